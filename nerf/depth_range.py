@@ -1,0 +1,53 @@
+"""Between which distances along its rays each photo can show anything (scene frame, region = [-0.9, 0.9]^3)."""
+
+import numpy as np
+from jaxtyping import Float
+
+from nerf.reconstruction import Reconstruction
+
+REGION_HALF = 0.9
+FEWEST_POINTS = 10  # fewer say nothing about a photo's depth range; all photos together then do
+NEAR_MARGIN = 0.7  # bare surfaces carry no points: the nearest thing may be nearer than the nearest point
+FARTHEST, LEAST_FAR = 1000.0, 100.0  # contraction maps these to 0.001 and 0.01 from the end of the world
+
+
+def near_and_far(scene: Reconstruction, bounded: bool) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+    """Distances along the unit ray, 0 < near < far, per photo.
+
+    Bounded: from where rays enter the region (or from the nearest points, from within it) to its farthest corner.
+    Unbounded: from 0.7 times the nearest points to four times the farthest, at least 100 and at most 1000 units,
+    which costs little because samples are spaced in contracted space.
+    """
+    entry, exit_ = _distances_to_region(scene.centres)
+    near, far = _points_range(scene)
+    # cameras that are inside the region and see no points still need a positive near
+    near = np.where(np.isfinite(near), near, np.maximum(entry, 0.05 * REGION_HALF))
+    if bounded:
+        near, far = np.maximum(entry, np.minimum(near, 0.5 * exit_)), exit_
+    else:
+        far = np.clip(4 * far, LEAST_FAR, FARTHEST)
+    return near, far
+
+
+def _distances_to_region(centres: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+    """Distances of the nearest point of the region (0 inside it) and of its farthest corner."""
+    nearest = np.linalg.norm(np.maximum(np.abs(centres) - REGION_HALF, 0.0), axis=1)
+    return nearest, np.linalg.norm(np.abs(centres) + REGION_HALF, axis=1)
+
+
+def _points_range(scene: Reconstruction) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+    """(near with margin, farthest point) per photo; (nan, 0) where no points are known at all.
+
+    Quantiles of 0.2 % and 99.9 %; a near below a twentieth of the median distance is a false match, not a surface.
+    """
+    count = len(scene.from_camera)
+    if not len(scene.point):
+        return np.full(count, np.nan), np.zeros(count)
+    distances = scene.distances()
+    near, far = np.empty(count), np.empty(count)
+    for view in range(count):
+        seen = distances[scene.view == view]
+        seen = seen if len(seen) >= FEWEST_POINTS else distances
+        low, middle, high = np.quantile(seen, [0.002, 0.5, 0.999])
+        near[view], far[view] = max(NEAR_MARGIN * low, 0.05 * middle), high
+    return near, far

@@ -1,0 +1,85 @@
+"""The similarity that carries a reconstruction into the scene frame, and all that is decided along with it."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from nerf.depth_range import REGION_HALF, near_and_far
+from nerf.reconstruction import Reconstruction, spatial_median
+from nerf.region import Layout, find_layout, find_region, given_region, share_beyond
+from nerf.scene import Similarity
+from nerf.up_vector import Up, find_up
+
+
+class Normalisation(NamedTuple):
+    """The scene frame and what is known of the scene in it.
+
+    ``beyond`` is the share of observations outside the region, ``arc_deg`` how far the cameras reach around it.
+    """
+
+    scene_from_sfm: Similarity
+    layout: Layout
+    bounded: bool
+    up: Up  # in the sfm frame
+    near: Float[np.ndarray, "n"]
+    far: Float[np.ndarray, "n"]
+    beyond: float
+    arc_deg: float
+
+
+def normalise(sfm: Reconstruction, has_alpha: bool, roi: tuple[float, float, float, float] | None) -> Normalisation:
+    """Choose the scene frame: region of interest in [-0.9, 0.9]^3, +z up, +y where the photos look.
+
+    ``roi`` (x, y, z, radius in the sfm frame) replaces the automatic region; the cube's half side is the radius.
+    The result is the same up to rounding for every similar reconstruction: x' = scale rotation (x - centre) with
+    all three found from shapes alone, in float64 relative to the cameras' middle.
+    Raises ValueError when the cameras stand in one place and there are no points.
+    """
+    layout, up = find_layout(sfm), find_up(sfm)
+    rotation = _frame(up.direction, _heading(sfm, layout))
+    middle = spatial_median(sfm.centres)
+    upright = sfm.in_frame(rotation, middle)
+    if roi is None:
+        region = find_region(upright, layout, has_alpha)
+    else:
+        region = given_region(upright, rotation @ (np.array(roi[:3]) - middle), roi[3], has_alpha)
+    scale = REGION_HALF / region.half
+    centre = middle + rotation.T @ region.centre
+    scene = upright.in_frame(np.eye(3), region.centre, scale)
+    near, far = near_and_far(scene, region.bounded)
+    return Normalisation(
+        scene_from_sfm=Similarity(scale, rotation, -scale * (rotation @ centre)),
+        layout=layout,
+        bounded=region.bounded,
+        up=up,
+        near=near,
+        far=far,
+        beyond=share_beyond(scene, np.zeros(3), REGION_HALF),
+        arc_deg=_arc_deg(scene.centres),
+    )
+
+
+def _heading(sfm: Reconstruction, layout: Layout) -> Float[np.ndarray, "3"]:
+    """The direction that becomes +y: where all photos look, or the first one if they look everywhere."""
+    return spatial_median(sfm.axes) if layout == "forward" else sfm.axes[0]
+
+
+def _frame(up: Float[np.ndarray, "3"], heading: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """Rotation that takes ``up`` to +z and ``heading`` into the half plane of +y and z.
+
+    A heading along up leaves the turn about z open; the sfm axis furthest from up then serves.
+    """
+    level = heading - up * (up @ heading)
+    if np.linalg.norm(level) < 1e-6:
+        least = np.eye(3)[np.argmin(np.abs(up))]
+        level = least - up * (up @ least)
+    y = level / np.linalg.norm(level)
+    return np.stack([np.cross(y, up), y, up])
+
+
+def _arc_deg(centres: Float[np.ndarray, "n 3"]) -> float:
+    """The arc about the z axis over which cameras stand: the full turn less the widest gap between neighbours."""
+    azimuths = np.sort(np.degrees(np.arctan2(centres[:, 1], centres[:, 0])))
+    gaps = np.diff(azimuths, append=azimuths[0] + 360)
+    return float(360 - gaps.max())

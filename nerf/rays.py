@@ -1,0 +1,55 @@
+"""Rays in the scene frame: origin, unit direction, near, far."""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+class Rays(NamedTuple):
+    """A batch of rays; ``near`` and ``far`` are distances along the unit ``directions`` in scene units."""
+
+    origins: Float[Tensor, "*rays 3"]
+    directions: Float[Tensor, "*rays 3"]
+    near: Float[Tensor, "*rays"]
+    far: Float[Tensor, "*rays"]
+
+
+def rays_of_view(
+    camera_directions: Float[Tensor, "*pixels 3"],
+    scene_from_camera: Float[Tensor, "3 4"],
+    near: float,
+    far: float,
+) -> Rays:
+    """Turn a camera's unit bearing vectors (one per pixel centre, camera frame) into rays of one view."""
+    directions = camera_directions @ scene_from_camera[:, :3].T
+    origins = scene_from_camera[:, 3].expand_as(directions)
+    return Rays(
+        origins,
+        directions,
+        torch.full_like(directions[..., 0], near),
+        torch.full_like(directions[..., 0], far),
+    )
+
+
+def points_on(rays: Rays, t: Float[Tensor, "*rays n"]) -> Float[Tensor, "*rays n 3"]:
+    """The points at distances ``t`` along the rays."""
+    return rays.origins[..., None, :] + t[..., None] * rays.directions[..., None, :]
+
+
+def clip_to_box(rays: Rays, half_size: float) -> Rays:
+    """Cut [near, far] to the cube [-half_size, half_size]^3 (the slab method of Kay and Kajiya 1986).
+
+    A ray that misses the cube between near and far gets the empty interval near = far = its old far. The interval
+    says where to look, not what is seen: it carries no gradient.
+    """
+    with torch.no_grad():
+        # A component of 0 would give 0/0 for an origin on a face; the smallest normal number gives the same slabs.
+        smallest = torch.finfo(rays.directions.dtype).tiny
+        directions = torch.where(rays.directions == 0, smallest, rays.directions)
+        first, second = (-half_size - rays.origins) / directions, (half_size - rays.origins) / directions
+        near = torch.maximum(rays.near, torch.minimum(first, second).amax(-1))
+        far = torch.minimum(rays.far, torch.maximum(first, second).amin(-1))
+        hit = near < far
+        return rays._replace(near=torch.where(hit, near, rays.far), far=torch.where(hit, far, rays.far))

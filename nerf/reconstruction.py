@@ -1,0 +1,104 @@
+"""What structure from motion knows of a scene, reduced to arrays; and two robust estimators of position.
+
+Everything here is numpy float64 and equivariant under similarities: coordinate-wise medians are not, so centres
+are spatial medians.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, Int
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """Posed photos and sparse points in one common frame.
+
+    ``bearings`` are unit vectors in the camera frame, sampled over each photo's whole field of view (the frustum);
+    observation j says that photo ``view[j]`` sees point ``point[j]``. There may be no points at all.
+    """
+
+    from_camera: Float[np.ndarray, "n 3 4"]
+    bearings: Float[np.ndarray, "n k 3"]
+    points: Float[np.ndarray, "m 3"]
+    view: Int[np.ndarray, "observations"]
+    point: Int[np.ndarray, "observations"]
+
+    @property
+    def centres(self) -> Float[np.ndarray, "n 3"]:
+        """Where the photos were taken from."""
+        return self.from_camera[:, :, 3]
+
+    @property
+    def rights(self) -> Float[np.ndarray, "n 3"]:
+        """The image x axes."""
+        return self.from_camera[:, :, 0]
+
+    @property
+    def ups(self) -> Float[np.ndarray, "n 3"]:
+        """The direction of the upper edge of each photo."""
+        return -self.from_camera[:, :, 1]
+
+    @property
+    def axes(self) -> Float[np.ndarray, "n 3"]:
+        """The optical axes."""
+        return self.from_camera[:, :, 2]
+
+    @property
+    def rays(self) -> Float[np.ndarray, "n k 3"]:
+        """The bearings in the common frame."""
+        return np.einsum("nij,nkj->nki", self.from_camera[:, :, :3], self.bearings)
+
+    def distances(self) -> Float[np.ndarray, "observations"]:
+        """Distance from the photo to the point, per observation."""
+        return np.linalg.norm(self.points[self.point] - self.centres[self.view], axis=1)
+
+    def in_frame(
+        self, rotation: Float[np.ndarray, "3 3"], centre: Float[np.ndarray, "3"], scale: float = 1.0
+    ) -> "Reconstruction":
+        """The same in the frame x' = scale rotation (x - centre): subtracting first keeps far origins exact."""
+        axes = rotation @ self.from_camera[:, :, :3]
+        centres = scale * (self.centres - centre) @ rotation.T
+        points = scale * (self.points - centre) @ rotation.T
+        return replace(self, from_camera=np.concatenate([axes, centres[:, :, None]], axis=2), points=points)
+
+
+def spatial_median(points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "d"]:
+    """The point of least summed distance to ``points`` (Weiszfeld's iteration; up to half may be outliers)."""
+    estimate = np.median(points, axis=0)
+    smallest = 1e-9 * np.median(np.linalg.norm(points - estimate, axis=1))
+    for _ in range(200):
+        distance = np.linalg.norm(points - estimate, axis=1)
+        weight = 1 / np.maximum(distance, smallest) if smallest > 0 else np.where(distance > 0, 0.0, 1.0)
+        step = weight @ (points - estimate) / weight.sum()
+        estimate = estimate + step
+        if np.linalg.norm(step) <= smallest:
+            break
+    return estimate
+
+
+def closest_point_to_lines(
+    origins: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "3"]:
+    """The point of least summed distance to the lines, by iteratively reweighted least squares.
+
+    Each round solves sum w_i (I - d_i d_i^T) (p - o_i) = 0 with w_i = 1 / distance. Parallel lines leave the
+    point free along them: of those the least-norm solution relative to the origins' median is taken.
+    """
+    middle = spatial_median(origins)
+    across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
+    offsets = np.einsum("nij,nj->ni", across, origins - middle)
+    weights = np.ones(len(origins))
+    estimate = np.zeros(3)
+    for _ in range(50):
+        normal = np.einsum("n,nij->ij", weights, across)
+        estimate = np.linalg.lstsq(normal, weights @ offsets, rcond=1e-9)[0]
+        distance = np.linalg.norm(across @ estimate - offsets, axis=1)
+        floor = 1e-6 * max(np.median(distance), np.median(np.linalg.norm(offsets, axis=1)))
+        weights = 1 / np.maximum(distance, floor) if floor > 0 else weights
+    return middle + estimate
+
+
+def angles_deg(a: Float[np.ndarray, "*n 3"], b: Float[np.ndarray, "*#n 3"]) -> Float[np.ndarray, "*n"]:
+    """Angles between unit vectors, in degrees."""
+    return np.degrees(np.arccos(np.clip((a * b).sum(-1), -1.0, 1.0)))

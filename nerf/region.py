@@ -1,0 +1,137 @@
+"""How the cameras stand, and the cube that holds what they were taken for.
+
+All lengths are relative to the scene's own: the cameras' distance to what they look at, or the spread of their
+standpoints. Points count once per photo that sees them, so a spurious point seen twice weighs little; extents are
+quantiles, so neither far points nor a far camera shrink the scene.
+"""
+
+from typing import Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from nerf.reconstruction import Reconstruction, angles_deg, closest_point_to_lines, spatial_median
+
+Layout = Literal["around", "inside", "forward"]
+
+FORWARD_DEG = 30.0  # four fifths of the optical axes within this of their median: all photos face one way
+CONVERGENT_DEG = 30.0  # four fifths of the axes within this of the direction to their common focus: they look at it
+AROUND_RADII = (0.4, 1.0)  # the cube's half side as a share of the cameras' distance to the focus
+FORWARD_REACH = 3.0  # the farthest depth the cube takes in, in median depths; beyond, detail is below a pixel's
+INSIDE_REACH = 2.0  # likewise around a camera that looks outward
+CORE, WHOLE = 0.95, 0.999  # shares of the observations that the cube should hold, and that make a scene bounded
+GROWTH = 1.25  # a cube that becomes WHOLE by growing at most this much is grown
+
+
+class Region(NamedTuple):
+    """A cube of half side ``half`` about ``centre``; ``bounded`` if all that the photos show lies in it."""
+
+    centre: Float[np.ndarray, "3"]
+    half: float
+    bounded: bool
+
+
+def focus(scene: Reconstruction) -> Float[np.ndarray, "3"]:
+    """The point nearest to the optical axes: what the photos have in common."""
+    return closest_point_to_lines(scene.centres, scene.axes)
+
+
+def find_layout(scene: Reconstruction) -> Layout:
+    """forward: the axes are nearly parallel; around: they meet in front of the cameras; inside: neither."""
+    middle = spatial_median(scene.axes)
+    length = np.linalg.norm(middle)
+    if length > 0 and np.quantile(angles_deg(scene.axes, middle / length), 0.8) <= FORWARD_DEG:
+        return "forward"
+    towards = focus(scene) - scene.centres
+    distance = np.linalg.norm(towards, axis=1, keepdims=True)
+    bearing = np.divide(towards, distance, out=-scene.axes, where=distance > 0)
+    return "around" if np.quantile(angles_deg(scene.axes, bearing), 0.8) <= CONVERGENT_DEG else "inside"
+
+
+def find_region(scene: Reconstruction, layout: Layout, has_alpha: bool) -> Region:
+    """The cube, aligned with the axes of the frame ``scene`` is in.
+
+    around: centred on the focus, holding 95 % of the observed points but not reaching beyond the cameras;
+    forward: the photos' frusta between the nearest and farthest observed depths; inside: the observed points and the
+    cameras, up to twice the usual viewing distance. Photos with alpha show nothing but the object: it is held whole.
+    Raises ValueError when the cameras stand in one place and there are no points to give a scale.
+    """
+    cube = {"around": _around, "forward": _forward, "inside": _inside}[layout](scene)
+    if not cube.half > 0:
+        raise ValueError("all cameras stand in one place and no point is known")
+    return _grown(cube, scene, has_alpha)
+
+
+def given_region(scene: Reconstruction, centre: Float[np.ndarray, "3"], half: float, has_alpha: bool) -> Region:
+    """A cube chosen by the user."""
+    return Region(centre, half, has_alpha or share_beyond(scene, centre, half) <= 1 - WHOLE)
+
+
+def share_beyond(scene: Reconstruction, centre: Float[np.ndarray, "3"], half: float) -> float:
+    """The share of observations whose point lies outside a cube; 1 without observations (nothing is known)."""
+    reach = _reach(scene, centre)
+    return float((reach > half).mean()) if len(reach) else 1.0
+
+
+def _reach(scene: Reconstruction, centre: Float[np.ndarray, "3"]) -> Float[np.ndarray, "observations"]:
+    """Half side of the cube about ``centre`` that just holds each observation's point."""
+    return np.abs(scene.points - centre).max(axis=1, initial=0.0)[scene.point]
+
+
+def _grown(cube: Region, scene: Reconstruction, has_alpha: bool) -> Region:
+    """Let the cube hold the whole scene where that costs little (or where alpha says that there is no more)."""
+    if not len(scene.point):
+        return cube._replace(bounded=has_alpha)
+    whole = float(np.quantile(_reach(scene, cube.centre), WHOLE))
+    if has_alpha or whole <= GROWTH * cube.half:
+        return Region(cube.centre, max(cube.half, whole), True)
+    return cube
+
+
+def _around(scene: Reconstruction) -> Region:
+    centre = focus(scene)
+    distance = float(np.median(np.linalg.norm(scene.centres - centre, axis=1)))
+    if len(scene.point):
+        half = float(np.quantile(_reach(scene, centre), CORE))
+    else:
+        half = distance * float(np.median(_half_widths(scene)))
+    return Region(centre, float(np.clip(half, *(share * distance for share in AROUND_RADII))), False)
+
+
+def _half_widths(scene: Reconstruction) -> Float[np.ndarray, "n"]:
+    """How far each photo sees to the side, at unit depth; at most 1 (45 degrees)."""
+    sideways = np.abs(scene.bearings[..., :2]).max(-1) / np.maximum(scene.bearings[..., 2], 1e-3)
+    return np.minimum(sideways.max(-1), 1.0)
+
+
+def _forward(scene: Reconstruction) -> Region:
+    near, far = _depth_extent(scene)
+    ends = np.concatenate([scene.centres[:, None] + depth * scene.rays for depth in (near, far)])
+    low, high = np.quantile(ends.reshape(-1, 3), [0.02, 0.98], axis=0)
+    return Region((low + high) / 2, float((high - low).max() / 2), False)
+
+
+def _depth_extent(scene: Reconstruction) -> tuple[float, float]:
+    """The depths between which photos that face one way show something."""
+    if len(scene.point):
+        depths = scene.distances()
+        near, far = np.quantile(depths, [1 - CORE, CORE])
+        return float(near), float(min(far, FORWARD_REACH * np.median(depths)))
+    spread = float(np.median(np.linalg.norm(scene.centres - spatial_median(scene.centres), axis=1)))
+    distance = float(np.median(np.linalg.norm(scene.centres - focus(scene), axis=1)))
+    # axes that meet closer than this are parallel up to noise: fall back on a comfortable stereo base, 1 : 8
+    depth = distance if distance > 4 * spread else 8 * spread
+    return depth / 2, depth * 2
+
+
+def _inside(scene: Reconstruction) -> Region:
+    middle = spatial_median(scene.centres)
+    spread = np.linalg.norm(scene.centres - middle, axis=1)
+    low, high = np.quantile(scene.centres, [0.05, 0.95], axis=0)
+    if not len(scene.point):
+        return Region(middle, 3 * float(np.quantile(spread, 0.9)), False)
+    reach = INSIDE_REACH * np.median(scene.distances())
+    points = np.quantile(scene.points[scene.point], [(1 - CORE) / 2, (1 + CORE) / 2], axis=0)
+    low = np.minimum(low, np.maximum(points[0], low - reach))
+    high = np.maximum(high, np.minimum(points[1], high + reach))
+    return Region((low + high) / 2, float((high - low).max() / 2), False)

@@ -1,0 +1,77 @@
+"""When a run ends and which learning rate each step has.
+
+``share`` is how much of a run is done, from 0 to 1; everything that changes while training is a function of it.
+A run bounded by steps knows its share exactly. A run bounded by seconds estimates how many steps will fit, and
+revises the estimate when the clock disagrees; the decisions are data (:class:`StepPlan`), so a resumed run that
+replays them gives every step the learning rate it had before.
+"""
+
+from typing import NamedTuple
+
+
+class Decision(NamedTuple):
+    """From step ``from_step`` on, the run is meant to have ``total_steps`` steps."""
+
+    from_step: int
+    total_steps: int
+
+
+class StepPlan(NamedTuple):
+    """The decisions so far, in order; the last one holds."""
+
+    decisions: tuple[Decision, ...]
+
+    @property
+    def total_steps(self) -> int:
+        """How many steps the run has, by the latest decision."""
+        return self.decisions[-1].total_steps
+
+    def share(self, step: int) -> float:
+        """The share of the run done before ``step``: continuous, linear between decisions, 1 at the end.
+
+        Every decision spreads the share that was left when it was made evenly over the steps that were left.
+        """
+        share = 0.0
+        ends = [later.from_step for later in self.decisions[1:]] + [self.total_steps]
+        for (start, total), end in zip(self.decisions, ends, strict=True):
+            if step <= start:
+                break
+            share += (1 - share) * (min(step, end) - start) / (total - start)
+        return share
+
+    def revised(self, step: int, total_steps: int) -> "StepPlan":
+        """This plan with one more decision made before ``step``.
+
+        Raises ValueError where that would leave no step to take, or rewrite a decision already made.
+        """
+        if not self.decisions[-1].from_step <= step < total_steps:
+            raise ValueError(f"at step {step} the plan {self.decisions} cannot become {total_steps} steps")
+        return StepPlan((*self.decisions, Decision(step, total_steps)))
+
+
+def plan_of(total_steps: int) -> StepPlan:
+    """The plan of a run of ``total_steps`` steps. Raises ValueError below one step."""
+    if total_steps < 1:
+        raise ValueError(f"a run needs at least one step, not {total_steps}")
+    return StepPlan((Decision(0, total_steps),))
+
+
+def steps_that_fit(step: int, seconds_left: float, steps_per_second: float) -> int:
+    """The total that uses up the time left at the measured rate; always at least the step about to be taken."""
+    return step + max(1, round(seconds_left * steps_per_second))
+
+
+def replanned(
+    plan: StepPlan, step: int, seconds_left: float, steps_per_second: float, tolerance_seconds: float
+) -> StepPlan:
+    """The plan before ``step``, revised only if it would end more than ``tolerance_seconds`` early or late."""
+    expected = (plan.total_steps - step) / steps_per_second
+    if abs(expected - seconds_left) <= tolerance_seconds:
+        return plan
+    total = steps_that_fit(step, seconds_left, steps_per_second)
+    return plan if total == plan.total_steps else plan.revised(step, total)
+
+
+def learning_rate(share: float, start: float, end: float) -> float:
+    """From ``start`` to ``end`` exponentially in the share of the run done (Mildenhall et al. 2020, section 5.3)."""
+    return start * (end / start) ** share

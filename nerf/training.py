@@ -1,0 +1,152 @@
+"""One optimisation step of the hierarchical NeRF, and the interface every kind of field trains behind.
+
+A step is a function of (state, step number, share of the run done): its random numbers come from the seed and the
+step number, so a run that goes on from a saved state repeats exactly what it would have done.
+"""
+
+from dataclasses import dataclass
+from typing import Literal, NamedTuple, Protocol
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerf.metrics import psnr
+from nerf.model import RadianceModel
+from nerf.paper import PaperNerf
+from nerf.randomness import generator
+from nerf.ray_bank import RayBank
+from nerf.rays import Rays
+from nerf.schedule import learning_rate
+
+
+class StepResult(NamedTuple):
+    """What one step did: its loss, the PSNR (dB) of the final rendering on its batch, and how many rays it drew."""
+
+    loss: float
+    psnr: float
+    rays: int
+
+
+class FieldTrainer(Protocol):
+    """What the training loop needs of any kind of field. Tensors of a state carry everything that a step changes."""
+
+    @property
+    def model(self) -> RadianceModel:
+        """The field as it is now."""
+        ...
+
+    def step(self, step: int, share: float, rate_scale: float) -> StepResult:
+        """Take step number ``step``, ``share`` of the run being done. Raises NonFinite and changes nothing."""
+        ...
+
+    def state(self) -> dict[str, Tensor]:
+        """The live tensors of model and optimiser; copy them to keep them."""
+        ...
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        """Go back to a saved state."""
+        ...
+
+
+class NonFinite(Exception):
+    """A loss or gradient is infinite or NaN. ``batch`` holds the tensors that led to it."""
+
+    def __init__(self, quantity: str, step: int, batch: dict[str, Tensor]) -> None:
+        super().__init__(f"the {quantity} of step {step} is not finite")
+        self.quantity, self.step, self.batch = quantity, step, batch
+
+
+@dataclass(frozen=True)
+class TrainerSettings:
+    """How to train. ``background`` is what lies behind the scene: a colour, or another random one each step
+    (only for photos with alpha, where it shows the field which space is empty)."""
+
+    batch_rays: int
+    seed: int
+    background: tuple[float, float, float] | Literal["random"]
+    rate_start: float = 5e-4
+    rate_end: float = 5e-5
+
+
+class Batch(NamedTuple):
+    """Rays with the colour each should see, and the background behind all of them."""
+
+    rays: Rays
+    target: Float[Tensor, "rays 3"]
+    background: Float[Tensor, "3"]
+
+
+def composite(
+    colour: Float[Tensor, "*rays 3"], alpha: Float[Tensor, "*rays"] | None, background: Float[Tensor, "3"]
+) -> Float[Tensor, "*rays 3"]:
+    """A pixel of straight alpha over a background; without alpha, the pixel itself."""
+    if alpha is None:
+        return colour
+    return background + alpha[..., None] * (colour - background)
+
+
+class PaperTrainer:
+    """Trains coarse and fine network together on |C_c - C|² + |C_f - C|² (Mildenhall et al. 2020, eq. 6) by Adam
+    with the published constants; the loss is the mean over rays and channels."""
+
+    def __init__(self, model: PaperNerf, bank: RayBank, settings: TrainerSettings) -> None:
+        self.model = model
+        self.bank = bank
+        self.settings = settings
+        self.parameters = [p for p in model.parameters() if p.requires_grad]
+        self.optimiser = torch.optim.Adam(self.parameters, betas=(0.9, 0.999), eps=1e-7, fused=True)
+
+    def step(self, step: int, share: float, rate_scale: float = 1.0) -> StepResult:
+        """One batch, one update. Raises NonFinite before the update, leaving model and optimiser as they were."""
+        random = generator(self.bank.device, self.settings.seed, step)
+        batch = self._batch(random)
+        coarse, fine = self.model.render_training(batch.rays, batch.background, random)
+        fine_error = (fine.colour - batch.target).square().mean()
+        loss = (coarse.colour - batch.target).square().mean() + fine_error
+        self.optimiser.zero_grad()
+        loss.backward()
+        gradients = [p.grad for p in self.parameters if p.grad is not None]
+        norm = torch.nn.utils.get_total_norm(gradients)
+        loss_now, error_now, norm_now = torch.stack([loss, fine_error, norm]).tolist()
+        for quantity, value in {"loss": loss_now, "gradient": norm_now}.items():
+            if not abs(value) < float("inf"):
+                raise NonFinite(quantity, step, _tensors_of(batch))
+        rate = rate_scale * learning_rate(share, self.settings.rate_start, self.settings.rate_end)
+        self.optimiser.param_groups[0]["lr"] = rate
+        self.optimiser.step()
+        return StepResult(loss_now, psnr(error_now), self.settings.batch_rays)
+
+    def state(self) -> dict[str, Tensor]:
+        """Weights as ``model.<name>``, Adam's moments and step counts as ``adam.<parameter>.<name>``."""
+        tensors = {f"model.{name}": tensor for name, tensor in self.model.state_dict().items()}
+        for index, moments in self.optimiser.state_dict()["state"].items():
+            tensors |= {f"adam.{index}.{name}": tensor for name, tensor in moments.items()}
+        return tensors
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        """Go back to what :meth:`state` gave. Raises RuntimeError for the state of another architecture."""
+        weights: dict[str, Tensor] = {}
+        moments: dict[int, dict[str, Tensor]] = {}
+        for key, tensor in state.items():
+            kind, name = key.split(".", 1)
+            if kind == "model":
+                weights[name] = tensor
+            else:
+                index, name = name.split(".")
+                moments.setdefault(int(index), {})[name] = tensor.clone()
+        self.model.load_state_dict(weights)
+        groups = self.optimiser.state_dict()["param_groups"]
+        self.optimiser.load_state_dict({"state": moments, "param_groups": groups})
+
+    def _batch(self, random: torch.Generator) -> Batch:
+        rays, colour, alpha = self.bank.sample(self.settings.batch_rays, random)
+        if self.settings.background == "random":
+            background = torch.rand(3, generator=random, device=self.bank.device)
+        else:
+            background = torch.tensor(self.settings.background, device=self.bank.device)
+        return Batch(rays, composite(colour, alpha, background), background)
+
+
+def _tensors_of(batch: Batch) -> dict[str, Tensor]:
+    return batch.rays._asdict() | {"target": batch.target, "background": batch.background}

@@ -1,0 +1,1 @@
+"""Orchestration and words for the user: command line, runner, manifests, workspace, demo."""

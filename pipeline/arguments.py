@@ -1,0 +1,147 @@
+"""The words of the command line: one dataclass per command, read by tyro; dotted flags come from the stage configs."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import tyro
+
+from pipeline.settings import Settings
+
+T = TypeVar("T")
+
+
+@dataclass
+class Common:
+    """Options of every command that runs stages."""
+
+    json: bool = False
+    """One JSON object a line instead of text."""
+    debug: bool = False
+    """Show the traceback of an error."""
+    replan: bool = False
+    """Forget the settings chosen automatically before and choose them again."""
+
+
+@dataclass
+class RunArguments:
+    """Photos in; cameras, radiance field, figures, video, mesh and report out."""
+
+    photos: tyro.conf.Positional[Path]
+    """A folder of photos, a transforms.json, or a folder with transforms_train.json."""
+    settings: Annotated[Settings, tyro.conf.arg(name="")] = field(default_factory=Settings)
+    common: Annotated[Common, tyro.conf.arg(name="")] = field(default_factory=Common)
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """The workspace (default: <photos>.nerf in the current folder)."""
+    cameras: Path | None = None
+    """Known cameras for these photos: a transforms.json or a COLMAP model folder."""
+    until: str | None = None
+    """The last stage to run."""
+    from_: Annotated[str | None, tyro.conf.arg(name="from")] = None
+    """Run this stage and all after it again even if they are cached."""
+    config: Path | None = None
+    """A TOML file with options, tables named by stage; flags win over it."""
+
+
+@dataclass
+class StageArguments:
+    """Bring one stage of a workspace up to date, with the recorded options plus the flags given."""
+
+    workspace: tyro.conf.Positional[Path]
+    """The workspace folder."""
+    settings: Annotated[Settings, tyro.conf.arg(name="")] = field(default_factory=Settings)
+    common: Annotated[Common, tyro.conf.arg(name="")] = field(default_factory=Common)
+    cameras: Path | None = None
+    """render only: a file with the cameras to render, like output/transforms.json."""
+    force: bool = False
+    """Run it again even if it is cached."""
+
+
+@dataclass
+class ResumeArguments:
+    """Repeat the recorded run: what is finished is kept, what was interrupted goes on."""
+
+    workspace: tyro.conf.Positional[Path]
+    common: Annotated[Common, tyro.conf.arg(name="")] = field(default_factory=Common)
+
+
+@dataclass
+class StatusArguments:
+    """Each stage: cached, stale, partial or never, with its one-line summary."""
+
+    workspace: tyro.conf.Positional[Path]
+    json: bool = False
+    """One JSON object instead of text."""
+
+
+@dataclass
+class ExplainArguments:
+    """Say whether a stage would run, and which part of its key changed."""
+
+    stage: tyro.conf.Positional[str]
+    workspace: tyro.conf.Positional[Path]
+
+
+@dataclass
+class CleanArguments:
+    """Remove results that the recorded options do not use."""
+
+    workspace: tyro.conf.Positional[Path]
+    dry_run: bool = False
+    """Only list them."""
+
+
+@dataclass
+class DoctorArguments:
+    """Versions, device, threads, free disk and a five-second numerical self-test."""
+
+
+@dataclass
+class DemoArguments:
+    """Photograph a synthetic scene, run everything on the photos and compare with the truth."""
+
+    settings: Annotated[Settings, tyro.conf.arg(name="")] = field(default_factory=Settings)
+    common: Annotated[Common, tyro.conf.arg(name="")] = field(default_factory=Common)
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("demo")
+    """Where photos and workspace go."""
+
+
+COMMANDS: dict[str, type] = {
+    "run": RunArguments,
+    "resume": ResumeArguments,
+    "status": StatusArguments,
+    "explain": ExplainArguments,
+    "clean": CleanArguments,
+    "doctor": DoctorArguments,
+    "demo": DemoArguments,
+}
+
+
+def parse(kind: type[T], command: str, words: Sequence[str], settings: Settings | None = None) -> T:
+    """Parse ``words``; stage options not named in them keep their value in ``settings``.
+
+    Raises SystemExit(2) after saying what is wrong, SystemExit(0) after ``--help``.
+    """
+    positional = {name: tyro.MISSING for name in ("photos", "workspace", "stage") if name in kind.__annotations__}
+    default: Any = kind(**positional)
+    if settings is not None:
+        default = replace(default, settings=settings)
+    return tyro.cli(kind, prog=f"pipeline {command}", args=list(words), default=default)
+
+
+def overview(stages: Sequence[str]) -> str:
+    """The text of ``pipeline --help``."""
+    commands = [(name, (kind.__doc__ or "").strip()) for name, kind in COMMANDS.items()]
+    lines = [f"  {name:<10} {text}" for name, text in commands]
+    return "\n".join(
+        [
+            "usage: pipeline COMMAND … (pipeline COMMAND --help says more)",
+            "",
+            "  pipeline run photos/       from photos to cameras, radiance field, video, mesh and report",
+            "",
+            *lines,
+            "",
+            f"One stage of a workspace, with its options: pipeline STAGE WORKSPACE ({', '.join(stages)})",
+        ]
+    )

@@ -1,0 +1,45 @@
+"""The stages in the order they run, and how they depend on each other."""
+
+from types import ModuleType
+
+from stages import evaluate, ingest, mesh, normalise, render, report, sfm, train
+
+# effects has its place between normalise and train.
+STAGES: dict[str, ModuleType] = {
+    "ingest": ingest,
+    "sfm": sfm,
+    "normalise": normalise,
+    "train": train,
+    "evaluate": evaluate,
+    "render": render,
+    "mesh": mesh,
+    "report": report,
+}
+
+EXIT_CODES = {
+    "ingest": 10,
+    "sfm": 11,
+    "normalise": 12,
+    "train": 14,
+    "evaluate": 15,
+    "render": 16,
+    "mesh": 17,
+    "report": 18,
+}
+
+
+def needed_for(stage: str) -> list[str]:
+    """``stage`` and everything it depends on, in order; the report is written from whatever is there."""
+    if stage == "report":
+        return [stage]
+    wanted = {stage}
+    for name in reversed(STAGES):
+        if name in wanted:
+            wanted.update(STAGES[name].NEEDS)
+    return [name for name in STAGES if name in wanted]
+
+
+def up_to(stage: str) -> list[str]:
+    """All stages from the first to ``stage``, in order."""
+    names = list(STAGES)
+    return names[: names.index(stage) + 1]

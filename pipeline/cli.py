@@ -1,0 +1,269 @@
+"""The command line: finds the command, runs it, turns every ending into words and an exit code.
+
+Exit codes: 0 done; 2 usage; 3 the workspace; 10 to 18 the stage that failed (pipeline/chain.py); 130 Ctrl-C;
+143 SIGTERM; 1 a defect of this program.
+"""
+
+import json
+import os
+import shutil
+import signal
+import sys
+import traceback
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+from pipeline import arguments as words_of
+from pipeline import chain, machine, status
+from pipeline.display import Display, SilentDisplay, choose_display
+from pipeline.runner import Runner, StageFailed
+from pipeline.settings import (
+    Settings,
+    UsageError,
+    default_workspace,
+    read_toml,
+    settings_from,
+    with_source,
+)
+from pipeline.workspace import Workspace
+from stages.contract import StageError
+
+EXIT_DEFECT, EXIT_USAGE, EXIT_WORKSPACE, EXIT_INTERRUPT, EXIT_TERMINATED = 1, 2, 3, 130, 143
+
+
+class Terminated(BaseException):
+    """SIGTERM arrived."""
+
+
+def main() -> None:
+    """Entry point of ``pipeline``."""
+    sys.exit(run_command(sys.argv[1:]))
+
+
+def run_command(words: Sequence[str]) -> int:
+    """Run one command line and return its exit code; errors are said on the way."""
+    if not words or words[0] in ("-h", "--help"):
+        print(words_of.overview(list(chain.STAGES)))
+        return 0 if words else EXIT_USAGE
+    if words[0] == "--version":
+        print(machine.versions(("pipeline-nerf",))["pipeline-nerf"])
+        return 0
+    debug = "--debug" in words
+    signal.signal(signal.SIGTERM, _on_sigterm)
+    try:
+        return _command(words[0])(words[1:])
+    except UsageError as error:
+        print(f"pipeline: {error}", file=sys.stderr)
+        return EXIT_USAGE
+    except StageFailed as failure:
+        if debug:
+            traceback.print_exc()
+        return chain.EXIT_CODES[failure.stage]
+    except StageError as error:
+        _say_error("pipeline", error, debug)
+        return EXIT_WORKSPACE
+    except KeyboardInterrupt:
+        print("stopped; finished stages are kept, `pipeline resume WORKSPACE` goes on", file=sys.stderr)
+        return EXIT_INTERRUPT
+    except Terminated:
+        print("terminated; finished stages are kept, `pipeline resume WORKSPACE` goes on", file=sys.stderr)
+        return EXIT_TERMINATED
+    except Exception as error:
+        _say_defect(error, debug)
+        return EXIT_DEFECT
+
+
+def _on_sigterm(*_: object) -> None:
+    raise Terminated
+
+
+def _say_error(who: str, error: StageError, debug: bool) -> None:
+    if debug:
+        traceback.print_exc()
+    print(f"{who}: {error.what}\n  why: {error.why}\n  try: {error.hint}", file=sys.stderr)
+
+
+def _say_defect(error: Exception, debug: bool) -> None:
+    if debug:
+        traceback.print_exc()
+    print(
+        f"pipeline: a defect of this program, not of your photos: {type(error).__name__}: {error}\n"
+        "  Finished stages are kept. Please report it with the output of the same command and --debug.",
+        file=sys.stderr,
+    )
+
+
+def _command(name: str) -> Callable[[Sequence[str]], int]:
+    commands: dict[str, Callable[[Sequence[str]], int]] = {
+        "run": command_run,
+        "resume": command_resume,
+        "status": command_status,
+        "explain": command_explain,
+        "clean": command_clean,
+        "doctor": command_doctor,
+        "demo": command_demo,
+    }
+    if name in commands:
+        return commands[name]
+    if name in chain.STAGES:
+        return lambda words: command_stage(name, words)
+    raise UsageError(f"no command {name!r}; there are: {', '.join([*commands, *chain.STAGES])}")
+
+
+def command_run(words: Sequence[str]) -> int:
+    """``pipeline run PHOTOS``: the whole chain, or a part of it."""
+    given = words_of.parse(words_of.RunArguments, "run", words)
+    if given.config is not None:  # the file's values become the defaults that flags override
+        from_file = settings_from(read_toml(given.config), f"--config {given.config}")
+        given = words_of.parse(words_of.RunArguments, "run", words, from_file)
+    last = _known_stage(given.until, "--until") or list(chain.STAGES)[-1]
+    stages = chain.up_to(last)
+    force = frozenset[str]()
+    if given.from_ is not None:
+        force = frozenset(stages[stages.index(_known_stage(given.from_, "--from", stages)) :])
+    root = given.output or default_workspace(given.photos)
+    with choose_display(given.common.json) as display:
+        try:
+            settings = with_source(given.settings, given.photos, given.cameras)
+        except StageError as error:
+            display.failed("ingest", error)
+            return chain.EXIT_CODES["ingest"]
+        return _run_stages(root, settings, stages, given.common, display, force)
+
+
+def _known_stage(name: str | None, flag: str, among: Sequence[str] = tuple(chain.STAGES)) -> str | None:
+    if name is not None and name not in among:
+        raise UsageError(f"{flag} {name}: not one of {', '.join(among)}")
+    return name
+
+
+def _run_stages(
+    root: Path,
+    settings: Settings,
+    stages: Sequence[str],
+    common: words_of.Common,
+    display: Display,
+    force: frozenset[str] = frozenset(),
+) -> int:
+    with Workspace(root) as workspace:
+        runner = Runner(workspace, settings, display)
+        display.headline(machine.headline(root))
+        try:
+            ran = runner.run(stages, force=force, replan=common.replan)
+        except StageFailed as failure:
+            display.failed(failure.stage, failure.error)
+            raise
+        display.finished(_closing_words(workspace, ran), _outputs(workspace))
+    return 0
+
+
+def _outputs(workspace: Workspace) -> dict[str, Path]:
+    folder = workspace.root / "output"
+    return {path.name: path for path in sorted(folder.iterdir())} if folder.is_dir() else {}
+
+
+def _closing_words(workspace: Workspace, ran: bool) -> str:
+    found = _outputs(workspace)
+    named = [str(found[name]) for name in ("report.html", "mesh.glb", "video.mp4") if name in found]
+    words = "" if ran else "nothing to do: everything is up to date "
+    return words + ("→ " + "  ".join(named) if named else f"→ {workspace.root}")
+
+
+def command_stage(stage: str, words: Sequence[str]) -> int:
+    """``pipeline STAGE WORKSPACE``: bring one stage, what it needs, and the report if there is one, up to date."""
+    given = words_of.parse(words_of.StageArguments, stage, words)
+    workspace = Workspace.existing(given.workspace)
+    recorded = _recorded_settings(workspace)
+    given = words_of.parse(words_of.StageArguments, stage, words, recorded)
+    settings = given.settings
+    if given.cameras is not None:
+        if stage != "render":
+            raise UsageError(f"--cameras belongs to `pipeline render` and `pipeline run`, not to {stage}")
+        update = {"cameras": given.cameras.absolute()}
+        settings = settings.model_copy(update={"render": settings.render.model_copy(update=update)})
+    stages = chain.needed_for(stage)
+    if stage != "report" and "report" in workspace.read_run()["keys"]:
+        stages = [*stages, "report"]
+    with choose_display(given.common.json) as display:
+        force = frozenset({stage}) if given.force else frozenset[str]()
+        return _run_stages(given.workspace, settings, stages, given.common, display, force)
+
+
+def _recorded_settings(workspace: Workspace) -> Settings:
+    return settings_from(workspace.read_run()["options"], f"options recorded in {workspace.root}")
+
+
+def command_resume(words: Sequence[str]) -> int:
+    """``pipeline resume WORKSPACE``: repeat the recorded run."""
+    given = words_of.parse(words_of.ResumeArguments, "resume", words)
+    workspace = Workspace.existing(given.workspace)
+    stages = workspace.read_run().get("stages") or list(chain.STAGES)
+    with choose_display(given.common.json) as display:
+        return _run_stages(given.workspace, _recorded_settings(workspace), stages, given.common, display)
+
+
+def _reader(root: Path) -> tuple[Workspace, Runner]:
+    workspace = Workspace.existing(root)
+    return workspace, Runner(workspace, _recorded_settings(workspace), SilentDisplay())
+
+
+def command_status(words: Sequence[str]) -> int:
+    """``pipeline status WORKSPACE``."""
+    given = words_of.parse(words_of.StatusArguments, "status", words)
+    statuses = status.all_statuses(*_reader(given.workspace))
+    if given.json:
+        print(json.dumps([asdict(s) for s in statuses], ensure_ascii=False))
+        return 0
+    for s in statuses:
+        print(f"{s.stage:<10} {s.state:<8} {s.text}".rstrip())
+    return 0
+
+
+def command_explain(words: Sequence[str]) -> int:
+    """``pipeline explain STAGE WORKSPACE``."""
+    given = words_of.parse(words_of.ExplainArguments, "explain", words)
+    stage = _known_stage(given.stage, "explain") or given.stage
+    print("\n".join(status.explain(*_reader(given.workspace), stage)))
+    return 0
+
+
+def command_clean(words: Sequence[str]) -> int:
+    """``pipeline clean WORKSPACE``: remove results that the recorded options do not use."""
+    given = words_of.parse(words_of.CleanArguments, "clean", words)
+    with Workspace.existing(given.workspace) as workspace:
+        stale = workspace.stale_folders(workspace.read_run()["keys"], list(chain.STAGES))
+        freed = sum(p.stat().st_size for folder in stale for p in folder.rglob("*") if p.is_file())
+        for folder in stale:
+            print(f"{'would remove' if given.dry_run else 'removed'} {folder}")
+            if not given.dry_run:
+                shutil.rmtree(folder)
+    print(f"{freed / 2**20:.1f} MB in {len(stale)} folders")
+    return 0
+
+
+def command_doctor(words: Sequence[str]) -> int:
+    """``pipeline doctor``: versions, device, threads, free disk, a numerical self-test."""
+    words_of.parse(words_of.DoctorArguments, "doctor", words)
+    from pipeline.doctor import examine
+
+    return examine(Path(os.curdir))
+
+
+def command_demo(words: Sequence[str]) -> int:
+    """``pipeline demo``: photograph a synthetic scene, run everything, compare with the truth."""
+    from pipeline import demo
+
+    given = words_of.parse(words_of.DemoArguments, "demo", words, demo.default_settings())
+    photos, root = given.output / "photos", given.output / "demo.nerf"
+    with choose_display(given.common.json) as display:
+        display.begin("photos")
+        line, seconds = demo.photograph(photos, display)
+        display.end("photos", line, seconds, cached=seconds == 0)
+        settings = with_source(given.settings, photos, None)
+        code = _run_stages(root, settings, list(chain.STAGES), given.common, display)
+        for text in demo.truth_lines(root / "output", photos):
+            display.headline(text)
+        report = root / "output" / "report.html"
+        display.finished(f"→ the report: {report}", {"report.html": report})
+    return code

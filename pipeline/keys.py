@@ -1,0 +1,106 @@
+"""Content keys: what a stage's result depends on, as a hash.
+
+key = sha256 of canonical JSON {stage, version, config, inputs: {upstream stage: its outputs digest}}. Paths in a
+config are replaced by the digest of what they point to, so that photos and workspaces can be moved. Machine,
+device, worker counts and times never enter.
+"""
+
+import hashlib
+import json
+import os
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+
+from stages.contract import StageError
+
+KEY_LENGTH = 16  # hex digits shown in folder names: 64 bits
+
+
+def canonical_json(value: Any) -> bytes:
+    """One spelling per value: sorted keys, no spaces, no NaN."""
+    text = json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False, ensure_ascii=False)
+    return text.encode("utf-8", "surrogateescape")
+
+
+def digest(value: Any) -> str:
+    """sha256 of a JSON value's canonical form."""
+    return hashlib.sha256(canonical_json(value)).hexdigest()
+
+
+def file_sha256(path: Path) -> str:
+    """sha256 of a file's bytes."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+class ContentIndex:
+    """Remembers the sha256 of files by (path, size, mtime), so that an unchanged photo is hashed once.
+
+    The index is a cache: it lives outside all digests and losing it costs only time.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.known: dict[str, list[Any]] = {}
+        self.changed = False
+        if path.is_file():
+            try:
+                self.known = json.loads(path.read_text("utf-8"))
+            except ValueError:
+                self.changed = True  # a damaged cache is rebuilt, it cannot cause a wrong answer
+
+    def sha256(self, path: Path) -> str:
+        """sha256 of one file, from memory where size and mtime still agree."""
+        stat = path.stat()
+        name = str(path.resolve())
+        known = self.known.get(name)
+        if known and known[:2] == [stat.st_size, stat.st_mtime_ns]:
+            return known[2]
+        value = file_sha256(path)
+        self.known[name] = [stat.st_size, stat.st_mtime_ns, value]
+        self.changed = True
+        return value
+
+    def of_files(self, root: Path, files: Iterable[Path]) -> str:
+        """Digest of files and their names relative to ``root``."""
+        return digest({os.path.relpath(file, root): self.sha256(file) for file in sorted(files)})
+
+    def of_path(self, path: Path) -> str:
+        """Digest of a file, or of all files below a folder that are not hidden."""
+        if path.is_file():
+            return self.sha256(path)
+        if not path.is_dir():
+            raise StageError(f"{path} does not exist", "a setting names it", "Check the path and run again.")
+        below = (p for p in path.rglob("*") if not any(part.startswith(".") for part in p.relative_to(path).parts))
+        return self.of_files(path, (p for p in below if p.is_file()))
+
+    def save(self) -> None:
+        """Write the index if anything in it changed."""
+        if self.changed:
+            temporary = self.path.with_suffix(".tmp")
+            temporary.write_text(json.dumps(self.known), "utf-8")
+            temporary.replace(self.path)
+            self.changed = False
+
+
+def config_for_key(config: BaseModel, index: ContentIndex, replaced: Mapping[str, str]) -> dict[str, Any]:
+    """The config as JSON values, every path replaced by its content's digest.
+
+    ``replaced`` gives digests for fields whose content the caller knows better than :meth:`ContentIndex.of_path`.
+    """
+    values = config.model_dump(mode="json")
+    for name in type(config).model_fields:
+        value = getattr(config, name)
+        if name in replaced:
+            values[name] = replaced[name]
+        elif isinstance(value, Path):
+            values[name] = index.of_path(value)
+    return values
+
+
+def stage_key(stage: str, version: int, config: Mapping[str, Any], inputs: Mapping[str, str]) -> str:
+    """The full key; folders are named by its first ``KEY_LENGTH`` digits."""
+    return digest({"stage": stage, "version": version, "config": config, "inputs": inputs})

@@ -1,0 +1,204 @@
+"""Runs stages: finds what is already there, plans what was left open, runs the rest, finishes it durably."""
+
+import shutil
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from pipeline import machine, manifests
+from pipeline.chain import STAGES
+from pipeline.display import Display
+from pipeline.keys import ContentIndex, config_for_key, digest, stage_key
+from pipeline.manifests import BadManifest, Manifest
+from pipeline.settings import Settings
+from pipeline.workspace import Workspace
+from stages.contract import StageConfig, StageError
+
+
+class StageFailed(Exception):
+    """A stage ended with a StageError; carries both so that the caller can word it and choose the exit code."""
+
+    def __init__(self, stage: str, error: StageError) -> None:
+        super().__init__(f"{stage}: {error}")
+        self.stage, self.error = stage, error
+
+
+class NotReady(Exception):
+    """A stage's key cannot be known yet: ``upstream`` (or the stage itself) has no current result or plan."""
+
+    def __init__(self, upstream: str) -> None:
+        super().__init__(upstream)
+        self.upstream = upstream
+
+
+@dataclass(frozen=True)
+class Job:
+    """One stage with everything that decides its key."""
+
+    stage: str
+    config: StageConfig
+    key_config: dict[str, Any]
+    inputs: dict[str, str]  # upstream stage -> outputs digest
+    folders: dict[str, Path]  # upstream stage -> finished folder
+    key: str
+
+    @property
+    def module(self) -> ModuleType:
+        return STAGES[self.stage]
+
+
+class Runner:
+    """Brings stages of one workspace up to date. The workspace's lock must be held by whoever calls ``run``."""
+
+    def __init__(self, workspace: Workspace, settings: Settings, display: Display) -> None:
+        self.workspace, self.settings, self.display = workspace, settings, display
+        self.force: frozenset[str] = frozenset()
+        self.state = workspace.read_run()
+        self.state["options"] = settings.model_dump(mode="json")
+        self.index = ContentIndex(workspace.root / ".content.json")
+        self.done: dict[str, Manifest] = {}
+
+    def run(self, stages: Sequence[str], *, force: frozenset[str] = frozenset(), replan: bool = False) -> bool:
+        """Bring ``stages`` (in chain order) up to date; True if anything ran. Raises StageFailed.
+
+        ``force`` names stages that run again even where a finished result exists; ``replan`` forgets what was
+        chosen for the user before.
+        """
+        self.force = force
+        if replan:
+            self.state["plans"] = {}
+        self.state["stages"] = list(stages)
+        self.workspace.write_run(self.state)
+        ran = [self._bring_up_to_date(stage) for stage in stages]
+        return any(ran)
+
+    def _bring_up_to_date(self, stage: str) -> bool:
+        started = time.monotonic()
+        self.display.begin(stage)
+        try:
+            job = self.resolve(stage)
+            self.state["keys"][stage] = job.key
+            manifest = None if stage in self.force else self.find_finished(job)
+            ran = manifest is None
+            if manifest is None:
+                manifest = self._execute(job)
+            self.workspace.link_outputs(self.workspace.folder(stage, job.key), job.module.LINKS)
+            self.workspace.write_run(self.state)
+            self.index.save()
+        except StageError as error:
+            raise StageFailed(stage, error) from error
+        except OSError as error:
+            raise StageFailed(stage, _disk_error(error)) from error
+        except MemoryError as error:
+            hint = "Close other programs, or lower the resolution or batch settings of this stage."
+            raise StageFailed(stage, StageError("out of memory", str(error) or stage, hint)) from error
+        self.done[stage] = manifest
+        self.display.end(stage, manifest.line, time.monotonic() - started, cached=not ran)
+        return ran
+
+    def resolve(self, stage: str, *, may_plan: bool = True) -> Job:
+        """Everything that decides ``stage``'s key.
+
+        Raises NotReady where an upstream result is missing, or where settings are left open and may not be planned.
+        """
+        module = STAGES[stage]
+        upstream = {name: m for name in module.NEEDS if (m := self._upstream(name, stage)) is not None}
+        folders = {name: self.workspace.folder(name, m.key) for name, m in upstream.items()}
+        # The report shows timings and logs too, so it depends on whole manifests and not only on outputs.
+        if stage == "report":
+            inputs = {name: manifests.file_sha256(folders[name] / manifests.NAME) for name in upstream}
+        else:
+            inputs = {name: m.outputs_digest for name, m in upstream.items()}
+        config = self._planned(stage, inputs, folders, may_plan)
+        key_config = self._config_for_key(stage, config)
+        key = stage_key(stage, module.VERSION, key_config, inputs)
+        return Job(stage, config, key_config, inputs, folders, key)
+
+    def _upstream(self, name: str, stage: str) -> Manifest | None:
+        """The current result of ``name``. Only the report does without: it is written from whatever is there."""
+        if name not in self.done:
+            try:
+                key = self.resolve(name, may_plan=False).key
+                self.done[name] = manifests.read(self.workspace.folder(name, key))
+            except (NotReady, FileNotFoundError, BadManifest):
+                if stage != "report":
+                    raise NotReady(name) from None
+        return self.done.get(name)
+
+    def _planned(self, stage: str, inputs: dict[str, str], folders: dict[str, Path], may_plan: bool) -> StageConfig:
+        """The stage's config with every "choose for me" answered: from run.json, or by the stage's plan()."""
+        module, options = STAGES[stage], getattr(self.settings, stage)
+        if not hasattr(module, "plan"):
+            return options
+        asked = digest({"options": self._config_for_key(stage, options), "inputs": inputs})
+        known = self.state["plans"].get(stage)
+        if known and known["asked"] == asked:
+            return module.Config.model_validate(known["config"])
+        if not may_plan:
+            raise NotReady(stage)
+        config = module.plan(options, folders)
+        self.state["plans"][stage] = {"asked": asked, "config": config.model_dump(mode="json")}
+        self.workspace.write_run(self.state)
+        return config
+
+    def _config_for_key(self, stage: str, config: StageConfig) -> dict[str, Any]:
+        replaced = {"photos": self._photos_digest()} if stage == "ingest" else {}
+        return config_for_key(config, self.index, replaced)
+
+    def _photos_digest(self) -> str:
+        """Digest of the photos' names and bytes; the last known one where the photos are gone but were ingested."""
+        from stages.sources import find_source
+
+        config = self.settings.ingest
+        if not config.photos.exists() and (known := self.state.get("photos_digest")):
+            return known
+        source = find_source(config.photos, config.cameras)
+        self.display.update(f"reading {len(source.files)} photos")
+        self.state["photos_digest"] = self.index.of_files(source.root, source.files)
+        return self.state["photos_digest"]
+
+    def find_finished(self, job: Job) -> Manifest | None:
+        """The finished result for this job, if there is one; a damaged one is set aside and said aloud."""
+        try:
+            return self.workspace.finished(job.stage, job.key)
+        except BadManifest as problem:
+            self.display.note(f"set aside as .bad and made again: {problem}")
+            return None
+
+    def _execute(self, job: Job) -> Manifest:
+        partial = self.workspace.partial(job.stage, job.key)
+        if partial.exists() and not (job.module.RESUMES and job.stage not in self.force):
+            shutil.rmtree(partial)
+        partial.mkdir(parents=True, exist_ok=True)
+        self.workspace.write_run(self.state)
+        started, clock = datetime.now(UTC), time.monotonic()
+        result = job.module.run(job.config, job.folders, partial, self.display)
+        outputs = manifests.describe_outputs(partial, result.outputs)
+        manifest = Manifest(
+            stage=job.stage,
+            version=job.module.VERSION,
+            key=job.key,
+            config=job.config.model_dump(mode="json"),
+            inputs=job.inputs,
+            outputs=outputs,
+            outputs_digest=manifests.outputs_digest(outputs),
+            records=manifests.files_below(partial, result.records),
+            facts=result.facts,
+            line=result.line,
+            seconds=round(time.monotonic() - clock, 3),
+            started=started.isoformat(timespec="seconds"),
+            machine=machine.facts(),
+        )
+        self.workspace.finish(partial, self.workspace.folder(job.stage, job.key), manifest)
+        return manifest
+
+
+def _disk_error(error: OSError) -> StageError:
+    """An OSError in words; finished stages are never touched by it."""
+    what = f"cannot read or write {error.filename}" if error.filename else "a file could not be read or written"
+    hint = "Free disk space or check permissions, then run again: finished stages are kept."
+    return StageError(what, error.strerror or str(error), hint)

@@ -1,0 +1,74 @@
+"""All options of a run: one pydantic model per stage, filled from defaults, a TOML file and flags, in that order."""
+
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from stages import evaluate, ingest, mesh, normalise, render, report, sfm, train
+from stages.contract import StageError
+
+
+class UsageError(Exception):
+    """A command line or config file that makes no sense; shown in one line, exit code 2."""
+
+
+class Settings(BaseModel):
+    """The options of every stage, as the user gave them: None still means "choose for me"."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    ingest: ingest.Config = ingest.Config()
+    sfm: sfm.Config = sfm.Config()
+    normalise: normalise.Config = normalise.Config()
+    train: train.Config = train.Config()
+    evaluate: evaluate.Config = evaluate.Config()
+    render: render.Config = render.Config()
+    mesh: mesh.Config = mesh.Config()
+    report: report.Config = report.Config()
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """The options in a TOML file: tables named by stage, the same keys as the flags."""
+    try:
+        return tomllib.loads(path.read_text("utf-8"))
+    except OSError as error:
+        raise UsageError(f"--config {path}: {error.strerror}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise UsageError(f"--config {path} is not TOML: {error}") from error
+
+
+def settings_from(values: Mapping[str, Any], origin: str) -> Settings:
+    """Validate ``values`` (stage → option → value). Raises UsageError naming every wrong key and its origin."""
+    try:
+        return Settings.model_validate(values)
+    except ValidationError as error:
+        problems = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
+        raise UsageError(f"{origin}: {problems}") from error
+
+
+def with_source(settings: Settings, photos: Path, cameras: Path | None) -> Settings:
+    """The settings with PHOTOS (and known cameras, if any) filled in. Raises StageError where PHOTOS is unusable."""
+    from stages.sources import find_source
+
+    source = find_source(photos, cameras)
+    given = None if cameras is None else cameras.absolute()
+    imported = None if source.cameras is None else source.cameras.absolute()
+    return settings.model_copy(
+        update={
+            "ingest": settings.ingest.model_copy(update={"photos": photos.absolute(), "cameras": given}),
+            "sfm": settings.sfm.model_copy(update={"cameras": imported}),
+        }
+    )
+
+
+def default_workspace(photos: Path) -> Path:
+    """``photos.nerf`` beside the photos; for a transforms.json or an images/ folder, named after its parent."""
+    base = photos.absolute()
+    if base.is_file() or base.name == "images":
+        base = base.parent
+    if base.name == "":
+        raise StageError("no workspace name", f"{photos} has no name to derive it from", "Give one with -o.")
+    return Path.cwd() / f"{base.name}.nerf"

@@ -1,0 +1,106 @@
+"""What is cached, stale, half done or never run, and why a stage would run; reads only, runs nothing."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from pipeline import manifests
+from pipeline.chain import STAGES
+from pipeline.keys import KEY_LENGTH
+from pipeline.manifests import BadManifest, Manifest
+from pipeline.runner import Job, NotReady, Runner
+from pipeline.workspace import Workspace
+from stages.contract import StageError
+
+
+@dataclass(frozen=True)
+class StageStatus:
+    """``state``: cached / stale / partial / never / waiting; ``text``: its summary or the reason."""
+
+    stage: str
+    state: str
+    text: str
+
+
+def last_result(workspace: Workspace, runner: Runner, stage: str) -> Manifest | None:
+    """The result run.json points to, or else the newest finished one of any key."""
+    known = runner.state["keys"].get(stage)
+    folders = [workspace.folder(stage, known)] if known else []
+    if (workspace.root / stage).is_dir():
+        others = (p for p in (workspace.root / stage).iterdir() if len(p.name) == KEY_LENGTH)
+        folders += sorted(others, key=lambda p: p.stat().st_mtime, reverse=True)
+    for folder in folders:
+        try:
+            return manifests.read(folder)
+        except (FileNotFoundError, BadManifest):
+            continue
+    return None
+
+
+def status_of(workspace: Workspace, runner: Runner, stage: str) -> StageStatus:
+    """How ``stage`` stands for the recorded options."""
+    last = last_result(workspace, runner, stage)
+    try:
+        job = runner.resolve(stage, may_plan=False)
+    except NotReady as waiting:
+        reason = "" if waiting.upstream == stage else f"waits for {waiting.upstream}"
+        return StageStatus(stage, "stale" if last else "never", reason)
+    except StageError as error:
+        return StageStatus(stage, "stale" if last else "never", f"{error.what}: {error.why}")
+    folder = workspace.folder(stage, job.key)
+    try:
+        manifest = manifests.read(folder)
+        manifests.check_outputs(folder, manifest)
+        return StageStatus(stage, "cached", manifest.line)
+    except FileNotFoundError:
+        pass
+    except BadManifest as problem:
+        return StageStatus(stage, "stale", str(problem))
+    if workspace.partial(stage, job.key).exists():
+        return StageStatus(stage, "partial", "interrupted; `pipeline resume` goes on")
+    if last is not None:
+        return StageStatus(stage, "stale", "; ".join(differences(job, last)) or "run again")
+    return StageStatus(stage, "never", "")
+
+
+def differences(job: Job, last: Manifest) -> list[str]:
+    """Which part of the key changed between the last result and now."""
+    found = []
+    if last.version != job.module.VERSION:
+        found.append(f"the stage itself changed (version {last.version} → {job.module.VERSION})")
+    now: dict[str, Any] = job.config.model_dump(mode="json")
+    for name in sorted({*now, *last.config}):
+        before, after = last.config.get(name), now.get(name)
+        if before != after:
+            found.append(f"{job.stage}.{name}: {before} → {after}")
+    for name in sorted({*job.inputs, *last.inputs}):
+        if job.inputs.get(name) != last.inputs.get(name):
+            found.append(f"{name} gives another result")
+    if not found and last.key != job.key:
+        found.append("the content of a file that its settings name changed")
+    return found
+
+
+def explain(workspace: Workspace, runner: Runner, stage: str) -> list[str]:
+    """Lines that say whether ``stage`` would run, and which part of its key makes it."""
+    status = status_of(workspace, runner, stage)
+    lines = [f"{stage}: {status.state}" + (f" · {status.text}" if status.text else "")]
+    try:
+        job = runner.resolve(stage, may_plan=False)
+    except (NotReady, StageError):
+        return lines
+    last = last_result(workspace, runner, stage)
+    if status.state == "cached":
+        lines.append("It would not run: its key has a finished result.")
+    elif last is None:
+        lines.append("It would run: it has never finished in this workspace.")
+    else:
+        lines += ["It would run because:", *(f"  {reason}" for reason in differences(job, last))]
+    lines.append(f"key {job.key[:KEY_LENGTH]} = version {job.module.VERSION}")
+    lines += [f"  config {name} = {value}" for name, value in sorted(job.key_config.items())]
+    lines += [f"  input  {name} = {value[:KEY_LENGTH]}" for name, value in sorted(job.inputs.items())]
+    return lines
+
+
+def all_statuses(workspace: Workspace, runner: Runner) -> list[StageStatus]:
+    """Every stage of the chain, in order."""
+    return [status_of(workspace, runner, stage) for stage in STAGES]

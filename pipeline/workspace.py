@@ -1,0 +1,166 @@
+"""A workspace on disk: one folder per stage and key, run.json, the output links, one lock.
+
+``<workspace>/<stage>/<key16>/`` is finished and immutable; ``<key16>.partial/`` is work in progress; ``output/``
+links the latest results; ``run.json`` holds the options, the planned settings and the key each stage uses.
+"""
+
+import json
+import os
+import shutil
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock, Timeout
+
+from pipeline import manifests
+from pipeline.keys import KEY_LENGTH
+from pipeline.manifests import BadManifest, Manifest
+from stages.contract import StageError
+
+RUN_FILE = "run.json"
+RUN_VERSION = 1
+
+
+class Workspace:
+    """Paths and durable state of one workspace. Use as a context manager to hold its lock."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self._lock = FileLock(root / ".lock")
+
+    @classmethod
+    def existing(cls, root: Path) -> "Workspace":
+        """A workspace that was made before; raises StageError with words if ``root`` is not one."""
+        if not (root / RUN_FILE).is_file():
+            why = "there is no run.json in it" if root.is_dir() else "there is no such folder"
+            raise StageError(f"{root} is not a workspace", why, "Start one with: pipeline run PHOTOS")
+        return cls(root)
+
+    def __enter__(self) -> "Workspace":
+        try:
+            self.root.mkdir(parents=True, exist_ok=True)
+            self._lock.acquire(timeout=0)
+        except Timeout:
+            why = f"process {self._holder()} holds its lock"
+            raise StageError(
+                f"{self.root} is in use", why, "Wait for it to end, or give another one with -o."
+            ) from None
+        except OSError as error:
+            hint = "Give a folder you may write to with -o."
+            raise StageError(f"cannot write to {self.root}", error.strerror or str(error), hint) from error
+        (self.root / ".lock.pid").write_text(f"{os.getpid()}\n")
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        (self.root / ".lock.pid").unlink(missing_ok=True)
+        self._lock.release()
+
+    def _holder(self) -> str:
+        try:
+            return (self.root / ".lock.pid").read_text().strip() or "unknown"
+        except OSError:
+            return "unknown"
+
+    def folder(self, stage: str, key: str) -> Path:
+        """Where the finished result of ``stage`` under ``key`` lies."""
+        return self.root / stage / key[:KEY_LENGTH]
+
+    def partial(self, stage: str, key: str) -> Path:
+        """Where work on it goes on."""
+        return self.root / stage / f"{key[:KEY_LENGTH]}.partial"
+
+    def finished(self, stage: str, key: str) -> Manifest | None:
+        """The manifest of a finished and undamaged result, or None. A damaged one is set aside as ``.bad``.
+
+        Raises BadManifest after setting it aside, so that the caller can say it aloud; asking again gives None.
+        """
+        folder = self.folder(stage, key)
+        try:
+            manifest = manifests.read(folder)
+            if manifest.key != key:
+                raise BadManifest(f"{folder} belongs to another key")
+            manifests.check_outputs(folder, manifest)
+        except FileNotFoundError:
+            if folder.exists():
+                self._set_aside(folder)
+                raise BadManifest(f"{folder} has no manifest") from None
+            return None
+        except BadManifest:
+            self._set_aside(folder)
+            raise
+        return manifest
+
+    def _set_aside(self, folder: Path) -> None:
+        bad = folder.with_name(folder.name + ".bad")
+        if bad.exists():
+            shutil.rmtree(bad)
+        folder.rename(bad)
+
+    def finish(self, partial: Path, folder: Path, manifest: Manifest) -> None:
+        """Turn a partial folder into a finished one: drop what it did not declare, sync, write manifest, rename."""
+        keep = {*manifest.outputs, *manifest.records}
+        for path in sorted(partial.rglob("*"), reverse=True):
+            if path.is_dir() and not path.is_symlink():
+                if not any(path.iterdir()):
+                    path.rmdir()
+            elif path.relative_to(partial).as_posix() not in keep:
+                path.unlink()
+            else:
+                with path.open("rb") as stream:
+                    os.fsync(stream.fileno())
+        manifests.write(partial, manifest)
+        if folder.exists():  # a forced run of the same key: the old result makes way at the last moment
+            self._set_aside(folder)
+        partial.rename(folder)
+        manifests.sync_folder(folder.parent)
+
+    def read_run(self) -> dict[str, Any]:
+        """run.json, or an empty run for a new workspace."""
+        try:
+            value = json.loads((self.root / RUN_FILE).read_text("utf-8"))
+            if value["version"] == RUN_VERSION:
+                return value
+            reason = f"it has version {value['version']}, this program reads {RUN_VERSION}"
+        except FileNotFoundError:
+            return {"version": RUN_VERSION, "options": {}, "plans": {}, "keys": {}}
+        except (ValueError, KeyError, TypeError) as error:
+            reason = f"it does not parse ({error})"
+        hint = f"Delete {self.root / RUN_FILE} and give the same `pipeline run` again: finished stages are kept."
+        raise StageError(f"cannot read {self.root / RUN_FILE}", reason, hint)
+
+    def write_run(self, run: dict[str, Any]) -> None:
+        """Write run.json durably."""
+        text = json.dumps(run, indent=1, sort_keys=True, allow_nan=False, ensure_ascii=False)
+        manifests.write_durably(self.root / RUN_FILE, text + "\n")
+
+    def link_outputs(self, folder: Path, names: tuple[str, ...]) -> None:
+        """Point ``output/<name>`` at the files of a finished folder; copies where links are not allowed."""
+        output = self.root / "output"
+        output.mkdir(exist_ok=True)
+        for name in names:
+            source, link = folder / name, output / Path(name).name
+            if not source.exists():
+                continue
+            temporary = output / f".{link.name}.tmp"
+            _remove(temporary)
+            try:
+                temporary.symlink_to(os.path.relpath(source, output), target_is_directory=source.is_dir())
+            except OSError:  # Windows without the privilege, or a file system without links
+                shutil.copytree(source, temporary) if source.is_dir() else shutil.copy2(source, temporary)
+            if link.is_dir() and not link.is_symlink():
+                _remove(link)
+            temporary.replace(link)
+
+    def stale_folders(self, keys: dict[str, str], stages: list[str]) -> list[Path]:
+        """Stage folders that run.json does not use: other keys, abandoned partials, damaged ones."""
+        current = {self.folder(stage, key) for stage, key in keys.items()}
+        current |= {self.partial(stage, key) for stage, key in keys.items()}
+        found = (p for stage in stages if (self.root / stage).is_dir() for p in (self.root / stage).iterdir())
+        return sorted(p for p in found if p not in current)
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)

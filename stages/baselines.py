@@ -1,0 +1,67 @@
+"""What a field must beat: the mean of the training photos, and the training photo taken from nearest by."""
+
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from nerf.scene import View
+
+
+class MeanPhoto(NamedTuple):
+    """The mean of the training photos. ``image`` (H, W, 3) is None where their sizes differ; ``colour`` is (3,)."""
+
+    image: "Tensor | None"
+    colour: "Tensor"
+
+    def shown_at(self, height: int, width: int) -> "Tensor":
+        """The prediction for a photo of this size: the mean image if it is of the same size, else the mean colour."""
+        if self.image is not None and self.image.shape[:2] == (height, width):
+            return self.image
+        return self.colour.expand(height, width, 3)
+
+
+def mean_photo(photos: "Iterable[Tensor]") -> MeanPhoto:
+    """Average (H, W, 3) photos, each of equal weight whatever its size. Raises ValueError for no photos."""
+    import torch
+
+    total, colours, sizes, count = torch.zeros(()), torch.zeros(3, dtype=torch.float64), set(), 0
+    for photo in photos:
+        sizes.add(photo.shape)
+        colours += photo.double().mean((0, 1))
+        total = total + photo.double() if len(sizes) == 1 else torch.zeros(())
+        count += 1
+    if not count:
+        raise ValueError("the mean of no photos")
+    image = (total / count).float() if len(sizes) == 1 else None
+    return MeanPhoto(image, (colours / count).float())
+
+
+def nearest_view(view: "View", candidates: "Sequence[View]") -> "View":
+    """The candidate whose pose is nearest: distance of the centres in scene units plus rotation angle in radians.
+
+    The region of interest is about two units wide, so a radian weighs as much as half the scene. The whole rotation
+    counts, roll included, since the photo is shown as it is. Equal distances go to the first by name.
+    """
+    return min(candidates, key=lambda candidate: (_pose_distance(view, candidate), candidate.name))
+
+
+def _pose_distance(a: "View", b: "View") -> float:
+    import numpy as np
+
+    pose_a, pose_b = a.scene_from_camera, b.scene_from_camera
+    moved = np.linalg.norm(pose_a[:, 3] - pose_b[:, 3])
+    # The chord ||R_a - R_b||_F = 2 sqrt(2) sin(angle / 2) keeps its precision at small angles, unlike arccos(trace).
+    chord = np.linalg.norm(pose_a[:, :3] - pose_b[:, :3])
+    return float(moved + 2 * np.arcsin(min(chord / np.sqrt(8), 1.0)))
+
+
+def resized(photo: "Tensor", height: int, width: int) -> "Tensor":
+    """An (H, W, 3) photo stretched to another size, antialiased; the photo itself if the size is the same."""
+    from torch.nn.functional import interpolate
+
+    if photo.shape[:2] == (height, width):
+        return photo
+    batch = photo.permute(2, 0, 1)[None]
+    return interpolate(batch, (height, width), mode="bilinear", antialias=True)[0].permute(1, 2, 0)

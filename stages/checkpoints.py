@@ -1,0 +1,81 @@
+"""Checkpoints of a training run: whole or not there, the last two kept.
+
+A checkpoint is a pair of files, ``<step>.safetensors`` and ``<step>.json``; the second names the first's sha256
+and is written last, so a kill at any instant leaves at worst a pair that is not one.
+"""
+
+import hashlib
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+KEPT = 2
+
+
+class Checkpoint(NamedTuple):
+    """A training state: tensors, and whatever else the run must know to go on, as JSON values."""
+
+    step: int
+    tensors: "dict[str, Tensor]"
+    facts: dict[str, Any]
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Write a file so that after a kill or power cut it is either the old one or the new one, on the disk."""
+    temporary = path.with_name(path.name + ".tmp")
+    with temporary.open("wb") as stream:
+        stream.write(content)
+        stream.flush()
+        os.fsync(stream.fileno())
+    temporary.replace(path)
+    directory = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(directory)
+    finally:
+        os.close(directory)
+
+
+def save_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
+    """Write ``checkpoint`` and forget all but the last KEPT."""
+    from safetensors.torch import save
+
+    folder.mkdir(parents=True, exist_ok=True)
+    tensors = save({name: tensor.contiguous() for name, tensor in checkpoint.tensors.items()})
+    meta = {"facts": checkpoint.facts, "sha256": hashlib.sha256(tensors).hexdigest()}
+    name = f"{checkpoint.step:09d}"
+    write_atomically(folder / f"{name}.safetensors", tensors)
+    write_atomically(folder / f"{name}.json", json.dumps(meta, allow_nan=False).encode())
+    for old in _steps(folder)[:-KEPT]:
+        (folder / f"{old:09d}.json").unlink()
+        (folder / f"{old:09d}.safetensors").unlink(missing_ok=True)
+
+
+def latest_checkpoint(folder: Path, note: Callable[[str], None]) -> Checkpoint | None:
+    """The newest good checkpoint, or None; every damaged one met on the way is removed and named to ``note``."""
+    for step in reversed(_steps(folder)):
+        try:
+            return _read(folder, step)
+        except (OSError, ValueError, KeyError) as fault:
+            note(f"the checkpoint of step {step} is damaged ({fault}); going back to the one before")
+            (folder / f"{step:09d}.json").unlink()
+            (folder / f"{step:09d}.safetensors").unlink(missing_ok=True)
+    return None
+
+
+def _steps(folder: Path) -> list[int]:
+    return sorted(int(path.stem) for path in folder.glob("*.json") if path.stem.isdigit())
+
+
+def _read(folder: Path, step: int) -> Checkpoint:
+    from safetensors.torch import load
+
+    meta = json.loads((folder / f"{step:09d}.json").read_bytes())
+    tensors = (folder / f"{step:09d}.safetensors").read_bytes()
+    if hashlib.sha256(tensors).hexdigest() != meta["sha256"]:
+        raise ValueError("its tensors are not those that were written")
+    return Checkpoint(step, load(tensors), meta["facts"])

@@ -1,0 +1,68 @@
+"""What a stage is: the few types that every stage shares with the runner and nothing else.
+
+A stage is a module of this package with
+
+* ``NEEDS: tuple[str, ...]``: the stages whose finished folders it reads;
+* ``VERSION: int``: raised whenever the same config and inputs would give other outputs than before;
+* ``RESUMES: bool``: whether it can go on from its own half-written folder (otherwise it starts clean);
+* ``LINKS: tuple[str, ...]``: the outputs or records shown in ``<workspace>/output/``;
+* ``Config``: its settings, a :class:`StageConfig`;
+* ``run(config, inputs, folder, progress) -> StageResult``: reads ``inputs[stage]`` (finished folders), writes
+  into ``folder`` and nowhere else, raises :class:`StageError` for everything a user can act on;
+* optionally ``plan(config, inputs) -> Config``: replaces every ``None`` ("choose for me") by a value. It is
+  called once; the answer is kept in run.json and enters the stage's key.
+
+Importing a stage must be cheap: torch, pycolmap, kornia and their like are imported inside ``run``.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+from pydantic import BaseModel, ConfigDict
+
+
+class StageConfig(BaseModel):
+    """Settings of one stage. Unknown keys, infinities and NaN are refused. A ``Path`` enters keys by content."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class StageError(Exception):
+    """A failure the user can act on: what happened, why, and what to try next (one sentence each)."""
+
+    def __init__(self, what: str, why: str, hint: str) -> None:
+        super().__init__(f"{what}: {why}. {hint}")
+        self.what, self.why, self.hint = what, why, hint
+
+
+class Progress(Protocol):
+    """How a stage speaks while it works. Both calls are cheap and may be made from any thread."""
+
+    def update(self, message: str, done: float | None = None) -> None:
+        """Replace the live line; ``done`` is the finished share in [0, 1], None where it is unknown."""
+        ...
+
+    def note(self, message: str) -> None:
+        """Print a line that stays: a decision and its reason, or a warning."""
+        ...
+
+
+@dataclass(frozen=True)
+class StageResult:
+    """What a stage hands back once its files are written.
+
+    ``outputs`` and ``records`` are paths relative to the stage's folder; a folder stands for all files below it.
+    Outputs are digested and decide what runs downstream, so they hold no time stamp, timing or absolute path;
+    those go into records. ``facts`` are plain JSON values for summary.json and the report; ``line`` is the
+    stage's one-line summary for the user.
+    """
+
+    outputs: tuple[str, ...]
+    line: str
+    records: tuple[str, ...] = ()
+    facts: dict[str, Any] = field(default_factory=dict)
+
+
+Inputs = Mapping[str, Path]

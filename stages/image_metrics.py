@@ -1,0 +1,51 @@
+"""How far a picture is from the photo: SSIM, error maps, and how sure a mean over few photos is."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import numpy as np
+    from torch import Tensor
+
+SSIM_WINDOW = 11
+ERROR_SCALE = 0.3
+"""The error that error maps show brightest. Fixed, so that maps of different runs can be compared."""
+
+FEWEST_FOR_INTERVAL = 3
+
+
+def ssim(image: "Tensor", truth: "Tensor") -> float | None:
+    """Mean structural similarity of two (H, W, 3) images in [0, 1]; None where they are smaller than its window.
+
+    Wang et al. 2004: Gaussian window of 11 pixels and sigma 1.5, only where the window lies inside the image,
+    so it equals scikit-image's ``structural_similarity(gaussian_weights=True, use_sample_covariance=False)``.
+    """
+    from kornia.metrics import ssim as kornia_ssim
+
+    if min(image.shape[:2]) < SSIM_WINDOW:
+        return None
+    batch = (picture.permute(2, 0, 1)[None] for picture in (image, truth))
+    return float(kornia_ssim(*batch, window_size=SSIM_WINDOW, eps=0.0, padding="valid").mean())
+
+
+def error_map(image: "Tensor", truth: "Tensor") -> "np.ndarray":
+    """The mean absolute error of the three channels as (H, W, 3) uint8: black 0, pale yellow ERROR_SCALE or more."""
+    from matplotlib import colormaps
+
+    error = (image - truth).abs().mean(-1) / ERROR_SCALE
+    return colormaps["magma"](error.clamp(0, 1).numpy(), bytes=True)[..., :3]
+
+
+def bootstrap_interval(values: Sequence[float], seed: int, resamples: int = 2000) -> tuple[float, float] | None:
+    """A 95 % interval of the mean of ``values`` by the percentile bootstrap (Efron 1979); None for fewer than three.
+
+    It says how the mean would vary with other test photos of the same scene, not with another training run.
+    """
+    import numpy as np
+
+    if len(values) < FEWEST_FOR_INTERVAL:
+        return None
+    samples = np.asarray(values, dtype=np.float64)
+    chosen = np.random.default_rng(seed).integers(len(samples), size=(resamples, len(samples)))
+    low, high = np.percentile(samples[chosen].mean(axis=1), [2.5, 97.5])
+    return float(low), float(high)

@@ -1,0 +1,162 @@
+"""The report's plots as inline SVG: text and axes take the page's colour, and equal data is equal bytes."""
+
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import numpy as np
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from nerf.scene import Scene, View
+
+BLUE, ORANGE, GREY = "#3b82f6", "#f2711c", "#8a8f98"
+INK = "#010203"  # drawn with this and then replaced by the page's own text colour
+BOX = 0.9  # the region of interest is [-0.9, 0.9]^3, see nerf/scene.py
+MOST_POINTS = 20_000
+
+
+def clock(seconds: float) -> str:
+    """Seconds as people say them: 0.4 s, 58 s, 3 min 20 s, 1 h 5 min."""
+    if seconds < 9.95:
+        return f"{seconds:.1f} s".replace(".0 s", " s")
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    big, small, units = (whole // 60, whole % 60, "min s") if whole < 3600 else (whole // 3600, whole % 3600 // 60, "h min")
+    first, second = units.split()
+    return f"{big} {first} {small} {second}" if small else f"{big} {first}"
+
+
+def last_doubling(curve: Sequence[dict[str, Any]]) -> float | None:
+    """What the second half of the training time bought in held-out dB; None where the curve does not reach that far.
+
+    The value at half time is interpolated linearly in the logarithm of time.
+    """
+    import numpy as np
+
+    rows = [row for row in curve if row["heldout_psnr"] is not None and row["seconds"] > 0]
+    if len(rows) < 2 or rows[0]["seconds"] > rows[-1]["seconds"] / 2:
+        return None
+    seconds = np.array([row["seconds"] for row in rows])
+    psnr = np.array([row["heldout_psnr"] for row in rows])
+    return float(psnr[-1] - np.interp(np.log(seconds[-1] / 2), np.log(seconds), psnr))
+
+
+def curve_svg(curve: Sequence[dict[str, Any]], baselines: dict[str, float | None]) -> str | None:
+    """PSNR against training seconds, one grid line per doubling of the time; None for fewer than two points.
+
+    ``baselines`` are drawn as horizontal lines under their names.
+    """
+    rows = [row for row in curve if row["seconds"] > 0]
+    if len(rows) < 2:
+        return None
+    with _drawing((8.2, 3.4), "curve") as figure:
+        axes = figure.add_subplot()
+        for key, label, colour in (("train_psnr", "training rays", GREY), ("heldout_psnr", "held-out photos", BLUE)):
+            seen = [(row["seconds"], row[key]) for row in rows if row[key] is not None]
+            if seen:
+                axes.plot(*zip(*seen, strict=True), color=colour, lw=2, marker="o", ms=3, label=label)
+        for name, psnr in baselines.items():
+            if psnr is not None:
+                axes.axhline(psnr, color=ORANGE, lw=1, ls=(0, (4, 3)))
+                axes.text(0.005, psnr, f"{name} {psnr:.1f} dB", transform=axes.get_yaxis_transform(), va="bottom", size=9)
+        _doubling_axis(axes, rows[0]["seconds"], rows[-1]["seconds"])
+        axes.set(xlabel="training time", ylabel="PSNR (dB)")
+        axes.legend(frameon=False, loc="lower right")
+        return _svg(figure)
+
+
+def cameras_svg(scene: "Scene", xyz: "np.ndarray", rgb: "np.ndarray") -> str:
+    """The cameras, the sparse points (n, 3) in their colours and the region of interest, from above and the side."""
+    with _drawing((10, 5), "cameras") as figure:
+        names = ("from above", "from the side") if scene.up_known else ("along z", "along y")
+        for panel, (name, vertical) in enumerate(zip(names, (1, 2), strict=True)):
+            axes = figure.add_subplot(1, 2, panel + 1)
+            _draw_layout(axes, scene, (0, vertical), xyz, rgb)
+            axes.set_title(name, size=11)
+        for label, colour in (("training photo", BLUE), ("test photo", ORANGE), ("region of interest", INK)):
+            axes.plot([], [], color=colour, label=label, ls="--" if colour == INK else "-", lw=1.4)
+        figure.legend(frameon=False, loc="outside lower center", ncols=3)
+        return _svg(figure)
+
+
+def _draw_layout(axes: "Axes", scene: "Scene", plane: tuple[int, int], xyz: "np.ndarray", rgb: "np.ndarray") -> None:
+    """One orthographic projection on the two given axes of the scene."""
+    import numpy as np
+    from matplotlib.collections import LineCollection
+
+    centres = np.array([view.scene_from_camera[:, 3] for view in scene.views])[:, plane]
+    low, high = np.minimum(centres.min(0), -BOX), np.maximum(centres.max(0), BOX)
+    middle, half = (low + high) / 2, (high - low).max() / 2 * 1.12
+    shown = np.linspace(0, len(xyz) - 1, min(len(xyz), MOST_POINTS)).astype(int)
+    axes.scatter(*xyz[shown][:, plane].T, c=rgb[shown] / 255, s=0.8, lw=0, alpha=0.6, rasterized=True)
+    axes.add_patch(_square(BOX))
+    for split, colour, order in (("train", BLUE, 3), ("test", ORANGE, 4)):
+        outlines = [_outline(scene, view, 0.1 * half)[:, plane] for view in scene.views if view.split == split]
+        axes.add_collection(LineCollection(outlines, colors=colour, lw=0.8, zorder=order))
+    axes.set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] - half, middle[1] + half), aspect="equal")
+    axes.set(xticks=[], yticks=[])
+    axes.spines[:].set_visible(False)
+
+
+def _outline(scene: "Scene", view: "View", depth: float) -> "np.ndarray":
+    """The pyramid from the camera's centre to its image at ``depth``, as one line through all edges: (11, 3)."""
+    import numpy as np
+
+    camera = scene.cameras[view.camera]
+    # COLMAP lists the focal length first in every camera model.
+    x, y = (np.array([camera.width, camera.height]) / 2 / camera.params[0]) * depth
+    corners = np.array([[-x, -y, depth], [x, -y, depth], [x, y, depth], [-x, y, depth], [0, 0, 0]])
+    stroke = corners[[4, 0, 1, 4, 2, 1, 2, 3, 4, 3, 0]]
+    return stroke @ view.scene_from_camera[:, :3].T + view.scene_from_camera[:, 3]
+
+
+def _square(half: float) -> Any:
+    from matplotlib.patches import Rectangle
+
+    return Rectangle((-half, -half), 2 * half, 2 * half, fill=False, ec=INK, lw=1.2, ls="--", alpha=0.7, zorder=2)
+
+
+def _doubling_axis(axes: "Axes", first: float, last: float) -> None:
+    """A logarithmic time axis with ticks at the end and at its halves, and the last half shaded."""
+    import math
+
+    ticks = [last / 2**k for k in range(max(1, min(8, math.ceil(math.log2(last / first)) + 1)))]
+    axes.set_xscale("log", base=2)
+    axes.set_xlim(min(first, ticks[-1]), last * 1.04)
+    axes.set_xticks(ticks, [clock(tick) for tick in ticks])
+    axes.set_xticks([], minor=True)
+    axes.axvspan(last / 2, last, color=BLUE, alpha=0.08, lw=0)
+    axes.grid(axis="both", alpha=0.18, lw=0.8)
+
+
+@contextmanager
+def _drawing(size: tuple[float, float], salt: str) -> "Iterator[Figure]":
+    """A figure to draw on, without pyplot's global state, whose identifiers depend on ``salt`` alone."""
+    from matplotlib import rc_context
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    ink = dict.fromkeys(("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color"), INK)
+    quiet = {"axes.spines.top": False, "axes.spines.right": False, "font.size": 10.5, "grid.color": INK}
+    with rc_context({"svg.hashsalt": salt, "svg.fonttype": "none", **ink, **quiet}):
+        figure = Figure(figsize=size, layout="constrained")
+        FigureCanvasAgg(figure)
+        yield figure
+
+
+def _svg(figure: "Figure") -> str:
+    """The figure as an element to be put into a page, transparent, scaling with its column."""
+    import io
+
+    buffer = io.StringIO()
+    figure.savefig(buffer, format="svg", transparent=True, dpi=160, metadata={"Date": None, "Creator": None})
+    text = buffer.getvalue()
+    text = text[text.index("<svg") :].replace(INK, "currentColor")
+    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
+    # Matplotlib numbers its groups afresh in every figure; nothing refers to them and a page may hold each id once.
+    text = re.sub(r' id="[\w.]+_\d+"', "", text)
+    return re.sub(r'<svg ([^>]*?)width="[^"]*"', r"<svg \1", re.sub(r'(<svg [^>]*?)height="[^"]*"', r"\1", text))

@@ -1,0 +1,249 @@
+"""What PHOTOS may be: a folder of photos, or photos whose cameras are already known.
+
+Cheap: lists folders and reads at most the JSON of a transforms file, never an image.
+"""
+
+import json
+import os
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+from stages.contract import StageError
+
+SourceKind = Literal["photos", "transforms", "blender", "colmap"]
+
+# Everything else is tried: what counts as a photo is decided by decoding, not by the name.
+_NOT_PHOTOS = frozenset(
+    ".txt .json .jsonl .md .rst .csv .tsv .xml .html .htm .pdf .doc .docx .log .ini .toml .yaml .yml .py .sh .ipynb "
+    ".zip .gz .tar .7z .npy .npz .pt .pth .pkl .bin .db .sqlite .ply .obj .mtl .glb .gltf .stl .las .laz "
+    ".xmp .aae .thm .mp3 .wav .m4a .ds_store .lnk .url .bak .tmp".split()
+)
+_VIDEOS = frozenset(".mp4 .mov .m4v .avi .mkv .webm .mpg .mpeg .3gp .mts .m2ts .wmv .lrv .insv".split())
+_IMAGES = frozenset(".jpg .jpeg .png .heic .heif .tif .tiff .webp .bmp .avif .gif .dng .cr2 .nef .arw".split())
+_EXTENSIONS_TRIED = ("", ".png", ".jpg", ".jpeg")
+_FOLDER_HINT = "Give the folder that holds the photos: pipeline run FOLDER"
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where photos, and perhaps cameras, come from.
+
+    ``kind`` "photos" goes through structure-from-motion and has no ``cameras``; otherwise ``cameras`` is the
+    transforms file, the folder of transforms_train.json, or the folder of one COLMAP model. ``files`` are the
+    files to decode, in order of their names relative to ``root``; some may turn out to be no images, and files
+    named by a transforms file may be missing.
+    """
+
+    kind: SourceKind
+    root: Path
+    cameras: Path | None
+    files: tuple[Path, ...]
+
+    def name(self, file: Path) -> str:
+        """The name of one of ``files``: relative to ``root``, with forward slashes, always encodable as UTF-8."""
+        return os.fsencode(file.relative_to(self.root).as_posix()).decode("utf-8", "backslashreplace")
+
+
+def find_source(photos: Path, cameras: Path | None = None) -> Source:
+    """Decide what PHOTOS is. Raises StageError where there is nothing to work on or the choice is not clear."""
+    photos, cameras = photos.absolute(), cameras and cameras.absolute()
+    try:
+        _check_given(photos, cameras)
+        if photos.is_file():
+            return _from_transforms("transforms", photos.parent, photos)
+        root = _photo_root(photos)
+        if cameras is not None and cameras.is_file():
+            return _from_transforms("transforms", root, cameras)
+        if cameras is not None:
+            return Source("colmap", root, _colmap_model(cameras), list_photos(root))
+        if (photos / "transforms_train.json").is_file():
+            return _from_transforms("blender", photos, photos)
+        return Source("photos", root, None, list_photos(root))
+    except PermissionError as error:
+        raise StageError(
+            f"cannot read {error.filename}", "permission denied", "Change its permissions (chmod -R u+rX)."
+        ) from error
+
+
+def list_photos(root: Path) -> tuple[Path, ...]:
+    """All files below ``root`` that may be photos, sorted by relative name.
+
+    Skipped: hidden files, ``masks`` folders, workspaces of ours (folders with a run.json), and files whose
+    extension says that they are no images. Folders that are symbolic links are not followed.
+    Raises StageError if nothing remains and PermissionError for a folder that cannot be read.
+    """
+
+    def fail(error: OSError) -> None:
+        raise error
+
+    found: list[Path] = []
+    for folder, subfolders, names in os.walk(root, onerror=fail):
+        here = Path(folder)
+        subfolders[:] = [s for s in subfolders if _is_photo_folder(here / s)]
+        found += [here / name for name in names if not name.startswith(".") and (here / name).is_file()]
+    if not found:
+        raise StageError(f"{root} is empty", "there is no file in it", _FOLDER_HINT)
+    photos = [file for file in found if file.suffix.lower() not in _NOT_PHOTOS | _VIDEOS]
+    if not photos:
+        raise _no_photos(root, found)
+    return tuple(sorted(photos, key=lambda file: file.relative_to(root).as_posix()))
+
+
+def read_frames(transforms: Path) -> dict[str, Any]:
+    """The content of a transforms file, checked to hold a list ``frames`` of objects with ``file_path`` and
+    ``transform_matrix``. Raises StageError otherwise."""
+    hint = "Give a transforms.json as nerfstudio, instant-ngp or the NeRF-synthetic scenes write it."
+    try:
+        content = json.loads(transforms.read_text("utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise StageError(f"cannot read {transforms.name}", f"it is not JSON ({error})", hint) from error
+    frames = content.get("frames") if isinstance(content, dict) else None
+    if not isinstance(frames, list) or not frames:
+        raise StageError(f"cannot use {transforms.name}", "it has no list named 'frames'", hint)
+    for index, frame in enumerate(frames):
+        if not (isinstance(frame, dict) and isinstance(frame.get("file_path"), str) and "transform_matrix" in frame):
+            raise StageError(
+                f"cannot use {transforms.name}", f"frame {index} lacks file_path or transform_matrix", hint
+            )
+    return content
+
+
+def official_splits(source: Source) -> dict[str, Path]:
+    """The transforms files of a source of kind "transforms" (one, named "all") or "blender" (train, perhaps test)."""
+    assert source.cameras is not None
+    if source.kind == "transforms":
+        return {"all": source.cameras}
+    files = {split: source.cameras / f"transforms_{split}.json" for split in ("train", "test")}
+    return {split: file for split, file in files.items() if file.is_file()}
+
+
+def named_frames(source: Source, transforms: Path) -> list[tuple[str, dict[str, Any]]]:
+    """The frames of one of the source's transforms files, each with the name of its photo. Errors as find_source."""
+    return [(source.name(file), frame) for file, frame in _frame_files(source, transforms)]
+
+
+def _frame_files(source: Source, transforms: Path) -> list[tuple[Path, dict[str, Any]]]:
+    root = source.root
+    folders = (root,) if transforms.parent == root else (root, root.parent, transforms.parent)
+    return [(_frame_file(frame["file_path"], folders), frame) for frame in read_frames(transforms)["frames"]]
+
+
+def _frame_file(file_path: str, folders: tuple[Path, ...]) -> Path:
+    """The photo that ``file_path`` names in the first of ``folders`` that has it; a missing extension is completed.
+
+    A photo that is nowhere is returned as if it were in the first folder, and refused when it is to be decoded.
+    """
+    for folder in folders:
+        for extension in _EXTENSIONS_TRIED:
+            file = _inside(folder, file_path + extension)
+            if file.is_file():
+                return file
+    return _inside(folders[0], file_path)
+
+
+def _inside(folder: Path, file_path: str) -> Path:
+    file = folder / os.path.normpath(file_path)
+    absolute = Path(file_path).is_absolute()
+    if absolute or "\0" in file_path or not file.resolve().is_relative_to(folder.resolve()):
+        raise StageError(
+            f"refused the photo {file_path!r}",
+            "its path is absolute" if absolute else f"it leads out of the folder {folder}",
+            "A transforms file may name photos inside its own folder only.",
+        )
+    return file
+
+
+def _check_given(photos: Path, cameras: Path | None) -> None:
+    if not photos.exists():
+        raise StageError(f"{photos} does not exist", "no file or folder has this name", "Check the spelling.")
+    if cameras is not None and not cameras.exists():
+        raise StageError(f"{cameras} does not exist", "no file or folder has this name", "Check --cameras.")
+    if photos.is_dir():
+        if (photos / "run.json").is_file():
+            raise StageError(
+                f"{photos} is a workspace", "it holds results, not photos", f"Go on with it: pipeline resume {photos}"
+            )
+    elif (suffix := photos.suffix.lower()) in _VIDEOS:
+        raise _video(photos)
+    elif suffix in _IMAGES:
+        raise StageError(
+            f"{photos.name} is a single image", "a scene needs many photos from different places", _FOLDER_HINT
+        )
+    elif suffix != ".json":
+        raise StageError(
+            f"cannot use {photos.name}", "it is neither a folder of photos nor a transforms.json", _FOLDER_HINT
+        )
+    elif cameras is not None:
+        raise StageError(
+            "two sources of cameras", f"{photos.name} and --cameras {cameras}", "Give the photo folder with --cameras."
+        )
+
+
+def _photo_root(folder: Path) -> Path:
+    images = folder / "images"
+    return images if images.is_dir() else folder
+
+
+def _is_photo_folder(folder: Path) -> bool:
+    return not folder.name.startswith(".") and folder.name != "masks" and not (folder / "run.json").is_file()
+
+
+def _from_transforms(kind: SourceKind, root: Path, cameras: Path) -> Source:
+    empty = Source(kind, root, cameras, ())
+    files = {file for transforms in official_splits(empty).values() for file, _ in _frame_files(empty, transforms)}
+    return replace(empty, files=_sorted_inside(root, files))
+
+
+def _sorted_inside(root: Path, files: set[Path]) -> tuple[Path, ...]:
+    outside = [file for file in files if not file.is_relative_to(root)]
+    if outside:
+        raise StageError(
+            f"{min(outside)} is not among the photos",
+            f"the transforms file names it, but it lies outside {root}",
+            "Give the folder that holds all photos of the transforms file.",
+        )
+    return tuple(sorted(files, key=lambda file: file.relative_to(root).as_posix()))
+
+
+def _colmap_model(folder: Path) -> Path:
+    """The one COLMAP model in ``folder``: itself, or below it or its ``sparse`` folder."""
+    places = [folder, folder / "sparse"]
+    places += [child for place in places if place.is_dir() for child in sorted(place.iterdir())]
+    models = sorted({place for place in places if _is_model(place)})
+    if not models:
+        raise StageError(
+            f"no COLMAP model in {folder}",
+            "there is no cameras, images and points3D with .bin or .txt",
+            "Give the model's own folder, for example sparse/0.",
+        )
+    if len(models) > 1:
+        names = ", ".join(str(model.relative_to(folder)) for model in models)
+        raise StageError(
+            f"{len(models)} COLMAP models in {folder}", f"{names}: which one is meant is not clear",
+            f"Give one of them: --cameras {models[0]}",
+        )  # fmt: skip
+    return models[0]
+
+
+def _is_model(folder: Path) -> bool:
+    return any(
+        all((folder / f"{part}{extension}").is_file() for part in ("cameras", "images", "points3D"))
+        for extension in (".bin", ".txt")
+    )
+
+
+def _no_photos(root: Path, found: list[Path]) -> StageError:
+    videos = sorted(file for file in found if file.suffix.lower() in _VIDEOS)
+    if videos:
+        return _video(videos[0])
+    suffixes = ", ".join(sorted({file.suffix.lower() or file.name for file in found})[:5])
+    return StageError(f"no photos in {root}", f"its {len(found)} files are no images ({suffixes})", _FOLDER_HINT)
+
+
+def _video(video: Path) -> StageError:
+    return StageError(
+        f"{video.name} is a video",
+        "video input is not built yet",
+        f"Extract frames first: mkdir frames && ffmpeg -i {video.name} -vf fps=2 -q:v 2 frames/%04d.jpg",
+    )

@@ -1,0 +1,37 @@
+"""Shared by all tests: shape checking of nerf/, and where the real photo sets are."""
+
+from pathlib import Path
+
+import pytest
+from jaxtyping import install_import_hook
+
+install_import_hook("nerf", "beartype.beartype")
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """The folder of real photo sets that lies beside a checkout; tests that need it skip by name without it."""
+    folder = Path(__file__).parents[1] / "../shared/data"
+    if not folder.is_dir():
+        pytest.skip(f"no real photo sets at {folder}")
+    return folder.resolve()
+
+
+class SilentProgress:
+    """A Progress that remembers what was said."""
+
+    def __init__(self) -> None:
+        self.updates: list[tuple[str, float | None]] = []
+        self.notes: list[str] = []
+
+    def update(self, message: str, done: float | None = None) -> None:
+        self.updates.append((message, done))
+
+    def note(self, message: str) -> None:
+        self.notes.append(message)
+
+
+@pytest.fixture
+def progress() -> SilentProgress:
+    """A Progress for calling a stage's run() directly."""
+    return SilentProgress()

@@ -1,0 +1,96 @@
+"""The plots: figures in words, geometry of the camera outlines, deterministic and theme-neutral SVG."""
+
+import math
+import re
+import xml.etree.ElementTree as ElementTree
+from typing import Any
+
+import numpy as np
+import pytest
+
+from nerf.scene import Camera, Scene, Similarity, View
+from stages.report_plots import _outline, cameras_svg, clock, curve_svg, last_doubling
+
+
+def _scene(count: int = 9) -> Scene:
+    """Cameras on a ring of radius two, looking inward, z up."""
+    views = []
+    for i in range(count):
+        angle = 2 * math.pi * i / count
+        forward = np.array([-math.cos(angle), -math.sin(angle), 0])
+        right = np.cross(forward, [0, 0, 1])
+        pose = np.stack([right, np.cross(forward, right), forward, -2 * forward], axis=1)
+        views.append(View(f"{i}.jpg", f"images/{i}.jpg", 0, pose, 0.5, 4.0, "train" if i % 8 else "test"))
+    camera = Camera("OPENCV", 640, 480, (500.0, 500.0, 320.0, 240.0, 0.0, 0.0, 0.0, 0.0))
+    return Scene((camera,), tuple(views), Similarity(1.0, np.eye(3), np.zeros(3)), True, False, "around", True)
+
+
+def _curve() -> list[dict[str, Any]]:
+    return [
+        {"step": 100 * k, "seconds": float(2**k), "train_psnr": 10 + 2.0 * k, "heldout_psnr": 9 + 1.5 * k if k % 2 else None}
+        for k in range(1, 8)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("seconds", "words"),
+    [(0.42, "0.4 s"), (3.0, "3 s"), (9.96, "10 s"), (58.4, "58 s"), (59.7, "1 min"), (200, "3 min 20 s"), (3900, "1 h 5 min")],
+)
+def test_clock(seconds: float, words: str):
+    assert clock(seconds) == words
+
+
+def test_the_last_doubling_is_exact_where_psnr_grows_with_the_logarithm_of_time():
+    assert last_doubling(_curve()) == pytest.approx(1.5)
+
+
+def test_a_flat_curve_buys_nothing_and_a_short_one_says_nothing():
+    rows = [{"seconds": s, "heldout_psnr": 20.0} for s in (10, 20, 40)]
+    assert last_doubling(rows) == 0
+    assert last_doubling(rows[2:]) is None
+    assert last_doubling([{"seconds": s, "heldout_psnr": 20.0} for s in (30, 40)]) is None
+    assert last_doubling([{"seconds": s, "heldout_psnr": None} for s in (10, 40)]) is None
+
+
+def test_plots_are_well_formed_and_the_same_twice():
+    xyz = np.random.default_rng(0).normal(0, 0.4, (500, 3))
+    rgb = np.random.default_rng(1).integers(0, 255, (500, 3))
+    for draw in (lambda: curve_svg(_curve(), {"nearest photo": 14.2}), lambda: cameras_svg(_scene(), xyz, rgb)):
+        svg = draw()
+        assert svg == draw() and svg is not None
+        ElementTree.fromstring(svg)
+        assert "currentColor" in svg and "#010203" not in svg
+        assert "date" not in svg.lower()
+
+
+def test_the_two_plots_share_no_identifier():
+    curve = curve_svg(_curve(), {})
+    cameras = cameras_svg(_scene(), np.zeros((1, 3)), np.zeros((1, 3), np.uint8))
+    ids = [set(re.findall(r'id="([^"]+)"', svg)) for svg in (curve or "", cameras)]
+    assert all(ids) and not ids[0] & ids[1]
+
+
+def test_curve_names_its_lines_and_needs_two_points():
+    svg = curve_svg(_curve(), {"nearest photo": 14.2, "mean image": None}) or ""
+    assert "nearest photo 14.2 dB" in svg and "mean image" not in svg and "2 min 8 s" in svg
+    assert curve_svg(_curve()[:1], {}) is None
+    assert curve_svg([], {}) is None
+
+
+def test_cameras_plot_says_which_way_is_up_only_where_it_is_known():
+    scene = _scene()
+    blind = Scene(scene.cameras, scene.views, scene.scene_from_sfm, True, False, "around", False)
+    points = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
+    assert "from above" in cameras_svg(scene, *points)
+    assert "from above" not in cameras_svg(blind, *points) and "along z" in cameras_svg(blind, *points)
+
+
+def test_a_camera_outline_starts_at_its_centre_and_opens_by_its_field_of_view():
+    scene = _scene()
+    view = scene.views[3]
+    outline = _outline(scene, view, 0.5)
+    centre, forward = view.scene_from_camera[:, 3], view.scene_from_camera[:, 2]
+    assert np.allclose(outline[0], centre)
+    corners = outline[[1, 2, 4, 7]] - centre
+    assert np.allclose(corners @ forward, 0.5)
+    assert np.linalg.norm(outline[1] - outline[2]) == pytest.approx(0.5 * 640 / 500)
