@@ -8,20 +8,21 @@ from nerf.reconstruction import Reconstruction
 REGION_HALF = 0.9
 FEWEST_POINTS = 10  # fewer say nothing about a photo's depth range; all photos together then do
 NEAR_MARGIN = 0.7  # bare surfaces carry no points: the nearest thing may be nearer than the nearest point
-FARTHEST, LEAST_FAR = 1000.0, 100.0  # contraction maps these to 0.001 and 0.01 from the end of the world
+LEAST_NEAR = 0.05 * REGION_HALF  # for cameras in the region whose depths nobody knows
+FARTHEST, LEAST_FAR = 1000.0, 20.0  # contraction maps these to 0.001 and 0.05 from the end of the world
 
 
 def near_and_far(scene: Reconstruction, bounded: bool) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
     """Distances along the unit ray, 0 < near < far, per photo.
 
     Bounded: from where rays enter the region (or from the nearest points, from within it) to its farthest corner.
-    Unbounded: from 0.7 times the nearest points to four times the farthest, at least 100 and at most 1000 units,
-    which costs little because samples are spaced in contracted space.
+    Unbounded: from 0.7 times the nearest points to four times the farthest, at least 20 and at most 1000 units,
+    which costs little because samples are spaced ever wider with distance.
     """
     entry, exit_ = _distances_to_region(scene.centres)
     near, far = _points_range(scene)
     # cameras that are inside the region and see no points still need a positive near
-    near = np.where(np.isfinite(near), near, np.maximum(entry, 0.05 * REGION_HALF))
+    near = np.where(np.isfinite(near), near, np.maximum(entry, LEAST_NEAR))
     if bounded:
         near, far = np.maximum(entry, np.minimum(near, 0.5 * exit_)), exit_
     else:
@@ -51,3 +52,23 @@ def _points_range(scene: Reconstruction) -> tuple[Float[np.ndarray, "n"], Float[
         low, middle, high = np.quantile(seen, [0.002, 0.5, 0.999])
         near[view], far[view] = max(NEAR_MARGIN * low, 0.05 * middle), high
     return near, far
+
+
+def range_between_views(
+    centres: Float[np.ndarray, "frames 3"],
+    view_centres: Float[np.ndarray, "n 3"],
+    view_near: Float[np.ndarray, "n"],
+    view_far: Float[np.ndarray, "n"],
+    bounded: bool,
+) -> tuple[Float[np.ndarray, "frames"], Float[np.ndarray, "frames"]]:
+    """(near, far) for cameras that took no photo: the widest range of their three nearest neighbours among the views.
+
+    In a bounded scene near counts from where rays enter the region, and far is the region's farthest corner.
+    """
+    distance = np.linalg.norm(centres[:, None] - view_centres, axis=2)
+    nearest = np.argsort(distance, axis=1, kind="stable")[:, :3]
+    if not bounded:
+        return view_near[nearest].min(axis=1), view_far[nearest].max(axis=1)
+    entry, far = _distances_to_region(centres)
+    beyond_entry = (view_near - _distances_to_region(view_centres)[0])[nearest].min(axis=1)
+    return np.maximum(entry + beyond_entry, LEAST_NEAR), far

@@ -1,6 +1,6 @@
 """The one interface between a radiance field and everything that uses it: renderer, evaluation, mesh, video."""
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor
@@ -20,6 +20,7 @@ class Rendering(NamedTuple):
     opacity: Float[Tensor, "*rays"]
 
 
+@runtime_checkable
 class RadianceModel(Protocol):
     """A trained field. Points are in the scene frame, densities per scene unit, colours in [0, 1]."""
 

@@ -37,7 +37,7 @@ def normalise(sfm: Reconstruction, has_alpha: bool, roi: tuple[float, float, flo
     Raises ValueError when the cameras stand in one place and there are no points.
     """
     layout, up = find_layout(sfm), find_up(sfm)
-    rotation = _frame(up.direction, _heading(sfm, layout))
+    rotation = _frame(up.direction, sfm.axes)
     middle = spatial_median(sfm.centres)
     upright = sfm.in_frame(rotation, middle)
     if roi is None:
@@ -60,21 +60,18 @@ def normalise(sfm: Reconstruction, has_alpha: bool, roi: tuple[float, float, flo
     )
 
 
-def _heading(sfm: Reconstruction, layout: Layout) -> Float[np.ndarray, "3"]:
-    """The direction that becomes +y: where all photos look, or the first one if they look everywhere."""
-    return spatial_median(sfm.axes) if layout == "forward" else sfm.axes[0]
+def _frame(up: Float[np.ndarray, "3"], axes: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3 3"]:
+    """Rotation that takes ``up`` to +z and the photos' heading to +y.
 
-
-def _frame(up: Float[np.ndarray, "3"], heading: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """Rotation that takes ``up`` to +z and ``heading`` into the half plane of +y and z.
-
-    A heading along up leaves the turn about z open; the sfm axis furthest from up then serves.
+    The heading is where most photos look, so that walls line up with the cube; where they look everywhere, it is
+    the first photo's. Photos that look along up leave the turn about z open: the input axis furthest from up serves.
     """
-    level = heading - up * (up @ heading)
-    if np.linalg.norm(level) < 1e-6:
-        least = np.eye(3)[np.argmin(np.abs(up))]
-        level = least - up * (up @ least)
-    y = level / np.linalg.norm(level)
+    level = axes - up * (axes @ up)[:, None]
+    middle = spatial_median(level)
+    candidates = np.stack([middle, level[0], (np.eye(3) - np.outer(up, up))[np.argmin(np.abs(up))]])
+    lengths = np.linalg.norm(candidates, axis=1)
+    chosen = int(np.argmax(lengths > [0.3, 1e-6, 0.0]))
+    y = candidates[chosen] / lengths[chosen]
     return np.stack([np.cross(y, up), y, up])
 
 

@@ -36,13 +36,11 @@ class RayBank(NamedTuple):
         """Where the tables are."""
         return self.pixels.device
 
-    def to(self, device: torch.device) -> "RayBank":
+    def to(self, device: torch.device | str) -> "RayBank":
         """This bank with its tables on ``device``."""
         return RayBank(*(table.to(device) for table in self))
 
-    def lookup(
-        self, pixel: Int[Tensor, "rays"]
-    ) -> tuple[Rays, Float[Tensor, "rays 3"], Float[Tensor, "rays"] | None]:
+    def lookup(self, pixel: Int[Tensor, "rays"]) -> tuple[Rays, Float[Tensor, "rays 3"], Float[Tensor, "rays"] | None]:
         """The rays through given pixels, with the pixels' colours and alpha in [0, 1] (None without a channel)."""
         view = torch.searchsorted(self.first_pixel, pixel, right=True) - 1
         within = pixel - self.first_pixel[view]

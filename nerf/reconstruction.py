@@ -64,15 +64,22 @@ class Reconstruction:
 
 
 def spatial_median(points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "d"]:
-    """The point of least summed distance to ``points`` (Weiszfeld's iteration; up to half may be outliers)."""
+    """The point of least summed distance to ``points``, of which a third may be far outliers.
+
+    Minimises sum sqrt(|x - p_i|^2 + e^2) by Weiszfeld's iteration. e, a tenth of the distance between close
+    points, makes the minimum unique and the iteration quick where the median falls on one of the points.
+    """
+    count = len(points)
+    apart = [points - np.roll(points, shift, axis=0) for shift in {1, count // 3, count // 2} - {0}]
+    softening = np.quantile(np.linalg.norm(np.concatenate(apart), axis=1), 0.25) / 10 if count > 1 else 0.0
     estimate = np.median(points, axis=0)
-    smallest = 1e-9 * np.median(np.linalg.norm(points - estimate, axis=1))
-    for _ in range(200):
-        distance = np.linalg.norm(points - estimate, axis=1)
-        weight = 1 / np.maximum(distance, smallest) if smallest > 0 else np.where(distance > 0, 0.0, 1.0)
+    if softening == 0:  # the points coincide, and with them every coordinate's median
+        return estimate
+    for _ in range(500):
+        weight = 1 / np.hypot(np.linalg.norm(points - estimate, axis=1), softening)
         step = weight @ (points - estimate) / weight.sum()
         estimate = estimate + step
-        if np.linalg.norm(step) <= smallest:
+        if np.linalg.norm(step) <= 1e-9 * softening:
             break
     return estimate
 
@@ -99,6 +106,6 @@ def closest_point_to_lines(
     return middle + estimate
 
 
-def angles_deg(a: Float[np.ndarray, "*n 3"], b: Float[np.ndarray, "*#n 3"]) -> Float[np.ndarray, "*n"]:
+def angles_deg(a: Float[np.ndarray, "*#n 3"], b: Float[np.ndarray, "*#n 3"]) -> Float[np.ndarray, "*n"]:
     """Angles between unit vectors, in degrees."""
-    return np.degrees(np.arccos(np.clip((a * b).sum(-1), -1.0, 1.0)))
+    return np.asarray(np.degrees(np.arccos(np.clip((a * b).sum(-1), -1.0, 1.0))))

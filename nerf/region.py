@@ -8,7 +8,7 @@ quantiles, so neither far points nor a far camera shrink the scene.
 from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from nerf.reconstruction import Reconstruction, angles_deg, closest_point_to_lines, spatial_median
 
@@ -19,6 +19,7 @@ CONVERGENT_DEG = 30.0  # four fifths of the axes within this of the direction to
 AROUND_RADII = (0.4, 1.0)  # the cube's half side as a share of the cameras' distance to the focus
 FORWARD_REACH = 3.0  # the farthest depth the cube takes in, in median depths; beyond, detail is below a pixel's
 INSIDE_REACH = 2.0  # likewise around a camera that looks outward
+FAR_CAMERA = 5.0  # a camera so many times as far from the cameras' middle as is usual does not count
 CORE, WHOLE = 0.95, 0.999  # shares of the observations that the cube should hold, and that make a scene bounded
 GROWTH = 1.25  # a cube that becomes WHOLE by growing at most this much is grown
 
@@ -88,6 +89,12 @@ def _grown(cube: Region, scene: Reconstruction, has_alpha: bool) -> Region:
     return cube
 
 
+def _near_by(scene: Reconstruction) -> Bool[np.ndarray, "n"]:
+    """All photos but those taken far from where the others were."""
+    distance = np.linalg.norm(scene.centres - spatial_median(scene.centres), axis=1)
+    return distance <= FAR_CAMERA * np.median(distance)
+
+
 def _around(scene: Reconstruction) -> Region:
     centre = focus(scene)
     distance = float(np.median(np.linalg.norm(scene.centres - centre, axis=1)))
@@ -106,8 +113,9 @@ def _half_widths(scene: Reconstruction) -> Float[np.ndarray, "n"]:
 
 def _forward(scene: Reconstruction) -> Region:
     near, far = _depth_extent(scene)
-    ends = np.concatenate([scene.centres[:, None] + depth * scene.rays for depth in (near, far)])
-    low, high = np.quantile(ends.reshape(-1, 3), [0.02, 0.98], axis=0)
+    near_by = _near_by(scene)
+    ends = np.concatenate([scene.centres[:, None] + depth * scene.rays for depth in (near, far)], axis=1)
+    low, high = np.quantile(ends[near_by].reshape(-1, 3), [0.02, 0.98], axis=0)
     return Region((low + high) / 2, float((high - low).max() / 2), False)
 
 
@@ -127,7 +135,8 @@ def _depth_extent(scene: Reconstruction) -> tuple[float, float]:
 def _inside(scene: Reconstruction) -> Region:
     middle = spatial_median(scene.centres)
     spread = np.linalg.norm(scene.centres - middle, axis=1)
-    low, high = np.quantile(scene.centres, [0.05, 0.95], axis=0)
+    centres = scene.centres[_near_by(scene)]
+    low, high = centres.min(axis=0), centres.max(axis=0)
     if not len(scene.point):
         return Region(middle, 3 * float(np.quantile(spread, 0.9)), False)
     reach = INSIDE_REACH * np.median(scene.distances())

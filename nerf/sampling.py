@@ -35,8 +35,8 @@ def stratified(
 
 
 def midpoint_edges(
-    t: Float[Tensor, "*rays n+1"], near: Float[Tensor, "*rays"]
-) -> Float[Tensor, "*rays n+1"]:
+    t: Float[Tensor, "*rays ends"], near: Float[Tensor, "*rays"]
+) -> Float[Tensor, "*rays ends"]:
     """Edges around the samples of ``t``, half-way between neighbours, from near to far.
 
     The weight of sample i is spread on both sides of t_i: the surface that stopped the light lies before it.
@@ -48,8 +48,8 @@ def midpoint_edges(
 
 @torch.no_grad()
 def sample_pdf(
-    edges: Float[Tensor, "*rays n+1"],
-    weights: Float[Tensor, "*rays n"],
+    edges: Float[Tensor, "*rays ends"],
+    weights: Float[Tensor, "*rays ends-1"],
     count: int,
     generator: torch.Generator | None,
 ) -> Float[Tensor, "*rays {count}"]:
@@ -62,7 +62,7 @@ def sample_pdf(
 
 
 def invert_cdf(
-    edges: Float[Tensor, "*rays n+1"], weights: Float[Tensor, "*rays n"], u: Float[Tensor, "*rays m"]
+    edges: Float[Tensor, "*rays ends"], weights: Float[Tensor, "*rays ends-1"], u: Float[Tensor, "*rays m"]
 ) -> Float[Tensor, "*rays m"]:
     """Positions at which the CDF of the piecewise-constant PDF reaches u in [0, 1].
 

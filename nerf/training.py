@@ -77,7 +77,7 @@ class Batch(NamedTuple):
     background: Float[Tensor, "3"]
 
 
-def composite(
+def over(
     colour: Float[Tensor, "*rays 3"], alpha: Float[Tensor, "*rays"] | None, background: Float[Tensor, "3"]
 ) -> Float[Tensor, "*rays 3"]:
     """A pixel of straight alpha over a background; without alpha, the pixel itself."""
@@ -103,7 +103,8 @@ class PaperTrainer:
         batch = self._batch(random)
         coarse, fine = self.model.render_training(batch.rays, batch.background, random)
         fine_error = (fine.colour - batch.target).square().mean()
-        loss = (coarse.colour - batch.target).square().mean() + fine_error
+        # A field without hierarchy has one rendering and counts it once.
+        loss = fine_error if coarse is fine else (coarse.colour - batch.target).square().mean() + fine_error
         self.optimiser.zero_grad()
         loss.backward()
         gradients = [p.grad for p in self.parameters if p.grad is not None]
@@ -145,7 +146,7 @@ class PaperTrainer:
             background = torch.rand(3, generator=random, device=self.bank.device)
         else:
             background = torch.tensor(self.settings.background, device=self.bank.device)
-        return Batch(rays, composite(colour, alpha, background), background)
+        return Batch(rays, over(colour, alpha, background), background)
 
 
 def _tensors_of(batch: Batch) -> dict[str, Tensor]:

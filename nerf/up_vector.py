@@ -15,7 +15,8 @@ from jaxtyping import Float
 from nerf.reconstruction import Reconstruction, angles_deg, spatial_median
 
 MOST_FLATNESS = 0.25  # tan 14 deg: a set of directions that leaves its plane further than this has no plane
-MOST_DISAGREEMENT_DEG = 35.0  # between the plane's normal and the photos' upper edges, and among the edges themselves
+MOST_PITCH_DEG = 65.0  # between the plane's normal and the upper edges, which lean as far as the photos look down
+MOST_DISAGREEMENT_DEG = 35.0  # among the upper edges
 
 
 class Up(NamedTuple):
@@ -31,8 +32,7 @@ class Up(NamedTuple):
 
 def find_up(scene: Reconstruction) -> Up:
     """The up vector best supported by the poses."""
-    edges = spatial_median(scene.ups)
-    edges = edges / np.linalg.norm(edges)
+    edges = _unit(spatial_median(scene.ups)[None])[0]
     planes = [
         (*_avoided_direction(vectors), source)
         for vectors, source in (
@@ -40,9 +40,9 @@ def find_up(scene: Reconstruction) -> Up:
             (_unit(scene.centres - spatial_median(scene.centres)), "level standpoints"),
         )
     ]
-    for flatness, normal, source in sorted(planes, key=lambda plane: plane[0]):
+    for flatness, normal, source in sorted(planes, key=lambda plane: round(plane[0], 6)):
         normal = normal if normal @ edges > 0 else -normal
-        if flatness < MOST_FLATNESS and angles_deg(normal, edges) < MOST_DISAGREEMENT_DEG:
+        if flatness < MOST_FLATNESS and angles_deg(normal, edges) < MOST_PITCH_DEG:
             return Up(normal, True, source)
     # three quarters must agree: a few photos turned by 90 degrees are common, half of them turned is no evidence
     if np.quantile(angles_deg(scene.ups, edges), 0.75) < MOST_DISAGREEMENT_DEG:

@@ -65,8 +65,9 @@ class ContentIndex:
         return value
 
     def of_files(self, root: Path, files: Iterable[Path]) -> str:
-        """Digest of files and their names relative to ``root``."""
-        return digest({os.path.relpath(file, root): self.sha256(file) for file in sorted(files)})
+        """Digest of files and their names relative to ``root``; one that is not there counts as missing."""
+        found = {file: self.sha256(file) if file.is_file() else "missing" for file in sorted(files)}
+        return digest({os.path.relpath(file, root): value for file, value in found.items()})
 
     def of_path(self, path: Path) -> str:
         """Digest of a file, or of all files below a folder that are not hidden."""

@@ -7,8 +7,15 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from stages import evaluate, ingest, mesh, normalise, render, report, sfm, train
 from stages.contract import StageError
+from stages.evaluate import Config as EvaluateConfig
+from stages.ingest import Config as IngestConfig
+from stages.mesh import Config as MeshConfig
+from stages.normalise import Config as NormaliseConfig
+from stages.render import Config as RenderConfig
+from stages.report import Config as ReportConfig
+from stages.sfm import Config as SfmConfig
+from stages.train import Config as TrainConfig
 
 
 class UsageError(Exception):
@@ -20,14 +27,14 @@ class Settings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    ingest: ingest.Config = ingest.Config()
-    sfm: sfm.Config = sfm.Config()
-    normalise: normalise.Config = normalise.Config()
-    train: train.Config = train.Config()
-    evaluate: evaluate.Config = evaluate.Config()
-    render: render.Config = render.Config()
-    mesh: mesh.Config = mesh.Config()
-    report: report.Config = report.Config()
+    ingest: IngestConfig = IngestConfig()
+    sfm: SfmConfig = SfmConfig()
+    normalise: NormaliseConfig = NormaliseConfig()
+    train: TrainConfig = TrainConfig()
+    evaluate: EvaluateConfig = EvaluateConfig()
+    render: RenderConfig = RenderConfig()
+    mesh: MeshConfig = MeshConfig()
+    report: ReportConfig = ReportConfig()
 
 
 def read_toml(path: Path) -> dict[str, Any]:

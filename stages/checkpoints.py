@@ -50,9 +50,10 @@ def save_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
     name = f"{checkpoint.step:09d}"
     write_atomically(folder / f"{name}.safetensors", tensors)
     write_atomically(folder / f"{name}.json", json.dumps(meta, allow_nan=False).encode())
-    for old in _steps(folder)[:-KEPT]:
-        (folder / f"{old:09d}.json").unlink()
-        (folder / f"{old:09d}.safetensors").unlink(missing_ok=True)
+    kept = {f"{step:09d}" for step in _steps(folder)[-KEPT:]}
+    for path in folder.iterdir():  # older pairs, and what a kill left of unfinished ones
+        if path.name.split(".")[0] not in kept:
+            path.unlink()
 
 
 def latest_checkpoint(folder: Path, note: Callable[[str], None]) -> Checkpoint | None:

@@ -18,15 +18,21 @@ Importing a stage must be cheap: torch, pycolmap, kornia and their like are impo
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Annotated, Any, Protocol
 
 from pydantic import BaseModel, ConfigDict
+from tyro.conf import Suppress
 
 
 class StageConfig(BaseModel):
     """Settings of one stage. Unknown keys, infinities and NaN are refused. A ``Path`` enters keys by content."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+# A path that the command line fills in from PHOTOS and --cameras; no dotted flag is offered for it.
+SourcePath = Annotated[Path, Suppress]
+OptionalSourcePath = Annotated[Path | None, Suppress]
 
 
 class StageError(Exception):

@@ -10,9 +10,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from nerf.scene import Scene, View
+    from nerf.scene import Scene, Split, View
 
 BLUE, ORANGE, GREY = "#3b82f6", "#f2711c", "#8a8f98"
+SPLIT_COLOURS: "dict[Split, str]" = {"train": BLUE, "test": ORANGE}
 INK = "#010203"  # drawn with this and then replaced by the page's own text colour
 BOX = 0.9  # the region of interest is [-0.9, 0.9]^3, see nerf/scene.py
 MOST_POINTS = 20_000
@@ -25,7 +26,9 @@ def clock(seconds: float) -> str:
     whole = round(seconds)
     if whole < 60:
         return f"{whole} s"
-    big, small, units = (whole // 60, whole % 60, "min s") if whole < 3600 else (whole // 3600, whole % 3600 // 60, "h min")
+    big, small, units = (
+        (whole // 60, whole % 60, "min s") if whole < 3600 else (whole // 3600, whole % 3600 // 60, "h min")
+    )
     first, second = units.split()
     return f"{big} {first} {small} {second}" if small else f"{big} {first}"
 
@@ -59,47 +62,51 @@ def curve_svg(curve: Sequence[dict[str, Any]], baselines: dict[str, float | None
             seen = [(row["seconds"], row[key]) for row in rows if row[key] is not None]
             if seen:
                 axes.plot(*zip(*seen, strict=True), color=colour, lw=2, marker="o", ms=3, label=label)
-        for name, psnr in baselines.items():
-            if psnr is not None:
-                axes.axhline(psnr, color=ORANGE, lw=1, ls=(0, (4, 3)))
-                axes.text(0.005, psnr, f"{name} {psnr:.1f} dB", transform=axes.get_yaxis_transform(), va="bottom", size=9)
+        _draw_baselines(axes, {name: psnr for name, psnr in baselines.items() if psnr is not None})
         _doubling_axis(axes, rows[0]["seconds"], rows[-1]["seconds"])
         axes.set(xlabel="training time", ylabel="PSNR (dB)")
         axes.legend(frameon=False, loc="lower right")
         return _svg(figure)
 
 
-def cameras_svg(scene: "Scene", xyz: "np.ndarray", rgb: "np.ndarray") -> str:
-    """The cameras, the sparse points (n, 3) in their colours and the region of interest, from above and the side."""
-    with _drawing((10, 5), "cameras") as figure:
-        names = ("from above", "from the side") if scene.up_known else ("along z", "along y")
-        for panel, (name, vertical) in enumerate(zip(names, (1, 2), strict=True)):
-            axes = figure.add_subplot(1, 2, panel + 1)
-            _draw_layout(axes, scene, (0, vertical), xyz, rgb)
-            axes.set_title(name, size=11)
-        for label, colour in (("training photo", BLUE), ("test photo", ORANGE), ("region of interest", INK)):
-            axes.plot([], [], color=colour, label=label, ls="--" if colour == INK else "-", lw=1.4)
-        figure.legend(frameon=False, loc="outside lower center", ncols=3)
-        return _svg(figure)
+def _draw_baselines(axes: "Axes", baselines: dict[str, float]) -> None:
+    """Horizontal lines named beside the plot, the highest above its line and the others below, so as not to collide."""
+    for name, psnr in baselines.items():
+        above = psnr == max(baselines.values())
+        axes.axhline(psnr, color=ORANGE, lw=1, ls=(0, (4, 3)))
+        place = {"transform": axes.get_yaxis_transform(), "va": "bottom" if above else "top", "size": 9.5}
+        axes.text(1.01, psnr, f"{name}\n{psnr:.1f} dB", linespacing=1.1, **place)
 
 
-def _draw_layout(axes: "Axes", scene: "Scene", plane: tuple[int, int], xyz: "np.ndarray", rgb: "np.ndarray") -> None:
-    """One orthographic projection on the two given axes of the scene."""
+def camera_svgs(scene: "Scene", xyz: "np.ndarray", rgb: "np.ndarray") -> dict[str, str]:
+    """The cameras, the sparse points (n, 3) in their colours and the region of interest, by the name of the view.
+
+    Orthographic projections along z and along y: from above and from the side where the scene knows its up.
+    """
+    names = ("from above", "from the side") if scene.up_known else ("along z", "along y")
+    return {name: _layout_svg(name, scene, (0, axis), xyz, rgb) for name, axis in zip(names, (1, 2), strict=True)}
+
+
+def _layout_svg(name: str, scene: "Scene", plane: tuple[int, int], xyz: "np.ndarray", rgb: "np.ndarray") -> str:
+    """One projection, on the two given axes of the scene. Points beyond the cameras and the box are cut off."""
     import numpy as np
     from matplotlib.collections import LineCollection
+    from matplotlib.patches import Rectangle
 
     centres = np.array([view.scene_from_camera[:, 3] for view in scene.views])[:, plane]
     low, high = np.minimum(centres.min(0), -BOX), np.maximum(centres.max(0), BOX)
-    middle, half = (low + high) / 2, (high - low).max() / 2 * 1.12
+    middle, half = (low + high) / 2, (high - low) / 2 + 0.06 * (high - low).max()
     shown = np.linspace(0, len(xyz) - 1, min(len(xyz), MOST_POINTS)).astype(int)
-    axes.scatter(*xyz[shown][:, plane].T, c=rgb[shown] / 255, s=0.8, lw=0, alpha=0.6, rasterized=True)
-    axes.add_patch(_square(BOX))
-    for split, colour, order in (("train", BLUE, 3), ("test", ORANGE, 4)):
-        outlines = [_outline(scene, view, 0.1 * half)[:, plane] for view in scene.views if view.split == split]
-        axes.add_collection(LineCollection(outlines, colors=colour, lw=0.8, zorder=order))
-    axes.set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] - half, middle[1] + half), aspect="equal")
-    axes.set(xticks=[], yticks=[])
-    axes.spines[:].set_visible(False)
+    with _drawing((5, min(8.0, max(1.6, 5 * half[1] / half[0]))), name) as figure:
+        axes = figure.add_subplot(aspect="equal")
+        axes.scatter(*xyz[shown][:, plane].T, c=rgb[shown] / 255, s=2, lw=0, alpha=0.7, rasterized=True)
+        axes.add_patch(Rectangle((-BOX, -BOX), 2 * BOX, 2 * BOX, fill=False, ec=INK, ls="--", alpha=0.6))
+        for split, colour in SPLIT_COLOURS.items():
+            outlines = [_outline(scene, view, 0.1 * half.max())[:, plane] for view in scene.of_split(split)]
+            axes.add_collection(LineCollection(outlines, colors=colour, lw=0.9, zorder=3))
+        axes.set(xlim=middle[0] + half[0] * np.array([-1, 1]), ylim=middle[1] + half[1] * np.array([-1, 1]))
+        axes.set_axis_off()
+        return _svg(figure)
 
 
 def _outline(scene: "Scene", view: "View", depth: float) -> "np.ndarray":
@@ -112,12 +119,6 @@ def _outline(scene: "Scene", view: "View", depth: float) -> "np.ndarray":
     corners = np.array([[-x, -y, depth], [x, -y, depth], [x, y, depth], [-x, y, depth], [0, 0, 0]])
     stroke = corners[[4, 0, 1, 4, 2, 1, 2, 3, 4, 3, 0]]
     return stroke @ view.scene_from_camera[:, :3].T + view.scene_from_camera[:, 3]
-
-
-def _square(half: float) -> Any:
-    from matplotlib.patches import Rectangle
-
-    return Rectangle((-half, -half), 2 * half, 2 * half, fill=False, ec=INK, lw=1.2, ls="--", alpha=0.7, zorder=2)
 
 
 def _doubling_axis(axes: "Axes", first: float, last: float) -> None:

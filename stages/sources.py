@@ -5,7 +5,8 @@ Cheap: lists folders and reads at most the JSON of a transforms file, never an i
 
 import json
 import os
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,13 +15,15 @@ from stages.contract import StageError
 SourceKind = Literal["photos", "transforms", "blender", "colmap"]
 
 # Everything else is tried: what counts as a photo is decided by decoding, not by the name.
-_NOT_PHOTOS = frozenset(
-    ".txt .json .jsonl .md .rst .csv .tsv .xml .html .htm .pdf .doc .docx .log .ini .toml .yaml .yml .py .sh .ipynb "
-    ".zip .gz .tar .7z .npy .npz .pt .pth .pkl .bin .db .sqlite .ply .obj .mtl .glb .gltf .stl .las .laz "
-    ".xmp .aae .thm .mp3 .wav .m4a .ds_store .lnk .url .bak .tmp".split()
+# fmt: off
+_NOT_PHOTOS = (
+    ".txt", ".json", ".jsonl", ".md", ".rst", ".csv", ".tsv", ".xml", ".html", ".pdf", ".log", ".ini", ".toml", ".yaml",
+    ".yml", ".py", ".sh", ".ipynb", ".zip", ".gz", ".tar", ".7z", ".npy", ".npz", ".pt", ".pth", ".pkl", ".bin", ".db",
+    ".ply", ".obj", ".mtl", ".glb", ".gltf", ".stl", ".las", ".laz", ".xmp", ".aae", ".thm", ".mp3", ".wav", ".m4a",
 )
-_VIDEOS = frozenset(".mp4 .mov .m4v .avi .mkv .webm .mpg .mpeg .3gp .mts .m2ts .wmv .lrv .insv".split())
-_IMAGES = frozenset(".jpg .jpeg .png .heic .heif .tif .tiff .webp .bmp .avif .gif .dng .cr2 .nef .arw".split())
+_VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".3gp", ".mts", ".m2ts", ".wmv", ".lrv")
+# fmt: on
+_IMAGES = (".jpg", ".jpeg", ".png", ".heic", ".heif", ".tif", ".tiff", ".webp", ".bmp", ".avif", ".gif")
 _EXTENSIONS_TRIED = ("", ".png", ".jpg", ".jpeg")
 _FOLDER_HINT = "Give the folder that holds the photos: pipeline run FOLDER"
 
@@ -32,17 +35,23 @@ class Source:
     ``kind`` "photos" goes through structure-from-motion and has no ``cameras``; otherwise ``cameras`` is the
     transforms file, the folder of transforms_train.json, or the folder of one COLMAP model. ``files`` are the
     files to decode, in order of their names relative to ``root``; some may turn out to be no images, and files
-    named by a transforms file may be missing.
+    named by a transforms file may be missing. ``frames`` maps each file_path of a transforms file, as it is
+    written there, to the name of its photo.
     """
 
     kind: SourceKind
     root: Path
     cameras: Path | None
     files: tuple[Path, ...]
+    frames: Mapping[str, str] = field(default_factory=dict)
 
     def name(self, file: Path) -> str:
         """The name of one of ``files``: relative to ``root``, with forward slashes, always encodable as UTF-8."""
-        return os.fsencode(file.relative_to(self.root).as_posix()).decode("utf-8", "backslashreplace")
+        return _name(self.root, file)
+
+
+def _name(root: Path, file: Path) -> str:
+    return os.fsencode(file.relative_to(root).as_posix()).decode("utf-8", "backslashreplace")
 
 
 def find_source(photos: Path, cameras: Path | None = None) -> Source:
@@ -51,14 +60,14 @@ def find_source(photos: Path, cameras: Path | None = None) -> Source:
     try:
         _check_given(photos, cameras)
         if photos.is_file():
-            return _from_transforms("transforms", photos.parent, photos)
+            return _from_transforms("transforms", photos.parent, photos, photos)
         root = _photo_root(photos)
         if cameras is not None and cameras.is_file():
-            return _from_transforms("transforms", root, cameras)
+            return _from_transforms("transforms", root, cameras, cameras)
         if cameras is not None:
             return Source("colmap", root, _colmap_model(cameras), list_photos(root))
         if (photos / "transforms_train.json").is_file():
-            return _from_transforms("blender", photos, photos)
+            return _from_blender(photos)
         return Source("photos", root, None, list_photos(root))
     except PermissionError as error:
         raise StageError(
@@ -84,13 +93,13 @@ def list_photos(root: Path) -> tuple[Path, ...]:
         found += [here / name for name in names if not name.startswith(".") and (here / name).is_file()]
     if not found:
         raise StageError(f"{root} is empty", "there is no file in it", _FOLDER_HINT)
-    photos = [file for file in found if file.suffix.lower() not in _NOT_PHOTOS | _VIDEOS]
+    photos = [file for file in found if file.suffix.lower() not in (*_NOT_PHOTOS, *_VIDEOS)]
     if not photos:
         raise _no_photos(root, found)
     return tuple(sorted(photos, key=lambda file: file.relative_to(root).as_posix()))
 
 
-def read_frames(transforms: Path) -> dict[str, Any]:
+def read_transforms(transforms: Path) -> dict[str, Any]:
     """The content of a transforms file, checked to hold a list ``frames`` of objects with ``file_path`` and
     ``transform_matrix``. Raises StageError otherwise."""
     hint = "Give a transforms.json as nerfstudio, instant-ngp or the NeRF-synthetic scenes write it."
@@ -107,26 +116,6 @@ def read_frames(transforms: Path) -> dict[str, Any]:
                 f"cannot use {transforms.name}", f"frame {index} lacks file_path or transform_matrix", hint
             )
     return content
-
-
-def official_splits(source: Source) -> dict[str, Path]:
-    """The transforms files of a source of kind "transforms" (one, named "all") or "blender" (train, perhaps test)."""
-    assert source.cameras is not None
-    if source.kind == "transforms":
-        return {"all": source.cameras}
-    files = {split: source.cameras / f"transforms_{split}.json" for split in ("train", "test")}
-    return {split: file for split, file in files.items() if file.is_file()}
-
-
-def named_frames(source: Source, transforms: Path) -> list[tuple[str, dict[str, Any]]]:
-    """The frames of one of the source's transforms files, each with the name of its photo. Errors as find_source."""
-    return [(source.name(file), frame) for file, frame in _frame_files(source, transforms)]
-
-
-def _frame_files(source: Source, transforms: Path) -> list[tuple[Path, dict[str, Any]]]:
-    root = source.root
-    folders = (root,) if transforms.parent == root else (root, root.parent, transforms.parent)
-    return [(_frame_file(frame["file_path"], folders), frame) for frame in read_frames(transforms)["frames"]]
 
 
 def _frame_file(file_path: str, folders: tuple[Path, ...]) -> Path:
@@ -189,10 +178,19 @@ def _is_photo_folder(folder: Path) -> bool:
     return not folder.name.startswith(".") and folder.name != "masks" and not (folder / "run.json").is_file()
 
 
-def _from_transforms(kind: SourceKind, root: Path, cameras: Path) -> Source:
-    empty = Source(kind, root, cameras, ())
-    files = {file for transforms in official_splits(empty).values() for file, _ in _frame_files(empty, transforms)}
-    return replace(empty, files=_sorted_inside(root, files))
+def _from_transforms(kind: SourceKind, root: Path, cameras: Path, *transforms: Path) -> Source:
+    files: dict[str, Path] = {}
+    for path in transforms:
+        folders = (root,) if path.parent == root else (root, root.parent, path.parent)
+        paths = (frame["file_path"] for frame in read_transforms(path)["frames"])
+        files |= {file_path: _frame_file(file_path, folders) for file_path in paths}
+    in_order = _sorted_inside(root, set(files.values()))
+    return Source(kind, root, cameras, in_order, {path: _name(root, file) for path, file in files.items()})
+
+
+def _from_blender(folder: Path) -> Source:
+    splits = [folder / f"transforms_{split}.json" for split in ("train", "test")]
+    return _from_transforms("blender", folder, folder, *(path for path in splits if path.is_file()))
 
 
 def _sorted_inside(root: Path, files: set[Path]) -> tuple[Path, ...]:

@@ -1,0 +1,173 @@
+"""Camera paths for videos that stay where photos were taken: a path through unseen space shows unseen space.
+
+All paths are poses ``scene_from_camera`` [rotation | centre] of shape (frames, 3, 4), numpy float64, rotations
+orthonormal, OpenCV axes, in the scene frame where +z is up. ``orbit`` and ``spiral`` return to where they began: the
+last frame is one step before the first. ``interpolated`` runs from one end of its tour to the other.
+"""
+
+import numpy as np
+from jaxtyping import Float
+
+from nerf.reconstruction import closest_point_to_lines, spatial_median
+
+FULL_CIRCLE_GAP_DEG = 60.0  # cameras with no wider gap in azimuth surround the object
+SMOOTHING_DEG = 20.0  # standard deviation over azimuth within which an orbit averages the cameras' radius and height
+STEEPEST = 0.15  # least horizontal distance of an orbit to its axis, in distances to the target (81 degrees)
+SPIRAL_SHARE = 0.7  # quantile of the cameras' offsets that the spiral reaches
+FRAMES_PER_KEY = 8  # interpolated: frames between two of the cameras it visits, so that the tour is not a blur
+
+Poses = Float[np.ndarray, "frames 3 4"]
+
+
+def orbit(cameras: Float[np.ndarray, "n 3 4"], frames: int) -> Poses:
+    """Around the point all cameras look at, at the height and distance that the cameras near each azimuth have.
+
+    Cameras on an arc (with a gap of more than 60 degrees) give a swing to and fro within that arc.
+    """
+    centres = cameras[:, :, 3]
+    target = closest_point_to_lines(centres, cameras[:, :, 2])
+    offsets = centres - target
+    azimuths = np.arctan2(offsets[:, 1], offsets[:, 0])
+    start, width = _arc(azimuths)
+    phase = np.arange(frames) / frames
+    if 2 * np.pi - width <= np.radians(FULL_CIRCLE_GAP_DEG):
+        path = start + 2 * np.pi * phase
+    else:
+        path = start + width * (1 - np.cos(2 * np.pi * phase)) / 2
+    radius, height = _ring(azimuths, offsets, path)
+    radius = np.maximum(radius, STEEPEST * np.hypot(radius, height))
+    around = np.stack([radius * np.cos(path), radius * np.sin(path), height], axis=1)
+    return look_at(target + around, target)
+
+
+def _arc(azimuths: Float[np.ndarray, "n"]) -> tuple[float, float]:
+    """(start, width) in radians of the shortest arc that holds all azimuths."""
+    ordered = np.sort(azimuths)
+    gaps = np.diff(ordered, append=ordered[0] + 2 * np.pi)
+    widest = int(np.argmax(gaps))
+    return float(ordered[(widest + 1) % len(ordered)]), float(2 * np.pi - gaps[widest])
+
+
+def _ring(
+    azimuths: Float[np.ndarray, "n"], offsets: Float[np.ndarray, "n 3"], path: Float[np.ndarray, "frames"]
+) -> tuple[Float[np.ndarray, "frames"], Float[np.ndarray, "frames"]]:
+    """The cameras' horizontal distance and height along the path: averages weighted by nearness in azimuth.
+
+    The weights exp(k (cos difference - 1)) (von Mises) are periodic and never vanish, so that no azimuth is empty.
+    """
+    concentration = 1 / np.radians(SMOOTHING_DEG) ** 2
+    closeness = concentration * (np.cos(path[:, None] - azimuths) - 1)
+    weight = np.exp(closeness - closeness.max(axis=1, keepdims=True))
+    weight = weight / weight.sum(axis=1, keepdims=True)
+    return weight @ np.linalg.norm(offsets[:, :2], axis=1), weight @ offsets[:, 2]
+
+
+def spiral(cameras: Float[np.ndarray, "n 3 4"], frames: int) -> Poses:
+    """Two turns of an ellipse before the scene that also moves in and out (LLFF's render path).
+
+    Centred on the cameras, all frames look at one point as far ahead as the region of interest's centre (Mildenhall
+    et al. 2019, ``render_path_spiral``); its half axes are 70 % quantiles of the cameras' offsets, where the published
+    code takes 90 % and with it leaves the cameras' own grid at the corners.
+    """
+    mean = average_pose(cameras)
+    offsets = (cameras[:, :, 3] - mean[:, 3]) @ mean[:, :3]
+    reach = np.quantile(np.abs(offsets), SPIRAL_SHARE, axis=0)
+    angle = 4 * np.pi * np.arange(frames) / frames
+    local = reach * np.stack([np.cos(angle), -np.sin(angle), -np.sin(angle / 2)], axis=1)
+    ahead = max(-mean[:, 3] @ mean[:, 2], 0.5)  # the region's centre is the origin
+    target = mean[:, 3] + ahead * mean[:, 2]
+    return look_at(mean[:, 3] + local @ mean[:, :3].T, target, up=-mean[:, 1])
+
+
+def average_pose(cameras: Float[np.ndarray, "n 3 4"]) -> Float[np.ndarray, "3 4"]:
+    """The spatial median of the centres with the rotation nearest to the mean of the rotations."""
+    rotation = nearest_rotations(cameras[:, :, :3].mean(axis=0))
+    return np.concatenate([rotation, spatial_median(cameras[:, :, 3])[:, None]], axis=1)
+
+
+def interpolated(cameras: Float[np.ndarray, "n 3 4"], frames: int) -> Poses:
+    """Through the cameras themselves along a short tour, at constant speed.
+
+    At most one camera in eight frames is visited, the ones furthest from each other; a Catmull-Rom spline runs through
+    centres and rotation matrices alike, and each matrix is carried to the nearest rotation. Speed counts one
+    radian of turning as much as the cameras' median distance from their middle.
+    """
+    spread = np.median(np.linalg.norm(cameras[:, :, 3] - spatial_median(cameras[:, :, 3]), axis=1))
+    features = np.concatenate(
+        [cameras[:, :, :3].reshape(-1, 9) / np.sqrt(2), cameras[:, :, 3] / (spread if spread > 0 else 1.0)], axis=1
+    )
+    keys = _farthest(features, max(2, frames // FRAMES_PER_KEY))
+    keys = keys[_short_tour(features[keys])]
+    fine = np.linspace(0, len(keys) - 1, 32 * len(keys))
+    steps = np.linalg.norm(np.diff(_catmull_rom(features[keys], fine), axis=0), axis=1)
+    length = np.concatenate([[0.0], np.cumsum(steps)])
+    at = np.interp(np.linspace(0, length[-1], frames), length, fine)
+    poses = _catmull_rom(cameras[keys].reshape(-1, 12), at).reshape(-1, 3, 4)
+    return np.concatenate([nearest_rotations(poses[:, :, :3]), poses[:, :, 3:]], axis=2)
+
+
+def _farthest(features: Float[np.ndarray, "n d"], count: int) -> np.ndarray:
+    """Indices of up to ``count`` rows, each the farthest from those before it; the first is row 0."""
+    chosen = [0]
+    distance = np.linalg.norm(features - features[0], axis=1)
+    while len(chosen) < min(count, len(features)):
+        chosen.append(int(np.argmax(distance)))
+        distance = np.minimum(distance, np.linalg.norm(features - features[chosen[-1]], axis=1))
+    return np.array(chosen)
+
+
+def _short_tour(features: Float[np.ndarray, "n d"]) -> np.ndarray:
+    """An order of the rows with a short path through them: nearest neighbours, then 2-opt until nothing improves."""
+    cost = np.linalg.norm(features[:, None] - features, axis=2)
+    tour = [int(np.argmax(cost.sum(axis=1)))]  # the most remote one: an end of the path
+    while len(tour) < len(features):
+        remaining = np.setdiff1d(np.arange(len(features)), tour)
+        tour.append(int(remaining[np.argmin(cost[tour[-1], remaining])]))
+    best = np.array(tour)
+    while (shorter := _uncrossed(best, cost)) is not None:
+        best = shorter
+    return best
+
+
+def _uncrossed(tour: np.ndarray, cost: Float[np.ndarray, "n n"]) -> np.ndarray | None:
+    """The tour with one stretch reversed that makes it shorter, or None."""
+    for i in range(len(tour) - 1):
+        for j in range(i + 1, len(tour)):
+            before = cost[tour[i - 1], tour[i]] if i else 0.0
+            before_turned = cost[tour[i - 1], tour[j]] if i else 0.0
+            after = cost[tour[j], tour[j + 1]] if j + 1 < len(tour) else 0.0
+            after_turned = cost[tour[i], tour[j + 1]] if j + 1 < len(tour) else 0.0
+            if before_turned + after_turned < before + after - 1e-9:
+                return np.concatenate([tour[:i], tour[i : j + 1][::-1], tour[j + 1 :]])
+    return None
+
+
+def _catmull_rom(keys: Float[np.ndarray, "n d"], at: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m d"]:
+    """The uniform Catmull-Rom spline through ``keys`` (at 0, 1, ..., n-1), its ends extended linearly."""
+    padded = np.concatenate([2 * keys[:1] - keys[1:2], keys, 2 * keys[-1:] - keys[-2:-1]])
+    segment = np.clip(at.astype(int), 0, len(keys) - 2)
+    u = (at - segment)[:, None]
+    p0, p1, p2, p3 = (padded[segment + k] for k in range(4))
+    return p1 + u / 2 * (p2 - p0 + u * (2 * p0 - 5 * p1 + 4 * p2 - p3 + u * (3 * (p1 - p2) + p3 - p0)))
+
+
+def look_at(
+    centres: Float[np.ndarray, "frames 3"],
+    target: Float[np.ndarray, "3"],
+    up: Float[np.ndarray, "3"] = np.array([0.0, 0.0, 1.0]),
+) -> Poses:
+    """Poses at ``centres`` that look at ``target`` and keep the horizon level. No view may be along ``up``."""
+    z = _unit(target - centres)
+    x = _unit(np.cross(z, up))
+    return np.stack([x, np.cross(z, x), z, centres], axis=2)
+
+
+def nearest_rotations(matrices: Float[np.ndarray, "*n 3 3"]) -> Float[np.ndarray, "*n 3 3"]:
+    """The rotation nearest to each matrix in the Frobenius norm (orthogonal Procrustes)."""
+    u, _, vt = np.linalg.svd(matrices)
+    sign = np.linalg.det(u @ vt)[..., None, None] * np.array([0.0, 0.0, 1.0]) + np.array([1.0, 1.0, 0.0])
+    return (u * sign) @ vt
+
+
+def _unit(vectors: Float[np.ndarray, "frames 3"]) -> Float[np.ndarray, "frames 3"]:
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)

@@ -1,0 +1,221 @@
+"""The hierarchical NeRF as published (Mildenhall et al. 2020): two MLPs, the coarse one placing the fine one's samples.
+
+Named deviations, each with its reason:
+
+* density through a shifted softplus unless ``density_activation="relu"``: ReLU has no gradient wherever the network
+  answers below zero, and now and then a whole network starts, and stays, there;
+* each second-stage sample is drawn from its own share of the probability (nerf/sampling.py) and the last interval
+  ends at far: no sample is wasted, no length is made up;
+* unbounded scenes are contracted (nerf/contraction.py) when ``contracted``; bounded ones are cut to the cube of half
+  size ``BOX``, because the encoding has period 2 and would repeat the scene beyond it.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+from nerf.compositing import composite, volume_weights
+from nerf.contraction import contract
+from nerf.encoding import positional_encoding
+from nerf.model import Rendering
+from nerf.randomness import generator as seeded_generator
+from nerf.rays import Rays, clip_to_box, points_on
+from nerf.sampling import Spacing, midpoint_edges, sample_pdf, stratified
+
+BOX = 0.95  # between the region of interest, 0.9, and half the encoding's period, 1
+CONTRACTED_SCALE = 0.45  # takes the contracted cube of half size 2 to 0.9
+
+# A fresh network answers about 0, and this density stops half the light over sqrt(2 · 10) scene units: rays inside the
+# region of interest (length 2) start at opacity 0.27, long ones (10) at 0.79, so that both see gradients.
+INITIAL_DENSITY = math.log(2) / math.sqrt(2 * 10)
+SOFTPLUS_SHIFT = math.log(math.expm1(INITIAL_DENSITY))
+
+
+@dataclass(frozen=True)
+class PaperSettings:
+    """Sizes and variants; the defaults are the published model. Raises ValueError on impossible values.
+
+    ``skip``: index from 0 of the layer after which gamma(x) is concatenated (the published fifth layer has index 4);
+    where no layer follows it there is no skip connection. ``positional_encoding=False`` feeds the bare position and
+    direction. ``hierarchical=False`` is a single network with as many queries per ray as the two have together.
+    """
+
+    depth: int = 8
+    width: int = 256
+    skip: int = 4
+    position_frequencies: int = 10
+    direction_frequencies: int = 4
+    samples_coarse: int = 64
+    samples_fine: int = 128
+    view_dependence: bool = True
+    positional_encoding: bool = True
+    hierarchical: bool = True
+    contracted: bool = False
+    spacing: Spacing = "linear"
+    density_activation: Literal["softplus", "relu"] = "softplus"
+
+    def __post_init__(self) -> None:
+        at_least = {"depth": 1, "width": 2, "skip": 0, "position_frequencies": 1, "direction_frequencies": 1}
+        for name, least in (at_least | {"samples_coarse": 2, "samples_fine": 1}).items():
+            if getattr(self, name) < least:
+                raise ValueError(f"{name} is {getattr(self, name)}; it must be at least {least}")
+        if self.spacing not in get_args(Spacing):
+            raise ValueError(f"spacing is {self.spacing!r}; it must be 'linear' or 'log'")
+        if self.density_activation not in ("softplus", "relu"):
+            raise ValueError(f"density_activation is {self.density_activation!r}; it must be 'softplus' or 'relu'")
+
+    @property
+    def queries_per_ray(self) -> int:
+        """Evaluations of a network per ray: the coarse samples, and their union with the fine ones."""
+        return self.samples_coarse + (self.samples_coarse + self.samples_fine)
+
+
+class PaperMlp(nn.Module):
+    """F_theta: (position, direction) -> (density, colour), density independent of direction (figure 7)."""
+
+    def __init__(self, settings: PaperSettings, init: torch.Generator) -> None:
+        super().__init__()
+        self.settings = settings
+        width = settings.width
+        position = 6 * settings.position_frequencies if settings.positional_encoding else 3
+        direction = 6 * settings.direction_frequencies if settings.positional_encoding else 3
+        inputs = [position] + [width] * (settings.depth - 1)
+        if settings.skip + 1 < settings.depth:
+            inputs[settings.skip + 1] += position
+        self.trunk = nn.ModuleList(_linear(size, width, init) for size in inputs)
+        self.density_head = _linear(width, 1, init)
+        self.feature = _linear(width, width, init)
+        self.colour_hidden = _linear(width + direction * settings.view_dependence, width // 2, init)
+        self.colour_head = _linear(width // 2, 3, init)
+
+    def forward(
+        self, points: Float[Tensor, "*rays n 3"], directions: Float[Tensor, "*rays 3"]
+    ) -> tuple[Float[Tensor, "*rays n"], Float[Tensor, "*rays n 3"]]:
+        """Density and colour of n points on each ray; points lie in (-1, 1)^3."""
+        hidden = self._hidden(points)
+        feature = self.feature(hidden)
+        if self.settings.view_dependence:
+            encoded = self._encode(directions, self.settings.direction_frequencies)
+            colour = _linear_of_parts(self.colour_hidden, feature, encoded[..., None, :])
+        else:
+            colour = self.colour_hidden(feature)
+        return self._sigma(hidden), torch.sigmoid(self.colour_head(torch.relu_(colour)))
+
+    def density(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points"]:
+        """Density alone, without the work for colour."""
+        return self._sigma(self._hidden(points))
+
+    def _hidden(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points width"]:
+        encoded = self._encode(points, self.settings.position_frequencies)
+        hidden = encoded
+        for index, layer in enumerate(self.trunk):
+            if index == self.settings.skip + 1:
+                hidden = _linear_of_parts(layer, hidden, encoded)
+            else:
+                hidden = layer(hidden)
+            hidden = torch.relu_(hidden)
+        return hidden
+
+    def _sigma(self, hidden: Float[Tensor, "*points width"]) -> Float[Tensor, "*points"]:
+        raw = self.density_head(hidden)[..., 0]
+        if self.settings.density_activation == "relu":
+            return torch.relu(raw)
+        # Beyond the threshold torch returns its argument; at 40 the difference is below float64's resolution.
+        return functional.softplus(raw + SOFTPLUS_SHIFT, threshold=40)
+
+    def _encode(self, x: Float[Tensor, "*batch 3"], frequencies: int) -> Float[Tensor, "*batch encoded"]:
+        return positional_encoding(x, frequencies) if self.settings.positional_encoding else x
+
+
+class PaperNerf(nn.Module):
+    """A RadianceModel in the scene frame; weights are a function of ``settings`` and ``seed``."""
+
+    def __init__(self, settings: PaperSettings, seed: int) -> None:
+        super().__init__()
+        self.settings = settings
+        self.coarse = PaperMlp(settings, seeded_generator("cpu", seed, 0)) if settings.hierarchical else None
+        self.fine = PaperMlp(settings, seeded_generator("cpu", seed, 1))
+
+    def density(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points"]:
+        """Density per scene unit; zero outside the cube to which an uncontracted field is cut."""
+        sigma = self.fine.density(self._coordinates(points))
+        return sigma if self.settings.contracted else torch.where((points.abs() <= BOX).all(-1), sigma, 0)
+
+    def colour(
+        self, points: Float[Tensor, "*points 3"], directions: Float[Tensor, "*points 3"]
+    ) -> Float[Tensor, "*points 3"]:
+        """Colour seen by viewing rays of unit ``directions``; without meaning where the density is zero."""
+        return self.fine(self._coordinates(points)[..., None, :], directions)[1][..., 0, :]
+
+    @torch.no_grad()
+    def render(self, rays: Rays, background: Float[Tensor, "3"]) -> Rendering:
+        """Render without randomness and without gradient; the coarse network answers for density only."""
+        rays = self._in_field(rays)
+        t = self._first_samples(rays, None)
+        if self.coarse is not None:
+            sigma = self.coarse.density(self._coordinates(points_on(rays, t[..., :-1])))
+            t = self._refined(rays, t, volume_weights(sigma, t)[0], None)
+        return self._seen(self.fine, rays, t, background)[0]
+
+    def render_training(
+        self, rays: Rays, background: Float[Tensor, "*#rays 3"], generator: torch.Generator | None
+    ) -> tuple[Rendering, Rendering]:
+        """The coarse and the fine rendering, both differentiable; one and the same if not ``hierarchical``."""
+        rays = self._in_field(rays)
+        t = self._first_samples(rays, generator)
+        if self.coarse is None:
+            only, _ = self._seen(self.fine, rays, t, background)
+            return only, only
+        coarse, weights = self._seen(self.coarse, rays, t, background)
+        fine, _ = self._seen(self.fine, rays, self._refined(rays, t, weights, generator), background)
+        return coarse, fine
+
+    def _in_field(self, rays: Rays) -> Rays:
+        return rays if self.settings.contracted else clip_to_box(rays, BOX)
+
+    def _coordinates(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
+        return CONTRACTED_SCALE * contract(points) if self.settings.contracted else points
+
+    def _first_samples(self, rays: Rays, generator: torch.Generator | None) -> Float[Tensor, "*rays ends"]:
+        settings = self.settings
+        count = settings.samples_coarse if settings.hierarchical else settings.queries_per_ray
+        return stratified(rays.near, rays.far, count, generator, settings.spacing)
+
+    def _refined(
+        self,
+        rays: Rays,
+        t: Float[Tensor, "*rays ends"],
+        weights: Float[Tensor, "*rays ends-1"],
+        generator: torch.Generator | None,
+    ) -> Float[Tensor, "*rays more"]:
+        """The sorted union of the samples and those drawn from their weights (section 5.2); far stays last."""
+        drawn = sample_pdf(midpoint_edges(t, rays.near), weights, self.settings.samples_fine, generator)
+        return torch.sort(torch.cat([t, drawn], -1)).values
+
+    def _seen(
+        self, mlp: PaperMlp, rays: Rays, t: Float[Tensor, "*rays ends"], background: Float[Tensor, "*#rays 3"]
+    ) -> tuple[Rendering, Float[Tensor, "*rays ends-1"]]:
+        points = self._coordinates(points_on(rays, t[..., :-1]))
+        return composite(*mlp(points, rays.directions), t, background)
+
+
+def _linear(inputs: int, outputs: int, init: torch.Generator) -> nn.Linear:
+    """A layer with Glorot-uniform weights and zero bias, as in the published code, drawn from ``init`` alone."""
+    layer = nn.utils.skip_init(nn.Linear, inputs, outputs)
+    nn.init.xavier_uniform_(layer.weight, generator=init)
+    nn.init.zeros_(layer.bias)
+    return layer
+
+
+def _linear_of_parts(
+    layer: nn.Linear, first: Float[Tensor, "*#points a"], second: Float[Tensor, "*#points b"]
+) -> Float[Tensor, "*points c"]:
+    """layer(cat([first, second], -1)) without the copy; ``second`` may be one per ray where ``first`` is per point."""
+    split = first.shape[-1]
+    weight = layer.weight
+    return functional.linear(first, weight[:, :split], layer.bias) + functional.linear(second, weight[:, split:])

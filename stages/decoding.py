@@ -1,0 +1,318 @@
+"""Decoding one image file of any kind into upright 8-bit sRGB, and what EXIF tells of its camera.
+
+Files come from anywhere: formats are a fixed list, sizes are checked before pixels are decoded, and whatever goes
+wrong becomes a :class:`DecodeError` with a reason a user understands.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+if TYPE_CHECKING:
+    import numpy as np
+    from PIL import Image
+
+MAX_PIXELS = 250_000_000
+MIN_SIDE_PX = 16
+# EPS and its like run interpreters; RAW files would be read as their thumbnails.
+_FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP", "GIF", "PPM", "HEIF", "AVIF", "JPEG2000")
+_RAW = (".dng", ".cr2", ".cr3", ".nef", ".nrw", ".arw", ".srf", ".raf", ".orf", ".rw2", ".pef", ".raw", ".iiq")
+# What COLMAP, too, accepts as focal length over the longer side.
+_FOCAL_RATIO = (0.1, 10.0)
+_SRGB_TOLERANCE = 2  # of 255: profiles closer than this to sRGB are sRGB written by another hand
+
+
+class DecodeError(Exception):
+    """A file that cannot become a photo; the text is the reason, to be shown after its name."""
+
+
+class CameraKey(NamedTuple):
+    """Photos for which all of this agrees share intrinsics. Orientation counts: it moves the principal point."""
+
+    make: str
+    model: str
+    lens: str
+    width: int
+    height: int
+    orientation: int
+    focal_mm: float | None
+    focal_px: float | None
+
+
+@dataclass(frozen=True)
+class Decoded:
+    """One image, upright, sRGB. ``focal_px`` is for these pixels, None where EXIF tells none or an absurd one.
+
+    ``suffix`` is ".jpg" or ".png" if the file's own bytes already say exactly this to any program (8-bit RGB or
+    RGBA, sRGB, upright, one frame), so that they can be copied; otherwise None. ``notes`` tell what was assumed.
+    """
+
+    pixels: "np.ndarray"  # (h, w, 3 or 4) uint8
+    focal_px: float | None
+    focal_source: str | None
+    camera_key: CameraKey
+    suffix: str | None
+    notes: tuple[str, ...]
+
+
+def decode(path: Path) -> Decoded:
+    """Decode one image file. Raises DecodeError with the reason if that cannot be done."""
+    if path.suffix.lower() in _RAW:
+        raise DecodeError("camera raw files are not read; export JPEG, PNG or TIFF")
+    with _open(path) as image:
+        stored_plainly = _is_plain(image)
+        _load(image)
+        return _convert(image, stored_plainly)
+
+
+@cache
+def _pillow() -> ModuleType:
+    """Pillow, able to read HEIC, with its own pixel limit replaced by ours."""
+    import logging
+    import warnings
+
+    import pillow_heif
+    from PIL import Image
+
+    pillow_heif.register_heif_opener()
+    Image.MAX_IMAGE_PIXELS = None
+    # What is wrong with a file we say ourselves.
+    warnings.filterwarnings("ignore", category=UserWarning, module=r"PIL\.")
+    logging.getLogger("PIL").setLevel(logging.CRITICAL)
+    Image.init()
+    return Image
+
+
+def _open(path: Path) -> "Image.Image":
+    """The image with its header read, of a size we accept."""
+    pillow = _pillow()
+    try:
+        image = pillow.open(path, formats=_FORMATS)
+    except pillow.UnidentifiedImageError as error:
+        raise DecodeError(_unrecognised(path)) from error
+    except FileNotFoundError as error:
+        raise DecodeError("there is no such file") from error
+    except Exception as error:  # on damaged files Pillow's parsers raise whatever they run into
+        if isinstance(error, OSError) and error.errno is not None:  # not Pillow's but the system's
+            raise DecodeError(f"cannot be read: {error.strerror}") from error
+        raise DecodeError(f"damaged: its header cannot be read ({error})") from error
+    width, height = image.size
+    if width * height > MAX_PIXELS:
+        megapixels = width * height / 1e6
+        raise DecodeError(f"{width}×{height} is {megapixels:.0f} megapixels; the limit is {MAX_PIXELS / 1e6:.0f}")
+    if min(width, height) < MIN_SIDE_PX:
+        raise DecodeError(f"{width}×{height} is too small; at least {MIN_SIDE_PX} pixels a side")
+    return image
+
+
+def _load(image: "Image.Image") -> None:
+    """Decode the pixels."""
+    try:
+        image.load()
+    except MemoryError as error:
+        raise DecodeError("does not fit into memory") from error
+    except OSError as error:
+        raise DecodeError(_what_is_missing(image, error)) from error
+    except Exception as error:  # as in _open
+        raise DecodeError(f"damaged: {error}") from error
+
+
+def _unrecognised(path: Path) -> str:
+    with path.open("rb") as file:
+        head = file.read(256)
+    if not head:
+        return "the file is empty"
+    if head.startswith((b"\xff\xd8", b"\x89PNG")):
+        return "damaged: its header cannot be read"
+    if all(byte in b"\t\r\n" or 32 <= byte < 127 for byte in head):
+        return "not an image: it is text"
+    return "not an image of a known format"
+
+
+def _convert(image: "Image.Image", stored_plainly: bool) -> Decoded:
+    """The loaded image as upright sRGB."""
+    import numpy as np
+
+    notes: list[str] = []
+    tags, orientation = _exif(image, notes)
+    converted, is_srgb = _to_srgb(_to_eight_bit(image), image.info.get("icc_profile"), notes)
+    pixels = np.asarray(_upright(converted, orientation))
+    opaque = pixels.shape[2] == 4 and bool((pixels[..., 3] == 255).all())
+    pixels = np.ascontiguousarray(pixels[..., :3] if opaque else pixels)
+    focal_px, focal_source = focal_from_exif(tags, *image.size)
+    if (frames := _frame_count(image)) > 1:
+        notes.append(f"first of {frames} frames")
+    copy = stored_plainly and is_srgb and orientation == 1 and not opaque
+    return Decoded(
+        pixels=pixels,
+        focal_px=focal_px,
+        focal_source=focal_source,
+        camera_key=_camera_key(tags, pixels.shape[1], pixels.shape[0], orientation, focal_px),
+        suffix=(".png" if image.format == "PNG" else ".jpg") if copy else None,
+        notes=tuple(notes),
+    )
+
+
+def _is_plain(image: "Image.Image") -> bool:
+    """Whether the file stores 8-bit RGB (or PNG RGBA) and nothing else. To be asked before its pixels are loaded."""
+    if image.format in ("JPEG", "MPO"):  # the further frames of phones' MPO files are previews and gain maps
+        return image.mode == "RGB"
+    if image.format != "PNG" or getattr(image, "n_frames", 1) > 1 or "transparency" in image.info:
+        return False
+    return image.tile[0].args in ("RGB", "RGBA")  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def _frame_count(image: "Image.Image") -> int:
+    """How many pictures the file shows. Asked last: counting the pages of a damaged TIFF spoils the image object."""
+    if image.format in ("MPO", "HEIF"):  # previews, depth and gain maps
+        return 1
+    try:
+        return getattr(image, "n_frames", 1)
+    except Exception:  # as in _open; the first page was read
+        return 1
+
+
+def _what_is_missing(image: Any, error: OSError) -> str:
+    """Words for an image whose pixels end early; rows that were not decoded have stayed zero."""
+    import numpy as np
+
+    word = "truncated" if "truncated" in str(error) else "damaged"
+    if image.format not in ("JPEG", "MPO", "PNG"):
+        return f"{word}: {error}"
+    image.tile = []  # what is there is all there is: do not try again
+    rows = np.asarray(image).reshape(image.height, -1).any(axis=1)
+    missing = 1 - (np.flatnonzero(rows)[-1] + 1) / image.height if rows.any() else 1.0
+    return f"{word}: {100 * missing:.0f} % of the picture is missing" if missing >= 0.005 else f"{word}: {error}"
+
+
+def _to_eight_bit(image: "Image.Image") -> "Image.Image":
+    """``image`` in mode L, LA, RGB, RGBA or CMYK."""
+    if image.mode in ("I", "I;16", "I;16L", "I;16B", "F"):
+        return _quantised(image)
+    if image.has_transparency_data:
+        return image if image.mode in ("LA", "RGBA") else image.convert("RGBA")
+    if image.mode in ("L", "RGB", "CMYK"):
+        return image
+    try:
+        return image.convert("L" if image.mode == "1" else "RGB")
+    except ValueError as error:
+        raise DecodeError(f"its pixel format {image.mode} is not read; export JPEG, PNG or TIFF") from error
+
+
+def _quantised(image: "Image.Image") -> "Image.Image":
+    """Grey of 16 bits, or of floats in [0, 1], as 8 bits."""
+    import numpy as np
+
+    values = np.asarray(image)
+    limit = 1.0 if image.mode == "F" else 65535.0
+    if not (values.min() >= 0 and values.max() <= limit):
+        raise DecodeError(f"pixel values from {values.min()} to {values.max()}; export it with 8 or 16 bits")
+    return _pillow().fromarray(np.rint(values * (255 / limit)).astype(np.uint8))
+
+
+def _to_srgb(image: "Image.Image", profile: bytes | None, notes: list[str]) -> "tuple[Image.Image, bool]":
+    """``image`` as RGB or RGBA in sRGB, and whether its values already were sRGB."""
+    import io
+
+    from PIL import ImageCms
+
+    mode = "RGBA" if image.mode in ("LA", "RGBA") else "RGB"
+    if not profile:
+        return image.convert(mode), True
+    source = image.convert("RGBA") if image.mode == "LA" else image
+    try:
+        transform = ImageCms.buildTransform(
+            ImageCms.ImageCmsProfile(io.BytesIO(profile)), ImageCms.createProfile("sRGB"), source.mode, mode
+        )
+        if source.mode == mode and _is_identity(transform, mode):
+            return source, True
+        converted = ImageCms.applyTransform(source, transform) or source  # None only for in-place work
+    except (ImageCms.PyCMSError, OSError, ValueError) as error:
+        notes.append(f"colour profile ignored ({error})")
+        return image.convert(mode), False
+    return converted, False
+
+
+def _is_identity(transform: Any, mode: str) -> bool:
+    import numpy as np
+    from PIL import ImageCms
+
+    levels = np.arange(0, 256, 15, dtype=np.uint8)
+    cube = np.stack(np.meshgrid(levels, levels, levels), axis=-1).reshape(len(levels), -1, 3)
+    before = _pillow().fromarray(cube).convert(mode)
+    after = ImageCms.applyTransform(before, transform)
+    return int(np.abs(np.asarray(before, int) - np.asarray(after, int)).max()) <= _SRGB_TOLERANCE
+
+
+def _upright(image: "Image.Image", orientation: int) -> "Image.Image":
+    """Undo an EXIF orientation (EXIF 2.32, tag 0x0112)."""
+    turns = _pillow().Transpose
+    turn = {
+        2: turns.FLIP_LEFT_RIGHT,
+        3: turns.ROTATE_180,
+        4: turns.FLIP_TOP_BOTTOM,
+        5: turns.TRANSPOSE,
+        6: turns.ROTATE_270,
+        7: turns.TRANSVERSE,
+        8: turns.ROTATE_90,
+    }.get(orientation)
+    return image if turn is None else image.transpose(turn)
+
+
+def _exif(image: "Image.Image", notes: list[str]) -> tuple[dict[str, Any], int]:
+    """EXIF tags by name, and the orientation (1 where absent or invalid)."""
+    from PIL import ExifTags
+
+    try:
+        exif = image.getexif()
+        tags = {**exif, **exif.get_ifd(ExifTags.IFD.Exif)}
+    except Exception:  # as in _open; the pixels are good
+        notes.append("its EXIF cannot be read")
+        return {}, 1
+    named = {ExifTags.TAGS.get(tag, str(tag)): value for tag, value in tags.items()}
+    orientation = named.get("Orientation")
+    return named, orientation if isinstance(orientation, int) and 1 <= orientation <= 8 else 1
+
+
+def focal_from_exif(tags: dict[str, Any], width: int, height: int) -> tuple[float | None, str | None]:
+    """Focal length in pixels of an image of this size from EXIF, and the tag it came from; None if not told.
+
+    The 35 mm equivalent is by the diagonal, as CIPA DCG-001 defines it and COLMAP reads it:
+    f_px = f_35 · diagonal_px / 43.27. Otherwise FocalLength with the focal plane resolution, which counts pixels
+    as the camera wrote them, so it is scaled to the present width (COLMAP does not). If the recorded pixel
+    dimensions have another aspect the image was cropped and neither says anything.
+    """
+    longer, shorter = max(width, height), min(width, height)
+    recorded = _positive(tags.get("ExifImageWidth")), _positive(tags.get("ExifImageHeight"))
+    camera_longer = longer
+    if recorded[0] and recorded[1]:
+        camera_longer = max(recorded[0], recorded[1])
+        if abs(min(recorded[0], recorded[1]) / camera_longer * longer / shorter - 1) > 0.02:
+            return None, None
+    focal, source = None, None
+    focal_mm, resolution = _positive(tags.get("FocalLength")), _positive(tags.get("FocalPlaneXResolution"))
+    unit_mm = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}.get(tags.get("FocalPlaneResolutionUnit", 2))
+    if focal_35 := _positive(tags.get("FocalLengthIn35mmFilm")):
+        focal, source = focal_35 / 43.27 * math.hypot(width, height), "FocalLengthIn35mmFilm"
+    elif focal_mm and resolution and unit_mm:
+        focal, source = focal_mm * resolution / unit_mm * longer / camera_longer, "FocalPlaneXResolution"
+    if focal is None or not _FOCAL_RATIO[0] <= focal / longer <= _FOCAL_RATIO[1]:
+        return None, None
+    return focal, source
+
+
+def _positive(value: Any) -> float | None:
+    """``value`` as a positive finite float; None for anything else that EXIF may hold."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None
+    return number if math.isfinite(number) and number > 0 else None
+
+
+def _camera_key(tags: dict[str, Any], width: int, height: int, orientation: int, focal_px: float | None) -> CameraKey:
+    make, model, lens = (str(tags.get(tag, "")).strip("\0 ") for tag in ("Make", "Model", "LensModel"))
+    return CameraKey(make, model, lens, width, height, orientation, _positive(tags.get("FocalLength")), focal_px)

@@ -1,0 +1,220 @@
+"""Stage mesh: the field's density becomes a coloured triangle mesh.
+
+density lattice over the region of interest → marching cubes at the density where the photos' rays stop → only
+what the photos cover and see → decimation → colours from the field, seen as the photos saw it → PLY, OBJ, GLB.
+A surface that leaves the region of interest ends there, open: closing it would invent geometry.
+"""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal, NamedTuple
+
+from pydantic import Field
+
+from stages.contract import Inputs, Progress, StageConfig, StageError, StageResult
+from stages.files import read_json, read_scene
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from nerf.lattice import Lattice
+    from nerf.model import RadianceModel
+    from nerf.scene import Scene
+    from stages.mesh_cleaning import Cleaned
+    from stages.mesh_files import ColouredMesh
+    from stages.mesh_level import Level
+    from stages.mesh_views import ShadowMap, Sight
+
+NEEDS = ("normalise", "train")
+VERSION = 1
+RESUMES = False
+LINKS = ("mesh.glb", "mesh.ply", "mesh.obj")
+
+HALF_BOX = 0.9  # the region of interest is [-0.9, 0.9]^3 of the scene frame
+CHUNK = 1 << 16
+LEVEL_RAYS = 1024
+POINTS_PER_RAY = 20  # lattice points per ray trained: about a tenth of what training cost
+BYTES_PER_POINT = 24  # density, occupancy and the copies of both that marching cubes makes
+
+Format = Literal["glb", "ply", "obj"]
+
+
+class Config(StageConfig):
+    """Settings of stage mesh."""
+
+    resolution: int | None = Field(None, ge=16, le=1024, description="lattice points per edge; none: from the training")
+    level: float | None = Field(None, gt=0, description="density of the surface; none: where the photos' rays stop")
+    keep: Literal["visible", "largest", "all"] = Field("visible", description="which parts of the raw surface")
+    min_views: int = Field(2, ge=1, description="photos that must look at a part for it to be visible")
+    min_component: float = Field(0.01, ge=0, le=1, description="smallest component kept, in areas of the largest")
+    max_faces: int = Field(300_000, ge=100, description="faces left by decimation")
+    formats: tuple[Format, ...] = Field(("glb", "ply"), min_length=1, description="files to write")
+    frame: Literal["sfm", "scene"] = Field("sfm", description="frame of the coordinates in the files")
+
+
+class Reconstruction(NamedTuple):
+    """What the compute part hands over; ``mesh`` is in the scene frame."""
+
+    mesh: "ColouredMesh"
+    level: "Level"
+    cleaned: "Cleaned"
+    ends: str
+    voxel: float
+
+
+def plan(config: Config, inputs: Inputs) -> Config:
+    """Choose the resolution from how much was trained."""
+    rays = read_json(inputs["train"] / "field.json")["rays"]
+    return config.model_copy(update={"resolution": config.resolution or affordable_resolution(rays)})
+
+
+def affordable_resolution(rays: int) -> int:
+    """Lattice points per edge that cost about a tenth of the training of ``rays``, a multiple of 16 in 96 ... 256."""
+    edge = (POINTS_PER_RAY * rays) ** (1 / 3)
+    return min(256, max(96, round(edge / 16) * 16))
+
+
+def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> StageResult:
+    """Extract the mesh and write it in every format asked for, with a picture of it."""
+    from stages.device import compute_device
+    from stages.field_files import load_field
+
+    scene = read_scene(inputs["normalise"])
+    device = compute_device()
+    model, info = load_field(inputs["train"], device)
+    resolution = config.resolution or affordable_resolution(info["rays"])
+    config = config.model_copy(update={"resolution": resolution})
+    result = reconstruct(config, model, scene, device, progress)
+    outputs = write_mesh(config, result.mesh, scene, folder)
+    faces, parts = len(result.mesh.faces), result.cleaned.kept
+    count = f"{faces / 1000:.0f} k faces" if faces >= 10_000 else f"{faces} faces"
+    line = f"{count}, {parts} component{'s' * (parts > 1)}, {result.ends}"
+    return StageResult(outputs, line, facts=_facts(config, result, scene))
+
+
+def reconstruct(
+    config: Config, model: "RadianceModel", scene: "Scene", device: str, progress: Progress
+) -> Reconstruction:
+    """The mesh of ``model`` in the scene frame; ``config.resolution`` must be set. Raises StageError without one."""
+    from stages.mesh_cleaning import clean, openness
+    from stages.mesh_files import ColouredMesh
+    from stages.mesh_surface import decimate, extract, vertex_normals
+    from stages.mesh_views import look, shadow_maps
+
+    lattice = _density(config, model, device, progress)
+    voxel = float(lattice.spacing().max())
+    views = scene.of_split("train")
+    maps = shadow_maps(lattice, scene, views, lambda done: progress.update("visibility", 0.6 + 0.2 * done))
+    level = _level(config, lattice, model, maps, progress)
+    progress.update("marching cubes", 0.8)
+    raw = extract(lattice, level.level)
+    sight = look(raw.vertices, vertex_normals(raw), scene, maps, voxel)
+    progress.update("cleaning", 0.85)
+    cleaned = clean(raw, sight, config.keep, min(config.min_views, len(views)), config.min_component)
+    surface = decimate(cleaned.surface, config.max_faces)
+    progress.update("colours", 0.9)
+    normals = vertex_normals(surface)
+    sight = look(surface.vertices, normals, scene, maps, voxel)
+    colours = _colours(model, surface.vertices, sight, device)
+    mesh = ColouredMesh(*surface, normals, colours)
+    return Reconstruction(mesh, level, cleaned, openness(surface, HALF_BOX, voxel), voxel)
+
+
+def _density(config: Config, model: "RadianceModel", device: str, progress: Progress) -> "Lattice":
+    import psutil
+    import torch
+
+    from nerf.lattice import density_lattice
+
+    assert config.resolution is not None
+    needed, available = BYTES_PER_POINT * config.resolution**3, psutil.virtual_memory().available
+    if needed > available:
+        fits = int((available / BYTES_PER_POINT) ** (1 / 3)) // 16 * 16
+        why = f"a lattice of {config.resolution}³ needs {needed / 2**30:.1f} GB and {available / 2**30:.1f} GB are free"
+        raise StageError("not enough memory for the mesh", why, f"Try --mesh.resolution {fits}.")
+    corner = torch.full((3,), HALF_BOX, device=device)
+    edge = config.resolution
+
+    def report(done: float) -> None:
+        progress.update(f"density at {edge}³ points", 0.6 * done)
+
+    return density_lattice(model, edge, -corner, corner, CHUNK, report)
+
+
+def _level(
+    config: Config, lattice: "Lattice", model: "RadianceModel", maps: "list[ShadowMap]", progress: Progress
+) -> "Level":
+    """The level asked for, or the one chosen from a fixed share of the maps' rays."""
+    import torch
+
+    from nerf.rays import Rays
+    from stages.mesh_level import Level, check_range, choose_level
+
+    check_range(lattice, config.level)
+    if config.level is not None:
+        return Level(config.level, "as asked", None)
+    every = Rays(*(torch.cat([getattr(m.rays, part).flatten(0, 1) for m in maps]) for part in Rays._fields))
+    stride = max(1, len(every.near) // LEVEL_RAYS)
+    level = choose_level(lattice, model, Rays(*(part[::stride] for part in every)))
+    progress.note(f"surface at density {level.level:.3g}: {level.reason}")
+    return level
+
+
+def _colours(model: "RadianceModel", vertices: "np.ndarray", sight: "Sight", device: str) -> "np.ndarray":
+    """sRGB bytes (n, 3) of the field at each vertex, in the direction from which the photos saw it."""
+    import torch
+
+    points = torch.tensor(vertices, dtype=torch.float32, device=device)
+    directions = torch.tensor(sight.direction, dtype=torch.float32, device=device)
+    with torch.no_grad():
+        chunks = zip(points.split(CHUNK), directions.split(CHUNK), strict=True)
+        colours = torch.cat([model.colour(p, d) for p, d in chunks])
+    return (colours.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
+
+
+def write_mesh(config: Config, mesh: "ColouredMesh", scene: "Scene", folder: Path) -> tuple[str, ...]:
+    """Write the files asked for, in the frame asked for, and preview.png; their names."""
+    from PIL import Image
+
+    from stages.mesh_files import Z_UP_TO_Y_UP, write_glb, write_obj, write_ply
+    from stages.mesh_picture import picture
+
+    Image.fromarray(picture(mesh, scene)).save(folder / "preview.png")
+    upright = Z_UP_TO_Y_UP
+    if config.frame == "sfm":
+        to_sfm = scene.scene_from_sfm.inverse()
+        mesh = mesh._replace(vertices=to_sfm.points(mesh.vertices), normals=mesh.normals @ to_sfm.rotation.T)
+        upright = upright @ scene.scene_from_sfm.rotation
+    formats = sorted(set(config.formats))
+    for kind in formats:
+        path = folder / f"mesh.{kind}"
+        if kind == "glb":
+            write_glb(path, mesh, upright)
+        elif kind == "ply":
+            write_ply(path, mesh)
+        else:
+            write_obj(path, mesh)
+    return (*(f"mesh.{kind}" for kind in formats), "preview.png")
+
+
+def _facts(config: Config, result: Reconstruction, scene: "Scene") -> dict[str, object]:
+    """Plain values for the report; lengths are in the frame of the files."""
+    from stages.mesh_surface import Surface, face_areas
+
+    unit = 1 / scene.scene_from_sfm.scale if config.frame == "sfm" else 1.0
+    mesh = result.mesh
+    return {
+        "vertices": len(mesh.vertices),
+        "faces": len(mesh.faces),
+        "watertight": result.ends == "watertight",
+        "ends": result.ends,
+        "components_kept": result.cleaned.kept,
+        "components_dropped": result.cleaned.dropped,
+        "faces_uncovered": result.cleaned.uncovered,
+        "level": result.level.level,
+        "level_reason": result.level.reason,
+        "level_miss_voxels": result.level.miss_voxels,
+        "resolution": config.resolution,
+        "voxel": result.voxel * unit,
+        "surface_area": float(face_areas(Surface(mesh.vertices, mesh.faces)).sum()) * unit**2,
+        "frame": config.frame,
+    }

@@ -1,0 +1,148 @@
+"""A shaded picture of a mesh without GPU, display or library: a z-buffer in numpy.
+
+Every triangle is tested against the pixels of its bounding box, all triangles at once and in blocks of fixed size.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+SUPERSAMPLING = 2
+BLOCK = 1 << 21  # triangle-pixel pairs tested at a time
+KEY_LIGHT, HEADLIGHT, SKY = 0.45, 0.30, 0.30  # shares of the shading; together a little over 1 where all agree
+TOWARDS_LIGHT = np.array([-0.5, -0.75, -0.45]) / np.linalg.norm([0.5, 0.75, 0.45])  # camera axes: upper left, behind
+CLAY = np.array([205, 200, 192], np.uint8)
+BACKFACE = np.array([96, 84, 92])  # the inside of an open surface must not pass for its outside
+SKY_TOP, SKY_BOTTOM = np.array([250.0, 251, 253]), np.array([222.0, 226, 232])
+
+
+class Viewpoint(NamedTuple):
+    """A pinhole camera with OpenCV axes: pose [R | centre] (3, 4), focal length and size in pixels."""
+
+    from_camera: np.ndarray
+    focal_px: float
+    width: int
+    height: int
+
+
+def preview(
+    vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray | None, camera: Viewpoint, shading: float = 1.0
+) -> np.ndarray:
+    """Render a mesh to (height, width, 3) uint8.
+
+    ``colours`` are one uint8 triple per vertex, or None for plain clay; ``shading`` blends from the colours as they
+    are (0) to fully lit (1). Faces that reach behind the camera are left out.
+    """
+    large = camera._replace(
+        focal_px=camera.focal_px * SUPERSAMPLING,
+        width=camera.width * SUPERSAMPLING,
+        height=camera.height * SUPERSAMPLING,
+    )
+    points = (vertices - camera.from_camera[:, 3]) @ camera.from_camera[:, :3]
+    depth = points[:, 2]
+    ahead = (depth > 1e-6 * np.abs(points).max(initial=1e-30))[faces].all(axis=1)
+    faces = faces[ahead]
+    divisor = np.where(depth > 0, depth, 1.0)[:, None]
+    pixels = points[:, :2] / divisor * large.focal_px + [large.width / 2, large.height / 2]
+    face_of_pixel = _nearest_faces(pixels, depth, faces, large)
+    image = _background(large)
+    hit = np.flatnonzero(face_of_pixel >= 0)
+    if len(hit):
+        base = np.broadcast_to(CLAY, vertices.shape) if colours is None else colours
+        image[hit] = _shade(points, base, faces[face_of_pixel[hit]], hit, large, shading)
+    tiled = image.reshape(camera.height, SUPERSAMPLING, camera.width, SUPERSAMPLING, 3)
+    return np.rint(tiled.mean(axis=(1, 3))).astype(np.uint8)
+
+
+def _nearest_faces(pixels: np.ndarray, depth: np.ndarray, faces: np.ndarray, camera: Viewpoint) -> np.ndarray:
+    """The face in front at each pixel, flat, -1 where there is none."""
+    corners = pixels[faces]
+    size = np.array([camera.width, camera.height])
+    first = np.clip(np.ceil(corners.min(axis=1) - 0.5), 0, size).astype(np.int64)
+    last = np.clip(np.floor(corners.max(axis=1) - 0.5), -1, size - 1).astype(np.int64)
+    extent = np.maximum(last - first + 1, 0)
+    pairs = extent.prod(axis=1)
+    inverse_depth = 1 / depth[faces]
+    best = np.zeros(camera.width * camera.height)
+    winner = np.full(camera.width * camera.height, -1)
+    todo = np.flatnonzero(pairs)
+    ends = np.cumsum(pairs[todo])
+    for block in np.split(todo, np.searchsorted(ends, np.arange(BLOCK, ends[-1], BLOCK)) if len(ends) else []):
+        face = np.repeat(block, pairs[block])
+        within = np.arange(len(face)) - np.repeat(np.cumsum(pairs[block]) - pairs[block], pairs[block])
+        row, column = np.divmod(within, extent[face, 0])
+        x, y = first[face, 0] + column, first[face, 1] + row
+        share = _barycentric(corners[face], np.stack([x, y], axis=1) + 0.5)
+        inside = (share >= 0).all(axis=1)
+        face, pixel = face[inside], y[inside] * camera.width + x[inside]
+        nearness = (share[inside] * inverse_depth[face]).sum(axis=1)
+        order = np.argsort(nearness, kind="stable")  # of equal pixels the last, nearest, assignment stands
+        pixel, face, nearness = pixel[order], face[order], nearness[order]
+        front = nearness > best[pixel]
+        best[pixel[front]], winner[pixel[front]] = nearness[front], face[front]
+    return winner
+
+
+def _barycentric(corners: np.ndarray, point: np.ndarray) -> np.ndarray:
+    """Barycentric coordinates (n, 3) of points in 2-D triangles (n, 3, 2); negative for triangles without area."""
+    edges = corners - point[:, None]
+    parts = _cross(edges[:, [1, 2, 0]], edges[:, [2, 0, 1]])
+    area = parts.sum(axis=1, keepdims=True)
+    return np.divide(parts, area, out=np.full_like(parts, -1.0), where=area != 0)
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+
+
+def _shade(
+    points: np.ndarray, colours: np.ndarray, faces: np.ndarray, pixel: np.ndarray, camera: Viewpoint, shading: float
+) -> np.ndarray:
+    """Light the visible faces at their pixels; ``points`` are in camera coordinates."""
+    a, b, c = points[faces].swapaxes(0, 1)
+    normals = np.cross(b - a, c - a)
+    row, column = np.divmod(pixel, camera.width)
+    ray = np.stack([column + 0.5 - camera.width / 2, row + 0.5 - camera.height / 2], axis=1) / camera.focal_px
+    ray = np.concatenate([ray, np.ones((len(ray), 1))], axis=1)
+    share = np.stack([(ray * np.cross(p, q)).sum(axis=1) for p, q in ((b, c), (c, a), (a, b))], axis=1)
+    share /= share.sum(axis=1, keepdims=True)
+    colour = (share[:, :, None] * colours[faces]).sum(axis=1)
+    away = (normals * ray).sum(axis=1) > 0
+    normals = np.where(away[:, None], -normals, normals)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    light = KEY_LIGHT * np.clip(normals @ TOWARDS_LIGHT, 0, 1)
+    light += HEADLIGHT * np.abs((normals * ray).sum(axis=1)) / np.linalg.norm(ray, axis=1)
+    light += SKY * (0.5 - 0.5 * normals[:, 1]) + 0.15
+    lit = colour * (1 - shading + shading * light[:, None])
+    return np.clip(np.where(away[:, None], 0.5 * lit + 0.5 * BACKFACE * light[:, None], lit), 0, 255)
+
+
+def _background(camera: Viewpoint) -> np.ndarray:
+    """A light vertical gradient, flat (pixels, 3)."""
+    share = np.linspace(0, 1, camera.height)[:, None]
+    rows = (1 - share) * SKY_TOP + share * SKY_BOTTOM
+    return np.repeat(rows, camera.width, axis=0)
+
+
+def look_at(centre: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """The pose [R | centre] (3, 4) of a camera at ``centre`` that looks at ``target``; ``up`` must not lie on its axis."""
+    forward = (target - centre) / np.linalg.norm(target - centre)
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(forward, right), forward, centre], axis=1)
+
+
+def framing(
+    vertices: np.ndarray, towards: np.ndarray, up: np.ndarray, width: int, height: int, field_of_view: float = 35.0
+) -> Viewpoint:
+    """A camera that shows all of ``vertices`` from direction ``towards`` (from the mesh to the camera); degrees."""
+    towards = towards / np.linalg.norm(towards)
+    focal_px = min(width, height) / 2 / np.tan(np.radians(field_of_view) / 2)
+    pose = look_at(towards, np.zeros(3), up)
+    turned = vertices @ pose[:, :3]
+    middle = (turned.min(axis=0) + turned.max(axis=0)) / 2
+    turned = turned - middle
+    reach = np.abs(turned[:, :2]) * focal_px / (0.46 * np.array([width, height]))
+    distance = float((reach.max(axis=1) - turned[:, 2]).max())
+    centre = (middle - [0, 0, distance]) @ pose[:, :3].T
+    return Viewpoint(np.concatenate([pose[:, :3], centre[:, None]], axis=1), focal_px, width, height)

@@ -1,0 +1,106 @@
+"""Triangles: marching cubes, cleaning, decimation, and what is open.
+
+``vertices`` are (n, 3) float64, ``faces`` (m, 3) int32 indices, counter-clockwise seen from outside, that is from
+the side of lower density.
+"""
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from nerf.lattice import Lattice
+
+
+class Surface(NamedTuple):
+    """An indexed triangle mesh."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+
+
+def extract(lattice: "Lattice", level: float) -> Surface:
+    """The surface where density passes ``level`` (marching cubes, Lewiner et al. 2003); open where the box cuts it.
+
+    Raises ValueError when ``level`` is not strictly inside the lattice's range.
+    """
+    from skimage.measure import marching_cubes
+
+    from nerf.lattice import occupancy
+
+    values = occupancy(lattice, level).values.cpu().numpy()
+    index, faces, _, _ = marching_cubes(values, 0.5, gradient_direction="ascent")
+    vertices = lattice.low.cpu().double().numpy() + index * lattice.spacing().cpu().double().numpy()
+    return Surface(vertices, faces.astype(np.int32))
+
+
+def vertex_normals(surface: Surface) -> np.ndarray:
+    """Unit outward normals (n, 3), averaged over a vertex's faces by area; zero for a vertex without area."""
+    a, b, c = surface.vertices[surface.faces].swapaxes(0, 1)
+    cross = np.repeat(np.cross(b - a, c - a), 3, axis=0)
+    corner = surface.faces.reshape(-1)
+    count = len(surface.vertices)
+    normals = np.stack([np.bincount(corner, cross[:, axis], count) for axis in range(3)], axis=1)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
+
+
+def face_areas(surface: Surface) -> np.ndarray:
+    """Area of each face."""
+    a, b, c = surface.vertices[surface.faces].swapaxes(0, 1)
+    return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+
+
+def components(surface: Surface) -> np.ndarray:
+    """The number of the connected component of each face, 0 for the one of largest area, then downwards."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    first, second = surface.faces[:, [0, 1]].T, surface.faces[:, [1, 2]].T
+    start, end = np.concatenate([first, second], axis=1)
+    size = len(surface.vertices)
+    graph = coo_matrix((np.ones(len(start), bool), (start, end)), (size, size))
+    label = connected_components(graph, directed=False)[1][surface.faces[:, 0]]
+    _, label = np.unique(label, return_inverse=True)
+    order = np.argsort(-np.bincount(label, face_areas(surface)), kind="stable")
+    return np.argsort(order)[label]
+
+
+def keep_faces(surface: Surface, keep: np.ndarray) -> tuple[Surface, np.ndarray]:
+    """The faces marked in ``keep`` (m,) with the vertices they use, and the old index of each new vertex."""
+    faces = surface.faces[keep]
+    used = np.unique(faces)
+    new = np.zeros(len(surface.vertices), np.int32)
+    new[used] = np.arange(len(used))
+    return Surface(surface.vertices[used], new[faces]), used
+
+
+def decimate(surface: Surface, max_faces: int) -> Surface:
+    """Collapse edges until ``max_faces`` remain (quadrics, Garland and Heckbert 1997); open borders stay put."""
+    from fast_simplification import simplify
+
+    if len(surface.faces) <= max_faces:
+        return surface
+    vertices, faces = simplify(surface.vertices, surface.faces, target_count=max_faces, preserve_border=True)
+    return Surface(vertices.astype(np.float64), faces.astype(np.int32))
+
+
+def is_watertight(surface: Surface) -> bool:
+    """Whether every edge belongs to exactly two faces, which pass it in opposite directions."""
+    start, end = _directed_edges(surface)
+    size = len(surface.vertices)
+    forth, count = np.unique(start * size + end, return_counts=True)
+    return bool((count == 1).all() and np.array_equal(forth, np.unique(end * size + start)))
+
+
+def border_vertices(surface: Surface) -> np.ndarray:
+    """Positions of the ends of every edge that belongs to one face only, (2 × edges, 3)."""
+    start, end = _directed_edges(surface)
+    size = len(surface.vertices)
+    edge, count = np.unique(np.minimum(start, end) * size + np.maximum(start, end), return_counts=True)
+    return surface.vertices[np.concatenate(np.divmod(edge[count == 1], size))]
+
+
+def _directed_edges(surface: Surface) -> tuple[np.ndarray, np.ndarray]:
+    faces = surface.faces.astype(np.int64)
+    return faces.reshape(-1), faces[:, [1, 2, 0]].reshape(-1)

@@ -1,0 +1,111 @@
+"""What the training photos say about a surface: which vertices they cover, which they see, and from where.
+
+A photo *covers* a vertex that lies inside its image, between its near and far; it *sees* the vertex when the vertex
+faces it and no more than half of the light is lost on the way. Losses are looked up in a shadow map (Williams
+1978): one coarse map per photo of the distance at which its rays lose half of their light.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from nerf.lattice import Lattice
+    from nerf.rays import Rays
+    from nerf.scene import Scene, View
+
+RAYS = 1 << 17  # over all photos: enough for the level and the maps, seconds on two cores
+LONGEST = 96
+SLACK_VOXELS = 3.0  # the surface lies before the median depth, and the map is coarse
+SELDOM_TILTED = 0.1  # cosine between viewing ray and normal below which a vertex is seen edge-on
+
+
+class Sight(NamedTuple):
+    """Per vertex: how many photos cover it, how many see it, and the mean viewing direction (n, 3).
+
+    The direction is a unit vector from the cameras that see the vertex towards it, each weighted by how squarely
+    it looks at the surface; where none does, it is the inward normal.
+    """
+
+    covered: np.ndarray
+    seen: np.ndarray
+    direction: np.ndarray
+
+
+class ShadowMap(NamedTuple):
+    """A photo's coarse grid of rays (h, w) and the distance at which each loses half of its light."""
+
+    view: "View"
+    rays: "Rays"
+    stop: np.ndarray
+
+
+def shadow_maps(
+    lattice: "Lattice", scene: "Scene", views: Sequence["View"], on_view: Callable[[float], None]
+) -> list[ShadowMap]:
+    """One map per photo; together about ``RAYS`` rays, each with a sample per voxel of the longest edge."""
+    from nerf.lattice import stopping_distance
+    from stages.training_data import view_rays
+
+    maps = []
+    for number, view in enumerate(views):
+        camera = scene.cameras[view.camera]
+        pixels = camera.width * camera.height
+        downscale = max((pixels * len(views) / RAYS) ** 0.5, max(camera.width, camera.height) / LONGEST, 1.0)
+        rays = view_rays(scene, view, downscale)
+        rays = type(rays)(*(part.to(lattice.low.device) for part in rays))
+        stop = stopping_distance(lattice, rays, max(lattice.values.shape))
+        maps.append(ShadowMap(view, rays, stop.cpu().numpy()))
+        on_view((number + 1) / len(views))
+    return maps
+
+
+def look(vertices: np.ndarray, normals: np.ndarray, scene: "Scene", maps: Sequence[ShadowMap], voxel: float) -> Sight:
+    """Look at every vertex from every photo; ``voxel`` is the lattice's spacing in scene units."""
+    covered = np.zeros(len(vertices), np.int32)
+    seen = np.zeros(len(vertices), np.int32)
+    towards = np.zeros_like(vertices)
+    for shadow in maps:
+        offset = vertices - shadow.view.scene_from_camera[:, 3]
+        distance = np.linalg.norm(offset, axis=1)
+        cell = _cells(offset, distance, scene, shadow)
+        inside = np.flatnonzero((cell >= 0) & (distance >= shadow.view.near) & (distance <= shadow.view.far))
+        covered[inside] += 1
+        direction = offset[inside] / distance[inside, None]
+        facing = -(direction * normals[inside]).sum(axis=1)
+        reach = _widened(shadow.stop).reshape(-1)[cell[inside]] + SLACK_VOXELS * voxel
+        sees = (facing > SELDOM_TILTED) & (distance[inside] <= reach)
+        seen[inside[sees]] += 1
+        towards[inside[sees]] += direction[sees] * facing[sees, None]
+    length = np.linalg.norm(towards, axis=1, keepdims=True)
+    direction = np.where(length > 0, towards / np.where(length > 0, length, 1), -normals)
+    return Sight(covered, seen, direction)
+
+
+def _cells(offset: np.ndarray, distance: np.ndarray, scene: "Scene", shadow: ShadowMap) -> np.ndarray:
+    """The flat index of each point's cell in the shadow map, -1 outside the image.
+
+    Lens polynomials fold back far outside of the image; points at wider angles than any ray are therefore refused.
+    """
+    from stages.colmap import project
+
+    camera, rotation = scene.cameras[shadow.view.camera], shadow.view.scene_from_camera[:, :3]
+    height, width = shadow.stop.shape
+    points = offset @ rotation
+    widest = float((shadow.rays.directions.cpu().double().numpy() @ rotation[:, 2]).min())
+    cell = np.full(len(points), -1)
+    ahead = np.flatnonzero(points[:, 2] > max(widest - 0.02, 1e-6) * distance)
+    scaled = project(camera, points[ahead]) * [width / camera.width, height / camera.height]
+    with np.errstate(invalid="ignore"):
+        within = ((scaled >= 0) & (scaled < [width, height])).all(axis=1)
+    column, row = scaled[within].astype(np.int64).T
+    cell[ahead[within]] = row * width + column
+    return cell
+
+
+def _widened(stop: np.ndarray) -> np.ndarray:
+    """The largest distance among each cell and its neighbours, so that silhouettes do not hide what is behind."""
+    from scipy.ndimage import maximum_filter
+
+    return maximum_filter(stop, size=3, mode="nearest")

@@ -1,0 +1,194 @@
+"""Stage normalise: the calibrated scene in our own frame, the split, and the export for other programs."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pydantic import Field
+
+from stages.contract import Inputs, Progress, StageConfig, StageError, StageResult
+from stages.files import read_json, write_json, write_tensors
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from nerf.normalisation import Normalisation
+    from nerf.reconstruction import Reconstruction
+    from nerf.scene import Camera, Scene, Split
+    from stages.colmap import SparseModel
+    from stages.photos import Photo
+
+NEEDS = ("ingest", "sfm")
+VERSION = 1
+RESUMES = False
+LINKS = ("transforms.json",)
+
+FEWEST_VIEWS = 3  # one to hold out, two to train on
+FRUSTUM_SAMPLES = 32  # bearings along each side of a photo
+FULL_TURN_DEG = 320.0  # no gap wider than the step of nine photos around
+
+
+class Config(StageConfig):
+    """``roi`` is the region of interest as x, y, z, radius in the sfm frame (the frame of output/transforms.json
+    and output/sparse); None finds it. Every ``test_every``-th photo by name is held out, beginning with the first,
+    unless the cameras came with a split of their own.
+    """
+
+    roi: tuple[float, float, float, float] | None = None
+    test_every: int = Field(8, ge=2)
+
+
+def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> StageResult:
+    """Read the sparse model, choose the scene frame, write scene.json, points.safetensors and transforms.json."""
+    from nerf.normalisation import normalise
+    from stages.colmap import read_model
+    from stages.photos import read_photos
+    from stages.transforms_export import transforms
+
+    model = read_model(inputs["sfm"] / "sparse")
+    _check(config, len(model.images))
+    by_file = {photo.file: photo for photo in read_photos(inputs["ingest"])}
+    posed = sorted(
+        ((by_file[f"images/{image.file}"], i) for i, image in enumerate(model.images)), key=lambda pair: pair[0].name
+    )
+    photos, order = [photo for photo, _ in posed], [i for _, i in posed]
+    has_alpha = all(photo.has_alpha for photo in photos)
+    sfm = _reconstruction(model, order)
+    try:
+        found = normalise(sfm, has_alpha, config.roi)
+    except ValueError as error:
+        hint = "Take photos from different places, or give --normalise.roi."
+        raise StageError("the scene has no scale", str(error), hint) from error
+    official = read_json(inputs["sfm"] / "registration.json")["test_files"]
+    split = _split(photos, config.test_every, official)
+    scene = _scene(sfm, photos, [model.images[i].camera for i in order], model.cameras, found, split)
+    write_json(folder / "scene.json", scene.to_json())
+    write_tensors(folder / "points.safetensors", _points(model, sfm, found))
+    write_json(folder / "transforms.json", transforms(scene))
+    return StageResult(
+        outputs=("scene.json", "points.safetensors", "transforms.json"),
+        line=_line(found, has_alpha),
+        facts=_facts(scene, found),
+    )
+
+
+def _check(config: Config, views: int) -> None:
+    if views < FEWEST_VIEWS:
+        raise StageError(
+            f"only {views} photo{'s' * (views != 1)} with a known camera",
+            f"a scene needs at least {FEWEST_VIEWS}: two to learn from and one to check against",
+            "Add photos that overlap with these.",
+        )
+    if config.roi and config.roi[3] <= 0:
+        raise StageError(
+            f"--normalise.roi has radius {config.roi[3]:g}",
+            "the fourth number is the region's half side and must be above 0",
+            "Give x y z radius in the frame of output/transforms.json.",
+        )
+
+
+def _reconstruction(model: "SparseModel", order: list[int]) -> "Reconstruction":
+    """The sparse model as plain geometry, its photos in ``order``."""
+    import numpy as np
+
+    from nerf.reconstruction import Reconstruction
+    from stages.colmap import camera_rays
+
+    side = FRUSTUM_SAMPLES
+    bearings = [camera_rays(camera, side, side).reshape(-1, 3).astype(float) for camera in model.cameras]
+    return Reconstruction(
+        from_camera=np.stack([model.images[i].sfm_from_camera for i in order]),
+        bearings=np.stack([bearings[model.images[i].camera] for i in order]),
+        points=model.xyz,
+        view=np.argsort(order)[model.view],
+        point=model.point,
+    )
+
+
+def _split(photos: "list[Photo]", test_every: int, official: list[str] | None) -> "list[Split]":
+    """An official split as it came; else the first photo by name and every ``test_every``-th after it (as LLFF)."""
+    held_out = {photo.file for photo in photos[::test_every]}
+    if official is not None:
+        held_out = {f"images/{file}" for file in official}
+    return ["test" if photo.file in held_out else "train" for photo in photos]
+
+
+def _scene(
+    sfm: "Reconstruction",
+    photos: "list[Photo]",
+    camera_of: list[int],
+    cameras: "Sequence[Camera]",
+    found: "Normalisation",
+    split: "list[Split]",
+) -> "Scene":
+    """The scene, its views in order of name."""
+    from nerf.scene import Scene, View
+
+    views = tuple(
+        View(
+            name=photo.name,
+            file=photo.file,
+            camera=camera_of[i],
+            scene_from_camera=found.scene_from_sfm.pose(sfm.from_camera[i]),
+            near=float(found.near[i]),
+            far=float(found.far[i]),
+            split=split[i],
+        )
+        for i, photo in enumerate(photos)
+    )
+    return Scene(
+        cameras=tuple(cameras),
+        views=views,
+        scene_from_sfm=found.scene_from_sfm,
+        bounded=found.bounded,
+        has_alpha=all(photo.has_alpha for photo in photos),
+        layout=found.layout,
+        up_known=found.up.known,
+    )
+
+
+def _points(model: "SparseModel", sfm: "Reconstruction", found: "Normalisation") -> "dict[str, np.ndarray]":
+    """points.safetensors, as docs/ARCHITECTURE.md lists it."""
+    import numpy as np
+
+    return {
+        "xyz": found.scene_from_sfm.points(model.xyz).astype(np.float32),
+        "rgb": model.rgb.astype(np.uint8),
+        "error_px": model.error_px.astype(np.float32),
+        "view": sfm.view.astype(np.int32),
+        "point": sfm.point.astype(np.int32),
+        "xy": model.xy.astype(np.float32),
+    }
+
+
+def _line(found: "Normalisation", has_alpha: bool) -> str:
+    """What was decided, for the user."""
+    arc = 360 if found.arc_deg > FULL_TURN_DEG else round(found.arc_deg / 10) * 10
+    layout = {
+        "around": f"{arc}° around an object",
+        "inside": "inside a space, looking around",
+        "forward": "photos facing one way",
+    }[found.layout]
+    bounded = "all within the region of interest" if found.bounded else "background unbounded"
+    up = f"up from {found.up.source}" if found.up.known else "no up: the cameras disagree"
+    return f"{layout}, {'background transparent' if has_alpha else bounded} · {up}"
+
+
+def _facts(scene: "Scene", found: "Normalisation") -> dict[str, Any]:
+    """The decisions and the numbers behind them."""
+    from nerf.depth_range import REGION_HALF
+
+    return {
+        "layout": scene.layout,
+        "bounded": scene.bounded,
+        "has_alpha": scene.has_alpha,
+        "up": found.up.source,
+        "up_known": scene.up_known,
+        "arc_deg": round(found.arc_deg, 1),
+        "share_beyond_region": round(found.beyond, 4),
+        "region_half_sfm": REGION_HALF / scene.scene_from_sfm.scale,
+        "near": min(view.near for view in scene.views),
+        "far": max(view.far for view in scene.views),
+        "train": len(scene.of_split("train")),
+        "test": len(scene.of_split("test")),
+    }

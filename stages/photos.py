@@ -1,0 +1,83 @@
+"""The photos as ingest left them: what photos.json says of each, and their pixels at any size."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from stages.contract import StageError
+from stages.files import read_json, write_json
+
+if TYPE_CHECKING:
+    import numpy as np
+
+
+@dataclass(frozen=True)
+class Photo:
+    """One decoded photo, upright, 8-bit sRGB.
+
+    Photos of equal ``camera_group`` share intrinsics. ``focal_px`` is the focal length that EXIF tells, at this
+    size, and ``focal_source`` the tag it came from; both None where EXIF tells none. ``sharpness`` is the variance
+    of the Laplacian; it compares photos of one set and means nothing by itself.
+    """
+
+    name: str  # the user's own file name, relative to the photo folder
+    file: str  # "images/…", ASCII, relative to ingest's folder
+    width: int
+    height: int
+    camera_group: int
+    focal_px: float | None
+    focal_source: str | None
+    has_alpha: bool
+    sharpness: float
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """A file that was not taken, and why."""
+
+    name: str
+    reason: str
+
+
+def write_photos(folder: Path, photos: Sequence[Photo], refused: Sequence[Refusal], frames: Mapping[str, str]) -> None:
+    """Write photos.json. ``frames`` maps each file_path of the given cameras to the name of its photo."""
+    content = {"photos": [asdict(p) for p in photos], "refused": [asdict(r) for r in refused], "frames": dict(frames)}
+    write_json(folder / "photos.json", content)
+
+
+def read_photos(ingest_folder: Path) -> list[Photo]:
+    """The photos of a finished ingest, in order of their names. Raises StageError if photos.json is damaged."""
+    try:
+        return [Photo(**photo) for photo in read_json(ingest_folder / "photos.json")["photos"]]
+    except (KeyError, TypeError) as error:
+        raise StageError("cannot read photos.json", str(error), "Delete its folder and run again.") from error
+
+
+def read_frame_names(ingest_folder: Path) -> dict[str, str]:
+    """Photo name by file_path as the given transforms file spells it; empty if no cameras were given."""
+    return read_json(ingest_folder / "photos.json")["frames"]
+
+
+def load_pixels(path: Path, width: int, height: int) -> "np.ndarray":
+    """The image as (height, width, 3 or 4) uint8, each pixel the mean of the area it covers.
+
+    The means are taken of sRGB values weighted by alpha (premultiplied); a pixel that nothing covers is black.
+    At the image's own size the values are those stored. Enlarging interpolates linearly.
+    """
+    import cv2
+    import numpy as np
+    from PIL import Image
+
+    with Image.open(path) as image:
+        pixels = np.asarray(image)
+    if (pixels.shape[1], pixels.shape[0]) == (width, height):
+        return pixels
+    if pixels.shape[2] == 3:
+        return cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA)
+    alpha = pixels[..., 3:].astype(np.float32)
+    premultiplied = np.concatenate([pixels[..., :3] * alpha, alpha], axis=2)
+    resized = cv2.resize(premultiplied, (width, height), interpolation=cv2.INTER_AREA)
+    covered = resized[..., 3:] > 0
+    colour = np.divide(resized[..., :3], resized[..., 3:], out=np.zeros_like(resized[..., :3]), where=covered)
+    return np.rint(np.concatenate([colour, resized[..., 3:]], axis=2)).astype(np.uint8)

@@ -1,0 +1,139 @@
+"""Which cameras the video is seen through: a path fitted to the photos, or cameras from a file."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from stages.contract import StageError
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from nerf.scene import Camera, Scene, Similarity
+
+PathKind = Literal["orbit", "spiral", "interpolated"]
+BY_LAYOUT: dict[str, PathKind] = {"around": "orbit", "forward": "spiral", "inside": "interpolated"}
+LEAST_FOCAL = 0.5  # in widths: a pinhole wider than 90 degrees stretches its corners
+
+
+@dataclass(frozen=True)
+class CameraPath:
+    """One camera, all of one size, and one pose ``scene_from_camera`` (frames, 3, 4) per frame."""
+
+    cameras: "tuple[Camera, ...]"
+    poses: "np.ndarray"
+
+    def resized(self, width: int) -> "CameraPath":
+        """The same views, ``width`` pixels wide; width and height even."""
+        return replace(self, cameras=tuple(resized(camera, width) for camera in self.cameras))
+
+
+def fitted_path(scene: "Scene", kind: PathKind, frames: int) -> CameraPath:
+    """A path among the training photos, through an undistorted camera of median focal length."""
+    import numpy as np
+
+    from nerf import camera_paths
+
+    views = np.stack([view.scene_from_camera for view in scene.of_split("train")])
+    path = {
+        "orbit": camera_paths.orbit,
+        "spiral": camera_paths.spiral,
+        "interpolated": camera_paths.interpolated,
+    }[kind]
+    return CameraPath((median_camera(scene),) * frames, path(views, frames))
+
+
+def median_camera(scene: "Scene") -> "Camera":
+    """The most usual photo size with the median focal length, as a pinhole with a centred principal point."""
+    import numpy as np
+
+    from nerf.scene import Camera
+
+    cameras = [scene.cameras[view.camera] for view in scene.of_split("train")]
+    sizes = [(camera.width, camera.height) for camera in cameras]
+    width, height = max(sorted(set(sizes)), key=sizes.count)
+    relative = float(np.median([c.params[0] / max(c.width, c.height) for c in cameras]))
+    focal = max(relative * max(width, height), LEAST_FOCAL * width)
+    return Camera("PINHOLE", width, height, (focal, focal, width / 2, height / 2))
+
+
+def path_from_file(scene: "Scene", file: Path) -> CameraPath:
+    """The cameras of a transforms.json (or of a path.json that this stage wrote), which lives in the sfm frame.
+
+    Poses are OpenGL camera-to-world matrices; intrinsics stand at the top or in each frame: ``w``, ``h`` and ``fl_x``
+    (with ``fl_y``, ``cx``, ``cy``, distortion) or ``camera_angle_x``; what is missing is taken from the photos.
+    Raises StageError if the file cannot be used.
+    """
+    import numpy as np
+
+    from nerf.scene import Camera
+    from stages.sources import read_transforms
+    from stages.transforms_export import OPENGL_FROM_OPENCV
+
+    content = read_transforms(file)
+    usual = median_camera(scene)
+    cameras: list[Camera] = []
+    poses = []
+    for index, frame in enumerate(content["frames"]):
+        try:
+            cameras.append(_camera(content | frame, usual))
+            pose = np.array(frame["transform_matrix"], float)[:3].reshape(3, 4)
+        except (TypeError, ValueError) as error:
+            hint = "Give numbers as output/transforms.json and output/path.json have them."
+            raise StageError(f"cannot use frame {index} of {file.name}", str(error), hint) from error
+        poses.append(_in_scene(pose, OPENGL_FROM_OPENCV, scene.scene_from_sfm))
+    if len({(camera.width, camera.height) for camera in cameras}) > 1:
+        raise StageError(
+            f"cannot make one video of {file.name}", "its frames differ in size", "Give all frames one w and h."
+        )
+    return CameraPath(tuple(cameras), np.stack(poses))
+
+
+def _in_scene(pose: "np.ndarray", axes: "np.ndarray", scene_from_sfm: "Similarity") -> "np.ndarray":
+    """An OpenGL pose in the sfm frame as ours; its axes must be orthonormal, up to a scale common to all three."""
+    import numpy as np
+
+    from nerf.camera_paths import nearest_rotations
+
+    if not (np.isfinite(pose).all() and np.linalg.det(pose[:, :3]) > 0):
+        raise ValueError("transform_matrix is no camera pose")
+    turned = np.concatenate([nearest_rotations(pose[:, :3] @ axes), pose[:, 3:]], axis=1)
+    return scene_from_sfm.pose(turned)
+
+
+def _camera(values: dict[str, Any], usual: "Camera") -> "Camera":
+    """Intrinsics under the format's names as a COLMAP camera."""
+    import math
+
+    from nerf.scene import Camera
+
+    width, height = int(values.get("w", usual.width)), int(values.get("h", usual.height))
+    if "fl_x" in values:
+        fx = float(values["fl_x"])
+    elif "camera_angle_x" in values:
+        fx = 0.5 * width / math.tan(0.5 * float(values["camera_angle_x"]))
+    else:
+        fx = usual.params[0] * max(width, height) / max(usual.width, usual.height)
+    fy = float(values.get("fl_y", fx))
+    if not (width > 0 and height > 0 and 0 < fx < math.inf and 0 < fy < math.inf):
+        raise ValueError(f"size {width} x {height} with focal length {fx:g} is no camera")
+    pinhole = (fx, fy, float(values.get("cx", width / 2)), float(values.get("cy", height / 2)))
+    fisheye = values.get("camera_model") == "OPENCV_FISHEYE"
+    names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2")
+    distortion = tuple(float(values.get(name, 0.0)) for name in names)
+    if fisheye or any(distortion):
+        return Camera("OPENCV_FISHEYE" if fisheye else "OPENCV", width, height, pinhole + distortion)
+    return Camera("PINHOLE", width, height, pinhole)
+
+
+def even_height(width: int, camera: "Camera") -> int:
+    """The even number of rows that keeps the camera's proportions best."""
+    return max(2, 2 * round(width * camera.height / camera.width / 2))
+
+
+def resized(camera: "Camera", width: int) -> "Camera":
+    """The same view with another (even) width and the even height next to its proportions."""
+    height = even_height(width, camera)
+    sx, sy = width / camera.width, height / camera.height
+    fx, fy, cx, cy, *distortion = camera.params
+    return replace(camera, width=width, height=height, params=(sx * fx, sy * fy, sx * cx, sy * cy, *distortion))

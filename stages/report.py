@@ -1,0 +1,260 @@
+"""Stage report: everything that the other stages found, as one HTML file that needs no network, and summary.json.
+
+It reads the stages' outputs and the manifest.json that the runner leaves beside them. Stages may be missing; what
+they would have told is then left out, never made up.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pydantic import Field
+
+from stages.contract import Inputs, Progress, StageConfig, StageResult
+from stages.files import read_json, read_scene, read_tensors, write_json
+
+if TYPE_CHECKING:
+    from nerf.scene import Scene
+
+NEEDS = ("ingest", "sfm", "normalise", "train", "evaluate", "render", "mesh")
+VERSION = 1
+RESUMES = False
+LINKS = ("report.html", "summary.json")
+
+WIDTH_LARGE, WIDTH_SMALL = 900, 420  # pixels of a picture in the page
+MOST_SMALL = 12  # further test photos shown, besides the best, the median and the worst
+BACKGROUNDS = {"white": 255, "black": 0}
+
+
+class Config(StageConfig):
+    """Settings of stage report."""
+
+    video_limit_mb: float = Field(12, ge=0)
+    """A larger video lies beside the page and not inside it."""
+
+
+@dataclass(frozen=True)
+class Results:
+    """What the finished stages left. The parts of stages that have not run are None (``curve`` is empty)."""
+
+    inputs: Inputs
+    manifests: Mapping[str, dict[str, Any]]
+    photos: dict[str, Any] | None
+    registration: dict[str, Any] | None
+    scene: "Scene | None"
+    field: dict[str, Any] | None
+    curve: list[dict[str, Any]]
+    metrics: dict[str, Any] | None
+
+
+def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> StageResult:
+    """Write report.html and summary.json."""
+    progress.update("reading results")
+    results = read_results(inputs)
+    summary = summarise(results)
+    write_json(folder / "summary.json", summary)
+    progress.update("writing the page")
+    (folder / "report.html").write_text(page(results, summary, config), "utf-8")
+    return StageResult(("report.html", "summary.json"), summary["verdict"], facts={"verdict": summary["verdict"]})
+
+
+def read_results(inputs: Inputs) -> Results:
+    """Read what is there. Raises StageError for a file that a finished stage must have left and did not."""
+
+    def of(stage: str, name: str) -> Any:
+        return read_json(inputs[stage] / name) if stage in inputs else None
+
+    return Results(
+        inputs=inputs,
+        manifests={stage: of(stage, "manifest.json") for stage in NEEDS if stage in inputs},
+        photos=of("ingest", "photos.json"),
+        registration=of("sfm", "registration.json"),
+        scene=read_scene(inputs["normalise"]) if "normalise" in inputs else None,
+        field=of("train", "field.json"),
+        curve=of("train", "curve.json") or [],
+        metrics=of("evaluate", "metrics.json"),
+    )
+
+
+def summarise(results: Results) -> dict[str, Any]:
+    """The content of summary.json; null for what no stage has told."""
+    manifests, registration, metrics = results.manifests, results.registration or {}, results.metrics or {}
+    mesh = manifests["mesh"]["facts"] if "mesh" in manifests else None
+    return {
+        "photos": len(results.photos["photos"]) if results.photos else None,
+        **{key: registration.get(key) for key in ("registered", "camera_model", "reprojection_px")},
+        "field": results.field["kind"] if results.field else None,
+        "train_seconds": _training_seconds(results),
+        "total_seconds": round(sum(manifest["seconds"] for manifest in manifests.values()), 3),
+        **{key: metrics.get(key) for key in ("psnr", "ssim", "psnr_mean_image", "psnr_nearest_view")},
+        "mesh": mesh and {key: mesh[key] for key in ("vertices", "faces", "watertight")},
+        "verdict": metrics.get("verdict", "Not measured: stage evaluate has not run."),
+    }
+
+
+def page(results: Results, summary: dict[str, Any], config: Config) -> str:
+    """The whole HTML page."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    from stages.live_line import short_count
+    from stages.report_plots import clock
+
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {"clock": clock, "short": short_count, "thousands": "{:,}".format, "value": _value}
+    return environment.get_template("report.html.j2").render(
+        workspace=_workspace(results.inputs),
+        summary=summary,
+        metrics=results.metrics,
+        registration=results.registration,
+        manifests=results.manifests,
+        refused=results.photos["refused"] if results.photos else [],
+        missing=_missing(results),
+        video=_video(results.inputs, config.video_limit_mb),
+        compared=_compared(results),
+        curve=_curve(results),
+        cameras=_cameras(results),
+        mesh_preview=_mesh_preview(results.inputs),
+        longest=max((manifest["seconds"] for manifest in results.manifests.values()), default=0) or 1,
+        machine=results.manifests.get("train", next(iter(results.manifests.values()), {})).get("machine", {}),
+    )
+
+
+def _workspace(inputs: Inputs) -> str:
+    """The workspace folder's own name: stage folders are <workspace>/<stage>/<key>."""
+    return next((folder.resolve().parents[1].name for folder in inputs.values()), "")
+
+
+def _training_seconds(results: Results) -> float | None:
+    """Training time over all interruptions, as the curve counted it."""
+    return results.curve[-1]["seconds"] if results.curve else None
+
+
+def _missing(results: Results) -> list[dict[str, str]]:
+    """The photos without a known camera, by their own names, and why."""
+    if results.registration is None or results.photos is None:
+        return []
+    names = {photo["file"]: photo["name"] for photo in results.photos["photos"]}
+    return [
+        {"name": names[f"images/{image['file']}"], "reason": image["reason"] or "no reason is known"}
+        for image in results.registration["images"]
+        if not image["registered"]
+    ]
+
+
+def _video(inputs: Inputs, limit_mb: float) -> str | None:
+    """The video as a data URI, or its name beside the page where it is larger than the limit."""
+    if "render" not in inputs:
+        return None
+    video = inputs["render"] / "video.mp4"
+    return _data_uri(video.read_bytes(), "video/mp4") if video.stat().st_size < limit_mb * 1e6 else "video.mp4"
+
+
+def _mesh_preview(inputs: Inputs) -> str | None:
+    preview = inputs["mesh"] / "preview.png" if "mesh" in inputs else None
+    return _data_uri(preview.read_bytes(), "image/png") if preview and preview.exists() else None
+
+
+def _cameras(results: Results) -> dict[str, Any]:
+    """The camera layout as SVG by the name of the view."""
+    from markupsafe import Markup
+
+    from stages.report_plots import camera_svgs
+
+    if results.scene is None:
+        return {}
+    points = read_tensors(results.inputs["normalise"] / "points.safetensors")
+    return {name: Markup(svg) for name, svg in camera_svgs(results.scene, points["xyz"], points["rgb"]).items()}
+
+
+def _curve(results: Results) -> dict[str, Any] | None:
+    """The training curve and what the last doubling of the time bought, in dB."""
+    from markupsafe import Markup
+
+    from stages.report_plots import curve_svg, last_doubling
+
+    metrics = results.metrics or {}
+    baselines = {"nearest photo": "psnr_nearest_view", "mean image": "psnr_mean_image"}
+    svg = curve_svg(results.curve, {name: metrics.get(key) for name, key in baselines.items()})
+    return svg and {"svg": Markup(svg), "gain": last_doubling(results.curve), "seconds": _training_seconds(results)}
+
+
+def _compared(results: Results) -> dict[str, Any] | None:
+    """Photo, render and error of the best, median and worst test photos, and of some of the others, small."""
+    if results.metrics is None or results.scene is None or not results.metrics["images"]:
+        return None
+    ranked = sorted(results.metrics["images"], key=lambda image: (-image["psnr"], image["name"]))
+    roles = {0: "best", len(ranked) // 2: "median", len(ranked) - 1: "worst"} if len(ranked) > 2 else {}
+    large = roles or dict.fromkeys(range(len(ranked)), "test photo")
+    others = [rank for rank in range(len(ranked)) if rank not in large]
+    small = others[:: max(1, -(-len(others) // MOST_SMALL))]
+    return {
+        "large": [_pictures(results, ranked[rank], WIDTH_LARGE) | {"role": role} for rank, role in large.items()],
+        "small": [_pictures(results, ranked[rank], WIDTH_SMALL) for rank in small],
+        "ranked": ranked,
+    }
+
+
+def _pictures(results: Results, image: dict[str, Any], width: int) -> dict[str, Any]:
+    """One test photo's figures with its photo, render and error map as data URIs, all of one size."""
+    from PIL import Image
+
+    from stages.photos import load_pixels
+
+    assert results.scene is not None
+    view = next(view for view in results.scene.views if view.name == image["name"])
+    render = Image.open(results.inputs["evaluate"] / image["render"])
+    error = Image.open(results.inputs["evaluate"] / image["error"])
+    size = (min(width, render.width), max(1, round(render.height * min(1, width / render.width))))
+    background = BACKGROUNDS[results.manifests["evaluate"]["config"]["background"]]
+    photo = Image.fromarray(_opaque(load_pixels(results.inputs["ingest"] / view.file, *size), background))
+    pictures = {"photo": photo, "render": render.resize(size, Image.Resampling.BOX), "error": error.resize(size)}
+    aspect = round(size[0] / size[1], 4)
+    return image | {"aspect": aspect} | {name: _jpeg_uri(picture) for name, picture in pictures.items()}
+
+
+def _opaque(pixels: Any, background: int) -> Any:
+    """(H, W, 3) uint8 from (H, W, 3 or 4): transparent photos over a grey level, as they were scored."""
+    import numpy as np
+
+    if pixels.shape[2] == 3:
+        return pixels
+    alpha = pixels[..., 3:] / 255
+    return np.rint(pixels[..., :3] * alpha + background * (1 - alpha)).astype(np.uint8)
+
+
+def _jpeg_uri(picture: Any) -> str:
+    import io
+
+    buffer = io.BytesIO()
+    picture.save(buffer, "JPEG", quality=88)
+    return _data_uri(buffer.getvalue(), "image/jpeg")
+
+
+def _data_uri(content: bytes, media_type: str) -> str:
+    import base64
+
+    return f"data:{media_type};base64,{base64.b64encode(content).decode('ascii')}"
+
+
+def _value(value: Any) -> str:
+    """A setting or fact in words; of an absolute path only the name, so that the page can be given away."""
+    if value is None:
+        return "–"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, int):
+        return f"{value:,}"
+    if isinstance(value, float):
+        return f"{value:.4g}" if abs(value) < 1e4 else f"{value:,.0f}"
+    if isinstance(value, list):
+        return ", ".join(map(_value, value))
+    if isinstance(value, dict):
+        return ", ".join(f"{key} {_value(entry)}" for key, entry in value.items())
+    return Path(value).name if isinstance(value, str) and Path(value).is_absolute() else str(value)

@@ -1,0 +1,199 @@
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from nerf.camera_paths import nearest_rotations
+from nerf.normalisation import Normalisation, normalise
+from nerf.reconstruction import Reconstruction, angles_deg
+from nerf.region import find_layout
+from tests.camera_layouts import ball, ring, room, room_points, seen_by, wall, wall_points
+
+SCENES = {
+    "around": lambda: seen_by(ring(), ball()),
+    "forward": lambda: seen_by(wall(), wall_points()),
+    "inside": lambda: seen_by(room(), room_points()),
+}
+
+
+def with_points(scene: Reconstruction, points: np.ndarray, views: int) -> Reconstruction:
+    """The scene with more points, each seen by the first ``views`` photos."""
+    count = len(scene.points)
+    view, point = np.meshgrid(np.arange(views), count + np.arange(len(points)))
+    return dataclasses.replace(
+        scene,
+        points=np.concatenate([scene.points, points]),
+        view=np.concatenate([scene.view, view.ravel()]),
+        point=np.concatenate([scene.point, point.ravel()]),
+    )
+
+
+def region_half(found: Normalisation) -> float:
+    return 0.9 / found.scene_from_sfm.scale
+
+
+@pytest.mark.parametrize("layout", SCENES)
+def test_layouts_are_told_apart(layout: str) -> None:
+    assert find_layout(SCENES[layout]()) == layout
+
+
+def test_an_arc_that_converges_is_around_and_a_narrow_one_is_forward() -> None:
+    assert find_layout(seen_by(ring(arc_deg=110.0), ball())) == "around"
+    assert find_layout(seen_by(ring(arc_deg=30.0), ball())) == "forward"
+
+
+@pytest.mark.parametrize("layout", SCENES)
+def test_the_region_holds_nearly_all_that_is_seen_and_is_filled_by_it(layout: str) -> None:
+    scene = SCENES[layout]()
+    found = normalise(scene, False, None)
+    reach = np.abs(found.scene_from_sfm.points(scene.points))[np.unique(scene.point)].max(axis=1)
+    assert (reach <= 0.9).mean() >= 0.94
+    assert np.quantile(reach, 0.95) > 0.35
+
+
+@pytest.mark.parametrize("layout", SCENES)
+def test_up_becomes_z_and_the_frame_is_a_rotation(layout: str) -> None:
+    found = normalise(SCENES[layout](), False, None)
+    rotation = found.scene_from_sfm.rotation
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(rotation) > 0
+    assert found.up.known
+    np.testing.assert_allclose(rotation @ [0.0, 0.0, 1.0], [0.0, 0.0, 1.0], atol=1e-6)
+
+
+def test_a_facade_faces_plus_y() -> None:
+    found = normalise(SCENES["forward"](), False, None)
+    np.testing.assert_allclose(found.scene_from_sfm.rotation, np.eye(3), atol=1e-9)
+
+
+@pytest.mark.parametrize("layout", SCENES)
+def test_far_outliers_hardly_change_the_scale(layout: str) -> None:
+    clean = SCENES[layout]()
+    random = np.random.default_rng(1)
+    spoilt = with_points(clean, 1e4 * random.normal(size=(15, 3)), views=2)
+    before, after = region_half(normalise(clean, False, None)), region_half(normalise(spoilt, False, None))
+    assert 0.8 * before < after < 1.3 * before
+
+
+@pytest.mark.parametrize("layout", SCENES)
+def test_one_far_camera_hardly_changes_the_scale(layout: str) -> None:
+    clean = SCENES[layout]()
+    from_camera = clean.from_camera.copy()
+    from_camera[3, :, 3] += 1e3 * np.array([0.3, -0.9, 0.3])
+    keep = clean.view != 3
+    spoilt = dataclasses.replace(clean, from_camera=from_camera, view=clean.view[keep], point=clean.point[keep])
+    before, after = region_half(normalise(clean, False, None)), region_half(normalise(spoilt, False, None))
+    assert 0.8 * before < after < 1.25 * before
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    st.sampled_from(sorted(SCENES)),
+    st.integers(0, 1000),
+    st.floats(-6, 6).map(lambda exponent: 10.0**exponent),
+    st.floats(0, 1e6),
+)
+def test_similar_reconstructions_give_the_same_scene(layout: str, seed: int, scale: float, offset: float) -> None:
+    scene = SCENES[layout]()
+    turn = nearest_rotations(np.random.default_rng(seed).normal(size=(3, 3)))
+    # the sfm frame is offset by up to a million of its own units, which float64 holds to 1e-10 of them
+    shift = np.array([offset, -offset, offset / 2]) * min(1.0, scale)
+    moved = scene.in_frame(turn, -turn.T @ shift / scale, scale)
+    one, other = normalise(scene, False, None), normalise(moved, False, None)
+    assert (one.layout, one.bounded, one.up.source) == (other.layout, other.bounded, other.up.source)
+    np.testing.assert_allclose(
+        other.scene_from_sfm.points(moved.points), one.scene_from_sfm.points(scene.points), atol=1e-5
+    )
+    np.testing.assert_allclose(other.near, one.near, rtol=1e-4)
+    np.testing.assert_allclose(other.far, one.far, rtol=1e-4)
+
+
+@pytest.mark.parametrize("layout", SCENES)
+@pytest.mark.parametrize("has_alpha", [False, True])
+def test_every_observed_point_but_outliers_lies_between_near_and_far(layout: str, has_alpha: bool) -> None:
+    scene = SCENES[layout]()
+    found = normalise(scene, has_alpha, None)
+    distance = scene.distances() * found.scene_from_sfm.scale
+    assert (found.near > 0).all()
+    assert (found.near[scene.view] < distance).mean() > 0.99
+    assert (found.far[scene.view] > distance).mean() > 0.995
+    assert (found.near < 0.999 * found.far).all()
+
+
+def test_alpha_and_a_closed_room_are_bounded_and_a_far_background_is_not() -> None:
+    around = SCENES["around"]()
+    backdrop = 40 * ball(60)
+    backdrop = backdrop[np.linalg.norm(backdrop, axis=1) > 20]
+    assert normalise(around, True, None).bounded
+    assert normalise(around, False, None).bounded
+    assert normalise(SCENES["inside"](), False, None).bounded
+    assert not normalise(with_points(around, backdrop, views=4), False, None).bounded
+
+
+def test_unbounded_scenes_reach_far_behind_the_farthest_point() -> None:
+    found = normalise(with_points(SCENES["around"](), 30 * ball(60), views=4), False, None)
+    assert (found.far >= 20).all()
+    assert (found.far <= 1000).all()
+
+
+def test_a_full_turn_and_an_arc_are_measured() -> None:
+    assert normalise(seen_by(ring(count=36), ball()), False, None).arc_deg == pytest.approx(350, abs=1)
+    assert normalise(seen_by(ring(arc_deg=100.0), ball()), False, None).arc_deg == pytest.approx(100, abs=3)
+
+
+def test_without_points_the_cameras_frusta_give_the_region() -> None:
+    scene = seen_by(ring(radius=4.0, height=0.0), np.zeros((0, 3)))
+    found = normalise(scene, True, None)
+    assert region_half(found) == pytest.approx(4.0 * 0.5, rel=1e-3)  # distance x tan(half field of view)
+    np.testing.assert_allclose(found.scene_from_sfm.points(np.zeros(3)), 0, atol=1e-6)
+    assert found.bounded
+    assert 0 < found.near.min() < 4.0 * found.scene_from_sfm.scale < found.far.max() < 10
+    assert not normalise(scene, False, None).bounded
+
+
+@pytest.mark.parametrize("poses", [wall(), room()], ids=["forward", "inside"])
+def test_without_points_other_layouts_get_a_region_too(poses: np.ndarray) -> None:
+    found = normalise(seen_by(poses, np.zeros((0, 3))), False, None)
+    spread = np.linalg.norm(poses[:, :, 3] - np.median(poses[:, :, 3], axis=0), axis=1).max()
+    assert spread < region_half(found) < 30 * spread
+    assert (found.near > 0).all()
+
+
+def test_a_given_region_is_taken_as_it_is() -> None:
+    scene = SCENES["around"]()
+    found = normalise(scene, False, (0.2, -0.1, 0.3, 2.5))
+    np.testing.assert_allclose(found.scene_from_sfm.points(np.array([0.2, -0.1, 0.3])), 0, atol=1e-12)
+    assert region_half(found) == pytest.approx(2.5)
+    assert found.bounded
+    assert not normalise(scene, False, (0.0, 0.0, 0.0, 0.3)).bounded
+
+
+def test_photos_from_one_place_without_points_have_no_scale() -> None:
+    poses = ring(radius=1.0)
+    poses[:, :, 3] = 0
+    with pytest.raises(ValueError, match="all cameras stand in one place and no point is known"):
+        normalise(seen_by(poses, np.zeros((0, 3))), False, None)
+
+
+def test_lego_fills_the_region_and_stays_inside(shared_data) -> None:
+    import json
+
+    axes = np.diag([1.0, -1.0, -1.0])
+    frames = []
+    for part in ("train", "test"):
+        content = json.loads((shared_data / f"lego_400/transforms_{part}.json").read_text())
+        frames += [np.array(frame["transform_matrix"])[:3] for frame in content["frames"]]
+    poses = np.stack([np.concatenate([f[:, :3] @ axes, f[:, 3:]], axis=1) for f in frames])
+    scene = seen_by(poses, np.zeros((0, 3)))
+    tangent = np.tan(content["camera_angle_x"] / 2)
+    bearings = scene.bearings * [tangent / 0.5, tangent / 0.5, 1]
+    scene = dataclasses.replace(scene, bearings=bearings / np.linalg.norm(bearings, axis=-1, keepdims=True))
+    found = normalise(scene, True, None)
+    assert found.layout == "around"
+    assert found.bounded
+    assert angles_deg(found.up.direction, np.array([0.0, 0.0, 1.0])) < 1e-3
+    corners = np.array([[-0.65, -1.15, -0.5], [0.65, 1.15, 1.05]])  # of the lego itself, in Blender's units
+    reach = np.abs(found.scene_from_sfm.points(corners))
+    assert 0.5 < reach.max() < 0.9

@@ -1,0 +1,66 @@
+import pytest
+import torch
+from torch import Tensor
+
+from nerf.randomness import generator
+from nerf.ray_bank import RayBank, build_ray_bank
+from nerf.rays import rays_of_view
+
+SIZES = [(3, 5), (4, 2), (3, 5)]  # (height, width) of each view
+CAMERAS = [0, 1, 0]
+
+
+def scattered(channels: int = 3) -> tuple[RayBank, list[Tensor], list[Tensor], Tensor]:
+    random = generator("cpu", 11)
+    photos = [torch.randint(256, (h, w, channels), generator=random, dtype=torch.uint8) for h, w in SIZES]
+    bearings = [torch.randn(h, w, 3, generator=random) for h, w in SIZES[:2]]
+    bearings = [b / b.norm(dim=-1, keepdim=True) for b in bearings]
+    poses = torch.cat([torch.linalg.qr(torch.randn(3, 3, 3, generator=random))[0], torch.randn(3, 3, 1)], -1)
+    near = torch.tensor([1.0, 2.0, 3.0])
+    return build_ray_bank(photos, CAMERAS, bearings, poses, near, near + 5), photos, bearings, poses
+
+
+def test_every_pixel_gets_its_own_ray_and_colour() -> None:
+    bank, photos, bearings, poses = scattered()
+    rays, colours, alpha = bank.lookup(torch.arange(3 * 5 + 4 * 2 + 3 * 5))
+    expected = [rays_of_view(bearings[c], poses[v], v + 1.0, v + 6.0) for v, c in enumerate(CAMERAS)]
+    for name, width in {"origins": (3,), "directions": (3,), "near": (), "far": ()}.items():
+        flat = torch.cat([getattr(part, name).reshape(-1, *width) for part in expected])
+        torch.testing.assert_close(getattr(rays, name), flat)
+    assert torch.equal(colours, torch.cat([photo.flatten(0, 1) for photo in photos]).float() / 255)
+    assert alpha is None
+
+
+def test_the_fourth_channel_is_alpha() -> None:
+    bank, photos, _, _ = scattered(channels=4)
+    _, colours, alpha = bank.lookup(torch.tensor([0, 7]))
+    assert alpha is not None
+    assert torch.equal(alpha, photos[0].flatten(0, 1)[[0, 7], 3].float() / 255)
+    assert torch.equal(colours, photos[0].flatten(0, 1)[[0, 7], :3].float() / 255)
+
+
+def test_samples_are_uniform_over_pixels_whatever_the_sizes_of_the_photos() -> None:
+    bank, *_ = scattered()
+    count = 38_000  # a thousand for each of the 38 pixels
+    near = bank.sample(count, generator("cpu", 0))[0].near
+    for view, (height, width) in enumerate(SIZES):
+        expected = count * height * width / 38
+        assert abs((near == view + 1).sum() - expected) < 4 * expected**0.5
+
+
+def test_samples_depend_on_the_generator_alone() -> None:
+    bank, *_ = scattered()
+    first, second, other = (bank.sample(20, generator("cpu", seed)) for seed in (1, 1, 2))
+    assert torch.equal(first[0].directions, second[0].directions)
+    assert not torch.equal(first[0].directions, other[0].directions)
+
+
+def test_a_photo_of_another_size_than_its_camera_is_refused() -> None:
+    photo, bearings = torch.zeros(2, 3, 3, dtype=torch.uint8), torch.zeros(3, 2, 3)
+    with pytest.raises(ValueError, match=r"photo 0 has size \(2, 3\), its camera 0 \(3, 2\)"):
+        build_ray_bank([photo], [0], [bearings], torch.zeros(1, 3, 4), torch.ones(1), torch.ones(1))
+
+
+def test_no_photos_are_refused() -> None:
+    with pytest.raises(ValueError, match="at least one photo"):
+        build_ray_bank([], [], [], torch.zeros(0, 3, 4), torch.ones(0), torch.ones(0))

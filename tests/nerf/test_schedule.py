@@ -1,0 +1,90 @@
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from nerf.schedule import StepPlan, learning_rate, plan_of, replanned, steps_that_fit
+
+
+@st.composite
+def plans(draw: st.DrawFn) -> StepPlan:
+    plan = plan_of(draw(st.integers(1, 1000)))
+    for _ in range(draw(st.integers(0, 6))):
+        earliest = plan.decisions[-1].from_step
+        step = draw(st.integers(earliest, max(earliest, plan.total_steps - 1)))
+        plan = plan.revised(step, draw(st.integers(step + 1, step + 1000)))
+    return plan
+
+
+@given(plans())
+def test_share_goes_from_0_to_1_and_never_back(plan: StepPlan) -> None:
+    shares = [plan.share(step) for step in range(plan.total_steps + 1)]
+    assert shares[0] == 0
+    assert shares[-1] == pytest.approx(1, abs=1e-12)
+    assert all(a < b for a, b in zip(shares, shares[1:], strict=False))
+
+
+@given(plans(), st.integers(1, 500), st.integers(0, 10**6))
+def test_a_decision_leaves_the_past_and_the_present_alone(plan: StepPlan, more: int, position: int) -> None:
+    earliest = plan.decisions[-1].from_step
+    step = earliest + position % (plan.total_steps - earliest)
+    revised = plan.revised(step, step + more)
+    assert [revised.share(s) for s in range(step + 1)] == [plan.share(s) for s in range(step + 1)]
+
+
+def test_a_plan_without_revision_is_linear() -> None:
+    assert [plan_of(4).share(step) for step in range(5)] == [0, 0.25, 0.5, 0.75, 1]
+
+
+def test_half_way_through_twice_the_steps() -> None:
+    plan = plan_of(4).revised(2, 6)
+    assert [plan.share(step) for step in range(7)] == [0, 0.25, 0.5, 0.625, 0.75, 0.875, 1]
+
+
+@pytest.mark.parametrize(("step", "total"), [(5, 5), (3, 9)])
+def test_no_decision_without_a_step_left_or_about_the_past(step: int, total: int) -> None:
+    with pytest.raises(ValueError, match="cannot become"):
+        plan_of(10).revised(4, 8).revised(step, total)
+
+
+def test_a_run_has_steps() -> None:
+    with pytest.raises(ValueError, match="at least one step"):
+        plan_of(0)
+
+
+@given(st.floats(0.01, 1000), st.floats(0.01, 1000))
+def test_a_run_on_a_steady_clock_ends_on_time(budget: float, rate: float) -> None:
+    plan, step = plan_of(10**6), 0
+    while step < plan.total_steps and step < 300:
+        step += 1
+        if step < plan.total_steps:
+            plan = replanned(plan, step, budget - step / rate, rate, 0.01 * budget)
+    # One step is the least a run can take, and the one that crosses the line is still taken.
+    assert abs(plan.total_steps / rate - budget) <= 0.01 * budget + 1.5 / rate
+    assert len(plan.decisions) <= 2
+
+
+def test_a_run_that_turns_out_slow_is_cut_short_and_still_ends_at_1() -> None:
+    plan = replanned(plan_of(100), 50, 1.0, 10.0, 0.1)
+    assert plan.total_steps == 60
+    assert plan.share(50) == 0.5
+    assert plan.share(60) == pytest.approx(1)
+
+
+def test_a_plan_that_is_right_enough_stands() -> None:
+    plan = plan_of(100)
+    assert replanned(plan, 50, 5.05, 10.0, 0.1) is plan
+
+
+def test_past_the_deadline_one_step_is_left() -> None:
+    assert steps_that_fit(7, -3.0, 10.0) == 8
+
+
+@given(st.floats(0.0, 1.0), st.floats(0.0, 0.5))
+def test_equal_shares_lower_the_rate_by_equal_factors(share: float, more: float) -> None:
+    ratio = learning_rate(share + more, 5e-4, 5e-5) / learning_rate(share, 5e-4, 5e-5)
+    assert ratio == pytest.approx(0.1**more, rel=1e-9)
+
+
+def test_the_rate_starts_and_ends_as_published() -> None:
+    assert learning_rate(0.0, 5e-4, 5e-5) == 5e-4
+    assert learning_rate(1.0, 5e-4, 5e-5) == pytest.approx(5e-5)

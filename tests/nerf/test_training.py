@@ -1,0 +1,134 @@
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from nerf.paper import PaperNerf, PaperSettings
+from nerf.probe import make_probe, measure
+from nerf.ray_bank import RayBank, build_ray_bank
+from nerf.training import NonFinite, PaperTrainer, TrainerSettings, over
+
+FIELD = PaperSettings(
+    depth=2, width=16, skip=9, position_frequencies=3, direction_frequencies=1, samples_coarse=8, samples_fine=8
+)
+TRAINER = TrainerSettings(batch_rays=64, seed=3, background=(1.0, 1.0, 1.0), rate_start=5e-3, rate_end=5e-4)
+
+
+def small_bank(channels: int = 3, size: int = 12) -> RayBank:
+    """Two opposite views of a red disc on white (or on nothing, with alpha), from 3 units away."""
+    grid = (torch.arange(size) + 0.5) / size - 0.5
+    y, x = torch.meshgrid(grid, grid, indexing="ij")
+    bearings = torch.stack([x, y, torch.ones_like(x)], -1)
+    bearings = bearings / bearings.norm(dim=-1, keepdim=True)
+    inside = (x**2 + y**2 < 0.06)[..., None]
+    photo = torch.where(inside, torch.tensor([200, 20, 20]), 255)
+    if channels == 4:
+        photo = torch.cat([photo, torch.where(inside, 255, 0)], -1)
+    front = torch.tensor([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, -3]])
+    back = torch.tensor([[-1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 3]])
+    near, far = torch.full((2,), 2.0), torch.full((2,), 4.0)
+    return build_ray_bank([photo.to(torch.uint8)] * 2, [0, 0], [bearings], torch.stack([front, back]), near, far)
+
+
+def trainer(settings: TrainerSettings = TRAINER, bank: RayBank | None = None) -> PaperTrainer:
+    return PaperTrainer(PaperNerf(FIELD, seed=0), bank or small_bank(), settings)
+
+
+def same(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:
+    return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
+
+
+def copied(state: dict[str, Tensor]) -> dict[str, Tensor]:
+    return {name: tensor.clone() for name, tensor in state.items()}
+
+
+def test_a_resumed_run_is_the_uninterrupted_one_bit_for_bit() -> None:
+    whole, first = trainer(), trainer()
+    results = [whole.step(step, step / 20) for step in range(20)]
+    for step in range(10):
+        first.step(step, step / 20)
+    second = trainer()
+    second.load_state(copied(first.state()))
+    assert [second.step(step, step / 20) for step in range(10, 20)] == results[10:]
+    assert same(whole.state(), second.state())
+
+
+def test_training_beats_a_flat_colour() -> None:
+    bank = small_bank()
+    run = trainer(bank=bank)
+    probe = make_probe(bank, 288, torch.ones(3), seed=5)
+    before = measure(run.model, probe).psnr
+    for step in range(150):
+        run.step(step, step / 150)
+    after = measure(run.model, probe).psnr
+    assert before < probe.flat_psnr < probe.flat_psnr + 3 < after < 60
+
+
+def test_the_loss_is_the_sum_of_both_renderings_mean_squared_errors() -> None:
+    run = trainer()
+    nothing = replace(FIELD, hierarchical=False)
+    alone = PaperTrainer(PaperNerf(nothing, seed=0), small_bank(), TRAINER).step(0, 0.0)
+    both = run.step(0, 0.0)
+    assert alone.loss == pytest.approx(10 ** (-alone.psnr / 10), rel=1e-5)
+    assert both.loss > 1.2 * 10 ** (-both.psnr / 10)
+    assert both.rays == TRAINER.batch_rays
+
+
+@pytest.mark.parametrize(("broken", "quantity"), [("loss", "loss"), ("gradient", "gradient")])
+def test_a_non_finite_step_changes_nothing_and_shows_its_batch(
+    broken: str, quantity: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = trainer()
+    run.step(0, 0.0)
+    if broken == "loss":
+        run.model.fine.colour_head.bias.data[1] = math.nan
+    else:
+        run.model.fine.colour_head.bias.register_hook(lambda gradient: gradient * math.inf)
+    before = copied(run.state())
+    with pytest.raises(NonFinite, match=f"the {quantity} of step 1 is not finite") as caught:
+        run.step(1, 0.5)
+    assert all(torch.equal(a, b) or a.isnan().any() for a, b in zip(before.values(), run.state().values(), strict=True))
+    assert caught.value.batch["target"].shape == (64, 3)
+    assert set(caught.value.batch) == {"origins", "directions", "near", "far", "target", "background"}
+
+
+def test_the_rate_scale_scales_the_update() -> None:
+    whole, half = trainer(), trainer()
+    start = copied(whole.state())
+    whole.step(0, 0.0, 1.0)
+    half.step(0, 0.0, 0.5)
+    for name, weight in start.items():
+        moved, moved_half = whole.state()[name] - weight, half.state()[name] - weight
+        torch.testing.assert_close(moved_half, moved / 2, atol=1e-6, rtol=1e-3)
+
+
+def test_a_random_background_is_new_in_every_step_and_shines_through_alpha() -> None:
+    run = trainer(replace(TRAINER, background="random"), small_bank(channels=4))
+    seen = []
+    forward = run.model.render_training
+
+    def spy(rays, background, generator):
+        seen.append(background)
+        return forward(rays, background, generator)
+
+    run.model.render_training = spy
+    run.step(0, 0.0)
+    run.step(1, 0.0)
+    assert not torch.equal(seen[0], seen[1])
+    assert all(((0 <= b) & (b < 1)).all() for b in seen)
+
+
+def test_over_is_linear_between_background_and_colour() -> None:
+    colour, background = torch.tensor([[0.2, 0.4, 0.6]]), torch.tensor([1.0, 0.0, 0.5])
+    assert torch.equal(over(colour, None, background), colour)
+    torch.testing.assert_close(over(colour, torch.zeros(1), background)[0], background)
+    torch.testing.assert_close(over(colour, torch.ones(1), background), colour)
+    torch.testing.assert_close(over(colour, torch.tensor([0.25]), background)[0], torch.tensor([0.8, 0.1, 0.525]))
+
+
+def test_a_state_of_another_architecture_is_refused() -> None:
+    other = PaperTrainer(PaperNerf(replace(FIELD, width=8), seed=0), small_bank(), TRAINER)
+    with pytest.raises(RuntimeError, match="size mismatch"):
+        trainer().load_state(other.state())

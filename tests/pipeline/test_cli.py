@@ -1,0 +1,184 @@
+"""The command line as a user meets it: words, exit codes, no traceback."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from pipeline.cli import run_command
+from pipeline.display import PlainDisplay, duration, end_line
+
+
+def test_help_names_every_command_and_stage(capsys: pytest.CaptureFixture[str]):
+    assert run_command(["--help"]) == 0
+    text = capsys.readouterr().out
+    for word in ("run", "resume", "status", "explain", "clean", "doctor", "demo", "sfm", "mesh"):
+        assert word in text
+
+
+def test_no_words_is_a_usage_error():
+    assert run_command([]) == 2
+
+
+def test_an_unknown_command_lists_the_known_ones(capsys: pytest.CaptureFixture[str]):
+    assert run_command(["fly"]) == 2
+    assert "no command 'fly'; there are: run, resume," in capsys.readouterr().err
+
+
+def test_help_of_run_lists_the_stage_options(capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit) as ending:
+        run_command(["run", "--help"])
+    assert ending.value.code == 0
+    text = capsys.readouterr().out
+    assert "--train.steps" in text
+    assert "--ingest.photos" not in text, "one spelling: PHOTOS is the positional argument"
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--until", "lunch"], "--until lunch: not one of ingest, sfm"),
+        (["--until", "sfm", "--from", "mesh"], "--from mesh: not one of ingest, sfm"),
+        (["--config", "missing.toml"], "--config missing.toml: No such file"),
+    ],
+)
+def test_usage_errors(tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], message: str):
+    assert run_command(["run", str(tmp_path), *words]) == 2
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[train]\nstepz = 3", "train.stepz: Extra inputs are not permitted"),
+        ('[train]\nsteps = "many"', "train.steps: Input should be a valid integer"),
+        ("[train", "is not TOML"),
+    ],
+)
+def test_a_config_file_is_validated(tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, message: str):
+    (tmp_path / "options.toml").write_text(text)
+    assert run_command(["run", str(tmp_path), "--config", str(tmp_path / "options.toml")]) == 2
+    assert message in capsys.readouterr().err
+
+
+def run_on(photos: Path, capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str]:
+    workspace = photos.parent / "w.nerf"
+    code = run_command(["run", str(photos), "-o", str(workspace), *words])
+    captured = capsys.readouterr()
+    assert "Traceback" not in captured.out + captured.err
+    return code, captured.out + captured.err
+
+
+def test_a_folder_that_does_not_exist(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    code, text = run_on(tmp_path / "nowhere", capsys)
+    assert code == 10
+    assert "nowhere" in text and "does not exist" in text
+    assert not (tmp_path / "w.nerf").exists(), "a usage slip leaves no workspace behind"
+
+
+def test_an_empty_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    (tmp_path / "photos").mkdir()
+    code, text = run_on(tmp_path / "photos", capsys)
+    assert code == 10
+    assert "try:" in text
+
+
+def test_one_photo(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    (tmp_path / "photos").mkdir()
+    Image.new("RGB", (40, 30)).save(tmp_path / "photos/a.jpg")
+    code, text = run_on(tmp_path / "photos", capsys)
+    assert code == 10
+    assert "try:" in text
+
+
+def test_text_named_jpg(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos/a.jpg").write_text("not a photo")
+    (tmp_path / "photos/b.jpg").write_text("nor this")
+    code, text = run_on(tmp_path / "photos", capsys)
+    assert code == 10
+    assert "a.jpg" in text
+
+
+def test_json_lines(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    (tmp_path / "photos").mkdir()
+    code = run_command(["run", str(tmp_path / "photos"), "-o", str(tmp_path / "w.nerf"), "--json"])
+    events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert code == 10
+    assert events[-1]["event"] == "error"
+    assert set(events[-1]) == {"event", "stage", "what", "why", "hint"}
+
+
+def test_until_ingest_then_status_and_explain_and_clean(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    (tmp_path / "photos").mkdir()
+    for k in range(3):
+        Image.effect_noise((64, 48), 30 + k).convert("RGB").save(tmp_path / f"photos/{k}.png")
+    workspace = str(tmp_path / "w.nerf")
+    assert run_on(tmp_path / "photos", capsys, "--until", "ingest")[0] == 0
+    code, text = run_on(tmp_path / "photos", capsys, "--until", "ingest")
+    assert code == 0
+    assert "nothing to do" in text
+    assert run_command(["status", workspace]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].split()[:2] == ["ingest", "cached"]
+    assert lines[1].split()[:2] == ["sfm", "never"]
+    assert run_command(["explain", "ingest", workspace]) == 0
+    assert "would not run" in capsys.readouterr().out
+    assert run_command(["clean", workspace]) == 0
+    assert "0.0 MB in 0 folders" in capsys.readouterr().out
+
+
+def test_status_of_no_workspace(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    assert run_command(["status", str(tmp_path)]) == 3
+    assert "is not a workspace" in capsys.readouterr().err
+
+
+def test_an_unwritable_place(capsys: pytest.CaptureFixture[str], tmp_path: Path):
+    (tmp_path / "photos").mkdir()
+    for k in range(3):
+        Image.new("RGB", (4, 4), (k, k, k)).save(tmp_path / f"photos/{k}.png")
+    assert run_command(["run", str(tmp_path / "photos"), "-o", "/proc/nowhere.nerf"]) == 3
+    assert "cannot write to /proc/nowhere.nerf" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_ends_cleanly_and_soon(tmp_path: Path, number: int, code: int):
+    (tmp_path / "photos").mkdir()
+    for k in range(200):
+        Image.effect_noise((640, 480), 30 + k).convert("RGB").save(tmp_path / f"photos/{k}.png", compress_level=0)
+    words = ["run", str(tmp_path / "photos"), "-o", str(tmp_path / "w.nerf"), "--json"]
+    command = [sys.executable, "-m", "pipeline", *words]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    for line in process.stdout:
+        if json.loads(line)["event"] == "progress":
+            break
+    started = time.monotonic()
+    process.send_signal(number)
+    _, errors = process.communicate(timeout=20)
+    assert process.returncode == code
+    assert "finished stages are kept" in errors and "Traceback" not in errors
+    assert time.monotonic() - started < 15  # a hang, not slowness, is what this would catch
+
+
+def test_durations():
+    assert duration(0.04) == "0.0 s"
+    assert duration(99.94) == "99.9 s"
+    assert duration(99.96) == "1 min 40 s"
+    assert duration(3599.6) == "1 h 00 min"
+    assert end_line("sfm", "all good", 61.0, cached=False) == "sfm        all good  [61.0 s]"
+    assert end_line("sfm", "all good", 61.0, cached=True) == "sfm        all good  [cached]"
+
+
+def test_plain_output_is_not_flooded(capsys: pytest.CaptureFixture[str]):
+    display = PlainDisplay()
+    display.begin("train")
+    for k in range(1000):
+        display.update(f"step {k}", k / 1000)
+    display.note("a line that stays")
+    assert capsys.readouterr().out == "train      a line that stays\n"

@@ -1,0 +1,85 @@
+"""Keys: equal for equal content, different for any difference, blind to place and time."""
+
+import os
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.keys import ContentIndex, canonical_json, config_for_key, digest, stage_key
+from stages.contract import StageConfig, StageError
+
+json_values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(),
+    lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner),
+    max_leaves=10,
+)
+
+
+@given(st.dictionaries(st.text(), json_values))
+def test_the_order_of_keys_does_not_matter(value: dict):
+    assert digest(value) == digest(dict(reversed(list(value.items()))))
+
+
+@given(json_values, json_values)
+def test_different_values_have_different_digests(a: object, b: object):
+    assert (digest(a) == digest(b)) == (canonical_json(a) == canonical_json(b))
+
+
+def test_not_a_number_has_no_key():
+    with pytest.raises(ValueError, match="Out of range float"):
+        digest({"x": float("nan")})
+
+
+def test_every_part_enters_the_key():
+    base = ("train", 1, {"steps": 3}, {"ingest": "aa"})
+    changed = [
+        ("sfm", *base[1:]),
+        ("train", 2, *base[2:]),
+        (*base[:2], {"steps": 4}, base[3]),
+        (*base[:3], {"ingest": "b"}),
+    ]
+    keys = {stage_key(*parts) for parts in [base, *changed]}
+    assert len(keys) == 5
+
+
+def test_the_index_notices_changes_and_survives_damage(tmp_path: Path):
+    file, cache = tmp_path / "a", tmp_path / "cache.json"
+    file.write_text("one")
+    index = ContentIndex(cache)
+    first = index.sha256(file)
+    index.save()
+    assert ContentIndex(cache).known[str(file.resolve())][2] == first
+    file.write_text("two")
+    os.utime(file, ns=(1, 1))
+    assert ContentIndex(cache).sha256(file) != first
+    cache.write_text("{torn")
+    assert ContentIndex(cache).sha256(file) != first
+
+
+def test_paths_enter_by_content(tmp_path: Path):
+    class Config(StageConfig):
+        cameras: Path | None = None
+        steps: int = 1
+
+    (tmp_path / "a.json").write_text("{}")
+    (tmp_path / "b.json").write_text("{}")
+    index = ContentIndex(tmp_path / "cache.json")
+    a = config_for_key(Config(cameras=tmp_path / "a.json"), index, {})
+    assert a == config_for_key(Config(cameras=tmp_path / "b.json"), index, {})
+    assert a["cameras"] not in (None, str(tmp_path / "a.json"))
+    with pytest.raises(StageError, match="does not exist"):
+        config_for_key(Config(cameras=tmp_path / "c.json"), index, {})
+
+
+def test_hidden_files_do_not_enter_a_folders_digest(tmp_path: Path):
+    folder = tmp_path / "model"
+    folder.mkdir()
+    (folder / "cameras.bin").write_bytes(b"1")
+    index = ContentIndex(tmp_path / "cache.json")
+    before = index.of_path(folder)
+    (folder / ".DS_Store").write_bytes(b"2")
+    assert index.of_path(folder) == before
+    (folder / "images.bin").write_bytes(b"2")
+    assert index.of_path(folder) != before

@@ -1,0 +1,226 @@
+"""The runner on three tiny stages: what runs, what is cached, what an interruption leaves."""
+
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from pipeline import status
+from pipeline.display import SilentDisplay
+from pipeline.runner import NotReady, Runner, StageFailed
+from pipeline.workspace import Workspace
+from stages.contract import StageError
+from tests.pipeline import fake_stages
+from tests.pipeline.fake_stages import FakeSettings, calls
+
+ALL = ("ingest", "sfm", "train")
+Bring = Callable[..., bool]
+
+
+@pytest.fixture(autouse=True)
+def fake_chain(monkeypatch: pytest.MonkeyPatch):
+    for module in ("runner", "status"):
+        monkeypatch.setattr(f"pipeline.{module}.STAGES", fake_stages.STAGES)
+    calls.clear()
+
+
+@pytest.fixture
+def photos(tmp_path: Path) -> Path:
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for k in range(3):
+        Image.new("RGB", (4, 4), (k, 0, 0)).save(folder / f"{k}.png")
+    return folder
+
+
+@pytest.fixture
+def bring(tmp_path: Path, photos: Path) -> Bring:
+    """Run the fake chain with options like sfm={"offset": 1}; says whether anything ran, and clears ``calls``."""
+
+    def go(root: Path = tmp_path / "w.nerf", stages=ALL, force=(), replan=False, **options: dict) -> bool:
+        calls.clear()
+        options["ingest"] = {"photos": photos} | options.get("ingest", {})
+        settings = FakeSettings.model_validate(options)
+        with Workspace(root) as workspace:
+            runner = Runner(workspace, settings, SilentDisplay())  # type: ignore[arg-type]
+            return runner.run(stages, force=frozenset(force), replan=replan)
+
+    return go
+
+
+def reader(root: Path) -> tuple[Workspace, Runner]:
+    workspace = Workspace.existing(root)
+    options = FakeSettings.model_validate(workspace.read_run()["options"])
+    return workspace, Runner(workspace, options, SilentDisplay())  # type: ignore[arg-type]
+
+
+def test_everything_runs_once(bring: Bring):
+    assert bring() is True
+    assert calls == ["ingest", "plan sfm", "sfm", "train"]
+    assert bring() is False
+    assert calls == []
+
+
+def test_only_what_changed_runs_again(bring: Bring):
+    bring()
+    bring(train={"steps": 4})
+    assert calls == ["train"]
+    bring(sfm={"offset": 7}, train={"steps": 4})
+    assert calls == ["plan sfm", "sfm", "train"]
+
+
+def test_going_back_to_old_settings_runs_nothing(bring: Bring):
+    bring()
+    bring(train={"steps": 4})
+    assert bring() is False
+
+
+def test_equal_upstream_bytes_leave_downstream_cached(bring: Bring):
+    bring(ingest={"number": 11})
+    assert bring(ingest={"number": 12}) is True
+    assert calls == ["ingest"]
+
+
+def test_photos_enter_by_name_and_content_not_by_place_or_time(bring: Bring, photos: Path):
+    bring()
+    os.utime(photos / "0.png")
+    assert bring() is False
+    photos.rename(photos.with_name("moved"))
+    assert bring(ingest={"photos": photos.with_name("moved")}) is False
+    Image.new("RGB", (4, 4), (9, 9, 9)).save(photos.with_name("moved") / "0.png")
+    bring(ingest={"photos": photos.with_name("moved")})
+    assert calls == ["ingest"]
+
+
+def test_a_workspace_can_be_moved(bring: Bring, tmp_path: Path):
+    bring()
+    (tmp_path / "w.nerf").rename(tmp_path / "elsewhere.nerf")
+    assert bring(tmp_path / "elsewhere.nerf") is False
+
+
+def test_a_finished_workspace_outlives_its_photos(bring: Bring, photos: Path, tmp_path: Path):
+    bring()
+    photos.rename(tmp_path / "gone")
+    assert bring() is False
+
+
+def test_a_plan_stands_until_the_options_change_or_replan(bring: Bring, tmp_path: Path):
+    bring()
+    assert json.loads((tmp_path / "w.nerf/run.json").read_text())["plans"]["sfm"]["config"]["offset"] == 5
+    bring(train={"steps": 9})
+    assert "plan sfm" not in calls
+    bring(replan=True)
+    assert calls == ["plan sfm"]  # the same answer: the same key, nothing runs
+
+
+def test_force_runs_again_and_replaces(bring: Bring, tmp_path: Path):
+    bring()
+    assert bring(force=("sfm",)) is True
+    assert calls == ["sfm"]  # its bytes are equal, so train stays cached
+    assert len([p for p in (tmp_path / "w.nerf/sfm").iterdir() if p.suffix == ""]) == 1
+
+
+def test_an_interrupted_stage_goes_on_from_its_checkpoint(bring: Bring, tmp_path: Path):
+    with pytest.raises(KeyboardInterrupt):
+        bring(train={"steps": 6, "die_at": 4})
+    workspace, runner = reader(tmp_path / "w.nerf")
+    assert [s.state for s in status.all_statuses(workspace, runner)] == ["cached", "cached", "partial"]
+    bring(train={"steps": 6, "die_at": 4})
+    manifest = next((tmp_path / "w.nerf/train").glob("*/manifest.json"))
+    assert json.loads(manifest.read_text())["line"] == "2 steps taken"
+
+
+def test_a_finished_folder_holds_what_its_manifest_lists(bring: Bring, tmp_path: Path):
+    bring()
+    for stage in ALL:
+        (folder,) = (tmp_path / "w.nerf" / stage).iterdir()
+        manifest = json.loads((folder / "manifest.json").read_text())
+        listed = {*manifest["outputs"], *manifest["records"], "manifest.json"}
+        assert {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()} == listed
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda folder: (folder / "manifest.json").write_text("{"),
+        lambda folder: (folder / "manifest.json").write_text("{}"),
+        lambda folder: (folder / "manifest.json").unlink(),
+        lambda folder: (folder / "result.json").write_text("longer than before, much longer"),
+        lambda folder: (folder / "result.json").unlink(),
+    ],
+    ids=["torn manifest", "empty manifest", "no manifest", "changed output", "missing output"],
+)
+def test_a_damaged_result_is_set_aside_and_made_again(bring: Bring, tmp_path: Path, damage: Callable[[Path], object]):
+    bring()
+    (folder,) = (tmp_path / "w.nerf/train").iterdir()
+    damage(folder)
+    bring()
+    assert calls == ["train"]
+    assert (folder.with_name(folder.name + ".bad")).is_dir()
+    assert json.loads((folder / "result.json").read_text()) == {"steps": 3}
+
+
+def test_a_stage_error_names_its_stage_and_keeps_the_rest(bring: Bring, tmp_path: Path):
+    with pytest.raises(StageFailed) as caught:
+        bring(sfm={"fail": True})
+    assert (caught.value.stage, caught.value.error.what) == ("sfm", "it failed")
+    bring()
+    assert "ingest" not in calls
+
+
+def test_output_links_point_at_the_latest_result(bring: Bring, tmp_path: Path):
+    bring(train={"steps": 3})
+    bring(train={"steps": 5})
+    output = tmp_path / "w.nerf/output"
+    assert json.loads((output / "result.json").read_text()) == {"steps": 5}
+    assert (output / "deep/number.json").is_file()
+    assert not os.readlink(output / "result.json").startswith("/"), "links survive moving the workspace"
+
+
+def test_status_and_explain_say_what_changed(bring: Bring, tmp_path: Path):
+    bring(train={"steps": 3})
+    with Workspace(tmp_path / "w.nerf") as workspace:
+        run = workspace.read_run()
+        run["options"]["train"]["steps"] = 8
+        workspace.write_run(run)
+    workspace, runner = reader(tmp_path / "w.nerf")
+    states = status.all_statuses(workspace, runner)
+    assert [s.state for s in states] == ["cached", "cached", "stale"]
+    assert states[2].text == "train.steps: 3 → 8"
+    assert "  train.steps: 3 → 8" in status.explain(workspace, runner, "train")
+    assert "It would not run: its key has a finished result." in status.explain(workspace, runner, "sfm")
+    assert calls[-1:] == ["train"], "looking runs nothing"
+
+
+def test_status_of_a_chain_that_stopped_early(bring: Bring, tmp_path: Path):
+    bring(stages=("ingest",))
+    workspace, runner = reader(tmp_path / "w.nerf")
+    assert [s.state for s in status.all_statuses(workspace, runner)] == ["cached", "never", "never"]
+    with pytest.raises(NotReady):
+        runner.resolve("train")
+
+
+def test_two_runs_on_one_workspace(bring: Bring, tmp_path: Path):
+    bring()
+    with Workspace(tmp_path / "w.nerf"), pytest.raises(StageError, match="is in use") as caught:
+        bring()
+    assert str(os.getpid()) in caught.value.why
+
+
+def test_a_folder_that_is_no_workspace(tmp_path: Path):
+    with pytest.raises(StageError, match=r"there is no run\.json in it"):
+        Workspace.existing(tmp_path)
+    with pytest.raises(StageError, match="there is no such folder"):
+        Workspace.existing(tmp_path / "nowhere")
+
+
+def test_clean_keeps_what_is_used(bring: Bring, tmp_path: Path):
+    bring(train={"steps": 3})
+    bring(train={"steps": 5})
+    workspace = Workspace.existing(tmp_path / "w.nerf")
+    stale = workspace.stale_folders(workspace.read_run()["keys"], list(ALL))
+    assert [p.parent.name for p in stale] == ["train"]
+    assert bring(train={"steps": 5}) is False

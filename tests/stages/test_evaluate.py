@@ -1,0 +1,240 @@
+"""Scoring against fields and photos known in closed form, the words of the verdict, and what happens at the edges."""
+
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+from torch import Tensor
+
+from nerf.model import Rendering
+from nerf.rays import Rays
+from nerf.scene import Camera, Scene, Similarity, View
+from stages import evaluate
+from stages.evaluate import affordable, verdict
+from stages.files import write_json
+
+WIDTH, HEIGHT, FOCAL = 32, 24, 30.0
+WAVES = np.array([[5.0, 2.0, 3.0], [-4.0, 6.0, 1.0], [2.0, -3.0, 7.0]])
+
+
+def sky(directions: np.ndarray) -> np.ndarray:
+    """A world that is all sky: colour by direction alone, within [0.2, 0.8]."""
+    return 0.5 + 0.3 * np.sin(directions @ WAVES.T)
+
+
+class SkyField:
+    """The sky as a field, off by ``error`` in every channel; with ``half`` the side x < 0 is empty."""
+
+    def __init__(self, error: float = 0, half: bool = False) -> None:
+        self.error, self.half = error, half
+
+    def density(self, points: Tensor) -> Tensor:
+        return torch.zeros_like(points[..., 0])
+
+    def colour(self, points: Tensor, directions: Tensor) -> Tensor:
+        return torch.from_numpy(sky(directions.double().numpy())) + self.error
+
+    def render(self, rays: Rays, background: Tensor) -> Rendering:
+        directions = rays.directions.double()
+        colour = self.colour(rays.origins, directions)
+        opacity = (directions[:, 0] >= 0).double() if self.half else torch.ones(len(directions))
+        shown = opacity[:, None] * colour + (1 - opacity[:, None]) * background
+        return Rendering(shown.float(), rays.far, opacity.float())
+
+
+def _view(index: int, name: str, split: Any) -> View:
+    """Cameras on a circle, looking outward."""
+    angle = 0.25 * index
+    forward, down = np.array([math.cos(angle), math.sin(angle), 0]), np.array([0.0, 0.0, -1.0])
+    pose = np.stack([np.cross(down, forward), down, forward, 0.3 * forward], axis=1)
+    return View(name, f"images/{Path(name).stem}.png", 0, pose, 0.1, 4.0, split)
+
+
+def _photo(view: View, alpha: bool) -> Image.Image:
+    """What a pinhole camera sees of the sky, computed from scratch."""
+    x, y = np.meshgrid(np.arange(WIDTH) + 0.5 - WIDTH / 2, np.arange(HEIGHT) + 0.5 - HEIGHT / 2)
+    bearings = np.stack([x, y, np.full_like(x, FOCAL)], -1)
+    directions = bearings / np.linalg.norm(bearings, axis=-1, keepdims=True) @ view.scene_from_camera[:, :3].T
+    pixels = np.rint(255 * sky(directions))
+    if alpha:
+        covered = directions[..., :1] >= 0
+        pixels = np.concatenate([np.where(covered, pixels, 0), 255 * covered], axis=-1)
+    return Image.fromarray(pixels.astype(np.uint8))
+
+
+Make = Callable[..., dict[str, Path]]
+
+
+@pytest.fixture
+def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Make:
+    """Finished folders for a scene of the sky and a field of it."""
+
+    def build(
+        field: SkyField | None = None, *, tests: int = 4, rays: int = 10**9, downscale: float = 1, alpha: bool = False
+    ) -> dict[str, Path]:
+        inputs = {stage: tmp_path / stage for stage in evaluate.NEEDS}
+        for folder in inputs.values():
+            folder.mkdir()
+        (inputs["ingest"] / "images").mkdir()
+        views = [_view(i, f"{i:03d}.jpg", "test" if i % 3 == 1 and i // 3 < tests else "train") for i in range(15)]
+        for view in views:
+            _photo(view, alpha).save(inputs["ingest"] / view.file)
+        camera = Camera("SIMPLE_PINHOLE", WIDTH, HEIGHT, (FOCAL, WIDTH / 2, HEIGHT / 2))
+        identity = Similarity(1.0, np.eye(3), np.zeros(3))
+        scene = Scene((camera,), tuple(views), identity, False, alpha, "inside", True)
+        write_json(inputs["normalise"] / "scene.json", scene.to_json())
+        info = {"kind": "sky", "downscale": downscale, "rays": rays, "background": [0.0, 0.0, 0.0]}
+        write_json(inputs["train"] / "field.json", info)
+        monkeypatch.setattr("stages.device.compute_device", lambda: "cpu")
+        monkeypatch.setattr("stages.field_files.load_field", lambda _folder, _device: (field or SkyField(), info))
+        return inputs
+
+    return build
+
+
+def _run(inputs: dict[str, Path], folder: Path, progress: Any, **settings: Any) -> tuple[dict[str, Any], str]:
+    folder.mkdir()
+    result = evaluate.run(evaluate.Config(**settings), inputs, folder, progress)
+    return json.loads((folder / "metrics.json").read_text("utf-8")), result.line
+
+
+def test_a_perfect_field_is_sharp_and_beats_both_trivial_predictions(make: Make, tmp_path: Path, progress: Any):
+    metrics, line = _run(make(), tmp_path / "out", progress)
+    assert 50 < metrics["psnr"] < 65  # the photos are rounded to 8 bits: 59 dB
+    assert 0.99 < metrics["ssim"] <= 1
+    assert 5 < metrics["psnr_mean_image"] < 25 and 5 < metrics["psnr_nearest_view"] < 25
+    assert metrics["verdict"].startswith("Sharp and trustworthy: 5")
+    assert line.endswith("· 4 photos") and "nearest photo" in line
+    assert progress.updates[-1] == ("test photo 4 of 4", 1.0)
+
+
+@pytest.mark.parametrize("error", [0.05, 0.1])
+def test_psnr_of_a_constant_error_is_its_closed_form(error: float, make: Make, tmp_path: Path, progress: Any):
+    metrics, _ = _run(make(SkyField(error)), tmp_path / "out", progress)
+    assert metrics["psnr"] == pytest.approx(-20 * math.log10(error), abs=0.05)
+
+
+def test_overall_figures_are_the_means_of_the_photos(make: Make, tmp_path: Path, progress: Any):
+    metrics, _ = _run(make(SkyField(0.1)), tmp_path / "out", progress)
+    assert [image["name"] for image in metrics["images"]] == ["001.jpg", "004.jpg", "007.jpg", "010.jpg"]
+    for key in evaluate.FIGURES:
+        assert metrics[key] == pytest.approx(np.mean([image[key] for image in metrics["images"]]))
+    low, high = metrics["psnr_interval"]
+    assert low <= metrics["psnr"] <= high
+    assert all(image["nearest_view"] not in ("001.jpg", "004.jpg") for image in metrics["images"])
+
+
+def test_pictures_are_what_the_figures_say(make: Make, tmp_path: Path, progress: Any):
+    metrics, _ = _run(make(SkyField(0.1)), tmp_path / "out", progress)
+    for image in metrics["images"]:
+        render = np.asarray(Image.open(tmp_path / "out" / image["render"]), float) / 255
+        error = np.asarray(Image.open(tmp_path / "out" / image["error"]))
+        truth = np.asarray(Image.open(tmp_path / "ingest/images" / Path(image["render"]).name), float) / 255
+        assert np.abs(render - truth - 0.1).max() < 0.01
+        assert error.shape == (HEIGHT, WIDTH, 3) and error.std(axis=(0, 1)).max() < 8 < error.mean()
+
+
+@pytest.mark.parametrize(("background", "empty"), [("white", 255), ("black", 0)])
+def test_alpha_data_is_scored_over_the_background(
+    background: str, empty: int, make: Make, tmp_path: Path, progress: Any
+):
+    inputs = make(SkyField(half=True), alpha=True)
+    metrics, _ = _run(inputs, tmp_path / "out", progress, background=background)
+    assert 50 < min(image["psnr"] for image in metrics["images"]) < 65  # photos that are all empty match exactly
+    render = np.asarray(Image.open(tmp_path / "out" / metrics["images"][-1]["render"]))
+    assert (render == empty).all(axis=-1).any()
+
+
+def test_scores_at_the_size_the_field_was_trained_at(make: Make, tmp_path: Path, progress: Any):
+    inputs = make(downscale=2)
+    metrics, line = _run(inputs, tmp_path / "out", progress)
+    assert metrics["width_share"] == 0.5 and line.endswith("· 4 photos at 50% width")
+    assert Image.open(tmp_path / "out" / metrics["images"][0]["render"]).size == (16, 12)
+    assert metrics["verdict"].endswith(" (at 50% of the photos' width).")
+    full, _ = _run(inputs, tmp_path / "full", progress, downscale=1)
+    assert full["width_share"] == 1 and full["psnr"] > metrics["psnr"]
+
+
+def test_a_short_training_is_scored_on_fewer_photos_and_says_so(make: Make, tmp_path: Path, progress: Any):
+    metrics, line = _run(make(rays=WIDTH * HEIGHT), tmp_path / "out", progress)
+    words = "3 of 4 test photos are scored, evenly spread: all of them would take longer than the training"
+    assert metrics["notes"][0] == words and progress.notes == [words]
+    assert (metrics["photos_scored"], metrics["photos_test"], len(metrics["images"])) == (3, 4, 3)
+    assert line.endswith("· 3 of 4 photos")
+
+
+def test_two_photos_give_no_interval_and_no_trust(make: Make, tmp_path: Path, progress: Any):
+    metrics, line = _run(make(tests=2), tmp_path / "out", progress)
+    assert metrics["psnr_interval"] is None and "±" not in line
+    assert metrics["notes"][0] == "no interval: 2 photos cannot show how much the figures vary"
+    assert metrics["verdict"].startswith("Sharp, as far as 2 photos can tell: ")
+
+
+def test_without_test_photos_nothing_is_measured_and_nothing_fails(make: Make, tmp_path: Path, progress: Any):
+    metrics, line = _run(make(tests=0), tmp_path / "out", progress)
+    assert all(metrics[key] is None for key in (*evaluate.FIGURES, "psnr_interval", "ssim_interval"))
+    assert metrics["images"] == [] and metrics["verdict"] == "Not measured: no photo was kept for testing."
+    assert metrics["notes"][0] == "no photo was kept for testing, so nothing is measured"
+    assert line == "no test photos, nothing measured"
+    assert (tmp_path / "out/renders").is_dir()
+
+
+def test_the_same_inputs_give_the_same_bytes(make: Make, tmp_path: Path, progress: Any):
+    inputs = make(SkyField(0.03))
+    _run(inputs, tmp_path / "a", progress)
+    _run(inputs, tmp_path / "b", progress)
+    files = sorted(path.relative_to(tmp_path / "a") for path in (tmp_path / "a").rglob("*.*"))
+    assert len(files) == 1 + 2 * 4
+    assert all((tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes() for file in files)
+
+
+def test_lpips_is_named_as_missing(make: Make, tmp_path: Path, progress: Any):
+    metrics, _ = _run(make(), tmp_path / "out", progress)
+    assert metrics["lpips"] is None
+    assert metrics["notes"][-1].startswith("LPIPS is not computed: ")
+
+
+@given(st.lists(st.integers(1, 100), max_size=12), st.integers(1, 1000))
+def test_affordable_is_the_largest_even_choice_within_the_budget(pixels: list[int], budget: int):
+    chosen = affordable(pixels, budget)
+    assert chosen == sorted(set(chosen)) and all(0 <= i < len(pixels) for i in chosen)
+    if sum(pixels) <= budget:
+        assert chosen == list(range(len(pixels)))
+    assert sum(pixels[i] for i in chosen) <= budget or len(chosen) == 1
+    assert bool(chosen) == bool(pixels)
+    if len(chosen) > 1:
+        gaps = np.diff([-0.5, *chosen, len(pixels) - 0.5])
+        assert gaps[1:-1].max() - gaps[1:-1].min() <= 1
+
+
+@pytest.mark.parametrize(
+    ("psnr", "ssim", "sentence"),
+    [
+        (11.2, 0.3, "Unusable: 11.2 dB is no better than the mean of the training photos (12.9 dB); "
+         "look at the camera layout, then train longer."),
+        (13.1, 0.4, "Worse than showing the nearest photo (13.1 against 14.2 dB): train longer."),
+        (17.3, 0.61, "Better than any photo nearby by 3.1 dB but soft: 17.3 dB on unseen photos, SSIM 0.61."),
+        (25.0, 0.65, "Better than any photo nearby by 10.8 dB but soft: 25.0 dB on unseen photos, SSIM 0.65."),
+        (24.0, 0.8, "Good, with fine detail missing: 24.0 dB on unseen photos, SSIM 0.80, "
+         "9.8 dB better than the nearest photo."),
+        (28.9, 0.87, "Sharp and trustworthy: 28.9 dB on unseen photos, SSIM 0.87, "
+         "14.7 dB better than the nearest photo."),
+    ],
+)  # fmt: skip
+def test_verdicts(psnr: float, ssim: float, sentence: str):
+    figures = {"psnr": psnr, "ssim": ssim, "psnr_nearest_view": 14.2, "psnr_mean_image": 12.9}
+    assert verdict(figures | {"photos_scored": 7, "width_share": 1}) == sentence
+
+
+def test_photos_too_small_for_ssim_are_judged_by_psnr_alone():
+    figures = {"psnr": 28.9, "ssim": None, "psnr_nearest_view": 14.2, "psnr_mean_image": 12.9}
+    words = verdict(figures | {"photos_scored": 7, "width_share": 1})
+    assert words == "Sharp and trustworthy: 28.9 dB on unseen photos, 14.7 dB better than the nearest photo."

@@ -1,0 +1,251 @@
+"""From whatever lies in the folder to decoded photos with ASCII names, and words for the rest."""
+
+import hashlib
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+
+from stages import ingest
+from stages.contract import StageError
+from stages.files import read_json
+from stages.ingest import Config, ascii_files
+from stages.photos import load_pixels, read_frame_names, read_photos
+
+
+def picture(seed: int, width: int = 32, height: int = 24) -> Image.Image:
+    return Image.fromarray(np.random.default_rng(seed).integers(0, 256, (height, width, 3), dtype=np.uint8))
+
+
+def put(folder: Path, *names: str) -> Path:
+    for seed, name in enumerate(names):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        picture(seed).save(folder / name, format="JPEG" if name.lower().endswith("jpg") else "PNG")
+    return folder
+
+
+def digests(folder: Path) -> dict[str, str]:
+    files = sorted(file for file in folder.rglob("*") if file.is_file())
+    return {str(file.relative_to(folder)): hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
+
+
+def failure(photos: Path, out: Path, progress: Any) -> StageError:
+    with pytest.raises(StageError) as caught:
+        ingest.run(Config(photos=photos), {}, out, progress)
+    return caught.value
+
+
+def test_plain_photos_are_copied_byte_for_byte(tmp_path: Path, progress: Any) -> None:
+    put(tmp_path / "in", "b.JPG", "a.png", "sub/c.jpg")
+    result = ingest.run(Config(photos=tmp_path / "in"), {}, tmp_path / "out", progress)
+    photos = read_photos(tmp_path / "out")
+    assert [photo.name for photo in photos] == ["a.png", "b.JPG", "sub/c.jpg"]
+    assert [photo.file for photo in photos] == ["images/a.png", "images/b.JPG", "images/sub/c.jpg"]
+    for photo in photos:
+        assert (tmp_path / "out" / photo.file).read_bytes() == (tmp_path / "in" / photo.name).read_bytes()
+    assert result.line == "3 photos 32×24, one camera, no EXIF focal"
+    assert result.outputs == ("images", "photos.json")
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["images", "photos.json"]
+    assert progress.updates[-1] == ("decoded 3 of 3 photos", 1.0)
+
+
+def test_everything_else_is_written_upright_as_png(tmp_path: Path, progress: Any) -> None:
+    put(tmp_path / "in", "a.png")
+    turned = picture(7)
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    turned.save(tmp_path / "in/turned.png", exif=exif)
+    ingest.run(Config(photos=tmp_path / "in"), {}, tmp_path / "out", progress)
+    photo = read_photos(tmp_path / "out")[1]
+    assert (photo.file, photo.width, photo.height) == ("images/turned.png", 24, 32)
+    assert np.array_equal(load_pixels(tmp_path / "out" / photo.file, 24, 32), np.rot90(np.asarray(turned), -1))
+
+
+def test_the_same_photos_give_the_same_bytes_wherever_they_lie(tmp_path: Path, progress: Any) -> None:
+    names = ["a.jpg", "b.png", "é.jpg", "c d.jpg", *(f"n{index}.png" for index in range(12))]
+    for place in ("one", "two"):
+        ingest.run(Config(photos=put(tmp_path / place, *names)), {}, tmp_path / f"{place}.out", progress)
+    first = digests(tmp_path / "one.out")
+    assert len(first) == len(names) + 1
+    assert first == digests(tmp_path / "two.out")
+
+
+def test_refused_files_are_named_and_do_not_stop_the_rest(tmp_path: Path, progress: Any) -> None:
+    folder = put(tmp_path / "in", "a.jpg", "b.jpg", "whole.jpg")
+    data = (folder / "whole.jpg").read_bytes()
+    (folder / "whole.jpg").unlink()
+    (folder / "cut.jpg").write_bytes(data[:-200])
+    (folder / "notes.jpg").write_text("not a photo at all\n")
+    (folder / "z copy of a.jpg").write_bytes((folder / "a.jpg").read_bytes())
+    result = ingest.run(Config(photos=folder), {}, tmp_path / "out", progress)
+    assert result.line == "2 photos 32×24, one camera, no EXIF focal, 3 refused"
+    refused = read_json(tmp_path / "out/photos.json")["refused"]
+    assert [refusal["name"] for refusal in refused] == ["cut.jpg", "notes.jpg", "z copy of a.jpg"]
+    assert refused == result.facts["refused"]
+    assert progress.notes[0].startswith("refused cut.jpg: truncated: ")
+    assert progress.notes[1:] == [
+        "refused notes.jpg: not an image: it is text",
+        "refused z copy of a.jpg: identical to a.jpg",
+    ]
+
+
+def test_at_most_ten_refusals_are_said(tmp_path: Path, progress: Any) -> None:
+    folder = put(tmp_path / "in", "a.jpg", "b.jpg")
+    for index in range(13):
+        (folder / f"x{index:02d}.jpg").write_bytes(b"")
+    ingest.run(Config(photos=folder), {}, tmp_path / "out", progress)
+    assert len(progress.notes) == 11
+    assert progress.notes[-1] == "… and 3 more, all in photos.json"
+
+
+def test_too_few_photos_in_words_that_fit(tmp_path: Path, progress: Any) -> None:
+    hint = "Take 20 to 100 overlapping photos of one scene from different places and put them into one folder."
+    error = failure(put(tmp_path / "one", "a.jpg"), tmp_path / "out1", progress)
+    assert (error.what, error.why, error.hint) == ("there is only one photo", "a.jpg; a scene needs at least two", hint)
+
+    (tmp_path / "none").mkdir()
+    (tmp_path / "none/a.jpg").write_text("text")
+    error = failure(tmp_path / "none", tmp_path / "out2", progress)
+    assert error.what == f"none of the 1 files in {tmp_path}/none is a usable photo"
+    assert error.why == "a.jpg: not an image: it is text"
+
+    put(tmp_path / "same", "a.png")
+    (tmp_path / "same/b.png").write_bytes((tmp_path / "same/a.png").read_bytes())
+    error = failure(tmp_path / "same", tmp_path / "out3", progress)
+    assert (error.what, error.why) == ("all 2 photos are identical", "they have the pixels of a.png")
+
+    put(tmp_path / "rest", "a.jpg")
+    (tmp_path / "rest/b.jpg").write_text("text")
+    error = failure(tmp_path / "rest", tmp_path / "out4", progress)
+    assert (error.what, error.why) == ("only one photo can be used, a.jpg", "1 other files were refused")
+
+
+def test_cameras_are_told_apart(tmp_path: Path, progress: Any) -> None:
+    put(tmp_path, "a.png", "b.png")
+    picture(8, width=40).save(tmp_path / "c.png")
+    exif = Image.Exif()
+    exif[271] = "Maker"
+    exif.get_ifd(0x8769)[41989] = 50
+    picture(9).save(tmp_path / "d.png", exif=exif)
+    result = ingest.run(Config(photos=tmp_path), {}, tmp_path / "out", progress)
+    photos = read_photos(tmp_path / "out")
+    assert [photo.camera_group for photo in photos] == [0, 0, 1, 2]
+    assert photos[3].focal_px == pytest.approx(50 / 43.27 * 40)
+    assert result.line == "4 photos in 2 sizes, 3 cameras, EXIF focal for 1"
+    assert result.facts["sizes"] == [[32, 24], [40, 24]]
+
+
+def test_sharpness_orders_blur(tmp_path: Path, progress: Any) -> None:
+    from PIL import ImageFilter
+
+    sharp = picture(0, 64, 64)
+    for index, radius in enumerate((0, 1, 3)):
+        sharp.filter(ImageFilter.GaussianBlur(radius)).save(tmp_path / f"{index}.png")
+    ingest.run(Config(photos=tmp_path), {}, tmp_path / "out", progress)
+    sharpness = [photo.sharpness for photo in read_photos(tmp_path / "out")]
+    assert sharpness[0] > 4 * sharpness[1] > 16 * sharpness[2] > 0
+
+
+def test_odd_names_stay_inside_and_become_ascii(tmp_path: Path, progress: Any) -> None:
+    odd = ["-rf.jpg", "a b.jpg", "line\nbreak.jpg", "…jpg", "Größe/ñ.jpg", "$(x);'.jpg", "[red]x.jpg", "..jpg.jpg"]
+    put(tmp_path / "in", *odd[:-1], "ok.jpg")
+    (tmp_path / "in" / os.fsdecode(b"\xff.jpg")).write_bytes((tmp_path / "in/ok.jpg").read_bytes()[:40])
+    ingest.run(Config(photos=tmp_path / "in"), {}, tmp_path / "out", progress)
+    photos = read_photos(tmp_path / "out")
+    assert {photo.name for photo in photos} == {*odd[:-1], "ok.jpg"}
+    for photo in photos:
+        assert (tmp_path / "out" / photo.file).resolve().is_relative_to(tmp_path / "out/images")
+        assert (tmp_path / "out" / photo.file).is_file()
+    assert progress.notes == ["refused \\xff.jpg: damaged: its header cannot be read (Truncated File Read)"]
+
+
+def test_terminal_codes_in_names_are_not_printed(tmp_path: Path, progress: Any) -> None:
+    put(tmp_path / "in", "a.jpg", "b.jpg")
+    (tmp_path / "in/\x1b[2J.jpg").write_text("text")
+    ingest.run(Config(photos=tmp_path / "in"), {}, tmp_path / "out", progress)
+    assert progress.notes == [r"refused '\x1b[2J.jpg': not an image: it is text"]
+
+
+def test_names_that_are_safe_are_kept_and_others_tell_what_they_were() -> None:
+    names = [("IMG_1.JPG", ".jpg"), ("sub/b-2.png", ".png"), ("Café au lait.jpg", ".jpg"), ("b.heic", ".png")]
+    files = ascii_files(names)
+    assert files[:2] == ["IMG_1.JPG", "sub/b-2.png"]
+    assert files[2].startswith("Cafe_au_lait-") and files[2].endswith(".jpg")
+    assert files[3] == "b.png"
+
+
+def test_colliding_names_are_told_apart_and_the_unchanged_one_wins() -> None:
+    files = ascii_files([("a.heic", ".png"), ("A.png", ".png"), ("a.png", ".png"), ("a.jpg", ".jpg")])
+    assert files[1] == "A.png"
+    assert len({os.path.splitext(file)[0].lower() for file in files}) == 4
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.lists(st.text(st.characters(exclude_characters="/\0", codec="utf-8"), min_size=1), min_size=1).map(
+                "/".join
+            ),
+            st.sampled_from([".jpg", ".png"]),
+        ),
+        max_size=12,
+        unique=True,
+    )
+)
+def test_any_names_become_safe_and_distinct(names: list[tuple[str, str]]) -> None:
+    files = ascii_files(names)
+    assert files == ascii_files(names)
+    assert len({os.path.splitext(file)[0].lower() for file in files}) == len(names)
+    folders = {str(parent).lower() for file in files for parent in Path(file).parents}
+    for file in files:
+        assert file.isascii() and len(file) < 200
+        assert set(file) <= set("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789-_./")
+        assert all(part and not part.startswith(("-", ".")) for part in file.split("/"))
+        assert file.lower() not in folders
+
+
+def test_only_photos_named_by_the_cameras_are_taken(tmp_path: Path, progress: Any) -> None:
+    import json
+
+    put(tmp_path, "images/a.png", "images/b.png", "images/unused.png")
+    (tmp_path / "images/copy.png").write_bytes((tmp_path / "images/a.png").read_bytes())
+    paths = ["images/a", "images/b.png", "images/copy.png", "images/gone.png"]
+    frames = [{"file_path": path, "transform_matrix": np.eye(4).tolist()} for path in paths]
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
+    result = ingest.run(Config(photos=tmp_path / "transforms.json"), {}, tmp_path / "out", progress)
+    assert [photo.name for photo in read_photos(tmp_path / "out")] == [
+        "images/a.png",
+        "images/b.png",
+        "images/copy.png",
+    ]
+    assert read_frame_names(tmp_path / "out")["images/a"] == "images/a.png"
+    assert result.line == "3 photos 32×24, cameras given, 1 refused"
+    assert progress.notes == ["refused images/gone.png: there is no such file"]
+
+
+def test_a_full_disk_is_said_in_words(tmp_path: Path, progress: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("shutil.copyfile", full)
+    error = failure(put(tmp_path / "in", "a.jpg", "b.jpg"), tmp_path / "out", progress)
+    assert error.what == f"cannot write the photos to {tmp_path}/out"
+    assert error.why == "No space left on device"
+
+
+@pytest.mark.parametrize(
+    ("scene", "line"),
+    [
+        ("sceaux_castle", "11 photos 1416×1064, one camera, EXIF focal 1433 px"),
+        ("room_no_overlap", "8 photos in 2 sizes, 2 cameras, no EXIF focal"),
+        ("lego_400", "125 photos 400×400 with alpha, cameras given"),
+    ],
+)
+def test_real_sets(shared_data: Path, tmp_path: Path, progress: Any, scene: str, line: str) -> None:
+    assert ingest.run(Config(photos=shared_data / scene), {}, tmp_path, progress).line == line
+    assert progress.notes == []

@@ -1,0 +1,90 @@
+"""photos.json round trips, and pixels at any size are area means."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+
+from stages.contract import StageError
+from stages.photos import Photo, Refusal, load_pixels, read_frame_names, read_photos, write_photos
+
+
+def stored(folder: Path, pixels: np.ndarray) -> Path:
+    path = folder / "p.png"
+    Image.fromarray(pixels).save(path)
+    return path
+
+
+def random_pixels(height: int, width: int, channels: int) -> np.ndarray:
+    return np.random.default_rng(0).integers(0, 256, (height, width, channels), dtype=np.uint8)
+
+
+def coverage(size: int, target: int) -> np.ndarray:
+    """(target, size) matrix: how much of each source pixel each target pixel covers; rows sum to one."""
+    edges = np.arange(target + 1) * size / target
+    pixel = np.arange(size)
+    overlap = np.minimum(edges[1:, None], pixel + 1) - np.maximum(edges[:-1, None], pixel)
+    return np.clip(overlap, 0, None) * target / size
+
+
+def test_coverage_is_a_partition() -> None:
+    assert np.allclose(coverage(7, 3).sum(axis=1), 1)
+    assert np.allclose(coverage(7, 3).sum(axis=0), 3 / 7)
+
+
+@pytest.mark.parametrize("channels", [3, 4])
+def test_own_size_is_the_identity(tmp_path: Path, channels: int) -> None:
+    pixels = random_pixels(9, 7, channels)
+    assert np.array_equal(load_pixels(stored(tmp_path, pixels), 7, 9), pixels)
+
+
+@given(width=st.integers(1, 13), height=st.integers(1, 11))
+def test_smaller_sizes_are_area_means(tmp_path_factory: pytest.TempPathFactory, width: int, height: int) -> None:
+    pixels = random_pixels(11, 13, 3)
+    loaded = load_pixels(stored(tmp_path_factory.getbasetemp(), pixels), width, height)
+    expected = np.einsum("ai,bj,ijc->abc", coverage(11, height), coverage(13, width), pixels.astype(float))
+    assert loaded.shape == (height, width, 3) and loaded.dtype == np.uint8
+    assert np.abs(loaded - expected).max() <= 0.51
+
+
+def test_colours_are_weighted_by_alpha(tmp_path: Path) -> None:
+    pixels = random_pixels(12, 12, 4)
+    loaded = load_pixels(stored(tmp_path, pixels), 5, 4)
+    weights = coverage(12, 4), coverage(12, 5)
+    alpha = np.einsum("ai,bj,ij->ab", *weights, pixels[..., 3] / 1.0)
+    colour = np.einsum("ai,bj,ijc->abc", *weights, pixels[..., :3] * (pixels[..., 3:] / 1.0)) / alpha[..., None]
+    assert np.abs(loaded - np.concatenate([colour, alpha[..., None]], axis=2)).max() <= 0.51
+
+
+def test_the_colour_of_transparent_pixels_does_not_leak(tmp_path: Path) -> None:
+    pixels = np.zeros((4, 8, 4), np.uint8)
+    pixels[:, :4] = (255, 0, 0, 255)
+    pixels[:, 4:] = (0, 255, 0, 0)
+    loaded = load_pixels(stored(tmp_path, pixels), 4, 2)
+    assert np.array_equal(loaded[:, :2], np.broadcast_to([255, 0, 0, 255], (2, 2, 4)))
+    assert np.array_equal(loaded[:, 2:], np.zeros((2, 2, 4)))
+    half = load_pixels(stored(tmp_path, pixels), 1, 1)
+    assert half.tolist() == [[[255, 0, 0, 128]]]
+
+
+def photo(**changes: object) -> Photo:
+    values = {"name": "é\n.jpg", "file": "images/e-1.jpg", "width": 4, "height": 3, "camera_group": 0}
+    values |= {"focal_px": 1 / 3, "focal_source": "FocalLengthIn35mmFilm", "has_alpha": False, "sharpness": 12.5}
+    return Photo(**values | changes)  # pyright: ignore[reportArgumentType]
+
+
+def test_photos_json_round_trips(tmp_path: Path) -> None:
+    photos = [photo(), photo(name="b", focal_px=None, focal_source=None)]
+    write_photos(tmp_path, photos, [Refusal("c.jpg", "truncated")], {"./b": "b"})
+    assert read_photos(tmp_path) == photos
+    assert read_frame_names(tmp_path) == {"./b": "b"}
+
+
+@pytest.mark.parametrize("content", ["", "{}", '{"photos": [{"name": "a"}]}', "[]", '{"photos": 3}'])
+def test_a_damaged_photos_json_is_named(tmp_path: Path, content: str) -> None:
+    (tmp_path / "photos.json").write_text(content)
+    with pytest.raises(StageError, match=r"cannot read photos\.json"):
+        read_photos(tmp_path)

@@ -1,0 +1,282 @@
+"""The page: complete, escaped, self-contained, the same twice, and readable with stages missing."""
+
+import json
+import math
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from nerf.scene import Camera, Scene, Similarity, View
+from stages import report
+from stages.contract import StageError
+from stages.files import write_json, write_tensors
+
+NASTY = "<script>alert(1)</script>.jpg"
+FACTS = {
+    "mesh": {"vertices": 105_900, "faces": 211_817, "watertight": False, "components_kept": 1},
+    "render": {"path": "orbit", "frames": 120, "width": 96, "height": 72, "fps": 24},
+}
+LINES = {
+    "ingest": "24 photos 96×72, one camera",
+    "sfm": "23/24 registered, 0.61 px",
+    "normalise": "around an object, bounded",
+    "train": "180 s · 24 k rays/s · held out 21.4 dB",
+    "evaluate": "21.4 ± 0.4 dB, SSIM 0.61",
+    "render": "orbit, 120 frames",
+    "mesh": "212 k faces, 1 component, open at the back",
+}
+
+
+def make_workspace(root: Path, width: int = 96, height: int = 72, count: int = 24) -> dict[str, Path]:
+    """Folders as the stages leave them, with ``count`` cameras on a ring and one photo that did not register."""
+    inputs = {stage: root / "fox.nerf" / stage / "0123456789abcdef" for stage in LINES}
+    for stage, folder in inputs.items():
+        folder.mkdir(parents=True)
+        _write_manifest(folder, stage)
+    names = [NASTY if i == 8 else f"IMG_{i:04d}.jpg" for i in range(count)]
+    _write_photos(inputs["ingest"], names, (width, height))
+    _write_registration(inputs["sfm"], count)
+    scene = _scene(names, (width, height))
+    write_json(inputs["normalise"] / "scene.json", scene.to_json())
+    rng = np.random.default_rng(0)
+    points = {"xyz": rng.normal(0, 0.3, (2000, 3)).astype(np.float32), "rgb": _colours(rng, 2000)}
+    write_tensors(inputs["normalise"] / "points.safetensors", points)
+    _write_training(inputs["train"])
+    _write_metrics(inputs["evaluate"], scene, (width, height))
+    (inputs["render"] / "video.mp4").write_bytes(b"not really a video" * 100)
+    Image.new("RGB", (64, 48), (90, 120, 150)).save(inputs["mesh"] / "preview.png")
+    return inputs
+
+
+def _colours(rng: np.random.Generator, count: int) -> np.ndarray:
+    return rng.integers(40, 220, (count, 3)).astype(np.uint8)
+
+
+def _write_manifest(folder: Path, stage: str) -> None:
+    config = {"evaluate": {"background": "white", "downscale": None}, "ingest": {"photos": "/home/someone/fox"}}
+    machine = {"cores": 2, "gpu": None, "memory_gb": 23.5, "python": "3.11.9", "torch": "2.13.0"}
+    manifest = {"stage": stage, "config": config.get(stage, {"seed": 0}), "facts": FACTS.get(stage, {})}
+    seconds = {"sfm": 58.2, "train": 181.7, "render": 60.1}.get(stage, 2.5)
+    write_json(folder / "manifest.json", manifest | {"line": LINES[stage], "seconds": seconds, "machine": machine})
+
+
+def _write_photos(folder: Path, names: list[str], size: tuple[int, int]) -> None:
+    (folder / "images").mkdir()
+    photos = [{"name": name, "file": f"images/{i:04d}.png"} for i, name in enumerate(names)]
+    photos.append({"name": "blurred <b>.jpg", "file": "images/9999.png"})
+    refused = [{"name": "notes & sums.jpg", "reason": "not an image: text"}]
+    write_json(folder / "photos.json", {"photos": photos, "refused": refused, "frames": {}})
+    for i, _ in enumerate(names):
+        _picture(i, size).save(folder / f"images/{i:04d}.png")
+
+
+def _write_registration(folder: Path, count: int) -> None:
+    images = [{"file": f"{i:04d}.png", "registered": True, "reason": None} for i in range(count)]
+    images.append({"file": "9999.png", "registered": False, "reason": "only 12 matches with any other photo"})
+    content = {"source": "sfm", "photos": count + 1, "registered": count, "reprojection_px": 0.61, "points": 8123}
+    write_json(folder / "registration.json", content | {"camera_model": "OPENCV", "images": images})
+
+
+def _scene(names: list[str], size: tuple[int, int]) -> Scene:
+    views = []
+    for i, name in enumerate(names):
+        angle = 2 * math.pi * i / len(names)
+        forward = np.array([-math.cos(angle), -math.sin(angle), -0.3]) / math.hypot(1, 0.3)
+        right = np.cross(forward, [0, 0, 1]) / np.linalg.norm(np.cross(forward, [0, 0, 1]))
+        pose = np.stack([right, np.cross(forward, right), forward, -2.2 * forward], axis=1)
+        split = "train" if i % 4 else "test"
+        views.append(View(name, f"images/{i:04d}.png", 0, pose, 0.5, 4.0, split))
+    camera = Camera("SIMPLE_PINHOLE", *size, (1.2 * size[0], size[0] / 2, size[1] / 2))
+    return Scene((camera,), tuple(views), Similarity(1.0, np.eye(3), np.zeros(3)), True, False, "around", True)
+
+
+def _write_training(folder: Path) -> None:
+    curve = [
+        {"step": 50 * k, "seconds": 5 * 1.35**k, "train_psnr": 21 - 9 * 0.8**k, "heldout_psnr": 21.5 - 10 * 0.8**k}
+        for k in range(13)
+    ]
+    write_json(folder / "curve.json", curve)
+    write_json(folder / "field.json", {"kind": "paper", "downscale": 1.0, "steps": 600, "rays": 600_000})
+
+
+def _write_metrics(folder: Path, scene: Scene, size: tuple[int, int]) -> None:
+    for name in ("renders", "errors"):
+        (folder / name).mkdir()
+    images = []
+    for rank, view in enumerate(scene.of_split("test")):
+        file = Path(view.file).name
+        _picture(rank * 4, size, blur=True).save(folder / "renders" / file)
+        Image.new("RGB", size, (60 + rank, 20, 80)).save(folder / "errors" / file)
+        figures = {"psnr": 19.0 + rank, "ssim": 0.5 + rank / 20, "psnr_mean_image": 12.9, "psnr_nearest_view": 14.2}
+        images.append({"name": view.name, "render": f"renders/{file}", "error": f"errors/{file}"} | figures)
+    overall = {"psnr": 21.5, "ssim": 0.62, "psnr_mean_image": 12.9, "psnr_nearest_view": 14.2}
+    counts = {"photos_scored": len(images), "photos_test": len(images), "width_share": 1.0, "error_scale": [0, 0.3]}
+    words = {"notes": ["LPIPS is not computed"], "verdict": "Better than any photo nearby by 7.3 dB but soft."}
+    write_json(folder / "metrics.json", {"psnr_interval": [21.1, 21.9], "images": images} | overall | counts | words)
+
+
+def _picture(seed: int, size: tuple[int, int], blur: bool = False) -> Image.Image:
+    """Something to look at: soft waves, sharper without ``blur``."""
+    x, y = np.meshgrid(np.linspace(0, 6, size[0]), np.linspace(0, 4, size[1]))
+    waves = np.stack([np.sin(x * (1 if blur else 3) + seed), np.cos(y * (1 if blur else 2)), np.sin(x + y)], -1)
+    return Image.fromarray((127 + 90 * waves).astype(np.uint8))
+
+
+class _Links(HTMLParser):
+    """Collects everything that a browser would load, and the tags."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.links: list[str] = []
+        self.tags: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.links += [value or "" for name, value in attrs if name in ("src", "href", "srcset", "poster")]
+
+
+def _run(inputs: dict[str, Path], folder: Path, progress: Any, **settings: Any) -> tuple[str, dict[str, Any]]:
+    folder.mkdir()
+    result = report.run(report.Config(**settings), inputs, folder, progress)
+    assert result.outputs == ("report.html", "summary.json")
+    return (folder / "report.html").read_text("utf-8"), json.loads((folder / "summary.json").read_text("utf-8"))
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    return make_workspace(tmp_path_factory.mktemp("report"))
+
+
+def test_summary_has_exactly_the_promised_keys(inputs: dict[str, Path], tmp_path: Path, progress: Any):
+    _, summary = _run(inputs, tmp_path / "out", progress)
+    assert summary == {
+        "photos": 25,
+        "registered": 24,
+        "camera_model": "OPENCV",
+        "reprojection_px": 0.61,
+        "field": "paper",
+        "train_seconds": pytest.approx(5 * 1.35**12),
+        "total_seconds": pytest.approx(58.2 + 181.7 + 60.1 + 4 * 2.5),
+        "psnr": 21.5,
+        "ssim": 0.62,
+        "psnr_mean_image": 12.9,
+        "psnr_nearest_view": 14.2,
+        "mesh": {"vertices": 105_900, "faces": 211_817, "watertight": False},
+        "verdict": "Better than any photo nearby by 7.3 dB but soft.",
+    }
+
+
+def test_page_loads_nothing_from_elsewhere(inputs: dict[str, Path], tmp_path: Path, progress: Any):
+    html, _ = _run(inputs, tmp_path / "out", progress)
+    parser = _Links()
+    parser.feed(html)
+    assert len(parser.links) > 15
+    assert all(link.startswith(("data:", "#")) for link in parser.links)
+    assert not re.search(r"url\((?!#)", html)
+    assert "link" not in parser.tags and "script" not in parser.tags
+
+
+def test_names_of_photos_are_escaped(inputs: dict[str, Path], tmp_path: Path, progress: Any):
+    html, _ = _run(inputs, tmp_path / "out", progress)
+    assert "<script" not in html and "&lt;script&gt;alert(1)&lt;/script&gt;.jpg" in html
+    assert "blurred &lt;b&gt;.jpg" in html and "notes &amp; sums.jpg" in html
+
+
+def test_page_is_the_same_twice_and_gives_no_folder_away(inputs: dict[str, Path], tmp_path: Path, progress: Any):
+    html, _ = _run(inputs, tmp_path / "out", progress)
+    assert html == _run(inputs, tmp_path / "again", progress)[0]
+    assert str(inputs["train"].parents[2]) not in html and "/home/someone" not in html
+    assert "pipeline resume fox.nerf" in html
+
+
+def test_page_tells_what_a_person_wants_to_know_in_that_order(inputs: dict[str, Path], tmp_path: Path, progress: Any):
+    html, _ = _run(inputs, tmp_path / "out", progress)
+    story = [
+        "Better than any photo nearby by 7.3 dB but soft.",
+        "21.5 <span>dB ± 0.4</span>",
+        "<video",
+        '<span class="tag">best</span> IMG_0020.jpg',
+        '<span class="tag">median</span> &lt;script&gt;alert(1)',
+        '<span class="tag">worst</span> IMG_0000.jpg',
+        "All 6 test photos",
+        "bought +0.5 dB on held-out photos",
+        "from above",
+        "only 12 matches with any other photo",
+        "<td>211,817",
+        "not an image: text",
+        "3 min 2 s",
+        "--evaluate.background",
+        "2.13.0",
+    ]
+    places = [html.find(words) for words in story[2:]]
+    assert all(words in html for words in story)
+    assert places == sorted(places)
+
+
+def test_a_large_video_lies_beside_the_page(inputs: dict[str, Path], tmp_path: Path, progress: Any):
+    html, _ = _run(inputs, tmp_path / "out", progress, video_limit_mb=0.001)
+    assert 'src="video.mp4"' in html and "data:video" not in html
+
+
+@pytest.mark.parametrize("last", ["ingest", "sfm", "normalise", "train", "evaluate", "render"])
+def test_page_reads_well_when_later_stages_are_missing(
+    last: str, inputs: dict[str, Path], tmp_path: Path, progress: Any
+):
+    stages = list(LINES)[: list(LINES).index(last) + 1]
+    html, summary = _run({stage: inputs[stage] for stage in stages}, tmp_path / "out", progress)
+    assert LINES[last] in html and "None" not in html and "Undefined" not in html
+    assert summary["mesh"] is None
+    assert (summary["psnr"] is None) == (last not in ("evaluate", "render"))
+    if summary["psnr"] is None:
+        assert summary["verdict"] == "Not measured: stage evaluate has not run."
+
+
+def test_without_test_photos_the_page_says_so(tmp_path: Path, progress: Any):
+    inputs = make_workspace(tmp_path)
+    path = inputs["evaluate"] / "metrics.json"
+    metrics = json.loads(path.read_text("utf-8"))
+    nothing = dict.fromkeys(("psnr", "ssim", "psnr_interval", "psnr_mean_image", "psnr_nearest_view"))
+    write_json(path, metrics | nothing | {"images": [], "verdict": "Not measured.", "notes": ["no photo was kept"]})
+    html, _ = _run(inputs, tmp_path / "out", progress)
+    assert "No photo was kept." in html and "None" not in html
+
+
+@pytest.mark.parametrize(
+    ("tests", "roles"), [(1, ["test photo"]), (2, ["test photo"] * 2), (3, ["best", "median", "worst"])]
+)
+def test_few_test_photos_are_all_shown(tests: int, roles: list[str], tmp_path: Path, progress: Any):
+    inputs = make_workspace(tmp_path)
+    path = inputs["evaluate"] / "metrics.json"
+    metrics = json.loads(path.read_text("utf-8"))
+    write_json(path, metrics | {"images": metrics["images"][:tests]})
+    html, _ = _run(inputs, tmp_path / "out", progress)
+    assert re.findall(r'<span class="tag">([^<]+)</span>', html) == roles
+    assert "<details>\n<summary>All" not in html
+
+
+def test_transparent_photos_are_shown_as_they_were_scored():
+    pixels = np.array([[[200, 100, 0, 0], [200, 100, 0, 255], [200, 100, 0, 51]]], np.uint8)
+    assert report._opaque(pixels, 255).tolist() == [[[255, 255, 255], [200, 100, 0], [244, 224, 204]]]
+    assert report._opaque(pixels[..., :3], 255).tolist() == [[[200, 100, 0]] * 3]
+
+
+def test_a_finished_stage_that_lost_a_file_is_an_error_with_its_name(tmp_path: Path, progress: Any):
+    inputs = make_workspace(tmp_path)
+    (inputs["train"] / "curve.json").unlink()
+    with pytest.raises(StageError, match=r"cannot read curve\.json"):
+        _run(inputs, tmp_path / "out", progress)
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [(None, "–"), (True, "yes"), (0.00012345, "0.0001234"),
+     (120_000.0, "120,000"), ([1, None], "1, –"), ({"a": 2}, "a 2"),
+     ("/home/someone/fox", "fox"), ("white", "white")],
+)  # fmt: skip
+def test_settings_in_words(value: Any, words: str):
+    assert report._value(value) == words

@@ -1,0 +1,199 @@
+"""What PHOTOS may be, and the words for what it may not be."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from stages.contract import StageError
+from stages.sources import Source, find_source
+
+
+def touch(folder: Path, *names: str) -> Path:
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(b"x")
+    return folder
+
+
+def transforms(path: Path, *file_paths: str) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    frames = [{"file_path": file_path, "transform_matrix": []} for file_path in file_paths]
+    path.write_text(json.dumps({"camera_angle_x": 0.7, "frames": frames}))
+    return path
+
+
+def names(source: Source) -> list[str]:
+    return [source.name(file) for file in source.files]
+
+
+def refusal(photos: Path, cameras: Path | None = None) -> StageError:
+    with pytest.raises(StageError) as caught:
+        find_source(photos, cameras)
+    return caught.value
+
+
+def test_importing_is_cheap() -> None:
+    code = "import sys, stages.sources; print(sorted({'numpy', 'PIL', 'cv2', 'torch', 'pycolmap'} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_a_folder_is_listed_recursively_in_order_of_name(tmp_path: Path) -> None:
+    touch(tmp_path, "b.jpg", "a.JPG", "sub/c.heic", "sub/deeper/d", "Z.png")
+    source = find_source(tmp_path)
+    assert (source.kind, source.root, source.cameras) == ("photos", tmp_path, None)
+    assert names(source) == ["Z.png", "a.JPG", "b.jpg", "sub/c.heic", "sub/deeper/d"]
+
+
+def test_what_is_no_photo_is_skipped(tmp_path: Path) -> None:
+    touch(tmp_path, "a.jpg", ".hidden.jpg", "._a.jpg", ".git/x.jpg", "masks/a.png", "notes.txt", "clip.MOV", "a.XMP")
+    touch(tmp_path, "photos.nerf/run.json", "photos.nerf/ingest/a.jpg", "sub/masks/a.png")
+    assert names(find_source(tmp_path)) == ["a.jpg"]
+
+
+def test_images_inside_is_the_root_and_transforms_beside_it_is_not_used(tmp_path: Path) -> None:
+    touch(tmp_path, "images/a.jpg", "images_2/a.jpg", "thumb.png")
+    transforms(tmp_path / "transforms.json", "images/a.jpg")
+    source = find_source(tmp_path)
+    assert (source.kind, source.root, names(source)) == ("photos", tmp_path / "images", ["a.jpg"])
+
+
+def test_a_transforms_file_names_its_photos(tmp_path: Path) -> None:
+    touch(tmp_path, "images/b.jpg", "images/a.jpg", "images/unused.jpg", "more/c.png")
+    cameras = transforms(tmp_path / "transforms.json", "images/b.jpg", "./images/a", "more/c", "images/gone.jpg")
+    source = find_source(cameras)
+    assert (source.kind, source.root, source.cameras) == ("transforms", tmp_path, cameras)
+    assert names(source) == ["images/a.jpg", "images/b.jpg", "images/gone.jpg", "more/c.png"]
+    assert source.frames["./images/a"] == "images/a.jpg"
+    assert source.frames["more/c"] == "more/c.png"
+
+
+def test_blender_scenes_keep_train_and_test(tmp_path: Path) -> None:
+    touch(tmp_path, "train/r_0.png", "test/r_0.png", "test/r_0_depth.png", "val/r_0.png")
+    for split in ("train", "test", "val"):
+        transforms(tmp_path / f"transforms_{split}.json", f"./{split}/r_0")
+    source = find_source(tmp_path)
+    assert (source.kind, source.root, source.cameras) == ("blender", tmp_path, tmp_path)
+    assert source.frames == {"./train/r_0": "train/r_0.png", "./test/r_0": "test/r_0.png"}
+    assert names(source) == ["test/r_0.png", "train/r_0.png"]
+
+
+@pytest.mark.parametrize("place", [".", "elsewhere"])
+@pytest.mark.parametrize("given", [".", "images"])
+def test_a_photo_folder_with_a_transforms_file(tmp_path: Path, place: str, given: str) -> None:
+    touch(tmp_path, "set/images/a.jpg", "set/images/b.jpg")
+    cameras = transforms(tmp_path / "set" / place / "cameras.json", "images/a.jpg")
+    source = find_source(tmp_path / "set" / given, cameras)
+    assert (source.kind, source.root, source.cameras) == ("transforms", tmp_path / "set/images", cameras)
+    assert names(source) == ["a.jpg"]
+    assert source.frames == {"images/a.jpg": "a.jpg"}
+
+
+def test_frames_of_another_camera_folder_are_not_taken_for_ours(tmp_path: Path) -> None:
+    touch(tmp_path, "left/0.jpg", "right/0.jpg")
+    cameras = transforms(tmp_path / "transforms.json", "left/0.jpg", "right/0.jpg")
+    error = refusal(tmp_path / "left", cameras)
+    assert error.what == f"{tmp_path}/right/0.jpg is not among the photos"
+
+
+COLMAP = [f"{part}.bin" for part in ("cameras", "images", "points3D")]
+
+
+@pytest.mark.parametrize("given", ["model", "model/sparse", "model/sparse/0"])
+@pytest.mark.parametrize("extension", [".bin", ".txt"])
+def test_a_photo_folder_with_a_colmap_model(tmp_path: Path, given: str, extension: str) -> None:
+    touch(tmp_path, "photos/a.jpg")
+    touch(tmp_path / "model/sparse/0", *(name.replace(".bin", extension) for name in COLMAP))
+    source = find_source(tmp_path / "photos", tmp_path / given)
+    assert (source.kind, source.cameras) == ("colmap", tmp_path / "model/sparse/0")
+    assert names(source) == ["a.jpg"]
+
+
+def test_several_colmap_models_are_listed_never_guessed(tmp_path: Path) -> None:
+    touch(tmp_path, "photos/a.jpg", *(f"m/sparse/{index}/{name}" for index in (0, 1) for name in COLMAP))
+    error = refusal(tmp_path / "photos", tmp_path / "m")
+    assert error.what == f"2 COLMAP models in {tmp_path}/m"
+    assert error.why == "sparse/0, sparse/1: which one is meant is not clear"
+    assert error.hint == f"Give one of them: --cameras {tmp_path}/m/sparse/0"
+
+
+@pytest.mark.parametrize("file_path", ["../secret.jpg", "/etc/passwd", "images/../../secret", "link/secret.jpg", "a\0"])
+def test_frames_may_not_leave_their_folder(tmp_path: Path, file_path: str) -> None:
+    touch(tmp_path, "secret.jpg", "scene/images/a.jpg")
+    (tmp_path / "scene/link").symlink_to(tmp_path)
+    error = refusal(transforms(tmp_path / "scene/transforms.json", "images/a.jpg", file_path))
+    assert error.what == f"refused the photo {file_path!r}"
+    assert error.hint == "A transforms file may name photos inside its own folder only."
+
+
+@pytest.mark.parametrize(
+    ("content", "why"),
+    [
+        ("{", "it is not JSON"),
+        ("[1]", "it has no list named 'frames'"),
+        ('{"frames": []}', "it has no list named 'frames'"),
+        ('{"frames": [{"file_path": "a.jpg"}]}', "frame 0 lacks file_path or transform_matrix"),
+        ('{"frames": [{"file_path": 3, "transform_matrix": []}]}', "frame 0 lacks file_path or transform_matrix"),
+        ("[" * 100_000, "it is not JSON"),
+    ],
+)
+def test_a_transforms_file_that_is_none(tmp_path: Path, content: str, why: str) -> None:
+    (tmp_path / "transforms.json").write_text(content)
+    assert refusal(tmp_path / "transforms.json").why.startswith(why)
+
+
+def test_words_for_what_cannot_be_used(tmp_path: Path) -> None:
+    touch(tmp_path, "video/clip.mp4", "texts/a.txt", "texts/b.md", "done.nerf/run.json", "one/a.JPG", "odd/a.xyz")
+    (tmp_path / "empty").mkdir()
+    cases = {
+        "nowhere": "nowhere does not exist: no file or folder has this name. Check the spelling.",
+        "empty": "empty is empty: there is no file in it. Give the folder that holds the photos: pipeline run FOLDER",
+        "texts": f"no photos in {tmp_path}/texts: its 2 files are no images (.md, .txt). "
+        "Give the folder that holds the photos: pipeline run FOLDER",
+        "video/clip.mp4": "clip.mp4 is a video: video input is not built yet. Extract frames first: "
+        "mkdir frames && ffmpeg -i clip.mp4 -vf fps=2 -q:v 2 frames/%04d.jpg",
+        "video": "clip.mp4 is a video: video input is not built yet.",
+        "one/a.JPG": "a.JPG is a single image: a scene needs many photos from different places. Give the folder",
+        "odd/a.xyz": "cannot use a.xyz: it is neither a folder of photos nor a transforms.json.",
+        "done.nerf": f"done.nerf is a workspace: it holds results, not photos. "
+        f"Go on with it: pipeline resume {tmp_path}/done.nerf",
+    }
+    for given, words in cases.items():
+        assert words in str(refusal(tmp_path / given)), given
+
+
+def test_words_for_cameras_that_cannot_be_used(tmp_path: Path) -> None:
+    touch(tmp_path, "photos/a.jpg")
+    cameras = transforms(tmp_path / "transforms.json", "photos/a.jpg")
+    assert refusal(tmp_path / "photos", tmp_path / "no").hint == "Check --cameras."
+    assert refusal(tmp_path / "photos", tmp_path / "photos").what == f"no COLMAP model in {tmp_path}/photos"
+    assert refusal(cameras, cameras).what == "two sources of cameras"
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")
+def test_a_folder_without_read_permission(tmp_path: Path) -> None:
+    touch(tmp_path, "a/b.jpg")
+    (tmp_path / "a").chmod(0)
+    try:
+        assert refusal(tmp_path).why == "permission denied"
+    finally:
+        (tmp_path / "a").chmod(0o755)
+
+
+def test_a_name_that_is_not_unicode_can_be_written_down(tmp_path: Path) -> None:
+    (tmp_path / os.fsdecode(b"caf\xe9.jpg")).write_bytes(b"x")
+    assert names(find_source(tmp_path)) == ["caf\\xe9.jpg"]
+
+
+@pytest.mark.parametrize(
+    ("given", "kind", "count"),
+    [("fox", "photos", 50), ("fox/transforms.json", "transforms", 50), ("lego_400", "blender", 125)],
+)
+def test_real_sets(shared_data: Path, given: str, kind: str, count: int) -> None:
+    source = find_source(shared_data / given)
+    assert (source.kind, len(source.files)) == (kind, count)
+    assert all(file.is_file() for file in source.files)
