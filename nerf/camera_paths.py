@@ -16,6 +16,7 @@ STEEPEST = 0.15  # least horizontal distance of an orbit to its axis, in distanc
 SPIRAL_SHARE = 0.7  # quantile of the cameras' offsets that the spiral reaches
 FRAMES_PER_KEY = 8  # interpolated: frames between two of the cameras it visits, so that the tour is not a blur
 
+UP = np.array([0.0, 0.0, 1.0])
 Poses = Float[np.ndarray, "frames 3 4"]
 
 
@@ -154,7 +155,7 @@ def _catmull_rom(keys: Float[np.ndarray, "n d"], at: Float[np.ndarray, "m"]) -> 
 def look_at(
     centres: Float[np.ndarray, "frames 3"],
     target: Float[np.ndarray, "3"],
-    up: Float[np.ndarray, "3"] = np.array([0.0, 0.0, 1.0]),
+    up: Float[np.ndarray, "3"] = UP,
 ) -> Poses:
     """Poses at ``centres`` that look at ``target`` and keep the horizon level. No view may be along ``up``."""
     z = _unit(target - centres)

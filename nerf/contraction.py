@@ -5,7 +5,6 @@ own ray from the origin. (mip-NeRF 360, Barron et al. 2022, eq. 10, with the inf
 the Euclidean one, so that the image fills a cube.)
 """
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 

@@ -10,12 +10,10 @@ def positional_encoding(
 ) -> Float[Tensor, "*batch 2*dims*{frequencies}"]:
     """sin(2^k pi x) of every coordinate for k = 0 ... frequencies - 1, then as many cosines, without the identity.
 
-    2^k x is exact in binary, and so is its reduction to [-1, 1] by the period 2; only then is it multiplied by pi.
-    That keeps float32 within 1e-6 at every k and stays finite however large x is. A cosine is the sine a quarter
-    period on, which makes one pass of both.
+    Turns of 2 pi are reduced to [-1/2, 1/2] before they become angles: 2^k x/2 and its distance to the nearest whole
+    number are exact in binary. That keeps float32 within 1e-6 at every k, and finite however large x is.
     """
-    octaves = 2.0 ** torch.arange(frequencies, dtype=x.dtype, device=x.device)
+    octaves = 2.0 ** torch.arange(-1, frequencies - 1, dtype=x.dtype, device=x.device)
     turns = (x[..., None] * octaves).flatten(-2)
-    turns = turns - 2 * torch.round(turns / 2)
-    quarter = torch.tensor([[0.0], [0.5]], dtype=x.dtype, device=x.device)
-    return torch.sin(torch.pi * (turns[..., None, :] + quarter)).flatten(-2)
+    angles = 2 * torch.pi * (turns - torch.round(turns))
+    return torch.cat([torch.sin(angles), torch.cos(angles)], -1)

@@ -7,7 +7,8 @@ Named deviations, each with its reason:
 * each second-stage sample is drawn from its own share of the probability (nerf/sampling.py) and the last interval
   ends at far: no sample is wasted, no length is made up;
 * unbounded scenes are contracted (nerf/contraction.py) when ``contracted``; bounded ones are cut to the cube of half
-  size ``BOX``, because the encoding has period 2 and would repeat the scene beyond it.
+  size ``BOX``, because the encoding has period 2 and would repeat the scene beyond it; directions are scaled by
+  ``DIRECTION_SCALE`` before they are encoded, for the same reason.
 """
 
 import math
@@ -29,6 +30,7 @@ from nerf.sampling import Spacing, midpoint_edges, sample_pdf, stratified
 
 BOX = 0.95  # between the region of interest, 0.9, and half the encoding's period, 1
 CONTRACTED_SCALE = 0.45  # takes the contracted cube of half size 2 to 0.9
+DIRECTION_SCALE = 0.9  # keeps +z and -z apart, which are one and the same to the encoding
 
 # A fresh network answers about 0, and this density stops half the light over sqrt(2 · 10) scene units: rays inside the
 # region of interest (length 2) start at opacity 0.27, long ones (10) at 0.79, so that both see gradients.
@@ -100,26 +102,25 @@ class PaperMlp(nn.Module):
         hidden = self._hidden(points)
         feature = self.feature(hidden)
         if self.settings.view_dependence:
-            encoded = self._encode(directions, self.settings.direction_frequencies)
+            encoded = self._encode(DIRECTION_SCALE * directions, self.settings.direction_frequencies)
             colour = _linear_of_parts(self.colour_hidden, feature, encoded[..., None, :])
         else:
             colour = self.colour_hidden(feature)
-        return self._sigma(hidden), torch.sigmoid(self.colour_head(torch.relu_(colour)))
+        return self._sigma(hidden), torch.sigmoid(self.colour_head(torch.relu(colour)))
 
     def density(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points"]:
         """Density alone, without the work for colour."""
         return self._sigma(self._hidden(points))
 
     def _hidden(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points width"]:
-        encoded = self._encode(points, self.settings.position_frequencies)
+        # Flat, because relu_ on a layer's output of more dimensions, a view, costs two copies on the way back.
+        encoded = self._encode(points.reshape(-1, 3), self.settings.position_frequencies)
         hidden = encoded
         for index, layer in enumerate(self.trunk):
-            if index == self.settings.skip + 1:
-                hidden = _linear_of_parts(layer, hidden, encoded)
-            else:
-                hidden = layer(hidden)
-            hidden = torch.relu_(hidden)
-        return hidden
+            assert isinstance(layer, nn.Linear)  # a ModuleList forgets its element type
+            after_skip = index == self.settings.skip + 1
+            hidden = torch.relu_(_linear_of_parts(layer, hidden, encoded) if after_skip else layer(hidden))
+        return hidden.reshape(*points.shape[:-1], self.settings.width)
 
     def _sigma(self, hidden: Float[Tensor, "*points width"]) -> Float[Tensor, "*points"]:
         raw = self.density_head(hidden)[..., 0]
@@ -201,12 +202,13 @@ class PaperNerf(nn.Module):
         self, mlp: PaperMlp, rays: Rays, t: Float[Tensor, "*rays ends"], background: Float[Tensor, "*#rays 3"]
     ) -> tuple[Rendering, Float[Tensor, "*rays ends-1"]]:
         points = self._coordinates(points_on(rays, t[..., :-1]))
-        return composite(*mlp(points, rays.directions), t, background)
+        sigma, colour = mlp(points, rays.directions)
+        return composite(sigma, colour, t, background)
 
 
 def _linear(inputs: int, outputs: int, init: torch.Generator) -> nn.Linear:
     """A layer with Glorot-uniform weights and zero bias, as in the published code, drawn from ``init`` alone."""
-    layer = nn.utils.skip_init(nn.Linear, inputs, outputs)
+    layer = nn.Linear(inputs, outputs, device="meta").to_empty(device="cpu")
     nn.init.xavier_uniform_(layer.weight, generator=init)
     nn.init.zeros_(layer.bias)
     return layer

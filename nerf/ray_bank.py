@@ -60,9 +60,9 @@ class RayBank(NamedTuple):
 
 
 def build_ray_bank(
-    photos: Sequence[UInt8[Tensor, "height width channels"]],
+    photos: Sequence[UInt8[Tensor, "_ _ channels"]],
     camera_of: Sequence[int],
-    camera_directions: Sequence[Float[Tensor, "rows columns 3"]],
+    camera_directions: Sequence[Float[Tensor, "_ _ 3"]],
     poses: Float[Tensor, "views 3 4"],
     near: Float[Tensor, "views"],
     far: Float[Tensor, "views"],
@@ -70,9 +70,9 @@ def build_ray_bank(
     """Lay photos end to end.
 
     Args:
-        photos: one picture per view, all with 3 or all with 4 channels.
+        photos: one (height, width, channels) picture per view, all with 3 or all with 4 channels.
         camera_of: per view, the index of its camera in ``camera_directions``.
-        camera_directions: per camera, the unit bearing vector of every pixel centre (camera frame).
+        camera_directions: per camera, (height, width, 3) unit bearing vectors of the pixel centres (camera frame).
         poses: scene_from_camera of every view.
         near, far: distances along the unit ray, per view.
 

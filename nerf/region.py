@@ -16,7 +16,7 @@ Layout = Literal["around", "inside", "forward"]
 
 FORWARD_DEG = 30.0  # four fifths of the optical axes within this of their median: all photos face one way
 CONVERGENT_DEG = 30.0  # four fifths of the axes within this of the direction to their common focus: they look at it
-AROUND_RADII = (0.4, 1.0)  # the cube's half side as a share of the cameras' distance to the focus
+LEAST_WIDTH = 0.5  # of what the photos see at the focus; textured spots may be small, the object around them is not
 FORWARD_REACH = 3.0  # the farthest depth the cube takes in, in median depths; beyond, detail is below a pixel's
 INSIDE_REACH = 2.0  # likewise around a camera that looks outward
 FAR_CAMERA = 5.0  # a camera so many times as far from the cameras' middle as is usual does not count
@@ -98,11 +98,11 @@ def _near_by(scene: Reconstruction) -> Bool[np.ndarray, "n"]:
 def _around(scene: Reconstruction) -> Region:
     centre = focus(scene)
     distance = float(np.median(np.linalg.norm(scene.centres - centre, axis=1)))
-    if len(scene.point):
-        half = float(np.quantile(_reach(scene, centre), CORE))
-    else:
-        half = distance * float(np.median(_half_widths(scene)))
-    return Region(centre, float(np.clip(half, *(share * distance for share in AROUND_RADII))), False)
+    width = distance * float(np.median(_half_widths(scene)))
+    if not len(scene.point):
+        return Region(centre, width, False)
+    half = float(np.quantile(_reach(scene, centre), CORE))
+    return Region(centre, min(max(half, LEAST_WIDTH * width), distance), False)
 
 
 def _half_widths(scene: Reconstruction) -> Float[np.ndarray, "n"]:

@@ -34,9 +34,7 @@ def stratified(
     return torch.cat([t, far], -1)
 
 
-def midpoint_edges(
-    t: Float[Tensor, "*rays ends"], near: Float[Tensor, "*rays"]
-) -> Float[Tensor, "*rays ends"]:
+def midpoint_edges(t: Float[Tensor, "*rays ends"], near: Float[Tensor, "*rays"]) -> Float[Tensor, "*rays ends"]:
     """Edges around the samples of ``t``, half-way between neighbours, from near to far.
 
     The weight of sample i is spread on both sides of t_i: the surface that stopped the light lies before it.
@@ -70,11 +68,12 @@ def invert_cdf(
     dividing the weights by it, and kept below the last entry of the CDF, so that bisection ends at a bin with
     cdf_i <= u < cdf_{i+1}, which is never an empty one.
     """
-    weights = torch.where(weights.sum(-1, keepdim=True) > 0, weights, 1)
+    weights = torch.where(weights.sum(-1, keepdim=True) == 0, 1, weights)
     cdf = torch.nn.functional.pad(torch.cumsum(weights, -1), (1, 0))
     total = cdf[..., -1:]
     u = torch.minimum(u * total, torch.nextafter(total, torch.zeros_like(total)))
-    above = torch.searchsorted(cdf, u, right=True)
+    # The clamp acts on NaN alone, for which bisection finds no bin: the positions must be NaN, not an index error.
+    above = torch.searchsorted(cdf, u, right=True).clamp(max=weights.shape[-1])
     low, high = cdf.gather(-1, above - 1), cdf.gather(-1, above)
     left, right = edges.gather(-1, above - 1), edges.gather(-1, above)
     return torch.lerp(left, right, (u - low) / (high - low))

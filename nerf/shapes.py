@@ -6,7 +6,7 @@ normal found by tracing faces the ray's origin.
 """
 
 import math
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -16,6 +16,7 @@ Points = Float[Tensor, "*points 3"]
 Values = Float[Tensor, "*points"]
 
 
+@runtime_checkable
 class Shape(Protocol):
     """A closed solid; lengths are in scene units."""
 
@@ -270,7 +271,7 @@ BISECTIONS = 40
 
 
 def dot(a: Points, b: Points) -> Values:
-    """Scalar product over the last axis; written out, which is several times faster than a sum over so short an axis."""
+    """Scalar product over the last axis, written out: a sum over so short an axis is several times slower."""
     return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
 
 

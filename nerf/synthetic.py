@@ -131,8 +131,8 @@ class SyntheticScene(NamedTuple):
         """Light from infinity: haze at the horizon, deeper blue above and below it, soft clouds everywhere."""
         height = directions[..., 2].abs()
         cloud = self.noise.fractal(directions * directions.new_tensor([1.5, 1.5, 2.5]) + 29, 4)
-        sky = mix((0.86, 0.78, 0.68), (0.16, 0.36, 0.62), (1.3 * height).clamp(0, 1).sqrt())
-        return mix(sky, (0.93, 0.92, 0.90), (4 * cloud - 1.75).clamp(0, 0.85))
+        sky = mix((0.86, 0.78, 0.68), (0.16, 0.36, 0.62), (1.3 * height).sqrt())
+        return mix(sky, (0.93, 0.92, 0.90), (4 * cloud - 1.75).clamp(max=0.85))
 
     def surface_points(self, count: int, seed: int) -> tuple[Float[Tensor, "count 3"], Float[Tensor, "count 3"]]:
         """Points and outward normals, area-uniform on the outside of the union, a function of the arguments."""
@@ -191,7 +191,7 @@ def still_life(seed: int = 0, highlight: float = 0.0) -> SyntheticScene:
 
     sink = 0.004  # what stands on the table reaches a little into it, so that no two surfaces coincide
     solids = (
-        solid(Frustum(TABLE_RADIUS, TABLE_RADIUS, 0.05), solid_texture.mosaic, 0, 0, -0.05),
+        solid(Frustum(TABLE_RADIUS, TABLE_RADIUS, 0.05), solid_texture.mosaic, 0.0, 0.0, -0.05),
         solid(Box((0.24, 0.20, 0.15)), solid_texture.wrapping, -0.30, 0.28, 0.15 - sink, 0.45),
         solid(Sphere(0.24), solid_texture.marble, 0.34, 0.36, 0.24 - sink),
         solid(Frustum(0.17, 0.25, 0.21), solid_texture.banded, -0.50, -0.30, 0.21 - sink, 0.3),
@@ -208,7 +208,7 @@ def ring_of_cameras(count: int, seed: int = 0) -> Float[np.ndarray, "count 3 4"]
     random = np.random.default_rng(seed)
     index = np.arange(count)
     azimuth = 2 * np.pi * (index + random.uniform(-0.2, 0.2, count)) / count
-    elevation = np.deg2rad(np.array([24.0, 40.0, 56.0])[index % 3] + random.uniform(-4, 4, count))
+    elevation = np.deg2rad(np.array([28.0, 40.0, 52.0])[index % 3] + random.uniform(-4, 4, count))
     distance = random.uniform(2.9, 3.3, count)
     ring = [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]
     centres = distance[:, None] * np.stack(ring, axis=-1)

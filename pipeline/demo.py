@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 PHOTOS = 40
 SEED = 0
 # A wide-angle lens with visible barrel distortion, slightly decentred: parameters fx, fy, cx, cy, k1, k2, p1, p2.
-LENS = Camera("OPENCV", 480, 360, (501.0, 499.5, 243.0, 178.2, -0.085, 0.032, 0.0011, -0.0008))
+LENS = Camera("OPENCV", 480, 360, (501.0, 499.5, 241.2, 179.3, -0.085, 0.032, 0.0011, -0.0008))
 SAMPLES_PER_SIDE = 2
 JPEG_QUALITY = 95
 TRAIN_SECONDS = 120.0
@@ -86,7 +86,7 @@ def _supersampled(camera: Camera) -> "torch.Tensor":
     from stages.colmap import camera_rays
 
     rays = camera_rays(camera, SAMPLES_PER_SIDE * camera.width, SAMPLES_PER_SIDE * camera.height)
-    return torch.from_numpy(rays).float()
+    return torch.from_numpy(rays)
 
 
 def _save(path: Path, image: "torch.Tensor") -> None:
@@ -111,6 +111,6 @@ def _refuse_strangers(folder: Path, truth: Truth) -> None:
     if others:
         raise StageError(
             f"cannot write the demo's photos to {folder}",
-            f"it holds {len(others)} other files, {others[0]} for one",
+            f"it holds {others[0]}, which is not one of them",
             "Give an empty folder: pipeline demo -o FOLDER",
         )

@@ -178,7 +178,8 @@ def verdict(metrics: dict[str, Any]) -> str:
     psnr, similarity, nearest, mean = (metrics[key] for key in ("psnr", "ssim", "psnr_nearest_view", "psnr_mean_image"))
     if psnr is None:
         return "Not measured: no photo was kept for testing."
-    figures = f"{psnr:.1f} dB on unseen photos" + ("" if similarity is None else f", SSIM {similarity:.2f}")
+    size = "" if metrics["width_share"] == 1 else f" at {metrics['width_share']:.0%} of their width"
+    figures = f"{psnr:.1f} dB on unseen photos{size}" + ("" if similarity is None else f", SSIM {similarity:.2f}")
     gain = f"{psnr - nearest:.1f} dB better than the nearest photo"
     if psnr <= mean:
         what = f"Unusable: {psnr:.1f} dB is no better than the mean of the training photos ({mean:.1f} dB)"
@@ -193,7 +194,7 @@ def verdict(metrics: dict[str, Any]) -> str:
         what = f"Sharp, as far as {_photos(metrics['photos_scored'])} can tell: {figures}, {gain}"
     else:
         what = f"Sharp and trustworthy: {figures}, {gain}"
-    return what + ("." if metrics["width_share"] == 1 else f" (at {metrics['width_share']:.0%} of the photos' width).")
+    return what + "."
 
 
 def _overall(

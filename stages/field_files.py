@@ -46,5 +46,6 @@ def load_field(folder: Path, device: str = "cpu") -> "tuple[RadianceModel, dict[
         model = PaperNerf(PaperSettings(**info["settings"]), seed=0)
         model.load_state_dict(load_file(folder / "field.safetensors"))
     except (OSError, KeyError, TypeError, ValueError, RuntimeError, SafetensorError) as error:
-        raise StageError("cannot read the trained field", str(error), "Run stage train again.") from error
+        why = " ".join(str(error).split())  # torch lists mismatches over several lines
+        raise StageError("cannot read the trained field", why, "Run stage train again.") from error
     return model.to(device).requires_grad_(False), info

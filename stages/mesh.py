@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from stages.mesh_cleaning import Cleaned
     from stages.mesh_files import ColouredMesh
     from stages.mesh_level import Level
-    from stages.mesh_views import ShadowMap, Sight
+    from stages.mesh_views import ShadowMap
 
 NEEDS = ("normalise", "train")
 VERSION = 1
@@ -41,14 +41,20 @@ Format = Literal["glb", "ply", "obj"]
 class Config(StageConfig):
     """Settings of stage mesh."""
 
-    resolution: int | None = Field(None, ge=16, le=1024, description="lattice points per edge; none: from the training")
-    level: float | None = Field(None, gt=0, description="density of the surface; none: where the photos' rays stop")
-    keep: Literal["visible", "largest", "all"] = Field("visible", description="which parts of the raw surface")
-    min_views: int = Field(2, ge=1, description="photos that must look at a part for it to be visible")
-    min_component: float = Field(0.01, ge=0, le=1, description="smallest component kept, in areas of the largest")
-    max_faces: int = Field(300_000, ge=100, description="faces left by decimation")
-    formats: tuple[Format, ...] = Field(("glb", "ply"), min_length=1, description="files to write")
-    frame: Literal["sfm", "scene"] = Field("sfm", description="frame of the coordinates in the files")
+    resolution: int | None = Field(
+        default=None, ge=16, le=1024, description="lattice points per edge; none: from the training"
+    )
+    level: float | None = Field(
+        default=None, gt=0, description="density of the surface; none: where the photos' rays stop"
+    )
+    keep: Literal["visible", "largest", "all"] = Field(default="visible", description="which parts of the raw surface")
+    min_views: int = Field(default=2, ge=1, description="photos that must look at a part for it to be visible")
+    min_component: float = Field(
+        default=0.01, ge=0, le=1, description="smallest component kept, in areas of the largest"
+    )
+    max_faces: int = Field(default=300_000, ge=100, description="faces left by decimation")
+    formats: tuple[Format, ...] = Field(default=("glb", "ply"), min_length=1, description="files to write")
+    frame: Literal["sfm", "scene"] = Field(default="sfm", description="frame of the coordinates in the files")
 
 
 class Reconstruction(NamedTuple):
@@ -95,6 +101,8 @@ def reconstruct(
     config: Config, model: "RadianceModel", scene: "Scene", device: str, progress: Progress
 ) -> Reconstruction:
     """The mesh of ``model`` in the scene frame; ``config.resolution`` must be set. Raises StageError without one."""
+    from scipy.spatial import KDTree
+
     from stages.mesh_cleaning import clean, openness
     from stages.mesh_files import ColouredMesh
     from stages.mesh_surface import decimate, extract, vertex_normals
@@ -107,15 +115,15 @@ def reconstruct(
     level = _level(config, lattice, model, maps, progress)
     progress.update("marching cubes", 0.8)
     raw = extract(lattice, level.level)
-    sight = look(raw.vertices, vertex_normals(raw), scene, maps, voxel)
+    sight = look(raw.vertices, vertex_normals(raw), maps, voxel)
     progress.update("cleaning", 0.85)
     cleaned = clean(raw, sight, config.keep, min(config.min_views, len(views)), config.min_component)
     surface = decimate(cleaned.surface, config.max_faces)
     progress.update("colours", 0.9)
-    normals = vertex_normals(surface)
-    sight = look(surface.vertices, normals, scene, maps, voxel)
-    colours = _colours(model, surface.vertices, sight, device)
-    mesh = ColouredMesh(*surface, normals, colours)
+    nearest = KDTree(cleaned.surface.vertices).query(surface.vertices)[1]
+    directions = sight.direction[cleaned.vertex[nearest]]
+    colours = _colours(model, surface.vertices, directions, device)
+    mesh = ColouredMesh(*surface, vertex_normals(surface), colours)
     return Reconstruction(mesh, level, cleaned, openness(surface, HALF_BOX, voxel), voxel)
 
 
@@ -159,15 +167,14 @@ def _level(
     return level
 
 
-def _colours(model: "RadianceModel", vertices: "np.ndarray", sight: "Sight", device: str) -> "np.ndarray":
-    """sRGB bytes (n, 3) of the field at each vertex, in the direction from which the photos saw it."""
+def _colours(model: "RadianceModel", vertices: "np.ndarray", directions: "np.ndarray", device: str) -> "np.ndarray":
+    """sRGB bytes (n, 3) of the field at each vertex, seen along ``directions`` (n, 3)."""
     import torch
 
-    points = torch.tensor(vertices, dtype=torch.float32, device=device)
-    directions = torch.tensor(sight.direction, dtype=torch.float32, device=device)
+    points = torch.tensor(vertices, dtype=torch.float32, device=device).split(CHUNK)
+    views = torch.tensor(directions, dtype=torch.float32, device=device).split(CHUNK)
     with torch.no_grad():
-        chunks = zip(points.split(CHUNK), directions.split(CHUNK), strict=True)
-        colours = torch.cat([model.colour(p, d) for p, d in chunks])
+        colours = torch.cat([model.colour(*pair) for pair in zip(points, views, strict=True)])
     return (colours.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
 
 

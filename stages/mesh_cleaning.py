@@ -18,6 +18,7 @@ class Cleaned(NamedTuple):
     """A cleaned surface; ``uncovered`` counts the faces cut away because too few photos look there."""
 
     surface: Surface
+    vertex: np.ndarray  # the old index of each vertex
     kept: int
     dropped: int
     uncovered: int
@@ -31,7 +32,7 @@ def clean(surface: Surface, sight: "Sight", keep: Keep, min_views: int, min_comp
     ``min_component`` of the largest one's area. ``largest`` keeps the component of largest area, ``all`` everything.
     Raises StageError if nothing remains.
     """
-    covered = (sight.covered[surface.faces] >= min_views).all(axis=1) | (keep != "visible")
+    covered = np.all(sight.covered[surface.faces] >= min_views, axis=1) | (keep != "visible")
     if not covered.any():
         why = f"none of its {len(surface.faces)} faces lies in {min_views} photos between near and far"
         raise StageError("no part of the surface is covered by the photos", why, "Try --mesh.keep all.")
@@ -39,15 +40,15 @@ def clean(surface: Surface, sight: "Sight", keep: Keep, min_views: int, min_comp
     label = components(surface)
     count = int(label.max()) + 1
     if keep == "visible":
-        seen = (sight.seen[old][surface.faces] >= min_views).any(axis=1)
+        seen = np.any(sight.seen[old][surface.faces] >= min_views, axis=1)
         good = _worth_keeping(label, face_areas(surface), seen, min_component)
     else:
         good = np.arange(count) < (1 if keep == "largest" else count)
     if not good.any():
         why = f"in none of its {count} components is a tenth of the area seen by {min_views} photos"
         raise StageError("no part of the surface is seen by the photos", why, "Try --mesh.keep all or --mesh.level.")
-    surface, _ = keep_faces(surface, good[label])
-    return Cleaned(surface, int(good.sum()), int((~good).sum()), int((~covered).sum()))
+    surface, left = keep_faces(surface, good[label])
+    return Cleaned(surface, old[left], int(good.sum()), int((~good).sum()), int((~covered).sum()))
 
 
 def _worth_keeping(label: np.ndarray, area: np.ndarray, seen: np.ndarray, min_component: float) -> np.ndarray:

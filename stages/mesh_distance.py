@@ -40,10 +40,10 @@ def sample_surface(vertices: "np.ndarray", faces: "np.ndarray", count: int, seed
 
 def two_sided(reconstruction: "np.ndarray", truth: "np.ndarray") -> MeshDistance:
     """Distances between two point sets (n, 3) and (m, 3). Raises ValueError when either is empty."""
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     if len(reconstruction) == 0 or len(truth) == 0:
         raise ValueError(f"distance of {len(reconstruction)} to {len(truth)} points: neither may be empty")
-    accuracy = float(cKDTree(truth).query(reconstruction)[0].mean())
-    completeness = float(cKDTree(reconstruction).query(truth)[0].mean())
+    accuracy = float(KDTree(truth).query(reconstruction)[0].mean())
+    completeness = float(KDTree(reconstruction).query(truth)[0].mean())
     return MeshDistance(accuracy, completeness, (accuracy + completeness) / 2)

@@ -26,7 +26,7 @@ FAR_FROM_ORIGIN = 16  # in sizes of the mesh: beyond it float32 keeps less than 
 
 
 class ColouredMesh(NamedTuple):
-    """What is written: ``vertices`` (n, 3) float64, ``faces`` (m, 3), unit ``normals`` (n, 3), sRGB ``colours`` uint8."""
+    """``vertices`` (n, 3) float64, ``faces`` (m, 3), unit ``normals`` (n, 3), ``colours`` sRGB uint8."""
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -61,7 +61,7 @@ def write_obj(path: Path, mesh: ColouredMesh) -> None:
     point = f"v %.{decimals}f %.{decimals}f %.{decimals}f %.4f %.4f %.4f"
     rows = np.concatenate([mesh.vertices, mesh.colours / 255], axis=1).tolist()
     lines = [point % tuple(row) for row in rows]
-    lines += ["f %d %d %d" % tuple(row) for row in (mesh.faces + 1).tolist()]
+    lines += [f"f {a} {b} {c}" for a, b, c in (mesh.faces + 1).tolist()]
     path.write_text("\n".join(lines) + "\n", "ascii")
 
 
@@ -77,7 +77,9 @@ def write_glb(path: Path, mesh: ColouredMesh, upright_from_mesh: np.ndarray) -> 
     document = json.dumps(_gltf(blocks, upright_from_mesh, offset), sort_keys=True, separators=(",", ":")).encode()
     document += b" " * (-len(document) % 4)
     binary = b"".join(block.tobytes() for block in blocks.values())
-    chunks = struct.pack("<I4s", len(document), b"JSON") + document + struct.pack("<I4s", len(binary), b"BIN\0") + binary
+    chunks = (
+        struct.pack("<I4s", len(document), b"JSON") + document + struct.pack("<I4s", len(binary), b"BIN\0") + binary
+    )
     path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
 
 
@@ -100,8 +102,10 @@ def _gltf(blocks: dict[str, np.ndarray], upright_from_mesh: np.ndarray, offset: 
         "extensionsUsed": ["KHR_materials_unlit"],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"name": "upright", "matrix": matrix.T.reshape(-1).tolist(), "children": [1]}]
-        + [{"name": "mesh", "mesh": 0, **place}],
+        "nodes": [
+            {"name": "upright", "matrix": matrix.T.reshape(-1).tolist(), "children": [1]},
+            {"name": "mesh", "mesh": 0, **place},
+        ],
         "meshes": [{"name": "mesh", "primitives": [primitive]}],
         "materials": [{"name": "radiance", "extensions": {"KHR_materials_unlit": {}}, **material}],
         "buffers": [{"byteLength": start}],

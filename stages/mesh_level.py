@@ -1,10 +1,10 @@
 """At which density is the surface? Where the photos' own rays stop.
 
 A radiance field has no surface, only density, and no fixed level suits every field: a short training leaves
-a fog of a few units, a long one walls of thousands. What the photos constrain is where light stops. So the
-rays of the training photos are followed through the lattice to their median depth (half of the light lost), and of a range
-of levels the one is taken whose surface those rays meet nearest to it. Holes, crusts and floaters all count,
-because a ray that stops without meeting the surface, or meets it without stopping, costs the full clip.
+a fog of a few units, a long one walls of thousands. What the photos constrain is where light stops. So rays of the
+training photos are followed through the field to their median depth (half of the light lost), and of a range of
+levels the one is taken whose surface those rays meet nearest to it. Holes, crusts and floaters all count, because
+a ray that stops without meeting the surface, or meets it without stopping, costs the full clip.
 """
 
 import math
@@ -73,8 +73,9 @@ def choose_level(lattice: "Lattice", model: "RadianceModel", rays: "Rays") -> Le
     if int(stopped.sum()) < MIN_STOPPED * len(stop) or not stopped.any():
         return _thickest_fog(lattice, float(stopped.float().mean()) if len(stop) else 0.0)
     low, high = float(lattice.values.min()), float(lattice.values.max())
-    margin = 0.01 * (high - low)
-    candidates = (peak[stopped].median() * torch.logspace(-2.5, 0.5, LEVELS)).clamp(low + margin, high - margin).tolist()
+    margin = 1e-5 * (high - low)
+    peaks = peak[stopped].median() * torch.logspace(-2.5, 0.5, LEVELS, device=peak.device)
+    candidates = peaks.clamp(low + margin, high - margin).tolist()
     voxel = float(lattice.spacing().max())
     surfaces = (first_crossing(along(occupancy(lattice, level), inside, t), t, 0.5) for level in candidates)
     misses = [_miss(surface, stop, voxel) for surface in surfaces]

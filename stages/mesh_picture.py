@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from stages.mesh_preview import Viewpoint, framing, preview
+from stages.mesh_preview import Viewpoint, framing, shade, visible_faces
 
 if TYPE_CHECKING:
     from nerf.scene import Scene
@@ -12,6 +12,7 @@ if TYPE_CHECKING:
 
 WIDTH, HEIGHT = 480, 400
 UP = np.array([0.0, 0.0, 1.0])
+ELEVATION = 30.0  # degrees above the horizon
 ROOM_FIELD_OF_VIEW = 75.0
 BAKED_SHADING = 0.35  # the colours hold the light of the photos already
 
@@ -20,30 +21,36 @@ def picture(mesh: "ColouredMesh", scene: "Scene") -> np.ndarray:
     """(2 × HEIGHT, 2 × WIDTH, 3) uint8: a row per viewpoint, colours on the left and clay on the right."""
     rows = []
     for camera in viewpoints(mesh.vertices, scene):
-        colour = preview(mesh.vertices, mesh.faces, mesh.colours, camera, BAKED_SHADING)
-        clay = preview(mesh.vertices, mesh.faces, None, camera)
+        visible = visible_faces(mesh.vertices, mesh.faces, camera)
+        colour = shade(mesh.vertices, mesh.faces, visible, mesh.colours, camera, BAKED_SHADING)
+        clay = shade(mesh.vertices, mesh.faces, visible, None, camera)
         rows.append(np.concatenate([colour, clay], axis=1))
     return np.concatenate(rows)
 
 
 def viewpoints(vertices: np.ndarray, scene: "Scene") -> tuple[Viewpoint, Viewpoint]:
-    """Two sides from which photos were taken: near the middle of the cameras, and the one farthest from it.
+    """Two views of what the photos show.
 
-    Around an object or in front of one, the whole mesh is framed from there; inside a room the cameras' own poses
-    are used, because from outside only the backs of its walls could be seen.
+    Around an object: from the side of the photo nearest to ``ELEVATION`` and from opposite. Facing one way: from the
+    middle of the cameras and from the camera farthest from it. Both frame the whole mesh. Inside a room the cameras'
+    own poses are used, because from outside only the backs of its walls could be seen.
     """
     poses = np.stack([view.scene_from_camera for view in scene.of_split("train")])
     centres = poses[:, :, 3]
+    if scene.layout == "around":
+        towards = -poses[:, :, 2]
+        side = towards[np.abs(towards[:, 2] - np.sin(np.radians(ELEVATION))).argmin()]
+        return _framed(vertices, side, UP), _framed(vertices, side * [-1, -1, 1], UP)
     first = int(np.linalg.norm(centres - centres.mean(axis=0), axis=1).argmin())
     second = int(np.linalg.norm(centres - centres[first], axis=1).argmax())
     if scene.layout == "inside":
         focal_px = WIDTH / 2 / np.tan(np.radians(ROOM_FIELD_OF_VIEW) / 2)
         return Viewpoint(poses[first], focal_px, WIDTH, HEIGHT), Viewpoint(poses[second], focal_px, WIDTH, HEIGHT)
-    return _framed(vertices, poses[first]), _framed(vertices, poses[second])
+    one, other = poses[first], poses[second]
+    return _framed(vertices, -one[:, 2], -one[:, 1]), _framed(vertices, -other[:, 2], -other[:, 1])
 
 
-def _framed(vertices: np.ndarray, pose: np.ndarray) -> Viewpoint:
-    """The whole mesh from a camera's side; +z is up unless the camera looks along it."""
-    backward = -pose[:, 2]
-    up = UP if abs(backward @ UP) < 0.95 else -pose[:, 1]
-    return framing(vertices, backward, up, WIDTH, HEIGHT)
+def _framed(vertices: np.ndarray, towards: np.ndarray, up: np.ndarray) -> Viewpoint:
+    """The whole mesh from direction ``towards``; +y stands in for an ``up`` that points at the camera."""
+    steep = abs(towards @ up) > 0.95
+    return framing(vertices, towards, np.array([0.0, 1, 0]) if steep else up, WIDTH, HEIGHT)

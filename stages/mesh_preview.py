@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 SUPERSAMPLING = 2
-BLOCK = 1 << 21  # triangle-pixel pairs tested at a time
+BLOCK = 1 << 17  # triangle-pixel pairs tested at a time: what fits into a processor's cache
 KEY_LIGHT, HEADLIGHT, SKY = 0.45, 0.30, 0.30  # shares of the shading; together a little over 1 where all agree
 TOWARDS_LIGHT = np.array([-0.5, -0.75, -0.45]) / np.linalg.norm([0.5, 0.75, 0.45])  # camera axes: upper left, behind
 CLAY = np.array([205, 200, 192], np.uint8)
@@ -33,25 +33,47 @@ def preview(
     ``colours`` are one uint8 triple per vertex, or None for plain clay; ``shading`` blends from the colours as they
     are (0) to fully lit (1). Faces that reach behind the camera are left out.
     """
-    large = camera._replace(
-        focal_px=camera.focal_px * SUPERSAMPLING,
-        width=camera.width * SUPERSAMPLING,
-        height=camera.height * SUPERSAMPLING,
-    )
-    points = (vertices - camera.from_camera[:, 3]) @ camera.from_camera[:, :3]
+    return shade(vertices, faces, visible_faces(vertices, faces, camera), colours, camera, shading)
+
+
+def visible_faces(vertices: np.ndarray, faces: np.ndarray, camera: Viewpoint) -> np.ndarray:
+    """The face in front at each subpixel, flat, -1 where there is none: the part of a preview worth doing once."""
+    camera = _supersampled(camera)
+    points = _in_camera(vertices, camera)
     depth = points[:, 2]
-    ahead = (depth > 1e-6 * np.abs(points).max(initial=1e-30))[faces].all(axis=1)
-    faces = faces[ahead]
+    usable = np.flatnonzero((depth > 1e-6 * np.abs(points).max(initial=1e-30))[faces].all(axis=1))
     divisor = np.where(depth > 0, depth, 1.0)[:, None]
-    pixels = points[:, :2] / divisor * large.focal_px + [large.width / 2, large.height / 2]
-    face_of_pixel = _nearest_faces(pixels, depth, faces, large)
+    pixels = points[:, :2] / divisor * camera.focal_px + [camera.width / 2, camera.height / 2]
+    winner = _nearest_faces(pixels, depth, faces[usable], camera)
+    return np.where(winner >= 0, usable[winner] if len(usable) else -1, -1)
+
+
+def shade(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    face_of_pixel: np.ndarray,
+    colours: np.ndarray | None,
+    camera: Viewpoint,
+    shading: float = 1.0,
+) -> np.ndarray:
+    """Light what :func:`visible_faces` found and average the subpixels; the other arguments are preview's."""
+    large = _supersampled(camera)
     image = _background(large)
     hit = np.flatnonzero(face_of_pixel >= 0)
     if len(hit):
         base = np.broadcast_to(CLAY, vertices.shape) if colours is None else colours
-        image[hit] = _shade(points, base, faces[face_of_pixel[hit]], hit, large, shading)
+        image[hit] = _lit(_in_camera(vertices, large), base, faces[face_of_pixel[hit]], hit, large, shading)
     tiled = image.reshape(camera.height, SUPERSAMPLING, camera.width, SUPERSAMPLING, 3)
     return np.rint(tiled.mean(axis=(1, 3))).astype(np.uint8)
+
+
+def _supersampled(camera: Viewpoint) -> Viewpoint:
+    pose, focal_px, width, height = camera
+    return Viewpoint(pose, focal_px * SUPERSAMPLING, width * SUPERSAMPLING, height * SUPERSAMPLING)
+
+
+def _in_camera(vertices: np.ndarray, camera: Viewpoint) -> np.ndarray:
+    return (vertices - camera.from_camera[:, 3]) @ camera.from_camera[:, :3]
 
 
 def _nearest_faces(pixels: np.ndarray, depth: np.ndarray, faces: np.ndarray, camera: Viewpoint) -> np.ndarray:
@@ -95,7 +117,7 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
-def _shade(
+def _lit(
     points: np.ndarray, colours: np.ndarray, faces: np.ndarray, pixel: np.ndarray, camera: Viewpoint, shading: float
 ) -> np.ndarray:
     """Light the visible faces at their pixels; ``points`` are in camera coordinates."""
@@ -125,7 +147,7 @@ def _background(camera: Viewpoint) -> np.ndarray:
 
 
 def look_at(centre: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """The pose [R | centre] (3, 4) of a camera at ``centre`` that looks at ``target``; ``up`` must not lie on its axis."""
+    """The pose [R | centre] (3, 4) of a camera at ``centre`` looking at ``target``; ``up`` must not lie on its axis."""
     forward = (target - centre) / np.linalg.norm(target - centre)
     right = np.cross(forward, up)
     right /= np.linalg.norm(right)

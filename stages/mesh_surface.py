@@ -81,7 +81,7 @@ def decimate(surface: Surface, max_faces: int) -> Surface:
 
     if len(surface.faces) <= max_faces:
         return surface
-    vertices, faces = simplify(surface.vertices, surface.faces, target_count=max_faces, preserve_border=True)
+    vertices, faces, *_ = simplify(surface.vertices, surface.faces, target_count=max_faces, preserve_border=True)
     return Surface(vertices.astype(np.float64), faces.astype(np.int32))
 
 

@@ -13,12 +13,14 @@ import numpy as np
 if TYPE_CHECKING:
     from nerf.lattice import Lattice
     from nerf.rays import Rays
-    from nerf.scene import Scene, View
+    from nerf.scene import Camera, Scene, View
 
 RAYS = 1 << 17  # over all photos: enough for the level and the maps, seconds on two cores
 LONGEST = 96
 SLACK_VOXELS = 3.0  # the surface lies before the median depth, and the map is coarse
-SELDOM_TILTED = 0.1  # cosine between viewing ray and normal below which a vertex is seen edge-on
+EDGE_ON = 0.1  # cosine between viewing ray and normal below which a vertex is not seen but grazed
+ANGLE_SLACK = 0.02  # the outermost ray goes through a pixel's centre, the image ends half a cell further
+BLOCK = 1 << 15  # vertices at a time: what fits into a processor's cache
 
 
 class Sight(NamedTuple):
@@ -34,17 +36,21 @@ class Sight(NamedTuple):
 
 
 class ShadowMap(NamedTuple):
-    """A photo's coarse grid of rays (h, w) and the distance at which each loses half of its light."""
+    """A photo and the distance at which each of its coarse grid of rays (h, w) loses half of its light."""
 
     view: "View"
+    camera: "Camera"
     rays: "Rays"
-    stop: np.ndarray
+    reach: np.ndarray  # the farthest among a cell and its neighbours, so that silhouettes hide nothing behind them
+    widest: float  # cosine between the optical axis and the outermost ray
 
 
 def shadow_maps(
     lattice: "Lattice", scene: "Scene", views: Sequence["View"], on_view: Callable[[float], None]
 ) -> list[ShadowMap]:
     """One map per photo; together about ``RAYS`` rays, each with a sample per voxel of the longest edge."""
+    from scipy.ndimage import maximum_filter
+
     from nerf.lattice import stopping_distance
     from stages.training_data import view_rays
 
@@ -55,27 +61,36 @@ def shadow_maps(
         downscale = max((pixels * len(views) / RAYS) ** 0.5, max(camera.width, camera.height) / LONGEST, 1.0)
         rays = view_rays(scene, view, downscale)
         rays = type(rays)(*(part.to(lattice.low.device) for part in rays))
-        stop = stopping_distance(lattice, rays, max(lattice.values.shape))
-        maps.append(ShadowMap(view, rays, stop.cpu().numpy()))
+        stop = stopping_distance(lattice, rays, max(lattice.values.shape)).cpu().numpy()
+        widest = float((rays.directions.cpu().double().numpy() @ view.scene_from_camera[:, 2]).min())
+        maps.append(ShadowMap(view, camera, rays, maximum_filter(stop, size=3, mode="nearest"), widest))
         on_view((number + 1) / len(views))
     return maps
 
 
-def look(vertices: np.ndarray, normals: np.ndarray, scene: "Scene", maps: Sequence[ShadowMap], voxel: float) -> Sight:
+def look(vertices: np.ndarray, normals: np.ndarray, maps: Sequence[ShadowMap], voxel: float) -> Sight:
     """Look at every vertex from every photo; ``voxel`` is the lattice's spacing in scene units."""
+    parts = [
+        _look(vertices[start : start + BLOCK], normals[start : start + BLOCK], maps, voxel)
+        for start in range(0, len(vertices), BLOCK)
+    ]
+    return Sight(*map(np.concatenate, zip(*parts, strict=True)))
+
+
+def _look(vertices: np.ndarray, normals: np.ndarray, maps: Sequence[ShadowMap], voxel: float) -> Sight:
     covered = np.zeros(len(vertices), np.int32)
     seen = np.zeros(len(vertices), np.int32)
     towards = np.zeros_like(vertices)
     for shadow in maps:
         offset = vertices - shadow.view.scene_from_camera[:, 3]
         distance = np.linalg.norm(offset, axis=1)
-        cell = _cells(offset, distance, scene, shadow)
+        cell = _cells(offset, distance, shadow)
         inside = np.flatnonzero((cell >= 0) & (distance >= shadow.view.near) & (distance <= shadow.view.far))
         covered[inside] += 1
         direction = offset[inside] / distance[inside, None]
         facing = -(direction * normals[inside]).sum(axis=1)
-        reach = _widened(shadow.stop).reshape(-1)[cell[inside]] + SLACK_VOXELS * voxel
-        sees = (facing > SELDOM_TILTED) & (distance[inside] <= reach)
+        reach = shadow.reach.reshape(-1)[cell[inside]] + SLACK_VOXELS * voxel
+        sees = (facing > EDGE_ON) & (distance[inside] <= reach)
         seen[inside[sees]] += 1
         towards[inside[sees]] += direction[sees] * facing[sees, None]
     length = np.linalg.norm(towards, axis=1, keepdims=True)
@@ -83,29 +98,19 @@ def look(vertices: np.ndarray, normals: np.ndarray, scene: "Scene", maps: Sequen
     return Sight(covered, seen, direction)
 
 
-def _cells(offset: np.ndarray, distance: np.ndarray, scene: "Scene", shadow: ShadowMap) -> np.ndarray:
+def _cells(offset: np.ndarray, distance: np.ndarray, shadow: ShadowMap) -> np.ndarray:
     """The flat index of each point's cell in the shadow map, -1 outside the image.
 
     Lens polynomials fold back far outside of the image; points at wider angles than any ray are therefore refused.
     """
     from stages.colmap import project
 
-    camera, rotation = scene.cameras[shadow.view.camera], shadow.view.scene_from_camera[:, :3]
-    height, width = shadow.stop.shape
-    points = offset @ rotation
-    widest = float((shadow.rays.directions.cpu().double().numpy() @ rotation[:, 2]).min())
+    height, width = shadow.reach.shape
+    points = offset @ shadow.view.scene_from_camera[:, :3]
     cell = np.full(len(points), -1)
-    ahead = np.flatnonzero(points[:, 2] > max(widest - 0.02, 1e-6) * distance)
-    scaled = project(camera, points[ahead]) * [width / camera.width, height / camera.height]
-    with np.errstate(invalid="ignore"):
-        within = ((scaled >= 0) & (scaled < [width, height])).all(axis=1)
+    ahead = np.flatnonzero(points[:, 2] > max(shadow.widest - ANGLE_SLACK, 1e-6) * distance)
+    scaled = project(shadow.camera, points[ahead]) * [width / shadow.camera.width, height / shadow.camera.height]
+    within = ((scaled >= 0) & (scaled < [width, height])).all(axis=1)
     column, row = scaled[within].astype(np.int64).T
     cell[ahead[within]] = row * width + column
     return cell
-
-
-def _widened(stop: np.ndarray) -> np.ndarray:
-    """The largest distance among each cell and its neighbours, so that silhouettes do not hide what is behind."""
-    from scipy.ndimage import maximum_filter
-
-    return maximum_filter(stop, size=3, mode="nearest")

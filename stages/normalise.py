@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from nerf.normalisation import Normalisation
     from nerf.reconstruction import Reconstruction
     from nerf.scene import Camera, Scene, Split
-    from stages.colmap import SparseModel
     from stages.photos import Photo
+    from stages.sparse_model import SparseModel
 
 NEEDS = ("ingest", "sfm")
 VERSION = 1
@@ -29,13 +29,15 @@ FULL_TURN_DEG = 320.0  # no gap wider than the step of nine photos around
 
 
 class Config(StageConfig):
-    """``roi`` is the region of interest as x, y, z, radius in the sfm frame (the frame of output/transforms.json
-    and output/sparse); None finds it. Every ``test_every``-th photo by name is held out, beginning with the first,
-    unless the cameras came with a split of their own.
-    """
+    """Settings of stage normalise."""
 
-    roi: tuple[float, float, float, float] | None = None
-    test_every: int = Field(8, ge=2)
+    roi: tuple[float, float, float, float] | None = Field(
+        default=None,
+        description="centre x, y, z and half side of the region of interest, in the frame of output/transforms.json",
+    )
+    test_every: int = Field(
+        default=8, ge=2, description="hold out every n-th photo by name, from the first (imported splits are kept)"
+    )
 
 
 def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> StageResult:
@@ -68,7 +70,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     return StageResult(
         outputs=("scene.json", "points.safetensors", "transforms.json"),
         line=_line(found, has_alpha),
-        facts=_facts(scene, found),
+        facts=_facts(scene, found, len(model.view)),
     )
 
 
@@ -174,7 +176,7 @@ def _line(found: "Normalisation", has_alpha: bool) -> str:
     return f"{layout}, {'background transparent' if has_alpha else bounded} · {up}"
 
 
-def _facts(scene: "Scene", found: "Normalisation") -> dict[str, Any]:
+def _facts(scene: "Scene", found: "Normalisation", observations: int) -> dict[str, Any]:
     """The decisions and the numbers behind them."""
     from nerf.depth_range import REGION_HALF
 
@@ -185,7 +187,7 @@ def _facts(scene: "Scene", found: "Normalisation") -> dict[str, Any]:
         "up": found.up.source,
         "up_known": scene.up_known,
         "arc_deg": round(found.arc_deg, 1),
-        "share_beyond_region": round(found.beyond, 4),
+        "share_beyond_region": round(found.beyond, 4) if observations else None,
         "region_half_sfm": REGION_HALF / scene.scene_from_sfm.scale,
         "near": min(view.near for view in scene.views),
         "far": max(view.far for view in scene.views),

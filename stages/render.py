@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,21 +23,26 @@ VERSION = 1
 RESUMES = False
 LINKS = ("video.mp4", "depth.mp4", "path.json")
 
+CHUNK = {"cpu": 512, "cuda": 8192}  # rays between two words to the user: a second of the published field on a laptop
+
 
 class Config(StageConfig):
-    """``path`` None follows the cameras' layout: orbit around an object, spiral before a scene, interpolated inside one.
-    ``cameras`` is a file with poses and intrinsics instead: a transforms.json in the frame of output/transforms.json, or
-    a path.json of ours. ``frames``, ``width`` (pixels) and ``fps`` None are chosen so that rendering takes no
-    longer than training did.
-    """
+    """Settings of stage render. What is None is chosen, so that rendering costs no more than training did."""
 
-    path: PathKind | None = None
-    cameras: Path | None = None
-    frames: int | None = Field(None, ge=2)
-    width: int | None = Field(None, ge=16, le=8192)
-    fps: int | None = Field(None, ge=1, le=120)
-    depth: bool = True
-    save_frames: bool = False
+    path: PathKind | None = Field(
+        default=None,
+        description="none: orbit around an object, spiral before a scene, interpolated within one",
+    )
+    cameras: Path | None = Field(
+        default=None,
+        description="poses and intrinsics instead of a path: a transforms.json in the frame of output/transforms.json, "
+        "or a path.json of ours",
+    )
+    frames: int | None = Field(default=None, ge=2, description="none: 24 to 120")
+    width: int | None = Field(default=None, ge=16, le=8192, description="pixels; odd numbers are rounded to even ones")
+    fps: int | None = Field(default=None, ge=1, le=120, description="none: 30, fewer for fewer than 120 frames")
+    depth: bool = Field(default=True, description="write depth.mp4 too")
+    save_frames: bool = Field(default=False, description="keep every frame as PNG in frames/")
 
 
 def plan(config: Config, inputs: Inputs) -> Config:
@@ -85,7 +89,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     write_json(folder / "speed.json", {"frames_per_second": frames_per_second})
     facts = _facts(config, path)
     line = f"{facts['path']}, {facts['frames']} frames {facts['width']}×{facts['height']}"
-    return StageResult(outputs, f"{line} · {frames_per_second:.1f} frames/s", ("speed.json",), facts)
+    return StageResult(outputs, f"{line} · {frames_per_second:.2g} frames/s", ("speed.json",), facts)
 
 
 def _path(config: Config, scene: "Scene") -> CameraPath:
@@ -121,18 +125,21 @@ def _render(
     bearings = {
         camera: torch.from_numpy(camera_rays(camera, camera.width, camera.height)) for camera in set(path.cameras)
     }
-    count = len(path.cameras)
+    count, started = len(path.cameras), time.perf_counter()
     for index, camera in enumerate(path.cameras):
         pose = torch.from_numpy(path.poses[index]).float()
         rays = rays_of_view(bearings[camera], pose, float(near[index]), float(far[index]))
 
         def on_chunk(share: float, index: int = index) -> None:
-            progress.update(f"frame {index + 1} of {count}", (index + share) / count)
+            done = (index + share) / count
+            left = (time.perf_counter() - started) * (1 - done) / done
+            progress.update(f"frame {index + 1} of {count} · {left:.0f} s left", done)
 
         image = render_image(
             model,
             Rays(*(part.to(device) for part in rays)),
             torch.tensor(background, device=device),
+            chunk=CHUNK[device],
             on_chunk=on_chunk,
         )
         yield Rendering(*(part.cpu() for part in image))
@@ -149,9 +156,8 @@ def _write(renderings: "Iterator[Rendering]", path: CameraPath, config: Config, 
     if config.save_frames:
         (folder / "frames").mkdir()
     waiting = folder / "inverse_depth.tmp"
-    with ExitStack() as stack:
-        add = stack.enter_context(video_writer(folder / "video.mp4", width, height, config.fps))
-        inverse = np.memmap(waiting, np.float16, "w+", shape=(len(path.cameras), height, width))
+    inverse = np.memmap(waiting, np.float16, "w+", shape=(len(path.cameras), height, width))
+    with video_writer(folder / "video.mp4", width, height, config.fps) as add:
         for index, rendering in enumerate(renderings):
             frame = (rendering.colour.clamp(0, 1) * 255).round().byte().numpy()
             add(frame)
@@ -161,8 +167,7 @@ def _write(renderings: "Iterator[Rendering]", path: CameraPath, config: Config, 
     if config.depth:
         _write_depth(inverse, folder / "depth.mp4", config.fps)
     waiting.unlink()
-    names = ["video.mp4"] + ["depth.mp4"] * config.depth + ["frames"] * config.save_frames
-    return names
+    return ["video.mp4"] + ["depth.mp4"] * config.depth + ["frames"] * config.save_frames
 
 
 def _write_depth(inverse: "np.ndarray", file: Path, fps: int) -> None:

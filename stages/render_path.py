@@ -66,22 +66,18 @@ def path_from_file(scene: "Scene", file: Path) -> CameraPath:
     """
     import numpy as np
 
-    from nerf.scene import Camera
     from stages.sources import read_transforms
-    from stages.transforms_export import OPENGL_FROM_OPENCV
 
     content = read_transforms(file)
     usual = median_camera(scene)
-    cameras: list[Camera] = []
-    poses = []
+    cameras, poses = [], []
     for index, frame in enumerate(content["frames"]):
         try:
             cameras.append(_camera(content | frame, usual))
-            pose = np.array(frame["transform_matrix"], float)[:3].reshape(3, 4)
+            poses.append(_in_scene(frame["transform_matrix"], scene.scene_from_sfm))
         except (TypeError, ValueError) as error:
             hint = "Give numbers as output/transforms.json and output/path.json have them."
             raise StageError(f"cannot use frame {index} of {file.name}", str(error), hint) from error
-        poses.append(_in_scene(pose, OPENGL_FROM_OPENCV, scene.scene_from_sfm))
     if len({(camera.width, camera.height) for camera in cameras}) > 1:
         raise StageError(
             f"cannot make one video of {file.name}", "its frames differ in size", "Give all frames one w and h."
@@ -89,16 +85,18 @@ def path_from_file(scene: "Scene", file: Path) -> CameraPath:
     return CameraPath(tuple(cameras), np.stack(poses))
 
 
-def _in_scene(pose: "np.ndarray", axes: "np.ndarray", scene_from_sfm: "Similarity") -> "np.ndarray":
-    """An OpenGL pose in the sfm frame as ours; its axes must be orthonormal, up to a scale common to all three."""
+def _in_scene(matrix: Any, scene_from_sfm: "Similarity") -> "np.ndarray":
+    """An OpenGL pose in the sfm frame as ours. Scaled axes are accepted: the nearest rotation is taken."""
     import numpy as np
 
     from nerf.camera_paths import nearest_rotations
+    from stages.transforms_export import OPENGL_FROM_OPENCV
 
+    pose = np.array(matrix, float)[:3].reshape(3, 4)
     if not (np.isfinite(pose).all() and np.linalg.det(pose[:, :3]) > 0):
         raise ValueError("transform_matrix is no camera pose")
-    turned = np.concatenate([nearest_rotations(pose[:, :3] @ axes), pose[:, 3:]], axis=1)
-    return scene_from_sfm.pose(turned)
+    rotation = nearest_rotations(pose[:, :3] @ OPENGL_FROM_OPENCV)
+    return scene_from_sfm.pose(np.concatenate([rotation, pose[:, 3:]], axis=1))
 
 
 def _camera(values: dict[str, Any], usual: "Camera") -> "Camera":

@@ -85,7 +85,7 @@ def summarise(results: Results) -> dict[str, Any]:
         "photos": len(results.photos["photos"]) if results.photos else None,
         **{key: registration.get(key) for key in ("registered", "camera_model", "reprojection_px")},
         "field": results.field["kind"] if results.field else None,
-        "train_seconds": _training_seconds(results),
+        "train_seconds": manifests["train"]["facts"]["train_seconds"] if "train" in manifests else None,
         "total_seconds": round(sum(manifest["seconds"] for manifest in manifests.values()), 3),
         **{key: metrics.get(key) for key in ("psnr", "ssim", "psnr_mean_image", "psnr_nearest_view")},
         "mesh": mesh and {key: mesh[key] for key in ("vertices", "faces", "watertight")},
@@ -129,11 +129,6 @@ def page(results: Results, summary: dict[str, Any], config: Config) -> str:
 def _workspace(inputs: Inputs) -> str:
     """The workspace folder's own name: stage folders are <workspace>/<stage>/<key>."""
     return next((folder.resolve().parents[1].name for folder in inputs.values()), "")
-
-
-def _training_seconds(results: Results) -> float | None:
-    """Training time over all interruptions, as the curve counted it."""
-    return results.curve[-1]["seconds"] if results.curve else None
 
 
 def _missing(results: Results) -> list[dict[str, str]]:
@@ -182,7 +177,9 @@ def _curve(results: Results) -> dict[str, Any] | None:
     metrics = results.metrics or {}
     baselines = {"nearest photo": "psnr_nearest_view", "mean image": "psnr_mean_image"}
     svg = curve_svg(results.curve, {name: metrics.get(key) for name, key in baselines.items()})
-    return svg and {"svg": Markup(svg), "gain": last_doubling(results.curve), "seconds": _training_seconds(results)}
+    if svg is None:
+        return None
+    return {"svg": Markup(svg), "gain": last_doubling(results.curve), "seconds": results.curve[-1]["seconds"]}
 
 
 def _compared(results: Results) -> dict[str, Any] | None:

@@ -65,7 +65,7 @@ def curve_svg(curve: Sequence[dict[str, Any]], baselines: dict[str, float | None
         _draw_baselines(axes, {name: psnr for name, psnr in baselines.items() if psnr is not None})
         _doubling_axis(axes, rows[0]["seconds"], rows[-1]["seconds"])
         axes.set(xlabel="training time", ylabel="PSNR (dB)")
-        axes.legend(frameon=False, loc="lower right")
+        axes.legend(frameon=False, loc="lower left", bbox_to_anchor=(0, 1), ncols=2, borderaxespad=0)
         return _svg(figure)
 
 
@@ -131,7 +131,7 @@ def _doubling_axis(axes: "Axes", first: float, last: float) -> None:
     axes.set_xticks(ticks, [clock(tick) for tick in ticks])
     axes.set_xticks([], minor=True)
     axes.axvspan(last / 2, last, color=BLUE, alpha=0.08, lw=0)
-    axes.grid(axis="both", alpha=0.18, lw=0.8)
+    axes.grid(color=INK, alpha=0.15, lw=0.8)
 
 
 @contextmanager
@@ -141,9 +141,10 @@ def _drawing(size: tuple[float, float], salt: str) -> "Iterator[Figure]":
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    ink = dict.fromkeys(("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color"), INK)
-    quiet = {"axes.spines.top": False, "axes.spines.right": False, "font.size": 10.5, "grid.color": INK}
-    with rc_context({"svg.hashsalt": salt, "svg.fonttype": "none", **ink, **quiet}):
+    style: dict[Any, Any] = {"svg.hashsalt": salt, "svg.fonttype": "none", "font.size": 10.5}
+    style |= {f"axes.spines.{side}": False for side in ("top", "right")}
+    style |= dict.fromkeys(("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color"), INK)
+    with rc_context(style):
         figure = Figure(figsize=size, layout="constrained")
         FigureCanvasAgg(figure)
         yield figure

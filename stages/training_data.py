@@ -37,7 +37,7 @@ def training_bank(ingest: Path, scene: "Scene", split: "Split", downscale: float
     views = scene.of_split(split)
     used = sorted({view.camera for view in views})
     return build_ray_bank(
-        photos=[torch.from_numpy(_stored_pixels(ingest, scene, view, downscale)) for view in views],
+        photos=[torch.tensor(_stored_pixels(ingest, scene, view, downscale)) for view in views],
         camera_of=[used.index(view.camera) for view in views],
         camera_directions=[camera_directions(scene.cameras[camera], downscale) for camera in used],
         poses=torch.tensor(np.stack([view.scene_from_camera for view in views]), dtype=torch.float32),
@@ -64,7 +64,7 @@ def view_pixels(
 
     from nerf.training import over
 
-    pixels = torch.from_numpy(_stored_pixels(ingest, scene, view, downscale)).float() / 255
+    pixels = torch.tensor(_stored_pixels(ingest, scene, view, downscale)).float() / 255
     alpha = pixels[..., 3] if scene.has_alpha else None
     return over(pixels[..., :3], alpha, torch.tensor(background, dtype=torch.float32))
 

@@ -76,6 +76,7 @@ def trainer_settings(config: "Config", scene: "Scene") -> "TrainerSettings":
     from nerf.training import TrainerSettings
 
     background = "random" if scene.has_alpha and config.background == "random" else field_background(config, scene)
+    assert config.batch_rays is not None and config.learning_rate is not None, "plan() chooses them"
     rates = (config.learning_rate, config.learning_rate * FINAL_RATE)
     return TrainerSettings(config.batch_rays, config.seed, background, *rates)
 
@@ -90,8 +91,8 @@ def rays_in_budget(config: "Config", scene: "Scene") -> float:
     """How many rays the run will draw: counted for a budget of steps, from measured speed for one of seconds."""
     from stages.training_size import rays_per_second
 
-    if config.steps is not None:
-        return float(config.steps * config.batch_rays)
-    assert config.seconds is not None, "one of the two is given"
     settings = trainer_settings(config, scene)
+    if config.steps is not None:
+        return float(config.steps * settings.batch_rays)
+    assert config.seconds is not None, "one of the two is given"
     return config.seconds * rays_per_second(scene, field_settings(config), settings, compute_device())

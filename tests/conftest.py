@@ -7,6 +7,8 @@ from jaxtyping import install_import_hook
 
 install_import_hook("nerf", "beartype.beartype")
 
+pytest_plugins = ["tests.synthetic_photos"]
+
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:

@@ -92,7 +92,7 @@ def test_agrees_with_the_slow_loop() -> None:
 
 def test_gradients() -> None:
     sigma, colour, t = (x.requires_grad_() for x in random_rays(2, 5))
-    assert torch.autograd.gradcheck(lambda *x: tuple(composite(*x, BLACK)[0]), (sigma, colour, t))
+    assert torch.autograd.gradcheck(lambda s, c, t: tuple(composite(s, c, t, BLACK)[0]), (sigma, colour, t))
 
 
 def test_an_empty_interval_shows_the_background_and_reports_far() -> None:

@@ -38,7 +38,8 @@ def test_gradients() -> None:
 
 
 @given(
-    st.lists(st.floats(-(2.0**100), 2.0**100, width=32), min_size=3, max_size=3), st.sampled_from([torch.float32, torch.float64])
+    st.lists(st.floats(-(2.0**100), 2.0**100, width=32), min_size=3, max_size=3),
+    st.sampled_from([torch.float32, torch.float64]),
 )
 def test_value_and_gradient_are_finite_everywhere(point: list[float], dtype: torch.dtype) -> None:
     x = torch.tensor(point, dtype=dtype, requires_grad=True)

@@ -61,18 +61,14 @@ def middle_jitter(settings: PaperSettings) -> tuple[np.ndarray, np.ndarray]:
     return np.full(first, 0.5), np.full(settings.samples_fine, 0.5)
 
 
-def slow(
-    weights: paper_loop.Weights, settings: PaperSettings, rays: Rays, jitters: list | None = None
-) -> list[tuple]:
+def slow(weights: paper_loop.Weights, settings: PaperSettings, rays: Rays, jitters: list | None = None) -> list[tuple]:
     """(coarse, fine) of every ray by the slow loop."""
     results = []
     for i in range(len(rays.near)):
         ray = (rays.origins[i].numpy(), rays.directions[i].numpy(), rays.near[i].item(), rays.far[i].item())
         jitter = jitters[i] if jitters else middle_jitter(settings)
         results.append(
-            paper_loop.render(
-                weights, dataclasses.asdict(settings), SOFTPLUS_SHIFT, ray, BACKGROUND.numpy(), jitter
-            )
+            paper_loop.render(weights, dataclasses.asdict(settings), SOFTPLUS_SHIFT, ray, BACKGROUND.numpy(), jitter)
         )
     return results
 
@@ -94,7 +90,8 @@ def test_float64_agrees_with_the_slow_loop(variant: str) -> None:
     model, rays = model_of(settings), rays_at(1.5, 12)
     with torch.no_grad():
         renderings = model.render_training(rays, BACKGROUND, None)
-    assert 0.2 < renderings[1].opacity.max() and (renderings[1].opacity.min() == 0) != settings.contracted
+    assert renderings[1].opacity.max() > 0.2
+    assert (renderings[1].opacity.min() == 0) != settings.contracted  # some rays miss the box
     expected = slow(weights_of(model), settings, rays)
     assert difference(renderings, expected) < 1e-9
     only_fine = model.render(rays, BACKGROUND)
@@ -189,6 +186,17 @@ def test_without_view_dependence_colour_ignores_direction_and_has_no_weights_for
     assert blind.fine.colour_hidden.in_features == SMALL.width
 
 
+def test_opposite_directions_along_an_axis_are_told_apart() -> None:
+    up = torch.tensor([[0.0, 0.0, 1.0]])
+    model, point = PaperNerf(SMALL, 0), torch.zeros(1, 3)
+    assert not torch.allclose(model.colour(point, up), model.colour(point, -up), atol=1e-4)
+
+
+def test_no_points_are_no_trouble() -> None:
+    model, none = PaperNerf(SMALL, 0), torch.zeros(0, 3)
+    assert model.density(none).shape == (0,) and model.colour(none, none).shape == (0, 3)
+
+
 def test_density_is_independent_of_direction_and_zero_outside_the_box() -> None:
     model = PaperNerf(SMALL, 0)
     points = torch.tensor([[0.3, -0.2, 0.1], [0.0, BOX + 1e-3, 0.0], [2.3, -0.2, 0.1], [1e30, 0.0, 0.0]])
@@ -231,11 +239,12 @@ def test_rays_may_have_any_leading_shape() -> None:
 def test_a_ray_that_misses_the_box_shows_the_background_at_far_and_has_no_gradient() -> None:
     model = PaperNerf(SMALL, 0)
     missing = Rays(torch.tensor([[5.0, 5.0, 0]]), torch.tensor([[0.0, 0, 1]]), torch.tensor([1.0]), torch.tensor([4.0]))
-    for rendering in model.render_training(missing, torch.tensor([[0.1, 0.2, 0.3]]), generator("cpu", 0)):
+    coarse, fine = model.render_training(missing, torch.tensor([[0.1, 0.2, 0.3]]), generator("cpu", 0))
+    for rendering in (coarse, fine):
         torch.testing.assert_close(rendering.colour, torch.tensor([[0.1, 0.2, 0.3]]))
         assert (rendering.depth.item(), rendering.opacity.item()) == (4, 0)
-    rendering.colour.sum().backward()
-    assert all(p.grad is None or not p.grad.any() for p in model.parameters())
+    (coarse.colour.sum() + fine.colour.sum()).backward()
+    assert all(p.grad is not None and not p.grad.any() for p in model.parameters())
 
 
 @pytest.mark.parametrize("activation", ["softplus", "relu"])
@@ -249,6 +258,13 @@ def test_extreme_densities_are_finite_in_value_and_gradient(activation: Any, siz
     assert torch.allclose(fine.opacity, torch.tensor(1.0 if size > 0 else 0.0))
     (coarse.colour.sum() + fine.colour.sum() + fine.depth.sum()).backward()
     assert all(torch.isfinite(p.grad).all() for p in model.parameters() if p.grad is not None)
+
+
+@pytest.mark.parametrize("net", ["coarse", "fine"])
+def test_a_weight_that_is_not_a_number_is_not_hidden(net: str) -> None:
+    model = PaperNerf(SMALL, 0)
+    torch.nn.init.constant_(model.get_parameter(f"{net}.density_head.bias"), math.nan)
+    assert model.render(rays_at(0.5, 4, torch.float32), torch.ones(3)).colour.isnan().all()
 
 
 def test_settings_survive_json() -> None:

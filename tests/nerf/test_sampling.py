@@ -56,8 +56,9 @@ def test_samples_follow_the_pdf() -> None:
     t = sample_pdf(edges, torch.tensor([[1.0, 3, 4]], dtype=torch.float64), 8000, generator("cpu", 3))
     counts = torch.histogram(t[0], bins=edges[0]).hist / 8000
     torch.testing.assert_close(counts, torch.tensor([1, 3, 4], dtype=torch.float64) / 8, atol=2e-4, rtol=0)
-    last = t[(t > 2)]
-    assert last.mean().item() == pytest.approx(4, abs=0.01) and last.std().item() == pytest.approx(4 / 12**0.5, abs=0.01)
+    last = t[t > 2]
+    assert last.mean().item() == pytest.approx(4, abs=0.01)
+    assert last.std().item() == pytest.approx(4 / 12**0.5, abs=0.01)
 
 
 def test_inverts_the_cdf_like_the_slow_loop() -> None:
@@ -111,6 +112,11 @@ def test_samples_ascend_within_their_bins_whatever_the_weights(
     used = w > 0 if w.sum() > 0 else torch.ones(6, dtype=torch.bool)
     assert t.min() >= e[:-1][used].min() and t.max() <= e[1:][used].max()
     assert (t.diff() >= -1e-6 * e[-1]).all()
+
+
+def test_a_weight_that_is_not_a_number_is_not_hidden() -> None:
+    t = sample_pdf(torch.arange(4.0).expand(2, 4), torch.tensor([[0.5, math.nan, 0.1], [1.0, 1.0, 1.0]]), 3, None)
+    assert t[0].isnan().all() and t[1].tolist() == [0.5, 1.5, 2.5]
 
 
 def test_no_gradient_passes() -> None:

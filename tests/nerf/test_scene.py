@@ -51,11 +51,12 @@ def test_a_pose_stays_rigid_and_sees_the_same_directions(similarity: Similarity,
 
 
 def scene() -> Scene:
+    first, second = turned(0.3, 1.0, [0.1, 1 / 3, 2]), turned(-0.3, 1.0, [0, 0, 1])
     return Scene(
         cameras=(Camera("OPENCV", 640, 480, (500.5, 501.5, 320.0, 240.0, 0.1, -0.01, 1e-4, 0.0)),),
         views=(
-            View("Straße 1.jpg", "images/0000.jpg", 0, turned(0.3, 1.0, [0.1, 1 / 3, 2]).matrix()[:3], 0.5, 7.0, "test"),
-            View("b.jpg", "images/0001.jpg", 0, turned(-0.3, 1.0, [0, 0, 1]).matrix()[:3], 0.25, 9.125, "train"),
+            View("Straße 1.jpg", "images/0000.jpg", 0, first.matrix()[:3], 0.5, 7.0, "test"),
+            View("b.jpg", "images/0001.jpg", 0, second.matrix()[:3], 0.25, 9.125, "train"),
         ),
         scene_from_sfm=turned(1.0, 0.3, [1, 2, 3]),
         bounded=False,

@@ -1,3 +1,5 @@
+from itertools import pairwise
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -7,11 +9,11 @@ from nerf.schedule import StepPlan, learning_rate, plan_of, replanned, steps_tha
 
 @st.composite
 def plans(draw: st.DrawFn) -> StepPlan:
-    plan = plan_of(draw(st.integers(1, 1000)))
+    plan = plan_of(draw(st.integers(1, 60)))
     for _ in range(draw(st.integers(0, 6))):
         earliest = plan.decisions[-1].from_step
         step = draw(st.integers(earliest, max(earliest, plan.total_steps - 1)))
-        plan = plan.revised(step, draw(st.integers(step + 1, step + 1000)))
+        plan = plan.revised(step, draw(st.integers(step + 1, step + 60)))
     return plan
 
 
@@ -20,10 +22,10 @@ def test_share_goes_from_0_to_1_and_never_back(plan: StepPlan) -> None:
     shares = [plan.share(step) for step in range(plan.total_steps + 1)]
     assert shares[0] == 0
     assert shares[-1] == pytest.approx(1, abs=1e-12)
-    assert all(a < b for a, b in zip(shares, shares[1:], strict=False))
+    assert all(a < b for a, b in pairwise(shares))
 
 
-@given(plans(), st.integers(1, 500), st.integers(0, 10**6))
+@given(plans(), st.integers(1, 50), st.integers(0, 10**6))
 def test_a_decision_leaves_the_past_and_the_present_alone(plan: StepPlan, more: int, position: int) -> None:
     earliest = plan.decisions[-1].from_step
     step = earliest + position % (plan.total_steps - earliest)
@@ -54,12 +56,12 @@ def test_a_run_has_steps() -> None:
 @given(st.floats(0.01, 1000), st.floats(0.01, 1000))
 def test_a_run_on_a_steady_clock_ends_on_time(budget: float, rate: float) -> None:
     plan, step = plan_of(10**6), 0
-    while step < plan.total_steps and step < 300:
+    while step < plan.total_steps and step < 40:
         step += 1
         if step < plan.total_steps:
             plan = replanned(plan, step, budget - step / rate, rate, 0.01 * budget)
-    # One step is the least a run can take, and the one that crosses the line is still taken.
-    assert abs(plan.total_steps / rate - budget) <= 0.01 * budget + 1.5 / rate
+    # The first step is what the clock is read by, and one more is the least a plan can hold.
+    assert abs(plan.total_steps / rate - budget) <= 0.01 * budget + 2 / rate
     assert len(plan.decisions) <= 2
 
 

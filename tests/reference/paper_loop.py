@@ -4,6 +4,7 @@ It takes complex weights as well, so that Im f(w + ih)/h is the derivative to ma
 where the method stops the gradient (placing the samples), it takes real parts.
 """
 
+import itertools
 import math
 
 import numpy as np
@@ -23,18 +24,16 @@ def contract(x: np.ndarray) -> np.ndarray:
 
 
 def relu(x: np.ndarray) -> np.ndarray:
-    return np.where(x.real > 0, x, 0)
+    return np.where(np.real(x) > 0, x, 0)
 
 
 def dense(weights: Weights, name: str, x: np.ndarray) -> np.ndarray:
     return weights[f"{name}.weight"] @ x + weights[f"{name}.bias"]
 
 
-def field(
-    weights: Weights, net: str, settings: dict, shift: float, point: np.ndarray, direction: np.ndarray
-) -> tuple:
+def field(weights: Weights, net: str, settings: dict, shift: float, point: np.ndarray, direction: np.ndarray) -> tuple:
     """Density and colour of one point seen along one direction."""
-    x, d = (0.45 * contract(point) if settings["contracted"] else point), direction
+    x, d = (0.45 * contract(point) if settings["contracted"] else point), 0.9 * direction
     if settings["positional_encoding"]:
         x, d = encode(x, settings["position_frequencies"]), encode(d, settings["direction_frequencies"])
     hidden = x
@@ -118,7 +117,7 @@ def render(
         only = along("fine", t)[:3]
         return only, only
     coarse = along("coarse", t)
-    edges = [near] + [(a + b) / 2 for a, b in zip(t[:-1], t[1:], strict=True)] + [far]
+    edges = [near] + [(a + b) / 2 for a, b in itertools.pairwise(t)] + [far]
     pdf = [float(np.real(w)) for w in coarse[3]]
     drawn = [invert_cdf(edges, pdf, (i + second[i]) / len(second)) for i in range(len(second))]
     return coarse[:3], along("fine", sorted(t + drawn))[:3]

@@ -158,7 +158,7 @@ def test_scores_at_the_size_the_field_was_trained_at(make: Make, tmp_path: Path,
     metrics, line = _run(inputs, tmp_path / "out", progress)
     assert metrics["width_share"] == 0.5 and line.endswith("· 4 photos at 50% width")
     assert Image.open(tmp_path / "out" / metrics["images"][0]["render"]).size == (16, 12)
-    assert metrics["verdict"].endswith(" (at 50% of the photos' width).")
+    assert " dB on unseen photos at 50% of their width, " in metrics["verdict"]
     full, _ = _run(inputs, tmp_path / "full", progress, downscale=1)
     assert full["width_share"] == 1 and full["psnr"] > metrics["psnr"]
 

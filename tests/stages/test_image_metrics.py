@@ -1,6 +1,7 @@
 """SSIM against scikit-image, the laws of the error map and of the bootstrap interval."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,7 +24,7 @@ def _picture(seed: int, height: int = 40, width: int = 52) -> torch.Tensor:
 @pytest.mark.parametrize("size", [(40, 52), (11, 11), (11, 64), (97, 33)])
 def test_ssim_equals_scikit_image(size: tuple[int, int]):
     a, b = _picture(1, *size), _picture(2, *size)
-    expected = structural_similarity(
+    expected: Any = structural_similarity(
         a.double().numpy(), b.double().numpy(), channel_axis=-1, data_range=1.0,
         gaussian_weights=True, sigma=1.5, use_sample_covariance=False,
     )  # fmt: skip

@@ -1,0 +1,109 @@
+"""Trains the grid field on a scene with Blender-style cameras and prints held-out PSNR against training seconds.
+
+    python -m benchmarks.grid_field ../shared/data/lego_400 --downscale 2 --seconds 60 --picture lego.png
+"""
+
+import argparse
+import json
+import math
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+
+from nerf.grid_field import GridField, GridSettings
+from nerf.grid_training import GridTrainer, GridTrainerSettings
+from nerf.kernels import reference
+from nerf.metrics import mean_squared_error, psnr
+from nerf.ray_bank import RayBank, build_ray_bank
+from nerf.rays import Rays
+from nerf.rendering import render_image
+from nerf.training import over
+
+SCENE_PER_BLENDER = 0.75  # takes the objects of the NeRF-synthetic set into [-0.9, 0.9]^3
+WHITE = torch.ones(3)
+
+
+def read_bank(folder: Path, split: str, downscale: int, every: int) -> RayBank:
+    """All photos of a split, RGBA, made smaller by averaging premultiplied pixels."""
+    cameras = json.loads((folder / f"transforms_{split}.json").read_text())
+    photos, poses = [], []
+    for frame in cameras["frames"][::every]:
+        image = Image.open(folder / f"{frame['file_path']}.png").convert("RGBA")
+        photos.append(torch.from_numpy(_smaller(np.asarray(image) / 255, downscale)))
+        pose = np.array(frame["transform_matrix"])[:3] * [1, -1, -1, SCENE_PER_BLENDER]
+        poses.append(torch.tensor(pose, dtype=torch.float32))
+    height, width = photos[0].shape[:2]
+    focal = width / 2 / math.tan(cameras["camera_angle_x"] / 2)
+    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    bearings = torch.stack([(x - width / 2) / focal, (y - height / 2) / focal, torch.ones_like(x)], -1)
+    near, far = torch.full((len(poses),), 0.1), torch.full((len(poses),), 10.0)
+    bearings /= bearings.norm(dim=-1, keepdim=True)
+    return build_ray_bank(photos, [0] * len(poses), [bearings], torch.stack(poses), near, far)
+
+
+def _smaller(pixels: np.ndarray, factor: int) -> np.ndarray:
+    height, width = (size // factor for size in pixels.shape[:2])
+    alpha = pixels[..., 3:]
+    mean = np.concatenate([pixels[..., :3] * alpha, alpha], -1)
+    mean = mean[: height * factor, : width * factor].reshape(height, factor, width, factor, 4).mean((1, 3))
+    colour = np.divide(mean[..., :3], mean[..., 3:], out=np.zeros_like(mean[..., :3]), where=mean[..., 3:] > 0)
+    return np.round(255 * np.concatenate([colour, mean[..., 3:]], -1)).astype(np.uint8)
+
+
+def heldout(model: GridField, bank: RayBank) -> tuple[float, list[torch.Tensor]]:
+    """Mean PSNR over the views, and [picture, truth] of the first."""
+    values, first = [], []
+    for view in range(len(bank.near)):
+        pixels = torch.arange(int(bank.first_pixel[view]), int(bank.first_pixel[view + 1]))
+        side = math.isqrt(len(pixels))
+        rays, colour, alpha = bank.lookup(pixels)
+        square = Rays(*(part.reshape(side, side, *part.shape[1:]) for part in rays))
+        truth = over(colour, alpha, WHITE).view(side, side, 3)
+        picture = render_image(model, square, WHITE).colour
+        values.append(psnr(mean_squared_error(picture, truth)))
+        first = first or [picture, truth]
+    return sum(values) / len(values), first
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--downscale", type=int, default=2)
+    parser.add_argument("--seconds", type=float, default=60)
+    parser.add_argument("--levels", type=int, default=5)
+    parser.add_argument("--log2-rows", type=int, default=18)
+    parser.add_argument("--finest", type=int, default=384)
+    parser.add_argument("--steps", type=int, default=384)
+    parser.add_argument("--samples", type=int, default=1 << 14)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--test-every", type=int, default=5)
+    parser.add_argument("--picture", type=Path, default=None)
+    given = parser.parse_args()
+    settings = GridSettings(given.levels, 4, given.log2_rows, 16, given.finest, steps=given.steps)
+    train = read_bank(given.folder, "train", given.downscale, 1)
+    test = read_bank(given.folder, "test", given.downscale, given.test_every)
+    model = GridField(settings, given.seed, reference)
+    trainer = GridTrainer(model, train, GridTrainerSettings(given.seed, "random", given.samples))
+    print(f"{settings}\n{model.layout.rows:,} rows, {torch.get_num_threads()} threads")
+    seconds, step, rays, due = 0.0, 0, 0, 5.0
+    while seconds < given.seconds:
+        started = time.perf_counter()
+        result = trainer.step(step, seconds / given.seconds)
+        seconds += time.perf_counter() - started
+        step, rays = step + 1, rays + result.rays
+        if seconds >= min(due, given.seconds):
+            quality, pictures = heldout(model, test)
+            speed = f"{step / seconds:.1f} steps/s  {rays / seconds:,.0f} rays/s"
+            per_ray = float(trainer.samples_per_ray)
+            print(f"{seconds:6.1f} s  held out {quality:.2f} dB  train {result.psnr:.2f}  {speed}  {per_ray:.1f}/ray", flush=True)
+            due *= 2
+            if given.picture:
+                both = (255 * torch.cat(pictures, 1).clamp(0, 1)).round().to(torch.uint8)
+                Image.fromarray(both.numpy()).save(given.picture)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,190 @@
+"""A radiance field of feature grids and two tiny networks (Müller et al. 2022), with empty space left out.
+
+The density cache plays the coarse network's part in the hierarchical NeRF: it places the samples. Its bits mark the
+cells that may hold something, rays are sampled in these alone, and the density found there decides how far along a
+ray colour is asked for at all.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from nerf import grid_mlp
+from nerf.grid_mlp import ColourPass, DensityPass, Weights
+from nerf.kernels import BOX, Backend, GridLayout, Lattice, Samples, grid_layout
+from nerf.kernels.marching import unit_coordinates
+from nerf.model import Rendering
+from nerf.randomness import generator
+from nerf.rays import Rays
+
+INITIAL_FEATURE = 1e-4
+HIDDEN_BEHIND = 1e-3  # transmittance below which the rest of a ray is left out
+
+
+@dataclass(frozen=True)
+class GridSettings:
+    """Sizes of a grid field. Raises ValueError on impossible ones.
+
+    ``steps``: lattice steps along the diagonal of a bounded scene's box. ``shortest_step`` (scene units) and ``cone``
+    (step per distance) replace it where space is ``contracted``.
+    """
+
+    levels: int = 5
+    features: int = 4
+    log2_rows: int = 18
+    coarsest: int = 16
+    finest: int = 384
+    contracted: bool = False
+    steps: int = 384
+    shortest_step: float = 0.002
+    cone: float = 0.008
+    most_samples: int = 1024
+    cache_cells: int = 128
+
+    def __post_init__(self) -> None:
+        at_least = {"levels": 1, "features": 1, "log2_rows": 1, "coarsest": 1, "steps": 1, "most_samples": 1}
+        for name, least in (at_least | {"finest": self.coarsest, "cache_cells": 4}).items():
+            if getattr(self, name) < least:
+                raise ValueError(f"{name} is {getattr(self, name)}; it must be at least {least}")
+        if self.cache_cells % 4:
+            raise ValueError(f"cache_cells is {self.cache_cells}; it must be a multiple of 4")
+        if not (self.shortest_step > 0 and self.cone > 0):
+            raise ValueError(f"shortest_step ({self.shortest_step}) and cone ({self.cone}) must be positive")
+
+    @property
+    def layout(self) -> GridLayout:
+        """Of the feature table."""
+        return grid_layout(self.levels, self.coarsest, self.finest, self.log2_rows, self.features)
+
+    @property
+    def lattice(self) -> Lattice:
+        """Of the samples."""
+        if self.contracted:
+            return Lattice(self.shortest_step, self.cone, True, self.cache_cells, self.most_samples)
+        step = 2 * BOX * math.sqrt(3) / self.steps
+        return Lattice(step, 0.0, False, self.cache_cells, self.most_samples)
+
+
+class GridPass(NamedTuple):
+    """What a rendering computed on its way, for :meth:`GridField.backward`; ``marched`` counts all densities asked."""
+
+    rays: Rays
+    background: Float[Tensor, "rays 3"]
+    marched: int
+    samples: Samples
+    points: Float[Tensor, "samples 3"]
+    density: DensityPass
+    colour: ColourPass
+    rendering: Rendering
+    weights: Float[Tensor, "samples"]
+
+
+class GridGradients(NamedTuple):
+    """Of the networks and, by way of the features and harmonics of the samples, of whatever lies before them."""
+
+    weights: Weights
+    features: Float[Tensor, "samples width"]
+    harmonics: Float[Tensor, "samples 16"]
+
+
+class GridField(nn.Module):
+    """A RadianceModel in the scene frame; its parameters are a function of ``settings`` and ``seed``.
+
+    Nothing here needs autograd: parameters are buffers, and gradients are computed by :meth:`backward`.
+    """
+
+    table: Tensor
+    bits: Tensor
+    density_hidden: Tensor
+    density_out: Tensor
+    colour_hidden: Tensor
+    colour_out: Tensor
+
+    def __init__(self, settings: GridSettings, seed: int, backend: Backend) -> None:
+        super().__init__()
+        self.settings, self.backend = settings, backend
+        self.layout, self.lattice = settings.layout, settings.lattice
+        random = generator("cpu", seed, 0)
+        shape = (self.layout.rows, settings.features)
+        self.register_buffer("table", (2 * torch.rand(shape, generator=random) - 1) * INITIAL_FEATURE)
+        for name, weight in grid_mlp.initial_weights(self.layout.width, random)._asdict().items():
+            self.register_buffer(name, weight)
+        self.register_buffer("bits", torch.full((settings.cache_cells**3 // 64,), -1))  # every cell may hold something
+
+    @property
+    def weights(self) -> Weights:
+        """The networks."""
+        return Weights(self.density_hidden, self.density_out, self.colour_hidden, self.colour_out)
+
+    def density(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points"]:
+        """Density per scene unit; zero outside the box of a bounded scene."""
+        unit = unit_coordinates(points, self.settings.contracted).reshape(-1, 3)
+        sigma = self.unit_density(unit).view(points.shape[:-1])
+        return sigma if self.settings.contracted else torch.where((points.abs() <= BOX).all(-1), sigma, 0)
+
+    def unit_density(self, unit: Float[Tensor, "points 3"]) -> Float[Tensor, "points"]:
+        """Density per scene unit at unit coordinates."""
+        return self._density_pass(unit.clamp(0, 1)).sigma
+
+    def colour(
+        self, points: Float[Tensor, "*points 3"], directions: Float[Tensor, "*points 3"]
+    ) -> Float[Tensor, "*points 3"]:
+        """Colour seen by viewing rays of unit ``directions``; without meaning where the density is zero."""
+        unit = unit_coordinates(points, self.settings.contracted).reshape(-1, 3).clamp(0, 1)
+        harmonics = self.backend.spherical_harmonics(directions.reshape(-1, 3))
+        colour = grid_mlp.colour_forward(self.weights, self._density_pass(unit).geometry, harmonics).colour
+        return colour.view(points.shape)
+
+    @torch.no_grad()
+    def render(self, rays: Rays, background: Float[Tensor, "3"]) -> Rendering:
+        """Render without randomness: samples stand in the middle of their intervals."""
+        middle = torch.full_like(rays.near, 0.5)
+        return self.forward(rays, middle, background.expand_as(rays.origins)).rendering
+
+    def forward(self, rays: Rays, jitter: Float[Tensor, "rays"], background: Float[Tensor, "rays 3"]) -> GridPass:
+        """Density of all samples in occupied cells; colour of those that can be seen."""
+        backend = self.backend
+        samples = backend.march(self.bits, self.lattice, rays, jitter)
+        marched = len(samples.t)
+        points = backend.sample_points(rays, samples, self.settings.contracted)
+        density = self._density_pass(points)
+        samples, seen = backend.visible_front(samples, density.sigma, HIDDEN_BEHIND)
+        points, density = points.index_select(0, seen), density.select(seen)
+        harmonics = backend.spherical_harmonics(rays.directions).index_select(0, samples.ray)
+        colour = grid_mlp.colour_forward(self.weights, density.geometry, harmonics)
+        rendering, weights = backend.composite(samples, density.sigma, colour.colour, background, rays.far)
+        return GridPass(rays, background, marched, samples, points, density, colour, rendering, weights)
+
+    def backward(self, done: GridPass, grad: Rendering, grad_weights: Float[Tensor, "samples"]) -> GridGradients:
+        """Gradients of a loss, given those of the rendering and of the samples' weights."""
+        density, colour = done.density, done.colour
+        grad_sigma, grad_colour = self.backend.composite_backward(
+            done.samples, density.sigma, colour.colour, done.background, done.rays.far, grad, grad_weights
+        )
+        return GridGradients(*grid_mlp.backward(self.weights, density, colour, grad_sigma, grad_colour))
+
+    def table_backward(
+        self, done: GridPass, gradients: GridGradients, grad_table: Float[Tensor, "rows features"]
+    ) -> None:
+        """Add the gradient of the table to ``grad_table``."""
+        self.backend.encode_backward_table(self.layout, done.points, gradients.features, grad_table)
+
+    def rays_backward(
+        self, done: GridPass, gradients: GridGradients
+    ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays 3"]]:
+        """Gradients of the rays' origins and directions, for refining poses."""
+        backend, rays, samples = self.backend, done.rays, done.samples
+        grad_points = backend.encode_backward_points(self.layout, self.table, done.points, gradients.features)
+        grad_origins, grad_directions = backend.sample_points_backward(
+            rays, samples, self.settings.contracted, grad_points
+        )
+        grad_harmonics = gradients.harmonics.new_zeros(len(rays.near), grid_mlp.DIRECTION)
+        grad_harmonics.index_add_(0, samples.ray.long(), gradients.harmonics)
+        return grad_origins, grad_directions + backend.spherical_harmonics_backward(rays.directions, grad_harmonics)
+
+    def _density_pass(self, unit: Float[Tensor, "points 3"]) -> DensityPass:
+        return grid_mlp.density_forward(self.weights, self.backend.encode(self.layout, self.table, unit))

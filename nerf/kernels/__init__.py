@@ -1,0 +1,204 @@
+"""The hot loops of the grid field: arrays in, arrays out, written more than once and tested against each other.
+
+A backend is a module with the functions of :class:`Backend`. ``nerf.kernels.reference`` is the specification: plain
+torch, any device, float32 or float64. The contract:
+
+* Tensors are contiguous, all on one device. Values are float32 (the reference takes float64 as well), indices int32,
+  bits int64. Backends read their arguments without copying and neither keep nor change them, except those that a
+  docstring says are changed *in place*. What a function returns belongs to the caller.
+* Nothing is differentiated by autograd: what has a ``_backward`` takes the gradient of a scalar loss with respect to
+  the results and returns, or adds to, the one with respect to the arguments. Sample distances carry no gradient.
+* Samples are *packed*: those of ray r are the entries starts[r] ... starts[r + 1] - 1, front to back. A ray may have
+  none.
+* Points given to a grid or to the density cache are in *unit coordinates*: [0, 1]^3 is the cube [-0.9, 0.9]^3 of a
+  bounded scene, or all of space folded into [-2, 2]^3 (nerf/contraction.py).
+* No function draws random numbers; no function fails on zero rays or zero samples.
+"""
+
+import math
+from typing import NamedTuple, Protocol, runtime_checkable
+
+from jaxtyping import Float, Int, Int32, Int64
+from torch import Tensor
+
+from nerf.model import Rendering
+from nerf.rays import Rays
+
+BOX = 0.9  # half the side of the cube that a bounded scene fills
+CONTRACTED_BOX = 2.0  # half the side of the cube into which contraction folds space
+
+
+class GridLayout(NamedTuple):
+    """A table that holds the vertices of several grids over the unit cube: level after level, a row per vertex.
+
+    Level l has ``resolutions[l]`` cells along each axis and owns the rows [first_rows[l], first_rows[l + 1]). Where
+    these suffice for all (R + 1)³ vertices, vertex (x, y, z) has row first_rows[l] + (x (R + 1) + y) (R + 1) + z (a
+    dense level). Otherwise their number is a power of two, and vertices share rows by the hash
+    (x ⊕ 2654435761 y ⊕ 805459861 z) mod rows, in unsigned 32-bit arithmetic (Müller et al. 2022, eq. 4).
+    """
+
+    resolutions: tuple[int, ...]
+    first_rows: tuple[int, ...]
+    features: int
+
+    @property
+    def rows(self) -> int:
+        """Rows of the whole table."""
+        return self.first_rows[-1]
+
+    @property
+    def width(self) -> int:
+        """Features of a point: those of level 0, then those of level 1, ..."""
+        return self.features * len(self.resolutions)
+
+    def level_rows(self, level: int) -> int:
+        """Rows of one level."""
+        return self.first_rows[level + 1] - self.first_rows[level]
+
+    def hashed(self, level: int) -> bool:
+        """Whether vertices of a level share rows."""
+        return self.level_rows(level) < (self.resolutions[level] + 1) ** 3
+
+
+def grid_layout(levels: int, coarsest: int, finest: int, log2_rows: int, features: int) -> GridLayout:
+    """Levels growing geometrically from ``coarsest`` to ``finest`` cells (Müller et al. 2022, eq. 2), none with more
+    than 2^log2_rows rows."""
+    growth = (finest / coarsest) ** (1 / max(1, levels - 1))
+    resolutions = tuple(round(coarsest * growth**level) for level in range(levels))
+    first_rows = [0]
+    for resolution in resolutions:
+        first_rows.append(first_rows[-1] + min((resolution + 1) ** 3, 1 << log2_rows))
+    return GridLayout(resolutions, tuple(first_rows), features)
+
+
+class Lattice(NamedTuple):
+    """Where samples may stand on a ray: at distances t(s_near + k + jitter), k = 0, 1, ...
+
+    A step is ``step`` long up to t = step / cone, from there on it is the share ``cone`` of the distance (always
+    ``step`` long if ``cone`` is 0): with dt/ds = max(step, cone t),
+
+        t(s) = step s                         for cone s <= 1
+        t(s) = step / cone exp(cone s - 1)    beyond
+
+    and s_near = s(max(near, entry into the box)). Sample k stands for the interval from t(s_near + k) to
+    t(s_near + k + 1), the last of which ends at far.
+
+    ``contracted``: space is folded; otherwise rays are cut to the box. ``cells``: of the density cache, per axis, a
+    multiple of 4. ``most_samples``: per ray; what lies behind them is not sampled.
+    """
+
+    step: float
+    cone: float
+    contracted: bool
+    cells: int
+    most_samples: int
+
+    @property
+    def linear_until(self) -> float:
+        """The distance from which steps grow."""
+        return self.step / self.cone if self.cone else math.inf
+
+
+class Samples(NamedTuple):
+    """Packed samples: of each its ray, its distance along it, and the length of the interval it stands for."""
+
+    starts: Int32[Tensor, "rays_and_end"]
+    ray: Int32[Tensor, "samples"]
+    t: Float[Tensor, "samples"]
+    dt: Float[Tensor, "samples"]
+
+
+@runtime_checkable
+class Backend(Protocol):
+    """The functions of a backend module; their docstrings are in ``nerf.kernels.reference``."""
+
+    def march(
+        self, bits: Int64[Tensor, "bricks"], lattice: Lattice, rays: Rays, jitter: Float[Tensor, "rays"]
+    ) -> Samples: ...
+
+    def sample_points(self, rays: Rays, samples: Samples, contracted: bool) -> Float[Tensor, "samples 3"]: ...
+
+    def sample_points_backward(
+        self, rays: Rays, samples: Samples, contracted: bool, grad_points: Float[Tensor, "samples 3"]
+    ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays 3"]]: ...
+
+    def encode(
+        self, layout: GridLayout, table: Float[Tensor, "rows features"], points: Float[Tensor, "points 3"]
+    ) -> Float[Tensor, "points width"]: ...
+
+    def encode_backward_table(
+        self,
+        layout: GridLayout,
+        points: Float[Tensor, "points 3"],
+        grad_features: Float[Tensor, "points width"],
+        grad_table: Float[Tensor, "rows features"],
+    ) -> None: ...
+
+    def encode_backward_points(
+        self,
+        layout: GridLayout,
+        table: Float[Tensor, "rows features"],
+        points: Float[Tensor, "points 3"],
+        grad_features: Float[Tensor, "points width"],
+    ) -> Float[Tensor, "points 3"]: ...
+
+    def spherical_harmonics(self, directions: Float[Tensor, "rays 3"]) -> Float[Tensor, "rays 16"]: ...
+
+    def spherical_harmonics_backward(
+        self, directions: Float[Tensor, "rays 3"], grad: Float[Tensor, "rays 16"]
+    ) -> Float[Tensor, "rays 3"]: ...
+
+    def visible_front(
+        self, samples: Samples, sigma: Float[Tensor, "samples"], threshold: float
+    ) -> tuple[Samples, Int32[Tensor, "kept"]]: ...
+
+    def composite(
+        self,
+        samples: Samples,
+        sigma: Float[Tensor, "samples"],
+        colour: Float[Tensor, "samples 3"],
+        background: Float[Tensor, "rays 3"],
+        far: Float[Tensor, "rays"],
+    ) -> tuple[Rendering, Float[Tensor, "samples"]]: ...
+
+    def composite_backward(
+        self,
+        samples: Samples,
+        sigma: Float[Tensor, "samples"],
+        colour: Float[Tensor, "samples 3"],
+        background: Float[Tensor, "rays 3"],
+        far: Float[Tensor, "rays"],
+        grad: Rendering,
+        grad_weights: Float[Tensor, "samples"],
+    ) -> tuple[Float[Tensor, "samples"], Float[Tensor, "samples 3"]]: ...
+
+    def distortion(
+        self, samples: Samples, weights: Float[Tensor, "samples"], lattice: Lattice
+    ) -> Float[Tensor, "rays"]: ...
+
+    def distortion_backward(
+        self, samples: Samples, weights: Float[Tensor, "samples"], lattice: Lattice, grad: Float[Tensor, "rays"]
+    ) -> Float[Tensor, "samples"]: ...
+
+    def adam(
+        self,
+        parameter: Float[Tensor, "*shape"],
+        gradient: Float[Tensor, "*shape"],
+        mean: Float[Tensor, "*shape"],
+        square: Float[Tensor, "*shape"],
+        rate: float,
+        count: int,
+    ) -> None: ...
+
+    def update_cache(
+        self,
+        cells: int,
+        thickness: Float[Tensor, "cache"],
+        points: Float[Tensor, "points 3"],
+        values: Float[Tensor, "points"],
+        decay: float,
+    ) -> None: ...
+
+    def occupied_bits(self, thickness: Float[Tensor, "cache"], threshold: float) -> Int64[Tensor, "bricks"]: ...
+
+    def cell_corners(self, cells: int, numbers: Int[Tensor, "chosen"]) -> Float[Tensor, "chosen 3"]: ...

@@ -1,0 +1,155 @@
+"""Volume rendering of packed samples (Mildenhall et al. 2020, eq. 3), and the distortion loss of its weights.
+
+With the optical depth tau_i = sigma_i dt_i of sample i, T_i = exp(-sum_{j<i} tau_j) is the transmittance before it,
+T_{i+1} the one behind it, and w_i = T_i (1 - exp(-tau_i)) its weight; U = exp(-sum tau_j) is the light that nothing
+stops.
+
+Sums over a ray are differences of running sums over all packed samples, taken in float64. So that a dense ray does
+not drown the others, tau is limited to OPAQUE before it is summed: exp(-OPAQUE) is zero even in float64, so the limit
+changes nothing.
+"""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int32
+from torch import Tensor
+
+from nerf.kernels import Lattice, Samples
+from nerf.model import Rendering
+
+OPAQUE = 800.0
+
+
+def visible_front(
+    samples: Samples, sigma: Float[Tensor, "samples"], threshold: float
+) -> tuple[Samples, Int32[Tensor, "kept"]]:
+    """The samples before which the transmittance is still ``threshold`` or more, and their numbers among all.
+
+    What remains of a ray is its front part; ``threshold`` 0 keeps everything. ``sigma`` must be the density that will
+    be composited: older ones (the cache's) would hide a surface from the very gradient that is to move it.
+    """
+    index = (_stopping(samples, sigma).before >= threshold).nonzero()[:, 0]
+    starts = torch.searchsorted(index, samples.starts.long(), out_int32=True)
+    index = index.int()
+    return Samples(starts, *(part.index_select(0, index) for part in samples[1:])), index
+
+
+def composite(
+    samples: Samples,
+    sigma: Float[Tensor, "samples"],
+    colour: Float[Tensor, "samples 3"],
+    background: Float[Tensor, "rays 3"],
+    far: Float[Tensor, "rays"],
+) -> tuple[Rendering, Float[Tensor, "samples"]]:
+    """What the rays see, and the weights of the samples.
+
+    colour = sum w_i c_i + U background, depth = sum w_i t_i + U far, opacity = 1 - U.
+    """
+    light = _stopping(samples, sigma)
+    stopped = _ray_sums(samples, light.weights[:, None] * torch.cat([colour, samples.t[:, None]], -1))
+    rendering = Rendering(
+        colour=stopped[:, :3] + light.unstopped[:, None] * background,
+        depth=stopped[:, 3] + light.unstopped * far,
+        opacity=light.opacity,
+    )
+    return rendering, light.weights
+
+
+def composite_backward(
+    samples: Samples,
+    sigma: Float[Tensor, "samples"],
+    colour: Float[Tensor, "samples 3"],
+    background: Float[Tensor, "rays 3"],
+    far: Float[Tensor, "rays"],
+    grad: Rendering,
+    grad_weights: Float[Tensor, "samples"],
+) -> tuple[Float[Tensor, "samples"], Float[Tensor, "samples 3"]]:
+    """Gradients of the densities and colours, from those of the rendering and of the weights.
+
+    With g_i = dL/dw_i and G = dL/dU in total, dL/dcolour_i = w_i dL/dcolour and
+    dL/dsigma_i = dt_i (T_{i+1} g_i - sum_{k>i} w_k g_k - U G).
+    """
+    light = _stopping(samples, sigma)
+    grad_seen, grad_depth = (part.index_select(0, samples.ray) for part in (grad.colour, grad.depth))
+    g = grad_weights + (grad_seen * colour).sum(-1) + grad_depth * samples.t
+    grad_unstopped = (grad.colour * background).sum(-1) + grad.depth * far - grad.opacity
+    behind = _sums_behind(samples, light.weights * g)
+    unstopped = (light.unstopped * grad_unstopped).index_select(0, samples.ray)
+    grad_sigma = samples.dt * (light.behind * g - behind - unstopped)
+    return grad_sigma, light.weights[:, None] * grad_seen
+
+
+def distortion(samples: Samples, weights: Float[Tensor, "samples"], lattice: Lattice) -> Float[Tensor, "rays"]:
+    """How far the weights of a ray are spread: sum_ij w_i w_j |m_i - m_j| + 1/3 sum_i w_i² l_i (Barron et al. 2022,
+    eq. 15), in one pass since the samples are in order: the first sum is 2 sum_i w_i sum_{j<i} w_j (m_i - m_j).
+
+    Positions m and lengths l are measured as the lattice does, dm = dt / max(t_1, t), where steps grow from t_1 on
+    (beyond it m is log t + const), and as distances if they do not.
+    """
+    m, lengths = _measure(samples, lattice)
+    before, moment_before = _sums_before(samples, torch.stack([weights, weights * m], -1)).unbind(-1)
+    return _ray_sums(samples, 2 * weights * (m * before - moment_before) + weights.square() * lengths / 3)
+
+
+def distortion_backward(
+    samples: Samples, weights: Float[Tensor, "samples"], lattice: Lattice, grad: Float[Tensor, "rays"]
+) -> Float[Tensor, "samples"]:
+    """Gradient of the weights: 2 sum_j w_j |m_i - m_j| + 2/3 w_i l_i."""
+    m, lengths = _measure(samples, lattice)
+    both = torch.stack([weights, weights * m], -1)
+    before, moment_before = _sums_before(samples, both).unbind(-1)
+    behind, moment_behind = _sums_behind(samples, both).unbind(-1)
+    apart = m * (before - behind) - moment_before + moment_behind
+    return grad.index_select(0, samples.ray) * (2 * apart + 2 / 3 * weights * lengths)
+
+
+class _Stopping(NamedTuple):
+    """Where the light is stopped: T_i, T_{i+1} and w_i per sample, U and 1 - U per ray."""
+
+    before: Float[Tensor, "samples"]
+    behind: Float[Tensor, "samples"]
+    weights: Float[Tensor, "samples"]
+    unstopped: Float[Tensor, "rays"]
+    opacity: Float[Tensor, "rays"]
+
+
+def _stopping(samples: Samples, sigma: Float[Tensor, "samples"]) -> _Stopping:
+    tau = (sigma * samples.dt).clamp(max=OPAQUE)
+    depth_before, depth = _sums_before(samples, tau), _ray_sums(samples, tau)
+    before = torch.exp(-depth_before)
+    return _Stopping(
+        before, torch.exp(-depth_before - tau), before * -torch.expm1(-tau), torch.exp(-depth), -torch.expm1(-depth)
+    )
+
+
+def _ray_sums(samples: Samples, values: Float[Tensor, "samples *channels"]) -> Float[Tensor, "rays *channels"]:
+    at_starts = _running(values).index_select(0, samples.starts)
+    return (at_starts[1:] - at_starts[:-1]).to(values.dtype)
+
+
+def _sums_before(samples: Samples, values: Float[Tensor, "samples *channels"]) -> Float[Tensor, "samples *channels"]:
+    """For each sample, the sum over those before it on its ray."""
+    running = _running(values)
+    first = samples.starts.index_select(0, samples.ray)
+    return (running[:-1] - running.index_select(0, first)).to(values.dtype)
+
+
+def _sums_behind(samples: Samples, values: Float[Tensor, "samples *channels"]) -> Float[Tensor, "samples *channels"]:
+    """For each sample, the sum over those behind it on its ray."""
+    running = _running(values)
+    end = samples.starts[1:].index_select(0, samples.ray)
+    return (running.index_select(0, end) - running[1:]).to(values.dtype)
+
+
+def _running(values: Float[Tensor, "samples *channels"]) -> Float[Tensor, "samples+1 *channels"]:
+    return torch.cat([values.new_zeros(1, *values.shape[1:]), values]).double().cumsum(0)
+
+
+def _measure(samples: Samples, lattice: Lattice) -> tuple[Float[Tensor, "samples"], Float[Tensor, "samples"]]:
+    """Positions and lengths in the measure of the lattice."""
+    t, dt = samples.t, samples.dt
+    if not lattice.cone:
+        return t, dt
+    relative = t / lattice.linear_until
+    return relative.clamp(max=1) + torch.log(relative.clamp(min=1)), dt / (lattice.linear_until * relative.clamp(min=1))

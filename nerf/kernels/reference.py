@@ -1,0 +1,37 @@
+"""The specification of the grid field's hot loops: plain torch, readable, on any device, in float32 or float64.
+
+Also a backend of its own (:class:`nerf.kernels.Backend`), for machines where no other runs.
+"""
+
+from nerf.kernels.adam import adam
+from nerf.kernels.cache import cell_corners, occupied_bits, update_cache
+from nerf.kernels.directions import spherical_harmonics, spherical_harmonics_backward
+from nerf.kernels.grid_encoding import encode, encode_backward_points, encode_backward_table
+from nerf.kernels.marching import march, sample_points, sample_points_backward
+from nerf.kernels.packed_compositing import (
+    composite,
+    composite_backward,
+    distortion,
+    distortion_backward,
+    visible_front,
+)
+
+__all__ = [
+    "adam",
+    "cell_corners",
+    "composite",
+    "composite_backward",
+    "distortion",
+    "distortion_backward",
+    "encode",
+    "encode_backward_points",
+    "encode_backward_table",
+    "march",
+    "occupied_bits",
+    "sample_points",
+    "sample_points_backward",
+    "spherical_harmonics",
+    "spherical_harmonics_backward",
+    "update_cache",
+    "visible_front",
+]

@@ -1,0 +1,44 @@
+"""One chunk of work per core, results in the order of the chunks.
+
+On a CPU, one Python thread per core with torch's own threads off beats torch's threads inside every operation: no
+barrier after each of them, and no collapse when other programs want the cores too (docs/numbers.md). Chunks are
+cut by the caller, never by the number of cores, so results do not depend on it.
+"""
+
+import functools
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import TypeVar
+
+import torch
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+def in_order(function: Callable[[Item], Result], items: Iterable[Item], device: torch.device) -> Iterator[Result]:
+    """``function(item)`` for every item, in order, on all cores where ``device`` is the CPU.
+
+    Only a few chunks are under way at a time: memory stays bounded and an interruption is heard soon.
+    """
+    workers = torch.get_num_threads()
+    if device.type != "cpu" or workers == 1:
+        yield from map(function, items)
+        return
+    pool, under_way = _pool(workers), deque[Future[Result]]()
+    try:
+        for item in items:
+            under_way.append(pool.submit(function, item))
+            if len(under_way) > 2 * workers:
+                yield under_way.popleft().result()
+        while under_way:
+            yield under_way.popleft().result()
+    finally:
+        for future in under_way:
+            future.cancel()
+
+
+@functools.cache
+def _pool(workers: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(workers, "chunk", initializer=torch.set_num_threads, initargs=(1,))

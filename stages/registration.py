@@ -1,0 +1,164 @@
+"""Which photos found their place, and why the others did not: read off COLMAP's database of features and matches.
+
+Plain SQLite, read-only, and never in a process that has the same database open through pycolmap: two copies of SQLite
+in one process undo each other's locks and damage the file (https://sqlite.org/howtocorrupt.html, section 2.2.1).
+"""
+
+import sqlite3
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from stages.contract import StageError
+
+if TYPE_CHECKING:
+    from stages.photos import Photo
+
+FEWEST_REGISTERED = 3  # one to hold out, two to learn from; two views alone fit many wrong scenes
+FEWEST_POINTS = 100
+FEW_FEATURES = 50
+SAME_VIEW_PX = 1.0
+FLAT_CONFIGS = (4, 5, 6)  # colmap TwoViewGeometry: PLANAR, PANORAMIC, PLANAR_OR_PANORAMIC
+PAIR_BASE = 2**31 - 1  # pair_id = PAIR_BASE * first image id + second image id
+OVERLAP_HINT = "Take photos with 60–80 % overlap, so that everything is visible in at least three of them."
+
+
+@dataclass(frozen=True)
+class Matches:
+    """The verified pairs of photos; photos are numbered from 0 in order of ``file``.
+
+    ``flat``: a plane or a rotation alone explains the pair, so it tells nothing of depth. ``shift_px``: median
+    distance between matched keypoints.
+    """
+
+    keypoints: Int[np.ndarray, "photos"]
+    pairs: Int[np.ndarray, "pairs 2"]
+    inliers: Int[np.ndarray, "pairs"]
+    flat: Bool[np.ndarray, "pairs"]
+    shift_px: Float[np.ndarray, "pairs"]
+
+
+@contextmanager
+def _opened(database: Path) -> Iterator[sqlite3.Connection]:
+    with closing(sqlite3.connect(f"{database.absolute().as_uri()}?mode=ro", uri=True, timeout=0.2)) as connection:
+        yield connection
+
+
+def count_done(database: Path) -> tuple[int, int]:
+    """How many photos have features and how many pairs are matched; (0, 0) while there is nothing to read yet."""
+    try:
+        with _opened(database) as db:
+            photos = db.execute("SELECT COUNT(*) FROM descriptors").fetchone()[0]
+            return photos, db.execute("SELECT COUNT(*) FROM two_view_geometries").fetchone()[0]
+    except sqlite3.OperationalError:  # not created yet, or locked for a moment
+        return 0, 0
+
+
+def is_sound(database: Path, names: Sequence[str]) -> bool:
+    """Whether the database is undamaged and holds exactly these images, or none yet."""
+    try:
+        with _opened(database) as db:
+            if db.execute("PRAGMA quick_check").fetchone() != ("ok",):
+                return False
+            entered = [name for (name,) in db.execute("SELECT name FROM images ORDER BY image_id")]
+    except sqlite3.DatabaseError:
+        return False
+    return entered in ([], list(names))
+
+
+def read_matches(database: Path) -> Matches:
+    """What feature extraction and matching found."""
+    with _opened(database) as db:
+        keypoints = db.execute(
+            "SELECT COALESCE(rows, 0) FROM images LEFT JOIN keypoints USING (image_id) ORDER BY image_id"
+        ).fetchall()
+        verified = db.execute(
+            "SELECT pair_id, rows, config, data FROM two_view_geometries WHERE rows > 0 ORDER BY pair_id"
+        ).fetchall()
+        places = {
+            image_id - 1: np.frombuffer(data, np.float32).reshape(rows, cols)[:, :2]
+            for image_id, rows, cols, data in db.execute("SELECT * FROM keypoints WHERE rows > 0")
+        }
+    pairs = np.array([divmod(pair_id, PAIR_BASE) for pair_id, *_ in verified], int).reshape(-1, 2) - 1
+    shifts = []
+    for (first, second), (_, rows, _, data) in zip(pairs, verified, strict=True):
+        matched = np.frombuffer(data, np.uint32).reshape(rows, 2)
+        offsets = places[first][matched[:, 0]] - places[second][matched[:, 1]]
+        shifts.append(np.median(np.linalg.norm(offsets, axis=1)))
+    return Matches(
+        keypoints=np.array(keypoints, int).reshape(-1),
+        pairs=pairs,
+        inliers=np.array([rows for _, rows, _, _ in verified], int),
+        flat=np.array([config in FLAT_CONFIGS for _, _, config, _ in verified], bool),
+        shift_px=np.array(shifts, float),
+    )
+
+
+def account(
+    names: Sequence[str], matches: Matches, models: Sequence[Sequence[str]], observations: dict[str, int]
+) -> list[dict[str, Any]]:
+    """What became of each photo, for registration.json. ``models`` are the names in each sub-model, best first."""
+    entries = []
+    for index, name in enumerate(names):
+        entries.append(
+            {
+                "file": name,
+                "registered": name in models[0],
+                "reason": None if name in models[0] else _reason(index, names, matches, models),
+                "keypoints": int(matches.keypoints[index]),
+                "observations": observations.get(name, 0),
+            }
+        )
+    return entries
+
+
+def _reason(index: int, names: Sequence[str], matches: Matches, models: Sequence[Sequence[str]]) -> str:
+    if not matches.keypoints[index]:
+        return "no features found in it: blurred, dark or without texture"
+    mine = (matches.pairs == index).any(axis=1)
+    if not mine.any():
+        return "it shares no view with any other photo"
+    if others := [model for model in models[1:] if names[index] in model]:
+        return f"it belongs to another group of {len(others[0])} photos that does not connect to this one"
+    partners = matches.pairs[mine].sum(axis=1) - index
+    in_model = np.array([names[partner] in models[0] for partner in partners])
+    if not in_model.any():
+        return "it shares views only with photos that are not registered either"
+    most = matches.inliers[mine][in_model].max()
+    return f"too few matches to the model: at most {most} with a registered photo"
+
+
+def why_no_model(photos: "Sequence[Photo]", matches: Matches, registered: int, points: int) -> StageError:
+    """The error for a set of photos from which no scene can be made, by what its pairs tell."""
+    count = len(photos)
+    pairs, verified = count * (count - 1) // 2, len(matches.pairs)
+    what = f"the cameras of {count} photos could not be found"
+    if np.median(matches.keypoints) < FEW_FEATURES:
+        return StageError(
+            what,
+            f"half of the photos show fewer than {FEW_FEATURES} features",
+            "Take sharper, better lit photos, or put something with texture into the scene.",
+        )
+    if not verified:
+        return StageError(what, f"0 of {pairs} pairs of photos share a view", OVERLAP_HINT)
+    if np.median(matches.shift_px) < SAME_VIEW_PX:
+        return StageError(
+            what,
+            f"the photos are all the same view ({verified} of {pairs} pairs differ by less than a pixel)",
+            "Move the camera between photos.",
+        )
+    if (flat := int(matches.flat.sum())) > verified / 2:
+        return StageError(
+            what,
+            f"{flat} of {verified} matching pairs differ by a turn of the camera alone, or show one flat surface",
+            "Move sideways between photos, by a tenth of the distance to the scene, instead of turning on the spot.",
+        )
+    why = f"{verified} of {pairs} pairs of photos share a view, but no two of them tell the depth of the scene"
+    if registered:
+        why = f"only {registered} photos and {points} points fit together; {verified} of {pairs} pairs share a view"
+    return StageError(what, why, OVERLAP_HINT)

@@ -1,0 +1,60 @@
+"""A sparse reconstruction in plain numpy: cameras, poses, points, and which image sees which point where."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from nerf.scene import Camera
+
+
+@dataclass(frozen=True)
+class SparseImage:
+    """A registered photo: its file relative to ingest's ``images/``, its camera, its pose."""
+
+    file: str
+    camera: int  # index into SparseModel.cameras
+    sfm_from_camera: Float[np.ndarray, "3 4"]
+
+
+@dataclass(frozen=True)
+class SparseModel:
+    """A sparse reconstruction in the sfm frame; images in order of ``file``, points in order of COLMAP's ids.
+
+    Observation k says that image ``view[k]`` sees point ``point[k]`` at pixel ``xy[k]``; by view, then keypoint.
+    """
+
+    cameras: list[Camera]
+    images: list[SparseImage]
+    xyz: Float[np.ndarray, "points 3"]
+    rgb: UInt8[np.ndarray, "points 3"]
+    error_px: Float[np.ndarray, "points"]
+    view: Int[np.ndarray, "observations"]
+    point: Int[np.ndarray, "observations"]
+    xy: Float[np.ndarray, "observations 2"]
+
+    @classmethod
+    def without_points(cls, cameras: list[Camera], images: list[SparseImage]) -> "SparseModel":
+        """Cameras alone; ``images`` in order of ``file``."""
+        none = np.zeros(0, int)
+        return cls(
+            cameras, images, np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0), none, none, np.zeros((0, 2))
+        )
+
+    def restricted(
+        self,
+        kept: Sequence[int],
+        scales: Sequence[tuple[float, float]],
+        cameras: list[Camera],
+        images: list[SparseImage],
+    ) -> "SparseModel":
+        """What ``images``, which stand for the images ``kept`` of this model, see of its points.
+
+        ``scales`` (across, down) take pixels of the old images to pixels of the new ones.
+        """
+        order = np.concatenate([np.flatnonzero(self.view == index) for index in kept])
+        view = np.repeat(np.arange(len(kept)), [np.count_nonzero(self.view == index) for index in kept])
+        points, point = np.unique(self.point[order], return_inverse=True)
+        xy = self.xy[order] * np.array(scales)[view]
+        return SparseModel(cameras, images, self.xyz[points], self.rgb[points], self.error_px[points], view, point, xy)

@@ -1,0 +1,135 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from nerf.camera_paths import average_pose, interpolated, look_at, nearest_rotations, orbit, spiral
+from tests.camera_layouts import ring, room, wall
+
+PATHS = {
+    "orbit of a circle": lambda n: orbit(ring(), n),
+    "orbit of an arc": lambda n: orbit(ring(arc_deg=100.0), n),
+    "spiral": lambda n: spiral(wall(), n),
+    "interpolated": lambda n: interpolated(room(), n),
+}
+LOOPED = sorted(set(PATHS) - {"interpolated"})
+
+
+def hemisphere(count: int = 60) -> np.ndarray:
+    directions = np.random.default_rng(0).normal(size=(count, 3)) * [1, 1, 0.8]
+    directions[:, 2] = np.abs(directions[:, 2]) + 0.05
+    return look_at(4 * directions / np.linalg.norm(directions, axis=1, keepdims=True), np.zeros(3))
+
+
+def steps(poses: np.ndarray) -> np.ndarray:
+    """Change from frame to frame, turning and moving taken together."""
+    return np.linalg.norm(np.diff(poses.reshape(-1, 12), axis=0), axis=1)
+
+
+@pytest.mark.parametrize("path", PATHS)
+@pytest.mark.parametrize("frames", [2, 24, 61])
+def test_poses_are_orthonormal_and_right_handed(path: str, frames: int) -> None:
+    poses = PATHS[path](frames)
+    assert poses.shape == (frames, 3, 4)
+    rotation = poses[:, :, :3]
+    np.testing.assert_allclose(rotation @ rotation.transpose(0, 2, 1), np.tile(np.eye(3), (frames, 1, 1)), atol=1e-12)
+    np.testing.assert_allclose(np.linalg.det(rotation), 1)
+
+
+@pytest.mark.parametrize("path", LOOPED)
+def test_looped_paths_close_without_a_jump(path: str) -> None:
+    poses = PATHS[path](60)
+    closing = np.linalg.norm(poses[0] - poses[-1])
+    assert closing <= 1.01 * steps(poses).max()
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_motion_is_smooth_and_more_frames_make_smaller_steps(path: str) -> None:
+    coarse, fine = steps(PATHS[path](61)), steps(PATHS[path](121))
+    assert 0 < fine.max() < 0.8 * coarse.max()
+
+
+def test_orbit_stands_where_the_cameras_stood_and_looks_where_they_looked() -> None:
+    poses = orbit(ring(radius=4.0, height=1.5), 36)
+    centres = poses[:, :, 3]
+    np.testing.assert_allclose(np.hypot(centres[:, 0], centres[:, 1]), 4.0, atol=1e-6)
+    np.testing.assert_allclose(centres[:, 2], 1.5, atol=1e-6)
+    np.testing.assert_allclose(poses[:, :, 2], -centres / np.linalg.norm(centres, axis=1, keepdims=True), atol=1e-6)
+    assert (poses[:, 2, 1] < 0).all()  # image y points down
+
+
+def test_orbit_of_an_arc_stays_within_the_arc_and_reaches_its_ends() -> None:
+    centres = orbit(ring(arc_deg=100.0), 60)[:, :, 3]
+    from_middle = np.degrees(np.arctan2(centres[:, 0], -centres[:, 1]))
+    assert np.abs(from_middle).max() == pytest.approx(50, abs=0.5)
+
+
+def test_orbit_follows_an_elliptic_ring() -> None:
+    angle = 2 * np.pi * np.arange(40) / 40
+    centres = np.stack([5 * np.cos(angle), 3 * np.sin(angle), 1 + 0.5 * np.sin(angle)], axis=1)
+    path = orbit(look_at(centres, np.zeros(3)), 80)[:, :, 3]
+    nearest = np.linalg.norm(path[:, None] - centres, axis=2).min(axis=1)
+    assert nearest.max() < 0.45  # neighbours are 0.6 apart
+
+
+def test_orbit_of_a_hemisphere_takes_its_middle_height() -> None:
+    poses = orbit(hemisphere(), 60)
+    distance = np.linalg.norm(poses[:, :, 3], axis=1)
+    assert (poses[:, 2, 3] > 0.3).all()
+    assert ((distance > 3) & (distance < 4.3)).all()
+
+
+def test_orbit_from_straight_above_keeps_a_horizon() -> None:
+    centres = np.array([[0.0, 1e-9, 4.0], [1e-9, 0.0, 4.0], [-1e-9, 0.0, 4.0]])
+    poses = np.tile(np.array([[1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 0]]), (3, 1, 1))
+    poses[:, :, 3] = centres
+    assert np.isfinite(orbit(poses, 12)).all()
+
+
+def test_spiral_stays_within_the_grid_of_cameras_and_looks_into_the_scene() -> None:
+    cameras = wall()
+    poses = spiral(cameras, 60)
+    low, high = cameras[:, :, 3].min(axis=0), cameras[:, :, 3].max(axis=0)
+    assert (poses[:, :, 3] >= low - 1e-9).all()
+    assert (poses[:, :, 3] <= high + 1e-9).all()
+    assert np.ptp(poses[:, 0, 3]) > 0.5 * (high - low)[0]
+    assert (poses[:, 1, 2] > 0.95).all()
+
+
+def test_interpolated_passes_through_every_camera_it_has_frames_for() -> None:
+    cameras = room(12)
+    poses = interpolated(cameras, 400)
+    away = np.linalg.norm((poses[:, None] - cameras).reshape(400, 12, 12), axis=2).min(axis=0)
+    assert away.max() < 0.05
+
+
+def test_interpolated_keeps_a_constant_speed() -> None:
+    moved = steps(interpolated(room(), 300))
+    assert moved.min() > 0.5 * moved.max()
+
+
+def test_interpolated_walks_along_a_row_of_cameras_whatever_their_order() -> None:
+    row = wall(rows=1, columns=9)
+    shuffled = row[np.random.default_rng(0).permutation(9)]
+    x = interpolated(shuffled, 120)[:, 0, 3]
+    assert np.ptp(x) == pytest.approx(8 * 0.3, rel=1e-6)
+    assert np.abs(np.diff(x)).sum() == pytest.approx(8 * 0.3, rel=1e-6)
+
+
+def test_paths_through_two_cameras_work() -> None:
+    for path in (orbit, spiral, interpolated):
+        assert np.isfinite(path(ring(arc_deg=20.0, count=2), 10)).all()
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 10_000))
+def test_nearest_rotation_is_the_identity_on_rotations_and_ignores_scale(seed: int) -> None:
+    matrix = np.random.default_rng(seed).normal(size=(3, 3))
+    rotation = nearest_rotations(matrix)
+    assert np.linalg.det(rotation) == pytest.approx(1)
+    np.testing.assert_allclose(nearest_rotations(rotation * 7), rotation, atol=1e-9)
+
+
+def test_average_pose_of_equal_poses_is_that_pose() -> None:
+    pose = ring()[3]
+    np.testing.assert_allclose(average_pose(np.tile(pose, (5, 1, 1))), pose, atol=1e-9)

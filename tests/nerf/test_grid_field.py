@@ -1,0 +1,156 @@
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from nerf import grid_mlp
+from nerf.grid_field import GridField, GridSettings
+from nerf.kernels import reference
+from nerf.model import RadianceModel, Rendering
+from nerf.rays import Rays
+
+SMALL = GridSettings(levels=2, log2_rows=9, coarsest=3, finest=9, steps=24, cache_cells=8)
+FOLDED = replace(SMALL, contracted=True, shortest_step=0.1, cone=0.2)
+
+
+def field(settings: GridSettings = SMALL, seed: int = 1) -> GridField:
+    """A field in float64 whose features are large enough to matter."""
+    model = GridField(settings, seed, reference).double()
+    model.table.mul_(2e4)
+    return model
+
+
+def rays(count: int = 6) -> Rays:
+    generator = torch.Generator().manual_seed(2)
+    origins = torch.randn(count, 3, generator=generator, dtype=torch.float64)
+    origins = 1.7 * origins / origins.norm(dim=-1, keepdim=True)
+    towards = 0.5 * torch.rand(count, 3, generator=generator, dtype=torch.float64) - origins
+    ends = torch.full((2, count), 0.3, dtype=torch.float64)
+    ends[1] = 4.0
+    return Rays(origins, towards / towards.norm(dim=-1, keepdim=True), *ends)
+
+
+def seen_by_autograd(model: GridField, given: Rays, jitter: Tensor, background: Tensor) -> Tensor:
+    """The loss sum(colour * k) + sum(depth) written with plain torch, differentiable in parameters and rays."""
+    settings = model.settings
+    samples = reference.march(model.bits, model.lattice, Rays(*(part.detach() for part in given)), jitter)
+    points = reference.sample_points(given, samples, settings.contracted)
+    features = encoded_by_autograd(model, points)
+    weights = model.weights
+    geometry = torch.relu(features @ weights.density_hidden) @ weights.density_out
+    sigma = geometry[:, 0].clamp(max=15).exp()
+    harmonics = reference.spherical_harmonics(given.directions)[samples.ray]
+    hidden = torch.relu(torch.cat([geometry, harmonics], -1) @ weights.colour_hidden)
+    rendering, _ = reference.composite(
+        samples, sigma, torch.sigmoid(hidden @ weights.colour_out), background, given.far
+    )
+    return (rendering.colour * torch.tensor([1.0, 2.0, -3.0])).sum() + rendering.depth.sum()
+
+
+def encoded_by_autograd(model: GridField, points: Tensor) -> Tensor:
+    features = []
+    layout = model.layout
+    for level, resolution in enumerate(layout.resolutions):
+        scaled = points * resolution
+        cell = scaled.detach().floor().clamp(0, resolution - 1)
+        inside = scaled - cell
+        value = torch.zeros(len(points), layout.features, dtype=points.dtype)
+        for corner in torch.cartesian_prod(*[torch.arange(2)] * 3):
+            share = torch.where(corner.bool(), inside, 1 - inside).prod(-1)
+            x, y, z = (cell.long() + corner).unbind(-1)
+            if layout.hashed(level):
+                number = (x ^ (y * 2654435761) ^ (z * 805459861)) % layout.level_rows(level)
+            else:
+                number = (x * (resolution + 1) + y) * (resolution + 1) + z
+            value = value + share[:, None] * model.table[layout.first_rows[level] + number]
+        features.append(value)
+    return torch.cat(features, -1)
+
+
+@pytest.mark.parametrize("settings", [SMALL, FOLDED])
+def test_all_gradients_are_those_of_autograd(settings: GridSettings) -> None:
+    model, given = field(settings), rays()
+    jitter = torch.rand(6, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    background = torch.rand(6, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    done = model.forward(given, jitter, background)
+    assert done.marched == len(done.samples.t), "these are to be compared without early termination"
+    ones = torch.ones(6, dtype=torch.float64)
+    grad = Rendering(torch.tensor([1.0, 2.0, -3.0], dtype=torch.float64).expand(6, 3), ones, 0 * ones)
+    gradients = model.backward(done, grad, torch.zeros_like(done.weights))
+    grad_table = torch.zeros_like(model.table)
+    model.table_backward(done, gradients, grad_table)
+    of_rays = model.rays_backward(done, gradients)
+
+    parameters = [model.table, *model.weights, given.origins, given.directions]
+    for parameter in parameters:
+        parameter.requires_grad_()
+    wanted = torch.autograd.grad(seen_by_autograd(model, given, jitter, background), parameters)
+    assert all(part.abs().max() > 1e-3 for part in wanted)
+    torch.testing.assert_close((grad_table, *gradients.weights, *of_rays), wanted, rtol=1e-9, atol=1e-10)
+
+
+def test_density_is_bounded_in_value_and_gradient() -> None:
+    logits = torch.tensor([-1e30, -100.0, 0.0, 15.0, 16.0, 1e30])
+    geometry = torch.zeros(6, 16)
+    geometry[:, 0] = logits
+    sigma = grid_mlp.DensityPass(geometry, geometry, geometry).sigma
+    assert sigma.isfinite().all()
+    assert sigma.max() == pytest.approx(math.exp(15))
+    assert sigma[2] == 1
+
+
+def test_it_is_a_radiance_model_of_the_scene_frame() -> None:
+    model = field()
+    assert isinstance(model, RadianceModel)
+    points = torch.tensor([[[0.0, 0, 0], [0.89, 0.1, -0.89]], [[0.91, 0, 0], [0, 0, -5]]], dtype=torch.float64)
+    density = model.density(points)
+    assert (density[0] > 0).all() and (density[1] == 0).all()
+    colour = model.colour(points, torch.tensor([0.0, 0, 1], dtype=torch.float64).expand_as(points))
+    assert colour.shape == points.shape and ((colour > 0) & (colour < 1)).all()
+    assert (field(FOLDED).density(1e6 * points) > 0).all()
+
+
+def test_density_agrees_with_what_rays_see() -> None:
+    """The opacity along a ray is 1 - exp(-∫ sigma dt), here by the middle rule on the field's own lattice."""
+    model, given = field(), rays()
+    rendering = model.render(given, torch.zeros(3, dtype=torch.float64))
+    step = model.lattice.step
+    middle = torch.full((6,), 0.5, dtype=torch.float64)
+    samples = reference.march(model.bits, model.lattice, given, middle)
+    points = given.origins[samples.ray] + samples.t[:, None] * given.directions[samples.ray]
+    depth = torch.zeros(6, dtype=torch.float64).index_add(0, samples.ray.long(), model.density(points) * samples.dt)
+    torch.testing.assert_close(rendering.opacity, -torch.expm1(-depth), rtol=0, atol=2e-3)
+    assert rendering.opacity.min() > 0.05 and samples.dt.max() == pytest.approx(step)
+
+
+def test_closed_cells_are_not_seen() -> None:
+    model, given = field(), rays()
+    model.bits.zero_()
+    rendering = model.render(given, torch.tensor([0.2, 0.4, 0.6], dtype=torch.float64))
+    assert (rendering.opacity == 0).all()
+    assert torch.equal(rendering.depth, given.far)
+    assert rendering.colour[3].tolist() == [0.2, 0.4, 0.6]
+
+
+def test_parameters_depend_on_the_seed_alone() -> None:
+    one, same, other = (GridField(SMALL, seed, reference).state_dict() for seed in (1, 1, 2))
+    assert all(torch.equal(one[name], same[name]) for name in one)
+    assert not torch.equal(one["table"], other["table"])
+    assert set(one) == {"table", "bits", "density_hidden", "density_out", "colour_hidden", "colour_out"}
+    assert 0.9e-4 < one["table"].abs().max() <= 1e-4
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"levels": 0}, "levels is 0; it must be at least 1"),
+        ({"coarsest": 10}, "finest is 9; it must be at least 10"),
+        ({"cache_cells": 10}, "cache_cells is 10; it must be a multiple of 4"),
+        ({"cone": 0.0}, r"shortest_step \(0.002\) and cone \(0.0\) must be positive"),
+    ],
+)
+def test_impossible_sizes_are_refused(wrong: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        replace(SMALL, **wrong)

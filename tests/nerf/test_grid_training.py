@@ -1,0 +1,158 @@
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from nerf.grid_field import GridField, GridSettings
+from nerf.grid_training import GridTrainer, GridTrainerSettings, rate_factor
+from nerf.kernels import reference
+from nerf.probe import make_probe, measure
+from nerf.ray_bank import RayBank, build_ray_bank
+from nerf.training import FieldTrainer, NonFinite
+
+FIELD = GridSettings(levels=2, log2_rows=10, coarsest=4, finest=16, steps=32, cache_cells=16)
+TRAINER = GridTrainerSettings(seed=3, background="random", samples=1024, most_rays=256)
+
+
+def small_bank(size: int = 12) -> RayBank:
+    """Two opposite views of a red disc on nothing, from 3 units away."""
+    grid = (torch.arange(size) + 0.5) / size - 0.5
+    y, x = torch.meshgrid(grid, grid, indexing="ij")
+    bearings = torch.stack([x, y, torch.ones_like(x)], -1)
+    bearings = bearings / bearings.norm(dim=-1, keepdim=True)
+    inside = (x**2 + y**2 < 0.04)[..., None]
+    photo = torch.cat([torch.where(inside, torch.tensor([200, 20, 20]), 255), torch.where(inside, 255, 0)], -1)
+    front = torch.tensor([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, -3]])
+    back = torch.tensor([[-1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 3]])
+    near, far = torch.full((2,), 1.0), torch.full((2,), 5.0)
+    return build_ray_bank([photo.to(torch.uint8)] * 2, [0, 0], [bearings], torch.stack([front, back]), near, far)
+
+
+def trainer(settings: GridTrainerSettings = TRAINER, field: GridSettings = FIELD) -> GridTrainer:
+    return GridTrainer(GridField(field, 0, reference), small_bank(), settings)
+
+
+def copied(state: dict[str, Tensor]) -> dict[str, Tensor]:
+    return {name: tensor.clone() for name, tensor in state.items()}
+
+
+def same(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:
+    return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
+
+
+def test_it_trains_behind_the_common_interface() -> None:
+    run: FieldTrainer = trainer()
+    probe = make_probe(small_bank(), 288, torch.ones(3), seed=5)
+    before = measure(run.model, probe).psnr
+    for step in range(80):
+        run.step(step, step / 80, 1.0)
+    after = measure(run.model, probe).psnr
+    assert before < probe.flat_psnr < probe.flat_psnr + 5 < after < 60
+
+
+def test_a_resumed_run_is_the_uninterrupted_one_bit_for_bit() -> None:
+    whole, first = trainer(), trainer()
+    results = [whole.step(step, step / 40) for step in range(40)]
+    for step in range(20):
+        first.step(step, step / 40)
+    second = trainer()
+    second.load_state(copied(first.state()))
+    assert [second.step(step, step / 40) for step in range(20, 40)] == results[20:]
+    assert same(whole.state(), second.state())
+    assert len({result.rays for result in results}) > 5, "the number of rays is meant to adapt"
+
+
+def test_rays_adapt_to_the_samples_they_need() -> None:
+    run = trainer(replace(TRAINER, most_rays=10_000))
+    results = [run.step(step, 0.5) for step in range(100)]
+    assert results[0].rays == 1024 // 128
+    needed = results[-1].rays * float(run.samples_per_ray)
+    assert 0.7 * 1024 < needed < 1.4 * 1024
+    assert results[-1].rays > 5 * results[0].rays
+
+
+def test_empty_space_is_closed_and_the_object_stays_open() -> None:
+    run = trainer(field=replace(FIELD, steps=200))
+    for step in range(96):
+        run.step(step, 0.5)
+    words = torch.stack([(run.model.bits >> bit) & 1 for bit in range(64)], -1)
+    opened = words.sum() / FIELD.cache_cells**3
+    assert 0.02 < opened < 0.7
+    rays, _, alpha = run.bank.lookup(torch.arange(len(run.bank.pixels)))
+    opacity = run.model.render(rays, torch.ones(3)).opacity
+    assert opacity[alpha == 1].mean() > 0.7
+    assert opacity[alpha == 0].mean() < 0.1
+
+
+@pytest.mark.parametrize(("broken", "quantity"), [(math.nan, "loss"), (math.inf, "gradient")])
+def test_a_non_finite_step_changes_nothing_and_shows_its_batch(
+    broken: float, quantity: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = trainer()
+    run.step(0, 0.0)
+    if quantity == "loss":
+        run.model.colour_out[0, 0] = broken
+    else:
+        backward = run.model.backward
+        monkeypatch.setattr(
+            run.model, "backward", lambda *a: backward(*a)._replace(features=torch.full((1, FIELD.levels * 4), broken))
+        )
+    before = copied(run.state())
+    with pytest.raises(NonFinite, match=f"the {quantity} of step 1 is not finite") as caught:
+        run.step(1, 0.5)
+    for name, tensor in run.state().items():
+        torch.testing.assert_close(tensor, before[name], rtol=0, atol=0, equal_nan=True)
+    assert set(caught.value.batch) == {"origins", "directions", "near", "far", "target", "background", "jitter"}
+
+
+def test_the_rate_scale_scales_the_update() -> None:
+    whole, half = trainer(), trainer()
+    start = copied(whole.state())
+    whole.step(0, 0.0, 1.0)
+    half.step(0, 0.0, 0.5)
+    for name in ("model.table", "model.colour_out"):
+        moved, moved_half = whole.state()[name] - start[name], half.state()[name] - start[name]
+        assert moved.any()
+        torch.testing.assert_close(moved_half, moved / 2, atol=1e-7, rtol=1e-3)
+
+
+def test_the_distortion_loss_is_added_and_has_its_gradient() -> None:
+    plain, with_it = trainer(), trainer(replace(TRAINER, distortion=1.0))
+    one, other = plain.step(0, 0.0), with_it.step(0, 0.0)
+    assert one.psnr == other.psnr
+    assert one.loss < other.loss < one.loss + 5
+    assert torch.equal(plain.mean["colour_out"], with_it.mean["colour_out"])
+    assert not torch.equal(plain.mean["density_out"], with_it.mean["density_out"])
+
+
+def test_unbounded_scenes_train_too() -> None:
+    run = trainer(
+        replace(TRAINER, background=(0.0, 0.0, 0.0), distortion=1e-3),
+        replace(FIELD, contracted=True, shortest_step=0.05, cone=0.1),
+    )
+    results = [run.step(step, step / 60) for step in range(60)]
+    first, last = (sum(r.psnr for r in part) / 10 for part in (results[:10], results[-10:]))
+    assert first + 3 < last < 60
+
+
+def test_the_rate_warms_up_stays_and_falls() -> None:
+    assert rate_factor(0, 0.0) == pytest.approx(0.05)
+    assert rate_factor(19, 0.1) == rate_factor(500, 0.2) == 1
+    assert rate_factor(500, 0.6) == pytest.approx(0.05**0.5)
+    assert rate_factor(500, 1.0) == pytest.approx(0.05)
+
+
+def test_a_state_of_another_architecture_is_refused() -> None:
+    other = trainer(field=replace(FIELD, levels=1))
+    with pytest.raises(RuntimeError, match=r"another field: mean\.density_hidden, mean\.table"):
+        trainer().load_state(other.state())
+
+
+def test_a_density_cache_of_an_unbounded_scene_has_finite_steps_everywhere() -> None:
+    model = GridField(replace(FIELD, contracted=True), 0, reference)
+    cache = GridTrainer(model, small_bank(), TRAINER).cache
+    cache.refresh(15, torch.Generator().manual_seed(1))
+    assert cache.thickness.isfinite().all()
+    assert cache.thickness.max() > 20 * cache.thickness.min() > 0

@@ -1,0 +1,49 @@
+"""A tiny finished ingest and normalise: photos of a ball, with exact cameras, as files."""
+
+from pathlib import Path
+
+import numpy as np
+
+from nerf.scene import Camera, Scene, Similarity, View
+from stages.files import write_json
+
+WIDTH, HEIGHT, FOCAL = 24, 16, 20.0
+CAMERA = Camera("PINHOLE", WIDTH, HEIGHT, (FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2))
+
+
+def pose_towards_origin(angle: float, distance: float = 3.0) -> np.ndarray:
+    """A camera on a horizontal circle that looks at the origin, z up."""
+    centre = distance * np.array([np.cos(angle), np.sin(angle), 0])
+    forward, down = -centre / distance, np.array([0, 0, -1.0])
+    return np.stack([np.cross(down, forward), down, forward, centre], axis=1)
+
+
+def ball_photo(channels: int = 3) -> np.ndarray:
+    """A blue ball of radius 0.6 at the origin, seen from 3 units away; white, or nothing, behind it."""
+    y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    inside = np.hypot(x - WIDTH / 2, y - HEIGHT / 2) < FOCAL * 0.6 / 3
+    photo = np.where(inside[..., None], [30, 60, 200], 255)
+    if channels == 4:
+        photo = np.concatenate([photo, np.where(inside, 255, 0)[..., None]], axis=2)
+    return photo.astype(np.uint8)
+
+
+def photographed(
+    folder: Path, views: int = 8, channels: int = 3, bounded: bool = True
+) -> tuple[dict[str, Path], Scene]:
+    """Write photos and scene.json; every fourth view is a test view."""
+    from PIL import Image
+
+    inputs = {name: folder / name for name in ("ingest", "normalise")}
+    (inputs["ingest"] / "images").mkdir(parents=True)
+    inputs["normalise"].mkdir()
+    kept = []
+    for index in range(views):
+        file = f"images/{index:03d}.png"
+        Image.fromarray(ball_photo(channels)).save(inputs["ingest"] / file)
+        pose = pose_towards_origin(2 * np.pi * index / views)
+        kept.append(View(f"{index}.png", file, 0, pose, 2.0, 4.0, "train" if index % 4 else "test"))
+    still = Similarity(1.0, np.eye(3), np.zeros(3))
+    scene = Scene((CAMERA,), tuple(kept), still, bounded, channels == 4, "around", True)
+    write_json(inputs["normalise"] / "scene.json", scene.to_json())
+    return inputs, scene

@@ -1,0 +1,83 @@
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from stages.checkpoints import Checkpoint, latest_checkpoint, save_checkpoint, write_atomically
+
+
+def checkpoint(step: int) -> Checkpoint:
+    return Checkpoint(step, {"weight": torch.arange(6.0).reshape(2, 3) / 7 + step}, {"seconds": step / 3})
+
+
+def saved(folder: Path, *steps: int) -> Path:
+    for step in steps:
+        save_checkpoint(folder, checkpoint(step))
+    return folder
+
+
+def test_what_was_saved_comes_back_bit_for_bit(tmp_path: Path) -> None:
+    found = latest_checkpoint(saved(tmp_path / "new", 7), pytest.fail)
+    assert found is not None
+    assert (found.step, found.facts) == (7, {"seconds": 7 / 3})
+    assert torch.equal(found.tensors["weight"], checkpoint(7).tensors["weight"])
+
+
+def test_the_last_two_are_kept(tmp_path: Path) -> None:
+    saved(tmp_path, 0, 5, 90, 100)
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == {f"{step:09d}.{kind}" for step in (90, 100) for kind in ("json", "safetensors")}
+
+
+def test_without_a_checkpoint_there_is_none(tmp_path: Path) -> None:
+    assert latest_checkpoint(tmp_path, pytest.fail) is None
+    assert latest_checkpoint(tmp_path / "missing", pytest.fail) is None
+
+
+@pytest.mark.parametrize("harm", ["cut tensors", "flipped bit", "cut json", "no tensors", "empty json"])
+def test_a_damaged_one_is_named_and_the_one_before_is_used(tmp_path: Path, harm: str) -> None:
+    saved(tmp_path, 3, 4)
+    tensors, meta = tmp_path / "000000004.safetensors", tmp_path / "000000004.json"
+    if harm == "cut tensors":
+        tensors.write_bytes(tensors.read_bytes()[:-5])
+    elif harm == "flipped bit":
+        content = bytearray(tensors.read_bytes())
+        content[-1] ^= 1
+        tensors.write_bytes(content)
+    elif harm == "cut json":
+        meta.write_bytes(meta.read_bytes()[:-5])
+    elif harm == "no tensors":
+        tensors.unlink()
+    else:
+        meta.write_text("{}")
+    said: list[str] = []
+    found = latest_checkpoint(tmp_path, said.append)
+    assert found is not None and found.step == 3
+    assert len(said) == 1 and said[0].startswith("the checkpoint of step 4 is damaged (")
+    assert said[0].endswith("); going back to the one before")
+    assert latest_checkpoint(tmp_path, pytest.fail) is not None
+
+
+def test_a_kill_before_the_json_leaves_no_checkpoint_and_its_rest_is_swept_up(tmp_path: Path) -> None:
+    saved(tmp_path, 1)
+    (tmp_path / "000000002.safetensors").write_bytes(b"half")
+    (tmp_path / "000000002.json.tmp").write_bytes(b"{")
+    found = latest_checkpoint(tmp_path, pytest.fail)
+    assert found is not None and found.step == 1
+    saved(tmp_path, 3)
+    assert not list(tmp_path.glob("*2.*"))
+
+
+def test_not_finite_facts_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        save_checkpoint(tmp_path, Checkpoint(1, {}, {"loss": float("nan")}))
+    assert latest_checkpoint(tmp_path, pytest.fail) is None
+
+
+def test_writing_replaces_the_whole_file(tmp_path: Path) -> None:
+    path = tmp_path / "plan.json"
+    write_atomically(path, json.dumps(list(range(100))).encode())
+    write_atomically(path, b"[]")
+    assert path.read_bytes() == b"[]"
+    assert [p.name for p in tmp_path.iterdir()] == ["plan.json"]

@@ -1,0 +1,154 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from nerf.scene import Camera
+from stages.colmap import camera_rays, is_valid, project, read_model, rescaled, write_model
+from stages.contract import StageError
+from stages.sparse_model import SparseImage, SparseModel
+
+W, H = 60, 40
+
+
+def lens(model: str, *params: float) -> Camera:
+    return Camera(model, W, H, tuple(map(float, params)))
+
+
+CAMERAS = [
+    lens("SIMPLE_PINHOLE", 50, 31, 19),
+    lens("PINHOLE", 50, 52, 31, 19),
+    lens("SIMPLE_RADIAL", 50, 31, 19, -0.1),
+    lens("RADIAL", 50, 31, 19, -0.1, 0.03),
+    lens("OPENCV", 50, 52, 31, 19, -0.1, 0.03, 0.001, -0.002),
+    lens("FULL_OPENCV", 50, 52, 31, 19, -0.1, 0.03, 0.001, -0.002, 0.01, 0.02, 0.01, 0.0),
+    lens("OPENCV_FISHEYE", 50, 52, 31, 19, 0.05, 0.01, 0.0, 0.0),
+    lens("SIMPLE_RADIAL_FISHEYE", 50, 31, 19, 0.05),
+    lens("THIN_PRISM_FISHEYE", 50, 52, 31, 19, 0.05, 0.01, 0.001, 0.001, 0.0, 0.0, 0.001, 0.001),
+    lens("EQUIRECTANGULAR", W, H),
+]
+
+
+@pytest.mark.parametrize("camera", CAMERAS, ids=lambda camera: camera.model)
+@pytest.mark.parametrize("size", [(W, H), (30, 20), (41, 26), (1, 1)])
+def test_rays_project_back_to_the_pixel_centres(camera: Camera, size: tuple[int, int]) -> None:
+    rays = camera_rays(camera, *size)
+    assert rays.shape == (size[1], size[0], 3)
+    assert rays.dtype == np.float32
+    np.testing.assert_allclose(np.linalg.norm(rays, axis=-1), 1, atol=1e-6)
+    x, y = np.meshgrid((np.arange(size[0]) + 0.5) * W / size[0], (np.arange(size[1]) + 0.5) * H / size[1])
+    np.testing.assert_allclose(project(camera, rays.reshape(-1, 3)), np.stack([x, y], -1).reshape(-1, 2), atol=1e-3)
+
+
+def test_rays_of_a_pinhole_are_what_they_should_be() -> None:
+    rays = camera_rays(CAMERAS[1], 30, 10)  # half as wide, a quarter as high
+    expected = np.array([(2 * 7.5 - 31) / 50, (4 * 3.5 - 19) / 52, 1.0])
+    np.testing.assert_allclose(rays[3, 7], expected / np.linalg.norm(expected), atol=1e-7)
+
+
+@pytest.mark.parametrize("k", [-2.0, -0.9])
+def test_distortion_that_cannot_be_undone_is_refused_with_its_share(k: float) -> None:
+    with pytest.raises(StageError, match=r"the SIMPLE_RADIAL camera has no ray for \d+\.\d% of its pixels"):
+        camera_rays(lens("SIMPLE_RADIAL", 30.0, 30.0, 20.0, k), W, H)
+
+
+def test_points_behind_the_camera_project_nowhere() -> None:
+    pixels = project(CAMERAS[4], np.array([[0.0, 0.0, 1.0], [0.1, 0.1, -1.0], [0.0, 0.0, -2.0]]))
+    np.testing.assert_allclose(pixels[0], (31, 19), atol=1e-9)
+    assert np.isnan(pixels[1:]).all()
+
+
+def test_a_camera_with_the_wrong_number_of_parameters_is_refused() -> None:
+    with pytest.raises(ValueError, match="OPENCV takes fx, fy, cx, cy, k1, k2, p1, p2, got 2 numbers"):
+        camera_rays(lens("OPENCV", 50.0, 50.0), W, H)
+
+
+def test_rescaling_scales_lengths_in_pixels_and_nothing_else() -> None:
+    assert rescaled(CAMERAS[4], 2 * W, 3 * H).params == (100, 156, 62, 57, -0.1, 0.03, 0.001, -0.002)
+
+
+@pytest.mark.parametrize("focal", [0.0, -5.0, np.nan, np.inf])
+def test_a_camera_needs_a_positive_focal_length(focal: float) -> None:
+    assert is_valid(CAMERAS[3])
+    assert not is_valid(lens("SIMPLE_PINHOLE", focal, 30.0, 20.0))
+
+
+def random_model(seed: int = 0, views: int = 5, points: int = 30) -> SparseModel:
+    """Cameras in front of a cloud of points, each point seen by at least two of them."""
+    random = np.random.default_rng(seed)
+    cameras = [lens("PINHOLE", 50, 52, 31, 19), lens("RADIAL", 60, 30, 20, 0.1, 0.0)]
+    images = []
+    for index in range(views):
+        rotation, _ = np.linalg.qr(random.normal(size=(3, 3)))
+        pose = np.concatenate([rotation * np.linalg.det(rotation), random.normal(size=(3, 1))], axis=1)
+        images.append(SparseImage(f"{index:02d}.jpg", index % 2, pose))
+    sees = random.uniform(size=(views, points)) < 0.5
+    sees[:2] = True
+    view, point = np.nonzero(sees)
+    xy = random.uniform(0, H, (len(view), 2))
+    rgb = random.integers(0, 256, (points, 3)).astype(np.uint8)
+    return SparseModel(cameras, images, random.normal(size=(points, 3)), rgb, np.zeros(points), view, point, xy)
+
+
+def test_a_model_survives_the_disk(tmp_path: Path) -> None:
+    model = random_model()
+    write_model(tmp_path / "a", model)
+    write_model(tmp_path / "b", model)
+    names = sorted(path.name for path in (tmp_path / "a").iterdir())
+    assert names == ["cameras.bin", "frames.bin", "images.bin", "points3D.bin", "rigs.bin"]
+    assert all((tmp_path / "a" / n).read_bytes() == (tmp_path / "b" / n).read_bytes() for n in names)
+    again = read_model(tmp_path / "a")
+    assert again.cameras == model.cameras
+    assert [(image.file, image.camera) for image in again.images] == [(i.file, i.camera) for i in model.images]
+    for mine, theirs in zip(model.images, again.images, strict=True):
+        np.testing.assert_allclose(theirs.sfm_from_camera, mine.sfm_from_camera, atol=1e-12)
+    for name in ("xyz", "rgb", "view", "point", "xy"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(model, name))
+
+
+def test_errors_are_the_mean_distance_to_the_projections(tmp_path: Path) -> None:
+    pose = np.concatenate([np.eye(3), np.zeros((3, 1))], axis=1)
+    moved = pose + np.array([0, 0, 0, 1.0])[None] * np.array([[1.0], [0], [0]])
+    images = [SparseImage("a.jpg", 0, pose), SparseImage("b.jpg", 0, moved)]
+    seen = np.array([[31.0 + 3, 19 + 4], [31.0 - 50 / 2, 19]])  # five pixels off in the first, exact in the second
+    none = np.zeros(1)
+    model = SparseModel(
+        [CAMERAS[1]], images, np.array([[0, 0, 2.0]]), np.zeros((1, 3), np.uint8), none, np.arange(2), np.zeros(2, int), seen
+    )  # fmt: skip
+    write_model(tmp_path, model)
+    np.testing.assert_allclose(read_model(tmp_path).error_px, [2.5])
+
+
+def test_cameras_alone_are_a_model_too(tmp_path: Path) -> None:
+    model = random_model()
+    write_model(tmp_path, SparseModel.without_points(model.cameras, model.images))
+    again = read_model(tmp_path)
+    assert (len(again.images), len(again.xyz), len(again.view)) == (5, 0, 0)
+    assert again.xy.shape == (0, 2)
+
+
+def test_a_damaged_model_is_an_error_that_names_it(tmp_path: Path) -> None:
+    sparse = tmp_path / "sparse"
+    with pytest.raises(StageError, match="cannot read the COLMAP model in sparse"):
+        read_model(sparse)
+    write_model(sparse, random_model())
+    (sparse / "images.bin").write_bytes((sparse / "images.bin").read_bytes()[:100])
+    with pytest.raises(StageError, match="cannot read the COLMAP model in sparse"):
+        read_model(sparse)
+
+
+def test_restricting_to_everything_changes_nothing() -> None:
+    model = random_model()
+    same = model.restricted(range(5), [(1.0, 1.0)] * 5, model.cameras, model.images)
+    for name in ("xyz", "rgb", "error_px", "view", "point", "xy"):
+        np.testing.assert_array_equal(getattr(same, name), getattr(model, name))
+
+
+def test_restricting_keeps_what_the_kept_images_see() -> None:
+    model = random_model()
+    part = model.restricted([3, 1], [(2.0, 1.0), (1.0, 1.0)], model.cameras, [model.images[3], model.images[1]])
+    for new, old, scale in ((0, 3, (2, 1)), (1, 1, (1, 1))):
+        mine, theirs = part.view == new, model.view == old
+        np.testing.assert_array_equal(part.xyz[part.point[mine]], model.xyz[model.point[theirs]])
+        np.testing.assert_array_equal(part.xy[mine], model.xy[theirs] * scale)
+    assert set(part.point) == set(range(len(part.xyz)))

@@ -1,0 +1,64 @@
+from pathlib import Path
+
+import pytest
+import torch
+
+from nerf.paper import PaperNerf, PaperSettings
+from nerf.rays import Rays
+from stages.contract import StageError
+from stages.field_files import load_field, save_field
+from stages.files import read_json, write_json
+
+SMALL = PaperSettings(depth=2, width=8, samples_coarse=4, samples_fine=4, contracted=True, spacing="log")
+INFO = {"background": [1.0, 1.0, 1.0], "downscale": 2.5, "steps": 7, "rays": 700}
+
+
+def test_a_field_comes_back_the_same(tmp_path: Path) -> None:
+    model = PaperNerf(SMALL, seed=5)
+    save_field(tmp_path, model, INFO)
+    loaded, info = load_field(tmp_path)
+    rays = Rays(torch.zeros(3, 3), torch.eye(3), torch.full((3,), 0.5), torch.full((3,), 4.0))
+    for ours, theirs in zip(model.render(rays, torch.ones(3)), loaded.render(rays, torch.ones(3)), strict=True):
+        assert torch.equal(ours, theirs)
+    assert {key: info[key] for key in INFO} == INFO
+    assert info["kind"] == "paper"
+    assert info["settings"]["spacing"] == "log"
+
+
+def test_equal_fields_are_equal_bytes(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        save_field(tmp_path / name, PaperNerf(SMALL, seed=5), INFO)
+    for file in ("field.safetensors", "field.json"):
+        assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
+
+
+def test_a_loaded_field_asks_for_no_gradients(tmp_path: Path) -> None:
+    save_field(tmp_path, PaperNerf(SMALL, seed=5), INFO)
+    loaded, _ = load_field(tmp_path)
+    assert not loaded.density(torch.zeros(2, 3)).requires_grad
+
+
+@pytest.mark.parametrize("harm", ["cut weights", "no weights", "another kind", "another size", "unknown setting"])
+def test_a_damaged_field_is_refused_in_words(harm: str, tmp_path: Path) -> None:
+    save_field(tmp_path, PaperNerf(SMALL, seed=5), INFO)
+    weights, info = tmp_path / "field.safetensors", read_json(tmp_path / "field.json")
+    if harm == "cut weights":
+        weights.write_bytes(weights.read_bytes()[:-9])
+    elif harm == "no weights":
+        weights.unlink()
+    elif harm == "another kind":
+        write_json(tmp_path / "field.json", info | {"kind": "voxels"})
+    elif harm == "another size":
+        write_json(tmp_path / "field.json", info | {"settings": info["settings"] | {"width": 16}})
+    else:
+        write_json(tmp_path / "field.json", info | {"settings": info["settings"] | {"colour_space": "xyz"}})
+    with pytest.raises(StageError, match=r"cannot read the trained field: .*\. Run stage train again\.") as failure:
+        load_field(tmp_path)
+    if harm == "another kind":
+        assert failure.value.why == "a field of kind 'voxels' is unknown to this version"
+
+
+def test_a_model_without_a_format_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(TypeError, match="no file format for a Linear"):
+        save_field(tmp_path, torch.nn.Linear(1, 1), INFO)  # type: ignore[arg-type]

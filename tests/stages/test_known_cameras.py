@@ -1,0 +1,236 @@
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from nerf.scene import Camera
+from stages.colmap import write_model
+from stages.contract import StageError
+from stages.known_cameras import OPENGL_FROM_OPENCV, KnownCameras, read_known_cameras
+from stages.photos import Photo
+from stages.sparse_model import SparseImage, SparseModel
+
+W, H = 60, 40
+
+
+def photo(index: int, width: int = W, height: int = H, folder: str = "") -> Photo:
+    return Photo(f"{folder}ä{index}.png", f"images/{folder}a{index}.png", width, height, 0, None, None, False, 1.0)
+
+
+def rotation(angle: float) -> np.ndarray:
+    cos, sin = math.cos(angle), math.sin(angle)
+    return np.array([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]])
+
+
+def matrix(index: int) -> np.ndarray:
+    """world_from_camera with OpenGL axes."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation(0.3 * index), (index, 2.0, -1.0)
+    return pose
+
+
+def frame(index: int, **values: Any) -> dict[str, Any]:
+    return {"file_path": f"./{index}", "transform_matrix": matrix(index).tolist()} | values
+
+
+PHOTOS = [photo(index) for index in range(3)]
+NAMES = {f"./{index}": f"ä{index}.png" for index in range(3)}
+LENS = {"fl_x": 50.0, "fl_y": 52.0, "cx": 31.0, "cy": 19.0}
+
+
+@pytest.fixture
+def read(tmp_path: Path):
+    """Writes a transforms.json of these frames and values and reads it with PHOTOS."""
+
+    def write_and_read(frames: list[dict[str, Any]], photos: list[Photo] = PHOTOS, **values: Any) -> KnownCameras:
+        path = tmp_path / "transforms.json"
+        path.write_text(json.dumps({**values, "frames": frames}))
+        return read_known_cameras(path, photos, NAMES)
+
+    return write_and_read
+
+
+def test_axes_turn_from_opengl_to_opencv_and_centres_stay(read) -> None:
+    known = read([frame(i) for i in (2, 0, 1)], **LENS)
+    assert [image.file for image in known.model.images] == ["a0.png", "a1.png", "a2.png"]
+    for index, image in enumerate(known.model.images):
+        pose = image.sfm_from_camera
+        np.testing.assert_allclose(pose[:, 3], matrix(index)[:3, 3])
+        np.testing.assert_allclose(pose[:, 0], matrix(index)[:3, 0], atol=1e-12)  # x stays
+        np.testing.assert_allclose(pose[:, 1:3], -matrix(index)[:3, 1:3], atol=1e-12)  # y and z turn round
+        assert np.linalg.det(pose[:, :3]) == pytest.approx(1)
+    assert known.test_files is None
+    assert known.notes == []
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        (LENS, ("PINHOLE", (50, 52, 31, 19))),
+        (LENS | {"k1": 0.1, "p2": 0.01}, ("OPENCV", (50, 52, 31, 19, 0.1, 0, 0, 0.01))),
+        (LENS | {"k1": 0.1, "camera_model": "SIMPLE_RADIAL"}, ("OPENCV", (50, 52, 31, 19, 0.1, 0, 0, 0))),
+        (LENS | {"k3": 0.2}, ("FULL_OPENCV", (50, 52, 31, 19, 0, 0, 0, 0, 0.2, 0, 0, 0))),
+        (
+            LENS | {"k1": 0.1, "k4": 0.3, "camera_model": "FULL_OPENCV"},
+            ("FULL_OPENCV", (50, 52, 31, 19, 0.1, 0, 0, 0, 0, 0.3, 0, 0)),
+        ),
+        (
+            LENS | {"k1": 0.1, "k4": 0.3, "camera_model": "OPENCV_FISHEYE"},
+            ("OPENCV_FISHEYE", (50, 52, 31, 19, 0.1, 0, 0, 0.3)),
+        ),
+        (LENS | {"k1": 0.1, "is_fisheye": True}, ("OPENCV_FISHEYE", (50, 52, 31, 19, 0.1, 0, 0, 0))),
+        ({"fl_x": 50}, ("PINHOLE", (50, 50, 30, 20))),
+        ({"camera_angle_x": math.pi / 2}, ("PINHOLE", (30, 30, 30, 20))),
+        ({"camera_angle_x": math.pi / 2, "camera_angle_y": 2 * math.atan(0.5)}, ("PINHOLE", (30, 40, 30, 20))),
+        (LENS | {"camera_angle_x": 3.0}, ("PINHOLE", (50, 52, 31, 19))),
+        (LENS | {"w": 2 * W, "h": 2 * H}, ("PINHOLE", (25, 26, 15.5, 9.5))),
+    ],
+)
+def test_intrinsics(read, values: dict[str, Any], expected: tuple[str, tuple[float, ...]]) -> None:
+    (camera,) = read([frame(i) for i in range(3)], **values).model.cameras
+    assert (camera.model, camera.width, camera.height) == (expected[0], W, H)
+    assert camera.params == pytest.approx(expected[1])
+
+
+def test_a_frames_own_intrinsics_win(read) -> None:
+    model = read([frame(0), frame(1, fl_x=70.0), frame(2)], **LENS).model
+    assert [camera.params[0] for camera in model.cameras] == [50, 70]
+    assert [image.camera for image in model.images] == [0, 1, 0]
+
+
+def _with(row: int, column: int, value: float) -> list[list[float]]:
+    pose = matrix(1)
+    pose[row, column] = value
+    return pose.tolist()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"transform_matrix": _with(0, 3, math.nan)}, r"transform_matrix of frame './1': it is not 4 × 4"),
+        ({"transform_matrix": _with(1, 1, math.inf)}, r"transform_matrix of frame './1': it is not 4 × 4"),
+        ({"transform_matrix": [[1, 0], [0, 1]]}, r"transform_matrix of frame './1': it is not 4 × 4"),
+        ({"transform_matrix": [[1, 0], ["x"]]}, r"transform_matrix of frame './1': it is not a matrix of numbers"),
+        ({"transform_matrix": (matrix(1) @ np.diag([-1, 1, 1, 1])).tolist()}, r"frame './1': it mirrors"),
+        ({"transform_matrix": (matrix(1) @ np.diag([2, 2, 2, 1])).tolist()}, r"no rotation: .* it scales by 2\."),
+        ({"transform_matrix": np.zeros((4, 4)).tolist()}, r"no rotation: RᵀR is off by 1, and it scales by 0\."),
+        ({"fl_x": 0}, r"focal length of frame './1': in pixels it comes to 0 × 52"),
+        ({"fl_x": -50}, r"focal length of frame './1': in pixels it comes to -50 × 52"),
+        ({"fl_x": math.nan}, r"fl_x of frame './1': it is nan, not a finite number"),
+        ({"cx": "31"}, r"cx of frame './1': it is '31', not a finite number"),
+        ({"k1": True}, r"k1 of frame './1': it is True, not a finite number"),
+        ({"w": 0, "h": 0}, r"size of frame './1': w and h are 0 and 0"),
+        ({"w": 80, "h": 40}, r"camera of './1': it is for 80×40 pixels, the photo has 60×40"),
+        ({"k4": 0.1}, r"distortion of frame './1': it has a k4, and its camera_model is not FULL_OPENCV"),
+        ({"camera_model": "EQUIRECTANGULAR"}, r"camera model of frame './1': panoramas are not supported"),
+    ],
+)
+def test_what_is_no_camera_is_refused_by_name(read, changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(StageError, match=message):
+        read([frame(0), frame(1, **changes), frame(2)], **LENS)
+
+
+def test_no_focal_length_at_all_is_refused(read) -> None:
+    with pytest.raises(StageError, match=r"focal length of frame './0': in pixels it comes to 0 × 0"):
+        read([frame(0)])
+
+
+def test_a_rotation_with_rounding_is_made_orthonormal(read) -> None:
+    rounded = matrix(1)
+    rounded[:3, :3] = np.round(rounded[:3, :3], 4)
+    (image,) = read([frame(1, transform_matrix=rounded.tolist())], **LENS).model.images
+    turned = image.sfm_from_camera[:, :3]
+    np.testing.assert_allclose(turned.T @ turned, np.eye(3), atol=1e-12)
+    assert 0 < np.abs(turned @ OPENGL_FROM_OPENCV - matrix(1)[:3, :3]).max() < 1e-4
+
+
+def test_frames_without_photo_and_photos_without_frame_are_named(read) -> None:
+    known = read([frame(0), frame(1), frame(7)], **LENS)
+    assert known.notes == ["1 cameras have no photo: ./7", "1 photos have no camera and are left out: ä2.png"]
+    assert [entry["registered"] for entry in known.account(PHOTOS)] == [True, True, False]
+    assert known.account(PHOTOS)[2]["reason"] == "the given cameras have none for it"
+
+
+def test_no_frame_with_a_photo_is_an_error(read) -> None:
+    with pytest.raises(StageError, match=r"no camera in transforms.json belongs to a photo"):
+        read([frame(8), frame(9)], **LENS)
+
+
+def test_a_photo_has_one_frame(read) -> None:
+    with pytest.raises(StageError, match=r"two frames for the photo ä1.png: one is './1'"):
+        read([frame(1), frame(1)], **LENS)
+
+
+@pytest.mark.parametrize("with_test", [True, False])
+def test_blender_folders_keep_their_split(tmp_path: Path, with_test: bool) -> None:
+    for split, indices in (("train", (0, 1)), ("test", (2,))):
+        if split == "train" or with_test:
+            content = {"camera_angle_x": math.pi / 2, "frames": [frame(i) for i in indices]}
+            (tmp_path / f"transforms_{split}.json").write_text(json.dumps(content))
+    known = read_known_cameras(tmp_path, PHOTOS, NAMES)
+    assert len(known.model.images) == (3 if with_test else 2)
+    assert known.test_files == (["a2.png"] if with_test else None)
+    (camera,) = known.model.cameras
+    assert camera.params == pytest.approx((30, 30, 30, 20))
+
+
+def colmap_model(folder: Path, names: list[str]) -> SparseModel:
+    camera = Camera("RADIAL", W, H, (50.0, 31.0, 19.0, 0.1, 0.0))
+    images = [SparseImage(name, 0, matrix(i)[:3] @ np.diag([1.0, -1, -1, 1])) for i, name in enumerate(sorted(names))]
+    count = len(names)
+    model = SparseModel(
+        cameras=[camera],
+        images=images,
+        xyz=np.array([[0.0, 2, -9], [1, 2, -8]]),
+        rgb=np.full((2, 3), 9, np.uint8),
+        error_px=np.zeros(2),
+        view=np.repeat(np.arange(count), 2),
+        point=np.tile([0, 1], count),
+        xy=np.tile([[20.0, 10.0], [40.0, 30.0]], (count, 1)),
+    )
+    write_model(folder, model)
+    return model
+
+
+def test_a_colmap_model_is_matched_by_name_and_keeps_its_points(tmp_path: Path) -> None:
+    given = colmap_model(tmp_path, ["ä1.png", "elsewhere/ä0.png", "other.png"])
+    known = read_known_cameras(tmp_path, PHOTOS, {})
+    assert [image.file for image in known.model.images] == ["a0.png", "a1.png"]
+    poses = {image.file: image.sfm_from_camera for image in given.images}
+    np.testing.assert_allclose(known.model.images[0].sfm_from_camera, poses["elsewhere/ä0.png"], atol=1e-12)
+    np.testing.assert_allclose(known.model.images[1].sfm_from_camera, poses["ä1.png"], atol=1e-12)
+    assert len(known.model.xyz) == 2
+    assert known.notes == ["1 cameras have no photo: other.png", "1 photos have no camera and are left out: ä2.png"]
+    assert [entry["observations"] for entry in known.account(PHOTOS)] == [2, 2, 0]
+
+
+def test_a_colmap_model_of_larger_photos_is_scaled(tmp_path: Path) -> None:
+    colmap_model(tmp_path, ["ä0.png", "ä1.png"])
+    known = read_known_cameras(tmp_path, [photo(0, W // 2, H // 2), photo(1)], {})
+    assert [camera.params for camera in known.model.cameras] == [(25, 15.5, 9.5, 0.1, 0), (50, 31, 19, 0.1, 0)]
+    np.testing.assert_array_equal(known.model.xy, [[10, 5], [20, 15], [20, 10], [40, 30]])
+
+
+def test_a_name_that_two_photos_share_matches_neither(tmp_path: Path) -> None:
+    colmap_model(tmp_path, ["ä0.png", "ä1.png"])
+    photos = [photo(0, folder="left/"), photo(0, folder="right/"), photo(1)]
+    known = read_known_cameras(tmp_path, photos, {})
+    assert [image.file for image in known.model.images] == ["a1.png"]
+
+
+def test_two_cameras_for_one_photo_are_refused(tmp_path: Path) -> None:
+    colmap_model(tmp_path, ["left/ä0.png", "right/ä0.png"])
+    with pytest.raises(StageError, match="two cameras for the photo ä0.png"):
+        read_known_cameras(tmp_path, PHOTOS, {})
+
+
+def test_the_fox_of_instant_ngp(shared_data: Path) -> None:
+    content = json.loads((shared_data / "fox/transforms.json").read_text())
+    names = {entry["file_path"]: Path(entry["file_path"]).name for entry in content["frames"]}
+    photos = [Photo(name, f"images/{name}", 648, 1152, 0, None, None, False, 1.0) for name in names.values()]
+    known = read_known_cameras(shared_data / "fox/transforms.json", photos, names)
+    assert len(known.model.images) == 50
+    assert [(camera.model, camera.params[0]) for camera in known.model.cameras] == [("OPENCV", 825.312)]

@@ -1,0 +1,142 @@
+"""Marching cubes and mesh surgery: closed forms on a ball and a torus, and what is open."""
+
+import numpy as np
+import pytest
+import torch
+
+from nerf.lattice import Lattice
+from stages.mesh_surface import (
+    Surface,
+    border_vertices,
+    components,
+    decimate,
+    extract,
+    face_areas,
+    is_watertight,
+    keep_faces,
+    vertex_normals,
+)
+
+LEVEL = 20.0
+SHARPNESS = 0.02
+TETRAHEDRON = Surface(
+    np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]),
+    np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32),
+)
+
+
+def lattice_of(distance, points=64):
+    """Density 2 × LEVEL inside, 0 outside, LEVEL where the signed ``distance`` is zero."""
+    axis = torch.linspace(-0.9, 0.9, points)
+    grid = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1)
+    corner = torch.full((3,), 0.9)
+    return Lattice(2 * LEVEL * torch.sigmoid(-distance(grid) / SHARPNESS), -corner, corner)
+
+
+def ball(points):
+    return points.norm(dim=-1) - 0.6
+
+
+def torus(points):
+    return torch.stack([points[..., :2].norm(dim=-1) - 0.5, points[..., 2]], dim=-1).norm(dim=-1) - 0.2
+
+
+def volume(surface):
+    a, b, c = surface.vertices[surface.faces].swapaxes(0, 1)
+    return float((a * np.cross(b, c)).sum() / 6)
+
+
+def euler(surface):
+    edges = len(surface.faces) * 3 // 2
+    return len(surface.vertices) - edges + len(surface.faces)
+
+
+@pytest.mark.parametrize(
+    ("distance", "area", "content", "characteristic"),
+    [
+        (ball, 4 * np.pi * 0.6**2, 4 / 3 * np.pi * 0.6**3, 2),
+        (torus, 4 * np.pi**2 * 0.5 * 0.2, 2 * np.pi**2 * 0.5 * 0.2**2, 0),
+    ],
+)
+def test_area_volume_and_topology_are_those_of_the_solid(distance, area, content, characteristic):
+    surface = extract(lattice_of(distance), LEVEL)
+    assert is_watertight(surface) and len(border_vertices(surface)) == 0
+    assert euler(surface) == characteristic
+    assert 0 < abs(float(face_areas(surface).sum()) / area - 1) < 0.005
+    assert 0 < abs(volume(surface) / content - 1) < 0.015  # positive: faces are counter-clockwise from outside
+    off = distance(torch.from_numpy(surface.vertices)).abs()
+    assert 0 < float(off.mean()) < 0.06 * 1.8 / 63 and float(off.max()) < 0.2 * 1.8 / 63  # in voxels of 1.8 / 63
+
+
+def test_normals_point_to_lower_density():
+    surface = extract(lattice_of(ball), LEVEL)
+    outward = surface.vertices / np.linalg.norm(surface.vertices, axis=1, keepdims=True)
+    assert 0.99 < float((vertex_normals(surface) * outward).sum(axis=1).min()) <= 1
+
+
+def test_a_density_of_thirty_decades_makes_the_same_surface():
+    lattice = lattice_of(ball)
+    extreme = lattice._replace(values=torch.where(lattice.values > 1.9 * LEVEL, 1e30, lattice.values))
+    assert np.isfinite(extract(extreme, LEVEL).vertices).all()
+    assert volume(extract(extreme, LEVEL)) == pytest.approx(volume(extract(lattice, LEVEL)), rel=0.01)
+
+
+def test_a_step_is_put_halfway_between_full_and_empty():
+    values = torch.zeros(12, 12, 12)
+    values[:6] = 1e6
+    corner = torch.full((3,), 1.1)
+    surface = extract(Lattice(values, -corner, corner), LEVEL)
+    np.testing.assert_allclose(surface.vertices[:, 0], 0, atol=1e-6)  # between vertices at -0.1 and 0.1
+
+
+def test_what_the_box_cuts_stays_open_there():
+    surface = extract(lattice_of(lambda p: p[..., 2] + 0.31), LEVEL)
+    assert not is_watertight(surface)
+    border = border_vertices(surface)
+    assert len(border) == 2 * 4 * 63
+    np.testing.assert_allclose(np.abs(border[:, :2]).max(axis=1), 0.9, atol=1e-6)
+
+
+def test_watertight_means_closed_and_consistently_wound():
+    assert is_watertight(TETRAHEDRON)
+    assert not is_watertight(TETRAHEDRON._replace(faces=TETRAHEDRON.faces[:3]))
+    flipped = TETRAHEDRON.faces.copy()
+    flipped[0] = flipped[0, ::-1]
+    assert not is_watertight(TETRAHEDRON._replace(faces=flipped))
+    assert len(border_vertices(TETRAHEDRON._replace(faces=TETRAHEDRON.faces[:3]))) == 6
+
+
+def test_components_are_numbered_by_area():
+    small = TETRAHEDRON.vertices * 0.5 + [3, 0, 0]
+    both = Surface(
+        np.concatenate([small, TETRAHEDRON.vertices]), np.concatenate([TETRAHEDRON.faces, TETRAHEDRON.faces + 4])
+    )
+    assert components(both).tolist() == [1] * 4 + [0] * 4
+    large, old = keep_faces(both, components(both) == 0)
+    assert old.tolist() == [4, 5, 6, 7]
+    np.testing.assert_array_equal(large.vertices, TETRAHEDRON.vertices)
+    np.testing.assert_array_equal(large.faces, TETRAHEDRON.faces)
+
+
+def test_normals_of_a_cornered_mesh_and_of_lost_vertices():
+    lost = TETRAHEDRON._replace(vertices=np.concatenate([TETRAHEDRON.vertices, [[9.0, 9, 9]]]))
+    normals = vertex_normals(lost)
+    np.testing.assert_allclose(normals[0], -np.ones(3) / np.sqrt(3))
+    assert (normals[4] == 0).all()
+
+
+def test_decimation_keeps_the_shape_closed():
+    surface = extract(lattice_of(torus), LEVEL)
+    fewer = decimate(surface, len(surface.faces) // 4)
+    assert 0.2 < len(fewer.faces) / len(surface.faces) <= 0.25
+    assert is_watertight(fewer) and euler(fewer) == 0
+    assert 0 < abs(volume(fewer) / volume(surface) - 1) < 0.01
+    assert decimate(surface, len(surface.faces)) is surface
+
+
+def test_decimation_leaves_borders_where_they_are():
+    surface = extract(lattice_of(lambda p: p[..., 2] + 0.2 * p[..., 0].cos()), LEVEL)
+    fewer = decimate(surface, len(surface.faces) // 3)
+    assert len(fewer.faces) < len(surface.faces) / 2
+    before, after = (np.unique(border_vertices(s).round(9), axis=0) for s in (surface, fewer))
+    np.testing.assert_array_equal(before, after)

@@ -1,0 +1,108 @@
+"""What the photos cover and see of a ball, in closed form."""
+
+import numpy as np
+import pytest
+import torch
+
+from nerf.lattice import Lattice
+from nerf.scene import Camera, Scene, Similarity, View
+from stages import mesh_views
+from stages.mesh_preview import look_at
+from stages.mesh_views import look, shadow_maps
+
+RADIUS = 0.5
+CORNER = torch.full((3,), 0.9)
+VOXEL = 1.8 / 63
+PINHOLE = Camera("PINHOLE", 120, 90, (140.0, 140.0, 60.0, 45.0))
+IDENTITY = Similarity(1.0, np.eye(3), np.zeros(3))
+
+
+def scene_of(*centres, camera=PINHOLE, near=0.5, far=6.0, target=(0, 0, 0)):
+    poses = [look_at(np.array(c, float), np.array(target, float), np.array([0, 0, 1.0])) for c in centres]
+    views = tuple(View(f"{i}.png", f"images/{i}.png", 0, pose, near, far, "train") for i, pose in enumerate(poses))
+    return Scene((camera,), views, IDENTITY, True, False, "around", True)
+
+
+@pytest.fixture(scope="module")
+def ball():
+    axis = torch.linspace(-0.9, 0.9, 64)
+    radius = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1).norm(dim=-1)
+    return Lattice(500 * torch.sigmoid((RADIUS - radius) / 0.01), -CORNER, CORNER)
+
+
+@pytest.fixture(scope="module")
+def normals():
+    random = np.random.default_rng(0).normal(size=(3000, 3))
+    return random / np.linalg.norm(random, axis=1, keepdims=True)
+
+
+def looked(lattice, scene, vertices, normals):
+    maps = shadow_maps(lattice, scene, scene.views, lambda done: None)
+    return look(vertices, normals, maps, VOXEL)
+
+
+def test_one_camera_covers_the_ball_and_sees_its_front(ball, normals):
+    vertices = RADIUS * normals
+    sight = looked(ball, scene_of((2.5, 0, 0)), vertices, normals)
+    assert (sight.covered == 1).all()
+    towards = vertices - [2.5, 0, 0]
+    facing = -(towards * normals).sum(axis=1) / np.linalg.norm(towards, axis=1)
+    assert (sight.seen[facing > 0.15] == 1).all()
+    assert (sight.seen[facing < 0.05] == 0).all()
+
+
+def test_the_direction_is_the_cameras_where_seen_and_the_inward_normal_elsewhere(ball, normals):
+    vertices = RADIUS * normals
+    sight = looked(ball, scene_of((2.5, 0, 0)), vertices, normals)
+    towards = vertices - [2.5, 0, 0]
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    expected = np.where(sight.seen[:, None] > 0, towards, -normals)
+    assert 0 < sight.seen.sum() < len(vertices)
+    np.testing.assert_allclose(sight.direction, expected, atol=1e-12)
+
+
+def test_two_cameras_count_twice_and_their_directions_are_weighted(ball):
+    normals = np.array([[1.0, 0, 0], [2**-0.5, 2**-0.5, 0], [0, 1.0, 0]])
+    sight = looked(ball, scene_of((2.5, 0, 0), (0, 2.5, 0)), RADIUS * normals, normals)
+    assert sight.seen.tolist() == [1, 2, 1]
+    np.testing.assert_allclose(sight.direction, -normals, atol=1e-12)
+
+
+def test_an_occluder_hides_what_is_behind_it():
+    values = torch.zeros(64, 64, 64)
+    values[50:53, :32] = 500.0  # a wall at x = 0.55, y < 0
+    points = np.array([[-0.5, 0.4, 0], [-0.5, -0.4, 0]])
+    sight = looked(Lattice(values, -CORNER, CORNER), scene_of((2.5, 0, 0)), points, np.tile([1.0, 0, 0], (2, 1)))
+    assert sight.covered.tolist() == [1, 1] and sight.seen.tolist() == [1, 0]
+
+
+@pytest.mark.parametrize(("near", "far", "covered"), [(0.5, 6.0, 1), (2.2, 6.0, 0), (0.5, 1.8, 0)])
+def test_only_points_between_near_and_far_are_covered(ball, near, far, covered):
+    point = np.array([[0.5, 0, 0]])
+    sight = looked(ball, scene_of((2.5, 0, 0), near=near, far=far), point, np.array([[1.0, 0, 0]]))
+    assert sight.covered.tolist() == [covered]
+
+
+def test_points_beside_and_behind_the_camera_are_not_covered(ball):
+    """The image is 120 px wide at a focal length of 140 px: from 2.5 away it reaches 1.071 to either side."""
+    points = np.array([[0, 1.05, 0], [0, 1.09, 0], [0, 0, 0.79], [0, 0, 0.82], [5.0, 0, 0]])
+    sight = looked(ball, scene_of((2.5, 0, 0)), points, np.tile([1.0, 0, 0], (5, 1)))
+    assert sight.covered.tolist() == [1, 0, 1, 0, 0]
+
+
+def test_lens_polynomials_that_fold_back_do_not_cover_what_the_photo_cannot_show(ball):
+    """With k1 = -0.3 the image radius shrinks again beyond tan(angle) = 1.05, and returns to 0 at 1.83."""
+    folding = Camera("SIMPLE_RADIAL", 120, 90, (140.0, 60.0, 45.0, -0.3))
+    points = np.array([[0.0, 0.5, 0], [0.0, 2.5 * 1.8, 0]])
+    sight = looked(ball, scene_of((2.5, 0, 0), camera=folding), points, np.tile([1.0, 0, 0], (2, 1)))
+    assert sight.covered.tolist() == [1, 0]
+
+
+def test_many_photos_share_the_rays(ball, monkeypatch):
+    monkeypatch.setattr(mesh_views, "RAYS", 1000)
+    told = []
+    for count, shape in ((1, (27, 37)), (10, (9, 12))):
+        scene = scene_of(*[(2.5, 0, 0)] * count)
+        maps = shadow_maps(ball, scene, scene.views, told.append)
+        assert [m.reach.shape for m in maps] == [shape] * count
+    assert told[0] == told[-1] == 1.0 and len(told) == 11

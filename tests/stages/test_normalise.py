@@ -1,0 +1,154 @@
+import json
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from nerf.scene import Camera
+from stages import normalise
+from stages.contract import StageError
+from stages.files import read_json, read_scene, read_tensors
+from stages.photos import Photo, write_photos
+from tests.camera_layouts import ball, ring, seen_by
+
+CAMERA = Camera("PINHOLE", 400, 400, (400.0, 400.0, 200.0, 200.0))
+
+
+@pytest.fixture
+def inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Builds the folders of ingest and sfm for a ring of photos around a ball of points; COLMAP lists them reversed."""
+
+    def build(
+        count: int = 17, alpha: bool = False, test_files: list[str] | None = None, one_place: bool = False
+    ) -> dict[str, Path]:
+        poses = ring(count)
+        if one_place:
+            poses[:, :, 3] = 0
+        scene = seen_by(poses, np.zeros((0, 3)) if one_place else ball())
+        folders = {name: tmp_path / name for name in ("ingest", "sfm", "normalise")}
+        for folder in folders.values():
+            folder.mkdir(exist_ok=True)
+        photos = [
+            Photo(f"ä {i:02d}.jpg", f"images/{i:02d}.png", 400, 400, 0, None, None, alpha, 1.0) for i in range(count)
+        ]
+        write_photos(folders["ingest"], photos, [], {})
+        (folders["sfm"] / "registration.json").write_text(json.dumps({"test_files": test_files}))
+        model = SimpleNamespace(
+            cameras=[CAMERA],
+            images=[
+                SimpleNamespace(file=f"{i:02d}.png", camera=0, sfm_from_camera=scene.from_camera[i])
+                for i in reversed(range(count))
+            ],
+            xyz=scene.points,
+            rgb=np.full((len(scene.points), 3), 7, np.uint8),
+            error_px=np.ones(len(scene.points)),
+            view=count - 1 - scene.view,
+            point=scene.point,
+            xy=np.zeros((len(scene.view), 2)),
+        )
+        monkeypatch.setattr("stages.colmap.read_model", lambda sparse: model)
+        return folders
+
+    return build
+
+
+def run(folders: dict[str, Path], progress, **config):
+    return normalise.run(normalise.Config(**config), folders, folders["normalise"], progress)
+
+
+def test_views_are_in_order_of_name_with_their_own_poses_and_observations(inputs, progress) -> None:
+    folders = inputs()
+    result = run(folders, progress)
+    scene, points = read_scene(folders["normalise"]), read_tensors(folders["normalise"] / "points.safetensors")
+    assert [view.name for view in scene.views] == [f"ä {i:02d}.jpg" for i in range(17)]
+    local = np.einsum(
+        "nji,nj->ni",
+        np.stack([scene.views[v].scene_from_camera[:, :3] for v in points["view"]]),
+        points["xyz"][points["point"]] - np.stack([scene.views[v].scene_from_camera[:, 3] for v in points["view"]]),
+    )
+    assert len(local) > 1000
+    assert (np.abs(local[:, :2]) <= 0.501 * local[:, 2:]).all()  # every point lies in the view that observes it
+    assert {name: part.dtype.name for name, part in points.items()} == {
+        "xyz": "float32",
+        "rgb": "uint8",
+        "error_px": "float32",
+        "view": "int32",
+        "point": "int32",
+        "xy": "float32",
+    }
+    assert all((folders["normalise"] / name).is_file() for name in result.outputs)
+
+
+def test_the_line_says_what_was_decided(inputs, progress) -> None:
+    result = run(inputs(), progress)
+    assert result.line == "360° around an object, all within the region of interest · up from level horizons"
+    assert result.facts["train"] + result.facts["test"] == 17
+
+
+def test_alpha_makes_the_background_known(inputs, progress) -> None:
+    folders = inputs(alpha=True)
+    assert "background transparent" in run(folders, progress).line
+    scene = read_scene(folders["normalise"])
+    assert scene.has_alpha
+    assert scene.bounded
+
+
+@pytest.mark.parametrize(("count", "held_out"), [(3, [0]), (8, [0]), (9, [0, 8]), (17, [0, 8, 16])])
+def test_every_eighth_photo_is_held_out_beginning_with_the_first(inputs, progress, count, held_out) -> None:
+    folders = inputs(count)
+    run(folders, progress)
+    views = read_scene(folders["normalise"]).views
+    assert [i for i, view in enumerate(views) if view.split == "test"] == held_out
+
+
+def test_an_official_split_is_kept(inputs, progress) -> None:
+    folders = inputs(9, test_files=["02.png", "05.png"])
+    run(folders, progress, test_every=3)
+    views = read_scene(folders["normalise"]).views
+    assert [view.file for view in views if view.split == "test"] == ["images/02.png", "images/05.png"]
+
+
+def test_equal_inputs_give_equal_bytes(inputs, progress) -> None:
+    folders = inputs()
+    outputs = run(folders, progress).outputs
+    first = [(folders["normalise"] / name).read_bytes() for name in outputs]
+    run(folders, progress)
+    assert first == [(folders["normalise"] / name).read_bytes() for name in outputs]
+
+
+def test_export_and_scene_tell_the_same_poses(inputs, progress) -> None:
+    folders = inputs()
+    run(folders, progress)
+    scene = read_scene(folders["normalise"])
+    frames = read_json(folders["normalise"] / "transforms.json")["frames"]
+    for i, (view, frame) in enumerate(zip(scene.views, frames, strict=True)):
+        assert frame["file_path"] == view.name
+        np.testing.assert_allclose(np.array(frame["transform_matrix"])[:3, 3], ring(17)[i][:, 3], atol=1e-9)
+
+
+def test_a_given_region_replaces_the_automatic_one(inputs, progress) -> None:
+    folders = inputs()
+    run(folders, progress, roi=(0.5, 0.0, 0.0, 3.0))
+    similarity = read_scene(folders["normalise"]).scene_from_sfm
+    assert similarity.scale == pytest.approx(0.3)
+    np.testing.assert_allclose(similarity.points(np.array([0.5, 0.0, 0.0])), 0, atol=1e-12)
+
+
+def test_two_photos_are_too_few(inputs, progress) -> None:
+    with pytest.raises(StageError) as error:
+        run(inputs(2), progress)
+    assert str(error.value) == (
+        "only 2 photos with a known camera: a scene needs at least 3: two to learn from and one to check against. "
+        "Add photos that overlap with these."
+    )
+
+
+def test_a_region_without_size_is_refused(inputs, progress) -> None:
+    with pytest.raises(StageError, match=r"--normalise.roi has radius 0: the fourth number is the region's half side"):
+        run(inputs(), progress, roi=(0.0, 0.0, 0.0, 0.0))
+
+
+def test_photos_from_one_place_are_refused_with_a_hint(inputs, progress) -> None:
+    with pytest.raises(StageError, match="the scene has no scale: all cameras stand in one place"):
+        run(inputs(one_place=True), progress)

@@ -1,0 +1,197 @@
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from nerf.model import Rendering
+from nerf.region import Layout
+from nerf.scene import Camera, Scene, Similarity, View
+from stages import render
+from stages.contract import StageError
+from stages.files import read_json, write_json
+from stages.render_path import CameraPath, fitted_path, median_camera, path_from_file, resized
+from stages.transforms_export import transforms
+from stages.video import read_video
+from tests.camera_layouts import ring, wall
+
+CAMERA = Camera("OPENCV", 160, 120, (150.0, 151.0, 82.0, 60.0, 0.05, 0.0, 0.0, 0.001))
+RADIUS = 0.6
+
+
+class Ball:
+    """An opaque ball about the origin, red where x > 0 and green elsewhere, before the background."""
+
+    def density(self, points):
+        return (points.norm(dim=-1) < RADIUS) * 1e3
+
+    def colour(self, points, directions):
+        return torch.where(points[..., :1] > 0, torch.tensor([1.0, 0, 0]), torch.tensor([0, 1.0, 0]))
+
+    def render(self, rays, background):
+        middle = -(rays.origins * rays.directions).sum(-1)
+        closest = rays.origins + middle[:, None] * rays.directions
+        inside = RADIUS**2 - (closest**2).sum(-1)
+        t = middle - inside.clamp(min=0).sqrt()
+        colour = self.colour(rays.origins + t[:, None] * rays.directions, rays.directions)
+        hit = inside > 0
+        return Rendering(torch.where(hit[:, None], colour, background), torch.where(hit, t, rays.far), hit.to(t.dtype))
+
+
+def scene_with(poses: np.ndarray, layout: Layout = "around", camera: Camera = CAMERA) -> Scene:
+    views = tuple(
+        View(f"{i}.jpg", f"images/{i}.png", 0, pose, 1.0, 9.0, "train" if i else "test") for i, pose in enumerate(poses)
+    )
+    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    similarity = Similarity(0.5, turn, np.array([0.1, 0.2, 0.3]))
+    return Scene((camera,), views, similarity, False, False, layout, True)
+
+
+@pytest.fixture
+def inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Path]:
+    """A ring of photos around an analytic ball, trained on 100,000 rays."""
+    folders = {name: tmp_path / name for name in ("normalise", "train", "render")}
+    for folder in folders.values():
+        folder.mkdir()
+    write_json(folders["normalise"] / "scene.json", scene_with(ring(12, radius=2.5, height=0.8)).to_json())
+    info = {"background": [0.0, 0.0, 1.0], "downscale": 1.0, "rays": 100_000}
+    write_json(folders["train"] / "field.json", info)
+    monkeypatch.setattr("stages.field_files.load_field", lambda folder, device="cpu": (Ball(), info))
+    return folders
+
+
+def given_path(content: dict[str, object], scene: Scene, folder: Path) -> CameraPath:
+    (folder / "t.json").write_text(json.dumps(content))
+    return path_from_file(scene, folder / "t.json")
+
+
+def run(inputs, progress, **config):
+    return render.run(render.Config(**config), inputs, inputs["render"], progress)
+
+
+def test_video_and_depth_show_the_field_from_the_path(inputs, progress) -> None:
+    result = run(inputs, progress, frames=8, width=80)
+    frames, fps = read_video(inputs["render"] / "video.mp4")
+    depth, _ = read_video(inputs["render"] / "depth.mp4")
+    assert frames.shape == depth.shape == (8, 60, 80, 3)
+    assert fps == 10
+    corner, centre = frames[:, 3, 3].astype(int), frames[:, 30, 40].astype(int)
+    assert (corner[:, 2] > 200).all()  # the blue background
+    assert (centre[:, :2].max(axis=1) > 150).all()  # the ball in the middle of every frame
+    assert {int(c.argmax()) for c in centre} == {0, 1}  # seen from both of its sides
+    assert (depth[:, 30, 40, 0].astype(int) > depth[:, 30, 40, 2] + 50).all()  # near is red
+    assert (depth[:, 3, 3, 0] < 100).all()  # far is not
+    assert result.line.startswith("orbit, 8 frames 80×60 · ")
+    assert set(result.outputs) == {"video.mp4", "depth.mp4", "path.json"}
+    assert result.records == ("speed.json",)
+    assert sorted(file.name for file in inputs["render"].iterdir()) == sorted([*result.outputs, *result.records])
+
+
+def test_equal_inputs_give_equal_bytes(inputs, progress) -> None:
+    names = run(inputs, progress, frames=3, width=40).outputs
+    first = {name: (inputs["render"] / name).read_bytes() for name in names}
+    run(inputs, progress, frames=3, width=40)
+    assert first == {name: (inputs["render"] / name).read_bytes() for name in names}
+
+
+def test_progress_rises_to_the_end(inputs, progress) -> None:
+    run(inputs, progress, frames=3, width=40)
+    shares = [done for _, done in progress.updates]
+    assert shares == sorted(shares)
+    assert shares[-1] == 1.0
+    assert progress.updates[-1][0].startswith("frame 3 of 3")
+
+
+def test_frames_are_kept_and_depth_left_out_on_request(inputs, progress) -> None:
+    outputs = run(inputs, progress, frames=3, width=40, depth=False, save_frames=True).outputs
+    assert set(outputs) == {"video.mp4", "path.json", "frames"}
+    assert [file.name for file in sorted((inputs["render"] / "frames").iterdir())] == [f"{i:05d}.png" for i in range(3)]
+
+
+def test_plan_answers_every_open_question_from_layout_and_rays(inputs) -> None:
+    config = render.plan(render.Config(), inputs)
+    assert (config.path, config.frames, config.fps) == ("orbit", 24, 10)
+    assert config.frames is not None
+    assert config.width is not None
+    assert config.frames * config.width * config.width * 3 / 4 <= 1.03 * 150_000 or config.width == 160
+    assert render.plan(config, inputs) == config
+
+
+@pytest.mark.parametrize(("layout", "path"), [("around", "orbit"), ("forward", "spiral"), ("inside", "interpolated")])
+def test_the_layout_chooses_the_path(inputs, layout: Layout, path: str) -> None:
+    write_json(inputs["normalise"] / "scene.json", scene_with(wall(), layout).to_json())
+    assert render.plan(render.Config(), inputs).path == path
+
+
+def test_a_written_path_can_be_given_back_as_cameras(inputs, progress, tmp_path: Path) -> None:
+    run(inputs, progress, frames=5, width=40)
+    first, written = (inputs["render"] / "video.mp4").read_bytes(), inputs["render"] / "path.json"
+    given = tmp_path / "cameras.json"
+    given.write_bytes(written.read_bytes())
+    result = run(inputs, progress, cameras=given, width=40)
+    assert result.line.startswith("cameras from a file, 5 frames 40×30")
+    frames, _ = read_video(inputs["render"] / "video.mp4")
+    (tmp_path / "first.mp4").write_bytes(first)
+    assert np.abs(frames.astype(int) - read_video(tmp_path / "first.mp4")[0]).mean() < 1
+
+
+def test_cameras_and_path_exclude_each_other(inputs, progress, tmp_path: Path) -> None:
+    with pytest.raises(StageError, match=r"--render.cameras excludes --render.path and --render.frames"):
+        run(inputs, progress, cameras=tmp_path / "x.json", frames=5)
+
+
+def test_exported_cameras_come_back_as_the_photos_own(tmp_path: Path) -> None:
+    poses = ring(5)
+    scene = scene_with(poses)
+    path = given_path(transforms(scene), scene, tmp_path)
+    np.testing.assert_allclose(path.poses, poses, atol=1e-12)
+    assert path.cameras == (CAMERA,) * 5
+
+
+def test_a_blender_camera_angle_is_understood_and_missing_sizes_are_the_photos(tmp_path: Path) -> None:
+    frame = {"file_path": "r_0", "transform_matrix": np.eye(4).tolist()}
+    camera = given_path({"camera_angle_x": np.pi / 2, "frames": [frame]}, scene_with(ring(5)), tmp_path).cameras[0]
+    assert (camera.model, camera.width, camera.height) == ("PINHOLE", 160, 120)
+    assert camera.params == pytest.approx((80, 80, 80, 60))
+
+
+@pytest.mark.parametrize(
+    ("frame", "words"),
+    [
+        ({"transform_matrix": [[1, 2], [3, 4]]}, "cannot use frame 0 of t.json"),
+        ({"transform_matrix": np.zeros((4, 4)).tolist()}, "transform_matrix is no camera pose"),
+        ({"transform_matrix": np.eye(4).tolist(), "fl_x": -3}, "size 160 x 120 with focal length -3 is no camera"),
+    ],
+)
+def test_unusable_frames_are_named(frame, words: str, tmp_path: Path) -> None:
+    with pytest.raises(StageError, match=words):
+        given_path({"frames": [{"file_path": "a"} | frame]}, scene_with(ring(5)), tmp_path)
+
+
+def test_frames_of_different_size_make_no_video(tmp_path: Path) -> None:
+    frame = {"file_path": "a", "transform_matrix": np.eye(4).tolist()}
+    with pytest.raises(StageError, match=r"cannot make one video of t.json: its frames differ in size"):
+        given_path({"frames": [frame, frame | {"w": 10, "h": 10}]}, scene_with(ring(5)), tmp_path)
+
+
+def test_the_median_camera_has_no_distortion_and_the_photos_angle_of_view() -> None:
+    scene = scene_with(ring(5))
+    camera = median_camera(scene)
+    assert camera == Camera("PINHOLE", 160, 120, (150.0, 150.0, 80.0, 60.0))
+    half = resized(camera, 80)
+    assert (half.width, half.height, half.params) == (80, 60, (75.0, 75.0, 40.0, 30.0))
+    assert fitted_path(scene, "orbit", 7).cameras == (camera,) * 7
+
+
+def test_a_fisheye_is_shown_no_wider_than_a_right_angle() -> None:
+    fisheye = Camera("OPENCV_FISHEYE", 160, 120, (40.0, 40.0, 80.0, 60.0, 0.0, 0.0, 0.0, 0.0))
+    assert median_camera(scene_with(ring(5), camera=fisheye)).params[0] == 80.0
+
+
+def test_speed_is_a_record_and_path_an_output(inputs, progress) -> None:
+    run(inputs, progress, frames=3, width=40)
+    assert read_json(inputs["render"] / "speed.json")["frames_per_second"] > 0
+    content = read_json(inputs["render"] / "path.json")
+    assert len(content["frames"]) == 3
+    assert (content["w"], content["h"], content["fps"]) == (40, 30, 10)

@@ -1,0 +1,250 @@
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from stages import ingest, sfm
+from stages.colmap import read_model
+from stages.contract import StageError
+from stages.files import read_json
+from stages.photos import Photo, write_photos
+from stages.registration import count_done
+from tests.small_scenes import write_blender_scene
+from tests.synthetic_photos import Quiet, SyntheticPhotos
+
+ROOT = Path(__file__).parents[2]
+SMALL = {"max_features": 1000}
+
+
+def ingested(folder: Path, images: dict[str, np.ndarray]) -> dict[str, Path]:
+    """What ingest would leave of these pictures: one camera for those of equal size."""
+    (folder / "images").mkdir(parents=True)
+    photos, sizes = [], {}
+    for name, pixels in images.items():
+        Image.fromarray(pixels).save(folder / "images" / name)
+        height, width = pixels.shape[:2]
+        group = sizes.setdefault((width, height), len(sizes))
+        photos.append(Photo(name, f"images/{name}", width, height, group, None, None, pixels.shape[2] == 4, 1.0))
+    write_photos(folder, photos, [], {})
+    return {"ingest": folder}
+
+
+@pytest.fixture(scope="module")
+def inputs(synthetic_photos: SyntheticPhotos, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """The synthetic photos after ingest."""
+    folder = tmp_path_factory.mktemp("ingest")
+    ingest.run(ingest.Config(photos=synthetic_photos.folder), {}, folder, Quiet())
+    return {"ingest": folder}
+
+
+@pytest.fixture(scope="module")
+def reconstructed(inputs: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a finished run on the synthetic photos."""
+    folder = tmp_path_factory.mktemp("sfm")
+    sfm.run(sfm.Config(**SMALL), inputs, folder, Quiet())
+    return folder
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    files = [*(folder / "sparse").iterdir(), folder / "registration.json"]
+    return {file.name: file.read_bytes() for file in files}
+
+
+def test_cameras_of_synthetic_photos_are_found(reconstructed: Path, synthetic_photos: SyntheticPhotos) -> None:
+    model, truth = read_model(reconstructed / "sparse"), synthetic_photos.truth.poses
+    assert [image.file for image in model.images] == sorted(truth)
+    true = np.stack([truth[image.file] for image in model.images])
+    found = np.stack([image.sfm_from_camera for image in model.images])
+    turns = true[:, :, :3] @ found[:, :, :3].transpose(0, 2, 1)  # truth from sfm, once per photo
+    spread = np.linalg.norm(true[:, :, 3] - true[:, :, 3].mean(0), axis=1).mean()
+    centred = [poses[:, :, 3] - poses[:, :, 3].mean(0) for poses in (found, true)]
+    turned = centred[0] @ turns[0].T
+    scale = (turned * centred[1]).sum() / (turned**2).sum()
+    assert 0 < np.linalg.norm(scale * turned - centred[1], axis=1).max() < 0.02 * spread
+    cosines = (np.einsum("nij,ij->n", turns, turns[0]) - 1) / 2
+    assert 0 < np.degrees(np.arccos(np.clip(cosines, -1, 1))).max() < 1.0
+
+
+def test_the_account_says_what_became_of_each_photo(reconstructed: Path) -> None:
+    account, model = read_json(reconstructed / "registration.json"), read_model(reconstructed / "sparse")
+    assert (account["source"], account["photos"], account["registered"]) == ("sfm", 12, 12)
+    assert account["test_files"] is None
+    assert account["camera_model"] == "RADIAL"
+    assert account["points"] == len(model.xyz) > 100
+    assert account["reprojection_px"] == pytest.approx(model.error_px.mean())
+    assert [image["observations"] for image in account["images"]] == np.bincount(model.view).tolist()
+    assert all(image["keypoints"] > image["observations"] > 20 for image in account["images"])
+    assert sorted(path.name for path in reconstructed.iterdir()) == ["registration.json", "sfm.log", "sparse"]
+
+
+PROGRAM = f"""
+import sys
+from pathlib import Path
+from stages import sfm
+from tests.synthetic_photos import Quiet
+sfm.run(sfm.Config(**{SMALL}), {{"ingest": Path(sys.argv[1])}}, Path(sys.argv[2]), Quiet())
+"""
+
+
+def wait_for(condition: Callable[[], object], seconds: float = 60) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "it did not happen in time"
+        time.sleep(0.01)
+
+
+def is_gone(pid: int) -> bool:
+    status = Path(f"/proc/{pid}/stat")
+    return not status.exists() or status.read_text().rpartition(")")[2].split()[0] == "Z"
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for the child in /proc")
+def test_a_killed_run_takes_its_child_along_and_goes_on_to_the_same_bytes(
+    inputs: dict[str, Path], reconstructed: Path, tmp_path: Path, progress
+) -> None:
+    parent = subprocess.Popen([sys.executable, "-c", PROGRAM, str(inputs["ingest"]), str(tmp_path)], cwd=ROOT)
+    children = Path(f"/proc/{parent.pid}/task/{parent.pid}/children")
+    wait_for(lambda: any(count_done(database)[1] for database in tmp_path.glob("matches-*.db")))
+    (child,) = map(int, children.read_text().split())
+    parent.kill()
+    parent.wait()
+    wait_for(lambda: is_gone(child))
+    sfm.run(sfm.Config(**SMALL), inputs, tmp_path, progress)
+    assert progress.notes[0].startswith("going on with the features of 12 photos and ")
+    assert contents(tmp_path) == contents(reconstructed)
+
+
+def test_a_damaged_database_is_made_anew(
+    inputs: dict[str, Path], reconstructed: Path, tmp_path: Path, progress
+) -> None:
+    (tmp_path / f"matches-{version('pycolmap')}.db").write_bytes(b"SQLite format 3\0 and then nothing of use")
+    sfm.run(sfm.Config(**SMALL), inputs, tmp_path, progress)
+    assert progress.notes[0] == "the matches of the interrupted run are damaged: starting over"
+    assert contents(tmp_path) == contents(reconstructed)
+
+
+@pytest.mark.parametrize(
+    ("child", "message"),
+    [
+        ("import os; os.abort()", r"was ended by SIGABRT while finding features: COLMAP failed inside \(it left no"),
+        ("import os; os.kill(os.getpid(), 9)", "was ended by SIGKILL .*: most often the machine ran out of memory"),
+        ("raise ValueError('no such thing')", "failed while finding features: ValueError: no such thing"),
+        ("import time; time.sleep(60)", "was given up while finding features: it took longer than 0.5 s"),
+    ],
+)
+def test_however_the_child_ends_it_is_an_error_with_words(
+    child: str, message: str, inputs: dict[str, Path], tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sfm, "CHILD", ["-c", child])
+    with pytest.raises(StageError, match=message):
+        sfm.run(sfm.Config(max_seconds=0.5 if "sleep" in child else 60), inputs, tmp_path, progress)
+    assert (tmp_path / "sfm.log").exists()
+
+
+def texture(seed: int, width: int = 600, height: int = 400) -> np.ndarray:
+    """Blots of all sizes, as a flat picture."""
+    import cv2
+
+    random = np.random.default_rng(seed)
+    picture = sum(
+        cv2.resize(random.normal(size=(height // size, width // size, 3)), (width, height), interpolation=cv2.INTER_CUBIC)
+        * size**0.5
+        for size in (3, 6, 12, 25, 50)
+    )  # fmt: skip
+    return np.clip(128 + 12 * np.asarray(picture), 0, 255).astype(np.uint8)
+
+
+def turned(angle: float, panorama: np.ndarray, size: tuple[int, int] = (240, 180), focal: float = 250.0) -> np.ndarray:
+    """What a camera sees of a far picture after turning about its vertical axis."""
+    import cv2
+
+    cos, sin = np.cos(angle), np.sin(angle)
+    lens = np.array([[focal, 0, size[0] / 2], [0, focal, size[1] / 2], [0, 0, 1]])
+    far = np.array([[focal, 0, panorama.shape[1] / 2], [0, focal, panorama.shape[0] / 2], [0, 0, 1]])
+    homography = far @ np.array([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]]) @ np.linalg.inv(lens)
+    return cv2.warpPerspective(panorama, homography, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+
+
+def refusal(images: dict[str, np.ndarray], folder: Path, progress) -> StageError:
+    inputs = ingested(folder / "ingest", images)
+    with pytest.raises(StageError) as error:
+        sfm.run(sfm.Config(**SMALL), inputs, folder / "sfm", progress)
+    assert not (folder / "sfm" / "sparse").exists()
+    assert not (folder / "sfm" / "registration.json").exists()
+    return error.value
+
+
+def test_photos_without_overlap_are_refused(tmp_path: Path, progress) -> None:
+    error = refusal({f"{i}.png": texture(i, 240, 180) for i in range(4)}, tmp_path, progress)
+    assert str(error) == (
+        "the cameras of 4 photos could not be found: 0 of 6 pairs of photos share a view. "
+        "Take photos with 60–80 % overlap, so that everything is visible in at least three of them."
+    )
+
+
+def test_turning_on_the_spot_is_refused(tmp_path: Path, progress) -> None:
+    panorama = texture(0)
+    error = refusal({f"{i}.png": turned(0.12 * i - 0.3, panorama) for i in range(6)}, tmp_path, progress)
+    assert "matching pairs differ by a turn of the camera alone, or show one flat surface" in error.why
+    assert "Move sideways" in error.hint
+
+
+def test_identical_photos_are_refused(tmp_path: Path, progress) -> None:
+    error = refusal({f"{i}.png": texture(0, 240, 180) for i in range(3)}, tmp_path, progress)
+    assert error.why == "the photos are all the same view (3 of 3 pairs differ by less than a pixel)"
+
+
+def test_blank_photos_are_refused(tmp_path: Path, progress) -> None:
+    error = refusal({f"{i}.png": np.full((180, 240, 3), 90, np.uint8) for i in range(3)}, tmp_path, progress)
+    assert error.why == "half of the photos show fewer than 50 features"
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_too_few_photos_are_refused_at_once(count: int, tmp_path: Path, progress) -> None:
+    error = refusal({f"{i}.png": texture(i, 240, 180) for i in range(count)}, tmp_path, progress)
+    assert error.what == f"cannot find cameras from {count} photo{'s' * (count == 2)}"
+
+
+def test_strangers_are_left_out_and_named_and_alpha_and_mixed_sizes_work(
+    inputs: dict[str, Path], tmp_path: Path, progress
+) -> None:
+    images = {path.name: np.asarray(Image.open(path)) for path in sorted((inputs["ingest"] / "images").iterdir())[:8]}
+    alpha = {f"{n}.png": np.dstack([i, np.full(i.shape[:2], 255, np.uint8)]) for n, i in list(images.items())[:6]}
+    plain = dict(list(images.items())[6:]) | {"stranger.png": texture(1, 300, 200)}
+    result = sfm.run(sfm.Config(**SMALL), ingested(tmp_path / "ingest", alpha | plain), tmp_path / "sfm", progress)
+    assert result.line.startswith("8/9 registered, ")
+    assert progress.notes[:3] == [
+        "1 of 9 photos found no place: matching them again, less strictly",
+        "1 of 9 photos found no place and are left out:",
+        "  stranger.png: it shares no view with any other photo",
+    ]
+    account = read_json(tmp_path / "sfm/registration.json")
+    assert [image["file"] for image in account["images"] if not image["registered"]] == ["stranger.png"]
+
+
+def test_the_screen_never_stands_still(inputs: dict[str, Path], tmp_path: Path, progress) -> None:
+    sfm.run(sfm.Config(**SMALL), inputs, tmp_path, progress)
+    shares = [done for _, done in progress.updates if done is not None]
+    assert shares == sorted(shares)
+    assert 0 <= shares[0] < shares[-1] <= 1
+    assert len(progress.updates) >= 3
+
+
+def test_known_cameras_go_through_without_points(tmp_path: Path, progress) -> None:
+    write_blender_scene(tmp_path / "blender", train=4, test=1)
+    config = ingest.Config(photos=tmp_path / "blender")
+    ingest.run(config, {}, tmp_path / "ingest", progress)
+    result = sfm.run(
+        sfm.Config(cameras=tmp_path / "blender"), {"ingest": tmp_path / "ingest"}, tmp_path / "sfm", progress
+    )
+    account = read_json(tmp_path / "sfm/registration.json")
+    assert result.line == "5/5 cameras known · PINHOLE"
+    assert (account["source"], account["reprojection_px"], account["points"]) == ("import", None, 0)
+    assert account["test_files"] == ["test/r_4.png"]
+    assert read_model(tmp_path / "sfm/sparse").cameras[0].params[0] == pytest.approx(52.0)

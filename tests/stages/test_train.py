@@ -1,0 +1,133 @@
+import json
+from pathlib import Path
+
+import pytest
+from pydantic import ValidationError
+
+from nerf.training import PaperTrainer
+from stages import train
+from stages.field_files import load_field
+from stages.files import read_json
+from stages.train import Config
+from tests.stages.photo_scene import photographed
+
+TINY = {
+    "depth": 2,
+    "width": 16,
+    "samples_coarse": 8,
+    "samples_fine": 8,
+    "position_frequencies": 4,
+    "batch_rays": 64,
+    "downscale": 1.0,
+    "learning_rate": 5e-3,
+}
+OUTPUTS = ("field.safetensors", "field.json")
+
+
+class Killed(BaseException):
+    """Stands for kill -9."""
+
+
+def trained(folder: Path, inputs: dict[str, Path], progress, **settings):
+    folder.mkdir(exist_ok=True)
+    return train.run(Config(**(TINY | settings)), inputs, folder, progress)
+
+
+def test_photos_become_a_field_that_beats_a_flat_colour(tmp_path: Path, progress) -> None:
+    inputs, _ = photographed(tmp_path, channels=4)
+    result = trained(tmp_path / "train", inputs, progress, steps=120)
+    assert result.outputs == OUTPUTS
+    assert all((tmp_path / "train" / name).exists() for name in (*result.outputs, *result.records))
+    flat = 11.0  # dB, of the best single colour
+    assert flat + 2 < result.facts["heldout_psnr"] < 60
+    _, info = load_field(tmp_path / "train")
+    assert (info["steps"], info["rays"], info["downscale"], info["background"]) == (120, 120 * 64, 1.0, [1, 1, 1])
+    assert result.facts["steps"] == 120 and result.facts["restarts"] == result.facts["rollbacks"] == 0
+    assert result.line.endswith(f"held out {result.facts['heldout_psnr']:.1f} dB")
+    curve = read_json(tmp_path / "train" / "curve.json")
+    assert curve[-1]["step"] == 120 and set(curve[-1]) == {"step", "seconds", "train_psnr", "heldout_psnr"}
+    assert progress.notes[0] == "small field, 120 steps · 6 photos at 1/1 of their size, 2.3 k pixels"
+
+
+def test_forty_steps_are_twenty_a_kill_and_twenty_more(
+    tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    inputs, _ = photographed(tmp_path, channels=4)
+    settings = {"steps": 40, "background": "random", "checkpoint_seconds": 1e-9}
+    trained(tmp_path / "whole", inputs, progress, **settings)
+    step = PaperTrainer.step
+
+    def killed(self: PaperTrainer, number: int, *rest: float):
+        if number == 20:
+            raise Killed
+        return step(self, number, *rest)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(PaperTrainer, "step", killed)
+        with pytest.raises(Killed):
+            trained(tmp_path / "cut", inputs, progress, **settings)
+    assert not (tmp_path / "cut" / "field.json").exists()
+    trained(tmp_path / "cut", inputs, progress, **settings)
+    assert "going on from step 20 of 40" in progress.notes
+    for name in OUTPUTS:
+        assert (tmp_path / "cut" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+    final = "checkpoints/000000040.safetensors"  # the optimiser, too
+    assert (tmp_path / "cut" / final).read_bytes() == (tmp_path / "whole" / final).read_bytes()
+
+
+def test_another_seed_is_another_field(tmp_path: Path, progress) -> None:
+    inputs, _ = photographed(tmp_path)
+    for seed in (0, 1):
+        trained(tmp_path / str(seed), inputs, progress, steps=2, seed=seed)
+    assert (tmp_path / "0" / OUTPUTS[0]).read_bytes() != (tmp_path / "1" / OUTPUTS[0]).read_bytes()
+
+
+@pytest.mark.parametrize("ablation", ["view_dependence", "positional_encoding", "hierarchical"])
+def test_every_ablation_trains_and_comes_back(ablation: str, tmp_path: Path, progress) -> None:
+    inputs, _ = photographed(tmp_path)
+    trained(tmp_path / "train", inputs, progress, steps=2, **{ablation: False})
+    _, info = load_field(tmp_path / "train")
+    assert info["settings"][ablation] is False
+
+
+def test_without_test_photos_nothing_is_held_out(tmp_path: Path, progress) -> None:
+    inputs, _ = photographed(tmp_path)
+    scene_file = inputs["normalise"] / "scene.json"
+    scene_file.write_text(scene_file.read_text().replace('"test"', '"train"'))
+    result = trained(tmp_path / "train", inputs, progress, steps=2)
+    assert result.facts["heldout_psnr"] is None
+    assert result.line.endswith("no photos held out")
+
+
+def test_two_budgets_are_refused_in_words() -> None:
+    with pytest.raises(ValidationError, match=r"steps \(500\) and seconds \(60\) are two budgets; give one"):
+        Config(steps=500, seconds=60)
+
+
+def test_plan_answers_everything_and_is_its_own_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("stages.training_size.TIMED_SECONDS", 0.01)
+    inputs, _ = photographed(tmp_path)
+    planned = train.plan(Config(batch_rays=8), inputs)
+    assert (planned.preset, planned.depth, planned.width) == ("small", 4, 64)
+    assert (planned.samples_coarse, planned.samples_fine) == (32, 32)
+    assert (planned.batch_rays, planned.learning_rate) == (8, 5e-3)
+    assert (planned.seconds, planned.steps) == (180, None)
+    assert (planned.contracted, planned.spacing, planned.downscale) == (False, "linear", 1.0)
+    assert train.plan(Config.model_validate(planned.model_dump()), inputs) == planned
+
+
+def test_the_published_preset_is_the_published_model(tmp_path: Path) -> None:
+    inputs, _ = photographed(tmp_path, bounded=False)
+    planned = train.plan(Config(preset="paper", steps=10, width=128), inputs)
+    assert (planned.depth, planned.width, planned.skip) == (8, 128, 4)
+    assert (planned.samples_coarse, planned.samples_fine) == (64, 128)
+    assert (planned.batch_rays, planned.learning_rate) == (1024, 5e-4)
+    assert (planned.contracted, planned.spacing) == (True, "log")
+
+
+def test_a_run_in_seconds_keeps_to_them(tmp_path: Path, progress) -> None:
+    inputs, _ = photographed(tmp_path)
+    result = trained(tmp_path / "train", inputs, progress, seconds=1.0)
+    assert 0.7 < result.facts["train_seconds"] < 1.5
+    decisions = json.loads((tmp_path / "train" / "plan.json").read_text())
+    assert decisions[-1][1] == result.facts["steps"] > 2

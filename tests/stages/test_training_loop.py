@@ -1,0 +1,241 @@
+"""The loop with a field that is one number, so that every kind of trouble can be staged."""
+
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from nerf.model import Rendering
+from nerf.probe import Probe
+from nerf.rays import Rays
+from nerf.training import NonFinite, StepResult
+from stages import training_loop
+from stages.checkpoints import latest_checkpoint
+from stages.contract import StageError
+from stages.training_log import TrainingLog
+from stages.training_loop import Budget, Probes, TrainingRun
+
+
+class Killed(BaseException):
+    """Stands for kill -9: nothing in the loop may handle it."""
+
+
+class OneNumber:
+    """Trains one number; ``trouble(step, rate_scale)`` may raise. Its model paints ``shown``, 20 dB from the truth."""
+
+    def __init__(self, seed: int, trouble: Callable[[int, float], None]) -> None:
+        self.seed, self.trouble = seed, trouble
+        self.value = torch.tensor(float(seed))
+        self.history: list[tuple[int, float, float]] = []
+        self.opacity, self.shown = 1.0, probe().colours + 0.1
+
+    @property
+    def model(self) -> "OneNumber":
+        return self
+
+    def step(self, step: int, share: float, rate_scale: float) -> StepResult:
+        self.trouble(step, rate_scale)
+        self.history.append((step, share, rate_scale))
+        self.value = self.value * 0.9 + rate_scale * (1 - share) * torch.sin(torch.tensor(float(step)))
+        return StepResult(float(self.value), 20.0, 4)
+
+    def state(self) -> dict[str, Tensor]:
+        return {"value": self.value}
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        self.value = state["value"].clone()
+
+    def density(self, points: Tensor) -> Tensor:
+        raise NotImplementedError
+
+    def colour(self, points: Tensor, directions: Tensor) -> Tensor:
+        raise NotImplementedError
+
+    def render(self, rays: Rays, background: Tensor) -> Rendering:
+        return Rendering(self.shown.expand(*rays.near.shape, 3), rays.far, torch.full_like(rays.far, self.opacity))
+
+
+def quiet(step: int, rate_scale: float) -> None:
+    """No trouble."""
+
+
+def slow(step: int, rate_scale: float) -> None:
+    """Steps long enough for a clock."""
+    time.sleep(0.003)
+
+
+def probe() -> Probe:
+    """Two rays, one to see black and one grey: a flat colour leaves a mean error of 1/16."""
+    rays = Rays(torch.zeros(2, 3), torch.ones(2, 3), torch.ones(2), torch.ones(2))
+    return Probe(rays, torch.tensor([[0.0] * 3, [0.5] * 3]), torch.zeros(3))
+
+
+def run_in(folder: Path, progress, steps: int | None = 40, seconds: float | None = None, make=None) -> TrainingRun:
+    folder.mkdir(exist_ok=True)
+    maker = make or (lambda attempt: OneNumber(attempt, quiet))
+    budget, probes = Budget(steps, seconds), Probes(probe(), probe())
+    return TrainingRun(maker, probes, budget, folder, 1e-9, TrainingLog(folder, False), progress)
+
+
+def number_of(run: TrainingRun) -> OneNumber:
+    assert isinstance(run.trainer, OneNumber)
+    return run.trainer
+
+
+def events(folder: Path) -> list[dict]:
+    return [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
+
+
+def killed_at(step: int) -> Callable[[int], OneNumber]:
+    def trouble(now: int, rate_scale: float) -> None:
+        if now == step:
+            raise Killed
+        slow(now, rate_scale)
+
+    return lambda attempt: OneNumber(attempt, trouble)
+
+
+def test_killed_and_resumed_is_the_same_as_uninterrupted(tmp_path: Path, progress) -> None:
+    whole = run_in(tmp_path / "whole", progress)
+    whole.train()
+    with pytest.raises(Killed):
+        run_in(tmp_path / "cut", progress, make=killed_at(20)).train()
+    resumed = run_in(tmp_path / "cut", progress)
+    resumed.train()
+    assert number_of(resumed).history[0][0] == 20, "the resumed run does not start over"
+    assert torch.equal(number_of(whole).value, number_of(resumed).value)
+    assert (whole.state.step, whole.state.rays) == (resumed.state.step, resumed.state.rays) == (40, 160)
+    assert "going on from step 20 of 40" in progress.notes
+
+
+def test_finished_and_run_again_does_nothing(tmp_path: Path, progress) -> None:
+    first = run_in(tmp_path, progress)
+    first.train()
+    again = run_in(tmp_path, progress)
+    again.train()
+    assert number_of(again).history == []
+    assert again.state == first.state
+
+
+def test_a_run_in_seconds_takes_about_that_long_and_its_share_ends_at_1(tmp_path: Path, progress) -> None:
+    run = run_in(tmp_path, progress, steps=None, seconds=0.3, make=lambda attempt: OneNumber(attempt, slow))
+    run.train()
+    assert 0.2 < run.state.seconds < 0.5
+    assert run.plan.share(run.state.step) == pytest.approx(1)
+    assert len(run.plan.decisions) >= 2
+    shares = [share for _, share, _ in number_of(run).history]
+    assert shares == sorted(shares) and shares[-1] < 1
+
+
+def test_a_resumed_run_in_seconds_replays_its_plan(tmp_path: Path, progress) -> None:
+    with pytest.raises(Killed):
+        run_in(tmp_path, progress, steps=None, seconds=0.3, make=killed_at(30)).train()
+    journal = json.loads((tmp_path / "plan.json").read_text())
+    resumed = run_in(tmp_path, progress, steps=None, seconds=0.3, make=lambda attempt: OneNumber(attempt, slow))
+    resumed.train()
+    assert [list(decision) for decision in resumed.plan.decisions] == journal
+    assert resumed.state.step == journal[-1][1]
+    assert number_of(resumed).history[0][1] == resumed.plan.share(30)
+
+
+def non_finite(at: int, until_rate: float) -> Callable[[int], OneNumber]:
+    def trouble(step: int, rate_scale: float) -> None:
+        if step == at and rate_scale > until_rate:
+            raise NonFinite("loss", step, {"target": torch.full((2, 3), torch.nan)})
+
+    return lambda attempt: OneNumber(attempt, trouble)
+
+
+def test_a_non_finite_step_is_rolled_back_at_half_the_rate(tmp_path: Path, progress) -> None:
+    run = run_in(tmp_path, progress, make=non_finite(at=25, until_rate=0.3))
+    run.train()
+    assert run.state.rollbacks == 2
+    assert {rate for step, _, rate in number_of(run).history if step > 25} == {0.25}
+    assert [e["step"] for e in events(tmp_path) if e["event"] == "nonfinite"] == [25, 25]
+    assert (tmp_path / "nonfinite_25.safetensors").is_file()
+    assert "the loss of step 25 is not finite: back to step 25 at half the learning rate" in progress.notes
+
+
+def test_after_three_roll_backs_training_fails_by_name(tmp_path: Path, progress) -> None:
+    run = run_in(tmp_path, progress, make=non_finite(at=25, until_rate=0))
+    with pytest.raises(StageError) as failure:
+        run.train()
+    assert failure.value.what == "training diverged"
+    assert (
+        failure.value.why == "the loss of step 25 is not finite, after 3 roll-backs that each halved the learning rate"
+    )
+    assert failure.value.hint == (
+        f"Try a tenth of --train.learning-rate; the batch is kept in {tmp_path / 'nonfinite_25.safetensors'}."
+    )
+
+
+def dying(seeds: int, opacity: float, grey: float) -> Callable[[int], OneNumber]:
+    """A field that is dead with its first ``seeds`` seeds: of some opacity and grey all over."""
+
+    def make(attempt: int) -> OneNumber:
+        field = OneNumber(attempt, quiet)
+        if attempt < seeds:
+            field.opacity, field.shown = opacity, torch.tensor(grey)
+        return field
+
+    return make
+
+
+@pytest.mark.parametrize(
+    ("opacity", "grey", "symptom"),
+    [
+        (1e-4, 0.25, "it is empty (mean opacity 1e-04)"),
+        (1.0, 0.7, "it is no better than a flat colour (5.8 of 12.0 dB)"),
+    ],
+)
+def test_a_dead_field_is_restarted_with_another_seed(
+    opacity: float, grey: float, symptom: str, tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(training_loop, "WARM_UP_STEPS", 10)
+    run = run_in(tmp_path, progress, make=dying(2, opacity, grey))
+    run.train()
+    assert (run.state.restarts, run.state.step, number_of(run).seed) == (2, 40, 2)
+    assert progress.notes == [f"after 10 steps the field is dead: {symptom}; starting with another seed"] * 2
+
+
+def test_a_field_that_stays_dead_fails_by_name(tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(training_loop, "WARM_UP_STEPS", 10)
+    run = run_in(tmp_path, progress, make=dying(9, opacity=0.0, grey=0.5))
+    with pytest.raises(StageError) as failure:
+        run.train()
+    assert failure.value.what == "the field does not learn"
+    assert failure.value.why == "after 10 steps it is empty (mean opacity 0e+00), with 3 different seeds"
+
+
+def test_the_curve_ends_with_the_run_and_is_on_record(
+    tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(training_loop, "FIRST_MEASUREMENT", 1e-6)
+    run = run_in(tmp_path, progress)
+    run.train()
+    assert run.state.curve[-1]["step"] == 40
+    assert run.state.curve[-1]["heldout_psnr"] == 20.0
+    measured = [e for e in events(tmp_path) if e["event"] == "measured"]
+    assert [e["step"] for e in measured] == [point["step"] for point in run.state.curve]
+    assert 1 < len(measured) < 40
+
+
+def test_the_live_line_tells_step_speed_quality_and_time_left(tmp_path: Path, progress) -> None:
+    run = run_in(tmp_path, progress)
+    assert run._describe() == ("first step", 0.0)
+    run.train()
+    message, done = progress.updates[-1]
+    assert message.startswith("step 40 · ") and message.endswith(
+        " rays/s · train 20.0 dB · held out 20.0 dB · 0 s left"
+    )
+    assert done == pytest.approx(1)
+
+
+def test_every_checkpoint_loads(tmp_path: Path, progress) -> None:
+    run_in(tmp_path, progress).train()
+    found = latest_checkpoint(tmp_path / "checkpoints", pytest.fail)
+    assert found is not None and found.step == 40

@@ -1,0 +1,95 @@
+import math
+
+import numpy as np
+import pytest
+
+from nerf.scene import Camera, Scene, Similarity, View
+from stages.transforms_export import intrinsics, transforms
+from tests.camera_layouts import ring
+
+TURN = np.array([[0.0, -1.0, 0.0], [0.6, 0.0, -0.8], [0.8, 0.0, 0.6]])
+SCENE_FROM_SFM = Similarity(0.25, TURN, np.array([1.0, -2.0, 0.5]))
+PINHOLE = Camera("PINHOLE", 640, 480, (500.0, 510.0, 320.0, 240.0))
+
+
+def scene_of(cameras: tuple[Camera, ...], sfm_poses: np.ndarray) -> Scene:
+    views = tuple(
+        View(
+            f"IMG {i}.jpg",
+            f"images/{i}.png",
+            i % len(cameras),
+            SCENE_FROM_SFM.pose(pose),
+            0.5,
+            9.0,
+            "train" if i else "test",
+        )
+        for i, pose in enumerate(sfm_poses)
+    )
+    return Scene(cameras, views, SCENE_FROM_SFM, False, False, "around", True)
+
+
+def test_poses_are_opengl_and_in_the_sfm_frame() -> None:
+    poses = ring(5)
+    content = transforms(scene_of((PINHOLE,), poses))
+    for pose, frame in zip(poses, content["frames"], strict=True):
+        matrix = np.array(frame["transform_matrix"])
+        np.testing.assert_allclose(matrix[:3, 3], pose[:, 3], atol=1e-12)
+        np.testing.assert_allclose(matrix[:3, 0], pose[:, 0], atol=1e-12)  # right
+        np.testing.assert_allclose(matrix[:3, 1], -pose[:, 1], atol=1e-12)  # up
+        np.testing.assert_allclose(matrix[:3, 2], -pose[:, 2], atol=1e-12)  # backward
+        np.testing.assert_array_equal(matrix[3], [0, 0, 0, 1])
+
+
+def test_names_split_and_shared_intrinsics() -> None:
+    content = transforms(scene_of((PINHOLE,), ring(4)))
+    assert [frame["file_path"] for frame in content["frames"]] == [f"IMG {i}.jpg" for i in range(4)]
+    assert content["test_filenames"] == ["IMG 0.jpg"]
+    assert content["train_filenames"] == ["IMG 1.jpg", "IMG 2.jpg", "IMG 3.jpg"]
+    assert (content["fl_x"], content["fl_y"], content["cx"], content["cy"]) == PINHOLE.params
+    assert (content["w"], content["h"], content["camera_model"]) == (640, 480, "OPENCV")
+    assert set(content["frames"][0]) == {"file_path", "transform_matrix"}
+
+
+def test_different_cameras_stand_in_their_frames() -> None:
+    other = Camera("OPENCV", 320, 240, (250.0, 251.0, 160.0, 120.0, 0.1, -0.02, 0.003, 0.004))
+    content = transforms(scene_of((PINHOLE, other), ring(4)))
+    assert "fl_x" not in content
+    assert [frame["w"] for frame in content["frames"]] == [640, 320, 640, 320]
+    assert [content["frames"][1][key] for key in ("k1", "k2", "p1", "p2")] == [0.1, -0.02, 0.003, 0.004]
+
+
+def test_region_of_interest_lies_in_the_unit_cube_of_instant_ngp() -> None:
+    content = transforms(scene_of((PINHOLE,), ring(4)))
+    centre = SCENE_FROM_SFM.inverse().points(np.zeros(3))
+    np.testing.assert_allclose(content["scale"] * centre + content["offset"], 0.5)
+    assert content["scale"] * 0.9 / SCENE_FROM_SFM.scale == pytest.approx(0.45)
+    assert math.log2(content["aabb_scale"]).is_integer()
+
+
+@pytest.mark.parametrize(
+    ("camera", "expected"),
+    [
+        (Camera("SIMPLE_RADIAL", 8, 6, (5.0, 4.0, 3.0, 0.1)), {"fl_x": 5.0, "fl_y": 5.0, "cx": 4.0, "k1": 0.1}),
+        (Camera("RADIAL", 8, 6, (5.0, 4.0, 3.0, 0.1, 0.2)), {"fl_y": 5.0, "k1": 0.1, "k2": 0.2}),
+        (
+            Camera("OPENCV_FISHEYE", 8, 6, (5.0, 6.0, 4.0, 3.0, 0.1, 0.2, 0.3, 0.4)),
+            {"camera_model": "OPENCV_FISHEYE", "fl_y": 6.0, "k3": 0.3, "k4": 0.4},
+        ),
+    ],
+)
+def test_camera_models_under_the_formats_names(camera: Camera, expected: dict[str, object]) -> None:
+    values = intrinsics(camera)
+    assert values.items() >= expected.items()
+    assert "f" not in values
+    assert "note" not in values
+
+
+def test_a_model_the_format_lacks_is_written_as_the_nearest_and_says_so() -> None:
+    values = intrinsics(Camera("FOV", 8, 6, (5.0, 6.0, 4.0, 3.0, 0.9)))
+    assert (values["camera_model"], values["fl_x"], values["cy"]) == ("OPENCV", 5.0, 3.0)
+    assert values["note"] == "approximation: FOV with parameters [5.0, 6.0, 4.0, 3.0, 0.9] has no counterpart here"
+
+
+def test_an_unknown_model_is_refused() -> None:
+    with pytest.raises(ValueError, match="camera model EQUIRECTANGULAR has no counterpart"):
+        intrinsics(Camera("EQUIRECTANGULAR", 8, 4, ()))

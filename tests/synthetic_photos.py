@@ -1,0 +1,41 @@
+"""A small set of synthetic photos with known cameras, drawn once per test run."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from nerf.scene import Camera
+from pipeline.truth import Truth
+
+LENS = Camera("OPENCV", 240, 180, (250.5, 249.75, 120.6, 89.65, -0.085, 0.032, 0.0011, -0.0008))
+
+
+class SyntheticPhotos(NamedTuple):
+    """Photos of the demo's still life, taken along a third of a circle, and the truth about them."""
+
+    folder: Path
+    truth: Truth
+
+
+@pytest.fixture(scope="session")
+def synthetic_photos(tmp_path_factory: pytest.TempPathFactory) -> SyntheticPhotos:
+    """Twelve photos of 240 × 180 with exact cameras. Do not write into the folder: all tests share it."""
+    from nerf.synthetic import ring_of_cameras
+    from pipeline.demo import write_photos
+
+    folder = tmp_path_factory.mktemp("synthetic") / "photos"
+    poses = {f"photo_{index:03d}.jpg": pose for index, pose in enumerate(ring_of_cameras(36)[:12])}
+    truth = Truth(LENS, poses, seed=0)
+    write_photos(folder, truth, Quiet())
+    return SyntheticPhotos(folder, truth)
+
+
+class Quiet:
+    """A Progress that says nothing."""
+
+    def update(self, message: str, done: float | None = None) -> None:
+        pass
+
+    def note(self, message: str) -> None:
+        pass
