@@ -99,7 +99,7 @@ def backward(
 def _relu_backward(
     hidden: Float[Tensor, "samples hidden"], grad: Float[Tensor, "samples hidden"]
 ) -> Float[Tensor, "samples hidden"]:
-    return grad.mul_(hidden > 0)
+    return grad.mul_(hidden.sign())  # several times faster than a mask
 
 
 def _glorot(inputs: int, outputs: int, random: torch.Generator) -> Float[Tensor, "inputs outputs"]:

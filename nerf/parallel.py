@@ -41,4 +41,9 @@ def in_order(function: Callable[[Item], Result], items: Iterable[Item], device: 
 
 @functools.cache
 def _pool(workers: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(workers, "chunk", initializer=torch.set_num_threads, initargs=(1,))
+    return ThreadPoolExecutor(workers, "chunk", initializer=_without_torchs_threads)
+
+
+def _without_torchs_threads() -> None:
+    torch.set_num_threads(1)
+    torch.get_num_threads()  # a thread takes over the number set last in any thread when it first asks: ask now

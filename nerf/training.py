@@ -5,6 +5,7 @@ step number, so a run that goes on from a saved state repeats exactly what it wo
 """
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal, NamedTuple, Protocol
 
 import torch
@@ -14,10 +15,15 @@ from torch import Tensor
 from nerf.metrics import psnr
 from nerf.model import RadianceModel
 from nerf.paper import PaperNerf
+from nerf.parallel import in_order
 from nerf.randomness import generator
 from nerf.ray_bank import RayBank
 from nerf.rays import Rays
 from nerf.schedule import learning_rate
+
+# Rays per chunk of a batch, each on its own core; elsewhere a batch is one chunk. Their gradients are added in order,
+# so results do not depend on the number of cores.
+CHUNK_RAYS = {"cpu": 256}
 
 
 class StepResult(NamedTuple):
@@ -86,6 +92,14 @@ def over(
     return background + alpha[..., None] * (colour - background)
 
 
+class _Part(NamedTuple):
+    """What one chunk of a batch contributes to it."""
+
+    loss: Float[Tensor, ""]
+    fine_error: Float[Tensor, ""]
+    gradients: tuple[Tensor, ...]
+
+
 class PaperTrainer:
     """Trains coarse and fine network together on |C_c - C|² + |C_f - C|² (Mildenhall et al. 2020, eq. 6) by Adam
     with the published constants; the loss is the mean over rays and channels."""
@@ -99,24 +113,36 @@ class PaperTrainer:
 
     def step(self, step: int, share: float, rate_scale: float = 1.0) -> StepResult:
         """One batch, one update. Raises NonFinite before the update, leaving model and optimiser as they were."""
-        random = generator(self.bank.device, self.settings.seed, step)
-        batch = self._batch(random)
-        coarse, fine = self.model.render_training(batch.rays, batch.background, random)
-        fine_error = (fine.colour - batch.target).square().mean()
-        # A field without hierarchy has one rendering and counts it once.
-        loss = fine_error if coarse is fine else (coarse.colour - batch.target).square().mean() + fine_error
-        self.optimiser.zero_grad()
-        loss.backward()
-        gradients = [p.grad for p in self.parameters if p.grad is not None]
+        batch = self._batch(generator(self.bank.device, self.settings.seed, step))
+        device = self.bank.device
+        starts = range(0, self.settings.batch_rays, CHUNK_RAYS.get(device.type, self.settings.batch_rays))
+        parts = list(in_order(partial(self._part, batch, step), starts, device))
+        gradients = [torch.stack(of_parts).sum(0) for of_parts in zip(*(part.gradients for part in parts), strict=True)]
         norm = torch.nn.utils.get_total_norm(gradients)
-        loss_now, error_now, norm_now = torch.stack([loss, fine_error, norm]).tolist()
-        for quantity, value in {"loss": loss_now, "gradient": norm_now}.items():
+        losses, errors = torch.stack([p.loss for p in parts]).sum(), torch.stack([p.fine_error for p in parts]).sum()
+        loss, error, norm_now = torch.stack([losses, errors, norm]).tolist()
+        for quantity, value in {"loss": loss, "gradient": norm_now}.items():
             if not abs(value) < float("inf"):
                 raise NonFinite(quantity, step, _tensors_of(batch))
+        for parameter, gradient in zip(self.parameters, gradients, strict=True):
+            parameter.grad = gradient
         rate = rate_scale * learning_rate(share, self.settings.rate_start, self.settings.rate_end)
         self.optimiser.param_groups[0]["lr"] = rate
         self.optimiser.step()
-        return StepResult(loss_now, psnr(error_now), self.settings.batch_rays)
+        return StepResult(loss, psnr(error), self.settings.batch_rays)
+
+    def _part(self, batch: Batch, step: int, start: int) -> _Part:
+        """What a slice of the batch adds to loss and gradient; it draws its samples from its own random numbers."""
+        size = CHUNK_RAYS.get(self.bank.device.type, self.settings.batch_rays)
+        rays = Rays(*(part[start : start + size] for part in batch.rays))
+        target = batch.target[start : start + size]
+        random = generator(self.bank.device, self.settings.seed, step, 1 + start)
+        coarse, fine = self.model.render_training(rays, batch.background, random)
+        fine_error = (fine.colour - target).square().sum() / batch.target.numel()
+        # A field without hierarchy has one rendering and counts it once.
+        coarse_error = (coarse.colour - target).square().sum() / batch.target.numel()
+        loss = fine_error if coarse is fine else coarse_error + fine_error
+        return _Part(loss.detach(), fine_error.detach(), torch.autograd.grad(loss, self.parameters))
 
     def state(self) -> dict[str, Tensor]:
         """Weights as ``model.<name>``, Adam's moments and step counts as ``adam.<parameter>.<name>``."""

@@ -1,6 +1,7 @@
 """``pipeline demo``: photos of a synthetic still life whose cameras and surfaces are known exactly."""
 
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,7 +12,10 @@ from stages.contract import Progress, StageError
 from stages.train import Config as TrainConfig
 
 if TYPE_CHECKING:
+    import numpy as np
     import torch
+
+    from nerf.synthetic import SyntheticScene
 
 PHOTOS = 40
 SEED = 0
@@ -55,18 +59,44 @@ def write_photos(folder: Path, truth: Truth, progress: Progress) -> None:
     """Draw every photo of ``truth`` into ``folder``; truth.json beside it comes last and marks them complete."""
     import torch
 
-    from nerf.synthetic import photograph as draw
-    from nerf.synthetic import still_life
-
     folder.mkdir(parents=True, exist_ok=True)
     truth_file(folder).unlink(missing_ok=True)
-    scene, directions = still_life(truth.seed), _supersampled(truth.camera)
-    for number, (name, pose) in enumerate(truth.poses.items()):
-        progress.update(f"photo {number + 1} of {len(truth.poses)}", number / len(truth.poses))
-        with torch.inference_mode():
-            image = draw(scene, directions, torch.tensor(pose, dtype=torch.float32), SAMPLES_PER_SIDE)
-        _save(folder / name, image)
+    scene, directions = _scene_and_directions(truth)
+    threads = torch.get_num_threads()
+    # Whole photos side by side: threads that share one photo mostly wait for each other.
+    torch.set_num_threads(1)
+    try:
+        with ThreadPoolExecutor(threads) as pool:
+            work = pool.map(lambda name: _draw(folder / name, scene, directions, truth.poses[name]), truth.poses)
+            for number, _ in enumerate(work, start=1):
+                progress.update(f"photo {number} of {len(truth.poses)}", number / len(truth.poses))
+    finally:
+        torch.set_num_threads(threads)
     truth.write(truth_file(folder))
+
+
+def _scene_and_directions(truth: Truth) -> "tuple[SyntheticScene, torch.Tensor]":
+    """The scene, and the unit bearing vectors of a grid of points inside every pixel, lens distortion included."""
+    import torch
+
+    from nerf.synthetic import still_life
+    from stages.colmap import camera_rays
+
+    camera = truth.camera
+    rays = camera_rays(camera, SAMPLES_PER_SIDE * camera.width, SAMPLES_PER_SIDE * camera.height)
+    return still_life(truth.seed), torch.from_numpy(rays)
+
+
+def _draw(path: Path, scene: "SyntheticScene", directions: "torch.Tensor", pose: "np.ndarray") -> None:
+    import torch
+    from PIL import Image
+
+    from nerf.synthetic import photograph as draw
+
+    with torch.inference_mode():
+        image = draw(scene, directions, torch.tensor(pose, dtype=torch.float32), SAMPLES_PER_SIDE)
+    pixels = (255 * image).round().byte().numpy()
+    Image.fromarray(pixels).save(path, quality=JPEG_QUALITY, subsampling=0)
 
 
 def truth_file(photos: Path) -> Path:
@@ -77,23 +107,6 @@ def truth_file(photos: Path) -> Path:
 def truth_lines(output: Path, photos: Path) -> list[str]:
     """How far the results in a workspace's output folder are from the truth, for the user to read."""
     return compare_with_truth(output, Truth.read(truth_file(photos))).lines()
-
-
-def _supersampled(camera: Camera) -> "torch.Tensor":
-    """Unit bearing vectors of a grid of points inside every pixel, lens distortion included."""
-    import torch
-
-    from stages.colmap import camera_rays
-
-    rays = camera_rays(camera, SAMPLES_PER_SIDE * camera.width, SAMPLES_PER_SIDE * camera.height)
-    return torch.from_numpy(rays)
-
-
-def _save(path: Path, image: "torch.Tensor") -> None:
-    from PIL import Image
-
-    pixels = (255 * image).round().byte().numpy()
-    Image.fromarray(pixels).save(path, quality=JPEG_QUALITY, subsampling=0)
 
 
 def _is_done(folder: Path, truth: Truth) -> bool:

@@ -30,10 +30,9 @@ FOCAL_GUESS = 1.2  # focal length over the longer side where EXIF is silent: 45 
 UPSAMPLE_UP_TO_PX = 1024  # smaller photos yield too few features at their own size
 BLOCK_SIZE = 5  # photos per block of matching; a block of pairs is committed at once (progress, resuming)
 SMALLEST_MODEL = 3
-# What finish() asks of a camera: it has 5 unknowns next to 6 per photo, so a few photos could explain them away.
-ENOUGH_PHOTOS = 5
-ENOUGH_OBSERVATIONS = 1000
-FARTHEST_PRINCIPAL_POINT = 0.1  # from the centre, as a share of width and height; lenses stay well within
+# What finish() asks of a principal point, in shares of the image: lenses are centred to about a percent.
+VAGUE_PRINCIPAL_POINT = 0.005  # a standard deviation above this, and the centre is the better guess
+FARTHEST_PRINCIPAL_POINT = 0.1
 ROUND_TRIP_PX = 0.01  # a bearing that does not project back to its pixel is a false root of the distortion
 # More residuals than any scene has: Ceres then sums in one thread, and results do not depend on thread timing.
 NEVER_MULTI_THREADED = 2**31 - 1
@@ -243,7 +242,10 @@ def copy_without_matches_of(names: Container[str], database: Path, copy: Path) -
     if copy.exists():
         return
     unfinished = copy.with_suffix(".unfinished")
-    shutil.copyfile(database, unfinished)
+    for part in ("", "-wal"):  # as long as anybody reads along, the latest pages stay in the write-ahead log
+        unfinished.with_name(unfinished.name + part).unlink(missing_ok=True)
+        if (source := database.with_name(database.name + part)).exists():
+            shutil.copyfile(source, unfinished.with_name(unfinished.name + part))
     with pycolmap.Database.open(unfinished) as db, pycolmap.DatabaseTransaction(db):
         images = sorted(db.read_all_images(), key=lambda image: image.image_id)
         for first, second in combinations(images, 2):
@@ -289,46 +291,60 @@ def _pipeline_options(seed: int) -> "pycolmap.IncrementalPipelineOptions":
 
 def finish(
     mapped: "pycolmap.Reconstruction", database: Path, seed: int, keep_camera_model: bool
-) -> "tuple[pycolmap.Reconstruction, bool]":
-    """The model after the final adjustment, and whether principal points took part in it.
+) -> "tuple[pycolmap.Reconstruction, set[int]]":
+    """The model after the final adjustment, and the cameras whose principal points took no part in it.
 
-    A camera shared by enough photos gets its principal point refined and, unless ``keep_camera_model``, a second
-    distortion term: on photos with measured cameras that halves the error of their positions
-    (benchmarks/sfm_accuracy.py). Other cameras stay as mapping left them, and principal points stay in the centre
-    if one of them runs away, as it can where the photos hardly differ in direction.
+    Principal points are refined and, unless ``keep_camera_model``, every camera gets a second distortion term: on
+    photos with measured cameras that halves the error of their positions (benchmarks/sfm_accuracy.py). Cameras that
+    the photos say too little about are left as mapping had them.
+    """
+    model = _adjusted(mapped, database, seed, set(), keep_camera_model)
+    vague = _vague_cameras(model)
+    if vague:
+        model = _adjusted(mapped, database, seed, vague, keep_camera_model)
+    return model, vague
+
+
+def _adjusted(
+    mapped: "pycolmap.Reconstruction", database: Path, seed: int, vague: set[int], keep_camera_model: bool
+) -> "pycolmap.Reconstruction":
+    import pycolmap
+
+    model = pycolmap.Reconstruction(mapped)
+    known = set(model.cameras) - vague
+    if not keep_camera_model:
+        for camera in map(model.camera, known):
+            params = [*camera.params, 0.0]
+            camera.model, camera.params = pycolmap.CameraModelId.RADIAL, params
+    # Whether to refine principal points holds for all cameras, so vague ones among others stay as they are.
+    _adjust(model, database, seed, vague if known else set(), principal_point=bool(known))
+    return model
+
+
+def _vague_cameras(model: "pycolmap.Reconstruction") -> set[int]:
+    """Cameras whose principal point the photos tell less well than one would guess it, or that came out absurd.
+
+    The standard deviation is that of a bundle adjustment at its minimum; its unit is the error of an observation.
     """
     import pycolmap
 
-    weak = _weak_cameras(mapped)
-    strong = set(mapped.cameras) - weak
-    for principal_point in (True, False) if strong else (False,):
-        model = pycolmap.Reconstruction(mapped)
-        if not keep_camera_model:
-            for camera_id in strong:
-                camera = model.camera(camera_id)
-                params = [*camera.params, 0.0]
-                camera.model, camera.params = pycolmap.CameraModelId.RADIAL, params
-        _adjust(model, database, seed, weak if principal_point else set(), principal_point)
-        if not principal_point or all(_is_plausible(model.camera(i)) for i in strong):
-            return model, principal_point
-    raise AssertionError("the last attempt always returns")
-
-
-def _weak_cameras(model: "pycolmap.Reconstruction") -> set[int]:
-    """Cameras that see too little to tell their principal point and second distortion term."""
-    images = [model.image(i) for i in model.reg_image_ids()]
-    weak = set()
-    for camera_id in model.cameras:
-        observations = [image.num_points3D for image in images if image.camera_id == camera_id]
-        if len(observations) < ENOUGH_PHOTOS or sum(observations) < ENOUGH_OBSERVATIONS:
-            weak.add(camera_id)
-    return weak
-
-
-def _is_plausible(camera: "pycolmap.Camera") -> bool:
-    """Whether the principal point is near enough to the centre for a photo that was not cropped."""
-    x, y = camera.principal_point_x / camera.width, camera.principal_point_y / camera.height
-    return max(abs(x - 0.5), abs(y - 0.5)) <= FARTHEST_PRINCIPAL_POINT
+    options = pycolmap.BundleAdjustmentOptions(refine_principal_point=True, print_summary=False)
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in sorted(model.reg_image_ids()):
+        config.add_image(image_id)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
+    covariance = pycolmap.estimate_ba_covariance(pycolmap.BACovarianceOptions(), model, adjuster)
+    error_px = model.compute_mean_reprojection_error()
+    vague = set()
+    for camera_id, camera in model.cameras.items():
+        size, place = np.array([camera.width, camera.height]), list(camera.principal_point_idxs())
+        off_centre = np.abs(camera.params[place] / size - 0.5).max()
+        spread = None if covariance is None else covariance.get_other_params_cov(camera.params)
+        sigma_px = np.inf if spread is None else error_px * np.sqrt(spread[place, place].max())
+        if not sigma_px < VAGUE_PRINCIPAL_POINT * size.max() or off_centre > FARTHEST_PRINCIPAL_POINT:
+            vague.add(camera_id)
+    return vague
 
 
 def _adjust(

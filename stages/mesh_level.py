@@ -27,11 +27,16 @@ MIN_STOPPED = 0.01  # share of rays below which the photos say too little about 
 
 
 class Level(NamedTuple):
-    """The density chosen for the surface, per scene unit; ``miss_voxels`` is the mean clipped distance, or None."""
+    """The density of the surface, per scene unit.
+
+    ``miss_voxels`` is the mean clipped distance of the surface to where rays stop, None where that was not measured;
+    ``clear`` says whether photos and surface agree.
+    """
 
     level: float
     reason: str
     miss_voxels: float | None
+    clear: bool
 
 
 def check_range(lattice: "Lattice", level: float | None) -> None:
@@ -84,7 +89,7 @@ def choose_level(lattice: "Lattice", model: "RadianceModel", rays: "Rays") -> Le
         f"its surface lies closest to where {len(stop)} rays of the photos lose half of their light, "
         f"{misses[best]:.2f} voxels away on average (tried {candidates[0]:.2g} to {candidates[-1]:.2g})"
     )
-    return Level(candidates[best], reason, misses[best])
+    return Level(candidates[best], reason, misses[best], misses[best] < CLIP_VOXELS / 2)
 
 
 def _stops(model: "RadianceModel", rays: "Rays", t: "torch.Tensor") -> "tuple[torch.Tensor, torch.Tensor]":
@@ -128,4 +133,4 @@ def _thickest_fog(lattice: "Lattice", share: float) -> Level:
         f"only {share:.1%} of the photos' rays lose half of their light in the box, so the field is still fog; "
         "this level splits thick from thin (Otsu on log density)"
     )
-    return Level(level, reason, None)
+    return Level(level, reason, None, False)

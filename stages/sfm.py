@@ -46,15 +46,15 @@ class Config(StageConfig):
 
     cameras: OptionalSourcePath = None
     """Known cameras: a transforms.json, a folder with transforms_train.json, or a COLMAP model."""
-    seed: int = Field(0, ge=0, lt=2**31)
-    max_image_size: int = Field(1600, ge=100)
+    seed: int = Field(default=0, ge=0, lt=2**31)
+    max_image_size: int = Field(default=1600, ge=100)
     """Longer side in pixels at which features are searched; larger photos are reduced for it."""
-    max_features: int = Field(4096, ge=100)
+    max_features: int = Field(default=4096, ge=100)
     """Features per photo, the largest ones first; matching takes time with its square."""
     camera_model: CameraModel | None = None
     """COLMAP's camera model; None: SIMPLE_RADIAL, and RADIAL in the end where enough photos share a camera."""
     matcher: Literal["exhaustive"] = "exhaustive"
-    max_seconds: float = Field(4 * 3600.0, gt=0)
+    max_seconds: float = Field(default=4 * 3600.0, gt=0)
     """When structure-from-motion is given up; what was matched until then is kept for the next try."""
 
 
@@ -268,8 +268,9 @@ def _say_who_is_missing(photos: "Sequence[Photo]", images: list[dict[str, Any]],
 
 
 def _say_principal_point(found: dict[str, Any], progress: Progress) -> None:
-    if not found["principal_point"]:
-        progress.note("principal points stay in the centre: too few photos share a camera to tell them")
+    if count := found["vague_cameras"]:
+        whose = "the principal point stays" if count == 1 else f"the principal points of {count} cameras stay"
+        progress.note(f"{whose} in the centre: the photos say too little about it")
 
 
 def _result(folder: Path, source: str, images: list[dict[str, Any]], **facts: Any) -> StageResult:

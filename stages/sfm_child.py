@@ -67,8 +67,8 @@ def reconstruct(job: Job, say: Say) -> dict[str, Any]:
     """Run structure-from-motion and write the best sub-model to ``sparse/``; nothing if none came out.
 
     Returns the ``database`` that was used in the end, the files in each sub-model, best first (``models``), and of the
-    best: its ``points``, ``observations`` by file, mean ``reprojection_px``, ``camera_model``, and whether the
-    ``principal_point`` was refined.
+    best: its ``points``, ``observations`` by file, mean ``reprojection_px``, ``camera_model``, and how many
+    ``vague_cameras`` kept their principal points in the centre.
     """
     database, images = Path(job.database), Path(job.images)
     photos = [Photo(**photo) for photo in job.photos]
@@ -88,7 +88,7 @@ def reconstruct(job: Job, say: Say) -> dict[str, Any]:
     if not mapped:
         return {"database": str(database), "models": []}
     say(phase="refining")
-    model, principal_point = colmap.finish(mapped[0], database, job.seed, job.camera_model is not None)
+    model, vague = colmap.finish(mapped[0], database, job.seed, job.camera_model is not None)
     sparse = Path(job.folder, "sparse")
     sparse.mkdir(exist_ok=True)
     model.write_binary(sparse)
@@ -99,7 +99,7 @@ def reconstruct(job: Job, say: Say) -> dict[str, Any]:
         "points": model.num_points3D(),
         "reprojection_px": model.compute_mean_reprojection_error(),
         "camera_model": "/".join(sorted({camera.model_name for camera in model.cameras.values()})),
-        "principal_point": principal_point,
+        "vague_cameras": len(vague),
     }
 
 

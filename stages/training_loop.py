@@ -192,8 +192,10 @@ class TrainingRun:
         heldout = None if self.probes.heldout is None else measure(self.trainer.model, self.probes.heldout).psnr
         cost = time.perf_counter() - started
         seconds = self.state.seconds
+        # Right after a kill at the very end no step has told how well the batches go.
+        train = self.pace.psnr if self.pace.count else measure(self.trainer.model, self.probes.train).psnr
         self.next_measurement = max(MEASUREMENT_GROWTH * seconds, seconds + cost / MOST_MEASURING)
-        point = {"step": self.state.step, "seconds": round(seconds, 3), "train_psnr": round(self.pace.psnr, 3)}
+        point = {"step": self.state.step, "seconds": round(seconds, 3), "train_psnr": round(train, 3)}
         point["heldout_psnr"] = None if heldout is None else round(heldout, 3)
         self.state.curve.append(point)
         self.log.point(point)

@@ -3,9 +3,18 @@
 from pathlib import Path
 
 import pytest
+import torch
+from hypothesis import settings
 from jaxtyping import install_import_hook
 
 install_import_hook("nerf", "beartype.beartype")
+
+# Tensors of tests are tiny: torch's threads would only wait for each other, most of all on a busy machine.
+torch.set_num_threads(1)
+
+# A slow machine is no failure.
+settings.register_profile("default", deadline=None)
+settings.load_profile("default")
 
 pytest_plugins = ["tests.synthetic_photos"]
 

@@ -111,10 +111,8 @@ def test_errors_are_the_mean_distance_to_the_projections(tmp_path: Path) -> None
     moved = pose + np.array([0, 0, 0, 1.0])[None] * np.array([[1.0], [0], [0]])
     images = [SparseImage("a.jpg", 0, pose), SparseImage("b.jpg", 0, moved)]
     seen = np.array([[31.0 + 3, 19 + 4], [31.0 - 50 / 2, 19]])  # five pixels off in the first, exact in the second
-    none = np.zeros(1)
-    model = SparseModel(
-        [CAMERAS[1]], images, np.array([[0, 0, 2.0]]), np.zeros((1, 3), np.uint8), none, np.arange(2), np.zeros(2, int), seen
-    )  # fmt: skip
+    xyz, rgb, point = np.array([[0, 0, 2.0]]), np.zeros((1, 3), np.uint8), np.zeros(2, int)
+    model = SparseModel([CAMERAS[1]], images, xyz, rgb, np.zeros(1), np.arange(2), point, seen)
     write_model(tmp_path, model)
     np.testing.assert_allclose(read_model(tmp_path).error_px, [2.5])
 

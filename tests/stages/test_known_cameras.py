@@ -223,7 +223,7 @@ def test_a_name_that_two_photos_share_matches_neither(tmp_path: Path) -> None:
 
 def test_two_cameras_for_one_photo_are_refused(tmp_path: Path) -> None:
     colmap_model(tmp_path, ["left/ä0.png", "right/ä0.png"])
-    with pytest.raises(StageError, match="two cameras for the photo ä0.png"):
+    with pytest.raises(StageError, match=r"two cameras for the photo ä0\.png"):
         read_known_cameras(tmp_path, PHOTOS, {})
 
 

@@ -209,11 +209,18 @@ def test_fields_without_a_surface_write_nothing(run_mesh, tmp_path, model, setti
 def test_a_lattice_beyond_memory_is_refused_with_one_that_fits(run_mesh, monkeypatch):
     import psutil
 
-    memory = psutil.virtual_memory()._replace(available=24 * 40**3)
+    memory = psutil.virtual_memory()._replace(available=16 * 40**3)
     monkeypatch.setattr(psutil, "virtual_memory", lambda: memory)
     with pytest.raises(StageError, match="not enough memory for the mesh") as error:
         run_mesh(Solid(ball), resolution=64)
     assert error.value.hint == "Try --mesh.resolution 32."
+
+
+def test_fog_becomes_a_mesh_that_says_it_is_fog(run_mesh, progress):
+    result, _ = run_mesh(Solid(ball, inside=0.3))
+    assert result.facts["faces"] > 100 and result.facts["level_miss_voxels"] is None
+    assert result.line.endswith("; the field has no clear surface yet, train for longer")
+    assert any("still fog" in note for note in progress.notes)
 
 
 def test_the_level_asked_for_is_taken(run_mesh):

@@ -55,7 +55,7 @@ def test_the_surface_lies_where_light_stops_whatever_the_density(rays, inside):
     model = Solid(ball, inside)
     lattice = lattice_of(model)
     chosen = choose_level(lattice, model, rays)
-    assert chosen.miss_voxels is not None and 0 < chosen.miss_voxels < 0.35
+    assert chosen.clear and chosen.miss_voxels is not None and 0 < chosen.miss_voxels < 0.35
     radii = np.linalg.norm(extract(lattice, chosen.level).vertices, axis=1)
     assert abs(radii.mean() - 0.55) < VOXEL
     assert "rays of the photos lose half of their light" in chosen.reason
@@ -97,7 +97,7 @@ def test_density_before_near_has_no_say(rays):
 def test_fog_is_split_into_thick_and_thin_and_called_fog(rays):
     model = Solid(ball, 0.02, softness=0.1, outside=0.002)
     chosen = choose_level(lattice_of(model), model, rays)
-    assert chosen.miss_voxels is None
+    assert chosen.miss_voxels is None and not chosen.clear
     assert 0.002 < chosen.level < 0.022
     assert chosen.reason.startswith("only 0.0% of the photos' rays") and "still fog" in chosen.reason
 

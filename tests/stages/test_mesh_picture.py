@@ -53,7 +53,7 @@ def test_a_room_is_shown_from_inside():
     np.testing.assert_allclose(other.from_camera[:, 3], [0.3, 0, 0])
 
 
-@pytest.mark.parametrize("centre", [(0, 0, 3), (2, 0, 1)])
+@pytest.mark.parametrize("centre", [(0.01, 0, 3), (2, 0, 1)])
 def test_the_picture_has_two_rows_of_colour_and_clay(monkeypatch, centre):
     monkeypatch.setattr(mesh_picture, "WIDTH", 40)
     monkeypatch.setattr(mesh_picture, "HEIGHT", 30)
