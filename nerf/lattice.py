@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerf.model import RadianceModel
+from nerf.parallel import in_order
 from nerf.rays import Rays
 
 
@@ -28,7 +29,6 @@ class Lattice(NamedTuple):
         return (self.high - self.low) / (torch.tensor(self.values.shape, device=self.low.device) - 1)
 
 
-@torch.no_grad()
 def density_lattice(
     model: RadianceModel,
     resolution: int,
@@ -48,12 +48,17 @@ def density_lattice(
     counts = [max(2, round(float(edge / edges.max()) * (resolution - 1)) + 1) for edge in edges]
     axes = [torch.linspace(float(a), float(b), n, device=low.device) for a, b, n in zip(low, high, counts, strict=True)]
     total = math.prod(counts)
-    values = torch.empty(total, device=low.device)
-    for start in range(0, total, chunk):
+
+    def density(start: int) -> Tensor:
         index = torch.arange(start, min(start + chunk, total), device=low.device)
         i, j, k = torch.unravel_index(index, counts)
-        values[index] = model.density(torch.stack([axes[0][i], axes[1][j], axes[2][k]], dim=-1)).float()
-        on_chunk(min(start + chunk, total) / total)
+        with torch.no_grad():  # a property of the thread
+            return model.density(torch.stack([axes[0][i], axes[1][j], axes[2][k]], dim=-1)).float()
+
+    values = torch.empty(total, device=low.device)
+    for number, part in enumerate(in_order(density, range(0, total, chunk), low.device)):
+        values[number * chunk : (number + 1) * chunk] = part
+        on_chunk(min((number + 1) * chunk, total) / total)
     return Lattice(values.reshape(counts), low, high)
 
 
