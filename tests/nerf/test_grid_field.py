@@ -80,7 +80,8 @@ def test_all_gradients_are_those_of_autograd(settings: GridSettings) -> None:
     grad = Rendering(torch.tensor([1.0, 2.0, -3.0], dtype=torch.float64).expand(6, 3), ones, 0 * ones)
     gradients = model.backward(done, grad, torch.zeros_like(done.weights))
     grad_table = torch.zeros_like(model.table)
-    model.table_backward(done, gradients, grad_table)
+    for level, rows in enumerate(grad_table.split([model.layout.level_rows(level) for level in range(2)])):
+        model.level_backward(level, done.points, gradients.features, rows)
     of_rays = model.rays_backward(done, gradients)
 
     parameters = [model.table, *model.weights, given.origins, given.directions]

@@ -64,6 +64,33 @@ def test_a_resumed_run_is_the_uninterrupted_one_bit_for_bit() -> None:
     assert len({result.rays for result in results}) > 5, "the number of rays is meant to adapt"
 
 
+def test_results_do_not_depend_on_the_number_of_threads() -> None:
+    settings = replace(TRAINER, samples=3 << 12, most_rays=4096)
+    threads, states = torch.get_num_threads(), []
+    try:
+        for count in (1, 2, 3):
+            torch.set_num_threads(count)
+            run = trainer(settings, replace(FIELD, levels=3, finest=64, log2_rows=16))
+            for step in range(20):  # the density cache is refreshed once
+                run.step(step, step / 20)
+            states.append(copied(run.state()))
+    finally:
+        torch.set_num_threads(threads)
+    assert same(states[0], states[1]) and same(states[0], states[2])
+
+
+def test_the_gradient_of_a_batch_is_the_sum_over_its_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = replace(TRAINER, samples=1 << 14, distortion=0.1)
+    after = []
+    for size in (1 << 14, 1 << 11):
+        monkeypatch.setattr("nerf.grid_training.CHUNK_SAMPLES", {"cpu": size})
+        run = trainer(settings)
+        assert len(run._chunks(run._batch(0))) == (1 << 14) // size
+        result = run.step(0, 0.0)
+        after.append((torch.tensor([result.loss, result.psnr]), run.mean, run.cache.thickness))
+    torch.testing.assert_close(*after, rtol=1e-4, atol=1e-9)
+
+
 def test_rays_adapt_to_the_samples_they_need() -> None:
     run = trainer(replace(TRAINER, most_rays=10_000))
     results = [run.step(step, 0.5) for step in range(100)]

@@ -3,6 +3,8 @@ from pathlib import Path
 import pytest
 import torch
 
+from nerf.grid_field import GridField, GridSettings
+from nerf.kernels import reference
 from nerf.paper import PaperNerf, PaperSettings
 from nerf.rays import Rays
 from stages.contract import StageError
@@ -10,33 +12,51 @@ from stages.field_files import load_field, save_field
 from stages.files import read_json, write_json
 
 SMALL = PaperSettings(depth=2, width=8, samples_coarse=4, samples_fine=4, contracted=True, spacing="log")
+GRID = GridSettings(levels=2, log2_rows=8, coarsest=4, finest=16, contracted=True, cache_cells=8)
+KINDS = {"paper": PaperNerf(SMALL, seed=5), "grid": GridField(GRID, 5, reference)}
 INFO = {"background": [1.0, 1.0, 1.0], "downscale": 2.5, "steps": 7, "rays": 700}
 
 
-def test_a_field_comes_back_the_same(tmp_path: Path) -> None:
-    model = PaperNerf(SMALL, seed=5)
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_field_comes_back_the_same(kind: str, tmp_path: Path) -> None:
+    model = KINDS[kind]
     save_field(tmp_path, model, INFO)
     loaded, info = load_field(tmp_path)
     rays = Rays(torch.zeros(3, 3), torch.eye(3), torch.full((3,), 0.5), torch.full((3,), 4.0))
-    for ours, theirs in zip(model.render(rays, torch.ones(3)), loaded.render(rays, torch.ones(3)), strict=True):
-        assert torch.equal(ours, theirs)
+    with torch.no_grad():
+        seen = model.render(rays, torch.ones(3))
+        assert all(torch.equal(*pair) for pair in zip(seen, loaded.render(rays, torch.ones(3)), strict=True))
+    assert 0 < seen.opacity.min() and seen.colour.std() > 0
     assert {key: info[key] for key in INFO} == INFO
-    assert info["kind"] == "paper"
-    assert info["settings"]["spacing"] == "log"
+    assert info["kind"] == kind
+    assert info["settings"]["contracted"] is True
 
 
-def test_equal_fields_are_equal_bytes(tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", KINDS)
+def test_equal_fields_are_equal_bytes(kind: str, tmp_path: Path) -> None:
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
-        save_field(tmp_path / name, PaperNerf(SMALL, seed=5), INFO)
+        save_field(tmp_path / name, KINDS[kind], INFO)
     for file in ("field.safetensors", "field.json"):
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
 
 
-def test_a_loaded_field_asks_for_no_gradients(tmp_path: Path) -> None:
-    save_field(tmp_path, PaperNerf(SMALL, seed=5), INFO)
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_loaded_field_asks_for_no_gradients(kind: str, tmp_path: Path) -> None:
+    save_field(tmp_path, KINDS[kind], INFO)
     loaded, _ = load_field(tmp_path)
     assert not loaded.density(torch.zeros(2, 3)).requires_grad
+
+
+def test_weights_of_equal_shape_but_another_grid_are_refused(tmp_path: Path) -> None:
+    model = KINDS["grid"]
+    save_field(tmp_path, model, INFO)
+    info = read_json(tmp_path / "field.json")
+    other = info["settings"] | {"steps": 99}
+    assert load_field(tmp_path)[1] == info
+    write_json(tmp_path / "field.json", info | {"settings": other})
+    with pytest.raises(StageError, match="cannot read the trained field: .*were not written with these settings"):
+        load_field(tmp_path)
 
 
 @pytest.mark.parametrize("harm", ["cut weights", "no weights", "another kind", "another size", "unknown setting"])

@@ -1,0 +1,88 @@
+"""The whole chain as a user runs it, on photos small enough for seconds: every promised file is there and sound."""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+
+from pipeline.cli import run_command
+from tests.small_scenes import write_blender_scene
+
+SUMMARY_KEYS = {
+    "photos", "registered", "camera_model", "reprojection_px", "field", "train_seconds", "total_seconds", "psnr",
+    "ssim", "psnr_mean_image", "psnr_nearest_view", "mesh", "verdict",
+}  # fmt: skip
+SMALL = "--train.steps 150 --train.downscale 1 --render.frames 4 --render.width 48 --mesh.resolution 40".split()
+
+
+@pytest.fixture(scope="module")
+def output(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The output folder of a run on a small set with known cameras."""
+    folder = tmp_path_factory.mktemp("chain")
+    photos = write_blender_scene(folder / "photos", train=14, test=3)
+    assert run_command(["run", str(photos), "-o", str(folder / "w.nerf"), *SMALL]) == 0
+    return folder / "w.nerf/output"
+
+
+def numbers_in(value: Any) -> list[float]:
+    if isinstance(value, dict):
+        return [n for v in value.values() for n in numbers_in(v)]
+    if isinstance(value, list):
+        return [n for v in value for n in numbers_in(v)]
+    return [value] if isinstance(value, float) else []
+
+
+def test_the_summary_has_every_key_and_only_finite_numbers(output: Path):
+    summary = json.loads((output / "summary.json").read_text())
+    assert set(summary) >= SUMMARY_KEYS
+    assert set(summary["mesh"]) >= {"vertices", "faces", "watertight"}
+    assert all(math.isfinite(n) for n in numbers_in(summary))
+    assert (summary["photos"], summary["registered"]) == (17, 17)
+    assert summary["psnr"] > summary["psnr_mean_image"] > 5
+
+
+def test_the_mesh_opens_and_is_not_degenerate(output: Path):
+    mesh = trimesh.load_mesh(output / "mesh.ply")
+    assert len(mesh.faces) > 500
+    assert np.isfinite(mesh.vertices).all()
+    # The table has radius 1 about the origin of the sfm frame, which for known cameras is their own.
+    assert 0.7 < np.abs(mesh.vertices[:, :2]).max() < 1.6
+    scene = trimesh.load_scene(output / "mesh.glb")
+    assert sum(len(g.faces) for g in scene.geometry.values()) == len(mesh.faces)
+
+
+def test_the_videos_hold_their_frames(output: Path):
+    from stages.video import read_video
+
+    for name in ("video.mp4", "depth.mp4"):
+        frames = read_video(output / name)
+        assert frames.shape[0] == 4
+        assert frames.shape[2] == 48
+        assert frames.std() > 1, f"{name} shows nothing"
+
+
+def test_the_report_stands_alone(output: Path):
+    page = (output / "report.html").read_text()
+    assert "<video" in page and "data:image/" in page
+    assert 'src="http' not in page and 'href="http' not in page
+
+
+def test_cameras_are_exported(output: Path):
+    exported = json.loads((output / "transforms.json").read_text())
+    assert len(exported["frames"]) == 17
+    assert (output / "sparse/cameras.bin").is_file()
+
+
+def test_exported_cameras_go_in_again(output: Path, tmp_path: Path):
+    photos = output.parents[1] / "photos"
+    words = ["run", str(photos), "--cameras", str(output / "transforms.json"), "-o", str(tmp_path / "again.nerf")]
+    assert run_command([*words, "--until", "normalise"]) == 0
+    again = json.loads((tmp_path / "again.nerf/output/transforms.json").read_text())
+    first = json.loads((output / "transforms.json").read_text())
+    poses = {f["file_path"]: np.array(f["transform_matrix"]) for f in first["frames"]}
+    for frame in again["frames"]:
+        np.testing.assert_allclose(frame["transform_matrix"], poses[frame["file_path"]], atol=1e-9)

@@ -1,0 +1,27 @@
+"""Real photos through structure from motion: all that can be registered is, and what cannot is refused in words."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from pipeline.cli import run_command
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "photos"), [("fountain_p11", 11), ("sceaux_castle", 11), ("fox", 50)])
+def test_every_photo_is_registered(shared_data: Path, tmp_path: Path, name: str, photos: int):
+    assert run_command(["run", str(shared_data / name), "-o", str(tmp_path / "w.nerf"), "--until", "normalise"]) == 0
+    (account,) = (tmp_path / "w.nerf/sfm").glob("*/registration.json")
+    registration = json.loads(account.read_text())
+    assert (registration["registered"], registration["photos"]) == (photos, photos)
+    assert 0 < registration["reprojection_px"] < 1.2
+
+
+@pytest.mark.slow
+def test_photos_without_overlap_are_refused(shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    assert run_command(["run", str(shared_data / "room_no_overlap"), "-o", str(tmp_path / "w.nerf")]) == 11
+    text = capsys.readouterr().err
+    assert "of 28 pairs share a view" in text
+    assert "60–80 % overlap" in text
+    assert "Traceback" not in text
