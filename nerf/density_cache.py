@@ -11,12 +11,13 @@ from torch import Tensor
 from nerf.contraction import uncontract
 from nerf.grid_field import GridField
 from nerf.kernels import CONTRACTED_BOX
+from nerf.parallel import in_order
 
 YOUNG_STEPS = 256  # a young field changes everywhere: all blocks of 2³ cells are measured, at one point each
 YOUNG_EVERY, YOUNG_FADE = 16, 0.8
 EVERY, FADE, MEASURED_CELLS = 64, 0.9, 26_000  # afterwards: so many cells, drawn at random
 THIN = 0.01  # a cell as thin as this, or as the mean cell, counts as empty
-CHUNK = 1 << 16  # points measured at once
+CHUNK = 1 << 14  # points measured at once
 
 
 class DensityCache:
@@ -68,7 +69,7 @@ class DensityCache:
         return corners + side / cells * torch.rand(corners.shape, generator=random, device=corners.device)
 
     def _measure(self, unit: Float[Tensor, "points 3"]) -> Float[Tensor, "points"]:
-        sigma = torch.cat([self.field.unit_density(part) for part in unit.split(CHUNK)])
+        sigma = torch.cat(list(in_order(self.field.unit_density, unit.split(CHUNK), unit.device)))
         return sigma * self._step_length(unit)
 
     def _step_length(self, unit: Float[Tensor, "points 3"]) -> Float[Tensor, "points"] | float:

@@ -167,11 +167,18 @@ class GridField(nn.Module):
         )
         return GridGradients(*grid_mlp.backward(self.weights, density, colour, grad_sigma, grad_colour))
 
-    def table_backward(
-        self, done: GridPass, gradients: GridGradients, grad_table: Float[Tensor, "rows features"]
+    def level_backward(
+        self,
+        level: int,
+        points: Float[Tensor, "samples 3"],
+        grad_features: Float[Tensor, "samples width"],
+        grad_rows: Float[Tensor, "rows features"],
     ) -> None:
-        """Add the gradient of the table to ``grad_table``."""
-        self.backend.encode_backward_table(self.layout, done.points, gradients.features, grad_table)
+        """Add the gradient of one level's rows of the table to ``grad_rows``."""
+        features, rows = self.layout.features, self.layout.level_rows(level)
+        alone = GridLayout(self.layout.resolutions[level : level + 1], (0, rows), features)
+        of_level = grad_features[:, level * features : (level + 1) * features].contiguous()
+        self.backend.encode_backward_table(alone, points, of_level, grad_rows)
 
     def rays_backward(
         self, done: GridPass, gradients: GridGradients

@@ -1,6 +1,8 @@
 """One optimisation step of a grid field, behind the same interface as the paper's (nerf/training.py)."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import astuple, dataclass
+from functools import partial
 from typing import Literal, NamedTuple
 
 import torch
@@ -8,9 +10,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf.density_cache import DensityCache
-from nerf.grid_field import GridField, GridGradients, GridPass
+from nerf.grid_field import GridField, GridPass
+from nerf.grid_mlp import Weights
 from nerf.metrics import psnr
 from nerf.model import Rendering
+from nerf.parallel import in_order
 from nerf.randomness import generator
 from nerf.ray_bank import RayBank
 from nerf.rays import Rays
@@ -21,6 +25,9 @@ CONSTANT_SHARE = 0.2  # of the run, before the rate begins to fall
 FINAL_RATE = 0.05  # of the rate at first
 FIRST_SAMPLES_PER_RAY = 128.0
 MEMORY = 0.9  # how much of the mean of samples per ray remains after each step
+# Colours in a chunk of a batch, each on its own core; elsewhere a batch is one chunk. What chunks find is added in
+# order, so results do not depend on the number of cores.
+CHUNK_SAMPLES = {"cpu": 1 << 12}
 
 
 @dataclass(frozen=True)
@@ -48,12 +55,24 @@ class GridBatch(NamedTuple):
 
 
 class Loss(NamedTuple):
-    """A loss, the mean squared error in it, and the gradients of rendering and weights."""
+    """A chunk's share of the loss, of the mean squared error in it, and the gradients of rendering and weights."""
 
     value: Tensor
     squared_error: Tensor
     grad: Rendering
     grad_weights: Float[Tensor, "samples"]
+
+
+class _Part(NamedTuple):
+    """What one chunk of a batch contributes to it: loss, gradients and their norm, the thickness of cells it met."""
+
+    loss: Tensor
+    squared_error: Tensor
+    weights: Weights
+    features: Float[Tensor, "samples width"]
+    points: Float[Tensor, "samples 3"]
+    norm: Tensor
+    thickness: Float[Tensor, "samples"]
 
 
 def rate_factor(step: int, share: float) -> float:
@@ -76,37 +95,39 @@ class GridTrainer:
 
     def step(self, step: int, share: float, rate_scale: float = 1.0) -> StepResult:
         """One batch, one update. Raises NonFinite before the update, leaving model and optimiser as they were."""
-        batch = self._batch(step)
-        done = self.model.forward(batch.rays, batch.jitter, batch.background)
-        loss = self._loss(done, batch.target)
-        gradients = self.model.backward(done, loss.grad, loss.grad_weights)
-        loss_now, error_now = self._finite(step, batch, loss, gradients)
-        self._update(step, done, gradients, rate_scale * self.settings.rate * rate_factor(step, share))
-        self.cache.raise_to(done.points, done.density.sigma * done.samples.dt)
-        self.cache.refresh(step, generator(self.bank.device, self.settings.seed, step, 1))
+        batch, device = self._batch(step), self.bank.device
         rays = len(batch.jitter)
-        self.samples_per_ray.mul_(MEMORY).add_((1 - MEMORY) * len(done.samples.t) / rays)
-        return StepResult(loss_now, psnr(error_now), rays)
+        parts = list(in_order(partial(self._part, rays), self._chunks(batch), device))
+        loss, error = self._finite(step, batch, parts)
+        rate = rate_scale * self.settings.rate * rate_factor(step, share)
+        self._update_table(parts, rate, step + 1)
+        self._update_networks([part.weights for part in parts], rate, step + 1)
+        for part in parts:
+            self.cache.raise_to(part.points, part.thickness)
+        self.cache.refresh(step, generator(device, self.settings.seed, step, 1))
+        samples = sum(len(part.points) for part in parts)
+        self.samples_per_ray.mul_(MEMORY).add_((1 - MEMORY) * samples / rays)
+        return StepResult(loss, psnr(error), rays)
 
     def state(self) -> dict[str, Tensor]:
         """Weights and cache bits as ``model.<name>``, Adam's moments as ``mean.<name>`` and ``square.<name>``, the
-        cache's thickness and the mean number of samples per ray."""
+        cache's thickness, the mean number of samples per ray, and the field's settings, to know it by."""
         return (
             {f"model.{name}": tensor for name, tensor in self.model.state_dict().items()}
             | {f"mean.{name}": tensor for name, tensor in self.mean.items()}
             | {f"square.{name}": tensor for name, tensor in self.square.items()}
             | {"thickness": self.cache.thickness, "samples_per_ray": self.samples_per_ray}
+            | {"settings": torch.tensor(astuple(self.model.settings), dtype=torch.float64)}
         )
 
     def load_state(self, state: dict[str, Tensor]) -> None:
-        """Go back to what :meth:`state` gave. Raises RuntimeError for the state of another architecture."""
+        """Go back to what :meth:`state` gave. Raises RuntimeError for the state of another field, also where its
+        tables have the same shapes."""
         mine = self.state()
-        if {name: tensor.shape for name, tensor in mine.items()} != {name: t.shape for name, t in state.items()}:
-            different = sorted(
-                n
-                for n in mine.keys() | state.keys()
-                if n not in mine or n not in state or mine[n].shape != state[n].shape
-            )
+        different = [name for name in sorted(mine.keys() | state.keys()) if _shape(mine, name) != _shape(state, name)]
+        if not different and not torch.equal(mine["settings"], state["settings"].to(mine["settings"].device)):
+            different = ["settings"]
+        if different:
             raise RuntimeError(f"this state belongs to another field: {', '.join(different)} differ")
         for name, tensor in mine.items():
             tensor.copy_(state[name])
@@ -123,11 +144,27 @@ class GridTrainer:
         target = colour if alpha is None else torch.lerp(background, colour, alpha[:, None])
         return GridBatch(rays, target, background, torch.rand(count, generator=random, device=device))
 
-    def _loss(self, done: GridPass, target: Float[Tensor, "rays 3"]) -> Loss:
-        error, rays = done.rendering.colour - target, len(target)
-        squared_error = error.square().mean()
-        none = torch.zeros(rays, device=error.device)
-        grad = Rendering(error * (2 / error.numel()), none, none)
+    def _chunks(self, batch: GridBatch) -> list[GridBatch]:
+        """The batch in parts of equally many rays, at most; how many follows from the settings alone."""
+        count = max(1, self.settings.samples // CHUNK_SAMPLES.get(self.bank.device.type, self.settings.samples))
+        size = -(-len(batch.jitter) // count)
+        rays = map(Rays, *(part.split(size) for part in batch.rays))
+        return list(map(GridBatch, rays, *(part.split(size) for part in batch[1:])))
+
+    def _part(self, rays: int, chunk: GridBatch) -> _Part:
+        """What a chunk of a batch of ``rays`` adds to loss and gradients."""
+        done = self.model.forward(chunk.rays, chunk.jitter, chunk.background)
+        loss = self._loss(rays, done, chunk.target)
+        weights, features, _ = self.model.backward(done, loss.grad, loss.grad_weights)
+        thickness = done.density.sigma * done.samples.dt
+        norm = torch.nn.utils.get_total_norm([*weights, features])
+        return _Part(loss.value, loss.squared_error, weights, features, done.points, norm, thickness)
+
+    def _loss(self, rays: int, done: GridPass, target: Float[Tensor, "chunk 3"]) -> Loss:
+        error = done.rendering.colour - target
+        squared_error = error.square().sum() / (3 * rays)
+        none = torch.zeros(len(target), device=error.device)
+        grad = Rendering(error * (2 / (3 * rays)), none, none)
         if not self.settings.distortion:
             return Loss(squared_error, squared_error, grad, torch.zeros_like(done.weights))
         backend, lattice = self.model.backend, self.model.lattice
@@ -136,22 +173,39 @@ class GridTrainer:
         grad_weights = backend.distortion_backward(done.samples, done.weights, lattice, each)
         return Loss(squared_error + spread, squared_error, grad, grad_weights)
 
-    def _finite(self, step: int, batch: GridBatch, loss: Loss, gradients: GridGradients) -> tuple[float, float]:
+    def _finite(self, step: int, batch: GridBatch, parts: Sequence[_Part]) -> tuple[float, float]:
         """Loss and squared error as numbers, once they and all gradients are known to be finite.
 
         The table's gradient is a sum of the features' gradients with weights up to 1: finite if their norm is.
         """
-        norm = torch.nn.utils.get_total_norm([*gradients.weights, gradients.features])
-        loss_now, error_now, norm_now = torch.stack([loss.value, loss.squared_error, norm]).tolist()
+        each = ([part.loss for part in parts], [part.squared_error for part in parts], [part.norm for part in parts])
+        loss_now, error_now, norm_now = (float(torch.stack(values).sum()) for values in each)
         for quantity, value in {"loss": loss_now, "gradient": norm_now}.items():
             if not abs(value) < float("inf"):
                 rest = {"target": batch.target, "background": batch.background, "jitter": batch.jitter}
                 raise NonFinite(quantity, step, batch.rays._asdict() | rest)
         return loss_now, error_now
 
-    def _update(self, step: int, done: GridPass, gradients: GridGradients, rate: float) -> None:
-        self.grad_table.zero_()
-        self.model.table_backward(done, gradients, self.grad_table)
-        for name, gradient in {"table": self.grad_table, **gradients.weights._asdict()}.items():
+    def _update_table(self, parts: Sequence[_Part], rate: float, count: int) -> None:
+        """Levels share no rows: each is a piece of work for a core of its own."""
+        layout, adam = self.model.layout, self.model.backend.adam
+
+        def update(level: int) -> None:
+            rows = slice(layout.first_rows[level], layout.first_rows[level + 1])
+            gradient = self.grad_table[rows].zero_()
+            for part in parts:
+                self.model.level_backward(level, part.points, part.features, gradient)
+            adam(self.model.table[rows], gradient, self.mean["table"][rows], self.square["table"][rows], rate, count)
+
+        for _ in in_order(update, range(len(layout.resolutions)), self.bank.device):
+            pass
+
+    def _update_networks(self, of_parts: Sequence[Weights], rate: float, count: int) -> None:
+        for name, gradients in zip(Weights._fields, zip(*of_parts, strict=True), strict=True):
+            gradient = torch.stack(gradients).sum(0)
             parameter, mean, square = self.parameters[name], self.mean[name], self.square[name]
-            self.model.backend.adam(parameter, gradient, mean, square, rate, step + 1)
+            self.model.backend.adam(parameter, gradient, mean, square, rate, count)
+
+
+def _shape(state: dict[str, Tensor], name: str) -> torch.Size | None:
+    return state[name].shape if name in state else None

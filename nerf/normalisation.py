@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from nerf.depth_range import REGION_HALF, near_and_far
 from nerf.reconstruction import Reconstruction, spatial_median
-from nerf.region import Layout, find_layout, find_region, given_region, share_beyond
+from nerf.region import Layout, find_layout, Region, find_region, share_beyond
 from nerf.scene import Similarity
 from nerf.up_vector import Up, find_up
 
@@ -43,15 +43,17 @@ def normalise(sfm: Reconstruction, has_alpha: bool, roi: tuple[float, float, flo
     if roi is None:
         region = find_region(upright, layout, has_alpha)
     else:
-        region = given_region(upright, rotation @ (np.array(roi[:3]) - middle), roi[3], has_alpha)
+        region = Region(rotation @ (np.array(roi[:3]) - middle), roi[3])
     scale = REGION_HALF / region.half
     centre = middle + rotation.T @ region.centre
     scene = upright.in_frame(np.eye(3), region.centre, scale)
-    near, far = near_and_far(scene, region.bounded)
+    # Points cannot prove that nothing lies beyond the cube: sky and plain walls have none. Only alpha does.
+    bounded = has_alpha
+    near, far = near_and_far(scene, bounded)
     return Normalisation(
         scene_from_sfm=Similarity(scale, rotation, -scale * (rotation @ centre)),
         layout=layout,
-        bounded=region.bounded,
+        bounded=bounded,
         up=up,
         near=near,
         far=far,

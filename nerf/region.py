@@ -20,16 +20,15 @@ LEAST_WIDTH = 0.5  # of what the photos see at the focus; textured spots may be 
 FORWARD_REACH = 3.0  # the farthest depth the cube takes in, in median depths; beyond, detail is below a pixel's
 INSIDE_REACH = 2.0  # likewise around a camera that looks outward
 FAR_CAMERA = 5.0  # a camera so many times as far from the cameras' middle as is usual does not count
-CORE, WHOLE = 0.95, 0.999  # shares of the observations that the cube should hold, and that make a scene bounded
+CORE, WHOLE = 0.95, 0.999  # shares of the observations that the cube should hold, and that are the whole scene
 GROWTH = 1.25  # a cube that becomes WHOLE by growing at most this much is grown
 
 
 class Region(NamedTuple):
-    """A cube of half side ``half`` about ``centre``; ``bounded`` if all that the photos show lies in it."""
+    """A cube of half side ``half`` about ``centre``."""
 
     centre: Float[np.ndarray, "3"]
     half: float
-    bounded: bool
 
 
 def focus(scene: Reconstruction) -> Float[np.ndarray, "3"]:
@@ -63,11 +62,6 @@ def find_region(scene: Reconstruction, layout: Layout, has_alpha: bool) -> Regio
     return _grown(cube, scene, has_alpha)
 
 
-def given_region(scene: Reconstruction, centre: Float[np.ndarray, "3"], half: float, has_alpha: bool) -> Region:
-    """A cube chosen by the user."""
-    return Region(centre, half, has_alpha or share_beyond(scene, centre, half) <= 1 - WHOLE)
-
-
 def share_beyond(scene: Reconstruction, centre: Float[np.ndarray, "3"], half: float) -> float:
     """The share of observations whose point lies outside a cube; 1 without observations (nothing is known)."""
     reach = _reach(scene, centre)
@@ -82,10 +76,10 @@ def _reach(scene: Reconstruction, centre: Float[np.ndarray, "3"]) -> Float[np.nd
 def _grown(cube: Region, scene: Reconstruction, has_alpha: bool) -> Region:
     """Let the cube hold the whole scene where that costs little (or where alpha says that there is no more)."""
     if not len(scene.point):
-        return cube._replace(bounded=has_alpha)
+        return cube
     whole = float(np.quantile(_reach(scene, cube.centre), WHOLE))
     if has_alpha or whole <= GROWTH * cube.half:
-        return Region(cube.centre, max(cube.half, whole), True)
+        return Region(cube.centre, max(cube.half, whole))
     return cube
 
 
@@ -100,9 +94,9 @@ def _around(scene: Reconstruction) -> Region:
     distance = float(np.median(np.linalg.norm(scene.centres - centre, axis=1)))
     width = distance * float(np.median(_half_widths(scene)))
     if not len(scene.point):
-        return Region(centre, width, False)
+        return Region(centre, width)
     half = float(np.quantile(_reach(scene, centre), CORE))
-    return Region(centre, min(max(half, LEAST_WIDTH * width), distance), False)
+    return Region(centre, min(max(half, LEAST_WIDTH * width), distance))
 
 
 def _half_widths(scene: Reconstruction) -> Float[np.ndarray, "n"]:
@@ -116,7 +110,7 @@ def _forward(scene: Reconstruction) -> Region:
     near_by = _near_by(scene)
     ends = np.concatenate([scene.centres[:, None] + depth * scene.rays for depth in (near, far)], axis=1)
     low, high = np.quantile(ends[near_by].reshape(-1, 3), [0.02, 0.98], axis=0)
-    return Region((low + high) / 2, float((high - low).max() / 2), False)
+    return Region((low + high) / 2, float((high - low).max() / 2))
 
 
 def _depth_extent(scene: Reconstruction) -> tuple[float, float]:
@@ -138,9 +132,9 @@ def _inside(scene: Reconstruction) -> Region:
     centres = scene.centres[_near_by(scene)]
     low, high = centres.min(axis=0), centres.max(axis=0)
     if not len(scene.point):
-        return Region(middle, 3 * float(np.quantile(spread, 0.9)), False)
+        return Region(middle, 3 * float(np.quantile(spread, 0.9)))
     reach = INSIDE_REACH * np.median(scene.distances())
     points = np.quantile(scene.points[scene.point], [(1 - CORE) / 2, (1 + CORE) / 2], axis=0)
     low = np.minimum(low, np.maximum(points[0], low - reach))
     high = np.maximum(high, np.minimum(points[1], high + reach))
-    return Region((low + high) / 2, float((high - low).max() / 2), False)
+    return Region((low + high) / 2, float((high - low).max() / 2))

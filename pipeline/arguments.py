@@ -123,11 +123,19 @@ def parse(kind: type[T], command: str, words: Sequence[str], settings: Settings 
 
     Raises SystemExit(2) after saying what is wrong, SystemExit(0) after ``--help``.
     """
+    # Steps and seconds are two budgets for one thing: the one given replaces the one recorded.
+    for given, other in (("steps", "seconds"), ("seconds", "steps")):
+        if settings is not None and _names(words, given) and not _names(words, other):
+            settings = settings.model_copy(update={"train": settings.train.model_copy(update={other: None})})
     positional = {name: tyro.MISSING for name in ("photos", "workspace", "stage") if name in kind.__annotations__}
     default: Any = kind(**positional)
     if settings is not None:
         default = replace(default, settings=settings)
     return tyro.cli(kind, prog=f"pipeline {command}", args=list(words), default=default)
+
+
+def _names(words: Sequence[str], option: str) -> bool:
+    return any(word.split("=")[0] == f"--train.{option}" for word in words)
 
 
 def overview(stages: Sequence[str]) -> str:

@@ -145,12 +145,13 @@ def _run_stages(
     common: words_of.Common,
     display: Display,
     force: frozenset[str] = frozenset(),
+    remember: bool = True,
 ) -> int:
     with Workspace(root) as workspace:
         runner = Runner(workspace, settings, display)
         display.headline(machine.headline(root))
         try:
-            ran = runner.run(stages, force=force, replan=common.replan)
+            ran = runner.run(stages, force=force, replan=common.replan, remember=remember)
         except StageFailed as failure:
             display.failed(failure.stage, failure.error)
             raise
@@ -187,7 +188,7 @@ def command_stage(stage: str, words: Sequence[str]) -> int:
         stages = [*stages, "report"]
     with choose_display(given.common.json) as display:
         force = frozenset({stage}) if given.force else frozenset[str]()
-        return _run_stages(given.workspace, settings, stages, given.common, display, force)
+        return _run_stages(given.workspace, settings, stages, given.common, display, force, remember=False)
 
 
 def _recorded_settings(workspace: Workspace) -> Settings:

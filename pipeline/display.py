@@ -10,6 +10,7 @@ from typing import Any, Protocol
 
 from stages.contract import StageError
 
+JSON_SECONDS = 0.2  # JSON output: one progress event at most this often
 HEARTBEAT_SECONDS = 10.0  # plain output: one line at most this often, so that a log stays readable
 
 
@@ -134,7 +135,7 @@ class JsonDisplay:
     """One JSON object a line on standard output, for scripts: {"event", "stage", ...}."""
 
     def __init__(self) -> None:
-        self._stage = ""
+        self._stage, self._last = "", 0.0
         self._lock = threading.Lock()
 
     def __enter__(self) -> "JsonDisplay":
@@ -151,11 +152,14 @@ class JsonDisplay:
         self._event("start", text=text)
 
     def begin(self, stage: str) -> None:
-        self._stage = stage
+        self._stage, self._last = stage, 0.0
         self._event("begin", stage=stage)
 
     def update(self, message: str, done: float | None = None) -> None:
-        self._event("progress", stage=self._stage, message=message, done=done)
+        now = time.monotonic()
+        if now - self._last >= JSON_SECONDS:
+            self._last = now
+            self._event("progress", stage=self._stage, message=message, done=done)
 
     def note(self, message: str) -> None:
         self._event("note", stage=self._stage, message=message)

@@ -8,7 +8,7 @@ device, worker counts and times never enter.
 import hashlib
 import json
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -70,13 +70,12 @@ class ContentIndex:
         return digest({os.path.relpath(file, root): value for file, value in found.items()})
 
     def of_path(self, path: Path) -> str:
-        """Digest of a file, or of all files below a folder that are not hidden."""
+        """Digest of a file, or of all files below a folder that are neither hidden nor in a workspace of ours."""
         if path.is_file():
             return self.sha256(path)
         if not path.is_dir():
             raise StageError(f"{path} does not exist", "a setting names it", "Check the path and run again.")
-        below = (p for p in path.rglob("*") if not any(part.startswith(".") for part in p.relative_to(path).parts))
-        return self.of_files(path, (p for p in below if p.is_file()))
+        return self.of_files(path, _files_of(path))
 
     def save(self) -> None:
         """Write the index if anything in it changed."""
@@ -87,13 +86,25 @@ class ContentIndex:
             self.changed = False
 
 
-def config_for_key(config: BaseModel, index: ContentIndex, replaced: Mapping[str, str]) -> dict[str, Any]:
-    """The config as JSON values, every path replaced by its content's digest.
+def _files_of(folder: Path) -> Iterator[Path]:
+    for entry in sorted(folder.iterdir()):
+        if entry.name.startswith("."):
+            continue
+        if entry.is_file():
+            yield entry
+        elif entry.is_dir() and not (entry / "run.json").is_file():
+            yield from _files_of(entry)
+
+
+def config_for_key(
+    config: BaseModel, index: ContentIndex, replaced: Mapping[str, str], unkeyed: Iterable[str] = ()
+) -> dict[str, Any]:
+    """The config as JSON values, every path replaced by its content's digest, without the ``unkeyed`` options.
 
     ``replaced`` gives digests for fields whose content the caller knows better than :meth:`ContentIndex.of_path`.
     """
-    values = config.model_dump(mode="json")
-    for name in type(config).model_fields:
+    values = config.model_dump(mode="json", exclude=set(unkeyed))
+    for name in values:
         value = getattr(config, name)
         if name in replaced:
             values[name] = replaced[name]

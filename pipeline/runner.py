@@ -62,19 +62,36 @@ class Runner:
         self.index = ContentIndex(workspace.root / ".content.json")
         self.done: dict[str, Manifest] = {}
 
-    def run(self, stages: Sequence[str], *, force: frozenset[str] = frozenset(), replan: bool = False) -> bool:
+    def run(
+        self,
+        stages: Sequence[str],
+        *,
+        force: frozenset[str] = frozenset(),
+        replan: bool = False,
+        remember: bool = True,
+    ) -> bool:
         """Bring ``stages`` (in chain order) up to date; True if anything ran. Raises StageFailed.
 
         ``force`` names stages that run again even where a finished result exists; ``replan`` forgets what was
-        chosen for the user before.
+        chosen for the user before; ``remember`` makes ``stages`` what `pipeline resume` repeats.
         """
         self.force = force
         if replan:
             self.state["plans"] = {}
-        self.state["stages"] = list(stages)
+        if remember:
+            self.state["stages"] = list(stages)
         self.workspace.write_run(self.state)
-        ran = [self._bring_up_to_date(stage) for stage in stages]
+        try:
+            ran = [self._bring_up_to_date(stage) for stage in stages]
+        finally:
+            self._unlink_outdated()
         return any(ran)
+
+    def _unlink_outdated(self) -> None:
+        """Take out of ``output/`` what belongs to other settings than the current ones."""
+        for stage, module in STAGES.items():
+            if stage not in self.done and self._upstream(stage, "report") is None:
+                self.workspace.unlink_outputs(module.LINKS)
 
     def _bring_up_to_date(self, stage: str) -> bool:
         started = time.monotonic()
@@ -83,6 +100,8 @@ class Runner:
             job = self.resolve(stage)
             self.state["keys"][stage] = job.key
             manifest = None if stage in self.force else self.find_finished(job)
+            if manifest is None:
+                self.workspace.unlink_outputs(job.module.LINKS)
             ran = manifest is None
             if manifest is None:
                 manifest = self._execute(job)
@@ -93,9 +112,12 @@ class Runner:
             raise StageFailed(stage, error) from error
         except OSError as error:
             raise StageFailed(stage, _disk_error(error)) from error
-        except MemoryError as error:
+        except (MemoryError, RuntimeError) as error:
+            if not _is_out_of_memory(error):
+                raise
             hint = "Close other programs, or lower the resolution or batch settings of this stage."
-            raise StageFailed(stage, StageError("out of memory", str(error) or stage, hint)) from error
+            why = str(error).splitlines()[0] if str(error) else f"{stage} asked for more than there is"
+            raise StageFailed(stage, StageError("out of memory", why, hint)) from error
         self.done[stage] = manifest
         self.display.end(stage, manifest.line, time.monotonic() - started, cached=not ran)
         return ran
@@ -135,19 +157,21 @@ class Runner:
         if not hasattr(module, "plan"):
             return options
         asked = digest({"options": self._config_for_key(stage, options), "inputs": inputs})
-        known = self.state["plans"].get(stage)
-        if known and known["asked"] == asked:
-            return module.Config.model_validate(known["config"])
+        plans = self.state["plans"].setdefault(stage, {})
+        if asked in plans:
+            # Paths are taken as given now: the plan was made for equal content, wherever that lay then.
+            paths = {name for name, value in options if isinstance(value, Path)}
+            return module.Config.model_validate(plans[asked] | options.model_dump(include=paths))
         if not may_plan:
             raise NotReady(stage)
         config = module.plan(options, folders)
-        self.state["plans"][stage] = {"asked": asked, "config": config.model_dump(mode="json")}
+        plans[asked] = config.model_dump(mode="json")
         self.workspace.write_run(self.state)
         return config
 
     def _config_for_key(self, stage: str, config: StageConfig) -> dict[str, Any]:
         replaced = {"photos": self._photos_digest()} if stage == "ingest" else {}
-        return config_for_key(config, self.index, replaced)
+        return config_for_key(config, self.index, replaced, getattr(STAGES[stage], "UNKEYED", ()))
 
     def _photos_digest(self) -> str:
         """Digest of the photos' names and bytes; the last known one where the photos are gone but were ingested."""
@@ -158,7 +182,8 @@ class Runner:
             return known
         source = find_source(config.photos, config.cameras)
         self.display.update(f"reading {len(source.files)} photos")
-        self.state["photos_digest"] = self.index.of_files(source.root, source.files)
+        files = self.index.of_files(source.root, source.files)
+        self.state["photos_digest"] = digest({"kind": source.kind, "frames": source.frames, "files": files})
         return self.state["photos_digest"]
 
     def find_finished(self, job: Job) -> Manifest | None:
@@ -170,7 +195,9 @@ class Runner:
             return None
 
     def _execute(self, job: Job) -> Manifest:
-        partial = self.workspace.partial(job.stage, job.key)
+        partial, folder = self.workspace.partial(job.stage, job.key), self.workspace.folder(job.stage, job.key)
+        if job.stage not in self.force and (manifest := self.workspace.complete(partial, folder, job.key)):
+            return manifest
         if partial.exists() and not (job.module.RESUMES and job.stage not in self.force):
             shutil.rmtree(partial)
         partial.mkdir(parents=True, exist_ok=True)
@@ -193,8 +220,15 @@ class Runner:
             started=started.isoformat(timespec="seconds"),
             machine=machine.facts(),
         )
-        self.workspace.finish(partial, self.workspace.folder(job.stage, job.key), manifest)
+        self.workspace.finish(partial, folder, manifest)
         return manifest
+
+
+def _is_out_of_memory(error: Exception) -> bool:
+    """torch says it with a RuntimeError, on the CPU and on GPUs in different words."""
+    return isinstance(error, MemoryError) or any(
+        words in str(error) for words in ("not enough memory", "out of memory", "can't allocate memory")
+    )
 
 
 def _disk_error(error: OSError) -> StageError:

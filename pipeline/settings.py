@@ -1,5 +1,6 @@
 """All options of a run: one pydantic model per stage, filled from defaults, a TOML file and flags, in that order."""
 
+import os
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -73,7 +74,7 @@ def with_source(settings: Settings, photos: Path, cameras: Path | None) -> Setti
 
 def default_workspace(photos: Path) -> Path:
     """``photos.nerf`` beside the photos; for a transforms.json or an images/ folder, named after its parent."""
-    base = photos.absolute()
+    base = Path(os.path.abspath(photos))  # resolves "..", keeps the names of links
     if base.is_file() or base.name == "images":
         base = base.parent
     if base.name == "":

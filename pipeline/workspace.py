@@ -97,22 +97,40 @@ class Workspace:
         folder.rename(bad)
 
     def finish(self, partial: Path, folder: Path, manifest: Manifest) -> None:
-        """Turn a partial folder into a finished one: drop what it did not declare, sync, write manifest, rename."""
-        keep = {*manifest.outputs, *manifest.records}
-        for path in sorted(partial.rglob("*"), reverse=True):
-            if path.is_dir() and not path.is_symlink():
-                if not any(path.iterdir()):
-                    path.rmdir()
-            elif path.relative_to(partial).as_posix() not in keep:
-                path.unlink()
-            else:
-                with path.open("rb") as stream:
-                    os.fsync(stream.fileno())
+        """Turn a partial folder into a finished one: sync, write the manifest, drop what it does not list, rename.
+
+        From the manifest on a kill loses nothing: :meth:`complete` does the rest.
+        """
+        for name in (*manifest.outputs, *manifest.records):
+            with (partial / name).open("rb") as stream:
+                os.fsync(stream.fileno())
         manifests.write(partial, manifest)
+        self._tidy(partial, {*manifest.outputs, *manifest.records, manifests.NAME})
         if folder.exists():  # a forced run of the same key: the old result makes way at the last moment
             self._set_aside(folder)
         partial.rename(folder)
         manifests.sync_folder(folder.parent)
+
+    def complete(self, partial: Path, folder: Path, key: str) -> Manifest | None:
+        """Finish a partial folder that was killed after its manifest was written; None where there is none."""
+        try:
+            manifest = manifests.read(partial)
+            manifests.check_outputs(partial, manifest)
+        except (FileNotFoundError, BadManifest):
+            return None
+        if manifest.key != key:
+            return None
+        self.finish(partial, folder, manifest)
+        return manifest
+
+    @staticmethod
+    def _tidy(folder: Path, keep: set[str]) -> None:
+        for path in sorted(folder.rglob("*"), reverse=True):
+            if path.is_dir() and not path.is_symlink():
+                if not any(path.iterdir()):
+                    path.rmdir()
+            elif path.relative_to(folder).as_posix() not in keep:
+                path.unlink()
 
     def read_run(self) -> dict[str, Any]:
         """run.json, or an empty run for a new workspace."""
@@ -140,6 +158,7 @@ class Workspace:
         for name in names:
             source, link = folder / name, output / Path(name).name
             if not source.exists():
+                _remove(link)
                 continue
             temporary = output / f".{link.name}.tmp"
             _remove(temporary)
@@ -150,6 +169,11 @@ class Workspace:
             if link.is_dir() and not link.is_symlink():
                 _remove(link)
             temporary.replace(link)
+
+    def unlink_outputs(self, names: tuple[str, ...]) -> None:
+        """Take ``output/<name>`` away, so that nothing there looks more current than it is."""
+        for name in names:
+            _remove(self.root / "output" / Path(name).name)
 
     def stale_folders(self, keys: dict[str, str], stages: list[str]) -> list[Path]:
         """Stage folders that run.json does not use: other keys, abandoned partials, damaged ones."""

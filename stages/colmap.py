@@ -34,8 +34,6 @@ SMALLEST_MODEL = 3
 VAGUE_PRINCIPAL_POINT = 0.005  # a standard deviation above this, and the centre is the better guess
 FARTHEST_PRINCIPAL_POINT = 0.1
 ROUND_TRIP_PX = 0.01  # a bearing that does not project back to its pixel is a false root of the distortion
-# More residuals than any scene has: Ceres then sums in one thread, and results do not depend on thread timing.
-NEVER_MULTI_THREADED = 2**31 - 1
 
 
 # --- camera models
@@ -283,7 +281,9 @@ def _pipeline_options(seed: int) -> "pycolmap.IncrementalPipelineOptions":
 
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
-    options.ba_min_num_residuals_for_cpu_multi_threading = NEVER_MULTI_THREADED
+    # With more threads RANSAC stops and Ceres sums as timing has it: rarely, but then every number is another.
+    # Mapping is no slower for it.
+    options.num_threads = options.mapper.num_threads = 1
     options.min_model_size = SMALLEST_MODEL
     pycolmap.set_random_seed(seed)
     return options
@@ -361,7 +361,7 @@ def _adjust(
     adjustment = pycolmap.BundleAdjustmentOptions(refine_principal_point=principal_point, print_summary=False)
     adjustment.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
     adjustment.ceres.solver_options.function_tolerance = 1e-6
-    adjustment.ceres.min_num_residuals_for_cpu_multi_threading = NEVER_MULTI_THREADED
+    adjustment.ceres.solver_options.num_threads = 1
     with pycolmap.Database.open(database) as db:
         wanted = pycolmap.DatabaseCacheOptions(min_num_matches=options.min_num_matches)
         cache = pycolmap.DatabaseCache.create(db, wanted)

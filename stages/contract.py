@@ -6,6 +6,7 @@ A stage is a module of this package with
 * ``VERSION: int``: raised whenever the same config and inputs would give other outputs than before;
 * ``RESUMES: bool``: whether it can go on from its own half-written folder (otherwise it starts clean);
 * ``LINKS: tuple[str, ...]``: the outputs or records shown in ``<workspace>/output/``;
+* optionally ``UNKEYED: tuple[str, ...]``: options that cannot change the result and so do not enter the key;
 * ``Config``: its settings, a :class:`StageConfig`;
 * ``run(config, inputs, folder, progress) -> StageResult``: reads ``inputs[stage]`` (finished folders), writes
   into ``folder`` and nowhere else, raises :class:`StageError` for everything a user can act on;

@@ -41,7 +41,7 @@ class Config(StageConfig):
 
     downscale: float | None = Field(None, ge=1)
     """How many times smaller than the photos to score. None: the size that the field was trained at."""
-    background: Literal["white", "black"] = "white"
+    background: Literal["white", "black"] | None = None
     """What photos with alpha are shown over; white is the habit of the NeRF-synthetic benchmark."""
     seed: int = 0
     """Of the interval."""
@@ -154,7 +154,8 @@ def _examiner(config: Config, scene: "Scene", inputs: Inputs, folder: Path) -> E
     assert config.downscale is not None
     device = compute_device()
     model, info = load_field(inputs["train"], device)
-    background = BACKGROUNDS[config.background] if scene.has_alpha else tuple(info["background"])
+    chosen = config.background if scene.has_alpha else None
+    background = tuple(info["background"]) if chosen is None else BACKGROUNDS[chosen]
     return Examiner(scene, inputs["ingest"], folder, model, device, config.downscale, background)
 
 

@@ -8,7 +8,9 @@ from stages.contract import StageError
 from stages.files import read_json, write_json
 
 if TYPE_CHECKING:
+    from nerf.grid_field import GridField
     from nerf.model import RadianceModel
+    from nerf.paper import PaperNerf
 
 
 def save_field(folder: Path, model: "RadianceModel", info: dict[str, Any]) -> None:
@@ -19,13 +21,15 @@ def save_field(folder: Path, model: "RadianceModel", info: dict[str, Any]) -> No
     """
     from safetensors.torch import save_file
 
+    from nerf.grid_field import GridField
     from nerf.paper import PaperNerf
 
-    if not isinstance(model, PaperNerf):
+    if not isinstance(model, PaperNerf | GridField):
         raise TypeError(f"no file format for a {type(model).__name__}")
+    kind = "grid" if isinstance(model, GridField) else "paper"
     weights = {name: tensor.detach().cpu().contiguous() for name, tensor in model.state_dict().items()}
     save_file(weights, folder / "field.safetensors")
-    write_json(folder / "field.json", {"kind": "paper", "settings": asdict(model.settings), **info})
+    write_json(folder / "field.json", {"kind": kind, "settings": asdict(model.settings), **info})
 
 
 def load_field(folder: Path, device: str = "cpu") -> "tuple[RadianceModel, dict[str, Any]]":
@@ -37,15 +41,23 @@ def load_field(folder: Path, device: str = "cpu") -> "tuple[RadianceModel, dict[
     from safetensors import SafetensorError
     from safetensors.torch import load_file
 
-    from nerf.paper import PaperNerf, PaperSettings
-
     info = read_json(folder / "field.json")
     try:
-        if info["kind"] != "paper":
-            raise ValueError(f"a field of kind {info['kind']!r} is unknown to this version")
-        model = PaperNerf(PaperSettings(**info["settings"]), seed=0)
+        model = _untrained(info["kind"], info["settings"])
         model.load_state_dict(load_file(folder / "field.safetensors"))
     except (OSError, KeyError, TypeError, ValueError, RuntimeError, SafetensorError) as error:
         why = " ".join(str(error).split())  # torch lists mismatches over several lines
         raise StageError("cannot read the trained field", why, "Run stage train again.") from error
     return model.to(device).requires_grad_(False), info
+
+
+def _untrained(kind: str, settings: dict[str, Any]) -> "PaperNerf | GridField":
+    from nerf.grid_field import GridField, GridSettings
+    from nerf.kernels import reference
+    from nerf.paper import PaperNerf, PaperSettings
+
+    if kind == "grid":
+        return GridField(GridSettings(**settings), 0, reference)
+    if kind == "paper":
+        return PaperNerf(PaperSettings(**settings), seed=0)
+    raise ValueError(f"a field of kind {kind!r} is unknown to this version")

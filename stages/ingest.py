@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 NEEDS: tuple[str, ...] = ()
 VERSION = 1
 RESUMES = False
-LINKS: tuple[str, ...] = ()
+LINKS = ("photos.json",)
 
 _MAX_WORKERS = 8  # each holds a few copies of one photo, up to 250 megapixels
 _MAX_NOTES = 10

@@ -21,8 +21,9 @@ if TYPE_CHECKING:
 NEEDS = ("ingest", "sfm")
 VERSION = 1
 RESUMES = False
-LINKS = ("transforms.json",)
+LINKS = ("transforms.json", "scene.json")
 
+FEWEST_TRAINING_VIEWS = 2
 FEWEST_VIEWS = 3  # one to hold out, two to train on
 FRUSTUM_SAMPLES = 32  # bearings along each side of a photo
 FULL_TURN_DEG = 320.0  # no gap wider than the step of nine photos around
@@ -63,6 +64,12 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
         raise StageError("the scene has no scale", str(error), hint) from error
     official = read_json(inputs["sfm"] / "registration.json")["test_files"]
     split = _split(photos, config.test_every, official)
+    if split.count("train") < FEWEST_TRAINING_VIEWS:
+        raise StageError(
+            f"only {split.count('train')} of {len(split)} photos are left to train on",
+            "the others are held out as test photos",
+            "Add training photos, or raise --normalise.test-every.",
+        )
     scene = _scene(sfm, photos, [model.images[i].camera for i in order], model.cameras, found, split)
     write_json(folder / "scene.json", scene.to_json())
     write_tensors(folder / "points.safetensors", _points(model, sfm, found))

@@ -26,6 +26,7 @@ NEEDS = ("ingest",)
 VERSION = 1
 RESUMES = True
 LINKS = ("sparse",)
+UNKEYED = ("max_seconds",)
 
 CameraModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE"]
 # The share of the whole where a phase begins, and how long it is (measured on 11 to 50 photos, two cores).
@@ -55,6 +56,7 @@ class Config(StageConfig):
     camera_model: CameraModel | None = None
     """COLMAP's camera model; None: SIMPLE_RADIAL, and RADIAL in the end where enough photos share a camera."""
     matcher: Literal["exhaustive"] = "exhaustive"
+    """Which pairs of photos are matched: all of them."""
     max_seconds: float = Field(default=4 * 3600.0, gt=0)
     """When structure-from-motion is given up; what was matched until then is kept for the next try."""
 

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from stages.training_loop import TrainingRun
 
 NEEDS = ("ingest", "normalise")
-VERSION = 1
+VERSION = 2
 RESUMES = True
 LINKS = ("curve.json",)
 
@@ -42,44 +42,73 @@ PRESETS = {
 }
 
 
-class Config(StageConfig):
-    """How to train. None is chosen for you: sizes by the preset, the rest by the scene and the budget."""
+# At first; both fall while training. Where space is folded a cell is met from farther away, and rays are longer.
+GRID_RATES = {"bounded": 2e-2, "contracted": 1e-2}
+GRID_SAMPLES = {"bounded": 1 << 14, "contracted": 24 << 10}
 
-    preset: Literal["small", "paper"] | None = Field(
-        default=None, description="sizes: paper is as published, none is small"
+GRID_ONLY = ("levels", "log2_rows", "finest", "batch_samples")
+PAPER_ONLY = (
+    *("preset", "batch_rays", "depth", "width", "skip", "position_frequencies", "direction_frequencies"),
+    *("samples_coarse", "samples_fine", "view_dependence", "positional_encoding", "hierarchical"),
+    *("density_activation", "spacing"),
+)
+
+
+class Config(StageConfig):
+    """How to train. None is chosen for you, by the scene and the budget.
+
+    The options of the paper field ask for that field: without one of them, none is the grid field.
+    """
+
+    field: Literal["grid", "paper"] | None = Field(
+        default=None, description="grid: minutes without a GPU; paper: the published networks; none: grid"
     )
     steps: int | None = Field(default=None, ge=1, description="train so many steps, with the same result every time")
     seconds: float | None = Field(
         default=None, gt=0, description="train so long; none, without steps, is three minutes"
     )
-    batch_rays: int | None = Field(default=None, ge=1, description="rays in a step; none: by the preset")
-    learning_rate: float | None = Field(
-        default=None, gt=0, description="at the start, falling to a tenth; none: by the preset"
-    )
+    learning_rate: float | None = Field(default=None, gt=0, description="at the start; none: by the field")
     seed: int = Field(default=0, description="of weights, batches and samples")
     downscale: float | None = Field(
         default=None, ge=1, description="photo width / trained width; none: as the budget allows"
     )
-    background: Literal["white", "black", "random"] = Field(
-        default="white", description="behind photos with transparency"
+    background: Literal["white", "black", "random"] | None = Field(
+        default=None, description="behind photos with transparency; none: random for grid, white for paper"
     )
-
-    depth: int | None = Field(default=None, ge=1, description="layers before the density")
-    width: int | None = Field(default=None, ge=2, description="of each layer")
-    skip: int | None = Field(default=None, ge=0, description="index of the layer after which the position enters again")
-    position_frequencies: int = Field(default=10, ge=1, description="L of the positional encoding of the position")
-    direction_frequencies: int = Field(default=4, ge=1, description="L of the positional encoding of the direction")
-    samples_coarse: int | None = Field(default=None, ge=2, description="on each ray, for the coarse network")
-    samples_fine: int | None = Field(
-        default=None, ge=1, description="on each ray, placed by the coarse network's weights"
-    )
-    view_dependence: bool = Field(default=True, description="let colour depend on the direction")
-    positional_encoding: bool = Field(default=True, description="lift coordinates to sines and cosines")
-    hierarchical: bool = Field(default=True, description="place fine samples by a coarse network")
-    density_activation: Literal["softplus", "relu"] = Field(default="softplus", description="relu is as published")
     contracted: bool | None = Field(default=None, description="fold in unbounded space; none: if the photos show any")
+
+    levels: int | None = Field(default=None, ge=1, le=16, description="grid: grids of features")
+    log2_rows: int | None = Field(default=None, ge=8, le=24, description="grid: rows of a grid's table, as power of 2")
+    finest: int | None = Field(default=None, ge=16, le=4096, description="grid: cells along an axis of the finest grid")
+    batch_samples: int | None = Field(default=None, ge=256, description="grid: colours computed in a step")
+
+    preset: Literal["small", "paper"] | None = Field(
+        default=None, description="paper: sizes, as published or small; none: small"
+    )
+    batch_rays: int | None = Field(default=None, ge=1, description="paper: rays in a step; none: by the preset")
+    depth: int | None = Field(default=None, ge=1, description="paper: layers before the density")
+    width: int | None = Field(default=None, ge=2, description="paper: of each layer")
+    skip: int | None = Field(
+        default=None, ge=0, description="paper: index of the layer after which the position enters again"
+    )
+    position_frequencies: int = Field(
+        default=10, ge=1, description="paper: L of the positional encoding of the position"
+    )
+    direction_frequencies: int = Field(
+        default=4, ge=1, description="paper: L of the positional encoding of the direction"
+    )
+    samples_coarse: int | None = Field(default=None, ge=2, description="paper: on each ray, for the coarse network")
+    samples_fine: int | None = Field(
+        default=None, ge=1, description="paper: on each ray, placed by the coarse network's weights"
+    )
+    view_dependence: bool = Field(default=True, description="paper: let colour depend on the direction")
+    positional_encoding: bool = Field(default=True, description="paper: lift coordinates to sines and cosines")
+    hierarchical: bool = Field(default=True, description="paper: place fine samples by a coarse network")
+    density_activation: Literal["softplus", "relu"] = Field(
+        default="softplus", description="paper: relu is as published"
+    )
     spacing: Literal["linear", "log"] | None = Field(
-        default=None, description="of coarse samples; none: log if contracted"
+        default=None, description="paper: of coarse samples; none: log if contracted"
     )
 
     checkpoint_seconds: float = Field(default=30.0, gt=0, description="between checkpoints")
@@ -91,26 +120,62 @@ class Config(StageConfig):
             raise ValueError(f"steps ({self.steps}) and seconds ({self.seconds:g}) are two budgets; give one")
         return self
 
+    @model_validator(mode="after")
+    def _one_field(self) -> "Config":
+        of_grid, of_paper = self._given(GRID_ONLY), self._given(PAPER_ONLY)
+        if of_grid and of_paper:
+            raise ValueError(f"{of_grid[0]} belongs to the grid field and {of_paper[0]} to the paper field; choose one")
+        if wrong := {"grid": of_paper, "paper": of_grid, None: []}[self.field]:
+            raise ValueError(f"{wrong[0]} does not belong to the {self.field} field; leave out one of the two")
+        return self
+
+    @property
+    def kind(self) -> Literal["grid", "paper"]:
+        """The field that these options ask for."""
+        return self.field or ("paper" if self._given(PAPER_ONLY) else "grid")
+
+    def _given(self, names: tuple[str, ...]) -> list[str]:
+        """Which of these options differ from their defaults, with their values."""
+        values = {name: getattr(self, name) for name in names}
+        return [f"{n} ({value})" for n, value in values.items() if value != type(self).model_fields[n].default]
+
 
 def plan(config: Config, inputs: Inputs) -> Config:
-    """Everything that was left open: preset and sizes, budget, contraction from the scene, then the photos' size."""
+    """Everything that was left open: field and budget, contraction from the scene, then sizes and the photos' size."""
     scene = read_scene(inputs["normalise"])
-    preset = config.preset or "small"
+    seconds = DEFAULT_SECONDS if config.steps is None and config.seconds is None else config.seconds
     contracted = not scene.bounded if config.contracted is None else config.contracted
-    chosen: dict[str, Any] = {
-        "preset": preset,
-        "seconds": DEFAULT_SECONDS if config.steps is None and config.seconds is None else config.seconds,
-        "contracted": contracted,
-        "spacing": config.spacing or ("log" if contracted else "linear"),
-    }
-    chosen |= {name: value for name, value in PRESETS[preset].items() if getattr(config, name) is None}
+    chosen = {"field": config.kind, "seconds": seconds, "contracted": contracted}
     config = config.model_copy(update=chosen)
-    if config.downscale is None:
-        from stages.training_setup import rays_in_budget
-        from stages.training_size import chosen_downscale
+    config = _filled(config, _grid_habits(config) if config.kind == "grid" else _paper_habits(config))
+    if config.downscale is None or (config.kind == "grid" and None in (config.levels, config.log2_rows, config.finest)):
+        from stages.training_size import chosen_downscale, grid_size, rays_in_budget
 
-        config = config.model_copy(update={"downscale": chosen_downscale(scene, rays_in_budget(config, scene))})
+        rays = rays_in_budget(config, scene)
+        config = _filled(config, {"downscale": chosen_downscale(scene, rays)})
+        if config.kind == "grid":
+            config = _filled(config, grid_size(config, scene, rays))
     return config
+
+
+def _grid_habits(config: Config) -> dict[str, Any]:
+    space = "contracted" if config.contracted else "bounded"
+    return {
+        "background": "random",
+        "learning_rate": GRID_RATES[space],
+        "batch_samples": GRID_SAMPLES[space],
+    }
+
+
+def _paper_habits(config: Config) -> dict[str, Any]:
+    preset = config.preset or "small"
+    spacing = "log" if config.contracted else "linear"
+    return {"background": "white", "preset": preset, "spacing": spacing, **PRESETS[preset]}
+
+
+def _filled(config: Config, values: dict[str, Any]) -> Config:
+    """``config`` with ``values`` where it holds None."""
+    return config.model_copy(update={name: v for name, v in values.items() if getattr(config, name) is None})
 
 
 def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> StageResult:
@@ -141,7 +206,7 @@ def _result(config: Config, training: "TrainingRun", folder: Path) -> StageResul
     left_behind = sorted(path.name for path in folder.glob("nonfinite_*.safetensors"))
     board = ["tensorboard"] if config.tensorboard else []
     facts = {
-        "field": config.preset,
+        "field": config.field,
         "steps": state.step,
         "train_seconds": round(state.seconds, 3),
         "rays_per_second": round(speed, 1),

@@ -1,22 +1,29 @@
 """From settings and photos to a training run that is ready for its first step, or its next one after a kill."""
 
-from dataclasses import fields, replace
+from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from stages.contract import Inputs, Progress
 from stages.device import compute_device
 from stages.live_line import short_count
 
 if TYPE_CHECKING:
+    from nerf.grid_field import GridSettings
+    from nerf.grid_training import GridTrainerSettings
     from nerf.paper import PaperSettings
     from nerf.ray_bank import RayBank
     from nerf.scene import Scene
-    from nerf.training import TrainerSettings
+    from nerf.training import FieldTrainer, TrainerSettings
     from stages.train import Config
     from stages.training_loop import TrainingRun
 
-FINAL_RATE = 0.1  # of the learning rate at the start
+FINAL_RATE = 0.1  # of the paper field's learning rate at the start
+# Weight of the distortion loss (Barron et al. 2022) in folded space, against matter close before the cameras. A box
+# around an object needs none.
+DISTORTION = 1e-3
+COARSEST = 16
+FEWEST_STEPS, MOST_STEPS = 256, 384  # along the diagonal of a bounded scene's box
 PROBE_RAYS = 2048
 WHITE, BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
 
@@ -25,9 +32,7 @@ def prepare(config: "Config", scene: "Scene", inputs: Inputs, folder: Path, prog
     """Load the photos and put everything in place for the first step, or the next after a kill."""
     import torch
 
-    from nerf.paper import PaperNerf
     from nerf.probe import make_probe
-    from nerf.training import PaperTrainer
     from stages.training_data import training_bank
     from stages.training_log import TrainingLog
     from stages.training_loop import Budget, Probes, TrainingRun
@@ -36,7 +41,6 @@ def prepare(config: "Config", scene: "Scene", inputs: Inputs, folder: Path, prog
     device = compute_device()
     progress.update("reading the photos")
     bank = training_bank(inputs["ingest"], scene, "train", config.downscale).to(device)
-    settings, field = trainer_settings(config, scene), field_settings(config)
     shown_over = torch.tensor(field_background(config, scene), device=device)
 
     heldout = None
@@ -44,13 +48,8 @@ def prepare(config: "Config", scene: "Scene", inputs: Inputs, folder: Path, prog
         unseen = training_bank(inputs["ingest"], scene, "test", config.downscale).to(device)
         heldout = make_probe(unseen, PROBE_RAYS, shown_over, config.seed)
     _say_sizes(config, bank, progress)
-
-    def make_trainer(attempt: int) -> PaperTrainer:
-        seed = config.seed + attempt
-        return PaperTrainer(PaperNerf(field, seed).to(device), bank, replace(settings, seed=seed))
-
     return TrainingRun(
-        make_trainer,
+        lambda attempt: make_trainer(config, scene, bank, config.seed + attempt),
         Probes(make_probe(bank, PROBE_RAYS, shown_over, config.seed), heldout),
         Budget(config.steps, config.seconds),
         folder,
@@ -60,39 +59,83 @@ def prepare(config: "Config", scene: "Scene", inputs: Inputs, folder: Path, prog
     )
 
 
+def make_trainer(config: "Config", scene: "Scene", bank: "RayBank", seed: int) -> "FieldTrainer":
+    """A fresh field of the kind that ``config`` asks for, with its trainer, where ``bank`` is."""
+    if config.field == "grid":
+        from nerf.grid_field import GridField
+        from nerf.grid_training import GridTrainer
+        from nerf.kernels import reference
+
+        model = GridField(grid_settings(config), seed, reference).to(bank.device)
+        return GridTrainer(model, bank, grid_trainer_settings(config, scene, seed))
+    from nerf.paper import PaperNerf
+    from nerf.training import PaperTrainer
+
+    published = PaperNerf(paper_settings(config), seed).to(bank.device)
+    return PaperTrainer(published, bank, paper_trainer_settings(config, scene, seed))
+
+
 def _say_sizes(config: "Config", bank: "RayBank", progress: Progress) -> None:
     budget = f"{config.steps:,} steps" if config.steps is not None else f"{config.seconds:g} s"
     photos = f"{len(bank.near)} photos at 1/{config.downscale:g} of their size"
-    progress.note(f"{config.preset} field, {budget} · {photos}, {short_count(len(bank.pixels))} pixels")
+    sizes = f"{config.levels} grids to {config.finest}³" if config.field == "grid" else config.preset
+    progress.note(f"{config.field} field ({sizes}), {budget} · {photos}, {short_count(len(bank.pixels))} pixels")
 
 
-def field_settings(config: "Config") -> "PaperSettings":
+def grid_settings(config: "Config") -> "GridSettings":
+    """Sizes of the grid field. Samples stand as close as the finest cells can tell them apart: in folded space half a
+    cell (it is 4 wide), growing with the distance from where the cells do; in a box two steps to three cells."""
+    from nerf.grid_field import GridSettings
+
+    assert config.levels and config.log2_rows and config.finest and config.contracted is not None, "plan() chooses them"
+    return GridSettings(
+        levels=config.levels,
+        log2_rows=config.log2_rows,
+        coarsest=min(COARSEST, config.finest),
+        finest=config.finest,
+        contracted=config.contracted,
+        steps=min(max(config.finest, FEWEST_STEPS), MOST_STEPS),
+        shortest_step=2 / config.finest,
+        cone=8 / config.finest,
+    )
+
+
+def grid_trainer_settings(config: "Config", scene: "Scene", seed: int) -> "GridTrainerSettings":
+    """How the grid field is trained."""
+    from nerf.grid_training import GridTrainerSettings
+
+    assert config.batch_samples is not None and config.learning_rate is not None, "plan() chooses them"
+    return GridTrainerSettings(
+        seed=seed,
+        background=_trained_over(config, scene),
+        samples=config.batch_samples,
+        rate=config.learning_rate,
+        distortion=DISTORTION if config.contracted else 0.0,
+    )
+
+
+def paper_settings(config: "Config") -> "PaperSettings":
+    """Sizes and ablations of the paper field."""
     from nerf.paper import PaperSettings
 
     return PaperSettings(**{part.name: getattr(config, part.name) for part in fields(PaperSettings)})
 
 
-def trainer_settings(config: "Config", scene: "Scene") -> "TrainerSettings":
+def paper_trainer_settings(config: "Config", scene: "Scene", seed: int) -> "TrainerSettings":
+    """How the paper field is trained."""
     from nerf.training import TrainerSettings
 
-    background = "random" if scene.has_alpha and config.background == "random" else field_background(config, scene)
     assert config.batch_rays is not None and config.learning_rate is not None, "plan() chooses them"
     rates = (config.learning_rate, config.learning_rate * FINAL_RATE)
-    return TrainerSettings(config.batch_rays, config.seed, background, *rates)
+    return TrainerSettings(config.batch_rays, seed, _trained_over(config, scene), *rates)
+
+
+def _trained_over(config: "Config", scene: "Scene") -> tuple[float, float, float] | Literal["random"]:
+    """What lies behind the scene while training; random only where alpha says how much of it is seen."""
+    return "random" if scene.has_alpha and config.background == "random" else field_background(config, scene)
 
 
 def field_background(config: "Config", scene: "Scene") -> tuple[float, float, float]:
     """What the finished field is shown over. Photos without alpha fill every ray; what a field leaves open is black,
     as published."""
     return WHITE if scene.has_alpha and config.background != "black" else BLACK
-
-
-def rays_in_budget(config: "Config", scene: "Scene") -> float:
-    """How many rays the run will draw: counted for a budget of steps, from measured speed for one of seconds."""
-    from stages.training_size import rays_per_second
-
-    settings = trainer_settings(config, scene)
-    if config.steps is not None:
-        return float(config.steps * settings.batch_rays)
-    assert config.seconds is not None, "one of the two is given"
-    return config.seconds * rays_per_second(scene, field_settings(config), settings, compute_device())

@@ -1,20 +1,29 @@
-"""At what size to train: as large as the budget can make use of."""
+"""At what size to train, photos and field: as large as the budget can make use of."""
 
 import math
 import time
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from stages.device import compute_device
+from stages.training_setup import make_trainer
+
 if TYPE_CHECKING:
-    from nerf.paper import PaperSettings
     from nerf.ray_bank import RayBank
     from nerf.scene import Scene
-    from nerf.training import TrainerSettings
+    from stages.train import Config
 
 LEAST_LONG_SIDE = 150  # pixels: below this a photo shows too little to judge anything by
 TIMED_SECONDS = 1.0
 MOST_TIMED_RAYS = {"cpu": 256, "cuda": 1 << 20}
 """A CPU is as fast on small batches, and a small one keeps the published model's steps short; a GPU is not."""
+SAMPLES_PER_RAY = {"bounded": 10, "contracted": 80}
+"""Colours that the grid field computes for a ray, over a run: measured on lego_400 and fox."""
+GRID_SIZES = {
+    "bounded": ((50e6, 5, 18, 512), (0, 4, 17, 256)),
+    "contracted": ((100e6, 6, 18, 1024), (40e6, 5, 18, 512), (0, 4, 17, 256)),
+}
+"""(computed colours from which on it pays, levels, log2 of rows, most cells along an axis), the largest first."""
+LEAST_FINEST = 128
 
 
 def chosen_downscale(scene: "Scene", rays: float) -> float:
@@ -30,20 +39,61 @@ def chosen_downscale(scene: "Scene", rays: float) -> float:
     return max(1.0, math.floor(10 * min(math.sqrt(pixels / rays), most)) / 10)
 
 
-def rays_per_second(scene: "Scene", field: "PaperSettings", trainer: "TrainerSettings", device: str) -> float:
-    """Measured training speed: steps of a fresh field on a grey picture, for about a second."""
-    from nerf.paper import PaperNerf
-    from nerf.training import PaperTrainer
+def grid_size(config: "Config", scene: "Scene", rays: float) -> dict[str, int]:
+    """Sizes of a grid field that sees ``rays`` at ``config.downscale``: more and larger tables where there are enough
+    to fill them. The finest cells are about as wide as a pixel where the region of interest fills the photo."""
+    from nerf.kernels import BOX, CONTRACTED_BOX
 
-    batch_rays = min(trainer.batch_rays, MOST_TIMED_RAYS[device])
-    model = PaperNerf(field, seed=0).to(device)
-    timed = PaperTrainer(model, _grey_bank(scene).to(device), replace(trainer, batch_rays=batch_rays))
-    timed.step(0, 0.0)  # the first step pays for memory and kernels
+    assert config.downscale is not None
+    samples = rays * SAMPLES_PER_RAY[_space(config)]
+    levels, log2_rows, most = next(sizes for least, *sizes in GRID_SIZES[_space(config)] if samples >= least)
+    cameras = [scene.cameras[view.camera] for view in scene.of_split("train")]
+    pixels = max(max(camera.width, camera.height) for camera in cameras) / config.downscale
+    across = pixels * (CONTRACTED_BOX / BOX if config.contracted else 1)
+    finest = max(LEAST_FINEST, min(most, 2 ** math.ceil(math.log2(across))))
+    return {"levels": levels, "log2_rows": log2_rows, "finest": finest}
+
+
+def rays_in_budget(config: "Config", scene: "Scene") -> float:
+    """How many rays the run will draw: counted for a budget of steps, from measured speed for one of seconds."""
+    if config.steps is not None:
+        return config.steps * _rays_per_step(config)
+    assert config.seconds is not None, "one of the two is given"
+    return config.seconds * rays_per_second(config, scene)
+
+
+def rays_per_second(config: "Config", scene: "Scene") -> float:
+    """Measured training speed: steps of a fresh field on a grey picture, for about a second."""
+    device = compute_device()
+    config = _timed(config, device)
+    trainer = make_trainer(config, scene, _grey_bank(scene).to(device), seed=0)
+    trainer.step(0, 0.0, 1.0)  # the first step pays for memory and kernels
     started, steps = time.perf_counter(), 0
     while steps == 0 or time.perf_counter() - started < TIMED_SECONDS:
         steps += 1
-        timed.step(steps, 0.0)
-    return steps * batch_rays / (time.perf_counter() - started)
+        trainer.step(steps, 0.0, 1.0)
+    return steps * _rays_per_step(config) / (time.perf_counter() - started)
+
+
+def _timed(config: "Config", device: str) -> "Config":
+    """Settings under which speed is measured before the grids' sizes are known."""
+    if config.field == "paper":
+        assert config.batch_rays is not None
+        return config.model_copy(update={"batch_rays": min(config.batch_rays, MOST_TIMED_RAYS[device])})
+    sizes = {"levels": config.levels or 5, "log2_rows": config.log2_rows or 18, "finest": config.finest or 512}
+    return config.model_copy(update=sizes)
+
+
+def _rays_per_step(config: "Config") -> float:
+    if config.field == "paper":
+        assert config.batch_rays is not None
+        return config.batch_rays
+    assert config.batch_samples is not None
+    return config.batch_samples / SAMPLES_PER_RAY[_space(config)]
+
+
+def _space(config: "Config") -> str:
+    return "contracted" if config.contracted else "bounded"
 
 
 def _grey_bank(scene: "Scene") -> "RayBank":

@@ -59,7 +59,7 @@ def test_the_videos_hold_their_frames(output: Path):
     from stages.video import read_video
 
     for name in ("video.mp4", "depth.mp4"):
-        frames = read_video(output / name)
+        frames, _ = read_video(output / name)
         assert frames.shape[0] == 4
         assert frames.shape[2] == 48
         assert frames.std() > 1, f"{name} shows nothing"

@@ -177,6 +177,12 @@ def test_a_state_of_another_architecture_is_refused() -> None:
         trainer().load_state(other.state())
 
 
+def test_a_state_of_equal_shapes_but_other_settings_is_refused() -> None:
+    other = trainer(field=replace(FIELD, steps=33))
+    with pytest.raises(RuntimeError, match="another field: settings differ"):
+        trainer().load_state(other.state())
+
+
 def test_a_density_cache_of_an_unbounded_scene_has_finite_steps_everywhere() -> None:
     model = GridField(replace(FIELD, contracted=True), 0, reference)
     cache = GridTrainer(model, small_bank(), TRAINER).cache

@@ -122,14 +122,10 @@ def test_every_observed_point_but_outliers_lies_between_near_and_far(layout: str
     assert (found.near < 0.999 * found.far).all()
 
 
-def test_alpha_and_a_closed_room_are_bounded_and_a_far_background_is_not() -> None:
+def test_only_alpha_proves_that_nothing_lies_beyond() -> None:
     around = SCENES["around"]()
-    backdrop = 40 * ball(60)
-    backdrop = backdrop[np.linalg.norm(backdrop, axis=1) > 20]
     assert normalise(around, True, None).bounded
-    assert normalise(around, False, None).bounded
-    assert normalise(SCENES["inside"](), False, None).bounded
-    assert not normalise(with_points(around, backdrop, views=4), False, None).bounded
+    assert not normalise(around, False, None).bounded, "sky and plain walls have no points"
 
 
 def test_unbounded_scenes_reach_far_behind_the_farthest_point() -> None:
@@ -166,8 +162,6 @@ def test_a_given_region_is_taken_as_it_is() -> None:
     found = normalise(scene, False, (0.2, -0.1, 0.3, 2.5))
     np.testing.assert_allclose(found.scene_from_sfm.points(np.array([0.2, -0.1, 0.3])), 0, atol=1e-12)
     assert region_half(found) == pytest.approx(2.5)
-    assert found.bounded
-    assert not normalise(scene, False, (0.0, 0.0, 0.0, 0.3)).bounded
 
 
 def test_photos_from_one_place_without_points_have_no_scale() -> None:

@@ -109,11 +109,53 @@ def test_a_finished_workspace_outlives_its_photos(bring: Bring, photos: Path, tm
 
 def test_a_plan_stands_until_the_options_change_or_replan(bring: Bring, tmp_path: Path):
     bring()
-    assert json.loads((tmp_path / "w.nerf/run.json").read_text())["plans"]["sfm"]["config"]["offset"] == 5
+    (plan,) = json.loads((tmp_path / "w.nerf/run.json").read_text())["plans"]["sfm"].values()
+    assert plan["offset"] == 5
     bring(train={"steps": 9})
     assert "plan sfm" not in calls
     bring(replan=True)
     assert calls == ["plan sfm"]  # the same answer: the same key, nothing runs
+
+
+def test_going_back_to_old_options_finds_the_old_plan(bring: Bring):
+    bring(sfm={"fail": False})
+    bring(sfm={"offset": 9})
+    bring(sfm={"fail": False})
+    assert calls == []
+
+
+def test_a_kill_between_manifest_and_rename_loses_nothing(bring: Bring, tmp_path: Path):
+    bring()
+    (folder,) = (tmp_path / "w.nerf/train").iterdir()
+    partial = folder.with_name(folder.name + ".partial")
+    folder.rename(partial)
+    (partial / "checkpoint.json").write_text("9")  # what finish() had not yet dropped
+    bring()
+    assert calls == []
+    assert sorted(p.name for p in folder.iterdir()) == ["manifest.json", "result.json"]
+
+
+def test_options_that_cannot_change_the_result_do_not_run_it_again(bring: Bring, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(fake_stages.STAGES["train"], "UNKEYED", ("die_at",), raising=False)
+    bring()
+    bring(train={"die_at": 99})
+    assert calls == []
+
+
+def test_output_shows_nothing_of_other_settings(bring: Bring, tmp_path: Path):
+    bring()
+    output = tmp_path / "w.nerf/output"
+    assert (output / "result.json").is_file()
+    bring(stages=("ingest", "sfm"), sfm={"offset": 1})
+    assert (output / "deep/number.json").is_file()
+    assert not (output / "result.json").is_symlink(), "the result of train belongs to another sfm"
+
+
+def test_a_failed_stage_leaves_no_old_link(bring: Bring, tmp_path: Path):
+    bring()
+    with pytest.raises(StageFailed):
+        bring(sfm={"fail": True})
+    assert not (tmp_path / "w.nerf/output/deep").exists()
 
 
 def test_force_runs_again_and_replaces(bring: Bring, tmp_path: Path):

@@ -26,7 +26,7 @@ def test_a_field_comes_back_the_same(kind: str, tmp_path: Path) -> None:
     with torch.no_grad():
         seen = model.render(rays, torch.ones(3))
         assert all(torch.equal(*pair) for pair in zip(seen, loaded.render(rays, torch.ones(3)), strict=True))
-    assert 0 < seen.opacity.min() and seen.colour.std() > 0
+    assert seen.opacity.min() > 0 and seen.colour.std() > 0
     assert {key: info[key] for key in INFO} == INFO
     assert info["kind"] == kind
     assert info["settings"]["contracted"] is True
@@ -46,17 +46,6 @@ def test_a_loaded_field_asks_for_no_gradients(kind: str, tmp_path: Path) -> None
     save_field(tmp_path, KINDS[kind], INFO)
     loaded, _ = load_field(tmp_path)
     assert not loaded.density(torch.zeros(2, 3)).requires_grad
-
-
-def test_weights_of_equal_shape_but_another_grid_are_refused(tmp_path: Path) -> None:
-    model = KINDS["grid"]
-    save_field(tmp_path, model, INFO)
-    info = read_json(tmp_path / "field.json")
-    other = info["settings"] | {"steps": 99}
-    assert load_field(tmp_path)[1] == info
-    write_json(tmp_path / "field.json", info | {"settings": other})
-    with pytest.raises(StageError, match="cannot read the trained field: .*were not written with these settings"):
-        load_field(tmp_path)
 
 
 @pytest.mark.parametrize("harm", ["cut weights", "no weights", "another kind", "another size", "unknown setting"])

@@ -82,7 +82,7 @@ def test_views_are_in_order_of_name_with_their_own_poses_and_observations(inputs
 
 def test_the_line_says_what_was_decided(inputs, progress) -> None:
     result = run(inputs(), progress)
-    assert result.line == "360° around an object, all within the region of interest · up from level horizons"
+    assert result.line == "360° around an object, background unbounded · up from level horizons"
     assert result.facts["train"] + result.facts["test"] == 17
 
 

@@ -4,8 +4,10 @@ from pathlib import Path
 import pytest
 from pydantic import ValidationError
 
+from nerf.grid_training import GridTrainer
 from nerf.training import PaperTrainer
 from stages import train
+from stages.contract import StageError
 from stages.field_files import load_field
 from stages.files import read_json
 from stages.train import Config
@@ -21,6 +23,8 @@ TINY = {
     "downscale": 1.0,
     "learning_rate": 5e-3,
 }
+TINY_GRID = {"levels": 2, "log2_rows": 10, "finest": 32, "batch_samples": 1024, "downscale": 1.0}
+TRAINERS = {"grid": GridTrainer, "paper": PaperTrainer}
 OUTPUTS = ("field.safetensors", "field.json")
 
 
@@ -30,7 +34,8 @@ class Killed(BaseException):
 
 def trained(folder: Path, inputs: dict[str, Path], progress, **settings):
     folder.mkdir(exist_ok=True)
-    return train.run(Config(**(TINY | settings)), inputs, folder, progress)
+    tiny = TINY_GRID if settings.get("field") == "grid" else TINY
+    return train.run(Config(**(tiny | settings)), inputs, folder, progress)
 
 
 def test_photos_become_a_field_that_beats_a_flat_colour(tmp_path: Path, progress) -> None:
@@ -46,24 +51,38 @@ def test_photos_become_a_field_that_beats_a_flat_colour(tmp_path: Path, progress
     assert result.line.endswith(f"held out {result.facts['heldout_psnr']:.1f} dB")
     curve = read_json(tmp_path / "train" / "curve.json")
     assert curve[-1]["step"] == 120 and set(curve[-1]) == {"step", "seconds", "train_psnr", "heldout_psnr"}
-    assert progress.notes[0] == "small field, 120 steps · 6 photos at 1/1 of their size, 2.3 k pixels"
+    assert progress.notes[0] == "paper field (small), 120 steps · 6 photos at 1/1 of their size, 2.3 k pixels"
 
 
+def test_the_grid_field_trains_from_photos_too(tmp_path: Path, progress) -> None:
+    inputs, _ = photographed(tmp_path, channels=4)
+    result = trained(tmp_path / "train", inputs, progress, field="grid", steps=120)
+    flat = 11.0  # dB, of the best single colour
+    assert flat + 2 < result.facts["heldout_psnr"] < 60
+    _, info = load_field(tmp_path / "train")
+    assert (info["kind"], info["background"], result.facts["field"]) == ("grid", [1, 1, 1], "grid")
+    assert (info["settings"]["levels"], info["settings"]["finest"]) == (2, 32)
+    assert 120 * 8 < info["rays"] < 120 * 8192
+    assert progress.notes[0] == "grid field (2 grids to 32³), 120 steps · 6 photos at 1/1 of their size, 2.3 k pixels"
+
+
+@pytest.mark.parametrize("field", TRAINERS)
 def test_forty_steps_are_twenty_a_kill_and_twenty_more(
-    tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch
+    field: str, tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     inputs, _ = photographed(tmp_path, channels=4)
-    settings = {"steps": 40, "background": "random", "checkpoint_seconds": 1e-9}
+    settings = {"field": field, "steps": 40, "background": "random", "checkpoint_seconds": 1e-9}
     trained(tmp_path / "whole", inputs, progress, **settings)
-    step = PaperTrainer.step
+    trainer = TRAINERS[field]
+    step = trainer.step
 
-    def killed(self: PaperTrainer, number: int, *rest: float):
+    def killed(self: object, number: int, *rest: float):
         if number == 20:
             raise Killed
         return step(self, number, *rest)
 
     with monkeypatch.context() as patch:
-        patch.setattr(PaperTrainer, "step", killed)
+        patch.setattr(trainer, "step", killed)
         with pytest.raises(Killed):
             trained(tmp_path / "cut", inputs, progress, **settings)
     assert not (tmp_path / "cut" / "field.json").exists()
@@ -73,6 +92,34 @@ def test_forty_steps_are_twenty_a_kill_and_twenty_more(
         assert (tmp_path / "cut" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
     final = "checkpoints/000000040.safetensors"  # the optimiser, too
     assert (tmp_path / "cut" / final).read_bytes() == (tmp_path / "whole" / final).read_bytes()
+
+
+def test_a_grid_field_that_diverges_is_rolled_back(tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch) -> None:
+    inputs, _ = photographed(tmp_path, channels=4)
+    step, broken = GridTrainer.step, []
+
+    def poisoned(self: GridTrainer, number: int, *rest: float):
+        if number == 30 and not broken:
+            broken.append(number)
+            self.model.colour_out[0, 0] = float("nan")
+        return step(self, number, *rest)
+
+    monkeypatch.setattr(GridTrainer, "step", poisoned)
+    result = trained(tmp_path / "train", inputs, progress, field="grid", steps=60)
+    assert result.facts["rollbacks"] == 1
+    assert "nonfinite_30.safetensors" in result.records
+    assert any("the loss of step 30 is not finite: back to step" in note for note in progress.notes)
+    assert 13 < result.facts["heldout_psnr"] < 60
+
+
+def test_a_grid_field_that_stays_empty_is_given_up_by_name(
+    tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    inputs, _ = photographed(tmp_path, channels=4)
+    monkeypatch.setattr("stages.training_loop.WARM_UP_STEPS", 3)
+    monkeypatch.setattr("nerf.grid_field.grid_mlp.DensityPass.sigma", property(lambda self: 0 * self.geometry[:, 0]))
+    with pytest.raises(StageError, match=r"the field does not learn: after 3 steps it is empty .* 3 different seeds"):
+        trained(tmp_path / "train", inputs, progress, field="grid", steps=20)
 
 
 def test_another_seed_is_another_field(tmp_path: Path, progress) -> None:
@@ -104,10 +151,54 @@ def test_two_budgets_are_refused_in_words() -> None:
         Config(steps=500, seconds=60)
 
 
-def test_plan_answers_everything_and_is_its_own_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"field": "grid", "width": 64}, r"width \(64\) does not belong to the grid field; leave out one of the two"),
+        ({"field": "grid", "preset": "paper"}, r"preset \(paper\) does not belong to the grid field"),
+        ({"field": "grid", "hierarchical": False}, r"hierarchical \(False\) does not belong to the grid field"),
+        ({"field": "paper", "levels": 4}, r"levels \(4\) does not belong to the paper field"),
+        ({"finest": 64, "depth": 4}, r"finest \(64\) belongs to the grid field and depth \(4\) to the paper field"),
+    ],
+)
+def test_contradicting_options_are_refused_in_words(given: dict, message: str) -> None:
+    with pytest.raises(ValidationError, match=message):
+        Config(**given)
+
+
+def test_options_of_the_paper_field_ask_for_it() -> None:
+    for given in ({"preset": "paper"}, {"width": 64}, {"view_dependence": False}, {"field": "paper"}):
+        assert Config(**given).kind == "paper"
+    for given in ({}, {"steps": 3}, {"learning_rate": 1e-3}, {"levels": 4}, {"contracted": True}, {"field": "grid"}):
+        assert Config(**given).kind == "grid"
+
+
+def test_every_option_is_shared_or_of_one_field() -> None:
+    shared = {"field", "steps", "seconds", "learning_rate", "seed", "downscale", "background", "contracted"}
+    shared |= {"checkpoint_seconds", "tensorboard"}
+    assert sorted([*shared, *train.GRID_ONLY, *train.PAPER_ONLY]) == sorted(Config.model_fields)
+
+
+@pytest.mark.parametrize("bounded", [True, False])
+def test_plan_answers_everything_for_the_grid_field(
+    bounded: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("stages.training_size.TIMED_SECONDS", 0.01)
+    inputs, _ = photographed(tmp_path, bounded=bounded)
+    planned = train.plan(Config(), inputs)
+    assert (planned.field, planned.seconds, planned.contracted) == ("grid", 180, not bounded)
+    assert (planned.downscale, planned.background) == (1.0, "random")
+    assert planned.levels and planned.log2_rows and planned.finest and planned.batch_samples
+    assert planned.learning_rate == train.GRID_RATES["bounded" if bounded else "contracted"]
+    assert train.plan(Config.model_validate(planned.model_dump()), inputs) == planned
+    assert train.plan(Config(levels=3, finest=64), inputs).levels == 3
+
+
+def test_plan_answers_everything_for_the_paper_field(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("stages.training_size.TIMED_SECONDS", 0.01)
     inputs, _ = photographed(tmp_path)
     planned = train.plan(Config(batch_rays=8), inputs)
+    assert (planned.field, planned.background, planned.levels) == ("paper", "white", None)
     assert (planned.preset, planned.depth, planned.width) == ("small", 4, 64)
     assert (planned.samples_coarse, planned.samples_fine) == (32, 32)
     assert (planned.batch_rays, planned.learning_rate) == (8, 5e-3)

@@ -5,11 +5,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nerf.paper import PaperSettings
+from nerf.grid_field import GridSettings
 from nerf.scene import Camera, Scene
-from nerf.training import TrainerSettings
+from stages.train import Config
 from stages.training_data import scaled_size
-from stages.training_size import LEAST_LONG_SIDE, chosen_downscale, rays_per_second
+from stages.training_setup import grid_settings
+from stages.training_size import LEAST_LONG_SIDE, chosen_downscale, grid_size, rays_in_budget, rays_per_second
 from tests.stages.photo_scene import photographed
 
 
@@ -45,9 +46,47 @@ def test_more_rays_never_mean_smaller_photos(scene: Scene, rays: float, factor: 
     assert chosen_downscale(sized, rays * factor) <= chosen_downscale(sized, rays)
 
 
-def test_the_speed_is_measured_on_this_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+GRID = Config(field="grid", steps=100, contracted=False, batch_samples=4096, learning_rate=1e-2, background="random")
+PAPER = Config(
+    field="paper",
+    seconds=10.0,
+    depth=1,
+    width=8,
+    skip=1,
+    samples_coarse=2,
+    samples_fine=2,
+    contracted=False,
+    spacing="linear",
+    batch_rays=64,
+    learning_rate=5e-3,
+)
+
+
+@pytest.mark.parametrize("config", [GRID, PAPER], ids=["grid", "paper"])
+def test_the_speed_is_measured_on_this_machine(config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("stages.training_size.TIMED_SECONDS", 0.05)
     _, scene = photographed(tmp_path, channels=4)
-    field = PaperSettings(depth=1, width=8, samples_coarse=2, samples_fine=2)
-    speed = rays_per_second(scene, field, TrainerSettings(64, 0, (1.0, 1.0, 1.0)), "cpu")
-    assert 10 < speed < 1e7
+    assert 10 < rays_per_second(config, scene) < 1e7
+
+
+def test_a_budget_of_steps_is_counted_not_timed(scene: Scene) -> None:
+    assert rays_in_budget(PAPER.model_copy(update={"steps": 5, "seconds": None}), scene) == 5 * 64
+    in_box, folded = (rays_in_budget(GRID.model_copy(update={"contracted": c}), scene) for c in (False, True))
+    assert 100 * 4096 / 100 < folded < in_box < 100 * 4096
+
+
+@given(st.floats(1e3, 1e9), st.floats(1, 100), st.floats(1, 20), st.booleans())
+def test_grids_grow_with_rays_and_pixels(scene: Scene, rays: float, factor: float, down: float, folded: bool) -> None:
+    sized, config = of_size(scene, 3000, 2000), GRID.model_copy(update={"contracted": folded})
+
+    def chosen(rays: float, downscale: float) -> dict[str, int]:
+        return grid_size(config.model_copy(update={"downscale": downscale}), sized, rays)
+
+    small, more_rays, fewer_pixels = chosen(rays, down), chosen(rays * factor, down), chosen(rays, down * factor)
+    assert all(more_rays[name] >= small[name] >= fewer_pixels[name] for name in small)
+    field = grid_settings(config.model_copy(update=small))
+    assert isinstance(field, GridSettings)
+    assert 128 <= field.finest <= 1024
+    # Two neighbouring samples lie in the same or in neighbouring cells of the finest grid, near the cameras at least.
+    cells_per_step = field.lattice.step * field.finest / (4 if folded else 1.8)
+    assert 0.3 < cells_per_step < 5
