@@ -65,7 +65,7 @@ def sheet(folders: dict[str, Path], file: Path) -> None:
     """One row per variant: the same four test photos as each of them renders them."""
     rows = []
     for folder in folders.values():
-        pictures = [Image.open(p) for p in sorted((folder / "renders").iterdir())[::6][:4]]
+        pictures = [Image.open(p) for p in sorted((folder / "renders").rglob("*.png"))[::6][:4]]
         row = Image.new("RGB", (sum(p.width for p in pictures), pictures[0].height))
         for index, picture in enumerate(pictures):
             row.paste(picture, (index * picture.width, 0))

@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from nerf.depth_range import REGION_HALF, near_and_far
 from nerf.reconstruction import Reconstruction, spatial_median
-from nerf.region import Layout, find_layout, Region, find_region, share_beyond
+from nerf.region import Layout, Region, find_layout, find_region, share_beyond
 from nerf.scene import Similarity
 from nerf.up_vector import Up, find_up
 

@@ -90,7 +90,11 @@ class Runner:
     def _unlink_outdated(self) -> None:
         """Take out of ``output/`` what belongs to other settings than the current ones."""
         for stage, module in STAGES.items():
-            if stage not in self.done and self._upstream(stage, "report") is None:
+            try:
+                current = stage in self.done or self._upstream(stage, "report") is not None
+            except StageError:  # photos or a file that a setting names are gone: said where that stage runs
+                current = False
+            if not current:
                 self.workspace.unlink_outputs(module.LINKS)
 
     def _bring_up_to_date(self, stage: str) -> bool:

@@ -14,7 +14,7 @@ from stages.contract import StageError
 
 @dataclass(frozen=True)
 class StageStatus:
-    """``state``: cached / stale / partial / never / waiting; ``text``: its summary or the reason."""
+    """``state``: cached / stale / partial / never; ``text``: its summary or the reason."""
 
     stage: str
     state: str
@@ -56,7 +56,7 @@ def status_of(workspace: Workspace, runner: Runner, stage: str) -> StageStatus:
     except BadManifest as problem:
         return StageStatus(stage, "stale", str(problem))
     if workspace.partial(stage, job.key).exists():
-        return StageStatus(stage, "partial", "interrupted; `pipeline resume` goes on")
+        return StageStatus(stage, "partial", "interrupted; `pipeline resume` takes it up again")
     if last is not None:
         return StageStatus(stage, "stale", "; ".join(differences(job, last)) or "run again")
     return StageStatus(stage, "never", "")
@@ -68,7 +68,7 @@ def differences(job: Job, last: Manifest) -> list[str]:
     if last.version != job.module.VERSION:
         found.append(f"the stage itself changed (version {last.version} → {job.module.VERSION})")
     now: dict[str, Any] = job.config.model_dump(mode="json")
-    for name in sorted({*now, *last.config}):
+    for name in sorted({*now, *last.config} - set(getattr(job.module, "UNKEYED", ()))):
         before, after = last.config.get(name), now.get(name)
         if before != after:
             found.append(f"{job.stage}.{name}: {before} → {after}")

@@ -42,7 +42,7 @@ class Config(StageConfig):
     downscale: float | None = Field(None, ge=1)
     """How many times smaller than the photos to score. None: the size that the field was trained at."""
     background: Literal["white", "black"] | None = None
-    """What photos with alpha are shown over; white is the habit of the NeRF-synthetic benchmark."""
+    """What photos with alpha are shown over. None: what the field was trained over, white where that was random."""
     seed: int = 0
     """Of the interval."""
 
@@ -66,6 +66,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
         progress.note(note)
     images = examiner.score([test[i] for i in chosen], progress)
     metrics = _overall(images, len(test), examiner.downscale, notes, config.seed)
+    metrics["background"] = list(examiner.background)
     write_json(folder / "metrics.json", metrics)
     facts = {key: metrics[key] for key in (*FIGURES, "verdict")}
     return StageResult(("metrics.json", "renders", "errors"), _line(metrics), facts=facts)

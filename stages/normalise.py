@@ -178,9 +178,9 @@ def _line(found: "Normalisation", has_alpha: bool) -> str:
         "inside": "inside a space, looking around",
         "forward": "photos facing one way",
     }[found.layout]
-    bounded = "all within the region of interest" if found.bounded else "background unbounded"
+    background = "transparent" if has_alpha else "unbounded"
     up = f"up from {found.up.source}" if found.up.known else "no up: the cameras disagree"
-    return f"{layout}, {'background transparent' if has_alpha else bounded} · {up}"
+    return f"{layout}, background {background} · {up}"
 
 
 def _facts(scene: "Scene", found: "Normalisation", observations: int) -> dict[str, Any]:

@@ -24,7 +24,6 @@ LINKS = ("report.html", "summary.json")
 
 WIDTH_LARGE, WIDTH_SMALL = 900, 420  # pixels of a picture in the page
 MOST_SMALL = 12  # further test photos shown, besides the best, the median and the worst
-BACKGROUNDS = {"white": 255, "black": 0}
 
 
 class Config(StageConfig):
@@ -209,7 +208,8 @@ def _pictures(results: Results, image: dict[str, Any], width: int) -> dict[str, 
     render = Image.open(results.inputs["evaluate"] / image["render"])
     error = Image.open(results.inputs["evaluate"] / image["error"])
     size = (min(width, render.width), max(1, round(render.height * min(1, width / render.width))))
-    background = BACKGROUNDS[results.manifests["evaluate"]["config"]["background"]]
+    assert results.metrics is not None
+    background = round(255 * results.metrics["background"][0])
     photo = Image.fromarray(_opaque(load_pixels(results.inputs["ingest"] / view.file, *size), background))
     pictures = {"photo": photo, "render": render.resize(size, Image.Resampling.BOX), "error": error.resize(size)}
     aspect = round(size[0] / size[1], 4)

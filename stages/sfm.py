@@ -202,7 +202,9 @@ def _start_child(stderr: Any) -> "subprocess.Popen[bytes]":
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=stderr,
-        env={**os.environ, "PYTHONPATH": path},
+        # COLMAP parallelises over photos and pairs by itself; threads inside its linear algebra would let
+        # roundings depend on the number of cores and on what else the machine does.
+        env={**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
         start_new_session=True,  # Ctrl-C reaches the parent alone, which then ends the child
     )
 

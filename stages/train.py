@@ -13,9 +13,10 @@ if TYPE_CHECKING:
     from stages.training_loop import TrainingRun
 
 NEEDS = ("ingest", "normalise")
-VERSION = 2
+VERSION = 1
 RESUMES = True
 LINKS = ("curve.json",)
+UNKEYED = ("checkpoint_seconds", "tensorboard")
 
 DEFAULT_SECONDS = 180.0
 # The small field has few steps and takes large ones: after 300 of 512 rays on lego_400 at a quarter of its size a

@@ -1,5 +1,6 @@
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 from pydantic import ValidationError
@@ -13,7 +14,7 @@ from stages.files import read_json
 from stages.train import Config
 from tests.stages.photo_scene import photographed
 
-TINY = {
+TINY: dict[str, Any] = {
     "depth": 2,
     "width": 16,
     "samples_coarse": 8,
@@ -23,7 +24,7 @@ TINY = {
     "downscale": 1.0,
     "learning_rate": 5e-3,
 }
-TINY_GRID = {"levels": 2, "log2_rows": 10, "finest": 32, "batch_samples": 1024, "downscale": 1.0}
+TINY_GRID: dict[str, Any] = {"levels": 2, "log2_rows": 10, "finest": 32, "batch_samples": 1024, "downscale": 1.0}
 TRAINERS = {"grid": GridTrainer, "paper": PaperTrainer}
 OUTPUTS = ("field.safetensors", "field.json")
 
@@ -167,10 +168,10 @@ def test_contradicting_options_are_refused_in_words(given: dict, message: str) -
 
 
 def test_options_of_the_paper_field_ask_for_it() -> None:
-    for given in ({"preset": "paper"}, {"width": 64}, {"view_dependence": False}, {"field": "paper"}):
-        assert Config(**given).kind == "paper"
-    for given in ({}, {"steps": 3}, {"learning_rate": 1e-3}, {"levels": 4}, {"contracted": True}, {"field": "grid"}):
-        assert Config(**given).kind == "grid"
+    of_paper: list[dict[str, Any]] = [{"preset": "paper"}, {"width": 64}, {"hierarchical": False}, {"field": "paper"}]
+    of_grid: list[dict[str, Any]] = [{}, {"steps": 3}, {"learning_rate": 1e-3}, {"levels": 4}, {"field": "grid"}]
+    assert {Config(**given).kind for given in of_paper} == {"paper"}
+    assert {Config(**given).kind for given in of_grid} == {"grid"}
 
 
 def test_every_option_is_shared_or_of_one_field() -> None:
