@@ -117,8 +117,7 @@ def command_run(words: Sequence[str]) -> int:
     if given.config is not None:  # the file's values become the defaults that flags override
         from_file = settings_from(read_toml(given.config), f"--config {given.config}")
         given = words_of.parse(words_of.RunArguments, "run", words, from_file)
-    last = _known_stage(given.until, "--until") or list(chain.STAGES)[-1]
-    stages = chain.up_to(last)
+    stages = chain.up_to(_known_stage(given.until or list(chain.STAGES)[-1], "--until"))
     force = frozenset[str]()
     if given.from_ is not None:
         force = frozenset(stages[stages.index(_known_stage(given.from_, "--from", stages)) :])
@@ -132,8 +131,8 @@ def command_run(words: Sequence[str]) -> int:
         return _run_stages(root, settings, stages, given.common, display, force)
 
 
-def _known_stage(name: str | None, flag: str, among: Sequence[str] = tuple(chain.STAGES)) -> str | None:
-    if name is not None and name not in among:
+def _known_stage(name: str, flag: str, among: Sequence[str] = tuple(chain.STAGES)) -> str:
+    if name not in among:
         raise UsageError(f"{flag} {name}: not one of {', '.join(among)}")
     return name
 
@@ -224,7 +223,7 @@ def command_status(words: Sequence[str]) -> int:
 def command_explain(words: Sequence[str]) -> int:
     """``pipeline explain STAGE WORKSPACE``."""
     given = words_of.parse(words_of.ExplainArguments, "explain", words)
-    stage = _known_stage(given.stage, "explain") or given.stage
+    stage = _known_stage(given.stage, "explain")
     print("\n".join(status.explain(*_reader(given.workspace), stage)))
     return 0
 

@@ -23,7 +23,7 @@ SEED = 0
 LENS = Camera("OPENCV", 480, 360, (501.0, 499.5, 241.2, 179.3, -0.085, 0.032, 0.0011, -0.0008))
 SAMPLES_PER_SIDE = 2
 JPEG_QUALITY = 95
-TRAIN_SECONDS = 120.0
+TRAIN_SECONDS = 75.0
 
 
 def default_settings() -> Settings:

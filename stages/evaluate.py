@@ -39,7 +39,7 @@ NO_LPIPS = "LPIPS is not computed: no package in use ships its weights and nothi
 class Config(StageConfig):
     """How to compare. None is chosen for you."""
 
-    downscale: float | None = Field(None, ge=1)
+    downscale: float | None = Field(default=None, ge=1)
     """How many times smaller than the photos to score. None: the size that the field was trained at."""
     background: Literal["white", "black"] | None = None
     """What photos with alpha are shown over. None: what the field was trained over, white where that was random."""

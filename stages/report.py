@@ -29,7 +29,7 @@ MOST_SMALL = 12  # further test photos shown, besides the best, the median and t
 class Config(StageConfig):
     """Settings of stage report."""
 
-    video_limit_mb: float = Field(12, ge=0)
+    video_limit_mb: float = Field(default=12, ge=0)
     """A larger video lies beside the page and not inside it."""
 
 

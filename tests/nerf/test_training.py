@@ -55,6 +55,22 @@ def test_a_resumed_run_is_the_uninterrupted_one_bit_for_bit() -> None:
     assert same(whole.state(), second.state())
 
 
+def test_results_do_not_depend_on_the_number_of_threads() -> None:
+    settings, states = replace(TRAINER, batch_rays=700), []  # three parts, the last one smaller
+    before = torch.get_num_threads()
+    try:
+        for threads in (1, 2, 3):
+            torch.set_num_threads(threads)
+            run = trainer(settings)
+            for step in range(6):
+                run.step(step, step / 6)
+            states.append(copied(run.state()))
+    finally:
+        torch.set_num_threads(before)
+    assert same(states[0], states[1])
+    assert same(states[0], states[2])
+
+
 def test_training_beats_a_flat_colour() -> None:
     bank = small_bank()
     run = trainer(bank=bank)

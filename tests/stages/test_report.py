@@ -116,8 +116,13 @@ def _write_metrics(folder: Path, scene: Scene, size: tuple[int, int]) -> None:
         figures = {"psnr": 19.0 + rank, "ssim": 0.5 + rank / 20, "psnr_mean_image": 12.9, "psnr_nearest_view": 14.2}
         images.append({"name": view.name, "render": f"renders/{file}", "error": f"errors/{file}"} | figures)
     overall = {"psnr": 21.5, "ssim": 0.62, "psnr_mean_image": 12.9, "psnr_nearest_view": 14.2}
-    counts = {"background": [1.0, 1.0, 1.0],
-        "photos_scored": len(images), "photos_test": len(images), "width_share": 1.0, "error_scale": [0, 0.3]}
+    counts = {
+        "background": [1.0, 1.0, 1.0],
+        "photos_scored": len(images),
+        "photos_test": len(images),
+        "width_share": 1.0,
+        "error_scale": [0, 0.3],
+    }
     words = {"notes": ["LPIPS is not computed"], "verdict": "Better than any photo nearby by 7.3 dB but soft."}
     write_json(folder / "metrics.json", {"psnr_interval": [21.1, 21.9], "images": images} | overall | counts | words)
 
