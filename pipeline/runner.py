@@ -206,6 +206,7 @@ class Runner:
             shutil.rmtree(partial)
         partial.mkdir(parents=True, exist_ok=True)
         self.workspace.write_run(self.state)
+        _load_native_code()
         started, clock = datetime.now(UTC), time.monotonic()
         result = job.module.run(job.config, job.folders, partial, self.display)
         outputs = manifests.describe_outputs(partial, result.outputs)
@@ -226,6 +227,13 @@ class Runner:
         )
         self.workspace.finish(partial, folder, manifest)
         return manifest
+
+
+def _load_native_code() -> None:
+    """COLMAP's import changes how signals are handled; once it is over, they are ours again."""
+    from stages.colmap import load
+
+    load()
 
 
 def _is_out_of_memory(error: Exception) -> bool:

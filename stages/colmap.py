@@ -8,6 +8,8 @@ Image ids are 1 + the photo's place in order of ``file``; an image, its frame an
 """
 
 import shutil
+import signal
+import threading
 from collections.abc import Callable, Container, Sequence
 from itertools import combinations
 from pathlib import Path
@@ -34,6 +36,15 @@ SMALLEST_MODEL = 3
 VAGUE_PRINCIPAL_POINT = 0.005  # a standard deviation above this, and the centre is the better guess
 FARTHEST_PRINCIPAL_POINT = 0.1
 ROUND_TRIP_PX = 0.01  # a bearing that does not project back to its pixel is a false root of the distortion
+
+
+def load() -> None:
+    """Import pycolmap, and take back the handler that it installs: it would turn SIGTERM into a crash report."""
+    before = signal.getsignal(signal.SIGTERM)
+    import pycolmap  # noqa: F401 -- for its side effect
+
+    if before is not None and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, before)
 
 
 # --- camera models
