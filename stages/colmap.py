@@ -235,7 +235,9 @@ def match_exhaustively(database: Path, seed: int, max_ratio: float) -> None:
     """
     import pycolmap
 
-    matching = pycolmap.FeatureMatchingOptions()
+    # With two threads about one run of the fox in seven has other matches in some pair, on the same descriptors: the
+    # approximate index (faiss) is not safe to build or search at once. With one thread none has.
+    matching = pycolmap.FeatureMatchingOptions(num_threads=1)
     matching.sift.max_ratio = max_ratio
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
