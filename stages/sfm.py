@@ -48,7 +48,7 @@ class Config(StageConfig):
     cameras: OptionalSourcePath = None
     """Known cameras: a transforms.json, a folder with transforms_train.json, or a COLMAP model."""
     seed: int = Field(default=0, ge=0, lt=2**31)
-    """Of every random choice in matching and mapping: the same seed gives the same bytes."""
+    """Of every random choice in matching and mapping; docs/numbers.md says how far runs were seen to repeat."""
     max_image_size: int = Field(default=1600, ge=100)
     """Longer side in pixels at which features are searched; larger photos are reduced for it."""
     max_features: int = Field(default=4096, ge=100)
