@@ -14,6 +14,7 @@ from pydantic import Field
 from stages.contract import Inputs, Progress, StageConfig, StageResult
 from stages.files import read_json, read_scene, write_json
 from stages.image_metrics import ERROR_SCALE, FEWEST_FOR_INTERVAL, bootstrap_interval, error_map, ssim
+from stages.render_plan import TRAINING_COST
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -26,10 +27,6 @@ NEEDS = ("ingest", "normalise", "train")
 VERSION = 1
 RESUMES = False
 LINKS = ("metrics.json", "renders", "errors")
-
-TRAINING_COST = 3
-"""A training ray costs about three rendered ones (forward, backward and update), so scoring three times the rays that
-were trained on takes about as long as the training."""
 
 BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 FIGURES = ("psnr", "ssim", "psnr_mean_image", "psnr_nearest_view")

@@ -19,11 +19,11 @@ from stages.contract import StageError
 from stages.photos import Photo
 from stages.sources import read_transforms
 from stages.sparse_model import SparseImage, SparseModel
+from stages.transforms_export import OPENGL_FROM_OPENCV
 
 ORTHONORMAL_WITHIN = 1e-3  # largest entry of RᵀR − 1 that is rounding; beyond it a matrix means something else
 ASPECT_WITHIN = 0.01
 MOST_NAMES = 5
-OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0])
 TRANSFORMS_HINT = "Correct the file, or leave the cameras out to have them found from the photos."
 FISHEYE, RATIONAL = "OPENCV_FISHEYE", "FULL_OPENCV"
 
