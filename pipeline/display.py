@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from stages.contract import StageError
+from stages.live_line import duration
 
 JSON_SECONDS = 0.2  # JSON output: one progress event at most this often
 HEARTBEAT_SECONDS = 10.0  # plain output: one line at most this often, so that a log stays readable
@@ -33,15 +34,6 @@ class Display(Protocol):
     def failed(self, stage: str, error: StageError) -> None: ...
 
     def finished(self, message: str, outputs: dict[str, Path]) -> None: ...
-
-
-def duration(seconds: float) -> str:
-    """``4.2 s``, ``2 min 05 s``, ``1 h 12 min``."""
-    if seconds < 99.95:
-        return f"{seconds:.1f} s"
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes_left = divmod(minutes, 60)
-    return f"{hours} h {minutes_left:02d} min" if hours else f"{minutes} min {rest:02d} s"
 
 
 def end_line(stage: str, line: str, seconds: float, cached: bool) -> str:

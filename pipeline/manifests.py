@@ -4,12 +4,12 @@
 """
 
 import json
-import os
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 from pipeline.keys import digest, file_sha256
+from stages.files import write_durably
 
 NAME = "manifest.json"
 
@@ -64,31 +64,10 @@ def outputs_digest(outputs: dict[str, dict[str, Any]]) -> str:
     return digest({name: entry["sha256"] for name, entry in outputs.items()})
 
 
-def write_durably(path: Path, text: str) -> None:
-    """Write a small file so that after a crash it is either the old one or the new one."""
-    temporary = path.with_name(path.name + ".tmp")
-    with temporary.open("w", encoding="utf-8") as stream:
-        stream.write(text)
-        stream.flush()
-        os.fsync(stream.fileno())
-    temporary.replace(path)
-    sync_folder(path.parent)
-
-
-def sync_folder(folder: Path) -> None:
-    """Make renames in ``folder`` durable, where the system can (not on Windows)."""
-    if os.name == "posix":
-        descriptor = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
-
-
 def write(folder: Path, manifest: Manifest) -> None:
     """Write ``manifest`` durably into ``folder``."""
     text = json.dumps(asdict(manifest), indent=1, sort_keys=True, allow_nan=False, ensure_ascii=False)
-    write_durably(folder / NAME, text + "\n")
+    write_durably(folder / NAME, (text + "\n").encode())
 
 
 def read(folder: Path) -> Manifest:

@@ -160,7 +160,8 @@ class Runner:
         module, options = STAGES[stage], getattr(self.settings, stage)
         if not hasattr(module, "plan"):
             return options
-        asked = digest({"options": self._config_for_key(stage, options), "inputs": inputs})
+        options_for_key = self._config_for_key(stage, options)
+        asked = digest({"version": module.VERSION, "options": options_for_key, "inputs": inputs})
         plans = self.state["plans"].setdefault(stage, {})
         if asked in plans:
             # Paths are taken as given now: the plan was made for equal content, wherever that lay then.
@@ -168,7 +169,7 @@ class Runner:
             return module.Config.model_validate(plans[asked] | options.model_dump(include=paths))
         if not may_plan:
             raise NotReady(stage)
-        config = module.plan(options, folders)
+        config = module.plan(options, folders, self.display)
         plans[asked] = config.model_dump(mode="json")
         self.workspace.write_run(self.state)
         return config

@@ -16,6 +16,7 @@ from pipeline import manifests
 from pipeline.keys import KEY_LENGTH
 from pipeline.manifests import BadManifest, Manifest
 from stages.contract import StageError
+from stages.files import sync_folder, write_durably
 
 RUN_FILE = "run.json"
 RUN_VERSION = 1
@@ -109,7 +110,7 @@ class Workspace:
         if folder.exists():  # a forced run of the same key: the old result makes way at the last moment
             self._set_aside(folder)
         partial.rename(folder)
-        manifests.sync_folder(folder.parent)
+        sync_folder(folder.parent)
 
     def complete(self, partial: Path, folder: Path, key: str) -> Manifest | None:
         """Finish a partial folder that was killed after its manifest was written; None where there is none."""
@@ -149,7 +150,7 @@ class Workspace:
     def write_run(self, run: dict[str, Any]) -> None:
         """Write run.json durably."""
         text = json.dumps(run, indent=1, sort_keys=True, allow_nan=False, ensure_ascii=False)
-        manifests.write_durably(self.root / RUN_FILE, text + "\n")
+        write_durably(self.root / RUN_FILE, (text + "\n").encode())
 
     def link_outputs(self, folder: Path, names: tuple[str, ...]) -> None:
         """Point ``output/<name>`` at the files of a finished folder; copies where links are not allowed."""

@@ -6,10 +6,11 @@ and is written last, so a kill at any instant leaves at worst a pair that is not
 
 import hashlib
 import json
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
+
+from stages.files import write_durably
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -25,21 +26,6 @@ class Checkpoint(NamedTuple):
     facts: dict[str, Any]
 
 
-def write_atomically(path: Path, content: bytes) -> None:
-    """Write a file so that after a kill or power cut it is either the old one or the new one, on the disk."""
-    temporary = path.with_name(path.name + ".tmp")
-    with temporary.open("wb") as stream:
-        stream.write(content)
-        stream.flush()
-        os.fsync(stream.fileno())
-    temporary.replace(path)
-    directory = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(directory)
-    finally:
-        os.close(directory)
-
-
 def save_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
     """Write ``checkpoint`` and forget all but the last KEPT."""
     from safetensors.torch import save
@@ -48,8 +34,8 @@ def save_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
     tensors = save({name: tensor.contiguous() for name, tensor in checkpoint.tensors.items()})
     meta = {"facts": checkpoint.facts, "sha256": hashlib.sha256(tensors).hexdigest()}
     name = f"{checkpoint.step:09d}"
-    write_atomically(folder / f"{name}.safetensors", tensors)
-    write_atomically(folder / f"{name}.json", json.dumps(meta, allow_nan=False).encode())
+    write_durably(folder / f"{name}.safetensors", tensors)
+    write_durably(folder / f"{name}.json", json.dumps(meta, allow_nan=False).encode())
     kept = {f"{step:09d}" for step in _steps(folder)[-KEPT:]}
     for path in folder.iterdir():  # older pairs, and what a kill left of unfinished ones
         if path.name.split(".")[0] not in kept:

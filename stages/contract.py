@@ -10,8 +10,9 @@ A stage is a module of this package with
 * ``Config``: its settings, a :class:`StageConfig`;
 * ``run(config, inputs, folder, progress) -> StageResult``: reads ``inputs[stage]`` (finished folders), writes
   into ``folder`` and nowhere else, raises :class:`StageError` for everything a user can act on;
-* optionally ``plan(config, inputs) -> Config``: replaces every ``None`` ("choose for me") by a value. It is
-  called once; the answer is kept in run.json and enters the stage's key.
+* optionally ``plan(config, inputs, progress) -> Config``: replaces every ``None`` ("choose for me") by a value,
+  where it must by timing a piece of the work. It is called once, before the stage's first run; the answer is kept
+  in run.json and enters the stage's key, so a run that was killed goes on with the same choice.
 
 Importing a stage must be cheap: torch, pycolmap, kornia and their like are imported inside ``run``.
 """

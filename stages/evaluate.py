@@ -12,24 +12,26 @@ from typing import TYPE_CHECKING, Any, Literal
 from pydantic import Field
 
 from stages.contract import Inputs, Progress, StageConfig, StageResult
-from stages.files import read_json, read_scene, write_json
+from stages.files import read_json, read_scene, write_json, write_png
 from stages.image_metrics import ERROR_SCALE, FEWEST_FOR_INTERVAL, bootstrap_interval, error_map, ssim
-from stages.render_plan import TRAINING_COST
+from stages.live_line import duration, short_count
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from nerf.model import RadianceModel
+    from nerf.rays import Rays
     from nerf.scene import Scene, View
     from stages.baselines import MeanPhoto
+    from stages.drawing import Painter
 
 NEEDS = ("ingest", "normalise", "train")
-VERSION = 1
+VERSION = 2
 RESUMES = False
 LINKS = ("metrics.json", "renders", "errors")
 
 BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 FIGURES = ("psnr", "ssim", "psnr_mean_image", "psnr_nearest_view")
+TRIED_PHOTOS = 4  # to see how fast the field draws them
 NO_LPIPS = "LPIPS is not computed: no package in use ships its weights and nothing is downloaded"
 
 
@@ -40,30 +42,71 @@ class Config(StageConfig):
     """How many times smaller than the photos to score. None: the size that the field was trained at."""
     background: Literal["white", "black"] | None = None
     """What photos with alpha are shown over. None: what the field was trained over, white where that was random."""
+    photos: int | None = Field(default=None, ge=1)
+    """How many test photos to score, evenly spread. None: as many as take no longer than the training."""
     seed: int = 0
     """Of the interval."""
 
 
-def plan(config: Config, inputs: Inputs) -> Config:
-    """The size that the field was trained at, where none was asked for."""
-    if config.downscale is not None:
-        return config
-    return config.model_copy(update={"downscale": read_json(inputs["train"] / "field.json")["downscale"]})
+def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
+    """The size that the field was trained at, and as many photos as this machine draws in a share of that time."""
+    if config.downscale is None:
+        downscale = read_json(inputs["train"] / "field.json")["downscale"]
+        config = config.model_copy(update={"downscale": downscale})
+    if config.photos is None and (scene := read_scene(inputs["normalise"])).of_split("test"):
+        config = config.model_copy(update={"photos": _affordable_photos(config, scene, inputs["train"], progress)})
+    return config
+
+
+def _affordable_photos(config: Config, scene: "Scene", train: Path, progress: Progress) -> int:
+    from stages.drawing import SHARE, measured_speed, training_seconds
+    from stages.training_data import scaled_size
+
+    assert config.downscale is not None
+    test = scene.of_split("test")
+    cameras = [scene.cameras[view.camera] for view in test]
+    pixels = [math.prod(scaled_size(camera, config.downscale)) for camera in cameras]
+    progress.update("trying how fast the field draws")
+    largest = max(1, int(min(max(c.width, c.height) for c in cameras) / config.downscale))
+    speed = measured_speed(train, lambda side: _tried_rays(scene, side), largest)
+    trained = training_seconds(train)
+    count = len(affordable(pixels, SHARE * trained * speed))
+    if count < len(test):
+        progress.note(
+            f"{short_count(speed)} rays/s here: all {len(test)} test photos take about "
+            f"{duration(sum(pixels) / speed)}, training took {duration(trained)}; --evaluate.photos asks for more"
+        )
+    return count
+
+
+def _tried_rays(scene: "Scene", side: int) -> "Rays":
+    """Rays of a few test photos, reduced to a long side of ``side`` pixels, in one row each photo after the other."""
+    import torch
+
+    from nerf.rays import Rays
+    from stages.training_data import view_rays
+
+    test = scene.of_split("test")
+    few = [test[i] for i in _spread(len(test), min(TRIED_PHOTOS, len(test)))]
+    cameras = [scene.cameras[view.camera] for view in few]
+    photos = [view_rays(scene, v, max(c.width, c.height) / side) for v, c in zip(few, cameras, strict=True)]
+    flat = [[part.reshape(1, -1, *part.shape[2:]) for part in rays] for rays in photos]
+    return Rays(*(torch.cat(parts, dim=1) for parts in zip(*flat, strict=True)))
 
 
 def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> StageResult:
     """Render the test photos, compare, and write metrics.json, renders/ and errors/."""
     scene = read_scene(inputs["normalise"])
-    examiner = _examiner(plan(config, inputs), scene, inputs, folder)
+    config = plan(config, inputs, progress)
+    examiner = _examiner(config, scene, inputs, folder)
     test = scene.of_split("test")
-    pixels = [examiner.pixels(view) for view in test]
-    chosen = affordable(pixels, TRAINING_COST * read_json(inputs["train"] / "field.json")["rays"])
-    notes = [_why_fewer(len(chosen), len(test))] if len(chosen) < len(test) else []
+    chosen = _spread(len(test), min(config.photos or 0, len(test)))
+    notes = [_how_many(len(chosen), len(test))] if len(chosen) < len(test) else []
     for note in notes:
         progress.note(note)
     images = examiner.score([test[i] for i in chosen], progress)
     metrics = _overall(images, len(test), examiner.downscale, notes, config.seed)
-    metrics["background"] = list(examiner.background)
+    metrics["background"] = examiner.painter.background.tolist()
     write_json(folder / "metrics.json", metrics)
     facts = {key: metrics[key] for key in (*FIGURES, "verdict")}
     return StageResult(("metrics.json", "renders", "errors"), _line(metrics), facts=facts)
@@ -76,16 +119,8 @@ class Examiner:
     scene: "Scene"
     ingest: Path
     folder: Path
-    model: "RadianceModel"
-    device: str
+    painter: "Painter"
     downscale: float
-    background: tuple[float, ...]
-
-    def pixels(self, view: "View") -> int:
-        """How many pixels, and so rays, a view has at this size."""
-        from stages.training_data import scaled_size
-
-        return math.prod(scaled_size(self.scene.cameras[view.camera], self.downscale))
 
     def score(self, views: "Sequence[View]", progress: Progress) -> list[dict[str, Any]]:
         """Render every view, write its picture and error map, and return its figures as metrics.json has them."""
@@ -114,8 +149,8 @@ class Examiner:
         nearest = nearest_view(view, self.scene.of_split("train"))
         # The decoded file has an ASCII name that is unique up to its suffix; the photo's own may be anything.
         file = Path(view.file.removeprefix("images/")).with_suffix(".png").as_posix()
-        _write_png(self.folder / "renders" / file, (image * 255).round().byte().numpy())
-        _write_png(self.folder / "errors" / file, error_map(image, truth))
+        write_png(self.folder / "renders" / file, (image * 255).round().byte().numpy())
+        write_png(self.folder / "errors" / file, error_map(image, truth))
         return {
             "name": view.name,
             "psnr": _psnr(image, truth),
@@ -130,34 +165,25 @@ class Examiner:
     def _photo(self, view: "View") -> "Tensor":
         from stages.training_data import view_pixels
 
-        return view_pixels(self.ingest, self.scene, view, self.downscale, self.background)
+        return view_pixels(self.ingest, self.scene, view, self.downscale, self.painter.background.tolist())
 
     def _render(self, view: "View", on_chunk: Callable[[float], None]) -> "Tensor":
-        import torch
-
-        from nerf.rays import Rays
-        from nerf.rendering import render_image
         from stages.training_data import view_rays
 
-        rays = Rays(*(part.to(self.device) for part in view_rays(self.scene, view, self.downscale)))
-        background = torch.tensor(self.background, device=self.device)
-        return render_image(self.model, rays, background, on_chunk=on_chunk).colour.clamp(0, 1).cpu()
+        return self.painter.draw(view_rays(self.scene, view, self.downscale), on_chunk).colour.clamp(0, 1)
 
 
 def _examiner(config: Config, scene: "Scene", inputs: Inputs, folder: Path) -> Examiner:
     """Load the field; data with alpha goes over the background asked for, the rest over what the field expects."""
-    from stages.device import compute_device
-    from stages.field_files import load_field
+    from stages.drawing import load_painter
 
     assert config.downscale is not None
-    device = compute_device()
-    model, info = load_field(inputs["train"], device)
     chosen = config.background if scene.has_alpha else None
-    background = tuple(info["background"]) if chosen is None else BACKGROUNDS[chosen]
-    return Examiner(scene, inputs["ingest"], folder, model, device, config.downscale, background)
+    painter = load_painter(inputs["train"], BACKGROUNDS[chosen] if chosen else None)
+    return Examiner(scene, inputs["ingest"], folder, painter, config.downscale)
 
 
-def affordable(pixels: Sequence[int], budget: int) -> list[int]:
+def affordable(pixels: Sequence[int], budget: float) -> list[int]:
     """Which photos to score: as many as ``budget`` pixels allow, at least one, spread evenly over the list."""
     for count in range(len(pixels), 1, -1):
         chosen = _spread(len(pixels), count)
@@ -234,8 +260,8 @@ def _line(metrics: dict[str, Any]) -> str:
     return f"{metrics['psnr']:.1f}{spread} dB{similarity} · {trivial} · {count}{size}"
 
 
-def _why_fewer(scored: int, test: int) -> str:
-    return f"{scored} of {test} test photos are scored, evenly spread: all of them would take longer than the training"
+def _how_many(scored: int, test: int) -> str:
+    return f"{scored} of {test} test photos are scored, evenly spread"
 
 
 def _photos(count: int) -> str:
@@ -260,10 +286,3 @@ def _psnr(image: "Tensor", truth: "Tensor") -> float:
     from nerf.metrics import mean_squared_error, psnr
 
     return psnr(mean_squared_error(image, truth))
-
-
-def _write_png(path: Path, pixels: Any) -> None:
-    from PIL import Image
-
-    path.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(pixels).save(path)

@@ -1,6 +1,7 @@
-"""Small files the stages exchange: canonical JSON and safetensors, written so that equal content is equal bytes."""
+"""Files: JSON, safetensors and PNG, written so that equal content is equal bytes, and durably where that matters."""
 
 import json
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,6 +26,27 @@ def read_json(path: Path) -> Any:
         raise StageError(f"cannot read {path.name}", str(error), "Delete its folder and run again.") from error
 
 
+def write_durably(path: Path, content: bytes) -> None:
+    """Write a file so that after a kill or power cut it is either the old one or the new one, on the disk."""
+    temporary = path.with_name(path.name + ".tmp")
+    with temporary.open("wb") as stream:
+        stream.write(content)
+        stream.flush()
+        os.fsync(stream.fileno())
+    temporary.replace(path)
+    sync_folder(path.parent)
+
+
+def sync_folder(folder: Path) -> None:
+    """Make renames in ``folder`` durable, where the system can (not on Windows)."""
+    if os.name == "posix":
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+
 def write_tensors(path: Path, tensors: "dict[str, np.ndarray]") -> None:
     """Write arrays as safetensors without metadata."""
     from safetensors.numpy import save_file
@@ -37,6 +59,14 @@ def read_tensors(path: Path) -> "dict[str, np.ndarray]":
     from safetensors.numpy import load_file
 
     return load_file(path)
+
+
+def write_png(path: Path, pixels: "np.ndarray") -> None:
+    """Write (height, width, 3 or 4) uint8, folders included; packed fast, for pictures hardly shrink any further."""
+    from PIL import Image
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(pixels).save(path, format="PNG", compress_level=1)
 
 
 def read_scene(folder: Path) -> "Scene":

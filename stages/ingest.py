@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 
 from stages.contract import Inputs, OptionalSourcePath, Progress, SourcePath, StageConfig, StageError, StageResult
 from stages.decoding import CameraKey, DecodeError, decode
+from stages.files import write_png
 from stages.photos import Photo, Refusal, write_photos
 from stages.sources import Source, find_source
 
@@ -128,7 +129,7 @@ def _take(file: Path, name: str, waiting: Path) -> _Taken | Refusal:
     if decoded.suffix:
         shutil.copyfile(file, waiting)
     else:
-        _write_png(waiting, pixels)
+        write_png(waiting, pixels)
     return _Taken(
         name=name,
         waiting=waiting,
@@ -140,12 +141,6 @@ def _take(file: Path, name: str, waiting: Path) -> _Taken | Refusal:
         digest=hashlib.blake2b(str(pixels.shape).encode() + pixels.data, digest_size=16).digest(),
         notes=decoded.notes,
     )
-
-
-def _write_png(path: Path, pixels: "np.ndarray") -> None:
-    from PIL import Image
-
-    Image.fromarray(pixels).save(path, format="PNG", compress_level=1)
 
 
 def _sharpness(pixels: "np.ndarray") -> float:

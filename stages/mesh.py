@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 from pydantic import Field
 
 from stages.contract import Inputs, Progress, StageConfig, StageError, StageResult
-from stages.files import read_json, read_scene
+from stages.files import read_json, read_scene, write_png
 
 if TYPE_CHECKING:
     import numpy as np
@@ -67,7 +67,7 @@ class Reconstruction(NamedTuple):
     voxel: float
 
 
-def plan(config: Config, inputs: Inputs) -> Config:
+def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
     """Choose the resolution from how much was trained."""
     rays = read_json(inputs["train"] / "field.json")["rays"]
     return config.model_copy(update={"resolution": config.resolution or affordable_resolution(rays)})
@@ -86,9 +86,8 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
 
     scene = read_scene(inputs["normalise"])
     device = compute_device()
-    model, info = load_field(inputs["train"], device)
-    resolution = config.resolution or affordable_resolution(info["rays"])
-    config = config.model_copy(update={"resolution": resolution})
+    model, _ = load_field(inputs["train"], device)
+    config = plan(config, inputs, progress)
     result = reconstruct(config, model, scene, device, progress)
     progress.update("writing", 0.95)
     outputs = write_mesh(config, result.mesh, scene, folder)
@@ -183,12 +182,10 @@ def _colours(model: "RadianceModel", vertices: "np.ndarray", directions: "np.nda
 
 def write_mesh(config: Config, mesh: "ColouredMesh", scene: "Scene", folder: Path) -> tuple[str, ...]:
     """Write the files asked for, in the frame asked for, and preview.png; their names."""
-    from PIL import Image
-
     from stages.mesh_files import Z_UP_TO_Y_UP, write_glb, write_obj, write_ply
     from stages.mesh_picture import picture
 
-    Image.fromarray(picture(mesh, scene)).save(folder / "preview.png")
+    write_png(folder / "preview.png", picture(mesh, scene))
     upright = Z_UP_TO_Y_UP
     if config.frame == "sfm":
         to_sfm = scene.scene_from_sfm.inverse()

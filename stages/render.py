@@ -8,26 +8,29 @@ from typing import TYPE_CHECKING, Any
 from pydantic import Field
 
 from stages.contract import Inputs, Progress, StageConfig, StageError, StageResult
-from stages.files import read_json, read_scene, write_json
-from stages.render_path import BY_LAYOUT, CameraPath, PathKind, fitted_path, median_camera, path_from_file
-from stages.render_plan import affordable, chosen_fps
+from stages.files import read_json, read_scene, write_json, write_png
+from stages.live_line import duration, short_count
+from stages.render_path import BY_LAYOUT, CameraPath, PathKind, fitted_path, path_from_file, path_rays
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from nerf.model import RadianceModel, Rendering
+    from nerf.model import Rendering
+    from nerf.rays import Rays
     from nerf.scene import Scene
+    from stages.drawing import Painter
 
 NEEDS = ("normalise", "train")
-VERSION = 1
+VERSION = 2
 RESUMES = False
 LINKS = ("video.mp4", "depth.mp4", "path.json")
 
-CHUNK = {"cpu": 512, "cuda": 8192}  # rays between two words to the user: a second of the published field on a laptop
+TRIED_VIEWS = 4  # of the path, to see how fast the field draws them
+WRITING_SECONDS = 1.5e-7  # to encode a pixel of video.mp4 and of depth.mp4 (x264 with one thread: 13 million a second)
 
 
 class Config(StageConfig):
-    """Settings of stage render. What is None is chosen, so that rendering costs no more than training did."""
+    """Settings of stage render. What is None is chosen, so that rendering takes no longer than training did."""
 
     path: PathKind | None = Field(
         default=None,
@@ -38,28 +41,83 @@ class Config(StageConfig):
         description="poses and intrinsics instead of a path: a transforms.json in the frame of output/transforms.json, "
         "or a path.json of ours",
     )
-    frames: int | None = Field(default=None, ge=2, description="none: 24 to 120")
+    frames: int | None = Field(default=None, ge=2, description="none: as many as time allows, 24 to 120 if it can be")
     width: int | None = Field(default=None, ge=16, le=8192, description="pixels; odd numbers are rounded to even ones")
     fps: int | None = Field(default=None, ge=1, le=120, description="none: 30, fewer for fewer than 120 frames")
     depth: bool = Field(default=True, description="write depth.mp4 too")
     save_frames: bool = Field(default=False, description="keep every frame as PNG in frames/")
 
 
-def plan(config: Config, inputs: Inputs) -> Config:
-    """Choose path, frames, width and fps. Counts rays, not seconds: the same training gives the same plan."""
+def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
+    """Choose path, frames, width and fps; frames and width by how fast this machine draws pictures along the path."""
+    from stages.render_plan import chosen_fps
+
     _check(config)
-    scene, info = read_scene(inputs["normalise"]), read_json(inputs["train"] / "field.json")
+    scene = read_scene(inputs["normalise"])
     if config.cameras is None:
-        camera, frames = median_camera(scene), config.frames
-        path = config.path or BY_LAYOUT[scene.layout]
-    else:
-        given = path_from_file(scene, config.cameras)
-        camera, frames, path = given.cameras[0], len(given.cameras), None
-    longest = max(camera.width, camera.height) / (info["downscale"] if config.cameras is None else 1)
-    frames, width = affordable(info["rays"], camera, longest, frames, config.width)
-    fps = config.fps or chosen_fps(frames)
+        config = config.model_copy(update={"path": config.path or BY_LAYOUT[scene.layout]})
+    path = _path(config, scene)
+    frames = len(path.cameras) if config.cameras else config.frames
+    width = config.width
+    if frames is None or width is None:
+        downscale = 1 if config.cameras else read_json(inputs["train"] / "field.json")["downscale"]
+        frames, width = _affordable(path, scene, inputs["train"], downscale, (frames, width), progress)
     kept = None if config.cameras else frames
-    return config.model_copy(update={"path": path, "frames": kept, "width": width, "fps": fps})
+    return config.model_copy(update={"frames": kept, "width": width, "fps": config.fps or chosen_fps(frames)})
+
+
+def _affordable(
+    path: CameraPath,
+    scene: "Scene",
+    train: Path,
+    downscale: float,
+    asked: tuple[int | None, int | None],
+    progress: Progress,
+) -> tuple[int, int]:
+    """(frames, width), where not asked for as many and as large as may be drawn in a share of the training's time."""
+    from stages.drawing import SHARE, measured_speed, training_seconds
+    from stages.render_plan import affordable, longest_side
+
+    camera = path.cameras[0]
+    progress.update("trying how fast the field draws")
+    longest = longest_side(camera, downscale)
+    drawn = measured_speed(train, lambda side: _tried_rays(path, scene, side), int(longest))
+    speed = 1 / (1 / drawn + WRITING_SECONDS)
+    trained = training_seconds(train)
+    frames, width = affordable(SHARE * trained * speed, camera, longest, *asked)
+    progress.note(_why(path.resized(width), frames, speed, trained, asked))
+    return frames, width
+
+
+def _tried_rays(path: CameraPath, scene: "Scene", side: int) -> "Rays":
+    """Rays of a few frames, reduced to a long side of ``side`` pixels, one above the other."""
+    import torch
+
+    from nerf.rays import Rays
+
+    camera = path.cameras[0]
+    count = len(path.cameras)
+    few = path.some(sorted({(2 * i + 1) * count // (2 * TRIED_VIEWS) for i in range(TRIED_VIEWS)}))
+    width = max(2, 2 * round(side * camera.width / max(camera.width, camera.height) / 2))
+    return Rays(*(torch.cat(parts) for parts in zip(*path_rays(few.resized(width), scene), strict=True)))
+
+
+def _why(
+    path: CameraPath, frames: int, rays_per_second: float, trained: float, asked: tuple[int | None, int | None]
+) -> str:
+    """What was chosen, how long it takes, and where that is less or more than one would wish."""
+    from stages.render_plan import FEWEST_FRAMES, SMALL_SIDE
+
+    camera = path.cameras[0]
+    seconds = frames * camera.width * camera.height / rays_per_second
+    words = f"{short_count(rays_per_second)} rays/s here: {frames} frames {camera.width}×{camera.height} take about "
+    words += f"{duration(seconds)}, training took {duration(trained)}"
+    if seconds > trained:
+        return f"{words}; that is longer, {'as asked' if any(asked) else 'but there is no smaller video'}"
+    small = (asked[0] is None and frames < FEWEST_FRAMES) or (
+        asked[1] is None and max(camera.width, camera.height) < SMALL_SIDE - 2
+    )
+    return f"{words}; more would take too long, --render.frames and --render.width ask for it" if small else words
 
 
 def _check(config: Config) -> None:
@@ -73,17 +131,16 @@ def _check(config: Config) -> None:
 
 def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> StageResult:
     """Render the path and write video.mp4, depth.mp4, path.json and, if asked, frames/."""
-    from stages.device import compute_device
-    from stages.field_files import load_field
+    from stages.drawing import load_painter
 
-    config = plan(config, inputs)
+    config = plan(config, inputs, progress)
     assert config.width is not None and config.fps is not None
     scene = read_scene(inputs["normalise"])
-    model, info = load_field(inputs["train"], compute_device())
+    painter = load_painter(inputs["train"])
     path = _path(config, scene).resized(config.width)
     write_json(folder / "path.json", _path_json(path, scene, config.fps))
     started = time.perf_counter()
-    renderings = _render(path, scene, model, info["background"], progress)
+    renderings = _render(path, scene, painter, progress)
     outputs = ("path.json", *_write(renderings, path, config, folder))
     frames_per_second = len(path.cameras) / (time.perf_counter() - started)
     write_json(folder / "speed.json", {"frames_per_second": frames_per_second})
@@ -93,56 +150,26 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
 
 
 def _path(config: Config, scene: "Scene") -> CameraPath:
+    """The cameras to render; of a path whose length is still open, FEWEST_FRAMES."""
+    from stages.render_plan import FEWEST_FRAMES
+
     if config.cameras is not None:
         return path_from_file(scene, config.cameras)
-    assert config.path is not None and config.frames is not None
-    return fitted_path(scene, config.path, config.frames)
+    assert config.path is not None
+    return fitted_path(scene, config.path, config.frames or FEWEST_FRAMES)
 
 
-def _render(
-    path: CameraPath, scene: "Scene", model: "RadianceModel", background: list[float], progress: Progress
-) -> "Iterator[Rendering]":
+def _render(path: CameraPath, scene: "Scene", painter: "Painter", progress: Progress) -> "Iterator[Rendering]":
     """The frames, one by one, on the CPU."""
-    import numpy as np
-    import torch
-
-    from nerf.depth_range import range_between_views
-    from nerf.model import Rendering
-    from nerf.rays import Rays, rays_of_view
-    from nerf.rendering import render_image
-    from stages.colmap import camera_rays
-    from stages.device import compute_device
-
-    device = compute_device()
-    views = scene.of_split("train")
-    near, far = range_between_views(
-        path.poses[:, :, 3],
-        np.stack([view.scene_from_camera[:, 3] for view in views]),
-        np.array([view.near for view in views]),
-        np.array([view.far for view in views]),
-        scene.bounded,
-    )
-    bearings = {
-        camera: torch.from_numpy(camera_rays(camera, camera.width, camera.height)) for camera in set(path.cameras)
-    }
     count, started = len(path.cameras), time.perf_counter()
-    for index, camera in enumerate(path.cameras):
-        pose = torch.from_numpy(path.poses[index]).float()
-        rays = rays_of_view(bearings[camera], pose, float(near[index]), float(far[index]))
+    for index, rays in enumerate(path_rays(path, scene)):
 
         def on_chunk(share: float, index: int = index) -> None:
             done = (index + share) / count
             left = (time.perf_counter() - started) * (1 - done) / done
-            progress.update(f"frame {index + 1} of {count} · {left:.0f} s left", done)
+            progress.update(f"frame {index + 1} of {count} · {duration(left)} left", done)
 
-        image = render_image(
-            model,
-            Rays(*(part.to(device) for part in rays)),
-            torch.tensor(background, device=device),
-            chunk=CHUNK[device],
-            on_chunk=on_chunk,
-        )
-        yield Rendering(*(part.cpu() for part in image))
+        yield painter.draw(rays, on_chunk)
 
 
 def _write(renderings: "Iterator[Rendering]", path: CameraPath, config: Config, folder: Path) -> list[str]:
@@ -163,7 +190,7 @@ def _write(renderings: "Iterator[Rendering]", path: CameraPath, config: Config, 
             add(frame)
             inverse[index] = 1 / rendering.depth.numpy()
             if config.save_frames:
-                _write_png(folder / "frames" / f"{index:05d}.png", frame)
+                write_png(folder / "frames" / f"{index:05d}.png", frame)
     if config.depth:
         _write_depth(inverse, folder / "depth.mp4", config.fps)
     waiting.unlink()
@@ -186,12 +213,6 @@ def _write_depth(inverse: "np.ndarray", file: Path, fps: int) -> None:
             level = np.clip((frame.astype(np.float32) - low) / span, 0, 1)
             bgr = cv2.applyColorMap(np.rint(255 * level).astype(np.uint8), cv2.COLORMAP_TURBO)
             add(np.ascontiguousarray(bgr[..., ::-1]))
-
-
-def _write_png(file: Path, frame: "np.ndarray") -> None:
-    from PIL import Image
-
-    Image.fromarray(frame).save(file)
 
 
 def _path_json(path: CameraPath, scene: "Scene", fps: int) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """Which cameras the video is seen through: a path fitted to the photos, or cameras from a file."""
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -9,6 +10,7 @@ from stages.contract import StageError
 if TYPE_CHECKING:
     import numpy as np
 
+    from nerf.rays import Rays
     from nerf.scene import Camera, Scene, Similarity
 
 PathKind = Literal["orbit", "spiral", "interpolated"]
@@ -26,6 +28,35 @@ class CameraPath:
     def resized(self, width: int) -> "CameraPath":
         """The same views, ``width`` pixels wide; width and height even."""
         return replace(self, cameras=tuple(resized(camera, width) for camera in self.cameras))
+
+    def some(self, frames: Sequence[int]) -> "CameraPath":
+        """Only these frames."""
+        return CameraPath(tuple(self.cameras[i] for i in frames), self.poses[list(frames)])
+
+
+def path_rays(path: CameraPath, scene: "Scene") -> "Iterator[Rays]":
+    """The rays (height, width) of every frame, on the CPU; near and far are those of the photos around it."""
+    import numpy as np
+    import torch
+
+    from nerf.depth_range import range_between_views
+    from nerf.rays import rays_of_view
+    from stages.colmap import camera_rays
+
+    views = scene.of_split("train")
+    near, far = range_between_views(
+        path.poses[:, :, 3],
+        np.stack([view.scene_from_camera[:, 3] for view in views]),
+        np.array([view.near for view in views]),
+        np.array([view.far for view in views]),
+        scene.bounded,
+    )
+    bearings = {
+        camera: torch.from_numpy(camera_rays(camera, camera.width, camera.height)) for camera in set(path.cameras)
+    }
+    for index, camera in enumerate(path.cameras):
+        pose = torch.from_numpy(path.poses[index]).float()
+        yield rays_of_view(bearings[camera], pose, float(near[index]), float(far[index]))
 
 
 def fitted_path(scene: "Scene", kind: PathKind, frames: int) -> CameraPath:

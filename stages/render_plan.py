@@ -1,39 +1,58 @@
-"""How large and how long a video may be so that rendering it costs no more than training did."""
+"""How large and how long a video may be so that drawing it stays within a number of rays."""
 
 import math
 from typing import TYPE_CHECKING
 
+from stages.render_path import even_height
+
 if TYPE_CHECKING:
     from nerf.scene import Camera
 
-TRAINING_COST = 3  # rendered rays that cost as much as one trained ray: forward, backward and update
-SHARE = 0.5  # of the training's cost
-FEWEST_FRAMES, MOST_FRAMES = 24, 120
-LEAST_LONG_SIDE, USUAL_LONG_SIDE = 200, 320  # pixels
-LEAST_RATE, FULL_RATE, SHORTEST_SECONDS = 10, 30, 4.0
+MOST_FRAMES, FEWEST_FRAMES, LEAST_FRAMES = 120, 24, 6  # four smooth seconds, a turn in steps of 15°, a slide show
+LARGEST_SIDE, USUAL_SIDE, SMALL_SIDE, LEAST_SIDE = 1920, 480, 200, 32  # pixels
+FULL_RATE, USUAL_SECONDS = 30, 4.0
 
 
-def affordable(
-    rays_trained: int, camera: "Camera", longest: float, frames: int | None, width: int | None
-) -> tuple[int, int]:
-    """(frames, width), each as given or chosen.
+def affordable(rays: float, camera: "Camera", longest: float, frames: int | None, width: int | None) -> tuple[int, int]:
+    """(frames, width), each as given or chosen so that all frames together have at most ``rays`` pixels.
 
-    Frames come first, as many of 24 to 120 as a long side of 320 pixels leaves; then pixels, from a long side of 200 to
-    ``longest`` (the size of the photos as trained). A very short training still gives the smallest of both.
+    A still has to show something before it is worth moving, and a size that shows it is enough until the motion is
+    smooth. So growing ``rays`` are spent on: 6 frames up to a long side of 200, 24 frames at that, a side of 480,
+    120 frames, a side of ``longest``. Less than 6 frames of 32 pixels there is not, whatever they cost.
     """
-    budget = SHARE * TRAINING_COST * rays_trained
     long_side = max(camera.width, camera.height)
-    pixels_per_square = camera.width * camera.height / long_side**2
+    squares = rays / (camera.width * camera.height / long_side**2)
+
+    def count(side: float, least: int, most: int) -> int:
+        return int(min(max(squares / side**2, least), most))
+
+    if width is not None:
+        frames = frames or count(width * long_side / camera.width, LEAST_FRAMES, MOST_FRAMES)
+        return frames, _even(width)
     if frames is None:
-        side = width * long_side / camera.width if width else min(USUAL_LONG_SIDE, longest)
-        frames = int(min(max(budget / (side**2 * pixels_per_square), FEWEST_FRAMES), MOST_FRAMES))
-    if width is None:
-        side = math.sqrt(budget / frames / pixels_per_square)
-        side = min(max(side, LEAST_LONG_SIDE), max(longest, LEAST_LONG_SIDE), long_side)
-        width = int(side * camera.width / long_side)
-    return frames, max(2, 2 * round(width / 2))
+        frames = count(min(USUAL_SIDE, longest), FEWEST_FRAMES, MOST_FRAMES)
+        if squares < frames * min(SMALL_SIDE, longest) ** 2:
+            frames = count(min(SMALL_SIDE, longest), LEAST_FRAMES, FEWEST_FRAMES)
+    side = min(max(math.sqrt(squares / frames), LEAST_SIDE), longest)
+    return frames, _even(side * camera.width / long_side)
+
+
+def _even(width: float) -> int:
+    return max(2, 2 * int(width / 2))
+
+
+def pixels(frames: int, width: int, camera: "Camera") -> int:
+    """All pixels of a video of ``camera``'s proportions."""
+    return frames * width * even_height(width, camera)
+
+
+def longest_side(camera: "Camera", downscale: float) -> float:
+    """The side beyond which a video shows nothing new: that of the photos as trained. Photos trained very small are
+    drawn larger than that, for blocks of pixels would hide what the field knows; none larger than it is or 1920."""
+    side = max(camera.width, camera.height)
+    return min(max(side / downscale, USUAL_SIDE), side, LARGEST_SIDE)
 
 
 def chosen_fps(frames: int) -> int:
-    """30; fewer for a short path, so that it lasts four seconds, but at least 10."""
-    return max(LEAST_RATE, min(FULL_RATE, round(frames / SHORTEST_SECONDS)))
+    """30; fewer for a short path, so that it lasts four seconds."""
+    return max(1, min(FULL_RATE, round(frames / USUAL_SECONDS)))

@@ -13,6 +13,7 @@ from pydantic import Field
 
 from stages.contract import Inputs, Progress, StageConfig, StageResult
 from stages.files import read_json, read_scene, read_tensors, write_json
+from stages.live_line import duration, short_count
 
 if TYPE_CHECKING:
     from nerf.scene import Scene
@@ -96,9 +97,6 @@ def page(results: Results, summary: dict[str, Any], config: Config) -> str:
     """The whole HTML page."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-    from stages.live_line import short_count
-    from stages.report_plots import clock
-
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent),
         autoescape=True,
@@ -106,7 +104,7 @@ def page(results: Results, summary: dict[str, Any], config: Config) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"clock": clock, "short": short_count, "thousands": "{:,}".format, "value": _value}
+    environment.filters |= {"duration": duration, "short": short_count, "thousands": "{:,}".format, "value": _value}
     return environment.get_template("report.html.j2").render(
         workspace=_workspace(results.inputs),
         summary=summary,

@@ -5,6 +5,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
+from stages.live_line import duration
+
 if TYPE_CHECKING:
     import numpy as np
     from matplotlib.axes import Axes
@@ -17,20 +19,6 @@ SPLIT_COLOURS: "dict[Split, str]" = {"train": BLUE, "test": ORANGE}
 INK = "#010203"  # drawn with this and then replaced by the page's own text colour
 BOX = 0.9  # the region of interest is [-0.9, 0.9]^3, see nerf/scene.py
 MOST_POINTS = 20_000
-
-
-def clock(seconds: float) -> str:
-    """Seconds as people say them: 0.4 s, 58 s, 3 min 20 s, 1 h 5 min."""
-    if seconds < 9.95:
-        return f"{seconds:.1f} s".replace(".0 s", " s")
-    whole = round(seconds)
-    if whole < 60:
-        return f"{whole} s"
-    big, small, units = (
-        (whole // 60, whole % 60, "min s") if whole < 3600 else (whole // 3600, whole % 3600 // 60, "h min")
-    )
-    first, second = units.split()
-    return f"{big} {first} {small} {second}" if small else f"{big} {first}"
 
 
 def last_doubling(curve: Sequence[dict[str, Any]]) -> float | None:
@@ -128,7 +116,7 @@ def _doubling_axis(axes: "Axes", first: float, last: float) -> None:
     ticks = [last / 2**k for k in range(max(1, min(8, math.ceil(math.log2(last / first)) + 1)))]
     axes.set_xscale("log", base=2)
     axes.set_xlim(min(first, ticks[-1]), last * 1.04)
-    axes.set_xticks(ticks, [clock(tick) for tick in ticks])
+    axes.set_xticks(ticks, [duration(tick) for tick in ticks])
     axes.set_xticks([], minor=True)
     axes.axvspan(last / 2, last, color=BLUE, alpha=0.08, lw=0)
     axes.grid(color=INK, alpha=0.15, lw=0.8)

@@ -141,7 +141,7 @@ class Config(StageConfig):
         return [f"{n} ({value})" for n, value in values.items() if value != type(self).model_fields[n].default]
 
 
-def plan(config: Config, inputs: Inputs) -> Config:
+def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
     """Everything that was left open: field and budget, contraction from the scene, then sizes and the photos' size."""
     scene = read_scene(inputs["normalise"])
     seconds = DEFAULT_SECONDS if config.steps is None and config.seconds is None else config.seconds
@@ -152,6 +152,7 @@ def plan(config: Config, inputs: Inputs) -> Config:
     if config.downscale is None or (config.kind == "grid" and None in (config.levels, config.log2_rows, config.finest)):
         from stages.training_size import chosen_downscale, grid_size, rays_in_budget
 
+        progress.update("trying how fast this machine trains")
         rays = rays_in_budget(config, scene)
         config = _filled(config, {"downscale": chosen_downscale(scene, rays)})
         if config.kind == "grid":
@@ -188,7 +189,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     from stages.field_files import save_field
     from stages.training_setup import field_background, prepare
 
-    config, scene = plan(config, inputs), read_scene(inputs["normalise"])
+    config, scene = plan(config, inputs, progress), read_scene(inputs["normalise"])
     training = prepare(config, scene, inputs, folder, progress)
     training.train()
     info = {"downscale": config.downscale, "steps": training.state.step, "rays": training.state.rays}

@@ -16,9 +16,9 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from stages.checkpoints import Checkpoint, latest_checkpoint, save_checkpoint, write_atomically
+from stages.checkpoints import Checkpoint, latest_checkpoint, save_checkpoint
 from stages.contract import Progress, StageError
-from stages.files import read_json
+from stages.files import read_json, write_durably
 from stages.live_line import live_line, short_count
 
 if TYPE_CHECKING:
@@ -205,7 +205,7 @@ class TrainingRun:
         self.next_checkpoint = time.monotonic() + self.checkpoint_seconds
 
     def _write_journal(self) -> None:
-        write_atomically(self.journal, json.dumps(self.plan.decisions).encode())
+        write_durably(self.journal, json.dumps(self.plan.decisions).encode())
 
     def _roll_back(self, fault: "NonFinite") -> None:
         """Keep the batch, return to the last good checkpoint and halve the rate; give up by name after the third."""

@@ -6,7 +6,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from stages.contract import StageConfig, StageError, StageResult
+from stages.contract import Progress, StageConfig, StageError, StageResult
 from stages.files import read_json, write_json
 
 calls: list[str] = []
@@ -37,7 +37,7 @@ def _run_ingest(config: IngestConfig, inputs: dict[str, Path], folder: Path, pro
     return StageResult(outputs=("number.json",), line=f"number {config.number}")
 
 
-def _plan_sfm(config: SfmConfig, inputs: dict[str, Path]) -> SfmConfig:
+def _plan_sfm(config: SfmConfig, inputs: dict[str, Path], progress: Progress) -> SfmConfig:
     calls.append("plan sfm")
     return config if config.offset is not None else config.model_copy(update={"offset": 5})
 

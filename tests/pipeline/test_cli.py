@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from pipeline.cli import run_command
-from pipeline.display import PlainDisplay, duration, end_line
+from pipeline.display import PlainDisplay, end_line
 
 
 def test_help_names_every_command_and_stage(capsys: pytest.CaptureFixture[str]):
@@ -166,12 +166,8 @@ def test_a_signal_ends_cleanly_and_soon(tmp_path: Path, number: int, code: int):
     assert time.monotonic() - started < 15  # a hang, not slowness, is what this would catch
 
 
-def test_durations():
-    assert duration(0.04) == "0.0 s"
-    assert duration(99.94) == "99.9 s"
-    assert duration(99.96) == "1 min 40 s"
-    assert duration(3599.6) == "1 h 00 min"
-    assert end_line("sfm", "all good", 61.0, cached=False) == "sfm        all good  [61.0 s]"
+def test_end_lines():
+    assert end_line("sfm", "all good", 61.0, cached=False) == "sfm        all good  [1 min 1 s]"
     assert end_line("sfm", "all good", 61.0, cached=True) == "sfm        all good  [cached]"
 
 

@@ -4,7 +4,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from stages.checkpoints import Checkpoint, latest_checkpoint, save_checkpoint, write_atomically
+from stages.checkpoints import Checkpoint, latest_checkpoint, save_checkpoint
+from stages.files import write_durably
 
 
 def checkpoint(step: int) -> Checkpoint:
@@ -77,7 +78,7 @@ def test_not_finite_facts_are_refused(tmp_path: Path) -> None:
 
 def test_writing_replaces_the_whole_file(tmp_path: Path) -> None:
     path = tmp_path / "plan.json"
-    write_atomically(path, json.dumps(list(range(100))).encode())
-    write_atomically(path, b"[]")
+    write_durably(path, json.dumps(list(range(100))).encode())
+    write_durably(path, b"[]")
     assert path.read_bytes() == b"[]"
     assert [p.name for p in tmp_path.iterdir()] == ["plan.json"]

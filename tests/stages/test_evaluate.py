@@ -78,7 +78,7 @@ def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Make:
     """Finished folders for a scene of the sky and a field of it."""
 
     def build(
-        field: SkyField | None = None, *, tests: int = 4, rays: int = 10**9, downscale: float = 1, alpha: bool = False
+        field: SkyField | None = None, *, tests: int = 4, speed: int = 10**9, downscale: float = 1, alpha: bool = False
     ) -> dict[str, Path]:
         inputs = {stage: tmp_path / stage for stage in evaluate.NEEDS}
         for folder in inputs.values():
@@ -91,8 +91,10 @@ def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Make:
         identity = Similarity(1.0, np.eye(3), np.zeros(3))
         scene = Scene((camera,), tuple(views), identity, False, alpha, "inside", True)
         write_json(inputs["normalise"] / "scene.json", scene.to_json())
-        info = {"kind": "sky", "downscale": downscale, "rays": rays, "background": [0.0, 0.0, 0.0]}
+        info = {"kind": "sky", "downscale": downscale, "background": [0.0, 0.0, 0.0]}
         write_json(inputs["train"] / "field.json", info)
+        write_json(inputs["train"] / "curve.json", [{"seconds": 2.0}])
+        monkeypatch.setattr("stages.drawing.Painter.rays_per_second", lambda *_: speed)
         monkeypatch.setattr("stages.device.compute_device", lambda: "cpu")
         monkeypatch.setattr("stages.field_files.load_field", lambda _folder, _device: (field or SkyField(), info))
         return inputs
@@ -163,12 +165,30 @@ def test_scores_at_the_size_the_field_was_trained_at(make: Make, tmp_path: Path,
     assert full["width_share"] == 1 and full["psnr"] > metrics["psnr"]
 
 
-def test_a_short_training_is_scored_on_fewer_photos_and_says_so(make: Make, tmp_path: Path, progress: Any):
-    metrics, line = _run(make(rays=WIDTH * HEIGHT), tmp_path / "out", progress)
-    words = "3 of 4 test photos are scored, evenly spread: all of them would take longer than the training"
-    assert metrics["notes"][0] == words and progress.notes == [words]
+def test_a_slow_field_is_scored_on_fewer_photos_and_says_so(make: Make, tmp_path: Path, progress: Any):
+    metrics, line = _run(make(speed=3 * WIDTH * HEIGHT), tmp_path / "out", progress)
+    words = "3 of 4 test photos are scored, evenly spread"
+    assert progress.notes == [
+        "2.3 k rays/s here: all 4 test photos take about 1.3 s, training took 2 s; --evaluate.photos asks for more",
+        words,
+    ]
+    assert metrics["notes"][0] == words
     assert (metrics["photos_scored"], metrics["photos_test"], len(metrics["images"])) == (3, 4, 3)
     assert line.endswith("· 3 of 4 photos")
+
+
+def test_photos_asked_for_are_scored_whatever_they_take(make: Make, tmp_path: Path, progress: Any):
+    inputs = make(speed=1)
+    assert _run(inputs, tmp_path / "two", progress, photos=2)[0]["photos_scored"] == 2
+    assert _run(inputs, tmp_path / "all", progress, photos=99)[0]["photos_scored"] == 4
+
+
+def test_plan_answers_every_open_question_once(make: Make, progress: Any):
+    inputs = make(downscale=1.5, speed=1)
+    planned = evaluate.plan(evaluate.Config(), inputs, progress)
+    assert (planned.downscale, planned.photos) == (1.5, 1)
+    assert evaluate.plan(planned, inputs, progress) == planned
+    assert len(progress.notes) == 1
 
 
 def test_two_photos_give_no_interval_and_no_trust(make: Make, tmp_path: Path, progress: Any):

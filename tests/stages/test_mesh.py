@@ -231,7 +231,7 @@ def test_the_level_asked_for_is_taken(run_mesh):
 @pytest.mark.parametrize(
     ("rays", "resolution"), [(0, 96), (50_000, 96), (100_000, 128), (350_000, 192), (10**6, 256), (10**9, 256)]
 )
-def test_the_resolution_follows_the_training(tmp_path, rays, resolution):
+def test_the_resolution_follows_the_training(tmp_path, progress, rays, resolution):
     write_json(tmp_path / "field.json", {"rays": rays})
-    assert mesh.plan(mesh.Config(), {"train": tmp_path}).resolution == resolution
-    assert mesh.plan(mesh.Config(resolution=77), {"train": tmp_path}).resolution == 77
+    assert mesh.plan(mesh.Config(), {"train": tmp_path}, progress).resolution == resolution
+    assert mesh.plan(mesh.Config(resolution=77), {"train": tmp_path}, progress).resolution == 77

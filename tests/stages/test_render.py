@@ -50,13 +50,15 @@ def scene_with(poses: np.ndarray, layout: Layout = "around", camera: Camera = CA
 
 @pytest.fixture
 def inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Path]:
-    """A ring of photos around an analytic ball, trained on 100,000 rays."""
+    """A ring of photos around an analytic ball, trained for ten seconds and drawn at 30,000 rays a second."""
     folders = {name: tmp_path / name for name in ("normalise", "train", "render")}
     for folder in folders.values():
         folder.mkdir()
     write_json(folders["normalise"] / "scene.json", scene_with(ring(12, radius=2.5, height=0.8)).to_json())
     info = {"background": [0.0, 0.0, 1.0], "downscale": 1.0, "rays": 100_000}
     write_json(folders["train"] / "field.json", info)
+    write_json(folders["train"] / "curve.json", [{"step": 9, "seconds": 10.0}])
+    monkeypatch.setattr("stages.drawing.Painter.rays_per_second", lambda self, sample, largest, seconds: 30_000)
     monkeypatch.setattr("stages.field_files.load_field", lambda folder, device="cpu": (Ball(), info))
     return folders
 
@@ -75,7 +77,7 @@ def test_video_and_depth_show_the_field_from_the_path(inputs, progress) -> None:
     frames, fps = read_video(inputs["render"] / "video.mp4")
     depth, _ = read_video(inputs["render"] / "depth.mp4")
     assert frames.shape == depth.shape == (8, 60, 80, 3)
-    assert fps == 10
+    assert fps == 2
     corner, centre = frames[:, 3, 3].astype(int), frames[:, 30, 40].astype(int)
     assert (corner[:, 2] > 200).all()  # the blue background
     assert (centre[:, :2].max(axis=1) > 150).all()  # the ball in the middle of every frame
@@ -109,19 +111,45 @@ def test_frames_are_kept_and_depth_left_out_on_request(inputs, progress) -> None
     assert [file.name for file in sorted((inputs["render"] / "frames").iterdir())] == [f"{i:05d}.png" for i in range(3)]
 
 
-def test_plan_answers_every_open_question_from_layout_and_rays(inputs) -> None:
-    config = render.plan(render.Config(), inputs)
-    assert (config.path, config.frames, config.fps) == ("orbit", 24, 10)
-    assert config.frames is not None
+def test_plan_answers_every_open_question(inputs, progress) -> None:
+    config = render.plan(render.Config(), inputs, progress)
+    assert (config.path, config.frames, config.width, config.fps) == ("orbit", 7, 160, 2)
+    words = "30 k rays/s here: 7 frames 160×120 take about 4.5 s, training took 10 s"
+    assert progress.notes == [f"{words}; more would take too long, --render.frames and --render.width ask for it"]
+    assert render.plan(config, inputs, progress) == config
+    assert len(progress.notes) == 1
+
+
+@pytest.mark.parametrize(("seconds", "frames"), [(0.02, 6), (10.0, 7), (60.0, 46), (1000.0, 120)])
+def test_drawing_is_expected_to_take_half_as_long_as_training(inputs, progress, seconds: float, frames: int) -> None:
+    write_json(inputs["train"] / "curve.json", [{"seconds": 0.01}, {"seconds": seconds}])
+    config = render.plan(render.Config(), inputs, progress)
+    assert config.frames == frames
     assert config.width is not None
-    assert config.frames * config.width * config.width * 3 / 4 <= 1.03 * 150_000 or config.width == 160
-    assert render.plan(config, inputs) == config
+    expected = frames * config.width**2 * 0.75 / 30_000
+    assert expected < 0.52 * seconds or (frames, config.width) == (6, 32)
+
+
+def test_a_video_that_must_take_longer_than_training_says_so(inputs, progress) -> None:
+    write_json(inputs["train"] / "curve.json", [{"seconds": 0.1}])
+    render.plan(render.Config(), inputs, progress)
+    render.plan(render.Config(frames=50), inputs, progress)
+    assert [note.split("; ")[1] for note in progress.notes] == [
+        "that is longer, but there is no smaller video",
+        "that is longer, as asked",
+    ]
+
+
+def test_nothing_is_timed_where_nothing_is_open(inputs, progress) -> None:
+    (inputs["train"] / "curve.json").unlink()
+    config = render.plan(render.Config(frames=8, width=80), inputs, progress)
+    assert (config.frames, config.width, config.fps, progress.notes) == (8, 80, 2, [])
 
 
 @pytest.mark.parametrize(("layout", "path"), [("around", "orbit"), ("forward", "spiral"), ("inside", "interpolated")])
-def test_the_layout_chooses_the_path(inputs, layout: Layout, path: str) -> None:
+def test_the_layout_chooses_the_path(inputs, progress, layout: Layout, path: str) -> None:
     write_json(inputs["normalise"] / "scene.json", scene_with(wall(), layout).to_json())
-    assert render.plan(render.Config(), inputs).path == path
+    assert render.plan(render.Config(), inputs, progress).path == path
 
 
 def test_a_written_path_can_be_given_back_as_cameras(inputs, progress, tmp_path: Path) -> None:
@@ -194,4 +222,4 @@ def test_speed_is_a_record_and_path_an_output(inputs, progress) -> None:
     assert read_json(inputs["render"] / "speed.json")["frames_per_second"] > 0
     content = read_json(inputs["render"] / "path.json")
     assert len(content["frames"]) == 3
-    assert (content["w"], content["h"], content["fps"]) == (40, 30, 10)
+    assert (content["w"], content["h"], content["fps"]) == (40, 30, 1)

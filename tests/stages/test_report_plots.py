@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from nerf.scene import Camera, Scene, Similarity, View
-from stages.report_plots import _outline, camera_svgs, clock, curve_svg, last_doubling
+from stages.report_plots import _outline, camera_svgs, curve_svg, last_doubling
 
 
 def _scene(count: int = 9) -> Scene:
@@ -35,22 +35,6 @@ def _curve() -> list[dict[str, Any]]:
         }
         for k in range(1, 8)
     ]
-
-
-@pytest.mark.parametrize(
-    ("seconds", "words"),
-    [
-        (0.42, "0.4 s"),
-        (3.0, "3 s"),
-        (9.96, "10 s"),
-        (58.4, "58 s"),
-        (59.7, "1 min"),
-        (200, "3 min 20 s"),
-        (3900, "1 h 5 min"),
-    ],
-)
-def test_clock(seconds: float, words: str):
-    assert clock(seconds) == words
 
 
 def test_the_last_doubling_is_exact_where_psnr_grows_with_the_logarithm_of_time():

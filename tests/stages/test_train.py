@@ -8,7 +8,7 @@ from pydantic import ValidationError
 from nerf.grid_training import GridTrainer
 from nerf.training import PaperTrainer
 from stages import train
-from stages.contract import StageError
+from stages.contract import Progress, StageError
 from stages.field_files import load_field
 from stages.files import read_json
 from stages.train import Config
@@ -182,35 +182,37 @@ def test_every_option_is_shared_or_of_one_field() -> None:
 
 @pytest.mark.parametrize("bounded", [True, False])
 def test_plan_answers_everything_for_the_grid_field(
-    bounded: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    bounded: bool, tmp_path: Path, progress: Progress, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("stages.training_size.TIMED_SECONDS", 0.01)
     inputs, _ = photographed(tmp_path, bounded=bounded)
-    planned = train.plan(Config(), inputs)
+    planned = train.plan(Config(), inputs, progress)
     assert (planned.field, planned.seconds, planned.contracted) == ("grid", 180, not bounded)
     assert (planned.downscale, planned.background) == (1.0, "random")
     assert planned.levels and planned.log2_rows and planned.finest and planned.batch_samples
     assert planned.learning_rate == train.GRID_RATES["bounded" if bounded else "contracted"]
-    assert train.plan(Config.model_validate(planned.model_dump()), inputs) == planned
-    assert train.plan(Config(levels=3, finest=64), inputs).levels == 3
+    assert train.plan(Config.model_validate(planned.model_dump()), inputs, progress) == planned
+    assert train.plan(Config(levels=3, finest=64), inputs, progress).levels == 3
 
 
-def test_plan_answers_everything_for_the_paper_field(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_plan_answers_everything_for_the_paper_field(
+    tmp_path: Path, progress: Progress, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("stages.training_size.TIMED_SECONDS", 0.01)
     inputs, _ = photographed(tmp_path)
-    planned = train.plan(Config(batch_rays=8), inputs)
+    planned = train.plan(Config(batch_rays=8), inputs, progress)
     assert (planned.field, planned.background, planned.levels) == ("paper", "white", None)
     assert (planned.preset, planned.depth, planned.width) == ("small", 4, 64)
     assert (planned.samples_coarse, planned.samples_fine) == (32, 32)
     assert (planned.batch_rays, planned.learning_rate) == (8, 5e-3)
     assert (planned.seconds, planned.steps) == (180, None)
     assert (planned.contracted, planned.spacing, planned.downscale) == (False, "linear", 1.0)
-    assert train.plan(Config.model_validate(planned.model_dump()), inputs) == planned
+    assert train.plan(Config.model_validate(planned.model_dump()), inputs, progress) == planned
 
 
-def test_the_published_preset_is_the_published_model(tmp_path: Path) -> None:
+def test_the_published_preset_is_the_published_model(tmp_path: Path, progress: Progress) -> None:
     inputs, _ = photographed(tmp_path, bounded=False)
-    planned = train.plan(Config(preset="paper", steps=10, width=128), inputs)
+    planned = train.plan(Config(preset="paper", steps=10, width=128), inputs, progress)
     assert (planned.depth, planned.width, planned.skip) == (8, 128, 4)
     assert (planned.samples_coarse, planned.samples_fine) == (64, 128)
     assert (planned.batch_rays, planned.learning_rate) == (1024, 5e-4)

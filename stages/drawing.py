@@ -1,0 +1,78 @@
+"""Pictures of a trained field, how fast it draws them here, and how many rays that leaves time for."""
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from stages.files import read_json
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from nerf.model import RadianceModel, Rendering
+    from nerf.rays import Rays
+
+CHUNK = {"cpu": 512, "cuda": 8192}  # rays between two words to the user: a second of the published field on a laptop
+SHARE = 0.5  # of the training's seconds that drawing may be expected to take; what is left is room for a busier machine
+TIMED_SECONDS = 0.5
+TIMED_SHARE = 0.05  # of the training's seconds, where that is less
+FIRST_SIDE = 24  # pixels
+
+
+@dataclass(frozen=True)
+class Painter:
+    """A trained field, where it is computed, and what it is shown over."""
+
+    model: "RadianceModel"
+    background: "Tensor"  # (3,), on the model's device
+
+    def draw(self, rays: "Rays", on_chunk: Callable[[float], None] | None = None) -> "Rendering":
+        """The picture (height, width) that ``rays`` see, on the CPU. ``on_chunk`` is told the finished share."""
+        from nerf.model import Rendering
+        from nerf.rays import Rays
+        from nerf.rendering import render_image
+
+        device = self.background.device
+        on_device = Rays(*(part.to(device) for part in rays))
+        image = render_image(self.model, on_device, self.background, CHUNK[device.type], on_chunk)
+        return Rendering(*(part.cpu() for part in image))
+
+    def rays_per_second(self, sample: "Callable[[int], Rays]", largest: int, seconds: float) -> float:
+        """Measured speed. ``sample(side)`` are rays of the pictures to come, reduced to ``side`` pixels; the side
+        grows from FIRST_SIDE to ``largest`` until drawing takes ``seconds``."""
+        side = min(FIRST_SIDE, largest)
+        self.draw(sample(side))  # the first picture pays for memory and kernels
+        while True:
+            rays = sample(side)
+            started = time.perf_counter()
+            self.draw(rays)
+            elapsed = time.perf_counter() - started
+            if elapsed >= seconds or side == largest:
+                return rays.near.numel() / elapsed
+            side = min(math.ceil(side * math.sqrt(2)), largest)
+
+
+def load_painter(train: Path, background: tuple[float, ...] | None = None) -> Painter:
+    """The field that stage train left in ``train``, over ``background``; None: what it was trained to stand before."""
+    import torch
+
+    from stages.device import compute_device
+    from stages.field_files import load_field
+
+    device = compute_device()
+    model, info = load_field(train, device)
+    return Painter(model, torch.tensor(info["background"] if background is None else background, device=device))
+
+
+def training_seconds(train: Path) -> float:
+    """How long the field in ``train`` was trained, without measuring and saving."""
+    return read_json(train / "curve.json")[-1]["seconds"]
+
+
+def measured_speed(train: Path, sample: "Callable[[int], Rays]", largest: int) -> float:
+    """Rays per second that the field in ``train`` draws on this machine, found in no more than a second or two."""
+    seconds = min(TIMED_SECONDS, TIMED_SHARE * training_seconds(train))
+    return load_painter(train).rays_per_second(sample, largest, seconds)

@@ -1,0 +1,68 @@
+"""What a painter draws, and how its speed is found."""
+
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from nerf.model import Rendering
+from nerf.rays import Rays
+from stages.drawing import Painter, training_seconds
+from stages.files import write_json
+
+
+class Slow:
+    """A field whose every ray costs the same time."""
+
+    def __init__(self, seconds_per_ray: float) -> None:
+        self.seconds_per_ray, self.rays = seconds_per_ray, 0
+
+    def density(self, points):
+        return points[..., 0]
+
+    def colour(self, points, directions):
+        return points
+
+    def render(self, rays: Rays, background: torch.Tensor) -> Rendering:
+        time.sleep(self.seconds_per_ray * len(rays.near))
+        self.rays += len(rays.near)
+        return Rendering(rays.directions * background, rays.far, rays.near)
+
+
+def square(side: int) -> Rays:
+    grid = torch.arange(3.0 * side * side).reshape(side, side, 3)
+    return Rays(grid, grid, grid[..., 0], grid[..., 1])
+
+
+def painter(seconds_per_ray: float = 0.0) -> Painter:
+    return Painter(Slow(seconds_per_ray), torch.tensor([1.0, 2.0, 3.0]))
+
+
+def test_a_picture_has_every_ray_in_its_place() -> None:
+    shares: list[float] = []
+    picture = painter().draw(square(40), shares.append)
+    torch.testing.assert_close(picture.colour, square(40).directions * torch.tensor([1.0, 2.0, 3.0]))
+    assert picture.depth.shape == picture.opacity.shape == (40, 40)
+    assert shares == sorted(shares) and shares[-1] == 1.0
+
+
+@pytest.mark.parametrize("seconds_per_ray", [1e-5, 1e-4])
+def test_the_speed_found_is_the_fields(seconds_per_ray: float) -> None:
+    speed = painter(seconds_per_ray).rays_per_second(square, 100, 0.02)
+    assert 0.5 / seconds_per_ray < speed <= 1 / seconds_per_ray  # waits last longer than asked, never shorter
+
+
+def test_timing_ends_at_the_largest_picture() -> None:
+    field = Slow(0.0)
+    Painter(field, torch.zeros(3)).rays_per_second(square, 50, 1e9)
+    assert field.rays == 24**2 + 24**2 + 34**2 + 49**2 + 50**2
+
+
+def test_a_picture_smaller_than_the_first_one_tried_will_do() -> None:
+    assert painter().rays_per_second(square, 5, 1e9) > 0
+
+
+def test_training_took_as_long_as_its_curve_says(tmp_path: Path) -> None:
+    write_json(tmp_path / "curve.json", [{"seconds": 2.0}, {"seconds": 61.5}])
+    assert training_seconds(tmp_path) == 61.5
