@@ -1,8 +1,11 @@
 """All pixels of a set of photos, and what it takes to turn any of them into a ray.
 
-Photos may differ in size and camera. They are laid end to end: a *pixel* index counts through all of them, row
-by row. Pixels stay uint8 and bearing vectors are stored once per camera, so that a hundred photos of two
-megapixels take 0.6 GB and not 8.
+Photos may differ in size and camera. They are laid end to end: a *pixel* index counts through all of them, row by
+row. The pixels stay uint8 and may be a file mapped into memory, so that there may be more of them than memory holds.
+
+A camera is a mosaic of *patches*, each small enough for its bearings to be linear in the pixel (the model of a pinhole
+camera: exact without distortion). One look-up then gives the ray of a pixel, and a camera takes the same small memory
+whatever the size of its photos: a set where every photo has a camera of its own stays small.
 """
 
 from collections.abc import Sequence
@@ -14,27 +17,38 @@ from torch import Tensor
 
 from nerf.rays import Rays
 
+# Bearings are brought to the plane z = 1, where those of a camera without distortion are linear in the pixel. Beyond 60
+# degrees from the axis, where that plane is too far away, they keep a bounded length.
+LEAST_FORWARD = 0.5
+
 
 class RayBank(NamedTuple):
-    """Photos as one table of pixels; make it with :func:`build_ray_bank`.
+    """Photos as one table of pixels; make it with :func:`ray_bank` or :func:`build_ray_bank`.
 
-    View v owns the pixels [first_pixel[v], first_pixel[v + 1]); its bearing vectors start at
-    ``directions[first_direction[v]]``, in the same order. ``pixels`` have 3 channels, or 4 with a straight (not
-    premultiplied) alpha.
+    View v owns the pixels [first_pixel[v], first_pixel[v + 1]); ``pixels`` have 3 channels, or 4 with a straight (not
+    premultiplied) alpha. What a look-up needs of a view stands in two tables with a column per view:
+
+    * ``layout``: its first pixel, its width, its camera's first patch, patches in a row;
+    * ``geometry``: the rotation scene_from_camera row by row, the centre, near, far, patches per pixel along x and y.
+
+    ``patches`` has a column per patch: the bearing in its middle, and how it changes along x and y over one patch.
     """
 
     pixels: UInt8[Tensor, "pixels channels"]
-    directions: Float[Tensor, "bearings 3"]
     first_pixel: Int[Tensor, "views_and_end"]
-    first_direction: Int[Tensor, "views"]
-    poses: Float[Tensor, "views 3 4"]
-    near: Float[Tensor, "views"]
-    far: Float[Tensor, "views"]
+    layout: Int[Tensor, "4 views"]
+    geometry: Float[Tensor, "16 views"]
+    patches: Float[Tensor, "9 patches"]
 
     @property
     def device(self) -> torch.device:
         """Where the tables are."""
         return self.pixels.device
+
+    @property
+    def near(self) -> Float[Tensor, "views"]:
+        """Per view, where rays begin."""
+        return self.geometry[12]
 
     def to(self, device: torch.device | str) -> "RayBank":
         """This bank with its tables on ``device``."""
@@ -42,14 +56,27 @@ class RayBank(NamedTuple):
 
     def lookup(self, pixel: Int[Tensor, "rays"]) -> tuple[Rays, Float[Tensor, "rays 3"], Float[Tensor, "rays"] | None]:
         """The rays through given pixels, with the pixels' colours and alpha in [0, 1] (None without a channel)."""
-        view = torch.searchsorted(self.first_pixel, pixel, right=True) - 1
-        within = pixel - self.first_pixel[view]
-        in_camera = self.directions[self.first_direction[view] + within]
-        pose = self.poses[view]
-        directions = (pose[:, :, :3] @ in_camera[:, :, None])[:, :, 0]
-        rays = Rays(pose[:, :, 3], directions, self.near[view], self.far[view])
-        values = self.pixels[pixel].float() / 255
+        view = torch.searchsorted(self.first_pixel, pixel, right=True).sub_(1)
+        geometry = self.geometry.index_select(1, view)
+        bearing = self._bearing(pixel, self.layout.index_select(1, view), geometry[14:])
+        directions = (geometry[:9].view(3, 3, -1) * bearing).sum(1)
+        rays = Rays(geometry[9:12].T.contiguous(), directions.T.contiguous(), geometry[12], geometry[13])
+        values = self.pixels.index_select(0, pixel).float().div_(255)
         return rays, values[:, :3], values[:, 3] if values.shape[1] == 4 else None
+
+    def _bearing(
+        self, pixel: Int[Tensor, "rays"], layout: Int[Tensor, "4 rays"], per_pixel: Float[Tensor, "2 rays"]
+    ) -> Float[Tensor, "3 rays"]:
+        """Unit bearings in the camera frame: of the patch, b + u db/du + v db/dv, with (u, v) from its middle."""
+        first_pixel, width, first_patch, across = layout
+        within = pixel - first_pixel
+        row = within // width
+        x, y = (within - row * width + 0.5) * per_pixel[0], (row + 0.5) * per_pixel[1]  # in patches
+        column, line = x.long(), y.long()
+        u, v = x.sub_(column).sub_(0.5), y.sub_(line).sub_(0.5)
+        patch = self.patches.index_select(1, first_patch + line * across + column)
+        bearing = torch.addcmul(torch.addcmul(patch[:3], patch[3:6], u), patch[6:], v)
+        return bearing / bearing.square().sum(0).sqrt_()
 
     def sample(
         self, count: int, generator: torch.Generator
@@ -59,42 +86,84 @@ class RayBank(NamedTuple):
         return self.lookup(pixel)
 
 
+class Placement(NamedTuple):
+    """How the views stand: scene_from_camera, and distances along the unit ray."""
+
+    poses: Float[Tensor, "views 3 4"]
+    near: Float[Tensor, "views"]
+    far: Float[Tensor, "views"]
+
+
+def ray_bank(
+    pixels: UInt8[Tensor, "pixels channels"],
+    sizes: Sequence[tuple[int, int]],
+    camera_of: Sequence[int],
+    camera_bearings: Sequence[Float[Tensor, "_ _ 3"]],
+    placement: Placement,
+) -> RayBank:
+    """The bank of photos that are laid end to end already.
+
+    Args:
+        pixels: all photos, row by row, with 3 or with 4 channels; taken as it is, without a copy.
+        sizes: per view, (height, width) of its photo in pixels.
+        camera_of: per view, the index of its camera in ``camera_bearings``.
+        camera_bearings: per camera, (rows, columns, 3) bearing vectors (camera frame) in the middles of the equal
+            patches into which they divide the picture. As many as pixels give each pixel its own; fewer are enough
+            where distortion is smooth.
+        placement: of every view.
+
+    Raises:
+        ValueError: if there are no photos, one has fewer pixels along a side than its camera has bearings, or
+            ``pixels`` has another length than all photos together.
+    """
+    if not sizes:
+        raise ValueError("a ray bank needs at least one photo")
+    grids = [(bearings.shape[0], bearings.shape[1]) for bearings in camera_bearings]
+    for view, (size, camera) in enumerate(zip(sizes, camera_of, strict=True)):
+        if size[0] < grids[camera][0] or size[1] < grids[camera][1]:
+            raise ValueError(f"photo {view} has size {size}, its camera {camera} {grids[camera]} bearings")
+    first_pixel = _starts([height * width for height, width in sizes])
+    if len(pixels) != first_pixel[-1]:
+        raise ValueError(f"there are {len(pixels)} pixels, the photos have {first_pixel[-1]}")
+    first_patch = _starts([rows * columns for rows, columns in grids])
+    cameras = torch.tensor(camera_of)
+    grid, size = torch.tensor(grids)[cameras], torch.tensor(sizes)
+    poses, near, far = placement
+    rotations, centres = poses[:, :, :3].reshape(-1, 9), poses[:, :, 3]
+    return RayBank(
+        pixels=pixels,
+        first_pixel=first_pixel,
+        layout=torch.stack([first_pixel[:-1], size[:, 1], first_patch[cameras], grid[:, 1]]),
+        geometry=torch.cat([rotations, centres, near[:, None], far[:, None], (grid / size).flip(1)], 1).T.contiguous(),
+        patches=torch.cat([_patches(bearings) for bearings in camera_bearings], 1),
+    )
+
+
 def build_ray_bank(
     photos: Sequence[UInt8[Tensor, "_ _ channels"]],
     camera_of: Sequence[int],
-    camera_directions: Sequence[Float[Tensor, "_ _ 3"]],
+    camera_bearings: Sequence[Float[Tensor, "_ _ 3"]],
     poses: Float[Tensor, "views 3 4"],
     near: Float[Tensor, "views"],
     far: Float[Tensor, "views"],
 ) -> RayBank:
-    """Lay photos end to end.
+    """:func:`ray_bank` of photos in memory, (height, width, channels) each, which it copies."""
+    pixels = [photo.flatten(0, 1) for photo in photos] or [torch.zeros(0, 3, dtype=torch.uint8)]
+    sizes = [(photo.shape[0], photo.shape[1]) for photo in photos]
+    return ray_bank(torch.cat(pixels), sizes, camera_of, camera_bearings, Placement(poses, near, far))
 
-    Args:
-        photos: one (height, width, channels) picture per view, all with 3 or all with 4 channels.
-        camera_of: per view, the index of its camera in ``camera_directions``.
-        camera_directions: per camera, (height, width, 3) unit bearing vectors of the pixel centres (camera frame).
-        poses: scene_from_camera of every view.
-        near, far: distances along the unit ray, per view.
 
-    Raises:
-        ValueError: if there are no photos or one has another size than its camera.
-    """
-    if not photos:
-        raise ValueError("a ray bank needs at least one photo")
-    for view, (photo, camera) in enumerate(zip(photos, camera_of, strict=True)):
-        if photo.shape[:2] != camera_directions[camera].shape[:2]:
-            sizes = f"{tuple(photo.shape[:2])}, its camera {camera} {tuple(camera_directions[camera].shape[:2])}"
-            raise ValueError(f"photo {view} has size {sizes}")
-    first_bearing = _starts([directions.shape[0] * directions.shape[1] for directions in camera_directions])
-    return RayBank(
-        pixels=torch.cat([photo.flatten(0, 1) for photo in photos]),
-        directions=torch.cat([directions.flatten(0, 1) for directions in camera_directions]),
-        first_pixel=_starts([photo.shape[0] * photo.shape[1] for photo in photos]),
-        first_direction=first_bearing[torch.tensor(camera_of)],
-        poses=poses,
-        near=near,
-        far=far,
-    )
+def _patches(bearings: Float[Tensor, "rows columns 3"]) -> Float[Tensor, "9 patches"]:
+    """Bearings on the plane z = 1, with their slopes along x and y per patch (central differences)."""
+    flat = bearings / bearings[..., 2:].clamp(min=LEAST_FORWARD)
+    return torch.cat([flat, _slope(flat, 1), _slope(flat, 0)], -1).flatten(0, 1).T.contiguous()
+
+
+def _slope(values: Float[Tensor, "rows columns 3"], axis: int) -> Float[Tensor, "rows columns 3"]:
+    count = values.shape[axis]
+    if count == 1:
+        return torch.zeros_like(values)
+    return torch.gradient(values, dim=axis, edge_order=min(2, count - 1))[0]
 
 
 def _starts(counts: list[int]) -> Int[Tensor, "counts_and_end"]:

@@ -19,13 +19,13 @@ class Painted:
         raise NotImplementedError
 
     def render(self, rays: Rays, background):
-        grey = rays.directions[..., :1].expand(*rays.near.shape, 3)
+        grey = (rays.directions[..., :1] / rays.directions[..., 2:]).expand(*rays.near.shape, 3)
         return Rendering(grey, rays.far, torch.full_like(rays.far, 0.5))
 
 
 def painted_bank() -> RayBank:
     values = torch.arange(256)
-    directions = torch.stack([values / 255, values * 0.0, values * 0.0], -1)[None]
+    directions = torch.stack([values / 255, values * 0.0, values * 0.0 + 1], -1)[None]
     photo = values.to(torch.uint8)[None, :, None].expand(1, 256, 3)
     return build_ray_bank([photo], [0], [directions], torch.eye(3, 4)[None], torch.ones(1), torch.full((1,), 2.0))
 

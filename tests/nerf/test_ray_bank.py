@@ -1,9 +1,11 @@
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from torch import Tensor
 
 from nerf.randomness import generator
-from nerf.ray_bank import RayBank, build_ray_bank
+from nerf.ray_bank import Placement, RayBank, build_ray_bank, ray_bank
 from nerf.rays import rays_of_view
 
 SIZES = [(3, 5), (4, 2), (3, 5)]  # (height, width) of each view
@@ -55,12 +57,54 @@ def test_samples_depend_on_the_generator_alone() -> None:
     assert not torch.equal(first[0].directions, other[0].directions)
 
 
-def test_a_photo_of_another_size_than_its_camera_is_refused() -> None:
+def test_a_photo_with_fewer_pixels_than_its_camera_has_bearings_is_refused() -> None:
     photo, bearings = torch.zeros(2, 3, 3, dtype=torch.uint8), torch.zeros(3, 2, 3)
-    with pytest.raises(ValueError, match=r"photo 0 has size \(2, 3\), its camera 0 \(3, 2\)"):
+    with pytest.raises(ValueError, match=r"photo 0 has size \(2, 3\), its camera 0 \(3, 2\) bearings"):
         build_ray_bank([photo], [0], [bearings], torch.zeros(1, 3, 4), torch.ones(1), torch.ones(1))
 
 
 def test_no_photos_are_refused() -> None:
     with pytest.raises(ValueError, match="at least one photo"):
         build_ray_bank([], [], [], torch.zeros(0, 3, 4), torch.ones(0), torch.ones(0))
+
+
+def test_a_table_that_is_not_all_photos_is_refused() -> None:
+    placement = Placement(torch.zeros(1, 3, 4), torch.ones(1), torch.ones(1))
+    with pytest.raises(ValueError, match="there are 5 pixels, the photos have 6"):
+        ray_bank(torch.zeros(5, 3, dtype=torch.uint8), [(2, 3)], [0], [torch.ones(1, 1, 3)], placement)
+
+
+def test_the_table_of_pixels_is_not_copied() -> None:
+    placement = Placement(torch.zeros(1, 3, 4), torch.ones(1), torch.ones(1))
+    pixels = torch.zeros(6, 3, dtype=torch.uint8)
+    assert ray_bank(pixels, [(2, 3)], [0], [torch.ones(1, 1, 3)], placement).pixels is pixels
+
+
+@given(st.integers(1, 40), st.integers(1, 40), st.integers(2, 40), st.integers(2, 40))
+def test_without_distortion_few_patches_are_as_good_as_many(rows: int, columns: int, height: int, width: int) -> None:
+    rows, columns = min(max(2, rows), height), min(max(2, columns), width)
+
+    def bearings(rows: int, columns: int) -> Tensor:
+        y, x = torch.meshgrid((torch.arange(rows) + 0.5) / rows, (torch.arange(columns) + 0.5) / columns, indexing="ij")
+        bearing = torch.stack([1.2 * x - 0.5, 0.8 * y - 0.4, torch.ones_like(x)], -1)
+        return bearing / bearing.norm(dim=-1, keepdim=True)
+
+    photo = torch.zeros(height, width, 3, dtype=torch.uint8)
+    views = (torch.eye(3, 4)[None], torch.ones(1), torch.ones(1))
+    bank = build_ray_bank([photo], [0], [bearings(rows, columns)], *views)
+    found = bank.lookup(torch.arange(height * width))[0].directions
+    assert bank.patches.shape[1] == rows * columns
+    torch.testing.assert_close(found, bearings(height, width).view(-1, 3), atol=2e-6, rtol=0)
+
+
+def test_rays_are_unit_vectors_behind_the_camera_too() -> None:
+    turn = torch.linspace(0.1, 2.9, 33)  # to 166 degrees from the axis
+    bearings = torch.stack([turn.sin(), torch.zeros(33), turn.cos()], -1)[None]
+    photo = torch.zeros(1, 330, 3, dtype=torch.uint8)
+    bank = build_ray_bank([photo], [0], [bearings], torch.eye(3, 4)[None], torch.ones(1), torch.ones(1))
+    directions = bank.lookup(torch.arange(330))[0].directions
+    torch.testing.assert_close(directions.norm(dim=1), torch.ones(330))
+    step = (2.9 - 0.1) / 32
+    expected = 0.1 + step * ((torch.arange(330) + 0.5) / 10 - 0.5)
+    off = torch.atan2(directions[:, 0], directions[:, 2]) - expected
+    assert 0 < off.abs().max() < 0.1 * step

@@ -7,8 +7,17 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from nerf.ray_bank import Placement, ray_bank
 from nerf.scene import Camera
-from stages.training_data import scaled_size, training_bank, view_pixels, view_rays
+from stages.training_data import (
+    MOST_PATCHES,
+    camera_directions,
+    patch_bearings,
+    scaled_size,
+    training_bank,
+    view_pixels,
+    view_rays,
+)
 from tests.stages.photo_scene import CAMERA, FOCAL, HEIGHT, WIDTH, ball_photo, photographed
 
 
@@ -69,11 +78,54 @@ def test_stray_alpha_in_an_opaque_scene_is_laid_over_white(tmp_path: Path) -> No
     assert torch.equal(bank.pixels[: WIDTH * HEIGHT], torch.from_numpy(ball_photo()).flatten(0, 1))
 
 
+def test_an_opaque_photo_in_a_scene_with_alpha_covers_every_pixel(tmp_path: Path) -> None:
+    inputs, scene = photographed(tmp_path, channels=3)
+    bank = training_bank(inputs["ingest"], replace(scene, has_alpha=True), "train", 1.0)
+    assert bank.pixels.shape[1] == 4
+    assert (bank.pixels[:, 3] == 255).all()
+    assert torch.equal(bank.pixels[: WIDTH * HEIGHT, :3], torch.from_numpy(ball_photo()).flatten(0, 1))
+
+
 def test_cameras_of_test_views_do_not_enter_the_training_bank(tmp_path: Path) -> None:
     inputs, scene = photographed(tmp_path)
     other = replace(CAMERA, params=(FOCAL, FOCAL, 1.0, 1.0))
     views = tuple(replace(view, camera=int(view.split == "train")) for view in scene.views)
     mixed = replace(scene, cameras=(other, CAMERA), views=views)
     bank = training_bank(inputs["ingest"], mixed, "train", 1.0)
-    assert len(bank.directions) == WIDTH * HEIGHT
-    assert torch.equal(bank.directions, training_bank(inputs["ingest"], scene, "train", 1.0).directions)
+    assert bank.patches.shape[1] == WIDTH * HEIGHT
+    assert torch.equal(bank.patches, training_bank(inputs["ingest"], scene, "train", 1.0).patches)
+
+
+def test_evaluation_reads_the_pixels_that_training_stored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    inputs, scene = photographed(tmp_path)
+    ingest, trained, unseen = inputs["ingest"], scene.of_split("train")[2], scene.of_split("test")[1]
+    decoded = [view_pixels(ingest, scene, view, 2.0) for view in (trained, unseen)]
+    for split in ("train", "test"):
+        training_bank(ingest, scene, split, 2.0)
+    monkeypatch.setattr("stages.photos.load_pixels", None)
+    for view, pixels in zip((trained, unseen), decoded, strict=True):
+        assert torch.equal(view_pixels(ingest, scene, view, 2.0), pixels)
+
+
+LENSES = {
+    "none": Camera("PINHOLE", 4000, 3000, (3000.0, 3000.0, 2010.0, 1490.0)),
+    "phone": Camera("SIMPLE_RADIAL", 4000, 3000, (3000.0, 2000.0, 1500.0, 0.1)),
+    "action camera": Camera("OPENCV", 4000, 3000, (2200.0, 2200.0, 2000.0, 1500.0, -0.25, 0.06, 1e-3, 1e-3)),
+    "fisheye": Camera("OPENCV_FISHEYE", 4000, 3000, (2000.0, 2000.0, 2000.0, 1500.0, 0.02, -0.005, 0.0, 0.0)),
+}
+
+
+@pytest.mark.parametrize(
+    ("lens", "limit_px"), [("none", 5e-4), ("phone", 3e-3), ("action camera", 3e-2), ("fisheye", 6e-2)]
+)
+def test_patches_bend_no_ray(lens: str, limit_px: float) -> None:
+    camera, downscale = LENSES[lens], 4.0
+    width, height = scaled_size(camera, downscale)
+    bearings = patch_bearings(camera, downscale)
+    assert max(bearings.shape[:2]) == MOST_PATCHES < width
+    placed = Placement(torch.eye(3, 4)[None], torch.ones(1), torch.ones(1))
+    bank = ray_bank(torch.zeros(width * height, 3, dtype=torch.uint8), [(height, width)], [0], [bearings], placed)
+    found = bank.lookup(torch.arange(width * height))[0].directions
+    exact = camera_directions(camera, downscale).view(-1, 3)
+    off_px = (found.double() - exact.double()).norm(dim=1).max() * camera.params[0] / downscale
+    assert 0 < off_px < limit_px

@@ -1,0 +1,136 @@
+"""What photos cost before the first step and in every one: time and memory of the pixel store, time of a batch.
+
+    python -m benchmarks.pixel_store [--photos 500] [--downscale 1] [--folder DIR]
+
+Makes synthetic photos of 12 megapixels (JPEG), builds their store, draws batches from it, and prints seconds, bytes
+and the peak memory of this process. ``file`` memory is the mapped store: the system takes it back when it needs it;
+``own`` memory is not given back. ``from the disk`` is a batch right after the store was dropped from memory: what
+every batch costs, at worst, where the store is much larger than memory. The last lines take the same batches from
+plain memory, for comparison.
+"""
+
+import argparse
+import mmap
+import os
+import resource
+import statistics
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from nerf.randomness import generator
+from nerf.ray_bank import RayBank
+from nerf.scene import Camera, Scene, Similarity, View
+from stages import pixel_store
+from stages.training_data import training_bank
+
+WIDTH, HEIGHT = 4000, 3000
+DIFFERENT = 4  # photos that are painted; the others are copies
+BATCHES = (4096, 8192)
+REPEATS = 100
+
+
+class Spoken:
+    """A Progress that says what stays."""
+
+    def update(self, message: str, done: float | None = None) -> None:
+        """Say nothing."""
+
+    def note(self, message: str) -> None:
+        """Say it."""
+        print(f"  {message}")
+
+
+def paint(folder: Path, photos: int) -> Scene:
+    """Photos with as much detail as a JPEG of a real one has, in an ingest folder, and their scene."""
+    (folder / "images").mkdir(parents=True)
+    views, camera = [], Camera("OPENCV", WIDTH, HEIGHT, (3000.0, 3000.0, WIDTH / 2, HEIGHT / 2, 0.1, -0.05, 0.0, 0.0))
+    for index in range(photos):
+        path = folder / f"images/{index:04d}.jpg"
+        if index < DIFFERENT:
+            coarse = np.random.default_rng(index).integers(0, 256, (HEIGHT // 4, WIDTH // 4, 3), dtype=np.uint8)
+            Image.fromarray(coarse).resize((WIDTH, HEIGHT), Image.Resampling.BICUBIC).save(path, quality=92)
+        else:
+            path.write_bytes((folder / f"images/{index % DIFFERENT:04d}.jpg").read_bytes())
+        views.append(View(path.name, f"images/{path.name}", index, np.eye(3, 4), 1.0, 9.0, "train"))
+    frame = Similarity(1.0, np.eye(3), np.zeros(3))
+    return Scene((camera,) * photos, tuple(views), frame, False, False, "inside", True)
+
+
+def memory() -> str:
+    """Peak of this process, and what it holds now, split into what is its own and what is mapped files."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    now = {line.split(":")[0]: int(line.split()[1]) / 1e6 for line in lines if line.startswith("Rss")}
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+    return f"peak {peak:.2f} GB · now own {now['RssAnon']:.2f} GB, file {now['RssFile']:.2f} GB"
+
+
+def milliseconds(work: Callable[[], object], repeats: int) -> str:
+    """Median and lowest duration."""
+    taken = []
+    for _ in range(repeats):
+        started = time.perf_counter()
+        work()
+        taken.append(1e3 * (time.perf_counter() - started))
+    return f"{statistics.median(taken):8.2f} ms (lowest {min(taken):.2f})"
+
+
+def draw(bank: RayBank, where: str, repeats: int = REPEATS) -> None:
+    """Time batches of rays."""
+    random = generator("cpu", 0)
+    for count in BATCHES:
+        print(f"{count} rays, {where:<16}{milliseconds(lambda n=count: bank.sample(n, random), repeats)}")
+
+
+def drop_from_memory(store: Path) -> None:
+    """Let the system forget a file that nobody has mapped."""
+    descriptor = os.open(store, os.O_RDONLY)
+    os.posix_fadvise(descriptor, 0, 0, os.POSIX_FADV_DONTNEED)
+    os.close(descriptor)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--photos", type=int, default=6)
+    parser.add_argument("--downscale", type=float, default=1.0)
+    parser.add_argument("--folder", type=Path, default=None, help="where to work; default: a temporary folder")
+    given = parser.parse_args()
+    with tempfile.TemporaryDirectory(dir=given.folder) as folder:
+        measure(Path(folder) / "ingest", given.photos, given.downscale)
+
+
+def measure(ingest: Path, photos: int, downscale: float) -> None:
+    """Build, draw, print."""
+    scene = paint(ingest, photos)
+    print(f"{photos} photos of {WIDTH} x {HEIGHT}, each with its own camera, at 1/{downscale:g}; {memory()}")
+
+    def opened() -> RayBank:
+        started = time.perf_counter()
+        bank = training_bank(ingest, scene, "train", downscale, Spoken())
+        print(f"opened in {time.perf_counter() - started:.1f} s; {memory()}")
+        return bank
+
+    opened()
+    (store,) = (path for path in ingest.with_name("ingest.pixels").iterdir() if not path.suffix)
+    print(f"the store was made: {store.stat().st_size / 1e9:.2f} GB")
+    warm(opened())
+    drop_from_memory(store)
+    pixel_store.FITS = 0.0  # as if memory were too small for it
+    draw(opened(), "from the disk", 5)
+
+
+def warm(bank: RayBank) -> None:
+    """Batches from a store that memory holds, and from a copy in plain memory."""
+    draw(bank, "first ones", 5)
+    bank.pixels.view(-1)[:: mmap.PAGESIZE].sum()
+    draw(bank, "mapped")
+    print(memory())
+    draw(bank._replace(pixels=bank.pixels.clone()), "plain memory")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,204 @@
+"""The pixels of a set of photos at one size, in a file that is mapped into memory: a cache, made again when in doubt.
+
+It lies beside the folder of ingest as ``<folder>.pixels/``, outside of every manifest and digest. A store is found by
+what it was made from (names, sizes and times of the files, the size asked for), is written once under a lock, and
+appears whole under its name or not at all. Photos are decoded on all cores, each written to its place and dropped.
+
+What a mapped file costs: as much memory as there is to spare, given back when others need it. Random reads are as
+fast as from plain memory once the file has been read; where it is larger than memory, each pixel that is not there
+waits for the disk (``benchmarks/pixel_store.py``).
+"""
+
+import hashlib
+import json
+import os
+import shutil
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, BinaryIO, NamedTuple
+
+from stages.contract import Progress, StageError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from torch import Tensor
+
+VERSION = 1  # raised when the same photos would give other pixels
+DECODING_BYTES = 1 << 30  # how much memory may go into photos that are being decoded at a time
+BYTES_PER_PIXEL = {3: 16, 4: 64}  # that decoding and shrinking a photo takes, by channels
+FITS = 0.8  # share of the free memory up to which a store is read ahead as a whole
+
+
+class StoredPhoto(NamedTuple):
+    """A photo of a store: its file below ingest's folder, and its size in pixels there."""
+
+    file: str
+    width: int
+    height: int
+
+
+Load = Callable[[int], "np.ndarray"]
+"""The pixels (height, width, channels) uint8 of a store's photo, by its index; called from several threads."""
+
+
+@dataclass(frozen=True)
+class PixelStore:
+    """Where the pixels of ``photos`` lie, whether or not they are there yet; make it with :func:`pixel_store`."""
+
+    path: Path
+    photos: tuple[StoredPhoto, ...]
+    channels: int
+
+    @property
+    def starts(self) -> list[int]:
+        """At which byte each photo begins, and at last where the last one ends."""
+        starts = [0]
+        for photo in self.photos:
+            starts.append(starts[-1] + photo.width * photo.height * self.channels)
+        return starts
+
+    def shape(self, index: int) -> tuple[int, int, int]:
+        """Height, width and channels of one photo."""
+        return self.photos[index].height, self.photos[index].width, self.channels
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether the pixels are there."""
+        return self.path.is_file() and self.path.stat().st_size == self.starts[-1]
+
+    def photo(self, index: int) -> "np.ndarray":
+        """The pixels of one photo, read into memory."""
+        import numpy as np
+
+        start, end = self.starts[index : index + 2]
+        pixels = np.fromfile(self.path, np.uint8, count=end - start, offset=start)
+        return pixels.reshape(self.shape(index))
+
+    def table(self, progress: Progress) -> "Tensor":
+        """All pixels, (pixels, channels) uint8, mapped into memory; not to be written to."""
+        import mmap
+        import warnings
+
+        import psutil
+        import torch
+
+        with self.path.open("rb") as stream:
+            mapped = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+        free = psutil.virtual_memory().available
+        fits = len(mapped) <= FITS * free
+        if not fits:
+            sizes = f"{_gigabytes(len(mapped))} at this size, {_gigabytes(free)} of memory are free"
+            progress.note(f"the photos take {sizes}: training waits for the disk; a larger --train.downscale will not")
+        if hasattr(mapped, "madvise"):  # not on Windows
+            mapped.madvise(mmap.MADV_WILLNEED if fits else mmap.MADV_RANDOM)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "The given buffer is not writable")
+            return torch.frombuffer(mapped, dtype=torch.uint8).view(-1, self.channels)
+
+
+def pixel_store(ingest: Path, name: str, photos: Sequence[StoredPhoto], channels: int) -> PixelStore:
+    """The store of these photos of ``ingest``, whole or still to be made; ``name`` is for people only."""
+    made_from = []
+    for photo in photos:
+        file = (ingest / photo.file).stat()
+        made_from.append([*photo, file.st_size, file.st_mtime_ns])
+    key = hashlib.sha256(json.dumps([VERSION, channels, made_from]).encode()).hexdigest()[:16]
+    return PixelStore(ingest.with_name(f"{ingest.name}.pixels") / f"{name}-{key}", tuple(photos), channels)
+
+
+def fill(store: PixelStore, load: Load, progress: Progress) -> None:
+    """Write the pixels of all photos, unless they are there; waits where another process is at it.
+
+    Raises:
+        StageError: if the disk has no room for them.
+        OSError: if a photo cannot be read or the store not be written.
+    """
+    if store.is_whole:
+        return
+    store.path.parent.mkdir(exist_ok=True)
+    with _only_one(store, progress):
+        if not store.is_whole:  # nobody else was faster
+            _write(store, load, progress)
+
+
+@contextmanager
+def _only_one(store: PixelStore, progress: Progress) -> Iterator[None]:
+    """One process at a time; the system lifts the lock of one that dies."""
+    from filelock import FileLock, Timeout
+
+    lock = FileLock(store.path.with_name(f"{store.path.name}.lock"))
+    while not lock.is_locked:
+        try:
+            lock.acquire(timeout=0.5)
+        except Timeout:
+            progress.update("waiting for another program that reads the same photos")
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def _write(store: PixelStore, load: Load, progress: Progress) -> None:
+    if store.path.exists():
+        found = f"{store.path.stat().st_size:,} bytes and not {store.starts[-1]:,}"
+        progress.note(f"the pixel store {store.path.name} has {found}: making it again")
+    partial = store.path.with_name(f"{store.path.name}.partial")
+    try:
+        with partial.open("wb") as stream:
+            _check_room(store)
+            _write_photos(store, load, stream, progress)
+            stream.flush()
+            os.fsync(stream.fileno())
+        partial.replace(store.path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def _write_photos(store: PixelStore, load: Load, stream: BinaryIO, progress: Progress) -> None:
+    """Every photo at its place. At a time there are as many in memory as there are workers."""
+    writing, starts = threading.Lock(), store.starts
+
+    def write(index: int) -> None:
+        pixels = load(index)
+        if pixels.shape != store.shape(index):
+            raise ValueError(f"{store.photos[index].file} has shape {pixels.shape} and not {store.shape(index)}")
+        # Written and not mapped: on a full disk a write raises OSError, where a mapping would kill the process.
+        with writing:
+            stream.seek(starts[index])
+            stream.write(pixels.data)
+
+    pool = ThreadPoolExecutor(_workers(store))
+    try:
+        pending = {pool.submit(write, index) for index in range(len(store.photos))}
+        while pending:
+            finished, pending = wait(pending, timeout=0.5, return_when=FIRST_COMPLETED)
+            for future in finished:
+                future.result()
+            done = len(store.photos) - len(pending)
+            progress.update(f"read {done} of {len(store.photos)} photos", done / len(store.photos))
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _workers(store: PixelStore) -> int:
+    """How many photos to decode at a time: one per core, fewer where they are too large for that."""
+    largest = max(photo.width * photo.height for photo in store.photos)
+    affordable = DECODING_BYTES // (BYTES_PER_PIXEL[store.channels] * largest)
+    return max(1, min(os.cpu_count() or 1, affordable))
+
+
+def _check_room(store: PixelStore) -> None:
+    free, needed = shutil.disk_usage(store.path.parent).free, store.starts[-1]
+    if needed > free:
+        why = f"they take {_gigabytes(needed)} at this size, and {store.path.parent} has {_gigabytes(free)} free"
+        raise StageError(
+            "no room for the pixels of the photos", why, "Free disk space, or give a larger --train.downscale."
+        )
+
+
+def _gigabytes(count: float) -> str:
+    return f"{count / 2**30:.1f} GB"
