@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     import numpy as np
 
 NEEDS: tuple[str, ...] = ()
-VERSION = 1
+VERSION = 2
 RESUMES = False
 LINKS = ("photos.json",)
 
@@ -136,7 +136,7 @@ def _take(file: Path, name: str, waiting: Path) -> _Taken | Refusal:
         suffix=decoded.suffix or ".png",
         camera_key=decoded.camera_key,
         focal_source=decoded.focal_source,
-        has_alpha=pixels.shape[2] == 4,
+        has_alpha=pixels.shape[2] == 4 and bool((pixels[..., 3] < 255).any()),
         sharpness=_sharpness(pixels),
         digest=hashlib.blake2b(str(pixels.shape).encode() + pixels.data, digest_size=16).digest(),
         notes=decoded.notes,

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from stages.sparse_model import SparseModel
 
 NEEDS = ("ingest", "sfm")
-VERSION = 1
+VERSION = 2
 RESUMES = False
 LINKS = ("transforms.json", "scene.json")
 
@@ -55,7 +55,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
         ((by_file[f"images/{image.file}"], i) for i, image in enumerate(model.images)), key=lambda pair: pair[0].name
     )
     photos, order = [photo for photo, _ in posed], [i for _, i in posed]
-    has_alpha = all(photo.has_alpha for photo in photos)
+    has_alpha = _has_alpha(photos, progress)
     sfm = _reconstruction(model, order)
     try:
         found = normalise(sfm, has_alpha, config.roi)
@@ -70,7 +70,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
             "the others are held out as test photos",
             "Add training photos, or raise --normalise.test-every.",
         )
-    scene = _scene(sfm, photos, [model.images[i].camera for i in order], model.cameras, found, split)
+    scene = _scene(sfm, photos, [model.images[i].camera for i in order], model.cameras, found, split, has_alpha)
     write_json(folder / "scene.json", scene.to_json())
     write_tensors(folder / "points.safetensors", _points(model, sfm, found))
     write_json(folder / "transforms.json", transforms(scene))
@@ -94,6 +94,20 @@ def _check(config: Config, views: int) -> None:
             "the fourth number is the region's half side and must be above 0",
             "Give x y z radius in the frame of output/transforms.json.",
         )
+
+
+def _has_alpha(photos: "list[Photo]", progress: Progress) -> bool:
+    """Whether the photos say what is background: most have transparent parts. The others are said to be exceptions."""
+    transparent = sum(photo.has_alpha for photo in photos)
+    opaque = len(photos) - transparent
+    has_alpha = transparent > opaque
+    if has_alpha and opaque:
+        progress.note(f"{opaque} of {len(photos)} photos have no transparent parts: taken as opaque everywhere")
+    elif transparent and not has_alpha:
+        progress.note(
+            f"{transparent} of {len(photos)} photos have transparent parts: laid over white, as most have none"
+        )
+    return has_alpha
 
 
 def _reconstruction(model: "SparseModel", order: list[int]) -> "Reconstruction":
@@ -129,6 +143,7 @@ def _scene(
     cameras: "Sequence[Camera]",
     found: "Normalisation",
     split: "list[Split]",
+    has_alpha: bool,
 ) -> "Scene":
     """The scene, its views in order of name."""
     from nerf.scene import Scene, View
@@ -150,7 +165,7 @@ def _scene(
         views=views,
         scene_from_sfm=found.scene_from_sfm,
         bounded=found.bounded,
-        has_alpha=all(photo.has_alpha for photo in photos),
+        has_alpha=has_alpha,
         layout=found.layout,
         up_known=found.up.known,
     )

@@ -228,6 +228,16 @@ def test_only_photos_named_by_the_cameras_are_taken(tmp_path: Path, progress: An
     assert progress.notes == ["refused images/gone.png: there is no such file"]
 
 
+def test_an_alpha_channel_without_transparent_parts_is_none(tmp_path: Path, progress: Any) -> None:
+    put(tmp_path / "in", "a.jpg")
+    for name, alpha in (("b.png", 255), ("c.png", 254)):
+        with_alpha = picture(1)
+        with_alpha.putalpha(alpha)
+        with_alpha.save(tmp_path / "in" / name)
+    ingest.run(Config(photos=tmp_path / "in"), {}, tmp_path / "out", progress)
+    assert [photo.has_alpha for photo in read_photos(tmp_path / "out")] == [False, False, True]
+
+
 def test_a_full_disk_is_said_in_words(tmp_path: Path, progress: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")

@@ -20,7 +20,7 @@ def inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Builds the folders of ingest and sfm for a ring of photos around a ball of points; COLMAP lists them reversed."""
 
     def build(
-        count: int = 17, alpha: bool = False, test_files: list[str] | None = None, one_place: bool = False
+        count: int = 17, transparent: int = 0, test_files: list[str] | None = None, one_place: bool = False
     ) -> dict[str, Path]:
         poses = ring(count)
         if one_place:
@@ -30,7 +30,8 @@ def inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         for folder in folders.values():
             folder.mkdir(exist_ok=True)
         photos = [
-            Photo(f"ä {i:02d}.jpg", f"images/{i:02d}.png", 400, 400, 0, None, None, alpha, 1.0) for i in range(count)
+            Photo(f"ä {i:02d}.jpg", f"images/{i:02d}.png", 400, 400, 0, None, None, i < transparent, 1.0)
+            for i in range(count)
         ]
         write_photos(folders["ingest"], photos, [], {})
         (folders["sfm"] / "registration.json").write_text(json.dumps({"test_files": test_files}))
@@ -87,11 +88,26 @@ def test_the_line_says_what_was_decided(inputs, progress) -> None:
 
 
 def test_alpha_makes_the_background_known(inputs, progress) -> None:
-    folders = inputs(alpha=True)
+    folders = inputs(transparent=17)
     assert "background transparent" in run(folders, progress).line
     scene = read_scene(folders["normalise"])
     assert scene.has_alpha
     assert scene.bounded
+    assert progress.notes == []
+
+
+@pytest.mark.parametrize(
+    ("transparent", "has_alpha", "note"),
+    [
+        (16, True, "1 of 17 photos have no transparent parts: taken as opaque everywhere"),
+        (1, False, "1 of 17 photos have transparent parts: laid over white, as most have none"),
+    ],
+)
+def test_most_photos_decide_on_alpha_and_exceptions_are_named(inputs, progress, transparent, has_alpha, note) -> None:
+    folders = inputs(transparent=transparent)
+    run(folders, progress)
+    scene = read_scene(folders["normalise"])
+    assert (scene.has_alpha, scene.bounded, progress.notes) == (has_alpha, has_alpha, [note])
 
 
 @pytest.mark.parametrize(("count", "held_out"), [(3, [0]), (8, [0]), (9, [0, 8]), (17, [0, 8, 16])])
