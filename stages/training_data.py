@@ -137,8 +137,6 @@ def _decoded_pixels(ingest: Path, scene: "Scene", view: "View", downscale: float
     pixels = load_pixels(ingest / view.file, *scaled_size(scene.cameras[view.camera], downscale))
     if scene.has_alpha and pixels.shape[2] == 3:  # a photo without transparent parts covers every pixel
         return np.concatenate([pixels, np.full_like(pixels[..., :1], 255)], axis=2)
-    if scene.has_alpha and pixels.shape[2] == 3:  # a photo without transparent parts covers every pixel
-        return np.concatenate([pixels, np.full_like(pixels[..., :1], 255)], axis=2)
     if scene.has_alpha or pixels.shape[2] == 3:
         return pixels
     alpha = pixels[..., 3:].astype(np.float32) / 255

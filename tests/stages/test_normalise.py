@@ -100,7 +100,7 @@ def test_alpha_makes_the_background_known(inputs, progress) -> None:
     ("transparent", "has_alpha", "note"),
     [
         (16, True, "1 of 17 photos have no transparent parts: taken as opaque everywhere"),
-        (1, False, "1 of 17 photos have transparent parts: laid over white, as most have none"),
+        (1, False, "1 of 17 photos have transparent parts: laid over white, most have none"),
     ],
 )
 def test_most_photos_decide_on_alpha_and_exceptions_are_named(inputs, progress, transparent, has_alpha, note) -> None:
