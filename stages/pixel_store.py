@@ -15,13 +15,14 @@ import os
 import shutil
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, NamedTuple
 
 from stages.contract import Progress, StageError
+from stages.live_line import live_line
 
 if TYPE_CHECKING:
     import numpy as np
@@ -146,11 +147,17 @@ def _write(store: PixelStore, load: Load, progress: Progress) -> None:
     if store.path.exists():
         found = f"{store.path.stat().st_size:,} bytes and not {store.starts[-1]:,}"
         progress.note(f"the pixel store {store.path.name} has {found}: making it again")
-    partial = store.path.with_name(f"{store.path.name}.partial")
+    partial, photos, written = store.path.with_name(f"{store.path.name}.partial"), len(store.photos), 0
+
+    def describe() -> tuple[str, float]:
+        waiting = f", the disk is taking {_gigabytes(store.starts[-1])}" if written == photos else ""
+        return f"read {written} of {photos} photos{waiting}", written / photos
+
     try:
-        with partial.open("wb") as stream:
+        with partial.open("wb") as stream, live_line(progress, describe):
             _check_room(store)
-            _write_photos(store, load, stream, progress)
+            for _ in _write_photos(store, load, stream):
+                written += 1
             stream.flush()
             os.fsync(stream.fileno())
         partial.replace(store.path)
@@ -158,7 +165,7 @@ def _write(store: PixelStore, load: Load, progress: Progress) -> None:
         partial.unlink(missing_ok=True)
 
 
-def _write_photos(store: PixelStore, load: Load, stream: BinaryIO, progress: Progress) -> None:
+def _write_photos(store: PixelStore, load: Load, stream: BinaryIO) -> Iterator[None]:
     """Every photo at its place. At a time there are as many in memory as there are workers."""
     writing, starts = threading.Lock(), store.starts
 
@@ -173,13 +180,8 @@ def _write_photos(store: PixelStore, load: Load, stream: BinaryIO, progress: Pro
 
     pool = ThreadPoolExecutor(_workers(store))
     try:
-        pending = {pool.submit(write, index) for index in range(len(store.photos))}
-        while pending:
-            finished, pending = wait(pending, timeout=0.5, return_when=FIRST_COMPLETED)
-            for future in finished:
-                future.result()
-            done = len(store.photos) - len(pending)
-            progress.update(f"read {done} of {len(store.photos)} photos", done / len(store.photos))
+        for future in [pool.submit(write, index) for index in range(len(store.photos))]:
+            yield future.result()
     finally:
         pool.shutdown(cancel_futures=True)
 

@@ -75,11 +75,16 @@ def training_bank(
     views, store = scene.of_split(split), _store(ingest, scene, split, downscale)
     fill(store, lambda index: _decoded_pixels(ingest, scene, views[index], downscale), progress)
     used = sorted({view.camera for view in views})
+
+    def bearings(index: int) -> "Tensor":
+        progress.update(f"rays of camera {index + 1} of {len(used)}", index / len(used))
+        return patch_bearings(scene.cameras[used[index]], downscale)
+
     return ray_bank(
         pixels=store.table(progress),
         sizes=[(photo.height, photo.width) for photo in store.photos],
         camera_of=[used.index(view.camera) for view in views],
-        camera_bearings=[patch_bearings(scene.cameras[camera], downscale) for camera in used],
+        camera_bearings=[bearings(index) for index in range(len(used))],
         placement=Placement(
             poses=torch.tensor(np.stack([view.scene_from_camera for view in views]), dtype=torch.float32),
             near=torch.tensor([view.near for view in views]),

@@ -54,7 +54,7 @@ def test_it_holds_what_was_loaded(tmp_path: Path, progress: SilentProgress, chan
     assert np.array_equal(table.numpy(), np.concatenate([pixels.reshape(-1, channels) for pixels in expected]))
     for index, pixels in enumerate(expected):
         assert np.array_equal(store.photo(index), pixels)
-    assert progress.updates[-1] == ("read 4 of 4 photos", 1.0)
+    assert progress.updates[-1] == ("read 4 of 4 photos, the disk is taking 0.0 GB", 1.0)
     assert progress.notes == []
 
 
