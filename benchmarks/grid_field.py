@@ -16,6 +16,7 @@ from PIL import Image
 from nerf.grid_field import GridField, GridSettings
 from nerf.grid_training import GridTrainer, GridTrainerSettings
 from nerf.kernels import reference
+from nerf.kernels import warp as fast
 from nerf.metrics import mean_squared_error, psnr
 from nerf.ray_bank import RayBank, build_ray_bank
 from nerf.rays import Rays
@@ -78,6 +79,7 @@ def main() -> None:
     parser.add_argument("--finest", type=int, default=384)
     parser.add_argument("--steps", type=int, default=384)
     parser.add_argument("--samples", type=int, default=1 << 14)
+    parser.add_argument("--backend", choices=("warp", "torch"), default="warp")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--test-every", type=int, default=5)
     parser.add_argument("--picture", type=Path, default=None)
@@ -86,7 +88,7 @@ def main() -> None:
     settings = GridSettings(given.levels, 4, given.log2_rows, 16, given.finest, steps=given.steps)
     train = read_bank(given.folder, "train", given.downscale, 1)
     test = read_bank(given.folder, "test", given.downscale, given.test_every)
-    model = GridField(settings, given.seed, reference)
+    model = GridField(settings, given.seed, fast if given.backend == "warp" else reference)
     trainer = GridTrainer(model, train, GridTrainerSettings(given.seed, "random", given.samples))
     print(f"{settings}\n{model.layout.rows:,} rows, {torch.get_num_threads()} threads")
     clock = time.process_time if given.processor_time else time.perf_counter

@@ -84,11 +84,11 @@ class GridPass(NamedTuple):
 
 
 class GridGradients(NamedTuple):
-    """Of the networks and, by way of the features and harmonics of the samples, of whatever lies before them."""
+    """Of the networks and, by way of the samples' features and the rays' harmonics, of whatever lies before them."""
 
     weights: Weights
     features: Float[Tensor, "samples width"]
-    harmonics: Float[Tensor, "samples 16"]
+    harmonics: Float[Tensor, "rays 16"]
 
 
 class GridField(nn.Module):
@@ -136,49 +136,41 @@ class GridField(nn.Module):
         """Colour seen by viewing rays of unit ``directions``; without meaning where the density is zero."""
         unit = unit_coordinates(points, self.settings.contracted).reshape(-1, 3).clamp(0, 1)
         harmonics = self.backend.spherical_harmonics(directions.reshape(-1, 3))
-        colour = grid_mlp.colour_forward(self.weights, self._density_pass(unit).geometry, harmonics).colour
-        return colour.view(points.shape)
+        each = torch.arange(len(unit) + 1, dtype=torch.int32, device=unit.device)  # a ray of its own for every point
+        alone = Samples(each, each[:-1], unit[:, 0], unit[:, 0])
+        geometry = self._density_pass(unit).geometry
+        return grid_mlp.colour_forward(self.weights, self.backend, alone, geometry, harmonics).colour.view(points.shape)
 
     @torch.no_grad()
     def render(self, rays: Rays, background: Float[Tensor, "3"]) -> Rendering:
         """Render without randomness: samples stand in the middle of their intervals."""
         middle = torch.full_like(rays.near, 0.5)
-        return self.forward(rays, middle, background.expand_as(rays.origins)).rendering
+        return self.forward(rays, middle, background.expand_as(rays.origins).contiguous()).rendering
 
     def forward(self, rays: Rays, jitter: Float[Tensor, "rays"], background: Float[Tensor, "rays 3"]) -> GridPass:
         """Density of all samples in occupied cells; colour of those that can be seen."""
-        backend = self.backend
+        backend, rays = self.backend, Rays(*(part.contiguous() for part in rays))
         samples = backend.march(self.bits, self.lattice, rays, jitter)
         marched = len(samples.t)
         points = backend.sample_points(rays, samples, self.settings.contracted)
         density = self._density_pass(points)
         samples, seen = backend.visible_front(samples, density.sigma, HIDDEN_BEHIND)
         points, density = points.index_select(0, seen), density.select(seen)
-        harmonics = backend.spherical_harmonics(rays.directions).index_select(0, samples.ray)
-        colour = grid_mlp.colour_forward(self.weights, density.geometry, harmonics)
+        harmonics = backend.spherical_harmonics(rays.directions)
+        colour = grid_mlp.colour_forward(self.weights, backend, samples, density.geometry, harmonics)
         rendering, weights = backend.composite(samples, density.sigma, colour.colour, background, rays.far)
         return GridPass(rays, background, marched, samples, points, density, colour, rendering, weights)
 
     def backward(self, done: GridPass, grad: Rendering, grad_weights: Float[Tensor, "samples"]) -> GridGradients:
         """Gradients of a loss, given those of the rendering and of the samples' weights."""
-        density, colour = done.density, done.colour
-        grad_sigma, grad_colour = self.backend.composite_backward(
+        backend, density, colour = self.backend, done.density, done.colour
+        grad_sigma, grad_colour = backend.composite_backward(
             done.samples, density.sigma, colour.colour, done.background, done.rays.far, grad, grad_weights
         )
-        return GridGradients(*grid_mlp.backward(self.weights, density, colour, grad_sigma, grad_colour))
-
-    def level_backward(
-        self,
-        level: int,
-        points: Float[Tensor, "samples 3"],
-        grad_features: Float[Tensor, "samples width"],
-        grad_rows: Float[Tensor, "rows features"],
-    ) -> None:
-        """Add the gradient of one level's rows of the table to ``grad_rows``."""
-        features, rows = self.layout.features, self.layout.level_rows(level)
-        alone = GridLayout(self.layout.resolutions[level : level + 1], (0, rows), features)
-        of_level = grad_features[:, level * features : (level + 1) * features].contiguous()
-        self.backend.encode_backward_table(alone, points, of_level, grad_rows)
+        of_colour = grid_mlp.colour_backward(self.weights, backend, done.samples, colour, grad_colour)
+        of_density = grid_mlp.density_backward(self.weights, backend, density, grad_sigma, of_colour.geometry)
+        weights = Weights(of_density.density_hidden, of_density.density_out, *of_colour[:2])
+        return GridGradients(weights, of_density.features, of_colour.harmonics)
 
     def rays_backward(
         self, done: GridPass, gradients: GridGradients
@@ -189,9 +181,9 @@ class GridField(nn.Module):
         grad_origins, grad_directions = backend.sample_points_backward(
             rays, samples, self.settings.contracted, grad_points
         )
-        grad_harmonics = gradients.harmonics.new_zeros(len(rays.near), grid_mlp.DIRECTION)
-        grad_harmonics.index_add_(0, samples.ray.long(), gradients.harmonics)
-        return grad_origins, grad_directions + backend.spherical_harmonics_backward(rays.directions, grad_harmonics)
+        return grad_origins, grad_directions + backend.spherical_harmonics_backward(
+            rays.directions, gradients.harmonics
+        )
 
     def _density_pass(self, unit: Float[Tensor, "points 3"]) -> DensityPass:
         return grid_mlp.density_forward(self.weights, self.backend.encode(self.layout, self.table, unit))

@@ -1,7 +1,8 @@
 """The two small networks behind the grids, without biases, forward and backward by hand: no autograd in the hot loop.
 
-Weights are (inputs, outputs), rows of activations are samples. The backward passes are those of the chain rule for
-matrix products: of Y = X W, dW = Xᵀ dY and dX = dY Wᵀ.
+All weights have rows of HIDDEN numbers: hidden layers are (inputs, HIDDEN), outputs (outputs, HIDDEN), which matrix
+products with few outputs need to be fast: (n, 64) x (64, 3) takes three times as long as with the smaller one
+transposed. Backward is the chain rule: of Y = X W, dW = Xᵀ dY and dX = dY Wᵀ.
 """
 
 from typing import NamedTuple
@@ -9,6 +10,8 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Float
 from torch import Tensor
+
+from nerf.kernels import Backend, Samples
 
 HIDDEN = 64
 GEOMETRY = 16  # numbers that the density network hands to the colour network; the first is the logarithm of density
@@ -20,9 +23,9 @@ class Weights(NamedTuple):
     """Of features -> hidden -> geometry, and geometry and direction -> hidden -> colour. Also holds gradients."""
 
     density_hidden: Float[Tensor, "features hidden"]
-    density_out: Float[Tensor, "hidden geometry"]
+    density_out: Float[Tensor, "geometry hidden"]
     colour_hidden: Float[Tensor, "geometry_and_direction hidden"]
-    colour_out: Float[Tensor, "hidden 3"]
+    colour_out: Float[Tensor, "3 hidden"]
 
 
 class DensityPass(NamedTuple):
@@ -44,64 +47,87 @@ class DensityPass(NamedTuple):
 
 
 class ColourPass(NamedTuple):
-    """What the colour network made of ``inputs``, layer by layer."""
+    """What the colour network made of the samples' ``geometry`` and the rays' ``harmonics``, layer by layer."""
 
-    inputs: Float[Tensor, "samples geometry_and_direction"]
+    geometry: Float[Tensor, "samples geometry"]
+    harmonics: Float[Tensor, "rays direction"]
     hidden: Float[Tensor, "samples hidden"]
     colour: Float[Tensor, "samples 3"]
 
 
+class DensityGradients(NamedTuple):
+    """Of the density network's weights and features."""
+
+    density_hidden: Float[Tensor, "features hidden"]
+    density_out: Float[Tensor, "geometry hidden"]
+    features: Float[Tensor, "samples features"]
+
+
+class ColourGradients(NamedTuple):
+    """Of the colour network's weights and inputs."""
+
+    colour_hidden: Float[Tensor, "geometry_and_direction hidden"]
+    colour_out: Float[Tensor, "3 hidden"]
+    geometry: Float[Tensor, "samples geometry"]
+    harmonics: Float[Tensor, "rays direction"]
+
+
 def initial_weights(features: int, random: torch.Generator) -> Weights:
     """Glorot-uniform weights (Glorot and Bengio 2010, eq. 16)."""
-    shapes = ((features, HIDDEN), (HIDDEN, GEOMETRY), (GEOMETRY + DIRECTION, HIDDEN), (HIDDEN, 3))
-    return Weights(*(_glorot(inputs, outputs, random) for inputs, outputs in shapes))
+    return Weights(*(_glorot(rows, random) for rows in (features, GEOMETRY, GEOMETRY + DIRECTION, 3)))
 
 
 def density_forward(weights: Weights, features: Float[Tensor, "samples features"]) -> DensityPass:
     """Features to geometry."""
     hidden = (features @ weights.density_hidden).relu_()
-    return DensityPass(features, hidden, hidden @ weights.density_out)
+    return DensityPass(features, hidden, hidden @ weights.density_out.T)
 
 
 def colour_forward(
     weights: Weights,
+    backend: Backend,
+    samples: Samples,
     geometry: Float[Tensor, "samples geometry"],
-    harmonics: Float[Tensor, "samples direction"],
+    harmonics: Float[Tensor, "rays direction"],
 ) -> ColourPass:
     """Geometry and viewing direction to colour, through a sigmoid."""
-    inputs = torch.cat([geometry, harmonics], -1)
-    hidden = (inputs @ weights.colour_hidden).relu_()
-    return ColourPass(inputs, hidden, (hidden @ weights.colour_out).sigmoid_())
+    hidden = geometry @ weights.colour_hidden[:GEOMETRY]
+    backend.add_ray_relu(samples, hidden, harmonics @ weights.colour_hidden[GEOMETRY:])
+    return ColourPass(geometry, harmonics, hidden, (hidden @ weights.colour_out.T).sigmoid_())
 
 
-def backward(
+def colour_backward(
+    weights: Weights, backend: Backend, samples: Samples, done: ColourPass, grad_colour: Float[Tensor, "samples 3"]
+) -> ColourGradients:
+    """Gradients of the network's weights and of its inputs, given that of the colour."""
+    grad_logits = grad_colour * done.colour * (1 - done.colour)
+    grad_hidden = grad_logits @ weights.colour_out
+    grad_of_ray = backend.add_ray_relu_backward(samples, done.hidden, grad_hidden)
+    of_hidden = torch.cat([done.geometry.T @ grad_hidden, done.harmonics.T @ grad_of_ray])
+    grad_geometry = grad_hidden @ weights.colour_hidden[:GEOMETRY].T
+    return ColourGradients(
+        of_hidden, grad_logits.T @ done.hidden, grad_geometry, grad_of_ray @ weights.colour_hidden[GEOMETRY:].T
+    )
+
+
+def density_backward(
     weights: Weights,
-    density: DensityPass,
-    colour: ColourPass,
+    backend: Backend,
+    done: DensityPass,
     grad_sigma: Float[Tensor, "samples"],
-    grad_colour: Float[Tensor, "samples 3"],
-) -> tuple[Weights, Float[Tensor, "samples features"], Float[Tensor, "samples direction"]]:
-    """Gradients of the weights, of the features and of the harmonics, given those of density and colour."""
-    grad_logits = grad_colour * colour.colour * (1 - colour.colour)
-    grad_hidden = _relu_backward(colour.hidden, grad_logits @ weights.colour_out.T)
-    grad_inputs = grad_hidden @ weights.colour_hidden.T
-    of_colour = (colour.inputs.T @ grad_hidden, colour.hidden.T @ grad_logits)
-
-    grad_geometry, grad_harmonics = grad_inputs.split([GEOMETRY, DIRECTION], -1)
-    within = density.geometry[:, 0] <= LARGEST_LOG_DENSITY
-    grad_geometry = grad_geometry.contiguous()
-    grad_geometry[:, 0] += torch.where(within, grad_sigma * density.sigma, 0)
-    grad_hidden = _relu_backward(density.hidden, grad_geometry @ weights.density_out.T)
-    of_density = (density.features.T @ grad_hidden, density.hidden.T @ grad_geometry)
-    return Weights(*of_density, *of_colour), grad_hidden @ weights.density_hidden.T, grad_harmonics
+    grad_geometry: Float[Tensor, "samples geometry"],
+) -> DensityGradients:
+    """Gradients of the network's weights and of the features, given those of the density and of the geometry as the
+    colour network saw it, to which the former's is added in place."""
+    within = done.geometry[:, 0] <= LARGEST_LOG_DENSITY
+    grad_geometry[:, 0] += torch.where(within, grad_sigma * done.sigma, 0)
+    grad_hidden = grad_geometry @ weights.density_out
+    backend.relu_backward(done.hidden, grad_hidden)
+    of_hidden = done.features.T @ grad_hidden
+    return DensityGradients(of_hidden, grad_geometry.T @ done.hidden, grad_hidden @ weights.density_hidden.T)
 
 
-def _relu_backward(
-    hidden: Float[Tensor, "samples hidden"], grad: Float[Tensor, "samples hidden"]
-) -> Float[Tensor, "samples hidden"]:
-    return grad.mul_(hidden.sign())  # several times faster than a mask
-
-
-def _glorot(inputs: int, outputs: int, random: torch.Generator) -> Float[Tensor, "inputs outputs"]:
-    limit = (6 / (inputs + outputs)) ** 0.5
-    return (2 * torch.rand(inputs, outputs, generator=random) - 1) * limit
+def _glorot(others: int, random: torch.Generator) -> Float[Tensor, "others hidden"]:
+    """Between the hidden units and ``others``, inputs or outputs alike."""
+    limit = (6 / (others + HIDDEN)) ** 0.5
+    return (2 * torch.rand(others, HIDDEN, generator=random) - 1) * limit

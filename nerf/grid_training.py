@@ -140,7 +140,7 @@ class GridTrainer:
         if self.settings.background == "random":
             background = torch.rand(count, 3, generator=random, device=device)
         else:
-            background = torch.tensor(self.settings.background, device=device).expand(count, 3)
+            background = torch.tensor(self.settings.background, device=device).repeat(count, 1)
         target = colour if alpha is None else torch.lerp(background, colour, alpha[:, None])
         return GridBatch(rays, target, background, torch.rand(count, generator=random, device=device))
 
@@ -188,16 +188,18 @@ class GridTrainer:
 
     def _update_table(self, parts: Sequence[_Part], rate: float, count: int) -> None:
         """Levels share no rows: each is a piece of work for a core of its own."""
-        layout, adam = self.model.layout, self.model.backend.adam
+        layout, backend = self.model.layout, self.model.backend
+        tables = (self.model.table, self.grad_table, self.mean["table"], self.square["table"])
 
         def update(level: int) -> None:
-            rows = slice(layout.first_rows[level], layout.first_rows[level + 1])
-            gradient = self.grad_table[rows].zero_()
             for part in parts:
-                self.model.level_backward(level, part.points, part.features, gradient)
-            adam(self.model.table[rows], gradient, self.mean["table"][rows], self.square["table"][rows], rate, count)
+                backend.encode_backward_table(layout, level, part.points, part.features, self.grad_table)
+            rows = slice(layout.first_rows[level], layout.first_rows[level + 1])
+            table, gradient, mean, square = (part[rows] for part in tables)
+            backend.adam(table, gradient, mean, square, rate, count)
 
-        for _ in in_order(update, range(len(layout.resolutions)), self.bank.device):
+        finest_first = range(len(layout.resolutions) - 1, -1, -1)  # the largest: no core waits long for the last
+        for _ in in_order(update, finest_first, self.bank.device):
             pass
 
     def _update_networks(self, of_parts: Sequence[Weights], rate: float, count: int) -> None:

@@ -43,7 +43,7 @@ def load_field(folder: Path, device: str = "cpu") -> "tuple[RadianceModel, dict[
 
     info = read_json(folder / "field.json")
     try:
-        model = _untrained(info["kind"], info["settings"])
+        model = _untrained(info["kind"], info["settings"], device)
         model.load_state_dict(load_file(folder / "field.safetensors"))
     except (OSError, KeyError, TypeError, ValueError, RuntimeError, SafetensorError) as error:
         why = " ".join(str(error).split())  # torch lists mismatches over several lines
@@ -51,13 +51,13 @@ def load_field(folder: Path, device: str = "cpu") -> "tuple[RadianceModel, dict[
     return model.to(device).requires_grad_(False), info
 
 
-def _untrained(kind: str, settings: dict[str, Any]) -> "PaperNerf | GridField":
+def _untrained(kind: str, settings: dict[str, Any], device: str) -> "PaperNerf | GridField":
     from nerf.grid_field import GridField, GridSettings
-    from nerf.kernels import reference
     from nerf.paper import PaperNerf, PaperSettings
+    from stages.backend import chosen_backend, load_backend
 
     if kind == "grid":
-        return GridField(GridSettings(**settings), 0, reference)
+        return GridField(GridSettings(**settings), 0, load_backend(chosen_backend(device), device))
     if kind == "paper":
         return PaperNerf(PaperSettings(**settings), seed=0)
     raise ValueError(f"a field of kind {kind!r} is unknown to this version")

@@ -47,7 +47,7 @@ PRESETS = {
 GRID_RATES = {"bounded": 2e-2, "contracted": 1e-2}
 GRID_SAMPLES = {"bounded": 1 << 14, "contracted": 24 << 10}
 
-GRID_ONLY = ("levels", "log2_rows", "finest", "batch_samples")
+GRID_ONLY = ("backend", "levels", "log2_rows", "finest", "batch_samples")
 PAPER_ONLY = (
     *("preset", "batch_rays", "depth", "width", "skip", "position_frequencies", "direction_frequencies"),
     *("samples_coarse", "samples_fine", "view_dependence", "positional_encoding", "hierarchical"),
@@ -78,6 +78,9 @@ class Config(StageConfig):
     )
     contracted: bool | None = Field(default=None, description="fold in unbounded space; none: if the photos show any")
 
+    backend: Literal["warp", "torch"] | None = Field(
+        default=None, description="grid: its kernels; none: warp where they run, torch runs anywhere"
+    )
     levels: int | None = Field(default=None, ge=1, le=16, description="grid: grids of features")
     log2_rows: int | None = Field(default=None, ge=8, le=24, description="grid: rows of a grid's table, as power of 2")
     finest: int | None = Field(default=None, ge=16, le=4096, description="grid: cells along an axis of the finest grid")
@@ -149,6 +152,11 @@ def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
     chosen = {"field": config.kind, "seconds": seconds, "contracted": contracted}
     config = config.model_copy(update=chosen)
     config = _filled(config, _grid_habits(config) if config.kind == "grid" else _paper_habits(config))
+    if config.kind == "grid" and config.backend is None:
+        from stages.backend import chosen_backend
+        from stages.device import compute_device
+
+        config = config.model_copy(update={"backend": chosen_backend(compute_device(), progress)})
     if config.downscale is None or (config.kind == "grid" and None in (config.levels, config.log2_rows, config.finest)):
         from stages.training_size import chosen_downscale, grid_size, rays_in_budget
 

@@ -22,14 +22,6 @@ if TYPE_CHECKING:
 MOST_PATCHES = 192
 
 
-class _Quiet:
-    """A Progress that says nothing."""
-
-    def update(self, message: str, done: float | None = None) -> None: ...
-
-    def note(self, message: str) -> None: ...
-
-
 def scaled_size(camera: "Camera", downscale: float) -> tuple[int, int]:
     """(width, height) of a camera's photos made ``downscale`` times smaller, rounded half up, at least one pixel."""
     return max(1, int(camera.width / downscale + 0.5)), max(1, int(camera.height / downscale + 0.5))
@@ -60,18 +52,15 @@ def patch_bearings(camera: "Camera", downscale: float) -> "Tensor":
     return torch.from_numpy(camera_rays(camera, math.ceil(width / shrink), math.ceil(height / shrink)))
 
 
-def training_bank(
-    ingest: Path, scene: "Scene", split: "Split", downscale: float, progress: Progress | None = None
-) -> "RayBank":
+def training_bank(ingest: Path, scene: "Scene", split: "Split", downscale: float, progress: Progress) -> "RayBank":
     """All pixels and rays of one split, on the CPU; the pixels are mapped from the pixel store, which is made if need
-    be. Without ``progress`` nothing is said."""
+    be."""
     import numpy as np
     import torch
 
     from nerf.ray_bank import Placement, ray_bank
     from stages.pixel_store import fill
 
-    progress = progress or _Quiet()
     views, store = scene.of_split(split), _store(ingest, scene, split, downscale)
     fill(store, lambda index: _decoded_pixels(ingest, scene, views[index], downscale), progress)
     used = sorted({view.camera for view in views})

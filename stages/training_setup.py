@@ -40,12 +40,12 @@ def prepare(config: "Config", scene: "Scene", inputs: Inputs, folder: Path, prog
     assert config.downscale is not None, "plan() chooses it"
     device = compute_device()
     progress.update("reading the photos")
-    bank = training_bank(inputs["ingest"], scene, "train", config.downscale).to(device)
+    bank = training_bank(inputs["ingest"], scene, "train", config.downscale, progress).to(device)
     shown_over = torch.tensor(field_background(config, scene), device=device)
 
     heldout = None
     if scene.of_split("test"):
-        unseen = training_bank(inputs["ingest"], scene, "test", config.downscale).to(device)
+        unseen = training_bank(inputs["ingest"], scene, "test", config.downscale, progress).to(device)
         heldout = make_probe(unseen, PROBE_RAYS, shown_over, config.seed)
     _say_sizes(config, bank, progress)
     return TrainingRun(
@@ -64,9 +64,11 @@ def make_trainer(config: "Config", scene: "Scene", bank: "RayBank", seed: int) -
     if config.field == "grid":
         from nerf.grid_field import GridField
         from nerf.grid_training import GridTrainer
-        from nerf.kernels import reference
+        from stages.backend import load_backend
 
-        model = GridField(grid_settings(config), seed, reference).to(bank.device)
+        assert config.backend, "plan() chooses it"
+        backend = load_backend(config.backend, bank.device.type)
+        model = GridField(grid_settings(config), seed, backend).to(bank.device)
         return GridTrainer(model, bank, grid_trainer_settings(config, scene, seed))
     from nerf.paper import PaperNerf
     from nerf.training import PaperTrainer

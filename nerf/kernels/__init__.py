@@ -129,6 +129,7 @@ class Backend(Protocol):
     def encode_backward_table(
         self,
         layout: GridLayout,
+        level: int,
         points: Float[Tensor, "points 3"],
         grad_features: Float[Tensor, "points width"],
         grad_table: Float[Tensor, "rows features"],
@@ -147,6 +148,16 @@ class Backend(Protocol):
     def spherical_harmonics_backward(
         self, directions: Float[Tensor, "rays 3"], grad: Float[Tensor, "rays 16"]
     ) -> Float[Tensor, "rays 3"]: ...
+
+    def add_ray_relu(
+        self, samples: Samples, hidden: Float[Tensor, "samples 64"], of_ray: Float[Tensor, "rays 64"]
+    ) -> None: ...
+
+    def add_ray_relu_backward(
+        self, samples: Samples, hidden: Float[Tensor, "samples 64"], grad: Float[Tensor, "samples 64"]
+    ) -> Float[Tensor, "rays 64"]: ...
+
+    def relu_backward(self, hidden: Float[Tensor, "samples 64"], grad: Float[Tensor, "samples 64"]) -> None: ...
 
     def visible_front(
         self, samples: Samples, sigma: Float[Tensor, "samples"], threshold: float

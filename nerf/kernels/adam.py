@@ -17,7 +17,7 @@ def adam(
     count: int,
 ) -> None:
     """Update ``parameter``, ``mean`` and ``square`` in place where the gradient is not exactly zero; where it is,
-    nothing changes, momentum included: an entry that no sample touched stays put.
+    nothing changes, momentum included: an entry that no sample touched stays put. ``gradient`` is zero afterwards.
 
     Kingma and Ba 2015, algorithm 1, but for epsilon: m ← 0.9 m + 0.1 g, v ← 0.99 v + 0.01 g²,
     p ← p - rate · m / (1 - 0.9^count) / max(LEAST_ROOT, √(v / (1 - 0.99^count))). ``count`` is the number of this
@@ -32,3 +32,4 @@ def adam(
         # Not sqrt: torch's is many times slower on zeros, of which most of a table consists.
         slope = (v / square_share).clamp_(min=LEAST_ROOT**2).rsqrt_()
         p.addcmul_(live.mul_(m), slope, value=-rate / mean_share)
+        g.zero_()

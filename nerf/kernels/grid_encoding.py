@@ -28,19 +28,21 @@ def encode(
 
 def encode_backward_table(
     layout: GridLayout,
+    level: int,
     points: Float[Tensor, "points 3"],
     grad_features: Float[Tensor, "points width"],
     grad_table: Float[Tensor, "rows features"],
 ) -> None:
-    """Add to ``grad_table``, in place: every vertex gets the gradient of each point it served, times its share."""
-    columns, flat = grad_features.T.contiguous(), grad_table.view(-1)
-    for level, resolution in enumerate(layout.resolutions):
-        cell, inside = _cell(resolution, points)
-        first_entry = _corner_rows(layout, level, cell).flatten().long() * layout.features
-        shares = _corner_shares(inside)
-        for feature in range(layout.features):
-            grad_corners = shares * columns[level * layout.features + feature]
-            flat.scatter_add_(0, first_entry + feature, grad_corners.flatten())
+    """Add to the rows of one level in ``grad_table``, in place: every vertex gets the gradient of each point that it
+    served, times its share. Levels share no rows: several threads may each do one."""
+    first_column = level * layout.features
+    columns = grad_features[:, first_column : first_column + layout.features].T.contiguous()
+    flat = grad_table.view(-1)
+    cell, inside = _cell(layout.resolutions[level], points)
+    first_entry = _corner_rows(layout, level, cell).flatten().long() * layout.features
+    shares = _corner_shares(inside)
+    for feature, column in enumerate(columns):
+        flat.scatter_add_(0, first_entry + feature, (shares * column).flatten())
 
 
 def encode_backward_points(

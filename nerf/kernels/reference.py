@@ -7,6 +7,7 @@ from nerf.kernels.adam import adam
 from nerf.kernels.cache import cell_corners, occupied_bits, update_cache
 from nerf.kernels.directions import spherical_harmonics, spherical_harmonics_backward
 from nerf.kernels.grid_encoding import encode, encode_backward_points, encode_backward_table
+from nerf.kernels.hidden_layer import add_ray_relu, add_ray_relu_backward, relu_backward
 from nerf.kernels.marching import march, sample_points, sample_points_backward
 from nerf.kernels.packed_compositing import (
     composite,
@@ -18,6 +19,8 @@ from nerf.kernels.packed_compositing import (
 
 __all__ = [
     "adam",
+    "add_ray_relu",
+    "add_ray_relu_backward",
     "cell_corners",
     "composite",
     "composite_backward",
@@ -28,6 +31,7 @@ __all__ = [
     "encode_backward_table",
     "march",
     "occupied_bits",
+    "relu_backward",
     "sample_points",
     "sample_points_backward",
     "spherical_harmonics",

@@ -39,12 +39,12 @@ def seen_by_autograd(model: GridField, given: Rays, jitter: Tensor, background: 
     points = reference.sample_points(given, samples, settings.contracted)
     features = encoded_by_autograd(model, points)
     weights = model.weights
-    geometry = torch.relu(features @ weights.density_hidden) @ weights.density_out
+    geometry = torch.relu(features @ weights.density_hidden) @ weights.density_out.T
     sigma = geometry[:, 0].clamp(max=15).exp()
     harmonics = reference.spherical_harmonics(given.directions)[samples.ray]
     hidden = torch.relu(torch.cat([geometry, harmonics], -1) @ weights.colour_hidden)
     rendering, _ = reference.composite(
-        samples, sigma, torch.sigmoid(hidden @ weights.colour_out), background, given.far
+        samples, sigma, torch.sigmoid(hidden @ weights.colour_out.T), background, given.far
     )
     return (rendering.colour * torch.tensor([1.0, 2.0, -3.0])).sum() + rendering.depth.sum()
 
@@ -80,8 +80,8 @@ def test_all_gradients_are_those_of_autograd(settings: GridSettings) -> None:
     grad = Rendering(torch.tensor([1.0, 2.0, -3.0], dtype=torch.float64).expand(6, 3), ones, 0 * ones)
     gradients = model.backward(done, grad, torch.zeros_like(done.weights))
     grad_table = torch.zeros_like(model.table)
-    for level, rows in enumerate(grad_table.split([model.layout.level_rows(level) for level in range(2)])):
-        model.level_backward(level, done.points, gradients.features, rows)
+    for level in range(2):
+        reference.encode_backward_table(model.layout, level, done.points, gradients.features, grad_table)
     of_rays = model.rays_backward(done, gradients)
 
     parameters = [model.table, *model.weights, given.origins, given.directions]

@@ -4,16 +4,17 @@ import pytest
 import torch
 
 from nerf.grid_field import GridField, GridSettings
-from nerf.kernels import reference
 from nerf.paper import PaperNerf, PaperSettings
 from nerf.rays import Rays
+from stages.backend import chosen_backend, load_backend
 from stages.contract import StageError
 from stages.field_files import load_field, save_field
 from stages.files import read_json, write_json
 
 SMALL = PaperSettings(depth=2, width=8, samples_coarse=4, samples_fine=4, contracted=True, spacing="log")
 GRID = GridSettings(levels=2, log2_rows=8, coarsest=4, finest=16, contracted=True, cache_cells=8)
-KINDS = {"paper": PaperNerf(SMALL, seed=5), "grid": GridField(GRID, 5, reference)}
+KERNELS = load_backend(chosen_backend("cpu"), "cpu")
+KINDS = {"paper": PaperNerf(SMALL, seed=5), "grid": GridField(GRID, 5, KERNELS)}
 INFO = {"background": [1.0, 1.0, 1.0], "downscale": 2.5, "steps": 7, "rays": 700}
 
 

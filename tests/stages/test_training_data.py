@@ -18,6 +18,7 @@ from stages.training_data import (
     view_pixels,
     view_rays,
 )
+from tests.conftest import SilentProgress
 from tests.stages.photo_scene import CAMERA, FOCAL, HEIGHT, WIDTH, ball_photo, photographed
 
 
@@ -49,9 +50,11 @@ def test_a_views_rays_go_through_its_pixel_centres(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("downscale", [1.0, 2.0, 3.3])
-def test_the_bank_and_the_views_are_the_same_pixels_and_rays(downscale: float, tmp_path: Path) -> None:
+def test_the_bank_and_the_views_are_the_same_pixels_and_rays(
+    downscale: float, tmp_path: Path, progress: SilentProgress
+) -> None:
     inputs, scene = photographed(tmp_path)
-    bank = training_bank(inputs["ingest"], scene, "train", downscale)
+    bank = training_bank(inputs["ingest"], scene, "train", downscale, progress)
     rays, colours, alpha = bank.lookup(torch.arange(len(bank.pixels)))
     views = scene.of_split("train")
     assert alpha is None and len(bank.near) == len(views) == 6
@@ -61,47 +64,49 @@ def test_the_bank_and_the_views_are_the_same_pixels_and_rays(downscale: float, t
     torch.testing.assert_close(rays.directions, torch.cat(directions))
 
 
-def test_transparent_pixels_are_shown_over_the_background(tmp_path: Path) -> None:
+def test_transparent_pixels_are_shown_over_the_background(tmp_path: Path, progress: SilentProgress) -> None:
     inputs, scene = photographed(tmp_path, channels=4)
     over_white = view_pixels(inputs["ingest"], scene, scene.views[0], 1.0)
     torch.testing.assert_close(over_white, torch.from_numpy(ball_photo()).float() / 255)
     over_green = view_pixels(inputs["ingest"], scene, scene.views[0], 1.0, (0.0, 1.0, 0.0))
     assert over_green[0, 0].tolist() == [0, 1, 0]
-    assert training_bank(inputs["ingest"], scene, "train", 1.0).pixels.shape[1] == 4
+    assert training_bank(inputs["ingest"], scene, "train", 1.0, progress).pixels.shape[1] == 4
 
 
-def test_stray_alpha_in_an_opaque_scene_is_laid_over_white(tmp_path: Path) -> None:
+def test_stray_alpha_in_an_opaque_scene_is_laid_over_white(tmp_path: Path, progress: SilentProgress) -> None:
     inputs, scene = photographed(tmp_path, channels=4)
     opaque = replace(scene, has_alpha=False)
-    bank = training_bank(inputs["ingest"], opaque, "train", 1.0)
+    bank = training_bank(inputs["ingest"], opaque, "train", 1.0, progress)
     assert bank.pixels.shape[1] == 3
     assert torch.equal(bank.pixels[: WIDTH * HEIGHT], torch.from_numpy(ball_photo()).flatten(0, 1))
 
 
-def test_an_opaque_photo_in_a_scene_with_alpha_covers_every_pixel(tmp_path: Path) -> None:
+def test_an_opaque_photo_in_a_scene_with_alpha_covers_every_pixel(tmp_path: Path, progress: SilentProgress) -> None:
     inputs, scene = photographed(tmp_path, channels=3)
-    bank = training_bank(inputs["ingest"], replace(scene, has_alpha=True), "train", 1.0)
+    bank = training_bank(inputs["ingest"], replace(scene, has_alpha=True), "train", 1.0, progress)
     assert bank.pixels.shape[1] == 4
     assert (bank.pixels[:, 3] == 255).all()
     assert torch.equal(bank.pixels[: WIDTH * HEIGHT, :3], torch.from_numpy(ball_photo()).flatten(0, 1))
 
 
-def test_cameras_of_test_views_do_not_enter_the_training_bank(tmp_path: Path) -> None:
+def test_cameras_of_test_views_do_not_enter_the_training_bank(tmp_path: Path, progress: SilentProgress) -> None:
     inputs, scene = photographed(tmp_path)
     other = replace(CAMERA, params=(FOCAL, FOCAL, 1.0, 1.0))
     views = tuple(replace(view, camera=int(view.split == "train")) for view in scene.views)
     mixed = replace(scene, cameras=(other, CAMERA), views=views)
-    bank = training_bank(inputs["ingest"], mixed, "train", 1.0)
+    bank = training_bank(inputs["ingest"], mixed, "train", 1.0, progress)
     assert bank.patches.shape[1] == WIDTH * HEIGHT
-    assert torch.equal(bank.patches, training_bank(inputs["ingest"], scene, "train", 1.0).patches)
+    assert torch.equal(bank.patches, training_bank(inputs["ingest"], scene, "train", 1.0, progress).patches)
 
 
-def test_evaluation_reads_the_pixels_that_training_stored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_evaluation_reads_the_pixels_that_training_stored(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, progress: SilentProgress
+) -> None:
     inputs, scene = photographed(tmp_path)
     ingest, trained, unseen = inputs["ingest"], scene.of_split("train")[2], scene.of_split("test")[1]
     decoded = [view_pixels(ingest, scene, view, 2.0) for view in (trained, unseen)]
     for split in ("train", "test"):
-        training_bank(ingest, scene, split, 2.0)
+        training_bank(ingest, scene, split, 2.0, progress)
     monkeypatch.setattr("stages.photos.load_pixels", None)
     for view, pixels in zip((trained, unseen), decoded, strict=True):
         assert torch.equal(view_pixels(ingest, scene, view, 2.0), pixels)

@@ -1,0 +1,45 @@
+"""The grid field's hot loops as NVIDIA Warp kernels: one source for CPU and CUDA (:class:`nerf.kernels.Backend`).
+
+Float32 and int32 tensors only. On the CPU a call uses the thread it is made from; results do not depend on how many
+threads call. On a GPU, gradients of the table are added in no fixed order.
+"""
+
+from nerf.kernels.directions import spherical_harmonics, spherical_harmonics_backward
+from nerf.kernels.warp.adam import adam
+from nerf.kernels.warp.cache import cell_corners, occupied_bits, update_cache
+from nerf.kernels.warp.compositing import (
+    composite,
+    composite_backward,
+    distortion,
+    distortion_backward,
+    visible_front,
+)
+from nerf.kernels.warp.encoding import encode, encode_backward_points, encode_backward_table
+from nerf.kernels.warp.launch import compile_kernels, why_not
+from nerf.kernels.warp.layers import add_ray_relu, add_ray_relu_backward, relu_backward
+from nerf.kernels.warp.marching import march, sample_points, sample_points_backward
+
+__all__ = [
+    "adam",
+    "add_ray_relu",
+    "add_ray_relu_backward",
+    "cell_corners",
+    "compile_kernels",
+    "composite",
+    "composite_backward",
+    "distortion",
+    "distortion_backward",
+    "encode",
+    "encode_backward_points",
+    "encode_backward_table",
+    "march",
+    "occupied_bits",
+    "relu_backward",
+    "sample_points",
+    "sample_points_backward",
+    "spherical_harmonics",
+    "spherical_harmonics_backward",
+    "update_cache",
+    "visible_front",
+    "why_not",
+]

@@ -1,0 +1,81 @@
+"""The density cache (``nerf.kernels.cache``)."""
+
+import torch
+import warp as wp
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+from nerf.kernels.cache import BRICK_CELLS, cell_corners
+from nerf.kernels.warp.launch import launch
+
+wp.set_module_options({"enable_backward": False})
+
+__all__ = ["cell_corners", "occupied_bits", "update_cache"]  # cell_corners runs once in 64 steps: torch will do
+
+
+def update_cache(
+    cells: int,
+    thickness: Float[Tensor, "cache"],
+    points: Float[Tensor, "points 3"],
+    values: Float[Tensor, "points"],
+    decay: float,
+) -> None:
+    """As in nerf.kernels.cache."""
+    if decay != 1:
+        faded = torch.empty_like(values)
+        launch(_fade, len(points), cells, thickness, points, decay, faded)
+        launch(_set, len(points), cells, thickness, points, faded)
+    launch(_raise, len(points), cells, thickness, points, values)
+
+
+def occupied_bits(thickness: Float[Tensor, "cache"], threshold: float) -> Int64[Tensor, "bricks"]:
+    """As in nerf.kernels.cache."""
+    bits = thickness.new_empty(len(thickness) // BRICK_CELLS, dtype=torch.int64)
+    launch(_occupied_bits, len(bits), thickness, threshold, bits)
+    return bits
+
+
+@wp.func
+def cell_number(cells: int, x: int, y: int, z: int):
+    """The number of cell (x, y, z), brick by brick."""
+    bricks = cells >> 2
+    brick = ((x >> 2) * bricks + (y >> 2)) * bricks + (z >> 2)
+    return (brick << 6) + ((x & 3) << 4) + ((y & 3) << 2) + (z & 3)
+
+
+@wp.func
+def cell_of(cells: int, point: wp.vec3):
+    """The number of the cell around a point; points outside the unit cube belong to the nearest."""
+    scaled = float(cells) * point
+    x = wp.clamp(int(scaled[0]), 0, cells - 1)
+    y = wp.clamp(int(scaled[1]), 0, cells - 1)
+    z = wp.clamp(int(scaled[2]), 0, cells - 1)
+    return cell_number(cells, x, y, z)
+
+
+@wp.kernel
+def _fade(cells: int, thickness: wp.array[float], points: wp.array[wp.vec3], decay: float, faded: wp.array[float]):
+    i = wp.tid()
+    faded[i] = decay * thickness[cell_of(cells, points[i])]
+
+
+@wp.kernel
+def _set(cells: int, thickness: wp.array[float], points: wp.array[wp.vec3], values: wp.array[float]):
+    i = wp.tid()
+    thickness[cell_of(cells, points[i])] = values[i]  # points of one cell bring the same value
+
+
+@wp.kernel
+def _raise(cells: int, thickness: wp.array[float], points: wp.array[wp.vec3], values: wp.array[float]):
+    i = wp.tid()
+    wp.atomic_max(thickness, cell_of(cells, points[i]), values[i])
+
+
+@wp.kernel
+def _occupied_bits(thickness: wp.array[float], threshold: float, bits: wp.array[wp.int64]):
+    brick = wp.tid()
+    word = wp.int64(0)
+    for cell in range(64):
+        if thickness[64 * brick + cell] > threshold:
+            word = word | (wp.int64(1) << wp.int64(cell))
+    bits[brick] = word

@@ -1,0 +1,278 @@
+"""Volume rendering of packed samples (``nerf.kernels.packed_compositing``): a ray is one thread's loop.
+
+Where the reference takes differences of sums over all rays in float64, sums here run along one ray, in float32.
+"""
+
+import torch
+import warp as wp
+from jaxtyping import Float, Int32
+from torch import Tensor
+
+from nerf.kernels import Lattice, Samples
+from nerf.kernels.packed_compositing import OPAQUE
+from nerf.kernels.warp.launch import launch
+from nerf.model import Rendering
+
+wp.set_module_options({"enable_backward": False})
+
+_OPAQUE = wp.constant(OPAQUE)
+
+
+def visible_front(
+    samples: Samples, sigma: Float[Tensor, "samples"], threshold: float
+) -> tuple[Samples, Int32[Tensor, "kept"]]:
+    """As in nerf.kernels.packed_compositing."""
+    rays, device = len(samples.starts) - 1, sigma.device
+    counts = torch.empty(rays, dtype=torch.int32, device=device)
+    launch(_count_visible, rays, samples.starts, samples.dt, sigma, threshold, counts)
+    starts = torch.nn.functional.pad(counts.cumsum(0, dtype=torch.int32), (1, 0))
+    total = int(starts[-1])
+    index, ray = (torch.empty(total, dtype=torch.int32, device=device) for _ in range(2))
+    t, dt = (torch.empty(total, device=device) for _ in range(2))
+    launch(_keep_front, rays, samples.starts, starts, samples.t, samples.dt, index, ray, t, dt)
+    return Samples(starts, ray, t, dt), index
+
+
+def composite(
+    samples: Samples,
+    sigma: Float[Tensor, "samples"],
+    colour: Float[Tensor, "samples 3"],
+    background: Float[Tensor, "rays 3"],
+    far: Float[Tensor, "rays"],
+) -> tuple[Rendering, Float[Tensor, "samples"]]:
+    """As in nerf.kernels.packed_compositing."""
+    rendering = Rendering(torch.empty_like(background), torch.empty_like(far), torch.empty_like(far))
+    weights = torch.empty_like(sigma)
+    packed = samples.starts, samples.t, samples.dt, sigma, colour
+    launch(_composite, len(far), *packed, background, far, *rendering, weights)
+    return rendering, weights
+
+
+def composite_backward(
+    samples: Samples,
+    sigma: Float[Tensor, "samples"],
+    colour: Float[Tensor, "samples 3"],
+    background: Float[Tensor, "rays 3"],
+    far: Float[Tensor, "rays"],
+    grad: Rendering,
+    grad_weights: Float[Tensor, "samples"],
+) -> tuple[Float[Tensor, "samples"], Float[Tensor, "samples 3"]]:
+    """As in nerf.kernels.packed_compositing."""
+    grad_sigma, grad_colour = torch.empty_like(sigma), torch.empty_like(colour)
+    packed = samples.starts, samples.t, samples.dt, sigma, colour
+    arguments = *packed, background, far, *grad, grad_weights, grad_sigma, grad_colour
+    launch(_composite_backward, len(far), *arguments)
+    return grad_sigma, grad_colour
+
+
+def distortion(samples: Samples, weights: Float[Tensor, "samples"], lattice: Lattice) -> Float[Tensor, "rays"]:
+    """As in nerf.kernels.packed_compositing."""
+    spread = weights.new_empty(len(samples.starts) - 1)
+    launch(_distortion, len(spread), _grows_from(lattice), samples.starts, samples.t, samples.dt, weights, spread)
+    return spread
+
+
+def distortion_backward(
+    samples: Samples, weights: Float[Tensor, "samples"], lattice: Lattice, grad: Float[Tensor, "rays"]
+) -> Float[Tensor, "samples"]:
+    """As in nerf.kernels.packed_compositing."""
+    grad_weights = torch.empty_like(weights)
+    packed = samples.starts, samples.t, samples.dt, weights
+    launch(_distortion_backward, len(grad), _grows_from(lattice), *packed, grad, grad_weights)
+    return grad_weights
+
+
+def _grows_from(lattice: Lattice) -> float:
+    """The distance from which steps grow; 0 where they never do."""
+    return lattice.linear_until if lattice.cone else 0.0
+
+
+@wp.func
+def _thickness(sigma: float, length: float):
+    return wp.min(sigma * length, _OPAQUE)
+
+
+@wp.func
+def _stopped(tau: float):
+    """1 - exp(-tau); by its series where the difference would lose digits."""
+    if tau < 0.1:
+        return tau * (1.0 - tau / 2.0 * (1.0 - tau / 3.0 * (1.0 - tau / 4.0 * (1.0 - tau / 5.0))))
+    return 1.0 - wp.exp(-tau)
+
+
+@wp.kernel
+def _count_visible(
+    starts: wp.array[int], lengths: wp.array[float], sigma: wp.array[float], threshold: float, counts: wp.array[int]
+):
+    ray = wp.tid()
+    tau = float(0.0)
+    i = int(starts[ray])
+    end = starts[ray + 1]
+    while i < end and wp.exp(-tau) >= threshold:
+        tau += _thickness(sigma[i], lengths[i])
+        i += 1
+    counts[ray] = i - starts[ray]
+
+
+@wp.kernel
+def _keep_front(
+    starts: wp.array[int],
+    kept_starts: wp.array[int],
+    distances: wp.array[float],
+    lengths: wp.array[float],
+    index: wp.array[int],
+    rays: wp.array[int],
+    kept_distances: wp.array[float],
+    kept_lengths: wp.array[float],
+):
+    ray = wp.tid()
+    behind = starts[ray] - kept_starts[ray]
+    for i in range(kept_starts[ray], kept_starts[ray + 1]):
+        index[i] = i + behind
+        rays[i] = ray
+        kept_distances[i] = distances[i + behind]
+        kept_lengths[i] = lengths[i + behind]
+
+
+@wp.kernel
+def _composite(
+    starts: wp.array[int],
+    distances: wp.array[float],
+    lengths: wp.array[float],
+    sigma: wp.array[float],
+    colour: wp.array[wp.vec3],
+    background: wp.array[wp.vec3],
+    far: wp.array[float],
+    seen: wp.array[wp.vec3],
+    depth: wp.array[float],
+    opacity: wp.array[float],
+    weights: wp.array[float],
+):
+    ray = wp.tid()
+    tau = float(0.0)
+    sum_colour = wp.vec3(0.0)
+    sum_depth = float(0.0)
+    for i in range(starts[ray], starts[ray + 1]):
+        more = _thickness(sigma[i], lengths[i])
+        weight = wp.exp(-tau) * _stopped(more)
+        tau += more
+        weights[i] = weight
+        sum_colour += weight * colour[i]
+        sum_depth += weight * distances[i]
+    unstopped = wp.exp(-tau)
+    seen[ray] = sum_colour + unstopped * background[ray]
+    depth[ray] = sum_depth + unstopped * far[ray]
+    opacity[ray] = _stopped(tau)
+
+
+@wp.kernel
+def _composite_backward(
+    starts: wp.array[int],
+    distances: wp.array[float],
+    lengths: wp.array[float],
+    sigma: wp.array[float],
+    colour: wp.array[wp.vec3],
+    background: wp.array[wp.vec3],
+    far: wp.array[float],
+    grad_seen: wp.array[wp.vec3],
+    grad_depth: wp.array[float],
+    grad_opacity: wp.array[float],
+    grad_weights: wp.array[float],
+    grad_sigma: wp.array[float],
+    grad_colour: wp.array[wp.vec3],
+):
+    ray = wp.tid()
+    start = starts[ray]
+    end = starts[ray + 1]
+    tau = float(0.0)
+    for i in range(start, end):
+        grad_sigma[i] = tau  # what lies before the sample, for the way back
+        tau += _thickness(sigma[i], lengths[i])
+    on_seen = grad_seen[ray]
+    on_depth = grad_depth[ray]
+    on_unstopped = wp.dot(on_seen, background[ray]) + on_depth * far[ray] - grad_opacity[ray]
+    behind = wp.exp(-tau) * on_unstopped
+    for step in range(end - start):
+        i = end - 1 - step
+        more = _thickness(sigma[i], lengths[i])
+        before = wp.exp(-grad_sigma[i])
+        weight = before * _stopped(more)
+        g = grad_weights[i] + wp.dot(on_seen, colour[i]) + on_depth * distances[i]
+        grad_sigma[i] = lengths[i] * (before * wp.exp(-more) * g - behind)
+        grad_colour[i] = weight * on_seen
+        behind += weight * g
+
+
+@wp.func
+def _position(grows_from: float, t: float):
+    """Along a ray as the lattice measures it: the distance, or its logarithm where steps grow."""
+    if grows_from == 0.0:
+        return t
+    relative = t / grows_from
+    return wp.min(relative, 1.0) + wp.log(wp.max(relative, 1.0))
+
+
+@wp.func
+def _length(grows_from: float, t: float, dt: float):
+    if grows_from == 0.0:
+        return dt
+    return dt / wp.max(grows_from, t)
+
+
+@wp.kernel
+def _distortion(
+    grows_from: float,
+    starts: wp.array[int],
+    distances: wp.array[float],
+    lengths: wp.array[float],
+    weights: wp.array[float],
+    spread: wp.array[float],
+):
+    ray = wp.tid()
+    # Sums of w_j and w_j (m - m_j) over the samples before, m being the position of the last: no large numbers meet.
+    before = float(0.0)
+    apart = float(0.0)
+    total = float(0.0)
+    last = float(0.0)
+    for i in range(starts[ray], starts[ray + 1]):
+        m = _position(grows_from, distances[i])
+        w = weights[i]
+        apart += before * (m - last)
+        total += w * (2.0 * apart + w * _length(grows_from, distances[i], lengths[i]) / 3.0)
+        before += w
+        last = m
+    spread[ray] = total
+
+
+@wp.kernel
+def _distortion_backward(
+    grows_from: float,
+    starts: wp.array[int],
+    distances: wp.array[float],
+    lengths: wp.array[float],
+    weights: wp.array[float],
+    grad: wp.array[float],
+    grad_weights: wp.array[float],
+):
+    ray = wp.tid()
+    start = starts[ray]
+    end = starts[ray + 1]
+    before = float(0.0)
+    apart = float(0.0)
+    last = float(0.0)
+    for i in range(start, end):
+        m = _position(grows_from, distances[i])
+        apart += before * (m - last)
+        own = weights[i] * _length(grows_from, distances[i], lengths[i]) / 3.0
+        grad_weights[i] = grad[ray] * 2.0 * (apart + own)
+        before += weights[i]
+        last = m
+    behind = float(0.0)
+    apart = float(0.0)
+    for step in range(end - start):
+        i = end - 1 - step
+        m = _position(grows_from, distances[i])
+        apart += behind * (last - m)
+        grad_weights[i] = grad_weights[i] + grad[ray] * 2.0 * apart
+        behind += weights[i]
+        last = m

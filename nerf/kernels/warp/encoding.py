@@ -1,0 +1,197 @@
+"""Multi-resolution feature grids (``nerf.kernels.grid_encoding``), for grids of four features."""
+
+import functools
+
+import torch
+import warp as wp
+from jaxtyping import Float
+from torch import Tensor
+
+from nerf.kernels import GridLayout
+from nerf.kernels.warp.launch import launch
+
+wp.set_module_options({"enable_backward": False})
+
+_PRIME_Y = wp.constant(wp.uint32(2654435761))
+_PRIME_Z = wp.constant(wp.uint32(805459861))
+FEATURES = 4  # of a vertex: a row of the table is one vec4
+vec8 = wp.types.vector(length=8, dtype=wp.float32)
+vec8i = wp.types.vector(length=8, dtype=wp.int32)
+
+
+def encode(
+    layout: GridLayout, table: Float[Tensor, "rows features"], points: Float[Tensor, "points 3"]
+) -> Float[Tensor, "points width"]:
+    """As in nerf.kernels.grid_encoding."""
+    features = points.new_empty(len(points), layout.width)
+    levels = _levels(layout, points.device)
+    launch(_encode, len(points), levels, len(layout.resolutions), table, points, features)
+    return features
+
+
+def encode_backward_table(
+    layout: GridLayout,
+    level: int,
+    points: Float[Tensor, "points 3"],
+    grad_features: Float[Tensor, "points width"],
+    grad_table: Float[Tensor, "rows features"],
+) -> None:
+    """As in nerf.kernels.grid_encoding. Points are added in their order on the CPU, in any order on a GPU."""
+    levels = _levels(layout, points.device)
+    launch(
+        _encode_backward_table, len(points), levels, len(layout.resolutions), level, points, grad_features, grad_table
+    )
+
+
+def encode_backward_points(
+    layout: GridLayout,
+    table: Float[Tensor, "rows features"],
+    points: Float[Tensor, "points 3"],
+    grad_features: Float[Tensor, "points width"],
+) -> Float[Tensor, "points 3"]:
+    """As in nerf.kernels.grid_encoding."""
+    grad_points = torch.empty_like(points)
+    levels = _levels(layout, points.device)
+    arguments = levels, len(layout.resolutions), table, points, grad_features, grad_points
+    launch(_encode_backward_points, len(points), *arguments)
+    return grad_points
+
+
+@functools.cache
+def _levels(layout: GridLayout, device: torch.device) -> Tensor:
+    """A row per level: its resolution, first row, the mask of its hash, and whether vertices are hashed."""
+    if layout.features != FEATURES:
+        raise ValueError(f"these kernels are for {FEATURES} features per vertex, not {layout.features}")
+    rows = [
+        (resolution, layout.first_rows[level], layout.level_rows(level) - 1, int(layout.hashed(level)))
+        for level, resolution in enumerate(layout.resolutions)
+    ]
+    return torch.tensor(rows, dtype=torch.int32, device=device)
+
+
+@wp.func
+def _cell(coordinate: float, resolution: int):
+    """The cell of a coordinate that was multiplied by the resolution; the rest of it is the place within."""
+    return wp.clamp(int(coordinate), 0, resolution - 1)
+
+
+@wp.func
+def _corner_rows(level: wp.vec4i, x: int, y: int, z: int):
+    """Table rows of the corners of a cell, z changing fastest."""
+    if level[3] != 0:
+        mask = wp.uint32(level[2])
+        x0 = wp.uint32(x)
+        x1 = wp.uint32(x + 1)
+        y0 = wp.uint32(y) * _PRIME_Y
+        y1 = y0 + _PRIME_Y
+        z0 = wp.uint32(z) * _PRIME_Z
+        z1 = z0 + _PRIME_Z
+        return vec8i(
+            level[1] + int((x0 ^ y0 ^ z0) & mask),
+            level[1] + int((x0 ^ y0 ^ z1) & mask),
+            level[1] + int((x0 ^ y1 ^ z0) & mask),
+            level[1] + int((x0 ^ y1 ^ z1) & mask),
+            level[1] + int((x1 ^ y0 ^ z0) & mask),
+            level[1] + int((x1 ^ y0 ^ z1) & mask),
+            level[1] + int((x1 ^ y1 ^ z0) & mask),
+            level[1] + int((x1 ^ y1 ^ z1) & mask),
+        )
+    side = level[0] + 1
+    first = level[1] + (x * side + y) * side + z
+    far = first + side * side
+    return vec8i(first, first + 1, first + side, first + side + 1, far, far + 1, far + side, far + side + 1)
+
+
+@wp.func
+def _corner_shares(u: float, v: float, w: float):
+    """Trilinear weights of the corners."""
+    a = (1.0 - u) * (1.0 - v)
+    b = (1.0 - u) * v
+    c = u * (1.0 - v)
+    d = u * v
+    t = 1.0 - w
+    return vec8(a * t, a * w, b * t, b * w, c * t, c * w, d * t, d * w)
+
+
+@wp.kernel
+def _encode(
+    levels: wp.array[wp.vec4i],
+    count: int,
+    table: wp.array[wp.vec4],
+    points: wp.array[wp.vec3],
+    features: wp.array[wp.vec4],
+):
+    i = wp.tid()
+    point = points[i]
+    for index in range(count):
+        level = levels[index]
+        scaled = float(level[0]) * point
+        x = _cell(scaled[0], level[0])
+        y = _cell(scaled[1], level[0])
+        z = _cell(scaled[2], level[0])
+        rows = _corner_rows(level, x, y, z)
+        shares = _corner_shares(scaled[0] - float(x), scaled[1] - float(y), scaled[2] - float(z))
+        mean = shares[0] * table[rows[0]]
+        for corner in range(1, 8):
+            mean += shares[corner] * table[rows[corner]]
+        features[i * count + index] = mean
+
+
+@wp.kernel
+def _encode_backward_table(
+    levels: wp.array[wp.vec4i],
+    count: int,
+    index: int,
+    points: wp.array[wp.vec3],
+    grad_features: wp.array[wp.vec4],
+    grad_table: wp.array[wp.vec4],
+):
+    i = wp.tid()
+    level = levels[index]
+    scaled = float(level[0]) * points[i]
+    x = _cell(scaled[0], level[0])
+    y = _cell(scaled[1], level[0])
+    z = _cell(scaled[2], level[0])
+    rows = _corner_rows(level, x, y, z)
+    shares = _corner_shares(scaled[0] - float(x), scaled[1] - float(y), scaled[2] - float(z))
+    grad = grad_features[i * count + index]
+    for corner in range(8):
+        wp.atomic_add(grad_table, rows[corner], shares[corner] * grad)
+
+
+@wp.kernel
+def _encode_backward_points(
+    levels: wp.array[wp.vec4i],
+    count: int,
+    table: wp.array[wp.vec4],
+    points: wp.array[wp.vec3],
+    grad_features: wp.array[wp.vec4],
+    grad_points: wp.array[wp.vec3],
+):
+    i = wp.tid()
+    total = wp.vec3(0.0, 0.0, 0.0)
+    for index in range(count):
+        level = levels[index]
+        scaled = float(level[0]) * points[i]
+        x = _cell(scaled[0], level[0])
+        y = _cell(scaled[1], level[0])
+        z = _cell(scaled[2], level[0])
+        u = scaled[0] - float(x)
+        v = scaled[1] - float(y)
+        w = scaled[2] - float(z)
+        rows = _corner_rows(level, x, y, z)
+        grad = grad_features[i * count + index]
+        # What the loss gains per unit of each corner's share.
+        g000 = wp.dot(grad, table[rows[0]])
+        g001 = wp.dot(grad, table[rows[1]])
+        g010 = wp.dot(grad, table[rows[2]])
+        g011 = wp.dot(grad, table[rows[3]])
+        g100 = wp.dot(grad, table[rows[4]])
+        g101 = wp.dot(grad, table[rows[5]])
+        g110 = wp.dot(grad, table[rows[6]])
+        g111 = wp.dot(grad, table[rows[7]])
+        on_x = wp.lerp(wp.lerp(g100 - g000, g101 - g001, w), wp.lerp(g110 - g010, g111 - g011, w), v)
+        on_y = wp.lerp(wp.lerp(g010 - g000, g011 - g001, w), wp.lerp(g110 - g100, g111 - g101, w), u)
+        on_z = wp.lerp(wp.lerp(g001 - g000, g011 - g010, v), wp.lerp(g101 - g100, g111 - g110, v), u)
+        total += float(level[0]) * wp.vec3(on_x, on_y, on_z)
+    grad_points[i] = total

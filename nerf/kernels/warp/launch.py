@@ -1,0 +1,117 @@
+"""Launches Warp kernels on torch tensors, at a few microseconds each.
+
+``wp.launch`` with ``wp.from_torch`` costs 50 to 100 microseconds of Python, as long as many of these kernels run. So a
+launch is recorded once per thread, kernel and device; afterwards only pointers, lengths and numbers are set anew. On
+the CPU a launch runs on the calling thread, with Python's lock released: the caller's threads are the parallelism.
+"""
+
+import threading
+from typing import Any, NamedTuple
+
+import torch
+import warp as wp
+from torch import Tensor
+
+wp.config.log_level = wp.LOG_ERROR  # a machine without a GPU is no news, nor is each module compiled
+wp.init()
+
+Argument = Tensor | int | float
+
+TORCH_TYPES = {wp.float32: torch.float32, wp.int32: torch.int32, wp.int64: torch.int64}
+
+vec16 = wp.types.vector(length=16, dtype=wp.float32)  # a cache line: rows of 64 numbers are four, and add as vectors do
+
+
+PACKAGE = "nerf.kernels.warp"
+
+
+def why_not(device: str) -> str | None:
+    """What keeps Warp's kernels from running on ``device`` ("cpu" or "cuda"); None if nothing does."""
+    if device == "cpu" or wp.is_cuda_available():
+        return None
+    return f"Warp {wp.config.version} finds no CUDA driver that is new enough for it"
+
+
+def compile_kernels(device: str) -> None:
+    """Have all kernels ready on ``device``: seconds the first time, afterwards they come from the user's cache."""
+    with _recording:
+        wp.load_module(PACKAGE, device, recursive=True, max_workers=torch.get_num_threads())
+
+
+class _Array(NamedTuple):
+    """What a kernel asks of an array: torch's type of its numbers, how many make an entry, the entry's bytes."""
+
+    dtype: torch.dtype
+    numbers: int
+    size: int
+
+
+class _Recorded(NamedTuple):
+    """A launch with its arguments, in place to be changed; ``arrays`` has None where a number is wanted."""
+
+    launch: Any
+    arrays: tuple[_Array | None, ...]
+
+
+_of_thread = threading.local()  # a recorded launch is changed before each run, so no two threads may share one
+_recording = threading.Lock()  # recording may compile and load code: twice at once would unload what already runs
+
+
+def launch(kernel: wp.Kernel, count: int, *arguments: Argument) -> None:
+    """Run ``kernel`` for ``wp.tid()`` = 0 ... count - 1, on the device of its first tensor.
+
+    Tensors are read as rows of what the kernel declares: (n, 8) float32 as 2 n entries of ``wp.vec4``. Raises TypeError
+    for a tensor that the kernel cannot read: of another type, not contiguous, or not a whole number of entries.
+    """
+    if count == 0:
+        return
+    device = next(argument.device for argument in arguments if isinstance(argument, Tensor))
+    launches: dict[tuple[wp.Kernel, torch.device], _Recorded] = vars(_of_thread).setdefault("launches", {})
+    recorded = launches.get((kernel, device))
+    if recorded is None:
+        with _recording:
+            recorded = launches[kernel, device] = _record(kernel, device, arguments)
+    ready = recorded.launch
+    for place, (array, argument) in enumerate(zip(recorded.arrays, arguments, strict=True), 1):
+        if isinstance(argument, Tensor):
+            if array is None or argument.dtype is not array.dtype or not argument.is_contiguous():
+                raise TypeError(_unreadable(kernel, place, array, argument))
+            entries, rest = divmod(argument.numel(), array.numbers)
+            if rest:
+                raise TypeError(_unreadable(kernel, place, array, argument))
+            entry = ready.params[place]
+            entry.data, entry.shape[0] = argument.data_ptr(), entries
+        else:
+            ready.params[place].value = argument
+    ready.set_dim(count)
+    ready.launch(wp.stream_from_torch(device) if device.type == "cuda" else None)
+
+
+def _record(kernel: wp.Kernel, device: torch.device, arguments: tuple[Argument, ...]) -> _Recorded:
+    inputs, arrays = [], []
+    for declared, argument in zip(kernel.adj.args, arguments, strict=True):
+        if isinstance(argument, Tensor):
+            array = _array(declared.type.dtype)
+            empty = wp.array(
+                ptr=argument.data_ptr(), dtype=declared.type.dtype, shape=1, device=wp.device_from_torch(device)
+            )
+            inputs.append(empty)
+            arrays.append(array)
+        else:
+            inputs.append(argument)
+            arrays.append(None)
+    recorded = wp.launch(kernel, dim=1, inputs=inputs, device=wp.device_from_torch(device), record_cmd=True)
+    return _Recorded(recorded, tuple(arrays))
+
+
+def _array(entry: Any) -> _Array:
+    number = getattr(entry, "_wp_scalar_type_", entry)
+    size = wp.types.type_size_in_bytes(entry)
+    return _Array(TORCH_TYPES[number], size // wp.types.type_size_in_bytes(number), size)
+
+
+def _unreadable(kernel: wp.Kernel, place: int, array: _Array | None, tensor: Tensor) -> str:
+    name = kernel.adj.args[place - 1].label
+    wanted = "a number" if array is None else f"contiguous {array.dtype} in entries of {array.numbers}"
+    layout = "contiguous" if tensor.is_contiguous() else "not contiguous"
+    return f"{kernel.key}: {name} must be {wanted}; it is {tuple(tensor.shape)} {tensor.dtype}, {layout}"

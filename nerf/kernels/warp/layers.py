@@ -1,0 +1,84 @@
+"""The hidden layer of the colour network, whose input is part the sample's and part its ray's
+(``nerf.kernels.hidden_layer``)."""
+
+import warp as wp
+from jaxtyping import Float
+from torch import Tensor
+
+from nerf.kernels import Samples
+from nerf.kernels.warp.launch import launch, vec16
+
+wp.set_module_options({"enable_backward": False})
+
+_HIDDEN = 64
+
+
+def add_ray_relu(samples: Samples, hidden: Float[Tensor, "samples 64"], of_ray: Float[Tensor, "rays 64"]) -> None:
+    """As in nerf.kernels.hidden_layer."""
+    launch(_add_ray_relu, len(of_ray), samples.starts, of_ray, hidden)
+
+
+def add_ray_relu_backward(
+    samples: Samples, hidden: Float[Tensor, "samples 64"], grad: Float[Tensor, "samples 64"]
+) -> Float[Tensor, "rays 64"]:
+    """As in nerf.kernels.hidden_layer."""
+    of_ray = grad.new_empty(len(samples.starts) - 1, _HIDDEN)
+    launch(_add_ray_relu_backward, len(of_ray), samples.starts, hidden, grad, of_ray)
+    return of_ray
+
+
+def relu_backward(hidden: Float[Tensor, "samples 64"], grad: Float[Tensor, "samples 64"]) -> None:
+    """As in nerf.kernels.hidden_layer."""
+    launch(_relu_backward, 4 * len(hidden), hidden, grad)
+
+
+@wp.func
+def _where_positive(hidden: vec16, grad: vec16):
+    """The gradient where the layer let it through: hidden is zero or, twice multiplied, surely 1 or more."""
+    one = vec16(1.0)
+    return wp.cw_mul(grad, wp.min(wp.min(3.0e38 * hidden, one) * 3.0e38, one))
+
+
+@wp.kernel
+def _add_ray_relu(starts: wp.array[int], of_ray: wp.array[vec16], hidden: wp.array[vec16]):
+    ray = wp.tid()
+    zero = vec16(0.0)
+    a = of_ray[4 * ray]
+    b = of_ray[4 * ray + 1]
+    c = of_ray[4 * ray + 2]
+    d = of_ray[4 * ray + 3]
+    for i in range(starts[ray], starts[ray + 1]):
+        hidden[4 * i] = wp.max(hidden[4 * i] + a, zero)
+        hidden[4 * i + 1] = wp.max(hidden[4 * i + 1] + b, zero)
+        hidden[4 * i + 2] = wp.max(hidden[4 * i + 2] + c, zero)
+        hidden[4 * i + 3] = wp.max(hidden[4 * i + 3] + d, zero)
+
+
+@wp.kernel
+def _add_ray_relu_backward(
+    starts: wp.array[int], hidden: wp.array[vec16], grad: wp.array[vec16], of_ray: wp.array[vec16]
+):
+    ray = wp.tid()
+    a = vec16(0.0)
+    b = vec16(0.0)
+    c = vec16(0.0)
+    d = vec16(0.0)
+    for i in range(starts[ray], starts[ray + 1]):
+        grad[4 * i] = _where_positive(hidden[4 * i], grad[4 * i])
+        grad[4 * i + 1] = _where_positive(hidden[4 * i + 1], grad[4 * i + 1])
+        grad[4 * i + 2] = _where_positive(hidden[4 * i + 2], grad[4 * i + 2])
+        grad[4 * i + 3] = _where_positive(hidden[4 * i + 3], grad[4 * i + 3])
+        a += grad[4 * i]
+        b += grad[4 * i + 1]
+        c += grad[4 * i + 2]
+        d += grad[4 * i + 3]
+    of_ray[4 * ray] = a
+    of_ray[4 * ray + 1] = b
+    of_ray[4 * ray + 2] = c
+    of_ray[4 * ray + 3] = d
+
+
+@wp.kernel
+def _relu_backward(hidden: wp.array[vec16], grad: wp.array[vec16]):
+    i = wp.tid()
+    grad[i] = _where_positive(hidden[i], grad[i])

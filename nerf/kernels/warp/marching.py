@@ -1,0 +1,302 @@
+"""Samples along rays (``nerf.kernels.marching``): where the density cache is empty, whole bricks are skipped."""
+
+import threading
+
+import torch
+import warp as wp
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+from nerf.kernels import BOX, CONTRACTED_BOX, Lattice, Samples
+from nerf.kernels.warp.cache import cell_number
+from nerf.kernels.warp.launch import launch
+from nerf.rays import Rays
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+_BOX = wp.constant(BOX)
+_HALF = wp.constant(CONTRACTED_BOX)
+
+
+def march(bits: Int64[Tensor, "bricks"], lattice: Lattice, rays: Rays, jitter: Float[Tensor, "rays"]) -> Samples:
+    """As in nerf.kernels.marching."""
+    count, device = len(jitter), jitter.device
+    found = _scratch(count * lattice.most_samples, device)
+    counts = torch.empty(count, dtype=torch.int32, device=device)
+    first = torch.empty(count, device=device)
+    far = torch.empty(count, device=device)
+    sizes = lattice.step, lattice.cone, int(lattice.contracted), lattice.cells, lattice.most_samples
+    launch(_march, count, bits, *sizes, *rays, jitter, found, counts, first, far)
+    starts = torch.nn.functional.pad(counts.cumsum(0, dtype=torch.int32), (1, 0))
+    total = int(starts[-1])
+    ray = torch.empty(total, dtype=torch.int32, device=device)
+    t, dt = torch.empty(total, device=device), torch.empty(total, device=device)
+    launch(_place, count, *sizes[:2], lattice.most_samples, found, starts, first, jitter, far, ray, t, dt)
+    return Samples(starts, ray, t, dt)
+
+
+def sample_points(rays: Rays, samples: Samples, contracted: bool) -> Float[Tensor, "samples 3"]:
+    """As in nerf.kernels.marching."""
+    points = samples.t.new_empty(len(samples.t), 3)
+    launch(_sample_points, len(points), int(contracted), rays.origins, rays.directions, samples.ray, samples.t, points)
+    return points
+
+
+def sample_points_backward(
+    rays: Rays, samples: Samples, contracted: bool, grad_points: Float[Tensor, "samples 3"]
+) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays 3"]]:
+    """As in nerf.kernels.marching."""
+    grad_origins, grad_directions = torch.empty_like(rays.origins), torch.empty_like(rays.directions)
+    packed = samples.starts, samples.t, grad_points
+    arguments = int(contracted), rays.origins, rays.directions, *packed, grad_origins, grad_directions
+    launch(_sample_points_backward, len(grad_origins), *arguments)
+    return grad_origins, grad_directions
+
+
+# Memory that a march fills and its own second half reads; kept, as fetching fresh pages takes longer than both.
+_of_thread = threading.local()
+
+
+def _scratch(length: int, device: torch.device) -> Tensor:
+    scratch: dict[torch.device, Tensor] = vars(_of_thread).setdefault("scratch", {})
+    kept = scratch.get(device)
+    if kept is None or len(kept) < length:
+        kept = scratch[device] = torch.empty(length, dtype=torch.int32, device=device)
+    return kept
+
+
+@wp.func
+def _distance(step: float, cone: float, s: float):
+    """t(s) of nerf.kernels.Lattice."""
+    if cone == 0.0:
+        return step * s
+    beyond = wp.max(cone * s - 1.0, 0.0)
+    return wp.min(step * s, step / cone) * wp.exp(beyond)
+
+
+@wp.func
+def _coordinate(step: float, cone: float, t: float):
+    """s(t), the inverse of t(s)."""
+    if cone == 0.0:
+        return t / step
+    until = step / cone
+    return wp.min(t, until) / step + wp.log(wp.max(t, until) / until) / cone
+
+
+@wp.func
+def _contract(point: wp.vec3):
+    """nerf.contraction.contract: the largest component r > 1 becomes 2 - 1/r, the others in proportion."""
+    r = wp.max(wp.max(wp.abs(point[0]), wp.abs(point[1])), wp.abs(point[2]))
+    if r <= 1.0:
+        return point
+    inverse = 1.0 / r
+    return (2.0 - inverse) * (inverse * point)
+
+
+@wp.func
+def _unit(contracted: int, point: wp.vec3):
+    if contracted != 0:
+        return (_contract(point) + wp.vec3(_HALF)) / (2.0 * _HALF)
+    return (point + wp.vec3(_BOX)) / (2.0 * _BOX)
+
+
+@wp.func
+def _leave(near: float, position: float, direction: float):
+    return 0.0
+
+
+@wp.func
+def _slab(origin: float, direction: float):
+    """Where a ray is between -BOX and BOX along one axis; everywhere or nowhere if it runs along them."""
+    if direction == 0.0:
+        if wp.abs(origin) <= _BOX:
+            return wp.vec2(-wp.inf, wp.inf)
+        return wp.vec2(wp.inf, -wp.inf)
+    a = (-_BOX - origin) / direction
+    b = (_BOX - origin) / direction
+    return wp.vec2(wp.min(a, b), wp.max(a, b))
+
+
+@wp.func
+def _axis_exit(cell: int, width: float, position: float, direction: float):
+    """How far along the ray the brick around a cell ends on one axis, in unit coordinates and their speed."""
+    if direction == 0.0:
+        return wp.inf
+    low = float((cell >> 2) << 2) * width
+    if direction > 0.0:
+        return (low + 4.0 * width - position) / direction
+    return (low - position) / direction
+
+
+@wp.func
+def _free_distance(contracted: int, cells: int, x: int, y: int, z: int, u: wp.vec3, point: wp.vec3, d: wp.vec3):
+    """How far along the ray it surely stays in the brick around cell (x, y, z), which holds its point (unit: u).
+
+    Where unit coordinates are linear, up to the brick's face. Where space is folded, r being the largest component
+    of the point, coordinates in [-2, 2] move at most 4/3 times as fast as the point, and at most 4/(r - a) times
+    within a distance a of it; so within a distance m of the nearest face (in the largest component) it stays for
+    max(3/4 m, m r / (4 + m)).
+    """
+    width = 1.0 / float(cells)
+    if contracted == 0:
+        v = d / (2.0 * _BOX)
+    else:
+        v = d / (2.0 * _HALF)
+        low = wp.vec3(float(x & ~3), float(y & ~3), float(z & ~3)) * width
+        nearest = wp.min(wp.min(u - low, low + wp.vec3(4.0 * width) - u))
+        r = wp.max(wp.abs(point))
+        unfolded = wp.max(wp.max(wp.abs(low - wp.vec3(0.5)), wp.abs(low + wp.vec3(4.0 * width) - wp.vec3(0.5))))
+        if unfolded > 0.2500001:
+            m = 2.0 * _HALF * nearest
+            return wp.max(0.75 * m, m * r / (4.0 + m))
+    on_x = _axis_exit(x, width, u[0], v[0])
+    on_y = _axis_exit(y, width, u[1], v[1])
+    return wp.min(wp.min(on_x, on_y), _axis_exit(z, width, u[2], v[2]))
+
+
+@wp.kernel
+def _march(
+    bits: wp.array[wp.int64],
+    step: float,
+    cone: float,
+    contracted: int,
+    cells: int,
+    most: int,
+    origins: wp.array[wp.vec3],
+    directions: wp.array[wp.vec3],
+    nears: wp.array[float],
+    fars: wp.array[float],
+    jitter: wp.array[float],
+    found: wp.array[int],
+    counts: wp.array[int],
+    firsts: wp.array[float],
+    ends: wp.array[float],
+):
+    ray = wp.tid()
+    o = origins[ray]
+    d = directions[ray]
+    near = nears[ray]
+    far = fars[ray]
+    if contracted == 0:
+        on_x = _slab(o[0], d[0])
+        on_y = _slab(o[1], d[1])
+        on_z = _slab(o[2], d[2])
+        near = wp.max(near, wp.max(wp.max(on_x[0], on_y[0]), on_z[0]))
+        far = wp.max(near, wp.min(far, wp.min(wp.min(on_x[1], on_y[1]), on_z[1])))
+    first = _coordinate(step, cone, near)
+    last = _coordinate(step, cone, far) - first
+    count = int(0)
+    k = int(0)
+    scale = float(cells)
+    while float(k) < last and count < most:
+        s = first + jitter[ray] + float(k)
+        t = _distance(step, cone, s)
+        if t >= far:
+            break
+        point = o + t * d
+        u = _unit(contracted, point)
+        x = wp.clamp(int(scale * u[0]), 0, cells - 1)
+        y = wp.clamp(int(scale * u[1]), 0, cells - 1)
+        z = wp.clamp(int(scale * u[2]), 0, cells - 1)
+        number = cell_number(cells, x, y, z)
+        word = bits[number >> 6]
+        if word == wp.int64(0):
+            free = _free_distance(contracted, cells, x, y, z, u, point, d)
+            # Rounded down by a thousandth of a step: a step too few is looked at again, one too many is lost.
+            steps = _coordinate(step, cone, t + free) - s - 0.001
+            k += wp.max(1, int(wp.min(steps, 1.0e6)) + 1)
+        else:
+            if ((word >> wp.int64(number & 63)) & wp.int64(1)) != wp.int64(0):
+                found[ray * most + count] = k
+                count += 1
+            k += 1
+    counts[ray] = count
+    firsts[ray] = first
+    ends[ray] = far
+
+
+@wp.kernel
+def _place(
+    step: float,
+    cone: float,
+    most: int,
+    found: wp.array[int],
+    starts: wp.array[int],
+    firsts: wp.array[float],
+    jitter: wp.array[float],
+    ends: wp.array[float],
+    rays: wp.array[int],
+    distances: wp.array[float],
+    lengths: wp.array[float],
+):
+    ray = wp.tid()
+    start = starts[ray]
+    for i in range(start, starts[ray + 1]):
+        k = float(found[ray * most + i - start])
+        here = _distance(step, cone, firsts[ray] + k)
+        there = wp.min(_distance(step, cone, firsts[ray] + k + 1.0), ends[ray])
+        rays[i] = ray
+        distances[i] = _distance(step, cone, firsts[ray] + jitter[ray] + k)
+        lengths[i] = there - here
+
+
+@wp.kernel
+def _sample_points(
+    contracted: int,
+    origins: wp.array[wp.vec3],
+    directions: wp.array[wp.vec3],
+    rays: wp.array[int],
+    distances: wp.array[float],
+    points: wp.array[wp.vec3],
+):
+    i = wp.tid()
+    ray = rays[i]
+    points[i] = _unit(contracted, origins[ray] + distances[i] * directions[ray])
+
+
+@wp.func
+def _unit_backward(contracted: int, point: wp.vec3, grad: wp.vec3):
+    """With r = |x_a| the largest component: y_i = f x_i for f = (2 - 1/r) / r, and df/dr = -2 (r - 1) / r³."""
+    if contracted == 0:
+        return grad / (2.0 * _BOX)
+    g = grad / (2.0 * _HALF)
+    axis = int(0)
+    if wp.abs(point[1]) > wp.abs(point[axis]):
+        axis = 1
+    if wp.abs(point[2]) > wp.abs(point[axis]):
+        axis = 2
+    r = wp.abs(point[axis])
+    if r <= 1.0:
+        return g
+    inverse = 1.0 / r
+    on_face = inverse * point
+    change = -2.0 * (1.0 - inverse) * inverse * wp.dot(g, on_face) * wp.sign(point[axis])
+    scaled = (2.0 - inverse) * inverse * g
+    return wp.vec3(
+        scaled[0] + wp.where(axis == 0, change, 0.0),
+        scaled[1] + wp.where(axis == 1, change, 0.0),
+        scaled[2] + wp.where(axis == 2, change, 0.0),
+    )
+
+
+@wp.kernel
+def _sample_points_backward(
+    contracted: int,
+    origins: wp.array[wp.vec3],
+    directions: wp.array[wp.vec3],
+    starts: wp.array[int],
+    distances: wp.array[float],
+    grad_points: wp.array[wp.vec3],
+    grad_origins: wp.array[wp.vec3],
+    grad_directions: wp.array[wp.vec3],
+):
+    ray = wp.tid()
+    on_origin = wp.vec3(0.0)
+    on_direction = wp.vec3(0.0)
+    for i in range(starts[ray], starts[ray + 1]):
+        t = distances[i]
+        grad = _unit_backward(contracted, origins[ray] + t * directions[ray], grad_points[i])
+        on_origin += grad
+        on_direction += t * grad
+    grad_origins[ray] = on_origin
+    grad_directions[ray] = on_direction

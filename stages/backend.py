@@ -1,0 +1,68 @@
+"""Which kernels compute the grid field: Warp's where they run, else torch's."""
+
+import contextlib
+import os
+import sys
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Literal
+
+from stages.contract import Progress, StageError
+
+if TYPE_CHECKING:
+    from nerf.kernels import Backend
+
+BackendName = Literal["warp", "torch"]
+
+
+def chosen_backend(device: str, progress: Progress | None = None) -> BackendName:
+    """ "warp" if its kernels run on ``device`` ("cpu" or "cuda"), else "torch"; then the reason is said."""
+    why = _why_not_warp(device)
+    if why and progress:
+        progress.note(f"the grid field is computed by torch alone, several times slower: {why}")
+    return "torch" if why else "warp"
+
+
+def load_backend(name: BackendName, device: str, progress: Progress | None = None) -> "Backend":
+    """The kernels, compiled for this machine; the first time takes some seconds, of which ``progress`` tells.
+
+    Raises:
+        StageError: if Warp's kernels are asked for and do not run on ``device``.
+    """
+    if name == "torch":
+        from nerf.kernels import reference
+
+        return reference
+    if why := _why_not_warp(device):
+        raise StageError("cannot use the Warp kernels", why, "Use --train.backend torch.")
+    from nerf.kernels import warp as kernels
+
+    if progress:
+        progress.update("compiling kernels, once on each machine")
+    kernels.compile_kernels(device)
+    return kernels
+
+
+def _why_not_warp(device: str) -> str | None:
+    try:
+        with _without_native_stderr():
+            from nerf.kernels import warp as kernels
+    except (ImportError, OSError) as error:
+        return f"warp-lang does not load here: {error}"
+    return kernels.why_not(device)
+
+
+@contextlib.contextmanager
+def _without_native_stderr() -> Iterator[None]:
+    """Warp's library prints a warning where there is no GPU, which nobody asked for, and offers no switch."""
+    if "nerf.kernels.warp" in sys.modules:
+        yield
+        return
+    sys.stderr.flush()
+    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 2)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
