@@ -1,13 +1,17 @@
 """The words of the command line: one dataclass per command, read by tyro; dotted flags come from the stage configs."""
 
+import io
+import re
 from collections.abc import Sequence
+from contextlib import redirect_stderr
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import tyro
+from pydantic import ValidationError
 
-from pipeline.settings import Settings
+from pipeline.settings import Settings, UsageError, wrong_options
 
 T = TypeVar("T")
 
@@ -121,7 +125,7 @@ COMMANDS: dict[str, type] = {
 def parse(kind: type[T], command: str, words: Sequence[str], settings: Settings | None = None) -> T:
     """Parse ``words``; stage options not named in them keep their value in ``settings``.
 
-    Raises SystemExit(2) after saying what is wrong, SystemExit(0) after ``--help``.
+    Raises UsageError with every wrong word in a sentence of its own, SystemExit(0) after ``--help``.
     """
     # Steps and seconds are two budgets for one thing: the one given replaces the one recorded.
     for given, other in (("steps", "seconds"), ("seconds", "steps")):
@@ -131,7 +135,30 @@ def parse(kind: type[T], command: str, words: Sequence[str], settings: Settings 
     default: Any = kind(**positional)
     if settings is not None:
         default = replace(default, settings=settings)
-    return tyro.cli(kind, prog=f"pipeline {command}", args=list(words), default=default)
+    said = io.StringIO()
+    try:
+        with redirect_stderr(said):
+            return tyro.cli(kind, prog=f"pipeline {command}", args=list(words), default=default)
+    except SystemExit as ending:
+        if ending.code in (None, 0):
+            raise
+        raise UsageError(f"{_what_is_wrong(ending, said.getvalue())} (pipeline {command} --help)") from ending
+
+
+def _what_is_wrong(ending: SystemExit, box: str) -> str:
+    """The problem in one line: pydantic's findings where an option was refused, else what tyro put into its box."""
+    fault = ending.__context__
+    if fault is not None and isinstance(refused := fault.__cause__ or fault.__context__, ValidationError):
+        return wrong_options(refused, "--" + str(fault.args[1]).removeprefix("settings."))
+    # Drawn with lines where the terminal has them, else indented by two; the title is neither.
+    lines = [line.strip(" │") for line in box.splitlines() if line.startswith(("│", "  "))]
+    words = " ".join(line for line in lines if line.strip("─-"))
+    for end in ("Got errors:", "Argument helptext:", "For full helptext"):
+        words = words.split(end)[0]
+    words, _, similar = words.partition("Perhaps you meant:")
+    words = re.sub(r"no type matching (.+) could be instantiated from \[(.*)\]", r"\2 does not fit \1", words)
+    words = " ".join(words.split()).removeprefix("Error parsing ").rstrip(".")
+    return words + (f"; perhaps {', '.join(re.findall(r'--[a-z0-9.-]+', similar))}" if similar else "")
 
 
 def _names(words: Sequence[str], option: str) -> bool:

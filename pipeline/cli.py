@@ -9,6 +9,7 @@ import os
 import shutil
 import signal
 import sys
+import time
 import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
@@ -31,6 +32,9 @@ from stages.contract import StageError
 
 EXIT_DEFECT, EXIT_USAGE, EXIT_WORKSPACE, EXIT_INTERRUPT, EXIT_TERMINATED = 1, 2, 3, 130, 143
 
+GO_ON = "Finished stages are kept; `pipeline resume WORKSPACE` goes on."
+REPORT_IT = "Finished stages are kept. Please report it with the output of the same command and --debug."
+
 
 class Terminated(BaseException):
     """SIGTERM arrived."""
@@ -49,28 +53,33 @@ def run_command(words: Sequence[str]) -> int:
     if words[0] == "--version":
         print(machine.versions(("pipeline-nerf",))["pipeline-nerf"])
         return 0
-    debug = "--debug" in words
+    debug, as_json = "--debug" in words, "--json" in words
     signal.signal(signal.SIGTERM, _on_sigterm)
     try:
         return _command(words[0])(words[1:])
     except UsageError as error:
-        print(f"pipeline: {error}", file=sys.stderr)
+        _say(StageError(str(error), "", ""), as_json)
         return EXIT_USAGE
     except StageFailed as failure:
         if debug:
             traceback.print_exc()
         return chain.EXIT_CODES[failure.stage]
     except StageError as error:
-        _say_error("pipeline", error, debug)
+        if debug:
+            traceback.print_exc()
+        _say(error, as_json)
         return EXIT_WORKSPACE
     except KeyboardInterrupt:
-        print("stopped; finished stages are kept, `pipeline resume WORKSPACE` goes on", file=sys.stderr)
+        _say(StageError("stopped", "Ctrl-C", GO_ON), as_json)
         return EXIT_INTERRUPT
     except Terminated:
-        print("terminated; finished stages are kept, `pipeline resume WORKSPACE` goes on", file=sys.stderr)
+        _say(StageError("stopped", "SIGTERM", GO_ON), as_json)
         return EXIT_TERMINATED
     except Exception as error:
-        _say_defect(error, debug)
+        if debug:
+            traceback.print_exc()
+        what = f"a defect of this program, not of your photos: {type(error).__name__}: {error}"
+        _say(StageError(what, "it should not happen", REPORT_IT), as_json)
         return EXIT_DEFECT
 
 
@@ -78,20 +87,14 @@ def _on_sigterm(*_: object) -> None:
     raise Terminated
 
 
-def _say_error(who: str, error: StageError, debug: bool) -> None:
-    if debug:
-        traceback.print_exc()
-    print(f"{who}: {error.what}\n  why: {error.why}\n  try: {error.hint}", file=sys.stderr)
-
-
-def _say_defect(error: Exception, debug: bool) -> None:
-    if debug:
-        traceback.print_exc()
-    print(
-        f"pipeline: a defect of this program, not of your photos: {type(error).__name__}: {error}\n"
-        "  Finished stages are kept. Please report it with the output of the same command and --debug.",
-        file=sys.stderr,
-    )
+def _say(error: StageError, as_json: bool) -> None:
+    """What ended the program outside of any stage, in words, or as an event like that of a stage that failed."""
+    if as_json:
+        print(json.dumps({"event": "error", "stage": None, **vars(error)}, ensure_ascii=False), flush=True)
+        return
+    print(f"pipeline: {error.what}", file=sys.stderr)
+    if error.why:
+        print(f"  why: {error.why}\n  try: {error.hint}", file=sys.stderr)
 
 
 def _command(name: str) -> Callable[[Sequence[str]], int]:
@@ -262,8 +265,12 @@ def command_demo(words: Sequence[str]) -> int:
         display.end("photos", line, seconds, cached=seconds == 0)
         settings = with_source(given.settings, photos, None)
         code = _run_stages(root, settings, list(chain.STAGES), given.common, display)
-        for text in demo.truth_lines(root / "output", photos):
-            display.headline(text)
+        started = time.monotonic()
+        display.begin("truth")
+        *notes, last = demo.truth_lines(root / "output", photos)
+        for text in notes:
+            display.note(text)
+        display.end("truth", last, time.monotonic() - started, cached=False)
         report = root / "output" / "report.html"
         display.finished(f"→ the report: {report}", {"report.html": report})
     return code

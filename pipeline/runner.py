@@ -9,7 +9,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from pipeline import machine, manifests
+from pipeline import attempts, machine, manifests
 from pipeline.chain import STAGES
 from pipeline.display import Display
 from pipeline.keys import ContentIndex, config_for_key, digest, stage_key
@@ -203,9 +203,11 @@ class Runner:
         partial, folder = self.workspace.partial(job.stage, job.key), self.workspace.folder(job.stage, job.key)
         if job.stage not in self.force and (manifest := self.workspace.complete(partial, folder, job.key)):
             return manifest
+        spent = attempts.spent(partial)
         if partial.exists() and not (job.module.RESUMES and job.stage not in self.force):
             shutil.rmtree(partial)
         partial.mkdir(parents=True, exist_ok=True)
+        attempts.begin(partial, spent)
         self.workspace.write_run(self.state)
         _load_native_code()
         started, clock = datetime.now(UTC), time.monotonic()
@@ -222,7 +224,7 @@ class Runner:
             records=manifests.files_below(partial, result.records),
             facts=result.facts,
             line=result.line,
-            seconds=round(time.monotonic() - clock, 3),
+            seconds=round(spent + time.monotonic() - clock, 3),
             started=started.isoformat(timespec="seconds"),
             machine=machine.facts(),
         )

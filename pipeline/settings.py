@@ -4,7 +4,7 @@ import os
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
@@ -17,6 +17,9 @@ from stages.render import Config as RenderConfig
 from stages.report import Config as ReportConfig
 from stages.sfm import Config as SfmConfig
 from stages.train import Config as TrainConfig
+
+if TYPE_CHECKING:
+    from pydantic_core import ErrorDetails
 
 
 class UsageError(Exception):
@@ -53,8 +56,24 @@ def settings_from(values: Mapping[str, Any], origin: str) -> Settings:
     try:
         return Settings.model_validate(values)
     except ValidationError as error:
-        problems = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
-        raise UsageError(f"{origin}: {problems}") from error
+        raise UsageError(f"{origin}: {wrong_options(error)}") from error
+
+
+def wrong_options(error: ValidationError, *parents: str) -> str:
+    """Every wrong option below ``parents`` with what it must be: ``train.steps 0 must be at least 1; …``."""
+    return "; ".join(_wrong_option(".".join([*parents, *map(str, e["loc"])]), e) for e in error.errors())
+
+
+def _wrong_option(name: str, problem: "ErrorDetails") -> str:
+    name = name.replace("_", "-") if name.startswith("--") else name
+    if problem["type"] == "extra_forbidden":
+        return f"there is no option {name}"
+    if problem["type"] == "value_error":
+        return f"{name}: {problem['msg'].removeprefix('Value error, ')}"
+    must = problem["msg"].removeprefix("Input should ")
+    for long, short in (("greater than or equal to", "at least"), ("less than or equal to", "at most")):
+        must = must.replace(long, short)
+    return f"{name} {problem['input']} must {must}"
 
 
 def with_source(settings: Settings, photos: Path, cameras: Path | None) -> Settings:

@@ -31,6 +31,7 @@ LINKS = ("metrics.json", "renders", "errors")
 
 BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 FIGURES = ("psnr", "ssim", "psnr_mean_image", "psnr_nearest_view")
+TRUSTED_WIDTH = 0.5  # of the photos: below, a picture can be sharp and the field know nothing of fine detail
 TRIED_PHOTOS = 4  # to see how fast the field draws them
 NO_LPIPS = "LPIPS is not computed: no package in use ships its weights and nothing is downloaded"
 
@@ -198,7 +199,7 @@ def verdict(metrics: dict[str, Any]) -> str:
     * no better than the mean image: unusable;
     * no better than the nearest photo: worse than showing that;
     * below 22 dB or SSIM 0.7: soft; below 27 dB or SSIM 0.85: good; else sharp, and trustworthy if at least three
-      photos say so.
+      photos say so at no less than half of their width.
     """
     psnr, similarity, nearest, mean = (metrics[key] for key in ("psnr", "ssim", "psnr_nearest_view", "psnr_mean_image"))
     if psnr is None:
@@ -215,6 +216,8 @@ def verdict(metrics: dict[str, Any]) -> str:
         what = f"Better than any photo nearby by {psnr - nearest:.1f} dB but soft: {figures}"
     elif psnr < 27 or _below(similarity, 0.85):
         what = f"Good, with fine detail missing: {figures}, {gain}"
+    elif metrics["width_share"] < TRUSTED_WIDTH:
+        what = f"Sharp as a small picture, finer detail was not looked at: {figures}, {gain}"
     elif metrics["photos_scored"] < FEWEST_FOR_INTERVAL:
         what = f"Sharp, as far as {_photos(metrics['photos_scored'])} can tell: {figures}, {gain}"
     else:

@@ -111,6 +111,7 @@ def page(results: Results, summary: dict[str, Any], config: Config) -> str:
         metrics=results.metrics,
         registration=results.registration,
         manifests=results.manifests,
+        settings=_settings(results.manifests),
         refused=results.photos["refused"] if results.photos else [],
         missing=_missing(results),
         video=_video(results.inputs, config.video_limit_mb),
@@ -121,6 +122,20 @@ def page(results: Results, summary: dict[str, Any], config: Config) -> str:
         longest=max((manifest["seconds"] for manifest in results.manifests.values()), default=0) or 1,
         machine=results.manifests.get("train", next(iter(results.manifests.values()), {})).get("machine", {}),
     )
+
+
+def _settings(manifests: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
+    """Every option that has a flag, by its flag, in the order of the stages."""
+    from importlib import import_module
+
+    from tyro.conf import Suppress
+
+    return {
+        f"--{stage}.{name.replace('_', '-')}": manifests[stage]["config"].get(name)
+        for stage in manifests
+        for name, field in sorted(import_module(f"stages.{stage}").Config.model_fields.items())
+        if Suppress not in field.metadata
+    }
 
 
 def _workspace(inputs: Inputs) -> str:

@@ -45,18 +45,26 @@ def test_help_of_run_lists_the_stage_options(capsys: pytest.CaptureFixture[str])
         (["--until", "lunch"], "--until lunch: not one of ingest, sfm"),
         (["--until", "sfm", "--from", "mesh"], "--from mesh: not one of ingest, sfm"),
         (["--config", "missing.toml"], "--config missing.toml: No such file"),
+        (["--train.steps", "0", "--train.log2-rows", "99"], "--train.steps 0 must be at least 1; "
+         "--train.log2-rows 99 must be at most 24 (pipeline run --help)"),
+        (["--train.steps", "5", "--train.seconds", "5"], "--train: steps (5) and seconds (5) are two budgets"),
+        (["--train.steps", "many"], "--train.steps: 'many' does not fit {None}|INT (pipeline run --help)"),
+        (["--train.field", "foo"], "invalid choice 'foo' for argument '--train.field'. Expected one of ("),
+        (["--train.stepz", "5"], "Unrecognized options: --train.stepz, 5; perhaps --train.steps"),
     ],
-)
+)  # fmt: skip
 def test_usage_errors(tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], message: str):
     assert run_command(["run", str(tmp_path), *words]) == 2
-    assert message in capsys.readouterr().err
+    text = capsys.readouterr().err
+    assert text.startswith("pipeline: ") and message in text
+    assert text.count("\n") == 1 and "pydantic" not in text
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("[train]\nstepz = 3", "train.stepz: Extra inputs are not permitted"),
-        ('[train]\nsteps = "many"', "train.steps: Input should be a valid integer"),
+        ("[train]\nstepz = 3", ": there is no option train.stepz\n"),
+        ('[train]\nsteps = "many"', ": train.steps many must be a valid integer"),
         ("[train", "is not TOML"),
     ],
 )
@@ -114,6 +122,25 @@ def test_json_lines(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert set(events[-1]) == {"event", "stage", "what", "why", "hint"}
 
 
+@pytest.mark.parametrize(
+    ("words", "code", "what"),
+    [
+        (["run", "photos", "--train.steps", "0"], 2, "--train.steps 0 must be at least 1 (pipeline run --help)"),
+        (["mesh", "nowhere.nerf"], 3, "nowhere.nerf is not a workspace"),
+        (["fly"], 2, "no command 'fly'"),
+    ],
+)
+def test_errors_outside_of_stages_are_events_too(
+    capsys: pytest.CaptureFixture[str], words: list[str], code: int, what: str
+):
+    assert run_command([*words, "--json"]) == code
+    captured = capsys.readouterr()
+    (event,) = map(json.loads, captured.out.splitlines())
+    assert set(event) == {"event", "stage", "what", "why", "hint"}
+    assert (event["event"], event["stage"]) == ("error", None)
+    assert event["what"].startswith(what) and captured.err == ""
+
+
 def test_until_ingest_then_status_and_explain_and_clean(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     (tmp_path / "photos").mkdir()
     for k in range(3):
@@ -160,9 +187,9 @@ def test_a_signal_ends_cleanly_and_soon(tmp_path: Path, number: int, code: int):
             break
     started = time.monotonic()
     process.send_signal(number)
-    _, errors = process.communicate(timeout=20)
+    rest, errors = process.communicate(timeout=20)
     assert process.returncode == code
-    assert "finished stages are kept" in errors and "Traceback" not in errors
+    assert "Finished stages are kept" in json.loads(rest.splitlines()[-1])["hint"] and errors == ""
     assert time.monotonic() - started < 15  # a hang, not slowness, is what this would catch
 
 

@@ -254,6 +254,21 @@ def test_verdicts(psnr: float, ssim: float, sentence: str):
     assert verdict(figures | {"photos_scored": 7, "width_share": 1}) == sentence
 
 
+@pytest.mark.parametrize(
+    ("width_share", "begin"),
+    [
+        (
+            0.13,
+            "Sharp as a small picture, finer detail was not looked at: 28.9 dB on unseen photos at 13% of their width",
+        ),
+        (0.5, "Sharp and trustworthy: 28.9 dB on unseen photos at 50% of their width"),
+    ],
+)
+def test_a_verdict_on_small_pictures_is_no_promise(width_share: float, begin: str):
+    figures = {"psnr": 28.9, "ssim": 0.9, "psnr_nearest_view": 14.2, "psnr_mean_image": 12.9}
+    assert verdict(figures | {"photos_scored": 7, "width_share": width_share}).startswith(begin)
+
+
 def test_photos_too_small_for_ssim_are_judged_by_psnr_alone():
     figures = {"psnr": 28.9, "ssim": None, "psnr_nearest_view": 14.2, "psnr_mean_image": 12.9}
     words = verdict(figures | {"photos_scored": 7, "width_share": 1})
