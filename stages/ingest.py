@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 NEEDS: tuple[str, ...] = ()
 VERSION = 2
 RESUMES = False
-LINKS = ("photos.json",)
+LINKS = ("photos.json", "images")
 
 _MAX_WORKERS = 8  # each holds a few copies of one photo, up to 250 megapixels
 _MAX_NOTES = 10

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from stages.sparse_model import SparseModel
 
 NEEDS = ("ingest", "sfm")
-VERSION = 2
+VERSION = 3
 RESUMES = False
 LINKS = ("transforms.json", "scene.json")
 
@@ -104,9 +104,7 @@ def _has_alpha(photos: "list[Photo]", progress: Progress) -> bool:
     if has_alpha and opaque:
         progress.note(f"{opaque} of {len(photos)} photos have no transparent parts: taken as opaque everywhere")
     elif transparent and not has_alpha:
-        progress.note(
-            f"{transparent} of {len(photos)} photos have transparent parts: laid over white, as most have none"
-        )
+        progress.note(f"{transparent} of {len(photos)} photos have transparent parts: laid over white, most have none")
     return has_alpha
 
 

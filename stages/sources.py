@@ -7,6 +7,7 @@ import json
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
@@ -118,17 +119,23 @@ def read_transforms(transforms: Path) -> dict[str, Any]:
     return content
 
 
-def _frame_file(file_path: str, folders: tuple[Path, ...]) -> Path:
-    """The photo that ``file_path`` names in the first of ``folders`` that has it; a missing extension is completed.
+def _names(frame: dict[str, Any]) -> tuple[str, ...]:
+    """What a frame calls its photo: in a file of ours by its own name first (``photo``), then ``file_path``."""
+    own = frame.get("photo")
+    return (own, frame["file_path"]) if isinstance(own, str) else (frame["file_path"],)
+
+
+def _frame_file(names: tuple[str, ...], folders: tuple[Path, ...]) -> Path:
+    """The photo that the first of ``names`` stands for in the first of ``folders`` that has it; a missing extension is
+    completed.
 
     A photo that is nowhere is returned as if it were in the first folder, and refused when it is to be decoded.
     """
-    for folder in folders:
-        for extension in _EXTENSIONS_TRIED:
-            file = _inside(folder, file_path + extension)
-            if file.is_file():
-                return file
-    return _inside(folders[0], file_path)
+    for name, folder, extension in product(names, folders, _EXTENSIONS_TRIED):
+        file = _inside(folder, name + extension)
+        if file.is_file():
+            return file
+    return _inside(folders[0], names[-1])
 
 
 def _inside(folder: Path, file_path: str) -> Path:
@@ -182,8 +189,8 @@ def _from_transforms(kind: SourceKind, root: Path, cameras: Path, *transforms: P
     files: dict[str, Path] = {}
     for path in transforms:
         folders = (root,) if path.parent == root else (root, root.parent, path.parent)
-        paths = (frame["file_path"] for frame in read_transforms(path)["frames"])
-        files |= {file_path: _frame_file(file_path, folders) for file_path in paths}
+        frames = read_transforms(path)["frames"]
+        files |= {frame["file_path"]: _frame_file(_names(frame), folders) for frame in frames}
     in_order = _sorted_inside(root, set(files.values()))
     return Source(kind, root, cameras, in_order, {path: _name(root, file) for path, file in files.items()})
 

@@ -31,8 +31,9 @@ _NEAREST = {
 def transforms(scene: Scene) -> dict[str, Any]:
     """The content of transforms.json. Intrinsics stand once if all photos share them, else in every frame.
 
-    ``scale`` and ``offset`` place the region of interest in instant-ngp's unit cube. A camera model that the format
-    lacks is written as the nearest one, with a ``note``. Raises ValueError for a model without any counterpart.
+    ``file_path`` is the decoded photo, ``photo`` its own name. ``scale`` and ``offset`` place the region of interest in
+    instant-ngp's unit cube. A camera model that the format lacks is written as the nearest one, with a ``note``.
+    Raises ValueError for a model without any counterpart.
     """
     cameras = [intrinsics(camera) for camera in scene.cameras]
     shared = len({view.camera for view in scene.views}) == 1
@@ -41,16 +42,16 @@ def transforms(scene: Scene) -> dict[str, Any]:
     for view in scene.views:
         own = {} if shared else cameras[view.camera]
         pose = opengl_matrix(sfm_from_scene.pose(view.scene_from_camera))
-        frames.append(own | {"file_path": view.name, "transform_matrix": pose})
+        frames.append(own | {"file_path": view.file, "photo": view.name, "transform_matrix": pose})
     scale = scene.scene_from_sfm.scale / 2  # of instant-ngp: [-1, 1] to [0, 1]
     return (cameras[scene.views[0].camera] if shared else {}) | {
         "frames": frames,
         "scale": scale,
         "offset": (0.5 - scale * sfm_from_scene.points(np.zeros(3))).tolist(),
         "aabb_scale": 1 if scene.bounded else 16,
-        "train_filenames": [view.name for view in scene.of_split("train")],
-        "test_filenames": [view.name for view in scene.of_split("test")],
-        "val_filenames": [view.name for view in scene.of_split("test")],
+        "train_filenames": [view.file for view in scene.of_split("train")],
+        "test_filenames": [view.file for view in scene.of_split("test")],
+        "val_filenames": [view.file for view in scene.of_split("test")],
     }
 
 

@@ -74,6 +74,7 @@ def test_the_report_stands_alone(output: Path):
 def test_cameras_are_exported(output: Path):
     exported = json.loads((output / "transforms.json").read_text())
     assert len(exported["frames"]) == 17
+    assert all((output / frame["file_path"]).is_file() for frame in exported["frames"])
     assert (output / "sparse/cameras.bin").is_file()
 
 

@@ -139,7 +139,7 @@ def test_export_and_scene_tell_the_same_poses(inputs, progress) -> None:
     scene = read_scene(folders["normalise"])
     frames = read_json(folders["normalise"] / "transforms.json")["frames"]
     for i, (view, frame) in enumerate(zip(scene.views, frames, strict=True)):
-        assert frame["file_path"] == view.name
+        assert (frame["file_path"], frame["photo"]) == (view.file, view.name)
         np.testing.assert_allclose(np.array(frame["transform_matrix"])[:3, 3], ring(17)[i][:, 3], atol=1e-9)
 
 

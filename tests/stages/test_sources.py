@@ -121,6 +121,17 @@ def test_several_colmap_models_are_listed_never_guessed(tmp_path: Path) -> None:
     assert error.hint == f"Give one of them: --cameras {tmp_path}/m/sparse/0"
 
 
+def test_an_export_of_ours_finds_the_photos_by_their_own_names(tmp_path: Path) -> None:
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    (photos / "ä.jpg").write_bytes(b"")
+    frame = {"file_path": "images/a-1.jpg", "photo": "ä.jpg", "transform_matrix": []}
+    cameras = tmp_path / "transforms.json"
+    cameras.write_text(json.dumps({"frames": [frame]}))
+    source = find_source(photos, cameras)
+    assert (source.files, source.frames) == ((photos / "ä.jpg",), {"images/a-1.jpg": "ä.jpg"})
+
+
 @pytest.mark.parametrize("file_path", ["../secret.jpg", "/etc/passwd", "images/../../secret", "link/secret.jpg", "a\0"])
 def test_frames_may_not_leave_their_folder(tmp_path: Path, file_path: str) -> None:
     touch(tmp_path, "secret.jpg", "scene/images/a.jpg")

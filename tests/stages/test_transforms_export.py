@@ -42,12 +42,13 @@ def test_poses_are_opengl_and_in_the_sfm_frame() -> None:
 
 def test_names_split_and_shared_intrinsics() -> None:
     content = transforms(scene_of((PINHOLE,), ring(4)))
-    assert [frame["file_path"] for frame in content["frames"]] == [f"IMG {i}.jpg" for i in range(4)]
-    assert content["test_filenames"] == ["IMG 0.jpg"]
-    assert content["train_filenames"] == ["IMG 1.jpg", "IMG 2.jpg", "IMG 3.jpg"]
+    assert [frame["file_path"] for frame in content["frames"]] == [f"images/{i}.png" for i in range(4)]
+    assert [frame["photo"] for frame in content["frames"]] == [f"IMG {i}.jpg" for i in range(4)]
+    assert content["test_filenames"] == ["images/0.png"]
+    assert content["train_filenames"] == [f"images/{i}.png" for i in (1, 2, 3)]
     assert (content["fl_x"], content["fl_y"], content["cx"], content["cy"]) == PINHOLE.params
     assert (content["w"], content["h"], content["camera_model"]) == (640, 480, "OPENCV")
-    assert set(content["frames"][0]) == {"file_path", "transform_matrix"}
+    assert set(content["frames"][0]) == {"file_path", "photo", "transform_matrix"}
 
 
 def test_different_cameras_stand_in_their_frames() -> None:
