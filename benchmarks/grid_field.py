@@ -18,6 +18,7 @@ from nerf.grid_training import GridTrainer, GridTrainerSettings
 from nerf.kernels import reference
 from nerf.kernels import warp as fast
 from nerf.metrics import mean_squared_error, psnr
+from nerf.parallel import take_over_cores
 from nerf.ray_bank import RayBank, build_ray_bank
 from nerf.rays import Rays
 from nerf.rendering import render_image
@@ -85,12 +86,14 @@ def main() -> None:
     parser.add_argument("--picture", type=Path, default=None)
     parser.add_argument("--processor-time", action="store_true", help="count this, not the clock: on a busy machine")
     given = parser.parse_args()
+    print(f"{torch.get_num_threads()} threads")
+    take_over_cores()
     settings = GridSettings(given.levels, 4, given.log2_rows, 16, given.finest, steps=given.steps)
     train = read_bank(given.folder, "train", given.downscale, 1)
     test = read_bank(given.folder, "test", given.downscale, given.test_every)
     model = GridField(settings, given.seed, fast if given.backend == "warp" else reference)
     trainer = GridTrainer(model, train, GridTrainerSettings(given.seed, "random", given.samples))
-    print(f"{settings}\n{model.layout.rows:,} rows, {torch.get_num_threads()} threads")
+    print(f"{settings}\n{model.layout.rows:,} rows")
     clock = time.process_time if given.processor_time else time.perf_counter
     seconds, step, rays, due = 0.0, 0, 0, 5.0
     while seconds < given.seconds:

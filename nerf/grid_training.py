@@ -25,15 +25,13 @@ CONSTANT_SHARE = 0.2  # of the run, before the rate begins to fall
 FINAL_RATE = 0.05  # of the rate at first
 FIRST_SAMPLES_PER_RAY = 128.0
 MEMORY = 0.9  # how much of the mean of samples per ray remains after each step
-# Colours in a chunk of a batch, each on its own core; elsewhere a batch is one chunk. What chunks find is added in
-# order, so results do not depend on the number of cores.
-CHUNK_SAMPLES = {"cpu": 1 << 12}
 
 
 @dataclass(frozen=True)
 class GridTrainerSettings:
     """How to train. ``samples``: colours to compute in a step; its rays are as many as are expected to need them, at
-    most ``most_rays``. ``background`` is what lies behind the scene: a colour, or another random one for each ray
+    most ``most_rays``. ``chunks``: equal parts of a step, each computed on a core; results depend on their number, not
+    on that of the cores. ``background`` is what lies behind the scene: a colour, or another random one for each ray
     (only for photos with alpha, where it shows the field which space is empty). ``distortion``: weight of the
     distortion loss, for scenes without a known background."""
 
@@ -41,6 +39,7 @@ class GridTrainerSettings:
     background: tuple[float, float, float] | Literal["random"]
     samples: int = 1 << 14
     most_rays: int = 1 << 13
+    chunks: int = 1
     rate: float = 2e-2
     distortion: float = 0.0
 
@@ -66,6 +65,7 @@ class Loss(NamedTuple):
 class _Part(NamedTuple):
     """What one chunk of a batch contributes to it: loss, gradients and their norm, the thickness of cells it met."""
 
+    batch: GridBatch
     loss: Tensor
     squared_error: Tensor
     weights: Weights
@@ -95,17 +95,13 @@ class GridTrainer:
 
     def step(self, step: int, share: float, rate_scale: float = 1.0) -> StepResult:
         """One batch, one update. Raises NonFinite before the update, leaving model and optimiser as they were."""
-        batch, device = self._batch(step), self.bank.device
-        rays = len(batch.jitter)
-        parts = list(in_order(partial(self._part, rays), self._chunks(batch), device))
-        loss, error = self._finite(step, batch, parts)
-        rate = rate_scale * self.settings.rate * rate_factor(step, share)
-        self._update_table(parts, rate, step + 1)
-        self._update_networks([part.weights for part in parts], rate, step + 1)
-        for part in parts:
-            self.cache.raise_to(part.points, part.thickness)
-        self.cache.refresh(step, generator(device, self.settings.seed, step, 1))
+        device, rays = self.bank.device, self._rays_per_chunk()
+        parts = list(in_order(partial(self._part, step, rays), range(self.settings.chunks), device))
+        loss, error = self._finite(step, parts)
+        self._update(parts, rate_scale * self.settings.rate * rate_factor(step, share), step + 1)
+        self.cache.refresh(step, generator(device, self.settings.seed, step, self.settings.chunks))
         samples = sum(len(part.points) for part in parts)
+        rays *= self.settings.chunks
         self.samples_per_ray.mul_(MEMORY).add_((1 - MEMORY) * samples / rays)
         return StepResult(loss, psnr(error), rays)
 
@@ -132,10 +128,13 @@ class GridTrainer:
         for name, tensor in mine.items():
             tensor.copy_(state[name])
 
-    def _batch(self, step: int) -> GridBatch:
-        random, device = generator(self.bank.device, self.settings.seed, step), self.bank.device
+    def _rays_per_chunk(self) -> int:
         wanted = int(self.settings.samples / max(1e-3, float(self.samples_per_ray)))
-        count = max(1, min(wanted, self.settings.most_rays))
+        return max(1, min(wanted, self.settings.most_rays) // self.settings.chunks)
+
+    def _batch(self, step: int, chunk: int, count: int) -> GridBatch:
+        device = self.bank.device
+        random = generator(device, self.settings.seed, step, chunk)
         rays, colour, alpha = self.bank.sample(count, random)
         if self.settings.background == "random":
             background = torch.rand(count, 3, generator=random, device=device)
@@ -144,21 +143,15 @@ class GridTrainer:
         target = colour if alpha is None else torch.lerp(background, colour, alpha[:, None])
         return GridBatch(rays, target, background, torch.rand(count, generator=random, device=device))
 
-    def _chunks(self, batch: GridBatch) -> list[GridBatch]:
-        """The batch in parts of equally many rays, at most; how many follows from the settings alone."""
-        count = max(1, self.settings.samples // CHUNK_SAMPLES.get(self.bank.device.type, self.settings.samples))
-        size = -(-len(batch.jitter) // count)
-        rays = map(Rays, *(part.split(size) for part in batch.rays))
-        return list(map(GridBatch, rays, *(part.split(size) for part in batch[1:])))
-
-    def _part(self, rays: int, chunk: GridBatch) -> _Part:
-        """What a chunk of a batch of ``rays`` adds to loss and gradients."""
-        done = self.model.forward(chunk.rays, chunk.jitter, chunk.background)
-        loss = self._loss(rays, done, chunk.target)
+    def _part(self, step: int, rays: int, chunk: int) -> _Part:
+        """What a chunk of so many rays adds to loss and gradients."""
+        batch = self._batch(step, chunk, rays)
+        done = self.model.forward(batch.rays, batch.jitter, batch.background)
+        loss = self._loss(rays * self.settings.chunks, done, batch.target)
         weights, features, _ = self.model.backward(done, loss.grad, loss.grad_weights)
         thickness = done.density.sigma * done.samples.dt
         norm = torch.nn.utils.get_total_norm([*weights, features])
-        return _Part(loss.value, loss.squared_error, weights, features, done.points, norm, thickness)
+        return _Part(batch, loss.value, loss.squared_error, weights, features, done.points, norm, thickness)
 
     def _loss(self, rays: int, done: GridPass, target: Float[Tensor, "chunk 3"]) -> Loss:
         error = done.rendering.colour - target
@@ -173,7 +166,7 @@ class GridTrainer:
         grad_weights = backend.distortion_backward(done.samples, done.weights, lattice, each)
         return Loss(squared_error + spread, squared_error, grad, grad_weights)
 
-    def _finite(self, step: int, batch: GridBatch, parts: Sequence[_Part]) -> tuple[float, float]:
+    def _finite(self, step: int, parts: Sequence[_Part]) -> tuple[float, float]:
         """Loss and squared error as numbers, once they and all gradients are known to be finite.
 
         The table's gradient is a sum of the features' gradients with weights up to 1: finite if their norm is.
@@ -182,31 +175,49 @@ class GridTrainer:
         loss_now, error_now, norm_now = (float(torch.stack(values).sum()) for values in each)
         for quantity, value in {"loss": loss_now, "gradient": norm_now}.items():
             if not abs(value) < float("inf"):
-                rest = {"target": batch.target, "background": batch.background, "jitter": batch.jitter}
-                raise NonFinite(quantity, step, batch.rays._asdict() | rest)
+                raise NonFinite(quantity, step, _whole([part.batch for part in parts]))
         return loss_now, error_now
 
-    def _update_table(self, parts: Sequence[_Part], rate: float, count: int) -> None:
-        """Levels share no rows: each is a piece of work for a core of its own."""
-        layout, backend = self.model.layout, self.model.backend
-        tables = (self.model.table, self.grad_table, self.mean["table"], self.square["table"])
-
-        def update(level: int) -> None:
-            for part in parts:
-                backend.encode_backward_table(layout, level, part.points, part.features, self.grad_table)
-            rows = slice(layout.first_rows[level], layout.first_rows[level + 1])
-            table, gradient, mean, square = (part[rows] for part in tables)
-            backend.adam(table, gradient, mean, square, rate, count)
-
-        finest_first = range(len(layout.resolutions) - 1, -1, -1)  # the largest: no core waits long for the last
-        for _ in in_order(update, finest_first, self.bank.device):
+    def _update(self, parts: Sequence[_Part], rate: float, count: int) -> None:
+        """Of the table's levels, which share no rows, of the networks and of the cache: each work for a core."""
+        finest_first = range(len(self.model.layout.resolutions) - 1, -1, -1)  # no core waits long for the last
+        work = [partial(self._update_level, level, parts, rate, count) for level in finest_first]
+        work.append(partial(self._update_networks, [part.weights for part in parts], rate, count))
+        work.append(partial(self._raise_cache, parts))
+        for _ in in_order(lambda update: update(), work, self.bank.device):
             pass
+
+    def _update_level(self, level: int, parts: Sequence[_Part], rate: float, count: int) -> None:
+        layout, backend = self.model.layout, self.model.backend
+        for part in parts:
+            backend.encode_backward_table(layout, level, part.points, part.features, self.grad_table)
+        rows = slice(layout.first_rows[level], layout.first_rows[level + 1])
+        backend.adam(
+            self.model.table[rows],
+            self.grad_table[rows],
+            self.mean["table"][rows],
+            self.square["table"][rows],
+            rate,
+            count,
+        )
 
     def _update_networks(self, of_parts: Sequence[Weights], rate: float, count: int) -> None:
         for name, gradients in zip(Weights._fields, zip(*of_parts, strict=True), strict=True):
             gradient = torch.stack(gradients).sum(0)
             parameter, mean, square = self.parameters[name], self.mean[name], self.square[name]
             self.model.backend.adam(parameter, gradient, mean, square, rate, count)
+
+    def _raise_cache(self, parts: Sequence[_Part]) -> None:
+        for part in parts:
+            self.cache.raise_to(part.points, part.thickness)
+
+
+def _whole(batches: Sequence[GridBatch]) -> dict[str, Tensor]:
+    """A batch by the names of its tensors, its chunks put together again."""
+    rays = zip(*(batch.rays for batch in batches), strict=True)
+    rest = zip(*(batch[1:] for batch in batches), strict=True)
+    names = (*Rays._fields, *GridBatch._fields[1:])
+    return {name: torch.cat(chunks) for name, chunks in zip(names, (*rays, *rest), strict=True)}
 
 
 def _shape(state: dict[str, Tensor], name: str) -> torch.Size | None:

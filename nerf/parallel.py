@@ -17,20 +17,39 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
+_taken: int | None = None
+
+
+def take_over_cores() -> None:
+    """From now on all cores belong to :func:`in_order`, as many as torch has threads now: torch's own are off.
+
+    They would spin for a while after each of their operations, on the very cores that the chunks need.
+    """
+    global _taken
+    if _taken is None:
+        _taken = torch.get_num_threads()
+        torch.set_num_threads(1)
+
+
+def workers() -> int:
+    """How many chunks :func:`in_order` computes at once on the CPU."""
+    return _taken or torch.get_num_threads()
+
+
 def in_order(function: Callable[[Item], Result], items: Iterable[Item], device: torch.device) -> Iterator[Result]:
     """``function(item)`` for every item, in order, on all cores where ``device`` is the CPU.
 
     Only a few chunks are under way at a time: memory stays bounded and an interruption is heard soon.
     """
-    workers = torch.get_num_threads()
-    if device.type != "cpu" or workers == 1:
+    count = workers()
+    if device.type != "cpu" or count == 1:
         yield from map(function, items)
         return
-    pool, under_way = _pool(workers), deque[Future[Result]]()
+    pool, under_way = _pool(count), deque[Future[Result]]()
     try:
         for item in items:
             under_way.append(pool.submit(function, item))
-            if len(under_way) > 2 * workers:
+            if len(under_way) > 2 * count:
                 yield under_way.popleft().result()
         while under_way:
             yield under_way.popleft().result()
@@ -40,8 +59,8 @@ def in_order(function: Callable[[Item], Result], items: Iterable[Item], device: 
 
 
 @functools.cache
-def _pool(workers: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(workers, "chunk", initializer=_without_torchs_threads)
+def _pool(count: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(count, "chunk", initializer=_without_torchs_threads)
 
 
 def _without_torchs_threads() -> None:

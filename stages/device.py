@@ -2,7 +2,22 @@
 
 
 def compute_device() -> str:
-    """ "cuda" where torch can use a GPU, else "cpu"; set CUDA_VISIBLE_DEVICES to nothing to stay on the CPU."""
+    """ "cuda" where torch can use a GPU, else "cpu"; set CUDA_VISIBLE_DEVICES to nothing to stay on the CPU.
+
+    On the CPU, cores are divided among chunks of work from now on (nerf/parallel.py).
+    """
     import torch
 
-    return "cuda" if torch.cuda.is_available() else "cpu"
+    from nerf.parallel import take_over_cores
+
+    if torch.cuda.is_available():
+        return "cuda"
+    take_over_cores()
+    return "cpu"
+
+
+def cores() -> int:
+    """How many chunks of work are computed at once: the CPU's cores, or 1 on a GPU, which divides work itself."""
+    from nerf.parallel import workers
+
+    return workers() if compute_device() == "cpu" else 1

@@ -45,9 +45,9 @@ PRESETS = {
 
 # At first; both fall while training. Where space is folded a cell is met from farther away, and rays are longer.
 GRID_RATES = {"bounded": 2e-2, "contracted": 1e-2}
-GRID_SAMPLES = {"bounded": 1 << 14, "contracted": 24 << 10}
+GRID_SAMPLES = 1 << 14
 
-GRID_ONLY = ("backend", "levels", "log2_rows", "finest", "batch_samples")
+GRID_ONLY = ("backend", "chunks", "levels", "log2_rows", "finest", "batch_samples")
 PAPER_ONLY = (
     *("preset", "batch_rays", "depth", "width", "skip", "position_frequencies", "direction_frequencies"),
     *("samples_coarse", "samples_fine", "view_dependence", "positional_encoding", "hierarchical"),
@@ -80,6 +80,9 @@ class Config(StageConfig):
 
     backend: Literal["warp", "torch"] | None = Field(
         default=None, description="grid: its kernels; none: warp where they run, torch runs anywhere"
+    )
+    chunks: int | None = Field(
+        default=None, ge=1, le=64, description="grid: parts of a step, each on a core; none: as many as cores"
     )
     levels: int | None = Field(default=None, ge=1, le=16, description="grid: grids of features")
     log2_rows: int | None = Field(default=None, ge=8, le=24, description="grid: rows of a grid's table, as power of 2")
@@ -152,11 +155,12 @@ def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
     chosen = {"field": config.kind, "seconds": seconds, "contracted": contracted}
     config = config.model_copy(update=chosen)
     config = _filled(config, _grid_habits(config) if config.kind == "grid" else _paper_habits(config))
-    if config.kind == "grid" and config.backend is None:
+    if config.kind == "grid":
         from stages.backend import chosen_backend
-        from stages.device import compute_device
+        from stages.device import compute_device, cores
 
-        config = config.model_copy(update={"backend": chosen_backend(compute_device(), progress)})
+        backend = config.backend or chosen_backend(compute_device(), progress)
+        config = config.model_copy(update={"backend": backend, "chunks": config.chunks or cores()})
     if config.downscale is None or (config.kind == "grid" and None in (config.levels, config.log2_rows, config.finest)):
         from stages.training_size import chosen_downscale, grid_size, rays_in_budget
 
@@ -173,7 +177,7 @@ def _grid_habits(config: Config) -> dict[str, Any]:
     return {
         "background": "random",
         "learning_rate": GRID_RATES[space],
-        "batch_samples": GRID_SAMPLES[space],
+        "batch_samples": GRID_SAMPLES,
     }
 
 

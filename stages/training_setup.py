@@ -106,11 +106,12 @@ def grid_trainer_settings(config: "Config", scene: "Scene", seed: int) -> "GridT
     """How the grid field is trained."""
     from nerf.grid_training import GridTrainerSettings
 
-    assert config.batch_samples is not None and config.learning_rate is not None, "plan() chooses them"
+    assert config.batch_samples and config.chunks and config.learning_rate, "plan() chooses them"
     return GridTrainerSettings(
         seed=seed,
         background=_trained_over(config, scene),
         samples=config.batch_samples,
+        chunks=config.chunks,
         rate=config.learning_rate,
         distortion=DISTORTION if config.contracted else 0.0,
     )

@@ -20,7 +20,7 @@ SAMPLES_PER_RAY = {"bounded": 10, "contracted": 80}
 """Colours that the grid field computes for a ray, over a run: measured on lego_400 and fox."""
 GRID_SIZES = {
     "bounded": ((50e6, 5, 18, 512), (0, 4, 17, 256)),
-    "contracted": ((100e6, 6, 18, 1024), (40e6, 5, 18, 512), (0, 4, 17, 256)),
+    "contracted": ((200e6, 6, 18, 1024), (60e6, 5, 18, 512), (0, 5, 17, 512)),
 }
 """(computed colours from which on it pays, levels, log2 of rows, most cells along an axis), the largest first."""
 LEAST_FINEST = 128

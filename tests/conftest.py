@@ -46,6 +46,12 @@ class SilentProgress:
         self.notes.append(message)
 
 
+@pytest.fixture(autouse=True)
+def cores_are_free(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever took over the cores in another test (nerf/parallel.py)."""
+    monkeypatch.setattr("nerf.parallel._taken", None)
+
+
 @pytest.fixture
 def progress() -> SilentProgress:
     """A Progress for calling a stage's run() directly."""

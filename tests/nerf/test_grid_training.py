@@ -6,10 +6,11 @@ import torch
 from torch import Tensor
 
 from nerf.grid_field import GridField, GridSettings
-from nerf.grid_training import GridTrainer, GridTrainerSettings, rate_factor
+from nerf.grid_training import GridBatch, GridTrainer, GridTrainerSettings, rate_factor
 from nerf.kernels import reference
 from nerf.probe import make_probe, measure
 from nerf.ray_bank import RayBank, build_ray_bank
+from nerf.rays import Rays
 from nerf.training import FieldTrainer, NonFinite
 
 FIELD = GridSettings(levels=2, log2_rows=10, coarsest=4, finest=16, steps=32, cache_cells=16)
@@ -79,16 +80,22 @@ def test_results_do_not_depend_on_the_number_of_threads() -> None:
     assert same(states[0], states[1]) and same(states[0], states[2])
 
 
-def test_the_gradient_of_a_batch_is_the_sum_over_its_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
-    settings = replace(TRAINER, samples=1 << 14, distortion=0.1)
-    after = []
-    for size in (1 << 14, 1 << 11):
-        monkeypatch.setattr("nerf.grid_training.CHUNK_SAMPLES", {"cpu": size})
-        run = trainer(settings)
-        assert len(run._chunks(run._batch(0))) == (1 << 14) // size
-        result = run.step(0, 0.0)
-        after.append((torch.tensor([result.loss, result.psnr]), run.mean, run.cache.thickness))
-    torch.testing.assert_close(*after, rtol=1e-4, atol=1e-9)
+def test_the_gradient_of_a_batch_is_the_sum_over_its_chunks() -> None:
+    run = trainer(replace(TRAINER, samples=1 << 14, distortion=0.1, chunks=4))
+    rays = run._rays_per_chunk()
+    parts = [run._part(0, rays, chunk) for chunk in range(4)]
+    assert rays > 10 and not torch.equal(parts[0].batch.target, parts[1].batch.target)
+    whole = GridBatch(
+        Rays(*(torch.cat(part) for part in zip(*(part.batch.rays for part in parts), strict=True))),
+        *(torch.cat(part) for part in zip(*(part.batch[1:] for part in parts), strict=True)),
+    )
+    done = run.model.forward(whole.rays, whole.jitter, whole.background)
+    loss = run._loss(4 * rays, done, whole.target)
+    gradients = run.model.backward(done, loss.grad, loss.grad_weights)
+    summed = [torch.stack(of_parts).sum(0) for of_parts in zip(*(part.weights for part in parts), strict=True)]
+    torch.testing.assert_close(summed, list(gradients.weights), rtol=1e-4, atol=1e-9)
+    torch.testing.assert_close(torch.cat([part.features for part in parts]), gradients.features, rtol=1e-4, atol=1e-9)
+    torch.testing.assert_close(sum(part.loss for part in parts), loss.value)
 
 
 def test_rays_adapt_to_the_samples_they_need() -> None:

@@ -5,7 +5,7 @@ import threading
 import pytest
 import torch
 
-from nerf.parallel import in_order
+from nerf.parallel import in_order, take_over_cores, workers
 
 CPU = torch.device("cpu")
 
@@ -54,3 +54,11 @@ def test_an_error_comes_out_and_later_chunks_are_not_begun():
 def test_one_thread_works_in_the_caller():
     torch.set_num_threads(1)
     assert list(in_order(lambda _: threading.current_thread(), [0], CPU)) == [threading.current_thread()]
+
+
+def test_cores_taken_over_stay_with_the_chunks():
+    take_over_cores()
+    assert torch.get_num_threads() == 1
+    take_over_cores()  # a second time changes nothing
+    assert workers() == 2
+    assert list(in_order(lambda _: torch.get_num_threads(), range(3), CPU)) == [1, 1, 1]

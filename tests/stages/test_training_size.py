@@ -46,7 +46,16 @@ def test_more_rays_never_mean_smaller_photos(scene: Scene, rays: float, factor: 
     assert chosen_downscale(sized, rays * factor) <= chosen_downscale(sized, rays)
 
 
-GRID = Config(field="grid", steps=100, contracted=False, batch_samples=4096, learning_rate=1e-2, background="random")
+GRID = Config(
+    field="grid",
+    backend="warp",
+    chunks=1,
+    steps=100,
+    contracted=False,
+    batch_samples=4096,
+    learning_rate=1e-2,
+    background="random",
+)
 PAPER = Config(
     field="paper",
     seconds=10.0,

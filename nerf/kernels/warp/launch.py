@@ -13,6 +13,9 @@ import warp as wp
 from torch import Tensor
 
 wp.config.log_level = wp.LOG_ERROR  # a machine without a GPU is no news, nor is each module compiled
+# Else every kernel on x86, with tiles or without, notes in one static pointer where its stack is: threads race for it
+# (seen to crash in debug mode). None means: on the stack only where a register of the thread holds that pointer.
+wp.config.enable_tiles_in_stack_memory = None
 wp.init()
 
 Argument = Tensor | int | float
@@ -39,11 +42,10 @@ def compile_kernels(device: str) -> None:
 
 
 class _Array(NamedTuple):
-    """What a kernel asks of an array: torch's type of its numbers, how many make an entry, the entry's bytes."""
+    """What a kernel asks of an array: torch's type of its numbers, and how many make an entry."""
 
     dtype: torch.dtype
     numbers: int
-    size: int
 
 
 class _Recorded(NamedTuple):
@@ -61,7 +63,8 @@ def launch(kernel: wp.Kernel, count: int, *arguments: Argument) -> None:
     """Run ``kernel`` for ``wp.tid()`` = 0 ... count - 1, on the device of its first tensor.
 
     Tensors are read as rows of what the kernel declares: (n, 8) float32 as 2 n entries of ``wp.vec4``. Raises TypeError
-    for a tensor that the kernel cannot read: of another type, not contiguous, or not a whole number of entries.
+    for a tensor that the kernel cannot read: of another type, not contiguous, or not a whole number of entries; and for
+    a number in place of a tensor or the other way round.
     """
     if count == 0:
         return
@@ -70,7 +73,7 @@ def launch(kernel: wp.Kernel, count: int, *arguments: Argument) -> None:
     recorded = launches.get((kernel, device))
     if recorded is None:
         with _recording:
-            recorded = launches[kernel, device] = _record(kernel, device, arguments)
+            recorded = launches[kernel, device] = _record(kernel, device)
     ready = recorded.launch
     for place, (array, argument) in enumerate(zip(recorded.arrays, arguments, strict=True), 1):
         if isinstance(argument, Tensor):
@@ -81,37 +84,35 @@ def launch(kernel: wp.Kernel, count: int, *arguments: Argument) -> None:
                 raise TypeError(_unreadable(kernel, place, array, argument))
             entry = ready.params[place]
             entry.data, entry.shape[0] = argument.data_ptr(), entries
-        else:
+        elif array is None:
             ready.params[place].value = argument
+        else:
+            raise TypeError(_unreadable(kernel, place, array, argument))
     ready.set_dim(count)
     ready.launch(wp.stream_from_torch(device) if device.type == "cuda" else None)
 
 
-def _record(kernel: wp.Kernel, device: torch.device, arguments: tuple[Argument, ...]) -> _Recorded:
-    inputs, arrays = [], []
-    for declared, argument in zip(kernel.adj.args, arguments, strict=True):
-        if isinstance(argument, Tensor):
-            array = _array(declared.type.dtype)
-            empty = wp.array(
-                ptr=argument.data_ptr(), dtype=declared.type.dtype, shape=1, device=wp.device_from_torch(device)
-            )
-            inputs.append(empty)
-            arrays.append(array)
-        else:
-            inputs.append(argument)
-            arrays.append(None)
-    recorded = wp.launch(kernel, dim=1, inputs=inputs, device=wp.device_from_torch(device), record_cmd=True)
-    return _Recorded(recorded, tuple(arrays))
+def _record(kernel: wp.Kernel, device: torch.device) -> _Recorded:
+    """With zeros and null pointers, all of which are set before it runs."""
+    types, where = [declared.type for declared in kernel.adj.args], wp.device_from_torch(device)
+    arrays = tuple(_array(declared.dtype) if hasattr(declared, "dtype") else None for declared in types)
+    inputs = [
+        0 if array is None else wp.array(ptr=0, dtype=declared.dtype, shape=1, device=where)
+        for declared, array in zip(types, arrays, strict=True)
+    ]
+    return _Recorded(wp.launch(kernel, dim=1, inputs=inputs, device=where, record_cmd=True), arrays)
 
 
 def _array(entry: Any) -> _Array:
     number = getattr(entry, "_wp_scalar_type_", entry)
-    size = wp.types.type_size_in_bytes(entry)
-    return _Array(TORCH_TYPES[number], size // wp.types.type_size_in_bytes(number), size)
+    return _Array(TORCH_TYPES[number], wp.types.type_size_in_bytes(entry) // wp.types.type_size_in_bytes(number))
 
 
-def _unreadable(kernel: wp.Kernel, place: int, array: _Array | None, tensor: Tensor) -> str:
+def _unreadable(kernel: wp.Kernel, place: int, array: _Array | None, argument: Argument) -> str:
     name = kernel.adj.args[place - 1].label
     wanted = "a number" if array is None else f"contiguous {array.dtype} in entries of {array.numbers}"
-    layout = "contiguous" if tensor.is_contiguous() else "not contiguous"
-    return f"{kernel.key}: {name} must be {wanted}; it is {tuple(tensor.shape)} {tensor.dtype}, {layout}"
+    found = str(argument)
+    if isinstance(argument, Tensor):
+        layout = "contiguous" if argument.is_contiguous() else "not contiguous"
+        found = f"{tuple(argument.shape)} {argument.dtype}, {layout}"
+    return f"{kernel.key}: {name} must be {wanted}; it is {found}"
