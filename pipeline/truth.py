@@ -127,7 +127,7 @@ def compare_with_truth(output: Path, truth: Truth) -> Comparison:
     from nerf.synthetic import TABLE_RADIUS
 
     content = read_json(output / "transforms.json")
-    found = {frame["file_path"]: np.array(frame["transform_matrix"])[:3] for frame in content["frames"]}
+    found = {frame["photo"]: np.array(frame["transform_matrix"])[:3] for frame in content["frames"]}
     names = sorted(found)
     estimated = np.stack([found[name] for name in names])
     estimated[:, :, :3] = estimated[:, :, :3] @ OPENGL_FROM_OPENCV
