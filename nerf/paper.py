@@ -130,7 +130,8 @@ class PaperMlp(nn.Module):
         return functional.softplus(raw + SOFTPLUS_SHIFT, threshold=40)
 
     def _encode(self, x: Float[Tensor, "*batch 3"], frequencies: int) -> Float[Tensor, "*batch encoded"]:
-        return positional_encoding(x, frequencies) if self.settings.positional_encoding else x
+        dtype = self.density_head.weight.dtype
+        return positional_encoding(x, frequencies, dtype) if self.settings.positional_encoding else x.to(dtype)
 
 
 class PaperNerf(nn.Module):
@@ -177,7 +178,10 @@ class PaperNerf(nn.Module):
         return coarse, fine
 
     def _in_field(self, rays: Rays) -> Rays:
-        return rays if self.settings.contracted else clip_to_box(rays, BOX)
+        """In float64, as are the points and sums on the rays: 2⁹π, the highest frequency, takes the rounding of a
+        float32 point to 1e-4. The networks compute in the type of their weights."""
+        exact = Rays(*(part.double() for part in rays))
+        return exact if self.settings.contracted else clip_to_box(exact, BOX)
 
     def _coordinates(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
         return CONTRACTED_SCALE * contract(points) if self.settings.contracted else points
@@ -203,7 +207,8 @@ class PaperNerf(nn.Module):
     ) -> tuple[Rendering, Float[Tensor, "*rays ends-1"]]:
         points = self._coordinates(points_on(rays, t[..., :-1]))
         sigma, colour = mlp(points, rays.directions)
-        return composite(sigma, colour, t, background)
+        rendering, weights = composite(sigma, colour, t, background)
+        return Rendering(*(part.to(background.dtype) for part in rendering)), weights
 
 
 def _linear(inputs: int, outputs: int, init: torch.Generator) -> nn.Linear:

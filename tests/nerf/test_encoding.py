@@ -60,3 +60,12 @@ def test_value_and_gradient_are_finite_everywhere(size: float) -> None:
     encoded.sum().backward()
     assert x.grad is not None and torch.isfinite(x.grad).all()
     assert torch.isfinite(encoded).all() and encoded.abs().max() <= 1
+
+
+def test_exact_points_give_exact_angles_in_a_coarser_type() -> None:
+    points = random_points(1000)
+    wanted = positional_encoding(points, 10)
+    rounded_late = positional_encoding(points, 10, torch.float32)
+    assert rounded_late.dtype == torch.float32
+    assert 0 < (rounded_late - wanted).abs().max() < 3e-7
+    assert (positional_encoding(points.float(), 10) - wanted).abs().max() > 1e-5

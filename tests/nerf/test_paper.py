@@ -109,13 +109,19 @@ def test_random_samples_agree_with_the_slow_loop() -> None:
     assert difference(renderings, slow(weights_of(model), SMALL, rays)) > 1e-3
 
 
-def test_float32_agrees_with_the_slow_loop_at_the_published_frequencies_and_samples() -> None:
-    settings = PaperSettings(width=16)
-    model, rays = model_of(settings), rays_at(0.8, 2, torch.float32)
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("contracted", [False, True])
+@pytest.mark.parametrize("sizes", [{"width": 16}, {"depth": 4, "width": 64, "samples_coarse": 32, "samples_fine": 32}])
+def test_float32_agrees_with_the_slow_loop_at_the_published_frequencies(
+    sizes: dict[str, int], contracted: bool, seed: int
+) -> None:
+    settings = PaperSettings(**sizes, contracted=contracted)
+    model, rays = PaperNerf(settings, seed), rays_at(0.8 + 0.1 * seed, 2, torch.float32)
     with torch.no_grad():
-        renderings = model.float().render_training(rays, BACKGROUND.float(), None)
-    exact = Rays(*(part.double() for part in rays))
-    assert 0 < difference(renderings, slow(weights_of(model), settings, exact)) < 1e-5
+        renderings = model.render_training(rays, BACKGROUND.float(), None)
+    assert renderings[1].colour.dtype == torch.float32
+    expected = slow(weights_of(model), settings, Rays(*(part.double() for part in rays)))
+    assert 0 < difference(renderings, expected) < 1e-5
 
 
 def loss_gradients(model: PaperNerf, rays: Rays) -> dict[str, np.ndarray]:
