@@ -111,11 +111,15 @@ def test_random_samples_agree_with_the_slow_loop() -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("contracted", [False, True])
-@pytest.mark.parametrize("sizes", [{"width": 16}, {"depth": 4, "width": 64, "samples_coarse": 32, "samples_fine": 32}])
+@pytest.mark.parametrize(
+    "settings",
+    [PaperSettings(width=16), PaperSettings(depth=4, width=64, samples_coarse=32, samples_fine=32)],
+    ids=["narrow", "shallow"],
+)
 def test_float32_agrees_with_the_slow_loop_at_the_published_frequencies(
-    sizes: dict[str, int], contracted: bool, seed: int
+    settings: PaperSettings, contracted: bool, seed: int
 ) -> None:
-    settings = PaperSettings(**sizes, contracted=contracted)
+    settings = dataclasses.replace(settings, contracted=contracted)
     model, rays = PaperNerf(settings, seed), rays_at(0.8 + 0.1 * seed, 2, torch.float32)
     with torch.no_grad():
         renderings = model.render_training(rays, BACKGROUND.float(), None)
