@@ -11,11 +11,12 @@ from torch import Tensor
 from nerf.contraction import uncontract
 from nerf.grid_field import GridField
 from nerf.kernels import CONTRACTED_BOX
+from nerf.kernels.cache import BRICK_CELLS
 from nerf.parallel import in_order
 
-YOUNG_STEPS = 256  # a young field changes everywhere: all blocks of 2³ cells are measured, at one point each
-YOUNG_EVERY, YOUNG_FADE = 16, 0.8
-EVERY, FADE, MEASURED_CELLS = 64, 0.9, 26_000  # afterwards: so many cells, drawn at random
+EVERY, FADE = 16, 0.7  # steps between two measurements, and what of a cell's thickness outlives its own
+YOUNG_STEPS = 256  # a young field changes everywhere: all cells are measured each time,
+PARTS = 4  # later a part of them in turn
 THIN = 0.01  # a cell as thin as this, or as the mean cell, counts as empty
 CHUNK = 1 << 14  # points measured at once
 
@@ -29,17 +30,15 @@ class DensityCache:
 
     def raise_to(self, unit: Float[Tensor, "points 3"], thickness: Float[Tensor, "points"]) -> None:
         """Take note of what training has found at some points, in unit coordinates."""
-        self._update(unit, thickness, 1.0)
+        self.field.backend.raise_cache(self.field.lattice.cells, self.thickness, unit, thickness)
 
     def refresh(self, step: int, random: torch.Generator) -> None:
         """Measure what is due at the end of step number ``step``; if something is, set the field's bits anew."""
-        young = step < YOUNG_STEPS
-        if (step + 1) % (YOUNG_EVERY if young else EVERY):
+        turn, early = divmod(step + 1, EVERY)
+        if early:
             return
-        if young:
-            self._measure_blocks(random)
-        else:
-            self._measure_some(random)
+        parts = 1 if step < YOUNG_STEPS else PARTS
+        self._measure_part(turn % parts, parts, random)
         self.field.bits.copy_(self.field.backend.occupied_bits(self.thickness, min(THIN, self._mean())))
 
     def _mean(self) -> float:
@@ -47,20 +46,16 @@ class DensityCache:
         rows = self.thickness.view(-1, self.field.settings.cache_cells)
         return float(rows.sum(-1).double().sum()) / len(self.thickness)
 
-    def _measure_blocks(self, random: torch.Generator) -> None:
+    def _measure_part(self, part: int, parts: int, random: torch.Generator) -> None:
+        """Measure every ``parts``-th brick, beginning with number ``part``: blocks of 2³ cells, at one point each."""
         cells, device = self.field.settings.cache_cells, self.thickness.device
         # A cell's number ends in the binary digits x₁x₀y₁y₀z₁z₀, so a block of 2³ cells is all values of x₀, y₀, z₀.
-        blocks = (-1, 2, 2, 2, 2, 2, 2)
-        first = torch.arange(cells**3, device=device).view(blocks)[:, :, 0, :, 0, :, 0].flatten()
-        measured = self._measure(self._points_in(first, 2, random)).view(-1, 2, 1, 2, 1, 2, 1)
-        thickness = self.thickness.view(blocks)
-        torch.maximum(thickness.mul_(YOUNG_FADE), measured, out=thickness)
-
-    def _measure_some(self, random: torch.Generator) -> None:
-        count, device = len(self.thickness), self.thickness.device
-        chosen = torch.randint(count, (MEASURED_CELLS,), generator=random, device=device)
-        unit = self._points_in(chosen, 1, random)
-        self._update(unit, self._measure(unit), FADE)
+        digits = (2, 2, 2, 2, 2, 2)
+        numbers = torch.arange(cells**3, device=device).view(-1, BRICK_CELLS)[part::parts].unflatten(1, digits)
+        first = numbers[:, :, 0, :, 0, :, 0]
+        measured = self._measure(self._points_in(first.flatten(), 2, random)).view(-1, 2, 1, 2, 1, 2, 1)
+        thickness = self.thickness.view(-1, BRICK_CELLS)[part::parts].unflatten(1, digits)
+        torch.maximum(thickness.mul_(FADE), measured, out=thickness)
 
     def _points_in(self, cell: Tensor, side: int, random: torch.Generator) -> Float[Tensor, "points 3"]:
         """A random point in each cube of ``side`` cells that begins at a cell."""
@@ -83,6 +78,3 @@ class DensityCache:
         margin = 0.5 / lattice.cells
         within = 2 * CONTRACTED_BOX * (unit.clamp(margin, 1 - margin) - 0.5)
         return (lattice.cone * uncontract(within).norm(dim=-1)).clamp(min=lattice.step)
-
-    def _update(self, unit: Float[Tensor, "points 3"], values: Float[Tensor, "points"], decay: float) -> None:
-        self.field.backend.update_cache(self.field.lattice.cells, self.thickness, unit, values, decay)

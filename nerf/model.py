@@ -22,7 +22,12 @@ class Rendering(NamedTuple):
 
 @runtime_checkable
 class RadianceModel(Protocol):
-    """A trained field. Points are in the scene frame, densities per scene unit, colours in [0, 1]."""
+    """A trained field. Points are in the scene frame, densities per scene unit, colours in [0, 1].
+
+    ``chunk_rays``: how many a CPU core best renders at once (docs/numbers.md).
+    """
+
+    chunk_rays: int
 
     def density(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points"]:
         """Volume density sigma at points."""

@@ -137,6 +137,8 @@ class PaperMlp(nn.Module):
 class PaperNerf(nn.Module):
     """A RadianceModel in the scene frame; weights are a function of ``settings`` and ``seed``."""
 
+    chunk_rays = 512
+
     def __init__(self, settings: PaperSettings, seed: int) -> None:
         super().__init__()
         self.settings = settings

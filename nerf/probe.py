@@ -13,8 +13,6 @@ from nerf.rays import Rays
 from nerf.rendering import render_image
 from nerf.training import over
 
-CHUNK = 1024  # rays rendered at once: bounds the memory of the largest field
-
 
 class Probe(NamedTuple):
     """Rays, what they should see, and the background both are shown over."""
@@ -46,5 +44,5 @@ def make_probe(bank: RayBank, count: int, background: Float[Tensor, "3"], seed: 
 def measure(model: RadianceModel, probe: Probe) -> ProbeResult:
     """Render the probe and compare."""
     one_row = Rays(*(part[None] for part in probe.rays))
-    seen = render_image(model, one_row, probe.background, CHUNK)
+    seen = render_image(model, one_row, probe.background)
     return ProbeResult(psnr(mean_squared_error(seen.colour[0], probe.colours)), float(seen.opacity.mean()))

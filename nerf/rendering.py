@@ -10,21 +10,22 @@ from nerf.model import RadianceModel, Rendering
 from nerf.parallel import in_order
 from nerf.rays import Rays
 
-CHUNK = 1024  # rays; larger ones are no faster on a CPU, whose caches they leave (docs/numbers.md)
+CUDA_CHUNK = 8192  # rays
 
 
 def render_image(
     model: RadianceModel,
     rays: Rays,
     background: Float[Tensor, "3"],
-    chunk: int = CHUNK,
+    chunk: int | None = None,
     on_chunk: Callable[[float], None] | None = None,
 ) -> Rendering:
-    """Render rays of shape (height, width), ``chunk`` at a time in row order.
+    """Render rays of shape (height, width), ``chunk`` at a time in row order; by default as many as suit the model.
 
     ``on_chunk`` is told the finished share, in (0, 1], after each chunk.
     """
     height, width = rays.near.shape
+    chunk = chunk or (model.chunk_rays if rays.near.device.type == "cpu" else CUDA_CHUNK)
     flat = Rays(*(part.reshape(height * width, *part.shape[2:]) for part in rays))
 
     def render(start: int) -> Rendering:

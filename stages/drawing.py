@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from nerf.model import RadianceModel, Rendering
     from nerf.rays import Rays
 
-CHUNK = {"cpu": 512, "cuda": 8192}  # rays between two words to the user: a second of the published field on a laptop
 SHARE = 0.5  # of the training's seconds that drawing may be expected to take; what is left is room for a busier machine
 TIMED_SECONDS = 0.5
 TIMED_SHARE = 0.05  # of the training's seconds, where that is less
@@ -37,7 +36,7 @@ class Painter:
 
         device = self.background.device
         on_device = Rays(*(part.to(device) for part in rays))
-        image = render_image(self.model, on_device, self.background, CHUNK[device.type], on_chunk)
+        image = render_image(self.model, on_device, self.background, on_chunk=on_chunk)
         return Rendering(*(part.cpu() for part in image))
 
     def rays_per_second(self, sample: "Callable[[int], Rays]", largest: int, seconds: float) -> float:

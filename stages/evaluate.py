@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from stages.drawing import Painter
 
 NEEDS = ("ingest", "normalise", "train")
-VERSION = 2
+VERSION = 3
 RESUMES = False
 LINKS = ("metrics.json", "renders", "errors")
 

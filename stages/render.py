@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from stages.drawing import Painter
 
 NEEDS = ("normalise", "train")
-VERSION = 2
+VERSION = 3
 RESUMES = False
 LINKS = ("video.mp4", "depth.mp4", "path.json")
 

@@ -201,13 +201,12 @@ class Backend(Protocol):
         count: int,
     ) -> None: ...
 
-    def update_cache(
+    def raise_cache(
         self,
         cells: int,
         thickness: Float[Tensor, "cache"],
         points: Float[Tensor, "points 3"],
         values: Float[Tensor, "points"],
-        decay: float,
     ) -> None: ...
 
     def occupied_bits(self, thickness: Float[Tensor, "cache"], threshold: float) -> Int64[Tensor, "bricks"]: ...

@@ -12,18 +12,14 @@ from torch import Tensor
 BRICK_CELLS = 64
 
 
-def update_cache(
+def raise_cache(
     cells: int,
     thickness: Float[Tensor, "cache"],
     points: Float[Tensor, "points 3"],
     values: Float[Tensor, "points"],
-    decay: float,
 ) -> None:
-    """In place: every cell with a point becomes max(decay · itself, its points' values), however many there are."""
-    number = cell_numbers(cells, points).long()
-    if decay != 1:
-        thickness[number] = decay * thickness[number]
-    thickness.scatter_reduce_(0, number, values, "amax")
+    """In place: every cell with a point becomes the largest of itself and its points' values, however many."""
+    thickness.scatter_reduce_(0, cell_numbers(cells, points).long(), values, "amax")
 
 
 def occupied_bits(thickness: Float[Tensor, "cache"], threshold: float) -> Int64[Tensor, "bricks"]:

@@ -4,7 +4,7 @@ Also a backend of its own (:class:`nerf.kernels.Backend`), for machines where no
 """
 
 from nerf.kernels.adam import adam
-from nerf.kernels.cache import cell_corners, occupied_bits, update_cache
+from nerf.kernels.cache import cell_corners, occupied_bits, raise_cache
 from nerf.kernels.directions import spherical_harmonics, spherical_harmonics_backward
 from nerf.kernels.grid_encoding import encode, encode_backward_points, encode_backward_table
 from nerf.kernels.hidden_layer import add_ray_relu, add_ray_relu_backward, relu_backward
@@ -31,11 +31,11 @@ __all__ = [
     "encode_backward_table",
     "march",
     "occupied_bits",
+    "raise_cache",
     "relu_backward",
     "sample_points",
     "sample_points_backward",
     "spherical_harmonics",
     "spherical_harmonics_backward",
-    "update_cache",
     "visible_front",
 ]

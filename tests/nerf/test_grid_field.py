@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 from nerf import grid_mlp
-from nerf.grid_field import GridField, GridSettings
-from nerf.kernels import reference
+from nerf.grid_field import HIDDEN_BEHIND, GridField, GridPass, GridSettings
+from nerf.kernels import GridLayout, reference
 from nerf.model import RadianceModel, Rendering
 from nerf.rays import Rays
 
@@ -155,3 +155,51 @@ def test_parameters_depend_on_the_seed_alone() -> None:
 def test_impossible_sizes_are_refused(wrong: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         replace(SMALL, **wrong)
+
+
+def in_waves(model: GridField, given: Rays, background: Tensor) -> tuple[Rendering, int]:
+    """The rendering, and of how many samples the density was asked for it."""
+    asked, encode = [0], reference.encode
+
+    def counted(layout: GridLayout, table: Tensor, points: Tensor) -> Tensor:
+        asked[0] += len(points)
+        return encode(layout, table, points)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(reference, "encode", counted)
+        return model.render(given, background), asked[0]
+
+
+def in_one_pass(model: GridField, given: Rays, background: Tensor) -> GridPass:
+    return model.forward(given, torch.full_like(given.near, 0.5), background.repeat(len(given.near), 1))
+
+
+@pytest.mark.parametrize("settings", [SMALL, FOLDED])
+@pytest.mark.parametrize("lengths", [(1, 1, 1), (60, 2, 5), (1 << 15, 8, 64)])
+def test_waves_through_thin_fog_see_what_a_single_pass_sees(
+    settings: GridSettings, lengths: tuple[int, int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, length in zip(("WAVE", "SHORTEST_WAVE", "LONGEST_WAVE"), lengths, strict=True):
+        monkeypatch.setattr(f"nerf.grid_field.{name}", length)
+    model, given, background = field(settings), rays(40), torch.tensor([0.2, 0.4, 0.6], dtype=torch.float64)
+    model.bits.random_(generator=torch.Generator().manual_seed(5))  # half of the cells are closed
+    whole = in_one_pass(model, given, background)
+    waves, asked = in_waves(model, given, background)
+    assert asked == whole.marched == len(whole.samples.t) > 40
+    assert whole.rendering.opacity.min() < 0.5 < whole.rendering.opacity.max()
+    torch.testing.assert_close(tuple(waves), tuple(whole.rendering), rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("settings", [SMALL, FOLDED])
+def test_waves_end_soon_behind_what_stops_the_light(settings: GridSettings, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("nerf.grid_field.WAVE", 80)
+    monkeypatch.setattr("nerf.grid_field.SHORTEST_WAVE", 2)
+    model, given, background = field(settings), rays(40), torch.tensor([0.2, 0.4, 0.6], dtype=torch.float64)
+    model.density_out[0] = model.density_out[0].abs() * 4  # dense everywhere, more or less
+    whole = in_one_pass(model, given, background)
+    waves, asked = in_waves(model, given, background)
+    assert len(whole.samples.t) < asked < 0.7 * whole.marched
+    assert whole.rendering.opacity.min() > 0.99
+    left = HIDDEN_BEHIND * torch.tensor([1.0, 5.0, 1.0])  # of a ray's colour, depth and opacity
+    for one, other, most in zip(waves, whole.rendering, left, strict=True):
+        assert 0 < (one - other).abs().max() < most

@@ -27,6 +27,8 @@ LOW, HIGH = torch.tensor([-0.9, -0.9, -0.9]), torch.tensor([0.9, 0.9, 0.9])
 class Field:
     """A stand-in model with a given density."""
 
+    chunk_rays = 64
+
     def __init__(self, function):
         self.function = function
 

@@ -12,6 +12,8 @@ from nerf.rays import Rays
 class Painted:
     """A model that answers with each ray's first direction component as grey, half opaque."""
 
+    chunk_rays = 64
+
     def density(self, points):
         raise NotImplementedError
 

@@ -10,6 +10,8 @@ from nerf.rendering import render_image
 class Gradient:
     """A model whose rendering tells which ray it was, and how many rays came at a time."""
 
+    chunk_rays = 5
+
     def __init__(self) -> None:
         self.sizes: list[int] = []
 
@@ -31,13 +33,13 @@ def grid(height: int, width: int) -> Rays:
     return Rays(numbers, directions, numbers[..., 0], numbers[..., 1])
 
 
-@pytest.mark.parametrize("chunk", [1, 7, 12, 100])
-def test_every_pixel_is_in_its_place(chunk: int) -> None:
+@pytest.mark.parametrize("chunk", [None, 1, 7, 12, 100])
+def test_every_pixel_is_in_its_place(chunk: int | None) -> None:
     model, rays, told = Gradient(), grid(3, 4), []
     image = render_image(model, rays, torch.tensor([1.0, 2.0, 3.0]), chunk, told.append)
     assert torch.equal(image.colour, rays.origins * torch.tensor([1.0, 2.0, 3.0]))
     assert torch.equal(image.depth, rays.near) and torch.equal(image.opacity, rays.far)
-    assert sum(model.sizes) == 12 and max(model.sizes) <= chunk
+    assert sum(model.sizes) == 12 and max(model.sizes) <= (chunk or model.chunk_rays)
     assert len(told) == len(model.sizes) and told == sorted(told) and told[-1] == 1
 
 

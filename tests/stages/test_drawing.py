@@ -15,6 +15,8 @@ from stages.files import write_json
 class Slow:
     """A field whose every ray costs the same time."""
 
+    chunk_rays = 64
+
     def __init__(self, seconds_per_ray: float) -> None:
         self.seconds_per_ray, self.rays = seconds_per_ray, 0
 

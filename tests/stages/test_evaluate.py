@@ -33,6 +33,8 @@ def sky(directions: np.ndarray) -> np.ndarray:
 class SkyField:
     """The sky as a field, off by ``error`` in every channel; with ``half`` the side x < 0 is empty."""
 
+    chunk_rays = 64
+
     def __init__(self, error: float = 0, half: bool = False) -> None:
         self.error, self.half = error, half
 

@@ -33,6 +33,8 @@ SMALL = (
 class Solid:
     """A stand-in field: solid where the signed distance is negative, coloured by position."""
 
+    chunk_rays = 64
+
     def __init__(self, distance, inside=300.0):
         self.distance, self.inside = distance, inside
 

@@ -19,6 +19,8 @@ VOXEL = 1.8 / (POINTS - 1)
 class Solid:
     """A stand-in model: ``inside`` times a soft step at the zero of a signed distance, over ``outside``."""
 
+    chunk_rays = 64
+
     def __init__(self, distance, inside, softness=0.004, outside=0.0):
         self.distance, self.inside, self.softness, self.outside = distance, inside, softness, outside
 

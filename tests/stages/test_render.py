@@ -23,6 +23,8 @@ RADIUS = 0.6
 class Ball:
     """An opaque ball about the origin, red where x > 0 and green elsewhere, before the background."""
 
+    chunk_rays = 64
+
     def density(self, points):
         return (points.norm(dim=-1) < RADIUS) * 1e3
 

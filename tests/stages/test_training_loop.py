@@ -27,6 +27,8 @@ class Killed(BaseException):
 class OneNumber:
     """Trains one number; ``trouble(step, rate_scale)`` may raise. Its model paints ``shown``, 20 dB from the truth."""
 
+    chunk_rays = 64
+
     def __init__(self, seed: int, trouble: Callable[[int, float], None]) -> None:
         self.seed, self.trouble = seed, trouble
         self.value = torch.tensor(float(seed))

@@ -6,7 +6,7 @@ threads call. On a GPU, gradients of the table are added in no fixed order.
 
 from nerf.kernels.directions import spherical_harmonics, spherical_harmonics_backward
 from nerf.kernels.warp.adam import adam
-from nerf.kernels.warp.cache import cell_corners, occupied_bits, update_cache
+from nerf.kernels.warp.cache import cell_corners, occupied_bits, raise_cache
 from nerf.kernels.warp.compositing import (
     composite,
     composite_backward,
@@ -34,12 +34,12 @@ __all__ = [
     "encode_backward_table",
     "march",
     "occupied_bits",
+    "raise_cache",
     "relu_backward",
     "sample_points",
     "sample_points_backward",
     "spherical_harmonics",
     "spherical_harmonics_backward",
-    "update_cache",
     "visible_front",
     "why_not",
 ]

@@ -10,21 +10,16 @@ from nerf.kernels.warp.launch import launch
 
 wp.set_module_options({"enable_backward": False})
 
-__all__ = ["cell_corners", "occupied_bits", "update_cache"]  # cell_corners runs once in 64 steps: torch will do
+__all__ = ["cell_corners", "occupied_bits", "raise_cache"]  # cell_corners runs once in 16 steps: torch will do
 
 
-def update_cache(
+def raise_cache(
     cells: int,
     thickness: Float[Tensor, "cache"],
     points: Float[Tensor, "points 3"],
     values: Float[Tensor, "points"],
-    decay: float,
 ) -> None:
     """As in nerf.kernels.cache."""
-    if decay != 1:
-        faded = torch.empty_like(values)
-        launch(_fade, len(points), cells, thickness, points, decay, faded)
-        launch(_set, len(points), cells, thickness, points, faded)
     launch(_raise, len(points), cells, thickness, points, values)
 
 
@@ -51,18 +46,6 @@ def cell_of(cells: int, point: wp.vec3):
     y = wp.clamp(int(scaled[1]), 0, cells - 1)
     z = wp.clamp(int(scaled[2]), 0, cells - 1)
     return cell_number(cells, x, y, z)
-
-
-@wp.kernel
-def _fade(cells: int, thickness: wp.array[float], points: wp.array[wp.vec3], decay: float, faded: wp.array[float]):
-    i = wp.tid()
-    faded[i] = decay * thickness[cell_of(cells, points[i])]
-
-
-@wp.kernel
-def _set(cells: int, thickness: wp.array[float], points: wp.array[wp.vec3], values: wp.array[float]):
-    i = wp.tid()
-    thickness[cell_of(cells, points[i])] = values[i]  # points of one cell bring the same value
 
 
 @wp.kernel

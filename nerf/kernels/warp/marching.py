@@ -101,11 +101,6 @@ def _unit(contracted: int, point: wp.vec3):
 
 
 @wp.func
-def _leave(near: float, position: float, direction: float):
-    return 0.0
-
-
-@wp.func
 def _slab(origin: float, direction: float):
     """Where a ray is between -BOX and BOX along one axis; everywhere or nowhere if it runs along them."""
     if direction == 0.0:

@@ -1,7 +1,7 @@
 import torch
 
 from nerf.kernels.cache import cell_numbers
-from nerf.kernels.reference import cell_corners, occupied_bits, update_cache
+from nerf.kernels.reference import cell_corners, occupied_bits, raise_cache
 
 
 def test_every_cell_has_one_number_and_bricks_are_words() -> None:
@@ -19,14 +19,12 @@ def test_points_outside_belong_to_the_nearest_cell() -> None:
     assert torch.equal(cell_numbers(8, outside), cell_numbers(8, outside.clamp(0, 0.999)))
 
 
-def test_cells_fade_once_and_rise_to_the_largest_value() -> None:
+def test_cells_rise_to_the_largest_value() -> None:
     thickness = torch.full((64,), 1.0)
     points = torch.tensor([[0.1, 0.1, 0.1], [0.1, 0.1, 0.1], [0.1, 0.1, 0.1], [0.9, 0.9, 0.9]])
-    update_cache(4, thickness, points, torch.tensor([0.1, 2.0, 0.3, 0.2]), 0.5)
-    assert (thickness[0], thickness[63]) == (2.0, 0.5)
-    assert (thickness[1:63] == 1).all()
-    update_cache(4, thickness, points, torch.tensor([0.1, 0.2, 0.3, 0.7]), 1.0)
-    assert (thickness[0].item(), thickness[63].item()) == (2.0, torch.tensor(0.7).item())
+    raise_cache(4, thickness, points, torch.tensor([0.1, 2.0, 0.3, 0.2]))
+    assert thickness[0] == 2
+    assert (thickness[1:] == 1).all()
 
 
 def test_bits_say_which_cells_exceed_the_threshold() -> None:

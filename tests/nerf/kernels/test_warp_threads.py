@@ -128,7 +128,7 @@ def everything(seed: int) -> list[Tensor]:
     adam = [torch.randn(layout.rows, 4, generator=random), grad_table.clone(), grad_table.clone(), grad_table.abs()]
     warp.adam(adam[0], adam[1], adam[2], adam[3], 1e-2, 3)
     thickness = torch.rand(512, generator=random)
-    warp.update_cache(8, thickness, points, sigma, 0.9)
+    warp.raise_cache(8, thickness, points, sigma)
     return [
         *(bits, *samples, points, features, grad_table, grad_points, *grad_rays, *front, kept, *rendering, weights),
         *(*grad_field, spread, grad_weights, hidden, grad_hidden, of_ray, *adam, thickness),
