@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from nerf.model import RadianceModel, Rendering
     from nerf.rays import Rays
 
-SHARE = 0.5  # of the training's seconds that drawing may be expected to take; what is left is room for a busier machine
+SHARE = 0.4  # of the training's seconds that drawing may be expected to take; what is left is room for a busier machine
 TIMED_SECONDS = 0.5
 TIMED_SHARE = 0.05  # of the training's seconds, where that is less
 FIRST_SIDE = 24  # pixels

@@ -18,10 +18,11 @@ RESUMES = True
 LINKS = ("curve.json",)
 UNKEYED = ("checkpoint_seconds", "tensorboard")
 
-DEFAULT_SECONDS = 180.0
+# Of training, where neither seconds nor steps are given.
+SECONDS = {"draft": 30.0, "standard": 180.0, "high": 900.0, "paper": 3600.0}
 # The small field has few steps and takes large ones: after 300 of 512 rays on lego_400 at a quarter of its size a
 # start at 5e-4 gave 14.7 dB held out, 2e-3 17.4, 5e-3 19.1. The paper's are those of its released lego config.
-PRESETS = {
+PAPER_SIZES = {
     "small": {
         "depth": 4,
         "width": 64,
@@ -31,7 +32,7 @@ PRESETS = {
         "batch_rays": 512,
         "learning_rate": 5e-3,
     },
-    "paper": {
+    "published": {
         "depth": 8,
         "width": 256,
         "skip": 4,
@@ -49,7 +50,7 @@ GRID_SAMPLES = 1 << 14
 
 GRID_ONLY = ("backend", "chunks", "levels", "log2_rows", "finest", "batch_samples")
 PAPER_ONLY = (
-    *("preset", "batch_rays", "depth", "width", "skip", "position_frequencies", "direction_frequencies"),
+    *("batch_rays", "depth", "width", "skip", "position_frequencies", "direction_frequencies"),
     *("samples_coarse", "samples_fine", "view_dependence", "positional_encoding", "hierarchical"),
     *("density_activation", "spacing"),
 )
@@ -65,9 +66,12 @@ class Config(StageConfig):
         default=None, description="grid: minutes without a GPU; paper: the published networks; none: grid"
     )
     steps: int | None = Field(default=None, ge=1, description="train so many steps, with the same result every time")
-    seconds: float | None = Field(
-        default=None, gt=0, description="train so long; none, without steps, is three minutes"
+    preset: Literal["draft", "standard", "high", "paper"] | None = Field(
+        default=None,
+        description="draft, standard, high: train for half a minute, three, fifteen, in sizes to match; "
+        "paper: the networks as published, for an hour; none: standard",
     )
+    seconds: float | None = Field(default=None, gt=0, description="train so long; none, without steps: by the preset")
     learning_rate: float | None = Field(default=None, gt=0, description="at the start; none: by the field")
     seed: int = Field(default=0, description="of weights, batches and samples")
     downscale: float | None = Field(
@@ -89,9 +93,6 @@ class Config(StageConfig):
     finest: int | None = Field(default=None, ge=16, le=4096, description="grid: cells along an axis of the finest grid")
     batch_samples: int | None = Field(default=None, ge=256, description="grid: colours computed in a step")
 
-    preset: Literal["small", "paper"] | None = Field(
-        default=None, description="paper: sizes, as published or small; none: small"
-    )
     batch_rays: int | None = Field(default=None, ge=1, description="paper: rays in a step; none: by the preset")
     depth: int | None = Field(default=None, ge=1, description="paper: layers before the density")
     width: int | None = Field(default=None, ge=2, description="paper: of each layer")
@@ -130,6 +131,8 @@ class Config(StageConfig):
     @model_validator(mode="after")
     def _one_field(self) -> "Config":
         of_grid, of_paper = self._given(GRID_ONLY), self._given(PAPER_ONLY)
+        if self.preset == "paper":
+            of_paper.insert(0, "preset (paper)")
         if of_grid and of_paper:
             raise ValueError(f"{of_grid[0]} belongs to the grid field and {of_paper[0]} to the paper field; choose one")
         if wrong := {"grid": of_paper, "paper": of_grid, None: []}[self.field]:
@@ -139,7 +142,7 @@ class Config(StageConfig):
     @property
     def kind(self) -> Literal["grid", "paper"]:
         """The field that these options ask for."""
-        return self.field or ("paper" if self._given(PAPER_ONLY) else "grid")
+        return self.field or ("paper" if self.preset == "paper" or self._given(PAPER_ONLY) else "grid")
 
     def _given(self, names: tuple[str, ...]) -> list[str]:
         """Which of these options differ from their defaults, with their values."""
@@ -150,9 +153,10 @@ class Config(StageConfig):
 def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
     """Everything that was left open: field and budget, contraction from the scene, then sizes and the photos' size."""
     scene = read_scene(inputs["normalise"])
-    seconds = DEFAULT_SECONDS if config.steps is None and config.seconds is None else config.seconds
+    preset = config.preset or "standard"
+    seconds = SECONDS[preset] if config.steps is None and config.seconds is None else config.seconds
     contracted = not scene.bounded if config.contracted is None else config.contracted
-    chosen = {"field": config.kind, "seconds": seconds, "contracted": contracted}
+    chosen = {"field": config.kind, "preset": preset, "seconds": seconds, "contracted": contracted}
     config = config.model_copy(update=chosen)
     config = _filled(config, _grid_habits(config) if config.kind == "grid" else _paper_habits(config))
     if config.kind == "grid":
@@ -182,9 +186,9 @@ def _grid_habits(config: Config) -> dict[str, Any]:
 
 
 def _paper_habits(config: Config) -> dict[str, Any]:
-    preset = config.preset or "small"
     spacing = "log" if config.contracted else "linear"
-    return {"background": "white", "preset": preset, "spacing": spacing, **PRESETS[preset]}
+    sizes = PAPER_SIZES["published" if config.preset == "paper" else "small"]
+    return {"background": "white", "spacing": spacing, **sizes}
 
 
 def _filled(config: Config, values: dict[str, Any]) -> Config:

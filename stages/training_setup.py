@@ -80,7 +80,9 @@ def make_trainer(config: "Config", scene: "Scene", bank: "RayBank", seed: int) -
 def _say_sizes(config: "Config", bank: "RayBank", progress: Progress) -> None:
     budget = f"{config.steps:,} steps" if config.steps is not None else f"{config.seconds:g} s"
     photos = f"{len(bank.near)} photos at 1/{config.downscale:g} of their size"
-    sizes = f"{config.levels} grids to {config.finest}³" if config.field == "grid" else config.preset
+    sizes = (
+        f"{config.levels} grids to {config.finest}³" if config.field == "grid" else f"{config.depth} × {config.width}"
+    )
     progress.note(f"{config.field} field ({sizes}), {budget} · {photos}, {short_count(len(bank.pixels))} pixels")
 
 

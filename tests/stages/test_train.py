@@ -52,7 +52,7 @@ def test_photos_become_a_field_that_beats_a_flat_colour(tmp_path: Path, progress
     assert result.line.endswith(f"held out {result.facts['heldout_psnr']:.1f} dB")
     curve = read_json(tmp_path / "train" / "curve.json")
     assert curve[-1]["step"] == 120 and set(curve[-1]) == {"step", "seconds", "train_psnr", "heldout_psnr"}
-    assert progress.notes[0] == "paper field (small), 120 steps · 6 photos at 1/1 of their size, 2.3 k pixels"
+    assert progress.notes[0] == "paper field (2 × 16), 120 steps · 6 photos at 1/1 of their size, 2.3 k pixels"
 
 
 def test_the_grid_field_trains_from_photos_too(tmp_path: Path, progress) -> None:
@@ -158,6 +158,7 @@ def test_two_budgets_are_refused_in_words() -> None:
         ({"field": "grid", "width": 64}, r"width \(64\) does not belong to the grid field; leave out one of the two"),
         ({"field": "grid", "preset": "paper"}, r"preset \(paper\) does not belong to the grid field"),
         ({"field": "grid", "hierarchical": False}, r"hierarchical \(False\) does not belong to the grid field"),
+        ({"preset": "paper", "levels": 4}, r"levels \(4\) belongs to the grid field and preset \(paper\) to the paper"),
         ({"field": "paper", "levels": 4}, r"levels \(4\) does not belong to the paper field"),
         ({"finest": 64, "depth": 4}, r"finest \(64\) belongs to the grid field and depth \(4\) to the paper field"),
     ],
@@ -175,7 +176,7 @@ def test_options_of_the_paper_field_ask_for_it() -> None:
 
 
 def test_every_option_is_shared_or_of_one_field() -> None:
-    shared = {"field", "steps", "seconds", "learning_rate", "seed", "downscale", "background", "contracted"}
+    shared = {"field", "preset", "steps", "seconds", "learning_rate", "seed", "downscale", "background", "contracted"}
     shared |= {"checkpoint_seconds", "tensorboard"}
     assert sorted([*shared, *train.GRID_ONLY, *train.PAPER_ONLY]) == sorted(Config.model_fields)
 
@@ -202,12 +203,26 @@ def test_plan_answers_everything_for_the_paper_field(
     inputs, _ = photographed(tmp_path)
     planned = train.plan(Config(batch_rays=8), inputs, progress)
     assert (planned.field, planned.background, planned.levels) == ("paper", "white", None)
-    assert (planned.preset, planned.depth, planned.width) == ("small", 4, 64)
+    assert (planned.preset, planned.depth, planned.width) == ("standard", 4, 64)
     assert (planned.samples_coarse, planned.samples_fine) == (32, 32)
     assert (planned.batch_rays, planned.learning_rate) == (8, 5e-3)
     assert (planned.seconds, planned.steps) == (180, None)
     assert (planned.contracted, planned.spacing, planned.downscale) == (False, "linear", 1.0)
     assert train.plan(Config.model_validate(planned.model_dump()), inputs, progress) == planned
+
+
+def test_presets_are_budgets_unless_one_is_given(tmp_path: Path, progress: Progress) -> None:
+    inputs, _ = photographed(tmp_path)
+    sizes: dict[str, Any] = {"downscale": 1.0, "levels": 2, "log2_rows": 8, "finest": 16}
+
+    def budget(**given: Any) -> tuple[float | None, int | None]:
+        planned = train.plan(Config(**given), inputs, progress)
+        return planned.seconds, planned.steps
+
+    assert [budget(preset=name, **sizes)[0] for name in (None, "draft", "standard", "high")] == [180, 30, 180, 900]
+    assert budget(preset="paper", downscale=1.0) == (3600, None)
+    assert budget(preset="draft", seconds=7, **sizes) == (7, None)
+    assert budget(preset="high", steps=5, **sizes) == (None, 5)
 
 
 def test_the_published_preset_is_the_published_model(tmp_path: Path, progress: Progress) -> None:
