@@ -160,10 +160,11 @@ def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
     config = config.model_copy(update=chosen)
     config = _filled(config, _grid_habits(config) if config.kind == "grid" else _paper_habits(config))
     if config.kind == "grid":
-        from stages.backend import chosen_backend
+        from stages.backend import chosen_backend, load_backend
         from stages.device import compute_device, cores
 
         backend = config.backend or chosen_backend(compute_device(), progress)
+        load_backend(backend, compute_device(), progress)
         config = config.model_copy(update={"backend": backend, "chunks": config.chunks or cores()})
     if config.downscale is None or (config.kind == "grid" and None in (config.levels, config.log2_rows, config.finest)):
         from stages.training_size import chosen_downscale, grid_size, rays_in_budget
