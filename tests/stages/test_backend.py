@@ -92,7 +92,8 @@ def test_planning_chooses_and_keeps_a_backend(tmp_path: Path, progress, monkeypa
     monkeypatch.setattr(warp, "why_not", lambda device: OLD_DRIVER)
     assert train.plan(sized, inputs, progress).backend == "torch"
     assert progress.notes == [NOTE + OLD_DRIVER]
-    assert train.plan(Config(**TINY, steps=10, backend="warp"), inputs, progress).backend == "warp", "as asked for"
+    with pytest.raises(StageError, match=r"cannot use the Warp kernels: .*--train.backend torch"):
+        train.plan(Config(**TINY, steps=10, backend="warp"), inputs, progress)
 
 
 def test_both_backends_train_the_same_field_from_photos(tmp_path: Path, progress) -> None:
