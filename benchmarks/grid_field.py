@@ -18,7 +18,7 @@ from nerf.grid_training import GridTrainer, GridTrainerSettings
 from nerf.kernels import reference
 from nerf.kernels import warp as fast
 from nerf.metrics import mean_squared_error, psnr
-from nerf.parallel import take_over_cores
+from nerf.parallel import take_over_cores, workers
 from nerf.ray_bank import RayBank, build_ray_bank
 from nerf.rays import Rays
 from nerf.rendering import render_image
@@ -92,7 +92,7 @@ def main() -> None:
     train = read_bank(given.folder, "train", given.downscale, 1)
     test = read_bank(given.folder, "test", given.downscale, given.test_every)
     model = GridField(settings, given.seed, fast if given.backend == "warp" else reference)
-    trainer = GridTrainer(model, train, GridTrainerSettings(given.seed, "random", given.samples))
+    trainer = GridTrainer(model, train, GridTrainerSettings(given.seed, "random", given.samples, chunks=workers()))
     print(f"{settings}\n{model.layout.rows:,} rows")
     clock = time.process_time if given.processor_time else time.perf_counter
     seconds, step, rays, due = 0.0, 0, 0, 5.0

@@ -1,0 +1,111 @@
+"""What the grid field reaches on real sets in so many seconds of training: held-out quality, speed, memory.
+
+    python -m benchmarks.fast_field ../shared/data --workspaces /tmp/fast_field [--only lego_400 fox]
+
+Every line is `pipeline train WORKSPACE --train.seconds S --train.downscale D` and `pipeline evaluate` on all held-out
+photos, from cameras that are found once for each set. Frame: one held-out view at the size in the table, drawn on all
+cores. Run it on an idle machine.
+"""
+
+import argparse
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from benchmarks.nerfacto import HERE, pipeline, stage_folder
+from stages.files import read_json, read_scene
+
+EVERY_PHOTO = 10**6
+HEAD = "| set / downscale | s | grids | steps | rays/s | PSNR (dB) | SSIM | frame | GB |\n" + 9 * "|---" + "|"
+
+
+class Case(NamedTuple):
+    """A set, photo width / trained width, seconds of training, and the width of the timed frame."""
+
+    name: str
+    downscale: float
+    seconds: float
+    frame_width: int
+
+
+CASES = (
+    Case("lego_400", 1, 60, 800),
+    Case("lego_400", 1, 300, 800),
+    Case("lego_400", 2, 60, 800),
+    Case("fox", 2.4, 60, 648),
+    Case("fox", 2.4, 180, 648),
+    Case("fern", 2, 180, 504),
+    Case("fountain_p11", 4, 180, 384),
+    Case("sceaux_castle", 4, 180, 384),
+)
+
+
+def train(workspace: Path, case: Case) -> float:
+    """Train and score anew; the peak memory of training in GB."""
+    budget = ("--train.seconds", str(case.seconds), "--train.downscale", str(case.downscale))
+    command = [sys.executable, "-m", "pipeline", "train", str(workspace), *budget, "--force", "--replan"]
+    process = subprocess.Popen(command, cwd=HERE.parent, stdout=sys.stderr)
+    _, status, usage = os.wait4(process.pid, 0)
+    if status:
+        raise SystemExit(f"{' '.join(command)} ended with status {status}")
+    pipeline("evaluate", workspace, "--evaluate.photos", str(EVERY_PHOTO))
+    return usage.ru_maxrss / 1e6
+
+
+def frame_seconds(workspace: Path, width: int) -> tuple[float, str]:
+    """How long a held-out view takes to draw at a width, and its size; the best of two."""
+    import numpy as np
+
+    from stages.drawing import load_painter
+    from stages.render_path import CameraPath, path_rays
+
+    scene = read_scene(stage_folder(workspace, "scene.json"))
+    view = scene.of_split("test")[0]
+    path = CameraPath((scene.cameras[view.camera],), np.asarray(view.scene_from_camera)[None]).resized(width)
+    painter, rays = load_painter(stage_folder(workspace, "curve.json")), next(iter(path_rays(path, scene)))
+    seconds = []
+    for _ in range(2):
+        started = time.perf_counter()
+        painter.draw(rays)
+        seconds.append(time.perf_counter() - started)
+    return min(seconds), "×".join(map(str, reversed(rays.near.shape)))
+
+
+def row(workspace: Path, case: Case, memory: float) -> str:
+    """The line of the table."""
+    folder = stage_folder(workspace, "curve.json")
+    facts: dict[str, Any] = read_json(folder / "manifest.json")["facts"]
+    field, metrics = read_json(folder / "field.json")["settings"], read_json(workspace / "output" / "metrics.json")
+    frame, size = frame_seconds(workspace, case.frame_width)
+    sizes = f"{field['levels']} × 2^{field['log2_rows']} to {field['finest']}"
+    quality = f"{metrics['psnr']:.2f} | {metrics['ssim']:.3f}"
+    speed = f"{facts['steps']:,} | {facts['rays_per_second']:,.0f}"
+    where = f"{case.name} / {case.downscale:g} | {case.seconds:g} | {sizes}"
+    return f"| {where} | {speed} | {quality} | {frame:.2f} s at {size} | {memory:.1f} |"
+
+
+def main() -> None:
+    """Run all cases whose set is there; those that are not are skipped by name."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--workspaces", type=Path, required=True, help="folder for one workspace per set")
+    parser.add_argument("--only", nargs="+", default=None, help="sets")
+    given = parser.parse_args()
+    given.workspaces.mkdir(parents=True, exist_ok=True)
+    print(HEAD)
+    for case in CASES:
+        if given.only and case.name not in given.only:
+            continue
+        if not (photos := (given.data / case.name).absolute()).is_dir():
+            print(f"{case.name} is skipped: {photos} is not there", file=sys.stderr)
+            continue
+        workspace = (given.workspaces / f"{case.name}.nerf").absolute()
+        pipeline("run", photos, "-o", workspace, "--until", "normalise")
+        print(row(workspace, case, train(workspace, case)), flush=True)
+
+
+if __name__ == "__main__":
+    main()
