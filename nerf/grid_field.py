@@ -6,25 +6,29 @@ ray colour is asked for at all.
 """
 
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor, nn
 
 from nerf import grid_mlp
 from nerf.grid_mlp import ColourPass, DensityPass, Weights
 from nerf.kernels import BOX, Backend, GridLayout, Lattice, Samples, grid_layout
-from nerf.kernels.marching import lattice_coordinate, lattice_distance, unit_coordinates
+from nerf.kernels.marching import lattice_coordinate, lattice_distance, starts_of, unit_coordinates
+from nerf.kernels.packed_compositing import OPAQUE
 from nerf.model import Rendering
 from nerf.randomness import generator
 from nerf.rays import Rays
 
 INITIAL_FEATURE = 1e-4
 HIDDEN_BEHIND = 1e-3  # transmittance below which the rest of a ray is left out
-# Of samples whose densities and colours are computed at once when rendering: in all, and per ray.
-WAVE, SHORTEST_WAVE, LONGEST_WAVE = 1 << 15, 8, 64
+# The optical depth that surely hides the rest: sums of waves round otherwise than the sum that decides.
+ENOUGH_DEPTH = -math.log(HIDDEN_BEHIND) * (1 + 1e-5)
+# Samples whose densities are computed at once: in all, and per ray (docs/numbers.md).
+WAVE, SHORTEST_WAVE, LONGEST_WAVE = 1 << 14, 16, 64
 
 
 @dataclass(frozen=True)
@@ -83,6 +87,15 @@ class GridPass(NamedTuple):
     colour: ColourPass
     rendering: Rendering
     weights: Float[Tensor, "samples"]
+
+
+class _Wave(NamedTuple):
+    """Some samples of the rays with these numbers."""
+
+    number: Int64[Tensor, "rays"]
+    samples: Samples
+    points: Float[Tensor, "samples 3"]
+    density: DensityPass
 
 
 class GridGradients(NamedTuple):
@@ -153,43 +166,38 @@ class GridField(nn.Module):
         light: colour = sum over waves of T c, where T is the light that the waves before have let through.
         """
         rays = Rays(*(part.contiguous() for part in rays))
-        far, number = rays.far, torch.arange(len(rays.far), device=rays.far.device)
-        seen, light = rays.far.new_zeros(len(number), 4), torch.ones_like(rays.far)
-        while len(number):
-            lattice = self.lattice._replace(most_samples=_wave_length(len(number)))
-            samples, wave = self._wave(rays, lattice)
-            before = light.index_select(0, number)
-            seen.index_add_(0, number, before[:, None] * torch.cat([wave.colour, wave.depth[:, None]], -1))
-            light[number] = behind = before * (1 - wave.opacity)
-            going_on = (behind >= HIDDEN_BEHIND) & (samples.starts.diff() == lattice.most_samples)
-            number, rays = number[going_on], Rays(*(part[going_on] for part in rays))
-            last = samples.t.index_select(0, samples.starts[1:][going_on] - 1)
-            rays = rays._replace(near=lattice_distance(lattice, lattice_coordinate(lattice, last) + 0.5))
-        return Rendering(seen[:, :3] + light[:, None] * background, seen[:, 3] + light * far, 1 - light)
+        seen, light = rays.far.new_zeros(len(rays.far), 4), torch.ones_like(rays.far)
+        harmonics = self.backend.spherical_harmonics(rays.directions)
+        for wave in self._waves(rays, torch.full_like(rays.near, 0.5)):
+            alone = self._composited(wave, harmonics.index_select(0, wave.number))
+            before = light.index_select(0, wave.number)
+            seen.index_add_(0, wave.number, before[:, None] * torch.cat([alone.colour, alone.depth[:, None]], -1))
+            light[wave.number] = before * (1 - alone.opacity)
+        return Rendering(seen[:, :3] + light[:, None] * background, seen[:, 3] + light * rays.far, 1 - light)
 
-    def _wave(self, rays: Rays, lattice: Lattice) -> tuple[Samples, Rendering]:
-        """The next samples of some rays, and what they alone let these see: before nothing, which is nowhere."""
-        backend, middle, nowhere = self.backend, torch.full_like(rays.near, 0.5), torch.zeros_like(rays.near)
-        samples = backend.march(self.bits, lattice, rays, middle)
-        density = self._density_pass(backend.sample_points(rays, samples, self.settings.contracted))
-        harmonics = backend.spherical_harmonics(rays.directions)
-        colour = grid_mlp.colour_forward(self.weights, backend, samples, density.geometry, harmonics).colour
-        black = torch.zeros_like(rays.origins)
-        return samples, backend.composite(samples, density.sigma, colour, black, nowhere)[0]
+    def _composited(self, wave: _Wave, harmonics: Float[Tensor, "rays 16"]) -> Rendering:
+        """What a wave's samples alone let its rays see, before nothing, which is nowhere."""
+        nowhere, black = harmonics.new_zeros(len(harmonics)), harmonics.new_zeros(len(harmonics), 3)
+        density = wave.density
+        colour = grid_mlp.colour_forward(self.weights, self.backend, wave.samples, density.geometry, harmonics).colour
+        return self.backend.composite(wave.samples, density.sigma, colour, black, nowhere)[0]
 
     def forward(self, rays: Rays, jitter: Float[Tensor, "rays"], background: Float[Tensor, "rays 3"]) -> GridPass:
         """Density of all samples in occupied cells; colour of those that can be seen."""
         backend, rays = self.backend, Rays(*(part.contiguous() for part in rays))
-        samples = backend.march(self.bits, self.lattice, rays, jitter)
-        marched = len(samples.t)
-        points = backend.sample_points(rays, samples, self.settings.contracted)
-        density = self._density_pass(points)
-        samples, seen = backend.visible_front(samples, density.sigma, HIDDEN_BEHIND)
-        points, density = points.index_select(0, seen), density.select(seen)
+        waves = list(self._waves(rays, jitter))
+        samples, order = _in_order(waves, len(jitter))
+        sigma = torch.cat([wave.density.sigma for wave in waves]).index_select(0, order)
+        samples, seen = backend.visible_front(samples, sigma, HIDDEN_BEHIND)
+        rows = order.index_select(0, seen)
+        points = torch.cat([wave.points for wave in waves]).index_select(0, rows)
+        density = DensityPass(
+            *(torch.cat(parts).index_select(0, rows) for parts in zip(*(wave.density for wave in waves), strict=True))
+        )
         harmonics = backend.spherical_harmonics(rays.directions)
         colour = grid_mlp.colour_forward(self.weights, backend, samples, density.geometry, harmonics)
         rendering, weights = backend.composite(samples, density.sigma, colour.colour, background, rays.far)
-        return GridPass(rays, background, marched, samples, points, density, colour, rendering, weights)
+        return GridPass(rays, background, len(order), samples, points, density, colour, rendering, weights)
 
     def backward(self, done: GridPass, grad: Rendering, grad_weights: Float[Tensor, "samples"]) -> GridGradients:
         """Gradients of a loss, given those of the rendering and of the samples' weights."""
@@ -215,6 +223,26 @@ class GridField(nn.Module):
             rays.directions, gradients.harmonics
         )
 
+    def _waves(self, rays: Rays, jitter: Float[Tensor, "rays"]) -> Iterator[_Wave]:
+        """The samples in occupied cells from front to back, in waves of a few per ray, with their densities: none of
+        a ray whose light the waves before have stopped."""
+        number, depth, taken = torch.arange(len(jitter), device=jitter.device), torch.zeros_like(jitter), 0
+        while len(number) and taken < self.lattice.most_samples:
+            length = min(_wave_length(len(number)), self.lattice.most_samples - taken)
+            lattice = self.lattice._replace(most_samples=length)
+            samples = self.backend.march(self.bits, lattice, rays, jitter)
+            points = self.backend.sample_points(rays, samples, lattice.contracted)
+            density = self._density_pass(points)
+            yield _Wave(number, samples, points, density)
+            taken, depth = taken + length, depth + _optical_depth(samples, density.sigma)
+            going_on = ((depth <= ENOUGH_DEPTH) & (samples.starts.diff() == length)).nonzero()[:, 0]
+            last = samples.t.index_select(0, samples.starts.index_select(0, going_on + 1) - 1)
+            number, depth, jitter, *of_rays = (
+                part.index_select(0, going_on) for part in (number, depth, jitter, *rays)
+            )
+            near = lattice_distance(lattice, lattice_coordinate(lattice, last) + (1 - jitter))
+            rays = Rays(*of_rays)._replace(near=near)
+
     def _density_pass(self, unit: Float[Tensor, "points 3"]) -> DensityPass:
         return grid_mlp.density_forward(self.weights, self.backend.encode(self.layout, self.table, unit))
 
@@ -222,3 +250,29 @@ class GridField(nn.Module):
 def _wave_length(rays: int) -> int:
     """Samples per ray: few while there are many rays, so that little lies behind what stops their light."""
     return min(max(WAVE // rays, SHORTEST_WAVE), LONGEST_WAVE)
+
+
+def _optical_depth(samples: Samples, sigma: Float[Tensor, "samples"]) -> Float[Tensor, "rays"]:
+    """The sum of sigma dt over each ray's samples."""
+    until = torch.nn.functional.pad((sigma * samples.dt).clamp(max=OPAQUE).double().cumsum(0), (1, 0))
+    return until.index_select(0, samples.starts).diff().to(sigma.dtype)
+
+
+def _in_order(waves: Sequence[_Wave], rays: int) -> tuple[Samples, Int64[Tensor, "samples"]]:
+    """The samples of all waves packed ray by ray, and where each is among the waves' one after the other."""
+    before, counts = [], torch.zeros(rays, dtype=torch.int64, device=waves[0].number.device)
+    for wave in waves:
+        before.append(counts.index_select(0, wave.number))
+        counts.index_add_(0, wave.number, wave.samples.starts.diff().long())
+    starts = starts_of(counts)
+    places = []
+    for wave, earlier in zip(waves, before, strict=True):
+        first = starts.index_select(0, wave.number) + earlier - wave.samples.starts[:-1]
+        ray = wave.samples.ray
+        places.append(first.index_select(0, ray) + torch.arange(len(ray), device=ray.device))
+    place = torch.cat(places)
+    order = torch.empty_like(place)
+    order[place] = torch.arange(len(place), device=place.device)
+    ray = torch.cat([wave.number.int().index_select(0, wave.samples.ray) for wave in waves])
+    t, dt = (torch.cat(parts) for parts in zip(*(wave.samples[2:] for wave in waves), strict=True))
+    return Samples(starts, *(part.index_select(0, order) for part in (ray, t, dt))), order

@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     from stages.training_loop import TrainingRun
 
 FINAL_RATE = 0.1  # of the paper field's learning rate at the start
-# Weight of the distortion loss (Barron et al. 2022) in folded space, against matter close before the cameras. A box
-# around an object needs none.
-DISTORTION = 1e-3
+# Weight of the distortion loss (Barron et al. 2022, who take 1e-2) in folded space, against fog and matter close before
+# the cameras; fog also costs most of the time (docs/numbers.md). A box around an object needs none.
+DISTORTION = 4e-3
 COARSEST = 16
 FEWEST_STEPS, MOST_STEPS = 256, 384  # along the diagonal of a bounded scene's box
 PROBE_RAYS = 2048

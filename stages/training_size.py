@@ -16,7 +16,7 @@ LEAST_LONG_SIDE = 150  # pixels: below this a photo shows too little to judge an
 TIMED_SECONDS = 1.0
 MOST_TIMED_RAYS = {"cpu": 256, "cuda": 1 << 20}
 """A CPU is as fast on small batches, and a small one keeps the published model's steps short; a GPU is not."""
-SAMPLES_PER_RAY = {"bounded": 8, "contracted": 40}
+SAMPLES_PER_RAY = {"bounded": 8, "contracted": 20}
 """Colours that the grid field computes for a ray, over a run: measured on lego_400 and fox (docs/numbers.md)."""
 GRID_SIZES = {
     "bounded": ((50e6, 5, 18, 512), (0, 4, 17, 256)),

@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 from nerf import grid_mlp
-from nerf.grid_field import HIDDEN_BEHIND, GridField, GridPass, GridSettings
-from nerf.kernels import GridLayout, reference
+from nerf.grid_field import HIDDEN_BEHIND, GridField, GridSettings
+from nerf.kernels import GridLayout, Samples, reference
 from nerf.model import RadianceModel, Rendering
 from nerf.rays import Rays
 
@@ -170,8 +170,21 @@ def in_waves(model: GridField, given: Rays, background: Tensor) -> tuple[Renderi
         return model.render(given, background), asked[0]
 
 
-def in_one_pass(model: GridField, given: Rays, background: Tensor) -> GridPass:
-    return model.forward(given, torch.full_like(given.near, 0.5), background.repeat(len(given.near), 1))
+def in_one_pass(model: GridField, given: Rays, jitter: Tensor, background: Tensor) -> tuple[int, Samples, Rendering]:
+    """How many samples stand in occupied cells, those that can be seen, and what the rays see; no waves."""
+    samples = reference.march(model.bits, model.lattice, given, jitter)
+    density = model._density_pass(reference.sample_points(given, samples, model.settings.contracted))
+    front, seen = reference.visible_front(samples, density.sigma, HIDDEN_BEHIND)
+    density, harmonics = density.select(seen), reference.spherical_harmonics(given.directions)
+    colour = grid_mlp.colour_forward(model.weights, reference, front, density.geometry, harmonics).colour
+    behind = background.repeat(len(jitter), 1)
+    rendering, _ = reference.composite(front, density.sigma, colour, behind, given.far)
+    return len(samples.t), front, rendering
+
+
+def in_short_waves(monkeypatch: pytest.MonkeyPatch, whole: int, shortest: int, longest: int) -> None:
+    for name, length in {"WAVE": whole, "SHORTEST_WAVE": shortest, "LONGEST_WAVE": longest}.items():
+        monkeypatch.setattr(f"nerf.grid_field.{name}", length)
 
 
 @pytest.mark.parametrize("settings", [SMALL, FOLDED])
@@ -179,27 +192,58 @@ def in_one_pass(model: GridField, given: Rays, background: Tensor) -> GridPass:
 def test_waves_through_thin_fog_see_what_a_single_pass_sees(
     settings: GridSettings, lengths: tuple[int, int, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for name, length in zip(("WAVE", "SHORTEST_WAVE", "LONGEST_WAVE"), lengths, strict=True):
-        monkeypatch.setattr(f"nerf.grid_field.{name}", length)
+    in_short_waves(monkeypatch, *lengths)
     model, given, background = field(settings), rays(40), torch.tensor([0.2, 0.4, 0.6], dtype=torch.float64)
     model.bits.random_(generator=torch.Generator().manual_seed(5))  # half of the cells are closed
-    whole = in_one_pass(model, given, background)
+    middle = torch.full_like(given.near, 0.5)
+    marched, front, whole = in_one_pass(model, given, middle, background)
     waves, asked = in_waves(model, given, background)
-    assert asked == whole.marched == len(whole.samples.t) > 40
-    assert whole.rendering.opacity.min() < 0.5 < whole.rendering.opacity.max()
-    torch.testing.assert_close(tuple(waves), tuple(whole.rendering), rtol=1e-9, atol=1e-9)
+    assert asked == marched == len(front.t) > 40
+    assert whole.opacity.min() < 0.5 < whole.opacity.max()
+    torch.testing.assert_close(tuple(waves), tuple(whole), rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("settings", [SMALL, FOLDED])
 def test_waves_end_soon_behind_what_stops_the_light(settings: GridSettings, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nerf.grid_field.WAVE", 80)
-    monkeypatch.setattr("nerf.grid_field.SHORTEST_WAVE", 2)
-    model, given, background = field(settings), rays(40), torch.tensor([0.2, 0.4, 0.6], dtype=torch.float64)
-    model.density_out[0] = model.density_out[0].abs() * 4  # dense everywhere, more or less
-    whole = in_one_pass(model, given, background)
+    in_short_waves(monkeypatch, 80, 2, 64)
+    model, given, background = dense_field(settings), rays(40), torch.tensor([0.2, 0.4, 0.6], dtype=torch.float64)
+    marched, front, whole = in_one_pass(model, given, torch.full_like(given.near, 0.5), background)
     waves, asked = in_waves(model, given, background)
-    assert len(whole.samples.t) < asked < 0.7 * whole.marched
-    assert whole.rendering.opacity.min() > 0.99
+    assert len(front.t) < asked < 0.7 * marched
+    assert whole.opacity.min() > 0.99
     left = HIDDEN_BEHIND * torch.tensor([1.0, 5.0, 1.0])  # of a ray's colour, depth and opacity
-    for one, other, most in zip(waves, whole.rendering, left, strict=True):
+    for one, other, most in zip(waves, whole, left, strict=True):
         assert 0 < (one - other).abs().max() < most
+
+
+@pytest.mark.parametrize("settings", [SMALL, FOLDED])
+@pytest.mark.parametrize("lengths", [(1, 1, 1), (80, 2, 64)])
+@pytest.mark.parametrize("dense", [False, True])
+def test_training_keeps_the_samples_of_a_single_pass_whatever_the_waves(
+    settings: GridSettings, lengths: tuple[int, int, int], dense: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    in_short_waves(monkeypatch, *lengths)
+    model, given = (dense_field if dense else field)(settings), rays(40)
+    model.bits.random_(generator=torch.Generator().manual_seed(5))
+    jitter = torch.rand(40, generator=torch.Generator().manual_seed(6), dtype=torch.float64)
+    background = torch.tensor([0.2, 0.4, 0.6], dtype=torch.float64)
+    marched, front, whole = in_one_pass(model, given, jitter, background)
+    done = model.forward(given, jitter, background.repeat(40, 1))
+    assert done.marched < marched if dense else done.marched == marched
+    assert torch.equal(done.samples.starts, front.starts) and torch.equal(done.samples.ray, front.ray)
+    torch.testing.assert_close(done.samples[2:], front[2:], rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(tuple(done.rendering), tuple(whole), rtol=1e-9, atol=1e-9)
+
+
+def test_a_ray_ends_after_the_most_samples_it_may_have(monkeypatch: pytest.MonkeyPatch) -> None:
+    in_short_waves(monkeypatch, 1, 3, 3)
+    model, given = field(replace(SMALL, most_samples=7)), rays(40)
+    middle = torch.full_like(given.near, 0.5)
+    done = model.forward(given, middle, torch.zeros(40, 3, dtype=torch.float64))
+    assert done.samples.starts.diff().max() == 7
+
+
+def dense_field(settings: GridSettings) -> GridField:
+    model = field(settings)
+    model.density_out[0] = model.density_out[0].abs() * 4
+    return model
