@@ -6,29 +6,24 @@ ray colour is asked for at all.
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from nerf import grid_mlp
 from nerf.grid_mlp import ColourPass, DensityPass, Weights
 from nerf.kernels import BOX, Backend, GridLayout, Lattice, Samples, grid_layout
-from nerf.kernels.marching import lattice_coordinate, lattice_distance, starts_of, unit_coordinates
-from nerf.kernels.packed_compositing import OPAQUE
+from nerf.kernels.marching import unit_coordinates
 from nerf.model import Rendering
 from nerf.randomness import generator
 from nerf.rays import Rays
+from nerf.waves import HIDDEN_BEHIND, Wave, front_to_back, packed
 
 INITIAL_FEATURE = 1e-4
-HIDDEN_BEHIND = 1e-3  # transmittance below which the rest of a ray is left out
-# The optical depth that surely hides the rest: sums of waves round otherwise than the sum that decides.
-ENOUGH_DEPTH = -math.log(HIDDEN_BEHIND) * (1 + 1e-5)
-# Samples whose densities are computed at once: in all, and per ray (docs/numbers.md).
-WAVE, SHORTEST_WAVE, LONGEST_WAVE = 1 << 14, 16, 64
 
 
 @dataclass(frozen=True)
@@ -87,15 +82,6 @@ class GridPass(NamedTuple):
     colour: ColourPass
     rendering: Rendering
     weights: Float[Tensor, "samples"]
-
-
-class _Wave(NamedTuple):
-    """Some samples of the rays with these numbers."""
-
-    number: Int64[Tensor, "rays"]
-    samples: Samples
-    points: Float[Tensor, "samples 3"]
-    density: DensityPass
 
 
 class GridGradients(NamedTuple):
@@ -175,7 +161,7 @@ class GridField(nn.Module):
             light[wave.number] = before * (1 - alone.opacity)
         return Rendering(seen[:, :3] + light[:, None] * background, seen[:, 3] + light * rays.far, 1 - light)
 
-    def _composited(self, wave: _Wave, harmonics: Float[Tensor, "rays 16"]) -> Rendering:
+    def _composited(self, wave: Wave, harmonics: Float[Tensor, "rays 16"]) -> Rendering:
         """What a wave's samples alone let its rays see, before nothing, which is nowhere."""
         nowhere, black = harmonics.new_zeros(len(harmonics)), harmonics.new_zeros(len(harmonics), 3)
         density = wave.density
@@ -186,7 +172,7 @@ class GridField(nn.Module):
         """Density of all samples in occupied cells; colour of those that can be seen."""
         backend, rays = self.backend, Rays(*(part.contiguous() for part in rays))
         waves = list(self._waves(rays, jitter))
-        samples, order = _in_order(waves, len(jitter))
+        samples, order = packed(waves, len(jitter))
         sigma = torch.cat([wave.density.sigma for wave in waves]).index_select(0, order)
         samples, seen = backend.visible_front(samples, sigma, HIDDEN_BEHIND)
         rows = order.index_select(0, seen)
@@ -223,56 +209,8 @@ class GridField(nn.Module):
             rays.directions, gradients.harmonics
         )
 
-    def _waves(self, rays: Rays, jitter: Float[Tensor, "rays"]) -> Iterator[_Wave]:
-        """The samples in occupied cells from front to back, in waves of a few per ray, with their densities: none of
-        a ray whose light the waves before have stopped."""
-        number, depth, taken = torch.arange(len(jitter), device=jitter.device), torch.zeros_like(jitter), 0
-        while len(number) and taken < self.lattice.most_samples:
-            length = min(_wave_length(len(number)), self.lattice.most_samples - taken)
-            lattice = self.lattice._replace(most_samples=length)
-            samples = self.backend.march(self.bits, lattice, rays, jitter)
-            points = self.backend.sample_points(rays, samples, lattice.contracted)
-            density = self._density_pass(points)
-            yield _Wave(number, samples, points, density)
-            taken, depth = taken + length, depth + _optical_depth(samples, density.sigma)
-            going_on = ((depth <= ENOUGH_DEPTH) & (samples.starts.diff() == length)).nonzero()[:, 0]
-            last = samples.t.index_select(0, samples.starts.index_select(0, going_on + 1) - 1)
-            number, depth, jitter, *of_rays = (
-                part.index_select(0, going_on) for part in (number, depth, jitter, *rays)
-            )
-            near = lattice_distance(lattice, lattice_coordinate(lattice, last) + (1 - jitter))
-            rays = Rays(*of_rays)._replace(near=near)
+    def _waves(self, rays: Rays, jitter: Float[Tensor, "rays"]) -> Iterator[Wave]:
+        return front_to_back(self.backend, self.bits, self.lattice, self._density_pass, rays, jitter)
 
     def _density_pass(self, unit: Float[Tensor, "points 3"]) -> DensityPass:
         return grid_mlp.density_forward(self.weights, self.backend.encode(self.layout, self.table, unit))
-
-
-def _wave_length(rays: int) -> int:
-    """Samples per ray: few while there are many rays, so that little lies behind what stops their light."""
-    return min(max(WAVE // rays, SHORTEST_WAVE), LONGEST_WAVE)
-
-
-def _optical_depth(samples: Samples, sigma: Float[Tensor, "samples"]) -> Float[Tensor, "rays"]:
-    """The sum of sigma dt over each ray's samples."""
-    until = torch.nn.functional.pad((sigma * samples.dt).clamp(max=OPAQUE).double().cumsum(0), (1, 0))
-    return until.index_select(0, samples.starts).diff().to(sigma.dtype)
-
-
-def _in_order(waves: Sequence[_Wave], rays: int) -> tuple[Samples, Int64[Tensor, "samples"]]:
-    """The samples of all waves packed ray by ray, and where each is among the waves' one after the other."""
-    before, counts = [], torch.zeros(rays, dtype=torch.int64, device=waves[0].number.device)
-    for wave in waves:
-        before.append(counts.index_select(0, wave.number))
-        counts.index_add_(0, wave.number, wave.samples.starts.diff().long())
-    starts = starts_of(counts)
-    places = []
-    for wave, earlier in zip(waves, before, strict=True):
-        first = starts.index_select(0, wave.number) + earlier - wave.samples.starts[:-1]
-        ray = wave.samples.ray
-        places.append(first.index_select(0, ray) + torch.arange(len(ray), device=ray.device))
-    place = torch.cat(places)
-    order = torch.empty_like(place)
-    order[place] = torch.arange(len(place), device=place.device)
-    ray = torch.cat([wave.number.int().index_select(0, wave.samples.ray) for wave in waves])
-    t, dt = (torch.cat(parts) for parts in zip(*(wave.samples[2:] for wave in waves), strict=True))
-    return Samples(starts, *(part.index_select(0, order) for part in (ray, t, dt))), order

@@ -6,10 +6,11 @@ import torch
 from torch import Tensor
 
 from nerf import grid_mlp
-from nerf.grid_field import HIDDEN_BEHIND, GridField, GridSettings
+from nerf.grid_field import GridField, GridSettings
 from nerf.kernels import GridLayout, Samples, reference
 from nerf.model import RadianceModel, Rendering
 from nerf.rays import Rays
+from nerf.waves import HIDDEN_BEHIND
 
 SMALL = GridSettings(levels=2, log2_rows=9, coarsest=3, finest=9, steps=24, cache_cells=8)
 FOLDED = replace(SMALL, contracted=True, shortest_step=0.1, cone=0.2)
@@ -184,7 +185,7 @@ def in_one_pass(model: GridField, given: Rays, jitter: Tensor, background: Tenso
 
 def in_short_waves(monkeypatch: pytest.MonkeyPatch, whole: int, shortest: int, longest: int) -> None:
     for name, length in {"WAVE": whole, "SHORTEST_WAVE": shortest, "LONGEST_WAVE": longest}.items():
-        monkeypatch.setattr(f"nerf.grid_field.{name}", length)
+        monkeypatch.setattr(f"nerf.waves.{name}", length)
 
 
 @pytest.mark.parametrize("settings", [SMALL, FOLDED])
