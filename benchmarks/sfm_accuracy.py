@@ -28,7 +28,7 @@ import numpy as np
 
 from pipeline.truth import align
 from stages import ingest, sfm
-from stages.colmap import read_model
+from stages.colmap.models import read_model
 from stages.sparse_model import SparseModel
 
 

@@ -80,7 +80,7 @@ def _scene_and_directions(truth: Truth) -> "tuple[SyntheticScene, torch.Tensor]"
     import torch
 
     from nerf.synthetic import still_life
-    from stages.colmap import camera_rays
+    from stages.colmap.cameras import camera_rays
 
     camera = truth.camera
     rays = camera_rays(camera, SAMPLES_PER_SIDE * camera.width, SAMPLES_PER_SIDE * camera.height)

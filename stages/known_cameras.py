@@ -14,7 +14,8 @@ import numpy as np
 from jaxtyping import Float
 
 from nerf.scene import Camera
-from stages.colmap import is_valid, read_model, rescaled
+from stages.colmap.cameras import is_valid, rescaled
+from stages.colmap.models import read_model
 from stages.contract import StageError
 from stages.photos import Photo
 from stages.sources import read_transforms

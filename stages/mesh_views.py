@@ -103,7 +103,7 @@ def _cells(offset: np.ndarray, distance: np.ndarray, shadow: ShadowMap) -> np.nd
 
     Lens polynomials fold back far outside of the image; points at wider angles than any ray are therefore refused.
     """
-    from stages.colmap import project
+    from stages.colmap.cameras import project
 
     height, width = shadow.reach.shape
     points = offset @ shadow.view.scene_from_camera[:, :3]

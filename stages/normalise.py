@@ -44,7 +44,7 @@ class Config(StageConfig):
 def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> StageResult:
     """Read the sparse model, choose the scene frame, write scene.json, points.safetensors and transforms.json."""
     from nerf.normalisation import normalise
-    from stages.colmap import read_model
+    from stages.colmap.models import read_model
     from stages.photos import read_photos
     from stages.transforms_export import transforms
 
@@ -113,7 +113,7 @@ def _reconstruction(model: "SparseModel", order: list[int]) -> "Reconstruction":
     import numpy as np
 
     from nerf.reconstruction import Reconstruction
-    from stages.colmap import camera_rays
+    from stages.colmap.cameras import camera_rays
 
     side = FRUSTUM_SAMPLES
     bearings = [camera_rays(camera, side, side).reshape(-1, 3).astype(float) for camera in model.cameras]

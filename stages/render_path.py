@@ -41,7 +41,7 @@ def path_rays(path: CameraPath, scene: "Scene") -> "Iterator[Rays]":
 
     from nerf.depth_range import range_between_views
     from nerf.rays import rays_of_view
-    from stages.colmap import camera_rays
+    from stages.colmap.cameras import camera_rays
 
     views = scene.of_split("train")
     near, far = range_between_views(

@@ -76,7 +76,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
 
 
 def _import(cameras: Path, photos: "list[Photo]", ingest: Path, folder: Path, progress: Progress) -> StageResult:
-    from stages.colmap import write_model
+    from stages.colmap.models import write_model
     from stages.known_cameras import read_known_cameras
     from stages.photos import read_frame_names
 

@@ -16,7 +16,9 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-from stages import colmap
+from stages.colmap.mapping import MAPPING_MODEL, map_incrementally, rank
+from stages.colmap.matching import copy_without_matches_of, extract_features, fill_database, match_exhaustively
+from stages.colmap.refinement import finish
 from stages.photos import Photo
 
 # Lowe's ratio: 0.8 is SIFT's own. 0.9 lets in many mismatches, most of which verification throws out again, and
@@ -73,22 +75,22 @@ def reconstruct(job: Job, say: Say) -> dict[str, Any]:
     database, images = Path(job.database), Path(job.images)
     photos = [Photo(**photo) for photo in job.photos]
     say(phase="features")
-    colmap.fill_database(database, photos, job.camera_model or colmap.MAPPING_MODEL)
-    colmap.extract_features(database, images, photos, job.max_image_size, job.max_features)
+    fill_database(database, photos, job.camera_model or MAPPING_MODEL)
+    extract_features(database, images, photos, job.max_image_size, job.max_features)
     mapped = _match_and_map(job, database, STRICT_RATIO, say)
     placed = _files(mapped[0]) if mapped else []
     missing = {file for photo in photos if (file := photo.file.removeprefix("images/")) not in placed}
     if missing:
         say(note=f"{len(missing)} of {len(photos)} photos found no place: matching them again, less strictly")
         loose = database.with_name(f"{database.stem}-loose.db")
-        colmap.copy_without_matches_of(missing, database, loose)
+        copy_without_matches_of(missing, database, loose)
         again = _match_and_map(job, loose, LOOSE_RATIO, say)
-        if again and (not mapped or colmap.rank(again[0]) > colmap.rank(mapped[0])):
+        if again and (not mapped or rank(again[0]) > rank(mapped[0])):
             mapped, database = again, loose
     if not mapped:
         return {"database": str(database), "models": []}
     say(phase="refining")
-    model, vague = colmap.finish(mapped[0], database, job.seed, job.camera_model is not None)
+    model, vague = finish(mapped[0], database, job.seed, job.camera_model is not None)
     sparse = Path(job.folder, "sparse")
     sparse.mkdir(exist_ok=True)
     model.write_binary(sparse)
@@ -106,11 +108,11 @@ def reconstruct(job: Job, say: Say) -> dict[str, Any]:
 def _match_and_map(job: Job, database: Path, max_ratio: float, say: Say) -> list[Any]:
     """All sub-models that come of matching so strictly, best first."""
     say(phase="matching", database=str(database), again=" again" if max_ratio == LOOSE_RATIO else "")
-    colmap.match_exhaustively(database, job.seed, max_ratio)
+    match_exhaustively(database, job.seed, max_ratio)
     say(phase="mapping", done=0)
     placed = count(1)
     models = Path(job.folder, "models")
-    mapped = colmap.map_incrementally(
+    mapped = map_incrementally(
         database, Path(job.images), models, job.seed, lambda: say(phase="mapping", done=next(placed))
     )
     shutil.rmtree(models)

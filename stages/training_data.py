@@ -35,7 +35,7 @@ def camera_directions(camera: "Camera", downscale: float) -> "Tensor":
     """
     import torch
 
-    from stages.colmap import camera_rays
+    from stages.colmap.cameras import camera_rays
 
     return torch.from_numpy(camera_rays(camera, *scaled_size(camera, downscale)))
 
@@ -45,7 +45,7 @@ def patch_bearings(camera: "Camera", downscale: float) -> "Tensor":
     bank, MOST_PATCHES along the longer side or one per pixel."""
     import torch
 
-    from stages.colmap import camera_rays
+    from stages.colmap.cameras import camera_rays
 
     width, height = scaled_size(camera, downscale)
     shrink = max(1.0, max(width, height) / MOST_PATCHES)

@@ -10,7 +10,7 @@ from nerf.scene import Camera
 from nerf.synthetic import still_life
 from pipeline import demo
 from pipeline.truth import Truth
-from stages.colmap import camera_rays
+from stages.colmap.cameras import camera_rays
 from stages.contract import StageError
 from tests.synthetic_photos import SyntheticPhotos
 

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from nerf.scene import Camera
-from stages.colmap import camera_rays, is_valid, project, read_model, rescaled, write_model
+from stages.colmap.cameras import camera_rays, is_valid, project, rescaled
+from stages.colmap.models import read_model, write_model
 from stages.contract import StageError
 from stages.sparse_model import SparseImage, SparseModel
 

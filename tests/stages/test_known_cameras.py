@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from nerf.scene import Camera
-from stages.colmap import write_model
+from stages.colmap.models import write_model
 from stages.contract import StageError
 from stages.known_cameras import OPENGL_FROM_OPENCV, KnownCameras, read_known_cameras
 from stages.photos import Photo

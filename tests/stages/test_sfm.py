@@ -11,7 +11,7 @@ from PIL import Image
 
 from pipeline.truth import align
 from stages import ingest, sfm
-from stages.colmap import read_model
+from stages.colmap.models import read_model
 from stages.contract import StageError
 from stages.files import read_json
 from stages.photos import Photo, write_photos

@@ -1,0 +1,78 @@
+"""Camera models: pixels to rays and back, for every model that COLMAP knows."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float
+
+from nerf.scene import Camera
+from stages.contract import StageError
+
+if TYPE_CHECKING:
+    import pycolmap
+
+ROUND_TRIP_PX = 0.01  # a bearing that does not project back to its pixel is a false root of the distortion
+
+
+def camera_rays(camera: Camera, width: int, height: int) -> Float[np.ndarray, "height width 3"]:
+    """Unit bearing vectors (float32) of the pixel centres of ``camera``'s image resized to width × height.
+
+    Raises StageError where the camera model has no inverse at some pixels.
+    """
+    model = native(camera)
+    # Centres are mapped to the camera's own pixels: Camera.rescale would average the two scales of one focal length.
+    x = (np.arange(width) + 0.5) * (camera.width / width)
+    rays = np.empty((height, width, 3), np.float32)
+    lost = 0
+    for row in range(height):
+        pixels = np.stack([x, np.full(width, (row + 0.5) * (camera.height / height))], axis=1)
+        bearings = np.asarray(model.cam_ray_from_img(pixels))
+        miss = np.abs(np.asarray(model.img_from_cam(bearings)) - pixels).max(axis=1)
+        lost += int(np.count_nonzero(~(miss < ROUND_TRIP_PX)))  # NaN counts as lost
+        rays[row] = bearings
+    if lost:
+        raise StageError(
+            f"the {camera.model} camera has no ray for {lost / (width * height):.1%} of its pixels",
+            f"its distortion cannot be undone there (parameters {', '.join(f'{p:.5g}' for p in camera.params)})",
+            "Check the distortion of the given cameras, or choose a simpler --sfm.camera-model.",
+        )
+    return rays
+
+
+def project(camera: Camera, points_camera: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
+    """Pixel coordinates of points in the camera's frame; NaN for points behind the camera."""
+    return np.asarray(native(camera).img_from_cam(np.asarray(points_camera, np.float64)))
+
+
+def rescaled(camera: Camera, width: int, height: int) -> Camera:
+    """The camera of the same image resized to width × height pixels."""
+    model = native(camera)
+    model.rescale(width, height)
+    return plain(model)
+
+
+def is_valid(camera: Camera) -> bool:
+    """Whether all parameters are finite and all focal lengths positive."""
+    focal = [camera.params[i] for i in native(camera).focal_length_idxs()]
+    return bool(np.isfinite(camera.params).all()) and all(f > 0 for f in focal)
+
+
+def native(camera: Camera, camera_id: int = 1) -> "pycolmap.Camera":
+    """The same camera for COLMAP. Raises ValueError where the model takes another number of parameters."""
+    import pycolmap
+
+    model = pycolmap.Camera(
+        camera_id=camera_id,
+        model=camera.model,
+        width=camera.width,
+        height=camera.height,
+        params=list(camera.params),
+    )
+    if not model.verify_params():
+        raise ValueError(f"{camera.model} takes {model.params_info}, got {len(camera.params)} numbers")
+    return model
+
+
+def plain(camera: "pycolmap.Camera") -> Camera:
+    """The inverse of :func:`native`."""
+    return Camera(camera.model_name, camera.width, camera.height, tuple(float(p) for p in camera.params))
