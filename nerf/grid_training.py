@@ -23,6 +23,10 @@ from nerf.training import NonFinite, StepResult
 WARM_UP_STEPS = 20
 CONSTANT_SHARE = 0.2  # of the run, before the rate begins to fall
 FINAL_RATE = 0.05  # of the rate at first
+# The distortion loss begins weak: it draws fog together wherever that stands, and far things that only smooth colours
+# tell apart (the sky) would be drawn close behind the scene before their place is known (docs/numbers.md).
+FIRST_DISTORTION = 0.25  # of its weight
+FULL_DISTORTION_SHARE = 0.3  # of the run
 FIRST_SAMPLES_PER_RAY = 128.0
 MEMORY = 0.9  # how much of the mean of samples per ray remains after each step
 
@@ -32,8 +36,8 @@ class GridTrainerSettings:
     """How to train. ``samples``: colours to compute in a step; its rays are as many as are expected to need them, at
     most ``most_rays``. ``chunks``: equal parts of a step, each computed on a core; results depend on their number, not
     on that of the cores. ``background`` is what lies behind the scene: a colour, or another random one for each ray
-    (only for photos with alpha, where it shows the field which space is empty). ``distortion``: weight of the
-    distortion loss, for scenes without a known background."""
+    (only for photos with alpha, where it shows the field which space is empty). ``distortion``: full
+    weight of the distortion loss, for scenes without a known background."""
 
     seed: int
     background: tuple[float, float, float] | Literal["random"]
@@ -81,6 +85,11 @@ def rate_factor(step: int, share: float) -> float:
     return min(1.0, (step + 1) / WARM_UP_STEPS) * FINAL_RATE**fallen
 
 
+def distortion_factor(share: float) -> float:
+    """The weight of the distortion loss over its full one: from a quarter it grows with the share of the run."""
+    return min(1.0, max(FIRST_DISTORTION, share / FULL_DISTORTION_SHARE))
+
+
 class GridTrainer:
     """Trains a grid field on the squared error of colours by Adam, and keeps its density cache."""
 
@@ -96,7 +105,7 @@ class GridTrainer:
     def step(self, step: int, share: float, rate_scale: float = 1.0) -> StepResult:
         """One batch, one update. Raises NonFinite before the update, leaving model and optimiser as they were."""
         device, rays = self.bank.device, self._rays_per_chunk()
-        parts = list(in_order(partial(self._part, step, rays), range(self.settings.chunks), device))
+        parts = list(in_order(partial(self._part, step, share, rays), range(self.settings.chunks), device))
         loss, error = self._finite(step, parts)
         self._update(parts, rate_scale * self.settings.rate * rate_factor(step, share), step + 1)
         self.cache.refresh(step, generator(device, self.settings.seed, step, self.settings.chunks))
@@ -143,25 +152,26 @@ class GridTrainer:
         target = colour if alpha is None else torch.lerp(background, colour, alpha[:, None])
         return GridBatch(rays, target, background, torch.rand(count, generator=random, device=device))
 
-    def _part(self, step: int, rays: int, chunk: int) -> _Part:
+    def _part(self, step: int, share: float, rays: int, chunk: int) -> _Part:
         """What a chunk of so many rays adds to loss and gradients."""
         batch = self._batch(step, chunk, rays)
         done = self.model.forward(batch.rays, batch.jitter, batch.background)
-        loss = self._loss(rays * self.settings.chunks, done, batch.target)
+        spread_weight = self.settings.distortion * distortion_factor(share)
+        loss = self._loss(rays * self.settings.chunks, spread_weight, done, batch.target)
         weights, features, _ = self.model.backward(done, loss.grad, loss.grad_weights)
         thickness = done.density.sigma * done.samples.dt
         norm = torch.nn.utils.get_total_norm([*weights, features])
         return _Part(batch, loss.value, loss.squared_error, weights, features, done.points, norm, thickness)
 
-    def _loss(self, rays: int, done: GridPass, target: Float[Tensor, "chunk 3"]) -> Loss:
+    def _loss(self, rays: int, spread_weight: float, done: GridPass, target: Float[Tensor, "chunk 3"]) -> Loss:
         error = done.rendering.colour - target
         squared_error = error.square().sum() / (3 * rays)
         none = torch.zeros(len(target), device=error.device)
         grad = Rendering(error * (2 / (3 * rays)), none, none)
-        if not self.settings.distortion:
+        if not spread_weight:
             return Loss(squared_error, squared_error, grad, torch.zeros_like(done.weights))
         backend, lattice = self.model.backend, self.model.lattice
-        each = none + self.settings.distortion / rays
+        each = none + spread_weight / rays
         spread = (each * backend.distortion(done.samples, done.weights, lattice)).sum()
         grad_weights = backend.distortion_backward(done.samples, done.weights, lattice, each)
         return Loss(squared_error + spread, squared_error, grad, grad_weights)

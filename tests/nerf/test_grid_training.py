@@ -83,14 +83,14 @@ def test_results_do_not_depend_on_the_number_of_threads() -> None:
 def test_the_gradient_of_a_batch_is_the_sum_over_its_chunks() -> None:
     run = trainer(replace(TRAINER, samples=1 << 14, distortion=0.1, chunks=4))
     rays = run._rays_per_chunk()
-    parts = [run._part(0, rays, chunk) for chunk in range(4)]
+    parts = [run._part(0, 1.0, rays, chunk) for chunk in range(4)]
     assert rays > 10 and not torch.equal(parts[0].batch.target, parts[1].batch.target)
     whole = GridBatch(
         Rays(*(torch.cat(part) for part in zip(*(part.batch.rays for part in parts), strict=True))),
         *(torch.cat(part) for part in zip(*(part.batch[1:] for part in parts), strict=True)),
     )
     done = run.model.forward(whole.rays, whole.jitter, whole.background)
-    loss = run._loss(4 * rays, done, whole.target)
+    loss = run._loss(4 * rays, 0.1, done, whole.target)
     gradients = run.model.backward(done, loss.grad, loss.grad_weights)
     summed = [torch.stack(of_parts).sum(0) for of_parts in zip(*(part.weights for part in parts), strict=True)]
     torch.testing.assert_close(summed, list(gradients.weights), rtol=1e-4, atol=1e-9)
@@ -154,11 +154,18 @@ def test_the_rate_scale_scales_the_update() -> None:
 
 def test_the_distortion_loss_is_added_and_has_its_gradient() -> None:
     plain, with_it = trainer(), trainer(replace(TRAINER, distortion=1.0))
-    one, other = plain.step(0, 0.0), with_it.step(0, 0.0)
+    one, other = plain.step(0, 1.0), with_it.step(0, 1.0)
     assert one.psnr == other.psnr
     assert one.loss < other.loss < one.loss + 5
     assert torch.equal(plain.mean["colour_out"], with_it.mean["colour_out"])
     assert not torch.equal(plain.mean["density_out"], with_it.mean["density_out"])
+
+
+def test_the_distortion_loss_begins_weak() -> None:
+    losses = [trainer(replace(TRAINER, distortion=1.0)).step(0, share).loss for share in (0.0, 0.05, 0.15, 0.3, 1.0)]
+    bare = trainer().step(0, 0.0).loss
+    added = [(loss - bare) / (losses[-1] - bare) for loss in losses]
+    assert added == pytest.approx([0.25, 0.25, 0.5, 1, 1], rel=1e-4)
 
 
 def test_unbounded_scenes_train_too() -> None:
