@@ -1,0 +1,66 @@
+"""Why a photo has no place in a model. Call it in a child process."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    import pycolmap
+
+
+def supports(model: "pycolmap.Reconstruction", database: Path, seed: int) -> dict[str, tuple[int, int]]:
+    """For every photo that is in the database but not in the model: how many of its features are points of the model
+    by its verified matches, and how many of those agree on one position of the camera (P3P in RANSAC, 12 px)."""
+    import pycolmap
+
+    registered = set(model.reg_image_ids())
+    found = {}
+    with pycolmap.Database.open(database) as db:
+        geometries = list(zip(*db.read_two_view_geometries(), strict=True))
+        for image in sorted(db.read_all_images(), key=lambda image: image.image_id):
+            if image.image_id in registered:
+                continue
+            points = _points_seen(image.image_id, geometries, model)
+            keypoints = np.asarray(db.read_keypoints(image.image_id), float)[:, :2]
+            camera = model.cameras.get(image.camera_id) or db.read_camera(image.camera_id)
+            found[image.name] = (len(points), _agreeing(points, keypoints, camera, model, seed))
+    return found
+
+
+def _points_seen(image_id: int, geometries: list, model: "pycolmap.Reconstruction") -> list[tuple[int, int]]:
+    """(keypoint, point) pairs of an image, by its matches with registered images; each pair once."""
+    import pycolmap
+
+    seen = set()
+    for pair_id, geometry in geometries:
+        first, second = pycolmap.pair_id_to_image_pair(pair_id)
+        if image_id not in (first, second):
+            continue
+        other, mine = (second, 0) if image_id == first else (first, 1)
+        if not (other in model.images and model.image(other).has_pose):
+            continue
+        places = model.image(other).points2D
+        for match in np.asarray(geometry.inlier_matches):
+            if (place := places[match[1 - mine]]).has_point3D():
+                seen.add((int(match[mine]), int(place.point3D_id)))
+    return sorted(seen)
+
+
+def _agreeing(
+    points: list[tuple[int, int]],
+    keypoints: np.ndarray,
+    camera: "pycolmap.Camera",
+    model: "pycolmap.Reconstruction",
+    seed: int,
+) -> int:
+    import pycolmap
+
+    if len(points) < 4:
+        return 0
+    options = pycolmap.AbsolutePoseEstimationOptions()
+    options.ransac.random_seed = seed
+    xy = keypoints[[keypoint for keypoint, _ in points]]
+    xyz = np.array([model.point3D(point).xyz for _, point in points])
+    answer = pycolmap.estimate_absolute_pose(xy, xyz, camera, options)
+    return int(answer["num_inliers"]) if answer else 0
