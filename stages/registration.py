@@ -30,13 +30,14 @@ OVERLAP_HINT = "Take photos with 60–80 % overlap, so that everything is visibl
 
 @dataclass(frozen=True)
 class Matches:
-    """The verified pairs of photos; photos are numbered from 0 in order of ``file``.
+    """The verified among ``tried`` pairs of photos; photos are numbered from 0 in order of ``file``.
 
     ``flat``: a plane or a rotation alone explains the pair, so it tells nothing of depth. ``shift_px``: median
     distance between matched keypoints.
     """
 
     keypoints: Int[np.ndarray, "photos"]
+    tried: int
     pairs: Int[np.ndarray, "pairs 2"]
     inliers: Int[np.ndarray, "pairs"]
     flat: Bool[np.ndarray, "pairs"]
@@ -74,6 +75,7 @@ def is_sound(database: Path, names: Sequence[str]) -> bool:
 def read_matches(database: Path) -> Matches:
     """What feature extraction and matching found."""
     with _opened(database) as db:
+        tried = db.execute("SELECT COUNT(*) FROM two_view_geometries").fetchone()[0]
         keypoints = db.execute(
             "SELECT COALESCE(rows, 0) FROM images LEFT JOIN keypoints USING (image_id) ORDER BY image_id"
         ).fetchall()
@@ -92,6 +94,7 @@ def read_matches(database: Path) -> Matches:
         shifts.append(np.median(np.linalg.norm(offsets, axis=1)))
     return Matches(
         keypoints=np.array(keypoints, int).reshape(-1),
+        tried=tried,
         pairs=pairs,
         inliers=np.array([rows for _, rows, _, _ in verified], int),
         flat=np.array([config in FLAT_CONFIGS for _, _, config, _ in verified], bool),
@@ -135,9 +138,8 @@ def _reason(index: int, names: Sequence[str], matches: Matches, models: Sequence
 
 def why_no_model(photos: "Sequence[Photo]", matches: Matches, registered: int, points: int) -> StageError:
     """The error for a set of photos from which no scene can be made, by what its pairs tell."""
-    count = len(photos)
-    pairs, verified = count * (count - 1) // 2, len(matches.pairs)
-    what = f"the cameras of {count} photos could not be found"
+    pairs, verified = matches.tried, len(matches.pairs)
+    what = f"the cameras of {len(photos)} photos could not be found"
     if np.median(matches.keypoints) < FEW_FEATURES:
         return StageError(
             what,

@@ -1,7 +1,6 @@
 """Stage sfm: where every photo was taken from, by structure-from-motion or from cameras that are known already."""
 
 import json
-import os
 import shutil
 import signal
 import subprocess
@@ -23,12 +22,13 @@ if TYPE_CHECKING:
     from stages.photos import Photo
 
 NEEDS = ("ingest",)
-VERSION = 1
+VERSION = 2
 RESUMES = True
 LINKS = ("sparse",)
 UNKEYED = ("max_seconds",)
 
 CameraModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE"]
+Matcher = Literal["exhaustive", "sequential", "spatial", "retrieval"]
 # The share of the whole where a phase begins, and how long it is (measured on 11 to 50 photos, two cores).
 PHASES = {
     "features": (0.0, 0.25),
@@ -38,6 +38,7 @@ PHASES = {
     "mapping again": (0.85, 0.1),
     "refining": (0.95, 0.05),
 }
+FOR_CHILD = ("seed", "max_image_size", "max_features", "camera_model", "matcher", "neighbours")
 CHILD = ["-m", "stages.sfm_child"]
 MOST_NAMES = 5
 
@@ -55,10 +56,25 @@ class Config(StageConfig):
     """Features per photo, the largest ones first; matching takes time with its square."""
     camera_model: CameraModel | None = None
     """COLMAP's camera model; None: SIMPLE_RADIAL, and RADIAL in the end where enough photos share a camera."""
-    matcher: Literal["exhaustive"] = "exhaustive"
-    """Which pairs of photos are matched: all of them."""
+    matcher: Matcher | None = None
+    """Which pairs of photos are matched: all, neighbours in time or place, or those that look alike; None: by cost."""
+    neighbours: int = Field(default=30, ge=1)
+    """Partners of each photo, where not all pairs are matched."""
     max_seconds: float = Field(default=4 * 3600.0, gt=0)
     """When structure-from-motion is given up; what was matched until then is kept for the next try."""
+
+
+def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
+    """The config with the pairs to match chosen, by what matching two of the photos takes on this machine."""
+    from stages.matching_plan import chosen_matcher
+    from stages.photos import read_photos
+
+    if config.cameras is not None or config.matcher is not None:
+        return config
+    photos = sorted(read_photos(inputs["ingest"]), key=lambda photo: photo.file)
+    features = config.model_dump(include={"max_image_size", "max_features"})
+    matcher = chosen_matcher(photos, inputs["ingest"] / "images", config.neighbours, features, progress)
+    return config.model_copy(update={"matcher": matcher})
 
 
 def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> StageResult:
@@ -69,7 +85,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     folder.mkdir(parents=True, exist_ok=True)
     if config.cameras is not None:
         return _import(config.cameras, photos, inputs["ingest"], folder, progress)
-    return _reconstruct(config, photos, inputs["ingest"], folder, progress)
+    return _reconstruct(plan(config, inputs, progress), photos, inputs["ingest"], folder, progress)
 
 
 # --- known cameras
@@ -100,9 +116,11 @@ def _import(cameras: Path, photos: "list[Photo]", ingest: Path, folder: Path, pr
 
 
 def _reconstruct(config: Config, photos: "list[Photo]", ingest: Path, folder: Path, progress: Progress) -> StageResult:
+    from stages.matching_plan import check_matcher, places_of
     from stages.registration import FEWEST_POINTS, FEWEST_REGISTERED, account, read_matches, why_no_model
 
     _check_count(photos)
+    check_matcher(config.matcher, places_of(photos))
     names = [photo.file.removeprefix("images/") for photo in photos]
     database = _database(folder, names, progress)
     found = _run_child(config, photos, ingest / "images", folder, database, progress)
@@ -167,9 +185,9 @@ def _run_child(
         "images": str(images.absolute()),
         "database": str(database.absolute()),
         "photos": [asdict(photo) for photo in photos],
-        **config.model_dump(include={"seed", "max_image_size", "max_features", "camera_model"}),
+        **config.model_dump(include={*FOR_CHILD}),
     }
-    latest: dict[str, Any] = {"phase": "features", "database": job["database"], "done": 0, "again": ""}
+    latest: dict[str, Any] = {"phase": "features", "database": job["database"], "done": 0, "again": "", "pairs": 0}
     log = folder / "sfm.log"
     with log.open("ab") as stderr:
         child = _start_child(stderr)
@@ -195,16 +213,14 @@ def _run_child(
 
 
 def _start_child(stderr: Any) -> "subprocess.Popen[bytes]":
-    root = str(Path(__file__).parents[1])
-    path = os.pathsep.join(filter(None, (root, os.environ.get("PYTHONPATH"))))
+    from stages.matching_plan import environment
+
     return subprocess.Popen(
         [sys.executable, *CHILD],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=stderr,
-        # COLMAP parallelises over photos and pairs by itself; threads inside its linear algebra would let
-        # roundings depend on the number of cores and on what else the machine does.
-        env={**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
+        env=environment(),
         start_new_session=True,  # Ctrl-C reaches the parent alone, which then ends the child
     )
 
@@ -228,7 +244,7 @@ def _describe(latest: Mapping[str, Any], photos: int) -> tuple[str, float | None
     features, pairs = count_done(Path(latest["database"]))  # the first of mapping's steps places two photos
     done, total, words = {
         "features": (features, photos, "features of {} of {} photos"),
-        "matching": (pairs, photos * (photos - 1) // 2, "matched {} of {} pairs of photos"),
+        "matching": (pairs, latest["pairs"], "matched {} of {} pairs of photos"),
         "mapping": (latest["done"] and min(latest["done"] + 1, photos), photos, "placed {} of {} photos"),
     }[phase]
     begin, length = PHASES[phase + latest["again"]]

@@ -12,19 +12,26 @@ import sys
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from itertools import count
 from pathlib import Path
 from typing import Any
 
 from stages.colmap.mapping import MAPPING_MODEL, map_incrementally, rank
-from stages.colmap.matching import copy_without_matches_of, extract_features, fill_database, match_exhaustively
+from stages.colmap.matching import (
+    LOOSE_RATIO,
+    STRICT_RATIO,
+    copy_without_matches_of,
+    extract_features,
+    fill_database,
+    look_alike,
+    match_pairs,
+)
 from stages.colmap.refinement import finish
+from stages.matching_plan import about, places_of
+from stages.pairing import Pairs, pairs_of, second_look
 from stages.photos import Photo
-
-# Lowe's ratio: 0.8 is SIFT's own. 0.9 lets in many mismatches, most of which verification throws out again, and
-# finds views that lie farther apart; only photos that otherwise stay without a place are matched like that.
-STRICT_RATIO = 0.8
-LOOSE_RATIO = 0.9
+from stages.sfm import Matcher
 
 Say = Callable[..., None]
 
@@ -44,6 +51,8 @@ class Job:
     max_image_size: int
     max_features: int
     camera_model: str | None
+    matcher: Matcher
+    neighbours: int
 
 
 def main() -> None:
@@ -77,14 +86,18 @@ def reconstruct(job: Job, say: Say) -> dict[str, Any]:
     say(phase="features")
     fill_database(database, photos, job.camera_model or MAPPING_MODEL)
     extract_features(database, images, photos, job.max_image_size, job.max_features)
-    mapped = _match_and_map(job, database, STRICT_RATIO, say)
+    similarity = cache(lambda: look_alike(database, len(photos), job.seed))
+    pairs = pairs_of(job.matcher, job.neighbours, len(photos), places_of(photos), similarity)
+    mapped = _match_and_map(job, database, pairs, STRICT_RATIO, say)
     placed = _files(mapped[0]) if mapped else []
-    missing = {file for photo in photos if (file := photo.file.removeprefix("images/")) not in placed}
+    files = [photo.file.removeprefix("images/") for photo in photos]
+    missing = [number for number, file in enumerate(files) if file not in placed]
     if missing:
         say(note=f"{len(missing)} of {len(photos)} photos found no place: matching them again, less strictly")
         loose = database.with_name(f"{database.stem}-loose.db")
-        copy_without_matches_of(missing, database, loose)
-        again = _match_and_map(job, loose, LOOSE_RATIO, say)
+        copy_without_matches_of({files[number] for number in missing}, database, loose)
+        pairs = second_look(pairs, missing, job.neighbours, similarity)
+        again = _match_and_map(job, loose, pairs, LOOSE_RATIO, say)
         if again and (not mapped or rank(again[0]) > rank(mapped[0])):
             mapped, database = again, loose
     if not mapped:
@@ -105,10 +118,11 @@ def reconstruct(job: Job, say: Say) -> dict[str, Any]:
     }
 
 
-def _match_and_map(job: Job, database: Path, max_ratio: float, say: Say) -> list[Any]:
-    """All sub-models that come of matching so strictly, best first."""
-    say(phase="matching", database=str(database), again=" again" if max_ratio == LOOSE_RATIO else "")
-    match_exhaustively(database, job.seed, max_ratio)
+def _match_and_map(job: Job, database: Path, pairs: Pairs, max_ratio: float, say: Say) -> list[Any]:
+    """All sub-models that come of matching these pairs so strictly, best first."""
+    again = " again" if max_ratio == LOOSE_RATIO else ""
+    say(phase="matching", database=str(database), pairs=len(pairs), again=again)
+    match_pairs(database, pairs, job.seed, max_ratio, lambda left, seconds: say(note=_expected(job, left, seconds)))
     say(phase="mapping", done=0)
     placed = count(1)
     models = Path(job.folder, "models")
@@ -117,6 +131,12 @@ def _match_and_map(job: Job, database: Path, max_ratio: float, say: Say) -> list
     )
     shutil.rmtree(models)
     return mapped
+
+
+def _expected(job: Job, pairs: int, seconds: float) -> str:
+    count = len(job.photos)
+    every = "all " if pairs == count * (count - 1) // 2 else ""
+    return f"matching {every}{pairs:,} pairs of photos: about {about(seconds)}"
 
 
 def _files(model: Any) -> list[str]:

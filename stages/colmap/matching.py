@@ -1,10 +1,20 @@
 """Features and matches: everything that fills COLMAP's database. Call it in a child process."""
 
+import os
 import shutil
-from collections.abc import Container, Sequence
+import time
+from collections.abc import Callable, Container, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache, partial
 from itertools import combinations
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from stages.feature_matching import match_descriptors
+from stages.pairing import Pairs, Similarity
+from stages.retrieval import photo_similarity
 
 if TYPE_CHECKING:
     import pycolmap
@@ -13,7 +23,12 @@ if TYPE_CHECKING:
 
 FOCAL_GUESS = 1.2  # focal length over the longer side where EXIF is silent: 45 degrees, a phone's wide lens
 UPSAMPLE_UP_TO_PX = 1024  # smaller photos yield too few features at their own size
-BLOCK_SIZE = 5  # photos per block of matching; a block of pairs is committed at once (progress, resuming)
+# Lowe's ratio: 0.8 is SIFT's own. 0.9 lets in many mismatches, most of which verification throws out again, and
+# finds views that lie farther apart; only photos that otherwise stay without a place are matched like that.
+STRICT_RATIO = 0.8
+LOOSE_RATIO = 0.9
+BLOCK_SIZE = 32  # pairs of photos that are committed at once (progress, resuming)
+CACHED_PHOTOS = 256  # whose features are held in memory, about half a megabyte each
 
 
 def fill_database(database: Path, photos: "Sequence[Photo]", camera_model: str) -> None:
@@ -74,22 +89,84 @@ def extract_features(
             pycolmap.extract_features(database, images, names, extraction_options=options, device=pycolmap.Device.cpu)
 
 
-def match_exhaustively(database: Path, seed: int, max_ratio: float) -> None:
-    """Match and verify every pair of photos that has not been yet.
+def match_pairs(
+    database: Path,
+    pairs: Pairs,
+    seed: int,
+    max_ratio: float,
+    on_expected: Callable[[int, float], None] = lambda left, seconds: None,
+) -> None:
+    """Match and verify these pairs of photos (numbered from 0) where that has not been done yet.
 
-    ``max_ratio`` is Lowe's: the best match must be nearer than this share of the second best.
+    ``max_ratio`` is Lowe's: the best match must be nearer than this share of the second best. ``on_expected`` is told
+    how many pairs there are to match and how long it will take, once a first block, spread over all, is done.
     """
     import pycolmap
 
-    # With two threads 2 of 9 runs on the fox came out different: on the same descriptors, four pairs of photos had
-    # one match more or less (it is an approximate search). With one thread that has not been seen.
-    matching = pycolmap.FeatureMatchingOptions(num_threads=1)
-    matching.sift.max_ratio = max_ratio
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = seed
-    # The block size decides which photo of a pair comes first, and with it ties: it may not depend on anything.
-    pairing = pycolmap.ExhaustivePairingOptions(block_size=BLOCK_SIZE)
-    pycolmap.match_exhaustive(database, matching, pairing, verification, pycolmap.Device.cpu)
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.random_seed = seed
+    with pycolmap.Database.open(database) as db, ThreadPoolExecutor(os.cpu_count()) as pool:
+        todo = _spread([(i, j) for i, j in pairs.tolist() if not db.exists_two_view_geometry(i + 1, j + 1)])
+        photo = lru_cache(CACHED_PHOTOS)(partial(_read_photo, db))
+        for begin in range(0, len(todo), BLOCK_SIZE):
+            block = todo[begin : begin + BLOCK_SIZE]
+            started = time.monotonic()
+            work = [pool.submit(_match, photo(i), photo(j), max_ratio, options) for i, j in block]
+            with pycolmap.DatabaseTransaction(db):
+                for (i, j), (matches, geometry) in zip(block, (each.result() for each in work), strict=True):
+                    db.write_matches(i + 1, j + 1, matches)
+                    db.write_two_view_geometry(i + 1, j + 1, geometry)
+            if not begin:
+                on_expected(len(todo), (time.monotonic() - started) * len(todo) / len(block))
+
+
+def _spread(pairs: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    """The same pairs, a block from all over them first: what it costs then holds for the rest."""
+    step = max(1, len(pairs) // BLOCK_SIZE)
+    first = pairs[::step][:BLOCK_SIZE]
+    chosen = set(first)
+    return first + [pair for pair in pairs if pair not in chosen]
+
+
+class _Photo(NamedTuple):
+    camera: "pycolmap.Camera"
+    places: np.ndarray  # (keypoints, 2), pixels
+    descriptors: np.ndarray  # (keypoints, 128), bytes
+
+
+def _read_photo(db: "pycolmap.Database", photo: int) -> _Photo:
+    camera = db.read_camera(db.read_image(photo + 1).camera_id)
+    keypoints = np.array(db.read_keypoints(photo + 1), float).reshape(-1, 6)
+    return _Photo(camera, keypoints[:, :2], read_descriptors(db, photo))
+
+
+def look_alike(database: Path, count: int, seed: int) -> Similarity:
+    """How much any two photos look alike, by their features."""
+    import pycolmap
+
+    with pycolmap.Database.open(database) as db:
+        return photo_similarity(partial(read_descriptors, db), count, seed)
+
+
+def read_descriptors(db: "pycolmap.Database", photo: int) -> np.ndarray:
+    """Of the photo with this number, (keypoints, 128) bytes."""
+    return np.array(db.read_descriptors(photo + 1).data, np.uint8).reshape(-1, 128)
+
+
+def _match(
+    first: _Photo, second: _Photo, max_ratio: float, options: "pycolmap.TwoViewGeometryOptions"
+) -> "tuple[np.ndarray, pycolmap.TwoViewGeometry]":
+    """Matches, and those that some geometry of two views explains; empty where too few do."""
+    import pycolmap
+
+    matches = match_descriptors(first.descriptors, second.descriptors, max_ratio)
+    if len(matches) < options.min_num_inliers:
+        return matches, pycolmap.TwoViewGeometry()
+    geometry = pycolmap.estimate_two_view_geometry(
+        first.camera, first.places, second.camera, second.places, matches, options
+    )
+    enough = len(geometry.inlier_matches) >= options.min_num_inliers
+    return matches, geometry if enough else pycolmap.TwoViewGeometry()
 
 
 def copy_without_matches_of(names: Container[str], database: Path, copy: Path) -> None:

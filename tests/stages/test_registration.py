@@ -16,6 +16,7 @@ def matches(*pairs: tuple[int, int, int], keypoints: int = 500, flat: int = 0, s
     array = np.array(pairs, int).reshape(-1, 3)
     return Matches(
         keypoints=np.full(len(NAMES), keypoints),
+        tried=len(NAMES) * (len(NAMES) - 1) // 2,
         pairs=array[:, :2],
         inliers=array[:, 2],
         flat=np.arange(len(array)) < flat,

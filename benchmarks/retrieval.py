@@ -1,0 +1,131 @@
+"""What choosing pairs by retrieval saves and loses on a large set, against matching every pair.
+
+    python benchmarks/retrieval.py [--photos 400] [--matchers exhaustive retrieval] [--neighbours 30]
+
+Draws photos of 320 × 240 along both sides of a synthetic street: each shows about a thirtieth of it, so that most pairs
+share nothing, and their names are in random order. Then runs stage sfm with each way of choosing pairs, and prints
+pairs, seconds of matching, seconds of the whole stage, registered photos, and the largest distance of a camera centre
+from the truth, in share of the street's length.
+"""
+
+import argparse
+import math
+import re
+import tempfile
+import time
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+
+from nerf import solid_texture
+from nerf.camera_paths import look_at
+from nerf.scene import Camera
+from nerf.shapes import Box
+from nerf.solid_texture import make_noise
+from nerf.synthetic import Solid, SyntheticScene, photograph
+from pipeline.truth import align
+from stages import ingest, sfm
+from stages.colmap.cameras import camera_rays
+from stages.colmap.models import read_model
+
+LENS = Camera("SIMPLE_RADIAL", 320, 240, (300.0, 160.0, 120.0, -0.05))
+STEP = 0.25  # scene units between photos
+AWAY = 2.5  # from the houses
+VISIBLE = 4.0  # along the street
+TEXTURES = (solid_texture.marble, solid_texture.wrapping, solid_texture.doughnut, solid_texture.peel)
+
+
+def street(length: float, random: np.random.Generator) -> SyntheticScene:
+    """Houses of width 1 along x, none like another: each has its own depth, height, texture and noise."""
+    solids = []
+    for house in range(-math.ceil(VISIBLE), math.ceil(length + VISIBLE)):
+        depth, height = random.uniform(0.3, 0.8), random.uniform(0.6, 1.4)
+        pose = torch.tensor([[1.0, 0, 0, house + 0.5], [0, 1, 0, 0], [0, 0, 1, 0]])
+        texture = TEXTURES[random.integers(len(TEXTURES))]
+        solids.append(Solid(Box((0.5, depth, height)), pose, partial(texture, make_noise(house + 1000))))
+    return SyntheticScene(tuple(solids), make_noise(0))
+
+
+def poses(count: int, random: np.random.Generator) -> np.ndarray:
+    """World from camera, (count, 3, 4): along the houses and back again, hand-held."""
+    there = (count + 1) // 2
+    along = 2 * STEP * np.concatenate([np.arange(there), np.arange(count - there)[::-1] + 0.5])
+    height = np.where(np.arange(count) < there, -0.15, 0.25)
+    centres = np.stack([along, np.full(count, -AWAY), height], axis=1) + random.uniform(-0.08, 0.08, (count, 3))
+    aims = np.stack([along, np.zeros(count), np.zeros(count)], axis=1) + random.uniform(-0.15, 0.15, (count, 3))
+    turns = look_at(centres - aims, np.zeros(3))[:, :, :3]
+    return np.concatenate([turns, centres[:, :, None]], axis=2)
+
+
+def draw(folder: Path, count: int, seed: int = 0) -> dict[str, np.ndarray]:
+    """Write the photos; the true poses by name."""
+    random = np.random.default_rng(seed)
+    truth = dict(zip((f"{i:04d}.png" for i in random.permutation(count)), poses(count, random), strict=True))
+    scene = street(STEP * count, random)
+    directions = torch.from_numpy(camera_rays(LENS, LENS.width, LENS.height))
+    folder.mkdir()
+    for name, pose in truth.items():
+        near = tuple(solid for solid in scene.solids if abs(float(solid.world_from_shape[0, 3]) - pose[0, 3]) < VISIBLE)
+        with torch.inference_mode():
+            image = photograph(scene._replace(solids=near), directions, torch.tensor(pose).float(), 1)
+        Image.fromarray((255 * image).round().byte().numpy()).save(folder / name)
+    return truth
+
+
+class Timed:
+    """A Progress that prints what stays and remembers how long each kind of live line stood."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self.last = ("", time.perf_counter())
+
+    def update(self, message: str, done: float | None = None) -> None:
+        """Account for the time since the last line."""
+        kind, now = re.sub(r"\d+", "#", message), time.perf_counter()
+        before, since = self.last
+        self.seconds[before] = self.seconds.get(before, 0.0) + now - since
+        self.last = (kind, now)
+
+    def note(self, message: str) -> None:
+        """Print the note."""
+        print(f"  {message}", flush=True)
+
+
+def measure(matcher: str, folder: Path, truth: dict[str, np.ndarray], neighbours: int) -> None:
+    """Run stage sfm and print its line of the table."""
+    progress, sfm_folder = Timed(), folder / matcher
+    config = sfm.Config.model_validate({"matcher": matcher, "neighbours": neighbours})
+    begin = time.perf_counter()
+    result = sfm.run(config, {"ingest": folder / "ingest"}, sfm_folder, progress)
+    seconds = time.perf_counter() - begin
+    model = read_model(sfm_folder / "sparse")
+    true = np.stack([truth[image.file] for image in model.images])[:, :, 3]
+    found = np.stack([image.sfm_from_camera for image in model.images])
+    aligned = np.stack([align(found[:, :, 3], true).pose(pose) for pose in found])[:, :, 3]
+    off = np.linalg.norm(aligned - true, axis=1).max() / np.ptp(true[:, 0])
+    matching = sum(value for kind, value in progress.seconds.items() if kind.startswith("matched"))
+    print(f"{matcher:12s} {matching:9.0f} {seconds:6.0f}  {100 * off:6.2f} %  {result.line}", flush=True)
+
+
+def main() -> None:
+    """Draw the street, then measure every way."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--photos", type=int, default=400)
+    parser.add_argument("--matchers", nargs="+", default=["exhaustive", "retrieval"])
+    parser.add_argument("--neighbours", type=int, default=sfm.Config().neighbours)
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        truth = draw(folder / "photos", arguments.photos)
+        (folder / "ingest").mkdir()
+        ingest.run(ingest.Config(photos=folder / "photos"), {}, folder / "ingest", Timed())
+        print(f"{'matcher':12s} {'matching':>9s} {'sfm s':>6s}  {'farthest':>8s}")
+        for matcher in arguments.matchers:
+            measure(matcher, folder, truth, arguments.neighbours)
+
+
+if __name__ == "__main__":
+    main()
