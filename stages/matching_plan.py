@@ -117,7 +117,7 @@ def main() -> None:
 def measure(images: str, photos: list[dict[str, Any]], max_image_size: int, max_features: int) -> float:
     """Seconds of the wall clock that matching any two of these photos takes, on all cores."""
     from stages.colmap.mapping import MAPPING_MODEL
-    from stages.colmap.matching import STRICT_RATIO, extract_features, fill_database, match_pairs
+    from stages.colmap.matching import STRICT_RATIO, Search, extract_features, fill_database, match_pairs
     from stages.pairing import exhaustive
     from stages.photos import Photo
 
@@ -126,7 +126,7 @@ def measure(images: str, photos: list[dict[str, Any]], max_image_size: int, max_
     with tempfile.TemporaryDirectory() as scratch:
         database = Path(scratch, "some.db")
         fill_database(database, some, MAPPING_MODEL)
-        extract_features(database, Path(images), some, max_image_size, max_features)
+        extract_features(database, Path(images), some, Search(max_image_size, max_features))
         started = time.monotonic()
         match_pairs(database, pairs, 0, STRICT_RATIO)
         return (time.monotonic() - started) / len(pairs)

@@ -5,7 +5,7 @@ in one process undo each other's locks and damage the file (https://sqlite.org/h
 """
 
 import sqlite3
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +15,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from stages.contract import StageError
+from stages.degeneracy import count_turns
+from stages.sfm_attempts import WEAK_START
 
 if TYPE_CHECKING:
     from stages.photos import Photo
@@ -22,6 +24,7 @@ if TYPE_CHECKING:
 FEWEST_REGISTERED = 3  # one to hold out, two to learn from; two views alone fit many wrong scenes
 FEWEST_POINTS = 100
 FEW_FEATURES = 50
+FEWEST_SEEN = WEAK_START.photo_matches
 SAME_VIEW_PX = 1.0
 FLAT_CONFIGS = (4, 5, 6)  # colmap TwoViewGeometry: PLANAR, PANORAMIC, PLANAR_OR_PANORAMIC
 PAIR_BASE = 2**31 - 1  # pair_id = PAIR_BASE * first image id + second image id
@@ -32,8 +35,8 @@ OVERLAP_HINT = "Take photos with 60–80 % overlap, so that everything is visibl
 class Matches:
     """The verified among ``tried`` pairs of photos; photos are numbered from 0 in order of ``file``.
 
-    ``flat``: a plane or a rotation alone explains the pair, so it tells nothing of depth. ``shift_px``: median
-    distance between matched keypoints.
+    ``flat``: a plane or a rotation alone explains the pair, so it tells nothing of depth; ``homography`` is that map
+    (zero where there is none). ``shift_px``: median distance between matched keypoints.
     """
 
     keypoints: Int[np.ndarray, "photos"]
@@ -41,6 +44,7 @@ class Matches:
     pairs: Int[np.ndarray, "pairs 2"]
     inliers: Int[np.ndarray, "pairs"]
     flat: Bool[np.ndarray, "pairs"]
+    homography: Float[np.ndarray, "pairs 3 3"]
     shift_px: Float[np.ndarray, "pairs"]
 
 
@@ -80,7 +84,7 @@ def read_matches(database: Path) -> Matches:
             "SELECT COALESCE(rows, 0) FROM images LEFT JOIN keypoints USING (image_id) ORDER BY image_id"
         ).fetchall()
         verified = db.execute(
-            "SELECT pair_id, rows, config, data FROM two_view_geometries WHERE rows > 0 ORDER BY pair_id"
+            "SELECT pair_id, rows, config, data, H FROM two_view_geometries WHERE rows > 0 ORDER BY pair_id"
         ).fetchall()
         places = {
             image_id - 1: np.frombuffer(data, np.float32).reshape(rows, cols)[:, :2]
@@ -88,7 +92,7 @@ def read_matches(database: Path) -> Matches:
         }
     pairs = np.array([divmod(pair_id, PAIR_BASE) for pair_id, *_ in verified], int).reshape(-1, 2) - 1
     shifts = []
-    for (first, second), (_, rows, _, data) in zip(pairs, verified, strict=True):
+    for (first, second), (_, rows, _, data, _) in zip(pairs, verified, strict=True):
         matched = np.frombuffer(data, np.uint32).reshape(rows, 2)
         offsets = places[first][matched[:, 0]] - places[second][matched[:, 1]]
         shifts.append(np.median(np.linalg.norm(offsets, axis=1)))
@@ -96,23 +100,34 @@ def read_matches(database: Path) -> Matches:
         keypoints=np.array(keypoints, int).reshape(-1),
         tried=tried,
         pairs=pairs,
-        inliers=np.array([rows for _, rows, _, _ in verified], int),
-        flat=np.array([config in FLAT_CONFIGS for _, _, config, _ in verified], bool),
+        inliers=np.array([rows for _, rows, *_ in verified], int),
+        flat=np.array([config in FLAT_CONFIGS for _, _, config, *_ in verified], bool),
+        homography=np.array([_matrix(blob) for *_, blob in verified]).reshape(-1, 3, 3),
         shift_px=np.array(shifts, float),
     )
 
 
+def _matrix(blob: bytes | None) -> np.ndarray:
+    return np.frombuffer(blob, np.float64).reshape(3, 3) if blob else np.zeros((3, 3))
+
+
 def account(
-    names: Sequence[str], matches: Matches, models: Sequence[Sequence[str]], observations: dict[str, int]
+    names: Sequence[str],
+    matches: Matches,
+    models: Sequence[Sequence[str]],
+    observations: Mapping[str, int],
+    supports: Mapping[str, tuple[int, int]],
 ) -> list[dict[str, Any]]:
-    """What became of each photo, for registration.json. ``models`` are the names in each sub-model, best first."""
+    """What became of each photo, for registration.json. ``models`` are the names in each sub-model, best first;
+    ``supports`` as stages/colmap/diagnosis.py finds them."""
     entries = []
     for index, name in enumerate(names):
+        reason = None if name in models[0] else _reason(index, names, matches, models, supports[name])
         entries.append(
             {
                 "file": name,
                 "registered": name in models[0],
-                "reason": None if name in models[0] else _reason(index, names, matches, models),
+                "reason": reason,
                 "keypoints": int(matches.keypoints[index]),
                 "observations": observations.get(name, 0),
             }
@@ -120,20 +135,33 @@ def account(
     return entries
 
 
-def _reason(index: int, names: Sequence[str], matches: Matches, models: Sequence[Sequence[str]]) -> str:
-    if not matches.keypoints[index]:
+def _reason(
+    index: int, names: Sequence[str], matches: Matches, models: Sequence[Sequence[str]], support: tuple[int, int]
+) -> str:
+    """Why a photo has no place: the first link that is missing between its features and the model."""
+    features, (seen, agreeing) = int(matches.keypoints[index]), support
+    if not features:
         return "no features found in it: blurred, dark or without texture"
     mine = (matches.pairs == index).any(axis=1)
     if not mine.any():
-        return "it shares no view with any other photo"
+        few = f" (only {features} features found in it)" if features < FEW_FEATURES else ""
+        return f"it shares no view with any other photo{few}"
     if others := [model for model in models[1:] if names[index] in model]:
         return f"it belongs to another group of {len(others[0])} photos that does not connect to this one"
     partners = matches.pairs[mine].sum(axis=1) - index
     in_model = np.array([names[partner] in models[0] for partner in partners])
     if not in_model.any():
-        return "it shares views only with photos that are not registered either"
-    most = matches.inliers[mine][in_model].max()
-    return f"too few matches to the model: at most {most} with a registered photo"
+        return f"it shares views only with photos that are not registered either ({len(partners)} of them)"
+    if seen >= FEWEST_SEEN and agreeing >= FEWEST_SEEN:
+        return f"its position is not sure: {agreeing} of its {seen} features that are points of the model agree on one"
+    if seen >= FEWEST_SEEN:
+        return (
+            f"its matches contradict each other: {agreeing} of {seen} agree on one position, {FEWEST_SEEN} are needed"
+        )
+    if matches.flat[mine][in_model].all():
+        turned = f"all {int(in_model.sum())} of its pairs with registered photos"
+        return f"{turned} differ by a turn of the camera alone, or show one flat surface"
+    return f"too few of its features are points of the model: {seen}, {FEWEST_SEEN} are needed"
 
 
 def why_no_model(photos: "Sequence[Photo]", matches: Matches, registered: int, points: int) -> StageError:
@@ -155,12 +183,24 @@ def why_no_model(photos: "Sequence[Photo]", matches: Matches, registered: int, p
             "Move the camera between photos.",
         )
     if (flat := int(matches.flat.sum())) > verified / 2:
-        return StageError(
-            what,
-            f"{flat} of {verified} matching pairs differ by a turn of the camera alone, or show one flat surface",
-            "Move sideways between photos, by a tenth of the distance to the scene, instead of turning on the spot.",
-        )
+        return _no_depth(what, photos, matches, flat)
     why = f"{verified} of {pairs} pairs of photos share a view, but no two of them tell the depth of the scene"
     if registered:
         why = f"only {registered} photos and {points} points fit together; {verified} of {pairs} pairs share a view"
     return StageError(what, why, OVERLAP_HINT)
+
+
+def _no_depth(what: str, photos: "Sequence[Photo]", matches: Matches, flat: int) -> StageError:
+    sizes = np.array([(photo.width, photo.height) for photo in photos])
+    turns = count_turns(matches.homography[matches.flat], sizes[matches.pairs[matches.flat]])
+    if turns > flat / 2:
+        return StageError(
+            what,
+            f"the camera turned on the spot: {turns} of {len(matches.pairs)} matching pairs differ by a rotation alone",
+            "Move sideways between photos, by a tenth of the distance to the scene, instead of turning on the spot.",
+        )
+    return StageError(
+        what,
+        f"the photos show one flat surface: a plane alone explains {flat} of {len(matches.pairs)} matching pairs",
+        "Take in something that stands out from the surface, and photograph it from the side as well.",
+    )

@@ -17,6 +17,7 @@ from pydantic import Field
 from stages.contract import Inputs, OptionalSourcePath, Progress, StageConfig, StageError, StageResult
 from stages.files import write_json
 from stages.live_line import live_line
+from stages.sfm_attempts import ATTEMPTS, JOURNAL, abandon
 
 if TYPE_CHECKING:
     from stages.photos import Photo
@@ -29,16 +30,10 @@ UNKEYED = ("max_seconds",)
 
 CameraModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE"]
 Matcher = Literal["exhaustive", "sequential", "spatial", "retrieval"]
-# The share of the whole where a phase begins, and how long it is (measured on 11 to 50 photos, two cores).
-PHASES = {
-    "features": (0.0, 0.25),
-    "matching": (0.25, 0.35),
-    "mapping": (0.6, 0.1),
-    "matching again": (0.7, 0.15),
-    "mapping again": (0.85, 0.1),
-    "refining": (0.95, 0.05),
-}
-FOR_CHILD = ("seed", "max_image_size", "max_features", "camera_model", "matcher", "neighbours")
+# The share of the first attempt where a phase begins, and how long it is (measured on 11 to 50 photos, two cores).
+PHASES = {"features": (0.0, 0.35), "matching": (0.35, 0.5), "mapping": (0.85, 0.15)}
+FIRST_ATTEMPT, REFINING = 0.7, 0.95  # where they end and begin in the whole
+FOR_CHILD = ("seed", "max_image_size", "max_features", "camera_model", "matcher", "neighbours", "attempts")
 CHILD = ["-m", "stages.sfm_child"]
 MOST_NAMES = 5
 
@@ -60,6 +55,8 @@ class Config(StageConfig):
     """Which pairs of photos are matched: all, neighbours in time or place, or those that look alike; None: by cost."""
     neighbours: int = Field(default=30, ge=1)
     """Partners of each photo, where not all pairs are matched."""
+    attempts: int = Field(default=len(ATTEMPTS), ge=1, le=len(ATTEMPTS))
+    """How many ways to find the cameras are tried while photos have no place; 1: only the first."""
     max_seconds: float = Field(default=4 * 3600.0, gt=0)
     """When structure-from-motion is given up; what was matched until then is kept for the next try."""
 
@@ -129,14 +126,14 @@ def _reconstruct(config: Config, photos: "list[Photo]", ingest: Path, folder: Pa
     if not models or len(models[0]) < FEWEST_REGISTERED or points < FEWEST_POINTS:
         shutil.rmtree(folder / "sparse", ignore_errors=True)
         raise why_no_model(photos, matches, len(models[0]) if models else 0, points)
-    images = account(names, matches, models, found["observations"])
+    images = account(names, matches, models, found["observations"], found["supports"])
     _say_who_is_missing(photos, images, progress)
     _say_principal_point(found, progress)
-    for leftover in folder.glob("matches-*"):
-        leftover.unlink()
+    _forget(folder)
     return _result(
         folder,
         source="sfm",
+        attempts=found["attempts"],
         images=images,
         reprojection_px=found["reprojection_px"],
         points=points,
@@ -166,14 +163,29 @@ def _database(folder: Path, names: Sequence[str], progress: Progress) -> Path:
     database = folder / f"matches-{version('pycolmap')}.db"
     if not database.exists():
         return database
-    if all(is_sound(one, names) for one in folder.glob("matches-*.db")):
+    journal = folder / "attempts" / JOURNAL
+    if all(is_sound(one, names) for one in folder.glob("matches-*.db")) and (not journal.exists() or _parses(journal)):
         features, pairs = count_done(database)
         progress.note(f"going on with the features of {features} photos and {pairs} matched pairs found before")
     else:
         progress.note("the matches of the interrupted run are damaged: starting over")
-        for damaged in folder.glob("matches-*"):
-            damaged.unlink()
+        _forget(folder)
     return database
+
+
+def _parses(path: Path) -> bool:
+    try:
+        json.loads(path.read_bytes())
+    except ValueError:
+        return False
+    return True
+
+
+def _forget(folder: Path) -> None:
+    """Remove what only an interrupted run needs."""
+    for database in folder.glob("matches-*"):
+        database.unlink()
+    shutil.rmtree(folder / "attempts", ignore_errors=True)
 
 
 def _run_child(
@@ -187,7 +199,8 @@ def _run_child(
         "photos": [asdict(photo) for photo in photos],
         **config.model_dump(include={*FOR_CHILD}),
     }
-    latest: dict[str, Any] = {"phase": "features", "database": job["database"], "done": 0, "again": "", "pairs": 0}
+    latest: dict[str, Any] = {"phase": "features", "database": job["database"], "done": 0, "pairs": 0}
+    latest["attempt"] = ATTEMPTS[0].name
     log = folder / "sfm.log"
     with log.open("ab") as stderr:
         child = _start_child(stderr)
@@ -208,6 +221,8 @@ def _run_child(
             child.kill()
             child.wait()
     if "result" not in latest:
+        if latest["attempt"] != ATTEMPTS[0].name and (late or code not in (0, -signal.SIGKILL)):
+            abandon(folder / "attempts", latest["attempt"])
         raise _child_failed(code, config.max_seconds if late else None, latest["phase"], log)
     return latest["result"]
 
@@ -240,15 +255,20 @@ def _describe(latest: Mapping[str, Any], photos: int) -> tuple[str, float | None
 
     phase = latest["phase"]
     if phase == "refining":
-        return "adjusting all cameras and points together", PHASES[phase][0]
+        return "adjusting all cameras and points together", REFINING
     features, pairs = count_done(Path(latest["database"]))  # the first of mapping's steps places two photos
     done, total, words = {
         "features": (features, photos, "features of {} of {} photos"),
         "matching": (pairs, latest["pairs"], "matched {} of {} pairs of photos"),
         "mapping": (latest["done"] and min(latest["done"] + 1, photos), photos, "placed {} of {} photos"),
     }[phase]
-    begin, length = PHASES[phase + latest["again"]]
-    return words.format(done, total) + latest["again"], begin + length * done / total
+    begin, length = PHASES[phase]
+    share = begin + length * done / max(1, total)
+    attempt = [one.name for one in ATTEMPTS].index(latest["attempt"])
+    if not attempt:
+        return words.format(done, total), FIRST_ATTEMPT * share
+    later = (attempt - 1 + share) / (len(ATTEMPTS) - 1)
+    return f"{words.format(done, total)} ({latest['attempt']})", FIRST_ATTEMPT + (REFINING - FIRST_ATTEMPT) * later
 
 
 def _child_failed(code: int, limit: float | None, phase: str, log: Path) -> StageError:

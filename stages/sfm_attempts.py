@@ -1,29 +1,39 @@
 """What structure-from-motion tries until every photo has a place: a fixed list, cheapest first. Runs in the child.
 
-Each attempt changes one thing against the first and says so. The best model so far and a journal are on disk between
-attempts (``attempts/`` in the stage's folder), so that whatever ends the process costs one attempt at most.
+Each attempt changes one thing against the first and says so. What came of it is on disk before the next one begins
+(``attempts/`` in the stage's folder), so that whatever ends the process costs one attempt at most.
 """
 
 import json
-import shutil
-from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
-from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
-from stages.colmap.mapping import OTHER_SEED, WEAK_START, Effort, map_globally, map_incrementally, rank
-from stages.files import write_json
+from stages.files import write_durably
 
-if TYPE_CHECKING:
-    import pycolmap
+# New features, or another idea of the lens, cost as much as the first attempt: they wait until so many are missing.
+WORTH_STARTING_OVER = 0.1
+JOURNAL, ABANDONED = "journal.json", "abandoned.json"
 
-# Attempts that search features or match anew cost as much as the first: they wait until so many photos are missing.
-WORTH_NEW_FEATURES = 0.1
+
+class Effort(NamedTuple):
+    """What incremental mapping asks of its first pair and of every photo after it; as it stands, COLMAP's defaults."""
+
+    first_pair_matches: int = 100
+    first_pair_angle_deg: float = 16.0
+    forward_motion: float = 0.95  # share of the first pair's motion along its view
+    photo_matches: int = 30  # with points of the model
+    photo_inlier_share: float = 0.25
+    seed: int = 0  # added to the run's
+
+
+# A quarter of the angle and half of the matches: what a first pair with little baseline still has.
+WEAK_START = Effort(50, 4.0, 1.0, 15, 0.15)
+OTHER_SEED = Effort(seed=1)
 
 
 class Attempt(NamedTuple):
-    """One way to get at cameras. ``matches``: those of the best attempt so far, or which new ones; ``effort`` of
+    """One way to get at cameras. ``matches``: new ones, or those of the best attempt so far ("same"); ``effort`` of
     incremental mapping, None for global mapping."""
 
     name: str
@@ -35,23 +45,87 @@ class Attempt(NamedTuple):
 ATTEMPTS = (
     Attempt("first", "", "strict", Effort()),
     Attempt("looser matching", "matching them again, less strictly", "loose", Effort()),
-    Attempt("weaker start", "mapping again, with less asked of the first pair and of every photo", "same", WEAK_START),
+    Attempt("weaker start", "mapping again, asking less of the first pair and of every photo", "same", WEAK_START),
     Attempt("other seed", "mapping again, with another seed", "same", OTHER_SEED),
-    Attempt("all at once", "placing all photos at once (global mapping)", "same", None),
+    Attempt("all at once", "mapping again, all photos at once", "same", None),
     Attempt("fisheye", "verifying and mapping again, as if through a fisheye lens", "fisheye", Effort()),
-    Attempt("more features", "searching twice the features at full size, and matching those", "rich", WEAK_START),
+    Attempt("more features", "searching twice as many features at full size", "rich", WEAK_START),
 )
 
 
-@dataclass
+@dataclass(frozen=True)
 class Tried:
-    """What came of an attempt: the files in each sub-model, best first, and what the best is ranked by."""
+    """What came of an attempt: the file name of its database, the files in each sub-model, best first, and of the best
+    one its points and mean error."""
 
     name: str
     database: str
     groups: list[list[str]] = field(default_factory=list)
-    rank: tuple[int, int, float] = (0, 0, 0.0)
-    skipped: str | None = None
+    points: int = 0
+    reprojection_px: float | None = None
+
+    @property
+    def rank(self) -> tuple[int, int, float]:
+        """Greater is better: more registered photos, then more points, then a smaller error."""
+        return (len(self.groups[0]), self.points, -(self.reprojection_px or 0.0)) if self.groups else (0, 0, 0.0)
 
 
-Say = Callable[..., None]
+class Journal:
+    """The attempts so far, on disk. ``model(name)`` is where an attempt's best sub-model is kept."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        folder.mkdir(parents=True, exist_ok=True)
+        self.tried = [Tried(**entry) for entry in _read(folder / JOURNAL)]
+        self.abandoned: list[str] = _read(folder / ABANDONED)
+
+    def model(self, name: str) -> Path:
+        """The folder of an attempt's best sub-model."""
+        return self.folder / name.replace(" ", "-")
+
+    def done(self, name: str) -> Tried | None:
+        """What came of the attempt of this name, None if it was not made."""
+        return next((tried for tried in self.tried if tried.name == name), None)
+
+    def add(self, tried: Tried) -> None:
+        """Note an attempt, durably."""
+        self.tried.append(tried)
+        write_durably(self.folder / JOURNAL, json.dumps([asdict(one) for one in self.tried]).encode())
+
+    def best(self) -> Tried | None:
+        """The best attempt that led to a model; of equals the first."""
+        return max((tried for tried in self.tried if tried.groups), key=lambda tried: tried.rank, default=None)
+
+
+def abandon(folder: Path, name: str) -> None:
+    """Note, in the parent, that an attempt ended the child by itself: it is not made again in this folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    write_durably(folder / ABANDONED, json.dumps(sorted({*_read(folder / ABANDONED), name})).encode())
+
+
+def _read(path: Path) -> list:
+    return json.loads(path.read_bytes()) if path.exists() else []
+
+
+class Situation(NamedTuple):
+    """What the attempts so far have left: ``missing`` of ``photos`` have no place; ``linked``: one of them shares a view
+    with another photo; ``flat``: there is no model, and a plane or a turn explains next to all pairs."""
+
+    missing: int
+    photos: int
+    linked: bool
+    flat: bool
+    lens_is_given: bool
+
+
+def reason_against(attempt: Attempt, now: Situation) -> str | None:
+    """Why an attempt cannot help or is not worth its time, None if it should be made."""
+    if now.flat and attempt.matches != "loose":
+        return "the photos tell nothing of depth"
+    if attempt.matches == "same" and not now.linked:
+        return "none of them shares a view with another photo"
+    if attempt.matches == "fisheye" and now.lens_is_given:
+        return "the camera model is given"
+    if attempt.matches in ("fisheye", "rich") and now.missing < WORTH_STARTING_OVER * now.photos:
+        return f"{now.missing} of {now.photos} photos are not worth starting over"
+    return None

@@ -12,26 +12,31 @@ import sys
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
+from functools import cached_property
 from itertools import count
 from pathlib import Path
 from typing import Any
 
-from stages.colmap.mapping import MAPPING_MODEL, map_incrementally, rank
+from stages.colmap.diagnosis import links, supports
+from stages.colmap.mapping import MAPPING_MODEL, map_globally, map_incrementally
 from stages.colmap.matching import (
     LOOSE_RATIO,
     STRICT_RATIO,
+    Search,
+    copy_as_fisheye,
     copy_without_matches_of,
     extract_features,
     fill_database,
     look_alike,
     match_pairs,
 )
+from stages.colmap.models import load_native
 from stages.colmap.refinement import finish
 from stages.matching_plan import about, places_of
-from stages.pairing import Pairs, pairs_of, second_look
+from stages.pairing import Pairs, Similarity, pairs_of, second_look
 from stages.photos import Photo
 from stages.sfm import Matcher
+from stages.sfm_attempts import ATTEMPTS, Attempt, Journal, Situation, Tried, reason_against
 
 Say = Callable[..., None]
 
@@ -53,6 +58,7 @@ class Job:
     camera_model: str | None
     matcher: Matcher
     neighbours: int
+    attempts: int
 
 
 def main() -> None:
@@ -74,69 +80,162 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
+class _Work:
+    """What the attempts share: the photos (numbered from 0, in order of ``file``), their pairs, the journal."""
+
+    def __init__(self, job: Job, say: Say) -> None:
+        self.job, self.say = job, say
+        self.photos = [Photo(**photo) for photo in job.photos]
+        self.files = [photo.file.removeprefix("images/") for photo in self.photos]
+        self.database, self.images = Path(job.database), Path(job.images)
+        self.journal = Journal(Path(job.folder, "attempts"))
+
+    @cached_property
+    def similarity(self) -> Similarity:
+        return look_alike(self.database, len(self.photos), self.job.seed)
+
+    @cached_property
+    def pairs(self) -> Pairs:
+        job = self.job
+        return pairs_of(job.matcher, job.neighbours, len(self.files), places_of(self.photos), lambda: self.similarity)
+
+    def missing(self) -> list[int]:
+        """The photos that have no place in the best model so far."""
+        best = self.journal.best()
+        placed = set(best.groups[0]) if best else set()
+        return [number for number, file in enumerate(self.files) if file not in placed]
+
+    def beside(self, name: str) -> Path:
+        """Another database, beside the first."""
+        return self.database.with_name(f"{self.database.stem}-{name}.db")
+
+    def latest(self) -> Path:
+        """The database of the best attempt; as long as there is no model, that with most matches, the latest."""
+        best = self.journal.best() or self.journal.tried[-1]
+        return self.database.with_name(best.database)
+
+
 def reconstruct(job: Job, say: Say) -> dict[str, Any]:
     """Run structure-from-motion and write the best sub-model to ``sparse/``; nothing if none came out.
 
-    Returns the ``database`` that was used in the end, the files in each sub-model, best first (``models``), and of the
-    best: its ``points``, ``observations`` by file, mean ``reprojection_px``, ``camera_model``, and how many
-    ``vague_cameras`` kept their principal points in the centre.
+    Returns the ``database`` that was used in the end, the files in each sub-model, best first (``models``), the
+    ``attempts`` that were made, and of the best model: its ``points``, ``observations`` by file, mean
+    ``reprojection_px``, ``camera_model``, how many ``vague_cameras`` kept their principal points in the centre, and
+    for every photo without a place how many of its features are points of it and how many agree (``supports``).
     """
-    database, images = Path(job.database), Path(job.images)
-    photos = [Photo(**photo) for photo in job.photos]
-    say(phase="features")
-    fill_database(database, photos, job.camera_model or MAPPING_MODEL)
-    extract_features(database, images, photos, job.max_image_size, job.max_features)
-    similarity = cache(lambda: look_alike(database, len(photos), job.seed))
-    pairs = pairs_of(job.matcher, job.neighbours, len(photos), places_of(photos), similarity)
-    mapped = _match_and_map(job, database, pairs, STRICT_RATIO, say)
-    placed = _files(mapped[0]) if mapped else []
-    files = [photo.file.removeprefix("images/") for photo in photos]
-    missing = [number for number, file in enumerate(files) if file not in placed]
-    if missing:
-        say(note=f"{len(missing)} of {len(photos)} photos found no place: matching them again, less strictly")
-        loose = database.with_name(f"{database.stem}-loose.db")
-        copy_without_matches_of({files[number] for number in missing}, database, loose)
-        pairs = second_look(pairs, missing, job.neighbours, similarity)
-        again = _match_and_map(job, loose, pairs, LOOSE_RATIO, say)
-        if again and (not mapped or rank(again[0]) > rank(mapped[0])):
-            mapped, database = again, loose
-    if not mapped:
-        return {"database": str(database), "models": []}
+    work = _Work(job, say)
+    for attempt in ATTEMPTS[: job.attempts]:
+        if (missing := work.missing()) and work.journal.done(attempt.name) is None:
+            _make(attempt, missing, work)
+    tried = [_entry(one) for one in work.journal.tried]
+    best = work.journal.best()
+    if best is None:
+        return {"database": str(work.latest()), "models": [], "attempts": tried}
     say(phase="refining")
-    model, vague = finish(mapped[0], database, job.seed, job.camera_model is not None)
+    database = work.latest()
+    mapped = load_native(work.journal.model(best.name))  # from disk also where it is at hand: then resuming is no other
+    model, vague = finish(mapped, database, job.seed, job.camera_model is not None)
     sparse = Path(job.folder, "sparse")
     sparse.mkdir(exist_ok=True)
     model.write_binary(sparse)
     return {
         "database": str(database),
-        "models": [_files(m) for m in (model, *mapped[1:])],
+        "attempts": tried,
+        "models": [_files(model), *best.groups[1:]],
         "observations": {m.name: m.num_points3D for m in map(model.image, sorted(model.reg_image_ids()))},
         "points": model.num_points3D(),
         "reprojection_px": model.compute_mean_reprojection_error(),
         "camera_model": "/".join(sorted({camera.model_name for camera in model.cameras.values()})),
         "vague_cameras": len(vague),
+        "supports": supports(model, database, job.seed),
     }
 
 
-def _match_and_map(job: Job, database: Path, pairs: Pairs, max_ratio: float, say: Say) -> list[Any]:
-    """All sub-models that come of matching these pairs so strictly, best first."""
-    again = " again" if max_ratio == LOOSE_RATIO else ""
-    say(phase="matching", database=str(database), pairs=len(pairs), again=again)
-    match_pairs(database, pairs, job.seed, max_ratio, lambda left, seconds: say(note=_expected(job, left, seconds)))
-    say(phase="mapping", done=0)
-    placed = count(1)
-    models = Path(job.folder, "models")
-    mapped = map_incrementally(
-        database, Path(job.images), models, job.seed, lambda: say(phase="mapping", done=next(placed))
-    )
+def _make(attempt: Attempt, missing: list[int], work: _Work) -> None:
+    """Make an attempt and note what came of it; one that cannot help is passed over, one that failed is named."""
+    count, lens_is_given = len(work.photos), work.job.camera_model is not None
+    if attempt.name != ATTEMPTS[0].name:
+        some, flat = links(work.latest(), {work.files[number] for number in missing})
+        situation = Situation(len(missing), count, some, flat and len(missing) == count, lens_is_given)
+        if reason_against(attempt, situation):
+            return
+        if attempt.name in work.journal.abandoned:
+            work.say(note=f"left out, for it ended the program last time: {attempt.words}")
+            return
+        have = "has" if len(missing) == 1 else "have"
+        work.say(note=f"{len(missing)} of {count} photos {have} no place yet: {attempt.words}")
+    work.say(attempt=attempt.name)
+    database = _matched(attempt, missing, work)
+    models = _mapped(attempt, database, work)
+    tried = Tried(attempt.name, database.name)
+    if models:
+        folder = work.journal.model(attempt.name)
+        folder.mkdir(parents=True, exist_ok=True)
+        models[0].write_binary(folder)
+        groups = [_files(model) for model in models]
+        error = models[0].compute_mean_reprojection_error()
+        tried = Tried(attempt.name, database.name, groups, models[0].num_points3D(), error)
+    work.journal.add(tried)
+
+
+def _matched(attempt: Attempt, missing: list[int], work: _Work) -> Path:
+    """The database with the matches that the attempt works on."""
+    job, database = work.job, work.database
+    if attempt.matches == "same":
+        return work.latest()
+    if attempt.matches == "strict":
+        _find_features(database, Search(job.max_image_size, job.max_features), work)
+        _match(database, work.pairs, STRICT_RATIO, work)
+    elif attempt.matches == "loose":
+        database = work.beside("loose")
+        copy_without_matches_of({work.files[number] for number in missing}, work.database, database)
+        _match(database, second_look(work.pairs, missing, job.neighbours, lambda: work.similarity), LOOSE_RATIO, work)
+    elif attempt.matches == "fisheye":
+        latest, database = work.latest(), work.beside("fisheye")
+        copy_as_fisheye(latest, database, job.seed)
+    else:
+        database = work.beside("rich")
+        longest = max(max(photo.width, photo.height) for photo in work.photos)
+        _find_features(database, Search(longest, 2 * job.max_features, from_double_size=True), work)
+        _match(database, work.pairs, STRICT_RATIO, work)
+    return database
+
+
+def _find_features(database: Path, search: Search, work: _Work) -> None:
+    work.say(phase="features", database=str(database))
+    fill_database(database, work.photos, work.job.camera_model or MAPPING_MODEL)
+    extract_features(database, work.images, work.photos, search)
+
+
+def _match(database: Path, pairs: Pairs, max_ratio: float, work: _Work) -> None:
+    def expect(left: int, seconds: float) -> None:
+        count = len(work.photos)
+        every = "all " if left == count * (count - 1) // 2 else ""
+        work.say(note=f"matching {every}{left:,} pairs of photos: about {about(seconds)}")
+
+    work.say(phase="matching", database=str(database), pairs=len(pairs))
+    match_pairs(database, pairs, work.job.seed, max_ratio, expect)
+
+
+def _mapped(attempt: Attempt, database: Path, work: _Work) -> list[Any]:
+    """All sub-models that come of these matches, best first."""
+    work.say(phase="mapping", done=0)
+    models = Path(work.job.folder, "models")
+    if attempt.effort is None:
+        found = map_globally(database, work.images, models, work.job.seed)
+    else:
+        placed = count(1)
+        report = lambda: work.say(phase="mapping", done=next(placed))  # noqa: E731
+        found = map_incrementally(database, work.images, models, work.job.seed, attempt.effort, report)
     shutil.rmtree(models)
-    return mapped
+    return found
 
 
-def _expected(job: Job, pairs: int, seconds: float) -> str:
-    count = len(job.photos)
-    every = "all " if pairs == count * (count - 1) // 2 else ""
-    return f"matching {every}{pairs:,} pairs of photos: about {about(seconds)}"
+def _entry(tried: Tried) -> dict[str, Any]:
+    """What registration.json says of an attempt."""
+    registered = len(tried.groups[0]) if tried.groups else 0
+    facts = {"registered": registered, "points": tried.points, "reprojection_px": tried.reprojection_px}
+    return {"attempt": tried.name, **facts}
 
 
 def _files(model: Any) -> list[str]:

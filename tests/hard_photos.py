@@ -95,14 +95,13 @@ def _bearings(camera: Camera) -> "torch.Tensor":
 
 @cache
 def _scene(number: int) -> "SyntheticScene":
+    from nerf.shapes import Frustum
     from nerf.synthetic import still_life
 
     if number != PLANE:
         return still_life(number)
     table = still_life(3)
-    top = table.solids[0]
-    wide = top._replace(shape=type(top.shape)(30.0, 30.0, 0.05))
-    return table._replace(solids=(wide,))
+    return table._replace(solids=(table.solids[0]._replace(shape=Frustum(30.0, 30.0, 0.05)),))
 
 
 def walk(count: int, of: int = 36, start: int = 0) -> Poses:

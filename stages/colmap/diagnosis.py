@@ -1,12 +1,38 @@
 """Why a photo has no place in a model. Call it in a child process."""
 
+from collections.abc import Container
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 if TYPE_CHECKING:
     import pycolmap
+
+MOSTLY = 0.9
+
+
+class Links(NamedTuple):
+    """What the verified pairs of photos say: whether one of the photos asked for has any, and whether next to all are
+    explained by a plane or a turn of the camera alone."""
+
+    some: bool
+    flat: bool
+
+
+def links(database: Path, names: Container[str]) -> Links:
+    """Of the photos with these names, and of all."""
+    import pycolmap
+
+    kinds = pycolmap.TwoViewGeometryConfiguration
+    some, flat = False, []
+    with pycolmap.Database.open(database) as db:
+        name = {image.image_id: image.name for image in db.read_all_images()}
+        for pair_id, geometry in zip(*db.read_two_view_geometries(), strict=True):
+            if len(geometry.inlier_matches):
+                some = some or any(name[number] in names for number in pycolmap.pair_id_to_image_pair(pair_id))
+                flat.append(geometry.config in (kinds.PLANAR, kinds.PANORAMIC, kinds.PLANAR_OR_PANORAMIC))
+    return Links(some, sum(flat) > MOSTLY * len(flat))
 
 
 def supports(model: "pycolmap.Reconstruction", database: Path, seed: int) -> dict[str, tuple[int, int]]:
@@ -23,7 +49,8 @@ def supports(model: "pycolmap.Reconstruction", database: Path, seed: int) -> dic
                 continue
             points = _points_seen(image.image_id, geometries, model)
             keypoints = np.asarray(db.read_keypoints(image.image_id), float)[:, :2]
-            camera = model.cameras.get(image.camera_id) or db.read_camera(image.camera_id)
+            known = model.exists_camera(image.camera_id)
+            camera = model.camera(image.camera_id) if known else db.read_camera(image.camera_id)
             found[image.name] = (len(points), _agreeing(points, keypoints, camera, model, seed))
     return found
 

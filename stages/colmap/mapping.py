@@ -2,7 +2,9 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
+
+from stages.sfm_attempts import Effort
 
 if TYPE_CHECKING:
     import pycolmap
@@ -11,26 +13,10 @@ MAPPING_MODEL = "SIMPLE_RADIAL"  # one focal length and one distortion term hold
 SMALLEST_MODEL = 3
 
 
-class Effort(NamedTuple):
-    """What incremental mapping asks of its first pair and of every photo after it; as it stands, COLMAP's defaults."""
-
-    first_pair_matches: int = 100
-    first_pair_angle_deg: float = 16.0
-    forward_motion: float = 0.95  # share of the first pair's motion along its view
-    photo_matches: int = 30  # with points of the model
-    photo_inlier_share: float = 0.25
-    seed: int = 0  # added to the run's
-
-
-# A quarter of the angle and half of the matches: what a first pair with little baseline still has.
-WEAK_START = Effort(50, 4.0, 1.0, 15, 0.15)
-OTHER_SEED = Effort(seed=1)
-
-
 def map_incrementally(
     database: Path, images: Path, models: Path, seed: int, effort: Effort, on_image: Callable[[], None]
 ) -> "list[pycolmap.Reconstruction]":
-    """All sub-models, best first (:func:`rank`). ``on_image`` is called per photo."""
+    """All sub-models, best first: most registered photos, then most points. ``on_image`` is called per photo."""
     import pycolmap
 
     models.mkdir(parents=True, exist_ok=True)
@@ -43,7 +29,7 @@ def map_incrementally(
     found = pycolmap.incremental_mapping(
         database, images, models, options, initial_image_pair_callback=on_image, next_image_callback=on_image
     )
-    return sorted(found.values(), key=rank, reverse=True)
+    return sorted(found.values(), key=_rank, reverse=True)
 
 
 def map_globally(database: Path, images: Path, models: Path, seed: int) -> "list[pycolmap.Reconstruction]":
@@ -60,12 +46,11 @@ def map_globally(database: Path, images: Path, models: Path, seed: int) -> "list
     mapper.retriangulation.random_seed = seed
     pycolmap.set_random_seed(seed)
     found = pycolmap.global_mapping(database, images, models, options)
-    return sorted(found.values(), key=rank, reverse=True)
+    return sorted(found.values(), key=_rank, reverse=True)
 
 
-def rank(model: "pycolmap.Reconstruction") -> tuple[int, int, float]:
-    """What makes a model better than another: more registered photos, then more points, then a smaller error."""
-    return model.num_reg_images(), model.num_points3D(), -model.compute_mean_reprojection_error()
+def _rank(model: "pycolmap.Reconstruction") -> tuple[int, int]:
+    return model.num_reg_images(), model.num_points3D()
 
 
 def pipeline_options(seed: int) -> "pycolmap.IncrementalPipelineOptions":

@@ -1,5 +1,6 @@
 """Features and matches: everything that fills COLMAP's database. Call it in a child process."""
 
+import math
 import os
 import shutil
 import time
@@ -28,6 +29,8 @@ UPSAMPLE_UP_TO_PX = 1024  # smaller photos yield too few features at their own s
 STRICT_RATIO = 0.8
 LOOSE_RATIO = 0.9
 BLOCK_SIZE = 32  # pairs of photos that are committed at once (progress, resuming)
+FISHEYE_MODEL = "SIMPLE_RADIAL_FISHEYE"
+FISHEYE_ANGLE_DEG = 150.0
 CACHED_PHOTOS = 256  # whose features are held in memory, about half a megabyte each
 
 
@@ -68,9 +71,16 @@ def _name(photo: "Photo") -> str:
     return photo.file.removeprefix("images/")
 
 
-def extract_features(
-    database: Path, images: Path, photos: "Sequence[Photo]", max_image_size: int, max_features: int
-) -> None:
+class Search(NamedTuple):
+    """How far features are searched: the longer side in pixels that photos are reduced to, the most features of each,
+    and whether photos of any size are doubled first."""
+
+    max_image_size: int
+    max_features: int
+    from_double_size: bool = False
+
+
+def extract_features(database: Path, images: Path, photos: "Sequence[Photo]", search: Search) -> None:
     """SIFT keypoints and descriptors of every photo that has none yet; alpha is ignored.
 
     Photos are searched from their own size down. Doubling them first, as is COLMAP's habit, costs 4.5 times as
@@ -79,9 +89,10 @@ def extract_features(
     import pycolmap
 
     options = pycolmap.FeatureExtractionOptions()
-    options.max_image_size = max_image_size
-    options.sift.max_num_features = max_features
-    small = {_name(p) for p in photos if max(p.width, p.height) <= UPSAMPLE_UP_TO_PX}
+    options.max_image_size = search.max_image_size
+    options.sift.max_num_features = search.max_features
+    doubled_up_to = math.inf if search.from_double_size else UPSAMPLE_UP_TO_PX
+    small = {_name(p) for p in photos if max(p.width, p.height) <= doubled_up_to}
     for first_octave, is_small in ((-1, True), (0, False)):
         names = [name for name in map(_name, photos) if (name in small) is is_small]
         if names:
@@ -175,11 +186,7 @@ def copy_without_matches_of(names: Container[str], database: Path, copy: Path) -
 
     if copy.exists():
         return
-    unfinished = copy.with_suffix(".unfinished")
-    for part in ("", "-wal"):  # as long as anybody reads along, the latest pages stay in the write-ahead log
-        unfinished.with_name(unfinished.name + part).unlink(missing_ok=True)
-        if (source := database.with_name(database.name + part)).exists():
-            shutil.copyfile(source, unfinished.with_name(unfinished.name + part))
+    unfinished = _unfinished_copy(database, copy)
     with pycolmap.Database.open(unfinished) as db, pycolmap.DatabaseTransaction(db):
         images = sorted(db.read_all_images(), key=lambda image: image.image_id)
         for first, second in combinations(images, 2):
@@ -187,3 +194,45 @@ def copy_without_matches_of(names: Container[str], database: Path, copy: Path) -
                 db.delete_matches(first.image_id, second.image_id)
                 db.delete_two_view_geometry(first.image_id, second.image_id)
     unfinished.replace(copy)
+
+
+def copy_as_fisheye(database: Path, copy: Path, seed: int) -> None:
+    """Copy the database, its cameras become fisheye lenses and its matches verified anew; nothing where it is there.
+
+    Without EXIF the lens is equidistant (r = f θ) with FISHEYE_ANGLE_DEG from corner to corner. Its focal length counts
+    as known: two views through such a lens have no fundamental matrix to do without it.
+    """
+    import pycolmap
+
+    if copy.exists():
+        return
+    unfinished = _unfinished_copy(database, copy)
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.random_seed = seed
+    with pycolmap.Database.open(unfinished) as db, pycolmap.DatabaseTransaction(db):
+        for camera in db.read_all_cameras():
+            focal_px = math.hypot(camera.width, camera.height) / math.radians(FISHEYE_ANGLE_DEG)
+            if camera.has_prior_focal_length:
+                focal_px = camera.mean_focal_length()
+            size = camera.width, camera.height
+            lens = pycolmap.Camera.create_from_model_name(camera.camera_id, FISHEYE_MODEL, focal_px, *size)
+            lens.has_prior_focal_length = True
+            db.update_camera(lens)
+        photo = lru_cache(CACHED_PHOTOS)(partial(_read_photo, db))
+        for pair_id, matches in zip(*db.read_all_matches(), strict=True):
+            first, second = pycolmap.pair_id_to_image_pair(pair_id)
+            one, other = photo(first - 1), photo(second - 1)
+            views = one.camera, one.places, other.camera, other.places
+            db.delete_two_view_geometry(first, second)
+            geometry = pycolmap.estimate_two_view_geometry(*views, np.asarray(matches, np.uint32), options)
+            db.write_two_view_geometry(first, second, geometry)
+    unfinished.replace(copy)
+
+
+def _unfinished_copy(database: Path, copy: Path) -> Path:
+    unfinished = copy.with_suffix(".unfinished")
+    for part in ("", "-wal"):  # as long as anybody reads along, the latest pages stay in the write-ahead log
+        unfinished.with_name(unfinished.name + part).unlink(missing_ok=True)
+        if (source := database.with_name(database.name + part)).exists():
+            shutil.copyfile(source, unfinished.with_name(unfinished.name + part))
+    return unfinished

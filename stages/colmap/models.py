@@ -1,12 +1,16 @@
 """Sparse models on disk, in COLMAP's own files."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from stages.colmap.cameras import native, plain
 from stages.contract import StageError
 from stages.sparse_model import SparseImage, SparseModel
+
+if TYPE_CHECKING:
+    import pycolmap
 
 
 def read_model(sparse: Path) -> SparseModel:
@@ -36,6 +40,13 @@ def read_model(sparse: Path) -> SparseModel:
         point=np.searchsorted(point_ids, np.array([p.point3D_id for s in seen for p in s], np.int64)),
         xy=np.array([p.xy for s in seen for p in s], float).reshape(-1, 2),
     )
+
+
+def load_native(sparse: Path) -> "pycolmap.Reconstruction":
+    """A model that this program wrote, as COLMAP has it."""
+    import pycolmap
+
+    return pycolmap.Reconstruction(sparse)
 
 
 def write_model(sparse: Path, model: SparseModel) -> None:

@@ -11,8 +11,10 @@ NAMES = ["a.jpg", "b.jpg", "c.jpg", "d.jpg", "e.jpg"]
 PHOTOS = [Photo(name, f"images/{name}", 60, 40, 0, None, None, False, 1.0) for name in NAMES]
 
 
-def matches(*pairs: tuple[int, int, int], keypoints: int = 500, flat: int = 0, shift_px: float = 9.0) -> Matches:
-    """Pairs as (first, second, inliers), the first ``flat`` of them flat."""
+def matches(
+    *pairs: tuple[int, int, int], keypoints: int = 500, flat: int = 0, shift_px: float = 9.0, turned: bool = True
+) -> Matches:
+    """Pairs as (first, second, inliers), the first ``flat`` of them flat, all of them turns or none."""
     array = np.array(pairs, int).reshape(-1, 3)
     return Matches(
         keypoints=np.full(len(NAMES), keypoints),
@@ -20,32 +22,67 @@ def matches(*pairs: tuple[int, int, int], keypoints: int = 500, flat: int = 0, s
         pairs=array[:, :2],
         inliers=array[:, 2],
         flat=np.arange(len(array)) < flat,
+        homography=np.tile(np.eye(3) if turned else np.diag([2.0, 1.0, 1.0]), (len(array), 1, 1)),
         shift_px=np.full(len(array), shift_px),
     )
 
 
-def test_every_photo_without_a_place_has_its_reason() -> None:
-    found = matches((0, 1, 90), (1, 2, 80), (2, 3, 19), (1, 3, 22))
-    found.keypoints[4] = 0
-    entries = account(NAMES, found, [["a.jpg", "b.jpg", "c.jpg"]], {"a.jpg": 60, "b.jpg": 70, "c.jpg": 50})
+FOUR = (matches((0, 1, 90), (1, 2, 80), (2, 3, 19), (1, 3, 22)), [["a.jpg", "b.jpg", "c.jpg"]])
+
+
+def reasons(found: Matches, models: list[list[str]], **support: tuple[int, int]) -> dict[str, str | None]:
+    entries = account(NAMES, found, models, {}, {name: support.get(name[0], (0, 0)) for name in NAMES})
+    return {entry["file"][0]: entry["reason"] for entry in entries}
+
+
+def test_the_account_tells_who_is_registered() -> None:
+    nothing = dict.fromkeys(NAMES, (0, 0))
+    entries = account(NAMES, *FOUR, {"a.jpg": 60, "b.jpg": 70, "c.jpg": 50}, nothing)
     assert [entry["registered"] for entry in entries] == [True, True, True, False, False]
     assert [entry["observations"] for entry in entries] == [60, 70, 50, 0, 0]
-    assert [entry["reason"] for entry in entries] == [
-        *[None] * 3,
-        "too few matches to the model: at most 22 with a registered photo",
-        "no features found in it: blurred, dark or without texture",
-    ]
+    assert [entry["reason"] is None for entry in entries] == [True, True, True, False, False]
+
+
+@pytest.mark.parametrize(
+    ("support", "why"),
+    [
+        ((7, 6), "too few of its features are points of the model: 7, 15 are needed"),
+        ((40, 9), "its matches contradict each other: 9 of 40 agree on one position, 15 are needed"),
+        ((40, 20), "its position is not sure: 20 of its 40 features that are points of the model agree on one"),
+    ],
+)
+def test_a_photo_that_shares_views_with_the_model_has_too_little_to_stand_on(
+    support: tuple[int, int], why: str
+) -> None:
+    assert reasons(*FOUR, d=support)["d"] == why
+
+
+def test_a_photo_may_only_be_turned_against_the_model() -> None:
+    found = matches((2, 3, 19), (1, 3, 22), (0, 1, 90), flat=2)
+    why = "all 2 of its pairs with registered photos differ by a turn of the camera alone, or show one flat surface"
+    assert reasons(found, FOUR[1], d=(3, 3))["d"] == why
 
 
 def test_a_photo_may_share_no_view_or_belong_elsewhere() -> None:
-    found = matches((0, 1, 90), (2, 3, 80))
-    models = [["a.jpg", "b.jpg"], ["c.jpg"]]
-    assert [entry["reason"] for entry in account(NAMES, found, models, {})] == [
-        *[None] * 2,
-        "it belongs to another group of 1 photos that does not connect to this one",
-        "it shares views only with photos that are not registered either",
-        "it shares no view with any other photo",
-    ]
+    told = reasons(matches((0, 1, 90), (2, 3, 80)), [["a.jpg", "b.jpg"], ["c.jpg"]])
+    assert told == {
+        "a": None,
+        "b": None,
+        "c": "it belongs to another group of 1 photos that does not connect to this one",
+        "d": "it shares views only with photos that are not registered either (1 of them)",
+        "e": "it shares no view with any other photo",
+    }
+
+
+@pytest.mark.parametrize(
+    ("keypoints", "why"),
+    [
+        (0, "no features found in it: blurred, dark or without texture"),
+        (20, "it shares no view with any other photo (only 20 features found in it)"),
+    ],
+)
+def test_a_photo_may_have_next_to_nothing_to_match(keypoints: int, why: str) -> None:
+    assert reasons(matches((0, 1, 90), keypoints=keypoints), [["a.jpg", "b.jpg"]])["e"] == why
 
 
 @pytest.mark.parametrize(
@@ -61,7 +98,12 @@ def test_a_photo_may_share_no_view_or_belong_elsewhere() -> None:
         (
             matches((0, 1, 90), (1, 2, 90), (2, 3, 90), flat=2),
             3,
-            "2 of 3 matching pairs differ by a turn of the camera alone, or show one flat surface",
+            "the camera turned on the spot: 2 of 3 matching pairs differ by a rotation alone",
+        ),
+        (
+            matches((0, 1, 90), (1, 2, 90), (2, 3, 90), flat=2, turned=False),
+            3,
+            "the photos show one flat surface: a plane alone explains 2 of 3 matching pairs",
         ),
         (
             matches((0, 1, 90)),

@@ -1,0 +1,68 @@
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from stages.sfm_attempts import ATTEMPTS, Journal, Situation, Tried, abandon, reason_against
+
+BY_NAME = {attempt.name: attempt for attempt in ATTEMPTS}
+
+
+def test_the_list_begins_with_the_plain_attempt_and_its_names_are_unique() -> None:
+    assert ATTEMPTS[0].matches == "strict" and not ATTEMPTS[0].words
+    assert len(BY_NAME) == len(ATTEMPTS)
+    assert all(attempt.words for attempt in ATTEMPTS[1:])
+
+
+def test_more_photos_beat_more_points_beat_less_error() -> None:
+    groups = [["a", "b", "c"], ["d"]]
+    ranked = [
+        Tried("none", "x.db"),
+        Tried("few", "x.db", [["a", "b"]], 900, 0.1),
+        Tried("inexact", "x.db", groups, 500, 0.9),
+        Tried("exact", "x.db", groups, 500, 0.3),
+        Tried("rich", "x.db", groups, 501, 2.0),
+    ]
+    ranks = [tried.rank for tried in ranked]
+    assert ranks == sorted(set(ranks))
+
+
+def test_the_journal_is_read_back_and_knows_the_best(tmp_path: Path) -> None:
+    journal = Journal(tmp_path / "attempts")
+    assert journal.best() is None and journal.done("first") is None
+    one, other = Tried("first", "x.db", [["a", "b"]], 50, 0.5), Tried("other seed", "x.db", [["a", "b"]], 50, 0.5)
+    for tried in (Tried("all at once", "x.db"), one, other):
+        journal.add(tried)
+    again = Journal(tmp_path / "attempts")
+    assert again.tried == journal.tried and again.best() == one  # of equals the first
+    assert again.done("other seed") == other
+    assert again.model("other seed") == tmp_path / "attempts" / "other-seed"
+
+
+def test_what_ended_the_program_is_remembered(tmp_path: Path) -> None:
+    for name in ("all at once", "fisheye", "fisheye"):
+        abandon(tmp_path / "attempts", name)
+    assert Journal(tmp_path / "attempts").abandoned == ["all at once", "fisheye"]
+
+
+PLAIN = Situation(missing=1, photos=50, linked=True, flat=False, lens_is_given=False)
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "why"),
+    [
+        ("looser matching", {"linked": False, "flat": True}, None),
+        ("weaker start", {}, None),
+        ("weaker start", {"linked": False, "missing": 40}, "none of them shares a view with another photo"),
+        ("weaker start", {"flat": True}, "the photos tell nothing of depth"),
+        ("all at once", {"linked": False}, "none of them shares a view with another photo"),
+        ("fisheye", {"missing": 40}, None),
+        ("fisheye", {"missing": 40, "lens_is_given": True}, "the camera model is given"),
+        ("fisheye", {"missing": 4}, "4 of 50 photos are not worth starting over"),
+        ("more features", {"missing": 5, "linked": False, "lens_is_given": True}, None),
+        ("more features", {"missing": 4}, "4 of 50 photos are not worth starting over"),
+        ("more features", {"missing": 50, "flat": True}, "the photos tell nothing of depth"),
+    ],
+)
+def test_an_attempt_that_cannot_help_is_not_made(name: str, change: dict[str, Any], why: str | None) -> None:
+    assert reason_against(BY_NAME[name], PLAIN._replace(**change)) == why
