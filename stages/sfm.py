@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from stages.photos import Photo
 
 NEEDS = ("ingest",)
-VERSION = 1
+VERSION = 2
 RESUMES = True
 LINKS = ("sparse",)
 UNKEYED = ("max_seconds",)
@@ -100,8 +100,9 @@ def _import(cameras: Path, photos: "list[Photo]", ingest: Path, folder: Path, pr
 
 
 def _reconstruct(config: Config, photos: "list[Photo]", ingest: Path, folder: Path, progress: Progress) -> StageResult:
-    from stages.registration import FEWEST_POINTS, FEWEST_REGISTERED, account, read_matches, why_no_model
+    from stages.registration import FEWEST_POINTS, FEWEST_REGISTERED, account, read_matches, with_left_out, why_no_model
 
+    everything, photos = photos, [photo for photo in photos if not photo.near_duplicate_of]
     _check_count(photos)
     names = [photo.file.removeprefix("images/") for photo in photos]
     database = _database(folder, names, progress)
@@ -119,7 +120,7 @@ def _reconstruct(config: Config, photos: "list[Photo]", ingest: Path, folder: Pa
     return _result(
         folder,
         source="sfm",
-        images=images,
+        images=with_left_out(images, everything),
         reprojection_px=found["reprojection_px"],
         points=points,
         camera_model=found["camera_model"],

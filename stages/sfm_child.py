@@ -19,6 +19,7 @@ from typing import Any
 from stages.colmap.mapping import MAPPING_MODEL, map_incrementally, rank
 from stages.colmap.matching import copy_without_matches_of, extract_features, fill_database, match_exhaustively
 from stages.colmap.refinement import finish
+from stages.masks import write_feature_masks
 from stages.photos import Photo
 
 # Lowe's ratio: 0.8 is SIFT's own. 0.9 lets in many mismatches, most of which verification throws out again, and
@@ -76,7 +77,10 @@ def reconstruct(job: Job, say: Say) -> dict[str, Any]:
     photos = [Photo(**photo) for photo in job.photos]
     say(phase="features")
     fill_database(database, photos, job.camera_model or MAPPING_MODEL)
-    extract_features(database, images, photos, job.max_image_size, job.max_features)
+    masks = Path(job.folder, "masks")
+    has_masks = write_feature_masks(images.parent, photos, masks)
+    extract_features(database, images, photos, job.max_image_size, job.max_features, masks if has_masks else None)
+    shutil.rmtree(masks, ignore_errors=True)
     mapped = _match_and_map(job, database, STRICT_RATIO, say)
     placed = _files(mapped[0]) if mapped else []
     missing = {file for photo in photos if (file := photo.file.removeprefix("images/")) not in placed}

@@ -54,9 +54,14 @@ def _name(photo: "Photo") -> str:
 
 
 def extract_features(
-    database: Path, images: Path, photos: "Sequence[Photo]", max_image_size: int, max_features: int
+    database: Path,
+    images: Path,
+    photos: "Sequence[Photo]",
+    max_image_size: int,
+    max_features: int,
+    masks: Path | None = None,
 ) -> None:
-    """SIFT keypoints and descriptors of every photo that has none yet; alpha is ignored.
+    """SIFT keypoints and descriptors of every photo that has none yet, where ``masks/<image name>.png`` is not black.
 
     Photos are searched from their own size down. Doubling them first, as is COLMAP's habit, costs 4.5 times as
     much and moves no camera of a well-sized photo (benchmarks/sfm_accuracy.py), so only small ones are doubled.
@@ -66,12 +71,22 @@ def extract_features(
     options = pycolmap.FeatureExtractionOptions()
     options.max_image_size = max_image_size
     options.sift.max_num_features = max_features
+    reader = pycolmap.ImageReaderOptions()
+    if masks is not None:
+        reader.mask_path = masks
     small = {_name(p) for p in photos if max(p.width, p.height) <= UPSAMPLE_UP_TO_PX}
     for first_octave, is_small in ((-1, True), (0, False)):
         names = [name for name in map(_name, photos) if (name in small) is is_small]
         if names:
             options.sift.first_octave = first_octave
-            pycolmap.extract_features(database, images, names, extraction_options=options, device=pycolmap.Device.cpu)
+            pycolmap.extract_features(
+                database,
+                images,
+                names,
+                reader_options=reader,
+                extraction_options=options,
+                device=pycolmap.Device.cpu,
+            )
 
 
 def match_exhaustively(database: Path, seed: int, max_ratio: float) -> None:
