@@ -100,7 +100,7 @@ def _import(cameras: Path, photos: "list[Photo]", ingest: Path, folder: Path, pr
 
 
 def _reconstruct(config: Config, photos: "list[Photo]", ingest: Path, folder: Path, progress: Progress) -> StageResult:
-    from stages.registration import FEWEST_POINTS, FEWEST_REGISTERED, account, read_matches, with_left_out, why_no_model
+    from stages.registration import FEWEST_POINTS, FEWEST_REGISTERED, account, read_matches, why_no_model, with_left_out
 
     everything, photos = photos, [photo for photo in photos if not photo.near_duplicate_of]
     _check_count(photos)

@@ -16,6 +16,7 @@ from stages.contract import StageError
 from stages.files import read_json
 from stages.photos import Photo, write_photos
 from stages.registration import count_done
+from tests.blots import blots
 from tests.small_scenes import write_blender_scene
 from tests.synthetic_photos import Quiet, SyntheticPhotos
 
@@ -145,18 +146,6 @@ def test_however_the_child_ends_it_is_an_error_with_words(
     assert (tmp_path / "sfm.log").exists()
 
 
-def texture(seed: int, width: int = 600, height: int = 400) -> np.ndarray:
-    """Blots of all sizes, as a flat picture."""
-    import cv2
-
-    random = np.random.default_rng(seed)
-    picture = np.full((height, width, 3), 128.0)
-    for size in (3, 6, 12, 25, 50):
-        blots = random.normal(size=(height // size, width // size, 3))
-        picture += 12 * size**0.5 * cv2.resize(blots, (width, height), interpolation=cv2.INTER_CUBIC)
-    return np.clip(picture, 0, 255).astype(np.uint8)
-
-
 def turned(angle: float, panorama: np.ndarray, size: tuple[int, int] = (240, 180), focal: float = 250.0) -> np.ndarray:
     """What a camera sees of a far picture after turning about its vertical axis."""
     import cv2
@@ -178,7 +167,7 @@ def refusal(images: dict[str, np.ndarray], folder: Path, progress) -> StageError
 
 
 def test_photos_without_overlap_are_refused(tmp_path: Path, progress) -> None:
-    error = refusal({f"{i}.png": texture(i, 240, 180) for i in range(4)}, tmp_path, progress)
+    error = refusal({f"{i}.png": blots(i, 240, 180) for i in range(4)}, tmp_path, progress)
     assert str(error) == (
         "the cameras of 4 photos could not be found: 0 of 6 pairs of photos share a view. "
         "Take photos with 60–80 % overlap, so that everything is visible in at least three of them."
@@ -186,14 +175,14 @@ def test_photos_without_overlap_are_refused(tmp_path: Path, progress) -> None:
 
 
 def test_turning_on_the_spot_is_refused(tmp_path: Path, progress) -> None:
-    panorama = texture(0)
+    panorama = blots(0)
     error = refusal({f"{i}.png": turned(0.12 * i - 0.3, panorama) for i in range(6)}, tmp_path, progress)
     assert "matching pairs differ by a turn of the camera alone, or show one flat surface" in error.why
     assert "Move sideways" in error.hint
 
 
 def test_identical_photos_are_refused(tmp_path: Path, progress) -> None:
-    error = refusal({f"{i}.png": texture(0, 240, 180) for i in range(3)}, tmp_path, progress)
+    error = refusal({f"{i}.png": blots(0, 240, 180) for i in range(3)}, tmp_path, progress)
     assert error.why == "the photos are all the same view (3 of 3 pairs differ by less than a pixel)"
 
 
@@ -204,7 +193,7 @@ def test_blank_photos_are_refused(tmp_path: Path, progress) -> None:
 
 @pytest.mark.parametrize("count", [1, 2])
 def test_too_few_photos_are_refused_at_once(count: int, tmp_path: Path, progress) -> None:
-    error = refusal({f"{i}.png": texture(i, 240, 180) for i in range(count)}, tmp_path, progress)
+    error = refusal({f"{i}.png": blots(i, 240, 180) for i in range(count)}, tmp_path, progress)
     assert error.what == f"cannot find cameras from {count} photo{'s' * (count == 2)}"
 
 
@@ -213,7 +202,7 @@ def test_strangers_are_left_out_and_named_and_alpha_and_mixed_sizes_work(
 ) -> None:
     images = {path.name: np.asarray(Image.open(path)) for path in sorted((inputs["ingest"] / "images").iterdir())[:8]}
     alpha = {f"{n}.png": np.dstack([i, np.full(i.shape[:2], 255, np.uint8)]) for n, i in list(images.items())[:6]}
-    plain = dict(list(images.items())[6:]) | {"stranger.png": texture(1, 300, 200)}
+    plain = dict(list(images.items())[6:]) | {"stranger.png": blots(1, 300, 200)}
     result = sfm.run(SMALL, ingested(tmp_path / "ingest", alpha | plain), tmp_path / "sfm", progress)
     assert result.line.startswith("8/9 registered, ")
     assert progress.notes[:3] == [
