@@ -59,7 +59,9 @@ class RayBank(NamedTuple):
 
     def to(self, device: torch.device | str) -> "RayBank":
         """This bank with its tables on ``device``."""
-        return RayBank(*(table if table is None else table.to(device) for table in self))
+        runs = None if self.runs is None else self.runs.to(device)
+        pixels, first_pixel, layout, geometry, patches, _ = self
+        return RayBank(*(table.to(device) for table in (pixels, first_pixel, layout, geometry, patches)), runs)
 
     @property
     def drawable(self) -> int:

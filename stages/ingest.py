@@ -21,10 +21,11 @@ from stages.ascii_names import ascii_files
 from stages.contract import Inputs, OptionalSourcePath, Progress, SourcePath, StageConfig, StageError, StageResult
 from stages.decoding import CameraKey, DecodeError, Place, decode
 from stages.files import write_png
+from stages.ingest_words import all_the_same, facts, say, say_findings, say_masks, say_refused, shown, summary, too_few
 from stages.masks import pair_masks, read_mask
 from stages.near_duplicates import near_duplicates, thumbnail
 from stages.photos import Photo, Refusal, write_photos
-from stages.sharpness import BLURRED, relative_sharpness, sharpness
+from stages.sharpness import relative_sharpness, sharpness
 from stages.sources import Source, find_source
 from stages.video_frames import FEWEST_FRAMES, take_frames
 
@@ -37,7 +38,6 @@ RESUMES = False
 LINKS = ("photos.json", "images", "masks")
 
 _MAX_WORKERS = 8  # each holds a few copies of one photo, up to 250 megapixels
-_MAX_NOTES = 10
 _NO_PLACE = Place()
 
 
@@ -99,19 +99,21 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
         if source.kind == "photos":
             taken, duplicates = _without_duplicates(taken)
             refused = sorted(refused + duplicates, key=lambda refusal: refusal.name)
-        _say([f"refused {_shown(r.name)}: {r.reason}" for r in refused], progress)
-        _say([f"{_shown(t.name)}: {note}" for t in taken for note in t.notes], progress)
+        say_refused(refused, progress)
+        say([f"{shown(t.name)}: {note}" for t in taken for note in t.notes], progress)
         if len(taken) < 2:
-            raise _too_few(source, taken, refused)
+            raise too_few(source, [photo.name for photo in taken], refused)
         photos = _store(taken, _same_pictures(taken) if source.kind == "photos" else {}, folder)
         shutil.rmtree(waiting)
         write_photos(folder, photos, refused, source.frames)
-    _say_findings(taken, photos, progress)
-    masks = ("masks",) if any(photo.mask for photo in photos) else ()
+    say_findings(photos, progress)
+    masks = [photo.mask for photo in taken if photo.mask]
+    turned, resized = sum(mask.turned for mask in masks), sum(mask.resized for mask in masks)
+    say_masks([mask.ignored for mask in masks], turned, resized, len(photos), progress)
     return StageResult(
-        outputs=("images", "photos.json", *masks),
-        line=_line(source, photos, refused),
-        facts=_facts(source, photos, refused),
+        outputs=("images", "photos.json", "masks") if masks else ("images", "photos.json"),
+        line=summary(source, photos, refused),
+        facts=facts(source, photos, refused),
     )
 
 
@@ -131,7 +133,7 @@ def _take_all(source: Source, config: Config, waiting: Path, progress: Progress)
     if source.kind == "video":
         return _take_video(source.files[0], config.frames, waiting, progress), []
     masks, strays = pair_masks([source.name(file) for file in source.files], source.masks)
-    _say([f"{_shown(f'masks/{file.name}')} is no photo's mask, which are called NAME.png" for file in strays], progress)
+    say([f"{shown(f'masks/{file.name}')} is no photo's mask, which are called NAME.png" for file in strays], progress)
     outcomes = _decode_all(source, masks, waiting, progress)
     refused = [outcome for outcome in outcomes if isinstance(outcome, Refusal)]
     return [outcome for outcome in outcomes if isinstance(outcome, _Taken)], refused
@@ -217,7 +219,7 @@ def _without_duplicates(taken: Sequence[_Taken]) -> tuple[list[_Taken], list[Ref
         first.setdefault(photo.digest, photo)
     kept = [photo for photo in taken if first[photo.digest] is photo]
     repeated = [photo for photo in taken if first[photo.digest] is not photo]
-    return kept, [Refusal(photo.name, f"identical to {_shown(first[photo.digest].name)}") for photo in repeated]
+    return kept, [Refusal(photo.name, f"identical to {shown(first[photo.digest].name)}") for photo in repeated]
 
 
 def _same_pictures(taken: Sequence[_Taken]) -> dict[str, str]:
@@ -226,11 +228,7 @@ def _same_pictures(taken: Sequence[_Taken]) -> dict[str, str]:
     thumbnails = [photo.thumbnail for photo in taken if photo.thumbnail is not None]
     same = near_duplicates(thumbnails, [photo.sharpness for photo in taken])
     if len(same) == len(taken) - 1:
-        raise StageError(
-            f"all {len(taken)} photos are nearly the same picture",
-            "the camera stood still between them, so they tell nothing of depth",
-            "Take 20 to 100 overlapping photos of one scene from different places.",
-        )
+        raise all_the_same(len(taken))
     return {taken[index].name: taken[kept].name for index, kept in sorted(same.items())}
 
 
@@ -269,94 +267,3 @@ def _store(taken: Sequence[_Taken], same: Mapping[str, str], folder: Path) -> li
 def _move(waiting: Path, target: Path) -> None:
     target.parent.mkdir(parents=True, exist_ok=True)
     waiting.replace(target)
-
-
-# --- what is said
-
-
-def _shown(name: str) -> str:
-    """A name as it may be printed: nothing in it can steer a terminal."""
-    return name if name.isprintable() else repr(name)
-
-
-def _say(notes: Sequence[str], progress: Progress) -> None:
-    for note in notes[:_MAX_NOTES]:
-        progress.note(note)
-    if len(notes) > _MAX_NOTES:
-        progress.note(f"… and {len(notes) - _MAX_NOTES} more, all in photos.json")
-
-
-def _say_findings(taken: Sequence[_Taken], photos: Sequence[Photo], progress: Progress) -> None:
-    """What the photos are like beside each other."""
-    same = [f"{_shown(p.name)} (as {_shown(p.near_duplicate_of)})" for p in photos if p.near_duplicate_of]
-    if same:
-        are = "1 photo is" if len(same) == 1 else f"{len(same)} photos are"
-        progress.note(f"{are} nearly the same picture as another and left out of matching: {_few(same)}")
-    blurred = [
-        f"{_shown(p.name)} ({p.relative_sharpness:.2f} ×)"
-        for p in photos
-        if p.relative_sharpness is not None and p.relative_sharpness < BLURRED and not p.near_duplicate_of
-    ]
-    if blurred:
-        are = "1 photo is" if len(blurred) == 1 else f"{len(blurred)} photos are"
-        progress.note(f"{are} far less sharp than those before and after, and kept: {_few(blurred)}")
-    masks = [photo.mask for photo in taken if photo.mask]
-    if masks:
-        ignored = sum(mask.ignored for mask in masks) / len(masks)
-        made = {"turned like the photo": "turned", "made as large as the photo": "resized"}
-        counts = {words: sum(getattr(mask, what) for mask in masks) for words, what in made.items()}
-        fitted = "".join(f", {count} {words}" for words, count in counts.items() if count)
-        progress.note(f"masks for {len(masks)} of {len(taken)} photos ignore {ignored:.0%} of them{fitted}")
-
-
-def _few(names: Sequence[str]) -> str:
-    more = f" and {len(names) - _MAX_NOTES} more, all in photos.json" if len(names) > _MAX_NOTES else ""
-    return ", ".join(names[:_MAX_NOTES]) + more
-
-
-def _too_few(source: Source, taken: Sequence[_Taken], refused: Sequence[Refusal]) -> StageError:
-    hint = "Take 20 to 100 overlapping photos of one scene from different places and put them into one folder."
-    if not taken:
-        first = f"{_shown(refused[0].name)}: {refused[0].reason}"
-        return StageError(f"none of the {len(refused)} files in {source.root} is a usable photo", first, hint)
-    only = _shown(taken[0].name)
-    if refused and all(refusal.reason.startswith("identical to ") for refusal in refused):
-        return StageError(f"all {len(refused) + 1} photos are identical", f"they have the pixels of {only}", hint)
-    if refused:
-        return StageError(f"only one photo can be used, {only}", f"{len(refused)} other files were refused", hint)
-    return StageError("there is only one photo", f"{only}; a scene needs at least two", hint)
-
-
-def _line(source: Source, photos: Sequence[Photo], refused: Sequence[Refusal]) -> str:
-    sizes = sorted({(photo.width, photo.height) for photo in photos})
-    size = "{}×{}".format(*sizes[0]) if len(sizes) == 1 else f"in {len(sizes)} sizes"
-    alpha = " with alpha" if any(photo.has_alpha for photo in photos) else ""
-    what = "frames" if source.kind == "video" else "photos"
-    line = f"{len(photos)} {what} {size}{alpha}, {_camera_words(source, photos)}"
-    return f"{line}, {len(refused)} refused" if refused else line
-
-
-def _camera_words(source: Source, photos: Sequence[Photo]) -> str:
-    if source.cameras is not None:
-        return "cameras given"
-    if source.kind == "video":
-        return f"{photos[-1].time_s:.1f} s of video"
-    groups = len({photo.camera_group for photo in photos})
-    cameras = "one camera" if groups == 1 else f"{groups} cameras"
-    known = [photo.focal_px for photo in photos if photo.focal_px is not None]
-    if not known:
-        return f"{cameras}, no EXIF focal"
-    if len(known) < len(photos):
-        return f"{cameras}, EXIF focal for {len(known)}"
-    return f"{cameras}, EXIF focal" + (f" {known[0]:.0f} px" if len(set(known)) == 1 else "")
-
-
-def _facts(source: Source, photos: Sequence[Photo], refused: Sequence[Refusal]) -> dict[str, object]:
-    return {
-        "source": source.kind,
-        "photos": len(photos),
-        "refused": [{"name": refusal.name, "reason": refusal.reason} for refusal in refused],
-        "sizes": sorted([photo.width, photo.height] for photo in {(p.width, p.height): p for p in photos}.values()),
-        "cameras": len({photo.camera_group for photo in photos}),
-        "focal_known": sum(photo.focal_px is not None for photo in photos),
-    }

@@ -134,7 +134,7 @@ class _Motion:
         grey = cv2.cvtColor(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY)
         moved = self._moved(grey)
         self.path = max(self.path, self.path_of_start + moved)
-        if self.start is None or moved >= LEAST_MOTION or len(self.corners) < FEWEST_CORNERS:
+        if self.corners is None or moved >= LEAST_MOTION or len(self.corners) < FEWEST_CORNERS:
             self.path_of_start, self.start = self.path, grey
             self.corners = corners(grey, MOST_CORNERS)
         return self.path
@@ -179,7 +179,9 @@ def _opened(video: Path) -> "Iterator[cv2.VideoCapture]":
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # quiet: what is wrong with a file we say ourselves
     import cv2
 
+    before = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     capture = cv2.VideoCapture(str(video), cv2.CAP_FFMPEG)
+    cv2.utils.logging.setLogLevel(before)
     try:
         if not capture.isOpened():
             raise _undecodable(video, "it is damaged, or of a kind that is not known here")
