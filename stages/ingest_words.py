@@ -90,14 +90,14 @@ def summary(source: Source, photos: Sequence[Photo], refused: Sequence[Refusal])
     alpha = " with alpha" if any(photo.has_alpha for photo in photos) else ""
     what = "frames" if source.kind == "video" else "photos"
     line = f"{len(photos)} {what} {size}{alpha}, {_camera_words(source, photos)}"
+    if photos[-1].time_s is not None:
+        line += f", {photos[-1].time_s:.1f} s of video"
     return f"{line}, {len(refused)} refused" if refused else line
 
 
 def _camera_words(source: Source, photos: Sequence[Photo]) -> str:
     if source.cameras is not None:
         return "cameras given"
-    if source.kind == "video":
-        return f"{photos[-1].time_s:.1f} s of video"
     groups = len({photo.camera_group for photo in photos})
     cameras = "one camera" if groups == 1 else f"{groups} cameras"
     known = [photo.focal_px for photo in photos if photo.focal_px is not None]

@@ -2,7 +2,7 @@
 
 import shutil
 from collections.abc import Container, Sequence
-from itertools import combinations
+from itertools import combinations, product
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -61,7 +61,8 @@ def extract_features(
     max_features: int,
     masks: Path | None = None,
 ) -> None:
-    """SIFT keypoints and descriptors of every photo that has none yet, where ``masks/<image name>.png`` is not black.
+    """SIFT keypoints and descriptors of every photo that has none yet, where ``masks/<image name>.png`` is not black,
+    or anywhere where that is not there.
 
     Photos are searched from their own size down. Doubling them first, as is COLMAP's habit, costs 4.5 times as
     much and moves no camera of a well-sized photo (benchmarks/sfm_accuracy.py), so only small ones are doubled.
@@ -71,22 +72,20 @@ def extract_features(
     options = pycolmap.FeatureExtractionOptions()
     options.max_image_size = max_image_size
     options.sift.max_num_features = max_features
-    reader = pycolmap.ImageReaderOptions()
-    if masks is not None:
-        reader.mask_path = masks
     small = {_name(p) for p in photos if max(p.width, p.height) <= UPSAMPLE_UP_TO_PX}
-    for first_octave, is_small in ((-1, True), (0, False)):
-        names = [name for name in map(_name, photos) if (name in small) is is_small]
-        if names:
-            options.sift.first_octave = first_octave
-            pycolmap.extract_features(
-                database,
-                images,
-                names,
-                reader_options=reader,
-                extraction_options=options,
-                device=pycolmap.Device.cpu,
-            )
+    masked = {name for name in map(_name, photos) if masks and (masks / f"{name}.png").is_file()}
+    # A photo without a mask has to go without a folder of masks: one that is not there is an error to COLMAP.
+    for is_small, is_masked in product((True, False), (False, True)):
+        names = [name for name in map(_name, photos) if (name in small, name in masked) == (is_small, is_masked)]
+        if not names:
+            continue
+        options.sift.first_octave = -1 if is_small else 0
+        reader = pycolmap.ImageReaderOptions()
+        if is_masked:
+            reader.mask_path = masks
+        pycolmap.extract_features(
+            database, images, names, reader_options=reader, extraction_options=options, device=pycolmap.Device.cpu
+        )
 
 
 def match_exhaustively(database: Path, seed: int, max_ratio: float) -> None:

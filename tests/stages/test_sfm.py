@@ -2,6 +2,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 
@@ -13,8 +14,8 @@ from pipeline.truth import align
 from stages import ingest, sfm
 from stages.colmap.models import read_model
 from stages.contract import StageError
-from stages.files import read_json
-from stages.photos import Photo, write_photos
+from stages.files import read_json, write_png
+from stages.photos import Photo, read_photos, write_photos
 from stages.registration import count_done
 from tests.blots import blots
 from tests.small_scenes import write_blender_scene
@@ -212,6 +213,40 @@ def test_strangers_are_left_out_and_named_and_alpha_and_mixed_sizes_work(
     ]
     account = read_json(tmp_path / "sfm/registration.json")
     assert [image["file"] for image in account["images"] if not image["registered"]] == ["stranger.png"]
+
+
+def test_nearly_the_same_pictures_are_not_matched_and_masks_keep_features_away(
+    inputs: dict[str, Path], tmp_path: Path, progress
+) -> None:
+    images = {path.name: np.asarray(Image.open(path)) for path in sorted((inputs["ingest"] / "images").iterdir())[:9]}
+    ingested(tmp_path / "ingest", images)
+    photos = read_photos(tmp_path / "ingest")
+    photos[1] = replace(photos[1], near_duplicate_of=photos[0].name)
+    mask = np.full((180, 240), 255, np.uint8)
+    mask[:, :80] = 0
+    photos[5] = replace(photos[5], mask="masks/m.png")
+    write_png(tmp_path / "ingest/masks/m.png", mask)
+    write_photos(tmp_path / "ingest", photos, [], {})
+    result = sfm.run(SMALL, {"ingest": tmp_path / "ingest"}, tmp_path / "sfm", progress)
+    account = read_json(tmp_path / "sfm/registration.json")
+    model = read_model(tmp_path / "sfm/sparse")
+    assert result.line.startswith("8/9 registered, ")
+    assert (account["photos"], account["registered"]) == (9, 8)
+    assert [image["file"] for image in account["images"]] == list(images)
+    assert account["images"][1] == {
+        "file": photos[1].file.removeprefix("images/"),
+        "registered": False,
+        "reason": f"nearly the same picture as {photos[0].name}: it adds no baseline",
+        "keypoints": 0,
+        "observations": 0,
+    }
+    place = {image.file: index for index, image in enumerate(model.images)}
+    seen_at = model.xy[model.view == place[photos[5].file.removeprefix("images/")]]
+    others = model.xy[model.view == place[photos[4].file.removeprefix("images/")]]
+    assert len(seen_at) > 20 and seen_at[:, 0].min() > 79
+    assert (others[:, 0] < 79).sum() > 20
+    assert progress.notes == []
+    assert sorted(path.name for path in (tmp_path / "sfm").iterdir()) == ["registration.json", "sfm.log", "sparse"]
 
 
 def test_the_screen_never_stands_still(inputs: dict[str, Path], tmp_path: Path, progress) -> None:
