@@ -244,7 +244,7 @@ def test_nearly_the_same_pictures_are_not_matched_and_masks_keep_features_away(
     seen_at = model.xy[model.view == place[photos[5].file.removeprefix("images/")]]
     others = model.xy[model.view == place[photos[4].file.removeprefix("images/")]]
     assert len(seen_at) > 20 and seen_at[:, 0].min() > 79
-    assert (others[:, 0] < 79).sum() > 20
+    assert (others[:, 0] < 79).sum() > 5
     assert progress.notes == []
     assert sorted(path.name for path in (tmp_path / "sfm").iterdir()) == ["registration.json", "sfm.log", "sparse"]
 
