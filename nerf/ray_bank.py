@@ -6,13 +6,16 @@ row. The pixels stay uint8 and may be a file mapped into memory, so that there m
 A camera is a mosaic of *patches*, each small enough for its bearings to be linear in the pixel (the model of a pinhole
 camera: exact without distortion). One look-up then gives the ray of a pixel, and a camera takes the same small memory
 whatever the size of its photos: a set where every photo has a camera of its own stays small.
+
+Where photos have masks, the pixels that may be drawn are kept as *runs* of neighbours, of which a photo has a few in a
+row; without masks there are none, and nothing to look up.
 """
 
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from nerf.rays import Rays
@@ -32,6 +35,9 @@ class RayBank(NamedTuple):
     * ``geometry``: the rotation scene_from_camera row by row, the centre, near, far, patches per pixel along x and y.
 
     ``patches`` has a column per patch: the bearing in its middle, and how it changes along x and y over one patch.
+
+    ``runs`` has a column per run of pixels that may be drawn: how many of them lie before it, and its first pixel. A
+    last column has the number of all of them. None: every pixel may be drawn.
     """
 
     pixels: UInt8[Tensor, "pixels channels"]
@@ -39,6 +45,7 @@ class RayBank(NamedTuple):
     layout: Int[Tensor, "4 views"]
     geometry: Float[Tensor, "16 views"]
     patches: Float[Tensor, "9 patches"]
+    runs: Int[Tensor, "2 runs_and_end"] | None = None
 
     @property
     def device(self) -> torch.device:
@@ -52,7 +59,24 @@ class RayBank(NamedTuple):
 
     def to(self, device: torch.device | str) -> "RayBank":
         """This bank with its tables on ``device``."""
-        return RayBank(*(table.to(device) for table in self))
+        runs = None if self.runs is None else self.runs.to(device)
+        pixels, first_pixel, layout, geometry, patches, _ = self
+        return RayBank(*(table.to(device) for table in (pixels, first_pixel, layout, geometry, patches)), runs)
+
+    @property
+    def drawable(self) -> int:
+        """How many pixels may be drawn."""
+        return len(self.pixels) if self.runs is None else int(self.runs[0, -1])
+
+    def without(self, ignored: Sequence[Bool[Tensor, "_ _"] | None]) -> "RayBank":
+        """This bank with pixels that :meth:`sample` never draws: per view, (height, width) True where the photo is to
+        be ignored, None where all of it is used. Raises ValueError if no pixel is left."""
+        if not any(mask is not None and mask.any() for mask in ignored):
+            return self
+        runs = _runs(ignored, self.first_pixel)
+        if not runs[0, -1]:
+            raise ValueError("the masks ignore every pixel")
+        return self._replace(runs=runs.to(self.device))
 
     def lookup(self, pixel: Int[Tensor, "rays"]) -> tuple[Rays, Float[Tensor, "rays 3"], Float[Tensor, "rays"] | None]:
         """The rays through given pixels, with the pixels' colours and alpha in [0, 1] (None without a channel)."""
@@ -81,9 +105,9 @@ class RayBank(NamedTuple):
     def sample(
         self, count: int, generator: torch.Generator
     ) -> tuple[Rays, Float[Tensor, "rays 3"], Float[Tensor, "rays"] | None]:
-        """:meth:`lookup` of ``count`` pixels drawn uniformly, with replacement."""
-        pixel = torch.randint(len(self.pixels), (count,), generator=generator, device=self.device)
-        return self.lookup(pixel)
+        """:meth:`lookup` of ``count`` pixels drawn uniformly from those that may be, with replacement."""
+        drawn = torch.randint(self.drawable, (count,), generator=generator, device=self.device)
+        return self.lookup(drawn if self.runs is None else _in_runs(self.runs, drawn))
 
 
 class Placement(NamedTuple):
@@ -153,6 +177,31 @@ def build_ray_bank(
     return ray_bank(torch.cat(pixels), sizes, camera_of, camera_bearings, Placement(poses, near, far))
 
 
+def _runs(
+    ignored: Sequence[Bool[Tensor, "_ _"] | None], first_pixel: Int[Tensor, "views_and_end"]
+) -> Int[Tensor, "2 runs_and_end"]:
+    """Runs of pixels that are not ignored, as :class:`RayBank` has them. No run is longer than a view."""
+    firsts, lengths = [], []
+    for mask, start, end in zip(ignored, first_pixel[:-1], first_pixel[1:], strict=True):
+        if mask is None:
+            firsts.append(start[None])
+            lengths.append((end - start)[None])
+            continue
+        used = torch.nn.functional.pad((~mask).flatten().to(torch.int8), (1, 1))
+        change = used.diff()
+        begins, ends = (change == 1).nonzero()[:, 0], (change == -1).nonzero()[:, 0]
+        firsts.append(start + begins)
+        lengths.append(ends - begins)
+    before = _starts(torch.cat(lengths).tolist())
+    return torch.stack([before, torch.cat([*firsts, first_pixel[-1:]])])
+
+
+def _in_runs(runs: Int[Tensor, "2 runs_and_end"], drawn: Int[Tensor, "rays"]) -> Int[Tensor, "rays"]:
+    """The pixels that are the ``drawn``-th ones, counted from 0, of those in runs."""
+    before, first = runs.index_select(1, torch.searchsorted(runs[0].contiguous(), drawn, right=True).sub_(1))
+    return first + drawn - before
+
+
 def _patches(bearings: Float[Tensor, "rows columns 3"]) -> Float[Tensor, "9 patches"]:
     """Bearings on the plane z = 1, with their slopes along x and y per patch (central differences)."""
     flat = bearings / bearings[..., 2:].clamp(min=LEAST_FORWARD)
@@ -168,4 +217,4 @@ def _slope(values: Float[Tensor, "rows columns 3"], axis: int) -> Float[Tensor, 
 
 def _starts(counts: list[int]) -> Int[Tensor, "counts_and_end"]:
     """Where each of several runs of ``counts`` items begins, and at last where the last one ends."""
-    return torch.cat([torch.zeros(1, dtype=torch.int64), torch.tensor(counts).cumsum(0)])
+    return torch.cat([torch.zeros(1, dtype=torch.int64), torch.tensor(counts, dtype=torch.int64).cumsum(0)])

@@ -54,7 +54,8 @@ class Similarity:
 
 @dataclass(frozen=True)
 class View:
-    """One photo with its pose. ``near`` and ``far`` are distances along the unit ray in scene units."""
+    """One photo with its pose. ``near`` and ``far`` are distances along the unit ray in scene units. ``mask`` is a grey
+    picture of the photo's size inside ingest's folder, 0 where the photo is to be ignored; None: nowhere."""
 
     name: str  # the photo's own name
     file: str  # the decoded image inside ingest's folder
@@ -63,6 +64,7 @@ class View:
     near: float
     far: float
     split: Split
+    mask: str | None = None
 
 
 @dataclass(frozen=True)

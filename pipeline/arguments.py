@@ -33,7 +33,7 @@ class RunArguments:
     """Photos in; cameras, radiance field, figures, video, mesh and report out."""
 
     photos: tyro.conf.Positional[Path]
-    """A folder of photos, a transforms.json, or a folder with transforms_train.json."""
+    """A folder of photos, a video, a transforms.json, or a folder with transforms_train.json."""
     settings: Annotated[Settings, tyro.conf.arg(name="")] = field(default_factory=Settings)
     common: Annotated[Common, tyro.conf.arg(name="")] = field(default_factory=Common)
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None

@@ -186,8 +186,8 @@ class Runner:
         if not config.photos.exists() and (known := self.state.get("photos_digest")):
             return known
         source = find_source(config.photos, config.cameras)
-        self.display.update(f"reading {len(source.files)} photos")
-        files = self.index.of_files(source.root, source.files)
+        self.display.update("reading the video" if source.kind == "video" else f"reading {len(source.files)} photos")
+        files = self.index.of_files(source.root, (*source.files, *(mask for _, mask in source.masks)))
         self.state["photos_digest"] = digest({"kind": source.kind, "frames": source.frames, "files": files})
         return self.state["photos_digest"]
 

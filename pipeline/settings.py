@@ -92,10 +92,13 @@ def with_source(settings: Settings, photos: Path, cameras: Path | None) -> Setti
 
 
 def default_workspace(photos: Path) -> Path:
-    """``photos.nerf`` beside the photos; for a transforms.json or an images/ folder, named after its parent."""
+    """``photos.nerf`` in the current folder; for a transforms.json or an images/ folder, named after its parent, for a
+    video ``clip.nerf``."""
     base = Path(os.path.abspath(photos))  # resolves "..", keeps the names of links
-    if base.is_file() or base.name == "images":
+    if base.suffix.lower() == ".json" or base.name == "images":
         base = base.parent
+    elif base.is_file():
+        base = base.with_suffix("")
     if base.name == "":
         raise StageError("no workspace name", f"{photos} has no name to derive it from", "Give one with -o.")
     return Path.cwd() / f"{base.name}.nerf"

@@ -1,6 +1,7 @@
 """What a field must beat: the mean of the training photos, and the training photo taken from nearest by."""
 
 from collections.abc import Iterable, Sequence
+from itertools import repeat
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
@@ -22,20 +23,31 @@ class MeanPhoto(NamedTuple):
         return self.colour.expand(height, width, 3)
 
 
-def mean_photo(photos: "Iterable[Tensor]") -> MeanPhoto:
-    """Average (H, W, 3) photos, each of equal weight whatever its size. Raises ValueError for no photos."""
+def mean_photo(photos: "Iterable[Tensor]", used: "Iterable[Tensor | None] | None" = None) -> MeanPhoto:
+    """Average (H, W, 3) photos, each of equal weight whatever its size. Raises ValueError for no photos.
+
+    ``used`` says of each photo which pixels count, (H, W) bool, None all of them. Where no photo has a pixel that
+    counts, the mean image has the mean colour.
+    """
     import torch
 
-    total, colours, sizes, count = torch.zeros(()), torch.zeros(3, dtype=torch.float64), set(), 0
-    for photo in photos:
+    total, weight, colours = torch.zeros(()), torch.zeros(()), torch.zeros(3, dtype=torch.float64)
+    sizes, count = set(), 0
+    for photo, mask in zip(photos, repeat(None) if used is None else used, strict=False):
         sizes.add(photo.shape)
-        colours += photo.double().mean((0, 1))
-        total = total + photo.double() if len(sizes) == 1 else torch.zeros(())
+        exact = photo.double()
+        if mask is not None and not mask.any():
+            continue
+        colours += exact.mean((0, 1)) if mask is None else exact[mask].mean(0)
+        if len(sizes) == 1:
+            total = total + (exact if mask is None else exact * mask[..., None])
+            weight = weight + (1 if mask is None else mask[..., None])
         count += 1
     if not count:
         raise ValueError("the mean of no photos")
-    image = (total / count).float() if len(sizes) == 1 else None
-    return MeanPhoto(image, (colours / count).float())
+    colour = colours / count
+    image = torch.where(weight > 0, total / weight.clamp(min=1), colour).float() if len(sizes) == 1 else None
+    return MeanPhoto(image, colour.float())
 
 
 def nearest_view(view: "View", candidates: "Sequence[View]") -> "View":

@@ -1,4 +1,4 @@
-"""Decoding one image file of any kind into upright 8-bit sRGB, and what EXIF tells of its camera.
+"""Decoding one image file of any kind into upright 8-bit sRGB, and what EXIF tells of its camera and place.
 
 Files come from anywhere: formats are a fixed list, sizes are checked before pixels are decoded, and whatever goes
 wrong becomes a :class:`DecodeError` with a reason a user understands.
@@ -22,6 +22,7 @@ _FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP", "GIF", "PPM", "HEIF", "AVIF", 
 _RAW = (".dng", ".cr2", ".cr3", ".nef", ".nrw", ".arw", ".srf", ".raf", ".orf", ".rw2", ".pef", ".raw", ".iiq")
 # What COLMAP, too, accepts as focal length over the longer side.
 _FOCAL_RATIO = (0.1, 10.0)
+_ALTITUDES_M = (-500.0, 20_000.0)  # of shores and aircraft: beyond, a receiver has not found its place
 _SRGB_TOLERANCE = 2  # of 255: profiles closer than this to sRGB are sRGB written by another hand
 
 
@@ -42,6 +43,14 @@ class CameraKey(NamedTuple):
     focal_px: float | None
 
 
+class Place(NamedTuple):
+    """Where EXIF says that a photo was taken: degrees, north and east positive, and metres above the sea."""
+
+    latitude: float | None = None
+    longitude: float | None = None
+    altitude_m: float | None = None
+
+
 @dataclass(frozen=True)
 class Decoded:
     """One image, upright, sRGB. ``focal_px`` is for these pixels, None where EXIF tells none or an absurd one.
@@ -54,6 +63,7 @@ class Decoded:
     focal_px: float | None
     focal_source: str | None
     camera_key: CameraKey
+    place: Place
     suffix: str | None
     notes: tuple[str, ...]
 
@@ -139,7 +149,7 @@ def _convert(image: "Image.Image", stored_plainly: bool) -> Decoded:
     notes: list[str] = []
     tags, orientation = _exif(image, notes)
     converted, is_srgb = _to_srgb(_to_eight_bit(image), image.info.get("icc_profile"), notes)
-    pixels = np.asarray(_upright(converted, orientation))
+    pixels = np.asarray(upright(converted, orientation))
     opaque = pixels.shape[2] == 4 and bool((pixels[..., 3] == 255).all())
     pixels = np.ascontiguousarray(pixels[..., :3] if opaque else pixels)
     focal_px, focal_source = focal_from_exif(tags, *image.size)
@@ -151,6 +161,7 @@ def _convert(image: "Image.Image", stored_plainly: bool) -> Decoded:
         focal_px=focal_px,
         focal_source=focal_source,
         camera_key=_camera_key(tags, pixels.shape[1], pixels.shape[0], orientation, focal_px),
+        place=place_from_exif(tags),
         suffix=(".png" if image.format == "PNG" else ".jpg") if copy else None,
         notes=tuple(notes),
     )
@@ -247,7 +258,7 @@ def _is_identity(transform: Any, mode: str) -> bool:
     return int(np.abs(np.asarray(before, int) - np.asarray(after, int)).max()) <= _SRGB_TOLERANCE
 
 
-def _upright(image: "Image.Image", orientation: int) -> "Image.Image":
+def upright(image: "Image.Image", orientation: int) -> "Image.Image":
     """Undo an EXIF orientation (EXIF 2.32, tag 0x0112)."""
     turns = _pillow().Transpose
     turn = {
@@ -269,10 +280,12 @@ def _exif(image: "Image.Image", notes: list[str]) -> tuple[dict[str, Any], int]:
     try:
         exif = image.getexif()
         tags = {**exif, **exif.get_ifd(ExifTags.IFD.Exif)}
+        place = exif.get_ifd(ExifTags.IFD.GPSInfo)
     except Exception:  # as in _open; the pixels are good
         notes.append("its EXIF cannot be read")
         return {}, 1
     named = {ExifTags.TAGS.get(tag, str(tag)): value for tag, value in tags.items()}
+    named |= {ExifTags.GPSTAGS.get(tag, str(tag)): value for tag, value in place.items()}
     orientation = named.get("Orientation")
     return named, orientation if isinstance(orientation, int) and 1 <= orientation <= 8 else 1
 
@@ -304,13 +317,45 @@ def focal_from_exif(tags: dict[str, Any], width: int, height: int) -> tuple[floa
     return focal, source
 
 
-def _positive(value: Any) -> float | None:
-    """``value`` as a positive finite float; None for anything else that EXIF may hold."""
+def place_from_exif(tags: dict[str, Any]) -> Place:
+    """Latitude, longitude and altitude (EXIF 2.32, GPS tags 1 to 6); nothing where they are incomplete, out of range,
+    or both 0, which is what a receiver writes that has not found its place."""
+    latitude = _degrees(tags.get("GPSLatitude"), tags.get("GPSLatitudeRef"), "NS")
+    longitude = _degrees(tags.get("GPSLongitude"), tags.get("GPSLongitudeRef"), "EW")
+    if latitude is None or longitude is None or abs(latitude) > 90 or abs(longitude) > 180:
+        return Place()
+    if latitude == longitude == 0:
+        return Place()
+    altitude = _number(tags.get("GPSAltitude"))
+    below_sea = tags.get("GPSAltitudeRef") in (1, b"\x01")
+    if altitude is not None:
+        altitude = -altitude if below_sea else altitude
+        altitude = altitude if _ALTITUDES_M[0] <= altitude <= _ALTITUDES_M[1] else None
+    return Place(latitude, longitude, altitude)
+
+
+def _degrees(value: Any, direction: Any, positive_negative: str) -> float | None:
+    """(degrees, minutes, seconds) and a letter as signed degrees."""
+    parts = [_number(part) for part in value] if isinstance(value, tuple | list) else []
+    sign = {positive_negative[0]: 1, positive_negative[1]: -1}.get(str(direction).strip("\0 ").upper())
+    if len(parts) != 3 or None in parts or sign is None:
+        return None
+    degrees, minutes, seconds = (part for part in parts if part is not None)
+    return sign * (degrees + minutes / 60 + seconds / 3600)
+
+
+def _number(value: Any) -> float | None:
+    """``value`` as a finite float; None for anything else that EXIF may hold."""
     try:
         number = float(value)
     except (TypeError, ValueError, ZeroDivisionError):
         return None
-    return number if math.isfinite(number) and number > 0 else None
+    return number if math.isfinite(number) else None
+
+
+def _positive(value: Any) -> float | None:
+    number = _number(value)
+    return number if number is not None and number > 0 else None
 
 
 def _camera_key(tags: dict[str, Any], width: int, height: int, orientation: int, focal_px: float | None) -> CameraKey:

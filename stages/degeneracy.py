@@ -23,8 +23,8 @@ def departure_from_rotation(
     in the middle. Infinite where H has no inverse.
     """
     far = np.full(len(homographies), np.inf)
-    finite: np.ndarray = np.isfinite(homographies).all(axis=(1, 2))
-    usable = np.linalg.det(np.where(finite[:, None, None], homographies, 0.0)) != 0
+    finite = np.isfinite(homographies).all(axis=(1, 2), keepdims=True)
+    usable = np.linalg.det(np.where(finite, homographies, 0.0)) != 0
     first, second = (_calibration(sizes[usable, side], focal) for side in (0, 1))
     normalised = np.linalg.solve(second, homographies[usable] @ first)
     normalised /= np.cbrt(np.linalg.det(normalised))[:, None, None]

@@ -103,9 +103,13 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     test = scene.of_split("test")
     chosen = _spread(len(test), min(config.photos or 0, len(test)))
     notes = [_how_many(len(chosen), len(test))] if len(chosen) < len(test) else []
+    views = [test[i] for i in chosen]
+    scored = [view for view in views if (used := examiner.used(view)) is None or used.any()]
+    if len(scored) < len(views):
+        notes.append(f"masks leave nothing to compare of {_photos(len(views) - len(scored))} at this size")
     for note in notes:
         progress.note(note)
-    images = examiner.score([test[i] for i in chosen], progress)
+    images = examiner.score(scored, progress)
     metrics = _overall(images, len(test), examiner.downscale, notes, config.seed)
     metrics["background"] = examiner.painter.background.tolist()
     write_json(folder / "metrics.json", metrics)
@@ -115,7 +119,8 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
 
 @dataclass(frozen=True)
 class Examiner:
-    """Draws test views at 1/``downscale`` of the photos' size and compares them with what the camera saw."""
+    """Draws test views at 1/``downscale`` of the photos' size and compares them with what the camera saw, less what
+    masks ignore."""
 
     scene: "Scene"
     ingest: Path
@@ -132,7 +137,8 @@ class Examiner:
         if not views:
             return []
         progress.update("averaging the training photos")
-        mean = mean_photo(self._photo(view) for view in self.scene.of_split("train"))
+        train = self.scene.of_split("train")
+        mean = mean_photo(map(self._photo, train), map(self.used, train))
         images = []
         for done, view in enumerate(views):
 
@@ -145,19 +151,19 @@ class Examiner:
     def _score_one(self, view: "View", mean: "MeanPhoto", on_chunk: Callable[[float], None]) -> dict[str, Any]:
         from stages.baselines import nearest_view, resized
 
-        truth, image = self._photo(view), self._render(view, on_chunk)
+        truth, used, image = self._photo(view), self.used(view), self._render(view, on_chunk)
         height, width = truth.shape[:2]
         nearest = nearest_view(view, self.scene.of_split("train"))
         # The decoded file has an ASCII name that is unique up to its suffix; the photo's own may be anything.
         file = Path(view.file.removeprefix("images/")).with_suffix(".png").as_posix()
         write_png(self.folder / "renders" / file, (image * 255).round().byte().numpy())
-        write_png(self.folder / "errors" / file, error_map(image, truth))
+        write_png(self.folder / "errors" / file, error_map(image, truth, used))
         return {
             "name": view.name,
-            "psnr": _psnr(image, truth),
-            "ssim": ssim(image, truth),
-            "psnr_mean_image": _psnr(mean.shown_at(height, width), truth),
-            "psnr_nearest_view": _psnr(resized(self._photo(nearest), height, width), truth),
+            "psnr": _psnr(image, truth, used),
+            "ssim": ssim(image, truth, used),
+            "psnr_mean_image": _psnr(mean.shown_at(height, width), truth, used),
+            "psnr_nearest_view": _psnr(resized(self._photo(nearest), height, width), truth, used),
             "nearest_view": nearest.name,
             "render": f"renders/{file}",
             "error": f"errors/{file}",
@@ -167,6 +173,11 @@ class Examiner:
         from stages.training_data import view_pixels
 
         return view_pixels(self.ingest, self.scene, view, self.downscale, self.painter.background.tolist())
+
+    def used(self, view: "View") -> "Tensor | None":
+        from stages.training_data import view_mask
+
+        return view_mask(self.ingest, self.scene, view, self.downscale)
 
     def _render(self, view: "View", on_chunk: Callable[[float], None]) -> "Tensor":
         from stages.training_data import view_rays
@@ -285,7 +296,9 @@ def _below(value: float | None, limit: float) -> bool:
     return value is not None and value < limit
 
 
-def _psnr(image: "Tensor", truth: "Tensor") -> float:
+def _psnr(image: "Tensor", truth: "Tensor", used: "Tensor | None") -> float:
     from nerf.metrics import mean_squared_error, psnr
 
+    if used is not None:
+        image, truth = image[used], truth[used]
     return psnr(mean_squared_error(image, truth))

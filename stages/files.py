@@ -62,7 +62,8 @@ def read_tensors(path: Path) -> "dict[str, np.ndarray]":
 
 
 def write_png(path: Path, pixels: "np.ndarray") -> None:
-    """Write (height, width, 3 or 4) uint8, folders included; packed fast, for pictures hardly shrink any further."""
+    """Write (height, width, 3 or 4) or grey (height, width) uint8, folders included; packed fast, for pictures hardly
+    shrink any further."""
     from PIL import Image
 
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -14,25 +14,41 @@ ERROR_SCALE = 0.3
 FEWEST_FOR_INTERVAL = 3
 
 
-def ssim(image: "Tensor", truth: "Tensor") -> float | None:
-    """Mean structural similarity of two (H, W, 3) images in [0, 1]; None where they are smaller than its window.
+def ssim(image: "Tensor", truth: "Tensor", used: "Tensor | None" = None) -> float | None:
+    """Mean structural similarity of two (H, W, 3) images in [0, 1]; None where no window fits in.
 
     Wang et al. 2004: Gaussian window of 11 pixels and sigma 1.5, only where the window lies inside the image,
     so it equals scikit-image's ``structural_similarity(gaussian_weights=True, use_sample_covariance=False)``.
+    With ``used``, (H, W) bool, only where all of the window is used.
     """
     from kornia.metrics import ssim as kornia_ssim
 
     if min(image.shape[:2]) < SSIM_WINDOW:
         return None
     batch = (picture.permute(2, 0, 1)[None] for picture in (image, truth))
-    return float(kornia_ssim(*batch, window_size=SSIM_WINDOW, eps=0.0, padding="valid").mean())
+    similarity = kornia_ssim(*batch, window_size=SSIM_WINDOW, eps=0.0, padding="valid")[0]
+    if used is None:
+        return float(similarity.mean())
+    inside = _windows_inside(used)
+    return float(similarity[:, inside].mean()) if inside.any() else None
 
 
-def error_map(image: "Tensor", truth: "Tensor") -> "np.ndarray":
-    """The mean absolute error of the three channels as (H, W, 3) uint8: black 0, pale yellow ERROR_SCALE or more."""
+def _windows_inside(used: "Tensor") -> "Tensor":
+    """Where all of an SSIM window is used, (H - 10, W - 10) bool."""
+    from torch.nn.functional import max_pool2d
+
+    ignored = (~used).float()[None, None]
+    return max_pool2d(ignored, SSIM_WINDOW, stride=1)[0, 0] == 0
+
+
+def error_map(image: "Tensor", truth: "Tensor", used: "Tensor | None" = None) -> "np.ndarray":
+    """The mean absolute error of the three channels as (H, W, 3) uint8: black 0, pale yellow ERROR_SCALE or more. What
+    is not ``used``, (H, W) bool, counts as no error."""
     from matplotlib import colormaps
 
     error = (image - truth).abs().mean(-1) / ERROR_SCALE
+    if used is not None:
+        error = error * used
     return colormaps["magma"](error.clamp(0, 1).numpy(), bytes=True)[..., :3]
 
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from stages.sparse_model import SparseModel
 
 NEEDS = ("ingest", "sfm")
-VERSION = 3
+VERSION = 4
 RESUMES = False
 LINKS = ("transforms.json", "scene.json")
 
@@ -155,6 +155,7 @@ def _scene(
             near=float(found.near[i]),
             far=float(found.far[i]),
             split=split[i],
+            mask=photo.mask,
         )
         for i, photo in enumerate(photos)
     )

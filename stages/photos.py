@@ -18,7 +18,13 @@ class Photo:
 
     Photos of equal ``camera_group`` share intrinsics. ``focal_px`` is the focal length that EXIF tells, at this
     size, and ``focal_source`` the tag it came from; both None where EXIF tells none. ``sharpness`` is the variance
-    of the Laplacian; it compares photos of one set and means nothing by itself.
+    of the Laplacian; it compares photos of one set and means nothing by itself. ``relative_sharpness`` is it over the
+    median of its neighbours' (stages/sharpness.py), None where there are too few.
+
+    ``mask`` is a grey PNG of the photo's size, 255 where it is to be used and 0 where it is to be ignored; None: all of
+    it is used. ``near_duplicate_of`` is the name of the photo that is nearly the same picture, which is used in its
+    place. ``time_s`` is when a frame of a video was taken, in seconds from its beginning, None for photos. The place
+    is EXIF's, in degrees (north and east positive) and metres above the sea, None where it tells none.
     """
 
     name: str  # the user's own file name, relative to the photo folder
@@ -30,6 +36,13 @@ class Photo:
     focal_source: str | None
     has_alpha: bool
     sharpness: float
+    relative_sharpness: float | None = None
+    mask: str | None = None  # "masks/….png", relative to ingest's folder
+    near_duplicate_of: str | None = None
+    time_s: float | None = None
+    latitude: float | None = None
+    longitude: float | None = None
+    altitude_m: float | None = None
 
 
 @dataclass(frozen=True)

@@ -135,6 +135,19 @@ def account(
     return entries
 
 
+def with_left_out(entries: Sequence[dict[str, Any]], photos: "Sequence[Photo]") -> list[dict[str, Any]]:
+    """The account of all ``photos`` in their order: what is known of those matched, and of those that ingest left out
+    that they are nearly the same picture as another one."""
+    known = {entry["file"]: entry for entry in entries}
+    everything = []
+    for photo in photos:
+        file = photo.file.removeprefix("images/")
+        reason = f"nearly the same picture as {photo.near_duplicate_of}: it adds no baseline"
+        left_out = {"file": file, "registered": False, "reason": reason, "keypoints": 0, "observations": 0}
+        everything.append(known.get(file, left_out))
+    return everything
+
+
 def _reason(
     index: int, names: Sequence[str], matches: Matches, models: Sequence[Sequence[str]], support: tuple[int, int]
 ) -> str:

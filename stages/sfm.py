@@ -114,8 +114,9 @@ def _import(cameras: Path, photos: "list[Photo]", ingest: Path, folder: Path, pr
 
 def _reconstruct(config: Config, photos: "list[Photo]", ingest: Path, folder: Path, progress: Progress) -> StageResult:
     from stages.matching_plan import check_matcher, places_of
-    from stages.registration import FEWEST_POINTS, FEWEST_REGISTERED, account, read_matches, why_no_model
+    from stages.registration import FEWEST_POINTS, FEWEST_REGISTERED, account, read_matches, why_no_model, with_left_out
 
+    everything, photos = photos, [photo for photo in photos if not photo.near_duplicate_of]
     _check_count(photos)
     check_matcher(config.matcher, places_of(photos))
     names = [photo.file.removeprefix("images/") for photo in photos]
@@ -134,7 +135,7 @@ def _reconstruct(config: Config, photos: "list[Photo]", ingest: Path, folder: Pa
         folder,
         source="sfm",
         attempts=found["attempts"],
-        images=images,
+        images=with_left_out(images, everything),
         reprojection_px=found["reprojection_px"],
         points=points,
         camera_model=found["camera_model"],

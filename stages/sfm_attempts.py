@@ -108,8 +108,8 @@ def _read(path: Path) -> list:
 
 
 class Situation(NamedTuple):
-    """What the attempts so far have left: ``missing`` of ``photos`` have no place; ``linked``: one of them shares a view
-    with another photo; ``flat``: there is no model, and a plane or a turn explains next to all pairs."""
+    """What the attempts so far have left: ``missing`` of ``photos`` have no place; ``linked``: one of them shares a
+    view with another photo; ``flat``: there is no model, and a plane or a turn explains next to all pairs."""
 
     missing: int
     photos: int

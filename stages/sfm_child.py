@@ -32,6 +32,7 @@ from stages.colmap.matching import (
 )
 from stages.colmap.models import load_native
 from stages.colmap.refinement import finish
+from stages.masks import write_feature_masks
 from stages.matching_plan import about, places_of
 from stages.pairing import Pairs, Similarity, pairs_of, second_look
 from stages.photos import Photo
@@ -204,7 +205,11 @@ def _matched(attempt: Attempt, missing: list[int], work: _Work) -> Path:
 def _find_features(database: Path, search: Search, work: _Work) -> None:
     work.say(phase="features", database=str(database))
     fill_database(database, work.photos, work.job.camera_model or MAPPING_MODEL)
+    masks = Path(work.job.folder, "masks")
+    if write_feature_masks(work.images.parent, work.photos, masks):
+        search = search._replace(masks=masks)
     extract_features(database, work.images, work.photos, search)
+    shutil.rmtree(masks, ignore_errors=True)
 
 
 def _match(database: Path, pairs: Pairs, max_ratio: float, work: _Work) -> None:

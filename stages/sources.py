@@ -1,19 +1,19 @@
-"""What PHOTOS may be: a folder of photos, or photos whose cameras are already known.
+"""What PHOTOS may be: a folder of photos, a video, or photos whose cameras are already known.
 
 Cheap: lists folders and reads at most the JSON of a transforms file, never an image.
 """
 
 import json
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
 from stages.contract import StageError
 
-SourceKind = Literal["photos", "transforms", "blender", "colmap"]
+SourceKind = Literal["photos", "video", "transforms", "blender", "colmap"]
 
 # Everything else is tried: what counts as a photo is decided by decoding, not by the name.
 # fmt: off
@@ -33,11 +33,12 @@ _FOLDER_HINT = "Give the folder that holds the photos: pipeline run FOLDER"
 class Source:
     """Where photos, and perhaps cameras, come from.
 
-    ``kind`` "photos" goes through structure-from-motion and has no ``cameras``; otherwise ``cameras`` is the
-    transforms file, the folder of transforms_train.json, or the folder of one COLMAP model. ``files`` are the
-    files to decode, in order of their names relative to ``root``; some may turn out to be no images, and files
-    named by a transforms file may be missing. ``frames`` maps each file_path of a transforms file, as it is
-    written there, to the name of its photo.
+    ``kind`` "photos" goes through structure-from-motion and has no ``cameras``, and so does "video", whose one file
+    is the video; otherwise ``cameras`` is the transforms file, the folder of transforms_train.json, or the folder of
+    one COLMAP model. ``files`` are the files to decode, in order of their names relative to ``root``; some may turn
+    out to be no images, and files named by a transforms file may be missing. ``frames`` maps each file_path of a
+    transforms file, as it is written there, to the name of its photo. ``masks`` are all files in folders named masks,
+    each after the name, relative to ``root``, that it would have without such a folder in it.
     """
 
     kind: SourceKind
@@ -45,14 +46,15 @@ class Source:
     cameras: Path | None
     files: tuple[Path, ...]
     frames: Mapping[str, str] = field(default_factory=dict)
+    masks: tuple[tuple[str, Path], ...] = ()
 
     def name(self, file: Path) -> str:
         """The name of one of ``files``: relative to ``root``, with forward slashes, always encodable as UTF-8."""
         return _name(self.root, file)
 
 
-def _name(root: Path, file: Path) -> str:
-    return os.fsencode(file.relative_to(root).as_posix()).decode("utf-8", "backslashreplace")
+def _name(root: Path, file: Path, below: Path = Path()) -> str:
+    return os.fsencode((below / file.relative_to(root)).as_posix()).decode("utf-8", "backslashreplace")
 
 
 def find_source(photos: Path, cameras: Path | None = None) -> Source:
@@ -60,29 +62,54 @@ def find_source(photos: Path, cameras: Path | None = None) -> Source:
     photos, cameras = photos.absolute(), cameras and cameras.absolute()
     try:
         _check_given(photos, cameras)
-        if photos.is_file():
-            return _from_transforms("transforms", photos.parent, photos, photos)
-        root = _photo_root(photos)
-        if cameras is not None and cameras.is_file():
-            return _from_transforms("transforms", root, cameras, cameras)
-        if cameras is not None:
-            return Source("colmap", root, _colmap_model(cameras), list_photos(root))
-        if (photos / "transforms_train.json").is_file():
-            return _from_blender(photos)
-        return Source("photos", root, None, list_photos(root))
+        source = _source(photos, cameras)
+        return source if source.kind == "video" else replace(source, masks=_list_masks(source.root, source.files))
     except PermissionError as error:
         raise StageError(
             f"cannot read {error.filename}", "permission denied", "Change its permissions (chmod -R u+rX)."
         ) from error
 
 
+def _source(photos: Path, cameras: Path | None) -> Source:
+    if photos.is_file() and _is_video(photos):
+        return Source("video", photos.parent, None, (photos,))
+    if photos.is_file():
+        return _from_transforms("transforms", photos.parent, photos, photos)
+    root = _photo_root(photos)
+    if cameras is not None and cameras.is_file():
+        return _from_transforms("transforms", root, cameras, cameras)
+    if cameras is None and (photos / "transforms_train.json").is_file():
+        return _from_blender(photos)
+    files = list_photos(root)
+    if cameras is not None and _is_video(files[0]):
+        raise _cameras_of_video(files[0])
+    if cameras is not None:
+        return Source("colmap", root, _colmap_model(cameras), files)
+    return Source("video" if _is_video(files[0]) else "photos", root, None, files)
+
+
 def list_photos(root: Path) -> tuple[Path, ...]:
-    """All files below ``root`` that may be photos, sorted by relative name.
+    """All files below ``root`` that may be photos, sorted by relative name; where there are none but a single video,
+    that.
 
     Skipped: hidden files, ``masks`` folders, workspaces of ours (folders with a run.json), and files whose
     extension says that they are no images. Folders that are symbolic links are not followed.
     Raises StageError if nothing remains and PermissionError for a folder that cannot be read.
     """
+    found = _files_below(root, _is_photo_folder)
+    if not found:
+        raise StageError(f"{root} is empty", "there is no file in it", _FOLDER_HINT)
+    photos = [file for file in found if file.suffix.lower() not in _NOT_PHOTOS and not _is_video(file)]
+    videos = [file for file in found if _is_video(file)]
+    if not photos and len(videos) == 1:
+        return (videos[0],)
+    if not photos:
+        raise _no_photos(root, found, videos)
+    return tuple(photos)
+
+
+def _files_below(root: Path, enters: Callable[[Path], bool]) -> list[Path]:
+    """The files below ``root`` that are not hidden, in folders that one ``enters``, sorted by relative name."""
 
     def fail(error: OSError) -> None:
         raise error
@@ -90,14 +117,24 @@ def list_photos(root: Path) -> tuple[Path, ...]:
     found: list[Path] = []
     for folder, subfolders, names in os.walk(root, onerror=fail):
         here = Path(folder)
-        subfolders[:] = [s for s in subfolders if _is_photo_folder(here / s)]
+        subfolders[:] = [s for s in subfolders if enters(here / s)]
         found += [here / name for name in names if not name.startswith(".") and (here / name).is_file()]
-    if not found:
-        raise StageError(f"{root} is empty", "there is no file in it", _FOLDER_HINT)
-    photos = [file for file in found if file.suffix.lower() not in (*_NOT_PHOTOS, *_VIDEOS)]
-    if not photos:
-        raise _no_photos(root, found)
-    return tuple(sorted(photos, key=lambda file: file.relative_to(root).as_posix()))
+    return sorted(found, key=lambda file: file.relative_to(root).as_posix())
+
+
+def _list_masks(root: Path, files: tuple[Path, ...]) -> tuple[tuple[str, Path], ...]:
+    """What lies in a ``masks`` folder in ``root``, in any folder of photos below it, or beside ``root`` where that is
+    an ``images`` folder. See :class:`Source`."""
+    holders = {holder for file in files for holder in file.parents if holder.is_relative_to(root)} | {root}
+    places = [(holder / "masks", holder.relative_to(root)) for holder in sorted(holders)]
+    if root.name == "images":
+        places.append((root.parent / "masks", Path()))
+    found = []
+    for masks, stands_in in places:
+        if masks.is_dir():
+            inside = _files_below(masks, lambda folder: not folder.name.startswith("."))
+            found += [(_name(masks, file, stands_in), file) for file in inside]
+    return tuple(found)
 
 
 def read_transforms(transforms: Path) -> dict[str, Any]:
@@ -160,15 +197,16 @@ def _check_given(photos: Path, cameras: Path | None) -> None:
             raise StageError(
                 f"{photos} is a workspace", "it holds results, not photos", f"Go on with it: pipeline resume {photos}"
             )
-    elif (suffix := photos.suffix.lower()) in _VIDEOS:
-        raise _video(photos)
-    elif suffix in _IMAGES:
+    elif _is_video(photos):
+        if cameras is not None:
+            raise _cameras_of_video(photos)
+    elif (suffix := photos.suffix.lower()) in _IMAGES:
         raise StageError(
             f"{photos.name} is a single image", "a scene needs many photos from different places", _FOLDER_HINT
         )
     elif suffix != ".json":
         raise StageError(
-            f"cannot use {photos.name}", "it is neither a folder of photos nor a transforms.json", _FOLDER_HINT
+            f"cannot use {photos.name}", "it is no folder of photos, video or transforms.json", _FOLDER_HINT
         )
     elif cameras is not None:
         raise StageError(
@@ -238,17 +276,24 @@ def _is_model(folder: Path) -> bool:
     )
 
 
-def _no_photos(root: Path, found: list[Path]) -> StageError:
-    videos = sorted(file for file in found if file.suffix.lower() in _VIDEOS)
+def _is_video(file: Path) -> bool:
+    return file.suffix.lower() in _VIDEOS
+
+
+def _cameras_of_video(video: Path) -> StageError:
+    return StageError(
+        f"cannot use --cameras with {video.name}",
+        "it is a video, and which of its frames become photos is decided here: no cameras can be known for them",
+        "Leave --cameras out, or give the folder of the photos that the cameras belong to.",
+    )
+
+
+def _no_photos(root: Path, found: list[Path], videos: list[Path]) -> StageError:
     if videos:
-        return _video(videos[0])
+        names = ", ".join(video.relative_to(root).as_posix() for video in videos[:5])
+        return StageError(
+            f"{len(videos)} videos in {root}", f"{names}: which one is meant is not clear",
+            f"Give one of them: pipeline run {videos[0]}",
+        )  # fmt: skip
     suffixes = ", ".join(sorted({file.suffix.lower() or file.name for file in found})[:5])
     return StageError(f"no photos in {root}", f"its {len(found)} files are no images ({suffixes})", _FOLDER_HINT)
-
-
-def _video(video: Path) -> StageError:
-    return StageError(
-        f"{video.name} is a video",
-        "video input is not built yet",
-        f"Extract frames first: mkdir frames && ffmpeg -i {video.name} -vf fps=2 -q:v 2 frames/%04d.jpg",
-    )

@@ -6,7 +6,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from stages.contract import Progress
+from stages.contract import Progress, StageError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -54,7 +54,7 @@ def patch_bearings(camera: "Camera", downscale: float) -> "Tensor":
 
 def training_bank(ingest: Path, scene: "Scene", split: "Split", downscale: float, progress: Progress) -> "RayBank":
     """All pixels and rays of one split, on the CPU; the pixels are mapped from the pixel store, which is made if need
-    be."""
+    be. What masks ignore is never drawn. Raises StageError where they leave nothing."""
     import numpy as np
     import torch
 
@@ -69,7 +69,7 @@ def training_bank(ingest: Path, scene: "Scene", split: "Split", downscale: float
         progress.update(f"rays of camera {index + 1} of {len(used)}", index / len(used))
         return patch_bearings(scene.cameras[used[index]], downscale)
 
-    return ray_bank(
+    bank = ray_bank(
         pixels=store.table(progress),
         sizes=[(photo.height, photo.width) for photo in store.photos],
         camera_of=[used.index(view.camera) for view in views],
@@ -80,6 +80,30 @@ def training_bank(ingest: Path, scene: "Scene", split: "Split", downscale: float
             far=torch.tensor([view.far for view in views]),
         ),
     )
+    if not any(view.mask for view in views):
+        return bank
+    return _masked(bank, [view_mask(ingest, scene, view, downscale) for view in views], split, progress)
+
+
+def _masked(bank: "RayBank", used: "Sequence[Tensor | None]", split: "Split", progress: Progress) -> "RayBank":
+    try:
+        bank = bank.without([None if mask is None else ~mask for mask in used])
+    except ValueError as error:
+        why = f"{error} of the {split} photos at this size"
+        raise StageError("nothing is left to train on", why, "Give a smaller --train.downscale.") from error
+    progress.note(f"masks leave {bank.drawable / len(bank.pixels):.0%} of the pixels of the {split} photos")
+    return bank
+
+
+def view_mask(ingest: Path, scene: "Scene", view: "View", downscale: float) -> "Tensor | None":
+    """Which pixels of a view are to be used, (H, W) bool; None: all of them."""
+    import torch
+
+    from stages.masks import load_mask
+
+    if view.mask is None:
+        return None
+    return torch.from_numpy(load_mask(ingest / view.mask, *scaled_size(scene.cameras[view.camera], downscale)))
 
 
 def view_rays(scene: "Scene", view: "View", downscale: float) -> "Rays":

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Container, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache, partial
-from itertools import combinations
+from itertools import combinations, product
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -73,15 +73,17 @@ def _name(photo: "Photo") -> str:
 
 class Search(NamedTuple):
     """How far features are searched: the longer side in pixels that photos are reduced to, the most features of each,
-    and whether photos of any size are doubled first."""
+    the folder of masks, and whether photos of any size are doubled first."""
 
     max_image_size: int
     max_features: int
+    masks: Path | None = None
     from_double_size: bool = False
 
 
 def extract_features(database: Path, images: Path, photos: "Sequence[Photo]", search: Search) -> None:
-    """SIFT keypoints and descriptors of every photo that has none yet; alpha is ignored.
+    """SIFT keypoints and descriptors of every photo that has none yet, where ``masks/<image name>.png`` is not black,
+    or anywhere where that is not there.
 
     Photos are searched from their own size down. Doubling them first, as is COLMAP's habit, costs 4.5 times as
     much and moves no camera of a well-sized photo (benchmarks/sfm_accuracy.py), so only small ones are doubled.
@@ -93,11 +95,20 @@ def extract_features(database: Path, images: Path, photos: "Sequence[Photo]", se
     options.sift.max_num_features = search.max_features
     doubled_up_to = math.inf if search.from_double_size else UPSAMPLE_UP_TO_PX
     small = {_name(p) for p in photos if max(p.width, p.height) <= doubled_up_to}
-    for first_octave, is_small in ((-1, True), (0, False)):
-        names = [name for name in map(_name, photos) if (name in small) is is_small]
-        if names:
-            options.sift.first_octave = first_octave
-            pycolmap.extract_features(database, images, names, extraction_options=options, device=pycolmap.Device.cpu)
+    masks = search.masks
+    masked = {name for name in map(_name, photos) if masks and (masks / f"{name}.png").is_file()}
+    # A photo without a mask has to go without a folder of masks: one that is not there is an error to COLMAP.
+    for is_small, is_masked in product((True, False), (False, True)):
+        names = [name for name in map(_name, photos) if (name in small, name in masked) == (is_small, is_masked)]
+        if not names:
+            continue
+        options.sift.first_octave = -1 if is_small else 0
+        reader = pycolmap.ImageReaderOptions()
+        if is_masked and masks:
+            reader.mask_path = masks
+        pycolmap.extract_features(
+            database, images, names, reader_options=reader, extraction_options=options, device=pycolmap.Device.cpu
+        )
 
 
 def match_pairs(

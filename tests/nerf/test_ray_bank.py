@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from nerf.randomness import generator
-from nerf.ray_bank import Placement, RayBank, build_ray_bank, ray_bank
+from nerf.ray_bank import Placement, RayBank, _in_runs, build_ray_bank, ray_bank
 from nerf.rays import rays_of_view
 
 SIZES = [(3, 5), (4, 2), (3, 5)]  # (height, width) of each view
@@ -108,3 +108,47 @@ def test_rays_are_unit_vectors_behind_the_camera_too() -> None:
     expected = 0.1 + step * ((torch.arange(330) + 0.5) / 10 - 0.5)
     off = torch.atan2(directions[:, 0], directions[:, 2]) - expected
     assert 0 < off.abs().max() < 0.1 * step
+
+
+SHARES = st.sampled_from([None, 0.0, 0.3, 0.6, 0.9, 1.0])
+
+
+@given(st.tuples(SHARES, SHARES, SHARES), st.integers(0, 99))
+def test_runs_count_through_the_pixels_that_no_mask_ignores(shares: tuple[float | None, ...], seed: int) -> None:
+    bank, *_ = scattered()
+    random = generator("cpu", seed)
+    noise = [torch.rand(size, generator=random) for size in SIZES]
+    ignored = [None if share is None else part < share for share, part in zip(shares, noise, strict=True)]
+    flat = [(part < (share or 0)).flatten() for share, part in zip(shares, noise, strict=True)]
+    used = (~torch.cat(flat)).nonzero()[:, 0]
+    if not len(used):
+        with pytest.raises(ValueError, match="the masks ignore every pixel"):
+            bank.without(ignored)
+        return
+    masked = bank.without(ignored)
+    assert masked.drawable == len(used)
+    if len(used) == 38:
+        assert masked is bank and bank.runs is None
+    else:
+        assert masked.runs is not None
+        assert torch.equal(_in_runs(masked.runs, torch.arange(len(used))), used)
+
+
+def test_ignored_pixels_are_never_drawn_and_the_others_alike() -> None:
+    bank, photos, *_ = scattered()
+    ignored = torch.zeros(SIZES[0], dtype=torch.bool)
+    ignored[1:, 1:4] = True
+    masked = bank.without([ignored, torch.ones(SIZES[1], dtype=torch.bool), None])
+    used = torch.cat([photos[0][~ignored], photos[2].flatten(0, 1)]).float() / 255
+    drawn = masked.sample(24_000, generator("cpu", 0))[1]  # a thousand for each of the 24 pixels
+    counts = (drawn[:, None] == used).all(-1).sum(0)
+    assert len(used) == 24 and counts.sum() == 24_000
+    assert (counts - 1000).abs().max() < 4 * 1000**0.5
+
+
+def test_without_masks_the_same_pixels_are_drawn_as_ever() -> None:
+    bank, *_ = scattered()
+    pixel = torch.randint(38, (20,), generator=generator("cpu", 3))
+    expected, drawn = bank.lookup(pixel), bank.without([None] * 3).sample(20, generator("cpu", 3))
+    assert torch.equal(drawn[0].directions, expected[0].directions) and torch.equal(drawn[1], expected[1])
+    assert bank.to("cpu").runs is None

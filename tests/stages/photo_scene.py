@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from nerf.scene import Camera, Scene, Similarity, View
-from stages.files import write_json
+from stages.files import write_json, write_png
 
 WIDTH, HEIGHT, FOCAL = 24, 16, 20.0
 CAMERA = Camera("PINHOLE", WIDTH, HEIGHT, (FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2))
@@ -29,9 +29,9 @@ def ball_photo(channels: int = 3) -> np.ndarray:
 
 
 def photographed(
-    folder: Path, views: int = 8, channels: int = 3, bounded: bool = True
+    folder: Path, views: int = 8, channels: int = 3, bounded: bool = True, mask: np.ndarray | None = None
 ) -> tuple[dict[str, Path], Scene]:
-    """Write photos and scene.json; every fourth view is a test view."""
+    """Write photos, scene.json and a ``mask`` (0 ignore, 255 use) for all; every fourth view is a test view."""
     from PIL import Image
 
     inputs = {name: folder / name for name in ("ingest", "normalise")}
@@ -42,7 +42,10 @@ def photographed(
         file = f"images/{index:03d}.png"
         Image.fromarray(ball_photo(channels)).save(inputs["ingest"] / file)
         pose = pose_towards_origin(2 * np.pi * index / views)
-        kept.append(View(f"{index}.png", file, 0, pose, 2.0, 4.0, "train" if index % 4 else "test"))
+        masked = None if mask is None else f"masks/{index:03d}.png.png"
+        if mask is not None and masked:
+            write_png(inputs["ingest"] / masked, mask)
+        kept.append(View(f"{index}.png", file, 0, pose, 2.0, 4.0, "train" if index % 4 else "test", masked))
     still = Similarity(1.0, np.eye(3), np.zeros(3))
     scene = Scene((CAMERA,), tuple(kept), still, bounded, channels == 4, "around", True)
     write_json(inputs["normalise"] / "scene.json", scene.to_json())

@@ -36,6 +36,24 @@ def test_photos_of_different_sizes_have_a_mean_colour_each_photo_counting_once()
     assert torch.allclose(mean.shown_at(5, 7), torch.full((5, 7, 3), 0.4))
 
 
+def test_a_mean_of_masked_photos_is_of_what_they_are_used_for():
+    photos = [torch.full((1, 3, 3), value) for value in (0.2, 0.4, 0.9)]
+    used = [torch.tensor([[True, False, False]]), torch.tensor([[True, True, False]]), None]
+    mean = mean_photo(photos, used)
+    assert torch.allclose(mean.shown_at(1, 3)[0, :, 0], torch.tensor([0.5, 0.65, 0.9]))
+    assert torch.allclose(mean.colour, torch.full((3,), 0.5))
+    hidden = mean_photo(photos[:2], used[:2])
+    assert torch.allclose(hidden.shown_at(1, 3)[0, 2], hidden.colour)
+    assert torch.equal(mean_photo(photos, [None] * 3).shown_at(1, 3), mean_photo(photos).shown_at(1, 3))
+
+
+def test_a_photo_that_is_masked_away_does_not_count():
+    photos, nothing = [torch.full((2, 2, 3), 0.3), torch.ones(2, 2, 3)], torch.zeros(2, 2, dtype=torch.bool)
+    assert torch.allclose(mean_photo(photos, [None, nothing]).shown_at(2, 2), photos[0])
+    with pytest.raises(ValueError, match="the mean of no photos"):
+        mean_photo(photos, [nothing, nothing])
+
+
 def test_a_test_photo_of_another_size_gets_the_mean_colour():
     mean = mean_photo([torch.linspace(0, 1, 12).reshape(2, 2, 3)])
     assert mean.shown_at(2, 2).std() > 0.1

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import ExifTags, Image, ImageCms
 
-from stages.decoding import MAX_PIXELS, DecodeError, decode, focal_from_exif
+from stages.decoding import MAX_PIXELS, DecodeError, Place, decode, focal_from_exif, place_from_exif
 
 WIDTH, HEIGHT = 48, 32
 
@@ -122,6 +122,26 @@ def test_sixteen_bit_colour_becomes_eight_and_is_not_copied(tmp_path: Path) -> N
     assert decoded.suffix is None
 
 
+def test_sixteen_bit_colour_tiffs_and_alpha(tmp_path: Path) -> None:
+    """Written by OpenCV: Pillow cannot write them."""
+    import cv2
+
+    deep = smooth().astype(np.uint16) * 257
+    cv2.imwrite(str(tmp_path / "a.tif"), np.ascontiguousarray(deep[..., ::-1]))
+    assert np.array_equal(decode(tmp_path / "a.tif").pixels, smooth())
+    with_alpha = np.dstack([deep[..., ::-1], deep[..., 0]])
+    cv2.imwrite(str(tmp_path / "b.png"), with_alpha)
+    decoded = decode(tmp_path / "b.png")
+    assert np.array_equal(decoded.pixels, np.dstack([smooth(), smooth()[..., 0]]))
+    assert decoded.suffix is None
+
+
+def test_grey_with_alpha_keeps_it(tmp_path: Path) -> None:
+    grey = smooth()[..., 0]
+    decoded = decode(saved(tmp_path / "la.png", Image.fromarray(np.dstack([grey, 255 - grey]))))
+    assert np.array_equal(decoded.pixels, np.dstack([grey, grey, grey, 255 - grey]))
+
+
 def test_alpha_is_kept_where_it_says_something(tmp_path: Path) -> None:
     rgba = np.concatenate([smooth(), smooth()[..., :1]], axis=2)
     decoded = decode(saved(tmp_path / "a.png", Image.fromarray(rgba)))
@@ -144,9 +164,10 @@ def test_palette_with_transparency(tmp_path: Path) -> None:
 
 def test_cmyk(tmp_path: Path) -> None:
     cmyk = Image.fromarray(smooth()).convert("CMYK")
-    decoded = decode(saved(tmp_path / "a.jpg", cmyk, quality=95))
-    assert decoded.suffix is None
-    assert 0 < np.abs(decoded.pixels.astype(int) - smooth()).mean() < 4
+    for name, options in (("a.jpg", {"quality": 95}), ("a.tif", {})):
+        decoded = decode(saved(tmp_path / name, cmyk, **options))
+        assert decoded.suffix is None
+        assert np.abs(decoded.pixels.astype(int) - smooth()).mean() < 4
 
 
 def icc(profile: object) -> bytes:
@@ -307,6 +328,49 @@ def test_exif_reaches_the_camera_key(tmp_path: Path) -> None:
     assert wide.camera_key[:6] == ("Maker", "M1", "", WIDTH, HEIGHT, 1)
     assert wide.focal_px == pytest.approx(28 / 43.27 * np.hypot(WIDTH, HEIGHT))
     assert wide.camera_key != zoomed.camera_key
+
+
+GREENWICH = {"GPSLatitude": (51, 28, 38.0), "GPSLatitudeRef": "N", "GPSLongitude": (0, 0, 1.8), "GPSLongitudeRef": "W"}
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png", "heic"])
+def test_where_a_photo_was_taken(tmp_path: Path, suffix: str) -> None:
+    exif = exif_with(Make="Maker")
+    numbers = {1: "S", 2: (33.0, 51.0, 24.5), 3: "E", 4: (151.0, 12.0, 54.0), 5: b"\1", 6: 4.25}
+    exif.get_ifd(ExifTags.IFD.GPSInfo).update(numbers)
+    big = Image.fromarray(smooth(96, 64))
+    decode(saved(tmp_path / "warm.png", big))  # registers HEIC
+    place = decode(saved(tmp_path / f"a.{suffix}", big, exif=exif)).place
+    assert place.latitude == pytest.approx(-(33 + 51 / 60 + 24.5 / 3600), abs=1e-6)
+    assert place.longitude == pytest.approx(151 + 12 / 60 + 54 / 3600, abs=1e-6)
+    assert place.altitude_m == pytest.approx(-4.25)
+    assert decode(tmp_path / "warm.png").place == Place()
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"GPSLatitude": (0, 0, 0), "GPSLongitude": (0, 0, 0)},  # no place found
+        {"GPSLatitude": (91, 0, 0)},
+        {"GPSLongitude": (180, 0, 1)},
+        {"GPSLatitude": (51, float("nan"), 0)},
+        {"GPSLatitude": (51, 28)},
+        {"GPSLatitude": "51.4"},
+        {"GPSLatitude": None},
+        {"GPSLongitudeRef": None},
+        {"GPSLatitudeRef": "E"},
+    ],
+)
+def test_a_place_that_cannot_be_is_none(wrong: dict[str, object]) -> None:
+    assert place_from_exif(GREENWICH | {"GPSAltitude": 46.0} | wrong) == Place()
+
+
+def test_altitudes_stand_for_themselves() -> None:
+    place = place_from_exif(GREENWICH)
+    assert place == Place(pytest.approx(51.477222, abs=1e-6), pytest.approx(-0.0005), None)
+    for value, level, expected in ((46.0, b"\0", 46.0), (12.5, 1, -12.5), (1e9, 0, None), (float("nan"), 0, None)):
+        tags = GREENWICH | {"GPSAltitude": value, "GPSAltitudeRef": level}
+        assert place_from_exif(tags) == Place(place.latitude, place.longitude, expected)
 
 
 @pytest.mark.parametrize("scene", ["banana", "sceaux_castle", "fern", "fox"])

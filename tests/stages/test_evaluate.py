@@ -19,7 +19,7 @@ from nerf.rays import Rays
 from nerf.scene import Camera, Scene, Similarity, View
 from stages import evaluate
 from stages.evaluate import affordable, verdict
-from stages.files import write_json
+from stages.files import write_json, write_png
 
 WIDTH, HEIGHT, FOCAL = 32, 24, 30.0
 WAVES = np.array([[5.0, 2.0, 3.0], [-4.0, 6.0, 1.0], [2.0, -3.0, 7.0]])
@@ -165,6 +165,43 @@ def test_scores_at_the_size_the_field_was_trained_at(make: Make, tmp_path: Path,
     assert " dB on unseen photos at 50% of their width, " in metrics["verdict"]
     full, _ = _run(inputs, tmp_path / "full", progress, downscale=1)
     assert full["width_share"] == 1 and full["psnr"] > metrics["psnr"]
+
+
+def masked(inputs: dict[str, Path], ignore: np.ndarray) -> dict[str, Path]:
+    """Spoil every photo where ``ignore`` (H, W) is set, and give it a mask that says so."""
+    scene = json.loads((inputs["normalise"] / "scene.json").read_text("utf-8"))
+    for view in scene["views"]:
+        pixels = np.array(Image.open(inputs["ingest"] / view["file"]))
+        pixels[ignore] = 255 - pixels[ignore]
+        Image.fromarray(pixels).save(inputs["ingest"] / view["file"])
+        view["mask"] = f"masks/{Path(view['file']).name}.png"
+        write_png(inputs["ingest"] / view["mask"], np.where(ignore, np.uint8(0), np.uint8(255)))
+    write_json(inputs["normalise"] / "scene.json", scene)
+    return inputs
+
+
+def test_what_masks_ignore_does_not_count(make: Make, tmp_path: Path, progress: Any):
+    ignore = np.zeros((HEIGHT, WIDTH), bool)
+    ignore[:, 20:] = True
+    metrics, _ = _run(masked(make(SkyField(0.1)), ignore), tmp_path / "out", progress)
+    for image in metrics["images"]:
+        assert image["psnr"] == pytest.approx(20, abs=0.05)  # the error is 0.1 wherever it counts
+        error = np.asarray(Image.open(tmp_path / "out" / image["error"]))
+        assert (error[:, 20:] == error[0, -1]).all() and (error[:, :20] != error[0, -1]).any(-1).all()
+        render = np.asarray(Image.open(tmp_path / "out" / image["render"]))
+        assert render[:, 20:].std() > 10  # the picture itself is whole
+    assert metrics["psnr_mean_image"] < 25 and metrics["ssim"] > 0.5
+
+
+def test_a_photo_of_which_masks_leave_nothing_at_this_size_is_not_scored(make: Make, tmp_path: Path, progress: Any):
+    inputs = masked(make(downscale=2), np.zeros((HEIGHT, WIDTH), bool))
+    dot = np.zeros((HEIGHT, WIDTH), np.uint8)
+    dot[3, 3] = 255
+    write_png(inputs["ingest"] / "masks/004.png.png", dot)
+    metrics, line = _run(inputs, tmp_path / "out", progress)
+    assert [image["name"] for image in metrics["images"]] == ["001.jpg", "007.jpg", "010.jpg"]
+    assert progress.notes == ["masks leave nothing to compare of 1 photo at this size"] == metrics["notes"][:1]
+    assert line.endswith("· 3 of 4 photos at 50% width")
 
 
 def test_a_slow_field_is_scored_on_fewer_photos_and_says_so(make: Make, tmp_path: Path, progress: Any):

@@ -82,3 +82,17 @@ def _interval(values: list[float]) -> tuple[float, float]:
     interval = bootstrap_interval(values, seed=0)
     assert interval is not None
     return interval
+
+
+def test_what_is_not_used_counts_nowhere():
+    """A field of windows that lie inside the left half scores as the left half alone, whatever the right half holds."""
+    a, b = _picture(1), _picture(2)
+    used = torch.zeros(a.shape[:2], dtype=torch.bool)
+    used[:, :26] = True
+    assert ssim(a, b, used) == pytest.approx(ssim(a[:, :26], b[:, :26]), abs=1e-6)
+    spoiled = torch.where(used[..., None], b, 1 - b)
+    assert ssim(a, spoiled, used) == ssim(a, b, used) != ssim(a, b)
+    assert np.array_equal(error_map(a, spoiled, used)[:, :26], error_map(a, b)[:, :26])
+    assert (error_map(a, spoiled, used)[:, 26:] == error_map(a, a)[:, 26:]).all()
+    used[::10, ::10] = False
+    assert ssim(a, b, used) is None

@@ -5,17 +5,17 @@ import os
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from PIL import Image
 
 from stages import ingest
 from stages.contract import StageError
 from stages.files import read_json
-from stages.ingest import Config, ascii_files
+from stages.ingest import Config
 from stages.photos import load_pixels, read_frame_names, read_photos
+from tests.blots import blots, cut_out
 
 
 def picture(seed: int, width: int = 32, height: int = 24) -> Image.Image:
@@ -48,7 +48,7 @@ def test_plain_photos_are_copied_byte_for_byte(tmp_path: Path, progress: Any) ->
     assert [photo.file for photo in photos] == ["images/a.png", "images/b.JPG", "images/sub/c.jpg"]
     for photo in photos:
         assert (tmp_path / "out" / photo.file).read_bytes() == (tmp_path / "in" / photo.name).read_bytes()
-    assert result.line == "3 photos 32×24, one camera, no EXIF focal"
+    assert result.line == "3 photos 32×24, 2 cameras, no EXIF focal"
     assert result.outputs == ("images", "photos.json")
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["images", "photos.json"]
     assert progress.updates[-1] == ("decoded 3 of 3 photos", 1.0)
@@ -140,6 +140,161 @@ def test_cameras_are_told_apart(tmp_path: Path, progress: Any) -> None:
     assert result.facts["sizes"] == [[32, 24], [40, 24]]
 
 
+def exif_of(make: str, model: str, lens: str = "") -> Image.Exif:
+    exif = Image.Exif()
+    exif[271], exif[272] = make, model
+    exif.get_ifd(0x8769)[42036] = lens
+    return exif
+
+
+def groups(folder: Path, out: Path, progress: Any) -> list[int]:
+    ingest.run(Config(photos=folder), {}, out, progress)
+    return [photo.camera_group for photo in read_photos(out)]
+
+
+def test_two_phones_in_one_folder_are_two_cameras_wherever_their_photos_lie(tmp_path: Path, progress: Any) -> None:
+    cameras = [("A", "1"), ("B", "1"), ("A", "1"), ("A", "2"), ("A", "1", "tele")]
+    (tmp_path / "in/more").mkdir(parents=True)
+    for seed, camera in enumerate(cameras):
+        folder = tmp_path / "in/more" if seed == 2 else tmp_path / "in"
+        picture(seed).save(folder / f"{seed}.jpg", exif=exif_of(*camera))
+    # in order of name 0 1 3 4 more/2
+    assert groups(tmp_path / "in", tmp_path / "out", progress) == [0, 1, 2, 3, 0]
+
+
+def test_without_exif_each_folder_is_a_camera(tmp_path: Path, progress: Any) -> None:
+    put(tmp_path / "in", "a.png", "b.png", "left/a.png", "left/b.png", "left/deep/a.png", "right/a.png")
+    assert groups(tmp_path / "in", tmp_path / "out", progress) == [0, 0, 1, 1, 2, 3]
+
+
+def test_where_photos_were_taken_is_written_down(tmp_path: Path, progress: Any) -> None:
+    put(tmp_path / "in", "a.png")
+    exif = exif_of("A", "1")
+    exif.get_ifd(0x8825).update({1: "N", 2: (48.0, 30.0, 0.0), 3: "E", 4: (9.0, 0.0, 0.0), 5: b"\0", 6: 341.5})
+    picture(1).save(tmp_path / "in/b.jpg", exif=exif)
+    ingest.run(Config(photos=tmp_path / "in"), {}, tmp_path / "out", progress)
+    places = [(photo.latitude, photo.longitude, photo.altitude_m) for photo in read_photos(tmp_path / "out")]
+    assert places == [(None, None, None), (48.5, 9.0, 341.5)]
+
+
+def test_a_photo_far_less_sharp_than_its_neighbours_is_named_and_kept(tmp_path: Path, progress: Any) -> None:
+    (tmp_path / "in").mkdir()
+    for index in range(6):
+        wall = blots(index, 240, 180)
+        Image.fromarray(cv2.blur(wall, (9, 9)) if index == 2 else wall).save(tmp_path / f"in/{index}.png")
+    ingest.run(Config(photos=tmp_path / "in"), {}, tmp_path / "out", progress)
+    relative = [photo.relative_sharpness for photo in read_photos(tmp_path / "out")]
+    assert relative[2] is not None and 0 < relative[2] < 0.1
+    assert all(one is not None and 0.5 < one < 2 for index, one in enumerate(relative) if index != 2)
+    assert progress.notes == [
+        f"1 photo is far less sharp than those before and after, and kept: 2.png ({relative[2]:.2f} ×)"
+    ]
+
+
+def shifted(folder: Path, *shifts: float, blurred: int | None = None) -> Path:
+    """Photos of a wall, each moved by so many pixels."""
+    folder.mkdir()
+    wall = blots(0, 500, 300)
+    for index, shift in enumerate(shifts):
+        view = cut_out(wall, 20 + shift, 20, 320, 240)
+        Image.fromarray(cv2.blur(view, (3, 3)) if index == blurred else view).save(folder / f"{index}.png")
+    return folder
+
+
+def test_of_nearly_the_same_pictures_the_sharpest_goes_on(tmp_path: Path, progress: Any) -> None:
+    folder = shifted(tmp_path / "in", 0, 2, 40, 41.5, 120, blurred=0)
+    result = ingest.run(Config(photos=folder), {}, tmp_path / "out", progress)
+    photos = read_photos(tmp_path / "out")
+    assert [photo.near_duplicate_of for photo in photos] == ["1.png", None, None, "2.png", None]
+    assert all((tmp_path / "out" / photo.file).is_file() for photo in photos)
+    assert result.line == "5 photos 320×240, one camera, no EXIF focal"
+    assert progress.notes == [
+        "2 photos are nearly the same picture as another and left out of matching: 0.png (as 1.png), 3.png (as 2.png)"
+    ]
+
+
+def test_photos_that_are_all_nearly_the_same_are_no_scene(tmp_path: Path, progress: Any) -> None:
+    error = failure(shifted(tmp_path / "in", 0, 1, 2), tmp_path / "out", progress)
+    assert (error.what, error.why) == (
+        "all 3 photos are nearly the same picture",
+        "the camera stood still between them, so they tell nothing of depth",
+    )
+
+
+def test_with_given_cameras_all_photos_are_used(tmp_path: Path, progress: Any) -> None:
+    import json
+
+    folder = shifted(tmp_path / "in", 0, 1, 2)
+    frames = [{"file_path": f"{index}.png", "transform_matrix": np.eye(4).tolist()} for index in range(3)]
+    (folder / "transforms.json").write_text(json.dumps({"frames": frames}))
+    ingest.run(Config(photos=folder / "transforms.json"), {}, tmp_path / "out", progress)
+    assert [photo.near_duplicate_of for photo in read_photos(tmp_path / "out")] == [None] * 3
+
+
+def mask_for(folder: Path, name: str, ignored_columns: int, size: tuple[int, int] = (32, 24)) -> None:
+    mask = np.full(size[::-1], 255, np.uint8)
+    mask[:, :ignored_columns] = 0
+    (folder / name).parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(mask).save(folder / name)
+
+
+def test_masks_go_with_their_photos(tmp_path: Path, progress: Any) -> None:
+    folder = put(tmp_path / "in", "a.png", "left/ö b.jpg", "c.png", "d.png", "e.png")
+    mask_for(folder, "masks/a.png", 8)
+    mask_for(folder, "masks/left/ö b.jpg.png", 32, (64, 48))
+    mask_for(folder, "masks/d.png", 0)  # ignores nothing
+    mask_for(folder, "masks/stranger.png", 8)
+    turned = Image.Exif()
+    turned[0x0112] = 6
+    picture(9, 24, 32).save(folder / "t.png", exif=turned)  # upright 32 × 24
+    stored = np.full((32, 24), 255, np.uint8)
+    stored[-16:] = 0  # its lower half is the left half of the upright photo
+    Image.fromarray(stored).save(folder / "masks/t.png")
+    result = ingest.run(Config(photos=folder), {}, tmp_path / "out", progress)
+    photos = read_photos(tmp_path / "out")
+    assert result.outputs == ("images", "photos.json", "masks")
+    assert [photo.mask is not None for photo in photos] == [True, False, False, False, True, True]
+    for photo, columns in zip([photos[0], photos[4], photos[5]], (8, 16, 16), strict=True):
+        assert photo.mask == f"masks/{photo.file.removeprefix('images/')}.png"
+        mask = np.asarray(Image.open(tmp_path / "out" / photo.mask))
+        assert np.array_equal(mask, np.broadcast_to(np.where(np.arange(32) < columns, 0, 255), (24, 32)))
+    assert progress.notes == [
+        "masks/stranger.png is no photo's mask, which are called NAME.png",
+        "masks of 3 of 6 photos ignore 42% of them, 1 turned upright like the photo, 1 made as large as the photo",
+    ]
+
+
+def test_a_photo_whose_mask_cannot_be_used_is_refused(tmp_path: Path, progress: Any) -> None:
+    folder = put(tmp_path / "in", "a.png", "b.png", "c.png", "d.png")
+    mask_for(folder, "masks/a.png", 8, (30, 30))
+    mask_for(folder, "masks/b.png", 32)
+    ingest.run(Config(photos=folder), {}, tmp_path / "out", progress)
+    assert [photo.name for photo in read_photos(tmp_path / "out")] == ["c.png", "d.png"]
+    assert progress.notes == [
+        "refused a.png: its mask a.png does not fit: it is 30×30 and the photo 32×24",
+        "refused b.png: its mask b.png ignores all of it (its brightest value is 0 of 255)",
+    ]
+
+
+def test_a_video_becomes_photos_with_times(tmp_path: Path, progress: Any) -> None:
+    from stages.video import video_writer
+
+    wall = blots(0, 500, 200)
+    with video_writer(tmp_path / "my clip.mp4", 160, 120, 10) as write:
+        for step in range(24):
+            write(np.ascontiguousarray(wall[20:140, 20 + 8 * step : 180 + 8 * step]))
+    result = ingest.run(Config(photos=tmp_path / "my clip.mp4", frames=10), {}, tmp_path / "out", progress)
+    photos = read_photos(tmp_path / "out")
+    assert 5 < len(photos) <= 10
+    assert result.line == f"{len(photos)} frames 160×120, one camera, no EXIF focal, {photos[-1].time_s:.1f} s of video"
+    for photo in photos:
+        assert photo.time_s is not None and photo.name == f"frame_{round(10 * photo.time_s):06d}.jpg"
+        assert photo.file == f"images/{photo.name}" and photo.camera_group == 0
+        assert Image.open(tmp_path / "out" / photo.file).size == (160, 120)
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["images", "photos.json"]
+    assert result.facts["source"] == "video"
+
+
 def test_sharpness_orders_blur(tmp_path: Path, progress: Any) -> None:
     from PIL import ImageFilter
 
@@ -169,44 +324,6 @@ def test_terminal_codes_in_names_are_not_printed(tmp_path: Path, progress: Any) 
     (tmp_path / "in/\x1b[2J.jpg").write_text("text")
     ingest.run(Config(photos=tmp_path / "in"), {}, tmp_path / "out", progress)
     assert progress.notes == [r"refused '\x1b[2J.jpg': not an image: it is text"]
-
-
-def test_names_that_are_safe_are_kept_and_others_tell_what_they_were() -> None:
-    names = [("IMG_1.JPG", ".jpg"), ("sub/b-2.png", ".png"), ("Café au lait.jpg", ".jpg"), ("b.heic", ".png")]
-    files = ascii_files(names)
-    assert files[:2] == ["IMG_1.JPG", "sub/b-2.png"]
-    assert files[2].startswith("Cafe_au_lait-") and files[2].endswith(".jpg")
-    assert files[3] == "b.png"
-
-
-def test_colliding_names_are_told_apart_and_the_unchanged_one_wins() -> None:
-    files = ascii_files([("a.heic", ".png"), ("A.png", ".png"), ("a.png", ".png"), ("a.jpg", ".jpg")])
-    assert files[1] == "A.png"
-    assert len({os.path.splitext(file)[0].lower() for file in files}) == 4
-
-
-@given(
-    st.lists(
-        st.tuples(
-            st.lists(st.text(st.characters(exclude_characters="/\0", codec="utf-8"), min_size=1), min_size=1).map(
-                "/".join
-            ),
-            st.sampled_from([".jpg", ".png"]),
-        ),
-        max_size=12,
-        unique=True,
-    )
-)
-def test_any_names_become_safe_and_distinct(names: list[tuple[str, str]]) -> None:
-    files = ascii_files(names)
-    assert files == ascii_files(names)
-    assert len({os.path.splitext(file)[0].lower() for file in files}) == len(names)
-    folders = {str(parent).lower() for file in files for parent in Path(file).parents}
-    for file in files:
-        assert file.isascii() and len(file) < 200
-        assert set(file) <= set("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789-_./")
-        assert all(part and not part.startswith(("-", ".")) for part in file.split("/"))
-        assert file.lower() not in folders
 
 
 def test_only_photos_named_by_the_cameras_are_taken(tmp_path: Path, progress: Any) -> None:

@@ -48,7 +48,7 @@ def inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
             point=scene.point,
             xy=np.zeros((len(scene.view), 2)),
         )
-        monkeypatch.setattr("stages.colmap.read_model", lambda sparse: model)
+        monkeypatch.setattr("stages.colmap.models.read_model", lambda sparse: model)
         return folders
 
     return build

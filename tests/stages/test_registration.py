@@ -1,11 +1,12 @@
 import sqlite3
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from stages.photos import Photo
-from stages.registration import Matches, account, count_done, is_sound, why_no_model
+from stages.registration import Matches, account, count_done, is_sound, why_no_model, with_left_out
 
 NAMES = ["a.jpg", "b.jpg", "c.jpg", "d.jpg", "e.jpg"]
 PHOTOS = [Photo(name, f"images/{name}", 60, 40, 0, None, None, False, 1.0) for name in NAMES]
@@ -25,6 +26,21 @@ def matches(
         homography=np.tile(np.eye(3) if turned else np.diag([2.0, 1.0, 1.0]), (len(array), 1, 1)),
         shift_px=np.full(len(array), shift_px),
     )
+
+
+def test_photos_left_out_of_matching_stand_in_the_account() -> None:
+    photos = [
+        replace(photo, near_duplicate_of="ä.jpg") if index in (0, 3) else photo for index, photo in enumerate(PHOTOS)
+    ]
+    matched = account(
+        ["b.jpg", "c.jpg", "e.jpg"], matches((0, 1, 90), (1, 2, 80)), [["b.jpg", "c.jpg", "e.jpg"]], {}, {}
+    )
+    entries = with_left_out(matched, photos)
+    assert [entry["file"] for entry in entries] == NAMES
+    assert [entry["reason"] for entry in entries if not entry["registered"]] == [
+        "nearly the same picture as ä.jpg: it adds no baseline"
+    ] * 2
+    assert all(entry.keys() == entries[0].keys() for entry in entries)
 
 
 FOUR = (matches((0, 1, 90), (1, 2, 80), (2, 3, 19), (1, 3, 22)), [["a.jpg", "b.jpg", "c.jpg"]])

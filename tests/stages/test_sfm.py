@@ -3,6 +3,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 
@@ -14,9 +15,10 @@ from pipeline.truth import align
 from stages import ingest, sfm
 from stages.colmap.models import read_model
 from stages.contract import StageError
-from stages.files import read_json
-from stages.photos import Photo, write_photos
+from stages.files import read_json, write_png
+from stages.photos import Photo, read_photos, write_photos
 from stages.registration import count_done
+from tests.blots import blots
 from tests.small_scenes import write_blender_scene
 from tests.synthetic_photos import Quiet, SyntheticPhotos
 
@@ -146,18 +148,6 @@ def test_however_the_child_ends_it_is_an_error_with_words(
     assert (tmp_path / "sfm.log").exists()
 
 
-def texture(seed: int, width: int = 600, height: int = 400) -> np.ndarray:
-    """Blots of all sizes, as a flat picture."""
-    import cv2
-
-    random = np.random.default_rng(seed)
-    picture = np.full((height, width, 3), 128.0)
-    for size in (3, 6, 12, 25, 50):
-        blots = random.normal(size=(height // size, width // size, 3))
-        picture += 12 * size**0.5 * cv2.resize(blots, (width, height), interpolation=cv2.INTER_CUBIC)
-    return np.clip(picture, 0, 255).astype(np.uint8)
-
-
 def turned(angle: float, panorama: np.ndarray, size: tuple[int, int] = (240, 180), focal: float = 250.0) -> np.ndarray:
     """What a camera sees of a far picture after turning about its vertical axis."""
     import cv2
@@ -179,7 +169,7 @@ def refusal(images: dict[str, np.ndarray], folder: Path, progress) -> StageError
 
 
 def test_photos_without_overlap_are_refused(tmp_path: Path, progress) -> None:
-    error = refusal({f"{i}.png": texture(i, 240, 180) for i in range(4)}, tmp_path, progress)
+    error = refusal({f"{i}.png": blots(i, 240, 180) for i in range(4)}, tmp_path, progress)
     assert str(error) == (
         "the cameras of 4 photos could not be found: 0 of 6 pairs of photos share a view. "
         "Take photos with 60–80 % overlap, so that everything is visible in at least three of them."
@@ -187,14 +177,14 @@ def test_photos_without_overlap_are_refused(tmp_path: Path, progress) -> None:
 
 
 def test_turning_on_the_spot_is_refused(tmp_path: Path, progress) -> None:
-    panorama = texture(0)
+    panorama = blots(0)
     error = refusal({f"{i}.png": turned(0.12 * i - 0.3, panorama) for i in range(6)}, tmp_path, progress)
     assert "matching pairs differ by a turn of the camera alone, or show one flat surface" in error.why
     assert "Move sideways" in error.hint
 
 
 def test_identical_photos_are_refused(tmp_path: Path, progress) -> None:
-    error = refusal({f"{i}.png": texture(0, 240, 180) for i in range(3)}, tmp_path, progress)
+    error = refusal({f"{i}.png": blots(0, 240, 180) for i in range(3)}, tmp_path, progress)
     assert error.why == "the photos are all the same view (3 of 3 pairs differ by less than a pixel)"
 
 
@@ -205,7 +195,7 @@ def test_blank_photos_are_refused(tmp_path: Path, progress) -> None:
 
 @pytest.mark.parametrize("count", [1, 2])
 def test_too_few_photos_are_refused_at_once(count: int, tmp_path: Path, progress) -> None:
-    error = refusal({f"{i}.png": texture(i, 240, 180) for i in range(count)}, tmp_path, progress)
+    error = refusal({f"{i}.png": blots(i, 240, 180) for i in range(count)}, tmp_path, progress)
     assert error.what == f"cannot find cameras from {count} photo{'s' * (count == 2)}"
 
 
@@ -214,7 +204,7 @@ def test_strangers_are_left_out_and_named_and_alpha_and_mixed_sizes_work(
 ) -> None:
     images = {path.name: np.asarray(Image.open(path)) for path in sorted((inputs["ingest"] / "images").iterdir())[:8]}
     alpha = {f"{n}.png": np.dstack([i, np.full(i.shape[:2], 255, np.uint8)]) for n, i in list(images.items())[:6]}
-    plain = dict(list(images.items())[6:]) | {"stranger.png": texture(1, 300, 200)}
+    plain = dict(list(images.items())[6:]) | {"stranger.png": blots(1, 300, 200)}
     result = sfm.run(SMALL, ingested(tmp_path / "ingest", alpha | plain), tmp_path / "sfm", progress)
     assert result.line.startswith("8/9 registered, ")
     assert [re.sub(r"about .*", "…", note) for note in progress.notes[:5]] == [
@@ -226,6 +216,40 @@ def test_strangers_are_left_out_and_named_and_alpha_and_mixed_sizes_work(
     ]
     account = read_json(tmp_path / "sfm/registration.json")
     assert [image["file"] for image in account["images"] if not image["registered"]] == ["stranger.png"]
+
+
+def test_nearly_the_same_pictures_are_not_matched_and_masks_keep_features_away(
+    inputs: dict[str, Path], tmp_path: Path, progress
+) -> None:
+    images = {path.name: np.asarray(Image.open(path)) for path in sorted((inputs["ingest"] / "images").iterdir())[:9]}
+    ingested(tmp_path / "ingest", images)
+    photos = read_photos(tmp_path / "ingest")
+    photos[1] = replace(photos[1], near_duplicate_of=photos[0].name)
+    mask = np.full((180, 240), 255, np.uint8)
+    mask[:, :80] = 0
+    photos[5] = replace(photos[5], mask="masks/m.png")
+    write_png(tmp_path / "ingest/masks/m.png", mask)
+    write_photos(tmp_path / "ingest", photos, [], {})
+    result = sfm.run(SMALL, {"ingest": tmp_path / "ingest"}, tmp_path / "sfm", progress)
+    account = read_json(tmp_path / "sfm/registration.json")
+    model = read_model(tmp_path / "sfm/sparse")
+    assert result.line.startswith("8/9 registered, ")
+    assert (account["photos"], account["registered"]) == (9, 8)
+    assert [image["file"] for image in account["images"]] == list(images)
+    assert account["images"][1] == {
+        "file": photos[1].file.removeprefix("images/"),
+        "registered": False,
+        "reason": f"nearly the same picture as {photos[0].name}: it adds no baseline",
+        "keypoints": 0,
+        "observations": 0,
+    }
+    place = {image.file: index for index, image in enumerate(model.images)}
+    seen_at = model.xy[model.view == place[photos[5].file.removeprefix("images/")]]
+    others = model.xy[model.view == place[photos[4].file.removeprefix("images/")]]
+    assert len(seen_at) > 20 and seen_at[:, 0].min() > 79
+    assert (others[:, 0] < 79).sum() > 5
+    assert progress.notes == []
+    assert sorted(path.name for path in (tmp_path / "sfm").iterdir()) == ["registration.json", "sfm.log", "sparse"]
 
 
 def test_the_screen_never_stands_still(inputs: dict[str, Path], tmp_path: Path, progress) -> None:

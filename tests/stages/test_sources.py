@@ -158,18 +158,26 @@ def test_a_transforms_file_that_is_none(tmp_path: Path, content: str, why: str) 
 
 
 def test_words_for_what_cannot_be_used(tmp_path: Path) -> None:
-    touch(tmp_path, "video/clip.mp4", "texts/a.txt", "texts/b.md", "done.nerf/run.json", "one/a.JPG", "odd/a.xyz")
+    touch(
+        tmp_path,
+        "videos/clip.mp4",
+        "videos/a/b.MOV",
+        "texts/a.txt",
+        "texts/b.md",
+        "done.nerf/run.json",
+        "one/a.JPG",
+        "odd/a.xyz",
+    )
     (tmp_path / "empty").mkdir()
     cases = {
         "nowhere": "nowhere does not exist: no file or folder has this name. Check the spelling.",
         "empty": "empty is empty: there is no file in it. Give the folder that holds the photos: pipeline run FOLDER",
         "texts": f"no photos in {tmp_path}/texts: its 2 files are no images (.md, .txt). "
         "Give the folder that holds the photos: pipeline run FOLDER",
-        "video/clip.mp4": "clip.mp4 is a video: video input is not built yet. Extract frames first: "
-        "mkdir frames && ffmpeg -i clip.mp4 -vf fps=2 -q:v 2 frames/%04d.jpg",
-        "video": "clip.mp4 is a video: video input is not built yet.",
+        "videos": f"2 videos in {tmp_path}/videos: a/b.MOV, clip.mp4: which one is meant is not clear. "
+        f"Give one of them: pipeline run {tmp_path}/videos/a/b.MOV",
         "one/a.JPG": "a.JPG is a single image: a scene needs many photos from different places. Give the folder",
-        "odd/a.xyz": "cannot use a.xyz: it is neither a folder of photos nor a transforms.json.",
+        "odd/a.xyz": "cannot use a.xyz: it is no folder of photos, video or transforms.json.",
         "done.nerf": f"done.nerf is a workspace: it holds results, not photos. "
         f"Go on with it: pipeline resume {tmp_path}/done.nerf",
     }
@@ -183,6 +191,41 @@ def test_words_for_cameras_that_cannot_be_used(tmp_path: Path) -> None:
     assert refusal(tmp_path / "photos", tmp_path / "no").hint == "Check --cameras."
     assert refusal(tmp_path / "photos", tmp_path / "photos").what == f"no COLMAP model in {tmp_path}/photos"
     assert refusal(cameras, cameras).what == "two sources of cameras"
+
+
+@pytest.mark.parametrize("given", ["holiday/clip.MP4", "holiday"])
+def test_a_video_or_a_folder_with_nothing_else(tmp_path: Path, given: str) -> None:
+    touch(tmp_path, "holiday/clip.MP4", "holiday/notes.txt", "holiday/masks/a.png")
+    source = find_source(tmp_path / given)
+    assert (source.kind, source.root, names(source)) == ("video", tmp_path / "holiday", ["clip.MP4"])
+    assert (source.cameras, source.masks) == (None, ())
+    with pytest.raises(StageError) as error:
+        find_source(tmp_path / given, transforms(tmp_path / "t.json", "a.jpg").parent)
+    assert str(error.value) == (
+        "cannot use --cameras with clip.MP4: it is a video, and which of its frames become photos is decided here: "
+        "no cameras can be known for them. "
+        "Leave --cameras out, or give the folder of the photos that the cameras belong to."
+    )
+
+
+def test_masks_are_listed_after_the_names_they_would_have_without_their_folder(tmp_path: Path) -> None:
+    touch(tmp_path, "a.jpg", "left/b.jpg", "masks/a.png", "masks/left/b.jpg.png", "left/masks/b.png", "masks/.x.png")
+    touch(tmp_path, "empty/masks/z.png")
+    source = find_source(tmp_path)
+    assert names(source) == ["a.jpg", "left/b.jpg"]
+    assert [(name, file.relative_to(tmp_path).as_posix()) for name, file in source.masks] == [
+        ("a.png", "masks/a.png"),
+        ("left/b.jpg.png", "masks/left/b.jpg.png"),
+        ("left/b.png", "left/masks/b.png"),
+    ]
+
+
+@pytest.mark.parametrize("given", [".", "images"])
+def test_masks_may_lie_beside_an_images_folder(tmp_path: Path, given: str) -> None:
+    touch(tmp_path, "images/a.jpg", "images/sub/b.jpg", "masks/a.png", "masks/sub/b.png")
+    assert [name for name, _ in find_source(tmp_path / given).masks] == ["a.png", "sub/b.png"]
+    cameras = transforms(tmp_path / "transforms.json", "images/a.jpg")
+    assert [name for name, _ in find_source(cameras).masks] == ["a.png", "sub/b.png"]
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")

@@ -9,12 +9,14 @@ from hypothesis import strategies as st
 
 from nerf.ray_bank import Placement, ray_bank
 from nerf.scene import Camera
+from stages.contract import StageError
 from stages.training_data import (
     MOST_PATCHES,
     camera_directions,
     patch_bearings,
     scaled_size,
     training_bank,
+    view_mask,
     view_pixels,
     view_rays,
 )
@@ -134,3 +136,45 @@ def test_patches_bend_no_ray(lens: str, limit_px: float) -> None:
     exact = camera_directions(camera, downscale).view(-1, 3)
     off_px = (found.double() - exact.double()).norm(dim=1).max() * camera.params[0] / downscale
     assert 0 < off_px < limit_px
+
+
+def half_mask() -> np.ndarray:
+    """Ignores the right side from x = 11 on."""
+    mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    mask[:, 11:] = 0
+    return mask
+
+
+@pytest.mark.parametrize(("downscale", "columns"), [(1.0, 11), (2.0, 5), (3.0, 3)])
+def test_a_reduced_pixel_is_used_where_all_it_covers_is(
+    downscale: float, columns: int, tmp_path: Path, progress: SilentProgress
+) -> None:
+    inputs, scene = photographed(tmp_path, mask=half_mask())
+    used = view_mask(inputs["ingest"], scene, scene.views[0], downscale)
+    assert used is not None
+    width, height = scaled_size(CAMERA, downscale)
+    assert used.shape == (height, width)
+    assert torch.equal(used, (torch.arange(width) < columns).expand(height, width))
+    bank = training_bank(inputs["ingest"], scene, "train", downscale, progress)
+    assert (bank.drawable, len(bank.pixels)) == (6 * height * columns, 6 * height * width)
+    assert progress.notes[-1] == f"masks leave {columns / width:.0%} of the pixels of the train photos"
+
+
+def test_without_masks_nothing_is_kept_of_them(tmp_path: Path, progress: SilentProgress) -> None:
+    inputs, scene = photographed(tmp_path)
+    assert view_mask(inputs["ingest"], scene, scene.views[0], 1.0) is None
+    assert training_bank(inputs["ingest"], scene, "train", 1.0, progress).runs is None
+    assert progress.notes == []
+
+
+def test_masks_that_leave_nothing_at_a_size_are_said(tmp_path: Path, progress: SilentProgress) -> None:
+    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+    mask[4, 4] = 255
+    inputs, scene = photographed(tmp_path, mask=mask)
+    assert training_bank(inputs["ingest"], scene, "train", 1.0, progress).drawable == 6
+    with pytest.raises(StageError) as error:
+        training_bank(inputs["ingest"], scene, "train", 2.0, progress)
+    assert str(error.value) == (
+        "nothing is left to train on: the masks ignore every pixel of the train photos at this size. "
+        "Give a smaller --train.downscale."
+    )

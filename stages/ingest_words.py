@@ -1,0 +1,120 @@
+"""What ingest says: files that are refused, what photos are like beside each other, the summary."""
+
+from collections.abc import Sequence
+
+from stages.contract import Progress, StageError
+from stages.photos import Photo, Refusal
+from stages.sharpness import BLURRED
+from stages.sources import Source
+
+MAX_NOTES = 10
+HINT = "Take 20 to 100 overlapping photos of one scene from different places and put them into one folder."
+
+
+def shown(name: str) -> str:
+    """A name as it may be printed: nothing in it can steer a terminal."""
+    return name if name.isprintable() else repr(name)
+
+
+def say(notes: Sequence[str], progress: Progress) -> None:
+    """The first few notes, and how many more there are."""
+    for note in notes[:MAX_NOTES]:
+        progress.note(note)
+    if len(notes) > MAX_NOTES:
+        progress.note(f"… and {len(notes) - MAX_NOTES} more, all in photos.json")
+
+
+def say_refused(refused: Sequence[Refusal], progress: Progress) -> None:
+    """Which files are no photos, and why."""
+    say([f"refused {shown(refusal.name)}: {refusal.reason}" for refusal in refused], progress)
+
+
+def say_findings(photos: Sequence[Photo], progress: Progress) -> None:
+    """Which photos are nearly the same picture, and which are blurred."""
+    same = [f"{shown(p.name)} (as {shown(p.near_duplicate_of)})" for p in photos if p.near_duplicate_of]
+    if same:
+        are = _photos_are(len(same))
+        progress.note(f"{are} nearly the same picture as another and left out of matching: {_few(same)}")
+    blurred = [
+        f"{shown(p.name)} ({p.relative_sharpness:.2f} ×)"
+        for p in photos
+        if p.relative_sharpness is not None and p.relative_sharpness < BLURRED and not p.near_duplicate_of
+    ]
+    if blurred:
+        are = _photos_are(len(blurred))
+        progress.note(f"{are} far less sharp than those before and after, and kept: {_few(blurred)}")
+
+
+def say_masks(ignored: Sequence[float], turned: int, resized: int, photos: int, progress: Progress) -> None:
+    """How many of the photos have masks, how much these ignore, and how many were made to fit."""
+    if not ignored:
+        return
+    turned_words = f", {turned} turned upright like the photo" if turned else ""
+    resized_words = f", {resized} made as large as the photo" if resized else ""
+    share = sum(ignored) / len(ignored)
+    progress.note(f"masks of {len(ignored)} of {photos} photos ignore {share:.0%} of them{turned_words}{resized_words}")
+
+
+def _photos_are(count: int) -> str:
+    return "1 photo is" if count == 1 else f"{count} photos are"
+
+
+def _few(names: Sequence[str]) -> str:
+    more = f" and {len(names) - MAX_NOTES} more, all in photos.json" if len(names) > MAX_NOTES else ""
+    return ", ".join(names[:MAX_NOTES]) + more
+
+
+def too_few(source: Source, names: Sequence[str], refused: Sequence[Refusal]) -> StageError:
+    """The error for one photo or none, ``names``, and what the refusals tell."""
+    if not names:
+        first = f"{shown(refused[0].name)}: {refused[0].reason}"
+        return StageError(f"none of the {len(refused)} files in {source.root} is a usable photo", first, HINT)
+    only = shown(names[0])
+    if refused and all(refusal.reason.startswith("identical to ") for refusal in refused):
+        return StageError(f"all {len(refused) + 1} photos are identical", f"they have the pixels of {only}", HINT)
+    if refused:
+        return StageError(f"only one photo can be used, {only}", f"{len(refused)} other files were refused", HINT)
+    return StageError("there is only one photo", f"{only}; a scene needs at least two", HINT)
+
+
+def all_the_same(photos: int) -> StageError:
+    """The error for photos that all show nearly the same picture."""
+    why = "the camera stood still between them, so they tell nothing of depth"
+    return StageError(f"all {photos} photos are nearly the same picture", why, HINT)
+
+
+def summary(source: Source, photos: Sequence[Photo], refused: Sequence[Refusal]) -> str:
+    """Ingest's line."""
+    sizes = sorted({(photo.width, photo.height) for photo in photos})
+    size = "{}×{}".format(*sizes[0]) if len(sizes) == 1 else f"in {len(sizes)} sizes"
+    alpha = " with alpha" if any(photo.has_alpha for photo in photos) else ""
+    what = "frames" if source.kind == "video" else "photos"
+    line = f"{len(photos)} {what} {size}{alpha}, {_camera_words(source, photos)}"
+    if photos[-1].time_s is not None:
+        line += f", {photos[-1].time_s:.1f} s of video"
+    return f"{line}, {len(refused)} refused" if refused else line
+
+
+def _camera_words(source: Source, photos: Sequence[Photo]) -> str:
+    if source.cameras is not None:
+        return "cameras given"
+    groups = len({photo.camera_group for photo in photos})
+    cameras = "one camera" if groups == 1 else f"{groups} cameras"
+    known = [photo.focal_px for photo in photos if photo.focal_px is not None]
+    if not known:
+        return f"{cameras}, no EXIF focal"
+    if len(known) < len(photos):
+        return f"{cameras}, EXIF focal for {len(known)}"
+    return f"{cameras}, EXIF focal" + (f" {known[0]:.0f} px" if len(set(known)) == 1 else "")
+
+
+def facts(source: Source, photos: Sequence[Photo], refused: Sequence[Refusal]) -> dict[str, object]:
+    """The summary as JSON values."""
+    return {
+        "source": source.kind,
+        "photos": len(photos),
+        "refused": [{"name": refusal.name, "reason": refusal.reason} for refusal in refused],
+        "sizes": sorted([photo.width, photo.height] for photo in {(p.width, p.height): p for p in photos}.values()),
+        "cameras": len({photo.camera_group for photo in photos}),
+        "focal_known": sum(photo.focal_px is not None for photo in photos),
+    }

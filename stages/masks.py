@@ -1,0 +1,124 @@
+"""Masks: which parts of a photo are to be ignored. Black ignores, in the user's files as in ours."""
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from stages.decoding import DecodeError, decode, upright
+from stages.files import write_png
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from stages.photos import Photo
+
+USE_FROM = 128  # of 255: from here on a pixel counts as used
+
+
+@dataclass(frozen=True)
+class Mask:
+    """A mask as large as its photo: ``pixels`` (h, w) uint8, 255 use, 0 ignore; what was done to make it fit."""
+
+    pixels: "np.ndarray"
+    turned: bool
+    resized: bool
+
+
+def pair_masks(names: Sequence[str], masks: Sequence[tuple[str, Path]]) -> tuple[dict[str, Path], list[Path]]:
+    """The mask file of each photo that has one, by the photo's name, and the files that are no photo's mask.
+
+    A photo's mask is called after it, with its ending or without, and ends in .png.
+    """
+    by_name: dict[str, Path] = {}
+    for name, file in masks:
+        if name.lower().endswith(".png"):
+            by_name.setdefault(name[: -len(".png")], file)
+    found: dict[str, Path] = {}
+    for name in names:
+        inside = name.removeprefix("images/")  # beside an images/ folder that a transforms file names
+        wanted = (name, os.path.splitext(name)[0], inside, os.path.splitext(inside)[0])
+        if file := next((by_name[one] for one in wanted if one in by_name), None):
+            found[name] = file
+    used = set(found.values())
+    return found, [file for _, file in masks if file not in used]
+
+
+def read_mask(file: Path, width: int, height: int, orientation: int) -> Mask:
+    """The mask of an upright photo of this size, whose file had this EXIF orientation.
+
+    A mask of the shape of the file as it was stored is turned like the photo. One of the same shape and another size is
+    resized to the nearest pixels. Raises DecodeError, words to follow the name of the photo, where it cannot be used.
+    """
+    import cv2
+    import numpy as np
+
+    try:
+        decoded = decode(file).pixels
+    except DecodeError as error:
+        raise DecodeError(f"its mask {file.name} cannot be used: {error}") from error
+    light = decoded[..., :3].max(axis=2)
+    if decoded.shape[2] == 4:
+        light = np.rint(light * (decoded[..., 3] / 255.0)).astype(np.uint8)
+    pixels = np.where(light >= USE_FROM, np.uint8(255), np.uint8(0))
+    size, found = (width, height), (pixels.shape[1], pixels.shape[0])
+    turned = orientation >= 5 and not _same_shape(found, size) and _same_shape(found, (height, width))
+    if turned:
+        pixels = _turned(pixels, orientation)
+    elif not _same_shape(found, size):
+        shapes = f"{found[0]}×{found[1]} and the photo {width}×{height}"
+        raise DecodeError(f"its mask {file.name} does not fit: it is {shapes}")
+    resized = (pixels.shape[1], pixels.shape[0]) != size
+    if resized:
+        pixels = cv2.resize(pixels, size, interpolation=cv2.INTER_NEAREST)
+    if not pixels.any():
+        raise DecodeError(f"its mask {file.name} ignores all of it (its brightest value is {light.max()} of 255)")
+    return Mask(pixels, turned, resized)
+
+
+def _same_shape(found: tuple[int, int], wanted: tuple[int, int]) -> bool:
+    """Whether a size is another one in a smaller or larger copy, rounded to whole pixels."""
+    return abs(found[0] * wanted[1] - found[1] * wanted[0]) <= max(wanted)
+
+
+def _turned(pixels: "np.ndarray", orientation: int) -> "np.ndarray":
+    import numpy as np
+    from PIL import Image
+
+    return np.ascontiguousarray(upright(Image.fromarray(pixels), orientation))
+
+
+def load_mask(path: Path, width: int, height: int) -> "np.ndarray":
+    """A mask that ingest wrote as (height, width) bool at a photo's reduced size, True where every pixel that goes into
+    one is to be used."""
+    import cv2
+    import numpy as np
+    from PIL import Image
+
+    with Image.open(path) as image:
+        ignored = (np.asarray(image) == 0).astype(np.float32)
+    if ignored.shape != (height, width):
+        ignored = cv2.resize(ignored, (width, height), interpolation=cv2.INTER_AREA)
+    return ignored == 0
+
+
+def write_feature_masks(ingest: Path, photos: "Sequence[Photo]", folder: Path) -> bool:
+    """Write for COLMAP, as ``folder/<image name>.png``, where features may lie: neither ignored nor transparent.
+
+    Returns whether any photo has such a mask; without, nothing is written.
+    """
+    import numpy as np
+    from PIL import Image
+
+    masked = [photo for photo in photos if photo.mask or photo.has_alpha]
+    for photo in masked:
+        allowed = np.full((photo.height, photo.width), 255, np.uint8)
+        if photo.mask:
+            with Image.open(ingest / photo.mask) as mask:
+                allowed = np.asarray(mask)
+        if photo.has_alpha:
+            with Image.open(ingest / photo.file) as image:
+                allowed = np.where(np.asarray(image.getchannel("A")) > 0, allowed, np.uint8(0))
+        write_png(folder / f"{photo.file.removeprefix('images/')}.png", allowed)
+    return bool(masked)

@@ -1,0 +1,45 @@
+"""How sharp photos are, and which are far less sharp than those around them."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import numpy as np
+
+WIDTH = 1000  # pixels: what is finer than this share of the picture hardly counts later on
+NEIGHBOURS = 3  # on each side
+FEWEST_NEIGHBOURS = 3  # for their median to mean something
+# A smear of n pixels thins the response to edges across it to about 1/n: here some four pixels of WIDTH.
+BLURRED = 0.25
+
+
+def sharpness(pixels: "np.ndarray") -> float:
+    """Variance of the Laplacian (Pech-Pacheco et al. 2000) of the grey image, at most WIDTH pixels wide."""
+    import cv2
+    import numpy as np
+
+    grey = cv2.cvtColor(pixels[..., :3], cv2.COLOR_RGB2GRAY)
+    if pixels.shape[2] == 4:  # what is transparent has no sharpness
+        grey = np.rint(grey * (pixels[..., 3] / 255.0)).astype(np.uint8)
+    height, width = grey.shape
+    if width > WIDTH:
+        grey = cv2.resize(grey, (WIDTH, max(1, round(height * WIDTH / width))), interpolation=cv2.INTER_AREA)
+    return float(f"{cv2.Laplacian(grey, cv2.CV_64F).var():.4g}")
+
+
+def relative_sharpness(values: Sequence[float], groups: Sequence[int]) -> list[float | None]:
+    """Each sharpness over the median of its neighbours': the NEIGHBOURS before and after it of the same group.
+
+    Neighbours show much the same, so the quotient tells blur from a subject with little texture. None where there are
+    fewer than FEWEST_NEIGHBOURS or they have no texture at all.
+    """
+    from statistics import median
+
+    relative: list[float | None] = [None] * len(values)
+    for group in set(groups):
+        members = [index for index, of in enumerate(groups) if of == group]
+        for place, index in enumerate(members):
+            around = members[max(0, place - NEIGHBOURS) : place] + members[place + 1 : place + 1 + NEIGHBOURS]
+            usual = median(values[other] for other in around) if len(around) >= FEWEST_NEIGHBOURS else 0.0
+            relative[index] = float(f"{values[index] / usual:.4g}") if usual > 0 else None
+    return relative

@@ -1,0 +1,210 @@
+"""The frames of a video that become photos: sharp ones, each a step of the camera away from the last.
+
+The video is decoded twice, a frame at a time: first to measure, on small grey frames, how far the picture has moved
+and how sharp it is, then to write the chosen ones.
+"""
+
+import os
+from bisect import bisect_left
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from stages.contract import Progress, StageError
+from stages.optical_flow import corners, follow_both_ways
+from stages.sharpness import sharpness
+
+if TYPE_CHECKING:
+    import cv2
+    import numpy as np
+
+FLOW_WIDTH = 500  # pixels of the frames on which motion is measured
+MOST_CORNERS, FEWEST_CORNERS = 150, 10
+# All in widths of the picture. Frames a STEP apart share 95 % of it, so that a point that crosses the picture is in
+# about twenty of them and frames four to eight apart have the 60-80 % overlap that photos should have.
+STEP = 0.05
+# Less than this is not added up: the tremble of a hand, or noise, would become a way.
+LEAST_MOTION = 0.01
+# Where nothing of a frame is found again in the next one, a cut or a jerk: nothing is known to be shared.
+LOST = 1.0
+FEWEST_FRAMES = 3  # as sfm needs
+JPEG_QUALITY = 95  # without chroma subsampling: far closer to the frame than the video is to what the camera saw
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A frame as measured: ``path`` is how far the picture has moved since the first one, in its own widths."""
+
+    time_s: float
+    path: float
+    sharpness: float
+
+
+@dataclass(frozen=True)
+class TakenFrame:
+    """A frame that was written as a JPEG ``file``; ``number`` counts the video's frames from 0."""
+
+    number: int
+    time_s: float
+    sharpness: float
+    file: Path
+    width: int
+    height: int
+
+
+def take_frames(video: Path, most: int, folder: Path, progress: Progress) -> list[TakenFrame]:
+    """Write at most ``most`` frames of ``video`` into ``folder``. Raises StageError where there is nothing to take.
+
+    The frames stand upright: what the video says of its rotation is undone.
+    """
+    frames = _measure(video, progress)
+    chosen = choose_frames(frames, most)
+    if len(chosen) < FEWEST_FRAMES:
+        raise _no_way(video, frames)
+    way = frames[-1].path
+    progress.note(
+        f"{len(chosen)} of {len(frames)} frames taken: the sharpest of each step of about "
+        f"{way / (len(chosen) - 1):.0%} of the picture's width, {way:.1f} widths in all"
+    )
+    return list(_write(video, frames, chosen, folder, progress))
+
+
+def choose_frames(frames: Sequence[Frame], most: int) -> list[int]:
+    """The numbers of the frames to take: after each one the sharpest of those that are half a step to one and a half
+    steps further, or else the next one there is. Steps grow from STEP until there are no more than ``most``."""
+    paths, step = [frame.path for frame in frames], STEP
+    while len(chosen := _chosen_by(paths, frames, step)) > most:
+        step *= max(1.01, len(chosen) / most)
+    return chosen
+
+
+def _chosen_by(paths: Sequence[float], frames: Sequence[Frame], step: float) -> list[int]:
+    chosen: list[int] = []
+    first, end = 0, bisect_left(paths, step / 2)
+    while first < len(frames):
+        end = max(end, first + 1)
+        best = max(range(first, end), key=lambda number: (frames[number].sharpness, -number))
+        chosen.append(best)
+        first = max(best + 1, bisect_left(paths, paths[best] + step / 2))
+        end = bisect_left(paths, paths[best] + 1.5 * step)
+    return chosen
+
+
+def _measure(video: Path, progress: Progress) -> list[Frame]:
+    """Time, way and sharpness of every frame."""
+    import cv2
+
+    frames: list[Frame] = []
+    motion = _Motion()
+    with _opened(video) as capture:
+        announced = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        while (answer := capture.read())[0]:
+            picture = cv2.cvtColor(answer[1], cv2.COLOR_BGR2RGB)
+            time_s = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
+            frames.append(Frame(time_s, motion.path_to(picture), sharpness(picture)))
+            if len(frames) % 10 == 0:
+                share = len(frames) / announced / 2 if announced >= len(frames) else None
+                progress.update(f"looked at {len(frames)} frames of {video.name}", share)
+    if not frames:
+        raise _undecodable(video, "not one frame of it can be decoded")
+    if len(frames) < 0.98 * announced:  # a container may count a frame or two too many
+        progress.note(f"only {len(frames)} of {announced} frames of {video.name} can be decoded: is the file whole?")
+    return frames
+
+
+class _Motion:
+    """How far the picture has moved: the median way of its corners, which are followed from one frame to the next ones
+    until it is LEAST_MOTION, and from there on anew."""
+
+    def __init__(self) -> None:
+        self.path = 0.0
+        self.path_of_start = 0.0
+        self.start: np.ndarray | None = None  # where corners are followed from
+        self.corners: np.ndarray | None = None
+
+    def path_to(self, picture: "np.ndarray") -> float:
+        """The way to the next frame, (h, w, 3) uint8, in widths of the picture. It never goes back."""
+        import cv2
+
+        height, width = picture.shape[:2]
+        scale = min(1.0, FLOW_WIDTH / width)
+        size = max(1, round(width * scale)), max(1, round(height * scale))
+        grey = cv2.cvtColor(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY)
+        moved = self._moved(grey)
+        self.path = max(self.path, self.path_of_start + moved)
+        if self.corners is None or moved >= LEAST_MOTION or len(self.corners) < FEWEST_CORNERS:
+            self.path_of_start, self.start = self.path, grey
+            self.corners = corners(grey, MOST_CORNERS)
+        return self.path
+
+    def _moved(self, grey: "np.ndarray") -> float:
+        """Since the start; nothing where that has no corners, a black frame for instance."""
+        import numpy as np
+
+        if self.start is None or self.corners is None or len(self.corners) < FEWEST_CORNERS:
+            return 0.0
+        there, followed = follow_both_ways(self.start, grey, self.corners)
+        if followed.sum() < FEWEST_CORNERS:
+            return LOST
+        ways = np.linalg.norm((there - self.corners)[followed, 0], axis=1)
+        return float(np.median(ways)) / grey.shape[1]
+
+
+def _write(
+    video: Path, frames: Sequence[Frame], chosen: Sequence[int], folder: Path, progress: Progress
+) -> Iterator[TakenFrame]:
+    import cv2
+    from PIL import Image
+
+    wanted = set(chosen)
+    with _opened(video) as capture:
+        for number in range(max(chosen) + 1):
+            if not capture.grab():
+                raise _undecodable(video, f"frame {number} could be decoded before and cannot now")
+            if number not in wanted:
+                continue
+            picture = cv2.cvtColor(capture.retrieve()[1], cv2.COLOR_BGR2RGB)
+            file = folder / f"{number:06d}"
+            Image.fromarray(picture).save(file, format="JPEG", quality=JPEG_QUALITY, subsampling=0)
+            height, width = picture.shape[:2]
+            time_s = round(frames[number].time_s - frames[0].time_s, 4)
+            yield TakenFrame(number, time_s, frames[number].sharpness, file, width, height)
+            progress.update(f"writing the {len(chosen)} frames taken", 0.5 + number / max(chosen) / 2)
+
+
+@contextmanager
+def _opened(video: Path) -> "Iterator[cv2.VideoCapture]":
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # quiet: what is wrong with a file we say ourselves
+    import cv2
+
+    before = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    capture = cv2.VideoCapture(str(video), cv2.CAP_FFMPEG)
+    cv2.utils.logging.setLogLevel(before)
+    try:
+        if not capture.isOpened():
+            raise _undecodable(video, "it is damaged, or of a kind that is not known here")
+        capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
+        yield capture
+    finally:
+        capture.release()
+
+
+def _undecodable(video: Path, why: str) -> StageError:
+    return StageError(
+        f"cannot decode the video {video.name}", why, f"Convert it first: ffmpeg -i {video.name} converted.mp4"
+    )
+
+
+def _no_way(video: Path, frames: Sequence[Frame]) -> StageError:
+    what = f"cannot take photos from {video.name}"
+    if len(frames) < FEWEST_FRAMES:
+        count = f"{len(frames)} frame{'s' * (len(frames) != 1)}"
+        return StageError(what, f"it has only {count}", "Film for ten seconds and more, walking around the scene.")
+    way = frames[-1].path
+    return StageError(
+        what,
+        f"the camera hardly moves: in {len(frames)} frames the picture shifts by {way:.1%} of its width",
+        "Walk around the scene while filming, slowly, so that every part of it is seen from several sides.",
+    )

@@ -1,0 +1,148 @@
+"""Which file is whose mask, how it is made to fit, and what COLMAP and training get of it."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+
+from stages.decoding import DecodeError
+from stages.files import write_png
+from stages.masks import load_mask, pair_masks, read_mask, write_feature_masks
+from stages.photos import Photo
+
+WIDTH, HEIGHT = 48, 32
+
+
+def ignoring(x: int, y: int, width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
+    """Black right of x and below y."""
+    mask = np.full((height, width), 255, np.uint8)
+    mask[y:, x:] = 0
+    return mask
+
+
+def saved(folder: Path, pixels: np.ndarray, name: str = "m.png") -> Path:
+    Image.fromarray(pixels).save(folder / name)
+    return folder / name
+
+
+def reason(file: Path) -> str:
+    with pytest.raises(DecodeError) as error:
+        read_mask(file, WIDTH, HEIGHT, 1)
+    return str(error.value)
+
+
+def test_masks_are_called_after_their_photos() -> None:
+    names = ["a.jpg", "b.jpg", "left/a.jpg", "ö d.heic", "e.png", "images/f.jpg", "g.jpg"]
+    files = ["a.png", "b.jpg.PNG", "left/a.jpg.png", "ö d.png", "e.png", "f.png", "x.png", "g.jpg", "g.tif"]
+    found, strays = pair_masks(names, [(file, Path("masks", file)) for file in files])
+    assert found == {name: Path("masks", file) for name, file in zip(names, files[:6], strict=False)}
+    assert strays == [Path("masks/x.png"), Path("masks/g.jpg"), Path("masks/g.tif")]
+
+
+def test_of_two_masks_of_one_photo_one_is_a_stray() -> None:
+    found, strays = pair_masks(["a.jpg"], [("a.jpg.png", Path("1")), ("a.png", Path("2")), ("a.png", Path("3"))])
+    assert (found, strays) == ({"a.jpg": Path("1")}, [Path("2"), Path("3")])
+
+
+@pytest.mark.parametrize("kind", ["1", "L", "RGB", "RGBA", "P", "16"])
+def test_black_is_ignored_whatever_the_kind_of_picture(kind: str, tmp_path: Path) -> None:
+    mask = ignoring(20, 10)
+    image = Image.fromarray(mask)
+    if kind == "16":
+        image = Image.fromarray(mask.astype(np.uint16) * 257)
+    elif kind != "L":
+        image = image.convert(kind)
+    image.save(tmp_path / "m.png")
+    found = read_mask(tmp_path / "m.png", WIDTH, HEIGHT, 1)
+    assert np.array_equal(found.pixels, mask)
+    assert (found.turned, found.resized) == (False, False)
+
+
+def test_half_bright_is_used_and_transparent_ignored(tmp_path: Path) -> None:
+    grey = np.full((HEIGHT, WIDTH, 4), 255, np.uint8)
+    grey[:, :10, :3], grey[:, 10:20, :3] = 127, 128
+    grey[:, 20:30, :3] = [0, 0, 200]  # a colour is not black
+    grey[:, 30:40, 3] = 0
+    found = read_mask(saved(tmp_path, grey), WIDTH, HEIGHT, 1).pixels
+    assert [int(value) for value in found[0, 5::10]] == [0, 255, 255, 0, 255]
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_a_mask_of_the_stored_shape_is_turned_like_the_photo(orientation: int, tmp_path: Path) -> None:
+    upright = ignoring(20, 10)
+    stored = {
+        5: upright.T,
+        6: upright.T[::-1],
+        7: upright.T[::-1, ::-1],
+        8: upright.T[:, ::-1],
+    }.get(orientation, upright)
+    found = read_mask(saved(tmp_path, np.ascontiguousarray(stored)), WIDTH, HEIGHT, orientation)
+    assert np.array_equal(found.pixels, upright)
+    assert found.turned == (orientation >= 5)
+
+
+@pytest.mark.parametrize(("factor", "turned"), [(0.5, False), (2, False), (2, True)])
+def test_a_mask_of_another_size_is_resized(factor: float, turned: bool, tmp_path: Path) -> None:
+    mask = ignoring(int(20 * factor), int(10 * factor), int(WIDTH * factor), int(HEIGHT * factor))
+    file = saved(tmp_path, np.ascontiguousarray(np.rot90(mask)) if turned else mask)
+    found = read_mask(file, WIDTH, HEIGHT, 6 if turned else 1)
+    assert np.array_equal(found.pixels, ignoring(20, 10))
+    assert (found.turned, found.resized) == (turned, True)
+
+
+@given(st.integers(100, 6000), st.integers(100, 6000), st.floats(0.1, 2))
+def test_any_reduction_rounded_to_pixels_keeps_its_shape(width: int, height: int, scale: float) -> None:
+    from stages.masks import _same_shape
+
+    reduced = max(1, round(width * scale)), max(1, round(height * scale))
+    assert _same_shape(reduced, (width, height))
+    assert not _same_shape((reduced[0] + width // 2 + 2, reduced[1]), (width, height)) or width > 50 * height
+
+
+def test_a_mask_that_cannot_be_used_is_a_reason_to_refuse_the_photo(tmp_path: Path) -> None:
+    assert reason(saved(tmp_path, ignoring(5, 5, 40, 40))) == (
+        "its mask m.png does not fit: it is 40×40 and the photo 48×32"
+    )
+    assert reason(saved(tmp_path, ignoring(5, 5, HEIGHT, WIDTH))).startswith("its mask m.png does not fit")
+    labels = np.minimum(ignoring(5, 5), 1)
+    assert reason(saved(tmp_path, labels)) == "its mask m.png ignores all of it (its brightest value is 1 of 255)"
+    (tmp_path / "t.png").write_text("text")
+    assert reason(tmp_path / "t.png") == "its mask t.png cannot be used: not an image: it is text"
+
+
+def photo(name: str, mask: str | None = None, has_alpha: bool = False) -> Photo:
+    return Photo(name, f"images/{name}", WIDTH, HEIGHT, 0, None, None, has_alpha, 1.0, mask=mask)
+
+
+def test_features_lie_where_nothing_is_ignored_or_transparent(tmp_path: Path) -> None:
+    rgba = np.full((HEIGHT, WIDTH, 4), 200, np.uint8)
+    rgba[:5, :, 3] = 0
+    rgba[5, :, 3] = 1
+    write_png(tmp_path / "images/s/a.png", rgba)
+    write_png(tmp_path / "images/c.png", rgba)
+    write_png(tmp_path / "masks/s/a.png.png", ignoring(20, 10))
+    write_png(tmp_path / "masks/b.jpg.png", ignoring(30, 20))
+    photos = [
+        photo("s/a.png", "masks/s/a.png.png", True),
+        photo("b.jpg", "masks/b.jpg.png"),
+        photo("c.png", None, True),
+    ]
+    assert write_feature_masks(tmp_path, [*photos, photo("d.jpg")], tmp_path / "out")
+    written = {file.relative_to(tmp_path / "out").as_posix() for file in (tmp_path / "out").rglob("*.png")}
+    assert written == {"s/a.png.png", "b.jpg.png", "c.png.png"}
+    both = ignoring(20, 10)
+    both[:5] = 0
+    assert np.array_equal(np.asarray(Image.open(tmp_path / "out/s/a.png.png")), both)
+    assert np.array_equal(np.asarray(Image.open(tmp_path / "out/b.jpg.png")), ignoring(30, 20))
+    assert not write_feature_masks(tmp_path, [photo("d.jpg")], tmp_path / "none")
+    assert not (tmp_path / "none").exists()
+
+
+def test_a_reduced_mask_uses_only_what_is_used_as_a_whole(tmp_path: Path) -> None:
+    file = saved(tmp_path, ignoring(21, 0))
+    assert np.array_equal(load_mask(file, WIDTH, HEIGHT), ignoring(21, 0) > 0)
+    assert np.array_equal(load_mask(file, 12, 8), np.broadcast_to(np.arange(12) < 5, (8, 12)))
+    assert np.array_equal(load_mask(file, 7, 3), np.broadcast_to(np.arange(7) < 3, (3, 7)))  # 3 / 7 of 48 is 20.6

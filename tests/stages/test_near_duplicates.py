@@ -1,0 +1,117 @@
+"""Pictures of which one is enough, and pictures that only look alike."""
+
+import numpy as np
+import pytest
+
+from stages.near_duplicates import near_duplicates, thumbnail
+from tests.blots import blots, cut_out
+
+WIDTH, HEIGHT = 400, 300
+FAR, NEAR = blots(0, 600, 500), blots(1, 600, 500)
+
+
+def seen(x: float, y: float = 0, parallax: float = 0, noise: int = 0, picture: np.ndarray = FAR) -> np.ndarray:
+    """What a camera sees of a far wall after a shift by (x, y) pixels; with ``parallax`` a nearer box in the middle, a
+    quarter of the picture, has shifted by so many pixels more."""
+    view = cut_out(picture, 50 + x, 50 + y, WIDTH, HEIGHT)
+    if parallax:
+        view[75:225, 100:300] = cut_out(NEAR, 50 + x + parallax, 50 + y, 200, 150)
+    if noise:
+        view = np.clip(view + np.random.default_rng(noise).normal(0, 4, view.shape), 0, 255).astype(np.uint8)
+    return view
+
+
+def found(*pictures: np.ndarray, sharpness: tuple[float, ...] = ()) -> dict[int, int]:
+    return near_duplicates([thumbnail(one) for one in pictures], sharpness or (1.0,) * len(pictures))
+
+
+def test_a_burst_without_any_motion_is_found_through_the_noise() -> None:
+    assert found(seen(0, noise=1), seen(0, noise=2), seen(0, noise=3)) == {1: 0, 2: 0}
+
+
+@pytest.mark.parametrize(("x", "y"), [(3, 0), (0, -3), (-4, 4), (0.4, 6)])
+def test_a_small_shift_of_everything_is_no_baseline(x: float, y: float) -> None:
+    assert found(seen(0, noise=1), seen(x, y, noise=2)) == {1: 0}
+
+
+def test_a_small_turn_is_no_baseline() -> None:
+    import cv2
+
+    turn = cv2.getRotationMatrix2D((WIDTH / 2, HEIGHT / 2), 1.0, 1.0)
+    turned = cv2.warpAffine(seen(0), turn, (WIDTH, HEIGHT), borderMode=cv2.BORDER_REPLICATE)
+    assert found(seen(0), turned) == {1: 0}
+
+
+@pytest.mark.parametrize("stops", [-3.0, -1.0, 1.0])
+def test_another_exposure_hides_nothing(stops: float) -> None:
+    """Linear light times 2^stops, clipped and encoded again (gamma 2.2): a stop more clips a few per cent."""
+    dim, again = (0.7 * seen(x, noise=noise) + 10 for x, noise in ((0, 1), (2, 2)))
+    linear = (again / 255) ** 2.2 * 2**stops
+    clipped = (linear > 1).mean()
+    assert 0.01 < clipped < 0.15 if stops > 0 else clipped == 0
+    exposed = np.rint(255 * linear.clip(0, 1) ** (1 / 2.2)).astype(np.uint8)
+    assert found(dim.astype(np.uint8), exposed) == {1: 0}
+
+
+def test_a_shift_that_shows_something_new_is_kept() -> None:
+    assert found(seen(0), seen(16)) == {}
+
+
+@pytest.mark.parametrize("parallax", [3, -3, 5])
+def test_parallax_is_a_baseline_however_small_the_shift(parallax: float) -> None:
+    assert found(seen(0, parallax=0.01, noise=1), seen(0, parallax=0.01 + parallax, noise=2)) == {}
+    assert found(seen(0, parallax=0.01, noise=1), seen(1, parallax=0.01, noise=2)) == {1: 0}
+
+
+def test_a_passer_by_does_not_make_another_picture() -> None:
+    walked = seen(0, noise=1)
+    walked[200:230, 30:60] = 20
+    assert found(seen(0, noise=2), walked) == {1: 0}
+
+
+def test_other_pictures_are_kept() -> None:
+    assert found(seen(0), seen(0, picture=NEAR), seen(0)[::-1].copy()) == {}
+
+
+def test_the_sharpest_stays_and_of_equals_the_first() -> None:
+    same = [seen(0, noise=index) for index in (1, 2, 3)]
+    assert found(*same, sharpness=(1.0, 3.0, 2.0)) == {0: 1, 2: 1}
+    assert found(*same, sharpness=(1.0, 1.0, 1.0)) == {1: 0, 2: 0}
+
+
+def test_of_a_slow_walk_enough_is_kept() -> None:
+    """Steps of 0.75 % of the width: each like the next, the first and the last are not."""
+    left_out = found(*(seen(3.0 * step) for step in range(12)))
+    kept = sorted(set(range(12)) - set(left_out))
+    assert 3 <= len(kept) < 12
+    assert all(abs(index - left_out[index]) * 3 <= 0.025 * WIDTH for index in left_out)
+    assert max(np.diff([*kept, 11])) * 3 <= 0.05 * WIDTH
+
+
+def test_blank_pictures_and_other_shapes_say_nothing() -> None:
+    blank = np.full((HEIGHT, WIDTH, 3), 90, np.uint8)
+    assert found(blank, blank) == {}
+    assert found(seen(0), np.rot90(seen(0)).copy(), seen(0)[:, :-60].copy()) == {}
+    assert near_duplicates([], []) == {}
+
+
+def test_what_is_transparent_counts_as_black() -> None:
+    opaque, rest = seen(0), seen(0, picture=NEAR)
+    hidden = np.dstack([rest, np.zeros((HEIGHT, WIDTH), np.uint8)])
+    hidden[:, :200, 3] = 255
+    black = np.where(hidden[..., 3:] > 0, rest, 0)
+    assert np.array_equal(thumbnail(hidden), thumbnail(black))
+    assert thumbnail(opaque).shape == (240, 320)
+
+
+def test_the_answer_does_not_depend_on_threads() -> None:
+    import cv2
+
+    pictures = [seen(2.0 * step, noise=step + 1) for step in range(6)]
+    before = cv2.getNumThreads()
+    try:
+        cv2.setNumThreads(1)
+        one = found(*pictures)
+    finally:
+        cv2.setNumThreads(before)
+    assert one == found(*pictures) != {}
