@@ -34,10 +34,20 @@ WAYS = {
 
 
 def places_of(photos: "Sequence[Photo]") -> "Places":
-    """When and where the photos were taken; ingest does not tell yet."""
-    from stages.pairing import Places
+    """When and where the photos were taken, as far as all of them tell."""
+    import numpy as np
 
-    return Places()
+    from stages.pairing import Places, cartesian
+
+    times = [photo.time_s for photo in photos]
+    places = [(photo.latitude, photo.longitude) for photo in photos]
+    altitudes = [photo.altitude_m for photo in photos]
+    time_s = None if None in times else np.array(times, float)
+    position_m = None
+    if all(None not in place for place in places):
+        latitude, longitude = np.array(places, float).T
+        position_m = cartesian(latitude, longitude, None if None in altitudes else np.array(altitudes, float))
+    return Places(time_s, position_m)
 
 
 def check_matcher(matcher: "Matcher | None", places: "Places") -> None:

@@ -122,11 +122,12 @@ def _reconstruct(config: Config, photos: "list[Photo]", ingest: Path, folder: Pa
     names = [photo.file.removeprefix("images/") for photo in photos]
     database = _database(folder, names, progress)
     found = _run_child(config, photos, ingest / "images", folder, database, progress)
-    matches = read_matches(Path(found["database"]))
     models, points = found["models"], found.get("points", 0)
     if not models or len(models[0]) < FEWEST_REGISTERED or points < FEWEST_POINTS:
         shutil.rmtree(folder / "sparse", ignore_errors=True)
-        raise why_no_model(photos, matches, len(models[0]) if models else 0, points)
+        # By the strict matches of the first attempt: later ones let in many that are false.
+        raise why_no_model(photos, read_matches(database), len(models[0]) if models else 0, points)
+    matches = read_matches(Path(found["database"]))
     images = account(names, matches, models, found["observations"], found["supports"])
     _say_who_is_missing(photos, images, progress)
     _say_principal_point(found, progress)

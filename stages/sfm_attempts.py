@@ -12,7 +12,7 @@ from typing import Literal, NamedTuple
 from stages.files import write_durably
 
 # New features, or another idea of the lens, cost as much as the first attempt: they wait until so many are missing.
-WORTH_STARTING_OVER = 0.1
+WORTH_STARTING_OVER = 0.1  # of all, and two at least: one may well be a stranger
 JOURNAL, ABANDONED = "journal.json", "abandoned.json"
 
 
@@ -126,6 +126,6 @@ def reason_against(attempt: Attempt, now: Situation) -> str | None:
         return "none of them shares a view with another photo"
     if attempt.matches == "fisheye" and now.lens_is_given:
         return "the camera model is given"
-    if attempt.matches in ("fisheye", "rich") and now.missing < WORTH_STARTING_OVER * now.photos:
-        return f"{now.missing} of {now.photos} photos are not worth starting over"
+    if attempt.matches in ("fisheye", "rich") and now.missing < max(2, WORTH_STARTING_OVER * now.photos):
+        return f"{now.missing} of {now.photos} photos missing is not worth starting over"
     return None

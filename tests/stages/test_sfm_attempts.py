@@ -58,9 +58,11 @@ PLAIN = Situation(missing=1, photos=50, linked=True, flat=False, lens_is_given=F
         ("all at once", {"linked": False}, "none of them shares a view with another photo"),
         ("fisheye", {"missing": 40}, None),
         ("fisheye", {"missing": 40, "lens_is_given": True}, "the camera model is given"),
-        ("fisheye", {"missing": 4}, "4 of 50 photos are not worth starting over"),
+        ("fisheye", {"missing": 4}, "4 of 50 photos missing is not worth starting over"),
         ("more features", {"missing": 5, "linked": False, "lens_is_given": True}, None),
-        ("more features", {"missing": 4}, "4 of 50 photos are not worth starting over"),
+        ("more features", {"missing": 4}, "4 of 50 photos missing is not worth starting over"),
+        ("more features", {"missing": 1, "photos": 8}, "1 of 8 photos missing is not worth starting over"),
+        ("more features", {"missing": 2, "photos": 8}, None),
         ("more features", {"missing": 50, "flat": True}, "the photos tell nothing of depth"),
     ],
 )
