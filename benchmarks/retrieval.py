@@ -1,6 +1,6 @@
 """What choosing pairs by retrieval saves and loses on a large set, against matching every pair.
 
-    python benchmarks/retrieval.py [--photos 400] [--matchers exhaustive retrieval] [--neighbours 30]
+    python -m benchmarks.retrieval [--photos 400] [--matchers exhaustive retrieval] [--neighbours 30]
 
 Draws photos of 320 × 240 along both sides of a synthetic street: each shows about a thirtieth of it, so that most pairs
 share nothing, and their names are in random order. Then runs stage sfm with each way of choosing pairs, and prints
@@ -10,7 +10,6 @@ from the truth, in share of the street's length.
 
 import argparse
 import math
-import re
 import tempfile
 import time
 from functools import partial
@@ -20,6 +19,7 @@ import numpy as np
 import torch
 from PIL import Image
 
+from benchmarks.sfm_speed import Timed
 from nerf import solid_texture
 from nerf.camera_paths import look_at
 from nerf.scene import Camera
@@ -73,25 +73,6 @@ def draw(folder: Path, count: int, seed: int = 0) -> dict[str, np.ndarray]:
             image = photograph(scene._replace(solids=near), directions, torch.tensor(pose).float(), 1)
         Image.fromarray((255 * image).round().byte().numpy()).save(folder / name)
     return truth
-
-
-class Timed:
-    """A Progress that prints what stays and remembers how long each kind of live line stood."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-        self.last = ("", time.perf_counter())
-
-    def update(self, message: str, done: float | None = None) -> None:
-        """Account for the time since the last line."""
-        kind, now = re.sub(r"\d+", "#", message), time.perf_counter()
-        before, since = self.last
-        self.seconds[before] = self.seconds.get(before, 0.0) + now - since
-        self.last = (kind, now)
-
-    def note(self, message: str) -> None:
-        """Print the note."""
-        print(f"  {message}", flush=True)
 
 
 def measure(matcher: str, folder: Path, truth: dict[str, np.ndarray], neighbours: int) -> None:
