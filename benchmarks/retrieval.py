@@ -12,6 +12,7 @@ import argparse
 import math
 import tempfile
 import time
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 
@@ -67,11 +68,17 @@ def draw(folder: Path, count: int, seed: int = 0) -> dict[str, np.ndarray]:
     scene = street(STEP * count, random)
     directions = torch.from_numpy(camera_rays(LENS, LENS.width, LENS.height))
     folder.mkdir()
-    for name, pose in truth.items():
+
+    def take(name: str) -> None:
+        pose = truth[name]
         near = tuple(solid for solid in scene.solids if abs(float(solid.world_from_shape[0, 3]) - pose[0, 3]) < VISIBLE)
         with torch.inference_mode():
             image = photograph(scene._replace(solids=near), directions, torch.tensor(pose).float(), 1)
         Image.fromarray((255 * image).round().byte().numpy()).save(folder / name)
+
+    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+        torch.set_num_threads(1)  # whole photos side by side: threads that share a small one mostly wait
+        list(pool.map(take, truth))
     return truth
 
 
