@@ -178,8 +178,8 @@ def test_what_is_worth_choosing_stays_so_where_a_pair_costs_more(count: int, sec
 
 def test_small_sets_are_matched_whole_whatever_it_costs() -> None:
     assert choose(60, 30, 1e6, Places()) == "exhaustive"
-    assert not can_save(60, 30)
-    assert can_save(100, 30)
+    assert not can_save(91, 30)
+    assert can_save(92, 30)
 
 
 def test_time_and_place_are_used_where_they_are_known() -> None:
