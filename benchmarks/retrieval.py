@@ -1,6 +1,7 @@
 """What choosing pairs by retrieval saves and loses on a large set, against matching every pair.
 
     python -m benchmarks.retrieval [--photos 400] [--matchers exhaustive retrieval] [--neighbours 30]
+                                   [--max-features 4096] [--folder DIR]
 
 Draws photos of 320 × 240 along both sides of a synthetic street: each shows about a thirtieth of it, so that most pairs
 share nothing, and their names are in random order. Then runs stage sfm with each way of choosing pairs, and prints
@@ -62,14 +63,16 @@ def poses(count: int, random: np.random.Generator) -> np.ndarray:
 
 
 def draw(folder: Path, count: int, seed: int = 0) -> dict[str, np.ndarray]:
-    """Write the photos; the true poses by name."""
+    """Write the photos that are not there yet; the true poses by name."""
     random = np.random.default_rng(seed)
     truth = dict(zip((f"{i:04d}.png" for i in random.permutation(count)), poses(count, random), strict=True))
     scene = street(STEP * count, random)
     directions = torch.from_numpy(camera_rays(LENS, LENS.width, LENS.height))
-    folder.mkdir()
+    folder.mkdir(parents=True, exist_ok=True)
 
     def take(name: str) -> None:
+        if (folder / name).exists():
+            return
         pose = truth[name]
         near = tuple(solid for solid in scene.solids if abs(float(solid.world_from_shape[0, 3]) - pose[0, 3]) < VISIBLE)
         with torch.inference_mode():
@@ -82,10 +85,9 @@ def draw(folder: Path, count: int, seed: int = 0) -> dict[str, np.ndarray]:
     return truth
 
 
-def measure(matcher: str, folder: Path, truth: dict[str, np.ndarray], neighbours: int) -> None:
+def measure(config: sfm.Config, folder: Path, truth: dict[str, np.ndarray]) -> None:
     """Run stage sfm and print its line of the table."""
-    progress, sfm_folder = Timed(), folder / matcher
-    config = sfm.Config.model_validate({"matcher": matcher, "neighbours": neighbours})
+    progress, sfm_folder = Timed(), folder / str(config.matcher)
     begin = time.perf_counter()
     result = sfm.run(config, {"ingest": folder / "ingest"}, sfm_folder, progress)
     seconds = time.perf_counter() - begin
@@ -95,7 +97,7 @@ def measure(matcher: str, folder: Path, truth: dict[str, np.ndarray], neighbours
     aligned = np.stack([align(found[:, :, 3], true).pose(pose) for pose in found])[:, :, 3]
     off = np.linalg.norm(aligned - true, axis=1).max() / np.ptp(true[:, 0])
     matching = sum(value for kind, value in progress.seconds.items() if kind.startswith("matched"))
-    print(f"{matcher:12s} {matching:9.0f} {seconds:6.0f}  {100 * off:6.2f} %  {result.line}", flush=True)
+    print(f"{config.matcher:12s} {matching:9.0f} {seconds:6.0f}  {100 * off:6.2f} %  {result.line}", flush=True)
 
 
 def main() -> None:
@@ -104,15 +106,18 @@ def main() -> None:
     parser.add_argument("--photos", type=int, default=400)
     parser.add_argument("--matchers", nargs="+", default=["exhaustive", "retrieval"])
     parser.add_argument("--neighbours", type=int, default=sfm.Config().neighbours)
+    parser.add_argument("--max-features", type=int, default=sfm.Config().max_features)
+    parser.add_argument("--folder", type=Path, help="where the photos are drawn, and kept")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
-        folder = Path(scratch)
-        truth = draw(folder / "photos", arguments.photos)
+        photos, folder = (arguments.folder or Path(scratch)) / "photos", Path(scratch)
+        truth = draw(photos, arguments.photos)
         (folder / "ingest").mkdir()
-        ingest.run(ingest.Config(photos=folder / "photos"), {}, folder / "ingest", Timed())
+        ingest.run(ingest.Config(photos=photos), {}, folder / "ingest", Timed())
         print(f"{'matcher':12s} {'matching':>9s} {'sfm s':>6s}  {'farthest':>8s}")
         for matcher in arguments.matchers:
-            measure(matcher, folder, truth, arguments.neighbours)
+            config = {"matcher": matcher, "neighbours": arguments.neighbours, "max_features": arguments.max_features}
+            measure(sfm.Config.model_validate(config), folder, truth)
 
 
 if __name__ == "__main__":
