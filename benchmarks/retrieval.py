@@ -1,6 +1,7 @@
 """What choosing pairs by retrieval saves and loses on a large set, against matching every pair.
 
-    python benchmarks/retrieval.py [--photos 400] [--matchers exhaustive retrieval] [--neighbours 30]
+    python -m benchmarks.retrieval [--photos 400] [--matchers exhaustive retrieval] [--neighbours 30]
+                                   [--max-features 4096] [--folder DIR]
 
 Draws photos of 320 × 240 along both sides of a synthetic street: each shows about a thirtieth of it, so that most pairs
 share nothing, and their names are in random order. Then runs stage sfm with each way of choosing pairs, and prints
@@ -10,9 +11,9 @@ from the truth, in share of the street's length.
 
 import argparse
 import math
-import re
 import tempfile
 import time
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 
@@ -20,6 +21,7 @@ import numpy as np
 import torch
 from PIL import Image
 
+from benchmarks.sfm_speed import Timed
 from nerf import solid_texture
 from nerf.camera_paths import look_at
 from nerf.scene import Camera
@@ -61,43 +63,31 @@ def poses(count: int, random: np.random.Generator) -> np.ndarray:
 
 
 def draw(folder: Path, count: int, seed: int = 0) -> dict[str, np.ndarray]:
-    """Write the photos; the true poses by name."""
+    """Write the photos that are not there yet; the true poses by name."""
     random = np.random.default_rng(seed)
     truth = dict(zip((f"{i:04d}.png" for i in random.permutation(count)), poses(count, random), strict=True))
     scene = street(STEP * count, random)
     directions = torch.from_numpy(camera_rays(LENS, LENS.width, LENS.height))
-    folder.mkdir()
-    for name, pose in truth.items():
+    folder.mkdir(parents=True, exist_ok=True)
+
+    def take(name: str) -> None:
+        if (folder / name).exists():
+            return
+        pose = truth[name]
         near = tuple(solid for solid in scene.solids if abs(float(solid.world_from_shape[0, 3]) - pose[0, 3]) < VISIBLE)
         with torch.inference_mode():
             image = photograph(scene._replace(solids=near), directions, torch.tensor(pose).float(), 1)
         Image.fromarray((255 * image).round().byte().numpy()).save(folder / name)
+
+    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+        torch.set_num_threads(1)  # whole photos side by side: threads that share a small one mostly wait
+        list(pool.map(take, truth))
     return truth
 
 
-class Timed:
-    """A Progress that prints what stays and remembers how long each kind of live line stood."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-        self.last = ("", time.perf_counter())
-
-    def update(self, message: str, done: float | None = None) -> None:
-        """Account for the time since the last line."""
-        kind, now = re.sub(r"\d+", "#", message), time.perf_counter()
-        before, since = self.last
-        self.seconds[before] = self.seconds.get(before, 0.0) + now - since
-        self.last = (kind, now)
-
-    def note(self, message: str) -> None:
-        """Print the note."""
-        print(f"  {message}", flush=True)
-
-
-def measure(matcher: str, folder: Path, truth: dict[str, np.ndarray], neighbours: int) -> None:
+def measure(config: sfm.Config, folder: Path, truth: dict[str, np.ndarray]) -> None:
     """Run stage sfm and print its line of the table."""
-    progress, sfm_folder = Timed(), folder / matcher
-    config = sfm.Config.model_validate({"matcher": matcher, "neighbours": neighbours})
+    progress, sfm_folder = Timed(), folder / str(config.matcher)
     begin = time.perf_counter()
     result = sfm.run(config, {"ingest": folder / "ingest"}, sfm_folder, progress)
     seconds = time.perf_counter() - begin
@@ -107,7 +97,7 @@ def measure(matcher: str, folder: Path, truth: dict[str, np.ndarray], neighbours
     aligned = np.stack([align(found[:, :, 3], true).pose(pose) for pose in found])[:, :, 3]
     off = np.linalg.norm(aligned - true, axis=1).max() / np.ptp(true[:, 0])
     matching = sum(value for kind, value in progress.seconds.items() if kind.startswith("matched"))
-    print(f"{matcher:12s} {matching:9.0f} {seconds:6.0f}  {100 * off:6.2f} %  {result.line}", flush=True)
+    print(f"{config.matcher:12s} {matching:9.0f} {seconds:6.0f}  {100 * off:6.2f} %  {result.line}", flush=True)
 
 
 def main() -> None:
@@ -116,15 +106,18 @@ def main() -> None:
     parser.add_argument("--photos", type=int, default=400)
     parser.add_argument("--matchers", nargs="+", default=["exhaustive", "retrieval"])
     parser.add_argument("--neighbours", type=int, default=sfm.Config().neighbours)
+    parser.add_argument("--max-features", type=int, default=sfm.Config().max_features)
+    parser.add_argument("--folder", type=Path, help="where the photos are drawn, and kept")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
-        folder = Path(scratch)
-        truth = draw(folder / "photos", arguments.photos)
+        photos, folder = (arguments.folder or Path(scratch)) / "photos", Path(scratch)
+        truth = draw(photos, arguments.photos)
         (folder / "ingest").mkdir()
-        ingest.run(ingest.Config(photos=folder / "photos"), {}, folder / "ingest", Timed())
+        ingest.run(ingest.Config(photos=photos), {}, folder / "ingest", Timed())
         print(f"{'matcher':12s} {'matching':>9s} {'sfm s':>6s}  {'farthest':>8s}")
         for matcher in arguments.matchers:
-            measure(matcher, folder, truth, arguments.neighbours)
+            config = {"matcher": matcher, "neighbours": arguments.neighbours, "max_features": arguments.max_features}
+            measure(sfm.Config.model_validate(config), folder, truth)
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ Similarity = Float[np.ndarray, "photos photos"]
 # than half as long. It is as long as a standard training takes.
 PATIENCE_SECONDS = 180.0
 MUTUAL = 0.5  # of a photo's nearest, about so many have it among their own
-LOOPS = 5  # one partner in so many of a video's photo is looked for at other times
+LOOPS = 5  # in a sequence one of so many partners is looked for at other times
 GPS_ERROR_M = 10.0  # twice the 4.9 m that phones reach under open sky (gps.gov, GPS accuracy)
 EARTH_AXES_M = (6_378_137.0, 6_356_752.314)  # WGS 84
 
@@ -66,11 +66,11 @@ def spanning_tree(similarity: Similarity) -> Pairs:
     outside = np.arange(count) > 0
     pairs = []
     for _ in range(count - 1):
-        nearest = int(np.argmax(np.where(outside, best, -np.inf)))
-        pairs.append((parent[nearest], nearest))
-        outside[nearest] = False
-        nearer = outside & (similarity[nearest] > best)
-        best[nearer], parent[nearer] = similarity[nearest, nearer], nearest
+        likest = int(np.argmax(np.where(outside, best, -np.inf)))
+        pairs.append((parent[likest], likest))
+        outside[likest] = False
+        closer = outside & (similarity[likest] > best)
+        best[closer], parent[closer] = similarity[likest, closer], likest
     return union(np.array(pairs, int).reshape(-1, 2))
 
 

@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-WORDS = 64
+WORDS = 128
 ROUNDS = 10
 SAMPLE = 50_000  # features that the words are made from
 

@@ -178,17 +178,12 @@ def read_descriptors(db: "pycolmap.Database", photo: int) -> np.ndarray:
 def _match(
     first: _Photo, second: _Photo, max_ratio: float, options: "pycolmap.TwoViewGeometryOptions"
 ) -> "tuple[np.ndarray, pycolmap.TwoViewGeometry]":
-    """Matches, and those that some geometry of two views explains; empty where too few do."""
+    """Matches, and the geometry of two views with those that it explains: none where they are too few."""
     import pycolmap
 
     matches = match_descriptors(first.descriptors, second.descriptors, max_ratio)
-    if len(matches) < options.min_num_inliers:
-        return matches, pycolmap.TwoViewGeometry()
-    geometry = pycolmap.estimate_two_view_geometry(
-        first.camera, first.places, second.camera, second.places, matches, options
-    )
-    enough = len(geometry.inlier_matches) >= options.min_num_inliers
-    return matches, geometry if enough else pycolmap.TwoViewGeometry()
+    views = first.camera, first.places, second.camera, second.places
+    return matches, pycolmap.estimate_two_view_geometry(*views, matches, options)
 
 
 def copy_without_matches_of(names: Container[str], database: Path, copy: Path) -> None:

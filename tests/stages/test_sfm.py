@@ -272,3 +272,11 @@ def test_known_cameras_go_through_without_points(tmp_path: Path, progress) -> No
     assert (account["source"], account["reprojection_px"], account["points"]) == ("import", None, 0)
     assert account["test_files"] == ["test/r_4.png"]
     assert read_model(tmp_path / "sfm/sparse").cameras[0].params[0] == pytest.approx(52.0)
+
+
+def test_photos_that_look_alike_are_enough(inputs: dict[str, Path], tmp_path: Path, progress) -> None:
+    config = sfm.Config(max_features=1000, matcher="retrieval", neighbours=3)
+    result = sfm.run(config, inputs, tmp_path, progress)
+    assert result.line.startswith("12/12 registered")
+    said = re.fullmatch(r"matching (\d+) pairs of photos: about \d+ s", progress.notes[0])
+    assert said and 12 * 3 / 2 <= int(said[1]) < 12 * 11 / 2
