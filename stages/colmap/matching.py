@@ -81,7 +81,7 @@ def extract_features(
             continue
         options.sift.first_octave = -1 if is_small else 0
         reader = pycolmap.ImageReaderOptions()
-        if is_masked:
+        if masks and is_masked:
             reader.mask_path = masks
         pycolmap.extract_features(
             database, images, names, reader_options=reader, extraction_options=options, device=pycolmap.Device.cpu
