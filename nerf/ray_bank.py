@@ -59,9 +59,8 @@ class RayBank(NamedTuple):
 
     def to(self, device: torch.device | str) -> "RayBank":
         """This bank with its tables on ``device``."""
-        runs = None if self.runs is None else self.runs.to(device)
-        pixels, first_pixel, layout, geometry, patches, _ = self
-        return RayBank(*(table.to(device) for table in (pixels, first_pixel, layout, geometry, patches)), runs)
+        moved = {name: table.to(device) for name, table in self._asdict().items() if table is not None}
+        return self._replace(**moved)
 
     @property
     def drawable(self) -> int:

@@ -12,6 +12,7 @@ from PIL import Image
 
 from pipeline.cli import run_command
 from pipeline.display import PlainDisplay, end_line
+from pipeline.settings import default_workspace
 
 
 def test_help_names_every_command_and_stage(capsys: pytest.CaptureFixture[str]):
@@ -80,6 +81,21 @@ def run_on(photos: Path, capsys: pytest.CaptureFixture[str], *words: str) -> tup
     captured = capsys.readouterr()
     assert "Traceback" not in captured.out + captured.err
     return code, captured.out + captured.err
+
+
+def test_workspaces_are_called_after_what_was_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "a walk.v2.mp4").write_bytes(b"")
+    monkeypatch.chdir(tmp_path)
+    cases = {"a walk.v2.mp4": "a walk.v2", "set/images": "set", "set/transforms.json": "set", "./set/": "set"}
+    for given, name in cases.items():
+        assert default_workspace(Path(given)) == tmp_path / f"{name}.nerf"
+
+
+def test_a_video_that_is_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    (tmp_path / "clip.mp4").write_text("no video")
+    assert run_command(["run", str(tmp_path / "clip.mp4"), "-o", str(tmp_path / "w.nerf")]) == 10
+    captured = capsys.readouterr()
+    assert "cannot decode the video clip.mp4" in captured.out + captured.err
 
 
 def test_a_folder_that_does_not_exist(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -255,8 +255,9 @@ def test_masks_go_with_their_photos(tmp_path: Path, progress: Any) -> None:
     assert result.outputs == ("images", "photos.json", "masks")
     assert [photo.mask is not None for photo in photos] == [True, False, False, False, True, True]
     for photo, columns in zip([photos[0], photos[4], photos[5]], (8, 16, 16), strict=True):
-        assert photo.mask == f"masks/{photo.file.removeprefix('images/')}.png"
-        mask = np.asarray(Image.open(tmp_path / "out" / photo.mask))
+        file = f"masks/{photo.file.removeprefix('images/')}.png"
+        mask = np.asarray(Image.open(tmp_path / "out" / file))
+        assert photo.mask == file
         assert np.array_equal(mask, np.broadcast_to(np.where(np.arange(32) < columns, 0, 255), (24, 32)))
     assert progress.notes == [
         "masks/stranger.png is no photo's mask, which are called NAME.png",
