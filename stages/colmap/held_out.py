@@ -5,6 +5,7 @@ simplest one wins that foretells them no worse than the best by more than the no
 too simple bends the poses; one that is too rich fits noise, and bends them too.
 """
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 
 # Points for the comparison are drawn until they have so many observations: 14 candidates then take seconds.
 MOST_OBSERVATIONS = 20_000
-MOST_PER_PHOTO = 100  # or until every photo may have so many, where there are hundreds of photos; a pose has 6 unknowns
+MOST_PER_PHOTO = 100  # where there are hundreds of photos it takes more: a pose alone has 6 unknowns
 FEWEST_HELD_OUT = 50  # the spread of so many is known to a tenth, 1/√(2 · 50); fewer are no evidence
 CAP_PX = 4.0  # what is farther off is a mismatch, as for COLMAP's own filter, and counts as this
 CELLS = 4  # neighbours in a photo err alike, so the noise is that of the means of 4 × 4 parts of each photo
@@ -34,7 +35,7 @@ class Trial(NamedTuple):
     lens: Lens
     error_px: Float[np.ndarray, "n"]  # of each held-out observation
     noise_px: float  # of the observations it was adjusted to
-    flaws: dict[int, str]  # by camera id
+    flaw: str | None  # of one of its cameras
 
 
 @dataclass
@@ -50,49 +51,66 @@ class Choice:
 def choose(mapped: "pycolmap.Reconstruction", seed: int, models: Sequence[str] = MODELS) -> Choice:
     """The lens of every camera, of these models.
 
-    All cameras try the same candidate at the same time. Those with enough held-out observations are judged by their
-    own, the others together; where even these are too few, cameras stay as mapping had them.
+    A camera is judged by its own photos alone where they share enough points, and the others all together, each
+    candidate being tried by all of them. Where even that is too little, cameras stay as mapping had them.
     """
-    import pycolmap
-
-    sample = pycolmap.Reconstruction(mapped)
-    held_out = hold_out(sample, seed)
-    noise = noise_px(mapped, observations(mapped))
-    camera_of = {i: mapped.image(i).camera_id for i in sorted(mapped.reg_image_ids())}
-    judges = np.array([camera_of[i] for i in held_out.image.tolist()], np.int64)
-    groups = _groups(judges, sorted(set(camera_of.values())))
-    members = [np.flatnonzero(np.isin(judges, group)) for group in groups]
-    enough = [len(where) >= FEWEST_HELD_OUT for where in members]
-    trials = list(_trials(sample, held_out, models, noise)) if any(enough) else []
-    cells = _cells(held_out, mapped)
-    choice = Choice(noise)
-    for index, (group, where) in enumerate(zip(groups, members, strict=True)):
-        mine = [_of_group(trial, where, group) for trial in trials] if enough[index] else []
-        chosen, rows = _judge(mine, cells[where])
+    cameras = sorted({mapped.image(i).camera_id for i in mapped.reg_image_ids()})
+    groups = _groups(mapped, cameras)
+    choice, most_photos = Choice(noise_px(mapped, observations(mapped))), 0
+    for index, group in enumerate(groups):
+        sample = _part(mapped, group)
+        photos = sample.num_reg_images()
+        most = max(MOST_OBSERVATIONS * photos // mapped.num_reg_images(), MOST_PER_PHOTO * photos)
+        held_out = hold_out(sample, seed, most)
+        chosen, why = None, f"only {len(held_out.xy)} points are seen in three photos, too few to compare camera models"
+        if len(held_out.xy) >= FEWEST_HELD_OUT:
+            trials = list(_trials(sample, held_out, models, choice.noise_px))
+            cells = _cells(held_out, mapped)
+            chosen, rows = _judge(trials, cells)
+            why = _reason(chosen, trials, cells)
+            choice.table += [row | {"group": index, "photos": photos} for row in rows]
         lens = chosen.lens if chosen else Lens(mapped.camera(group[0]).model_name, False)
-        photos = sum(camera in group for camera in camera_of.values())
         choice.lenses |= dict.fromkeys(group, lens)
-        choice.table += [row | {"group": index, "photos": photos} for row in rows]
-        if enough[index]:
-            why = _reason(chosen, mine, cells[where])
-        else:
-            why = f"only {len(where)} points are seen in three photos, too few to compare camera models"
         whose = f"{photos} photos: " if len(groups) > 1 else ""
         given = " as given" if len(models) == 1 else ""
         choice.notes.append(f"{whose}camera model {lens.model}{given}, principal point {lens.place}: {why}")
-        if chosen and len(where) == max(map(len, members)):
-            choice.noise_px = chosen.noise_px
+        if chosen and photos > most_photos:
+            choice.noise_px, most_photos = chosen.noise_px, photos
     return choice
 
 
-def hold_out(model: "pycolmap.Reconstruction", seed: int) -> Observations:
-    """Reduce a model to points drawn at random; of each that three photos see, take one observation away.
+def _groups(mapped: "pycolmap.Reconstruction", cameras: list[int]) -> list[list[int]]:
+    """Cameras that are judged together: each one whose photos share enough points alone, then all others."""
+    if len(cameras) == 1:
+        return [cameras]
+    camera_of = {i: mapped.image(i).camera_id for i in mapped.reg_image_ids()}
+    shared: Counter[int] = Counter()
+    for point_id in mapped.point3D_ids():
+        views = Counter(camera_of[element.image_id] for element in mapped.point3D(point_id).track.elements)
+        shared.update(camera for camera, count in views.items() if count >= 3)
+    alone = [camera for camera in cameras if shared[camera] >= FEWEST_HELD_OUT]
+    others = [camera for camera in cameras if camera not in alone]
+    return [[camera] for camera in alone] + ([others] if others else [])
+
+
+def _part(mapped: "pycolmap.Reconstruction", cameras: list[int]) -> "pycolmap.Reconstruction":
+    """The photos of these cameras and the points that two of them see."""
+    import pycolmap
+
+    part = pycolmap.Reconstruction(mapped)
+    for image_id in sorted(part.reg_image_ids()):
+        if part.image(image_id).camera_id not in cameras:
+            part.deregister_frame(part.image(image_id).frame_id)
+    return part
+
+
+def hold_out(model: "pycolmap.Reconstruction", seed: int, most: int) -> Observations:
+    """Reduce a model to points drawn until they have so many observations; take one of each with three or more away.
 
     Which one is drawn too, so they come from all photos. Two are left, and so every point keeps its place.
     """
     random = np.random.default_rng(seed)
     drawn, count = [], 0
-    most = max(MOST_OBSERVATIONS, MOST_PER_PHOTO * model.num_reg_images())
     for point_id in random.permutation(np.array(sorted(model.point3D_ids()), np.int64)).tolist():
         if count < most:
             drawn.append(point_id)
@@ -114,13 +132,6 @@ def hold_out(model: "pycolmap.Reconstruction", seed: int) -> Observations:
     )
 
 
-def _groups(judges: Int[np.ndarray, "n"], cameras: list[int]) -> list[list[int]]:
-    """Cameras that are judged together: one with enough observations alone, then all others."""
-    alone = [camera for camera in cameras if np.count_nonzero(judges == camera) >= FEWEST_HELD_OUT]
-    others = [camera for camera in cameras if camera not in alone]
-    return [[camera] for camera in alone] + ([others] if others else [])
-
-
 def _cells(seen: Observations, model: "pycolmap.Reconstruction") -> Int[np.ndarray, "n"]:
     """In which part of which photo an observation lies."""
     size = {i: (c.width, c.height) for i in model.reg_image_ids() for c in [model.camera(model.image(i).camera_id)]}
@@ -136,16 +147,17 @@ def _trials(
     import pycolmap
 
     trained = observations(sample)
+    cameras = sorted({sample.image(i).camera_id for i in sample.reg_image_ids()})
     _adjust(sample, False, noise)  # most of the way is the same for all candidates
     for name in models:
         model = pycolmap.Reconstruction(sample)
-        equip(model, dict.fromkeys(model.cameras, name))
+        equip(model, dict.fromkeys(cameras, name))
         for principal_point in (False, True):
             _adjust(model, principal_point, noise)
             length = np.linalg.norm(residuals(model, held_out), axis=1)
             error = np.where(length < CAP_PX, length, CAP_PX)  # a point behind the camera (NaN) counts as far off
-            flaws = {camera_id: why for camera_id in model.cameras if (why := flaw(model.camera(camera_id)))}
-            yield Trial(Lens(name, principal_point), error, noise_px(model, trained), flaws)
+            flaws = filter(None, map(flaw, map(model.camera, cameras)))
+            yield Trial(Lens(name, principal_point), error, noise_px(model, trained), next(flaws, None))
 
 
 def _adjust(model: "pycolmap.Reconstruction", principal_point: bool, noise: float) -> None:
@@ -177,16 +189,10 @@ def adjustment_options(principal_point: bool, noise: float) -> "pycolmap.BundleA
     return options
 
 
-def _of_group(trial: Trial, where: Int[np.ndarray, "n"], cameras: Sequence[int]) -> Trial:
-    """A trial as far as it concerns some cameras."""
-    flaws = {camera: why for camera, why in trial.flaws.items() if camera in cameras}
-    return trial._replace(error_px=trial.error_px[where], flaws=flaws)
-
-
 def _judge(trials: list[Trial], cells: Int[np.ndarray, "n"]) -> tuple[Trial | None, list[dict[str, Any]]]:
     """The trial whose lens to take, None if all are absurd, and the table."""
     chosen, excess = None, {}
-    if sound := [trial for trial in trials if not trial.flaws]:
+    if sound := [trial for trial in trials if not trial.flaw]:
         best = min(sound, key=lambda trial: trial.error_px.mean())
         excess = {trial.lens: paired(trial.error_px - best.error_px, cells) for trial in sound}
         able = [trial for trial in sound if excess[trial.lens][0] <= NOISE_MULTIPLES * excess[trial.lens][1]]
@@ -199,11 +205,11 @@ def _judge(trials: list[Trial], cells: Int[np.ndarray, "n"]) -> tuple[Trial | No
                 "model": trial.lens.model,
                 "principal_point": trial.lens.place,
                 "free_parameters": trial.lens.free_parameters,
-                "held_out_px": None if trial.flaws else float(trial.error_px.mean()),
+                "held_out_px": None if trial.flaw else float(trial.error_px.mean()),
                 "worse_px": worse,
                 "noise_px": noise,
                 "chosen": trial is chosen,
-                "reason": next(iter(trial.flaws.values()), None),
+                "reason": trial.flaw,
             }
         )
     return chosen, rows
@@ -221,7 +227,7 @@ def _reason(chosen: Trial | None, trials: list[Trial], cells: Int[np.ndarray, "n
     if chosen is None:
         return "every candidate comes out absurd, so it stays as mapping had it"
     error = f"held-out error {chosen.error_px.mean():.2f} px"
-    simpler = [trial for trial in trials if not trial.flaws and trial.lens.complexity < chosen.lens.complexity]
+    simpler = [trial for trial in trials if not trial.flaw and trial.lens.complexity < chosen.lens.complexity]
     if not simpler:
         return f"{error}, and no richer one is better by more than the noise"
     rival = min(simpler, key=lambda trial: trial.error_px.mean())

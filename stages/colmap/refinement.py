@@ -4,13 +4,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stages.colmap.held_out import adjustment_options, choose
+from stages.colmap.held_out import Choice, adjustment_options, choose
 from stages.colmap.lenses import MODELS, equip
 from stages.colmap.mapping import pipeline_options
 from stages.colmap.uncertainty import pose_uncertainty_px
 
 if TYPE_CHECKING:
     import pycolmap
+
+# The first choice can only go by what mapping's lens let in. Where another one lets in a tenth more, mostly from the
+# borders of wide photos, that is where it shows what it is worth.
+MANY_MORE = 1.1
 
 
 @dataclass(frozen=True)
@@ -26,12 +30,25 @@ class Finished:
 def finish(mapped: "pycolmap.Reconstruction", database: Path, seed: int, camera_model: str | None) -> Finished:
     """Choose the camera model by held-out observations, unless it is given, and adjust everything with it.
 
-    Of a given model it is only chosen whether its principal point is refined.
+    Of a given model it is only chosen whether its principal point is refined. Where many more observations fit the
+    chosen lens than mapping's, the choice is made again with them.
     """
+    models = (camera_model,) if camera_model else MODELS
+    choice = choose(mapped, seed, models)
+    model = _adjusted(mapped, database, seed, choice)
+    if model.compute_num_observations() > MANY_MORE * mapped.compute_num_observations():
+        choice = choose(model, seed, models)
+        model = _adjusted(model, database, seed, choice)
+    uncertainty = pose_uncertainty_px(model, choice.noise_px)
+    return Finished(model, choice.table, choice.notes, {model.image(i).name: px for i, px in uncertainty.items()})
+
+
+def _adjusted(
+    before: "pycolmap.Reconstruction", database: Path, seed: int, choice: Choice
+) -> "pycolmap.Reconstruction":
     import pycolmap
 
-    choice = choose(mapped, seed, (camera_model,) if camera_model else MODELS)
-    model = pycolmap.Reconstruction(mapped)
+    model = pycolmap.Reconstruction(before)
     equip(model, {camera_id: lens.model for camera_id, lens in choice.lenses.items()})
     centred = {camera_id for camera_id, lens in choice.lenses.items() if not lens.principal_point}
     # Whether to refine principal points holds for all cameras at once: those that keep theirs are adjusted before.
@@ -39,8 +56,7 @@ def finish(mapped: "pycolmap.Reconstruction", database: Path, seed: int, camera_
         _adjust(model, database, seed, set(), adjustment_options(False, choice.noise_px))
     if centred != choice.lenses.keys():
         _adjust(model, database, seed, centred, adjustment_options(True, choice.noise_px))
-    uncertainty = pose_uncertainty_px(model, choice.noise_px)
-    return Finished(model, choice.table, choice.notes, {model.image(i).name: px for i, px in uncertainty.items()})
+    return model
 
 
 def _adjust(

@@ -111,12 +111,12 @@ def _gauge(pose: Float[np.ndarray, "3 4"]) -> Float[np.ndarray, "6 7"]:
 def _error_px(residual: Float[np.ndarray, "n 2"], scale: float, poses: int, points: int) -> float:
     """Standard deviation of a coordinate that has the effect of these residuals r under soft-L1 of this scale s.
 
-    √(E[ψ²] / E[ψ']²) with the influence ψ(r) = r / √(1 + (r/s)²) (Huber 1981, section 7.6), corrected for what poses
-    and points took up.
+    √(E[ψ²] / E[ψ']²) with the influence ψ(r) = r / √(1 + (r/s)²) (Huber 1981, section 7.6), where residuals are
+    enlarged to what they would be if poses and points did not follow the noise.
     """
-    square = (residual**2).sum(axis=1) / scale**2
-    root = np.sqrt(1 + square)
-    influence = scale**2 * np.mean(square / (1 + square)) / 2  # of a coordinate
-    slope = np.mean((1 - square / (2 * root**2)) / root)
     count = 2 * len(residual)
-    return float(np.sqrt(influence * count / max(count - 6 * poses - 3 * points + 7, 1)) / slope)
+    left = 1 - (6 * poses + 3 * points - 7) / count  # the share of the noise's square that residuals show
+    square = (residual**2).sum(axis=1) / max(left, 1 / count) / scale**2
+    influence = scale**2 * np.mean(square / (1 + square)) / 2  # of a coordinate
+    slope = np.mean((1 - square / (2 * (1 + square))) / np.sqrt(1 + square))
+    return float(np.sqrt(influence) / slope)

@@ -32,11 +32,11 @@ def look_at(centre: np.ndarray, target: np.ndarray, roll: float) -> np.ndarray:
 
 
 def photographed(
-    camera: Camera, seed: int = 0, photos: int = 10, points: int = 500, noise: float = 0.5, room: bool = False
+    *cameras: Camera, seed: int = 0, photos: int = 10, points: int = 500, noise: float = 0.5, room: bool = False
 ) -> "pycolmap.Reconstruction":
     """Photos from around a cloud of points, or from inside it (``room``), as a model with true cameras and points.
 
-    Where points were seen is off by Gaussian noise (deviation of a coordinate in pixels). Some photos are rolled.
+    The cameras take turns. Where points were seen is off by Gaussian noise (deviation of a coordinate in pixels).
     """
     import pycolmap
 
@@ -51,17 +51,21 @@ def photographed(
         look_at(centre, aim + random.normal(0, 0.2, 3), roll)
         for centre, aim, roll in zip(centres, np.broadcast_to(target, centres.shape), angle % 0.7 * 2, strict=True)
     ]
-    model, theirs = pycolmap.Reconstruction(), native(camera)
-    model.add_camera_with_trivial_rig(theirs)
+    model = pycolmap.Reconstruction()
+    for camera_id, camera in enumerate(cameras, start=1):
+        model.add_camera_with_trivial_rig(native(camera, camera_id))
     tracks = [pycolmap.Track() for _ in xyz]
     for image_id, pose in enumerate(poses, start=1):
-        seen = np.asarray(theirs.img_from_cam(xyz @ pose[:, :3].T + pose[:, 3]))
+        camera = model.camera(1 + image_id % len(cameras))
+        seen = np.asarray(camera.img_from_cam(xyz @ pose[:, :3].T + pose[:, 3]))
         seen = seen + random.normal(0, noise, seen.shape)
         inside = np.flatnonzero((seen > 0).all(axis=1) & (seen < (camera.width, camera.height)).all(axis=1))
         for keypoint, point in enumerate(inside):
             tracks[point].add_element(image_id, keypoint)
         places = pycolmap.Point2DList([pycolmap.Point2D(xy) for xy in seen[inside]])
-        image = pycolmap.Image(name=f"{image_id:02d}.jpg", camera_id=1, image_id=image_id, points2D=places)
+        image = pycolmap.Image(
+            name=f"{image_id:02d}.jpg", camera_id=camera.camera_id, image_id=image_id, points2D=places
+        )
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose))
     for place, track in zip(xyz, tracks, strict=True):
         if track.length() >= 2:
@@ -69,17 +73,18 @@ def photographed(
     return model
 
 
-def adjust(model: "pycolmap.Reconstruction", noise: float = 0.5, intrinsics: bool = True) -> None:
-    """Bundle adjustment as the stage does it, with the principal point where it is."""
+def adjust(model: "pycolmap.Reconstruction", principal_point: bool = False, intrinsics: bool = True) -> None:
+    """Bundle adjustment as the stage does it, for a noise of half a pixel."""
     import pycolmap
 
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in sorted(model.reg_image_ids()):
         config.add_image(image_id)
     if not intrinsics:
-        config.set_constant_cam_intrinsics(1)
+        for camera_id in model.cameras:
+            config.set_constant_cam_intrinsics(camera_id)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    pycolmap.create_default_bundle_adjuster(adjustment_options(False, noise), config, model).solve()
+    pycolmap.create_default_bundle_adjuster(adjustment_options(principal_point, 0.5), config, model).solve()
 
 
 def mapped(truth: "pycolmap.Reconstruction", widest: float = 180.0) -> "pycolmap.Reconstruction":
@@ -90,7 +95,7 @@ def mapped(truth: "pycolmap.Reconstruction", widest: float = 180.0) -> "pycolmap
     for image_id, (mine, points) in points_in_camera(model, seen := observations(model)).items():
         off = np.degrees(np.arctan2(np.linalg.norm(points[:, :2], axis=1), points[:, 2]))
         _drop(model, image_id, seen.point[mine][off > widest].tolist())
-    equip(model, {1: "SIMPLE_RADIAL"})
+    equip(model, dict.fromkeys(model.cameras, "SIMPLE_RADIAL"))
     for _ in range(2):
         adjust(model)
         seen = observations(model)
