@@ -23,7 +23,6 @@ import pycolmap
 
 from benchmarks.sfm_accuracy import errors
 from stages import ingest, sfm
-from stages.colmap.mapping import rank
 from stages.colmap.models import read_model
 from stages.sparse_model import SparseModel
 
@@ -63,7 +62,7 @@ def colmaps_defaults(photos: Path, folder: Path) -> tuple[Path, dict[str, float]
     parts["mapping"] = clock() - begin - sum(parts.values())
     best = folder / "best"
     best.mkdir()
-    max(models.values(), key=rank).write_binary(best)
+    max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D())).write_binary(best)
     return best, parts
 
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from nerf.scene import Scene
 
 NEEDS = ("ingest", "sfm", "normalise", "train", "evaluate", "render", "mesh")
-VERSION = 1
+VERSION = 2
 RESUMES = False
 LINKS = ("report.html", "summary.json")
 
@@ -114,6 +114,8 @@ def page(results: Results, summary: dict[str, Any], config: Config) -> str:
         settings=_settings(results.manifests),
         refused=results.photos["refused"] if results.photos else [],
         missing=_missing(results),
+        lenses=_lenses(results),
+        uncertainty=_uncertainty(results),
         video=_video(results.inputs, config.video_limit_mb),
         compared=_compared(results),
         curve=_curve(results),
@@ -153,6 +155,32 @@ def _missing(results: Results) -> list[dict[str, str]]:
         for image in results.registration["images"]
         if not image["registered"]
     ]
+
+
+def _lenses(results: Results) -> dict[str, Any]:
+    """The comparison of camera models in stage sfm."""
+    from stages.colmap.held_out import NOISE_MULTIPLES
+
+    rows = (results.registration or {}).get("camera_models", [])
+    chosen = [f"{row['model']}, principal point {row['principal_point']}" for row in rows if row["chosen"]]
+    return {
+        "rows": rows,
+        "several": len({row["group"] for row in rows}) > 1,
+        "multiples": f"{NOISE_MULTIPLES:g}",
+        "summary": f"Camera model: {'; '.join(dict.fromkeys(chosen)) or 'no candidate would do'}",
+    }
+
+
+def _uncertainty(results: Results) -> dict[str, Any] | None:
+    """How well poses are known, of the median and the worst photo."""
+    if results.registration is None or results.photos is None:
+        return None
+    names = {photo["file"]: photo["name"] for photo in results.photos["photos"]}
+    known = [(i["uncertainty_px"], i["file"]) for i in results.registration["images"] if i.get("uncertainty_px")]
+    if not known:
+        return None
+    most, file = max(known)
+    return {"median": sorted(known)[len(known) // 2][0], "most": most, "worst": names[f"images/{file}"]}
 
 
 def _video(inputs: Inputs, limit_mb: float) -> str | None:

@@ -50,7 +50,8 @@ class Config(StageConfig):
     max_features: int = Field(default=4096, ge=100)
     """Features per photo, the largest ones first; matching takes time with its square."""
     camera_model: CameraModel | None = None
-    """COLMAP's camera model; None: SIMPLE_RADIAL, and RADIAL in the end where enough photos share a camera."""
+    """COLMAP's camera model; None: SIMPLE_RADIAL while mapping, and then the simplest one that held-out observations
+    do not speak against."""
     matcher: Matcher | None = None
     """Which pairs of photos are matched: all, neighbours in time or place, or those that look alike; None: by cost."""
     neighbours: int = Field(default=30, ge=1)
@@ -101,10 +102,12 @@ def _import(cameras: Path, photos: "list[Photo]", ingest: Path, folder: Path, pr
     return _result(
         folder,
         source="import",
-        images=known.account(photos),
+        attempts=[],
+        images=[image | {"uncertainty_px": None} for image in known.account(photos)],
         reprojection_px=float(known.model.error_px.mean()) if len(known.model.xyz) else None,
         points=len(known.model.xyz),
         camera_model="/".join(sorted({camera.model for camera in known.model.cameras})),
+        camera_models=[],
         test_files=known.test_files,
     )
 
@@ -130,16 +133,17 @@ def _reconstruct(config: Config, photos: "list[Photo]", ingest: Path, folder: Pa
     matches = read_matches(Path(found["database"]))
     images = account(names, matches, models, found["observations"], found["supports"])
     _say_who_is_missing(photos, images, progress)
-    _say_principal_point(found, progress)
     _forget(folder)
+    spread = found["uncertainty_px"]
     return _result(
         folder,
         source="sfm",
         attempts=found["attempts"],
-        images=with_left_out(images, everything),
+        images=[image | {"uncertainty_px": spread.get(image["file"])} for image in with_left_out(images, everything)],
         reprojection_px=found["reprojection_px"],
         points=points,
         camera_model=found["camera_model"],
+        camera_models=found["camera_models"],
         test_files=None,
     )
 
@@ -308,12 +312,6 @@ def _say_who_is_missing(photos: "Sequence[Photo]", images: list[dict[str, Any]],
     for reason, who in by_reason.items():
         more = f" and {len(who) - MOST_NAMES} more" if len(who) > MOST_NAMES else ""
         progress.note(f"  {', '.join(who[:MOST_NAMES])}{more}: {reason}")
-
-
-def _say_principal_point(found: dict[str, Any], progress: Progress) -> None:
-    if count := found["vague_cameras"]:
-        whose = "the principal point stays" if count == 1 else f"the principal points of {count} cameras stay"
-        progress.note(f"{whose} in the centre: the photos say too little about it")
 
 
 def _result(folder: Path, source: str, images: list[dict[str, Any]], **facts: Any) -> StageResult:

@@ -46,7 +46,7 @@ Say = Callable[..., None]
 class Job:
     """What the parent asks for; ``photos`` are Photos as dicts in order of ``file``. ``folder`` gets ``sparse/``.
 
-    ``camera_model`` None: SIMPLE_RADIAL for mapping, and RADIAL in the end where there is enough to go by.
+    ``camera_model`` None: SIMPLE_RADIAL for mapping, and in the end what held-out observations speak for.
     """
 
     folder: str
@@ -120,9 +120,9 @@ def reconstruct(job: Job, say: Say) -> dict[str, Any]:
     """Run structure-from-motion and write the best sub-model to ``sparse/``; nothing if none came out.
 
     Returns the ``database`` that was used in the end, the files in each sub-model, best first (``models``), the
-    ``attempts`` that were made, and of the best model: its ``points``, ``observations`` by file, mean
-    ``reprojection_px``, ``camera_model``, how many ``vague_cameras`` kept their principal points in the centre, and
-    for every photo without a place how many of its features are points of it and how many agree (``supports``).
+    ``attempts`` that were made, and of the best model: its ``points``, mean ``reprojection_px``, ``camera_model``, the
+    comparison of ``camera_models``, by file ``observations`` and ``uncertainty_px``, and for every photo without a
+    place how many of its features are points of it and how many of them agree (``supports``).
     """
     work = _Work(job, say)
     for attempt in ATTEMPTS[: job.attempts]:
@@ -135,7 +135,11 @@ def reconstruct(job: Job, say: Say) -> dict[str, Any]:
     say(phase="refining")
     database = work.latest()
     mapped = load_native(work.journal.model(best.name))  # from disk also where it is at hand: then resuming is no other
-    model, vague = finish(mapped, database, job.seed, job.camera_model is not None)
+    finished = finish(mapped, database, job.seed, job.camera_model)
+    for note in finished.notes:
+        say(note=note)
+    model = finished.model
+    registered = [model.image(i) for i in sorted(model.reg_image_ids())]
     sparse = Path(job.folder, "sparse")
     sparse.mkdir(exist_ok=True)
     model.write_binary(sparse)
@@ -143,11 +147,12 @@ def reconstruct(job: Job, say: Say) -> dict[str, Any]:
         "database": str(database),
         "attempts": tried,
         "models": [_files(model), *best.groups[1:]],
-        "observations": {m.name: m.num_points3D for m in map(model.image, sorted(model.reg_image_ids()))},
+        "observations": {image.name: image.num_points3D for image in registered},
+        "uncertainty_px": finished.uncertainty_px,
         "points": model.num_points3D(),
         "reprojection_px": model.compute_mean_reprojection_error(),
-        "camera_model": "/".join(sorted({camera.model_name for camera in model.cameras.values()})),
-        "vague_cameras": len(vague),
+        "camera_model": "/".join(sorted({model.camera(image.camera_id).model_name for image in registered})),
+        "camera_models": finished.camera_models,
         "supports": supports(model, database, job.seed),
     }
 

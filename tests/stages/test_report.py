@@ -22,6 +22,15 @@ FACTS = {
     "train": {"train_seconds": 183.3, "restarts": 0, "rollbacks": 2},
     "render": {"path": "orbit", "frames": 120, "width": 96, "height": 72, "fps": 24},
 }
+CAMERA_MODELS = [
+    {"group": 0, "photos": 24, "model": model, "principal_point": place, "free_parameters": free, "chosen": worse == 0}
+    | {"held_out_px": error, "worse_px": worse, "noise_px": noise, "reason": reason}
+    for model, place, free, error, worse, noise, reason in [
+        ("SIMPLE_RADIAL", "centred", 2, 0.6912, 0.0812, 0.0101, None),
+        ("OPENCV", "refined", 8, 0.6100, 0.0, 0.0, None),
+        ("OPENCV_FISHEYE", "refined", 8, None, None, None, "its distortion cannot be undone at 2.0% of the pixels"),
+    ]
+]
 LINES = {
     "ingest": "24 photos 96×72, one camera",
     "sfm": "23/24 registered, 0.61 px",
@@ -77,10 +86,15 @@ def _write_photos(folder: Path, names: list[str], size: tuple[int, int]) -> None
 
 
 def _write_registration(folder: Path, count: int) -> None:
-    images = [{"file": f"{i:04d}.png", "registered": True, "reason": None} for i in range(count)]
-    images.append({"file": "9999.png", "registered": False, "reason": "only 12 matches with any other photo"})
+    images: list[dict[str, object]] = [
+        {"file": f"{i:04d}.png", "registered": True, "reason": None, "uncertainty_px": (i + 1) / 50}
+        for i in range(count)
+    ]
+    reason = "only 12 matches with any other photo"
+    images.append({"file": "9999.png", "registered": False, "reason": reason, "uncertainty_px": None})
     content = {"source": "sfm", "photos": count + 1, "registered": count, "reprojection_px": 0.61, "points": 8123}
-    write_json(folder / "registration.json", content | {"camera_model": "OPENCV", "images": images})
+    lenses = {"camera_model": "OPENCV", "camera_models": CAMERA_MODELS}
+    write_json(folder / "registration.json", content | lenses | {"images": images})
 
 
 def _scene(names: list[str], size: tuple[int, int]) -> Scene:
@@ -224,6 +238,24 @@ def test_page_tells_what_a_person_wants_to_know_in_that_order(inputs: dict[str, 
     places = [html.find(words) for words in story[2:]]
     assert all(words in html for words in story)
     assert places == sorted(places)
+
+
+def test_page_shows_the_evidence_for_the_camera_model(tmp_path: Path, progress: Any):
+    inputs = make_workspace(tmp_path)
+    html, _ = _run(inputs, tmp_path / "out", progress)
+    assert "<summary>Camera model: OPENCV, principal point refined</summary>" in html
+    assert "by more than 3 times the noise of the difference" in html
+    for cells in ('0.6912</td><td class="number">0.0812 ± 0.0101</td><td></td>', "<td>chosen</td>"):
+        assert cells in html
+    assert "–</td><td>its distortion cannot be undone at 2.0% of the pixels</td>" in html
+    assert "median photo's pose is known to 0.26 px" in html
+    assert "the least certain one's (IMG_0023.jpg) to 0.48 px" in html
+    path = inputs["sfm"] / "registration.json"
+    registration = json.loads(path.read_text("utf-8"))
+    unknown = [image | {"uncertainty_px": None} for image in registration["images"]]
+    write_json(path, registration | {"camera_models": [], "images": unknown})  # as with given cameras
+    html, _ = _run(inputs, tmp_path / "given", progress)
+    assert "Camera model:" not in html and "pose is known" not in html
 
 
 def test_a_large_video_lies_beside_the_page(inputs: dict[str, Path], tmp_path: Path, progress: Any):

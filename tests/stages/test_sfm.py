@@ -76,7 +76,11 @@ def test_the_account_says_what_became_of_each_photo(reconstructed: Path) -> None
     account, model = read_json(reconstructed / "registration.json"), read_model(reconstructed / "sparse")
     assert (account["source"], account["photos"], account["registered"]) == ("sfm", 12, 12)
     assert account["test_files"] is None
-    assert account["camera_model"] == "SIMPLE_RADIAL"  # so few points say nothing about the principal point
+    assert account["camera_model"] == "SIMPLE_PINHOLE"  # as they were drawn, with the principal point in the centre
+    (chosen,) = (row for row in account["camera_models"] if row["chosen"])
+    assert (chosen["model"], chosen["principal_point"], chosen["photos"]) == ("SIMPLE_PINHOLE", "centred", 12)
+    assert 0 < chosen["held_out_px"] < 1
+    assert all(0 < image["uncertainty_px"] < 1 for image in account["images"])
     assert account["points"] == len(model.xyz) > 100
     assert account["reprojection_px"] == pytest.approx(model.error_px.mean())
     assert [image["observations"] for image in account["images"]] == np.bincount(model.view).tolist()
@@ -271,6 +275,8 @@ def test_known_cameras_go_through_without_points(tmp_path: Path, progress) -> No
     assert result.line == "5/5 cameras known · PINHOLE"
     assert (account["source"], account["reprojection_px"], account["points"]) == ("import", None, 0)
     assert account["test_files"] == ["test/r_4.png"]
+    assert account["camera_models"] == []
+    assert {image["uncertainty_px"] for image in account["images"]} == {None}
     assert read_model(tmp_path / "sfm/sparse").cameras[0].params[0] == pytest.approx(52.0)
 
 
