@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 
 from stages.contract import StageError
 from stages.degeneracy import count_turns
-from stages.sfm_attempts import WEAK_START
+from stages.sfm_attempts import FEWEST_MATCHES
 
 if TYPE_CHECKING:
     from stages.photos import Photo
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 FEWEST_REGISTERED = 3  # one to hold out, two to learn from; two views alone fit many wrong scenes
 FEWEST_POINTS = 100
 FEW_FEATURES = 50
-FEWEST_SEEN = WEAK_START.photo_matches
 SAME_VIEW_PX = 1.0
 FLAT_CONFIGS = (4, 5, 6)  # colmap TwoViewGeometry: PLANAR, PANORAMIC, PLANAR_OR_PANORAMIC
 PAIR_BASE = 2**31 - 1  # pair_id = PAIR_BASE * first image id + second image id
@@ -165,16 +164,15 @@ def _reason(
     in_model = np.array([names[partner] in models[0] for partner in partners])
     if not in_model.any():
         return f"it shares views only with photos that are not registered either ({len(partners)} of them)"
-    if seen >= FEWEST_SEEN and agreeing >= FEWEST_SEEN:
+    if seen >= FEWEST_MATCHES and agreeing >= FEWEST_MATCHES:
         return f"its position is not sure: {agreeing} of its {seen} features that are points of the model agree on one"
-    if seen >= FEWEST_SEEN:
-        return (
-            f"its matches contradict each other: {agreeing} of {seen} agree on one position, {FEWEST_SEEN} are needed"
-        )
+    if seen >= FEWEST_MATCHES:
+        agree = f"{agreeing} of {seen} agree on one position, {FEWEST_MATCHES} are needed"
+        return f"its matches contradict each other: {agree}"
     if matches.flat[mine][in_model].all():
         turned = f"all {int(in_model.sum())} of its pairs with registered photos"
         return f"{turned} differ by a turn of the camera alone, or show one flat surface"
-    return f"too few of its features are points of the model: {seen}, {FEWEST_SEEN} are needed"
+    return f"too few of its features are points of the model: {seen}, {FEWEST_MATCHES} are needed"
 
 
 def why_no_model(photos: "Sequence[Photo]", matches: Matches, registered: int, points: int) -> StageError:

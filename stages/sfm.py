@@ -125,7 +125,7 @@ def _reconstruct(config: Config, photos: "list[Photo]", ingest: Path, folder: Pa
     names = [photo.file.removeprefix("images/") for photo in photos]
     database = _database(folder, names, progress)
     found = _run_child(config, photos, ingest / "images", folder, database, progress)
-    models, points = found["models"], found.get("points", 0)
+    models, points = found["models"], found["points"]
     if not models or len(models[0]) < FEWEST_REGISTERED or points < FEWEST_POINTS:
         shutil.rmtree(folder / "sparse", ignore_errors=True)
         # By the strict matches of the first attempt: later ones let in many that are false.

@@ -36,6 +36,7 @@ from stages.masks import write_feature_masks
 from stages.matching_plan import about, places_of
 from stages.pairing import Pairs, Similarity, pairs_of, second_look
 from stages.photos import Photo
+from stages.registration import FEWEST_POINTS, FEWEST_REGISTERED
 from stages.sfm import Matcher
 from stages.sfm_attempts import ATTEMPTS, Attempt, Journal, Situation, Tried, reason_against
 
@@ -117,7 +118,7 @@ class _Work:
 
 
 def reconstruct(job: Job, say: Say) -> dict[str, Any]:
-    """Run structure-from-motion and write the best sub-model to ``sparse/``; nothing if none came out.
+    """Run structure-from-motion and write the best sub-model to ``sparse/``; nothing if none came out that is usable.
 
     Returns the ``database`` that was used in the end, the files in each sub-model, best first (``models``), the
     ``attempts`` that were made, and of the best model: its ``points``, mean ``reprojection_px``, ``camera_model``, the
@@ -130,8 +131,9 @@ def reconstruct(job: Job, say: Say) -> dict[str, Any]:
             _make(attempt, missing, work)
     tried = [_entry(one) for one in work.journal.tried]
     best = work.journal.best()
-    if best is None:
-        return {"database": str(work.latest()), "models": [], "attempts": tried}
+    if best is None or len(best.groups[0]) < FEWEST_REGISTERED or best.points < FEWEST_POINTS:
+        models, points = (best.groups, best.points) if best else ([], 0)
+        return {"database": str(work.latest()), "models": models, "points": points, "attempts": tried}
     say(phase="refining")
     database = work.latest()
     mapped = load_native(work.journal.model(best.name))  # from disk also where it is at hand: then resuming is no other
@@ -194,7 +196,7 @@ def _matched(attempt: Attempt, missing: list[int], work: _Work) -> Path:
         _match(database, work.pairs, STRICT_RATIO, work)
     elif attempt.matches == "loose":
         database = work.beside("loose")
-        copy_without_matches_of({work.files[number] for number in missing}, work.database, database)
+        copy_without_matches_of({work.files[number] for number in missing}, work.latest(), database)
         _match(database, second_look(work.pairs, missing, job.neighbours, lambda: work.similarity), LOOSE_RATIO, work)
     elif attempt.matches == "fisheye":
         latest, database = work.latest(), work.beside("fisheye")

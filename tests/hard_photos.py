@@ -111,6 +111,13 @@ def walk(count: int, of: int = 36, start: int = 0) -> Poses:
     return ring_of_cameras(of)[start : start + count]
 
 
+def closer(poses: Poses, share: float) -> Poses:
+    """The same views from so much of the distance to the middle of the table."""
+    poses = poses.copy()
+    poses[:, :, 3] *= share
+    return poses
+
+
 def along(poses: Poses, camera: Camera = LENS, scene: int = 0, prefix: str = "photo") -> list[Shot]:
     """One shot per pose."""
     return [Shot(f"{prefix}_{index:03d}.png", camera, pose, scene) for index, pose in enumerate(poses)]

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from stages.sfm_attempts import Effort
+from stages.sfm_attempts import FEWEST_MATCHES, Effort
 
 if TYPE_CHECKING:
     import pycolmap
@@ -21,11 +21,11 @@ def map_incrementally(
 
     models.mkdir(parents=True, exist_ok=True)
     options = pipeline_options(seed + effort.seed)
-    options.mapper.init_min_num_inliers = effort.first_pair_matches
-    options.mapper.init_min_tri_angle = effort.first_pair_angle_deg
+    options.mapper.init_min_num_inliers = effort.matches
+    options.mapper.init_min_tri_angle = effort.angle_deg
     options.mapper.init_max_forward_motion = effort.forward_motion
-    options.mapper.abs_pose_min_num_inliers = effort.photo_matches
-    options.mapper.abs_pose_min_inlier_ratio = effort.photo_inlier_share
+    options.structure_less_registration_fallback = effort.without_structure
+    options.mapper.abs_pose_min_num_inliers = FEWEST_MATCHES
     found = pycolmap.incremental_mapping(
         database, images, models, options, initial_image_pair_callback=on_image, next_image_callback=on_image
     )
@@ -33,7 +33,10 @@ def map_incrementally(
 
 
 def map_globally(database: Path, images: Path, models: Path, seed: int) -> "list[pycolmap.Reconstruction]":
-    """All sub-models, best first, of placing all photos at once (GLOMAP, Pan et al. 2024). It cannot be interrupted."""
+    """All sub-models, best first, of placing all photos at once (GLOMAP, Pan et al. 2024). It cannot be interrupted.
+
+    Photos that share no points with the others may be among them, placed at will: only the largest group stays.
+    """
     import pycolmap
 
     models.mkdir(parents=True, exist_ok=True)
@@ -46,7 +49,26 @@ def map_globally(database: Path, images: Path, models: Path, seed: int) -> "list
     mapper.retriangulation.random_seed = seed
     pycolmap.set_random_seed(seed)
     found = pycolmap.global_mapping(database, images, models, options)
+    for model in found.values():
+        _keep_largest_group(model)
     return sorted(found.values(), key=_rank, reverse=True)
+
+
+def _keep_largest_group(model: "pycolmap.Reconstruction") -> None:
+    import numpy as np
+    from scipy.sparse import csr_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    images = [model.image(image_id) for image_id in sorted(model.reg_image_ids())]
+    points = [[place.point3D_id for place in image.get_observation_points2D()] for image in images]
+    owner = np.repeat(np.arange(len(images)), [len(seen) for seen in points])
+    point = np.unique(np.array([one for seen in points for one in seen], np.int64), return_inverse=True)[1]
+    sees = csr_matrix((np.ones(len(owner)), (owner, point)))
+    _, group = connected_components((sees @ sees.T) >= FEWEST_MATCHES, directed=False)
+    largest = np.bincount(group).argmax()
+    for image, of in zip(images, group, strict=True):
+        if of != largest:
+            model.deregister_frame(image.frame_id)
 
 
 def _rank(model: "pycolmap.Reconstruction") -> tuple[int, int]:

@@ -4,6 +4,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from stages.colmap.held_out import Choice, adjustment_options, choose
 from stages.colmap.lenses import MODELS, equip
 from stages.colmap.mapping import pipeline_options
@@ -39,8 +41,12 @@ def finish(mapped: "pycolmap.Reconstruction", database: Path, seed: int, camera_
     if model.compute_num_observations() > MANY_MORE * mapped.compute_num_observations():
         choice = choose(model, seed, models)
         model = _adjusted(model, database, seed, choice)
-    uncertainty = pose_uncertainty_px(model, choice.noise_px)
-    return Finished(model, choice.table, choice.notes, {model.image(i).name: px for i, px in uncertainty.items()})
+    notes, uncertainty = choice.notes, {}
+    try:
+        uncertainty = pose_uncertainty_px(model, choice.noise_px)
+    except np.linalg.LinAlgError:
+        notes = [*notes, "how well the poses are known cannot be told: the points leave some of them free to move"]
+    return Finished(model, choice.table, notes, {model.image(i).name: px for i, px in uncertainty.items()})
 
 
 def _adjusted(

@@ -62,9 +62,9 @@ def test_the_account_tells_who_is_registered() -> None:
 @pytest.mark.parametrize(
     ("support", "why"),
     [
-        ((7, 6), "too few of its features are points of the model: 7, 15 are needed"),
-        ((40, 9), "its matches contradict each other: 9 of 40 agree on one position, 15 are needed"),
-        ((40, 20), "its position is not sure: 20 of its 40 features that are points of the model agree on one"),
+        ((7, 6), "too few of its features are points of the model: 7, 30 are needed"),
+        ((40, 9), "its matches contradict each other: 9 of 40 agree on one position, 30 are needed"),
+        ((40, 35), "its position is not sure: 35 of its 40 features that are points of the model agree on one"),
     ],
 )
 def test_a_photo_that_shares_views_with_the_model_has_too_little_to_stand_on(
