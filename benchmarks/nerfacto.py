@@ -100,7 +100,7 @@ def export(workspace: Path, downscale: float, target: Path) -> tuple[int, int]:
     if scene.has_alpha or others:
         raise SystemExit("this comparison takes opaque photos of one size")
     for view in scene.views:
-        file = target / renamed(view.name)
+        file = target / renamed(view.file)
         file.parent.mkdir(parents=True, exist_ok=True)
         pixels = view_pixels(ingest, scene, view, downscale).numpy()
         Image.fromarray(np.rint(255 * pixels).astype(np.uint8)).save(file)
@@ -108,9 +108,9 @@ def export(workspace: Path, downscale: float, target: Path) -> tuple[int, int]:
     return width, height
 
 
-def renamed(photo: str) -> str:
+def renamed(file: str) -> str:
     """The lossless file of a photo, in nerfstudio's folder."""
-    return Path("images", photo).with_suffix(".png").as_posix()
+    return Path(file).with_suffix(".png").as_posix()
 
 
 def shrunk(cameras: dict[str, Any], width: int, height: int) -> dict[str, Any]:

@@ -38,6 +38,16 @@ class Trial(NamedTuple):
     flaw: str | None  # of one of its cameras
 
 
+class Verdict(NamedTuple):
+    """What came of the comparison for some cameras: the trial whose lens they take, None if there is none."""
+
+    cameras: list[int]
+    photos: int
+    chosen: Trial | None
+    rows: list[dict[str, Any]]
+    why: str
+
+
 @dataclass
 class Choice:
     """The lens of every camera that has photos, by its id, and why: a table's rows and sentences."""
@@ -52,31 +62,44 @@ def choose(mapped: "pycolmap.Reconstruction", seed: int, models: Sequence[str] =
     """The lens of every camera, of these models.
 
     A camera is judged by its own photos alone where they share enough points, and the others all together, each
-    candidate being tried by all of them. Where even that is too little, cameras stay as mapping had them.
+    candidate being tried by all of them. Cameras that come out alike so are judged once more, together, since more
+    observations tell finer differences. Where evidence is too little, cameras stay as mapping had them.
     """
     cameras = sorted({mapped.image(i).camera_id for i in mapped.reg_image_ids()})
-    groups = _groups(mapped, cameras)
-    choice, most_photos = Choice(noise_px(mapped, observations(mapped))), 0
-    for index, group in enumerate(groups):
-        sample = _part(mapped, group)
-        photos = sample.num_reg_images()
-        most = max(MOST_OBSERVATIONS * photos // mapped.num_reg_images(), MOST_PER_PHOTO * photos)
-        held_out = hold_out(sample, seed, most)
-        chosen, why = None, f"only {len(held_out.xy)} points are seen in three photos, too few to compare camera models"
-        if len(held_out.xy) >= FEWEST_HELD_OUT:
-            trials = list(_trials(sample, held_out, models, choice.noise_px))
-            cells = _cells(held_out, mapped)
-            chosen, rows = _judge(trials, cells)
-            why = _reason(chosen, trials, cells)
-            choice.table += [row | {"group": index, "photos": photos} for row in rows]
+    noise = noise_px(mapped, observations(mapped))
+    verdicts = [_verdict(mapped, group, seed, models, noise) for group in _groups(mapped, cameras)]
+    judged = [verdict for verdict in verdicts if verdict.chosen]
+    if len(judged) > 1 and len({verdict.chosen.lens for verdict in judged if verdict.chosen}) == 1:
+        alike = sorted(camera for verdict in judged for camera in verdict.cameras)
+        rest = [verdict for verdict in verdicts if not verdict.chosen]
+        verdicts = [_verdict(mapped, alike, seed, models, noise), *rest]
+    largest = max((v for v in verdicts if v.chosen), key=lambda v: v.photos, default=None)
+    choice = Choice(largest.chosen.noise_px if largest and largest.chosen else noise)
+    for index, (group, photos, chosen, rows, why) in enumerate(verdicts):
         lens = chosen.lens if chosen else Lens(mapped.camera(group[0]).model_name, False)
         choice.lenses |= dict.fromkeys(group, lens)
-        whose = f"{photos} photos: " if len(groups) > 1 else ""
+        choice.table += [row | {"group": index, "photos": photos} for row in rows]
+        whose = f"{photos} photos: " if len(verdicts) > 1 else ""
         given = " as given" if len(models) == 1 else ""
         choice.notes.append(f"{whose}camera model {lens.model}{given}, principal point {lens.place}: {why}")
-        if chosen and photos > most_photos:
-            choice.noise_px, most_photos = chosen.noise_px, photos
     return choice
+
+
+def _verdict(
+    mapped: "pycolmap.Reconstruction", cameras: list[int], seed: int, models: Sequence[str], noise: float
+) -> Verdict:
+    """Let every candidate foretell what these cameras saw."""
+    sample = _part(mapped, cameras)
+    photos = sample.num_reg_images()
+    most = max(MOST_OBSERVATIONS * photos // mapped.num_reg_images(), MOST_PER_PHOTO * photos)
+    held_out = hold_out(sample, seed, most)
+    if len(held_out.xy) < FEWEST_HELD_OUT:
+        why = f"only {len(held_out.xy)} points are seen in three photos, too few to compare camera models"
+        return Verdict(cameras, photos, None, [], why)
+    trials = list(_trials(sample, held_out, models, noise))
+    cells = _cells(held_out, mapped)
+    chosen, rows = _judge(trials, cells)
+    return Verdict(cameras, photos, chosen, rows, _reason(chosen, trials, cells))
 
 
 def _groups(mapped: "pycolmap.Reconstruction", cameras: list[int]) -> list[list[int]]:

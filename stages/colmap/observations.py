@@ -62,9 +62,12 @@ def noise_px(model: "pycolmap.Reconstruction", seen: Observations) -> float:
     """Standard deviation of a coordinate of an observation, robust to mismatches.
 
     It is the residuals' own, from their median length, times √(2n / (2n − unknowns)): points and poses follow the
-    noise, which makes residuals smaller than it.
+    noise, which makes residuals smaller than it. Of a model without observations it is the least there is.
     """
     count, unknowns = 2 * len(seen.xy), 3 * len(np.unique(seen.point)) + 6 * len(np.unique(seen.image))
     length = np.linalg.norm(residuals(model, seen), axis=1)
-    sigma = float(np.median(length[np.isfinite(length)])) / MEDIAN_PER_SIGMA
+    in_front = length[np.isfinite(length)]
+    if not len(in_front):
+        return LEAST_NOISE_PX
+    sigma = float(np.median(in_front)) / MEDIAN_PER_SIGMA
     return max(sigma * (count / max(count - unknowns, 1)) ** 0.5, LEAST_NOISE_PX)

@@ -87,6 +87,13 @@ def test_every_camera_is_judged_by_its_own_photos() -> None:
     assert choice.notes[1].startswith("5 photos: camera model SIMPLE_RADIAL, ")
 
 
+def test_cameras_that_come_out_alike_are_judged_once_more_together() -> None:
+    choice = choose(mapped(photographed(BARREL, BARREL, points=150)), 0)
+    assert choice.lenses == dict.fromkeys((1, 2), Lens("SIMPLE_RADIAL", False))
+    assert {(row["group"], row["photos"]) for row in choice.table} == {(0, 10)}
+    assert len(choice.notes) == 1
+
+
 def test_cameras_with_few_photos_are_judged_together() -> None:
     choice = choose(mapped(photographed(*5 * [BARREL], points=100)), 0)  # two photos each
     assert choice.lenses == dict.fromkeys(range(1, 6), Lens("SIMPLE_RADIAL", False))

@@ -3,7 +3,7 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from stages.colmap.observations import observations
+from stages.colmap.observations import LEAST_NOISE_PX, noise_px, observations
 from stages.colmap.uncertainty import _error_px, pose_uncertainty_px
 from tests.stages.lens_scene import adjust, lens, photographed
 
@@ -86,3 +86,11 @@ def test_mismatches_count_by_their_pull() -> None:
     assert gaussian == pytest.approx(0.5 / 0.929**0.5, rel=0.01)  # soft-L1 at one sigma is 93 % efficient
     residual[::20] *= 100
     assert gaussian < _error_px(residual, 0.5, 0, 0) < 1.2 * gaussian
+
+
+def test_where_nothing_was_seen_nothing_is_known() -> None:
+    model = photographed(CAMERA, photos=PHOTOS, points=POINTS)
+    for point_id in list(model.point3D_ids()):
+        model.delete_point3D(point_id)
+    assert pose_uncertainty_px(model, 0.5) == {}
+    assert noise_px(model, observations(model)) == LEAST_NOISE_PX
