@@ -27,8 +27,9 @@ MOST_CORNERS, FEWEST_CORNERS = 150, 10
 STEP = 0.05
 # Less than this is not added up: the tremble of a hand, or noise, would become a way.
 LEAST_MOTION = 0.01
-# Where nothing of a frame is found again in the next one, a cut or a jerk: nothing is known to be shared.
-LOST = 1.0
+# Where less than a third of the corners are found again, a cut or a jerk, they are those that happened to move least:
+# nothing is known to be shared.
+FOLLOWED_SHARE, LOST = 1 / 3, 1.0
 FEWEST_FRAMES = 3  # as sfm needs
 JPEG_QUALITY = 95  # without chroma subsampling: far closer to the frame than the video is to what the camera saw
 
@@ -146,7 +147,7 @@ class _Motion:
         if self.start is None or self.corners is None or len(self.corners) < FEWEST_CORNERS:
             return 0.0
         there, followed = follow_both_ways(self.start, grey, self.corners)
-        if followed.sum() < FEWEST_CORNERS:
+        if followed.sum() < max(FEWEST_CORNERS, FOLLOWED_SHARE * len(followed)):
             return LOST
         ways = np.linalg.norm((there - self.corners)[followed, 0], axis=1)
         return float(np.median(ways)) / grey.shape[1]

@@ -126,15 +126,6 @@ def test_a_plan_stands_until_the_options_change_or_replan(bring: Bring, tmp_path
     assert calls == ["plan sfm"]  # the same answer: the same key, nothing runs
 
 
-def test_a_new_or_changed_mask_is_a_change_of_the_photos(bring: Bring, photos: Path):
-    bring()
-    (photos / "masks").mkdir()
-    for level in (0, 255):
-        Image.new("L", (4, 4), level).save(photos / "masks/0.png")
-        assert bring() and calls[0] == "ingest"
-        assert not bring()
-
-
 def test_going_back_to_old_options_finds_the_old_plan(bring: Bring):
     bring(sfm={"fail": False})
     bring(sfm={"offset": 9})
