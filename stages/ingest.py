@@ -103,6 +103,8 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
         say([f"{shown(t.name)}: {note}" for t in taken for note in t.notes], progress)
         if len(taken) < 2:
             raise too_few(source, [photo.name for photo in taken], refused)
+        if source.kind == "photos":
+            progress.update("looking for photos that are nearly the same")
         photos = _store(taken, _same_pictures(taken) if source.kind == "photos" else {}, folder)
         shutil.rmtree(waiting)
         write_photos(folder, photos, refused, source.frames)

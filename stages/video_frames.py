@@ -25,10 +25,13 @@ MOST_CORNERS, FEWEST_CORNERS = 150, 10
 # All in widths of the picture. Frames a STEP apart share 95 % of it, so that a point that crosses the picture is in
 # about twenty of them and frames four to eight apart have the 60-80 % overlap that photos should have.
 STEP = 0.05
+# Of the ways of the corners: walking around a thing, and towards it, hardly moves what is in the middle of the picture.
+MOVED_QUANTILE = 0.75
 # Less than this is not added up: the tremble of a hand, or noise, would become a way.
 LEAST_MOTION = 0.01
-# Where nothing of a frame is found again in the next one, a cut or a jerk: nothing is known to be shared.
-LOST = 1.0
+# Where less than a third of the corners are found again, a cut or a jerk, they are those that happened to move least:
+# nothing is known to be shared.
+FOLLOWED_SHARE, LOST = 1 / 3, 1.0
 FEWEST_FRAMES = 3  # as sfm needs
 JPEG_QUALITY = 95  # without chroma subsampling: far closer to the frame than the video is to what the camera saw
 
@@ -115,8 +118,8 @@ def _measure(video: Path, progress: Progress) -> list[Frame]:
 
 
 class _Motion:
-    """How far the picture has moved: the median way of its corners, which are followed from one frame to the next ones
-    until it is LEAST_MOTION, and from there on anew."""
+    """How far the picture has moved: the upper quartile of the ways of its corners, which are followed from one frame
+    to the next ones until it is LEAST_MOTION, and from there on anew."""
 
     def __init__(self) -> None:
         self.path = 0.0
@@ -146,10 +149,10 @@ class _Motion:
         if self.start is None or self.corners is None or len(self.corners) < FEWEST_CORNERS:
             return 0.0
         there, followed = follow_both_ways(self.start, grey, self.corners)
-        if followed.sum() < FEWEST_CORNERS:
+        if followed.sum() < max(FEWEST_CORNERS, FOLLOWED_SHARE * len(followed)):
             return LOST
         ways = np.linalg.norm((there - self.corners)[followed, 0], axis=1)
-        return float(np.median(ways)) / grey.shape[1]
+        return float(np.quantile(ways, MOVED_QUANTILE)) / grey.shape[1]
 
 
 def _write(

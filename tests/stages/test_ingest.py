@@ -51,7 +51,10 @@ def test_plain_photos_are_copied_byte_for_byte(tmp_path: Path, progress: Any) ->
     assert result.line == "3 photos 32×24, 2 cameras, no EXIF focal"
     assert result.outputs == ("images", "photos.json")
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["images", "photos.json"]
-    assert progress.updates[-1] == ("decoded 3 of 3 photos", 1.0)
+    assert progress.updates[-2:] == [
+        ("decoded 3 of 3 photos", 1.0),
+        ("looking for photos that are nearly the same", None),
+    ]
 
 
 def test_everything_else_is_written_upright_as_png(tmp_path: Path, progress: Any) -> None:
