@@ -1,0 +1,133 @@
+"""What structure-from-motion makes of photo sets that it finds hard: the right cameras, or the right words."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.truth import align
+from stages import ingest, sfm
+from stages.colmap.models import read_model
+from stages.contract import StageError
+from stages.files import read_json
+from tests.hard_photos import (
+    BARREL,
+    FISHEYE,
+    LENS,
+    OFF_CENTRE,
+    PLANE,
+    TELE,
+    WIDE,
+    Shot,
+    along,
+    as_taken,
+    closer,
+    every_fifth_blurred,
+    exposed,
+    on_the_spot,
+    shoot,
+    two_lenses,
+    walk,
+)
+
+SCENE_SIZE = 2.0  # the diameter of the table
+OUTLIER = [*along(walk(11)), Shot("stranger.png", LENS, walk(1, start=20)[0], scene=7)]
+TWO_GROUPS = [*along(walk(9)), *along(walk(7), scene=PLANE, prefix="other")]
+
+
+def found(folder: Path, shots: Sequence[Shot], develop: Callable = as_taken) -> tuple[Path, list[str]]:
+    """The finished stage sfm of these photos, and what was said."""
+    notes: list[str] = []
+
+    class Listening:
+        def update(self, message: str, done: float | None = None) -> None:
+            pass
+
+        def note(self, message: str) -> None:
+            notes.append(message)
+
+    shoot(folder / "photos", shots, develop)
+    inputs = {"ingest": folder / "ingest"}
+    inputs["ingest"].mkdir()
+    ingest.run(ingest.Config(photos=folder / "photos"), {}, inputs["ingest"], Listening())
+    sfm.run(sfm.Config(), inputs, folder / "sfm", Listening())
+    return folder / "sfm", notes
+
+
+def errors(folder: Path, shots: Sequence[Shot]) -> dict[str, tuple[float, float]]:
+    """Of every registered photo: how far off it is, in percent of the scene's size, and how far turned, in degrees."""
+    images = read_model(folder / "sparse").images
+    by_name = {shot.name: shot.pose for shot in shots}
+    true = np.stack([by_name[image.file] for image in images])
+    poses = np.stack([image.sfm_from_camera for image in images])
+    true_from_sfm = align(poses[:, :, 3], true[:, :, 3])
+    poses = np.stack([true_from_sfm.pose(pose) for pose in poses])
+    percent = 100 / SCENE_SIZE * np.linalg.norm(poses[:, :, 3] - true[:, :, 3], axis=1)
+    cosines = (np.einsum("nij,nij->n", poses[:, :, :3], true[:, :, :3]) - 1) / 2
+    degrees = np.degrees(np.arccos(np.clip(cosines, -1, 1)))
+    return {image.file: pair for image, *pair in zip(images, percent, degrees, strict=True)}  # type: ignore[misc]
+
+
+def missing(folder: Path) -> dict[str, str]:
+    """The reason why, by photo without a place."""
+    images = read_json(folder / "registration.json")["images"]
+    return {image["file"]: image["reason"] for image in images if not image["registered"]}
+
+
+@pytest.mark.parametrize(
+    ("shots", "develop", "focal_px"),
+    [
+        pytest.param(along(walk(12), BARREL), as_taken, (250,), id="barrel distortion"),
+        pytest.param(along(closer(walk(14, of=28), 0.5), FISHEYE), as_taken, (152.8,), id="fisheye of 150 degrees"),
+        pytest.param(along(walk(12), OFF_CENTRE), as_taken, (330,), id="principal point off centre"),
+        pytest.param(two_lenses(), as_taken, (TELE.params[0], WIDE.params[0]), id="two lenses"),
+        pytest.param(along(walk(12), scene=PLANE), as_taken, (334,), id="one flat surface"),
+        pytest.param(along(walk(3)), as_taken, (334,), id="three photos"),
+        pytest.param(along(walk(12)), exposed, (334,), id="exposure from -2 to +2 EV"),
+    ],
+)
+def test_every_camera_is_found(
+    shots: list[Shot], develop: Callable, focal_px: tuple[float, ...], tmp_path: Path
+) -> None:
+    folder, _ = found(tmp_path, shots, develop)
+    assert missing(folder) == {}
+    off = np.array(list(errors(folder, shots).values()))
+    assert off.shape == (len(shots), 2) and (off > 0).any() and (off < 1).all()
+    cameras = sorted(read_model(folder / "sparse").cameras, key=lambda camera: -camera.params[0])
+    assert [camera.params[0] for camera in cameras] == pytest.approx(focal_px, rel=0.03)
+
+
+def test_a_photo_of_another_scene_is_left_out(tmp_path: Path) -> None:
+    folder, notes = found(tmp_path, OUTLIER)
+    assert missing(folder) == {"stranger.png": "it shares no view with any other photo"}
+    assert "1 of 12 photos found no place and are left out:" in notes
+    assert 0 < max(max(pair) for pair in errors(folder, OUTLIER).values()) < 1
+
+
+def test_of_two_groups_the_larger_is_taken_and_the_other_named(tmp_path: Path) -> None:
+    folder, notes = found(tmp_path, TWO_GROUPS)
+    why = "it belongs to another group of 7 photos that does not connect to this one"
+    assert missing(folder) == {shot.name: why for shot in TWO_GROUPS if shot.scene == PLANE}
+    assert 0 < max(max(pair) for pair in errors(folder, TWO_GROUPS).values()) < 1
+    attempts = read_json(folder / "registration.json")["attempts"]
+    assert attempts[0]["registered"] == 9
+    assert any(note.startswith("7 of 16 photos have no place yet: ") for note in notes)
+
+
+def test_blurred_photos_are_named_and_do_no_harm(tmp_path: Path) -> None:
+    shots = along(walk(15))
+    folder, notes = found(tmp_path, shots, every_fifth_blurred)
+    blurred = {shot.name for index, shot in enumerate(shots) if index % 5 == 2}
+    assert missing(folder).keys() <= blurred
+    assert all(any(name in note for note in notes) for name in blurred)
+    off = errors(folder, shots)
+    assert 0 < max(max(pair) for name, pair in off.items() if name not in blurred) < 1
+    assert all(max(pair) < 5 for pair in off.values())  # 15 px of blur are 5 % of the width
+
+
+def test_turning_on_the_spot_is_named(tmp_path: Path) -> None:
+    with pytest.raises(StageError) as caught:
+        found(tmp_path, along(on_the_spot()))
+    assert caught.value.why == "the camera turned on the spot: 66 of 66 matching pairs differ by a rotation alone"
+    assert caught.value.hint.startswith("Move sideways between photos")
