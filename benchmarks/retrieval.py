@@ -7,6 +7,10 @@ Draws photos of 320 × 240 along both sides of a synthetic street: each shows ab
 share nothing, and their names are in random order. Then runs stage sfm with each way of choosing pairs, and prints
 pairs, seconds of matching, seconds of the whole stage, registered photos, and the largest distance of a camera centre
 from the truth, in share of the street's length.
+
+On two cores busy with other work, 400 photos of 1359 features (--max-features 1000): retrieval matched 7923 of 79 800
+pairs and registered 400. A sample of 640 pairs each took 15.8 ms of a processor per pair that retrieval chose (more of
+them overlap) and 11.0 ms per pair of all: 126 s of a processor together, 1.5 s of it to find the pairs, against 878 s.
 """
 
 import argparse
