@@ -27,12 +27,12 @@ from PIL import Image
 
 from benchmarks.sfm_speed import Timed
 from nerf import solid_texture
+from nerf.alignment import align
 from nerf.camera_paths import look_at
 from nerf.scene import Camera
 from nerf.shapes import Box
 from nerf.solid_texture import make_noise
 from nerf.synthetic import Solid, SyntheticScene, photograph
-from pipeline.truth import align
 from stages import ingest, sfm
 from stages.colmap.cameras import camera_rays
 from stages.colmap.models import read_model

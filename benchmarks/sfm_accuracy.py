@@ -27,7 +27,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.truth import align
+from nerf.alignment import align
 from stages import ingest, sfm
 from stages.colmap.models import read_model
 from stages.sparse_model import SparseModel

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from nerf.alignment import align
 from nerf.scene import Camera, Similarity
 from stages.files import read_json, write_json
 from stages.transforms_export import OPENGL_FROM_OPENCV
@@ -100,23 +101,6 @@ class Comparison:
                 f"truth {accuracy:.2f} %, what the photos show of the truth to mesh {completeness:.2f} %)"
             )
         return said
-
-
-def align(points: Float[np.ndarray, "n 3"], targets: Float[np.ndarray, "n 3"]) -> Similarity:
-    """The similarity that brings ``points`` closest to ``targets`` in the sense of least squares, never a reflection.
-
-    Umeyama 1991, equations 40 to 42. Raises ValueError for fewer than three points or points on one line, which
-    leave the rotation open.
-    """
-    middle, target_middle = points.mean(0), targets.mean(0)
-    offsets, target_offsets = points - middle, targets - target_middle
-    u, singular, vt = np.linalg.svd(target_offsets.T @ offsets / len(points))
-    if len(points) < 3 or not singular[1] > 1e-9 * singular[0]:
-        raise ValueError(f"{len(points)} cameras on one line fit the truth in more than one way")
-    proper = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    rotation = (u * proper) @ vt
-    scale = float((singular * proper).sum() / offsets.var(0).sum())
-    return Similarity(scale, rotation, target_middle - scale * rotation @ middle)
 
 
 def compare_with_truth(output: Path, truth: Truth) -> Comparison:

@@ -108,6 +108,7 @@ def _import(cameras: Path, photos: "list[Photo]", ingest: Path, folder: Path, pr
         points=len(known.model.xyz),
         camera_model="/".join(sorted({camera.model for camera in known.model.cameras})),
         camera_models=[],
+        georeference=None,
         test_files=known.test_files,
     )
 
@@ -144,8 +145,34 @@ def _reconstruct(config: Config, photos: "list[Photo]", ingest: Path, folder: Pa
         points=points,
         camera_model=found["camera_model"],
         camera_models=found["camera_models"],
+        georeference=_georeference(folder, photos, progress),
         test_files=None,
     )
+
+
+def _georeference(folder: Path, photos: "Sequence[Photo]", progress: Progress) -> dict[str, Any] | None:
+    """Metres and compass directions by the registered photos' GPS, said; None where no photo has any, or too little."""
+    import numpy as np
+
+    from stages.colmap.models import read_model
+    from stages.georeference import georeference
+
+    by_file = {photo.file.removeprefix("images/"): photo for photo in photos}
+    centres, places = [], []
+    for image in read_model(folder / "sparse").images:
+        photo = by_file[image.file]
+        if photo.latitude is not None and photo.longitude is not None:
+            centres.append(image.sfm_from_camera[:, 3])
+            places.append((photo.latitude, photo.longitude, photo.altitude_m))
+    if not places:
+        return None
+    found = georeference(np.array(centres), places)
+    if isinstance(found, str):
+        progress.note(f"no metres from the photos' GPS: {found}")
+        return None
+    scale = f"one unit is {found.enu_from_sfm.scale:.3g} m"
+    progress.note(f"GPS of {found.used} photos: {scale}; places are off by {found.error_m:.1f} m (median)")
+    return found.to_json()
 
 
 def _check_count(photos: "Sequence[Photo]") -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.truth import align
+from nerf.alignment import align
 from stages import ingest, sfm
 from stages.colmap.models import read_model
 from stages.contract import StageError

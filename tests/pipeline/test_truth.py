@@ -5,15 +5,12 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from skimage.measure import marching_cubes
 
-from nerf.camera_paths import nearest_rotations
 from nerf.scene import Camera, Scene, Similarity, View
 from nerf.synthetic import ring_of_cameras, still_life
-from pipeline.truth import Truth, align, compare_with_truth, seen
+from pipeline.truth import Truth, compare_with_truth, seen
 from stages.contract import StageError
 from stages.transforms_export import transforms
 
@@ -34,46 +31,6 @@ def write_output(folder: Path, poses: dict[str, np.ndarray], camera: Camera = LE
     scene = Scene((camera,), tuple(views), own, bounded=True, has_alpha=False, layout="around", up_known=True)
     (folder / "transforms.json").write_text(json.dumps(transforms(scene)))
     return folder
-
-
-@given(seed=st.integers(0, 2**32 - 1), count=st.integers(3, 12), scale=st.floats(1e-3, 1e3), far=st.floats(0, 100))
-def test_align_recovers_a_similarity(seed: int, count: int, scale: float, far: float):
-    random = np.random.default_rng(seed)
-    points = random.normal(size=(count, 3))
-    true = Similarity(scale, nearest_rotations(random.normal(size=(3, 3))), far * random.normal(size=3))
-    found = align(points, true.points(points))
-    np.testing.assert_allclose(found.points(points), true.points(points), atol=1e-6 * scale, rtol=1e-6)
-    assert found.scale == pytest.approx(scale, rel=1e-6)
-    np.testing.assert_allclose(found.rotation @ found.rotation.T, np.eye(3), atol=1e-9)
-
-
-@given(seed=st.integers(0, 2**32 - 1))
-def test_align_never_mirrors(seed: int):
-    points = np.random.default_rng(seed).normal(size=(8, 3))
-    found = align(points, points * [1, 1, -1])
-    assert np.linalg.det(found.rotation) == pytest.approx(1)
-    assert np.linalg.norm(found.points(points) - points * [1, 1, -1]) > 1e-3
-
-
-@given(seed=st.integers(0, 2**32 - 1))
-def test_no_other_similarity_fits_better_than_align(seed: int):
-    random = np.random.default_rng(seed)
-    points, targets = random.normal(size=(2, 6, 3))
-    best = align(points, targets)
-
-    def cost(similarity: Similarity) -> float:
-        return float(np.square(similarity.points(points) - targets).sum())
-
-    for _ in range(5):
-        turned = nearest_rotations(best.rotation + 0.01 * random.normal(size=(3, 3)))
-        nearby = Similarity(best.scale * (1 + 0.01 * random.normal()), turned, best.translation)
-        assert cost(nearby) >= cost(best)
-
-
-@pytest.mark.parametrize("points", [np.eye(3)[:2], np.arange(12).reshape(4, 3) * 1.0, np.zeros((5, 3))])
-def test_align_refuses_what_leaves_the_rotation_open(points: np.ndarray):
-    with pytest.raises(ValueError, match=f"{len(points)} cameras on one line fit the truth in more than one way"):
-        align(points, points)
 
 
 def test_the_truth_has_no_error(tmp_path: Path):

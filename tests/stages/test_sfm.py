@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipeline.truth import align
+from nerf.alignment import align
 from stages import ingest, sfm
 from stages.colmap.models import read_model
 from stages.contract import StageError

@@ -1,0 +1,77 @@
+import numpy as np
+import pytest
+
+from nerf.camera_paths import nearest_rotations
+from nerf.scene import Similarity
+from stages.georeference import Georeference, east_north_up, georeference
+
+HERE = (47.3769, 8.5417, 408.0)
+METRES_PER_DEGREE = 111_178.0  # northwards at 47 degrees
+
+
+def walked(count: int = 12, radius_m: float = 60.0) -> np.ndarray:
+    """East, north and up of photos around a house, in metres."""
+    angle = np.linspace(0, 2 * np.pi, count, endpoint=False)
+    return np.stack([radius_m * np.cos(angle), radius_m * np.sin(angle), 5 * np.sin(3 * angle)], axis=1)
+
+
+def places(enu: np.ndarray) -> list[tuple[float, float, float | None]]:
+    north, east, height = HERE
+    per_degree_east = 75_460.0  # at 47.3769 degrees on WGS 84
+    return [(north + y / METRES_PER_DEGREE, east + x / per_degree_east, height + z) for x, y, z in enu]
+
+
+SFM_FROM_ENU = Similarity(0.13, nearest_rotations(np.random.default_rng(3).normal(size=(3, 3))), np.array([4.0, -2, 9]))
+
+
+def test_east_north_and_up_are_what_they_say() -> None:
+    np.testing.assert_allclose(east_north_up(0, 0), [[0, 1, 0], [0, 0, 1], [1, 0, 0]], atol=1e-15)
+    np.testing.assert_allclose(east_north_up(90, 0)[2], [0, 0, 1], atol=1e-15)
+    turned = east_north_up(*HERE[:2])
+    np.testing.assert_allclose(turned @ turned.T, np.eye(3), atol=1e-15)
+
+
+def test_the_scale_and_the_directions_are_found() -> None:
+    enu = walked()
+    found = georeference(SFM_FROM_ENU.points(enu), places(enu))
+    assert isinstance(found, Georeference)
+    assert found.used == 12 and 0 < found.error_m < 0.05
+    assert found.enu_from_sfm.scale == pytest.approx(1 / 0.13, rel=1e-3)
+    back = found.enu_from_sfm.rotation @ SFM_FROM_ENU.rotation
+    np.testing.assert_allclose(back, np.eye(3), atol=2e-3)
+    told = found.to_json()
+    assert told["metres_per_unit"] == found.enu_from_sfm.scale and told["photos"] == 12
+    assert told["origin"]["latitude"] == pytest.approx(HERE[0], abs=1e-3)
+
+
+def test_a_few_wrong_places_do_no_harm() -> None:
+    enu = walked(20)
+    told = enu + np.random.default_rng(0).normal(0, 1, enu.shape)
+    told[[3, 11]] += [[400, 0, 0], [0, -900, 50]]
+    found = georeference(SFM_FROM_ENU.points(enu), places(told))
+    assert isinstance(found, Georeference)
+    assert 15 <= found.used <= 18 and 0.5 < found.error_m < 3
+    assert found.enu_from_sfm.scale == pytest.approx(1 / 0.13, rel=0.03)
+
+
+@pytest.mark.parametrize(
+    ("enu", "why"),
+    [
+        (walked()[:3], "3 registered photos tell where they were taken, 4 are needed"),
+        (walked(radius_m=3) * [1, 1, 0], "their places lie within 3 m, and GPS errs by up to 10 m"),
+        (
+            np.linspace(0, 90, 7)[:, None] * [1.0, 0, 0],
+            "they were taken along one line, which leaves open how the scene is turned about it",
+        ),
+    ],
+)
+def test_it_says_why_not(enu: np.ndarray, why: str) -> None:
+    assert georeference(SFM_FROM_ENU.points(enu), places(enu)) == why
+
+
+def test_without_all_heights_none_counts() -> None:
+    enu = walked() * [1, 1, 0]
+    known = places(enu)
+    known[4] = (*known[4][:2], None)
+    found = georeference(SFM_FROM_ENU.points(enu), known)
+    assert isinstance(found, Georeference) and found.origin[2] == 0 and found.used == 12
