@@ -33,7 +33,9 @@ Matcher = Literal["exhaustive", "sequential", "spatial", "retrieval"]
 # The share of the first attempt where a phase begins, and how long it is (measured on 11 to 50 photos, two cores).
 PHASES = {"features": (0.0, 0.35), "matching": (0.35, 0.5), "mapping": (0.85, 0.15)}
 FIRST_ATTEMPT, REFINING = 0.7, 0.95  # where they end and begin in the whole
-FOR_CHILD = ("seed", "max_image_size", "max_features", "camera_model", "matcher", "neighbours", "attempts")
+FOR_CHILD = (
+    "seed", "max_image_size", "max_features", "camera_model", "camera_params", "matcher", "neighbours", "attempts",
+)  # fmt: skip
 CHILD = ["-m", "stages.sfm_child"]
 MOST_NAMES = 5
 
@@ -52,6 +54,8 @@ class Config(StageConfig):
     camera_model: CameraModel | None = None
     """COLMAP's camera model; None: SIMPLE_RADIAL while mapping, and then the simplest one that held-out observations
     do not speak against."""
+    camera_params: tuple[float, ...] | None = None
+    """The numbers of --sfm.camera-model where they are known, in COLMAP's order, for photos of this size; kept."""
     matcher: Matcher | None = None
     """Which pairs of photos are matched: all, neighbours in time or place, or those that look alike; None: by cost."""
     neighbours: int = Field(default=30, ge=1)
@@ -122,6 +126,7 @@ def _reconstruct(config: Config, photos: "list[Photo]", ingest: Path, folder: Pa
 
     everything, photos = photos, [photo for photo in photos if not photo.near_duplicate_of]
     _check_count(photos)
+    _check_camera(config, photos)
     check_matcher(config.matcher, places_of(photos))
     names = [photo.file.removeprefix("images/") for photo in photos]
     database = _database(folder, names, progress)
@@ -184,6 +189,29 @@ def _check_count(photos: "Sequence[Photo]") -> None:
             f"it takes at least {FEWEST_REGISTERED} photos that overlap",
             OVERLAP_HINT,
         )
+
+
+def _check_camera(config: Config, photos: "Sequence[Photo]") -> None:
+    """Raises StageError where the given intrinsics cannot be those of the photos."""
+    from nerf.scene import Camera
+    from stages.colmap.cameras import is_valid
+
+    if config.camera_params is None:
+        return
+    what = "cannot use --sfm.camera-params"
+    hint = "Give COLMAP's numbers for these photos: --sfm.camera-model SIMPLE_RADIAL --sfm.camera-params F CX CY K."
+    if config.camera_model is None:
+        raise StageError(what, "the model that they are the parameters of is not given", hint)
+    sizes = sorted({(photo.width, photo.height) for photo in photos})
+    if len(sizes) > 1:
+        listed = ", ".join(f"{width}×{height}" for width, height in sizes[:3])
+        raise StageError(what, f"the photos have {len(sizes)} sizes ({listed}) and so several cameras", hint)
+    try:
+        valid = is_valid(Camera(config.camera_model, *sizes[0], config.camera_params))
+    except ValueError as error:
+        raise StageError(what, str(error), hint) from error
+    if not valid:
+        raise StageError(what, "a focal length is not positive", hint)
 
 
 def _database(folder: Path, names: Sequence[str], progress: Progress) -> Path:

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from stages.colmap.diagnosis import links, supports
-from stages.colmap.mapping import MAPPING_MODEL, map_globally, map_incrementally
+from stages.colmap.mapping import MAPPING_MODEL, incremental_options, map_globally, map_incrementally
 from stages.colmap.matching import (
     LOOSE_RATIO,
     STRICT_RATIO,
@@ -58,6 +58,7 @@ class Job:
     max_image_size: int
     max_features: int
     camera_model: str | None
+    camera_params: list[float] | None
     matcher: Matcher
     neighbours: int
     attempts: int
@@ -137,7 +138,7 @@ def reconstruct(job: Job, say: Say) -> dict[str, Any]:
     say(phase="refining")
     database = work.latest()
     mapped = load_native(work.journal.model(best.name))  # from disk also where it is at hand: then resuming is no other
-    finished = finish(mapped, database, job.seed, job.camera_model)
+    finished = finish(mapped, database, job.seed, job.camera_model, job.camera_params is not None)
     for note in finished.notes:
         say(note=note)
     model = finished.model
@@ -211,7 +212,7 @@ def _matched(attempt: Attempt, missing: list[int], work: _Work) -> Path:
 
 def _find_features(database: Path, search: Search, work: _Work) -> None:
     work.say(phase="features", database=str(database))
-    fill_database(database, work.photos, work.job.camera_model or MAPPING_MODEL)
+    fill_database(database, work.photos, work.job.camera_model or MAPPING_MODEL, work.job.camera_params)
     masks = Path(work.job.folder, "masks")
     if write_feature_masks(work.images.parent, work.photos, masks):
         search = search._replace(masks=masks)
@@ -233,12 +234,15 @@ def _mapped(attempt: Attempt, database: Path, work: _Work) -> list[Any]:
     """All sub-models that come of these matches, best first."""
     work.say(phase="mapping", done=0)
     models = Path(work.job.folder, "models")
+    seed, lens_is_known = work.job.seed, work.job.camera_params is not None
     if attempt.effort is None:
-        found = map_globally(database, work.images, models, work.job.seed)
+        found = map_globally(database, work.images, models, seed, lens_is_known)
     else:
         placed = count(1)
-        report = lambda: work.say(phase="mapping", done=next(placed))  # noqa: E731
-        found = map_incrementally(database, work.images, models, work.job.seed, attempt.effort, report)
+        options = incremental_options(seed, attempt.effort, lens_is_known)
+        found = map_incrementally(
+            database, work.images, models, options, lambda: work.say(phase="mapping", done=next(placed))
+        )
     shutil.rmtree(models)
     return found
 

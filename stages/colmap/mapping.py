@@ -14,25 +14,39 @@ SMALLEST_MODEL = 3
 
 
 def map_incrementally(
-    database: Path, images: Path, models: Path, seed: int, effort: Effort, on_image: Callable[[], None]
+    database: Path,
+    images: Path,
+    models: Path,
+    options: "pycolmap.IncrementalPipelineOptions",
+    on_image: Callable[[], None],
 ) -> "list[pycolmap.Reconstruction]":
     """All sub-models, best first: most registered photos, then most points. ``on_image`` is called per photo."""
     import pycolmap
 
     models.mkdir(parents=True, exist_ok=True)
-    options = pipeline_options(seed + effort.seed)
-    options.mapper.init_min_num_inliers = effort.matches
-    options.mapper.init_min_tri_angle = effort.angle_deg
-    options.mapper.init_max_forward_motion = effort.forward_motion
-    options.structure_less_registration_fallback = effort.without_structure
-    options.mapper.abs_pose_min_num_inliers = FEWEST_MATCHES
     found = pycolmap.incremental_mapping(
         database, images, models, options, initial_image_pair_callback=on_image, next_image_callback=on_image
     )
     return sorted(found.values(), key=_rank, reverse=True)
 
 
-def map_globally(database: Path, images: Path, models: Path, seed: int) -> "list[pycolmap.Reconstruction]":
+def incremental_options(seed: int, effort: Effort, lens_is_known: bool) -> "pycolmap.IncrementalPipelineOptions":
+    """What mapping asks of photos; a known lens is kept as it is."""
+    options = pipeline_options(seed + effort.seed)
+    options.mapper.init_min_num_inliers = effort.matches
+    options.mapper.init_min_tri_angle = effort.angle_deg
+    options.mapper.init_max_forward_motion = effort.forward_motion
+    options.structure_less_registration_fallback = effort.without_structure
+    options.mapper.abs_pose_min_num_inliers = FEWEST_MATCHES
+    if lens_is_known:
+        options.ba_refine_focal_length = options.ba_refine_extra_params = False
+        options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
+    return options
+
+
+def map_globally(
+    database: Path, images: Path, models: Path, seed: int, lens_is_known: bool
+) -> "list[pycolmap.Reconstruction]":
     """All sub-models, best first, of placing all photos at once (GLOMAP, Pan et al. 2024). It cannot be interrupted.
 
     Photos that share no points with the others may be among them, placed at will: only the largest group stays.
@@ -47,6 +61,8 @@ def map_globally(database: Path, images: Path, models: Path, seed: int) -> "list
     mapper.global_positioning.use_gpu = mapper.bundle_adjustment.ceres.use_gpu = False
     mapper.bundle_adjustment.ceres.solver_options.num_threads = 1
     mapper.retriangulation.random_seed = seed
+    mapper.bundle_adjustment.refine_focal_length = not lens_is_known
+    mapper.bundle_adjustment.refine_extra_params = not lens_is_known
     pycolmap.set_random_seed(seed)
     found = pycolmap.global_mapping(database, images, models, options)
     for model in found.values():

@@ -34,8 +34,13 @@ FISHEYE_ANGLE_DEG = 150.0
 CACHED_PHOTOS = 256  # whose features are held in memory, about half a megabyte each
 
 
-def fill_database(database: Path, photos: "Sequence[Photo]", camera_model: str) -> None:
-    """Enter photos (in order of ``file``) and one camera per camera group, all or nothing."""
+def fill_database(
+    database: Path, photos: "Sequence[Photo]", camera_model: str, camera_params: Sequence[float] | None = None
+) -> None:
+    """Enter photos (in order of ``file``) and one camera per camera group, all or nothing.
+
+    Known ``camera_params`` are those of one camera for all photos.
+    """
     import pycolmap
 
     with pycolmap.Database.open(database) as db, pycolmap.DatabaseTransaction(db):
@@ -43,9 +48,11 @@ def fill_database(database: Path, photos: "Sequence[Photo]", camera_model: str) 
             return
         camera_ids: dict[int, int] = {}
         for image_id, photo in enumerate(photos, start=1):
-            if photo.camera_group not in camera_ids:
-                camera_ids[photo.camera_group] = _enter_camera(db, photo, camera_model, len(camera_ids) + 1)
-            camera_id = camera_ids[photo.camera_group]
+            group = 0 if camera_params else photo.camera_group
+            if group not in camera_ids:
+                camera_ids[group] = len(camera_ids) + 1
+                _enter_camera(db, _first_guess(photo, camera_model, camera_params, camera_ids[group]))
+            camera_id = camera_ids[group]
             image = pycolmap.Image(name=_name(photo), camera_id=camera_id, image_id=image_id)
             db.write_image(image, use_image_id=True)
             frame = pycolmap.Frame(frame_id=image_id, rig_id=camera_id)
@@ -53,17 +60,35 @@ def fill_database(database: Path, photos: "Sequence[Photo]", camera_model: str) 
             db.write_frame(frame, use_frame_id=True)
 
 
-def _enter_camera(db: "pycolmap.Database", photo: "Photo", camera_model: str, camera_id: int) -> int:
+def _first_guess(photo: "Photo", model: str, params: Sequence[float] | None, camera_id: int) -> "pycolmap.Camera":
+    """The camera of a photo: as it is known, by EXIF's focal length, or by a guess."""
     import pycolmap
 
-    focal_px = photo.focal_px or FOCAL_GUESS * max(photo.width, photo.height)
-    camera = pycolmap.Camera.create_from_model_name(camera_id, camera_model, focal_px, photo.width, photo.height)
-    camera.has_prior_focal_length = photo.focal_px is not None
+    size = photo.width, photo.height
+    if params is not None:
+        camera = pycolmap.Camera(camera_id=camera_id, model=model, width=size[0], height=size[1], params=list(params))
+        camera.has_prior_focal_length = True
+        return camera
+    fisheye = model.endswith("FISHEYE")
+    guess = fisheye_focal_px(*size) if fisheye else FOCAL_GUESS * max(size)
+    camera = pycolmap.Camera.create_from_model_name(camera_id, model, photo.focal_px or guess, *size)
+    # Two views through a fisheye have no fundamental matrix to do without a focal length: the guess has to serve.
+    camera.has_prior_focal_length = fisheye or photo.focal_px is not None
+    return camera
+
+
+def fisheye_focal_px(width: int, height: int) -> float:
+    """Of an equidistant lens, r = f θ, with FISHEYE_ANGLE_DEG from corner to corner."""
+    return math.hypot(width, height) / math.radians(FISHEYE_ANGLE_DEG)
+
+
+def _enter_camera(db: "pycolmap.Database", camera: "pycolmap.Camera") -> None:
+    import pycolmap
+
     db.write_camera(camera, use_camera_id=True)
-    rig = pycolmap.Rig(rig_id=camera_id)
+    rig = pycolmap.Rig(rig_id=camera.camera_id)
     rig.add_ref_sensor(camera.sensor_id)
     db.write_rig(rig, use_rig_id=True)
-    return camera_id
 
 
 def _name(photo: "Photo") -> str:
@@ -205,8 +230,7 @@ def copy_without_matches_of(names: Container[str], database: Path, copy: Path) -
 def copy_as_fisheye(database: Path, copy: Path, seed: int) -> None:
     """Copy the database, its cameras become fisheye lenses and its matches verified anew; nothing where it is there.
 
-    Without EXIF the lens is equidistant (r = f θ) with FISHEYE_ANGLE_DEG from corner to corner. Its focal length counts
-    as known: two views through such a lens have no fundamental matrix to do without it.
+    Without EXIF the focal length is :func:`fisheye_focal_px`, and counts as known.
     """
     import pycolmap
 
@@ -217,10 +241,8 @@ def copy_as_fisheye(database: Path, copy: Path, seed: int) -> None:
     options.ransac.random_seed = seed
     with pycolmap.Database.open(unfinished) as db, pycolmap.DatabaseTransaction(db):
         for camera in db.read_all_cameras():
-            focal_px = math.hypot(camera.width, camera.height) / math.radians(FISHEYE_ANGLE_DEG)
-            if camera.has_prior_focal_length:
-                focal_px = camera.mean_focal_length()
             size = camera.width, camera.height
+            focal_px = camera.mean_focal_length() if camera.has_prior_focal_length else fisheye_focal_px(*size)
             lens = pycolmap.Camera.create_from_model_name(camera.camera_id, FISHEYE_MODEL, focal_px, *size)
             lens.has_prior_focal_length = True
             db.update_camera(lens)

@@ -9,6 +9,7 @@ import numpy as np
 from stages.colmap.held_out import Choice, adjustment_options, choose
 from stages.colmap.lenses import MODELS, equip
 from stages.colmap.mapping import pipeline_options
+from stages.colmap.observations import noise_px, observations
 from stages.colmap.uncertainty import pose_uncertainty_px
 
 if TYPE_CHECKING:
@@ -29,18 +30,31 @@ class Finished:
     uncertainty_px: dict[str, float]  # by the image's name
 
 
-def finish(mapped: "pycolmap.Reconstruction", database: Path, seed: int, camera_model: str | None) -> Finished:
+def finish(
+    mapped: "pycolmap.Reconstruction", database: Path, seed: int, camera_model: str | None, lens_is_known: bool
+) -> Finished:
     """Choose the camera model by held-out observations, unless it is given, and adjust everything with it.
 
-    Of a given model it is only chosen whether its principal point is refined. Where many more observations fit the
-    chosen lens than mapping's, the choice is made again with them.
+    Of a given model it is only chosen whether its principal point is refined; a known lens is kept as it is. Where
+    many more observations fit the chosen lens than mapping's, the choice is made again with them.
     """
+    import pycolmap
+
+    if lens_is_known:
+        choice = Choice(noise_px(mapped, observations(mapped)), notes=["the camera is kept as given"])
+        model = pycolmap.Reconstruction(mapped)
+        _adjust(model, database, seed, set(model.cameras), adjustment_options(False, choice.noise_px))
+        return _finished(model, choice)
     models = (camera_model,) if camera_model else MODELS
     choice = choose(mapped, seed, models)
     model = _adjusted(mapped, database, seed, choice)
     if model.compute_num_observations() > MANY_MORE * mapped.compute_num_observations():
         choice = choose(model, seed, models)
         model = _adjusted(model, database, seed, choice)
+    return _finished(model, choice)
+
+
+def _finished(model: "pycolmap.Reconstruction", choice: Choice) -> Finished:
     notes, uncertainty = choice.notes, {}
     try:
         uncertainty = pose_uncertainty_px(model, choice.noise_px)

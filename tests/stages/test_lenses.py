@@ -199,10 +199,10 @@ def test_where_the_chosen_lens_lets_many_more_observations_in_it_is_chosen_again
         return many
 
     monkeypatch.setattr(refinement, "_adjusted", adjusted)
-    finished = refinement.finish(few, Path("matches.db"), 0, None)
+    finished = refinement.finish(few, Path("matches.db"), 0, None, False)
     assert asked == [few, many]
     assert finished.model is many
     assert sorted(finished.uncertainty_px) == [f"{i:02d}.jpg" for i in range(1, 7)]
     asked.clear()
-    refinement.finish(many, Path("matches.db"), 0, None)
+    refinement.finish(many, Path("matches.db"), 0, None, False)
     assert asked == [many]

@@ -1,4 +1,5 @@
 import re
+import shutil
 import subprocess
 import sys
 import time
@@ -255,6 +256,99 @@ def test_nearly_the_same_pictures_are_not_matched_and_masks_keep_features_away(
     assert len(seen_at) > 20 and seen_at[:, 0].min() > 79
     assert (others[:, 0] < 79).sum() > 5
     assert sorted(path.name for path in (tmp_path / "sfm").iterdir()) == ["registration.json", "sfm.log", "sparse"]
+
+
+def test_a_known_camera_is_kept(
+    inputs: dict[str, Path], synthetic_photos: SyntheticPhotos, tmp_path: Path, progress
+) -> None:
+    lens = synthetic_photos.truth.camera
+    config = SMALL.model_copy(update={"camera_model": lens.model, "camera_params": lens.params})
+    result = sfm.run(config, inputs, tmp_path, progress)
+    assert result.line.startswith("12/12 registered, ") and " · OPENCV · " in result.line
+    assert read_model(tmp_path / "sparse").cameras == [lens]
+    assert "the camera is kept as given" in progress.notes
+    assert read_json(tmp_path / "registration.json")["camera_models"] == []
+
+
+@pytest.mark.parametrize(
+    ("given", "sizes", "why"),
+    [
+        (
+            {"camera_params": (250.0, 120.0, 90.0)},
+            [(240, 180)],
+            "the model that they are the parameters of is not given",
+        ),
+        (
+            {"camera_model": "RADIAL", "camera_params": (250.0, 120.0, 90.0)},
+            [(240, 180)],
+            "RADIAL takes f, cx, cy, k1, k2, got 3 numbers",
+        ),
+        (
+            {"camera_model": "SIMPLE_PINHOLE", "camera_params": (-250.0, 120.0, 90.0)},
+            [(240, 180)],
+            "a focal length is not positive",
+        ),
+        (
+            {"camera_model": "SIMPLE_PINHOLE", "camera_params": (250.0, 120.0, 90.0)},
+            [(240, 180), (180, 240)],
+            "the photos have 2 sizes (180×240, 240×180) and so several cameras",
+        ),
+    ],
+)
+def test_intrinsics_that_cannot_be_those_of_the_photos_are_refused(
+    given: dict[str, object], sizes: list[tuple[int, int]], why: str, tmp_path: Path, progress
+) -> None:
+    images = {f"{i}.png": blots(i, *sizes[i % len(sizes)]) for i in range(3)}
+    with pytest.raises(StageError) as caught:
+        sfm.run(SMALL.model_copy(update=given), ingested(tmp_path / "ingest", images), tmp_path / "sfm", progress)
+    assert (caught.value.what, caught.value.why) == ("cannot use --sfm.camera-params", why)
+
+
+def test_photos_with_gps_tell_metres_and_directions(
+    inputs: dict[str, Path], synthetic_photos: SyntheticPhotos, tmp_path: Path, progress
+) -> None:
+    """The walk around the table, as if a unit were 40 m, at the equator, where degrees east and north are metres."""
+    ingest_folder = tmp_path / "ingest"
+    shutil.copytree(inputs["ingest"], ingest_folder)
+    centres = {name: 40 * pose[:, 3] for name, pose in synthetic_photos.truth.poses.items()}
+    photos = [
+        replace(photo, longitude=x / 111_319.49, latitude=y / 110_574.28, altitude_m=float(z))
+        for photo in read_photos(ingest_folder)
+        for x, y, z in [centres[photo.name]]
+    ]
+    write_photos(ingest_folder, photos, [], {})
+    sfm.run(SMALL, {"ingest": ingest_folder}, tmp_path / "sfm", progress)
+    found = read_json(tmp_path / "sfm/registration.json")["georeference"]
+    assert found["photos"] == 12 and 0 < found["error_m"] < 0.5
+    images = read_model(tmp_path / "sfm/sparse").images
+    matrix = np.array(found["enu_from_sfm"])
+    enu = np.array([matrix[:3, :3] @ image.sfm_from_camera[:, 3] + matrix[:3, 3] for image in images])
+    true = np.array([centres[image.file] for image in images])
+    np.testing.assert_allclose(enu - enu[0], true - true[0], atol=1.5)  # of walks of 120 m
+    assert any(note.startswith("GPS of 12 photos: one unit is ") for note in progress.notes)
+
+
+def test_an_attempt_that_ended_the_program_is_left_out(
+    inputs: dict[str, Path], tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    images = {path.name: np.asarray(Image.open(path)) for path in sorted((inputs["ingest"] / "images").iterdir())[:6]}
+    folders = ingested(tmp_path / "ingest", images | {"stranger.png": blots(1, 300, 200)})
+    crash = (
+        "import sys, stages.sfm_child as c, os\n"
+        "first = c._matched\n"
+        "c._matched = lambda a, m, w: os.abort() if a.name == 'looser matching' else first(a, m, w)\n"
+        "c.main()"
+    )
+    with monkeypatch.context() as patched:
+        patched.setattr(sfm, "CHILD", ["-c", crash])
+        with pytest.raises(StageError, match="was ended by SIGABRT"):
+            sfm.run(SMALL, folders, tmp_path / "sfm", progress)
+    progress.notes.clear()
+    result = sfm.run(SMALL, folders, tmp_path / "sfm", progress)
+    assert result.line.startswith("6/7 registered, ")
+    assert progress.notes[0].startswith("going on with the features of 7 photos and 21 matched pairs")
+    assert "left out, for it ended the program last time: matching them again, less strictly" in progress.notes
+    assert not (tmp_path / "sfm/attempts").exists()
 
 
 def test_the_screen_never_stands_still(inputs: dict[str, Path], tmp_path: Path, progress) -> None:
