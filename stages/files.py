@@ -37,6 +37,14 @@ def write_durably(path: Path, content: bytes) -> None:
     sync_folder(path.parent)
 
 
+def make_durable(folder: Path) -> None:
+    """Have every file of a folder, and the folder, on the disk."""
+    for path in folder.iterdir():
+        with path.open("rb") as stream:
+            os.fsync(stream.fileno())
+    sync_folder(folder)
+
+
 def sync_folder(folder: Path) -> None:
     """Make renames in ``folder`` durable, where the system can (not on Windows)."""
     if os.name == "posix":

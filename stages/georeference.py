@@ -17,6 +17,7 @@ from stages.pairing import GPS_ERROR_M, cartesian
 FEWEST_PLACES = 4  # three fix a similarity, the fourth tells whether it is right
 FAR_OFF = 3.0  # times the median distance: a place so wrong is not averaged with the others
 ROUNDS = 10
+ONE_LINE = "they were taken along one line, which leaves open how the scene is turned about it"
 
 
 @dataclass(frozen=True)
@@ -71,10 +72,18 @@ def georeference(
         return f"their places lie within {spread:.0f} m, and GPS errs by up to {GPS_ERROR_M:.0f} m"
     across = np.linalg.svd(enu - enu.mean(axis=0), compute_uv=False)[1] / np.sqrt(len(enu))
     if across < GPS_ERROR_M / 2:
-        return "they were taken along one line, which leaves open how the scene is turned about it"
+        return ONE_LINE
+    if not np.linalg.svd(centres - centres.mean(axis=0), compute_uv=False)[1] > 1e-6 * np.abs(centres).max():
+        return ONE_LINE
     fitted, kept = _robust(centres, enu)
+    walked = fitted.scale * np.linalg.svd(centres - centres.mean(axis=0), compute_uv=False)[1] / np.sqrt(len(centres))
+    if walked < GPS_ERROR_M / 2:
+        return ONE_LINE
     off = np.linalg.norm(fitted.points(centres) - enu, axis=1)
-    return Georeference(fitted, origin, int(kept.sum()), float(np.median(off[kept])))
+    error = float(np.median(off[kept]))
+    if error > spread / FAR_OFF:
+        return f"their places, {spread:.0f} m apart, are {error:.0f} m off where the photos put them"
+    return Georeference(fitted, origin, int(kept.sum()), error)
 
 
 def _robust(

@@ -74,6 +74,7 @@ def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
     if config.cameras is not None or config.matcher is not None:
         return config
     photos = sorted(read_photos(inputs["ingest"]), key=lambda photo: photo.file)
+    photos = [photo for photo in photos if not photo.near_duplicate_of]
     features = config.model_dump(include={"max_image_size", "max_features"})
     matcher = chosen_matcher(photos, inputs["ingest"] / "images", config.neighbours, features, progress)
     return config.model_copy(update={"matcher": matcher})
@@ -125,7 +126,7 @@ def _reconstruct(config: Config, photos: "list[Photo]", ingest: Path, folder: Pa
     from stages.registration import FEWEST_POINTS, FEWEST_REGISTERED, account, read_matches, why_no_model, with_left_out
 
     everything, photos = photos, [photo for photo in photos if not photo.near_duplicate_of]
-    _check_count(photos)
+    _check_count(photos, len(everything))
     _check_camera(config, photos)
     check_matcher(config.matcher, places_of(photos))
     names = [photo.file.removeprefix("images/") for photo in photos]
@@ -139,9 +140,8 @@ def _reconstruct(config: Config, photos: "list[Photo]", ingest: Path, folder: Pa
     matches = read_matches(Path(found["database"]))
     images = account(names, matches, models, found["observations"], found["supports"])
     _say_who_is_missing(photos, images, progress)
-    _forget(folder)
     spread = found["uncertainty_px"]
-    return _result(
+    result = _result(
         folder,
         source="sfm",
         attempts=found["attempts"],
@@ -153,6 +153,8 @@ def _reconstruct(config: Config, photos: "list[Photo]", ingest: Path, folder: Pa
         georeference=_georeference(folder, photos, progress),
         test_files=None,
     )
+    _forget(folder)
+    return result
 
 
 def _georeference(folder: Path, photos: "Sequence[Photo]", progress: Progress) -> dict[str, Any] | None:
@@ -180,13 +182,16 @@ def _georeference(folder: Path, photos: "Sequence[Photo]", progress: Progress) -
     return found.to_json()
 
 
-def _check_count(photos: "Sequence[Photo]") -> None:
+def _check_count(photos: "Sequence[Photo]", ingested: int) -> None:
     from stages.registration import FEWEST_REGISTERED, OVERLAP_HINT
 
     if len(photos) < FEWEST_REGISTERED:
         raise StageError(
             f"cannot find cameras from {len(photos)} photo{'s' * (len(photos) != 1)}",
-            f"it takes at least {FEWEST_REGISTERED} photos that overlap",
+            f"it takes at least {FEWEST_REGISTERED} photos that overlap"
+            + (
+                f", and {ingested - len(photos)} are nearly the same picture as one of these" * (ingested > len(photos))
+            ),
             OVERLAP_HINT,
         )
 
@@ -223,6 +228,7 @@ def _database(folder: Path, names: Sequence[str], progress: Progress) -> Path:
 
     database = folder / f"matches-{version('pycolmap')}.db"
     if not database.exists():
+        _forget(folder)  # attempts without their matches, or those of another version of COLMAP
         return database
     journal = folder / "attempts" / JOURNAL
     if all(is_sound(one, names) for one in folder.glob("matches-*.db")) and (not journal.exists() or _parses(journal)):
@@ -243,10 +249,11 @@ def _parses(path: Path) -> bool:
 
 
 def _forget(folder: Path) -> None:
-    """Remove what only an interrupted run needs."""
+    """Remove what only an interrupted run needs: the journal first, for without the rest it would mislead."""
+    (folder / "attempts" / JOURNAL).unlink(missing_ok=True)
+    shutil.rmtree(folder / "attempts", ignore_errors=True)
     for database in folder.glob("matches-*"):
         database.unlink()
-    shutil.rmtree(folder / "attempts", ignore_errors=True)
 
 
 def _run_child(
@@ -283,8 +290,11 @@ def _run_child(
             child.wait()
     if "result" not in latest:
         if latest["attempt"] != ATTEMPTS[0].name and (late or code not in (0, -signal.SIGKILL)):
-            abandon(folder / "attempts", latest["attempt"])
-        raise _child_failed(code, config.max_seconds if late else None, latest["phase"], log)
+            abandon(folder / "attempts", latest["attempt"], "ran out of time" if late else "ended the program")
+            without = f"Run again: it goes on without the attempt {latest['attempt']!r}. Log: {log}"
+        else:
+            without = None
+        raise _child_failed(code, config.max_seconds if late else None, latest["phase"], log, without)
     return latest["result"]
 
 
@@ -332,7 +342,8 @@ def _describe(latest: Mapping[str, Any], photos: int) -> tuple[str, float | None
     return f"{words.format(done, total)} ({latest['attempt']})", FIRST_ATTEMPT + (REFINING - FIRST_ATTEMPT) * later
 
 
-def _child_failed(code: int, limit: float | None, phase: str, log: Path) -> StageError:
+def _child_failed(code: int, limit: float | None, phase: str, log: Path, without: str | None) -> StageError:
+    """``without``: the hint where running again goes on without the attempt that failed."""
     lines = log.read_text("utf-8", "replace").strip().splitlines()
     last = lines[-1].strip() if lines else "it left no message"
     where = f"while {phase}" if phase != "features" else "while finding features"
@@ -340,7 +351,7 @@ def _child_failed(code: int, limit: float | None, phase: str, log: Path) -> Stag
         return StageError(
             f"structure-from-motion was given up {where}",
             f"it took longer than {limit:g} s",
-            "Give it longer with --sfm.max-seconds, or fewer photos; matches found so far are kept.",
+            without or "Give it longer with --sfm.max-seconds, or fewer photos; matches found so far are kept.",
         )
     if code < 0:
         name = signal.Signals(-code).name

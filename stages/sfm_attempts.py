@@ -53,7 +53,7 @@ ATTEMPTS = (
     Attempt("weaker start", "mapping again, asking less of the first pair", "same", WEAK_START),
     Attempt("other seed", "mapping again, with another seed", "same", OTHER_SEED),
     Attempt("all at once", "mapping again, all photos at once", "same", None),
-    Attempt("more features", "searching twice as many features at full size", "rich", WEAK_START),
+    Attempt("more features", "searching twice as many features at twice the size", "rich", WEAK_START),
 )
 
 
@@ -81,15 +81,16 @@ class Journal:
         self.folder = folder
         folder.mkdir(parents=True, exist_ok=True)
         self.tried = [Tried(**entry) for entry in _read(folder / JOURNAL)]
-        self.abandoned: list[str] = _read(folder / ABANDONED)
+        self.abandoned: dict[str, str] = dict(_read(folder / ABANDONED))  # by attempt, what became of it
 
     def model(self, name: str) -> Path:
         """The folder of an attempt's best sub-model."""
         return self.folder / name.replace(" ", "-")
 
-    def done(self, name: str) -> Tried | None:
-        """What came of the attempt of this name, None if it was not made."""
-        return next((tried for tried in self.tried if tried.name == name), None)
+    def left(self) -> tuple[Attempt, ...]:
+        """The attempts after the last one in the journal: what was passed over before it stays so."""
+        names = [attempt.name for attempt in ATTEMPTS]
+        return ATTEMPTS[names.index(self.tried[-1].name) + 1 :] if self.tried else ATTEMPTS
 
     def add(self, tried: Tried) -> None:
         """Note an attempt, durably."""
@@ -101,10 +102,11 @@ class Journal:
         return max((tried for tried in self.tried if tried.groups), key=lambda tried: tried.rank, default=None)
 
 
-def abandon(folder: Path, name: str) -> None:
-    """Note, in the parent, that an attempt ended the child by itself: it is not made again in this folder."""
+def abandon(folder: Path, name: str, why: str) -> None:
+    """Note, in the parent, what became of an attempt that is not to be made again in this folder."""
     folder.mkdir(parents=True, exist_ok=True)
-    write_durably(folder / ABANDONED, json.dumps(sorted({*_read(folder / ABANDONED), name})).encode())
+    abandoned = dict(_read(folder / ABANDONED)) | {name: why}
+    write_durably(folder / ABANDONED, json.dumps(sorted(abandoned.items())).encode())
 
 
 def _read(path: Path) -> list:

@@ -32,6 +32,7 @@ from stages.colmap.matching import (
 )
 from stages.colmap.models import load_native
 from stages.colmap.refinement import finish
+from stages.files import make_durable
 from stages.masks import write_feature_masks
 from stages.matching_plan import about, places_of
 from stages.pairing import Pairs, Similarity, pairs_of, second_look
@@ -104,7 +105,7 @@ class _Work:
 
     def missing(self) -> list[int]:
         """The photos that have no place in the best model so far."""
-        best = self.journal.best()
+        best = self.usable()
         placed = set(best.groups[0]) if best else set()
         return [number for number, file in enumerate(self.files) if file not in placed]
 
@@ -112,10 +113,16 @@ class _Work:
         """Another database, beside the first."""
         return self.database.with_name(f"{self.database.stem}-{name}.db")
 
+    def usable(self) -> Tried | None:
+        """The best attempt, if its model is good enough to go on with."""
+        best = self.journal.best()
+        good = best and len(best.groups[0]) >= FEWEST_REGISTERED and best.points >= FEWEST_POINTS
+        return best if good else None
+
     def latest(self) -> Path:
-        """The database of the best attempt; as long as there is no model, that with most matches, the latest."""
-        best = self.journal.best() or self.journal.tried[-1]
-        return self.database.with_name(best.database)
+        """The database of the best attempt; as long as there is no model, the latest with the lens as it was."""
+        plain = [tried for tried in self.journal.tried if tried.name != "fisheye"]
+        return self.database.with_name((self.usable() or plain[-1]).database)
 
 
 def reconstruct(job: Job, say: Say) -> dict[str, Any]:
@@ -127,13 +134,14 @@ def reconstruct(job: Job, say: Say) -> dict[str, Any]:
     place how many of its features are points of it and how many of them agree (``supports``).
     """
     work = _Work(job, say)
-    for attempt in ATTEMPTS[: job.attempts]:
-        if (missing := work.missing()) and work.journal.done(attempt.name) is None:
+    for attempt in work.journal.left():
+        if attempt in ATTEMPTS[: job.attempts] and (missing := work.missing()):
             _make(attempt, missing, work)
     tried = [_entry(one) for one in work.journal.tried]
-    best = work.journal.best()
-    if best is None or len(best.groups[0]) < FEWEST_REGISTERED or best.points < FEWEST_POINTS:
-        models, points = (best.groups, best.points) if best else ([], 0)
+    best = work.usable()
+    if best is None:
+        poor = work.journal.best()
+        models, points = (poor.groups, poor.points) if poor else ([], 0)
         return {"database": str(work.latest()), "models": models, "points": points, "attempts": tried}
     say(phase="refining")
     database = work.latest()
@@ -168,8 +176,8 @@ def _make(attempt: Attempt, missing: list[int], work: _Work) -> None:
         situation = Situation(len(missing), count, some, flat and len(missing) == count, lens_is_given)
         if reason_against(attempt, situation):
             return
-        if attempt.name in work.journal.abandoned:
-            work.say(note=f"left out, for it ended the program last time: {attempt.words}")
+        if why := work.journal.abandoned.get(attempt.name):
+            work.say(note=f"left out, for it {why} last time: {attempt.words}")
             return
         have = "has" if len(missing) == 1 else "have"
         work.say(note=f"{len(missing)} of {count} photos {have} no place yet: {attempt.words}")
@@ -181,6 +189,7 @@ def _make(attempt: Attempt, missing: list[int], work: _Work) -> None:
         folder = work.journal.model(attempt.name)
         folder.mkdir(parents=True, exist_ok=True)
         models[0].write_binary(folder)
+        make_durable(folder)
         groups = [_files(model) for model in models]
         error = models[0].compute_mean_reprojection_error()
         tried = Tried(attempt.name, database.name, groups, models[0].num_points3D(), error)
@@ -204,8 +213,8 @@ def _matched(attempt: Attempt, missing: list[int], work: _Work) -> Path:
         copy_as_fisheye(latest, database, job.seed)
     else:
         database = work.beside("rich")
-        longest = max(max(photo.width, photo.height) for photo in work.photos)
-        _find_features(database, Search(longest, 2 * job.max_features, from_double_size=True), work)
+        twice = Search(2 * job.max_image_size, 2 * job.max_features, doubled_up_to=job.max_image_size)
+        _find_features(database, twice, work)
         _match(database, work.pairs, STRICT_RATIO, work)
     return database
 

@@ -76,10 +76,12 @@ def _keep_largest_group(model: "pycolmap.Reconstruction") -> None:
     from scipy.sparse.csgraph import connected_components
 
     images = [model.image(image_id) for image_id in sorted(model.reg_image_ids())]
+    if not model.num_points3D():
+        return
     points = [[place.point3D_id for place in image.get_observation_points2D()] for image in images]
     owner = np.repeat(np.arange(len(images)), [len(seen) for seen in points])
     point = np.unique(np.array([one for seen in points for one in seen], np.int64), return_inverse=True)[1]
-    sees = csr_matrix((np.ones(len(owner)), (owner, point)))
+    sees = csr_matrix((np.ones(len(owner)), (owner, point)), shape=(len(images), int(point.max()) + 1))
     _, group = connected_components((sees @ sees.T) >= FEWEST_MATCHES, directed=False)
     largest = np.bincount(group).argmax()
     for image, of in zip(images, group, strict=True):

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from stages.photos import Photo
 
 FOCAL_GUESS = 1.2  # focal length over the longer side where EXIF is silent: 45 degrees, a phone's wide lens
-UPSAMPLE_UP_TO_PX = 1024  # smaller photos yield too few features at their own size
 # Lowe's ratio: 0.8 is SIFT's own. 0.9 lets in many mismatches, most of which verification throws out again, and
 # finds views that lie farther apart; only photos that otherwise stay without a place are matched like that.
 STRICT_RATIO = 0.8
@@ -98,12 +97,12 @@ def _name(photo: "Photo") -> str:
 
 class Search(NamedTuple):
     """How far features are searched: the longer side in pixels that photos are reduced to, the most features of each,
-    the folder of masks, and whether photos of any size are doubled first."""
+    the folder of masks, and up to which longer side photos are doubled first: smaller ones yield too few features."""
 
     max_image_size: int
     max_features: int
     masks: Path | None = None
-    from_double_size: bool = False
+    doubled_up_to: int = 1024
 
 
 def extract_features(database: Path, images: Path, photos: "Sequence[Photo]", search: Search) -> None:
@@ -118,8 +117,7 @@ def extract_features(database: Path, images: Path, photos: "Sequence[Photo]", se
     options = pycolmap.FeatureExtractionOptions()
     options.max_image_size = search.max_image_size
     options.sift.max_num_features = search.max_features
-    doubled_up_to = math.inf if search.from_double_size else UPSAMPLE_UP_TO_PX
-    small = {_name(p) for p in photos if max(p.width, p.height) <= doubled_up_to}
+    small = {_name(p) for p in photos if max(p.width, p.height) <= search.doubled_up_to}
     masks = search.masks
     masked = {name for name in map(_name, photos) if masks and (masks / f"{name}.png").is_file()}
     # A photo without a mask has to go without a folder of masks: one that is not there is an error to COLMAP.

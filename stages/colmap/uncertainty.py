@@ -24,21 +24,20 @@ def pose_uncertainty_px(model: "pycolmap.Reconstruction", noise: float) -> dict[
     Bundle Adjustment, section 9.3). Cameras are held since refining poses could not mend them: a focal length a little
     long looks like places a little far away.
 
-    ``noise`` scales adjustments' soft-L1. Photos with very few observations have no entry, and none has where the
-    equations leave more than the frame open (points without depth).
+    ``noise`` scales adjustments' soft-L1. Photos with very few observations have no entry. Raises LinAlgError where
+    the equations leave more than the frame open (points without depth).
     """
     seen = observations(model)
     counts = dict(zip(*(a.tolist() for a in np.unique(seen.image, return_counts=True)), strict=True))
     keep = np.isin(seen.image, [i for i, count in counts.items() if count >= FEWEST_OBSERVATIONS])
     seen = Observations(*(part[keep] for part in seen))
+    point, views = np.unique(seen.point, return_counts=True)
+    seen = Observations(*(part[np.isin(seen.point, point[views >= 2])] for part in seen))  # one view gives no depth
     ids = np.unique(seen.image)
     if not len(ids):
         return {}
     to_pose, to_point = _jacobians(model, seen)
-    try:
-        covariance = _whitened_covariance(model, seen, ids, to_pose, to_point)
-    except np.linalg.LinAlgError:
-        return {}
+    covariance = _whitened_covariance(model, seen, ids, to_pose, to_point)
     sigma = _error_px(residuals(model, seen), noise, len(ids), len(np.unique(seen.point)))
     traces = np.einsum("iaia->i", covariance.reshape(len(ids), 6, len(ids), 6))
     return {i: sigma * float(np.sqrt(trace / counts[i])) for i, trace in zip(ids.tolist(), traces, strict=True)}

@@ -1,9 +1,11 @@
+import re
+
 import numpy as np
 import pytest
 
 from nerf.camera_paths import nearest_rotations
 from nerf.scene import Similarity
-from stages.georeference import Georeference, east_north_up, georeference
+from stages.georeference import ONE_LINE, Georeference, east_north_up, georeference
 
 HERE = (47.3769, 8.5417, 408.0)
 METRES_PER_DEGREE = 111_178.0  # northwards at 47 degrees
@@ -75,3 +77,18 @@ def test_without_all_heights_none_counts() -> None:
     known[4] = (*known[4][:2], None)
     found = georeference(SFM_FROM_ENU.points(enu), known)
     assert isinstance(found, Georeference) and found.origin[2] == 0 and found.used == 12
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_noise_across_a_straight_walk_tells_no_direction(seed: int) -> None:
+    enu = np.linspace(0, 100, 12)[:, None] * [1.0, 0, 0]
+    told = enu + np.random.default_rng(seed).normal(0, 7, enu.shape) * [1, 1, 0]
+    winding = enu + np.random.default_rng(9).normal(0, 0.1, enu.shape)  # as a hand holds a camera
+    assert georeference(SFM_FROM_ENU.points(winding), places(told)) == ONE_LINE
+
+
+def test_places_that_have_nothing_to_do_with_the_photos_are_refused() -> None:
+    told = np.random.default_rng(1).normal(0, 60, (12, 3))
+    why = georeference(SFM_FROM_ENU.points(walked()), places(told))
+    assert isinstance(why, str)
+    assert re.fullmatch(r"their places, \d+ m apart, are \d+ m off where the photos put them", why)

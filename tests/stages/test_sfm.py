@@ -19,6 +19,7 @@ from stages.contract import StageError
 from stages.files import read_json, write_png
 from stages.photos import Photo, read_photos, write_photos
 from stages.registration import count_done
+from stages.sfm_attempts import Journal, Tried
 from tests.blots import blots
 from tests.small_scenes import write_blender_scene
 from tests.synthetic_photos import Quiet, SyntheticPhotos
@@ -349,6 +350,14 @@ def test_an_attempt_that_ended_the_program_is_left_out(
     assert progress.notes[0].startswith("going on with the features of 7 photos and 21 matched pairs")
     assert "left out, for it ended the program last time: matching them again, less strictly" in progress.notes
     assert not (tmp_path / "sfm/attempts").exists()
+
+
+def test_attempts_whose_matches_are_gone_are_forgotten(
+    inputs: dict[str, Path], reconstructed: Path, tmp_path: Path, progress
+) -> None:
+    Journal(tmp_path / "attempts").add(Tried("first", "matches-0.db", [["photo_000.jpg"] * 12], 500, 0.1))
+    sfm.run(SMALL, inputs, tmp_path, progress)
+    assert contents(tmp_path) == contents(reconstructed)
 
 
 def test_the_screen_never_stands_still(inputs: dict[str, Path], tmp_path: Path, progress) -> None:

@@ -29,20 +29,21 @@ def test_more_photos_beat_more_points_beat_less_error() -> None:
 
 def test_the_journal_is_read_back_and_knows_the_best(tmp_path: Path) -> None:
     journal = Journal(tmp_path / "attempts")
-    assert journal.best() is None and journal.done("first") is None
+    assert journal.best() is None and journal.left() == ATTEMPTS
     one, other = Tried("first", "x.db", [["a", "b"]], 50, 0.5), Tried("other seed", "x.db", [["a", "b"]], 50, 0.5)
-    for tried in (Tried("all at once", "x.db"), one, other):
+    for tried in (one, Tried("weaker start", "x.db"), other):
         journal.add(tried)
     again = Journal(tmp_path / "attempts")
     assert again.tried == journal.tried and again.best() == one  # of equals the first
-    assert again.done("other seed") == other
+    assert [attempt.name for attempt in again.left()] == ["all at once", "more features"]
     assert again.model("other seed") == tmp_path / "attempts" / "other-seed"
 
 
 def test_what_ended_the_program_is_remembered(tmp_path: Path) -> None:
     for name in ("all at once", "fisheye", "fisheye"):
-        abandon(tmp_path / "attempts", name)
-    assert Journal(tmp_path / "attempts").abandoned == ["all at once", "fisheye"]
+        abandon(tmp_path / "attempts", name, "ran out of time" if name == "fisheye" else "ended the program")
+    abandoned = Journal(tmp_path / "attempts").abandoned
+    assert abandoned == {"all at once": "ended the program", "fisheye": "ran out of time"}
 
 
 PLAIN = Situation(missing=1, photos=50, linked=True, flat=False, lens_is_given=False)
