@@ -9,12 +9,7 @@ more where the machine does other work; what was registered, the mean reprojecti
 ``reference_cameras.json`` has measured cameras, the mean distance of the camera centres after the similarity that fits
 them best and the mean angle between the rotations.
 
-On two cores busy with other work, pycolmap 4.2.1:
-
-    fountain_p11   COLMAP's defaults   65 s, processors  57 s  11 registered, 0.24 px, centres 9.22 mm, rotations 0.375°
-                   ingest + sfm        38 s, processors  19 s  11 registered, 0.34 px, centres 2.73 mm, rotations 0.146°
-    fox            COLMAP's defaults  329 s, processors 170 s  50 registered, 0.67 px
-                   ingest + sfm        92 s, processors  55 s  50 registered, 0.75 px
+Figures are in docs/numbers.md.
 """
 
 import argparse
