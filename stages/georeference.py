@@ -17,6 +17,7 @@ from stages.pairing import GPS_ERROR_M, cartesian
 FEWEST_PLACES = 4  # three fix a similarity, the fourth tells whether it is right
 FAR_OFF = 3.0  # times the median distance: a place so wrong is not averaged with the others
 ROUNDS = 10
+LARGEST_ERROR = 1 / 3  # of how far apart the places are: with more they have nothing to do with the photos
 ONE_LINE = "they were taken along one line, which leaves open how the scene is turned about it"
 
 
@@ -70,20 +71,22 @@ def georeference(
     spread = float(np.linalg.norm(enu - np.median(enu, axis=0), axis=1).max())
     if spread < GPS_ERROR_M:
         return f"their places lie within {spread:.0f} m, and GPS errs by up to {GPS_ERROR_M:.0f} m"
-    across = np.linalg.svd(enu - enu.mean(axis=0), compute_uv=False)[1] / np.sqrt(len(enu))
-    if across < GPS_ERROR_M / 2:
-        return ONE_LINE
-    if not np.linalg.svd(centres - centres.mean(axis=0), compute_uv=False)[1] > 1e-6 * np.abs(centres).max():
+    width = _across(centres)
+    if _across(enu) < GPS_ERROR_M / 2 or not width * np.sqrt(len(centres)) > 1e-6 * np.abs(centres).max():
         return ONE_LINE
     fitted, kept = _robust(centres, enu)
-    walked = fitted.scale * np.linalg.svd(centres - centres.mean(axis=0), compute_uv=False)[1] / np.sqrt(len(centres))
-    if walked < GPS_ERROR_M / 2:
+    if fitted.scale * width < GPS_ERROR_M / 2:
         return ONE_LINE
     off = np.linalg.norm(fitted.points(centres) - enu, axis=1)
     error = float(np.median(off[kept]))
-    if error > spread / FAR_OFF:
+    if error > LARGEST_ERROR * spread:
         return f"their places, {spread:.0f} m apart, are {error:.0f} m off where the photos put them"
     return Georeference(fitted, origin, int(kept.sum()), error)
+
+
+def _across(points: Float[np.ndarray, "n 3"]) -> float:
+    """The standard deviation of points along the second of their principal axes: 0 on a line."""
+    return float(np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[1] / np.sqrt(len(points)))
 
 
 def _robust(

@@ -164,16 +164,17 @@ def _georeference(folder: Path, photos: "Sequence[Photo]", progress: Progress) -
     from stages.colmap.models import read_model
     from stages.georeference import georeference
 
-    by_file = {photo.file.removeprefix("images/"): photo for photo in photos}
-    centres, places = [], []
-    for image in read_model(folder / "sparse").images:
-        photo = by_file[image.file]
-        if photo.latitude is not None and photo.longitude is not None:
-            centres.append(image.sfm_from_camera[:, 3])
-            places.append((photo.latitude, photo.longitude, photo.altitude_m))
-    if not places:
+    place_of = {
+        photo.file.removeprefix("images/"): (photo.latitude, photo.longitude, photo.altitude_m)
+        for photo in photos
+        if photo.latitude is not None and photo.longitude is not None
+    }
+    images = read_model(folder / "sparse").images if place_of else []
+    located = [image for image in images if image.file in place_of]
+    if not located:
         return None
-    found = georeference(np.array(centres), places)
+    centres = np.array([image.sfm_from_camera[:, 3] for image in located])
+    found = georeference(centres, [place_of[image.file] for image in located])
     if isinstance(found, str):
         progress.note(f"no metres from the photos' GPS: {found}")
         return None
@@ -186,14 +187,10 @@ def _check_count(photos: "Sequence[Photo]", ingested: int) -> None:
     from stages.registration import FEWEST_REGISTERED, OVERLAP_HINT
 
     if len(photos) < FEWEST_REGISTERED:
-        raise StageError(
-            f"cannot find cameras from {len(photos)} photo{'s' * (len(photos) != 1)}",
-            f"it takes at least {FEWEST_REGISTERED} photos that overlap"
-            + (
-                f", and {ingested - len(photos)} are nearly the same picture as one of these" * (ingested > len(photos))
-            ),
-            OVERLAP_HINT,
-        )
+        why = f"it takes at least {FEWEST_REGISTERED} photos that overlap"
+        if same := ingested - len(photos):
+            why += f", and {same} are nearly the same picture as one of these"
+        raise StageError(f"cannot find cameras from {len(photos)} photo{'s' * (len(photos) != 1)}", why, OVERLAP_HINT)
 
 
 def _check_camera(config: Config, photos: "Sequence[Photo]") -> None:

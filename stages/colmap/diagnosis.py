@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from stages.registration import FLAT_CONFIGS
+
 if TYPE_CHECKING:
     import pycolmap
 
@@ -24,14 +26,13 @@ def links(database: Path, names: Container[str]) -> Links:
     """Of the photos with these names, and of all."""
     import pycolmap
 
-    kinds = pycolmap.TwoViewGeometryConfiguration
     some, flat = False, []
     with pycolmap.Database.open(database) as db:
         name = {image.image_id: image.name for image in db.read_all_images()}
         for pair_id, geometry in zip(*db.read_two_view_geometries(), strict=True):
             if len(geometry.inlier_matches):
                 some = some or any(name[number] in names for number in pycolmap.pair_id_to_image_pair(pair_id))
-                flat.append(geometry.config in (kinds.PLANAR, kinds.PANORAMIC, kinds.PLANAR_OR_PANORAMIC))
+                flat.append(int(geometry.config) in FLAT_CONFIGS)
     return Links(some, sum(flat) > MOSTLY * len(flat))
 
 
@@ -43,10 +44,9 @@ def supports(model: "pycolmap.Reconstruction", database: Path, seed: int) -> dic
     registered = set(model.reg_image_ids())
     found = {}
     with pycolmap.Database.open(database) as db:
-        geometries = list(zip(*db.read_two_view_geometries(), strict=True))
-        for image in sorted(db.read_all_images(), key=lambda image: image.image_id):
-            if image.image_id in registered:
-                continue
+        missing = [image for image in db.read_all_images() if image.image_id not in registered]
+        geometries = list(zip(*db.read_two_view_geometries(), strict=True)) if missing else []
+        for image in sorted(missing, key=lambda image: image.image_id):
             points = _points_seen(image.image_id, geometries, model)
             keypoints = np.asarray(db.read_keypoints(image.image_id), float)[:, :2]
             known = model.exists_camera(image.camera_id)

@@ -148,8 +148,7 @@ def match_pairs(
     """
     import pycolmap
 
-    options = pycolmap.TwoViewGeometryOptions()
-    options.ransac.random_seed = seed
+    options = _verification(seed)
     with pycolmap.Database.open(database) as db, ThreadPoolExecutor(os.cpu_count()) as pool:
         todo = _spread([(i, j) for i, j in pairs.tolist() if not db.exists_two_view_geometry(i + 1, j + 1)])
         photo = lru_cache(CACHED_PHOTOS)(partial(_read_photo, db))
@@ -202,11 +201,25 @@ def _match(
     first: _Photo, second: _Photo, max_ratio: float, options: "pycolmap.TwoViewGeometryOptions"
 ) -> "tuple[np.ndarray, pycolmap.TwoViewGeometry]":
     """Matches, and the geometry of two views with those that it explains: none where they are too few."""
+    matches = match_descriptors(first.descriptors, second.descriptors, max_ratio)
+    return matches, _verified(first, second, matches, options)
+
+
+def _verification(seed: int) -> "pycolmap.TwoViewGeometryOptions":
     import pycolmap
 
-    matches = match_descriptors(first.descriptors, second.descriptors, max_ratio)
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.random_seed = seed
+    return options
+
+
+def _verified(
+    first: _Photo, second: _Photo, matches: np.ndarray, options: "pycolmap.TwoViewGeometryOptions"
+) -> "pycolmap.TwoViewGeometry":
+    import pycolmap
+
     views = first.camera, first.places, second.camera, second.places
-    return matches, pycolmap.estimate_two_view_geometry(*views, matches, options)
+    return pycolmap.estimate_two_view_geometry(*views, matches, options)
 
 
 def copy_without_matches_of(names: Container[str], database: Path, copy: Path) -> None:
@@ -234,9 +247,7 @@ def copy_as_fisheye(database: Path, copy: Path, seed: int) -> None:
 
     if copy.exists():
         return
-    unfinished = _unfinished_copy(database, copy)
-    options = pycolmap.TwoViewGeometryOptions()
-    options.ransac.random_seed = seed
+    unfinished, options = _unfinished_copy(database, copy), _verification(seed)
     with pycolmap.Database.open(unfinished) as db, pycolmap.DatabaseTransaction(db):
         for camera in db.read_all_cameras():
             size = camera.width, camera.height
@@ -247,10 +258,8 @@ def copy_as_fisheye(database: Path, copy: Path, seed: int) -> None:
         photo = lru_cache(CACHED_PHOTOS)(partial(_read_photo, db))
         for pair_id, matches in zip(*db.read_all_matches(), strict=True):
             first, second = pycolmap.pair_id_to_image_pair(pair_id)
-            one, other = photo(first - 1), photo(second - 1)
-            views = one.camera, one.places, other.camera, other.places
+            geometry = _verified(photo(first - 1), photo(second - 1), np.asarray(matches, np.uint32), options)
             db.delete_two_view_geometry(first, second)
-            geometry = pycolmap.estimate_two_view_geometry(*views, np.asarray(matches, np.uint32), options)
             db.write_two_view_geometry(first, second, geometry)
     unfinished.replace(copy)
 
