@@ -61,7 +61,7 @@ def heldout(model: GridField, bank: RayBank) -> tuple[float, list[torch.Tensor]]
     for view in range(len(bank.near)):
         pixels = torch.arange(int(bank.first_pixel[view]), int(bank.first_pixel[view + 1]))
         side = math.isqrt(len(pixels))
-        rays, colour, alpha = bank.lookup(pixels)
+        rays, colour, alpha, _ = bank.lookup(pixels)
         square = Rays(*(part.reshape(side, side, *part.shape[1:]) for part in rays))
         truth = over(colour, alpha, WHITE).view(side, side, 3)
         picture = render_image(model, square, WHITE).colour

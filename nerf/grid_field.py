@@ -31,7 +31,7 @@ class GridSettings:
     """Sizes of a grid field. Raises ValueError on impossible ones.
 
     ``steps``: lattice steps along the diagonal of a bounded scene's box. ``shortest_step`` (scene units) and ``cone``
-    (step per distance) replace it where space is ``contracted``.
+    (step per distance) replace it where space is ``contracted``. Without ``view_dependence`` a point has one colour.
     """
 
     levels: int = 5
@@ -45,6 +45,7 @@ class GridSettings:
     cone: float = 0.008
     most_samples: int = 1024
     cache_cells: int = 128
+    view_dependence: bool = True
 
     def __post_init__(self) -> None:
         at_least = {"levels": 1, "features": 1, "log2_rows": 1, "coarsest": 1, "steps": 1, "most_samples": 1}
@@ -89,7 +90,7 @@ class GridGradients(NamedTuple):
 
     weights: Weights
     features: Float[Tensor, "samples width"]
-    harmonics: Float[Tensor, "rays 16"]
+    harmonics: Float[Tensor, "rays direction"]
 
 
 class GridField(nn.Module):
@@ -114,7 +115,13 @@ class GridField(nn.Module):
         random = generator("cpu", seed, 0)
         shape = (self.layout.rows, settings.features)
         self.register_buffer("table", (2 * torch.rand(shape, generator=random) - 1) * INITIAL_FEATURE)
-        for name, weight in grid_mlp.initial_weights(self.layout.width, random)._asdict().items():
+        self.of_directions, self.of_directions_backward = (
+            (backend.spherical_harmonics, backend.spherical_harmonics_backward)
+            if settings.view_dependence
+            else (grid_mlp.no_directions, grid_mlp.no_directions_backward)
+        )
+        direction = grid_mlp.DIRECTION if settings.view_dependence else 0
+        for name, weight in grid_mlp.initial_weights(self.layout.width, direction, random)._asdict().items():
             self.register_buffer(name, weight)
         self.register_buffer("bits", torch.full((settings.cache_cells**3 // 64,), -1))  # every cell may hold something
 
@@ -138,7 +145,7 @@ class GridField(nn.Module):
     ) -> Float[Tensor, "*points 3"]:
         """Colour seen by viewing rays of unit ``directions``; without meaning where the density is zero."""
         unit = unit_coordinates(points, self.settings.contracted).reshape(-1, 3).clamp(0, 1)
-        harmonics = self.backend.spherical_harmonics(directions.reshape(-1, 3))
+        harmonics = self.of_directions(directions.reshape(-1, 3))
         each = torch.arange(len(unit) + 1, dtype=torch.int32, device=unit.device)  # a ray of its own for every point
         alone = Samples(each, each[:-1], unit[:, 0], unit[:, 0])
         geometry = self._density_pass(unit).geometry
@@ -153,7 +160,7 @@ class GridField(nn.Module):
         """
         rays = Rays(*(part.contiguous() for part in rays))
         seen, light = rays.far.new_zeros(len(rays.far), 4), torch.ones_like(rays.far)
-        harmonics = self.backend.spherical_harmonics(rays.directions)
+        harmonics = self.of_directions(rays.directions)
         for wave in self._waves(rays, torch.full_like(rays.near, 0.5)):
             alone = self._composited(wave, harmonics.index_select(0, wave.number))
             before = light.index_select(0, wave.number)
@@ -161,7 +168,7 @@ class GridField(nn.Module):
             light[wave.number] = before * (1 - alone.opacity)
         return Rendering(seen[:, :3] + light[:, None] * background, seen[:, 3] + light * rays.far, 1 - light)
 
-    def _composited(self, wave: Wave, harmonics: Float[Tensor, "rays 16"]) -> Rendering:
+    def _composited(self, wave: Wave, harmonics: Float[Tensor, "rays direction"]) -> Rendering:
         """What a wave's samples alone let its rays see, before nothing, which is nowhere."""
         nowhere, black = harmonics.new_zeros(len(harmonics)), harmonics.new_zeros(len(harmonics), 3)
         density = wave.density
@@ -180,7 +187,7 @@ class GridField(nn.Module):
         density = DensityPass(
             *(torch.cat(parts).index_select(0, rows) for parts in zip(*(wave.density for wave in waves), strict=True))
         )
-        harmonics = backend.spherical_harmonics(rays.directions)
+        harmonics = self.of_directions(rays.directions)
         colour = grid_mlp.colour_forward(self.weights, backend, samples, density.geometry, harmonics)
         rendering, weights = backend.composite(samples, density.sigma, colour.colour, background, rays.far)
         return GridPass(rays, background, len(order), samples, points, density, colour, rendering, weights)
@@ -205,7 +212,7 @@ class GridField(nn.Module):
         grad_origins, grad_directions = backend.sample_points_backward(
             rays, samples, self.settings.contracted, grad_points
         )
-        return grad_origins, grad_directions + backend.spherical_harmonics_backward(
+        return grad_origins, grad_directions + self.of_directions_backward(
             rays.directions, gradients.harmonics
         )
 

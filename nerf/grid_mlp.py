@@ -15,7 +15,7 @@ from nerf.kernels import Backend, Samples
 
 HIDDEN = 64
 GEOMETRY = 16  # numbers that the density network hands to the colour network; the first is the logarithm of density
-DIRECTION = 16  # spherical harmonics
+DIRECTION = 16  # spherical harmonics, where colour depends on the direction
 LARGEST_LOG_DENSITY = 15.0
 
 
@@ -72,9 +72,20 @@ class ColourGradients(NamedTuple):
     harmonics: Float[Tensor, "rays direction"]
 
 
-def initial_weights(features: int, random: torch.Generator) -> Weights:
-    """Glorot-uniform weights (Glorot and Bengio 2010, eq. 16)."""
-    return Weights(*(_glorot(rows, random) for rows in (features, GEOMETRY, GEOMETRY + DIRECTION, 3)))
+def initial_weights(features: int, direction: int, random: torch.Generator) -> Weights:
+    """Glorot-uniform weights (Glorot and Bengio 2010, eq. 16); ``direction``: DIRECTION, or 0 for colours that are the
+    same from everywhere."""
+    return Weights(*(_glorot(rows, random) for rows in (features, GEOMETRY, GEOMETRY + direction, 3)))
+
+
+def no_directions(directions: Float[Tensor, "rays 3"]) -> Float[Tensor, "rays 0"]:
+    """What colours that are the same from everywhere know of the viewing direction, in the place of harmonics."""
+    return directions[:, :0]
+
+
+def no_directions_backward(directions: Float[Tensor, "rays 3"], grad: Float[Tensor, "rays 0"]) -> Float[Tensor, "rays 3"]:
+    """They do not depend on it."""
+    return torch.zeros_like(directions)
 
 
 def density_forward(weights: Weights, features: Float[Tensor, "samples features"]) -> DensityPass:

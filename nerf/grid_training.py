@@ -1,15 +1,16 @@
 """One optimisation step of a grid field, behind the same interface as the paper's (nerf/training.py)."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import astuple, dataclass
 from functools import partial
 from typing import Literal, NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from nerf.density_cache import DensityCache
+from nerf.effects import AS_GIVEN, AS_RENDERED, PhotoColours, PhotoRays, Seen
 from nerf.grid_field import GridField, GridPass
 from nerf.grid_mlp import Weights
 from nerf.metrics import psnr
@@ -49,21 +50,25 @@ class GridTrainerSettings:
 
 
 class GridBatch(NamedTuple):
-    """Rays with the colour each should see over its background, and where its samples stand in their intervals."""
+    """Rays with the colour each should see over its background, where its samples stand in their intervals, and whose
+    view it belongs to."""
 
     rays: Rays
     target: Float[Tensor, "rays 3"]
     background: Float[Tensor, "rays 3"]
     jitter: Float[Tensor, "rays"]
+    view: Int[Tensor, "rays"]
 
 
 class Loss(NamedTuple):
-    """A chunk's share of the loss, of the mean squared error in it, and the gradients of rendering and weights."""
+    """A chunk's share of the loss, of the mean squared error in it, and the gradients of rendering, weights and of
+    what the photos make of colours."""
 
     value: Tensor
     squared_error: Tensor
     grad: Rendering
     grad_weights: Float[Tensor, "samples"]
+    grad_photos: dict[str, Tensor]
 
 
 class _Part(NamedTuple):
@@ -75,6 +80,7 @@ class _Part(NamedTuple):
     weights: Weights
     features: Float[Tensor, "samples width"]
     points: Float[Tensor, "samples 3"]
+    photos: dict[str, Tensor]
     norm: Tensor
     thickness: Float[Tensor, "samples"]
 
@@ -91,12 +97,23 @@ def distortion_factor(share: float) -> float:
 
 
 class GridTrainer:
-    """Trains a grid field on the squared error of colours by Adam, and keeps its density cache."""
+    """Trains a grid field on the squared error of colours by Adam, and keeps its density cache. ``photo_rays`` and
+    ``photo_colours`` stand between the field and each photo (nerf/effects)."""
 
-    def __init__(self, model: GridField, bank: RayBank, settings: GridTrainerSettings) -> None:
+    def __init__(
+        self,
+        model: GridField,
+        bank: RayBank,
+        settings: GridTrainerSettings,
+        photo_rays: PhotoRays = AS_GIVEN,
+        photo_colours: PhotoColours = AS_RENDERED,
+    ) -> None:
         self.model, self.bank, self.settings = model, bank, settings
+        self.photo_rays, self.photo_colours = photo_rays, photo_colours
         self.cache = DensityCache(model)
-        self.parameters = {"table": model.table, **model.weights._asdict()}
+        self.photo_parts = [part for part in (photo_rays, photo_colours) if part.parameters]
+        of_photos = {**photo_rays.parameters, **photo_colours.parameters}
+        self.parameters = {"table": model.table, **model.weights._asdict(), **of_photos}
         self.mean = {name: torch.zeros_like(tensor) for name, tensor in self.parameters.items()}
         self.square = {name: torch.zeros_like(tensor) for name, tensor in self.parameters.items()}
         self.grad_table = torch.zeros_like(model.table)
@@ -107,7 +124,7 @@ class GridTrainer:
         device, rays = self.bank.device, self._rays_per_chunk()
         parts = list(in_order(partial(self._part, step, share, rays), range(self.settings.chunks), device))
         loss, error = self._finite(step, parts)
-        self._update(parts, rate_scale * self.settings.rate * rate_factor(step, share), step + 1)
+        self._update(parts, rate_scale * rate_factor(step, share), step + 1)
         self.cache.refresh(step, generator(device, self.settings.seed, step, self.settings.chunks))
         samples = sum(len(part.points) for part in parts)
         rays *= self.settings.chunks
@@ -115,10 +132,13 @@ class GridTrainer:
         return StepResult(loss, psnr(error), rays)
 
     def state(self) -> dict[str, Tensor]:
-        """Weights and cache bits as ``model.<name>``, Adam's moments as ``mean.<name>`` and ``square.<name>``, the
-        cache's thickness, the mean number of samples per ray, and the field's settings, to know it by."""
+        """Weights and cache bits as ``model.<name>``, what is learnt of photos as ``photo.<name>``, Adam's moments as
+        ``mean.<name>`` and ``square.<name>``, the cache's thickness, the mean number of samples per ray, and the
+        field's settings, to know it by."""
+        of_photos = {**self.photo_rays.parameters, **self.photo_colours.parameters}
         return (
             {f"model.{name}": tensor for name, tensor in self.model.state_dict().items()}
+            | {f"photo.{name}": tensor for name, tensor in of_photos.items()}
             | {f"mean.{name}": tensor for name, tensor in self.mean.items()}
             | {f"square.{name}": tensor for name, tensor in self.square.items()}
             | {"thickness": self.cache.thickness, "samples_per_ray": self.samples_per_ray}
@@ -144,37 +164,40 @@ class GridTrainer:
     def _batch(self, step: int, chunk: int, count: int) -> GridBatch:
         device = self.bank.device
         random = generator(device, self.settings.seed, step, chunk)
-        rays, colour, alpha = self.bank.sample(count, random)
+        rays, colour, alpha, view = self.bank.sample(count, random)
         if self.settings.background == "random":
             background = torch.rand(count, 3, generator=random, device=device)
         else:
             background = torch.tensor(self.settings.background, device=device).repeat(count, 1)
         target = colour if alpha is None else torch.lerp(background, colour, alpha[:, None])
-        return GridBatch(rays, target, background, torch.rand(count, generator=random, device=device))
+        return GridBatch(rays, target, background, torch.rand(count, generator=random, device=device), view)
 
     def _part(self, step: int, share: float, rays: int, chunk: int) -> _Part:
         """What a chunk of so many rays adds to loss and gradients."""
         batch = self._batch(step, chunk, rays)
-        done = self.model.forward(batch.rays, batch.jitter, batch.background)
+        done = self.model.forward(self.photo_rays.forward(batch.rays, batch.view), batch.jitter, batch.background)
         spread_weight = self.settings.distortion * distortion_factor(share)
-        loss = self._loss(rays * self.settings.chunks, spread_weight, done, batch.target)
-        weights, features, _ = self.model.backward(done, loss.grad, loss.grad_weights)
+        loss = self._loss(rays * self.settings.chunks, spread_weight, done, batch)
+        gradients = self.model.backward(done, loss.grad, loss.grad_weights)
+        grad_rays = partial(self.model.rays_backward, done, gradients)
+        photos = loss.grad_photos | self.photo_rays.backward(batch.rays, batch.view, grad_rays)
+        weights, features, _ = gradients
         thickness = done.density.sigma * done.samples.dt
-        norm = torch.nn.utils.get_total_norm([*weights, features])
-        return _Part(batch, loss.value, loss.squared_error, weights, features, done.points, norm, thickness)
+        norm = torch.nn.utils.get_total_norm([*weights, features, *photos.values()])
+        return _Part(batch, loss.value, loss.squared_error, weights, features, done.points, photos, norm, thickness)
 
-    def _loss(self, rays: int, spread_weight: float, done: GridPass, target: Float[Tensor, "chunk 3"]) -> Loss:
-        error = done.rendering.colour - target
+    def _loss(self, rays: int, spread_weight: float, done: GridPass, batch: GridBatch) -> Loss:
+        seen = Seen(done.rendering, batch.background, batch.view)
+        error = self.photo_colours.residual(seen, batch.target)
         squared_error = error.square().sum() / (3 * rays)
-        none = torch.zeros(len(target), device=error.device)
-        grad = Rendering(error * (2 / (3 * rays)), none, none)
+        grad, photos = self.photo_colours.backward(seen, error * (2 / (3 * rays)))
         if not spread_weight:
-            return Loss(squared_error, squared_error, grad, torch.zeros_like(done.weights))
+            return Loss(squared_error, squared_error, grad, torch.zeros_like(done.weights), photos)
         backend, lattice = self.model.backend, self.model.lattice
-        each = none + spread_weight / rays
+        each = torch.full((len(error),), spread_weight / rays, device=error.device)
         spread = (each * backend.distortion(done.samples, done.weights, lattice)).sum()
         grad_weights = backend.distortion_backward(done.samples, done.weights, lattice, each)
-        return Loss(squared_error + spread, squared_error, grad, grad_weights)
+        return Loss(squared_error + spread, squared_error, grad, grad_weights, photos)
 
     def _finite(self, step: int, parts: Sequence[_Part]) -> tuple[float, float]:
         """Loss and squared error as numbers, once they and all gradients are known to be finite.
@@ -188,12 +211,17 @@ class GridTrainer:
                 raise NonFinite(quantity, step, _whole([part.batch for part in parts]))
         return loss_now, error_now
 
-    def _update(self, parts: Sequence[_Part], rate: float, count: int) -> None:
-        """Of the table's levels, which share no rows, of the networks and of the cache: each work for a core."""
+    def _update(self, parts: Sequence[_Part], factor: float, count: int) -> None:
+        """Of the table's levels, which share no rows, of the networks, of what is learnt of photos and of the cache:
+        each work for a core. ``factor``: of all learning rates."""
         finest_first = range(len(self.model.layout.resolutions) - 1, -1, -1)  # no core waits long for the last
+        rate = self.settings.rate * factor
         work = [partial(self._update_level, level, parts, rate, count) for level in finest_first]
-        work.append(partial(self._update_networks, [part.weights for part in parts], rate, count))
+        of_networks = [part.weights._asdict() for part in parts]
+        work.append(partial(self._update_small, Weights._fields, of_networks, rate, count))
         work.append(partial(self._raise_cache, parts))
+        for of_photos in self.photo_parts:
+            work.append(partial(self._update_photos, of_photos, parts, of_photos.rate * factor, count))
         for _ in in_order(lambda update: update(), work, self.bank.device):
             pass
 
@@ -211,11 +239,20 @@ class GridTrainer:
             count,
         )
 
-    def _update_networks(self, of_parts: Sequence[Weights], rate: float, count: int) -> None:
-        for name, gradients in zip(Weights._fields, zip(*of_parts, strict=True), strict=True):
-            gradient = torch.stack(gradients).sum(0)
+    def _update_small(
+        self, names: Iterable[str], of_parts: Sequence[dict[str, Tensor]], rate: float, count: int
+    ) -> None:
+        """Of parameters that are small beside the table."""
+        for name in names:
+            gradient = torch.stack([part[name] for part in of_parts]).sum(0)
             parameter, mean, square = self.parameters[name], self.mean[name], self.square[name]
             self.model.backend.adam(parameter, gradient, mean, square, rate, count)
+
+    def _update_photos(
+        self, of_photos: PhotoRays | PhotoColours, parts: Sequence[_Part], rate: float, count: int
+    ) -> None:
+        self._update_small(of_photos.parameters, [part.photos for part in parts], rate, count)
+        of_photos.settle()
 
     def _raise_cache(self, parts: Sequence[_Part]) -> None:
         for part in parts:

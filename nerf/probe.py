@@ -2,11 +2,13 @@
 
 from typing import NamedTuple
 
-from jaxtyping import Float
+import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
+from nerf.effects import AS_RENDERED, PhotoColours, Seen
 from nerf.metrics import mean_squared_error, psnr
-from nerf.model import RadianceModel
+from nerf.model import RadianceModel, Rendering
 from nerf.randomness import generator
 from nerf.ray_bank import RayBank
 from nerf.rays import Rays
@@ -15,11 +17,12 @@ from nerf.training import over
 
 
 class Probe(NamedTuple):
-    """Rays, what they should see, and the background both are shown over."""
+    """Rays, what they should see, the background both are shown over, and the views that the rays belong to."""
 
     rays: Rays
     colours: Float[Tensor, "rays 3"]
     background: Float[Tensor, "3"]
+    view: Int[Tensor, "rays"]
 
     @property
     def flat_psnr(self) -> float:
@@ -37,12 +40,14 @@ class ProbeResult(NamedTuple):
 
 def make_probe(bank: RayBank, count: int, background: Float[Tensor, "3"], seed: int) -> Probe:
     """Draw ``count`` pixels of ``bank``, always the same for the same seed."""
-    rays, colour, alpha = bank.sample(count, generator(bank.device, seed))
-    return Probe(rays, over(colour, alpha, background), background)
+    rays, colour, alpha, view = bank.sample(count, generator(bank.device, seed))
+    return Probe(rays, over(colour, alpha, background), background, view)
 
 
-def measure(model: RadianceModel, probe: Probe) -> ProbeResult:
-    """Render the probe and compare."""
+@torch.no_grad()
+def measure(model: RadianceModel, probe: Probe, photo_colours: PhotoColours = AS_RENDERED) -> ProbeResult:
+    """Render the probe and compare it with the photos, each as ``photo_colours`` takes it to show the field."""
     one_row = Rays(*(part[None] for part in probe.rays))
-    seen = render_image(model, one_row, probe.background)
-    return ProbeResult(psnr(mean_squared_error(seen.colour[0], probe.colours)), float(seen.opacity.mean()))
+    seen = Rendering(*(part[0] for part in render_image(model, one_row, probe.background)))
+    residual = photo_colours.residual(Seen(seen, probe.background, probe.view), probe.colours)
+    return ProbeResult(psnr(float(residual.square().mean())), float(seen.opacity.mean()))

@@ -25,6 +25,15 @@ from nerf.rays import Rays
 LEAST_FORWARD = 0.5
 
 
+class Drawn(NamedTuple):
+    """Pixels with the rays through them: colour and alpha in [0, 1] (None without such a channel), and whose view."""
+
+    rays: Rays
+    colour: Float[Tensor, "rays 3"]
+    alpha: Float[Tensor, "rays"] | None
+    view: Int[Tensor, "rays"]
+
+
 class RayBank(NamedTuple):
     """Photos as one table of pixels; make it with :func:`ray_bank` or :func:`build_ray_bank`.
 
@@ -77,15 +86,15 @@ class RayBank(NamedTuple):
             raise ValueError("the masks ignore every pixel")
         return self._replace(runs=runs.to(self.device))
 
-    def lookup(self, pixel: Int[Tensor, "rays"]) -> tuple[Rays, Float[Tensor, "rays 3"], Float[Tensor, "rays"] | None]:
-        """The rays through given pixels, with the pixels' colours and alpha in [0, 1] (None without a channel)."""
+    def lookup(self, pixel: Int[Tensor, "rays"]) -> Drawn:
+        """Given pixels, and the rays through them."""
         view = torch.searchsorted(self.first_pixel, pixel, right=True).sub_(1)
         geometry = self.geometry.index_select(1, view)
         bearing = self._bearing(pixel, self.layout.index_select(1, view), geometry[14:])
         directions = (geometry[:9].view(3, 3, -1) * bearing).sum(1)
         rays = Rays(geometry[9:12].T.contiguous(), directions.T.contiguous(), geometry[12], geometry[13])
         values = self.pixels.index_select(0, pixel).float().div_(255)
-        return rays, values[:, :3], values[:, 3] if values.shape[1] == 4 else None
+        return Drawn(rays, values[:, :3], values[:, 3] if values.shape[1] == 4 else None, view)
 
     def _bearing(
         self, pixel: Int[Tensor, "rays"], layout: Int[Tensor, "4 rays"], per_pixel: Float[Tensor, "2 rays"]
@@ -101,9 +110,7 @@ class RayBank(NamedTuple):
         bearing = torch.addcmul(torch.addcmul(patch[:3], patch[3:6], u), patch[6:], v)
         return bearing / bearing.square().sum(0).sqrt_()
 
-    def sample(
-        self, count: int, generator: torch.Generator
-    ) -> tuple[Rays, Float[Tensor, "rays 3"], Float[Tensor, "rays"] | None]:
+    def sample(self, count: int, generator: torch.Generator) -> Drawn:
         """:meth:`lookup` of ``count`` pixels drawn uniformly from those that may be, with replacement."""
         drawn = torch.randint(self.drawable, (count,), generator=generator, device=self.device)
         return self.lookup(drawn if self.runs is None else _in_runs(self.runs, drawn))

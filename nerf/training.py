@@ -9,11 +9,12 @@ from functools import partial
 from typing import Literal, NamedTuple, Protocol
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
+from nerf.effects import AS_GIVEN, AS_RENDERED, PhotoColours, PhotoRays, Seen
 from nerf.metrics import psnr
-from nerf.model import RadianceModel
+from nerf.model import RadianceModel, Rendering
 from nerf.paper import PaperNerf
 from nerf.parallel import in_order
 from nerf.randomness import generator
@@ -40,6 +41,16 @@ class FieldTrainer(Protocol):
     @property
     def model(self) -> RadianceModel:
         """The field as it is now."""
+        ...
+
+    @property
+    def photo_rays(self) -> PhotoRays:
+        """Where the photos' rays run."""
+        ...
+
+    @property
+    def photo_colours(self) -> PhotoColours:
+        """What the photos make of its colours."""
         ...
 
     def step(self, step: int, share: float, rate_scale: float) -> StepResult:
@@ -76,11 +87,16 @@ class TrainerSettings:
 
 
 class Batch(NamedTuple):
-    """Rays with the colour each should see, and the background behind all of them."""
+    """Rays with the colour each should see, the view each belongs to, and the background behind all of them."""
 
     rays: Rays
     target: Float[Tensor, "rays 3"]
+    view: Int[Tensor, "rays"]
     background: Float[Tensor, "3"]
+
+    def part(self, rows: slice) -> "Batch":
+        """Some of the rays."""
+        return Batch(Rays(*(part[rows] for part in self.rays)), self.target[rows], self.view[rows], self.background)
 
 
 def over(
@@ -102,14 +118,30 @@ class _Part(NamedTuple):
 
 class PaperTrainer:
     """Trains coarse and fine network together on |C_c - C|² + |C_f - C|² (Mildenhall et al. 2020, eq. 6) by Adam
-    with the published constants; the loss is the mean over rays and channels."""
+    with the published constants; the loss is the mean over rays and channels. ``photo_rays`` and ``photo_colours``
+    stand between the field and each photo (nerf/effects)."""
 
-    def __init__(self, model: PaperNerf, bank: RayBank, settings: TrainerSettings) -> None:
+    def __init__(
+        self,
+        model: PaperNerf,
+        bank: RayBank,
+        settings: TrainerSettings,
+        photo_rays: PhotoRays = AS_GIVEN,
+        photo_colours: PhotoColours = AS_RENDERED,
+    ) -> None:
         self.model = model
         self.bank = bank
         self.settings = settings
-        self.parameters = [p for p in model.parameters() if p.requires_grad]
-        self.optimiser = torch.optim.Adam(self.parameters, betas=(0.9, 0.999), eps=1e-7, fused=True)
+        self.photo_rays, self.photo_colours = photo_rays, photo_colours
+        self.photo_parts = [part for part in (photo_rays, photo_colours) if part.parameters]
+        self.photo_parameters = {**photo_rays.parameters, **photo_colours.parameters}
+        networks = [p for p in model.parameters() if p.requires_grad]
+        groups = [{"params": networks, "of_start": 1.0}]
+        for part in self.photo_parts:
+            learnt = [parameter.requires_grad_() for parameter in part.parameters.values()]
+            groups.append({"params": learnt, "of_start": part.rate / settings.rate_start})
+        self.parameters = [parameter for group in groups for parameter in group["params"]]
+        self.optimiser = torch.optim.Adam(groups, betas=(0.9, 0.999), eps=1e-7, fused=True)
 
     def step(self, step: int, share: float, rate_scale: float = 1.0) -> StepResult:
         """One batch, one update. Raises NonFinite before the update, leaving model and optimiser as they were."""
@@ -127,26 +159,35 @@ class PaperTrainer:
         for parameter, gradient in zip(self.parameters, gradients, strict=True):
             parameter.grad = gradient
         rate = rate_scale * learning_rate(share, self.settings.rate_start, self.settings.rate_end)
-        self.optimiser.param_groups[0]["lr"] = rate
+        for group in self.optimiser.param_groups:
+            group["lr"] = rate * group["of_start"]
         self.optimiser.step()
+        with torch.no_grad():
+            for part in self.photo_parts:
+                part.settle()
         return StepResult(loss, psnr(error), self.settings.batch_rays)
 
     def _part(self, batch: Batch, step: int, start: int) -> _Part:
         """What a slice of the batch adds to loss and gradient; it draws its samples from its own random numbers."""
         size = CHUNK_RAYS.get(self.bank.device.type, self.settings.batch_rays)
-        rays = Rays(*(part[start : start + size] for part in batch.rays))
-        target = batch.target[start : start + size]
+        rays, target, view, background = batch.part(slice(start, start + size))
         random = generator(self.bank.device, self.settings.seed, step, 1 + start)
-        coarse, fine = self.model.render_training(rays, batch.background, random)
-        fine_error = (fine.colour - target).square().sum() / batch.target.numel()
+        coarse, fine = self.model.render_training(self.photo_rays.forward(rays, view), background, random)
+
+        def squared_error(rendering: Rendering) -> Float[Tensor, ""]:
+            residual = self.photo_colours.residual(Seen(rendering, background, view), target)
+            return residual.square().sum() / batch.target.numel()
+
+        fine_error = squared_error(fine)
         # A field without hierarchy has one rendering and counts it once.
-        coarse_error = (coarse.colour - target).square().sum() / batch.target.numel()
-        loss = fine_error if coarse is fine else coarse_error + fine_error
+        loss = fine_error if coarse is fine else squared_error(coarse) + fine_error
         return _Part(loss.detach(), fine_error.detach(), torch.autograd.grad(loss, self.parameters))
 
     def state(self) -> dict[str, Tensor]:
-        """Weights as ``model.<name>``, Adam's moments and step counts as ``adam.<parameter>.<name>``."""
+        """Weights as ``model.<name>``, what is learnt of photos as ``photo.<name>``, Adam's moments and step counts as
+        ``adam.<parameter>.<name>``."""
         tensors = {f"model.{name}": tensor for name, tensor in self.model.state_dict().items()}
+        tensors |= {f"photo.{name}": tensor.detach() for name, tensor in self.photo_parameters.items()}
         for index, moments in self.optimiser.state_dict()["state"].items():
             tensors |= {f"adam.{index}.{name}": tensor for name, tensor in moments.items()}
         return tensors
@@ -159,6 +200,8 @@ class PaperTrainer:
             kind, name = key.split(".", 1)
             if kind == "model":
                 weights[name] = tensor
+            elif kind == "photo":
+                self.photo_parameters[name].detach().copy_(tensor)
             else:
                 index, name = name.split(".")
                 moments.setdefault(int(index), {})[name] = tensor.clone()
@@ -167,13 +210,13 @@ class PaperTrainer:
         self.optimiser.load_state_dict({"state": moments, "param_groups": groups})
 
     def _batch(self, random: torch.Generator) -> Batch:
-        rays, colour, alpha = self.bank.sample(self.settings.batch_rays, random)
+        rays, colour, alpha, view = self.bank.sample(self.settings.batch_rays, random)
         if self.settings.background == "random":
             background = torch.rand(3, generator=random, device=self.bank.device)
         else:
             background = torch.tensor(self.settings.background, device=self.bank.device)
-        return Batch(rays, over(colour, alpha, background), background)
+        return Batch(rays, over(colour, alpha, background), view, background)
 
 
 def _tensors_of(batch: Batch) -> dict[str, Tensor]:
-    return batch.rays._asdict() | {"target": batch.target, "background": batch.background}
+    return batch.rays._asdict() | {"target": batch.target, "view": batch.view, "background": batch.background}

@@ -2,13 +2,13 @@
 
 from types import ModuleType
 
-from stages import evaluate, ingest, mesh, normalise, render, report, sfm, train
+from stages import effects, evaluate, ingest, mesh, normalise, render, report, sfm, train
 
-# effects has its place between normalise and train.
 STAGES: dict[str, ModuleType] = {
     "ingest": ingest,
     "sfm": sfm,
     "normalise": normalise,
+    "effects": effects,
     "train": train,
     "evaluate": evaluate,
     "render": render,
@@ -20,6 +20,7 @@ EXIT_CODES = {
     "ingest": 10,
     "sfm": 11,
     "normalise": 12,
+    "effects": 13,
     "train": 14,
     "evaluate": 15,
     "render": 16,

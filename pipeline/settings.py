@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from stages.contract import StageError
+from stages.effects import Config as EffectsConfig
 from stages.evaluate import Config as EvaluateConfig
 from stages.ingest import Config as IngestConfig
 from stages.mesh import Config as MeshConfig
@@ -34,6 +35,7 @@ class Settings(BaseModel):
     ingest: IngestConfig = IngestConfig()
     sfm: SfmConfig = SfmConfig()
     normalise: NormaliseConfig = NormaliseConfig()
+    effects: EffectsConfig = EffectsConfig()
     train: TrainConfig = TrainConfig()
     evaluate: EvaluateConfig = EvaluateConfig()
     render: RenderConfig = RenderConfig()

@@ -6,14 +6,15 @@ from typing import TYPE_CHECKING, Any, Literal
 from pydantic import Field, model_validator
 
 from stages.contract import Inputs, Progress, StageConfig, StageResult
+from stages.effect_decisions import read_decisions
 from stages.files import read_scene, write_json
 from stages.live_line import short_count
 
 if TYPE_CHECKING:
     from stages.training_loop import TrainingRun
 
-NEEDS = ("ingest", "normalise")
-VERSION = 4
+NEEDS = ("ingest", "normalise", "effects")
+VERSION = 5
 RESUMES = True
 LINKS = ("curve.json",)
 UNKEYED = ("checkpoint_seconds", "tensorboard")
@@ -51,7 +52,7 @@ GRID_SAMPLES = 1 << 14
 GRID_ONLY = ("backend", "chunks", "levels", "log2_rows", "finest", "batch_samples")
 PAPER_ONLY = (
     *("batch_rays", "depth", "width", "skip", "position_frequencies", "direction_frequencies"),
-    *("samples_coarse", "samples_fine", "view_dependence", "positional_encoding", "hierarchical"),
+    *("samples_coarse", "samples_fine", "positional_encoding", "hierarchical"),
     *("density_activation", "spacing"),
 )
 
@@ -80,7 +81,10 @@ class Config(StageConfig):
     background: Literal["white", "black", "random"] | None = Field(
         default=None, description="behind photos with transparency; none: random for grid, white for paper"
     )
-    contracted: bool | None = Field(default=None, description="fold in unbounded space; none: if the photos show any")
+    contracted: bool | None = Field(default=None, description="fold in unbounded space; none: as stage effects decided")
+    view_dependence: bool | None = Field(
+        default=None, description="let colour depend on the direction; none: as stage effects decided"
+    )
 
     backend: Literal["warp", "torch"] | None = Field(
         default=None, description="grid: its kernels; none: warp where they run, torch runs anywhere"
@@ -109,7 +113,6 @@ class Config(StageConfig):
     samples_fine: int | None = Field(
         default=None, ge=1, description="paper: on each ray, placed by the coarse network's weights"
     )
-    view_dependence: bool = Field(default=True, description="paper: let colour depend on the direction")
     positional_encoding: bool = Field(default=True, description="paper: lift coordinates to sines and cosines")
     hierarchical: bool = Field(default=True, description="paper: place fine samples by a coarse network")
     density_activation: Literal["softplus", "relu"] = Field(
@@ -151,14 +154,13 @@ class Config(StageConfig):
 
 
 def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
-    """Everything that was left open: field and budget, contraction from the scene, then sizes and the photos' size."""
-    scene = read_scene(inputs["normalise"])
+    """Everything that was left open: field and budget, what stage effects decided, then sizes and the photos' size."""
+    scene, decisions = read_scene(inputs["normalise"]), read_decisions(inputs["effects"])
     preset = config.preset or "standard"
     seconds = SECONDS[preset] if config.steps is None and config.seconds is None else config.seconds
-    contracted = not scene.bounded if config.contracted is None else config.contracted
-    chosen = {"field": config.kind, "preset": preset, "seconds": seconds, "contracted": contracted}
-    config = config.model_copy(update=chosen)
-    config = _filled(config, _grid_habits(config) if config.kind == "grid" else _paper_habits(config))
+    config = config.model_copy(update={"field": config.kind, "preset": preset, "seconds": seconds})
+    config = _filled(config, {"contracted": decisions.unbounded, "view_dependence": decisions.view_dependence})
+    config = with_habits(config)
     if config.kind == "grid":
         from stages.backend import chosen_backend, load_backend
         from stages.device import compute_device, cores
@@ -175,6 +177,11 @@ def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
         if config.kind == "grid":
             config = _filled(config, grid_size(config, scene, rays))
     return config
+
+
+def with_habits(config: Config) -> Config:
+    """``config`` with what its field is usually trained with where it leaves that open."""
+    return _filled(config, _grid_habits(config) if config.kind == "grid" else _paper_habits(config))
 
 
 def _grid_habits(config: Config) -> dict[str, Any]:
@@ -203,6 +210,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     Raises:
         StageError: if training diverges or the field does not learn, every remedy of ours having failed.
     """
+    from stages.effect_decisions import learnt_of_photos
     from stages.field_files import save_field
     from stages.training_setup import field_background, prepare
 
@@ -211,6 +219,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     training.train()
     info = {"downscale": config.downscale, "steps": training.state.step, "rays": training.state.rays}
     info["background"] = list(field_background(config, scene))
+    info |= learnt_of_photos(training.trainer, scene.of_split("train"))
     save_field(folder, training.trainer.model, info)
     write_json(folder / "curve.json", training.state.curve)
     return _result(config, training, folder)

@@ -22,7 +22,7 @@ from stages.files import read_json, write_durably
 from stages.live_line import live_line, short_count
 
 if TYPE_CHECKING:
-    from nerf.probe import Probe
+    from nerf.probe import Probe, ProbeResult
     from nerf.schedule import StepPlan
     from nerf.training import FieldTrainer, NonFinite
     from stages.training_log import TrainingLog
@@ -189,11 +189,12 @@ class TrainingRun:
         from nerf.probe import measure
 
         started = time.perf_counter()
-        heldout = None if self.probes.heldout is None else measure(self.trainer.model, self.probes.heldout).psnr
+        shown = self.trainer.photo_colours.shown(self.trainer.model)
+        heldout = None if self.probes.heldout is None else measure(shown, self.probes.heldout).psnr
         cost = time.perf_counter() - started
         seconds = self.state.seconds
         # Right after a kill at the very end no step has told how well the batches go.
-        train = self.pace.psnr if self.pace.count else measure(self.trainer.model, self.probes.train).psnr
+        train = self.pace.psnr if self.pace.count else self._on_training_photos().psnr
         self.next_measurement = max(MEASUREMENT_GROWTH * seconds, seconds + cost / MOST_MEASURING)
         point = {"step": self.state.step, "seconds": round(seconds, 3), "train_psnr": round(train, 3)}
         point["heldout_psnr"] = None if heldout is None else round(heldout, 3)
@@ -228,14 +229,17 @@ class TrainingRun:
 
     def _symptom(self) -> str | None:
         """What is wrong with the field after its warm-up, or None; judged on training photos alone."""
-        from nerf.probe import measure
-
-        seen = measure(self.trainer.model, self.probes.train)
+        seen = self._on_training_photos()
         if seen.opacity < EMPTY_OPACITY:
             return f"it is empty (mean opacity {seen.opacity:.0e})"
         if seen.psnr <= self.probes.train.flat_psnr:
             return f"it is no better than a flat colour ({seen.psnr:.1f} of {self.probes.train.flat_psnr:.1f} dB)"
         return None
+
+    def _on_training_photos(self) -> "ProbeResult":
+        from nerf.probe import measure
+
+        return measure(self.trainer.model, self.probes.train, self.trainer.photo_colours)
 
     def _restart(self, symptom: str) -> None:
         """Begin anew with another seed; give up by name after the second."""

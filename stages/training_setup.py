@@ -9,6 +9,7 @@ from stages.device import compute_device
 from stages.live_line import short_count
 
 if TYPE_CHECKING:
+    from nerf.effects import PhotoColours, PhotoRays
     from nerf.grid_field import GridSettings
     from nerf.grid_training import GridTrainerSettings
     from nerf.paper import PaperSettings
@@ -33,6 +34,7 @@ def prepare(config: "Config", scene: "Scene", inputs: Inputs, folder: Path, prog
     import torch
 
     from nerf.probe import make_probe
+    from stages.effect_decisions import photo_parts, read_decisions
     from stages.training_data import training_bank
     from stages.training_log import TrainingLog
     from stages.training_loop import Budget, Probes, TrainingRun
@@ -48,8 +50,11 @@ def prepare(config: "Config", scene: "Scene", inputs: Inputs, folder: Path, prog
         unseen = training_bank(inputs["ingest"], scene, "test", config.downscale, progress).to(device)
         heldout = make_probe(unseen, PROBE_RAYS, shown_over, config.seed)
     _say_sizes(config, bank, progress)
+    decisions, views = read_decisions(inputs["effects"]), scene.of_split("train")
     return TrainingRun(
-        lambda attempt: make_trainer(config, scene, bank, config.seed + attempt),
+        lambda attempt: make_trainer(
+            config, scene, bank, config.seed + attempt, photo_parts(decisions, views, bank.device)
+        ),
         Probes(make_probe(bank, PROBE_RAYS, shown_over, config.seed), heldout),
         Budget(config.steps, config.seconds),
         folder,
@@ -59,8 +64,18 @@ def prepare(config: "Config", scene: "Scene", inputs: Inputs, folder: Path, prog
     )
 
 
-def make_trainer(config: "Config", scene: "Scene", bank: "RayBank", seed: int) -> "FieldTrainer":
-    """A fresh field of the kind that ``config`` asks for, with its trainer, where ``bank`` is."""
+def make_trainer(
+    config: "Config",
+    scene: "Scene",
+    bank: "RayBank",
+    seed: int,
+    photo_parts: "tuple[PhotoRays, PhotoColours] | None" = None,
+) -> "FieldTrainer":
+    """A fresh field of the kind that ``config`` asks for, with its trainer, where ``bank`` is. ``photo_parts`` stand
+    between it and the photos; None: nothing does."""
+    from nerf.effects import AS_GIVEN, AS_RENDERED
+
+    photo_parts = photo_parts or (AS_GIVEN, AS_RENDERED)
     if config.field == "grid":
         from nerf.grid_field import GridField
         from nerf.grid_training import GridTrainer
@@ -69,12 +84,12 @@ def make_trainer(config: "Config", scene: "Scene", bank: "RayBank", seed: int) -
         assert config.backend, "plan() chooses it"
         backend = load_backend(config.backend, bank.device.type)
         model = GridField(grid_settings(config), seed, backend).to(bank.device)
-        return GridTrainer(model, bank, grid_trainer_settings(config, scene, seed))
+        return GridTrainer(model, bank, grid_trainer_settings(config, scene, seed), *photo_parts)
     from nerf.paper import PaperNerf
     from nerf.training import PaperTrainer
 
     published = PaperNerf(paper_settings(config), seed).to(bank.device)
-    return PaperTrainer(published, bank, paper_trainer_settings(config, scene, seed))
+    return PaperTrainer(published, bank, paper_trainer_settings(config, scene, seed), *photo_parts)
 
 
 def _say_sizes(config: "Config", bank: "RayBank", progress: Progress) -> None:
@@ -101,6 +116,7 @@ def grid_settings(config: "Config") -> "GridSettings":
         steps=min(max(config.finest, FEWEST_STEPS), MOST_STEPS),
         shortest_step=2 / config.finest,
         cone=8 / config.finest,
+        view_dependence=config.view_dependence is not False,
     )
 
 

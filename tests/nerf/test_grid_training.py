@@ -5,6 +5,10 @@ import pytest
 import torch
 from torch import Tensor
 
+from nerf.effects import AS_GIVEN, AS_RENDERED
+from nerf.effects.exposure import expose
+from nerf.effects.exposures import Exposures
+from nerf.effects.poses import RefinedPoses
 from nerf.grid_field import GridField, GridSettings
 from nerf.grid_training import GridBatch, GridTrainer, GridTrainerSettings, rate_factor
 from nerf.kernels import reference
@@ -90,7 +94,7 @@ def test_the_gradient_of_a_batch_is_the_sum_over_its_chunks() -> None:
         *(torch.cat(part) for part in zip(*(part.batch[1:] for part in parts), strict=True)),
     )
     done = run.model.forward(whole.rays, whole.jitter, whole.background)
-    loss = run._loss(4 * rays, 0.1, done, whole.target)
+    loss = run._loss(4 * rays, 0.1, done, whole)
     gradients = run.model.backward(done, loss.grad, loss.grad_weights)
     summed = [torch.stack(of_parts).sum(0) for of_parts in zip(*(part.weights for part in parts), strict=True)]
     torch.testing.assert_close(summed, list(gradients.weights), rtol=1e-4, atol=1e-9)
@@ -114,7 +118,7 @@ def test_empty_space_is_closed_and_the_object_stays_open() -> None:
     words = torch.stack([(run.model.bits >> bit) & 1 for bit in range(64)], -1)
     opened = words.sum() / FIELD.cache_cells**3
     assert 0.02 < opened < 0.7
-    rays, _, alpha = run.bank.lookup(torch.arange(len(run.bank.pixels)))
+    rays, _, alpha, _ = run.bank.lookup(torch.arange(len(run.bank.pixels)))
     opacity = run.model.render(rays, torch.ones(3)).opacity
     assert opacity[alpha == 1].mean() > 0.7
     assert opacity[alpha == 0].mean() < 0.1
@@ -203,3 +207,68 @@ def test_a_density_cache_of_an_unbounded_scene_has_finite_steps_everywhere() -> 
     cache.refresh(15, torch.Generator().manual_seed(1))
     assert cache.thickness.isfinite().all()
     assert cache.thickness.max() > 20 * cache.thickness.min() > 0
+
+
+def unequal_bank() -> RayBank:
+    """The two views of the disc, the second at half the light, without transparency."""
+    bank = small_bank()
+    pixels = bank.pixels.clone()
+    half = len(pixels) // 2
+    pixels[half:, :3] = (255 * expose(pixels[half:, :3] / 255, torch.full((3,), -math.log(2)))).round().byte()
+    return bank._replace(pixels=pixels[:, :3].contiguous())
+
+
+def test_exposures_are_learnt_where_they_are_modelled() -> None:
+    settings = replace(TRAINER, background=(1.0, 1.0, 1.0))
+    errors = []
+    for colours in (AS_RENDERED, Exposures(torch.zeros(2, 3))):
+        run = GridTrainer(GridField(FIELD, 0, reference), unequal_bank(), settings, AS_GIVEN, colours)
+        for step in range(150):
+            result = run.step(step, step / 150)
+        errors.append(result.psnr)
+    learnt = colours.parameters["log_gain"]
+    assert 0.1 < float((learnt[0] - learnt[1]).mean()) < 0.8 and float(learnt.mean()) == pytest.approx(0, abs=1e-6)
+    assert errors[1] > errors[0] + 0.5
+
+
+def test_the_gradient_of_poses_is_that_of_the_loss() -> None:
+    poses = RefinedPoses(2)
+    poses.turn += torch.tensor([[0.02, 0.01, -0.01], [0.0, -0.02, 0.03]])
+    run = GridTrainer(GridField(FIELD, 0, reference), small_bank(), replace(TRAINER, background=(0.2, 0.9, 0.5)), poses)
+    for step in range(60):
+        run.step(step, 0.5)
+    by_hand, losses = run._part(7, 0.5, 128, 0).photos, []
+    for sign in (1, -1):
+        poses.shift[0, 0] += sign * 2e-3
+        losses.append(float(run._part(7, 0.5, 128, 0).loss))
+        poses.shift[0, 0] -= sign * 2e-3
+    assert float(by_hand["shift"][0, 0]) == pytest.approx((losses[0] - losses[1]) / 4e-3, rel=0.2)
+    assert set(by_hand) == {"turn", "shift"} and all(g.isfinite().all() for g in by_hand.values())
+
+
+def test_what_is_learnt_of_photos_is_part_of_the_state() -> None:
+    def fresh() -> GridTrainer:
+        parts = RefinedPoses(2), Exposures(torch.tensor([[0.0, 0, 0], [0.5, 0.5, 0.5]]))
+        return GridTrainer(GridField(FIELD, 0, reference), small_bank(), TRAINER, *parts)
+
+    whole, first, second = fresh(), fresh(), fresh()
+    for step in range(20):
+        whole.step(step, step / 20)
+    for step in range(10):
+        first.step(step, step / 20)
+    second.load_state(copied(first.state()))
+    for step in range(10, 20):
+        second.step(step, step / 20)
+    assert same(whole.state(), second.state())
+    assert {"photo.turn", "photo.shift", "photo.log_gain", "mean.turn"} <= whole.state().keys()
+    with pytest.raises(RuntimeError, match="photo"):
+        trainer().load_state(whole.state())
+
+
+def test_without_view_dependence_a_point_has_one_colour() -> None:
+    run = GridTrainer(GridField(replace(FIELD, view_dependence=False), 0, reference), small_bank(), TRAINER)
+    for step in range(60):
+        result = run.step(step, step / 60)
+    points, directions = torch.rand(50, 3) - 0.5, torch.nn.functional.normalize(torch.randn(2, 50, 3), dim=-1)
+    assert torch.equal(run.model.colour(points, directions[0]), run.model.colour(points, directions[1]))
+    assert result.psnr > 12 and run.model.colour_hidden.shape[0] == 16

@@ -24,7 +24,7 @@ def scattered(channels: int = 3) -> tuple[RayBank, list[Tensor], list[Tensor], T
 
 def test_every_pixel_gets_its_own_ray_and_colour() -> None:
     bank, photos, bearings, poses = scattered()
-    rays, colours, alpha = bank.lookup(torch.arange(3 * 5 + 4 * 2 + 3 * 5))
+    rays, colours, alpha, _ = bank.lookup(torch.arange(3 * 5 + 4 * 2 + 3 * 5))
     expected = [rays_of_view(bearings[c], poses[v], v + 1.0, v + 6.0) for v, c in enumerate(CAMERAS)]
     for name, width in {"origins": (3,), "directions": (3,), "near": (), "far": ()}.items():
         flat = torch.cat([getattr(part, name).reshape(-1, *width) for part in expected])
@@ -35,7 +35,7 @@ def test_every_pixel_gets_its_own_ray_and_colour() -> None:
 
 def test_the_fourth_channel_is_alpha() -> None:
     bank, photos, _, _ = scattered(channels=4)
-    _, colours, alpha = bank.lookup(torch.tensor([0, 7]))
+    _, colours, alpha, _ = bank.lookup(torch.tensor([0, 7]))
     assert alpha is not None
     assert torch.equal(alpha, photos[0].flatten(0, 1)[[0, 7], 3].float() / 255)
     assert torch.equal(colours, photos[0].flatten(0, 1)[[0, 7], :3].float() / 255)

@@ -1,10 +1,11 @@
-"""A tiny finished ingest and normalise: photos of a ball, with exact cameras, as files."""
+"""A tiny finished ingest, normalise and effects: photos of a ball, with exact cameras, as files."""
 
 from pathlib import Path
 
 import numpy as np
 
 from nerf.scene import Camera, Scene, Similarity, View
+from stages.effect_decisions import Decisions, write_decisions
 from stages.files import write_json, write_png
 
 WIDTH, HEIGHT, FOCAL = 24, 16, 20.0
@@ -34,9 +35,11 @@ def photographed(
     """Write photos, scene.json and a ``mask`` (0 ignore, 255 use) for all; every fourth view is a test view."""
     from PIL import Image
 
-    inputs = {name: folder / name for name in ("ingest", "normalise")}
+    inputs = {name: folder / name for name in ("ingest", "normalise", "effects")}
     (inputs["ingest"] / "images").mkdir(parents=True)
     inputs["normalise"].mkdir()
+    inputs["effects"].mkdir()
+    write_decisions(inputs["effects"], Decisions(unbounded=not bounded))
     kept = []
     for index in range(views):
         file = f"images/{index:03d}.png"

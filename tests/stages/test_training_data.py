@@ -57,7 +57,7 @@ def test_the_bank_and_the_views_are_the_same_pixels_and_rays(
 ) -> None:
     inputs, scene = photographed(tmp_path)
     bank = training_bank(inputs["ingest"], scene, "train", downscale, progress)
-    rays, colours, alpha = bank.lookup(torch.arange(len(bank.pixels)))
+    rays, colours, alpha, _ = bank.lookup(torch.arange(len(bank.pixels)))
     views = scene.of_split("train")
     assert alpha is None and len(bank.near) == len(views) == 6
     pixels = [view_pixels(inputs["ingest"], scene, view, downscale).flatten(0, 1) for view in views]

@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from nerf.effects import AS_GIVEN, AS_RENDERED
 from nerf.model import Rendering
 from nerf.probe import Probe
 from nerf.rays import Rays
@@ -28,6 +29,7 @@ class OneNumber:
     """Trains one number; ``trouble(step, rate_scale)`` may raise. Its model paints ``shown``, 20 dB from the truth."""
 
     chunk_rays = 64
+    photo_rays, photo_colours = AS_GIVEN, AS_RENDERED
 
     def __init__(self, seed: int, trouble: Callable[[int, float], None]) -> None:
         self.seed, self.trouble = seed, trouble
@@ -73,7 +75,7 @@ def slow(step: int, rate_scale: float) -> None:
 def probe() -> Probe:
     """Two rays, one to see black and one grey: a flat colour leaves a mean error of 1/16."""
     rays = Rays(torch.zeros(2, 3), torch.ones(2, 3), torch.ones(2), torch.ones(2))
-    return Probe(rays, torch.tensor([[0.0] * 3, [0.5] * 3]), torch.zeros(3))
+    return Probe(rays, torch.tensor([[0.0] * 3, [0.5] * 3]), torch.zeros(3), torch.tensor([0, 1]))
 
 
 def run_in(folder: Path, progress, steps: int | None = 40, seconds: float | None = None, make=None) -> TrainingRun:

@@ -1,0 +1,61 @@
+"""Where a photo was taken from, found against a finished field: for photos that took no part in training it."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerf.effects import AS_RENDERED, PhotoColours, Seen
+from nerf.effects.poses import RefinedPoses
+from nerf.grid_field import GridField
+from nerf.randomness import generator
+from nerf.rays import Rays
+
+STEPS = 60
+RAYS = 1024  # looked at in a step
+RATE = 2e-3  # radians and scene units at first, falling exponentially to
+FINAL_RATE = 0.1  # of it
+
+
+def fit_pose(
+    model: GridField,
+    rays: Rays,
+    target: Float[Tensor, "pixels 3"],
+    background: Float[Tensor, "3"],
+    photo_colours: PhotoColours = AS_RENDERED,
+    seed: int = 0,
+) -> RefinedPoses:
+    """The correction of one photo's pose that makes the field look most like it, by Adam on the squared error.
+
+    ``rays`` and ``target`` are pixels of that photo (those by which the pose may be judged), ``photo_colours`` says
+    what the photo makes of colours; both it and the field stay as they are. The correction and ``photo_colours`` know
+    a single view, 0.
+    """
+    pose, random = RefinedPoses(1, target.device), generator(target.device, seed)
+    mean, square = ({name: torch.zeros_like(part) for name, part in pose.parameters.items()} for _ in range(2))
+    for step in range(STEPS):
+        pixel = torch.randint(len(target), (min(RAYS, len(target)),), generator=random, device=target.device)
+        jitter = torch.rand(len(pixel), generator=random, device=target.device)
+        some = Rays(*(part[pixel] for part in rays))
+        gradients = _gradients(model, pose, photo_colours, (some, target[pixel], background), jitter)
+        rate = RATE * FINAL_RATE ** (step / (STEPS - 1))
+        for name, gradient in gradients.items():
+            model.backend.adam(pose.parameters[name], gradient, mean[name], square[name], rate, step + 1)
+    return pose
+
+
+def _gradients(
+    model: GridField,
+    pose: RefinedPoses,
+    photo_colours: PhotoColours,
+    pixels: tuple[Rays, Float[Tensor, "pixels 3"], Float[Tensor, "3"]],
+    jitter: Float[Tensor, "pixels"],
+) -> dict[str, Tensor]:
+    """Of the mean squared error on ``pixels`` (rays, colours, the background behind them), by the pose."""
+    rays, target, background = pixels
+    view = torch.zeros(len(target), dtype=torch.int64, device=target.device)
+    done = model.forward(pose.forward(rays, view), jitter, background.expand_as(target).contiguous())
+    seen = Seen(done.rendering, background, view)
+    residual = photo_colours.residual(seen, target)
+    grad, _ = photo_colours.backward(seen, residual * (2 / residual.numel()))
+    gradients = model.backward(done, grad, torch.zeros_like(done.weights))
+    return pose.backward(rays, view, lambda: model.rays_backward(done, gradients))

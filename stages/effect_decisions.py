@@ -1,0 +1,86 @@
+"""What stage effects decided, as the stages after it read it: ``decisions.json``."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from stages.contract import StageError
+from stages.files import read_json, write_json
+
+if TYPE_CHECKING:
+    import torch
+
+    from nerf.effects import PhotoColours, PhotoRays
+    from nerf.scene import View
+    from nerf.training import FieldTrainer
+
+
+@dataclass(frozen=True)
+class Decisions:
+    """Which effects are modelled. ``exposure``: natural logarithm of the gain per channel in linear light, by the name
+    of each training photo; None: all photos have one exposure."""
+
+    view_dependence: bool = True
+    unbounded: bool = False
+    pose_refinement: bool = False
+    exposure: dict[str, list[float]] | None = None
+
+    def log_gain(self, views: "Sequence[View]") -> "torch.Tensor":
+        """The gains of some training photos, (views, 3)."""
+        import torch
+
+        assert self.exposure is not None
+        return torch.tensor([self.exposure[view.name] for view in views])
+
+
+def write_decisions(folder: Path, decisions: Decisions) -> None:
+    """Write decisions.json."""
+    write_json(folder / "decisions.json", asdict(decisions))
+
+
+def read_decisions(folder: Path) -> Decisions:
+    """Read decisions.json. Raises StageError where it is missing or damaged."""
+    try:
+        return Decisions(**read_json(folder / "decisions.json"))
+    except TypeError as error:
+        raise StageError("cannot read decisions.json", str(error), "Delete its folder and run again.") from error
+
+
+def photo_parts(
+    decisions: Decisions, views: "Sequence[View]", device: "torch.device"
+) -> "tuple[PhotoRays, PhotoColours]":
+    """What stands between the field and the photos ``views``, in their order."""
+    from nerf.effects import AS_GIVEN, AS_RENDERED
+    from nerf.effects.exposures import Exposures
+    from nerf.effects.poses import RefinedPoses
+
+    rays = RefinedPoses(len(views), device) if decisions.pose_refinement else AS_GIVEN
+    colours = AS_RENDERED if decisions.exposure is None else Exposures.of_tracks(decisions.log_gain(views).to(device))
+    return rays, colours
+
+
+def learnt_of_photos(trainer: "FieldTrainer", views: "Sequence[View]") -> dict[str, Any]:
+    """What training learnt of each photo, for field.json: nothing where no effect is on.
+
+    ``exposure``: ``neutral``, at which the field is shown, and the gain of each photo, as natural logarithms in linear
+    light. ``poses``: each photo's rotation vector (radians) and shift (scene units), added to its calibrated pose.
+    """
+    import torch
+
+    from nerf.effects.exposures import Exposures
+    from nerf.effects.poses import RefinedPoses
+
+    learnt: dict[str, Any] = {}
+    names = [view.name for view in views]
+    if isinstance(trainer.photo_colours, Exposures):
+        gains = trainer.photo_colours.log_gain.tolist()
+        learnt["exposure"] = {"neutral": trainer.photo_colours.neutral.tolist(), "photos": _by(names, gains)}
+    if isinstance(trainer.photo_rays, RefinedPoses):
+        corrections = torch.cat([trainer.photo_rays.turn, trainer.photo_rays.shift], dim=1)
+        learnt["poses"] = _by(names, corrections.tolist())
+    return learnt
+
+
+def _by(names: list[str], rows: list[list[float]]) -> dict[str, list[float]]:
+    return dict(zip(names, rows, strict=True))

@@ -1,0 +1,167 @@
+"""Stage effects: which optional effects the scene calls for, with the evidence; the others are not simulated at all."""
+
+import math
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+from pydantic import Field
+
+from stages.contract import Inputs, Progress, StageConfig, StageResult
+from stages.effect_decisions import Decisions, write_decisions
+from stages.files import read_scene, write_json
+
+if TYPE_CHECKING:
+    from nerf.evidence.evidence import Evidence
+    from nerf.scene import Scene
+    from stages.pilots import Pilot, PilotScene
+
+NEEDS = ("ingest", "sfm", "normalise")
+VERSION = 1
+RESUMES = False
+LINKS = ("effects.json",)
+
+Switch = Literal["auto", "on", "off"]
+MOST_PILOTS = 2
+PILOT_STEPS = 150  # as many as tell ±1 EV or a highlight from none (docs/numbers.md)
+
+
+class Config(StageConfig):
+    """Which effects to model. auto decides by evidence, and says which."""
+
+    exposure: Switch = Field(default="auto", description="a gain per photo and colour channel")
+    view_dependence: Switch = Field(default="auto", description="colour that depends on the viewing direction")
+    background: Switch = Field(default="auto", description="space beyond the region of interest, folded in")
+    pose_refinement: Switch = Field(default="auto", description="a rigid correction of each photo's camera")
+    pilot_steps: int = Field(
+        default=PILOT_STEPS, ge=0, description="steps of each pilot training, where the evidence is not clear; 0: no pilots"
+    )
+    seed: int = Field(default=0, description="of the pilots")
+
+
+class Verdict(NamedTuple):
+    """Whether an effect is on, and why."""
+
+    on: bool
+    reason: str
+    pilot: "Pilot | None" = None
+
+
+def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> StageResult:
+    """Gather the evidence, decide, and write decisions.json and, for people and the report, effects.json."""
+    from stages.effect_evidence import gather
+
+    started = time.perf_counter()
+    scene = read_scene(inputs["normalise"])
+    found = gather(inputs, scene, progress)
+    statistics_seconds = time.perf_counter() - started
+    gains = dict(zip((v.name for v in scene.of_split("train")), found.log_gain.tolist(), strict=True))
+    study = _Study(config, scene, inputs["ingest"], gains, found.evidence, progress)
+    decisions, verdicts = study.decide()
+    write_decisions(folder, decisions)
+    table = {name: _entry(verdicts.get(name), evidence) for name, evidence in found.evidence.items()}
+    write_json(folder / "effects.json", table)
+    facts = {"on": [name for name, entry in table.items() if entry["on"]], "statistics_seconds": statistics_seconds}
+    return StageResult(("decisions.json",), _line(table), ("effects.json",), facts)
+
+
+class _Study:
+    """Decides effect after effect; each pilot builds on what was decided before it."""
+
+    def __init__(
+        self,
+        config: Config,
+        scene: "Scene",
+        ingest: Path,
+        gains: dict[str, list[float]],
+        evidence: "dict[str, Evidence]",
+        progress: Progress,
+    ) -> None:
+        self.config, self.scene, self.ingest, self.gains = config, scene, ingest, gains
+        self.evidence, self.progress = evidence, progress
+        self.pilots = 0
+        self.trial: PilotScene | None = None
+
+    def decide(self) -> tuple[Decisions, dict[str, Verdict]]:
+        """What to model, and the reasons by effect."""
+        decisions = Decisions(view_dependence=True, unbounded=False, pose_refinement=False, exposure=None)
+        verdicts: dict[str, Verdict] = {}
+        arms: dict[str, dict[bool, dict[str, Any]]] = {
+            "background": {True: {"unbounded": True}, False: {"unbounded": False}},
+            "exposure": {True: {"exposure": self.gains}, False: {"exposure": None}},
+            "view_dependence": {True: {"view_dependence": True}, False: {"view_dependence": False}},
+            "pose_refinement": {True: {"pose_refinement": True}, False: {"pose_refinement": False}},
+        }
+        for name, arm in arms.items():
+            off, on = (replace(decisions, **arm[value]) for value in (False, True))
+            verdicts[name] = self._verdict(name, off, on)
+            decisions = on if verdicts[name].on else off
+        return decisions, verdicts
+
+    def _verdict(self, name: str, off: Decisions, on: Decisions) -> Verdict:
+        asked: Switch = getattr(self.config, name)
+        evidence = self.evidence[name]
+        if asked != "auto":
+            return Verdict(asked == "on", f"asked for; {evidence.words}")
+        costly = name == "pose_refinement" and evidence.called_for is True
+        if evidence.called_for is not None and not costly:
+            return Verdict(evidence.called_for, evidence.words)
+        # Without a pilot an effect stays as it is in the published method: only the colour depends on the direction.
+        default = evidence.called_for or name == "view_dependence"
+        if math.isinf(evidence.noise):
+            return Verdict(default, evidence.words)
+        if why := self._why_no_pilot():
+            return Verdict(default, f"{evidence.words}; not clear, and no pilot: {why}")
+        return self._piloted(name, off, on)
+
+    def _why_no_pilot(self) -> str | None:
+        from stages.pilots import pilot_scene
+
+        if not self.config.pilot_steps:
+            return "none was wanted"
+        if self.pilots == MOST_PILOTS:
+            return f"{MOST_PILOTS} were made already"
+        if self.trial is None:
+            self.trial = pilot_scene(self.ingest, self.scene, self.progress)
+        return "too few training photos" if self.trial is None else None
+
+    def _piloted(self, name: str, off: Decisions, on: Decisions) -> Verdict:
+        from stages.pilots import run_pilot
+
+        assert self.trial is not None
+        self.pilots += 1
+        pilot = run_pilot(self.trial, off, on, self.config.pilot_steps, self.config.seed, self.progress)
+        gain = f"a pilot gained {pilot.gain_db:+.2f} ± {pilot.noise_db:.2f} dB"
+        return Verdict(pilot.pays, f"{self.evidence[name].words}; {gain}", pilot)
+
+
+def _entry(verdict: Verdict | None, evidence: "Evidence") -> dict[str, Any]:
+    """One effect in effects.json; without a verdict it is one that is decided elsewhere or only seen."""
+    pilot = verdict.pilot if verdict else None
+    return {
+        "on": verdict.on if verdict else bool(evidence.called_for),
+        "modelled": verdict is not None,
+        "statistic": _finite(evidence.statistic),
+        "unit": evidence.unit,
+        "threshold": _finite(evidence.threshold),
+        "noise": _finite(evidence.noise),
+        "pilot_gain_db": pilot.gain_db if pilot else None,
+        "pilot_noise_db": pilot.noise_db if pilot else None,
+        "cost": pilot.cost if pilot else None,
+        "seconds": round(pilot.seconds, 3) if pilot else 0.0,
+        "reason": verdict.reason if verdict else evidence.words,
+    }
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _line(table: dict[str, dict[str, Any]]) -> str:
+    """exposure on (…) · view dependence on (…) · 2 off · seen, not modelled: vignetting (…)."""
+    modelled = {name.replace("_", " "): entry for name, entry in table.items() if entry["modelled"]}
+    on = [f"{name} on ({entry['reason']})" for name, entry in modelled.items() if entry["on"]]
+    seen = [f"{n.replace('_', ' ')} ({e['reason']})" for n, e in table.items() if not e["modelled"] and e["on"]]
+    line = " · ".join([*on, f"{len(modelled) - len(on)} off"])
+    return line + (f" · seen, not modelled: {', '.join(seen)}" if seen else "")

@@ -1,0 +1,80 @@
+import math
+
+import pytest
+import torch
+
+from nerf.effects import AS_GIVEN, AS_RENDERED, PhotoColours, PhotoRays, Seen
+from nerf.effects.exposure import expose
+from nerf.effects.exposures import Exposures
+from nerf.effects.poses import RefinedPoses
+from nerf.model import Rendering
+
+VIEW = torch.tensor([0, 2, 2, 1])
+GAINS = torch.tensor([[0.5, 0.0, -0.2], [0.0, 0.3, 0.1], [-0.4, 0.1, 0.2]], dtype=torch.float64)
+BACKGROUND = torch.tensor([0.9, 0.2, 0.4], dtype=torch.float64)
+
+
+def seen(colour: torch.Tensor | None = None, opacity: torch.Tensor | None = None) -> Seen:
+    random = torch.Generator().manual_seed(0)
+    full = torch.rand(4, dtype=torch.float64, generator=random) if opacity is None else opacity
+    own = full[:, None] * (0.1 + 0.6 * torch.rand(4, 3, dtype=torch.float64, generator=random))
+    if colour is None:
+        colour = own + (1 - full)[:, None] * BACKGROUND
+    return Seen(Rendering(colour, torch.zeros_like(full), full), BACKGROUND, VIEW)
+
+
+def test_every_part_keeps_the_contract() -> None:
+    colours: list[PhotoColours] = [AS_RENDERED, Exposures(GAINS)]
+    rays: list[PhotoRays] = [AS_GIVEN, RefinedPoses(3)]
+    assert [len(part.parameters) for part in (*colours, *rays)] == [0, 1, 0, 2]
+
+
+def test_gains_of_one_show_what_is_rendered() -> None:
+    target = torch.rand(4, 3, dtype=torch.float64)
+    plain = AS_RENDERED.residual(seen(), target)
+    torch.testing.assert_close(Exposures(0 * GAINS).residual(seen(), target), plain, rtol=0, atol=1e-15)
+
+
+def test_the_gain_is_of_the_scenes_own_light() -> None:
+    nothing = seen(BACKGROUND.expand(4, 3), torch.zeros(4, dtype=torch.float64))
+    torch.testing.assert_close(Exposures(GAINS).residual(nothing, BACKGROUND.expand(4, 3)), torch.zeros(4, 3).double())
+    opaque = seen(opacity=torch.ones(4, dtype=torch.float64))
+    expected = expose(opaque.rendering.colour, GAINS[VIEW])
+    torch.testing.assert_close(Exposures(GAINS).residual(opaque, torch.zeros(4, 3).double()), expected)
+
+
+def test_backward_is_the_derivative_of_the_residual() -> None:
+    target, part = torch.zeros(4, 3, dtype=torch.float64), Exposures(GAINS)
+    grad = torch.randn(4, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
+    given = seen()
+    rendering, of_gain = part.backward(given, grad)
+    colour, opacity = (x.clone().requires_grad_() for x in (given.rendering.colour, given.rendering.opacity))
+    gains = part.log_gain.requires_grad_()
+    residual = part.residual(given._replace(rendering=Rendering(colour, given.rendering.depth, opacity)), target)
+    expected = torch.autograd.grad((residual * grad).sum(), [colour, opacity, gains])
+    torch.testing.assert_close([rendering.colour, rendering.opacity, of_gain["log_gain"]], list(expected))
+
+
+def test_a_full_pixel_asks_for_no_more_than_being_full() -> None:
+    bright = seen(torch.full((4, 3), 0.95, dtype=torch.float64), torch.ones(4, dtype=torch.float64))
+    part = Exposures(torch.full((3, 3), math.log(2), dtype=torch.float64))
+    assert (part.residual(bright, torch.ones(4, 3).double()) == 0).all()
+    assert (part.residual(bright, torch.full((4, 3), 0.9).double()) > 0.1).all(), "too bright where the photo is not full"
+
+
+def test_the_darkest_photo_shows_the_field_as_it_is_and_the_mean_gain_is_kept() -> None:
+    part = Exposures.of_tracks(GAINS)
+    assert torch.equal(part.log_gain.amin(0), torch.zeros(3).double())
+    torch.testing.assert_close(part.log_gain - part.log_gain[:1], GAINS - GAINS[:1])
+    before = part.log_gain.mean(0).clone()
+    part.log_gain += torch.tensor([[0.1, 0, 0], [0.2, 0, 0], [0.3, 0, 0.3]])
+    part.settle()
+    torch.testing.assert_close(part.log_gain.mean(0), before)
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_the_neutral_gain_is_that_of_a_usual_photo(count: int) -> None:
+    gains = torch.linspace(0, 1, count)[:, None].repeat(1, 3)
+    neutral = Exposures(gains).neutral
+    assert (gains.min(0).values <= neutral).all() and (neutral <= gains.max(0).values).all()
+    assert abs(float(neutral[0]) - 0.5) <= 0.5 / max(1, count - 1) + (count == 1) * 0.5

@@ -1,0 +1,50 @@
+import torch
+
+from nerf.effects.poses import RefinedPoses
+from nerf.rays import Rays
+
+
+def rays(count: int = 6) -> Rays:
+    random = torch.Generator().manual_seed(1)
+    directions = torch.nn.functional.normalize(torch.randn(count, 3, generator=random), dim=-1)
+    return Rays(torch.randn(count, 3, generator=random), directions, torch.ones(count), torch.full((count,), 5.0))
+
+
+VIEW = torch.tensor([0, 2, 2, 1, 0, 2])
+
+
+def test_a_correction_of_nothing_changes_no_bit() -> None:
+    same = RefinedPoses(3).forward(rays(), VIEW)
+    assert all(torch.equal(a, b) for a, b in zip(same, rays(), strict=True))
+
+
+def test_rays_turn_and_shift_with_their_own_camera() -> None:
+    poses = RefinedPoses(3)
+    poses.turn[2], poses.shift[1] = torch.tensor([0, 0, torch.pi / 2]), torch.tensor([1.0, 2, 3])
+    moved, before = poses.forward(rays(), VIEW), rays()
+    quarter = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    torch.testing.assert_close(moved.directions[VIEW == 2], before.directions[VIEW == 2] @ quarter.T)
+    torch.testing.assert_close(moved.origins[VIEW == 1] - before.origins[VIEW == 1], torch.tensor([[1.0, 2, 3]]))
+    assert torch.equal(moved.directions[VIEW == 0], before.directions[VIEW == 0])
+    torch.testing.assert_close(moved.directions.norm(dim=-1), torch.ones(6))
+
+
+def test_backward_is_the_derivative_of_forward() -> None:
+    poses, given = RefinedPoses(3), rays()
+    random = torch.Generator().manual_seed(2)
+    for part in poses.parameters.values():
+        part += 0.3 * torch.randn(3, 3, generator=random)
+    weights = [torch.randn(6, 3, generator=random) for _ in range(2)]
+    by_hand = poses.backward(given, VIEW, lambda: (weights[0], weights[1]))
+    leaves = [part.requires_grad_() for part in poses.parameters.values()]
+    moved = poses.forward(given, VIEW)
+    expected = torch.autograd.grad((moved.origins * weights[0]).sum() + (moved.directions * weights[1]).sum(), leaves)
+    torch.testing.assert_close(list(by_hand.values()), list(expected), rtol=1e-5, atol=1e-6)
+    assert list(by_hand) == list(poses.parameters)
+
+
+def test_what_all_cameras_share_is_taken_out() -> None:
+    poses = RefinedPoses(3)
+    poses.turn += torch.tensor([[1.0, 0, 0], [2, 0, 0], [3, 0, 3]])
+    poses.settle()
+    torch.testing.assert_close(poses.turn, torch.tensor([[-1.0, 0, -1], [0, 0, -1], [1, 0, 2]]))
