@@ -28,7 +28,9 @@ def background_evidence(
     share = float(np.average(beyond, weights=seen))
     effective = float(seen.sum() ** 2 / np.sum(seen**2))
     noise = float(np.sqrt(max(share * (1 - share), 1 / effective) / effective))
-    words = f"{share:.1%} of what is tracked lies beyond the region; {untracked:.0%} of the photos' area has no track near"
+    words = (
+        f"{share:.1%} of what is tracked lies beyond the region; {untracked:.0%} of the photos' area has no track near"
+    )
     return judged(share, noise, THRESHOLD, "share", words)
 
 

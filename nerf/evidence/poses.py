@@ -1,7 +1,7 @@
 """How far photos are from where their pose puts them: residuals of reprojection that a whole photo has in common."""
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from nerf.evidence.evidence import Evidence, judged, unknown
 
@@ -78,8 +78,3 @@ def pose_evidence(
         noise = float(np.sqrt(np.mean(expected[known])))
     words = f"photos are off by {common:.2g} px as a whole, ± {noise:.1g}; poses uncertain by {uncertain:.2g} px"
     return judged(max(common, uncertain), noise, THRESHOLD_PX, "px", words)
-
-
-def finite(*values: Float[np.ndarray, "views"]) -> Bool[np.ndarray, "views"]:
-    """Where all of them are numbers."""
-    return np.logical_and.reduce([np.isfinite(value) for value in values])
