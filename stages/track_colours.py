@@ -1,7 +1,7 @@
 """What the training photos show at the sparse points: their colours, and how sharp the photos are in each direction.
 
-Every photo is decoded once, in full size. A point's colour is the mean over a square window that shows the same piece of
-its surface in every photo, so near photos are given larger windows than far ones.
+Every photo is decoded once, in full size. A point's colour is the mean over a square window that shows the same piece
+of its surface in every photo, so near photos are given larger windows than far ones.
 """
 
 import os
@@ -229,7 +229,7 @@ def _window_means(pixels: "np.ndarray", used: "np.ndarray", corner: "np.ndarray"
 
 
 def _gradients(pixels: "np.ndarray") -> "np.ndarray":
-    """The mean of g g^T (2, 2) of the grey picture, at most GRADIENT_WIDTH wide; what is transparent counts as black."""
+    """The mean of g g^T (2, 2) of the grey picture, at most GRADIENT_WIDTH wide; what is transparent is black."""
     import cv2
     import numpy as np
 
@@ -250,4 +250,3 @@ def _workers(scene: "Scene") -> int:
     """How many photos to decode at a time: one per core, fewer where they are too large for that."""
     largest = max(camera.width * camera.height for camera in scene.cameras)
     return max(1, min(os.cpu_count() or 1, DECODING_BYTES // (40 * largest)))
-

@@ -6,7 +6,7 @@ from jaxtyping import Float, Int
 from nerf.evidence.evidence import Evidence, judged, unknown
 
 REGION_HALF = 0.9  # the region of interest is [-0.9, 0.9]^3 of the scene frame
-# Where a field has nothing it shows one colour; what the photos show there deviates by some 0.25 in sRGB values from it.
+# Where a field has nothing it shows one colour; the photos deviate from it there by some 0.25 in sRGB values.
 # A share q of such pixels adds 0.06 q to the squared error: half a percent of them would be 1.1 dB at 30 dB.
 # Points are not pixels: they stand where texture is, so half a percent of them is known no better than to a factor 2.
 THRESHOLD = 0.01
@@ -17,8 +17,7 @@ def background_evidence(
     position: Float[np.ndarray, "points 3"], point: Int[np.ndarray, "k"], has_alpha: bool, untracked: float
 ) -> Evidence:
     """The share of observations whose point lies beyond the region (the background is unbounded), its noise that of a
-    count of independent points; ``untracked`` only joins the words. With alpha photos say themselves that there is none.
-    """
+    count of independent points; ``untracked`` only joins the words. Photos with alpha say themselves that there is none."""
     if has_alpha:
         return Evidence(0.0, "share", THRESHOLD, 0.0, False, "the photos' alpha says what is background")
     seen = np.bincount(point, minlength=len(position)).astype(float)

@@ -17,9 +17,9 @@ GREY = 2.0  # the grey zone: from the threshold down to this part of it
 
 
 class Evidence(NamedTuple):
-    """What was measured. ``threshold``: from here on the effect is called for; the grey zone is half of it and more.
-    ``noise`` is of the statistic, both in ``unit``, infinite where nothing is known. ``called_for`` None: a pilot should
-    decide, where there is one. ``words``: one clause with its number."""
+    """What was measured. ``threshold``: from here on the effect is called for; the grey zone begins at half of it.
+    ``noise`` is of the statistic, both in ``unit``, infinite where nothing is known. ``called_for`` None: a pilot
+    should decide, where there is one. ``words``: one clause with its number."""
 
     statistic: float
     unit: str

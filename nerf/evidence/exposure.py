@@ -1,8 +1,8 @@
 """How much brighter each photo shows the same points: gains per channel, by a robust fit in log linear light.
 
 ln(light of observation k) = log_gain[photo] + brightness[point] + vignetting · radius² + noise, per channel, by
-iteratively reweighted least squares (Holland & Welsch 1977): Huber's weights from the least-squares start, then Geman and
-McClure's, which forget highlights and passers-by.
+iteratively reweighted least squares (Holland & Welsch 1977): Huber's weights from the least-squares start, then Geman
+and McClure's, which forget highlights and passers-by.
 """
 
 from typing import NamedTuple
@@ -15,8 +15,8 @@ from nerf.evidence.tracks import TrackColours, log_light, log_noise, usable
 from nerf.evidence.two_way import TwoWay, two_way
 
 EV = float(np.log(2.0))
-# A gain that is off by d in ln(light) makes an error of VALUE_PER_LOG_LIGHT d in sRGB values: HARM is d = 0.034, 0.05 EV.
-# Called for from twice that, when photos differ by 0.1 EV on the usual.
+# A gain that is off by d in ln(light) makes an error of VALUE_PER_LOG_LIGHT d in sRGB values: HARM is d = 0.034,
+# 0.05 EV. Called for from twice that, when gains deviate by 0.1 EV.
 THRESHOLD_EV = 2 * HARM / VALUE_PER_LOG_LIGHT / EV
 HUBER, REDESCENDING = 1.345, 5.0  # in robust deviations: both lose some 5 % to plain means of normal noise
 HUBER_ROUNDS, MOST_ROUNDS = 8, 30
@@ -25,13 +25,13 @@ LEAST_NOISE = 0.25 / 255  # of an sRGB value: no photo of 8 bits is more exact, 
 
 
 class ExposureFit(NamedTuple):
-    """``log_gain`` (views, 3): natural logarithm of linear light, its median over the connected photos 0 in each channel;
+    """``log_gain`` (views, 3): natural logarithm of linear light, its median over the connected photos 0 per channel;
     ``error``: its standard error, infinite (and the gain 0) where a photo shares no points with the others.
 
     ``used`` are the m observations fitted, ``rest`` (m, 3) what is left of their logarithms, ``weight`` (m, 3) their
     robust weights over the variance of their noise. ``noise`` is the robust deviation of what is left as an sRGB value.
-    ``contrast`` (views,): by how much ln(light) of a photo rises too much with that of the points, 0.1 for a power of 1.1;
-    with ``brightness_spread`` it is the difference in gain between bright and dark points.
+    ``contrast`` (views,): by how much ln(light) of a photo rises too much with that of the points, 0.1 for a power of
+    1.1; times ``brightness_spread`` it is the difference in gain between bright and dark points.
     """
 
     layout: TwoWay
@@ -145,8 +145,7 @@ def _contrast(
 def exposure_evidence(fit: ExposureFit) -> Evidence:
     """Whether photos differ in exposure (or white balance): the deviation of gains over photos and channels, EV.
 
-    Noise is that of a gain, clustered by point. It counts double in quadrature off the statistic, so that noise alone is
-    not taken for a difference.
+    The noise, that of one gain, is taken off in quadrature, so that noise alone is no difference.
     """
     if not fit.known.any():
         return unknown("EV", THRESHOLD_EV, "no two photos show the same unsaturated points", None)

@@ -1,4 +1,4 @@
-"""Whether rows of a video's frames were taken one after the other: residuals along the motion that grow with the row."""
+"""Whether rows of a video's frames were taken one after another: residuals along the motion that grow with the row."""
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -15,11 +15,11 @@ def rolling_shutter_evidence(
     motion: Float[np.ndarray, "views 2"],
     view: Int[np.ndarray, "k"],
 ) -> Evidence:
-    """The error at the upper and lower edges of a frame of usual motion, px: half the product of the readout, as a part of
-    the time between frames, and of the motion. Called for where it harms as wrong poses do (nerf/evidence/poses.py).
+    """The error at the upper and lower edges of a frame of usual motion, px: half the product of the motion and of the
+    readout as a part of the time between frames. Called for where it harms as wrong poses do (nerf/evidence/poses.py).
 
-    ``residual``: observed minus projected, px; ``row``: y / height; ``motion``: how far the picture moves from a frame to
-    the next, px, NaN where it is not known or the photos are no video. The row at y shows the scene (y - 1/2) readouts
+    ``residual``: observed minus projected, px; ``row``: y / height; ``motion``: how far the picture moves from a frame
+    to the next, px, NaN where it is not known or the photos are no video. The row at y shows the scene (y - 1/2) readouts
     later, so residual = readout (y - 1/2) motion; the part that poses could take up (shift, zoom) is gone after
     a bundle adjustment, and what is found is a lower bound.
     """
@@ -38,7 +38,8 @@ def rolling_shutter_evidence(
     score = np.bincount(view[kept], expected * (along - readout * expected), len(speed))
     edge = float(np.median(speed[moving])) / 2
     noise = float(np.sqrt(np.sum(score**2))) / size * edge
-    words = f"rows take {abs(readout):.0%} of the time between frames, {abs(readout) * edge:.2g} ± {noise:.1g} px at the edges"
+    off = f"{abs(readout) * edge:.2g} ± {noise:.1g} px at the edges"
+    words = f"rows take {abs(readout):.0%} of the time between frames, {off}"
     found = judged(abs(readout) * edge, noise, THRESHOLD_PX, "px", words)
     return found._replace(called_for=bool(found.called_for))
 

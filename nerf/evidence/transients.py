@@ -81,8 +81,8 @@ def expected_places(
     centre: Float[np.ndarray, "3"],
     position: Float[np.ndarray, "points 3"],
 ) -> Int[np.ndarray, "m"]:
-    """The points that a camera at ``centre`` should see, because two photos from nearly there do: within NEAR_DEG of its
-    direction, at a distance that differs by at most NEAR_RATIO. Observations are those of the other photos."""
+    """The points that a camera at ``centre`` should see, because two photos from nearly there do: within NEAR_DEG of
+    its direction, at a distance that differs by at most NEAR_RATIO. Observations are those of the other photos."""
     offset = centre - position
     length = np.linalg.norm(offset, axis=1)
     offset = offset / np.maximum(length, np.finfo(float).tiny)[:, None]

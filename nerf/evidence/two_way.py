@@ -1,8 +1,8 @@
 """Weighted fits of y_k = a[view_k] + b[point_k]: what belongs to photos, what to points, and what is left.
 
 The points' parts are eliminated, which leaves the Laplacian of the graph of photos that share points:
-A = diag(sum w) - sum over points of w w^T / sum(w), as in a bundle adjustment of one number per photo (Schur complement;
-in statistics the two-way layout, and leaving its remainder regressed on another's is Frisch-Waugh-Lovell).
+A = diag(sum w) - sum over points of w w^T / sum(w), as in a bundle adjustment of one number per photo (Schur
+complement). In statistics it is the two-way layout, and slopes between what it leaves are Frisch, Waugh and Lovell's.
 """
 
 from dataclasses import dataclass

@@ -99,7 +99,7 @@ def _growth(
 
 
 def _step(sums: Float[np.ndarray, "2 5"]) -> float:
-    """The difference of where two lines start, from the sums of 1, x, x², y and x y; of the means where x is constant."""
+    """The difference of where two lines start, from sums of 1, x, x², y and x y; of the means where x is constant."""
     start = []
     for count, x, xx, y, xy in sums:
         count = max(count, 1.0)
