@@ -76,3 +76,9 @@ def native(camera: Camera, camera_id: int = 1) -> "pycolmap.Camera":
 def plain(camera: "pycolmap.Camera") -> Camera:
     """The inverse of :func:`native`."""
     return Camera(camera.model_name, camera.width, camera.height, tuple(float(p) for p in camera.params))
+
+
+def focal_and_centre(camera: Camera) -> tuple[float, tuple[float, float]]:
+    """The mean focal length and the principal point, in pixels."""
+    model = native(camera)
+    return float(model.mean_focal_length()), (float(model.principal_point_x), float(model.principal_point_y))

@@ -1,0 +1,47 @@
+"""A statistic beside its noise and its threshold, and what follows from the three.
+
+How large an effect has to be is the same question everywhere: what does a field lose that does not model it? A field at
+30 dB has a mean squared error of 1e-3; it falls to 29.7 dB where an effect adds 7.2 % to that, a root mean square error
+of ``HARM`` = 0.0085 in sRGB values. That is where the grey zone begins, and at twice that size, 1.1 dB, an effect
+is called for.
+"""
+
+from typing import NamedTuple
+
+HARM = 0.0085  # rms error in sRGB values that costs 0.3 dB at 30 dB: sqrt(1e-3 (10^0.03 - 1))
+# Root mean square, over the colours of usual photos (mean 0.5, deviation 0.25), of what a step in the natural logarithm
+# of linear light changes in the sRGB value s: ds / d ln(light) = (s + 0.055) / 2.4.
+VALUE_PER_LOG_LIGHT = 0.25
+SURE = 5.0  # times its noise: what is called for is not noise in any of many scenes, photos and channels
+GREY = 2.0  # the grey zone: from the threshold down to this part of it
+
+
+class Evidence(NamedTuple):
+    """What was measured. ``threshold``: from here on the effect is called for; the grey zone begins at half of it.
+    ``noise`` is of the statistic, both in ``unit``, infinite where nothing is known. ``called_for`` None: a pilot
+    should decide, where there is one. ``words``: one clause with its number."""
+
+    statistic: float
+    unit: str
+    threshold: float
+    noise: float
+    called_for: bool | None
+    words: str
+
+
+def decide(statistic: float, noise: float, threshold: float) -> bool | None:
+    """True: it reaches the threshold and SURE times its noise. False: even two noises more would leave it below the
+    grey zone. None: between, or nothing is known (infinite noise)."""
+    if statistic >= threshold and statistic >= SURE * noise:
+        return True
+    return False if statistic + 2 * noise < threshold / GREY else None
+
+
+def judged(statistic: float, noise: float, threshold: float, unit: str, words: str) -> Evidence:
+    """An Evidence that follows the rule of :func:`decide`."""
+    return Evidence(statistic, unit, threshold, noise, decide(statistic, noise, threshold), words)
+
+
+def unknown(unit: str, threshold: float, why: str, called_for: bool | None) -> Evidence:
+    """Nothing can be measured; ``called_for`` is what to do without knowing."""
+    return Evidence(0.0, unit, threshold, float("inf"), called_for, f"{why}: nothing known")

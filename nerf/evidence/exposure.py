@@ -1,0 +1,172 @@
+"""How much brighter each photo shows the same points: gains per channel, by a robust fit in log linear light.
+
+ln(light of observation k) = log_gain[photo] + brightness[point] + vignetting · radius² + noise, per channel, by
+iteratively reweighted least squares (Holland & Welsch 1977): Huber's weights from the least-squares start, then Geman
+and McClure's, which forget highlights and passers-by.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from nerf.evidence.evidence import HARM, SURE, VALUE_PER_LOG_LIGHT, Evidence, judged, unknown
+from nerf.evidence.tracks import TrackColours, log_light, log_noise, usable
+from nerf.evidence.two_way import TwoWay, two_way
+
+EV = float(np.log(2.0))
+# A gain that is off by d in ln(light) makes an error of VALUE_PER_LOG_LIGHT d in sRGB values: HARM is d = 0.034,
+# 0.05 EV. Called for from twice that, when gains deviate by 0.1 EV.
+THRESHOLD_EV = 2 * HARM / VALUE_PER_LOG_LIGHT / EV
+HUBER, REDESCENDING = 1.345, 5.0  # in robust deviations: both lose some 5 % to plain means of normal noise
+HUBER_ROUNDS, MOST_ROUNDS = 8, 30
+CONVERGED = 1e-5
+LEAST_NOISE = 0.25 / 255  # of an sRGB value: no photo of 8 bits is more exact, and a perfect fit has no deviation
+
+
+class ExposureFit(NamedTuple):
+    """``log_gain`` (views, 3): natural logarithm of linear light, its median over the connected photos 0 per channel;
+    ``error``: its standard error, infinite (and the gain 0) where a photo shares no points with the others.
+
+    ``used`` are the m observations fitted, ``rest`` (m, 3) what is left of their logarithms, ``weight`` (m, 3) their
+    robust weights over the variance of their noise. ``noise`` is the robust deviation of what is left as an sRGB value.
+    ``contrast`` (views,): by how much ln(light) of a photo rises too much with that of the points, 0.1 for a power of
+    1.1; times ``brightness_spread`` it is the difference in gain between bright and dark points.
+    """
+
+    layout: TwoWay
+    used: Int[np.ndarray, "m"]
+    rest: Float[np.ndarray, "m 3"]
+    weight: Float[np.ndarray, "m 3"]
+    log_gain: Float[np.ndarray, "views 3"]
+    error: Float[np.ndarray, "views 3"]
+    vignetting: Float[np.ndarray, "3"]
+    noise: float
+    contrast: Float[np.ndarray, "views"]
+    contrast_error: Float[np.ndarray, "views"]
+    brightness_spread: float
+
+    @property
+    def known(self) -> Bool[np.ndarray, "views"]:
+        """The photos whose gain is known beside the others'."""
+        return self.layout.main
+
+
+def fit_exposure(tracks: TrackColours) -> ExposureFit:
+    """Gains of all photos. Radial darkening is fitted beside them where it is beyond doubt (``vignetting``, ln at the
+    corner), for gains of photos that show the same points at their corners would take a part of it."""
+    used = usable(tracks)
+    layout = two_way(tracks.view[used], tracks.point[used], tracks.views)
+    y, sigma = log_light(tracks.colour[used]), log_noise(tracks.colour[used])
+    square = tracks.radius[used] ** 2
+    gain, error = np.zeros((tracks.views, 3)), np.full((tracks.views, 3), np.inf)
+    rest, weight = np.zeros_like(y), np.ones_like(y)
+    vignetting, noise = np.zeros(3), np.zeros(3)
+    for channel in range(3 if layout.main.any() else 0):
+        part = y[:, channel]
+        weight[:, channel], noise[channel], given_up = _robust_weights(layout, part, sigma[:, channel])
+        slope, slope_error = layout.slope(part, square, weight[:, channel])
+        if abs(slope) > SURE * slope_error:
+            vignetting[channel] = slope
+            part = part - slope * square
+            weight[:, channel], noise[channel], given_up = _robust_weights(layout, part, sigma[:, channel])
+        gain[:, channel] = layout.parts(part, weight[:, channel])
+        rest[:, channel] = layout.around_points(part - gain[layout.view, channel], weight[:, channel])
+        error[:, channel] = layout.errors(rest[:, channel], weight[:, channel]) * given_up
+    if layout.main.any():
+        gain[layout.main] -= np.median(gain[layout.main], axis=0)
+    contrast, contrast_error, spread = _contrast(layout, y - gain[layout.view] - vignetting * square[:, None], weight)
+    return ExposureFit(
+        layout, used, rest, weight, gain, error, vignetting, float(noise.mean()), contrast, contrast_error, spread
+    )
+
+
+def _robust_weights(
+    layout: TwoWay, y: Float[np.ndarray, "m"], sigma: Float[np.ndarray, "m"]
+) -> tuple[Float[np.ndarray, "m"], float, float]:
+    """Converged weights, the robust deviation in units of ``sigma``, and by how much standard errors grow over those of
+    fixed weights.
+
+    What is left of an observation is smaller by sqrt(1 - its part in the point's weight) than its noise. Weights that
+    fall with what is left follow a shift by less than it: E[w + u w'] in place of E[w] (Huber 1964).
+    """
+    base = sigma**-2
+    weight, scale, before = base, 0.0, np.zeros(layout.views)
+    for turn in range(MOST_ROUNDS):
+        gain = layout.parts(y, weight)
+        rest = layout.around_points(y - gain[layout.view], weight)
+        size = np.abs(rest) / (sigma * np.sqrt(np.maximum(1 - layout.share(weight), 0.02)))
+        scale = max(1.4826 * float(np.median(size)), LEAST_NOISE)
+        size = size / scale
+        if turn < HUBER_ROUNDS:
+            weight = base * np.minimum(1, HUBER / np.maximum(size, HUBER))
+        else:
+            weight = base / (1 + (size / REDESCENDING) ** 2) ** 2
+        if turn > HUBER_ROUNDS and np.abs(gain - before).max() < CONVERGED:
+            break
+        before = gain
+    bent = 1 + (size / REDESCENDING) ** 2
+    followed = float(np.sum(base * (4 - 3 * bent) / bent**3)) / float(np.sum(base / bent**2))
+    return weight, scale, 1 / max(followed, 0.1)
+
+
+def _contrast(
+    layout: TwoWay, y: Float[np.ndarray, "m 3"], weight: Float[np.ndarray, "m 3"]
+) -> tuple[Float[np.ndarray, "views"], Float[np.ndarray, "views"], float]:
+    """How each photo's brightness, gains removed, rises with that of its points in the other photos: the slope - 1, its
+    median 0; its standard error; and the deviation of brightness over a photo's points.
+
+    The other photos' mean is as noisy as the photo is itself, which would flatten a slope against it: so difference is
+    laid against middle (Bland & Altman 1986).
+    """
+    none = np.zeros(layout.views)
+    if not layout.main.any():
+        return none, np.full(layout.views, np.inf), 0.0
+    grey, importance = y.mean(axis=1), weight.min(axis=1)
+    share = np.minimum(layout.share(importance), 0.98)
+    difference = (grey - layout.mean(grey, importance)) / (1 - share)
+    importance = importance * (1 - share)
+    total = np.maximum(layout.per_view(importance), np.finfo(float).tiny)
+    middle = grey - difference / 2
+    middle = middle - (layout.per_view(importance * middle) / total)[layout.view]
+    difference = difference - (layout.per_view(importance * difference) / total)[layout.view]
+    size = layout.per_view(importance * middle**2)
+    known = layout.main & (size > 1e-4 * total) & (np.bincount(layout.view, minlength=layout.views) > 3)
+    if not known.any():
+        return none, np.full(layout.views, np.inf), 0.0
+    size = np.where(known, size, 1.0)
+    slope = np.where(known, layout.per_view(importance * middle * difference) / size, 0.0)
+    score = importance * middle * (difference - slope[layout.view] * middle)
+    error = np.where(known, np.sqrt(layout.per_view(score**2)) / size, np.inf)
+    slope = np.where(known, slope - np.median(slope[known]), 0.0)
+    return slope, error, float(np.sqrt(np.median((size / total)[known])))
+
+
+def exposure_evidence(fit: ExposureFit) -> Evidence:
+    """Whether photos differ in exposure (or white balance): the deviation of gains over photos and channels, EV.
+
+    The noise, that of one gain, is taken off in quadrature, so that noise alone is no difference.
+    """
+    if not fit.known.any():
+        return unknown("EV", THRESHOLD_EV, "no two photos show the same unsaturated points", None)
+    gain, error = fit.log_gain[fit.known] / EV, fit.error[fit.known] / EV
+    noise = float(np.sqrt(np.mean(error**2)))
+    spread = float(np.sqrt(max(np.mean((gain - gain.mean(axis=0)) ** 2) - noise**2, 0.0)))
+    span = float(np.ptp(gain.mean(axis=1)))
+    ratio = f"{span / noise:.0f} × their noise" if noise > 0 else "without noise"
+    alone = int(np.count_nonzero(~fit.known))
+    left_out = f"; {alone} photos share no points with the others" if alone else ""
+    return judged(spread, noise, THRESHOLD_EV, "EV", f"gains span {span:.2g} EV, {ratio}{left_out}")
+
+
+def tone_evidence(fit: ExposureFit) -> Evidence:
+    """Whether gains alone are not enough: how much photos' gains differ between bright points and dark ones, EV per
+    deviation of brightness. The threshold is that of exposure."""
+    known = fit.known & np.isfinite(fit.contrast_error)
+    if not known.any() or fit.brightness_spread == 0:
+        return unknown("EV", THRESHOLD_EV, "no two photos show the same unsaturated points", None)
+    scale = fit.brightness_spread / EV
+    noise = float(np.sqrt(np.mean(fit.contrast_error[known] ** 2))) * scale
+    spread = float(np.sqrt(max(np.mean((fit.contrast[known] * scale) ** 2) - noise**2, 0.0)))
+    words = f"gains differ by {spread:.2g} EV between bright and dark points, ± {noise:.1g}"
+    return judged(spread, noise, THRESHOLD_EV, "EV", words)

@@ -1,0 +1,59 @@
+"""Whether rows of a video's frames were taken one after another: residuals along the motion that grow with the row."""
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from nerf.evidence.evidence import Evidence, judged, unknown
+from nerf.evidence.poses import THRESHOLD_PX
+
+LEAST_MOTION_PX = 2.0  # per frame, below which rows have no time to differ
+
+
+def rolling_shutter_evidence(
+    residual: Float[np.ndarray, "k 2"],
+    row: Float[np.ndarray, "k"],
+    motion: Float[np.ndarray, "views 2"],
+    view: Int[np.ndarray, "k"],
+) -> Evidence:
+    """The error at the upper and lower edges of a frame of usual motion, px: half the product of the motion and of the
+    readout as a part of the time between frames. Called for where it harms as wrong poses do (nerf/evidence/poses.py).
+
+    ``residual``: observed minus projected, px; ``row``: y / height; ``motion``: how far the picture moves from a frame
+    to the next, px, NaN where it is not known or the photos are no video. The row at y shows the scene (y - 1/2) readouts
+    later, so residual = readout (y - 1/2) motion; the part that poses could take up (shift, zoom) is gone after
+    a bundle adjustment, and what is found is a lower bound.
+    """
+    speed = np.linalg.norm(motion, axis=1)
+    moving = np.isfinite(speed) & (speed > LEAST_MOTION_PX)
+    kept = moving[view]
+    if np.count_nonzero(kept) < 100 or np.count_nonzero(moving) < 3:
+        return unknown("px", THRESHOLD_PX, "no video, or one that hardly moves", False)
+    along = np.sum(residual[kept] * motion[view[kept]], axis=1) / speed[view[kept]]
+    limit = 4 * 1.4826 * float(np.median(np.abs(along)))
+    along = np.clip(along, -limit, limit)  # false matches
+    expected = (row[kept] - 0.5) * speed[view[kept]]
+    size = float(np.sum(expected**2))
+    readout = float(np.sum(expected * along)) / size
+    # frames are taken as independent, their points are not
+    score = np.bincount(view[kept], expected * (along - readout * expected), len(speed))
+    edge = float(np.median(speed[moving])) / 2
+    noise = float(np.sqrt(np.sum(score**2))) / size * edge
+    off = f"{abs(readout) * edge:.2g} ± {noise:.1g} px at the edges"
+    words = f"rows take {abs(readout):.0%} of the time between frames, {off}"
+    found = judged(abs(readout) * edge, noise, THRESHOLD_PX, "px", words)
+    return found._replace(called_for=bool(found.called_for))
+
+
+def motion_to_next(
+    xy: Float[np.ndarray, "k 2"], point: Int[np.ndarray, "k"], view: Int[np.ndarray, "k"], views: int
+) -> Float[np.ndarray, "views 2"]:
+    """How far the picture moves from a frame to the next one, px: the median over the points that both see; NaN for the
+    last one, and where they share fewer than ten."""
+    motion = np.full((views, 2), np.nan)
+    of_view = [np.flatnonzero(view == number) for number in range(views)]
+    for number in range(views - 1):
+        here, there = of_view[number], of_view[number + 1]
+        _, left, right = np.intersect1d(point[here], point[there], return_indices=True)
+        if len(left) >= 10:
+            motion[number] = np.median(xy[there[right]] - xy[here[left]], axis=0)
+    return motion

@@ -1,0 +1,92 @@
+"""Whether something stood in some photos only: points that single photos show in another colour than the others do.
+
+Features are matched by how they look, so what stands before a point rarely has its observation: an observed outlier is
+a highlight or a false match. A passer-by shows where points are *expected*: photos taken from nearly the same direction
+see them, this one should, and has another colour there. Both are looked at, with the same rule.
+"""
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from nerf.evidence.evidence import Evidence, judged, unknown
+from nerf.evidence.exposure import ExposureFit
+from nerf.evidence.tracks import TrackColours, linear_light
+
+OUTLIER = 0.1  # sRGB value, rms of the channels: ten times what a good photo is off by
+FEWEST_POINTS = 20  # in a photo, for a share of them to mean something
+SURE = 5.0  # robust deviations over what the other photos have
+LEAST_EXCESS = 0.05  # of a photo's points: less is an edge that is missed by a pixel
+# A share q of all pixels showing something else, by some 0.3, adds 0.09 q to the squared error where the field has it
+# right, and as much again where it is led astray: 0.15 % of them would be 1.1 dB. Points are no pixels, and
+# surfaces that hide each other are expected wrongly: one percent of all points is beyond doubt.
+THRESHOLD = 0.01
+NEAR_DEG, NEAR_RATIO = 10.0, 1.3  # photos so close to each other hide the same points, but for few
+
+
+def transients_evidence(tracks: TrackColours, fit: ExposureFit, expected: TrackColours | None) -> Evidence:
+    """The share of all points that photos show in another colour beyond what is usual for a photo, of those photos only
+    where it is much more than in the others (robust z). ``expected``: where photos should show points that they
+    have no observation of, its ``point`` numbered like that of ``tracks``."""
+    if not fit.known.any():
+        return unknown("share", THRESHOLD, "no tracks", False)
+    looked = tracks if expected is None else _together(tracks, expected)
+    known = fit.known[looked.view] & np.isin(looked.point, tracks.point[fit.used])
+    looked = looked.only(known)
+    outlier = _differs(looked, _usual_light(tracks, fit), fit)
+    seen = np.bincount(looked.view, minlength=looked.views)
+    enough = seen >= FEWEST_POINTS
+    if np.count_nonzero(enough) < 3:
+        return unknown("share", THRESHOLD, "too few photos with enough points", False)
+    share = np.bincount(looked.view, outlier, looked.views)[enough] / seen[enough]
+    usual = float(np.median(share))
+    deviation = 1.4826 * float(np.median(np.abs(share - usual)))
+    count_noise = np.sqrt(np.maximum(usual * (1 - usual), 1 / seen[enough]) / seen[enough])
+    excess = share - usual
+    odd = (excess > SURE * np.hypot(deviation, count_noise)) & (excess > LEAST_EXCESS)
+    found = float(np.sum(excess[odd]) / len(excess))
+    noise = float(np.sqrt(np.sum(deviation**2 + count_noise**2)) / len(excess))
+    words = f"{odd.sum()} of {len(odd)} photos show {found:.1%} of all points in another colour than the others"
+    return judged(found, noise, THRESHOLD, "share", words)
+
+
+def _together(one: TrackColours, other: TrackColours) -> TrackColours:
+    """The observations of both, without texture."""
+    names = ("view", "point", "colour", "saturated", "radius", "towards", "distance", "footprint")
+    return TrackColours(one.views, *[np.concatenate([getattr(one, n), getattr(other, n)]) for n in names])
+
+
+def _usual_light(tracks: TrackColours, fit: ExposureFit) -> Float[np.ndarray, "points 3"]:
+    """The robust mean of each point's light, in the exposure of no photo; NaN for points without a fit."""
+    size = int(tracks.point.max(initial=-1)) + 1
+    mean = np.full((size, 3), np.nan)
+    for channel in range(3):
+        light = linear_light(tracks.colour[fit.used, channel]) * np.exp(-fit.log_gain[fit.layout.view, channel])
+        mean[tracks.point[fit.used], channel] = fit.layout.mean(light, fit.weight[:, channel])
+    return mean
+
+
+def _differs(looked: TrackColours, usual: Float[np.ndarray, "points 3"], fit: ExposureFit) -> Bool[np.ndarray, "k"]:
+    """Which observations are another colour than their point's, in the exposure of their photo. What is cut off at 0 or
+    1 is compared where it was cut."""
+    light = usual[looked.point] * np.exp(fit.log_gain[looked.view])
+    value = np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 0.0031308) ** (1 / 2.4) - 0.055)
+    difference = looked.colour - np.clip(value, 0, 1)
+    return np.sqrt(np.mean(difference**2, axis=1)) > OUTLIER
+
+
+def expected_places(
+    towards: Float[np.ndarray, "k 3"],
+    distance: Float[np.ndarray, "k"],
+    point: Int[np.ndarray, "k"],
+    centre: Float[np.ndarray, "3"],
+    position: Float[np.ndarray, "points 3"],
+) -> Int[np.ndarray, "m"]:
+    """The points that a camera at ``centre`` should see, because two photos from nearly there do: within NEAR_DEG of
+    its direction, at a distance that differs by at most NEAR_RATIO. Observations are those of the other photos."""
+    offset = centre - position
+    length = np.linalg.norm(offset, axis=1)
+    offset = offset / np.maximum(length, np.finfo(float).tiny)[:, None]
+    close = np.sum(towards * offset[point], axis=1) > np.cos(np.radians(NEAR_DEG))
+    ratio = distance / np.maximum(length[point], np.finfo(float).tiny)
+    close &= (ratio < NEAR_RATIO) & (ratio > 1 / NEAR_RATIO)
+    return np.flatnonzero(np.bincount(point[close], minlength=len(position)) >= 2)

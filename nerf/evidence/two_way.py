@@ -1,0 +1,133 @@
+"""Weighted fits of y_k = a[view_k] + b[point_k]: what belongs to photos, what to points, and what is left.
+
+The points' parts are eliminated, which leaves the Laplacian of the graph of photos that share points:
+A = diag(sum w) - sum over points of w w^T / sum(w), as in a bundle adjustment of one number per photo (Schur
+complement). In statistics it is the two-way layout, and slopes between what it leaves are Frisch, Waugh and Lovell's.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from nerf.evidence.tracks import within_groups
+
+
+@dataclass(frozen=True)
+class TwoWay:
+    """Which photo and which point each of m observations is of, in order of point, and all pairs of one point.
+
+    ``main``: the photos of the largest connected part of the graph; of the others nothing is known beside them.
+    """
+
+    views: int
+    view: Int[np.ndarray, "m"]
+    point: Int[np.ndarray, "m"]  # 0 … points - 1, every one there
+    first: Int[np.ndarray, "pairs"]  # an observation, and another one of the same point
+    second: Int[np.ndarray, "pairs"]
+    main: Bool[np.ndarray, "views"]
+
+    def mean(self, values: Float[np.ndarray, "m"], weight: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:
+        """Each observation's point's weighted mean."""
+        top = np.bincount(self.point, weight * values)
+        return (top / np.bincount(self.point, weight))[self.point]
+
+    def per_view(self, values: Float[np.ndarray, "m"]) -> Float[np.ndarray, "views"]:
+        """Sums over the observations of each photo."""
+        return np.bincount(self.view, values, self.views)
+
+    def share(self, weight: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:
+        """The part of each observation in the weight of its point."""
+        return weight / np.bincount(self.point, weight)[self.point]
+
+    def outer(self, left: Float[np.ndarray, "m"], right: Float[np.ndarray, "m"]) -> Float[np.ndarray, "views views"]:
+        """Sum over points of u u'^T, u[v] the sum of ``left`` over photo v's observations of it, u' of ``right``."""
+        place = self.view[self.first] * self.views + self.view[self.second]
+        crossed = np.bincount(place, left[self.first] * right[self.second], self.views**2)
+        matrix = crossed.reshape(self.views, self.views)
+        matrix = matrix + matrix.T
+        matrix[np.diag_indices(self.views)] += self.per_view(left * right)
+        return matrix
+
+    def laplacian(self, weight: Float[np.ndarray, "m"]) -> Float[np.ndarray, "main main"]:
+        """A of the connected photos, made regular by the gauge that their parts sum to nothing."""
+        matrix = np.diag(self.per_view(weight)) - self.outer(weight, self.share(weight))
+        matrix = matrix[np.ix_(self.main, self.main)]
+        size = np.trace(matrix) / max(len(matrix), 1)
+        return matrix + size / max(len(matrix), 1)
+
+    def parts(self, y: Float[np.ndarray, "m"], weight: Float[np.ndarray, "m"]) -> Float[np.ndarray, "views"]:
+        """The photos' parts, 0 on average over the connected ones and 0 for the others."""
+        gain = np.zeros(self.views)
+        right = self.per_view(weight * (y - self.mean(y, weight)))[self.main]
+        if len(right):
+            gain[self.main] = np.linalg.solve(self.laplacian(weight), right)
+        return gain
+
+    def rest(self, y: Float[np.ndarray, "m"], weight: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:
+        """What neither photos nor points explain of ``y``."""
+        return self.around_points(y - self.parts(y, weight)[self.view], weight)
+
+    def around_points(self, y: Float[np.ndarray, "m"], weight: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:
+        """What is left of ``y`` beside each point's mean."""
+        return y - self.mean(y, weight)
+
+    def errors(self, rest: Float[np.ndarray, "m"], weight: Float[np.ndarray, "m"]) -> Float[np.ndarray, "views"]:
+        """Standard errors of :meth:`parts`, infinite for photos that are not connected.
+
+        Points are taken as independent, their observations are not (sandwich estimator, clustered by point; Liang &
+        Zeger 1986); n / (n - 1) for the n points of a photo, whose errors its own part has made smaller.
+        """
+        error = np.full(self.views, np.inf)
+        if not self.main.any():
+            return error
+        inverse = np.linalg.inv(self.laplacian(weight))
+        score = self.outer(weight * rest, weight * rest)[np.ix_(self.main, self.main)]
+        seen = np.bincount(self.view, minlength=self.views)[self.main]
+        few = np.sqrt(seen / np.maximum(seen - 1, 0.5))
+        error[self.main] = few * np.sqrt(np.maximum(np.diag(inverse @ score @ inverse), 0.0))
+        return error
+
+    def slope(
+        self, y: Float[np.ndarray, "m"], x: Float[np.ndarray, "m"], weight: Float[np.ndarray, "m"]
+    ) -> tuple[float, float]:
+        """How ``y`` follows ``x`` within photos and points alike, and the slope's standard error (clustered by point);
+        (0, inf) where ``x`` does not vary within them."""
+        across = self.rest(x, weight)
+        size = float(np.sum(weight * across**2))
+        if not size > 1e-9 * float(np.sum(weight * x**2)):
+            return 0.0, float("inf")
+        rest = self.rest(y, weight)
+        slope = float(np.sum(weight * across * rest)) / size
+        score = np.bincount(self.point, weight * across * (rest - slope * across))
+        return slope, float(np.sqrt(np.sum(score**2))) / size
+
+
+def two_way(view: Int[np.ndarray, "m"], point: Int[np.ndarray, "m"], views: int) -> TwoWay:
+    """The layout of observations that are in order of point (``nerf.evidence.tracks.usable``)."""
+    rank, length = within_groups(point)
+    of = np.cumsum(rank == 0) - 1
+    pairs = [
+        np.stack([first := np.flatnonzero(rank + lag < length), first + lag])
+        for lag in range(1, int(length.max(initial=1)))
+    ]
+    first, second = np.concatenate(pairs, axis=1) if pairs else np.zeros((2, 0), int)
+    return TwoWay(views, view, of, first, second, _largest_part(view, of, views))
+
+
+def _largest_part(view: Int[np.ndarray, "m"], point: Int[np.ndarray, "m"], views: int) -> Bool[np.ndarray, "views"]:
+    """The photos of the largest part of the graph, by the smallest number that spreads over each part; none where no
+    two photos share a point."""
+    if not len(view):
+        return np.zeros(views, bool)
+    label = np.arange(views)
+    starts = np.flatnonzero(np.diff(point, prepend=-1))
+    while True:
+        of_point = np.minimum.reduceat(label[view], starts)
+        spread = label.copy()
+        np.minimum.at(spread, view, of_point[point])
+        if np.array_equal(spread, label):
+            break
+        label = spread
+    sizes = np.bincount(label, minlength=views)
+    return (label == sizes.argmax()) & (sizes.max() > 1)

@@ -1,0 +1,117 @@
+"""All statistics of a scene: what its sparse model and its training photos say about each optional effect."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from stages.contract import Progress
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from nerf.evidence.evidence import Evidence
+    from nerf.evidence.exposure import ExposureFit
+    from nerf.scene import Scene
+
+
+class SceneEvidence(NamedTuple):
+    """The evidence by effect, and the gains that effects may begin with, of the training photos in order of name."""
+
+    of: "dict[str, Evidence]"
+    exposure: "ExposureFit"
+
+
+def scene_evidence(
+    ingest: Path,
+    scene: "Scene",
+    points: "Mapping[str, np.ndarray]",
+    uncertainty_px: Mapping[str, float | None],
+    progress: Progress,
+) -> SceneEvidence:
+    """Everything that can be told without training. ``points`` is points.safetensors, ``uncertainty_px`` what
+    registration.json says of each photo by its file (``images/…``)."""
+    from nerf.evidence.blur import blur_evidence
+    from nerf.evidence.exposure import exposure_evidence, fit_exposure, tone_evidence
+    from nerf.evidence.media import media_evidence
+    from nerf.evidence.scale import scale_evidence
+    from nerf.evidence.transients import transients_evidence
+    from nerf.evidence.view_dependence import view_dependence_evidence
+    from nerf.evidence.vignetting import vignetting_evidence
+    from stages.track_colours import look_at_photos
+
+    looked = look_at_photos(ingest, scene, points, progress)
+    progress.update("fitting the photos' exposures")
+    fit, tracks = fit_exposure(looked.tracks), looked.tracks
+    of = {
+        "exposure": exposure_evidence(fit),
+        "tone": tone_evidence(fit),
+        "view_dependence": view_dependence_evidence(tracks, fit),
+        "vignetting": vignetting_evidence(tracks, fit),
+        "transients": transients_evidence(tracks, fit, looked.expected),
+        "scale": scale_evidence(tracks),
+        "media": media_evidence(tracks, fit),
+        "blur": blur_evidence(looked.gradients),
+    }
+    return SceneEvidence(of | _geometric(ingest, scene, points, uncertainty_px), fit)
+
+
+def _geometric(
+    ingest: Path,
+    scene: "Scene",
+    points: "Mapping[str, np.ndarray]",
+    uncertainty_px: Mapping[str, float | None],
+) -> "dict[str, Evidence]":
+    """What is told by places alone."""
+    import numpy as np
+
+    from nerf.evidence.background import background_evidence, untracked_share
+    from nerf.evidence.poses import common_residuals, pose_evidence
+    from nerf.evidence.rolling_shutter import motion_to_next, rolling_shutter_evidence
+
+    views = scene.of_split("train")
+    xy, view, point, residual = training_residuals(scene, points)
+    size = np.array([[scene.cameras[one.camera].width, scene.cameras[one.camera].height] for one in views], float)
+    stated = np.array([uncertainty_px.get(one.file) for one in views], float)  # None becomes NaN
+    motion = np.full((len(views), 2), np.nan)
+    if _is_video(ingest, [one.file for one in views]):
+        motion = motion_to_next(xy, point, view, len(views))
+    untracked = untracked_share(xy / size[view], view, len(views))
+    return {
+        "background": background_evidence(points["xyz"].astype(float), point, scene.has_alpha, untracked),
+        "pose_refinement": pose_evidence(*common_residuals(residual, xy, view, len(views)), stated),
+        "rolling_shutter": rolling_shutter_evidence(residual, xy[:, 1] / size[view, 1], motion, view),
+    }
+
+
+def _is_video(ingest: Path, files: Sequence[str]) -> bool:
+    """Whether all of the photos are frames of a video."""
+    from stages.photos import read_photos
+
+    timed = {photo.file for photo in read_photos(ingest) if photo.time_s is not None}
+    return set(files) <= timed
+
+
+def training_residuals(
+    scene: "Scene", points: "Mapping[str, np.ndarray]"
+) -> "tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]":
+    """Of each observation of a training photo its pixel (k, 2), its photo's number among the training photos, its
+    point, and observed minus projected pixel (k, 2). Points that their photo cannot see at all are left out."""
+    import numpy as np
+
+    from stages.colmap.cameras import project
+
+    parts = []
+    trained = [index for index, view in enumerate(scene.views) if view.split == "train"]
+    for number, index in enumerate(trained):
+        of_view, pose = points["view"] == index, scene.views[index].scene_from_camera
+        point, xy = points["point"][of_view].astype(int), points["xy"][of_view].astype(float)
+        if not len(point):
+            continue
+        inside = (points["xyz"][point].astype(float) - pose[:, 3]) @ pose[:, :3]
+        residual = xy - project(scene.cameras[scene.views[index].camera], inside)
+        seen = np.isfinite(residual).all(axis=1)
+        parts.append((xy[seen], np.full(seen.sum(), number), point[seen], residual[seen]))
+    if not parts:
+        return np.zeros((0, 2)), np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2))
+    xy, view, point, residual = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return xy, view, point, residual

@@ -1,0 +1,252 @@
+"""What the training photos show at the sparse points: their colours, and how sharp the photos are in each direction.
+
+Every photo is decoded once, in full size. A point's colour is the mean over a square window that shows the same piece
+of its surface in every photo, so near photos are given larger windows than far ones.
+"""
+
+import os
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from stages.contract import Progress
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from nerf.evidence.tracks import TrackColours
+    from nerf.scene import Scene, View
+
+MOST = 200_000  # observations: gains of 500 photos are then known to a few thousandths
+MOST_EXPECTED = 1000  # places per photo where a point should be seen and was not matched
+WINDOW = 1 / 200  # of the photo's longer side: what training at usual sizes makes one pixel or two of
+LEAST_WINDOW, LARGEST_WINDOW = 5, 3.0  # pixels; times the usual window
+CLIPPED_SHARE = 0.1  # of a window's values beyond these are too many to trust its mean
+DARKEST, BRIGHTEST = 3, 252  # of 255
+GRADIENT_WIDTH = 1000  # as stages/sharpness.py
+DECODING_BYTES = 2 << 30  # of photos in memory at a time
+
+
+class PhotoEvidence(NamedTuple):
+    """``tracks``: observed points; ``expected``: places where points should be seen and have no observation;
+    ``gradients``: (views, 2, 2) mean of g g^T over each photo, g the gradient of grey values in [0, 1]."""
+
+    tracks: "TrackColours"
+    expected: "TrackColours"
+    gradients: "np.ndarray"
+
+
+class _Places(NamedTuple):
+    """Where to look in one photo: pixel coordinates (n, 2), widths of the windows (n,), odd."""
+
+    xy: "np.ndarray"
+    window: "np.ndarray"
+
+
+def track_colours(
+    ingest: Path, scene: "Scene", points: "Mapping[str, np.ndarray]", progress: Progress, most: int = MOST
+) -> "TrackColours":
+    """The colours of at most ``most`` observations of the training photos, whole tracks evenly drawn; ``points`` is
+    points.safetensors of normalise. Windows that a mask, transparency or the photo's edge cuts are left out."""
+    return look_at_photos(ingest, scene, points, progress, most).tracks
+
+
+def look_at_photos(
+    ingest: Path, scene: "Scene", points: "Mapping[str, np.ndarray]", progress: Progress, most: int = MOST
+) -> PhotoEvidence:
+    """All that is read off the pixels of the training photos, each decoded once; test photos are not looked at."""
+    import numpy as np
+
+    views = scene.of_split("train")
+    tracks, xy = training_tracks(scene, points, most)
+    expected, expected_xy = _expected(scene, points, tracks)
+    both, at = _joined(tracks, expected), np.concatenate([xy, expected_xy])
+    window = _windows(scene, both)
+    of_view = [np.flatnonzero(both.view == number) for number in range(len(views))]
+
+    def look(number: int) -> "tuple[np.ndarray, np.ndarray]":
+        chosen = of_view[number]
+        return _look(ingest, scene, views[number], _Places(at[chosen], window[chosen]))
+
+    seen = np.full((len(both), 5), np.nan)
+    gradients = np.empty((len(views), 2, 2))
+    pool = ThreadPoolExecutor(_workers(scene))
+    try:
+        for number, future in enumerate([pool.submit(look, number) for number in range(len(views))]):
+            seen[of_view[number]], gradients[number] = future.result()
+            progress.update(f"looked at {number + 1} of {len(views)} photos", (number + 1) / len(views))
+    finally:
+        pool.shutdown(cancel_futures=True)
+    both = replace(both, colour=seen[:, :3], saturated=seen[:, 3] > 0, texture=seen[:, 4])
+    there, observed = np.isfinite(seen[:, 0]), np.arange(len(both)) < len(tracks)
+    return PhotoEvidence(both.only(there & observed), both.only(there & ~observed), gradients)
+
+
+def training_tracks(
+    scene: "Scene", points: "Mapping[str, np.ndarray]", most: int = MOST
+) -> "tuple[TrackColours, np.ndarray]":
+    """The geometry of the observations of training photos, their colours still black, and their pixels (k, 2); of
+    points that two of them see at least. Whole points are left out, evenly, until ``most`` observations are left."""
+    import numpy as np
+
+    number = np.full(len(scene.views), -1)
+    trained = [index for index, view in enumerate(scene.views) if view.split == "train"]
+    number[trained] = np.arange(len(trained))
+    view = number[points["view"]]
+    count = np.bincount(points["point"][view >= 0], minlength=len(points["xyz"]))
+    several = np.flatnonzero(count > 1)
+    share = min(1.0, most / max(int(count[several].sum()), 1))
+    step = np.floor(np.arange(1, len(several) + 1) * share)
+    drawn = np.zeros(len(count), bool)
+    drawn[several[np.diff(step, prepend=0) > 0]] = True
+    kept = np.flatnonzero((view >= 0) & drawn[points["point"]])
+    xy = points["xy"][kept].astype(float)
+    return _seen_from(scene, points["xyz"].astype(float), view[kept], points["point"][kept].astype(int), xy), xy
+
+
+def _seen_from(
+    scene: "Scene", xyz: "np.ndarray", view: "np.ndarray", point: "np.ndarray", xy: "np.ndarray"
+) -> "TrackColours":
+    """The geometry of observations; colours are black and nothing is saturated."""
+    import numpy as np
+
+    from nerf.evidence.tracks import TrackColours
+    from stages.colmap.cameras import focal_and_centre
+
+    views = scene.of_split("train")
+    if not len(view):
+        return replace(TrackColours.empty(len(views)), texture=np.zeros(0))
+    lenses = [focal_and_centre(camera) for camera in scene.cameras]
+    focal = np.array([lenses[one.camera][0] for one in views])[view]
+    middle = np.array([lenses[one.camera][1] for one in views])[view]
+    diagonal = np.array([np.hypot(*_size(scene, one)) for one in views])[view]
+    towards = np.stack([one.scene_from_camera[:, 3] for one in views])[view] - xyz[point]
+    distance = np.maximum(np.linalg.norm(towards, axis=1), np.finfo(float).tiny)
+    return TrackColours(
+        views=len(views),
+        view=view,
+        point=point,
+        colour=np.zeros((len(view), 3)),
+        saturated=np.zeros(len(view), bool),
+        radius=2 * np.linalg.norm(xy - middle, axis=1) / diagonal,
+        towards=towards / distance[:, None],
+        distance=distance,
+        footprint=distance / focal,
+        texture=np.zeros(len(view)),
+    )
+
+
+def _size(scene: "Scene", view: "View") -> tuple[int, int]:
+    camera = scene.cameras[view.camera]
+    return camera.width, camera.height
+
+
+def _expected(
+    scene: "Scene", points: "Mapping[str, np.ndarray]", tracks: "TrackColours"
+) -> "tuple[TrackColours, np.ndarray]":
+    """Where training photos should show points that they have no observation of."""
+    import numpy as np
+
+    from nerf.evidence.transients import expected_places
+    from stages.colmap.cameras import project
+
+    xyz = points["xyz"].astype(float)
+    seen, places = [], []
+    for number, view in enumerate(scene.of_split("train")):
+        other, pose = tracks.view != number, view.scene_from_camera
+        arguments = tracks.towards[other], tracks.distance[other], tracks.point[other], pose[:, 3], xyz
+        point = np.setdiff1d(expected_places(*arguments), tracks.point[~other])
+        point = point[:: 1 + len(point) // MOST_EXPECTED]
+        camera = scene.cameras[view.camera]
+        xy = project(camera, (xyz[point] - pose[:, 3]) @ pose[:, :3]).reshape(-1, 2) if len(point) else np.zeros((0, 2))
+        inside = ((xy > 0) & (xy < _size(scene, view))).all(axis=1)  # NaN, behind the camera, is not inside
+        seen.append(np.stack([np.full(inside.sum(), number), point[inside]], axis=1))
+        places.append(xy[inside])
+    pairs, xy = np.concatenate([np.zeros((0, 2), int), *seen]), np.concatenate([np.zeros((0, 2)), *places])
+    return _seen_from(scene, xyz, pairs[:, 0], pairs[:, 1], xy), xy
+
+
+def _joined(one: "TrackColours", other: "TrackColours") -> "TrackColours":
+    from dataclasses import fields
+
+    import numpy as np
+
+    names = [field.name for field in fields(one) if field.name != "views"]
+    return replace(one, **{name: np.concatenate([getattr(one, name), getattr(other, name)]) for name in names})
+
+
+def _windows(scene: "Scene", tracks: "TrackColours") -> "np.ndarray":
+    """The width of each observation's window, odd: WINDOW of the photo where the point's pixels are largest, and more
+    where they are smaller, so that all show the same piece."""
+    import numpy as np
+
+    if not len(tracks):
+        return np.zeros(0, int)
+    size = np.array([max(_size(scene, view)) for view in scene.of_split("train")])
+    usual = np.maximum(size * WINDOW, LEAST_WINDOW)[tracks.view]
+    extent = np.zeros(int(tracks.point.max()) + 1)
+    np.maximum.at(extent, tracks.point, usual * tracks.footprint)
+    width = np.clip(extent[tracks.point] / tracks.footprint, usual, LARGEST_WINDOW * usual)
+    return 2 * np.floor(width / 2).astype(int) + 1
+
+
+def _look(ingest: Path, scene: "Scene", view: "View", places: _Places) -> "tuple[np.ndarray, np.ndarray]":
+    """Per place red, green, blue, whether it is clipped, and the texture, NaN where it cannot be used; and the photo's
+    mean of g g^T."""
+    import numpy as np
+
+    from stages.masks import load_mask
+    from stages.photos import load_pixels
+
+    width, height = _size(scene, view)
+    pixels = load_pixels(ingest / view.file, width, height)
+    used = np.ones(pixels.shape[:2], bool) if pixels.shape[2] == 3 else pixels[..., 3] == 255
+    if view.mask:
+        used = used & load_mask(ingest / view.mask, width, height)
+    seen = np.full((len(places.xy), 5), np.nan)
+    for side in np.unique(places.window):
+        of_size = np.flatnonzero(places.window == side)
+        corner = np.floor(places.xy[of_size]).astype(int) - side // 2
+        whole = ((corner >= 0) & (corner + side <= [width, height])).all(axis=1)
+        seen[of_size[whole]] = _window_means(pixels, used, corner[whole], int(side))
+    return seen, _gradients(pixels)
+
+
+def _window_means(pixels: "np.ndarray", used: "np.ndarray", corner: "np.ndarray", side: int) -> "np.ndarray":
+    """(n, 5) as :func:`_look` gives them, of square windows that lie in the photo whole."""
+    import numpy as np
+
+    x = corner[:, 0, None] + np.tile(np.arange(side), side)
+    y = corner[:, 1, None] + np.repeat(np.arange(side), side)
+    window = pixels[y, x, :3]
+    clipped = ((window <= DARKEST) | (window >= BRIGHTEST)).mean(axis=1).max(axis=1) > CLIPPED_SHARE
+    texture = window.mean(axis=2).std(axis=1) / 255
+    result = np.column_stack([window.mean(axis=1) / 255, clipped, texture])
+    result[~used[y, x].all(axis=1)] = np.nan
+    return result
+
+
+def _gradients(pixels: "np.ndarray") -> "np.ndarray":
+    """The mean of g g^T (2, 2) of the grey picture, at most GRADIENT_WIDTH wide; what is transparent is black."""
+    import cv2
+    import numpy as np
+
+    grey = cv2.cvtColor(pixels[..., :3], cv2.COLOR_RGB2GRAY).astype(np.float32) / 255
+    if pixels.shape[2] == 4:
+        grey = grey * (pixels[..., 3] / np.float32(255))
+    height, width = grey.shape
+    if width > GRADIENT_WIDTH:
+        size = GRADIENT_WIDTH, max(1, round(height * GRADIENT_WIDTH / width))
+        grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+    across = cv2.Scharr(grey, cv2.CV_32F, 1, 0, scale=1 / 32).ravel()
+    down = cv2.Scharr(grey, cv2.CV_32F, 0, 1, scale=1 / 32).ravel()
+    gradient = np.stack([across, down]).astype(float)
+    return gradient @ gradient.T / gradient.shape[1]
+
+
+def _workers(scene: "Scene") -> int:
+    """How many photos to decode at a time: one per core, fewer where they are too large for that."""
+    largest = max(camera.width * camera.height for camera in scene.cameras)
+    return max(1, min(os.cpu_count() or 1, DECODING_BYTES // (40 * largest)))
