@@ -162,7 +162,6 @@ def even_height(width: int, camera: "Camera") -> int:
 
 def resized(camera: "Camera", width: int) -> "Camera":
     """The same view with another (even) width and the even height next to its proportions."""
-    height = even_height(width, camera)
-    sx, sy = width / camera.width, height / camera.height
-    fx, fy, cx, cy, *distortion = camera.params
-    return replace(camera, width=width, height=height, params=(sx * fx, sy * fy, sx * cx, sy * cy, *distortion))
+    from stages.colmap.cameras import rescaled
+
+    return rescaled(camera, width, even_height(width, camera))

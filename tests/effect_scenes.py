@@ -20,7 +20,7 @@ from stages.files import write_json, write_tensors
 from stages.photos import Photo, write_photos
 from tests.small_scenes import pinhole_directions
 
-WIDTH, HEIGHT, FOCAL = 160, 120, 167.0
+WIDTH, HEIGHT, FOCAL = 400, 300, 417.0
 CAMERA = Camera("PINHOLE", WIDTH, HEIGHT, (FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2))
 POINTS, MATCHED, TRACK_NOISE_PX = 3000, 0.6, 0.3
 

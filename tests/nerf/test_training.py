@@ -5,9 +5,12 @@ import pytest
 import torch
 from torch import Tensor
 
+from nerf.effects.exposures import Exposures
+from nerf.effects.poses import RefinedPoses
 from nerf.paper import PaperNerf, PaperSettings
 from nerf.probe import make_probe, measure
 from nerf.ray_bank import RayBank, build_ray_bank
+from nerf.rays import Rays
 from nerf.training import NonFinite, PaperTrainer, TrainerSettings, over
 
 FIELD = PaperSettings(
@@ -106,7 +109,7 @@ def test_a_non_finite_step_changes_nothing_and_shows_its_batch(
         run.step(1, 0.5)
     assert all(torch.equal(a, b) or a.isnan().any() for a, b in zip(before.values(), run.state().values(), strict=True))
     assert caught.value.batch["target"].shape == (64, 3)
-    assert set(caught.value.batch) == {"origins", "directions", "near", "far", "target", "background"}
+    assert set(caught.value.batch) == {*Rays._fields, "target", "view", "background"}
 
 
 def test_the_rate_scale_scales_the_update() -> None:
@@ -147,3 +150,22 @@ def test_a_state_of_another_architecture_is_refused() -> None:
     other = PaperTrainer(PaperNerf(replace(FIELD, width=8), seed=0), small_bank(), TRAINER)
     with pytest.raises(RuntimeError, match="size mismatch"):
         trainer().load_state(other.state())
+
+
+def test_what_is_learnt_of_photos_is_trained_and_resumed() -> None:
+    def fresh() -> PaperTrainer:
+        parts = RefinedPoses(2), Exposures(torch.tensor([[0.0, 0, 0], [0.5, 0.5, 0.5]]))
+        return PaperTrainer(PaperNerf(FIELD, seed=0), small_bank(), TRAINER, *parts)
+
+    whole, first, second = fresh(), fresh(), fresh()
+    begun = {name: part.detach().clone() for name, part in whole.photo_parameters.items()}
+    for step in range(12):
+        whole.step(step, step / 12)
+    for step in range(6):
+        first.step(step, step / 12)
+    second.load_state(copied(first.state()))
+    for step in range(6, 12):
+        second.step(step, step / 12)
+    assert same(whole.state(), second.state())
+    moved = {name: (part.detach() - begun[name]).abs().max() for name, part in whole.photo_parameters.items()}
+    assert set(moved) == {"turn", "shift", "log_gain"} and all(1e-4 < change < 0.2 for change in moved.values())
