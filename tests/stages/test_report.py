@@ -299,7 +299,7 @@ def test_page_shows_what_the_photos_call_for(tmp_path: Path, progress: Any):
     write_json(inputs["effects"] / "effects.json", EFFECTS)
     html, _ = _run(inputs, tmp_path / "out", progress)
     section = html[html.index("Effects of these photos") : html.index("Where the cameras stood")]
-    cells = re.findall(r"<t[dh][^>]*>(.*?)</t[dh]>", section)
+    cells = re.findall(r"<t[dh](?: [^>]*)?>(.*?)</t[dh]>", section)
     rows = [cells[i : i + 8] for i in range(0, len(cells), 8)]
     assert rows[0] == ["effect", "", "statistic", "threshold", "noise", "gain in trial", "costs", "why"]
     assert rows[1:] == [
