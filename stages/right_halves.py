@@ -36,6 +36,6 @@ def right_half_psnr(
     light = own_light(rendering.colour, rendering.opacity, background)
     behind = rendering.colour - light
     log_gain = fit_log_gain(light[left], truth[left] - behind[left])
-    fitted = behind + expose(light, log_gain)
-    scores = (psnr(mean_squared_error(shown[right].clamp(0, 1), truth[right])) for shown in (rendering.colour, fitted))
-    return next(scores), next(scores)
+    fitted = behind[right] + expose(light[right], log_gain)
+    raw, fitted = (mean_squared_error(c.clamp(0, 1), truth[right]) for c in (rendering.colour[right], fitted))
+    return psnr(raw), psnr(fitted)
