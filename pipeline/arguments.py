@@ -15,6 +15,11 @@ from pipeline.settings import Settings, UsageError, wrong_options
 
 T = TypeVar("T")
 
+Effects = Annotated[
+    tyro.conf.UseAppendAction[tuple[str, ...]],
+    tyro.conf.arg(metavar="NAME=on|off|auto", help="Force an effect on or off, or let the photos decide; repeatable."),
+]
+
 
 @dataclass
 class Common:
@@ -40,6 +45,9 @@ class RunArguments:
     """The workspace (default: <photos>.nerf in the current folder)."""
     cameras: Path | None = None
     """Known cameras for these photos: a transforms.json or a COLMAP model folder."""
+    like: str | None = None
+    """Render the video as this training photo was exposed (its name; where the effect exposure is on)."""
+    effect: Effects = ()
     until: str | None = None
     """The last stage to run."""
     from_: Annotated[str | None, tyro.conf.arg(name="from")] = None
@@ -58,6 +66,9 @@ class StageArguments:
     common: Annotated[Common, tyro.conf.arg(name="")] = field(default_factory=Common)
     cameras: Path | None = None
     """render only: a file with the cameras to render, like output/transforms.json."""
+    like: str | None = None
+    """render only: render the video as this training photo was exposed (its name)."""
+    effect: Effects = ()
     force: bool = False
     """Run it again even if it is cached."""
 
@@ -107,6 +118,7 @@ class DemoArguments:
 
     settings: Annotated[Settings, tyro.conf.arg(name="")] = field(default_factory=Settings)
     common: Annotated[Common, tyro.conf.arg(name="")] = field(default_factory=Common)
+    effect: Effects = ()
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("demo")
     """Where photos and workspace go."""
 

@@ -25,6 +25,7 @@ from pipeline.settings import (
     default_workspace,
     read_toml,
     settings_from,
+    with_effects,
     with_source,
 )
 from pipeline.workspace import Workspace
@@ -120,6 +121,7 @@ def command_run(words: Sequence[str]) -> int:
     if given.config is not None:  # the file's values become the defaults that flags override
         from_file = settings_from(read_toml(given.config), f"--config {given.config}")
         given = words_of.parse(words_of.RunArguments, "run", words, from_file)
+    asked = _like(with_effects(given.settings, given.effect), given.like)
     stages = chain.up_to(_known_stage(given.until or list(chain.STAGES)[-1], "--until"))
     force = frozenset[str]()
     if given.from_ is not None:
@@ -127,11 +129,18 @@ def command_run(words: Sequence[str]) -> int:
     root = given.output or default_workspace(given.photos)
     with choose_display(given.common.json) as display:
         try:
-            settings = with_source(given.settings, given.photos, given.cameras)
+            settings = with_source(asked, given.photos, given.cameras)
         except StageError as error:
             display.failed("ingest", error)
             return chain.EXIT_CODES["ingest"]
         return _run_stages(root, settings, stages, given.common, display, force)
+
+
+def _like(settings: Settings, photo: str | None) -> Settings:
+    """The settings with ``--like PHOTO``."""
+    if photo is None:
+        return settings
+    return settings.model_copy(update={"render": settings.render.model_copy(update={"like": photo})})
 
 
 def _known_stage(name: str, flag: str, among: Sequence[str] = tuple(chain.STAGES)) -> str:
@@ -179,10 +188,11 @@ def command_stage(stage: str, words: Sequence[str]) -> int:
     workspace = Workspace.existing(given.workspace)
     recorded = _recorded_settings(workspace)
     given = words_of.parse(words_of.StageArguments, stage, words, recorded)
-    settings = given.settings
+    for flag in ("cameras", "like"):
+        if getattr(given, flag) is not None and stage != "render":
+            raise UsageError(f"--{flag} belongs to `pipeline render` and `pipeline run`, not to {stage}")
+    settings = _like(with_effects(given.settings, given.effect), given.like)
     if given.cameras is not None:
-        if stage != "render":
-            raise UsageError(f"--cameras belongs to `pipeline render` and `pipeline run`, not to {stage}")
         update = {"cameras": given.cameras.absolute()}
         settings = settings.model_copy(update={"render": settings.render.model_copy(update=update)})
     stages = chain.needed_for(stage)
@@ -258,12 +268,13 @@ def command_demo(words: Sequence[str]) -> int:
     from pipeline import demo
 
     given = words_of.parse(words_of.DemoArguments, "demo", words, demo.default_settings())
+    asked = with_effects(given.settings, given.effect)
     photos, root = given.output / "photos", given.output / "demo.nerf"
     with choose_display(given.common.json) as display:
         display.begin("photos")
         line, seconds = demo.photograph(photos, display)
         display.end("photos", line, seconds, cached=seconds == 0)
-        settings = with_source(given.settings, photos, None)
+        settings = with_source(asked, photos, None)
         code = _run_stages(root, settings, list(chain.STAGES), given.common, display)
         started = time.monotonic()
         display.begin("truth")

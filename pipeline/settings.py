@@ -2,9 +2,9 @@
 
 import os
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
@@ -21,6 +21,8 @@ from stages.train import Config as TrainConfig
 
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
+
+Options = TypeVar("Options", bound=BaseModel)
 
 
 class UsageError(Exception):
@@ -76,6 +78,27 @@ def _wrong_option(name: str, problem: "ErrorDetails") -> str:
     for long, short in (("greater than or equal to", "at least"), ("less than or equal to", "at most")):
         must = must.replace(long, short)
     return f"{name} {problem['input']} must {must}"
+
+
+def with_effects(settings: Options, choices: Sequence[str]) -> Options:
+    """The settings of all stages with each ``NAME=on|off|auto`` as the option NAME of stage effects; the last one wins.
+
+    Raises UsageError for another name or value, with those that there are.
+    """
+    effects = getattr(settings, "effects", None)
+    fields = {} if effects is None else type(effects).model_fields
+    names = [name for name, field in fields.items() if {"on", "off", "auto"} <= set(get_args(field.annotation))]
+    chosen = {}
+    for choice in choices:
+        name, _, value = choice.partition("=")
+        if name.replace("-", "_") not in names:
+            raise UsageError(f"--effect {choice}: no effect {name!r}; there are: {', '.join(names) or 'none'}")
+        if value not in ("on", "off", "auto"):
+            raise UsageError(f"--effect {choice}: {name} can be on, off or auto, as in --effect {name}=on")
+        chosen[name.replace("-", "_")] = value
+    if effects is None or not chosen:
+        return settings
+    return settings.model_copy(update={"effects": effects.model_copy(update=chosen)})
 
 
 def with_source(settings: Settings, photos: Path, cameras: Path | None) -> Settings:

@@ -19,19 +19,21 @@ from stages.live_line import duration, short_count
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from nerf.model import Rendering
     from nerf.rays import Rays
     from nerf.scene import Scene, View
     from stages.baselines import MeanPhoto
     from stages.drawing import Painter
 
 NEEDS = ("ingest", "normalise", "train")
-VERSION = 3
+VERSION = 4
 RESUMES = False
 LINKS = ("metrics.json", "renders", "errors")
 
 BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
-FIGURES = ("psnr", "ssim", "psnr_mean_image", "psnr_nearest_view")
+FIGURES = ("psnr", "ssim", "psnr_mean_image", "psnr_nearest_view", "psnr_right", "psnr_fitted_right")
 TRUSTED_WIDTH = 0.5  # of the photos: below, a picture can be sharp and the field know nothing of fine detail
+WORTH_SAYING = 0.5  # dB between the two scores of right halves
 TRIED_PHOTOS = 4  # to see how fast the field draws them
 NO_LPIPS = "LPIPS is not computed: no package in use ships its weights and nothing is downloaded"
 
@@ -150,8 +152,11 @@ class Examiner:
 
     def _score_one(self, view: "View", mean: "MeanPhoto", on_chunk: Callable[[float], None]) -> dict[str, Any]:
         from stages.baselines import nearest_view, resized
+        from stages.right_halves import right_half_psnr
 
-        truth, used, image = self._photo(view), self.used(view), self._render(view, on_chunk)
+        truth, used, rendering = self._photo(view), self.used(view), self._render(view, on_chunk)
+        image = rendering.colour.clamp(0, 1)
+        right, fitted = right_half_psnr(rendering, self.painter.background.cpu(), truth, used)
         height, width = truth.shape[:2]
         nearest = nearest_view(view, self.scene.of_split("train"))
         # The decoded file has an ASCII name that is unique up to its suffix; the photo's own may be anything.
@@ -164,6 +169,8 @@ class Examiner:
             "ssim": ssim(image, truth, used),
             "psnr_mean_image": _psnr(mean.shown_at(height, width), truth, used),
             "psnr_nearest_view": _psnr(resized(self._photo(nearest), height, width), truth, used),
+            "psnr_right": right,
+            "psnr_fitted_right": fitted,
             "nearest_view": nearest.name,
             "render": f"renders/{file}",
             "error": f"errors/{file}",
@@ -179,10 +186,10 @@ class Examiner:
 
         return view_mask(self.ingest, self.scene, view, self.downscale)
 
-    def _render(self, view: "View", on_chunk: Callable[[float], None]) -> "Tensor":
+    def _render(self, view: "View", on_chunk: Callable[[float], None]) -> "Rendering":
         from stages.training_data import view_rays
 
-        return self.painter.draw(view_rays(self.scene, view, self.downscale), on_chunk).colour.clamp(0, 1)
+        return self.painter.draw(view_rays(self.scene, view, self.downscale), on_chunk)
 
 
 def _examiner(config: Config, scene: "Scene", inputs: Inputs, folder: Path) -> Examiner:
@@ -248,6 +255,8 @@ def _overall(
         notes = [*notes, "no photo was kept for testing, so nothing is measured"]
     elif len(images) < FEWEST_FOR_INTERVAL:
         notes = [*notes, f"no interval: {_photos(len(images))} cannot show how much the figures vary"]
+    if small := sum(image["psnr_right"] is None for image in images):
+        notes = [*notes, f"a half of {_photos(small)} has too few pixels to fit an exposure on or to score with it"]
     metrics |= {
         "lpips": None,
         "photos_scored": len(images),
@@ -267,6 +276,9 @@ def _line(metrics: dict[str, Any]) -> str:
     interval = metrics["psnr_interval"]
     spread = f" ± {(interval[1] - interval[0]) / 2:.1f}" if interval else ""
     similarity = "" if metrics["ssim"] is None else f", SSIM {metrics['ssim']:.2f}"
+    right, fitted = metrics["psnr_right"], metrics["psnr_fitted_right"]
+    if right is not None and abs(fitted - right) > WORTH_SAYING:
+        similarity += f" · right halves {right:.1f} dB, {fitted:.1f} dB with its exposure fitted on the left half"
     trivial = f"nearest photo {metrics['psnr_nearest_view']:.1f} dB, mean image {metrics['psnr_mean_image']:.1f} dB"
     scored, test = metrics["photos_scored"], metrics["photos_test"]
     count = _photos(scored) if scored == test else f"{scored} of {test} photos"

@@ -1,5 +1,7 @@
 """A trained field on disk: ``field.safetensors`` (weights) and ``field.json`` (what they belong to)."""
 
+import difflib
+import math
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,6 +13,8 @@ if TYPE_CHECKING:
     from nerf.grid_field import GridField
     from nerf.model import RadianceModel
     from nerf.paper import PaperNerf
+
+MOST_NAMES = 8  # of photos, in an error
 
 
 def save_field(folder: Path, model: "RadianceModel", info: dict[str, Any]) -> None:
@@ -35,6 +39,8 @@ def save_field(folder: Path, model: "RadianceModel", info: dict[str, Any]) -> No
 def load_field(folder: Path, device: str = "cpu") -> "tuple[RadianceModel, dict[str, Any]]":
     """The field in ``folder``, ready to render, and the content of its field.json.
 
+    One that models exposure comes at its neutral one, wrapped in an ExposedModel; :func:`seen_like` gives others.
+
     Raises:
         StageError: if the files are missing or damaged, or another version of the program wrote them.
     """
@@ -45,10 +51,57 @@ def load_field(folder: Path, device: str = "cpu") -> "tuple[RadianceModel, dict[
     try:
         model = _untrained(info["kind"], info["settings"], device)
         model.load_state_dict(load_file(folder / "field.safetensors"))
+        neutral = _neutral(info)
     except (OSError, KeyError, TypeError, ValueError, RuntimeError, SafetensorError) as error:
         why = " ".join(str(error).split())  # torch lists mismatches over several lines
         raise StageError("cannot read the trained field", why, "Run stage train again.") from error
-    return model.to(device).requires_grad_(False), info
+    model = model.to(device).requires_grad_(False)
+    return model if neutral is None else _exposed(model, neutral, device), info
+
+
+def seen_like(model: "RadianceModel", info: dict[str, Any], photo: str, device: str) -> "RadianceModel":
+    """A field from :func:`load_field` as the training photo of that name saw it.
+
+    Raises:
+        StageError: if the field models no exposure, or has none of that photo.
+    """
+    from nerf.effects.exposure import ExposedModel
+
+    what, among = f"no exposure of {photo} is known", info.get("exposure")
+    if among is None or not isinstance(model, ExposedModel):
+        why = "all photos share one exposure: the effect is off for this scene"
+        raise StageError(what, why, "Leave out --render.like, or train with --effect exposure=on.")
+    if photo not in among["photos"]:
+        why = f"the field knows those of the training photos: {_some(sorted(among['photos']), photo)}"
+        raise StageError(what, why, "Give one of these names to --render.like.")
+    return _exposed(model.model, among["photos"][photo], device)
+
+
+def _neutral(info: dict[str, Any]) -> list[float] | None:
+    """The neutral log gains, None where exposure is not modelled. Raises ValueError for what are no gains."""
+    if info.get("exposure") is None:
+        return None
+    for name, log_gain in {"neutral": info["exposure"]["neutral"], **info["exposure"]["photos"]}.items():
+        if len(log_gain) != 3 or not all(math.isfinite(value) for value in log_gain):
+            raise ValueError(f"the exposure of {name} is {log_gain}; it must be three numbers")
+    return info["exposure"]["neutral"]
+
+
+def _exposed(model: "RadianceModel", log_gain: list[float], device: str) -> "RadianceModel":
+    import torch
+
+    from nerf.effects.exposure import ExposedModel
+
+    return ExposedModel(model, torch.tensor(log_gain, dtype=torch.float32, device=device))
+
+
+def _some(names: list[str], wanted: str) -> str:
+    """The names; of many only some, those like the one ``wanted`` first, and how many others there are."""
+    if len(names) <= MOST_NAMES:
+        return ", ".join(names)
+    alike = difflib.get_close_matches(wanted, names, n=MOST_NAMES, cutoff=0.4)
+    shown = [*alike, *(name for name in names if name not in alike)][:MOST_NAMES]
+    return f"{', '.join(shown)} and {len(names) - len(shown)} more"
 
 
 def _untrained(kind: str, settings: dict[str, Any], device: str) -> "PaperNerf | GridField":

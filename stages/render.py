@@ -45,6 +45,10 @@ class Config(StageConfig):
     width: int | None = Field(default=None, ge=16, le=8192, description="pixels; odd numbers are rounded to even ones")
     fps: int | None = Field(default=None, ge=1, le=120, description="none: 30, fewer for fewer than 120 frames")
     depth: bool = Field(default=True, description="write depth.mp4 too")
+    like: str | None = Field(
+        default=None,
+        description="name of a training photo to render as it was exposed, where photos differ; none: neutral",
+    )
     save_frames: bool = Field(default=False, description="keep every frame as PNG in frames/")
 
 
@@ -136,7 +140,8 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     config = plan(config, inputs, progress)
     assert config.width is not None and config.fps is not None
     scene = read_scene(inputs["normalise"])
-    painter = load_painter(inputs["train"])
+    painter = load_painter(inputs["train"], like=config.like)
+    exposure = _exposure(config, inputs["train"])
     path = _path(config, scene).resized(config.width)
     write_json(folder / "path.json", _path_json(path, scene, config.fps))
     started = time.perf_counter()
@@ -144,8 +149,9 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     outputs = ("path.json", *_write(renderings, path, config, folder))
     frames_per_second = len(path.cameras) / (time.perf_counter() - started)
     write_json(folder / "speed.json", {"frames_per_second": frames_per_second})
-    facts = _facts(config, path)
+    facts = _facts(config, path) | ({} if exposure is None else {"exposure": exposure})
     line = f"{facts['path']}, {facts['frames']} frames {facts['width']}×{facts['height']}"
+    line += "" if exposure is None else f" · {exposure}"
     return StageResult(outputs, f"{line} · {frames_per_second:.2g} frames/s", ("speed.json",), facts)
 
 
@@ -227,6 +233,13 @@ def _path_json(path: CameraPath, scene: "Scene", fps: int) -> dict[str, Any]:
         for index, (camera, pose) in enumerate(zip(path.cameras, path.poses, strict=True))
     ]
     return (intrinsics(path.cameras[0]) if shared else {}) | {"fps": fps, "frames": frames}
+
+
+def _exposure(config: Config, train: Path) -> str | None:
+    """At which exposure the video is, in words; None where the field has only one."""
+    if read_json(train / "field.json").get("exposure") is None:
+        return None
+    return "neutral exposure" if config.like is None else f"exposed like {config.like}"
 
 
 def _facts(config: Config, path: CameraPath) -> dict[str, Any]:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from nerf.scene import Scene
 
 NEEDS = ("ingest", "sfm", "normalise", "train", "evaluate", "render", "mesh")
-VERSION = 2
+VERSION = 3
 RESUMES = False
 LINKS = ("report.html", "summary.json")
 
@@ -43,6 +43,7 @@ class Results:
     photos: dict[str, Any] | None
     registration: dict[str, Any] | None
     scene: "Scene | None"
+    effects: dict[str, Any] | None
     field: dict[str, Any] | None
     curve: list[dict[str, Any]]
     metrics: dict[str, Any] | None
@@ -71,6 +72,7 @@ def read_results(inputs: Inputs) -> Results:
         photos=of("ingest", "photos.json"),
         registration=of("sfm", "registration.json"),
         scene=read_scene(inputs["normalise"]) if "normalise" in inputs else None,
+        effects=of("effects", "effects.json"),
         field=of("train", "field.json"),
         curve=of("train", "curve.json") or [],
         metrics=of("evaluate", "metrics.json"),
@@ -97,6 +99,8 @@ def page(results: Results, summary: dict[str, Any], config: Config) -> str:
     """The whole HTML page."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
+    from stages.report_effects import effects_table
+
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent),
         autoescape=True,
@@ -119,6 +123,7 @@ def page(results: Results, summary: dict[str, Any], config: Config) -> str:
         video=_video(results.inputs, config.video_limit_mb),
         compared=_compared(results),
         curve=_curve(results),
+        effects=effects_table(results.effects),
         cameras=_cameras(results),
         mesh_preview=_mesh_preview(results.inputs),
         longest=max((manifest["seconds"] for manifest in results.manifests.values()), default=0) or 1,

@@ -51,6 +51,8 @@ def test_help_of_run_lists_the_stage_options(capsys: pytest.CaptureFixture[str])
         (["--train.steps", "5", "--train.seconds", "5"], "--train: steps (5) and seconds (5) are two budgets"),
         (["--train.steps", "many"], "--train.steps: 'many' does not fit {None}|INT (pipeline run --help)"),
         (["--train.field", "foo"], "invalid choice 'foo' for argument '--train.field'. Expected one of ("),
+        (["--effect", "lens_flare=on"], "--effect lens_flare=on: no effect 'lens_flare'; there are: "),
+        (["--effect", "lens_flare=on", "--effect", "fog=on"], "--effect lens_flare=on: no effect"),
         (["--train.stepz", "5"], "Unrecognized options: --train.stepz, 5; perhaps --train.steps"),
     ],
 )  # fmt: skip
@@ -73,6 +75,26 @@ def test_a_config_file_is_validated(tmp_path: Path, capsys: pytest.CaptureFixtur
     (tmp_path / "options.toml").write_text(text)
     assert run_command(["run", str(tmp_path), "--config", str(tmp_path / "options.toml")]) == 2
     assert message in capsys.readouterr().err
+
+
+def test_like_is_an_option_of_render_whichever_way_it_is_spelt(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    seen: list[str | None] = []
+    monkeypatch.setattr("pipeline.cli._run_stages", lambda root, settings, *_, **__: seen.append(settings.render.like))
+    (tmp_path / "photos").mkdir()
+    Image.new("RGB", (40, 30)).save(tmp_path / "photos/a.jpg")
+    for words in (["--like", "a.jpg"], ["--render.like", "a.jpg"], []):
+        run_command(["run", str(tmp_path / "photos"), *words])
+    assert seen == ["a.jpg", "a.jpg", None]
+
+
+def test_like_belongs_to_render(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):
+    seen: list[str | None] = []
+    monkeypatch.setattr("pipeline.cli._run_stages", lambda root, settings, *_, **__: seen.append(settings.render.like))
+    (tmp_path / "run.json").write_text(json.dumps({"version": 1, "options": {}, "plans": {}, "keys": {}}))
+    assert run_command(["mesh", str(tmp_path), "--like", "a.jpg"]) == 2
+    assert "--like belongs to `pipeline render` and `pipeline run`, not to mesh" in capsys.readouterr().err
+    run_command(["render", str(tmp_path), "--like", "a.jpg"])
+    assert seen == ["a.jpg"]
 
 
 def run_on(photos: Path, capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str]:

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from PIL import Image
 from torch import Tensor
 
+from nerf.effects.exposure import expose
 from nerf.model import Rendering
 from nerf.rays import Rays
 from nerf.scene import Camera, Scene, Similarity, View
@@ -178,6 +179,54 @@ def masked(inputs: dict[str, Path], ignore: np.ndarray) -> dict[str, Path]:
         write_png(inputs["ingest"] / view["mask"], np.where(ignore, np.uint8(0), np.uint8(255)))
     write_json(inputs["normalise"] / "scene.json", scene)
     return inputs
+
+
+def exposed(inputs: dict[str, Path], log_gain: float, noise: float) -> dict[str, Path]:
+    """Take every photo again at that gain, with noise on top, the same for all gains."""
+    random = np.random.default_rng(5)
+    for file in sorted((inputs["ingest"] / "images").iterdir()):
+        light = expose(torch.from_numpy(np.array(Image.open(file))) / 255, torch.full((3,), log_gain)).numpy()
+        pixels = (light + noise * random.standard_normal(light.shape)).clip(0, 1)
+        Image.fromarray(np.rint(255 * pixels).astype(np.uint8)).save(file)
+    return inputs
+
+
+@pytest.mark.parametrize("stops", [-1.0, 0.5])
+def test_the_exposure_of_a_test_photo_is_no_fault_of_the_field(stops: float, make: Make, tmp_path: Path, progress: Any):
+    log_gain = stops * math.log(2)
+    metrics, line = _run(exposed(make(), log_gain, 0.03), tmp_path / "out", progress)
+    noise_alone = -20 * math.log10(0.03)
+    assert metrics["psnr_fitted_right"] == pytest.approx(noise_alone, abs=0.1)
+    assert metrics["psnr"] < noise_alone - 6 and metrics["psnr_right"] < noise_alone - 6
+    right, fitted = metrics["psnr_right"], metrics["psnr_fitted_right"]
+    words = f"right halves {right:.1f} dB, {fitted:.1f} dB with its exposure fitted on the left half · nearest photo"
+    assert words in line and line.startswith(f"{metrics['psnr']:.1f} ± ")
+    assert f"{metrics['psnr']:.1f} dB" in metrics["verdict"], "the verdict keeps the raw score"
+
+
+def test_without_a_gain_both_scores_of_right_halves_agree(make: Make, tmp_path: Path, progress: Any):
+    metrics, line = _run(exposed(make(), 0.0, 0.03), tmp_path / "out", progress)
+    assert metrics["psnr_fitted_right"] == pytest.approx(metrics["psnr_right"], abs=0.05)
+    assert metrics["psnr_right"] == pytest.approx(metrics["psnr"], abs=0.3)
+    assert "right" not in line and metrics["psnr_fitted_right"] != metrics["psnr_right"]
+
+
+def test_masks_count_in_the_scores_of_right_halves(make: Make, tmp_path: Path, progress: Any):
+    ignore = np.zeros((HEIGHT, WIDTH), bool)
+    ignore[:, 4:9] = ignore[:14, 20:] = True
+    metrics, _ = _run(masked(make(), ignore), tmp_path / "out", progress)
+    assert min(image["psnr_fitted_right"] for image in metrics["images"]) > 50
+    ignore[:, 4 : WIDTH // 2] = True  # 96 pixels of the left half are left
+    ignore[:10, :4] = True  # 56
+    metrics, line = _run(masked(make_again(tmp_path), ignore), tmp_path / "narrow", progress)
+    assert all(metrics[key] is None for key in ("psnr_right", "psnr_fitted_right")) and metrics["psnr"] > 25
+    assert "a half of 4 photos has too few pixels to fit an exposure on or to score with it" in metrics["notes"]
+    assert "right" not in line
+
+
+def make_again(folder: Path) -> dict[str, Path]:
+    """The folders that were made before."""
+    return {stage: folder / stage for stage in evaluate.NEEDS}
 
 
 def test_what_masks_ignore_does_not_count(make: Make, tmp_path: Path, progress: Any):

@@ -4,7 +4,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
+from nerf.effects.exposure import ExposedModel
 from nerf.model import Rendering
 from nerf.region import Layout
 from nerf.scene import Camera, Scene, Similarity, View
@@ -225,3 +227,46 @@ def test_speed_is_a_record_and_path_an_output(inputs, progress) -> None:
     content = read_json(inputs["render"] / "path.json")
     assert len(content["frames"]) == 3
     assert (content["w"], content["h"], content["fps"]) == (40, 30, 1)
+
+
+def with_exposure(inputs, monkeypatch) -> None:
+    """The ball as a field with an exposure of its own and one photo a stop brighter."""
+    photos = {"bright.jpg": [np.log(2)] * 3, "dark.jpg": [-np.log(2)] * 3}
+    info = read_json(inputs["train"] / "field.json") | {"exposure": {"neutral": [0.0] * 3, "photos": photos}}
+    write_json(inputs["train"] / "field.json", info)
+    shown = ExposedModel(GreyBall(), torch.zeros(3))
+    monkeypatch.setattr("stages.field_files.load_field", lambda folder, device="cpu": (shown, info))
+
+
+class GreyBall(Ball):
+    def colour(self, points, directions):
+        return torch.full_like(points, 0.5)
+
+
+@pytest.mark.parametrize(
+    ("like", "level", "words"),
+    [(None, 0.5, "neutral exposure"), ("bright.jpg", 0.6858, "exposed like bright.jpg"),
+     ("dark.jpg", 0.3608, "exposed like dark.jpg")],
+)  # fmt: skip
+def test_a_field_with_exposure_is_rendered_at_a_stated_one(
+    inputs, progress, monkeypatch, like: str | None, level: float, words: str
+) -> None:
+    with_exposure(inputs, monkeypatch)
+    result = run(inputs, progress, frames=2, width=40, like=like, save_frames=True)
+    assert result.facts["exposure"] == words and f" · {words} · " in result.line
+    frame = np.asarray(Image.open(inputs["render"] / "frames/00000.png"))
+    assert np.abs(frame[15, 20] / 255 - level).max() < 0.004
+    assert frame[1, 1].tolist() == [0, 0, 255]  # the background has no exposure
+
+
+def test_a_field_without_exposure_says_nothing_of_it(inputs, progress) -> None:
+    result = run(inputs, progress, frames=2, width=40)
+    assert "exposure" not in result.facts and "expos" not in result.line
+    with pytest.raises(StageError, match=r"no exposure of a\.jpg is known: all photos share one exposure"):
+        run(inputs, progress, frames=2, width=40, like="a.jpg")
+
+
+def test_a_photo_without_exposure_is_refused(inputs, progress, monkeypatch) -> None:
+    with_exposure(inputs, monkeypatch)
+    with pytest.raises(StageError, match=r"no exposure of a\.jpg is known: .* bright\.jpg"):
+        run(inputs, progress, frames=2, width=40, like="a.jpg")

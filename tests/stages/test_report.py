@@ -128,8 +128,10 @@ def _write_metrics(folder: Path, scene: Scene, size: tuple[int, int]) -> None:
         _picture(rank * 4, size, blur=True).save(folder / "renders" / file)
         Image.new("RGB", size, (60 + rank, 20, 80)).save(folder / "errors" / file)
         figures = {"psnr": 19.0 + rank, "ssim": 0.5 + rank / 20, "psnr_mean_image": 12.9, "psnr_nearest_view": 14.2}
+        figures |= {"psnr_right": 18.5 + rank, "psnr_fitted_right": 23.25 + rank}
         images.append({"name": view.name, "render": f"renders/{file}", "error": f"errors/{file}"} | figures)
     overall = {"psnr": 21.5, "ssim": 0.62, "psnr_mean_image": 12.9, "psnr_nearest_view": 14.2}
+    overall |= {"psnr_right": 21.0, "psnr_fitted_right": 25.8}
     counts = {
         "background": [1.0, 1.0, 1.0],
         "photos_scored": len(images),
@@ -256,6 +258,69 @@ def test_page_shows_the_evidence_for_the_camera_model(tmp_path: Path, progress: 
     write_json(path, registration | {"camera_models": [], "images": unknown})  # as with given cameras
     html, _ = _run(inputs, tmp_path / "given", progress)
     assert "Camera model:" not in html and "pose is known" not in html
+
+
+def test_page_shows_both_scores_of_right_halves_with_what_they_mean(tmp_path: Path, progress: Any):
+    inputs = make_workspace(tmp_path)
+    html, _ = _run(inputs, tmp_path / "out", progress)
+    assert "right half, exposure fitted on the left (dB)</th>" in html
+    assert '<td class="number">23.50</td><td class="number">28.25</td></tr>' in html
+    assert "Right halves of the photos alone: 21.0 dB, and 25.8 dB with the exposure of each photo fitted" in html
+    path = inputs["evaluate"] / "metrics.json"
+    metrics = json.loads(path.read_text("utf-8"))
+    unknown = {"psnr_right": None, "psnr_fitted_right": None}
+    write_json(path, metrics | unknown | {"images": [image | unknown for image in metrics["images"]]})
+    html, _ = _run(inputs, tmp_path / "unknown", progress)
+    assert "Right halves" not in html and '<td class="number">–</td><td class="number">–</td></tr>' in html
+
+
+def effect(on: bool, reason: str, **figures: Any) -> dict[str, Any]:
+    """An entry of effects.json."""
+    nothing = dict.fromkeys(("statistic", "threshold", "noise", "pilot_gain_db", "pilot_noise_db"))
+    return nothing | {"on": on, "modelled": True, "unit": "", "seconds": 0.0, "reason": reason} | figures
+
+
+EFFECTS = {
+    "background": effect(False, "no pixel looks beyond the region"),
+    "exposure": effect(True, "gains span 0.8 EV", statistic=0.8, threshold=0.05, noise=0.016, unit="EV", seconds=2.5),
+    "view_dependence": effect(True, "it pays", pilot_gain_db=0.94, pilot_noise_db=0.21),
+    "motion_blur": effect(True, "<i>smeared</i>", modelled=False, statistic=4.0, threshold=2.5, unit="px"),
+    "mirrors": effect(False, "none seen", modelled=False),
+}
+
+
+def test_page_shows_what_the_photos_call_for(tmp_path: Path, progress: Any):
+    inputs = make_workspace(tmp_path)
+    assert "Effects of these photos" not in _run(inputs, tmp_path / "without", progress)[0]
+    inputs["effects"] = tmp_path / "fox.nerf" / "effects" / "0123456789abcdef"
+    inputs["effects"].mkdir(parents=True)
+    manifest = json.loads((inputs["train"] / "manifest.json").read_text("utf-8"))
+    write_json(inputs["effects"] / "manifest.json", manifest | {"stage": "effects", "config": {}, "facts": {}})
+    write_json(inputs["effects"] / "effects.json", EFFECTS)
+    html, _ = _run(inputs, tmp_path / "out", progress)
+    section = html[html.index("Effects of these photos") : html.index("Where the cameras stood")]
+    cells = re.findall(r"<t[dh](?: [^>]*)?>(.*?)</t[dh]>", section)
+    rows = [cells[i : i + 8] for i in range(0, len(cells), 8)]
+    assert rows[0] == ["effect", "", "statistic", "threshold", "noise", "gain in trial", "costs", "why"]
+    assert rows[1:] == [
+        ["exposure", "<b>on</b>", "0.8 EV", "0.05 EV", "0.016 EV", "–", "2.5 s", "gains span 0.8 EV"],
+        ["view dependence", "<b>on</b>", "–", "–", "–", "+0.9 ± 0.2 dB", "–", "it pays"],
+        ["background", "off", "–", "–", "–", "–", "–", "no pixel looks beyond the region"],
+    ]
+    flags = re.findall(r"<li>(.*?)</li>", section)
+    assert flags == [
+        "motion blur: &lt;i&gt;smeared&lt;/i&gt; (4 px, threshold 2.5 px). Hold the camera still, give more light or a "
+        "shorter exposure time, and leave blurred photos out."
+    ]
+
+
+def test_without_flags_there_is_no_list_of_them(tmp_path: Path, progress: Any):
+    inputs = make_workspace(tmp_path) | {"effects": tmp_path / "effects"}
+    inputs["effects"].mkdir()
+    write_json(inputs["effects"] / "manifest.json", json.loads((inputs["mesh"] / "manifest.json").read_text("utf-8")))
+    write_json(inputs["effects"] / "effects.json", {"exposure": EFFECTS["exposure"]})
+    html, _ = _run(inputs, tmp_path / "out", progress)
+    assert "Effects of these photos" in html and "not modelled" not in html
 
 
 def test_a_large_video_lies_beside_the_page(inputs: dict[str, Path], tmp_path: Path, progress: Any):

@@ -1,0 +1,45 @@
+"""The report's table of effects, and what was seen in the photos that no effect models."""
+
+from typing import Any
+
+from stages.live_line import duration
+
+# What to do about it; the effect's own reason says what was seen.
+ADVICE = {
+    "motion_blur": "Hold the camera still, give more light or a shorter exposure time, and leave blurred photos out.",
+    "defocus": "Close the aperture, focus once and keep the focus locked.",
+    "rolling_shutter": "Take photos standing still in place of a video, or move the camera slowly.",
+    "participating_media": "Wait for clear air: haze, smoke and water are taken for parts of the scene.",
+    "mirrors": "Cover mirrors and large panes, or mask them out: what they show is taken for a room behind them.",
+    "transients": "Mask out what moves, or leave out the photos that show it.",
+    "vignetting": "Close the aperture, or correct the vignetting before ingest.",
+    "scale": "Keep a similar distance, or add photos at the distances in between.",
+}
+
+
+def effects_table(effects: dict[str, Any] | None) -> dict[str, Any] | None:
+    """``rows`` of the effects that can be modelled, those that are on first, with every figure in words, and ``flags``:
+    what was seen and is not modelled, with advice. None where no stage has looked for effects."""
+    if effects is None:
+        return None
+    modelled = [(name, entry) for name, entry in effects.items() if entry["modelled"]]
+    ranked = sorted(modelled, key=lambda item: (not item[1]["on"], item[0]))
+    seen = sorted((name, entry) for name, entry in effects.items() if not entry["modelled"] and entry["on"])
+    return {
+        "rows": [_row(name, entry) for name, entry in ranked],
+        "flags": [_row(name, entry) | {"advice": ADVICE.get(name, "")} for name, entry in seen],
+    }
+
+
+def _row(name: str, entry: dict[str, Any]) -> dict[str, Any]:
+    figures = {key: entry[key] for key in ("statistic", "threshold", "noise")}
+    unit = f" {entry['unit']}" if entry["unit"] else ""
+    gain, noise = entry["pilot_gain_db"], entry["pilot_noise_db"]
+    return {
+        "name": name.replace("_", " "),
+        "on": entry["on"],
+        **{key: "–" if figure is None else f"{figure:.3g}{unit}" for key, figure in figures.items()},
+        "pilot": "–" if gain is None else f"{gain:+.1f}" + ("" if noise is None else f" ± {noise:.1f}") + " dB",
+        "cost": duration(entry["seconds"]) if entry["seconds"] else "–",
+        "reason": entry["reason"],
+    }

@@ -1,0 +1,41 @@
+"""How like a photo a rendering is once its exposure is that of the photo, told by pixels that did not choose it.
+
+A field of photos that differ in exposure has one exposure of its own, and a held-out photo's is anybody's guess. The
+gain (per channel, in linear light) is fitted on the left half of the photo; the right half is scored with it and, for
+comparison, without.
+"""
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from nerf.model import Rendering
+
+FEWEST_PIXELS = 64  # of a half
+
+
+def right_half_psnr(
+    rendering: "Rendering", background: "Tensor", truth: "Tensor", used: "Tensor | None" = None
+) -> tuple[float | None, float | None]:
+    """PSNR of the right half: as rendered, and with the exposure that makes the left half like the photo.
+
+    ``rendering`` is (H, W), shown over ``background`` (3,), which no gain changes; ``truth`` is (H, W, 3), and only
+    pixels that are ``used``, (H, W) bool, count. (None, None) where a half has fewer than FEWEST_PIXELS of them.
+    """
+    import torch
+
+    from nerf.effects.exposure import expose, fit_log_gain, own_light
+    from nerf.metrics import mean_squared_error, psnr
+
+    used = torch.ones(truth.shape[:2], dtype=torch.bool) if used is None else used
+    in_left = torch.arange(truth.shape[1]) < truth.shape[1] // 2
+    left, right = used & in_left, used & ~in_left
+    if min(int(left.sum()), int(right.sum())) < FEWEST_PIXELS:
+        return None, None
+    light = own_light(rendering.colour, rendering.opacity, background)
+    behind = rendering.colour - light
+    log_gain = fit_log_gain(light[left], truth[left] - behind[left])
+    fitted = behind[right] + expose(light[right], log_gain)
+    raw, fitted = (mean_squared_error(c.clamp(0, 1), truth[right]) for c in (rendering.colour[right], fitted))
+    return psnr(raw), psnr(fitted)
