@@ -212,9 +212,7 @@ class GridField(nn.Module):
         grad_origins, grad_directions = backend.sample_points_backward(
             rays, samples, self.settings.contracted, grad_points
         )
-        return grad_origins, grad_directions + self.of_directions_backward(
-            rays.directions, gradients.harmonics
-        )
+        return grad_origins, grad_directions + self.of_directions_backward(rays.directions, gradients.harmonics)
 
     def _waves(self, rays: Rays, jitter: Float[Tensor, "rays"]) -> Iterator[Wave]:
         return front_to_back(self.backend, self.bits, self.lattice, self._density_pass, rays, jitter)

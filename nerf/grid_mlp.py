@@ -83,7 +83,9 @@ def no_directions(directions: Float[Tensor, "rays 3"]) -> Float[Tensor, "rays 0"
     return directions[:, :0]
 
 
-def no_directions_backward(directions: Float[Tensor, "rays 3"], grad: Float[Tensor, "rays 0"]) -> Float[Tensor, "rays 3"]:
+def no_directions_backward(
+    directions: Float[Tensor, "rays 3"], grad: Float[Tensor, "rays 0"]
+) -> Float[Tensor, "rays 3"]:
     """They do not depend on it."""
     return torch.zeros_like(directions)
 

@@ -35,7 +35,9 @@ class Config(StageConfig):
     background: Switch = Field(default="auto", description="space beyond the region of interest, folded in")
     pose_refinement: Switch = Field(default="auto", description="a rigid correction of each photo's camera")
     pilot_steps: int = Field(
-        default=PILOT_STEPS, ge=0, description="steps of each pilot training, where the evidence is not clear; 0: no pilots"
+        default=PILOT_STEPS,
+        ge=0,
+        description="steps of each pilot training, where the evidence is not clear; 0: no pilots",
     )
     seed: int = Field(default=0, description="of the pilots")
 

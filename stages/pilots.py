@@ -17,9 +17,11 @@ from stages.effect_decisions import Decisions, photo_parts
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from nerf.grid_field import GridField
+    from nerf.model import Rendering
     from nerf.ray_bank import RayBank
     from nerf.rays import Rays
-    from nerf.scene import Scene, View
+    from nerf.scene import Scene
     from stages.train import Config as TrainConfig
 
 LONG_SIDE = 200  # pixels of the photos in a pilot
@@ -65,6 +67,7 @@ class PilotScene(NamedTuple):
 def pilot_scene(ingest: Path, scene: "Scene", progress: Progress) -> PilotScene | None:
     """Small photos to train on and to judge by, both from the training photos; None where there are too few."""
     from stages.device import compute_device
+    from stages.right_halves import enough
     from stages.training_data import training_bank, view_mask, view_pixels, view_rays
 
     views = scene.of_split("train")
@@ -75,15 +78,16 @@ def pilot_scene(ingest: Path, scene: "Scene", progress: Progress) -> PilotScene 
     split = replace(scene, views=tuple(replace(v, split="test" if v.name in chosen else "train") for v in views))
     downscale = max(1.0, max(max(camera.width, camera.height) for camera in scene.cameras) / LONG_SIDE)
     bank = training_bank(ingest, split, "train", downscale, progress).to(compute_device())
-    kept = tuple(
+    photos = [
         _Photo(
             view_rays(split, view, downscale),
             view_pixels(ingest, split, view, downscale, (0.0, 0.0, 0.0)),
             view_mask(ingest, split, view, downscale),
         )
         for view in split.of_split("test")
-    )
-    return PilotScene(split, bank, kept)
+    ]
+    kept = tuple(photo for photo in photos if enough(photo.colours, photo.used))
+    return PilotScene(split, bank, kept) if kept else None
 
 
 def run_pilot(trial: PilotScene, off: Decisions, on: Decisions, steps: int, seed: int, progress: Progress) -> Pilot:
@@ -93,7 +97,9 @@ def run_pilot(trial: PilotScene, off: Decisions, on: Decisions, steps: int, seed
     for number in range(SEEDS):
         scores = []
         for index, arm in enumerate((off, on)):
-            progress.update(f"pilot training {2 * number + index + 1} of {2 * SEEDS}", (2 * number + index) / (2 * SEEDS))
+            progress.update(
+                f"pilot training {2 * number + index + 1} of {2 * SEEDS}", (2 * number + index) / (2 * SEEDS)
+            )
             trained = time.perf_counter()
             field = _trained(trial, arm, steps, seed + number)
             seconds[index] += time.perf_counter() - trained
@@ -103,8 +109,9 @@ def run_pilot(trial: PilotScene, off: Decisions, on: Decisions, steps: int, seed
     return Pilot(mean(gains), noise, seconds[1] / seconds[0] - 1, time.perf_counter() - started)
 
 
-def _trained(trial: PilotScene, arm: Decisions, steps: int, seed: int):
+def _trained(trial: PilotScene, arm: Decisions, steps: int, seed: int) -> "GridField":
     """A grid field after ``steps`` steps under the decisions of one arm."""
+    from nerf.grid_field import GridField
     from stages.training_setup import make_trainer
 
     device = trial.bank.device
@@ -112,7 +119,8 @@ def _trained(trial: PilotScene, arm: Decisions, steps: int, seed: int):
     trainer = make_trainer(_config(arm, steps, device.type), trial.scene, trial.bank, seed, parts)
     for step in range(steps):
         trainer.step(step, step / steps, 1.0)
-    return trainer.model
+    assert isinstance(trainer.model, GridField)
+    return trainer.model.to("cpu")
 
 
 def _config(arm: Decisions, steps: int, device: str) -> "TrainConfig":
@@ -135,43 +143,44 @@ def _config(arm: Decisions, steps: int, device: str) -> "TrainConfig":
     )
 
 
-def _score(field, photo: _Photo, poses: bool, seed: int) -> float:
-    """PSNR on the right half of a photo whose exposure (and pose) is fitted on its left half."""
+def _score(field: "GridField", photo: _Photo, poses: bool, seed: int) -> float:
+    """PSNR (dB) on the right half of a photo whose exposure (and pose) is fitted on its left half."""
+    from stages.right_halves import right_half_psnr
+
+    picture = _seen(field, photo.rays)
+    if poses:
+        picture = _seen(field, _moved(field, photo, picture, seed))
+    _, fitted = right_half_psnr(picture, _black(), photo.colours, photo.used)
+    assert fitted is not None, "pilot_scene keeps no photo that has too few pixels"
+    return fitted
+
+
+def _moved(field: "GridField", photo: _Photo, picture: "Rendering", seed: int) -> "Rays":
+    """The photo's rays from where its left half says that it was taken."""
     import torch
 
-    from nerf.effects.exposure import expose, fit_log_gain
+    from nerf.effects.exposure import fit_log_gain
+    from nerf.effects.exposures import Exposures
     from nerf.effects.pose_fit import fit_pose
-    from nerf.metrics import mean_squared_error, psnr
     from nerf.rays import Rays
+    from stages.right_halves import halves
+
+    left, _ = halves(photo.colours, photo.used)
+    target = photo.colours[left]
+    exposure = Exposures(fit_log_gain(picture.colour[left], target)[None])
+    pose = fit_pose(field, Rays(*(part[left] for part in photo.rays)), target, _black(), exposure, seed)
+    flat = Rays(*(part.flatten(0, 1) for part in photo.rays))
+    moved = pose.forward(flat, torch.zeros(len(flat.near), dtype=torch.int64))
+    return Rays(*(part.view_as(whole) for part, whole in zip(moved, photo.rays, strict=True)))
+
+
+def _seen(field: "GridField", rays: "Rays") -> "Rendering":
     from nerf.rendering import render_image
 
-    black = torch.zeros(3)
-    left, right = _halves(photo)
-    rays = photo.rays
-
-    def seen(rays: Rays) -> torch.Tensor:
-        return render_image(field, rays, black).colour
-
-    picture = seen(rays)
-    gain = fit_log_gain(picture[left], photo.colours[left])
-    if poses:
-        from nerf.effects.exposures import Exposures
-
-        pixels = Rays(*(part[left] for part in rays))
-        pose = fit_pose(field, pixels, photo.colours[left], black, Exposures(gain[None]), seed)
-        flat = Rays(*(part.flatten(0, 1) for part in rays))
-        moved = pose.forward(flat, torch.zeros(len(flat.near), dtype=torch.int64))
-        picture = seen(Rays(*(part.view_as(whole) for part, whole in zip(moved, rays, strict=True))))
-        gain = fit_log_gain(picture[left], photo.colours[left])
-    exposed = expose(picture[right], gain).clamp(0, 1)
-    return psnr(mean_squared_error(exposed, photo.colours[right]))
+    return render_image(field, rays, _black())
 
 
-def _halves(photo: _Photo) -> "tuple[Tensor, Tensor]":
-    """(height, width) masks of the used pixels on the left and on the right."""
+def _black() -> "Tensor":
     import torch
 
-    height, width = photo.colours.shape[:2]
-    used = torch.ones(height, width, dtype=torch.bool) if photo.used is None else photo.used
-    left = (torch.arange(width) < width // 2).expand(height, width)
-    return used & left, used & ~left
+    return torch.zeros(3)

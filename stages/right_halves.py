@@ -23,19 +23,29 @@ def right_half_psnr(
     ``rendering`` is (H, W), shown over ``background`` (3,), which no gain changes; ``truth`` is (H, W, 3), and only
     pixels that are ``used``, (H, W) bool, count. (None, None) where a half has fewer than FEWEST_PIXELS of them.
     """
-    import torch
-
     from nerf.effects.exposure import expose, fit_log_gain, own_light
     from nerf.metrics import mean_squared_error, psnr
 
-    used = torch.ones(truth.shape[:2], dtype=torch.bool) if used is None else used
-    in_left = torch.arange(truth.shape[1]) < truth.shape[1] // 2
-    left, right = used & in_left, used & ~in_left
-    if min(int(left.sum()), int(right.sum())) < FEWEST_PIXELS:
+    if not enough(truth, used):
         return None, None
+    left, right = halves(truth, used)
     light = own_light(rendering.colour, rendering.opacity, background)
     behind = rendering.colour - light
     log_gain = fit_log_gain(light[left], truth[left] - behind[left])
     fitted = behind[right] + expose(light[right], log_gain)
     raw, fitted = (mean_squared_error(c.clamp(0, 1), truth[right]) for c in (rendering.colour[right], fitted))
     return psnr(raw), psnr(fitted)
+
+
+def halves(truth: "Tensor", used: "Tensor | None") -> "tuple[Tensor, Tensor]":
+    """The used pixels of the left half and those of the right half, (H, W) bool; ``truth`` is (H, W, 3)."""
+    import torch
+
+    used = torch.ones(truth.shape[:2], dtype=torch.bool) if used is None else used
+    in_left = torch.arange(truth.shape[1]) < truth.shape[1] // 2
+    return used & in_left, used & ~in_left
+
+
+def enough(truth: "Tensor", used: "Tensor | None") -> bool:
+    """Whether both halves have the pixels that it takes."""
+    return min(int(half.sum()) for half in halves(truth, used)) >= FEWEST_PIXELS

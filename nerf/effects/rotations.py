@@ -17,7 +17,9 @@ def rotation_from_vector(vector: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3 3
     small = square < SERIES_BELOW
     angle = torch.where(small, 1.0, square).sqrt()  # away from 0, so that no infinite derivative is multiplied by 0
     sine = torch.where(small, 1 - square / 6 + square.square() / 120, angle.sin() / angle)
-    versine = torch.where(small, 0.5 - square / 24 + square.square() / 720, 0.5 * ((angle / 2).sin() / (angle / 2)) ** 2)
+    versine = torch.where(
+        small, 0.5 - square / 24 + square.square() / 720, 0.5 * ((angle / 2).sin() / (angle / 2)) ** 2
+    )
     cross = cross_matrix(vector)
     identity = torch.eye(3, dtype=vector.dtype, device=vector.device)
     return identity + sine[..., None, None] * cross + versine[..., None, None] * (cross @ cross)

@@ -71,7 +71,9 @@ def test_clear_evidence_decides_without_a_pilot(decided: Callable) -> None:
 
 
 @pytest.mark.parametrize(("gain", "on"), [(0.3, True), (0.15, False), (-1.0, False)])
-def test_a_pilot_decides_in_the_grey_zone_by_its_gain_against_its_noise(decided: Callable, gain: float, on: bool) -> None:
+def test_a_pilot_decides_in_the_grey_zone_by_its_gain_against_its_noise(
+    decided: Callable, gain: float, on: bool
+) -> None:
     decisions, table, _, tried = decided(effects.Config(), gain, exposure=evidence(None))
     assert tried == ["exposure"] and (decisions.exposure is not None) is on
     assert (table["exposure"]["pilot_gain_db"], table["exposure"]["seconds"]) == (gain, 3.0)

@@ -59,7 +59,9 @@ def test_a_full_pixel_asks_for_no_more_than_being_full() -> None:
     bright = seen(torch.full((4, 3), 0.95, dtype=torch.float64), torch.ones(4, dtype=torch.float64))
     part = Exposures(torch.full((3, 3), math.log(2), dtype=torch.float64))
     assert (part.residual(bright, torch.ones(4, 3).double()) == 0).all()
-    assert (part.residual(bright, torch.full((4, 3), 0.9).double()) > 0.1).all(), "too bright where the photo is not full"
+    assert (part.residual(bright, torch.full((4, 3), 0.9).double()) > 0.1).all(), (
+        "too bright where the photo is not full"
+    )
 
 
 def test_the_darkest_photo_shows_the_field_as_it_is_and_the_mean_gain_is_kept() -> None:

@@ -5,7 +5,18 @@ import torch
 
 from nerf.effects.rotations import SERIES_BELOW, cross_matrix, rotation_from_vector
 
-ANGLES = (0.0, 1e-30, 1e-8, 1e-3, 0.999 * SERIES_BELOW**0.5, 1.001 * SERIES_BELOW**0.5, 1.0, math.pi - 1e-6, math.pi, 6.0)
+ANGLES = (
+    0.0,
+    1e-30,
+    1e-8,
+    1e-3,
+    0.999 * SERIES_BELOW**0.5,
+    1.001 * SERIES_BELOW**0.5,
+    1.0,
+    math.pi - 1e-6,
+    math.pi,
+    6.0,
+)
 AXIS = torch.tensor([2.0, -3.0, 6.0], dtype=torch.float64) / 7
 
 
