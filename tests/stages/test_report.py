@@ -309,8 +309,8 @@ def test_page_shows_what_the_photos_call_for(tmp_path: Path, progress: Any):
     ]
     flags = re.findall(r"<li>(.*?)</li>", section)
     assert flags == [
-        "blur: &lt;i&gt;smeared&lt;/i&gt; (4 px, threshold 2.5 px). Hold the camera still, lock the focus, give more light, "
-        "and leave blurred photos out."
+        "blur: &lt;i&gt;smeared&lt;/i&gt; (4 px, threshold 2.5 px). Hold the camera still, lock the focus, give more "
+        "light, and leave blurred photos out."
     ]
 
 
