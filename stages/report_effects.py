@@ -6,8 +6,8 @@ from stages.live_line import duration
 
 # What to do about it; the effect's own reason says what was seen.
 ADVICE = {
-    "motion_blur": "Hold the camera still, give more light or a shorter exposure time, and leave blurred photos out.",
-    "defocus": "Close the aperture, focus once and keep the focus locked.",
+    "blur": "Hold the camera still, lock the focus, give more light, and leave blurred photos out.",
+    "tone": "Turn off automatic contrast, HDR and filters, or develop all photos with one curve.",
     "rolling_shutter": "Take photos standing still in place of a video, or move the camera slowly.",
     "participating_media": "Wait for clear air: haze, smoke and water are taken for parts of the scene.",
     "mirrors": "Cover mirrors and large panes, or mask them out: what they show is taken for a room behind them.",

@@ -284,7 +284,7 @@ EFFECTS = {
     "background": effect(False, "no pixel looks beyond the region"),
     "exposure": effect(True, "gains span 0.8 EV", statistic=0.8, threshold=0.05, noise=0.016, unit="EV", seconds=2.5),
     "view_dependence": effect(True, "it pays", pilot_gain_db=0.94, pilot_noise_db=0.21),
-    "motion_blur": effect(True, "<i>smeared</i>", modelled=False, statistic=4.0, threshold=2.5, unit="px"),
+    "blur": effect(True, "<i>smeared</i>", modelled=False, statistic=4.0, threshold=2.5, unit="px"),
     "mirrors": effect(False, "none seen", modelled=False),
 }
 
@@ -309,8 +309,8 @@ def test_page_shows_what_the_photos_call_for(tmp_path: Path, progress: Any):
     ]
     flags = re.findall(r"<li>(.*?)</li>", section)
     assert flags == [
-        "motion blur: &lt;i&gt;smeared&lt;/i&gt; (4 px, threshold 2.5 px). Hold the camera still, give more light or a "
-        "shorter exposure time, and leave blurred photos out."
+        "blur: &lt;i&gt;smeared&lt;/i&gt; (4 px, threshold 2.5 px). Hold the camera still, lock the focus, give more "
+        "light, and leave blurred photos out."
     ]
 
 
