@@ -47,6 +47,11 @@ class ExposureFit(NamedTuple):
     brightness_spread: float
 
     @property
+    def unknown_because(self) -> str:
+        """Why nothing is known of any photo, where that is so."""
+        return "no two photos show the same unsaturated points" if len(self.used) else "no tracks"
+
+    @property
     def known(self) -> Bool[np.ndarray, "views"]:
         """The photos whose gain is known beside the others'."""
         return self.layout.main
@@ -148,7 +153,7 @@ def exposure_evidence(fit: ExposureFit) -> Evidence:
     The noise, that of one gain, is taken off in quadrature, so that noise alone is no difference.
     """
     if not fit.known.any():
-        return unknown("EV", THRESHOLD_EV, "no two photos show the same unsaturated points", None)
+        return unknown("EV", THRESHOLD_EV, fit.unknown_because, None)
     gain, error = fit.log_gain[fit.known] / EV, fit.error[fit.known] / EV
     noise = float(np.sqrt(np.mean(error**2)))
     spread = float(np.sqrt(max(np.mean((gain - gain.mean(axis=0)) ** 2) - noise**2, 0.0)))
@@ -164,7 +169,7 @@ def tone_evidence(fit: ExposureFit) -> Evidence:
     deviation of brightness. The threshold is that of exposure."""
     known = fit.known & np.isfinite(fit.contrast_error)
     if not known.any() or fit.brightness_spread == 0:
-        return unknown("EV", THRESHOLD_EV, "no two photos show the same unsaturated points", None)
+        return unknown("EV", THRESHOLD_EV, fit.unknown_because, False)
     scale = fit.brightness_spread / EV
     noise = float(np.sqrt(np.mean(fit.contrast_error[known] ** 2))) * scale
     spread = float(np.sqrt(max(np.mean((fit.contrast[known] * scale) ** 2) - noise**2, 0.0)))

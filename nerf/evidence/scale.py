@@ -22,7 +22,7 @@ def scale_evidence(tracks: TrackColours) -> Evidence:
     rank, length = within_groups(tracks.point[order])
     several = length > 1
     if not several.any():
-        return unknown("×", THRESHOLD, "no point is seen by two photos", None)
+        return unknown("×", THRESHOLD, "no tracks", False)
     size = tracks.footprint[order]
     ratio = size[several & (rank == length - 1)] / size[several & (rank == 0)]
     found = float(np.quantile(ratio, QUANTILE))

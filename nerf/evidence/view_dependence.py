@@ -27,7 +27,7 @@ def view_dependence_evidence(tracks: TrackColours, fit: ExposureFit) -> Evidence
     narrow ones; the widest third of the pairs against the narrowest. Noise by batches of points (jackknife)."""
     unit = "sRGB"
     if not fit.known.any():
-        return unknown(unit, THRESHOLD, "no two photos show the same unsaturated points", None)
+        return unknown(unit, THRESHOLD, fit.unknown_because, None)
     first, second = _pairs(fit.layout)
     view_of = fit.layout.view
     both = fit.known[view_of[first]] & fit.known[view_of[second]]
