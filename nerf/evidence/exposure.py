@@ -26,7 +26,7 @@ LEAST_NOISE = 0.25 / 255  # of an sRGB value: no photo of 8 bits is more exact, 
 
 class ExposureFit(NamedTuple):
     """``log_gain`` (views, 3): natural logarithm of linear light, its median over the connected photos 0 per channel;
-    ``error``: its standard error, infinite (and the gain 0) where a photo shares no points with the others.
+    ``error``: its standard error, infinite (and the gain 0) where a photo shares hardly any points with the others.
 
     ``used`` are the m observations fitted, ``rest`` (m, 3) what is left of their logarithms, ``weight`` (m, 3) their
     robust weights over the variance of their noise. ``noise`` is the robust deviation of what is left as an sRGB value.
@@ -54,7 +54,7 @@ class ExposureFit(NamedTuple):
     @property
     def known(self) -> Bool[np.ndarray, "views"]:
         """The photos whose gain is known beside the others'."""
-        return self.layout.main
+        return np.isfinite(self.error).all(axis=1)
 
 
 def fit_exposure(tracks: TrackColours) -> ExposureFit:
@@ -78,8 +78,9 @@ def fit_exposure(tracks: TrackColours) -> ExposureFit:
         gain[:, channel] = layout.parts(part, weight[:, channel])
         rest[:, channel] = layout.around_points(part - gain[layout.view, channel], weight[:, channel])
         error[:, channel] = layout.errors(rest[:, channel], weight[:, channel]) * given_up
-    if layout.main.any():
-        gain[layout.main] -= np.median(gain[layout.main], axis=0)
+    known = np.isfinite(error).all(axis=1)
+    if known.any():
+        gain = np.where(known[:, None], gain - np.median(gain[known], axis=0), 0.0)
     contrast, contrast_error, spread = _contrast(layout, y - gain[layout.view] - vignetting * square[:, None], weight)
     return ExposureFit(
         layout, used, rest, weight, gain, error, vignetting, float(noise.mean()), contrast, contrast_error, spread
@@ -160,7 +161,7 @@ def exposure_evidence(fit: ExposureFit) -> Evidence:
     span = float(np.ptp(gain.mean(axis=1)))
     ratio = f"{span / noise:.0f} × their noise" if noise > 0 else "without noise"
     alone = int(np.count_nonzero(~fit.known))
-    left_out = f"; {alone} photos share no points with the others" if alone else ""
+    left_out = f"; {alone} photos share hardly any points with the others" if alone else ""
     return judged(spread, noise, THRESHOLD_EV, "EV", f"gains span {span:.2g} EV, {ratio}{left_out}")
 
 

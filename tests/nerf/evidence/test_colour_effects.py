@@ -7,8 +7,8 @@ import pytest
 
 from nerf.evidence import media, transients, view_dependence, vignetting
 from nerf.evidence.exposure import EV, fit_exposure
-from nerf.evidence.tracks import TrackColours
-from tests.nerf.evidence.photographed_points import photographed_points
+from nerf.evidence.tracks import TrackColours, linear_light
+from tests.nerf.evidence.photographed_points import encoded, photographed_points
 
 SEEDS = range(20)
 
@@ -68,7 +68,7 @@ def test_shining_points_call_for_view_dependence() -> None:
 
 def test_rough_windows_seen_from_aside_are_not_view_dependence() -> None:
     """Noise that grows with texture and angle, but not where there is no texture."""
-    for seed in SEEDS:
+    for seed in range(8):
         draw = np.random.default_rng(seed)
         tracks = photographed_points(seed, points=800, per_point=6)
         texture = draw.uniform(0, 0.15, tracks.point.max() + 1)[tracks.point]
@@ -88,7 +88,7 @@ def test_one_direction_says_nothing_of_view_dependence() -> None:
     tracks = photographed_points(0)
     tracks = replace(tracks, towards=np.tile([0.0, 0.0, 1.0], (len(tracks), 1)))
     found = view_dependence.view_dependence_evidence(tracks, fit_exposure(tracks))
-    assert found.called_for is None and found.words == "points are seen from directions only 0.0° apart: nothing known"
+    assert found.called_for is None and found.words == "points are seen from directions 0.0° apart: nothing known"
 
 
 def passed_by(seed: int, share: float, photos: int = 2) -> tuple[TrackColours, TrackColours]:
@@ -141,9 +141,7 @@ def test_expected_places_are_those_that_two_near_photos_see() -> None:
 def hazy(seed: int, per_unit: float) -> TrackColours:
     """Points through a medium as bright as the points are on average."""
     tracks = photographed_points(seed, points=800, noise=0.004, log_gain=exposed(seed) / 2)
-    from nerf.evidence.tracks import linear_light
-    from tests.nerf.evidence.photographed_points import encoded
-
+    tracks = replace(tracks, distance=2 * tracks.distance - 5)
     left = np.exp(-per_unit * tracks.distance)[:, None]
     light = linear_light(tracks.colour) * left + 0.3 * np.exp(exposed(seed) / 2)[tracks.view][:, None] * (1 - left)
     return replace(tracks, colour=encoded(light))
