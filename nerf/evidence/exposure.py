@@ -54,7 +54,7 @@ class ExposureFit(NamedTuple):
     @property
     def known(self) -> Bool[np.ndarray, "views"]:
         """The photos whose gain is known beside the others'."""
-        return np.isfinite(self.error).all(axis=1)
+        return np.asarray(np.isfinite(self.error).all(axis=1))
 
 
 def fit_exposure(tracks: TrackColours) -> ExposureFit:
@@ -78,7 +78,7 @@ def fit_exposure(tracks: TrackColours) -> ExposureFit:
         gain[:, channel] = layout.parts(part, weight[:, channel])
         rest[:, channel] = layout.around_points(part - gain[layout.view, channel], weight[:, channel])
         error[:, channel] = layout.errors(rest[:, channel], weight[:, channel]) * given_up
-    known = np.isfinite(error).all(axis=1)
+    known = np.asarray(np.isfinite(error).all(axis=1))
     if known.any():
         gain = np.where(known[:, None], gain - np.median(gain[known], axis=0), 0.0)
     contrast, contrast_error, spread = _contrast(layout, y - gain[layout.view] - vignetting * square[:, None], weight)
@@ -97,7 +97,7 @@ def _robust_weights(
     fall with what is left follow a shift by less than it: E[w + u w'] in place of E[w] (Huber 1964).
     """
     base = sigma**-2
-    weight, scale, before = base, 0.0, np.zeros(layout.views)
+    weight, scale, size, before = base, 0.0, np.zeros_like(y), np.zeros(layout.views)
     for turn in range(MOST_ROUNDS):
         gain = layout.parts(y, weight)
         rest = layout.around_points(y - gain[layout.view], weight)
