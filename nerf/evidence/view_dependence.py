@@ -24,7 +24,9 @@ BATCHES = 20
 
 def view_dependence_evidence(tracks: TrackColours, fit: ExposureFit) -> Evidence:
     """The deviation of colours along tracks (sRGB values, root mean square of the channels) that wide angles have over
-    narrow ones; the widest third of the pairs against the narrowest. Noise by batches of points (jackknife)."""
+    narrow ones; the widest third of the pairs against the narrowest. Noise by batches of points (jackknife).
+
+    A lower bound: features on highlights move with the highlight and have no tracks."""
     unit = "sRGB"
     if not fit.known.any():
         return unknown(unit, THRESHOLD, fit.unknown_because, None)

@@ -27,13 +27,13 @@ def shining(seed: int, strength: float, **settings: object) -> TrackColours:
     return replace(tracks, colour=colour, saturated=((colour < 0.02) | (colour > 0.98)).any(axis=1))
 
 
-@pytest.mark.parametrize("gain", [-0.5, 0.3])
+@pytest.mark.parametrize("gain", [-0.33, 0.2])
 def test_vignetting_is_found_under_exposures(gain: float) -> None:
     for seed in SEEDS:
         tracks = photographed_points(seed, log_gain=exposed(seed), vignetting=gain)
         found = vignetting.vignetting_evidence(tracks, fit_exposure(tracks))
         assert abs(found.statistic - abs(gain) / EV) < 5 * found.noise
-        assert found.called_for is (True if gain == -0.5 else found.called_for)
+        assert found.called_for is (True if gain == -0.33 else found.called_for)
         assert (" darker than " in found.words) == (gain < 0)
 
 
@@ -60,10 +60,10 @@ def test_diffuse_points_do_not_call_for_view_dependence() -> None:
 
 def test_shining_points_call_for_view_dependence() -> None:
     for seed in SEEDS:
-        tracks = shining(seed, 0.05, points=600, log_gain=exposed(seed))
+        tracks = shining(seed, 0.035, points=600, log_gain=exposed(seed))
         found = view_dependence.view_dependence_evidence(tracks, fit_exposure(tracks))
         assert found.called_for is True, found
-        assert 0.02 < found.statistic < 0.06
+        assert 0.018 < found.statistic < 0.04
 
 
 def test_rough_windows_seen_from_aside_are_not_view_dependence() -> None:

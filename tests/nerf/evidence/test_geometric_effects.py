@@ -23,14 +23,27 @@ def test_the_ratio_of_footprints(ratio: float, called_for: bool | None) -> None:
         near = tracks.view < 6  # every point is seen by five photos in a row: some by both kinds, some by one
         tracks = replace(tracks, footprint=np.where(near, 1.0, ratio))
         found = scale_evidence(tracks)
-        assert found.statistic == ratio and found.called_for is called_for
+        assert found.statistic == pytest.approx(ratio) and found.called_for is called_for
+
+
+def test_far_and_near_photos_are_compared_by_way_of_those_between() -> None:
+    """No point is seen by photos more than a third of the walk apart, the first of which are five times as far."""
+    for seed in SEEDS:
+        tracks = photographed_points(seed, views=30, per_point=4)
+        walk = tracks.only(
+            tracks.view + 4 > tracks.point * 0 + np.repeat(tracks.view[::4], 4)
+        )  # none from last to first
+        point_size = np.random.default_rng(seed).uniform(0.5, 2, walk.point.max() + 1)[walk.point]
+        found = scale_evidence(replace(walk, footprint=point_size * 6.0 ** (walk.view / 29)))
+        assert found.called_for is True and 4.5 < found.statistic < 6
+        assert found.words.startswith("pixels at the same points differ 1.2-fold in size, by way of other photos ")
 
 
 def test_a_few_false_points_are_no_scale() -> None:
     tracks = photographed_points(0)
     footprint = np.ones(len(tracks))
     footprint[:30:5] = 50
-    assert scale_evidence(replace(tracks, footprint=footprint)).statistic == 1
+    assert 1 <= scale_evidence(replace(tracks, footprint=footprint)).statistic < 1.2
     assert scale_evidence(TrackColours.empty(2)).words == "no tracks: nothing known"
 
 
