@@ -17,7 +17,7 @@ def background_evidence(
     position: Float[np.ndarray, "points 3"], point: Int[np.ndarray, "k"], has_alpha: bool, untracked: float
 ) -> Evidence:
     """The share of observations whose point lies beyond the region (the background is unbounded), its noise that of a
-    count of independent points; ``untracked`` only joins the words. Photos with alpha say themselves that there is none."""
+    count of independent points; ``untracked`` only joins the words. Photos with alpha say themselves what is there."""
     if has_alpha:
         return Evidence(0.0, "share", THRESHOLD, 0.0, False, "the photos' alpha says what is background")
     seen = np.bincount(point, minlength=len(position)).astype(float)

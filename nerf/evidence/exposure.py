@@ -26,7 +26,7 @@ LEAST_NOISE = 0.25 / 255  # of an sRGB value: no photo of 8 bits is more exact, 
 
 class ExposureFit(NamedTuple):
     """``log_gain`` (views, 3): natural logarithm of linear light, its median over the connected photos 0 per channel;
-    ``error``: its standard error, infinite (and the gain 0) where a photo shares no points with the others.
+    ``error``: its standard error, infinite (and the gain 0) where a photo shares hardly any points with the others.
 
     ``used`` are the m observations fitted, ``rest`` (m, 3) what is left of their logarithms, ``weight`` (m, 3) their
     robust weights over the variance of their noise. ``noise`` is the robust deviation of what is left as an sRGB value.
@@ -47,9 +47,14 @@ class ExposureFit(NamedTuple):
     brightness_spread: float
 
     @property
+    def unknown_because(self) -> str:
+        """Why nothing is known of any photo, where that is so."""
+        return "no two photos show the same unsaturated points" if len(self.used) else "no tracks"
+
+    @property
     def known(self) -> Bool[np.ndarray, "views"]:
         """The photos whose gain is known beside the others'."""
-        return self.layout.main
+        return np.asarray(np.isfinite(self.error).all(axis=1))
 
 
 def fit_exposure(tracks: TrackColours) -> ExposureFit:
@@ -73,8 +78,9 @@ def fit_exposure(tracks: TrackColours) -> ExposureFit:
         gain[:, channel] = layout.parts(part, weight[:, channel])
         rest[:, channel] = layout.around_points(part - gain[layout.view, channel], weight[:, channel])
         error[:, channel] = layout.errors(rest[:, channel], weight[:, channel]) * given_up
-    if layout.main.any():
-        gain[layout.main] -= np.median(gain[layout.main], axis=0)
+    known = np.asarray(np.isfinite(error).all(axis=1))
+    if known.any():
+        gain = np.where(known[:, None], gain - np.median(gain[known], axis=0), 0.0)
     contrast, contrast_error, spread = _contrast(layout, y - gain[layout.view] - vignetting * square[:, None], weight)
     return ExposureFit(
         layout, used, rest, weight, gain, error, vignetting, float(noise.mean()), contrast, contrast_error, spread
@@ -91,7 +97,7 @@ def _robust_weights(
     fall with what is left follow a shift by less than it: E[w + u w'] in place of E[w] (Huber 1964).
     """
     base = sigma**-2
-    weight, scale, before = base, 0.0, np.zeros(layout.views)
+    weight, scale, size, before = base, 0.0, np.zeros_like(y), np.zeros(layout.views)
     for turn in range(MOST_ROUNDS):
         gain = layout.parts(y, weight)
         rest = layout.around_points(y - gain[layout.view], weight)
@@ -148,14 +154,14 @@ def exposure_evidence(fit: ExposureFit) -> Evidence:
     The noise, that of one gain, is taken off in quadrature, so that noise alone is no difference.
     """
     if not fit.known.any():
-        return unknown("EV", THRESHOLD_EV, "no two photos show the same unsaturated points", None)
+        return unknown("EV", THRESHOLD_EV, fit.unknown_because, None)
     gain, error = fit.log_gain[fit.known] / EV, fit.error[fit.known] / EV
     noise = float(np.sqrt(np.mean(error**2)))
     spread = float(np.sqrt(max(np.mean((gain - gain.mean(axis=0)) ** 2) - noise**2, 0.0)))
     span = float(np.ptp(gain.mean(axis=1)))
     ratio = f"{span / noise:.0f} × their noise" if noise > 0 else "without noise"
     alone = int(np.count_nonzero(~fit.known))
-    left_out = f"; {alone} photos share no points with the others" if alone else ""
+    left_out = f"; {alone} photos share hardly any points with the others" if alone else ""
     return judged(spread, noise, THRESHOLD_EV, "EV", f"gains span {span:.2g} EV, {ratio}{left_out}")
 
 
@@ -164,7 +170,7 @@ def tone_evidence(fit: ExposureFit) -> Evidence:
     deviation of brightness. The threshold is that of exposure."""
     known = fit.known & np.isfinite(fit.contrast_error)
     if not known.any() or fit.brightness_spread == 0:
-        return unknown("EV", THRESHOLD_EV, "no two photos show the same unsaturated points", None)
+        return unknown("EV", THRESHOLD_EV, fit.unknown_because, False)
     scale = fit.brightness_spread / EV
     noise = float(np.sqrt(np.mean(fit.contrast_error[known] ** 2))) * scale
     spread = float(np.sqrt(max(np.mean((fit.contrast[known] * scale) ** 2) - noise**2, 0.0)))

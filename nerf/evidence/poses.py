@@ -43,7 +43,7 @@ def _similarity(
     one, none = np.ones_like(x), np.zeros_like(x)
     design = np.concatenate([np.stack([one, none, x, -y], 1), np.stack([none, one, y, x], 1)])
     target = residual.T.ravel()
-    weight = np.ones(len(target))
+    weight, rest = np.ones(len(target)), target
     solution = np.zeros(FREE)
     for _ in range(ROUNDS):
         root = np.sqrt(weight)

@@ -19,9 +19,9 @@ def rolling_shutter_evidence(
     readout as a part of the time between frames. Called for where it harms as wrong poses do (nerf/evidence/poses.py).
 
     ``residual``: observed minus projected, px; ``row``: y / height; ``motion``: how far the picture moves from a frame
-    to the next, px, NaN where it is not known or the photos are no video. The row at y shows the scene (y - 1/2) readouts
-    later, so residual = readout (y - 1/2) motion; the part that poses could take up (shift, zoom) is gone after
-    a bundle adjustment, and what is found is a lower bound.
+    to the next, px, NaN where it is not known or the photos are no video. The row at y shows the scene (y - 1/2)
+    readouts later, so residual = readout (y - 1/2) motion; what poses could take up of it (shift, zoom) is gone after a
+    bundle adjustment, and what is found is a lower bound.
     """
     speed = np.linalg.norm(motion, axis=1)
     moving = np.isfinite(speed) & (speed > LEAST_MOTION_PX)

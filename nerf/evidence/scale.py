@@ -3,7 +3,8 @@
 import numpy as np
 
 from nerf.evidence.evidence import Evidence, judged, unknown
-from nerf.evidence.tracks import TrackColours, within_groups
+from nerf.evidence.tracks import MOST_IN_TRACK, TrackColours, within_groups
+from nerf.evidence.two_way import two_way
 
 # A sample that stands for a pixel is right at one size. Detail between one octave and the next is what photos at twice
 # the distance cannot show and photos at the other show whole: from there on they contradict each other at edges (the
@@ -13,22 +14,35 @@ QUANTILE = 0.95
 
 
 def scale_evidence(tracks: TrackColours) -> Evidence:
-    """The 95th percentile over points of the largest by the smallest footprint, over the photos that see each.
+    """The 95th percentile over points of the largest by the smallest footprint, over the photos that see each; or the
+    ratio of the 95th by the 5th percentile of photos, where that is more.
 
-    Features are matched over some two octaves at most, so the ratio between photos that share no point is not known:
-    what is found is a lower bound.
+    Features are matched over an octave or two, so far and near photos of the same thing may share no point, but others
+    between them do: ln(footprint) = size[photo] + size[point], fitted to all, compares photos by way of these.
     """
     order = np.lexsort((tracks.footprint, tracks.point))
     rank, length = within_groups(tracks.point[order])
     several = length > 1
     if not several.any():
-        return unknown("×", THRESHOLD, "no point is seen by two photos", None)
+        return unknown("×", THRESHOLD, "no tracks", False)
     size = tracks.footprint[order]
     ratio = size[several & (rank == length - 1)] / size[several & (rank == 0)]
     found = float(np.quantile(ratio, QUANTILE))
     # the quantiles that are a binomial deviation off: the standard error of a quantile without a distribution
     off = np.sqrt(QUANTILE * (1 - QUANTILE) / len(ratio))
     below, above = np.quantile(ratio, [QUANTILE - off, min(QUANTILE + off, 1.0)])
-    words = f"pixels of different photos differ {found:.2g}-fold in size at the same points"
-    # beside a ratio of 1, which photos at one distance have
-    return judged(found, float(above - below) / 2, THRESHOLD, "×", words)
+    whole = _between_photos(tracks)
+    words = f"pixels at the same points differ {found:.2g}-fold in size, by way of other photos {whole:.2g}-fold"
+    return judged(max(found, whole), float(above - below) / 2, THRESHOLD, "×", words)
+
+
+def _between_photos(tracks: TrackColours) -> float:
+    """The ratio of the sizes of pixels between nine tenths of the connected photos."""
+    seen = tracks.only(np.lexsort((tracks.view, tracks.point)))
+    rank, length = within_groups(seen.point)
+    seen = seen.only((length > 1) & (rank < MOST_IN_TRACK))
+    layout = two_way(seen.view, seen.point, seen.views)
+    if not layout.main.any():
+        return 1.0
+    size = layout.parts(np.log(seen.footprint), np.ones(len(seen)))[layout.main]
+    return float(np.exp(np.ptp(np.quantile(size, [1 - QUANTILE, QUANTILE]))))

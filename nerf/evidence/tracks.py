@@ -1,6 +1,6 @@
 """What photos show at the sparse points, and this in logarithms of linear light with its noise."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -37,8 +37,8 @@ class TrackColours:
 
     def only(self, kept: Bool[np.ndarray, "k"] | Int[np.ndarray, "m"]) -> "TrackColours":
         """Some of the observations."""
-        parts = {f.name: getattr(self, f.name) for f in fields(self)[1:]}
-        return TrackColours(self.views, **{name: None if part is None else part[kept] for name, part in parts.items()})
+        parts = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "views"}
+        return replace(self, **{name: None if part is None else part[kept] for name, part in parts.items()})
 
 
 def usable(tracks: TrackColours) -> Int[np.ndarray, "m"]:

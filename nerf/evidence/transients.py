@@ -28,7 +28,7 @@ def transients_evidence(tracks: TrackColours, fit: ExposureFit, expected: TrackC
     where it is much more than in the others (robust z). ``expected``: where photos should show points that they
     have no observation of, its ``point`` numbered like that of ``tracks``."""
     if not fit.known.any():
-        return unknown("share", THRESHOLD, "no tracks", False)
+        return unknown("share", THRESHOLD, fit.unknown_because, False)
     looked = tracks if expected is None else _together(tracks, expected)
     known = fit.known[looked.view] & np.isin(looked.point, tracks.point[fit.used])
     looked = looked.only(known)
@@ -44,7 +44,8 @@ def transients_evidence(tracks: TrackColours, fit: ExposureFit, expected: TrackC
     excess = share - usual
     odd = (excess > SURE * np.hypot(deviation, count_noise)) & (excess > LEAST_EXCESS)
     found = float(np.sum(excess[odd]) / len(excess))
-    noise = float(np.sqrt(np.sum(deviation**2 + count_noise**2)) / len(excess))
+    of_one = deviation**2 + count_noise**2  # where no photo is odd, one could have been overlooked
+    noise = float(np.sqrt(np.sum(of_one[odd]) if odd.any() else np.mean(of_one))) / len(excess)
     words = f"{odd.sum()} of {len(odd)} photos show {found:.1%} of all points in another colour than the others"
     return judged(found, noise, THRESHOLD, "share", words)
 

@@ -76,7 +76,8 @@ class TwoWay:
         """Standard errors of :meth:`parts`, infinite for photos that are not connected.
 
         Points are taken as independent, their observations are not (sandwich estimator, clustered by point; Liang &
-        Zeger 1986); n / (n - 1) for the n points of a photo, whose errors its own part has made smaller.
+        Zeger 1986). A photo of n points has n / (n - 3) times that variance: its own part has made what is left
+        smaller, and so few tell the noise no better than Student's t says; of three points nothing is known.
         """
         error = np.full(self.views, np.inf)
         if not self.main.any():
@@ -84,8 +85,9 @@ class TwoWay:
         inverse = np.linalg.inv(self.laplacian(weight))
         score = self.outer(weight * rest, weight * rest)[np.ix_(self.main, self.main)]
         seen = np.bincount(self.view, minlength=self.views)[self.main]
-        few = np.sqrt(seen / np.maximum(seen - 1, 0.5))
-        error[self.main] = few * np.sqrt(np.maximum(np.diag(inverse @ score @ inverse), 0.0))
+        variance = np.maximum(np.diag(inverse @ score @ inverse), 0.0)
+        few = seen / np.maximum(seen - 3, 1)
+        error[self.main] = np.where(seen > 3, np.sqrt(few * variance), np.inf)
         return error
 
     def slope(

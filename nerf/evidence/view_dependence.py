@@ -17,17 +17,19 @@ from nerf.evidence.two_way import TwoWay
 
 THRESHOLD = 2 * HARM  # deviation of colours, sRGB values: a field of diffuse colours has it as its error
 FEWEST_PAIRS = 60  # in each of the two ranges of angles
-LEAST_SPREAD_DEG = 3.0  # between the middles of the two ranges
-LARGEST = 0.98  # quantile of squared differences beyond which they count no more: false matches, passers-by
+LEAST_SPREAD_DEG = 1.5  # between the two ranges
+LARGEST = 20.0  # medians of squared differences (three deviations), what false matches and passers-by count at most
 BATCHES = 20
 
 
 def view_dependence_evidence(tracks: TrackColours, fit: ExposureFit) -> Evidence:
     """The deviation of colours along tracks (sRGB values, root mean square of the channels) that wide angles have over
-    narrow ones; the widest third of the pairs against the narrowest. Noise by batches of points (jackknife)."""
+    narrow ones; the widest third of the pairs against the narrowest. Noise by batches of points (jackknife).
+
+    A lower bound: features on highlights move with the highlight and have no tracks."""
     unit = "sRGB"
     if not fit.known.any():
-        return unknown(unit, THRESHOLD, "no two photos show the same unsaturated points", None)
+        return unknown(unit, THRESHOLD, fit.unknown_because, None)
     first, second = _pairs(fit.layout)
     view_of = fit.layout.view
     both = fit.known[view_of[first]] & fit.known[view_of[second]]
@@ -36,15 +38,17 @@ def view_dependence_evidence(tracks: TrackColours, fit: ExposureFit) -> Evidence
     cosine = np.clip(np.sum(towards[first] * towards[second], axis=1), -1, 1)
     angle = np.degrees(np.arccos(cosine))
     low, high = np.quantile(angle, [1 / 3, 2 / 3]) if len(angle) else (0.0, 0.0)
+    spread = float(high - low)
+    if len(angle) and spread < LEAST_SPREAD_DEG:
+        return unknown(unit, THRESHOLD, f"points are seen from directions {spread:.1f}° apart", None)
     wide = angle >= high
     chosen = wide | (angle <= low)
     if min(wide.sum(), (chosen & ~wide).sum()) < FEWEST_PAIRS:
         return unknown(unit, THRESHOLD, "too few points are seen from several directions", None)
-    spread = float(np.median(angle[wide]) - np.median(angle[chosen & ~wide]))
-    if spread < LEAST_SPREAD_DEG:
-        return unknown(unit, THRESHOLD, f"points are seen from directions only {spread:.1f}° apart", None)
-    squared = _half_squares(tracks, fit, first, second)[chosen]
-    squared = np.minimum(squared, np.quantile(squared, LARGEST))
+    squared = _half_squares(tracks, fit, first, second)
+    for group in (wide, chosen & ~wide):
+        squared[group] = np.minimum(squared[group], LARGEST * np.median(squared[group]))
+    squared = squared[chosen]
     texture = np.zeros(len(tracks)) if tracks.texture is None else tracks.texture
     texture = ((texture[fit.used][first] ** 2 + texture[fit.used][second] ** 2) / 2)[chosen]
     points = fit.layout.point[first][chosen]
@@ -53,9 +57,9 @@ def view_dependence_evidence(tracks: TrackColours, fit: ExposureFit) -> Evidence
 
 
 def _judged(growth: float, noise: float, angle_deg: float) -> Evidence:
-    """Variances as deviations: the noise of a root, or the root of the noise where the growth is none."""
+    """Variances as deviations; two noises more in the one are two more in the other."""
     deviation = float(np.sqrt(max(growth, 0.0)))
-    uncertain = noise / (2 * deviation) if growth > noise else float(np.sqrt(noise)) / 2
+    uncertain = (float(np.sqrt(deviation**2 + 2 * noise)) - deviation) / 2
     words = f"colours change by {deviation:.2g} of 1 over {angle_deg:.0f}°, ± {uncertain:.1g}"
     return judged(deviation, uncertain, THRESHOLD, "sRGB", words)
 

@@ -17,11 +17,11 @@ def vignetting_evidence(tracks: TrackColours, fit: ExposureFit) -> Evidence:
     """The gain at the corners beside the middle, EV, mean of the channels: the slope of ln(light) over the square of
     the radius within photos and points alike, so neither gains nor points that are always in corners pass for it."""
     if not fit.known.any():
-        return unknown("EV", THRESHOLD_EV, "no two photos show the same unsaturated points", None)
+        return unknown("EV", THRESHOLD_EV, fit.unknown_because, False)
     y, square = log_light(tracks.colour[fit.used]), tracks.radius[fit.used] ** 2
     found = np.array([fit.layout.slope(y[:, channel], square, fit.weight[:, channel]) for channel in range(3)])
     slope, noise = found[:, 0].mean() / EV, np.sqrt(np.mean(found[:, 1] ** 2)) / EV
     if not np.isfinite(noise):
-        return unknown("EV", THRESHOLD_EV, "every point lies at one radius in all photos", None)
+        return unknown("EV", THRESHOLD_EV, "every point lies at one radius in all photos", False)
     words = f"corners are {abs(slope):.2g} EV {'darker' if slope < 0 else 'brighter'} than the middle, ± {noise:.1g}"
     return judged(float(abs(slope)), float(noise), THRESHOLD_EV, "EV", words)

@@ -39,7 +39,7 @@ def photographed_points(
     colour = np.clip(encoded(light) + noise * draw.normal(size=light.shape), 0, 1)
     angle = 2 * np.pi * view / views + 0.05 * draw.normal(size=len(view))
     towards = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=1)
-    saturated = ((colour < 0.02) | (colour > 0.98)).any(axis=1)
+    saturated = np.asarray(((colour < 0.02) | (colour > 0.98)).any(axis=1))
     distance = 3 + draw.random(len(view))
     return TrackColours(
         views, view, point, colour, saturated, radius, towards, distance, distance / 500, np.full(len(view), 0.05)

@@ -1,0 +1,82 @@
+import numpy as np
+import pytest
+
+from nerf.evidence.two_way import TwoWay, two_way
+
+
+def drawn(seed: int, views: int = 7, points: int = 40) -> tuple[TwoWay, np.ndarray]:
+    """A layout in which some photos see a point twice, and weights."""
+    draw = np.random.default_rng(seed)
+    point = np.sort(draw.integers(0, points, 200))
+    layout = two_way(draw.integers(0, views, 200), point, views)
+    return layout, draw.uniform(0.1, 3, 200)
+
+
+def slow_fit(layout: TwoWay, y: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Gains and what is left, by least squares over a design matrix with a column per photo and per point."""
+    points = layout.point.max() + 1
+    design = np.concatenate([np.eye(layout.views)[layout.view], np.eye(points)[layout.point]], axis=1)
+    root = np.sqrt(weight)
+    solution = np.linalg.lstsq(design * root[:, None], y * root, rcond=None)[0]
+    gain = solution[: layout.views]
+    return gain - gain.mean(), y - design @ solution
+
+
+def test_parts_and_rest_are_those_of_least_squares() -> None:
+    layout, weight = drawn(0)
+    y = np.random.default_rng(1).normal(size=200)
+    gain, rest = slow_fit(layout, y, weight)
+    np.testing.assert_allclose(layout.parts(y, weight), gain, atol=1e-9)
+    np.testing.assert_allclose(layout.rest(y, weight), rest, atol=1e-9)
+
+
+def test_what_is_of_photos_and_points_alone_leaves_nothing() -> None:
+    layout, weight = drawn(2)
+    draw = np.random.default_rng(3)
+    y = draw.normal(size=layout.views)[layout.view] + draw.normal(size=40)[layout.point]
+    np.testing.assert_allclose(layout.rest(y, weight), 0, atol=1e-9)
+
+
+def test_errors_are_those_of_repeated_draws() -> None:
+    layout, weight = drawn(4, points=80)
+    draw = np.random.default_rng(5)
+    gains, errors = [], []
+    for _ in range(300):
+        y = draw.normal(size=200) / np.sqrt(weight)
+        gains.append(layout.parts(y, weight))
+        errors.append(layout.errors(layout.rest(y, weight), weight))
+    np.testing.assert_allclose(np.sqrt(np.mean(np.square(errors), axis=0)), np.std(gains, axis=0), rtol=0.25)
+
+
+def test_the_slope_is_that_of_least_squares_with_its_error() -> None:
+    layout, weight = drawn(6)
+    draw = np.random.default_rng(7)
+    x = draw.normal(size=200) + layout.view
+    off = []
+    for _ in range(200):
+        y = 0.7 * x + draw.normal(size=layout.views)[layout.view] + draw.normal(size=200) / np.sqrt(weight)
+        slope, error = layout.slope(y, x, weight)
+        off.append((slope - 0.7) / error)
+    assert 0.85 < np.std(off) < 1.25 and abs(np.mean(off)) < 0.3
+
+
+def test_no_slope_over_what_belongs_to_photos() -> None:
+    layout, weight = drawn(8)
+    slope, error = layout.slope(np.random.default_rng(9).normal(size=200), 1.0 * layout.view, weight)
+    assert slope == 0 and np.isinf(error)
+
+
+def test_the_largest_part_of_the_graph() -> None:
+    view = np.array([0, 1, 1, 2, 4, 5, 3])
+    point = np.array([0, 0, 1, 1, 2, 2, 3])
+    np.testing.assert_array_equal(two_way(view, point, 6).main, [True, True, True, False, False, False])
+    assert not two_way(np.zeros(0, int), np.zeros(0, int), 3).main.any()
+    assert not two_way(np.array([0, 1]), np.array([0, 1]), 2).main.any()
+
+
+@pytest.mark.parametrize("length", [2, 3, 10])
+def test_all_pairs_of_a_point_are_there_once(length: int) -> None:
+    layout = two_way(np.tile(np.arange(length), 2), np.repeat([0, 1], length), length)
+    pairs = set(zip(layout.first.tolist(), layout.second.tolist(), strict=True))
+    assert len(pairs) == len(layout.first) == length * (length - 1)
+    assert all(a < b and (a < length) == (b < length) for a, b in pairs)

@@ -1,0 +1,219 @@
+"""Colours at sparse points, read off photos whose every pixel is known."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from nerf.evidence.exposure import EV
+from nerf.scene import Camera, Scene, View
+from stages.colmap.cameras import focal_and_centre
+from stages.evidence import scene_evidence, training_residuals
+from stages.files import write_png
+from stages.photos import Photo, write_photos
+from stages.track_colours import look_at_photos, track_colours, training_tracks
+from tests.conftest import SilentProgress
+from tests.stages.photo_scene import pose_towards_origin
+
+WIDTH, HEIGHT, FOCAL = 640, 480, 700.0
+CAMERA = Camera("PINHOLE", WIDTH, HEIGHT, (FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2))
+VIEWS, POINTS = 8, 60
+TEST_VIEWS = (0, 4)
+
+
+def value(seed: int) -> np.ndarray:
+    """The colour of each point, (POINTS, 3) in [60, 160] of 255, every one another."""
+    return np.random.default_rng(seed).integers(60, 160, (POINTS, 3))
+
+
+def photographed_points(
+    folder: Path, gain: np.ndarray | None = None, **settings: object
+) -> tuple[Scene, dict[str, np.ndarray]]:
+    """Photos of squares of one colour each around every point, and what normalise would say of them.
+
+    Test photos are white: whoever looks at them is found out. ``gain`` (VIEWS,) multiplies the sRGB values.
+    """
+    factor = np.ones(VIEWS) if gain is None else gain
+    xyz = np.random.default_rng(1).uniform(-0.7, 0.7, (POINTS, 3))
+    views, seen, photos = [], [], []
+    for number in range(VIEWS):
+        pose = pose_towards_origin(2 * np.pi * number / VIEWS / 6, 3.0)
+        inside = (xyz - pose[:, 3]) @ pose[:, :3]
+        xy = FOCAL * inside[:, :2] / inside[:, 2:] + [WIDTH / 2, HEIGHT / 2]
+        pixels = np.full((HEIGHT, WIDTH, 3), 100, np.uint8)
+        kept = []
+        for point, (x, y) in enumerate(np.floor(xy).astype(int)):
+            apart = np.abs(xy - xy[point]).max(axis=1)
+            if 6 <= x < WIDTH - 6 and 6 <= y < HEIGHT - 6 and np.sort(apart)[1] > 11:
+                pixels[y - 5 : y + 6, x - 5 : x + 6] = np.rint(value(0)[point] * factor[number])
+                kept.append(point)
+        split = "test" if number in TEST_VIEWS else "train"
+        if split == "test":
+            pixels[:] = 255
+        file = f"images/{number}.png"
+        write_png(folder / file, pixels)
+        views.append(View(f"{number}.png", file, 0, pose, 2.0, 4.0, split))
+        photos.append(Photo(f"{number}.png", file, WIDTH, HEIGHT, 0, None, None, False, 1.0))
+        seen.extend((number, point, *xy[point]) for point in kept)
+    write_photos(folder, photos, [], {})
+    table = np.array(seen)
+    points = {
+        "xyz": xyz.astype(np.float32),
+        "rgb": value(0).astype(np.uint8),
+        "error_px": np.zeros(POINTS, np.float32),
+        "view": table[:, 0].astype(np.int32),
+        "point": table[:, 1].astype(np.int32),
+        "xy": table[:, 2:].astype(np.float32),
+    }
+    return _scene(views), points
+
+
+def _scene(views: list[View]) -> Scene:
+    from nerf.scene import Similarity
+
+    return Scene((CAMERA,), tuple(views), Similarity(1.0, np.eye(3), np.zeros(3)), False, False, "around", True)
+
+
+def without_points(points: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    return {name: array[:0] for name, array in points.items()}
+
+
+def test_colours_are_those_of_the_photos(tmp_path: Path, progress: SilentProgress) -> None:
+    scene, points = photographed_points(tmp_path)
+    tracks = track_colours(tmp_path, scene, points, progress)
+    assert len(tracks) > 60 and tracks.views == VIEWS - len(TEST_VIEWS)
+    np.testing.assert_allclose(tracks.colour, value(0)[tracks.point] / 255, atol=1e-9)
+    assert not tracks.saturated.any()
+    assert tracks.texture is not None and tracks.texture.max() < 1e-6
+    assert progress.updates[-1] == ("looked at 6 of 6 photos", 1.0)
+
+
+def test_geometry_is_that_of_the_cameras(tmp_path: Path, progress: SilentProgress) -> None:
+    scene, points = photographed_points(tmp_path)
+    tracks, xy = training_tracks(scene, points)
+    view = scene.of_split("train")[tracks.view[7]]
+    offset = view.scene_from_camera[:, 3] - points["xyz"][tracks.point[7]]
+    np.testing.assert_allclose(tracks.distance[7], np.linalg.norm(offset))
+    np.testing.assert_allclose(tracks.towards[7], offset / np.linalg.norm(offset))
+    np.testing.assert_allclose(tracks.footprint, tracks.distance / FOCAL)
+    np.testing.assert_allclose(tracks.radius[7], np.hypot(*(xy[7] - [320, 240])) / np.hypot(320, 240))
+    residual = training_residuals(scene, points)[3]
+    assert 0 < np.abs(residual).max() < 1e-3
+
+
+def test_test_photos_are_not_opened(tmp_path: Path, progress: SilentProgress) -> None:
+    scene, points = photographed_points(tmp_path)
+    for number in TEST_VIEWS:
+        (tmp_path / f"images/{number}.png").unlink()
+    assert len(track_colours(tmp_path, scene, points, progress)) > 60
+
+
+def test_masked_and_transparent_windows_are_left_out(tmp_path: Path, progress: SilentProgress) -> None:
+    scene, points = photographed_points(tmp_path)
+    whole = track_colours(tmp_path, scene, points, progress)
+    mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    mask[:, 320:] = 0
+    write_png(tmp_path / "masks/1.png.png", mask)
+    with Image.open(tmp_path / "images/2.png") as image:
+        pixels = np.dstack([np.asarray(image), mask])
+    write_png(tmp_path / "images/2.png", pixels)
+    views = [replace(view, mask="masks/1.png.png" if view.name == "1.png" else None) for view in scene.views]
+    cut = track_colours(tmp_path, replace(scene, views=tuple(views)), points, progress)
+    for number in range(6):
+        of_view = points["view"] == 1 + number + (number > 2)
+        reaching = np.count_nonzero(np.floor(points["xy"][of_view, 0]) + 2 >= 320)  # windows of five pixels
+        lost = np.count_nonzero(whole.view == number) - np.count_nonzero(cut.view == number)
+        assert lost == (reaching if number < 2 else 0) and reaching > 5
+    assert len(cut) < len(whole)
+
+
+def test_clipped_windows_are_saturated(tmp_path: Path, progress: SilentProgress) -> None:
+    gain = np.ones(VIEWS)
+    gain[3] = 2.2
+    scene, points = photographed_points(tmp_path, np.minimum(gain, 255 / 159))
+    tracks = track_colours(tmp_path, scene, points, progress)
+    bright = (tracks.view == 2) & (value(0)[tracks.point].max(axis=1) >= 157)
+    assert np.array_equal(tracks.saturated, bright)
+
+
+def test_fewer_observations_are_whole_tracks(tmp_path: Path, progress: SilentProgress) -> None:
+    scene, points = photographed_points(tmp_path)
+    all_of_them, some = training_tracks(scene, points)[0], training_tracks(scene, points, 60)[0]
+    assert 30 < len(some) < 75 < len(all_of_them)
+    lengths = np.bincount(all_of_them.point, minlength=POINTS)
+    kept = np.bincount(some.point, minlength=POINTS)
+    np.testing.assert_array_equal(kept[kept > 0], lengths[kept > 0])
+
+
+def test_near_photos_have_larger_windows(tmp_path: Path, progress: SilentProgress) -> None:
+    from stages.track_colours import _windows
+
+    scene, points = photographed_points(tmp_path)
+    tracks = training_tracks(scene, points)[0]
+    near = replace(tracks, footprint=np.where(tracks.view == 0, 0.5, 1.0) * 0.03)
+    window = _windows(scene, near)
+    paired = np.isin(near.point, near.point[near.view > 0])
+    assert set(window[(near.view == 0) & paired]) == {11} and set(window[near.view > 0]) == {5}
+
+
+def test_places_where_a_point_should_be_seen(tmp_path: Path, progress: SilentProgress) -> None:
+    scene, points = photographed_points(tmp_path)
+    point = int(np.bincount(points["point"][points["view"] == 2]).argmax())
+    removed = (points["view"] == 2) & (points["point"] == point)
+    others = (points["point"] == point) & ~removed
+    assert removed.sum() == 1 and others.sum() > 3
+    fewer = {name: array[~removed] if name in ("view", "point", "xy") else array for name, array in points.items()}
+    expected = look_at_photos(tmp_path, scene, fewer, progress).expected
+    found = (expected.view == 1) & (expected.point == point)
+    assert found.sum() == 1
+    np.testing.assert_allclose(expected.colour[found][0], value(0)[point] / 255, atol=1e-9)
+
+
+def test_without_points_only_the_photos_are_looked_at(tmp_path: Path, progress: SilentProgress) -> None:
+    scene, points = photographed_points(tmp_path)
+    looked = look_at_photos(tmp_path, scene, without_points(points), progress)
+    assert len(looked.tracks) == len(looked.expected) == 0 and looked.tracks.views == 6
+    assert looked.gradients.shape == (6, 2, 2) and (np.linalg.eigvalsh(looked.gradients) > 0).all()
+
+
+def test_gradients_are_thinned_by_a_smear_across_it_alone(tmp_path: Path, progress: SilentProgress) -> None:
+    import cv2
+
+    scene, points = photographed_points(tmp_path)
+    sharp = look_at_photos(tmp_path, scene, without_points(points), progress).gradients[0]
+    with Image.open(tmp_path / "images/1.png") as image:
+        write_png(tmp_path / "images/1.png", cv2.blur(np.asarray(image), (9, 1)))
+    smeared = look_at_photos(tmp_path, scene, without_points(points), progress).gradients[0]
+    assert smeared[0, 0] < 0.3 * sharp[0, 0] and smeared[1, 1] > 0.5 * sharp[1, 1]
+
+
+def test_all_evidence_of_a_scene(tmp_path: Path, progress: SilentProgress) -> None:
+    gain = np.where(np.arange(VIEWS) % 2, 1.0, 0.7)
+    scene, points = photographed_points(tmp_path, gain)
+    found = scene_evidence(tmp_path, scene, points, {"images/1.png": None, "images/2.png": 0.1}, progress)
+    assert set(found.of) == {
+        *("exposure", "tone", "view_dependence", "vignetting", "transients", "scale", "media", "blur"),
+        *("background", "pose_refinement", "rolling_shutter"),
+    }
+    assert found.of["exposure"].called_for is True
+    bright, dark = found.exposure.log_gain[[0, 2, 3, 5]], found.exposure.log_gain[[1, 4]]
+    assert abs((bright.mean() - dark.mean()) / EV - 1.1) < 0.25  # 0.7 of an sRGB value is about half of the light
+    assert found.of["pose_refinement"].called_for is False
+    assert found.of["background"].called_for is None  # so few points
+    assert found.of["rolling_shutter"].words == "no video, or one that hardly moves: nothing known"
+    for name, evidence in found.of.items():
+        assert np.isfinite(evidence.statistic) and evidence.words, name
+
+
+def test_no_evidence_without_points(tmp_path: Path, progress: SilentProgress) -> None:
+    scene, points = photographed_points(tmp_path)
+    found = scene_evidence(tmp_path, scene, without_points(points), {}, progress).of
+    unsure = {name for name, evidence in found.items() if evidence.called_for is None}
+    assert unsure == {"exposure", "view_dependence", "pose_refinement", "background"}
+    assert not any(evidence.called_for for evidence in found.values())
+
+
+def test_focal_length_and_principal_point() -> None:
+    camera = Camera("OPENCV", 100, 80, (50.0, 52.0, 49.0, 41.0, 0.1, 0.0, 0.0, 0.0))
+    assert focal_and_centre(camera) == (51.0, (49.0, 41.0))
