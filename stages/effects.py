@@ -10,7 +10,7 @@ from pydantic import Field
 
 from stages.contract import Inputs, Progress, StageConfig, StageResult
 from stages.effect_decisions import Decisions, write_decisions
-from stages.files import read_scene, write_json
+from stages.files import read_json, read_scene, read_tensors, write_json
 
 if TYPE_CHECKING:
     from nerf.evidence.evidence import Evidence
@@ -23,6 +23,10 @@ RESUMES = False
 LINKS = ("effects.json",)
 
 Switch = Literal["auto", "on", "off"]
+ORDER = (
+    *("exposure", "view_dependence", "background", "pose_refinement", "lens"),  # modelled
+    *("tone", "vignetting", "transients", "scale", "blur", "rolling_shutter", "participating_media"),  # seen
+)
 MOST_PILOTS = 2
 PILOT_STEPS = 150  # as many as tell ±1 EV or a highlight from none (docs/numbers.md)
 
@@ -52,17 +56,21 @@ class Verdict(NamedTuple):
 
 def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> StageResult:
     """Gather the evidence, decide, and write decisions.json and, for people and the report, effects.json."""
-    from stages.effect_evidence import gather
+    from stages.evidence import lens_evidence, scene_evidence
 
     started = time.perf_counter()
-    scene = read_scene(inputs["normalise"])
-    found = gather(inputs, scene, progress)
+    scene, registration = read_scene(inputs["normalise"]), read_json(inputs["sfm"] / "registration.json")
+    uncertainty = {f"images/{image['file']}": image.get("uncertainty_px") for image in registration["images"]}
+    points = read_tensors(inputs["normalise"] / "points.safetensors")
+    found = scene_evidence(inputs["ingest"], scene, points, uncertainty, progress)
     statistics_seconds = time.perf_counter() - started
-    gains = dict(zip((v.name for v in scene.of_split("train")), found.log_gain.tolist(), strict=True))
-    study = _Study(config, scene, inputs["ingest"], gains, found.evidence, progress)
-    decisions, verdicts = study.decide()
+    names = [view.name for view in scene.of_split("train")]
+    gains = dict(zip(names, found.exposure.log_gain.tolist(), strict=True))
+    decisions, verdicts = _Study(config, scene, inputs["ingest"], gains, found.of, progress).decide()
     write_decisions(folder, decisions)
-    table = {name: _entry(verdicts.get(name), evidence) for name, evidence in found.evidence.items()}
+    lens = lens_evidence(registration)
+    evidence, verdicts["lens"] = found.of | {"lens": lens}, Verdict(bool(lens.called_for), lens.words)
+    table = {name: _entry(verdicts.get(name), evidence[name]) for name in ORDER if name in evidence}
     write_json(folder / "effects.json", table)
     facts = {"on": [name for name, entry in table.items() if entry["on"]], "statistics_seconds": statistics_seconds}
     return StageResult(("decisions.json",), _line(table), ("effects.json",), facts)

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from stages.contract import Progress
 
@@ -12,6 +12,9 @@ if TYPE_CHECKING:
     from nerf.evidence.evidence import Evidence
     from nerf.evidence.exposure import ExposureFit
     from nerf.scene import Scene
+
+
+PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")
 
 
 class SceneEvidence(NamedTuple):
@@ -49,10 +52,25 @@ def scene_evidence(
         "vignetting": vignetting_evidence(tracks, fit),
         "transients": transients_evidence(tracks, fit, looked.expected),
         "scale": scale_evidence(tracks),
-        "media": media_evidence(tracks, fit),
+        "participating_media": media_evidence(tracks, fit),
         "blur": blur_evidence(looked.gradients),
     }
     return SceneEvidence(of | _geometric(ingest, scene, points, uncertainty_px), fit)
+
+
+def lens_evidence(registration: dict[str, Any]) -> "Evidence":
+    """The choice that stage sfm made by held-out reprojection error, shown beside the others."""
+    from nerf.evidence.evidence import Evidence, unknown
+
+    chosen = [row for row in registration.get("camera_models") or [] if row["chosen"]]
+    if not chosen:
+        return unknown("px", 0.0, "the cameras were given", False)
+    simplest = {row["group"]: row for row in reversed(registration["camera_models"])}
+    gains = [simplest[row["group"]]["held_out_px"] - row["held_out_px"] for row in chosen]
+    models = ", ".join(sorted({row["model"] for row in chosen}))
+    noise = max(row["noise_px"] for row in chosen)
+    words = f"{models}: held-out error {max(gains):.2g} px below that of {simplest[chosen[0]['group']]['model']}"
+    return Evidence(max(gains), "px", noise, noise, any(row["model"] not in PINHOLES for row in chosen), words)
 
 
 def _geometric(

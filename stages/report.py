@@ -18,7 +18,7 @@ from stages.live_line import duration, short_count
 if TYPE_CHECKING:
     from nerf.scene import Scene
 
-NEEDS = ("ingest", "sfm", "normalise", "train", "evaluate", "render", "mesh")
+NEEDS = ("ingest", "sfm", "normalise", "effects", "train", "evaluate", "render", "mesh")
 VERSION = 3
 RESUMES = False
 LINKS = ("report.html", "summary.json")

@@ -20,7 +20,7 @@ from stages.files import write_json, write_tensors
 from stages.photos import Photo, write_photos
 from tests.small_scenes import pinhole_directions
 
-WIDTH, HEIGHT, FOCAL = 400, 300, 417.0
+WIDTH, HEIGHT, FOCAL = 240, 180, 250.0
 CAMERA = Camera("PINHOLE", WIDTH, HEIGHT, (FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2))
 POINTS, MATCHED, TRACK_NOISE_PX = 3000, 0.6, 0.3
 
@@ -28,8 +28,8 @@ POINTS, MATCHED, TRACK_NOISE_PX = 3000, 0.6, 0.3
 @dataclass(frozen=True)
 class Effects:
     """How the photos differ from plain ones. ``exposure_ev``: photos are brighter or darker by up to so much.
-    ``highlight``: strength of mirror-like reflections. ``jitter_px``: by how much poses are wrong. ``alpha``: the sky is
-    transparent. ``vignetting_ev``: darker at the corner. ``strangers``: share of photos in which somebody passes by.
+    ``highlight``: strength of mirror-like reflections. ``jitter_px``: by how much poses are wrong. ``alpha``: the sky
+    is transparent. ``vignetting_ev``: darker at the corner. ``strangers``: share of photos in which somebody passes by.
     ``farther``: distance of every other camera over the usual one."""
 
     exposure_ev: float = 0.0

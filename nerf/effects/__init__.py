@@ -85,8 +85,12 @@ class PhotoColours(PhotoPart, Protocol):
 class AsGiven:
     """Rays as the calibrated cameras have them: a :class:`PhotoRays` without effect."""
 
-    parameters: dict[str, Tensor] = {}
     rate = 0.0
+
+    @property
+    def parameters(self) -> dict[str, Tensor]:
+        """None."""
+        return {}
 
     def settle(self) -> None:
         """Nothing to do."""
@@ -103,8 +107,12 @@ class AsGiven:
 class AsRendered:
     """Photos that show what is rendered: a :class:`PhotoColours` without effect."""
 
-    parameters: dict[str, Tensor] = {}
     rate = 0.0
+
+    @property
+    def parameters(self) -> dict[str, Tensor]:
+        """None."""
+        return {}
 
     def settle(self) -> None:
         """Nothing to do."""

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float, Int
 
-from nerf.evidence.evidence import Evidence, judged, unknown
+from nerf.evidence.evidence import Evidence, unknown
 
 REGION_HALF = 0.9  # the region of interest is [-0.9, 0.9]^3 of the scene frame
 # Where a field has nothing it shows one colour; the photos deviate from it there by some 0.25 in sRGB values.
@@ -22,7 +22,7 @@ def background_evidence(
         return Evidence(0.0, "share", THRESHOLD, 0.0, False, "the photos' alpha says what is background")
     seen = np.bincount(point, minlength=len(position)).astype(float)
     if not seen.any():
-        return unknown("share", THRESHOLD, "no tracks", None)
+        return unknown("share", THRESHOLD, "no tracks", True)
     beyond = np.abs(position).max(axis=1) > REGION_HALF
     share = float(np.average(beyond, weights=seen))
     effective = float(seen.sum() ** 2 / np.sum(seen**2))
@@ -30,7 +30,9 @@ def background_evidence(
     words = (
         f"{share:.1%} of what is tracked lies beyond the region; {untracked:.0%} of the photos' area has no track near"
     )
-    return judged(share, noise, THRESHOLD, "share", words)
+    if share < THRESHOLD:
+        words += ", and only alpha could tell that nothing lies beyond"
+    return Evidence(share, "share", THRESHOLD, noise, True, words)
 
 
 def untracked_share(place: Float[np.ndarray, "k 2"], view: Int[np.ndarray, "k"], views: int) -> float:

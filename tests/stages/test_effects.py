@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 
 from nerf.evidence.evidence import Evidence
-from stages import effect_evidence, effects, pilots
+from nerf.evidence.exposure import ExposureFit, fit_exposure
+from nerf.evidence.tracks import TrackColours
+from stages import effects, evidence, pilots
 from stages.effect_decisions import Decisions, read_decisions, write_decisions
-from stages.effect_evidence import Found
+from stages.evidence import SceneEvidence
+from stages.files import write_json, write_tensors
 from stages.pilots import Pilot
 from tests.effect_scenes import Effects, effect_scene
 from tests.stages.photo_scene import photographed
@@ -17,19 +20,28 @@ from tests.synthetic_photos import Quiet
 CLEAR = {"exposure": False, "view_dependence": True, "background": True, "pose_refinement": False, "vignetting": True}
 
 
-def evidence(called_for: bool | None, noise: float = 0.1) -> Evidence:
+def found(called_for: bool | None, noise: float = 0.1) -> Evidence:
     return Evidence(1.0, "EV", 2.0, noise, called_for, "one of two")
+
+
+def replace_gain(fit: ExposureFit, gain: float) -> ExposureFit:
+    return fit._replace(log_gain=np.full_like(fit.log_gain, gain))
 
 
 @pytest.fixture
 def decided(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[Decisions, dict, str, list[str]]]:
     """Runs the stage on given evidence; the pilots' arms are noted, and gain ``gain`` ± 0.1 dB."""
     inputs, scene = photographed(tmp_path / "scene", views=9, bounded=False)
+    inputs["sfm"] = tmp_path / "scene" / "sfm"
+    inputs["sfm"].mkdir()
+    write_json(inputs["sfm"] / "registration.json", {"images": [], "camera_models": []})
+    write_tensors(inputs["normalise"] / "points.safetensors", {"xyz": np.zeros((0, 3), np.float32)})
     count = len(scene.of_split("train"))
 
-    def run(config: effects.Config, gain: float = 1.0, **found: Evidence) -> tuple[Decisions, dict, str, list[str]]:
-        asked = {name: evidence(value) for name, value in CLEAR.items()} | found
-        monkeypatch.setattr(effect_evidence, "gather", lambda *_: Found(asked, np.full((count, 3), 0.5)))
+    def run(config: effects.Config, gain: float = 1.0, **given: Evidence) -> tuple[Decisions, dict, str, list[str]]:
+        told = {name: found(value) for name, value in CLEAR.items()} | given
+        exposure = replace_gain(fit_exposure(TrackColours.empty(count)), 0.5)
+        monkeypatch.setattr(evidence, "scene_evidence", lambda *_: SceneEvidence(told, exposure))
         tried: list[str] = []
 
         def run_pilot(_trial: object, off: Decisions, on: Decisions, *_rest: object) -> Pilot:
@@ -51,7 +63,7 @@ def test_clear_evidence_decides_without_a_pilot(decided: Callable) -> None:
     assert decisions == Decisions(view_dependence=True, unbounded=True, pose_refinement=False, exposure=None)
     assert not tried
     assert line == (
-        "view dependence on (one of two) · background on (one of two) · 2 off · "
+        "view dependence on (one of two) · background on (one of two) · 3 off · "
         "seen, not modelled: vignetting (one of two)"
     )
     assert table["exposure"] == {
@@ -74,40 +86,40 @@ def test_clear_evidence_decides_without_a_pilot(decided: Callable) -> None:
 def test_a_pilot_decides_in_the_grey_zone_by_its_gain_against_its_noise(
     decided: Callable, gain: float, on: bool
 ) -> None:
-    decisions, table, _, tried = decided(effects.Config(), gain, exposure=evidence(None))
+    decisions, table, _, tried = decided(effects.Config(), gain, exposure=found(None))
     assert tried == ["exposure"] and (decisions.exposure is not None) is on
     assert (table["exposure"]["pilot_gain_db"], table["exposure"]["seconds"]) == (gain, 3.0)
     assert table["exposure"]["reason"] == f"one of two; a pilot gained {gain:+.2f} ± 0.10 dB"
 
 
 def test_gains_go_to_training_by_the_names_of_its_photos(decided: Callable) -> None:
-    decisions, *_ = decided(effects.Config(), exposure=evidence(True))
+    decisions, *_ = decided(effects.Config(), exposure=found(True))
     assert set(decisions.exposure) == {f"{i}.png" for i in (1, 2, 3, 5, 6, 7)}
     assert all(gain == [0.5] * 3 for gain in decisions.exposure.values())
 
 
 def test_refining_poses_is_costly_and_always_has_to_show_its_gain(decided: Callable) -> None:
-    assert decided(effects.Config(), 1.0, pose_refinement=evidence(True))[0].pose_refinement
-    decisions, _, _, tried = decided(effects.Config(), 0.0, pose_refinement=evidence(True))
+    assert decided(effects.Config(), 1.0, pose_refinement=found(True))[0].pose_refinement
+    decisions, _, _, tried = decided(effects.Config(), 0.0, pose_refinement=found(True))
     assert tried == ["pose_refinement"] and not decisions.pose_refinement
 
 
 def test_there_are_two_pilots_at_most(decided: Callable) -> None:
-    grey = {name: evidence(None) for name in ("exposure", "view_dependence", "pose_refinement")}
+    grey = {name: found(None) for name in ("exposure", "view_dependence", "pose_refinement")}
     decisions, table, _, tried = decided(effects.Config(), 1.0, **grey)
     assert tried == ["exposure", "view_dependence"] and not decisions.pose_refinement
     assert table["pose_refinement"]["reason"] == "one of two; not clear, and no pilot: 2 were made already"
 
 
 def test_without_pilots_the_grey_zone_stays_as_the_method_was_published(decided: Callable) -> None:
-    grey = {name: evidence(None) for name in ("exposure", "view_dependence", "pose_refinement")}
+    grey = {name: found(None) for name in ("exposure", "view_dependence", "pose_refinement")}
     decisions, table, _, tried = decided(effects.Config(pilot_steps=0), 1.0, **grey)
     assert not tried and decisions == Decisions(view_dependence=True, unbounded=True)
     assert table["exposure"]["reason"] == "one of two; not clear, and no pilot: none was wanted"
 
 
 def test_what_nothing_is_known_of_is_not_tried(decided: Callable) -> None:
-    unknown = {name: evidence(None, float("inf")) for name in ("exposure", "view_dependence", "pose_refinement")}
+    unknown = {name: found(None, float("inf")) for name in ("exposure", "view_dependence", "pose_refinement")}
     decisions, table, _, tried = decided(effects.Config(), 1.0, **unknown)
     assert not tried and decisions == Decisions(view_dependence=True, unbounded=True)
     assert table["exposure"]["noise"] is None
@@ -116,7 +128,7 @@ def test_what_nothing_is_known_of_is_not_tried(decided: Callable) -> None:
 @pytest.mark.parametrize("value", ["on", "off"])
 def test_what_was_asked_for_is_done(decided: Callable, value: effects.Switch) -> None:
     config = effects.Config(exposure=value, view_dependence=value, background=value, pose_refinement=value)
-    decisions, table, _, tried = decided(config, exposure=evidence(None))
+    decisions, table, _, tried = decided(config, exposure=found(None))
     on = value == "on"
     assert not tried and (decisions.exposure is not None) is on
     assert (decisions.view_dependence, decisions.unbounded, decisions.pose_refinement) == (on, on, on)
@@ -132,10 +144,8 @@ def test_decisions_are_read_as_they_were_written(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("made", "on"),
     [
-        (Effects(), {"background"}),
-        (Effects(exposure_ev=1.0), {"background", "exposure"}),
-        (Effects(highlight=1.0), {"background", "view_dependence"}),
-        (Effects(alpha=True), set()),
+        (Effects(exposure_ev=1.0), {"background", "exposure", "view_dependence"}),
+        (Effects(highlight=1.0, alpha=True), {"view_dependence"}),
     ],
 )
 def test_real_evidence_of_a_synthetic_scene(tmp_path: Path, made: Effects, on: set[str]) -> None:
