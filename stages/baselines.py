@@ -51,22 +51,14 @@ def mean_photo(photos: "Iterable[Tensor]", used: "Iterable[Tensor | None] | None
 
 
 def nearest_view(view: "View", candidates: "Sequence[View]") -> "View":
-    """The candidate whose pose is nearest: distance of the centres in scene units plus rotation angle in radians.
-
-    The region of interest is about two units wide, so a radian weighs as much as half the scene. The whole rotation
-    counts, roll included, since the photo is shown as it is. Equal distances go to the first by name.
-    """
-    return min(candidates, key=lambda candidate: (_pose_distance(view, candidate), candidate.name))
-
-
-def _pose_distance(a: "View", b: "View") -> float:
+    """The candidate whose pose is nearest (nerf/pose_distance.py); of several, the first by name."""
     import numpy as np
 
-    pose_a, pose_b = a.scene_from_camera, b.scene_from_camera
-    moved = np.linalg.norm(pose_a[:, 3] - pose_b[:, 3])
-    # The chord ||R_a - R_b||_F = 2 sqrt(2) sin(angle / 2) keeps its precision at small angles, unlike arccos(trace).
-    chord = np.linalg.norm(pose_a[:, :3] - pose_b[:, :3])
-    return float(moved + 2 * np.arcsin(min(chord / np.sqrt(8), 1.0)))
+    from nerf.pose_distance import pose_distances
+
+    ordered = sorted(candidates, key=lambda candidate: candidate.name)
+    poses = np.stack([candidate.scene_from_camera for candidate in ordered])
+    return ordered[int(np.argmin(pose_distances(view.scene_from_camera, poses)))]
 
 
 def resized(photo: "Tensor", height: int, width: int) -> "Tensor":

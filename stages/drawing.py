@@ -3,7 +3,7 @@
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -27,6 +27,13 @@ class Painter:
 
     model: "RadianceModel"
     background: "Tensor"  # (3,), on the model's device
+
+    def at_gain(self, log_gain: "Tensor") -> "Painter":
+        """This field at another gain than the neutral one; only for a field that models exposure."""
+        from nerf.effects.exposure import ExposedModel
+
+        assert isinstance(self.model, ExposedModel)
+        return replace(self, model=ExposedModel(self.model.model, log_gain.to(self.background.device)))
 
     def draw(self, rays: "Rays", on_chunk: Callable[[float], None] | None = None) -> "Rendering":
         """The picture (height, width) that ``rays`` see, on the CPU. ``on_chunk`` is told the finished share."""

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     import torch
 
     from nerf.effects import PhotoColours, PhotoRays
-    from nerf.scene import View
+    from nerf.scene import Scene, View
     from nerf.training import FieldTrainer
 
 
@@ -58,6 +58,29 @@ def photo_parts(
     rays = RefinedPoses(len(views), device) if decisions.pose_refinement else AS_GIVEN
     colours = AS_RENDERED if decisions.exposure is None else Exposures.of_tracks(decisions.log_gain(views).to(device))
     return rays, colours
+
+
+def told_by_neighbours(scene: "Scene", unseen: "Sequence[View]") -> "torch.Tensor":
+    """(unseen, training photos): how much each training photo tells of each photo that took no part in training."""
+    import numpy as np
+    import torch
+
+    from nerf.pose_distance import neighbour_weights
+
+    poses, known = (np.stack([v.scene_from_camera for v in views]) for views in (unseen, scene.of_split("train")))
+    return torch.from_numpy(neighbour_weights(poses, known)).float()
+
+
+def expected_gains(field: dict[str, Any], scene: "Scene", unseen: "Sequence[View]") -> "dict[str, torch.Tensor]":
+    """By the name of a photo that took no part in training, the log gains (3,) that its neighbours let expect, from the
+    content of field.json; empty where exposure is not modelled."""
+    import torch
+
+    if field.get("exposure") is None or not unseen:
+        return {}
+    known = torch.tensor([field["exposure"]["photos"][view.name] for view in scene.of_split("train")])
+    gains = told_by_neighbours(scene, unseen) @ known
+    return dict(zip((view.name for view in unseen), gains, strict=True))
 
 
 def learnt_of_photos(trainer: "FieldTrainer", views: "Sequence[View]") -> dict[str, Any]:

@@ -122,12 +122,13 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
 @dataclass(frozen=True)
 class Examiner:
     """Draws test views at 1/``downscale`` of the photos' size and compares them with what the camera saw, less what
-    masks ignore."""
+    masks ignore. ``gains`` are the exposures expected of photos by their names, where exposure is modelled."""
 
     scene: "Scene"
     ingest: Path
     folder: Path
     painter: "Painter"
+    gains: "dict[str, Tensor]"
     downscale: float
 
     def score(self, views: "Sequence[View]", progress: Progress) -> list[dict[str, Any]]:
@@ -189,17 +190,20 @@ class Examiner:
     def _render(self, view: "View", on_chunk: Callable[[float], None]) -> "Rendering":
         from stages.training_data import view_rays
 
-        return self.painter.draw(view_rays(self.scene, view, self.downscale), on_chunk)
+        painter = self.painter.at_gain(self.gains[view.name]) if self.gains else self.painter
+        return painter.draw(view_rays(self.scene, view, self.downscale), on_chunk)
 
 
 def _examiner(config: Config, scene: "Scene", inputs: Inputs, folder: Path) -> Examiner:
     """Load the field; data with alpha goes over the background asked for, the rest over what the field expects."""
     from stages.drawing import load_painter
+    from stages.effect_decisions import expected_gains
 
     assert config.downscale is not None
     chosen = config.background if scene.has_alpha else None
     painter = load_painter(inputs["train"], BACKGROUNDS[chosen] if chosen else None)
-    return Examiner(scene, inputs["ingest"], folder, painter, config.downscale)
+    gains = expected_gains(read_json(inputs["train"] / "field.json"), scene, scene.of_split("test"))
+    return Examiner(scene, inputs["ingest"], folder, painter, gains, config.downscale)
 
 
 def affordable(pixels: Sequence[int], budget: float) -> list[int]:

@@ -22,6 +22,8 @@ from stages.files import read_json, write_durably
 from stages.live_line import live_line, short_count
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from nerf.probe import Probe, ProbeResult
     from nerf.schedule import StepPlan
     from nerf.training import FieldTrainer, NonFinite
@@ -47,10 +49,12 @@ class Budget(NamedTuple):
 
 
 class Probes(NamedTuple):
-    """Fixed pixels to measure on; ``heldout`` is None without test photos, is reported and decides nothing."""
+    """Fixed pixels to measure on; ``heldout`` is None without test photos, is reported and decides nothing.
+    ``neighbours`` (test photos, training photos): how much these tell of those."""
 
     train: "Probe"
-    heldout: "Probe | None"
+    heldout: "Probe | None" = None
+    neighbours: "Tensor | None" = None
 
 
 @dataclass
@@ -189,8 +193,10 @@ class TrainingRun:
         from nerf.probe import measure
 
         started = time.perf_counter()
-        shown = self.trainer.photo_colours.shown(self.trainer.model)
-        heldout = None if self.probes.heldout is None else measure(shown, self.probes.heldout).psnr
+        heldout = None
+        if self.probes.heldout is not None and self.probes.neighbours is not None:
+            unseen = self.trainer.photo_colours.of_unseen(self.probes.neighbours)
+            heldout = measure(self.trainer.model, self.probes.heldout, unseen).psnr
         cost = time.perf_counter() - started
         seconds = self.state.seconds
         # Right after a kill at the very end no step has told how well the batches go.

@@ -34,7 +34,7 @@ def prepare(config: "Config", scene: "Scene", inputs: Inputs, folder: Path, prog
     import torch
 
     from nerf.probe import make_probe
-    from stages.effect_decisions import photo_parts, read_decisions
+    from stages.effect_decisions import photo_parts, read_decisions, told_by_neighbours
     from stages.training_data import training_bank
     from stages.training_log import TrainingLog
     from stages.training_loop import Budget, Probes, TrainingRun
@@ -45,17 +45,18 @@ def prepare(config: "Config", scene: "Scene", inputs: Inputs, folder: Path, prog
     bank = training_bank(inputs["ingest"], scene, "train", config.downscale, progress).to(device)
     shown_over = torch.tensor(field_background(config, scene), device=device)
 
-    heldout = None
+    probes = Probes(make_probe(bank, PROBE_RAYS, shown_over, config.seed))
     if scene.of_split("test"):
         unseen = training_bank(inputs["ingest"], scene, "test", config.downscale, progress).to(device)
         heldout = make_probe(unseen, PROBE_RAYS, shown_over, config.seed)
+        probes = probes._replace(heldout=heldout, neighbours=told_by_neighbours(scene, scene.of_split("test")))
     _say_sizes(config, bank, progress)
     decisions, views = read_decisions(inputs["effects"]), scene.of_split("train")
     return TrainingRun(
         lambda attempt: make_trainer(
             config, scene, bank, config.seed + attempt, photo_parts(decisions, views, bank.device)
         ),
-        Probes(make_probe(bank, PROBE_RAYS, shown_over, config.seed), heldout),
+        probes,
         Budget(config.steps, config.seconds),
         folder,
         config.checkpoint_seconds,

@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerf.model import RadianceModel, Rendering
+from nerf.model import Rendering
 from nerf.rays import Rays
 
 
@@ -69,8 +69,9 @@ class PhotoRays(PhotoPart, Protocol):
 class PhotoColours(PhotoPart, Protocol):
     """What each photo makes of the colours of its rays."""
 
-    def shown(self, model: RadianceModel) -> RadianceModel:
-        """The field as a usual photo shows it: what to compare with photos that were never seen."""
+    def of_unseen(self, weights: Float[Tensor, "unseen views"]) -> "PhotoColours":
+        """What photos that took no part are expected to make of colours, from what ``weights`` says of their neighbours
+        among those that did (nerf/pose_distance.py)."""
         ...
 
     def residual(self, seen: Seen, target: Float[Tensor, "rays 3"]) -> Float[Tensor, "rays 3"]:
@@ -117,9 +118,9 @@ class AsRendered:
     def settle(self) -> None:
         """Nothing to do."""
 
-    def shown(self, model: RadianceModel) -> RadianceModel:
-        """The field itself."""
-        return model
+    def of_unseen(self, weights: Float[Tensor, "unseen views"]) -> "AsRendered":
+        """The same."""
+        return self
 
     def residual(self, seen: Seen, target: Float[Tensor, "rays 3"]) -> Float[Tensor, "rays 3"]:
         """Rendered less shown."""

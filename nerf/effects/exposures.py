@@ -9,8 +9,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf.effects import Seen
-from nerf.effects.exposure import ExposedModel, expose, expose_backward
-from nerf.model import RadianceModel, Rendering
+from nerf.effects.exposure import expose, expose_backward
+from nerf.model import Rendering
 
 RATE = 2e-3  # of the logarithm of a gain; gains begin within a percent or two of where they end
 
@@ -46,9 +46,9 @@ class Exposures:
         """The gain that stands for all: the median over the photos, per channel."""
         return self.log_gain.median(0).values
 
-    def shown(self, model: RadianceModel) -> RadianceModel:
-        """The field at the neutral gain."""
-        return ExposedModel(model, self.neutral)
+    def of_unseen(self, weights: Float[Tensor, "unseen views"]) -> "Exposures":
+        """Gains like those of the photos taken nearest by: a camera that sets its exposure sees there what they saw."""
+        return Exposures(weights.to(self.log_gain) @ self.log_gain)
 
     def residual(self, seen: Seen, target: Float[Tensor, "rays 3"]) -> Float[Tensor, "rays 3"]:
         """e(C - (1 - o) b) + (1 - o) b less the target, with e of nerf/effects/exposure.py and opacity o; 0 where the
