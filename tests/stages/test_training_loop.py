@@ -81,7 +81,7 @@ def probe() -> Probe:
 def run_in(folder: Path, progress, steps: int | None = 40, seconds: float | None = None, make=None) -> TrainingRun:
     folder.mkdir(exist_ok=True)
     maker = make or (lambda attempt: OneNumber(attempt, quiet))
-    budget, probes = Budget(steps, seconds), Probes(probe(), probe())
+    budget, probes = Budget(steps, seconds), Probes(probe(), probe(), torch.eye(2))
     return TrainingRun(maker, probes, budget, folder, 1e-9, TrainingLog(folder, False), progress)
 
 
