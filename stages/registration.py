@@ -140,10 +140,9 @@ def with_left_out(entries: Sequence[dict[str, Any]], photos: "Sequence[Photo]") 
     known = {entry["file"]: entry for entry in entries}
     everything = []
     for photo in photos:
-        file = photo.file.removeprefix("images/")
         reason = f"nearly the same picture as {photo.near_duplicate_of}: it adds no baseline"
-        left_out = {"file": file, "registered": False, "reason": reason, "keypoints": 0, "observations": 0}
-        everything.append(known.get(file, left_out))
+        left_out = {"file": photo.image_name, "registered": False, "reason": reason, "keypoints": 0, "observations": 0}
+        everything.append(known.get(photo.image_name, left_out))
     return everything
 
 

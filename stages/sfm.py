@@ -129,7 +129,7 @@ def _reconstruct(config: Config, photos: "list[Photo]", ingest: Path, folder: Pa
     _check_count(photos, len(everything))
     _check_camera(config, photos)
     check_matcher(config.matcher, places_of(photos))
-    names = [photo.file.removeprefix("images/") for photo in photos]
+    names = [photo.image_name for photo in photos]
     database = _database(folder, names, progress)
     found = _run_child(config, photos, ingest / "images", folder, database, progress)
     models, points = found["models"], found["points"]
@@ -165,7 +165,7 @@ def _georeference(folder: Path, photos: "Sequence[Photo]", progress: Progress) -
     from stages.georeference import georeference
 
     place_of = {
-        photo.file.removeprefix("images/"): (photo.latitude, photo.longitude, photo.altitude_m)
+        photo.image_name: (photo.latitude, photo.longitude, photo.altitude_m)
         for photo in photos
         if photo.latitude is not None and photo.longitude is not None
     }

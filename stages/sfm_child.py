@@ -90,7 +90,7 @@ class _Work:
     def __init__(self, job: Job, say: Say) -> None:
         self.job, self.say = job, say
         self.photos = [Photo(**photo) for photo in job.photos]
-        self.files = [photo.file.removeprefix("images/") for photo in self.photos]
+        self.files = [photo.image_name for photo in self.photos]
         self.database, self.images = Path(job.database), Path(job.images)
         self.journal = Journal(Path(job.folder, "attempts"))
 
