@@ -71,7 +71,7 @@ def epipoles_inside(
     Around an epipole points have next to no parallax, whatever their depth. F maps points of the first photo to lines
     of the second; ``sizes``: width and height in pixels of both photos of a pair. False where F is zero.
     """
-    inside = fundamental.any(axis=(1, 2))
+    inside = np.any(fundamental != 0, axis=(1, 2), keepdims=True)[:, 0, 0]
     for side, matrix in ((0, fundamental), (1, fundamental.transpose(0, 2, 1))):
         epipole = np.linalg.svd(matrix)[2][:, 2]
         epipole = epipole * np.where(epipole[:, 2:] < 0, -1, 1)

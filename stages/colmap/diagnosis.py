@@ -53,7 +53,8 @@ def find_conflict(models: "Sequence[pycolmap.Reconstruction]") -> dict[str, Any]
         poses = _poses(model)
         if not (shared := sorted(best.keys() & poses.keys())):
             continue
-        apart = elsewhere(*(np.array([of[name] for name in shared]) for of in (best, poses)), extent)
+        here, there = (np.array([of[name] for name in shared]) for of in (best, poses))
+        apart = elsewhere(here, there, extent)
         if apart.sum() >= max(FEWEST_ELSEWHERE, SHARE_ELSEWHERE * len(shared)):
             return {"group": group, "shared": len(shared), "elsewhere": int(apart.sum())}
     return None

@@ -405,7 +405,7 @@ def test_an_attempt_for_which_no_time_is_left_is_not_begun(
     assert result.line.startswith("6/7 registered, ")
     # All of the first time's 100 s of mapping, 1 - (6/7)² of those of matching; twice 100 s are for the adjustment.
     said = (
-        "left out, for it would take about 2 min and the last adjustment, of --sfm.max-seconds about 4 min are left: "
+        "left out, for it would take about 2 min and the last adjustment, of --sfm.max-seconds 4 min are left: "
         "matching them again, less strictly"
     )
     assert said in progress.notes
