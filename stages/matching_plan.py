@@ -39,6 +39,7 @@ WAYS = {
 # the products of matching. Below 1131 pixels photos would have to be doubled to yield enough, which saves nothing.
 ORDINARY = 100  # photos
 BEARABLE_SECONDS = 540.0
+WORTH_IT = 0.7  # of the time: small photos, or such with few features, gain nothing by a step down, and are spared it
 
 
 class Tier(NamedTuple):
@@ -120,21 +121,22 @@ def chosen(left_open: Open, photos: "Sequence[Photo]", images: Path, neighbours:
     if not pairs_open and len(tiers) == 1:
         return Chosen(*tiers[0], left_open.matcher or "exhaustive")
     progress.update("measuring what features and matches of a few photos take")
-    costs = [_measured(photos, images, tiers[0])]
-    matcher = left_open.matcher or choose(count, neighbours, costs[0].per_pair, places_of(photos))
+    full = _measured(photos, images, tiers[0])
+    matcher = left_open.matcher or choose(count, neighbours, full.per_pair, places_of(photos))
     pairs = expected_pairs(matcher, count, neighbours)
     if matcher != left_open.matcher and matcher != "exhaustive":
         everything = expected_pairs("exhaustive", count, neighbours)
         progress.note(
-            f"{count} photos have {everything:,} pairs, about {about(everything * costs[0].per_pair)}: "
-            f"{WAYS[matcher].format(neighbours)}, about {about(pairs * costs[0].per_pair)}"
+            f"{count} photos have {everything:,} pairs, about {about(everything * full.per_pair)}: "
+            f"{WAYS[matcher].format(neighbours)}, about {about(pairs * full.per_pair)}"
         )
-    for tier in tiers[1:]:
-        if costs[-1].of(count, pairs) <= BEARABLE_SECONDS:
+    tier, seconds = tiers[0], full.of(count, pairs)
+    for less in tiers[1:]:
+        if seconds <= BEARABLE_SECONDS:
             break
-        costs.append(_measured(photos, images, tier))
-    tier = tiers[len(costs) - 1]
-    progress.note(_search_in_words(count, tiers[0], tier, *(cost.of(count, pairs) for cost in (costs[0], costs[-1]))))
+        if (shorter := _measured(photos, images, less).of(count, pairs)) <= WORTH_IT * seconds:
+            tier, seconds = less, shorter
+    progress.note(_search_in_words(count, tiers[0], tier, full.of(count, pairs), seconds))
     return Chosen(*tier, matcher)
 
 
