@@ -1,10 +1,13 @@
-"""How far the cameras that stage sfm finds are from measured ones.
+"""How far the cameras that stage sfm finds are from measured ones, or from those that came with the photos.
 
-    python benchmarks/sfm_accuracy.py DATA [--camera-model OPENCV] [--sets fountain_p11 herzjesu_p8]
+    python benchmarks/sfm_accuracy.py DATA [--camera-model OPENCV] [--sets fountain_p11 herzjesu_p8 fox]
 
 DATA holds a folder per set: photos, and reference_cameras.json with K (px), world_from_camera_rotation and
 camera_center_m for each. Printed are the mean and largest distance of the camera centres after the similarity that
 fits them best, and the mean angle between the rotations, beside the seconds that sfm took.
+
+A set with a transforms.json instead, and photos in images/, has no truth but the cameras of another program: how far
+both agree, centres in percent of the largest distance between two of the given ones.
 
 On two busy cores, pycolmap 4.2.1, mean mm / mean degrees on fountain_p11 (11 photos) and herzjesu_p8 (8 photos):
 
@@ -30,6 +33,8 @@ import numpy as np
 from nerf.alignment import align
 from stages import ingest, sfm
 from stages.colmap.models import read_model
+from stages.known_cameras import read_known_cameras
+from stages.photos import Photo, read_photos
 from stages.sparse_model import SparseModel
 
 
@@ -49,28 +54,49 @@ def errors(model: SparseModel, reference: dict[str, dict[str, list]]) -> tuple[n
     measured = [reference[image.file] for image in model.images]
     rotations = np.array([camera["world_from_camera_rotation"] for camera in measured])
     centres = np.array([camera["camera_center_m"] for camera in measured])
+    distances, degrees = apart(model, np.concatenate([rotations, centres[:, :, None]], axis=2))
+    return 1000 * distances, degrees
+
+
+def apart(model: SparseModel, true: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distances of the centres and angles (degrees) of the model's images from poses (n, 3, 4) from the camera."""
     found = np.stack([image.sfm_from_camera for image in model.images])
-    world_from_sfm = align(found[:, :, 3], centres)
-    aligned = np.stack([world_from_sfm.pose(pose) for pose in found])
-    cosines = (np.einsum("nij,nij->n", aligned[:, :, :3], rotations) - 1) / 2
-    distances = np.linalg.norm(aligned[:, :, 3] - centres, axis=1)
-    return 1000 * distances, np.degrees(np.arccos(np.clip(cosines, -1, 1)))
+    true_from_sfm = align(found[:, :, 3], true[:, :, 3])
+    aligned = np.stack([true_from_sfm.pose(pose) for pose in found])
+    cosines = (np.einsum("nij,nij->n", aligned[:, :, :3], true[:, :, :3]) - 1) / 2
+    distances = np.linalg.norm(aligned[:, :, 3] - true[:, :, 3], axis=1)
+    return distances, np.degrees(np.arccos(np.clip(cosines, -1, 1)))
 
 
-def measure(photos: Path, config: sfm.Config) -> None:
+def agreement(model: SparseModel, transforms: Path, photos: list[Photo]) -> tuple[np.ndarray, np.ndarray]:
+    """Distances of the centres in percent of the largest between two given ones, and angles in degrees, per photo."""
+    frames = json.loads(transforms.read_text())["frames"]
+    names = {frame["file_path"]: Path(frame["file_path"]).name for frame in frames}
+    given = {image.file: image.sfm_from_camera for image in read_known_cameras(transforms, photos, names).model.images}
+    poses = np.stack([given[image.file] for image in model.images])
+    size = max(float(np.linalg.norm(poses[:, :, 3] - pose[:, 3], axis=1).max()) for pose in poses)
+    distances, degrees = apart(model, poses)
+    return 100 * distances / size, degrees
+
+
+def measure(data: Path, config: sfm.Config) -> None:
     """Run ingest and sfm on one set and print its line of the table."""
-    reference = json.loads((photos / "reference_cameras.json").read_text())
+    transforms = data / "transforms.json"
     with tempfile.TemporaryDirectory() as scratch:
         folders = {name: Path(scratch, name) for name in ("ingest", "sfm")}
         folders["ingest"].mkdir()
+        photos = data / "images" if transforms.exists() else data
         ingest.run(ingest.Config(photos=photos), {}, folders["ingest"], Quiet())
         begin = time.perf_counter()
         result = sfm.run(config, folders, folders["sfm"], Quiet())
         seconds = time.perf_counter() - begin
         model = read_model(folders["sfm"] / "sparse")
-    millimetres, degrees = errors(model, reference)
+        if transforms.exists():
+            unit, (off, degrees) = "%", agreement(model, transforms, read_photos(folders["ingest"]))
+        else:
+            unit, (off, degrees) = "mm", errors(model, json.loads((data / "reference_cameras.json").read_text()))
     print(
-        f"{photos.name:14s} {millimetres.mean():7.2f} {millimetres.max():7.2f} {degrees.mean():8.3f} {seconds:6.0f}  "
+        f"{data.name:14s} {off.mean():7.2f} {off.max():7.2f} {unit:2s} {degrees.mean():8.3f} {seconds:6.0f}  "
         f"{result.line}"
     )
 
@@ -81,10 +107,12 @@ def main() -> None:
     parser.add_argument("data", type=Path)
     parser.add_argument("--sets", nargs="+", default=["fountain_p11", "herzjesu_p8"])
     parser.add_argument("--camera-model", default=None)
-    parser.add_argument("--max-features", type=int, default=sfm.Config().max_features)
+    parser.add_argument("--max-features", type=int, default=None)
+    parser.add_argument("--max-image-size", type=int, default=None)
     arguments = parser.parse_args()
-    config = sfm.Config(camera_model=arguments.camera_model, max_features=arguments.max_features)
-    print(f"{'set':14s} {'mean mm':>7s} {'max mm':>7s} {'mean deg':>8s} {'s':>6s}")
+    given = {name: getattr(arguments, name) for name in ("camera_model", "max_features", "max_image_size")}
+    config = sfm.Config(**given)
+    print(f"{'set':14s} {'mean':>7s} {'max':>7s}    {'mean deg':>8s} {'s':>6s}")
     for name in arguments.sets:
         measure(arguments.data / name, config)
 

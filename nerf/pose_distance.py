@@ -6,9 +6,7 @@ from jaxtyping import Float
 NEIGHBOURS = 4
 
 
-def pose_distances(
-    pose: Float[np.ndarray, "3 4"], others: Float[np.ndarray, "n 3 4"]
-) -> Float[np.ndarray, "n"]:
+def pose_distances(pose: Float[np.ndarray, "3 4"], others: Float[np.ndarray, "n 3 4"]) -> Float[np.ndarray, "n"]:
     """Distance of the centres in scene units plus rotation angle in radians.
 
     The region of interest is about two units wide, so a radian weighs as much as half the scene. The whole rotation

@@ -1,16 +1,24 @@
-"""What a set of photos lacks when no depth can be had from it: a turn of the camera on the spot, or one flat surface.
+"""What is wrong with a set of photos when no depth, or two contradicting scenes, come of it.
+
+A turn of the camera on the spot, one flat surface, a camera that moves straight ahead, or parts that look alike.
 
 Two photos taken from one place, or of one plane, are related by a homography H (Hartley and Zisserman 2004, ch. 13).
 From one place it is H = K R K⁻¹, so with the right focal length K⁻¹ H K is a rotation; for a plane at distance d with
 normal n and a camera that moved by t it is R + t nᵀ/d, and no rotation.
 """
 
+from itertools import combinations
+
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 # A step of 2 % of the distance to the plane makes K⁻¹ H K differ so much from a rotation; half a pixel of noise in
 # photos of 300 pixels, a tenth of it.
 LIKE_A_ROTATION = 0.02
+# Between two models of the same photos poses differ by less than a degree and a hundredth of the scene where both are
+# right (docs/numbers.md); what repeats puts a photo another facade, or window, farther.
+SAME_ANGLE_DEG, SAME_PLACE = 5.0, 0.05
+RADIAL_DEG, MOSTLY = 15.0, 0.8
 FOCAL_LENGTHS = np.geomspace(0.3, 6, 61)  # over the longer side: from 118 to 10 degrees
 
 
@@ -50,3 +58,78 @@ def count_turns(homographies: Float[np.ndarray, "pairs 3 3"], sizes: Int[np.ndar
     return max(
         int((departure_from_rotation(homographies, sizes, focal) < LIKE_A_ROTATION).sum()) for focal in FOCAL_LENGTHS
     )
+
+
+# --- moving straight ahead
+
+
+def epipoles_inside(
+    fundamental: Float[np.ndarray, "pairs 3 3"], sizes: Int[np.ndarray, "pairs 2 2"]
+) -> Bool[np.ndarray, "pairs"]:
+    """Whether the camera moves towards something visible: both epipoles, F e = 0 and Fᵀ e' = 0, lie in the photos.
+
+    Around an epipole points have next to no parallax, whatever their depth. F maps points of the first photo to lines
+    of the second; ``sizes``: width and height in pixels of both photos of a pair. False where F is zero.
+    """
+    inside = np.any(fundamental != 0, axis=(1, 2), keepdims=True)[:, 0, 0]
+    for side, matrix in ((0, fundamental), (1, fundamental.transpose(0, 2, 1))):
+        epipole = np.linalg.svd(matrix)[2][:, 2]
+        epipole = epipole * np.where(epipole[:, 2:] < 0, -1, 1)
+        limit = epipole[:, 2:] * sizes[:, side]
+        inside &= ((epipole[:, :2] > 0) & (epipole[:, :2] < limit)).all(axis=1)
+    return inside
+
+
+def expands(
+    first: Float[np.ndarray, "matches 2"], second: Float[np.ndarray, "matches 2"], size: Int[np.ndarray, "2"]
+) -> bool:
+    """Whether most matches move straight away from one point of the picture, or towards it: as it is when the camera
+    moves ahead and hardly turns. Told so where a homography explains the pair, and its epipole is not defined.
+
+    The point e is the one whose rays the offsets o at x cross least: min Σ (o × (x − e))² / |o|².
+    """
+    offsets = second - first
+    length = np.linalg.norm(offsets, axis=1)
+    moving = length > 0
+    if moving.sum() < 2:
+        return False
+    across = np.stack([-offsets[moving, 1], offsets[moving, 0]], axis=1) / length[moving, None]
+    focus, _, rank, _ = np.linalg.lstsq(across, (across * first[moving]).sum(axis=1), rcond=None)
+    if rank < 2 or not ((focus > 0) & (focus < size)).all():
+        return False
+    rays = first[moving] - focus
+    outwards = (rays * offsets[moving]).sum(axis=1)
+    radial = np.abs(outwards) > np.cos(np.radians(RADIAL_DEG)) * np.linalg.norm(rays, axis=1) * length[moving]
+    return max((radial & (outwards > 0)).mean(), (radial & (outwards < 0)).mean()) > MOSTLY
+
+
+# --- parts that look alike
+
+
+def elsewhere(
+    first: Float[np.ndarray, "photos 3 4"], second: Float[np.ndarray, "photos 3 4"], extent: float
+) -> Bool[np.ndarray, "photos"]:
+    """Which photos of two models, by their poses (from the camera), stand elsewhere in the second than in the first.
+
+    Compared is after the similarity between the models on which most photos agree; every two photos propose one.
+    ``extent``: how far apart the first model's cameras stand (root mean square). None of fewer than three photos.
+    """
+    best = np.zeros(len(first), bool)
+    nowhere_else = best.copy()
+    if len(first) < 3:
+        return nowhere_else
+    between = first[:, :, :3] @ second[:, :, :3].transpose(0, 2, 1)
+    for pair in combinations(range(len(first)), 2):
+        chosen = list(pair)
+        u, _, vt = np.linalg.svd(between[chosen].sum(axis=0))
+        rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+        step, other_step = (np.linalg.norm(np.diff(of[chosen, :, 3], axis=0)) for of in (first, second))
+        if other_step == 0:
+            continue
+        moved = step / other_step * second[:, :, 3] @ rotation.T
+        off = first[:, :, 3] - moved
+        far = np.linalg.norm(off - off[chosen].mean(axis=0), axis=1) > SAME_PLACE * extent
+        cosine = (np.einsum("nij,ij->n", between, rotation) - 1) / 2
+        agreeing = ~far & (cosine > np.cos(np.radians(SAME_ANGLE_DEG)))
+        best = max(best, agreeing, key=np.sum)
+    return ~best if best.any() else nowhere_else  # they all stand in one place: nothing to compare

@@ -49,7 +49,7 @@ class KnownCameras:
                 "keypoints": observations.get(file, 0),
                 "observations": observations.get(file, 0),
             }
-            for file in map(_file, photos)
+            for file in (photo.image_name for photo in photos)
         ]
 
 
@@ -91,7 +91,7 @@ def _from_transforms(
             if photo is None:
                 absent.append(name)
                 continue
-            file = _file(photo)
+            file = photo.image_name
             if file in posed:
                 raise StageError(f"two frames for the photo {photo.name}", f"one is {name!r}", TRANSFORMS_HINT)
             posed[file] = _Posed(photo, _camera({**content, **frame}, photo), _pose(frame["transform_matrix"], name))
@@ -100,7 +100,7 @@ def _from_transforms(
     return KnownCameras(
         model=_without_points([posed[file] for file in sorted(posed)], paths[0].name),
         test_files=sorted(test_files) if test_files else None,
-        notes=_notes(absent, [photo.name for photo in photos if _file(photo) not in posed]),
+        notes=_notes(absent, [photo.name for photo in photos if photo.image_name not in posed]),
     )
 
 
@@ -108,7 +108,7 @@ def _without_points(posed: Sequence[_Posed], source: str) -> SparseModel:
     if not posed:
         raise _nothing_matches(source)
     cameras = list(dict.fromkeys(p.camera for p in posed))
-    images = [SparseImage(_file(p.photo), cameras.index(p.camera), p.world_from_camera) for p in posed]
+    images = [SparseImage(p.photo.image_name, cameras.index(p.camera), p.world_from_camera) for p in posed]
     return SparseModel.without_points(cameras, images)
 
 
@@ -193,30 +193,30 @@ def _wrong(what: str, why: str) -> StageError:
 def _from_colmap(folder: Path, photos: Sequence[Photo]) -> KnownCameras:
     given = read_model(folder)
     photo_of = _by_name([image.file for image in given.images], photos)
-    kept = sorted(photo_of, key=lambda i: _file(photo_of[i]))
+    kept = sorted(photo_of, key=lambda i: photo_of[i].image_name)
     if not kept:
         raise _nothing_matches(folder.name)
     cameras_of = [_checked(given, i, photo_of[i]) for i in kept]
     cameras = list(dict.fromkeys(cameras_of))
     images = [
-        SparseImage(_file(photo_of[i]), cameras.index(camera), given.images[i].sfm_from_camera)
+        SparseImage(photo_of[i].image_name, cameras.index(camera), given.images[i].sfm_from_camera)
         for i, camera in zip(kept, cameras_of, strict=True)
     ]
     scales = [_scale(given.cameras[given.images[i].camera], photo_of[i]) for i in kept]
-    posed = {_file(photo) for photo in photo_of.values()}
+    posed = {photo.image_name for photo in photo_of.values()}
     return KnownCameras(
         model=given.restricted(kept, scales, cameras, images),
         test_files=None,
         notes=_notes(
             [image.file for i, image in enumerate(given.images) if i not in photo_of],
-            [photo.name for photo in photos if _file(photo) not in posed],
+            [photo.name for photo in photos if photo.image_name not in posed],
         ),
     )
 
 
 def _by_name(names: Sequence[str], photos: Sequence[Photo]) -> dict[int, Photo]:
     """Photo by index of its image: of the same name, else alone with the same last part of the name."""
-    exact = {photo.name: photo for photo in photos} | {_file(photo): photo for photo in photos}
+    exact = {photo.name: photo for photo in photos} | {photo.image_name: photo for photo in photos}
     last: dict[str, list[Photo]] = {}
     for photo in photos:
         last.setdefault(PurePosixPath(photo.name).name, []).append(photo)
@@ -241,10 +241,6 @@ def _checked(given: SparseModel, index: int, photo: Photo) -> Camera:
 
 
 # --- both
-
-
-def _file(photo: Photo) -> str:
-    return photo.file.removeprefix("images/")
 
 
 def _scale(camera: Camera, photo: Photo) -> tuple[float, float]:

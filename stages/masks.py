@@ -120,5 +120,5 @@ def write_feature_masks(ingest: Path, photos: "Sequence[Photo]", folder: Path) -
         if photo.has_alpha:
             with Image.open(ingest / photo.file) as image:
                 allowed = np.where(np.asarray(image.getchannel("A")) > 0, allowed, np.uint8(0))
-        write_png(folder / f"{photo.file.removeprefix('images/')}.png", allowed)
+        write_png(folder / f"{photo.image_name}.png", allowed)
     return bool(masked)

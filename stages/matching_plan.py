@@ -1,7 +1,7 @@
-"""Which pairs of photos to match, decided before the work starts by what a pair costs on this machine.
+"""How far to search features and which pairs of photos to match, decided beforehand by what that costs on this machine.
 
 The cost is measured on a few of the photos, in a child process (COLMAP may abort): ``python -m stages.matching_plan``
-reads a job from stdin as one line of JSON and answers with the seconds a pair takes.
+reads a job from stdin as one line of JSON and answers with a :class:`Cost`.
 """
 
 import json
@@ -13,7 +13,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from stages.contract import Progress, StageError
 from stages.live_line import duration
@@ -23,14 +23,60 @@ if TYPE_CHECKING:
     from stages.photos import Photo
     from stages.sfm import Matcher
 
-# Neighbours in the list see much the same, those of different parts often nothing: both kinds of pairs are timed.
-MEASURED = (1 / 4, 3 / 4)  # where in the list of photos two neighbours are taken from
+FEWEST_MEASURED = 4
 CHILD = ["-m", "stages.matching_plan"]
 WAYS = {
     "sequential": "neighbours in time, {} each",
     "spatial": "the {} nearest places of each",
     "retrieval": "retrieval of {} neighbours each",
 }
+
+
+# The accuracy in docs/numbers.md is that of the first tier: sets of ordinary size are always searched so, and none
+# farther, since that costs a multiple and moves no camera of a well-sized photo; where photos find no place there is an
+# attempt for it. Larger sets, whose photos have partners enough, give way where features and matches, made once for all
+# trainings to come, would take longer than three of them. A step down has half the pixels or the same, and a quarter of
+# the products of matching. Below 1131 pixels photos would have to be doubled to yield enough, which saves nothing.
+ORDINARY = 100  # photos
+BEARABLE_SECONDS = 540.0
+WORTH_IT = 0.7  # of the time: small photos, or such with few features, gain nothing by a step down, and are spared it
+
+
+class Tier(NamedTuple):
+    """How far features are searched: the longer side of photos in pixels, and how many each has at most."""
+
+    max_image_size: int
+    max_features: int
+
+
+TIERS = (Tier(1600, 4096), Tier(1131, 2048), Tier(1131, 1024))
+
+
+class Open(NamedTuple):
+    """What the user says of the search; None is left open."""
+
+    max_image_size: int | None
+    max_features: int | None
+    matcher: "Matcher | None"
+
+
+class Chosen(NamedTuple):
+    """The same, with every answer."""
+
+    max_image_size: int
+    max_features: int
+    matcher: "Matcher"
+
+
+class Cost(NamedTuple):
+    """Seconds of the wall clock, all cores at work, that the features of a photo and a pair of photos take."""
+
+    per_photo: float
+    per_pair: float
+
+    def of(self, photos: int, pairs: int) -> float:
+        """Seconds for a set."""
+        return photos * self.per_photo + pairs * self.per_pair
 
 
 def places_of(photos: "Sequence[Photo]") -> "Places":
@@ -60,28 +106,55 @@ def check_matcher(matcher: "Matcher | None", places: "Places") -> None:
         )
 
 
-def chosen_matcher(
-    photos: "Sequence[Photo]", images: Path, neighbours: int, features: dict[str, int], progress: Progress
-) -> "Matcher":
-    """The way of choosing pairs that fits the photos and this machine; says so where it is not all of them.
+def chosen(left_open: Open, photos: "Sequence[Photo]", images: Path, neighbours: int, progress: Progress) -> Chosen:
+    """What is left open, chosen by what the photos take on this machine; said where anything was measured for it.
 
-    ``features``: ``max_image_size`` and ``max_features``. Nothing is measured where it could change nothing.
+    First the pairs, then how far features are searched, so that sets of ordinary size are always searched in full.
+    Nothing is measured where it could change nothing.
     """
     from stages.pairing import can_save, choose, expected_pairs
 
-    count = len(photos)
-    if not can_save(count, neighbours):
-        return "exhaustive"
-    progress.update("measuring what matching two photos takes")
-    seconds = _seconds_per_pair(photos, images, features)
-    matcher = choose(count, neighbours, seconds, places_of(photos))
-    if matcher != "exhaustive":
-        everything, pairs = (expected_pairs(one, count, neighbours) for one in ("exhaustive", matcher))
+    count, tiers = len(photos), tiers_of(left_open)
+    pairs_open = left_open.matcher is None and can_save(count, neighbours)
+    if count <= ORDINARY:
+        tiers = tiers[:1]
+    if not pairs_open and len(tiers) == 1:
+        return Chosen(*tiers[0], left_open.matcher or "exhaustive")
+    progress.update("measuring what features and matches of a few photos take")
+    full = _measured(photos, images, tiers[0])
+    matcher = left_open.matcher or choose(count, neighbours, full.per_pair, places_of(photos))
+    pairs = expected_pairs(matcher, count, neighbours)
+    if matcher != left_open.matcher and matcher != "exhaustive":
+        everything = expected_pairs("exhaustive", count, neighbours)
         progress.note(
-            f"{count} photos have {everything:,} pairs, about {about(everything * seconds)}: "
-            f"{WAYS[matcher].format(neighbours)}, about {about(pairs * seconds)}"
+            f"{count} photos have {everything:,} pairs, about {about(everything * full.per_pair)}: "
+            f"{WAYS[matcher].format(neighbours)}, about {about(pairs * full.per_pair)}"
         )
-    return matcher
+    tier, seconds = tiers[0], full.of(count, pairs)
+    for less in tiers[1:]:
+        if seconds <= BEARABLE_SECONDS:
+            break
+        if (shorter := _measured(photos, images, less).of(count, pairs)) <= WORTH_IT * seconds:
+            tier, seconds = less, shorter
+    progress.note(_search_in_words(count, tiers[0], tier, full.of(count, pairs), seconds))
+    return Chosen(*tier, matcher)
+
+
+def tiers_of(left_open: Open) -> list[Tier]:
+    """The tiers to choose from, what is given in all of them."""
+    size, features = left_open.max_image_size, left_open.max_features
+    return list(dict.fromkeys(Tier(size or tier.max_image_size, features or tier.max_features) for tier in TIERS))
+
+
+def _search_in_words(count: int, full: Tier, tier: Tier, seconds_full: float, seconds: float) -> str:
+    if tier == full:
+        return f"{count} photos searched at {_in_words(tier)} and matched: about {about(seconds)}"
+    instead = f"at {_in_words(tier)} instead, about {about(seconds)}"
+    return f"{count} photos searched at {_in_words(full)} and matched take about {about(seconds_full)}: {instead}"
+
+
+def _in_words(tier: Tier) -> str:
+    return f"{tier.max_image_size} pixels for {tier.max_features} features"
 
 
 def about(seconds: float) -> str:
@@ -89,20 +162,33 @@ def about(seconds: float) -> str:
     return duration(max(1, round(seconds)) if seconds < 60 else 60 * round(seconds / 60))
 
 
-def _seconds_per_pair(photos: "Sequence[Photo]", images: Path, features: dict[str, int]) -> float:
+def _measured(photos: "Sequence[Photo]", images: Path, tier: Tier) -> Cost:
     """Measured in a child process, all cores at work. Raises StageError where it does not end well."""
-    first = {int(share * len(photos)) for share in MEASURED}
-    some = [asdict(photos[index]) for index in sorted(first | {index + 1 for index in first})]
-    job = json.dumps({"images": str(images.absolute()), "photos": some, **features})
+    some = [asdict(photo) for photo in _sample(photos, os.cpu_count() or 1)]
+    job = json.dumps({"images": str(images.absolute()), "photos": some, **tier._asdict()})
     answer = subprocess.run(
         [sys.executable, *CHILD], input=job.encode(), capture_output=True, env=environment(), start_new_session=True
     )
     if answer.returncode:
         lines = answer.stderr.decode("utf-8", "replace").strip().splitlines()
         why = lines[-1] if lines else f"COLMAP ended with {answer.returncode}"
-        hint = "Name the pairs to match, and nothing is measured: --sfm.matcher exhaustive."
-        raise StageError("could not measure what matching two photos takes", why, hint)
-    return json.loads(answer.stdout)["seconds_per_pair"]
+        every = f"--sfm.matcher exhaustive --sfm.max-image-size {tier.max_image_size}"
+        hint = f"Say how, and nothing is measured: {every} --sfm.max-features {tier.max_features}."
+        raise StageError("could not measure what features and matches take", why, hint)
+    return Cost(**json.loads(answer.stdout))
+
+
+def _sample(photos: "Sequence[Photo]", cores: int) -> "list[Photo]":
+    """Two neighbours each from all over the list, at least four photos and enough for all cores.
+
+    Neighbours in the list see much the same, those of different parts often nothing: both kinds of pairs are timed.
+    """
+    wanted = max(FEWEST_MEASURED, cores)
+    places = wanted // 2
+    first = [int((place + 0.5) / places * len(photos)) for place in range(places)]
+    return [
+        photos[index] for index in sorted({one for index in first for one in (index, index + 1)}) if index < len(photos)
+    ]
 
 
 def environment() -> dict[str, str]:
@@ -121,11 +207,11 @@ def main() -> None:
     job = json.loads(sys.stdin.buffer.readline())
     channel = os.dup(1)
     os.dup2(2, 1)  # nothing else may print there
-    os.write(channel, json.dumps({"seconds_per_pair": measure(**job)}).encode())
+    os.write(channel, json.dumps(measure(**job)._asdict()).encode())
 
 
-def measure(images: str, photos: list[dict[str, Any]], max_image_size: int, max_features: int) -> float:
-    """Seconds of the wall clock that matching any two of these photos takes, on all cores."""
+def measure(images: str, photos: list[dict[str, Any]], max_image_size: int, max_features: int) -> Cost:
+    """What these photos take."""
     from stages.colmap.mapping import MAPPING_MODEL
     from stages.colmap.matching import STRICT_RATIO, Search, extract_features, fill_database, match_pairs
     from stages.pairing import exhaustive
@@ -136,10 +222,11 @@ def measure(images: str, photos: list[dict[str, Any]], max_image_size: int, max_
     with tempfile.TemporaryDirectory() as scratch:
         database = Path(scratch, "some.db")
         fill_database(database, some, MAPPING_MODEL)
-        extract_features(database, Path(images), some, Search(max_image_size, max_features))
         started = time.monotonic()
+        extract_features(database, Path(images), some, Search(max_image_size, max_features))
+        extracted = time.monotonic()
         match_pairs(database, pairs, 0, STRICT_RATIO)
-        return (time.monotonic() - started) / len(pairs)
+        return Cost((extracted - started) / len(some), (time.monotonic() - extracted) / len(pairs))
 
 
 if __name__ == "__main__":

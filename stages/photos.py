@@ -44,6 +44,11 @@ class Photo:
     longitude: float | None = None
     altitude_m: float | None = None
 
+    @property
+    def image_name(self) -> str:
+        """Its name in COLMAP's databases and models and in registration.json: ``file`` without ``images/``."""
+        return self.file.removeprefix("images/")
+
 
 @dataclass(frozen=True)
 class Refusal:

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from stages.contract import StageError
-from stages.degeneracy import count_turns
+from stages.degeneracy import count_turns, epipoles_inside, expands
 from stages.sfm_attempts import FEWEST_MATCHES
 
 if TYPE_CHECKING:
@@ -35,7 +35,8 @@ class Matches:
     """The verified among ``tried`` pairs of photos; photos are numbered from 0 in order of ``file``.
 
     ``flat``: a plane or a rotation alone explains the pair, so it tells nothing of depth; ``homography`` is that map
-    (zero where there is none). ``shift_px``: median distance between matched keypoints.
+    (zero where there is none). ``ahead``: the camera moved towards something in the picture, or away from it.
+    ``shift_px``: median distance between matched keypoints.
     """
 
     keypoints: Int[np.ndarray, "photos"]
@@ -44,6 +45,7 @@ class Matches:
     inliers: Int[np.ndarray, "pairs"]
     flat: Bool[np.ndarray, "pairs"]
     homography: Float[np.ndarray, "pairs 3 3"]
+    ahead: Bool[np.ndarray, "pairs"]
     shift_px: Float[np.ndarray, "pairs"]
 
 
@@ -83,31 +85,40 @@ def read_matches(database: Path) -> Matches:
             "SELECT COALESCE(rows, 0) FROM images LEFT JOIN keypoints USING (image_id) ORDER BY image_id"
         ).fetchall()
         verified = db.execute(
-            "SELECT pair_id, rows, config, data, H FROM two_view_geometries WHERE rows > 0 ORDER BY pair_id"
+            "SELECT pair_id, rows, config, data, H, F FROM two_view_geometries WHERE rows > 0 ORDER BY pair_id"
         ).fetchall()
+        sizes = np.array(
+            db.execute("SELECT width, height FROM images JOIN cameras USING (camera_id) ORDER BY image_id").fetchall(),
+            int,
+        ).reshape(-1, 2)
         places = {
             image_id - 1: np.frombuffer(data, np.float32).reshape(rows, cols)[:, :2]
             for image_id, rows, cols, data in db.execute("SELECT * FROM keypoints WHERE rows > 0")
         }
     pairs = np.array([divmod(pair_id, PAIR_BASE) for pair_id, *_ in verified], int).reshape(-1, 2) - 1
+    flat = np.array([config in FLAT_CONFIGS for _, _, config, *_ in verified], bool)
+    ahead = epipoles_inside(_matrices([blob for *_, blob in verified]), sizes[pairs])
     shifts = []
-    for (first, second), (_, rows, _, data, _) in zip(pairs, verified, strict=True):
+    for number, ((first, second), (_, rows, _, data, *_)) in enumerate(zip(pairs, verified, strict=True)):
         matched = np.frombuffer(data, np.uint32).reshape(rows, 2)
-        offsets = places[first][matched[:, 0]] - places[second][matched[:, 1]]
-        shifts.append(np.median(np.linalg.norm(offsets, axis=1)))
+        here, there = places[first][matched[:, 0]], places[second][matched[:, 1]]
+        shifts.append(np.median(np.linalg.norm(there - here, axis=1)))
+        if flat[number]:
+            ahead[number] = expands(here, there, sizes[first])
     return Matches(
         keypoints=np.array(keypoints, int).reshape(-1),
         tried=tried,
         pairs=pairs,
         inliers=np.array([rows for _, rows, *_ in verified], int),
-        flat=np.array([config in FLAT_CONFIGS for _, _, config, *_ in verified], bool),
-        homography=np.array([_matrix(blob) for *_, blob in verified]).reshape(-1, 3, 3),
+        flat=flat,
+        homography=_matrices([blob for *_, blob, _ in verified]),
+        ahead=ahead,
         shift_px=np.array(shifts, float),
     )
 
 
-def _matrix(blob: bytes | None) -> np.ndarray:
-    return np.frombuffer(blob, np.float64).reshape(3, 3) if blob else np.zeros((3, 3))
+def _matrices(blobs: Sequence[bytes | None]) -> Float[np.ndarray, "n 3 3"]:
+    return np.array([np.frombuffer(blob, float) if blob else np.zeros(9) for blob in blobs]).reshape(-1, 3, 3)
 
 
 def account(
@@ -116,12 +127,16 @@ def account(
     models: Sequence[Sequence[str]],
     observations: Mapping[str, int],
     supports: Mapping[str, tuple[int, int]],
+    conflict: Mapping[str, int] | None = None,
 ) -> list[dict[str, Any]]:
     """What became of each photo, for registration.json. ``models`` are the names in each sub-model, best first;
-    ``supports`` as stages/colmap/diagnosis.py finds them."""
+    ``supports`` and ``conflict`` as stages/colmap/diagnosis.py finds them."""
+    contradicted = set(models[conflict["group"]]) if conflict else set()
     entries = []
     for index, name in enumerate(names):
         reason = None if name in models[0] else _reason(index, names, matches, models, supports[name])
+        if reason and conflict and name in contradicted:
+            reason = _contradiction(models, conflict)
         entries.append(
             {
                 "file": name,
@@ -134,16 +149,30 @@ def account(
     return entries
 
 
+def _contradiction(models: Sequence[Sequence[str]], conflict: Mapping[str, int]) -> str:
+    shares = f"shares {conflict['shared']} with this one and puts {conflict['elsewhere']} of them elsewhere"
+    return (
+        f"it belongs to a group of {len(models[conflict['group']])} photos that {shares}: something looks alike there"
+    )
+
+
+def repeated_structure(models: Sequence[Sequence[str]], conflict: Mapping[str, int]) -> str:
+    """What is said of two groups of photos that contradict each other, and what to do."""
+    sizes = f"two groups of {len(models[0])} and {len(models[conflict['group']])} photos"
+    where = f"share {conflict['shared']} and disagree about where {conflict['elsewhere']} of them were taken"
+    advice = "take photos that lead from one such part to the other, or mask what repeats"
+    return f"repeated structure: {sizes} {where}. Parts of the scene look alike: {advice}"
+
+
 def with_left_out(entries: Sequence[dict[str, Any]], photos: "Sequence[Photo]") -> list[dict[str, Any]]:
     """The account of all ``photos`` in their order: what is known of those matched, and of those that ingest left out
     that they are nearly the same picture as another one."""
     known = {entry["file"]: entry for entry in entries}
     everything = []
     for photo in photos:
-        file = photo.file.removeprefix("images/")
         reason = f"nearly the same picture as {photo.near_duplicate_of}: it adds no baseline"
-        left_out = {"file": file, "registered": False, "reason": reason, "keypoints": 0, "observations": 0}
-        everything.append(known.get(file, left_out))
+        left_out = {"file": photo.image_name, "registered": False, "reason": reason, "keypoints": 0, "observations": 0}
+        everything.append(known.get(photo.image_name, left_out))
     return everything
 
 
@@ -169,6 +198,9 @@ def _reason(
     if seen >= FEWEST_MATCHES:
         agree = f"{agreeing} of {seen} agree on one position, {FEWEST_MATCHES} are needed"
         return f"its matches contradict each other: {agree}"
+    if matches.ahead[mine][in_model].all():
+        steps = f"in all {int(in_model.sum())} of its pairs with registered photos"
+        return f"{steps} the camera moves straight towards something in the picture: too little parallax"
     if matches.flat[mine][in_model].all():
         turned = f"all {int(in_model.sum())} of its pairs with registered photos"
         return f"{turned} differ by a turn of the camera alone, or show one flat surface"
@@ -193,25 +225,36 @@ def why_no_model(photos: "Sequence[Photo]", matches: Matches, registered: int, p
             f"the photos are all the same view ({verified} of {pairs} pairs differ by less than a pixel)",
             "Move the camera between photos.",
         )
-    if (flat := int(matches.flat.sum())) > verified / 2:
-        return _no_depth(what, photos, matches, flat)
+    if error := _no_depth(what, photos, matches):
+        return error
     why = f"{verified} of {pairs} pairs of photos share a view, but no two of them tell the depth of the scene"
     if registered:
         why = f"only {registered} photos and {points} points fit together; {verified} of {pairs} pairs share a view"
     return StageError(what, why, OVERLAP_HINT)
 
 
-def _no_depth(what: str, photos: "Sequence[Photo]", matches: Matches, flat: int) -> StageError:
+def _no_depth(what: str, photos: "Sequence[Photo]", matches: Matches) -> StageError | None:
+    """The error where most pairs lack what tells depth, by the name of what they have instead."""
     sizes = np.array([(photo.width, photo.height) for photo in photos])
+    count, flat, ahead = len(matches.pairs), int(matches.flat.sum()), int(matches.ahead.sum())
     turns = count_turns(matches.homography[matches.flat], sizes[matches.pairs[matches.flat]])
-    if turns > flat / 2:
+    if flat > count / 2 and turns > flat / 2:
         return StageError(
             what,
-            f"the camera turned on the spot: {turns} of {len(matches.pairs)} matching pairs differ by a rotation alone",
+            f"the camera turned on the spot: {turns} of {count} matching pairs differ by a rotation alone",
             "Move sideways between photos, by a tenth of the distance to the scene, instead of turning on the spot.",
         )
-    return StageError(
-        what,
-        f"the photos show one flat surface: a plane alone explains {flat} of {len(matches.pairs)} matching pairs",
-        "Take in something that stands out from the surface, and photograph it from the side as well.",
-    )
+    if ahead > count / 2:
+        return StageError(
+            what,
+            f"the camera moved straight ahead: in {ahead} of {count} matching pairs it goes towards something in the "
+            "picture, which leaves too little parallax",
+            "Step sideways between photos as well, by a tenth of the distance to the scene, or turn the camera aside.",
+        )
+    if flat > count / 2:
+        return StageError(
+            what,
+            f"the photos show one flat surface: a plane alone explains {flat} of {count} matching pairs",
+            "Take in something that stands out from the surface, and photograph it from the side as well.",
+        )
+    return None

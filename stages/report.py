@@ -119,6 +119,7 @@ def page(results: Results, summary: dict[str, Any], config: Config) -> str:
         refused=results.photos["refused"] if results.photos else [],
         missing=_missing(results),
         lenses=_lenses(results),
+        attempts=_attempts(results),
         uncertainty=_uncertainty(results),
         video=_video(results.inputs, config.video_limit_mb),
         compared=_compared(results),
@@ -174,6 +175,24 @@ def _lenses(results: Results) -> dict[str, Any]:
         "multiples": f"{NOISE_MULTIPLES:g}",
         "summary": f"Camera model: {'; '.join(dict.fromkeys(chosen)) or 'no candidate would do'}",
     }
+
+
+def _attempts(results: Results) -> list[dict[str, Any]]:
+    """What stage sfm tried and what became of it in words (``outcome``); empty where the first attempt did it all."""
+    rows = (results.registration or {}).get("attempts", [])
+    kept = next((row for row in rows if row["kept"]), None)
+    return [row | {"outcome": _outcome(row, kept)} for row in rows] if len(rows) > 1 else []
+
+
+def _outcome(row: dict[str, Any], kept: dict[str, Any] | None) -> str:
+    if row["kept"] or row["passed"] is not None:
+        return "kept" if row["kept"] else f"not made: {row['passed']}"
+    if not row["registered"] or kept is None:
+        return "no model"
+    for fact, words in (("registered", "fewer photos"), ("points", "fewer points")):
+        if row[fact] != kept[fact]:
+            return words
+    return "a larger error" if row["reprojection_px"] > kept["reprojection_px"] else "no better"
 
 
 def _uncertainty(results: Results) -> dict[str, Any] | None:

@@ -2,12 +2,7 @@
 
 import json
 import shutil
-import signal
-import subprocess
-import sys
-import threading
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -16,27 +11,21 @@ from pydantic import Field
 
 from stages.contract import Inputs, OptionalSourcePath, Progress, StageConfig, StageError, StageResult
 from stages.files import write_json
-from stages.live_line import live_line
-from stages.sfm_attempts import ATTEMPTS, JOURNAL, abandon
+from stages.sfm_attempts import ATTEMPTS, JOURNAL
+from stages.sfm_process import run_child
 
 if TYPE_CHECKING:
     from stages.photos import Photo
 
 NEEDS = ("ingest",)
-VERSION = 2
+VERSION = 3
 RESUMES = True
 LINKS = ("sparse",)
+# It may decide that an attempt is not made, which is said; in the key it would part a run from the matches kept for it.
 UNKEYED = ("max_seconds",)
 
 CameraModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE"]
 Matcher = Literal["exhaustive", "sequential", "spatial", "retrieval"]
-# The share of the first attempt where a phase begins, and how long it is (measured on 11 to 50 photos, two cores).
-PHASES = {"features": (0.0, 0.35), "matching": (0.35, 0.5), "mapping": (0.85, 0.15)}
-FIRST_ATTEMPT, REFINING = 0.7, 0.95  # where they end and begin in the whole
-FOR_CHILD = (
-    "seed", "max_image_size", "max_features", "camera_model", "camera_params", "matcher", "neighbours", "attempts",
-)  # fmt: skip
-CHILD = ["-m", "stages.sfm_child"]
 MOST_NAMES = 5
 
 
@@ -47,10 +36,12 @@ class Config(StageConfig):
     """Known cameras: a transforms.json, a folder with transforms_train.json, or a COLMAP model."""
     seed: int = Field(default=0, ge=0, lt=2**31)
     """Of every random choice in matching and mapping; docs/numbers.md says how far runs were seen to repeat."""
-    max_image_size: int = Field(default=1600, ge=100)
-    """Longer side in pixels at which features are searched; larger photos are reduced for it."""
-    max_features: int = Field(default=4096, ge=100)
-    """Features per photo, the largest ones first; matching takes time with its square."""
+    max_image_size: int | None = Field(default=None, ge=100)
+    """Longer side in pixels at which features are searched; larger photos are reduced for it; None: 1600, and of
+    large sets as much as is bearable here."""
+    max_features: int | None = Field(default=None, ge=100)
+    """Features per photo, the largest ones first; matching takes time with its square; None: 4096, and of large sets
+    as many as is bearable here."""
     camera_model: CameraModel | None = None
     """COLMAP's camera model; None: SIMPLE_RADIAL while mapping, and then the simplest one that held-out observations
     do not speak against."""
@@ -63,21 +54,22 @@ class Config(StageConfig):
     attempts: int = Field(default=len(ATTEMPTS), ge=1, le=len(ATTEMPTS))
     """How many ways to find the cameras are tried while photos have no place; 1: only the first."""
     max_seconds: float = Field(default=4 * 3600.0, gt=0)
-    """When structure-from-motion is given up; what was matched until then is kept for the next try."""
+    """When structure-from-motion is given up; what was matched until then is kept for the next try. Attempts that
+    would not fit are not begun."""
 
 
 def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
-    """The config with the pairs to match chosen, by what matching two of the photos takes on this machine."""
-    from stages.matching_plan import chosen_matcher
+    """The config with features and pairs chosen, by what they take on this machine for some of the photos."""
+    from stages.matching_plan import Open, chosen
     from stages.photos import read_photos
 
-    if config.cameras is not None or config.matcher is not None:
+    left_open = Open(config.max_image_size, config.max_features, config.matcher)
+    if config.cameras is not None or None not in left_open:
         return config
     photos = sorted(read_photos(inputs["ingest"]), key=lambda photo: photo.file)
     photos = [photo for photo in photos if not photo.near_duplicate_of]
-    features = config.model_dump(include={"max_image_size", "max_features"})
-    matcher = chosen_matcher(photos, inputs["ingest"] / "images", config.neighbours, features, progress)
-    return config.model_copy(update={"matcher": matcher})
+    answer = chosen(left_open, photos, inputs["ingest"] / "images", config.neighbours, progress)
+    return config.model_copy(update=answer._asdict())
 
 
 def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> StageResult:
@@ -108,6 +100,7 @@ def _import(cameras: Path, photos: "list[Photo]", ingest: Path, folder: Path, pr
         folder,
         source="import",
         attempts=[],
+        repeated_structure=None,
         images=[image | {"uncertainty_px": None} for image in known.account(photos)],
         reprojection_px=float(known.model.error_px.mean()) if len(known.model.xyz) else None,
         points=len(known.model.xyz),
@@ -123,28 +116,39 @@ def _import(cameras: Path, photos: "list[Photo]", ingest: Path, folder: Path, pr
 
 def _reconstruct(config: Config, photos: "list[Photo]", ingest: Path, folder: Path, progress: Progress) -> StageResult:
     from stages.matching_plan import check_matcher, places_of
-    from stages.registration import FEWEST_POINTS, FEWEST_REGISTERED, account, read_matches, why_no_model, with_left_out
+    from stages.registration import (
+        FEWEST_POINTS,
+        FEWEST_REGISTERED,
+        account,
+        read_matches,
+        repeated_structure,
+        why_no_model,
+        with_left_out,
+    )
 
     everything, photos = photos, [photo for photo in photos if not photo.near_duplicate_of]
     _check_count(photos, len(everything))
     _check_camera(config, photos)
     check_matcher(config.matcher, places_of(photos))
-    names = [photo.file.removeprefix("images/") for photo in photos]
+    names = [photo.image_name for photo in photos]
     database = _database(folder, names, progress)
-    found = _run_child(config, photos, ingest / "images", folder, database, progress)
+    found = run_child(config, photos, ingest / "images", folder, database, progress)
     models, points = found["models"], found["points"]
     if not models or len(models[0]) < FEWEST_REGISTERED or points < FEWEST_POINTS:
         shutil.rmtree(folder / "sparse", ignore_errors=True)
         # By the strict matches of the first attempt: later ones let in many that are false.
         raise why_no_model(photos, read_matches(database), len(models[0]) if models else 0, points)
     matches = read_matches(Path(found["database"]))
-    images = account(names, matches, models, found["observations"], found["supports"])
+    images = account(names, matches, models, found["observations"], found["supports"], found["conflict"])
+    if found["conflict"]:
+        progress.note(repeated_structure(models, found["conflict"]))
     _say_who_is_missing(photos, images, progress)
     spread = found["uncertainty_px"]
     result = _result(
         folder,
         source="sfm",
         attempts=found["attempts"],
+        repeated_structure=found["conflict"],
         images=[image | {"uncertainty_px": spread.get(image["file"])} for image in with_left_out(images, everything)],
         reprojection_px=found["reprojection_px"],
         points=points,
@@ -165,7 +169,7 @@ def _georeference(folder: Path, photos: "Sequence[Photo]", progress: Progress) -
     from stages.georeference import georeference
 
     place_of = {
-        photo.file.removeprefix("images/"): (photo.latitude, photo.longitude, photo.altitude_m)
+        photo.image_name: (photo.latitude, photo.longitude, photo.altitude_m)
         for photo in photos
         if photo.latitude is not None and photo.longitude is not None
     }
@@ -251,114 +255,6 @@ def _forget(folder: Path) -> None:
     shutil.rmtree(folder / "attempts", ignore_errors=True)
     for database in folder.glob("matches-*"):
         database.unlink()
-
-
-def _run_child(
-    config: Config, photos: "Sequence[Photo]", images: Path, folder: Path, database: Path, progress: Progress
-) -> dict[str, Any]:
-    """Do the work in stages/sfm_child.py and hand back its result. Raises StageError if the child does not end well."""
-    job = {
-        "folder": str(folder.absolute()),
-        "images": str(images.absolute()),
-        "database": str(database.absolute()),
-        "photos": [asdict(photo) for photo in photos],
-        **config.model_dump(include={*FOR_CHILD}),
-    }
-    latest: dict[str, Any] = {"phase": "features", "database": job["database"], "done": 0, "pairs": 0}
-    latest["attempt"] = ATTEMPTS[0].name
-    log = folder / "sfm.log"
-    with log.open("ab") as stderr:
-        child = _start_child(stderr)
-        overtime = threading.Timer(config.max_seconds, child.kill)
-        overtime.start()
-        assert child.stdin and child.stdout
-        try:
-            with live_line(progress, lambda: _describe(latest, len(photos))):
-                _hand_over(child.stdin, job)
-                for message in map(json.loads, child.stdout):
-                    if note := message.pop("note", None):
-                        progress.note(note)
-                    latest.update(message)
-            code = child.wait()
-        finally:
-            late = not overtime.is_alive()
-            overtime.cancel()
-            child.kill()
-            child.wait()
-    if "result" not in latest:
-        if latest["attempt"] != ATTEMPTS[0].name and (late or code not in (0, -signal.SIGKILL)):
-            abandon(folder / "attempts", latest["attempt"], "ran out of time" if late else "ended the program")
-            without = f"Run again: it goes on without the attempt {latest['attempt']!r}. Log: {log}"
-        else:
-            without = None
-        raise _child_failed(code, config.max_seconds if late else None, latest["phase"], log, without)
-    return latest["result"]
-
-
-def _start_child(stderr: Any) -> "subprocess.Popen[bytes]":
-    from stages.matching_plan import environment
-
-    return subprocess.Popen(
-        [sys.executable, *CHILD],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=stderr,
-        env=environment(),
-        start_new_session=True,  # Ctrl-C reaches the parent alone, which then ends the child
-    )
-
-
-def _hand_over(stdin: Any, job: dict[str, Any]) -> None:
-    """Write the job and leave the pipe open: its end tells the child that the parent is gone."""
-    try:
-        stdin.write(json.dumps(job).encode() + b"\n")
-        stdin.flush()
-    except BrokenPipeError:  # the child died at once; its exit code says how
-        return
-
-
-def _describe(latest: Mapping[str, Any], photos: int) -> tuple[str, float | None]:
-    """The live line and the finished share of the whole."""
-    from stages.registration import count_done
-
-    phase = latest["phase"]
-    if phase == "refining":
-        return "adjusting all cameras and points together", REFINING
-    features, pairs = count_done(Path(latest["database"]))  # the first of mapping's steps places two photos
-    done, total, words = {
-        "features": (features, photos, "features of {} of {} photos"),
-        "matching": (pairs, latest["pairs"], "matched {} of {} pairs of photos"),
-        "mapping": (latest["done"] and min(latest["done"] + 1, photos), photos, "placed {} of {} photos"),
-    }[phase]
-    begin, length = PHASES[phase]
-    share = begin + length * done / max(1, total)
-    attempt = [one.name for one in ATTEMPTS].index(latest["attempt"])
-    if not attempt:
-        return words.format(done, total), FIRST_ATTEMPT * share
-    later = (attempt - 1 + share) / (len(ATTEMPTS) - 1)
-    return f"{words.format(done, total)} ({latest['attempt']})", FIRST_ATTEMPT + (REFINING - FIRST_ATTEMPT) * later
-
-
-def _child_failed(code: int, limit: float | None, phase: str, log: Path, without: str | None) -> StageError:
-    """``without``: the hint where running again goes on without the attempt that failed."""
-    lines = log.read_text("utf-8", "replace").strip().splitlines()
-    last = lines[-1].strip() if lines else "it left no message"
-    where = f"while {phase}" if phase != "features" else "while finding features"
-    if limit is not None:
-        return StageError(
-            f"structure-from-motion was given up {where}",
-            f"it took longer than {limit:g} s",
-            without or "Give it longer with --sfm.max-seconds, or fewer photos; matches found so far are kept.",
-        )
-    if code < 0:
-        name = signal.Signals(-code).name
-        memory = code == -signal.SIGKILL
-        return StageError(
-            f"structure-from-motion was ended by {name} {where}",
-            "most often the machine ran out of memory" if memory else f"COLMAP failed inside ({last})",
-            f"Run again: what was matched is kept. With less memory: --sfm.max-features 2048. Log: {log}",
-        )
-    return StageError(f"structure-from-motion failed {where}", last, f"The whole log is in {log}")
 
 
 # --- what is said and written

@@ -5,14 +5,18 @@ Each attempt changes one thing against the first and says so. What came of it is
 """
 
 import json
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from stages.files import write_durably
 
 # New features, or another idea of the lens, cost as much as the first attempt: they wait until so many are missing.
 WORTH_STARTING_OVER = 0.1  # of all, and two at least: one may well be a stranger
+# The lens is chosen and everything adjusted in 0.8 to 1.6 times the time of mapping (docs/numbers.md).
+FINISHING = 2.0
+NO_TIME = "too little was left of --sfm.max-seconds"
 JOURNAL, ABANDONED = "journal.json", "abandoned.json"
 
 
@@ -60,13 +64,16 @@ ATTEMPTS = (
 @dataclass(frozen=True)
 class Tried:
     """What came of an attempt: the file name of its database, the files in each sub-model, best first, and of the best
-    one its points and mean error."""
+    one its points, its mean error, and where another one contradicts it (``Conflict``, as a dict). ``seconds`` are
+    those of each phase."""
 
     name: str
     database: str
     groups: list[list[str]] = field(default_factory=list)
     points: int = 0
     reprojection_px: float | None = None
+    conflict: dict[str, Any] | None = None
+    seconds: dict[str, float] = field(default_factory=dict)
 
     @property
     def rank(self) -> tuple[int, int, float]:
@@ -75,12 +82,15 @@ class Tried:
 
 
 class Journal:
-    """The attempts so far, on disk. ``model(name)`` is where an attempt's best sub-model is kept."""
+    """The attempts so far, on disk, and why others were ``passed`` over, by their names. ``model(name)`` is where an
+    attempt's best sub-model is kept."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         folder.mkdir(parents=True, exist_ok=True)
-        self.tried = [Tried(**entry) for entry in _read(folder / JOURNAL)]
+        tried, passed = _read(folder / JOURNAL) or ([], {})
+        self.tried = [Tried(**entry) for entry in tried]
+        self.passed: dict[str, str] = passed
         self.abandoned: dict[str, str] = dict(_read(folder / ABANDONED))  # by attempt, what became of it
 
     def model(self, name: str) -> Path:
@@ -93,13 +103,28 @@ class Journal:
         return ATTEMPTS[names.index(self.tried[-1].name) + 1 :] if self.tried else ATTEMPTS
 
     def add(self, tried: Tried) -> None:
-        """Note an attempt, durably."""
+        """Note an attempt, durably, and those passed over before it."""
         self.tried.append(tried)
-        write_durably(self.folder / JOURNAL, json.dumps([asdict(one) for one in self.tried]).encode())
+        content = [asdict(one) for one in self.tried], self.passed
+        write_durably(self.folder / JOURNAL, json.dumps(content).encode())
 
     def best(self) -> Tried | None:
         """The best attempt that led to a model; of equals the first."""
         return max((tried for tried in self.tried if tried.groups), key=lambda tried: tried.rank, default=None)
+
+    def account(self) -> list[dict[str, Any]]:
+        """What registration.json says of each attempt that was made or passed over; one of those made is kept."""
+        kept, made = self.best(), {tried.name: tried for tried in self.tried}
+        rows = []
+        for name in (attempt.name for attempt in ATTEMPTS):
+            if one := made.get(name):
+                facts = {"points": one.points, "reprojection_px": one.reprojection_px}
+                registered = len(one.groups[0]) if one.groups else 0
+                rows.append({"attempt": name, "registered": registered, **facts, "kept": one == kept, "passed": None})
+            elif name in self.passed:
+                facts = dict.fromkeys(("registered", "points", "reprojection_px"))
+                rows.append({"attempt": name, **facts, "kept": False, "passed": self.passed[name]})
+        return rows
 
 
 def abandon(folder: Path, name: str, why: str) -> None:
@@ -109,8 +134,28 @@ def abandon(folder: Path, name: str, why: str) -> None:
     write_durably(folder / ABANDONED, json.dumps(sorted(abandoned.items())).encode())
 
 
-def _read(path: Path) -> list:
+def _read(path: Path) -> Any:
     return json.loads(path.read_bytes()) if path.exists() else []
+
+
+def expected_seconds(attempt: Attempt, tried: Sequence[Tried], missing: float, chosen_pairs: bool) -> float:
+    """How long an attempt will take, by what those before it took. ``missing``: the share of photos without a place.
+
+    Mapping takes as long as it did at most; it is over sooner where nothing more is found. New features are searched on
+    four times the pixels and are twice as many, which is four times the products of matching and twice the mapping.
+    """
+    first = tried[0].seconds
+    mapping = max(one.seconds["mapping"] for one in tried)
+    if attempt.matches == "rich":
+        return 4 * (first["features"] + first["matching"]) + 2 * mapping
+    # A missing photo's pairs are matched again, or where pairs were chosen as many as the first time.
+    again = {"same": 0.0, "fisheye": 1.0, "loose": 1.0 if chosen_pairs else 1 - (1 - missing) ** 2}
+    return again[attempt.matches] * first["matching"] + mapping
+
+
+def time_against(expected: float, tried: Sequence[Tried], left: float) -> bool:
+    """Whether an attempt would not leave the time in which its model, or the best one so far, is adjusted."""
+    return expected + FINISHING * max(one.seconds["mapping"] for one in tried) > left
 
 
 class Situation(NamedTuple):

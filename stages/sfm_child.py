@@ -10,14 +10,15 @@ import os
 import shutil
 import sys
 import threading
+import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import count
 from pathlib import Path
 from typing import Any
 
-from stages.colmap.diagnosis import links, supports
+from stages.colmap.diagnosis import find_conflict, links, supports
 from stages.colmap.mapping import MAPPING_MODEL, incremental_options, map_globally, map_incrementally
 from stages.colmap.matching import (
     LOOSE_RATIO,
@@ -39,7 +40,17 @@ from stages.pairing import Pairs, Similarity, pairs_of, second_look
 from stages.photos import Photo
 from stages.registration import FEWEST_POINTS, FEWEST_REGISTERED
 from stages.sfm import Matcher
-from stages.sfm_attempts import ATTEMPTS, Attempt, Journal, Situation, Tried, reason_against
+from stages.sfm_attempts import (
+    ATTEMPTS,
+    NO_TIME,
+    Attempt,
+    Journal,
+    Situation,
+    Tried,
+    expected_seconds,
+    reason_against,
+    time_against,
+)
 
 Say = Callable[..., None]
 
@@ -63,6 +74,7 @@ class Job:
     matcher: Matcher
     neighbours: int
     attempts: int
+    max_seconds: float
 
 
 def main() -> None:
@@ -90,9 +102,24 @@ class _Work:
     def __init__(self, job: Job, say: Say) -> None:
         self.job, self.say = job, say
         self.photos = [Photo(**photo) for photo in job.photos]
-        self.files = [photo.file.removeprefix("images/") for photo in self.photos]
+        self.files = [photo.image_name for photo in self.photos]
         self.database, self.images = Path(job.database), Path(job.images)
         self.journal = Journal(Path(job.folder, "attempts"))
+        self.started = self.begun = time.monotonic()
+        self.seconds: dict[str, float] = {}  # of this attempt's phases
+
+    def begin(self, phase: str, **more: Any) -> None:
+        """Say that a phase begins."""
+        self.begun = time.monotonic()
+        self.say(phase=phase, **more)
+
+    def end(self, phase: str) -> None:
+        """Note what the phase took."""
+        self.seconds[phase] = time.monotonic() - self.begun
+
+    def left(self) -> float:
+        """Seconds until the parent gives up."""
+        return self.started + self.job.max_seconds - time.monotonic()
 
     @cached_property
     def similarity(self) -> Similarity:
@@ -129,15 +156,14 @@ def reconstruct(job: Job, say: Say) -> dict[str, Any]:
     """Run structure-from-motion and write the best sub-model to ``sparse/``; nothing if none came out that is usable.
 
     Returns the ``database`` that was used in the end, the files in each sub-model, best first (``models``), the
-    ``attempts`` that were made, and of the best model: its ``points``, mean ``reprojection_px``, ``camera_model``, the
-    comparison of ``camera_models``, by file ``observations`` and ``uncertainty_px``, and for every photo without a
-    place how many of its features are points of it and how many of them agree (``supports``).
+    ``attempts`` that were made or passed over, and of the best model: the ``conflict`` with another one, ``points``,
+    mean ``reprojection_px``, ``camera_model``, the comparison of ``camera_models``, by file ``observations`` and
+    ``uncertainty_px``, and for every photo without a place how many of its features are points of it and how many of
+    them agree (``supports``).
     """
     work = _Work(job, say)
-    for attempt in work.journal.left():
-        if attempt in ATTEMPTS[: job.attempts] and (missing := work.missing()):
-            _make(attempt, missing, work)
-    tried = [_entry(one) for one in work.journal.tried]
+    _try_all(work)
+    tried = work.journal.account()
     best = work.usable()
     if best is None:
         poor = work.journal.best()
@@ -164,35 +190,74 @@ def reconstruct(job: Job, say: Say) -> dict[str, Any]:
         "reprojection_px": model.compute_mean_reprojection_error(),
         "camera_model": "/".join(sorted({model.camera(image.camera_id).model_name for image in registered})),
         "camera_models": finished.camera_models,
+        "conflict": best.conflict,
         "supports": supports(model, database, job.seed),
     }
 
 
+def _try_all(work: _Work) -> None:
+    """Make the attempts that are left while photos have no place, and say which were passed over, and why."""
+    journal, unsaid = work.journal, {}
+    for attempt in journal.left():
+        journal.passed.pop(attempt.name, None)  # of an interrupted run that had less time
+        if attempt not in ATTEMPTS[: work.job.attempts] or not (missing := work.missing()):
+            continue
+        if attempt.name == ATTEMPTS[0].name:
+            _make(attempt, missing, work)
+        elif why := _no_use(attempt, missing, work):
+            journal.passed[attempt.name] = why
+            unsaid.setdefault(why, []).append(attempt.words)
+        elif why := _no_way(attempt, missing, work):
+            journal.passed[attempt.name] = why
+        else:
+            have = "has" if len(missing) == 1 else "have"
+            work.say(note=f"{len(missing)} of {len(work.photos)} photos {have} no place yet: {attempt.words}")
+            _make(attempt, missing, work)
+    for why, words in unsaid.items():
+        work.say(note=f"passed over, for {why}: {'; '.join(words)}")
+
+
+def _no_use(attempt: Attempt, missing: list[int], work: _Work) -> str | None:
+    """Why the attempt cannot help, None if it can."""
+    some, flat = links(work.latest(), {work.files[number] for number in missing})
+    count = len(work.photos)
+    lens_is_given = work.job.camera_model is not None
+    return reason_against(attempt, Situation(len(missing), count, some, flat and len(missing) == count, lens_is_given))
+
+
+def _no_way(attempt: Attempt, missing: list[int], work: _Work) -> str | None:
+    """Why the attempt might help and is not made all the same, said; None if it is."""
+    if became := work.journal.abandoned.get(attempt.name):
+        work.say(note=f"left out, for it {became} last time: {attempt.words}")
+        return f"it {became}"
+    tried, left, chosen_pairs = work.journal.tried, work.left(), work.job.matcher != "exhaustive"
+    expected = expected_seconds(attempt, tried, len(missing) / len(work.photos), chosen_pairs)
+    if not time_against(expected, tried, left):
+        return None
+    times = f"about {about(expected)} and the last adjustment, of --sfm.max-seconds {about(left)} are left"
+    work.say(note=f"left out, for it would take {times}: {attempt.words}")
+    return NO_TIME
+
+
 def _make(attempt: Attempt, missing: list[int], work: _Work) -> None:
-    """Make an attempt and note what came of it; one that cannot help is passed over, one that failed is named."""
-    count, lens_is_given = len(work.photos), work.job.camera_model is not None
-    if attempt.name != ATTEMPTS[0].name:
-        some, flat = links(work.latest(), {work.files[number] for number in missing})
-        situation = Situation(len(missing), count, some, flat and len(missing) == count, lens_is_given)
-        if reason_against(attempt, situation):
-            return
-        if why := work.journal.abandoned.get(attempt.name):
-            work.say(note=f"left out, for it {why} last time: {attempt.words}")
-            return
-        have = "has" if len(missing) == 1 else "have"
-        work.say(note=f"{len(missing)} of {count} photos {have} no place yet: {attempt.words}")
+    """Make an attempt and note what came of it."""
     work.say(attempt=attempt.name)
+    work.seconds = {}
     database = _matched(attempt, missing, work)
     models = _mapped(attempt, database, work)
-    tried = Tried(attempt.name, database.name)
+    tried = Tried(attempt.name, database.name, seconds=work.seconds)
     if models:
         folder = work.journal.model(attempt.name)
         folder.mkdir(parents=True, exist_ok=True)
         models[0].write_binary(folder)
         make_durable(folder)
-        groups = [_files(model) for model in models]
-        error = models[0].compute_mean_reprojection_error()
-        tried = Tried(attempt.name, database.name, groups, models[0].num_points3D(), error)
+        tried = replace(
+            tried,
+            groups=[_files(model) for model in models],
+            points=models[0].num_points3D(),
+            reprojection_px=models[0].compute_mean_reprojection_error(),
+            conflict=find_conflict(models),
+        )
     work.journal.add(tried)
 
 
@@ -220,13 +285,14 @@ def _matched(attempt: Attempt, missing: list[int], work: _Work) -> Path:
 
 
 def _find_features(database: Path, search: Search, work: _Work) -> None:
-    work.say(phase="features", database=str(database))
+    work.begin("features", database=str(database))
     fill_database(database, work.photos, work.job.camera_model or MAPPING_MODEL, work.job.camera_params)
     masks = Path(work.job.folder, "masks")
     if write_feature_masks(work.images.parent, work.photos, masks):
         search = search._replace(masks=masks)
     extract_features(database, work.images, work.photos, search)
     shutil.rmtree(masks, ignore_errors=True)
+    work.end("features")
 
 
 def _match(database: Path, pairs: Pairs, max_ratio: float, work: _Work) -> None:
@@ -235,13 +301,14 @@ def _match(database: Path, pairs: Pairs, max_ratio: float, work: _Work) -> None:
         every = "all " if left == count * (count - 1) // 2 else ""
         work.say(note=f"matching {every}{left:,} pairs of photos: about {about(seconds)}")
 
-    work.say(phase="matching", database=str(database), pairs=len(pairs))
+    work.begin("matching", database=str(database), pairs=len(pairs))
     match_pairs(database, pairs, work.job.seed, max_ratio, expect)
+    work.end("matching")
 
 
 def _mapped(attempt: Attempt, database: Path, work: _Work) -> list[Any]:
     """All sub-models that come of these matches, best first."""
-    work.say(phase="mapping", done=0)
+    work.begin("mapping", done=0)
     models = Path(work.job.folder, "models")
     seed, lens_is_known = work.job.seed, work.job.camera_params is not None
     if attempt.effort is None:
@@ -253,14 +320,8 @@ def _mapped(attempt: Attempt, database: Path, work: _Work) -> list[Any]:
             database, work.images, models, options, lambda: work.say(phase="mapping", done=next(placed))
         )
     shutil.rmtree(models)
+    work.end("mapping")
     return found
-
-
-def _entry(tried: Tried) -> dict[str, Any]:
-    """What registration.json says of an attempt."""
-    registered = len(tried.groups[0]) if tried.groups else 0
-    facts = {"registered": registered, "points": tried.points, "reprojection_px": tried.reprojection_px}
-    return {"attempt": tried.name, **facts}
 
 
 def _files(model: Any) -> list[str]:

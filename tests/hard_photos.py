@@ -135,6 +135,13 @@ def on_the_spot(count: int = 12) -> Poses:
     return poses
 
 
+def straight_ahead(count: int = 12) -> Poses:
+    """Steps towards what the first photo of the walk has in its middle."""
+    poses = np.repeat(walk(1), count, axis=0)
+    poses[:, :, 3] += 0.12 * np.arange(count)[:, None] * poses[:, :, 2]
+    return poses
+
+
 def two_lenses() -> list[Shot]:
     """Every other photo with a longer lens, each lens in a folder of its own."""
     shots = [(TELE, "tele") if index % 2 else (WIDE, "wide") for index in range(14)]

@@ -34,8 +34,8 @@ GradRays = Callable[[], tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays 3"]]]
 
 
 @runtime_checkable
-class PhotoPart(Protocol):
-    """What both kinds of part have."""
+class PhotoRays(Protocol):
+    """Where the rays of each photo run."""
 
     @property
     def parameters(self) -> dict[str, Float[Tensor, "views _"]]:
@@ -51,11 +51,6 @@ class PhotoPart(Protocol):
         """After an update: take out what the field could take up itself (the gauge)."""
         ...
 
-
-@runtime_checkable
-class PhotoRays(PhotoPart, Protocol):
-    """Where the rays of each photo run."""
-
     def forward(self, rays: Rays, view: Int[Tensor, "rays"]) -> Rays:
         """The rays along which to look, given those of the calibrated cameras."""
         ...
@@ -66,8 +61,22 @@ class PhotoRays(PhotoPart, Protocol):
 
 
 @runtime_checkable
-class PhotoColours(PhotoPart, Protocol):
+class PhotoColours(Protocol):
     """What each photo makes of the colours of its rays."""
+
+    @property
+    def parameters(self) -> dict[str, Float[Tensor, "views _"]]:
+        """What is learnt with the field."""
+        ...
+
+    @property
+    def rate(self) -> float:
+        """Adam's learning rate for them before the field's warm-up and decay."""
+        ...
+
+    def settle(self) -> None:
+        """After an update: take out what the field could take up itself (the gauge)."""
+        ...
 
     def of_unseen(self, weights: Float[Tensor, "unseen views"]) -> "PhotoColours":
         """What photos that took no part are expected to make of colours, from what ``weights`` says of their neighbours

@@ -1,17 +1,20 @@
 """Why a photo has no place in a model. Call it in a child process."""
 
-from collections.abc import Container
+from collections.abc import Container, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from stages.degeneracy import elsewhere
 from stages.registration import FLAT_CONFIGS
 
 if TYPE_CHECKING:
     import pycolmap
 
 MOSTLY = 0.9
+# A single photo may merely have a bad place in one of two models: it takes several to say that the models contradict.
+FEWEST_ELSEWHERE, SHARE_ELSEWHERE = 2, 0.2
 
 
 class Links(NamedTuple):
@@ -34,6 +37,33 @@ def links(database: Path, names: Container[str]) -> Links:
                 some = some or any(name[number] in names for number in pycolmap.pair_id_to_image_pair(pair_id))
                 flat.append(int(geometry.config) in FLAT_CONFIGS)
     return Links(some, sum(flat) > MOSTLY * len(flat))
+
+
+def find_conflict(models: "Sequence[pycolmap.Reconstruction]") -> dict[str, Any] | None:
+    """The largest sub-model that shares photos with the best one (the first) and puts some of them elsewhere.
+
+    ``group`` is its number, ``shared`` how many photos both have, ``elsewhere`` how many of them it puts elsewhere.
+    """
+    if len(models) < 2:
+        return None
+    best = _poses(models[0])
+    centres = np.array(list(best.values()))[:, :, 3]
+    extent = float(np.sqrt(((centres - centres.mean(0)) ** 2).sum(axis=1).mean()))
+    for group, model in enumerate(models[1:], start=1):
+        poses = _poses(model)
+        if not (shared := sorted(best.keys() & poses.keys())):
+            continue
+        here, there = (np.array([of[name] for name in shared]) for of in (best, poses))
+        apart = elsewhere(here, there, extent)
+        if apart.sum() >= max(FEWEST_ELSEWHERE, SHARE_ELSEWHERE * len(shared)):
+            return {"group": group, "shared": len(shared), "elsewhere": int(apart.sum())}
+    return None
+
+
+def _poses(model: "pycolmap.Reconstruction") -> dict[str, np.ndarray]:
+    """By name, (3, 4) from the photo's camera to the model's frame."""
+    images = (model.image(number) for number in model.reg_image_ids())
+    return {image.name: image.cam_from_world().inverse().matrix() for image in images}
 
 
 def supports(model: "pycolmap.Reconstruction", database: Path, seed: int) -> dict[str, tuple[int, int]]:

@@ -52,7 +52,7 @@ def fill_database(
                 camera_ids[group] = len(camera_ids) + 1
                 _enter_camera(db, _first_guess(photo, camera_model, camera_params, camera_ids[group]))
             camera_id = camera_ids[group]
-            image = pycolmap.Image(name=_name(photo), camera_id=camera_id, image_id=image_id)
+            image = pycolmap.Image(name=photo.image_name, camera_id=camera_id, image_id=image_id)
             db.write_image(image, use_image_id=True)
             frame = pycolmap.Frame(frame_id=image_id, rig_id=camera_id)
             frame.add_data_id(image.data_id)
@@ -90,11 +90,6 @@ def _enter_camera(db: "pycolmap.Database", camera: "pycolmap.Camera") -> None:
     db.write_rig(rig, use_rig_id=True)
 
 
-def _name(photo: "Photo") -> str:
-    """The photo's name inside COLMAP."""
-    return photo.file.removeprefix("images/")
-
-
 class Search(NamedTuple):
     """How far features are searched: the longer side in pixels that photos are reduced to, the most features of each,
     the folder of masks, and up to which longer side photos are doubled first: smaller ones yield too few features."""
@@ -117,12 +112,13 @@ def extract_features(database: Path, images: Path, photos: "Sequence[Photo]", se
     options = pycolmap.FeatureExtractionOptions()
     options.max_image_size = search.max_image_size
     options.sift.max_num_features = search.max_features
-    small = {_name(p) for p in photos if max(p.width, p.height) <= search.doubled_up_to}
+    every = [photo.image_name for photo in photos]
+    small = {p.image_name for p in photos if max(p.width, p.height) <= search.doubled_up_to}
     masks = search.masks
-    masked = {name for name in map(_name, photos) if masks and (masks / f"{name}.png").is_file()}
+    masked = {name for name in every if masks and (masks / f"{name}.png").is_file()}
     # A photo without a mask has to go without a folder of masks: one that is not there is an error to COLMAP.
     for is_small, is_masked in product((True, False), (False, True)):
-        names = [name for name in map(_name, photos) if (name in small, name in masked) == (is_small, is_masked)]
+        names = [name for name in every if (name in small, name in masked) == (is_small, is_masked)]
         if not names:
             continue
         options.sift.first_octave = -1 if is_small else 0

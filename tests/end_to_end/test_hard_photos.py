@@ -27,6 +27,7 @@ from tests.hard_photos import (
     exposed,
     on_the_spot,
     shoot,
+    straight_ahead,
     two_lenses,
     walk,
 )
@@ -36,7 +37,9 @@ OUTLIER = [*along(walk(11)), Shot("stranger.png", LENS, walk(1, start=20)[0], sc
 TWO_GROUPS = [*along(walk(9)), *along(walk(7), scene=PLANE, prefix="other")]
 
 
-def found(folder: Path, shots: Sequence[Shot], develop: Callable = as_taken) -> tuple[Path, list[str]]:
+def found(
+    folder: Path, shots: Sequence[Shot], develop: Callable = as_taken, config: sfm.Config | None = None
+) -> tuple[Path, list[str]]:
     """The finished stage sfm of these photos, and what was said."""
     notes: list[str] = []
 
@@ -51,7 +54,7 @@ def found(folder: Path, shots: Sequence[Shot], develop: Callable = as_taken) -> 
     inputs = {"ingest": folder / "ingest"}
     inputs["ingest"].mkdir()
     ingest.run(ingest.Config(photos=folder / "photos"), {}, inputs["ingest"], Listening())
-    sfm.run(sfm.Config(), inputs, folder / "sfm", Listening())
+    sfm.run(config or sfm.Config(), inputs, folder / "sfm", Listening())
     return folder / "sfm", notes
 
 
@@ -131,3 +134,14 @@ def test_turning_on_the_spot_is_named(tmp_path: Path) -> None:
         found(tmp_path, along(on_the_spot()))
     assert caught.value.why == "the camera turned on the spot: 66 of 66 matching pairs differ by a rotation alone"
     assert caught.value.hint.startswith("Move sideways between photos")
+
+
+def test_moving_straight_ahead_is_named(tmp_path: Path) -> None:
+    """The first attempt alone: another one, which takes the lens as known, places them all."""
+    with pytest.raises(StageError) as caught:
+        found(tmp_path, along(straight_ahead()), config=sfm.Config(attempts=1))
+    assert caught.value.why == (
+        "the camera moved straight ahead: in 66 of 66 matching pairs it goes towards something in the picture, "
+        "which leaves too little parallax"
+    )
+    assert caught.value.hint.startswith("Step sideways between photos")

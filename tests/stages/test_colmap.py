@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 
 from nerf.scene import Camera
+from nerf.synthetic import ring_of_cameras
 from stages.colmap.cameras import camera_rays, is_valid, project, rescaled
-from stages.colmap.models import read_model, write_model
+from stages.colmap.diagnosis import find_conflict
+from stages.colmap.models import load_native, read_model, write_model
 from stages.contract import StageError
 from stages.sparse_model import SparseImage, SparseModel
 
@@ -151,3 +153,30 @@ def test_restricting_keeps_what_the_kept_images_see() -> None:
         np.testing.assert_array_equal(part.xyz[part.point[mine]], model.xyz[model.point[theirs]])
         np.testing.assert_array_equal(part.xy[mine], model.xy[theirs] * scale)
     assert set(part.point) == set(range(len(part.xyz)))
+
+
+QUARTER_TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+
+
+@pytest.mark.parametrize(
+    ("photos", "moved", "conflict"),
+    [
+        (range(6, 16), range(10, 12), {"group": 1, "shared": 6, "elsewhere": 2}),
+        (range(6, 16), range(9, 10), None),  # one photo may merely have a bad place
+        (range(6, 16), range(0), None),
+        (range(12, 16), range(12, 16), None),  # nothing is shared
+    ],
+)
+def test_a_model_that_puts_shared_photos_elsewhere_is_found(
+    photos: range, moved: range, conflict: dict[str, int] | None, tmp_path: Path
+) -> None:
+    poses = dict(enumerate(ring_of_cameras(16)))
+    best = {number: poses[number] for number in range(12)}
+    other = {number: QUARTER_TURN @ poses[number] if number in moved else poses[number] for number in photos}
+    models = []
+    for name, group in (("best", best), ("other", other)):
+        images = [SparseImage(f"{number:02d}.png", 0, pose) for number, pose in group.items()]
+        write_model(tmp_path / name, SparseModel.without_points([CAMERAS[0]], images))
+        models.append(load_native(tmp_path / name))
+    assert find_conflict(models) == conflict
+    assert find_conflict(models[:1]) is None

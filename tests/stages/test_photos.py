@@ -76,6 +76,11 @@ def photo(**changes: object) -> Photo:
     return Photo(**values | changes)  # pyright: ignore[reportArgumentType]
 
 
+def test_a_photo_in_a_folder_keeps_it_in_its_name_for_colmap() -> None:
+    photo = Photo("Küche/1.jpg", "images/Kuche/images/1.jpg", 60, 40, 0, None, None, False, 1.0)
+    assert photo.image_name == "Kuche/images/1.jpg"
+
+
 def test_photos_json_round_trips(tmp_path: Path) -> None:
     photos = [photo(), photo(name="b", focal_px=None, focal_source=None)]
     write_photos(tmp_path, photos, [Refusal("c.jpg", "truncated")], {"./b": "b"})

@@ -6,16 +6,29 @@ import numpy as np
 import pytest
 
 from stages.photos import Photo
-from stages.registration import Matches, account, count_done, is_sound, why_no_model, with_left_out
+from stages.registration import (
+    Matches,
+    account,
+    count_done,
+    is_sound,
+    repeated_structure,
+    why_no_model,
+    with_left_out,
+)
 
 NAMES = ["a.jpg", "b.jpg", "c.jpg", "d.jpg", "e.jpg"]
 PHOTOS = [Photo(name, f"images/{name}", 60, 40, 0, None, None, False, 1.0) for name in NAMES]
 
 
 def matches(
-    *pairs: tuple[int, int, int], keypoints: int = 500, flat: int = 0, shift_px: float = 9.0, turned: bool = True
+    *pairs: tuple[int, int, int],
+    keypoints: int = 500,
+    flat: int = 0,
+    ahead: int = 0,
+    shift_px: float = 9.0,
+    turned: bool = True,
 ) -> Matches:
-    """Pairs as (first, second, inliers), the first ``flat`` of them flat, all of them turns or none."""
+    """Pairs as (first, second, inliers), the first so many of them ``flat`` or ``ahead``, all of them turns or none."""
     array = np.array(pairs, int).reshape(-1, 3)
     return Matches(
         keypoints=np.full(len(NAMES), keypoints),
@@ -24,6 +37,7 @@ def matches(
         inliers=array[:, 2],
         flat=np.arange(len(array)) < flat,
         homography=np.tile(np.eye(3) if turned else np.diag([2.0, 1.0, 1.0]), (len(array), 1, 1)),
+        ahead=np.arange(len(array)) < ahead,
         shift_px=np.full(len(array), shift_px),
     )
 
@@ -79,6 +93,33 @@ def test_a_photo_may_only_be_turned_against_the_model() -> None:
     assert reasons(found, FOUR[1], d=(3, 3))["d"] == why
 
 
+def test_a_photo_may_only_be_a_step_ahead_of_the_model() -> None:
+    steps = (2, 3, 19), (1, 3, 22), (0, 1, 90)
+    why = (
+        "in all 2 of its pairs with registered photos the camera moves straight towards something in the picture: "
+        "too little parallax"
+    )
+    assert reasons(matches(*steps, ahead=2), FOUR[1], d=(3, 3))["d"] == why
+    assert reasons(matches(*steps, ahead=2, flat=1), FOUR[1], d=(3, 3))["d"] == why
+    assert reasons(matches(*steps, ahead=1), FOUR[1], d=(3, 3))["d"] != why
+    assert reasons(matches(*steps, ahead=2), FOUR[1], d=(40, 35))["d"] != why  # it sees enough of the model
+
+
+def test_groups_that_contradict_each_other_are_named() -> None:
+    found, models = matches((0, 1, 90), (3, 4, 80)), [["a.jpg", "b.jpg", "c.jpg"], ["b.jpg", "c.jpg", "d.jpg", "e.jpg"]]
+    conflict = {"group": 1, "shared": 2, "elsewhere": 2}
+    entries = account(NAMES, found, models, {}, dict.fromkeys(NAMES, (0, 0)), conflict)
+    assert [entry["reason"] for entry in entries[:3]] == [None] * 3
+    assert {entry["reason"] for entry in entries[3:]} == {
+        "it belongs to a group of 4 photos that shares 2 with this one and puts 2 of them elsewhere: "
+        "something looks alike there"
+    }
+    assert repeated_structure(models, conflict) == (
+        "repeated structure: two groups of 3 and 4 photos share 2 and disagree about where 2 of them were taken. Parts "
+        "of the scene look alike: take photos that lead from one such part to the other, or mask what repeats"
+    )
+
+
 def test_a_photo_may_share_no_view_or_belong_elsewhere() -> None:
     told = reasons(matches((0, 1, 90), (2, 3, 80)), [["a.jpg", "b.jpg"], ["c.jpg"]])
     assert told == {
@@ -120,6 +161,12 @@ def test_a_photo_may_have_next_to_nothing_to_match(keypoints: int, why: str) -> 
             matches((0, 1, 90), (1, 2, 90), (2, 3, 90), flat=2, turned=False),
             3,
             "the photos show one flat surface: a plane alone explains 2 of 3 matching pairs",
+        ),
+        (
+            matches((0, 1, 90), (1, 2, 90), (2, 3, 90), ahead=2, flat=2, turned=False),
+            3,
+            "the camera moved straight ahead: in 2 of 3 matching pairs it goes towards something in the picture, "
+            "which leaves too little parallax",
         ),
         (
             matches((0, 1, 90)),

@@ -323,6 +323,41 @@ def test_without_flags_there_is_no_list_of_them(tmp_path: Path, progress: Any):
     assert "Effects of these photos" in html and "not modelled" not in html
 
 
+ATTEMPTS = [
+    dict(zip(("attempt", "registered", "points", "reprojection_px", "kept", "passed"), row, strict=True))
+    for row in [
+        ("first", 20, 7000, 0.6, False, None),
+        ("fisheye", None, None, None, False, "4 of 24 photos missing is not worth starting over"),
+        ("looser matching", 23, 8123, 0.61, True, None),
+        ("weaker start", 0, 0, None, False, None),
+        ("other seed", 23, 8100, 0.6, False, None),
+        ("all at once", 23, 8123, 0.75, False, None),
+    ]
+]
+
+
+def test_page_shows_what_was_tried_to_find_the_cameras(tmp_path: Path, progress: Any):
+    inputs = make_workspace(tmp_path)
+    path = inputs["sfm"] / "registration.json"
+    registration = json.loads(path.read_text("utf-8"))
+    write_json(path, registration | {"attempts": ATTEMPTS})
+    html, _ = _run(inputs, tmp_path / "out", progress)
+    assert "<summary>Ways tried to find the cameras: 5</summary>" in html
+    row = re.compile(r"<tr><td>([^<]*)</td><td[^>]*>([^<]*)</td><td[^>]*>([^<]*)</td><td[^>]*>([^<]*)</td><td>([^<]*)<")
+    table = html[html.index("Ways tried") :].partition("</table>")[0]
+    assert row.findall(table) == [
+        ("first", "20", "7,000", "0.60", "fewer photos"),
+        ("fisheye", "–", "–", "–", "not made: 4 of 24 photos missing is not worth starting over"),
+        ("looser matching", "23", "8,123", "0.61", "kept"),
+        ("weaker start", "0", "0", "–", "no model"),
+        ("other seed", "23", "8,100", "0.60", "fewer points"),
+        ("all at once", "23", "8,123", "0.75", "a larger error"),
+    ]
+    write_json(path, registration | {"attempts": ATTEMPTS[2:3]})  # the first was enough
+    html, _ = _run(inputs, tmp_path / "one", progress)
+    assert "Ways tried" not in html
+
+
 def test_a_large_video_lies_beside_the_page(inputs: dict[str, Path], tmp_path: Path, progress: Any):
     html, _ = _run(inputs, tmp_path / "out", progress, video_limit_mb=0.001)
     assert 'src="video.mp4"' in html and "data:video" not in html

@@ -13,13 +13,13 @@ import pytest
 from PIL import Image
 
 from nerf.alignment import align
-from stages import ingest, sfm
+from stages import ingest, sfm, sfm_process
 from stages.colmap.models import read_model
 from stages.contract import StageError
 from stages.files import read_json, write_png
 from stages.photos import Photo, read_photos, write_photos
 from stages.registration import count_done
-from stages.sfm_attempts import Journal, Tried
+from stages.sfm_attempts import ATTEMPTS, NO_TIME, Journal, Tried
 from tests.blots import blots
 from tests.small_scenes import write_blender_scene
 from tests.synthetic_photos import Quiet, SyntheticPhotos
@@ -148,7 +148,7 @@ def test_a_damaged_database_is_made_anew(
 def test_however_the_child_ends_it_is_an_error_with_words(
     child: str, message: str, inputs: dict[str, Path], tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sfm, "CHILD", ["-c", child])
+    monkeypatch.setattr(sfm_process, "CHILD", ["-c", child])
     with pytest.raises(StageError, match=message):
         sfm.run(sfm.Config(max_seconds=0.5 if "sleep" in child else 60), inputs, tmp_path, progress)
     assert (tmp_path / "sfm.log").exists()
@@ -218,11 +218,21 @@ def test_strangers_are_left_out_and_named_and_alpha_and_mixed_sizes_work(
         "matching all 36 pairs of photos: …",
         "1 of 9 photos has no place yet: matching them again, less strictly",
         "matching 8 pairs of photos: …",
+        "passed over, for 1 of 9 photos missing is not worth starting over: verifying and mapping again, as if through "
+        "a fisheye lens; searching twice as many features at twice the size",
+        "passed over, for none of them shares a view with another photo: mapping again, asking less of the first pair; "
+        "mapping again, with another seed; mapping again, all photos at once",
         "1 of 9 photos found no place and are left out:",
         "  stranger.png: it shares no view with any other photo",
     ]
     account = read_json(tmp_path / "sfm/registration.json")
     assert [image["file"] for image in account["images"] if not image["registered"]] == ["stranger.png"]
+    tried = {row["attempt"]: row["passed"] for row in account["attempts"]}
+    assert list(tried) == [attempt.name for attempt in ATTEMPTS]
+    assert [name for name, passed in tried.items() if passed is None] == ["first", "looser matching"]
+    assert tried["fisheye"] == "1 of 9 photos missing is not worth starting over"
+    assert [row["attempt"] for row in account["attempts"] if row["kept"]] == ["first"]
+    assert account["repeated_structure"] is None
 
 
 def test_nearly_the_same_pictures_are_not_matched_and_masks_keep_features_away(
@@ -244,7 +254,7 @@ def test_nearly_the_same_pictures_are_not_matched_and_masks_keep_features_away(
     assert (account["photos"], account["registered"]) == (9, 8)
     assert [image["file"] for image in account["images"]] == list(images)
     assert account["images"][1] == {
-        "file": photos[1].file.removeprefix("images/"),
+        "file": photos[1].image_name,
         "registered": False,
         "reason": f"nearly the same picture as {photos[0].name}: it adds no baseline",
         "keypoints": 0,
@@ -252,8 +262,8 @@ def test_nearly_the_same_pictures_are_not_matched_and_masks_keep_features_away(
         "uncertainty_px": None,
     }
     place = {image.file: index for index, image in enumerate(model.images)}
-    seen_at = model.xy[model.view == place[photos[5].file.removeprefix("images/")]]
-    others = model.xy[model.view == place[photos[4].file.removeprefix("images/")]]
+    seen_at = model.xy[model.view == place[photos[5].image_name]]
+    others = model.xy[model.view == place[photos[4].image_name]]
     assert len(seen_at) > 20 and seen_at[:, 0].min() > 79
     assert (others[:, 0] < 79).sum() > 5
     assert sorted(path.name for path in (tmp_path / "sfm").iterdir()) == ["registration.json", "sfm.log", "sparse"]
@@ -329,27 +339,79 @@ def test_photos_with_gps_tell_metres_and_directions(
     assert any(note.startswith("GPS of 12 photos: one unit is ") for note in progress.notes)
 
 
-def test_an_attempt_that_ended_the_program_is_left_out(
-    inputs: dict[str, Path], tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def with_a_stranger(inputs: dict[str, Path], folder: Path) -> dict[str, Path]:
+    """Six photos and one of another scene: the first attempt leaves it without a place."""
     images = {path.name: np.asarray(Image.open(path)) for path in sorted((inputs["ingest"] / "images").iterdir())[:6]}
-    folders = ingested(tmp_path / "ingest", images | {"stranger.png": blots(1, 300, 200)})
+    return ingested(folder, images | {"stranger.png": blots(1, 300, 200)})
+
+
+@pytest.mark.parametrize(
+    ("end", "message", "became"),
+    [
+        ("os.abort()", "was ended by SIGABRT .*goes on without the attempt 'looser matching'", "ended the program"),
+        (
+            "os.kill(os.getpid(), 9)",
+            "was ended by SIGKILL .*ran out of memory. Run again: it goes on without",
+            "was killed, most often for want of memory",
+        ),
+        ("int('x')", "failed while mapping: ValueError.*Run again: it goes on without", "ended the program"),
+    ],
+)
+def test_an_attempt_that_ended_the_program_is_left_out(
+    end: str,
+    message: str,
+    became: str,
+    inputs: dict[str, Path],
+    tmp_path: Path,
+    progress,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    folders = with_a_stranger(inputs, tmp_path / "ingest")
     crash = (
         "import sys, stages.sfm_child as c, os\n"
         "first = c._matched\n"
-        "c._matched = lambda a, m, w: os.abort() if a.name == 'looser matching' else first(a, m, w)\n"
+        f"c._matched = lambda a, m, w: {end} if a.name == 'looser matching' else first(a, m, w)\n"
         "c.main()"
     )
     with monkeypatch.context() as patched:
-        patched.setattr(sfm, "CHILD", ["-c", crash])
-        with pytest.raises(StageError, match="was ended by SIGABRT"):
+        patched.setattr(sfm_process, "CHILD", ["-c", crash])
+        with pytest.raises(StageError, match=message):
             sfm.run(SMALL, folders, tmp_path / "sfm", progress)
     progress.notes.clear()
     result = sfm.run(SMALL, folders, tmp_path / "sfm", progress)
     assert result.line.startswith("6/7 registered, ")
     assert progress.notes[0].startswith("going on with the features of 7 photos and 21 matched pairs")
-    assert "left out, for it ended the program last time: matching them again, less strictly" in progress.notes
+    assert f"left out, for it {became} last time: matching them again, less strictly" in progress.notes
+    tried = {row["attempt"]: row["passed"] for row in read_json(tmp_path / "sfm/registration.json")["attempts"]}
+    assert tried["looser matching"] == f"it {became}"
     assert not (tmp_path / "sfm/attempts").exists()
+
+
+def test_an_attempt_for_which_no_time_is_left_is_not_begun(
+    inputs: dict[str, Path], tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    slow = (
+        "import stages.sfm_child as c\n"
+        "end = c._Work.end\n"
+        "def slowly(work, phase):\n"
+        "    end(work, phase)\n"
+        "    work.seconds[phase] += 100\n"
+        "c._Work.end = slowly\n"
+        "c.main()"
+    )
+    monkeypatch.setattr(sfm_process, "CHILD", ["-c", slow])
+    config = SMALL.model_copy(update={"max_seconds": 240.0})
+    result = sfm.run(config, with_a_stranger(inputs, tmp_path / "ingest"), tmp_path / "sfm", progress)
+    assert result.line.startswith("6/7 registered, ")
+    # All of the first time's 100 s of mapping, 1 - (6/7)² of those of matching; twice 100 s are for the adjustment.
+    said = (
+        "left out, for it would take about 2 min and the last adjustment, of --sfm.max-seconds 4 min are left: "
+        "matching them again, less strictly"
+    )
+    assert said in progress.notes
+    tried = {row["attempt"]: row["passed"] for row in read_json(tmp_path / "sfm/registration.json")["attempts"]}
+    assert tried["looser matching"] == NO_TIME == "too little was left of --sfm.max-seconds"
+    assert tried["weaker start"] == "none of them shares a view with another photo"
 
 
 def test_attempts_whose_matches_are_gone_are_forgotten(

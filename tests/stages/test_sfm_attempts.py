@@ -3,7 +3,16 @@ from typing import Any
 
 import pytest
 
-from stages.sfm_attempts import ATTEMPTS, Journal, Situation, Tried, abandon, reason_against
+from stages.sfm_attempts import (
+    ATTEMPTS,
+    Journal,
+    Situation,
+    Tried,
+    abandon,
+    expected_seconds,
+    reason_against,
+    time_against,
+)
 
 BY_NAME = {attempt.name: attempt for attempt in ATTEMPTS}
 
@@ -37,6 +46,49 @@ def test_the_journal_is_read_back_and_knows_the_best(tmp_path: Path) -> None:
     assert again.tried == journal.tried and again.best() == one  # of equals the first
     assert [attempt.name for attempt in again.left()] == ["all at once", "more features"]
     assert again.model("other seed") == tmp_path / "attempts" / "other-seed"
+
+
+def test_what_was_passed_over_is_kept_with_what_was_made_and_one_of_these_is_kept(tmp_path: Path) -> None:
+    journal = Journal(tmp_path / "attempts")
+    journal.add(Tried("first", "x.db", [["a", "b"]], 50, 0.5))
+    journal.passed["fisheye"] = "the camera model is given"
+    journal.add(Tried("looser matching", "x.db", [["a", "b", "c"]], 60, 0.4))
+    journal.passed["weaker start"] = "not noted: nothing was made after it"
+    again = Journal(tmp_path / "attempts")
+    assert again.passed == {"fisheye": "the camera model is given"}
+    none = {"registered": None, "points": None, "reprojection_px": None}
+    assert again.account() == [
+        {"attempt": "first", "registered": 2, "points": 50, "reprojection_px": 0.5, "kept": False, "passed": None},
+        {"attempt": "fisheye", **none, "kept": False, "passed": "the camera model is given"},
+        {"attempt": "looser matching", "registered": 3, "points": 60, "reprojection_px": 0.4}
+        | {"kept": True, "passed": None},
+    ]
+
+
+TIMED = [
+    Tried("first", "x.db", seconds={"features": 10.0, "matching": 40.0, "mapping": 20.0}),
+    Tried("other seed", "x.db", seconds={"mapping": 30.0}),
+]
+
+
+@pytest.mark.parametrize(
+    ("name", "chosen_pairs", "seconds"),
+    [
+        ("fisheye", False, 40 + 30),
+        ("looser matching", False, 0.75 * 40 + 30),  # of all pairs, three quarters have one of half of the photos
+        ("looser matching", True, 40 + 30),
+        ("weaker start", False, 30),
+        ("all at once", True, 30),
+        ("more features", False, 4 * (10 + 40) + 2 * 30),
+    ],
+)
+def test_earlier_attempts_tell_how_long_the_next_will_take(name: str, chosen_pairs: bool, seconds: float) -> None:
+    assert expected_seconds(BY_NAME[name], TIMED, 0.5, chosen_pairs) == pytest.approx(seconds)
+
+
+def test_an_attempt_must_leave_time_for_the_last_adjustment() -> None:
+    assert time_against(50.0, TIMED, 50.0 + 2 * 30 - 1)
+    assert not time_against(50.0, TIMED, 50.0 + 2 * 30 + 1)
 
 
 def test_what_ended_the_program_is_remembered(tmp_path: Path) -> None:
