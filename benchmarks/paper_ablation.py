@@ -26,7 +26,7 @@ VARIANTS: dict[str, dict[str, bool]] = {
     "no positional encoding": {"positional_encoding": False},
     "no hierarchical sampling": {"hierarchical": False},
 }
-STAGES = ("ingest", "sfm", "normalise", "train", "evaluate")
+STAGES = ("ingest", "sfm", "normalise", "effects", "train", "evaluate")
 
 
 def settings_of(photos: Path, variant: str, seed: int, steps: int, downscale: float) -> Settings:
