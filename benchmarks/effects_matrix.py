@@ -1,0 +1,118 @@
+"""Whether stage effects decides right on synthetic scenes, and what the effects that are called for gain.
+
+    python -m benchmarks.effects_matrix [--seeds 5] [--gain-steps 600] [--only exposure …]
+
+Every row is a kind of photos of the demo's still life (24 photos of 240 × 180, exact tracks); every seed another still
+life, walk and draw of the effect. "right": in how many seeds exactly the effects named were on, view dependence aside,
+which is counted by itself. "gain": right halves of photos kept back, with the effect against without, after
+--gain-steps steps, mean over three trainings of the first seed.
+"""
+
+import argparse
+import json
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+from stages import effects
+from stages.effect_decisions import Decisions, read_decisions
+from stages.files import read_scene
+from stages.pilots import pilot_scene, run_pilot
+from tests.effect_scenes import Effects, effect_scene
+from tests.synthetic_photos import Quiet
+
+
+class Cell(NamedTuple):
+    """Photos, which effects they call for, and which are only seen."""
+
+    made: Effects
+    on: frozenset[str]
+    seen: frozenset[str] = frozenset()
+
+
+def cell(made: Effects, on: str = "", seen: str = "") -> Cell:
+    """Names separated by spaces."""
+    return Cell(made, frozenset(on.split()), frozenset(seen.split()))
+
+
+CELLS = {
+    "plain": cell(Effects(), "background"),
+    "exposure": cell(Effects(exposure_ev=1.0), "background exposure"),
+    "highlights": cell(Effects(highlight=1.0), "background"),
+    "alpha": cell(Effects(alpha=True)),
+    "poses": cell(Effects(jitter_px=3.0), "background pose_refinement"),
+    "exposure, alpha": cell(Effects(exposure_ev=1.0, alpha=True), "exposure"),
+    "exposure, highlights": cell(Effects(exposure_ev=1.0, highlight=1.0), "background exposure"),
+    "exposure, poses": cell(Effects(exposure_ev=1.0, jitter_px=3.0), "background exposure pose_refinement"),
+    "vignetting": cell(Effects(vignetting_ev=1.0), "background", "vignetting"),
+    "passers-by": cell(Effects(strangers=0.15), "background", "transients"),
+    "4 × distance": cell(Effects(farther=4.0), "background", "scale"),
+}
+
+
+class Outcome(NamedTuple):
+    """What the stage decided, and where its inputs are."""
+
+    decisions: Decisions
+    table: dict
+    inputs: dict[str, Path]
+
+    @property
+    def on(self) -> set[str]:
+        """The modelled effects that are on, lens and view dependence aside."""
+        aside = ("lens", "view_dependence")
+        return {name for name, entry in self.table.items() if entry["on"] and entry["modelled"] and name not in aside}
+
+
+def decide(folder: Path, made: Effects, seed: int) -> Outcome:
+    """Make the photos and run the stage on them."""
+    inputs, out = effect_scene(folder / "scene", made, seed), folder / "effects"
+    out.mkdir()
+    effects.run(effects.Config(seed=seed), inputs, out, Quiet())
+    return Outcome(read_decisions(out), json.loads((out / "effects.json").read_text("utf-8")), inputs)
+
+
+def gains(found: Outcome, wanted: frozenset[str], steps: int) -> str:
+    """What each effect of a scene gains over leaving it out, in dB."""
+    trial = pilot_scene(found.inputs["ingest"], read_scene(found.inputs["normalise"]), Quiet())
+    assert trial is not None
+    without = {"exposure": {"exposure": None}, "pose_refinement": {"pose_refinement": False}}
+    parts = []
+    for name, off in without.items():
+        if name in wanted and name in found.on:
+            pilot = run_pilot(trial, replace(found.decisions, **off), found.decisions, steps, 0, Quiet())
+            parts.append(f"{name} {pilot.gain_db:+.2f} ± {pilot.noise_db:.2f}, {pilot.cost:+.0%} time")
+    return "; ".join(parts)
+
+
+def row(name: str, seeds: int, steps: int) -> str:
+    """The line of the table."""
+    wanted, right, depends, seen, wrong, gain = CELLS[name], 0, 0, 0, [], ""
+    for seed in range(seeds):
+        with tempfile.TemporaryDirectory() as folder:
+            found = decide(Path(folder), wanted.made, seed)
+            right += found.on == wanted.on
+            wrong += [f"seed {seed}: {' '.join(sorted(found.on ^ wanted.on))}"] if found.on != wanted.on else []
+            depends += found.table["view_dependence"]["on"]
+            seen += all(found.table[flag]["on"] for flag in wanted.seen)
+            if seed == 0:
+                gain = gains(found, wanted.on, steps)
+    flags = f"{seen}/{seeds}" if wanted.seen else ""
+    return f"| {name} | {right}/{seeds} | {flags} | {depends}/{seeds} | {gain} | {', '.join(wrong)} |"
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--gain-steps", type=int, default=600)
+    parser.add_argument("--only", nargs="*", default=list(CELLS))
+    given = parser.parse_args()
+    print("| photos | right | seen | view dependence on | gain (dB) | wrong |\n" + 6 * "|---" + "|")
+    for name in given.only:
+        print(row(name, given.seeds, given.gain_steps), flush=True)
+
+
+if __name__ == "__main__":
+    main()
