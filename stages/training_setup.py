@@ -107,7 +107,8 @@ def grid_settings(config: "Config") -> "GridSettings":
     cell (it is 4 wide), growing with the distance from where the cells do; in a box two steps to three cells."""
     from nerf.grid_field import GridSettings
 
-    assert config.levels and config.log2_rows and config.finest and config.contracted is not None, "plan() chooses them"
+    assert config.levels and config.log2_rows and config.finest, "plan() chooses them"
+    assert config.contracted is not None and config.view_dependence is not None, "plan() takes them from stage effects"
     return GridSettings(
         levels=config.levels,
         log2_rows=config.log2_rows,
@@ -117,7 +118,7 @@ def grid_settings(config: "Config") -> "GridSettings":
         steps=min(max(config.finest, FEWEST_STEPS), MOST_STEPS),
         shortest_step=2 / config.finest,
         cone=8 / config.finest,
-        view_dependence=config.view_dependence is not False,
+        view_dependence=config.view_dependence,
     )
 
 

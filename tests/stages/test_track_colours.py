@@ -193,14 +193,13 @@ def test_all_evidence_of_a_scene(tmp_path: Path, progress: SilentProgress) -> No
     scene, points = photographed_points(tmp_path, gain)
     found = scene_evidence(tmp_path, scene, points, {"images/1.png": None, "images/2.png": 0.1}, progress)
     assert set(found.of) == {
-        *("exposure", "tone", "view_dependence", "vignetting", "transients", "scale", "media", "blur"),
+        *("exposure", "tone", "view_dependence", "vignetting", "transients", "scale", "participating_media", "blur"),
         *("background", "pose_refinement", "rolling_shutter"),
     }
     assert found.of["exposure"].called_for is True
     bright, dark = found.exposure.log_gain[[0, 2, 3, 5]], found.exposure.log_gain[[1, 4]]
     assert abs((bright.mean() - dark.mean()) / EV - 1.1) < 0.25  # 0.7 of an sRGB value is about half of the light
     assert found.of["pose_refinement"].called_for is False
-    assert found.of["background"].called_for is None  # so few points
     assert found.of["rolling_shutter"].words == "no video, or one that hardly moves: nothing known"
     for name, evidence in found.of.items():
         assert np.isfinite(evidence.statistic) and evidence.words, name
@@ -210,8 +209,8 @@ def test_no_evidence_without_points(tmp_path: Path, progress: SilentProgress) ->
     scene, points = photographed_points(tmp_path)
     found = scene_evidence(tmp_path, scene, without_points(points), {}, progress).of
     unsure = {name for name, evidence in found.items() if evidence.called_for is None}
-    assert unsure == {"exposure", "view_dependence", "pose_refinement", "background"}
-    assert not any(evidence.called_for for evidence in found.values())
+    assert unsure == {"exposure", "view_dependence", "pose_refinement"}
+    assert [name for name, evidence in found.items() if evidence.called_for] == ["background"]
 
 
 def test_focal_length_and_principal_point() -> None:

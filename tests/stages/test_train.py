@@ -177,7 +177,7 @@ def test_options_of_the_paper_field_ask_for_it() -> None:
 
 def test_every_option_is_shared_or_of_one_field() -> None:
     shared = {"field", "preset", "steps", "seconds", "learning_rate", "seed", "downscale", "background", "contracted"}
-    shared |= {"checkpoint_seconds", "tensorboard"}
+    shared |= {"view_dependence", "checkpoint_seconds", "tensorboard"}
     assert sorted([*shared, *train.GRID_ONLY, *train.PAPER_ONLY]) == sorted(Config.model_fields)
 
 

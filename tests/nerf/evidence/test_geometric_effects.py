@@ -47,12 +47,13 @@ def test_a_few_false_points_are_no_scale() -> None:
     assert scale_evidence(TrackColours.empty(2)).words == "no tracks: nothing known"
 
 
-@pytest.mark.parametrize(("share", "called_for"), [(0.0, False), (0.008, None), (0.05, True)])
-def test_the_background_beyond_the_region(share: float, called_for: bool | None) -> None:
+@pytest.mark.parametrize("share", [0.0, 0.008, 0.05])
+def test_the_background_is_modelled_unless_alpha_says_that_there_is_none(share: float) -> None:
     position = np.zeros((4000, 3))
     position[: int(share * 4000), 2] = -5
     found = background_evidence(position, np.repeat(np.arange(4000), 3), False, 0.1)
-    assert found.called_for is called_for and abs(found.statistic - share) < 1e-9
+    assert found.called_for is True and abs(found.statistic - share) < 1e-9
+    assert ("only alpha could tell that nothing lies beyond" in found.words) is (share < 0.01)
 
 
 def test_alpha_says_what_is_background() -> None:
