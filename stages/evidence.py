@@ -69,7 +69,7 @@ def lens_evidence(registration: dict[str, Any]) -> "Evidence":
     gains = [simplest[row["group"]]["held_out_px"] - row["held_out_px"] for row in chosen]
     models = ", ".join(sorted({row["model"] for row in chosen}))
     noise = max(row["noise_px"] for row in chosen)
-    words = f"{models}: held-out error {max(gains):.2g} px below that of {simplest[chosen[0]['group']]['model']}"
+    words = f"{models}: held-out error {max(gains):.2g} px below that of the simplest candidate"
     return Evidence(max(gains), "px", noise, noise, any(row["model"] not in PINHOLES for row in chosen), words)
 
 
