@@ -1,8 +1,9 @@
-"""How exact the formulas of nerf/ are in float32: a case for each, measured against float64 on ordinary and extreme input.
+"""How exact the formulas of nerf/ are in float32: a case each, measured against float64 on ordinary and extreme input.
 
-The cases are data, so that three readers share them: ``tests/numerics`` holds them to their bounds, ``docs/NUMERICS.md``
-is written from them, and ``pipeline doctor --selftest`` runs them on the user's own device. A new formula gets a case
-in one of the modules beside this one and thereby a row, a test and a line of the self-test.
+The cases are data that three readers share: ``tests/numerics`` holds them to their bounds, ``docs/NUMERICS.md`` is
+written from them, and ``pipeline doctor --selftest`` runs them on the user's own device. A new formula gets a case in
+one of the modules beside this one (or in a new one that ``matrix.py`` adds) and thereby a row, a test and a line of the
+self-test.
 """
 
 from collections.abc import Callable
