@@ -26,7 +26,7 @@ class Row(NamedTuple):
 def matrix(backends: Mapping[str, Backend], device: torch.device | str) -> Iterator[Row]:
     """Every case on ``device``; those of kernels on each of ``backends``, the others once, as "torch"."""
     for case in CASES:
-        used = backends if case.kernels else {"torch": reference}
+        used: Mapping[str, Backend] = backends if case.kernels else {"torch": reference}
         yield Row(case, {name: measure(case, backend, device) for name, backend in used.items()})
 
 

@@ -45,6 +45,15 @@ def test_errors_keep_their_bounds_and_the_bounds_mean_something(case: Case) -> N
         assert max(each.gradient or 0.0 for each in measured) >= case.gradient.error / SLACK
 
 
+@pytest.mark.gpu
+@pytest.mark.parametrize("case", CASES, ids=named)
+def test_a_gpu_keeps_the_bounds_too(case: Case) -> None:
+    if not torch.cuda.is_available() or warp.why_not("cuda"):
+        pytest.skip("torch or Warp finds no GPU")
+    measured = {name: measure(case, BACKENDS[name], "cuda") for name in backends_of(case)}
+    assert Row(case, measured).passed, measured
+
+
 class ByHand(torch.autograd.Function):
     """A case's function with the gradient that was written by hand."""
 
