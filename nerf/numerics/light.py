@@ -189,6 +189,12 @@ COMPOSITED: dict[str, Any] = {
     "extreme": _hard_densities,
 }
 
+PACKED: dict[str, Any] = COMPOSITED | {
+    "where": "nerf/kernels/packed_compositing.py: composite, composite_backward",
+    "hazard": "as above; differences of running sums over all rays; T g − Σ w g − U G cancels",
+    "answer": "sums in float64 of τ limited to 800, where exp is 0 even there; Warp sums along one ray",
+}
+
 CASES = [
     Case(
         formula="stratified samples, even",
@@ -279,12 +285,7 @@ CASES = [
         gradient=Bound(1e-5, "one"),
         differentiable=2,
         kernels=True,
-        **COMPOSITED
-        | {
-            "where": "nerf/kernels/packed_compositing.py: composite, composite_backward",
-            "hazard": "as above; differences of running sums over all rays; T g − Σ w g − U G cancels",
-            "answer": "sums in float64 of τ limited to 800, where exp is 0 even there; Warp sums along one ray",
-        },
+        **PACKED,
     ),
     Case(
         formula="distortion ΣΣ w_i w_j |m_i − m_j| + ⅓ Σ w² l",

@@ -17,7 +17,7 @@ ELSEWHERE = {
     "tests/nerf/test_grid_field.py",
     "nerf/grid_field.py": "puts rows together: tests/nerf/test_grid_field.py",
     "nerf/density_cache.py": "σ times the lattice's step; the outermost cells, which reach to infinity, count half a "
-    "cell within: tests/nerf/test_grid_field.py",
+    "cell within: tests/nerf/test_grid_training.py",
     "nerf/ray_bank.py": "bearings linear within a patch, of length 1/2 or more before they are divided by it: "
     "tests/nerf/test_ray_bank.py",
     "nerf/rendering.py": "cuts pictures into chunks: tests/nerf/test_rendering.py",
