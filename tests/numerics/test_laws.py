@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
@@ -22,11 +22,12 @@ from stages.mesh_surface import extract
 
 BACKENDS = pytest.mark.parametrize("backend", [reference, warp], ids=["torch", "warp"])
 DENSITY = st.one_of(st.just(0.0), st.floats(-45, 30).map(lambda e: 10.0**e), st.floats(0, 100))
-LENGTH = st.one_of(st.just(0.0), st.floats(-6, 1).map(lambda e: 10.0**e))
+LENGTH = st.integers(0, 8192).map(lambda n: n / 1024)  # of which float32 knows the sums, in any order
 INTERVALS = st.lists(st.tuples(DENSITY, LENGTH), min_size=1, max_size=12)
 NUMBER = st.floats(-1e6, 1e6, width=32)
 FRACTION = st.floats(0, 1, width=32)
 EPSILON = torch.finfo(torch.float32).eps
+DENORMAL = 1e-37  # below it float32 has fewer digits
 LAYOUT = grid_layout(3, 3, 48, 10, 4)
 
 
@@ -115,15 +116,17 @@ def test_the_encoding_has_period_two_up_to_a_million(x: float) -> None:
 def test_contraction_keeps_directions_and_order(point: list[float]) -> None:
     x = torch.tensor(point)
     y, farther = contract(x), contract(2 * x)
-    assert y.abs().max() <= 2 and (farther.abs() >= y.abs() * (1 - 4 * EPSILON)).all()
+    assert y.abs().max() <= 2 and (farther.abs() + DENORMAL >= y.abs() * (1 - 4 * EPSILON)).all()
     assert (y * x.sign() >= 0).all()
     if x.abs().max() < 100:
-        torch.testing.assert_close(uncontract(y), x, rtol=2e-4, atol=0)
+        torch.testing.assert_close(uncontract(y), x, rtol=2e-4, atol=DENORMAL)
 
 
 @given(st.lists(st.sampled_from([0.0, -0.0, 1.0, -1.0, 0.5]), min_size=3, max_size=3), st.floats(-3, 3, width=32))
 def test_axis_parallel_rays_meet_the_box_where_it_is(towards: list[float], at: float) -> None:
-    """From inside, from outside, away from it and past it; both backends march nowhere else."""
+    """From inside, from outside, away from it and past it; both backends march nowhere else. A ray that runs within a
+    face may count either way."""
+    assume(abs(at) != float(torch.tensor(BOX)))
     if not any(towards):
         towards = [0.0, 1.0, 0.0]
     directions = torch.nn.functional.normalize(torch.tensor([towards]), dim=-1)
