@@ -11,6 +11,7 @@ pictures beside the workspace.
 import argparse
 import statistics
 from pathlib import Path
+from typing import Any
 
 from PIL import Image
 
@@ -20,19 +21,22 @@ from pipeline.settings import Settings, settings_from, with_source
 from pipeline.workspace import Workspace
 from stages.files import read_json
 
-VARIANTS: dict[str, dict[str, bool]] = {
+VARIANTS: dict[str, dict[str, dict[str, Any]]] = {
     "complete": {},
-    "no view dependence": {"view_dependence": False},
-    "no positional encoding": {"positional_encoding": False},
-    "no hierarchical sampling": {"hierarchical": False},
+    "no view dependence": {"effects": {"view_dependence": "off"}},
+    "no positional encoding": {"train": {"positional_encoding": False}},
+    "no hierarchical sampling": {"train": {"hierarchical": False}},
 }
+AS_PUBLISHED = {"exposure": "off", "view_dependence": "on", "pose_refinement": "off"}
 STAGES = ("ingest", "sfm", "normalise", "effects", "train", "evaluate")
 
 
 def settings_of(photos: Path, variant: str, seed: int, steps: int, downscale: float) -> Settings:
     """The reduced paper field (4 layers of 64, 32 + 32 samples) in one variant."""
-    train = {"field": "paper", "steps": steps, "seed": seed, "downscale": downscale, **VARIANTS[variant]}
-    return with_source(settings_from({"train": train}, "the benchmark"), photos, None)
+    train = {"field": "paper", "steps": steps, "seed": seed, "downscale": downscale}
+    chosen = VARIANTS[variant]
+    values = {"train": train | chosen.get("train", {}), "effects": AS_PUBLISHED | chosen.get("effects", {})}
+    return with_source(settings_from(values, "the benchmark"), photos, None)
 
 
 def score(root: Path, settings: Settings) -> tuple[dict, Path]:

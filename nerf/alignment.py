@@ -5,6 +5,8 @@ from jaxtyping import Float
 
 from nerf.scene import Similarity
 
+FLAT = 1e-9  # of the largest singular value: less across a line is the rounding of its points, not an extent
+
 
 def align(points: Float[np.ndarray, "n 3"], targets: Float[np.ndarray, "n 3"]) -> Similarity:
     """The similarity that brings ``points`` closest to ``targets`` in the sense of least squares, never a reflection.
@@ -15,7 +17,7 @@ def align(points: Float[np.ndarray, "n 3"], targets: Float[np.ndarray, "n 3"]) -
     middle, target_middle = points.mean(0), targets.mean(0)
     offsets, target_offsets = points - middle, targets - target_middle
     u, singular, vt = np.linalg.svd(target_offsets.T @ offsets / len(points))
-    if len(points) < 3 or not singular[1] > 1e-9 * singular[0]:
+    if len(points) < 3 or not singular[1] > FLAT * singular[0]:
         raise ValueError(f"{len(points)} points on one line fit in more than one way")
     proper = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
     rotation = (u * proper) @ vt

@@ -14,6 +14,7 @@ FULL_CIRCLE_GAP_DEG = 60.0  # cameras with no wider gap in azimuth surround the 
 SMOOTHING_DEG = 20.0  # standard deviation over azimuth within which an orbit averages the cameras' radius and height
 STEEPEST = 0.15  # least horizontal distance of an orbit to its axis, in distances to the target (81 degrees)
 SPIRAL_SHARE = 0.7  # quantile of the cameras' offsets that the spiral reaches
+ROUNDING = 1e-9  # of tour lengths of about 10: reversing a stretch gains more, or the search would run in circles
 FRAMES_PER_KEY = 8  # interpolated: frames between two of the cameras it visits, so that the tour is not a blur
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -138,7 +139,7 @@ def _uncrossed(tour: np.ndarray, cost: Float[np.ndarray, "n n"]) -> np.ndarray |
             before_turned = cost[tour[i - 1], tour[j]] if i else 0.0
             after = cost[tour[j], tour[j + 1]] if j + 1 < len(tour) else 0.0
             after_turned = cost[tour[i], tour[j + 1]] if j + 1 < len(tour) else 0.0
-            if before_turned + after_turned < before + after - 1e-9:
+            if before_turned + after_turned < before + after - ROUNDING:
                 return np.concatenate([tour[:i], tour[i : j + 1][::-1], tour[j + 1 :]])
     return None
 

@@ -11,7 +11,7 @@ def positional_encoding(
     """sin(2^k pi x) of every coordinate for k = 0 ... frequencies - 1, then as many cosines, without the identity.
 
     Turns of 2 pi are reduced to [-1/2, 1/2] before they become angles: 2^k x/2 and its distance to the nearest whole
-    number are exact in binary. That keeps float32 within 1e-6 at every k, and finite however large x is.
+    number are exact in binary. That keeps float32 within 1e-6 at every k, and finite as long as 2^k x is.
     With a ``dtype`` the angles are rounded to it, and sines and cosines taken, after they are reduced.
     """
     octaves = 2.0 ** torch.arange(-1, frequencies - 1, dtype=x.dtype, device=x.device)

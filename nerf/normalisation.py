@@ -11,6 +11,9 @@ from nerf.region import Layout, Region, find_layout, find_region, share_beyond
 from nerf.scene import Similarity
 from nerf.up_vector import Up, find_up
 
+# Shortest level heading that is one: of the mean of all photos, of the first photo (beyond rounding), of an axis.
+LEAST_HEADINGS = (0.3, 1e-6, 0.0)
+
 
 class Normalisation(NamedTuple):
     """The scene frame and what is known of the scene in it.
@@ -72,7 +75,7 @@ def _frame(up: Float[np.ndarray, "3"], axes: Float[np.ndarray, "n 3"]) -> Float[
     middle = spatial_median(level)
     candidates = np.stack([middle, level[0], (np.eye(3) - np.outer(up, up))[np.argmin(np.abs(up))]])
     lengths = np.linalg.norm(candidates, axis=1)
-    chosen = int(np.argmax(lengths > [0.3, 1e-6, 0.0]))
+    chosen = int(np.argmax(lengths > LEAST_HEADINGS))
     y = candidates[chosen] / lengths[chosen]
     return np.stack([np.cross(y, up), y, up])
 

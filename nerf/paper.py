@@ -38,6 +38,12 @@ INITIAL_DENSITY = math.log(2) / math.sqrt(2 * 10)
 SOFTPLUS_SHIFT = math.log(math.expm1(INITIAL_DENSITY))
 
 
+def shifted_softplus(raw: Float[Tensor, "*points"]) -> Float[Tensor, "*points"]:
+    """log(1 + exp(raw + SOFTPLUS_SHIFT)): INITIAL_DENSITY at 0, with a gradient everywhere."""
+    # Beyond the threshold torch returns its argument; at 40 the difference is below float64's resolution.
+    return functional.softplus(raw + SOFTPLUS_SHIFT, threshold=40)
+
+
 @dataclass(frozen=True)
 class PaperSettings:
     """Sizes and variants; the defaults are the published model. Raises ValueError on impossible values.
@@ -126,8 +132,7 @@ class PaperMlp(nn.Module):
         raw = self.density_head(hidden)[..., 0]
         if self.settings.density_activation == "relu":
             return torch.relu(raw)
-        # Beyond the threshold torch returns its argument; at 40 the difference is below float64's resolution.
-        return functional.softplus(raw + SOFTPLUS_SHIFT, threshold=40)
+        return shifted_softplus(raw)
 
     def _encode(self, x: Float[Tensor, "*batch 3"], frequencies: int) -> Float[Tensor, "*batch encoded"]:
         dtype = self.density_head.weight.dtype

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerf.effects import AS_RENDERED, PhotoColours, Seen
+from nerf.effects import AS_GIVEN, AS_RENDERED, PhotoColours, PhotoRays, Seen
 from nerf.metrics import mean_squared_error, psnr
 from nerf.model import RadianceModel, Rendering
 from nerf.randomness import generator
@@ -45,9 +45,14 @@ def make_probe(bank: RayBank, count: int, background: Float[Tensor, "3"], seed: 
 
 
 @torch.no_grad()
-def measure(model: RadianceModel, probe: Probe, photo_colours: PhotoColours = AS_RENDERED) -> ProbeResult:
-    """Render the probe and compare it with the photos, each as ``photo_colours`` takes it to show the field."""
-    one_row = Rays(*(part[None] for part in probe.rays))
+def measure(
+    model: RadianceModel,
+    probe: Probe,
+    photo_colours: PhotoColours = AS_RENDERED,
+    photo_rays: PhotoRays = AS_GIVEN,
+) -> ProbeResult:
+    """Render the probe and compare it with the photos, as ``photo_rays`` and ``photo_colours`` have them."""
+    one_row = Rays(*(part[None] for part in photo_rays.forward(probe.rays, probe.view)))
     seen = Rendering(*(part[0] for part in render_image(model, one_row, probe.background)))
     residual = photo_colours.residual(Seen(seen, probe.background, probe.view), probe.colours)
     return ProbeResult(psnr(float(residual.square().mean())), float(seen.opacity.mean()))

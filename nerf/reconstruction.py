@@ -9,6 +9,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int
 
+CONVERGED = 1e-9  # of the softening, which is a tenth of the distance between close points: far below any use of it
+PARALLEL = 1e-9  # of the largest singular value: below it lines leave a direction open, and rounding must not choose
+NEAREST = 1e-6  # of the usual distance: a line hit exactly would weigh infinitely much
+
 
 @dataclass(frozen=True)
 class Reconstruction:
@@ -79,7 +83,7 @@ def spatial_median(points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "d"]:
         weight = 1 / np.hypot(np.linalg.norm(points - estimate, axis=1), softening)
         step = weight @ (points - estimate) / weight.sum()
         estimate = estimate + step
-        if np.linalg.norm(step) <= 1e-9 * softening:
+        if np.linalg.norm(step) <= CONVERGED * softening:
             break
     return estimate
 
@@ -99,9 +103,9 @@ def closest_point_to_lines(
     estimate = np.zeros(3)
     for _ in range(50):
         normal = np.einsum("n,nij->ij", weights, across)
-        estimate = np.linalg.lstsq(normal, weights @ offsets, rcond=1e-9)[0]
+        estimate = np.linalg.lstsq(normal, weights @ offsets, rcond=PARALLEL)[0]
         distance = np.linalg.norm(across @ estimate - offsets, axis=1)
-        floor = 1e-6 * max(np.median(distance), np.median(np.linalg.norm(offsets, axis=1)))
+        floor = NEAREST * max(np.median(distance), np.median(np.linalg.norm(offsets, axis=1)))
         weights = 1 / np.maximum(distance, floor) if floor > 0 else weights
     return middle + estimate
 

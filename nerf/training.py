@@ -26,6 +26,10 @@ from nerf.schedule import learning_rate
 # so results do not depend on the number of cores.
 CHUNK_RAYS = {"cpu": 256}
 
+# Adam's epsilon in the published code (Keras's default): far below the root of any gradient's square that counts, it
+# keeps a weight without gradient where it is, 0/1e-7 instead of 0/0.
+PUBLISHED_EPSILON = 1e-7
+
 
 class StepResult(NamedTuple):
     """What one step did: its loss, the PSNR (dB) of the final rendering on its batch, and how many rays it drew."""
@@ -141,7 +145,7 @@ class PaperTrainer:
             learnt = [parameter.requires_grad_() for parameter in part.parameters.values()]
             groups.append({"params": learnt, "of_start": part.rate / settings.rate_start})
         self.parameters = [parameter for group in groups for parameter in group["params"]]
-        self.optimiser = torch.optim.Adam(groups, betas=(0.9, 0.999), eps=1e-7, fused=True)
+        self.optimiser = torch.optim.Adam(groups, betas=(0.9, 0.999), eps=PUBLISHED_EPSILON, fused=True)
 
     def step(self, step: int, share: float, rate_scale: float = 1.0) -> StepResult:
         """One batch, one update. Raises NonFinite before the update, leaving model and optimiser as they were."""

@@ -257,10 +257,10 @@ def command_clean(words: Sequence[str]) -> int:
 
 def command_doctor(words: Sequence[str]) -> int:
     """``pipeline doctor``: versions, device, threads, free disk, a numerical self-test."""
-    words_of.parse(words_of.DoctorArguments, "doctor", words)
+    given = words_of.parse(words_of.DoctorArguments, "doctor", words)
     from pipeline.doctor import examine
 
-    return examine(Path(os.curdir))
+    return examine(Path(os.curdir), given.selftest)
 
 
 def command_demo(words: Sequence[str]) -> int:

@@ -1,4 +1,5 @@
-"""``pipeline doctor``: what this machine has, and whether its arithmetic can be trusted, in about five seconds."""
+"""``pipeline doctor``: what this machine has, and whether its arithmetic can be trusted, in about five seconds; with
+``--selftest``, formula by formula (pipeline/selftest.py)."""
 
 import platform
 import time
@@ -6,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline import machine
+from pipeline.selftest import numerical_matrix
 
 if TYPE_CHECKING:
     import torch
@@ -17,8 +19,9 @@ PACKAGES = (
 LOW_DISK_GB = 2.0
 
 
-def examine(folder: Path) -> int:
-    """Print versions, device, threads, free disk and the self-test; 0 if all is well, 1 otherwise."""
+def examine(folder: Path, selftest: bool = False) -> int:
+    """Print versions, device, threads, free disk and the self-test, the long one if asked for; 0 if all is well, 1
+    otherwise."""
     import torch
 
     print(f"python {platform.python_version()} on {platform.platform()}")
@@ -32,6 +35,8 @@ def examine(folder: Path) -> int:
         problems.append(f"only {free_gb:.1f} GB free: a run needs about {LOW_DISK_GB:.0f} GB")
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     problems += [f"self-test: {name}: {error}" for name, error in self_test(device) if error]
+    if selftest:
+        problems += numerical_matrix(device.type)
     print("\n".join(f"problem: {problem}" for problem in problems) or "all well")
     return 1 if problems else 0
 

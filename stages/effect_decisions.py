@@ -51,11 +51,17 @@ def photo_parts(
     decisions: Decisions, views: "Sequence[View]", device: "torch.device"
 ) -> "tuple[PhotoRays, PhotoColours]":
     """What stands between the field and the photos ``views``, in their order."""
+    import numpy as np
+    import torch
+
     from nerf.effects import AS_GIVEN, AS_RENDERED
     from nerf.effects.exposures import Exposures
     from nerf.effects.poses import RefinedPoses
 
-    rays = RefinedPoses(len(views), device) if decisions.pose_refinement else AS_GIVEN
+    rays = AS_GIVEN
+    if decisions.pose_refinement:
+        centres = np.stack([view.scene_from_camera[:, 3] for view in views])
+        rays = RefinedPoses(torch.tensor(centres, dtype=torch.float32, device=device))
     colours = AS_RENDERED if decisions.exposure is None else Exposures.of_tracks(decisions.log_gain(views).to(device))
     return rays, colours
 

@@ -28,7 +28,7 @@ ORDER = (
     *("tone", "vignetting", "transients", "scale", "blur", "rolling_shutter", "participating_media"),  # seen
 )
 MOST_PILOTS = 2
-PILOT_STEPS = 150  # as many as tell ±1 EV or a highlight from none (docs/numbers.md)
+PILOT_STEPS = 150
 
 
 class Config(StageConfig):
@@ -97,11 +97,12 @@ class _Study:
         """What to model, and the reasons by effect."""
         decisions = Decisions(view_dependence=True, unbounded=False, pose_refinement=False, exposure=None)
         verdicts: dict[str, Verdict] = {}
+        # Poses before view dependence: there are two pilots, and wrong poses cost more.
         arms: dict[str, dict[bool, dict[str, Any]]] = {
             "background": {True: {"unbounded": True}, False: {"unbounded": False}},
             "exposure": {True: {"exposure": self.gains}, False: {"exposure": None}},
-            "view_dependence": {True: {"view_dependence": True}, False: {"view_dependence": False}},
             "pose_refinement": {True: {"pose_refinement": True}, False: {"pose_refinement": False}},
+            "view_dependence": {True: {"view_dependence": True}, False: {"view_dependence": False}},
         }
         for name, arm in arms.items():
             off, on = (replace(decisions, **arm[value]) for value in (False, True))
@@ -122,8 +123,9 @@ class _Study:
         if math.isinf(evidence.noise):
             return Verdict(default, evidence.words)
         if why := self._why_no_pilot():
-            return Verdict(default, f"{evidence.words}; not clear, and no pilot: {why}")
-        return self._piloted(name, off, on)
+            doubt = "costly" if costly else "not clear"
+            return Verdict(default, f"{evidence.words}; {doubt}, and no pilot: {why}")
+        return self._piloted(name, off, on, default)
 
     def _why_no_pilot(self) -> str | None:
         from stages.pilots import pilot_scene
@@ -136,14 +138,19 @@ class _Study:
             self.trial = pilot_scene(self.ingest, self.scene, self.progress)
         return "too few training photos" if self.trial is None else None
 
-    def _piloted(self, name: str, off: Decisions, on: Decisions) -> Verdict:
+    def _piloted(self, name: str, off: Decisions, on: Decisions, default: bool) -> Verdict:
+        from nerf.training import NonFinite
         from stages.pilots import run_pilot
 
         assert self.trial is not None
         self.pilots += 1
-        pilot = run_pilot(self.trial, off, on, self.config.pilot_steps, self.config.seed, self.progress)
+        words = self.evidence[name].words
+        try:
+            pilot = run_pilot(self.trial, off, on, self.config.pilot_steps, self.config.seed, self.progress)
+        except NonFinite as fault:
+            return Verdict(default, f"{words}; not clear, and the pilot diverged: {fault}")
         gain = f"a pilot gained {pilot.gain_db:+.2f} ± {pilot.noise_db:.2f} dB"
-        return Verdict(pilot.pays, f"{self.evidence[name].words}; {gain}", pilot)
+        return Verdict(pilot.pays, f"{words}; {gain}", pilot)
 
 
 def _entry(verdict: Verdict | None, evidence: "Evidence") -> dict[str, Any]:

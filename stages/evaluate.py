@@ -114,6 +114,8 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     images = examiner.score(scored, progress)
     metrics = _overall(images, len(test), examiner.downscale, notes, config.seed)
     metrics["background"] = examiner.painter.background.tolist()
+    metrics["exposure"] = "as the photos taken nearest by" if examiner.gains else None
+    metrics["poses_fitted"] = examiner.fits_poses
     write_json(folder / "metrics.json", metrics)
     facts = {key: metrics[key] for key in (*FIGURES, "verdict")}
     return StageResult(("metrics.json", "renders", "errors"), _line(metrics), facts=facts)
@@ -122,13 +124,15 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
 @dataclass(frozen=True)
 class Examiner:
     """Draws test views at 1/``downscale`` of the photos' size and compares them with what the camera saw, less what
-    masks ignore. ``gains`` are the exposures expected of photos by their names, where exposure is modelled."""
+    masks ignore. ``gains`` are the exposures expected of photos by their names, where exposure is modelled;
+    ``fits_poses``: the second score has the photo's pose fitted, too, for poses were refined in training."""
 
     scene: "Scene"
     ingest: Path
     folder: Path
     painter: "Painter"
     gains: "dict[str, Tensor]"
+    fits_poses: bool
     downscale: float
 
     def score(self, views: "Sequence[View]", progress: Progress) -> list[dict[str, Any]]:
@@ -158,6 +162,9 @@ class Examiner:
         truth, used, rendering = self._photo(view), self.used(view), self._render(view, on_chunk)
         image = rendering.colour.clamp(0, 1)
         right, fitted = right_half_psnr(rendering, self.painter.background.cpu(), truth, used)
+        if self.fits_poses and right is not None:
+            moved = self._from_fitted_pose(view, rendering, truth, used)
+            _, fitted = right_half_psnr(moved, self.painter.background.cpu(), truth, used)
         height, width = truth.shape[:2]
         nearest = nearest_view(view, self.scene.of_split("train"))
         # The decoded file has an ASCII name that is unique up to its suffix; the photo's own may be anything.
@@ -177,6 +184,22 @@ class Examiner:
             "error": f"errors/{file}",
         }
 
+    def _from_fitted_pose(
+        self, view: "View", rendering: "Rendering", truth: "Tensor", used: "Tensor | None"
+    ) -> "Rendering":
+        """The view from where its left half says that it was taken."""
+        from nerf.effects.exposure import ExposedModel
+        from nerf.grid_field import GridField
+        from stages.right_halves import from_fitted_pose
+        from stages.training_data import view_rays
+
+        model = self.painter.model
+        field = model.model if isinstance(model, ExposedModel) else model
+        assert isinstance(field, GridField), "only with a grid field does evaluate fit poses"
+        rays = view_rays(self.scene, view, self.downscale)
+        painter = self._painter(view)
+        return painter.draw(from_fitted_pose(field, rays, rendering, self.painter.background.cpu(), truth, used))
+
     def _photo(self, view: "View") -> "Tensor":
         from stages.training_data import view_pixels
 
@@ -190,8 +213,10 @@ class Examiner:
     def _render(self, view: "View", on_chunk: Callable[[float], None]) -> "Rendering":
         from stages.training_data import view_rays
 
-        painter = self.painter.at_gain(self.gains[view.name]) if self.gains else self.painter
-        return painter.draw(view_rays(self.scene, view, self.downscale), on_chunk)
+        return self._painter(view).draw(view_rays(self.scene, view, self.downscale), on_chunk)
+
+    def _painter(self, view: "View") -> "Painter":
+        return self.painter.at_gain(self.gains[view.name]) if self.gains else self.painter
 
 
 def _examiner(config: Config, scene: "Scene", inputs: Inputs, folder: Path) -> Examiner:
@@ -202,8 +227,10 @@ def _examiner(config: Config, scene: "Scene", inputs: Inputs, folder: Path) -> E
     assert config.downscale is not None
     chosen = config.background if scene.has_alpha else None
     painter = load_painter(inputs["train"], BACKGROUNDS[chosen] if chosen else None)
-    gains = expected_gains(read_json(inputs["train"] / "field.json"), scene, scene.of_split("test"))
-    return Examiner(scene, inputs["ingest"], folder, painter, gains, config.downscale)
+    field = read_json(inputs["train"] / "field.json")
+    gains = expected_gains(field, scene, scene.of_split("test"))
+    fits_poses = "poses" in field and field["kind"] == "grid"
+    return Examiner(scene, inputs["ingest"], folder, painter, gains, fits_poses, config.downscale)
 
 
 def affordable(pixels: Sequence[int], budget: float) -> list[int]:

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from nerf.grid_field import GridField
-    from nerf.model import Rendering
     from nerf.ray_bank import RayBank
     from nerf.rays import Rays
     from nerf.scene import Scene
@@ -31,12 +30,13 @@ FEWEST_LEFT = 4  # and with fewer left to train on there is no pilot
 SEEDS = 3
 BATCH_SAMPLES = 1 << 13  # half the usual: a pilot has to be short, and is judged early
 CHUNKS = 4  # fixed, so that a pilot ends the same whatever the machine
-SURE = 2.0  # standard errors by which a gain must exceed 0
+SURE = 2.0  # standard errors by which a gain must exceed 0,
+LEAST_GAIN_DB = 0.1  # and this, which nobody sees
 
 
 class Pilot(NamedTuple):
-    """What switching an effect on gained on the photos kept back, in dB: mean and standard error over the seeds, and
-    the seconds it took. ``cost`` is the share by which it made training slower."""
+    """What switching an effect on gained on the photos kept back, in dB: mean and standard error over seeds and photos,
+    and the seconds it took. ``cost`` is the share by which it made training slower."""
 
     gain_db: float
     noise_db: float
@@ -46,7 +46,7 @@ class Pilot(NamedTuple):
     @property
     def pays(self) -> bool:
         """Whether the gain is more than its noise."""
-        return self.gain_db > SURE * self.noise_db
+        return self.gain_db > max(SURE * self.noise_db, LEAST_GAIN_DB)
 
 
 class _Photo(NamedTuple):
@@ -92,22 +92,30 @@ def pilot_scene(ingest: Path, scene: "Scene", progress: Progress) -> PilotScene 
 
 
 def run_pilot(trial: PilotScene, off: Decisions, on: Decisions, steps: int, seed: int, progress: Progress) -> Pilot:
-    """Train both arms for each seed and compare."""
-    started, gains, seconds = time.perf_counter(), [], [0.0, 0.0]
+    """Train both arms for each seed and compare. Raises NonFinite where an arm diverges."""
+    started, gains = time.perf_counter(), []
+    arms, seconds = {"off": off, "on": on}, {"off": 0.0, "on": 0.0}
     poses = off.pose_refinement != on.pose_refinement
+    _trained(trial, off, 1, seed)  # pays for kernels and memory
     for number in range(SEEDS):
-        scores = []
-        for index, arm in enumerate((off, on)):
-            progress.update(
-                f"pilot training {2 * number + index + 1} of {2 * SEEDS}", (2 * number + index) / (2 * SEEDS)
-            )
+        scores: dict[str, list[float]] = {}
+        for name in ("off", "on") if number % 2 else ("on", "off"):
+            done = (2 * number + len(scores)) / (2 * SEEDS)
+            progress.update(f"pilot training {2 * number + len(scores) + 1} of {2 * SEEDS}", done)
             trained = time.perf_counter()
-            field = _trained(trial, arm, steps, seed + number)
-            seconds[index] += time.perf_counter() - trained
-            scores.append(mean(_score(field, photo, poses, seed) for photo in trial.kept))
-        gains.append(scores[1] - scores[0])
-    noise = stdev(gains) / SEEDS**0.5
-    return Pilot(mean(gains), noise, seconds[1] / seconds[0] - 1, time.perf_counter() - started)
+            field = _trained(trial, arms[name], steps, seed + number)
+            seconds[name] += time.perf_counter() - trained
+            scores[name] = [_score(field, photo, poses, seed) for photo in trial.kept]
+        gains.append([with_it - without for with_it, without in zip(scores["on"], scores["off"], strict=True)])
+    cost = seconds["on"] / seconds["off"] - 1
+    return Pilot(mean(map(mean, gains)), _noise(gains), cost, time.perf_counter() - started)
+
+
+def _noise(gains: list[list[float]]) -> float:
+    """Standard error of the mean gain: the seeds' own, or the photos' where that is more."""
+    of_seeds = [mean(of_seed) for of_seed in gains]
+    of_photos = [mean(of_photo) for of_photo in zip(*gains, strict=True)]
+    return max(stdev(each) / len(each) ** 0.5 for each in (of_seeds, of_photos) if len(each) > 1)
 
 
 def _trained(trial: PilotScene, arm: Decisions, steps: int, seed: int) -> "GridField":
@@ -147,42 +155,16 @@ def _config(arm: Decisions, steps: int, device: str) -> "TrainConfig":
 
 def _score(field: "GridField", photo: _Photo, poses: bool, seed: int) -> float:
     """PSNR (dB) on the right half of a photo whose exposure (and pose) is fitted on its left half."""
-    from stages.right_halves import right_half_psnr
+    import torch
 
-    picture = _seen(field, photo.rays)
+    from nerf.rendering import render_image
+    from stages.right_halves import from_fitted_pose, right_half_psnr
+
+    black = torch.zeros(3)
+    picture = render_image(field, photo.rays, black)
     if poses:
-        picture = _seen(field, _moved(field, photo, picture, seed))
-    _, fitted = right_half_psnr(picture, _black(), photo.colours, photo.used)
+        rays = from_fitted_pose(field, photo.rays, picture, black, photo.colours, photo.used, seed)
+        picture = render_image(field, rays, black)
+    _, fitted = right_half_psnr(picture, black, photo.colours, photo.used)
     assert fitted is not None, "pilot_scene keeps no photo that has too few pixels"
     return fitted
-
-
-def _moved(field: "GridField", photo: _Photo, picture: "Rendering", seed: int) -> "Rays":
-    """The photo's rays from where its left half says that it was taken."""
-    import torch
-
-    from nerf.effects.exposure import fit_log_gain
-    from nerf.effects.exposures import Exposures
-    from nerf.effects.pose_fit import fit_pose
-    from nerf.rays import Rays
-    from stages.right_halves import halves
-
-    left, _ = halves(photo.colours, photo.used)
-    target = photo.colours[left]
-    exposure = Exposures(fit_log_gain(picture.colour[left], target)[None])
-    pose = fit_pose(field, Rays(*(part[left] for part in photo.rays)), target, _black(), exposure, seed)
-    flat = Rays(*(part.flatten(0, 1) for part in photo.rays))
-    moved = pose.forward(flat, torch.zeros(len(flat.near), dtype=torch.int64))
-    return Rays(*(part.view_as(whole) for part, whole in zip(moved, photo.rays, strict=True)))
-
-
-def _seen(field: "GridField", rays: "Rays") -> "Rendering":
-    from nerf.rendering import render_image
-
-    return render_image(field, rays, _black())
-
-
-def _black() -> "Tensor":
-    import torch
-
-    return torch.zeros(3)

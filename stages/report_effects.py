@@ -40,6 +40,7 @@ def _row(name: str, entry: dict[str, Any]) -> dict[str, Any]:
         "on": entry["on"],
         **{key: "–" if figure is None else f"{figure:.3g}{unit}" for key, figure in figures.items()},
         "pilot": "–" if gain is None else f"{gain:+.1f}" + ("" if noise is None else f" ± {noise:.1f}") + " dB",
-        "cost": duration(entry["seconds"]) if entry["seconds"] else "–",
+        "cost": "–" if entry["cost"] is None else f"{entry['cost']:+.0%} time",
+        "seconds": duration(entry["seconds"]) if entry["seconds"] else "–",
         "reason": entry["reason"],
     }

@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from nerf.grid_field import GridField
     from nerf.model import Rendering
+    from nerf.rays import Rays
 
 FEWEST_PIXELS = 64  # of a half
 
@@ -35,6 +37,33 @@ def right_half_psnr(
     fitted = behind[right] + expose(light[right], log_gain)
     raw, fitted = (mean_squared_error(c.clamp(0, 1), truth[right]) for c in (rendering.colour[right], fitted))
     return psnr(raw), psnr(fitted)
+
+
+def from_fitted_pose(
+    field: "GridField",
+    rays: "Rays",
+    rendering: "Rendering",
+    background: "Tensor",
+    truth: "Tensor",
+    used: "Tensor | None",
+    seed: int = 0,
+) -> "Rays":
+    """``rays`` (H, W) of a photo from where its left half says that it was taken, at the exposure that suits its
+    ``rendering`` along them; everything on the CPU."""
+    import torch
+
+    from nerf.effects.exposure import fit_log_gain, own_light
+    from nerf.effects.exposures import Exposures
+    from nerf.effects.pose_fit import fit_pose
+    from nerf.rays import Rays
+
+    left, _ = halves(truth, used)
+    light = own_light(rendering.colour[left], rendering.opacity[left], background)
+    exposure = Exposures(fit_log_gain(light, truth[left] - (rendering.colour[left] - light))[None])
+    pose = fit_pose(field, Rays(*(part[left] for part in rays)), truth[left], background, exposure, seed)
+    flat = Rays(*(part.flatten(0, 1) for part in rays))
+    moved = pose.forward(flat, torch.zeros(len(flat.near), dtype=torch.int64))
+    return Rays(*(part.view_as(whole) for part, whole in zip(moved, rays, strict=True)))
 
 
 def halves(truth: "Tensor", used: "Tensor | None") -> "tuple[Tensor, Tensor]":

@@ -1,9 +1,10 @@
 """Stage train: photos and cameras become a radiance field."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field, model_validator
+from tyro.conf import Suppress
 
 from stages.contract import Inputs, Progress, StageConfig, StageResult
 from stages.effect_decisions import read_decisions
@@ -81,10 +82,9 @@ class Config(StageConfig):
     background: Literal["white", "black", "random"] | None = Field(
         default=None, description="behind photos with transparency; none: random for grid, white for paper"
     )
-    contracted: bool | None = Field(default=None, description="fold in unbounded space; none: as stage effects decided")
-    view_dependence: bool | None = Field(
-        default=None, description="let colour depend on the direction; none: as stage effects decided"
-    )
+    # Stage effects decides these; no flag is offered for them.
+    contracted: Annotated[bool | None, Suppress] = Field(default=None, description="fold in unbounded space")
+    view_dependence: Annotated[bool | None, Suppress] = Field(default=None, description="colour knows the direction")
 
     backend: Literal["warp", "torch"] | None = Field(
         default=None, description="grid: its kernels; none: warp where they run, torch runs anywhere"
@@ -172,7 +172,7 @@ def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
         from stages.training_size import chosen_downscale, grid_size, rays_in_budget
 
         progress.update("trying how fast this machine trains")
-        rays = rays_in_budget(config, scene)
+        rays = rays_in_budget(config, scene, decisions)
         config = _filled(config, {"downscale": chosen_downscale(scene, rays)})
         if config.kind == "grid":
             config = _filled(config, grid_size(config, scene, rays))

@@ -5,11 +5,13 @@ import time
 from typing import TYPE_CHECKING
 
 from stages.device import compute_device
+from stages.effect_decisions import photo_parts
 from stages.training_setup import make_trainer
 
 if TYPE_CHECKING:
     from nerf.ray_bank import RayBank
     from nerf.scene import Scene
+    from stages.effect_decisions import Decisions
     from stages.train import Config
 
 LEAST_LONG_SIDE = 150  # pixels: below this a photo shows too little to judge anything by
@@ -54,19 +56,21 @@ def grid_size(config: "Config", scene: "Scene", rays: float) -> dict[str, int]:
     return {"levels": levels, "log2_rows": log2_rows, "finest": finest}
 
 
-def rays_in_budget(config: "Config", scene: "Scene") -> float:
+def rays_in_budget(config: "Config", scene: "Scene", decisions: "Decisions") -> float:
     """How many rays the run will draw: counted for a budget of steps, from measured speed for one of seconds."""
     if config.steps is not None:
         return config.steps * _rays_per_step(config)
     assert config.seconds is not None, "one of the two is given"
-    return config.seconds * rays_per_second(config, scene)
+    return config.seconds * rays_per_second(config, scene, decisions)
 
 
-def rays_per_second(config: "Config", scene: "Scene") -> float:
-    """Measured training speed: steps of a fresh field on a grey picture, for about a second."""
+def rays_per_second(config: "Config", scene: "Scene", decisions: "Decisions") -> float:
+    """Measured training speed: steps of a fresh field, with its effects, on a grey picture, for about a second."""
     device = compute_device()
     config = _timed(config, device)
-    trainer = make_trainer(config, scene, _grey_bank(scene).to(device), seed=0)
+    bank = _grey_bank(scene).to(device)
+    parts = photo_parts(decisions, scene.of_split("train")[:1], bank.device)
+    trainer = make_trainer(config, scene, bank, seed=0, photo_parts=parts)
     trainer.step(0, 0.0, 1.0)  # the first step pays for memory and kernels
     started, steps = time.perf_counter(), 0
     while steps == 0 or time.perf_counter() - started < TIMED_SECONDS:

@@ -10,9 +10,9 @@ from nerf.grid_field import GridField
 from nerf.randomness import generator
 from nerf.rays import Rays
 
-STEPS = 60
-RAYS = 1024  # looked at in a step
-RATE = 2e-3  # radians and scene units at first, falling exponentially to
+STEPS = 40
+RAYS = 256  # looked at in a step
+RATE = 3e-3  # radians and scene units at first, falling exponentially to
 FINAL_RATE = 0.1  # of it
 
 
@@ -30,7 +30,7 @@ def fit_pose(
     what the photo makes of colours; both it and the field stay as they are. The correction and ``photo_colours`` know
     a single view, 0.
     """
-    pose, random = RefinedPoses(1, target.device), generator(target.device, seed)
+    pose, random = RefinedPoses(torch.zeros(1, 3, device=target.device)), generator(target.device, seed)
     mean, square = ({name: torch.zeros_like(part) for name, part in pose.parameters.items()} for _ in range(2))
     for step in range(STEPS):
         pixel = torch.randint(len(target), (min(RAYS, len(target)),), generator=random, device=target.device)

@@ -2,8 +2,8 @@
 
 o' = o + t and d' = exp([w]) d: a rotation vector w (radians) about the camera's own centre and a shift t (scene units),
 in the scene's axes (Lin et al. 2021, BARF; SO(3) × R³ keeps the two apart where BARF's se(3) mixes them). On: 6 numbers
-per photo, and the gradient of every sample's place. What all cameras share is left to the field: it may turn and shift
-as a whole, which no photo can tell.
+per photo, and the gradient of every sample's place. What all cameras share is left to the field: it may turn, shift
+and grow as a whole, which no photo can tell.
 """
 
 import torch
@@ -18,13 +18,13 @@ RATE = 1e-3  # radians and scene units; 5 pixels of a phone's photo at a quarter
 
 
 class RefinedPoses:
-    """A :class:`nerf.effects.PhotoRays` that begins at the calibrated poses."""
+    """A :class:`nerf.effects.PhotoRays` that begins at the calibrated poses, whose cameras stand at ``centres``."""
 
     rate = RATE
 
-    def __init__(self, views: int, device: torch.device | str = "cpu") -> None:
-        self.turn = torch.zeros(views, 3, device=device)
-        self.shift = torch.zeros(views, 3, device=device)
+    def __init__(self, centres: Float[Tensor, "views 3"]) -> None:
+        self.turn, self.shift = torch.zeros_like(centres), torch.zeros_like(centres)
+        self.gauge = _gauge(centres)
 
     @property
     def parameters(self) -> dict[str, Float[Tensor, "views 3"]]:
@@ -32,9 +32,11 @@ class RefinedPoses:
         return {"turn": self.turn, "shift": self.shift}
 
     def settle(self) -> None:
-        """Take out the mean turn and shift."""
-        for each in (self.turn, self.shift):
-            each -= each.mean(0)
+        """Take out what moves all cameras like one body, or scales their places (to first order)."""
+        motion = torch.cat([self.turn, self.shift]).double().flatten()
+        shared = (self.gauge @ (self.gauge.T @ motion)).to(self.turn.dtype).view(2, -1, 3)
+        self.turn -= shared[0]
+        self.shift -= shared[1]
 
     def forward(self, rays: Rays, view: Int[Tensor, "rays"]) -> Rays:
         """Turn and shift rays with their cameras."""
@@ -52,3 +54,18 @@ class RefinedPoses:
             turn = self.turn.detach().requires_grad_()
             (of_turn,) = torch.autograd.grad(rotation_from_vector(turn), turn, of_rotation)
         return {"turn": of_turn, "shift": shift}
+
+
+def _gauge(centres: Float[Tensor, "views 3"]) -> Float[Tensor, "numbers gauge"]:
+    """An orthonormal basis of the motions of all cameras that a field can take up itself: shift, turn w with shift
+    w × o, scale with shift s o, of centres o about their mean. At most seven; fewer where cameras coincide."""
+    places = (centres - centres.mean(0)).double()
+    axes = torch.eye(3, dtype=torch.float64, device=centres.device)
+    still = torch.zeros_like(places)
+    motions = [torch.cat([still, axis.expand_as(places)]) for axis in axes]
+    motions += [
+        torch.cat([axis.expand_as(places), torch.linalg.cross(axis.expand_as(places), places)]) for axis in axes
+    ]
+    motions.append(torch.cat([still, places]))
+    basis, size, _ = torch.linalg.svd(torch.stack([motion.flatten() for motion in motions], 1), full_matrices=False)
+    return basis[:, size > 1e-9 * size[0]]

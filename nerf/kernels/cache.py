@@ -23,8 +23,9 @@ def raise_cache(
 
 
 def occupied_bits(thickness: Float[Tensor, "cache"], threshold: float) -> Int64[Tensor, "bricks"]:
-    """A bit for each cell thicker than ``threshold``."""
-    occupied = (thickness > threshold).view(-1, BRICK_CELLS)
+    """A bit for each cell thicker than ``threshold``, and for each whose thickness is not a number: left out, a cell
+    where the field is broken would look empty."""
+    occupied = ~(thickness <= threshold).view(-1, BRICK_CELLS)
     return (occupied.long() << torch.arange(BRICK_CELLS, device=thickness.device)).sum(-1)
 
 

@@ -68,7 +68,8 @@ def _cell(
     """The cell of each point and where in it the point is, in [0, 1]^3; an axis a row, which torch is fastest with."""
     scaled = points.T.contiguous() * resolution
     cell = scaled.floor().clamp_(0, resolution - 1)
-    return cell.int(), scaled - cell
+    # The second clamp acts on NaN alone, which has no cell: its features must be NaN, not an index error.
+    return cell.int().clamp_(0, resolution - 1), scaled - cell
 
 
 def _corner_rows(layout: GridLayout, level: int, cell: Int32[Tensor, "3 points"]) -> Int32[Tensor, "8 points"]:

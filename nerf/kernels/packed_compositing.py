@@ -86,10 +86,13 @@ def distortion(samples: Samples, weights: Float[Tensor, "samples"], lattice: Lat
 
     Positions m and lengths l are measured as the lattice does, dm = dt / max(t_1, t), where steps grow from t_1 on
     (beyond it m is log t + const), and as distances if they do not.
+
+    All in float64: m sum w_j - sum w_j m_j cancels for weights that stand close together far out.
     """
     m, lengths = _measure(samples, lattice)
-    before, moment_before = _sums_before(samples, torch.stack([weights, weights * m], -1)).unbind(-1)
-    return _ray_sums(samples, 2 * weights * (m * before - moment_before) + weights.square() * lengths / 3)
+    w = weights.double()
+    before, moment_before = _sums_before(samples, torch.stack([w, w * m], -1)).unbind(-1)
+    return _ray_sums(samples, 2 * w * (m * before - moment_before) + w.square() * lengths / 3).to(weights.dtype)
 
 
 def distortion_backward(
@@ -97,11 +100,12 @@ def distortion_backward(
 ) -> Float[Tensor, "samples"]:
     """Gradient of the weights: 2 sum_j w_j |m_i - m_j| + 2/3 w_i l_i."""
     m, lengths = _measure(samples, lattice)
-    both = torch.stack([weights, weights * m], -1)
+    w = weights.double()
+    both = torch.stack([w, w * m], -1)
     before, moment_before = _sums_before(samples, both).unbind(-1)
     behind, moment_behind = _sums_behind(samples, both).unbind(-1)
     apart = m * (before - behind) - moment_before + moment_behind
-    return grad.index_select(0, samples.ray) * (2 * apart + 2 / 3 * weights * lengths)
+    return grad.index_select(0, samples.ray) * (2 * apart + 2 / 3 * w * lengths).to(weights.dtype)
 
 
 class _Stopping(NamedTuple):
@@ -147,8 +151,8 @@ def _running(values: Float[Tensor, "samples *channels"]) -> Float[Tensor, "sampl
 
 
 def _measure(samples: Samples, lattice: Lattice) -> tuple[Float[Tensor, "samples"], Float[Tensor, "samples"]]:
-    """Positions and lengths in the measure of the lattice."""
-    t, dt = samples.t, samples.dt
+    """Positions and lengths in the measure of the lattice, float64."""
+    t, dt = samples.t.double(), samples.dt.double()
     if not lattice.cone:
         return t, dt
     relative = t / lattice.linear_until

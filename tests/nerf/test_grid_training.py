@@ -231,23 +231,31 @@ def test_exposures_are_learnt_where_they_are_modelled() -> None:
 
 
 def test_the_gradient_of_poses_is_that_of_the_loss() -> None:
-    poses = RefinedPoses(2)
+    poses = RefinedPoses(torch.eye(3)[:2])
     poses.turn += torch.tensor([[0.02, 0.01, -0.01], [0.0, -0.02, 0.03]])
     run = GridTrainer(GridField(FIELD, 0, reference), small_bank(), replace(TRAINER, background=(0.2, 0.9, 0.5)), poses)
     for step in range(60):
         run.step(step, 0.5)
-    by_hand, losses = run._part(7, 0.5, 128, 0).photos, []
-    for sign in (1, -1):
-        poses.shift[0, 0] += sign * 2e-3
-        losses.append(float(run._part(7, 0.5, 128, 0).loss))
-        poses.shift[0, 0] -= sign * 2e-3
-    assert float(by_hand["shift"][0, 0]) == pytest.approx((losses[0] - losses[1]) / 4e-3, rel=0.2)
-    assert set(by_hand) == {"turn", "shift"} and all(g.isfinite().all() for g in by_hand.values())
+    by_hand = run._part(7, 0.5, 128, 0).photos
+    assert set(by_hand) == {"turn", "shift"}
+
+    def difference(part: Tensor, view: int, axis: int) -> float:
+        losses = []
+        for sign in (1, -1):
+            part[view, axis] += sign * 2e-3
+            losses.append(float(run._part(7, 0.5, 128, 0).loss))
+            part[view, axis] -= sign * 2e-3
+        return (losses[0] - losses[1]) / 4e-3
+
+    for name, part in poses.parameters.items():
+        # across the line of sight: what a shift along it or a turn about it does is too little to measure like this
+        found = torch.tensor([[difference(part, view, axis) for axis in (0, 1)] for view in (0, 1)])
+        torch.testing.assert_close(by_hand[name][:, :2], found, rtol=0.2, atol=0.1 * float(found.abs().max()))
 
 
 def test_what_is_learnt_of_photos_is_part_of_the_state() -> None:
     def fresh() -> GridTrainer:
-        parts = RefinedPoses(2), Exposures(torch.tensor([[0.0, 0, 0], [0.5, 0.5, 0.5]]))
+        parts = RefinedPoses(torch.eye(3)[:2]), Exposures(torch.tensor([[0.0, 0, 0], [0.5, 0.5, 0.5]]))
         return GridTrainer(GridField(FIELD, 0, reference), small_bank(), TRAINER, *parts)
 
     whole, first, second = fresh(), fresh(), fresh()

@@ -154,7 +154,7 @@ def test_a_state_of_another_architecture_is_refused() -> None:
 
 def test_what_is_learnt_of_photos_is_trained_and_resumed() -> None:
     def fresh() -> PaperTrainer:
-        parts = RefinedPoses(2), Exposures(torch.tensor([[0.0, 0, 0], [0.5, 0.5, 0.5]]))
+        parts = RefinedPoses(torch.eye(3)[:2]), Exposures(torch.tensor([[0.0, 0, 0], [0.5, 0.5, 0.5]]))
         return PaperTrainer(PaperNerf(FIELD, seed=0), small_bank(), TRAINER, *parts)
 
     whole, first, second = fresh(), fresh(), fresh()

@@ -8,6 +8,7 @@ import pytest
 from nerf.evidence.evidence import Evidence
 from nerf.evidence.exposure import ExposureFit, fit_exposure
 from nerf.evidence.tracks import TrackColours
+from nerf.training import NonFinite
 from stages import effects, evidence, pilots
 from stages.effect_decisions import Decisions, read_decisions, write_decisions
 from stages.evidence import SceneEvidence
@@ -38,7 +39,9 @@ def decided(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tu
     write_tensors(inputs["normalise"] / "points.safetensors", {"xyz": np.zeros((0, 3), np.float32)})
     count = len(scene.of_split("train"))
 
-    def run(config: effects.Config, gain: float = 1.0, **given: Evidence) -> tuple[Decisions, dict, str, list[str]]:
+    def run(
+        config: effects.Config, gain: float = 1.0, pilot: Callable | None = None, **given: Evidence
+    ) -> tuple[Decisions, dict, str, list[str]]:
         told = {name: found(value) for name, value in CLEAR.items()} | given
         exposure = replace_gain(fit_exposure(TrackColours.empty(count)), 0.5)
         monkeypatch.setattr(evidence, "scene_evidence", lambda *_: SceneEvidence(told, exposure))
@@ -48,7 +51,7 @@ def decided(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tu
             tried.extend(name for name, value in vars(on).items() if value != getattr(off, name))
             return Pilot(gain, 0.1, 0.05, 3.0)
 
-        monkeypatch.setattr(pilots, "run_pilot", run_pilot)
+        monkeypatch.setattr(pilots, "run_pilot", pilot or run_pilot)
         folder = tmp_path / f"effects{len(list(tmp_path.iterdir()))}"
         folder.mkdir()
         result = effects.run(config, inputs, folder, Quiet())
@@ -107,8 +110,17 @@ def test_refining_poses_is_costly_and_always_has_to_show_its_gain(decided: Calla
 def test_there_are_two_pilots_at_most(decided: Callable) -> None:
     grey = {name: found(None) for name in ("exposure", "view_dependence", "pose_refinement")}
     decisions, table, _, tried = decided(effects.Config(), 1.0, **grey)
-    assert tried == ["exposure", "view_dependence"] and not decisions.pose_refinement
-    assert table["pose_refinement"]["reason"] == "one of two; not clear, and no pilot: 2 were made already"
+    assert tried == ["exposure", "pose_refinement"] and decisions.view_dependence
+    assert table["view_dependence"]["reason"] == "one of two; not clear, and no pilot: 2 were made already"
+
+
+def test_a_pilot_that_diverges_leaves_the_effect_as_it_would_be(decided: Callable) -> None:
+    def diverging(*_: object) -> Pilot:
+        raise NonFinite("loss", 3, {})
+
+    decisions, table, *_ = decided(effects.Config(), 1.0, diverging, exposure=found(None))
+    assert decisions.exposure is None
+    assert table["exposure"]["reason"].endswith("not clear, and the pilot diverged: the loss of step 3 is not finite")
 
 
 def test_without_pilots_the_grey_zone_stays_as_the_method_was_published(decided: Callable) -> None:

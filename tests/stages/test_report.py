@@ -276,13 +276,15 @@ def test_page_shows_both_scores_of_right_halves_with_what_they_mean(tmp_path: Pa
 
 def effect(on: bool, reason: str, **figures: Any) -> dict[str, Any]:
     """An entry of effects.json."""
-    nothing = dict.fromkeys(("statistic", "threshold", "noise", "pilot_gain_db", "pilot_noise_db"))
+    nothing = dict.fromkeys(("statistic", "threshold", "noise", "pilot_gain_db", "pilot_noise_db", "cost"))
     return nothing | {"on": on, "modelled": True, "unit": "", "seconds": 0.0, "reason": reason} | figures
 
 
 EFFECTS = {
     "background": effect(False, "no pixel looks beyond the region"),
-    "exposure": effect(True, "gains span 0.8 EV", statistic=0.8, threshold=0.05, noise=0.016, unit="EV", seconds=2.5),
+    "exposure": effect(
+        True, "gains span 0.8 EV", statistic=0.8, threshold=0.05, noise=0.016, unit="EV", seconds=2.5, cost=0.04
+    ),
     "view_dependence": effect(True, "it pays", pilot_gain_db=0.94, pilot_noise_db=0.21),
     "blur": effect(True, "<i>smeared</i>", modelled=False, statistic=4.0, threshold=2.5, unit="px"),
     "mirrors": effect(False, "none seen", modelled=False),
@@ -300,12 +302,22 @@ def test_page_shows_what_the_photos_call_for(tmp_path: Path, progress: Any):
     html, _ = _run(inputs, tmp_path / "out", progress)
     section = html[html.index("Effects of these photos") : html.index("Where the cameras stood")]
     cells = re.findall(r"<t[dh](?: [^>]*)?>(.*?)</t[dh]>", section)
-    rows = [cells[i : i + 8] for i in range(0, len(cells), 8)]
-    assert rows[0] == ["effect", "", "statistic", "threshold", "noise", "gain in trial", "costs", "why"]
+    rows = [cells[i : i + 9] for i in range(0, len(cells), 9)]
+    assert rows[0] == [
+        "effect",
+        "",
+        "statistic",
+        "threshold",
+        "noise",
+        "gain in pilot",
+        "costs when on",
+        "pilot took",
+        "why",
+    ]
     assert rows[1:] == [
-        ["exposure", "<b>on</b>", "0.8 EV", "0.05 EV", "0.016 EV", "–", "2.5 s", "gains span 0.8 EV"],
-        ["view dependence", "<b>on</b>", "–", "–", "–", "+0.9 ± 0.2 dB", "–", "it pays"],
-        ["background", "off", "–", "–", "–", "–", "–", "no pixel looks beyond the region"],
+        ["exposure", "<b>on</b>", "0.8 EV", "0.05 EV", "0.016 EV", "–", "+4% time", "2.5 s", "gains span 0.8 EV"],
+        ["view dependence", "<b>on</b>", "–", "–", "–", "+0.9 ± 0.2 dB", "–", "–", "it pays"],
+        ["background", "off", "–", "–", "–", "–", "–", "–", "no pixel looks beyond the region"],
     ]
     flags = re.findall(r"<li>(.*?)</li>", section)
     assert flags == [

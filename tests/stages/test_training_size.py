@@ -10,6 +10,7 @@ from nerf.scene import Camera, Scene
 from stages.train import Config
 from stages.training_data import scaled_size
 from stages.training_setup import grid_settings
+from stages.effect_decisions import Decisions
 from stages.training_size import LEAST_LONG_SIDE, chosen_downscale, grid_size, rays_in_budget, rays_per_second
 from tests.stages.photo_scene import photographed
 
@@ -77,12 +78,12 @@ PAPER = Config(
 def test_the_speed_is_measured_on_this_machine(config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("stages.training_size.TIMED_SECONDS", 0.05)
     _, scene = photographed(tmp_path, channels=4)
-    assert 10 < rays_per_second(config, scene) < 1e7
+    assert 10 < rays_per_second(config, scene, Decisions()) < 1e7
 
 
 def test_a_budget_of_steps_is_counted_not_timed(scene: Scene) -> None:
-    assert rays_in_budget(PAPER.model_copy(update={"steps": 5, "seconds": None}), scene) == 5 * 64
-    in_box, folded = (rays_in_budget(GRID.model_copy(update={"contracted": c}), scene) for c in (False, True))
+    assert rays_in_budget(PAPER.model_copy(update={"steps": 5, "seconds": None}), scene, Decisions()) == 5 * 64
+    in_box, folded = (rays_in_budget(GRID.model_copy(update={"contracted": c}), scene, Decisions()) for c in (False, True))
     assert 100 * 4096 / 100 < folded < in_box < 100 * 4096
 
 

@@ -59,6 +59,6 @@ def _occupied_bits(thickness: wp.array[float], threshold: float, bits: wp.array[
     brick = wp.tid()
     word = wp.int64(0)
     for cell in range(64):
-        if thickness[64 * brick + cell] > threshold:
+        if not (thickness[64 * brick + cell] <= threshold):
             word = word | (wp.int64(1) << wp.int64(cell))
     bits[brick] = word

@@ -90,7 +90,9 @@ def _grows_from(lattice: Lattice) -> float:
 
 @wp.func
 def _thickness(sigma: float, length: float):
-    return wp.min(sigma * length, _OPAQUE)
+    """At most OPAQUE. Not by wp.min, which takes NaN for missing: a density that is no number would look solid."""
+    tau = sigma * length
+    return wp.where(tau > _OPAQUE, _OPAQUE, tau)
 
 
 @wp.func

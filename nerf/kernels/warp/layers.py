@@ -33,6 +33,12 @@ def relu_backward(hidden: Float[Tensor, "samples 64"], grad: Float[Tensor, "samp
 
 
 @wp.func
+def _rectified(x: vec16):
+    """max(x, 0), and NaN where x is not a number: wp.max alone takes NaN for missing. 0 x changes no finite number."""
+    return wp.max(x, vec16(0.0)) + 0.0 * x
+
+
+@wp.func
 def _where_positive(hidden: vec16, grad: vec16):
     """The gradient where the layer let it through: hidden is zero or, twice multiplied, surely 1 or more."""
     one = vec16(1.0)
@@ -42,16 +48,15 @@ def _where_positive(hidden: vec16, grad: vec16):
 @wp.kernel
 def _add_ray_relu(starts: wp.array[int], of_ray: wp.array[vec16], hidden: wp.array[vec16]):
     ray = wp.tid()
-    zero = vec16(0.0)
     a = of_ray[4 * ray]
     b = of_ray[4 * ray + 1]
     c = of_ray[4 * ray + 2]
     d = of_ray[4 * ray + 3]
     for i in range(starts[ray], starts[ray + 1]):
-        hidden[4 * i] = wp.max(hidden[4 * i] + a, zero)
-        hidden[4 * i + 1] = wp.max(hidden[4 * i + 1] + b, zero)
-        hidden[4 * i + 2] = wp.max(hidden[4 * i + 2] + c, zero)
-        hidden[4 * i + 3] = wp.max(hidden[4 * i + 3] + d, zero)
+        hidden[4 * i] = _rectified(hidden[4 * i] + a)
+        hidden[4 * i + 1] = _rectified(hidden[4 * i + 1] + b)
+        hidden[4 * i + 2] = _rectified(hidden[4 * i + 2] + c)
+        hidden[4 * i + 3] = _rectified(hidden[4 * i + 3] + d)
 
 
 @wp.kernel

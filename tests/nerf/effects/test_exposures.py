@@ -25,7 +25,7 @@ def seen(colour: torch.Tensor | None = None, opacity: torch.Tensor | None = None
 
 def test_every_part_keeps_the_contract() -> None:
     colours: list[PhotoColours] = [AS_RENDERED, Exposures(GAINS)]
-    rays: list[PhotoRays] = [AS_GIVEN, RefinedPoses(3)]
+    rays: list[PhotoRays] = [AS_GIVEN, RefinedPoses(torch.zeros(3, 3))]
     assert [len(part.parameters) for part in (*colours, *rays)] == [0, 1, 0, 2]
 
 

@@ -14,12 +14,12 @@ VIEW = torch.tensor([0, 2, 2, 1, 0, 2])
 
 
 def test_a_correction_of_nothing_changes_no_bit() -> None:
-    same = RefinedPoses(3).forward(rays(), VIEW)
+    same = RefinedPoses(torch.zeros(3, 3)).forward(rays(), VIEW)
     assert all(torch.equal(a, b) for a, b in zip(same, rays(), strict=True))
 
 
 def test_rays_turn_and_shift_with_their_own_camera() -> None:
-    poses = RefinedPoses(3)
+    poses = RefinedPoses(torch.zeros(3, 3))
     poses.turn[2], poses.shift[1] = torch.tensor([0, 0, torch.pi / 2]), torch.tensor([1.0, 2, 3])
     moved, before = poses.forward(rays(), VIEW), rays()
     quarter = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
@@ -30,7 +30,7 @@ def test_rays_turn_and_shift_with_their_own_camera() -> None:
 
 
 def test_backward_is_the_derivative_of_forward() -> None:
-    poses, given = RefinedPoses(3), rays()
+    poses, given = RefinedPoses(torch.zeros(3, 3)), rays()
     random = torch.Generator().manual_seed(2)
     for part in poses.parameters.values():
         part += 0.3 * torch.randn(3, 3, generator=random)
@@ -43,8 +43,32 @@ def test_backward_is_the_derivative_of_forward() -> None:
     assert list(by_hand) == list(poses.parameters)
 
 
+def ring(count: int = 8) -> torch.Tensor:
+    angle = torch.arange(count) * 2 * torch.pi / count
+    return torch.stack([3 * angle.cos() + 1, 3 * angle.sin(), 0.2 * (5 * angle).sin()], -1)
+
+
 def test_what_all_cameras_share_is_taken_out() -> None:
-    poses = RefinedPoses(3)
-    poses.turn += torch.tensor([[1.0, 0, 0], [2, 0, 0], [3, 0, 3]])
+    poses, centres = RefinedPoses(ring()), ring()
+    turn, shift = torch.tensor([0.01, -0.02, 0.03]), torch.tensor([0.1, 0.2, -0.3])
+    poses.turn += turn
+    poses.shift += shift + torch.linalg.cross(turn.expand_as(centres), centres) + 0.05 * centres
     poses.settle()
-    torch.testing.assert_close(poses.turn, torch.tensor([[-1.0, 0, -1], [0, 0, -1], [1, 0, 2]]))
+    assert poses.turn.abs().max() < 1e-6 and poses.shift.abs().max() < 1e-6
+
+
+def test_what_is_a_cameras_own_stays() -> None:
+    poses = RefinedPoses(ring())
+    poses.turn[3] = torch.tensor([0.0, 0.02, 0])
+    poses.settle()
+    once = poses.turn.clone()
+    poses.settle()
+    torch.testing.assert_close(poses.turn, once)  # a projection
+    assert poses.turn[3, 1] > 0.01 and poses.turn[[0, 1, 2, 4, 5, 6, 7]].abs().max() < 0.01
+
+
+def test_cameras_in_one_place_have_a_gauge_too() -> None:
+    poses = RefinedPoses(torch.zeros(2, 3))
+    poses.turn += torch.tensor([[1.0, 0, 0], [3, 0, 3]])
+    poses.settle()
+    torch.testing.assert_close(poses.turn, torch.tensor([[-1.0, 0, -1.5], [1, 0, 1.5]]))

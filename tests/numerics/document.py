@@ -1,0 +1,104 @@
+"""docs/NUMERICS.md: the matrix as it was measured here, and where the rest of nerf/ is tested."""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from nerf.numerics.matrix import Row, figure, limit
+
+DOCUMENT = Path(__file__).parents[2] / "docs" / "NUMERICS.md"
+
+# What has no row. A module of nerf/ stands in a row, here, or fails a test.
+ELSEWHERE = {
+    "nerf/kernels/hidden_layer.py": "max(x + y, 0) and its mask, bit for bit: tests/nerf/kernels/test_warp.py; NaN "
+    "stays NaN: tests/numerics/test_not_a_number.py",
+    "nerf/kernels/cache.py": "comparisons and bits, exact: tests/nerf/kernels/test_cache.py; a cell that is no number "
+    "counts as occupied",
+    "nerf/waves.py": "cuts rays where the light is below 1e-3; the product of the waves' light is off by 6e-8 a wave: "
+    "tests/nerf/test_grid_field.py",
+    "nerf/grid_field.py": "puts rows together: tests/nerf/test_grid_field.py",
+    "nerf/density_cache.py": "σ times the lattice's step; the outermost cells, which reach to infinity, count half a "
+    "cell within: tests/nerf/test_grid_training.py",
+    "nerf/ray_bank.py": "bearings linear within a patch, of length 1/2 or more before they are divided by it: "
+    "tests/nerf/test_ray_bank.py",
+    "nerf/effects/exposure.py": "powers taken between powers, without light in between; value, gradient, extremes: "
+    "tests/nerf/effects/test_exposure.py",
+    "nerf/effects/exposures.py": "gains of a photo's rays: tests/nerf/effects/test_exposures.py",
+    "nerf/effects/rotations.py": "its series below 0.1 radians, against the matrix exponential from 0 to beyond π: "
+    "tests/nerf/effects/test_rotations.py",
+    "nerf/effects/poses.py": "turns and shifts of rays: tests/nerf/effects/test_poses.py",
+    "nerf/effects/pose_fit.py": "a search: tests/stages/test_pilots.py",
+    "nerf/pose_distance.py": "float64, ratios of distances: tests/nerf/test_pose_distance.py",
+    "nerf/rendering.py": "cuts pictures into chunks: tests/nerf/test_rendering.py",
+    "nerf/probe.py": "mean colour, PSNR: tests/nerf/test_probe.py",
+    "nerf/training.py": "sums of chunks; refuses what is not finite before the update: tests/nerf/test_training.py",
+    "nerf/grid_training.py": "likewise: tests/nerf/test_grid_training.py",
+    "nerf/schedule.py": "rates within the range they are given, in float64: tests/nerf/test_schedule.py",
+    "nerf/reconstruction.py": "float64, relative to the cameras' middle: tests/nerf/test_reconstruction.py",
+    "nerf/normalisation.py": "float64, the same for every similar reconstruction, 1e6 off the origin too: "
+    "tests/nerf/test_normalisation.py",
+    "nerf/region.py": "float64: tests/nerf/test_normalisation.py",
+    "nerf/up_vector.py": "float64: tests/nerf/test_up_vector.py",
+    "nerf/depth_range.py": "float64: tests/nerf/test_normalisation.py",
+    "nerf/alignment.py": "float64, refuses points on one line: tests/nerf/test_alignment.py",
+    "nerf/camera_paths.py": "float64: tests/nerf/test_camera_paths.py",
+    "nerf/shapes.py": "the synthetic scene, without gradient, against exact geometry: tests/nerf/test_shapes.py",
+    "nerf/solid_texture.py": "the synthetic scene: tests/nerf/test_solid_texture.py",
+    "nerf/synthetic.py": "the synthetic scene: tests/nerf/test_synthetic.py",
+}
+NO_FORMULA = {
+    "nerf/scene.py", "nerf/model.py", "nerf/parallel.py", "nerf/randomness.py", "nerf/kernels/reference.py",
+}  # fmt: skip
+# Measured as the rows of the functions they repeat, or measuring themselves.
+REPEATED = ("nerf/kernels/warp/", "nerf/numerics/")
+# Statistics in float64, each with its own noise: tests/nerf/evidence.
+STATISTICS = ("nerf/evidence/",)
+
+HEAD = """# Numerics
+
+How far each formula of `nerf/` is from the truth in float32, in value and gradient, on ordinary and on extreme input.
+The cases are in `nerf/numerics`; this page is written from them by `python -m tests.numerics`, `tests/numerics` holds
+them to the limits given here, and `pipeline doctor --selftest` measures them on your own machine.
+
+* **Errors** are the worst over all inputs tried, against float64 on the same float32 input: `itself`, as a share of the
+  true number (below 1.2e-38, where float32 has fewer digits, of that); `row`, of the largest true number of its ray or
+  point; `one`, absolute. Two figures are those of the two backends, torch / Warp. Limits are four or five times what
+  was measured; a test fails as well if an error is fifty times smaller than its limit: then nothing was compared, or
+  the limit says nothing.
+* **Finite**: every value and gradient of every input tried, else the error would be infinite.
+* **Gradients** are those the program uses, by autograd or by hand. All are checked against differences in float64
+  (`gradcheck`) as well. The references themselves are checked with 50 digits (`tests/numerics/test_references.py`).
+* **Laws** that hold for all input are in `tests/numerics/test_laws.py` and beside the formulas' other tests in
+  `tests/nerf`.
+* **NaN is never masked**: what is not a number stays so up to the loss, which refuses the step
+  (`tests/numerics/test_not_a_number.py`). No `nan_to_num`, no swallowed exception (`tests/test_architecture.py`); every
+  number that looks like an epsilon has a name and a reason (`tests/numerics/test_epsilons.py`).
+* **bfloat16 and float16** are used nowhere. Were matrix products to run in them, rendering, loss and everything below
+  would stay float32.
+"""
+
+
+def document(rows: Iterable[Row]) -> str:
+    """The whole page."""
+    rows = list(rows)
+    inputs = sum(next(iter(row.measured.values())).rows for row in rows)
+    table = [
+        "| formula | where | domain | what float32 could do | what the code does | inputs tried | value | gradient |",
+        "|---|---|---|---|---|---|---|---|",
+        *(f"| {' | '.join(_cells(row))} |" for row in rows),
+    ]
+    others = [f"* `{module}`: {words}." for module, words in ELSEWHERE.items()]
+    counts = f"{len(rows)} formulas, {inputs} rows of input."
+    return "\n".join([HEAD, counts, "", *table, "", "## Elsewhere", "", *others, ""])
+
+
+def _cells(row: Row) -> list[str]:
+    case, backends = row.case, row.measured.values()
+    tried = f"{case.tried} ({next(iter(backends)).rows})"
+    words = case.formula, f"`{case.where}`", case.domain, case.hazard, case.answer, tried
+    values = " / ".join(figure(measured.value) for measured in backends)
+    gradients = " / ".join(figure(measured.gradient) for measured in backends)
+    return [
+        *(text.replace("|", "\\|") for text in words),
+        f"{values} ({limit(case.value)})",
+        f"{gradients} ({limit(case.gradient)})" if case.gradient else "none",
+    ]

@@ -1,0 +1,43 @@
+"""``pipeline doctor --selftest``: the table is whole, and what is off is said and ends in exit code 1."""
+
+import pytest
+
+from nerf.numerics import matrix
+from nerf.numerics.matrix import CASES
+from pipeline import cli, doctor, selftest
+
+
+def test_every_formula_has_a_line_for_each_backend(capsys: pytest.CaptureFixture[str]) -> None:
+    assert selftest.numerical_matrix("cpu") == []
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "numerical self-test on cpu: worst errors in float32 against float64"
+    of_cases = [line for line in lines if line.startswith("  ok ")]
+    assert len(of_cases) == sum(2 if case.kernels else 1 for case in CASES) == len(lines) - 3
+    assert all(any(case.formula[:50] in line for line in of_cases) for case in CASES)
+    assert lines[-1].startswith(f"{len(CASES)} formulas, {len(CASES)} within their limits, ")
+
+
+def test_without_warp_torch_alone_is_measured(monkeypatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr("stages.backend._why_not_warp", lambda device: "it is not there")
+    monkeypatch.setattr(matrix, "CASES", [case for case in CASES if case.kernels][:1])
+    assert selftest.numerical_matrix("cpu") == []
+    assert " torch " in (out := capsys.readouterr().out) and " warp " not in out
+
+
+def test_what_is_off_is_said_and_the_program_ends_with_one(monkeypatch, capsys: pytest.CaptureFixture[str]) -> None:
+    case = next(case for case in CASES if "contraction" in case.formula)
+    off = case._replace(function=lambda backend, x: case.function(backend, x) * 1.001)
+    monkeypatch.setattr(matrix, "CASES", [case, off])
+    monkeypatch.setattr(doctor, "self_test", lambda device: [])
+    assert cli.run_command(["doctor", "--selftest"]) == 1
+    out = capsys.readouterr().out
+    assert f"problem: self-test: {case.formula} (nerf/contraction.py: contract) is off by more than its limit" in out
+    assert "\n  FAILED " in out and "2 formulas, 1 within their limits" in out
+
+
+def test_the_matrix_is_measured_only_if_asked_for(monkeypatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(doctor, "self_test", lambda device: [])
+    monkeypatch.setattr(doctor, "numerical_matrix", lambda device: ["the matrix was measured"])
+    assert cli.run_command(["doctor"]) == 0 and "matrix" not in capsys.readouterr().out
+    assert cli.run_command(["doctor", "--selftest"]) == 1
+    assert "problem: the matrix was measured" in capsys.readouterr().out

@@ -1,0 +1,108 @@
+"""Pilots on a synthetic scene: what they compare, and that they compare nothing else."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from nerf.effects.exposure import expose
+from nerf.effects.pose_fit import fit_pose
+from nerf.effects.poses import RefinedPoses
+from nerf.rendering import render_image
+from stages import pilots
+from stages.effect_decisions import Decisions, expected_gains, told_by_neighbours
+from stages.files import read_scene
+from stages.pilots import Pilot, PilotScene, pilot_scene, run_pilot
+from tests.effect_scenes import Effects, effect_scene
+from tests.stages.photo_scene import photographed
+from tests.synthetic_photos import Quiet
+
+PLAIN = Decisions(view_dependence=True, unbounded=False)
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    return effect_scene(tmp_path_factory.mktemp("scene"), Effects(alpha=True), views=14)
+
+
+@pytest.fixture(scope="module")
+def trial(inputs: dict[str, Path]) -> PilotScene:
+    made = pilot_scene(inputs["ingest"], read_scene(inputs["normalise"]), Quiet())
+    assert made is not None
+    return made
+
+
+def test_photos_are_kept_back_from_the_training_photos_alone(trial: PilotScene, inputs: dict[str, Path]) -> None:
+    given = read_scene(inputs["normalise"])
+    trained, kept = ({view.name for view in trial.scene.of_split(split)} for split in ("train", "test"))
+    assert kept and trained | kept == {view.name for view in given.of_split("train")} and not trained & kept
+    assert len(trial.kept) == len(kept) and len(trial.bank.near) == len(trained)
+
+
+def test_equal_arms_gain_exactly_nothing(trial: PilotScene) -> None:
+    pilot = run_pilot(trial, PLAIN, PLAIN, 3, 0, Quiet())
+    assert (pilot.gain_db, pilot.noise_db, pilot.pays) == (0.0, 0.0, False)
+
+
+def test_a_wrong_exposure_loses(trial: PilotScene) -> None:
+    names = [view.name for view in trial.scene.of_split("train")]
+    wrong = replace(PLAIN, exposure={name: [3.0 * (i % 2)] * 3 for i, name in enumerate(names)})
+    pilot = run_pilot(trial, wrong, PLAIN, 40, 0, Quiet())
+    assert 0.5 < pilot.gain_db < 30 and pilot.pays and pilot.seconds > 0
+
+
+def test_too_few_photos_make_no_pilot(tmp_path: Path) -> None:
+    inputs, scene = photographed(tmp_path, views=5)
+    assert pilot_scene(inputs["ingest"], scene, Quiet()) is None
+
+
+@pytest.mark.parametrize(
+    ("gain", "noise", "pays"), [(1.0, 0.4, True), (1.0, 0.6, False), (0.05, 0.0, False), (-1.0, 0.1, False)]
+)
+def test_what_pays_is_more_than_noise_and_than_nothing(gain: float, noise: float, pays: bool) -> None:
+    assert Pilot(gain, noise, 0.0, 1.0).pays is pays
+
+
+def test_noise_is_that_of_seeds_or_of_photos_whichever_is_more() -> None:
+    assert pilots._noise([[1.0, 1.0], [3.0, 3.0], [2.0, 2.0]]) == pytest.approx(1 / 3**0.5)
+    assert pilots._noise([[1.0, 3.0], [1.0, 3.0], [1.0, 3.0]]) == pytest.approx(1.0)
+
+
+def test_a_photos_pose_is_found_against_a_finished_field(trial: PilotScene) -> None:
+    field, photo = pilots._trained(trial, PLAIN, 150, 0), trial.kept[0]
+    rays = type(photo.rays)(*(part.flatten(0, 1) for part in photo.rays))
+    black, view = torch.zeros(3), torch.zeros(len(rays.near), dtype=torch.int64)
+    target = render_image(field, photo.rays, black).colour.flatten(0, 1)
+    wrong = RefinedPoses(torch.zeros(1, 3))
+    wrong.turn += torch.tensor([[0.02, -0.015, 0.0]])
+    found = fit_pose(field, wrong.forward(rays, view), target, black)
+    left = (found.forward(wrong.forward(rays, view), view).directions - rays.directions).norm(dim=-1).mean()
+    before = (wrong.forward(rays, view).directions - rays.directions).norm(dim=-1).mean()
+    assert 0 < left < 0.4 * before
+
+
+def test_the_exposure_expected_of_an_unseen_photo_is_its_neighbours(inputs: dict[str, Path]) -> None:
+    scene = read_scene(inputs["normalise"])
+    train, test = scene.of_split("train"), scene.of_split("test")
+    photos = {view.name: [0.1 * i, 0.0, -0.1] for i, view in enumerate(train)}
+    gains = expected_gains({"exposure": {"neutral": [0.0] * 3, "photos": photos}}, scene, test)
+    weights = told_by_neighbours(scene, test)
+    assert weights.shape == (len(test), len(train)) and set(gains) == {view.name for view in test}
+    for row, view in zip(weights, test, strict=True):
+        assert float(gains[view.name][0]) == pytest.approx(float(row @ (0.1 * torch.arange(len(train)))), abs=1e-6)
+        assert gains[view.name][1:].tolist() == pytest.approx([0.0, -0.1], abs=1e-6)
+    assert expected_gains({}, scene, test) == {}
+
+
+def test_the_scenes_photos_are_as_bright_as_they_say(tmp_path: Path) -> None:
+    """The helper itself: an exposure effect changes photos by gains within its range, and nothing else does."""
+    plain = effect_scene(tmp_path / "plain", Effects(), views=3)
+    exposed = effect_scene(tmp_path / "exposed", Effects(exposure_ev=1.0), views=3)
+    from stages.photos import load_pixels
+
+    for name in ("000.png", "001.png", "002.png"):
+        a, b = (torch.tensor(load_pixels(i["ingest"] / "images" / name, 240, 180)) / 255 for i in (plain, exposed))
+        middle = (a > 0.1) & (a < 0.6)
+        shown = {ev: (expose(a, torch.tensor([ev * 0.6931] * 3)) - b)[middle].abs().mean() for ev in (-1.0, 0.0, 1.0)}
+        assert middle.any() and shown[0.0] > 0.003 and min(shown.values()) < 0.35
