@@ -27,6 +27,8 @@ ORDER = (
     *("exposure", "view_dependence", "background", "pose_refinement", "lens"),  # modelled
     *("tone", "vignetting", "transients", "scale", "blur", "rolling_shutter", "participating_media"),  # seen
 )
+# What the published method has is left out only where that gains; the rest is added only where that does.
+PART_OF_THE_METHOD = ("view_dependence",)
 MOST_PILOTS = 2
 PILOT_STEPS = 150
 
@@ -116,10 +118,11 @@ class _Study:
         if asked != "auto":
             return Verdict(asked == "on", f"asked for; {evidence.words}")
         costly = name == "pose_refinement" and evidence.called_for is True
-        if evidence.called_for is not None and not costly:
+        # Highlights have no tracks: what is seen of view dependence is a lower bound, and too little of it no proof.
+        unproven = name in PART_OF_THE_METHOD and evidence.called_for is False
+        if evidence.called_for is not None and not (costly or unproven):
             return Verdict(evidence.called_for, evidence.words)
-        # Without a pilot an effect stays as it is in the published method: only the colour depends on the direction.
-        default = evidence.called_for or name == "view_dependence"
+        default = evidence.called_for is True or name in PART_OF_THE_METHOD
         if math.isinf(evidence.noise):
             return Verdict(default, evidence.words)
         if why := self._why_no_pilot():
@@ -150,7 +153,8 @@ class _Study:
         except NonFinite as fault:
             return Verdict(default, f"{words}; not clear, and the pilot diverged: {fault}")
         gain = f"a pilot gained {pilot.gain_db:+.2f} ± {pilot.noise_db:.2f} dB"
-        return Verdict(pilot.pays, f"{words}; {gain}", pilot)
+        stays = not pilot.hurts if name in PART_OF_THE_METHOD else pilot.pays
+        return Verdict(stays, f"{words}; {gain}", pilot)
 
 
 def _entry(verdict: Verdict | None, evidence: "Evidence") -> dict[str, Any]:

@@ -48,6 +48,11 @@ class Pilot(NamedTuple):
         """Whether the gain is more than its noise."""
         return self.gain_db > max(SURE * self.noise_db, LEAST_GAIN_DB)
 
+    @property
+    def hurts(self) -> bool:
+        """Whether leaving it out would gain as clearly."""
+        return -self.gain_db > max(SURE * self.noise_db, LEAST_GAIN_DB)
+
 
 class _Photo(NamedTuple):
     """A photo kept back: (height, width) rays, colours and which pixels count."""

@@ -14,6 +14,7 @@ from nerf.effects import GradRays
 from nerf.effects.rotations import rotation_from_vector
 from nerf.rays import Rays
 
+SAME_PLACE = 1e-9  # singular values below this share of the largest come from rounding: cameras that coincide
 RATE = 1e-3  # radians and scene units; 5 pixels of a phone's photo at a quarter of its size are about 1e-2
 
 
@@ -68,4 +69,4 @@ def _gauge(centres: Float[Tensor, "views 3"]) -> Float[Tensor, "numbers gauge"]:
     ]
     motions.append(torch.cat([still, places]))
     basis, size, _ = torch.linalg.svd(torch.stack([motion.flatten() for motion in motions], 1), full_matrices=False)
-    return basis[:, size > 1e-9 * size[0]]
+    return basis[:, size > SAME_PLACE * size[0]]

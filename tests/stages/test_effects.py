@@ -95,6 +95,15 @@ def test_a_pilot_decides_in_the_grey_zone_by_its_gain_against_its_noise(
     assert table["exposure"]["reason"] == f"one of two; a pilot gained {gain:+.2f} ± 0.10 dB"
 
 
+@pytest.mark.parametrize("called_for", [None, False])
+@pytest.mark.parametrize(("gain", "on"), [(0.5, True), (-0.15, True), (-0.5, False)])
+def test_view_dependence_is_left_out_only_where_that_gains(
+    decided: Callable, called_for: bool | None, gain: float, on: bool
+) -> None:
+    decisions, _, _, tried = decided(effects.Config(), gain, view_dependence=found(called_for))
+    assert tried == ["view_dependence"] and decisions.view_dependence is on
+
+
 def test_gains_go_to_training_by_the_names_of_its_photos(decided: Callable) -> None:
     decisions, *_ = decided(effects.Config(), exposure=found(True))
     assert set(decisions.exposure) == {f"{i}.png" for i in (1, 2, 3, 5, 6, 7)}

@@ -7,10 +7,10 @@ from hypothesis import strategies as st
 
 from nerf.grid_field import GridSettings
 from nerf.scene import Camera, Scene
+from stages.effect_decisions import Decisions
 from stages.train import Config
 from stages.training_data import scaled_size
 from stages.training_setup import grid_settings
-from stages.effect_decisions import Decisions
 from stages.training_size import LEAST_LONG_SIDE, chosen_downscale, grid_size, rays_in_budget, rays_per_second
 from tests.stages.photo_scene import photographed
 
@@ -83,7 +83,8 @@ def test_the_speed_is_measured_on_this_machine(config: Config, tmp_path: Path, m
 
 def test_a_budget_of_steps_is_counted_not_timed(scene: Scene) -> None:
     assert rays_in_budget(PAPER.model_copy(update={"steps": 5, "seconds": None}), scene, Decisions()) == 5 * 64
-    in_box, folded = (rays_in_budget(GRID.model_copy(update={"contracted": c}), scene, Decisions()) for c in (False, True))
+    spaces = [GRID.model_copy(update={"contracted": contracted}) for contracted in (False, True)]
+    in_box, folded = (rays_in_budget(config, scene, Decisions()) for config in spaces)
     assert 100 * 4096 / 100 < folded < in_box < 100 * 4096
 
 
