@@ -30,7 +30,7 @@ ORDER = (
 # What the published method has is left out only where that gains; the rest is added only where that does.
 PART_OF_THE_METHOD = ("view_dependence",)
 MOST_PILOTS = 2
-PILOT_STEPS = 150
+PILOT_STEPS = 100
 
 
 class Config(StageConfig):
