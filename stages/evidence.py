@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 
 PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")
+GAIN_DIGITS = 4  # of logarithms: a hundredth of what they are known to
 
 
 class SceneEvidence(NamedTuple):
@@ -33,6 +34,8 @@ def scene_evidence(
 ) -> SceneEvidence:
     """Everything that can be told without training. ``points`` is points.safetensors, ``uncertainty_px`` what
     registration.json says of each photo by its file (``images/…``)."""
+    import numpy as np
+
     from nerf.evidence.blur import blur_evidence
     from nerf.evidence.exposure import exposure_evidence, fit_exposure, tone_evidence
     from nerf.evidence.media import media_evidence
@@ -55,7 +58,10 @@ def scene_evidence(
         "participating_media": media_evidence(tracks, fit),
         "blur": blur_evidence(looked.gradients),
     }
-    return SceneEvidence(of | _geometric(ingest, scene, points, uncertainty_px), fit)
+    # What is trained begins with the gains: logarithms that differ in their last digits from processor to processor
+    # must not make another field.
+    gains = np.round(fit.log_gain, GAIN_DIGITS) + 0.0  # no -0
+    return SceneEvidence(of | _geometric(ingest, scene, points, uncertainty_px), fit._replace(log_gain=gains))
 
 
 def lens_evidence(registration: dict[str, Any]) -> "Evidence":
