@@ -3,13 +3,12 @@
 import numpy as np
 from jaxtyping import Float, Int
 
-from nerf.evidence.evidence import Evidence, judged, unknown
+from nerf.evidence.evidence import HUBER, OF_GAUSSIAN, Evidence, judged, unknown
 
 # An error of d pixels changes values by d times their step from pixel to pixel, which in usual photos at 1000 pixels is
 # 0.03 rms: HARM is 0.3 px, and called for is twice that.
 THRESHOLD_PX = 0.6
 FREE = 4  # shift, turn and zoom: what a wrong pose does to far and near points alike
-HUBER = 1.345
 ROUNDS = 10
 
 
@@ -49,7 +48,7 @@ def _similarity(
         root = np.sqrt(weight)
         solution = np.linalg.lstsq(design * root[:, None], target * root, rcond=None)[0]
         rest = target - design @ solution
-        scale = 1.4826 * float(np.median(np.abs(rest)))
+        scale = OF_GAUSSIAN * float(np.median(np.abs(rest)))
         size = np.abs(rest) / scale if scale > 0 else np.zeros_like(rest)
         weight = np.minimum(1, HUBER / np.maximum(size, HUBER))
     # the variance of a Huber estimate: E[psi²] / E[psi']²

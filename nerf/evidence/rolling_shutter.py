@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float, Int
 
-from nerf.evidence.evidence import Evidence, judged, unknown
+from nerf.evidence.evidence import OF_GAUSSIAN, Evidence, judged, unknown
 from nerf.evidence.poses import THRESHOLD_PX
 
 LEAST_MOTION_PX = 2.0  # per frame, below which rows have no time to differ
@@ -29,7 +29,7 @@ def rolling_shutter_evidence(
     if np.count_nonzero(kept) < 100 or np.count_nonzero(moving) < 3:
         return unknown("px", THRESHOLD_PX, "no video, or one that hardly moves", False)
     along = np.sum(residual[kept] * motion[view[kept]], axis=1) / speed[view[kept]]
-    limit = 4 * 1.4826 * float(np.median(np.abs(along)))
+    limit = 4 * OF_GAUSSIAN * float(np.median(np.abs(along)))
     along = np.clip(along, -limit, limit)  # false matches
     expected = (row[kept] - 0.5) * speed[view[kept]]
     size = float(np.sum(expected**2))

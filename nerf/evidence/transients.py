@@ -8,9 +8,9 @@ see them, this one should, and has another colour there. Both are looked at, wit
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from nerf.evidence.evidence import Evidence, judged, unknown
+from nerf.evidence.evidence import OF_GAUSSIAN, Evidence, judged, unknown
 from nerf.evidence.exposure import ExposureFit
-from nerf.evidence.tracks import TrackColours, linear_light
+from nerf.evidence.tracks import TrackColours, linear_light, srgb_values
 
 OUTLIER = 0.1  # sRGB value, rms of the channels: ten times what a good photo is off by
 FEWEST_POINTS = 20  # in a photo, for a share of them to mean something
@@ -39,7 +39,7 @@ def transients_evidence(tracks: TrackColours, fit: ExposureFit, expected: TrackC
         return unknown("share", THRESHOLD, "too few photos with enough points", False)
     share = np.bincount(looked.view, outlier, looked.views)[enough] / seen[enough]
     usual = float(np.median(share))
-    deviation = 1.4826 * float(np.median(np.abs(share - usual)))
+    deviation = OF_GAUSSIAN * float(np.median(np.abs(share - usual)))
     count_noise = np.sqrt(np.maximum(usual * (1 - usual), 1 / seen[enough]) / seen[enough])
     excess = share - usual
     odd = (excess > SURE * np.hypot(deviation, count_noise)) & (excess > LEAST_EXCESS)
@@ -70,8 +70,7 @@ def _differs(looked: TrackColours, usual: Float[np.ndarray, "points 3"], fit: Ex
     """Which observations are another colour than their point's, in the exposure of their photo. What is cut off at 0 or
     1 is compared where it was cut."""
     light = usual[looked.point] * np.exp(fit.log_gain[looked.view])
-    value = np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 0.0031308) ** (1 / 2.4) - 0.055)
-    difference = looked.colour - np.clip(value, 0, 1)
+    difference = looked.colour - np.clip(srgb_values(light), 0, 1)
     return np.sqrt(np.mean(difference**2, axis=1)) > OUTLIER
 
 
