@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 MOST = 200_000  # observations: gains of 500 photos are then known to a few thousandths
 MOST_EXPECTED = 1000  # places per photo where a point should be seen and was not matched
+MOST_LOOKED_AT = 20_000  # observations of photos nearby that tell these places
 WINDOW = 1 / 200  # of the photo's longer side: what training at usual sizes makes one pixel or two of
 LEAST_WINDOW, LARGEST_WINDOW = 5, 3.0  # pixels; times the usual window
 CLIPPED_SHARE = 0.1  # of a window's values beyond these are too many to trust its mean
@@ -147,12 +148,14 @@ def _expected(
     from nerf.evidence.transients import expected_places
     from stages.colmap.cameras import project
 
-    xyz = points["xyz"].astype(float)
+    xyz, views = points["xyz"].astype(float), scene.of_split("train")
+    centres = np.array([view.scene_from_camera[:, 3] for view in views]).reshape(-1, 3)
+    rank = np.unique(tracks.point, return_inverse=True)[1]  # ids may have been drawn in steps themselves
     seen, places = [], []
-    for number, view in enumerate(scene.of_split("train")):
-        other, pose = tracks.view != number, view.scene_from_camera
-        arguments = tracks.towards[other], tracks.distance[other], tracks.point[other], pose[:, 3], xyz
-        point = np.setdiff1d(expected_places(*arguments), tracks.point[~other])
+    for number, view in enumerate(views):
+        near, pose = _seen_nearby(tracks, rank, centres, number), view.scene_from_camera
+        arguments = tracks.towards[near], tracks.distance[near], tracks.point[near], pose[:, 3], xyz
+        point = np.setdiff1d(expected_places(*arguments), tracks.point[tracks.view == number])
         point = point[:: 1 + len(point) // MOST_EXPECTED]
         camera = scene.cameras[view.camera]
         xy = project(camera, (xyz[point] - pose[:, 3]) @ pose[:, :3]).reshape(-1, 2) if len(point) else np.zeros((0, 2))
@@ -161,6 +164,20 @@ def _expected(
         places.append(xy[inside])
     pairs, xy = np.concatenate([np.zeros((0, 2), int), *seen]), np.concatenate([np.zeros((0, 2)), *places])
     return _seen_from(scene, xyz, pairs[:, 0], pairs[:, 1], xy), xy
+
+
+def _seen_nearby(tracks: "TrackColours", rank: "np.ndarray", centres: "np.ndarray", number: int) -> "np.ndarray":
+    """The observations of other photos that may tell what a training photo should show: of photos not too far from it,
+    and of these, where they are many, those of an even share of the points, whose numbers without gaps are ``rank``."""
+    import numpy as np
+
+    from nerf.evidence.transients import NEAR_APART
+
+    apart = np.linalg.norm(centres - centres[number], axis=1)
+    apart[number] = np.inf
+    near = np.flatnonzero(tracks.distance > apart[tracks.view] / NEAR_APART)
+    step = -(-len(near) // MOST_LOOKED_AT)
+    return near[rank[near] % step == number % step] if step > 1 else near
 
 
 def _joined(one: "TrackColours", other: "TrackColours") -> "TrackColours":
@@ -208,9 +225,7 @@ def _look(ingest: Path, scene: "Scene", view: "View", places: _Places) -> "tuple
     return seen, _gradients(pixels)
 
 
-def _window_means(
-    pixels: "np.ndarray", used: "np.ndarray", corner: "np.ndarray", side: "np.ndarray"
-) -> "np.ndarray":
+def _window_means(pixels: "np.ndarray", used: "np.ndarray", corner: "np.ndarray", side: "np.ndarray") -> "np.ndarray":
     """(n, 5) as :func:`_look` gives them, of square windows that lie in the photo whole.
 
     Sums over windows are differences of the sums from the photo's corner (Crow 1984), one plane after another, so

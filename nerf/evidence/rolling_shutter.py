@@ -47,8 +47,8 @@ def rolling_shutter_evidence(
 def motion_to_next(
     xy: Float[np.ndarray, "k 2"], point: Int[np.ndarray, "k"], view: Int[np.ndarray, "k"], views: int
 ) -> Float[np.ndarray, "views 2"]:
-    """How far the picture moves from a frame to the next one, in the pixels of ``xy``: the median over the points that both see; NaN for the
-    last one, and where they share fewer than ten."""
+    """How far the picture moves from a frame to the next one, in the pixels of ``xy``: the median over the points that
+    both see; NaN for the last one, and where they share fewer than ten."""
     motion = np.full((views, 2), np.nan)
     of_view = [np.flatnonzero(view == number) for number in range(views)]
     for number in range(views - 1):

@@ -21,6 +21,8 @@ LEAST_EXCESS = 0.05  # of a photo's points: less is an edge that is missed by a 
 # surfaces that hide each other are expected wrongly: one percent of all points is beyond doubt.
 THRESHOLD = 0.01
 NEAR_DEG, NEAR_RATIO = 10.0, 1.3  # photos so close to each other hide the same points, but for few
+# Cosine law: two such photos are no farther from each other than by this part of either's distance to the point.
+NEAR_APART = float(np.sqrt(1 + NEAR_RATIO**2 - 2 * NEAR_RATIO * np.cos(np.radians(NEAR_DEG))))
 
 
 def transients_evidence(tracks: TrackColours, fit: ExposureFit, expected: TrackColours | None) -> Evidence:
@@ -82,11 +84,11 @@ def expected_places(
     position: Float[np.ndarray, "points 3"],
 ) -> Int[np.ndarray, "m"]:
     """The points that a camera at ``centre`` should see, because two photos from nearly there do: within NEAR_DEG of
-    its direction, at a distance that differs by at most NEAR_RATIO. Observations are those of the other photos."""
-    offset = centre - position
-    length = np.linalg.norm(offset, axis=1)
-    offset = offset / np.maximum(length, np.finfo(float).tiny)[:, None]
-    close = np.sum(towards * offset[point], axis=1) > np.cos(np.radians(NEAR_DEG))
-    ratio = distance / np.maximum(length[point], np.finfo(float).tiny)
+    its direction, at a distance that differs by at most NEAR_RATIO. Observations are those of the other photos; what a
+    photo farther away than NEAR_APART of its ``distance`` sees may be left out before."""
+    offset = centre - position[point]
+    length = np.maximum(np.linalg.norm(offset, axis=1), np.finfo(float).tiny)
+    close = np.sum(towards * offset, axis=1) > np.cos(np.radians(NEAR_DEG)) * length
+    ratio = distance / length
     close &= (ratio < NEAR_RATIO) & (ratio > 1 / NEAR_RATIO)
     return np.flatnonzero(np.bincount(point[close], minlength=len(position)) >= 2)

@@ -15,7 +15,6 @@ from jaxtyping import Bool, Float, Int
 
 from nerf.evidence.tracks import within_groups
 
-
 EXACT = 1e-12  # of a residual, beside the right-hand side
 
 

@@ -4,8 +4,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 from PIL import Image
 
+import stages.track_colours
+from nerf.evidence import transients
 from nerf.evidence.exposure import EV
 from nerf.scene import Camera, Scene, View
 from stages.colmap.cameras import focal_and_centre
@@ -16,6 +19,7 @@ from stages.track_colours import (
     BRIGHTEST,
     CLIPPED_SHARE,
     DARKEST,
+    _expected,
     _window_means,
     look_at_photos,
     training_tracks,
@@ -199,6 +203,37 @@ def test_places_where_a_point_should_be_seen(tmp_path: Path, progress: SilentPro
     np.testing.assert_allclose(expected.colour[found][0], value(0)[point] / 255, atol=1e-9)
 
 
+def test_only_photos_nearby_are_asked_what_should_be_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    count, each = 60, 400  # photos all around; each point is seen by every second one of ten
+    poses = [pose_towards_origin(2 * np.pi * number / count) for number in range(count)]
+    scene = _scene([View(f"{n}.png", f"images/{n}.png", 0, pose, 2.0, 4.0, "train") for n, pose in enumerate(poses)])
+    draw = np.random.default_rng(0)
+    view = (draw.integers(0, count, (each, 1)) + np.arange(0, 10, 2)) % count
+    points = {
+        "xyz": draw.uniform(-0.5, 0.5, (each, 3)),
+        "view": view.ravel(),
+        "point": np.repeat(np.arange(each), 5),
+        "xy": np.zeros((5 * each, 2)),
+    }
+    tracks = training_tracks(scene, points)[0]
+    tracks = replace(tracks, point=2 * tracks.point)  # as where every second point was drawn
+    points["xyz"] = points["xyz"].repeat(2, axis=0)
+
+    def pairs() -> set[tuple[int, int]]:
+        expected = _expected(scene, points, tracks)[0]
+        return set(zip(expected.view.tolist(), expected.point.tolist(), strict=True))
+
+    near = pairs()
+    monkeypatch.setattr(transients, "NEAR_APART", 100.0)
+    assert pairs() == near and len(near) > 1000
+    monkeypatch.setattr(stages.track_colours, "MOST_LOOKED_AT", 300)
+    some = pairs()
+    # whole points are drawn, other ones for every photo
+    assert some < near and 0.05 < len(some) / len(near) < 0.3
+    assert {view for view, _ in some} == set(range(count))
+    assert len({point for _, point in some}) > 0.5 * len({point for _, point in near})
+
+
 def test_without_points_only_the_photos_are_looked_at(tmp_path: Path, progress: SilentProgress) -> None:
     scene, points = photographed_points(tmp_path)
     looked = look_at_photos(tmp_path, scene, without_points(points), progress)
@@ -228,6 +263,8 @@ def test_all_evidence_of_a_scene(tmp_path: Path, progress: SilentProgress) -> No
     assert found.of["exposure"].called_for is True
     bright, dark = found.exposure.log_gain[[0, 2, 3, 5]], found.exposure.log_gain[[1, 4]]
     assert abs((bright.mean() - dark.mean()) / EV - 1.1) < 0.25  # 0.7 of an sRGB value is about half of the light
+    # the last digits of a logarithm depend on the processor, and what is trained begins with these
+    assert np.array_equal(found.exposure.log_gain, np.round(found.exposure.log_gain, 4))
     assert found.of["pose_refinement"].called_for is False
     assert found.of["rolling_shutter"].words == "no video, or one that hardly moves: nothing known"
     for name, evidence in found.of.items():
