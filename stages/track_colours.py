@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 MOST = 200_000  # observations: gains of 500 photos are then known to a few thousandths
 MOST_EXPECTED = 1000  # places per photo where a point should be seen and was not matched
-MOST_LOOKED_AT = 20_000  # observations of photos nearby that tell these places
+MOST_LOOKED_AT = 12_000_000  # observations of photos nearby that tell these places, for all photos: two seconds
 WINDOW = 1 / 200  # of the photo's longer side: what training at usual sizes makes one pixel or two of
 LEAST_WINDOW, LARGEST_WINDOW = 5, 3.0  # pixels; times the usual window
 CLIPPED_SHARE = 0.1  # of a window's values beyond these are too many to trust its mean
@@ -176,7 +176,7 @@ def _seen_nearby(tracks: "TrackColours", rank: "np.ndarray", centres: "np.ndarra
     apart = np.linalg.norm(centres - centres[number], axis=1)
     apart[number] = np.inf
     near = np.flatnonzero(tracks.distance > apart[tracks.view] / NEAR_APART)
-    step = -(-len(near) // MOST_LOOKED_AT)
+    step = -(-len(near) * len(centres) // MOST_LOOKED_AT)
     return near[rank[near] % step == number % step] if step > 1 else near
 
 
