@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
 
 PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")
+REFERENCE_PX = 1000  # the longer side, as nerf/evidence/poses.py says in its unit
+GAIN_DIGITS = 4  # of logarithms: a hundredth of what they are known to
 
 
 class SceneEvidence(NamedTuple):
@@ -33,6 +35,8 @@ def scene_evidence(
 ) -> SceneEvidence:
     """Everything that can be told without training. ``points`` is points.safetensors, ``uncertainty_px`` what
     registration.json says of each photo by its file (``images/…``)."""
+    import numpy as np
+
     from nerf.evidence.blur import blur_evidence
     from nerf.evidence.exposure import exposure_evidence, fit_exposure, tone_evidence
     from nerf.evidence.media import media_evidence
@@ -55,31 +59,39 @@ def scene_evidence(
         "participating_media": media_evidence(tracks, fit),
         "blur": blur_evidence(looked.gradients),
     }
-    return SceneEvidence(of | _geometric(ingest, scene, points, uncertainty_px), fit)
+    # What is trained begins with the gains: logarithms that differ in their last digits from processor to processor
+    # must not make another field.
+    gains = np.round(fit.log_gain, GAIN_DIGITS) + 0.0  # no -0
+    return SceneEvidence(of | geometric_evidence(ingest, scene, points, uncertainty_px), fit._replace(log_gain=gains))
 
 
 def lens_evidence(registration: dict[str, Any]) -> "Evidence":
     """The choice that stage sfm made by held-out reprojection error, shown beside the others."""
     from nerf.evidence.evidence import Evidence, unknown
 
-    chosen = [row for row in registration.get("camera_models") or [] if row["chosen"]]
+    rows = registration.get("camera_models") or []
+    chosen = [row for row in rows if row["chosen"]]
     if not chosen:
-        return unknown("px", 0.0, "the cameras were given", False)
-    simplest = {row["group"]: row for row in reversed(registration["camera_models"])}
-    gains = [simplest[row["group"]]["held_out_px"] - row["held_out_px"] for row in chosen]
-    models = ", ".join(sorted({row["model"] for row in chosen}))
-    noise = max(row["noise_px"] for row in chosen)
-    words = f"{models}: held-out error {max(gains):.2g} px below that of the simplest candidate"
-    return Evidence(max(gains), "px", noise, noise, any(row["model"] not in PINHOLES for row in chosen), words)
+        given = registration.get("source") == "import"
+        why = "no candidate makes a sound camera" if rows else "too few points to compare camera models"
+        return unknown("px", float("inf"), "the cameras were given" if given else why, False)
+    # candidates come from the simplest on; a simple one that was not sound has no figure
+    simplest = {row["group"]: row["held_out_px"] for row in reversed(rows) if row["held_out_px"] is not None}
+    gained = sorted(((simplest[row["group"]] - row["held_out_px"], row) for row in chosen), key=lambda pair: -pair[0])
+    (most, first), *others = gained
+    words = f"{first['model']}: held-out error {most:.2g} px below that of the simplest candidate"
+    words += "".join(f", {row['model']}: {gain:.2g} px" for gain, row in others)
+    noise = first["noise_px"]
+    return Evidence(most, "px", noise, noise, any(row["model"] not in PINHOLES for row in chosen), words)
 
 
-def _geometric(
+def geometric_evidence(
     ingest: Path,
     scene: "Scene",
     points: "Mapping[str, np.ndarray]",
     uncertainty_px: Mapping[str, float | None],
 ) -> "dict[str, Evidence]":
-    """What is told by places alone."""
+    """What is told by places alone. Errors are laid on photos of REFERENCE_PX, for which thresholds are derived."""
     import numpy as np
 
     from nerf.evidence.background import background_evidence, untracked_share
@@ -90,9 +102,11 @@ def _geometric(
     xy, view, point, residual = training_residuals(scene, points)
     size = np.array([[scene.cameras[one.camera].width, scene.cameras[one.camera].height] for one in views], float)
     stated = np.array([uncertainty_px.get(one.file) for one in views], float)  # None becomes NaN
+    usual = REFERENCE_PX / size.max(axis=1)
+    residual, stated = residual * usual[view, None], stated * usual
     motion = np.full((len(views), 2), np.nan)
     if _is_video(ingest, [one.file for one in views]):
-        motion = motion_to_next(xy, point, view, len(views))
+        motion = motion_to_next(xy * usual[view, None], point, view, len(views))
     untracked = untracked_share(xy / size[view], view, len(views))
     return {
         "background": background_evidence(points["xyz"].astype(float), point, scene.has_alpha, untracked),

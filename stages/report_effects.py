@@ -10,7 +10,6 @@ ADVICE = {
     "tone": "Turn off automatic contrast, HDR and filters, or develop all photos with one curve.",
     "rolling_shutter": "Take photos standing still in place of a video, or move the camera slowly.",
     "participating_media": "Wait for clear air: haze, smoke and water are taken for parts of the scene.",
-    "mirrors": "Cover mirrors and large panes, or mask them out: what they show is taken for a room behind them.",
     "transients": "Mask out what moves, or leave out the photos that show it.",
     "vignetting": "Close the aperture, or correct the vignetting before ingest.",
     "scale": "Keep a similar distance, or add photos at the distances in between.",

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 MOST = 200_000  # observations: gains of 500 photos are then known to a few thousandths
 MOST_EXPECTED = 1000  # places per photo where a point should be seen and was not matched
+MOST_LOOKED_AT = 12_000_000  # observations of photos nearby that tell these places, for all photos: two seconds
 WINDOW = 1 / 200  # of the photo's longer side: what training at usual sizes makes one pixel or two of
 LEAST_WINDOW, LARGEST_WINDOW = 5, 3.0  # pixels; times the usual window
 CLIPPED_SHARE = 0.1  # of a window's values beyond these are too many to trust its mean
@@ -45,18 +46,13 @@ class _Places(NamedTuple):
     window: "np.ndarray"
 
 
-def track_colours(
-    ingest: Path, scene: "Scene", points: "Mapping[str, np.ndarray]", progress: Progress, most: int = MOST
-) -> "TrackColours":
-    """The colours of at most ``most`` observations of the training photos, whole tracks evenly drawn; ``points`` is
-    points.safetensors of normalise. Windows that a mask, transparency or the photo's edge cuts are left out."""
-    return look_at_photos(ingest, scene, points, progress, most).tracks
-
-
 def look_at_photos(
     ingest: Path, scene: "Scene", points: "Mapping[str, np.ndarray]", progress: Progress, most: int = MOST
 ) -> PhotoEvidence:
-    """All that is read off the pixels of the training photos, each decoded once; test photos are not looked at."""
+    """All that is read off the pixels of the training photos, each decoded once; test photos are not looked at.
+
+    Tracks are at most ``most`` observations, whole tracks evenly drawn; ``points`` is points.safetensors of normalise.
+    Windows that a mask, transparency or the photo's edge cuts are left out."""
     import numpy as np
 
     views = scene.of_split("train")
@@ -152,12 +148,14 @@ def _expected(
     from nerf.evidence.transients import expected_places
     from stages.colmap.cameras import project
 
-    xyz = points["xyz"].astype(float)
+    xyz, views = points["xyz"].astype(float), scene.of_split("train")
+    centres = np.array([view.scene_from_camera[:, 3] for view in views]).reshape(-1, 3)
+    rank = np.unique(tracks.point, return_inverse=True)[1]  # ids may have been drawn in steps themselves
     seen, places = [], []
-    for number, view in enumerate(scene.of_split("train")):
-        other, pose = tracks.view != number, view.scene_from_camera
-        arguments = tracks.towards[other], tracks.distance[other], tracks.point[other], pose[:, 3], xyz
-        point = np.setdiff1d(expected_places(*arguments), tracks.point[~other])
+    for number, view in enumerate(views):
+        near, pose = _seen_nearby(tracks, rank, centres, number), view.scene_from_camera
+        arguments = tracks.towards[near], tracks.distance[near], tracks.point[near], pose[:, 3], xyz
+        point = np.setdiff1d(expected_places(*arguments), tracks.point[tracks.view == number])
         point = point[:: 1 + len(point) // MOST_EXPECTED]
         camera = scene.cameras[view.camera]
         xy = project(camera, (xyz[point] - pose[:, 3]) @ pose[:, :3]).reshape(-1, 2) if len(point) else np.zeros((0, 2))
@@ -166,6 +164,20 @@ def _expected(
         places.append(xy[inside])
     pairs, xy = np.concatenate([np.zeros((0, 2), int), *seen]), np.concatenate([np.zeros((0, 2)), *places])
     return _seen_from(scene, xyz, pairs[:, 0], pairs[:, 1], xy), xy
+
+
+def _seen_nearby(tracks: "TrackColours", rank: "np.ndarray", centres: "np.ndarray", number: int) -> "np.ndarray":
+    """The observations of other photos that may tell what a training photo should show: of photos not too far from it,
+    and of these, where they are many, those of an even share of the points, whose numbers without gaps are ``rank``."""
+    import numpy as np
+
+    from nerf.evidence.transients import NEAR_APART
+
+    apart = np.linalg.norm(centres - centres[number], axis=1)
+    apart[number] = np.inf
+    near = np.flatnonzero(tracks.distance > apart[tracks.view] / NEAR_APART)
+    step = -(-len(near) * len(centres) // MOST_LOOKED_AT)
+    return near[rank[near] % step == number % step] if step > 1 else near
 
 
 def _joined(one: "TrackColours", other: "TrackColours") -> "TrackColours":
@@ -206,25 +218,44 @@ def _look(ingest: Path, scene: "Scene", view: "View", places: _Places) -> "tuple
     if view.mask:
         used = used & load_mask(ingest / view.mask, width, height)
     seen = np.full((len(places.xy), 5), np.nan)
-    for side in np.unique(places.window):
-        of_size = np.flatnonzero(places.window == side)
-        corner = np.floor(places.xy[of_size]).astype(int) - side // 2
-        whole = ((corner >= 0) & (corner + side <= [width, height])).all(axis=1)
-        seen[of_size[whole]] = _window_means(pixels, used, corner[whole], int(side))
+    corner = np.floor(places.xy).astype(int) - places.window[:, None] // 2
+    whole = ((corner >= 0) & (corner + places.window[:, None] <= [width, height])).all(axis=1)
+    if whole.any():
+        seen[whole] = _window_means(pixels, used, corner[whole], places.window[whole])
     return seen, _gradients(pixels)
 
 
-def _window_means(pixels: "np.ndarray", used: "np.ndarray", corner: "np.ndarray", side: int) -> "np.ndarray":
-    """(n, 5) as :func:`_look` gives them, of square windows that lie in the photo whole."""
+def _window_means(pixels: "np.ndarray", used: "np.ndarray", corner: "np.ndarray", side: "np.ndarray") -> "np.ndarray":
+    """(n, 5) as :func:`_look` gives them, of square windows that lie in the photo whole.
+
+    Sums over windows are differences of the sums from the photo's corner (Crow 1984), one plane after another, so
+    neither time nor memory grows with the windows. All are of whole numbers below 2^53, and exact.
+    """
+    import cv2
     import numpy as np
 
-    x = corner[:, 0, None] + np.tile(np.arange(side), side)
-    y = corner[:, 1, None] + np.repeat(np.arange(side), side)
-    window = pixels[y, x, :3]
-    clipped = ((window <= DARKEST) | (window >= BRIGHTEST)).mean(axis=1).max(axis=1) > CLIPPED_SHARE
-    texture = window.mean(axis=2).std(axis=1) / 255
-    result = np.column_stack([window.mean(axis=1) / 255, clipped, texture])
-    result[~used[y, x].all(axis=1)] = np.nan
+    left, top = corner.T
+    right, bottom = left + side, top + side
+    area = side.astype(float) ** 2
+
+    def summed(plane: "np.ndarray") -> "np.ndarray":
+        upto = cv2.integral(plane, sdepth=cv2.CV_64F)
+        return upto[bottom, right] - upto[bottom, left] - upto[top, right] + upto[top, left]
+
+    result = np.empty((len(corner), 5))
+    clipped = np.zeros(len(corner), bool)
+    grey = np.zeros(pixels.shape[:2], np.float32)  # three times, a whole number
+    for channel in range(3):
+        plane = cv2.extractChannel(pixels, channel)
+        result[:, channel] = summed(plane) / (255 * area)
+        beyond = ((plane <= DARKEST) | (plane >= BRIGHTEST)).view(np.uint8)
+        clipped |= summed(beyond) > CLIPPED_SHARE * area
+        grey += plane
+    grey_sum = summed(grey)
+    grey_squares = summed(np.multiply(grey, grey, out=grey))
+    result[:, 3] = clipped
+    result[:, 4] = np.sqrt(area * grey_squares - grey_sum**2) / (area * 3 * 255)
+    result[summed(used.view(np.uint8)) < area] = np.nan
     return result
 
 

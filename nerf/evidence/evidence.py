@@ -14,6 +14,8 @@ HARM = 0.0085  # rms error in sRGB values that costs 0.3 dB at 30 dB: sqrt(1e-3 
 VALUE_PER_LOG_LIGHT = 0.25
 SURE = 5.0  # times its noise: what is called for is not noise in any of many scenes, photos and channels
 GREY = 2.0  # the grey zone: from the threshold down to this part of it
+HUBER = 1.345  # deviations, beyond which what is left pulls no harder: 95 % of the efficiency of plain means
+OF_GAUSSIAN = 1.4826  # the deviation of Gaussian noise by its median absolute value
 
 
 class Evidence(NamedTuple):

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from nerf.evidence.evidence import HARM, SURE, VALUE_PER_LOG_LIGHT, Evidence, judged, unknown
+from nerf.evidence.evidence import HARM, HUBER, OF_GAUSSIAN, SURE, VALUE_PER_LOG_LIGHT, Evidence, judged, unknown
 from nerf.evidence.tracks import TrackColours, log_light, log_noise, usable
 from nerf.evidence.two_way import TwoWay, two_way
 
@@ -18,7 +18,7 @@ EV = float(np.log(2.0))
 # A gain that is off by d in ln(light) makes an error of VALUE_PER_LOG_LIGHT d in sRGB values: HARM is d = 0.034,
 # 0.05 EV. Called for from twice that, when gains deviate by 0.1 EV.
 THRESHOLD_EV = 2 * HARM / VALUE_PER_LOG_LIGHT / EV
-HUBER, REDESCENDING = 1.345, 5.0  # in robust deviations: both lose some 5 % to plain means of normal noise
+REDESCENDING = 5.0  # in robust deviations: as HUBER loses some 5 % to plain means of normal noise
 HUBER_ROUNDS, MOST_ROUNDS = 8, 30
 CONVERGED = 1e-5
 LEAST_NOISE = 0.25 / 255  # of an sRGB value: no photo of 8 bits is more exact, and a perfect fit has no deviation
@@ -102,7 +102,7 @@ def _robust_weights(
         gain = layout.parts(y, weight)
         rest = layout.around_points(y - gain[layout.view], weight)
         size = np.abs(rest) / (sigma * np.sqrt(np.maximum(1 - layout.share(weight), 0.02)))
-        scale = max(1.4826 * float(np.median(size)), LEAST_NOISE)
+        scale = max(OF_GAUSSIAN * float(np.median(size)), LEAST_NOISE)
         size = size / scale
         if turn < HUBER_ROUNDS:
             weight = base * np.minimum(1, HUBER / np.maximum(size, HUBER))

@@ -3,13 +3,13 @@
 import numpy as np
 from jaxtyping import Float, Int
 
-from nerf.evidence.evidence import Evidence, judged, unknown
+from nerf.evidence.evidence import HUBER, OF_GAUSSIAN, Evidence, judged, unknown
 
+PX = "px at 1000"  # pixels of a photo whose longer side has 1000: what a full photo's are depends on the camera
 # An error of d pixels changes values by d times their step from pixel to pixel, which in usual photos at 1000 pixels is
 # 0.03 rms: HARM is 0.3 px, and called for is twice that.
 THRESHOLD_PX = 0.6
 FREE = 4  # shift, turn and zoom: what a wrong pose does to far and near points alike
-HUBER = 1.345
 ROUNDS = 10
 
 
@@ -49,7 +49,7 @@ def _similarity(
         root = np.sqrt(weight)
         solution = np.linalg.lstsq(design * root[:, None], target * root, rcond=None)[0]
         rest = target - design @ solution
-        scale = 1.4826 * float(np.median(np.abs(rest)))
+        scale = OF_GAUSSIAN * float(np.median(np.abs(rest)))
         size = np.abs(rest) / scale if scale > 0 else np.zeros_like(rest)
         weight = np.minimum(1, HUBER / np.maximum(size, HUBER))
     # the variance of a Huber estimate: E[psi²] / E[psi']²
@@ -62,7 +62,7 @@ def pose_evidence(
     power: Float[np.ndarray, "views"], expected: Float[np.ndarray, "views"], uncertainty_px: Float[np.ndarray, "views"]
 ) -> Evidence:
     """Root mean square over photos of the common residual, noise taken off; or of how uncertain poses are said to be,
-    where that is more. All in px; NaN where a photo's is not known.
+    where that is more. All in PX; NaN where a photo's is not known.
 
     After a bundle adjustment of these very points nothing in common is left, and the uncertainty says more; poses that
     were given, and points triangulated in them, show what is wrong with them, less what the points have taken up.
@@ -71,10 +71,11 @@ def pose_evidence(
     stated = uncertainty_px[np.isfinite(uncertainty_px)]
     uncertain = float(np.sqrt(np.mean(stated**2))) if len(stated) else 0.0
     if not known.any() and not len(stated):
-        return unknown("px", THRESHOLD_PX, "no tracks", None)
+        return unknown(PX, THRESHOLD_PX, "no tracks", None)
     common, noise = 0.0, 0.0
     if known.any():
         common = float(np.sqrt(max(np.mean(power[known] - expected[known]), 0.0)))
         noise = float(np.sqrt(np.mean(expected[known])))
-    words = f"photos are off by {common:.2g} px as a whole, ± {noise:.1g}; poses uncertain by {uncertain:.2g} px"
-    return judged(max(common, uncertain), noise, THRESHOLD_PX, "px", words)
+    off = f"photos are off by {common:.2g} px as a whole, ± {noise:.1g}"
+    words = f"at 1000 pixels {off}; poses uncertain by {uncertain:.2g} px"
+    return judged(max(common, uncertain), noise, THRESHOLD_PX, PX, words)

@@ -3,10 +3,10 @@
 import numpy as np
 from jaxtyping import Float, Int
 
-from nerf.evidence.evidence import Evidence, judged, unknown
-from nerf.evidence.poses import THRESHOLD_PX
+from nerf.evidence.evidence import OF_GAUSSIAN, Evidence, judged, unknown
+from nerf.evidence.poses import PX, THRESHOLD_PX
 
-LEAST_MOTION_PX = 2.0  # per frame, below which rows have no time to differ
+LEAST_MOTION_PX = 2.0  # per frame, at 1000 pixels, below which rows have no time to differ
 
 
 def rolling_shutter_evidence(
@@ -15,11 +15,11 @@ def rolling_shutter_evidence(
     motion: Float[np.ndarray, "views 2"],
     view: Int[np.ndarray, "k"],
 ) -> Evidence:
-    """The error at the upper and lower edges of a frame of usual motion, px: half the product of the motion and of the
+    """The error at the upper and lower edges of a frame of usual motion, PX: half the product of the motion and of the
     readout as a part of the time between frames. Called for where it harms as wrong poses do (nerf/evidence/poses.py).
 
-    ``residual``: observed minus projected, px; ``row``: y / height; ``motion``: how far the picture moves from a frame
-    to the next, px, NaN where it is not known or the photos are no video. The row at y shows the scene (y - 1/2)
+    ``residual``: observed minus projected, PX; ``row``: y / height; ``motion``: how far the picture moves from a frame
+    to the next, PX, NaN where it is not known or the photos are no video. The row at y shows the scene (y - 1/2)
     readouts later, so residual = readout (y - 1/2) motion; what poses could take up of it (shift, zoom) is gone after a
     bundle adjustment, and what is found is a lower bound.
     """
@@ -27,9 +27,9 @@ def rolling_shutter_evidence(
     moving = np.isfinite(speed) & (speed > LEAST_MOTION_PX)
     kept = moving[view]
     if np.count_nonzero(kept) < 100 or np.count_nonzero(moving) < 3:
-        return unknown("px", THRESHOLD_PX, "no video, or one that hardly moves", False)
+        return unknown(PX, THRESHOLD_PX, "no video, or one that hardly moves", False)
     along = np.sum(residual[kept] * motion[view[kept]], axis=1) / speed[view[kept]]
-    limit = 4 * 1.4826 * float(np.median(np.abs(along)))
+    limit = 4 * OF_GAUSSIAN * float(np.median(np.abs(along)))
     along = np.clip(along, -limit, limit)  # false matches
     expected = (row[kept] - 0.5) * speed[view[kept]]
     size = float(np.sum(expected**2))
@@ -38,17 +38,17 @@ def rolling_shutter_evidence(
     score = np.bincount(view[kept], expected * (along - readout * expected), len(speed))
     edge = float(np.median(speed[moving])) / 2
     noise = float(np.sqrt(np.sum(score**2))) / size * edge
-    off = f"{abs(readout) * edge:.2g} ± {noise:.1g} px at the edges"
+    off = f"at 1000 pixels {abs(readout) * edge:.2g} ± {noise:.1g} px at the edges"
     words = f"rows take {abs(readout):.0%} of the time between frames, {off}"
-    found = judged(abs(readout) * edge, noise, THRESHOLD_PX, "px", words)
+    found = judged(abs(readout) * edge, noise, THRESHOLD_PX, PX, words)
     return found._replace(called_for=bool(found.called_for))
 
 
 def motion_to_next(
     xy: Float[np.ndarray, "k 2"], point: Int[np.ndarray, "k"], view: Int[np.ndarray, "k"], views: int
 ) -> Float[np.ndarray, "views 2"]:
-    """How far the picture moves from a frame to the next one, px: the median over the points that both see; NaN for the
-    last one, and where they share fewer than ten."""
+    """How far the picture moves from a frame to the next one, in the pixels of ``xy``: the median over the points that
+    both see; NaN for the last one, and where they share fewer than ten."""
     motion = np.full((views, 2), np.nan)
     of_view = [np.flatnonzero(view == number) for number in range(views)]
     for number in range(views - 1):

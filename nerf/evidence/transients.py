@@ -8,9 +8,9 @@ see them, this one should, and has another colour there. Both are looked at, wit
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from nerf.evidence.evidence import Evidence, judged, unknown
+from nerf.evidence.evidence import OF_GAUSSIAN, Evidence, judged, unknown
 from nerf.evidence.exposure import ExposureFit
-from nerf.evidence.tracks import TrackColours, linear_light
+from nerf.evidence.tracks import TrackColours, linear_light, srgb_values
 
 OUTLIER = 0.1  # sRGB value, rms of the channels: ten times what a good photo is off by
 FEWEST_POINTS = 20  # in a photo, for a share of them to mean something
@@ -21,6 +21,8 @@ LEAST_EXCESS = 0.05  # of a photo's points: less is an edge that is missed by a 
 # surfaces that hide each other are expected wrongly: one percent of all points is beyond doubt.
 THRESHOLD = 0.01
 NEAR_DEG, NEAR_RATIO = 10.0, 1.3  # photos so close to each other hide the same points, but for few
+# Cosine law: two such photos are no farther from each other than by this part of either's distance to the point.
+NEAR_APART = float(np.sqrt(1 + NEAR_RATIO**2 - 2 * NEAR_RATIO * np.cos(np.radians(NEAR_DEG))))
 
 
 def transients_evidence(tracks: TrackColours, fit: ExposureFit, expected: TrackColours | None) -> Evidence:
@@ -39,7 +41,7 @@ def transients_evidence(tracks: TrackColours, fit: ExposureFit, expected: TrackC
         return unknown("share", THRESHOLD, "too few photos with enough points", False)
     share = np.bincount(looked.view, outlier, looked.views)[enough] / seen[enough]
     usual = float(np.median(share))
-    deviation = 1.4826 * float(np.median(np.abs(share - usual)))
+    deviation = OF_GAUSSIAN * float(np.median(np.abs(share - usual)))
     count_noise = np.sqrt(np.maximum(usual * (1 - usual), 1 / seen[enough]) / seen[enough])
     excess = share - usual
     odd = (excess > SURE * np.hypot(deviation, count_noise)) & (excess > LEAST_EXCESS)
@@ -70,8 +72,7 @@ def _differs(looked: TrackColours, usual: Float[np.ndarray, "points 3"], fit: Ex
     """Which observations are another colour than their point's, in the exposure of their photo. What is cut off at 0 or
     1 is compared where it was cut."""
     light = usual[looked.point] * np.exp(fit.log_gain[looked.view])
-    value = np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 0.0031308) ** (1 / 2.4) - 0.055)
-    difference = looked.colour - np.clip(value, 0, 1)
+    difference = looked.colour - np.clip(srgb_values(light), 0, 1)
     return np.sqrt(np.mean(difference**2, axis=1)) > OUTLIER
 
 
@@ -83,11 +84,11 @@ def expected_places(
     position: Float[np.ndarray, "points 3"],
 ) -> Int[np.ndarray, "m"]:
     """The points that a camera at ``centre`` should see, because two photos from nearly there do: within NEAR_DEG of
-    its direction, at a distance that differs by at most NEAR_RATIO. Observations are those of the other photos."""
-    offset = centre - position
-    length = np.linalg.norm(offset, axis=1)
-    offset = offset / np.maximum(length, np.finfo(float).tiny)[:, None]
-    close = np.sum(towards * offset[point], axis=1) > np.cos(np.radians(NEAR_DEG))
-    ratio = distance / np.maximum(length[point], np.finfo(float).tiny)
+    its direction, at a distance that differs by at most NEAR_RATIO. Observations are those of the other photos; what a
+    photo farther away than NEAR_APART of its ``distance`` sees may be left out before."""
+    offset = centre - position[point]
+    length = np.maximum(np.linalg.norm(offset, axis=1), np.finfo(float).tiny)
+    close = np.sum(towards * offset, axis=1) > np.cos(np.radians(NEAR_DEG)) * length
+    ratio = distance / length
     close &= (ratio < NEAR_RATIO) & (ratio > 1 / NEAR_RATIO)
     return np.flatnonzero(np.bincount(point[close], minlength=len(position)) >= 2)

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 
 from nerf.evidence.evidence import HARM, Evidence, judged, unknown
 from nerf.evidence.exposure import ExposureFit
-from nerf.evidence.tracks import TrackColours, log_light
+from nerf.evidence.tracks import OFFSET, POWER, TrackColours, log_light
 from nerf.evidence.two_way import TwoWay
 
 THRESHOLD = 2 * HARM  # deviation of colours, sRGB values: a field of diffuse colours has it as its error
@@ -84,7 +84,7 @@ def _half_squares(
     gone = fit.log_gain[fit.layout.view] + fit.vignetting * (tracks.radius[fit.used] ** 2)[:, None]
     light = log_light(colour) - gone
     middle = (colour[first] + colour[second]) / 2
-    difference = (light[first] - light[second]) * (middle + 0.055) / 2.4
+    difference = (light[first] - light[second]) * (middle + OFFSET) / POWER
     return np.mean(difference**2, axis=1) / 2
 
 

@@ -4,15 +4,26 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 from PIL import Image
 
+import stages.track_colours
+from nerf.evidence import transients
 from nerf.evidence.exposure import EV
 from nerf.scene import Camera, Scene, View
 from stages.colmap.cameras import focal_and_centre
 from stages.evidence import scene_evidence, training_residuals
 from stages.files import write_png
 from stages.photos import Photo, write_photos
-from stages.track_colours import look_at_photos, track_colours, training_tracks
+from stages.track_colours import (
+    BRIGHTEST,
+    CLIPPED_SHARE,
+    DARKEST,
+    _expected,
+    _window_means,
+    look_at_photos,
+    training_tracks,
+)
 from tests.conftest import SilentProgress
 from tests.stages.photo_scene import pose_towards_origin
 
@@ -81,7 +92,7 @@ def without_points(points: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 def test_colours_are_those_of_the_photos(tmp_path: Path, progress: SilentProgress) -> None:
     scene, points = photographed_points(tmp_path)
-    tracks = track_colours(tmp_path, scene, points, progress)
+    tracks = look_at_photos(tmp_path, scene, points, progress).tracks
     assert len(tracks) > 60 and tracks.views == VIEWS - len(TEST_VIEWS)
     np.testing.assert_allclose(tracks.colour, value(0)[tracks.point] / 255, atol=1e-9)
     assert not tracks.saturated.any()
@@ -106,12 +117,12 @@ def test_test_photos_are_not_opened(tmp_path: Path, progress: SilentProgress) ->
     scene, points = photographed_points(tmp_path)
     for number in TEST_VIEWS:
         (tmp_path / f"images/{number}.png").unlink()
-    assert len(track_colours(tmp_path, scene, points, progress)) > 60
+    assert len(look_at_photos(tmp_path, scene, points, progress).tracks) > 60
 
 
 def test_masked_and_transparent_windows_are_left_out(tmp_path: Path, progress: SilentProgress) -> None:
     scene, points = photographed_points(tmp_path)
-    whole = track_colours(tmp_path, scene, points, progress)
+    whole = look_at_photos(tmp_path, scene, points, progress).tracks
     mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
     mask[:, 320:] = 0
     write_png(tmp_path / "masks/1.png.png", mask)
@@ -119,7 +130,7 @@ def test_masked_and_transparent_windows_are_left_out(tmp_path: Path, progress: S
         pixels = np.dstack([np.asarray(image), mask])
     write_png(tmp_path / "images/2.png", pixels)
     views = [replace(view, mask="masks/1.png.png" if view.name == "1.png" else None) for view in scene.views]
-    cut = track_colours(tmp_path, replace(scene, views=tuple(views)), points, progress)
+    cut = look_at_photos(tmp_path, replace(scene, views=tuple(views)), points, progress).tracks
     for number in range(6):
         of_view = points["view"] == 1 + number + (number > 2)
         reaching = np.count_nonzero(np.floor(points["xy"][of_view, 0]) + 2 >= 320)  # windows of five pixels
@@ -132,9 +143,31 @@ def test_clipped_windows_are_saturated(tmp_path: Path, progress: SilentProgress)
     gain = np.ones(VIEWS)
     gain[3] = 2.2
     scene, points = photographed_points(tmp_path, np.minimum(gain, 255 / 159))
-    tracks = track_colours(tmp_path, scene, points, progress)
+    tracks = look_at_photos(tmp_path, scene, points, progress).tracks
     bright = (tracks.view == 2) & (value(0)[tracks.point].max(axis=1) >= 157)
     assert np.array_equal(tracks.saturated, bright)
+
+
+def test_windows_are_summed_as_if_each_were_looked_at() -> None:
+    draw = np.random.default_rng(0)
+    pixels = draw.integers(0, 256, (300, 400, 4), dtype=np.uint8)
+    pixels[:150] = pixels[:150] // 2 + 60  # none clipped, where the rest is in half of its windows
+    used = draw.random((300, 400)) > 1e-3
+    side = draw.choice([5, 7, 21, 61], 500)
+    side[:2] = 61
+    corner = (draw.random((500, 2)) * ([401, 301] - side[:, None])).astype(int)
+    corner[:2] = [[0, 0], [400 - 61, 300 - 61]]
+    found = _window_means(pixels, used, corner, side)
+    direct = []
+    for (x, y), width in zip(corner, side, strict=True):
+        window = pixels[y : y + width, x : x + width, :3].reshape(-1, 3)
+        clipped = ((window <= DARKEST) | (window >= BRIGHTEST)).mean(axis=0).max() > CLIPPED_SHARE
+        whole = used[y : y + width, x : x + width].all()
+        row = [*window.mean(axis=0) / 255, clipped, window.mean(axis=1).std() / 255]
+        direct.append(row if whole else [np.nan] * 5)
+    np.testing.assert_allclose(found, direct, rtol=1e-12)
+    there = found[np.isfinite(found[:, 0])]
+    assert 100 < len(there) < 450 and 0.01 < there[:, 3].mean() < 0.9
 
 
 def test_fewer_observations_are_whole_tracks(tmp_path: Path, progress: SilentProgress) -> None:
@@ -170,6 +203,37 @@ def test_places_where_a_point_should_be_seen(tmp_path: Path, progress: SilentPro
     np.testing.assert_allclose(expected.colour[found][0], value(0)[point] / 255, atol=1e-9)
 
 
+def test_only_photos_nearby_are_asked_what_should_be_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    count, each = 60, 400  # photos all around; each point is seen by every second one of ten
+    poses = [pose_towards_origin(2 * np.pi * number / count) for number in range(count)]
+    scene = _scene([View(f"{n}.png", f"images/{n}.png", 0, pose, 2.0, 4.0, "train") for n, pose in enumerate(poses)])
+    draw = np.random.default_rng(0)
+    view = (draw.integers(0, count, (each, 1)) + np.arange(0, 10, 2)) % count
+    points = {
+        "xyz": draw.uniform(-0.5, 0.5, (each, 3)),
+        "view": view.ravel(),
+        "point": np.repeat(np.arange(each), 5),
+        "xy": np.zeros((5 * each, 2)),
+    }
+    tracks = training_tracks(scene, points)[0]
+    tracks = replace(tracks, point=2 * tracks.point)  # as where every second point was drawn
+    points["xyz"] = points["xyz"].repeat(2, axis=0)
+
+    def pairs() -> set[tuple[int, int]]:
+        expected = _expected(scene, points, tracks)[0]
+        return set(zip(expected.view.tolist(), expected.point.tolist(), strict=True))
+
+    near = pairs()
+    monkeypatch.setattr(transients, "NEAR_APART", 100.0)
+    assert pairs() == near and len(near) > 1000
+    monkeypatch.setattr(stages.track_colours, "MOST_LOOKED_AT", 300 * count)
+    some = pairs()
+    # whole points are drawn, other ones for every photo
+    assert some < near and 0.05 < len(some) / len(near) < 0.3
+    assert {view for view, _ in some} == set(range(count))
+    assert len({point for _, point in some}) > 0.5 * len({point for _, point in near})
+
+
 def test_without_points_only_the_photos_are_looked_at(tmp_path: Path, progress: SilentProgress) -> None:
     scene, points = photographed_points(tmp_path)
     looked = look_at_photos(tmp_path, scene, without_points(points), progress)
@@ -199,6 +263,8 @@ def test_all_evidence_of_a_scene(tmp_path: Path, progress: SilentProgress) -> No
     assert found.of["exposure"].called_for is True
     bright, dark = found.exposure.log_gain[[0, 2, 3, 5]], found.exposure.log_gain[[1, 4]]
     assert abs((bright.mean() - dark.mean()) / EV - 1.1) < 0.25  # 0.7 of an sRGB value is about half of the light
+    # the last digits of a logarithm depend on the processor, and what is trained begins with these
+    assert np.array_equal(found.exposure.log_gain, np.round(found.exposure.log_gain, 4))
     assert found.of["pose_refinement"].called_for is False
     assert found.of["rolling_shutter"].words == "no video, or one that hardly moves: nothing known"
     for name, evidence in found.of.items():

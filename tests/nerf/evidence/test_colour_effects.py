@@ -138,6 +138,21 @@ def test_expected_places_are_those_that_two_near_photos_see() -> None:
     assert places([(0, 0), (3, 0)], [3, -0.2, 0]) == []  # one of them from far away
 
 
+def test_photos_that_show_a_point_alike_are_near_each_other() -> None:
+    draw = np.random.default_rng(0)
+    here = draw.normal(size=(2000, 3))
+    there = here * draw.uniform(0.6, 1.6, (2000, 1)) + 0.15 * draw.normal(size=here.shape)
+    distance = np.linalg.norm(there, axis=1)
+
+    def alike(k: int) -> bool:
+        twice = there[[k, k]] / distance[k], distance[[k, k]], np.zeros(2, int)
+        return len(transients.expected_places(*twice, here[k], np.zeros((1, 3)))) == 1
+
+    apart = np.linalg.norm(there - here, axis=1) / distance
+    farthest = max(apart[k] for k in range(2000) if alike(k))
+    assert 0.9 * transients.NEAR_APART < farthest <= transients.NEAR_APART
+
+
 def hazy(seed: int, per_unit: float) -> TrackColours:
     """Points through a medium as bright as the points are on average."""
     tracks = photographed_points(seed, points=800, noise=0.004, log_gain=exposed(seed) / 2)

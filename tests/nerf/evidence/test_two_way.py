@@ -1,7 +1,12 @@
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from nerf.evidence.two_way import TwoWay, two_way
+from nerf.evidence.two_way import TwoWay, inverted, solved, two_way
 
 
 def drawn(seed: int, views: int = 7, points: int = 40) -> tuple[TwoWay, np.ndarray]:
@@ -80,3 +85,48 @@ def test_all_pairs_of_a_point_are_there_once(length: int) -> None:
     pairs = set(zip(layout.first.tolist(), layout.second.tolist(), strict=True))
     assert len(pairs) == len(layout.first) == length * (length - 1)
     assert all(a < b and (a < length) == (b < length) for a, b in pairs)
+
+
+def chain(seed: int, size: int, weakest: float) -> np.ndarray:
+    """The Laplacian of photos in a row, the links between them from ``weakest`` to 1, made regular as in a fit."""
+    link = np.exp(np.random.default_rng(seed).uniform(np.log(weakest), 0, size - 1))
+    matrix = np.diag(np.append(link, 0) + np.append(0, link)) - np.diag(link, 1) - np.diag(link, -1)
+    return matrix + np.trace(matrix) / size**2
+
+
+@pytest.mark.parametrize(("size", "weakest"), [(1, 1.0), (2, 1.0), (40, 1.0), (300, 0.1), (60, 1e-5)])
+def test_equations_are_solved_as_exactly_as_by_lapack(size: int, weakest: float) -> None:
+    matrix = chain(0, size, weakest) if size > 1 else np.array([[3.0]])
+    truth = np.random.default_rng(1).normal(size=size)
+    right = matrix @ truth
+    allowed = 1e-9 * max(1.0, np.linalg.cond(matrix) / 1e4)
+    np.testing.assert_allclose(solved(matrix, right), truth, atol=allowed)
+    np.testing.assert_allclose(inverted(matrix) @ right, truth, atol=allowed)
+    assert np.array_equal(solved(matrix, np.zeros(size)), np.zeros(size))
+
+
+FIT = """
+import hashlib
+
+import numpy as np
+
+from nerf.evidence.exposure import fit_exposure
+from tests.nerf.evidence.photographed_points import photographed_points
+
+tracks = photographed_points(0, views=160, points=1200, per_point=6, log_gain=np.random.default_rng(0).normal(size=160))
+fit = fit_exposure(tracks)
+print(hashlib.sha256(fit.log_gain.tobytes() + fit.error.tobytes()).hexdigest())
+"""
+
+
+def test_gains_are_the_same_bytes_with_any_blas() -> None:
+    """Threads and kernels are what BLAS chooses by the machine; LAPACK gives other last digits with each of these."""
+    found = set()
+    for threads, kernels in (("1", "PRESCOTT"), ("2", "HASWELL")):
+        blas = {"OPENBLAS_NUM_THREADS": threads, "OPENBLAS_CORETYPE": kernels}
+        root = Path(__file__).parents[3]
+        done = subprocess.run(
+            [sys.executable, "-c", FIT], cwd=root, env=os.environ | blas, check=True, capture_output=True, text=True
+        )
+        found.add(done.stdout.strip())
+    assert len(found) == 1 and len(found.pop()) == 64

@@ -1,0 +1,110 @@
+"""What registration.json and the places of observations say, without a photo."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from nerf.evidence.evidence import Evidence
+from nerf.scene import Camera, Scene, Similarity, View
+from stages.evidence import geometric_evidence, lens_evidence
+from stages.photos import Photo, write_photos
+from tests.stages.photo_scene import pose_towards_origin
+
+VIEWS, POINTS = 10, 120
+
+
+def geometric(folder: Path, width: int, shift: float, readout: float = 0.0) -> dict[str, Evidence]:
+    """Frames of a video, 3:4, whose points are off by ``shift`` of the width, each frame in another direction, and by
+    the motion that a readout of this part of a frame makes; poses are stated to be uncertain by half a thousandth."""
+    height, focal = width * 3 // 4, 1.1 * width
+    draw = np.random.default_rng(0)
+    xyz = draw.uniform(-0.7, 0.7, (POINTS, 3))
+    places, views, photos = [], [], []
+    for number in range(VIEWS):
+        pose = pose_towards_origin(0.0)
+        pose[:, 3] += 0.03 * number * pose[:, 0]  # sideways, by eleven thousandths of the width
+        inside = (xyz - pose[:, 3]) @ pose[:, :3]
+        places.append(focal * inside[:, :2] / inside[:, 2:] + [width / 2, height / 2])
+        file = f"images/{number}.png"
+        views.append(View(f"{number}.png", file, 0, pose, 2.0, 4.0, "train"))
+        photos.append(Photo(f"{number}.png", file, width, height, 0, None, None, False, 1.0, time_s=number / 10))
+    folder.mkdir()
+    write_photos(folder, photos, [], {})
+    xy = np.array(places)
+    motion = np.median(np.diff(xy, axis=0), axis=1)
+    motion = np.concatenate([motion, motion[-1:]])[:, None]
+    rows = readout * (xy[..., 1:] / height - 0.5) * motion
+    angle = draw.uniform(0, 2 * np.pi, VIEWS)
+    xy = xy + shift * width * np.stack([np.cos(angle), np.sin(angle)], 1)[:, None] + rows
+    points = {
+        "xyz": xyz.astype(np.float32),
+        "view": np.repeat(np.arange(VIEWS, dtype=np.int32), POINTS),
+        "point": np.tile(np.arange(POINTS, dtype=np.int32), VIEWS),
+        "xy": xy.reshape(-1, 2).astype(np.float32),
+    }
+    camera = Camera("PINHOLE", width, height, (focal, focal, width / 2, height / 2))
+    scene = Scene((camera,), tuple(views), Similarity(1.0, np.eye(3), np.zeros(3)), False, False, "around", True)
+    return geometric_evidence(folder, scene, points, {view.file: width / 2000 for view in views})
+
+
+@pytest.mark.parametrize(("shift", "called_for"), [(0.0002, None), (0.001, True)])
+def test_errors_of_poses_are_those_of_a_photo_of_a_thousand_pixels(
+    tmp_path: Path, shift: float, called_for: bool | None
+) -> None:
+    found = [geometric(tmp_path / str(width), width, shift)["pose_refinement"] for width in (800, 4000)]
+    for one in found:
+        assert one.statistic == pytest.approx(max(1000 * shift, 0.5), rel=0.05) and one.called_for is called_for
+        assert one.unit == "px at 1000" and one.words.startswith("at 1000 pixels photos are off by ")
+        assert one.words.endswith("; poses uncertain by 0.5 px")
+
+
+def test_rows_are_late_by_pixels_of_a_photo_of_a_thousand(tmp_path: Path) -> None:
+    small, large = (geometric(tmp_path / str(width), width, 0.0, 0.5)["rolling_shutter"] for width in (800, 4000))
+    assert small.called_for is large.called_for is True and small.unit == "px at 1000"
+    assert large.statistic == pytest.approx(small.statistic, rel=0.05)
+    assert large.words.startswith("rows take ") and " between frames, at 1000 pixels " in large.words
+    # eleven thousandths of the width are motion enough, however small the photo is: here they are 1.8 of its pixels
+    assert geometric(tmp_path / "icon", 160, 0.0, 0.5)["rolling_shutter"].called_for is True
+
+
+def candidate(group: int, model: str, error: float | None, chosen: bool = False) -> dict[str, Any]:
+    """A row of camera_models."""
+    noise = None if error is None else 0.001
+    return {"group": group, "model": model, "held_out_px": error, "noise_px": noise, "chosen": chosen}
+
+
+def test_a_lens_is_compared_with_the_simplest_sound_candidate_of_its_own_group() -> None:
+    rows = [
+        candidate(0, "SIMPLE_PINHOLE", None),
+        candidate(0, "PINHOLE", 0.9),
+        candidate(0, "OPENCV", 0.6, chosen=True),
+        candidate(1, "SIMPLE_PINHOLE", 0.65),
+        candidate(1, "SIMPLE_RADIAL", 0.55, chosen=True),
+        candidate(1, "OPENCV", 0.54),
+    ]
+    found = lens_evidence({"source": "sfm", "camera_models": rows})
+    assert found.statistic == pytest.approx(0.3) and found.called_for is True
+    assert found.words == ("OPENCV: held-out error 0.3 px below that of the simplest candidate, SIMPLE_RADIAL: 0.1 px")
+    alone = lens_evidence({"source": "sfm", "camera_models": rows[3:]})
+    assert alone.words == "SIMPLE_RADIAL: held-out error 0.1 px below that of the simplest candidate"
+
+
+def test_a_pinhole_is_no_lens() -> None:
+    found = lens_evidence({"source": "sfm", "camera_models": [candidate(0, "PINHOLE", 0.5, chosen=True)]})
+    assert found.called_for is False and found.statistic == 0
+
+
+@pytest.mark.parametrize(
+    ("source", "rows", "why"),
+    [
+        ("import", [], "the cameras were given"),
+        ("sfm", [], "too few points to compare camera models"),
+        ("sfm", [candidate(0, "PINHOLE", None)], "no candidate makes a sound camera"),
+    ],
+)
+def test_why_nothing_is_known_of_the_lens(source: str, rows: list[dict[str, Any]], why: str) -> None:
+    found = lens_evidence({"source": source, "camera_models": rows})
+    assert found.words == f"{why}: nothing known" and found.called_for is False
+    assert np.isinf(found.noise) and np.isinf(found.threshold)
