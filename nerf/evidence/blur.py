@@ -5,6 +5,7 @@ from jaxtyping import Float
 
 from nerf.evidence.evidence import Evidence, unknown
 
+ONE_DIRECTION = 1e-6  # of the larger eigenvalue: stripes, whose gradients across say nothing and cannot be divided by
 NEIGHBOURS = 3  # on each side
 LOST = 0.5  # of the gradients' amplitude: edges are twice as wide
 ONE_WAY = 0.6  # amplitude lost in one direction beside the other: a smear and no defocus
@@ -45,7 +46,7 @@ def relative_gradients(gradients: Float[np.ndarray, "views 2 2"]) -> Float[np.nd
         if len(around) < NEIGHBOURS or not np.isfinite(tensor).all():
             continue
         size, axes = np.linalg.eigh(np.median(around, axis=0))
-        if size[0] > 1e-6 * size[1] > 0:
+        if size[0] > ONE_DIRECTION * size[1] > 0:
             white = axes / np.sqrt(size)
             amplitude[view] = np.sqrt(np.maximum(np.linalg.eigvalsh(white.T @ tensor @ white), 0.0))
     return amplitude

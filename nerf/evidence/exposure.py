@@ -20,7 +20,7 @@ EV = float(np.log(2.0))
 THRESHOLD_EV = 2 * HARM / VALUE_PER_LOG_LIGHT / EV
 REDESCENDING = 5.0  # in robust deviations: as HUBER loses some 5 % to plain means of normal noise
 HUBER_ROUNDS, MOST_ROUNDS = 8, 30
-CONVERGED = 1e-5
+CONVERGED = 1e-5  # of a log gain: a tenth of what gains are rounded to where they leave
 LEAST_NOISE = 0.25 / 255  # of an sRGB value: no photo of 8 bits is more exact, and a perfect fit has no deviation
 
 

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int
 
 from nerf.evidence.tracks import within_groups
 
+CONSTANT = 1e-9  # share of its square sum that x has left around its photos and points: no more than rounding
 EXACT = 1e-12  # of a residual, beside the right-hand side
 
 
@@ -102,7 +103,7 @@ class TwoWay:
         (0, inf) where ``x`` does not vary within them."""
         across = self.rest(x, weight)
         size = float(np.sum(weight * across**2))
-        if not size > 1e-9 * float(np.sum(weight * x**2)):
+        if not size > CONSTANT * float(np.sum(weight * x**2)):
             return 0.0, float("inf")
         rest = self.rest(y, weight)
         slope = float(np.sum(weight * across * rest)) / size
