@@ -117,17 +117,15 @@ class _Study:
         evidence = self.evidence[name]
         if asked != "auto":
             return Verdict(asked == "on", f"asked for; {evidence.words}")
-        costly = name == "pose_refinement" and evidence.called_for is True
         # Highlights have no tracks: what is seen of view dependence is a lower bound, and too little of it no proof.
         unproven = name in PART_OF_THE_METHOD and evidence.called_for is False
-        if evidence.called_for is not None and not (costly or unproven):
+        if evidence.called_for is not None and not unproven:
             return Verdict(evidence.called_for, evidence.words)
-        default = evidence.called_for is True or name in PART_OF_THE_METHOD
+        default = name in PART_OF_THE_METHOD
         if math.isinf(evidence.noise):
             return Verdict(default, evidence.words)
         if why := self._why_no_pilot():
-            doubt = "costly" if costly else "not clear"
-            return Verdict(default, f"{evidence.words}; {doubt}, and no pilot: {why}")
+            return Verdict(default, f"{evidence.words}; not clear, and no pilot: {why}")
         return self._piloted(name, off, on, default)
 
     def _why_no_pilot(self) -> str | None:

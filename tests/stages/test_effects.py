@@ -110,10 +110,9 @@ def test_gains_go_to_training_by_the_names_of_its_photos(decided: Callable) -> N
     assert all(gain == [0.5] * 3 for gain in decisions.exposure.values())
 
 
-def test_refining_poses_is_costly_and_always_has_to_show_its_gain(decided: Callable) -> None:
-    assert decided(effects.Config(), 1.0, pose_refinement=found(True))[0].pose_refinement
-    decisions, _, _, tried = decided(effects.Config(), 0.0, pose_refinement=found(True))
-    assert tried == ["pose_refinement"] and not decisions.pose_refinement
+def test_poses_that_are_clearly_wrong_are_refined_without_a_pilot_which_would_be_too_short(decided: Callable) -> None:
+    decisions, _, _, tried = decided(effects.Config(), -1.0, pose_refinement=found(True))
+    assert not tried and decisions.pose_refinement
 
 
 def test_there_are_two_pilots_at_most(decided: Callable) -> None:
