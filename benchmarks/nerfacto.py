@@ -66,22 +66,21 @@ def train_ours(workspace: Path, downscale: float, seconds: float) -> Point:
 
 
 def score_ours(workspace: Path) -> float:
-    """Mean PSNR over the held-out photos at the trained size."""
-    import torch
-
+    """Mean PSNR over the held-out photos at the trained size, as stage evaluate scores them."""
     from nerf.metrics import mean_squared_error, psnr
-    from nerf.rendering import render_image
-    from stages.field_files import load_field
-    from stages.files import read_scene
+    from stages.drawing import load_painter
+    from stages.effect_decisions import expected_gains
+    from stages.files import read_json, read_scene
     from stages.training_data import view_pixels, view_rays
 
-    scene = read_scene(stage_folder(workspace, "scene.json"))
-    model, info = load_field(stage_folder(workspace, "curve.json"))
+    scene, train = read_scene(stage_folder(workspace, "scene.json")), stage_folder(workspace, "curve.json")
+    painter, info = load_painter(train), read_json(train / "field.json")
+    gains = expected_gains(info, scene, scene.of_split("test"))
     ingest, values = stage_folder(workspace, "photos.json"), []
     for view in scene.of_split("test"):
         truth = view_pixels(ingest, scene, view, info["downscale"])
-        rays = view_rays(scene, view, info["downscale"])
-        picture = render_image(model, rays, torch.tensor(info["background"])).colour.clamp(0, 1)
+        at_gain = painter.at_gain(gains[view.name]) if gains else painter
+        picture = at_gain.draw(view_rays(scene, view, info["downscale"])).colour.clamp(0, 1)
         values.append(psnr(mean_squared_error(picture, truth)))
     return sum(values) / len(values)
 
