@@ -112,8 +112,8 @@ class GridTrainer:
         self.photo_rays, self.photo_colours = photo_rays, photo_colours
         self.cache = DensityCache(model)
         self.photo_parts = [part for part in (photo_rays, photo_colours) if part.parameters]
-        of_photos = {**photo_rays.parameters, **photo_colours.parameters}
-        self.parameters = {"table": model.table, **model.weights._asdict(), **of_photos}
+        self.photo_parameters = {**photo_rays.parameters, **photo_colours.parameters}
+        self.parameters = {"table": model.table, **model.weights._asdict(), **self.photo_parameters}
         self.mean = {name: torch.zeros_like(tensor) for name, tensor in self.parameters.items()}
         self.square = {name: torch.zeros_like(tensor) for name, tensor in self.parameters.items()}
         self.grad_table = torch.zeros_like(model.table)
@@ -135,10 +135,9 @@ class GridTrainer:
         """Weights and cache bits as ``model.<name>``, what is learnt of photos as ``photo.<name>``, Adam's moments as
         ``mean.<name>`` and ``square.<name>``, the cache's thickness, the mean number of samples per ray, and the
         field's settings, to know it by."""
-        of_photos = {**self.photo_rays.parameters, **self.photo_colours.parameters}
         return (
             {f"model.{name}": tensor for name, tensor in self.model.state_dict().items()}
-            | {f"photo.{name}": tensor for name, tensor in of_photos.items()}
+            | {f"photo.{name}": tensor for name, tensor in self.photo_parameters.items()}
             | {f"mean.{name}": tensor for name, tensor in self.mean.items()}
             | {f"square.{name}": tensor for name, tensor in self.square.items()}
             | {"thickness": self.cache.thickness, "samples_per_ray": self.samples_per_ray}

@@ -100,14 +100,14 @@ class _Study:
         decisions = Decisions(view_dependence=True, unbounded=False, pose_refinement=False, exposure=None)
         verdicts: dict[str, Verdict] = {}
         # Poses before view dependence: there are two pilots, and wrong poses cost more.
-        arms: dict[str, dict[bool, dict[str, Any]]] = {
-            "background": {True: {"unbounded": True}, False: {"unbounded": False}},
-            "exposure": {True: {"exposure": self.gains}, False: {"exposure": None}},
-            "pose_refinement": {True: {"pose_refinement": True}, False: {"pose_refinement": False}},
-            "view_dependence": {True: {"view_dependence": True}, False: {"view_dependence": False}},
+        settings: dict[str, tuple[str, Any, Any]] = {  # of Decisions: its name, off, on
+            "background": ("unbounded", False, True),
+            "exposure": ("exposure", None, self.gains),
+            "pose_refinement": ("pose_refinement", False, True),
+            "view_dependence": ("view_dependence", False, True),
         }
-        for name, arm in arms.items():
-            off, on = (replace(decisions, **arm[value]) for value in (False, True))
+        for name, (setting, *values) in settings.items():
+            off, on = (replace(decisions, **{setting: value}) for value in values)
             verdicts[name] = self._verdict(name, off, on)
             decisions = on if verdicts[name].on else off
         return decisions, verdicts

@@ -15,6 +15,7 @@ from stages.contract import Inputs, Progress, StageConfig, StageResult
 from stages.files import read_json, read_scene, write_json, write_png
 from stages.image_metrics import ERROR_SCALE, FEWEST_FOR_INTERVAL, bootstrap_interval, error_map, ssim
 from stages.live_line import duration, short_count
+from stages.spread import spread
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -90,7 +91,7 @@ def _tried_rays(scene: "Scene", side: int) -> "Rays":
     from stages.training_data import view_rays
 
     test = scene.of_split("test")
-    few = [test[i] for i in _spread(len(test), min(TRIED_PHOTOS, len(test)))]
+    few = [test[i] for i in spread(len(test), min(TRIED_PHOTOS, len(test)))]
     cameras = [scene.cameras[view.camera] for view in few]
     photos = [view_rays(scene, v, max(c.width, c.height) / side) for v, c in zip(few, cameras, strict=True)]
     flat = [[part.reshape(1, -1, *part.shape[2:]) for part in rays] for rays in photos]
@@ -103,7 +104,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     config = plan(config, inputs, progress)
     examiner = _examiner(config, scene, inputs, folder)
     test = scene.of_split("test")
-    chosen = _spread(len(test), min(config.photos or 0, len(test)))
+    chosen = spread(len(test), min(config.photos or 0, len(test)))
     notes = [_how_many(len(chosen), len(test))] if len(chosen) < len(test) else []
     views = [test[i] for i in chosen]
     scored = [view for view in views if (used := examiner.used(view)) is None or used.any()]
@@ -236,10 +237,10 @@ def _examiner(config: Config, scene: "Scene", inputs: Inputs, folder: Path) -> E
 def affordable(pixels: Sequence[int], budget: float) -> list[int]:
     """Which photos to score: as many as ``budget`` pixels allow, at least one, spread evenly over the list."""
     for count in range(len(pixels), 1, -1):
-        chosen = _spread(len(pixels), count)
+        chosen = spread(len(pixels), count)
         if sum(pixels[i] for i in chosen) <= budget:
             return chosen
-    return _spread(len(pixels), min(1, len(pixels)))
+    return spread(len(pixels), min(1, len(pixels)))
 
 
 def verdict(metrics: dict[str, Any]) -> str:
@@ -323,11 +324,6 @@ def _how_many(scored: int, test: int) -> str:
 
 def _photos(count: int) -> str:
     return "1 photo" if count == 1 else f"{count} photos"
-
-
-def _spread(length: int, count: int) -> list[int]:
-    """``count`` indices in the middle of equal parts of a list."""
-    return [(2 * i + 1) * length // (2 * count) for i in range(count)]
 
 
 def _mean(values: Sequence[float | None]) -> float | None:

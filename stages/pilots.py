@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from stages.contract import Progress
 from stages.effect_decisions import Decisions, photo_parts
+from stages.spread import spread
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -80,7 +81,7 @@ def pilot_scene(ingest: Path, scene: "Scene", progress: Progress) -> PilotScene 
     count = min(MOST_KEPT, len(views) // KEPT_EVERY) or 1
     if len(views) - count < FEWEST_LEFT:
         return None
-    chosen = {views[(2 * i + 1) * len(views) // (2 * count)].name for i in range(count)}
+    chosen = {views[i].name for i in spread(len(views), count)}
     split = replace(scene, views=tuple(replace(v, split="test" if v.name in chosen else "train") for v in views))
     downscale = max(1.0, max(max(camera.width, camera.height) for camera in scene.cameras) / LONG_SIDE)
     bank = training_bank(ingest, split, "train", downscale, progress).to(compute_device())

@@ -11,6 +11,7 @@ from stages.contract import Inputs, Progress, StageConfig, StageError, StageResu
 from stages.files import read_json, read_scene, write_json, write_png
 from stages.live_line import duration, short_count
 from stages.render_path import BY_LAYOUT, CameraPath, PathKind, fitted_path, path_from_file, path_rays
+from stages.spread import spread
 
 if TYPE_CHECKING:
     import numpy as np
@@ -101,7 +102,7 @@ def _tried_rays(path: CameraPath, scene: "Scene", side: int) -> "Rays":
 
     camera = path.cameras[0]
     count = len(path.cameras)
-    few = path.some(sorted({(2 * i + 1) * count // (2 * TRIED_VIEWS) for i in range(TRIED_VIEWS)}))
+    few = path.some(sorted(set(spread(count, TRIED_VIEWS))))
     width = max(2, 2 * round(side * camera.width / max(camera.width, camera.height) / 2))
     return Rays(*(torch.cat(parts) for parts in zip(*path_rays(few.resized(width), scene), strict=True)))
 

@@ -25,15 +25,14 @@ def right_half_psnr(
     ``rendering`` is (H, W), shown over ``background`` (3,), which no gain changes; ``truth`` is (H, W, 3), and only
     pixels that are ``used``, (H, W) bool, count. (None, None) where a half has fewer than FEWEST_PIXELS of them.
     """
-    from nerf.effects.exposure import expose, fit_log_gain, own_light
+    from nerf.effects.exposure import expose
     from nerf.metrics import mean_squared_error, psnr
 
     if not enough(truth, used):
         return None, None
     left, right = halves(truth, used)
-    light = own_light(rendering.colour, rendering.opacity, background)
+    light, log_gain = _exposed_as_left(rendering, background, truth, left)
     behind = rendering.colour - light
-    log_gain = fit_log_gain(light[left], truth[left] - behind[left])
     fitted = behind[right] + expose(light[right], log_gain)
     raw, fitted = (mean_squared_error(c.clamp(0, 1), truth[right]) for c in (rendering.colour[right], fitted))
     return psnr(raw), psnr(fitted)
@@ -52,18 +51,28 @@ def from_fitted_pose(
     ``rendering`` along them; everything on the CPU."""
     import torch
 
-    from nerf.effects.exposure import fit_log_gain, own_light
     from nerf.effects.exposures import Exposures
     from nerf.effects.pose_fit import fit_pose
     from nerf.rays import Rays
 
     left, _ = halves(truth, used)
-    light = own_light(rendering.colour[left], rendering.opacity[left], background)
-    exposure = Exposures(fit_log_gain(light, truth[left] - (rendering.colour[left] - light))[None])
+    _, log_gain = _exposed_as_left(rendering, background, truth, left)
+    exposure = Exposures(log_gain[None])
     pose = fit_pose(field, Rays(*(part[left] for part in rays)), truth[left], background, exposure, seed)
     flat = Rays(*(part.flatten(0, 1) for part in rays))
     moved = pose.forward(flat, torch.zeros(len(flat.near), dtype=torch.int64))
     return Rays(*(part.view_as(whole) for part, whole in zip(moved, rays, strict=True)))
+
+
+def _exposed_as_left(
+    rendering: "Rendering", background: "Tensor", truth: "Tensor", left: "Tensor"
+) -> "tuple[Tensor, Tensor]":
+    """The scene's own light (H, W, 3) in a rendering, and its log gain (3,) by the pixels ``left`` of the photo."""
+    from nerf.effects.exposure import fit_log_gain, own_light
+
+    light = own_light(rendering.colour, rendering.opacity, background)
+    behind = rendering.colour - light
+    return light, fit_log_gain(light[left], truth[left] - behind[left])
 
 
 def halves(truth: "Tensor", used: "Tensor | None") -> "tuple[Tensor, Tensor]":
