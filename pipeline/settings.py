@@ -1,5 +1,6 @@
 """All options of a run: one pydantic model per stage, filled from defaults, a TOML file and flags, in that order."""
 
+import difflib
 import os
 import tomllib
 from collections.abc import Mapping, Sequence
@@ -102,10 +103,15 @@ def with_effects(settings: Options, choices: Sequence[str]) -> Options:
 
 
 def with_source(settings: Settings, photos: Path, cameras: Path | None) -> Settings:
-    """The settings with PHOTOS (and known cameras, if any) filled in. Raises StageError where PHOTOS is unusable."""
+    """The settings with PHOTOS (and known cameras, if any) filled in. Raises StageError where PHOTOS is unusable,
+    UsageError where the photo to render like is none of them: better now than after the training."""
     from stages.sources import find_source
 
     source = find_source(photos, cameras)
+    names, like = [source.name(file) for file in source.files], settings.render.like
+    if like is not None and source.kind != "video" and like not in names:
+        near = difflib.get_close_matches(like, names, n=3)
+        raise UsageError(f"--like {like}: no photo has that name" + (f"; perhaps {', '.join(near)}" if near else ""))
     given = None if cameras is None else cameras.absolute()
     imported = None if source.cameras is None else source.cameras.absolute()
     return settings.model_copy(

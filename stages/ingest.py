@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     import numpy as np
 
 NEEDS: tuple[str, ...] = ()
-VERSION = 3
+VERSION = 4
 RESUMES = False
 LINKS = ("photos.json", "images", "masks")
 
@@ -74,6 +74,7 @@ class _Taken:
     focal_source: str | None = None
     has_alpha: bool = False
     place: Place = _NO_PLACE
+    exposure_ev: float | None = None
     time_s: float | None = None
     mask: _TakenMask | None = None
     digest: bytes = b""  # of size and pixels
@@ -197,6 +198,7 @@ def _take(file: Path, name: str, mask: Path | None, waiting: Path) -> _Taken | R
         focal_source=decoded.focal_source,
         has_alpha=pixels.shape[2] == 4 and bool((pixels[..., 3] < 255).any()),
         place=decoded.place,
+        exposure_ev=decoded.exposure_ev,
         mask=taken_mask,
         digest=hashlib.blake2b(str(pixels.shape).encode() + pixels.data, digest_size=16).digest(),
         thumbnail=thumbnail(pixels),
@@ -261,6 +263,7 @@ def _store(taken: Sequence[_Taken], same: Mapping[str, str], folder: Path) -> li
                 near_duplicate_of=same.get(photo.name),
                 time_s=photo.time_s,
                 **photo.place._asdict(),
+                exposure_ev=photo.exposure_ev,
             )
         )
     return photos

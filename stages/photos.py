@@ -24,7 +24,8 @@ class Photo:
     ``mask`` is a grey PNG of the photo's size, 255 where it is to be used and 0 where it is to be ignored; None: all of
     it is used. ``near_duplicate_of`` is the name of the photo that is nearly the same picture, which is used in its
     place. ``time_s`` is when a frame of a video was taken, in seconds from its beginning, None for photos. The place
-    is EXIF's, in degrees (north and east positive) and metres above the sea, None where it tells none.
+    is EXIF's, in degrees (north and east positive) and metres above the sea, None where it tells none; so is
+    ``exposure_ev``, in stops (stages/decoding.py: exposure_from_exif).
     """
 
     name: str  # the user's own file name, relative to the photo folder
@@ -43,6 +44,7 @@ class Photo:
     latitude: float | None = None
     longitude: float | None = None
     altitude_m: float | None = None
+    exposure_ev: float | None = None
 
     @property
     def image_name(self) -> str:

@@ -87,6 +87,13 @@ def test_like_is_an_option_of_render_whichever_way_it_is_spelt(tmp_path: Path, m
     assert seen == ["a.jpg", "a.jpg", None]
 
 
+def test_a_photo_to_render_like_has_to_be_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    Image.new("RGB", (40, 30)).save(tmp_path / "IMG_1.jpg")
+    assert run_command(["run", str(tmp_path), "-o", str(tmp_path / "w"), "--like", "IMG_1.jpeg"]) == 2
+    assert "--like IMG_1.jpeg: no photo has that name; perhaps IMG_1.jpg" in capsys.readouterr().err
+    assert not (tmp_path / "w").exists()
+
+
 def test_like_belongs_to_render(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):
     seen: list[str | None] = []
     monkeypatch.setattr("pipeline.cli._run_stages", lambda root, settings, *_, **__: seen.append(settings.render.like))
