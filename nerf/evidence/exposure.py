@@ -169,7 +169,7 @@ def exposure_evidence(fit: ExposureFit, told: Float[np.ndarray, "views"] | None 
 
 
 def _beside_told(gain: Float[np.ndarray, "known"], told: Float[np.ndarray, "known"]) -> str:
-    """How far the gains are from what the cameras wrote, in words; nothing where they wrote of fewer than two photos."""
+    """How far the gains are from what the cameras wrote, in words; nothing where they wrote of less than two."""
     both = np.isfinite(told)
     if np.count_nonzero(both) < 2:
         return ""
