@@ -47,9 +47,11 @@ class Point:
 
 @dataclass(frozen=True)
 class Recommendation:
-    """A point, and why in words; ``still_rising`` where the longest trainings were still worth their time."""
+    """A point, and why in words, which begin with the ``headline``; ``still_rising`` where the longest trainings were
+    still worth their time."""
 
     point: Point
+    headline: str
     words: str
     still_rising: bool
 
@@ -126,7 +128,10 @@ def recommend(points: Sequence[Point]) -> Recommendation:
     front, deviation = pareto_front(points), pooled_deviation(points)
     index = knee(front, deviation or 0.0)
     point, best = front[index], front[-1]
-    words = f"For this scene: {duration(point.train_seconds)} of training, {point.label}: {_decibel(point, deviation)}."
+    headline = (
+        f"For this scene: {duration(point.train_seconds)} of training, {point.label}: {_decibel(point, deviation)}."
+    )
+    words = headline
     if point is best:
         words += f" Nothing tried is better, and up to there every doubling of the time paid: {_more(points)}."
     else:
@@ -135,7 +140,7 @@ def recommend(points: Sequence[Point]) -> Recommendation:
     if cheaper:
         lost, share = point.psnr - cheaper[-1].psnr, cheaper[-1].train_seconds / point.train_seconds
         words += f" With {share:.0%} of the time ({cheaper[-1].label}) it is {lost:.1f} dB less."
-    return Recommendation(point, words, point is best)
+    return Recommendation(point, headline, words, point is best)
 
 
 def _decibel(point: Point, deviation: float | None) -> str:

@@ -18,13 +18,18 @@ if TYPE_CHECKING:
 
 # Marker, colour and name of each family; colours of Okabe and Ito, which the colour-blind tell apart, too.
 FAMILIES = {
-    "grid": ("o", "#0072b2", "feature grid"),
+    "grid": ("o", "#0072b2", "feature grid (small, middle, large)"),
     "grid samples": ("s", "#56b4e9", "feature grid, other samples per ray"),
     "paper": ("D", "#d55e00", "paper's networks, reduced"),
     "ablation": ("v", "#cc79a7", "reduced, a part left out"),
     "published": ("P", "#e69f00", "paper's networks, published"),
 }
 SIZE = (10.5, 6.2)  # inches
+MARK = 6.5  # points
+LARGER = {"small grid": 0.7, "large grid": 1.4}
+NAMES = 0.32  # of the axis of the times: room at the left for the first name
+TICKS = [*(k * 10.0**e for e in (-2, -1, 0) for k in (1, 2, 5)), 10.0, 20.0, 30.0]
+TICKS += [*(60.0 * k for k in (1, 2, 5, 10, 20, 30)), *(3600.0 * k for k in (1, 2, 5, 10, 20))]
 LETTER = 8.5  # points, of labels
 GAP = 1.25  # lines between labels of the front
 DPI = 160
@@ -43,6 +48,7 @@ def write_plot(study: dict[str, Any], folder: Path) -> None:
     """tradeoff.svg and tradeoff.png, on white."""
     with drawing(SIZE, "tradeoff") as figure:
         draw(figure, study)
+        figure.suptitle(study["headline"], x=0.02, ha="left", size=12)
         ink, paper = "#1d2025", "#ffffff"
         figure.savefig(folder / "tradeoff.png", dpi=DPI, facecolor=paper, metadata={"Software": None})
         svg = svg_element(figure).replace("currentColor", ink)
@@ -62,13 +68,14 @@ def draw(figure: "Figure", study: dict[str, Any]) -> None:
     axes = figure.add_subplot()
     rows = study["points"]
     front = [row for row in rows if row["front"]]
-    axes.set_xscale("log", base=2)
+    axes.set_xscale("log")
     for family, (marker, colour, name) in FAMILIES.items():
         own = [row for row in rows if VARIANTS[row["variant"]].family == family]
+        for row in own:
+            spread, size = row["deviation"] or 0.0, MARK * LARGER.get(row["variant"], 1.0)
+            axes.errorbar(row["train_seconds"], row["psnr"], spread, fmt=marker, color=colour, ms=size, lw=1, zorder=3)
         if own:
-            place = ([row["train_seconds"] for row in own], [row["psnr"] for row in own])
-            spread = [row["deviation"] or 0.0 for row in own]
-            axes.errorbar(*place, yerr=spread, fmt=marker, color=colour, ms=6.5, lw=1, zorder=3, label=name)
+            axes.plot([], [], marker, color=colour, ms=MARK, label=name)
     axes.step(
         *([row[key] for row in front] for key in ("train_seconds", "psnr")), where="post", color=INK, lw=1.3, alpha=0.6
     )
@@ -78,19 +85,20 @@ def draw(figure: "Figure", study: dict[str, Any]) -> None:
     _frame(axes, rows)
     _number_the_others(axes, rows)
     _name_the_front(axes, front)
-    axes.legend(frameon=False, loc="lower right", fontsize=LETTER + 0.5)
+    axes.legend(
+        frameon=False, loc="lower left", bbox_to_anchor=(0, 1), ncols=3, borderaxespad=0.2, fontsize=LETTER + 0.5
+    )
 
 
 def _frame(axes: "Axes", rows: Sequence[dict[str, Any]]) -> None:
-    """Axes with a line for each doubling of the time, and room at the left of the front for its names."""
+    """Axes with lines at round times, and room at the left of the front for its names."""
     times, scores = [row["train_seconds"] for row in rows], [row["psnr"] for row in rows]
-    low, high = math.floor(math.log2(min(times))), math.ceil(math.log2(max(times)))
-    ticks = [2.0**power for power in range(low, high + 1)]
+    first, last = min(times) / 2, max(times) * 1.25
+    ticks = [tick for tick in TICKS if first <= tick <= last]
     axes.set_xticks(ticks, [duration(tick) for tick in ticks])
     axes.set_xticks([], minor=True)
     room = 0.06 * (max(scores) - min(scores)) + 0.1
-    octaves = math.log2(max(times) / min(times)) + 1
-    axes.set_xlim(min(times) / 2 ** (0.42 * octaves), max(times) * 1.25)
+    axes.set_xlim(min(times) / (max(times) / min(times) * 2) ** NAMES, last)
     axes.set_ylim(min(scores) - room, max(scores) + 2 * room)
     axes.set_xlabel("training time on this machine")
     axes.set_ylabel("PSNR on held-out photos (dB)")
@@ -105,16 +113,12 @@ def _number_the_others(axes: "Axes", rows: Sequence[dict[str, Any]]) -> None:
 
 
 def _name_the_front(axes: "Axes", front: Sequence[dict[str, Any]]) -> None:
-    """Names at the upper left of the front's points, where nothing lies, from the best down, none on another."""
-    low, high = axes.get_ylim()
-    line = (high - low) * GAP * LETTER / (72 * 0.86 * SIZE[1])
-    left, right = (math.log2(edge) for edge in axes.get_xlim())
-    ceiling = high
-    for row in reversed(front):
+    """Names at the upper left of the front's points, where nothing lies, from the fastest on, none on another."""
+    (low, high), (left, right) = axes.get_ylim(), axes.get_xlim()
+    line, y = (high - low) * GAP * LETTER / (72 * 0.8 * SIZE[1]), low
+    for row in front:
         name = f"{row['number']}  {row['variant']}, {resolution_words(row['downscale'])}"
-        y = min(row["psnr"] + 0.5 * line, ceiling - line)
-        ceiling = y
-        x = 2 ** (math.log2(row["train_seconds"]) - 0.02 * (right - left))
+        x, y = row["train_seconds"] / (right / left) ** 0.02, max(row["psnr"] + 0.5 * line, y + line)
         axes.annotate(
             name,
             (row["train_seconds"], row["psnr"]),
@@ -124,6 +128,7 @@ def _name_the_front(axes: "Axes", front: Sequence[dict[str, Any]]) -> None:
             va="center",
             arrowprops={"arrowstyle": "-", "color": INK, "alpha": 0.35, "lw": 0.6, "shrinkA": 0, "shrinkB": 3},
         )
+    axes.set_ylim(low, max(high, y + line))
 
 
 def write_sheet(rows: Sequence[Row], path: Path) -> None:
@@ -131,14 +136,12 @@ def write_sheet(rows: Sequence[Row], path: Path) -> None:
     from PIL import Image
 
     strips = [Image.open(row.strip).convert("RGB") for row in rows]
-    aspect = strips[0].width / strips[0].height
-    tall = SHOT / DPI  # inches a row
-    with drawing((aspect * tall + 2.1, len(rows) * tall), "ablation") as figure:
-        figure.set_layout_engine("none")  # names stand in the margin
-        grid = figure.subplots(len(rows), 1, squeeze=False)[:, 0]
-        share = 2.1 / (aspect * tall + 2.1)
-        figure.subplots_adjust(left=share, right=1, bottom=0, top=1, hspace=0.03)
-        for axes, row, strip in zip(grid, rows, strips, strict=True):
+    tall, names = SHOT / DPI, 2.1  # inches of a row and of the margin for names
+    width = names + tall * strips[0].width / strips[0].height
+    with drawing((width, len(rows) * tall), "ablation") as figure:
+        for number, (row, strip) in enumerate(zip(rows, strips, strict=True)):
+            bottom = 1 - (number + 1) / len(rows)
+            axes = figure.add_axes((names / width, bottom, 1 - names / width, 0.97 / len(rows)))
             axes.imshow(strip, interpolation="nearest", aspect="auto")
             axes.set_axis_off()
             score = "" if row.psnr is None else f"\n{row.psnr:.1f} dB"
