@@ -3,7 +3,6 @@
 Equal data gives equal bytes.
 """
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
