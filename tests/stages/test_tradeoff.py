@@ -1,4 +1,5 @@
 import shutil
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from tests.stages.photo_scene import photographed
 
 TINY_GRID = {"levels": 2, "log2_rows": 10, "finest": 32, "batch_samples": 1024}
 TINY_PAPER = {"depth": 2, "width": 16, "samples_coarse": 8, "samples_fine": 8, "batch_rays": 64}
-SPEEDS = dict.fromkeys(tradeoff_arms.TIMED, (120.0, 1e5)) | {"paper, published": (0.1, 10.0)}
+SPEEDS: dict[str, Any] = dict.fromkeys(tradeoff_arms.TIMED, (120.0, 1e5)) | {"paper, published": (0.1, 10.0)}
 CONFIG: dict[str, Any] = {"seconds": 14.0, "seeds": 2, "downscale": 1.0, "sizes": (1.0,), "windows": 3}
 
 
@@ -38,7 +39,7 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 def studied(folder: Path, photos: dict[str, Path], progress: Any, **settings: Any):
     folder.mkdir(exist_ok=True)
-    return tradeoff.run(Config(**(CONFIG | {"speeds": SPEEDS} | settings)), photos, folder, progress)
+    return tradeoff.run(Config.model_validate(CONFIG | {"speeds": SPEEDS} | settings), photos, folder, progress)
 
 
 class Killed(BaseException):
@@ -112,7 +113,9 @@ def test_a_slow_machine_leaves_arms_out_and_names_them(
     study = read_json(tmp_path / "tradeoff.json")
     spent = sum(arm["wall_seconds"] for arm in study["arms"])
     assert 0.5 * CONFIG["seconds"] < spent <= 1.1 * CONFIG["seconds"]
-    assert len(study["left_out"]) > len(tradeoff.selection_of(Config(**CONFIG, speeds=SPEEDS)).left_out)
+    assert len(study["left_out"]) > len(
+        tradeoff.selection_of(Config.model_validate(CONFIG | {"speeds": SPEEDS})).left_out
+    )
     assert any("slower than when it was measured" in note for note in progress.notes)
 
 
@@ -178,7 +181,7 @@ def test_memory_is_looked_at_while_the_block_runs() -> None:
         pass
     with tradeoff_trial.peak_memory() as peak:
         block = torch.ones(100_000_000, dtype=torch.uint8)
-        torch.cuda.is_available() or __import__("time").sleep(0.2)
+        time.sleep(0.2)
         del block
     if not torch.cuda.is_available():
         assert 50e6 < peak() - before() < 400e6
