@@ -12,8 +12,8 @@ RUNG = 1.7
 RUNGS = 8
 FEWEST_STEPS = 30  # a training of fewer says nothing of its field
 OVERHEAD = 1.2  # wall time of a training over its training seconds: the photos, the probes, the files
-DRAWING = {"grid": 0.3, "paper": 3.0}
-"""Rays drawn a second over rays trained: pictures of a grid field have all samples, its batches a fixed number."""
+DRAWING = {"grid": 0.7, "paper": 3.0}
+"""Rays drawn a second over rays trained, about: drawing does less, but a grid field of few steps is fog all over."""
 SPENT_ELSEWHERE = 0.03  # of the study's time: measuring speeds before it, drawing plots after it
 
 
