@@ -138,6 +138,7 @@ def write_sheet(rows: Sequence[Row], path: Path) -> None:
     tall, names = SHOT / DPI, 2.1  # inches of a row and of the margin for names
     width = names + tall * strips[0].width / strips[0].height
     with drawing((width, len(rows) * tall), "ablation") as figure:
+        figure.set_layout_engine("none")  # every axes has its place below
         for number, (row, strip) in enumerate(zip(rows, strips, strict=True)):
             bottom = 1 - (number + 1) / len(rows)
             axes = figure.add_axes((names / width, bottom, 1 - names / width, 0.97 / len(rows)))
