@@ -150,7 +150,7 @@ def test_without_held_out_photos_there_is_no_study(tmp_path: Path, photos: dict[
 
 
 def test_too_little_time_is_said_with_numbers(tmp_path: Path, photos: dict[str, Path], progress: Any) -> None:
-    with pytest.raises(StageError, match=r"2 s are too short here even for grid at full resolution: 17, 10, 6, 3"):
+    with pytest.raises(StageError, match=r"2 s are too short here even for grid at full resolution: 15, 9, 5, 3"):
         studied(tmp_path, photos, progress, seconds=2.0)
 
 
