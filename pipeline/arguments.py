@@ -69,6 +69,8 @@ class StageArguments:
     like: str | None = None
     """render only: render the video as this training photo was exposed (its name)."""
     effect: Effects = ()
+    budget: str | None = None
+    """tradeoff only: how long the study may take, as in 30m."""
     force: bool = False
     """Run it again even if it is cached."""
 

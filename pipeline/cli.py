@@ -1,6 +1,6 @@
 """The command line: finds the command, runs it, turns every ending into words and an exit code.
 
-Exit codes: 0 done; 2 usage; 3 the workspace; 10 to 18 the stage that failed (pipeline/chain.py); 130 Ctrl-C;
+Exit codes: 0 done; 2 usage; 3 the workspace; 10 to 19 the stage that failed (pipeline/chain.py); 130 Ctrl-C;
 143 SIGTERM; 1 a defect of this program.
 """
 
@@ -18,6 +18,7 @@ from pathlib import Path
 from pipeline import arguments as words_of
 from pipeline import chain, machine, status
 from pipeline.display import Display, SilentDisplay, choose_display
+from pipeline.durations import seconds_from
 from pipeline.runner import Runner, StageFailed
 from pipeline.settings import (
     Settings,
@@ -192,6 +193,8 @@ def command_stage(stage: str, words: Sequence[str]) -> int:
         if getattr(given, flag) is not None and stage != "render":
             raise UsageError(f"--{flag} belongs to `pipeline render` and `pipeline run`, not to {stage}")
     settings = _like(with_effects(given.settings, given.effect), given.like)
+    if given.budget is not None:
+        settings = _study_for(settings, given.budget, stage)
     if given.cameras is not None:
         update = {"cameras": given.cameras.absolute()}
         settings = settings.model_copy(update={"render": settings.render.model_copy(update=update)})
@@ -203,6 +206,14 @@ def command_stage(stage: str, words: Sequence[str]) -> int:
         return _run_stages(given.workspace, settings, stages, given.common, display, force, remember=False)
 
 
+def _study_for(settings: Settings, budget: str, stage: str) -> Settings:
+    """The settings with `pipeline tradeoff --budget`."""
+    if stage != "tradeoff":
+        raise UsageError(f"--budget belongs to `pipeline tradeoff`, not to {stage}")
+    update = {"seconds": seconds_from(budget)}
+    return settings.model_copy(update={"tradeoff": settings.tradeoff.model_copy(update=update)})
+
+
 def _recorded_settings(workspace: Workspace) -> Settings:
     return settings_from(workspace.read_run()["options"], f"options recorded in {workspace.root}")
 
@@ -211,7 +222,7 @@ def command_resume(words: Sequence[str]) -> int:
     """``pipeline resume WORKSPACE``: repeat the recorded run."""
     given = words_of.parse(words_of.ResumeArguments, "resume", words)
     workspace = Workspace.existing(given.workspace)
-    stages = workspace.read_run().get("stages") or list(chain.STAGES)
+    stages = workspace.read_run().get("stages") or chain.usual()
     with choose_display(given.common.json) as display:
         return _run_stages(given.workspace, _recorded_settings(workspace), stages, given.common, display)
 
@@ -275,7 +286,7 @@ def command_demo(words: Sequence[str]) -> int:
         line, seconds = demo.photograph(photos, display)
         display.end("photos", line, seconds, cached=seconds == 0)
         settings = with_source(asked, photos, None)
-        code = _run_stages(root, settings, list(chain.STAGES), given.common, display)
+        code = _run_stages(root, settings, chain.usual(), given.common, display)
         started = time.monotonic()
         display.begin("truth")
         *notes, last = demo.truth_lines(root / "output", photos)

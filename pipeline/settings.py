@@ -18,6 +18,7 @@ from stages.normalise import Config as NormaliseConfig
 from stages.render import Config as RenderConfig
 from stages.report import Config as ReportConfig
 from stages.sfm import Config as SfmConfig
+from stages.tradeoff import Config as TradeoffConfig
 from stages.train import Config as TrainConfig
 
 if TYPE_CHECKING:
@@ -43,6 +44,7 @@ class Settings(BaseModel):
     evaluate: EvaluateConfig = EvaluateConfig()
     render: RenderConfig = RenderConfig()
     mesh: MeshConfig = MeshConfig()
+    tradeoff: TradeoffConfig = TradeoffConfig()
     report: ReportConfig = ReportConfig()
 
 

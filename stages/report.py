@@ -18,8 +18,8 @@ from stages.live_line import duration, short_count
 if TYPE_CHECKING:
     from nerf.scene import Scene
 
-NEEDS = ("ingest", "sfm", "normalise", "effects", "train", "evaluate", "render", "mesh")
-VERSION = 3
+NEEDS = ("ingest", "sfm", "normalise", "effects", "train", "evaluate", "render", "mesh", "tradeoff")
+VERSION = 4
 RESUMES = False
 LINKS = ("report.html", "summary.json")
 
@@ -36,7 +36,10 @@ class Config(StageConfig):
 
 @dataclass(frozen=True)
 class Results:
-    """What the finished stages left. The parts of stages that have not run are None (``curve`` is empty)."""
+    """What the finished stages left. The parts of stages that have not run are None (``curve`` is empty).
+
+    The study has no part in ``manifests``: its time is none of the run's.
+    """
 
     inputs: Inputs
     manifests: Mapping[str, dict[str, Any]]
@@ -47,6 +50,7 @@ class Results:
     field: dict[str, Any] | None
     curve: list[dict[str, Any]]
     metrics: dict[str, Any] | None
+    study: dict[str, Any] | None
 
 
 def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> StageResult:
@@ -68,7 +72,7 @@ def read_results(inputs: Inputs) -> Results:
 
     return Results(
         inputs=inputs,
-        manifests={stage: of(stage, "manifest.json") for stage in NEEDS if stage in inputs},
+        manifests={stage: of(stage, "manifest.json") for stage in NEEDS if stage in inputs and stage != "tradeoff"},
         photos=of("ingest", "photos.json"),
         registration=of("sfm", "registration.json"),
         scene=read_scene(inputs["normalise"]) if "normalise" in inputs else None,
@@ -76,6 +80,7 @@ def read_results(inputs: Inputs) -> Results:
         field=of("train", "field.json"),
         curve=of("train", "curve.json") or [],
         metrics=of("evaluate", "metrics.json"),
+        study=of("tradeoff", "tradeoff.json"),
     )
 
 
@@ -125,6 +130,7 @@ def page(results: Results, summary: dict[str, Any], config: Config) -> str:
         compared=_compared(results),
         curve=_curve(results),
         effects=effects_table(results.effects),
+        study=_study(results),
         cameras=_cameras(results),
         mesh_preview=_mesh_preview(results.inputs),
         longest=max((manifest["seconds"] for manifest in results.manifests.values()), default=0) or 1,
@@ -244,6 +250,24 @@ def _curve(results: Results) -> dict[str, Any] | None:
     if svg is None:
         return None
     return {"svg": Markup(svg), "gain": last_doubling(results.curve), "seconds": results.curve[-1]["seconds"]}
+
+
+def _study(results: Results) -> dict[str, Any] | None:
+    """The study of cost and quality: recommendation, plot, table, and the ablation's pictures where there are any."""
+    from markupsafe import Markup
+
+    from stages.tradeoff import COLUMNS, cells
+    from stages.tradeoff_plot import plot_svg
+
+    if results.study is None:
+        return None
+    ablation = results.inputs["tradeoff"] / "ablation.png"
+    return results.study | {
+        "svg": Markup(plot_svg(results.study)),
+        "columns": COLUMNS,
+        "rows": [{"cells": cells(row), "front": row["front"]} for row in results.study["points"]],
+        "ablation": _data_uri(ablation.read_bytes(), "image/png") if ablation.exists() else None,
+    }
 
 
 def _compared(results: Results) -> dict[str, Any] | None:

@@ -50,7 +50,7 @@ PAPER_SIZES = {
 GRID_RATES = {"bounded": 2e-2, "contracted": 1e-2}
 GRID_SAMPLES = 1 << 14
 
-GRID_ONLY = ("backend", "chunks", "levels", "log2_rows", "finest", "batch_samples")
+GRID_ONLY = ("backend", "chunks", "levels", "log2_rows", "finest", "batch_samples", "ray_samples")
 PAPER_ONLY = (
     *("batch_rays", "depth", "width", "skip", "position_frequencies", "direction_frequencies"),
     *("samples_coarse", "samples_fine", "positional_encoding", "hierarchical"),
@@ -96,6 +96,9 @@ class Config(StageConfig):
     log2_rows: int | None = Field(default=None, ge=8, le=24, description="grid: rows of a grid's table, as power of 2")
     finest: int | None = Field(default=None, ge=16, le=4096, description="grid: cells along an axis of the finest grid")
     batch_samples: int | None = Field(default=None, ge=256, description="grid: colours computed in a step")
+    ray_samples: float = Field(
+        default=1.0, gt=0, description="grid: samples along a ray, times what suits its finest cells"
+    )
 
     batch_rays: int | None = Field(default=None, ge=1, description="paper: rays in a step; none: by the preset")
     depth: int | None = Field(default=None, ge=1, description="paper: layers before the density")

@@ -115,9 +115,9 @@ def grid_settings(config: "Config") -> "GridSettings":
         coarsest=min(COARSEST, config.finest),
         finest=config.finest,
         contracted=config.contracted,
-        steps=min(max(config.finest, FEWEST_STEPS), MOST_STEPS),
-        shortest_step=2 / config.finest,
-        cone=8 / config.finest,
+        steps=max(1, round(config.ray_samples * min(max(config.finest, FEWEST_STEPS), MOST_STEPS))),
+        shortest_step=2 / (config.ray_samples * config.finest),
+        cone=8 / (config.ray_samples * config.finest),
         view_dependence=config.view_dependence,
     )
 

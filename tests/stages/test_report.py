@@ -15,6 +15,8 @@ from nerf.scene import Camera, Scene, Similarity, View
 from stages import report
 from stages.contract import StageError
 from stages.files import write_json, write_tensors
+from stages.tradeoff_front import recommend, table
+from tests.stages.test_tradeoff_front import point
 
 NASTY = "<script>alert(1)</script>.jpg"
 FACTS = {
@@ -368,6 +370,33 @@ def test_page_shows_what_was_tried_to_find_the_cameras(tmp_path: Path, progress:
     write_json(path, registration | {"attempts": ATTEMPTS[2:3]})  # the first was enough
     html, _ = _run(inputs, tmp_path / "one", progress)
     assert "Ways tried" not in html
+
+
+def test_page_shows_the_study_and_leaves_its_time_out(tmp_path: Path, progress: Any):
+    inputs = make_workspace(tmp_path)
+    before, summary_before = _run(inputs, tmp_path / "before", progress)
+    inputs["tradeoff"] = tmp_path / "fox.nerf" / "tradeoff" / "0123456789abcdef"
+    inputs["tradeoff"].mkdir(parents=True)
+    points = [
+        point(10.0, 20.0),
+        point(20.0, 23.0, seeds=2, deviation=0.2),
+        point(15.0, 18.0, variant="no view dependence"),
+    ]
+    points = sorted(points, key=lambda p: p.train_seconds)
+    study = {"headline": "", "recommendation": recommend(points).words, "recommended": 3, "points": table(points)}
+    study |= {"scored": "6 windows of 2 held-out photos", "left_out": ["paper, published: 5 steps"]}
+    write_json(inputs["tradeoff"] / "tradeoff.json", study)
+    (inputs["tradeoff"] / "manifest.json").write_text('{"seconds": 1800}')
+    assert "What quality costs here" not in before
+    text, summary = _run(inputs, tmp_path / "out", progress)
+    assert "What quality costs here" in text and study["recommendation"] in text
+    for words in ("All 3 settings", "<b>23.00 ± 0.20</b>", ">18.00<", "6 windows of 2", "paper, published: 5 steps"):
+        assert words in text, words
+    assert "reduced, a part left out" in text, "the plot's legend"
+    assert "What each part of the method is worth" not in text, "no picture, no title"
+    assert summary == summary_before, "the study's time is none of the run's"
+    Image.new("RGB", (64, 48)).save(inputs["tradeoff"] / "ablation.png")
+    assert "What each part of the method is worth" in _run(inputs, tmp_path / "pictures", progress)[0]
 
 
 def test_a_large_video_lies_beside_the_page(inputs: dict[str, Path], tmp_path: Path, progress: Any):
