@@ -5,7 +5,7 @@ PSNR is taken from the float picture in [0, 1], per photo; figures over all phot
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from stages.drawing import Painter
 
 NEEDS = ("ingest", "normalise", "train")
-VERSION = 4
+VERSION = 5
 RESUMES = False
 LINKS = ("metrics.json", "renders", "errors")
 
@@ -164,7 +164,7 @@ class Examiner:
         image = rendering.colour.clamp(0, 1)
         right, fitted = right_half_psnr(rendering, self.painter.background.cpu(), truth, used)
         if self.fits_poses and right is not None:
-            moved = self._from_fitted_pose(view, rendering, truth, used)
+            moved = self._from_fitted_pose(view, truth, used)
             _, fitted = right_half_psnr(moved, self.painter.background.cpu(), truth, used)
         height, width = truth.shape[:2]
         nearest = nearest_view(view, self.scene.of_split("train"))
@@ -185,9 +185,7 @@ class Examiner:
             "error": f"errors/{file}",
         }
 
-    def _from_fitted_pose(
-        self, view: "View", rendering: "Rendering", truth: "Tensor", used: "Tensor | None"
-    ) -> "Rendering":
+    def _from_fitted_pose(self, view: "View", truth: "Tensor", used: "Tensor | None") -> "Rendering":
         """The view from where its left half says that it was taken."""
         from nerf.effects.exposure import ExposedModel
         from nerf.grid_field import GridField
@@ -198,8 +196,9 @@ class Examiner:
         field = model.model if isinstance(model, ExposedModel) else model
         assert isinstance(field, GridField), "only with a grid field does evaluate fit poses"
         rays = view_rays(self.scene, view, self.downscale)
-        painter = self._painter(view)
-        return painter.draw(from_fitted_pose(field, rays, rendering, self.painter.background.cpu(), truth, used))
+        as_it_is = replace(self.painter, model=field).draw(rays)
+        moved = from_fitted_pose(field, rays, as_it_is, self.painter.background.cpu(), truth, used)
+        return self._painter(view).draw(moved)
 
     def _photo(self, view: "View") -> "Tensor":
         from stages.training_data import view_pixels
