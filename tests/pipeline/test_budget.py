@@ -1,6 +1,7 @@
 """A budget on a machine whose clock and speed are made up: it converges, whatever the machine does and however often
 it is killed."""
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -110,18 +111,16 @@ class Machine:
         self.now, self.slowness, self.halves_at, self.killed_at = 1000.0, slowness, float("inf"), list[float]()
 
     def work(self, seconds: float, folder: Path | None = None) -> None:
-        """Let time pass, in tenths; a kill leaves no trace but the last file written."""
-        for _ in range(round(10 * seconds)):
-            self.now += 0.1 * self.slowness * (2 if self.now >= self.halves_at else 1)
-            if folder is not None:
-                self.touch(folder)
+        """Let time pass, in quarters; a kill leaves no trace but the last file written."""
+        for _ in range(round(4 * seconds)):
+            self.now += 0.25 * self.slowness * (2 if self.now >= self.halves_at else 1)
             if self.killed_at and self.now >= self.killed_at[0]:
                 self.killed_at.pop(0)
+                if folder is not None:
+                    self.touch(folder)
                 raise Killed
 
     def touch(self, folder: Path) -> None:
-        import os
-
         (folder / "trace").write_text("x")
         for path in (folder, folder / "trace"):
             os.utime(path, (self.now, self.now))
@@ -131,7 +130,7 @@ class Killed(BaseException):
     """SIGKILL: nothing is noted down."""
 
 
-UNITS = {"evaluate": (1, 8, 1.5), "render": (6, 2000, 0.1), "mesh": (4, 400, 0.15)}
+UNITS = {"evaluate": (1, 8, 1.5), "render": (6, 4000, 0.1), "mesh": (4, 400, 0.15)}
 """Least and most, and seconds for each at full speed."""
 MUST = {"ingest": 1.5, "sfm": 40.0, "normalise": 0.3, "effects": 3.0, "report": 1.5}
 EXPECTED: dict[str, float | None] = dict.fromkeys(SHARES) | {
@@ -164,10 +163,9 @@ def chain(machine: Machine) -> dict[str, SimpleNamespace]:
                 machine.work(3.0, folder)
                 while done < config.seconds:  # the clock decides, whatever the machine does
                     before = machine.now
-                    machine.work(0.5 / machine.slowness, folder)
+                    machine.work(1.0, folder)
                     done += machine.now - before
                     checkpoint.write_text(str(done))
-                    machine.touch(folder)
             elif name in UNITS:
                 machine.work(config.units * UNITS[name][2], folder)
             else:
@@ -235,8 +233,9 @@ def spent(runner: Runner) -> dict[str, float]:
     return runner.budget.state["spent"]
 
 
-@pytest.mark.parametrize("total", [120.0, 300.0, 900.0])
-@pytest.mark.parametrize("slowness", [0.2, 0.7, 1.0, 1.5])
+@pytest.mark.parametrize(
+    ("total", "slowness"), [(120, 0.5), (120, 1.0), (300, 0.8), (300, 1.5), (900, 0.5), (900, 1.5)]
+)
 def test_a_run_takes_its_budget_on_slow_and_fast_machines(go: Go, total: float, slowness: float) -> None:
     machine = Machine(slowness)
     runner = go(machine, total)
@@ -268,7 +267,7 @@ def test_the_same_again_is_nothing_to_do_and_another_budget_loses_nothing(go: Go
     assert (again.ran, again.took) == (False, 0)
     longer = go(machine, 300.0)
     assert longer.ran and folders < {path for path in (tmp_path / "w.nerf").glob("*/*") if path.is_dir()}
-    assert "sfm" not in spent(longer)
+    assert spent(longer)["sfm"] < 1  # planned anew, and found finished
     assert longer.took == pytest.approx(300, rel=0.1)  # what the cameras cost before goes to the training
     back = go(machine, 120.0)
     assert not back.ran or set(spent(back)) == {"report"}
