@@ -136,7 +136,7 @@ def command_run(words: Sequence[str]) -> int:
         except StageError as error:
             display.failed("ingest", error)
             return chain.EXIT_CODES["ingest"]
-        return _run_stages(root, settings, stages, given.common, display, force, new_budget=(budget,))
+        return _run_stages(root, settings, stages, given.common, display, force, new_budget=(budget, 0.0))
 
 
 def _budget(text: str | None, settings: Settings) -> float | None:
@@ -168,8 +168,9 @@ def _run_stages(
     display: Display,
     force: frozenset[str] = frozenset(),
     remember: bool = True,
-    new_budget: tuple[float | None] | None = None,
+    new_budget: tuple[float | None, float] | None = None,
 ) -> int:
+    """``new_budget``: seconds for the whole command (None: no limit), and those spent before; None: as recorded."""
     with Workspace(root) as workspace:
         runner = Runner(workspace, settings, display)
         if new_budget is not None:
@@ -296,7 +297,8 @@ def command_demo(words: Sequence[str]) -> int:
         line, seconds = demo.photograph(photos, display)
         display.end("photos", line, seconds, cached=seconds == 0)
         settings = with_source(asked, photos, None)
-        code = _run_stages(root, settings, list(chain.STAGES), given.common, display, new_budget=(budget,))
+        every = list(chain.STAGES)
+        code = _run_stages(root, settings, every, given.common, display, new_budget=(budget, seconds))
         started = time.monotonic()
         display.begin("truth")
         *notes, last = demo.truth_lines(root / "output", photos)

@@ -10,7 +10,7 @@ from types import ModuleType
 from typing import Any
 
 from pipeline import attempts, machine, manifests
-from pipeline.budget import Budget, allotted, training_seconds
+from pipeline.budget import Budget, allotted, least_total, training_seconds
 from pipeline.chain import STAGES
 from pipeline.display import Display
 from pipeline.keys import ContentIndex, config_for_key, digest, stage_key
@@ -18,6 +18,7 @@ from pipeline.manifests import BadManifest, Manifest
 from pipeline.settings import Settings
 from pipeline.workspace import Workspace
 from stages.contract import StageConfig, StageError
+from stages.live_line import duration
 
 
 class StageFailed(Exception):
@@ -71,12 +72,17 @@ class Runner:
         """The time that the run may take in all, where there is a limit."""
         return Budget(self.state["budget"]) if self.state.get("budget") else None
 
-    def set_budget(self, total: float | None) -> None:
-        """Make ``total`` seconds the budget of this workspace, None for no limit. The same as before goes on."""
+    def set_budget(self, total: float | None, before: float = 0.0) -> None:
+        """Make ``total`` seconds the budget of this workspace, None for no limit. The same as before goes on.
+
+        ``before``: seconds spent already on what the photos were made in.
+        """
         if total is None:
             self.state.pop("budget", None)
         elif self.budget is None or self.budget.total != total:
             self.state["budget"] = Budget.new(total, self._options_digest())
+            if before:
+                Budget(self.state["budget"]).end("photos", before)
 
     def time_left(self, budget: Budget) -> float:
         """Seconds of the budget that this run has: all, unless it goes on with an interrupted one."""
@@ -245,6 +251,10 @@ class Runner:
             return options
         to_come = {name: self.times.get(name) for name in self.stages[self.stages.index(stage) + 1 :]}
         wall = allotted(stage, self.budget.left, to_come, self.budget.total)
+        if stage == "train" and (least := least_total({stage: None, **to_come})) > self.budget.left:
+            left, took = duration(max(0.0, self.budget.left)), duration(self.budget.total)
+            why = f"{left} of {took} are left, the smallest of all that is to come takes about {duration(least)}"
+            self.display.note(f"the budget cannot be kept: {why}")
         self.budget.promise(stage, wall)
         seconds = training_seconds(wall) if stage == "train" else wall
         return options.model_copy(update={"seconds": round(seconds, 1)})

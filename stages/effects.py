@@ -33,6 +33,7 @@ ORDER = (
 PART_OF_THE_METHOD = ("view_dependence",)
 MOST_PILOTS = 2
 PILOT_STEPS = 100
+WORTH_TIMING = 3.0  # seconds: in less no pilot is made, and to find out takes one or two
 
 
 class Config(StageConfig):
@@ -68,6 +69,8 @@ def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
         return config
     if config.seconds is None or not config.pilot_steps:
         return config.model_copy(update={"pilots": MOST_PILOTS})
+    if config.seconds < WORTH_TIMING:
+        return config.model_copy(update={"pilots": 0})
     from stages.pilots import expected_seconds
 
     progress.update("trying how long a pilot would take")

@@ -147,8 +147,7 @@ def chosen(
             break
         if (shorter := _measured(photos, images, less).of(count, pairs)) <= WORTH_IT * seconds:
             tier, seconds = less, shorter
-    if tier != tiers[0] or count > ORDINARY:
-        progress.note(_search_in_words(count, tiers[0], tier, full.of(count, pairs), seconds))
+    progress.note(_search_in_words(count, tiers[0], tier, full.of(count, pairs), seconds))
     return Chosen(*tier, matcher)
 
 

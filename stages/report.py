@@ -41,8 +41,8 @@ class Config(StageConfig):
 
     video_limit_mb: float = Field(default=12, ge=0)
     """A larger video lies beside the page and not inside it."""
-    # The runner knows it; no flag is offered.
     budget: Annotated[Account | None, Suppress] = None
+    """What the runner knows of the time given to the run; no flag is offered for it."""
 
 
 @dataclass(frozen=True)

@@ -361,3 +361,11 @@ def test_photos_too_small_for_ssim_are_judged_by_psnr_alone():
     figures = {"psnr": 28.9, "ssim": None, "psnr_nearest_view": 14.2, "psnr_mean_image": 12.9}
     words = verdict(figures | {"photos_scored": 7, "width_share": 1})
     assert words == "Sharp and trustworthy: 28.9 dB on unseen photos, 14.7 dB better than the nearest photo."
+
+
+@pytest.mark.parametrize(("seconds", "count"), [(0.9, 1), (2.9, 2), (5.0, 4), (0.01, 1)])
+def test_seconds_given_bound_the_photos_whatever_training_took(make: Make, progress: Any, seconds: float, count: int):
+    inputs = make(speed=WIDTH * HEIGHT)  # a photo a second; reading fifteen takes 0.75 of them
+    planned = evaluate.plan(evaluate.Config(seconds=seconds), inputs, progress)
+    assert planned.photos == count
+    assert not progress.notes or f", given {seconds:g} s;" in progress.notes[0].replace("0 s", "0.01 s")
