@@ -20,6 +20,11 @@ Effects = Annotated[
     tyro.conf.arg(metavar="NAME=on|off|auto", help="Force an effect on or off, or let the photos decide; repeatable."),
 ]
 
+Budget = Annotated[
+    str | None,
+    tyro.conf.arg(metavar="DURATION", help="Wall time for the whole command, like 90s, 10m or 1h30m."),
+]
+
 
 @dataclass
 class Common:
@@ -48,6 +53,7 @@ class RunArguments:
     like: str | None = None
     """Render the video as this training photo was exposed (its name; where the effect exposure is on)."""
     effect: Effects = ()
+    budget: Budget = None
     until: str | None = None
     """The last stage to run."""
     from_: Annotated[str | None, tyro.conf.arg(name="from")] = None
@@ -124,6 +130,7 @@ class DemoArguments:
     settings: Annotated[Settings, tyro.conf.arg(name="")] = field(default_factory=Settings)
     common: Annotated[Common, tyro.conf.arg(name="")] = field(default_factory=Common)
     effect: Effects = ()
+    budget: Budget = None
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("demo")
     """Where photos and workspace go."""
 

@@ -16,7 +16,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from pipeline import arguments as words_of
-from pipeline import chain, machine, status
+from pipeline import chain, forecast, machine, status
 from pipeline.display import Display, SilentDisplay, choose_display
 from pipeline.durations import seconds_from
 from pipeline.runner import Runner, StageFailed
@@ -31,6 +31,7 @@ from pipeline.settings import (
 )
 from pipeline.workspace import Workspace
 from stages.contract import StageError
+from stages.live_line import duration
 
 EXIT_DEFECT, EXIT_USAGE, EXIT_WORKSPACE, EXIT_INTERRUPT, EXIT_TERMINATED = 1, 2, 3, 130, 143
 
@@ -128,13 +129,22 @@ def command_run(words: Sequence[str]) -> int:
     if given.from_ is not None:
         force = frozenset(stages[stages.index(_known_stage(given.from_, "--from", stages)) :])
     root = given.output or default_workspace(given.photos)
+    budget = _budget(given.budget, asked)
     with choose_display(given.common.json) as display:
         try:
             settings = with_source(asked, given.photos, given.cameras)
         except StageError as error:
             display.failed("ingest", error)
             return chain.EXIT_CODES["ingest"]
-        return _run_stages(root, settings, stages, given.common, display, force)
+        return _run_stages(root, settings, stages, given.common, display, force, new_budget=(budget, 0.0))
+
+
+def _budget(text: str | None, settings: Settings) -> float | None:
+    """The seconds of ``--budget``. Raises UsageError beside steps, which take as long as they take."""
+    if text is not None and settings.train.steps is not None:
+        what = f"--budget {text} and --train.steps {settings.train.steps}: so many steps take as long as they take"
+        raise UsageError(f"{what}; leave out one, or give --train.seconds")
+    return None if text is None else seconds_from(text)
 
 
 def _like(settings: Settings, photo: str | None) -> Settings:
@@ -158,16 +168,24 @@ def _run_stages(
     display: Display,
     force: frozenset[str] = frozenset(),
     remember: bool = True,
+    new_budget: tuple[float | None, float] | None = None,
 ) -> int:
+    """``new_budget``: seconds for the whole command (None: no limit), and those spent before; None: as recorded."""
     with Workspace(root) as workspace:
         runner = Runner(workspace, settings, display)
-        display.headline(machine.headline(root))
+        if new_budget is not None:
+            runner.set_budget(*new_budget)
+        times = forecast.times(settings)
+        display.headline(" · ".join([machine.headline(root), *forecast.promise(runner, stages, force, times)]))
         try:
-            ran = runner.run(stages, force=force, replan=common.replan, remember=remember)
+            ran = runner.run(stages, force=force, replan=common.replan, remember=remember, times=times)
         except StageFailed as failure:
             display.failed(failure.stage, failure.error)
             raise
-        display.finished(_closing_words(workspace, ran), _outputs(workspace))
+        words = _closing_words(workspace, ran)
+        if ran and runner.budget:
+            words = f"{duration(runner.budget.spent)} of {duration(runner.budget.total)} spent {words}"
+        display.finished(words, _outputs(workspace))
     return 0
 
 
@@ -278,7 +296,10 @@ def command_demo(words: Sequence[str]) -> int:
     """``pipeline demo``: photograph a synthetic scene, run everything, compare with the truth."""
     from pipeline import demo
 
-    given = words_of.parse(words_of.DemoArguments, "demo", words, demo.default_settings())
+    given = words_of.parse(words_of.DemoArguments, "demo", words)
+    if given.budget is None:
+        given = words_of.parse(words_of.DemoArguments, "demo", words, demo.default_settings())
+    budget = _budget(given.budget, given.settings)
     asked = with_effects(given.settings, given.effect)
     photos, root = given.output / "photos", given.output / "demo.nerf"
     with choose_display(given.common.json) as display:
@@ -286,7 +307,8 @@ def command_demo(words: Sequence[str]) -> int:
         line, seconds = demo.photograph(photos, display)
         display.end("photos", line, seconds, cached=seconds == 0)
         settings = with_source(asked, photos, None)
-        code = _run_stages(root, settings, chain.usual(), given.common, display)
+        budgeted = (budget, seconds)
+        code = _run_stages(root, settings, chain.usual(), given.common, display, new_budget=budgeted)
         started = time.monotonic()
         display.begin("truth")
         *notes, last = demo.truth_lines(root / "output", photos)

@@ -7,9 +7,10 @@ they would have told is then left out, never made up.
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field
+from tyro.conf import Suppress
 
 from stages.contract import Inputs, Progress, StageConfig, StageResult
 from stages.files import read_json, read_scene, read_tensors, write_json
@@ -27,11 +28,21 @@ WIDTH_LARGE, WIDTH_SMALL = 900, 420  # pixels of a picture in the page
 MOST_SMALL = 12  # further test photos shown, besides the best, the median and the worst
 
 
+class Account(StageConfig):
+    """What a budget of wall time promised and what was spent, in seconds, by stage; none of what was there already."""
+
+    seconds: float
+    promised: dict[str, float]
+    spent: dict[str, float]
+
+
 class Config(StageConfig):
     """Settings of stage report."""
 
     video_limit_mb: float = Field(default=12, ge=0)
     """A larger video lies beside the page and not inside it."""
+    budget: Annotated[Account | None, Suppress] = None
+    """What the runner knows of the time given to the run; no flag is offered for it."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +69,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     progress.update("reading results")
     results = read_results(inputs)
     summary = summarise(results)
+    summary["budget"] = config.budget and config.budget.model_dump()
     write_json(folder / "summary.json", summary)
     progress.update("writing the page")
     (folder / "report.html").write_text(page(results, summary, config), "utf-8")
@@ -120,6 +132,7 @@ def page(results: Results, summary: dict[str, Any], config: Config) -> str:
         metrics=results.metrics,
         registration=results.registration,
         manifests=results.manifests,
+        budget=config.budget,
         settings=_settings(results.manifests),
         refused=results.photos["refused"] if results.photos else [],
         missing=_missing(results),

@@ -22,7 +22,8 @@ VERSION = 3
 RESUMES = True
 LINKS = ("sparse",)
 # It may decide that an attempt is not made, which is said; in the key it would part a run from the matches kept for it.
-UNKEYED = ("max_seconds",)
+# And the time it is given decides how far features are searched, which enters the key.
+UNKEYED = ("max_seconds", "seconds")
 
 CameraModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE"]
 Matcher = Literal["exhaustive", "sequential", "spatial", "retrieval"]
@@ -53,6 +54,9 @@ class Config(StageConfig):
     """Partners of each photo, where not all pairs are matched."""
     attempts: int = Field(default=len(ATTEMPTS), ge=1, le=len(ATTEMPTS))
     """How many ways to find the cameras are tried while photos have no place; 1: only the first."""
+    seconds: float | None = Field(default=None, gt=0)
+    """That it may take, if it can be: features are searched less far where they would take longer, and further attempts
+    that would not fit are not begun. It is not given up for it; None: as long as is bearable."""
     max_seconds: float = Field(default=4 * 3600.0, gt=0)
     """When structure-from-motion is given up; what was matched until then is kept for the next try. Attempts that
     would not fit are not begun."""
@@ -68,7 +72,8 @@ def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
         return config
     photos = sorted(read_photos(inputs["ingest"]), key=lambda photo: photo.file)
     photos = [photo for photo in photos if not photo.near_duplicate_of]
-    answer = chosen(left_open, photos, inputs["ingest"] / "images", config.neighbours, progress)
+    images = inputs["ingest"] / "images"
+    answer = chosen(left_open, photos, images, config.neighbours, progress, config.seconds)
     return config.model_copy(update=answer._asdict())
 
 

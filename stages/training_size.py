@@ -66,9 +66,14 @@ def rays_in_budget(config: "Config", scene: "Scene", decisions: "Decisions") -> 
 
 
 def rays_per_second(config: "Config", scene: "Scene", decisions: "Decisions") -> float:
-    """Measured training speed: steps of a fresh field, with its effects, on a grey picture, for about a second."""
+    """Measured training speed."""
+    config = _timed(config, compute_device())
+    return rays_per_step(config) / seconds_per_step(config, scene, decisions)
+
+
+def seconds_per_step(config: "Config", scene: "Scene", decisions: "Decisions") -> float:
+    """Measured: steps of a fresh field of known sizes, with its effects, on a grey picture, for about a second."""
     device = compute_device()
-    config = _timed(config, device)
     bank = _grey_bank(scene).to(device)
     parts = photo_parts(decisions, scene.of_split("train")[:1], bank.device)
     trainer = make_trainer(config, scene, bank, seed=0, photo_parts=parts)
@@ -77,7 +82,7 @@ def rays_per_second(config: "Config", scene: "Scene", decisions: "Decisions") ->
     while steps == 0 or time.perf_counter() - started < TIMED_SECONDS:
         steps += 1
         trainer.step(steps, 0.0, 1.0)
-    return steps * rays_per_step(config) / (time.perf_counter() - started)
+    return (time.perf_counter() - started) / steps
 
 
 def _timed(config: "Config", device: str) -> "Config":

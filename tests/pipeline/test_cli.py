@@ -54,6 +54,9 @@ def test_help_of_run_lists_the_stage_options(capsys: pytest.CaptureFixture[str])
         (["--train.field", "foo"], "invalid choice 'foo' for argument '--train.field'. Expected one of ("),
         (["--effect", "lens_flare=on"], "--effect lens_flare=on: no effect 'lens_flare'; there are: "),
         (["--effect", "lens_flare=on", "--effect", "fog=on"], "--effect lens_flare=on: no effect"),
+        (["--budget", "10"], "'10' is not a duration; write it like 90s, 10m or 1h30m"),
+        (["--budget", "2m", "--train.steps", "50"], "--budget 2m and --train.steps 50: so many steps take as "
+         "long as they take; leave out one, or give --train.seconds"),
         (["--train.stepz", "5"], "Unrecognized options: --train.stepz, 5; perhaps --train.steps"),
     ],
 )  # fmt: skip

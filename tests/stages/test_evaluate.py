@@ -392,3 +392,11 @@ def test_poses_are_fitted_to_the_field_as_it_is_and_scored_as_the_photo_was_expo
     exposed, truth = neutral.at_gain(gain).draw(rays), view_pixels(inputs["ingest"], scene, view, 1.0, (0.0,) * 3)
     _, fitted = right_half_psnr(exposed, torch.zeros(3), truth)
     assert scored["psnr_fitted_right"] == pytest.approx(fitted)
+
+
+@pytest.mark.parametrize(("seconds", "count"), [(0.9, 1), (2.9, 2), (5.0, 4), (0.01, 1)])
+def test_seconds_given_bound_the_photos_whatever_training_took(make: Make, progress: Any, seconds: float, count: int):
+    inputs = make(speed=WIDTH * HEIGHT)  # a photo a second; reading fifteen takes 0.75 of them
+    planned = evaluate.plan(evaluate.Config(seconds=seconds), inputs, progress)
+    assert planned.photos == count
+    assert not progress.notes or f", given {seconds:g} s;" in progress.notes[0].replace("0 s", "0.01 s")

@@ -193,7 +193,20 @@ def test_summary_has_exactly_the_promised_keys(inputs: dict[str, Path], tmp_path
         "psnr_nearest_view": 14.2,
         "mesh": {"vertices": 105_900, "faces": 211_817, "watertight": False},
         "verdict": "Better than any photo nearby by 7.3 dB but soft.",
+        "budget": None,
     }
+
+
+def test_a_budget_is_shown_promised_beside_spent_and_in_all(inputs: dict[str, Path], tmp_path: Path, progress: Any):
+    account = {"seconds": 300.0, "promised": {"sfm": 50.0, "train": 170.0}, "spent": {"train": 166.0, "mesh": 12.0}}
+    html, summary = _run(inputs, tmp_path / "out", progress, budget=account)
+    assert summary["budget"] == account
+    text = " ".join(re.sub("<[^>]+>", " ", html).split())
+    assert "Given 5 min in all; 2 min 58 s spent before this page was written." in text
+    rows = {row[0]: row[2:4] for row in ([re.sub("<[^>]+>", "", c) for c in re.findall("<td.*?</td>", line)]
+            for line in re.findall("<tr>.*</tr>", html.split("How it was made")[1])) if len(row) == 6}  # fmt: skip
+    assert rows["sfm"] == ["50 s", "–"] and rows["train"] == ["2 min 50 s", "2 min 46 s"] and rows["mesh"][1] == "12 s"
+    assert "Given 5 min" not in _run(inputs, tmp_path / "without", progress)[0]
 
 
 def test_page_loads_nothing_from_elsewhere(inputs: dict[str, Path], tmp_path: Path, progress: Any):
