@@ -10,10 +10,11 @@ from typing import NamedTuple
 
 
 class Decision(NamedTuple):
-    """From step ``from_step`` on, the run is meant to have ``total_steps`` steps."""
+    """From step ``from_step`` on, before which ``share`` of the run is done, it is meant to have ``total_steps``."""
 
     from_step: int
     total_steps: int
+    share: float
 
 
 class StepPlan(NamedTuple):
@@ -27,17 +28,12 @@ class StepPlan(NamedTuple):
         return self.decisions[-1].total_steps
 
     def share(self, step: int) -> float:
-        """The share of the run done before ``step``: continuous, linear between decisions, 1 at the end.
+        """The share of the run done before ``step``, 1 at the end.
 
         Every decision spreads the share that was left when it was made evenly over the steps that were left.
         """
-        share = 0.0
-        ends = [later.from_step for later in self.decisions[1:]] + [self.total_steps]
-        for (start, total), end in zip(self.decisions, ends, strict=True):
-            if step <= start:
-                break
-            share += (1 - share) * (min(step, end) - start) / (total - start)
-        return share
+        start, total, share = next(decision for decision in reversed(self.decisions) if decision.from_step <= step)
+        return share if total == start else share + (1 - share) * min(1.0, (step - start) / (total - start))
 
     def revised(self, step: int, total_steps: int) -> "StepPlan":
         """This plan with one more decision made before ``step``.
@@ -46,14 +42,24 @@ class StepPlan(NamedTuple):
         """
         if not self.decisions[-1].from_step <= step < total_steps:
             raise ValueError(f"at step {step} the plan {self.decisions} cannot become {total_steps} steps")
-        return StepPlan((*self.decisions, Decision(step, total_steps)))
+        return StepPlan((*self.decisions, Decision(step, total_steps, self.share(step))))
+
+    def extended(self, total_steps: int) -> "StepPlan":
+        """This plan, once it is at its end, with more steps: its share falls to that of a run of ``total_steps``.
+
+        Raises ValueError where that would add no step.
+        """
+        done = self.total_steps
+        if total_steps <= done:
+            raise ValueError(f"after {done} steps the run cannot go on to {total_steps}")
+        return StepPlan((*self.decisions, Decision(done, total_steps, done / total_steps)))
 
 
 def plan_of(total_steps: int) -> StepPlan:
     """The plan of a run of ``total_steps`` steps. Raises ValueError below one step."""
     if total_steps < 1:
         raise ValueError(f"a run needs at least one step, not {total_steps}")
-    return StepPlan((Decision(0, total_steps),))
+    return StepPlan((Decision(0, total_steps, 0.0),))
 
 
 def steps_that_fit(step: int, seconds_left: float, steps_per_second: float) -> int:
