@@ -40,14 +40,23 @@ def last_doubling(curve: Curve) -> float | None:
 
 
 def knee(curve: Curve) -> float | None:
-    """The seconds from which on every doubling of the time bought less than KNEE_DB; None while doublings buy more.
-
-    Only points that the curve follows for a doubling can tell, and at least one must.
-    """
-    told = [(seconds, db) for seconds, db in curve if 2 * seconds <= curve[-1][0]]
-    found = None
-    for seconds, db in reversed(told):
-        if quality_at(curve, 2 * seconds) - db >= KNEE_DB:
+    """The seconds from which on every doubling of the time bought less than KNEE_DB; None while doublings buy more, or
+    where the curve does not reach back far enough to tell."""
+    if last_doubling(curve) is None:
+        return None
+    half, found = curve[-1][0] / 2, None
+    for seconds in [half, *(time for time, _ in reversed(curve) if time < half)]:
+        if quality_at(curve, 2 * seconds) - quality_at(curve, seconds) >= KNEE_DB:
             break
         found = seconds
     return found
+
+
+# Fitted by benchmarks.prediction (docs/numbers.md): placeholder until measured below.
+NEXT_FLAT_DB, NEXT_OF_LAST, NEXT_HALF_WIDTH = 0.0, 0.6, 0.5
+
+
+def next_doubling(curve: Curve) -> Gain | None:
+    """What training once more as long is predicted to buy."""
+    last = last_doubling(curve)
+    return None if last is None else Gain(NEXT_FLAT_DB + NEXT_OF_LAST * last, NEXT_HALF_WIDTH)
