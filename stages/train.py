@@ -250,7 +250,9 @@ def _with_photos_aside(config: Config, scene: "Scene", progress: Progress) -> "S
 
     scene = with_validation(scene)
     aside, left = len(scene.of_split("validation")), len(scene.of_split("train"))
-    progress.note(f"{aside} of {aside + left} training photos are set aside to tell when {config.target_psnr:g} dB are reached")
+    progress.note(
+        f"{aside} of {aside + left} training photos are set aside to tell when {config.target_psnr:g} dB are reached"
+    )
     return scene
 
 
@@ -292,6 +294,8 @@ def _line(config: Config, training: "TrainingRun") -> str:
     if config.after is not None:
         parts[0] += f", {state.seconds_before:.0f} s of them before"
     parts += [f"{short_count(state.step)} steps", f"{short_count(state.rays / state.seconds)} rays/s"]
-    parts += ["no photos held out" if heldout is None else f"held out {heldout:.1f} dB {sparkline(state.curve)}".rstrip()]
+    parts += [
+        "no photos held out" if heldout is None else f"held out {heldout:.1f} dB {sparkline(state.curve)}".rstrip()
+    ]
     parts += [next_words(state.curve), target_words(config.target_psnr, state.validation_psnr, state.seconds)]
     return " · ".join(filter(None, parts))

@@ -34,9 +34,9 @@ def prepare(config: "Config", scene: "Scene", inputs: Inputs, folder: Path, prog
 
     from nerf.probe import make_probe
     from stages.effect_decisions import photo_parts, read_decisions
+    from stages.train_more import budget_of
     from stages.training_data import training_bank
     from stages.training_log import TrainingLog
-    from stages.train_more import budget_of
     from stages.training_loop import Probes, TrainingRun
     from stages.unseen import PROBE_RAYS, Target, unseen_photos
 
@@ -98,7 +98,9 @@ def make_trainer(
 
 
 def _say_sizes(config: "Config", bank: "RayBank", progress: Progress) -> None:
-    steps, seconds = (config.steps, config.seconds) if config.after is None else (config.more_steps, config.more_seconds)
+    steps, seconds = (
+        (config.steps, config.seconds) if config.after is None else (config.more_steps, config.more_seconds)
+    )
     budget = ("" if config.after is None else "another ") + (f"{seconds:g} s" if steps is None else f"{steps:,} steps")
     photos = f"{len(bank.near)} photos at 1/{config.downscale:g} of their size"
     sizes = (

@@ -50,7 +50,7 @@ def test_a_probe_is_always_the_same() -> None:
 
 
 def two_photos(grey: float = 0.0) -> RayBank:
-    """Photos of 20 x 30 and 13 x 17 pixels whose colours tell view, row and column; the painter above paints ``grey``."""
+    """Photos of 20 x 30 and 13 x 17 pixels whose colours tell view, row and column; Painted paints them ``grey``."""
     photos, directions = [], []
     for view, (height, width) in enumerate(((20, 30), (13, 17))):
         y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")

@@ -86,12 +86,12 @@ def unseen() -> Unseen:
     return Unseen(probe(), Patches(probe(), torch.ones(2, 1, 1, dtype=torch.bool)), torch.eye(2))
 
 
-def run_in(folder: Path, progress, budget: Budget | None = None, make=None, target: Target | None = None) -> TrainingRun:
+def run_in(
+    folder: Path, progress, budget: Budget | None = None, make=None, target: Target | None = None
+) -> TrainingRun:
     folder.mkdir(exist_ok=True)
     maker, probes = make or (lambda attempt: OneNumber(attempt, quiet)), Probes(probe(), unseen(), target)
-    return TrainingRun(
-        maker, probes, budget or Budget(40, None), folder, 1e-9, TrainingLog(folder, False), progress
-    )
+    return TrainingRun(maker, probes, budget or Budget(40, None), folder, 1e-9, TrainingLog(folder, False), progress)
 
 
 def number_of(run: TrainingRun) -> OneNumber:
