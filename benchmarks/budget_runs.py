@@ -1,4 +1,4 @@
-"""Trains the grid field for one budget of steps after the other, measures each run on its way, and keeps all in a JSON file.
+"""Trains the grid field for one budget of steps after the other, measures each run on its way, keeps all in a file.
 
 python -m benchmarks.budget_runs fox.nerf lego_400.nerf --runs runs.json
 python -m benchmarks.budget_runs fox.nerf --schedule late --runs runs.json
@@ -23,6 +23,7 @@ from nerf.grid_training import CONSTANT_SHARE, GridTrainer
 from nerf.probe import Probe, make_probe, measure
 from nerf.ray_bank import RayBank
 from nerf.scene import Scene
+from nerf.schedule import plan_of
 from nerf.training import FieldTrainer
 from stages.backend import chosen_backend, load_backend
 from stages.device import compute_device
@@ -41,8 +42,9 @@ PER_DOUBLING = 2  # measurements
 FIRST = 32  # steps
 MEAN_EVERY = 8  # steps
 MEANS = {"mean_10": 6.94}  # the exponent whose profile is 10 % of the run wide
-SCHEDULES = {"today": None, "late": 0.25, "later": 0.4}
-"""Share of the steps in which the rate falls at the end, after being constant until then; None: today's."""
+SCHEDULES = ("today", "late", "more")
+"""late: the rate is constant for three quarters of the steps and then falls; more: half of the steps as a run of their
+own, then the other half on top (`--more`)."""
 
 
 class Quiet:
@@ -79,9 +81,9 @@ def bench_of(workspace: Path) -> Bench:
         chunks=CHUNKS,
         batch_samples=SAMPLES,
         downscale=max(1.0, longest / LONG_SIDE),
-        levels=4 if not decisions.unbounded else 5,
-        log2_rows=17,
-        finest=256 if not decisions.unbounded else 512,
+        levels=4,
+        log2_rows=15,
+        finest=256,
     )
     config = with_habits(config)
     assert config.downscale is not None
@@ -111,12 +113,13 @@ class RunningMean:
 
 def share_of(step: int, steps: int, schedule: str) -> float:
     """The share done before ``step`` by which the trainer takes its rate."""
-    falling = SCHEDULES[schedule]
-    if falling is None:
-        return step / steps
-    start = (1 - falling) * steps
-    constant = CONSTANT_SHARE * min(1, step / start)
-    return constant + (1 - CONSTANT_SHARE) * max(0.0, step - start) / (steps - start)
+    if schedule == "late":
+        start = 0.75 * steps
+        constant = CONSTANT_SHARE * min(1, step / start)
+        return constant + (1 - CONSTANT_SHARE) * max(0.0, step - start) / (steps - start)
+    if schedule == "more":
+        return plan_of(steps // 2).extended(steps).share(step)
+    return plan_of(steps).share(step)
 
 
 def train_run(bench: Bench, seed: int, steps: int, schedule: str) -> dict[str, Any]:

@@ -53,8 +53,8 @@ class StepPlan(NamedTuple):
         return StepPlan((*self.decisions, Decision(step, total_steps, self.share(step), reason)))
 
     def closing(self, step: int) -> "StepPlan":
-        """This plan, from ``step`` on annealed in a fraction (CLOSING_SHARE) of the steps done, or at its end if that is
-        sooner. Raises ValueError as :meth:`revised`."""
+        """This plan, from ``step`` on annealed in a fraction (CLOSING_SHARE) of the steps done, or at its end if
+        that is sooner. Raises ValueError as :meth:`revised`."""
         return self.revised(step, min(self.total_steps, step + max(1, round(CLOSING_SHARE * step))), "target")
 
     def ended(self, step: int) -> "StepPlan":

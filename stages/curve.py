@@ -1,7 +1,7 @@
 """curve.json: quality against training time, and what it says in words.
 
-``{"device": "cpu" | "cuda", "threads", "points": [{"step", "seconds", "train_psnr", "heldout_psnr", "heldout_ssim"}…]}``;
-what cannot be measured is null. Seconds are those of training steps alone: measuring is not among them.
+``{"device": "cpu" | "cuda", "threads", "points": [{"step", "seconds", "train_psnr", "heldout_psnr", "heldout_ssim"}
+…]}``; what cannot be measured is null. Seconds are those of training steps alone: measuring is not among them.
 """
 
 from collections.abc import Sequence
@@ -83,7 +83,7 @@ def ssim_words(points: Sequence[dict[str, Any]]) -> str | None:
 
 
 def sparkline(points: Sequence[dict[str, Any]]) -> str:
-    """Held-out PSNR from the first measurement to the last, evenly in the logarithm of time; "" for fewer than three."""
+    """Held-out PSNR from the first measurement to the last, even in log time; "" for fewer than three."""
     from nerf.learning_curve import quality_at
 
     curve = heldout_curve(points)

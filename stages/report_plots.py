@@ -23,8 +23,8 @@ MOST_POINTS = 20_000
 
 
 def curve_svg(points: Sequence[dict[str, Any]], baselines: dict[str, float | None]) -> str | None:
-    """PSNR against training seconds, one grid line per doubling of the time, with the knee and what the next doubling is
-    predicted to buy; None for fewer than two points. ``baselines`` are drawn as horizontal lines under their names.
+    """PSNR against training seconds, one grid line per doubling of the time, with the knee and what the next doubling
+    is predicted to buy; None for fewer than two points. ``baselines`` are drawn as horizontal lines under their names.
     """
     rows = [row for row in points if row["seconds"] > 0]
     if len(rows) < 2:

@@ -64,8 +64,8 @@ class Probes(NamedTuple):
 
 @dataclass
 class RunState:
-    """What a checkpoint keeps beside the tensors. ``seconds`` and ``rays`` include what was discarded, and what was done
-    before in the finished run that this one goes on from."""
+    """What a checkpoint keeps beside the tensors. ``seconds`` and ``rays`` include what was discarded, and what was
+    done before in the finished run that this one goes on from."""
 
     step: int = 0
     seconds: float = 0.0
