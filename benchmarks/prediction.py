@@ -2,8 +2,8 @@
 
 python -m benchmarks.prediction runs.json
 
-Every case is a run of T steps and one of 2 T with the same seed: from the curve of the first alone it is predicted by how
-much the second ends higher, and the constants of the prediction are those of the other sets only. At the end: what
+Every case is a run of T steps and one of 2 T with the same seed: from the curve of the first alone it is predicted by
+how much the second ends higher, and the constants of the prediction are those of the other sets only. At the end: what
 nerf/learning_curve.py holds, and how curves compare across budgets and schedules.
 """
 

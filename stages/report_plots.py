@@ -20,6 +20,7 @@ SPLIT_COLOURS: "dict[Split, str]" = {"train": BLUE, "test": ORANGE}
 INK = "#010203"  # drawn with this and then replaced by the page's own text colour
 BOX = 0.9  # the region of interest is [-0.9, 0.9]^3, see nerf/scene.py
 MOST_POINTS = 20_000
+ROOM_BELOW = 0.08  # of the curve's height, so that the name of the lowest line stands clear of the times
 
 
 def curve_svg(points: Sequence[dict[str, Any]], baselines: dict[str, float | None]) -> str | None:
@@ -65,7 +66,7 @@ def _draw_knee(axes: "Axes", curve: Sequence[tuple[float, float]]) -> None:
     psnr = quality_at(curve, seconds)
     axes.plot(seconds, psnr, "o", mfc="none", mec=ORANGE, ms=11, mew=2)
     words = f"knee, {duration(seconds)}: twice the time bought < {KNEE_DB:g} dB"
-    axes.annotate(words, (seconds, psnr), (0, -14), textcoords="offset points", ha="center", va="top", size=9.5)
+    axes.annotate(words, (seconds, psnr), (10, -16), textcoords="offset points", ha="left", va="top", size=9.5)
 
 
 def _draw_baselines(axes: "Axes", baselines: dict[str, float]) -> None:
@@ -75,6 +76,8 @@ def _draw_baselines(axes: "Axes", baselines: dict[str, float]) -> None:
         axes.axhline(psnr, color=ORANGE, lw=1, ls=(0, (4, 3)))
         place = {"transform": axes.get_yaxis_transform(), "va": "bottom" if above else "top", "size": 9.5}
         axes.text(1.01, psnr, f"{name}\n{psnr:.1f} dB", linespacing=1.1, **place)
+    low, high = axes.get_ylim()
+    axes.set_ylim(low - ROOM_BELOW * (high - low), high)
 
 
 def camera_svgs(scene: "Scene", xyz: "np.ndarray", rgb: "np.ndarray") -> dict[str, str]:
