@@ -1,9 +1,10 @@
-"""A fixed handful of pixels on which a field in training is measured now and then."""
+"""Fixed pixels on which a field in training is measured now and then: single ones, which tell PSNR, and small whole
+patches of the photos, which can be compared in structure."""
 
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from nerf.effects import AS_GIVEN, AS_RENDERED, PhotoColours, PhotoRays, Seen
@@ -38,9 +39,39 @@ class ProbeResult(NamedTuple):
     opacity: float
 
 
+class Patches(NamedTuple):
+    """Squares of photos: ``probe`` has their pixels one patch after the other, row by row; ``used`` says which of them
+    count."""
+
+    probe: Probe
+    used: Bool[Tensor, "patches side side"]
+
+
 def make_probe(bank: RayBank, count: int, background: Float[Tensor, "3"], seed: int) -> Probe:
     """Draw ``count`` pixels of ``bank``, always the same for the same seed."""
-    rays, colour, alpha, view = bank.sample(count, generator(bank.device, seed))
+    return _probe_of(bank, bank.draw(count, generator(bank.device, seed)), background)
+
+
+def make_patches(bank: RayBank, count: int, side: int, background: Float[Tensor, "3"], seed: int) -> Patches:
+    """``count`` squares around drawn pixels of ``bank``, moved to lie inside their photos; always the same for the same
+    seed. Their side is ``side`` pixels, less where a photo is smaller."""
+    first, width = bank.layout[:2]
+    height = bank.first_pixel.diff() // width
+    side = min(side, int(width.min()), int(height.min()))
+    pixel = bank.draw(count, generator(bank.device, seed, 1))
+    view = torch.searchsorted(bank.first_pixel, pixel, right=True) - 1
+    first, width, height = (table.index_select(0, view) for table in (first, width, height))
+    within = pixel - first
+    top = (within // width - side // 2).clamp(min=0).minimum(height - side)
+    left = (within % width - side // 2).clamp(min=0).minimum(width - side)
+    steps = torch.arange(side, device=bank.device)
+    corner = first + top * width + left
+    pixels = corner[:, None, None] + steps[:, None] * width[:, None, None] + steps
+    return Patches(_probe_of(bank, pixels.flatten(), background), bank.may_be_drawn(pixels))
+
+
+def _probe_of(bank: RayBank, pixels: Int[Tensor, "rays"], background: Float[Tensor, "3"]) -> Probe:
+    rays, colour, alpha, view = bank.lookup(pixels)
     return Probe(rays, over(colour, alpha, background), background, view)
 
 
@@ -52,7 +83,25 @@ def measure(
     photo_rays: PhotoRays = AS_GIVEN,
 ) -> ProbeResult:
     """Render the probe and compare it with the photos, as ``photo_rays`` and ``photo_colours`` have them."""
+    residual, opacity = _residual(model, probe, photo_colours, photo_rays)
+    return ProbeResult(psnr(float(residual.square().mean())), float(opacity.mean()))
+
+
+@torch.no_grad()
+def pictures(
+    model: RadianceModel, patches: Patches, photo_colours: PhotoColours = AS_RENDERED
+) -> tuple[Float[Tensor, "patches side side 3"], Float[Tensor, "patches side side 3"]]:
+    """What the field shows of the patches, in [0, 1], and what the photos show."""
+    truth = patches.probe.colours
+    residual, _ = _residual(model, patches.probe, photo_colours, AS_GIVEN)
+    shape = (*patches.used.shape, 3)
+    return (truth + residual).clamp(0, 1).view(shape), truth.view(shape)
+
+
+def _residual(
+    model: RadianceModel, probe: Probe, photo_colours: PhotoColours, photo_rays: PhotoRays
+) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"]]:
+    """By how much the photos would show more than they do, and the opacity of the field."""
     one_row = Rays(*(part[None] for part in photo_rays.forward(probe.rays, probe.view)))
     seen = Rendering(*(part[0] for part in render_image(model, one_row, probe.background)))
-    residual = photo_colours.residual(Seen(seen, probe.background, probe.view), probe.colours)
-    return ProbeResult(psnr(float(residual.square().mean())), float(seen.opacity.mean()))
+    return photo_colours.residual(Seen(seen, probe.background, probe.view), probe.colours), seen.opacity

@@ -112,8 +112,20 @@ class RayBank(NamedTuple):
 
     def sample(self, count: int, generator: torch.Generator) -> Drawn:
         """:meth:`lookup` of ``count`` pixels drawn uniformly from those that may be, with replacement."""
+        return self.lookup(self.draw(count, generator))
+
+    def draw(self, count: int, generator: torch.Generator) -> Int[Tensor, "rays"]:
+        """``count`` pixels drawn uniformly from those that may be, with replacement."""
         drawn = torch.randint(self.drawable, (count,), generator=generator, device=self.device)
-        return self.lookup(drawn if self.runs is None else _in_runs(self.runs, drawn))
+        return drawn if self.runs is None else _in_runs(self.runs, drawn)
+
+    def may_be_drawn(self, pixel: Int[Tensor, "*rays"]) -> Bool[Tensor, "*rays"]:
+        """Whether :meth:`sample` may draw these pixels."""
+        if self.runs is None:
+            return torch.ones_like(pixel, dtype=torch.bool)
+        run = torch.searchsorted(self.runs[1].contiguous(), pixel.flatten(), right=True).sub_(1).clamp_(min=0)
+        into = pixel.flatten() - self.runs[1, run]
+        return ((into >= 0) & (into < self.runs[0].diff()[run])).view(pixel.shape)
 
 
 class Placement(NamedTuple):

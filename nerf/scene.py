@@ -9,7 +9,8 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-Split = Literal["train", "test"]
+Split = Literal["train", "validation", "test"]
+"""Validation photos are set aside from the training photos while a run is made that asks for them; no file has any."""
 SCHEMA_VERSION = 1
 
 

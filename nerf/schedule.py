@@ -1,4 +1,4 @@
-"""When a run ends and which learning rate each step has.
+"""When a run ends and which learning rate each step has, and when it is measured.
 
 ``share`` is how much of a run is done, from 0 to 1; everything that changes while training is a function of it.
 A run bounded by steps knows its share exactly. A run bounded by seconds estimates how many steps will fit, and
@@ -6,14 +6,23 @@ revises the estimate when the clock disagrees; the decisions are data (:class:`S
 replays them gives every step the learning rate it had before.
 """
 
-from typing import NamedTuple
+import math
+from typing import Literal, NamedTuple
+
+Reason = Literal["begin", "clock", "target", "more"]
+
+# Of the steps done so far: in how many more a run towards a target anneals once that may be what it takes.
+CLOSING_SHARE = 0.25
 
 
 class Decision(NamedTuple):
-    """From step ``from_step`` on, the run is meant to have ``total_steps`` steps."""
+    """From step ``from_step`` on, before which ``share`` of the run is done, it is meant to have ``total_steps``, for a
+    ``reason``: it begins, the clock says so, a target is near or reached, or it is to go on."""
 
     from_step: int
     total_steps: int
+    share: float
+    reason: Reason = "begin"
 
 
 class StepPlan(NamedTuple):
@@ -27,33 +36,49 @@ class StepPlan(NamedTuple):
         return self.decisions[-1].total_steps
 
     def share(self, step: int) -> float:
-        """The share of the run done before ``step``: continuous, linear between decisions, 1 at the end.
+        """The share of the run done before ``step``, 1 at the end.
 
         Every decision spreads the share that was left when it was made evenly over the steps that were left.
         """
-        share = 0.0
-        ends = [later.from_step for later in self.decisions[1:]] + [self.total_steps]
-        for (start, total), end in zip(self.decisions, ends, strict=True):
-            if step <= start:
-                break
-            share += (1 - share) * (min(step, end) - start) / (total - start)
-        return share
+        start, total, share, _ = next(decision for decision in reversed(self.decisions) if decision.from_step <= step)
+        return share if total == start else share + (1 - share) * min(1.0, (step - start) / (total - start))
 
-    def revised(self, step: int, total_steps: int) -> "StepPlan":
+    def revised(self, step: int, total_steps: int, reason: Reason = "clock") -> "StepPlan":
         """This plan with one more decision made before ``step``.
 
         Raises ValueError where that would leave no step to take, or rewrite a decision already made.
         """
         if not self.decisions[-1].from_step <= step < total_steps:
             raise ValueError(f"at step {step} the plan {self.decisions} cannot become {total_steps} steps")
-        return StepPlan((*self.decisions, Decision(step, total_steps)))
+        return StepPlan((*self.decisions, Decision(step, total_steps, self.share(step), reason)))
+
+    def closing(self, step: int) -> "StepPlan":
+        """This plan, from ``step`` on annealed in a fraction (CLOSING_SHARE) of the steps done, or at its end if
+        that is sooner. Raises ValueError as :meth:`revised`."""
+        return self.revised(step, min(self.total_steps, step + max(1, round(CLOSING_SHARE * step))), "target")
+
+    def ended(self, step: int) -> "StepPlan":
+        """This plan without the steps from ``step`` on. Raises ValueError where that rewrites a decision."""
+        if not self.decisions[-1].from_step < step <= self.total_steps:
+            raise ValueError(f"the plan {self.decisions} cannot end at step {step}")
+        return StepPlan((*self.decisions, Decision(step, step, self.share(step), "target")))
+
+    def extended(self, total_steps: int) -> "StepPlan":
+        """This plan, once it is at its end, with more steps: its share falls to that of a run of ``total_steps``.
+
+        Raises ValueError where that would add no step.
+        """
+        done = self.total_steps
+        if total_steps <= done:
+            raise ValueError(f"after {done} steps the run cannot go on to {total_steps}")
+        return StepPlan((*self.decisions, Decision(done, total_steps, done / total_steps, "more")))
 
 
 def plan_of(total_steps: int) -> StepPlan:
     """The plan of a run of ``total_steps`` steps. Raises ValueError below one step."""
     if total_steps < 1:
         raise ValueError(f"a run needs at least one step, not {total_steps}")
-    return StepPlan((Decision(0, total_steps),))
+    return StepPlan((Decision(0, total_steps, 0.0),))
 
 
 def steps_that_fit(step: int, seconds_left: float, steps_per_second: float) -> int:
@@ -75,3 +100,13 @@ def replanned(
 def learning_rate(share: float, start: float, end: float) -> float:
     """From ``start`` to ``end`` exponentially in the share of the run done (Mildenhall et al. 2020, section 5.3)."""
     return start * (end / start) ** share
+
+
+def next_in_series(now: float, first: float, growth: float) -> float:
+    """The first of ``first``, ``first * growth``, ``first * growth²`` … that is more than ``now``."""
+    if now < first:
+        return first
+    due = first * growth ** math.floor(math.log(now / first) / math.log(growth))
+    while due <= now:
+        due *= growth
+    return due

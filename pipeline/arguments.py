@@ -12,12 +12,21 @@ import tyro
 from pydantic import ValidationError
 
 from pipeline.settings import Settings, UsageError, wrong_options
+from stages.train import Config as TrainConfig
 
 T = TypeVar("T")
 
 Effects = Annotated[
     tyro.conf.UseAppendAction[tuple[str, ...]],
     tyro.conf.arg(metavar="NAME=on|off|auto", help="Force an effect on or off, or let the photos decide; repeatable."),
+]
+More = Annotated[
+    str | None,
+    tyro.conf.arg(
+        metavar="10m",
+        help="Go on from the finished training for so much longer (90s, 10m, 1h30m, or 500steps), with the recorded "
+        "options; what it gave so far is kept.",
+    ),
 ]
 
 Budget = Annotated[
@@ -56,6 +65,7 @@ class RunArguments:
     budget: Budget = None
     until: str | None = None
     """The last stage to run."""
+    more: More = None
     from_: Annotated[str | None, tyro.conf.arg(name="from")] = None
     """Run this stage and all after it again even if they are cached."""
     config: Path | None = None
@@ -77,6 +87,7 @@ class StageArguments:
     effect: Effects = ()
     budget: str | None = None
     """tradeoff only: how long the study may take, as in 30m."""
+    more: More = None
     force: bool = False
     """Run it again even if it is cached."""
 
@@ -151,10 +162,8 @@ def parse(kind: type[T], command: str, words: Sequence[str], settings: Settings 
 
     Raises UsageError with every wrong word in a sentence of its own, SystemExit(0) after ``--help``.
     """
-    # Steps and seconds are two budgets for one thing: the one given replaces the one recorded.
-    for given, other in (("steps", "seconds"), ("seconds", "steps")):
-        if settings is not None and _names(words, given) and not _names(words, other):
-            settings = settings.model_copy(update={"train": settings.train.model_copy(update={other: None})})
+    if settings is not None:
+        settings = settings.model_copy(update={"train": _without_replaced(settings.train, words)})
     positional = {name: tyro.MISSING for name in ("photos", "workspace", "stage") if name in kind.__annotations__}
     default: Any = kind(**positional)
     if settings is not None:
@@ -167,6 +176,18 @@ def parse(kind: type[T], command: str, words: Sequence[str], settings: Settings 
         if ending.code in (None, 0):
             raise
         raise UsageError(f"{_what_is_wrong(ending, said.getvalue())} (pipeline {command} --help)") from ending
+
+
+def _without_replaced(recorded: TrainConfig, words: Sequence[str]) -> TrainConfig:
+    """The recorded options of training without the budgets that the one given in ``words`` stands in place of."""
+    given = {option for option in ("steps", "seconds", "preset") if _names(words, option)}
+    replaced: dict[str, None] = {}
+    for option, other in (("steps", "seconds"), ("seconds", "steps")):
+        if option in given and other not in given:
+            replaced[other] = None
+    if given:  # a new training does not go on from another
+        replaced |= dict.fromkeys(("after", "more_steps", "more_seconds"))
+    return recorded.model_copy(update=replaced)
 
 
 def _what_is_wrong(ending: SystemExit, box: str) -> str:

@@ -19,6 +19,7 @@ from pipeline import arguments as words_of
 from pipeline import chain, forecast, machine, status
 from pipeline.display import Display, SilentDisplay, choose_display
 from pipeline.durations import seconds_from
+from pipeline.more import with_more
 from pipeline.runner import Runner, StageFailed
 from pipeline.settings import (
     Settings,
@@ -123,16 +124,20 @@ def command_run(words: Sequence[str]) -> int:
     if given.config is not None:  # the file's values become the defaults that flags override
         from_file = settings_from(read_toml(given.config), f"--config {given.config}")
         given = words_of.parse(words_of.RunArguments, "run", words, from_file)
-    asked = _like(with_effects(given.settings, given.effect), given.like)
+    root, cameras = given.output or default_workspace(given.photos), given.cameras
+    if given.more is not None:
+        recorded = _recorded_settings(Workspace.existing(root))
+        given = words_of.parse(words_of.RunArguments, "run", words, recorded)
+        cameras = cameras or recorded.ingest.cameras
+    asked = _like(with_effects(_more(given, root), given.effect), given.like)
     stages = chain.up_to(_known_stage(given.until or list(chain.STAGES)[-1], "--until"))
     force = frozenset[str]()
     if given.from_ is not None:
         force = frozenset(stages[stages.index(_known_stage(given.from_, "--from", stages)) :])
-    root = given.output or default_workspace(given.photos)
     budget = _budget(given.budget, asked)
     with choose_display(given.common.json) as display:
         try:
-            settings = with_source(asked, given.photos, given.cameras)
+            settings = with_source(asked, given.photos, cameras)
         except StageError as error:
             display.failed("ingest", error)
             return chain.EXIT_CODES["ingest"]
@@ -140,11 +145,18 @@ def command_run(words: Sequence[str]) -> int:
 
 
 def _budget(text: str | None, settings: Settings) -> float | None:
-    """The seconds of ``--budget``. Raises UsageError beside steps, which take as long as they take."""
+    """The seconds of ``--budget``. Raises UsageError beside steps, which take as long as they take, and ``--more``."""
+    if text is not None and settings.train.after is not None:
+        raise UsageError("--budget and --more are two budgets; give one")
     if text is not None and settings.train.steps is not None:
         what = f"--budget {text} and --train.steps {settings.train.steps}: so many steps take as long as they take"
         raise UsageError(f"{what}; leave out one, or give --train.seconds")
     return None if text is None else seconds_from(text)
+
+
+def _more(given: words_of.RunArguments | words_of.StageArguments, root: Path) -> Settings:
+    """The settings given, with ``--more``."""
+    return given.settings if given.more is None else with_more(given.settings, Workspace.existing(root), given.more)
 
 
 def _like(settings: Settings, photo: str | None) -> Settings:
@@ -210,7 +222,9 @@ def command_stage(stage: str, words: Sequence[str]) -> int:
     for flag in ("cameras", "like"):
         if getattr(given, flag) is not None and stage != "render":
             raise UsageError(f"--{flag} belongs to `pipeline render` and `pipeline run`, not to {stage}")
-    settings = _like(with_effects(given.settings, given.effect), given.like)
+    if given.more is not None and stage != "train":
+        raise UsageError(f"--more belongs to `pipeline train` and `pipeline run`, not to {stage}")
+    settings = _like(with_effects(_more(given, given.workspace), given.effect), given.like)
     if given.budget is not None:
         settings = _study_for(settings, given.budget, stage)
     if given.cameras is not None:

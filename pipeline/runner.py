@@ -319,7 +319,9 @@ class Runner:
 
 
 def _takes_what_it_is_given(options: StageConfig) -> bool:
-    return getattr(options, "seconds", 0.0) is None and getattr(options, "steps", None) is None
+    """Whether nothing else says how long the stage works: neither seconds nor steps, nor those of ``--more``."""
+    open_ended = getattr(options, "seconds", 0.0) is None
+    return open_ended and all(getattr(options, name, None) is None for name in ("steps", "after"))
 
 
 def _load_native_code() -> None:

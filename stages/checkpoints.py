@@ -54,6 +54,11 @@ def latest_checkpoint(folder: Path, note: Callable[[str], None]) -> Checkpoint |
     return None
 
 
+def checkpoint_files(folder: Path, step: int) -> list[str]:
+    """The two files of the checkpoint of ``step``, relative to the folder that holds ``folder``."""
+    return [f"{folder.name}/{step:09d}.{suffix}" for suffix in ("safetensors", "json")]
+
+
 def _steps(folder: Path) -> list[int]:
     return sorted(int(path.stem) for path in folder.glob("*.json") if path.stem.isdigit())
 

@@ -101,7 +101,7 @@ class Allowance:
 
 def training_seconds(train: Path) -> float:
     """How long the field in ``train`` was trained, without measuring and saving."""
-    return read_json(train / "curve.json")[-1]["seconds"]
+    return read_json(train / "curve.json")["points"][-1]["seconds"]
 
 
 def measured_speed(train: Path, sample: "Callable[[int], Rays]", largest: int) -> float:

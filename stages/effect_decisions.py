@@ -1,7 +1,7 @@
 """What stage effects decided, as the stages after it read it: ``decisions.json``."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -84,7 +84,9 @@ def expected_gains(field: dict[str, Any], scene: "Scene", unseen: "Sequence[View
 
     if field.get("exposure") is None or not unseen:
         return {}
-    known = torch.tensor([field["exposure"]["photos"][view.name] for view in scene.of_split("train")])
+    photos = field["exposure"]["photos"]  # of all training photos but those that were set aside for a target
+    scene = replace(scene, views=tuple(view for view in scene.views if view.name in photos))
+    known = torch.tensor([photos[view.name] for view in scene.of_split("train")])
     gains = told_by_neighbours(scene, unseen) @ known
     return dict(zip((view.name for view in unseen), gains, strict=True))
 

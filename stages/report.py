@@ -47,7 +47,7 @@ class Config(StageConfig):
 
 @dataclass(frozen=True)
 class Results:
-    """What the finished stages left. The parts of stages that have not run are None (``curve`` is empty).
+    """What the finished stages left. The parts of stages that have not run are None.
 
     The study has no part in ``manifests``: its time is none of the run's.
     """
@@ -59,7 +59,7 @@ class Results:
     scene: "Scene | None"
     effects: dict[str, Any] | None
     field: dict[str, Any] | None
-    curve: list[dict[str, Any]]
+    curve: dict[str, Any] | None
     metrics: dict[str, Any] | None
     study: dict[str, Any] | None
 
@@ -90,7 +90,7 @@ def read_results(inputs: Inputs) -> Results:
         scene=read_scene(inputs["normalise"]) if "normalise" in inputs else None,
         effects=of("effects", "effects.json"),
         field=of("train", "field.json"),
-        curve=of("train", "curve.json") or [],
+        curve=of("train", "curve.json"),
         metrics=of("evaluate", "metrics.json"),
         study=of("tradeoff", "tradeoff.json"),
     )
@@ -252,17 +252,23 @@ def _cameras(results: Results) -> dict[str, Any]:
 
 
 def _curve(results: Results) -> dict[str, Any] | None:
-    """The training curve and what the last doubling of the time bought, in dB."""
+    """The training curve, and what it says of the time, in sentences."""
     from markupsafe import Markup
 
-    from stages.report_plots import curve_svg, last_doubling
+    from stages.curve import doubling_words, knee_words, ssim_words
+    from stages.report_plots import curve_svg
 
-    metrics = results.metrics or {}
+    if results.curve is None:
+        return None
+    points, metrics = results.curve["points"], results.metrics or {}
     baselines = {"nearest photo": "psnr_nearest_view", "mean image": "psnr_mean_image"}
-    svg = curve_svg(results.curve, {name: metrics.get(key) for name, key in baselines.items()})
+    svg = curve_svg(points, {name: metrics.get(key) for name, key in baselines.items()})
     if svg is None:
         return None
-    return {"svg": Markup(svg), "gain": last_doubling(results.curve), "seconds": results.curve[-1]["seconds"]}
+    words = [doubling_words(points), knee_words(points), ssim_words(points)]
+    threads = results.curve["threads"]
+    where = "a GPU" if results.curve["device"] == "cuda" else f"{threads} processor core{'' if threads == 1 else 's'}"
+    return {"svg": Markup(svg), "words": [f"{word[0].upper()}{word[1:]}." for word in words if word], "where": where}
 
 
 def _study(results: Results) -> dict[str, Any] | None:

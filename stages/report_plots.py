@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
+from stages.curve import heldout_curve
 from stages.live_line import duration
 
 if TYPE_CHECKING:
@@ -19,29 +20,14 @@ SPLIT_COLOURS: "dict[Split, str]" = {"train": BLUE, "test": ORANGE}
 INK = "#010203"  # drawn with this and then replaced by the page's own text colour
 BOX = 0.9  # the region of interest is [-0.9, 0.9]^3, see nerf/scene.py
 MOST_POINTS = 20_000
+ROOM_BELOW = 0.08  # of the curve's height, so that the name of the lowest line stands clear of the times
 
 
-def last_doubling(curve: Sequence[dict[str, Any]]) -> float | None:
-    """What the second half of the training time bought in held-out dB; None where the curve does not reach that far.
-
-    The value at half time is interpolated linearly in the logarithm of time.
+def curve_svg(points: Sequence[dict[str, Any]], baselines: dict[str, float | None]) -> str | None:
+    """PSNR against training seconds, one grid line per doubling of the time, with the knee and what the next doubling
+    is predicted to buy; None for fewer than two points. ``baselines`` are drawn as horizontal lines under their names.
     """
-    import numpy as np
-
-    rows = [row for row in curve if row["heldout_psnr"] is not None and row["seconds"] > 0]
-    if len(rows) < 2 or rows[0]["seconds"] > rows[-1]["seconds"] / 2:
-        return None
-    seconds = np.array([row["seconds"] for row in rows])
-    psnr = np.array([row["heldout_psnr"] for row in rows])
-    return float(psnr[-1] - np.interp(np.log(seconds[-1] / 2), np.log(seconds), psnr))
-
-
-def curve_svg(curve: Sequence[dict[str, Any]], baselines: dict[str, float | None]) -> str | None:
-    """PSNR against training seconds, one grid line per doubling of the time; None for fewer than two points.
-
-    ``baselines`` are drawn as horizontal lines under their names.
-    """
-    rows = [row for row in curve if row["seconds"] > 0]
+    rows = [row for row in points if row["seconds"] > 0]
     if len(rows) < 2:
         return None
     with drawing((8.2, 3.4), "curve") as figure:
@@ -51,10 +37,36 @@ def curve_svg(curve: Sequence[dict[str, Any]], baselines: dict[str, float | None
             if seen:
                 axes.plot(*zip(*seen, strict=True), color=colour, lw=2, marker="o", ms=3, label=label)
         _draw_baselines(axes, {name: psnr for name, psnr in baselines.items() if psnr is not None})
-        _doubling_axis(axes, rows[0]["seconds"], rows[-1]["seconds"])
+        last = rows[-1]["seconds"] * (2 if _draw_prediction(axes, heldout_curve(rows)) else 1)
+        _draw_knee(axes, heldout_curve(rows))
+        _doubling_axis(axes, rows[0]["seconds"], rows[-1]["seconds"], last)
         axes.set(xlabel="training time", ylabel="PSNR (dB)")
-        axes.legend(frameon=False, loc="lower left", bbox_to_anchor=(0, 1), ncols=2, borderaxespad=0)
+        axes.legend(frameon=False, loc="lower left", bbox_to_anchor=(0, 1), ncols=3, borderaxespad=0)
         return svg_element(figure)
+
+
+def _draw_prediction(axes: "Axes", curve: Sequence[tuple[float, float]]) -> bool:
+    """A dotted line on to twice the time, with its interval; False where nothing is predicted."""
+    from nerf.learning_curve import next_doubling
+
+    coming = next_doubling(curve)
+    if coming is None:
+        return False
+    (seconds, psnr), style = curve[-1], {"color": BLUE, "lw": 1.5, "ls": (0, (1, 1.5))}
+    axes.plot([seconds, 2 * seconds], [psnr, psnr + coming.db], label="predicted", **style)
+    axes.errorbar(2 * seconds, psnr + coming.db, coming.half_width, color=BLUE, capsize=4, lw=1.5)
+    return True
+
+
+def _draw_knee(axes: "Axes", curve: Sequence[tuple[float, float]]) -> None:
+    from nerf.learning_curve import KNEE_DB, knee, quality_at
+
+    if (seconds := knee(curve)) is None:
+        return
+    psnr = quality_at(curve, seconds)
+    axes.plot(seconds, psnr, "o", mfc="none", mec=ORANGE, ms=11, mew=2)
+    words = f"knee, {duration(seconds)}: twice the time bought < {KNEE_DB:g} dB"
+    axes.annotate(words, (seconds, psnr), (10, -16), textcoords="offset points", ha="left", va="top", size=9.5)
 
 
 def _draw_baselines(axes: "Axes", baselines: dict[str, float]) -> None:
@@ -64,6 +76,8 @@ def _draw_baselines(axes: "Axes", baselines: dict[str, float]) -> None:
         axes.axhline(psnr, color=ORANGE, lw=1, ls=(0, (4, 3)))
         place = {"transform": axes.get_yaxis_transform(), "va": "bottom" if above else "top", "size": 9.5}
         axes.text(1.01, psnr, f"{name}\n{psnr:.1f} dB", linespacing=1.1, **place)
+    low, high = axes.get_ylim()
+    axes.set_ylim(low - ROOM_BELOW * (high - low), high)
 
 
 def camera_svgs(scene: "Scene", xyz: "np.ndarray", rgb: "np.ndarray") -> dict[str, str]:
@@ -109,13 +123,14 @@ def _outline(scene: "Scene", view: "View", depth: float) -> "np.ndarray":
     return stroke @ view.scene_from_camera[:, :3].T + view.scene_from_camera[:, 3]
 
 
-def _doubling_axis(axes: "Axes", first: float, last: float) -> None:
-    """A logarithmic time axis with ticks at the end and at its halves, and the last half shaded."""
+def _doubling_axis(axes: "Axes", first: float, last: float, end: float) -> None:
+    """A logarithmic time axis to ``end`` with ticks there, at ``last`` and at its halves, and the last half shaded."""
     import math
 
     ticks = [last / 2**k for k in range(max(1, min(8, math.ceil(math.log2(last / first)) + 1)))]
+    ticks = [end, *ticks] if end > last else ticks
     axes.set_xscale("log", base=2)
-    axes.set_xlim(min(first, ticks[-1]), last * 1.04)
+    axes.set_xlim(min(first, ticks[-1]), end * 1.04)
     axes.set_xticks(ticks, [duration(tick) for tick in ticks])
     axes.set_xticks([], minor=True)
     axes.axvspan(last / 2, last, color=BLUE, alpha=0.08, lw=0)

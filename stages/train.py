@@ -8,14 +8,15 @@ from tyro.conf import Suppress
 
 from stages.contract import Inputs, Progress, StageConfig, StageResult
 from stages.effect_decisions import read_decisions
-from stages.files import read_scene, write_json
+from stages.files import read_scene
 from stages.live_line import short_count
 
 if TYPE_CHECKING:
+    from nerf.scene import Scene
     from stages.training_loop import TrainingRun
 
 NEEDS = ("ingest", "normalise", "effects")
-VERSION = 5
+VERSION = 6
 RESUMES = True
 LINKS = ("curve.json",)
 UNKEYED = ("checkpoint_seconds", "tensorboard")
@@ -74,6 +75,13 @@ class Config(StageConfig):
         "paper: the networks as published, for an hour; none: standard",
     )
     seconds: float | None = Field(default=None, gt=0, description="train so long; none, without steps: by the preset")
+    target_psnr: float | None = Field(
+        default=None,
+        gt=0,
+        le=100,
+        description="stop once so many dB are reached on photos set aside from the training photos; at the latest "
+        "when the time or the steps are used up",
+    )
     learning_rate: float | None = Field(default=None, gt=0, description="at the start; none: by the field")
     seed: int = Field(default=0, description="of weights, batches and samples")
     downscale: float | None = Field(
@@ -82,6 +90,10 @@ class Config(StageConfig):
     background: Literal["white", "black", "random"] | None = Field(
         default=None, description="behind photos with transparency; none: random for grid, white for paper"
     )
+    # `--more` gives these.
+    after: Annotated[str | None, Suppress] = Field(default=None, description="go on from this finished training,")
+    more_steps: Annotated[int | None, Suppress] = Field(default=None, ge=1, description="for so many steps,")
+    more_seconds: Annotated[float | None, Suppress] = Field(default=None, gt=0, description="or for so long")
     # Stage effects decides these; no flag is offered for them.
     contracted: Annotated[bool | None, Suppress] = Field(default=None, description="fold in unbounded space")
     view_dependence: Annotated[bool | None, Suppress] = Field(default=None, description="colour knows the direction")
@@ -157,7 +169,12 @@ class Config(StageConfig):
 
 
 def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
-    """Everything that was left open: field and budget, what stage effects decided, then sizes and the photos' size."""
+    """Everything that was left open: field and budget, what stage effects decided, then sizes and the photos' size; or
+    all of it as the finished training has it that is to go on."""
+    if config.after is not None:
+        from stages.train_more import continued
+
+        return continued(config, inputs)
     scene, decisions = read_scene(inputs["normalise"]), read_decisions(inputs["effects"])
     preset = config.preset or "standard"
     seconds = SECONDS[preset] if config.steps is None and config.seconds is None else config.seconds
@@ -213,40 +230,75 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     Raises:
         StageError: if training diverges or the field does not learn, every remedy of ours having failed.
     """
+    from stages.curve import write_curve
     from stages.effect_decisions import learnt_of_photos
     from stages.field_files import save_field
     from stages.training_setup import field_background, prepare
 
     config, scene = plan(config, inputs, progress), read_scene(inputs["normalise"])
+    if config.target_psnr is not None:
+        scene = _with_photos_aside(config, scene, progress)
     training = prepare(config, scene, inputs, folder, progress)
     training.train()
     info = {"downscale": config.downscale, "steps": training.state.step, "rays": training.state.rays}
     info["background"] = list(field_background(config, scene))
     info |= learnt_of_photos(training.trainer, scene.of_split("train"))
     save_field(folder, training.trainer.model, info)
-    write_json(folder / "curve.json", training.state.curve)
-    return _result(config, training, folder)
+    write_curve(folder, training.state.curve)
+    return _result(config, training, folder, progress)
 
 
-def _result(config: Config, training: "TrainingRun", folder: Path) -> StageResult:
+def _with_photos_aside(config: Config, scene: "Scene", progress: Progress) -> "Scene":
+    from stages.unseen import with_validation
+
+    scene = with_validation(scene)
+    aside, left = len(scene.of_split("validation")), len(scene.of_split("train"))
+    progress.note(
+        f"{aside} of {aside + left} training photos are set aside to tell when {config.target_psnr:g} dB are reached"
+    )
+    return scene
+
+
+def _result(config: Config, training: "TrainingRun", folder: Path, progress: Progress) -> StageResult:
+    from stages.checkpoints import checkpoint_files
+    from stages.curve import doubling_words, target_words
+
     state, last = training.state, training.state.curve[-1]
-    speed = state.rays / state.seconds
-    heldout = last["heldout_psnr"]
-    quality = "no photos held out" if heldout is None else f"held out {heldout:.1f} dB"
-    line = f"{state.seconds:.0f} s · {short_count(state.step)} steps · {short_count(speed)} rays/s · {quality}"
+    said = [doubling_words(state.curve), target_words(config.target_psnr, state.validation_psnr, state.seconds)]
+    for words in filter(None, said):
+        progress.note(words)
     left_behind = sorted(path.name for path in folder.glob("nonfinite_*.safetensors"))
     board = ["tensorboard"] if config.tensorboard else []
     facts = {
         "field": config.field,
         "steps": state.step,
         "train_seconds": round(state.seconds, 3),
-        "rays_per_second": round(speed, 1),
+        "rays_per_second": round(state.rays / state.seconds, 1),
         "train_psnr": last["train_psnr"],
-        "heldout_psnr": heldout,
+        "heldout_psnr": last["heldout_psnr"],
+        "validation_psnr": state.validation_psnr,
         "curve": state.curve[-5:],
         "downscale": config.downscale,
         "restarts": state.restarts,
         "rollbacks": state.rollbacks,
     }
-    records = ("curve.json", "log.jsonl", "plan.json", *left_behind, *board)
-    return StageResult(("field.safetensors", "field.json"), line, records, facts)
+    final = checkpoint_files(training.checkpoints, state.step)
+    records = ("curve.json", "log.jsonl", "plan.json", *final, *left_behind, *board)
+    return StageResult(("field.safetensors", "field.json"), _line(config, training), records, facts)
+
+
+def _line(config: Config, training: "TrainingRun") -> str:
+    """180 s · 5.4 k steps · 24 k rays/s · held out 28.9 dB ▁▃▅▆▇█ · the next doubling buys +0.6 ± 0.4 dB."""
+    from stages.curve import next_words, sparkline, target_words
+
+    state = training.state
+    heldout = state.curve[-1]["heldout_psnr"]
+    parts = [f"{state.seconds:.0f} s"]
+    if config.after is not None:
+        parts[0] += f", {state.seconds_before:.0f} s of them before"
+    parts += [f"{short_count(state.step)} steps", f"{short_count(state.rays / state.seconds)} rays/s"]
+    parts += [
+        "no photos held out" if heldout is None else f"held out {heldout:.1f} dB {sparkline(state.curve)}".rstrip()
+    ]
+    parts += [next_words(state.curve), target_words(config.target_psnr, state.validation_psnr, state.seconds)]
+    return " · ".join(filter(None, parts))

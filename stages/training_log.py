@@ -23,7 +23,7 @@ class TrainingLog:
         """Record one point of the curve."""
         self.event("measured", **point)
         if self.board is not None:
-            for name in ("train_psnr", "heldout_psnr"):
+            for name in ("train_psnr", "heldout_psnr", "heldout_ssim"):
                 if point[name] is not None:
                     self.board.add_scalar(name, point[name], point["step"])
             self.board.flush()

@@ -4,7 +4,9 @@ What can happen to a run, and what the loop does:
 
 * killed: goes on from the last good checkpoint; the journal of step plans gives every step its old learning rate;
 * a loss or gradient stops being finite: the batch is kept, the state rolled back and the rate halved, three times;
-* the field is dead after the warm-up (empty, or no better than one flat colour): another seed, twice at most.
+* the field is dead after the warm-up (empty, or no better than one flat colour): another seed, twice at most;
+* it goes on from the end of a finished run: from that run's last checkpoint, at the rates of the longer run;
+* it comes near a target on validation photos: it anneals early, and goes on as before if that was not enough.
 """
 
 import json
@@ -22,44 +24,48 @@ from stages.files import read_json, write_durably
 from stages.live_line import live_line, short_count
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from nerf.probe import Probe, ProbeResult
     from nerf.schedule import StepPlan
     from nerf.training import FieldTrainer, NonFinite
     from stages.training_log import TrainingLog
+    from stages.unseen import Target, Unseen
 
 MOST_ROLLBACKS = 3
 MOST_RESTARTS = 2
 WARM_UP_STEPS = 500  # after these a field is examined; a healthy one beats a flat colour long before
 EMPTY_OPACITY = 1e-3  # a field whose mean opacity is below this shows nothing but background
-FIRST_MEASUREMENT = 2.0  # training seconds; the next ones follow at 1.5 times that, and so on
-MEASUREMENT_GROWTH = 1.5
-MOST_MEASURING = 0.1  # share of the time that may go into measuring
+FIRST_MEASUREMENT = {"seconds": 2.0, "steps": 64.0}  # of training; the next follow at so many times that, and so on:
+MEASUREMENT_GROWTH, TARGET_GROWTH = 2**0.5, 1.1  # the second where a measurement may end the run
+MOST_MEASURING = 0.05  # of a run in seconds: the share of the time that may go into measuring
+# By how much PSNR may be expected to rise while the rate falls (docs/numbers.md): so far below a target a run anneals.
+ANNEALING_DB = 1.0
 PLAN_SHARE = 0.01  # of a budget in seconds: how often the clock is looked at, and how far off a plan may be
 PROVISIONAL_STEPS = 1_000_000  # the plan of a run in seconds until its first step has been timed
 RATE_MEMORY_SECONDS = 5.0  # how far back the measured speed and the shown PSNR look
 
 
 class Budget(NamedTuple):
-    """How long to train: exactly one of the two is given. Seconds count training steps alone."""
+    """How long to train: exactly one of the first two is given. Seconds count training steps alone. ``after``: the
+    folder of a finished run from whose end to go on; the budget is then for what comes on top."""
 
     steps: int | None
     seconds: float | None
+    after: Path | None = None
 
 
 class Probes(NamedTuple):
-    """Fixed pixels to measure on; ``heldout`` is None without test photos, is reported and decides nothing.
-    ``neighbours`` (test photos, training photos): how much these tell of those."""
+    """Fixed pixels to measure on; ``heldout`` is None without test photos, is reported and decides nothing. A
+    ``target`` decides when to stop."""
 
     train: "Probe"
-    heldout: "Probe | None" = None
-    neighbours: "Tensor | None" = None
+    heldout: "Unseen | None" = None
+    target: "Target | None" = None
 
 
 @dataclass
 class RunState:
-    """What a checkpoint keeps beside the tensors. ``seconds`` and ``rays`` include what was discarded."""
+    """What a checkpoint keeps beside the tensors. ``seconds`` and ``rays`` include what was discarded, and what was
+    done before in the finished run that this one goes on from."""
 
     step: int = 0
     seconds: float = 0.0
@@ -67,6 +73,9 @@ class RunState:
     restarts: int = 0
     rollbacks: int = 0
     curve: list[dict[str, Any]] = field(default_factory=list)
+    validation_psnr: float | None = None
+    steps_before: int = 0  # of the finished run that this one goes on from
+    seconds_before: float = 0.0
 
 
 class Pace:
@@ -104,9 +113,11 @@ class TrainingRun:
         self.folder, self.checkpoint_seconds = folder, checkpoint_seconds
         self.log, self.progress = log, progress
         self.checkpoints, self.journal = folder / "checkpoints", folder / "plan.json"
-        self.pace = Pace()
+        self.pace, self.next_planning = Pace(), 0.0
         checkpoint = latest_checkpoint(self.checkpoints, progress.note)
-        if checkpoint is None or checkpoint.step == 0:
+        if checkpoint is None and budget.after is not None:
+            self._go_on(budget.after)
+        elif checkpoint is None or checkpoint.step == 0:
             self._begin(RunState(**checkpoint.facts) if checkpoint else RunState())
         else:
             self._resume(checkpoint)
@@ -116,14 +127,18 @@ class TrainingRun:
         from nerf.training import NonFinite
 
         with live_line(self.progress, self._describe):
-            while self.state.step < self.plan.total_steps:
+            while not self._is_over:
                 try:
                     self._take_steps()
                 except NonFinite as fault:
                     self._roll_back(fault)
-            if not self.state.curve or self.state.curve[-1]["step"] != self.state.step:
-                self._measure()
         self._save()
+
+    @property
+    def _is_over(self) -> bool:
+        """Whether the last step of the plan is taken and measured."""
+        step, curve = self.state.step, self.state.curve
+        return step == self.plan.total_steps and bool(curve) and curve[-1]["step"] == step
 
     def _begin(self, state: RunState) -> None:
         """Start from fresh weights; ``state`` carries over what earlier attempts cost."""
@@ -131,25 +146,54 @@ class TrainingRun:
 
         self.state = state
         self.trainer: FieldTrainer = self.make_trainer(state.restarts)
-        self.plan: StepPlan = plan_of(self.budget.steps or PROVISIONAL_STEPS)
-        self.clock_budget = self.budget.seconds
-        self.next_planning, self.next_measurement = 0.0, state.seconds + FIRST_MEASUREMENT
+        steps, self.clock_budget = self._limits()
+        self.plan: StepPlan = plan_of(steps or PROVISIONAL_STEPS)
+        self._plan_measurement()
         self._write_journal()
         self._save()
 
+    def _go_on(self, folder: Path) -> None:
+        """Start from the end of the finished run in ``folder``, at the rate that the longer run would have there."""
+        checkpoint = latest_checkpoint(folder / "checkpoints", self.progress.note)
+        if checkpoint is None:
+            why = f"the last state of the training in {folder} cannot be read"
+            raise StageError("training cannot go on", why, "Train anew, for longer, without --more.")
+        self._load(checkpoint, folder / "plan.json")
+        self.state.steps_before, self.state.seconds_before = step, seconds = self.state.step, self.state.seconds
+        steps, self.clock_budget = self._limits()
+        if steps is None:
+            assert self.budget.seconds is not None, "one of the two is given"
+            steps = step + max(1, round(self.budget.seconds * step / seconds))
+        self.plan = self.plan.extended(steps)
+        self._write_journal()
+        self._save()
+        self.log.event("extended", step, total_steps=self.plan.total_steps)
+        self.progress.note(f"going on from the {step:,} steps of the finished training, in {self.plan.total_steps:,}")
+
+    def _limits(self) -> tuple[int | None, float | None]:
+        """The steps or seconds after which the run ends at the latest, those of earlier runs included."""
+        steps, seconds, _ = self.budget
+        if steps is not None:
+            return self.state.steps_before + steps, None
+        assert seconds is not None, "one of the two is given"
+        return None, self.state.seconds_before + seconds
+
     def _resume(self, checkpoint: Checkpoint) -> None:
         """Go on from a checkpoint, by the plan that held when the run was killed: its steps are now counted."""
+        self._load(checkpoint, self.journal)
+        self.next_checkpoint = time.monotonic() + self.checkpoint_seconds
+        self.log.event("resumed", self.state.step)
+        self.progress.note(f"going on from step {self.state.step:,} of {self.plan.total_steps:,}")
+
+    def _load(self, checkpoint: Checkpoint, journal: Path) -> None:
         from nerf.schedule import Decision, StepPlan
 
         self.state = RunState(**checkpoint.facts)
         self.trainer = self.make_trainer(self.state.restarts)
         self.trainer.load_state(checkpoint.tensors)
-        self.plan = StepPlan(tuple(Decision(*decision) for decision in read_json(self.journal)))
+        self.plan = StepPlan(tuple(Decision(*decision) for decision in read_json(journal)))
         self.clock_budget = None
-        self.next_measurement = self.state.seconds * MEASUREMENT_GROWTH
-        self.next_checkpoint = time.monotonic() + self.checkpoint_seconds
-        self.log.event("resumed", self.state.step)
-        self.progress.note(f"going on from step {self.state.step:,} of {self.plan.total_steps:,}")
+        self._plan_measurement()
 
     def _take_steps(self) -> None:
         """Steps to the end of the plan, with everything that is due between them."""
@@ -157,12 +201,14 @@ class TrainingRun:
             self._take_step()
             if self.state.step == WARM_UP_STEPS and (symptom := self._symptom()):
                 self._restart(symptom)
-            if self.state.seconds >= self.next_measurement:
+            if self._elapsed >= self.next_measurement:
                 self._measure()
             if self.clock_budget is not None and self.state.seconds >= self.next_planning:
                 self._replan(self.clock_budget)
             if time.monotonic() >= self.next_checkpoint:
                 self._save()
+        if not self._is_over:
+            self._measure()
 
     def _take_step(self) -> None:
         started = time.perf_counter()
@@ -179,7 +225,8 @@ class TrainingRun:
 
         step = self.state.step
         self.next_planning = self.state.seconds + PLAN_SHARE * budget
-        if not self.plan.decisions[-1].from_step <= step < self.plan.total_steps:
+        last = self.plan.decisions[-1]
+        if not last.from_step <= step < self.plan.total_steps or last.reason == "target":
             return
         left, tolerance = budget - self.state.seconds, PLAN_SHARE * budget
         plan = replanned(self.plan, step, left, 1 / self.pace.seconds_per_step, tolerance)
@@ -190,22 +237,70 @@ class TrainingRun:
 
     def _measure(self) -> None:
         """Add a point to the curve. Not training time, and without influence on what is trained."""
-        from nerf.probe import measure
+        from stages.unseen import look
 
         started = time.perf_counter()
-        heldout = None
-        if self.probes.heldout is not None and self.probes.neighbours is not None:
-            unseen = self.trainer.photo_colours.of_unseen(self.probes.neighbours)
-            heldout = measure(self.trainer.model, self.probes.heldout, unseen).psnr
-        cost = time.perf_counter() - started
-        seconds = self.state.seconds
+        seen = look(self.trainer, self.probes.heldout) if self.probes.heldout else None
         # Right after a kill at the very end no step has told how well the batches go.
         train = self.pace.psnr if self.pace.count else self._on_training_photos().psnr
-        self.next_measurement = max(MEASUREMENT_GROWTH * seconds, seconds + cost / MOST_MEASURING)
-        point = {"step": self.state.step, "seconds": round(seconds, 3), "train_psnr": round(train, 3)}
-        point["heldout_psnr"] = None if heldout is None else round(heldout, 3)
+        point = {"step": self.state.step, "seconds": round(self.state.seconds, 3), "train_psnr": round(train, 3)}
+        point["heldout_psnr"] = None if seen is None else round(seen.psnr, 3)
+        point["heldout_ssim"] = None if seen is None or seen.ssim is None else round(seen.ssim, 4)
         self.state.curve.append(point)
         self.log.point(point)
+        if self.probes.target is not None:
+            self._steer(self.probes.target)
+        self._plan_measurement(time.perf_counter() - started)
+
+    @property
+    def _elapsed(self) -> float:
+        """What measurements are spaced by: steps where these are counted, so that nothing depends on the clock."""
+        return self.state.seconds if self.budget.steps is None else float(self.state.step)
+
+    def _plan_measurement(self, cost: float = 0.0) -> None:
+        """Decide when to measure next; the last time took ``cost`` seconds."""
+        from nerf.schedule import next_in_series
+
+        growth = MEASUREMENT_GROWTH if self.probes.target is None else TARGET_GROWTH
+        kind = "seconds" if self.budget.steps is None else "steps"
+        self.next_measurement = next_in_series(self._elapsed, FIRST_MEASUREMENT[kind], growth)
+        if kind == "seconds":
+            self.next_measurement = max(self.next_measurement, self._elapsed + cost / MOST_MEASURING)
+
+    def _steer(self, target: "Target") -> None:
+        """Stop where the validation photos are as good as wanted; anneal where that may be all it takes; go on as
+        before where it was not enough and there is time. Decisions already in the plan are not made again."""
+        from stages.unseen import look
+
+        step, decided = self.state.step, self.plan.decisions[-1]
+        self.state.validation_psnr = round(look(self.trainer, target.photos).psnr, 3)
+        self.log.event("validated", step, psnr=self.state.validation_psnr)
+        if step <= decided.from_step:
+            return
+        failed = sum(decision.reason == "target" for decision in self.plan.decisions)
+        missing = target.psnr - self.state.validation_psnr
+        plan = self.plan
+        if missing <= 0:
+            plan = plan.ended(step)
+        elif step == plan.total_steps:
+            if decided.reason == "target" and self._most_steps() > step:
+                plan = plan.extended(self._most_steps())
+        elif decided.reason != "target" and missing <= ANNEALING_DB / 2**failed:
+            plan = plan.closing(step)
+        if plan is not self.plan:
+            self.plan = plan
+            self._write_journal()
+            self.log.event("steered", step, total_steps=plan.total_steps)
+            seen = f"{self.state.validation_psnr:.1f} of {target.psnr:g} dB on photos set aside"
+            self.progress.note(f"{seen} after {step:,} steps: now {plan.total_steps:,} in all")
+
+    def _most_steps(self) -> int:
+        """How many steps the budget allows for."""
+        steps, seconds = self._limits()
+        if steps is not None:
+            return steps
+        assert seconds is not None, "one of the two is given"
+        return self.state.step + int((seconds - self.state.seconds) / self.pace.seconds_per_step)
 
     def _save(self) -> None:
         save_checkpoint(self.checkpoints, Checkpoint(self.state.step, self.trainer.state(), asdict(self.state)))
@@ -256,7 +351,8 @@ class TrainingRun:
             raise StageError("the field does not learn", why, "Check the cameras: the photos may not fit their poses.")
         self.progress.note(f"after {WARM_UP_STEPS} steps the field is dead: {symptom}; starting with another seed")
         shutil.rmtree(self.checkpoints)
-        self._begin(RunState(seconds=self.state.seconds, rays=self.state.rays, restarts=restarts))
+        kept = {name: getattr(self.state, name) for name in ("seconds", "rays", "steps_before", "seconds_before")}
+        self._begin(RunState(restarts=restarts, **kept))
 
     def _describe(self) -> tuple[str, float]:
         """The live line: step, speed, quality, time left."""

@@ -25,7 +25,6 @@ FINAL_RATE = 0.1  # of the paper field's learning rate at the start
 DISTORTION = 4e-3
 COARSEST = 16
 FEWEST_STEPS, MOST_STEPS = 256, 384  # along the diagonal of a bounded scene's box
-PROBE_RAYS = 2048
 WHITE, BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
 
 
@@ -34,10 +33,12 @@ def prepare(config: "Config", scene: "Scene", inputs: Inputs, folder: Path, prog
     import torch
 
     from nerf.probe import make_probe
-    from stages.effect_decisions import photo_parts, read_decisions, told_by_neighbours
+    from stages.effect_decisions import photo_parts, read_decisions
+    from stages.train_more import budget_of
     from stages.training_data import training_bank
     from stages.training_log import TrainingLog
-    from stages.training_loop import Budget, Probes, TrainingRun
+    from stages.training_loop import Probes, TrainingRun
+    from stages.unseen import PROBE_RAYS, Target, unseen_photos
 
     assert config.downscale is not None, "plan() chooses it"
     device = compute_device()
@@ -45,11 +46,14 @@ def prepare(config: "Config", scene: "Scene", inputs: Inputs, folder: Path, prog
     bank = training_bank(inputs["ingest"], scene, "train", config.downscale, progress).to(device)
     shown_over = torch.tensor(field_background(config, scene), device=device)
 
-    probes = Probes(make_probe(bank, PROBE_RAYS, shown_over, config.seed))
-    if scene.of_split("test"):
-        unseen = training_bank(inputs["ingest"], scene, "test", config.downscale, progress).to(device)
-        heldout = make_probe(unseen, PROBE_RAYS, shown_over, config.seed)
-        probes = probes._replace(heldout=heldout, neighbours=told_by_neighbours(scene, scene.of_split("test")))
+    probes = Probes(
+        make_probe(bank, PROBE_RAYS, shown_over, config.seed),
+        unseen_photos(config, inputs["ingest"], scene, "test", device, progress),
+    )
+    if config.target_psnr is not None:
+        aside = unseen_photos(config, inputs["ingest"], scene, "validation", device, progress)
+        assert aside is not None, "stage train sets some aside"
+        probes = probes._replace(target=Target(config.target_psnr, aside))
     _say_sizes(config, bank, progress)
     decisions, views = read_decisions(inputs["effects"]), scene.of_split("train")
     return TrainingRun(
@@ -57,7 +61,7 @@ def prepare(config: "Config", scene: "Scene", inputs: Inputs, folder: Path, prog
             config, scene, bank, config.seed + attempt, photo_parts(decisions, views, bank.device)
         ),
         probes,
-        Budget(config.steps, config.seconds),
+        budget_of(config, inputs),
         folder,
         config.checkpoint_seconds,
         TrainingLog(folder, config.tensorboard),
@@ -94,7 +98,10 @@ def make_trainer(
 
 
 def _say_sizes(config: "Config", bank: "RayBank", progress: Progress) -> None:
-    budget = f"{config.steps:,} steps" if config.steps is not None else f"{config.seconds:g} s"
+    steps, seconds = (
+        (config.steps, config.seconds) if config.after is None else (config.more_steps, config.more_seconds)
+    )
+    budget = ("" if config.after is None else "another ") + (f"{seconds:g} s" if steps is None else f"{steps:,} steps")
     photos = f"{len(bank.near)} photos at 1/{config.downscale:g} of their size"
     sizes = (
         f"{config.levels} grids to {config.finest}³" if config.field == "grid" else f"{config.depth} × {config.width}"

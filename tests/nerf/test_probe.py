@@ -4,7 +4,7 @@ import torch
 
 from nerf.metrics import PSNR_LIMIT
 from nerf.model import Rendering
-from nerf.probe import make_probe, measure
+from nerf.probe import make_patches, make_probe, measure, pictures
 from nerf.ray_bank import RayBank, build_ray_bank
 from nerf.rays import Rays
 
@@ -47,3 +47,48 @@ def test_a_probe_is_always_the_same() -> None:
     first, again, other = (make_probe(painted_bank(), 50, torch.zeros(3), seed).colours for seed in (4, 4, 5))
     assert torch.equal(first, again)
     assert not torch.equal(first, other)
+
+
+def two_photos(grey: float = 0.0) -> RayBank:
+    """Photos of 20 x 30 and 13 x 17 pixels whose colours tell view, row and column; Painted paints them ``grey``."""
+    photos, directions = [], []
+    for view, (height, width) in enumerate(((20, 30), (13, 17))):
+        y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+        photos.append(torch.stack([torch.full_like(x, 100 * view), y, x], -1).to(torch.uint8))
+        directions.append(torch.tensor([grey, 0.0, 1.0]).expand(height, width, 3))
+    poses = torch.eye(3, 4).expand(2, 3, 4)
+    return build_ray_bank(photos, [0, 1], directions, poses, torch.ones(2), torch.full((2,), 2.0))
+
+
+def test_patches_are_squares_of_the_photos() -> None:
+    shown, truth = pictures(Painted(), make_patches(two_photos(), 40, 9, torch.zeros(3), seed=1))
+    assert shown.shape == truth.shape == (40, 9, 9, 3) and not shown.any()
+    values = (truth * 255).round().long()
+    steps = torch.arange(9)
+    assert (values[..., 0] == values[:, :1, :1, 0]).all(), "a patch lies in one photo"
+    assert (values[..., 1] == values[:, :1, :1, 1] + steps[:, None]).all()
+    assert (values[..., 2] == values[:, :1, :1, 2] + steps).all()
+    assert set(values[:, 0, 0, 0].tolist()) == {0, 100}, "both photos have some"
+    assert values[values[:, 0, 0, 0] == 0][..., 1].max() == 19, "some touch the border"
+
+
+def test_patches_fit_into_the_smallest_photo() -> None:
+    patches = make_patches(two_photos(), 5, 50, torch.zeros(3), seed=1)
+    assert patches.used.shape == (5, 13, 13) and patches.used.all()
+
+
+def test_patches_know_what_masks_ignore() -> None:
+    ignored = torch.zeros(20, 30, dtype=torch.bool)
+    ignored[:, :10] = True
+    bank = two_photos().without([ignored, torch.ones(13, 17, dtype=torch.bool)])
+    patches = make_patches(bank, 40, 9, torch.zeros(3), seed=1)
+    _, truth = pictures(Painted(), patches)
+    values = (truth * 255).round().long()
+    assert (values[..., 0] == 0).all(), "nothing of the second photo is used"
+    assert torch.equal(patches.used, values[..., 2] >= 10)
+    assert 0 < patches.used.float().mean() < 1
+
+
+def test_a_picture_is_as_bright_as_a_photo_can_be() -> None:
+    shown, _ = pictures(Painted(), make_patches(two_photos(grey=1.5), 4, 9, torch.zeros(3), seed=1))
+    assert (shown == 1).all()

@@ -42,6 +42,23 @@ def test_half_way_through_twice_the_steps() -> None:
     assert [plan.share(step) for step in range(7)] == [0, 0.25, 0.5, 0.625, 0.75, 0.875, 1]
 
 
+@given(plans(), st.integers(1, 60), st.integers(1, 60))
+def test_more_steps_take_the_share_back_to_that_of_the_longer_run(plan: StepPlan, more: int, yet_more: int) -> None:
+    done = plan.total_steps
+    longer = plan.extended(done + more)
+    assert [longer.share(step) for step in range(done)] == [plan.share(step) for step in range(done)]
+    whole = plan_of(done + more)
+    for step in range(done, done + more + 1):
+        assert longer.share(step) == pytest.approx(whole.share(step), abs=1e-12)
+    assert longer.extended(done + more + yet_more).share(done + more) == (done + more) / (done + more + yet_more)
+
+
+@pytest.mark.parametrize("total", [4, 3])
+def test_more_steps_are_more_than_there_were(total: int) -> None:
+    with pytest.raises(ValueError, match="cannot go on"):
+        plan_of(4).extended(total)
+
+
 @pytest.mark.parametrize(("step", "total"), [(5, 5), (3, 9)])
 def test_no_decision_without_a_step_left_or_about_the_past(step: int, total: int) -> None:
     with pytest.raises(ValueError, match="cannot become"):

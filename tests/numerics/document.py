@@ -29,10 +29,11 @@ ELSEWHERE = {
     "nerf/effects/pose_fit.py": "a search: tests/stages/test_pilots.py",
     "nerf/pose_distance.py": "float64, ratios of distances: tests/nerf/test_pose_distance.py",
     "nerf/rendering.py": "cuts pictures into chunks: tests/nerf/test_rendering.py",
-    "nerf/probe.py": "mean colour, PSNR: tests/nerf/test_probe.py",
+    "nerf/probe.py": "mean colour, PSNR, patches of pixels: tests/nerf/test_probe.py",
     "nerf/training.py": "sums of chunks; refuses what is not finite before the update: tests/nerf/test_training.py",
     "nerf/grid_training.py": "likewise: tests/nerf/test_grid_training.py",
     "nerf/schedule.py": "rates within the range they are given, in float64: tests/nerf/test_schedule.py",
+    "nerf/learning_curve.py": "interpolation in log time, in float64: tests/nerf/test_learning_curve.py",
     "nerf/reconstruction.py": "float64, relative to the cameras' middle: tests/nerf/test_reconstruction.py",
     "nerf/normalisation.py": "float64, the same for every similar reconstruction, 1e6 off the origin too: "
     "tests/nerf/test_normalisation.py",

@@ -282,3 +282,17 @@ def test_plain_output_is_not_flooded(capsys: pytest.CaptureFixture[str]):
         display.update(f"step {k}", k / 1000)
     display.note("a line that stays")
     assert capsys.readouterr().out == "train      a line that stays\n"
+
+
+def test_a_budget_and_more_are_two_budgets(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    def with_after(settings: Settings, *_: object) -> Settings:
+        return settings.model_copy(update={"train": settings.train.model_copy(update={"after": "0" * 16})})
+
+    monkeypatch.setattr("pipeline.cli.with_more", with_after)
+    (tmp_path / "w").mkdir()
+    (tmp_path / "w/run.json").write_text('{"version": 1, "options": {}, "plans": {}, "keys": {}}')
+    words = ["run", str(tmp_path), "-o", str(tmp_path / "w"), "--more", "10m", "--budget", "5m"]
+    assert run_command(words) == 2
+    assert "--budget and --more are two budgets; give one" in capsys.readouterr().err

@@ -66,7 +66,7 @@ def test_a_picture_smaller_than_the_first_one_tried_will_do() -> None:
 
 
 def test_training_took_as_long_as_its_curve_says(tmp_path: Path) -> None:
-    write_json(tmp_path / "curve.json", [{"seconds": 2.0}, {"seconds": 61.5}])
+    write_json(tmp_path / "curve.json", {"points": [{"seconds": 2.0}, {"seconds": 61.5}]})
     assert training_seconds(tmp_path) == 61.5
 
 

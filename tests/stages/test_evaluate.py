@@ -103,7 +103,7 @@ def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Make:
         write_json(inputs["normalise"] / "scene.json", scene.to_json())
         info = {"kind": "sky", "downscale": downscale, "background": [0.0, 0.0, 0.0]}
         write_json(inputs["train"] / "field.json", info)
-        write_json(inputs["train"] / "curve.json", [{"seconds": 2.0}])
+        write_json(inputs["train"] / "curve.json", {"points": [{"seconds": 2.0}]})
         monkeypatch.setattr("stages.drawing.Painter.rays_per_second", lambda *_: speed)
         monkeypatch.setattr("stages.device.compute_device", lambda: "cpu")
         monkeypatch.setattr("stages.field_files.load_field", lambda _folder, _device: (field or SkyField(), info))

@@ -61,7 +61,7 @@ def inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Path]:
     write_json(folders["normalise"] / "scene.json", scene_with(ring(12, radius=2.5, height=0.8)).to_json())
     info = {"background": [0.0, 0.0, 1.0], "downscale": 1.0, "rays": 100_000}
     write_json(folders["train"] / "field.json", info)
-    write_json(folders["train"] / "curve.json", [{"step": 9, "seconds": 10.0}])
+    write_json(folders["train"] / "curve.json", {"points": [{"step": 9, "seconds": 10.0}]})
     monkeypatch.setattr("stages.drawing.Painter.rays_per_second", lambda self, sample, largest, seconds: 30_000)
     monkeypatch.setattr("stages.field_files.load_field", lambda folder, device="cpu": (Ball(), info))
     return folders
@@ -126,7 +126,7 @@ def test_plan_answers_every_open_question(inputs, progress) -> None:
 
 @pytest.mark.parametrize(("seconds", "frames"), [(0.02, 6), (10.0, 6), (60.0, 37), (1000.0, 120)])
 def test_drawing_is_expected_to_take_a_share_of_the_training(inputs, progress, seconds: float, frames: int) -> None:
-    write_json(inputs["train"] / "curve.json", [{"seconds": 0.01}, {"seconds": seconds}])
+    write_json(inputs["train"] / "curve.json", {"points": [{"seconds": 0.01}, {"seconds": seconds}]})
     config = render.plan(render.Config(), inputs, progress)
     assert config.frames == frames
     assert config.width is not None
@@ -135,7 +135,7 @@ def test_drawing_is_expected_to_take_a_share_of_the_training(inputs, progress, s
 
 
 def test_a_video_that_must_take_longer_than_training_says_so(inputs, progress) -> None:
-    write_json(inputs["train"] / "curve.json", [{"seconds": 0.1}])
+    write_json(inputs["train"] / "curve.json", {"points": [{"seconds": 0.1}]})
     render.plan(render.Config(), inputs, progress)
     render.plan(render.Config(frames=50), inputs, progress)
     assert [note.split("; ")[1] for note in progress.notes] == [

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from nerf.scene import Camera, Scene, Similarity, View
-from stages.report_plots import _outline, camera_svgs, curve_svg, last_doubling
+from stages.report_plots import _outline, camera_svgs, curve_svg
 
 
 def _scene(count: int = 9) -> Scene:
@@ -37,18 +37,6 @@ def _curve() -> list[dict[str, Any]]:
     ]
 
 
-def test_the_last_doubling_is_exact_where_psnr_grows_with_the_logarithm_of_time():
-    assert last_doubling(_curve()) == pytest.approx(1.5)
-
-
-def test_a_flat_curve_buys_nothing_and_a_short_one_says_nothing():
-    rows = [{"seconds": s, "heldout_psnr": 20.0} for s in (10, 20, 40)]
-    assert last_doubling(rows) == 0
-    assert last_doubling(rows[2:]) is None
-    assert last_doubling([{"seconds": s, "heldout_psnr": 20.0} for s in (30, 40)]) is None
-    assert last_doubling([{"seconds": s, "heldout_psnr": None} for s in (10, 40)]) is None
-
-
 def test_plots_are_well_formed_and_the_same_twice():
     xyz = np.random.default_rng(0).normal(0, 0.4, (500, 3))
     rgb = np.random.default_rng(1).integers(0, 255, (500, 3))
@@ -69,6 +57,15 @@ def test_plots_of_one_page_share_no_identifier():
     assert all(ids)
     together = [name for plot in ids for name in plot]
     assert len(together) == len(set(together))
+
+
+def test_the_curve_shows_what_comes_next_and_where_the_knee_is():
+    steep = curve_svg(_curve(), {}) or ""
+    assert "predicted" in steep and "4 min 16 s" in steep and "knee" not in steep
+    flat = [row | {"heldout_psnr": 20 - 8 / row["seconds"]} for row in _curve()]
+    assert "knee, 16 s: twice the time bought &lt; 0.5 dB" in (curve_svg(flat, {}) or "")
+    unknown = [row | {"heldout_psnr": None} for row in _curve()]
+    assert "predicted" not in (curve_svg(unknown, {}) or "predicted")
 
 
 def test_curve_names_its_lines_and_needs_two_points():

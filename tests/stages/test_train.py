@@ -9,6 +9,7 @@ from nerf.grid_training import GridTrainer
 from nerf.training import PaperTrainer
 from stages import train
 from stages.contract import Progress, StageError
+from stages.device import cores
 from stages.field_files import load_field
 from stages.files import read_json
 from stages.train import Config
@@ -49,9 +50,13 @@ def test_photos_become_a_field_that_beats_a_flat_colour(tmp_path: Path, progress
     _, info = load_field(tmp_path / "train")
     assert (info["steps"], info["rays"], info["downscale"], info["background"]) == (120, 120 * 64, 1.0, [1, 1, 1])
     assert result.facts["steps"] == 120 and result.facts["restarts"] == result.facts["rollbacks"] == 0
-    assert result.line.endswith(f"held out {result.facts['heldout_psnr']:.1f} dB")
+    assert f"held out {result.facts['heldout_psnr']:.1f} dB " in result.line
     curve = read_json(tmp_path / "train" / "curve.json")
-    assert curve[-1]["step"] == 120 and set(curve[-1]) == {"step", "seconds", "train_psnr", "heldout_psnr"}
+    assert (curve["device"], curve["threads"]) == ("cpu", cores())
+    last = curve["points"][-1]
+    assert [point["step"] for point in curve["points"]] == [64, 91, 120]
+    assert set(last) == {"step", "seconds", "train_psnr", "heldout_psnr", "heldout_ssim"}
+    assert curve["points"][0]["heldout_ssim"] < last["heldout_ssim"] < 1
     assert progress.notes[0] == "paper field (2 × 16), 120 steps · 6 photos at 1/1 of their size, 2.3 k pixels"
 
 
@@ -177,7 +182,8 @@ def test_options_of_the_paper_field_ask_for_it() -> None:
 
 def test_every_option_is_shared_or_of_one_field() -> None:
     shared = {"field", "preset", "steps", "seconds", "learning_rate", "seed", "downscale", "background", "contracted"}
-    shared |= {"view_dependence", "checkpoint_seconds", "tensorboard"}
+    shared |= {"view_dependence", "checkpoint_seconds", "tensorboard", "target_psnr"}
+    shared |= {"after", "more_steps", "more_seconds"}
     assert sorted([*shared, *train.GRID_ONLY, *train.PAPER_ONLY]) == sorted(Config.model_fields)
 
 
@@ -240,3 +246,24 @@ def test_a_run_in_seconds_keeps_to_them(tmp_path: Path, progress) -> None:
     assert 0.7 < result.facts["train_seconds"] < 1.5
     decisions = json.loads((tmp_path / "train" / "plan.json").read_text())
     assert decisions[-1][1] == result.facts["steps"] > 2
+
+
+def test_a_target_is_judged_on_photos_set_aside(tmp_path: Path, progress) -> None:
+    inputs, _ = photographed(tmp_path, views=12, channels=4)
+    result = trained(tmp_path / "train", inputs, progress, field="grid", steps=400, target_psnr=14.0)
+    assert "1 of 9 training photos are set aside to tell when 14 dB are reached" in progress.notes
+    assert result.facts["steps"] < 400 and result.facts["validation_psnr"] >= 14
+    assert "14 dB reached after" in result.line
+    assert "validation" not in (inputs["normalise"] / "scene.json").read_text()
+
+
+def test_a_target_that_is_missed_is_said(tmp_path: Path, progress) -> None:
+    inputs, _ = photographed(tmp_path, views=12, channels=4)
+    result = trained(tmp_path / "train", inputs, progress, field="grid", steps=20, target_psnr=60.0)
+    assert result.facts["steps"] == 20 and "60 dB not reached in" in result.line
+
+
+def test_too_few_photos_for_a_target(tmp_path: Path, progress) -> None:
+    inputs, _ = photographed(tmp_path, views=5)
+    with pytest.raises(StageError, match="of 3 training photos too few would be left"):
+        trained(tmp_path / "train", inputs, progress, steps=20, target_psnr=20.0)

@@ -1,6 +1,8 @@
 """The loop with a field that is one number, so that every kind of trouble can be staged."""
 
 import json
+import math
+import shutil
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -11,7 +13,7 @@ from torch import Tensor
 
 from nerf.effects import AS_GIVEN, AS_RENDERED
 from nerf.model import Rendering
-from nerf.probe import Probe
+from nerf.probe import Patches, Probe
 from nerf.rays import Rays
 from nerf.training import NonFinite, StepResult
 from stages import training_loop
@@ -19,6 +21,7 @@ from stages.checkpoints import latest_checkpoint
 from stages.contract import StageError
 from stages.training_log import TrainingLog
 from stages.training_loop import Budget, Probes, TrainingRun
+from stages.unseen import Target, Unseen
 
 
 class Killed(BaseException):
@@ -78,11 +81,17 @@ def probe() -> Probe:
     return Probe(rays, torch.tensor([[0.0] * 3, [0.5] * 3]), torch.zeros(3), torch.tensor([0, 1]))
 
 
-def run_in(folder: Path, progress, steps: int | None = 40, seconds: float | None = None, make=None) -> TrainingRun:
+def unseen() -> Unseen:
+    """The same rays; their patches are too small for SSIM."""
+    return Unseen(probe(), Patches(probe(), torch.ones(2, 1, 1, dtype=torch.bool)), torch.eye(2))
+
+
+def run_in(
+    folder: Path, progress, budget: Budget | None = None, make=None, target: Target | None = None
+) -> TrainingRun:
     folder.mkdir(exist_ok=True)
-    maker = make or (lambda attempt: OneNumber(attempt, quiet))
-    budget, probes = Budget(steps, seconds), Probes(probe(), probe(), torch.eye(2))
-    return TrainingRun(maker, probes, budget, folder, 1e-9, TrainingLog(folder, False), progress)
+    maker, probes = make or (lambda attempt: OneNumber(attempt, quiet)), Probes(probe(), unseen(), target)
+    return TrainingRun(maker, probes, budget or Budget(40, None), folder, 1e-9, TrainingLog(folder, False), progress)
 
 
 def number_of(run: TrainingRun) -> OneNumber:
@@ -126,7 +135,7 @@ def test_finished_and_run_again_does_nothing(tmp_path: Path, progress) -> None:
 
 
 def test_a_run_in_seconds_takes_about_that_long_and_its_share_ends_at_1(tmp_path: Path, progress) -> None:
-    run = run_in(tmp_path, progress, steps=None, seconds=0.3, make=lambda attempt: OneNumber(attempt, slow))
+    run = run_in(tmp_path, progress, Budget(None, 0.3), make=lambda attempt: OneNumber(attempt, slow))
     run.train()
     assert 0.2 < run.state.seconds < 0.5
     assert run.plan.share(run.state.step) == pytest.approx(1)
@@ -137,9 +146,9 @@ def test_a_run_in_seconds_takes_about_that_long_and_its_share_ends_at_1(tmp_path
 
 def test_a_resumed_run_in_seconds_replays_its_plan(tmp_path: Path, progress) -> None:
     with pytest.raises(Killed):
-        run_in(tmp_path, progress, steps=None, seconds=0.3, make=killed_at(30)).train()
+        run_in(tmp_path, progress, Budget(None, 0.3), make=killed_at(30)).train()
     journal = json.loads((tmp_path / "plan.json").read_text())
-    resumed = run_in(tmp_path, progress, steps=None, seconds=0.3, make=lambda attempt: OneNumber(attempt, slow))
+    resumed = run_in(tmp_path, progress, Budget(None, 0.3), make=lambda attempt: OneNumber(attempt, slow))
     resumed.train()
     assert [list(decision) for decision in resumed.plan.decisions] == journal
     assert resumed.state.step == journal[-1][1]
@@ -218,14 +227,15 @@ def test_a_field_that_stays_dead_fails_by_name(tmp_path: Path, progress, monkeyp
 def test_the_curve_ends_with_the_run_and_is_on_record(
     tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(training_loop, "FIRST_MEASUREMENT", 1e-6)
+    monkeypatch.setitem(training_loop.FIRST_MEASUREMENT, "steps", 10.0)
     run = run_in(tmp_path, progress)
     run.train()
     assert run.state.curve[-1]["step"] == 40
     assert run.state.curve[-1]["heldout_psnr"] == 20.0
     measured = [e for e in events(tmp_path) if e["event"] == "measured"]
     assert [e["step"] for e in measured] == [point["step"] for point in run.state.curve]
-    assert 1 < len(measured) < 40
+    assert [point["step"] for point in run.state.curve] == [10, 15, 21, 29, 40]
+    assert {"device", "threads"} & set(run.state.curve[0]) == set() and run.state.curve[0]["heldout_ssim"] is None
 
 
 def test_the_live_line_tells_step_speed_quality_and_time_left(tmp_path: Path, progress) -> None:
@@ -243,3 +253,127 @@ def test_every_checkpoint_loads(tmp_path: Path, progress) -> None:
     run_in(tmp_path, progress).train()
     found = latest_checkpoint(tmp_path / "checkpoints", pytest.fail)
     assert found is not None and found.step == 40
+
+
+def finished(folder: Path, progress, steps: int = 40) -> Path:
+    run_in(folder, progress, Budget(steps, None)).train()
+    return folder
+
+
+def test_more_steps_begin_where_the_finished_run_ended_at_the_longer_run_s_rates(tmp_path: Path, progress) -> None:
+    first = finished(tmp_path / "first", progress)
+    before = {path: path.read_bytes() for path in first.rglob("*") if path.is_file()}
+    longer = run_in(tmp_path / "more", progress, Budget(20, None, first))
+    longer.train()
+    assert [(step, share) for step, share, _ in number_of(longer).history] == [
+        (step, pytest.approx(step / 60)) for step in range(40, 60)
+    ]
+    assert (longer.state.step, longer.state.rays, longer.state.steps_before) == (60, 240, 40)
+    curve = [point["step"] for point in longer.state.curve]
+    assert curve == sorted(set(curve)) and curve[-1] == 60 and 40 in curve, "one curve over both"
+    assert before == {path: path.read_bytes() for path in first.rglob("*") if path.is_file()}
+    assert "going on from the 40 steps of the finished training, in 60" in progress.notes
+
+
+def test_more_steps_in_two_pieces_are_the_same_bytes(tmp_path: Path, progress) -> None:
+    first, budget = finished(tmp_path / "first", progress), Budget(20, None, tmp_path / "first")
+    whole = run_in(tmp_path / "whole", progress, budget)
+    whole.train()
+    with pytest.raises(Killed):
+        run_in(tmp_path / "cut", progress, budget, killed_at(51)).train()
+    shutil.rmtree(first)  # what has begun needs the first run no more
+    resumed = run_in(tmp_path / "cut", progress, budget)
+    resumed.train()
+    assert number_of(resumed).history[0][0] == 51
+    assert torch.equal(number_of(whole).value, number_of(resumed).value)
+
+
+def test_more_seconds_take_about_that_long(tmp_path: Path, progress) -> None:
+    def make(attempt: int) -> OneNumber:
+        return OneNumber(attempt, slow)
+
+    first = run_in(tmp_path / "first", progress, Budget(None, 0.2), make)
+    first.train()
+    more = run_in(tmp_path / "more", progress, Budget(None, 0.2, tmp_path / "first"), make)
+    assert more.plan.share(first.state.step) == pytest.approx(0.5, abs=0.05)
+    more.train()
+    assert 0.1 < more.state.seconds - first.state.seconds < 0.35
+
+
+def test_without_a_readable_state_there_is_no_more(tmp_path: Path, progress) -> None:
+    first = finished(tmp_path / "first", progress)
+    for path in (first / "checkpoints").glob("*.safetensors"):
+        path.write_bytes(b"")
+    with pytest.raises(StageError, match="cannot be read"):
+        run_in(tmp_path / "more", progress, Budget(20, None, first))
+
+
+class Rising(OneNumber):
+    """Comes nearer the truth by 1 dB with every doubling of the steps, and by ``annealing`` dB as its rate falls: at
+    constant rate it is at 20 dB after 500 steps."""
+
+    annealing = 1.0
+
+    def __init__(self) -> None:
+        super().__init__(0, quiet)
+
+    def step(self, step: int, share: float, rate_scale: float) -> StepResult:
+        result = super().step(step, share, rate_scale)
+        db = 20 + math.log2((step + 1) / 500) + self.annealing * share
+        self.shown = probe().colours + 10 ** (-db / 20)
+        return result
+
+
+class RisingLess(Rising):
+    """One that gains nothing by annealing."""
+
+    annealing = 0.0
+
+
+def towards(folder: Path, progress, target: float, make=Rising, steps: int = 1000) -> TrainingRun:
+    run = run_in(folder, progress, Budget(steps, None), lambda attempt: make(), Target(target, unseen()))
+    run.train()
+    return run
+
+
+def reasons(run: TrainingRun) -> list[str]:
+    return [decision.reason for decision in run.plan.decisions]
+
+
+def test_a_target_ends_the_run_once_it_is_reached(tmp_path: Path, progress) -> None:
+    run = towards(tmp_path, progress, 20.0)
+    assert run.state.validation_psnr is not None and 20.0 <= run.state.validation_psnr < 20.3
+    assert 200 < run.state.step < 400, "annealing gave the last of it"
+    assert reasons(run) == ["begin", "target", "target"]
+    assert run.plan.total_steps == run.state.step == run.state.curve[-1]["step"]
+
+
+def test_a_target_out_of_reach_takes_the_whole_budget_and_ends_annealed(tmp_path: Path, progress) -> None:
+    run = towards(tmp_path, progress, 30.0)
+    assert run.state.step == 1000 and reasons(run) == ["begin"]
+    assert run.state.validation_psnr == pytest.approx(22.0, abs=0.1)
+
+
+def test_annealing_that_does_not_suffice_is_undone(tmp_path: Path, progress) -> None:
+    run = towards(tmp_path, progress, 20.0, RisingLess)
+    assert reasons(run)[:3] == ["begin", "target", "more"]
+    assert run.state.validation_psnr is not None and 20.0 <= run.state.validation_psnr < 20.3
+    back = run.plan.decisions[2]
+    assert (back.total_steps, back.share) == (1000, back.from_step / 1000)
+
+
+@pytest.mark.parametrize("at", [70, 225, 250])
+def test_a_run_to_a_target_in_two_pieces_is_the_same(at: int, tmp_path: Path, progress) -> None:
+    class Mortal(Rising):
+        def step(self, step: int, share: float, rate_scale: float) -> StepResult:
+            if step == at:
+                raise Killed
+            return super().step(step, share, rate_scale)
+
+    whole = towards(tmp_path / "whole", progress, 20.0)
+    with pytest.raises(Killed):
+        towards(tmp_path / "cut", progress, 20.0, Mortal)
+    resumed = towards(tmp_path / "cut", progress, 20.0)
+    assert resumed.plan == whole.plan
+    assert torch.equal(number_of(whole).value, number_of(resumed).value)
+    assert [p["step"] for p in resumed.state.curve] == [p["step"] for p in whole.state.curve]

@@ -1,0 +1,175 @@
+"""Trains the grid field for one budget of steps after the other, measures each run on its way, keeps all in a file.
+
+python -m benchmarks.budget_runs fox.nerf lego_400.nerf --runs runs.json
+python -m benchmarks.budget_runs fox.nerf --schedule late --runs runs.json
+
+A workspace needs its stages up to effects. A run that the file holds already is not made again. All runs of a set have
+one size of photos and of field. Beside the field itself a running mean of its weights is measured, over the last
+tenth of the run (Karras et al. 2024, section 3.1). benchmarks.prediction reads the file.
+"""
+
+import argparse
+import json
+import math
+import time
+from itertools import product
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+
+from nerf.grid_field import GridField
+from nerf.grid_training import CONSTANT_SHARE, GridTrainer
+from nerf.probe import Probe, make_probe, measure
+from nerf.ray_bank import RayBank
+from nerf.scene import Scene
+from nerf.schedule import plan_of
+from nerf.training import FieldTrainer
+from stages.backend import chosen_backend, load_backend
+from stages.device import compute_device
+from stages.effect_decisions import Decisions, photo_parts, read_decisions, told_by_neighbours
+from stages.files import read_json, read_scene
+from stages.train import Config, with_habits
+from stages.training_data import training_bank
+from stages.training_setup import field_background, make_trainer
+
+BUDGETS = (125, 250, 500, 1000)
+LONG_SIDE = 150  # pixels of the photos
+CHUNKS = 2
+SAMPLES = 1 << 12
+PROBE_RAYS = 2048
+PER_DOUBLING = 2  # measurements
+FIRST = 32  # steps
+MEAN_EVERY = 8  # steps
+MEANS = {"mean_10": 6.94}  # the exponent whose profile is 10 % of the run wide
+SCHEDULES = ("today", "late", "more")
+"""late: the rate is constant for three quarters of the steps and then falls; more: half of the steps as a run of their
+own, then the other half on top (`--more`)."""
+
+
+class Quiet:
+    """Says nothing."""
+
+    def update(self, message: str, done: float | None = None) -> None: ...
+
+    def note(self, message: str) -> None:
+        print(message)
+
+
+class Bench(NamedTuple):
+    """What all runs of one set share."""
+
+    config: Config
+    scene: Scene
+    decisions: Decisions
+    bank: RayBank
+    probe: Probe
+    neighbours: torch.Tensor
+
+
+def bench_of(workspace: Path) -> Bench:
+    """The photos, cameras and decisions of a workspace."""
+    keys = read_json(workspace / "run.json")["keys"]
+    ingest, normalise, effects = (workspace / s / keys[s][:16] for s in ("ingest", "normalise", "effects"))
+    scene, decisions = read_scene(normalise), read_decisions(effects)
+    longest = max(max(camera.width, camera.height) for camera in scene.cameras)
+    config = Config(
+        field="grid",
+        contracted=decisions.unbounded,
+        view_dependence=decisions.view_dependence,
+        backend=chosen_backend(compute_device(), Quiet()),
+        chunks=CHUNKS,
+        batch_samples=SAMPLES,
+        downscale=max(1.0, longest / LONG_SIDE),
+        levels=4,
+        log2_rows=15,
+        finest=256,
+    )
+    config = with_habits(config)
+    assert config.downscale is not None
+    train, test = (training_bank(ingest, scene, s, config.downscale, Quiet()) for s in ("train", "test"))
+    shown_over = torch.tensor(field_background(config, scene))
+    probe = make_probe(test, PROBE_RAYS, shown_over, seed=0)
+    return Bench(config, scene, decisions, train, probe, told_by_neighbours(scene, scene.of_split("test")))
+
+
+class RunningMean:
+    """A mean of the weights of which the last ones count most, over a constant share of the run."""
+
+    def __init__(self, trainer: FieldTrainer, exponent: float) -> None:
+        model = trainer.model
+        assert isinstance(model, GridField)
+        self.of, self.exponent = model, exponent
+        self.model = GridField(model.settings, 0, model.backend)
+
+    def add(self, step: int) -> None:
+        new = 1 - max(0.0, 1 - MEAN_EVERY / step) ** (self.exponent + 1)
+        for name, tensor in self.of.state_dict().items():
+            if name == "bits":
+                self.model.bits.copy_(tensor)
+            else:
+                self.model.state_dict()[name].lerp_(tensor, new)
+
+
+def share_of(step: int, steps: int, schedule: str) -> float:
+    """The share done before ``step`` by which the trainer takes its rate."""
+    if schedule == "late":
+        start = 0.75 * steps
+        constant = CONSTANT_SHARE * min(1, step / start)
+        return constant + (1 - CONSTANT_SHARE) * max(0.0, step - start) / (steps - start)
+    if schedule == "more":
+        return plan_of(steps // 2).extended(steps).share(step)
+    return plan_of(steps).share(step)
+
+
+def train_run(bench: Bench, seed: int, steps: int, schedule: str) -> dict[str, Any]:
+    """One run, measured at geometric steps."""
+    parts = photo_parts(bench.decisions, bench.scene.of_split("train"), bench.bank.device)
+    trainer = make_trainer(bench.config, bench.scene, bench.bank, seed, parts)
+    assert isinstance(trainer, GridTrainer)
+    means = {name: RunningMean(trainer, exponent) for name, exponent in MEANS.items()}
+    due = {round(steps / 2 ** (k / PER_DOUBLING)) for k in range(PER_DOUBLING * int(math.log2(steps / FIRST)) + 1)}
+    points, pace, rays = [], 0.0, 0
+    for step in range(steps):
+        result = trainer.step(step, share_of(step, steps, schedule))
+        pace += (result.psnr - pace) * max(1 / (step + 1), 0.02)
+        rays += result.rays
+        if (step + 1) % MEAN_EVERY == 0:
+            for mean in means.values():
+                mean.add(step + 1)
+        if step + 1 in due:
+            unseen = trainer.photo_colours.of_unseen(bench.neighbours)
+            models = {"heldout_psnr": trainer.model} | {name: mean.model for name, mean in means.items()}
+            psnr = {name: measure(model, bench.probe, unseen).psnr for name, model in models.items()}
+            points.append({"step": step + 1, "train_psnr": pace, **psnr})
+    return {"rays": rays, "pixels": bench.bank.drawable, "points": points}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("workspaces", type=Path, nargs="+")
+    parser.add_argument("--runs", type=Path, required=True)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1])
+    parser.add_argument("--steps", type=int, nargs="+", default=BUDGETS)
+    parser.add_argument("--schedule", choices=SCHEDULES, default="today")
+    given = parser.parse_args()
+    runs = json.loads(given.runs.read_text()) if given.runs.exists() else []
+    for workspace in given.workspaces:
+        bench = None
+        for seed, steps in product(given.seeds, given.steps):
+            run = {"set": workspace.stem, "seed": seed, "steps": steps, "schedule": given.schedule}
+            if any(run.items() <= made.items() for made in runs):
+                continue
+            bench = bench or bench_of(workspace)
+            load_backend(bench.config.backend or "warp", compute_device(), Quiet())
+            clock = time.process_time()
+            run |= train_run(bench, seed, steps, given.schedule)
+            last = run["points"][-1]
+            psnr = " ".join(f"{name} {last[name]:.2f}" for name in ("train_psnr", "heldout_psnr", *MEANS))
+            print(workspace.stem, seed, steps, given.schedule, psnr, f"{time.process_time() - clock:.0f} s", flush=True)
+            runs.append(run)
+            given.runs.write_text(json.dumps(runs))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,143 @@
+"""How well a run's own curve tells what twice the steps would give, from the file of benchmarks.budget_runs.
+
+python -m benchmarks.prediction runs.json
+
+Every case is a run of T steps and one of 2 T with the same seed: from the curve of the first alone it is predicted by
+how much the second ends higher, and the constants of the prediction are those of the other sets only. At the end: what
+nerf/learning_curve.py holds, and how curves compare across budgets and schedules.
+"""
+
+import argparse
+import json
+from itertools import pairwise
+from pathlib import Path
+from statistics import mean
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from nerf.learning_curve import Curve, last_doubling
+
+SHARE = 0.8  # of the truths that an interval is to hold
+MEASURED = ("heldout_psnr", "mean_10")
+Run = dict[str, Any]
+
+
+class Case(NamedTuple):
+    """What the shorter run's curve tells, and by how much the longer one ended higher."""
+
+    name: str
+    set: str
+    told: tuple[float, ...]
+    reached: float
+
+
+def curve_of(run: Run, measured: str = "heldout_psnr") -> Curve:
+    """(steps, dB): of a run on an idle machine steps and seconds differ by a factor."""
+    return [(float(point["step"]), point[measured]) for point in run["points"]]
+
+
+def final(run: Run) -> float:
+    return run["points"][-1]["heldout_psnr"]
+
+
+def cases_of(runs: list[Run]) -> list[Case]:
+    """Consecutive budgets of one set and seed under today's schedule."""
+    today = sorted(
+        (run for run in runs if run["schedule"] == "today"), key=lambda run: (run["set"], run["seed"], run["steps"])
+    )
+    cases = []
+    for short, long in pairwise(today):
+        if (short["set"], short["seed"], 2 * short["steps"]) != (long["set"], long["seed"], long["steps"]):
+            continue
+        last = last_doubling(curve_of(short))
+        assert last is not None, "runs are measured for more than a doubling"
+        gap = short["points"][-1]["train_psnr"] - final(short)
+        name = f"{short['set']} seed {short['seed']} {short['steps']} steps"
+        cases.append(Case(name, short["set"], (1.0, last, gap), final(long) - final(short)))
+    return cases
+
+
+def fitted(cases: list[Case], terms: list[int]) -> np.ndarray:
+    """Least squares on some of what is told."""
+    told = np.array([[case.told[i] for i in terms] for case in cases])
+    return np.linalg.lstsq(told, np.array([case.reached for case in cases]), rcond=None)[0]
+
+
+def predicted(case: Case, terms: list[int], constants: np.ndarray) -> float:
+    return float(np.array([case.told[i] for i in terms]) @ constants)
+
+
+def left_out(cases: list[Case], terms: list[int]) -> list[float]:
+    """Reached less predicted, of each case, by the constants of all other sets."""
+    residuals = []
+    for case in cases:
+        constants = fitted([other for other in cases if other.set != case.set], terms)
+        residuals.append(case.reached - predicted(case, terms, constants))
+    return residuals
+
+
+def half_width(cases: list[Case], terms: list[int]) -> float:
+    """Half the interval that holds SHARE of the truths, judged by sets that the constants do not come from."""
+    return float(np.quantile(np.abs(left_out(cases, terms)), SHARE))
+
+
+def score(cases: list[Case], terms: list[int]) -> list[tuple[Case, float, float]]:
+    """Each case with what is predicted of it and the half width, both without any run of its own set."""
+    rows = []
+    for case in cases:
+        others = [other for other in cases if other.set != case.set]
+        rows.append((case, predicted(case, terms, fitted(others, terms)), half_width(others, terms)))
+    return rows
+
+
+def print_scores(cases: list[Case]) -> None:
+    models = {"constant": [0], "share of the last": [1], "line in the last": [0, 1], "line, and the gap": [0, 1, 2]}
+    for name, terms in models.items():
+        rows = score(cases, terms)
+        covered = mean(abs(case.reached - guess) <= half for case, guess, half in rows)
+        rms = mean((case.reached - guess) ** 2 for case, guess, _ in rows) ** 0.5
+        print(f"{name:<18} rms {rms:.2f} dB, covered {covered:.0%}, half width {mean(r[2] for r in rows):.2f}")
+    terms = models["line in the last"]
+    print("\n| case | last doubling | predicted | reached | |\n|---|---|---|---|---|")
+    for case, guess, half in score(cases, terms):
+        inside = "" if abs(case.reached - guess) <= half else "outside"
+        print(f"| {case.name} | {case.told[1]:+.2f} | {guess:+.2f} ± {half:.2f} | {case.reached:+.2f} | {inside} |")
+    constants = ", ".join(f"{value:.3f}" for value in fitted(cases, terms))
+    print(f"\n{len(cases)} cases; of all of them: {constants}, ± {half_width(cases, terms):.2f}")
+
+
+def print_schedules(runs: list[Run]) -> None:
+    """What is measured on the way of a longer run, less what a run ended with that had so many steps only."""
+    ended = {(run["set"], run["seed"], run["steps"]): final(run) for run in runs if run["schedule"] == "today"}
+    for schedule in dict.fromkeys(run["schedule"] for run in runs):
+        of = [run for run in runs if run["schedule"] == schedule]
+        for measured in MEASURED:
+            for times in (2, 4, 8):
+                off = [
+                    dict(curve_of(run, measured))[run["steps"] / times] - short
+                    for run in of
+                    if (short := ended.get((run["set"], run["seed"], run["steps"] // times))) is not None
+                ]
+                if len(off) > 1:
+                    print(
+                        f"{schedule:<6} {measured:<12} at 1/{times}: {mean(off):+.2f} dB, spread {np.std(off):.2f}"
+                        f" ({len(off)} runs)"
+                    )
+        alike = [final(run) - ended[key] for run in of if (key := (run["set"], run["seed"], run["steps"])) in ended]
+        print(f"{schedule:<6} at the end, beside today's: {mean(alike):+.2f} dB ({len(alike)} runs)\n")
+    gained = [run["points"][-1]["mean_10"] - final(run) for run in runs]
+    print(f"the running mean at the end, beside the field: {mean(gained):+.2f} dB ({len(gained)} runs)")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("runs", type=Path)
+    runs = json.loads(parser.parse_args().runs.read_text())
+    print_scores(cases_of(runs))
+    print()
+    print_schedules(runs)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,62 @@
+"""What a curve of quality against training time tells: the last doubling of the time, the next one, the knee.
+
+A curve is a sequence of (seconds, dB), rising in seconds, of one run. Between its points quality is linear in the
+logarithm of time.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+Curve = Sequence[tuple[float, float]]
+
+KNEE_DB = 0.5
+"""A doubling of the time that buys less than this is past the knee: about the least that people see side by side."""
+
+
+class Gain(NamedTuple):
+    """Decibels, and half the width of the interval that holds the truth four times out of five."""
+
+    db: float
+    half_width: float
+
+
+def quality_at(curve: Curve, seconds: float) -> float:
+    """dB after so many seconds. Raises ValueError outside of the curve."""
+    if not curve or not curve[0][0] <= seconds <= curve[-1][0]:
+        raise ValueError(f"the curve has no point on both sides of {seconds:g} s")
+    after = next(index for index, (time, _) in enumerate(curve) if time >= seconds)
+    if curve[after][0] == seconds:
+        return curve[after][1]
+    (early, low), (late, high) = curve[after - 1], curve[after]
+    return low + (high - low) * math.log(seconds / early) / math.log(late / early)
+
+
+def last_doubling(curve: Curve) -> float | None:
+    """What the second half of the time bought, in dB; None where the curve does not reach back that far."""
+    if len(curve) < 2 or curve[0][0] > curve[-1][0] / 2:
+        return None
+    return curve[-1][1] - quality_at(curve, curve[-1][0] / 2)
+
+
+def knee(curve: Curve) -> float | None:
+    """The seconds from which on every doubling of the time bought less than KNEE_DB; None while doublings buy more, or
+    where the curve does not reach back far enough to tell."""
+    if last_doubling(curve) is None:
+        return None
+    half, found = curve[-1][0] / 2, None
+    for seconds in [half, *(time for time, _ in reversed(curve) if time < half)]:
+        if quality_at(curve, 2 * seconds) - quality_at(curve, seconds) >= KNEE_DB:
+            break
+        found = seconds
+    return found
+
+
+# Fitted by benchmarks.prediction (docs/numbers.md): placeholder until measured below.
+NEXT_FLAT_DB, NEXT_OF_LAST, NEXT_HALF_WIDTH = 0.0, 0.6, 0.5
+
+
+def next_doubling(curve: Curve) -> Gain | None:
+    """What training once more as long is predicted to buy."""
+    last = last_doubling(curve)
+    return None if last is None else Gain(NEXT_FLAT_DB + NEXT_OF_LAST * last, NEXT_HALF_WIDTH)

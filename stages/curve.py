@@ -1,0 +1,98 @@
+"""curve.json: quality against training time, and what it says in words.
+
+``{"device": "cpu" | "cuda", "threads", "points": [{"step", "seconds", "train_psnr", "heldout_psnr", "heldout_ssim"}
+…]}``; what cannot be measured is null. Seconds are those of training steps alone: measuring is not among them.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from stages.files import write_json
+from stages.live_line import duration
+
+BARS = "▁▂▃▄▅▆▇█"
+SPARK_WIDTH = 10
+
+
+def write_curve(folder: Path, points: list[dict[str, Any]]) -> None:
+    """Write curve.json of a run that ends on this machine."""
+    from stages.device import compute_device, cores
+
+    write_json(folder / "curve.json", {"device": compute_device(), "threads": cores(), "points": points})
+
+
+def heldout_curve(points: Sequence[dict[str, Any]]) -> list[tuple[float, float]]:
+    """(seconds, dB on held-out photos), as nerf/learning_curve.py reads it."""
+    known = ((point["seconds"], point["heldout_psnr"]) for point in points)
+    return [(seconds, psnr) for seconds, psnr in known if psnr is not None and seconds > 0]
+
+
+def doubling_words(points: Sequence[dict[str, Any]]) -> str | None:
+    """What the last doubling of the time bought and the next is predicted to buy; None where the curve is too short."""
+    from nerf.learning_curve import last_doubling, next_doubling
+
+    curve = heldout_curve(points)
+    last, coming = last_doubling(curve), next_doubling(curve)
+    if last is None:
+        return None
+    words = f"the last doubling of time, to {duration(curve[-1][0])}, bought {last:+.1f} dB on held-out photos"
+    if coming is None:
+        return words
+    return f"{words}; the next is predicted to buy {coming.db:+.1f} dB (± {coming.half_width:.1f})"
+
+
+def next_words(points: Sequence[dict[str, Any]]) -> str | None:
+    """:func:`doubling_words` for a line that has no room."""
+    from nerf.learning_curve import next_doubling
+
+    coming = next_doubling(heldout_curve(points))
+    return coming and f"the next doubling buys {coming.db:+.1f} ± {coming.half_width:.1f} dB"
+
+
+def target_words(target: float | None, reached: float | None, seconds: float) -> str | None:
+    """Whether a target was reached, and after how long; None where there was none."""
+    if target is None or reached is None:
+        return None
+    if reached >= target:
+        return f"{target:g} dB reached after {duration(seconds)}, on photos set aside"
+    return f"{target:g} dB not reached in {duration(seconds)}: {reached:.1f} on photos set aside"
+
+
+def knee_words(points: Sequence[dict[str, Any]]) -> str | None:
+    """Where the knee is, or that there is none; None where the curve is too short to tell."""
+    from nerf.learning_curve import KNEE_DB, knee, last_doubling
+
+    curve = heldout_curve(points)
+    if last_doubling(curve) is None:
+        return None
+    at = knee(curve)
+    if at is None:
+        return f"no knee yet: the last doubling bought more than {KNEE_DB:g} dB"
+    return f"the knee is at {duration(at)}: from there on a doubling bought less than {KNEE_DB:g} dB"
+
+
+def ssim_words(points: Sequence[dict[str, Any]]) -> str | None:
+    """SSIM at the end and half of the time before; None where it is not known."""
+    known = [(p["seconds"], p["heldout_ssim"]) for p in points if p["heldout_ssim"] is not None and p["seconds"] > 0]
+    if len(known) < 2 or known[0][0] > known[-1][0] / 2:
+        return None
+    from nerf.learning_curve import quality_at
+
+    return f"SSIM rose from {quality_at(known, known[-1][0] / 2):.2f} to {known[-1][1]:.2f} in that doubling"
+
+
+def sparkline(points: Sequence[dict[str, Any]]) -> str:
+    """Held-out PSNR from the first measurement to the last, even in log time; "" for fewer than three."""
+    from nerf.learning_curve import quality_at
+
+    curve = heldout_curve(points)
+    if len(curve) < 3:
+        return ""
+    first, ratio = curve[0][0], curve[-1][0] / curve[0][0]
+    times = [first * ratio ** (k / (SPARK_WIDTH - 1)) for k in range(SPARK_WIDTH)]
+    values = [quality_at(curve, min(time, curve[-1][0])) for time in times]
+    low, high = min(values), max(values)
+    if high == low:
+        return BARS[0] * SPARK_WIDTH
+    return "".join(BARS[round((value - low) / (high - low) * (len(BARS) - 1))] for value in values)

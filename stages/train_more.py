@@ -1,0 +1,77 @@
+"""Going on from the end of a finished training: with its settings, photos and cameras, for longer.
+
+A training is named ``<key>/<digest>``: the first 16 digits of its key, which name its folder in the workspace, and of
+the digest of its outputs. So the name says what was trained and not where it lies.
+"""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from stages.contract import Inputs, StageError
+from stages.files import read_json
+
+if TYPE_CHECKING:
+    from stages.train import Config
+    from stages.training_loop import Budget
+
+DIGITS = 16
+OWN = ("after", "more_steps", "more_seconds")
+# Replaced by the budget for more; or without influence on what is trained.
+FREE = (*OWN, "steps", "seconds", "preset", "checkpoint_seconds", "tensorboard")
+ANEW = "Give --train.seconds or --train.steps to train anew."
+
+
+def training_name(key: str, outputs_digest: str) -> str:
+    """The name of a finished training."""
+    return f"{key[:DIGITS]}/{outputs_digest[:DIGITS]}"
+
+
+def earlier_training(name: str, inputs: Inputs) -> Path:
+    """The folder of a finished training in the workspace of ``inputs``.
+
+    Raises StageError where it is gone, or has been made again and become another.
+    """
+    key, digest = name.split("/")
+    folder = inputs["effects"].parents[1] / "train" / key
+    what = "training cannot go on"
+    if not (folder / "manifest.json").is_file():
+        raise StageError(what, f"the training that it goes on from, {folder}, is gone", ANEW)
+    if not read_json(folder / "manifest.json")["outputs_digest"].startswith(digest):
+        raise StageError(what, f"{folder} was trained again since and is another field now", "Give --more again.")
+    return folder
+
+
+def continued(config: "Config", inputs: Inputs) -> "Config":
+    """The settings of the training that ``config`` goes on from, with the budget for more.
+
+    Raises StageError where the two do not go together: photos, cameras or settings have changed.
+    """
+    assert config.after is not None
+    manifest = read_json(earlier_training(config.after, inputs) / "manifest.json")
+    _same_inputs(manifest["inputs"], inputs)
+    settings: dict[str, Any] = manifest["config"]
+    given = {name: value for name, value in config.model_dump(mode="json").items() if value is not None}
+    free = {*FREE, "target_psnr"} if settings["target_psnr"] is not None else FREE
+    for name, value in given.items():
+        if name not in free and value != settings[name]:
+            why = f"{name} is {value} now and was {settings[name]}"
+            raise StageError("training cannot go on with other settings", why, ANEW)
+    own = {name: getattr(config, name) for name in (*OWN, "checkpoint_seconds", "tensorboard")}
+    target = {"target_psnr": config.target_psnr or settings["target_psnr"]}
+    return type(config).model_validate(settings | own | target)
+
+
+def _same_inputs(digests: dict[str, str], inputs: Inputs) -> None:
+    now = {stage: read_json(inputs[stage] / "manifest.json")["outputs_digest"] for stage in digests}
+    if changed := [stage for stage in digests if digests[stage] != now[stage]]:
+        why = f"what it was trained on has changed since: {', '.join(changed)}"
+        raise StageError("training cannot go on", why, ANEW)
+
+
+def budget_of(config: "Config", inputs: Inputs) -> "Budget":
+    """How long to train, and from where on."""
+    from stages.training_loop import Budget
+
+    if config.after is None:
+        return Budget(config.steps, config.seconds)
+    return Budget(config.more_steps, config.more_seconds, earlier_training(config.after, inputs))

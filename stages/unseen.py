@@ -1,0 +1,97 @@
+"""Photos that take no part in training, and what a field in training shows of them: a fixed handful of pixels."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from stages.contract import Progress, StageError
+from stages.image_metrics import ssim
+from stages.spread import spread
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from nerf.probe import Patches, Probe
+    from nerf.scene import Scene, Split
+    from nerf.training import FieldTrainer
+    from stages.train import Config
+
+PROBE_RAYS = 2048
+# SSIM looks at windows of 11 pixels. Many small squares tell more of the photos than a few large ones; together they
+# take twice the rays of the probe.
+PATCHES, PATCH_SIDE = 16, 16
+VALIDATION_EVERY = 8  # of the training photos one is set aside where a target decides when to stop,
+MOST_VALIDATION = 8  # but no more than these,
+FEWEST_LEFT = 4  # and with fewer left there is no target
+
+
+class Unseen(NamedTuple):
+    """Pixels and patches of some photos, and how much each training photo tells of each of these."""
+
+    probe: "Probe"
+    patches: "Patches"
+    neighbours: "Tensor"
+
+
+class Target(NamedTuple):
+    """PSNR (dB) to be reached on photos that decide nothing else."""
+
+    psnr: float
+    photos: Unseen
+
+
+class Look(NamedTuple):
+    """PSNR (dB) and SSIM; None where the photos are smaller than a window of SSIM, or masks leave no window."""
+
+    psnr: float
+    ssim: float | None
+
+
+def unseen_photos(
+    config: "Config", ingest: Path, scene: "Scene", split: "Split", device: str, progress: Progress
+) -> Unseen | None:
+    """Of the photos of a split; None where it has none. Always the same pixels for the same seed."""
+    import kornia.metrics  # noqa: F401 # takes seconds, which would count as the cost of the first measurement
+    import torch
+
+    from nerf.probe import make_patches, make_probe
+    from stages.effect_decisions import told_by_neighbours
+    from stages.training_data import training_bank
+    from stages.training_setup import field_background
+
+    if not scene.of_split(split):
+        return None
+    assert config.downscale is not None, "plan() chooses it"
+    bank = training_bank(ingest, scene, split, config.downscale, progress).to(device)
+    shown_over = torch.tensor(field_background(config, scene), device=device)
+    return Unseen(
+        make_probe(bank, PROBE_RAYS, shown_over, config.seed),
+        make_patches(bank, PATCHES, PATCH_SIDE, shown_over, config.seed),
+        told_by_neighbours(scene, scene.of_split(split)),
+    )
+
+
+def look(trainer: "FieldTrainer", unseen: Unseen) -> Look:
+    """How the field does on photos that it has never seen, exposed as their neighbours let expect."""
+    from nerf.probe import measure, pictures
+
+    as_expected = trainer.photo_colours.of_unseen(unseen.neighbours)
+    psnr = measure(trainer.model, unseen.probe, as_expected).psnr
+    rows = zip(*pictures(trainer.model, unseen.patches, as_expected), unseen.patches.used, strict=True)
+    known = [value for row in rows if (value := ssim(*(part.cpu() for part in row))) is not None]
+    return Look(psnr, sum(known) / len(known) if known else None)
+
+
+def with_validation(scene: "Scene") -> "Scene":
+    """``scene`` with every eighth training photo, at most MOST_VALIDATION, evenly spread, in the split "validation".
+
+    Raises StageError where too few would be left to train on.
+    """
+    train = scene.of_split("train")
+    count = min(MOST_VALIDATION, len(train) // VALIDATION_EVERY) or 1
+    if len(train) - count < FEWEST_LEFT:
+        why = f"photos to decide by have to be set aside, and of {len(train)} training photos too few would be left"
+        raise StageError("no target can be trained to", why, "Leave out --train.target-psnr.")
+    chosen = {train[i].name for i in spread(len(train), count)}
+    views = (replace(view, split="validation") if view.name in chosen else view for view in scene.views)
+    return replace(scene, views=tuple(views))

@@ -1,0 +1,62 @@
+"""What a curve of quality against time tells."""
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from nerf.learning_curve import KNEE_DB, knee, last_doubling, next_doubling, quality_at
+
+LATEST = 8.0
+
+
+def straight(per_doubling: float, doublings: int = 6) -> list[tuple[float, float]]:
+    """As much for every doubling."""
+    return [(2.0**k, 20 + per_doubling * k) for k in range(doublings + 1)]
+
+
+def saturating(first: float, doublings: int = 10) -> list[tuple[float, float]]:
+    """Every doubling buys half of what the one before did."""
+    return [(2.0**k, 30 - first * 2 * 0.5**k) for k in range(doublings + 1)]
+
+
+@given(st.floats(0.01, 3), st.floats(1, 64))
+def test_quality_is_straight_in_the_logarithm_of_time(per_doubling: float, seconds: float):
+    assert quality_at(straight(per_doubling), seconds) == pytest.approx(20 + per_doubling * math.log2(seconds))
+
+
+@pytest.mark.parametrize("seconds", [0.5, 65.0])
+def test_no_quality_beyond_the_curve(seconds: float):
+    with pytest.raises(ValueError, match="no point on both sides"):
+        quality_at(straight(1.0), seconds)
+
+
+@given(st.floats(-1, 3), st.floats(0.1, 100))
+def test_the_last_doubling_does_not_know_the_unit_of_time(per_doubling: float, unit: float):
+    curve = [(seconds * unit, db) for seconds, db in straight(per_doubling)]
+    assert last_doubling(curve) == pytest.approx(per_doubling)
+
+
+@pytest.mark.parametrize("curve", [[], [(1.0, 20.0)], [(1.0, 20.0), (1.9, 21.0)]])
+def test_a_short_curve_tells_nothing(curve: list[tuple[float, float]]):
+    assert last_doubling(curve) is None and next_doubling(curve) is None and knee(curve) is None
+
+
+def test_the_knee_is_where_doublings_begin_to_buy_little():
+    # 4, 2, 1, 0.5, 0.25 …: from 16 on less than half a decibel, at 8 just that much.
+    assert knee(saturating(4.0)) == 16.0
+
+
+@given(st.floats(KNEE_DB, 3))
+def test_no_knee_while_doublings_buy_much(per_doubling: float):
+    assert knee(straight(per_doubling * (1 + 1e-9))) is None
+
+
+def test_a_flat_curve_is_all_knee():
+    assert knee(straight(0.1)) == 1.0
+
+
+def test_a_late_rise_undoes_a_knee():
+    flat_then_steep = [(1.0, 20.0), (2.0, 20.1), (4.0, 20.2), (8.0, 22.0)]
+    assert knee(flat_then_steep) is None
