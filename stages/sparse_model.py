@@ -42,6 +42,27 @@ class SparseModel:
             cameras, images, np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0), none, none, np.zeros((0, 2))
         )
 
+    def without_points_behind(self) -> tuple["SparseModel", int]:
+        """This model without the observations whose point does not lie in front of its camera, and how many those are.
+        Points that nobody sees any more are left out, too."""
+        poses = np.array([image.sfm_from_camera for image in self.images]).reshape(-1, 3, 4)[self.view]
+        # Divided by the largest number first: products of places far from the origin are then numbers, too.
+        away = self.xyz[self.point] - poses[:, :, 3]
+        depth = np.einsum("ni,ni->n", away / max(np.abs(away).max(initial=0.0), np.finfo(float).tiny), poses[:, :, 2])
+        front = depth > 0
+        points, point = np.unique(self.point[front], return_inverse=True)
+        model = SparseModel(
+            self.cameras,
+            self.images,
+            self.xyz[points],
+            self.rgb[points],
+            self.error_px[points],
+            self.view[front],
+            point,
+            self.xy[front],
+        )
+        return model, int((~front).sum())
+
     def restricted(
         self,
         kept: Sequence[int],
