@@ -15,7 +15,9 @@ from nerf.up_vector import Up, find_up
 LEAST_HEADINGS = (0.3, 1e-6, 0.0)
 # Of the distance from the origin: what places differ by that are written with twelve digits, or rounded a few times.
 ONE_PLACE = 1e-12
-LEAST_HALF = 1e-30  # of the region in input units: what single-precision numbers, in which meshes are written, still tell apart
+LEAST_HALF = (
+    1e-30  # of the region in input units: what single-precision numbers, in which meshes are written, still tell apart
+)
 
 
 class Normalisation(NamedTuple):

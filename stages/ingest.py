@@ -21,7 +21,18 @@ from stages.ascii_names import ascii_files
 from stages.contract import Inputs, OptionalSourcePath, Progress, SourcePath, StageConfig, StageError, StageResult
 from stages.decoding import CameraKey, DecodeError, Place, decode
 from stages.files import write_png
-from stages.ingest_words import all_plain, all_the_same, facts, say, say_findings, say_masks, say_refused, shown, summary, too_few
+from stages.ingest_words import (
+    all_plain,
+    all_the_same,
+    facts,
+    say,
+    say_findings,
+    say_masks,
+    say_refused,
+    shown,
+    summary,
+    too_few,
+)
 from stages.masks import pair_masks, read_mask
 from stages.near_duplicates import near_duplicates, thumbnail
 from stages.photos import Photo, Refusal, write_photos

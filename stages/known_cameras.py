@@ -176,7 +176,9 @@ def _pose(matrix: Any, name: str) -> Float[np.ndarray, "3 4"]:
         raise _wrong(f"the transform_matrix of frame {name!r}", why)
     rotation = pose[:, :3]
     if not np.abs(rotation).max() <= LARGEST_ENTRY:
-        raise _wrong(f"the transform_matrix of frame {name!r}", f"it is no rotation: {np.abs(rotation).max():.3g} is in it")
+        raise _wrong(
+            f"the transform_matrix of frame {name!r}", f"it is no rotation: {np.abs(rotation).max():.3g} is in it"
+        )
     if (determinant := np.linalg.det(rotation)) < 0:
         raise _wrong(f"the transform_matrix of frame {name!r}", "it mirrors (its determinant is negative)")
     off = np.abs(rotation.T @ rotation - np.eye(3)).max()

@@ -106,7 +106,7 @@ def path_from_file(scene: "Scene", file: Path) -> CameraPath:
         try:
             cameras.append(_camera(content | frame, usual))
             poses.append(_in_scene(frame["transform_matrix"], scene.scene_from_sfm))
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:
             hint = "Give numbers as output/transforms.json and output/path.json have them."
             raise StageError(f"cannot use frame {index} of {file.name}", str(error), hint) from error
     if len({(camera.width, camera.height) for camera in cameras}) > 1:

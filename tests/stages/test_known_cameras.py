@@ -117,8 +117,8 @@ def _with(row: int, column: int, value: float) -> list[list[float]]:
         ({"transform_matrix": (matrix(1) @ np.diag([-1, 1, 1, 1])).tolist()}, r"frame './1': it mirrors"),
         ({"transform_matrix": (matrix(1) @ np.diag([2, 2, 2, 1])).tolist()}, r"no rotation: .* it scales by 2\."),
         ({"transform_matrix": np.zeros((4, 4)).tolist()}, r"no rotation: RᵀR is off by 1, and it scales by 0\."),
-        ({"fl_x": 0}, r"focal length of frame './1': in pixels it comes to 0 × 52"),
-        ({"fl_x": -50}, r"focal length of frame './1': in pixels it comes to -50 × 52"),
+        ({"fl_x": 0}, r"camera of './1': a focal length of 0 × 52 pixels is not one for a picture of 60×40"),
+        ({"fl_x": -50}, r"camera of './1': a focal length of -50 × 52 pixels is not one"),
         ({"fl_x": math.nan}, r"fl_x of frame './1': it is nan, not a finite number"),
         ({"cx": "31"}, r"cx of frame './1': it is '31', not a finite number"),
         ({"k1": True}, r"k1 of frame './1': it is True, not a finite number"),
@@ -134,7 +134,7 @@ def test_what_is_no_camera_is_refused_by_name(read, changes: dict[str, Any], mes
 
 
 def test_no_focal_length_at_all_is_refused(read) -> None:
-    with pytest.raises(StageError, match=r"focal length of frame './0': in pixels it comes to 0 × 0"):
+    with pytest.raises(StageError, match=r"camera of './0': a focal length of 0 × 0 pixels is not one"):
         read([frame(0)])
 
 
