@@ -79,8 +79,8 @@ def _check_extent(sfm: Reconstruction, middle: Float[np.ndarray, "3"]) -> None:
     extent, distance = np.abs(places - middle).max(), np.abs(places).max()
     if 0 < extent <= ONE_PLACE * distance:
         raise ValueError(
-            f"it is {extent:.2g} units large and {distance:.2g} from the origin, too far for numbers of 16 digits to tell "
-            "its parts from one another"
+            f"all its places are within {extent:.2g} units, {distance:.2g} from the origin: one place, as far as "
+            "numbers of 16 digits can tell"
         )
 
 

@@ -16,6 +16,7 @@ from jaxtyping import Float
 
 from nerf.scene import Camera
 from stages.colmap.cameras import focal_lengths_and_centre, rescaled
+from stages.colmap.model_files import FARTHEST, LARGEST_SIDE
 from stages.colmap.models import read_model
 from stages.contract import StageError
 from stages.photos import Photo
@@ -28,7 +29,6 @@ ASPECT_WITHIN = 0.01
 # Focal lengths in widths of the picture: from 179° across to 20 seconds of arc, a telescope's.
 FOCAL_RATIOS = (0.005, 10_000.0)
 FARTHEST_CENTRE = 100.0  # in widths: where the principal point of the last corner cut out of a large picture may lie
-FARTHEST_PLACE = 1e30  # of a camera: what single-precision numbers, which meshes are written in, hold squared and all
 LARGEST_ENTRY = 1e6  # of a matrix that is looked at more closely: products of three of them are numbers
 MOST_NAMES = 5
 MOST_LETTERS = 40  # of a value, in an error
@@ -127,7 +127,7 @@ def _camera(values: Mapping[str, Any], photo: Photo) -> Camera:
         return _finite(values.get(key, default), f"{key} of frame {name!r}")
 
     width, height = number("w", photo.width), number("h", photo.height)
-    if not (width >= 1 and height >= 1 and width.is_integer() and height.is_integer()):
+    if not all(1 <= side <= LARGEST_SIDE and side.is_integer() for side in (width, height)):
         raise _wrong(f"the size of frame {name!r}", f"w and h are {width:g} and {height:g}")
     fx = number("fl_x", _focal_of(values.get("camera_angle_x"), width, name))
     fy = number("fl_y", _focal_of(values.get("camera_angle_y"), height, name) or fx)
@@ -171,8 +171,8 @@ def _pose(matrix: Any, name: str) -> Float[np.ndarray, "3 4"]:
         raise _wrong(f"the transform_matrix of frame {name!r}", "it is not a matrix of numbers") from error
     if pose.shape != (3, 4) or not np.isfinite(pose).all():
         raise _wrong(f"the transform_matrix of frame {name!r}", "it is not 4 × 4 (or 3 × 4) finite numbers")
-    if (place := np.abs(pose[:, 3]).max()) > FARTHEST_PLACE:
-        why = f"its place is {place:.3g} units from the origin, and the most is {FARTHEST_PLACE:g}"
+    if (place := np.abs(pose[:, 3]).max()) > FARTHEST:
+        why = f"its place is {place:.3g} units from the origin, and the most is {FARTHEST:g}"
         raise _wrong(f"the transform_matrix of frame {name!r}", why)
     rotation = pose[:, :3]
     if not np.abs(rotation).max() <= LARGEST_ENTRY:
@@ -248,8 +248,6 @@ def _by_name(names: Sequence[str], photos: Sequence[Photo]) -> dict[int, Photo]:
 def _checked(given: SparseModel, index: int, photo: Photo) -> Camera:
     image = given.images[index]
     camera = given.cameras[image.camera]
-    if not np.abs(image.sfm_from_camera[:, 3]).max() <= FARTHEST_PLACE:
-        raise _wrong(f"the camera of {image.file}", f"its place is more than {FARTHEST_PLACE:g} units from the origin")
     return _at_size_of(photo, camera, image.file)
 
 

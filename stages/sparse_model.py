@@ -8,6 +8,8 @@ from jaxtyping import Float, Int, UInt8
 
 from nerf.scene import Camera
 
+EDGE_ON = 1e-6  # of its distance: a point less deep than this is beside the camera, where no lens looks
+
 
 @dataclass(frozen=True)
 class SparseImage:
@@ -46,10 +48,9 @@ class SparseModel:
         """This model without the observations whose point does not lie in front of its camera, and how many those are.
         Points that nobody sees any more are left out, too."""
         poses = np.array([image.sfm_from_camera for image in self.images]).reshape(-1, 3, 4)[self.view]
-        # Divided by the largest number first: products of places far from the origin are then numbers, too.
         away = self.xyz[self.point] - poses[:, :, 3]
-        depth = np.einsum("ni,ni->n", away / max(np.abs(away).max(initial=0.0), np.finfo(float).tiny), poses[:, :, 2])
-        front = depth > 0
+        depth = np.einsum("ni,ni->n", away, poses[:, :, 2])
+        front = depth > EDGE_ON * np.linalg.norm(away, axis=1)
         points, point = np.unique(self.point[front], return_inverse=True)
         model = SparseModel(
             self.cameras,

@@ -1,8 +1,8 @@
-"""The files of a COLMAP model, binary or text, read without COLMAP, whose own reader believes what it reads: a count that
-was damaged makes it allocate until the machine is full, loop without end, or abort the process.
+"""The files of a COLMAP model, binary or text, read without COLMAP.
 
-https://colmap.github.io/format.html. Only cameras, images and points3D are read: what rigs and frames say of poses is in
-images, too, and tracks are what images say of their points.
+COLMAP's own reader believes what it reads: a count that was damaged makes it allocate until the machine is full, loop
+without end, or abort the process. https://colmap.github.io/format.html. Only cameras, images and points3D are read:
+what rigs and frames say of poses is in images, too, and tracks are what images say of their points.
 """
 
 import struct
@@ -39,12 +39,13 @@ CAMERA_MODELS = {
 }
 PARAMETERS = dict(CAMERA_MODELS.values())
 LARGEST_SIDE = 2**31 - 1
+FARTHEST = 1e30  # of anything, in its units: squares and products of three such numbers are numbers, too
 NO_POINT = -1
 
 
 class FileImage(NamedTuple):
-    """An image as it is in the file: ``pose`` is (qw, qx, qy, qz, tx, ty, tz) of camera_from_world, ``points`` the id of
-    each of its keypoints' point, NO_POINT where it has none."""
+    """An image as it is in the file: ``pose`` is (qw, qx, qy, qz, tx, ty, tz) of camera_from_world, ``points`` the id
+    of each of its keypoints' point, NO_POINT where it has none."""
 
     name: str
     camera: int
@@ -70,8 +71,8 @@ class ModelFiles(NamedTuple):
 
 
 def read_model_files(folder: Path) -> ModelFiles:
-    """The model in ``folder``, checked to be one: every number finite, every id there once, every image with a camera and
-    points that exist. Raises OSError, and ValueError with the reason, which names the file."""
+    """The model in ``folder``, checked to be one: places somewhere, every id there once, every image with a camera and
+    points that exist. Raises OSError, and ValueError or OverflowError with the reason."""
     binary = (folder / "cameras.bin").is_file()
     readers = (
         {"cameras": _binary_cameras, "images": _binary_images, "points3D": _binary_points}
@@ -107,15 +108,15 @@ def _check(model: ModelFiles) -> None:
     for image in model.images.values():
         if image.camera not in model.cameras:
             raise ValueError(f"image {image.name} is of camera {image.camera}, which is not there")
-        if not (np.isfinite(image.pose).all() and image.pose[:4].any()):
+        if not (np.isfinite(image.pose).all() and image.pose[:4].any() and np.abs(image.pose[4:]).max() <= FARTHEST):
             raise ValueError(f"image {image.name} has no pose: {', '.join(f'{v:.6g}' for v in image.pose)}")
         seen = image.points != NO_POINT
-        if not np.isfinite(image.xy[seen]).all():
-            raise ValueError(f"image {image.name} has keypoints that are not finite")
+        if not (np.abs(image.xy[seen]) <= FARTHEST).all():
+            raise ValueError(f"image {image.name} has keypoints that are nowhere")
         if (unknown := ~np.isin(image.points, ids) & seen).any():
             raise ValueError(f"image {image.name} sees point {image.points[unknown][0]}, which is not there")
     for number, point in model.points.items():
-        if not np.isfinite(point.xyz).all():
+        if not (np.abs(point.xyz) <= FARTHEST).all():
             raise ValueError(f"point {number} is nowhere: {', '.join(f'{v:.6g}' for v in point.xyz)}")
 
 

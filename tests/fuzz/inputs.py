@@ -1,4 +1,4 @@
-"""What strangers' files may hold: valid ones with edits, and JSON trees. Every strategy shrinks towards the valid file."""
+"""What strangers' files may hold: valid ones with edits, and JSON trees; all shrink towards the valid file."""
 
 import json
 import struct

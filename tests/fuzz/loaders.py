@@ -1,7 +1,7 @@
 """Every loader of files that strangers may have made: what it is given, and how it is called.
 
-A loader may answer, or refuse in words (``REFUSALS``). Anything else that it raises, and any case in which it takes
-longer than ``SECONDS``, is a defect.
+A loader may answer, or refuse in words (``REFUSALS``). Anything else that it raises is a defect, and so is a case that
+takes more than ``SECONDS`` of processor time.
 """
 
 import hashlib
