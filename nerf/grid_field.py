@@ -24,6 +24,11 @@ from nerf.rays import Rays
 from nerf.waves import HIDDEN_BEHIND, Wave, front_to_back, packed
 
 INITIAL_FEATURE = 1e-4
+# Far beyond any use: no loop over them is endless, and indices stay within 32 bits.
+LARGEST = {"levels": 64, "features": 256, "log2_rows": 30, "finest": 2**20, "cache_cells": 1024} | {
+    "steps": 10**6,
+    "most_samples": 10**6,
+}
 
 
 @dataclass(frozen=True)
@@ -52,10 +57,13 @@ class GridSettings:
         for name, least in (at_least | {"finest": self.coarsest, "cache_cells": 4}).items():
             if getattr(self, name) < least:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be at least {least}")
+        for name, most in LARGEST.items():
+            if getattr(self, name) > most:
+                raise ValueError(f"{name} is {getattr(self, name)}; it must be at most {most}")
         if self.cache_cells % 4:
             raise ValueError(f"cache_cells is {self.cache_cells}; it must be a multiple of 4")
-        if not (self.shortest_step > 0 and self.cone > 0):
-            raise ValueError(f"shortest_step ({self.shortest_step}) and cone ({self.cone}) must be positive")
+        if not (0 < self.shortest_step < math.inf and 0 < self.cone < math.inf):
+            raise ValueError(f"shortest_step ({self.shortest_step}) and cone ({self.cone}) must be positive numbers")
 
     @property
     def layout(self) -> GridLayout:

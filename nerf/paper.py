@@ -44,6 +44,9 @@ def shifted_softplus(raw: Float[Tensor, "*points"]) -> Float[Tensor, "*points"]:
     return functional.softplus(raw + SOFTPLUS_SHIFT, threshold=40)
 
 
+LARGEST = 10_000  # of any size of these networks: far beyond any use, and no loop over it is endless
+
+
 @dataclass(frozen=True)
 class PaperSettings:
     """Sizes and variants; the defaults are the published model. Raises ValueError on impossible values.
@@ -72,6 +75,8 @@ class PaperSettings:
         for name, least in (at_least | {"samples_coarse": 2, "samples_fine": 1}).items():
             if getattr(self, name) < least:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be at least {least}")
+            if getattr(self, name) > LARGEST:
+                raise ValueError(f"{name} is {getattr(self, name)}; it must be at most {LARGEST}")
         if self.spacing not in get_args(Spacing):
             raise ValueError(f"spacing is {self.spacing!r}; it must be 'linear' or 'log'")
         if self.density_activation not in ("softplus", "relu"):

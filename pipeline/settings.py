@@ -24,6 +24,7 @@ from stages.train import Config as TrainConfig
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
 
+MOST_WRONG, MOST_LETTERS = 10, 100  # options in one error, and letters of a name or value in it
 Options = TypeVar("Options", bound=BaseModel)
 
 
@@ -68,7 +69,13 @@ def settings_from(values: Mapping[str, Any], origin: str) -> Settings:
 
 def wrong_options(error: ValidationError, *parents: str) -> str:
     """Every wrong option below ``parents`` with what it must be: ``train.steps 0 must be at least 1; …``."""
-    return "; ".join(_wrong_option(".".join([*parents, *map(str, e["loc"])]), e) for e in error.errors())
+    wrong = [_wrong_option(_short(".".join([*parents, *map(str, e["loc"])])), e) for e in error.errors()]
+    more = f"; and {len(wrong) - MOST_WRONG} more" if len(wrong) > MOST_WRONG else ""
+    return "; ".join(wrong[:MOST_WRONG]) + more
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= MOST_LETTERS else f"{text[:MOST_LETTERS]}…"
 
 
 def _wrong_option(name: str, problem: "ErrorDetails") -> str:
@@ -80,7 +87,7 @@ def _wrong_option(name: str, problem: "ErrorDetails") -> str:
     must = problem["msg"].removeprefix("Input should ")
     for long, short in (("greater than or equal to", "at least"), ("less than or equal to", "at most")):
         must = must.replace(long, short)
-    return f"{name} {problem['input']} must {must}"
+    return f"{name} {_short(str(problem['input']))} must {must}"
 
 
 def with_effects(settings: Options, choices: Sequence[str]) -> Options:

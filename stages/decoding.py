@@ -197,7 +197,10 @@ def _what_is_missing(image: Any, error: OSError) -> str:
     if image.format not in ("JPEG", "MPO", "PNG"):
         return f"{word}: {error}"
     image.tile = []  # what is there is all there is: do not try again
-    rows = np.asarray(image).reshape(image.height, -1).any(axis=1)
+    try:
+        rows = np.asarray(image).reshape(image.height, -1).any(axis=1)
+    except OSError:  # the decoder refused before there were any pixels
+        return f"{word}: {error}"
     missing = 1 - (np.flatnonzero(rows)[-1] + 1) / image.height if rows.any() else 1.0
     return f"{word}: {100 * missing:.0f} % of the picture is missing" if missing >= 0.005 else f"{word}: {error}"
 

@@ -1,12 +1,12 @@
 """The photos as ingest left them: what photos.json says of each, and their pixels at any size."""
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from stages.contract import StageError
-from stages.files import read_json, write_json
+from stages.files import damaged, read_dataclass, write_json
 
 if TYPE_CHECKING:
     import numpy as np
@@ -68,15 +68,29 @@ def write_photos(folder: Path, photos: Sequence[Photo], refused: Sequence[Refusa
 
 def read_photos(ingest_folder: Path) -> list[Photo]:
     """The photos of a finished ingest, in order of their names. Raises StageError if photos.json is damaged."""
-    try:
-        return [Photo(**photo) for photo in read_json(ingest_folder / "photos.json")["photos"]]
-    except (KeyError, TypeError) as error:
-        raise StageError("cannot read photos.json", str(error), "Delete its folder and run again.") from error
+    photos = _read(ingest_folder).photos
+    for file in (file for photo in photos for file in (photo.file, photo.mask) if file is not None):
+        if not re.fullmatch(r"(images|masks)(/[\w-][\w.-]*)+", file, re.ASCII):
+            raise damaged("photos.json", f"{file[:40]!r} is no file of this folder")
+    return photos
 
 
 def read_frame_names(ingest_folder: Path) -> dict[str, str]:
     """Photo name by file_path as the given transforms file spells it; empty if no cameras were given."""
-    return read_json(ingest_folder / "photos.json")["frames"]
+    return _read(ingest_folder).frames
+
+
+@dataclass(frozen=True)
+class _PhotosFile:
+    """photos.json."""
+
+    photos: list[Photo]
+    refused: list[Refusal]
+    frames: dict[str, str]
+
+
+def _read(ingest_folder: Path) -> _PhotosFile:
+    return read_dataclass(ingest_folder / "photos.json", _PhotosFile)
 
 
 def load_pixels(path: Path, width: int, height: int) -> "np.ndarray":

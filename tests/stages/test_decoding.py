@@ -239,6 +239,15 @@ def test_only_the_first_frame_counts(tmp_path: Path) -> None:
     assert (decoded.suffix, decoded.notes) == (None, ("first of 2 frames",))
 
 
+def test_a_jpeg_that_its_decoder_refuses_is_refused_in_words(tmp_path: Path) -> None:
+    """Without a pixel decoded, there is no share of the picture that could be missing."""
+    content = bytearray(saved(tmp_path / "a.jpg", Image.fromarray(smooth())).read_bytes())
+    for damage in (0x55, 0x00):
+        content[content.index(b"\xff\xc0") + 11] = damage  # a component's sampling factors
+        (tmp_path / "a.jpg").write_bytes(content)
+        assert reason(tmp_path / "a.jpg").startswith("damaged: ")
+
+
 def test_a_truncated_jpeg_says_how_much_is_missing(tmp_path: Path) -> None:
     data = io.BytesIO()
     rng = np.random.default_rng(0)
