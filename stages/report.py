@@ -14,6 +14,7 @@ from pydantic import Field
 from stages.contract import Inputs, Progress, StageConfig, StageResult
 from stages.files import read_json, read_scene, read_tensors, write_json
 from stages.live_line import duration, short_count
+from stages.training_parts import PARTS_FILE
 
 if TYPE_CHECKING:
     from nerf.scene import Scene
@@ -46,6 +47,7 @@ class Results:
     effects: dict[str, Any] | None
     field: dict[str, Any] | None
     curve: list[dict[str, Any]]
+    parts: dict[str, Any] | None
     metrics: dict[str, Any] | None
 
 
@@ -75,6 +77,7 @@ def read_results(inputs: Inputs) -> Results:
         effects=of("effects", "effects.json"),
         field=of("train", "field.json"),
         curve=of("train", "curve.json") or [],
+        parts=of("train", PARTS_FILE) if "train" in inputs and (inputs["train"] / PARTS_FILE).exists() else None,
         metrics=of("evaluate", "metrics.json"),
     )
 
@@ -89,6 +92,8 @@ def summarise(results: Results) -> dict[str, Any]:
         "field": results.field["kind"] if results.field else None,
         "train_seconds": manifests["train"]["facts"]["train_seconds"] if "train" in manifests else None,
         "total_seconds": round(sum(manifest["seconds"] for manifest in manifests.values()), 3),
+        "stage_seconds": {stage: manifest["seconds"] for stage, manifest in manifests.items()},
+        "training_parts": results.parts,
         **{key: metrics.get(key) for key in ("psnr", "ssim", "psnr_mean_image", "psnr_nearest_view")},
         "mesh": mesh and {key: mesh[key] for key in ("vertices", "faces", "watertight")},
         "verdict": metrics.get("verdict", "Not measured: stage evaluate has not run."),
@@ -100,6 +105,7 @@ def page(results: Results, summary: dict[str, Any], config: Config) -> str:
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     from stages.report_effects import effects_table
+    from stages.report_parts import parts_bar
 
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent),
@@ -124,6 +130,7 @@ def page(results: Results, summary: dict[str, Any], config: Config) -> str:
         video=_video(results.inputs, config.video_limit_mb),
         compared=_compared(results),
         curve=_curve(results),
+        parts=parts_bar(results.parts),
         effects=effects_table(results.effects),
         cameras=_cameras(results),
         mesh_preview=_mesh_preview(results.inputs),

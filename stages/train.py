@@ -212,6 +212,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     """
     from stages.effect_decisions import learnt_of_photos
     from stages.field_files import save_field
+    from stages.training_parts import write_parts
     from stages.training_setup import field_background, prepare
 
     config, scene = plan(config, inputs, progress), read_scene(inputs["normalise"])
@@ -222,10 +223,13 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     info |= learnt_of_photos(training.trainer, scene.of_split("train"))
     save_field(folder, training.trainer.model, info)
     write_json(folder / "curve.json", training.state.curve)
-    return _result(config, training, folder)
+    progress.update("measuring what this machine can do")
+    device = training.probes.train.colours.device
+    parts = write_parts(folder, training.state.timings, training.trainer.model, device)
+    return _result(config, training, folder, parts)
 
 
-def _result(config: Config, training: "TrainingRun", folder: Path) -> StageResult:
+def _result(config: Config, training: "TrainingRun", folder: Path, parts: list[str]) -> StageResult:
     state, last = training.state, training.state.curve[-1]
     speed = state.rays / state.seconds
     heldout = last["heldout_psnr"]
@@ -245,5 +249,5 @@ def _result(config: Config, training: "TrainingRun", folder: Path) -> StageResul
         "restarts": state.restarts,
         "rollbacks": state.rollbacks,
     }
-    records = ("curve.json", "log.jsonl", "plan.json", *left_behind, *board)
+    records = ("curve.json", "log.jsonl", "plan.json", *parts, *left_behind, *board)
     return StageResult(("field.safetensors", "field.json"), line, records, facts)

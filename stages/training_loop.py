@@ -13,6 +13,7 @@ import shutil
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -20,6 +21,7 @@ from stages.checkpoints import Checkpoint, latest_checkpoint, save_checkpoint
 from stages.contract import Progress, StageError
 from stages.files import read_json, write_durably
 from stages.live_line import live_line, short_count
+from stages.training_parts import observed
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -67,6 +69,7 @@ class RunState:
     restarts: int = 0
     rollbacks: int = 0
     curve: list[dict[str, Any]] = field(default_factory=list)
+    timings: dict[str, Any] = field(default_factory=dict)
 
 
 class Pace:
@@ -166,7 +169,9 @@ class TrainingRun:
 
     def _take_step(self) -> None:
         started = time.perf_counter()
-        result = self.trainer.step(self.state.step, self.plan.share(self.state.step), 0.5**self.state.rollbacks)
+        share, scale = self.plan.share(self.state.step), 0.5**self.state.rollbacks
+        take = partial(self.trainer.step, self.state.step, share, scale)
+        result = observed(take, self.state.step, self.state.timings, self.probes.train.colours.device)
         seconds = time.perf_counter() - started
         self.state.step += 1
         self.state.seconds += seconds
