@@ -21,7 +21,7 @@ from nerf.randomness import generator
 from nerf.ray_bank import RayBank
 from nerf.rays import Rays
 from nerf.stopwatch import Work, part
-from nerf.training import NonFinite, StepResult
+from nerf.training import RAYS, NonFinite, StepResult, all_finite
 
 WARM_UP_STEPS = 20
 CONSTANT_SHARE = 0.2  # of the run, before the rate begins to fall
@@ -179,7 +179,10 @@ class GridTrainer:
         """What a chunk of so many rays adds to loss and gradients."""
         with part("batch"):
             batch = self._batch(step, chunk, rays)
-        done = self.model.forward(self.photo_rays.forward(batch.rays, batch.view), batch.jitter, batch.background)
+            seen_along = self.photo_rays.forward(batch.rays, batch.view)
+            if not all_finite(seen_along):
+                raise NonFinite(RAYS, step, _whole([batch]))
+        done = self.model.forward(seen_along, batch.jitter, batch.background)
         spread_weight = self.settings.distortion * distortion_factor(share)
         with part("composite"):
             loss = self._loss(rays * self.settings.chunks, spread_weight, done, batch)

@@ -80,6 +80,15 @@ class NonFinite(Exception):
         self.quantity, self.step, self.batch = quantity, step, batch
 
 
+RAYS = "geometry of rays"
+
+
+def all_finite(rays: Rays) -> bool:
+    """Whether samples can be placed on all of them. What is no number would drop out of the comparisons that cut a ray
+    to a box, and the ray would count as one that meets nothing."""
+    return bool(torch.cat([each.flatten() for each in rays]).isfinite().all())
+
+
 @dataclass(frozen=True)
 class TrainerSettings:
     """How to train. ``background`` is what lies behind the scene: a colour, or another random one each step
@@ -180,7 +189,10 @@ class PaperTrainer:
         size = CHUNK_RAYS.get(self.bank.device.type, self.settings.batch_rays)
         rays, target, view, background = batch.part(slice(start, start + size))
         random = generator(self.bank.device, self.settings.seed, step, 1 + start)
-        coarse, fine = self.model.render_training(self.photo_rays.forward(rays, view), background, random)
+        seen_along = self.photo_rays.forward(rays, view)
+        if not all_finite(seen_along):
+            raise NonFinite(RAYS, step, _tensors_of(batch))
+        coarse, fine = self.model.render_training(seen_along, background, random)
 
         def squared_error(rendering: Rendering) -> Float[Tensor, ""]:
             residual = self.photo_colours.residual(Seen(rendering, background, view), target)
@@ -195,24 +207,28 @@ class PaperTrainer:
 
     def state(self) -> dict[str, Tensor]:
         """Weights as ``model.<name>``, what is learnt of photos as ``photo.<name>``, Adam's moments and step counts as
-        ``adam.<parameter>.<name>``."""
-        tensors = {f"model.{name}": tensor for name, tensor in self.model.state_dict().items()}
+        ``adam.<parameter>.<name>``, and the field's settings, to know it by."""
+        tensors = {"settings": torch.frombuffer(bytearray(repr(self.model.settings).encode()), dtype=torch.uint8)}
+        tensors |= {f"model.{name}": tensor for name, tensor in self.model.state_dict().items()}
         tensors |= {f"photo.{name}": tensor.detach() for name, tensor in self.photo_parameters.items()}
         for index, moments in self.optimiser.state_dict()["state"].items():
             tensors |= {f"adam.{index}.{name}": tensor for name, tensor in moments.items()}
         return tensors
 
     def load_state(self, state: dict[str, Tensor]) -> None:
-        """Go back to what :meth:`state` gave. Raises RuntimeError for the state of another architecture."""
+        """Go back to what :meth:`state` gave. Raises RuntimeError for the state of another field."""
+        mine = self.state()["settings"]
+        if "settings" not in state or not torch.equal(state["settings"].cpu(), mine):
+            raise RuntimeError("this state belongs to another field: settings differ")
         weights: dict[str, Tensor] = {}
         moments: dict[int, dict[str, Tensor]] = {}
         for key, tensor in state.items():
-            kind, name = key.split(".", 1)
+            kind, _, name = key.partition(".")
             if kind == "model":
                 weights[name] = tensor
             elif kind == "photo":
                 self.photo_parameters[name].detach().copy_(tensor)
-            else:
+            elif kind == "adam":
                 index, name = name.split(".")
                 moments.setdefault(int(index), {})[name] = tensor.clone()
         self.model.load_state_dict(weights)

@@ -235,6 +235,8 @@ def _result(config: Config, training: "TrainingRun", folder: Path, parts: list[s
     heldout = last["heldout_psnr"]
     quality = "no photos held out" if heldout is None else f"held out {heldout:.1f} dB"
     line = f"{state.seconds:.0f} s · {short_count(state.step)} steps · {short_count(speed)} rays/s · {quality}"
+    if state.symptom is not None:
+        line += f" · of no use yet: {state.symptom}"
     left_behind = sorted(path.name for path in folder.glob("nonfinite_*.safetensors"))
     board = ["tensorboard"] if config.tensorboard else []
     facts = {
@@ -248,6 +250,7 @@ def _result(config: Config, training: "TrainingRun", folder: Path, parts: list[s
         "downscale": config.downscale,
         "restarts": state.restarts,
         "rollbacks": state.rollbacks,
+        "symptom": state.symptom,
     }
     records = ("curve.json", "log.jsonl", "plan.json", *parts, *left_behind, *board)
     return StageResult(("field.safetensors", "field.json"), line, records, facts)

@@ -4,7 +4,9 @@ What can happen to a run, and what the loop does:
 
 * killed: goes on from the last good checkpoint; the journal of step plans gives every step its old learning rate;
 * a loss or gradient stops being finite: the batch is kept, the state rolled back and the rate halved, three times;
-* the field is dead after the warm-up (empty, or no better than one flat colour): another seed, twice at most.
+* the field is dead after the warm-up (empty, or no better than one flat colour): another seed, twice at most;
+* it is so later, or at the end: back to the last checkpoint, like after a loss that is not finite. A run that ends
+  within the warm-up is too short to judge: it ends, and says aloud what is wrong with it.
 """
 
 import json
@@ -19,6 +21,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from stages.checkpoints import Checkpoint, latest_checkpoint, save_checkpoint
 from stages.contract import Progress, StageError
+from stages.examination import Lost, is_suspicious, not_finite, symptom_of
 from stages.files import read_json, write_durably
 from stages.live_line import live_line, short_count
 from stages.training_parts import observed
@@ -34,7 +37,6 @@ if TYPE_CHECKING:
 MOST_ROLLBACKS = 3
 MOST_RESTARTS = 2
 WARM_UP_STEPS = 500  # after these a field is examined; a healthy one beats a flat colour long before
-EMPTY_OPACITY = 1e-3  # a field whose mean opacity is below this shows nothing but background
 FIRST_MEASUREMENT = 2.0  # training seconds; the next ones follow at 1.5 times that, and so on
 MEASUREMENT_GROWTH = 1.5
 MOST_MEASURING = 0.1  # share of the time that may go into measuring
@@ -70,6 +72,7 @@ class RunState:
     rollbacks: int = 0
     curve: list[dict[str, Any]] = field(default_factory=list)
     timings: dict[str, Any] = field(default_factory=dict)
+    symptom: str | None = None  # of a field that ended within its warm-up
 
 
 class Pace:
@@ -108,7 +111,7 @@ class TrainingRun:
         self.log, self.progress = log, progress
         self.checkpoints, self.journal = folder / "checkpoints", folder / "plan.json"
         self.pace = Pace()
-        checkpoint = latest_checkpoint(self.checkpoints, progress.note)
+        checkpoint = latest_checkpoint(self.checkpoints, progress.note, self._fits)
         if checkpoint is None or checkpoint.step == 0:
             self._begin(RunState(**checkpoint.facts) if checkpoint else RunState())
         else:
@@ -119,10 +122,12 @@ class TrainingRun:
         from nerf.training import NonFinite
 
         with live_line(self.progress, self._describe):
-            while self.state.step < self.plan.total_steps:
+            while True:
                 try:
                     self._take_steps()
-                except NonFinite as fault:
+                    self._examine_at_the_end()
+                    break
+                except (NonFinite, Lost) as fault:
                     self._roll_back(fault)
             if not self.state.curve or self.state.curve[-1]["step"] != self.state.step:
                 self._measure()
@@ -139,6 +144,10 @@ class TrainingRun:
         self.next_planning, self.next_measurement = 0.0, state.seconds + FIRST_MEASUREMENT
         self._write_journal()
         self._save()
+
+    def _fits(self, checkpoint: Checkpoint) -> None:
+        """Raise RuntimeError for the state of another field, TypeError for facts that are not a run's."""
+        self.make_trainer(RunState(**checkpoint.facts).restarts).load_state(checkpoint.tensors)
 
     def _resume(self, checkpoint: Checkpoint) -> None:
         """Go on from a checkpoint, by the plan that held when the run was killed: its steps are now counted."""
@@ -158,13 +167,15 @@ class TrainingRun:
         """Steps to the end of the plan, with everything that is due between them."""
         while self.state.step < self.plan.total_steps:
             self._take_step()
-            if self.state.step == WARM_UP_STEPS and (symptom := self._symptom()):
+            if self.state.step == WARM_UP_STEPS and (symptom := symptom_of(self.trainer, self.probes.train)):
                 self._restart(symptom)
             if self.state.seconds >= self.next_measurement:
+                self._examine()
                 self._measure()
             if self.clock_budget is not None and self.state.seconds >= self.next_planning:
                 self._replan(self.clock_budget)
             if time.monotonic() >= self.next_checkpoint:
+                self._examine()
                 self._save()
 
     def _take_step(self) -> None:
@@ -219,33 +230,62 @@ class TrainingRun:
     def _write_journal(self) -> None:
         write_durably(self.journal, json.dumps(self.plan.decisions).encode())
 
-    def _roll_back(self, fault: "NonFinite") -> None:
+    def _examine(self) -> None:
+        """Before the state is kept: raise Lost where it is not finite or, the warm-up being over, the field is dead."""
+        if name := not_finite(self.trainer):
+            raise Lost(f"after {self.state.step:,} steps the field is lost: its {name} is not finite")
+        if self.state.step > WARM_UP_STEPS and is_suspicious(self.pace.psnr, self.probes.train):
+            self._examine_fully()
+
+    def _examine_at_the_end(self) -> None:
+        self._examine()
+        if self.state.step >= WARM_UP_STEPS:
+            self._examine_fully()
+        elif symptom := symptom_of(self.trainer, self.probes.train):
+            self.state.symptom = symptom
+            self.log.event("unripe", self.state.step, symptom=symptom)
+            self.progress.note(f"after {self.state.step:,} steps the field is of no use yet: {symptom}; train longer")
+
+    def _examine_fully(self) -> None:
+        if symptom := symptom_of(self.trainer, self.probes.train):
+            raise Lost(f"after {self.state.step:,} steps the field is lost: {symptom}")
+
+    def _roll_back(self, fault: "NonFinite | Lost") -> None:
         """Keep the batch, return to the last good checkpoint and halve the rate; give up by name after the third."""
+        hint = self._on_record(fault)
+        rollbacks = self.state.rollbacks + 1
+        if rollbacks > MOST_ROLLBACKS:
+            why = f"{fault}, after {MOST_ROLLBACKS} roll-backs that each halved the learning rate"
+            raise StageError("training diverged", why, hint)
+        checkpoint = latest_checkpoint(self.checkpoints, self.progress.note, self._load_sound)
+        if checkpoint is None:
+            state = self.state
+            self._begin(RunState(0, state.seconds, state.rays, state.restarts, rollbacks))
+        else:
+            self.state.step, self.state.rollbacks = checkpoint.step, rollbacks
+        self.progress.note(f"{fault}: back to step {self.state.step:,} at half the learning rate")
+
+    def _load_sound(self, checkpoint: Checkpoint) -> None:
+        """Go back to it. Raises Lost where the field was dead already, which its batches tell only some seconds later."""
+        self.trainer.load_state(checkpoint.tensors)
+        if checkpoint.step > WARM_UP_STEPS and (symptom := symptom_of(self.trainer, self.probes.train)):
+            raise Lost(symptom)
+
+    def _on_record(self, fault: "NonFinite | Lost") -> str:
+        """Log the fault, and keep the batch of one that has it; what the user may try."""
+        slower = "Try a tenth of --train.learning-rate"
+        if isinstance(fault, Lost):
+            self.log.event("lost", self.state.step, symptom=str(fault))
+            return f"{slower}."
         from safetensors.torch import save_file
+
+        from nerf.training import RAYS
 
         name = f"nonfinite_{fault.step}.safetensors"
         save_file({key: tensor.contiguous() for key, tensor in fault.batch.items()}, self.folder / name)
         self.log.event("nonfinite", fault.step, quantity=fault.quantity, batch=name)
-        rollbacks = self.state.rollbacks + 1
-        if rollbacks > MOST_ROLLBACKS:
-            why = f"{fault}, after {MOST_ROLLBACKS} roll-backs that each halved the learning rate"
-            hint = f"Try a tenth of --train.learning-rate; the batch is kept in {self.folder / name}."
-            raise StageError("training diverged", why, hint)
-        checkpoint = latest_checkpoint(self.checkpoints, self.progress.note)
-        if checkpoint is None:
-            raise StageError("training cannot roll back", f"{fault} and no checkpoint is readable", "Run it again.")
-        self.trainer.load_state(checkpoint.tensors)
-        self.state.step, self.state.rollbacks = checkpoint.step, rollbacks
-        self.progress.note(f"{fault}: back to step {checkpoint.step:,} at half the learning rate")
-
-    def _symptom(self) -> str | None:
-        """What is wrong with the field after its warm-up, or None; judged on training photos alone."""
-        seen = self._on_training_photos()
-        if seen.opacity < EMPTY_OPACITY:
-            return f"it is empty (mean opacity {seen.opacity:.0e})"
-        if seen.psnr <= self.probes.train.flat_psnr:
-            return f"it is no better than a flat colour ({seen.psnr:.1f} of {self.probes.train.flat_psnr:.1f} dB)"
-        return None
+        advice = "Check the cameras, which give the rays" if fault.quantity == RAYS else slower
+        return f"{advice}; the batch is kept in {self.folder / name}."
 
     def _on_training_photos(self) -> "ProbeResult":
         from nerf.probe import measure
@@ -258,7 +298,8 @@ class TrainingRun:
         restarts = self.state.restarts + 1
         if restarts > MOST_RESTARTS:
             why = f"after {WARM_UP_STEPS} steps {symptom}, with {restarts} different seeds"
-            raise StageError("the field does not learn", why, "Check the cameras: the photos may not fit their poses.")
+            hint = "Check the cameras: the photos may not fit their poses. Or try a tenth of --train.learning-rate."
+            raise StageError("the field does not learn", why, hint)
         self.progress.note(f"after {WARM_UP_STEPS} steps the field is dead: {symptom}; starting with another seed")
         shutil.rmtree(self.checkpoints)
         self._begin(RunState(seconds=self.state.seconds, rays=self.state.rays, restarts=restarts))
