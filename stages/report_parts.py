@@ -23,10 +23,12 @@ PARTS = {
 
 
 def parts_bar(table: dict[str, Any] | None) -> dict[str, Any] | None:
-    """Rows for the page, longest first: name, words, colour, shares in percent; None where nothing was timed."""
+    """Rows for the page, longest first and waiting last: name, words, colour, shares in percent; None where nothing was
+    timed."""
     if table is None:
         return None
-    rows = [row | dict(zip(("colour", "words"), PARTS[row["part"]], strict=True)) for row in table["parts"]]
+    ordered = sorted(table["parts"], key=lambda row: row["part"] == WAITING)
+    rows = [row | dict(zip(("colour", "words"), PARTS[row["part"]], strict=True)) for row in ordered]
     for row in rows:
         row["percent"] = 100 * row["share"]
         row["of_rate"] = 100 * row["floor"] / row["seconds"] if row["floor"] and row["seconds"] else None

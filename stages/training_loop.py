@@ -266,7 +266,7 @@ class TrainingRun:
         self.progress.note(f"{fault}: back to step {self.state.step:,} at half the learning rate")
 
     def _load_sound(self, checkpoint: Checkpoint) -> None:
-        """Go back to it. Raises Lost where the field was dead already, which its batches tell only some seconds later."""
+        """Go back to it. Raises Lost where the field was dead already, as its batches tell only seconds later."""
         self.trainer.load_state(checkpoint.tensors)
         if checkpoint.step > WARM_UP_STEPS and (symptom := symptom_of(self.trainer, self.probes.train)):
             raise Lost(symptom)

@@ -6,8 +6,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 from safetensors.torch import load_file
 
 from nerf.effects.exposures import Exposures
@@ -18,6 +20,7 @@ from nerf.ray_bank import RayBank
 from nerf.training import PaperTrainer
 from stages import train, training_loop
 from stages.contract import StageError, StageResult
+from stages.decoding import DecodeError, decode
 from stages.examination import symptom_of
 from stages.field_files import load_field
 from stages.files import read_scene
@@ -225,6 +228,26 @@ def train_loop_trainer(inputs: dict[str, Path], bank: RayBank) -> GridTrainer:
     trainer = make_trainer(config, read_scene(inputs["normalise"]), bank, 0)
     assert isinstance(trainer, GridTrainer)
     return trainer
+
+
+@pytest.mark.parametrize("poison", [float("nan"), float("inf"), float("-inf")])
+def test_a_float_photo_with_pixels_that_are_no_numbers_is_refused_by_name(tmp_path: Path, poison: float) -> None:
+    values = np.full((20, 30), 0.5, np.float32)
+    Image.fromarray(values).save(tmp_path / "fine.tif")
+    values[3, 4] = poison
+    Image.fromarray(values).save(tmp_path / "poisoned.tif")
+    assert decode(tmp_path / "fine.tif").pixels.shape == (20, 30, 3)
+    with pytest.raises(DecodeError, match=r"^1 of its 600 pixels are no numbers \(NaN or infinite\)$"):
+        decode(tmp_path / "poisoned.tif")
+
+
+@pytest.mark.parametrize(
+    "head", [b"\x76\x2f\x31\x01\x02\x00\x00\x00", b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n\x02\x02"]
+)
+def test_openexr_and_radiance_files_are_no_photos(tmp_path: Path, head: bytes) -> None:
+    (tmp_path / "light.bin").write_bytes(head + bytes(range(256)))
+    with pytest.raises(DecodeError, match="not an image of a known format"):
+        decode(tmp_path / "light.bin")
 
 
 def _forget(trainer: Any) -> None:

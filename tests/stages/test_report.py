@@ -242,7 +242,7 @@ def test_page_tells_what_a_person_wants_to_know_in_that_order(inputs: dict[str, 
         '<span class="tag">worst</span> IMG_0000.jpg',
         "All 6 test photos",
         "bought +0.5 dB on held-out photos",
-        "not finite 2 times, went back",
+        "not finite, or a field that was lost, 2 times, went back",
         "from above",
         "only 12 matches with any other photo",
         "<td>211,817",
@@ -463,3 +463,12 @@ def test_a_training_without_timed_steps_is_no_fault(inputs: dict[str, Path], tmp
     (inputs["train"] / "parts.json").unlink()
     html, summary = _run(inputs, tmp_path / "out", progress)
     assert "Where training spent its time" not in html and summary["training_parts"] is None
+
+
+def test_a_field_of_no_use_is_named(inputs: dict[str, Path], tmp_path: Path, progress: Any):
+    path = inputs["train"] / "manifest.json"
+    manifest = json.loads(path.read_text("utf-8"))
+    manifest["facts"]["symptom"] = "it is empty (mean opacity 0e+00)"
+    write_json(path, manifest)
+    html, _ = _run(inputs, tmp_path / "out", progress)
+    assert "<b>The field is of no use yet:</b> it is empty (mean opacity 0e+00)." in html
