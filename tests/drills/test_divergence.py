@@ -32,15 +32,24 @@ KINDS: dict[str, dict[str, Any]] = {
     "warp": {"backend": "warp"},
     "paper": {"depth": 2, "width": 16, "samples_coarse": 8, "samples_fine": 8, "batch_rays": 64},
 }
-GRID = {"field": "grid", "levels": 2, "log2_rows": 10, "finest": 32, "batch_samples": 1024, "learning_rate": 2e-2}
-WARM_UP = 60
+GRID: dict[str, Any] = {
+    "field": "grid",
+    "levels": 2,
+    "log2_rows": 10,
+    "finest": 32,
+    "batch_samples": 1024,
+    "learning_rate": 2e-2,
+}
+WARM_UP = 40
 NAMED = ("training diverged", "the field does not learn")
 
 
 @pytest.fixture(autouse=True)
 def short_warm_up(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(training_loop, "WARM_UP_STEPS", WARM_UP)
-    monkeypatch.setattr("stages.training_parts.RATES_SECONDS", 0.0)
+    monkeypatch.setattr("stages.training_parts.write_parts", lambda *_: [])
+    monkeypatch.setattr("stages.training_setup.PROBE_RAYS", 256)
+    monkeypatch.setattr("nerf.density_cache.EVERY", 32)  # measuring it is most of what so small a field costs
 
 
 @pytest.fixture
@@ -50,8 +59,9 @@ def inputs(tmp_path: Path) -> dict[str, Path]:
 
 def trained(kind: str, inputs: dict[str, Path], folder: Path, progress: Any, **settings: Any) -> StageResult:
     folder.mkdir(exist_ok=True)
-    base = {"learning_rate": 5e-3} if kind == "paper" else GRID
-    return train.run(train.Config(downscale=1.0, **(base | KINDS[kind] | settings)), inputs, folder, progress)
+    base: dict[str, Any] = {"learning_rate": 5e-3} if kind == "paper" else GRID
+    config: dict[str, Any] = {"downscale": 1.0} | base | KINDS[kind] | settings
+    return train.run(train.Config(**config), inputs, folder, progress)
 
 
 def seen(folder: Path, inputs: dict[str, Path], progress: Any) -> tuple[float, float]:
@@ -61,7 +71,7 @@ def seen(folder: Path, inputs: dict[str, Path], progress: Any) -> tuple[float, f
     return measure(load_field(folder)[0], probe).psnr, probe.flat_psnr
 
 
-@pytest.mark.parametrize("steps", [WARM_UP - 20, WARM_UP + 60])
+@pytest.mark.parametrize("steps", [WARM_UP - 20, WARM_UP + 20])
 @pytest.mark.parametrize("rate", [1e-1, 1.0, 10.0])
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_rate_far_too_high_never_gives_a_bad_model_in_silence(
@@ -77,7 +87,7 @@ def test_a_rate_far_too_high_never_gives_a_bad_model_in_silence(
     if psnr > flat + 1:  # the loop looks at other pixels
         assert result.facts["symptom"] is None
     if psnr < flat - 1:
-        assert steps < WARM_UP and result.facts["symptom"] in result.line
+        assert steps < WARM_UP and str(result.facts["symptom"]) in result.line
         assert any("the field is of no use yet" in note for note in progress.notes)
 
 
@@ -98,12 +108,12 @@ def test_a_field_lost_again_and_again_is_refused_by_name(
     kind: str, inputs: dict[str, Path], tmp_path: Path, progress: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     spoil_at(WARM_UP + 20, _forget, monkeypatch, kind)
-    with pytest.raises(StageError, match=r"training diverged: after 80 steps the field is lost: it is .* 3 roll-backs"):
+    with pytest.raises(StageError, match=r"training diverged: after 60 steps the field is lost: it is .* 3 roll-backs"):
         trained(kind, inputs, tmp_path / "train", progress, steps=WARM_UP + 20, checkpoint_seconds=0.1)
     assert not (tmp_path / "train" / "field.json").exists()
 
 
-@pytest.mark.parametrize("poison", [float("nan"), float("inf"), float("-inf")])
+@pytest.mark.parametrize("poison", [float("nan"), float("inf")])
 @pytest.mark.parametrize("kind", KINDS)
 def test_weights_that_the_last_update_broke_are_never_kept(
     kind: str, poison: float, inputs: dict[str, Path], tmp_path: Path, progress: Any, monkeypatch: pytest.MonkeyPatch
@@ -112,8 +122,8 @@ def test_weights_that_the_last_update_broke_are_never_kept(
         weights = trainer.state()
         weights["model.table" if kind != "paper" else "model.fine.trunk.0.weight"].view(-1)[7] = poison
 
-    spoil_once_at(30, break_one_weight, monkeypatch, kind)
-    result = trained(kind, inputs, tmp_path / "train", progress, steps=30)
+    spoil_once_at(12, break_one_weight, monkeypatch, kind)
+    result = trained(kind, inputs, tmp_path / "train", progress, steps=12)
     assert result.facts["rollbacks"] == 1
     assert any("is not finite: back to step 0 at half the learning rate" in note for note in progress.notes)
     assert weights_are_finite(tmp_path / "train")
@@ -140,14 +150,14 @@ def test_rays_that_are_no_numbers_end_training_by_name(
         table, number = ROWS[row]
         getattr(bank, table)[number, ::2] = poison
 
-    spoil_at(20, lambda trainer: poisoned(trainer.bank), monkeypatch, kind)
+    spoil_at(5, lambda trainer: poisoned(trainer.bank), monkeypatch, kind)
     with pytest.raises(StageError) as failure:
-        trained(kind, inputs, tmp_path / "train", progress, steps=40)
+        trained(kind, inputs, tmp_path / "train", progress, steps=10)
     assert failure.value.what == "training diverged"
     assert re.match("the geometry of rays of step [0-9]+ is not finite, after 3 roll-backs", failure.value.why)
     assert "Check the cameras" in failure.value.hint
-    assert any("the geometry of rays of step 20 is not finite: back to step" in note for note in progress.notes)
-    assert (tmp_path / "train" / "nonfinite_20.safetensors").is_file()
+    assert any("the geometry of rays of step 5 is not finite: back to step" in note for note in progress.notes)
+    assert (tmp_path / "train" / "nonfinite_5.safetensors").is_file()
 
 
 @pytest.mark.parametrize("what", ["poses", "gains"])
@@ -172,7 +182,7 @@ def weights_are_finite(folder: Path) -> bool:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_checkpoint_of_a_sound_run_is_sound(kind: str, inputs: dict[str, Path], tmp_path: Path, progress: Any):
-    result = trained(kind, inputs, tmp_path / "train", progress, steps=WARM_UP + 40, checkpoint_seconds=1e-9)
+    result = trained(kind, inputs, tmp_path / "train", progress, steps=WARM_UP + 20, checkpoint_seconds=0.05)
     assert (result.facts["rollbacks"], result.facts["restarts"], result.facts["symptom"]) == (0, 0, None)
     assert not any("lost" in note or "no use" in note for note in progress.notes)
 
@@ -223,7 +233,8 @@ def test_no_number_is_a_symptom(inputs: dict[str, Path], progress: Any) -> None:
 def train_loop_trainer(inputs: dict[str, Path], bank: RayBank) -> GridTrainer:
     from stages.training_setup import make_trainer
 
-    asked = train.Config(downscale=1.0, steps=1, **(GRID | KINDS["torch"] | {"chunks": 1}))
+    settings: dict[str, Any] = {"downscale": 1.0, "steps": 1, "chunks": 1} | GRID | KINDS["torch"]
+    asked = train.Config(**settings)
     config = train.with_habits(asked.model_copy(update={"contracted": False, "view_dependence": True}))
     trainer = make_trainer(config, read_scene(inputs["normalise"]), bank, 0)
     assert isinstance(trainer, GridTrainer)
@@ -278,7 +289,13 @@ def spoil_at(step: int, spoil: Callable[[Any], None], monkeypatch: pytest.Monkey
 def spoil_once_at(step: int, spoil: Callable[[Any], None], monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
     """:func:`spoil_at`, only the first time."""
     done = []
-    spoil_at(step, lambda trainer: done or (done.append(step), spoil(trainer)), monkeypatch, kind)
+
+    def first_time(trainer: Any) -> None:
+        if not done:
+            done.append(step)
+            spoil(trainer)
+
+    spoil_at(step, first_time, monkeypatch, kind)
 
 
 def with_photo_parts(monkeypatch: pytest.MonkeyPatch, what: str) -> None:

@@ -26,7 +26,7 @@ CPU = torch.device("cpu")
 RATES = Rates(1e10, 1e8, 1e10)
 GRID_PARTS = {"batch", "march", "gather", "encode", "mlp", "composite", "backward", "scatter", "optimiser", "cache"}
 PAPER_PARTS = {"batch", "sampling", "encode", "mlp", "composite", "backward", "optimiser"}
-PAPER = {"depth": 3, "width": 16, "skip": 1, "samples_coarse": 8, "samples_fine": 8}
+PAPER: dict[str, Any] = {"depth": 3, "width": 16, "skip": 1, "samples_coarse": 8, "samples_fine": 8}
 
 
 def bank() -> RayBank:
