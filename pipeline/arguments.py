@@ -132,6 +132,8 @@ class DoctorArguments:
 
     selftest: bool = False
     """Measure every formula of docs/NUMERICS.md on this machine's device as well, in under a minute."""
+    bench: bool = False
+    """Measure matrix products, random reads and copying as well, and say what training can reach here at most; 5 s."""
 
 
 @dataclass

@@ -303,7 +303,7 @@ def command_doctor(words: Sequence[str]) -> int:
     given = words_of.parse(words_of.DoctorArguments, "doctor", words)
     from pipeline.doctor import examine
 
-    return examine(Path(os.curdir), given.selftest)
+    return examine(Path(os.curdir), given.selftest, given.bench)
 
 
 def command_demo(words: Sequence[str]) -> int:

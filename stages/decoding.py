@@ -224,6 +224,8 @@ def _quantised(image: "Image.Image") -> "Image.Image":
     import numpy as np
 
     values = np.asarray(image)
+    if wrong := int(values.size - np.isfinite(values).sum()):
+        raise DecodeError(f"{wrong:,} of its {values.size:,} pixels are no numbers (NaN or infinite)")
     limit = 1.0 if image.mode == "F" else 65535.0
     if not (values.min() >= 0 and values.max() <= limit):
         raise DecodeError(f"pixel values from {values.min()} to {values.max()}; export it with 8 or 16 bits")

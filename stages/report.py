@@ -15,6 +15,7 @@ from tyro.conf import Suppress
 from stages.contract import Inputs, Progress, StageConfig, StageResult
 from stages.files import read_json, read_scene, read_tensors, write_json
 from stages.live_line import duration, short_count
+from stages.training_parts import PARTS_FILE
 
 if TYPE_CHECKING:
     from nerf.scene import Scene
@@ -60,6 +61,7 @@ class Results:
     effects: dict[str, Any] | None
     field: dict[str, Any] | None
     curve: dict[str, Any] | None
+    parts: dict[str, Any] | None
     metrics: dict[str, Any] | None
     study: dict[str, Any] | None
 
@@ -91,6 +93,7 @@ def read_results(inputs: Inputs) -> Results:
         effects=of("effects", "effects.json"),
         field=of("train", "field.json"),
         curve=of("train", "curve.json"),
+        parts=of("train", PARTS_FILE) if "train" in inputs and (inputs["train"] / PARTS_FILE).exists() else None,
         metrics=of("evaluate", "metrics.json"),
         study=of("tradeoff", "tradeoff.json"),
     )
@@ -106,6 +109,8 @@ def summarise(results: Results) -> dict[str, Any]:
         "field": results.field["kind"] if results.field else None,
         "train_seconds": manifests["train"]["facts"]["train_seconds"] if "train" in manifests else None,
         "total_seconds": round(sum(manifest["seconds"] for manifest in manifests.values()), 3),
+        "stage_seconds": {stage: manifest["seconds"] for stage, manifest in manifests.items()},
+        "training_parts": results.parts,
         **{key: metrics.get(key) for key in ("psnr", "ssim", "psnr_mean_image", "psnr_nearest_view")},
         "mesh": mesh and {key: mesh[key] for key in ("vertices", "faces", "watertight")},
         "verdict": metrics.get("verdict", "Not measured: stage evaluate has not run."),
@@ -117,6 +122,7 @@ def page(results: Results, summary: dict[str, Any], config: Config) -> str:
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     from stages.report_effects import effects_table
+    from stages.report_parts import parts_bar
 
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent),
@@ -142,6 +148,7 @@ def page(results: Results, summary: dict[str, Any], config: Config) -> str:
         video=_video(results.inputs, config.video_limit_mb),
         compared=_compared(results),
         curve=_curve(results),
+        parts=parts_bar(results.parts),
         effects=effects_table(results.effects),
         study=_study(results),
         cameras=_cameras(results),

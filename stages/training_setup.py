@@ -37,7 +37,8 @@ def prepare(config: "Config", scene: "Scene", inputs: Inputs, folder: Path, prog
     from stages.train_more import budget_of
     from stages.training_data import training_bank
     from stages.training_log import TrainingLog
-    from stages.training_loop import Probes, TrainingRun
+    from stages.training_loop import TrainingRun
+    from stages.training_state import Probes
     from stages.unseen import PROBE_RAYS, Target, unseen_photos
 
     assert config.downscale is not None, "plan() chooses it"

@@ -33,6 +33,16 @@ CAMERA_MODELS = [
         ("OPENCV_FISHEYE", "refined", 8, None, None, None, "its distortion cannot be undone at 2.0% of the pixels"),
     ]
 ]
+PARTS = {"steps_timed": 19, "rays": 19_456, "seconds": 5.0, "core_seconds": 10.0, "floor_share": 0.6} | {
+    "rates": {"products": 80_123_456_789, "rows": 150_000_000, "bytes": 19_000_000_000},
+    "parts": [
+        {"part": "backward", "seconds": 5.0, "share": 0.5, "floor": 3.5},
+        {"part": "mlp", "seconds": 3.0, "share": 0.3, "floor": 1.9},
+        {"part": "waiting", "seconds": 1.0, "share": 0.1, "floor": None},
+        {"part": "rest", "seconds": 1.0, "share": 0.1, "floor": None},
+    ],
+    "most_rays_per_second": 7205.9,
+}
 LINES = {
     "ingest": "24 photos 96×72, one camera",
     "sfm": "23/24 registered, 0.61 px",
@@ -120,6 +130,7 @@ def _write_training(folder: Path) -> None:
     ]
     write_json(folder / "curve.json", {"device": "cpu", "threads": 2, "points": curve})
     write_json(folder / "field.json", {"kind": "paper", "downscale": 1.0, "steps": 600, "rays": 600_000})
+    write_json(folder / "parts.json", PARTS)
 
 
 def _write_metrics(folder: Path, scene: Scene, size: tuple[int, int]) -> None:
@@ -188,6 +199,9 @@ def test_summary_has_exactly_the_promised_keys(inputs: dict[str, Path], tmp_path
         "field": "paper",
         "train_seconds": 183.3,
         "total_seconds": pytest.approx(58.2 + 181.7 + 60.1 + 4 * 2.5),
+        "stage_seconds": {"ingest": 2.5, "sfm": 58.2, "normalise": 2.5, "train": 181.7}
+        | {"evaluate": 2.5, "render": 60.1, "mesh": 2.5},
+        "training_parts": PARTS,
         "psnr": 21.5,
         "ssim": 0.62,
         "psnr_mean_image": 12.9,
@@ -244,7 +258,7 @@ def test_page_tells_what_a_person_wants_to_know_in_that_order(inputs: dict[str, 
         '<span class="tag">worst</span> IMG_0000.jpg',
         "All 6 test photos",
         "bought +0.5 dB on held-out photos",
-        "not finite 2 times, went back",
+        "not finite, or a field that was lost, 2 times, went back",
         "from above",
         "only 12 matches with any other photo",
         "<td>211,817",
@@ -475,3 +489,29 @@ def test_a_finished_stage_that_lost_a_file_is_an_error_with_its_name(tmp_path: P
 )  # fmt: skip
 def test_settings_in_words(value: Any, words: str):
     assert report._value(value) == words
+
+
+def test_training_shows_where_its_time_went(inputs: dict[str, Path], tmp_path: Path, progress: Any):
+    html, _ = _run(inputs, tmp_path / "out", progress)
+    assert "<h3>Where training spent its time</h3>" in html
+    assert re.search(r"backward</td>.*?50\.0%.*?70%", html)
+    assert (
+        "take 60% of the time it was computed in" in html and "it would be 7.2 k rays/s; these steps made 3.9 k" in html
+    )
+    widths = [float(width) for width in re.findall(r'<i style="width: ([\d.]+)%; background', html)]
+    assert widths == [50, 30, 10, 10]
+
+
+def test_a_training_without_timed_steps_is_no_fault(inputs: dict[str, Path], tmp_path: Path, progress: Any):
+    (inputs["train"] / "parts.json").unlink()
+    html, summary = _run(inputs, tmp_path / "out", progress)
+    assert "Where training spent its time" not in html and summary["training_parts"] is None
+
+
+def test_a_field_of_no_use_is_named(inputs: dict[str, Path], tmp_path: Path, progress: Any):
+    path = inputs["train"] / "manifest.json"
+    manifest = json.loads(path.read_text("utf-8"))
+    manifest["facts"]["symptom"] = "it is empty (mean opacity 0e+00)"
+    write_json(path, manifest)
+    html, _ = _run(inputs, tmp_path / "out", progress)
+    assert "<b>The field is of no use yet:</b> it is empty (mean opacity 0e+00)." in html
