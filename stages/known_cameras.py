@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from nerf.scene import Camera
-from stages.colmap.cameras import focal_lengths_and_centre, rescaled
+from stages.colmap.cameras import camera_rays, focal_lengths_and_centre, rescaled
 from stages.colmap.model_files import FARTHEST, LARGEST_SIDE
 from stages.colmap.models import read_model
 from stages.contract import StageError
@@ -33,6 +33,7 @@ LARGEST_ENTRY = 1e6  # of a matrix that is looked at more closely: products of t
 MOST_NAMES = 5
 MOST_LETTERS = 40  # of a value, in an error
 TRANSFORMS_HINT = "Correct the file, or leave the cameras out to have them found from the photos."
+LENS_SAMPLES = 8  # pixels along each side at which a lens must have an inverse; normalise looks at more
 FISHEYE, RATIONAL = "OPENCV_FISHEYE", "FULL_OPENCV"
 
 
@@ -259,9 +260,11 @@ def _scale(camera: Camera, photo: Photo) -> tuple[float, float]:
 
 
 def _at_size_of(photo: Photo, camera: Camera, name: str) -> Camera:
-    """``camera`` rescaled where the photo has another size. Raises StageError where it has another shape, too."""
+    """``camera`` rescaled where the photo has another size. Raises StageError where it has another shape, too, and for
+    a lens that is none."""
     if flaw := _flaw(camera):
         raise _wrong(f"the camera of {name!r}", flaw)
+    camera_rays(camera, LENS_SAMPLES, LENS_SAMPLES)
     across, down = _scale(camera, photo)
     if across == down == 1:
         return camera

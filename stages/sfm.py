@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from stages.photos import Photo
 
 NEEDS = ("ingest",)
-VERSION = 3
+VERSION = 4
 RESUMES = True
 LINKS = ("sparse",)
 # It may decide that an attempt is not made, which is said; in the key it would part a run from the matches kept for it.
@@ -92,7 +92,9 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
 
 
 def _import(cameras: Path, photos: "list[Photo]", ingest: Path, folder: Path, progress: Progress) -> StageResult:
-    from stages.colmap.models import write_model
+    import numpy as np
+
+    from stages.colmap.models import read_model, write_model
     from stages.known_cameras import read_known_cameras
     from stages.photos import read_frame_names
 
@@ -101,13 +103,20 @@ def _import(cameras: Path, photos: "list[Photo]", ingest: Path, folder: Path, pr
     for note in known.notes:
         progress.note(note)
     write_model(folder / "sparse", known.model)
+    errors = read_model(folder / "sparse").error_px  # computed anew: what the given model says of them may be anything
+    if lost := int((~np.isfinite(errors)).sum()):
+        raise StageError(
+            f"the cameras of {cameras.name} do not fit its points",
+            f"{lost} of {len(errors)} points are seen where their cameras cannot see anything",
+            "Check the distortion of the cameras, or leave them out to have them found from the photos.",
+        )
     return _result(
         folder,
         source="import",
         attempts=[],
         repeated_structure=None,
         images=[image | {"uncertainty_px": None} for image in known.account(photos)],
-        reprojection_px=float(known.model.error_px.mean()) if len(known.model.xyz) else None,
+        reprojection_px=float(errors.mean()) if len(errors) else None,
         points=len(known.model.xyz),
         camera_model="/".join(sorted({camera.model for camera in known.model.cameras})),
         camera_models=[],

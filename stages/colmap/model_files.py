@@ -176,7 +176,7 @@ def _binary_images(path: Path) -> Iterator[tuple[int, FileImage]]:
     for _ in range(*file.take("Q")):
         number, *pose, camera = file.take("I7dI")
         name = file.text()
-        seen = np.frombuffer(file.skip(*file.take("Q"), keypoint.itemsize), keypoint)
+        seen = np.frombuffer(file.skip(file.take("Q")[0], keypoint.itemsize), keypoint)
         yield number, FileImage(name, camera, np.array(pose), seen["xy"], seen["point"])
 
 

@@ -127,7 +127,8 @@ def _load_photo(folder: Path) -> None:
 
     decoded = decode(folder / "a.png")
     assert decoded.pixels.dtype == np.uint8 and decoded.pixels.shape[2] in (3, 4)
-    sharpness(decoded.pixels), one_colour(decoded.pixels), thumbnail(decoded.pixels)
+    for measure in (sharpness, one_colour, thumbnail):
+        measure(decoded.pixels)
 
 
 def _load_mask(folder: Path) -> None:
@@ -196,32 +197,29 @@ def _photos(frames: dict[str, str]) -> list:
     ]
 
 
-def _load_cameras(given: Path, sparse: Path) -> None:
+def _load_cameras(given: Path, folder: Path) -> None:
     """From what is given to the finished stages ingest (photos.json) and sfm, less the photos."""
-    from stages.colmap.models import read_model, write_model
-    from stages.files import write_json
-    from stages.known_cameras import read_known_cameras
     from stages.photos import write_photos
     from stages.sources import find_source
 
     source = find_source(given)
     assert all(file.is_relative_to(source.root) for file in source.files)
     photos = _photos(dict(source.frames))
-    sparse.parent.mkdir()
-    write_photos(sparse.parent, photos, [], source.frames)
+    folder.mkdir()
+    write_photos(folder, photos, [], source.frames)
     assert source.cameras is not None
-    known = read_known_cameras(source.cameras, photos, source.frames)
-    write_json(sparse.parent / "registration.json", known.account(photos))
-    write_model(sparse, known.model)
-    _normalise(read_model(sparse), known.model)
+    _import_cameras(source.cameras, photos, folder)
 
 
-def _normalise(model: Any, before: Any) -> None:
-    """The scene frame of cameras that were taken: finite, whatever they were."""
+def _import_cameras(cameras: Path, photos: list, folder: Path) -> None:
+    """The end of stage sfm with given cameras, and the scene frame of them: finite, whatever they were."""
     from nerf.normalisation import normalise
+    from stages.colmap.models import read_model
     from stages.normalise import _reconstruction
+    from stages.sfm import _import
 
-    assert len(model.images) == len(before.images) and np.isfinite(model.error_px).all()
+    assert _import(cameras, photos, folder, folder / "sfm", Quiet()).outputs
+    model = read_model(folder / "sfm" / "sparse")
     try:
         found = normalise(_reconstruction(model, list(range(len(model.images)))), False, None)
     except ValueError as error:
@@ -231,11 +229,11 @@ def _normalise(model: Any, before: Any) -> None:
 
 
 def _load_blender(folder: Path) -> None:
-    _load_cameras(folder, folder / "out" / "sparse")
+    _load_cameras(folder, folder / "out")
 
 
 def _load_transforms(folder: Path) -> None:
-    _load_cameras(folder / "t.json", folder / "out" / "sparse")
+    _load_cameras(folder / "t.json", folder / "out")
 
 
 @cache
@@ -288,13 +286,12 @@ def colmap_models() -> dict[str, dict[str, bytes]]:
 
 
 def _load_colmap(folder: Path) -> None:
-    from stages.colmap.models import read_model, write_model
-    from stages.known_cameras import read_known_cameras
+    from stages.photos import write_photos
 
-    names = {f"p{i}.png": f"p{i}.png" for i in range(3)}
-    known = read_known_cameras(folder, _photos(names), {})
-    write_model(folder / "out", known.model)
-    _normalise(read_model(folder / "out"), known.model)
+    photos = _photos({f"p{i}.png": f"p{i}.png" for i in range(3)})
+    (folder / "out").mkdir()
+    write_photos(folder / "out", photos, [], {})
+    _import_cameras(folder, photos, folder / "out")
 
 
 # --- settings and workspaces

@@ -239,13 +239,13 @@ def test_only_the_first_frame_counts(tmp_path: Path) -> None:
     assert (decoded.suffix, decoded.notes) == (None, ("first of 2 frames",))
 
 
-def test_a_jpeg_that_its_decoder_refuses_is_refused_in_words(tmp_path: Path) -> None:
-    """Without a pixel decoded, there is no share of the picture that could be missing."""
-    content = bytearray(saved(tmp_path / "a.jpg", Image.fromarray(smooth())).read_bytes())
-    for damage in (0x55, 0x00):
-        content[content.index(b"\xff\xc0") + 11] = damage  # a component's sampling factors
-        (tmp_path / "a.jpg").write_bytes(content)
-        assert reason(tmp_path / "a.jpg").startswith("damaged: ")
+def test_a_jpeg_that_ends_with_its_header_is_refused_in_words(tmp_path: Path) -> None:
+    """Without a place for pixels, there is no share of the picture that could be missing."""
+    content = saved(tmp_path / "a.jpg", Image.fromarray(smooth())).read_bytes()
+    frame = content.index(b"\xff\xc0")
+    end = frame + 2 + int.from_bytes(content[frame + 2 : frame + 4], "big")
+    (tmp_path / "a.jpg").write_bytes(content[:end])
+    assert reason(tmp_path / "a.jpg") == "damaged: cannot load this image"
 
 
 def test_a_truncated_jpeg_says_how_much_is_missing(tmp_path: Path) -> None:
