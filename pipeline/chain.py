@@ -1,5 +1,6 @@
 """The stages in the order they run, and how they depend on each other."""
 
+from collections.abc import Mapping
 from types import ModuleType
 
 from stages import effects, evaluate, ingest, mesh, normalise, render, report, sfm, train
@@ -29,15 +30,15 @@ EXIT_CODES = {
 }
 
 
-def needed_for(stage: str) -> list[str]:
+def needed_for(stage: str, stages: Mapping[str, ModuleType] = STAGES) -> list[str]:
     """``stage`` and everything it depends on, in order; the report is written from whatever is there."""
     if stage == "report":
         return [stage]
     wanted = {stage}
-    for name in reversed(STAGES):
+    for name in reversed(stages):
         if name in wanted:
-            wanted.update(STAGES[name].NEEDS)
-    return [name for name in STAGES if name in wanted]
+            wanted.update(stages[name].NEEDS)
+    return [name for name in stages if name in wanted]
 
 
 def up_to(stage: str) -> list[str]:

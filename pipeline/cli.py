@@ -162,7 +162,7 @@ def _run_stages(
         runner = Runner(workspace, settings, display)
         display.headline(machine.headline(root))
         try:
-            ran = runner.run(stages, force=force, replan=common.replan, remember=remember)
+            ran = runner.run(stages, force=force, replan=common.replan, remember=remember, verify=common.verify)
         except StageFailed as failure:
             display.failed(failure.stage, failure.error)
             raise
@@ -224,13 +224,14 @@ def _reader(root: Path) -> tuple[Workspace, Runner]:
 def command_status(words: Sequence[str]) -> int:
     """``pipeline status WORKSPACE``."""
     given = words_of.parse(words_of.StatusArguments, "status", words)
-    statuses = status.all_statuses(*_reader(given.workspace))
+    statuses = status.all_statuses(*_reader(given.workspace), given.verify)
+    code = EXIT_DEFECT if given.verify and any(s.state == "damaged" for s in statuses) else 0
     if given.json:
         print(json.dumps([asdict(s) for s in statuses], ensure_ascii=False))
-        return 0
+        return code
     for s in statuses:
         print(f"{s.stage:<10} {s.state:<8} {s.text}".rstrip())
-    return 0
+    return code
 
 
 def command_explain(words: Sequence[str]) -> int:

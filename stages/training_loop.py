@@ -216,10 +216,10 @@ class TrainingRun:
 
     def _roll_back(self, fault: "NonFinite") -> None:
         """Keep the batch, return to the last good checkpoint and halve the rate; give up by name after the third."""
-        from safetensors.torch import save_file
+        from safetensors.torch import save
 
         name = f"nonfinite_{fault.step}.safetensors"
-        save_file({key: tensor.contiguous() for key, tensor in fault.batch.items()}, self.folder / name)
+        (self.folder / name).write_bytes(save({key: tensor.contiguous() for key, tensor in fault.batch.items()}))
         self.log.event("nonfinite", fault.step, quantity=fault.quantity, batch=name)
         rollbacks = self.state.rollbacks + 1
         if rollbacks > MOST_ROLLBACKS:

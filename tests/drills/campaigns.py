@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from pipeline.chain import STAGES
-from tests.drills.drill import Program, copy_workspace, results, run_words
+from tests.drills.drill import Prepare, Program, copy_workspace, results, run_words
 
 EXIT_CODES = {signal.SIGINT: 130, signal.SIGTERM: 143}
 
@@ -28,19 +28,19 @@ class Chain:
         self.seconds = {event["stage"]: event["seconds"] for event in program.events() if event["event"] == "end"}
         self.expected = results(self.workspace)
 
-    def start(self, workspace: Path) -> Program:
-        """The same run in another workspace."""
-        words = run_words(self.photos, workspace, *self.options)
-        return Program(words, workspace.parent / f"{workspace.name}.says")
+    def start(self, workspace: Path, *more: str, says: Path | None = None, prepare: Prepare = None) -> Program:
+        """The same run in another workspace; what it says goes to ``says``, by default beside that."""
+        words = run_words(self.photos, workspace, *self.options, *more)
+        return Program(words, says or workspace.parent / f"{workspace.name}.says", prepare)
 
     def before(self, stage: str, to: Path) -> Path:
         """A workspace in which everything before ``stage`` is finished."""
         stages = list(self.seconds)
         return copy_workspace(self.workspace, to, tuple(stages[stages.index(stage) :]))
 
-    def lost(self, workspace: Path) -> list[str]:
+    def lost(self, workspace: Path, says: Path | None = None) -> list[str]:
         """Run again and name the stages whose results are not those of the undisturbed run."""
-        self.start(workspace).finish()
+        self.start(workspace, says=says).finish()
         found = results(workspace)
         return [stage for stage, digest in self.expected.items() if found.get(stage) != digest]
 

@@ -23,6 +23,8 @@ TINY = (
 ).split()
 PATIENCE = 120.0  # seconds until a program counts as hanging
 
+Prepare = Callable[[], None] | None
+
 _server = multiprocessing.get_context("forkserver")
 _server.set_forkserver_preload(["tests.drills.preloaded"])
 
@@ -33,7 +35,7 @@ class Program:
 
     words: list[str]
     files: Path
-    prepare: Callable[[], None] | None = None
+    prepare: Prepare = None
     process: Any = field(init=False)
 
     def __post_init__(self) -> None:
@@ -107,7 +109,7 @@ class Program:
         return self
 
 
-def _live(words: list[str], files: Path, mark: str, prepare: Callable[[], None] | None) -> None:
+def _live(words: list[str], files: Path, mark: str, prepare: Prepare) -> None:
     """In the forked process: become a program as a shell starts it, and run the command line."""
     import sys
 

@@ -17,7 +17,7 @@ from filelock import FileLock
 from pipeline.workspace import Workspace
 from stages import pixel_store as module
 from stages.contract import StageError
-from stages.pixel_store import PixelStore, StoredPhoto, fill, pixel_store
+from stages.pixel_store import checksum, PixelStore, StoredPhoto, fill, pixel_store
 from tests.conftest import SilentProgress
 
 SIZES = [(5, 3), (4, 2), (7, 6), (5, 3)]  # (width, height)
@@ -97,7 +97,7 @@ def test_a_damaged_store_is_made_again_and_said(tmp_path: Path, progress: Silent
     assert not store.is_whole
     fill(store, painted, progress)
     assert np.array_equal(store.photo(2), painted(2))
-    assert progress.notes == [f"the pixel store {store.path.name} has {size:,} bytes and not 240: making it again"]
+    assert progress.notes == [f"the pixel store {store.path.name} has {size:,} bytes and not 256: making it again"]
 
 
 def test_photos_are_decoded_a_few_at_a_time_and_dropped(
@@ -191,7 +191,8 @@ def test_a_second_process_waits_and_finds_it_made(tmp_path: Path, progress: Sile
     waiting.start()
     while not progress.updates:
         time.sleep(0.01)
-    store.path.write_bytes(b"".join(painted(index).tobytes() for index in range(len(SIZES))))
+    pixels = [painted(index).tobytes() for index in range(len(SIZES))]
+    store.path.write_bytes(b"".join([*pixels, *map(checksum, pixels)]))
     lock.release()
     waiting.join(10)
     assert not waiting.is_alive()
@@ -223,3 +224,21 @@ def test_a_kill_leaves_no_store_and_no_lock(tmp_path: Path, progress: SilentProg
     fill(store, painted, progress)
     assert np.array_equal(store.photo(3), painted(3))
     assert not store.path.with_name(f"{store.path.name}.partial").exists()
+
+
+def test_a_flipped_bit_is_found_said_and_made_again(tmp_path: Path, progress: SilentProgress) -> None:
+    store = store_of(tmp_path)
+    fill(store, painted, progress)
+    sound = store.path.read_bytes()
+    for bit in (0, 8 * store.starts[2] + 3, 8 * store.starts[-1] + 1):  # of the pixels, and of a checksum
+        store.path.write_bytes(flipped(sound, bit))
+        assert len(store.damaged()) == 1
+        fill(store, painted, progress)
+        assert store.path.read_bytes() == sound
+    assert [note.endswith("have changed on the disk: making it again") for note in progress.notes] == 3 * [True]
+
+
+def flipped(content: bytes, bit: int) -> bytes:
+    changed = bytearray(content)
+    changed[bit // 8] ^= 1 << bit % 8
+    return bytes(changed)
