@@ -27,6 +27,7 @@ RESUMES = False
 LINKS = ("video.mp4", "depth.mp4", "path.json")
 
 TRIED_VIEWS = 4  # of the path, to see how fast the field draws them
+BYTES_PER_PIXEL = 200  # of a frame while it is drawn and written: rays, colours, depth; 105 to 195 measured
 WRITING_SECONDS = 1.5e-7  # to encode a pixel of video.mp4 and of depth.mp4 (x264 with one thread: 13 million a second)
 
 
@@ -144,6 +145,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     painter = load_painter(inputs["train"], like=config.like)
     exposure = _exposure(config, inputs["train"])
     path = _path(config, scene).resized(config.width)
+    _check_memory(path)
     write_json(folder / "path.json", _path_json(path, scene, config.fps))
     started = time.perf_counter()
     renderings = _render(path, scene, painter, progress)
@@ -154,6 +156,16 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     line = f"{facts['path']}, {facts['frames']} frames {facts['width']}×{facts['height']}"
     line += "" if exposure is None else f" · {exposure}"
     return StageResult(outputs, f"{line} · {frames_per_second:.2g} frames/s", ("speed.json",), facts)
+
+
+def _check_memory(path: CameraPath) -> None:
+    """Raises StageError where not even one frame can be drawn."""
+    from stages.memory import check_memory
+
+    camera = max(path.cameras, key=lambda camera: camera.width * camera.height)
+    size = f"{camera.width}×{camera.height}"
+    needed, hint = BYTES_PER_PIXEL * camera.width * camera.height, f"Try --render.width {camera.width // 2}."
+    check_memory(needed, "the video", f"drawing a frame of {size} takes", hint)
 
 
 def _path(config: Config, scene: "Scene") -> CameraPath:

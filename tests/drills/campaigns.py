@@ -38,11 +38,12 @@ class Chain:
         stages = list(self.seconds)
         return copy_workspace(self.workspace, to, tuple(stages[stages.index(stage) :]))
 
-    def lost(self, workspace: Path, says: Path | None = None) -> list[str]:
-        """Run again and name the stages whose results are not those of the undisturbed run."""
-        self.start(workspace, says=says).finish()
-        found = results(workspace)
-        return [stage for stage, digest in self.expected.items() if found.get(stage) != digest]
+    def lost(self, workspace: Path, *more: str, until: str = "report", says: Path | None = None) -> list[str]:
+        """Run again and name the stages, as far as ``until``, whose results are not those of the undisturbed run."""
+        self.start(workspace, *more, "--until", until, says=says).finish()
+        found, stages = results(workspace), list(self.seconds)
+        asked = stages[: stages.index(until) + 1] if until in stages else stages
+        return [stage for stage in asked if stage != "report" and found.get(stage) != self.expected[stage]]
 
 
 @dataclass

@@ -80,10 +80,10 @@ def test_a_full_disk_at_every_stage(chain: Chain, small_disk: Path, stage: str, 
     assert results(workspace) == before, "nothing finished is lost"
     (small_disk / "ballast").unlink()
     if share:
-        assert chain.lost(workspace, says=says) == []
+        assert chain.lost(workspace, until=stage, says=says) == []
 
 
-@pytest.mark.parametrize("leave", [0, 1 << 16, 1 << 18], ids=["at once", "sooner", "later"])
+@pytest.mark.parametrize("leave", [0, 1 << 16], ids=["at once", "soon"])
 def test_a_disk_that_fills_up_somewhere(chain: Chain, small_disk: Path, leave: int):
     workspace = small_disk / "w.nerf"
     ballast = fill_up(small_disk, leave)
@@ -95,7 +95,7 @@ def test_a_disk_that_fills_up_somewhere(chain: Chain, small_disk: Path, leave: i
     assert chain.lost(workspace, says=small_disk.parent / "says") == []
 
 
-@pytest.mark.parametrize("leave", [200_000, 1_500_000], ids=["features", "model"])
+@pytest.mark.parametrize("leave", [200_000, 1_500_000], ids=["features", "matches"])
 def test_a_full_disk_inside_colmap(synthetic_photos: SyntheticPhotos, small_disk: Path, leave: int):
     def sfm() -> Program:
         words = f"run {synthetic_photos.folder} -o {small_disk / 'w.nerf'} --json --until sfm --sfm.max-features 500"
@@ -107,7 +107,7 @@ def test_a_full_disk_inside_colmap(synthetic_photos: SyntheticPhotos, small_disk
     program = sfm()
     assert program.wait() == 11
     (error,) = [event for event in program.events() if event["event"] == "error"]
-    assert error["stage"] == "sfm" and "No space left" in f"{error['why']} {error['hint']}" or "full" in error["why"], error
+    assert error["stage"] == "sfm" and NO_ROOM in error["why"], error
     assert not list((small_disk / "w.nerf/sfm").glob("*/manifest.json"))
     ballast.unlink()
     sfm().finish()
