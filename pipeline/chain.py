@@ -35,7 +35,7 @@ def needed_for(stage: str, stages: Mapping[str, ModuleType] = STAGES) -> list[st
     if stage == "report":
         return [stage]
     wanted = {stage}
-    for name in reversed(stages):
+    for name in reversed(list(stages)):
         if name in wanted:
             wanted.update(stages[name].NEEDS)
     return [name for name in stages if name in wanted]

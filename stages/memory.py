@@ -31,7 +31,9 @@ def check_memory(needed: float, what: str, why: str, hint: str) -> None:
     """Raises StageError where ``what`` needs more than there is; ``why`` says what takes that much."""
     free = available_bytes()
     if needed > free:
-        raise StageError(f"not enough memory for {what}", f"{why} {in_words(needed)} and {in_words(free)} are free", hint)
+        raise StageError(
+            f"not enough memory for {what}", f"{why} {in_words(needed)} and {in_words(free)} are free", hint
+        )
 
 
 def at_once(count: int, each: float) -> int:

@@ -131,9 +131,7 @@ def _last_words(log: Path) -> str:
     return lines[-1].strip() if lines else "it left no message"
 
 
-def _child_failed(
-    code: int, limit: float | None, phase: str, last: str, without: str | None, log: Path
-) -> StageError:
+def _child_failed(code: int, limit: float | None, phase: str, last: str, without: str | None, log: Path) -> StageError:
     """``last``: what the child said at last; ``without``: the hint where running again goes on without the attempt that
     failed."""
     free = shutil.disk_usage(log.parent).free

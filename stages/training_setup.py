@@ -94,7 +94,10 @@ def check_field_fits(config: "Config") -> None:
     from stages.memory import check_memory
 
     if config.field == "grid":
-        why, hint = f"{config.levels} grids of up to 2^{config.log2_rows} rows take", "Give a smaller --train.log2-rows."
+        why, hint = (
+            f"{config.levels} grids of up to 2^{config.log2_rows} rows take",
+            "Give a smaller --train.log2-rows.",
+        )
     else:
         why = f"{config.depth} × {config.width} networks on {cores()} cores at a time take"
         hint = "Give a smaller --train.width, --train.batch-rays or --train.samples-fine, or fewer cores (taskset)."

@@ -1,7 +1,5 @@
 """The chain of all drills: run once, copied by each."""
 
-from pathlib import Path
-
 import pytest
 
 from tests.drills.campaigns import Chain

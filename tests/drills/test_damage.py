@@ -54,13 +54,12 @@ def test_a_flipped_bit_in_any_file_is_found(chain: Chain, tmp_path: Path):
     assert count > 45
 
 
-@pytest.mark.parametrize("kind", DAMAGES)
-def test_every_stage_damaged_at_once(chain: Chain, tmp_path: Path, kind: str):
+def test_every_stage_damaged_at_once(chain: Chain, tmp_path: Path):
     workspace = copy_workspace(chain.workspace, tmp_path / "w.nerf")
-    chance = random.Random(kind)
+    chance = random.Random(7)
     for folder in finished_folders(workspace).values():
         files = [file for file in files_of(folder) if file.name != "manifest.json"]
-        DAMAGES[kind](chance.choice(files))
+        chance.choice(list(DAMAGES.values()))(chance.choice(files))
     code, said = status(workspace, "--verify")
     assert code == 1 and said.count(" damaged ") == len(STAGES), said
     program = chain.start(workspace, "--verify").finish()
@@ -83,7 +82,7 @@ def test_a_flipped_bit_does_not_reach_the_next_stage(chain: Chain, tmp_path: Pat
     assert found == {name: digest for name, digest in chain.expected.items() if name in found} and stage in found
 
 
-@pytest.mark.parametrize("kind", DAMAGES)
+@pytest.mark.parametrize("kind", ["flipped", "deleted"])
 @pytest.mark.parametrize("file", ["run.json", ".content.json", "manifest.json"])
 def test_the_books_damaged(chain: Chain, tmp_path: Path, file: str, kind: str):
     workspace = copy_workspace(chain.workspace, tmp_path / "w.nerf")

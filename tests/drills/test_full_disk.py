@@ -64,11 +64,13 @@ class FullAt:
             fill_up(self.disk, self.leave)
             return run(*arguments)
 
-        setattr(module, "run", run_on_a_full_disk)
+        module.run = run_on_a_full_disk
 
 
-@pytest.mark.parametrize("share", [0.0, 0.5], ids=["at once", "half-way"])
-@pytest.mark.parametrize("stage", STAGES)
+LARGE = ("ingest", "train", "evaluate", "render", "mesh")  # stages that write more than a page or two
+
+
+@pytest.mark.parametrize("stage, share", [*((stage, 0.0) for stage in STAGES), *((stage, 0.5) for stage in LARGE)])
 def test_a_full_disk_at_every_stage(chain: Chain, small_disk: Path, stage: str, share: float):
     size = sum(path.stat().st_size for path in finished_folders(chain.workspace)[stage].rglob("*") if path.is_file())
     workspace, says = chain.before(stage, small_disk / "w.nerf"), small_disk.parent / "says"
@@ -95,6 +97,7 @@ def test_a_disk_that_fills_up_somewhere(chain: Chain, small_disk: Path, leave: i
     assert chain.lost(workspace, says=small_disk.parent / "says") == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("leave", [200_000, 1_500_000], ids=["features", "matches"])
 def test_a_full_disk_inside_colmap(synthetic_photos: SyntheticPhotos, small_disk: Path, leave: int):
     def sfm() -> Program:

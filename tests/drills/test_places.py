@@ -25,7 +25,7 @@ def test_moved_half_way_through_training(chain: Chain, tmp_path: Path):
     (tmp_path / "elsewhere").mkdir()
     moved = (tmp_path / "here.nerf").rename(tmp_path / "elsewhere/other name.nerf")
     assert chain.lost(moved) == []
-    assert all((link.exists() for link in (moved / "output").iterdir())), "output/ points at what is there"
+    assert all(link.exists() for link in (moved / "output").iterdir()), "output/ points at what is there"
 
 
 def test_photos_moved_and_gone(chain: Chain, tmp_path: Path):

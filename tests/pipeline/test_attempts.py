@@ -15,7 +15,7 @@ def test_nothing_was_spent_where_nobody_began(tmp_path: Path):
 
 
 def begin_earlier(folder: Path, seconds: float) -> None:
-    """An attempt that began so many seconds of the machine's running time ago, by a clock that was put forward since."""
+    """An attempt that began so many seconds of the machine's running time ago."""
     attempts.begin(folder, 100.0)
     value = json.loads((folder / attempts.NAME).read_text())
     (folder / attempts.NAME).write_text(json.dumps(value | {"up": value["up"] - seconds}))

@@ -10,7 +10,7 @@ from stages import memory
 from stages.colmap.matching import BYTES_PER_SEARCHED_PIXEL, Search, feature_bytes
 from stages.contract import StageError
 from stages.memory import at_once, available_bytes, check_memory, in_words, rooms_in_groups
-from tests.stages.photo_scene import photo
+from stages.photos import Photo
 
 
 @pytest.fixture
@@ -47,7 +47,9 @@ def test_the_least_counts(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(memory, "rooms_in_groups", lambda *_: [5000])
     assert available_bytes() == 5000
     used = psutil.Process().memory_info().vms
-    monkeypatch.setattr(resource, "getrlimit", lambda kind: (used + 1000, -1) if kind == resource.RLIMIT_AS else (-1, -1))
+    monkeypatch.setattr(
+        resource, "getrlimit", lambda kind: (used + 1000, -1) if kind == resource.RLIMIT_AS else (-1, -1)
+    )
     assert available_bytes() <= 1000
     monkeypatch.setattr(memory, "rooms_in_groups", lambda *_: [-20])
     assert available_bytes() == 0
@@ -78,4 +80,7 @@ def test_words():
 
 @pytest.mark.parametrize("size, side, searched", [((2000, 1000), 1000, 1000 * 500), ((1000, 500), 1600, 2000 * 1000)])
 def test_features_are_searched_on_reduced_or_doubled_photos(size: tuple[int, int], side: int, searched: int):
-    assert feature_bytes([photo(*size)], Search(side, 100)) == BYTES_PER_SEARCHED_PIXEL * searched
+    assert (
+        feature_bytes([Photo("a", "images/a.png", *size, 0, None, None, False, 1.0)], Search(side, 100))
+        == BYTES_PER_SEARCHED_PIXEL * searched
+    )

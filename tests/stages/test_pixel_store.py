@@ -17,7 +17,7 @@ from filelock import FileLock
 from pipeline.workspace import Workspace
 from stages import pixel_store as module
 from stages.contract import StageError
-from stages.pixel_store import checksum, PixelStore, StoredPhoto, fill, pixel_store
+from stages.pixel_store import PixelStore, StoredPhoto, checksum, fill, pixel_store
 from tests.conftest import SilentProgress
 
 SIZES = [(5, 3), (4, 2), (7, 6), (5, 3)]  # (width, height)
