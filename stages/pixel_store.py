@@ -3,7 +3,8 @@
 It lies beside the folder of ingest as ``<folder>.pixels/``, outside of every manifest and digest. A store is found by
 what it was made from (names, sizes and times of the files, the size asked for), is written once under a lock, and
 appears whole under its name or not at all. A CRC-32 of each photo's pixels stands at its end: what has changed on the
-disk since is found before it is used, and made again. Photos are decoded on all cores, each written to its place and dropped.
+disk since is found before it is used, and made again. Photos are decoded on all cores, each written to its place and
+dropped.
 
 What a mapped file costs: as much memory as there is to spare, given back when others need it. Random reads are as
 fast as from plain memory once the file has been read; where it is larger than memory, each pixel that is not there

@@ -1,4 +1,4 @@
-"""The long form of the drills: ``python -m tests.drills --kills 40 --signals 36`` prints what was done and what was lost."""
+"""The long form of the drills: ``python -m tests.drills --kills 40 --signals 36`` prints what was done and lost."""
 
 import argparse
 import sys
@@ -9,7 +9,7 @@ from tests.drills.campaigns import Chain, interruptions, kills
 from tests.small_scenes import write_blender_scene
 from tests.synthetic_photos import write_synthetic_photos
 
-FEW_FEATURES = ("--sfm.max-features", "800", "--train.downscale", "4", "--until", "train")
+FEW_FEATURES = ("--sfm.max-features", "800", "--until", "normalise")
 
 
 def main() -> int:

@@ -1,7 +1,7 @@
 """What all drills share: a chain that takes seconds, programs that can be struck at any instant, and what came of it.
 
-A program of a drill is forked from a server that has imported everything already (4 s each time otherwise), in a session
-of its own, as a shell would start it. What it prints goes to files, so that it can be read while it runs.
+A program of a drill is forked from a server that has imported everything already (4 s each time otherwise), in a
+session of its own, as a shell would start it. What it prints goes to files, so that it can be read while it runs.
 """
 
 import json
@@ -18,8 +18,8 @@ from typing import Any
 MARK = "PIPELINE_DRILL"  # in the environment of a program and of all that it starts
 TINY = (
     "--train.steps 60 --train.levels 2 --train.log2-rows 10 --train.finest 32 --train.batch-samples 1024"
-    " --evaluate.photos 2 --train.chunks 2 --train.backend warp --train.checkpoint-seconds 0.05 --train.downscale 1 --render.frames 6"
-    " --render.width 32 --mesh.resolution 24 --mesh.keep all"
+    " --train.chunks 2 --train.backend warp --train.checkpoint-seconds 0.05 --train.downscale 1 --evaluate.photos 2"
+    " --render.frames 6 --render.width 32 --mesh.resolution 24 --mesh.keep all"
 ).split()
 PATIENCE = 120.0  # seconds until a program counts as hanging
 
@@ -31,7 +31,7 @@ _server.set_forkserver_preload(["tests.drills.preloaded"])
 
 @dataclass
 class Program:
-    """``pipeline WORDS`` in a process of its own. ``files``: where it prints; ``prepare`` is called in it beforehand."""
+    """``pipeline WORDS`` in a process of its own; ``files``: where it prints; ``prepare`` is called in it first."""
 
     words: list[str]
     files: Path
@@ -118,8 +118,8 @@ def _live(words: list[str], files: Path, mark: str, prepare: Prepare) -> None:
         descriptor = os.open(files / name, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
         os.dup2(descriptor, number)
         os.close(descriptor)
-    sys.stdout = open(1, "w", encoding="utf-8", closefd=False)
-    sys.stderr = open(2, "w", encoding="utf-8", closefd=False)
+    sys.stdout = open(1, "w", encoding="utf-8", closefd=False)  # noqa: SIM115 -- until the program ends
+    sys.stderr = open(2, "w", encoding="utf-8", closefd=False)  # noqa: SIM115
     os.environ[MARK] = mark
     signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)

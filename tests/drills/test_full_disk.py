@@ -64,7 +64,7 @@ class FullAt:
             fill_up(self.disk, self.leave)
             return run(*arguments)
 
-        module.run = run_on_a_full_disk
+        vars(module)["run"] = run_on_a_full_disk
 
 
 LARGE = ("ingest", "train", "evaluate", "render", "mesh")  # stages that write more than a page or two

@@ -38,7 +38,8 @@ FIELDS = {
     "torch": "--train.backend torch --train.steps 20",
     "paper": "--train.field paper --train.width 32 --train.depth 2 --train.skip 1 --train.samples-coarse 8"
     " --train.samples-fine 8 --train.batch-rays 512 --train.steps 20",
-    "contracted": "--train.contracted True --train.steps 20 --train.backend warp",
+    "effects": "--effect background=on --effect exposure=on --effect pose_refinement=on --train.steps 20"
+    " --train.backend warp",
 }
 
 
@@ -47,7 +48,7 @@ FIELDS = {
 def test_every_field_and_backend(chain: Chain, tmp_path: Path, kind: str):
     found = []
     for count in (1, 2, 4):
-        workspace = chain.before("train", tmp_path / f"{count}.nerf")
+        workspace = chain.before("effects", tmp_path / f"{count}.nerf")
         tiny = "--train.levels 2 --train.log2-rows 10 --train.finest 32 --train.batch-samples 1024 --train.chunks 2"
         sizes = "" if kind == "paper" else tiny
         words = f"run {chain.photos} -o {workspace} --until evaluate {sizes} {FIELDS[kind]}"
