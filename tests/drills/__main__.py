@@ -9,7 +9,7 @@ from tests.drills.campaigns import Chain, interruptions, kills
 from tests.small_scenes import write_blender_scene
 from tests.synthetic_photos import write_synthetic_photos
 
-FEW_FEATURES = ("--sfm.max-features", "800", "--until", "normalise")
+FEW_FEATURES = ("--sfm.max-features", "800")
 
 
 def main() -> int:
@@ -23,7 +23,9 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         known = Chain(write_blender_scene(folder / "known"), folder / "known.nerf")
-        colmap = Chain(write_synthetic_photos(folder / "colmap").folder, folder / "colmap.nerf", FEW_FEATURES)
+        colmap = Chain(
+            write_synthetic_photos(folder / "colmap").folder, folder / "colmap.nerf", FEW_FEATURES, until="normalise"
+        )
         for name, campaign, count in (("SIGKILL", kills, given.kills), ("signals", interruptions, given.signals)):
             for words, chain, stages, share in (
                 ("cameras known", known, list(known.seconds), count - count // 4),

@@ -21,6 +21,7 @@ class Chain:
     photos: Path
     workspace: Path
     options: tuple[str, ...] = ()
+    until: str = "report"
     seconds: dict[str, float] = field(default_factory=dict)  # of each stage
 
     def __post_init__(self) -> None:
@@ -30,7 +31,8 @@ class Chain:
 
     def start(self, workspace: Path, *more: str, says: Path | None = None, prepare: Prepare = None) -> Program:
         """The same run in another workspace; what it says goes to ``says``, by default beside that."""
-        words = run_words(self.photos, workspace, *self.options, *more)
+        as_far = () if "--until" in more else ("--until", self.until)
+        words = run_words(self.photos, workspace, *self.options, *as_far, *more)
         return Program(words, says or workspace.parent / f"{workspace.name}.says", prepare)
 
     def before(self, stage: str, to: Path) -> Path:
@@ -38,11 +40,12 @@ class Chain:
         stages = list(self.seconds)
         return copy_workspace(self.workspace, to, tuple(stages[stages.index(stage) :]))
 
-    def lost(self, workspace: Path, *more: str, until: str = "report", says: Path | None = None) -> list[str]:
+    def lost(self, workspace: Path, *more: str, until: str | None = None, says: Path | None = None) -> list[str]:
         """Run again and name the stages, as far as ``until``, whose results are not those of the undisturbed run."""
+        until = until or self.until
         self.start(workspace, *more, "--until", until, says=says).finish()
         found, stages = results(workspace), list(self.seconds)
-        asked = stages[: stages.index(until) + 1] if until in stages else stages
+        asked = stages[: stages.index(until) + 1]
         return [stage for stage in asked if stage != "report" and found.get(stage) != self.expected[stage]]
 
 
