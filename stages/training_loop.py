@@ -320,12 +320,12 @@ class TrainingRun:
         if isinstance(fault, Lost):
             self.log.event("lost", self.state.step, symptom=str(fault))
             return f"{slower}."
-        from safetensors.torch import save_file
+        from safetensors.torch import save
 
         from nerf.training import RAYS
 
         name = f"nonfinite_{fault.step}.safetensors"
-        save_file({key: tensor.contiguous() for key, tensor in fault.batch.items()}, self.folder / name)
+        (self.folder / name).write_bytes(save({key: tensor.contiguous() for key, tensor in fault.batch.items()}))
         self.log.event("nonfinite", fault.step, quantity=fault.quantity, batch=name)
         advice = "Check the cameras, which give the rays" if fault.quantity == RAYS else slower
         return f"{advice}; the batch is kept in {self.folder / name}."
