@@ -302,7 +302,10 @@ class TrainingRun:
             why = f"{fault}, after {MOST_ROLLBACKS} roll-backs that each halved the learning rate"
             raise StageError("training diverged", why, hint)
         checkpoint = latest_checkpoint(self.checkpoints, self.progress.note, self._load_sound)
-        if checkpoint is None:
+        if checkpoint is None and self.budget.after is not None:
+            self._go_on(self.budget.after)
+            self.state.rollbacks = rollbacks
+        elif checkpoint is None:
             self._begin(self.state.anew(self.state.restarts, rollbacks))
         else:
             self.state.step, self.state.rollbacks = checkpoint.step, rollbacks
