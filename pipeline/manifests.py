@@ -81,8 +81,9 @@ def read(folder: Path) -> Manifest:
         raise
     except ValidationError as error:
         raise BadManifest(f"{folder / NAME} does not parse ({first_fault(error)})") from error
-    if not all(set(entry) == {"size", "sha256"} for entry in manifest.outputs.values()):
-        raise BadManifest(f"{folder / NAME} lists outputs without their size and sha256")
+    for name, entry in manifest.outputs.items():
+        if not (isinstance(entry.get("size"), int) and isinstance(entry.get("sha256"), str)):
+            raise BadManifest(f"{folder / NAME} does not tell size and sha256 of {name[:40]!r}")
     if manifest.outputs_digest != outputs_digest(manifest.outputs):
         raise BadManifest(f"{folder / NAME} contradicts itself: its digest is not that of its outputs")
     return manifest
