@@ -86,8 +86,9 @@ def read(folder: Path) -> Manifest:
         raise BadManifest(f"{folder / NAME} cannot be used ({first_fault(error)})") from error
     except (ValueError, TypeError, RecursionError) as error:
         raise BadManifest(f"{folder / NAME} cannot be used ({error})") from error
-    if not all(set(entry) == {"size", "sha256"} for entry in (*manifest.outputs.values(), *manifest.records.values())):
-        raise BadManifest(f"{folder / NAME} lists files without their size and sha256")
+    for name, entry in {**manifest.outputs, **manifest.records}.items():
+        if not (isinstance(entry.get("size"), int) and isinstance(entry.get("sha256"), str)):
+            raise BadManifest(f"{folder / NAME} does not tell size and sha256 of {name[:40]!r}")
     if manifest.outputs_digest != outputs_digest(manifest.outputs):
         raise BadManifest(f"{folder / NAME} contradicts itself: its digest is not that of its outputs")
     return manifest

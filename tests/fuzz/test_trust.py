@@ -3,6 +3,7 @@
 import ast
 import json
 import socket
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 from PIL import Image
 
 from pipeline.cli import run_command
-from pipeline.manifests import BadManifest, Manifest, check_outputs, outputs_digest
+from pipeline.manifests import BadManifest, Manifest, check_outputs, outputs_digest, read
 from pipeline.workspace import Workspace
 from stages.contract import StageError
 from stages.photos import Photo, read_photos, write_photos
@@ -141,6 +142,14 @@ def test_outputs_of_a_manifest_lie_in_its_folder(tmp_path: Path) -> None:
         manifest = Manifest("mesh", 1, "0", {}, {}, outputs, outputs_digest(outputs), {}, {}, "", 0.0, "")
         with pytest.raises(BadManifest, match="leads out of its folder"):
             check_outputs(folder, manifest)
+
+
+@pytest.mark.parametrize("entry", [{}, {"size": 1.5, "sha256": "0"}, {"size": 1, "sha256": float("nan")}])
+def test_outputs_of_a_manifest_have_a_size_and_a_digest(entry: dict, tmp_path: Path) -> None:
+    manifest = Manifest("mesh", 1, "0", {}, {}, {"a": entry}, "0", [], {}, "", 0.0, "")
+    (tmp_path / "manifest.json").write_text(json.dumps(asdict(manifest)))
+    with pytest.raises(BadManifest, match="does not tell size and sha256 of 'a'"):
+        read(tmp_path)
 
 
 @pytest.mark.parametrize("link", ["mesh", "mesh/0123456789abcdef", "output", "train/0123456789abcdef.partial"])
