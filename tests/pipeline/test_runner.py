@@ -41,13 +41,13 @@ def photos(tmp_path: Path) -> Path:
 def bring(tmp_path: Path, photos: Path) -> Bring:
     """Run the fake chain with options like sfm={"offset": 1}; says whether anything ran, and clears ``calls``."""
 
-    def go(root: Path = tmp_path / "w.nerf", stages=ALL, force=(), replan=False, **options: dict) -> bool:
+    def go(root: Path = tmp_path / "w.nerf", stages=ALL, force=(), replan=False, verify=False, **options: dict) -> bool:
         calls.clear()
         options["ingest"] = {"photos": photos} | options.get("ingest", {})
         settings = FakeSettings.model_validate(options)
         with Workspace(root) as workspace:
             runner = Runner(workspace, settings, SilentDisplay())  # type: ignore[arg-type]
-            return runner.run(stages, force=frozenset(force), replan=replan)
+            return runner.run(stages, force=frozenset(force), replan=replan, verify=verify)
 
     return go
 
@@ -213,6 +213,71 @@ def test_a_damaged_result_is_set_aside_and_made_again(bring: Bring, tmp_path: Pa
     assert calls == ["train"]
     assert (folder.with_name(folder.name + ".bad")).is_dir()
     assert json.loads((folder / "result.json").read_text()) == {"steps": 3}
+
+
+def flip(file: Path) -> None:
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 4
+    file.write_bytes(content)
+
+
+def test_a_flipped_bit_is_found_before_anything_reads_it(bring: Bring, tmp_path: Path):
+    bring()
+    (folder,) = (tmp_path / "w.nerf/sfm").iterdir()
+    flip(folder / "deep/number.json")
+    assert not bring(), "a command with nothing to do looks at sizes alone"
+    bring(train={"steps": 5})
+    assert calls == ["sfm", "train"]
+    assert folder.with_name(folder.name + ".bad").is_dir()
+
+
+def test_a_record_counts_too_where_asked_to_verify(bring: Bring, tmp_path: Path):
+    bring()
+    (folder,) = (tmp_path / "w.nerf/sfm").iterdir()
+    flip(folder / "log.txt")
+    assert [s.state for s in status.all_statuses(*reader(tmp_path / "w.nerf"))] == ["cached"] * 3
+    assert [s.state for s in status.all_statuses(*reader(tmp_path / "w.nerf"), deep=True)][1] == "damaged"
+    bring(verify=True)
+    assert calls == ["sfm"]
+
+
+def test_a_flipped_bit_in_the_books_is_found(bring: Bring, tmp_path: Path):
+    bring()
+    run_file = tmp_path / "w.nerf/run.json"
+    run_file.write_text(run_file.read_text().replace('"steps": 3', '"steps": 7'))
+    with pytest.raises(StageError, match="it has changed since it was written"):
+        Workspace.existing(tmp_path / "w.nerf").read_run()
+
+
+def test_ctrl_c_reads_no_photos(bring: Bring, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    bring()
+
+    def interrupted(*_: object) -> None:
+        reads.append("photos")
+        raise KeyboardInterrupt
+
+    reads: list[str] = []
+    monkeypatch.setattr(Runner, "_photos_digest", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        bring()
+    assert reads == ["photos"]
+    assert (tmp_path / "w.nerf/output/result.json").exists(), "nothing was at work, so nothing is out of date"
+
+
+def test_a_full_disk_under_the_books_is_the_workspaces_fault(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    with Workspace(tmp_path / "w.nerf") as workspace:
+        monkeypatch.setattr("pipeline.workspace.write_durably", full)
+        with pytest.raises(StageError, match="No space left on device"):
+            workspace.write_run({})
+    monkeypatch.setattr(Path, "write_text", full)
+    with pytest.raises(StageError, match="No space left on device"), Workspace(tmp_path / "other.nerf"):
+        pass
+    monkeypatch.undo()
+    with Workspace(tmp_path / "other.nerf"):
+        pass  # the lock is free again
 
 
 def test_a_stage_error_names_its_stage_and_keeps_the_rest(bring: Bring, tmp_path: Path):
