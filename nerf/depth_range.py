@@ -9,6 +9,7 @@ REGION_HALF = 0.9
 FEWEST_POINTS = 10  # fewer say nothing about a photo's depth range; all photos together then do
 NEAR_MARGIN = 0.7  # bare surfaces carry no points: the nearest thing may be nearer than the nearest point
 LEAST_NEAR = 0.05 * REGION_HALF  # for cameras in the region whose depths nobody knows
+BEYOND = 2.0  # a camera far from the region sees at least as far behind it as it is in front of it
 FARTHEST, LEAST_FAR = 1000.0, 20.0  # contraction maps these to 0.001 and 0.05 from the end of the world
 
 
@@ -17,17 +18,17 @@ def near_and_far(scene: Reconstruction, bounded: bool) -> tuple[Float[np.ndarray
 
     Bounded: from where rays enter the region (or from the nearest points, from within it) to its farthest corner.
     Unbounded: from 0.7 times the nearest points to four times the farthest, at least 20 and at most 1000 units,
-    which costs little because samples are spaced ever wider with distance.
+    which costs little because samples are spaced ever wider with distance; from far away at least to twice the region's
+    farthest corner.
     """
     entry, exit_ = _distances_to_region(scene.centres)
     near, far = _points_range(scene)
     # cameras that are inside the region and see no points still need a positive near
     near = np.where(np.isfinite(near), near, np.maximum(entry, LEAST_NEAR))
     if bounded:
-        near, far = np.maximum(entry, np.minimum(near, 0.5 * exit_)), exit_
-    else:
-        far = np.clip(4 * far, LEAST_FAR, FARTHEST)
-    return near, far
+        return np.maximum(entry, np.minimum(near, 0.5 * exit_)), exit_
+    far = np.maximum(np.clip(4 * far, LEAST_FAR, FARTHEST), BEYOND * exit_)
+    return np.minimum(near, 0.5 * far), far
 
 
 def _distances_to_region(centres: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:

@@ -21,9 +21,16 @@ from nerf.kernels.marching import unit_coordinates
 from nerf.model import Rendering
 from nerf.randomness import generator
 from nerf.rays import Rays
+from nerf.stopwatch import Work, part
 from nerf.waves import HIDDEN_BEHIND, Wave, front_to_back, packed
 
 INITIAL_FEATURE = 1e-4
+# Far beyond any use: no loop over them is endless, and indices stay within 32 bits.
+LARGEST = {"levels": 64, "features": 256, "log2_rows": 30, "finest": 2**20, "cache_cells": 1024} | {
+    "steps": 10**6,
+    "most_samples": 10**6,
+}
+CORNERS = 8  # of a cell: rows that a point reads of each grid
 
 
 @dataclass(frozen=True)
@@ -52,10 +59,13 @@ class GridSettings:
         for name, least in (at_least | {"finest": self.coarsest, "cache_cells": 4}).items():
             if getattr(self, name) < least:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be at least {least}")
+        for name, most in LARGEST.items():
+            if getattr(self, name) > most:
+                raise ValueError(f"{name} is {getattr(self, name)}; it must be at most {most}")
         if self.cache_cells % 4:
             raise ValueError(f"cache_cells is {self.cache_cells}; it must be a multiple of 4")
-        if not (self.shortest_step > 0 and self.cone > 0):
-            raise ValueError(f"shortest_step ({self.shortest_step}) and cone ({self.cone}) must be positive")
+        if not (0 < self.shortest_step < math.inf and 0 < self.cone < math.inf):
+            raise ValueError(f"shortest_step ({self.shortest_step}) and cone ({self.cone}) must be positive numbers")
 
     @property
     def layout(self) -> GridLayout:
@@ -179,17 +189,19 @@ class GridField(nn.Module):
         """Density of all samples in occupied cells; colour of those that can be seen."""
         backend, rays = self.backend, Rays(*(part.contiguous() for part in rays))
         waves = list(self._waves(rays, jitter))
-        samples, order = packed(waves, len(jitter))
-        sigma = torch.cat([wave.density.sigma for wave in waves]).index_select(0, order)
-        samples, seen = backend.visible_front(samples, sigma, HIDDEN_BEHIND)
-        rows = order.index_select(0, seen)
-        points = torch.cat([wave.points for wave in waves]).index_select(0, rows)
-        density = DensityPass(
-            *(torch.cat(parts).index_select(0, rows) for parts in zip(*(wave.density for wave in waves), strict=True))
-        )
-        harmonics = self.of_directions(rays.directions)
+        with part("march"):
+            samples, order = packed(waves, len(jitter))
+            sigma = torch.cat([wave.density.sigma for wave in waves]).index_select(0, order)
+            samples, seen = backend.visible_front(samples, sigma, HIDDEN_BEHIND)
+            rows = order.index_select(0, seen)
+            points = torch.cat([wave.points for wave in waves]).index_select(0, rows)
+            of_waves = zip(*(wave.density for wave in waves), strict=True)
+            density = DensityPass(*(torch.cat(parts).index_select(0, rows) for parts in of_waves))
+        with part("encode"):
+            harmonics = self.of_directions(rays.directions)
         colour = grid_mlp.colour_forward(self.weights, backend, samples, density.geometry, harmonics)
-        rendering, weights = backend.composite(samples, density.sigma, colour.colour, background, rays.far)
+        with part("composite"):
+            rendering, weights = backend.composite(samples, density.sigma, colour.colour, background, rays.far)
         return GridPass(rays, background, len(order), samples, points, density, colour, rendering, weights)
 
     def backward(self, done: GridPass, grad: Rendering, grad_weights: Float[Tensor, "samples"]) -> GridGradients:
@@ -218,4 +230,6 @@ class GridField(nn.Module):
         return front_to_back(self.backend, self.bits, self.lattice, self._density_pass, rays, jitter)
 
     def _density_pass(self, unit: Float[Tensor, "points 3"]) -> DensityPass:
-        return grid_mlp.density_forward(self.weights, self.backend.encode(self.layout, self.table, unit))
+        with part("gather", Work(rows=CORNERS * len(self.layout.resolutions) * len(unit))):
+            features = self.backend.encode(self.layout, self.table, unit)
+        return grid_mlp.density_forward(self.weights, features)

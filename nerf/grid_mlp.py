@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf.kernels import Backend, Samples
+from nerf.stopwatch import Work, part
 
 HIDDEN = 64
 GEOMETRY = 16  # numbers that the density network hands to the colour network; the first is the logarithm of density
@@ -90,10 +91,22 @@ def no_directions_backward(
     return torch.zeros_like(directions)
 
 
+def density_products(weights: Weights) -> int:
+    """Multiplications and additions of a sample's density; the way back has twice as many."""
+    return 2 * (weights.density_hidden.numel() + weights.density_out.numel())
+
+
+def colour_products(weights: Weights) -> int:
+    """Multiplications and additions of a sample's colour, without what its ray shares; twice as many on the
+    way back."""
+    return 2 * (GEOMETRY * HIDDEN + weights.colour_out.numel())
+
+
 def density_forward(weights: Weights, features: Float[Tensor, "samples features"]) -> DensityPass:
     """Features to geometry."""
-    hidden = (features @ weights.density_hidden).relu_()
-    return DensityPass(features, hidden, hidden @ weights.density_out.T)
+    with part("mlp", Work(products=density_products(weights) * len(features))):
+        hidden = (features @ weights.density_hidden).relu_()
+        return DensityPass(features, hidden, hidden @ weights.density_out.T)
 
 
 def colour_forward(
@@ -104,9 +117,10 @@ def colour_forward(
     harmonics: Float[Tensor, "rays direction"],
 ) -> ColourPass:
     """Geometry and viewing direction to colour, through a sigmoid."""
-    hidden = geometry @ weights.colour_hidden[:GEOMETRY]
-    backend.add_ray_relu(samples, hidden, harmonics @ weights.colour_hidden[GEOMETRY:])
-    return ColourPass(geometry, harmonics, hidden, (hidden @ weights.colour_out.T).sigmoid_())
+    with part("mlp", Work(products=colour_products(weights) * len(geometry))):
+        hidden = geometry @ weights.colour_hidden[:GEOMETRY]
+        backend.add_ray_relu(samples, hidden, harmonics @ weights.colour_hidden[GEOMETRY:])
+        return ColourPass(geometry, harmonics, hidden, (hidden @ weights.colour_out.T).sigmoid_())
 
 
 def colour_backward(

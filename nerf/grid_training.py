@@ -9,9 +9,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from nerf import grid_mlp
 from nerf.density_cache import DensityCache
 from nerf.effects import AS_GIVEN, AS_RENDERED, PhotoColours, PhotoRays, Seen
-from nerf.grid_field import GridField, GridPass
+from nerf.grid_field import CORNERS, GridField, GridPass
 from nerf.grid_mlp import Weights
 from nerf.metrics import psnr
 from nerf.model import Rendering
@@ -19,7 +20,8 @@ from nerf.parallel import in_order
 from nerf.randomness import generator
 from nerf.ray_bank import RayBank
 from nerf.rays import Rays
-from nerf.training import NonFinite, StepResult
+from nerf.stopwatch import Work, part
+from nerf.training import RAYS, NonFinite, StepResult, all_finite
 
 WARM_UP_STEPS = 20
 CONSTANT_SHARE = 0.2  # of the run, before the rate begins to fall
@@ -29,6 +31,7 @@ FINAL_RATE = 0.05  # of the rate at first
 FIRST_DISTORTION = 0.25  # of its weight
 FULL_DISTORTION_SHARE = 0.3  # of the run
 FIRST_SAMPLES_PER_RAY = 128.0
+ADAM_BYTES = 4 * 7  # of an entry of the table: its gradient read and cleared, itself and its moments read and written
 MEMORY = 0.9  # how much of the mean of samples per ray remains after each step
 
 
@@ -111,7 +114,7 @@ class GridTrainer:
         self.model, self.bank, self.settings = model, bank, settings
         self.photo_rays, self.photo_colours = photo_rays, photo_colours
         self.cache = DensityCache(model)
-        self.photo_parts = [part for part in (photo_rays, photo_colours) if part.parameters]
+        self.photo_parts = [each for each in (photo_rays, photo_colours) if each.parameters]
         self.photo_parameters = {**photo_rays.parameters, **photo_colours.parameters}
         self.parameters = {"table": model.table, **model.weights._asdict(), **self.photo_parameters}
         self.mean = {name: torch.zeros_like(tensor) for name, tensor in self.parameters.items()}
@@ -125,8 +128,9 @@ class GridTrainer:
         parts = list(in_order(partial(self._part, step, share, rays), range(self.settings.chunks), device))
         loss, error = self._finite(step, parts)
         self._update(parts, rate_scale * rate_factor(step, share), step + 1)
-        self.cache.refresh(step, generator(device, self.settings.seed, step, self.settings.chunks))
-        samples = sum(len(part.points) for part in parts)
+        with part("cache"):
+            self.cache.refresh(step, generator(device, self.settings.seed, step, self.settings.chunks))
+        samples = sum(len(each.points) for each in parts)
         rays *= self.settings.chunks
         self.samples_per_ray.mul_(MEMORY).add_((1 - MEMORY) * samples / rays)
         return StepResult(loss, psnr(error), rays)
@@ -173,17 +177,29 @@ class GridTrainer:
 
     def _part(self, step: int, share: float, rays: int, chunk: int) -> _Part:
         """What a chunk of so many rays adds to loss and gradients."""
-        batch = self._batch(step, chunk, rays)
-        done = self.model.forward(self.photo_rays.forward(batch.rays, batch.view), batch.jitter, batch.background)
+        with part("batch"):
+            batch = self._batch(step, chunk, rays)
+            seen_along = self.photo_rays.forward(batch.rays, batch.view)
+            if not all_finite(seen_along):
+                raise NonFinite(RAYS, step, _whole([batch]))
+        done = self.model.forward(seen_along, batch.jitter, batch.background)
         spread_weight = self.settings.distortion * distortion_factor(share)
-        loss = self._loss(rays * self.settings.chunks, spread_weight, done, batch)
-        gradients = self.model.backward(done, loss.grad, loss.grad_weights)
-        grad_rays = partial(self.model.rays_backward, done, gradients)
-        photos = loss.grad_photos | self.photo_rays.backward(batch.rays, batch.view, grad_rays)
+        with part("composite"):
+            loss = self._loss(rays * self.settings.chunks, spread_weight, done, batch)
+        with part("backward", self._backward_work(done)):
+            gradients = self.model.backward(done, loss.grad, loss.grad_weights)
+            grad_rays = partial(self.model.rays_backward, done, gradients)
+            photos = loss.grad_photos | self.photo_rays.backward(batch.rays, batch.view, grad_rays)
         weights, features, _ = gradients
         thickness = done.density.sigma * done.samples.dt
         norm = torch.nn.utils.get_total_norm([*weights, features, *photos.values()])
         return _Part(batch, loss.value, loss.squared_error, weights, features, done.points, photos, norm, thickness)
+
+    def _backward_work(self, done: GridPass) -> Work:
+        weights = self.model.weights
+        products = 2 * (grid_mlp.density_products(weights) + grid_mlp.colour_products(weights)) * len(done.points)
+        to_points = CORNERS * len(self.model.layout.resolutions) * len(done.points) if self.photo_rays.parameters else 0
+        return Work(products, to_points)
 
     def _loss(self, rays: int, spread_weight: float, done: GridPass, batch: GridBatch) -> Loss:
         seen = Seen(done.rendering, batch.background, batch.view)
@@ -203,11 +219,11 @@ class GridTrainer:
 
         The table's gradient is a sum of the features' gradients with weights up to 1: finite if their norm is.
         """
-        each = ([part.loss for part in parts], [part.squared_error for part in parts], [part.norm for part in parts])
+        each = zip(*((chunk.loss, chunk.squared_error, chunk.norm) for chunk in parts), strict=True)
         loss_now, error_now, norm_now = (float(torch.stack(values).sum()) for values in each)
         for quantity, value in {"loss": loss_now, "gradient": norm_now}.items():
             if not abs(value) < float("inf"):
-                raise NonFinite(quantity, step, _whole([part.batch for part in parts]))
+                raise NonFinite(quantity, step, _whole([chunk.batch for chunk in parts]))
         return loss_now, error_now
 
     def _update(self, parts: Sequence[_Part], factor: float, count: int) -> None:
@@ -216,7 +232,7 @@ class GridTrainer:
         finest_first = range(len(self.model.layout.resolutions) - 1, -1, -1)  # no core waits long for the last
         rate = self.settings.rate * factor
         work = [partial(self._update_level, level, parts, rate, count) for level in finest_first]
-        of_networks = [part.weights._asdict() for part in parts]
+        of_networks = [chunk.weights._asdict() for chunk in parts]
         work.append(partial(self._update_small, Weights._fields, of_networks, rate, count))
         work.append(partial(self._raise_cache, parts))
         for of_photos in self.photo_parts:
@@ -226,36 +242,35 @@ class GridTrainer:
 
     def _update_level(self, level: int, parts: Sequence[_Part], rate: float, count: int) -> None:
         layout, backend = self.model.layout, self.model.backend
-        for part in parts:
-            backend.encode_backward_table(layout, level, part.points, part.features, self.grad_table)
+        with part("scatter", Work(rows=CORNERS * sum(len(each.points) for each in parts))):
+            for each in parts:
+                backend.encode_backward_table(layout, level, each.points, each.features, self.grad_table)
         rows = slice(layout.first_rows[level], layout.first_rows[level + 1])
-        backend.adam(
-            self.model.table[rows],
-            self.grad_table[rows],
-            self.mean["table"][rows],
-            self.square["table"][rows],
-            rate,
-            count,
-        )
+        of_level = [self.model.table, self.grad_table, self.mean["table"], self.square["table"]]
+        table, grad, mean, square = (tensor[rows] for tensor in of_level)
+        with part("optimiser", Work(bytes=ADAM_BYTES * table.numel())):
+            backend.adam(table, grad, mean, square, rate, count)
 
     def _update_small(
         self, names: Iterable[str], of_parts: Sequence[dict[str, Tensor]], rate: float, count: int
     ) -> None:
         """Of parameters that are small beside the table."""
-        for name in names:
-            gradient = torch.stack([part[name] for part in of_parts]).sum(0)
-            parameter, mean, square = self.parameters[name], self.mean[name], self.square[name]
-            self.model.backend.adam(parameter, gradient, mean, square, rate, count)
+        with part("optimiser"):
+            for name in names:
+                gradient = torch.stack([each[name] for each in of_parts]).sum(0)
+                parameter, mean, square = self.parameters[name], self.mean[name], self.square[name]
+                self.model.backend.adam(parameter, gradient, mean, square, rate, count)
 
     def _update_photos(
         self, of_photos: PhotoRays | PhotoColours, parts: Sequence[_Part], rate: float, count: int
     ) -> None:
-        self._update_small(of_photos.parameters, [part.photos for part in parts], rate, count)
+        self._update_small(of_photos.parameters, [chunk.photos for chunk in parts], rate, count)
         of_photos.settle()
 
     def _raise_cache(self, parts: Sequence[_Part]) -> None:
-        for part in parts:
-            self.cache.raise_to(part.points, part.thickness)
+        with part("cache"):
+            for each in parts:
+                self.cache.raise_to(each.points, each.thickness)
 
 
 def _whole(batches: Sequence[GridBatch]) -> dict[str, Tensor]:

@@ -13,6 +13,11 @@ from nerf.up_vector import Up, find_up
 
 # Shortest level heading that is one: of the mean of all photos, of the first photo (beyond rounding), of an axis.
 LEAST_HEADINGS = (0.3, 1e-6, 0.0)
+# Of the distance from the origin: what places differ by that are written with twelve digits, or rounded a few times.
+ONE_PLACE = 1e-12
+LEAST_HALF = (
+    1e-30  # of the region in input units: what single-precision numbers, in which meshes are written, still tell apart
+)
 
 
 class Normalisation(NamedTuple):
@@ -37,16 +42,20 @@ def normalise(sfm: Reconstruction, has_alpha: bool, roi: tuple[float, float, flo
     ``roi`` (x, y, z, radius in the sfm frame) replaces the automatic region; the cube's half side is the radius.
     The result is the same up to rounding for every similar reconstruction: x' = scale rotation (x - centre) with
     all three found from shapes alone, in float64 relative to the cameras' middle.
-    Raises ValueError when the cameras stand in one place and there are no points.
+    Raises ValueError when the cameras stand in one place and there are no points, or where the scene is too small for
+    numbers, be it at its distance from the origin or by itself.
     """
     layout, up = find_layout(sfm), find_up(sfm)
     rotation = _frame(up.direction, sfm.axes)
     middle = spatial_median(sfm.centres)
+    _check_extent(sfm, middle)
     upright = sfm.in_frame(rotation, middle)
     if roi is None:
         region = find_region(upright, layout, has_alpha)
     else:
         region = Region(rotation @ (np.array(roi[:3]) - middle), roi[3])
+    if not region.half >= LEAST_HALF:
+        raise ValueError(f"it is {region.half:.2g} units large, and {LEAST_HALF:g} is the least")
     scale = REGION_HALF / region.half
     centre = middle + rotation.T @ region.centre
     scene = upright.in_frame(np.eye(3), region.centre, scale)
@@ -63,6 +72,16 @@ def normalise(sfm: Reconstruction, has_alpha: bool, roi: tuple[float, float, flo
         beyond=share_beyond(scene, np.zeros(3), REGION_HALF),
         arc_deg=_arc_deg(scene.centres),
     )
+
+
+def _check_extent(sfm: Reconstruction, middle: Float[np.ndarray, "3"]) -> None:
+    places = np.concatenate([sfm.centres, sfm.points])
+    extent, distance = np.abs(places - middle).max(), np.abs(places).max()
+    if 0 < extent <= ONE_PLACE * distance:
+        raise ValueError(
+            f"all its places are within {extent:.2g} units, {distance:.2g} from the origin: one place, as far as "
+            "numbers of 16 digits can tell"
+        )
 
 
 def _frame(up: Float[np.ndarray, "3"], axes: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3 3"]:

@@ -27,6 +27,7 @@ from nerf.model import Rendering
 from nerf.randomness import generator as seeded_generator
 from nerf.rays import Rays, clip_to_box, points_on
 from nerf.sampling import Spacing, midpoint_edges, sample_pdf, stratified
+from nerf.stopwatch import Work, part
 
 BOX = 0.95  # between the region of interest, 0.9, and half the encoding's period, 1
 CONTRACTED_SCALE = 0.45  # takes the contracted cube of half size 2 to 0.9
@@ -42,6 +43,9 @@ def shifted_softplus(raw: Float[Tensor, "*points"]) -> Float[Tensor, "*points"]:
     """log(1 + exp(raw + SOFTPLUS_SHIFT)): INITIAL_DENSITY at 0, with a gradient everywhere."""
     # Beyond the threshold torch returns its argument; at 40 the difference is below float64's resolution.
     return functional.softplus(raw + SOFTPLUS_SHIFT, threshold=40)
+
+
+LARGEST = 10_000  # of any size of these networks: far beyond any use, and no loop over it is endless
 
 
 @dataclass(frozen=True)
@@ -72,6 +76,8 @@ class PaperSettings:
         for name, least in (at_least | {"samples_coarse": 2, "samples_fine": 1}).items():
             if getattr(self, name) < least:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be at least {least}")
+            if getattr(self, name) > LARGEST:
+                raise ValueError(f"{name} is {getattr(self, name)}; it must be at most {LARGEST}")
         if self.spacing not in get_args(Spacing):
             raise ValueError(f"spacing is {self.spacing!r}; it must be 'linear' or 'log'")
         if self.density_activation not in ("softplus", "relu"):
@@ -100,19 +106,26 @@ class PaperMlp(nn.Module):
         self.feature = _linear(width, width, init)
         self.colour_hidden = _linear(width + direction * settings.view_dependence, width // 2, init)
         self.colour_head = _linear(width // 2, 3, init)
+        once_per_ray = (width // 2) * direction * settings.view_dependence
+        of_encoding = position * width * (2 if settings.skip + 1 < settings.depth else 1)
+        # Multiplications and additions per point, forward and back. On the way back each weight has its own gradient,
+        # and passes on that of its input unless that is an encoding.
+        self.products = 2 * (sum(each.numel() for each in self.parameters() if each.ndim == 2) - once_per_ray)
+        self.products_backward = 2 * self.products - 2 * of_encoding
 
     def forward(
         self, points: Float[Tensor, "*rays n 3"], directions: Float[Tensor, "*rays 3"]
     ) -> tuple[Float[Tensor, "*rays n"], Float[Tensor, "*rays n 3"]]:
         """Density and colour of n points on each ray; points lie in (-1, 1)^3."""
-        hidden = self._hidden(points)
-        feature = self.feature(hidden)
-        if self.settings.view_dependence:
-            encoded = self._encode(DIRECTION_SCALE * directions, self.settings.direction_frequencies)
-            colour = _linear_of_parts(self.colour_hidden, feature, encoded[..., None, :])
-        else:
-            colour = self.colour_hidden(feature)
-        return self._sigma(hidden), torch.sigmoid(self.colour_head(torch.relu(colour)))
+        with part("mlp", Work(products=self.products * points[..., 0].numel())):
+            hidden = self._hidden(points)
+            feature = self.feature(hidden)
+            if self.settings.view_dependence:
+                encoded = self._encode(DIRECTION_SCALE * directions, self.settings.direction_frequencies)
+                colour = _linear_of_parts(self.colour_hidden, feature, encoded[..., None, :])
+            else:
+                colour = self.colour_hidden(feature)
+            return self._sigma(hidden), torch.sigmoid(self.colour_head(torch.relu(colour)))
 
     def density(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points"]:
         """Density alone, without the work for colour."""
@@ -136,7 +149,8 @@ class PaperMlp(nn.Module):
 
     def _encode(self, x: Float[Tensor, "*batch 3"], frequencies: int) -> Float[Tensor, "*batch encoded"]:
         dtype = self.density_head.weight.dtype
-        return positional_encoding(x, frequencies, dtype) if self.settings.positional_encoding else x.to(dtype)
+        with part("encode"):
+            return positional_encoding(x, frequencies, dtype) if self.settings.positional_encoding else x.to(dtype)
 
 
 class PaperNerf(nn.Module):
@@ -187,8 +201,9 @@ class PaperNerf(nn.Module):
     def _in_field(self, rays: Rays) -> Rays:
         """In float64, as are the points and sums on the rays: 2⁹π, the highest frequency, takes the rounding of a
         float32 point to 1e-4. The networks compute in the type of their weights."""
-        exact = Rays(*(part.double() for part in rays))
-        return exact if self.settings.contracted else clip_to_box(exact, BOX)
+        with part("sampling"):
+            exact = Rays(*(each.double() for each in rays))
+            return exact if self.settings.contracted else clip_to_box(exact, BOX)
 
     def _coordinates(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
         return CONTRACTED_SCALE * contract(points) if self.settings.contracted else points
@@ -196,7 +211,8 @@ class PaperNerf(nn.Module):
     def _first_samples(self, rays: Rays, generator: torch.Generator | None) -> Float[Tensor, "*rays ends"]:
         settings = self.settings
         count = settings.samples_coarse if settings.hierarchical else settings.queries_per_ray
-        return stratified(rays.near, rays.far, count, generator, settings.spacing)
+        with part("sampling"):
+            return stratified(rays.near, rays.far, count, generator, settings.spacing)
 
     def _refined(
         self,
@@ -206,16 +222,19 @@ class PaperNerf(nn.Module):
         generator: torch.Generator | None,
     ) -> Float[Tensor, "*rays more"]:
         """The sorted union of the samples and those drawn from their weights (section 5.2); far stays last."""
-        drawn = sample_pdf(midpoint_edges(t, rays.near), weights, self.settings.samples_fine, generator)
-        return torch.sort(torch.cat([t, drawn], -1)).values
+        with part("sampling"):
+            drawn = sample_pdf(midpoint_edges(t, rays.near), weights, self.settings.samples_fine, generator)
+            return torch.sort(torch.cat([t, drawn], -1)).values
 
     def _seen(
         self, mlp: PaperMlp, rays: Rays, t: Float[Tensor, "*rays ends"], background: Float[Tensor, "*#rays 3"]
     ) -> tuple[Rendering, Float[Tensor, "*rays ends-1"]]:
-        points = self._coordinates(points_on(rays, t[..., :-1]))
+        with part("sampling"):
+            points = self._coordinates(points_on(rays, t[..., :-1]))
         sigma, colour = mlp(points, rays.directions)
-        rendering, weights = composite(sigma, colour, t, background)
-        return Rendering(*(part.to(background.dtype) for part in rendering)), weights
+        with part("composite"):
+            rendering, weights = composite(sigma, colour, t, background)
+            return Rendering(*(each.to(background.dtype) for each in rendering)), weights
 
 
 def _linear(inputs: int, outputs: int, init: torch.Generator) -> nn.Linear:

@@ -13,6 +13,8 @@ from typing import TypeVar
 
 import torch
 
+from nerf.stopwatch import REST, part
+
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
@@ -48,7 +50,7 @@ def in_order(function: Callable[[Item], Result], items: Iterable[Item], device: 
     pool, under_way = _pool(count), deque[Future[Result]]()
     try:
         for item in items:
-            under_way.append(pool.submit(function, item))
+            under_way.append(pool.submit(_worked, function, item))
             if len(under_way) > 2 * count:
                 yield under_way.popleft().result()
         while under_way:
@@ -56,6 +58,11 @@ def in_order(function: Callable[[Item], Result], items: Iterable[Item], device: 
     finally:
         for future in under_way:
             future.cancel()
+
+
+def _worked(function: Callable[[Item], Result], item: Item) -> Result:
+    with part(REST):
+        return function(item)
 
 
 @functools.cache

@@ -21,6 +21,7 @@ from nerf.randomness import generator
 from nerf.ray_bank import RayBank
 from nerf.rays import Rays
 from nerf.schedule import learning_rate
+from nerf.stopwatch import Work, part
 
 # Rays per chunk of a batch, each on its own core; elsewhere a batch is one chunk. Their gradients are added in order,
 # so results do not depend on the number of cores.
@@ -29,6 +30,7 @@ CHUNK_RAYS = {"cpu": 256}
 # Adam's epsilon in the published code (Keras's default): far below the root of any gradient's square that counts, it
 # keeps a weight without gradient where it is, 0/1e-7 instead of 0/0.
 PUBLISHED_EPSILON = 1e-7
+ADAM_BYTES = 4 * 7  # of a weight: its gradient read, itself and its moments read and written
 
 
 class StepResult(NamedTuple):
@@ -76,6 +78,15 @@ class NonFinite(Exception):
     def __init__(self, quantity: str, step: int, batch: dict[str, Tensor]) -> None:
         super().__init__(f"the {quantity} of step {step} is not finite")
         self.quantity, self.step, self.batch = quantity, step, batch
+
+
+RAYS = "geometry of rays"
+
+
+def all_finite(rays: Rays) -> bool:
+    """Whether samples can be placed on all of them. What is no number would drop out of the comparisons that cut a ray
+    to a box, and the ray would count as one that meets nothing."""
+    return bool(torch.cat([each.flatten() for each in rays]).isfinite().all())
 
 
 @dataclass(frozen=True)
@@ -137,23 +148,24 @@ class PaperTrainer:
         self.bank = bank
         self.settings = settings
         self.photo_rays, self.photo_colours = photo_rays, photo_colours
-        self.photo_parts = [part for part in (photo_rays, photo_colours) if part.parameters]
+        self.photo_parts = [each for each in (photo_rays, photo_colours) if each.parameters]
         self.photo_parameters = {**photo_rays.parameters, **photo_colours.parameters}
         networks = [p for p in model.parameters() if p.requires_grad]
         groups = [{"params": networks, "of_start": 1.0}]
-        for part in self.photo_parts:
-            learnt = [parameter.requires_grad_() for parameter in part.parameters.values()]
-            groups.append({"params": learnt, "of_start": part.rate / settings.rate_start})
+        for of_photos in self.photo_parts:
+            learnt = [parameter.requires_grad_() for parameter in of_photos.parameters.values()]
+            groups.append({"params": learnt, "of_start": of_photos.rate / settings.rate_start})
         self.parameters = [parameter for group in groups for parameter in group["params"]]
         self.optimiser = torch.optim.Adam(groups, betas=(0.9, 0.999), eps=PUBLISHED_EPSILON, fused=True)
 
     def step(self, step: int, share: float, rate_scale: float = 1.0) -> StepResult:
         """One batch, one update. Raises NonFinite before the update, leaving model and optimiser as they were."""
-        batch = self._batch(generator(self.bank.device, self.settings.seed, step))
+        with part("batch"):
+            batch = self._batch(generator(self.bank.device, self.settings.seed, step))
         device = self.bank.device
         starts = range(0, self.settings.batch_rays, CHUNK_RAYS.get(device.type, self.settings.batch_rays))
         parts = list(in_order(partial(self._part, batch, step), starts, device))
-        gradients = [torch.stack(of_parts).sum(0) for of_parts in zip(*(part.gradients for part in parts), strict=True)]
+        gradients = [torch.stack(of).sum(0) for of in zip(*(each.gradients for each in parts), strict=True)]
         norm = torch.nn.utils.get_total_norm(gradients)
         losses, errors = torch.stack([p.loss for p in parts]).sum(), torch.stack([p.fine_error for p in parts]).sum()
         loss, error, norm_now = torch.stack([losses, errors, norm]).tolist()
@@ -165,10 +177,11 @@ class PaperTrainer:
         rate = rate_scale * learning_rate(share, self.settings.rate_start, self.settings.rate_end)
         for group in self.optimiser.param_groups:
             group["lr"] = rate * group["of_start"]
-        self.optimiser.step()
+        with part("optimiser", Work(bytes=ADAM_BYTES * sum(each.numel() for each in self.parameters))):
+            self.optimiser.step()
         with torch.no_grad():
-            for part in self.photo_parts:
-                part.settle()
+            for of_photos in self.photo_parts:
+                of_photos.settle()
         return StepResult(loss, psnr(error), self.settings.batch_rays)
 
     def _part(self, batch: Batch, step: int, start: int) -> _Part:
@@ -176,42 +189,54 @@ class PaperTrainer:
         size = CHUNK_RAYS.get(self.bank.device.type, self.settings.batch_rays)
         rays, target, view, background = batch.part(slice(start, start + size))
         random = generator(self.bank.device, self.settings.seed, step, 1 + start)
-        coarse, fine = self.model.render_training(self.photo_rays.forward(rays, view), background, random)
+        seen_along = self.photo_rays.forward(rays, view)
+        if not all_finite(seen_along):
+            raise NonFinite(RAYS, step, _tensors_of(batch))
+        coarse, fine = self.model.render_training(seen_along, background, random)
 
         def squared_error(rendering: Rendering) -> Float[Tensor, ""]:
             residual = self.photo_colours.residual(Seen(rendering, background, view), target)
             return residual.square().sum() / batch.target.numel()
 
-        fine_error = squared_error(fine)
-        # A field without hierarchy has one rendering and counts it once.
-        loss = fine_error if coarse is fine else squared_error(coarse) + fine_error
-        return _Part(loss.detach(), fine_error.detach(), torch.autograd.grad(loss, self.parameters))
+        with part("composite"):
+            fine_error = squared_error(fine)
+            # A field without hierarchy has one rendering and counts it once.
+            loss = fine_error if coarse is fine else squared_error(coarse) + fine_error
+        with part("backward", self._backward_work(len(view))):
+            return _Part(loss.detach(), fine_error.detach(), torch.autograd.grad(loss, self.parameters))
 
     def state(self) -> dict[str, Tensor]:
         """Weights as ``model.<name>``, what is learnt of photos as ``photo.<name>``, Adam's moments and step counts as
-        ``adam.<parameter>.<name>``."""
-        tensors = {f"model.{name}": tensor for name, tensor in self.model.state_dict().items()}
+        ``adam.<parameter>.<name>``, and the field's settings, to know it by."""
+        tensors = {"settings": torch.frombuffer(bytearray(repr(self.model.settings).encode()), dtype=torch.uint8)}
+        tensors |= {f"model.{name}": tensor for name, tensor in self.model.state_dict().items()}
         tensors |= {f"photo.{name}": tensor.detach() for name, tensor in self.photo_parameters.items()}
         for index, moments in self.optimiser.state_dict()["state"].items():
             tensors |= {f"adam.{index}.{name}": tensor for name, tensor in moments.items()}
         return tensors
 
     def load_state(self, state: dict[str, Tensor]) -> None:
-        """Go back to what :meth:`state` gave. Raises RuntimeError for the state of another architecture."""
+        """Go back to what :meth:`state` gave. Raises RuntimeError for the state of another field."""
+        mine = self.state()["settings"]
+        if "settings" not in state or not torch.equal(state["settings"].cpu(), mine):
+            raise RuntimeError("this state belongs to another field: settings differ")
         weights: dict[str, Tensor] = {}
         moments: dict[int, dict[str, Tensor]] = {}
         for key, tensor in state.items():
-            kind, name = key.split(".", 1)
+            kind, _, name = key.partition(".")
             if kind == "model":
                 weights[name] = tensor
             elif kind == "photo":
                 self.photo_parameters[name].detach().copy_(tensor)
-            else:
+            elif kind == "adam":
                 index, name = name.split(".")
                 moments.setdefault(int(index), {})[name] = tensor.clone()
         self.model.load_state_dict(weights)
         groups = self.optimiser.state_dict()["param_groups"]
         self.optimiser.load_state_dict({"state": moments, "param_groups": groups})
+
+    def _backward_work(self, rays: int) -> Work:
+        return Work(products=self.model.fine.products_backward * self.model.settings.queries_per_ray * rays)
 
     def _batch(self, random: torch.Generator) -> Batch:
         rays, colour, alpha, view = self.bank.sample(self.settings.batch_rays, random)

@@ -17,6 +17,7 @@ from nerf.kernels import Backend, Lattice, Samples
 from nerf.kernels.marching import lattice_coordinate, lattice_distance, starts_of
 from nerf.kernels.packed_compositing import OPAQUE
 from nerf.rays import Rays
+from nerf.stopwatch import part
 
 HIDDEN_BEHIND = 1e-3  # transmittance below which the rest of a ray is left out
 # The optical depth that surely hides the rest: sums of waves round otherwise than the sum that decides.
@@ -50,16 +51,18 @@ def front_to_back(
     number, depth, taken = torch.arange(len(jitter), device=jitter.device), torch.zeros_like(jitter), 0
     while len(number) and taken < lattice.most_samples:
         length = min(_wave_length(len(number)), lattice.most_samples - taken)
-        samples = backend.march(bits, lattice._replace(most_samples=length), rays, jitter)
-        points = backend.sample_points(rays, samples, lattice.contracted)
+        with part("march"):
+            samples = backend.march(bits, lattice._replace(most_samples=length), rays, jitter)
+            points = backend.sample_points(rays, samples, lattice.contracted)
         density = density_at(points)
         yield Wave(number, samples, points, density)
-        taken, depth = taken + length, depth + _optical_depth(samples, density.sigma)
-        going_on = ((depth <= ENOUGH_DEPTH) & (samples.starts.diff() == length)).nonzero()[:, 0]
-        last = samples.t.index_select(0, samples.starts.index_select(0, going_on + 1) - 1)
-        number, depth, jitter, *of_rays = (part.index_select(0, going_on) for part in (number, depth, jitter, *rays))
-        near = lattice_distance(lattice, lattice_coordinate(lattice, last) + (1 - jitter))
-        rays = Rays(*of_rays)._replace(near=near)
+        with part("march"):
+            taken, depth = taken + length, depth + _optical_depth(samples, density.sigma)
+            going_on = ((depth <= ENOUGH_DEPTH) & (samples.starts.diff() == length)).nonzero()[:, 0]
+            last = samples.t.index_select(0, samples.starts.index_select(0, going_on + 1) - 1)
+            number, depth, jitter, *of_rays = (of.index_select(0, going_on) for of in (number, depth, jitter, *rays))
+            near = lattice_distance(lattice, lattice_coordinate(lattice, last) + (1 - jitter))
+            rays = Rays(*of_rays)._replace(near=near)
 
 
 def packed(waves: Sequence[Wave], rays: int) -> tuple[Samples, Int64[Tensor, "samples"]]:

@@ -29,6 +29,11 @@ More = Annotated[
     ),
 ]
 
+Budget = Annotated[
+    str | None,
+    tyro.conf.arg(metavar="DURATION", help="Wall time for the whole command, like 90s, 10m or 1h30m."),
+]
+
 
 @dataclass
 class Common:
@@ -57,6 +62,7 @@ class RunArguments:
     like: str | None = None
     """Render the video as this training photo was exposed (its name; where the effect exposure is on)."""
     effect: Effects = ()
+    budget: Budget = None
     until: str | None = None
     """The last stage to run."""
     more: More = None
@@ -79,6 +85,8 @@ class StageArguments:
     like: str | None = None
     """render only: render the video as this training photo was exposed (its name)."""
     effect: Effects = ()
+    budget: str | None = None
+    """tradeoff only: how long the study may take, as in 30m."""
     more: More = None
     force: bool = False
     """Run it again even if it is cached."""
@@ -124,6 +132,8 @@ class DoctorArguments:
 
     selftest: bool = False
     """Measure every formula of docs/NUMERICS.md on this machine's device as well, in under a minute."""
+    bench: bool = False
+    """Measure matrix products, random reads and copying as well, and say what training can reach here at most; 5 s."""
 
 
 @dataclass
@@ -133,6 +143,7 @@ class DemoArguments:
     settings: Annotated[Settings, tyro.conf.arg(name="")] = field(default_factory=Settings)
     common: Annotated[Common, tyro.conf.arg(name="")] = field(default_factory=Common)
     effect: Effects = ()
+    budget: Budget = None
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("demo")
     """Where photos and workspace go."""
 

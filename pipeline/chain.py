@@ -2,7 +2,7 @@
 
 from types import ModuleType
 
-from stages import effects, evaluate, ingest, mesh, normalise, render, report, sfm, train
+from stages import effects, evaluate, ingest, mesh, normalise, render, report, sfm, tradeoff, train
 
 STAGES: dict[str, ModuleType] = {
     "ingest": ingest,
@@ -13,6 +13,7 @@ STAGES: dict[str, ModuleType] = {
     "evaluate": evaluate,
     "render": render,
     "mesh": mesh,
+    "tradeoff": tradeoff,
     "report": report,
 }
 
@@ -25,8 +26,12 @@ EXIT_CODES = {
     "evaluate": 15,
     "render": 16,
     "mesh": 17,
+    "tradeoff": 19,
     "report": 18,
 }
+
+ON_REQUEST = ("tradeoff",)
+"""Stages that take long and that nothing needs: they run where they are named."""
 
 
 def needed_for(stage: str) -> list[str]:
@@ -41,6 +46,11 @@ def needed_for(stage: str) -> list[str]:
 
 
 def up_to(stage: str) -> list[str]:
-    """All stages from the first to ``stage``, in order."""
+    """All stages from the first to ``stage``, in order, of those ON_REQUEST only ``stage`` itself."""
     names = list(STAGES)
-    return names[: names.index(stage) + 1]
+    return [name for name in names[: names.index(stage) + 1] if name == stage or name not in ON_REQUEST]
+
+
+def usual() -> list[str]:
+    """The stages that a run has unless it is told otherwise."""
+    return up_to(list(STAGES)[-1])

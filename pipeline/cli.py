@@ -1,6 +1,6 @@
 """The command line: finds the command, runs it, turns every ending into words and an exit code.
 
-Exit codes: 0 done; 2 usage; 3 the workspace; 10 to 18 the stage that failed (pipeline/chain.py); 130 Ctrl-C;
+Exit codes: 0 done; 2 usage; 3 the workspace; 10 to 19 the stage that failed (pipeline/chain.py); 130 Ctrl-C;
 143 SIGTERM; 1 a defect of this program.
 """
 
@@ -16,8 +16,9 @@ from dataclasses import asdict
 from pathlib import Path
 
 from pipeline import arguments as words_of
-from pipeline import chain, machine, status
+from pipeline import chain, forecast, machine, status
 from pipeline.display import Display, SilentDisplay, choose_display
+from pipeline.durations import seconds_from
 from pipeline.more import with_more
 from pipeline.runner import Runner, StageFailed
 from pipeline.settings import (
@@ -31,6 +32,7 @@ from pipeline.settings import (
 )
 from pipeline.workspace import Workspace
 from stages.contract import StageError
+from stages.live_line import duration
 
 EXIT_DEFECT, EXIT_USAGE, EXIT_WORKSPACE, EXIT_INTERRUPT, EXIT_TERMINATED = 1, 2, 3, 130, 143
 
@@ -132,13 +134,24 @@ def command_run(words: Sequence[str]) -> int:
     force = frozenset[str]()
     if given.from_ is not None:
         force = frozenset(stages[stages.index(_known_stage(given.from_, "--from", stages)) :])
+    budget = _budget(given.budget, asked)
     with choose_display(given.common.json) as display:
         try:
             settings = with_source(asked, given.photos, cameras)
         except StageError as error:
             display.failed("ingest", error)
             return chain.EXIT_CODES["ingest"]
-        return _run_stages(root, settings, stages, given.common, display, force)
+        return _run_stages(root, settings, stages, given.common, display, force, new_budget=(budget, 0.0))
+
+
+def _budget(text: str | None, settings: Settings) -> float | None:
+    """The seconds of ``--budget``. Raises UsageError beside steps, which take as long as they take, and ``--more``."""
+    if text is not None and settings.train.after is not None:
+        raise UsageError("--budget and --more are two budgets; give one")
+    if text is not None and settings.train.steps is not None:
+        what = f"--budget {text} and --train.steps {settings.train.steps}: so many steps take as long as they take"
+        raise UsageError(f"{what}; leave out one, or give --train.seconds")
+    return None if text is None else seconds_from(text)
 
 
 def _more(given: words_of.RunArguments | words_of.StageArguments, root: Path) -> Settings:
@@ -167,16 +180,24 @@ def _run_stages(
     display: Display,
     force: frozenset[str] = frozenset(),
     remember: bool = True,
+    new_budget: tuple[float | None, float] | None = None,
 ) -> int:
+    """``new_budget``: seconds for the whole command (None: no limit), and those spent before; None: as recorded."""
     with Workspace(root) as workspace:
         runner = Runner(workspace, settings, display)
-        display.headline(machine.headline(root))
+        if new_budget is not None:
+            runner.set_budget(*new_budget)
+        times = forecast.times(settings)
+        display.headline(" · ".join([machine.headline(root), *forecast.promise(runner, stages, force, times)]))
         try:
-            ran = runner.run(stages, force=force, replan=common.replan, remember=remember)
+            ran = runner.run(stages, force=force, replan=common.replan, remember=remember, times=times)
         except StageFailed as failure:
             display.failed(failure.stage, failure.error)
             raise
-        display.finished(_closing_words(workspace, ran), _outputs(workspace))
+        words = _closing_words(workspace, ran)
+        if ran and runner.budget:
+            words = f"{duration(runner.budget.spent)} of {duration(runner.budget.total)} spent {words}"
+        display.finished(words, _outputs(workspace))
     return 0
 
 
@@ -204,6 +225,8 @@ def command_stage(stage: str, words: Sequence[str]) -> int:
     if given.more is not None and stage != "train":
         raise UsageError(f"--more belongs to `pipeline train` and `pipeline run`, not to {stage}")
     settings = _like(with_effects(_more(given, given.workspace), given.effect), given.like)
+    if given.budget is not None:
+        settings = _study_for(settings, given.budget, stage)
     if given.cameras is not None:
         update = {"cameras": given.cameras.absolute()}
         settings = settings.model_copy(update={"render": settings.render.model_copy(update=update)})
@@ -215,6 +238,14 @@ def command_stage(stage: str, words: Sequence[str]) -> int:
         return _run_stages(given.workspace, settings, stages, given.common, display, force, remember=False)
 
 
+def _study_for(settings: Settings, budget: str, stage: str) -> Settings:
+    """The settings with `pipeline tradeoff --budget`."""
+    if stage != "tradeoff":
+        raise UsageError(f"--budget belongs to `pipeline tradeoff`, not to {stage}")
+    update = {"seconds": seconds_from(budget)}
+    return settings.model_copy(update={"tradeoff": settings.tradeoff.model_copy(update=update)})
+
+
 def _recorded_settings(workspace: Workspace) -> Settings:
     return settings_from(workspace.read_run()["options"], f"options recorded in {workspace.root}")
 
@@ -223,7 +254,7 @@ def command_resume(words: Sequence[str]) -> int:
     """``pipeline resume WORKSPACE``: repeat the recorded run."""
     given = words_of.parse(words_of.ResumeArguments, "resume", words)
     workspace = Workspace.existing(given.workspace)
-    stages = workspace.read_run().get("stages") or list(chain.STAGES)
+    stages = workspace.read_run().get("stages") or chain.usual()
     with choose_display(given.common.json) as display:
         return _run_stages(given.workspace, _recorded_settings(workspace), stages, given.common, display)
 
@@ -272,14 +303,17 @@ def command_doctor(words: Sequence[str]) -> int:
     given = words_of.parse(words_of.DoctorArguments, "doctor", words)
     from pipeline.doctor import examine
 
-    return examine(Path(os.curdir), given.selftest)
+    return examine(Path(os.curdir), given.selftest, given.bench)
 
 
 def command_demo(words: Sequence[str]) -> int:
     """``pipeline demo``: photograph a synthetic scene, run everything, compare with the truth."""
     from pipeline import demo
 
-    given = words_of.parse(words_of.DemoArguments, "demo", words, demo.default_settings())
+    given = words_of.parse(words_of.DemoArguments, "demo", words)
+    if given.budget is None:
+        given = words_of.parse(words_of.DemoArguments, "demo", words, demo.default_settings())
+    budget = _budget(given.budget, given.settings)
     asked = with_effects(given.settings, given.effect)
     photos, root = given.output / "photos", given.output / "demo.nerf"
     with choose_display(given.common.json) as display:
@@ -287,7 +321,8 @@ def command_demo(words: Sequence[str]) -> int:
         line, seconds = demo.photograph(photos, display)
         display.end("photos", line, seconds, cached=seconds == 0)
         settings = with_source(asked, photos, None)
-        code = _run_stages(root, settings, list(chain.STAGES), given.common, display)
+        budgeted = (budget, seconds)
+        code = _run_stages(root, settings, chain.usual(), given.common, display, new_budget=budgeted)
         started = time.monotonic()
         display.begin("truth")
         *notes, last = demo.truth_lines(root / "output", photos)

@@ -1,5 +1,5 @@
 """``pipeline doctor``: what this machine has, and whether its arithmetic can be trusted, in about five seconds; with
-``--selftest``, formula by formula (pipeline/selftest.py)."""
+``--selftest``, formula by formula (pipeline/selftest.py); with ``--bench``, how fast it is (pipeline/bench.py)."""
 
 import platform
 import time
@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline import machine
+from pipeline.bench import bench_lines
 from pipeline.selftest import numerical_matrix
 
 if TYPE_CHECKING:
@@ -19,9 +20,9 @@ PACKAGES = (
 LOW_DISK_GB = 2.0
 
 
-def examine(folder: Path, selftest: bool = False) -> int:
-    """Print versions, device, threads, free disk and the self-test, the long one if asked for; 0 if all is well, 1
-    otherwise."""
+def examine(folder: Path, selftest: bool = False, bench: bool = False) -> int:
+    """Print versions, device, threads, free disk and the self-test, the long one and the machine's rates if asked for.
+    0 if all is well, 1 otherwise."""
     import torch
 
     print(f"python {platform.python_version()} on {platform.platform()}")
@@ -37,6 +38,8 @@ def examine(folder: Path, selftest: bool = False) -> int:
     problems += [f"self-test: {name}: {error}" for name, error in self_test(device) if error]
     if selftest:
         problems += numerical_matrix(device.type)
+    if bench:
+        print("\n".join(bench_lines(device)))
     print("\n".join(f"problem: {problem}" for problem in problems) or "all well")
     return 1 if problems else 0
 

@@ -4,12 +4,15 @@
 """
 
 import json
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from pydantic import TypeAdapter, ValidationError
+
 from pipeline.keys import digest, file_sha256
-from stages.files import write_durably
+from stages.files import first_fault, write_durably
 
 NAME = "manifest.json"
 
@@ -59,7 +62,7 @@ def describe_outputs(folder: Path, names: tuple[str, ...]) -> dict[str, dict[str
     }
 
 
-def outputs_digest(outputs: dict[str, dict[str, Any]]) -> str:
+def outputs_digest(outputs: Mapping[str, dict[str, Any]]) -> str:
     """One digest for all outputs: names and content."""
     return digest({name: entry["sha256"] for name, entry in outputs.items()})
 
@@ -73,12 +76,13 @@ def write(folder: Path, manifest: Manifest) -> None:
 def read(folder: Path) -> Manifest:
     """The manifest of ``folder``. Raises FileNotFoundError, or BadManifest with the reason."""
     try:
-        value = json.loads((folder / NAME).read_text("utf-8"))
-        manifest = Manifest(**value)
+        manifest = TypeAdapter(Manifest).validate_json((folder / NAME).read_bytes(), strict=True)
     except FileNotFoundError:
         raise
-    except (ValueError, TypeError) as error:
-        raise BadManifest(f"{folder / NAME} does not parse ({error})") from error
+    except ValidationError as error:
+        raise BadManifest(f"{folder / NAME} does not parse ({first_fault(error)})") from error
+    if not all(set(entry) == {"size", "sha256"} for entry in manifest.outputs.values()):
+        raise BadManifest(f"{folder / NAME} lists outputs without their size and sha256")
     if manifest.outputs_digest != outputs_digest(manifest.outputs):
         raise BadManifest(f"{folder / NAME} contradicts itself: its digest is not that of its outputs")
     return manifest
@@ -88,6 +92,8 @@ def check_outputs(folder: Path, manifest: Manifest, deep: bool = False) -> None:
     """Raise BadManifest unless every output is there with its size (``deep``: with its sha256)."""
     for name, entry in manifest.outputs.items():
         path = folder / name
+        if not path.resolve().is_relative_to(folder.resolve()):
+            raise BadManifest(f"{path} leads out of its folder")
         if not path.is_file():
             raise BadManifest(f"{path} is missing")
         if path.stat().st_size != entry["size"]:

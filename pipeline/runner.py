@@ -2,7 +2,7 @@
 
 import shutil
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -10,6 +10,7 @@ from types import ModuleType
 from typing import Any
 
 from pipeline import attempts, machine, manifests
+from pipeline.budget import Budget, allotted, least_total, training_seconds
 from pipeline.chain import STAGES
 from pipeline.display import Display
 from pipeline.keys import ContentIndex, config_for_key, digest, stage_key
@@ -17,6 +18,7 @@ from pipeline.manifests import BadManifest, Manifest
 from pipeline.settings import Settings
 from pipeline.workspace import Workspace
 from stages.contract import StageConfig, StageError
+from stages.live_line import duration
 
 
 class StageFailed(Exception):
@@ -61,6 +63,40 @@ class Runner:
         self.state["options"] = settings.model_dump(mode="json")
         self.index = ContentIndex(workspace.root / ".content.json")
         self.done: dict[str, Manifest] = {}
+        self.stages: list[str] = []
+        self.times: Mapping[str, float | None] = {}
+        self.works_on: str | None = None
+
+    @property
+    def budget(self) -> Budget | None:
+        """The time that the run may take in all, where there is a limit."""
+        return Budget(self.state["budget"]) if self.state.get("budget") else None
+
+    def set_budget(self, total: float | None, before: float = 0.0) -> None:
+        """Make ``total`` seconds the budget of this workspace, None for no limit. The same as before goes on.
+
+        ``before``: seconds spent already on what the photos were made in.
+        """
+        if total is None:
+            self.state.pop("budget", None)
+        elif self.budget is None or self.budget.total != total:
+            self.state["budget"] = Budget.new(total, self._options_digest())
+            if before:
+                Budget(self.state["budget"]).end("photos", before)
+
+    def time_left(self, budget: Budget) -> float:
+        """Seconds of the budget that this run has: all, unless it goes on with an interrupted one."""
+        budget.recover(self.workspace.root)
+        return budget.left if budget.is_of(self._options_digest()) else budget.total
+
+    def is_done(self, stage: str) -> bool:
+        """Whether a finished result of ``stage`` is there for these options, as far as can be told beforehand."""
+        found = bool(self.state["keys"]) and self._upstream(stage, "report") is not None
+        self.done.clear()  # what runs now may make it outdated
+        return found
+
+    def _options_digest(self) -> str:
+        return digest(self.state["options"])
 
     def run(
         self,
@@ -69,13 +105,18 @@ class Runner:
         force: frozenset[str] = frozenset(),
         replan: bool = False,
         remember: bool = True,
+        times: Mapping[str, float | None] | None = None,
     ) -> bool:
         """Bring ``stages`` (in chain order) up to date; True if anything ran. Raises StageFailed.
 
         ``force`` names stages that run again even where a finished result exists; ``replan`` forgets what was
-        chosen for the user before; ``remember`` makes ``stages`` what `pipeline resume` repeats.
+        chosen for the user before; ``remember`` makes ``stages`` what `pipeline resume` repeats; ``times`` are the
+        seconds that stages are expected to take (pipeline/forecast.py), for a budget.
         """
-        self.force = force
+        self.force, self.stages, self.times = force, list(stages), times or {}
+        if self.budget:
+            self.budget.recover(self.workspace.root)
+        continues = self.budget is not None and not self.budget.over
         if replan:
             self.state["plans"] = {}
         if remember:
@@ -85,6 +126,10 @@ class Runner:
             ran = [self._bring_up_to_date(stage) for stage in stages]
         finally:
             self._unlink_outdated()
+        # One stage of an interrupted run does not end it.
+        if self.budget and (remember or not continues):
+            self.budget.close()
+        self.workspace.write_run(self.state)
         return any(ran)
 
     def _unlink_outdated(self) -> None:
@@ -122,6 +167,11 @@ class Runner:
             hint = "Close other programs, or lower the resolution or batch settings of this stage."
             why = str(error).splitlines()[0] if str(error) else f"{stage} asked for more than there is"
             raise StageFailed(stage, StageError("out of memory", why, hint)) from error
+        finally:
+            if self.budget and self.works_on == stage:
+                self.budget.end(stage, time.monotonic() - started)
+                self.works_on = None
+                self.workspace.write_run(self.state)
         self.done[stage] = manifest
         self.display.end(stage, manifest.line, time.monotonic() - started, cached=not ran)
         return ran
@@ -158,10 +208,12 @@ class Runner:
     def _planned(self, stage: str, inputs: dict[str, str], folders: dict[str, Path], may_plan: bool) -> StageConfig:
         """The stage's config with every "choose for me" answered: from run.json, or by the stage's plan()."""
         module, options = STAGES[stage], getattr(self.settings, stage)
+        if stage == "report" and self.budget:
+            return module.Config.model_validate(options.model_dump() | {"budget": self.budget.account()})
         if not hasattr(module, "plan"):
             return options
         options_for_key = self._config_for_key(stage, options)
-        asked = digest({"version": module.VERSION, "options": options_for_key, "inputs": inputs})
+        asked = digest({"version": module.VERSION, "options": options_for_key, "inputs": inputs} | self._time(options))
         plans = self.state["plans"].setdefault(stage, {})
         if asked in plans:
             # Paths are taken as given now: the plan was made for equal content, wherever that lay then.
@@ -169,10 +221,43 @@ class Runner:
             return module.Config.model_validate(plans[asked] | options.model_dump(include=paths))
         if not may_plan:
             raise NotReady(stage)
-        config = module.plan(options, folders, self.display)
+        self._begin_work(stage)
+        config = module.plan(self._with_time(stage, options), folders, self.display)
         plans[asked] = config.model_dump(mode="json")
         self.workspace.write_run(self.state)
         return config
+
+    def _time(self, options: StageConfig) -> dict[str, float]:
+        """What a choice made for ``options`` depends on besides them: the budget, or seconds that enter no key."""
+        if self.budget and _takes_what_it_is_given(options):
+            return {"budget": self.budget.total}
+        seconds = getattr(options, "seconds", None)
+        return {} if seconds is None else {"seconds": seconds}
+
+    def _begin_work(self, stage: str) -> None:
+        """From here on ``stage`` costs time: nothing that was found finished does."""
+        if self.budget is None or self.works_on == stage:
+            return
+        self.works_on = stage
+        self.budget.continue_as(self._options_digest())
+        self.budget.begin(stage)
+        if (seconds := self.times.get(stage)) is not None:
+            self.budget.promise(stage, seconds)
+        self.workspace.write_run(self.state)
+
+    def _with_time(self, stage: str, options: StageConfig) -> StageConfig:
+        """``options`` with the seconds that the budget leaves for the stage, where it has one and they are open."""
+        if self.budget is None or not _takes_what_it_is_given(options):
+            return options
+        to_come = {name: self.times.get(name) for name in self.stages[self.stages.index(stage) + 1 :]}
+        wall = allotted(stage, self.budget.left, to_come, self.budget.total)
+        if stage == "train" and (least := least_total({stage: None, **to_come})) > self.budget.left:
+            left, took = duration(max(0.0, self.budget.left)), duration(self.budget.total)
+            why = f"{left} of {took} are left, the smallest of all that is to come takes about {duration(least)}"
+            self.display.note(f"the budget cannot be kept: {why}")
+        self.budget.promise(stage, wall)
+        seconds = training_seconds(wall) if stage == "train" else wall
+        return options.model_copy(update={"seconds": round(seconds, 1)})
 
     def _config_for_key(self, stage: str, config: StageConfig) -> dict[str, Any]:
         replaced = {"photos": self._photos_digest()} if stage == "ingest" else {}
@@ -203,6 +288,7 @@ class Runner:
         partial, folder = self.workspace.partial(job.stage, job.key), self.workspace.folder(job.stage, job.key)
         if job.stage not in self.force and (manifest := self.workspace.complete(partial, folder, job.key)):
             return manifest
+        self._begin_work(job.stage)
         spent = attempts.spent(partial)
         if partial.exists() and not (job.module.RESUMES and job.stage not in self.force):
             shutil.rmtree(partial)
@@ -230,6 +316,12 @@ class Runner:
         )
         self.workspace.finish(partial, folder, manifest)
         return manifest
+
+
+def _takes_what_it_is_given(options: StageConfig) -> bool:
+    """Whether nothing else says how long the stage works: neither seconds nor steps, nor those of ``--more``."""
+    open_ended = getattr(options, "seconds", 0.0) is None
+    return open_ended and all(getattr(options, name, None) is None for name in ("steps", "after"))
 
 
 def _load_native_code() -> None:

@@ -1,5 +1,6 @@
 """All options of a run: one pydantic model per stage, filled from defaults, a TOML file and flags, in that order."""
 
+import difflib
 import os
 import tomllib
 from collections.abc import Mapping, Sequence
@@ -17,11 +18,13 @@ from stages.normalise import Config as NormaliseConfig
 from stages.render import Config as RenderConfig
 from stages.report import Config as ReportConfig
 from stages.sfm import Config as SfmConfig
+from stages.tradeoff import Config as TradeoffConfig
 from stages.train import Config as TrainConfig
 
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
 
+MOST_WRONG, MOST_LETTERS = 10, 100  # options in one error, and letters of a name or value in it
 Options = TypeVar("Options", bound=BaseModel)
 
 
@@ -42,6 +45,7 @@ class Settings(BaseModel):
     evaluate: EvaluateConfig = EvaluateConfig()
     render: RenderConfig = RenderConfig()
     mesh: MeshConfig = MeshConfig()
+    tradeoff: TradeoffConfig = TradeoffConfig()
     report: ReportConfig = ReportConfig()
 
 
@@ -65,7 +69,13 @@ def settings_from(values: Mapping[str, Any], origin: str) -> Settings:
 
 def wrong_options(error: ValidationError, *parents: str) -> str:
     """Every wrong option below ``parents`` with what it must be: ``train.steps 0 must be at least 1; …``."""
-    return "; ".join(_wrong_option(".".join([*parents, *map(str, e["loc"])]), e) for e in error.errors())
+    wrong = [_wrong_option(_short(".".join([*parents, *map(str, e["loc"])])), e) for e in error.errors()]
+    more = f"; and {len(wrong) - MOST_WRONG} more" if len(wrong) > MOST_WRONG else ""
+    return "; ".join(wrong[:MOST_WRONG]) + more
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= MOST_LETTERS else f"{text[:MOST_LETTERS]}…"
 
 
 def _wrong_option(name: str, problem: "ErrorDetails") -> str:
@@ -77,7 +87,7 @@ def _wrong_option(name: str, problem: "ErrorDetails") -> str:
     must = problem["msg"].removeprefix("Input should ")
     for long, short in (("greater than or equal to", "at least"), ("less than or equal to", "at most")):
         must = must.replace(long, short)
-    return f"{name} {problem['input']} must {must}"
+    return f"{name} {_short(str(problem['input']))} must {must}"
 
 
 def with_effects(settings: Options, choices: Sequence[str]) -> Options:
@@ -102,10 +112,15 @@ def with_effects(settings: Options, choices: Sequence[str]) -> Options:
 
 
 def with_source(settings: Settings, photos: Path, cameras: Path | None) -> Settings:
-    """The settings with PHOTOS (and known cameras, if any) filled in. Raises StageError where PHOTOS is unusable."""
+    """The settings with PHOTOS (and known cameras, if any) filled in. Raises StageError where PHOTOS is unusable,
+    UsageError where the photo to render like is none of them: better now than after the training."""
     from stages.sources import find_source
 
     source = find_source(photos, cameras)
+    names, like = [source.name(file) for file in source.files], settings.render.like
+    if like is not None and source.kind != "video" and like not in names:
+        near = difflib.get_close_matches(like, names, n=3)
+        raise UsageError(f"--like {like}: no photo has that name" + (f"; perhaps {', '.join(near)}" if near else ""))
     given = None if cameras is None else cameras.absolute()
     imported = None if source.cameras is None else source.cameras.absolute()
     return settings.model_copy(

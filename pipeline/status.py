@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from pipeline import manifests
-from pipeline.chain import STAGES
+from pipeline.chain import ON_REQUEST, STAGES
 from pipeline.keys import KEY_LENGTH
 from pipeline.manifests import BadManifest, Manifest
 from pipeline.runner import Job, NotReady, Runner
@@ -56,7 +56,8 @@ def status_of(workspace: Workspace, runner: Runner, stage: str) -> StageStatus:
     except BadManifest as problem:
         return StageStatus(stage, "stale", str(problem))
     if workspace.partial(stage, job.key).exists():
-        return StageStatus(stage, "partial", "interrupted; `pipeline resume` takes it up again")
+        command = stage if stage in ON_REQUEST else "resume"
+        return StageStatus(stage, "partial", f"interrupted; `pipeline {command}` takes it up again")
     if last is not None:
         return StageStatus(stage, "stale", "; ".join(differences(job, last)) or "run again")
     return StageStatus(stage, "never", "")

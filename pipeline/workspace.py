@@ -8,18 +8,30 @@ import json
 import os
 import shutil
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from filelock import FileLock, Timeout
+from pydantic import BaseModel, Field, ValidationError
 
 from pipeline import manifests
 from pipeline.keys import KEY_LENGTH
 from pipeline.manifests import BadManifest, Manifest
 from stages.contract import StageError
-from stages.files import sync_folder, write_durably
+from stages.files import first_fault, sync_folder, write_durably
 
 RUN_FILE = "run.json"
 RUN_VERSION = 1
+
+
+class _RunFile(BaseModel):
+    """run.json: of each stage its options, what was chosen for it by what was asked, and its key."""
+
+    version: int
+    options: dict[str, dict[str, Any]]
+    plans: dict[str, dict[str, dict[str, Any]]]
+    keys: dict[str, Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]]
+    stages: list[str] | None = None
+    photos_digest: str | None = None
 
 
 class Workspace:
@@ -31,15 +43,17 @@ class Workspace:
 
     @classmethod
     def existing(cls, root: Path) -> "Workspace":
-        """A workspace that was made before; raises StageError with words if ``root`` is not one."""
+        """A workspace that was made before; raises StageError with words if ``root`` is not one, or has links in it."""
         if not (root / RUN_FILE).is_file():
             why = "there is no run.json in it" if root.is_dir() else "there is no such folder"
             raise StageError(f"{root} is not a workspace", why, "Start one with: pipeline run PHOTOS")
+        _refuse_links(root)
         return cls(root)
 
     def __enter__(self) -> "Workspace":
         try:
             self.root.mkdir(parents=True, exist_ok=True)
+            _refuse_links(self.root)
             self._lock.acquire(timeout=0)
         except Timeout:
             why = f"process {self._holder()} holds its lock"
@@ -138,11 +152,14 @@ class Workspace:
         try:
             value = json.loads((self.root / RUN_FILE).read_text("utf-8"))
             if value["version"] == RUN_VERSION:
+                _RunFile.model_validate(value, strict=True)
                 return value
             reason = f"it has version {value['version']}, this program reads {RUN_VERSION}"
         except FileNotFoundError:
             return {"version": RUN_VERSION, "options": {}, "plans": {}, "keys": {}}
-        except (ValueError, KeyError, TypeError) as error:
+        except ValidationError as error:
+            reason = first_fault(error)
+        except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
             reason = f"it does not parse ({error})"
         hint = f"Delete {self.root / RUN_FILE} and give the same `pipeline run` again: finished stages are kept."
         raise StageError(f"cannot read {self.root / RUN_FILE}", reason, hint)
@@ -182,6 +199,17 @@ class Workspace:
         current |= {self.partial(stage, key) for stage, key in keys.items()}
         found = (p for stage in stages if (self.root / stage).is_dir() for p in (self.root / stage).iterdir())
         return sorted(p for p in found if p not in current)
+
+
+def _refuse_links(root: Path) -> None:
+    """What is written and removed below ``root`` must lie there: only what ``output/`` holds may be links."""
+    for path in (path for folder in (root, *root.iterdir()) if folder.is_dir() for path in folder.iterdir()):
+        if path.is_symlink() and path.parent != root / "output":
+            raise StageError(
+                f"{path} is a link",
+                "results are written and removed there, and a link may lead anywhere",
+                "Put the folder itself in its place. The whole workspace may be a link.",
+            )
 
 
 def _remove(path: Path) -> None:

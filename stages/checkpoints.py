@@ -1,7 +1,8 @@
 """Checkpoints of a training run: whole or not there, the last two kept.
 
-A checkpoint is a pair of files, ``<step>.safetensors`` and ``<step>.json``; the second names the first's sha256
-and is written last, so a kill at any instant leaves at worst a pair that is not one.
+A checkpoint is a pair of files, ``<step>.safetensors`` and ``<step>.json``; the second holds the sha256 of the first
+and of its own facts and is written last, so a kill at any instant leaves at worst a pair that is not one, and a flipped
+bit anywhere in either does not pass.
 """
 
 import hashlib
@@ -10,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from stages.examination import Lost
 from stages.files import write_durably
 
 if TYPE_CHECKING:
@@ -32,8 +34,8 @@ def save_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
 
     folder.mkdir(parents=True, exist_ok=True)
     tensors = save({name: tensor.contiguous() for name, tensor in checkpoint.tensors.items()})
-    meta = {"facts": checkpoint.facts, "sha256": hashlib.sha256(tensors).hexdigest()}
     name = f"{checkpoint.step:09d}"
+    meta = {"facts": checkpoint.facts, "sha256": _digest(name, checkpoint.facts, tensors)}
     write_durably(folder / f"{name}.safetensors", tensors)
     write_durably(folder / f"{name}.json", json.dumps(meta, allow_nan=False).encode())
     kept = {f"{step:09d}" for step in _steps(folder)[-KEPT:]}
@@ -42,15 +44,28 @@ def save_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
             path.unlink()
 
 
-def latest_checkpoint(folder: Path, note: Callable[[str], None]) -> Checkpoint | None:
-    """The newest good checkpoint, or None; every damaged one met on the way is removed and named to ``note``."""
+def latest_checkpoint(
+    folder: Path, note: Callable[[str], None], fits: Callable[[Checkpoint], None] = lambda _: None
+) -> Checkpoint | None:
+    """The newest good checkpoint, or None; every damaged one met on the way is removed and named to ``note``.
+
+    ``fits`` raises RuntimeError or TypeError for a checkpoint that is whole and belongs to something else, Lost for one
+    of a field that is no good.
+    """
     for step in reversed(_steps(folder)):
         try:
-            return _read(folder, step)
+            checkpoint = _read(folder, step)
+            fits(checkpoint)
+            return checkpoint
         except (OSError, ValueError, KeyError) as fault:
-            note(f"the checkpoint of step {step} is damaged ({fault}); going back to the one before")
-            (folder / f"{step:09d}.json").unlink()
-            (folder / f"{step:09d}.safetensors").unlink(missing_ok=True)
+            wrong = f"is damaged ({fault})"
+        except Lost as fault:
+            wrong = f"is of no use ({fault})"
+        except (RuntimeError, TypeError) as fault:
+            wrong = f"is not of this training ({' '.join(str(fault).split())})"
+        note(f"the checkpoint of step {step} {wrong}; going back to the one before")
+        (folder / f"{step:09d}.json").unlink()
+        (folder / f"{step:09d}.safetensors").unlink(missing_ok=True)
     return None
 
 
@@ -63,11 +78,17 @@ def _steps(folder: Path) -> list[int]:
     return sorted(int(path.stem) for path in folder.glob("*.json") if path.stem.isdigit())
 
 
+def _digest(name: str, facts: dict[str, Any], tensors: bytes) -> str:
+    digest = hashlib.sha256(tensors)
+    digest.update(json.dumps([name, facts], sort_keys=True).encode())
+    return digest.hexdigest()
+
+
 def _read(folder: Path, step: int) -> Checkpoint:
     from safetensors.torch import load
 
     meta = json.loads((folder / f"{step:09d}.json").read_bytes())
     tensors = (folder / f"{step:09d}.safetensors").read_bytes()
-    if hashlib.sha256(tensors).hexdigest() != meta["sha256"]:
-        raise ValueError("its tensors are not those that were written")
+    if _digest(f"{step:09d}", meta["facts"], tensors) != meta["sha256"]:
+        raise ValueError("it is not what was written")
     return Checkpoint(step, load(tensors), meta["facts"])

@@ -56,7 +56,8 @@ class Decoded:
     """One image, upright, sRGB. ``focal_px`` is for these pixels, None where EXIF tells none or an absurd one.
 
     ``suffix`` is ".jpg" or ".png" if the file's own bytes already say exactly this to any program (8-bit RGB or
-    RGBA, sRGB, upright, one frame), so that they can be copied; otherwise None. ``notes`` tell what was assumed.
+    RGBA, sRGB, upright, one frame), so that they can be copied; otherwise None. ``notes`` tell what was assumed,
+    ``exposure_ev`` is what :func:`exposure_from_exif` tells.
     """
 
     pixels: "np.ndarray"  # (h, w, 3 or 4) uint8
@@ -64,6 +65,7 @@ class Decoded:
     focal_source: str | None
     camera_key: CameraKey
     place: Place
+    exposure_ev: float | None
     suffix: str | None
     notes: tuple[str, ...]
 
@@ -162,6 +164,7 @@ def _convert(image: "Image.Image", stored_plainly: bool) -> Decoded:
         focal_source=focal_source,
         camera_key=_camera_key(tags, pixels.shape[1], pixels.shape[0], orientation, focal_px),
         place=place_from_exif(tags),
+        exposure_ev=exposure_from_exif(tags),
         suffix=(".png" if image.format == "PNG" else ".jpg") if copy else None,
         notes=tuple(notes),
     )
@@ -194,7 +197,10 @@ def _what_is_missing(image: Any, error: OSError) -> str:
     if image.format not in ("JPEG", "MPO", "PNG"):
         return f"{word}: {error}"
     image.tile = []  # what is there is all there is: do not try again
-    rows = np.asarray(image).reshape(image.height, -1).any(axis=1)
+    try:
+        rows = np.asarray(image).reshape(image.height, -1).any(axis=1)
+    except OSError:  # the decoder refused before there were any pixels
+        return f"{word}: {error}"
     missing = 1 - (np.flatnonzero(rows)[-1] + 1) / image.height if rows.any() else 1.0
     return f"{word}: {100 * missing:.0f} % of the picture is missing" if missing >= 0.005 else f"{word}: {error}"
 
@@ -218,6 +224,8 @@ def _quantised(image: "Image.Image") -> "Image.Image":
     import numpy as np
 
     values = np.asarray(image)
+    if wrong := int(values.size - np.isfinite(values).sum()):
+        raise DecodeError(f"{wrong:,} of its {values.size:,} pixels are no numbers (NaN or infinite)")
     limit = 1.0 if image.mode == "F" else 65535.0
     if not (values.min() >= 0 and values.max() <= limit):
         raise DecodeError(f"pixel values from {values.min()} to {values.max()}; export it with 8 or 16 bits")
@@ -315,6 +323,15 @@ def focal_from_exif(tags: dict[str, Any], width: int, height: int) -> tuple[floa
     if focal is None or not _FOCAL_RATIO[0] <= focal / longer <= _FOCAL_RATIO[1]:
         return None, None
     return focal, source
+
+
+def exposure_from_exif(tags: dict[str, Any]) -> float | None:
+    """How many stops brighter a photo shows a scene than one of 1 s, f/1 and ISO 1 would: log2(t S / N²), of exposure
+    time t, sensitivity S and f-number N (EXIF 2.32, tags 0x829A, 0x8827, 0x829D); None where one is missing or 0."""
+    sensitivity = tags.get("ISOSpeedRatings")
+    sensitivity = sensitivity[0] if isinstance(sensitivity, tuple | list) and sensitivity else sensitivity
+    time, speed, stop = (_positive(value) for value in (tags.get("ExposureTime"), sensitivity, tags.get("FNumber")))
+    return math.log2(time) + math.log2(speed) - 2 * math.log2(stop) if time and speed and stop else None
 
 
 def place_from_exif(tags: dict[str, Any]) -> Place:

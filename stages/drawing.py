@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from stages.files import read_json
+from stages.live_line import duration
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from nerf.rays import Rays
 
 SHARE = 0.4  # of the training's seconds that drawing may be expected to take; what is left is room for a busier machine
+LEAST_DRAWING = 0.5  # seconds: less draws nothing
 TIMED_SECONDS = 0.5
 TIMED_SHARE = 0.05  # of the training's seconds, where that is less
 FIRST_SIDE = 24  # pixels
@@ -76,6 +78,25 @@ def load_painter(train: Path, background: tuple[float, ...] | None = None, like:
     if like is not None:
         model = seen_like(model, info, like, device)
     return Painter(model, torch.tensor(info["background"] if background is None else background, device=device))
+
+
+class Allowance:
+    """Seconds of drawing for a stage that begins now: what is left of ``seconds`` given to it, less ``beside`` for all
+    else that it does; a share of the training's where none are given."""
+
+    def __init__(self, seconds: float | None, train: Path, beside: float) -> None:
+        self.began, self.given, self.beside = time.perf_counter(), seconds, beside
+        self.trained = training_seconds(train)
+
+    def left(self) -> float:
+        """Seconds that pictures may take."""
+        if self.given is None:
+            return SHARE * self.trained
+        return max(LEAST_DRAWING, self.given - (time.perf_counter() - self.began) - self.beside)
+
+    def words(self) -> str:
+        """What the choice is held against."""
+        return f"training took {duration(self.trained)}" if self.given is None else f"given {duration(self.given)}"
 
 
 def training_seconds(train: Path) -> float:

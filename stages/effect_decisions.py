@@ -5,8 +5,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stages.contract import StageError
-from stages.files import read_json, write_json
+from stages.files import read_dataclass, write_json
 
 if TYPE_CHECKING:
     import torch
@@ -41,10 +40,7 @@ def write_decisions(folder: Path, decisions: Decisions) -> None:
 
 def read_decisions(folder: Path) -> Decisions:
     """Read decisions.json. Raises StageError where it is missing or damaged."""
-    try:
-        return Decisions(**read_json(folder / "decisions.json"))
-    except TypeError as error:
-        raise StageError("cannot read decisions.json", str(error), "Delete its folder and run again.") from error
+    return read_dataclass(folder / "decisions.json", Decisions)
 
 
 def photo_parts(

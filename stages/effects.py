@@ -11,6 +11,7 @@ from pydantic import Field
 from stages.contract import Inputs, Progress, StageConfig, StageResult
 from stages.effect_decisions import Decisions, write_decisions
 from stages.files import read_json, read_scene, read_tensors, write_json
+from stages.live_line import duration
 
 if TYPE_CHECKING:
     from nerf.evidence.evidence import Evidence
@@ -21,6 +22,7 @@ NEEDS = ("ingest", "sfm", "normalise")
 VERSION = 1
 RESUMES = False
 LINKS = ("effects.json",)
+UNKEYED = ("seconds",)  # it decides how many pilots, and that enters the key
 
 Switch = Literal["auto", "on", "off"]
 ORDER = (
@@ -31,6 +33,7 @@ ORDER = (
 PART_OF_THE_METHOD = ("view_dependence",)
 MOST_PILOTS = 2
 PILOT_STEPS = 100
+WORTH_TIMING = 3.0  # seconds: in less no pilot is made, and to find out takes one or two
 
 
 class Config(StageConfig):
@@ -45,6 +48,10 @@ class Config(StageConfig):
         ge=0,
         description="steps of each pilot training, where the evidence is not clear; 0: no pilots",
     )
+    pilots: int | None = Field(
+        default=None, ge=0, description=f"how many at most; none: {MOST_PILOTS}, fewer where there is no time for them"
+    )
+    seconds: float | None = Field(default=None, ge=0, description="that pilots may take; none: as long as they take")
     seed: int = Field(default=0, description="of the pilots")
 
 
@@ -56,11 +63,30 @@ class Verdict(NamedTuple):
     pilot: "Pilot | None" = None
 
 
+def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
+    """How many pilots there may be: as many as fit into the time, by what a step takes on this machine."""
+    if config.pilots is not None:
+        return config
+    if config.seconds is None or not config.pilot_steps:
+        return config.model_copy(update={"pilots": MOST_PILOTS})
+    if config.seconds < WORTH_TIMING:
+        return config.model_copy(update={"pilots": 0})
+    from stages.pilots import expected_seconds
+
+    progress.update("trying how long a pilot would take")
+    took = expected_seconds(read_scene(inputs["normalise"]), config.pilot_steps)
+    pilots = min(MOST_PILOTS, int(config.seconds / took))
+    if pilots < MOST_PILOTS:
+        count = "none" if not pilots else "one at most"
+        progress.note(f"a pilot takes about {duration(took)} here, {duration(config.seconds)} are given: {count}")
+    return config.model_copy(update={"pilots": pilots})
+
+
 def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> StageResult:
     """Gather the evidence, decide, and write decisions.json and, for people and the report, effects.json."""
     from stages.evidence import lens_evidence, scene_evidence
 
-    started = time.perf_counter()
+    started, config = time.perf_counter(), plan(config, inputs, progress)
     scene, registration = read_scene(inputs["normalise"]), read_json(inputs["sfm"] / "registration.json")
     uncertainty = {f"images/{image['file']}": image.get("uncertainty_px") for image in registration["images"]}
     points = read_tensors(inputs["normalise"] / "points.safetensors")
@@ -133,8 +159,8 @@ class _Study:
 
         if not self.config.pilot_steps:
             return "none was wanted"
-        if self.pilots == MOST_PILOTS:
-            return f"{MOST_PILOTS} were made already"
+        if self.pilots == self.config.pilots:
+            return f"{self.pilots} were made already" if self.pilots else "there is no time for one"
         if self.trial is None:
             self.trial = pilot_scene(self.ingest, self.scene, self.progress)
         return "too few training photos" if self.trial is None else None

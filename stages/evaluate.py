@@ -5,7 +5,7 @@ PSNR is taken from the float picture in [0, 1], per photo; figures over all phot
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -27,14 +27,16 @@ if TYPE_CHECKING:
     from stages.drawing import Painter
 
 NEEDS = ("ingest", "normalise", "train")
-VERSION = 4
+VERSION = 5
 RESUMES = False
 LINKS = ("metrics.json", "renders", "errors")
+UNKEYED = ("seconds",)  # it decides how many photos, and that enters the key
 
 BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 FIGURES = ("psnr", "ssim", "psnr_mean_image", "psnr_nearest_view", "psnr_right", "psnr_fitted_right")
 TRUSTED_WIDTH = 0.5  # of the photos: below, a picture can be sharp and the field know nothing of fine detail
 WORTH_SAYING = 0.5  # dB between the two scores of right halves
+BESIDE_DRAWING = 0.05  # seconds for each photo of the set, to read it: the mean image is one of them all
 TRIED_PHOTOS = 4  # to see how fast the field draws them
 NO_LPIPS = "LPIPS is not computed: no package in use ships its weights and nothing is downloaded"
 
@@ -48,6 +50,8 @@ class Config(StageConfig):
     """What photos with alpha are shown over. None: what the field was trained over, white where that was random."""
     photos: int | None = Field(default=None, ge=1)
     """How many test photos to score, evenly spread. None: as many as take no longer than the training."""
+    seconds: float | None = Field(default=None, gt=0)
+    """That the stage may take. None: 40 % of the training's for drawing."""
     seed: int = 0
     """Of the interval."""
 
@@ -63,22 +67,22 @@ def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
 
 
 def _affordable_photos(config: Config, scene: "Scene", train: Path, progress: Progress) -> int:
-    from stages.drawing import SHARE, measured_speed, training_seconds
+    from stages.drawing import Allowance, measured_speed
     from stages.training_data import scaled_size
 
     assert config.downscale is not None
     test = scene.of_split("test")
+    allowance = Allowance(config.seconds, train, BESIDE_DRAWING * len(scene.views))
     cameras = [scene.cameras[view.camera] for view in test]
     pixels = [math.prod(scaled_size(camera, config.downscale)) for camera in cameras]
     progress.update("trying how fast the field draws")
     largest = max(1, int(min(max(c.width, c.height) for c in cameras) / config.downscale))
     speed = measured_speed(train, lambda side: _tried_rays(scene, side), largest)
-    trained = training_seconds(train)
-    count = len(affordable(pixels, SHARE * trained * speed))
+    count = len(affordable(pixels, allowance.left() * speed))
     if count < len(test):
         progress.note(
             f"{short_count(speed)} rays/s here: all {len(test)} test photos take about "
-            f"{duration(sum(pixels) / speed)}, training took {duration(trained)}; --evaluate.photos asks for more"
+            f"{duration(sum(pixels) / speed)}, {allowance.words()}; --evaluate.photos asks for more"
         )
     return count
 
@@ -164,7 +168,7 @@ class Examiner:
         image = rendering.colour.clamp(0, 1)
         right, fitted = right_half_psnr(rendering, self.painter.background.cpu(), truth, used)
         if self.fits_poses and right is not None:
-            moved = self._from_fitted_pose(view, rendering, truth, used)
+            moved = self._from_fitted_pose(view, truth, used)
             _, fitted = right_half_psnr(moved, self.painter.background.cpu(), truth, used)
         height, width = truth.shape[:2]
         nearest = nearest_view(view, self.scene.of_split("train"))
@@ -185,9 +189,7 @@ class Examiner:
             "error": f"errors/{file}",
         }
 
-    def _from_fitted_pose(
-        self, view: "View", rendering: "Rendering", truth: "Tensor", used: "Tensor | None"
-    ) -> "Rendering":
+    def _from_fitted_pose(self, view: "View", truth: "Tensor", used: "Tensor | None") -> "Rendering":
         """The view from where its left half says that it was taken."""
         from nerf.effects.exposure import ExposedModel
         from nerf.grid_field import GridField
@@ -198,8 +200,9 @@ class Examiner:
         field = model.model if isinstance(model, ExposedModel) else model
         assert isinstance(field, GridField), "only with a grid field does evaluate fit poses"
         rays = view_rays(self.scene, view, self.downscale)
-        painter = self._painter(view)
-        return painter.draw(from_fitted_pose(field, rays, rendering, self.painter.background.cpu(), truth, used))
+        as_it_is = replace(self.painter, model=field).draw(rays)
+        moved = from_fitted_pose(field, rays, as_it_is, self.painter.background.cpu(), truth, used)
+        return self._painter(view).draw(moved)
 
     def _photo(self, view: "View") -> "Tensor":
         from stages.training_data import view_pixels

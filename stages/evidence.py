@@ -50,7 +50,7 @@ def scene_evidence(
     progress.update("fitting the photos' exposures")
     fit, tracks = fit_exposure(looked.tracks), looked.tracks
     of = {
-        "exposure": exposure_evidence(fit),
+        "exposure": exposure_evidence(fit, told_exposures(ingest, scene)),
         "tone": tone_evidence(fit),
         "view_dependence": view_dependence_evidence(tracks, fit),
         "vignetting": vignetting_evidence(tracks, fit),
@@ -63,6 +63,16 @@ def scene_evidence(
     # must not make another field.
     gains = np.round(fit.log_gain, GAIN_DIGITS) + 0.0  # no -0
     return SceneEvidence(of | geometric_evidence(ingest, scene, points, uncertainty_px), fit._replace(log_gain=gains))
+
+
+def told_exposures(ingest: Path, scene: "Scene") -> "np.ndarray":
+    """(training photos,) exposure that EXIF tells of each, EV up to a constant; NaN where it tells none."""
+    import numpy as np
+
+    from stages.photos import read_photos
+
+    told = {photo.file: photo.exposure_ev for photo in read_photos(ingest)}
+    return np.array([told.get(view.file) for view in scene.of_split("train")], float)  # None becomes NaN
 
 
 def lens_evidence(registration: dict[str, Any]) -> "Evidence":

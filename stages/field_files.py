@@ -1,13 +1,14 @@
 """A trained field on disk: ``field.safetensors`` (weights) and ``field.json`` (what they belong to)."""
 
 import difflib
+import json
 import math
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stages.contract import StageError
-from stages.files import read_json, write_json
+from stages.files import MOST_LETTERS, first_fault, read_json, write_json
 
 if TYPE_CHECKING:
     from nerf.grid_field import GridField
@@ -44,16 +45,20 @@ def load_field(folder: Path, device: str = "cpu") -> "tuple[RadianceModel, dict[
     Raises:
         StageError: if the files are missing or damaged, or another version of the program wrote them.
     """
+    from pydantic import ValidationError
     from safetensors import SafetensorError
     from safetensors.torch import load_file
 
     info = read_json(folder / "field.json")
     try:
-        model = _untrained(info["kind"], info["settings"], device)
-        model.load_state_dict(load_file(folder / "field.safetensors"))
+        weights = folder / "field.safetensors"
+        model = _untrained(info["kind"], info["settings"], weights.stat().st_size, device)
+        model.load_state_dict(load_file(weights))
         neutral = _neutral(info)
-    except (OSError, KeyError, TypeError, ValueError, RuntimeError, SafetensorError) as error:
-        why = " ".join(str(error).split())  # torch lists mismatches over several lines
+    except ValidationError as error:
+        raise StageError("cannot read the trained field", first_fault(error), "Run stage train again.") from error
+    except (OSError, KeyError, TypeError, AttributeError, ValueError, RuntimeError, SafetensorError) as error:
+        why = " ".join(str(error).split())[:MOST_LETTERS]  # torch lists mismatches over several lines
         raise StageError("cannot read the trained field", why, "Run stage train again.") from error
     model = model.to(device).requires_grad_(False)
     return model if neutral is None else _exposed(model, neutral, device), info
@@ -104,13 +109,29 @@ def _some(names: list[str], wanted: str) -> str:
     return f"{', '.join(shown)} and {len(names) - len(shown)} more"
 
 
-def _untrained(kind: str, settings: dict[str, Any], device: str) -> "PaperNerf | GridField":
+def _untrained(kind: str, settings: dict[str, Any], stored: int, device: str) -> "PaperNerf | GridField":
+    """The field of these settings; ``stored`` is the size of its weights in bytes, which it must not exceed. Raises
+    ValueError, before anything is allocated."""
+    from pydantic import TypeAdapter
+
     from nerf.grid_field import GridField, GridSettings
     from nerf.paper import PaperNerf, PaperSettings
     from stages.backend import chosen_backend, load_backend
 
+    if kind not in ("grid", "paper"):
+        raise ValueError(f"a field of kind {str(kind)[:MOST_LETTERS]!r} is unknown to this version")
+    text = json.dumps(settings)
     if kind == "grid":
-        return GridField(GridSettings(**settings), 0, load_backend(chosen_backend(device), device))
-    if kind == "paper":
-        return PaperNerf(PaperSettings(**settings), seed=0)
-    raise ValueError(f"a field of kind {kind!r} is unknown to this version")
+        grid = GridSettings(**settings)  # which refuses unknown names; their types are checked next
+        TypeAdapter(GridSettings).validate_json(text, strict=True)
+        _check_size(grid.layout.rows * grid.features, stored)
+        return GridField(grid, 0, load_backend(chosen_backend(device), device))
+    paper = PaperSettings(**settings)
+    TypeAdapter(PaperSettings).validate_json(text, strict=True)
+    _check_size(paper.depth * paper.width**2, stored)
+    return PaperNerf(paper, seed=0)
+
+
+def _check_size(numbers: int, stored: int) -> None:
+    if 4 * numbers > stored:
+        raise ValueError(f"its settings ask for {4 * numbers} bytes of weights and more, and {stored} are there")

@@ -3,14 +3,18 @@
 import json
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from stages.contract import StageError
 
 if TYPE_CHECKING:
     import numpy as np
+    from pydantic import ValidationError
 
     from nerf.scene import Scene
+
+T = TypeVar("T")
+MOST_LETTERS = 300  # of what another program says of a file
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -19,11 +23,37 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def read_json(path: Path) -> Any:
-    """Read a JSON file that one of our stages wrote."""
+    """Read a JSON file that one of our stages wrote. Raises StageError where it is missing or damaged."""
     try:
         return json.loads(path.read_text("utf-8"))
-    except (OSError, ValueError) as error:
-        raise StageError(f"cannot read {path.name}", str(error), "Delete its folder and run again.") from error
+    except (OSError, ValueError, RecursionError) as error:
+        raise damaged(path.name, str(error)) from error
+
+
+def damaged(name: str, why: str) -> StageError:
+    """The error for a file that one of our stages wrote and that is not any more as it was."""
+    return StageError(f"cannot read {name}", why, "Delete its folder and run again.")
+
+
+def read_dataclass(path: Path, kind: type[T]) -> T:
+    """Read a JSON file that one of our stages wrote as this dataclass, every field of its own type.
+
+    Raises StageError where it is missing or damaged.
+    """
+    from pydantic import TypeAdapter, ValidationError
+
+    try:
+        return TypeAdapter(kind).validate_json(path.read_bytes(), strict=True)
+    except OSError as error:
+        raise damaged(path.name, str(error)) from error
+    except ValidationError as error:
+        raise damaged(path.name, first_fault(error)) from error
+
+
+def first_fault(error: "ValidationError") -> str:
+    """Where the first fault is and what, in one line."""
+    fault = error.errors()[0]
+    return f"{'.'.join(map(str, fault['loc'])) or 'it'}: {fault['msg']}"[:MOST_LETTERS]
 
 
 def write_durably(path: Path, content: bytes) -> None:
@@ -63,10 +93,14 @@ def write_tensors(path: Path, tensors: "dict[str, np.ndarray]") -> None:
 
 
 def read_tensors(path: Path) -> "dict[str, np.ndarray]":
-    """Read arrays written by :func:`write_tensors`."""
+    """Read arrays written by :func:`write_tensors`. Raises StageError where the file is missing or damaged."""
+    from safetensors import SafetensorError
     from safetensors.numpy import load_file
 
-    return load_file(path)
+    try:
+        return load_file(path)
+    except (OSError, KeyError, ValueError, SafetensorError) as error:
+        raise damaged(path.name, str(error)) from error
 
 
 def write_png(path: Path, pixels: "np.ndarray") -> None:
@@ -79,7 +113,11 @@ def write_png(path: Path, pixels: "np.ndarray") -> None:
 
 
 def read_scene(folder: Path) -> "Scene":
-    """The scene that stage normalise left in ``folder``."""
+    """The scene that stage normalise left in ``folder``. Raises StageError where it is missing or damaged."""
     from nerf.scene import Scene
 
-    return Scene.from_json(read_json(folder / "scene.json"))
+    value = read_json(folder / "scene.json")
+    try:
+        return Scene.from_json(value)
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        raise damaged("scene.json", f"{type(error).__name__}: {error}"[:MOST_LETTERS]) from error

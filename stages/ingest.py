@@ -21,11 +21,22 @@ from stages.ascii_names import ascii_files
 from stages.contract import Inputs, OptionalSourcePath, Progress, SourcePath, StageConfig, StageError, StageResult
 from stages.decoding import CameraKey, DecodeError, Place, decode
 from stages.files import write_png
-from stages.ingest_words import all_the_same, facts, say, say_findings, say_masks, say_refused, shown, summary, too_few
+from stages.ingest_words import (
+    all_plain,
+    all_the_same,
+    facts,
+    say,
+    say_findings,
+    say_masks,
+    say_refused,
+    shown,
+    summary,
+    too_few,
+)
 from stages.masks import pair_masks, read_mask
 from stages.near_duplicates import near_duplicates, thumbnail
 from stages.photos import Photo, Refusal, write_photos
-from stages.sharpness import relative_sharpness, sharpness
+from stages.sharpness import one_colour, relative_sharpness, sharpness
 from stages.sources import Source, find_source
 from stages.video_frames import FEWEST_FRAMES, take_frames
 
@@ -33,7 +44,7 @@ if TYPE_CHECKING:
     import numpy as np
 
 NEEDS: tuple[str, ...] = ()
-VERSION = 3
+VERSION = 4
 RESUMES = False
 LINKS = ("photos.json", "images", "masks")
 
@@ -73,7 +84,9 @@ class _Taken:
     sharpness: float
     focal_source: str | None = None
     has_alpha: bool = False
+    one_colour: str | None = None
     place: Place = _NO_PLACE
+    exposure_ev: float | None = None
     time_s: float | None = None
     mask: _TakenMask | None = None
     digest: bytes = b""  # of size and pixels
@@ -103,6 +116,8 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
         say([f"{shown(t.name)}: {note}" for t in taken for note in t.notes], progress)
         if len(taken) < 2:
             raise too_few(source, [photo.name for photo in taken], refused)
+        if all(photo.one_colour for photo in taken):
+            raise all_plain([(photo.name, photo.one_colour) for photo in taken if photo.one_colour])
         if source.kind == "photos":
             progress.update("looking for photos that are nearly the same")
         photos = _store(taken, _same_pictures(taken) if source.kind == "photos" else {}, folder)
@@ -196,7 +211,9 @@ def _take(file: Path, name: str, mask: Path | None, waiting: Path) -> _Taken | R
         sharpness=sharpness(pixels),
         focal_source=decoded.focal_source,
         has_alpha=pixels.shape[2] == 4 and bool((pixels[..., 3] < 255).any()),
+        one_colour=one_colour(pixels),
         place=decoded.place,
+        exposure_ev=decoded.exposure_ev,
         mask=taken_mask,
         digest=hashlib.blake2b(str(pixels.shape).encode() + pixels.data, digest_size=16).digest(),
         thumbnail=thumbnail(pixels),
@@ -261,6 +278,7 @@ def _store(taken: Sequence[_Taken], same: Mapping[str, str], folder: Path) -> li
                 near_duplicate_of=same.get(photo.name),
                 time_s=photo.time_s,
                 **photo.place._asdict(),
+                exposure_ev=photo.exposure_ev,
             )
         )
     return photos

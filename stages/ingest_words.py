@@ -83,6 +83,14 @@ def all_the_same(photos: int) -> StageError:
     return StageError(f"all {photos} photos are nearly the same picture", why, HINT)
 
 
+def all_plain(colours: Sequence[tuple[str, str]]) -> StageError:
+    """The error for photos that show nothing: (name, the one colour of all its pixels)."""
+    name, colour = colours[0]
+    why = f"{shown(name)} is {colour} everywhere, so there is nothing that could be found or learnt"
+    hint = "Look at the photos: a cap on the lens, an exposure far off, or an export that failed."
+    return StageError(f"all {len(colours)} photos show one single colour", why, hint)
+
+
 def summary(source: Source, photos: Sequence[Photo], refused: Sequence[Refusal]) -> str:
     """Ingest's line."""
     sizes = sorted({(photo.width, photo.height) for photo in photos})

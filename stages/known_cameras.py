@@ -5,6 +5,7 @@ OpenCV axes here and nowhere else. Photos are told apart by their own names, as 
 """
 
 import math
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -14,7 +15,8 @@ import numpy as np
 from jaxtyping import Float
 
 from nerf.scene import Camera
-from stages.colmap.cameras import is_valid, rescaled
+from stages.colmap.cameras import camera_rays, focal_lengths_and_centre, rescaled
+from stages.colmap.model_files import FARTHEST, LARGEST_SIDE
 from stages.colmap.models import read_model
 from stages.contract import StageError
 from stages.photos import Photo
@@ -24,8 +26,14 @@ from stages.transforms_export import OPENGL_FROM_OPENCV
 
 ORTHONORMAL_WITHIN = 1e-3  # largest entry of RᵀR − 1 that is rounding; beyond it a matrix means something else
 ASPECT_WITHIN = 0.01
+# Focal lengths in widths of the picture: from 179° across to 20 seconds of arc, a telescope's.
+FOCAL_RATIOS = (0.005, 10_000.0)
+FARTHEST_CENTRE = 100.0  # in widths: where the principal point of the last corner cut out of a large picture may lie
+LARGEST_ENTRY = 1e6  # of a matrix that is looked at more closely: products of three of them are numbers
 MOST_NAMES = 5
+MOST_LETTERS = 40  # of a value, in an error
 TRANSFORMS_HINT = "Correct the file, or leave the cameras out to have them found from the photos."
+LENS_SAMPLES = 8  # pixels along each side at which a lens must have an inverse; normalise looks at more
 FISHEYE, RATIONAL = "OPENCV_FISHEYE", "FULL_OPENCV"
 
 
@@ -120,12 +128,10 @@ def _camera(values: Mapping[str, Any], photo: Photo) -> Camera:
         return _finite(values.get(key, default), f"{key} of frame {name!r}")
 
     width, height = number("w", photo.width), number("h", photo.height)
-    if not (width >= 1 and height >= 1 and width.is_integer() and height.is_integer()):
+    if not all(1 <= side <= LARGEST_SIDE and side.is_integer() for side in (width, height)):
         raise _wrong(f"the size of frame {name!r}", f"w and h are {width:g} and {height:g}")
     fx = number("fl_x", _focal_of(values.get("camera_angle_x"), width, name))
     fy = number("fl_y", _focal_of(values.get("camera_angle_y"), height, name) or fx)
-    if not (fx > 0 and fy > 0):
-        raise _wrong(f"the focal length of frame {name!r}", f"in pixels it comes to {fx:g} × {fy:g}")
     pinhole = (fx, fy, number("cx", width / 2), number("cy", height / 2))
     k = [number(f"k{i}", 0.0) for i in range(1, 7)]
     p = [number("p1", 0.0), number("p2", 0.0)]
@@ -162,11 +168,18 @@ def _pose(matrix: Any, name: str) -> Float[np.ndarray, "3 4"]:
     """world_from_camera with OpenCV axes, from a matrix as written in a transforms file."""
     try:
         pose = np.array(matrix, np.float64)[:3]
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise _wrong(f"the transform_matrix of frame {name!r}", "it is not a matrix of numbers") from error
     if pose.shape != (3, 4) or not np.isfinite(pose).all():
         raise _wrong(f"the transform_matrix of frame {name!r}", "it is not 4 × 4 (or 3 × 4) finite numbers")
+    if (place := np.abs(pose[:, 3]).max()) > FARTHEST:
+        why = f"its place is {place:.3g} units from the origin, and the most is {FARTHEST:g}"
+        raise _wrong(f"the transform_matrix of frame {name!r}", why)
     rotation = pose[:, :3]
+    if not np.abs(rotation).max() <= LARGEST_ENTRY:
+        raise _wrong(
+            f"the transform_matrix of frame {name!r}", f"it is no rotation: {np.abs(rotation).max():.3g} is in it"
+        )
     if (determinant := np.linalg.det(rotation)) < 0:
         raise _wrong(f"the transform_matrix of frame {name!r}", "it mirrors (its determinant is negative)")
     off = np.abs(rotation.T @ rotation - np.eye(3)).max()
@@ -178,9 +191,10 @@ def _pose(matrix: Any, name: str) -> Float[np.ndarray, "3 4"]:
 
 
 def _finite(value: Any, what: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise _wrong(what, f"it is {value!r}, not a finite number")
-    return float(value)
+    number = value if isinstance(value, int | float) and not isinstance(value, bool) else math.nan
+    if not abs(number) <= sys.float_info.max:
+        raise _wrong(what, f"it is {repr(value)[:MOST_LETTERS]}, not a finite number")
+    return float(number)
 
 
 def _wrong(what: str, why: str) -> StageError:
@@ -204,14 +218,14 @@ def _from_colmap(folder: Path, photos: Sequence[Photo]) -> KnownCameras:
     ]
     scales = [_scale(given.cameras[given.images[i].camera], photo_of[i]) for i in kept]
     posed = {photo.image_name for photo in photo_of.values()}
-    return KnownCameras(
-        model=given.restricted(kept, scales, cameras, images),
-        test_files=None,
-        notes=_notes(
-            [image.file for i, image in enumerate(given.images) if i not in photo_of],
-            [photo.name for photo in photos if photo.image_name not in posed],
-        ),
+    model, behind = given.restricted(kept, scales, cameras, images).without_points_behind()
+    notes = _notes(
+        [image.file for i, image in enumerate(given.images) if i not in photo_of],
+        [photo.name for photo in photos if photo.image_name not in posed],
     )
+    if behind:
+        notes.append(f"{behind} observations of points behind their cameras are left out")
+    return KnownCameras(model, None, notes)
 
 
 def _by_name(names: Sequence[str], photos: Sequence[Photo]) -> dict[int, Photo]:
@@ -235,8 +249,6 @@ def _by_name(names: Sequence[str], photos: Sequence[Photo]) -> dict[int, Photo]:
 def _checked(given: SparseModel, index: int, photo: Photo) -> Camera:
     image = given.images[index]
     camera = given.cameras[image.camera]
-    if not (is_valid(camera) and np.isfinite(image.sfm_from_camera).all()):
-        raise _wrong(f"the camera of {image.file}", f"{camera.model} with {camera.params} and its pose are no camera")
     return _at_size_of(photo, camera, image.file)
 
 
@@ -248,7 +260,11 @@ def _scale(camera: Camera, photo: Photo) -> tuple[float, float]:
 
 
 def _at_size_of(photo: Photo, camera: Camera, name: str) -> Camera:
-    """``camera`` rescaled where the photo has another size. Raises StageError where it has another shape, too."""
+    """``camera`` rescaled where the photo has another size. Raises StageError where it has another shape, too, and for
+    a lens that is none."""
+    if flaw := _flaw(camera):
+        raise _wrong(f"the camera of {name!r}", flaw)
+    camera_rays(camera, LENS_SAMPLES, LENS_SAMPLES)
     across, down = _scale(camera, photo)
     if across == down == 1:
         return camera
@@ -258,6 +274,21 @@ def _at_size_of(photo: Photo, camera: Camera, name: str) -> Camera:
             f"it is for {camera.width}×{camera.height} pixels, the photo has {photo.width}×{photo.height}",
         )
     return rescaled(camera, photo.width, photo.height)
+
+
+def _flaw(camera: Camera) -> str | None:
+    """What is wrong with intrinsics that no lens and no crop could have."""
+    if not np.isfinite(camera.params).all():
+        return f"its parameters are not finite: {', '.join(f'{value:.5g}' for value in camera.params)}"
+    focal, centre = focal_lengths_and_centre(camera)
+    longer = max(camera.width, camera.height)
+    if not all(FOCAL_RATIOS[0] <= value / longer <= FOCAL_RATIOS[1] for value in focal):
+        pixels = " × ".join(f"{value:.5g}" for value in focal)
+        return f"a focal length of {pixels} pixels is not one for a picture of {camera.width}×{camera.height}"
+    if max(map(abs, centre), default=0.0) > FARTHEST_CENTRE * longer:
+        place = ", ".join(f"{value:.5g}" for value in centre)
+        return f"its principal point ({place}) is far outside of its {camera.width}×{camera.height} pixels"
+    return None
 
 
 def _nothing_matches(source: str) -> StageError:

@@ -39,6 +39,8 @@ WAYS = {
 # the products of matching. Below 1131 pixels photos would have to be doubled to yield enough, which saves nothing.
 ORDINARY = 100  # photos
 BEARABLE_SECONDS = 540.0
+SEARCHING = 0.55  # of the seconds given to structure from motion: mapping and adjusting take the rest
+DENSEST = (0.5, 0.08)  # seconds of a photo and of a pair, two cores, of photos with the most features (fountain_p11)
 WORTH_IT = 0.7  # of the time: small photos, or such with few features, gain nothing by a step down, and are spared it
 
 
@@ -106,17 +108,26 @@ def check_matcher(matcher: "Matcher | None", places: "Places") -> None:
         )
 
 
-def chosen(left_open: Open, photos: "Sequence[Photo]", images: Path, neighbours: int, progress: Progress) -> Chosen:
+def chosen(
+    left_open: Open,
+    photos: "Sequence[Photo]",
+    images: Path,
+    neighbours: int,
+    progress: Progress,
+    seconds_given: float | None = None,
+) -> Chosen:
     """What is left open, chosen by what the photos take on this machine; said where anything was measured for it.
 
     First the pairs, then how far features are searched, so that sets of ordinary size are always searched in full.
-    Nothing is measured where it could change nothing.
+    Nothing is measured where it could change nothing. With ``seconds_given`` to all of structure from motion, sets of
+    ordinary size give way, too, where features and matches would take more than their part of it.
     """
     from stages.pairing import can_save, choose, expected_pairs
 
     count, tiers = len(photos), tiers_of(left_open)
     pairs_open = left_open.matcher is None and can_save(count, neighbours)
-    if count <= ORDINARY:
+    bearable = BEARABLE_SECONDS if seconds_given is None else min(BEARABLE_SECONDS, SEARCHING * seconds_given)
+    if count <= ORDINARY and (seconds_given is None or _at_most(count) <= bearable):
         tiers = tiers[:1]
     if not pairs_open and len(tiers) == 1:
         return Chosen(*tiers[0], left_open.matcher or "exhaustive")
@@ -132,12 +143,18 @@ def chosen(left_open: Open, photos: "Sequence[Photo]", images: Path, neighbours:
         )
     tier, seconds = tiers[0], full.of(count, pairs)
     for less in tiers[1:]:
-        if seconds <= BEARABLE_SECONDS:
+        if seconds <= bearable:
             break
         if (shorter := _measured(photos, images, less).of(count, pairs)) <= WORTH_IT * seconds:
             tier, seconds = less, shorter
     progress.note(_search_in_words(count, tiers[0], tier, full.of(count, pairs), seconds))
     return Chosen(*tier, matcher)
+
+
+def _at_most(count: int) -> float:
+    """Seconds that features and all pairs of ``count`` photos take at most, before any is measured."""
+    cores = os.cpu_count() or 1
+    return Cost(*DENSEST).of(count, count * (count - 1) // 2) * max(1.0, 2 / cores)
 
 
 def tiers_of(left_open: Open) -> list[Tier]:

@@ -22,6 +22,7 @@ import numpy as np
 FLOAT, UNSIGNED_INT, UNSIGNED_SHORT = 5126, 5125, 5123  # glTF component types
 ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
 Z_UP_TO_Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+MOST_DECIMALS = 40  # what a scene of 1e-30 units asks for, and there are no smaller ones
 FAR_FROM_ORIGIN = 16  # in sizes of the mesh: beyond it float32 keeps less than a millionth of the size
 
 
@@ -57,7 +58,7 @@ def write_ply(path: Path, mesh: ColouredMesh) -> None:
 
 def write_obj(path: Path, mesh: ColouredMesh) -> None:
     """Wavefront OBJ with colours after the coordinates, as MeshLab, Blender and CloudCompare read them."""
-    decimals = int(np.clip(np.ceil(7 - np.log10(_size(mesh.vertices))), 0, 17))
+    decimals = int(np.clip(np.ceil(7 - np.log10(_size(mesh.vertices))), 0, MOST_DECIMALS))
     point = f"v %.{decimals}f %.{decimals}f %.{decimals}f %.4f %.4f %.4f"
     rows = np.concatenate([mesh.vertices, mesh.colours / 255], axis=1).tolist()
     lines = [point % tuple(row) for row in rows]

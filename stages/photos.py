@@ -1,12 +1,12 @@
 """The photos as ingest left them: what photos.json says of each, and their pixels at any size."""
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from stages.contract import StageError
-from stages.files import read_json, write_json
+from stages.files import damaged, read_dataclass, write_json
 
 if TYPE_CHECKING:
     import numpy as np
@@ -24,7 +24,8 @@ class Photo:
     ``mask`` is a grey PNG of the photo's size, 255 where it is to be used and 0 where it is to be ignored; None: all of
     it is used. ``near_duplicate_of`` is the name of the photo that is nearly the same picture, which is used in its
     place. ``time_s`` is when a frame of a video was taken, in seconds from its beginning, None for photos. The place
-    is EXIF's, in degrees (north and east positive) and metres above the sea, None where it tells none.
+    is EXIF's, in degrees (north and east positive) and metres above the sea, None where it tells none; so is
+    ``exposure_ev``, in stops (stages/decoding.py: exposure_from_exif).
     """
 
     name: str  # the user's own file name, relative to the photo folder
@@ -43,6 +44,7 @@ class Photo:
     latitude: float | None = None
     longitude: float | None = None
     altitude_m: float | None = None
+    exposure_ev: float | None = None
 
     @property
     def image_name(self) -> str:
@@ -66,15 +68,29 @@ def write_photos(folder: Path, photos: Sequence[Photo], refused: Sequence[Refusa
 
 def read_photos(ingest_folder: Path) -> list[Photo]:
     """The photos of a finished ingest, in order of their names. Raises StageError if photos.json is damaged."""
-    try:
-        return [Photo(**photo) for photo in read_json(ingest_folder / "photos.json")["photos"]]
-    except (KeyError, TypeError) as error:
-        raise StageError("cannot read photos.json", str(error), "Delete its folder and run again.") from error
+    photos = _read(ingest_folder).photos
+    for file in (file for photo in photos for file in (photo.file, photo.mask) if file is not None):
+        if not re.fullmatch(r"(images|masks)(/[\w-][\w.-]*)+", file, re.ASCII):
+            raise damaged("photos.json", f"{file[:40]!r} is no file of this folder")
+    return photos
 
 
 def read_frame_names(ingest_folder: Path) -> dict[str, str]:
     """Photo name by file_path as the given transforms file spells it; empty if no cameras were given."""
-    return read_json(ingest_folder / "photos.json")["frames"]
+    return _read(ingest_folder).frames
+
+
+@dataclass(frozen=True)
+class _PhotosFile:
+    """photos.json."""
+
+    photos: list[Photo]
+    refused: list[Refusal]
+    frames: dict[str, str]
+
+
+def _read(ingest_folder: Path) -> _PhotosFile:
+    return read_dataclass(ingest_folder / "photos.json", _PhotosFile)
 
 
 def load_pixels(path: Path, width: int, height: int) -> "np.ndarray":

@@ -31,6 +31,7 @@ FEWEST_LEFT = 4  # and with fewer left to train on there is no pilot
 SEEDS = 3
 BATCH_SAMPLES = 1 << 13  # half the usual: a pilot has to be short, and is judged early
 CHUNKS = 4  # fixed, so that a pilot ends the same whatever the machine
+BESIDE_TRAINING = 0.3  # of the time of the trainings: reading photos, the warm-up, scoring
 SURE = 2.0  # standard errors by which a gain must exceed 0,
 LEAST_GAIN_DB = 0.1  # and this, which nobody sees
 
@@ -95,6 +96,16 @@ def pilot_scene(ingest: Path, scene: "Scene", progress: Progress) -> PilotScene 
     ]
     kept = tuple(photo for photo in photos if enough(photo.colours, photo.used))
     return PilotScene(split, bank, kept) if kept else None
+
+
+def expected_seconds(scene: "Scene", steps: int) -> float:
+    """What a pilot takes here: its trainings, by a few steps of a fresh field, and what goes on beside them."""
+    from stages.device import compute_device
+    from stages.training_size import seconds_per_step
+
+    arm = Decisions(view_dependence=True, unbounded=not scene.has_alpha, pose_refinement=False, exposure=None)
+    per_step = seconds_per_step(_config(arm, steps, compute_device()), scene, arm)
+    return (1 + BESIDE_TRAINING) * 2 * SEEDS * steps * per_step
 
 
 def run_pilot(trial: PilotScene, off: Decisions, on: Decisions, steps: int, seed: int, progress: Progress) -> Pilot:

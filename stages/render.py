@@ -19,13 +19,15 @@ if TYPE_CHECKING:
     from nerf.model import Rendering
     from nerf.rays import Rays
     from nerf.scene import Scene
-    from stages.drawing import Painter
+    from stages.drawing import Allowance, Painter
 
 NEEDS = ("normalise", "train")
 VERSION = 3
 RESUMES = False
 LINKS = ("video.mp4", "depth.mp4", "path.json")
+UNKEYED = ("seconds",)  # it decides how many frames and how large, and these enter the key
 
+STARTING_SECONDS = 1.0  # to load the field once more and to write what is not video
 TRIED_VIEWS = 4  # of the path, to see how fast the field draws them
 WRITING_SECONDS = 1.5e-7  # to encode a pixel of video.mp4 and of depth.mp4 (x264 with one thread: 13 million a second)
 
@@ -45,6 +47,9 @@ class Config(StageConfig):
     frames: int | None = Field(default=None, ge=2, description="none: as many as time allows, 24 to 120 if it can be")
     width: int | None = Field(default=None, ge=16, le=8192, description="pixels; odd numbers are rounded to even ones")
     fps: int | None = Field(default=None, ge=1, le=120, description="none: 30, fewer for fewer than 120 frames")
+    seconds: float | None = Field(
+        default=None, gt=0, description="that the stage may take; none: 40 % of the training's for drawing"
+    )
     depth: bool = Field(default=True, description="write depth.mp4 too")
     like: str | None = Field(
         default=None,
@@ -55,6 +60,7 @@ class Config(StageConfig):
 
 def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
     """Choose path, frames, width and fps; frames and width by how fast this machine draws pictures along the path."""
+    from stages.drawing import Allowance
     from stages.render_plan import chosen_fps
 
     _check(config)
@@ -66,7 +72,8 @@ def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
     width = config.width
     if frames is None or width is None:
         downscale = 1 if config.cameras else read_json(inputs["train"] / "field.json")["downscale"]
-        frames, width = _affordable(path, scene, inputs["train"], downscale, (frames, width), progress)
+        allowance = Allowance(config.seconds, inputs["train"], STARTING_SECONDS)
+        frames, width = _affordable(path, scene, inputs["train"], downscale, (frames, width), allowance, progress)
     kept = None if config.cameras else frames
     return config.model_copy(update={"frames": kept, "width": width, "fps": config.fps or chosen_fps(frames)})
 
@@ -77,10 +84,11 @@ def _affordable(
     train: Path,
     downscale: float,
     asked: tuple[int | None, int | None],
+    allowance: "Allowance",
     progress: Progress,
 ) -> tuple[int, int]:
-    """(frames, width), where not asked for as many and as large as may be drawn in a share of the training's time."""
-    from stages.drawing import SHARE, measured_speed, training_seconds
+    """(frames, width), where not asked for as many and as large as may be drawn in the time allowed."""
+    from stages.drawing import measured_speed
     from stages.render_plan import affordable, longest_side
 
     camera = path.cameras[0]
@@ -88,9 +96,8 @@ def _affordable(
     longest = longest_side(camera, downscale)
     drawn = measured_speed(train, lambda side: _tried_rays(path, scene, side), int(longest))
     speed = 1 / (1 / drawn + WRITING_SECONDS)
-    trained = training_seconds(train)
-    frames, width = affordable(SHARE * trained * speed, camera, longest, *asked)
-    progress.note(_why(path.resized(width), frames, speed, trained, asked))
+    frames, width = affordable(allowance.left() * speed, camera, longest, *asked)
+    progress.note(_why(path.resized(width), frames, speed, allowance, asked))
     return frames, width
 
 
@@ -108,7 +115,7 @@ def _tried_rays(path: CameraPath, scene: "Scene", side: int) -> "Rays":
 
 
 def _why(
-    path: CameraPath, frames: int, rays_per_second: float, trained: float, asked: tuple[int | None, int | None]
+    path: CameraPath, frames: int, rays_per_second: float, allowance: "Allowance", asked: tuple[int | None, int | None]
 ) -> str:
     """What was chosen, how long it takes, and where that is less or more than one would wish."""
     from stages.render_plan import FEWEST_FRAMES, SMALL_SIDE
@@ -116,8 +123,8 @@ def _why(
     camera = path.cameras[0]
     seconds = frames * camera.width * camera.height / rays_per_second
     words = f"{short_count(rays_per_second)} rays/s here: {frames} frames {camera.width}×{camera.height} take about "
-    words += f"{duration(seconds)}, training took {duration(trained)}"
-    if seconds > trained:
+    words += f"{duration(seconds)}, {allowance.words()}"
+    if seconds > (allowance.given or allowance.trained):
         return f"{words}; that is longer, {'as asked' if any(asked) else 'but there is no smaller video'}"
     small = (asked[0] is None and frames < FEWEST_FRAMES) or (
         asked[1] is None and max(camera.width, camera.height) < SMALL_SIDE - 2

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 PathKind = Literal["orbit", "spiral", "interpolated"]
 BY_LAYOUT: dict[str, PathKind] = {"around": "orbit", "forward": "spiral", "inside": "interpolated"}
+LARGEST_SIDE = 2**15  # pixels: four times as many as any screen has
 LEAST_FOCAL = 0.5  # in widths: a pinhole wider than 90 degrees stretches its corners
 
 
@@ -106,7 +107,7 @@ def path_from_file(scene: "Scene", file: Path) -> CameraPath:
         try:
             cameras.append(_camera(content | frame, usual))
             poses.append(_in_scene(frame["transform_matrix"], scene.scene_from_sfm))
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, ArithmeticError) as error:
             hint = "Give numbers as output/transforms.json and output/path.json have them."
             raise StageError(f"cannot use frame {index} of {file.name}", str(error), hint) from error
     if len({(camera.width, camera.height) for camera in cameras}) > 1:
@@ -144,8 +145,8 @@ def _camera(values: dict[str, Any], usual: "Camera") -> "Camera":
     else:
         fx = usual.params[0] * max(width, height) / max(usual.width, usual.height)
     fy = float(values.get("fl_y", fx))
-    if not (width > 0 and height > 0 and 0 < fx < math.inf and 0 < fy < math.inf):
-        raise ValueError(f"size {width} x {height} with focal length {fx:g} is no camera")
+    if not (0 < width <= LARGEST_SIDE and 0 < height <= LARGEST_SIDE and 0 < fx < math.inf and 0 < fy < math.inf):
+        raise ValueError(f"size {width:.6g} x {height:.6g} with focal length {fx:g} is no camera")
     pinhole = (fx, fy, float(values.get("cx", width / 2)), float(values.get("cy", height / 2)))
     fisheye = values.get("camera_model") == "OPENCV_FISHEYE"
     names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2")

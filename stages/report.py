@@ -7,19 +7,21 @@ they would have told is then left out, never made up.
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field
+from tyro.conf import Suppress
 
 from stages.contract import Inputs, Progress, StageConfig, StageResult
 from stages.files import read_json, read_scene, read_tensors, write_json
 from stages.live_line import duration, short_count
+from stages.training_parts import PARTS_FILE
 
 if TYPE_CHECKING:
     from nerf.scene import Scene
 
-NEEDS = ("ingest", "sfm", "normalise", "effects", "train", "evaluate", "render", "mesh")
-VERSION = 3
+NEEDS = ("ingest", "sfm", "normalise", "effects", "train", "evaluate", "render", "mesh", "tradeoff")
+VERSION = 4
 RESUMES = False
 LINKS = ("report.html", "summary.json")
 
@@ -27,16 +29,29 @@ WIDTH_LARGE, WIDTH_SMALL = 900, 420  # pixels of a picture in the page
 MOST_SMALL = 12  # further test photos shown, besides the best, the median and the worst
 
 
+class Account(StageConfig):
+    """What a budget of wall time promised and what was spent, in seconds, by stage; none of what was there already."""
+
+    seconds: float
+    promised: dict[str, float]
+    spent: dict[str, float]
+
+
 class Config(StageConfig):
     """Settings of stage report."""
 
     video_limit_mb: float = Field(default=12, ge=0)
     """A larger video lies beside the page and not inside it."""
+    budget: Annotated[Account | None, Suppress] = None
+    """What the runner knows of the time given to the run; no flag is offered for it."""
 
 
 @dataclass(frozen=True)
 class Results:
-    """What the finished stages left. The parts of stages that have not run are None."""
+    """What the finished stages left. The parts of stages that have not run are None.
+
+    The study has no part in ``manifests``: its time is none of the run's.
+    """
 
     inputs: Inputs
     manifests: Mapping[str, dict[str, Any]]
@@ -46,7 +61,9 @@ class Results:
     effects: dict[str, Any] | None
     field: dict[str, Any] | None
     curve: dict[str, Any] | None
+    parts: dict[str, Any] | None
     metrics: dict[str, Any] | None
+    study: dict[str, Any] | None
 
 
 def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> StageResult:
@@ -54,6 +71,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     progress.update("reading results")
     results = read_results(inputs)
     summary = summarise(results)
+    summary["budget"] = config.budget and config.budget.model_dump()
     write_json(folder / "summary.json", summary)
     progress.update("writing the page")
     (folder / "report.html").write_text(page(results, summary, config), "utf-8")
@@ -68,14 +86,16 @@ def read_results(inputs: Inputs) -> Results:
 
     return Results(
         inputs=inputs,
-        manifests={stage: of(stage, "manifest.json") for stage in NEEDS if stage in inputs},
+        manifests={stage: of(stage, "manifest.json") for stage in NEEDS if stage in inputs and stage != "tradeoff"},
         photos=of("ingest", "photos.json"),
         registration=of("sfm", "registration.json"),
         scene=read_scene(inputs["normalise"]) if "normalise" in inputs else None,
         effects=of("effects", "effects.json"),
         field=of("train", "field.json"),
         curve=of("train", "curve.json"),
+        parts=of("train", PARTS_FILE) if "train" in inputs and (inputs["train"] / PARTS_FILE).exists() else None,
         metrics=of("evaluate", "metrics.json"),
+        study=of("tradeoff", "tradeoff.json"),
     )
 
 
@@ -89,6 +109,8 @@ def summarise(results: Results) -> dict[str, Any]:
         "field": results.field["kind"] if results.field else None,
         "train_seconds": manifests["train"]["facts"]["train_seconds"] if "train" in manifests else None,
         "total_seconds": round(sum(manifest["seconds"] for manifest in manifests.values()), 3),
+        "stage_seconds": {stage: manifest["seconds"] for stage, manifest in manifests.items()},
+        "training_parts": results.parts,
         **{key: metrics.get(key) for key in ("psnr", "ssim", "psnr_mean_image", "psnr_nearest_view")},
         "mesh": mesh and {key: mesh[key] for key in ("vertices", "faces", "watertight")},
         "verdict": metrics.get("verdict", "Not measured: stage evaluate has not run."),
@@ -100,6 +122,7 @@ def page(results: Results, summary: dict[str, Any], config: Config) -> str:
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     from stages.report_effects import effects_table
+    from stages.report_parts import parts_bar
 
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent),
@@ -115,6 +138,7 @@ def page(results: Results, summary: dict[str, Any], config: Config) -> str:
         metrics=results.metrics,
         registration=results.registration,
         manifests=results.manifests,
+        budget=config.budget,
         settings=_settings(results.manifests),
         refused=results.photos["refused"] if results.photos else [],
         missing=_missing(results),
@@ -124,7 +148,9 @@ def page(results: Results, summary: dict[str, Any], config: Config) -> str:
         video=_video(results.inputs, config.video_limit_mb),
         compared=_compared(results),
         curve=_curve(results),
+        parts=parts_bar(results.parts),
         effects=effects_table(results.effects),
+        study=_study(results),
         cameras=_cameras(results),
         mesh_preview=_mesh_preview(results.inputs),
         longest=max((manifest["seconds"] for manifest in results.manifests.values()), default=0) or 1,
@@ -250,6 +276,24 @@ def _curve(results: Results) -> dict[str, Any] | None:
     threads = results.curve["threads"]
     where = "a GPU" if results.curve["device"] == "cuda" else f"{threads} processor core{'' if threads == 1 else 's'}"
     return {"svg": Markup(svg), "words": [f"{word[0].upper()}{word[1:]}." for word in words if word], "where": where}
+
+
+def _study(results: Results) -> dict[str, Any] | None:
+    """The study of cost and quality: recommendation, plot, table, and the ablation's pictures where there are any."""
+    from markupsafe import Markup
+
+    from stages.tradeoff import COLUMNS, cells
+    from stages.tradeoff_plot import plot_svg
+
+    if results.study is None:
+        return None
+    ablation = results.inputs["tradeoff"] / "ablation.png"
+    return results.study | {
+        "svg": Markup(plot_svg(results.study)),
+        "columns": COLUMNS,
+        "rows": [{"cells": cells(row), "front": row["front"]} for row in results.study["points"]],
+        "ablation": _data_uri(ablation.read_bytes(), "image/png") if ablation.exists() else None,
+    }
 
 
 def _compared(results: Results) -> dict[str, Any] | None:

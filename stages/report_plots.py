@@ -30,7 +30,7 @@ def curve_svg(points: Sequence[dict[str, Any]], baselines: dict[str, float | Non
     rows = [row for row in points if row["seconds"] > 0]
     if len(rows) < 2:
         return None
-    with _drawing((8.2, 3.4), "curve") as figure:
+    with drawing((8.2, 3.4), "curve") as figure:
         axes = figure.add_subplot()
         for key, label, colour in (("train_psnr", "training rays", GREY), ("heldout_psnr", "held-out photos", BLUE)):
             seen = [(row["seconds"], row[key]) for row in rows if row[key] is not None]
@@ -42,7 +42,7 @@ def curve_svg(points: Sequence[dict[str, Any]], baselines: dict[str, float | Non
         _doubling_axis(axes, rows[0]["seconds"], rows[-1]["seconds"], last)
         axes.set(xlabel="training time", ylabel="PSNR (dB)")
         axes.legend(frameon=False, loc="lower left", bbox_to_anchor=(0, 1), ncols=3, borderaxespad=0)
-        return _svg(figure)
+        return svg_element(figure)
 
 
 def _draw_prediction(axes: "Axes", curve: Sequence[tuple[float, float]]) -> bool:
@@ -100,7 +100,7 @@ def _layout_svg(name: str, scene: "Scene", plane: tuple[int, int], xyz: "np.ndar
     low, high = np.minimum(centres.min(0), -BOX), np.maximum(centres.max(0), BOX)
     middle, half = (low + high) / 2, (high - low) / 2 + 0.06 * (high - low).max()
     shown = np.linspace(0, len(xyz) - 1, min(len(xyz), MOST_POINTS)).astype(int)
-    with _drawing((5, min(8.0, max(1.6, 5 * half[1] / half[0]))), name) as figure:
+    with drawing((5, min(8.0, max(1.6, 5 * half[1] / half[0]))), name) as figure:
         axes = figure.add_subplot(aspect="equal")
         axes.scatter(*xyz[shown][:, plane].T, c=rgb[shown] / 255, s=2, lw=0, alpha=0.7, rasterized=True)
         axes.add_patch(Rectangle((-BOX, -BOX), 2 * BOX, 2 * BOX, fill=False, ec=INK, ls="--", alpha=0.6))
@@ -109,7 +109,7 @@ def _layout_svg(name: str, scene: "Scene", plane: tuple[int, int], xyz: "np.ndar
             axes.add_collection(LineCollection(outlines, colors=colour, lw=0.9, zorder=3))
         axes.set(xlim=middle[0] + half[0] * np.array([-1, 1]), ylim=middle[1] + half[1] * np.array([-1, 1]))
         axes.set_axis_off()
-        return _svg(figure)
+        return svg_element(figure)
 
 
 def _outline(scene: "Scene", view: "View", depth: float) -> "np.ndarray":
@@ -139,7 +139,7 @@ def _doubling_axis(axes: "Axes", first: float, last: float, end: float) -> None:
 
 
 @contextmanager
-def _drawing(size: tuple[float, float], salt: str) -> "Iterator[Figure]":
+def drawing(size: tuple[float, float], salt: str) -> "Iterator[Figure]":
     """A figure to draw on, without pyplot's global state, whose identifiers depend on ``salt`` alone."""
     from matplotlib import rc_context
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -154,7 +154,7 @@ def _drawing(size: tuple[float, float], salt: str) -> "Iterator[Figure]":
         yield figure
 
 
-def _svg(figure: "Figure") -> str:
+def svg_element(figure: "Figure") -> str:
     """The figure as an element to be put into a page, transparent, scaling with its column."""
     import io
 

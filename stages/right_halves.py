@@ -47,8 +47,8 @@ def from_fitted_pose(
     used: "Tensor | None",
     seed: int = 0,
 ) -> "Rays":
-    """``rays`` (H, W) of a photo from where its left half says that it was taken, at the exposure that suits its
-    ``rendering`` along them; everything on the CPU."""
+    """``rays`` (H, W) of a photo from where its left half says that it was taken, at the exposure that suits the
+    ``rendering`` of ``field`` along them (at no other exposure than the field's own); everything on the CPU."""
     import torch
 
     from nerf.effects.exposures import Exposures

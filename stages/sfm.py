@@ -18,11 +18,12 @@ if TYPE_CHECKING:
     from stages.photos import Photo
 
 NEEDS = ("ingest",)
-VERSION = 3
+VERSION = 4
 RESUMES = True
 LINKS = ("sparse",)
 # It may decide that an attempt is not made, which is said; in the key it would part a run from the matches kept for it.
-UNKEYED = ("max_seconds",)
+# And the time it is given decides how far features are searched, which enters the key.
+UNKEYED = ("max_seconds", "seconds")
 
 CameraModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE"]
 Matcher = Literal["exhaustive", "sequential", "spatial", "retrieval"]
@@ -53,6 +54,9 @@ class Config(StageConfig):
     """Partners of each photo, where not all pairs are matched."""
     attempts: int = Field(default=len(ATTEMPTS), ge=1, le=len(ATTEMPTS))
     """How many ways to find the cameras are tried while photos have no place; 1: only the first."""
+    seconds: float | None = Field(default=None, gt=0)
+    """That it may take, if it can be: features are searched less far where they would take longer, and further attempts
+    that would not fit are not begun. It is not given up for it; None: as long as is bearable."""
     max_seconds: float = Field(default=4 * 3600.0, gt=0)
     """When structure-from-motion is given up; what was matched until then is kept for the next try. Attempts that
     would not fit are not begun."""
@@ -68,7 +72,8 @@ def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
         return config
     photos = sorted(read_photos(inputs["ingest"]), key=lambda photo: photo.file)
     photos = [photo for photo in photos if not photo.near_duplicate_of]
-    answer = chosen(left_open, photos, inputs["ingest"] / "images", config.neighbours, progress)
+    images = inputs["ingest"] / "images"
+    answer = chosen(left_open, photos, images, config.neighbours, progress, config.seconds)
     return config.model_copy(update=answer._asdict())
 
 
@@ -87,7 +92,9 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
 
 
 def _import(cameras: Path, photos: "list[Photo]", ingest: Path, folder: Path, progress: Progress) -> StageResult:
-    from stages.colmap.models import write_model
+    import numpy as np
+
+    from stages.colmap.models import read_model, write_model
     from stages.known_cameras import read_known_cameras
     from stages.photos import read_frame_names
 
@@ -96,13 +103,20 @@ def _import(cameras: Path, photos: "list[Photo]", ingest: Path, folder: Path, pr
     for note in known.notes:
         progress.note(note)
     write_model(folder / "sparse", known.model)
+    errors = read_model(folder / "sparse").error_px  # computed anew: what the given model says of them may be anything
+    if lost := int((~np.isfinite(errors)).sum()):
+        raise StageError(
+            f"the cameras of {cameras.name} do not fit its points",
+            f"{lost} of {len(errors)} points are seen where their cameras cannot see anything",
+            "Check the distortion of the cameras, or leave them out to have them found from the photos.",
+        )
     return _result(
         folder,
         source="import",
         attempts=[],
         repeated_structure=None,
         images=[image | {"uncertainty_px": None} for image in known.account(photos)],
-        reprojection_px=float(known.model.error_px.mean()) if len(known.model.xyz) else None,
+        reprojection_px=float(errors.mean()) if len(errors) else None,
         points=len(known.model.xyz),
         camera_model="/".join(sorted({camera.model for camera in known.model.cameras})),
         camera_models=[],

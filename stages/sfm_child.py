@@ -6,6 +6,7 @@ goes too. Messages to the parent are lines of JSON on stdout; whatever COLMAP pr
 """
 
 import json
+import math
 import os
 import shutil
 import sys
@@ -74,6 +75,7 @@ class Job:
     matcher: Matcher
     neighbours: int
     attempts: int
+    seconds: float | None
     max_seconds: float
 
 
@@ -118,8 +120,8 @@ class _Work:
         self.seconds[phase] = time.monotonic() - self.begun
 
     def left(self) -> float:
-        """Seconds until the parent gives up."""
-        return self.started + self.job.max_seconds - time.monotonic()
+        """Seconds that further attempts may take."""
+        return self.started + min(self.job.seconds or math.inf, self.job.max_seconds) - time.monotonic()
 
     @cached_property
     def similarity(self) -> Similarity:
@@ -234,7 +236,8 @@ def _no_way(attempt: Attempt, missing: list[int], work: _Work) -> str | None:
     expected = expected_seconds(attempt, tried, len(missing) / len(work.photos), chosen_pairs)
     if not time_against(expected, tried, left):
         return None
-    times = f"about {about(expected)} and the last adjustment, of --sfm.max-seconds {about(left)} are left"
+    limit = "--sfm.max-seconds" if work.job.seconds is None else "the time it is given"
+    times = f"about {about(expected)} and the last adjustment, of {limit} {about(max(0.0, left))} are left"
     work.say(note=f"left out, for it would take {times}: {attempt.words}")
     return NO_TIME
 

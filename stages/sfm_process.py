@@ -26,7 +26,7 @@ PHASES = {"features": (0.0, 0.35), "matching": (0.35, 0.5), "mapping": (0.85, 0.
 FIRST_ATTEMPT, REFINING = 0.7, 0.95  # where they end and begin in the whole
 FOR_CHILD = (
     "seed", "max_image_size", "max_features", "camera_model", "camera_params", "matcher", "neighbours", "attempts",
-    "max_seconds",
+    "seconds", "max_seconds",
 )  # fmt: skip
 CHILD = ["-m", "stages.sfm_child"]
 

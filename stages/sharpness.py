@@ -1,4 +1,4 @@
-"""How sharp photos are, and which are far less sharp than those around them."""
+"""How sharp photos are, and which are far less sharp than those around them; which show nothing at all."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -43,3 +43,12 @@ def relative_sharpness(values: Sequence[float], groups: Sequence[int]) -> list[f
             usual = median(values[other] for other in around) if len(around) >= FEWEST_NEIGHBOURS else 0.0
             relative[index] = float(f"{values[index] / usual:.4g}") if usual > 0 else None
     return relative
+
+
+def one_colour(pixels: "np.ndarray") -> str | None:
+    """The one colour of all pixels (h, w, 3 or 4) uint8, in words; None for a picture of anything."""
+    if pixels.shape[2] == 4 and not pixels[..., 3].any():
+        return "transparent"
+    if (pixels != pixels[0, 0]).any():
+        return None
+    return "#" + "".join(f"{value:02x}" for value in pixels[0, 0].tolist())

@@ -26,6 +26,8 @@ _VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".3
 # fmt: on
 _IMAGES = (".jpg", ".jpeg", ".png", ".heic", ".heif", ".tif", ".tiff", ".webp", ".bmp", ".avif", ".gif")
 _EXTENSIONS_TRIED = ("", ".png", ".jpg", ".jpeg")
+LONGEST_PATH, LONGEST_NAME = 2000, 250  # bytes, with room for an extension
+MOST_LETTERS = 60  # of a name, in an error
 _FOLDER_HINT = "Give the folder that holds the photos: pipeline run FOLDER"
 
 
@@ -153,6 +155,9 @@ def read_transforms(transforms: Path) -> dict[str, Any]:
             raise StageError(
                 f"cannot use {transforms.name}", f"frame {index} lacks file_path or transform_matrix", hint
             )
+        if wrong := next((name for name in _names(frame) if not _is_name(name)), None):
+            why = f"no file can have the name of frame {index}, {ascii(wrong)[:MOST_LETTERS]}"
+            raise StageError(f"cannot use {transforms.name}", why, hint)
     return content
 
 
@@ -160,6 +165,15 @@ def _names(frame: dict[str, Any]) -> tuple[str, ...]:
     """What a frame calls its photo: in a file of ours by its own name first (``photo``), then ``file_path``."""
     own = frame.get("photo")
     return (own, frame["file_path"]) if isinstance(own, str) else (frame["file_path"],)
+
+
+def _is_name(file_path: str) -> bool:
+    """Whether it can be written as UTF-8 and is of a length that file systems take."""
+    try:
+        parts = file_path.encode().split(b"/")
+    except UnicodeEncodeError:
+        return False
+    return sum(map(len, parts)) <= LONGEST_PATH and max(map(len, parts)) <= LONGEST_NAME
 
 
 def _frame_file(names: tuple[str, ...], folders: tuple[Path, ...]) -> Path:
@@ -180,7 +194,7 @@ def _inside(folder: Path, file_path: str) -> Path:
     absolute = Path(file_path).is_absolute()
     if absolute or "\0" in file_path or not file.resolve().is_relative_to(folder.resolve()):
         raise StageError(
-            f"refused the photo {file_path!r}",
+            f"refused the photo {file_path[:MOST_LETTERS]!r}",
             "its path is absolute" if absolute else f"it leads out of the folder {folder}",
             "A transforms file may name photos inside its own folder only.",
         )

@@ -8,6 +8,8 @@ from jaxtyping import Float, Int, UInt8
 
 from nerf.scene import Camera
 
+EDGE_ON = 1e-6  # of its distance: a point less deep than this is beside the camera, where no lens looks
+
 
 @dataclass(frozen=True)
 class SparseImage:
@@ -41,6 +43,26 @@ class SparseModel:
         return cls(
             cameras, images, np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0), none, none, np.zeros((0, 2))
         )
+
+    def without_points_behind(self) -> tuple["SparseModel", int]:
+        """This model without the observations whose point does not lie in front of its camera, and how many those are.
+        Points that nobody sees any more are left out, too."""
+        poses = np.array([image.sfm_from_camera for image in self.images]).reshape(-1, 3, 4)[self.view]
+        away = self.xyz[self.point] - poses[:, :, 3]
+        depth = np.einsum("ni,ni->n", away, poses[:, :, 2])
+        front = depth > EDGE_ON * np.linalg.norm(away, axis=1)
+        points, point = np.unique(self.point[front], return_inverse=True)
+        model = SparseModel(
+            self.cameras,
+            self.images,
+            self.xyz[points],
+            self.rgb[points],
+            self.error_px[points],
+            self.view[front],
+            point,
+            self.xy[front],
+        )
+        return model, int((~front).sum())
 
     def restricted(
         self,

@@ -51,7 +51,7 @@ PAPER_SIZES = {
 GRID_RATES = {"bounded": 2e-2, "contracted": 1e-2}
 GRID_SAMPLES = 1 << 14
 
-GRID_ONLY = ("backend", "chunks", "levels", "log2_rows", "finest", "batch_samples")
+GRID_ONLY = ("backend", "chunks", "levels", "log2_rows", "finest", "batch_samples", "ray_samples")
 PAPER_ONLY = (
     *("batch_rays", "depth", "width", "skip", "position_frequencies", "direction_frequencies"),
     *("samples_coarse", "samples_fine", "positional_encoding", "hierarchical"),
@@ -108,6 +108,9 @@ class Config(StageConfig):
     log2_rows: int | None = Field(default=None, ge=8, le=24, description="grid: rows of a grid's table, as power of 2")
     finest: int | None = Field(default=None, ge=16, le=4096, description="grid: cells along an axis of the finest grid")
     batch_samples: int | None = Field(default=None, ge=256, description="grid: colours computed in a step")
+    ray_samples: float = Field(
+        default=1.0, gt=0, description="grid: samples along a ray, times what suits its finest cells"
+    )
 
     batch_rays: int | None = Field(default=None, ge=1, description="paper: rays in a step; none: by the preset")
     depth: int | None = Field(default=None, ge=1, description="paper: layers before the density")
@@ -230,6 +233,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     from stages.curve import write_curve
     from stages.effect_decisions import learnt_of_photos
     from stages.field_files import save_field
+    from stages.training_parts import write_parts
     from stages.training_setup import field_background, prepare
 
     config, scene = plan(config, inputs, progress), read_scene(inputs["normalise"])
@@ -242,7 +246,10 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     info |= learnt_of_photos(training.trainer, scene.of_split("train"))
     save_field(folder, training.trainer.model, info)
     write_curve(folder, training.state.curve)
-    return _result(config, training, folder, progress)
+    progress.update("measuring what this machine can do")
+    device = training.probes.train.colours.device
+    parts = write_parts(folder, training.state.timings, training.trainer.model, device)
+    return _result(config, training, folder, parts, progress)
 
 
 def _with_photos_aside(config: Config, scene: "Scene", progress: Progress) -> "Scene":
@@ -256,7 +263,7 @@ def _with_photos_aside(config: Config, scene: "Scene", progress: Progress) -> "S
     return scene
 
 
-def _result(config: Config, training: "TrainingRun", folder: Path, progress: Progress) -> StageResult:
+def _result(config: Config, training: "TrainingRun", folder: Path, parts: list[str], progress: Progress) -> StageResult:
     from stages.checkpoints import checkpoint_files
     from stages.curve import doubling_words, target_words
 
@@ -278,9 +285,10 @@ def _result(config: Config, training: "TrainingRun", folder: Path, progress: Pro
         "downscale": config.downscale,
         "restarts": state.restarts,
         "rollbacks": state.rollbacks,
+        "symptom": state.symptom,
     }
     final = checkpoint_files(training.checkpoints, state.step)
-    records = ("curve.json", "log.jsonl", "plan.json", *final, *left_behind, *board)
+    records = ("curve.json", "log.jsonl", "plan.json", *parts, *final, *left_behind, *board)
     return StageResult(("field.safetensors", "field.json"), _line(config, training), records, facts)
 
 
@@ -298,4 +306,6 @@ def _line(config: Config, training: "TrainingRun") -> str:
         "no photos held out" if heldout is None else f"held out {heldout:.1f} dB {sparkline(state.curve)}".rstrip()
     ]
     parts += [next_words(state.curve), target_words(config.target_psnr, state.validation_psnr, state.seconds)]
+    if state.symptom is not None:
+        parts.append(f"of no use yet: {state.symptom}")
     return " · ".join(filter(None, parts))

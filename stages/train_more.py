@@ -12,7 +12,7 @@ from stages.files import read_json
 
 if TYPE_CHECKING:
     from stages.train import Config
-    from stages.training_loop import Budget
+    from stages.training_state import Budget
 
 DIGITS = 16
 OWN = ("after", "more_steps", "more_seconds")
@@ -70,7 +70,7 @@ def _same_inputs(digests: dict[str, str], inputs: Inputs) -> None:
 
 def budget_of(config: "Config", inputs: Inputs) -> "Budget":
     """How long to train, and from where on."""
-    from stages.training_loop import Budget
+    from stages.training_state import Budget
 
     if config.after is None:
         return Budget(config.steps, config.seconds)

@@ -5,35 +5,39 @@ What can happen to a run, and what the loop does:
 * killed: goes on from the last good checkpoint; the journal of step plans gives every step its old learning rate;
 * a loss or gradient stops being finite: the batch is kept, the state rolled back and the rate halved, three times;
 * the field is dead after the warm-up (empty, or no better than one flat colour): another seed, twice at most;
+* it is so later, or at the end: back to the last checkpoint, like after a loss that is not finite. A run that ends
+  within the warm-up is too short to judge: it ends, and says aloud what is wrong with it;
 * it goes on from the end of a finished run: from that run's last checkpoint, at the rates of the longer run;
 * it comes near a target on validation photos: it anneals early, and goes on as before if that was not enough.
 """
 
 import json
-import math
 import shutil
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING
 
 from stages.checkpoints import Checkpoint, latest_checkpoint, save_checkpoint
 from stages.contract import Progress, StageError
+from stages.examination import Lost, is_suspicious, not_finite, symptom_of
 from stages.files import read_json, write_durably
 from stages.live_line import live_line, short_count
+from stages.training_parts import observed
+from stages.training_state import Budget, Pace, Probes, RunState
 
 if TYPE_CHECKING:
-    from nerf.probe import Probe, ProbeResult
+    from nerf.probe import ProbeResult
     from nerf.schedule import StepPlan
     from nerf.training import FieldTrainer, NonFinite
     from stages.training_log import TrainingLog
-    from stages.unseen import Target, Unseen
+    from stages.unseen import Target
 
 MOST_ROLLBACKS = 3
 MOST_RESTARTS = 2
 WARM_UP_STEPS = 500  # after these a field is examined; a healthy one beats a flat colour long before
-EMPTY_OPACITY = 1e-3  # a field whose mean opacity is below this shows nothing but background
 FIRST_MEASUREMENT = {"seconds": 2.0, "steps": 64.0}  # of training; the next follow at so many times that, and so on:
 MEASUREMENT_GROWTH, TARGET_GROWTH = 2**0.5, 1.1  # the second where a measurement may end the run
 MOST_MEASURING = 0.05  # of a run in seconds: the share of the time that may go into measuring
@@ -41,56 +45,6 @@ MOST_MEASURING = 0.05  # of a run in seconds: the share of the time that may go 
 ANNEALING_DB = 1.0
 PLAN_SHARE = 0.01  # of a budget in seconds: how often the clock is looked at, and how far off a plan may be
 PROVISIONAL_STEPS = 1_000_000  # the plan of a run in seconds until its first step has been timed
-RATE_MEMORY_SECONDS = 5.0  # how far back the measured speed and the shown PSNR look
-
-
-class Budget(NamedTuple):
-    """How long to train: exactly one of the first two is given. Seconds count training steps alone. ``after``: the
-    folder of a finished run from whose end to go on; the budget is then for what comes on top."""
-
-    steps: int | None
-    seconds: float | None
-    after: Path | None = None
-
-
-class Probes(NamedTuple):
-    """Fixed pixels to measure on; ``heldout`` is None without test photos, is reported and decides nothing. A
-    ``target`` decides when to stop."""
-
-    train: "Probe"
-    heldout: "Unseen | None" = None
-    target: "Target | None" = None
-
-
-@dataclass
-class RunState:
-    """What a checkpoint keeps beside the tensors. ``seconds`` and ``rays`` include what was discarded, and what was
-    done before in the finished run that this one goes on from."""
-
-    step: int = 0
-    seconds: float = 0.0
-    rays: int = 0
-    restarts: int = 0
-    rollbacks: int = 0
-    curve: list[dict[str, Any]] = field(default_factory=list)
-    validation_psnr: float | None = None
-    steps_before: int = 0  # of the finished run that this one goes on from
-    seconds_before: float = 0.0
-
-
-class Pace:
-    """Running means of a run's speed and batch PSNR, forgetting after a few seconds. Shown, and used for planning."""
-
-    def __init__(self) -> None:
-        self.count, self.seconds_per_step, self.rays_per_step, self.psnr = 0, 0.0, 0.0, 0.0
-
-    def add(self, seconds: float, rays: int, psnr: float) -> None:
-        """Take one step into account."""
-        self.count += 1
-        new = max(1 / self.count, 1 - math.exp(-seconds / RATE_MEMORY_SECONDS))
-        self.seconds_per_step += new * (seconds - self.seconds_per_step)
-        self.rays_per_step += new * (rays - self.rays_per_step)
-        self.psnr += new * (psnr - self.psnr)
 
 
 class TrainingRun:
@@ -114,7 +68,7 @@ class TrainingRun:
         self.log, self.progress = log, progress
         self.checkpoints, self.journal = folder / "checkpoints", folder / "plan.json"
         self.pace, self.next_planning = Pace(), 0.0
-        checkpoint = latest_checkpoint(self.checkpoints, progress.note)
+        checkpoint = latest_checkpoint(self.checkpoints, progress.note, self._fits)
         if checkpoint is None and budget.after is not None:
             self._go_on(budget.after)
         elif checkpoint is None or checkpoint.step == 0:
@@ -127,10 +81,12 @@ class TrainingRun:
         from nerf.training import NonFinite
 
         with live_line(self.progress, self._describe):
-            while not self._is_over:
+            over = False
+            while not over:
                 try:
                     self._take_steps()
-                except NonFinite as fault:
+                    over = self._is_over
+                except (NonFinite, Lost) as fault:
                     self._roll_back(fault)
         self._save()
 
@@ -178,6 +134,10 @@ class TrainingRun:
         assert seconds is not None, "one of the two is given"
         return None, self.state.seconds_before + seconds
 
+    def _fits(self, checkpoint: Checkpoint) -> None:
+        """Raise RuntimeError for the state of another field, TypeError for facts that are not a run's."""
+        self.make_trainer(RunState(**checkpoint.facts).restarts).load_state(checkpoint.tensors)
+
     def _resume(self, checkpoint: Checkpoint) -> None:
         """Go on from a checkpoint, by the plan that held when the run was killed: its steps are now counted."""
         self._load(checkpoint, self.journal)
@@ -199,20 +159,25 @@ class TrainingRun:
         """Steps to the end of the plan, with everything that is due between them."""
         while self.state.step < self.plan.total_steps:
             self._take_step()
-            if self.state.step == WARM_UP_STEPS and (symptom := self._symptom()):
+            if self.state.step == WARM_UP_STEPS and (symptom := symptom_of(self.trainer, self.probes.train)):
                 self._restart(symptom)
             if self._elapsed >= self.next_measurement:
+                self._examine()
                 self._measure()
             if self.clock_budget is not None and self.state.seconds >= self.next_planning:
                 self._replan(self.clock_budget)
             if time.monotonic() >= self.next_checkpoint:
+                self._examine()
                 self._save()
+        self._examine_at_the_end()
         if not self._is_over:
             self._measure()
 
     def _take_step(self) -> None:
         started = time.perf_counter()
-        result = self.trainer.step(self.state.step, self.plan.share(self.state.step), 0.5**self.state.rollbacks)
+        share, scale = self.plan.share(self.state.step), 0.5**self.state.rollbacks
+        take = partial(self.trainer.step, self.state.step, share, scale)
+        result = observed(take, self.state.step, self.state.timings, self.probes.train.colours.device)
         seconds = time.perf_counter() - started
         self.state.step += 1
         self.state.seconds += seconds
@@ -311,33 +276,61 @@ class TrainingRun:
     def _write_journal(self) -> None:
         write_durably(self.journal, json.dumps(self.plan.decisions).encode())
 
-    def _roll_back(self, fault: "NonFinite") -> None:
+    def _examine(self) -> None:
+        """Before the state is kept: raise Lost where it is not finite or, the warm-up being over, the field is dead."""
+        if name := not_finite(self.trainer):
+            raise Lost(f"after {self.state.step:,} steps the field is lost: its {name} is not finite")
+        if self.state.step > WARM_UP_STEPS and is_suspicious(self.pace.psnr, self.probes.train):
+            self._examine_fully()
+
+    def _examine_at_the_end(self) -> None:
+        self._examine()
+        if self.state.step >= WARM_UP_STEPS:
+            self._examine_fully()
+        elif symptom := symptom_of(self.trainer, self.probes.train):
+            self.state.symptom = symptom
+            self.log.event("unripe", self.state.step, symptom=symptom)
+            self.progress.note(f"after {self.state.step:,} steps the field is of no use yet: {symptom}; train longer")
+
+    def _examine_fully(self) -> None:
+        if symptom := symptom_of(self.trainer, self.probes.train):
+            raise Lost(f"after {self.state.step:,} steps the field is lost: {symptom}")
+
+    def _roll_back(self, fault: "NonFinite | Lost") -> None:
         """Keep the batch, return to the last good checkpoint and halve the rate; give up by name after the third."""
+        hint = self._on_record(fault)
+        rollbacks = self.state.rollbacks + 1
+        if rollbacks > MOST_ROLLBACKS:
+            why = f"{fault}, after {MOST_ROLLBACKS} roll-backs that each halved the learning rate"
+            raise StageError("training diverged", why, hint)
+        checkpoint = latest_checkpoint(self.checkpoints, self.progress.note, self._load_sound)
+        if checkpoint is None:
+            self._begin(self.state.anew(self.state.restarts, rollbacks))
+        else:
+            self.state.step, self.state.rollbacks = checkpoint.step, rollbacks
+        self.progress.note(f"{fault}: back to step {self.state.step:,} at half the learning rate")
+
+    def _load_sound(self, checkpoint: Checkpoint) -> None:
+        """Go back to it. Raises Lost where the field was dead already, as its batches tell only seconds later."""
+        self.trainer.load_state(checkpoint.tensors)
+        if checkpoint.step > WARM_UP_STEPS and (symptom := symptom_of(self.trainer, self.probes.train)):
+            raise Lost(symptom)
+
+    def _on_record(self, fault: "NonFinite | Lost") -> str:
+        """Log the fault, and keep the batch of one that has it; what the user may try."""
+        slower = "Try a tenth of --train.learning-rate"
+        if isinstance(fault, Lost):
+            self.log.event("lost", self.state.step, symptom=str(fault))
+            return f"{slower}."
         from safetensors.torch import save_file
+
+        from nerf.training import RAYS
 
         name = f"nonfinite_{fault.step}.safetensors"
         save_file({key: tensor.contiguous() for key, tensor in fault.batch.items()}, self.folder / name)
         self.log.event("nonfinite", fault.step, quantity=fault.quantity, batch=name)
-        rollbacks = self.state.rollbacks + 1
-        if rollbacks > MOST_ROLLBACKS:
-            why = f"{fault}, after {MOST_ROLLBACKS} roll-backs that each halved the learning rate"
-            hint = f"Try a tenth of --train.learning-rate; the batch is kept in {self.folder / name}."
-            raise StageError("training diverged", why, hint)
-        checkpoint = latest_checkpoint(self.checkpoints, self.progress.note)
-        if checkpoint is None:
-            raise StageError("training cannot roll back", f"{fault} and no checkpoint is readable", "Run it again.")
-        self.trainer.load_state(checkpoint.tensors)
-        self.state.step, self.state.rollbacks = checkpoint.step, rollbacks
-        self.progress.note(f"{fault}: back to step {checkpoint.step:,} at half the learning rate")
-
-    def _symptom(self) -> str | None:
-        """What is wrong with the field after its warm-up, or None; judged on training photos alone."""
-        seen = self._on_training_photos()
-        if seen.opacity < EMPTY_OPACITY:
-            return f"it is empty (mean opacity {seen.opacity:.0e})"
-        if seen.psnr <= self.probes.train.flat_psnr:
-            return f"it is no better than a flat colour ({seen.psnr:.1f} of {self.probes.train.flat_psnr:.1f} dB)"
-        return None
+        advice = "Check the cameras, which give the rays" if fault.quantity == RAYS else slower
+        return f"{advice}; the batch is kept in {self.folder / name}."
 
     def _on_training_photos(self) -> "ProbeResult":
         from nerf.probe import measure
@@ -350,11 +343,11 @@ class TrainingRun:
         restarts = self.state.restarts + 1
         if restarts > MOST_RESTARTS:
             why = f"after {WARM_UP_STEPS} steps {symptom}, with {restarts} different seeds"
-            raise StageError("the field does not learn", why, "Check the cameras: the photos may not fit their poses.")
+            hint = "Check the cameras: the photos may not fit their poses. Or try a tenth of --train.learning-rate."
+            raise StageError("the field does not learn", why, hint)
         self.progress.note(f"after {WARM_UP_STEPS} steps the field is dead: {symptom}; starting with another seed")
         shutil.rmtree(self.checkpoints)
-        kept = {name: getattr(self.state, name) for name in ("seconds", "rays", "steps_before", "seconds_before")}
-        self._begin(RunState(restarts=restarts, **kept))
+        self._begin(self.state.anew(restarts, rollbacks=0))
 
     def _describe(self) -> tuple[str, float]:
         """The live line: step, speed, quality, time left."""

@@ -37,7 +37,8 @@ def prepare(config: "Config", scene: "Scene", inputs: Inputs, folder: Path, prog
     from stages.train_more import budget_of
     from stages.training_data import training_bank
     from stages.training_log import TrainingLog
-    from stages.training_loop import Probes, TrainingRun
+    from stages.training_loop import TrainingRun
+    from stages.training_state import Probes
     from stages.unseen import PROBE_RAYS, Target, unseen_photos
 
     assert config.downscale is not None, "plan() chooses it"
@@ -122,9 +123,9 @@ def grid_settings(config: "Config") -> "GridSettings":
         coarsest=min(COARSEST, config.finest),
         finest=config.finest,
         contracted=config.contracted,
-        steps=min(max(config.finest, FEWEST_STEPS), MOST_STEPS),
-        shortest_step=2 / config.finest,
-        cone=8 / config.finest,
+        steps=max(1, round(config.ray_samples * min(max(config.finest, FEWEST_STEPS), MOST_STEPS))),
+        shortest_step=2 / (config.ray_samples * config.finest),
+        cone=8 / (config.ray_samples * config.finest),
         view_dependence=config.view_dependence,
     )
 

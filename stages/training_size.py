@@ -4,7 +4,7 @@ import math
 import time
 from typing import TYPE_CHECKING
 
-from stages.device import compute_device
+from stages.device import compute_device, cores
 from stages.effect_decisions import photo_parts
 from stages.training_setup import make_trainer
 
@@ -17,7 +17,8 @@ if TYPE_CHECKING:
 LEAST_LONG_SIDE = 150  # pixels: below this a photo shows too little to judge anything by
 TIMED_SECONDS = 1.0
 MOST_TIMED_RAYS = {"cpu": 256, "cuda": 1 << 20}
-"""A CPU is as fast on small batches, and a small one keeps the published model's steps short; a GPU is not."""
+"""For each core: one chunk of a batch. More keep a CPU no busier and make the published model's steps long; a GPU needs
+many."""
 SAMPLES_PER_RAY = {"bounded": 8, "contracted": 20}
 """Colours that the grid field computes for a ray, over a run: measured on lego_400 and fox (docs/numbers.md)."""
 GRID_SIZES = {
@@ -59,15 +60,20 @@ def grid_size(config: "Config", scene: "Scene", rays: float) -> dict[str, int]:
 def rays_in_budget(config: "Config", scene: "Scene", decisions: "Decisions") -> float:
     """How many rays the run will draw: counted for a budget of steps, from measured speed for one of seconds."""
     if config.steps is not None:
-        return config.steps * _rays_per_step(config)
+        return config.steps * rays_per_step(config)
     assert config.seconds is not None, "one of the two is given"
     return config.seconds * rays_per_second(config, scene, decisions)
 
 
 def rays_per_second(config: "Config", scene: "Scene", decisions: "Decisions") -> float:
-    """Measured training speed: steps of a fresh field, with its effects, on a grey picture, for about a second."""
+    """Measured training speed."""
+    config = _timed(config, compute_device())
+    return rays_per_step(config) / seconds_per_step(config, scene, decisions)
+
+
+def seconds_per_step(config: "Config", scene: "Scene", decisions: "Decisions") -> float:
+    """Measured: steps of a fresh field of known sizes, with its effects, on a grey picture, for about a second."""
     device = compute_device()
-    config = _timed(config, device)
     bank = _grey_bank(scene).to(device)
     parts = photo_parts(decisions, scene.of_split("train")[:1], bank.device)
     trainer = make_trainer(config, scene, bank, seed=0, photo_parts=parts)
@@ -76,19 +82,20 @@ def rays_per_second(config: "Config", scene: "Scene", decisions: "Decisions") ->
     while steps == 0 or time.perf_counter() - started < TIMED_SECONDS:
         steps += 1
         trainer.step(steps, 0.0, 1.0)
-    return steps * _rays_per_step(config) / (time.perf_counter() - started)
+    return (time.perf_counter() - started) / steps
 
 
 def _timed(config: "Config", device: str) -> "Config":
     """Settings under which speed is measured before the grids' sizes are known."""
     if config.field == "paper":
         assert config.batch_rays is not None
-        return config.model_copy(update={"batch_rays": min(config.batch_rays, MOST_TIMED_RAYS[device])})
+        return config.model_copy(update={"batch_rays": min(config.batch_rays, MOST_TIMED_RAYS[device] * cores())})
     sizes = {"levels": config.levels or 5, "log2_rows": config.log2_rows or 18, "finest": config.finest or 512}
     return config.model_copy(update=sizes)
 
 
-def _rays_per_step(config: "Config") -> float:
+def rays_per_step(config: "Config") -> float:
+    """Rays of one step: as set for the paper field, for the grid field expected from the colours it computes."""
     if config.field == "paper":
         assert config.batch_rays is not None
         return config.batch_rays

@@ -148,10 +148,12 @@ def _contrast(
     return slope, error, float(np.sqrt(np.median((size / total)[known])))
 
 
-def exposure_evidence(fit: ExposureFit) -> Evidence:
+def exposure_evidence(fit: ExposureFit, told: Float[np.ndarray, "views"] | None = None) -> Evidence:
     """Whether photos differ in exposure (or white balance): the deviation of gains over photos and channels, EV.
 
-    The noise, that of one gain, is taken off in quadrature, so that noise alone is no difference.
+    The noise, that of one gain, is taken off in quadrature, so that noise alone is no difference. ``told`` is what the
+    camera wrote of each photo's exposure (EV up to a constant, NaN where nothing): a cross-check, which decides nothing
+    because programs that develop photos change exposures and leave what was written.
     """
     if not fit.known.any():
         return unknown("EV", THRESHOLD_EV, fit.unknown_because, None)
@@ -162,7 +164,18 @@ def exposure_evidence(fit: ExposureFit) -> Evidence:
     ratio = f"{span / noise:.0f} × their noise" if noise > 0 else "without noise"
     alone = int(np.count_nonzero(~fit.known))
     left_out = f"; {alone} photos share hardly any points with the others" if alone else ""
-    return judged(spread, noise, THRESHOLD_EV, "EV", f"gains span {span:.2g} EV, {ratio}{left_out}")
+    checked = "" if told is None else _beside_told(gain.mean(axis=1), told[fit.known])
+    return judged(spread, noise, THRESHOLD_EV, "EV", f"gains span {span:.2g} EV, {ratio}{left_out}{checked}")
+
+
+def _beside_told(gain: Float[np.ndarray, "known"], told: Float[np.ndarray, "known"]) -> str:
+    """How far the gains are from what the cameras wrote, in words; nothing where they wrote of less than two."""
+    both = np.isfinite(told)
+    if np.count_nonzero(both) < 2:
+        return ""
+    apart = (gain - told)[both]
+    apart = np.sqrt(np.mean((apart - apart.mean()) ** 2))
+    return f"; EXIF tells of {np.ptp(told[both]):.2g} EV, the gains deviate from it by {apart:.2g}"
 
 
 def tone_evidence(fit: ExposureFit) -> Evidence:

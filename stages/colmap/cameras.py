@@ -53,8 +53,15 @@ def rescaled(camera: Camera, width: int, height: int) -> Camera:
 
 def is_valid(camera: Camera) -> bool:
     """Whether all parameters are finite and all focal lengths positive."""
-    focal = [camera.params[i] for i in native(camera).focal_length_idxs()]
+    focal, _ = focal_lengths_and_centre(camera)
     return bool(np.isfinite(camera.params).all()) and all(f > 0 for f in focal)
+
+
+def focal_lengths_and_centre(camera: Camera) -> tuple[list[float], list[float]]:
+    """The parameters that are focal lengths, one or two, and the principal point's; a panorama has neither."""
+    model = native(camera)
+    focal, centre = model.focal_length_idxs(), model.principal_point_idxs()
+    return [camera.params[i] for i in focal], [camera.params[i] for i in centre]
 
 
 def native(camera: Camera, camera_id: int = 1) -> "pycolmap.Camera":

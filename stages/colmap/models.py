@@ -4,8 +4,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Float
 
-from stages.colmap.cameras import native, plain
+from stages.colmap.cameras import native
+from stages.colmap.model_files import NO_POINT, read_model_files
 from stages.contract import StageError
 from stages.sparse_model import SparseImage, SparseModel
 
@@ -15,31 +17,45 @@ if TYPE_CHECKING:
 
 def read_model(sparse: Path) -> SparseModel:
     """Read a COLMAP model (binary or text). Raises StageError if it is damaged."""
-    import pycolmap
-
     try:
-        model = pycolmap.Reconstruction(sparse)
-    except (ValueError, RuntimeError, LookupError, OSError) as error:
+        files = read_model_files(sparse)
+    except (ValueError, OverflowError, OSError) as error:
         raise StageError(
             f"cannot read the COLMAP model in {sparse.name}", str(error), "Check that it is a complete COLMAP model."
         ) from error
-    camera_ids = sorted(model.cameras)
-    images = sorted((model.image(i) for i in model.reg_image_ids()), key=lambda image: image.name)
-    point_ids = np.array(sorted(model.point3D_ids()), np.int64)
-    points = [model.point3D(i) for i in point_ids]
-    seen = [image.get_observation_points2D() for image in images]
+    camera_ids = sorted(files.cameras)
+    images = sorted(files.images.values(), key=lambda image: image.name)
+    point_ids = np.array(sorted(files.points), np.int64)
+    points = [files.points[i] for i in point_ids.tolist()]
+    seen = [image.points != NO_POINT for image in images]
     return SparseModel(
-        cameras=[plain(model.camera(i)) for i in camera_ids],
-        images=[
-            SparseImage(i.name, camera_ids.index(i.camera_id), i.cam_from_world().inverse().matrix()) for i in images
-        ],
+        cameras=[files.cameras[i] for i in camera_ids],
+        images=[SparseImage(i.name, camera_ids.index(i.camera), world_from_camera(i.pose)) for i in images],
         xyz=np.array([p.xyz for p in points]).reshape(-1, 3),
-        rgb=np.array([p.color for p in points], np.uint8).reshape(-1, 3),
-        error_px=np.array([p.error for p in points], float),
-        view=np.repeat(np.arange(len(images)), [len(s) for s in seen]),
-        point=np.searchsorted(point_ids, np.array([p.point3D_id for s in seen for p in s], np.int64)),
-        xy=np.array([p.xy for s in seen for p in s], float).reshape(-1, 2),
+        rgb=np.array([p.rgb for p in points], np.uint8).reshape(-1, 3),
+        error_px=np.array([p.error_px for p in points], float),
+        view=np.repeat(np.arange(len(images)), [int(s.sum()) for s in seen]),
+        point=np.searchsorted(point_ids, _joined([i.points[s] for i, s in zip(images, seen, strict=True)], (0,))),
+        xy=_joined([i.xy[s] for i, s in zip(images, seen, strict=True)], (0, 2)),
     )
+
+
+def _joined(parts: list[np.ndarray], empty: tuple[int, ...]) -> np.ndarray:
+    return np.concatenate(parts) if parts else np.zeros(empty)
+
+
+def world_from_camera(pose: Float[np.ndarray, "7"]) -> Float[np.ndarray, "3 4"]:
+    """The inverse of COLMAP's camera_from_world, (qw, qx, qy, qz, tx, ty, tz), whose quaternion is normalised."""
+    quaternion = pose[:4] / np.abs(pose[:4]).max()  # first, or the square of a tiny one is zero
+    w, x, y, z = quaternion / np.linalg.norm(quaternion)
+    rotation = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)],
+            [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)],
+            [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    return np.concatenate([rotation, -(rotation @ pose[4:])[:, None]], axis=1)
 
 
 def load_native(sparse: Path) -> "pycolmap.Reconstruction":

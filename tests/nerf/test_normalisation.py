@@ -122,6 +122,49 @@ def test_every_observed_point_but_outliers_lies_between_near_and_far(layout: str
     assert (found.near < 0.999 * found.far).all()
 
 
+@pytest.mark.parametrize("has_alpha", [False, True])
+@pytest.mark.parametrize("away", [1.0, 30.0, 1e3, 1e6])
+def test_a_camera_anywhere_has_near_before_far_and_reaches_the_region(away: float, has_alpha: bool) -> None:
+    poses = ring()
+    poses[0, :, 3] *= away
+    cameras = dataclasses.replace(
+        seen_by(poses, ball()), points=np.zeros((0, 3)), view=np.zeros(0, int), point=np.zeros(0, int)
+    )
+    for scene in (cameras, seen_by(poses, ball())):
+        found = normalise(scene, has_alpha, None)
+        distance = np.linalg.norm(found.scene_from_sfm.points(scene.centres), axis=1)
+        assert (found.near > 0).all() and (found.near < found.far).all()
+        assert (found.near < distance).all() and (found.far > distance).all()
+
+
+def test_a_telephoto_lens_far_away_sees_the_region() -> None:
+    """The region is as wide as the picture: 40 of its half sides away."""
+    scene = seen_by(ring(radius=4.0), np.zeros((0, 3)))
+    narrow = scene.bearings * [0.05, 0.05, 1.0]
+    narrow /= np.linalg.norm(narrow, axis=2, keepdims=True)
+    found = normalise(dataclasses.replace(scene, bearings=narrow), False, None)
+    distance = np.linalg.norm(found.scene_from_sfm.points(scene.centres), axis=1)
+    assert (distance > 20).all()
+    assert (found.near < distance - 0.9).all() and (found.far > distance + 0.9).all()
+
+
+def test_a_view_of_nothing_but_the_far_distance_has_near_before_far() -> None:
+    scene = with_points(seen_by(ring(), ball()), np.array([[0.0, 1e5, 0.0]]) + ball(50), 3)
+    only_far = scene.point >= 400
+    keep = (scene.view != 0) | only_far
+    found = normalise(dataclasses.replace(scene, view=scene.view[keep], point=scene.point[keep]), False, None)
+    assert (found.near < 0.999 * found.far).all()
+
+
+@pytest.mark.parametrize("offset", [0.0, 1e6, -1e12])
+def test_cameras_in_one_place_are_refused_wherever_it_is(offset: float) -> None:
+    scene = seen_by(room(), np.zeros((0, 3)))
+    poses = scene.from_camera.copy()
+    poses[:, :, 3] = offset + np.array([0.1, 0.2, 0.3]) * (1 + 1e-16 * np.arange(len(poses)))[:, None]
+    with pytest.raises(ValueError, match="one place"):
+        normalise(dataclasses.replace(scene, from_camera=poses), False, None)
+
+
 def test_only_alpha_proves_that_nothing_lies_beyond() -> None:
     around = SCENES["around"]()
     assert normalise(around, True, None).bounded

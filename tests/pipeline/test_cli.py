@@ -10,9 +10,10 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
+from pipeline import chain
 from pipeline.cli import run_command
 from pipeline.display import PlainDisplay, end_line
-from pipeline.settings import default_workspace
+from pipeline.settings import Settings, default_workspace
 
 
 def test_help_names_every_command_and_stage(capsys: pytest.CaptureFixture[str]):
@@ -53,6 +54,9 @@ def test_help_of_run_lists_the_stage_options(capsys: pytest.CaptureFixture[str])
         (["--train.field", "foo"], "invalid choice 'foo' for argument '--train.field'. Expected one of ("),
         (["--effect", "lens_flare=on"], "--effect lens_flare=on: no effect 'lens_flare'; there are: "),
         (["--effect", "lens_flare=on", "--effect", "fog=on"], "--effect lens_flare=on: no effect"),
+        (["--budget", "10"], "'10' is not a duration; write it like 90s, 10m or 1h30m"),
+        (["--budget", "2m", "--train.steps", "50"], "--budget 2m and --train.steps 50: so many steps take as "
+         "long as they take; leave out one, or give --train.seconds"),
         (["--train.stepz", "5"], "Unrecognized options: --train.stepz, 5; perhaps --train.steps"),
     ],
 )  # fmt: skip
@@ -85,6 +89,41 @@ def test_like_is_an_option_of_render_whichever_way_it_is_spelt(tmp_path: Path, m
     for words in (["--like", "a.jpg"], ["--render.like", "a.jpg"], []):
         run_command(["run", str(tmp_path / "photos"), *words])
     assert seen == ["a.jpg", "a.jpg", None]
+
+
+def test_a_photo_to_render_like_has_to_be_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    Image.new("RGB", (40, 30)).save(tmp_path / "IMG_1.jpg")
+    assert run_command(["run", str(tmp_path), "-o", str(tmp_path / "w"), "--like", "IMG_1.jpeg"]) == 2
+    assert "--like IMG_1.jpeg: no photo has that name; perhaps IMG_1.jpg" in capsys.readouterr().err
+    assert not (tmp_path / "w").exists()
+
+
+def test_a_study_is_asked_for_by_its_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    seen: list[tuple[Settings, list[str]]] = []
+
+    def remember(_root: Path, settings: Settings, stages: list[str], *_: object, **__: object) -> None:
+        seen.append((settings, stages))
+
+    monkeypatch.setattr("pipeline.cli._run_stages", remember)
+    (tmp_path / "run.json").write_text('{"version": 1, "options": {}, "plans": {}, "keys": {}}')
+    run_command(["tradeoff", str(tmp_path), "--budget", "30m"])
+    run_command(["tradeoff", str(tmp_path), "--tradeoff.seconds", "60"])
+    assert [settings.tradeoff.seconds for settings, _ in seen] == [1800, 60]
+    assert seen[0][1] == ["ingest", "sfm", "normalise", "effects", "tradeoff"]
+
+
+def test_the_budget_of_a_study_belongs_to_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    (tmp_path / "run.json").write_text('{"version": 1, "options": {}, "plans": {}, "keys": {}}')
+    assert run_command(["mesh", str(tmp_path), "--budget", "30m"]) == 2
+    assert "--budget belongs to `pipeline tradeoff`, not to mesh" in capsys.readouterr().err
+    assert run_command(["tradeoff", str(tmp_path), "--budget", "soon"]) == 2
+    assert "'soon' is not a duration" in capsys.readouterr().err
+
+
+def test_a_run_has_no_study_unless_it_is_named():
+    assert "tradeoff" not in chain.usual() and chain.usual()[-1] == "report"
+    assert "tradeoff" not in chain.up_to("mesh") and chain.up_to("tradeoff")[-1] == "tradeoff"
+    assert chain.needed_for("report") == ["report"]
 
 
 def test_like_belongs_to_render(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):
@@ -243,3 +282,17 @@ def test_plain_output_is_not_flooded(capsys: pytest.CaptureFixture[str]):
         display.update(f"step {k}", k / 1000)
     display.note("a line that stays")
     assert capsys.readouterr().out == "train      a line that stays\n"
+
+
+def test_a_budget_and_more_are_two_budgets(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    def with_after(settings: Settings, *_: object) -> Settings:
+        return settings.model_copy(update={"train": settings.train.model_copy(update={"after": "0" * 16})})
+
+    monkeypatch.setattr("pipeline.cli.with_more", with_after)
+    (tmp_path / "w").mkdir()
+    (tmp_path / "w/run.json").write_text('{"version": 1, "options": {}, "plans": {}, "keys": {}}')
+    words = ["run", str(tmp_path), "-o", str(tmp_path / "w"), "--more", "10m", "--budget", "5m"]
+    assert run_command(words) == 2
+    assert "--budget and --more are two budgets; give one" in capsys.readouterr().err

@@ -82,3 +82,41 @@ def test_writing_replaces_the_whole_file(tmp_path: Path) -> None:
     write_durably(path, b"[]")
     assert path.read_bytes() == b"[]"
     assert [p.name for p in tmp_path.iterdir()] == ["plan.json"]
+
+
+def test_no_flipped_bit_of_either_file_passes(tmp_path: Path) -> None:
+    """Header, tensors, facts, digest: every byte of a small checkpoint."""
+    saved(tmp_path, 3)
+    whole = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    assert len(whole) == 2
+    for path, content in whole.items():
+        for place in range(len(content)):
+            for each, kept in whole.items():
+                each.write_bytes(kept)
+            path.write_bytes(content[:place] + bytes([content[place] ^ 1 << place % 8]) + content[place + 1 :])
+            found = latest_checkpoint(tmp_path, lambda _: None)
+            assert found is None or found.facts == checkpoint(3).facts, f"byte {place} of {path.name}"
+            assert found is None or torch.equal(found.tensors["weight"], checkpoint(3).tensors["weight"])
+
+
+def test_a_checkpoint_under_another_step_does_not_pass(tmp_path: Path) -> None:
+    saved(tmp_path, 3)
+    for path in list(tmp_path.iterdir()):
+        path.rename(tmp_path / path.name.replace("3", "4"))
+    assert latest_checkpoint(tmp_path, lambda _: None) is None
+
+
+@pytest.mark.parametrize("fault", [RuntimeError("another field"), TypeError("an unknown fact")])
+def test_one_that_belongs_to_something_else_is_named_and_the_one_before_is_used(
+    tmp_path: Path, fault: Exception
+) -> None:
+    saved(tmp_path, 3, 4)
+    said: list[str] = []
+
+    def fits(found: Checkpoint) -> None:
+        if found.step == 4:
+            raise fault
+
+    found = latest_checkpoint(tmp_path, said.append, fits)
+    assert found is not None and found.step == 3
+    assert said == [f"the checkpoint of step 4 is not of this training ({fault}); going back to the one before"]

@@ -1,6 +1,7 @@
 """Every kind of file a camera, a phone or an accident may leave in a photo folder."""
 
 import io
+import math
 import struct
 import zlib
 from pathlib import Path
@@ -10,7 +11,15 @@ import numpy as np
 import pytest
 from PIL import ExifTags, Image, ImageCms
 
-from stages.decoding import MAX_PIXELS, DecodeError, Place, decode, focal_from_exif, place_from_exif
+from stages.decoding import (
+    MAX_PIXELS,
+    DecodeError,
+    Place,
+    decode,
+    exposure_from_exif,
+    focal_from_exif,
+    place_from_exif,
+)
 
 WIDTH, HEIGHT = 48, 32
 
@@ -230,6 +239,15 @@ def test_only_the_first_frame_counts(tmp_path: Path) -> None:
     assert (decoded.suffix, decoded.notes) == (None, ("first of 2 frames",))
 
 
+def test_a_jpeg_that_ends_with_its_header_is_refused_in_words(tmp_path: Path) -> None:
+    """Without a place for pixels, there is no share of the picture that could be missing."""
+    content = saved(tmp_path / "a.jpg", Image.fromarray(smooth())).read_bytes()
+    frame = content.index(b"\xff\xc0")
+    end = frame + 2 + int.from_bytes(content[frame + 2 : frame + 4], "big")
+    (tmp_path / "a.jpg").write_bytes(content[:end])
+    assert reason(tmp_path / "a.jpg") == "damaged: cannot load this image"
+
+
 def test_a_truncated_jpeg_says_how_much_is_missing(tmp_path: Path) -> None:
     data = io.BytesIO()
     rng = np.random.default_rng(0)
@@ -328,6 +346,23 @@ def test_exif_reaches_the_camera_key(tmp_path: Path) -> None:
     assert wide.camera_key[:6] == ("Maker", "M1", "", WIDTH, HEIGHT, 1)
     assert wide.focal_px == pytest.approx(28 / 43.27 * np.hypot(WIDTH, HEIGHT))
     assert wide.camera_key != zoomed.camera_key
+
+
+def test_how_a_photo_was_exposed(tmp_path: Path) -> None:
+    tags = {"ExposureTime": 0.01, "ISOSpeedRatings": 200, "FNumber": 2.8}
+    told = decode(saved(tmp_path / "a.jpg", Image.fromarray(smooth()), exif=exif_with(**tags))).exposure_ev
+    assert told == pytest.approx(math.log2(0.01 * 200 / 2.8**2), abs=1e-3)
+    one = exposure_from_exif(tags)
+    assert one is not None
+    assert exposure_from_exif(tags | {"ExposureTime": 0.02}) == pytest.approx(one + 1)
+    assert exposure_from_exif(tags | {"ISOSpeedRatings": (100, 0)}) == pytest.approx(one - 1)
+    assert exposure_from_exif(tags | {"FNumber": 5.6}) == pytest.approx(one - 2)
+
+
+@pytest.mark.parametrize("tag", ["ExposureTime", "ISOSpeedRatings", "FNumber"])
+@pytest.mark.parametrize("value", [None, 0, -1, float("nan"), "fast", ()])
+def test_an_exposure_that_is_not_told_is_none(tag: str, value: object) -> None:
+    assert exposure_from_exif({"ExposureTime": 0.01, "ISOSpeedRatings": 200, "FNumber": 2.8, tag: value}) is None
 
 
 GREENWICH = {"GPSLatitude": (51, 28, 38.0), "GPSLatitudeRef": "N", "GPSLongitude": (0, 0, 1.8), "GPSLongitudeRef": "W"}

@@ -8,7 +8,7 @@ import torch
 
 from nerf.model import Rendering
 from nerf.rays import Rays
-from stages.drawing import Painter, training_seconds
+from stages.drawing import Allowance, Painter, training_seconds
 from stages.files import write_json
 
 
@@ -68,3 +68,14 @@ def test_a_picture_smaller_than_the_first_one_tried_will_do() -> None:
 def test_training_took_as_long_as_its_curve_says(tmp_path: Path) -> None:
     write_json(tmp_path / "curve.json", {"points": [{"seconds": 2.0}, {"seconds": 61.5}]})
     assert training_seconds(tmp_path) == 61.5
+
+
+def test_pictures_have_what_is_left_of_the_time_given_or_a_share_of_the_trainings(tmp_path: Path) -> None:
+    write_json(tmp_path / "curve.json", [{"seconds": 50.0}])
+    assert Allowance(None, tmp_path, 3.0).left() == 20.0
+    assert 5 < Allowance(10.0, tmp_path, 3.0).left() <= 7
+    assert 0 < Allowance(1.0, tmp_path, 3.0).left() <= 1
+    assert (Allowance(None, tmp_path, 3.0).words(), Allowance(10.0, tmp_path, 3.0).words()) == (
+        "training took 50 s",
+        "given 10 s",
+    )

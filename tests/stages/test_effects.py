@@ -176,3 +176,16 @@ def test_real_evidence_of_a_synthetic_scene(tmp_path: Path, made: Effects, on: s
     table = json.loads((folder / "effects.json").read_text("utf-8"))
     found = {name for name, entry in table.items() if entry["on"] and entry["modelled"]}
     assert found == on
+
+
+@pytest.mark.parametrize(("seconds", "pilots_made"), [(0.0, 0), (29.0, 0), (31.0, 1), (95.0, 2)])
+def test_pilots_are_made_as_far_as_they_fit(
+    decided: Callable, monkeypatch: pytest.MonkeyPatch, seconds: float, pilots_made: int
+) -> None:
+    monkeypatch.setattr(pilots, "expected_seconds", lambda *_: 30.0)
+    grey = {name: found(None) for name in ("exposure", "pose_refinement")}
+    _, table, _, tried = decided(effects.Config(seconds=seconds), 1.0, **grey)
+    assert len(tried) == pilots_made
+    assert (table["pose_refinement"]["reason"] == "one of two; not clear, and no pilot: there is no time for one") == (
+        pilots_made == 0
+    )

@@ -14,13 +14,20 @@ from hypothesis import strategies as st
 from PIL import Image
 from torch import Tensor
 
-from nerf.effects.exposure import expose
+from nerf.effects.exposure import ExposedModel, expose
+from nerf.grid_field import GridField, GridSettings
 from nerf.model import Rendering
 from nerf.rays import Rays
 from nerf.scene import Camera, Scene, Similarity, View
 from stages import evaluate
-from stages.evaluate import affordable, verdict
+from stages.backend import chosen_backend, load_backend
+from stages.drawing import Painter
+from stages.evaluate import Examiner, affordable, verdict
 from stages.files import write_json, write_png
+from stages.right_halves import right_half_psnr
+from stages.training_data import view_pixels, view_rays
+from tests.stages.photo_scene import photographed
+from tests.synthetic_photos import Quiet
 
 WIDTH, HEIGHT, FOCAL = 32, 24, 30.0
 WAVES = np.array([[5.0, 2.0, 3.0], [-4.0, 6.0, 1.0], [2.0, -3.0, 7.0]])
@@ -361,3 +368,35 @@ def test_photos_too_small_for_ssim_are_judged_by_psnr_alone():
     figures = {"psnr": 28.9, "ssim": None, "psnr_nearest_view": 14.2, "psnr_mean_image": 12.9}
     words = verdict(figures | {"photos_scored": 7, "width_share": 1})
     assert words == "Sharp and trustworthy: 28.9 dB on unseen photos, 14.7 dB better than the nearest photo."
+
+
+def test_poses_are_fitted_to_the_field_as_it_is_and_scored_as_the_photo_was_exposed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    inputs, scene = photographed(tmp_path)
+    kernels = load_backend(chosen_backend("cpu"), "cpu")
+    field = GridField(GridSettings(levels=2, log2_rows=8, coarsest=4, finest=16, cache_cells=8), 5, kernels)
+    plain, gain = Painter(field, torch.zeros(3)), torch.full((3,), 0.7)
+    view, given = scene.of_split("test")[0], []
+
+    def fit(model: GridField, rays: Rays, rendering: Rendering, *_: object) -> Rays:
+        given.append((model, rendering.colour))
+        return rays
+
+    monkeypatch.setattr("stages.right_halves.from_fitted_pose", fit)
+    neutral = Painter(ExposedModel(field, torch.full((3,), 0.3)), torch.zeros(3))
+    examiner = Examiner(scene, inputs["ingest"], tmp_path, neutral, {view.name: gain}, True, 1.0)
+    (scored,) = examiner.score([view], Quiet())
+    rays = view_rays(scene, view, 1.0)
+    assert given[0][0] is field and torch.equal(given[0][1], plain.draw(rays).colour)
+    exposed, truth = neutral.at_gain(gain).draw(rays), view_pixels(inputs["ingest"], scene, view, 1.0, (0.0,) * 3)
+    _, fitted = right_half_psnr(exposed, torch.zeros(3), truth)
+    assert scored["psnr_fitted_right"] == pytest.approx(fitted)
+
+
+@pytest.mark.parametrize(("seconds", "count"), [(0.9, 1), (2.9, 2), (5.0, 4), (0.01, 1)])
+def test_seconds_given_bound_the_photos_whatever_training_took(make: Make, progress: Any, seconds: float, count: int):
+    inputs = make(speed=WIDTH * HEIGHT)  # a photo a second; reading fifteen takes 0.75 of them
+    planned = evaluate.plan(evaluate.Config(seconds=seconds), inputs, progress)
+    assert planned.photos == count
+    assert not progress.notes or f", given {seconds:g} s;" in progress.notes[0].replace("0 s", "0.01 s")

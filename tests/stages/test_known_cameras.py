@@ -1,3 +1,4 @@
+import dataclasses
 import json
 import math
 from pathlib import Path
@@ -102,9 +103,9 @@ def test_a_frames_own_intrinsics_win(read) -> None:
 
 
 def _with(row: int, column: int, value: float) -> list[list[float]]:
-    pose = matrix(1)
-    pose[row, column] = value
-    return pose.tolist()
+    pose = matrix(1).tolist()
+    pose[row][column] = value
+    return pose
 
 
 @pytest.mark.parametrize(
@@ -117,8 +118,16 @@ def _with(row: int, column: int, value: float) -> list[list[float]]:
         ({"transform_matrix": (matrix(1) @ np.diag([-1, 1, 1, 1])).tolist()}, r"frame './1': it mirrors"),
         ({"transform_matrix": (matrix(1) @ np.diag([2, 2, 2, 1])).tolist()}, r"no rotation: .* it scales by 2\."),
         ({"transform_matrix": np.zeros((4, 4)).tolist()}, r"no rotation: RᵀR is off by 1, and it scales by 0\."),
-        ({"fl_x": 0}, r"focal length of frame './1': in pixels it comes to 0 × 52"),
-        ({"fl_x": -50}, r"focal length of frame './1': in pixels it comes to -50 × 52"),
+        ({"fl_x": 0}, r"camera of './1': a focal length of 0 × 52 pixels is not one for a picture of 60×40"),
+        ({"fl_x": -50}, r"camera of './1': a focal length of -50 × 52 pixels is not one"),
+        ({"fl_x": 1e308}, r"camera of './1': a focal length of 1e\+308 × 52 pixels is not one"),
+        ({"fl_x": 1e-300}, r"camera of './1': a focal length of 1e-300 × 52 pixels is not one"),
+        ({"fl_x": 10**400}, r"fl_x of frame './1': it is 10{39}, not a finite number"),
+        ({"cx": -1e300}, r"camera of './1': its principal point \(-1e\+300, 19\) is far outside of its 60×40"),
+        ({"w": 10**30, "h": 10**30}, r"size of frame './1': w and h are 1e\+30 and 1e\+30"),
+        ({"transform_matrix": _with(0, 3, 1e300)}, r"frame './1': its place is 1e\+300 units from the origin"),
+        ({"transform_matrix": _with(0, 0, 1e308)}, r"frame './1': it is no rotation: 1e\+308 is in it"),
+        ({"transform_matrix": _with(0, 0, 10**400)}, r"frame './1': it is not a matrix of numbers"),
         ({"fl_x": math.nan}, r"fl_x of frame './1': it is nan, not a finite number"),
         ({"cx": "31"}, r"cx of frame './1': it is '31', not a finite number"),
         ({"k1": True}, r"k1 of frame './1': it is True, not a finite number"),
@@ -134,7 +143,7 @@ def test_what_is_no_camera_is_refused_by_name(read, changes: dict[str, Any], mes
 
 
 def test_no_focal_length_at_all_is_refused(read) -> None:
-    with pytest.raises(StageError, match=r"focal length of frame './0': in pixels it comes to 0 × 0"):
+    with pytest.raises(StageError, match=r"camera of './0': a focal length of 0 × 0 pixels is not one"):
         read([frame(0)])
 
 
@@ -193,6 +202,23 @@ def colmap_model(folder: Path, names: list[str]) -> SparseModel:
     )
     write_model(folder, model)
     return model
+
+
+def test_points_behind_cameras_or_in_them_are_left_out(tmp_path: Path) -> None:
+    """COLMAP gives such an observation an error of 1e153 pixels."""
+    given = colmap_model(tmp_path, ["ä0.png", "ä1.png"])
+    behind = given.images[0].sfm_from_camera @ np.array([0.0, 0, -1, 1])
+    harmed = dataclasses.replace(given, xyz=np.stack([behind, given.images[1].sfm_from_camera[:, 3]]))
+    write_model(tmp_path, harmed)
+    known = read_known_cameras(tmp_path, PHOTOS, {})
+    assert "observations of points behind their cameras are left out" in known.notes[-1]
+    seen = known.model
+    depth = [
+        ((seen.xyz[p] - seen.images[v].sfm_from_camera[:, 3]) @ seen.images[v].sfm_from_camera[:, 2])
+        for v, p in zip(seen.view, seen.point, strict=True)
+    ]
+    assert len(seen.view) < len(given.view) and all(d > 0 for d in depth)
+    assert len(seen.xyz) == len(set(seen.point.tolist())) == len(seen.rgb) == len(seen.error_px)
 
 
 def test_a_colmap_model_is_matched_by_name_and_keeps_its_points(tmp_path: Path) -> None:

@@ -204,3 +204,17 @@ def test_places_are_needed_to_go_by_places() -> None:
 )
 def test_times_are_said_roughly(seconds: float, words: str) -> None:
     assert about(seconds) == words
+
+
+def test_where_time_is_given_sets_of_ordinary_size_give_way_too(progress, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = costing(monkeypatch, (0.5, 0.05), (0.2, 0.01))
+    assert chosen(ALL_OPEN, photos(50), Path(), 30, progress, 60.0) == Chosen(1131, 2048, "exhaustive")
+    assert asked == list(TIERS[:2]) and "50 photos searched at 1600 pixels" in progress.notes[0]
+
+
+def test_time_enough_is_found_by_measuring_or_beyond_doubt_without(progress, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = costing(monkeypatch, (0.13, 0.012))
+    assert chosen(ALL_OPEN, photos(50), Path(), 30, progress, 60.0) == Chosen(1600, 4096, "exhaustive")
+    assert len(asked) == 1
+    assert chosen(ALL_OPEN, photos(11), Path(), 30, progress, 90.0) == Chosen(1600, 4096, "exhaustive")
+    assert len(asked) == 1

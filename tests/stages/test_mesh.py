@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from hypothesis import given
+from hypothesis import strategies as st
 from trimesh.visual import ColorVisuals
 
 from nerf.scene import Camera, Scene, Similarity, View
@@ -237,3 +239,23 @@ def test_the_resolution_follows_the_training(tmp_path, progress, rays, resolutio
     write_json(tmp_path / "field.json", {"rays": rays})
     assert mesh.plan(mesh.Config(), {"train": tmp_path}, progress).resolution == resolution
     assert mesh.plan(mesh.Config(resolution=77), {"train": tmp_path}, progress).resolution == 77
+
+
+def test_the_resolution_grows_with_the_time_and_falls_with_what_a_point_takes() -> None:
+    times = [mesh.resolution_in(seconds, 5e-7) for seconds in (-5.0, 5.0, 8.0, 10.0, 20.0, 1000.0)]
+    assert times == sorted(times) and (times[0], times[-1]) == (64, 256)
+    assert all(edge % 16 == 0 for edge in times) and len(set(times)) > 3
+    assert mesh.resolution_in(20.0, 1e-6) < mesh.resolution_in(20.0, 5e-7)
+    # A slow field says nothing of how fast the rest is: what it draws in a minute is still looked for.
+    assert mesh.resolution_in(120.0, 2e-5) > 96
+
+
+@given(st.floats(8.0, 60.0), st.floats(1e-7, 1e-5))
+def test_the_resolution_chosen_fits_and_the_next_would_not(seconds: float, per_point: float) -> None:
+    def takes(edge: int) -> float:
+        beside = min(per_point, mesh.SLOWEST)
+        return edge**3 * (per_point + 1.5 * beside) + mesh.BESIDE_POINTS * beside
+
+    edge = mesh.resolution_in(seconds, per_point)
+    assert takes(edge) <= seconds * (1 + 1e-9) or edge == 64
+    assert takes(edge + 16) > seconds or edge == 256

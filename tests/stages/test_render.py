@@ -270,3 +270,12 @@ def test_a_photo_without_exposure_is_refused(inputs, progress, monkeypatch) -> N
     with_exposure(inputs, monkeypatch)
     with pytest.raises(StageError, match=r"no exposure of a\.jpg is known: .* bright\.jpg"):
         run(inputs, progress, frames=2, width=40, like="a.jpg")
+
+
+@pytest.mark.parametrize("seconds", [3.0, 10.0, 60.0])
+def test_seconds_given_bound_the_video_whatever_training_took(inputs, progress, seconds: float) -> None:
+    config = render.plan(render.Config(seconds=seconds), inputs, progress)
+    assert config.frames is not None and config.width is not None
+    expected = config.frames * config.width**2 * 0.75 / 30_000
+    assert 0.4 * (seconds - render.STARTING_SECONDS) < expected < seconds
+    assert f"given {seconds:g} s" in progress.notes[0].replace("1 min", "60 s")

@@ -15,6 +15,8 @@ from nerf.scene import Camera, Scene, Similarity, View
 from stages import report
 from stages.contract import StageError
 from stages.files import write_json, write_tensors
+from stages.tradeoff_front import recommend, table
+from tests.stages.test_tradeoff_front import point
 
 NASTY = "<script>alert(1)</script>.jpg"
 FACTS = {
@@ -31,6 +33,16 @@ CAMERA_MODELS = [
         ("OPENCV_FISHEYE", "refined", 8, None, None, None, "its distortion cannot be undone at 2.0% of the pixels"),
     ]
 ]
+PARTS = {"steps_timed": 19, "rays": 19_456, "seconds": 5.0, "core_seconds": 10.0, "floor_share": 0.6} | {
+    "rates": {"products": 80_123_456_789, "rows": 150_000_000, "bytes": 19_000_000_000},
+    "parts": [
+        {"part": "backward", "seconds": 5.0, "share": 0.5, "floor": 3.5},
+        {"part": "mlp", "seconds": 3.0, "share": 0.3, "floor": 1.9},
+        {"part": "waiting", "seconds": 1.0, "share": 0.1, "floor": None},
+        {"part": "rest", "seconds": 1.0, "share": 0.1, "floor": None},
+    ],
+    "most_rays_per_second": 7205.9,
+}
 LINES = {
     "ingest": "24 photos 96×72, one camera",
     "sfm": "23/24 registered, 0.61 px",
@@ -118,6 +130,7 @@ def _write_training(folder: Path) -> None:
     ]
     write_json(folder / "curve.json", {"device": "cpu", "threads": 2, "points": curve})
     write_json(folder / "field.json", {"kind": "paper", "downscale": 1.0, "steps": 600, "rays": 600_000})
+    write_json(folder / "parts.json", PARTS)
 
 
 def _write_metrics(folder: Path, scene: Scene, size: tuple[int, int]) -> None:
@@ -186,13 +199,29 @@ def test_summary_has_exactly_the_promised_keys(inputs: dict[str, Path], tmp_path
         "field": "paper",
         "train_seconds": 183.3,
         "total_seconds": pytest.approx(58.2 + 181.7 + 60.1 + 4 * 2.5),
+        "stage_seconds": {"ingest": 2.5, "sfm": 58.2, "normalise": 2.5, "train": 181.7}
+        | {"evaluate": 2.5, "render": 60.1, "mesh": 2.5},
+        "training_parts": PARTS,
         "psnr": 21.5,
         "ssim": 0.62,
         "psnr_mean_image": 12.9,
         "psnr_nearest_view": 14.2,
         "mesh": {"vertices": 105_900, "faces": 211_817, "watertight": False},
         "verdict": "Better than any photo nearby by 7.3 dB but soft.",
+        "budget": None,
     }
+
+
+def test_a_budget_is_shown_promised_beside_spent_and_in_all(inputs: dict[str, Path], tmp_path: Path, progress: Any):
+    account = {"seconds": 300.0, "promised": {"sfm": 50.0, "train": 170.0}, "spent": {"train": 166.0, "mesh": 12.0}}
+    html, summary = _run(inputs, tmp_path / "out", progress, budget=account)
+    assert summary["budget"] == account
+    text = " ".join(re.sub("<[^>]+>", " ", html).split())
+    assert "Given 5 min in all; 2 min 58 s spent before this page was written." in text
+    rows = {row[0]: row[2:4] for row in ([re.sub("<[^>]+>", "", c) for c in re.findall("<td.*?</td>", line)]
+            for line in re.findall("<tr>.*</tr>", html.split("How it was made")[1])) if len(row) == 6}  # fmt: skip
+    assert rows["sfm"] == ["50 s", "–"] and rows["train"] == ["2 min 50 s", "2 min 46 s"] and rows["mesh"][1] == "12 s"
+    assert "Given 5 min" not in _run(inputs, tmp_path / "without", progress)[0]
 
 
 def test_page_loads_nothing_from_elsewhere(inputs: dict[str, Path], tmp_path: Path, progress: Any):
@@ -229,7 +258,7 @@ def test_page_tells_what_a_person_wants_to_know_in_that_order(inputs: dict[str, 
         '<span class="tag">worst</span> IMG_0000.jpg',
         "All 6 test photos",
         "bought +0.5 dB on held-out photos",
-        "not finite 2 times, went back",
+        "not finite, or a field that was lost, 2 times, went back",
         "from above",
         "only 12 matches with any other photo",
         "<td>211,817",
@@ -371,6 +400,33 @@ def test_page_shows_what_was_tried_to_find_the_cameras(tmp_path: Path, progress:
     assert "Ways tried" not in html
 
 
+def test_page_shows_the_study_and_leaves_its_time_out(tmp_path: Path, progress: Any):
+    inputs = make_workspace(tmp_path)
+    before, summary_before = _run(inputs, tmp_path / "before", progress)
+    inputs["tradeoff"] = tmp_path / "fox.nerf" / "tradeoff" / "0123456789abcdef"
+    inputs["tradeoff"].mkdir(parents=True)
+    points = [
+        point(10.0, 20.0),
+        point(20.0, 23.0, seeds=2, deviation=0.2),
+        point(15.0, 18.0, variant="no view dependence"),
+    ]
+    points = sorted(points, key=lambda p: p.train_seconds)
+    study = {"headline": "", "recommendation": recommend(points).words, "recommended": 3, "points": table(points)}
+    study |= {"scored": "6 windows of 2 held-out photos", "left_out": ["paper, published: 5 steps"]}
+    write_json(inputs["tradeoff"] / "tradeoff.json", study)
+    (inputs["tradeoff"] / "manifest.json").write_text('{"seconds": 1800}')
+    assert "What quality costs here" not in before
+    text, summary = _run(inputs, tmp_path / "out", progress)
+    assert "What quality costs here" in text and study["recommendation"] in text
+    for words in ("All 3 settings", "<b>23.00 ± 0.20</b>", ">18.00<", "6 windows of 2", "paper, published: 5 steps"):
+        assert words in text, words
+    assert "reduced, a part left out" in text, "the plot's legend"
+    assert "What each part of the method is worth" not in text, "no picture, no title"
+    assert summary == summary_before, "the study's time is none of the run's"
+    Image.new("RGB", (64, 48)).save(inputs["tradeoff"] / "ablation.png")
+    assert "What each part of the method is worth" in _run(inputs, tmp_path / "pictures", progress)[0]
+
+
 def test_a_large_video_lies_beside_the_page(inputs: dict[str, Path], tmp_path: Path, progress: Any):
     html, _ = _run(inputs, tmp_path / "out", progress, video_limit_mb=0.001)
     assert 'src="video.mp4"' in html and "data:video" not in html
@@ -433,3 +489,29 @@ def test_a_finished_stage_that_lost_a_file_is_an_error_with_its_name(tmp_path: P
 )  # fmt: skip
 def test_settings_in_words(value: Any, words: str):
     assert report._value(value) == words
+
+
+def test_training_shows_where_its_time_went(inputs: dict[str, Path], tmp_path: Path, progress: Any):
+    html, _ = _run(inputs, tmp_path / "out", progress)
+    assert "<h3>Where training spent its time</h3>" in html
+    assert re.search(r"backward</td>.*?50\.0%.*?70%", html)
+    assert (
+        "take 60% of the time it was computed in" in html and "it would be 7.2 k rays/s; these steps made 3.9 k" in html
+    )
+    widths = [float(width) for width in re.findall(r'<i style="width: ([\d.]+)%; background', html)]
+    assert widths == [50, 30, 10, 10]
+
+
+def test_a_training_without_timed_steps_is_no_fault(inputs: dict[str, Path], tmp_path: Path, progress: Any):
+    (inputs["train"] / "parts.json").unlink()
+    html, summary = _run(inputs, tmp_path / "out", progress)
+    assert "Where training spent its time" not in html and summary["training_parts"] is None
+
+
+def test_a_field_of_no_use_is_named(inputs: dict[str, Path], tmp_path: Path, progress: Any):
+    path = inputs["train"] / "manifest.json"
+    manifest = json.loads(path.read_text("utf-8"))
+    manifest["facts"]["symptom"] = "it is empty (mean opacity 0e+00)"
+    write_json(path, manifest)
+    html, _ = _run(inputs, tmp_path / "out", progress)
+    assert "<b>The field is of no use yet:</b> it is empty (mean opacity 0e+00)." in html

@@ -20,7 +20,8 @@ from stages import training_loop
 from stages.checkpoints import latest_checkpoint
 from stages.contract import StageError
 from stages.training_log import TrainingLog
-from stages.training_loop import Budget, Probes, TrainingRun
+from stages.training_loop import TrainingRun
+from stages.training_state import Budget, Probes
 from stages.unseen import Target, Unseen
 
 

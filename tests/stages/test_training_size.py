@@ -103,3 +103,14 @@ def test_grids_grow_with_rays_and_pixels(scene: Scene, rays: float, factor: floa
     # Two neighbouring samples lie in the same or in neighbouring cells of the finest grid, near the cameras at least.
     cells_per_step = field.lattice.step * field.finest / (4 if folded else 1.8)
     assert 0.3 < cells_per_step < 5
+
+
+@pytest.mark.parametrize("contracted", [False, True])
+@given(factor=st.floats(0.25, 4.0))
+def test_ray_samples_multiply_the_samples_along_a_ray(contracted: bool, factor: float) -> None:
+    sizes = {"levels": 4, "log2_rows": 16, "finest": 512, "contracted": contracted}
+    usual = grid_settings(GRID.model_copy(update=sizes))
+    asked = grid_settings(GRID.model_copy(update=sizes | {"ray_samples": factor}))
+    assert asked.steps == pytest.approx(factor * usual.steps, abs=0.5)
+    assert asked.cone == pytest.approx(usual.cone / factor)
+    assert asked.lattice.step == pytest.approx(usual.lattice.step / factor, rel=0.01)

@@ -72,6 +72,19 @@ def test_the_least_difference_is_called_for() -> None:
         assert 0.9 < found.statistic / (1.15 * THRESHOLD_EV) < 1.1
 
 
+def test_what_cameras_wrote_is_laid_beside_the_gains_and_decides_nothing() -> None:
+    gain = np.linspace(-0.5, 0.5, 12) * EV
+    fit = fit_exposure(photographed_points(3, log_gain=gain))
+    alone = exposure_evidence(fit)
+    told = gain / EV + 7.0  # the constant is unknown
+    agreeing, deviating = exposure_evidence(fit, told), exposure_evidence(fit, -told)
+    assert agreeing.words.startswith(f"{alone.words}; EXIF tells of 1 EV, the gains deviate from it by 0.0")
+    assert "deviate from it by 0.6" in deviating.words  # twice the gains' own deviation, 0.314
+    assert agreeing[:5] == deviating[:5] == alone[:5]
+    sparse = np.where(np.arange(12) < 1, told, np.nan)
+    assert exposure_evidence(fit, sparse) == exposure_evidence(fit, np.full(12, np.nan)) == alone
+
+
 def test_between_the_thresholds_a_pilot_decides() -> None:
     for seed in SEEDS:
         gain = drawn_gains(seed, 12, 0.75 * THRESHOLD_EV)

@@ -1,0 +1,98 @@
+"""What a mesh costs: seconds and distance to what is known of the surface, against the lattice's resolution.
+
+    pipeline run PHOTOS --until train --train.steps 1500
+    python -m benchmarks.mesh_cost PHOTOS.nerf
+    python -m benchmarks.mesh_cost demo/demo.nerf --truth demo/truth.json
+
+With --truth (of `pipeline demo`'s photos) distances are two-sided, to the exact surface, in percent of the scene's
+size. Without, they go from the sparse points within the region of interest to the mesh, in percent of the region's
+size: nothing else is known of a real scene's surface, and where there is no texture not even that.
+"""
+
+import argparse
+import shutil
+import tempfile
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.truth import Truth, compare_with_truth
+from pipeline.workspace import Workspace
+from stages.contract import Inputs
+from stages.device import compute_device
+from stages.field_files import load_field
+from stages.files import read_scene, read_tensors
+from stages.mesh import HALF_BOX, Config, reconstruct, write_mesh
+from stages.mesh_distance import sample_surface
+
+if TYPE_CHECKING:
+    from nerf.scene import Scene
+    from stages.mesh_files import ColouredMesh
+
+SAMPLES = 200_000  # of the mesh
+
+
+class Quiet:
+    """A Progress that says nothing."""
+
+    def update(self, message: str, done: float | None = None) -> None:
+        """Nothing."""
+
+    def note(self, message: str) -> None:
+        """Nothing."""
+
+
+def to_truth(mesh: "ColouredMesh", scene: "Scene", normalise: Path, truth: Truth) -> str:
+    """Mesh to truth, and truth to mesh, in percent of the scene's size."""
+    with tempfile.TemporaryDirectory() as folder:
+        shutil.copy(normalise / "transforms.json", folder)
+        write_mesh(Config(formats=("ply",)), mesh, scene, Path(folder))
+        error = compare_with_truth(Path(folder), truth).mesh
+    assert error is not None, "the mesh has just been written"
+    return f"{error.accuracy:.2f} | {error.completeness:.2f}"
+
+
+def to_points(mesh: "ColouredMesh", normalise: Path) -> str:
+    """From the sparse points in the region to the mesh: median, and nine in ten, in percent of the region's size."""
+    from scipy.spatial import KDTree
+
+    xyz = read_tensors(normalise / "points.safetensors")["xyz"]
+    inside = xyz[np.abs(xyz).max(1) < HALF_BOX]
+    distance = KDTree(sample_surface(mesh.vertices, mesh.faces, SAMPLES, seed=0)).query(inside)[0]
+    median, most = np.percentile(distance, [50, 90]) * 100 / (2 * HALF_BOX)
+    return f"{median:.2f} | {most:.2f}"
+
+
+def row(folders: Inputs, resolution: int, truth: Truth | None) -> str:
+    """One resolution's row of the table."""
+    scene, device = read_scene(folders["normalise"]), compute_device()
+    model, _ = load_field(folders["train"], device)
+    started = time.perf_counter()
+    made = reconstruct(Config(resolution=resolution), model, scene, device, Quiet())
+    seconds = time.perf_counter() - started
+    normalise = folders["normalise"]
+    known = to_points(made.mesh, normalise) if truth is None else to_truth(made.mesh, scene, normalise, truth)
+    return f"| {resolution}³ | {len(made.mesh.faces):,} | {seconds:.1f} | {known} |"
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("workspace", type=Path)
+    parser.add_argument("--resolutions", type=int, nargs="+", default=[48, 64, 96, 128, 192, 256])
+    parser.add_argument("--truth", type=Path, default=None)
+    given = parser.parse_args()
+    workspace = Workspace.existing(given.workspace)
+    keys = workspace.read_run()["keys"]
+    folders = {stage: workspace.folder(stage, keys[stage]) for stage in ("normalise", "train")}
+    truth = Truth.read(given.truth) if given.truth else None
+    names = "mesh to truth (%) | truth to mesh (%)" if truth else "median point to mesh (%) | nine in ten within (%)"
+    print(f"| lattice | faces | s | {names} |\n|---|---|---|---|---|")
+    for resolution in given.resolutions:
+        print(row(folders, resolution, truth), flush=True)
+
+
+if __name__ == "__main__":
+    main()

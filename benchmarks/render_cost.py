@@ -1,0 +1,102 @@
+"""What a frame costs: seconds and held-out PSNR against samples per ray and resolution, of one finished field.
+
+    pipeline run PHOTOS --until train --train.steps 1500
+    python -m benchmarks.render_cost PHOTOS.nerf --downscales 4 2 1
+
+The field is drawn with other samples than it was trained with: nothing is trained anew (what training with them
+gives is in the study, `pipeline tradeoff`).
+"""
+
+import argparse
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from nerf.effects.exposure import ExposedModel
+from nerf.grid_field import GridField
+from nerf.metrics import mean_squared_error, psnr
+from nerf.model import RadianceModel
+from nerf.paper import PaperNerf
+from pipeline.workspace import Workspace
+from stages.drawing import Painter, load_painter
+from stages.effect_decisions import expected_gains
+from stages.files import read_json, read_scene
+from stages.spread import spread
+from stages.tradeoff_arms import resolution_words
+from stages.training_data import view_pixels, view_rays
+
+
+def with_samples(model: RadianceModel, factor: float) -> RadianceModel:
+    """The same field with so many times the samples along each ray."""
+    if isinstance(model, ExposedModel):
+        return ExposedModel(with_samples(model.model, factor), model.log_gain)
+    if isinstance(model, GridField):
+        given = model.settings
+        finer = {"shortest_step": given.shortest_step / factor, "cone": given.cone / factor}
+        settings = replace(given, steps=max(1, round(given.steps * factor)), **finer)
+        changed: GridField | PaperNerf = GridField(settings, 0, model.backend)
+    else:
+        assert isinstance(model, PaperNerf)
+        given = model.settings
+        coarse, fine = (max(2, round(count * factor)) for count in (given.samples_coarse, given.samples_fine))
+        changed = PaperNerf(replace(given, samples_coarse=coarse, samples_fine=fine), seed=0)
+    changed.load_state_dict(model.state_dict())
+    return changed.to(next(iter(model.state_dict().values())).device).requires_grad_(False)
+
+
+def samples_of(model: RadianceModel) -> str:
+    """How the samples of a field are laid, in its own terms."""
+    if isinstance(model, ExposedModel):
+        return samples_of(model.model)
+    if isinstance(model, GridField):
+        step, bounded = model.settings.shortest_step, f"{model.settings.steps} along the box's diagonal"
+        return f"steps from {step:.4f}" if model.settings.contracted else bounded
+    assert isinstance(model, PaperNerf)
+    return f"{model.settings.samples_coarse} + {model.settings.samples_fine}"
+
+
+def measured(painter: Painter, folders: dict[str, Path], downscale: float, photos: int) -> tuple[float, float]:
+    """Mean seconds a frame and mean PSNR (dB) over ``photos`` test photos."""
+    scene = read_scene(folders["normalise"])
+    test = scene.of_split("test")
+    gains = expected_gains(read_json(folders["train"] / "field.json"), scene, test)
+    seconds, scores = [], []
+    for index in spread(len(test), min(photos, len(test))):
+        view = test[index]
+        shown = painter.at_gain(gains[view.name]) if gains else painter
+        rays = view_rays(scene, view, downscale)
+        truth = view_pixels(folders["ingest"], scene, view, downscale, painter.background.tolist())
+        started = time.perf_counter()
+        picture = shown.draw(rays).colour.clamp(0, 1)
+        seconds.append(time.perf_counter() - started)
+        scores.append(psnr(mean_squared_error(picture, truth)))
+    return sum(seconds) / len(seconds), sum(scores) / len(scores)
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("workspace", type=Path)
+    parser.add_argument("--factors", type=float, nargs="+", default=[0.25, 0.5, 1.0, 2.0])
+    parser.add_argument("--downscales", type=float, nargs="+", default=[4.0, 2.0, 1.0])
+    parser.add_argument("--photos", type=int, default=2)
+    given = parser.parse_args()
+    workspace = Workspace.existing(given.workspace)
+    keys = workspace.read_run()["keys"]
+    folders = {stage: workspace.folder(stage, keys[stage]) for stage in ("ingest", "normalise", "train")}
+    painter = load_painter(folders["train"])
+    print("| samples | resolution | a frame (s) | PSNR (dB) |\n|---|---|---|---|")
+    for downscale in given.downscales:
+        for factor in given.factors:
+            other = replace(painter, model=with_samples(painter.model, factor))
+            measured(other, folders, max(given.downscales) * 4, 1)  # the first picture pays for memory and kernels
+            with torch.no_grad():
+                seconds, score = measured(other, folders, downscale, given.photos)
+            words = f"× {factor:g} ({samples_of(other.model)})"
+            print(f"| {words} | {resolution_words(downscale)} | {seconds:.2f} | {score:.2f} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

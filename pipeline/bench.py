@@ -1,0 +1,81 @@
+"""``pipeline doctor --bench``: what this machine can do, and how fast training could be with nothing else to do."""
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import torch
+
+    from nerf.stopwatch import Work
+
+SECONDS = 0.3  # for each rate
+TABLES = {"2¹⁷": 1 << 17, "2²⁰": 1 << 20}  # rows: of one grid, of all five of a large field
+# Of a ray while the grid field trains, about (docs/numbers.md): colours computed, densities looked at.
+RAYS = {"around an object": (8, 12), "in unbounded space": (16, 37)}
+PAPER_RAYS = {"paper field as published": (8, 256, 64, 128), "paper field 4 × 64": (4, 64, 32, 32)}
+
+
+def bench_lines(device: "torch.device") -> list[str]:
+    """Measure, and the table in lines."""
+    from nerf.machine_rates import measure_copy, measure_gather, measure_products
+    from stages.device import compute_device, cores
+
+    compute_device()
+    count = cores()
+    products = {width: measure_products(device, width, SECONDS) for width in (64, 256)}
+    reads = {name: measure_gather(device, rows, SECONDS) for name, rows in TABLES.items()}
+    copied = measure_copy(device, SECONDS)
+    words = f"{count} cores at once" if device.type == "cpu" else "the GPU"
+    lines = [f"rates of {words}, float32" + (", per core and in all" if count > 1 else "")]
+    for width, rate in products.items():
+        lines.append(_line(f"matrix products (8192, {width}) × ({width}, {width})", rate / 1e9, count, "GFLOP/s"))
+    for name, rate in reads.items():
+        lines.append(_line(f"random reads of 16 bytes, table of {name} rows", rate / 1e6, count, "million/s"))
+    lines.append(_line("memory, copying 16 MB", copied / 1e9, count, "GB/s"))
+    return [*lines, *_meaning(products, reads["2²⁰"], copied, count)]
+
+
+def _line(name: str, rate: float, count: int, unit: str) -> str:
+    return (
+        f"  {name:<48} {rate:>8.1f} {rate * count:>8.1f} {unit}" if count > 1 else f"  {name:<48} {rate:>8.1f} {unit}"
+    )
+
+
+def _meaning(products: dict[int, float], reads: float, copied: float, count: int) -> list[str]:
+    """What training can reach here at most: the work of a ray that nothing can save, at these rates."""
+    from nerf.machine_rates import Rates
+    from nerf.stopwatch import Work
+    from stages.live_line import short_count
+
+    lines = ["at these rates, with nothing else to do and no core waiting, training would reach"]
+    for where, (colours, densities) in RAYS.items():
+        most = count / Rates(products[64], reads, copied).seconds(grid_work(colours, densities))
+        text = f"grid field {where} ({colours} colours, {densities} densities a ray)"
+        lines.append(f"  {short_count(most):>8} rays/s  {text}")
+    for name, sizes in PAPER_RAYS.items():
+        most = count / Rates(products[sizes[1]], reads, copied).seconds(Work(products=paper_products(*sizes)))
+        lines.append(f"  {short_count(most):>8} rays/s  {name}")
+    return lines
+
+
+def grid_work(colours: int, densities: int) -> "Work":
+    """Of a ray of a large grid field in training, its share of the optimiser's included."""
+    from nerf import grid_mlp
+    from nerf.grid_field import CORNERS, GridField, GridSettings
+    from nerf.grid_training import ADAM_BYTES, GridTrainerSettings
+    from nerf.kernels import reference
+    from nerf.stopwatch import Work
+
+    model = GridField(GridSettings(), 0, reference)
+    density, colour = grid_mlp.density_products(model.weights), grid_mlp.colour_products(model.weights)
+    rows = CORNERS * model.settings.levels * (densities + colours)
+    steps_per_ray = colours / GridTrainerSettings(0, "random").samples
+    adam = ADAM_BYTES * model.table.numel() * steps_per_ray
+    return Work(densities * density + colours * (colour + 2 * (density + colour)), rows, adam)
+
+
+def paper_products(depth: int, width: int, coarse: int, fine: int) -> int:
+    """Multiplications and additions of a ray of the paper's field in training."""
+    from nerf.paper import PaperNerf, PaperSettings
+
+    model = PaperNerf(PaperSettings(depth=depth, width=width, samples_coarse=coarse, samples_fine=fine), 0)
+    return model.settings.queries_per_ray * (model.fine.products + model.fine.products_backward)

@@ -1,0 +1,129 @@
+"""A budget of wall time for a whole run: what each stage may take of what is left, and what was promised and spent.
+
+Nothing is shared out once for all. Just before a stage begins, what is really left is divided among it and those after
+it, so that what one stage took more or less than it was promised is made good by the others: a slower machine, a
+quicker structure from motion, a kill. Structure from motion cannot be planned to the second, so it comes first of all
+that the rest is fitted around; training gets most of what is left.
+"""
+
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+# Of the time that is left once what cannot be planned has its own. A user waits for the field; figures, a video and a
+# mesh are there to see it by, and gain little beyond MOST_SECONDS. A training of less than half a minute is worth none.
+SHARES = {"train": 0.68, "evaluate": 0.05, "render": 0.15, "mesh": 0.12}
+LEAST_SECONDS = {"train": 30.0, "evaluate": 2.0, "render": 4.0, "mesh": 6.0}
+MOST_SECONDS = {"evaluate": 60.0, "render": 300.0, "mesh": 60.0}
+SFM_SHARE = 0.5  # of the budget: what structure from motion may take before it searches fewer features
+PILOTS_SHARE = 0.15  # of the budget, and of what is left no more than
+PILOTS_OF_LEFT = 0.25  # this: a pilot has to leave a training that is worth it
+LARGEST_SHARE = 0.35  # of the budget: what a stage other than train may take where all before it is there already
+# Training's own seconds count steps alone. Reading the photos and timing the first steps take about STARTING; probing
+# and checkpoints 1.5 to 2 % (fox, fountain_p11 and sceaux_castle, three minutes each).
+STARTING, BESIDE_STEPS = 4.0, 0.02
+
+
+def allotted(stage: str, left: float, to_come: Mapping[str, float | None], total: float) -> float:
+    """Seconds that ``stage`` may take when ``left`` seconds of a budget of ``total`` are left.
+
+    ``to_come`` are the stages after it: what one is expected to take, None where it takes what it is given. Never less
+    than the least that makes sense, whatever is left.
+    """
+    open_ended = [name for name, seconds in to_come.items() if seconds is None and name in SHARES]
+    free = left - sum(seconds or 0.0 for seconds in to_come.values())
+    if stage == "sfm":
+        return max(1.0, min(SFM_SHARE * total, free - sum(LEAST_SECONDS[name] for name in open_ended)))
+    if stage == "effects":
+        return max(0.0, min(PILOTS_SHARE * total, PILOTS_OF_LEFT * free))
+    whole = SHARES[stage] + sum(SHARES[name] for name in open_ended)
+    reserved = sum(_reserved(name, free * SHARES[name] / whole) for name in open_ended)
+    most = total if stage == "train" else LARGEST_SHARE * total
+    return max(LEAST_SECONDS[stage], min(free - reserved, most))
+
+
+def _reserved(stage: str, share: float) -> float:
+    return min(max(share, LEAST_SECONDS[stage]), MOST_SECONDS.get(stage, share))
+
+
+def training_seconds(wall: float) -> float:
+    """Seconds of training steps in a stage train that takes ``wall`` seconds in all, at least half of these."""
+    return max(wall / 2, (wall - STARTING) / (1 + BESIDE_STEPS))
+
+
+def least_total(expected: Mapping[str, float | None]) -> float:
+    """The smallest budget that can be kept: everything that is expected, and the least of all that can give way."""
+    return sum(LEAST_SECONDS.get(name, 0.0) if seconds is None else seconds for name, seconds in expected.items())
+
+
+class Budget:
+    """The budget of a run as run.json keeps it: ``total`` seconds, and of each stage what was promised and spent.
+
+    ``spent`` counts every attempt of the present run, also those that were killed, as far as their last sign of life;
+    what is found finished costs nothing. Once a run is over, the next one that finds work to do begins a new account.
+    """
+
+    def __init__(self, state: dict[str, Any]) -> None:
+        self.state = state
+
+    @staticmethod
+    def new(total: float, of: str) -> dict[str, Any]:
+        """A new account, for run.json; ``of`` tells runs with other options apart."""
+        return {"seconds": total, "of": of, "promised": {}, "spent": {}, "running": None, "over": False}
+
+    @property
+    def total(self) -> float:
+        return self.state["seconds"]
+
+    @property
+    def over(self) -> bool:
+        return self.state["over"]
+
+    @property
+    def spent(self) -> float:
+        return sum(self.state["spent"].values())
+
+    @property
+    def left(self) -> float:
+        return self.total - self.spent
+
+    def continue_as(self, of: str) -> None:
+        """Work begins in a run ``of`` these options: a new account, unless it goes on with one that is not over."""
+        if not self.is_of(of):
+            self.state.update(self.new(self.total, of))
+
+    def is_of(self, of: str) -> bool:
+        """Whether this is the account of an unfinished run ``of`` these options."""
+        return not self.over and self.state["of"] == of
+
+    def begin(self, stage: str) -> None:
+        """Note that work on ``stage`` has begun now."""
+        self.state["running"] = {"stage": stage, "began": time.time()}
+
+    def promise(self, stage: str, seconds: float) -> None:
+        """Note what ``stage`` is given, or expected to take; the first word counts, later attempts go on under it."""
+        self.state["promised"].setdefault(stage, round(seconds, 1))
+
+    def end(self, stage: str, seconds: float) -> None:
+        """Note that an attempt at ``stage`` ended, well or not, after ``seconds``."""
+        spent = self.state["spent"]
+        spent[stage] = round(spent.get(stage, 0.0) + seconds, 1)
+        self.state["running"] = None
+
+    def recover(self, root: Path) -> None:
+        """Count an attempt that was killed: until the last file that it wrote in the workspace ``root``."""
+        running = self.state["running"]
+        if running is not None:
+            files = (root / running["stage"]).rglob("*")
+            last = max((path.lstat().st_mtime for path in files), default=0.0)
+            self.end(running["stage"], max(0.0, last - running["began"]))
+
+    def close(self) -> None:
+        """The run has come to its end: what is done from now on is another one."""
+        self.state["over"] = True
+
+    def account(self) -> dict[str, Any]:
+        """Total, promised and spent, for the report, which cannot know what it takes itself."""
+        kept = {name: {s: v for s, v in self.state[name].items() if s != "report"} for name in ("promised", "spent")}
+        return {"seconds": self.total, **kept}

@@ -1,0 +1,115 @@
+"""How long a run is expected to take, said before it begins: from the photos' number and size and measured rates."""
+
+import time
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+from pipeline import machine
+from pipeline.budget import STARTING, least_total
+from pipeline.settings import Settings
+from stages.live_line import duration
+from stages.matching_plan import about
+from stages.train import SECONDS
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from pipeline.runner import Runner
+
+VIDEO_FRAMES = 40  # photos that a clip is taken to become, before that is known
+
+
+class Photos(NamedTuple):
+    """How many, and how large each is in millions of pixels."""
+
+    number: int
+    megapixels: float
+
+
+def photos_of(settings: Settings) -> Photos | None:
+    """What is to be seen of the photos without decoding any; None where they are gone."""
+    from stages.sources import find_source
+
+    if not settings.ingest.photos.exists():
+        return None
+    source = find_source(settings.ingest.photos, settings.ingest.cameras)
+    if source.kind == "video":
+        return Photos(VIDEO_FRAMES, 1.0)
+    return Photos(len(source.files), _megapixels(source.files[len(source.files) // 2]))
+
+
+def _megapixels(file: "Path") -> float:
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(file) as image:
+            return image.width * image.height / 1e6
+    except (OSError, UnidentifiedImageError):  # ingest says what is wrong with it, or reads it after all
+        return 2.0
+
+
+def expected(settings: Settings, photos: Photos) -> dict[str, float | None]:
+    """Seconds by stage; None of those that take what a budget gives them.
+
+    Rates were measured on two cores, on fox, fountain_p11, fern, banana, herzjesu_p8 and the demo (docs/numbers.md):
+    sfm took 0.6 to 1.8 times as long, and more where photos found no place at once.
+    """
+    known = settings.sfm.cameras is not None
+    seconds: dict[str, float | None] = {
+        "ingest": 0.5 + 0.015 * photos.number * photos.megapixels,
+        "sfm": 0.2 if known else sfm_seconds(photos, machine.cores()),
+        "normalise": 0.3,
+        "effects": 10.0,  # two or three, and half a minute where a pilot has to decide
+        "report": 2.0,
+    }
+    for stage in ("train", "evaluate", "render", "mesh"):
+        given = getattr(settings, stage).seconds
+        seconds[stage] = given and given + (STARTING if stage == "train" else 0.0)
+    return seconds
+
+
+def sfm_seconds(photos: Photos, cores: int) -> float:
+    """Features of each photo, matches of each pair or of 30 partners each, and mapping, which has one core."""
+    pairs = photos.number * min(photos.number - 1, 60) / 2
+    features = 0.25 * photos.number * min(photos.megapixels, 1.7)
+    return 4.0 + (features + 0.02 * pairs) * 2 / cores + 0.4 * photos.number
+
+
+def without_budget(settings: Settings, times: Mapping[str, float | None]) -> float | None:
+    """Seconds of a run without a budget; None where training counts steps, which nobody has timed yet."""
+    train = settings.train
+    if train.steps is not None and "train" in times:
+        return None
+    trained = train.seconds or SECONDS[train.preset or "standard"]
+    # What a training of three minutes is followed by (fox, fountain_p11, the demo).
+    usual = {"train": trained + STARTING, "evaluate": 0.05 * trained, "render": 0.35 * trained}
+    usual["mesh"] = 5.0 + 0.15 * trained
+    return sum(usual.get(stage, 0.0) if seconds is None else seconds for stage, seconds in times.items())
+
+
+def times(settings: Settings) -> dict[str, float | None]:
+    """:func:`expected` of the photos that ``settings`` name; nothing where these are gone."""
+    photos = photos_of(settings)
+    return {} if photos is None else expected(settings, photos)
+
+
+def promise(
+    runner: "Runner", stages: Sequence[str], force: frozenset[str], times: Mapping[str, float | None]
+) -> list[str]:
+    """What is said at the start of a run of ``stages``: how long it takes, where anything has to run."""
+    left = {stage: times[stage] for stage in stages if stage in times and (stage in force or not runner.is_done(stage))}
+    if set(left) <= {"report"}:
+        return []
+    if (budget := runner.budget) is not None:
+        return [in_words(budget.total, runner.time_left(budget), left)]
+    usual = without_budget(runner.settings, left)
+    return [] if usual is None else [f"done in about {about(usual)}"]
+
+
+def in_words(total: float, left: float, times: Mapping[str, float | None]) -> str:
+    """The promise of a budget of ``total`` seconds, ``left`` of them not spent; ``times`` of what has to run."""
+    least, finish = least_total(times), time.strftime("%H:%M", time.localtime(time.time() + left))
+    if least > left:
+        soonest = f"about {about(least)} is the least that would do"
+        return f"budget {duration(total)}, too short for these photos: {soonest}; all is made as small as can be"
+    return f"budget {duration(total)}, done at about {finish}"

@@ -1,0 +1,288 @@
+"""Stage tradeoff: a study of what quality costs on this scene and this machine.
+
+Fields of several kinds and sizes are trained for several times, at several photo sizes, with several seeds; each is
+scored on the same pixels of the held-out photos. What nothing beats is drawn as a front, and one point of it is
+recommended. The stage is no part of the usual chain: it runs when it is asked for.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+
+from pydantic import Field
+from tyro.conf import Suppress
+
+from stages.contract import Inputs, Progress, StageConfig, StageError, StageResult
+from stages.files import read_scene, write_json
+from stages.live_line import duration
+from stages.tradeoff_arms import VARIANTS, Arm, Selection, Speed, drawn_per_second, in_words, resolution_words
+
+if TYPE_CHECKING:
+    from nerf.scene import Scene
+    from stages.tradeoff_front import Point
+    from stages.tradeoff_trial import Exam
+
+NEEDS = ("ingest", "normalise", "effects")
+VERSION = 1
+RESUMES = True
+LINKS = ("tradeoff.svg", "tradeoff.png", "tradeoff.md", "tradeoff.json", "ablation.png")
+
+FEWEST_WINDOWS, MOST_WINDOWS = 6, 32
+SCORING_SHARE = 0.003  # of the study's time: for drawing all windows once, whatever the field; but the published one
+COLUMNS = ("", "field", "photos", "steps", "training", "a frame", "peak memory", "model", "PSNR (dB)", "SSIM", "seeds")
+LATE = 0.1  # of the study's time by which it may end late before arms are left out
+
+
+class Config(StageConfig):
+    """How large a study. None is chosen for you."""
+
+    seconds: float = Field(default=1800.0, gt=0, description="for all trainings and scores; --budget 30m says the same")
+    seeds: int = Field(default=3, ge=1, le=9, description="trainings of one setting at most, as far as the time goes")
+    downscale: float | None = Field(
+        default=None, ge=1, description="photo width / width that all are scored at; none: the finest trained at"
+    )
+    # Measured or chosen by plan(); no flag is offered for them.
+    speeds: Annotated[dict[str, tuple[float, float]] | None, Suppress] = Field(
+        default=None, description="steps and rays a second of training, by variant"
+    )
+    sizes: Annotated[tuple[float, ...] | None, Suppress] = Field(default=None, description="photo sizes trained at")
+    windows: Annotated[int | None, Suppress] = Field(default=None, description="of the held-out photos, scored on")
+
+
+class Trial(NamedTuple):
+    """An arm that was run and its figures."""
+
+    arm: Arm
+    figures: dict[str, Any]
+
+
+def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
+    """Measure how fast this machine trains each kind of field; choose photo sizes and windows by that."""
+    from stages.tradeoff_speeds import PUBLISHED, longest_downscale, measured_speeds
+    from stages.tradeoff_trial import WINDOW
+
+    scene = _scene_with_test_photos(inputs)
+    speeds = measured_speeds(scene, inputs, config.seconds, progress)
+    sizes = config.sizes or longest_downscale(scene, speeds, config.seconds)
+    drawn = min(drawn_per_second(name, speed) for name, speed in speeds.items() if name != PUBLISHED)
+    affordable = SCORING_SHARE * config.seconds * drawn / WINDOW**2
+    chosen = {
+        "speeds": {name: (round(speed.steps, 4), round(speed.rays, 2)) for name, speed in speeds.items()},
+        "sizes": sizes,
+        "windows": min(max(FEWEST_WINDOWS, int(affordable)), MOST_WINDOWS),
+        "downscale": config.downscale or sizes[0],
+    }
+    return config.model_copy(update=chosen)
+
+
+def _scene_with_test_photos(inputs: Inputs) -> "Scene":
+    scene = read_scene(inputs["normalise"])
+    if not scene.of_split("test"):
+        why = "no photo of this scene was kept for testing"
+        raise StageError("nothing to score a study by", why, "Lower --normalise.test-every, or add photos.")
+    return scene
+
+
+def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> StageResult:
+    """Train and score arm by arm, then write tables, plot, pictures and the recommendation.
+
+    Raises:
+        StageError: without held-out photos, or where not one arm could be scored.
+    """
+    from stages.tradeoff_trial import make_exam
+
+    config = config if config.speeds else plan(config, inputs, progress)
+    assert config.windows and config.downscale, "plan() chooses them"
+    scene, selection = _scene_with_test_photos(inputs), selection_of(config)
+    for line in plan_words(selection, config.seconds):
+        progress.note(line)
+    exam = make_exam(inputs["ingest"], scene, config.downscale, config.windows)
+    trials, late = _run_all(config, selection, exam, inputs, folder, progress)
+    if all(trial.figures["failed"] for trial in trials):
+        why = "; ".join(dict.fromkeys(str(trial.figures["failed"]) for trial in trials))
+        why = why or f"{duration(config.seconds)} are too short here even for {selection.left_out[0]}"
+        raise StageError("the study has no result", why, "Give it more time, as in --budget 30m.")
+    return _written(config, trials, (*selection.left_out, *late), exam, folder)
+
+
+def selection_of(config: Config) -> Selection:
+    """The arms of a planned study."""
+    from stages.tradeoff_arms import select
+    from stages.tradeoff_trial import WINDOW
+
+    assert config.speeds and config.sizes and config.windows, "plan() chooses them"
+    speeds = {name: Speed(*speed) for name, speed in config.speeds.items()}
+    return select(config.seconds, config.seeds, config.sizes, speeds, config.windows * WINDOW**2)
+
+
+def plan_words(selection: Selection, seconds: float) -> list[str]:
+    """What will be trained, a line for each variant with its share of the time, and what is left out."""
+    lines = [f"{len(selection.arms)} trainings, about {duration(selection.seconds)} of {duration(seconds)}"]
+    for variant in VARIANTS:
+        arms = [arm for arm in selection.arms if arm.variant == variant]
+        if arms:
+            share = sum(arm.seconds for arm in arms) / selection.seconds
+            settings = len({(arm.downscale, arm.steps) for arm in arms})
+            sizes = ", ".join(resolution_words(size) for size in sorted({arm.downscale for arm in arms}))
+            steps = [arm.steps for arm in arms]
+            span = f"{min(steps):,}" if min(steps) == max(steps) else f"{min(steps):,} to {max(steps):,}"
+            seeds = f"{len(arms)} trainings" if len(arms) > settings else "one seed each"
+            lines.append(f"{variant}: {settings} × {span} steps at {sizes}, {seeds}, {share:.0%} of the time")
+    if selection.left_out:
+        lines.append(f"left out for want of time: {'; '.join(selection.left_out)}")
+    return lines
+
+
+def _run_all(
+    config: Config, selection: Selection, exam: "Exam", inputs: Inputs, folder: Path, progress: Progress
+) -> tuple[list[Trial], tuple[str, ...]]:
+    """Every arm that the time allows, and those that it did not because the machine was slower than measured."""
+    from stages.tradeoff_trial import run_arm
+
+    trials, late, spent, expected = list[Trial](), list[Arm](), 0.0, 0.0
+    for number, arm in enumerate(selection.arms, 1):
+        slowness = spent / expected if expected else 1.0
+        if spent + arm.seconds * slowness > (1 + LATE) * config.seconds:
+            late.append(arm)
+            continue
+        inner = _ArmProgress(progress, f"{number}/{len(selection.arms)} {arm.variant}", spent / config.seconds)
+        figures = run_arm(arm, exam, inputs, folder / "arms", inner)
+        trials.append(Trial(arm, figures))
+        spent, expected = spent + figures["wall_seconds"], expected + arm.seconds
+        progress.note(f"{number}/{len(selection.arms)} {_trial_words(arm, figures)}")
+    named = in_words(late)
+    if late:
+        progress.note(f"the machine is slower than when it was measured; not trained: {'; '.join(named)}")
+    return trials, named
+
+
+def _trial_words(arm: Arm, figures: dict[str, Any]) -> str:
+    words = f"{arm.variant}, {resolution_words(arm.downscale)}, {arm.steps:,} steps, seed {arm.seed}: "
+    if figures["failed"]:
+        return words + f"no result ({figures['failed']})"
+    again = f", started again {figures['restarts']} times" if figures["restarts"] else ""
+    return words + f"{figures['psnr']:.2f} dB in {duration(figures['train_seconds'])}{again}"
+
+
+class _ArmProgress:
+    """A Progress for one arm: live lines under its name and the study's share of the time; its notes are kept back, for
+    the study says in one line what became of it."""
+
+    def __init__(self, progress: Progress, name: str, done: float) -> None:
+        self.progress, self.name, self.done = progress, name, min(1.0, done)
+
+    def update(self, message: str, done: float | None = None) -> None:
+        """As the arm's, under its name; the share is the study's."""
+        del done
+        self.progress.update(f"{self.name} · {message}", self.done)
+
+    def note(self, message: str) -> None:
+        """As a live line."""
+        self.update(message)
+
+
+def _written(
+    config: Config, trials: Sequence[Trial], left_out: Sequence[str], exam: "Exam", folder: Path
+) -> StageResult:
+    """Write everything. What depends on the clock are records; the scores of the trainings are outputs."""
+    from stages.tradeoff_front import points_of, pooled_deviation, recommend, table
+    from stages.tradeoff_plot import write_plot
+
+    points = points_of(trials)
+    recommendation = recommend(points)
+    study = {
+        "headline": recommendation.headline,
+        "recommendation": recommendation.words,
+        "recommended": points.index(recommendation.point) + 1,
+        "still_rising": recommendation.still_rising,
+        "pooled_deviation": pooled_deviation(points),
+        "scored": _scored_on(config, exam),
+        "points": table(points),
+        "arms": [{**trial.arm._asdict(), **trial.figures} for trial in trials],
+        "left_out": list(left_out),
+    }
+    write_json(folder / "tradeoff.json", study)
+    write_json(folder / "quality.json", [_quality(trial) for trial in trials])
+    (folder / "tradeoff.md").write_text(markdown(study), "utf-8")
+    write_plot(study, folder)
+    pictures = _ablation_picture(points, trials, exam, folder)
+    line = f"{len(points)} settings, {sum(row['front'] for row in study['points'])} on the front · "
+    records = ("tradeoff.json", "tradeoff.md", "tradeoff.svg", "tradeoff.png")
+    facts = {"recommendation": recommendation.words, "settings": len(points), "trainings": len(trials)}
+    return StageResult(("quality.json", *pictures), line + recommendation.words, records, facts)
+
+
+def _quality(trial: Trial) -> dict[str, Any]:
+    """What a training of so many steps gives, whenever it is run."""
+    figures = {key: trial.figures.get(key) for key in ("psnr", "ssim", "model_mb", "failed")}
+    return {**trial.arm.options, "variant": trial.arm.variant, **figures}
+
+
+def _scored_on(config: Config, exam: "Exam") -> str:
+    from stages.tradeoff_trial import WINDOW
+
+    photos = len({window.photo for window in exam.windows})
+    assert config.downscale
+    return (
+        f"{len(exam.windows)} windows of {WINDOW} × {WINDOW} pixels of {photos} held-out photo{'s' * (photos > 1)} "
+        f"at {resolution_words(config.downscale)}, the same for all"
+    )
+
+
+def _ablation_picture(
+    points: "Sequence[Point]", trials: Sequence[Trial], exam: "Exam", folder: Path
+) -> tuple[str, ...]:
+    """ablation.png: windows of the photos beside what the method and each variant of it draw there; the names of the
+    files written, none where no ablation was run."""
+    from stages.tradeoff_arms import ABLATIONS, COMPLETE
+    from stages.tradeoff_plot import Row, write_sheet
+    from stages.tradeoff_trial import write_strip
+
+    ablated = next((t.arm for t in trials if t.arm.variant in ABLATIONS and not t.figures["failed"]), None)
+    if ablated is None:
+        return ()
+    write_strip(folder / "arms" / "photo.png", [window.truth for window in exam.shown])
+    rows = [Row("photo", None, folder / "arms" / "photo.png")]
+    for trial in trials:
+        same = (trial.arm.downscale, trial.arm.steps, trial.arm.seed) == (
+            ablated.downscale,
+            ablated.steps,
+            ablated.seed,
+        )
+        if same and trial.arm.variant in (COMPLETE, *ABLATIONS) and not trial.figures["failed"]:
+            score = next(p.psnr for p in points if (p.variant, p.steps) == (trial.arm.variant, trial.arm.steps))
+            rows.append(Row(trial.arm.variant, score, folder / "arms" / f"{trial.arm.name}.png"))
+    best = max((t for t in trials if not t.figures["failed"]), key=lambda trial: trial.figures["psnr"])
+    rows.append(Row(f"best: {best.arm.variant}", best.figures["psnr"], folder / "arms" / f"{best.arm.name}.png"))
+    write_sheet(rows, folder / "ablation.png")
+    return ("ablation.png",)
+
+
+def markdown(study: dict[str, Any]) -> str:
+    """tradeoff.md: the recommendation and the table. Bold rows are those that nothing beats."""
+    lines = [study["recommendation"], "", f"Scored on {study['scored']}.", ""]
+    lines += ["| " + " | ".join(COLUMNS) + " |", "|---" * len(COLUMNS) + "|"]
+    for row in study["points"]:
+        shown = [f"**{cell}**" if row["front"] else cell for cell in cells(row)]
+        lines.append("| " + " | ".join(shown) + " |")
+    if study["left_out"]:
+        lines += ["", f"Left out for want of time: {'; '.join(study['left_out'])}."]
+    return "\n".join(lines) + "\n"
+
+
+def cells(row: dict[str, Any]) -> list[str]:
+    """A point's row of the table, as COLUMNS has it."""
+    spread = "" if row["deviation"] is None else f" ± {row['deviation']:.2f}"
+    return [
+        str(row["number"]),
+        row["variant"],
+        resolution_words(row["downscale"]),
+        f"{row['steps']:,}",
+        f"{row['train_seconds']:.1f} s",
+        f"{row['frame_seconds']:.2f} s",
+        f"{row['peak_memory_mb']:,.0f} MB",
+        f"{row['model_mb']:.1f} MB",
+        f"{row['psnr']:.2f}{spread}",
+        "–" if row["ssim"] is None else f"{row['ssim']:.3f}",
+        str(row["seeds"]),
+    ]

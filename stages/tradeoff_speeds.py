@@ -1,0 +1,68 @@
+"""How fast this machine trains each variant of a study, and which photo sizes that calls for."""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+from stages.contract import Inputs, Progress
+from stages.tradeoff_arms import FEWEST_STEPS, LONGEST, TIMED, VARIANTS, Speed, field_of, photo_sizes
+
+if TYPE_CHECKING:
+    from nerf.scene import Scene
+    from stages.train import Config as TrainConfig
+
+REDUCED, PUBLISHED = "paper, reduced", "paper, published"
+
+
+class _Quiet:
+    """A Progress whose notes nobody needs: stage train says them again."""
+
+    def __init__(self, progress: Progress) -> None:
+        self.update = progress.update
+
+    def note(self, message: str) -> None:
+        """Nothing."""
+
+
+def measured_speeds(scene: "Scene", inputs: Inputs, seconds: float, progress: Progress) -> dict[str, Speed]:
+    """A second or two of training for each variant that has a speed of its own.
+
+    The published networks are timed only where they could come to a score in a study of ``seconds``: one of their steps
+    may take longer than the whole timing. Their arithmetic beside the reduced ones' tells.
+    """
+    from stages.effect_decisions import read_decisions
+    from stages.training_size import rays_per_second, rays_per_step
+
+    decisions, speeds = read_decisions(inputs["effects"]), dict[str, Speed]()
+    for number, name in enumerate(TIMED):
+        progress.update(f"trying how fast this machine trains: {name}", number / len(TIMED))
+        config = _planned(name, inputs, progress)
+        if name == PUBLISHED:
+            rays = speeds[REDUCED].rays * _work(_planned(REDUCED, inputs, progress)) / _work(config)
+            if LONGEST * seconds * rays < FEWEST_STEPS * rays_per_step(config):
+                speeds[name] = Speed(rays / rays_per_step(config), rays)
+                continue
+        rays = rays_per_second(config, scene, decisions)
+        speeds[name] = Speed(rays / rays_per_step(config), rays)
+    return speeds
+
+
+def _planned(name: str, inputs: Inputs, progress: Progress) -> "TrainConfig":
+    """What stage train makes of a variant; nothing is left for it to choose by time."""
+    from stages import train
+
+    asked = train.Config(field=field_of(name), steps=1, downscale=1.0, **VARIANTS[name].options)  # type: ignore[arg-type]
+    return train.plan(asked, inputs, _Quiet(progress))
+
+
+def _work(config: "TrainConfig") -> float:
+    """Multiplications of a ray through both networks of a paper field, about."""
+    assert config.samples_coarse and config.samples_fine and config.depth and config.width
+    return (2 * config.samples_coarse + config.samples_fine) * config.depth * config.width**2
+
+
+def longest_downscale(scene: "Scene", speeds: Mapping[str, Speed], seconds: float) -> tuple[float, ...]:
+    """The photo sizes of a study of ``seconds``, see :func:`photo_sizes`."""
+    from stages.training_size import chosen_downscale
+
+    smallest = chosen_downscale(scene, rays=1.0)  # as small as photos are ever made
+    return photo_sizes(chosen_downscale(scene, LONGEST * seconds * speeds["grid"].rays), smallest)

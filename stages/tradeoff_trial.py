@@ -1,0 +1,180 @@
+"""One training of a study: stage train in a folder of its own, then its score on windows of the held-out photos.
+
+Every field is scored on the same pixels at the same size, whatever size it was trained at. Windows stand for whole
+photos because the published networks would take longer to draw those than to be trained.
+"""
+
+import shutil
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from stages.contract import Inputs, Progress, StageError
+from stages.files import read_json, write_json
+from stages.tradeoff_arms import Arm
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from nerf.rays import Rays
+    from nerf.scene import Scene, View
+
+WINDOW = 64  # pixels along an edge
+SHOWN = 3  # windows kept as pictures, those with most detail
+# Steps between windows that fill a square evenly, however many there are (Roberts 2018, the R2 sequence).
+STEPS_OF_PLACES = (0.7548776662466927, 0.5698402909980532)
+MEMORY_LOOK_SECONDS = 0.05
+
+
+class Window(NamedTuple):
+    """A part of a held-out photo: rays and colours (h, w, …), and which pixels count (None: all)."""
+
+    photo: str
+    rays: "Rays"
+    truth: "Tensor"
+    used: "Tensor | None"
+
+
+@dataclass(frozen=True)
+class Exam:
+    """What every arm of a study is scored on; make it with :func:`make_exam`. ``frame`` is a whole photo's pixels."""
+
+    scene: "Scene"
+    windows: tuple[Window, ...]
+    frame: int
+
+    @property
+    def shown(self) -> list[Window]:
+        """The windows with the largest differences within them, the largest first."""
+        return sorted(self.windows, key=lambda window: -float(window.truth.std((0, 1)).mean()))[:SHOWN]
+
+
+def make_exam(ingest: Path, scene: "Scene", downscale: float, count: int) -> Exam:
+    """``count`` windows spread over the held-out photos at 1/``downscale`` of their size."""
+    from stages.training_data import scaled_size
+
+    test = scene.of_split("test")
+    windows = tuple(_window(ingest, scene, test[i % len(test)], downscale, i) for i in range(count))
+    width, height = scaled_size(scene.cameras[test[0].camera], downscale)
+    return Exam(scene, windows, width * height)
+
+
+def _window(ingest: Path, scene: "Scene", view: "View", downscale: float, number: int) -> Window:
+    from nerf.rays import Rays
+    from stages.training_data import view_mask, view_pixels, view_rays
+    from stages.training_setup import BLACK, WHITE
+
+    truth = view_pixels(ingest, scene, view, downscale, WHITE if scene.has_alpha else BLACK)
+    top, left = (
+        int((0.5 + number * step) % 1 * (max(0, size - WINDOW) + 1))
+        for step, size in zip(STEPS_OF_PLACES, truth.shape[:2], strict=True)
+    )
+    part = (slice(top, top + WINDOW), slice(left, left + WINDOW))
+    used = view_mask(ingest, scene, view, downscale)
+    rays = Rays(*(values[part].clone() for values in view_rays(scene, view, downscale)))
+    return Window(view.name, rays, truth[part].clone(), None if used is None else used[part])
+
+
+def run_arm(arm: Arm, exam: Exam, inputs: Inputs, folder: Path, progress: Progress) -> dict[str, Any]:
+    """Train and score one arm, or read what an earlier attempt found; its figures, with ``failed`` (why) where the
+    field did not learn. A killed training goes on from its checkpoint."""
+    from stages import train
+
+    found = folder / f"{arm.name}.json"
+    if found.exists():
+        return read_json(found)
+    started, work = time.perf_counter(), folder / arm.name
+    work.mkdir(parents=True, exist_ok=True)
+    figures: dict[str, Any] = {"failed": None}
+    with peak_memory() as peak:
+        try:
+            result = train.run(train.Config(**arm.options), inputs, work, progress)
+        except StageError as error:
+            figures["failed"] = f"{error.what}: {error.why}"
+        else:
+            figures |= {name: result.facts[name] for name in ("train_seconds", "restarts")}
+            figures |= _score(arm, exam, work, folder, progress)
+    figures |= {"peak_memory_mb": round(peak() / 1e6), "wall_seconds": round(time.perf_counter() - started, 3)}
+    write_json(found, figures)
+    shutil.rmtree(work)
+    return figures
+
+
+def _score(arm: Arm, exam: Exam, work: Path, folder: Path, progress: Progress) -> dict[str, Any]:
+    """PSNR over the pixels of all windows, mean SSIM, seconds a frame; the shown windows as a picture."""
+    from nerf.metrics import psnr
+    from stages.drawing import load_painter
+    from stages.effect_decisions import expected_gains
+    from stages.image_metrics import ssim
+
+    painter = load_painter(work)
+    gains = expected_gains(read_json(work / "field.json"), exam.scene, exam.scene.of_split("test"))
+    painter.draw(exam.windows[0].rays)  # the first picture pays for memory and kernels
+    errors, similarities, drawn, seconds = [], [], {}, 0.0
+    for number, window in enumerate(exam.windows):
+        progress.update(f"scoring, window {number + 1} of {len(exam.windows)}", number / len(exam.windows))
+        shown_as = painter.at_gain(gains[window.photo]) if gains else painter
+        started = time.perf_counter()
+        image = shown_as.draw(window.rays).colour.clamp(0, 1)
+        seconds += time.perf_counter() - started
+        error = (image - window.truth).square().mean(-1)
+        errors.append(error if window.used is None else error[window.used])
+        similarities.append(ssim(image, window.truth, window.used))
+        drawn[id(window)] = image
+    import torch
+
+    write_strip(folder / f"{arm.name}.png", [drawn[id(window)] for window in exam.shown])
+    known = [similarity for similarity in similarities if similarity is not None]
+    rays = sum(window.rays.near.numel() for window in exam.windows)
+    return {
+        "psnr": round(psnr(float(torch.cat([error.flatten() for error in errors]).mean())), 4),
+        "ssim": round(sum(known) / len(known), 5) if known else None,
+        "model_mb": round((work / "field.safetensors").stat().st_size / 1e6, 3),
+        "frame_seconds": round(seconds * exam.frame / rays, 4),
+    }
+
+
+def write_strip(path: Path, windows: "list[Tensor]") -> None:
+    """Pictures (h, w, 3) in [0, 1] side by side as a PNG, cut to the smallest."""
+    import torch
+
+    from stages.files import write_png
+
+    height, width = (min(window.shape[axis] for window in windows) for axis in (0, 1))
+    row = torch.cat([window[:height, :width] for window in windows], dim=1)
+    write_png(path, (row * 255).round().byte().numpy())
+
+
+@contextmanager
+def peak_memory() -> Iterator[Callable[[], int]]:
+    """Yields a function that tells, once the block is left, the most bytes in use within it: a GPU's, or the whole
+    program's, looked at twenty times a second."""
+    import gc
+
+    import torch
+
+    gc.collect()
+    if torch.cuda.is_available():
+        torch.cuda.reset_peak_memory_stats()
+        yield torch.cuda.max_memory_allocated
+        return
+    import psutil
+
+    process, most, over = psutil.Process(), [0], threading.Event()
+
+    def look() -> None:
+        while not over.wait(MEMORY_LOOK_SECONDS):
+            most[0] = max(most[0], process.memory_info().rss)
+
+    most[0] = process.memory_info().rss
+    watcher = threading.Thread(target=look, daemon=True)
+    watcher.start()
+    try:
+        yield lambda: most[0]
+    finally:
+        over.set()
+        watcher.join()

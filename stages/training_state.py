@@ -1,0 +1,68 @@
+"""What a training run is given and what it keeps: budget, probes, state, pace."""
+
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+if TYPE_CHECKING:
+    from nerf.probe import Probe
+    from stages.unseen import Target, Unseen
+
+RATE_MEMORY_SECONDS = 5.0  # how far back the measured speed and the shown PSNR look
+
+
+class Budget(NamedTuple):
+    """How long to train: exactly one of the first two is given. Seconds count training steps alone. ``after``: the
+    folder of a finished run from whose end to go on; the budget is then for what comes on top."""
+
+    steps: int | None
+    seconds: float | None
+    after: Path | None = None
+
+
+class Probes(NamedTuple):
+    """Fixed pixels to measure on; ``heldout`` is None without test photos, is reported and decides nothing. A
+    ``target`` decides when to stop."""
+
+    train: "Probe"
+    heldout: "Unseen | None" = None
+    target: "Target | None" = None
+
+
+@dataclass
+class RunState:
+    """What a checkpoint keeps beside the tensors. ``seconds`` and ``rays`` include what was discarded, and what was
+    done before in the finished run that this one goes on from."""
+
+    step: int = 0
+    seconds: float = 0.0
+    rays: int = 0
+    restarts: int = 0
+    rollbacks: int = 0
+    curve: list[dict[str, Any]] = field(default_factory=list)
+    validation_psnr: float | None = None
+    steps_before: int = 0  # of the finished run that this one goes on from
+    seconds_before: float = 0.0
+    timings: dict[str, Any] = field(default_factory=dict)
+    symptom: str | None = None  # of a field that ended within its warm-up
+
+    def anew(self, restarts: int, rollbacks: int) -> "RunState":
+        """The state of a run that begins again with fresh weights: only what was spent is kept."""
+        spent = {name: getattr(self, name) for name in ("seconds", "rays", "steps_before", "seconds_before")}
+        return RunState(restarts=restarts, rollbacks=rollbacks, **spent)
+
+
+class Pace:
+    """Running means of a run's speed and batch PSNR, forgetting after a few seconds. Shown, and used for planning."""
+
+    def __init__(self) -> None:
+        self.count, self.seconds_per_step, self.rays_per_step, self.psnr = 0, 0.0, 0.0, 0.0
+
+    def add(self, seconds: float, rays: int, psnr: float) -> None:
+        """Take one step into account."""
+        self.count += 1
+        new = max(1 / self.count, 1 - math.exp(-seconds / RATE_MEMORY_SECONDS))
+        self.seconds_per_step += new * (seconds - self.seconds_per_step)
+        self.rays_per_step += new * (rays - self.rays_per_step)
+        self.psnr += new * (psnr - self.psnr)

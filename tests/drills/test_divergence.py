@@ -1,0 +1,313 @@
+"""Rates far too high, numbers that are none, damaged checkpoints: never a bad model that looks like a good one."""
+
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from safetensors.torch import load_file
+
+from nerf.effects.exposures import Exposures
+from nerf.effects.poses import RefinedPoses
+from nerf.grid_training import GridTrainer
+from nerf.probe import make_probe, measure
+from nerf.ray_bank import RayBank
+from nerf.training import PaperTrainer
+from stages import train, training_loop
+from stages.contract import StageError, StageResult
+from stages.decoding import DecodeError, decode
+from stages.examination import symptom_of
+from stages.field_files import load_field
+from stages.files import read_scene
+from stages.training_data import training_bank
+from tests.stages.photo_scene import photographed
+
+KINDS: dict[str, dict[str, Any]] = {
+    "torch": {"backend": "torch"},
+    "warp": {"backend": "warp"},
+    "paper": {"depth": 2, "width": 16, "samples_coarse": 8, "samples_fine": 8, "batch_rays": 64},
+}
+GRID: dict[str, Any] = {
+    "field": "grid",
+    "levels": 2,
+    "log2_rows": 10,
+    "finest": 32,
+    "batch_samples": 1024,
+    "learning_rate": 2e-2,
+}
+WARM_UP = 40
+NAMED = ("training diverged", "the field does not learn")
+
+
+@pytest.fixture(autouse=True)
+def short_warm_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(training_loop, "WARM_UP_STEPS", WARM_UP)
+    monkeypatch.setattr("stages.training_parts.write_parts", lambda *_: [])
+    monkeypatch.setattr("stages.training_setup.PROBE_RAYS", 256)
+    monkeypatch.setattr("nerf.density_cache.EVERY", 32)  # measuring it is most of what so small a field costs
+
+
+@pytest.fixture
+def inputs(tmp_path: Path) -> dict[str, Path]:
+    return photographed(tmp_path, channels=4)[0]
+
+
+def trained(kind: str, inputs: dict[str, Path], folder: Path, progress: Any, **settings: Any) -> StageResult:
+    folder.mkdir(exist_ok=True)
+    base: dict[str, Any] = {"learning_rate": 5e-3} if kind == "paper" else GRID
+    config: dict[str, Any] = {"downscale": 1.0} | base | KINDS[kind] | settings
+    return train.run(train.Config(**config), inputs, folder, progress)
+
+
+def seen(folder: Path, inputs: dict[str, Path], progress: Any) -> tuple[float, float]:
+    """PSNR of the field in ``folder`` on training photos, and that of a flat colour."""
+    bank = training_bank(inputs["ingest"], read_scene(inputs["normalise"]), "train", 1.0, progress)
+    probe = make_probe(bank, 512, torch.ones(3), 0)
+    return measure(load_field(folder)[0], probe).psnr, probe.flat_psnr
+
+
+@pytest.mark.parametrize("steps", [WARM_UP - 20, WARM_UP + 20])
+@pytest.mark.parametrize("rate", [1e-1, 1.0, 10.0])
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_rate_far_too_high_never_gives_a_bad_model_in_silence(
+    kind: str, rate: float, steps: int, inputs: dict[str, Path], tmp_path: Path, progress: Any
+) -> None:
+    try:
+        result = trained(kind, inputs, tmp_path / "train", progress, steps=steps, learning_rate=rate)
+    except StageError as refusal:
+        assert refusal.what in NAMED and "--train.learning-rate" in refusal.hint
+        assert steps > WARM_UP or refusal.what == "training diverged"
+        return
+    psnr, flat = seen(tmp_path / "train", inputs, progress)
+    if psnr > flat + 1:  # the loop looks at other pixels
+        assert result.facts["symptom"] is None
+    if psnr < flat - 1:
+        assert steps < WARM_UP and str(result.facts["symptom"]) in result.line
+        assert any("the field is of no use yet" in note for note in progress.notes)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_field_that_is_lost_after_its_warm_up_goes_back(
+    kind: str, inputs: dict[str, Path], tmp_path: Path, progress: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spoil_once_at(WARM_UP + 20, _forget, monkeypatch, kind)
+    result = trained(kind, inputs, tmp_path / "train", progress, steps=WARM_UP + 20, checkpoint_seconds=0.1)
+    assert (result.facts["rollbacks"], result.facts["symptom"]) == (1, None)
+    assert any("the field is lost: it is" in note and "at half the learning rate" in note for note in progress.notes)
+    psnr, flat = seen(tmp_path / "train", inputs, progress)
+    assert flat + 1 < psnr < 60
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_field_lost_again_and_again_is_refused_by_name(
+    kind: str, inputs: dict[str, Path], tmp_path: Path, progress: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spoil_at(WARM_UP + 20, _forget, monkeypatch, kind)
+    with pytest.raises(StageError, match=r"training diverged: after 60 steps the field is lost: it is .* 3 roll-backs"):
+        trained(kind, inputs, tmp_path / "train", progress, steps=WARM_UP + 20, checkpoint_seconds=0.1)
+    assert not (tmp_path / "train" / "field.json").exists()
+
+
+@pytest.mark.parametrize("poison", [float("nan"), float("inf")])
+@pytest.mark.parametrize("kind", KINDS)
+def test_weights_that_the_last_update_broke_are_never_kept(
+    kind: str, poison: float, inputs: dict[str, Path], tmp_path: Path, progress: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def break_one_weight(trainer: Any) -> None:
+        weights = trainer.state()
+        weights["model.table" if kind != "paper" else "model.fine.trunk.0.weight"].view(-1)[7] = poison
+
+    spoil_once_at(12, break_one_weight, monkeypatch, kind)
+    result = trained(kind, inputs, tmp_path / "train", progress, steps=12)
+    assert result.facts["rollbacks"] == 1
+    assert any("is not finite: back to step 0 at half the learning rate" in note for note in progress.notes)
+    assert weights_are_finite(tmp_path / "train")
+
+
+# Of the bank: near and far, the cameras' places, their rotations; and how bearings change from pixel to pixel.
+ROWS = {"near": ("geometry", 12), "far": ("geometry", 13), "centres": ("geometry", 9), "rotations": ("geometry", 4)}
+ROWS["bearings"] = ("patches", 1)
+
+
+@pytest.mark.parametrize("poison", [float("nan"), float("inf")])
+@pytest.mark.parametrize("row", ROWS)
+@pytest.mark.parametrize("kind", KINDS)
+def test_rays_that_are_no_numbers_end_training_by_name(
+    kind: str,
+    row: str,
+    poison: float,
+    inputs: dict[str, Path],
+    tmp_path: Path,
+    progress: Any,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def poisoned(bank: RayBank) -> None:
+        table, number = ROWS[row]
+        getattr(bank, table)[number, ::2] = poison
+
+    spoil_at(5, lambda trainer: poisoned(trainer.bank), monkeypatch, kind)
+    with pytest.raises(StageError) as failure:
+        trained(kind, inputs, tmp_path / "train", progress, steps=10)
+    assert failure.value.what == "training diverged"
+    assert re.match("the geometry of rays of step [0-9]+ is not finite, after 3 roll-backs", failure.value.why)
+    assert "Check the cameras" in failure.value.hint
+    assert any("the geometry of rays of step 5 is not finite: back to step" in note for note in progress.notes)
+    assert (tmp_path / "train" / "nonfinite_5.safetensors").is_file()
+
+
+@pytest.mark.parametrize("what", ["poses", "gains"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_is_learnt_of_photos_is_gated_and_rolled_back(
+    kind: str, what: str, inputs: dict[str, Path], tmp_path: Path, progress: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with_photo_parts(monkeypatch, what)
+
+    def poison(trainer: Any) -> None:
+        next(iter(trainer.photo_parameters.values())).detach().view(-1)[::2] = float("nan")
+
+    spoil_once_at(20, poison, monkeypatch, kind)
+    result = trained(kind, inputs, tmp_path / "train", progress, steps=WARM_UP + 21)
+    assert result.facts["rollbacks"] == 1 and "nonfinite_20.safetensors" in result.records
+    assert weights_are_finite(tmp_path / "train")
+
+
+def weights_are_finite(folder: Path) -> bool:
+    return all(tensor.isfinite().all() for tensor in load_file(folder / "field.safetensors").values())
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_checkpoint_of_a_sound_run_is_sound(kind: str, inputs: dict[str, Path], tmp_path: Path, progress: Any):
+    result = trained(kind, inputs, tmp_path / "train", progress, steps=WARM_UP + 20, checkpoint_seconds=0.05)
+    assert (result.facts["rollbacks"], result.facts["restarts"], result.facts["symptom"]) == (0, 0, None)
+    assert not any("lost" in note or "no use" in note for note in progress.notes)
+
+
+@pytest.mark.parametrize("other", [{"log2_rows": 11}, {"finest": 31}, {"levels": 3}])
+def test_a_checkpoint_of_another_field_is_said_aloud_and_the_one_before_goes_on(
+    other: dict[str, int], inputs: dict[str, Path], tmp_path: Path, progress: Any
+) -> None:
+    _checkpoint_of_another(tmp_path, inputs, progress, "torch", other)
+
+
+@pytest.mark.parametrize("other", [{"width": 18}, {"depth": 3}, {"density_activation": "relu"}, {"spacing": "log"}])
+def test_so_is_one_of_another_paper_field(
+    other: dict[str, Any], inputs: dict[str, Path], tmp_path: Path, progress: Any
+) -> None:
+    _checkpoint_of_another(tmp_path, inputs, progress, "paper", other)
+
+
+def _checkpoint_of_another(
+    folder: Path, inputs: dict[str, Path], progress: Any, kind: str, other: dict[str, Any]
+) -> None:
+    """Of step 20, beside our own of step 10."""
+    mine, theirs = folder / "mine", folder / "theirs"
+    trained(kind, inputs, mine, progress, steps=10)
+    trained(kind, inputs, theirs, progress, steps=20, **other)
+    expected = (mine / "field.safetensors").read_bytes()
+    for file in (theirs / "checkpoints").glob("*20.*"):
+        shutil.copy(file, mine / "checkpoints")
+    again = trained(kind, inputs, mine, progress, steps=10)
+    assert again.facts["steps"] == 10
+    assert any("the checkpoint of step 20 is not of this training" in note for note in progress.notes)
+    assert (mine / "field.safetensors").read_bytes() == expected
+
+
+def test_no_number_is_a_symptom(inputs: dict[str, Path], progress: Any) -> None:
+    """Comparisons with NaN are false: neither empty nor worse than a flat colour would be said of it."""
+    bank = training_bank(inputs["ingest"], read_scene(inputs["normalise"]), "train", 1.0, progress)
+    trainer = train_loop_trainer(inputs, bank)
+    probe = make_probe(bank, 64, torch.ones(3), 0)
+    trainer.model.colour_out[:] = float("nan")
+    assert symptom_of(trainer, probe) == "its model.colour_out is not finite"
+    trainer.model.colour_out[:] = 3e38
+    trainer.model.colour_hidden[:] = 3e38
+    symptom = symptom_of(trainer, probe)
+    assert symptom is None or "no number" in symptom or "flat colour" in symptom
+
+
+def train_loop_trainer(inputs: dict[str, Path], bank: RayBank) -> GridTrainer:
+    from stages.training_setup import make_trainer
+
+    settings: dict[str, Any] = {"downscale": 1.0, "steps": 1, "chunks": 1} | GRID | KINDS["torch"]
+    asked = train.Config(**settings)
+    config = train.with_habits(asked.model_copy(update={"contracted": False, "view_dependence": True}))
+    trainer = make_trainer(config, read_scene(inputs["normalise"]), bank, 0)
+    assert isinstance(trainer, GridTrainer)
+    return trainer
+
+
+@pytest.mark.parametrize("poison", [float("nan"), float("inf"), float("-inf")])
+def test_a_float_photo_with_pixels_that_are_no_numbers_is_refused_by_name(tmp_path: Path, poison: float) -> None:
+    values = np.full((20, 30), 0.5, np.float32)
+    Image.fromarray(values).save(tmp_path / "fine.tif")
+    values[3, 4] = poison
+    Image.fromarray(values).save(tmp_path / "poisoned.tif")
+    assert decode(tmp_path / "fine.tif").pixels.shape == (20, 30, 3)
+    with pytest.raises(DecodeError, match=r"^1 of its 600 pixels are no numbers \(NaN or infinite\)$"):
+        decode(tmp_path / "poisoned.tif")
+
+
+@pytest.mark.parametrize(
+    "head", [b"\x76\x2f\x31\x01\x02\x00\x00\x00", b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n\x02\x02"]
+)
+def test_openexr_and_radiance_files_are_no_photos(tmp_path: Path, head: bytes) -> None:
+    (tmp_path / "light.bin").write_bytes(head + bytes(range(256)))
+    with pytest.raises(DecodeError, match="not an image of a known format"):
+        decode(tmp_path / "light.bin")
+
+
+def _forget(trainer: Any) -> None:
+    """The weights of a field that is empty everywhere, all of them finite."""
+    with torch.no_grad():
+        if isinstance(trainer, PaperTrainer):
+            trainer.model.fine.density_head.weight.zero_()
+            trainer.model.fine.density_head.bias.fill_(-100)
+        else:
+            for name, value in {"table": 1.0, "density_hidden": 1.0, "density_out": -1.0}.items():
+                getattr(trainer.model, name).fill_(value)
+
+
+def spoil_at(step: int, spoil: Callable[[Any], None], monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
+    """``spoil`` the trainer whenever it has taken so many steps."""
+    trainer = PaperTrainer if kind == "paper" else GridTrainer
+    take = trainer.step
+
+    def spoiled(self: Any, number: int, *rest: float):
+        result = take(self, number, *rest)
+        if number + 1 == step:
+            spoil(self)
+        return result
+
+    monkeypatch.setattr(trainer, "step", spoiled)
+
+
+def spoil_once_at(step: int, spoil: Callable[[Any], None], monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
+    """:func:`spoil_at`, only the first time."""
+    done = []
+
+    def first_time(trainer: Any) -> None:
+        if not done:
+            done.append(step)
+            spoil(trainer)
+
+    spoil_at(step, first_time, monkeypatch, kind)
+
+
+def with_photo_parts(monkeypatch: pytest.MonkeyPatch, what: str) -> None:
+    """Train with poses or gains of photos, whatever the effects say."""
+    from nerf.effects import AS_GIVEN, AS_RENDERED
+
+    def parts(decisions: Any, views: Any, device: torch.device):
+        centres = torch.tensor([view.scene_from_camera[:, 3] for view in views], dtype=torch.float32)
+        return (
+            (RefinedPoses(centres), AS_RENDERED)
+            if what == "poses"
+            else (AS_GIVEN, Exposures(torch.zeros(len(views), 3)))
+        )
+
+    monkeypatch.setattr("stages.effect_decisions.photo_parts", parts)

@@ -1,0 +1,41 @@
+"""Loaders answer or refuse in words, whatever they are given. The long run: ``python -m benchmarks.fuzz``."""
+
+import os
+import struct
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+
+from tests.fuzz.loaders import LOADERS, attempt, colmap_models
+
+SLOW = (HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.filter_too_much)
+EXAMPLES = int(os.environ.get("FUZZ_EXAMPLES", "60"))
+
+
+@pytest.mark.parametrize("name", LOADERS)
+def test_a_loader_answers_or_refuses_in_words(name: str) -> None:
+    loader = LOADERS[name]
+    taken = []
+
+    @settings(max_examples=EXAMPLES, derandomize=True, database=None, suppress_health_check=SLOW)
+    @given(files=loader.files())
+    def check(files: dict[str, bytes]) -> None:
+        taken.append(attempt(loader, files))
+
+    check()
+    assert any(taken) and not all(taken), "what is given must be valid at times, and damaged at times"
+
+
+@pytest.mark.parametrize("error", [float("nan"), float("inf"), 1e308])
+def test_what_a_colmap_model_says_of_its_own_errors_is_not_believed(error: float) -> None:
+    files = dict(colmap_models()["bin"])
+    points = bytearray(files["points3D.bin"])
+    struct.pack_into("<d", points, 8 + 8 + 24 + 3, error)
+    assert attempt(LOADERS["colmap binary"], {**files, "points3D.bin": bytes(points)})
+
+
+def test_a_lens_that_cannot_be_undone_is_refused_where_it_is_given() -> None:
+    files = dict(colmap_models()["bin"])
+    cameras = bytearray(files["cameras.bin"])
+    struct.pack_into("<d", cameras, 8 + 24 + 32, 1e16)
+    assert not attempt(LOADERS["colmap binary"], {**files, "cameras.bin": bytes(cameras)})

@@ -1,0 +1,29 @@
+import pytest
+import torch
+
+from nerf import machine_rates
+from nerf.machine_rates import Rates, measure_rates
+from nerf.stopwatch import Work
+
+CPU = torch.device("cpu")
+
+
+def test_rates_are_those_of_a_computer_and_no_random_state_changes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(machine_rates, "STREAMED", 1 << 18)
+    monkeypatch.setattr(machine_rates, "GATHERED", 1 << 12)
+    before = torch.get_rng_state()
+    rates = measure_rates(CPU, width=16, rows=1 << 10, seconds=0.05)
+    assert torch.equal(before, torch.get_rng_state())
+    for rate in rates:
+        assert 1e6 < rate < 1e14
+
+
+def test_the_same_again_is_about_as_fast(monkeypatch: pytest.MonkeyPatch) -> None:
+    first, second = (measure_rates(CPU, width=64, rows=1 << 12, seconds=0.3).products for _ in range(2))
+    assert 1 / 3 < first / second < 3
+
+
+def test_seconds_of_work_are_a_sum_of_shares() -> None:
+    rates = Rates(products=10.0, rows=4.0, bytes=2.0)
+    assert rates.seconds(Work()) == 0
+    assert rates.seconds(Work(products=20, rows=4, bytes=1)) == 2 + 1 + 0.5

@@ -1,0 +1,363 @@
+"""A budget on a machine whose clock and speed are made up: it converges, whatever the machine does and however often
+it is killed."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+from pydantic import BaseModel
+
+from pipeline.budget import LEAST_SECONDS, MOST_SECONDS, SHARES, Budget, allotted, least_total, training_seconds
+from pipeline.display import SilentDisplay
+from pipeline.runner import Runner
+from pipeline.workspace import Workspace
+from stages.contract import StageConfig, StageResult
+from stages.files import write_json
+
+CHAIN = ("ingest", "sfm", "normalise", "effects", "train", "evaluate", "render", "mesh", "report")
+NEEDS: dict[str, tuple[str, ...]] = {
+    "sfm": ("ingest",),
+    "normalise": ("sfm",),
+    "effects": ("normalise",),
+    "train": ("effects",),
+}
+NEEDS |= {"evaluate": ("train",), "render": ("train",), "mesh": ("train",)}
+NEEDS["report"] = ("train", "evaluate", "render", "mesh")
+OPEN = dict.fromkeys(SHARES)
+
+# --- the shares
+
+
+@pytest.mark.parametrize("left", [60.0, 300.0, 3000.0])
+def test_shares_use_up_what_is_left_and_no_more(left: float) -> None:
+    """If every stage takes just what it is given, nothing is left over but what the last ones have no use for."""
+    rest, taken = dict(OPEN), []
+    for stage in list(OPEN):
+        del rest[stage]
+        taken.append(allotted(stage, left - sum(taken), rest, left))
+    assert 0.9 * left < sum(taken) <= left * (1 + 1e-9)
+    assert taken[0] == max(taken)
+
+
+@given(
+    left=st.floats(-1e3, 1e5),
+    total=st.floats(1, 1e5),
+    stage=st.sampled_from(list(SHARES)),
+    report=st.floats(0, 100),
+)
+def test_never_less_than_the_least_nor_more_than_there_is(left: float, total: float, stage: str, report: float) -> None:
+    after = list(SHARES)[list(SHARES).index(stage) + 1 :]
+    seconds = allotted(stage, left, dict.fromkeys(after) | {"report": report}, total)
+    assert LEAST_SECONDS[stage] <= seconds <= max(LEAST_SECONDS[stage], left)
+    more = allotted(stage, left + 50, dict.fromkeys(after) | {"report": report}, total)
+    assert more >= seconds - 1e-9
+
+
+def test_what_later_stages_have_no_use_for_goes_to_training() -> None:
+    hours = allotted("train", 36000.0, {name: None for name in SHARES if name != "train"}, 36000.0)
+    assert hours == pytest.approx(36000 - sum(MOST_SECONDS.values()))
+
+
+def test_cached_stages_cost_nothing_but_a_video_does_not_grow_to_fill_an_hour() -> None:
+    assert allotted("render", 3600.0, {"mesh": None, "report": 2.0}, 3600.0) == pytest.approx(0.35 * 3600)
+
+
+def test_structure_from_motion_leaves_the_rest_its_least() -> None:
+    assert allotted("sfm", 600.0, OPEN, 600.0) == 300.0
+    assert allotted("sfm", 55.0, OPEN, 60.0) == pytest.approx(55 - sum(LEAST_SECONDS.values()))
+    assert allotted("sfm", 10.0, OPEN, 60.0) == 1.0
+
+
+def test_pilots_never_take_more_than_their_part() -> None:
+    assert allotted("effects", 500.0, OPEN, 600.0) == 90.0
+    assert allotted("effects", 80.0, OPEN, 600.0) == 20.0
+    assert allotted("effects", -5.0, OPEN, 600.0) == 0.0
+
+
+@pytest.mark.parametrize("wall", [5.0, 20.0, 300.0])
+def test_steps_are_given_less_than_the_stage(wall: float) -> None:
+    assert wall / 2 <= training_seconds(wall) < wall
+    assert training_seconds(wall) + 10 > 0.9 * wall
+
+
+def test_the_least_budget_is_what_has_to_be() -> None:
+    assert least_total({"sfm": 50.0, "train": None, "report": 2.0}) == 52 + LEAST_SECONDS["train"]
+
+
+# --- whole runs
+
+
+class Stage(StageConfig):
+    """A stage that works for as long as it is told, or as long as it must."""
+
+    photos: Path = Path()
+    cameras: Path | None = None
+    seconds: float | None = None
+    units: int | None = None
+    pace: float = 1.0
+
+
+class Fixed(StageConfig):
+    photos: Path = Path()
+    cameras: Path | None = None
+    budget: dict[str, Any] | None = None
+
+
+class Machine:
+    """A clock, and how many seconds a second of work takes from ``halves_at`` on and before."""
+
+    def __init__(self, slowness: float = 1.0) -> None:
+        self.now, self.slowness, self.halves_at, self.killed_at = 1000.0, slowness, float("inf"), list[float]()
+
+    def work(self, seconds: float, folder: Path | None = None) -> None:
+        """Let time pass, in quarters; a kill leaves no trace but the last file written."""
+        for _ in range(round(4 * seconds)):
+            self.now += 0.25 * self.slowness * (2 if self.now >= self.halves_at else 1)
+            if self.killed_at and self.now >= self.killed_at[0]:
+                self.killed_at.pop(0)
+                if folder is not None:
+                    self.touch(folder)
+                raise Killed
+
+    def touch(self, folder: Path) -> None:
+        (folder / "trace").write_text("x")
+        for path in (folder, folder / "trace"):
+            os.utime(path, (self.now, self.now))
+
+
+class Killed(BaseException):
+    """SIGKILL: nothing is noted down."""
+
+
+UNITS = {"evaluate": (1, 8, 1.5), "render": (6, 4000, 0.1), "mesh": (4, 400, 0.15)}
+"""Least and most, and seconds for each at full speed."""
+MUST = {"ingest": 1.5, "sfm": 40.0, "normalise": 0.3, "effects": 3.0, "report": 1.5}
+EXPECTED: dict[str, float | None] = dict.fromkeys(SHARES) | {
+    "ingest": 1.0, "sfm": 50.0, "normalise": 0.3, "effects": 10.0, "report": 2.0,
+}  # fmt: skip
+
+
+def chain(machine: Machine) -> dict[str, SimpleNamespace]:
+    """Nine stages like the real ones: some take what they take, training has a clock, the rest measure speed."""
+
+    def plan(name: str) -> Callable[..., Stage]:
+        def units(config: Stage, _inputs: object, _progress: object) -> Stage:
+            if name not in UNITS or config.units is not None:
+                return config
+            least, most, each = UNITS[name]
+            measured = machine.now
+            machine.work(0.5)
+            speed = 0.5 / (machine.now - measured)
+            assert config.seconds is not None
+            count = int(config.seconds * speed / each)
+            return config.model_copy(update={"units": max(least, min(most, count))})
+
+        return units
+
+    def run(name: str) -> Callable[..., StageResult]:
+        def work(config: Any, _inputs: object, folder: Path, _progress: object) -> StageResult:
+            if name == "train":
+                checkpoint = folder / "seconds"
+                done = float(checkpoint.read_text()) if checkpoint.exists() else 0.0
+                machine.work(3.0, folder)
+                while done < config.seconds:  # the clock decides, whatever the machine does
+                    before = machine.now
+                    machine.work(1.0, folder)
+                    done += machine.now - before
+                    checkpoint.write_text(str(done))
+            elif name in UNITS:
+                machine.work(config.units * UNITS[name][2], folder)
+            else:
+                machine.work(MUST[name], folder)
+            write_json(folder / "result.json", {"stage": name, "config": config.model_dump(mode="json")})
+            return StageResult(("result.json",), name)
+
+        return work
+
+    def stage(name: str) -> SimpleNamespace:
+        common = {"NEEDS": NEEDS.get(name, ()), "VERSION": 1, "RESUMES": name == "train", "LINKS": ()}
+        if name in ("ingest", "normalise", "report"):
+            return SimpleNamespace(Config=Fixed, run=run(name), **common)
+        unkeyed = () if name == "train" else ("seconds",)
+        return SimpleNamespace(Config=Stage, run=run(name), plan=plan(name), UNKEYED=unkeyed, **common)
+
+    return {name: stage(name) for name in CHAIN}
+
+
+class Options(BaseModel):
+    ingest: Fixed = Fixed()
+    sfm: Stage = Stage()
+    normalise: Fixed = Fixed()
+    effects: Stage = Stage()
+    train: Stage = Stage()
+    evaluate: Stage = Stage()
+    render: Stage = Stage()
+    mesh: Stage = Stage()
+    report: Fixed = Fixed()
+
+
+class Outcome(NamedTuple):
+    """Of one command: its account, whether anything ran, and the seconds until it ended."""
+
+    budget: Budget | None
+    ran: bool
+    took: float
+
+
+Go = Callable[..., Outcome]
+
+
+@pytest.fixture
+def go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Go:
+    """Run the chain on a machine under a budget; ``resume`` goes on without naming one."""
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    Image.new("RGB", (4, 4)).save(photos / "0.png")
+
+    def run(
+        machine: Machine, total: float | None, resume: bool = False, stages=CHAIN, replan=False, **options
+    ) -> Outcome:
+        clock = SimpleNamespace(monotonic=lambda: machine.now, time=lambda: machine.now)
+        monkeypatch.setattr("pipeline.runner.STAGES", chain(machine))
+        for module in ("runner", "budget", "attempts"):
+            monkeypatch.setattr(f"pipeline.{module}.time", clock)
+        monkeypatch.setattr("pipeline.runner._load_native_code", lambda: None)
+        settings = Options.model_validate({"ingest": {"photos": photos}} | options)
+        with Workspace(tmp_path / "w.nerf") as workspace:
+            runner = Runner(workspace, settings, SilentDisplay())  # type: ignore[arg-type]
+            if not resume:
+                runner.set_budget(total)
+            began = machine.now
+            ran = runner.run(stages, times=EXPECTED, replan=replan)
+        return Outcome(runner.budget, ran, machine.now - began)
+
+    return run
+
+
+def spent(runner: Outcome) -> dict[str, float]:
+    assert runner.budget is not None
+    return runner.budget.state["spent"]
+
+
+@pytest.mark.parametrize(
+    ("total", "slowness"), [(120, 0.5), (120, 1.0), (300, 0.8), (300, 1.5), (900, 0.5), (900, 1.5)]
+)
+def test_a_run_takes_its_budget_on_slow_and_fast_machines(go: Go, total: float, slowness: float) -> None:
+    machine = Machine(slowness)
+    runner = go(machine, total)
+    assert runner.took == pytest.approx(total, rel=0.1)
+    assert sum(spent(runner).values()) == pytest.approx(runner.took, abs=1)
+    assert spent(runner)["train"] > 0.3 * total or slowness == 1.5
+    assert runner.budget is not None
+    account = runner.budget.account()
+    assert set(account["promised"]) == set(account["spent"]) == set(CHAIN) - {"report"}
+
+
+@pytest.mark.parametrize("when", [20.0, 90.0, 200.0, 260.0])
+def test_a_machine_that_becomes_half_as_fast_midway_is_met(go: Go, when: float) -> None:
+    machine = Machine()
+    machine.halves_at = machine.now + when
+    assert go(machine, 300.0).took == pytest.approx(300, rel=0.2)
+
+
+def test_a_budget_too_small_for_the_cameras_makes_the_least_of_the_rest(go: Go) -> None:
+    runner = go(Machine(), 45.0)
+    assert runner.took < 45 + sum(LEAST_SECONDS.values()) + 5
+    assert spent(runner)["train"] < LEAST_SECONDS["train"] + 5
+
+
+def test_the_same_again_is_nothing_to_do_and_another_budget_loses_nothing(go: Go, tmp_path: Path) -> None:
+    machine = Machine()
+    go(machine, 120.0)
+    folders = {path for path in (tmp_path / "w.nerf").glob("*/*") if path.is_dir()}
+    again = go(machine, 120.0)
+    assert (again.ran, again.took) == (False, 0)
+    longer = go(machine, 300.0)
+    assert longer.ran and folders < {path for path in (tmp_path / "w.nerf").glob("*/*") if path.is_dir()}
+    assert spent(longer)["sfm"] < 1  # planned anew, and found finished
+    assert longer.took == pytest.approx(300, rel=0.1)  # what the cameras cost before goes to the training
+    back = go(machine, 120.0)
+    assert not back.ran or set(spent(back)) == {"report"}
+
+
+def test_without_a_budget_again_its_choices_are_forgotten_but_not_lost(go: Go) -> None:
+    given = {name: {"seconds": 5.0} for name in SHARES}
+    machine = Machine()
+    go(machine, 120.0)
+    plain = go(machine, None, **given)
+    assert plain.budget is None and plain.ran
+    assert not go(machine, None, **given).ran
+
+
+@pytest.mark.parametrize("kills", [[30.0], [100.0], [100.0, 170.0], [225.0], [255.0, 270.0]])
+def test_a_kill_and_a_resume_keep_the_total(go: Go, kills: list[float]) -> None:
+    machine = Machine()
+    machine.killed_at = [machine.now + when for when in kills]
+    worked = 0.0
+    for _ in kills:
+        began = machine.now
+        with pytest.raises(Killed):
+            go(machine, 300.0, resume=worked > 0)
+        worked += machine.now - began
+        later = 5000.0  # nobody counts the hours between
+        machine.now += later
+        machine.killed_at = [when + later for when in machine.killed_at]
+    runner = go(machine, 300.0, resume=True)
+    assert worked + runner.took == pytest.approx(300, rel=0.1)
+    assert sum(spent(runner).values()) == pytest.approx(worked + runner.took, abs=3)
+
+
+def test_other_options_are_another_run_with_its_whole_budget(go: Go) -> None:
+    machine = Machine()
+    machine.killed_at = [machine.now + 200]
+    with pytest.raises(Killed):
+        go(machine, 300.0)
+    other = go(machine, 300.0, train={"pace": 2.0})
+    assert other.took == pytest.approx(300, rel=0.1)
+
+
+def test_seconds_given_to_a_stage_win_and_the_rest_fits_around_it(go: Go) -> None:
+    machine = Machine()
+    runner = go(machine, 300.0, evaluate={"seconds": 4.0}, train={"seconds": 100.0})
+    assert spent(runner)["train"] == pytest.approx(104, abs=3)
+    assert spent(runner)["evaluate"] == pytest.approx(4, abs=2)
+    assert runner.took <= 310
+
+
+def test_one_stage_alone_has_a_share_and_not_the_whole(go: Go) -> None:
+    machine = Machine()
+    go(machine, 300.0)
+    runner = go(machine, None, resume=True, stages=("render", "report"), render={"pace": 2.0})
+    assert set(spent(runner)) == {"render", "report"}
+    assert 40 < spent(runner)["render"] < 0.4 * 300
+
+
+def test_until_train_leaves_nothing_for_what_is_not_asked_for(go: Go) -> None:
+    runner = go(Machine(), 200.0, stages=CHAIN[:5])
+    assert runner.took == pytest.approx(200, rel=0.05)
+
+
+def test_replan_shares_out_anew(go: Go) -> None:
+    machine = Machine()
+    first = go(machine, 200.0)
+    machine.slowness = 0.5
+    again = go(machine, 200.0, replan=True)
+    assert spent(again)["train"] > 1.1 * spent(first)["train"]  # the cameras are there already
+    assert again.took == pytest.approx(200, rel=0.1)
+
+
+def test_an_account_survives_its_journey_through_json() -> None:
+    budget = Budget(Budget.new(60.0, "of"))
+    budget.promise("sfm", 20.0)
+    budget.promise("sfm", 99.0)
+    budget.begin("sfm")
+    budget.end("sfm", 12.34)
+    budget.end("sfm", 1.0)
+    assert (budget.spent, budget.left) == (pytest.approx(13.3), pytest.approx(46.7))
+    assert budget.account() == {"seconds": 60.0, "promised": {"sfm": 20.0}, "spent": {"sfm": 13.3}}

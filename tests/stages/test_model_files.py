@@ -1,0 +1,121 @@
+"""COLMAP's files, whole and damaged. Where COLMAP itself reads them it hangs, aborts or fills the memory."""
+
+import shutil
+import struct
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+
+from stages.colmap.model_files import CAMERA_MODELS, read_model_files
+from stages.colmap.models import read_model, world_from_camera
+from stages.contract import StageError
+from tests.fuzz.loaders import colmap_models
+
+
+@pytest.fixture(params=["bin", "txt"])
+def model(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    """A folder with a valid model of three photos and three points."""
+    for name, content in colmap_models()[request.param].items():
+        (tmp_path / name).write_bytes(content)
+    return tmp_path
+
+
+def test_the_camera_models_are_those_of_this_colmap() -> None:
+    native = {int(id_): name for name, id_ in pycolmap.CameraModelId.__members__.items() if name != "INVALID"}
+    assert {number: name for number, (name, _) in CAMERA_MODELS.items()} == native
+    for number, (_, count) in CAMERA_MODELS.items():
+        camera = pycolmap.Camera.create_from_model_id(1, pycolmap.CameraModelId(number), 10.0, 10, 10)
+        assert len(camera.params) == count
+
+
+def test_it_reads_what_colmap_reads(model: Path) -> None:
+    ours, theirs = read_model(model), pycolmap.Reconstruction(model)
+    assert [image.file for image in ours.images] == [theirs.image(i).name for i in sorted(theirs.reg_image_ids())]
+    for index, image in enumerate(ours.images):
+        native = theirs.image(index + 1)
+        np.testing.assert_allclose(image.sfm_from_camera, native.cam_from_world().inverse().matrix(), atol=1e-15)
+        mine = ours.view == index
+        np.testing.assert_array_equal(ours.xy[mine], [point.xy for point in native.points2D])
+        assert (ours.point[mine] + 1).tolist() == [point.point3D_id for point in native.points2D]
+    np.testing.assert_array_equal(ours.xyz, [theirs.point3D(i).xyz for i in sorted(theirs.point3D_ids())])
+    assert ours.cameras[0].params == tuple(theirs.camera(1).params)
+
+
+@pytest.mark.parametrize("scale", [1e-300, 1e-9, 1.0, 1e9, 1e300])
+def test_quaternions_need_no_length(scale: float) -> None:
+    pose = np.array([0.1, -0.5, 0.7, 0.2, 1.0, 2.0, 3.0])
+    expected = pycolmap.Rigid3d(pycolmap.Rotation3d(pose[[1, 2, 3, 0]] / np.linalg.norm(pose[:4])), pose[4:])
+    pose[:4] *= scale
+    np.testing.assert_allclose(world_from_camera(pose), expected.inverse().matrix(), atol=1e-14)
+
+
+def overwritten(path: Path, place: int, form: str, value: float) -> None:
+    content = bytearray(path.read_bytes())
+    struct.pack_into(form, content, place, value)
+    path.write_bytes(content)
+
+
+@pytest.mark.parametrize("count", [2**64 - 1, 2**63, 2**40, 5])
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
+def test_a_count_that_is_too_large_ends_with_the_file(name: str, count: int, tmp_path: Path) -> None:
+    for file, content in colmap_models()["bin"].items():
+        (tmp_path / file).write_bytes(content)
+    overwritten(tmp_path / f"{name}.bin", 0, "<Q", count)
+    with pytest.raises(StageError, match=rf"{name}\.bin is damaged: .*bytes"):
+        read_model(tmp_path)
+
+
+def test_a_keypoint_count_that_is_too_large_ends_with_the_file(tmp_path: Path) -> None:
+    for file, content in colmap_models()["bin"].items():
+        (tmp_path / file).write_bytes(content)
+    overwritten(tmp_path / "images.bin", 8 + 64 + len("p0.png") + 1, "<Q", 2**61)
+    with pytest.raises(StageError, match=r"images\.bin is damaged: it announces 2305843009213693952 entries"):
+        read_model(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new", "why"),
+    [
+        ("cameras", "OPENCV", "OPENCVX", "there is no camera model 'OPENCVX'"),
+        ("cameras", " 24 20 ", " 0 20 ", "camera 1 has 0×20 pixels"),
+        ("cameras", " 24 20 ", " 99999999999 20 ", "camera 1 has 1e+11×20 pixels"),
+        ("cameras", " 12 10 ", " 12 ", "a OPENCV camera has 8 parameters, not 7"),
+        ("images", " 1 p0.png", " 7 p0.png", "image p0.png is of camera 7, which is not there"),
+    ],
+)
+def test_text_that_is_no_model(name: str, old: str, new: str, why: str, tmp_path: Path) -> None:
+    for file, content in colmap_models()["txt"].items():
+        (tmp_path / file).write_bytes(content)
+    text = (tmp_path / f"{name}.txt").read_text()
+    assert old in text
+    (tmp_path / f"{name}.txt").write_text(text.replace(old, new))
+    with pytest.raises(StageError) as caught:
+        read_model(tmp_path)
+    assert why in caught.value.why
+
+
+def test_points_that_are_not_there_and_poses_that_are_none(tmp_path: Path) -> None:
+    for file, content in colmap_models()["bin"].items():
+        (tmp_path / file).write_bytes(content)
+    whole = tmp_path / "whole"
+    whole.mkdir()
+    shutil.copy(tmp_path / "images.bin", whole)
+    overwritten(tmp_path / "images.bin", 8 + 64 + len("p0.png") + 1 + 8 + 16, "<q", 99)
+    with pytest.raises(StageError, match=r"image p0\.png sees point 99, which is not there"):
+        read_model(tmp_path)
+    for place, value in ((12, float("nan")), (44, float("inf"))):
+        shutil.copy(whole / "images.bin", tmp_path)
+        overwritten(tmp_path / "images.bin", place, "<d", value)
+        with pytest.raises(StageError, match=r"image p0\.png has no pose"):
+            read_model(tmp_path)
+
+
+def test_an_id_twice(tmp_path: Path) -> None:
+    for file, content in colmap_models()["txt"].items():
+        (tmp_path / file).write_bytes(content)
+    camera = (tmp_path / "cameras.txt").read_text()
+    (tmp_path / "cameras.txt").write_text(camera + camera)
+    with pytest.raises(ValueError, match=r"cameras\.txt is damaged: the id 1 is there twice"):
+        read_model_files(tmp_path)

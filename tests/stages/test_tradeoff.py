@@ -1,0 +1,187 @@
+import shutil
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from stages import tradeoff, tradeoff_arms, tradeoff_trial
+from stages.contract import StageError
+from stages.files import read_json, read_scene
+from stages.tradeoff import Config
+from stages.tradeoff_arms import VARIANTS, Arm, Variant
+from tests.stages.photo_scene import photographed
+
+TINY_GRID = {"levels": 2, "log2_rows": 10, "finest": 32, "batch_samples": 1024}
+TINY_PAPER = {"depth": 2, "width": 16, "samples_coarse": 8, "samples_fine": 8, "batch_rays": 64}
+SPEEDS: dict[str, Any] = dict.fromkeys(tradeoff_arms.TIMED, (120.0, 1e5)) | {"paper, published": (0.1, 10.0)}
+CONFIG: dict[str, Any] = {"seconds": 14.0, "seeds": 2, "downscale": 1.0, "sizes": (1.0,), "windows": 3}
+
+
+@pytest.fixture(autouse=True)
+def tiny_fields(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The variants as they are, in sizes that train in a blink; few of them, none left out for a busy machine."""
+    for name, (family, options, speed) in VARIANTS.items():
+        sizes: Mapping[str, Any] = TINY_GRID if family.startswith("grid") else TINY_PAPER
+        kept = {key: value for key, value in options.items() if key not in (*TINY_GRID, "preset")}
+        monkeypatch.setitem(VARIANTS, name, Variant(family, kept | sizes, speed))
+    monkeypatch.setattr(tradeoff_arms, "OVERHEAD", 1.0)
+    monkeypatch.setattr(tradeoff_arms, "SPENT_ELSEWHERE", 0.6)
+    monkeypatch.setattr(tradeoff, "LATE", 1e3)
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    return photographed(tmp_path_factory.mktemp("photos"), channels=4)[0]
+
+
+def studied(folder: Path, photos: dict[str, Path], progress: Any, **settings: Any):
+    folder.mkdir(exist_ok=True)
+    return tradeoff.run(Config.model_validate(CONFIG | {"speeds": SPEEDS} | settings), photos, folder, progress)
+
+
+class Killed(BaseException):
+    """Stands for kill -9."""
+
+
+def test_a_study_from_arms_to_recommendation_and_the_same_after_a_kill(
+    tmp_path: Path, photos: dict[str, Path], progress: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    result = studied(tmp_path / "whole", photos, progress)
+    files = {*result.outputs, *result.records}
+    assert {"quality.json", "ablation.png", "tradeoff.json", "tradeoff.md", "tradeoff.svg", "tradeoff.png"} == files
+    assert all((tmp_path / "whole" / name).stat().st_size > 0 for name in files)
+    study = read_json(tmp_path / "whole" / "tradeoff.json")
+    assert {row["variant"] for row in study["points"]} >= {"grid", "paper, reduced", "no positional encoding"}
+    assert any(row["seeds"] == 2 and row["deviation"] > 0 for row in study["points"])
+    for row in study["points"]:
+        assert 5 < row["psnr"] < 60 and row["train_seconds"] > 0 and row["frame_seconds"] > 0
+        assert 0.001 < row["model_mb"] < 10 and 50 < row["peak_memory_mb"] < 100_000
+    assert "paper, published at full resolution: 1 steps (fewer than 30)" in study["left_out"]
+    assert study["points"][study["recommended"] - 1]["front"]
+    assert study["recommendation"] in (tmp_path / "whole" / "tradeoff.md").read_text()
+    assert result.line.endswith(study["recommendation"])
+
+    count, begun = len(study["arms"]), []
+    whole = tradeoff_trial._score
+
+    def killed_at_the_fourth(arm: Arm, *rest: Any) -> dict[str, Any]:
+        begun.append(arm.name)
+        if len(begun) == 4:
+            raise Killed
+        return whole(arm, *rest)
+
+    monkeypatch.setattr(tradeoff_trial, "_score", killed_at_the_fourth)
+    with pytest.raises(Killed):
+        studied(tmp_path / "killed", photos, progress)
+    studied(tmp_path / "killed", photos, progress)
+    assert len(begun) == count + 1, "each arm once, and the killed one again"
+    assert begun[3] == begun[4] and len(set(begun)) == count
+    for name in ("quality.json", "ablation.png"):
+        assert (tmp_path / "killed" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+
+
+def test_what_is_planned_is_what_is_run(tmp_path: Path, photos: dict[str, Path], progress: Any) -> None:
+    planned = tradeoff.plan(Config(seconds=60.0), photos, progress)
+    assert planned.speeds and set(planned.speeds) == set(tradeoff_arms.TIMED)
+    assert all(steps > 0 and rays > steps for steps, rays in planned.speeds.values())
+    assert planned.sizes == (1.0,) and planned.downscale == 1.0
+    assert planned.windows and 6 <= planned.windows <= 32
+    assert Config.model_validate(planned.model_dump(mode="json")) == planned
+    words = tradeoff.plan_words(tradeoff.selection_of(planned), planned.seconds)
+    shares = [int(line.rsplit(", ", 1)[1].split("%")[0]) for line in words if line.endswith("of the time")]
+    assert 97 <= sum(shares) <= 103
+
+
+def test_a_slow_machine_leaves_arms_out_and_names_them(
+    tmp_path: Path, photos: dict[str, Path], progress: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def slow(arm: Arm, *rest: Any) -> dict[str, Any]:
+        write = tmp_path / "arms" / f"{arm.name}.png"
+        write.parent.mkdir(exist_ok=True)
+        tradeoff_trial.write_strip(write, [torch.zeros(8, 8, 3)])
+        figures = {"failed": None, "restarts": 0, "psnr": 20.0, "ssim": 0.5, "train_seconds": 1.0}
+        figures |= {"frame_seconds": 1.0, "peak_memory_mb": 100, "model_mb": 1.0}
+        return figures | {"wall_seconds": 3 * arm.seconds}
+
+    monkeypatch.setattr(tradeoff_trial, "run_arm", slow)
+    monkeypatch.setattr(tradeoff, "LATE", 0.1)
+    monkeypatch.setattr(tradeoff_arms, "SPENT_ELSEWHERE", 0.0)
+    studied(tmp_path, photos, progress)
+    study = read_json(tmp_path / "tradeoff.json")
+    spent = sum(arm["wall_seconds"] for arm in study["arms"])
+    assert 0.5 * CONFIG["seconds"] < spent <= 1.1 * CONFIG["seconds"]
+    assert len(study["left_out"]) > len(
+        tradeoff.selection_of(Config.model_validate(CONFIG | {"speeds": SPEEDS})).left_out
+    )
+    assert any("slower than when it was measured" in note for note in progress.notes)
+
+
+def test_an_arm_that_does_not_learn_is_said_and_the_study_goes_on(
+    tmp_path: Path, photos: dict[str, Path], progress: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from stages import train
+
+    whole = train.run
+
+    def diverges(config: train.Config, *rest: Any) -> Any:
+        if not config.positional_encoding:
+            raise StageError("training diverged", "it was told to", "Do not tell it to.")
+        return whole(config, *rest)
+
+    monkeypatch.setattr(train, "run", diverges)
+    studied(tmp_path, photos, progress, seeds=1)
+    study = read_json(tmp_path / "tradeoff.json")
+    assert "no positional encoding" not in {row["variant"] for row in study["points"]}
+    assert [a["failed"] for a in study["arms"] if a["failed"]] == ["training diverged: it was told to"]
+    assert any("no result (training diverged: it was told to)" in note for note in progress.notes)
+
+
+def test_without_held_out_photos_there_is_no_study(tmp_path: Path, photos: dict[str, Path], progress: Any) -> None:
+    inputs = {name: tmp_path / name for name in photos}
+    for name, folder in photos.items():
+        shutil.copytree(folder, inputs[name])
+    scene = (inputs["normalise"] / "scene.json").read_text()
+    (inputs["normalise"] / "scene.json").write_text(scene.replace('"test"', '"train"'))
+    with pytest.raises(StageError, match="no photo of this scene was kept for testing"):
+        tradeoff.plan(Config(), inputs, progress)
+
+
+def test_too_little_time_is_said_with_numbers(tmp_path: Path, photos: dict[str, Path], progress: Any) -> None:
+    with pytest.raises(StageError, match=r"2 s are too short here even for grid at full resolution: 15, 9, 5, 3"):
+        studied(tmp_path, photos, progress, seconds=2.0)
+
+
+def test_windows_are_parts_of_the_photos(photos: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    from stages.training_data import view_pixels, view_rays
+
+    monkeypatch.setattr(tradeoff_trial, "WINDOW", 8)
+    scene = read_scene(photos["normalise"])
+    exam = tradeoff_trial.make_exam(photos["ingest"], scene, 1.0, 5)
+    assert exam.frame == 24 * 16 and len(exam.windows) == 5 and len(exam.shown) == 3
+    assert len({window.photo for window in exam.windows}) == 2
+    for window in exam.windows:
+        view = next(v for v in scene.views if v.name == window.photo)
+        truth, rays = view_pixels(photos["ingest"], scene, view, 1.0), view_rays(scene, view, 1.0)
+        places = [
+            (y, x)
+            for y in range(9)
+            for x in range(17)
+            if torch.equal(rays.directions[y : y + 8, x : x + 8], window.rays.directions)
+        ]
+        assert len(places) == 1
+        y, x = places[0]
+        assert torch.equal(truth[y : y + 8, x : x + 8], window.truth)
+
+
+def test_memory_is_looked_at_while_the_block_runs() -> None:
+    with tradeoff_trial.peak_memory() as before:
+        pass
+    with tradeoff_trial.peak_memory() as peak:
+        block = torch.ones(100_000_000, dtype=torch.uint8)
+        time.sleep(0.2)
+        del block
+    if not torch.cuda.is_available():
+        assert 50e6 < peak() - before() < 400e6
