@@ -1,7 +1,7 @@
 """Where the time of a step goes: seconds of the cores by part, beside the work that each part cannot do without.
 
-Code names its parts where it does them, ``with part("gather", Work(rows=...)):``. While no stopwatch runs that costs a
-tenth of a microsecond, and nothing else happens; with one running, the same work is done in the same order.
+Code names its parts where it does them, ``with part("gather", Work(rows=...)):``. While no stopwatch runs that costs less
+than a microsecond, and nothing else happens; with one running, the same work is done in the same order.
 """
 
 import threading

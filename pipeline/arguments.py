@@ -45,6 +45,8 @@ class Common:
     """Show the traceback of an error."""
     replan: bool = False
     """Forget the settings chosen automatically before and choose them again."""
+    verify: bool = False
+    """Read every file of finished results and compare it with its sha256; what is damaged is made again."""
 
 
 @dataclass
@@ -107,6 +109,8 @@ class StatusArguments:
     workspace: tyro.conf.Positional[Path]
     json: bool = False
     """One JSON object instead of text."""
+    verify: bool = False
+    """Read every file of finished results and compare it with its sha256; exit code 1 if one is damaged."""
 
 
 @dataclass

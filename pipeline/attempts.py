@@ -1,6 +1,7 @@
 """How long earlier attempts at a stage took, so that a stage's time is that of all its attempts.
 
-A killed program cannot say when it died; the last file that it wrote tells.
+A killed program cannot say when it died; the last file that it wrote tells. The machine's own running time, which no
+one sets, keeps a clock that was put forward from counting as work.
 """
 
 import json
@@ -14,15 +15,16 @@ NAME = "attempts.json"
 
 def begin(partial: Path, spent: float) -> None:
     """Note that an attempt begins now in ``partial``, after others that took ``spent`` seconds."""
-    write_durably(partial / NAME, json.dumps({"spent": spent, "began": time.time()}).encode())
+    write_durably(partial / NAME, json.dumps({"spent": spent, "began": time.time(), "up": time.monotonic()}).encode())
 
 
 def spent(partial: Path) -> float:
     """Seconds that all attempts in ``partial`` took until their last sign of life; 0 where there was none."""
     try:
         value = json.loads((partial / NAME).read_bytes())
-        before, began = float(value["spent"]), float(value["began"])
+        before, began, up = float(value["spent"]), float(value["began"]), float(value["up"])
     except (OSError, ValueError, KeyError, TypeError):
         return 0.0
     last = max(path.stat().st_mtime for path in partial.rglob("*"))
-    return before + max(0.0, last - began)
+    passed = time.monotonic() - up  # negative after a restart of the machine, and else more than the attempt took
+    return before + max(0.0, min(last - began, passed) if passed >= 0 else last - began)

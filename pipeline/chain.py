@@ -1,5 +1,6 @@
 """The stages in the order they run, and how they depend on each other."""
 
+from collections.abc import Mapping
 from types import ModuleType
 
 from stages import effects, evaluate, ingest, mesh, normalise, render, report, sfm, tradeoff, train
@@ -34,15 +35,15 @@ ON_REQUEST = ("tradeoff",)
 """Stages that take long and that nothing needs: they run where they are named."""
 
 
-def needed_for(stage: str) -> list[str]:
+def needed_for(stage: str, stages: Mapping[str, ModuleType] = STAGES) -> list[str]:
     """``stage`` and everything it depends on, in order; the report is written from whatever is there."""
     if stage == "report":
         return [stage]
     wanted = {stage}
-    for name in reversed(STAGES):
+    for name in reversed(list(stages)):
         if name in wanted:
-            wanted.update(STAGES[name].NEEDS)
-    return [name for name in STAGES if name in wanted]
+            wanted.update(stages[name].NEEDS)
+    return [name for name in stages if name in wanted]
 
 
 def up_to(stage: str) -> list[str]:

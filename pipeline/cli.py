@@ -19,8 +19,9 @@ from pipeline import arguments as words_of
 from pipeline import chain, forecast, machine, status
 from pipeline.display import Display, SilentDisplay, choose_display
 from pipeline.durations import seconds_from
+from pipeline.failures import StageFailed
 from pipeline.more import with_more
-from pipeline.runner import Runner, StageFailed
+from pipeline.runner import Runner
 from pipeline.settings import (
     Settings,
     UsageError,
@@ -190,7 +191,8 @@ def _run_stages(
         times = forecast.times(settings)
         display.headline(" · ".join([machine.headline(root), *forecast.promise(runner, stages, force, times)]))
         try:
-            ran = runner.run(stages, force=force, replan=common.replan, remember=remember, times=times)
+            given = {"force": force, "replan": common.replan, "remember": remember, "verify": common.verify}
+            ran = runner.run(stages, times=times, **given)
         except StageFailed as failure:
             display.failed(failure.stage, failure.error)
             raise
@@ -267,13 +269,14 @@ def _reader(root: Path) -> tuple[Workspace, Runner]:
 def command_status(words: Sequence[str]) -> int:
     """``pipeline status WORKSPACE``."""
     given = words_of.parse(words_of.StatusArguments, "status", words)
-    statuses = status.all_statuses(*_reader(given.workspace))
+    statuses = status.all_statuses(*_reader(given.workspace), given.verify)
+    code = EXIT_DEFECT if given.verify and any(s.state == "damaged" for s in statuses) else 0
     if given.json:
         print(json.dumps([asdict(s) for s in statuses], ensure_ascii=False))
-        return 0
+        return code
     for s in statuses:
         print(f"{s.stage:<10} {s.state:<8} {s.text}".rstrip())
-    return 0
+    return code
 
 
 def command_explain(words: Sequence[str]) -> int:

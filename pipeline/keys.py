@@ -37,9 +37,11 @@ def file_sha256(path: Path) -> str:
 
 
 class ContentIndex:
-    """Remembers the sha256 of files by (path, size, mtime), so that an unchanged photo is hashed once.
+    """Remembers the sha256 of files by path, size and times, so that an unchanged photo is hashed once.
 
-    The index is a cache: it lives outside all digests and losing it costs only time.
+    Of the times one is that of the last change of the file or of its name, which no program can set (on Windows that
+    of its creation): content that was exchanged under its old size and date is noticed. The index is a cache: it lives
+    outside all digests and losing it costs only time.
     """
 
     def __init__(self, path: Path) -> None:
@@ -48,19 +50,23 @@ class ContentIndex:
         self.changed = False
         if path.is_file():
             try:
-                self.known = json.loads(path.read_text("utf-8"))
-            except ValueError:
+                known = json.loads(path.read_text("utf-8"))
+                if digest(known["files"]) != known["sha256"]:
+                    raise ValueError("it has changed since it was written")
+                self.known = known["files"]
+            except (ValueError, KeyError, TypeError):
                 self.changed = True  # a damaged cache is rebuilt, it cannot cause a wrong answer
 
     def sha256(self, path: Path) -> str:
         """sha256 of one file, from memory where size and mtime still agree."""
         stat = path.stat()
         name = str(path.resolve())
+        identity = [stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns]
         known = self.known.get(name)
-        if known and known[:2] == [stat.st_size, stat.st_mtime_ns]:
-            return known[2]
+        if known and known[:-1] == identity:
+            return known[-1]
         value = file_sha256(path)
-        self.known[name] = [stat.st_size, stat.st_mtime_ns, value]
+        self.known[name] = [*identity, value]
         self.changed = True
         return value
 
@@ -81,7 +87,7 @@ class ContentIndex:
         """Write the index if anything in it changed."""
         if self.changed:
             temporary = self.path.with_suffix(".tmp")
-            temporary.write_text(json.dumps(self.known), "utf-8")
+            temporary.write_text(json.dumps({"files": self.known, "sha256": digest(self.known)}), "utf-8")
             temporary.replace(self.path)
             self.changed = False
 

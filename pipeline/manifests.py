@@ -1,6 +1,7 @@
 """What a finished stage folder says of itself: ``manifest.json``.
 
-``outputs`` are digested and decide what runs downstream; ``records`` (curves, logs, timings) are only listed.
+``outputs`` are digested and decide what runs downstream; ``records`` (curves, logs, timings) are checked, but decide
+nothing. The file ends with the sha256 of all that it says: a flipped bit is found even in a figure.
 """
 
 import json
@@ -15,6 +16,7 @@ from pipeline.keys import digest, file_sha256
 from stages.files import first_fault, write_durably
 
 NAME = "manifest.json"
+SEAL = "sha256"
 
 
 class BadManifest(Exception):
@@ -23,7 +25,7 @@ class BadManifest(Exception):
 
 @dataclass(frozen=True)
 class Manifest:
-    """One finished stage. ``outputs`` maps relative paths to {"size", "sha256"}."""
+    """One finished stage. ``outputs`` and ``records`` map relative paths to {"size", "sha256"}."""
 
     stage: str
     version: int
@@ -32,7 +34,7 @@ class Manifest:
     inputs: dict[str, str]
     outputs: dict[str, dict[str, Any]]
     outputs_digest: str
-    records: list[str]
+    records: dict[str, dict[str, Any]]
     facts: dict[str, Any]
     line: str
     seconds: float
@@ -55,7 +57,7 @@ def files_below(folder: Path, names: tuple[str, ...]) -> list[str]:
 
 
 def describe_outputs(folder: Path, names: tuple[str, ...]) -> dict[str, dict[str, Any]]:
-    """Size and sha256 of every declared output."""
+    """Size and sha256 of every file that ``names`` stand for."""
     return {
         name: {"size": (folder / name).stat().st_size, "sha256": file_sha256(folder / name)}
         for name in files_below(folder, names)
@@ -69,28 +71,47 @@ def outputs_digest(outputs: Mapping[str, dict[str, Any]]) -> str:
 
 def write(folder: Path, manifest: Manifest) -> None:
     """Write ``manifest`` durably into ``folder``."""
-    text = json.dumps(asdict(manifest), indent=1, sort_keys=True, allow_nan=False, ensure_ascii=False)
+    text = json.dumps(sealed(asdict(manifest)), indent=1, sort_keys=True, allow_nan=False, ensure_ascii=False)
     write_durably(folder / NAME, (text + "\n").encode())
 
 
 def read(folder: Path) -> Manifest:
     """The manifest of ``folder``. Raises FileNotFoundError, or BadManifest with the reason."""
     try:
-        manifest = TypeAdapter(Manifest).validate_json((folder / NAME).read_bytes(), strict=True)
+        value = unsealed(json.loads((folder / NAME).read_text("utf-8")))
+        manifest = TypeAdapter(Manifest).validate_python(value, strict=True)
     except FileNotFoundError:
         raise
     except ValidationError as error:
-        raise BadManifest(f"{folder / NAME} does not parse ({first_fault(error)})") from error
-    if not all(set(entry) == {"size", "sha256"} for entry in manifest.outputs.values()):
-        raise BadManifest(f"{folder / NAME} lists outputs without their size and sha256")
+        raise BadManifest(f"{folder / NAME} cannot be used ({first_fault(error)})") from error
+    except (ValueError, TypeError, RecursionError) as error:
+        raise BadManifest(f"{folder / NAME} cannot be used ({error})") from error
+    if not all(set(entry) == {"size", "sha256"} for entry in (*manifest.outputs.values(), *manifest.records.values())):
+        raise BadManifest(f"{folder / NAME} lists files without their size and sha256")
     if manifest.outputs_digest != outputs_digest(manifest.outputs):
         raise BadManifest(f"{folder / NAME} contradicts itself: its digest is not that of its outputs")
     return manifest
 
 
+def sealed(value: dict[str, Any]) -> dict[str, Any]:
+    """``value`` with the sha256 of itself, as it will be read back."""
+    plain = json.loads(json.dumps(value, allow_nan=False))
+    return {**plain, SEAL: digest(plain)}
+
+
+def unsealed(value: dict[str, Any]) -> dict[str, Any]:
+    """What :func:`sealed` was given. Raises ValueError where it has changed since."""
+    if not isinstance(value, dict) or SEAL not in value:
+        raise ValueError("it has no seal")
+    plain = {name: entry for name, entry in value.items() if name != SEAL}
+    if digest(plain) != value[SEAL]:
+        raise ValueError("it has changed since it was written")
+    return plain
+
+
 def check_outputs(folder: Path, manifest: Manifest, deep: bool = False) -> None:
-    """Raise BadManifest unless every output is there with its size (``deep``: with its sha256)."""
-    for name, entry in manifest.outputs.items():
+    """Raise BadManifest unless every output and record is there with its size (``deep``: with its sha256)."""
+    for name, entry in {**manifest.outputs, **manifest.records}.items():
         path = folder / name
         if not path.resolve().is_relative_to(folder.resolve()):
             raise BadManifest(f"{path} leads out of its folder")

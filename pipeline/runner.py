@@ -11,8 +11,9 @@ from typing import Any
 
 from pipeline import attempts, machine, manifests
 from pipeline.budget import Budget, allotted, least_total, training_seconds
-from pipeline.chain import STAGES
+from pipeline.chain import STAGES, needed_for
 from pipeline.display import Display
+from pipeline.failures import worded
 from pipeline.keys import ContentIndex, config_for_key, digest, stage_key
 from pipeline.manifests import BadManifest, Manifest
 from pipeline.settings import Settings
@@ -21,12 +22,8 @@ from stages.contract import StageConfig, StageError
 from stages.live_line import duration
 
 
-class StageFailed(Exception):
-    """A stage ended with a StageError; carries both so that the caller can word it and choose the exit code."""
-
-    def __init__(self, stage: str, error: StageError) -> None:
-        super().__init__(f"{stage}: {error}")
-        self.stage, self.error = stage, error
+class DamagedInputs(Exception):
+    """A stage was about to read files that are not what was written; they have been set aside."""
 
 
 class NotReady(Exception):
@@ -66,6 +63,9 @@ class Runner:
         self.stages: list[str] = []
         self.times: Mapping[str, float | None] = {}
         self.works_on: str | None = None
+        self.checked: set[str] = set()  # stages whose files were written or read anew by this program
+        self.at_work = ""
+        self.verify = False
 
     @property
     def budget(self) -> Budget | None:
@@ -106,14 +106,16 @@ class Runner:
         replan: bool = False,
         remember: bool = True,
         times: Mapping[str, float | None] | None = None,
+        verify: bool = False,
     ) -> bool:
         """Bring ``stages`` (in chain order) up to date; True if anything ran. Raises StageFailed.
 
         ``force`` names stages that run again even where a finished result exists; ``replan`` forgets what was
         chosen for the user before; ``remember`` makes ``stages`` what `pipeline resume` repeats; ``times`` are the
-        seconds that stages are expected to take (pipeline/forecast.py), for a budget.
+        seconds that stages are expected to take (pipeline/forecast.py), for a budget; ``verify`` reads every file of a
+        finished result before it counts as finished.
         """
-        self.force, self.stages, self.times = force, list(stages), times or {}
+        self.verify, self.force, self.stages, self.times = verify, force, list(stages), times or {}
         if self.budget:
             self.budget.recover(self.workspace.root)
         continues = self.budget is not None and not self.budget.over
@@ -124,8 +126,13 @@ class Runner:
         self.workspace.write_run(self.state)
         try:
             ran = [self._bring_up_to_date(stage) for stage in stages]
-        finally:
+        except Exception:
             self._unlink_outdated()
+            raise
+        except BaseException:  # a signal: whoever sent it does not wait for photos to be read
+            self._unlink_after(self.at_work)
+            raise
+        self._unlink_outdated()
         # One stage of an interrupted run does not end it.
         if self.budget and (remember or not continues):
             self.budget.close()
@@ -142,39 +149,69 @@ class Runner:
             if not current:
                 self.workspace.unlink_outputs(module.LINKS)
 
+    def _unlink_after(self, stage: str) -> None:
+        """Take out of ``output/`` what rests on ``stage``, which was at work; nothing where none was."""
+        for later, module in STAGES.items():
+            if stage and (later == "report" or stage in needed_for(later, STAGES)):
+                self.workspace.unlink_outputs(module.LINKS)
+
     def _bring_up_to_date(self, stage: str) -> bool:
         started = time.monotonic()
         self.display.begin(stage)
         try:
-            job = self.resolve(stage)
-            self.state["keys"][stage] = job.key
-            manifest = None if stage in self.force else self.find_finished(job)
-            if manifest is None:
-                self.workspace.unlink_outputs(job.module.LINKS)
-            ran = manifest is None
-            if manifest is None:
-                manifest = self._execute(job)
-            self.workspace.link_outputs(self.workspace.folder(stage, job.key), job.module.LINKS)
-            self.workspace.write_run(self.state)
-            self.index.save()
-        except StageError as error:
-            raise StageFailed(stage, error) from error
-        except OSError as error:
-            raise StageFailed(stage, _disk_error(error)) from error
-        except (MemoryError, RuntimeError) as error:
-            if not _is_out_of_memory(error):
-                raise
-            hint = "Close other programs, or lower the resolution or batch settings of this stage."
-            why = str(error).splitlines()[0] if str(error) else f"{stage} asked for more than there is"
-            raise StageFailed(stage, StageError("out of memory", why, hint)) from error
-        finally:
-            if self.budget and self.works_on == stage:
-                self.budget.end(stage, time.monotonic() - started)
-                self.works_on = None
+            with worded(stage):
+                job, manifest, ran = self._found_or_made(stage)
+                self.workspace.link_outputs(self.workspace.folder(stage, job.key), job.module.LINKS)
                 self.workspace.write_run(self.state)
+                self.index.save()
+        finally:
+            self._end_work(stage, time.monotonic() - started)
         self.done[stage] = manifest
         self.display.end(stage, manifest.line, time.monotonic() - started, cached=not ran)
         return ran
+
+    def _found_or_made(self, stage: str) -> tuple[Job, Manifest, bool]:
+        """The stage's job and result, and whether it had to run for it."""
+        try:
+            job = self.resolve(stage)
+            self.state["keys"][stage] = job.key
+            manifest = None if stage in self.force else self.find_finished(job)
+            if manifest is not None:
+                return job, manifest, False
+            self._check_inputs(job.folders)
+        except DamagedInputs:
+            self._make_inputs_again(stage)
+            return self._found_or_made(stage)
+        self.workspace.unlink_outputs(job.module.LINKS)
+        return job, self._execute(job), True
+
+    def _check_inputs(self, folders: Mapping[str, Path]) -> None:
+        """Compare all that a stage is about to read with its sha256. Raises DamagedInputs after setting the bad aside.
+
+        Once per program and stage: what this program wrote itself was hashed when it was written.
+        """
+        damaged = False
+        for name in folders:
+            if name in self.checked:
+                continue
+            self.display.update(f"checking the files of {name}")
+            try:
+                self.workspace.finished(name, self.done[name].key, deep=True)
+                self.checked.add(name)
+            except BadManifest as problem:
+                self.display.note(f"set aside as .bad and made again: {problem}")
+                damaged = True
+        if damaged:
+            raise DamagedInputs
+
+    def _make_inputs_again(self, stage: str) -> None:
+        """Bring everything below ``stage`` up to date once more; what lies above the damage may change with it."""
+        needed = {name for above in STAGES[stage].NEEDS if above in self.done for name in needed_for(above, STAGES)}
+        self.done.clear()
+        for name in STAGES:
+            if name in needed:
+                self._bring_up_to_date(name)
+        self.display.begin(stage)
 
     def resolve(self, stage: str, *, may_plan: bool = True) -> Job:
         """Everything that decides ``stage``'s key.
@@ -221,6 +258,7 @@ class Runner:
             return module.Config.model_validate(plans[asked] | options.model_dump(include=paths))
         if not may_plan:
             raise NotReady(stage)
+        self._check_inputs(folders)
         self._begin_work(stage)
         config = module.plan(self._with_time(stage, options), folders, self.display)
         plans[asked] = config.model_dump(mode="json")
@@ -244,6 +282,13 @@ class Runner:
         if (seconds := self.times.get(stage)) is not None:
             self.budget.promise(stage, seconds)
         self.workspace.write_run(self.state)
+
+    def _end_work(self, stage: str, seconds: float) -> None:
+        """Note what ``stage`` cost, where it did."""
+        if self.budget and self.works_on == stage:
+            self.budget.end(stage, seconds)
+            self.works_on = None
+            self.workspace.write_run(self.state)
 
     def _with_time(self, stage: str, options: StageConfig) -> StageConfig:
         """``options`` with the seconds that the budget leaves for the stage, where it has one and they are open."""
@@ -279,7 +324,10 @@ class Runner:
     def find_finished(self, job: Job) -> Manifest | None:
         """The finished result for this job, if there is one; a damaged one is set aside and said aloud."""
         try:
-            return self.workspace.finished(job.stage, job.key)
+            manifest = self.workspace.finished(job.stage, job.key, deep=self.verify)
+            if manifest is not None and self.verify:
+                self.checked.add(job.stage)
+            return manifest
         except BadManifest as problem:
             self.display.note(f"set aside as .bad and made again: {problem}")
             return None
@@ -297,6 +345,7 @@ class Runner:
         self.workspace.write_run(self.state)
         _load_native_code()
         started, clock = datetime.now(UTC), time.monotonic()
+        self.at_work = job.stage
         result = job.module.run(job.config, job.folders, partial, self.display)
         outputs = manifests.describe_outputs(partial, result.outputs)
         manifest = Manifest(
@@ -307,7 +356,7 @@ class Runner:
             inputs=job.inputs,
             outputs=outputs,
             outputs_digest=manifests.outputs_digest(outputs),
-            records=manifests.files_below(partial, result.records),
+            records=manifests.describe_outputs(partial, result.records),
             facts=result.facts,
             line=result.line,
             seconds=round(spent + time.monotonic() - clock, 3),
@@ -315,6 +364,9 @@ class Runner:
             machine=machine.facts(),
         )
         self.workspace.finish(partial, folder, manifest)
+        self.checked.add(job.stage)
+        self.force -= {job.stage}
+        self.at_work = ""
         return manifest
 
 
@@ -329,17 +381,3 @@ def _load_native_code() -> None:
     from stages.colmap import load
 
     load()
-
-
-def _is_out_of_memory(error: Exception) -> bool:
-    """torch says it with a RuntimeError, on the CPU and on GPUs in different words."""
-    return isinstance(error, MemoryError) or any(
-        words in str(error) for words in ("not enough memory", "out of memory", "can't allocate memory")
-    )
-
-
-def _disk_error(error: OSError) -> StageError:
-    """An OSError in words; finished stages are never touched by it."""
-    what = f"cannot read or write {error.filename}" if error.filename else "a file could not be read or written"
-    hint = "Free disk space or check permissions, then run again: finished stages are kept."
-    return StageError(what, error.strerror or str(error), hint)

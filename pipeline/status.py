@@ -14,7 +14,7 @@ from stages.contract import StageError
 
 @dataclass(frozen=True)
 class StageStatus:
-    """``state``: cached / stale / partial / never; ``text``: its summary or the reason."""
+    """``state``: cached / stale / damaged / partial / never; ``text``: its summary or the reason."""
 
     stage: str
     state: str
@@ -36,8 +36,8 @@ def last_result(workspace: Workspace, runner: Runner, stage: str) -> Manifest | 
     return None
 
 
-def status_of(workspace: Workspace, runner: Runner, stage: str) -> StageStatus:
-    """How ``stage`` stands for the recorded options."""
+def status_of(workspace: Workspace, runner: Runner, stage: str, deep: bool = False) -> StageStatus:
+    """How ``stage`` stands for the recorded options; ``deep``: its files are read and compared with their sha256."""
     last = last_result(workspace, runner, stage)
     try:
         job = runner.resolve(stage, may_plan=False)
@@ -49,12 +49,12 @@ def status_of(workspace: Workspace, runner: Runner, stage: str) -> StageStatus:
     folder = workspace.folder(stage, job.key)
     try:
         manifest = manifests.read(folder)
-        manifests.check_outputs(folder, manifest)
+        manifests.check_outputs(folder, manifest, deep)
         return StageStatus(stage, "cached", manifest.line)
     except FileNotFoundError:
         pass
     except BadManifest as problem:
-        return StageStatus(stage, "stale", str(problem))
+        return StageStatus(stage, "damaged", f"{problem}; `pipeline resume --verify` makes it again")
     if workspace.partial(stage, job.key).exists():
         command = stage if stage in ON_REQUEST else "resume"
         return StageStatus(stage, "partial", f"interrupted; `pipeline {command}` takes it up again")
@@ -102,6 +102,6 @@ def explain(workspace: Workspace, runner: Runner, stage: str) -> list[str]:
     return lines
 
 
-def all_statuses(workspace: Workspace, runner: Runner) -> list[StageStatus]:
+def all_statuses(workspace: Workspace, runner: Runner, deep: bool = False) -> list[StageStatus]:
     """Every stage of the chain, in order."""
-    return [status_of(workspace, runner, stage) for stage in STAGES]
+    return [status_of(workspace, runner, stage, deep) for stage in STAGES]

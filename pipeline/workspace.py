@@ -55,20 +55,24 @@ class Workspace:
             self.root.mkdir(parents=True, exist_ok=True)
             _refuse_links(self.root)
             self._lock.acquire(timeout=0)
+            (self.root / ".lock.pid").write_text(f"{os.getpid()}\n")
         except Timeout:
             why = f"process {self._holder()} holds its lock"
             raise StageError(
                 f"{self.root} is in use", why, "Wait for it to end, or give another one with -o."
             ) from None
         except OSError as error:
-            hint = "Give a folder you may write to with -o."
-            raise StageError(f"cannot write to {self.root}", error.strerror or str(error), hint) from error
-        (self.root / ".lock.pid").write_text(f"{os.getpid()}\n")
+            self._lock.release()
+            raise self._cannot_write(error) from error
         return self
 
     def __exit__(self, *_: object) -> None:
         (self.root / ".lock.pid").unlink(missing_ok=True)
         self._lock.release()
+
+    def _cannot_write(self, error: OSError) -> StageError:
+        hint = "Make room there, or give a folder you may write to with -o."
+        return StageError(f"cannot write to {self.root}", error.strerror or str(error), hint)
 
     def _holder(self) -> str:
         try:
@@ -84,9 +88,10 @@ class Workspace:
         """Where work on it goes on."""
         return self.root / stage / f"{key[:KEY_LENGTH]}.partial"
 
-    def finished(self, stage: str, key: str) -> Manifest | None:
+    def finished(self, stage: str, key: str, deep: bool = False) -> Manifest | None:
         """The manifest of a finished and undamaged result, or None. A damaged one is set aside as ``.bad``.
 
+        ``deep``: every file is read and compared with its sha256; else sizes are.
         Raises BadManifest after setting it aside, so that the caller can say it aloud; asking again gives None.
         """
         folder = self.folder(stage, key)
@@ -94,7 +99,7 @@ class Workspace:
             manifest = manifests.read(folder)
             if manifest.key != key:
                 raise BadManifest(f"{folder} belongs to another key")
-            manifests.check_outputs(folder, manifest)
+            manifests.check_outputs(folder, manifest, deep)
         except FileNotFoundError:
             if folder.exists():
                 self._set_aside(folder)
@@ -151,6 +156,7 @@ class Workspace:
         """run.json, or an empty run for a new workspace."""
         try:
             value = json.loads((self.root / RUN_FILE).read_text("utf-8"))
+            value = manifests.unsealed(value) if manifests.SEAL in value else value
             if value["version"] == RUN_VERSION:
                 _RunFile.model_validate(value, strict=True)
                 return value
@@ -160,14 +166,17 @@ class Workspace:
         except ValidationError as error:
             reason = first_fault(error)
         except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-            reason = f"it does not parse ({error})"
+            reason = f"it cannot be used ({error})"
         hint = f"Delete {self.root / RUN_FILE} and give the same `pipeline run` again: finished stages are kept."
         raise StageError(f"cannot read {self.root / RUN_FILE}", reason, hint)
 
     def write_run(self, run: dict[str, Any]) -> None:
-        """Write run.json durably."""
-        text = json.dumps(run, indent=1, sort_keys=True, allow_nan=False, ensure_ascii=False)
-        write_durably(self.root / RUN_FILE, (text + "\n").encode())
+        """Write run.json durably. Raises StageError if it cannot be written."""
+        text = json.dumps(manifests.sealed(run), indent=1, sort_keys=True, allow_nan=False, ensure_ascii=False)
+        try:
+            write_durably(self.root / RUN_FILE, (text + "\n").encode())
+        except OSError as error:
+            raise self._cannot_write(error) from error
 
     def link_outputs(self, folder: Path, names: tuple[str, ...]) -> None:
         """Point ``output/<name>`` at the files of a finished folder; copies where links are not allowed."""

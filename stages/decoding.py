@@ -120,6 +120,15 @@ def _open(path: Path) -> "Image.Image":
     return image
 
 
+def pixel_count(path: Path) -> int:
+    """How many pixels a file says that it has; 0 for one that is refused by its header."""
+    try:
+        with _open(path) as image:
+            return image.width * image.height
+    except DecodeError:
+        return 0
+
+
 def _load(image: "Image.Image") -> None:
     """Decode the pixels."""
     try:

@@ -24,7 +24,7 @@ def save_field(folder: Path, model: "RadianceModel", info: dict[str, Any]) -> No
     Raises:
         TypeError: for a kind of field that has no file format.
     """
-    from safetensors.torch import save_file
+    from safetensors.torch import save
 
     from nerf.grid_field import GridField
     from nerf.paper import PaperNerf
@@ -33,7 +33,7 @@ def save_field(folder: Path, model: "RadianceModel", info: dict[str, Any]) -> No
         raise TypeError(f"no file format for a {type(model).__name__}")
     kind = "grid" if isinstance(model, GridField) else "paper"
     weights = {name: tensor.detach().cpu().contiguous() for name, tensor in model.state_dict().items()}
-    save_file(weights, folder / "field.safetensors")
+    (folder / "field.safetensors").write_bytes(save(weights))
     write_json(folder / "field.json", {"kind": kind, "settings": asdict(model.settings), **info})
 
 

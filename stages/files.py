@@ -87,9 +87,9 @@ def sync_folder(folder: Path) -> None:
 
 def write_tensors(path: Path, tensors: "dict[str, np.ndarray]") -> None:
     """Write arrays as safetensors without metadata."""
-    from safetensors.numpy import save_file
+    from safetensors.numpy import save
 
-    save_file(tensors, path)
+    path.write_bytes(save(tensors))  # save_file words a full disk as an error of its own kind
 
 
 def read_tensors(path: Path) -> "dict[str, np.ndarray]":

@@ -49,6 +49,7 @@ RESUMES = False
 LINKS = ("photos.json", "images", "masks")
 
 _MAX_WORKERS = 8  # each holds a few copies of one photo, up to 250 megapixels
+_BYTES_PER_PIXEL = 24  # of a photo while it is decoded, turned, packed and looked at; 22 measured for 16 bits
 _NO_PLACE = Place()
 
 
@@ -172,7 +173,7 @@ def _take_video(video: Path, most: int, waiting: Path, progress: Progress) -> li
 
 def _decode_all(source: Source, masks: Mapping[str, Path], waiting: Path, progress: Progress) -> list[_Taken | Refusal]:
     """The outcome of every file, in the order of ``source.files`` whatever order they finish in."""
-    pool = ThreadPoolExecutor(min(os.cpu_count() or 1, _MAX_WORKERS))
+    pool = ThreadPoolExecutor(_workers(source.files))
     names = [source.name(file) for file in source.files]
     try:
         futures: list[Future[_Taken | Refusal]] = [
@@ -189,6 +190,18 @@ def _decode_all(source: Source, masks: Mapping[str, Path], waiting: Path, progre
     finally:
         pool.shutdown(cancel_futures=True)
     return [future.result() for future in futures]
+
+
+def _workers(files: Sequence[Path]) -> int:
+    """How many photos to decode at a time: one per core, fewer where memory is short of that many of the largest."""
+    from stages.decoding import pixel_count
+    from stages.memory import at_once, check_memory
+
+    largest = max(map(pixel_count, files), default=0)
+    needed = _BYTES_PER_PIXEL * max(1, largest)
+    megapixels = f"decoding a photo of {largest / 1e6:.0f} megapixels takes"
+    check_memory(needed, "the photos", megapixels, "Close other programs, or make the photos smaller.")
+    return at_once(min(os.cpu_count() or 1, _MAX_WORKERS), needed)
 
 
 def _take(file: Path, name: str, mask: Path | None, waiting: Path) -> _Taken | Refusal:

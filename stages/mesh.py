@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from pydantic import Field
 
-from stages.contract import Inputs, Progress, StageConfig, StageError, StageResult
+from stages.contract import Inputs, Progress, StageConfig, StageResult
 from stages.files import read_json, read_scene, write_png
 
 if TYPE_CHECKING:
@@ -179,17 +179,17 @@ def reconstruct(
 
 
 def _density(config: Config, model: "RadianceModel", device: str, progress: Progress) -> "Lattice":
-    import psutil
     import torch
 
     from nerf.lattice import density_lattice
+    from stages.memory import available_bytes, check_memory
 
     assert config.resolution is not None
-    needed, available = BYTES_PER_POINT * config.resolution**3, psutil.virtual_memory().available
-    if needed > available:
-        fits = int((available / BYTES_PER_POINT) ** (1 / 3)) // 16 * 16
-        why = f"a lattice of {config.resolution}³ needs {needed / 2**30:.1f} GB and {available / 2**30:.1f} GB are free"
-        raise StageError("not enough memory for the mesh", why, f"Try --mesh.resolution {fits}.")
+    fits = int((available_bytes() / BYTES_PER_POINT) ** (1 / 3)) // 16 * 16
+    hint = f"Try --mesh.resolution {fits}." if fits >= 16 else "Close other programs."
+    check_memory(
+        BYTES_PER_POINT * config.resolution**3, "the mesh", f"a lattice of {config.resolution}³ points needs", hint
+    )
     corner = torch.full((3,), HALF_BOX, device=device)
     edge = config.resolution
 

@@ -2,7 +2,9 @@
 
 It lies beside the folder of ingest as ``<folder>.pixels/``, outside of every manifest and digest. A store is found by
 what it was made from (names, sizes and times of the files, the size asked for), is written once under a lock, and
-appears whole under its name or not at all. Photos are decoded on all cores, each written to its place and dropped.
+appears whole under its name or not at all. A CRC-32 of each photo's pixels stands at its end: what has changed on the
+disk since is found before it is used, and made again. Photos are decoded on all cores, each written to its place and
+dropped.
 
 What a mapped file costs: as much memory as there is to spare, given back when others need it. Random reads are as
 fast as from plain memory once the file has been read; where it is larger than memory, each pixel that is not there
@@ -14,6 +16,7 @@ import json
 import os
 import shutil
 import threading
+import zlib
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -28,9 +31,10 @@ if TYPE_CHECKING:
     import numpy as np
     from torch import Tensor
 
-VERSION = 1  # raised when the same photos would give other pixels
+VERSION = 2  # raised when the same photos would give other pixels
 DECODING_BYTES = 1 << 30  # how much memory may go into photos that are being decoded at a time
 BYTES_PER_PIXEL = {3: 16, 4: 64}  # that decoding and shrinking a photo takes, by channels
+CHECKSUM_BYTES = 4
 FITS = 0.8  # share of the free memory up to which a store is read ahead as a whole
 
 
@@ -62,6 +66,11 @@ class PixelStore:
             starts.append(starts[-1] + photo.width * photo.height * self.channels)
         return starts
 
+    @property
+    def size(self) -> int:
+        """Of the file in bytes: the pixels, and a checksum per photo."""
+        return self.starts[-1] + CHECKSUM_BYTES * len(self.photos)
+
     def shape(self, index: int) -> tuple[int, int, int]:
         """Height, width and channels of one photo."""
         return self.photos[index].height, self.photos[index].width, self.channels
@@ -69,27 +78,37 @@ class PixelStore:
     @property
     def is_whole(self) -> bool:
         """Whether the pixels are there."""
-        return self.path.is_file() and self.path.stat().st_size == self.starts[-1]
+        return self.path.is_file() and self.path.stat().st_size == self.size
 
-    def photo(self, index: int) -> "np.ndarray":
-        """The pixels of one photo, read into memory."""
+    def damaged(self) -> list[str]:
+        """The files of the photos whose pixels are no longer those that were written; reads all of a whole store."""
+        return [photo.file for index, photo in enumerate(self.photos) if self.photo(index) is None]
+
+    def photo(self, index: int) -> "np.ndarray | None":
+        """The pixels of one photo, read into memory; None where they are no longer those that were written."""
         import numpy as np
 
-        start, end = self.starts[index : index + 2]
-        pixels = np.fromfile(self.path, np.uint8, count=end - start, offset=start)
-        return pixels.reshape(self.shape(index))
+        starts = self.starts
+        with self.path.open("rb") as stream:
+            stream.seek(starts[index])
+            pixels = stream.read(starts[index + 1] - starts[index])
+            stream.seek(starts[-1] + CHECKSUM_BYTES * index)
+            if checksum(pixels) != stream.read(CHECKSUM_BYTES):
+                return None
+        return np.frombuffer(pixels, np.uint8).reshape(self.shape(index))
 
     def table(self, progress: Progress) -> "Tensor":
         """All pixels, (pixels, channels) uint8, mapped into memory; not to be written to."""
         import mmap
         import warnings
 
-        import psutil
         import torch
 
+        from stages.memory import available_bytes
+
         with self.path.open("rb") as stream:
-            mapped = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
-        free = psutil.virtual_memory().available
+            mapped = mmap.mmap(stream.fileno(), self.starts[-1], access=mmap.ACCESS_READ)
+        free = available_bytes()
         fits = len(mapped) <= FITS * free
         if not fits:
             sizes = f"{_gigabytes(len(mapped))} at this size, {_gigabytes(free)} of memory are free"
@@ -99,6 +118,11 @@ class PixelStore:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "The given buffer is not writable")
             return torch.frombuffer(mapped, dtype=torch.uint8).view(-1, self.channels)
+
+
+def checksum(pixels: "bytes | memoryview") -> bytes:
+    """CRC-32 of a photo's pixels, as it stands in the file."""
+    return zlib.crc32(pixels).to_bytes(CHECKSUM_BYTES, "little")
 
 
 def pixel_store(ingest: Path, name: str, photos: Sequence[StoredPhoto], channels: int) -> PixelStore:
@@ -112,18 +136,29 @@ def pixel_store(ingest: Path, name: str, photos: Sequence[StoredPhoto], channels
 
 
 def fill(store: PixelStore, load: Load, progress: Progress) -> None:
-    """Write the pixels of all photos, unless they are there; waits where another process is at it.
+    """Write the pixels of all photos, unless they are there and sound; waits where another process is at it.
 
     Raises:
         StageError: if the disk has no room for them.
         OSError: if a photo cannot be read or the store not be written.
     """
-    if store.is_whole:
+    if _is_sound(store, progress):
         return
     store.path.parent.mkdir(exist_ok=True)
     with _only_one(store, progress):
         if not store.is_whole:  # nobody else was faster
             _write(store, load, progress)
+
+
+def _is_sound(store: PixelStore, progress: Progress) -> bool:
+    """Whether the pixels are there as they were written; a store that has changed since is removed."""
+    if not store.is_whole:
+        return False
+    if not (damaged := store.damaged()):
+        return True
+    progress.note(f"the pixels of {damaged[0]} in {store.path.name} have changed on the disk: making it again")
+    store.path.unlink()
+    return False
 
 
 @contextmanager
@@ -145,7 +180,7 @@ def _only_one(store: PixelStore, progress: Progress) -> Iterator[None]:
 
 def _write(store: PixelStore, load: Load, progress: Progress) -> None:
     if store.path.exists():
-        found = f"{store.path.stat().st_size:,} bytes and not {store.starts[-1]:,}"
+        found = f"{store.path.stat().st_size:,} bytes and not {store.size:,}"
         progress.note(f"the pixel store {store.path.name} has {found}: making it again")
     partial, photos, written = store.path.with_name(f"{store.path.name}.partial"), len(store.photos), 0
 
@@ -177,6 +212,8 @@ def _write_photos(store: PixelStore, load: Load, stream: BinaryIO) -> Iterator[N
         with writing:
             stream.seek(starts[index])
             stream.write(pixels.data)
+            stream.seek(starts[-1] + CHECKSUM_BYTES * index)
+            stream.write(checksum(pixels.data))
 
     pool = ThreadPoolExecutor(_workers(store))
     try:
@@ -194,7 +231,7 @@ def _workers(store: PixelStore) -> int:
 
 
 def _check_room(store: PixelStore) -> None:
-    free, needed = shutil.disk_usage(store.path.parent).free, store.starts[-1]
+    free, needed = shutil.disk_usage(store.path.parent).free, store.size
     if needed > free:
         why = f"they take {_gigabytes(needed)} at this size, and {store.path.parent} has {_gigabytes(free)} free"
         raise StageError(

@@ -29,6 +29,7 @@ UNKEYED = ("seconds",)  # it decides how many frames and how large, and these en
 
 STARTING_SECONDS = 1.0  # to load the field once more and to write what is not video
 TRIED_VIEWS = 4  # of the path, to see how fast the field draws them
+BYTES_PER_PIXEL = 200  # of a frame while it is drawn and written: rays, colours, depth; 105 to 195 measured
 WRITING_SECONDS = 1.5e-7  # to encode a pixel of video.mp4 and of depth.mp4 (x264 with one thread: 13 million a second)
 
 
@@ -151,6 +152,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     painter = load_painter(inputs["train"], like=config.like)
     exposure = _exposure(config, inputs["train"])
     path = _path(config, scene).resized(config.width)
+    _check_memory(path)
     write_json(folder / "path.json", _path_json(path, scene, config.fps))
     started = time.perf_counter()
     renderings = _render(path, scene, painter, progress)
@@ -161,6 +163,16 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     line = f"{facts['path']}, {facts['frames']} frames {facts['width']}×{facts['height']}"
     line += "" if exposure is None else f" · {exposure}"
     return StageResult(outputs, f"{line} · {frames_per_second:.2g} frames/s", ("speed.json",), facts)
+
+
+def _check_memory(path: CameraPath) -> None:
+    """Raises StageError where not even one frame can be drawn."""
+    from stages.memory import check_memory
+
+    camera = max(path.cameras, key=lambda camera: camera.width * camera.height)
+    size = f"{camera.width}×{camera.height}"
+    needed, hint = BYTES_PER_PIXEL * camera.width * camera.height, f"Try --render.width {camera.width // 2}."
+    check_memory(needed, "the video", f"drawing a frame of {size} takes", hint)
 
 
 def _path(config: Config, scene: "Scene") -> CameraPath:
@@ -197,15 +209,16 @@ def _write(renderings: "Iterator[Rendering]", path: CameraPath, config: Config, 
     if config.save_frames:
         (folder / "frames").mkdir()
     waiting = folder / "inverse_depth.tmp"
-    inverse = np.memmap(waiting, np.float16, "w+", shape=(len(path.cameras), height, width))
-    with video_writer(folder / "video.mp4", width, height, config.fps) as add:
+    # Written and not mapped: on a full disk a write raises OSError, where a mapping would kill the process.
+    with waiting.open("wb") as depths, video_writer(folder / "video.mp4", width, height, config.fps) as add:
         for index, rendering in enumerate(renderings):
             frame = (rendering.colour.clamp(0, 1) * 255).round().byte().numpy()
             add(frame)
-            inverse[index] = 1 / rendering.depth.numpy()
+            depths.write((1 / rendering.depth.numpy()).astype(np.float16).data)
             if config.save_frames:
                 write_png(folder / "frames" / f"{index:05d}.png", frame)
     if config.depth:
+        inverse = np.memmap(waiting, np.float16, "r", shape=(len(path.cameras), height, width))
         _write_depth(inverse, folder / "depth.mp4", config.fps)
     waiting.unlink()
     return ["video.mp4"] + ["depth.mp4"] * config.depth + ["frames"] * config.save_frames

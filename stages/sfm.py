@@ -144,6 +144,7 @@ def _reconstruct(config: Config, photos: "list[Photo]", ingest: Path, folder: Pa
     _check_count(photos, len(everything))
     _check_camera(config, photos)
     check_matcher(config.matcher, places_of(photos))
+    _check_memory(config, photos)
     names = [photo.image_name for photo in photos]
     database = _database(folder, names, progress)
     found = run_child(config, photos, ingest / "images", folder, database, progress)
@@ -209,6 +210,17 @@ def _check_count(photos: "Sequence[Photo]", ingested: int) -> None:
         if same := ingested - len(photos):
             why += f", and {same} are nearly the same picture as one of these"
         raise StageError(f"cannot find cameras from {len(photos)} photo{'s' * (len(photos) != 1)}", why, OVERLAP_HINT)
+
+
+def _check_memory(config: Config, photos: "Sequence[Photo]") -> None:
+    """Raises StageError where not even one photo at a time can be searched for features."""
+    from stages.colmap.matching import Search, feature_bytes
+    from stages.memory import check_memory
+
+    assert config.max_image_size and config.max_features, "plan() chooses them"
+    needed = feature_bytes(photos, Search(config.max_image_size, config.max_features))
+    why = f"a photo searched at {config.max_image_size} pixels takes"
+    check_memory(needed, "features of the photos", why, f"Try --sfm.max-image-size {config.max_image_size // 2}.")
 
 
 def _check_camera(config: Config, photos: "Sequence[Photo]") -> None:

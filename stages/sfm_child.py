@@ -32,7 +32,7 @@ from stages.colmap.matching import (
     look_alike,
     match_pairs,
 )
-from stages.colmap.models import load_native
+from stages.colmap.models import load_native, write_native
 from stages.colmap.refinement import finish
 from stages.files import make_durable
 from stages.masks import write_feature_masks
@@ -89,7 +89,11 @@ def main() -> None:
     def say(**message: Any) -> None:
         channel.write(json.dumps(message) + "\n")
 
-    say(result=reconstruct(job, say))
+    try:
+        say(result=reconstruct(job, say))
+    except Exception as fault:  # the log, where Python will write it, may lie on the disk that is full
+        say(fault=f"{type(fault).__name__}: {fault}".splitlines()[0])
+        raise
 
 
 def _end_with_parent() -> None:
@@ -180,8 +184,7 @@ def reconstruct(job: Job, say: Say) -> dict[str, Any]:
     model = finished.model
     registered = [model.image(i) for i in sorted(model.reg_image_ids())]
     sparse = Path(job.folder, "sparse")
-    sparse.mkdir(exist_ok=True)
-    model.write_binary(sparse)
+    write_native(sparse, model)
     return {
         "database": str(database),
         "attempts": tried,
@@ -251,8 +254,7 @@ def _make(attempt: Attempt, missing: list[int], work: _Work) -> None:
     tried = Tried(attempt.name, database.name, seconds=work.seconds)
     if models:
         folder = work.journal.model(attempt.name)
-        folder.mkdir(parents=True, exist_ok=True)
-        models[0].write_binary(folder)
+        write_native(folder, models[0])
         make_durable(folder)
         tried = replace(
             tried,

@@ -4,6 +4,7 @@ What it does is in stages/sfm_child.py.
 """
 
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -28,6 +29,7 @@ FOR_CHILD = (
     "seed", "max_image_size", "max_features", "camera_model", "camera_params", "matcher", "neighbours", "attempts",
     "seconds", "max_seconds",
 )  # fmt: skip
+FULL_DISK = 1 << 22  # bytes: less than the smallest of COLMAP's files that may have found no room
 CHILD = ["-m", "stages.sfm_child"]
 
 
@@ -65,7 +67,8 @@ def run_child(
             child.wait()
     if "result" not in latest:
         limit = config.max_seconds if late else None
-        raise _child_failed(code, limit, latest["phase"], log, _without(latest["attempt"], code, late, log))
+        last = latest.get("fault") or _last_words(log)
+        raise _child_failed(code, limit, latest["phase"], last, _without(latest["attempt"], code, late, log), log)
     return latest["result"]
 
 
@@ -123,10 +126,17 @@ def _describe(latest: Mapping[str, Any], photos: int) -> tuple[str, float | None
     return f"{words.format(done, total)} ({latest['attempt']})", FIRST_ATTEMPT + (REFINING - FIRST_ATTEMPT) * later
 
 
-def _child_failed(code: int, limit: float | None, phase: str, log: Path, without: str | None) -> StageError:
-    """``without``: the hint where running again goes on without the attempt that failed."""
+def _last_words(log: Path) -> str:
     lines = log.read_text("utf-8", "replace").strip().splitlines()
-    last = lines[-1].strip() if lines else "it left no message"
+    return lines[-1].strip() if lines else "it left no message"
+
+
+def _child_failed(code: int, limit: float | None, phase: str, last: str, without: str | None, log: Path) -> StageError:
+    """``last``: what the child said at last; ``without``: the hint where running again goes on without the attempt that
+    failed."""
+    free = shutil.disk_usage(log.parent).free
+    if free < FULL_DISK:  # COLMAP and its database say it in words of their own, or do not notice
+        last += f"; the disk has only {free / 2**20:.1f} MB free: No space left on device"
     where = f"while {phase}" if phase != "features" else "while finding features"
     if limit is not None:
         return StageError(

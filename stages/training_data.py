@@ -133,7 +133,9 @@ def _pixels(ingest: Path, scene: "Scene", view: "View", downscale: float) -> "np
     """The photo of a view as uint8, out of the pixel store where that is there."""
     store = _store(ingest, scene, view.split, downscale)
     if store.is_whole:
-        return store.photo([photo.file for photo in store.photos].index(view.file))
+        stored = store.photo([photo.file for photo in store.photos].index(view.file))
+        if stored is not None:
+            return stored
     return _decoded_pixels(ingest, scene, view, downscale)
 
 

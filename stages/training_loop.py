@@ -304,7 +304,10 @@ class TrainingRun:
             why = f"{fault}, after {MOST_ROLLBACKS} roll-backs that each halved the learning rate"
             raise StageError("training diverged", why, hint)
         checkpoint = latest_checkpoint(self.checkpoints, self.progress.note, self._load_sound)
-        if checkpoint is None:
+        if checkpoint is None and self.budget.after is not None:
+            self._go_on(self.budget.after)
+            self.state.rollbacks = rollbacks
+        elif checkpoint is None:
             self._begin(self.state.anew(self.state.restarts, rollbacks))
         else:
             self.state.step, self.state.rollbacks = checkpoint.step, rollbacks
@@ -322,12 +325,12 @@ class TrainingRun:
         if isinstance(fault, Lost):
             self.log.event("lost", self.state.step, symptom=str(fault))
             return f"{slower}."
-        from safetensors.torch import save_file
+        from safetensors.torch import save
 
         from nerf.training import RAYS
 
         name = f"nonfinite_{fault.step}.safetensors"
-        save_file({key: tensor.contiguous() for key, tensor in fault.batch.items()}, self.folder / name)
+        (self.folder / name).write_bytes(save({key: tensor.contiguous() for key, tensor in fault.batch.items()}))
         self.log.event("nonfinite", fault.step, quantity=fault.quantity, batch=name)
         advice = "Check the cameras, which give the rays" if fault.quantity == RAYS else slower
         return f"{advice}; the batch is kept in {self.folder / name}."

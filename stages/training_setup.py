@@ -25,6 +25,9 @@ FINAL_RATE = 0.1  # of the paper field's learning rate at the start
 DISTORTION = 4e-3
 COARSEST = 16
 FEWEST_STEPS, MOST_STEPS = 256, 384  # along the diagonal of a bounded scene's box
+TABLE_COPIES = 6  # of the grids' features: themselves, their gradient, Adam's two moments, and twice in a checkpoint
+SAMPLE_BYTES = 4096  # that a sample of a grid field's step takes while it is computed
+ACTIVATIONS_PER_LAYER = 2  # numbers kept of each unit of the paper field for its gradient
 WHITE, BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
 
 
@@ -43,6 +46,8 @@ def prepare(config: "Config", scene: "Scene", inputs: Inputs, folder: Path, prog
 
     assert config.downscale is not None, "plan() chooses it"
     device = compute_device()
+    if device == "cpu":
+        check_field_fits(config)
     progress.update("reading the photos")
     bank = training_bank(inputs["ingest"], scene, "train", config.downscale, progress).to(device)
     shown_over = torch.tensor(field_background(config, scene), device=device)
@@ -68,6 +73,40 @@ def prepare(config: "Config", scene: "Scene", inputs: Inputs, folder: Path, prog
         TrainingLog(folder, config.tensorboard),
         progress,
     )
+
+
+def field_bytes(config: "Config", workers: int) -> float:
+    """Memory on the CPU that training a field takes beside the photos, so many chunks of work at a time."""
+    if config.field == "grid":
+        from nerf.kernels import grid_layout
+
+        settings = grid_settings(config)
+        sizes = settings.levels, settings.coarsest, settings.finest, settings.log2_rows, settings.features
+        assert config.batch_samples
+        return TABLE_COPIES * 4 * settings.features * grid_layout(*sizes).rows + SAMPLE_BYTES * config.batch_samples
+    from nerf.training import CHUNK_RAYS
+
+    sizes = paper_settings(config)
+    assert config.batch_rays
+    rays = min(CHUNK_RAYS["cpu"], config.batch_rays)
+    samples = rays * (2 * sizes.samples_coarse + sizes.samples_fine)
+    return workers * ACTIVATIONS_PER_LAYER * 4 * samples * sizes.width * sizes.depth
+
+
+def check_field_fits(config: "Config") -> None:
+    """Raises StageError where training this field would take more memory than there is."""
+    from stages.device import cores
+    from stages.memory import check_memory
+
+    if config.field == "grid":
+        why, hint = (
+            f"{config.levels} grids of up to 2^{config.log2_rows} rows take",
+            "Give a smaller --train.log2-rows.",
+        )
+    else:
+        why = f"{config.depth} × {config.width} networks on {cores()} cores at a time take"
+        hint = "Give a smaller --train.width, --train.batch-rays or --train.samples-fine, or fewer cores (taskset)."
+    check_memory(field_bytes(config, cores()), "the field", why, hint)
 
 
 def make_trainer(

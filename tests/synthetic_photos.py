@@ -21,10 +21,14 @@ class SyntheticPhotos(NamedTuple):
 @pytest.fixture(scope="session")
 def synthetic_photos(tmp_path_factory: pytest.TempPathFactory) -> SyntheticPhotos:
     """Twelve photos of 240 × 180 with exact cameras. Do not write into the folder: all tests share it."""
+    return write_synthetic_photos(tmp_path_factory.mktemp("synthetic") / "photos")
+
+
+def write_synthetic_photos(folder: Path) -> SyntheticPhotos:
+    """The same in a folder of one's own."""
     from nerf.synthetic import ring_of_cameras
     from pipeline.demo import write_photos
 
-    folder = tmp_path_factory.mktemp("synthetic") / "photos"
     poses = {f"photo_{index:03d}.jpg": pose for index, pose in enumerate(ring_of_cameras(36)[:12])}
     truth = Truth(LENS, poses, seed=0)
     write_photos(folder, truth, Quiet())

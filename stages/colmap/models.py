@@ -1,5 +1,8 @@
 """Sparse models on disk, in COLMAP's own files."""
 
+import errno
+import os
+import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,6 +16,10 @@ from stages.sparse_model import SparseImage, SparseModel
 
 if TYPE_CHECKING:
     import pycolmap
+
+
+# At most, in COLMAP's binary files: a feature with its part of a track, a point, a photo with its name; and the rest.
+BYTES_PER_PLACE, BYTES_PER_POINT, BYTES_PER_IMAGE, FIXED_BYTES = 32, 51, 1024, 1 << 16
 
 
 def read_model(sparse: Path) -> SparseModel:
@@ -65,6 +72,17 @@ def load_native(sparse: Path) -> "pycolmap.Reconstruction":
     return pycolmap.Reconstruction(sparse)
 
 
+def write_native(sparse: Path, model: "pycolmap.Reconstruction") -> None:
+    """Write ``model`` as COLMAP's binary files. Raises OSError where the disk has no room: COLMAP itself would leave
+    files that end in the middle, and say nothing."""
+    sparse.mkdir(parents=True, exist_ok=True)
+    places = sum(image.num_points2D() for image in map(model.image, model.reg_image_ids()))
+    needed = BYTES_PER_PLACE * places + BYTES_PER_POINT * model.num_points3D() + BYTES_PER_IMAGE * model.num_images()
+    if shutil.disk_usage(sparse).free < needed + FIXED_BYTES:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(sparse))
+    model.write_binary(sparse)
+
+
 def write_model(sparse: Path, model: SparseModel) -> None:
     """The inverse of :func:`read_model`: standard binary files. Points are numbered anew, errors computed anew."""
     import pycolmap
@@ -84,5 +102,4 @@ def write_model(sparse: Path, model: SparseModel) -> None:
     for xyz, rgb, track in zip(model.xyz, model.rgb, tracks, strict=True):
         new.add_point3D(xyz, track, rgb)
     new.update_point_3d_errors()
-    sparse.mkdir(parents=True, exist_ok=True)
-    new.write_binary(sparse)
+    write_native(sparse, new)

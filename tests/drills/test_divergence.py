@@ -72,7 +72,7 @@ def seen(folder: Path, inputs: dict[str, Path], progress: Any) -> tuple[float, f
 
 
 @pytest.mark.parametrize("steps", [WARM_UP - 20, WARM_UP + 20])
-@pytest.mark.parametrize("rate", [1e-1, 1.0, 10.0])
+@pytest.mark.parametrize("rate", [*(pytest.param(rate, marks=pytest.mark.slow) for rate in (1e-1, 1.0)), 10.0])
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_rate_far_too_high_never_gives_a_bad_model_in_silence(
     kind: str, rate: float, steps: int, inputs: dict[str, Path], tmp_path: Path, progress: Any

@@ -4,123 +4,76 @@ import json
 import random
 import shutil
 import signal
-import subprocess
-import sys
-import time
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from pipeline.chain import usual
-from tests.small_scenes import write_blender_scene
+from tests.drills.campaigns import Chain
+from tests.drills.drill import Program, copy_workspace, results
 from tests.synthetic_photos import SyntheticPhotos
 
-SMALL = (
-    "--train.steps 400 --train.levels 2 --train.log2-rows 10 --train.finest 32 --train.batch-samples 2048"
-    " --train.checkpoint-seconds 0.2 --train.downscale 1 --render.frames 24 --render.width 64 --mesh.resolution 64"
-).split()
 AT_WORK = ("train", "evaluate", "render", "mesh")  # stages that say how far they are: killed in the middle of it
 
 
-def command(photos: Path, workspace: Path) -> list[str]:
-    return [sys.executable, "-m", "pipeline", "run", str(photos), "-o", str(workspace), "--json", *SMALL]
+def at_work(stage: str, events: list[dict[str, Any]]) -> bool:
+    """Whether ``stage`` has begun, or, where it says how far it is, has done something."""
+    kind = "progress" if stage in AT_WORK else "begin"
+    return any(e["event"] == kind and e["stage"] == stage and (kind == "begin" or e["done"]) for e in events)
 
 
-def digests(workspace: Path) -> dict[str, str]:
-    """Stage → digest of its outputs."""
-    keys = json.loads((workspace / "run.json").read_text())["keys"]
-    found = {}
-    for stage, key in keys.items():
-        manifest = json.loads((workspace / stage / key[:16] / "manifest.json").read_text())
-        found[stage] = manifest["outputs_digest"]
-    return found
+def kill_in(stage: str, program: Program, delay: float) -> bool:
+    """Kill it ``delay`` seconds after ``stage`` got to work; False if it had ended the stage by then."""
+    program.wait_until(partial(at_work, stage))
+    program.process.join(delay)
+    program.strike(signal.SIGKILL)
+    return not any(event["event"] == "end" and event["stage"] == stage for event in program.events())
 
 
-@pytest.fixture(scope="module")
-def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, str]]:
-    """Photos, and the digests of a run from start to end."""
-    folder = tmp_path_factory.mktemp("undisturbed")
-    photos = write_blender_scene(folder / "photos")
-    answer = subprocess.run(command(photos, folder / "w.nerf"), capture_output=True, text=True)
-    assert answer.returncode == 0, answer.stdout + answer.stderr
-    return photos, digests(folder / "w.nerf")
-
-
-def kill_in(stage: str, process: subprocess.Popen, delay: float) -> bool:
-    """Kill the process ``delay`` seconds after ``stage`` got to work; False if it had ended the stage by then."""
-    assert process.stdout is not None
-    for line in process.stdout:
-        event = json.loads(line)
-        begun = event["event"] == "begin" and stage not in AT_WORK
-        if event.get("stage") == stage and (begun or (event["event"] == "progress" and event["done"])):
-            break
-    time.sleep(delay)
-    process.kill()
-    rest = process.communicate()[0]
-    return not any(json.loads(line)["event"] == "end" for line in rest.splitlines() if line.endswith("}"))
-
-
-def test_killed_in_every_stage(undisturbed: tuple[Path, dict[str, str]], tmp_path: Path):
-    photos, expected = undisturbed
+def test_killed_in_every_stage(chain: Chain, tmp_path: Path):
     instants = random.Random(7)
-    struck = 0
+    workspace, struck = tmp_path / "w.nerf", 0
     for stage in usual():
-        process = subprocess.Popen(command(photos, tmp_path / "w.nerf"), stdout=subprocess.PIPE, text=True)
-        struck += kill_in(stage, process, instants.uniform(0.0, 0.2))
-        assert process.returncode == -signal.SIGKILL or stage == "report"
+        struck += kill_in(stage, chain.start(workspace), instants.uniform(0.0, 0.1))
     assert struck >= len(usual()) // 2, "most kills must land inside their stage"
-    answer = subprocess.run(command(photos, tmp_path / "w.nerf"), capture_output=True, text=True)
-    assert answer.returncode == 0, answer.stdout + answer.stderr
-    found = digests(tmp_path / "w.nerf")
-    # The report shows how long everything took, so it alone may differ.
-    assert found.keys() == expected.keys()
-    assert {s: d for s, d in found.items() if s != "report"} == {s: d for s, d in expected.items() if s != "report"}
+    assert chain.lost(workspace) == []
 
 
-def test_a_second_run_does_nothing_and_soon(undisturbed: tuple[Path, dict[str, str]]):
-    photos, _ = undisturbed
-    answer = subprocess.run(command(photos, photos.parent / "w.nerf"), capture_output=True, text=True)
-    events = [json.loads(line) for line in answer.stdout.splitlines()]
-    assert all(event["cached"] for event in events if event["event"] == "end")
-    assert events[-1]["message"].startswith("nothing to do")
+def test_a_second_run_does_nothing_and_soon(chain: Chain):
+    program = chain.start(chain.workspace).finish()
+    assert all(event["cached"] for event in program.events() if event["event"] == "end")
+    assert program.events()[-1]["message"].startswith("nothing to do")
 
 
-def test_another_mesh_resolution_runs_only_mesh_and_report(undisturbed: tuple[Path, dict[str, str]]):
-    photos, _ = undisturbed
-    words = [*command(photos, photos.parent / "w.nerf")[:-1], "24"]
-    answer = subprocess.run(words, capture_output=True, text=True)
-    events = [json.loads(line) for line in answer.stdout.splitlines()]
-    ran = [event["stage"] for event in events if event["event"] == "end" and not event["cached"]]
+def test_another_mesh_resolution_runs_only_mesh_and_report(chain: Chain, tmp_path: Path):
+    program = chain.start(copy_workspace(chain.workspace, tmp_path / "w.nerf"), "--mesh.resolution", "20").finish()
+    ran = [event["stage"] for event in program.events() if event["event"] == "end" and not event["cached"]]
     assert ran == ["mesh", "report"]
 
 
-def videos_plan(workspace: Path) -> dict[str, object]:
+def videos_plan(workspace: Path) -> dict[str, Any]:
     """What was chosen for stage render."""
     plans = json.loads((workspace / "run.json").read_text())["plans"]["render"].values()
     return next(plan for plan in plans if plan["depth"] is False)
 
 
-def test_a_killed_video_goes_on_with_the_size_that_was_chosen_for_it(
-    undisturbed: tuple[Path, dict[str, str]], tmp_path: Path
-):
-    workspace = tmp_path / "w.nerf"
-    shutil.copytree(undisturbed[0].parent / "w.nerf", workspace, symlinks=True)
-    open_again = "--render.frames None --render.width None --render.no-depth --json".split()
-    words = [sys.executable, "-m", "pipeline", "render", str(workspace), *open_again]
-    process = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
-    assert kill_in("render", process, 0.0)
+def test_a_killed_video_goes_on_with_the_size_that_was_chosen_for_it(chain: Chain, tmp_path: Path):
+    workspace = copy_workspace(chain.workspace, tmp_path / "w.nerf")
+    open_again = "--render.frames None --render.width None --render.no-depth".split()
+    assert kill_in("render", Program(["render", str(workspace), "--json", *open_again], tmp_path / "says"), 0.0)
     chosen = videos_plan(workspace)
-    answer = subprocess.run([*words[:5], "--json"], capture_output=True, text=True)
-    assert answer.returncode == 0, answer.stdout + answer.stderr
+    Program(["render", str(workspace), "--json"], tmp_path / "says").finish()
     assert videos_plan(workspace) == chosen
     path = json.loads((workspace / "output/path.json").read_text())
     assert (len(path["frames"]), path["w"], path["fps"]) == (chosen["frames"], chosen["width"], chosen["fps"])
 
 
 # What is said when sfm reaches the instants to be killed at: finding features, matching, and matching once more.
-SFM_INSTANTS = ("features of", "matched", "has no place yet: matching them again", "adjusting all cameras")
+SFM_INSTANTS = ("features of", "match", "has no place yet: matching them again", "adjusting all cameras")
 
 
 @pytest.fixture
@@ -135,30 +88,22 @@ def photos_and_a_stranger(synthetic_photos: SyntheticPhotos, tmp_path: Path) -> 
     return folder
 
 
-def kill_when_said(words: str, process: subprocess.Popen, delay: float) -> bool:
-    """Kill the process ``delay`` seconds after it said ``words``; False if it never did or had finished by then."""
-    assert process.stdout is not None
-    said = any(words in json.loads(line).get("message", "") for line in process.stdout)
-    time.sleep(delay)
-    process.kill()
-    rest = process.communicate()[0]
-    return said and '"event": "finished"' not in rest
-
-
 def test_killed_while_photos_are_matched(photos_and_a_stranger: Path, tmp_path: Path):
-    def sfm(name: str) -> list[str]:
-        few = "--until sfm --sfm.max-features 800 --json".split()
-        return [sys.executable, "-m", "pipeline", "run", str(photos_and_a_stranger), "-o", str(tmp_path / name), *few]
+    def sfm(name: str) -> Program:
+        words = ["run", str(photos_and_a_stranger), "-o", str(tmp_path / name), "--json", "--until", "sfm"]
+        return Program([*words, "--sfm.max-features", "800"], tmp_path / "says")
 
-    answer = subprocess.run(sfm("undisturbed.nerf"), capture_output=True, text=True)
-    assert answer.returncode == 0, answer.stdout + answer.stderr
-    assert SFM_INSTANTS[2] in answer.stdout
+    def said(words: str, events: list[dict[str, Any]]) -> bool:
+        return any(words in event.get("message", "") for event in events)
+
+    assert SFM_INSTANTS[2] in sfm("undisturbed.nerf").finish().said
     instants = random.Random(3)
     for words in SFM_INSTANTS:
-        process = subprocess.Popen(sfm("killed.nerf"), stdout=subprocess.PIPE, text=True)
-        assert kill_when_said(words, process, instants.uniform(0.0, 0.1)), f"no kill at: {words}"
-        assert process.returncode == -signal.SIGKILL
-    answer = subprocess.run(sfm("killed.nerf"), capture_output=True, text=True)
-    assert answer.returncode == 0, answer.stdout + answer.stderr
-    assert "going on with the features of 8 photos" in answer.stdout
-    assert digests(tmp_path / "killed.nerf") == digests(tmp_path / "undisturbed.nerf")
+        program = sfm("killed.nerf")
+        assert program.wait_until(partial(said, words)), f"no kill at: {words}"
+        program.process.join(instants.uniform(0.0, 0.1))
+        program.strike(signal.SIGKILL)
+        assert program.wait() == -signal.SIGKILL
+    program = sfm("killed.nerf").finish()
+    assert "going on with the features of 8 photos" in program.said
+    assert results(tmp_path / "killed.nerf") == results(tmp_path / "undisturbed.nerf")

@@ -138,7 +138,7 @@ def test_outputs_of_a_manifest_lie_in_its_folder(tmp_path: Path) -> None:
     (folder / "link.png").symlink_to(secret)
     for name in ("../secret.png", str(secret), "link.png"):
         outputs = {name: {"size": secret.stat().st_size, "sha256": "0"}}
-        manifest = Manifest("mesh", 1, "0", {}, {}, outputs, outputs_digest(outputs), [], {}, "", 0.0, "")
+        manifest = Manifest("mesh", 1, "0", {}, {}, outputs, outputs_digest(outputs), {}, {}, "", 0.0, "")
         with pytest.raises(BadManifest, match="leads out of its folder"):
             check_outputs(folder, manifest)
 

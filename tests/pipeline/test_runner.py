@@ -10,7 +10,8 @@ from PIL import Image
 
 from pipeline import status
 from pipeline.display import SilentDisplay
-from pipeline.runner import NotReady, Runner, StageFailed
+from pipeline.failures import StageFailed
+from pipeline.runner import NotReady, Runner
 from pipeline.workspace import Workspace
 from stages.contract import StageError
 from tests.pipeline import fake_stages

@@ -17,7 +17,7 @@ from filelock import FileLock
 from pipeline.workspace import Workspace
 from stages import pixel_store as module
 from stages.contract import StageError
-from stages.pixel_store import PixelStore, StoredPhoto, fill, pixel_store
+from stages.pixel_store import PixelStore, StoredPhoto, checksum, fill, pixel_store
 from tests.conftest import SilentProgress
 
 SIZES = [(5, 3), (4, 2), (7, 6), (5, 3)]  # (width, height)
@@ -42,6 +42,13 @@ def never(index: int) -> np.ndarray:
     raise AssertionError(f"photo {index} is decoded again")
 
 
+def kept(store: PixelStore, index: int) -> np.ndarray:
+    """A photo of the store, whose pixels are those that were written."""
+    pixels = store.photo(index)
+    assert pixels is not None
+    return pixels
+
+
 @pytest.mark.parametrize("channels", [3, 4])
 def test_it_holds_what_was_loaded(tmp_path: Path, progress: SilentProgress, channels: int) -> None:
     store = store_of(tmp_path, channels)
@@ -53,7 +60,7 @@ def test_it_holds_what_was_loaded(tmp_path: Path, progress: SilentProgress, chan
     assert table.dtype == torch.uint8
     assert np.array_equal(table.numpy(), np.concatenate([pixels.reshape(-1, channels) for pixels in expected]))
     for index, pixels in enumerate(expected):
-        assert np.array_equal(store.photo(index), pixels)
+        assert np.array_equal(kept(store, index), pixels)
     assert progress.updates[-1] == ("read 4 of 4 photos, the disk is taking 0.0 GB", 1.0)
     assert progress.notes == []
 
@@ -96,8 +103,8 @@ def test_a_damaged_store_is_made_again_and_said(tmp_path: Path, progress: Silent
     os.truncate(store.path, size)
     assert not store.is_whole
     fill(store, painted, progress)
-    assert np.array_equal(store.photo(2), painted(2))
-    assert progress.notes == [f"the pixel store {store.path.name} has {size:,} bytes and not 240: making it again"]
+    assert np.array_equal(kept(store, 2), painted(2))
+    assert progress.notes == [f"the pixel store {store.path.name} has {size:,} bytes and not 256: making it again"]
 
 
 def test_photos_are_decoded_a_few_at_a_time_and_dropped(
@@ -123,7 +130,7 @@ def test_photos_are_decoded_a_few_at_a_time_and_dropped(
 
     fill(store, load, progress)
     assert 1 <= most <= 2
-    assert store.photo(39).min() == store.photo(39).max() == 39
+    assert kept(store, 39).min() == kept(store, 39).max() == 39
 
 
 @pytest.mark.parametrize(
@@ -191,7 +198,8 @@ def test_a_second_process_waits_and_finds_it_made(tmp_path: Path, progress: Sile
     waiting.start()
     while not progress.updates:
         time.sleep(0.01)
-    store.path.write_bytes(b"".join(painted(index).tobytes() for index in range(len(SIZES))))
+    pixels = [painted(index).tobytes() for index in range(len(SIZES))]
+    store.path.write_bytes(b"".join([*pixels, *map(checksum, pixels)]))
     lock.release()
     waiting.join(10)
     assert not waiting.is_alive()
@@ -221,5 +229,23 @@ def test_a_kill_leaves_no_store_and_no_lock(tmp_path: Path, progress: SilentProg
     assert killed.returncode == -signal.SIGKILL
     assert store.path.with_name(f"{store.path.name}.partial").exists() and not store.is_whole
     fill(store, painted, progress)
-    assert np.array_equal(store.photo(3), painted(3))
+    assert np.array_equal(kept(store, 3), painted(3))
     assert not store.path.with_name(f"{store.path.name}.partial").exists()
+
+
+def test_a_flipped_bit_is_found_said_and_made_again(tmp_path: Path, progress: SilentProgress) -> None:
+    store = store_of(tmp_path)
+    fill(store, painted, progress)
+    sound = store.path.read_bytes()
+    for bit in (0, 8 * store.starts[2] + 3, 8 * store.starts[-1] + 1):  # of the pixels, and of a checksum
+        store.path.write_bytes(flipped(sound, bit))
+        assert len(store.damaged()) == 1
+        fill(store, painted, progress)
+        assert store.path.read_bytes() == sound
+    assert [note.endswith("have changed on the disk: making it again") for note in progress.notes] == 3 * [True]
+
+
+def flipped(content: bytes, bit: int) -> bytes:
+    changed = bytearray(content)
+    changed[bit // 8] ^= 1 << bit % 8
+    return bytes(changed)

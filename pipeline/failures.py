@@ -1,0 +1,45 @@
+"""What ends a stage, as something a user can act on."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from stages.contract import StageError
+
+
+class StageFailed(Exception):
+    """A stage ended with a StageError; carries both so that the caller can word it and choose the exit code."""
+
+    def __init__(self, stage: str, error: StageError) -> None:
+        super().__init__(f"{stage}: {error}")
+        self.stage, self.error = stage, error
+
+
+@contextmanager
+def worded(stage: str) -> Iterator[None]:
+    """Whatever a user can act on becomes a StageFailed."""
+    try:
+        yield
+    except StageError as error:
+        raise StageFailed(stage, error) from error
+    except OSError as error:
+        raise StageFailed(stage, _disk_error(error)) from error
+    except (MemoryError, RuntimeError) as error:
+        if not _is_out_of_memory(error):
+            raise
+        hint = "Close other programs, or lower the resolution or batch settings of this stage."
+        why = str(error).splitlines()[0] if str(error) else f"{stage} asked for more than there is"
+        raise StageFailed(stage, StageError("out of memory", why, hint)) from error
+
+
+def _is_out_of_memory(error: Exception) -> bool:
+    """torch says it with a RuntimeError, on the CPU and on GPUs in different words."""
+    return isinstance(error, MemoryError) or any(
+        words in str(error) for words in ("not enough memory", "out of memory", "can't allocate memory")
+    )
+
+
+def _disk_error(error: OSError) -> StageError:
+    """An OSError in words; finished stages are never touched by it."""
+    what = f"cannot read or write {error.filename}" if error.filename else "a file could not be read or written"
+    hint = "Free disk space or check permissions, then run again: finished stages are kept."
+    return StageError(what, error.strerror or str(error), hint)
