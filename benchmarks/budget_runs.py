@@ -4,8 +4,9 @@ python -m benchmarks.budget_runs fox.nerf lego_400.nerf --runs runs.json
 python -m benchmarks.budget_runs fox.nerf --schedule late --runs runs.json
 
 A workspace needs its stages up to effects. A run that the file holds already is not made again. All runs of a set have
-one size of photos and of field. Beside the field itself a running mean of its weights is measured, over the last
-tenth of the run (Karras et al. 2024, section 3.1). benchmarks.prediction reads the file.
+one size of field and of photos, such that 500 steps draw every pixel about once, as stage train chooses it. Beside the
+field itself a running mean of its weights is measured, over the last tenth of the run (Karras et al. 2024, section
+3.1). benchmarks.prediction reads the file.
 """
 
 import argparse
@@ -32,9 +33,10 @@ from stages.files import read_json, read_scene
 from stages.train import Config, with_habits
 from stages.training_data import training_bank
 from stages.training_setup import field_background, make_trainer
+from stages.training_size import SAMPLES_PER_RAY
 
 BUDGETS = (125, 250, 500, 1000)
-LONG_SIDE = 150  # pixels of the photos
+ONCE = 500  # steps that draw every pixel of the training photos once: it is their number that gives the photos' size
 CHUNKS = 2
 SAMPLES = 1 << 12
 PROBE_RAYS = 2048
@@ -72,7 +74,8 @@ def bench_of(workspace: Path) -> Bench:
     keys = read_json(workspace / "run.json")["keys"]
     ingest, normalise, effects = (workspace / s / keys[s][:16] for s in ("ingest", "normalise", "effects"))
     scene, decisions = read_scene(normalise), read_decisions(effects)
-    longest = max(max(camera.width, camera.height) for camera in scene.cameras)
+    cameras = [scene.cameras[view.camera] for view in scene.of_split("train")]
+    rays = ONCE * SAMPLES / SAMPLES_PER_RAY["contracted" if decisions.unbounded else "bounded"]
     config = Config(
         field="grid",
         contracted=decisions.unbounded,
@@ -80,7 +83,7 @@ def bench_of(workspace: Path) -> Bench:
         backend=chosen_backend(compute_device(), Quiet()),
         chunks=CHUNKS,
         batch_samples=SAMPLES,
-        downscale=max(1.0, longest / LONG_SIDE),
+        downscale=max(1.0, math.sqrt(sum(camera.width * camera.height for camera in cameras) / rays)),
         levels=4,
         log2_rows=15,
         finest=256,

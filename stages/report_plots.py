@@ -63,10 +63,11 @@ def _draw_knee(axes: "Axes", curve: Sequence[tuple[float, float]]) -> None:
 
     if (seconds := knee(curve)) is None:
         return
-    psnr = quality_at(curve, seconds)
+    psnr, late = quality_at(curve, seconds), seconds**2 > curve[0][0] * curve[-1][0]
     axes.plot(seconds, psnr, "o", mfc="none", mec=ORANGE, ms=11, mew=2)
     words = f"knee, {duration(seconds)}: twice the time bought < {KNEE_DB:g} dB"
-    axes.annotate(words, (seconds, psnr), (10, -16), textcoords="offset points", ha="left", va="top", size=9.5)
+    place = {"textcoords": "offset points", "ha": "right" if late else "left", "va": "top", "size": 9.5}
+    axes.annotate(words, (seconds, psnr), (10, -16), **place)
 
 
 def _draw_baselines(axes: "Axes", baselines: dict[str, float]) -> None:

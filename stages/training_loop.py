@@ -256,8 +256,10 @@ class TrainingRun:
             self.plan = plan
             self._write_journal()
             self.log.event("steered", step, total_steps=plan.total_steps)
-            seen = f"{self.state.validation_psnr:.1f} of {target.psnr:g} dB on photos set aside"
-            self.progress.note(f"{seen} after {step:,} steps: now {plan.total_steps:,} in all")
+            if plan.total_steps > step:
+                seen = f"{self.state.validation_psnr:.1f} of {target.psnr:g} dB on photos set aside after {step:,} steps"
+                next_ = "annealing over" if plan.decisions[-1].reason == "target" else "going on for"
+                self.progress.note(f"{seen}: {next_} {plan.total_steps - step:,} more")
 
     def _most_steps(self) -> int:
         """How many steps the budget allows for."""
