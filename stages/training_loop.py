@@ -257,9 +257,11 @@ class TrainingRun:
             self._write_journal()
             self.log.event("steered", step, total_steps=plan.total_steps)
             if plan.total_steps > step:
-                seen = f"{self.state.validation_psnr:.1f} of {target.psnr:g} dB on photos set aside after {step:,} steps"
-                next_ = "annealing over" if plan.decisions[-1].reason == "target" else "going on for"
-                self.progress.note(f"{seen}: {next_} {plan.total_steps - step:,} more")
+                seen = (
+                    f"{self.state.validation_psnr:.1f} of {target.psnr:g} dB on photos set aside after {step:,} steps"
+                )
+                and_now = "annealing over" if plan.decisions[-1].reason == "target" else "going on for"
+                self.progress.note(f"{seen}: {and_now} {plan.total_steps - step:,} more")
 
     def _most_steps(self) -> int:
         """How many steps the budget allows for."""
