@@ -79,7 +79,7 @@ def read(folder: Path) -> Manifest:
     """The manifest of ``folder``. Raises FileNotFoundError, or BadManifest with the reason."""
     try:
         value = unsealed(json.loads((folder / NAME).read_text("utf-8")))
-        manifest = TypeAdapter(Manifest).validate_python(value, strict=True)
+        manifest = TypeAdapter(Manifest).validate_json(json.dumps(value), strict=True)
     except FileNotFoundError:
         raise
     except ValidationError as error:

@@ -10,7 +10,7 @@ from PIL import Image
 
 from pipeline import forecast
 from pipeline.budget import Budget
-from pipeline.chain import STAGES
+from pipeline.chain import usual
 from pipeline.forecast import Photos, expected, photos_of, sfm_seconds
 from pipeline.settings import Settings
 
@@ -45,7 +45,7 @@ def test_structure_from_motion_is_foretold_within_a_factor_of_two_and_a_half(set
 
 def test_known_cameras_take_no_time() -> None:
     times = expected(Settings.model_validate({"sfm": {"cameras": Path("t.json")}}), Photos(50, 2.0))
-    assert times["sfm"] == 0.2 and set(times) == set(STAGES)
+    assert times["sfm"] == 0.2 and set(times) == set(usual())
     assert [stage for stage, seconds in times.items() if seconds is None] == ["train", "evaluate", "render", "mesh"]
 
 
