@@ -61,7 +61,7 @@ def promise(photos: Path) -> Promise:
             is_done=lambda stage: stage in done,
             time_left=lambda budget: budget.left,
         )
-        return forecast.promise(runner, list(STAGES), frozenset(), expected(runner.settings, Photos(50, 2.0)))
+        return forecast.promise(runner, usual(), frozenset(), expected(runner.settings, Photos(50, 2.0)))
 
     return words
 
@@ -75,7 +75,7 @@ def test_a_run_without_a_budget_is_foretold_in_minutes(promise: Promise) -> None
 
 def test_what_is_there_already_is_not_waited_for(promise: Promise) -> None:
     assert promise(done=("ingest", "sfm", "normalise", "effects", "train")) == ["done in about 2 min"]
-    assert promise(done=tuple(STAGES)) == [] == promise(600.0, done=tuple(STAGES))
+    assert promise(done=tuple(usual())) == [] == promise(600.0, done=tuple(usual()))
 
 
 def test_a_budget_is_promised_with_its_end_or_said_to_be_too_short(promise: Promise) -> None:
