@@ -48,7 +48,7 @@ NAMED = ("training diverged", "the field does not learn")
 def short_warm_up(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(training_loop, "WARM_UP_STEPS", WARM_UP)
     monkeypatch.setattr("stages.training_parts.write_parts", lambda *_: [])
-    monkeypatch.setattr("stages.training_setup.PROBE_RAYS", 256)
+    monkeypatch.setattr("stages.unseen.PROBE_RAYS", 256)
     monkeypatch.setattr("nerf.density_cache.EVERY", 32)  # measuring it is most of what so small a field costs
 
 
