@@ -15,7 +15,7 @@ from tests.drills.campaigns import Chain
 from tests.drills.drill import MARK, Program, finished_folders, results
 from tests.synthetic_photos import SyntheticPhotos
 
-STAGES = list(stages_of.STAGES)
+STAGES = stages_of.usual()
 NO_ROOM = "No space left on device"
 
 
