@@ -145,7 +145,9 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1])
     parser.add_argument("--steps", type=int, nargs="+", default=BUDGETS)
     parser.add_argument("--schedule", choices=SCHEDULES, default="whole")
-    parser.add_argument("--constant", type=float, default=grid_training.CONSTANT_SHARE, help="share before the rate falls")
+    parser.add_argument(
+        "--constant", type=float, default=grid_training.CONSTANT_SHARE, help="share before the rate falls"
+    )
     given = parser.parse_args()
     runs = json.loads(given.runs.read_text()) if given.runs.exists() else []
     for workspace in given.workspaces:
@@ -161,7 +163,16 @@ def main() -> None:
             run |= train_run(bench, seed, steps, given.schedule)
             last = run["points"][-1]
             psnr = " ".join(f"{name} {last[name]:.2f}" for name in ("train_psnr", "heldout_psnr", *MEANS))
-            print(workspace.stem, seed, steps, given.schedule, given.constant, psnr, f"{time.process_time() - clock:.0f} s", flush=True)
+            print(
+                workspace.stem,
+                seed,
+                steps,
+                given.schedule,
+                given.constant,
+                psnr,
+                f"{time.process_time() - clock:.0f} s",
+                flush=True,
+            )
             runs.append(run)
             given.runs.write_text(json.dumps(runs))
 

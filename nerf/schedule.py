@@ -11,7 +11,8 @@ from typing import Literal, NamedTuple
 
 Reason = Literal["begin", "clock", "target", "more"]
 
-# A run towards a target that stops early does so as every run ends: the last quarter of its steps, at the shares of that.
+# A run towards a target that stops early does so as every run ends: with the last quarter of its steps, at the shares
+# of that.
 CLOSING_SHARE = 0.75
 
 
