@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -257,7 +258,9 @@ def test_a_signal_ends_cleanly_and_soon(tmp_path: Path, number: int, code: int):
         Image.effect_noise((640, 480), 30 + k).convert("RGB").save(tmp_path / f"photos/{k}.png", compress_level=0)
     words = ["run", str(tmp_path / "photos"), "-o", str(tmp_path / "w.nerf"), "--json"]
     command = [sys.executable, "-m", "pipeline", *words]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    # A shell starts what runs in its background with Ctrl-C ignored, and these tests may be in one.
+    heard = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=heard)
     assert process.stdout is not None
     for line in process.stdout:
         if json.loads(line)["event"] == "progress":
