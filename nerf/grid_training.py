@@ -24,9 +24,7 @@ from nerf.stopwatch import Work, part
 from nerf.training import RAYS, NonFinite, StepResult, all_finite
 
 WARM_UP_STEPS = 20
-# Of the run, before the rate begins to fall. A fall over most of the run costs short runs up to 2 dB and gains long
-# ones nothing (docs/numbers.md); and what is measured before it does not depend on how long the run will be.
-CONSTANT_SHARE = 0.75
+CONSTANT_SHARE = 0.2  # of the run, before the rate begins to fall
 FINAL_RATE = 0.05  # of the rate at first
 # The distortion loss begins weak: it draws fog together wherever that stands, and far things that only smooth colours
 # tell apart (the sky) would be drawn close behind the scene before their place is known (docs/numbers.md).
