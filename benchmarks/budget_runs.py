@@ -1,7 +1,7 @@
 """Trains the grid field for one budget of steps after the other, measures each run on its way, keeps all in a file.
 
 python -m benchmarks.budget_runs fox.nerf lego_400.nerf --runs runs.json
-python -m benchmarks.budget_runs fox.nerf --schedule late --runs runs.json
+python -m benchmarks.budget_runs fox.nerf --constant 0.2 --schedule more --runs runs.json
 
 A workspace needs its stages up to effects. A run that the file holds already is not made again. All runs of a set have
 one size of field and of photos, such that 500 steps draw every pixel about once, as stage train chooses it. Beside the
@@ -19,8 +19,9 @@ from typing import Any, NamedTuple
 
 import torch
 
+from nerf import grid_training
 from nerf.grid_field import GridField
-from nerf.grid_training import CONSTANT_SHARE, GridTrainer
+from nerf.grid_training import GridTrainer
 from nerf.probe import Probe, make_probe, measure
 from nerf.ray_bank import RayBank
 from nerf.scene import Scene
@@ -44,9 +45,8 @@ PER_DOUBLING = 2  # measurements
 FIRST = 32  # steps
 MEAN_EVERY = 8  # steps
 MEANS = {"mean_10": 6.94}  # the exponent whose profile is 10 % of the run wide
-SCHEDULES = ("today", "late", "more")
-"""late: the rate is constant for three quarters of the steps and then falls; more: half of the steps as a run of their
-own, then the other half on top (`--more`)."""
+SCHEDULES = ("whole", "more")
+"""more: half of the steps as a run of their own, then the other half on top (`--more`)."""
 
 
 class Quiet:
@@ -114,17 +114,6 @@ class RunningMean:
                 self.model.state_dict()[name].lerp_(tensor, new)
 
 
-def share_of(step: int, steps: int, schedule: str) -> float:
-    """The share done before ``step`` by which the trainer takes its rate."""
-    if schedule == "late":
-        start = 0.75 * steps
-        constant = CONSTANT_SHARE * min(1, step / start)
-        return constant + (1 - CONSTANT_SHARE) * max(0.0, step - start) / (steps - start)
-    if schedule == "more":
-        return plan_of(steps // 2).extended(steps).share(step)
-    return plan_of(steps).share(step)
-
-
 def train_run(bench: Bench, seed: int, steps: int, schedule: str) -> dict[str, Any]:
     """One run, measured at geometric steps."""
     parts = photo_parts(bench.decisions, bench.scene.of_split("train"), bench.bank.device)
@@ -132,9 +121,10 @@ def train_run(bench: Bench, seed: int, steps: int, schedule: str) -> dict[str, A
     assert isinstance(trainer, GridTrainer)
     means = {name: RunningMean(trainer, exponent) for name, exponent in MEANS.items()}
     due = {round(steps / 2 ** (k / PER_DOUBLING)) for k in range(PER_DOUBLING * int(math.log2(steps / FIRST)) + 1)}
+    plan = plan_of(steps) if schedule == "whole" else plan_of(steps // 2).extended(steps)
     points, pace, rays = [], 0.0, 0
     for step in range(steps):
-        result = trainer.step(step, share_of(step, steps, schedule))
+        result = trainer.step(step, plan.share(step))
         pace += (result.psnr - pace) * max(1 / (step + 1), 0.02)
         rays += result.rays
         if (step + 1) % MEAN_EVERY == 0:
@@ -154,13 +144,17 @@ def main() -> None:
     parser.add_argument("--runs", type=Path, required=True)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1])
     parser.add_argument("--steps", type=int, nargs="+", default=BUDGETS)
-    parser.add_argument("--schedule", choices=SCHEDULES, default="today")
+    parser.add_argument("--schedule", choices=SCHEDULES, default="whole")
+    parser.add_argument(
+        "--constant", type=float, default=grid_training.CONSTANT_SHARE, help="share before the rate falls"
+    )
     given = parser.parse_args()
     runs = json.loads(given.runs.read_text()) if given.runs.exists() else []
     for workspace in given.workspaces:
         bench = None
         for seed, steps in product(given.seeds, given.steps):
             run = {"set": workspace.stem, "seed": seed, "steps": steps, "schedule": given.schedule}
+            run["constant"] = grid_training.CONSTANT_SHARE = given.constant
             if any(run.items() <= made.items() for made in runs):
                 continue
             bench = bench or bench_of(workspace)
@@ -169,7 +163,16 @@ def main() -> None:
             run |= train_run(bench, seed, steps, given.schedule)
             last = run["points"][-1]
             psnr = " ".join(f"{name} {last[name]:.2f}" for name in ("train_psnr", "heldout_psnr", *MEANS))
-            print(workspace.stem, seed, steps, given.schedule, psnr, f"{time.process_time() - clock:.0f} s", flush=True)
+            print(
+                workspace.stem,
+                seed,
+                steps,
+                given.schedule,
+                given.constant,
+                psnr,
+                f"{time.process_time() - clock:.0f} s",
+                flush=True,
+            )
             runs.append(run)
             given.runs.write_text(json.dumps(runs))
 

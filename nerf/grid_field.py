@@ -21,6 +21,7 @@ from nerf.kernels.marching import unit_coordinates
 from nerf.model import Rendering
 from nerf.randomness import generator
 from nerf.rays import Rays
+from nerf.sky import initial_sky, sky_backward, sky_colour
 from nerf.stopwatch import Work, part
 from nerf.waves import HIDDEN_BEHIND, Wave, front_to_back, packed
 
@@ -39,6 +40,7 @@ class GridSettings:
 
     ``steps``: lattice steps along the diagonal of a bounded scene's box. ``shortest_step`` (scene units) and ``cone``
     (step per distance) replace it where space is ``contracted``. Without ``view_dependence`` a point has one colour.
+    ``sky``: a colour for each direction lies behind everything (nerf/sky.py), whatever else is given as a background.
     """
 
     levels: int = 5
@@ -53,6 +55,7 @@ class GridSettings:
     most_samples: int = 1024
     cache_cells: int = 128
     view_dependence: bool = True
+    sky: bool = False
 
     def __post_init__(self) -> None:
         at_least = {"levels": 1, "features": 1, "log2_rows": 1, "coarsest": 1, "steps": 1, "most_samples": 1}
@@ -96,11 +99,13 @@ class GridPass(NamedTuple):
 
 
 class GridGradients(NamedTuple):
-    """Of the networks and, by way of the samples' features and the rays' harmonics, of whatever lies before them."""
+    """Of the networks and, by way of the samples' features, the rays' harmonics and the background, of whatever lies
+    before them."""
 
     weights: Weights
     features: Float[Tensor, "samples width"]
     harmonics: Float[Tensor, "rays direction"]
+    background: Float[Tensor, "rays 3"]
 
 
 class GridField(nn.Module):
@@ -117,6 +122,7 @@ class GridField(nn.Module):
     density_out: Tensor
     colour_hidden: Tensor
     colour_out: Tensor
+    sky: Tensor
 
     def __init__(self, settings: GridSettings, seed: int, backend: Backend) -> None:
         super().__init__()
@@ -133,6 +139,8 @@ class GridField(nn.Module):
         direction = grid_mlp.DIRECTION if settings.view_dependence else 0
         for name, weight in grid_mlp.initial_weights(self.layout.width, direction, random)._asdict().items():
             self.register_buffer(name, weight)
+        if settings.sky:
+            self.register_buffer("sky", initial_sky())
         self.register_buffer("bits", torch.full((settings.cache_cells**3 // 64,), -1))  # every cell may hold something
 
     @property
@@ -176,7 +184,8 @@ class GridField(nn.Module):
             before = light.index_select(0, wave.number)
             seen.index_add_(0, wave.number, before[:, None] * torch.cat([alone.colour, alone.depth[:, None]], -1))
             light[wave.number] = before * (1 - alone.opacity)
-        return Rendering(seen[:, :3] + light[:, None] * background, seen[:, 3] + light * rays.far, 1 - light)
+        behind = self._behind(rays, background)
+        return Rendering(seen[:, :3] + light[:, None] * behind, seen[:, 3] + light * rays.far, 1 - light)
 
     def _composited(self, wave: Wave, harmonics: Float[Tensor, "rays direction"]) -> Rendering:
         """What a wave's samples alone let its rays see, before nothing, which is nowhere."""
@@ -188,6 +197,7 @@ class GridField(nn.Module):
     def forward(self, rays: Rays, jitter: Float[Tensor, "rays"], background: Float[Tensor, "rays 3"]) -> GridPass:
         """Density of all samples in occupied cells; colour of those that can be seen."""
         backend, rays = self.backend, Rays(*(part.contiguous() for part in rays))
+        background = self._behind(rays, background)
         waves = list(self._waves(rays, jitter))
         with part("march"):
             samples, order = packed(waves, len(jitter))
@@ -213,7 +223,8 @@ class GridField(nn.Module):
         of_colour = grid_mlp.colour_backward(self.weights, backend, done.samples, colour, grad_colour)
         of_density = grid_mlp.density_backward(self.weights, backend, density, grad_sigma, of_colour.geometry)
         weights = Weights(of_density.density_hidden, of_density.density_out, *of_colour[:2])
-        return GridGradients(weights, of_density.features, of_colour.harmonics)
+        of_background = (1 - done.rendering.opacity)[:, None] * grad.colour
+        return GridGradients(weights, of_density.features, of_colour.harmonics, of_background)
 
     def rays_backward(
         self, done: GridPass, gradients: GridGradients
@@ -224,7 +235,17 @@ class GridField(nn.Module):
         grad_origins, grad_directions = backend.sample_points_backward(
             rays, samples, self.settings.contracted, grad_points
         )
-        return grad_origins, grad_directions + self.of_directions_backward(rays.directions, gradients.harmonics)
+        grad_directions = grad_directions + self.of_directions_backward(rays.directions, gradients.harmonics)
+        if self.settings.sky:
+            grad_directions += sky_backward(backend, self.sky, rays.directions, gradients.background)[1]
+        return grad_origins, grad_directions
+
+    def sky_backward(self, done: GridPass, gradients: GridGradients) -> Float[Tensor, "rows 4"]:
+        """Gradient of the sky, for a field that has one."""
+        return sky_backward(self.backend, self.sky, done.rays.directions, gradients.background)[0]
+
+    def _behind(self, rays: Rays, background: Float[Tensor, "*#rays 3"]) -> Float[Tensor, "*#rays 3"]:
+        return sky_colour(self.backend, self.sky, rays.directions) if self.settings.sky else background
 
     def _waves(self, rays: Rays, jitter: Float[Tensor, "rays"]) -> Iterator[Wave]:
         return front_to_back(self.backend, self.bits, self.lattice, self._density_pass, rays, jitter)

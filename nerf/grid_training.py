@@ -20,11 +20,14 @@ from nerf.parallel import in_order
 from nerf.randomness import generator
 from nerf.ray_bank import RayBank
 from nerf.rays import Rays
+from nerf.sky import RATE as SKY_RATE
 from nerf.stopwatch import Work, part
 from nerf.training import RAYS, NonFinite, StepResult, all_finite
 
 WARM_UP_STEPS = 20
-CONSTANT_SHARE = 0.2  # of the run, before the rate begins to fall
+# Of the run, before the rate begins to fall. A fall over most of the run costs short runs up to 2 dB and gains long
+# ones nothing (docs/numbers.md); and what is measured before it does not depend on how long the run will be.
+CONSTANT_SHARE = 0.75
 FINAL_RATE = 0.05  # of the rate at first
 # The distortion loss begins weak: it draws fog together wherever that stands, and far things that only smooth colours
 # tell apart (the sky) would be drawn close behind the scene before their place is known (docs/numbers.md).
@@ -83,6 +86,7 @@ class _Part(NamedTuple):
     weights: Weights
     features: Float[Tensor, "samples width"]
     points: Float[Tensor, "samples 3"]
+    sky: dict[str, Tensor]
     photos: dict[str, Tensor]
     norm: Tensor
     thickness: Float[Tensor, "samples"]
@@ -116,7 +120,9 @@ class GridTrainer:
         self.cache = DensityCache(model)
         self.photo_parts = [each for each in (photo_rays, photo_colours) if each.parameters]
         self.photo_parameters = {**photo_rays.parameters, **photo_colours.parameters}
-        self.parameters = {"table": model.table, **model.weights._asdict(), **self.photo_parameters}
+        of_networks = model.weights._asdict()
+        self.sky = {"sky": model.sky} if model.settings.sky else {}
+        self.parameters = {"table": model.table, **of_networks, **self.sky, **self.photo_parameters}
         self.mean = {name: torch.zeros_like(tensor) for name, tensor in self.parameters.items()}
         self.square = {name: torch.zeros_like(tensor) for name, tensor in self.parameters.items()}
         self.grad_table = torch.zeros_like(model.table)
@@ -190,10 +196,13 @@ class GridTrainer:
             gradients = self.model.backward(done, loss.grad, loss.grad_weights)
             grad_rays = partial(self.model.rays_backward, done, gradients)
             photos = loss.grad_photos | self.photo_rays.backward(batch.rays, batch.view, grad_rays)
-        weights, features, _ = gradients
+            sky = {name: self.model.sky_backward(done, gradients) for name in self.sky}
+        weights, features, *_ = gradients
         thickness = done.density.sigma * done.samples.dt
-        norm = torch.nn.utils.get_total_norm([*weights, features, *photos.values()])
-        return _Part(batch, loss.value, loss.squared_error, weights, features, done.points, photos, norm, thickness)
+        norm = torch.nn.utils.get_total_norm([*weights, features, *sky.values(), *photos.values()])
+        return _Part(
+            batch, loss.value, loss.squared_error, weights, features, done.points, sky, photos, norm, thickness
+        )
 
     def _backward_work(self, done: GridPass) -> Work:
         weights = self.model.weights
@@ -234,6 +243,7 @@ class GridTrainer:
         work = [partial(self._update_level, level, parts, rate, count) for level in finest_first]
         of_networks = [chunk.weights._asdict() for chunk in parts]
         work.append(partial(self._update_small, Weights._fields, of_networks, rate, count))
+        work.append(partial(self._update_small, self.sky, [chunk.sky for chunk in parts], SKY_RATE * rate, count))
         work.append(partial(self._raise_cache, parts))
         for of_photos in self.photo_parts:
             work.append(partial(self._update_photos, of_photos, parts, of_photos.rate * factor, count))

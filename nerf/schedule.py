@@ -11,8 +11,9 @@ from typing import Literal, NamedTuple
 
 Reason = Literal["begin", "clock", "target", "more"]
 
-# Of the steps done so far: in how many more a run towards a target anneals once that may be what it takes.
-CLOSING_SHARE = 0.25
+# A run towards a target that stops early does so as every run ends: with the last quarter of its steps, at the shares
+# of that.
+CLOSING_SHARE = 0.75
 
 
 class Decision(NamedTuple):
@@ -43,19 +44,23 @@ class StepPlan(NamedTuple):
         start, total, share, _ = next(decision for decision in reversed(self.decisions) if decision.from_step <= step)
         return share if total == start else share + (1 - share) * min(1.0, (step - start) / (total - start))
 
-    def revised(self, step: int, total_steps: int, reason: Reason = "clock") -> "StepPlan":
+    def revised(self, step: int, total_steps: int) -> "StepPlan":
         """This plan with one more decision made before ``step``.
 
         Raises ValueError where that would leave no step to take, or rewrite a decision already made.
         """
         if not self.decisions[-1].from_step <= step < total_steps:
             raise ValueError(f"at step {step} the plan {self.decisions} cannot become {total_steps} steps")
-        return StepPlan((*self.decisions, Decision(step, total_steps, self.share(step), reason)))
+        return StepPlan((*self.decisions, Decision(step, total_steps, self.share(step), "clock")))
 
     def closing(self, step: int) -> "StepPlan":
-        """This plan, from ``step`` on annealed in a fraction (CLOSING_SHARE) of the steps done, or at its end if
-        that is sooner. Raises ValueError as :meth:`revised`."""
-        return self.revised(step, min(self.total_steps, step + max(1, round(CLOSING_SHARE * step))), "target")
+        """This plan with ``step`` as the first one of the last quarter of a run, or of what is left if that is less.
+        Raises ValueError where that rewrites a decision or leaves no step."""
+        if not self.decisions[-1].from_step <= step < self.total_steps:
+            raise ValueError(f"the plan {self.decisions} cannot close at step {step}")
+        total = min(self.total_steps, max(step + 1, round(step / CLOSING_SHARE)))
+        share = max(CLOSING_SHARE, self.share(step))
+        return StepPlan((*self.decisions, Decision(step, total, share, "target")))
 
     def ended(self, step: int) -> "StepPlan":
         """This plan without the steps from ``step`` on. Raises ValueError where that rewrites a decision."""

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 from pydantic import Field
 
 from stages.contract import Inputs, Progress, StageConfig, StageResult
-from stages.files import read_json, read_scene, write_png
+from stages.files import read_json, read_scene, read_tensors, write_png
 
 if TYPE_CHECKING:
     import numpy as np
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from stages.mesh_views import ShadowMap
 
 NEEDS = ("normalise", "train")
-VERSION = 1
+VERSION = 2
 RESUMES = False
 LINKS = ("mesh.glb", "mesh.ply", "mesh.obj")
 UNKEYED = ("seconds",)  # it decides the resolution, and that enters the key
@@ -137,7 +137,8 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     device = compute_device()
     model, _ = load_field(inputs["train"], device)
     config = plan(config, inputs, progress)
-    result = reconstruct(config, model, scene, device, progress)
+    points = read_tensors(inputs["normalise"] / "points.safetensors")["xyz"].astype(float)
+    result = reconstruct(config, model, scene, points, device, progress)
     progress.update("writing", 0.95)
     outputs = write_mesh(config, result.mesh, scene, folder)
     faces, parts = len(result.mesh.faces), result.cleaned.kept
@@ -149,12 +150,13 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
 
 
 def reconstruct(
-    config: Config, model: "RadianceModel", scene: "Scene", device: str, progress: Progress
+    config: Config, model: "RadianceModel", scene: "Scene", points: "np.ndarray", device: str, progress: Progress
 ) -> Reconstruction:
-    """The mesh of ``model`` in the scene frame; ``config.resolution`` must be set. Raises StageError without one."""
+    """The mesh of ``model`` in the scene frame, where sparse ``points`` (n, 3) are, too; ``config.resolution`` must be
+    set. Raises StageError without a surface."""
     from scipy.spatial import KDTree
 
-    from stages.mesh_cleaning import clean, openness
+    from stages.mesh_cleaning import clean, located, openness
     from stages.mesh_files import ColouredMesh
     from stages.mesh_surface import decimate, extract, vertex_normals
     from stages.mesh_views import look, shadow_maps
@@ -168,7 +170,8 @@ def reconstruct(
     raw = extract(lattice, level.level)
     sight = look(raw.vertices, vertex_normals(raw), maps, voxel)
     progress.update("cleaning", 0.85)
-    cleaned = clean(raw, sight, config.keep, min(config.min_views, len(views)), config.min_component)
+    near = located(raw.vertices, points)
+    cleaned = clean(raw, sight, near, config.keep, min(config.min_views, len(views)), config.min_component)
     surface = decimate(cleaned.surface, config.max_faces)
     progress.update("colours", 0.9)
     nearest = KDTree(cleaned.surface.vertices).query(surface.vertices)[1]

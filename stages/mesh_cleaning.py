@@ -1,4 +1,4 @@
-"""Which parts of a raw surface to keep: what the photos cover and see, without specks."""
+"""Which parts of a raw surface to keep: what the photos cover, see and locate, without specks."""
 
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
@@ -12,6 +12,10 @@ if TYPE_CHECKING:
 
 Keep = Literal["visible", "largest", "all"]
 SEEN_SHARE = 0.1  # of a component's area; an inner cavity has none, the seen side of an object about half
+# Of a component's area, near a sparse point. Surfaces have 0.8 to 1 of theirs, sheets of sky none (docs/numbers.md).
+LOCATED_SHARE = 0.1
+REACH = 0.1  # scene units; farther where points stand that far apart themselves
+REACH_IN_SPACINGS = 3.0
 
 
 class Cleaned(NamedTuple):
@@ -24,13 +28,30 @@ class Cleaned(NamedTuple):
     uncovered: int
 
 
-def clean(surface: Surface, sight: "Sight", keep: Keep, min_views: int, min_component: float) -> Cleaned:
-    """Drop what the photos do not vouch for.
+def located(vertices: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Whether a sparse point is near each vertex, (n,) bool; ``points`` (m, 3), in the same frame.
+
+    Sparse points are where details of photos agree on a place. What has none far and wide (sky, fog) is somewhere
+    only because the field had to put it somewhere. Without two points nothing is known, and all is True.
+    """
+    from scipy.spatial import KDTree
+
+    if len(points) < 2:
+        return np.ones(len(vertices), bool)
+    tree = KDTree(points)
+    spacing = float(np.median(tree.query(points, 2)[0][:, 1]))
+    return tree.query(vertices, distance_upper_bound=max(REACH, REACH_IN_SPACINGS * spacing))[0] < np.inf
+
+
+def clean(
+    surface: Surface, sight: "Sight", near_points: np.ndarray, keep: Keep, min_views: int, min_component: float
+) -> Cleaned:
+    """Drop what the photos do not vouch for; ``near_points``: of each vertex, by :func:`located`.
 
     ``visible`` cuts the faces that fewer than ``min_views`` photos cover (depth cannot be known from one), then
-    drops components that hardly any of those photos see (inner cavities) and those with less than
-    ``min_component`` of the largest one's area. ``largest`` keeps the component of largest area, ``all`` everything.
-    Raises StageError if nothing remains.
+    drops components that hardly any of those photos see (inner cavities), those far from all sparse points unless all
+    are, and those with less than ``min_component`` of the largest one's area. ``largest`` keeps the component of
+    largest area, ``all`` everything. Raises StageError if nothing remains.
     """
     covered = np.all(sight.covered[surface.faces] >= min_views, axis=1) | (keep != "visible")
     if not covered.any():
@@ -41,7 +62,8 @@ def clean(surface: Surface, sight: "Sight", keep: Keep, min_views: int, min_comp
     count = int(label.max()) + 1
     if keep == "visible":
         seen = np.any(sight.seen[old][surface.faces] >= min_views, axis=1)
-        good = _worth_keeping(label, face_areas(surface), seen, min_component)
+        near = np.any(near_points[old][surface.faces], axis=1)
+        good = _worth_keeping(label, face_areas(surface), seen, near, min_component)
     else:
         good = np.arange(count) < (1 if keep == "largest" else count)
     if not good.any():
@@ -51,12 +73,15 @@ def clean(surface: Surface, sight: "Sight", keep: Keep, min_views: int, min_comp
     return Cleaned(surface, old[left], int(good.sum()), int((~good).sum()), int((~covered).sum()))
 
 
-def _worth_keeping(label: np.ndarray, area: np.ndarray, seen: np.ndarray, min_component: float) -> np.ndarray:
-    """Whether each component is seen and large enough, (components,) bool."""
+def _worth_keeping(
+    label: np.ndarray, area: np.ndarray, seen: np.ndarray, near: np.ndarray, min_component: float
+) -> np.ndarray:
+    """Whether each component is seen, located and large enough, (components,) bool."""
     total = np.bincount(label, area)
-    visible = np.bincount(label, area * seen) >= SEEN_SHARE * total
-    visible &= total > 0
-    return visible & (total >= min_component * total[visible].max(initial=0.0))
+    good = (np.bincount(label, area * seen) >= SEEN_SHARE * total) & (total > 0)
+    certain = good & (np.bincount(label, area * near) >= LOCATED_SHARE * total)
+    good = certain if certain.any() else good
+    return good & (total >= min_component * total[good].max(initial=0.0))
 
 
 def openness(surface: Surface, half_box: float, voxel: float) -> str:

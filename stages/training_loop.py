@@ -235,6 +235,7 @@ class TrainingRun:
     def _steer(self, target: "Target") -> None:
         """Stop where the validation photos are as good as wanted; anneal where that may be all it takes; go on as
         before where it was not enough and there is time. Decisions already in the plan are not made again."""
+        from nerf.schedule import CLOSING_SHARE
         from stages.unseen import look
 
         step, decided = self.state.step, self.plan.decisions[-1]
@@ -250,7 +251,7 @@ class TrainingRun:
         elif step == plan.total_steps:
             if decided.reason == "target" and self._most_steps() > step:
                 plan = plan.extended(self._most_steps())
-        elif decided.reason != "target" and missing <= ANNEALING_DB / 2**failed:
+        elif missing <= ANNEALING_DB / 2**failed and plan.share(step) < CLOSING_SHARE:
             plan = plan.closing(step)
         if plan is not self.plan:
             self.plan = plan

@@ -80,7 +80,7 @@ def field_bytes(config: "Config", workers: int) -> float:
     if config.field == "grid":
         from nerf.kernels import grid_layout
 
-        settings = grid_settings(config)
+        settings = grid_settings(config, sky=False)  # which is small beside the rest
         sizes = settings.levels, settings.coarsest, settings.finest, settings.log2_rows, settings.features
         assert config.batch_samples
         return TABLE_COPIES * 4 * settings.features * grid_layout(*sizes).rows + SAMPLE_BYTES * config.batch_samples
@@ -128,7 +128,7 @@ def make_trainer(
 
         assert config.backend, "plan() chooses it"
         backend = load_backend(config.backend, bank.device.type)
-        model = GridField(grid_settings(config), seed, backend).to(bank.device)
+        model = GridField(grid_settings(config, has_sky(config, scene)), seed, backend).to(bank.device)
         return GridTrainer(model, bank, grid_trainer_settings(config, scene, seed), *photo_parts)
     from nerf.paper import PaperNerf
     from nerf.training import PaperTrainer
@@ -149,7 +149,12 @@ def _say_sizes(config: "Config", bank: "RayBank", progress: Progress) -> None:
     progress.note(f"{config.field} field ({sizes}), {budget} · {photos}, {short_count(len(bank.pixels))} pixels")
 
 
-def grid_settings(config: "Config") -> "GridSettings":
+def has_sky(config: "Config", scene: "Scene") -> bool:
+    """Whether something is seen at infinity: where space has no end, and no alpha tells what is seen of it."""
+    return bool(config.contracted) and not scene.has_alpha
+
+
+def grid_settings(config: "Config", sky: bool) -> "GridSettings":
     """Sizes of the grid field. Samples stand as close as the finest cells can tell them apart: in folded space half a
     cell (it is 4 wide), growing with the distance from where the cells do; in a box two steps to three cells."""
     from nerf.grid_field import GridSettings
@@ -166,6 +171,7 @@ def grid_settings(config: "Config") -> "GridSettings":
         shortest_step=2 / (config.ray_samples * config.finest),
         cone=8 / (config.ray_samples * config.finest),
         view_dependence=config.view_dependence,
+        sky=sky,
     )
 
 

@@ -6,9 +6,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nerf import grid_mlp
+from nerf import grid_mlp, sky
 from nerf.grid_mlp import DIRECTION, GEOMETRY, HIDDEN, LARGEST_LOG_DENSITY, DensityPass, Weights
-from nerf.kernels import Backend, Samples, grid_layout
+from nerf.kernels import Backend, GridLayout, Samples, grid_layout
 from nerf.kernels.adam import LEAST_ROOT, MEAN_DECAY, SQUARE_DECAY
 from nerf.numerics import Bound, Case
 from nerf.numerics.space import decades, directions, uniform
@@ -52,28 +52,30 @@ def _encode_points_backward(backend: Backend, grad: Tensor, points: Tensor) -> t
     return (backend.encode_backward_points(LAYOUT, _table(points), points, grad),)
 
 
-def _trilinear(table: Tensor, points: Tensor) -> Tensor:
+def _trilinear(table: Tensor, points: Tensor, layout: GridLayout = LAYOUT) -> Tensor:
     """Level by level and corner by corner, as the layout's docstring has it."""
     levels = []
-    for level, resolution in enumerate(LAYOUT.resolutions):
+    for level, resolution in enumerate(layout.resolutions):
         scaled = points * resolution
         cell = scaled.detach().floor().clamp(0, resolution - 1)
         mean: Any = 0
         for corner in torch.cartesian_prod(*[torch.arange(2, device=points.device)] * 3):
             share = torch.where(corner == 1, scaled - cell, 1 - (scaled - cell))
-            mean = mean + (share[:, :1] * share[:, 1:2] * share[:, 2:]) * table[_row(level, cell.long() + corner)]
+            mean = (
+                mean + (share[:, :1] * share[:, 1:2] * share[:, 2:]) * table[_row(layout, level, cell.long() + corner)]
+            )
         levels.append(mean)
     return torch.cat(levels, -1)
 
 
-def _row(level: int, vertex: Tensor) -> Tensor:
+def _row(layout: GridLayout, level: int, vertex: Tensor) -> Tensor:
     x, y, z = vertex.unbind(-1)
-    if LAYOUT.hashed(level):
-        number = (x ^ (y * 2654435761) ^ (z * 805459861)) % LAYOUT.level_rows(level)
+    if layout.hashed(level):
+        number = (x ^ (y * 2654435761) ^ (z * 805459861)) % layout.level_rows(level)
     else:
-        side = LAYOUT.resolutions[level] + 1
+        side = layout.resolutions[level] + 1
         number = (x * side + y) * side + z
-    return LAYOUT.first_rows[level] + number
+    return layout.first_rows[level] + number
 
 
 def _table_points(like: Tensor) -> Tensor:
@@ -169,6 +171,23 @@ def _colour_plainly(geometry: Tensor, harmonics: Tensor) -> Tensor:
     return torch.sigmoid(hidden @ weights.colour_out.T)
 
 
+def _sky_directions(like: Tensor) -> Tensor:
+    return torch.nn.functional.normalize(_dyadic(directions(12, 512))).to(like)
+
+
+def _sky(backend: Backend, table: Tensor) -> Tensor:
+    return sky.sky_colour(backend, table, _sky_directions(table))
+
+
+def _sky_backward(backend: Backend, grad: Tensor, table: Tensor) -> tuple[Tensor]:
+    return (sky.sky_backward(backend, table, _sky_directions(table), grad)[0],)
+
+
+def _sky_plainly(table: Tensor) -> Tensor:
+    on_sphere = (_sky_directions(torch.zeros(1)).to(table) + 1) / 2
+    return torch.sigmoid(sum(_trilinear(table, on_sphere, sky.LAYOUT).split(4, -1)))[:, :3]
+
+
 def _adam(backend: Backend, gradient: Tensor, mean: Tensor, square: Tensor) -> Tensor:
     """How far an entry moves, in rates."""
     entry = torch.zeros_like(gradient)
@@ -192,6 +211,7 @@ def _hard_gradients() -> tuple[Tensor, Tensor, Tensor]:
 
 
 LOGARITHMS = torch.tensor([[-1e30], [-200.0], [-88.0], [-1e-45], [0.0], [14.999], [15.0], [15.000001], [88.0], [1e30]])
+SKY_SIZES = torch.tensor([0, 1e-38, 1.0, 30.0, 1.0]).repeat(sky.LAYOUT.rows)[: sky.LAYOUT.rows, None]
 
 CASES = [
     Case(
@@ -239,6 +259,23 @@ CASES = [
         backward=_encode_table_backward,
         value=Bound(1e-6, "one"),
         gradient=Bound(5e-6, "row"),
+        differentiable=1,
+        kernels=True,
+    ),
+    Case(
+        formula="the sky: sigmoid of what its table has on the unit sphere",
+        where="nerf/sky.py: sky_colour, sky_backward",
+        domain="finite features",
+        hazard="levels cancel: a logit is off by half an ulp of the largest feature; 1 − c is 0 beyond 17",
+        answer="accepted, as for the colour network: where features are that large, the colour is saturated",
+        tried="features of size 1, 0, 1e-38 and 30 in 512 directions",
+        typical=lambda: (uniform(13, -1, 1, sky.LAYOUT.rows, 4) * SKY_SIZES,),
+        extreme=lambda: (torch.zeros(0, 4),),
+        function=_sky,
+        reference=_sky_plainly,
+        backward=_sky_backward,
+        value=Bound(5e-6, "one"),
+        gradient=Bound(5e-6, "one"),
         differentiable=1,
         kernels=True,
     ),

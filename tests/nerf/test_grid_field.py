@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerf import grid_mlp
+from nerf import grid_mlp, sky
 from nerf.grid_field import GridField, GridSettings
 from nerf.kernels import GridLayout, Samples, reference
 from nerf.model import RadianceModel, Rendering
@@ -14,12 +14,15 @@ from nerf.waves import HIDDEN_BEHIND
 
 SMALL = GridSettings(levels=2, log2_rows=9, coarsest=3, finest=9, steps=24, cache_cells=8)
 FOLDED = replace(SMALL, contracted=True, shortest_step=0.1, cone=0.2)
+OUTDOORS = replace(FOLDED, sky=True)
 
 
 def field(settings: GridSettings = SMALL, seed: int = 1) -> GridField:
     """A field in float64 whose features are large enough to matter."""
     model = GridField(settings, seed, reference).double()
     model.table.mul_(2e4)
+    if settings.sky:
+        model.sky.normal_(generator=torch.Generator().manual_seed(5))
     return model
 
 
@@ -38,7 +41,10 @@ def seen_by_autograd(model: GridField, given: Rays, jitter: Tensor, background: 
     settings = model.settings
     samples = reference.march(model.bits, model.lattice, Rays(*(part.detach() for part in given)), jitter)
     points = reference.sample_points(given, samples, settings.contracted)
-    features = encoded_by_autograd(model, points)
+    features = encoded_by_autograd(model.layout, model.table, points)
+    if settings.sky:
+        on_sphere = encoded_by_autograd(sky.LAYOUT, model.sky, (given.directions + 1) / 2)
+        background = torch.sigmoid(sum(on_sphere.split(4, -1)))[:, :3]
     weights = model.weights
     geometry = torch.relu(features @ weights.density_hidden) @ weights.density_out.T
     sigma = geometry[:, 0].clamp(max=15).exp()
@@ -50,9 +56,8 @@ def seen_by_autograd(model: GridField, given: Rays, jitter: Tensor, background: 
     return (rendering.colour * torch.tensor([1.0, 2.0, -3.0])).sum() + rendering.depth.sum()
 
 
-def encoded_by_autograd(model: GridField, points: Tensor) -> Tensor:
+def encoded_by_autograd(layout: GridLayout, table: Tensor, points: Tensor) -> Tensor:
     features = []
-    layout = model.layout
     for level, resolution in enumerate(layout.resolutions):
         scaled = points * resolution
         cell = scaled.detach().floor().clamp(0, resolution - 1)
@@ -65,12 +70,12 @@ def encoded_by_autograd(model: GridField, points: Tensor) -> Tensor:
                 number = (x ^ (y * 2654435761) ^ (z * 805459861)) % layout.level_rows(level)
             else:
                 number = (x * (resolution + 1) + y) * (resolution + 1) + z
-            value = value + share[:, None] * model.table[layout.first_rows[level] + number]
+            value = value + share[:, None] * table[layout.first_rows[level] + number]
         features.append(value)
     return torch.cat(features, -1)
 
 
-@pytest.mark.parametrize("settings", [SMALL, FOLDED])
+@pytest.mark.parametrize("settings", [SMALL, FOLDED, OUTDOORS])
 def test_all_gradients_are_those_of_autograd(settings: GridSettings) -> None:
     model, given = field(settings), rays()
     jitter = torch.rand(6, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
@@ -85,12 +90,15 @@ def test_all_gradients_are_those_of_autograd(settings: GridSettings) -> None:
         reference.encode_backward_table(model.layout, level, done.points, gradients.features, grad_table)
     of_rays = model.rays_backward(done, gradients)
 
-    parameters = [model.table, *model.weights, given.origins, given.directions]
+    of_sky = [model.sky_backward(done, gradients)] if settings.sky else []
+
+    skies = [model.sky] if settings.sky else []
+    parameters = [model.table, *model.weights, *skies, given.origins, given.directions]
     for parameter in parameters:
         parameter.requires_grad_()
     wanted = torch.autograd.grad(seen_by_autograd(model, given, jitter, background), parameters)
     assert all(part.abs().max() > 1e-3 for part in wanted)
-    torch.testing.assert_close((grad_table, *gradients.weights, *of_rays), wanted, rtol=1e-9, atol=1e-10)
+    torch.testing.assert_close((grad_table, *gradients.weights, *of_sky, *of_rays), wanted, rtol=1e-9, atol=1e-10)
 
 
 def test_density_is_bounded_in_value_and_gradient() -> None:
@@ -134,6 +142,21 @@ def test_closed_cells_are_not_seen() -> None:
     assert (rendering.opacity == 0).all()
     assert torch.equal(rendering.depth, given.far)
     assert rendering.colour[3].tolist() == [0.2, 0.4, 0.6]
+
+
+def test_what_nothing_stops_ends_in_the_sky_whatever_the_background() -> None:
+    model, given = field(OUTDOORS), rays()
+    model.bits.zero_()
+    seen = [model.render(given, torch.full((3,), shade, dtype=torch.float64)).colour for shade in (0.0, 1.0)]
+    assert torch.equal(*seen) and seen[0].std(0).min() > 0.01
+    torch.testing.assert_close(seen[0], sky.sky_colour(reference, model.sky, given.directions))
+    there_too = Rays(1000 + given.origins, *given[1:])
+    assert torch.equal(model.render(there_too, torch.zeros(3, dtype=torch.float64)).colour, seen[0])
+
+
+def test_a_new_sky_is_grey_all_around() -> None:
+    model = GridField(OUTDOORS, 1, reference)
+    assert (sky.sky_colour(reference, model.sky, torch.nn.functional.normalize(torch.randn(99, 3))) == 0.5).all()
 
 
 def test_parameters_depend_on_the_seed_alone() -> None:

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nerf.schedule import StepPlan, learning_rate, plan_of, replanned, steps_that_fit
+from nerf.schedule import CLOSING_SHARE, StepPlan, learning_rate, plan_of, replanned, steps_that_fit
 
 
 @st.composite
@@ -51,6 +51,27 @@ def test_more_steps_take_the_share_back_to_that_of_the_longer_run(plan: StepPlan
     for step in range(done, done + more + 1):
         assert longer.share(step) == pytest.approx(whole.share(step), abs=1e-12)
     assert longer.extended(done + more + yet_more).share(done + more) == (done + more) / (done + more + yet_more)
+
+
+@given(st.integers(1, 500), st.data())
+def test_a_run_that_closes_early_ends_as_every_run_does(total: int, data: st.DataObject) -> None:
+    plan, step = plan_of(total), data.draw(st.integers(0, total - 1))
+    closed = plan.closing(step)
+    assert step < closed.total_steps <= total
+    assert closed.share(step) >= CLOSING_SHARE and closed.share(closed.total_steps) == 1
+    assert [closed.share(s) for s in range(step)] == [plan.share(s) for s in range(step)]
+    if closed.total_steps < total and step >= 10:
+        whole = plan_of(closed.total_steps)
+        assert closed.share(step) == pytest.approx(whole.share(step), abs=0.05)
+
+
+def test_a_run_may_end_at_any_step_it_has_come_to() -> None:
+    ended = plan_of(10).closing(6).ended(7)
+    assert ended.total_steps == 7 and ended.share(7) == plan_of(10).closing(6).share(7)
+    with pytest.raises(ValueError, match="cannot end"):
+        ended.ended(7)
+    with pytest.raises(ValueError, match="cannot close"):
+        ended.closing(7)
 
 
 @pytest.mark.parametrize("total", [4, 3])

@@ -97,7 +97,7 @@ def test_grids_grow_with_rays_and_pixels(scene: Scene, rays: float, factor: floa
 
     small, more_rays, fewer_pixels = chosen(rays, down), chosen(rays * factor, down), chosen(rays, down * factor)
     assert all(more_rays[name] >= small[name] >= fewer_pixels[name] for name in small)
-    field = grid_settings(config.model_copy(update=small))
+    field = grid_settings(config.model_copy(update=small), sky=False)
     assert isinstance(field, GridSettings)
     assert 128 <= field.finest <= 1024
     # Two neighbouring samples lie in the same or in neighbouring cells of the finest grid, near the cameras at least.
@@ -109,8 +109,8 @@ def test_grids_grow_with_rays_and_pixels(scene: Scene, rays: float, factor: floa
 @given(factor=st.floats(0.25, 4.0))
 def test_ray_samples_multiply_the_samples_along_a_ray(contracted: bool, factor: float) -> None:
     sizes = {"levels": 4, "log2_rows": 16, "finest": 512, "contracted": contracted}
-    usual = grid_settings(GRID.model_copy(update=sizes))
-    asked = grid_settings(GRID.model_copy(update=sizes | {"ray_samples": factor}))
+    usual = grid_settings(GRID.model_copy(update=sizes), sky=False)
+    asked = grid_settings(GRID.model_copy(update=sizes | {"ray_samples": factor}), sky=False)
     assert asked.steps == pytest.approx(factor * usual.steps, abs=0.5)
     assert asked.cone == pytest.approx(usual.cone / factor)
     assert asked.lattice.step == pytest.approx(usual.lattice.step / factor, rel=0.01)

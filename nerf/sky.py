@@ -1,0 +1,57 @@
+"""What folded space stands before: a colour of the viewing direction alone, as if it were infinitely far away.
+
+Without it a ray that nothing stops ends in black: skies, haze and dark distance have to be drawn somewhere in space,
+which two photos' disagreement about a smooth surface cannot tell, and directions that no photo looked in are black
+holes. That light from infinity depends on the direction alone is Rematas et al. 2022 (Urban Radiance Fields, section
+3.2), who use a network; here it is a coarse feature grid like the field's own, read where the direction meets the unit
+sphere: colour = sigmoid(sum of the levels' features).
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerf.kernels import Backend, grid_layout
+
+# Of the last, one cell is 7° wide: skies and far hills, not what has parallax. Three features are a colour; the kernels
+# read four.
+LAYOUT = grid_layout(levels=2, coarsest=4, finest=16, log2_rows=13, features=4)
+# Of the field's. The sky must be found before fog near the cameras takes its place (docs/numbers.md).
+RATE = 10.0
+
+
+def initial_sky() -> Float[Tensor, "rows 4"]:
+    """Grey in every direction."""
+    return torch.zeros(LAYOUT.rows, LAYOUT.features)
+
+
+def sky_colour(
+    backend: Backend, sky: Float[Tensor, "rows 4"], directions: Float[Tensor, "rays 3"]
+) -> Float[Tensor, "rays 3"]:
+    """The colour seen in each direction (unit vectors)."""
+    return _levels(backend.encode(LAYOUT, sky, _on_sphere(directions))).sum(1)[:, :3].sigmoid()
+
+
+def sky_backward(
+    backend: Backend,
+    sky: Float[Tensor, "rows 4"],
+    directions: Float[Tensor, "rays 3"],
+    grad: Float[Tensor, "rays 3"],
+) -> tuple[Float[Tensor, "rows 4"], Float[Tensor, "rays 3"]]:
+    """Gradients of the sky and of the directions, each taken as a free vector, given that of the colours."""
+    colour, unit = sky_colour(backend, sky, directions), _on_sphere(directions)
+    of_logits = torch.nn.functional.pad(grad * colour * (1 - colour), (0, 1))
+    of_features = of_logits.repeat(1, len(LAYOUT.resolutions))
+    of_sky = torch.zeros_like(sky)
+    for level in range(len(LAYOUT.resolutions)):
+        backend.encode_backward_table(LAYOUT, level, unit, of_features, of_sky)
+    return of_sky, backend.encode_backward_points(LAYOUT, sky, unit, of_features) / 2
+
+
+def _on_sphere(directions: Float[Tensor, "rays 3"]) -> Float[Tensor, "rays 3"]:
+    """Where a direction meets the unit sphere, in the unit coordinates of the grid around it."""
+    return directions / 2 + 0.5
+
+
+def _levels(features: Float[Tensor, "rays width"]) -> Float[Tensor, "rays levels 4"]:
+    return features.view(-1, len(LAYOUT.resolutions), LAYOUT.features)
