@@ -185,7 +185,7 @@ def _sky_backward(backend: Backend, grad: Tensor, table: Tensor) -> tuple[Tensor
 
 def _sky_plainly(table: Tensor) -> Tensor:
     on_sphere = (_sky_directions(torch.zeros(1)).to(table) + 1) / 2
-    return torch.sigmoid(sum(_trilinear(table, on_sphere, sky.LAYOUT).split(4, -1)))[:, :3]
+    return torch.sigmoid(_trilinear(table, on_sphere, sky.LAYOUT).view(len(on_sphere), -1, 4).sum(1))[:, :3]
 
 
 def _adam(backend: Backend, gradient: Tensor, mean: Tensor, square: Tensor) -> Tensor:

@@ -44,7 +44,7 @@ def seen_by_autograd(model: GridField, given: Rays, jitter: Tensor, background: 
     features = encoded_by_autograd(model.layout, model.table, points)
     if settings.sky:
         on_sphere = encoded_by_autograd(sky.LAYOUT, model.sky, (given.directions + 1) / 2)
-        background = torch.sigmoid(sum(on_sphere.split(4, -1)))[:, :3]
+        background = torch.sigmoid(on_sphere.view(len(on_sphere), -1, 4).sum(1))[:, :3]
     weights = model.weights
     geometry = torch.relu(features @ weights.density_hidden) @ weights.density_out.T
     sigma = geometry[:, 0].clamp(max=15).exp()
