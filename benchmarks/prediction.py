@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from nerf.grid_training import CONSTANT_SHARE
 from nerf.learning_curve import Curve, last_doubling
 
 SHARE = 0.8  # of the truths that an interval is to hold
@@ -41,13 +42,16 @@ def final(run: Run) -> float:
     return run["points"][-1]["heldout_psnr"]
 
 
+def in_use(run: Run) -> bool:
+    """Whether a run was made in one piece, under the schedule that is in use."""
+    return run["schedule"] == "whole" and run["constant"] == CONSTANT_SHARE
+
+
 def cases_of(runs: list[Run]) -> list[Case]:
-    """Consecutive budgets of one set and seed under today's schedule."""
-    today = sorted(
-        (run for run in runs if run["schedule"] == "today"), key=lambda run: (run["set"], run["seed"], run["steps"])
-    )
+    """Consecutive budgets of one set and seed."""
+    whole = sorted(filter(in_use, runs), key=lambda run: (run["set"], run["seed"], run["steps"]))
     cases = []
-    for short, long in pairwise(today):
+    for short, long in pairwise(whole):
         if (short["set"], short["seed"], 2 * short["steps"]) != (long["set"], long["seed"], long["steps"]):
             continue
         last = last_doubling(curve_of(short))
@@ -109,9 +113,9 @@ def print_scores(cases: list[Case]) -> None:
 
 def print_schedules(runs: list[Run]) -> None:
     """What is measured on the way of a longer run, less what a run ended with that had so many steps only."""
-    ended = {(run["set"], run["seed"], run["steps"]): final(run) for run in runs if run["schedule"] == "today"}
-    for schedule in dict.fromkeys(run["schedule"] for run in runs):
-        of = [run for run in runs if run["schedule"] == schedule]
+    ended = {(run["set"], run["seed"], run["steps"]): final(run) for run in filter(in_use, runs)}
+    for schedule, constant in dict.fromkeys((run["schedule"], run["constant"]) for run in runs):
+        of = [run for run in runs if (run["schedule"], run["constant"]) == (schedule, constant)]
         for measured in MEASURED:
             for times in (2, 4, 8):
                 off = [
@@ -120,12 +124,12 @@ def print_schedules(runs: list[Run]) -> None:
                     if (short := ended.get((run["set"], run["seed"], run["steps"] // times))) is not None
                 ]
                 if len(off) > 1:
-                    print(
-                        f"{schedule:<6} {measured:<12} at 1/{times}: {mean(off):+.2f} dB, spread {np.std(off):.2f}"
-                        f" ({len(off)} runs)"
-                    )
+                    told = f"{mean(off):+.2f} dB, spread {np.std(off):.2f} ({len(off)} runs)"
+                    print(f"{schedule:<6} {constant:.0%} {measured:<12} at 1/{times}: {told}")
         alike = [final(run) - ended[key] for run in of if (key := (run["set"], run["seed"], run["steps"])) in ended]
-        print(f"{schedule:<6} at the end, beside today's: {mean(alike):+.2f} dB ({len(alike)} runs)\n")
+        print(
+            f"{schedule:<6} {constant:.0%} at the end, beside those in use: {mean(alike):+.2f} dB ({len(alike)} runs)\n"
+        )
     gained = [run["points"][-1]["mean_10"] - final(run) for run in runs]
     print(f"the running mean at the end, beside the field: {mean(gained):+.2f} dB ({len(gained)} runs)")
 

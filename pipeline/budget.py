@@ -14,7 +14,7 @@ from typing import Any
 # Of the time that is left once what cannot be planned has its own. A user waits for the field; figures, a video and a
 # mesh are there to see it by, and gain little beyond MOST_SECONDS. A training of less than half a minute is worth none.
 SHARES = {"train": 0.68, "evaluate": 0.05, "render": 0.15, "mesh": 0.12}
-LEAST_SECONDS = {"train": 30.0, "evaluate": 2.0, "render": 4.0, "mesh": 6.0}
+LEAST_SECONDS = {"train": 30.0, "evaluate": 2.0, "render": 4.0, "mesh": 8.0}
 MOST_SECONDS = {"evaluate": 60.0, "render": 300.0, "mesh": 60.0}
 SFM_SHARE = 0.5  # of the budget: what structure from motion may take before it searches fewer features
 PILOTS_SHARE = 0.15  # of the budget, and of what is left no more than

@@ -13,6 +13,7 @@ from pydantic import Field
 
 from stages.contract import Inputs, Progress, StageConfig, StageResult
 from stages.files import read_json, read_scene, read_tensors, write_png
+from stages.mesh_size import affordable_resolution, resolution_in, seconds_per_density, yardstick
 
 if TYPE_CHECKING:
     import numpy as np
@@ -34,13 +35,6 @@ UNKEYED = ("seconds",)  # it decides the resolution, and that enters the key
 HALF_BOX = 0.9  # the region of interest is [-0.9, 0.9]^3 of the scene frame
 CHUNK = 1 << 16
 LEVEL_RAYS = 1024
-POINTS_PER_RAY = 20  # lattice points per ray trained: about a tenth of what training cost
-# What else a lattice point takes (marching cubes, decimation, cleaning), in densities of the grid field, and what any
-# mesh takes besides (visibility, level, colours, picture): fox at 96 and 256 points per edge, idle. Fields slower than
-# SLOWEST seconds a point say nothing of how fast the rest is.
-BESIDE_DENSITY, BESIDE_POINTS, SLOWEST = 1.5, 13e6, 4e-6
-LEAST_RESOLUTION, MOST_RESOLUTION = 64, 256
-TIMED_EDGES, TIMED_SECONDS = (32, 64, 96), 0.3
 BYTES_PER_POINT = 16  # density, occupancy and marching cubes; 12 to 13 measured at 192³ and 320³
 
 Format = Literal["glb", "ply", "obj"]
@@ -83,49 +77,11 @@ def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
     if config.resolution is None and config.seconds is not None:
         progress.update("trying how fast the field tells its density")
         began = time.perf_counter()
-        per_point = _seconds_per_point(inputs["train"])
-        resolution = resolution_in(config.seconds - (time.perf_counter() - began), per_point)
+        speeds = seconds_per_density(inputs["train"], HALF_BOX, CHUNK), yardstick()
+        resolution = resolution_in(config.seconds - (time.perf_counter() - began), *speeds)
         return config.model_copy(update={"resolution": resolution})
     rays = read_json(inputs["train"] / "field.json")["rays"]
     return config.model_copy(update={"resolution": config.resolution or affordable_resolution(rays)})
-
-
-def affordable_resolution(rays: int) -> int:
-    """Lattice points per edge that cost about a tenth of the training of ``rays``, a multiple of 16 in 96 ... 256."""
-    edge = (POINTS_PER_RAY * rays) ** (1 / 3)
-    return min(MOST_RESOLUTION, max(96, round(edge / 16) * 16))
-
-
-def resolution_in(seconds: float, per_point: float) -> int:
-    """Lattice points per edge, a multiple of 16 in 64 ... 256, of a mesh that takes ``seconds`` where the density of a
-    point takes ``per_point``."""
-    beside = min(per_point, SLOWEST)
-    points = (seconds - BESIDE_POINTS * beside) / (per_point + BESIDE_DENSITY * beside)
-    edge = 16 * int(max(points, 0.0) ** (1 / 3) / 16)
-    return min(MOST_RESOLUTION, max(LEAST_RESOLUTION, edge))
-
-
-def _seconds_per_point(train: Path) -> float:
-    """Measured: larger lattices until one takes long enough to tell."""
-    import torch
-
-    from nerf.lattice import density_lattice
-    from stages.device import compute_device
-    from stages.field_files import load_field
-
-    device = compute_device()
-    model, _ = load_field(train, device)
-    corner = torch.full((3,), HALF_BOX, device=device)
-    density_lattice(model, TIMED_EDGES[0], -corner, corner, CHUNK)  # the first pays for memory and kernels
-    seconds = per_point = 0.0
-    for edge in TIMED_EDGES:
-        if seconds >= TIMED_SECONDS:
-            break
-        began = time.perf_counter()
-        density_lattice(model, edge, -corner, corner, CHUNK).values.cpu()
-        seconds = time.perf_counter() - began
-        per_point = seconds / edge**3
-    return per_point
 
 
 def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> StageResult:

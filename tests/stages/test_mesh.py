@@ -8,20 +8,19 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from hypothesis import given
-from hypothesis import strategies as st
 from trimesh.visual import ColorVisuals
 
 from nerf.scene import Camera, Scene, Similarity, View
 from stages import field_files, mesh, mesh_picture, mesh_views
 from stages.contract import StageError
-from stages.files import write_json
+from stages.files import write_json, write_tensors
 from stages.mesh_preview import look_at
 
 RADIUS = 0.4
 TURN = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
 SCENE_FROM_SFM = Similarity(0.25, TURN, np.array([0.1, -0.2, 0.3]))
 VOXEL = 1.8 / 47
+NO_POINTS = np.zeros((0, 3), np.float32)
 
 
 SMALL = (
@@ -60,6 +59,11 @@ def hollow_ball_and_speck(points):
     return torch.minimum(torch.maximum(ball(points), 0.2 - points.norm(dim=-1)), speck)
 
 
+def two_balls(points):
+    apart = torch.tensor([0.0, 0.0, 0.5])
+    return torch.minimum((points - apart).norm(dim=-1), (points + apart).norm(dim=-1)) - 0.3
+
+
 def plain(points):
     return points[..., 2] + 0.2
 
@@ -82,11 +86,12 @@ def run_mesh(tmp_path, progress, monkeypatch):
     for module, name, small in SMALL:
         monkeypatch.setattr(module, name, small)
 
-    def run(model, folder="mesh", scene=None, **settings):
+    def run(model, folder="mesh", scene=None, points=NO_POINTS, **settings):
         inputs = {name: tmp_path / name for name in mesh.NEEDS}
         for path in (*inputs.values(), tmp_path / folder):
             path.mkdir(exist_ok=True)
         write_json(inputs["normalise"] / "scene.json", (scene or scene_around()).to_json())
+        write_tensors(inputs["normalise"] / "points.safetensors", {"xyz": points})
         write_json(inputs["train"] / "field.json", {"rays": 1000})
         monkeypatch.setattr(field_files, "load_field", lambda folder, device="cpu": (model, {"rays": 1000}))
         config = mesh.Config.model_validate({"resolution": 48} | settings)
@@ -176,6 +181,17 @@ def test_specks_and_cavities_are_dropped(run_mesh):
     assert everything.facts["components_kept"] == 3
 
 
+def test_a_part_that_no_sparse_point_locates_is_dropped(run_mesh):
+    direction = np.random.default_rng(0).normal(size=(500, 3))
+    above = (0.3 * direction / np.linalg.norm(direction, axis=1, keepdims=True) + [0, 0, 0.5]).astype(np.float32)
+    result, folder = run_mesh(Solid(two_balls), points=above)
+    assert (result.facts["components_kept"], result.facts["components_dropped"]) == (1, 1)
+    loaded = trimesh.load_mesh(folder / "mesh.ply", process=False)
+    assert SCENE_FROM_SFM.points(np.asarray(loaded.vertices))[:, 2].min() > 0.15
+    unknown, _ = run_mesh(Solid(two_balls), folder="unknown")
+    assert unknown.facts["components_kept"] == 2
+
+
 def test_a_plain_ends_at_the_box_or_where_the_photos_end(run_mesh):
     result, folder = run_mesh(Solid(plain))
     assert result.facts["watertight"] is False
@@ -239,23 +255,3 @@ def test_the_resolution_follows_the_training(tmp_path, progress, rays, resolutio
     write_json(tmp_path / "field.json", {"rays": rays})
     assert mesh.plan(mesh.Config(), {"train": tmp_path}, progress).resolution == resolution
     assert mesh.plan(mesh.Config(resolution=77), {"train": tmp_path}, progress).resolution == 77
-
-
-def test_the_resolution_grows_with_the_time_and_falls_with_what_a_point_takes() -> None:
-    times = [mesh.resolution_in(seconds, 5e-7) for seconds in (-5.0, 5.0, 8.0, 10.0, 20.0, 1000.0)]
-    assert times == sorted(times) and (times[0], times[-1]) == (64, 256)
-    assert all(edge % 16 == 0 for edge in times) and len(set(times)) > 3
-    assert mesh.resolution_in(20.0, 1e-6) < mesh.resolution_in(20.0, 5e-7)
-    # A slow field says nothing of how fast the rest is: what it draws in a minute is still looked for.
-    assert mesh.resolution_in(120.0, 2e-5) > 96
-
-
-@given(st.floats(8.0, 60.0), st.floats(1e-7, 1e-5))
-def test_the_resolution_chosen_fits_and_the_next_would_not(seconds: float, per_point: float) -> None:
-    def takes(edge: int) -> float:
-        beside = min(per_point, mesh.SLOWEST)
-        return edge**3 * (per_point + 1.5 * beside) + mesh.BESIDE_POINTS * beside
-
-    edge = mesh.resolution_in(seconds, per_point)
-    assert takes(edge) <= seconds * (1 + 1e-9) or edge == 64
-    assert takes(edge + 16) > seconds or edge == 256

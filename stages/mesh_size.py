@@ -1,0 +1,70 @@
+"""How fine a mesh's lattice can be in the time there is."""
+
+import time
+from pathlib import Path
+
+POINTS_PER_RAY = 20  # lattice points per ray trained: about a tenth of what training cost
+LEAST_RESOLUTION, MOST_RESOLUTION = 64, 256
+TIMED_EDGES, TIMED_SECONDS = (32, 64, 96), 0.3
+# What takes time besides the densities, in surfaces of a ball like the one that :func:`yardstick` extracts: everything
+# once (visibility, level, colours, picture, files), and the rest (marching cubes, cleaning, decimation) per lattice
+# point. On an idle machine, where a ball takes 0.022 s: demo, fox and fern at 96 and 192 points per edge took 5.0 to
+# 6.5 s and 0.9 to 1.6 µs a point, and the stage a second and a half more to begin (docs/numbers.md).
+ONCE, PER_POINT = 340.0, 7e-5
+BALL_EDGE, BALL_TIMES = 96, 3
+
+
+def affordable_resolution(rays: int) -> int:
+    """Lattice points per edge that cost about a tenth of the training of ``rays``, a multiple of 16 in 96 ... 256."""
+    edge = (POINTS_PER_RAY * rays) ** (1 / 3)
+    return min(MOST_RESOLUTION, max(96, round(edge / 16) * 16))
+
+
+def resolution_in(seconds: float, per_density: float, per_ball: float) -> int:
+    """Lattice points per edge, a multiple of 16 in 64 ... 256, of a mesh that takes ``seconds`` where a density takes
+    ``per_density`` and the surface of a ball ``per_ball`` seconds."""
+    points = (seconds - ONCE * per_ball) / (per_density + PER_POINT * per_ball)
+    edge = 16 * int(max(points, 0.0) ** (1 / 3) / 16)
+    return min(MOST_RESOLUTION, max(LEAST_RESOLUTION, edge))
+
+
+def seconds_per_density(train: Path, half_box: float, chunk: int) -> float:
+    """Measured: larger lattices of the field in ``train`` over [-half_box, half_box]³ until one takes long enough to
+    tell."""
+    import torch
+
+    from nerf.lattice import density_lattice
+    from stages.device import compute_device
+    from stages.field_files import load_field
+
+    device = compute_device()
+    model, _ = load_field(train, device)
+    corner = torch.full((3,), half_box, device=device)
+    density_lattice(model, TIMED_EDGES[0], -corner, corner, chunk)  # the first pays for memory and kernels
+    seconds = per_point = 0.0
+    for edge in TIMED_EDGES:
+        if seconds >= TIMED_SECONDS:
+            break
+        began = time.perf_counter()
+        density_lattice(model, edge, -corner, corner, chunk).values.cpu()
+        seconds = time.perf_counter() - began
+        per_point = seconds / edge**3
+    return per_point
+
+
+def yardstick() -> float:
+    """Seconds for the surface of a ball on a lattice of BALL_EDGE³, the best of a few: how fast this machine is at what
+    is no field."""
+    import torch
+
+    from nerf.lattice import Lattice
+    from stages.mesh_surface import extract, vertex_normals
+
+    line = torch.linspace(-1, 1, BALL_EDGE)
+    radius = torch.stack(torch.meshgrid(line, line, line, indexing="ij")).norm(dim=0)
+    lattice, times = Lattice((4 * (0.6 - radius)).exp(), -torch.ones(3), torch.ones(3)), []
+    for _ in range(BALL_TIMES):
+        began = time.perf_counter()
+        vertex_normals(extract(lattice, 1.0))
+        times.append(time.perf_counter() - began)
+    return min(times)
