@@ -52,10 +52,10 @@ def knee(curve: Curve) -> float | None:
     return found
 
 
-# Least squares over 36 pairs of runs of T and 2 T steps, six sets (docs/numbers.md). More than 1, because within a run
-# the rate falls: its second half shows less than a run of twice the steps gains.
-NEXT_OF_LAST = 2.06
-NEXT_HALF_WIDTH = 1.3  # dB: held 29 of the 36, each judged by constants of the other sets
+# Least squares over 33 pairs of runs of T and 2 T steps, six sets (docs/numbers.md). More than 1, because a run anneals
+# once: half-way it has that still before it, so that its second half shows less than a run of twice the steps gains.
+NEXT_OF_LAST = 1.19
+NEXT_HALF_WIDTH = 1.0  # dB: held 28 of the 33, each judged by constants of the other sets
 
 
 def next_doubling(curve: Curve) -> Gain | None:

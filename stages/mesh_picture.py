@@ -31,7 +31,8 @@ def picture(mesh: "ColouredMesh", scene: "Scene") -> np.ndarray:
 def viewpoints(vertices: np.ndarray, scene: "Scene") -> tuple[Viewpoint, Viewpoint]:
     """Two views of what the photos show.
 
-    Around an object: from the side of the photo nearest to ``ELEVATION`` and from opposite. Facing one way: from the
+    Around an object: from the side of the photo nearest to ``ELEVATION``, and as far around from there as photos were
+    taken, which is opposite if they were taken all around. Facing one way: from the
     middle of the cameras and from the camera farthest from it. Both frame the whole mesh. Inside a room the cameras'
     own poses are used, because from outside only the backs of its walls could be seen.
     """
@@ -40,7 +41,7 @@ def viewpoints(vertices: np.ndarray, scene: "Scene") -> tuple[Viewpoint, Viewpoi
     if scene.layout == "around":
         towards = -poses[:, :, 2]
         side = towards[np.abs(towards[:, 2] - np.sin(np.radians(ELEVATION))).argmin()]
-        return _framed(vertices, side, UP), _framed(vertices, side * [-1, -1, 1], UP)
+        return _framed(vertices, side, UP), _framed(vertices, _farthest_around(side, towards), UP)
     first = int(np.linalg.norm(centres - centres.mean(axis=0), axis=1).argmin())
     second = int(np.linalg.norm(centres - centres[first], axis=1).argmax())
     if scene.layout == "inside":
@@ -48,6 +49,14 @@ def viewpoints(vertices: np.ndarray, scene: "Scene") -> tuple[Viewpoint, Viewpoi
         return Viewpoint(poses[first], focal_px, WIDTH, HEIGHT), Viewpoint(poses[second], focal_px, WIDTH, HEIGHT)
     one, other = poses[first], poses[second]
     return _framed(vertices, -one[:, 2], -one[:, 1]), _framed(vertices, -other[:, 2], -other[:, 1])
+
+
+def _farthest_around(side: np.ndarray, towards: np.ndarray) -> np.ndarray:
+    """``side`` turned around the vertical to where the one of ``towards`` (n, 3) is that is farthest from it."""
+    other = towards[(towards @ side).argmin()]
+    turn = np.arctan2(other[1], other[0]) - np.arctan2(side[1], side[0])
+    cosine, sine = np.cos(turn), np.sin(turn)
+    return np.array([cosine * side[0] - sine * side[1], sine * side[0] + cosine * side[1], side[2]])
 
 
 def _framed(vertices: np.ndarray, towards: np.ndarray, up: np.ndarray) -> Viewpoint:

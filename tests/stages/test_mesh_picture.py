@@ -28,14 +28,17 @@ def shows_all(camera):
     return bool((points[:, 2] > 0).all() and (np.abs(pixels) < [camera.width / 2, camera.height / 2]).all())
 
 
-def test_an_object_is_shown_from_a_photos_side_and_from_opposite():
-    scene = scene_of("around", [(0.1, 0, 3), (2, 0.5, 1.1), (0, -3, 0.1)])
+@pytest.mark.parametrize(("last", "turned"), [((-2, -0.5, 0.4), 180.0), ((0.5, -2.0, 0.2), -90.0)])
+def test_an_object_is_shown_from_a_photos_side_and_as_far_around_as_there_are_photos(last, turned):
+    scene = scene_of("around", [(-0.1, 0, 3), (2, 0.5, 1.1), last])
     one, other = viewpoints(CUBE, scene)
     assert shows_all(one) and shows_all(other)
     side = -one.from_camera[:, 2]
     np.testing.assert_allclose(side, np.array([2, 0.5, 1.1]) / np.linalg.norm([2, 0.5, 1.1]))
     assert abs(np.degrees(np.arcsin(side[2])) - ELEVATION) < 5
-    np.testing.assert_allclose(-other.from_camera[:, 2], side * [-1, -1, 1])
+    turn = np.radians(turned)
+    around = [side[0] * np.cos(turn) - side[1] * np.sin(turn), side[0] * np.sin(turn) + side[1] * np.cos(turn)]
+    np.testing.assert_allclose(-other.from_camera[:, 2], [*around, side[2]], atol=1e-12)
 
 
 def test_what_faces_one_way_is_shown_from_where_the_cameras_stand():
