@@ -21,7 +21,7 @@ from nerf.kernels.marching import unit_coordinates
 from nerf.model import Rendering
 from nerf.randomness import generator
 from nerf.rays import Rays
-from nerf.sky import initial_sky, sky_backward, sky_colour
+from nerf.sky import directions_backward, initial_sky, sky_backward, sky_colour
 from nerf.stopwatch import Work, part
 from nerf.waves import HIDDEN_BEHIND, Wave, front_to_back, packed
 
@@ -237,12 +237,14 @@ class GridField(nn.Module):
         )
         grad_directions = grad_directions + self.of_directions_backward(rays.directions, gradients.harmonics)
         if self.settings.sky:
-            grad_directions += sky_backward(backend, self.sky, rays.directions, gradients.background)[1]
+            grad_directions += directions_backward(
+                backend, self.sky, rays.directions, done.background, gradients.background
+            )
         return grad_origins, grad_directions
 
     def sky_backward(self, done: GridPass, gradients: GridGradients) -> Float[Tensor, "rows 4"]:
         """Gradient of the sky, for a field that has one."""
-        return sky_backward(self.backend, self.sky, done.rays.directions, gradients.background)[0]
+        return sky_backward(self.backend, done.rays.directions, done.background, gradients.background)
 
     def _behind(self, rays: Rays, background: Float[Tensor, "*#rays 3"]) -> Float[Tensor, "*#rays 3"]:
         return sky_colour(self.backend, self.sky, rays.directions) if self.settings.sky else background

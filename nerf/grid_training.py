@@ -42,9 +42,9 @@ MEMORY = 0.9  # how much of the mean of samples per ray remains after each step
 class GridTrainerSettings:
     """How to train. ``samples``: colours to compute in a step; its rays are as many as are expected to need them, at
     most ``most_rays``. ``chunks``: equal parts of a step, each computed on a core; results depend on their number, not
-    on that of the cores. ``background`` is what lies behind the scene: a colour, or another random one for each ray
-    (only for photos with alpha, where it shows the field which space is empty). ``distortion``: full
-    weight of the distortion loss, for scenes without a known background."""
+    on that of the cores. ``background`` is what lies behind a scene without a sky: a colour, or another random one for
+    each ray (only for photos with alpha, where it shows the field which space is empty). ``distortion``: full weight
+    of the distortion loss, for scenes without a known background."""
 
     seed: int
     background: tuple[float, float, float] | Literal["random"]

@@ -52,8 +52,8 @@ def knee(curve: Curve) -> float | None:
     return found
 
 
-# Least squares over 33 pairs of runs of T and 2 T steps, six sets (docs/numbers.md). More than 1, because a run anneals
-# once: half-way it has that still before it, so that its second half shows less than a run of twice the steps gains.
+# Least squares over 33 pairs of runs of T and 2 T steps, six sets (docs/numbers.md): what a run gained from half of its
+# time to its end, annealing included, against what a run of twice the time ends higher.
 NEXT_OF_LAST = 1.19
 NEXT_HALF_WIDTH = 1.0  # dB: held 28 of the 33, each judged by constants of the other sets
 

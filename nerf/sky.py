@@ -1,9 +1,10 @@
 """What folded space stands before: a colour of the viewing direction alone, as if it were infinitely far away.
 
-Without it a ray that nothing stops ends in black: skies, haze and dark distance have to be drawn somewhere in space,
-which two photos' disagreement about a smooth surface cannot tell, and directions that no photo looked in are black
-holes. That light from infinity depends on the direction alone is Rematas et al. 2022 (Urban Radiance Fields, section
-3.2), who use a network; here it is a coarse feature grid like the field's own, read where the direction meets the unit
+Without it a ray that nothing stops ends in black. So skies, haze and other smooth distance have to be drawn in space,
+where nothing about them tells how far away they are, and directions that no photo looked in are black holes.
+
+That light from infinity depends on the direction alone is Rematas et al. 2022 (Urban Radiance Fields, section 3.2),
+who use a network; here it is a coarse feature grid like the field's own, read where the direction meets the unit
 sphere: colour = sigmoid(sum of the levels' features).
 """
 
@@ -34,18 +35,33 @@ def sky_colour(
 
 def sky_backward(
     backend: Backend,
+    directions: Float[Tensor, "rays 3"],
+    colour: Float[Tensor, "rays 3"],
+    grad: Float[Tensor, "rays 3"],
+) -> Float[Tensor, "rows 4"]:
+    """Gradient of the sky, given the colours it was seen in and theirs."""
+    features, unit = _features_backward(colour, grad), _on_sphere(directions)
+    of_sky = grad.new_zeros(LAYOUT.rows, LAYOUT.features)
+    for level in range(len(LAYOUT.resolutions)):
+        backend.encode_backward_table(LAYOUT, level, unit, features, of_sky)
+    return of_sky
+
+
+def directions_backward(
+    backend: Backend,
     sky: Float[Tensor, "rows 4"],
     directions: Float[Tensor, "rays 3"],
+    colour: Float[Tensor, "rays 3"],
     grad: Float[Tensor, "rays 3"],
-) -> tuple[Float[Tensor, "rows 4"], Float[Tensor, "rays 3"]]:
-    """Gradients of the sky and of the directions, each taken as a free vector, given that of the colours."""
-    colour, unit = sky_colour(backend, sky, directions), _on_sphere(directions)
+) -> Float[Tensor, "rays 3"]:
+    """Gradient of the directions, each taken as a free vector."""
+    features = _features_backward(colour, grad)
+    return backend.encode_backward_points(LAYOUT, sky, _on_sphere(directions), features) / 2
+
+
+def _features_backward(colour: Float[Tensor, "rays 3"], grad: Float[Tensor, "rays 3"]) -> Float[Tensor, "rays width"]:
     of_logits = torch.nn.functional.pad(grad * colour * (1 - colour), (0, 1))
-    of_features = of_logits.repeat(1, len(LAYOUT.resolutions))
-    of_sky = torch.zeros_like(sky)
-    for level in range(len(LAYOUT.resolutions)):
-        backend.encode_backward_table(LAYOUT, level, unit, of_features, of_sky)
-    return of_sky, backend.encode_backward_points(LAYOUT, sky, unit, of_features) / 2
+    return of_logits.repeat(1, len(LAYOUT.resolutions))
 
 
 def _on_sphere(directions: Float[Tensor, "rays 3"]) -> Float[Tensor, "rays 3"]:

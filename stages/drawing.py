@@ -64,7 +64,8 @@ class Painter:
 
 
 def load_painter(train: Path, background: tuple[float, ...] | None = None, like: str | None = None) -> Painter:
-    """The field that stage train left in ``train``, over ``background``; None: what it was trained to stand before.
+    """The field that stage train left in ``train``, over ``background``, which a field with a
+    sky does not show; None: what it was trained to stand before.
 
     ``like`` names the training photo whose exposure it is shown at; None: the neutral one.
     """

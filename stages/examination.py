@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from nerf.probe import Probe
     from nerf.training import FieldTrainer
 
-EMPTY_OPACITY = 1e-3  # a field whose mean opacity is below this shows nothing but background
+EMPTY_OPACITY = 1e-3  # a field whose mean opacity is below this shows nothing but background or sky
 SUSPICIOUS_DB = 3.0  # above a flat colour: batches that are no better may come from a field that is lost
 
 

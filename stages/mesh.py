@@ -1,7 +1,7 @@
 """Stage mesh: the field's density becomes a coloured triangle mesh.
 
 density lattice over the region of interest → marching cubes at the density where the photos' rays stop → only
-what the photos cover and see → decimation → colours from the field, seen as the photos saw it → PLY, OBJ, GLB.
+what the photos cover, see and locate → decimation → colours from the field, seen as the photos saw it → PLY, OBJ, GLB.
 A surface that leaves the region of interest ends there, open: closing it would invent geometry.
 """
 
@@ -73,7 +73,7 @@ class Reconstruction(NamedTuple):
 
 
 def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
-    """Choose the resolution: from how much was trained, or by the time there is and what a density takes here."""
+    """Choose the resolution: from how much was trained, or by the time there is and what things take here."""
     if config.resolution is None and config.seconds is not None:
         progress.update("trying how fast the field tells its density")
         began = time.perf_counter()
@@ -112,7 +112,7 @@ def reconstruct(
     set. Raises StageError without a surface."""
     from scipy.spatial import KDTree
 
-    from stages.mesh_cleaning import clean, located, openness
+    from stages.mesh_cleaning import clean, openness
     from stages.mesh_files import ColouredMesh
     from stages.mesh_surface import decimate, extract, vertex_normals
     from stages.mesh_views import look, shadow_maps
@@ -126,8 +126,7 @@ def reconstruct(
     raw = extract(lattice, level.level)
     sight = look(raw.vertices, vertex_normals(raw), maps, voxel)
     progress.update("cleaning", 0.85)
-    near = located(raw.vertices, points)
-    cleaned = clean(raw, sight, near, config.keep, min(config.min_views, len(views)), config.min_component)
+    cleaned = clean(raw, sight, points, config.keep, min(config.min_views, len(views)), config.min_component)
     surface = decimate(cleaned.surface, config.max_faces)
     progress.update("colours", 0.9)
     nearest = KDTree(cleaned.surface.vertices).query(surface.vertices)[1]

@@ -14,6 +14,7 @@ WIDTH, HEIGHT = 480, 400
 UP = np.array([0.0, 0.0, 1.0])
 ELEVATION = 30.0  # degrees above the horizon
 ROOM_FIELD_OF_VIEW = 75.0
+LEAST_LEVEL = 0.3  # the horizontal part of a direction that has a side: 73° above the horizon
 BAKED_SHADING = 0.35  # the colours hold the light of the photos already
 
 
@@ -52,11 +53,18 @@ def viewpoints(vertices: np.ndarray, scene: "Scene") -> tuple[Viewpoint, Viewpoi
 
 
 def _farthest_around(side: np.ndarray, towards: np.ndarray) -> np.ndarray:
-    """``side`` turned around the vertical to where the one of ``towards`` (n, 3) is that is farthest from it."""
-    other = towards[(towards @ side).argmin()]
-    turn = np.arctan2(other[1], other[0]) - np.arctan2(side[1], side[0])
-    cosine, sine = np.cos(turn), np.sin(turn)
-    return np.array([cosine * side[0] - sine * side[1], sine * side[0] + cosine * side[1], side[2]])
+    """``side`` turned around the vertical to the one of ``towards`` (n, 3) that is farthest around; steep ones have no
+    side that would tell."""
+    level = np.linalg.norm(towards[:, :2], axis=1)
+    flat = towards[level >= min(LEAST_LEVEL, level.max())][:, :2]
+    one, other = (complex(*part) for part in (side[:2], flat[_along(flat, side[:2]).argmin()]))
+    turned = abs(one) * other / abs(other) if other else one
+    return np.array([turned.real, turned.imag, side[2]])
+
+
+def _along(flat: np.ndarray, side: np.ndarray) -> np.ndarray:
+    """The cosine of the angle between each of ``flat`` (n, 2) and ``side``, times a number they share."""
+    return flat @ side / np.maximum(np.linalg.norm(flat, axis=1), np.finfo(float).tiny)
 
 
 def _framed(vertices: np.ndarray, towards: np.ndarray, up: np.ndarray) -> Viewpoint:

@@ -212,6 +212,6 @@ def _trained_over(config: "Config", scene: "Scene") -> tuple[float, float, float
 
 
 def field_background(config: "Config", scene: "Scene") -> tuple[float, float, float]:
-    """What the finished field is shown over. Photos without alpha fill every ray; what a field leaves open is black,
-    as published."""
+    """What the finished field is shown over, unless it has a sky. Photos without alpha fill every ray; what a field
+    without one leaves open is black, as published."""
     return WHITE if scene.has_alpha and config.background != "black" else BLACK

@@ -180,7 +180,8 @@ def _sky(backend: Backend, table: Tensor) -> Tensor:
 
 
 def _sky_backward(backend: Backend, grad: Tensor, table: Tensor) -> tuple[Tensor]:
-    return (sky.sky_backward(backend, table, _sky_directions(table), grad)[0],)
+    directions = _sky_directions(table)
+    return (sky.sky_backward(backend, directions, sky.sky_colour(backend, table, directions), grad),)
 
 
 def _sky_plainly(table: Tensor) -> Tensor:

@@ -106,3 +106,17 @@ def test_more_of_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
 def test_more_belongs_to_training(trained, capsys: pytest.CaptureFixture[str]):
     assert run_command(["evaluate", trained[1], "--more", "10m"]) == 2
     assert "--more belongs to `pipeline train` and `pipeline run`, not to evaluate" in capsys.readouterr().err
+
+
+def test_a_training_of_another_version_is_not_gone_on_with(trained, capsys: pytest.CaptureFixture[str], monkeypatch):
+    def refuse(self: object, state: dict) -> None:
+        raise RuntimeError("this state belongs to another field: settings differ")
+
+    photos, workspace = trained
+    before = sorted(path for path in result(workspace).rglob("*") if path.is_file())
+    monkeypatch.setattr("nerf.grid_training.GridTrainer.load_state", refuse)
+    words = ["--more", "6steps", "--train.learning-rate", "0.02"]  # the workspace remembers the rate of another test
+    assert run_command(["run", photos, "-o", workspace, "--until", "train", *words]) == 14
+    said = capsys.readouterr().err
+    assert "is of another version of this program" in said and "without --more" in said
+    assert all(path.is_file() for path in before), "the finished training stays whole"

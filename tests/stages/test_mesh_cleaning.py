@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from stages.contract import StageError
-from stages.mesh_cleaning import REACH, clean, located, openness
+from stages.mesh_cleaning import FEWEST_POINTS, REACH, clean, openness
 from stages.mesh_surface import Surface
 from stages.mesh_views import Sight
 
@@ -24,57 +24,74 @@ def sight(covered, seen):
     return Sight(covered, seen, np.zeros((len(seen), 3)))
 
 
-def near(*components):
-    """Four vertices per component, all near a sparse point or far from any."""
-    return np.repeat(components, 4)
+NO_POINTS = np.zeros((0, 3))
+
+
+def points_at(*corners, count=2 * FEWEST_POINTS):
+    """A dense cloud of points around each of some places."""
+    cloud = np.random.default_rng(0).normal(scale=REACH / 10, size=(count, 3))
+    return np.concatenate([cloud + corner for corner in corners])
 
 
 def test_visible_keeps_what_is_seen_and_large_enough():
     surface = tetrahedra(1.0, 0.5, 0.05, 1.0)  # the third is a speck of 1/400 of the area, the last an unseen cavity
-    cleaned = clean(surface, sight([5, 5, 5, 5], [3, 2, 5, 1]), near(True, True, True, True), "visible", 2, 0.01)
+    cleaned = clean(surface, sight([5, 5, 5, 5], [3, 2, 5, 1]), NO_POINTS, "visible", 2, 0.01)
     assert (cleaned.kept, cleaned.dropped, cleaned.uncovered) == (2, 2, 0)
     np.testing.assert_array_equal(cleaned.surface.vertices, surface.vertices[:8])
     assert cleaned.vertex.tolist() == list(range(8))
 
 
 def test_an_unseen_component_does_not_set_the_scale():
-    cleaned = clean(tetrahedra(100.0, 1.0), sight([5, 5], [0, 5]), near(True, True), "visible", 2, 0.01)
+    cleaned = clean(tetrahedra(100.0, 1.0), sight([5, 5], [0, 5]), NO_POINTS, "visible", 2, 0.01)
     assert (cleaned.kept, len(cleaned.surface.faces)) == (1, 4)
 
 
 def test_what_is_far_from_every_sparse_point_goes_and_does_not_set_the_scale():
-    view = sight([5, 5], [5, 5])
-    cleaned = clean(tetrahedra(100.0, 1.0), view, near(False, True), "visible", 2, 0.01)
+    view, both = sight([5, 5], [5, 5]), tetrahedra(100.0, 1.0)
+    on_the_second = both.vertices[4]
+    cleaned = clean(both, view, points_at(on_the_second), "visible", 2, 0.01)
     assert (cleaned.kept, cleaned.dropped, len(cleaned.surface.faces)) == (1, 1, 4)
     assert cleaned.surface.vertices[:, 0].max() == 3.0
-    assert clean(tetrahedra(2.0, 1.0), view, near(False, False), "visible", 2, 0.01).kept == 2  # nothing to go by
 
 
-def test_a_surface_reaches_beyond_its_sparse_points():
-    surface = sheet(0.0, 1.0)  # of two triangles, of which one has a point at a corner
-    view = Sight(np.full(4, 5), np.full(4, 5), np.zeros((4, 3)))
-    assert clean(surface, view, np.array([False, True, False, False]), "visible", 2, 0.01).dropped == 0
+@pytest.mark.parametrize("count", [0, 1, FEWEST_POINTS - 1])
+def test_few_points_tell_nothing(count):
+    surface = tetrahedra(2.0, 1.0)
+    points = points_at(surface.vertices[4], count=count)
+    assert clean(surface, sight([5, 5], [5, 5]), points, "visible", 2, 0.01).kept == 2
 
 
-def test_near_is_within_reach_of_a_point_or_of_the_distance_between_points():
-    points = np.array([[0.0, 0, 0], [REACH / 10, 0, 0], [0, REACH / 10, 0]])
-    at = np.array([[0, 0, 0.9 * REACH], [0, 0, 1.1 * REACH], [0, 0, 2.9], [0, 0, 3.1]])
-    assert located(at, points).tolist() == [True, False, False, False]
-    assert located(at, points * (10 / REACH)).tolist() == [True, True, True, False]  # they stand 1 apart
-    for few in (0, 1):
-        assert located(at, points[:few]).all()
+def test_points_far_from_all_of_the_surface_tell_nothing():
+    points = points_at(np.array([0.0, 50, 50]))
+    assert clean(tetrahedra(2.0, 1.0), sight([5, 5], [5, 5]), points, "visible", 2, 0.01).kept == 2
+
+
+def test_a_bare_wall_is_not_dropped_for_a_speck_on_it():
+    """The wall has points in one corner alone: it stays if they are more than those on the speck."""
+    steps = np.arange(101.0)
+    edges = np.stack([np.stack([steps, 0 * steps, 0 * steps], -1), np.stack([steps, 0 * steps + 1, 0 * steps], -1)], 1)
+    first = 2 * np.arange(100)[:, None]
+    strip = np.concatenate([first + np.array(corners) for corners in ([0, 2, 1], [1, 2, 3])])
+    speck = np.array([[200.0, 0, 0], [201, 0, 0], [200, 1, 0]])
+    wall = Surface(np.concatenate([edges.reshape(-1, 3), speck]), np.vstack([strip, [202, 203, 204]]).astype(np.int32))
+    view = Sight(np.full(205, 5), np.full(205, 5), np.zeros((205, 3)))
+    on_the_wall, on_the_speck = points_at(wall.vertices[0]), points_at(speck[0])
+    both = np.concatenate([on_the_wall, on_the_speck[: len(on_the_speck) // 2]])
+    assert clean(wall, view, both, "visible", 2, 0.0).kept == 2
+    both = np.concatenate([on_the_wall[: len(on_the_wall) // 2], on_the_speck])
+    assert clean(wall, view, both, "visible", 2, 0.0).kept == 1
 
 
 def test_faces_without_enough_photos_are_cut_before_components_are_counted():
     view = sight([5, 1], [5, 1])
-    assert clean(tetrahedra(1.0, 1.0), view, near(True, True), "visible", 2, 0.01)[2:] == (1, 0, 4)
+    assert clean(tetrahedra(1.0, 1.0), view, NO_POINTS, "visible", 2, 0.01)[2:] == (1, 0, 4)
     view.covered[0] = 1  # three of the four faces of the first touch its first vertex
-    assert clean(tetrahedra(1.0, 1.0), view, near(True, True), "visible", 2, 0.01)[2:] == (1, 0, 7)
+    assert clean(tetrahedra(1.0, 1.0), view, NO_POINTS, "visible", 2, 0.01)[2:] == (1, 0, 7)
 
 
 @pytest.mark.parametrize(("keep", "kept"), [("largest", 1), ("all", 3)])
 def test_other_rules_ignore_the_photos(keep, kept):
-    cleaned = clean(tetrahedra(0.5, 1.0, 0.5), sight([0, 0, 0], [0, 0, 0]), near(True, False, False), keep, 2, 0.01)
+    cleaned = clean(tetrahedra(0.5, 1.0, 0.5), sight([0, 0, 0], [0, 0, 0]), NO_POINTS, keep, 2, 0.01)
     assert (cleaned.kept, cleaned.dropped) == (kept, 3 - kept)
     assert np.ptp(cleaned.surface.vertices[:, 1]) == 1.0
 
@@ -88,7 +105,7 @@ def test_other_rules_ignore_the_photos(keep, kept):
 )
 def test_nothing_left_is_an_error_that_helps(covered, message):
     with pytest.raises(StageError, match=message) as error:
-        clean(tetrahedra(1.0), sight([covered], [0]), near(True), "visible", 2, 0.01)
+        clean(tetrahedra(1.0), sight([covered], [0]), NO_POINTS, "visible", 2, 0.01)
     assert "--mesh.keep all" in error.value.hint
 
 

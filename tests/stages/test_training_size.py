@@ -10,7 +10,7 @@ from nerf.scene import Camera, Scene
 from stages.effect_decisions import Decisions
 from stages.train import Config
 from stages.training_data import scaled_size
-from stages.training_setup import grid_settings
+from stages.training_setup import grid_settings, has_sky
 from stages.training_size import LEAST_LONG_SIDE, chosen_downscale, grid_size, rays_in_budget, rays_per_second
 from tests.stages.photo_scene import photographed
 
@@ -114,3 +114,10 @@ def test_ray_samples_multiply_the_samples_along_a_ray(contracted: bool, factor: 
     assert asked.steps == pytest.approx(factor * usual.steps, abs=0.5)
     assert asked.cone == pytest.approx(usual.cone / factor)
     assert asked.lattice.step == pytest.approx(usual.lattice.step / factor, rel=0.01)
+
+
+@pytest.mark.parametrize("has_alpha", [False, True])
+@pytest.mark.parametrize("contracted", [False, True])
+def test_a_sky_is_where_space_has_no_end_and_no_alpha_tells(scene: Scene, contracted: bool, has_alpha: bool) -> None:
+    config = GRID.model_copy(update={"contracted": contracted})
+    assert has_sky(config, replace(scene, has_alpha=has_alpha)) is (contracted and not has_alpha)
