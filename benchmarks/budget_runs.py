@@ -163,16 +163,8 @@ def main() -> None:
             run |= train_run(bench, seed, steps, given.schedule)
             last = run["points"][-1]
             psnr = " ".join(f"{name} {last[name]:.2f}" for name in ("train_psnr", "heldout_psnr", *MEANS))
-            print(
-                workspace.stem,
-                seed,
-                steps,
-                given.schedule,
-                given.constant,
-                psnr,
-                f"{time.process_time() - clock:.0f} s",
-                flush=True,
-            )
+            what = f"{workspace.stem} {seed} {steps} {given.schedule} {given.constant}"
+            print(what, psnr, f"{time.process_time() - clock:.0f} s", flush=True)
             runs.append(run)
             given.runs.write_text(json.dumps(runs))
 

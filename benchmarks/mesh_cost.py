@@ -54,12 +54,11 @@ def to_truth(mesh: "ColouredMesh", scene: "Scene", normalise: Path, truth: Truth
     return f"{error.accuracy:.2f} | {error.completeness:.2f}"
 
 
-def to_points(mesh: "ColouredMesh", normalise: Path) -> str:
+def to_points(mesh: "ColouredMesh", points: np.ndarray) -> str:
     """From the sparse points in the region to the mesh: median, and nine in ten, in percent of the region's size."""
     from scipy.spatial import KDTree
 
-    xyz = read_tensors(normalise / "points.safetensors")["xyz"]
-    inside = xyz[np.abs(xyz).max(1) < HALF_BOX]
+    inside = points[np.abs(points).max(1) < HALF_BOX]
     distance = KDTree(sample_surface(mesh.vertices, mesh.faces, SAMPLES, seed=0)).query(inside)[0]
     median, most = np.percentile(distance, [50, 90]) * 100 / (2 * HALF_BOX)
     return f"{median:.2f} | {most:.2f}"
@@ -74,7 +73,7 @@ def row(folders: Inputs, resolution: int, truth: Truth | None) -> str:
     started = time.perf_counter()
     made = reconstruct(Config(resolution=resolution), model, scene, points, device, Quiet())
     seconds = time.perf_counter() - started
-    known = to_points(made.mesh, normalise) if truth is None else to_truth(made.mesh, scene, normalise, truth)
+    known = to_points(made.mesh, points) if truth is None else to_truth(made.mesh, scene, normalise, truth)
     return f"| {resolution}³ | {len(made.mesh.faces):,} | {seconds:.1f} | {known} |"
 
 

@@ -30,7 +30,8 @@ def sky_colour(
     backend: Backend, sky: Float[Tensor, "rows 4"], directions: Float[Tensor, "rays 3"]
 ) -> Float[Tensor, "rays 3"]:
     """The colour seen in each direction (unit vectors)."""
-    return _levels(backend.encode(LAYOUT, sky, _on_sphere(directions))).sum(1)[:, :3].sigmoid()
+    features = backend.encode(LAYOUT, sky, _on_sphere(directions))
+    return features.view(-1, len(LAYOUT.resolutions), LAYOUT.features).sum(1)[:, :3].sigmoid()
 
 
 def sky_backward(
@@ -67,7 +68,3 @@ def _features_backward(colour: Float[Tensor, "rays 3"], grad: Float[Tensor, "ray
 def _on_sphere(directions: Float[Tensor, "rays 3"]) -> Float[Tensor, "rays 3"]:
     """Where a direction meets the unit sphere, in the unit coordinates of the grid around it."""
     return directions / 2 + 0.5
-
-
-def _levels(features: Float[Tensor, "rays width"]) -> Float[Tensor, "rays levels 4"]:
-    return features.view(-1, len(LAYOUT.resolutions), LAYOUT.features)

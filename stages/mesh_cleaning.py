@@ -17,7 +17,6 @@ SEEN_SHARE = 0.1  # of a component's area; an inner cavity has none, the seen si
 LOCATED_SHARE = 0.1
 REACH, REACH_IN_SPACINGS = 0.1, 3.0  # scene units; of the distance from a sparse point to the next, if that is more
 FEWEST_POINTS = 50  # near the surface; fewer tell nothing of what is far from them
-TINY_AREA = 1e-300  # of a component of no area, whose share is then 0
 
 
 class Cleaned(NamedTuple):
@@ -65,7 +64,7 @@ def _worth_keeping(
     """Whether each component is seen, located and large enough, (components,) bool."""
     area = face_areas(surface)
     total = np.bincount(label, area)
-    good = (np.bincount(label, area * seen) >= SEEN_SHARE * total) & (total > 0)
+    good = _have(label, area, seen, SEEN_SHARE) & (total > 0)
     good = _located(surface, label, area, points, good)
     return good & (total >= min_component * total[good].max(initial=0.0))
 
@@ -85,8 +84,7 @@ def _located(surface: Surface, label: np.ndarray, area: np.ndarray, points: np.n
     spacing = float(np.median(tree.query(points, 2)[0][:, 1]))
     reach = max(REACH, REACH_IN_SPACINGS * spacing)
     near = np.isfinite(tree.query(surface.vertices, distance_upper_bound=reach)[0])
-    share = np.bincount(label, area * near[surface.faces].any(1)) / np.maximum(np.bincount(label, area), TINY_AREA)
-    certain = good & (share >= LOCATED_SHARE)
+    certain = good & _have(label, area, near[surface.faces].any(1), LOCATED_SHARE)
 
     of_vertex = np.zeros(len(surface.vertices), label.dtype)
     of_vertex[surface.faces] = label[:, None]
@@ -94,6 +92,11 @@ def _located(surface: Surface, label: np.ndarray, area: np.ndarray, points: np.n
     holder = of_vertex[np.asarray(vertex)[np.isfinite(distance)]]
     held, of_certain = (int(which[holder].sum()) for which in (good, certain))
     return certain if held >= FEWEST_POINTS and of_certain >= held / 2 else good
+
+
+def _have(label: np.ndarray, area: np.ndarray, marked: np.ndarray, share: float) -> np.ndarray:
+    """Whether the ``marked`` faces are so large a share of each component's area, (components,) bool."""
+    return np.bincount(label, area * marked) >= share * np.bincount(label, area)
 
 
 def openness(surface: Surface, half_box: float, voxel: float) -> str:

@@ -33,9 +33,9 @@ def viewpoints(vertices: np.ndarray, scene: "Scene") -> tuple[Viewpoint, Viewpoi
     """Two views of what the photos show.
 
     Around an object: from the side of the photo nearest to ``ELEVATION``, and as far around from there as photos were
-    taken, which is opposite if they were taken all around. Facing one way: from the
-    middle of the cameras and from the camera farthest from it. Both frame the whole mesh. Inside a room the cameras'
-    own poses are used, because from outside only the backs of its walls could be seen.
+    taken, which is opposite if they were taken all around. Facing one way: from the middle of the cameras and from the
+    camera farthest from it. Both frame the whole mesh. Inside a room the cameras' own poses are used, because from
+    outside only the backs of its walls could be seen.
     """
     poses = np.stack([view.scene_from_camera for view in scene.of_split("train")])
     centres = poses[:, :, 3]
