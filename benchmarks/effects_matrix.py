@@ -75,7 +75,7 @@ def decide(folder: Path, made: Effects, seed: int) -> Outcome:
 
 def gains(found: Outcome, wanted: frozenset[str], steps: int) -> str:
     """What each effect of a scene gains over leaving it out, in dB."""
-    trial = pilot_scene(found.inputs["ingest"], read_scene(found.inputs["normalise"]), Quiet())
+    trial = pilot_scene(found.inputs, read_scene(found.inputs["normalise"]), Quiet())
     assert trial is not None
     without = {"exposure": {"exposure": None}, "pose_refinement": {"pose_refinement": False}}
     parts = []

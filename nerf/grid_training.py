@@ -20,7 +20,9 @@ from nerf.parallel import in_order
 from nerf.randomness import generator
 from nerf.ray_bank import RayBank
 from nerf.rays import Rays
+from nerf.sky import PRIOR as SKY_PRIOR
 from nerf.sky import RATE as SKY_RATE
+from nerf.sparse_depth import depth_loss, depth_loss_backward
 from nerf.stopwatch import Work, part
 from nerf.training import RAYS, NonFinite, StepResult, all_finite
 
@@ -33,6 +35,7 @@ FINAL_RATE = 0.05  # of the rate at first
 # tell apart (the sky) would be drawn close behind the scene before their place is known (docs/numbers.md).
 FIRST_DISTORTION = 0.25  # of its weight
 FULL_DISTORTION_SHARE = 0.3  # of the run
+GUIDED_RAYS = 0.125  # so many of them run to sparse points, where some are known
 FIRST_SAMPLES_PER_RAY = 128.0
 ADAM_BYTES = 4 * 7  # of an entry of the table: its gradient read and cleared, itself and its moments read and written
 MEMORY = 0.9  # how much of the mean of samples per ray remains after each step
@@ -44,7 +47,8 @@ class GridTrainerSettings:
     most ``most_rays``. ``chunks``: equal parts of a step, each computed on a core; results depend on their number, not
     on that of the cores. ``background`` is what lies behind a scene without a sky: a colour, or another random one for
     each ray (only for photos with alpha, where it shows the field which space is empty). ``distortion``: full weight
-    of the distortion loss, for scenes without a known background."""
+    of the distortion loss, for scenes without a known background. ``depth``: weight at first of the depth loss, at the
+    pixels whose distance the bank knows."""
 
     seed: int
     background: tuple[float, float, float] | Literal["random"]
@@ -53,17 +57,19 @@ class GridTrainerSettings:
     chunks: int = 1
     rate: float = 2e-2
     distortion: float = 0.0
+    depth: float = 0.0
 
 
 class GridBatch(NamedTuple):
-    """Rays with the colour each should see over its background, where its samples stand in their intervals, and whose
-    view it belongs to."""
+    """Rays with the colour each should see over its background, where its samples stand in their intervals, whose view
+    it belongs to, and how far away is the sparse point that it runs to; 0: to none."""
 
     rays: Rays
     target: Float[Tensor, "rays 3"]
     background: Float[Tensor, "rays 3"]
     jitter: Float[Tensor, "rays"]
     view: Int[Tensor, "rays"]
+    distance: Float[Tensor, "rays"]
 
 
 class Loss(NamedTuple):
@@ -101,6 +107,12 @@ def rate_factor(step: int, share: float) -> float:
 def distortion_factor(share: float) -> float:
     """The weight of the distortion loss over its full one: from a quarter it grows with the share of the run."""
     return min(1.0, max(FIRST_DISTORTION, share / FULL_DISTORTION_SHARE))
+
+
+def depth_factor(share: float) -> float:
+    """The weight of the depth loss over its first one: it falls to nothing over the run. Shape is decided early, and
+    once it is about right photos know it better than points do."""
+    return 1 - share
 
 
 class GridTrainer:
@@ -170,28 +182,36 @@ class GridTrainer:
         wanted = int(self.settings.samples / max(1e-3, float(self.samples_per_ray)))
         return max(1, min(wanted, self.settings.most_rays) // self.settings.chunks)
 
-    def _batch(self, step: int, chunk: int, count: int) -> GridBatch:
+    def _batch(self, step: int, share: float, chunk: int, count: int) -> GridBatch:
         device = self.bank.device
         random = generator(device, self.settings.seed, step, chunk)
-        rays, colour, alpha, view = self.bank.sample(count, random)
+        to_points = int(GUIDED_RAYS * count) if self._is_guided(share) else 0
+        pixel, distance = self.bank.draw(count - to_points, random), torch.zeros(count, device=device)
+        if to_points:
+            of_points, distance[-to_points:] = self.bank.draw_known(to_points, random)
+            pixel = torch.cat([pixel, of_points])
+        rays, colour, alpha, view = self.bank.lookup(pixel)
         if self.settings.background == "random":
             background = torch.rand(count, 3, generator=random, device=device)
         else:
             background = torch.tensor(self.settings.background, device=device).repeat(count, 1)
         target = colour if alpha is None else torch.lerp(background, colour, alpha[:, None])
-        return GridBatch(rays, target, background, torch.rand(count, generator=random, device=device), view)
+        jitter = torch.rand(count, generator=random, device=device)
+        return GridBatch(rays, target, background, jitter, view, distance)
+
+    def _is_guided(self, share: float) -> bool:
+        return self.bank.known is not None and self.settings.depth * depth_factor(share) > 0
 
     def _part(self, step: int, share: float, rays: int, chunk: int) -> _Part:
         """What a chunk of so many rays adds to loss and gradients."""
         with part("batch"):
-            batch = self._batch(step, chunk, rays)
+            batch = self._batch(step, share, chunk, rays)
             seen_along = self.photo_rays.forward(batch.rays, batch.view)
             if not all_finite(seen_along):
                 raise NonFinite(RAYS, step, _whole([batch]))
         done = self.model.forward(seen_along, batch.jitter, batch.background)
-        spread_weight = self.settings.distortion * distortion_factor(share)
         with part("composite"):
-            loss = self._loss(rays * self.settings.chunks, spread_weight, done, batch)
+            loss = self._loss(rays * self.settings.chunks, share, done, batch)
         with part("backward", self._backward_work(done)):
             gradients = self.model.backward(done, loss.grad, loss.grad_weights)
             grad_rays = partial(self.model.rays_backward, done, gradients)
@@ -210,18 +230,24 @@ class GridTrainer:
         to_points = CORNERS * len(self.model.layout.resolutions) * len(done.points) if self.photo_rays.parameters else 0
         return Work(products, to_points)
 
-    def _loss(self, rays: int, spread_weight: float, done: GridPass, batch: GridBatch) -> Loss:
+    def _loss(self, rays: int, share: float, done: GridPass, batch: GridBatch) -> Loss:
         seen = Seen(done.rendering, batch.background, batch.view)
         error = self.photo_colours.residual(seen, batch.target)
         squared_error = error.square().sum() / (3 * rays)
         grad, photos = self.photo_colours.backward(seen, error * (2 / (3 * rays)))
-        if not spread_weight:
-            return Loss(squared_error, squared_error, grad, torch.zeros_like(done.weights), photos)
+        value, grad_weights = squared_error, torch.zeros_like(done.weights)
         backend, lattice = self.model.backend, self.model.lattice
-        each = torch.full((len(error),), spread_weight / rays, device=error.device)
-        spread = (each * backend.distortion(done.samples, done.weights, lattice)).sum()
-        grad_weights = backend.distortion_backward(done.samples, done.weights, lattice, each)
-        return Loss(squared_error + spread, squared_error, grad, grad_weights, photos)
+        if self.settings.distortion:
+            each = torch.full_like(batch.distance, self.settings.distortion * distortion_factor(share) / rays)
+            value = value + (each * backend.distortion(done.samples, done.weights, lattice)).sum()
+            grad_weights = backend.distortion_backward(done.samples, done.weights, lattice, each)
+        if self._is_guided(share):
+            each = torch.full_like(batch.distance, self.settings.depth * depth_factor(share) / rays)
+            places = done.rays.far, batch.distance, lattice
+            value = value + (each * depth_loss(done.samples, done.weights, done.rendering.opacity, *places)).sum()
+            of_weights, of_opacity = depth_loss_backward(done.samples, *places, each)
+            grad_weights, grad = grad_weights + of_weights, grad._replace(opacity=grad.opacity + of_opacity)
+        return Loss(value, squared_error, grad, grad_weights, photos)
 
     def _finite(self, step: int, parts: Sequence[_Part]) -> tuple[float, float]:
         """Loss and squared error as numbers, once they and all gradients are known to be finite.
@@ -243,7 +269,10 @@ class GridTrainer:
         work = [partial(self._update_level, level, parts, rate, count) for level in finest_first]
         of_networks = [chunk.weights._asdict() for chunk in parts]
         work.append(partial(self._update_small, Weights._fields, of_networks, rate, count))
-        work.append(partial(self._update_small, self.sky, [chunk.sky for chunk in parts], SKY_RATE * rate, count))
+        rays = sum(len(chunk.batch.jitter) for chunk in parts)
+        prior = {name: sky * (SKY_PRIOR / rays) for name, sky in self.sky.items()}
+        of_sky = [prior, *(chunk.sky for chunk in parts)]
+        work.append(partial(self._update_small, self.sky, of_sky, SKY_RATE * rate, count))
         work.append(partial(self._raise_cache, parts))
         for of_photos in self.photo_parts:
             work.append(partial(self._update_photos, of_photos, parts, of_photos.rate * factor, count))

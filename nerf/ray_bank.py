@@ -47,6 +47,9 @@ class RayBank(NamedTuple):
 
     ``runs`` has a column per run of pixels that may be drawn: how many of them lie before it, and its first pixel. A
     last column has the number of all of them. None: every pixel may be drawn.
+
+    ``known`` are pixels that show a sparse point, ``distance`` how far along their rays (scene units) it lies. None: of
+    no pixel is that known.
     """
 
     pixels: UInt8[Tensor, "pixels channels"]
@@ -55,6 +58,8 @@ class RayBank(NamedTuple):
     geometry: Float[Tensor, "16 views"]
     patches: Float[Tensor, "9 patches"]
     runs: Int[Tensor, "2 runs_and_end"] | None = None
+    known: Int[Tensor, "known"] | None = None
+    distance: Float[Tensor, "known"] | None = None
 
     @property
     def device(self) -> torch.device:
@@ -85,6 +90,12 @@ class RayBank(NamedTuple):
         if not runs[0, -1]:
             raise ValueError("the masks ignore every pixel")
         return self._replace(runs=runs.to(self.device))
+
+    def with_distances(self, pixel: Int[Tensor, "known"], distance: Float[Tensor, "known"]) -> "RayBank":
+        """This bank, which knows how far away is what these pixels show (scene units, along the ray). Pixels that may
+        not be drawn are left out: give the masks first."""
+        kept = self.may_be_drawn(pixel)
+        return self._replace(known=pixel[kept], distance=distance[kept].float()) if kept.any() else self
 
     def lookup(self, pixel: Int[Tensor, "rays"]) -> Drawn:
         """Given pixels, and the rays through them."""
@@ -118,6 +129,12 @@ class RayBank(NamedTuple):
         """``count`` pixels drawn uniformly from those that may be, with replacement."""
         drawn = torch.randint(self.drawable, (count,), generator=generator, device=self.device)
         return drawn if self.runs is None else _in_runs(self.runs, drawn)
+
+    def draw_known(self, count: int, generator: torch.Generator) -> tuple[Int[Tensor, "rays"], Float[Tensor, "rays"]]:
+        """``count`` of the pixels whose distance is known, drawn uniformly with replacement, and their distances."""
+        assert self.known is not None and self.distance is not None, "a bank that knows none is not asked"
+        drawn = torch.randint(len(self.known), (count,), generator=generator, device=self.device)
+        return self.known.index_select(0, drawn), self.distance.index_select(0, drawn)
 
     def may_be_drawn(self, pixel: Int[Tensor, "*rays"]) -> Bool[Tensor, "*rays"]:
         """Whether :meth:`sample` may draw these pixels."""

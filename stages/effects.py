@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from stages.pilots import Pilot, PilotScene
 
 NEEDS = ("ingest", "sfm", "normalise")
-VERSION = 2
+VERSION = 3
 RESUMES = False
 LINKS = ("effects.json",)
 UNKEYED = ("seconds",)  # it decides how many pilots, and that enters the key
@@ -94,7 +94,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     statistics_seconds = time.perf_counter() - started
     names = [view.name for view in scene.of_split("train")]
     gains = dict(zip(names, found.exposure.log_gain.tolist(), strict=True))
-    decisions, verdicts = _Study(config, scene, inputs["ingest"], gains, found.of, progress).decide()
+    decisions, verdicts = _Study(config, scene, inputs, gains, found.of, progress).decide()
     write_decisions(folder, decisions)
     lens = lens_evidence(registration)
     evidence, verdicts["lens"] = found.of | {"lens": lens}, Verdict(bool(lens.called_for), lens.words)
@@ -111,12 +111,12 @@ class _Study:
         self,
         config: Config,
         scene: "Scene",
-        ingest: Path,
+        inputs: Inputs,
         gains: dict[str, list[float]],
         evidence: "dict[str, Evidence]",
         progress: Progress,
     ) -> None:
-        self.config, self.scene, self.ingest, self.gains = config, scene, ingest, gains
+        self.config, self.scene, self.inputs, self.gains = config, scene, inputs, gains
         self.evidence, self.progress = evidence, progress
         self.pilots = 0
         self.trial: PilotScene | None = None
@@ -162,7 +162,7 @@ class _Study:
         if self.pilots == self.config.pilots:
             return f"{self.pilots} were made already" if self.pilots else "there is no time for one"
         if self.trial is None:
-            self.trial = pilot_scene(self.ingest, self.scene, self.progress)
+            self.trial = pilot_scene(self.inputs, self.scene, self.progress)
         return "too few training photos" if self.trial is None else None
 
     def _piloted(self, name: str, off: Decisions, on: Decisions, default: bool) -> Verdict:

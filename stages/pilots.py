@@ -7,11 +7,10 @@ half of such a photo and judged on its right half.
 
 import time
 from dataclasses import replace
-from pathlib import Path
 from statistics import mean, stdev
 from typing import TYPE_CHECKING, NamedTuple
 
-from stages.contract import Progress
+from stages.contract import Inputs, Progress
 from stages.effect_decisions import Decisions, photo_parts
 from stages.spread import spread
 
@@ -72,27 +71,28 @@ class PilotScene(NamedTuple):
     kept: "tuple[_Photo, ...]"
 
 
-def pilot_scene(ingest: Path, scene: "Scene", progress: Progress) -> PilotScene | None:
+def pilot_scene(inputs: Inputs, scene: "Scene", progress: Progress) -> PilotScene | None:
     """Small photos to train on and to judge by, both from the training photos; None where there are too few."""
     from stages.device import compute_device
     from stages.right_halves import enough
-    from stages.training_data import training_bank, view_mask, view_pixels, view_rays
+    from stages.training_data import guided_bank, view_mask, view_pixels, view_rays
 
     views = scene.of_split("train")
     count = min(MOST_KEPT, len(views) // KEPT_EVERY) or 1
     if len(views) - count < FEWEST_LEFT:
         return None
     chosen = {views[i].name for i in spread(len(views), count)}
-    split = replace(scene, views=tuple(replace(v, split="test" if v.name in chosen else "train") for v in views))
+    kept_back = (replace(view, split="validation") if view.name in chosen else view for view in scene.views)
+    split = replace(scene, views=tuple(kept_back))
     downscale = max(1.0, max(max(camera.width, camera.height) for camera in scene.cameras) / LONG_SIDE)
-    bank = training_bank(ingest, split, "train", downscale, progress).to(compute_device())
+    bank = guided_bank(inputs, split, downscale, progress).to(compute_device())
     photos = [
         _Photo(
             view_rays(split, view, downscale),
-            view_pixels(ingest, split, view, downscale, (0.0, 0.0, 0.0)),
-            view_mask(ingest, split, view, downscale),
+            view_pixels(inputs["ingest"], split, view, downscale, (0.0, 0.0, 0.0)),
+            view_mask(inputs["ingest"], split, view, downscale),
         )
-        for view in split.of_split("test")
+        for view in split.of_split("validation")
     ]
     kept = tuple(photo for photo in photos if enough(photo.colours, photo.used))
     return PilotScene(split, bank, kept) if kept else None

@@ -6,7 +6,8 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from stages.contract import Progress, StageError
+from stages.contract import Inputs, Progress, StageError
+from stages.files import read_tensors
 
 if TYPE_CHECKING:
     import numpy as np
@@ -83,6 +84,27 @@ def training_bank(ingest: Path, scene: "Scene", split: "Split", downscale: float
     if not any(view.mask for view in views):
         return bank
     return _masked(bank, [view_mask(ingest, scene, view, downscale) for view in views], split, progress)
+
+
+def guided_bank(inputs: Inputs, scene: "Scene", downscale: float, progress: Progress) -> "RayBank":
+    """:func:`training_bank` of the training photos, which knows how far away are the sparse points that they show.
+
+    Of normalise's points only those that two training photos saw, where these saw them."""
+    import numpy as np
+    import torch
+
+    from stages.track_colours import training_tracks
+
+    bank = training_bank(inputs["ingest"], scene, "train", downscale, progress)
+    tracks, xy = training_tracks(scene, read_tensors(inputs["normalise"] / "points.safetensors"))
+    cameras = [scene.cameras[view.camera] for view in scene.of_split("train")]
+    full = np.array([(camera.width, camera.height) for camera in cameras]).reshape(-1, 2)[tracks.view]
+    size = np.array([scaled_size(camera, downscale) for camera in cameras]).reshape(-1, 2)[tracks.view]
+    column, row = np.clip(np.floor(xy * size / full), 0, size - 1).astype(int).T
+    within = torch.from_numpy(row * size[:, 0] + column)
+    return bank.with_distances(
+        bank.first_pixel[torch.from_numpy(tracks.view)] + within, torch.from_numpy(tracks.distance)
+    )
 
 
 def _masked(bank: "RayBank", used: "Sequence[Tensor | None]", split: "Split", progress: Progress) -> "RayBank":

@@ -23,6 +23,8 @@ FINAL_RATE = 0.1  # of the paper field's learning rate at the start
 # Weight of the distortion loss (Barron et al. 2022, who take 1e-2) in folded space, against fog and matter close before
 # the cameras; fog also costs most of the time (docs/numbers.md). A box around an object needs none.
 DISTORTION = 4e-3
+# Weight at first of the depth loss at sparse points (Deng et al. 2022 take 0.1, too, of another one).
+DEPTH = 0.1
 COARSEST = 16
 FEWEST_STEPS, MOST_STEPS = 256, 384  # along the diagonal of a bounded scene's box
 TABLE_COPIES = 6  # of the grids' features: themselves, their gradient, Adam's two moments, and twice in a checkpoint
@@ -38,7 +40,7 @@ def prepare(config: "Config", scene: "Scene", inputs: Inputs, folder: Path, prog
     from nerf.probe import make_probe
     from stages.effect_decisions import photo_parts, read_decisions
     from stages.train_more import budget_of
-    from stages.training_data import training_bank
+    from stages.training_data import guided_bank
     from stages.training_log import TrainingLog
     from stages.training_loop import TrainingRun
     from stages.training_state import Probes
@@ -49,7 +51,7 @@ def prepare(config: "Config", scene: "Scene", inputs: Inputs, folder: Path, prog
     if device == "cpu":
         check_field_fits(config)
     progress.update("reading the photos")
-    bank = training_bank(inputs["ingest"], scene, "train", config.downscale, progress).to(device)
+    bank = guided_bank(inputs, scene, config.downscale, progress).to(device)
     shown_over = torch.tensor(field_background(config, scene), device=device)
 
     probes = Probes(
@@ -187,6 +189,7 @@ def grid_trainer_settings(config: "Config", scene: "Scene", seed: int) -> "GridT
         chunks=config.chunks,
         rate=config.learning_rate,
         distortion=DISTORTION if config.contracted else 0.0,
+        depth=DEPTH,
     )
 
 

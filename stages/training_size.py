@@ -19,8 +19,9 @@ TIMED_SECONDS = 1.0
 MOST_TIMED_RAYS = {"cpu": 256, "cuda": 1 << 20}
 """For each core: one chunk of a batch. More keep a CPU no busier and make the published model's steps long; a GPU needs
 many."""
-SAMPLES_PER_RAY = {"bounded": 8, "contracted": 20}
-"""Colours that the grid field computes for a ray, over a run: measured on lego_400 and fox (docs/numbers.md)."""
+SAMPLES_PER_RAY = {"bounded": 8, "contracted": 12}
+"""Colours that the grid field computes for a ray, over a run: measured on lego_400 and five photo sets
+(docs/numbers.md)."""
 GRID_SIZES = {
     "bounded": ((50e6, 5, 18, 512), (0, 4, 17, 256)),
     "contracted": ((200e6, 6, 18, 1024), (60e6, 5, 18, 512), (0, 5, 17, 512)),

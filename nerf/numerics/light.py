@@ -1,4 +1,4 @@
-"""Cases of what rays see: samples placed by a density, volume rendering, distortion, what a density lattice stops."""
+"""Cases of what rays see: samples placed by a density, volume rendering, what a density lattice stops."""
 
 from typing import Any
 
@@ -6,17 +6,15 @@ import torch
 from torch import Tensor
 
 from nerf.compositing import composite, volume_weights
-from nerf.kernels import Backend, Lattice, Samples
+from nerf.kernels import Backend, Samples
 from nerf.lattice import Lattice as DensityLattice
 from nerf.lattice import first_crossing, occupancy, optical_depth
-from nerf.metrics import PSNR_LIMIT, psnr
 from nerf.model import Rendering
 from nerf.numerics import Bound, Case
 from nerf.numerics.space import decades, uniform
 from nerf.sampling import Spacing, invert_cdf, midpoint_edges, stratified
 
 N = 8  # intervals of a ray
-EVEN, GROWING = Lattice(0.05, 0.0, False, 8, 100), Lattice(0.05, 0.2, True, 8, 100)
 
 
 def _ends(like: Tensor) -> Tensor:
@@ -25,7 +23,7 @@ def _ends(like: Tensor) -> Tensor:
     return torch.cat([steps.new_full((1,), 2.0), 2 + steps.cumsum(0)])
 
 
-def _packed(like: Tensor) -> Samples:
+def packed(like: Tensor) -> Samples:
     """The same intervals on every ray of ``like``, samples at their beginnings."""
     rays, ends = len(like), _ends(like)
     starts = torch.arange(0, rays * N + 1, N, dtype=torch.int32, device=like.device)
@@ -47,7 +45,7 @@ def _hard_densities() -> tuple[Tensor, Tensor, Tensor]:
     return sigma, uniform(4, 0, 1, len(sigma), N, 3), uniform(5, 0, 1, len(sigma), 3)
 
 
-def _light(sigma: Tensor) -> tuple[Tensor, Tensor]:
+def light(sigma: Tensor) -> tuple[Tensor, Tensor]:
     """Weights, and the light that nothing stops; from running sums, interval by interval."""
     tau = sigma * _ends(sigma).diff()
     passed, weights = torch.zeros_like(tau[:, 0]), []
@@ -58,10 +56,10 @@ def _light(sigma: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _seen(sigma: Tensor, colour: Tensor, background: Tensor) -> Tensor:
-    weights, passed = _light(sigma)
-    ends, light = _ends(sigma), torch.exp(-passed)[:, None]
-    depth = (weights * ends[:-1]).sum(-1, keepdim=True) + light * ends[-1]
-    seen = (weights[..., None] * colour).sum(1) + light * background
+    weights, passed = light(sigma)
+    ends, unstopped = _ends(sigma), torch.exp(-passed)[:, None]
+    depth = (weights * ends[:-1]).sum(-1, keepdim=True) + unstopped * ends[-1]
+    seen = (weights[..., None] * colour).sum(1) + unstopped * background
     return torch.cat([seen, depth, -torch.expm1(-passed)[:, None], weights], -1)
 
 
@@ -73,7 +71,7 @@ def _composite(_: Backend, sigma: Tensor, colour: Tensor, background: Tensor) ->
 def _composite_packed(backend: Backend, sigma: Tensor, colour: Tensor, background: Tensor) -> Tensor:
     far = _ends(sigma)[-1].expand(len(sigma)).contiguous()
     (seen, depth, opacity), weights = backend.composite(
-        _packed(sigma), sigma.reshape(-1), colour.reshape(-1, 3), background, far
+        packed(sigma), sigma.reshape(-1), colour.reshape(-1, 3), background, far
     )
     return torch.cat([seen, depth[:, None], opacity[:, None], weights.view(-1, N)], -1)
 
@@ -83,44 +81,9 @@ def _composite_packed_backward(
 ) -> tuple[Tensor, Tensor]:
     far = _ends(sigma)[-1].expand(len(sigma)).contiguous()
     of_rendering = Rendering(*(part.contiguous() for part in (grad[:, :3], grad[:, 3], grad[:, 4])))
-    arguments = _packed(sigma), sigma.reshape(-1), colour.reshape(-1, 3), background, far
+    arguments = packed(sigma), sigma.reshape(-1), colour.reshape(-1, 3), background, far
     of_sigma, of_colour = backend.composite_backward(*arguments, of_rendering, grad[:, 5:].reshape(-1))
     return of_sigma.view(-1, N), of_colour.view(-1, N, 3)
-
-
-def _far_out(like: Tensor, lattice: Lattice) -> Samples:
-    """Packed samples far from the camera, in steps of 0.2 to 2 % of their distance, as the lattice's are: around 3
-    where steps do not grow, around 768 where they do. float32 and float64 share their places."""
-    samples, distance = _packed(like), 768.0 if lattice.cone else 3.0
-    return samples._replace(t=distance * (1 + samples.t / 64), dt=distance / 64 * samples.dt)
-
-
-def _distortion(lattice: Lattice) -> dict[str, Any]:
-    def reference(weights: Tensor) -> Tensor:
-        t, lengths = (part[:N] for part in _far_out(weights, lattice)[2:])
-        m = 1 + torch.log(t / lattice.linear_until) if lattice.cone else t
-        lengths = lengths / t if lattice.cone else lengths
-        pairs = weights[:, :, None] * weights[:, None] * (m[:, None] - m).abs()
-        return (pairs.sum((1, 2)) + (weights.square() * lengths).sum(1) / 3)[:, None]
-
-    def function(backend: Backend, weights: Tensor) -> Tensor:
-        return backend.distortion(_far_out(weights, lattice), weights.reshape(-1), lattice)[:, None]
-
-    def backward(backend: Backend, grad: Tensor, weights: Tensor) -> tuple[Tensor]:
-        flat = weights.reshape(-1)
-        return (backend.distortion_backward(_far_out(weights, lattice), flat, lattice, grad[:, 0]).view(-1, N),)
-
-    return {"function": function, "reference": reference, "backward": backward, "differentiable": 1, "kernels": True}
-
-
-def _weights() -> tuple[Tensor]:
-    return (_light(decades(1, -4, 2, 256, N))[0],)
-
-
-def _hard_weights() -> tuple[Tensor]:
-    """All in one interval or in two neighbours, at the end of the ray too; tiny ones; equal ones."""
-    pairs = (torch.eye(N) + torch.eye(N).roll(1, 0)) / 2
-    return (torch.cat([torch.eye(N), pairs, torch.full((1, N), 1e-4), torch.full((1, N), 1 / N)]),)
 
 
 def _stratified(spacing: Spacing):
@@ -157,10 +120,6 @@ def _spiky_weights() -> tuple[Tensor, Tensor, Tensor]:
     weights = torch.cat([spikes, others, spikes.clamp(max=1) + 1e-7])
     rows = len(weights)
     return _ends(weights).repeat(rows, 1), weights, torch.linspace(0, 1, 17).repeat(rows, 1)
-
-
-def _psnrs(_: Backend, error: Tensor) -> Tensor:
-    return torch.tensor([[psnr(float(each))] for each in error[:, 0]], dtype=torch.float64)
 
 
 def _occupancy(density: Tensor, level: float = 7.0) -> Tensor:
@@ -286,45 +245,6 @@ CASES = [
         differentiable=2,
         kernels=True,
         **PACKED,
-    ),
-    Case(
-        formula="distortion ΣΣ w_i w_j |m_i − m_j| + ⅓ Σ w² l",
-        where="nerf/kernels/packed_compositing.py: distortion, distortion_backward",
-        domain="weights in [0, 1]",
-        hazard="m Σ w − Σ w m cancels for weights close together far out",
-        answer="sums in float64; Warp adds up distances between neighbours, so that no large numbers meet",
-        tried="steps of 0.2 to 2 % of the distance; rendered weights; all in one interval or two, 1e-4 each",
-        typical=_weights,
-        extreme=_hard_weights,
-        value=Bound(5e-7, "itself"),
-        gradient=Bound(5e-7, "row"),
-        **_distortion(EVEN),
-    ),
-    Case(
-        formula="distortion where steps grow, m = log t",
-        where="nerf/kernels/packed_compositing.py: distortion, distortion_backward",
-        domain="weights in [0, 1], t > 0",
-        hazard="as above; log of 0; float32 of log t is off by 5e-7, of two neighbours' difference by 1e-4 of it",
-        answer="as above; the logarithm is taken of max(1, t/t₁), in float32 by Warp: 1e-4 of a small loss",
-        tried="as above",
-        typical=_weights,
-        extreme=_hard_weights,
-        value=Bound(3e-4, "itself"),
-        gradient=Bound(5e-5, "row"),
-        **_distortion(GROWING),
-    ),
-    Case(
-        formula="PSNR −10 log₁₀ MSE",
-        where="nerf/metrics.py: psnr",
-        domain="0 ≤ MSE < ∞; anything else is refused",
-        hazard="infinite for equal pictures",
-        answer="100 dB and no more, in float64",
-        tried="MSE from 0, 1e-38, 1e-10 to 1e30",
-        typical=lambda: (decades(1, -9, 0, 256, 1),),
-        extreme=lambda: (torch.tensor([[0.0], [1e-38], [1e-10], [0.999], [1e30]]),),
-        function=_psnrs,
-        reference=lambda error: torch.where(error > 1e-10, -10 * torch.log10(error), PSNR_LIMIT).cpu(),
-        value=Bound(1e-15, "itself"),
     ),
     Case(
         formula="occupancy 1 − 2^(−σ/level)",

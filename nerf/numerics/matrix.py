@@ -6,9 +6,9 @@ from typing import NamedTuple
 import torch
 
 from nerf.kernels import Backend, reference
-from nerf.numerics import Bound, Case, Measured, light, measure, networks, space
+from nerf.numerics import Bound, Case, Measured, light, losses, measure, networks, space
 
-CASES: tuple[Case, ...] = (*space.CASES, *light.CASES, *networks.CASES)
+CASES: tuple[Case, ...] = (*space.CASES, *light.CASES, *losses.CASES, *networks.CASES)
 
 
 class Row(NamedTuple):

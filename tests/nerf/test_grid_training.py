@@ -10,7 +10,7 @@ from nerf.effects.exposure import expose
 from nerf.effects.exposures import Exposures
 from nerf.effects.poses import RefinedPoses
 from nerf.grid_field import GridField, GridSettings
-from nerf.grid_training import GridBatch, GridTrainer, GridTrainerSettings, rate_factor
+from nerf.grid_training import GridBatch, GridTrainer, GridTrainerSettings, depth_factor, rate_factor
 from nerf.kernels import reference
 from nerf.probe import make_probe, measure
 from nerf.ray_bank import RayBank, build_ray_bank
@@ -86,16 +86,18 @@ def test_results_do_not_depend_on_the_number_of_threads() -> None:
 
 
 def test_the_gradient_of_a_batch_is_the_sum_over_its_chunks() -> None:
-    run = trainer(replace(TRAINER, samples=1 << 14, distortion=0.1, chunks=4))
+    run = trainer(replace(TRAINER, samples=1 << 14, distortion=0.1, depth=0.2, chunks=4))
+    run.bank = run.bank.with_distances(torch.tensor([0, 200]), torch.tensor([3.0, 2.5]))
     rays = run._rays_per_chunk()
-    parts = [run._part(0, 1.0, rays, chunk) for chunk in range(4)]
+    parts = [run._part(0, 0.25, rays, chunk) for chunk in range(4)]
+    assert all((part.batch.distance > 0).sum() == rays // 8 for part in parts)
     assert rays > 10 and not torch.equal(parts[0].batch.target, parts[1].batch.target)
     whole = GridBatch(
         Rays(*(torch.cat(part) for part in zip(*(part.batch.rays for part in parts), strict=True))),
         *(torch.cat(part) for part in zip(*(part.batch[1:] for part in parts), strict=True)),
     )
     done = run.model.forward(whole.rays, whole.jitter, whole.background)
-    loss = run._loss(4 * rays, 0.1, done, whole)
+    loss = run._loss(4 * rays, 0.25, done, whole)
     gradients = run.model.backward(done, loss.grad, loss.grad_weights)
     summed = [torch.stack(of_parts).sum(0) for of_parts in zip(*(part.weights for part in parts), strict=True)]
     torch.testing.assert_close(summed, list(gradients.weights), rtol=1e-4, atol=1e-9)
@@ -143,7 +145,7 @@ def test_a_non_finite_step_changes_nothing_and_shows_its_batch(
         run.step(1, 0.5)
     for name, tensor in run.state().items():
         torch.testing.assert_close(tensor, before[name], rtol=0, atol=0, equal_nan=True)
-    assert set(caught.value.batch) == {*Rays._fields, "target", "background", "jitter", "view"}
+    assert set(caught.value.batch) == {*Rays._fields, "target", "background", "jitter", "view", "distance"}
 
 
 def test_the_rate_scale_scales_the_update() -> None:
@@ -296,3 +298,53 @@ def test_the_sky_becomes_what_is_seen_in_its_direction() -> None:
     assert (seen - 0.5).abs().min() > 0.05
     assert {"model.sky", "mean.sky", "square.sky"} <= run.state().keys()
     assert not any("sky" in name for name in trainer().state())
+
+
+def test_known_distances_decide_a_shape_that_colours_leave_open() -> None:
+    """Photos of one colour fit any depth; the centre of one is known to be 3 units away."""
+    bank = small_bank()
+    grey = bank._replace(pixels=torch.full_like(bank.pixels[:, :3], 128))
+    guided = grey.with_distances(torch.tensor([78]), torch.tensor([3.0]))
+    settings = replace(TRAINER, background=(0.0, 0.0, 0.0), depth=0.1)
+    centre, depth = grey.lookup(torch.tensor([78])).rays, {}
+    for name, photos in {"open": grey, "guided": guided}.items():
+        run = GridTrainer(GridField(FIELD, 0, reference), photos, settings)
+        for step in range(120):
+            run.step(step, step / 120)
+        depth[name] = float(run.model.render(centre, torch.zeros(3)).depth)
+    assert abs(depth["guided"] - 3) < 0.15 < abs(depth["open"] - 3) - 0.3
+
+
+def test_points_guide_a_run_less_and_less() -> None:
+    settings = replace(TRAINER, depth=0.1)
+    plain, guided = trainer(settings), trainer(settings)
+    guided.bank = guided.bank.with_distances(torch.tensor([0, 200]), torch.tensor([3.0, 2.5]))
+    assert depth_factor(0.0) == 1 and depth_factor(0.25) == 0.75 and depth_factor(1.0) == 0
+    assert plain.step(0, 1.0) == guided.step(0, 1.0)
+    assert same(plain.state(), guided.state())
+    plain.step(1, 0.9)
+    guided.step(1, 0.9)
+    assert not same(plain.state(), guided.state())
+
+
+def test_without_a_weight_known_distances_change_nothing() -> None:
+    plain, other = trainer(), trainer()
+    other.bank = other.bank.with_distances(torch.tensor([0, 200]), torch.tensor([3.0, 2.5]))
+    assert [plain.step(step, 0.1) for step in range(3)] == [other.step(step, 0.1) for step in range(3)]
+    assert same(plain.state(), other.state())
+
+
+def test_the_sky_where_it_is_always_hidden_falls_back_to_grey(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Light of a millionth reaches it now and then; Adam alone would follow that anywhere."""
+    outdoors = replace(FIELD, contracted=True, shortest_step=0.05, cone=0.1, sky=True)
+    run = GridTrainer(GridField(outdoors, 0, reference), small_bank(), replace(TRAINER, background=(0.0, 0.0, 0.0)))
+    run.model.sky.fill_(3.0)
+    noise = torch.Generator().manual_seed(0)
+
+    def faint(*_: object) -> Tensor:
+        return 1e-10 * torch.randn(run.model.sky.shape, generator=noise)
+
+    monkeypatch.setattr(run.model, "sky_backward", faint)
+    for step in range(120):
+        run.step(step, 0.0)
+    assert run.model.sky.abs().mean() < 0.5

@@ -152,3 +152,26 @@ def test_without_masks_the_same_pixels_are_drawn_as_ever() -> None:
     expected, drawn = bank.lookup(pixel), bank.without([None] * 3).sample(20, generator("cpu", 3))
     assert torch.equal(drawn[0].directions, expected[0].directions) and torch.equal(drawn[1], expected[1])
     assert bank.to("cpu").runs is None
+
+
+def test_known_distances_are_drawn_with_their_pixels_as_often_as_each_other() -> None:
+    bank, *_ = scattered()
+    assert bank.known is None and bank.with_distances(torch.zeros(0).long(), torch.zeros(0)).known is None
+    known = bank.with_distances(torch.tensor([3, 30, 3]), torch.tensor([1.5, 2.5, 3.5]))
+    pixel, distance = known.draw_known(3000, generator("cpu", 0))
+    pairs, counts = torch.stack([pixel.float(), distance], 1).unique(dim=0, return_counts=True)
+    assert pairs.tolist() == [[3, 1.5], [3, 3.5], [30, 2.5]]
+    assert (counts - 1000).abs().max() < 100
+    again, *_ = known.draw_known(3000, generator("cpu", 0))
+    assert torch.equal(pixel, again)
+    assert torch.equal(known.draw(50, generator("cpu", 1)), bank.draw(50, generator("cpu", 1)))
+
+
+def test_distances_of_pixels_that_masks_ignore_are_forgotten() -> None:
+    bank, *_ = scattered()
+    ignored = torch.zeros(SIZES[0], dtype=torch.bool)
+    ignored[0] = True
+    masked = bank.without([ignored, None, None])
+    known = masked.with_distances(torch.tensor([3, 30]), torch.tensor([1.5, 2.5])).known
+    assert known is not None and known.tolist() == [30]
+    assert masked.with_distances(torch.tensor([3]), torch.tensor([1.5])).known is None

@@ -10,7 +10,7 @@ from torch import Tensor
 from nerf.kernels import Lattice
 from nerf.kernels.adam import LEAST_ROOT
 from nerf.numerics import Case, error
-from nerf.numerics.light import GROWING
+from nerf.numerics.losses import GROWING
 from nerf.numerics.matrix import CASES
 from nerf.numerics.networks import COUNT
 from nerf.numerics.space import FOLDED, OCTAVES

@@ -1,4 +1,4 @@
-"""A tiny finished ingest, normalise and effects: photos of a ball, with exact cameras, as files."""
+"""A tiny finished ingest, normalise and effects: photos of a ball, with exact cameras and points, as files."""
 
 from pathlib import Path
 
@@ -6,9 +6,10 @@ import numpy as np
 
 from nerf.scene import Camera, Scene, Similarity, View
 from stages.effect_decisions import Decisions, write_decisions
-from stages.files import write_json, write_png
+from stages.files import write_json, write_png, write_tensors
 
 WIDTH, HEIGHT, FOCAL = 24, 16, 20.0
+RADIUS = 0.6  # of the ball
 CAMERA = Camera("PINHOLE", WIDTH, HEIGHT, (FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2))
 
 
@@ -20,9 +21,9 @@ def pose_towards_origin(angle: float, distance: float = 3.0) -> np.ndarray:
 
 
 def ball_photo(channels: int = 3) -> np.ndarray:
-    """A blue ball of radius 0.6 at the origin, seen from 3 units away; white, or nothing, behind it."""
+    """A blue ball at the origin, seen from 3 units away; white, or nothing, behind it."""
     y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
-    inside = np.hypot(x - WIDTH / 2, y - HEIGHT / 2) < FOCAL * 0.6 / 3
+    inside = np.hypot(x - WIDTH / 2, y - HEIGHT / 2) < FOCAL * RADIUS / 3
     photo = np.where(inside[..., None], [30, 60, 200], 255)
     if channels == 4:
         photo = np.concatenate([photo, np.where(inside, 255, 0)[..., None]], axis=2)
@@ -52,4 +53,27 @@ def photographed(
     still = Similarity(1.0, np.eye(3), np.zeros(3))
     scene = Scene((CAMERA,), tuple(kept), still, bounded, channels == 4, "around", True)
     write_json(inputs["normalise"] / "scene.json", scene.to_json())
+    write_tensors(inputs["normalise"] / "points.safetensors", seen_points(scene))
     return inputs, scene
+
+
+def seen_points(scene: Scene) -> dict[str, np.ndarray]:
+    """points.safetensors: 16 points around the ball's waist, each seen by the cameras that it is turned to."""
+    angle = 2 * np.pi * np.arange(16) / 16
+    xyz = RADIUS * np.stack([np.cos(angle), np.sin(angle), np.zeros(16)], axis=1)
+    seen = []
+    for number, view in enumerate(scene.views):
+        rotation, centre = view.scene_from_camera[:, :3], view.scene_from_camera[:, 3]
+        turned_to = np.flatnonzero(((centre - xyz) * xyz).sum(axis=1) > 0)
+        x, y, z = ((xyz[turned_to] - centre) @ rotation).T
+        xy = FOCAL * np.stack([x / z, y / z], axis=1) + [WIDTH / 2, HEIGHT / 2]
+        seen += [(number, point, *place) for point, place in zip(turned_to, xy, strict=True)]
+    view, point, *xy = np.array(seen).T
+    return {
+        "xyz": xyz.astype(np.float32),
+        "rgb": np.tile(np.array([30, 60, 200], np.uint8), (16, 1)),
+        "error_px": np.full(16, 0.5, np.float32),
+        "view": view.astype(np.int32),
+        "point": point.astype(np.int32),
+        "xy": np.stack(xy, axis=1).astype(np.float32),
+    }

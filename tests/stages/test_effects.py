@@ -12,7 +12,7 @@ from nerf.training import NonFinite
 from stages import effects, evidence, pilots
 from stages.effect_decisions import Decisions, read_decisions, write_decisions
 from stages.evidence import SceneEvidence
-from stages.files import write_json, write_tensors
+from stages.files import write_json
 from stages.pilots import Pilot
 from tests.effect_scenes import Effects, effect_scene
 from tests.stages.photo_scene import photographed
@@ -36,7 +36,6 @@ def decided(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tu
     inputs["sfm"] = tmp_path / "scene" / "sfm"
     inputs["sfm"].mkdir()
     write_json(inputs["sfm"] / "registration.json", {"images": [], "camera_models": []})
-    write_tensors(inputs["normalise"] / "points.safetensors", {"xyz": np.zeros((0, 3), np.float32)})
     count = len(scene.of_split("train"))
 
     def run(

@@ -28,14 +28,14 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 @pytest.fixture(scope="module")
 def trial(inputs: dict[str, Path]) -> PilotScene:
-    made = pilot_scene(inputs["ingest"], read_scene(inputs["normalise"]), Quiet())
+    made = pilot_scene(inputs, read_scene(inputs["normalise"]), Quiet())
     assert made is not None
     return made
 
 
 def test_photos_are_kept_back_from_the_training_photos_alone(trial: PilotScene, inputs: dict[str, Path]) -> None:
     given = read_scene(inputs["normalise"])
-    trained, kept = ({view.name for view in trial.scene.of_split(split)} for split in ("train", "test"))
+    trained, kept = ({view.name for view in trial.scene.of_split(split)} for split in ("train", "validation"))
     assert kept and trained | kept == {view.name for view in given.of_split("train")} and not trained & kept
     assert len(trial.kept) == len(kept) and len(trial.bank.near) == len(trained)
 
@@ -54,7 +54,7 @@ def test_a_wrong_exposure_loses(trial: PilotScene) -> None:
 
 def test_too_few_photos_make_no_pilot(tmp_path: Path) -> None:
     inputs, scene = photographed(tmp_path, views=5)
-    assert pilot_scene(inputs["ingest"], scene, Quiet()) is None
+    assert pilot_scene(inputs, scene, Quiet()) is None
 
 
 @pytest.mark.parametrize(

@@ -10,9 +10,11 @@ from hypothesis import strategies as st
 from nerf.ray_bank import Placement, ray_bank
 from nerf.scene import Camera
 from stages.contract import StageError
+from stages.files import write_tensors
 from stages.training_data import (
     MOST_PATCHES,
     camera_directions,
+    guided_bank,
     patch_bearings,
     scaled_size,
     training_bank,
@@ -21,7 +23,7 @@ from stages.training_data import (
     view_rays,
 )
 from tests.conftest import SilentProgress
-from tests.stages.photo_scene import CAMERA, FOCAL, HEIGHT, WIDTH, ball_photo, photographed
+from tests.stages.photo_scene import CAMERA, FOCAL, HEIGHT, RADIUS, WIDTH, ball_photo, photographed, seen_points
 
 
 @given(st.integers(1, 9000), st.integers(1, 9000), st.floats(1.0, 50.0))
@@ -178,3 +180,38 @@ def test_masks_that_leave_nothing_at_a_size_are_said(tmp_path: Path, progress: S
         "nothing is left to train on: the masks ignore every pixel of the train photos at this size. "
         "Give a smaller --train.downscale."
     )
+
+
+@pytest.mark.parametrize("downscale", [1.0, 2.0, 3.3])
+def test_the_bank_knows_where_training_photos_show_points(
+    downscale: float, tmp_path: Path, progress: SilentProgress
+) -> None:
+    inputs, scene = photographed(tmp_path)
+    bank = guided_bank(inputs, scene, downscale, progress)
+    assert bank.known is not None and bank.distance is not None
+    seen = seen_points(scene)
+    trained = np.array([view.split == "train" for view in scene.views])[seen["view"]]
+    assert len(bank.known) == trained.sum() > 30
+    rays = bank.lookup(bank.known).rays
+    hit = rays.origins + bank.distance[:, None] * rays.directions
+    # Rays run through the middles of pixels, points lie anywhere inside of them.
+    half_a_pixel = 0.5 * 2**0.5 * downscale * 3.0 / FOCAL
+    closest = torch.cdist(hit, torch.from_numpy(seen["xyz"])).min(-1).values
+    assert (closest < half_a_pixel).all()
+    assert float((hit.norm(dim=-1) - RADIUS).abs().mean()) < half_a_pixel / 2
+
+
+def test_points_that_one_training_photo_saw_alone_are_no_guide(tmp_path: Path, progress: SilentProgress) -> None:
+    inputs, scene = photographed(tmp_path)
+    seen = seen_points(scene)
+    alone = {name: seen[name][:1] if name in ("view", "point", "xy") else seen[name] for name in seen}
+    write_tensors(inputs["normalise"] / "points.safetensors", alone)
+    assert guided_bank(inputs, scene, 1.0, progress).known is None
+
+
+def test_points_on_masked_pixels_are_no_guide(tmp_path: Path, progress: SilentProgress) -> None:
+    mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    mask[:, WIDTH // 2 :] = 0
+    inputs, scene = photographed(tmp_path, mask=mask)
+    known = guided_bank(inputs, scene, 1.0, progress).known
+    assert known is not None and (known % WIDTH < WIDTH // 2).all()

@@ -1,0 +1,59 @@
+"""How far from a sparse point the light of its ray is stopped: what structure from motion tells a young field.
+
+Where few photos look, many shapes explain their colours, and a field settles for one of them early. At some pixels more
+is known than a colour: the photo shows a point there whose distance was triangulated. The idea of a loss on it is Deng
+et al.'s (2022, "Depth-supervised NeRF"), who compare distributions by their divergence, with an uncertainty for every
+point. Here it is the mean distance between where light is stopped and the point, the first Wasserstein distance to all
+of it being stopped there: finite wherever the light is, and an outlier pulls no harder than a good point.
+"""
+
+from jaxtyping import Float
+from torch import Tensor
+
+from nerf.kernels import Lattice, Samples
+from nerf.kernels.marching import lattice_coordinate
+
+
+def depth_loss(
+    samples: Samples,
+    weights: Float[Tensor, "samples"],
+    opacity: Float[Tensor, "rays"],
+    far: Float[Tensor, "rays"],
+    distance: Float[Tensor, "rays"],
+    lattice: Lattice,
+) -> Float[Tensor, "rays"]:
+    """sum_i w_i |m(t_i) - m(d)| + U |m(far) - m(d)| of each ray, where U = 1 - opacity is the light that nothing stops
+    and d the ``distance`` of its point; 0 for rays whose d is 0, of which none is known.
+
+    Positions m are measured as in the distortion loss (nerf/kernels/packed_compositing.py): dm = dt / max(t_1, t) where
+    steps grow from t_1 on, so that a tenth too far costs the same at any distance; as distances if they do not.
+    """
+    of_samples, of_rest = _apart(samples, far, distance, lattice)
+    rest = (1 - opacity) * of_rest
+    return rest.index_add(0, samples.ray, weights * of_samples)
+
+
+def depth_loss_backward(
+    samples: Samples,
+    far: Float[Tensor, "rays"],
+    distance: Float[Tensor, "rays"],
+    lattice: Lattice,
+    grad: Float[Tensor, "rays"],
+) -> tuple[Float[Tensor, "samples"], Float[Tensor, "rays"]]:
+    """Gradients of the weights and of the opacities."""
+    of_samples, of_rest = _apart(samples, far, distance, lattice)
+    return grad.index_select(0, samples.ray) * of_samples, -grad * of_rest
+
+
+def _apart(
+    samples: Samples, far: Float[Tensor, "rays"], distance: Float[Tensor, "rays"], lattice: Lattice
+) -> tuple[Float[Tensor, "samples"], Float[Tensor, "rays"]]:
+    """How far samples and the ends of rays are from their point; 0 on rays without one."""
+    known, point = distance > 0, _measure(distance, lattice)
+    of_samples = (_measure(samples.t, lattice) - point.index_select(0, samples.ray)).abs()
+    of_rest = (_measure(far, lattice) - point).abs()
+    return of_samples * known.index_select(0, samples.ray), of_rest * known
+
+
+def _measure(t: Float[Tensor, "*batch"], lattice: Lattice) -> Float[Tensor, "*batch"]:
+    return (lattice.cone or lattice.step) * lattice_coordinate(lattice, t)
