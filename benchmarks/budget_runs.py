@@ -32,7 +32,7 @@ from stages.device import compute_device
 from stages.effect_decisions import Decisions, photo_parts, read_decisions, told_by_neighbours
 from stages.files import read_json, read_scene
 from stages.train import Config, with_habits
-from stages.training_data import training_bank
+from stages.training_data import guided_bank, training_bank
 from stages.training_setup import field_background, make_trainer
 from stages.training_size import SAMPLES_PER_RAY
 
@@ -72,8 +72,8 @@ class Bench(NamedTuple):
 def bench_of(workspace: Path) -> Bench:
     """The photos, cameras and decisions of a workspace."""
     keys = read_json(workspace / "run.json")["keys"]
-    ingest, normalise, effects = (workspace / s / keys[s][:16] for s in ("ingest", "normalise", "effects"))
-    scene, decisions = read_scene(normalise), read_decisions(effects)
+    inputs = {stage: workspace / stage / keys[stage][:16] for stage in ("ingest", "normalise", "effects")}
+    scene, decisions = read_scene(inputs["normalise"]), read_decisions(inputs["effects"])
     cameras = [scene.cameras[view.camera] for view in scene.of_split("train")]
     rays = ONCE * SAMPLES / SAMPLES_PER_RAY["contracted" if decisions.unbounded else "bounded"]
     config = Config(
@@ -90,7 +90,8 @@ def bench_of(workspace: Path) -> Bench:
     )
     config = with_habits(config)
     assert config.downscale is not None
-    train, test = (training_bank(ingest, scene, s, config.downscale, Quiet()) for s in ("train", "test"))
+    train = guided_bank(inputs, scene, config.downscale, Quiet())
+    test = training_bank(inputs["ingest"], scene, "test", config.downscale, Quiet())
     shown_over = torch.tensor(field_background(config, scene))
     probe = make_probe(test, PROBE_RAYS, shown_over, seed=0)
     return Bench(config, scene, decisions, train, probe, told_by_neighbours(scene, scene.of_split("test")))

@@ -14,6 +14,7 @@ from nerf.density_cache import DensityCache
 from nerf.effects import AS_GIVEN, AS_RENDERED, PhotoColours, PhotoRays, Seen
 from nerf.grid_field import CORNERS, GridField, GridPass
 from nerf.grid_mlp import Weights
+from nerf.kernels import BOX
 from nerf.metrics import psnr
 from nerf.model import Rendering
 from nerf.parallel import in_order
@@ -35,7 +36,7 @@ FINAL_RATE = 0.05  # of the rate at first
 # tell apart (the sky) would be drawn close behind the scene before their place is known (docs/numbers.md).
 FIRST_DISTORTION = 0.25  # of its weight
 FULL_DISTORTION_SHARE = 0.3  # of the run
-GUIDED_RAYS = 0.125  # so many of them run to sparse points, where some are known
+GUIDED_EVERY = 8  # one ray in so many runs to a sparse point, where some are known
 FIRST_SAMPLES_PER_RAY = 128.0
 ADAM_BYTES = 4 * 7  # of an entry of the table: its gradient read and cleared, itself and its moments read and written
 MEMORY = 0.9  # how much of the mean of samples per ray remains after each step
@@ -47,8 +48,8 @@ class GridTrainerSettings:
     most ``most_rays``. ``chunks``: equal parts of a step, each computed on a core; results depend on their number, not
     on that of the cores. ``background`` is what lies behind a scene without a sky: a colour, or another random one for
     each ray (only for photos with alpha, where it shows the field which space is empty). ``distortion``: full weight
-    of the distortion loss, for scenes without a known background. ``depth``: weight at first of the depth loss, at the
-    pixels whose distance the bank knows."""
+    of the distortion loss, for scenes without a known background. ``depth_loss``: its weight at first, at the pixels
+    whose distance the bank knows."""
 
     seed: int
     background: tuple[float, float, float] | Literal["random"]
@@ -57,7 +58,7 @@ class GridTrainerSettings:
     chunks: int = 1
     rate: float = 2e-2
     distortion: float = 0.0
-    depth: float = 0.0
+    depth_loss: float = 0.0
 
 
 class GridBatch(NamedTuple):
@@ -127,7 +128,9 @@ class GridTrainer:
         photo_rays: PhotoRays = AS_GIVEN,
         photo_colours: PhotoColours = AS_RENDERED,
     ) -> None:
-        self.model, self.bank, self.settings = model, bank, settings
+        self.model, self.settings = model, settings
+        # Nothing beyond the box of a bounded scene is drawn: a point there would pull the light to its walls.
+        self.bank = bank if model.settings.contracted else bank.known_within(BOX)
         self.photo_rays, self.photo_colours = photo_rays, photo_colours
         self.cache = DensityCache(model)
         self.photo_parts = [each for each in (photo_rays, photo_colours) if each.parameters]
@@ -185,7 +188,8 @@ class GridTrainer:
     def _batch(self, step: int, share: float, chunk: int, count: int) -> GridBatch:
         device = self.bank.device
         random = generator(device, self.settings.seed, step, chunk)
-        to_points = int(GUIDED_RAYS * count) if self._is_guided(share) else 0
+        # Shared out over the chunks, which are small where cores are many and the field is young.
+        to_points = (chunk + 1) * count // GUIDED_EVERY - chunk * count // GUIDED_EVERY if self._is_guided(share) else 0
         pixel, distance = self.bank.draw(count - to_points, random), torch.zeros(count, device=device)
         if to_points:
             of_points, distance[-to_points:] = self.bank.draw_known(to_points, random)
@@ -200,7 +204,7 @@ class GridTrainer:
         return GridBatch(rays, target, background, jitter, view, distance)
 
     def _is_guided(self, share: float) -> bool:
-        return self.bank.known is not None and self.settings.depth * depth_factor(share) > 0
+        return self.bank.known is not None and self.settings.depth_loss * depth_factor(share) > 0
 
     def _part(self, step: int, share: float, rays: int, chunk: int) -> _Part:
         """What a chunk of so many rays adds to loss and gradients."""
@@ -242,7 +246,7 @@ class GridTrainer:
             value = value + (each * backend.distortion(done.samples, done.weights, lattice)).sum()
             grad_weights = backend.distortion_backward(done.samples, done.weights, lattice, each)
         if self._is_guided(share):
-            each = torch.full_like(batch.distance, self.settings.depth * depth_factor(share) / rays)
+            each = torch.full_like(batch.distance, self.settings.depth_loss * depth_factor(share) / rays)
             places = done.rays.far, batch.distance, lattice
             value = value + (each * depth_loss(done.samples, done.weights, done.rendering.opacity, *places)).sum()
             of_weights, of_opacity = depth_loss_backward(done.samples, *places, each)
@@ -269,15 +273,19 @@ class GridTrainer:
         work = [partial(self._update_level, level, parts, rate, count) for level in finest_first]
         of_networks = [chunk.weights._asdict() for chunk in parts]
         work.append(partial(self._update_small, Weights._fields, of_networks, rate, count))
-        rays = sum(len(chunk.batch.jitter) for chunk in parts)
-        prior = {name: sky * (SKY_PRIOR / rays) for name, sky in self.sky.items()}
-        of_sky = [prior, *(chunk.sky for chunk in parts)]
+        of_sky = [*(chunk.sky for chunk in parts), self._sky_prior(parts)]
         work.append(partial(self._update_small, self.sky, of_sky, SKY_RATE * rate, count))
         work.append(partial(self._raise_cache, parts))
         for of_photos in self.photo_parts:
             work.append(partial(self._update_photos, of_photos, parts, of_photos.rate * factor, count))
         for _ in in_order(lambda update: update(), work, self.bank.device):
             pass
+
+    def _sky_prior(self, parts: Sequence[_Part]) -> dict[str, Tensor]:
+        """The prior's gradient of the sky, where rays of this batch ran to it: what none runs to stays as it is."""
+        rays = sum(len(chunk.batch.jitter) for chunk in parts)
+        touched = {name: torch.stack([chunk.sky[name] for chunk in parts]).sum(0) != 0 for name in self.sky}
+        return {name: SKY_PRIOR / rays * sky * touched[name] for name, sky in self.sky.items()}
 
     def _update_level(self, level: int, parts: Sequence[_Part], rate: float, count: int) -> None:
         layout, backend = self.model.layout, self.model.backend

@@ -92,10 +92,24 @@ class RayBank(NamedTuple):
         return self._replace(runs=runs.to(self.device))
 
     def with_distances(self, pixel: Int[Tensor, "known"], distance: Float[Tensor, "known"]) -> "RayBank":
-        """This bank, which knows how far away is what these pixels show (scene units, along the ray). Pixels that may
-        not be drawn are left out: give the masks first."""
+        """This bank, which knows how far away is what these pixels show (scene units, along the ray).
+
+        Left out are pixels that may not be drawn (so give the masks first) and those that are not wholly opaque, whose
+        light ends in part elsewhere."""
         kept = self.may_be_drawn(pixel)
-        return self._replace(known=pixel[kept], distance=distance[kept].float()) if kept.any() else self
+        if self.pixels.shape[1] == 4:
+            kept &= self.pixels.index_select(0, pixel)[:, 3] == 255
+        if not kept.any():
+            return self._replace(known=None, distance=None)
+        return self._replace(known=pixel[kept], distance=distance[kept].float())
+
+    def known_within(self, half: float) -> "RayBank":
+        """This bank without the known distances that end outside of the cube from -``half`` to ``half``."""
+        if self.known is None or self.distance is None:
+            return self
+        rays = self.lookup(self.known).rays
+        inside = ((rays.origins + self.distance[:, None] * rays.directions).abs() <= half).all(-1)
+        return self.with_distances(self.known[inside], self.distance[inside])
 
     def lookup(self, pixel: Int[Tensor, "rays"]) -> Drawn:
         """Given pixels, and the rays through them."""

@@ -19,8 +19,8 @@ from nerf.kernels import Backend, grid_layout
 LAYOUT = grid_layout(levels=2, coarsest=4, finest=16, log2_rows=13, features=4)
 # Of the field's. The sky must be found before fog near the cameras takes its place (docs/numbers.md).
 RATE = 10.0
-# Pulls towards grey as hard as so much of a ray's light pulls towards the photo. What is always hidden gets light of
-# less than that now and then, which Adam, whose steps are as long for faint gradients, would follow to black and white.
+# Pulls what rays run to towards grey, as hard as so much of a ray's light pulls towards the photo. What is hidden gets
+# less light than that, which Adam, whose steps are as long for faint gradients, would follow to black and white.
 PRIOR = 1e-5
 
 

@@ -89,14 +89,15 @@ def training_bank(ingest: Path, scene: "Scene", split: "Split", downscale: float
 def guided_bank(inputs: Inputs, scene: "Scene", downscale: float, progress: Progress) -> "RayBank":
     """:func:`training_bank` of the training photos, which knows how far away are the sparse points that they show.
 
-    Of normalise's points only those that two training photos saw, where these saw them."""
+    Of normalise's points only those that two training photos saw at least, where these saw them."""
     import numpy as np
     import torch
 
     from stages.track_colours import training_tracks
 
     bank = training_bank(inputs["ingest"], scene, "train", downscale, progress)
-    tracks, xy = training_tracks(scene, read_tensors(inputs["normalise"] / "points.safetensors"))
+    points = read_tensors(inputs["normalise"] / "points.safetensors")
+    tracks, xy = training_tracks(scene, points, most=len(points["view"]))
     cameras = [scene.cameras[view.camera] for view in scene.of_split("train")]
     full = np.array([(camera.width, camera.height) for camera in cameras]).reshape(-1, 2)[tracks.view]
     size = np.array([scaled_size(camera, downscale) for camera in cameras]).reshape(-1, 2)[tracks.view]

@@ -22,9 +22,9 @@ if TYPE_CHECKING:
 FINAL_RATE = 0.1  # of the paper field's learning rate at the start
 # Weight of the distortion loss (Barron et al. 2022, who take 1e-2) in folded space, against fog and matter close before
 # the cameras; fog also costs most of the time (docs/numbers.md). A box around an object needs none.
-DISTORTION = 4e-3
-# Weight at first of the depth loss at sparse points (Deng et al. 2022 take 0.1, too, of another one).
-DEPTH = 0.1
+DISTORTION = 2e-3
+# Weight at first of the loss at sparse points (docs/numbers.md; Deng et al. 2022 take 0.1, too, of another loss).
+DEPTH_LOSS = 0.1
 COARSEST = 16
 FEWEST_STEPS, MOST_STEPS = 256, 384  # along the diagonal of a bounded scene's box
 TABLE_COPIES = 6  # of the grids' features: themselves, their gradient, Adam's two moments, and twice in a checkpoint
@@ -189,7 +189,7 @@ def grid_trainer_settings(config: "Config", scene: "Scene", seed: int) -> "GridT
         chunks=config.chunks,
         rate=config.learning_rate,
         distortion=DISTORTION if config.contracted else 0.0,
-        depth=DEPTH,
+        depth_loss=DEPTH_LOSS,
     )
 
 

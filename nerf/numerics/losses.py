@@ -75,8 +75,8 @@ def _depth_loss_plainly(weights: Tensor) -> Tensor:
 
     t, point = _far_out(weights, GROWING).t[:N].to(weights), m(_point_distances(weights[:, 0]))[:, None]
     ends = torch.cat([t, t.new_tensor([FAR])])
-    light = torch.cat([weights, 1 - weights.sum(-1, keepdim=True)], -1)
-    return (light * (m(ends) - point).abs()).sum(-1, keepdim=True)
+    all_light = torch.cat([weights, 1 - weights.sum(-1, keepdim=True)], -1)
+    return (all_light * (m(ends) - point).abs()).sum(-1, keepdim=True)
 
 
 def _psnrs(_: Backend, error: Tensor) -> Tensor:

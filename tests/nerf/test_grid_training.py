@@ -86,11 +86,11 @@ def test_results_do_not_depend_on_the_number_of_threads() -> None:
 
 
 def test_the_gradient_of_a_batch_is_the_sum_over_its_chunks() -> None:
-    run = trainer(replace(TRAINER, samples=1 << 14, distortion=0.1, depth=0.2, chunks=4))
-    run.bank = run.bank.with_distances(torch.tensor([0, 200]), torch.tensor([3.0, 2.5]))
+    run = trainer(replace(TRAINER, samples=1 << 14, distortion=0.1, depth_loss=0.2, chunks=4))
+    run.bank = run.bank.with_distances(torch.tensor([78, 222]), torch.tensor([3.0, 2.5]))
     rays = run._rays_per_chunk()
     parts = [run._part(0, 0.25, rays, chunk) for chunk in range(4)]
-    assert all((part.batch.distance > 0).sum() == rays // 8 for part in parts)
+    assert sum(int((part.batch.distance > 0).sum()) for part in parts) == 4 * rays // 8
     assert rays > 10 and not torch.equal(parts[0].batch.target, parts[1].batch.target)
     whole = GridBatch(
         Rays(*(torch.cat(part) for part in zip(*(part.batch.rays for part in parts), strict=True))),
@@ -305,7 +305,7 @@ def test_known_distances_decide_a_shape_that_colours_leave_open() -> None:
     bank = small_bank()
     grey = bank._replace(pixels=torch.full_like(bank.pixels[:, :3], 128))
     guided = grey.with_distances(torch.tensor([78]), torch.tensor([3.0]))
-    settings = replace(TRAINER, background=(0.0, 0.0, 0.0), depth=0.1)
+    settings = replace(TRAINER, background=(0.0, 0.0, 0.0), depth_loss=0.1)
     centre, depth = grey.lookup(torch.tensor([78])).rays, {}
     for name, photos in {"open": grey, "guided": guided}.items():
         run = GridTrainer(GridField(FIELD, 0, reference), photos, settings)
@@ -316,9 +316,9 @@ def test_known_distances_decide_a_shape_that_colours_leave_open() -> None:
 
 
 def test_points_guide_a_run_less_and_less() -> None:
-    settings = replace(TRAINER, depth=0.1)
+    settings = replace(TRAINER, depth_loss=0.1)
     plain, guided = trainer(settings), trainer(settings)
-    guided.bank = guided.bank.with_distances(torch.tensor([0, 200]), torch.tensor([3.0, 2.5]))
+    guided.bank = guided.bank.with_distances(torch.tensor([78, 222]), torch.tensor([3.0, 2.5]))
     assert depth_factor(0.0) == 1 and depth_factor(0.25) == 0.75 and depth_factor(1.0) == 0
     assert plain.step(0, 1.0) == guided.step(0, 1.0)
     assert same(plain.state(), guided.state())
@@ -327,9 +327,40 @@ def test_points_guide_a_run_less_and_less() -> None:
     assert not same(plain.state(), guided.state())
 
 
+def test_the_depth_loss_fades_in_value_and_gradient() -> None:
+    run = trainer(replace(TRAINER, depth_loss=0.1))
+    run.bank = run.bank.with_distances(torch.tensor([78]), torch.tensor([3.0]))
+    batch = run._batch(0, 0.0, 0, 64)
+    done = run.model.forward(batch.rays, batch.jitter, batch.background)
+    early, late, over = (run._loss(64, share, done, batch) for share in (0.25, 0.75, 1.0))
+    of_depth = [float(loss.value - loss.squared_error) for loss in (early, late, over)]
+    assert of_depth[0] == pytest.approx(3 * of_depth[1]) and of_depth[1] > 0 == of_depth[2]
+    pulls = [loss.grad_weights - over.grad_weights for loss in (early, late)]
+    torch.testing.assert_close(pulls[0], 3 * pulls[1])
+    pulls = [loss.grad.opacity - over.grad.opacity for loss in (early, late)]
+    torch.testing.assert_close(pulls[0], 3 * pulls[1])
+    assert pulls[0].any()
+
+
+def test_however_many_the_chunks_an_eighth_of_the_rays_run_to_points() -> None:
+    run = trainer(replace(TRAINER, depth_loss=0.1))
+    run.bank = run.bank.with_distances(torch.tensor([78]), torch.tensor([3.0]))
+    for count in (1, 3, 5, 8, 21):
+        to_points = [int((run._batch(0, 0.1, chunk, count).distance > 0).sum()) for chunk in range(32)]
+        assert sum(to_points) == 32 * count // 8 and max(to_points) - min(to_points) <= 1
+
+
+def test_points_beyond_the_box_of_a_bounded_scene_are_no_guide() -> None:
+    bank = small_bank().with_distances(torch.tensor([78, 78]), torch.tensor([3.0, 9.0]))
+    outdoors = replace(FIELD, contracted=True, shortest_step=0.05, cone=0.1)
+    for field, distances in {FIELD: [3.0], outdoors: [3.0, 9.0]}.items():
+        kept = GridTrainer(GridField(field, 0, reference), bank, TRAINER).bank.distance
+        assert kept is not None and kept.tolist() == distances
+
+
 def test_without_a_weight_known_distances_change_nothing() -> None:
     plain, other = trainer(), trainer()
-    other.bank = other.bank.with_distances(torch.tensor([0, 200]), torch.tensor([3.0, 2.5]))
+    other.bank = other.bank.with_distances(torch.tensor([78, 222]), torch.tensor([3.0, 2.5]))
     assert [plain.step(step, 0.1) for step in range(3)] == [other.step(step, 0.1) for step in range(3)]
     assert same(plain.state(), other.state())
 
@@ -342,9 +373,12 @@ def test_the_sky_where_it_is_always_hidden_falls_back_to_grey(monkeypatch: pytes
     noise = torch.Generator().manual_seed(0)
 
     def faint(*_: object) -> Tensor:
-        return 1e-10 * torch.randn(run.model.sky.shape, generator=noise)
+        light = 1e-10 * torch.randn(run.model.sky.shape, generator=noise)
+        light[:100] = 0
+        return light
 
     monkeypatch.setattr(run.model, "sky_backward", faint)
     for step in range(120):
         run.step(step, 0.0)
-    assert run.model.sky.abs().mean() < 0.5
+    assert run.model.sky[100:].abs().mean() < 0.5
+    assert torch.equal(run.model.sky[:100], torch.full((100, 4), 3.0)), "no ray of any batch ran there"

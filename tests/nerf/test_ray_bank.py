@@ -175,3 +175,23 @@ def test_distances_of_pixels_that_masks_ignore_are_forgotten() -> None:
     known = masked.with_distances(torch.tensor([3, 30]), torch.tensor([1.5, 2.5])).known
     assert known is not None and known.tolist() == [30]
     assert masked.with_distances(torch.tensor([3]), torch.tensor([1.5])).known is None
+
+
+def test_distances_of_pixels_that_are_not_opaque_are_forgotten() -> None:
+    bank, *_ = scattered(channels=4)
+    pixels = bank.pixels.clone()
+    pixels[3, 3], pixels[4, 3] = 255, 254
+    known = bank._replace(pixels=pixels).with_distances(torch.tensor([3, 4]), torch.tensor([1.5, 2.5])).known
+    assert known is not None and known.tolist() == [3]
+
+
+def test_distances_that_end_outside_of_a_cube_are_forgotten() -> None:
+    bank, *_ = scattered()
+    rays = bank.lookup(torch.tensor([3, 3])).rays
+    distance = torch.tensor([0.5, 90.0])
+    ends = (rays.origins + distance[:, None] * rays.directions).abs().amax(-1)
+    known = bank.with_distances(torch.tensor([3, 3]), distance)
+    kept = known.known_within(float(ends[0]) + 1e-3).distance
+    assert kept is not None and kept.tolist() == [0.5]
+    assert known.known_within(float(ends[0]) - 1e-3).known is None
+    assert bank.known_within(1.0) is bank

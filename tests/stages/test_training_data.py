@@ -201,12 +201,26 @@ def test_the_bank_knows_where_training_photos_show_points(
     assert float((hit.norm(dim=-1) - RADIUS).abs().mean()) < half_a_pixel / 2
 
 
-def test_points_that_one_training_photo_saw_alone_are_no_guide(tmp_path: Path, progress: SilentProgress) -> None:
+def test_points_guide_once_two_training_photos_saw_them(tmp_path: Path, progress: SilentProgress) -> None:
     inputs, scene = photographed(tmp_path)
     seen = seen_points(scene)
-    alone = {name: seen[name][:1] if name in ("view", "point", "xy") else seen[name] for name in seen}
-    write_tensors(inputs["normalise"] / "points.safetensors", alone)
-    assert guided_bank(inputs, scene, 1.0, progress).known is None
+    trained = np.array([view.split == "train" for view in scene.views])[seen["view"]]
+    of_one = seen["point"] == 6
+    assert trained[of_one].sum() > 1 and (~trained[of_one]).any()
+    rows = [*np.flatnonzero(of_one & ~trained), *np.flatnonzero(of_one & trained)[:2]]
+    for count, known in {len(rows) - 1: 0, len(rows): 2}.items():
+        some = {name: seen[name][rows[:count]] if name in ("view", "point", "xy") else seen[name] for name in seen}
+        write_tensors(inputs["normalise"] / "points.safetensors", some)
+        bank = guided_bank(inputs, scene, 1.0, progress)
+        assert (0 if bank.known is None else len(bank.known)) == known
+
+
+def test_points_on_the_rim_of_what_alpha_shows_are_no_guide(tmp_path: Path, progress: SilentProgress) -> None:
+    inputs, scene = photographed(tmp_path, channels=4)
+    bank, opaque = (guided_bank(inputs, each, 1.0, progress) for each in (scene, replace(scene, has_alpha=False)))
+    assert bank.known is not None and opaque.known is not None
+    assert (bank.pixels[bank.known, 3] == 255).all()
+    assert 0 < len(bank.known) < len(opaque.known)
 
 
 def test_points_on_masked_pixels_are_no_guide(tmp_path: Path, progress: SilentProgress) -> None:
