@@ -99,27 +99,33 @@ class RayBank(NamedTuple):
         kept = self.may_be_drawn(pixel)
         if self.pixels.shape[1] == 4:
             kept &= self.pixels.index_select(0, pixel)[:, 3] == 255
-        if not kept.any():
-            return self._replace(known=None, distance=None)
-        return self._replace(known=pixel[kept], distance=distance[kept].float())
+        return self._knowing(pixel[kept], distance[kept].float())
 
     def known_within(self, half: float) -> "RayBank":
         """This bank without the known distances that end outside of the cube from -``half`` to ``half``."""
         if self.known is None or self.distance is None:
             return self
-        rays = self.lookup(self.known).rays
+        rays, _ = self._rays(self.known)
         inside = ((rays.origins + self.distance[:, None] * rays.directions).abs() <= half).all(-1)
-        return self.with_distances(self.known[inside], self.distance[inside])
+        return self._knowing(self.known[inside], self.distance[inside])
+
+    def _knowing(self, pixel: Int[Tensor, "known"], distance: Float[Tensor, "known"]) -> "RayBank":
+        known = len(pixel) > 0
+        return self._replace(known=pixel if known else None, distance=distance if known else None)
 
     def lookup(self, pixel: Int[Tensor, "rays"]) -> Drawn:
         """Given pixels, and the rays through them."""
+        rays, view = self._rays(pixel)
+        values = self.pixels.index_select(0, pixel).float().div_(255)
+        return Drawn(rays, values[:, :3], values[:, 3] if values.shape[1] == 4 else None, view)
+
+    def _rays(self, pixel: Int[Tensor, "rays"]) -> tuple[Rays, Int[Tensor, "rays"]]:
+        """The rays through pixels, and whose views they are; the photos, which may be on disk, are not read."""
         view = torch.searchsorted(self.first_pixel, pixel, right=True).sub_(1)
         geometry = self.geometry.index_select(1, view)
         bearing = self._bearing(pixel, self.layout.index_select(1, view), geometry[14:])
         directions = (geometry[:9].view(3, 3, -1) * bearing).sum(1)
-        rays = Rays(geometry[9:12].T.contiguous(), directions.T.contiguous(), geometry[12], geometry[13])
-        values = self.pixels.index_select(0, pixel).float().div_(255)
-        return Drawn(rays, values[:, :3], values[:, 3] if values.shape[1] == 4 else None, view)
+        return Rays(geometry[9:12].T.contiguous(), directions.T.contiguous(), geometry[12], geometry[13]), view
 
     def _bearing(
         self, pixel: Int[Tensor, "rays"], layout: Int[Tensor, "4 rays"], per_pixel: Float[Tensor, "2 rays"]

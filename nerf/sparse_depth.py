@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf.kernels import Lattice, Samples
-from nerf.kernels.marching import lattice_coordinate
+from nerf.kernels.marching import lattice_measure
 
 
 def depth_loss(
@@ -25,8 +25,8 @@ def depth_loss(
     """sum_i w_i |m(t_i) - m(d)| + U |m(far) - m(d)| of each ray, where U = 1 - opacity is the light that nothing stops
     and d the ``distance`` of its point; 0 for rays whose d is 0, of which none is known.
 
-    Positions m are measured as in the distortion loss (nerf/kernels/packed_compositing.py): dm = dt / max(t_1, t) where
-    steps grow from t_1 on, so that a tenth too far costs the same at any distance; as distances if they do not.
+    Positions m are measured as in the distortion loss (nerf/kernels/marching.py: lattice_measure), so that where steps
+    grow a tenth too far costs the same at any distance.
     """
     of_samples, of_rest = _apart(samples, far, distance, lattice)
     rest = (1 - opacity) * of_rest
@@ -49,11 +49,7 @@ def _apart(
     samples: Samples, far: Float[Tensor, "rays"], distance: Float[Tensor, "rays"], lattice: Lattice
 ) -> tuple[Float[Tensor, "samples"], Float[Tensor, "rays"]]:
     """How far samples and the ends of rays are from their point; 0 on rays without one."""
-    known, point = distance > 0, _measure(distance, lattice)
-    of_samples = (_measure(samples.t, lattice) - point.index_select(0, samples.ray)).abs()
-    of_rest = (_measure(far, lattice) - point).abs()
+    known, point = distance > 0, lattice_measure(lattice, distance)
+    of_samples = (lattice_measure(lattice, samples.t) - point.index_select(0, samples.ray)).abs()
+    of_rest = (lattice_measure(lattice, far) - point).abs()
     return of_samples * known.index_select(0, samples.ray), of_rest * known
-
-
-def _measure(t: Float[Tensor, "*batch"], lattice: Lattice) -> Float[Tensor, "*batch"]:
-    return (lattice.cone or lattice.step) * lattice_coordinate(lattice, t)

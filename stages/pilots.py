@@ -6,13 +6,11 @@ half of such a photo and judged on its right half.
 """
 
 import time
-from dataclasses import replace
 from statistics import mean, stdev
 from typing import TYPE_CHECKING, NamedTuple
 
 from stages.contract import Inputs, Progress
 from stages.effect_decisions import Decisions, photo_parts
-from stages.spread import spread
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -24,9 +22,7 @@ if TYPE_CHECKING:
     from stages.train import Config as TrainConfig
 
 LONG_SIDE = 200  # pixels of the photos in a pilot
-KEPT_EVERY = 8  # of the training photos one is kept back,
-MOST_KEPT = 4  # but no more than these,
-FEWEST_LEFT = 4  # and with fewer left to train on there is no pilot
+MOST_KEPT = 4  # of the training photos, to judge by
 SEEDS = 3
 BATCH_SAMPLES = 1 << 13  # half the usual: a pilot has to be short, and is judged early
 CHUNKS = 4  # fixed, so that a pilot ends the same whatever the machine
@@ -76,14 +72,11 @@ def pilot_scene(inputs: Inputs, scene: "Scene", progress: Progress) -> PilotScen
     from stages.device import compute_device
     from stages.right_halves import enough
     from stages.training_data import guided_bank, view_mask, view_pixels, view_rays
+    from stages.unseen import set_aside
 
-    views = scene.of_split("train")
-    count = min(MOST_KEPT, len(views) // KEPT_EVERY) or 1
-    if len(views) - count < FEWEST_LEFT:
+    split = set_aside(scene, MOST_KEPT)
+    if split is None:
         return None
-    chosen = {views[i].name for i in spread(len(views), count)}
-    kept_back = (replace(view, split="validation") if view.name in chosen else view for view in scene.views)
-    split = replace(scene, views=tuple(kept_back))
     downscale = max(1.0, max(max(camera.width, camera.height) for camera in scene.cameras) / LONG_SIDE)
     bank = guided_bank(inputs, split, downscale, progress).to(compute_device())
     photos = [

@@ -20,9 +20,9 @@ PROBE_RAYS = 2048
 # SSIM looks at windows of 11 pixels. Many small squares tell more of the photos than a few large ones; together they
 # take twice the rays of the probe.
 PATCHES, PATCH_SIDE = 16, 16
-VALIDATION_EVERY = 8  # of the training photos one is set aside where a target decides when to stop,
-MOST_VALIDATION = 8  # but no more than these,
-FEWEST_LEFT = 4  # and with fewer left there is no target
+VALIDATION_EVERY = 8  # of the training photos one is set aside to decide by,
+FEWEST_LEFT = 4  # and with fewer left to train on none can be
+MOST_VALIDATION = 8  # where a target decides when to stop
 
 
 class Unseen(NamedTuple):
@@ -87,11 +87,21 @@ def with_validation(scene: "Scene") -> "Scene":
 
     Raises StageError where too few would be left to train on.
     """
-    train = scene.of_split("train")
-    count = min(MOST_VALIDATION, len(train) // VALIDATION_EVERY) or 1
-    if len(train) - count < FEWEST_LEFT:
-        why = f"photos to decide by have to be set aside, and of {len(train)} training photos too few would be left"
+    split = set_aside(scene, MOST_VALIDATION)
+    if split is None:
+        count = len(scene.of_split("train"))
+        why = f"photos to decide by have to be set aside, and of {count} training photos too few would be left"
         raise StageError("no target can be trained to", why, "Leave out --train.target-psnr.")
+    return split
+
+
+def set_aside(scene: "Scene", most: int) -> "Scene | None":
+    """``scene`` with every eighth training photo, at most ``most``, evenly spread, in the split "validation"; None
+    where too few would be left to train on. Views keep their places, by which sparse points know them."""
+    train = scene.of_split("train")
+    count = min(most, len(train) // VALIDATION_EVERY) or 1
+    if len(train) - count < FEWEST_LEFT:
+        return None
     chosen = {train[i].name for i in spread(len(train), count)}
     views = (replace(view, split="validation") if view.name in chosen else view for view in scene.views)
     return replace(scene, views=tuple(views))

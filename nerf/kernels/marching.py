@@ -52,6 +52,15 @@ def lattice_coordinate(lattice: Lattice, t: Float[Tensor, "*batch"]) -> Float[Te
     return t.clamp(max=linear_until) / lattice.step + torch.log(t.clamp(min=linear_until) / linear_until) / lattice.cone
 
 
+def lattice_measure(lattice: Lattice, t: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """The measure m in which losses tell distances: dm = dt / max(t_1, t) where steps grow from t_1 on (beyond it m is
+    log t + const), distances themselves if they do not."""
+    if not lattice.cone:
+        return t
+    relative = t / lattice.linear_until
+    return relative.clamp(max=1) + torch.log(relative.clamp(min=1))
+
+
 def sample_points(rays: Rays, samples: Samples, contracted: bool) -> Float[Tensor, "samples 3"]:
     """The samples' points o + t d, in unit coordinates."""
     return unit_coordinates(_scene_points(rays, samples), contracted)

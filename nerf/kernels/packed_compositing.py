@@ -16,6 +16,7 @@ from jaxtyping import Float, Int32
 from torch import Tensor
 
 from nerf.kernels import Lattice, Samples
+from nerf.kernels.marching import lattice_measure
 from nerf.model import Rendering
 
 OPAQUE = 800.0
@@ -153,7 +154,5 @@ def _running(values: Float[Tensor, "samples *channels"]) -> Float[Tensor, "sampl
 def _measure(samples: Samples, lattice: Lattice) -> tuple[Float[Tensor, "samples"], Float[Tensor, "samples"]]:
     """Positions and lengths in the measure of the lattice, float64."""
     t, dt = samples.t.double(), samples.dt.double()
-    if not lattice.cone:
-        return t, dt
-    relative = t / lattice.linear_until
-    return relative.clamp(max=1) + torch.log(relative.clamp(min=1)), dt / (lattice.linear_until * relative.clamp(min=1))
+    lengths = dt / (lattice.linear_until * (t / lattice.linear_until).clamp(min=1)) if lattice.cone else dt
+    return lattice_measure(lattice, t), lengths
