@@ -109,8 +109,8 @@ class RunningMean:
     def add(self, step: int) -> None:
         new = 1 - max(0.0, 1 - MEAN_EVERY / step) ** (self.exponent + 1)
         for name, tensor in self.of.state_dict().items():
-            if name == "bits":
-                self.model.bits.copy_(tensor)
+            if name in ("bits", "clearance"):
+                self.model.state_dict()[name].copy_(tensor)
             else:
                 self.model.state_dict()[name].lerp_(tensor, new)
 

@@ -39,7 +39,7 @@ class DensityCache:
             return
         parts = 1 if step < YOUNG_STEPS else PARTS
         self._measure_part(turn % parts, parts, random)
-        self.field.bits.copy_(self.field.backend.occupied_bits(self.thickness, min(THIN, self._mean())))
+        self.field.occupy(self.field.backend.occupied_bits(self.thickness, min(THIN, self._mean())))
 
     def _mean(self) -> float:
         """Summed in rows, so that the result does not depend on how many threads share the work."""

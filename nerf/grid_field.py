@@ -11,12 +11,13 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor, nn
 
 from nerf import grid_mlp
 from nerf.grid_mlp import ColourPass, DensityPass, Weights
-from nerf.kernels import BOX, Backend, GridLayout, Lattice, Samples, grid_layout
+from nerf.kernels import BOX, Backend, GridLayout, Lattice, Occupied, Samples, grid_layout
+from nerf.kernels.cache import occupied
 from nerf.kernels.marching import unit_coordinates
 from nerf.model import Rendering
 from nerf.randomness import generator
@@ -114,10 +115,11 @@ class GridField(nn.Module):
     Nothing here needs autograd: parameters are buffers, and gradients are computed by :meth:`backward`.
     """
 
-    chunk_rays = 4096
+    chunk_rays = 8192
 
     table: Tensor
     bits: Tensor
+    clearance: Tensor
     density_hidden: Tensor
     density_out: Tensor
     colour_hidden: Tensor
@@ -142,11 +144,18 @@ class GridField(nn.Module):
         if settings.sky:
             self.register_buffer("sky", initial_sky())
         self.register_buffer("bits", torch.full((settings.cache_cells**3 // 64,), -1))  # every cell may hold something
+        self.register_buffer("clearance", torch.zeros(settings.cache_cells**3 // 64, dtype=torch.uint8))
 
     @property
     def weights(self) -> Weights:
         """The networks."""
         return Weights(self.density_hidden, self.density_out, self.colour_hidden, self.colour_out)
+
+    def occupy(self, bits: Int64[Tensor, "bricks"]) -> None:
+        """From now on sample these cells alone (``nerf.kernels.cache``)."""
+        now = occupied(bits)
+        self.bits.copy_(now.bits)
+        self.clearance.copy_(now.clearance)
 
     def density(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points"]:
         """Density per scene unit; zero outside the box of a bounded scene."""
@@ -250,7 +259,9 @@ class GridField(nn.Module):
         return sky_colour(self.backend, self.sky, rays.directions) if self.settings.sky else background
 
     def _waves(self, rays: Rays, jitter: Float[Tensor, "rays"]) -> Iterator[Wave]:
-        return front_to_back(self.backend, self.bits, self.lattice, self._density_pass, rays, jitter)
+        return front_to_back(
+            self.backend, Occupied(self.bits, self.clearance), self.lattice, self._density_pass, rays, jitter
+        )
 
     def _density_pass(self, unit: Float[Tensor, "points 3"]) -> DensityPass:
         with part("gather", Work(rows=CORNERS * len(self.layout.resolutions) * len(unit))):

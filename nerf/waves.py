@@ -13,7 +13,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from nerf.grid_mlp import DensityPass
-from nerf.kernels import Backend, Lattice, Samples
+from nerf.kernels import Backend, Lattice, Occupied, Samples
 from nerf.kernels.marching import lattice_coordinate, lattice_distance, starts_of
 from nerf.kernels.packed_compositing import OPAQUE
 from nerf.rays import Rays
@@ -23,7 +23,7 @@ HIDDEN_BEHIND = 1e-3  # transmittance below which the rest of a ray is left out
 # The optical depth that surely hides the rest: sums of waves round otherwise than the sum that decides.
 ENOUGH_DEPTH = -math.log(HIDDEN_BEHIND) * (1 + 1e-5)
 # Samples whose densities are computed at once: in all, and per ray (docs/numbers.md).
-WAVE, SHORTEST_WAVE, LONGEST_WAVE = 1 << 14, 16, 64
+WAVE, SHORTEST_WAVE, LONGEST_WAVE = 1 << 14, 6, 64
 
 
 class Wave(NamedTuple):
@@ -37,7 +37,7 @@ class Wave(NamedTuple):
 
 def front_to_back(
     backend: Backend,
-    bits: Int64[Tensor, "bricks"],
+    occupied: Occupied,
     lattice: Lattice,
     density_at: Callable[[Float[Tensor, "points 3"]], DensityPass],
     rays: Rays,
@@ -52,7 +52,7 @@ def front_to_back(
     while len(number) and taken < lattice.most_samples:
         length = min(_wave_length(len(number)), lattice.most_samples - taken)
         with part("march"):
-            samples = backend.march(bits, lattice._replace(most_samples=length), rays, jitter)
+            samples = backend.march(occupied, lattice._replace(most_samples=length), rays, jitter)
             points = backend.sample_points(rays, samples, lattice.contracted)
         density = density_at(points)
         yield Wave(number, samples, points, density)

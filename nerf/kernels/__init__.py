@@ -18,7 +18,7 @@ torch, any device, float32 or float64. The contract:
 import math
 from typing import NamedTuple, Protocol, runtime_checkable
 
-from jaxtyping import Float, Int, Int32, Int64
+from jaxtyping import Float, Int, Int32, Int64, UInt8
 from torch import Tensor
 
 from nerf.model import Rendering
@@ -99,6 +99,14 @@ class Lattice(NamedTuple):
         return self.step / self.cone if self.cone else math.inf
 
 
+class Occupied(NamedTuple):
+    """Where the density cache says that there may be something, and how far around each brick it says that there is
+    nothing (``nerf.kernels.cache``): what is known to be empty may be skipped, and no more follows from it."""
+
+    bits: Int64[Tensor, "bricks"]
+    clearance: UInt8[Tensor, "bricks"]
+
+
 class Samples(NamedTuple):
     """Packed samples: of each its ray, its distance along it, and the length of the interval it stands for."""
 
@@ -112,9 +120,7 @@ class Samples(NamedTuple):
 class Backend(Protocol):
     """The functions of a backend module; their docstrings are in ``nerf.kernels.reference``."""
 
-    def march(
-        self, bits: Int64[Tensor, "bricks"], lattice: Lattice, rays: Rays, jitter: Float[Tensor, "rays"]
-    ) -> Samples: ...
+    def march(self, occupied: Occupied, lattice: Lattice, rays: Rays, jitter: Float[Tensor, "rays"]) -> Samples: ...
 
     def sample_points(self, rays: Rays, samples: Samples, contracted: bool) -> Float[Tensor, "samples 3"]: ...
 

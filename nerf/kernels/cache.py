@@ -6,10 +6,13 @@ index b = ((x/4) B + y/4) B + z/4 with B bricks along each axis, and the cell ha
 """
 
 import torch
-from jaxtyping import Float, Int, Int32, Int64
+from jaxtyping import Bool, Float, Int, Int32, Int64
 from torch import Tensor
 
+from nerf.kernels import Occupied
+
 BRICK_CELLS = 64
+MOST_CLEAR = 8  # bricks: a quarter of a cube of 128 cells, so that a ray crosses an empty one in a few hops
 
 
 def raise_cache(
@@ -27,6 +30,28 @@ def occupied_bits(thickness: Float[Tensor, "cache"], threshold: float) -> Int64[
     where the field is broken would look empty."""
     occupied = ~(thickness <= threshold).view(-1, BRICK_CELLS)
     return (occupied.long() << torch.arange(BRICK_CELLS, device=thickness.device)).sum(-1)
+
+
+def occupied(bits: Int64[Tensor, "bricks"]) -> Occupied:
+    """With the clearance of each brick: with n, the (2 n - 1)³ bricks around it hold no occupied cell. 0 for one that
+    does itself, at most MOST_CLEAR."""
+    side = round(len(bits) ** (1 / 3))
+    reached = (bits != 0).view(side, side, side)
+    clear = torch.zeros_like(reached, dtype=torch.uint8)
+    for _ in range(MOST_CLEAR):
+        clear += ~reached
+        reached = _grown(reached)
+    return Occupied(bits, clear.flatten())
+
+
+def _grown(reached: Bool[Tensor, "side side side"]) -> Bool[Tensor, "side side side"]:
+    """With all their neighbours, across edges and corners too."""
+    for axis in range(3):
+        several, last = reached.clone(), reached.shape[axis] - 1
+        several.narrow(axis, 1, last).logical_or_(reached.narrow(axis, 0, last))
+        several.narrow(axis, 0, last).logical_or_(reached.narrow(axis, 1, last))
+        reached = several
+    return reached
 
 
 def cell_numbers(cells: int, points: Float[Tensor, "*points 3"]) -> Int32[Tensor, "*points"]:

@@ -5,12 +5,12 @@ from jaxtyping import Bool, Float, Int32, Int64
 from torch import Tensor
 
 from nerf.contraction import contract
-from nerf.kernels import BOX, CONTRACTED_BOX, Lattice, Samples
+from nerf.kernels import BOX, CONTRACTED_BOX, Lattice, Occupied, Samples
 from nerf.kernels.cache import cell_numbers
 from nerf.rays import Rays, clip_to_box
 
 
-def march(bits: Int64[Tensor, "bricks"], lattice: Lattice, rays: Rays, jitter: Float[Tensor, "rays"]) -> Samples:
+def march(occupied: Occupied, lattice: Lattice, rays: Rays, jitter: Float[Tensor, "rays"]) -> Samples:
     """The samples of the lattice that lie in occupied cells.
 
     ``jitter`` in [0, 1) says where in its interval each sample of a ray stands; a sample that would stand at or
@@ -27,7 +27,7 @@ def march(bits: Int64[Tensor, "bricks"], lattice: Lattice, rays: Rays, jitter: F
     # The same as points_on(rays, t), laid out axis by axis: torch is several times faster without a row of 3 innermost.
     points = (rays.origins.T[:, :, None] + t * rays.directions.T[:, :, None]).movedim(0, -1)
     points = unit_coordinates(points, lattice.contracted)
-    wanted &= _is_occupied(bits, cell_numbers(lattice.cells, points))
+    wanted &= _is_occupied(occupied.bits, cell_numbers(lattice.cells, points))
     if len(k) > lattice.most_samples:
         wanted &= wanted.cumsum(-1) <= lattice.most_samples
     ray, k_wanted = wanted.nonzero(as_tuple=True)

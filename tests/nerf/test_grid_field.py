@@ -8,6 +8,7 @@ from torch import Tensor
 from nerf import grid_mlp, sky
 from nerf.grid_field import GridField, GridSettings
 from nerf.kernels import GridLayout, Samples, reference
+from nerf.kernels.cache import occupied
 from nerf.model import RadianceModel, Rendering
 from nerf.rays import Rays
 from nerf.waves import HIDDEN_BEHIND
@@ -39,7 +40,7 @@ def rays(count: int = 6) -> Rays:
 def seen_by_autograd(model: GridField, given: Rays, jitter: Tensor, background: Tensor) -> Tensor:
     """The loss sum(colour * k) + sum(depth) written with plain torch, differentiable in parameters and rays."""
     settings = model.settings
-    samples = reference.march(model.bits, model.lattice, Rays(*(part.detach() for part in given)), jitter)
+    samples = reference.march(occupied(model.bits), model.lattice, Rays(*(part.detach() for part in given)), jitter)
     points = reference.sample_points(given, samples, settings.contracted)
     features = encoded_by_autograd(model.layout, model.table, points)
     if settings.sky:
@@ -128,7 +129,7 @@ def test_density_agrees_with_what_rays_see() -> None:
     rendering = model.render(given, torch.zeros(3, dtype=torch.float64))
     step = model.lattice.step
     middle = torch.full((6,), 0.5, dtype=torch.float64)
-    samples = reference.march(model.bits, model.lattice, given, middle)
+    samples = reference.march(occupied(model.bits), model.lattice, given, middle)
     points = given.origins[samples.ray] + samples.t[:, None] * given.directions[samples.ray]
     depth = torch.zeros(6, dtype=torch.float64).index_add(0, samples.ray.long(), model.density(points) * samples.dt)
     torch.testing.assert_close(rendering.opacity, -torch.expm1(-depth), rtol=0, atol=2e-3)
@@ -137,7 +138,7 @@ def test_density_agrees_with_what_rays_see() -> None:
 
 def test_closed_cells_are_not_seen() -> None:
     model, given = field(), rays()
-    model.bits.zero_()
+    model.occupy(torch.zeros_like(model.bits))
     rendering = model.render(given, torch.tensor([0.2, 0.4, 0.6], dtype=torch.float64))
     assert (rendering.opacity == 0).all()
     assert torch.equal(rendering.depth, given.far)
@@ -146,7 +147,7 @@ def test_closed_cells_are_not_seen() -> None:
 
 def test_what_nothing_stops_ends_in_the_sky_whatever_the_background() -> None:
     model, given = field(OUTDOORS), rays()
-    model.bits.zero_()
+    model.occupy(torch.zeros_like(model.bits))
     seen = [model.render(given, torch.full((3,), shade, dtype=torch.float64)).colour for shade in (0.0, 1.0)]
     assert torch.equal(*seen) and seen[0].std(0).min() > 0.01
     torch.testing.assert_close(seen[0], sky.sky_colour(reference, model.sky, given.directions))
@@ -163,7 +164,7 @@ def test_parameters_depend_on_the_seed_alone() -> None:
     one, same, other = (GridField(SMALL, seed, reference).state_dict() for seed in (1, 1, 2))
     assert all(torch.equal(one[name], same[name]) for name in one)
     assert not torch.equal(one["table"], other["table"])
-    assert set(one) == {"table", "bits", "density_hidden", "density_out", "colour_hidden", "colour_out"}
+    assert set(one) == {"table", "bits", "clearance", "density_hidden", "density_out", "colour_hidden", "colour_out"}
     assert 0.9e-4 < one["table"].abs().max() <= 1e-4
 
 
@@ -196,7 +197,7 @@ def in_waves(model: GridField, given: Rays, background: Tensor) -> tuple[Renderi
 
 def in_one_pass(model: GridField, given: Rays, jitter: Tensor, background: Tensor) -> tuple[int, Samples, Rendering]:
     """How many samples stand in occupied cells, those that can be seen, and what the rays see; no waves."""
-    samples = reference.march(model.bits, model.lattice, given, jitter)
+    samples = reference.march(occupied(model.bits), model.lattice, given, jitter)
     density = model._density_pass(reference.sample_points(given, samples, model.settings.contracted))
     front, seen = reference.visible_front(samples, density.sigma, HIDDEN_BEHIND)
     density, harmonics = density.select(seen), reference.spherical_harmonics(given.directions)
@@ -218,7 +219,7 @@ def test_waves_through_thin_fog_see_what_a_single_pass_sees(
 ) -> None:
     in_short_waves(monkeypatch, *lengths)
     model, given, background = field(settings), rays(40), torch.tensor([0.2, 0.4, 0.6], dtype=torch.float64)
-    model.bits.random_(generator=torch.Generator().manual_seed(5))  # half of the cells are closed
+    model.occupy(model.bits.random_(generator=torch.Generator().manual_seed(5)))  # half of the cells are closed
     middle = torch.full_like(given.near, 0.5)
     marched, front, whole = in_one_pass(model, given, middle, background)
     waves, asked = in_waves(model, given, background)
@@ -248,7 +249,7 @@ def test_training_keeps_the_samples_of_a_single_pass_whatever_the_waves(
 ) -> None:
     in_short_waves(monkeypatch, *lengths)
     model, given = (dense_field if dense else field)(settings), rays(40)
-    model.bits.random_(generator=torch.Generator().manual_seed(5))
+    model.occupy(model.bits.random_(generator=torch.Generator().manual_seed(5)))
     jitter = torch.rand(40, generator=torch.Generator().manual_seed(6), dtype=torch.float64)
     background = torch.tensor([0.2, 0.4, 0.6], dtype=torch.float64)
     marched, front, whole = in_one_pass(model, given, jitter, background)

@@ -13,7 +13,7 @@ from nerf.compositing import composite, volume_weights
 from nerf.contraction import contract, uncontract
 from nerf.encoding import positional_encoding
 from nerf.kernels import BOX, Backend, Lattice, Samples, grid_layout, reference, warp
-from nerf.kernels.cache import cell_numbers
+from nerf.kernels.cache import cell_numbers, occupied
 from nerf.lattice import Lattice as DensityLattice
 from nerf.rays import Rays, clip_to_box
 from nerf.sampling import invert_cdf
@@ -135,9 +135,9 @@ def test_axis_parallel_rays_meet_the_box_where_it_is(towards: list[float], at: f
     t = torch.linspace(0, 10, 5001)
     inside = ((rays.origins + t[:, None] * directions).abs() <= BOX).all(-1).double().mean() * 10
     assert float(cut.far - cut.near) == pytest.approx(float(inside), abs=5e-3)
-    bits, lattice = torch.full((8,), -1), Lattice(0.05, 0.0, False, 8, 1000)
+    where, lattice = occupied(torch.full((8,), -1)), Lattice(0.05, 0.0, False, 8, 1000)
     for backend in (reference, warp):
-        samples = backend.march(bits, lattice, rays, torch.full((1,), 0.5))
+        samples = backend.march(where, lattice, rays, torch.full((1,), 0.5))
         assert ((samples.t >= cut.near) & (samples.t <= cut.far)).all()
         assert float(samples.dt.sum()) == pytest.approx(float(cut.far - cut.near), abs=0.051)
 

@@ -4,10 +4,10 @@ import threading
 
 import torch
 import warp as wp
-from jaxtyping import Float, Int64
+from jaxtyping import Float
 from torch import Tensor
 
-from nerf.kernels import BOX, CONTRACTED_BOX, Lattice, Samples
+from nerf.kernels import BOX, CONTRACTED_BOX, Lattice, Occupied, Samples
 from nerf.kernels.warp.cache import cell_number
 from nerf.kernels.warp.launch import launch
 from nerf.rays import Rays
@@ -18,7 +18,7 @@ _BOX = wp.constant(BOX)
 _HALF = wp.constant(CONTRACTED_BOX)
 
 
-def march(bits: Int64[Tensor, "bricks"], lattice: Lattice, rays: Rays, jitter: Float[Tensor, "rays"]) -> Samples:
+def march(occupied: Occupied, lattice: Lattice, rays: Rays, jitter: Float[Tensor, "rays"]) -> Samples:
     """As in nerf.kernels.marching."""
     count, device = len(jitter), jitter.device
     found = _scratch(count * lattice.most_samples, device)
@@ -26,7 +26,7 @@ def march(bits: Int64[Tensor, "bricks"], lattice: Lattice, rays: Rays, jitter: F
     first = torch.empty(count, device=device)
     far = torch.empty(count, device=device)
     sizes = lattice.step, lattice.cone, int(lattice.contracted), lattice.cells, lattice.most_samples
-    launch(_march, count, bits, *sizes, *rays, jitter, found, counts, first, far)
+    launch(_march, count, *occupied, *sizes, *rays, jitter, found, counts, first, far)
     starts = torch.nn.functional.pad(counts.cumsum(0, dtype=torch.int32), (1, 0))
     total = int(starts[-1])
     ray = torch.empty(total, dtype=torch.int32, device=device)
@@ -113,45 +113,49 @@ def _slab(origin: float, direction: float):
 
 
 @wp.func
-def _axis_exit(cell: int, width: float, position: float, direction: float):
-    """How far along the ray the brick around a cell ends on one axis, in unit coordinates and their speed."""
-    if direction == 0.0:
+def _axis_exit(low: float, high: float, position: float, speed: float):
+    """How far along the ray it leaves the interval from ``low`` to ``high`` on one axis."""
+    if speed == 0.0:
         return wp.inf
-    low = float((cell >> 2) << 2) * width
-    if direction > 0.0:
-        return (low + 4.0 * width - position) / direction
-    return (low - position) / direction
+    return (wp.where(speed > 0.0, high, low) - position) / speed
 
 
 @wp.func
-def _free_distance(contracted: int, cells: int, x: int, y: int, z: int, u: wp.vec3, point: wp.vec3, d: wp.vec3):
-    """How far along the ray it surely stays in the brick around cell (x, y, z), which holds its point (unit: u).
+def _free_distance(
+    contracted: int, cells: int, x: int, y: int, z: int, clear: int, u: wp.vec3, point: wp.vec3, d: wp.vec3
+):
+    """How far along the ray it surely stays in the cube of ``2 clear - 1`` bricks per side around cell (x, y, z), which
+    holds its point (unit: u).
 
-    Where unit coordinates are linear, up to the brick's face. Where space is folded, r being the largest component
-    of the point, coordinates in [-2, 2] move at most 4/3 times as fast as the point, and at most 4/(r - a) times
-    within a distance a of it; so within a distance m of the nearest face (in the largest component) it stays for
-    max(3/4 m, m r / (4 + m)).
+    Where unit coordinates are linear, up to where it leaves these bricks or that region. Where space is folded, r being
+    the largest component of the point, coordinates in [-2, 2] move at most 4/3 times as fast as the point, and at most
+    4/(r - a) times within a distance a of it; so within a distance m of the nearest face (in the largest component) it
+    stays for max(3/4 m, m r / (4 + m)).
     """
     width = 1.0 / float(cells)
-    if contracted == 0:
-        v = d / (2.0 * _BOX)
-    else:
-        v = d / (2.0 * _HALF)
-        low = wp.vec3(float(x & ~3), float(y & ~3), float(z & ~3)) * width
-        nearest = wp.min(wp.min(u - low, low + wp.vec3(4.0 * width) - u))
+    around = 4.0 * float(clear - 1)
+    low = (wp.vec3(float(x & ~3), float(y & ~3), float(z & ~3)) - wp.vec3(around)) * width
+    high = low + wp.vec3((2.0 * around + 4.0) * width)
+    v = d / (2.0 * _BOX)
+    folded = float(0.0)
+    if contracted != 0:
         r = wp.max(wp.abs(point))
-        unfolded = wp.max(wp.max(wp.abs(low - wp.vec3(0.5)), wp.abs(low + wp.vec3(4.0 * width) - wp.vec3(0.5))))
-        if unfolded > 0.2500001:
-            m = 2.0 * _HALF * nearest
-            return wp.max(0.75 * m, m * r / (4.0 + m))
-    on_x = _axis_exit(x, width, u[0], v[0])
-    on_y = _axis_exit(y, width, u[1], v[1])
-    return wp.min(wp.min(on_x, on_y), _axis_exit(z, width, u[2], v[2]))
+        m = 2.0 * _HALF * wp.min(wp.min(u - low, high - u))
+        folded = wp.max(0.75 * m, m * r / (4.0 + m))
+        if r >= 1.0:
+            return folded
+        v = d / (2.0 * _HALF)
+        low = wp.max(low, wp.vec3(0.25))  # [-1, 1] of [-2, 2]
+        high = wp.min(high, wp.vec3(0.75))
+    on_x = _axis_exit(low[0], high[0], u[0], v[0])
+    on_y = _axis_exit(low[1], high[1], u[1], v[1])
+    return wp.max(folded, wp.min(wp.min(on_x, on_y), _axis_exit(low[2], high[2], u[2], v[2])))
 
 
 @wp.kernel
 def _march(
     bits: wp.array[wp.int64],
+    clearance: wp.array[wp.uint8],
     step: float,
     cone: float,
     contracted: int,
@@ -196,7 +200,8 @@ def _march(
         number = cell_number(cells, x, y, z)
         word = bits[number >> 6]
         if word == wp.int64(0):
-            free = _free_distance(contracted, cells, x, y, z, u, point, d)
+            clear = wp.max(1, int(clearance[number >> 6]))
+            free = _free_distance(contracted, cells, x, y, z, clear, u, point, d)
             # Rounded down by a thousandth of a step: a step too few is looked at again, one too many is lost.
             steps = _coordinate(step, cone, t + free) - s - 0.001
             k += wp.max(1, int(wp.min(steps, 1.0e6)) + 1)

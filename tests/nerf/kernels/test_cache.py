@@ -1,6 +1,6 @@
 import torch
 
-from nerf.kernels.cache import cell_numbers
+from nerf.kernels.cache import MOST_CLEAR, cell_numbers, occupied
 from nerf.kernels.reference import cell_corners, occupied_bits, raise_cache
 
 
@@ -35,3 +35,20 @@ def test_bits_say_which_cells_exceed_the_threshold() -> None:
     assert unpacked == (thickness > 0.4).tolist()
     assert occupied_bits(torch.full((64,), 2.0), 1.0).tolist() == [-1]
     assert occupied_bits(torch.full((64,), 1.0), 1.0).tolist() == [0]
+
+
+def test_clearance_is_the_distance_to_the_nearest_occupied_brick() -> None:
+    side = 12
+    bits = torch.zeros(side**3, dtype=torch.int64)
+    filled = torch.tensor([3, 11 * side**2 + 2 * side + 9])
+    bits[filled] = torch.tensor([1, -(1 << 63)])
+    place = torch.cartesian_prod(*3 * [torch.arange(side)])
+    distance = (place[:, None] - place[filled]).abs().amax(-1).amin(-1)
+    assert (distance > MOST_CLEAR).any() and (distance == 0).sum() == 2
+    assert torch.equal(occupied(bits).clearance.long(), distance.clamp(max=MOST_CLEAR))
+
+
+def test_nothing_is_clear_in_a_full_cache_and_all_of_it_in_an_empty_one() -> None:
+    assert occupied(torch.full((8,), -1)).clearance.tolist() == [0] * 8
+    assert occupied(torch.zeros(8, dtype=torch.int64)).clearance.tolist() == [MOST_CLEAR] * 8
+    assert occupied(torch.zeros(1, dtype=torch.int64)).clearance.tolist() == [MOST_CLEAR]

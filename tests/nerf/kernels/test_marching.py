@@ -5,13 +5,14 @@ from torch import Tensor
 
 from nerf.contraction import contract
 from nerf.kernels import BOX, Lattice
+from nerf.kernels.cache import occupied
 from nerf.kernels.marching import lattice_coordinate, lattice_distance
 from nerf.kernels.reference import march, occupied_bits, sample_points, sample_points_backward
 from nerf.rays import Rays, clip_to_box
 
 BOUNDED = Lattice(step=0.05, cone=0.0, contracted=False, cells=8, most_samples=1000)
 FOLDED = Lattice(step=0.05, cone=0.1, contracted=True, cells=8, most_samples=1000)
-FULL = torch.full((8,), -1)
+FULL = occupied(torch.full((8,), -1))
 
 
 def random_rays(count: int = 50, near: float = 0.1, far: float = 9.0) -> Rays:
@@ -72,7 +73,7 @@ def test_samples_of_an_empty_cell_are_skipped_and_the_others_stay_where_they_are
     rays = random_rays(400)
     jitter = jitter_of(rays)
     thickness = torch.rand(512, generator=torch.Generator().manual_seed(5))
-    some = march(occupied_bits(thickness, 0.7), BOUNDED, rays, jitter)
+    some = march(occupied(occupied_bits(thickness, 0.7)), BOUNDED, rays, jitter)
     every = march(FULL, BOUNDED, rays, jitter)
     points = sample_points(rays, every, False)
     x, y, z = (8 * points).long().clamp(0, 7).unbind(-1)
@@ -113,7 +114,7 @@ def test_the_cap_keeps_the_first_samples() -> None:
 
 def test_an_empty_cache_or_no_rays_give_no_samples() -> None:
     rays = random_rays(3)
-    nothing = march(torch.zeros(8, dtype=torch.int64), BOUNDED, rays, jitter_of(rays))
+    nothing = march(occupied(torch.zeros(8, dtype=torch.int64)), BOUNDED, rays, jitter_of(rays))
     assert (nothing.starts.tolist(), len(nothing.t)) == ([0, 0, 0, 0], 0)
     none = Rays(*(part[:0] for part in rays))
     assert march(FULL, FOLDED, none, jitter_of(none)).starts.tolist() == [0]

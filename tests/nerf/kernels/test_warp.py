@@ -18,8 +18,8 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from nerf.contraction import uncontract
-from nerf.kernels import BOX, Backend, Lattice, Samples, grid_layout, reference, warp
-from nerf.kernels.cache import cell_corners, cell_numbers
+from nerf.kernels import BOX, Backend, Lattice, Occupied, Samples, grid_layout, reference, warp
+from nerf.kernels.cache import cell_corners, cell_numbers, occupied
 from nerf.kernels.marching import lattice_coordinate, unit_coordinates
 from nerf.kernels.warp import cache
 from nerf.kernels.warp.launch import launch
@@ -172,13 +172,13 @@ def random_rays(device: str, count: int, far: float = 30.0) -> Rays:
     return rays_of(origins, directions, 0.05, far)
 
 
-def bits_of(device: str, kind: str, cells: int) -> Tensor:
+def occupied_of(device: str, kind: str, cells: int) -> Occupied:
     if kind in ("empty", "full"):
-        return torch.full((cells**3 // 64,), -1 if kind == "full" else 0, device=device)
+        return occupied(torch.full((cells**3 // 64,), -1 if kind == "full" else 0, device=device))
     thickness = uniform(device, 7, cells**3)
     if kind == "bricks":  # three bricks of ten, all of their cells
-        return -(thickness.view(-1, 64)[:, 0] < 0.3).long()
-    return reference.occupied_bits(thickness, {"random": 0.5, "sparse": 0.97}[kind])
+        return occupied(-(thickness.view(-1, 64)[:, 0] < 0.3).long())
+    return occupied(reference.occupied_bits(thickness, {"random": 0.5, "sparse": 0.97}[kind]))
 
 
 def places(lattice: Lattice, rays: Rays, jitter: Tensor, samples: Samples) -> Tensor:
@@ -199,10 +199,10 @@ def decided_by_rounding(lattice: Lattice, rays: Rays, samples: Samples) -> Tenso
     return (to_face < 1e-6 * lattice.cells) | ((t / far - 1).abs() < 1e-6)
 
 
-def assert_same_march(bits: Tensor, lattice: Lattice, rays: Rays, jitter: Tensor) -> Samples:
+def assert_same_march(where: Occupied, lattice: Lattice, rays: Rays, jitter: Tensor) -> Samples:
     """Bounded, where samples are a step apart, both give the same numbers; folded, exp() and log() may differ by their
     last digit: t by 1e-6 of itself, dt, a difference of two distances, by 1e-6 of t."""
-    given, wanted = (backend.march(bits, lattice, rays, jitter) for backend in (warp, reference))
+    given, wanted = (backend.march(where, lattice, rays, jitter) for backend in (warp, reference))
     at, right = (places(lattice, rays, jitter, samples) for samples in (given, wanted))
     in_both, common = torch.isin(at, right), torch.isin(right, at)
     assert decided_by_rounding(lattice, rays, given)[~in_both].all(), "a sample in an empty cell"
@@ -223,7 +223,7 @@ def assert_same_march(bits: Tensor, lattice: Lattice, rays: Rays, jitter: Tensor
 def test_marching(device: str, kind: str, cells: int, lattice: Lattice) -> None:
     rays = random_rays(device, 320)
     samples = assert_same_march(
-        bits_of(device, kind, cells), lattice._replace(cells=cells), rays, uniform(device, 8, 320)
+        occupied_of(device, kind, cells), lattice._replace(cells=cells), rays, uniform(device, 8, 320)
     )
     assert kind != "empty" or len(samples.t) == 0
     assert kind == "empty" or cells == 4 or len(samples.t) > 20
@@ -233,8 +233,8 @@ def test_marching(device: str, kind: str, cells: int, lattice: Lattice) -> None:
 @pytest.mark.parametrize("most", [1, 17])
 def test_marching_stops_at_the_cap(device: str, most: int, lattice: Lattice) -> None:
     rays = random_rays(device, 320)
-    bits = bits_of(device, "random", 32)
-    samples = assert_same_march(bits, lattice._replace(most_samples=most), rays, uniform(device, 8, 320))
+    where = occupied_of(device, "random", 32)
+    samples = assert_same_march(where, lattice._replace(most_samples=most), rays, uniform(device, 8, 320))
     assert samples.starts.diff().max() == most
 
 
@@ -242,7 +242,10 @@ def test_marching_from_far_away_in_folded_space(device: str) -> None:
     rays = random_rays(device, 320, far=1e7)
     origins = rays.origins * torch.logspace(0, 6, 320)[:, None]
     samples = assert_same_march(
-        bits_of(device, "full", 16), FOLDED._replace(cells=16), rays._replace(origins=origins), uniform(device, 8, 320)
+        occupied_of(device, "full", 16),
+        FOLDED._replace(cells=16),
+        rays._replace(origins=origins),
+        uniform(device, 8, 320),
     )
     assert samples.t.max() > 5e6
 
@@ -267,14 +270,14 @@ def aimed_rays(device: str, lattice: Lattice, cell: int, count: int) -> Rays:
 def test_skipping_bricks_loses_no_sample(device: str, cells: int, lattice: Lattice) -> None:
     """Bit for bit: the samples in the one occupied cell are those that a full cache has there."""
     lattice = lattice._replace(cells=cells, most_samples=4096)
-    full = bits_of(device, "full", cells)
+    full = occupied_of(device, "full", cells)
     for cell in (0, cells**3 // 2, 7 * cells**3 // 9, cells**3 - 1):
         rays, jitter = aimed_rays(device, lattice, cell, 1000), uniform(device, 11, 1000)
         every = warp.march(full, lattice, rays, jitter)
         here = cell_numbers(cells, warp.sample_points(rays, every, lattice.contracted)) == cell
-        bits = torch.zeros_like(full)
+        bits = torch.zeros_like(full.bits)
         bits[cell >> 6] = 1 << (cell & 63) if cell & 63 != 63 else -(1 << 63)
-        found = warp.march(bits, lattice, rays, jitter)
+        found = warp.march(occupied(bits), lattice, rays, jitter)
         assert here.sum() > 100
         for part, whole in zip(found[1:], every[1:], strict=True):
             assert torch.equal(part, whole[here])
@@ -286,7 +289,7 @@ def test_sample_points(device: str, contracted: bool) -> None:
     if contracted:
         rays = rays._replace(origins=rays.origins * torch.logspace(0, 6, 320)[:, None])
     lattice = FOLDED if contracted else BOUNDED
-    samples = warp.march(bits_of(device, "random", 32), lattice, rays, uniform(device, 8, 320))
+    samples = warp.march(occupied_of(device, "random", 32), lattice, rays, uniform(device, 8, 320))
     points = agree("sample_points", rays, samples, contracted)
     assert points.min() > -1e-6 and points.max() < 1 + 1e-6
 
@@ -296,7 +299,7 @@ def test_gradients_of_sample_points(device: str, contracted: bool) -> None:
     """Ray by ray, as they fall with the square of the distance."""
     rays = random_rays(device, 320, far=1e3)
     lattice = FOLDED if contracted else BOUNDED
-    samples = warp.march(bits_of(device, "random", 32), lattice, rays, uniform(device, 8, 320))
+    samples = warp.march(occupied_of(device, "random", 32), lattice, rays, uniform(device, 8, 320))
     grad = normal(device, 12, len(samples.t), 3)
     given = warp.sample_points_backward(rays, samples, contracted, grad)
     wanted = reference.sample_points_backward(*doubled((rays, samples, contracted, grad)))
@@ -554,10 +557,10 @@ def test_no_rays_and_no_samples_are_fine_even_at_first(device: str, rays: int) -
 
     def everything() -> None:
         samples, empty, none = packed(device, counts), torch.zeros(0, device=device), torch.zeros(0, 3, device=device)
-        bits, some = bits_of(device, "empty", 32), random_rays(device, 320)
+        nowhere, some = occupied_of(device, "empty", 32), random_rays(device, 320)
         few = Rays(*(part[:rays] for part in some))
         for lattice in (BOUNDED, FOLDED):
-            marched = warp.march(bits, lattice, few, few.near)
+            marched = warp.march(nowhere, lattice, few, few.near)
             assert marched.starts.tolist() == [0] * (rays + 1) and len(marched.t) == 0
             agree("sample_points", few, samples, lattice.contracted)
             agree("sample_points_backward", few, samples, lattice.contracted, none)

@@ -16,6 +16,7 @@ from torch import Tensor
 from nerf.grid_field import GridField, GridSettings
 from nerf.grid_training import GridTrainer, GridTrainerSettings
 from nerf.kernels import Lattice, grid_layout, warp
+from nerf.kernels.cache import occupied
 from nerf.model import Rendering
 from nerf.randomness import generator
 from nerf.ray_bank import RayBank, build_ray_bank
@@ -58,7 +59,7 @@ def small_trainer() -> GridTrainer:
     field = GridSettings(levels=3, log2_rows=8, coarsest=4, finest=16, steps=32, cache_cells=8)
     settings = GridTrainerSettings(seed=3, background="random", samples=1024, most_rays=256, chunks=4, distortion=1e-3)
     model = GridField(field, 0, warp)
-    model.bits.copy_(warp.occupied_bits(torch.rand(512, generator=torch.Generator().manual_seed(2)), 0.3))
+    model.occupy(warp.occupied_bits(torch.rand(512, generator=torch.Generator().manual_seed(2)), 0.3))
     return GridTrainer(model, noise_bank(), settings)
 
 
@@ -104,7 +105,7 @@ def everything(seed: int) -> list[Tensor]:
         0.3 * torch.randn(count, 3, generator=random), directions, *torch.tensor([[0.05], [4.0]]).repeat(1, count)
     )
     bits = warp.occupied_bits(torch.rand(512, generator=random), 0.4)
-    samples = warp.march(bits, lattice, rays, torch.rand(count, generator=random))
+    samples = warp.march(occupied(bits), lattice, rays, torch.rand(count, generator=random))
     points = warp.sample_points(rays, samples, lattice.contracted)
     table = torch.randn(layout.rows, 4, generator=random)
     features = warp.encode(layout, table, points)
