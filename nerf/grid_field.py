@@ -24,7 +24,7 @@ from nerf.randomness import generator
 from nerf.rays import Rays
 from nerf.sky import directions_backward, initial_sky, sky_backward, sky_colour
 from nerf.stopwatch import Work, part
-from nerf.waves import HIDDEN_BEHIND, Wave, front_to_back, packed
+from nerf.waves import HIDDEN_BEHIND, Wave, front_to_back
 
 INITIAL_FEATURE = 1e-4
 # Far beyond any use: no loop over them is endless, and indices stay within 32 bits.
@@ -94,6 +94,7 @@ class GridPass(NamedTuple):
     samples: Samples
     points: Float[Tensor, "samples 3"]
     density: DensityPass
+    harmonics: Float[Tensor, "rays direction"]
     colour: ColourPass
     rendering: Rendering
     weights: Float[Tensor, "samples"]
@@ -172,11 +173,11 @@ class GridField(nn.Module):
     ) -> Float[Tensor, "*points 3"]:
         """Colour seen by viewing rays of unit ``directions``; without meaning where the density is zero."""
         unit = unit_coordinates(points, self.settings.contracted).reshape(-1, 3).clamp(0, 1)
-        harmonics = self.of_directions(directions.reshape(-1, 3))
+        of_rays = grid_mlp.ray_hidden(self.weights, self.of_directions(directions.reshape(-1, 3)))
         each = torch.arange(len(unit) + 1, dtype=torch.int32, device=unit.device)  # a ray of its own for every point
         alone = Samples(each, each[:-1], unit[:, 0], unit[:, 0])
         geometry = self._density_pass(unit).geometry
-        return grid_mlp.colour_forward(self.weights, self.backend, alone, geometry, harmonics).colour.view(points.shape)
+        return grid_mlp.colour_forward(self.weights, self.backend, alone, geometry, of_rays).colour.view(points.shape)
 
     @torch.no_grad()
     def render(self, rays: Rays, background: Float[Tensor, "3"]) -> Rendering:
@@ -187,21 +188,20 @@ class GridField(nn.Module):
         """
         rays = Rays(*(part.contiguous() for part in rays))
         seen, light = rays.far.new_zeros(len(rays.far), 4), torch.ones_like(rays.far)
-        harmonics = self.of_directions(rays.directions)
+        of_rays = grid_mlp.ray_hidden(self.weights, self.of_directions(rays.directions))
         for wave in self._waves(rays, torch.full_like(rays.near, 0.5)):
-            alone = self._composited(wave, harmonics.index_select(0, wave.number))
-            before = light.index_select(0, wave.number)
-            seen.index_add_(0, wave.number, before[:, None] * torch.cat([alone.colour, alone.depth[:, None]], -1))
-            light[wave.number] = before * (1 - alone.opacity)
+            alone = self._composited(wave, of_rays)
+            seen += light[:, None] * torch.cat([alone.colour, alone.depth[:, None]], -1)
+            light *= 1 - alone.opacity
         behind = self._behind(rays, background)
         return Rendering(seen[:, :3] + light[:, None] * behind, seen[:, 3] + light * rays.far, 1 - light)
 
-    def _composited(self, wave: Wave, harmonics: Float[Tensor, "rays direction"]) -> Rendering:
-        """What a wave's samples alone let its rays see, before nothing, which is nowhere."""
-        nowhere, black = harmonics.new_zeros(len(harmonics)), harmonics.new_zeros(len(harmonics), 3)
-        density = wave.density
-        colour = grid_mlp.colour_forward(self.weights, self.backend, wave.samples, density.geometry, harmonics).colour
-        return self.backend.composite(wave.samples, density.sigma, colour, black, nowhere)[0]
+    def _composited(self, wave: Wave, of_rays: Float[Tensor, "rays hidden"]) -> Rendering:
+        """What a wave's samples alone let the rays see, before nothing, which is nowhere."""
+        nowhere, black = of_rays.new_zeros(len(of_rays)), of_rays.new_zeros(len(of_rays), 3)
+        geometry = wave.density.geometry
+        colour = grid_mlp.colour_forward(self.weights, self.backend, wave.samples, geometry, of_rays).colour
+        return self.backend.composite(wave.samples, wave.sigma, colour, black, nowhere)[0]
 
     def forward(self, rays: Rays, jitter: Float[Tensor, "rays"], background: Float[Tensor, "rays 3"]) -> GridPass:
         """Density of all samples in occupied cells; colour of those that can be seen."""
@@ -209,8 +209,8 @@ class GridField(nn.Module):
         background = self._behind(rays, background)
         waves = list(self._waves(rays, jitter))
         with part("march"):
-            samples, order = packed(waves, len(jitter))
-            sigma = torch.cat([wave.density.sigma for wave in waves]).index_select(0, order)
+            samples, order = backend.pack_waves([wave.samples for wave in waves])
+            sigma = torch.cat([wave.sigma for wave in waves]).index_select(0, order)
             samples, seen = backend.visible_front(samples, sigma, HIDDEN_BEHIND)
             rows = order.index_select(0, seen)
             points = torch.cat([wave.points for wave in waves]).index_select(0, rows)
@@ -218,10 +218,11 @@ class GridField(nn.Module):
             density = DensityPass(*(torch.cat(parts).index_select(0, rows) for parts in of_waves))
         with part("encode"):
             harmonics = self.of_directions(rays.directions)
-        colour = grid_mlp.colour_forward(self.weights, backend, samples, density.geometry, harmonics)
+            of_rays = grid_mlp.ray_hidden(self.weights, harmonics)
+        colour = grid_mlp.colour_forward(self.weights, backend, samples, density.geometry, of_rays)
         with part("composite"):
             rendering, weights = backend.composite(samples, density.sigma, colour.colour, background, rays.far)
-        return GridPass(rays, background, len(order), samples, points, density, colour, rendering, weights)
+        return GridPass(rays, background, len(order), samples, points, density, harmonics, colour, rendering, weights)
 
     def backward(self, done: GridPass, grad: Rendering, grad_weights: Float[Tensor, "samples"]) -> GridGradients:
         """Gradients of a loss, given those of the rendering and of the samples' weights."""
@@ -229,7 +230,7 @@ class GridField(nn.Module):
         grad_sigma, grad_colour = backend.composite_backward(
             done.samples, density.sigma, colour.colour, done.background, done.rays.far, grad, grad_weights
         )
-        of_colour = grid_mlp.colour_backward(self.weights, backend, done.samples, colour, grad_colour)
+        of_colour = grid_mlp.colour_backward(self.weights, backend, done.samples, colour, done.harmonics, grad_colour)
         of_density = grid_mlp.density_backward(self.weights, backend, density, grad_sigma, of_colour.geometry)
         weights = Weights(of_density.density_hidden, of_density.density_out, *of_colour[:2])
         of_background = (1 - done.rendering.opacity)[:, None] * grad.colour

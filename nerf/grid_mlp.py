@@ -48,10 +48,9 @@ class DensityPass(NamedTuple):
 
 
 class ColourPass(NamedTuple):
-    """What the colour network made of the samples' ``geometry`` and the rays' ``harmonics``, layer by layer."""
+    """What the colour network made of the samples' ``geometry`` and their rays, layer by layer."""
 
     geometry: Float[Tensor, "samples geometry"]
-    harmonics: Float[Tensor, "rays direction"]
     hidden: Float[Tensor, "samples hidden"]
     colour: Float[Tensor, "samples 3"]
 
@@ -109,28 +108,38 @@ def density_forward(weights: Weights, features: Float[Tensor, "samples features"
         return DensityPass(features, hidden, hidden @ weights.density_out.T)
 
 
+def ray_hidden(weights: Weights, harmonics: Float[Tensor, "rays direction"]) -> Float[Tensor, "rays hidden"]:
+    """What a ray's viewing direction adds to the colour network's hidden layer, for all of its samples."""
+    return harmonics @ weights.colour_hidden[GEOMETRY:]
+
+
 def colour_forward(
     weights: Weights,
     backend: Backend,
     samples: Samples,
     geometry: Float[Tensor, "samples geometry"],
-    harmonics: Float[Tensor, "rays direction"],
+    of_rays: Float[Tensor, "rays hidden"],
 ) -> ColourPass:
-    """Geometry and viewing direction to colour, through a sigmoid."""
+    """Geometry and viewing direction (:func:`ray_hidden`) to colour, through a sigmoid."""
     with part("mlp", Work(products=colour_products(weights) * len(geometry))):
         hidden = geometry @ weights.colour_hidden[:GEOMETRY]
-        backend.add_ray_relu(samples, hidden, harmonics @ weights.colour_hidden[GEOMETRY:])
-        return ColourPass(geometry, harmonics, hidden, (hidden @ weights.colour_out.T).sigmoid_())
+        backend.add_ray_relu(samples, hidden, of_rays)
+        return ColourPass(geometry, hidden, (hidden @ weights.colour_out.T).sigmoid_())
 
 
 def colour_backward(
-    weights: Weights, backend: Backend, samples: Samples, done: ColourPass, grad_colour: Float[Tensor, "samples 3"]
+    weights: Weights,
+    backend: Backend,
+    samples: Samples,
+    done: ColourPass,
+    harmonics: Float[Tensor, "rays direction"],
+    grad_colour: Float[Tensor, "samples 3"],
 ) -> ColourGradients:
     """Gradients of the network's weights and of its inputs, given that of the colour."""
     grad_logits = grad_colour * done.colour * (1 - done.colour)
     grad_hidden = grad_logits @ weights.colour_out
     grad_of_ray = backend.add_ray_relu_backward(samples, done.hidden, grad_hidden)
-    of_hidden = torch.cat([done.geometry.T @ grad_hidden, done.harmonics.T @ grad_of_ray])
+    of_hidden = torch.cat([done.geometry.T @ grad_hidden, harmonics.T @ grad_of_ray])
     grad_geometry = grad_hidden @ weights.colour_hidden[:GEOMETRY].T
     return ColourGradients(
         of_hidden, grad_logits.T @ done.hidden, grad_geometry, grad_of_ray @ weights.colour_hidden[GEOMETRY:].T

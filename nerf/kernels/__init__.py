@@ -16,9 +16,10 @@ torch, any device, float32 or float64. The contract:
 """
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple, Protocol, runtime_checkable
 
-from jaxtyping import Float, Int, Int32, Int64, UInt8
+from jaxtyping import Float, Float64, Int, Int32, Int64, UInt8
 from torch import Tensor
 
 from nerf.model import Rendering
@@ -164,6 +165,20 @@ class Backend(Protocol):
     ) -> Float[Tensor, "rays 64"]: ...
 
     def relu_backward(self, hidden: Float[Tensor, "samples 64"], grad: Float[Tensor, "samples 64"]) -> None: ...
+
+    def end_wave(
+        self,
+        lattice: Lattice,
+        samples: Samples,
+        sigma: Float[Tensor, "samples"],
+        threshold: float,
+        jitter: Float[Tensor, "rays"],
+        far: Float[Tensor, "rays"],
+        depth: Float64[Tensor, "rays"],
+        near: Float[Tensor, "rays"],
+    ) -> None: ...
+
+    def pack_waves(self, waves: Sequence[Samples]) -> tuple[Samples, Int32[Tensor, "samples"]]: ...
 
     def visible_front(
         self, samples: Samples, sigma: Float[Tensor, "samples"], threshold: float

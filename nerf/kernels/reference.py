@@ -16,6 +16,7 @@ from nerf.kernels.packed_compositing import (
     distortion_backward,
     visible_front,
 )
+from nerf.kernels.waves import end_wave, pack_waves
 
 __all__ = [
     "adam",
@@ -29,8 +30,10 @@ __all__ = [
     "encode",
     "encode_backward_points",
     "encode_backward_table",
+    "end_wave",
     "march",
     "occupied_bits",
+    "pack_waves",
     "raise_cache",
     "relu_backward",
     "sample_points",

@@ -155,13 +155,15 @@ def _each(like: Tensor) -> Samples:
 
 
 def _colour(backend: Backend, geometry: Tensor, harmonics: Tensor) -> Tensor:
-    return grid_mlp.colour_forward(_weights(geometry), backend, _each(geometry), geometry, harmonics).colour
+    weights = _weights(geometry)
+    of_rays = grid_mlp.ray_hidden(weights, harmonics)
+    return grid_mlp.colour_forward(weights, backend, _each(geometry), geometry, of_rays).colour
 
 
 def _colour_backward(backend: Backend, grad: Tensor, geometry: Tensor, harmonics: Tensor) -> tuple[Tensor, Tensor]:
     weights, samples = _weights(geometry), _each(geometry)
-    done = grid_mlp.colour_forward(weights, backend, samples, geometry, harmonics)
-    gradients = grid_mlp.colour_backward(weights, backend, samples, done, grad)
+    done = grid_mlp.colour_forward(weights, backend, samples, geometry, grid_mlp.ray_hidden(weights, harmonics))
+    gradients = grid_mlp.colour_backward(weights, backend, samples, done, harmonics, grad)
     return gradients.geometry, gradients.harmonics
 
 

@@ -200,8 +200,9 @@ def in_one_pass(model: GridField, given: Rays, jitter: Tensor, background: Tenso
     samples = reference.march(occupied(model.bits), model.lattice, given, jitter)
     density = model._density_pass(reference.sample_points(given, samples, model.settings.contracted))
     front, seen = reference.visible_front(samples, density.sigma, HIDDEN_BEHIND)
-    density, harmonics = density.select(seen), reference.spherical_harmonics(given.directions)
-    colour = grid_mlp.colour_forward(model.weights, reference, front, density.geometry, harmonics).colour
+    density = density.select(seen)
+    of_rays = grid_mlp.ray_hidden(model.weights, reference.spherical_harmonics(given.directions))
+    colour = grid_mlp.colour_forward(model.weights, reference, front, density.geometry, of_rays).colour
     behind = background.repeat(len(jitter), 1)
     rendering, _ = reference.composite(front, density.sigma, colour, behind, given.far)
     return len(samples.t), front, rendering

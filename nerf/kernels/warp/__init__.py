@@ -4,7 +4,6 @@ Float32 and int32 tensors only. On the CPU a call uses the thread it is made fro
 threads call. On a GPU, gradients of the table are added in no fixed order.
 """
 
-from nerf.kernels.directions import spherical_harmonics, spherical_harmonics_backward
 from nerf.kernels.warp.adam import adam
 from nerf.kernels.warp.cache import cell_corners, occupied_bits, raise_cache
 from nerf.kernels.warp.compositing import (
@@ -14,10 +13,12 @@ from nerf.kernels.warp.compositing import (
     distortion_backward,
     visible_front,
 )
+from nerf.kernels.warp.directions import spherical_harmonics, spherical_harmonics_backward
 from nerf.kernels.warp.encoding import encode, encode_backward_points, encode_backward_table
 from nerf.kernels.warp.launch import compile_kernels, why_not
 from nerf.kernels.warp.layers import add_ray_relu, add_ray_relu_backward, relu_backward
 from nerf.kernels.warp.marching import march, sample_points, sample_points_backward
+from nerf.kernels.warp.waves import end_wave, pack_waves
 
 __all__ = [
     "adam",
@@ -32,8 +33,10 @@ __all__ = [
     "encode",
     "encode_backward_points",
     "encode_backward_table",
+    "end_wave",
     "march",
     "occupied_bits",
+    "pack_waves",
     "raise_cache",
     "relu_backward",
     "sample_points",

@@ -89,7 +89,7 @@ def _grows_from(lattice: Lattice) -> float:
 
 
 @wp.func
-def _thickness(sigma: float, length: float):
+def thickness(sigma: float, length: float):
     """At most OPAQUE. Not by wp.min, which takes NaN for missing: a density that is no number would look solid."""
     tau = sigma * length
     return wp.where(tau > _OPAQUE, _OPAQUE, tau)
@@ -112,7 +112,7 @@ def _count_visible(
     i = int(starts[ray])
     end = starts[ray + 1]
     while i < end and wp.exp(-float(tau)) >= threshold:
-        tau += wp.float64(_thickness(sigma[i], lengths[i]))
+        tau += wp.float64(thickness(sigma[i], lengths[i]))
         i += 1
     counts[ray] = i - starts[ray]
 
@@ -156,7 +156,7 @@ def _composite(
     sum_colour = wp.vec3d()
     sum_depth = wp.float64(0.0)
     for i in range(starts[ray], starts[ray + 1]):
-        more = _thickness(sigma[i], lengths[i])
+        more = thickness(sigma[i], lengths[i])
         weight = wp.exp(-float(tau)) * _stopped(more)
         tau += wp.float64(more)
         weights[i] = weight
@@ -190,14 +190,14 @@ def _composite_backward(
     tau = wp.float64(0.0)
     for i in range(start, end):
         grad_sigma[i] = float(tau)  # what lies before the sample, for the way back
-        tau += wp.float64(_thickness(sigma[i], lengths[i]))
+        tau += wp.float64(thickness(sigma[i], lengths[i]))
     on_seen = grad_seen[ray]
     on_depth = grad_depth[ray]
     on_unstopped = wp.dot(on_seen, background[ray]) + on_depth * far[ray] - grad_opacity[ray]
     behind = wp.float64(wp.exp(-float(tau)) * on_unstopped)
     for step in range(end - start):
         i = end - 1 - step
-        more = _thickness(sigma[i], lengths[i])
+        more = thickness(sigma[i], lengths[i])
         before = wp.exp(-grad_sigma[i])
         weight = before * _stopped(more)
         g = grad_weights[i] + wp.dot(on_seen, colour[i]) + on_depth * distances[i]

@@ -20,7 +20,13 @@ wp.init()
 
 Argument = Tensor | int | float
 
-TORCH_TYPES = {wp.float32: torch.float32, wp.int32: torch.int32, wp.int64: torch.int64, wp.uint8: torch.uint8}
+TORCH_TYPES = {
+    wp.float32: torch.float32,
+    wp.float64: torch.float64,
+    wp.int32: torch.int32,
+    wp.int64: torch.int64,
+    wp.uint8: torch.uint8,
+}
 
 vec16 = wp.types.vector(length=16, dtype=wp.float32)  # a cache line: rows of 64 numbers are four, and add as vectors do
 

@@ -66,7 +66,7 @@ def _scratch(length: int, device: torch.device) -> Tensor:
 
 
 @wp.func
-def _distance(step: float, cone: float, s: float):
+def lattice_distance(step: float, cone: float, s: float):
     """t(s) of nerf.kernels.Lattice."""
     if cone == 0.0:
         return step * s
@@ -75,7 +75,7 @@ def _distance(step: float, cone: float, s: float):
 
 
 @wp.func
-def _coordinate(step: float, cone: float, t: float):
+def lattice_coordinate(step: float, cone: float, t: float):
     """s(t), the inverse of t(s)."""
     if cone == 0.0:
         return t / step
@@ -182,14 +182,14 @@ def _march(
         on_z = _slab(o[2], d[2])
         near = wp.max(near, wp.max(wp.max(on_x[0], on_y[0]), on_z[0]))
         far = wp.max(near, wp.min(far, wp.min(wp.min(on_x[1], on_y[1]), on_z[1])))
-    first = _coordinate(step, cone, near)
-    last = _coordinate(step, cone, far) - first
+    first = lattice_coordinate(step, cone, near)
+    last = lattice_coordinate(step, cone, far) - first
     count = int(0)
     k = int(0)
     scale = float(cells)
     while float(k) < last and count < most:
         s = first + jitter[ray] + float(k)
-        t = _distance(step, cone, s)
+        t = lattice_distance(step, cone, s)
         if t >= far:
             break
         point = o + t * d
@@ -203,7 +203,7 @@ def _march(
             clear = wp.max(1, int(clearance[number >> 6]))
             free = _free_distance(contracted, cells, x, y, z, clear, u, point, d)
             # Rounded down by a thousandth of a step: a step too few is looked at again, one too many is lost.
-            steps = _coordinate(step, cone, t + free) - s - 0.001
+            steps = lattice_coordinate(step, cone, t + free) - s - 0.001
             k += wp.max(1, int(wp.min(steps, 1.0e6)) + 1)
         else:
             if ((word >> wp.int64(number & 63)) & wp.int64(1)) != wp.int64(0):
@@ -233,10 +233,10 @@ def _place(
     start = starts[ray]
     for i in range(start, starts[ray + 1]):
         k = float(found[ray * most + i - start])
-        here = _distance(step, cone, firsts[ray] + k)
-        there = wp.min(_distance(step, cone, firsts[ray] + k + 1.0), ends[ray])
+        here = lattice_distance(step, cone, firsts[ray] + k)
+        there = wp.min(lattice_distance(step, cone, firsts[ray] + k + 1.0), ends[ray])
         rays[i] = ray
-        distances[i] = _distance(step, cone, firsts[ray] + jitter[ray] + k)
+        distances[i] = lattice_distance(step, cone, firsts[ray] + jitter[ray] + k)
         lengths[i] = there - here
 
 

@@ -10,7 +10,17 @@ from nerf.kernels.warp.launch import PACKAGE
 
 assert nerf.kernels.warp.adam  # the package defines all kernels when it is imported
 
-MODULES = {"adam": 2, "cache": 2, "compositing": 6, "encoding": 3, "layers": 3, "marching": 4}  # with their kernels
+# With their kernels.
+MODULES = {
+    "adam": 2,
+    "cache": 2,
+    "compositing": 6,
+    "directions": 1,
+    "encoding": 3,
+    "layers": 3,
+    "marching": 4,
+    "waves": 2,
+}
 
 
 @pytest.mark.parametrize(("arch", "kind"), [(80, "ptx"), (90, "cubin")])
