@@ -154,9 +154,8 @@ class GridField(nn.Module):
 
     def occupy(self, bits: Int64[Tensor, "bricks"]) -> None:
         """From now on sample these cells alone (``nerf.kernels.cache``)."""
-        now = occupied(bits)
-        self.bits.copy_(now.bits)
-        self.clearance.copy_(now.clearance)
+        self.bits.copy_(bits)
+        self.clearance.copy_(occupied(bits).clearance)
 
     def density(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points"]:
         """Density per scene unit; zero outside the box of a bounded scene."""
@@ -173,7 +172,7 @@ class GridField(nn.Module):
     ) -> Float[Tensor, "*points 3"]:
         """Colour seen by viewing rays of unit ``directions``; without meaning where the density is zero."""
         unit = unit_coordinates(points, self.settings.contracted).reshape(-1, 3).clamp(0, 1)
-        of_rays = grid_mlp.ray_hidden(self.weights, self.of_directions(directions.reshape(-1, 3)))
+        of_rays = grid_mlp.ray_hidden(self.weights, self.of_directions(directions.reshape(-1, 3).contiguous()))
         each = torch.arange(len(unit) + 1, dtype=torch.int32, device=unit.device)  # a ray of its own for every point
         alone = Samples(each, each[:-1], unit[:, 0], unit[:, 0])
         geometry = self._density_pass(unit).geometry

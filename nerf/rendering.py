@@ -1,5 +1,6 @@
 """Whole images, rendered in fixed chunks so that memory is bounded and results do not depend on threads."""
 
+import math
 from collections.abc import Callable
 
 import torch
@@ -11,6 +12,8 @@ from nerf.parallel import in_order
 from nerf.rays import Rays
 
 CUDA_CHUNK = 8192  # rays
+# A small picture is cut into so many chunks, of so many rays at least: with fewer, most cores would have nothing to do.
+CHUNKS, LEAST_CHUNK = 16, 1024
 
 
 def render_image(
@@ -20,12 +23,15 @@ def render_image(
     chunk: int | None = None,
     on_chunk: Callable[[float], None] | None = None,
 ) -> Rendering:
-    """Render rays of shape (height, width), ``chunk`` at a time in row order; by default as many as suit the model.
+    """Render rays of shape (height, width), ``chunk`` at a time in row order; by default as many as suit the
+    model and the picture.
 
     ``on_chunk`` is told the finished share, in (0, 1], after each chunk.
     """
     height, width = rays.near.shape
-    chunk = chunk or (model.chunk_rays if rays.near.device.type == "cpu" else CUDA_CHUNK)
+    if chunk is None and rays.near.device.type == "cpu":
+        chunk = min(model.chunk_rays, max(LEAST_CHUNK, math.ceil(height * width / CHUNKS)))
+    chunk = chunk or CUDA_CHUNK
     flat = Rays(*(part.reshape(height * width, *part.shape[2:]) for part in rays))
 
     def render(start: int) -> Rendering:

@@ -22,7 +22,8 @@ WAVE, SHORTEST_WAVE, LONGEST_WAVE = 1 << 14, 6, 64
 
 
 class Wave(NamedTuple):
-    """Some samples of all rays; of those whose light is used up there are none."""
+    """Some samples of all rays; of those whose light is used up there are none. ``sigma`` is the density's, which it
+    would compute anew each time it is asked."""
 
     samples: Samples
     points: Float[Tensor, "samples 3"]
@@ -39,7 +40,7 @@ def front_to_back(
     jitter: Float[Tensor, "rays"],
 ) -> Iterator[Wave]:
     """The samples in occupied cells that rays with light left meet, ``lattice.most_samples`` per ray at most, in one
-    wave or more.
+    wave or more; there must be rays.
 
     Their places are those of :meth:`Backend.march`: the next wave goes on along the lattice where the last has ended.
     ``density_at`` answers for points in unit coordinates.

@@ -46,8 +46,17 @@ class Terminated(BaseException):
 
 
 def main() -> None:
-    """Entry point of ``pipeline``."""
-    sys.exit(run_command(sys.argv[1:]))
+    """Entry point of ``pipeline``. That nobody reads its words to the end (`pipeline … | head`) is no error."""
+    code: int | str | None = 0
+    try:
+        try:
+            code = run_command(sys.argv[1:])
+        except SystemExit as ending:  # of a help text
+            code = ending.code
+        sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    sys.exit(code)
 
 
 def run_command(words: Sequence[str]) -> int:
@@ -80,6 +89,8 @@ def run_command(words: Sequence[str]) -> int:
     except Terminated:
         _say(StageError("stopped", "SIGTERM", GO_ON), as_json)
         return EXIT_TERMINATED
+    except BrokenPipeError:
+        raise
     except Exception as error:
         if debug:
             traceback.print_exc()

@@ -4,6 +4,7 @@ import json
 import sys
 import threading
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -45,6 +46,12 @@ def end_line(stage: str, line: str, seconds: float, cached: bool) -> str:
 def error_text(stage: str, error: StageError) -> str:
     """A stage error as the user reads it: what, why, what to try."""
     return f"{stage} failed: {error.what}\n  why: {error.why}\n  try: {error.hint}"
+
+
+def _print(text: str) -> None:
+    """At once; the run goes on where nobody reads along any more."""
+    with suppress(BrokenPipeError):
+        print(text, flush=True)
 
 
 class SilentDisplay:
@@ -94,7 +101,7 @@ class PlainDisplay:
 
     def _say(self, text: str) -> None:
         with self._lock:
-            print(text, flush=True)
+            _print(text)
 
     def headline(self, text: str) -> None:
         self._say(text)
@@ -137,7 +144,7 @@ class JsonDisplay:
 
     def _event(self, event: str, **values: Any) -> None:
         with self._lock:
-            print(json.dumps({"event": event, **values}, ensure_ascii=False), flush=True)
+            _print(json.dumps({"event": event, **values}, ensure_ascii=False))
 
     def headline(self, text: str) -> None:
         self._event("start", text=text)

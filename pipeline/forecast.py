@@ -81,8 +81,8 @@ def without_budget(settings: Settings, times: Mapping[str, float | None]) -> flo
     if train.steps is not None and "train" in times:
         return None
     trained = train.seconds or SECONDS[train.preset or "standard"]
-    # What a training of three minutes is followed by (fox, fountain_p11, the demo).
-    usual = {"train": trained + STARTING, "evaluate": 0.05 * trained, "render": 0.35 * trained}
+    # What a training of three minutes is followed by (fox, fountain_p11, the demo; drawing scaled to its share now).
+    usual = {"train": trained + STARTING, "evaluate": 0.05 * trained, "render": 0.27 * trained}
     usual["mesh"] = 5.0 + 0.15 * trained
     return sum(usual.get(stage, 0.0) if seconds is None else seconds for stage, seconds in times.items())
 

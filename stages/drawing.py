@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from nerf.model import RadianceModel, Rendering
     from nerf.rays import Rays
 
-SHARE = 0.4  # of the training's seconds that drawing may be expected to take; what is left is room for a busier machine
+SHARE = 0.3  # of the training's seconds that drawing may be expected to take; what is left is room for a busier machine
 LEAST_DRAWING = 0.5  # seconds: less draws nothing
 TIMED_SECONDS = 0.5
 TIMED_SHARE = 0.05  # of the training's seconds, where that is less

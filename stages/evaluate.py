@@ -51,7 +51,7 @@ class Config(StageConfig):
     photos: int | None = Field(default=None, ge=1)
     """How many test photos to score, evenly spread. None: as many as take no longer than the training."""
     seconds: float | None = Field(default=None, gt=0)
-    """That the stage may take. None: 40 % of the training's for drawing."""
+    """That the stage may take. None: 30 % of the training's for drawing."""
     seed: int = 0
     """Of the interval."""
 

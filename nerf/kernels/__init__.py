@@ -3,9 +3,10 @@
 A backend is a module with the functions of :class:`Backend`. ``nerf.kernels.reference`` is the specification: plain
 torch, any device, float32 or float64. The contract:
 
-* Tensors are contiguous, all on one device. Values are float32 (the reference takes float64 as well), indices int32,
-  bits int64. Backends read their arguments without copying and neither keep nor change them, except those that a
-  docstring says are changed *in place*. What a function returns belongs to the caller.
+* Tensors are contiguous, all on one device. Values are float32 (the reference takes float64 as well), optical depths
+  float64, indices int32, bits int64, clearances uint8. Backends read their arguments without copying and neither keep
+  nor change them, except those that a docstring says are changed *in place*. What a function returns belongs to the
+  caller.
 * Nothing is differentiated by autograd: what has a ``_backward`` takes the gradient of a scalar loss with respect to
   the results and returns, or adds to, the one with respect to the arguments. Sample distances carry no gradient.
 * Samples are *packed*: those of ray r are the entries starts[r] ... starts[r + 1] - 1, front to back. A ray may have

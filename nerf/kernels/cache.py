@@ -33,8 +33,8 @@ def occupied_bits(thickness: Float[Tensor, "cache"], threshold: float) -> Int64[
 
 
 def occupied(bits: Int64[Tensor, "bricks"]) -> Occupied:
-    """With the clearance of each brick: with n, the (2 n - 1)³ bricks around it hold no occupied cell. 0 for one that
-    does itself, at most MOST_CLEAR."""
+    """With the clearance of each brick. A clearance of n means that the cube of 2 n - 1 bricks per side around it holds
+    no occupied cell; it is 0 where the brick itself holds one, and at most MOST_CLEAR."""
     side = round(len(bits) ** (1 / 3))
     reached = (bits != 0).view(side, side, side)
     clear = torch.zeros_like(reached, dtype=torch.uint8)
@@ -47,10 +47,10 @@ def occupied(bits: Int64[Tensor, "bricks"]) -> Occupied:
 def _grown(reached: Bool[Tensor, "side side side"]) -> Bool[Tensor, "side side side"]:
     """With all their neighbours, across edges and corners too."""
     for axis in range(3):
-        several, last = reached.clone(), reached.shape[axis] - 1
-        several.narrow(axis, 1, last).logical_or_(reached.narrow(axis, 0, last))
-        several.narrow(axis, 0, last).logical_or_(reached.narrow(axis, 1, last))
-        reached = several
+        grown, last = reached.clone(), reached.shape[axis] - 1
+        grown.narrow(axis, 1, last).logical_or_(reached.narrow(axis, 0, last))
+        grown.narrow(axis, 0, last).logical_or_(reached.narrow(axis, 1, last))
+        reached = grown
     return reached
 
 

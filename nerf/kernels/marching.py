@@ -33,7 +33,7 @@ def march(occupied: Occupied, lattice: Lattice, rays: Rays, jitter: Float[Tensor
     ray, k_wanted = wanted.nonzero(as_tuple=True)
     start, end = (lattice_distance(lattice, first[ray] + k_wanted + edge) for edge in (0, 1))
     dt = torch.minimum(end, rays.far[ray]) - start
-    return Samples(starts_of(wanted.sum(-1)), ray.int(), t[wanted], dt)
+    return Samples(_starts_of(wanted.sum(-1)), ray.int(), t[wanted], dt)
 
 
 def lattice_distance(lattice: Lattice, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
@@ -84,7 +84,7 @@ def unit_coordinates(points: Float[Tensor, "*points 3"], contracted: bool) -> Fl
     return ((contract(points) if contracted else points) + half) / (2 * half)
 
 
-def starts_of(counts: Tensor) -> Int32[Tensor, "rays_and_end"]:
+def _starts_of(counts: Tensor) -> Int32[Tensor, "rays_and_end"]:
     """Where each ray's samples start among packed ones, and at last their number."""
     return torch.nn.functional.pad(counts.cumsum(0), (1, 0)).int()
 

@@ -24,15 +24,16 @@ def end_wave(
     """In place, after a wave of up to ``lattice.most_samples`` samples of each ray: ``depth`` grows by their optical
     depth, sum sigma dt, and ``near`` becomes where the ray goes on.
 
-    That is one step along the lattice behind its last sample; ``far``, so that nothing is left of it, for a ray that
+    That is where the interval behind its last sample's begins; ``far``, so that nothing is left of it, for a ray that
     had fewer samples than it might have had, or whose transmittance exp(-depth) is below ``threshold`` or no number.
     """
     depth.index_add_(0, samples.ray, (sigma * samples.dt).clamp(max=OPAQUE).double())
     goes_on = (samples.starts.diff() == lattice.most_samples) & (torch.exp(-depth.to(sigma.dtype)) >= threshold)
     ray = goes_on.nonzero()[:, 0]
     last = samples.t.index_select(0, samples.starts.index_select(0, ray + 1) - 1)
+    onward = lattice_distance(lattice, lattice_coordinate(lattice, last) + (1 - jitter.index_select(0, ray)))
     near.copy_(far)
-    near[ray] = lattice_distance(lattice, lattice_coordinate(lattice, last) + (1 - jitter.index_select(0, ray)))
+    near[ray] = torch.minimum(onward, far[ray])
 
 
 def pack_waves(waves: Sequence[Samples]) -> tuple[Samples, Int32[Tensor, "samples"]]:

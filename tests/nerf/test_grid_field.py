@@ -7,7 +7,7 @@ from torch import Tensor
 
 from nerf import grid_mlp, sky
 from nerf.grid_field import GridField, GridSettings
-from nerf.kernels import GridLayout, Samples, reference
+from nerf.kernels import GridLayout, Samples, reference, warp
 from nerf.kernels.cache import occupied
 from nerf.model import RadianceModel, Rendering
 from nerf.rays import Rays
@@ -118,8 +118,11 @@ def test_it_is_a_radiance_model_of_the_scene_frame() -> None:
     points = torch.tensor([[[0.0, 0, 0], [0.89, 0.1, -0.89]], [[0.91, 0, 0], [0, 0, -5]]], dtype=torch.float64)
     density = model.density(points)
     assert (density[0] > 0).all() and (density[1] == 0).all()
-    colour = model.colour(points, torch.tensor([0.0, 0, 1], dtype=torch.float64).expand_as(points))
+    towards = torch.tensor([0.0, 0, 1], dtype=torch.float64)
+    colour = model.colour(points, towards.expand_as(points))
     assert colour.shape == points.shape and ((colour > 0) & (colour < 1)).all()
+    compiled = GridField(SMALL, 0, warp)
+    assert compiled.colour(points.float(), towards.float().expand_as(points)).shape == points.shape
     assert (field(FOLDED).density(1e6 * points) > 0).all()
 
 
@@ -240,6 +243,33 @@ def test_waves_end_soon_behind_what_stops_the_light(settings: GridSettings, monk
     left = HIDDEN_BEHIND * torch.tensor([1.0, 5.0, 1.0])  # of a ray's colour, depth and opacity
     for one, other, most in zip(waves, whole, left, strict=True):
         assert 0 < (one - other).abs().max() < most
+
+
+def test_what_is_empty_follows_from_what_is_occupied() -> None:
+    model = field(replace(SMALL, cache_cells=32))
+    for cell in (5, 17):
+        bits = torch.zeros_like(model.bits)
+        bits[cell] = 1
+        model.occupy(bits)
+        assert torch.equal(model.bits, bits)
+        assert torch.equal(model.clearance, occupied(bits).clearance) and model.clearance.unique().numel() > 3
+
+
+@pytest.mark.parametrize("settings", [SMALL, FOLDED])
+def test_waves_of_compiled_kernels_see_what_a_single_pass_of_them_sees(
+    settings: GridSettings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model, given = GridField(replace(settings, cache_cells=32), 0, warp), Rays(*(part.float() for part in rays(300)))
+    model.table.mul_(3e4)
+    few = torch.randint(len(model.bits), (40,), generator=torch.Generator().manual_seed(5))
+    model.occupy(torch.zeros_like(model.bits).index_fill_(0, few, -1))
+    pictures = []
+    for lengths in ((1 << 16, 64, 64), (1, 2, 2)):
+        in_short_waves(monkeypatch, *lengths)
+        pictures.append(model.render(given, torch.ones(3)))
+    assert pictures[0].opacity.max() > 0.1
+    for one, other in zip(*pictures, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.parametrize("settings", [SMALL, FOLDED])

@@ -13,7 +13,7 @@ ELSEWHERE = {
     "stays NaN: tests/numerics/test_not_a_number.py",
     "nerf/kernels/cache.py": "comparisons and bits, exact: tests/nerf/kernels/test_cache.py; a cell that is no number "
     "counts as occupied",
-    "nerf/kernels/waves.py": "the optical depth as compositing sums it, the lattice's step as marching takes it: "
+    "nerf/kernels/waves.py": "sums of optical depth in float64, the lattice's step as marching takes it: "
     "tests/nerf/kernels/test_waves.py",
     "nerf/waves.py": "cuts rays where the light is below 1e-3; the product of the waves' light is off by 6e-8 a wave: "
     "tests/nerf/test_grid_field.py",

@@ -1,6 +1,7 @@
 """The command line as a user meets it: words, exit codes, no traceback."""
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -13,7 +14,7 @@ from PIL import Image
 
 from pipeline import chain
 from pipeline.cli import run_command
-from pipeline.display import PlainDisplay, end_line
+from pipeline.display import Display, JsonDisplay, PlainDisplay, end_line
 from pipeline.settings import Settings, default_workspace
 
 
@@ -271,6 +272,31 @@ def test_a_signal_ends_cleanly_and_soon(tmp_path: Path, number: int, code: int):
     assert process.returncode == code
     assert "Finished stages are kept" in json.loads(rest.splitlines()[-1])["hint"] and errors == ""
     assert time.monotonic() - started < 15  # a hang, not slowness, is what this would catch
+
+
+@pytest.mark.parametrize("words", [["--help"], ["run", "--help"], ["status", "--help"], ["--version"]])
+def test_words_that_nobody_reads_are_no_error(words: list[str]):
+    command = [sys.executable, "-m", "pipeline", *words]
+    buffered = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=buffered)
+    assert process.stdout is not None and process.stderr is not None
+    process.stdout.close()
+    assert process.stderr.read() == "" and process.wait() == 0
+
+
+@pytest.mark.parametrize("display", [PlainDisplay(), JsonDisplay()])
+def test_a_run_goes_on_when_nobody_reads_along(display: Display, monkeypatch: pytest.MonkeyPatch):
+    read, write = os.pipe()
+    os.close(read)
+    with open(write, "w") as unread:
+        monkeypatch.setattr(sys, "stdout", unread)
+        display.headline("two cores")
+        display.begin("train")
+        display.note("said to nobody")
+        monkeypatch.undo()
+        with pytest.raises(BrokenPipeError):
+            unread.flush()
+        os.dup2(os.open(os.devnull, os.O_WRONLY), write)
 
 
 def test_end_lines():

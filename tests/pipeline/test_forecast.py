@@ -68,7 +68,7 @@ def promise(photos: Path) -> Promise:
 
 def test_a_run_without_a_budget_is_foretold_in_minutes(promise: Promise) -> None:
     assert promise() == ["done in about 6 min"]  # fox: 5 min 42 s
-    assert promise(train={"seconds": 900.0}) == ["done in about 25 min"]
+    assert promise(train={"seconds": 900.0}) == ["done in about 24 min"]
     assert promise(train={"preset": "draft"}) == ["done in about 2 min"]
     assert promise(train={"steps": 500}) == []
 

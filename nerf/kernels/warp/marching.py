@@ -1,4 +1,5 @@
-"""Samples along rays (``nerf.kernels.marching``): where the density cache is empty, whole bricks are skipped."""
+"""Samples along rays (``nerf.kernels.marching``): where the density cache is empty, whole
+neighbourhoods of bricks are skipped."""
 
 import threading
 
@@ -124,8 +125,8 @@ def _axis_exit(low: float, high: float, position: float, speed: float):
 def _free_distance(
     contracted: int, cells: int, x: int, y: int, z: int, clear: int, u: wp.vec3, point: wp.vec3, d: wp.vec3
 ):
-    """How far along the ray it surely stays in the cube of ``2 clear - 1`` bricks per side around cell (x, y, z), which
-    holds its point (unit: u).
+    """How far along the ray it stays, but for rounding at a face, within the cube of ``2 clear - 1`` bricks per side
+    around cell (x, y, z), which holds its point (unit: u).
 
     Where unit coordinates are linear, up to where it leaves these bricks or that region. Where space is folded, r being
     the largest component of the point, coordinates in [-2, 2] move at most 4/3 times as fast as the point, and at most

@@ -65,10 +65,11 @@ def _end_wave(
     for i in range(start, end):
         tau += wp.float64(thickness(sigma[i], lengths[i]))
     depth[ray] = tau
-    on = far[ray]
+    onward = far[ray]
     if end - start == most and wp.exp(-float(tau)) >= threshold:
-        on = lattice_distance(step, cone, lattice_coordinate(step, cone, distances[end - 1]) + (1.0 - jitter[ray]))
-    near[ray] = on
+        s = lattice_coordinate(step, cone, distances[end - 1]) + (1.0 - jitter[ray])
+        onward = wp.min(onward, lattice_distance(step, cone, s))
+    near[ray] = onward
 
 
 @wp.kernel

@@ -576,6 +576,11 @@ def test_no_rays_and_no_samples_are_fine_even_at_first(device: str, rays: int) -
         agree("encode_backward_points", layout, table, none, features)
         warp.encode_backward_table(layout, 0, none, features, table)
         agree("visible_front", samples, empty, 0.5)
+        agree("spherical_harmonics", few.directions)
+        agree("pack_waves", [samples, samples])
+        depth, near = torch.zeros(rays, dtype=torch.float64, device=device), few.near.clone()
+        warp.end_wave(FOLDED, samples, empty, 0.5, few.near, few.far, depth, near)
+        assert torch.equal(near, few.far) and not depth.any()
         inputs = samples, empty, none, few.directions, few.far
         rendering, _ = agree("composite", *inputs)
         assert torch.equal(rendering.colour, few.directions) and torch.equal(rendering.depth, few.far)

@@ -1,6 +1,7 @@
 """What is known of rays between two waves of samples, of both backends, against loops over each ray."""
 
 import math
+from collections.abc import Iterator
 
 import pytest
 import torch
@@ -14,11 +15,25 @@ COUNTS = (0, 4, 1, 4, 4, 0, 3, 4)
 BOUNDED, FOLDED = Lattice(0.05, 0.0, False, 8, 4), Lattice(0.05, 0.1, True, 8, 4)
 
 
+@pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)], autouse=True)
+def device(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Everything below runs on the CPU and, where there is one, on a GPU."""
+    if request.param == "cuda" and not torch.cuda.is_available():
+        pytest.skip("torch finds no GPU")
+    if why := warp.why_not(request.param):
+        pytest.skip(why)
+    with torch.device(request.param):
+        yield
+
+
+def random_numbers(count: int, seed: int) -> Tensor:
+    return torch.rand(count, generator=torch.Generator("cpu").manual_seed(seed), device="cpu").to(torch.zeros(0).device)
+
+
 def wave_of(counts: tuple[int, ...], seed: int = 1) -> Samples:
-    random = torch.Generator().manual_seed(seed)
     starts = torch.tensor([0, *counts]).cumsum(0).int()
     ray = torch.repeat_interleave(torch.arange(len(counts)), starts.diff()).int()
-    dt = 0.05 + 0.1 * torch.rand(sum(counts), generator=random)
+    dt = 0.05 + 0.1 * random_numbers(sum(counts), seed)
     t = torch.cat([dt[:0], *(0.3 + part.cumsum(0) for part in dt.split(counts))])
     return Samples(starts, ray, t, dt)
 
@@ -41,7 +56,7 @@ def jitters(count: int) -> Tensor:
 @pytest.mark.parametrize("lattice", [BOUNDED, FOLDED])
 def test_rays_with_light_go_on_behind_their_last_sample(backend: Backend, lattice: Lattice) -> None:
     samples = wave_of(COUNTS)
-    sigma = torch.rand(len(samples.t), generator=torch.Generator().manual_seed(2))
+    sigma = random_numbers(len(samples.t), 2)
     sigma[samples.ray == 3] = 50.0  # which stops its light
     depth, near = ended(backend, lattice, samples, sigma, 0.2)
     for ray, count in enumerate(COUNTS):
@@ -50,6 +65,7 @@ def test_rays_with_light_go_on_behind_their_last_sample(backend: Backend, lattic
         if count < lattice.most_samples or ray == 3:
             assert near[ray] == 9
             continue
+        assert near[ray] < 9
         steps = lattice_coordinate(lattice, near[ray]) - lattice_coordinate(lattice, samples.t[mine][-1])
         assert float(steps) == pytest.approx(1 - float(jitters(len(COUNTS))[ray]), abs=1e-4)
     assert (near < 9).sum() == 3
@@ -58,7 +74,7 @@ def test_rays_with_light_go_on_behind_their_last_sample(backend: Backend, lattic
 @BACKENDS
 def test_the_light_decides_as_it_does_for_visible_samples(backend: Backend) -> None:
     """A ray goes on exactly if a sample behind its last one would be visible."""
-    samples, sigma = wave_of((4,) * 200), torch.rand(800, generator=torch.Generator().manual_seed(3))
+    samples, sigma = wave_of((4,) * 200), random_numbers(800, 3)
     depth, near = torch.zeros(200, dtype=torch.float64), torch.zeros(200)
     backend.end_wave(BOUNDED, samples, sigma, 0.8, jitters(200), torch.full((200,), 9.0), depth, near)
     more = wave_of((5,) * 200)
