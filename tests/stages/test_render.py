@@ -118,7 +118,7 @@ def test_frames_are_kept_and_depth_left_out_on_request(inputs, progress) -> None
 def test_plan_answers_every_open_question(inputs, progress) -> None:
     config = render.plan(render.Config(), inputs, progress)
     assert (config.path, config.frames, config.width, config.fps) == ("orbit", 6, 140, 2)
-    words = "30 k rays/s here: 6 frames 140×105 take about 3 s, training took 10 s"
+    words = "30 k rays/s here: 6 frames 140×104 take about 2.9 s, training took 10 s"
     assert progress.notes == [f"{words}; more would take too long, --render.frames and --render.width ask for it"]
     assert render.plan(config, inputs, progress) == config
     assert len(progress.notes) == 1
