@@ -81,7 +81,7 @@ def test_the_account_says_what_became_of_each_photo(reconstructed: Path) -> None
     # So few points say next to nothing about distortion: which of the two it is differs between processors.
     assert account["camera_model"] in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL")
     (chosen,) = (row for row in account["camera_models"] if row["chosen"])
-    assert (chosen["model"], chosen["photos"]) == (account["camera_model"], 12)
+    assert (chosen["model"], chosen["principal_point"], chosen["photos"]) == (account["camera_model"], "centred", 12)
     assert 0 < chosen["held_out_px"] < 1
     assert all(0 < image["uncertainty_px"] < 1 for image in account["images"])
     assert account["points"] == len(model.xyz) > 100
