@@ -1,5 +1,6 @@
 """From settings and photos to a training run that is ready for its first step, or its next one after a kill."""
 
+import math
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -26,7 +27,11 @@ DISTORTION = 2e-3
 # Weight at first of the loss at sparse points (docs/numbers.md; Deng et al. 2022 take 0.1, too, of another loss).
 DEPTH_LOSS = 0.1
 COARSEST = 16
-FEWEST_STEPS, MOST_STEPS = 256, 384  # along the diagonal of a bounded scene's box
+# Samples along a ray (docs/numbers.md): steps along the diagonal of a bounded scene's box at most, and, where space is
+# folded, steps in a finest cell and the distance from where steps grow in proportion to it.
+MOST_STEPS = 576
+STEPS_PER_CELL = 3
+EVEN_UNTIL = 0.25
 TABLE_COPIES = 6  # of the grids' features: themselves, their gradient, Adam's two moments, and twice in a checkpoint
 SAMPLE_BYTES = 4096  # that a sample of a grid field's step takes while it is computed
 ACTIVATIONS_PER_LAYER = 2  # numbers kept of each unit of the paper field for its gradient
@@ -157,21 +162,23 @@ def has_sky(config: "Config", scene: "Scene") -> bool:
 
 
 def grid_settings(config: "Config", sky: bool) -> "GridSettings":
-    """Sizes of the grid field. Samples stand as close as the finest cells can tell them apart: in folded space half a
-    cell (it is 4 wide), growing with the distance from where the cells do; in a box two steps to three cells."""
+    """Sizes of the grid field. Samples stand as close as the finest cells can tell them apart: in folded space a third
+    of a cell near the camera, growing with the distance, as pixels do; in a box a cell, or MOST_STEPS in all."""
     from nerf.grid_field import GridSettings
+    from nerf.kernels import CONTRACTED_BOX
 
     assert config.levels and config.log2_rows and config.finest, "plan() chooses them"
     assert config.contracted is not None and config.view_dependence is not None, "plan() takes them from stage effects"
+    shortest = 2 * CONTRACTED_BOX / (STEPS_PER_CELL * config.finest * config.ray_samples)
     return GridSettings(
         levels=config.levels,
         log2_rows=config.log2_rows,
         coarsest=min(COARSEST, config.finest),
         finest=config.finest,
         contracted=config.contracted,
-        steps=max(1, round(config.ray_samples * min(max(config.finest, FEWEST_STEPS), MOST_STEPS))),
-        shortest_step=2 / (config.ray_samples * config.finest),
-        cone=8 / (config.ray_samples * config.finest),
+        steps=max(1, round(config.ray_samples * min(math.sqrt(3) * config.finest, MOST_STEPS))),
+        shortest_step=shortest,
+        cone=shortest / EVEN_UNTIL,
         view_dependence=config.view_dependence,
         sky=sky,
     )

@@ -1,3 +1,4 @@
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -102,7 +103,7 @@ def test_grids_grow_with_rays_and_pixels(scene: Scene, rays: float, factor: floa
     assert 128 <= field.finest <= 1024
     # Two neighbouring samples lie in the same or in neighbouring cells of the finest grid, near the cameras at least.
     cells_per_step = field.lattice.step * field.finest / (4 if folded else 1.8)
-    assert 0.3 < cells_per_step < 5
+    assert cells_per_step == pytest.approx(1 / 3 if folded else max(1, math.sqrt(3) * field.finest / 576), rel=0.01)
 
 
 @pytest.mark.parametrize("contracted", [False, True])
