@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from pipeline import machine
 from pipeline.budget import STARTING, least_total
 from pipeline.settings import Settings
+from stages.contract import StageError
 from stages.live_line import duration
 from stages.matching_plan import about
 from stages.train import SECONDS
@@ -27,12 +28,15 @@ class Photos(NamedTuple):
 
 
 def photos_of(settings: Settings) -> Photos | None:
-    """What is to be seen of the photos without decoding any; None where they are gone."""
+    """What is to be seen of the photos without decoding any; None where they are gone or cannot be used."""
     from stages.sources import find_source
 
     if not settings.ingest.photos.exists():
         return None
-    source = find_source(settings.ingest.photos, settings.ingest.cameras)
+    try:
+        source = find_source(settings.ingest.photos, settings.ingest.cameras)
+    except StageError:  # ingest says what is wrong with them, where it has to run at all
+        return None
     if source.kind == "video":
         return Photos(VIDEO_FRAMES, 1.0)
     return Photos(len(source.files), _megapixels(source.files[len(source.files) // 2]))

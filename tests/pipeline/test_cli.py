@@ -239,6 +239,17 @@ def test_until_ingest_then_status_and_explain_and_clean(tmp_path: Path, capsys: 
     assert "0.0 MB in 0 folders" in capsys.readouterr().out
 
 
+def test_photos_that_are_taken_away_fail_their_own_stage(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    (tmp_path / "photos").mkdir()
+    for k in range(3):
+        Image.effect_noise((64, 48), 30 + k).convert("RGB").save(tmp_path / f"photos/{k}.png")
+    assert run_on(tmp_path / "photos", capsys, "--until", "ingest")[0] == 0
+    for photo in (tmp_path / "photos").iterdir():
+        photo.unlink()
+    assert run_command(["resume", str(tmp_path / "w.nerf")]) == 10
+    assert f"{tmp_path / 'photos'} is empty" in capsys.readouterr().err
+
+
 def test_status_of_no_workspace(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert run_command(["status", str(tmp_path)]) == 3
     assert "is not a workspace" in capsys.readouterr().err

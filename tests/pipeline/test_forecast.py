@@ -31,6 +31,8 @@ def test_photos_are_counted_and_measured_without_decoding(photos: Path) -> None:
     (photos / "2.png").write_bytes(b"not an image")
     assert photos_of(settings(photos)) == Photos(5, 2.0)
     assert photos_of(settings(photos / "gone")) is None
+    (photos / "empty").mkdir()
+    assert photos_of(settings(photos / "empty")) is None
     assert forecast.times(settings(photos / "gone")) == {}
 
 
