@@ -31,8 +31,6 @@ def photos_of(settings: Settings) -> Photos | None:
     """What is to be seen of the photos without decoding any; None where they are gone or cannot be used."""
     from stages.sources import find_source
 
-    if not settings.ingest.photos.exists():
-        return None
     try:
         source = find_source(settings.ingest.photos, settings.ingest.cameras)
     except StageError:  # ingest says what is wrong with them, where it has to run at all

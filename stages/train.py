@@ -49,8 +49,8 @@ PAPER_SIZES = {
 
 # At first; both fall while training. Where space is folded a cell is met from farther away, and rays are longer.
 GRID_RATES = {"bounded": 2e-2, "contracted": 1e-2}
-# Colours of a step. A box holds one object, before whatever is known to be behind it, and more of them even out what a
-# step learns; in folded space more steps are worth more than larger ones (docs/numbers.md).
+# Colours of a step, as measured: in a box larger steps go with its closer samples; in folded space they gained nothing
+# where there are many photos and lost where there are few (docs/numbers.md).
 GRID_SAMPLES = {"bounded": 3 << 13, "contracted": 1 << 14}
 
 GRID_ONLY = ("backend", "chunks", "levels", "log2_rows", "finest", "batch_samples", "ray_samples")
