@@ -8,6 +8,8 @@ from nerf.reconstruction import Reconstruction
 REGION_HALF = 0.9
 FEWEST_POINTS = 10  # fewer say nothing about a photo's depth range; all photos together then do
 NEAR_MARGIN = 0.7  # bare surfaces carry no points: the nearest thing may be nearer than the nearest point
+CLOSEST = 0.002  # quantile: what is nearer is a false match, not a surface
+MOST_POINTS = 20_000  # looked at per photo: the quantile of more is the same
 LEAST_NEAR = 0.05 * REGION_HALF  # for cameras in the region whose depths nobody knows
 BEYOND = 2.0  # a camera far from the region sees at least as far behind it as it is in front of it
 FARTHEST, LEAST_FAR = 1000.0, 20.0  # contraction maps these to 0.001 and 0.05 from the end of the world
@@ -17,9 +19,9 @@ def near_and_far(scene: Reconstruction, bounded: bool) -> tuple[Float[np.ndarray
     """Distances along the unit ray, 0 < near < far, per photo.
 
     Bounded: from where rays enter the region (or from the nearest points, from within it) to its farthest corner.
-    Unbounded: from 0.7 times the nearest points to four times the farthest, at least 20 and at most 1000 units,
-    which costs little because samples are spaced ever wider with distance; from far away at least to twice the region's
-    farthest corner.
+    Unbounded: from 0.7 times the nearest points in its field of view to four times the farthest, at least 20 and at most
+    1000 units, which costs little because samples are spaced ever wider with distance; from far away at least to twice
+    the region's farthest corner.
     """
     entry, exit_ = _distances_to_region(scene.centres)
     near, far = _points_range(scene)
@@ -40,7 +42,9 @@ def _distances_to_region(centres: Float[np.ndarray, "n 3"]) -> tuple[Float[np.nd
 def _points_range(scene: Reconstruction) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
     """(near with margin, farthest point) per photo; (nan, 0) where no points are known at all.
 
-    Quantiles of 0.2 % and 99.9 %; a near below a twentieth of the median distance is a false match, not a surface.
+    Quantiles of 0.2 % and 99.9 %; a near below a twentieth of the median distance is a false match, not a surface. What
+    other photos place in a photo's field of view counts for its near, too: matching may fail on the nearest thing in a
+    photo, and a near behind it cuts it out of the picture.
     """
     count = len(scene.from_camera)
     if not len(scene.point):
@@ -50,9 +54,21 @@ def _points_range(scene: Reconstruction) -> tuple[Float[np.ndarray, "n"], Float[
     for view in range(count):
         seen = distances[scene.view == view]
         seen = seen if len(seen) >= FEWEST_POINTS else distances
-        low, middle, high = np.quantile(seen, [0.002, 0.5, 0.999])
+        low, middle, high = np.quantile(seen, [CLOSEST, 0.5, 0.999])
+        before = _distances_in_field(scene, view)
+        if len(before) >= FEWEST_POINTS:
+            low = min(low, np.quantile(before, CLOSEST))
         near[view], far[view] = max(NEAR_MARGIN * low, 0.05 * middle), high
     return near, far
+
+
+def _distances_in_field(scene: Reconstruction, view: int) -> Float[np.ndarray, "points"]:
+    """Distances of the points in a photo's field of view, whichever photos see them."""
+    points = scene.points[:: -(-len(scene.points) // MOST_POINTS)]
+    local = (points - scene.centres[view]) @ scene.from_camera[view, :, :3]
+    angles, field = (np.arctan2(of[:, :2], of[:, 2:]) for of in (local, scene.bearings[view]))
+    inside = ((angles >= field.min(axis=0)) & (angles <= field.max(axis=0))).all(axis=1)
+    return np.linalg.norm(local[inside], axis=1)
 
 
 def range_between_views(

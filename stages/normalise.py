@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from stages.sparse_model import SparseModel
 
 NEEDS = ("ingest", "sfm")
-VERSION = 5
+VERSION = 6
 RESUMES = False
 LINKS = ("transforms.json", "scene.json")
 

@@ -122,6 +122,28 @@ def test_every_observed_point_but_outliers_lies_between_near_and_far(layout: str
     assert (found.near < 0.999 * found.far).all()
 
 
+@pytest.mark.parametrize("views", [1, 8])
+def test_near_lies_before_what_only_other_photos_have_points_of(views: int) -> None:
+    """The foremost part of a thing, on which matching fails in some photos: their near must not cut it off."""
+    scene = SCENES["around"]()
+    distance = scene.distances()
+    unmatched = (scene.view < views) & (distance < np.quantile(distance, 0.4))
+    found = normalise(dataclasses.replace(scene, view=scene.view[~unmatched], point=scene.point[~unmatched]), False, None)
+    assert (found.near[scene.view] < distance * found.scene_from_sfm.scale).mean() > 0.99
+    np.testing.assert_allclose(found.near[:views], normalise(scene, False, None).near[:views], rtol=0.1)
+
+
+def test_points_behind_or_beside_a_photo_say_nothing_of_its_near() -> None:
+    scene = SCENES["around"]()
+    centre, axis, right = scene.centres[0], scene.axes[0], scene.rights[0]
+    jitter = 0.01 * ball(50)
+    elsewhere = np.concatenate([centre - 0.5 * axis + jitter, centre + 0.5 * axis + 0.6 * right + jitter])
+    clean, found = (normalise(each, False, None) for each in (scene, with_points(scene, elsewhere, 0)))
+    np.testing.assert_allclose(found.near[0], clean.near[0], rtol=0.02)
+    inside = with_points(scene, centre + 0.5 * axis + jitter, 0)
+    assert normalise(inside, False, None).near[0] < 0.5 * clean.near[0]
+
+
 @pytest.mark.parametrize("has_alpha", [False, True])
 @pytest.mark.parametrize("away", [1.0, 30.0, 1e3, 1e6])
 def test_a_camera_anywhere_has_near_before_far_and_reaches_the_region(away: float, has_alpha: bool) -> None:
