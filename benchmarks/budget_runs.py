@@ -4,8 +4,8 @@ python -m benchmarks.budget_runs fox.nerf lego_400.nerf --runs runs.json
 python -m benchmarks.budget_runs fox.nerf --constant 0.2 --schedule more --runs runs.json
 
 A workspace needs its stages up to effects. A run that the file holds already is not made again. All runs of a set have
-one size of field and of photos, such that 500 steps draw every pixel about once, as stage train chooses it. Beside the
-field itself a running mean of its weights is measured, over the last tenth of the run (Karras et al. 2024, section
+one size of field and of photos, those that stage train chooses where 1,000 steps draw every pixel about once. Beside
+the field itself a running mean of its weights is measured, over the last tenth of the run (Karras et al. 2024, section
 3.1). benchmarks.prediction reads the file.
 """
 
@@ -34,12 +34,11 @@ from stages.files import read_json, read_scene
 from stages.train import Config, with_habits
 from stages.training_data import guided_bank, training_bank
 from stages.training_setup import field_background, make_trainer
-from stages.training_size import SAMPLES_PER_RAY
+from stages.training_size import chosen_downscale, grid_size, rays_per_step
 
-BUDGETS = (125, 250, 500, 1000)
-ONCE = 500  # steps that draw every pixel of the training photos once: it is their number that gives the photos' size
+BUDGETS = (125, 250, 500, 1000, 2000)
+ONCE = 1000  # steps that draw every pixel of the training photos once: it is their number that gives the photos' size
 CHUNKS = 2
-SAMPLES = 1 << 12
 PROBE_RAYS = 2048
 PER_DOUBLING = 2  # measurements
 FIRST = 32  # steps
@@ -74,24 +73,21 @@ def bench_of(workspace: Path) -> Bench:
     keys = read_json(workspace / "run.json")["keys"]
     inputs = {stage: workspace / stage / keys[stage][:16] for stage in ("ingest", "normalise", "effects")}
     scene, decisions = read_scene(inputs["normalise"]), read_decisions(inputs["effects"])
-    cameras = [scene.cameras[view.camera] for view in scene.of_split("train")]
-    rays = ONCE * SAMPLES / SAMPLES_PER_RAY["contracted" if decisions.unbounded else "bounded"]
-    config = Config(
-        field="grid",
-        contracted=decisions.unbounded,
-        view_dependence=decisions.view_dependence,
-        backend=chosen_backend(compute_device(), Quiet()),
-        chunks=CHUNKS,
-        batch_samples=SAMPLES,
-        downscale=max(1.0, math.sqrt(sum(camera.width * camera.height for camera in cameras) / rays)),
-        levels=4,
-        log2_rows=15,
-        finest=256,
+    config = with_habits(
+        Config(
+            field="grid",
+            contracted=decisions.unbounded,
+            view_dependence=decisions.view_dependence,
+            backend=chosen_backend(compute_device(), Quiet()),
+            chunks=CHUNKS,
+        )
     )
-    config = with_habits(config)
-    assert config.downscale is not None
-    train = guided_bank(inputs, scene, config.downscale, Quiet())
-    test = training_bank(inputs["ingest"], scene, "test", config.downscale, Quiet())
+    rays = ONCE * rays_per_step(config)
+    downscale = chosen_downscale(scene, rays)
+    config = config.model_copy(update={"downscale": downscale})
+    config = config.model_copy(update=grid_size(config, scene, rays))
+    train = guided_bank(inputs, scene, downscale, Quiet())
+    test = training_bank(inputs["ingest"], scene, "test", downscale, Quiet())
     shown_over = torch.tensor(field_background(config, scene))
     probe = make_probe(test, PROBE_RAYS, shown_over, seed=0)
     return Bench(config, scene, decisions, train, probe, told_by_neighbours(scene, scene.of_split("test")))

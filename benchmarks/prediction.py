@@ -9,6 +9,7 @@ nerf/learning_curve.py holds, and how curves compare across budgets and schedule
 
 import argparse
 import json
+from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 from statistics import mean
@@ -17,20 +18,46 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from nerf.grid_training import CONSTANT_SHARE
-from nerf.learning_curve import Curve, last_doubling
+from nerf.learning_curve import TYPICAL_STEPS, Curve, last_doubling
 
 SHARE = 0.8  # of the truths that an interval is to hold
+LEAST = 0.1  # dB: by as much two seeds differ
+SHARES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)  # of the last doubling, for the interval
 MEASURED = ("heldout_psnr", "mean_10")
 Run = dict[str, Any]
 
 
 class Case(NamedTuple):
-    """What the shorter run's curve tells, and by how much the longer one ended higher."""
+    """What the curve of a run of ``steps`` tells, and by how much the one of twice the steps ended higher."""
 
     name: str
     set: str
-    told: tuple[float, ...]
+    steps: int
+    last: float
+    gap: float
     reached: float
+
+
+Terms = Callable[[Case, float], list[float]]
+"""What a case's prediction is linear in, for an exponent that is fitted, too."""
+
+MODELS: dict[str, Terms] = {
+    "always the same": lambda case, _: [1.0],
+    "share of the last": lambda case, _: [case.last],
+    "line in the last": lambda case, _: [1.0, case.last],
+    "line, and the gap": lambda case, _: [1.0, case.last, case.gap],
+    "share, falling": lambda case, exponent: [case.last * (TYPICAL_STEPS / case.steps) ** exponent],
+}
+IN_USE = "share, falling"
+EXPONENTS = tuple(np.arange(0.0, 1.05, 0.05))
+
+
+class Fit(NamedTuple):
+    exponent: float
+    constants: np.ndarray
+
+    def of(self, case: Case, terms: Terms) -> float:
+        return float(np.array(terms(case, self.exponent)) @ self.constants)
 
 
 def curve_of(run: Run, measured: str = "heldout_psnr") -> Curve:
@@ -58,57 +85,73 @@ def cases_of(runs: list[Run]) -> list[Case]:
         assert last is not None, "runs are measured for more than a doubling"
         gap = short["points"][-1]["train_psnr"] - final(short)
         name = f"{short['set']} seed {short['seed']} {short['steps']} steps"
-        cases.append(Case(name, short["set"], (1.0, last, gap), final(long) - final(short)))
+        cases.append(Case(name, short["set"], short["steps"], last, gap, final(long) - final(short)))
     return cases
 
 
-def fitted(cases: list[Case], terms: list[int]) -> np.ndarray:
-    """Least squares on some of what is told."""
-    told = np.array([[case.told[i] for i in terms] for case in cases])
-    return np.linalg.lstsq(told, np.array([case.reached for case in cases]), rcond=None)[0]
+def fitted(cases: list[Case], terms: Terms) -> Fit:
+    """Least squares, for the exponent that leaves least."""
+
+    def squares(fit: Fit) -> float:
+        return sum((case.reached - fit.of(case, terms)) ** 2 for case in cases)
+
+    reached = np.array([case.reached for case in cases])
+    fits = []
+    for exponent in EXPONENTS:
+        told = np.array([terms(case, exponent) for case in cases])
+        fits.append(Fit(float(exponent), np.linalg.lstsq(told, reached, rcond=None)[0]))
+    return min(fits, key=squares)
 
 
-def predicted(case: Case, terms: list[int], constants: np.ndarray) -> float:
-    return float(np.array([case.told[i] for i in terms]) @ constants)
-
-
-def left_out(cases: list[Case], terms: list[int]) -> list[float]:
+def left_out(cases: list[Case], terms: Terms) -> list[float]:
     """Reached less predicted, of each case, by the constants of all other sets."""
-    residuals = []
-    for case in cases:
-        constants = fitted([other for other in cases if other.set != case.set], terms)
-        residuals.append(case.reached - predicted(case, terms, constants))
-    return residuals
+    fits = {one: fitted([case for case in cases if case.set != one], terms) for one in {case.set for case in cases}}
+    return [case.reached - fits[case.set].of(case, terms) for case in cases]
 
 
-def half_width(cases: list[Case], terms: list[int]) -> float:
-    """Half the interval that holds SHARE of the truths, judged by sets that the constants do not come from."""
-    return float(np.quantile(np.abs(left_out(cases, terms)), SHARE))
+class Width(NamedTuple):
+    """Half the interval around a prediction: ``least``, and a share of what the last doubling gained."""
+
+    least: float
+    share: float
+
+    def of(self, case: Case) -> float:
+        return self.least + self.share * max(case.last, 0.0)
 
 
-def score(cases: list[Case], terms: list[int]) -> list[tuple[Case, float, float]]:
+def width(cases: list[Case], terms: Terms) -> Width:
+    """The narrowest on average that holds SHARE of the truths, judged by sets that the constants do not come from."""
+    off = np.abs(left_out(cases, terms))
+    gained = np.array([max(case.last, 0.0) for case in cases])
+    tried = [Width(max(float(np.quantile(off - share * gained, SHARE)), LEAST), share) for share in SHARES]
+    return min(tried, key=lambda found: found.least + found.share * gained.mean())
+
+
+def score(cases: list[Case], terms: Terms) -> list[tuple[Case, float, float]]:
     """Each case with what is predicted of it and the half width, both without any run of its own set."""
     rows = []
     for case in cases:
         others = [other for other in cases if other.set != case.set]
-        rows.append((case, predicted(case, terms, fitted(others, terms)), half_width(others, terms)))
+        rows.append((case, fitted(others, terms).of(case, terms), width(others, terms).of(case)))
     return rows
 
 
 def print_scores(cases: list[Case]) -> None:
-    models = {"constant": [0], "share of the last": [1], "line in the last": [0, 1], "line, and the gap": [0, 1, 2]}
-    for name, terms in models.items():
+    for name, terms in MODELS.items():
         rows = score(cases, terms)
         covered = mean(abs(case.reached - guess) <= half for case, guess, half in rows)
         rms = mean((case.reached - guess) ** 2 for case, guess, _ in rows) ** 0.5
         print(f"{name:<18} rms {rms:.2f} dB, covered {covered:.0%}, half width {mean(r[2] for r in rows):.2f}")
-    terms = models["line in the last"]
+    terms = MODELS[IN_USE]
     print("\n| case | last doubling | predicted | reached | |\n|---|---|---|---|---|")
     for case, guess, half in score(cases, terms):
         inside = "" if abs(case.reached - guess) <= half else "outside"
-        print(f"| {case.name} | {case.told[1]:+.2f} | {guess:+.2f} ± {half:.2f} | {case.reached:+.2f} | {inside} |")
-    constants = ", ".join(f"{value:.3f}" for value in fitted(cases, terms))
-    print(f"\n{len(cases)} cases; of all of them: {constants}, ± {half_width(cases, terms):.2f}")
+        print(f"| {case.name} | {case.last:+.2f} | {guess:+.2f} ± {half:.2f} | {case.reached:+.2f} | {inside} |")
+    fit = fitted(cases, terms)
+    found = width(cases, terms)
+    print(
+        f"\n{len(cases)} cases; of all: {fit.constants} at an exponent of {fit.exponent:.2f}, ± {found.least:.2f} + {found.share:.2f} × the last doubling"
+    )
 
 
 def print_schedules(runs: list[Run]) -> None:

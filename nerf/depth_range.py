@@ -19,9 +19,9 @@ def near_and_far(scene: Reconstruction, bounded: bool) -> tuple[Float[np.ndarray
     """Distances along the unit ray, 0 < near < far, per photo.
 
     Bounded: from where rays enter the region (or from the nearest points, from within it) to its farthest corner.
-    Unbounded: from 0.7 times the nearest points in its field of view to four times the farthest, at least 20 and at most
-    1000 units, which costs little because samples are spaced ever wider with distance; from far away at least to twice
-    the region's farthest corner.
+    Unbounded: from 0.7 times the nearest points in its field of view to four times the farthest, at least 20 and at
+    most 1000 units, which costs little because samples are spaced ever wider with distance; from far away at least to
+    twice the region's farthest corner.
     """
     entry, exit_ = _distances_to_region(scene.centres)
     near, far = _points_range(scene)

@@ -52,13 +52,20 @@ def knee(curve: Curve) -> float | None:
     return found
 
 
-# Least squares over 33 pairs of runs of T and 2 T steps, six sets (docs/numbers.md): what a run gained from half of its
+# Least squares over 52 pairs of runs of T and 2 T steps, seven sets (docs/numbers.md): what a run gained from half of its
 # time to its end, annealing included, against what a run of twice the time ends higher.
-NEXT_OF_LAST = 1.19
-NEXT_HALF_WIDTH = 1.0  # dB: held 28 of the 33, each judged by constants of the other sets
+NEXT_OF_LAST = 0.7  # at so many steps; of other runs' last doubling another share:
+TYPICAL_STEPS = 1000
+NEXT_EXPONENT = 0.4  # in fog doublings buy more and more, later less and less
+NEXT_HALF_WIDTH = 0.1, 0.4  # dB, and the share of the last doubling: held four of five, each judged by other sets
 
 
-def next_doubling(curve: Curve) -> Gain | None:
-    """What a run of twice the time is predicted to end higher than this one; None as :func:`last_doubling`."""
+def next_doubling(curve: Curve, steps: int) -> Gain | None:
+    """What a run of twice the time is predicted to end higher than this one, of ``steps``; None as
+    :func:`last_doubling`. Measured of the grid field."""
     last = last_doubling(curve)
-    return None if last is None else Gain(NEXT_OF_LAST * last, NEXT_HALF_WIDTH)
+    if last is None:
+        return None
+    least, share = NEXT_HALF_WIDTH
+    fall = (TYPICAL_STEPS / steps) ** NEXT_EXPONENT
+    return Gain(NEXT_OF_LAST * fall * last, least + share * max(last, 0.0))

@@ -6,10 +6,13 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from stages.files import write_json
 from stages.live_line import duration
+
+if TYPE_CHECKING:
+    from nerf.learning_curve import Gain
 
 BARS = "▁▂▃▄▅▆▇█"
 SPARK_WIDTH = 10
@@ -28,12 +31,19 @@ def heldout_curve(points: Sequence[dict[str, Any]]) -> list[tuple[float, float]]
     return [(seconds, psnr) for seconds, psnr in known if psnr is not None and seconds > 0]
 
 
+def coming_doubling(points: Sequence[dict[str, Any]]) -> "Gain | None":
+    """What the next doubling of the time is predicted to buy; None where the curve is too short."""
+    from nerf.learning_curve import next_doubling
+
+    return next_doubling(heldout_curve(points), points[-1]["step"]) if points else None
+
+
 def doubling_words(points: Sequence[dict[str, Any]]) -> str | None:
     """What the last doubling of the time bought and the next is predicted to buy; None where the curve is too short."""
-    from nerf.learning_curve import last_doubling, next_doubling
+    from nerf.learning_curve import last_doubling
 
     curve = heldout_curve(points)
-    last, coming = last_doubling(curve), next_doubling(curve)
+    last, coming = last_doubling(curve), coming_doubling(points)
     if last is None:
         return None
     words = f"the last doubling of time, to {duration(curve[-1][0])}, bought {last:+.1f} dB on held-out photos"
@@ -44,9 +54,7 @@ def doubling_words(points: Sequence[dict[str, Any]]) -> str | None:
 
 def next_words(points: Sequence[dict[str, Any]]) -> str | None:
     """:func:`doubling_words` for a line that has no room."""
-    from nerf.learning_curve import next_doubling
-
-    coming = next_doubling(heldout_curve(points))
+    coming = coming_doubling(points)
     return coming and f"the next doubling buys {coming.db:+.1f} ± {coming.half_width:.1f} dB"
 
 

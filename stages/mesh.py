@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from stages.mesh_views import ShadowMap
 
 NEEDS = ("normalise", "train")
-VERSION = 2
+VERSION = 3
 RESUMES = False
 LINKS = ("mesh.glb", "mesh.ply", "mesh.obj")
 UNKEYED = ("seconds",)  # it decides the resolution, and that enters the key

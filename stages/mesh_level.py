@@ -68,7 +68,8 @@ def choose_level(lattice: "Lattice", model: "RadianceModel", rays: "Rays") -> Le
     """The density whose surface in ``lattice`` lies closest to where ``rays`` lose half of their light in ``model``."""
     import torch
 
-    from nerf.lattice import along, box_interval, first_crossing, occupancy, ray_distances
+    from nerf.lattice import along, box_interval, first_crossing, ray_distances
+    from stages.mesh_surface import solidity
 
     inside = box_interval(rays, lattice.low, lattice.high)
     inside = type(rays)(*(part[inside.far > inside.near] for part in inside))
@@ -82,7 +83,7 @@ def choose_level(lattice: "Lattice", model: "RadianceModel", rays: "Rays") -> Le
     peaks = peak[stopped].median() * torch.logspace(-2.5, 0.5, LEVELS, device=peak.device)
     candidates = peaks.clamp(low + margin, high - margin).tolist()
     voxel = float(lattice.spacing().max())
-    surfaces = (first_crossing(along(occupancy(lattice, level), inside, t), t, 0.5) for level in candidates)
+    surfaces = (first_crossing(along(solidity(lattice, level), inside, t), t, 0.5) for level in candidates)
     misses = [_miss(surface, stop, voxel) for surface in surfaces]
     best = min(range(LEVELS), key=misses.__getitem__)
     reason = (

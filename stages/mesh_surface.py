@@ -12,11 +12,23 @@ if TYPE_CHECKING:
     from nerf.lattice import Lattice
 
 
+# Passes of nerf.lattice.smoothed: a Gaussian of a lattice point's distance. The field's finest cells are about as
+# small, and what differs between two of them is noise that a lattice would pick at random (docs/numbers.md).
+SMOOTHING = 2
+
+
 class Surface(NamedTuple):
     """An indexed triangle mesh."""
 
     vertices: np.ndarray
     faces: np.ndarray
+
+
+def solidity(lattice: "Lattice", level: float) -> "Lattice":
+    """What passes 1/2 at the surface of density ``level``: the occupancy, less what is finer than the lattice."""
+    from nerf.lattice import occupancy, smoothed
+
+    return smoothed(occupancy(lattice, level), SMOOTHING)
 
 
 def extract(lattice: "Lattice", level: float) -> Surface:
@@ -26,9 +38,7 @@ def extract(lattice: "Lattice", level: float) -> Surface:
     """
     from skimage.measure import marching_cubes
 
-    from nerf.lattice import occupancy
-
-    values = occupancy(lattice, level).values.cpu().numpy()
+    values = solidity(lattice, level).values.cpu().numpy()
     index, faces, _, _ = marching_cubes(values, 0.5, gradient_direction="ascent")
     vertices = lattice.low.cpu().double().numpy() + index * lattice.spacing().cpu().double().numpy()
     return Surface(vertices, faces.astype(np.int32))

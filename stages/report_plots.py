@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from stages.curve import heldout_curve
+from stages.curve import coming_doubling, heldout_curve
 from stages.live_line import duration
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ def curve_svg(points: Sequence[dict[str, Any]], baselines: dict[str, float | Non
             if seen:
                 axes.plot(*zip(*seen, strict=True), color=colour, lw=2, marker="o", ms=3, label=label)
         _draw_baselines(axes, {name: psnr for name, psnr in baselines.items() if psnr is not None})
-        last = rows[-1]["seconds"] * (2 if _draw_prediction(axes, heldout_curve(rows)) else 1)
+        last = rows[-1]["seconds"] * (2 if _draw_prediction(axes, rows) else 1)
         _draw_knee(axes, heldout_curve(rows))
         _doubling_axis(axes, rows[0]["seconds"], rows[-1]["seconds"], last)
         axes.set(xlabel="training time", ylabel="PSNR (dB)")
@@ -45,14 +45,12 @@ def curve_svg(points: Sequence[dict[str, Any]], baselines: dict[str, float | Non
         return svg_element(figure)
 
 
-def _draw_prediction(axes: "Axes", curve: Sequence[tuple[float, float]]) -> bool:
+def _draw_prediction(axes: "Axes", rows: Sequence[dict[str, Any]]) -> bool:
     """A dotted line on to twice the time, with its interval; False where nothing is predicted."""
-    from nerf.learning_curve import next_doubling
-
-    coming = next_doubling(curve)
+    coming = coming_doubling(rows)
     if coming is None:
         return False
-    (seconds, psnr), style = curve[-1], {"color": BLUE, "lw": 1.5, "ls": (0, (1, 1.5))}
+    (seconds, psnr), style = heldout_curve(rows)[-1], {"color": BLUE, "lw": 1.5, "ls": (0, (1, 1.5))}
     axes.plot([seconds, 2 * seconds], [psnr, psnr + coming.db], label="predicted", **style)
     axes.errorbar(2 * seconds, psnr + coming.db, coming.half_width, color=BLUE, capsize=4, lw=1.5)
     return True

@@ -164,6 +164,11 @@ class Config(StageConfig):
         """The field that these options ask for."""
         return self.field or ("paper" if self.preset == "paper" or self._given(PAPER_ONLY) else "grid")
 
+    @property
+    def space(self) -> Literal["bounded", "contracted"]:
+        """Which of the measured constants count."""
+        return "contracted" if self.contracted else "bounded"
+
     def _given(self, names: tuple[str, ...]) -> list[str]:
         """Which of these options differ from their defaults, with their values."""
         values = {name: getattr(self, name) for name in names}
@@ -207,11 +212,10 @@ def with_habits(config: Config) -> Config:
 
 
 def _grid_habits(config: Config) -> dict[str, Any]:
-    space = "contracted" if config.contracted else "bounded"
     return {
         "background": "random",
-        "learning_rate": GRID_RATES[space],
-        "batch_samples": GRID_SAMPLES[space],
+        "learning_rate": GRID_RATES[config.space],
+        "batch_samples": GRID_SAMPLES[config.space],
     }
 
 

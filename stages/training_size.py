@@ -49,8 +49,8 @@ def grid_size(config: "Config", scene: "Scene", rays: float) -> dict[str, int]:
     from nerf.kernels import BOX, CONTRACTED_BOX
 
     assert config.downscale is not None
-    samples = rays * SAMPLES_PER_RAY[_space(config)]
-    levels, log2_rows, most = next(sizes for least, *sizes in GRID_SIZES[_space(config)] if samples >= least)
+    samples = rays * SAMPLES_PER_RAY[config.space]
+    levels, log2_rows, most = next(sizes for least, *sizes in GRID_SIZES[config.space] if samples >= least)
     cameras = [scene.cameras[view.camera] for view in scene.of_split("train")]
     pixels = max(max(camera.width, camera.height) for camera in cameras) / config.downscale
     across = pixels * (CONTRACTED_BOX / BOX if config.contracted else 1)
@@ -101,11 +101,7 @@ def rays_per_step(config: "Config") -> float:
         assert config.batch_rays is not None
         return config.batch_rays
     assert config.batch_samples is not None
-    return config.batch_samples / SAMPLES_PER_RAY[_space(config)]
-
-
-def _space(config: "Config") -> str:
-    return "contracted" if config.contracted else "bounded"
+    return config.batch_samples / SAMPLES_PER_RAY[config.space]
 
 
 def _grey_bank(scene: "Scene") -> "RayBank":

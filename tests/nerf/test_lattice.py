@@ -16,6 +16,7 @@ from nerf.lattice import (
     occupancy,
     optical_depth,
     ray_distances,
+    smoothed,
     stopping_distance,
     trilinear,
 )
@@ -153,3 +154,22 @@ def test_what_rays_meet_is_what_lies_there():
     t = ray_distances(rays, 12)
     points = rays.origins[:, None] + t[..., None] * rays.directions[:, None]
     torch.testing.assert_close(along(lattice, rays, t)[:, 1:-1], linear(points)[:, 1:-1], atol=1e-4, rtol=0)
+
+
+def test_smoothing_averages_neighbours_and_takes_what_is_beyond_the_box_for_its_side():
+    values = torch.zeros(5, 4, 3)
+    values[2, 0, 1] = 1.0
+    once = smoothed(Lattice(values, LOW, HIGH), 1).values
+    assert float(once[2, 0, 1]) == 0.5 * 0.75 * 0.5 and float(once[1, 1, 2]) == 0.25**3
+    assert float(smoothed(Lattice(torch.full((3, 4, 5), 0.3), LOW, HIGH), 3).values.std()) < 1e-7
+    assert torch.equal(smoothed(Lattice(values, LOW, HIGH), 0).values, values)
+
+
+def test_smoothing_is_a_gaussian_of_the_passes_and_leaves_a_step_where_it_is():
+    line = (torch.arange(40) >= 20).double().expand(3, 3, 40)
+    smooth = smoothed(Lattice(line, LOW, HIGH), 2).values[1, 1]
+    slope = smooth.diff()
+    places = torch.arange(39) + 0.5
+    middle = float((slope * places).sum())
+    assert middle == pytest.approx(19.5) and float(smooth[19] + smooth[20]) == pytest.approx(1.0)
+    assert float((slope * (places - middle) ** 2).sum()) == pytest.approx(1.0)

@@ -40,7 +40,7 @@ def test_the_last_doubling_does_not_know_the_unit_of_time(per_doubling: float, u
 
 @pytest.mark.parametrize("curve", [[], [(1.0, 20.0)], [(1.0, 20.0), (1.9, 21.0)]])
 def test_a_short_curve_tells_nothing(curve: list[tuple[float, float]]):
-    assert last_doubling(curve) is None and next_doubling(curve) is None and knee(curve) is None
+    assert last_doubling(curve) is None and next_doubling(curve, 1000) is None and knee(curve) is None
 
 
 def test_the_knee_is_where_doublings_begin_to_buy_little():
@@ -60,3 +60,17 @@ def test_a_flat_curve_is_all_knee():
 def test_a_late_rise_undoes_a_knee():
     flat_then_steep = [(1.0, 20.0), (2.0, 20.1), (4.0, 20.2), (8.0, 22.0)]
     assert knee(flat_then_steep) is None
+
+
+@given(st.floats(0.1, 4), st.integers(1, 100_000))
+def test_the_next_doubling_buys_a_share_of_the_last_that_falls_with_the_steps(last: float, steps: int):
+    coming, later = (next_doubling(straight(last), count) for count in (steps, 2 * steps))
+    assert coming is not None and later is not None
+    assert coming.db > later.db > 0
+    assert coming.half_width == later.half_width > 0
+
+
+def test_a_curve_that_falls_goes_on_falling_and_is_no_surer_for_it():
+    coming, flat = (next_doubling(straight(last), 1000) for last in (-1.0, 0.0))
+    assert coming is not None and flat is not None
+    assert coming.db < flat.db == 0 and coming.half_width == flat.half_width > 0

@@ -128,7 +128,8 @@ def test_near_lies_before_what_only_other_photos_have_points_of(views: int) -> N
     scene = SCENES["around"]()
     distance = scene.distances()
     unmatched = (scene.view < views) & (distance < np.quantile(distance, 0.4))
-    found = normalise(dataclasses.replace(scene, view=scene.view[~unmatched], point=scene.point[~unmatched]), False, None)
+    matched = dataclasses.replace(scene, view=scene.view[~unmatched], point=scene.point[~unmatched])
+    found = normalise(matched, False, None)
     assert (found.near[scene.view] < distance * found.scene_from_sfm.scale).mean() > 0.99
     np.testing.assert_allclose(found.near[:views], normalise(scene, False, None).near[:views], rtol=0.1)
 
