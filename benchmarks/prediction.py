@@ -18,11 +18,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from nerf.grid_training import CONSTANT_SHARE
-from nerf.learning_curve import TYPICAL_STEPS, Curve, last_doubling
+from nerf.learning_curve import FEWEST_STEPS, TYPICAL_STEPS, Curve, last_doubling
 
 SHARE = 0.8  # of the truths that an interval is to hold
 LEAST = 0.1  # dB: by as much two seeds differ
-SHARES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)  # of the last doubling, for the interval
+SHARES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)  # of what is predicted, for the interval
 MEASURED = ("heldout_psnr", "mean_10")
 Run = dict[str, Any]
 
@@ -75,10 +75,12 @@ def in_use(run: Run) -> bool:
 
 
 def cases_of(runs: list[Run]) -> list[Case]:
-    """Consecutive budgets of one set and seed."""
+    """Consecutive budgets of one set and seed, of those long enough to predict anything."""
     whole = sorted(filter(in_use, runs), key=lambda run: (run["set"], run["seed"], run["steps"]))
     cases = []
     for short, long in pairwise(whole):
+        if short["steps"] < FEWEST_STEPS:
+            continue
         if (short["set"], short["seed"], 2 * short["steps"]) != (long["set"], long["seed"], long["steps"]):
             continue
         last = last_doubling(curve_of(short))
@@ -110,21 +112,22 @@ def left_out(cases: list[Case], terms: Terms) -> list[float]:
 
 
 class Width(NamedTuple):
-    """Half the interval around a prediction: ``least``, and a share of what the last doubling gained."""
+    """Half the interval around a prediction: ``least``, and a share of what is predicted."""
 
     least: float
     share: float
 
-    def of(self, case: Case) -> float:
-        return self.least + self.share * max(case.last, 0.0)
+    def of(self, guess: float) -> float:
+        return self.least + self.share * max(guess, 0.0)
 
 
 def width(cases: list[Case], terms: Terms) -> Width:
     """The narrowest on average that holds SHARE of the truths, judged by sets that the constants do not come from."""
     off = np.abs(left_out(cases, terms))
-    gained = np.array([max(case.last, 0.0) for case in cases])
-    tried = [Width(max(float(np.quantile(off - share * gained, SHARE)), LEAST), share) for share in SHARES]
-    return min(tried, key=lambda found: found.least + found.share * gained.mean())
+    fit = fitted(cases, terms)
+    gains = np.array([max(fit.of(case, terms), 0.0) for case in cases])
+    tried = [Width(max(float(np.quantile(off - share * gains, SHARE)), LEAST), share) for share in SHARES]
+    return min(tried, key=lambda found: found.least + found.share * gains.mean())
 
 
 def score(cases: list[Case], terms: Terms) -> list[tuple[Case, float, float]]:
@@ -132,7 +135,8 @@ def score(cases: list[Case], terms: Terms) -> list[tuple[Case, float, float]]:
     rows = []
     for case in cases:
         others = [other for other in cases if other.set != case.set]
-        rows.append((case, fitted(others, terms).of(case, terms), width(others, terms).of(case)))
+        guess = fitted(others, terms).of(case, terms)
+        rows.append((case, guess, width(others, terms).of(guess)))
     return rows
 
 
@@ -149,9 +153,9 @@ def print_scores(cases: list[Case]) -> None:
         print(f"| {case.name} | {case.last:+.2f} | {guess:+.2f} ± {half:.2f} | {case.reached:+.2f} | {inside} |")
     fit = fitted(cases, terms)
     found = width(cases, terms)
-    print(
-        f"\n{len(cases)} cases; of all: {fit.constants} at an exponent of {fit.exponent:.2f}, ± {found.least:.2f} + {found.share:.2f} × the last doubling"
-    )
+    constants = ", ".join(f"{value:.3f}" for value in fit.constants)
+    print(f"\n{len(cases)} cases; of all: {constants} at an exponent of {fit.exponent:.2f},")
+    print(f"± {found.least:.2f} and {found.share:.2f} of what is predicted")
 
 
 def print_schedules(runs: list[Run]) -> None:

@@ -8,8 +8,7 @@ from nerf.reconstruction import Reconstruction
 REGION_HALF = 0.9
 FEWEST_POINTS = 10  # fewer say nothing about a photo's depth range; all photos together then do
 NEAR_MARGIN = 0.7  # bare surfaces carry no points: the nearest thing may be nearer than the nearest point
-CLOSEST = 0.002  # quantile: what is nearer is a false match, not a surface
-MOST_POINTS = 20_000  # looked at per photo: the quantile of more is the same
+SURE_VIEWS = 3  # photos that see a point which is no false match
 LEAST_NEAR = 0.05 * REGION_HALF  # for cameras in the region whose depths nobody knows
 BEYOND = 2.0  # a camera far from the region sees at least as far behind it as it is in front of it
 FARTHEST, LEAST_FAR = 1000.0, 20.0  # contraction maps these to 0.001 and 0.05 from the end of the world
@@ -28,7 +27,7 @@ def near_and_far(scene: Reconstruction, bounded: bool) -> tuple[Float[np.ndarray
     # cameras that are inside the region and see no points still need a positive near
     near = np.where(np.isfinite(near), near, np.maximum(entry, LEAST_NEAR))
     if bounded:
-        return np.maximum(entry, np.minimum(near, 0.5 * exit_)), exit_
+        return np.where(entry > LEAST_NEAR, entry, np.minimum(near, 0.5 * exit_)), exit_
     far = np.maximum(np.clip(4 * far, LEAST_FAR, FARTHEST), BEYOND * exit_)
     return np.minimum(near, 0.5 * far), far
 
@@ -42,33 +41,43 @@ def _distances_to_region(centres: Float[np.ndarray, "n 3"]) -> tuple[Float[np.nd
 def _points_range(scene: Reconstruction) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
     """(near with margin, farthest point) per photo; (nan, 0) where no points are known at all.
 
-    Quantiles of 0.2 % and 99.9 %; a near below a twentieth of the median distance is a false match, not a surface. What
-    other photos place in a photo's field of view counts for its near, too: matching may fail on the nearest thing in a
-    photo, and a near behind it cuts it out of the picture.
+    Quantiles of 0.2 % and 99.9 % of what a photo sees; alone, a near below a twentieth of the median distance is a
+    false match, not a surface. What other photos place in its field of view counts, too: matching may fail on the
+    nearest or the farthest thing in a photo, and beyond its near and far it would be cut out of the picture.
     """
     count = len(scene.from_camera)
     if not len(scene.point):
         return np.full(count, np.nan), np.zeros(count)
     distances = scene.distances()
+    sure = scene.points[np.bincount(scene.point, minlength=len(scene.points)) >= SURE_VIEWS]
     near, far = np.empty(count), np.empty(count)
     for view in range(count):
         seen = distances[scene.view == view]
         seen = seen if len(seen) >= FEWEST_POINTS else distances
-        low, middle, high = np.quantile(seen, [CLOSEST, 0.5, 0.999])
-        before = _distances_in_field(scene, view)
-        if len(before) >= FEWEST_POINTS:
-            low = min(low, np.quantile(before, CLOSEST))
-        near[view], far[view] = max(NEAR_MARGIN * low, 0.05 * middle), high
+        low, middle, high = np.quantile(seen, [0.002, 0.5, 0.999])
+        low = max(low, 0.05 / NEAR_MARGIN * middle)
+        low, high = _widened(scene, view, sure, low, high)
+        near[view], far[view] = NEAR_MARGIN * low, high
     return near, far
 
 
-def _distances_in_field(scene: Reconstruction, view: int) -> Float[np.ndarray, "points"]:
-    """Distances of the points in a photo's field of view, whichever photos see them."""
-    points = scene.points[:: -(-len(scene.points) // MOST_POINTS)]
-    local = (points - scene.centres[view]) @ scene.from_camera[view, :, :3]
+def _widened(
+    scene: Reconstruction, view: int, points: Float[np.ndarray, "n 3"], low: float, high: float
+) -> tuple[float, float]:
+    """The range of distances, widened on either side as far as FEWEST_POINTS points in a photo's field of view go."""
+    offset = points - scene.centres[view]
+    distance = np.linalg.norm(offset, axis=1)
+    beyond = (distance < low) | (distance > high)
+    local = offset[beyond] @ scene.from_camera[view, :, :3]
     angles, field = (np.arctan2(of[:, :2], of[:, 2:]) for of in (local, scene.bearings[view]))
     inside = ((angles >= field.min(axis=0)) & (angles <= field.max(axis=0))).all(axis=1)
-    return np.linalg.norm(local[inside], axis=1)
+    distance = np.sort(distance[beyond][inside])
+    nearer, farther = distance[distance < low], distance[distance > high]
+    if len(nearer) >= FEWEST_POINTS:
+        low = float(nearer[FEWEST_POINTS - 1])
+    if len(farther) >= FEWEST_POINTS:
+        high = float(farther[-FEWEST_POINTS])
+    return low, high
 
 
 def range_between_views(

@@ -18,7 +18,8 @@ NEAREST = 1e-6  # of the usual distance: a line hit exactly would weigh infinite
 class Reconstruction:
     """Posed photos and sparse points in one common frame.
 
-    ``bearings`` are unit vectors in the camera frame, sampled over each photo's whole field of view (the frustum);
+    ``bearings`` are unit vectors in the camera frame, sampled over each photo's whole field of view (the frustum), or,
+    where alpha tells, over the rectangle that holds all that is not background;
     observation j says that photo ``view[j]`` sees point ``point[j]``. There may be no points at all.
     """
 

@@ -53,10 +53,14 @@ def find_region(scene: Reconstruction, layout: Layout, has_alpha: bool) -> Regio
 
     around: centred on the focus, holding 95 % of the observed points but not reaching beyond the cameras;
     forward: the photos' frusta between the nearest and farthest observed depths; inside: the observed points and the
-    cameras, up to twice the usual viewing distance. Photos with alpha show nothing but the object: it is held whole.
+    cameras, up to twice the usual viewing distance. Photos with alpha show nothing but the object: it is
+    held whole.
     Raises ValueError when the cameras stand in one place and there are no points to give a scale.
     """
-    cube = {"around": _around, "forward": _forward, "inside": _inside}[layout](scene)
+    if layout == "around" and has_alpha:
+        cube = _opaque(scene)
+    else:
+        cube = {"around": _around, "forward": _forward, "inside": _inside}[layout](scene)
     if not cube.half > 0:
         raise ValueError("all cameras stand in one place and no point is known")
     return _grown(cube, scene, has_alpha)
@@ -97,6 +101,14 @@ def _around(scene: Reconstruction) -> Region:
         return Region(centre, width)
     half = float(np.quantile(_reach(scene, centre), CORE))
     return Region(centre, min(max(half, LEAST_WIDTH * width), distance))
+
+
+def _opaque(scene: Reconstruction) -> Region:
+    """What holds all that is opaque in any photo, bare or textured: with alpha, bearings reach no farther."""
+    centre = focus(scene)
+    distance = np.linalg.norm(scene.centres - centre, axis=1)
+    reach = (distance * _half_widths(scene))[_near_by(scene)].max()
+    return Region(centre, float(min(reach, np.median(distance))))
 
 
 def _half_widths(scene: Reconstruction) -> Float[np.ndarray, "n"]:

@@ -34,8 +34,8 @@ from stages.ingest_words import (
     too_few,
 )
 from stages.masks import pair_masks, read_mask
-from stages.near_duplicates import near_duplicates, thumbnail
-from stages.photos import Photo, Refusal, write_photos
+from stages.near_duplicates import near_duplicates, small, thumbnail
+from stages.photos import Box, Photo, Refusal, opaque_box, write_photos
 from stages.sharpness import one_colour, relative_sharpness, sharpness
 from stages.sources import Source, find_source
 from stages.video_frames import FEWEST_FRAMES, take_frames
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     import numpy as np
 
 NEEDS: tuple[str, ...] = ()
-VERSION = 4
+VERSION = 5
 RESUMES = False
 LINKS = ("photos.json", "images", "masks")
 
@@ -66,10 +66,12 @@ class Config(StageConfig):
 
 @dataclass(frozen=True)
 class _TakenMask:
-    """A mask that waits in ``waiting``, the share of pixels that it ignores, and what was done to make it fit."""
+    """A mask that waits in ``waiting``, the share of pixels that it ignores, itself made as small as the photo's
+    thumbnail, and what was done to make it fit."""
 
     waiting: Path
     ignored: float
+    thumbnail: "np.ndarray"
     turned: bool
     resized: bool
 
@@ -92,6 +94,7 @@ class _Taken:
     mask: _TakenMask | None = None
     digest: bytes = b""  # of size and pixels
     thumbnail: "np.ndarray | None" = None
+    opaque: Box | None = None
     notes: tuple[str, ...] = ()
 
     @property
@@ -229,7 +232,8 @@ def _take(file: Path, name: str, mask: Path | None, waiting: Path) -> _Taken | R
         exposure_ev=decoded.exposure_ev,
         mask=taken_mask,
         digest=hashlib.blake2b(str(pixels.shape).encode() + pixels.data, digest_size=16).digest(),
-        thumbnail=thumbnail(pixels),
+        thumbnail=thumbnail(pixels, taken_mask.thumbnail if taken_mask else None),
+        opaque=opaque_box(pixels),
         notes=decoded.notes,
     )
 
@@ -241,7 +245,7 @@ def _take_mask(file: Path, photo: CameraKey, waiting: Path) -> _TakenMask | None
     if not ignored:
         return None
     write_png(waiting, mask.pixels)
-    return _TakenMask(waiting, ignored, mask.turned, mask.resized)
+    return _TakenMask(waiting, ignored, small(mask.pixels), mask.turned, mask.resized)
 
 
 def _without_duplicates(taken: Sequence[_Taken]) -> tuple[list[_Taken], list[Refusal]]:
@@ -285,6 +289,8 @@ def _store(taken: Sequence[_Taken], same: Mapping[str, str], folder: Path) -> li
                 focal_px=photo.camera_key.focal_px,
                 focal_source=photo.focal_source,
                 has_alpha=photo.has_alpha,
+                opaque=photo.opaque,
+                used_share=1 - photo.mask.ignored if photo.mask else 1.0,
                 sharpness=photo.sharpness,
                 relative_sharpness=relative[index],
                 mask=f"masks/{file}.png" if photo.mask else None,

@@ -34,20 +34,29 @@ class _Picture(NamedTuple):
     corners: "np.ndarray"  # (n, 1, 2) float32, pixels
 
 
-def thumbnail(pixels: "np.ndarray") -> "np.ndarray":
-    """A photo, (h, w, 3 or 4) uint8, as (h', w') uint8 with equalised grey values; what is transparent counts as
-    black."""
+def thumbnail(pixels: "np.ndarray", used: "np.ndarray | None" = None) -> "np.ndarray":
+    """A photo, (h, w, 3 or 4) uint8, as (h', w') uint8 with equalised grey values. What is transparent counts as
+    black, and what its mask ignores, ``used`` being the mask made :func:`small`: before a background that never moves,
+    an object that turns is another picture."""
     import cv2
     import numpy as np
+
+    picture = small(pixels)
+    grey = cv2.cvtColor(picture[..., :3], cv2.COLOR_RGB2GRAY)
+    for cover in (picture[..., 3] if pixels.shape[2] == 4 else None, used):
+        if cover is not None:
+            grey = np.rint(grey * (cover / 255.0)).astype(np.uint8)
+    return cv2.equalizeHist(grey)
+
+
+def small(pixels: "np.ndarray") -> "np.ndarray":
+    """A picture of any channels, no larger than a thumbnail."""
+    import cv2
 
     height, width = pixels.shape[:2]
     scale = min(1.0, THUMBNAIL_PX / max(height, width))
     size = max(1, round(width * scale)), max(1, round(height * scale))
-    small = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
-    grey = cv2.cvtColor(small[..., :3], cv2.COLOR_RGB2GRAY)
-    if pixels.shape[2] == 4:
-        grey = np.rint(grey * (small[..., 3] / 255.0)).astype(np.uint8)
-    return cv2.equalizeHist(grey)
+    return cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
 
 
 def near_duplicates(thumbnails: "Sequence[np.ndarray]", sharpness: Sequence[float]) -> dict[int, int]:

@@ -1,5 +1,6 @@
 """Stage normalise: the calibrated scene in our own frame, the split, and the export for other programs."""
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
     from nerf.normalisation import Normalisation
     from nerf.reconstruction import Reconstruction
     from nerf.scene import Camera, Scene, Split
-    from stages.photos import Photo
+    from stages.photos import Box, Photo
     from stages.sparse_model import SparseModel
 
 NEEDS = ("ingest", "sfm")
@@ -56,7 +57,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     )
     photos, order = [photo for photo, _ in posed], [i for _, i in posed]
     has_alpha = _has_alpha(photos, progress)
-    sfm = _reconstruction(model, order)
+    sfm = _reconstruction(model, order, photos, has_alpha)
     try:
         found = normalise(sfm, has_alpha, config.roi)
     except ValueError as error:
@@ -108,22 +109,35 @@ def _has_alpha(photos: "list[Photo]", progress: Progress) -> bool:
     return has_alpha
 
 
-def _reconstruction(model: "SparseModel", order: list[int]) -> "Reconstruction":
-    """The sparse model as plain geometry, its photos in ``order``."""
+def _reconstruction(model: "SparseModel", order: list[int], photos: "list[Photo]", has_alpha: bool) -> "Reconstruction":
+    """The sparse model as plain geometry, its photos in ``order``, which is that of ``photos``."""
     import numpy as np
 
     from nerf.reconstruction import Reconstruction
     from stages.colmap.cameras import camera_rays
 
     side = FRUSTUM_SAMPLES
-    bearings = [camera_rays(camera, side, side).reshape(-1, 3).astype(float) for camera in model.cameras]
+    rays = [camera_rays(camera, side, side).astype(float) for camera in model.cameras]
+    boxes = [photo.opaque if has_alpha else None for photo in photos]
     return Reconstruction(
         from_camera=np.stack([model.images[i].sfm_from_camera for i in order]),
-        bearings=np.stack([bearings[model.images[i].camera] for i in order]),
+        bearings=np.stack([_within(rays[model.images[i].camera], box) for i, box in zip(order, boxes, strict=True)]),
         points=model.xyz,
         view=np.argsort(order)[model.view],
         point=model.point,
     )
+
+
+def _within(rays: "np.ndarray", box: "Box | None") -> "np.ndarray":
+    """A photo's (side, side, 3) bearings as a list of as many, all of them within the box."""
+    import numpy as np
+
+    if box is not None:
+        side, (left, top, right, bottom) = len(rays), box
+        spans = ((top, bottom), (left, right))
+        rows, columns = (np.clip(np.arange(side), int(low * side), math.ceil(high * side) - 1) for low, high in spans)
+        rays = rays[np.ix_(rows, columns)]
+    return rays.reshape(-1, 3)
 
 
 def _split(photos: "list[Photo]", test_every: int, official: list[str] | None) -> "list[Split]":

@@ -12,6 +12,10 @@ if TYPE_CHECKING:
     import numpy as np
 
 
+Box = tuple[float, float, float, float]
+"""Left, top, right and bottom of a rectangle, as shares of a photo's width and height."""
+
+
 @dataclass(frozen=True)
 class Photo:
     """One decoded photo, upright, 8-bit sRGB.
@@ -25,7 +29,8 @@ class Photo:
     it is used. ``near_duplicate_of`` is the name of the photo that is nearly the same picture, which is used in its
     place. ``time_s`` is when a frame of a video was taken, in seconds from its beginning, None for photos. The place
     is EXIF's, in degrees (north and east positive) and metres above the sea, None where it tells none; so is
-    ``exposure_ev``, in stops (stages/decoding.py: exposure_from_exif).
+    ``exposure_ev``, in stops (stages/decoding.py: exposure_from_exif). ``opaque`` holds all that is more than half
+    opaque, None without alpha; ``used_share`` is what the mask leaves of the pixels.
     """
 
     name: str  # the user's own file name, relative to the photo folder
@@ -45,6 +50,8 @@ class Photo:
     longitude: float | None = None
     altitude_m: float | None = None
     exposure_ev: float | None = None
+    opaque: Box | None = None
+    used_share: float = 1.0
 
     @property
     def image_name(self) -> str:
@@ -91,6 +98,21 @@ class _PhotosFile:
 
 def _read(ingest_folder: Path) -> _PhotosFile:
     return read_dataclass(ingest_folder / "photos.json", _PhotosFile)
+
+
+def opaque_box(pixels: "np.ndarray") -> Box | None:
+    """What holds all that is more than half opaque of (h, w, 3 or 4) uint8; None where all or nothing of it is."""
+    import numpy as np
+
+    if pixels.shape[2] != 4:
+        return None
+    opaque = pixels[..., 3] > 127
+    if not opaque.any() or opaque.all():
+        return None
+    height, width = opaque.shape
+    columns, rows = np.flatnonzero(opaque.any(axis=0)), np.flatnonzero(opaque.any(axis=1))
+    left, right = float(columns[0]) / width, float(columns[-1] + 1) / width
+    return left, float(rows[0]) / height, right, float(rows[-1] + 1) / height
 
 
 def load_pixels(path: Path, width: int, height: int) -> "np.ndarray":

@@ -10,13 +10,14 @@ from stages.contract import Inputs, Progress, StageConfig, StageResult
 from stages.effect_decisions import read_decisions
 from stages.files import read_scene
 from stages.live_line import short_count
+from stages.photos import read_photos
 
 if TYPE_CHECKING:
     from nerf.scene import Scene
     from stages.training_loop import TrainingRun
 
 NEEDS = ("ingest", "normalise", "effects")
-VERSION = 10
+VERSION = 11
 RESUMES = True
 LINKS = ("curve.json",)
 UNKEYED = ("checkpoint_seconds", "tensorboard")
@@ -200,7 +201,8 @@ def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
 
         progress.update("trying how fast this machine trains")
         rays = rays_in_budget(config, scene, decisions)
-        config = _filled(config, {"downscale": chosen_downscale(scene, rays)})
+        used = {photo.name: photo.used_share for photo in read_photos(inputs["ingest"])}
+        config = _filled(config, {"downscale": chosen_downscale(scene, rays, used)})
         if config.kind == "grid":
             config = _filled(config, grid_size(config, scene, rays))
     return config

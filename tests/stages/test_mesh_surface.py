@@ -29,7 +29,7 @@ TETRAHEDRON = Surface(
 
 
 def lattice_of(distance, points=64):
-    """Density LEVEL where the signed ``distance`` is zero, growing inwards, so that the occupancy is a logistic step."""
+    """Density LEVEL where the signed ``distance`` is zero, growing inwards: the occupancy is a logistic step."""
     axis = torch.linspace(-0.9, 0.9, points)
     grid = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1)
     corner = torch.full((3,), 0.9)

@@ -12,7 +12,14 @@ from stages.effect_decisions import Decisions
 from stages.train import Config
 from stages.training_data import scaled_size
 from stages.training_setup import grid_settings, has_sky
-from stages.training_size import LEAST_LONG_SIDE, chosen_downscale, grid_size, rays_in_budget, rays_per_second
+from stages.training_size import (
+    LEAST_LONG_SIDE,
+    MOST_PHOTOS,
+    chosen_downscale,
+    grid_size,
+    rays_in_budget,
+    rays_per_second,
+)
 from tests.stages.photo_scene import photographed
 
 
@@ -46,6 +53,29 @@ def test_photos_are_never_enlarged_nor_made_tiny(scene: Scene, width: int, heigh
 def test_more_rays_never_mean_smaller_photos(scene: Scene, rays: float, factor: float) -> None:
     sized = of_size(scene, 3000, 2000)
     assert chosen_downscale(sized, rays * factor) <= chosen_downscale(sized, rays)
+
+
+def test_what_masks_ignore_is_not_drawn_and_takes_no_pixels(scene: Scene) -> None:
+    large = of_size(scene, 2000, 1000)
+    used = {view.name: 0.25 for view in large.views}
+    assert chosen_downscale(large, 3_000_000, used) == 1.0 == chosen_downscale(large, 12_000_000)
+
+
+def test_one_small_photo_does_not_decide_for_all(scene: Scene) -> None:
+    small = Camera("PINHOLE", 150, 100, (1.0, 1.0, 0.0, 0.0))
+    views = tuple(replace(view, camera=int(index == 1)) for index, view in enumerate(scene.views))
+    mixed = replace(of_size(scene, 2000, 1000), views=views)
+    mixed = replace(mixed, cameras=(*mixed.cameras, small))
+    assert chosen_downscale(mixed, 2_500_000) == 2.0
+
+
+def test_many_photos_of_the_same_things_are_not_made_ever_smaller(scene: Scene) -> None:
+    train = scene.of_split("train")[0]
+    few, many = (
+        replace(of_size(scene, 2000, 1000), views=tuple(replace(train, name=str(i)) for i in range(count)))
+        for count in (MOST_PHOTOS, 10 * MOST_PHOTOS)
+    )
+    assert chosen_downscale(few, 6e6) == chosen_downscale(many, 6e6) == 4.0
 
 
 GRID = Config(
