@@ -71,7 +71,7 @@ def row(folders: Inputs, resolution: int, truth: Truth | None) -> str:
     normalise = folders["normalise"]
     points = read_tensors(normalise / "points.safetensors")["xyz"].astype(float)
     started = time.perf_counter()
-    made = reconstruct(Config(resolution=resolution), model, scene, points, device, Quiet())
+    made = reconstruct(Config(resolution=resolution), model, scene, folders["ingest"], points, device, Quiet())
     seconds = time.perf_counter() - started
     known = to_points(made.mesh, points) if truth is None else to_truth(made.mesh, scene, normalise, truth)
     return f"| {resolution}³ | {len(made.mesh.faces):,} | {seconds:.1f} | {known} |"
@@ -86,7 +86,7 @@ def main() -> None:
     given = parser.parse_args()
     workspace = Workspace.existing(given.workspace)
     keys = workspace.read_run()["keys"]
-    folders = {stage: workspace.folder(stage, keys[stage]) for stage in ("normalise", "train")}
+    folders = {stage: workspace.folder(stage, keys[stage]) for stage in ("ingest", "normalise", "train")}
     truth = Truth.read(given.truth) if given.truth else None
     names = "mesh to truth (%) | truth to mesh (%)" if truth else "median point to mesh (%) | nine in ten within (%)"
     print(f"| lattice | faces | s | {names} |\n|---|---|---|---|---|")

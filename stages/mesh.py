@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from stages.mesh_level import Level
     from stages.mesh_views import ShadowMap
 
-NEEDS = ("normalise", "train")
+NEEDS = ("ingest", "normalise", "train")
 VERSION = 3
 RESUMES = False
 LINKS = ("mesh.glb", "mesh.ply", "mesh.obj")
@@ -94,7 +94,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     model, _ = load_field(inputs["train"], device)
     config = plan(config, inputs, progress)
     points = read_tensors(inputs["normalise"] / "points.safetensors")["xyz"].astype(float)
-    result = reconstruct(config, model, scene, points, device, progress)
+    result = reconstruct(config, model, scene, inputs["ingest"], points, device, progress)
     progress.update("writing", 0.95)
     outputs = write_mesh(config, result.mesh, scene, folder)
     faces, parts = len(result.mesh.faces), result.cleaned.kept
@@ -106,10 +106,16 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
 
 
 def reconstruct(
-    config: Config, model: "RadianceModel", scene: "Scene", points: "np.ndarray", device: str, progress: Progress
+    config: Config,
+    model: "RadianceModel",
+    scene: "Scene",
+    ingest: Path,
+    points: "np.ndarray",
+    device: str,
+    progress: Progress,
 ) -> Reconstruction:
     """The mesh of ``model`` in the scene frame, where sparse ``points`` (n, 3) are, too; ``config.resolution`` must be
-    set. Raises StageError without a surface."""
+    set. Masks lie in the folder of stage ``ingest``. Raises StageError without a surface."""
     from scipy.spatial import KDTree
 
     from stages.mesh_cleaning import clean, openness
@@ -120,7 +126,7 @@ def reconstruct(
     lattice = _density(config, model, device, progress)
     voxel = float(lattice.spacing().max())
     views = scene.of_split("train")
-    maps = shadow_maps(lattice, scene, views, lambda done: progress.update("visibility", 0.6 + 0.2 * done))
+    maps = shadow_maps(lattice, scene, ingest, views, lambda done: progress.update("visibility", 0.6 + 0.2 * done))
     level = _level(config, lattice, model, maps, progress)
     progress.update("marching cubes", 0.8)
     raw = extract(lattice, level.level)
@@ -165,11 +171,12 @@ def _level(
 
     from nerf.rays import Rays
     from stages.mesh_level import Level, check_range, choose_level
+    from stages.mesh_views import used_rays
 
     check_range(lattice, config.level)
     if config.level is not None:
         return Level(config.level, "as asked", None, True)
-    every = Rays(*(torch.cat([getattr(m.rays, part).flatten(0, 1) for m in maps]) for part in Rays._fields))
+    every = Rays(*(torch.cat(parts) for parts in zip(*(used_rays(one) for one in maps), strict=True)))
     stride = max(1, len(every.near) // LEVEL_RAYS)
     level = choose_level(lattice, model, Rays(*(part[::stride] for part in every)))
     progress.note(f"surface at density {level.level:.3g}: {level.reason}")

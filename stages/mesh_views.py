@@ -1,11 +1,12 @@
 """What the training photos say about a surface: which vertices they cover, which they see, and from where.
 
-A photo *covers* a vertex that lies inside its image, between its near and far; it *sees* the vertex when the vertex
-faces it and no more than half of the light is lost on the way. Losses are looked up in a shadow map (Williams
-1978): one coarse map per photo of the distance at which its rays lose half of their light.
+A photo *covers* a vertex that lies inside its image where its mask ignores nothing, between its near and far; it *sees*
+the vertex when the vertex faces it and no more than half of the light is lost on the way. Losses are looked up in a
+shadow map (Williams 1978): one coarse map per photo of the distance at which its rays lose half of their light.
 """
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -43,16 +44,18 @@ class ShadowMap(NamedTuple):
     rays: "Rays"
     reach: np.ndarray  # the farthest among a cell and its neighbours, so that silhouettes hide nothing behind them
     widest: float  # cosine between the optical axis and the outermost ray
+    used: np.ndarray | None  # of the rays (h, w); None: all
 
 
 def shadow_maps(
-    lattice: "Lattice", scene: "Scene", views: Sequence["View"], on_view: Callable[[float], None]
+    lattice: "Lattice", scene: "Scene", ingest: Path, views: Sequence["View"], on_view: Callable[[float], None]
 ) -> list[ShadowMap]:
-    """One map per photo; together about ``RAYS`` rays, each with a sample per voxel of the longest edge."""
+    """One map per photo; together about ``RAYS`` rays, each with a sample per voxel of the longest edge. Masks lie in
+    the folder of stage ``ingest``."""
     from scipy.ndimage import maximum_filter
 
     from nerf.lattice import stopping_distance
-    from stages.training_data import view_rays
+    from stages.training_data import view_mask, view_rays
 
     maps = []
     for number, view in enumerate(views):
@@ -63,9 +66,22 @@ def shadow_maps(
         rays = type(rays)(*(part.to(lattice.low.device) for part in rays))
         stop = stopping_distance(lattice, rays, max(lattice.values.shape)).cpu().numpy()
         widest = float((rays.directions.cpu().double().numpy() @ view.scene_from_camera[:, 2]).min())
-        maps.append(ShadowMap(view, camera, rays, maximum_filter(stop, size=3, mode="nearest"), widest))
+        mask = view_mask(ingest, scene, view, downscale)
+        used = None if mask is None else mask.numpy()
+        maps.append(ShadowMap(view, camera, rays, maximum_filter(stop, size=3, mode="nearest"), widest, used))
         on_view((number + 1) / len(views))
     return maps
+
+
+def used_rays(shadow: ShadowMap) -> "Rays":
+    """The rays of a map that its mask does not ignore, (n,)."""
+    import torch
+
+    flat = type(shadow.rays)(*(part.flatten(0, 1) for part in shadow.rays))
+    if shadow.used is None:
+        return flat
+    used = torch.from_numpy(shadow.used).flatten().to(flat.near.device)
+    return type(flat)(*(part[used] for part in flat))
 
 
 def look(vertices: np.ndarray, normals: np.ndarray, maps: Sequence[ShadowMap], voxel: float) -> Sight:
@@ -99,7 +115,7 @@ def _look(vertices: np.ndarray, normals: np.ndarray, maps: Sequence[ShadowMap], 
 
 
 def _cells(offset: np.ndarray, distance: np.ndarray, shadow: ShadowMap) -> np.ndarray:
-    """The flat index of each point's cell in the shadow map, -1 outside the image.
+    """The flat index of each point's cell in the shadow map, -1 outside the image and where its mask ignores it.
 
     Lens polynomials fold back far outside of the image; points at wider angles than any ray are therefore refused.
     """
@@ -113,4 +129,6 @@ def _cells(offset: np.ndarray, distance: np.ndarray, shadow: ShadowMap) -> np.nd
     within = ((scaled >= 0) & (scaled < [width, height])).all(axis=1)
     column, row = scaled[within].astype(np.int64).T
     cell[ahead[within]] = row * width + column
+    if shadow.used is not None:
+        cell[ahead[within]] = np.where(shadow.used[row, column], cell[ahead[within]], -1)
     return cell

@@ -201,7 +201,8 @@ def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
 
         progress.update("trying how fast this machine trains")
         rays = rays_in_budget(config, scene, decisions)
-        used = {photo.name: photo.used_share for photo in read_photos(inputs["ingest"])}
+        masked = any(view.mask for view in scene.views)
+        used = {photo.name: photo.used_share for photo in read_photos(inputs["ingest"])} if masked else {}
         config = _filled(config, {"downscale": chosen_downscale(scene, rays, used)})
         if config.kind == "grid":
             config = _filled(config, grid_size(config, scene, rays))

@@ -1,5 +1,8 @@
 """What the photos cover and see of a ball, in closed form."""
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -7,8 +10,9 @@ import torch
 from nerf.lattice import Lattice
 from nerf.scene import Camera, Scene, Similarity, View
 from stages import mesh_views
+from stages.files import write_png
 from stages.mesh_preview import look_at
-from stages.mesh_views import look, shadow_maps
+from stages.mesh_views import look, shadow_maps, used_rays
 
 RADIUS = 0.5
 CORNER = torch.full((3,), 0.9)
@@ -37,7 +41,7 @@ def normals():
 
 
 def looked(lattice, scene, vertices, normals):
-    maps = shadow_maps(lattice, scene, scene.views, lambda done: None)
+    maps = shadow_maps(lattice, scene, Path(), scene.views, lambda done: None)
     return look(vertices, normals, maps, VOXEL)
 
 
@@ -103,6 +107,22 @@ def test_many_photos_share_the_rays(ball, monkeypatch):
     told = []
     for count, shape in ((1, (27, 37)), (10, (9, 12))):
         scene = scene_of(*[(2.5, 0, 0)] * count)
-        maps = shadow_maps(ball, scene, scene.views, told.append)
+        maps = shadow_maps(ball, scene, Path(), scene.views, told.append)
         assert [m.reach.shape for m in maps] == [shape] * count
     assert told[0] == told[-1] == 1.0 and len(told) == 11
+
+
+def test_what_a_mask_ignores_is_neither_covered_nor_asked_where_light_stops(ball, normals, tmp_path):
+    mask = np.full((90, 120), 255, np.uint8)
+    mask[:, :60] = 0
+    (tmp_path / "masks").mkdir()
+    write_png(tmp_path / "masks" / "0.png", mask)
+    scene = scene_of((2.5, 0, 0))
+    masked = replace(scene, views=(replace(scene.views[0], mask="masks/0.png"),))
+    maps = shadow_maps(ball, masked, tmp_path, masked.views, lambda done: None)
+    vertices = RADIUS * normals
+    local = (vertices - scene.views[0].scene_from_camera[:, 3]) @ scene.views[0].scene_from_camera[:, :3]
+    sight = look(vertices, normals, maps, VOXEL)
+    assert (sight.covered[local[:, 0] < -0.05] == 0).all() and (sight.covered[local[:, 0] > 0.05] == 1).all()
+    (whole,) = shadow_maps(ball, scene, tmp_path, scene.views, lambda done: None)
+    assert len(used_rays(maps[0]).near) == pytest.approx(len(used_rays(whole).near) / 2, rel=0.05)

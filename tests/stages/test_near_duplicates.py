@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stages.near_duplicates import near_duplicates, thumbnail
+from stages.near_duplicates import near_duplicates, small, thumbnail
 from tests.blots import blots, cut_out
 
 WIDTH, HEIGHT = 400, 300
@@ -102,6 +102,19 @@ def test_what_is_transparent_counts_as_black() -> None:
     black = np.where(hidden[..., 3:] > 0, rest, 0)
     assert np.array_equal(thumbnail(hidden), thumbnail(black))
     assert thumbnail(opaque).shape == (240, 320)
+
+
+def test_what_turns_before_a_background_that_never_moves_is_another_picture_where_masks_say_what_counts() -> None:
+    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+    one, other = seen(0, noise=1), seen(0, noise=2)
+    for view, turned in ((one, 0), (other, 12)):
+        view[130:170, 180:220] = cut_out(NEAR, 50 + turned, 50, 40, 40)
+    mask[:] = 0
+    mask[130:170, 180:220] = 255
+    assert found(one, other) == {1: 0}
+    assert near_duplicates([thumbnail(view, small(mask)) for view in (one, other)], (1.0, 1.0)) == {}
+    whole = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    assert near_duplicates([thumbnail(view, small(whole)) for view in (one, other)], (1.0, 1.0)) == {1: 0}
 
 
 def test_the_answer_does_not_depend_on_threads() -> None:

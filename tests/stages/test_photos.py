@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from stages.contract import StageError
-from stages.photos import Photo, Refusal, load_pixels, read_frame_names, read_photos, write_photos
+from stages.photos import Photo, Refusal, load_pixels, opaque_box, read_frame_names, read_photos, write_photos
 
 
 def stored(folder: Path, pixels: np.ndarray) -> Path:
@@ -93,3 +93,13 @@ def test_a_damaged_photos_json_is_named(tmp_path: Path, content: str) -> None:
     (tmp_path / "photos.json").write_text(content)
     with pytest.raises(StageError, match=r"cannot read photos\.json"):
         read_photos(tmp_path)
+
+
+def test_what_is_opaque_lies_in_its_box() -> None:
+    pixels = np.zeros((40, 60, 4), np.uint8)
+    pixels[10:20, 30:45, 3] = 200
+    pixels[5, 5, 3] = 127  # less than half
+    assert opaque_box(pixels) == (0.5, 0.25, 0.75, 0.5)
+    assert opaque_box(np.full((4, 6, 4), 255, np.uint8)) is None
+    assert opaque_box(np.zeros((4, 6, 4), np.uint8)) is None
+    assert opaque_box(pixels[..., :3]) is None

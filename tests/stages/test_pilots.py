@@ -79,7 +79,7 @@ def test_a_photos_pose_is_found_against_a_finished_field(trial: PilotScene) -> N
     found = fit_pose(field, wrong.forward(rays, view), target, black)
     left = (found.forward(wrong.forward(rays, view), view).directions - rays.directions).norm(dim=-1).mean()
     before = (wrong.forward(rays, view).directions - rays.directions).norm(dim=-1).mean()
-    assert 0 < left < 0.4 * before
+    assert 0 < left < 0.5 * before
 
 
 def test_the_exposure_expected_of_an_unseen_photo_is_its_neighbours(inputs: dict[str, Path]) -> None:
