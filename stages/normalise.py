@@ -57,7 +57,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     )
     photos, order = [photo for photo, _ in posed], [i for _, i in posed]
     has_alpha = _has_alpha(photos, progress)
-    sfm = _reconstruction(model, order, photos, has_alpha)
+    sfm = _reconstruction(model, order, [photo.opaque if has_alpha else None for photo in photos])
     try:
         found = normalise(sfm, has_alpha, config.roi)
     except ValueError as error:
@@ -109,8 +109,8 @@ def _has_alpha(photos: "list[Photo]", progress: Progress) -> bool:
     return has_alpha
 
 
-def _reconstruction(model: "SparseModel", order: list[int], photos: "list[Photo]", has_alpha: bool) -> "Reconstruction":
-    """The sparse model as plain geometry, its photos in ``order``, which is that of ``photos``."""
+def _reconstruction(model: "SparseModel", order: list[int], boxes: "Sequence[Box | None]") -> "Reconstruction":
+    """The sparse model as plain geometry, its photos in ``order``, and of each no more than what is in its box."""
     import numpy as np
 
     from nerf.reconstruction import Reconstruction
@@ -118,7 +118,6 @@ def _reconstruction(model: "SparseModel", order: list[int], photos: "list[Photo]
 
     side = FRUSTUM_SAMPLES
     rays = [camera_rays(camera, side, side).astype(float) for camera in model.cameras]
-    boxes = [photo.opaque if has_alpha else None for photo in photos]
     return Reconstruction(
         from_camera=np.stack([model.images[i].sfm_from_camera for i in order]),
         bearings=np.stack([_within(rays[model.images[i].camera], box) for i, box in zip(order, boxes, strict=True)]),

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from stages.photos import Photo
 
 NEEDS = ("ingest",)
-VERSION = 4
+VERSION = 5
 RESUMES = True
 LINKS = ("sparse",)
 # It may decide that an attempt is not made, which is said; in the key it would part a run from the matches kept for it.

@@ -14,6 +14,8 @@ from stages.files import write_durably
 
 # New features, or another idea of the lens, cost as much as the first attempt: they wait until so many are missing.
 WORTH_STARTING_OVER = 0.1  # of all, and two at least: one may well be a stranger
+# Nor is mapping again, minutes of many photos, for a blurred one among them: the others show what it shows.
+WORTH_ANOTHER = 0.02
 # The lens is chosen and everything adjusted in 0.8 to 1.6 times the time of mapping (docs/numbers.md).
 FINISHING = 2.0
 NO_TIME = "too little was left of --sfm.max-seconds"
@@ -177,6 +179,8 @@ def reason_against(attempt: Attempt, now: Situation) -> str | None:
         return "none of them shares a view with another photo"
     if attempt.matches == "fisheye" and now.lens_is_given:
         return "the camera model is given"
+    if now.missing < WORTH_ANOTHER * now.photos:
+        return f"{now.missing} of {now.photos} photos missing is not worth mapping again"
     if attempt.matches in ("fisheye", "rich") and now.missing < max(2, WORTH_STARTING_OVER * now.photos):
         return f"{now.missing} of {now.photos} photos missing is not worth starting over"
     return None
