@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
-from nerf.reconstruction import Reconstruction
+from nerf.reconstruction import Reconstruction, within
 
 REGION_HALF = 0.9
 FEWEST_POINTS = 10  # fewer say nothing about a photo's depth range; all photos together then do
@@ -65,12 +65,9 @@ def _widened(
     scene: Reconstruction, view: int, points: Float[np.ndarray, "n 3"], low: float, high: float
 ) -> tuple[float, float]:
     """The range of distances, widened on either side as far as FEWEST_POINTS points in a photo's field of view go."""
-    offset = points - scene.centres[view]
-    distance = np.linalg.norm(offset, axis=1)
+    distance = np.linalg.norm(points - scene.centres[view], axis=1)
     beyond = (distance < low) | (distance > high)
-    local = offset[beyond] @ scene.from_camera[view, :, :3]
-    angles, field = (np.arctan2(of[:, :2], of[:, 2:]) for of in (local, scene.bearings[view]))
-    inside = ((angles >= field.min(axis=0)) & (angles <= field.max(axis=0))).all(axis=1)
+    inside = within(scene.angles_to(view, points[beyond]), scene.field(view))
     distance = np.sort(distance[beyond][inside])
     nearer, farther = distance[distance < low], distance[distance > high]
     if len(nearer) >= FEWEST_POINTS:

@@ -7,7 +7,7 @@ are spatial medians.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 CONVERGED = 1e-9  # of the softening, which is a tenth of the distance between close points: far below any use of it
 PARALLEL = 1e-9  # of the largest singular value: below it lines leave a direction open, and rounding must not choose
@@ -18,8 +18,7 @@ NEAREST = 1e-6  # of the usual distance: a line hit exactly would weigh infinite
 class Reconstruction:
     """Posed photos and sparse points in one common frame.
 
-    ``bearings`` are unit vectors in the camera frame, sampled over each photo's whole field of view (the frustum), or,
-    where alpha tells, over the rectangle that holds all that is not background;
+    ``bearings`` are unit vectors in the camera frame, sampled over each photo's whole field of view (the frustum);
     observation j says that photo ``view[j]`` sees point ``point[j]``. There may be no points at all.
     """
 
@@ -28,6 +27,7 @@ class Reconstruction:
     points: Float[np.ndarray, "m 3"]
     view: Int[np.ndarray, "observations"]
     point: Int[np.ndarray, "observations"]
+    opaque: Float[np.ndarray, "n 2 2"] | None = None
 
     @property
     def centres(self) -> Float[np.ndarray, "n 3"]:
@@ -54,6 +54,14 @@ class Reconstruction:
         """The bearings in the common frame."""
         return np.einsum("nij,nkj->nki", self.from_camera[:, :, :3], self.bearings)
 
+    def field(self, view: int) -> Float[np.ndarray, "2 2"]:
+        """The least and the greatest :func:`angles` in a photo."""
+        return extent(angles(self.bearings[view]))
+
+    def angles_to(self, view: int, points: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m 2"]:
+        """The :func:`angles` at which a photo has points."""
+        return angles((points - self.centres[view]) @ self.from_camera[view, :, :3])
+
     def distances(self) -> Float[np.ndarray, "observations"]:
         """Distance from the photo to the point, per observation."""
         return np.linalg.norm(self.points[self.point] - self.centres[self.view], axis=1)
@@ -66,6 +74,22 @@ class Reconstruction:
         centres = scale * (self.centres - centre) @ rotation.T
         points = scale * (self.points - centre) @ rotation.T
         return replace(self, from_camera=np.concatenate([axes, centres[:, :, None]], axis=2), points=points)
+
+
+def angles(vectors: Float[np.ndarray, "*m 3"]) -> Float[np.ndarray, "*m 2"]:
+    """How far to the right and down of the optical axis vectors in a camera's frame point, in radians. A photo is a
+    rectangle of them, whatever its lens."""
+    return np.arctan2(vectors[..., :2], vectors[..., 2:])
+
+
+def extent(values: Float[np.ndarray, "m d"]) -> Float[np.ndarray, "2 d"]:
+    """The least and the greatest."""
+    return np.stack([values.min(axis=0), values.max(axis=0)])
+
+
+def within(values: Float[np.ndarray, "m d"], box: Float[np.ndarray, "2 d"]) -> Bool[np.ndarray, "m"]:
+    """Which rows lie in an :func:`extent`."""
+    return ((values >= box[0]) & (values <= box[1])).all(axis=1)
 
 
 def spatial_median(points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "d"]:

@@ -10,7 +10,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from nerf.reconstruction import Reconstruction, angles_deg, closest_point_to_lines, spatial_median
+from nerf.reconstruction import Reconstruction, angles_deg, closest_point_to_lines, extent, spatial_median, within
 
 Layout = Literal["around", "inside", "forward"]
 
@@ -21,6 +21,9 @@ FORWARD_REACH = 3.0  # the farthest depth the cube takes in, in median depths; b
 INSIDE_REACH = 2.0  # likewise around a camera that looks outward
 FAR_CAMERA = 5.0  # a camera so many times as far from the cameras' middle as is usual does not count
 CORE, WHOLE = 0.95, 0.999  # shares of the observations that the cube should hold, and that are the whole scene
+CARVED = 48  # points along an edge of the cube that is carved
+MOST_CARVING = 200  # photos that carve it; more tell no more
+MISTAKEN = 0.05  # of the photos in which a point is: so many may call it background by mistake
 GROWTH = 1.25  # a cube that becomes WHOLE by growing at most this much is grown
 
 
@@ -57,7 +60,7 @@ def find_region(scene: Reconstruction, layout: Layout, has_alpha: bool) -> Regio
     held whole.
     Raises ValueError when the cameras stand in one place and there are no points to give a scale.
     """
-    if layout == "around" and has_alpha:
+    if layout == "around" and has_alpha and scene.opaque is not None:
         cube = _opaque(scene)
     else:
         cube = {"around": _around, "forward": _forward, "inside": _inside}[layout](scene)
@@ -104,11 +107,25 @@ def _around(scene: Reconstruction) -> Region:
 
 
 def _opaque(scene: Reconstruction) -> Region:
-    """What holds all that is opaque in any photo, bare or textured: with alpha, bearings reach no farther."""
-    centre = focus(scene)
+    """What may be opaque, bare or textured: carved out of a cube that surely holds it by every photo's rectangle."""
+    assert scene.opaque is not None
+    centre, near_by = focus(scene), _near_by(scene)
     distance = np.linalg.norm(scene.centres - centre, axis=1)
-    reach = (distance * _half_widths(scene))[_near_by(scene)].max()
-    return Region(centre, float(min(reach, np.median(distance))))
+    widest = np.tan(np.minimum(np.abs(scene.opaque).max(axis=(1, 2)), np.pi / 4))
+    half = float(min((distance * widest)[near_by].max(), np.median(distance)))
+    side = np.linspace(-half, half, CARVED)
+    points = centre + np.stack(np.meshgrid(side, side, side, indexing="ij"), axis=-1).reshape(-1, 3)
+    seen, clear = np.zeros(len(points), int), np.zeros(len(points), int)
+    for view in range(0, len(scene.centres), -(-len(scene.centres) // MOST_CARVING)):
+        angles = scene.angles_to(view, points)
+        in_photo = within(angles, scene.field(view))
+        seen += in_photo
+        clear += in_photo & ~within(angles, scene.opaque[view])
+    left = points[(seen > clear) & (clear <= MISTAKEN * seen)]
+    if not len(left):
+        return Region(centre, half)
+    low, high = extent(left)
+    return Region((low + high) / 2, float(min((high - low).max() / 2 + side[1] - side[0], half)))
 
 
 def _half_widths(scene: Reconstruction) -> Float[np.ndarray, "n"]:

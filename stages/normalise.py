@@ -57,7 +57,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     )
     photos, order = [photo for photo, _ in posed], [i for _, i in posed]
     has_alpha = _has_alpha(photos, progress)
-    sfm = _reconstruction(model, order, [photo.opaque if has_alpha else None for photo in photos])
+    sfm = _reconstruction(model, order, [photo.opaque for photo in photos] if has_alpha else None)
     try:
         found = normalise(sfm, has_alpha, config.roi)
     except ValueError as error:
@@ -109,34 +109,35 @@ def _has_alpha(photos: "list[Photo]", progress: Progress) -> bool:
     return has_alpha
 
 
-def _reconstruction(model: "SparseModel", order: list[int], boxes: "Sequence[Box | None]") -> "Reconstruction":
-    """The sparse model as plain geometry, its photos in ``order``, and of each no more than what is in its box."""
+def _reconstruction(model: "SparseModel", order: list[int], boxes: "Sequence[Box | None] | None") -> "Reconstruction":
+    """The sparse model as plain geometry, its photos in ``order``. ``boxes`` hold what is opaque of each, None where
+    all of it may be; None without alpha."""
     import numpy as np
 
-    from nerf.reconstruction import Reconstruction
+    from nerf.reconstruction import Reconstruction, angles, extent
     from stages.colmap.cameras import camera_rays
 
     side = FRUSTUM_SAMPLES
     rays = [camera_rays(camera, side, side).astype(float) for camera in model.cameras]
+    each = [rays[model.images[i].camera] for i in order]
+    opaque = [_within(grid, box) for grid, box in zip(each, boxes, strict=True)] if boxes is not None else None
     return Reconstruction(
         from_camera=np.stack([model.images[i].sfm_from_camera for i in order]),
-        bearings=np.stack([_within(rays[model.images[i].camera], box) for i, box in zip(order, boxes, strict=True)]),
+        bearings=np.stack([grid.reshape(-1, 3) for grid in each]),
         points=model.xyz,
         view=np.argsort(order)[model.view],
         point=model.point,
+        opaque=None if opaque is None else np.stack([extent(angles(one)) for one in opaque]),
     )
 
 
 def _within(rays: "np.ndarray", box: "Box | None") -> "np.ndarray":
-    """A photo's (side, side, 3) bearings as a list of as many, all of them within the box."""
-    import numpy as np
-
-    if box is not None:
-        side, (left, top, right, bottom) = len(rays), box
-        spans = ((top, bottom), (left, right))
-        rows, columns = (np.clip(np.arange(side), int(low * side), math.ceil(high * side) - 1) for low, high in spans)
-        rays = rays[np.ix_(rows, columns)]
-    return rays.reshape(-1, 3)
+    """Those of a photo's (side, side, 3) bearings that go through a box, and at least one along each side, (n, 3)."""
+    if box is None:
+        return rays.reshape(-1, 3)
+    side, (left, top, right, bottom) = len(rays), box
+    rows, columns = (slice(int(low * side), math.ceil(high * side)) for low, high in ((top, bottom), (left, right)))
+    return rays[rows, columns].reshape(-1, 3)
 
 
 def _split(photos: "list[Photo]", test_every: int, official: list[str] | None) -> "list[Split]":

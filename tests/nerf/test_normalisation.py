@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from nerf.camera_paths import nearest_rotations
 from nerf.normalisation import Normalisation, normalise
-from nerf.reconstruction import Reconstruction, angles_deg
+from nerf.reconstruction import Reconstruction, angles_deg, extent
 from nerf.region import find_layout
 from tests.camera_layouts import ball, ring, room, room_points, seen_by, wall, wall_points
 
@@ -175,15 +175,34 @@ def test_points_behind_or_beside_a_photo_or_unsure_ones_say_nothing_of_its_near(
     assert near_beside(centre + 0.5 * axis + jitter, 3) < 0.5 * clean
 
 
+def opaque_where(scene: Reconstruction, solid: np.ndarray) -> Reconstruction:
+    """The scene with photos whose alpha leaves a solid of points, and what holds it."""
+    boxes = [extent(np.clip(scene.angles_to(view, solid), *scene.field(view))) for view in range(len(scene.centres))]
+    return dataclasses.replace(scene, opaque=np.stack(boxes))
+
+
 def test_with_alpha_the_region_holds_what_is_opaque_where_only_a_spot_of_it_has_points() -> None:
-    scene = seen_by(ring(), 0.2 * ball())
-    tall = dataclasses.replace(scene, bearings=scene.bearings * [0.1, 0.8, 1.0])
-    for has_alpha, half in ((True, 4.27 * 0.4), (False, None)):
-        found = normalise(tall, has_alpha, None)
-        if half is not None:
-            assert region_half(found) == pytest.approx(half, rel=0.02)
-        else:
-            assert region_half(found) < 1.1
+    bottle = ball(4000) * [0.3, 0.3, 1.0] + [0.0, 0.0, 0.2]
+    scene = opaque_where(seen_by(ring(), 0.2 * ball()), bottle)
+    found = normalise(scene, True, None)
+    assert np.abs(found.scene_from_sfm.points(bottle)).max() <= 0.95
+    assert region_half(found) == pytest.approx(1.0, rel=0.15)
+
+
+def test_a_photo_of_a_part_and_one_that_is_mistaken_carve_nothing_away() -> None:
+    thing = ball(4000)
+    scene = opaque_where(seen_by(np.concatenate([ring(40), ring(2, radius=1.6)]), thing), thing)  # two see a part
+    assert scene.opaque is not None
+    scene.opaque[3] = [[0.2, 0.2], [0.3, 0.3]]
+    found = normalise(scene, True, None)
+    assert np.abs(found.scene_from_sfm.points(thing)).max() <= 0.95
+    assert region_half(found) == pytest.approx(1.0, rel=0.15)
+
+
+def test_photos_of_which_nothing_is_left_still_have_a_region() -> None:
+    scene = seen_by(ring(), ball())
+    nothing = dataclasses.replace(scene, opaque=np.tile([[0.45, 0.45], [0.46, 0.46]], (16, 1, 1)))
+    assert region_half(normalise(nothing, True, None)) > 0
 
 
 @pytest.mark.parametrize("has_alpha", [False, True])
