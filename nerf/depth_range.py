@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
-from nerf.reconstruction import Reconstruction, within
+from nerf.reconstruction import Reconstruction
 
 REGION_HALF = 0.9
 FEWEST_POINTS = 10  # fewer say nothing about a photo's depth range; all photos together then do
@@ -67,11 +67,10 @@ def _widened(
     """The range of distances, widened on either side as far as FEWEST_POINTS points in a photo's field of view go."""
     distance = np.linalg.norm(points - scene.centres[view], axis=1)
     beyond = (distance < low) | (distance > high)
-    inside = within(scene.angles_to(view, points[beyond]), scene.field(view))
-    distance = np.sort(distance[beyond][inside])
+    distance = np.sort(distance[beyond][scene.shows(view, points[beyond])])
     nearer, farther = distance[distance < low], distance[distance > high]
     if len(nearer) >= FEWEST_POINTS:
-        low = float(nearer[FEWEST_POINTS - 1])
+        low = max(float(nearer[FEWEST_POINTS - 1]), LEAST_NEAR)
     if len(farther) >= FEWEST_POINTS:
         high = float(farther[-FEWEST_POINTS])
     return low, high

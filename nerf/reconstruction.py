@@ -62,6 +62,12 @@ class Reconstruction:
         """The :func:`angles` at which a photo has points."""
         return angles((points - self.centres[view]) @ self.from_camera[view, :, :3])
 
+    def shows(self, view: int, points: Float[np.ndarray, "m 3"]) -> Bool[np.ndarray, "m"]:
+        """Which points lie in a photo's field of view, hidden or not."""
+        local = (points - self.centres[view]) @ self.from_camera[view, :, :3]
+        widest = self.bearings[view, :, 2].min()
+        return within(angles(local), self.field(view)) & (local[:, 2] >= widest * np.linalg.norm(local, axis=1))
+
     def distances(self) -> Float[np.ndarray, "observations"]:
         """Distance from the photo to the point, per observation."""
         return np.linalg.norm(self.points[self.point] - self.centres[self.view], axis=1)
@@ -77,8 +83,8 @@ class Reconstruction:
 
 
 def angles(vectors: Float[np.ndarray, "*m 3"]) -> Float[np.ndarray, "*m 2"]:
-    """How far to the right and down of the optical axis vectors in a camera's frame point, in radians. A photo is a
-    rectangle of them, whatever its lens."""
+    """How far to the right and down of the optical axis vectors in a camera's frame point, in radians. A photo
+    without distortion is a rectangle of them."""
     return np.arctan2(vectors[..., :2], vectors[..., 2:])
 
 

@@ -117,10 +117,9 @@ def _opaque(scene: Reconstruction) -> Region:
     points = centre + np.stack(np.meshgrid(side, side, side, indexing="ij"), axis=-1).reshape(-1, 3)
     seen, clear = np.zeros(len(points), int), np.zeros(len(points), int)
     for view in range(0, len(scene.centres), -(-len(scene.centres) // MOST_CARVING)):
-        angles = scene.angles_to(view, points)
-        in_photo = within(angles, scene.field(view))
-        seen += in_photo
-        clear += in_photo & ~within(angles, scene.opaque[view])
+        shown = scene.shows(view, points)
+        seen += shown
+        clear += shown & ~within(scene.angles_to(view, points), scene.opaque[view])
     left = points[(seen > clear) & (clear <= MISTAKEN * seen)]
     if not len(left):
         return Region(centre, half)

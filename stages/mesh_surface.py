@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from stages.contract import StageError
+
 if TYPE_CHECKING:
     from nerf.lattice import Lattice
 
@@ -34,11 +36,19 @@ def solidity(lattice: "Lattice", level: float) -> "Lattice":
 def extract(lattice: "Lattice", level: float) -> Surface:
     """The surface where density passes ``level`` (marching cubes, Lewiner et al. 2003); open where the box cuts it.
 
-    Raises ValueError when ``level`` is not strictly inside the lattice's range.
+    Raises StageError where nothing is as solid as that, or all is: of sheets of one lattice point and rods of two
+    smoothing leaves nothing.
     """
     from skimage.measure import marching_cubes
 
     values = solidity(lattice, level).values.cpu().numpy()
+    if not values.min() < 0.5 < values.max():
+        raise StageError(
+            f"no surface at density {level:.3g}",
+            f"between neighbours of the lattice it averages {values.min():.0%} to {values.max():.0%} of solid: what is "
+            "there is too thin for the lattice, or fills the box",
+            "Give a higher --mesh.resolution or another --mesh.level.",
+        )
     index, faces, _, _ = marching_cubes(values, 0.5, gradient_direction="ascent")
     vertices = lattice.low.cpu().double().numpy() + index * lattice.spacing().cpu().double().numpy()
     return Surface(vertices, faces.astype(np.int32))

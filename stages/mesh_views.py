@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 RAYS = 1 << 17  # over all photos: enough for the level and the maps, seconds on two cores
 LONGEST = 96
+LONGEST_MASK = 384  # a cell counts as ignored if any pixel in it is, and thin things must not go
 SLACK_VOXELS = 3.0  # the surface lies before the median depth, and the map is coarse
 EDGE_ON = 0.1  # cosine between viewing ray and normal below which a vertex is not seen but grazed
 ANGLE_SLACK = 0.02  # the outermost ray goes through a pixel's centre, the image ends half a cell further
@@ -44,7 +45,7 @@ class ShadowMap(NamedTuple):
     rays: "Rays"
     reach: np.ndarray  # the farthest among a cell and its neighbours, so that silhouettes hide nothing behind them
     widest: float  # cosine between the optical axis and the outermost ray
-    used: np.ndarray | None  # of the rays (h, w); None: all
+    used: np.ndarray | None  # what the mask leaves of the photo, finer than the rays; None: all
 
 
 def shadow_maps(
@@ -66,7 +67,7 @@ def shadow_maps(
         rays = type(rays)(*(part.to(lattice.low.device) for part in rays))
         stop = stopping_distance(lattice, rays, max(lattice.values.shape)).cpu().numpy()
         widest = float((rays.directions.cpu().double().numpy() @ view.scene_from_camera[:, 2]).min())
-        mask = view_mask(ingest, scene, view, downscale)
+        mask = view_mask(ingest, scene, view, max(1.0, max(camera.width, camera.height) / LONGEST_MASK))
         used = None if mask is None else mask.numpy()
         maps.append(ShadowMap(view, camera, rays, maximum_filter(stop, size=3, mode="nearest"), widest, used))
         on_view((number + 1) / len(views))
@@ -80,7 +81,11 @@ def used_rays(shadow: ShadowMap) -> "Rays":
     flat = type(shadow.rays)(*(part.flatten(0, 1) for part in shadow.rays))
     if shadow.used is None:
         return flat
-    used = torch.from_numpy(shadow.used).flatten().to(flat.near.device)
+    rows, columns = (  # of the mask, at the middles of the rays' cells
+        (np.arange(cells) * 2 + 1) * pixels // (2 * cells)
+        for cells, pixels in zip(shadow.reach.shape, shadow.used.shape, strict=True)
+    )
+    used = torch.from_numpy(shadow.used[np.ix_(rows, columns)]).flatten().to(flat.near.device)
     return type(flat)(*(part[used] for part in flat))
 
 
@@ -125,10 +130,11 @@ def _cells(offset: np.ndarray, distance: np.ndarray, shadow: ShadowMap) -> np.nd
     points = offset @ shadow.view.scene_from_camera[:, :3]
     cell = np.full(len(points), -1)
     ahead = np.flatnonzero(points[:, 2] > max(shadow.widest - ANGLE_SLACK, 1e-6) * distance)
-    scaled = project(shadow.camera, points[ahead]) * [width / shadow.camera.width, height / shadow.camera.height]
-    within = ((scaled >= 0) & (scaled < [width, height])).all(axis=1)
-    column, row = scaled[within].astype(np.int64).T
-    cell[ahead[within]] = row * width + column
+    share = project(shadow.camera, points[ahead]) / [shadow.camera.width, shadow.camera.height]
+    shown = np.flatnonzero(((share >= 0) & (share < 1)).all(axis=1))
     if shadow.used is not None:
-        cell[ahead[within]] = np.where(shadow.used[row, column], cell[ahead[within]], -1)
+        column, row = (share[shown] * shadow.used.shape[::-1]).astype(np.int64).T
+        shown = shown[shadow.used[row, column]]
+    column, row = (share[shown] * [width, height]).astype(np.int64).T
+    cell[ahead[shown]] = row * width + column
     return cell

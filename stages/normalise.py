@@ -27,6 +27,7 @@ LINKS = ("transforms.json", "scene.json")
 FEWEST_TRAINING_VIEWS = 2
 FEWEST_VIEWS = 3  # one to hold out, two to train on
 FRUSTUM_SAMPLES = 32  # bearings along each side of a photo
+OPAQUE_SAMPLES = 128  # likewise, where the edges of what is opaque are told
 FULL_TURN_DEG = 320.0  # no gap wider than the step of nine photos around
 
 
@@ -117,17 +118,21 @@ def _reconstruction(model: "SparseModel", order: list[int], boxes: "Sequence[Box
     from nerf.reconstruction import Reconstruction, angles, extent
     from stages.colmap.cameras import camera_rays
 
-    side = FRUSTUM_SAMPLES
-    rays = [camera_rays(camera, side, side).astype(float) for camera in model.cameras]
-    each = [rays[model.images[i].camera] for i in order]
-    opaque = [_within(grid, box) for grid, box in zip(each, boxes, strict=True)] if boxes is not None else None
+    def rays(side: int) -> "list[np.ndarray]":
+        of_cameras = [camera_rays(camera, side, side).astype(float) for camera in model.cameras]
+        return [of_cameras[model.images[i].camera] for i in order]
+
+    opaque = None
+    if boxes is not None:
+        parts = [_within(grid, box) for grid, box in zip(rays(OPAQUE_SAMPLES), boxes, strict=True)]
+        opaque = np.stack([extent(angles(part)) for part in parts])
     return Reconstruction(
         from_camera=np.stack([model.images[i].sfm_from_camera for i in order]),
-        bearings=np.stack([grid.reshape(-1, 3) for grid in each]),
+        bearings=np.stack([grid.reshape(-1, 3) for grid in rays(FRUSTUM_SAMPLES)]),
         points=model.xyz,
         view=np.argsort(order)[model.view],
         point=model.point,
-        opaque=None if opaque is None else np.stack([extent(angles(one)) for one in opaque]),
+        opaque=opaque,
     )
 
 

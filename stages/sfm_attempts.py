@@ -1,4 +1,4 @@
-"""What structure-from-motion tries until every photo has a place: a fixed list, cheapest first. Runs in the child.
+"""What structure-from-motion tries while photos have no place: a fixed list, cheapest first. Runs in the child.
 
 Each attempt changes one thing against the first and says so. What came of it is on disk before the next one begins
 (``attempts/`` in the stage's folder), so that whatever ends the process costs one attempt at most.

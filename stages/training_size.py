@@ -3,7 +3,6 @@
 import math
 import time
 from collections.abc import Mapping
-from statistics import median
 from typing import TYPE_CHECKING
 
 from stages.device import compute_device, cores
@@ -17,6 +16,7 @@ if TYPE_CHECKING:
     from stages.train import Config
 
 LEAST_LONG_SIDE = 150  # pixels: below this a photo shows too little to judge anything by
+MOST_PIXELS = 400e6  # of many photos, which are held in memory: 1.2 GB
 MOST_PHOTOS = 48  # of 240 photos of one scene, 0.2 rays a pixel are best (docs/numbers.md)
 TIMED_SECONDS = 1.0
 MOST_TIMED_RAYS = {"cpu": 256, "cuda": 1 << 20}
@@ -39,16 +39,17 @@ def chosen_downscale(scene: "Scene", rays: float, used: "Mapping[str, float] | N
 
     Every pixel of the training photos is then drawn about once: more pixels than rays would be decoded for
     nothing, and with fewer the run would see the same ones again while finer ones were to be had. More than MOST_PHOTOS
-    show the same things again, and rays are spread over things: then so many photos' worth of pixels is drawn. The
-    usual photo's long side keeps LEAST_LONG_SIDE pixels, and photos are never enlarged.
+    show the same things again, and rays are spread over things: then each has as many pixels as if it were one of so
+    many, as long as all have no more than MOST_PIXELS. The long side keeps LEAST_LONG_SIDE pixels, and photos are never
+    enlarged.
     """
     views, used = scene.of_split("train"), used or {}
     cameras = [scene.cameras[view.camera] for view in views]
     shares = [used.get(view.name, 1.0) for view in views]
     pixels = sum(share * camera.width * camera.height for share, camera in zip(shares, cameras, strict=True))
-    pixels *= min(1.0, MOST_PHOTOS / len(views))
-    most = median(max(camera.width, camera.height) for camera in cameras) / LEAST_LONG_SIDE
-    return max(1.0, math.floor(10 * min(math.sqrt(pixels / rays), most)) / 10)
+    drawn = max(rays, min(rays * len(views) / MOST_PHOTOS, MOST_PIXELS))
+    most = min(max(camera.width, camera.height) for camera in cameras) / LEAST_LONG_SIDE
+    return max(1.0, math.floor(10 * min(math.sqrt(pixels / drawn), most)) / 10)
 
 
 def grid_size(config: "Config", scene: "Scene", rays: float) -> dict[str, int]:

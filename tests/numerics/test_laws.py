@@ -17,8 +17,9 @@ from nerf.kernels.cache import cell_numbers, occupied
 from nerf.lattice import Lattice as DensityLattice
 from nerf.rays import Rays, clip_to_box
 from nerf.sampling import invert_cdf
+from stages.contract import StageError
 from stages.image_metrics import ssim
-from stages.mesh_surface import extract
+from stages.mesh_surface import extract, is_watertight
 
 BACKENDS = pytest.mark.parametrize("backend", [reference, warp], ids=["torch", "warp"])
 DENSITY = st.one_of(st.just(0.0), st.floats(-45, 30).map(lambda e: 10.0**e), st.floats(0, 100))
@@ -188,14 +189,20 @@ def test_ssim_of_flat_pictures_is_that_of_their_means(a: list[float], b: list[fl
 def test_a_lattice_without_a_surface_is_refused(density: float) -> None:
     """Empty, full, constant: no level lies strictly inside."""
     corner = torch.ones(3)
-    with pytest.raises(ValueError, match=r"[Ss]urface level must be within volume data range"):
+    with pytest.raises(StageError, match="no surface at density 7"):
         extract(DensityLattice(torch.full((6, 6, 6), density), -corner, corner), 7.0)
 
 
-@pytest.mark.parametrize("density", [8.0, 1e4, 1e30])
-def test_one_full_vertex_in_an_empty_lattice_is_a_closed_surface(density: float) -> None:
-    values = torch.zeros(5, 5, 5)
-    values[2, 2, 2] = density
+@pytest.mark.parametrize("density", [1e4, 1e30])
+def test_a_block_of_full_vertices_is_a_closed_surface_and_a_single_one_is_too_thin(
+    density: float,
+) -> None:
+    values = torch.zeros(7, 7, 7)
+    values[2:5, 2:5, 2:5] = density
     surface = extract(DensityLattice(values, -torch.ones(3), torch.ones(3)), 7.0)
-    assert len(surface.faces) == 8 and np.isfinite(surface.vertices).all()
-    assert 0 < np.abs(surface.vertices).max() <= 0.25 + 1e-6
+    assert is_watertight(surface) and np.isfinite(surface.vertices).all()
+    assert 1 / 3 < np.abs(surface.vertices).max() < 2 / 3
+    alone = torch.zeros(7, 7, 7)
+    alone[3, 3, 3] = density
+    with pytest.raises(StageError, match="too thin for the lattice"):
+        extract(DensityLattice(alone, -torch.ones(3), torch.ones(3)), 7.0)

@@ -109,7 +109,6 @@ def test_what_turns_before_a_background_that_never_moves_is_another_picture_wher
     one, other = seen(0, noise=1), seen(0, noise=2)
     for view, turned in ((one, 0), (other, 12)):
         view[130:170, 180:220] = cut_out(NEAR, 50 + turned, 50, 40, 40)
-    mask[:] = 0
     mask[130:170, 180:220] = 255
     assert found(one, other) == {1: 0}
     assert near_duplicates([thumbnail(view, small(mask)) for view in (one, other)], (1.0, 1.0)) == {}

@@ -15,6 +15,7 @@ from stages.training_setup import grid_settings, has_sky
 from stages.training_size import (
     LEAST_LONG_SIDE,
     MOST_PHOTOS,
+    MOST_PIXELS,
     chosen_downscale,
     grid_size,
     rays_in_budget,
@@ -61,14 +62,6 @@ def test_what_masks_ignore_is_not_drawn_and_takes_no_pixels(scene: Scene) -> Non
     assert chosen_downscale(large, 3_000_000, used) == 1.0 == chosen_downscale(large, 12_000_000)
 
 
-def test_one_small_photo_does_not_decide_for_all(scene: Scene) -> None:
-    small = Camera("PINHOLE", 150, 100, (1.0, 1.0, 0.0, 0.0))
-    views = tuple(replace(view, camera=int(index == 1)) for index, view in enumerate(scene.views))
-    mixed = replace(of_size(scene, 2000, 1000), views=views)
-    mixed = replace(mixed, cameras=(*mixed.cameras, small))
-    assert chosen_downscale(mixed, 2_500_000) == 2.0
-
-
 def test_many_photos_of_the_same_things_are_not_made_ever_smaller(scene: Scene) -> None:
     train = scene.of_split("train")[0]
     few, many = (
@@ -76,6 +69,8 @@ def test_many_photos_of_the_same_things_are_not_made_ever_smaller(scene: Scene) 
         for count in (MOST_PHOTOS, 10 * MOST_PHOTOS)
     )
     assert chosen_downscale(few, 6e6) == chosen_downscale(many, 6e6) == 4.0
+    assert chosen_downscale(many, 90e6) == math.floor(10 * math.sqrt(480 * 2e6 / MOST_PIXELS)) / 10 > 1
+    assert chosen_downscale(many, 960e6) == 1.0
 
 
 GRID = Config(
