@@ -58,14 +58,16 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     )
     photos, order = [photo for photo, _ in posed], [i for _, i in posed]
     has_alpha = _has_alpha(photos, progress)
-    sfm = _reconstruction(model, order, [photo.opaque for photo in photos] if has_alpha else None)
+    official = read_json(inputs["sfm"] / "registration.json")["test_files"]
+    split = _split(photos, config.test_every, official)
+    # What is opaque in a test photo decides nothing.
+    boxes = [photo.opaque if part == "train" else None for photo, part in zip(photos, split, strict=True)]
+    sfm = _reconstruction(model, order, boxes if has_alpha else None)
     try:
         found = normalise(sfm, has_alpha, config.roi)
     except ValueError as error:
         hint = "Take photos from different places, or give --normalise.roi."
         raise StageError("the scene has no scale", str(error), hint) from error
-    official = read_json(inputs["sfm"] / "registration.json")["test_files"]
-    split = _split(photos, config.test_every, official)
     if split.count("train") < FEWEST_TRAINING_VIEWS:
         raise StageError(
             f"only {split.count('train')} of {len(split)} photos are left to train on",
