@@ -2,7 +2,7 @@
 
 A file that already is plain (8-bit RGB or RGBA, sRGB, upright JPEG or PNG) is copied byte for byte; everything
 else is written as PNG. Each photo is decoded by one worker and dropped again, so memory holds one per worker, and of
-each photo a thumbnail. The frames that are taken from a video are written as JPEG.
+each photo a thumbnail, and one of its mask. The frames that are taken from a video are written as JPEG.
 """
 
 import hashlib
