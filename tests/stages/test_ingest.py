@@ -257,6 +257,7 @@ def test_masks_go_with_their_photos(tmp_path: Path, progress: Any) -> None:
     photos = read_photos(tmp_path / "out")
     assert result.outputs == ("images", "photos.json", "masks")
     assert [photo.mask is not None for photo in photos] == [True, False, False, False, True, True]
+    assert [photo.used_share for photo in photos] == [0.75, 1, 1, 1, 0.5, 0.5]
     for photo, columns in zip([photos[0], photos[4], photos[5]], (8, 16, 16), strict=True):
         file = f"masks/{photo.file.removeprefix('images/')}.png"
         mask = np.asarray(Image.open(tmp_path / "out" / file))
@@ -347,6 +348,17 @@ def test_only_photos_named_by_the_cameras_are_taken(tmp_path: Path, progress: An
     assert read_frame_names(tmp_path / "out")["images/a"] == "images/a.png"
     assert result.line == "3 photos 32×24, cameras given, 1 refused"
     assert progress.notes == ["refused images/gone.png: there is no such file"]
+
+
+def test_what_is_opaque_is_noted(tmp_path: Path, progress: Any) -> None:
+    cut_out = np.asarray(picture(1).convert("RGBA")).copy()
+    cut_out[..., 3] = 0
+    cut_out[6:12, 8:24, 3] = 255
+    (tmp_path / "in").mkdir()
+    Image.fromarray(cut_out).save(tmp_path / "in" / "a.png")
+    put(tmp_path / "in", "b.jpg")
+    ingest.run(Config(photos=tmp_path / "in"), {}, tmp_path / "out", progress)
+    assert [photo.opaque for photo in read_photos(tmp_path / "out")] == [(0.25, 0.25, 0.75, 0.5), None]
 
 
 def test_an_alpha_channel_without_transparent_parts_is_none(tmp_path: Path, progress: Any) -> None:

@@ -2,6 +2,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from pydantic import ValidationError
 
@@ -12,8 +13,9 @@ from stages.contract import Progress, StageError
 from stages.device import cores
 from stages.field_files import load_field
 from stages.files import read_json
+from stages.photos import Photo, write_photos
 from stages.train import Config
-from tests.stages.photo_scene import photographed
+from tests.stages.photo_scene import HEIGHT, WIDTH, photographed
 
 TINY: dict[str, Any] = {
     "depth": 2,
@@ -200,6 +202,26 @@ def test_plan_answers_everything_for_the_grid_field(
     assert planned.learning_rate == train.GRID_RATES["bounded" if bounded else "contracted"]
     assert train.plan(Config.model_validate(planned.model_dump()), inputs, progress) == planned
     assert train.plan(Config(levels=3, finest=64), inputs, progress).levels == 3
+
+
+def test_what_masks_ignore_does_not_count_for_the_size_of_the_photos(
+    tmp_path: Path, progress: Progress, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("stages.training_size.LEAST_LONG_SIDE", 2)
+    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+    mask[: HEIGHT // 4] = 255
+    sizes: dict[str, Any] = {"levels": 2, "log2_rows": 8, "finest": 16, "batch_samples": 256, "steps": 2}
+    chosen = []
+    for name, given in (("all", None), ("some", mask)):
+        inputs, scene = photographed(tmp_path / name, mask=given)
+        share = 1.0 if given is None else 0.25
+        photos = [
+            Photo(v.name, v.file, WIDTH, HEIGHT, 0, None, None, False, 1.0, mask=v.mask, used_share=share)
+            for v in scene.views
+        ]
+        write_photos(inputs["ingest"], photos, [], {})
+        chosen.append(train.plan(Config(**sizes), inputs, progress).downscale)
+    assert chosen[0] == pytest.approx(2 * chosen[1], abs=0.2) and chosen[1] > 1
 
 
 def test_plan_answers_everything_for_the_paper_field(
