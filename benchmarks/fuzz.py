@@ -108,8 +108,18 @@ def attack(name: str, seconds: float, seed: int) -> dict[str, Any]:
         try:
             seeded(seed)(check)()
         except (Exception, ExceptionGroup) as fault:  # any is one: that is what is looked for
-            faults.append(f"seed {seed}: {type(fault).__name__}: {str(fault)[:300]} {' '.join(fault.__notes__)[:1000]}")
+            faults += [f"seed {seed}: {_in_words(one)}" for one in _each(fault)]
     return counts | {"faults": faults}
+
+
+def _each(fault: Exception) -> tuple[Exception, ...]:
+    """The faults that Hypothesis found in one go: a group where they differ."""
+    return fault.exceptions if isinstance(fault, ExceptionGroup) else (fault,)
+
+
+def _in_words(fault: Exception) -> str:
+    notes = " ".join(getattr(fault, "__notes__", ()))
+    return f"{type(fault).__name__}: {str(fault)[:300]} {notes[:1000]}"
 
 
 def print_table(table: dict[str, dict[str, Any]]) -> None:

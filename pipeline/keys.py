@@ -15,6 +15,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from stages.contract import StageError
+from stages.sources import cannot_read
 
 KEY_LENGTH = 16  # hex digits shown in folder names: 64 bits
 
@@ -58,7 +59,13 @@ class ContentIndex:
                 self.changed = True  # a damaged cache is rebuilt, it cannot cause a wrong answer
 
     def sha256(self, path: Path) -> str:
-        """sha256 of one file, from memory where size and mtime still agree."""
+        """sha256 of one file, from memory where size and mtime still agree. Raises StageError if it cannot be read."""
+        try:
+            return self._sha256(path)
+        except OSError as error:
+            raise cannot_read(path, error) from error
+
+    def _sha256(self, path: Path) -> str:
         stat = path.stat()
         name = str(path.resolve())
         identity = [stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns]

@@ -25,6 +25,8 @@ from typing import Annotated, Any, Protocol
 from pydantic import BaseModel, ConfigDict
 from tyro.conf import Suppress
 
+MOST_LETTERS = 600  # of each part of an error
+
 
 class StageConfig(BaseModel):
     """Settings of one stage. Unknown keys, infinities and NaN are refused. A ``Path`` enters keys by content."""
@@ -38,11 +40,19 @@ OptionalSourcePath = Annotated[Path | None, Suppress]
 
 
 class StageError(Exception):
-    """A failure the user can act on: what happened, why, and what to try next (one sentence each)."""
+    """A failure the user can act on: what happened, why, and what to try next (one sentence each).
+
+    Each part is cut where it is very long: it may quote a file, in which a name may have any length.
+    """
 
     def __init__(self, what: str, why: str, hint: str) -> None:
-        super().__init__(f"{what}: {why}. {hint}")
-        self.what, self.why, self.hint = what, why, hint
+        self.what, self.why, self.hint = (bounded(part) for part in (what, why, hint))
+        super().__init__(f"{self.what}: {self.why}. {self.hint}")
+
+
+def bounded(text: str) -> str:
+    """At most ``MOST_LETTERS`` of it."""
+    return text if len(text) <= MOST_LETTERS else f"{text[:MOST_LETTERS]}…"
 
 
 class Progress(Protocol):

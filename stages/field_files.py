@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stages.contract import StageError
-from stages.files import MOST_LETTERS, first_fault, read_json, write_json
+from stages.files import first_fault, read_json, write_json
 
 if TYPE_CHECKING:
     from nerf.grid_field import GridField
@@ -57,8 +57,17 @@ def load_field(folder: Path, device: str = "cpu") -> "tuple[RadianceModel, dict[
         neutral = _neutral(info)
     except ValidationError as error:
         raise StageError("cannot read the trained field", first_fault(error), "Run stage train again.") from error
-    except (OSError, KeyError, TypeError, AttributeError, ValueError, RuntimeError, SafetensorError) as error:
-        why = " ".join(str(error).split())[:MOST_LETTERS]  # torch lists mismatches over several lines
+    except (
+        OSError,
+        KeyError,
+        TypeError,
+        AttributeError,
+        ValueError,
+        OverflowError,
+        RuntimeError,
+        SafetensorError,
+    ) as error:
+        why = " ".join(str(error).split())  # torch lists mismatches over several lines
         raise StageError("cannot read the trained field", why, "Run stage train again.") from error
     model = model.to(device).requires_grad_(False)
     return model if neutral is None else _exposed(model, neutral, device), info
@@ -119,7 +128,7 @@ def _untrained(kind: str, settings: dict[str, Any], stored: int, device: str) ->
     from stages.backend import chosen_backend, load_backend
 
     if kind not in ("grid", "paper"):
-        raise ValueError(f"a field of kind {str(kind)[:MOST_LETTERS]!r} is unknown to this version")
+        raise ValueError(f"a field of kind {kind!r} is unknown to this version")
     text = json.dumps(settings)
     if kind == "grid":
         grid = GridSettings(**settings)  # which refuses unknown names; their types are checked next

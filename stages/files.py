@@ -5,7 +5,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from stages.contract import StageError
+from stages.contract import StageError, bounded
 
 if TYPE_CHECKING:
     import numpy as np
@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from nerf.scene import Scene
 
 T = TypeVar("T")
-MOST_LETTERS = 300  # of what another program says of a file
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -53,7 +52,7 @@ def read_dataclass(path: Path, kind: type[T]) -> T:
 def first_fault(error: "ValidationError") -> str:
     """Where the first fault is and what, in one line."""
     fault = error.errors()[0]
-    return f"{'.'.join(map(str, fault['loc'])) or 'it'}: {fault['msg']}"[:MOST_LETTERS]
+    return bounded(f"{'.'.join(map(str, fault['loc'])) or 'it'}: {fault['msg']}")
 
 
 def write_durably(path: Path, content: bytes) -> None:
@@ -120,4 +119,4 @@ def read_scene(folder: Path) -> "Scene":
     try:
         return Scene.from_json(value)
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
-        raise damaged("scene.json", f"{type(error).__name__}: {error}"[:MOST_LETTERS]) from error
+        raise damaged("scene.json", f"{type(error).__name__}: {error}") from error

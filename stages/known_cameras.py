@@ -20,7 +20,7 @@ from stages.colmap.model_files import FARTHEST, LARGEST_SIDE
 from stages.colmap.models import read_model
 from stages.contract import StageError
 from stages.photos import Photo
-from stages.sources import read_transforms
+from stages.sources import pose_matrix, read_transforms
 from stages.sparse_model import SparseImage, SparseModel
 from stages.transforms_export import OPENGL_FROM_OPENCV
 
@@ -167,11 +167,9 @@ def _focal_of(angle: Any, size: float, name: str) -> float:
 def _pose(matrix: Any, name: str) -> Float[np.ndarray, "3 4"]:
     """world_from_camera with OpenCV axes, from a matrix as written in a transforms file."""
     try:
-        pose = np.array(matrix, np.float64)[:3]
-    except (TypeError, ValueError, OverflowError) as error:
-        raise _wrong(f"the transform_matrix of frame {name!r}", "it is not a matrix of numbers") from error
-    if pose.shape != (3, 4) or not np.isfinite(pose).all():
-        raise _wrong(f"the transform_matrix of frame {name!r}", "it is not 4 × 4 (or 3 × 4) finite numbers")
+        pose = pose_matrix(matrix)
+    except ValueError as error:
+        raise _wrong(f"frame {name!r}", str(error)) from error
     if (place := np.abs(pose[:, 3]).max()) > FARTHEST:
         why = f"its place is {place:.3g} units from the origin, and the most is {FARTHEST:g}"
         raise _wrong(f"the transform_matrix of frame {name!r}", why)

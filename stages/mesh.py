@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from stages.mesh_views import ShadowMap
 
 NEEDS = ("ingest", "normalise", "train")
-VERSION = 3
+VERSION = 4
 RESUMES = False
 LINKS = ("mesh.glb", "mesh.ply", "mesh.obj")
 UNKEYED = ("seconds",)  # it decides the resolution, and that enters the key
@@ -35,6 +35,7 @@ UNKEYED = ("seconds",)  # it decides the resolution, and that enters the key
 HALF_BOX = 0.9  # the region of interest is [-0.9, 0.9]^3 of the scene frame
 CHUNK = 1 << 16
 LEVEL_RAYS = 1024
+COLOUR_SAMPLES = 8  # through the two lattice cells about a vertex
 BYTES_PER_POINT = 20  # density, occupancy, its averages and marching cubes; 16 measured at 208³
 
 Format = Literal["glb", "ply", "obj"]
@@ -137,7 +138,7 @@ def reconstruct(
     progress.update("colours", 0.9)
     nearest = KDTree(cleaned.surface.vertices).query(surface.vertices)[1]
     directions = sight.direction[cleaned.vertex[nearest]]
-    colours = _colours(model, surface.vertices, directions, device)
+    colours = _colours(model, surface.vertices, directions, voxel, device)
     mesh = ColouredMesh(*surface, vertex_normals(surface), colours)
     return Reconstruction(mesh, level, cleaned, openness(surface, HALF_BOX, voxel), voxel)
 
@@ -183,15 +184,30 @@ def _level(
     return level
 
 
-def _colours(model: "RadianceModel", vertices: "np.ndarray", directions: "np.ndarray", device: str) -> "np.ndarray":
-    """sRGB bytes (n, 3) of the field at each vertex, seen along ``directions`` (n, 3)."""
+def _colours(
+    model: "RadianceModel", vertices: "np.ndarray", directions: "np.ndarray", voxel: float, device: str
+) -> "np.ndarray":
+    """sRGB bytes (n, 3) of what is seen along ``directions`` (n, 3) from a lattice cell before each vertex to one
+    behind it.
+
+    A field's colour means something where the field is dense, and a vertex is as far from there as the lattice is
+    coarse. Light that nothing there stops comes from where the way ends.
+    """
     import torch
 
-    points = torch.tensor(vertices, dtype=torch.float32, device=device).split(CHUNK)
-    views = torch.tensor(directions, dtype=torch.float32, device=device).split(CHUNK)
-    with torch.no_grad():
-        colours = torch.cat([model.colour(*pair) for pair in zip(points, views, strict=True)])
-    return (colours.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
+    from nerf.compositing import composite
+
+    t = torch.linspace(-voxel, voxel, COLOUR_SAMPLES + 1, device=device)
+    colours = []
+    for start in range(0, len(vertices), CHUNK // COLOUR_SAMPLES):
+        some = slice(start, start + CHUNK // COLOUR_SAMPLES)
+        points, views = (torch.tensor(a[some], dtype=torch.float32, device=device) for a in (vertices, directions))
+        along = points[:, None] + t[:-1, None] * views[:, None]
+        with torch.no_grad():
+            each = model.colour(along, views[:, None].expand_as(along))
+            seen, _ = composite(model.density(along), each, t.expand(len(points), -1), each[:, -1])
+        colours.append(seen.colour)
+    return (torch.cat(colours).clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
 
 
 def write_mesh(config: Config, mesh: "ColouredMesh", scene: "Scene", folder: Path) -> tuple[str, ...]:

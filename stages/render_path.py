@@ -122,11 +122,12 @@ def _in_scene(matrix: Any, scene_from_sfm: "Similarity") -> "np.ndarray":
     import numpy as np
 
     from nerf.camera_paths import nearest_rotations
+    from stages.sources import pose_matrix
     from stages.transforms_export import OPENGL_FROM_OPENCV
 
-    pose = np.array(matrix, float)[:3].reshape(3, 4)
-    if not (np.isfinite(pose).all() and np.linalg.det(pose[:, :3]) > 0):
-        raise ValueError("transform_matrix is no camera pose")
+    pose = pose_matrix(matrix)
+    if not np.linalg.det(pose[:, :3]) > 0:
+        raise ValueError("its transform_matrix mirrors, or has no volume")
     rotation = nearest_rotations(pose[:, :3] @ OPENGL_FROM_OPENCV)
     return scene_from_sfm.pose(np.concatenate([rotation, pose[:, 3:]], axis=1))
 

@@ -9,9 +9,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from stages.contract import StageError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from jaxtyping import Float
 
 SourceKind = Literal["photos", "video", "transforms", "blender", "colmap"]
 
@@ -66,10 +70,14 @@ def find_source(photos: Path, cameras: Path | None = None) -> Source:
         _check_given(photos, cameras)
         source = _source(photos, cameras)
         return source if source.kind == "video" else replace(source, masks=_list_masks(source.root, source.files))
-    except PermissionError as error:
-        raise StageError(
-            f"cannot read {error.filename}", "permission denied", "Change its permissions (chmod -R u+rX)."
-        ) from error
+    except OSError as error:
+        raise cannot_read(error.filename or photos, error) from error
+
+
+def cannot_read(path: Path | str, error: OSError) -> StageError:
+    """The error for a file or folder of the user's that cannot be read, or has gone since it was listed."""
+    hint = "Check that it is still there and may be read (chmod -R u+rX), then run again."
+    return StageError(f"cannot read {path}", (error.strerror or str(error)).lower(), hint)
 
 
 def _source(photos: Path, cameras: Path | None) -> Source:
@@ -159,6 +167,19 @@ def read_transforms(transforms: Path) -> dict[str, Any]:
             why = f"no file can have the name of frame {index}, {ascii(wrong)[:MOST_LETTERS]}"
             raise StageError(f"cannot use {transforms.name}", why, hint)
     return content
+
+
+def pose_matrix(matrix: Any) -> "Float[np.ndarray, '3 4']":
+    """The first three rows of a frame's ``transform_matrix``. Raises ValueError for what is no matrix of that shape."""
+    import numpy as np
+
+    try:
+        pose = np.array(matrix, np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ValueError("its transform_matrix is not a matrix of numbers") from error
+    if pose.shape not in ((3, 4), (4, 4)) or not np.isfinite(pose[:3]).all():
+        raise ValueError("its transform_matrix is not 4 × 4 (or 3 × 4) finite numbers")
+    return pose[:3]
 
 
 def _names(frame: dict[str, Any]) -> tuple[str, ...]:

@@ -4,6 +4,7 @@ A loader may answer, or refuse in words (``REFUSALS``). Anything else that it ra
 takes more than ``SECONDS`` of processor time.
 """
 
+import contextlib
 import hashlib
 import io
 import json
@@ -319,7 +320,8 @@ def _load_run(folder: Path) -> None:
     from pipeline import status
     from pipeline.cli import _reader
 
-    status.all_statuses(*_reader(folder))
+    with contextlib.chdir(folder):  # where relative paths in it lead
+        status.all_statuses(*_reader(folder))
 
 
 @cache

@@ -1,12 +1,14 @@
 """Loaders answer or refuse in words, whatever they are given. The long run: ``python -m benchmarks.fuzz``."""
 
+import json
 import os
 import struct
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, given, settings
 
-from tests.fuzz.loaders import LOADERS, attempt, colmap_models
+from tests.fuzz.loaders import LOADERS, attempt, colmap_models, manifest, run_file, transforms
 
 SLOW = (HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.filter_too_much)
 EXAMPLES = int(os.environ.get("FUZZ_EXAMPLES", "60"))
@@ -24,6 +26,18 @@ def test_a_loader_answers_or_refuses_in_words(name: str) -> None:
 
     check()
     assert any(taken) and not all(taken), "what is given must be valid at times, and damaged at times"
+
+
+@pytest.mark.parametrize(
+    ("name", "file", "content"),
+    [
+        ("run.json", "run.json", run_file() | {"version": "x" * 70_000}),
+        ("camera path", "path.json", transforms() | {"fl_x": "x" * 70_000}),
+        ("manifest.json", "manifest.json", manifest() | {"x" * 70_000: 1}),
+    ],
+)
+def test_a_refusal_does_not_repeat_what_may_have_any_length(name: str, file: str, content: dict[str, Any]) -> None:
+    assert not attempt(LOADERS[name], {file: json.dumps(content).encode()})
 
 
 @pytest.mark.parametrize("error", [float("nan"), float("inf"), 1e308])

@@ -83,3 +83,10 @@ def test_hidden_files_do_not_enter_a_folders_digest(tmp_path: Path):
     assert index.of_path(folder) == before
     (folder / "images.bin").write_bytes(b"2")
     assert index.of_path(folder) != before
+
+
+@pytest.mark.skipif(not Path("/proc/self/mem").exists(), reason="needs a file that nobody can read")
+def test_a_file_that_cannot_be_read_is_refused_in_words(tmp_path: Path):
+    (tmp_path / "a.jpg").symlink_to("/proc/self/mem")
+    with pytest.raises(StageError, match=r"cannot read .*a\.jpg: .+ Check that it is still there"):
+        ContentIndex(tmp_path / "index.json").of_path(tmp_path)

@@ -125,7 +125,14 @@ def test_a_photo_without_exposure_is_refused_with_those_that_have_one(tmp_path: 
 
 
 @pytest.mark.parametrize(
-    "harm", [{"neutral": [0.0, 0.0]}, {"photos": {"a.jpg": [0.0, "bright", 0.0]}}, {"photos": None}, {"neutral": 1.0}]
+    "harm",
+    [
+        {"neutral": [0.0, 0.0]},
+        {"photos": {"a.jpg": [0.0, "bright", 0.0]}},
+        {"photos": None},
+        {"neutral": 1.0},
+        {"neutral": [10**400, 0, 0]},
+    ],
 )
 def test_damaged_exposure_is_refused_in_words(harm: dict[str, object], tmp_path: Path) -> None:
     save_field(tmp_path, KINDS["paper"], INFO | {"exposure": EXPOSURE | harm})

@@ -113,9 +113,25 @@ def test_a_ball_becomes_a_closed_ball_in_the_sfm_frame(run_mesh, progress):
         assert loaded.is_watertight and loaded.volume > 0
         assert 0 < abs(loaded.volume / (4 / 3 * np.pi * (radii.mean() / 0.25) ** 3) - 1) < 0.02
         expected = np.rint(255 * (0.5 + in_scene / 1.8))
-        assert np.abs(colours_of(loaded) - expected).max() <= 1
+        assert np.abs(colours_of(loaded) - expected).max() <= 255 * VOXEL / 1.8, "those of a lattice cell away, at most"
     assert any("surface at density" in note for note in progress.notes)
     assert any("density at 48³ points" in message for message, _ in progress.updates)
+
+
+class Painted(Solid):
+    """A field that is red where there is something, and white where there is nothing."""
+
+    def density(self, points):
+        return self.inside * (self.distance(points) < 0)
+
+    def colour(self, points, directions):
+        return torch.where(self.distance(points)[..., None] < 0, torch.tensor([1.0, 0, 0]), torch.ones(3))
+
+
+def test_colours_are_those_of_what_is_there_not_of_the_emptiness_that_a_vertex_may_lie_in(run_mesh):
+    _, folder = run_mesh(Painted(ball, inside=3000.0))
+    colours = colours_of(trimesh.load_mesh(folder / "mesh.ply", process=False))
+    assert (colours[:, 1:] < 64).mean() > 0.99
 
 
 def test_the_facts_are_those_of_the_files(run_mesh):

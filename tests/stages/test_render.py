@@ -191,8 +191,10 @@ def test_a_blender_camera_angle_is_understood_and_missing_sizes_are_the_photos(t
 @pytest.mark.parametrize(
     ("frame", "words"),
     [
-        ({"transform_matrix": [[1, 2], [3, 4]]}, "cannot use frame 0 of t.json"),
-        ({"transform_matrix": np.zeros((4, 4)).tolist()}, "transform_matrix is no camera pose"),
+        ({"transform_matrix": [[1, 2], [3, 4]]}, "cannot use frame 0 of t.json: its transform_matrix is not 4 × 4"),
+        ({"transform_matrix": 7}, "cannot use frame 0 of t.json: its transform_matrix is not 4 × 4"),
+        ({"transform_matrix": None}, "cannot use frame 0 of t.json: its transform_matrix is not"),
+        ({"transform_matrix": np.zeros((4, 4)).tolist()}, "its transform_matrix mirrors, or has no volume"),
         ({"transform_matrix": np.eye(4).tolist(), "fl_x": -3}, "size 160 x 120 with focal length -3 is no camera"),
     ],
 )

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -236,6 +237,17 @@ def test_a_folder_without_read_permission(tmp_path: Path) -> None:
         assert refusal(tmp_path).why == "permission denied"
     finally:
         (tmp_path / "a").chmod(0o755)
+
+
+def test_a_folder_that_goes_while_it_is_listed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    touch(tmp_path, "a/b.jpg")
+
+    def enters(folder: Path) -> bool:
+        shutil.rmtree(folder)
+        return True
+
+    monkeypatch.setattr("stages.sources._is_photo_folder", enters)
+    assert refusal(tmp_path).what == f"cannot read {tmp_path / 'a'}"
 
 
 def test_a_name_that_is_not_unicode_can_be_written_down(tmp_path: Path) -> None:
