@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from stages.mesh_preview import Viewpoint, framing, shade, visible_faces
+from stages.mesh_preview import Viewpoint, framing, look, shade
 
 if TYPE_CHECKING:
     from nerf.scene import Scene
@@ -22,9 +22,9 @@ def picture(mesh: "ColouredMesh", scene: "Scene") -> np.ndarray:
     """(2 × HEIGHT, 2 × WIDTH, 3) uint8: a row per viewpoint, colours on the left and clay on the right."""
     rows = []
     for camera in viewpoints(mesh.vertices, scene):
-        visible = visible_faces(mesh.vertices, mesh.faces, camera)
-        colour = shade(mesh.vertices, mesh.faces, visible, mesh.colours, camera, BAKED_SHADING)
-        clay = shade(mesh.vertices, mesh.faces, visible, None, camera)
+        seen = look(mesh.vertices, mesh.faces, camera)
+        colour = shade(seen, mesh.faces, mesh.colours, camera, BAKED_SHADING)
+        clay = shade(seen, mesh.faces, None, camera, 1.0)
         rows.append(np.concatenate([colour, clay], axis=1))
     return np.concatenate(rows)
 

@@ -12,7 +12,7 @@ BLOCK = 1 << 17  # triangle-pixel pairs tested at a time: what fits into a proce
 KEY_LIGHT, HEADLIGHT, SKY = 0.45, 0.30, 0.30  # shares of the shading; together a little over 1 where all agree
 TOWARDS_LIGHT = np.array([-0.5, -0.75, -0.45]) / np.linalg.norm([0.5, 0.75, 0.45])  # camera axes: upper left, behind
 CLAY = np.array([205, 200, 192], np.uint8)
-BACKFACE = np.array([96, 84, 92])  # the inside of an open surface must not pass for its outside
+BACKFACE = np.array([96, 84, 92], np.float32)  # the inside of an open surface must not pass for its outside
 SKY_TOP, SKY_BOTTOM = np.array([250.0, 251, 253]), np.array([222.0, 226, 232])
 
 
@@ -33,11 +33,25 @@ def preview(
     ``colours`` are one uint8 triple per vertex, or None for plain clay; ``shading`` blends from the colours as they
     are (0) to fully lit (1). Faces that reach behind the camera are left out.
     """
-    return shade(vertices, faces, visible_faces(vertices, faces, camera), colours, camera, shading)
+    return shade(look(vertices, faces, camera), faces, colours, camera, shading)
 
 
-def visible_faces(vertices: np.ndarray, faces: np.ndarray, camera: Viewpoint) -> np.ndarray:
-    """The face in front at each subpixel, flat, -1 where there is none: the part of a preview worth doing once."""
+class Seen(NamedTuple):
+    """What a viewpoint sees, per subpixel on the mesh: the part of a preview worth doing once for several colours.
+
+    ``pixel`` is its flat index, ``face`` the face in front, ``share`` (n, 3) what each corner has of it, in
+    perspective, ``light`` how bright it is, and ``away`` whether the face's back is seen.
+    """
+
+    pixel: np.ndarray
+    face: np.ndarray
+    share: np.ndarray
+    light: np.ndarray
+    away: np.ndarray
+
+
+def look(vertices: np.ndarray, faces: np.ndarray, camera: Viewpoint) -> Seen:
+    """The faces in front, and the light on them; the arguments are preview's."""
     camera = _supersampled(camera)
     points = _in_camera(vertices, camera)
     depth = points[:, 2]
@@ -45,24 +59,21 @@ def visible_faces(vertices: np.ndarray, faces: np.ndarray, camera: Viewpoint) ->
     divisor = np.where(depth > 0, depth, 1.0)[:, None]
     pixels = points[:, :2] / divisor * camera.focal_px + [camera.width / 2, camera.height / 2]
     winner = _nearest_faces(pixels, depth, faces[usable], camera)
-    return np.where(winner >= 0, usable[winner] if len(usable) else -1, -1)
+    pixel = np.flatnonzero(winner >= 0)
+    face = usable[winner[pixel]]
+    return Seen(pixel, face, *_lit(points, faces, face, pixel, camera))
 
 
-def shade(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    face_of_pixel: np.ndarray,
-    colours: np.ndarray | None,
-    camera: Viewpoint,
-    shading: float = 1.0,
-) -> np.ndarray:
-    """Light what :func:`visible_faces` found and average the subpixels; the other arguments are preview's."""
-    large = _supersampled(camera)
-    image = _background(large)
-    hit = np.flatnonzero(face_of_pixel >= 0)
-    if len(hit):
-        base = np.broadcast_to(CLAY, vertices.shape) if colours is None else colours
-        image[hit] = _lit(_in_camera(vertices, large), base, faces[face_of_pixel[hit]], hit, large, shading)
+def shade(seen: Seen, faces: np.ndarray, colours: np.ndarray | None, camera: Viewpoint, shading: float) -> np.ndarray:
+    """Colour what :func:`look` saw and average the subpixels; the other arguments are preview's."""
+    image = _background(_supersampled(camera))
+    if colours is None:
+        colour = CLAY.astype(np.float32)
+    else:
+        colour = (seen.share[:, :, None] * colours[faces[seen.face]]).sum(axis=1)
+    light = seen.light[:, None]
+    lit = colour * (1 - shading + shading * light)
+    image[seen.pixel] = np.clip(np.where(seen.away[:, None], 0.5 * lit + 0.5 * BACKFACE * light, lit), 0, 255)
     tiled = image.reshape(camera.height, SUPERSAMPLING, camera.width, SUPERSAMPLING, 3)
     return np.rint(tiled.mean(axis=(1, 3))).astype(np.uint8)
 
@@ -118,32 +129,36 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _lit(
-    points: np.ndarray, colours: np.ndarray, faces: np.ndarray, pixel: np.ndarray, camera: Viewpoint, shading: float
-) -> np.ndarray:
-    """Light the visible faces at their pixels; ``points`` are in camera coordinates."""
+    points: np.ndarray, faces: np.ndarray, face: np.ndarray, pixel: np.ndarray, camera: Viewpoint
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The shares, light and backs of :class:`Seen`, float32; ``points`` are in camera coordinates.
+
+    What belongs to a face is computed once for it, in float64: a small one's cross products nearly cancel.
+    """
     a, b, c = points[faces].swapaxes(0, 1)
+    opposite = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1).astype(np.float32)
     normals = np.cross(b - a, c - a)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = np.divide(normals, length, out=normals, where=length > 0).astype(np.float32)[face]
     row, column = np.divmod(pixel, camera.width)
     ray = np.stack([column + 0.5 - camera.width / 2, row + 0.5 - camera.height / 2], axis=1) / camera.focal_px
-    ray = np.concatenate([ray, np.ones((len(ray), 1))], axis=1)
-    share = np.stack([(ray * np.cross(p, q)).sum(axis=1) for p, q in ((b, c), (c, a), (a, b))], axis=1)
+    ray = np.concatenate([ray, np.ones((len(ray), 1))], axis=1).astype(np.float32)
+    share = np.einsum("nkj,nj->nk", opposite[face], ray)
     share /= share.sum(axis=1, keepdims=True)
-    colour = (share[:, :, None] * colours[faces]).sum(axis=1)
-    away = (normals * ray).sum(axis=1) > 0
-    normals = np.where(away[:, None], -normals, normals)
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    light = KEY_LIGHT * np.clip(normals @ TOWARDS_LIGHT, 0, 1)
-    light += HEADLIGHT * np.abs((normals * ray).sum(axis=1)) / np.linalg.norm(ray, axis=1)
+    towards = np.einsum("nj,nj->n", normals, ray)
+    away = towards > 0
+    normals[away] *= -1
+    light = KEY_LIGHT * np.clip(normals @ TOWARDS_LIGHT.astype(np.float32), 0, 1)
+    light += HEADLIGHT * np.abs(towards) / np.linalg.norm(ray, axis=1)
     light += SKY * (0.5 - 0.5 * normals[:, 1]) + 0.15
-    lit = colour * (1 - shading + shading * light[:, None])
-    return np.clip(np.where(away[:, None], 0.5 * lit + 0.5 * BACKFACE * light[:, None], lit), 0, 255)
+    return share, light, away
 
 
 def _background(camera: Viewpoint) -> np.ndarray:
     """A light vertical gradient, flat (pixels, 3)."""
     share = np.linspace(0, 1, camera.height)[:, None]
     rows = (1 - share) * SKY_TOP + share * SKY_BOTTOM
-    return np.repeat(rows, camera.width, axis=0)
+    return np.repeat(rows.astype(np.float32), camera.width, axis=0)
 
 
 def look_at(centre: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
