@@ -8,9 +8,9 @@ LEAST_RESOLUTION, MOST_RESOLUTION = 64, 256
 TIMED_EDGES, TIMED_SECONDS = (32, 64, 96), 0.3
 # What takes time besides the densities, in surfaces of a ball like the one that :func:`yardstick` extracts: everything
 # once (visibility, level, colours, picture, files), and the rest (marching cubes, cleaning, decimation) per lattice
-# point. On an idle machine, where a ball takes 0.023 s: demo, fox and fern at 96 and 192 points per edge took 5.0 to
-# 6.5 s and 0.9 to 1.6 µs a point, and the stage a second and a half more to begin (docs/numbers.md).
-ONCE, PER_POINT = 280.0, 6e-5
+# point. On an idle machine, where a ball takes 0.024 s: fox, fountain_p11 and herzjesu_p8 at 64 to 192 points per edge
+# took 2.6 to 3 s and 0.8 to 1.1 µs a point (docs/numbers.md).
+ONCE, PER_POINT = 150.0, 4.5e-5
 BALL_EDGE, BALL_TIMES = 96, 3
 
 
