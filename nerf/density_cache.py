@@ -5,7 +5,7 @@ held fading meanwhile, and raised at once where training finds more.
 """
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerf.contraction import uncontract
@@ -22,11 +22,14 @@ CHUNK = 1 << 14  # points measured at once
 
 
 class DensityCache:
-    """The thickness of every cell, in the order of the field's ``bits``, which follow from it."""
+    """The thickness of every cell, in the order of the field's ``bits``, which follow from it. Cells that are not
+    ``usable`` stay empty; None: all are."""
 
-    def __init__(self, field: GridField) -> None:
-        self.field = field
+    def __init__(self, field: GridField, usable: Bool[Tensor, "cache"] | None = None) -> None:
+        self.field, self.usable = field, usable
         self.thickness = torch.zeros(field.settings.cache_cells**3, device=field.table.device)
+        if usable is not None:
+            field.occupy(field.backend.occupied_bits(usable.float(), 0.5))
 
     def raise_to(self, unit: Float[Tensor, "points 3"], thickness: Float[Tensor, "points"]) -> None:
         """Take note of what training has found at some points, in unit coordinates."""
@@ -39,12 +42,15 @@ class DensityCache:
             return
         parts = 1 if step < YOUNG_STEPS else PARTS
         self._measure_part(turn % parts, parts, random)
+        if self.usable is not None:
+            self.thickness.mul_(self.usable)
         self.field.occupy(self.field.backend.occupied_bits(self.thickness, min(THIN, self._mean())))
 
     def _mean(self) -> float:
-        """Summed in rows, so that the result does not depend on how many threads share the work."""
+        """Of the usable cells; summed in rows, so that no result depends on how many threads share the work."""
         rows = self.thickness.view(-1, self.field.settings.cache_cells)
-        return float(rows.sum(-1).double().sum()) / len(self.thickness)
+        cells = len(self.thickness) if self.usable is None else int(self.usable.sum())
+        return float(rows.sum(-1).double().sum()) / max(1, cells)
 
     def _measure_part(self, part: int, parts: int, random: torch.Generator) -> None:
         """Measure every ``parts``-th brick, beginning with number ``part``: blocks of 2³ cells, at one point each."""

@@ -6,7 +6,7 @@ from functools import partial
 from typing import Literal, NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from nerf import grid_mlp
@@ -26,6 +26,7 @@ from nerf.sky import RATE as SKY_RATE
 from nerf.sparse_depth import depth_loss, depth_loss_backward
 from nerf.stopwatch import Work, part
 from nerf.training import RAYS, NonFinite, StepResult, all_finite
+from nerf.visibility import well_seen
 
 WARM_UP_STEPS = 20
 # Of the run, before the rate begins to fall. A fall over most of the run costs short runs up to 2 dB and gains long
@@ -49,7 +50,8 @@ class GridTrainerSettings:
     on that of the cores. ``background`` is what lies behind a scene without a sky: a colour, or another random one for
     each ray (only for photos with alpha, where it shows the field which space is empty). ``distortion``: full weight
     of the distortion loss, for scenes without a known background. ``depth_loss``: its weight at first, at the pixels
-    whose distance the bank knows."""
+    whose distance the bank knows. ``least_photos``: that must look into a cell for something to stand there
+    (nerf/visibility.py)."""
 
     seed: int
     background: tuple[float, float, float] | Literal["random"]
@@ -59,6 +61,7 @@ class GridTrainerSettings:
     rate: float = 2e-2
     distortion: float = 0.0
     depth_loss: float = 0.0
+    least_photos: int = 1
 
 
 class GridBatch(NamedTuple):
@@ -132,7 +135,7 @@ class GridTrainer:
         # Nothing beyond the box of a bounded scene is drawn: a point there would pull the light to its walls.
         self.bank = bank if model.settings.contracted else bank.known_within(BOX)
         self.photo_rays, self.photo_colours = photo_rays, photo_colours
-        self.cache = DensityCache(model)
+        self.cache = DensityCache(model, self._usable())
         self.photo_parts = [each for each in (photo_rays, photo_colours) if each.parameters]
         self.photo_parameters = {**photo_rays.parameters, **photo_colours.parameters}
         of_networks = model.weights._asdict()
@@ -142,6 +145,10 @@ class GridTrainer:
         self.square = {name: torch.zeros_like(tensor) for name, tensor in self.parameters.items()}
         self.grad_table = torch.zeros_like(model.table)
         self.samples_per_ray = torch.tensor(FIRST_SAMPLES_PER_RAY, dtype=torch.float64)
+
+    def _usable(self) -> Bool[Tensor, "cache"] | None:
+        least, lattice = self.settings.least_photos, self.model.lattice
+        return well_seen(self.bank, least, lattice.cells, lattice.contracted) if least > 1 else None
 
     def step(self, step: int, share: float, rate_scale: float = 1.0) -> StepResult:
         """One batch, one update. Raises NonFinite before the update, leaving model and optimiser as they were."""

@@ -105,7 +105,7 @@ class RayBank(NamedTuple):
         """This bank without the known distances that end outside of the cube from -``half`` to ``half``."""
         if self.known is None or self.distance is None:
             return self
-        rays, _ = self._rays(self.known)
+        rays, _ = self.rays(self.known)
         inside = ((rays.origins + self.distance[:, None] * rays.directions).abs() <= half).all(-1)
         return self._knowing(self.known[inside], self.distance[inside])
 
@@ -115,11 +115,11 @@ class RayBank(NamedTuple):
 
     def lookup(self, pixel: Int[Tensor, "rays"]) -> Drawn:
         """Given pixels, and the rays through them."""
-        rays, view = self._rays(pixel)
+        rays, view = self.rays(pixel)
         values = self.pixels.index_select(0, pixel).float().div_(255)
         return Drawn(rays, values[:, :3], values[:, 3] if values.shape[1] == 4 else None, view)
 
-    def _rays(self, pixel: Int[Tensor, "rays"]) -> tuple[Rays, Int[Tensor, "rays"]]:
+    def rays(self, pixel: Int[Tensor, "rays"]) -> tuple[Rays, Int[Tensor, "rays"]]:
         """The rays through pixels, and whose views they are; the photos, which may be on disk, are not read."""
         view = torch.searchsorted(self.first_pixel, pixel, right=True).sub_(1)
         geometry = self.geometry.index_select(1, view)

@@ -97,7 +97,9 @@ class Allowance:
 
     def words(self) -> str:
         """What the choice is held against."""
-        return f"training took {duration(self.trained)}" if self.given is None else f"given {duration(self.given)}"
+        if self.given is None:
+            return f"training took {duration(self.trained)}"
+        return f"given {duration(self.given)}, of which {duration(self.left())} are left for drawing"
 
 
 def training_seconds(train: Path) -> float:

@@ -40,12 +40,12 @@ def occupied(bits: Int64[Tensor, "bricks"]) -> Occupied:
     clear = torch.zeros_like(reached, dtype=torch.uint8)
     for _ in range(MOST_CLEAR):
         clear += ~reached
-        reached = _grown(reached)
+        reached = grown(reached)
     return Occupied(bits, clear.flatten())
 
 
-def _grown(reached: Bool[Tensor, "side side side"]) -> Bool[Tensor, "side side side"]:
-    """With all their neighbours, across edges and corners too."""
+def grown(reached: Bool[Tensor, "side side side"]) -> Bool[Tensor, "side side side"]:
+    """Cells with all their neighbours, across edges and corners too."""
     for axis in range(3):
         grown, last = reached.clone(), reached.shape[axis] - 1
         grown.narrow(axis, 1, last).logical_or_(reached.narrow(axis, 0, last))
@@ -60,6 +60,11 @@ def cell_numbers(cells: int, points: Float[Tensor, "*points 3"]) -> Int32[Tensor
     bricks = cells // 4
     brick = ((x >> 2) * bricks + (y >> 2)) * bricks + (z >> 2)
     return (brick << 6) + ((x & 3) << 4) + ((y & 3) << 2) + (z & 3)
+
+
+def holds(bits: Int64[Tensor, "bricks"], numbers: Int[Tensor, "*points"]) -> Bool[Tensor, "*points"]:
+    """The bits of these cells."""
+    return (bits[(numbers >> 6).long()] >> (numbers & 63)) & 1 != 0
 
 
 def cell_corners(cells: int, numbers: Int[Tensor, "chosen"]) -> Float[Tensor, "chosen 3"]:

@@ -399,4 +399,4 @@ def test_seconds_given_bound_the_photos_whatever_training_took(make: Make, progr
     inputs = make(speed=WIDTH * HEIGHT)  # a photo a second; reading fifteen takes 0.75 of them
     planned = evaluate.plan(evaluate.Config(seconds=seconds), inputs, progress)
     assert planned.photos == count
-    assert not progress.notes or f", given {seconds:g} s;" in progress.notes[0].replace("0 s", "0.01 s")
+    assert not progress.notes or f", given {seconds:g} s, of which" in progress.notes[0].replace("0 s", "0.01 s")
