@@ -36,6 +36,7 @@ BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 FIGURES = ("psnr", "ssim", "psnr_mean_image", "psnr_nearest_view", "psnr_right", "psnr_fitted_right")
 TRUSTED_WIDTH = 0.5  # of the photos: below, a picture can be sharp and the field know nothing of fine detail
 WORTH_SAYING = 0.5  # dB between the two scores of right halves
+LEAST_SIDE = 128  # pixels of the longer side of a photo that is scored, where there is a choice
 BESIDE_DRAWING = 0.05  # seconds for each photo of the set, to read it: the mean image is one of them all
 TRIED_PHOTOS = 4  # to see how fast the field draws them
 NO_LPIPS = "LPIPS is not computed: no package in use ships its weights and nothing is downloaded"
@@ -57,16 +58,20 @@ class Config(StageConfig):
 
 
 def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
-    """The size that the field was trained at, and as many photos as this machine draws in a share of that time."""
-    if config.downscale is None:
+    """The size that the field was trained at, and as many photos as this machine draws in a share of that time; where
+    that is not enough for one, a smaller size."""
+    asked = config.downscale
+    if asked is None:
         downscale = read_json(inputs["train"] / "field.json")["downscale"]
         config = config.model_copy(update={"downscale": downscale})
     if config.photos is None and (scene := read_scene(inputs["normalise"])).of_split("test"):
-        config = config.model_copy(update={"photos": _affordable_photos(config, scene, inputs["train"], progress)})
+        return _affordable(config, scene, inputs["train"], asked is None, progress)
     return config
 
 
-def _affordable_photos(config: Config, scene: "Scene", train: Path, progress: Progress) -> int:
+def _affordable(config: Config, scene: "Scene", train: Path, may_shrink: bool, progress: Progress) -> Config:
+    """``config`` with the number of photos that there is time for, and where it must and ``may_shrink``, a smaller
+    size."""
     from stages.drawing import Allowance, measured_speed
     from stages.training_data import scaled_size
 
@@ -78,13 +83,22 @@ def _affordable_photos(config: Config, scene: "Scene", train: Path, progress: Pr
     progress.update("trying how fast the field draws")
     largest = max(1, int(min(max(c.width, c.height) for c in cameras) / config.downscale))
     speed = measured_speed(train, lambda side: _tried_rays(scene, side), largest)
-    count = len(affordable(pixels, allowance.left() * speed))
-    if count < len(test):
+    budget = allowance.left() * speed
+    chosen = affordable(pixels, budget)  # one at least: only one where that takes too long
+    if len(chosen) < len(test):
         progress.note(
             f"{short_count(speed)} rays/s here: all {len(test)} test photos take about "
             f"{duration(sum(pixels) / speed)}, {allowance.words()}; --evaluate.photos asks for more"
         )
-    return count
+    downscale, one = config.downscale, pixels[chosen[0]]
+    smallest = max(cameras[chosen[0]].width, cameras[chosen[0]].height) / LEAST_SIDE
+    if may_shrink and one > budget and smallest > downscale:
+        downscale = min(math.ceil(100 * downscale * math.sqrt(one / budget)) / 100, smallest)
+        progress.note(
+            f"a test photo takes about {duration(one / speed)}, {allowance.words()}: it is scored at "
+            f"{1 / downscale:.0%} of its width; --evaluate.downscale {config.downscale:g} asks for more"
+        )
+    return config.model_copy(update={"photos": len(chosen), "downscale": downscale})
 
 
 def _tried_rays(scene: "Scene", side: int) -> "Rays":

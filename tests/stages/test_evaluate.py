@@ -278,6 +278,17 @@ def test_photos_asked_for_are_scored_whatever_they_take(make: Make, tmp_path: Pa
     assert _run(inputs, tmp_path / "all", progress, photos=99)[0]["photos_scored"] == 4
 
 
+def test_a_photo_too_large_for_the_time_is_scored_smaller(make: Make, progress: Any, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(evaluate, "LEAST_SIDE", 4)
+    inputs = make(speed=WIDTH * HEIGHT // 4)  # a quarter of a photo a second
+    planned = evaluate.plan(evaluate.Config(seconds=1 + 15 * evaluate.BESIDE_DRAWING), inputs, progress)
+    assert planned.photos == 1 and planned.downscale == pytest.approx(2, abs=0.05)
+    assert "it is scored at 50% of its width; --evaluate.downscale 1 asks for more" in progress.notes[-1]
+    monkeypatch.setattr(evaluate, "LEAST_SIDE", WIDTH)
+    assert evaluate.plan(evaluate.Config(seconds=1), inputs, progress).downscale == 1
+    assert evaluate.plan(evaluate.Config(seconds=1, downscale=1), inputs, progress).downscale == 1
+
+
 def test_plan_answers_every_open_question_once(make: Make, progress: Any):
     inputs = make(downscale=1.5, speed=1)
     planned = evaluate.plan(evaluate.Config(), inputs, progress)
