@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from nerf import grid_mlp
 from nerf.grid_mlp import ColourPass, DensityPass, Weights
 from nerf.kernels import BOX, Backend, GridLayout, Lattice, Occupied, Samples, grid_layout
-from nerf.kernels.cache import cell_numbers, holds, occupied
+from nerf.kernels.cache import cell_numbers, is_occupied, occupied
 from nerf.kernels.marching import unit_coordinates
 from nerf.model import Rendering
 from nerf.randomness import generator
@@ -160,7 +160,7 @@ class GridField(nn.Module):
     def density(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points"]:
         """Density per scene unit; zero in cells that are not sampled, and outside the box of a bounded scene."""
         unit = unit_coordinates(points, self.settings.contracted).reshape(-1, 3)
-        sampled = holds(self.bits, cell_numbers(self.settings.cache_cells, unit))
+        sampled = is_occupied(self.bits, cell_numbers(self.settings.cache_cells, unit))
         sigma = torch.where(sampled, self.unit_density(unit), 0).view(points.shape[:-1])
         return sigma if self.settings.contracted else torch.where((points.abs() <= BOX).all(-1), sigma, 0)
 

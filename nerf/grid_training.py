@@ -51,7 +51,7 @@ class GridTrainerSettings:
     each ray (only for photos with alpha, where it shows the field which space is empty). ``distortion``: full weight
     of the distortion loss, for scenes without a known background. ``depth_loss``: its weight at first, at the pixels
     whose distance the bank knows. ``least_photos``: that must look into a cell for something to stand there
-    (nerf/visibility.py)."""
+    (nerf/visibility.py), or all but one where they are few."""
 
     seed: int
     background: tuple[float, float, float] | Literal["random"]
@@ -147,7 +147,7 @@ class GridTrainer:
         self.samples_per_ray = torch.tensor(FIRST_SAMPLES_PER_RAY, dtype=torch.float64)
 
     def _usable(self) -> Bool[Tensor, "cache"] | None:
-        least, lattice = self.settings.least_photos, self.model.lattice
+        least, lattice = min(self.settings.least_photos, len(self.bank.near) - 1), self.model.lattice
         return well_seen(self.bank, least, lattice.cells, lattice.contracted) if least > 1 else None
 
     def step(self, step: int, share: float, rate_scale: float = 1.0) -> StepResult:

@@ -17,7 +17,7 @@ from nerf.rays import Rays
 SIDE = 64  # coarse cells along an edge of the unit cube
 RAYS = 32  # along each side of a photo: of one of 60 degrees they are a coarse cell apart at a distance of two
 STEPS = 128  # along a ray, in equal ratios: over three decades a coarse cell long at a distance of one
-DECADES = 1e-4  # of far: where a ray that begins at its camera is first looked at
+FIRST = 1e-4  # of far: where a ray that begins at its camera is first looked at
 
 
 def well_seen(bank: RayBank, least: int, cells: int, contracted: bool) -> Bool[Tensor, "cache"]:
@@ -41,7 +41,7 @@ def photos_looking(bank: RayBank, side: int, contracted: bool) -> Int[Tensor, "s
     ratio = torch.linspace(0, 1, STEPS, device=bank.device)
     for view in range(len(bank.near)):
         rays = _spread_rays(bank, view)
-        start = rays.near.maximum(DECADES * rays.far)
+        start = rays.near.maximum(FIRST * rays.far)
         t = start[:, None] * (rays.far / start)[:, None] ** ratio
         points = rays.origins[:, None] + t[..., None] * rays.directions[:, None]
         count += grown(_touched(points.flatten(0, 1), side, contracted))

@@ -26,7 +26,7 @@ FINAL_RATE = 0.1  # of the paper field's learning rate at the start
 DISTORTION = 2e-3
 # Weight at first of the loss at sparse points (docs/numbers.md; Deng et al. 2022 take 0.1, too, of another loss).
 DEPTH_LOSS = 0.1
-# Photos that must look into a cell for something to stand there; one less than there are, where they are few.
+# Photos that must look into a cell for something to stand there (docs/numbers.md).
 LEAST_PHOTOS = 3
 COARSEST = 16
 # Samples along a ray (docs/numbers.md): steps along the diagonal of a bounded scene's box at most, and, where space is
@@ -199,7 +199,7 @@ def grid_trainer_settings(config: "Config", scene: "Scene", seed: int) -> "GridT
         rate=config.learning_rate,
         distortion=DISTORTION if config.contracted else 0.0,
         depth_loss=DEPTH_LOSS,
-        least_photos=min(LEAST_PHOTOS, max(1, len(scene.of_split("train")) - 1)),
+        least_photos=LEAST_PHOTOS,
     )
 
 

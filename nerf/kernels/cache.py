@@ -62,9 +62,10 @@ def cell_numbers(cells: int, points: Float[Tensor, "*points 3"]) -> Int32[Tensor
     return (brick << 6) + ((x & 3) << 4) + ((y & 3) << 2) + (z & 3)
 
 
-def holds(bits: Int64[Tensor, "bricks"], numbers: Int[Tensor, "*points"]) -> Bool[Tensor, "*points"]:
+def is_occupied(bits: Int64[Tensor, "bricks"], numbers: Int32[Tensor, "*points"]) -> Bool[Tensor, "*points"]:
     """The bits of these cells."""
-    return (bits[(numbers >> 6).long()] >> (numbers & 63)) & 1 != 0
+    brick = bits.index_select(0, (numbers >> 6).flatten()).view(numbers.shape)
+    return (brick >> (numbers & 63)) & 1 != 0
 
 
 def cell_corners(cells: int, numbers: Int[Tensor, "chosen"]) -> Float[Tensor, "chosen 3"]:

@@ -1,12 +1,12 @@
 """Samples along rays where the density cache says that there may be something, and the points at which they stand."""
 
 import torch
-from jaxtyping import Bool, Float, Int32, Int64
+from jaxtyping import Float, Int32
 from torch import Tensor
 
 from nerf.contraction import contract
 from nerf.kernels import BOX, CONTRACTED_BOX, Lattice, Occupied, Samples
-from nerf.kernels.cache import cell_numbers
+from nerf.kernels.cache import cell_numbers, is_occupied
 from nerf.rays import Rays, clip_to_box
 
 
@@ -27,7 +27,7 @@ def march(occupied: Occupied, lattice: Lattice, rays: Rays, jitter: Float[Tensor
     # The same as points_on(rays, t), laid out axis by axis: torch is several times faster without a row of 3 innermost.
     points = (rays.origins.T[:, :, None] + t * rays.directions.T[:, :, None]).movedim(0, -1)
     points = unit_coordinates(points, lattice.contracted)
-    wanted &= _is_occupied(occupied.bits, cell_numbers(lattice.cells, points))
+    wanted &= is_occupied(occupied.bits, cell_numbers(lattice.cells, points))
     if len(k) > lattice.most_samples:
         wanted &= wanted.cumsum(-1) <= lattice.most_samples
     ray, k_wanted = wanted.nonzero(as_tuple=True)
@@ -107,8 +107,3 @@ def _contract_backward(
     change = -2 * (1 - inverse) * inverse * (grad * on_face).sum(-1, keepdim=True) * on_face.gather(-1, axis).sign()
     result = (2 - inverse) * inverse * grad
     return result.scatter_add(-1, axis, change)
-
-
-def _is_occupied(bits: Int64[Tensor, "bricks"], cells: Int32[Tensor, "*points"]) -> Bool[Tensor, "*points"]:
-    brick = bits.index_select(0, (cells >> 6).flatten()).view(cells.shape)
-    return (brick >> (cells & 63)) & 1 != 0
