@@ -26,7 +26,7 @@ from nerf.sky import RATE as SKY_RATE
 from nerf.sparse_depth import depth_loss, depth_loss_backward
 from nerf.stopwatch import Work, part
 from nerf.training import RAYS, NonFinite, StepResult, all_finite
-from nerf.visibility import well_seen
+from nerf.visibility import usable_cells
 
 WARM_UP_STEPS = 20
 # Of the run, before the rate begins to fall. A fall over most of the run costs short runs up to 2 dB and gains long
@@ -50,8 +50,8 @@ class GridTrainerSettings:
     on that of the cores. ``background`` is what lies behind a scene without a sky: a colour, or another random one for
     each ray (only for photos with alpha, where it shows the field which space is empty). ``distortion``: full weight
     of the distortion loss, for scenes without a known background. ``depth_loss``: its weight at first, at the pixels
-    whose distance the bank knows. ``least_photos``: that must look into a cell for something to stand there
-    (nerf/visibility.py), or all but one where they are few."""
+    whose distance the bank knows. ``least_photos``: that must look into a cell of folded space for something to stand
+    before their foregrounds (nerf/visibility.py), or all but one where they are few."""
 
     seed: int
     background: tuple[float, float, float] | Literal["random"]
@@ -148,7 +148,7 @@ class GridTrainer:
 
     def _usable(self) -> Bool[Tensor, "cache"] | None:
         least, lattice = min(self.settings.least_photos, len(self.bank.near) - 1), self.model.lattice
-        return well_seen(self.bank, least, lattice.cells, lattice.contracted) if least > 1 else None
+        return usable_cells(self.bank, least, lattice.cells) if least > 1 and lattice.contracted else None
 
     def step(self, step: int, share: float, rate_scale: float = 1.0) -> StepResult:
         """One batch, one update. Raises NonFinite before the update, leaving model and optimiser as they were."""

@@ -26,7 +26,7 @@ FINAL_RATE = 0.1  # of the paper field's learning rate at the start
 DISTORTION = 2e-3
 # Weight at first of the loss at sparse points (docs/numbers.md; Deng et al. 2022 take 0.1, too, of another loss).
 DEPTH_LOSS = 0.1
-# Photos that must look into a cell for something to stand there (docs/numbers.md).
+# Photos that must look into a cell for something to stand before their foregrounds (docs/numbers.md).
 LEAST_PHOTOS = 3
 COARSEST = 16
 # Samples along a ray (docs/numbers.md): steps along the diagonal of a bounded scene's box at most, and, where space is

@@ -7,13 +7,14 @@ import pytest
 import torch
 
 from nerf.contraction import uncontract
+from nerf.depth_range import NEAR_MARGIN
 from nerf.grid_field import GridField, GridSettings
 from nerf.grid_training import GridTrainer, GridTrainerSettings
 from nerf.kernels import CONTRACTED_BOX, reference
-from nerf.kernels.cache import cell_corners, cell_numbers, grown, is_occupied
+from nerf.kernels.cache import cell_corners, grown, is_occupied
 from nerf.kernels.marching import unit_coordinates
 from nerf.ray_bank import RayBank, build_ray_bank
-from nerf.visibility import photos_looking, well_seen
+from nerf.visibility import photos_looking, usable_cells
 
 SIZE, HALF = 12, 0.5  # pixels of a photo, and half its width at a distance of one
 NEAR, FAR = 1.0, 40.0
@@ -44,21 +45,21 @@ def centres(side: int) -> torch.Tensor:
     return uncontract(torch.stack(torch.meshgrid(line, line, line, indexing="ij"), -1))
 
 
-def projected(views: RayBank, points: torch.Tensor) -> torch.Tensor:
-    """How many photos have the points in their picture, between near and far."""
+def projected(views: RayBank, points: torch.Tensor, near: float) -> torch.Tensor:
+    """How many photos have the points in their picture, between ``near`` and far."""
     count = torch.zeros(points.shape[:-1], dtype=torch.int32)
     for geometry in views.geometry.T:
         local = (points - geometry[9:12]) @ geometry[:9].view(3, 3)
         edge = HALF * (1 - 1 / SIZE)  # the middles of the outermost pixels
         inside = (local[..., :2].abs() <= edge * local[..., 2:]).all(-1) & (local[..., 2] > 0)
         distance = local.norm(dim=-1)
-        count += (inside & (distance > NEAR) & (distance < FAR)).int()
+        count += (inside & (distance > near) & (distance < FAR)).int()
     return count
 
 
 def test_photos_are_counted_as_a_projection_counts_them() -> None:
     views = bank()
-    found, true = photos_looking(views, SIDE, True), projected(views, centres(SIDE))
+    found, true = photos_looking(views, SIDE).count, projected(views, centres(SIDE), NEAR)
     assert (found >= true).all(), "no photo that looks into a cell is overlooked"
     assert set(found.unique().tolist()) == set(range(len(views.near) + 1))
     for least in range(1, len(views.near) + 1):
@@ -66,40 +67,46 @@ def test_photos_are_counted_as_a_projection_counts_them() -> None:
         assert (around[found >= least]).float().mean() > 0.97, "and others are next to one"
 
 
-def test_what_is_before_near_beyond_far_or_behind_is_not_looked_at() -> None:
-    views = bank(1)
-    found = photos_looking(views, SIDE, True)
-    along = torch.tensor([[2.5 - t, 0.0, 0.0] for t in (-3.0, 0.4, 1.3, 2.5, 20.0)])
-    cells = (SIDE * unit_coordinates(along, True)).long()
-    assert found[tuple(cells.T)].tolist() == [0, 0, 1, 1, 1]
-    at_once = views._replace(geometry=views.geometry.index_fill(0, torch.tensor(12), 0.0))
-    found = photos_looking(at_once, SIDE, True)
-    assert found[tuple(cells.T)].tolist() == [0, 1, 1, 1, 1], "where near is zero rays begin at the camera"
+def test_the_foreground_begins_where_the_nearest_point_is_known() -> None:
+    views = bank()
+    found, true = photos_looking(views, SIDE).behind, projected(views, centres(SIDE), NEAR / NEAR_MARGIN) > 0
+    assert found[true].all() and grown(grown(true))[found].float().mean() > 0.97
+    one = bank(1)
+    along = torch.tensor([[2.5 - t, 0.0, 0.0] for t in (-3.0, 0.4, 1.15, 1.7, 2.5, 20.0)])
+    cells = tuple((SIDE * unit_coordinates(along, True)).long().T)
+    looks = photos_looking(one, SIDE)
+    assert looks.count[cells].tolist() == [0, 0, 1, 1, 1, 1], "behind a camera and before near it sees nothing"
+    assert looks.behind[cells].tolist() == [False, False, False, True, True, True]
 
 
-def test_a_known_point_keeps_its_cell() -> None:
-    views, pixel, distance = bank(2), torch.tensor([0]), 1.1
-    knowing = views.with_distances(pixel, torch.tensor([distance]))
-    before, after = (well_seen(each, 2, 64, True) for each in (views, knowing))
-    ray = views.rays(pixel)[0]
-    number = cell_numbers(64, unit_coordinates(ray.origins + distance * ray.directions, True)).long()
-    assert not before[number] and after[number]
-    assert 0 < int((after & ~before).sum()) <= 27
+def test_before_all_foregrounds_several_photos_are_needed() -> None:
+    views = bank()
+    looks = photos_looking(views, 16)
+    for least in (1, 2, 3):
+        usable = usable_cells(views, least, 16)
+        x, y, z = (16 * cell_corners(16, torch.arange(16**3))).long().unbind(-1)
+        count, behind = looks.count[x, y, z], looks.behind[x, y, z]
+        assert torch.equal(usable, (count >= least) | behind)
+        assert (~usable & (count > 0)).any() == (least > 1)
 
 
-@pytest.mark.parametrize("contracted", [True, False])
-def test_nothing_is_ever_sampled_elsewhere_nor_found_there(contracted: bool) -> None:
-    field = GridField(replace(FIELD, contracted=contracted), 0, reference)
+def test_nothing_is_ever_sampled_elsewhere_nor_found_there() -> None:
+    field = GridField(FIELD, 0, reference)
     views = bank(4, 0.15)
     trainer = GridTrainer(field, views, TRAINER)
-    usable = well_seen(views, 3, 16, contracted)
+    usable = usable_cells(views, 3, 16)
     assert 0.02 < usable.float().mean() < 0.98
     numbers = torch.arange(16**3, dtype=torch.int32)
     for step in range(40):
         assert not (is_occupied(field.bits, numbers) & ~usable).any()
         trainer.step(step, step / 40)
     elsewhere = cell_corners(16, numbers[~usable]) + 0.5 / 16
-    half = CONTRACTED_BOX if contracted else 1.0
-    points = 2 * half * (elsewhere - 0.5)
-    assert not field.density(uncontract(points) if contracted else points).any()
+    assert not field.density(uncontract(2 * CONTRACTED_BOX * (elsewhere - 0.5))).any()
     assert field.unit_density(elsewhere).any(), "which is not what the networks say"
+
+
+@pytest.mark.parametrize(("views", "contracted", "least"), [(1, True, 3), (2, True, 3), (4, False, 3), (4, True, 1)])
+def test_where_photos_are_few_or_space_ends_all_of_it_is_used(views: int, contracted: bool, least: int) -> None:
+    field = GridField(replace(FIELD, contracted=contracted), 0, reference)
+    GridTrainer(field, bank(views), replace(TRAINER, least_photos=least))
+    assert (field.bits == -1).all()
