@@ -81,10 +81,10 @@ def test_the_foreground_begins_where_the_nearest_point_is_known() -> None:
 
 def test_before_all_foregrounds_several_photos_are_needed() -> None:
     views = bank()
-    looks = photos_looking(views, 16)
+    looks = photos_looking(views, 64)
+    x, y, z = (64 * cell_corners(64, torch.arange(64**3))).long().unbind(-1)
     for least in (1, 2, 3):
-        usable = usable_cells(views, least, 16)
-        x, y, z = (16 * cell_corners(16, torch.arange(16**3))).long().unbind(-1)
+        usable = usable_cells(views, least, 64)
         count, behind = looks.count[x, y, z], looks.behind[x, y, z]
         assert torch.equal(usable, (count >= least) | behind)
         assert (~usable & (count > 0)).any() == (least > 1)
