@@ -27,7 +27,7 @@ class Looks(NamedTuple):
     """Of each of side³ cells of the unit cube: how many photos look into it or a neighbour, whatever hides it, and
     whether it lies in the foreground of one of them, or behind that."""
 
-    count: Int[Tensor, "side side side"]
+    photos: Int[Tensor, "side side side"]
     behind: Bool[Tensor, "side side side"]
 
 
@@ -36,7 +36,7 @@ def usable_cells(bank: RayBank, least: int, cells: int) -> Bool[Tensor, "cache"]
     ``least`` photos of ``bank`` look into, or one in its foreground or behind that."""
     side = min(SIDE, cells)
     looks = photos_looking(bank, side)
-    usable = (looks.count >= least) | looks.behind
+    usable = (looks.photos >= least) | looks.behind
     corners = cell_corners(cells, torch.arange(cells**3, device=bank.device))
     x, y, z = (side * corners).long().unbind(-1)
     return usable[x, y, z]

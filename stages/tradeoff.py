@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from stages.tradeoff_trial import Exam
 
 NEEDS = ("ingest", "normalise", "effects")
-VERSION = 3
+VERSION = 4
 RESUMES = True
 LINKS = ("tradeoff.svg", "tradeoff.png", "tradeoff.md", "tradeoff.json", "ablation.png")
 

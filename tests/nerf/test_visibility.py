@@ -59,7 +59,7 @@ def projected(views: RayBank, points: torch.Tensor, near: float) -> torch.Tensor
 
 def test_photos_are_counted_as_a_projection_counts_them() -> None:
     views = bank()
-    found, true = photos_looking(views, SIDE).count, projected(views, centres(SIDE), NEAR)
+    found, true = photos_looking(views, SIDE).photos, projected(views, centres(SIDE), NEAR)
     assert (found >= true).all(), "no photo that looks into a cell is overlooked"
     assert set(found.unique().tolist()) == set(range(len(views.near) + 1))
     for least in range(1, len(views.near) + 1):
@@ -75,7 +75,7 @@ def test_the_foreground_begins_where_the_nearest_point_is_known() -> None:
     along = torch.tensor([[2.5 - t, 0.0, 0.0] for t in (-3.0, 0.4, 1.15, 1.7, 2.5, 20.0)])
     cells = tuple((SIDE * unit_coordinates(along, True)).long().T)
     looks = photos_looking(one, SIDE)
-    assert looks.count[cells].tolist() == [0, 0, 1, 1, 1, 1], "behind a camera and before near it sees nothing"
+    assert looks.photos[cells].tolist() == [0, 0, 1, 1, 1, 1], "behind a camera and before near it sees nothing"
     assert looks.behind[cells].tolist() == [False, False, False, True, True, True]
 
 
@@ -85,7 +85,7 @@ def test_before_all_foregrounds_several_photos_are_needed() -> None:
     x, y, z = (64 * cell_corners(64, torch.arange(64**3))).long().unbind(-1)
     for least in (1, 2, 3):
         usable = usable_cells(views, least, 64)
-        count, behind = looks.count[x, y, z], looks.behind[x, y, z]
+        count, behind = looks.photos[x, y, z], looks.behind[x, y, z]
         assert torch.equal(usable, (count >= least) | behind)
         assert (~usable & (count > 0)).any() == (least > 1)
 
