@@ -26,8 +26,9 @@ class DensityCache:
     ``usable`` stay empty; None: all are."""
 
     def __init__(self, field: GridField, usable: Bool[Tensor, "cache"] | None = None) -> None:
-        self.field, self.usable = field, usable
+        self.field, self.unusable = field, None if usable is None else ~usable
         self.thickness = torch.zeros(field.settings.cache_cells**3, device=field.table.device)
+        self.usable_cells = len(self.thickness) if usable is None else max(1, int(usable.sum()))
         if usable is not None:
             field.occupy(field.backend.occupied_bits(usable.float(), 0.5))
 
@@ -42,15 +43,14 @@ class DensityCache:
             return
         parts = 1 if step < YOUNG_STEPS else PARTS
         self._measure_part(turn % parts, parts, random)
-        if self.usable is not None:
-            self.thickness.mul_(self.usable)
+        if self.unusable is not None:
+            self.thickness.masked_fill_(self.unusable, 0)
         self.field.occupy(self.field.backend.occupied_bits(self.thickness, min(THIN, self._mean())))
 
     def _mean(self) -> float:
         """Of the usable cells; summed in rows, so that no result depends on how many threads share the work."""
         rows = self.thickness.view(-1, self.field.settings.cache_cells)
-        cells = len(self.thickness) if self.usable is None else int(self.usable.sum())
-        return float(rows.sum(-1).double().sum()) / max(1, cells)
+        return float(rows.sum(-1).double().sum()) / self.usable_cells
 
     def _measure_part(self, part: int, parts: int, random: torch.Generator) -> None:
         """Measure every ``parts``-th brick, beginning with number ``part``: blocks of 2³ cells, at one point each."""

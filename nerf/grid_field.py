@@ -161,8 +161,11 @@ class GridField(nn.Module):
         """Density per scene unit; zero in cells that are not sampled, and outside the box of a bounded scene."""
         unit = unit_coordinates(points, self.settings.contracted).reshape(-1, 3)
         sampled = is_occupied(self.bits, cell_numbers(self.settings.cache_cells, unit))
-        sigma = torch.where(sampled, self.unit_density(unit), 0).view(points.shape[:-1])
-        return sigma if self.settings.contracted else torch.where((points.abs() <= BOX).all(-1), sigma, 0)
+        if not self.settings.contracted:
+            sampled &= (points.reshape(-1, 3).abs() <= BOX).all(-1)
+        sigma = unit.new_zeros(len(unit))
+        sigma[sampled] = self.unit_density(unit[sampled])
+        return sigma.view(points.shape[:-1])
 
     def unit_density(self, unit: Float[Tensor, "points 3"]) -> Float[Tensor, "points"]:
         """Density per scene unit at unit coordinates."""

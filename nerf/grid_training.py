@@ -147,8 +147,11 @@ class GridTrainer:
         self.samples_per_ray = torch.tensor(FIRST_SAMPLES_PER_RAY, dtype=torch.float64)
 
     def _usable(self) -> Bool[Tensor, "cache"] | None:
+        """Known only where points tell where foregrounds begin, in folded space: a box is carved beforehand."""
         least, lattice = min(self.settings.least_photos, len(self.bank.near) - 1), self.model.lattice
-        return usable_cells(self.bank, least, lattice.cells) if least > 1 and lattice.contracted else None
+        if least <= 1 or self.bank.known is None or not lattice.contracted:
+            return None
+        return usable_cells(self.bank, least, lattice.cells)
 
     def step(self, step: int, share: float, rate_scale: float = 1.0) -> StepResult:
         """One batch, one update. Raises NonFinite before the update, leaving model and optimiser as they were."""

@@ -3,70 +3,73 @@
 What one photo alone sees can be explained by something at any distance, also right before its camera; and what two see
 often can, where it is dark or plain. A field puts it there, in the way of every other view. (Philip and Deschaintre
 2023, "Floaters No More", see the same and weaken gradients near cameras.) So before a photo's foreground, which begins
-with the nearest thing that is known of, there is nothing but what several photos look at.
+at the sparse points nearest to it, there is nothing but what several photos look at.
 """
 
-from typing import NamedTuple
-
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
+from nerf.contraction import uncontract
 from nerf.depth_range import NEAR_MARGIN
+from nerf.kernels import CONTRACTED_BOX
 from nerf.kernels.cache import cell_corners, grown
-from nerf.kernels.marching import unit_coordinates
 from nerf.ray_bank import RayBank
-from nerf.rays import Rays
 
 SIDE = 64  # coarse cells along an edge of the unit cube
-RAYS = 32  # along each side of a photo: of one of 60 degrees they are a coarse cell apart at a distance of two
-STEPS = 128  # along a ray, in equal ratios: over three decades a coarse cell long at a distance of one
-
-
-class Looks(NamedTuple):
-    """Of each of side³ cells of the unit cube: how many photos look into it or a neighbour, whatever hides it, and
-    whether it lies in the foreground of one of them, or behind that."""
-
-    photos: Int[Tensor, "side side side"]
-    behind: Bool[Tensor, "side side side"]
+EDGE_PIXELS = 16  # along each side of a photo, from which its field of view is known
 
 
 def usable_cells(bank: RayBank, least: int, cells: int) -> Bool[Tensor, "cache"]:
-    """Which of ``cells``³ cells of folded space, in the order of ``nerf.kernels.cache``, may hold something: those that
-    ``least`` photos of ``bank`` look into, or one in its foreground or behind that."""
+    """Which of ``cells``³ cells of folded space, in the order of ``nerf.kernels.cache``, may hold something: those
+    whose middles ``least`` photos of ``bank`` look at, or one, from where its foreground begins; and a coarse cell
+    around them. What hides them, and masks, count for nothing."""
     side = min(SIDE, cells)
-    looks = photos_looking(bank, side)
-    usable = (looks.photos >= least) | looks.behind
+    middles = _middles(side, bank.device)
+    photos = torch.zeros(side**3, dtype=torch.int32, device=bank.device)
+    undecided = torch.arange(side**3, device=bank.device)
+    for view in range(len(bank.near)):
+        seen, in_foreground = _looked_at(bank, view, middles)
+        photos[undecided] += seen
+        still = (~in_foreground & (photos[undecided] < least)).nonzero()[:, 0]
+        undecided, middles = undecided[still], middles[:, still]
+    usable = torch.ones(side**3, dtype=torch.bool, device=bank.device)
+    usable[undecided] = False
     corners = cell_corners(cells, torch.arange(cells**3, device=bank.device))
     x, y, z = (side * corners).long().unbind(-1)
-    return usable[x, y, z]
+    return grown(usable.view(side, side, side))[x, y, z]
 
 
-def photos_looking(bank: RayBank, side: int) -> Looks:
-    """Where the photos look, between near and far."""
-    count = torch.zeros(side, side, side, dtype=torch.int32, device=bank.device)
-    behind = torch.zeros_like(count, dtype=torch.bool)
-    ratio = torch.linspace(0, 1, STEPS, device=bank.device)
-    for view in range(len(bank.near)):
-        rays = _spread_rays(bank, view)
-        t = rays.near[:, None] * (rays.far / rays.near)[:, None] ** ratio
-        points = rays.origins[:, None] + t[..., None] * rays.directions[:, None]
-        count += grown(_touched(points.flatten(0, 1), side))
-        behind |= _touched(points[NEAR_MARGIN * t >= rays.near[:, None]], side)
-    return Looks(count, grown(behind))
+def _middles(side: int, device: torch.device) -> Float[Tensor, "3 cells"]:
+    """Where the middles of side³ cells of the unit cube are in the scene."""
+    line = 2 * CONTRACTED_BOX * ((torch.arange(side, device=device) + 0.5) / side - 0.5)
+    return uncontract(torch.stack(torch.meshgrid(line, line, line, indexing="ij"), -1)).flatten(0, 2).T.contiguous()
 
 
-def _spread_rays(bank: RayBank, view: int) -> Rays:
-    """RAYS² rays of a photo, those of its corners among them."""
+def _looked_at(
+    bank: RayBank, view: int, points: Float[Tensor, "3 points"]
+) -> tuple[Bool[Tensor, "points"], Bool[Tensor, "points"]]:
+    """Which points a photo may show between near and far, and which of these are no nearer than its foreground."""
+    geometry = bank.geometry[:, view]
+    from_scene, centre, near, far = geometry[:9].view(3, 3).T, geometry[9:12, None], geometry[12], geometry[13]
+    field = _angles(from_scene @ _spread_directions(bank, view).T)
+    local = from_scene @ (points - centre)
+    angles, distance = _angles(local), local.square().sum(0).sqrt()
+    inside = (angles >= field.amin(1, keepdim=True)) & (angles <= field.amax(1, keepdim=True))
+    seen = inside.all(0) & (distance >= near) & (distance <= far)
+    return seen, seen & (NEAR_MARGIN * distance >= near)
+
+
+def _angles(vectors: Float[Tensor, "3 n"]) -> Float[Tensor, "2 n"]:
+    """How far to the right and down of the optical axis vectors in a camera's frame point, in radians. A photo without
+    distortion is a rectangle of them."""
+    return torch.atan2(vectors[:2], vectors[2:])
+
+
+def _spread_directions(bank: RayBank, view: int) -> Float[Tensor, "rays 3"]:
+    """Of EDGE_PIXELS² rays of a photo, those of its corners among them."""
     first, end = bank.first_pixel[view : view + 2].tolist()
     width = int(bank.layout[1, view])
-    row, column = (torch.linspace(0, n - 1, RAYS, device=bank.device).round() for n in ((end - first) // width, width))
-    return bank.rays((first + width * row.double()[:, None] + column).flatten().long())[0]
-
-
-def _touched(points: Float[Tensor, "points 3"], side: int) -> Bool[Tensor, "side side side"]:
-    """The cells in which points of the scene lie."""
-    x, y, z = (side * unit_coordinates(points, True)).long().clamp(0, side - 1).unbind(-1)
-    touched = torch.zeros(side**3, dtype=torch.bool, device=points.device)
-    touched[(x * side + y) * side + z] = True
-    return touched.view(side, side, side)
+    share = torch.linspace(0, 1, EDGE_PIXELS, dtype=torch.float64, device=bank.device)
+    row, column = (((n - 1) * share).round().long() for n in ((end - first) // width, width))
+    return bank.rays((first + width * row[:, None] + column).flatten())[0].directions

@@ -72,7 +72,7 @@ def run_command(words: Sequence[str]) -> int:
     try:
         return _command(words[0])(words[1:])
     except UsageError as error:
-        _say(StageError(str(error), "", ""), as_json)
+        _say(str(error), "", "", as_json)
         return EXIT_USAGE
     except StageFailed as failure:
         if debug:
@@ -81,13 +81,13 @@ def run_command(words: Sequence[str]) -> int:
     except StageError as error:
         if debug:
             traceback.print_exc()
-        _say(error, as_json)
+        _say(error.what, error.why, error.hint, as_json)
         return EXIT_WORKSPACE
     except KeyboardInterrupt:
-        _say(StageError("stopped", "Ctrl-C", GO_ON), as_json)
+        _say("stopped", "Ctrl-C", GO_ON, as_json)
         return EXIT_INTERRUPT
     except Terminated:
-        _say(StageError("stopped", "SIGTERM", GO_ON), as_json)
+        _say("stopped", "SIGTERM", GO_ON, as_json)
         return EXIT_TERMINATED
     except BrokenPipeError:
         raise
@@ -95,7 +95,7 @@ def run_command(words: Sequence[str]) -> int:
         if debug:
             traceback.print_exc()
         what = f"a defect of this program, not of your photos: {type(error).__name__}: {error}"
-        _say(StageError(what, "it should not happen", REPORT_IT), as_json)
+        _say(what, "it should not happen", REPORT_IT, as_json)
         return EXIT_DEFECT
 
 
@@ -103,14 +103,15 @@ def _on_sigterm(*_: object) -> None:
     raise Terminated
 
 
-def _say(error: StageError, as_json: bool) -> None:
+def _say(what: str, why: str, hint: str, as_json: bool) -> None:
     """What ended the program outside of any stage, in words, or as an event like that of a stage that failed."""
     if as_json:
-        print(json.dumps({"event": "error", "stage": None, **vars(error)}, ensure_ascii=False), flush=True)
+        event = {"event": "error", "stage": None, "what": what, "why": why, "hint": hint}
+        print(json.dumps(event, ensure_ascii=False), flush=True)
         return
-    print(f"pipeline: {error.what}", file=sys.stderr)
-    if error.why:
-        print(f"  why: {error.why}\n  try: {error.hint}", file=sys.stderr)
+    print(f"pipeline: {what}", file=sys.stderr)
+    if why:
+        print(f"  why: {why}\n  try: {hint}", file=sys.stderr)
 
 
 def _command(name: str) -> Callable[[Sequence[str]], int]:

@@ -88,7 +88,11 @@ class ContentIndex:
             return self.sha256(path)
         if not path.is_dir():
             raise StageError(f"{path} does not exist", "a setting names it", "Check the path and run again.")
-        return self.of_files(path, _files_of(path))
+        try:
+            files = list(_files_of(path))
+        except OSError as error:
+            raise cannot_read(error.filename or path, error) from error
+        return self.of_files(path, files)
 
     def save(self) -> None:
         """Write the index if anything in it changed."""

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from stages.contract import StageError
+from stages.contract import StageError, bounded
 from stages.effects import Config as EffectsConfig
 from stages.evaluate import Config as EvaluateConfig
 from stages.ingest import Config as IngestConfig
@@ -69,13 +69,9 @@ def settings_from(values: Mapping[str, Any], origin: str) -> Settings:
 
 def wrong_options(error: ValidationError, *parents: str) -> str:
     """Every wrong option below ``parents`` with what it must be: ``train.steps 0 must be at least 1; …``."""
-    wrong = [_wrong_option(_short(".".join([*parents, *map(str, e["loc"])])), e) for e in error.errors()]
+    wrong = [_wrong_option(bounded(".".join([*parents, *map(str, e["loc"])]), MOST_LETTERS), e) for e in error.errors()]
     more = f"; and {len(wrong) - MOST_WRONG} more" if len(wrong) > MOST_WRONG else ""
     return "; ".join(wrong[:MOST_WRONG]) + more
-
-
-def _short(text: str) -> str:
-    return text if len(text) <= MOST_LETTERS else f"{text[:MOST_LETTERS]}…"
 
 
 def _wrong_option(name: str, problem: "ErrorDetails") -> str:
@@ -87,7 +83,7 @@ def _wrong_option(name: str, problem: "ErrorDetails") -> str:
     must = problem["msg"].removeprefix("Input should ")
     for long, short in (("greater than or equal to", "at least"), ("less than or equal to", "at most")):
         must = must.replace(long, short)
-    return f"{name} {_short(str(problem['input']))} must {must}"
+    return f"{name} {bounded(str(problem['input']), MOST_LETTERS)} must {must}"
 
 
 def with_effects(settings: Options, choices: Sequence[str]) -> Options:

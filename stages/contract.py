@@ -50,9 +50,9 @@ class StageError(Exception):
         super().__init__(f"{self.what}: {self.why}. {self.hint}")
 
 
-def bounded(text: str) -> str:
-    """At most ``MOST_LETTERS`` of it."""
-    return text if len(text) <= MOST_LETTERS else f"{text[:MOST_LETTERS]}…"
+def bounded(text: str, most: int = MOST_LETTERS) -> str:
+    """At most so many letters of it."""
+    return text if len(text) <= most else f"{text[:most]}…"
 
 
 class Progress(Protocol):

@@ -37,6 +37,7 @@ FIGURES = ("psnr", "ssim", "psnr_mean_image", "psnr_nearest_view", "psnr_right",
 TRUSTED_WIDTH = 0.5  # of the photos: below, a picture can be sharp and the field know nothing of fine detail
 WORTH_SAYING = 0.5  # dB between the two scores of right halves
 LEAST_SIDE = 128  # pixels of the longer side of a photo that is scored, where there is a choice
+READING = 0.25  # seconds for each photo of the set where it is read at another size than the field was trained at
 BESIDE_DRAWING = 0.05  # seconds for each photo of the set, to read it: the mean image is one of them all
 TRIED_PHOTOS = 4  # to see how fast the field draws them
 NO_LPIPS = "LPIPS is not computed: no package in use ships its weights and nothing is downloaded"
@@ -46,7 +47,8 @@ class Config(StageConfig):
     """How to compare. None is chosen for you."""
 
     downscale: float | None = Field(default=None, ge=1)
-    """How many times smaller than the photos to score. None: the size that the field was trained at."""
+    """How many times smaller than the photos to score. None: the size that the field was trained at, or smaller where
+    one photo of that takes too long."""
     background: Literal["white", "black"] | None = None
     """What photos with alpha are shown over. None: what the field was trained over, white where that was random."""
     photos: int | None = Field(default=None, ge=1)
@@ -92,7 +94,8 @@ def _affordable(config: Config, scene: "Scene", train: Path, may_shrink: bool, p
         )
     downscale, one = config.downscale, pixels[chosen[0]]
     smallest = max(cameras[chosen[0]].width, cameras[chosen[0]].height) / LEAST_SIDE
-    if may_shrink and one > budget and smallest > downscale:
+    saved = (one - budget) / speed - READING * len(scene.views)
+    if may_shrink and saved > 0 and smallest > downscale:
         downscale = min(math.ceil(100 * downscale * math.sqrt(one / budget)) / 100, smallest)
         progress.note(
             f"a test photo takes about {duration(one / speed)}, {allowance.words()}: it is scored at "

@@ -138,7 +138,7 @@ def reconstruct(
     progress.update("colours", 0.9)
     nearest = KDTree(cleaned.surface.vertices).query(surface.vertices)[1]
     directions = sight.direction[cleaned.vertex[nearest]]
-    colours = _colours(model, surface.vertices, directions, voxel, device)
+    colours = _colours(model, cleaned.surface.vertices[nearest], directions, voxel, device)
     mesh = ColouredMesh(*surface, vertex_normals(surface), colours)
     return Reconstruction(mesh, level, cleaned, openness(surface, HALF_BOX, voxel), voxel)
 
@@ -187,11 +187,11 @@ def _level(
 def _colours(
     model: "RadianceModel", vertices: "np.ndarray", directions: "np.ndarray", voxel: float, device: str
 ) -> "np.ndarray":
-    """sRGB bytes (n, 3) of what is seen along ``directions`` (n, 3) from a lattice cell before each vertex to one
-    behind it.
+    """sRGB bytes (n, 3) of what is seen along ``directions`` (n, 3) from a lattice cell before each vertex of the raw
+    surface to one behind it.
 
     A field's colour means something where the field is dense, and a vertex is as far from there as the lattice is
-    coarse. Light that nothing there stops comes from where the way ends.
+    coarse. Light that no sample stops comes from the last one.
     """
     import torch
 

@@ -11,6 +11,9 @@ TIMED_EDGES, TIMED_SECONDS = (32, 64, 96), 0.3
 # point. On an idle machine, where a ball takes 0.024 s: fox, fountain_p11 and herzjesu_p8 at 64 to 192 points per edge
 # took 2.6 to 3 s and 0.8 to 1.1 µs a point (docs/numbers.md).
 ONCE, PER_POINT = 150.0, 4.5e-5
+# A colour costs as much as this many densities, 16 passes through the networks; surfaces have 3 to 5 vertices for each
+# point of a side of the lattice, and decimation leaves 150,000.
+COLOURED, VERTICES_PER_FACE, MOST_VERTICES = 16, 5, 150_000
 BALL_EDGE, BALL_TIMES = 96, 3
 
 
@@ -23,9 +26,15 @@ def affordable_resolution(rays: int) -> int:
 def resolution_in(seconds: float, per_density: float, per_ball: float) -> int:
     """Lattice points per edge, a multiple of 16 in 64 ... 256, of a mesh that takes ``seconds`` where a density takes
     ``per_density`` and the surface of a ball ``per_ball`` seconds."""
-    points = (seconds - ONCE * per_ball) / (per_density + PER_POINT * per_ball)
-    edge = 16 * int(max(points, 0.0) ** (1 / 3) / 16)
-    return min(MOST_RESOLUTION, max(LEAST_RESOLUTION, edge))
+    edges = range(LEAST_RESOLUTION, MOST_RESOLUTION + 1, 16)
+    fitting = [edge for edge in edges if seconds_of(edge, per_density, per_ball) <= seconds]
+    return max(fitting, default=LEAST_RESOLUTION)
+
+
+def seconds_of(edge: int, per_density: float, per_ball: float) -> float:
+    """What a mesh of ``edge`` lattice points per edge is expected to take."""
+    densities = edge**3 + COLOURED * min(VERTICES_PER_FACE * edge**2, MOST_VERTICES)
+    return densities * per_density + (ONCE + PER_POINT * edge**3) * per_ball
 
 
 def seconds_per_density(train: Path, half_box: float, chunk: int) -> float:

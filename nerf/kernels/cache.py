@@ -47,10 +47,10 @@ def occupied(bits: Int64[Tensor, "bricks"]) -> Occupied:
 def grown(reached: Bool[Tensor, "side side side"]) -> Bool[Tensor, "side side side"]:
     """Cells with all their neighbours, across edges and corners too."""
     for axis in range(3):
-        grown, last = reached.clone(), reached.shape[axis] - 1
-        grown.narrow(axis, 1, last).logical_or_(reached.narrow(axis, 0, last))
-        grown.narrow(axis, 0, last).logical_or_(reached.narrow(axis, 1, last))
-        reached = grown
+        wider, last = reached.clone(), reached.shape[axis] - 1
+        wider.narrow(axis, 1, last).logical_or_(reached.narrow(axis, 0, last))
+        wider.narrow(axis, 0, last).logical_or_(reached.narrow(axis, 1, last))
+        reached = wider
     return reached
 
 

@@ -11,14 +11,13 @@ from nerf.depth_range import NEAR_MARGIN
 from nerf.grid_field import GridField, GridSettings
 from nerf.grid_training import GridTrainer, GridTrainerSettings
 from nerf.kernels import CONTRACTED_BOX, reference
-from nerf.kernels.cache import cell_corners, grown, is_occupied
+from nerf.kernels.cache import cell_corners, cell_numbers, grown, is_occupied
 from nerf.kernels.marching import unit_coordinates
 from nerf.ray_bank import RayBank, build_ray_bank
-from nerf.visibility import photos_looking, usable_cells
+from nerf.visibility import usable_cells
 
 SIZE, HALF = 12, 0.5  # pixels of a photo, and half its width at a distance of one
 NEAR, FAR = 1.0, 40.0
-SIDE = 32
 FIELD = GridSettings(levels=2, log2_rows=10, coarsest=4, finest=16, steps=32, cache_cells=16, contracted=True)
 TRAINER = GridTrainerSettings(seed=3, background=(0.0, 0.0, 0.0), samples=1024, most_rays=256, least_photos=3)
 
@@ -39,60 +38,56 @@ def bank(count: int = 4, half: float = HALF) -> RayBank:
     return build_ray_bank([photo] * count, [0] * count, [bearings], torch.stack(poses), near, far)
 
 
-def centres(side: int) -> torch.Tensor:
-    """Where the cells' middles are in the scene."""
-    line = 2 * CONTRACTED_BOX * ((torch.arange(side) + 0.5) / side - 0.5)
-    return uncontract(torch.stack(torch.meshgrid(line, line, line, indexing="ij"), -1))
+def knowing(views: RayBank) -> RayBank:
+    """With a sparse point: the rule holds where some are known."""
+    return views.with_distances(torch.tensor([5]), torch.tensor([2.5]))
 
 
-def projected(views: RayBank, points: torch.Tensor, near: float) -> torch.Tensor:
+def middles(cells: int) -> torch.Tensor:
+    """Where the cells' middles are in the scene, in the order of the cache."""
+    unit = cell_corners(cells, torch.arange(cells**3)) + 0.5 / cells
+    return uncontract(2 * CONTRACTED_BOX * (unit - 0.5))
+
+
+def projected(views: RayBank, points: torch.Tensor, near: float, half: float) -> torch.Tensor:
     """How many photos have the points in their picture, between ``near`` and far."""
-    count = torch.zeros(points.shape[:-1], dtype=torch.int32)
+    photos = torch.zeros(len(points), dtype=torch.int32)
     for geometry in views.geometry.T:
         local = (points - geometry[9:12]) @ geometry[:9].view(3, 3)
-        edge = HALF * (1 - 1 / SIZE)  # the middles of the outermost pixels
-        inside = (local[..., :2].abs() <= edge * local[..., 2:]).all(-1) & (local[..., 2] > 0)
+        inside = (local[:, :2].abs() <= half * (1 - 1 / SIZE) * local[:, 2:]).all(-1) & (local[:, 2] > 0)
         distance = local.norm(dim=-1)
-        count += (inside & (distance > near) & (distance < FAR)).int()
-    return count
+        photos += (inside & (distance > near) & (distance < FAR)).int()
+    return photos
 
 
-def test_photos_are_counted_as_a_projection_counts_them() -> None:
-    views = bank()
-    found, true = photos_looking(views, SIDE).photos, projected(views, centres(SIDE), NEAR)
-    assert (found >= true).all(), "no photo that looks into a cell is overlooked"
-    assert set(found.unique().tolist()) == set(range(len(views.near) + 1))
-    for least in range(1, len(views.near) + 1):
-        around = grown(grown(true >= least))
-        assert (around[found >= least]).float().mean() > 0.97, "and others are next to one"
+@pytest.mark.parametrize("half", [0.15, 0.5, 1.3])
+@pytest.mark.parametrize("least", [1, 2, 3, 4])
+def test_a_cell_is_usable_where_enough_photos_look_or_one_from_its_foreground_on(half: float, least: int) -> None:
+    views = bank(half=half)
+    usable, points = usable_cells(views, least, 64), middles(64)
+    photos = projected(views, points, NEAR, half)
+    wanted = (photos >= least) | (projected(views, points, NEAR / NEAR_MARGIN, half) > 0)
+    assert usable[wanted].all(), "none is overlooked, however wide the lens"
+    numbers = cell_numbers(64, (cell_corners(64, torch.arange(64**3)) + 0.5 / 64)).long()
+    assert torch.equal(numbers, torch.arange(64**3))
+    cube = torch.zeros(64, 64, 64, dtype=torch.bool)
+    x, y, z = (64 * cell_corners(64, numbers)).long().unbind(-1)
+    cube[x, y, z] = wanted
+    assert not (usable & ~grown(grown(cube))[x, y, z]).any(), "and others are next to one"
+    if half < 0.2:  # wide photos see what is right before the others from their foregrounds on
+        assert (~usable & (photos > 0)).any() == (least > 1)
 
 
-def test_the_foreground_begins_where_the_nearest_point_is_known() -> None:
-    views = bank()
-    found, true = photos_looking(views, SIDE).behind, projected(views, centres(SIDE), NEAR / NEAR_MARGIN) > 0
-    assert found[true].all() and grown(grown(true))[found].float().mean() > 0.97
-    one = bank(1)
-    along = torch.tensor([[2.5 - t, 0.0, 0.0] for t in (-3.0, 0.4, 1.15, 1.7, 2.5, 20.0)])
-    cells = tuple((SIDE * unit_coordinates(along, True)).long().T)
-    looks = photos_looking(one, SIDE)
-    assert looks.photos[cells].tolist() == [0, 0, 1, 1, 1, 1], "behind a camera and before near it sees nothing"
-    assert looks.behind[cells].tolist() == [False, False, False, True, True, True]
-
-
-def test_before_all_foregrounds_several_photos_are_needed() -> None:
-    views = bank()
-    looks = photos_looking(views, 64)
-    x, y, z = (64 * cell_corners(64, torch.arange(64**3))).long().unbind(-1)
-    for least in (1, 2, 3):
-        usable = usable_cells(views, least, 64)
-        count, behind = looks.photos[x, y, z], looks.behind[x, y, z]
-        assert torch.equal(usable, (count >= least) | behind)
-        assert (~usable & (count > 0)).any() == (least > 1)
+def test_what_one_photo_sees_alone_before_its_foreground_is_left_empty() -> None:
+    along = torch.tensor([[2.5 - t, 0.0, 0.0] for t in (-3.0, 0.4, 1.2, 1.7, 2.5, 20.0)])
+    usable = usable_cells(bank(2), 2, 64)
+    numbers = cell_numbers(64, unit_coordinates(along, True)).long()
+    assert usable[numbers].tolist() == [False, False, False, True, True, True]
 
 
 def test_nothing_is_ever_sampled_elsewhere_nor_found_there() -> None:
     field = GridField(FIELD, 0, reference)
-    views = bank(4, 0.15)
+    views = knowing(bank(4, 0.15))
     trainer = GridTrainer(field, views, TRAINER)
     usable = usable_cells(views, 3, 16)
     assert 0.02 < usable.float().mean() < 0.98
@@ -105,8 +100,12 @@ def test_nothing_is_ever_sampled_elsewhere_nor_found_there() -> None:
     assert field.unit_density(elsewhere).any(), "which is not what the networks say"
 
 
-@pytest.mark.parametrize(("views", "contracted", "least"), [(1, True, 3), (2, True, 3), (4, False, 3), (4, True, 1)])
-def test_where_photos_are_few_or_space_ends_all_of_it_is_used(views: int, contracted: bool, least: int) -> None:
+@pytest.mark.parametrize(
+    ("views", "contracted", "least"),
+    [(knowing(bank(2)), True, 3), (bank(), True, 3), (knowing(bank()), False, 3), (knowing(bank()), True, 1)],
+    ids=["two photos", "no points", "a box", "one is enough"],
+)
+def test_where_the_rule_says_nothing_all_of_space_is_used(views: RayBank, contracted: bool, least: int) -> None:
     field = GridField(replace(FIELD, contracted=contracted), 0, reference)
-    GridTrainer(field, bank(views), replace(TRAINER, least_photos=least))
+    GridTrainer(field, views, replace(TRAINER, least_photos=least))
     assert (field.bits == -1).all()

@@ -20,7 +20,7 @@ ELSEWHERE = {
     "nerf/grid_field.py": "puts rows together: tests/nerf/test_grid_field.py",
     "nerf/density_cache.py": "σ times the lattice's step; the outermost cells, which reach to infinity, count half a "
     "cell within: tests/nerf/test_grid_training.py",
-    "nerf/visibility.py": "points along rays, in equal ratios of distance; cells around them count as well: "
+    "nerf/visibility.py": "angles and distances of the middles of cells; the cells around them count as well: "
     "tests/nerf/test_visibility.py",
     "nerf/ray_bank.py": "bearings linear within a patch, of length 1/2 or more before they are divided by it: "
     "tests/nerf/test_ray_bank.py",

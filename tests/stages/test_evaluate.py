@@ -280,13 +280,19 @@ def test_photos_asked_for_are_scored_whatever_they_take(make: Make, tmp_path: Pa
 
 def test_a_photo_too_large_for_the_time_is_scored_smaller(make: Make, progress: Any, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(evaluate, "LEAST_SIDE", 4)
-    inputs = make(speed=WIDTH * HEIGHT // 4)  # a quarter of a photo a second
-    planned = evaluate.plan(evaluate.Config(seconds=1 + 15 * evaluate.BESIDE_DRAWING), inputs, progress)
-    assert planned.photos == 1 and planned.downscale == pytest.approx(2, abs=0.05)
-    assert "it is scored at 50% of its width; --evaluate.downscale 1 asks for more" in progress.notes[-1]
-    monkeypatch.setattr(evaluate, "LEAST_SIDE", WIDTH)
-    assert evaluate.plan(evaluate.Config(seconds=1), inputs, progress).downscale == 1
-    assert evaluate.plan(evaluate.Config(seconds=1, downscale=1), inputs, progress).downscale == 1
+    monkeypatch.setattr("stages.drawing.Allowance.left", lambda _: 2.0)
+    inputs = make(speed=WIDTH * HEIGHT // 32)  # a photo takes 32 seconds
+
+    def downscale(**asked: Any) -> float | None:
+        return evaluate.plan(evaluate.Config(seconds=2, **asked), inputs, progress).downscale
+
+    assert downscale() == 4
+    assert "it is scored at 25% of its width; --evaluate.downscale 1 asks for more" in progress.notes[-1]
+    assert downscale(downscale=1) == 1, "as asked"
+    monkeypatch.setattr(evaluate, "LEAST_SIDE", WIDTH / 3)
+    assert downscale() == 3, "no smaller than can be judged"
+    monkeypatch.setattr(evaluate, "READING", 30 / 15 + 0.01)
+    assert downscale() == 1, "reading fifteen photos at another size takes as long"
 
 
 def test_plan_answers_every_open_question_once(make: Make, progress: Any):

@@ -119,19 +119,22 @@ def test_a_ball_becomes_a_closed_ball_in_the_sfm_frame(run_mesh, progress):
 
 
 class Painted(Solid):
-    """A field that is red where there is something, and white where there is nothing."""
+    """A field that is red where there is something, blue deeper in, and white where there is nothing."""
 
     def density(self, points):
         return self.inside * (self.distance(points) < 0)
 
     def colour(self, points, directions):
-        return torch.where(self.distance(points)[..., None] < 0, torch.tensor([1.0, 0, 0]), torch.ones(3))
+        distance = self.distance(points)[..., None]
+        inside = torch.where(distance > -0.5 * VOXEL, torch.tensor([1.0, 0, 0]), torch.tensor([0.0, 0, 1]))
+        return torch.where(distance < 0, inside, torch.ones(3))
 
 
-def test_colours_are_those_of_what_is_there_not_of_the_emptiness_that_a_vertex_may_lie_in(run_mesh):
-    _, folder = run_mesh(Painted(ball, inside=3000.0))
+def test_colours_are_those_of_what_is_seen_first_not_of_the_emptiness_that_a_vertex_may_lie_in(run_mesh):
+    _, folder = run_mesh(Painted(ball, inside=3000.0), max_faces=1500)
     colours = colours_of(trimesh.load_mesh(folder / "mesh.ply", process=False))
-    assert (colours[:, 1:] < 64).mean() > 0.99
+    assert (colours[:, :2] < (256, 64)).mean() > 0.99, "not white: what is outside"
+    assert (colours[:, 2] < 64).mean() > 0.99, "nor blue: what is hidden by the red"
 
 
 def test_the_facts_are_those_of_the_files(run_mesh):

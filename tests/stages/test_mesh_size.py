@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stages.mesh_size import ONCE, PER_POINT, affordable_resolution, resolution_in, yardstick
+from stages.mesh_size import ONCE, affordable_resolution, resolution_in, seconds_of, yardstick
 
 
 def test_the_resolution_grows_with_the_time_and_falls_with_what_things_take():
@@ -21,12 +21,10 @@ def test_the_resolution_grows_with_the_time_and_falls_with_what_things_take():
 
 @given(st.floats(8.0, 60.0), st.floats(1e-7, 1e-5), st.floats(0.005, 0.1))
 def test_the_resolution_chosen_fits_and_the_next_would_not(seconds: float, per_density: float, per_ball: float):
-    def takes(edge: int) -> float:
-        return ONCE * per_ball + edge**3 * (per_density + PER_POINT * per_ball)
-
     edge = resolution_in(seconds, per_density, per_ball)
-    assert takes(edge) <= seconds * (1 + 1e-9) or edge == 64
-    assert takes(edge + 16) > seconds or edge == 256
+    assert seconds_of(edge, per_density, per_ball) <= seconds or edge == 64
+    assert seconds_of(edge + 16, per_density, per_ball) > seconds or edge == 256
+    assert seconds_of(edge, 2 * per_density, per_ball) > seconds_of(edge, per_density, per_ball) > ONCE * per_ball
 
 
 def test_a_longer_training_gets_a_finer_lattice():
