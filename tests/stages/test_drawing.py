@@ -79,5 +79,5 @@ def test_pictures_have_what_is_left_of_the_time_given_or_a_share_of_the_training
     assert 0 < Allowance(1.0, tmp_path, 3.0).left() <= 1
     assert (Allowance(None, tmp_path, 3.0).words(), Allowance(10.0, tmp_path, 3.0).words()) == (
         "training took 50 s",
-        "given 10 s",
+        "given 10 s, of which 7 s are left for drawing",
     )
