@@ -67,7 +67,8 @@ def _widened(
     """The range of distances, widened on either side as far as FEWEST_POINTS points in a photo's field of view go."""
     distance = np.linalg.norm(points - scene.centres[view], axis=1)
     beyond = (distance < low) | (distance > high)
-    distance = np.sort(distance[beyond][scene.shows(view, points[beyond])])
+    _, shown = scene.project(view, points[beyond])
+    distance = np.sort(distance[beyond][shown])
     nearer, farther = distance[distance < low], distance[distance > high]
     if len(nearer) >= FEWEST_POINTS:
         low = max(float(nearer[FEWEST_POINTS - 1]), LEAST_NEAR)

@@ -36,7 +36,7 @@ class Normalisation(NamedTuple):
     arc_deg: float
 
 
-def normalise(sfm: Reconstruction, has_alpha: bool, roi: tuple[float, float, float, float] | None) -> Normalisation:
+def normalise(sfm: Reconstruction, roi: tuple[float, float, float, float] | None) -> Normalisation:
     """Choose the scene frame: region of interest in [-0.9, 0.9]^3, +z up, +y where the photos look.
 
     ``roi`` (x, y, z, radius in the sfm frame) replaces the automatic region; the cube's half side is the radius.
@@ -50,17 +50,14 @@ def normalise(sfm: Reconstruction, has_alpha: bool, roi: tuple[float, float, flo
     middle = spatial_median(sfm.centres)
     _check_extent(sfm, middle)
     upright = sfm.in_frame(rotation, middle)
-    if roi is None:
-        region = find_region(upright, layout, has_alpha)
-    else:
-        region = Region(rotation @ (np.array(roi[:3]) - middle), roi[3])
+    region = find_region(upright, layout) if roi is None else Region(rotation @ (np.array(roi[:3]) - middle), roi[3])
     if not region.half >= LEAST_HALF:
         raise ValueError(f"it is {region.half:.2g} units large, and {LEAST_HALF:g} is the least")
     scale = REGION_HALF / region.half
     centre = middle + rotation.T @ region.centre
     scene = upright.in_frame(np.eye(3), region.centre, scale)
     # Points cannot prove that nothing lies beyond the cube: sky and plain walls have none. Only alpha does.
-    bounded = has_alpha
+    bounded = sfm.opaque is not None
     near, far = near_and_far(scene, bounded)
     return Normalisation(
         scene_from_sfm=Similarity(scale, rotation, -scale * (rotation @ centre)),

@@ -19,7 +19,9 @@ class Reconstruction:
     """Posed photos and sparse points in one common frame.
 
     ``bearings`` are unit vectors in the camera frame, sampled over each photo's whole field of view (the frustum);
-    observation j says that photo ``view[j]`` sees point ``point[j]``. There may be no points at all.
+    observation j says that photo ``view[j]`` sees point ``point[j]``. There may be no points at all. ``opaque`` is the
+    :func:`extent` of the :func:`angles` of what may be opaque in each photo: beside it all is background. Without
+    alpha, which alone tells, None.
     """
 
     from_camera: Float[np.ndarray, "n 3 4"]
@@ -58,15 +60,13 @@ class Reconstruction:
         """The least and the greatest :func:`angles` in a photo."""
         return extent(angles(self.bearings[view]))
 
-    def angles_to(self, view: int, points: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m 2"]:
-        """The :func:`angles` at which a photo has points."""
-        return angles((points - self.centres[view]) @ self.from_camera[view, :, :3])
-
-    def shows(self, view: int, points: Float[np.ndarray, "m 3"]) -> Bool[np.ndarray, "m"]:
-        """Which points lie in a photo's field of view, hidden or not."""
+    def project(
+        self, view: int, points: Float[np.ndarray, "m 3"]
+    ) -> tuple[Float[np.ndarray, "m 2"], Bool[np.ndarray, "m"]]:
+        """The :func:`angles` at which a photo has points, and which of them lie in its field of view, hidden or not."""
         local = (points - self.centres[view]) @ self.from_camera[view, :, :3]
-        widest = self.bearings[view, :, 2].min()
-        return within(angles(local), self.field(view)) & (local[:, 2] >= widest * np.linalg.norm(local, axis=1))
+        at, widest = angles(local), self.bearings[view, :, 2].min()
+        return at, within(at, self.field(view)) & (local[:, 2] >= widest * np.linalg.norm(local, axis=1))
 
     def distances(self) -> Float[np.ndarray, "observations"]:
         """Distance from the photo to the point, per observation."""

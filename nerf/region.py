@@ -51,7 +51,7 @@ def find_layout(scene: Reconstruction) -> Layout:
     return "around" if np.quantile(angles_deg(scene.axes, bearing), 0.8) <= CONVERGENT_DEG else "inside"
 
 
-def find_region(scene: Reconstruction, layout: Layout, has_alpha: bool) -> Region:
+def find_region(scene: Reconstruction, layout: Layout) -> Region:
     """The cube, aligned with the axes of the frame ``scene`` is in.
 
     around: centred on the focus, holding 95 % of the observed points but not reaching beyond the cameras;
@@ -60,13 +60,13 @@ def find_region(scene: Reconstruction, layout: Layout, has_alpha: bool) -> Regio
     held whole.
     Raises ValueError when the cameras stand in one place and there are no points to give a scale.
     """
-    if layout == "around" and has_alpha and scene.opaque is not None:
-        cube = _opaque(scene)
+    if layout == "around" and scene.opaque is not None:
+        cube = _carved(scene, scene.opaque)
     else:
         cube = {"around": _around, "forward": _forward, "inside": _inside}[layout](scene)
     if not cube.half > 0:
         raise ValueError("all cameras stand in one place and no point is known")
-    return _grown(cube, scene, has_alpha)
+    return _grown(cube, scene)
 
 
 def share_beyond(scene: Reconstruction, centre: Float[np.ndarray, "3"], half: float) -> float:
@@ -80,12 +80,12 @@ def _reach(scene: Reconstruction, centre: Float[np.ndarray, "3"]) -> Float[np.nd
     return np.abs(scene.points - centre).max(axis=1, initial=0.0)[scene.point]
 
 
-def _grown(cube: Region, scene: Reconstruction, has_alpha: bool) -> Region:
+def _grown(cube: Region, scene: Reconstruction) -> Region:
     """Let the cube hold the whole scene where that costs little (or where alpha says that there is no more)."""
     if not len(scene.point):
         return cube
     whole = float(np.quantile(_reach(scene, cube.centre), WHOLE))
-    if has_alpha or whole <= GROWTH * cube.half:
+    if scene.opaque is not None or whole <= GROWTH * cube.half:
         return Region(cube.centre, max(cube.half, whole))
     return cube
 
@@ -106,20 +106,19 @@ def _around(scene: Reconstruction) -> Region:
     return Region(centre, min(max(half, LEAST_WIDTH * width), distance))
 
 
-def _opaque(scene: Reconstruction) -> Region:
+def _carved(scene: Reconstruction, opaque: Float[np.ndarray, "n 2 2"]) -> Region:
     """What may be opaque, bare or textured: carved out of a cube that surely holds it by every photo's rectangle."""
-    assert scene.opaque is not None
     centre, near_by = focus(scene), _near_by(scene)
     distance = np.linalg.norm(scene.centres - centre, axis=1)
-    widest = np.tan(np.minimum(np.abs(scene.opaque).max(axis=(1, 2)), np.pi / 4))
+    widest = np.tan(np.minimum(np.abs(opaque).max(axis=(1, 2)), np.pi / 4))
     half = float(min((distance * widest)[near_by].max(), np.median(distance)))
     side = np.linspace(-half, half, CARVED)
     points = centre + np.stack(np.meshgrid(side, side, side, indexing="ij"), axis=-1).reshape(-1, 3)
     seen, clear = np.zeros(len(points), int), np.zeros(len(points), int)
     for view in range(0, len(scene.centres), -(-len(scene.centres) // MOST_CARVING)):
-        shown = scene.shows(view, points)
+        at, shown = scene.project(view, points)
         seen += shown
-        clear += shown & ~within(scene.angles_to(view, points), scene.opaque[view])
+        clear += shown & ~within(at, opaque[view])
     left = points[(seen > clear) & (clear <= MISTAKEN * seen)]
     if not len(left):
         return Region(centre, half)

@@ -64,7 +64,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     boxes = [photo.opaque if part == "train" else None for photo, part in zip(photos, split, strict=True)]
     sfm = _reconstruction(model, order, boxes if has_alpha else None)
     try:
-        found = normalise(sfm, has_alpha, config.roi)
+        found = normalise(sfm, config.roi)
     except ValueError as error:
         hint = "Take photos from different places, or give --normalise.roi."
         raise StageError("the scene has no scale", str(error), hint) from error

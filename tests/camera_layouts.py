@@ -1,5 +1,7 @@
 """Synthetic reconstructions for tests: cameras in typical layouts and points that they see."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from nerf.camera_paths import look_at
@@ -18,6 +20,11 @@ def seen_by(poses: np.ndarray, points: np.ndarray) -> Reconstruction:
     inside = (np.abs(local[..., :2]).max(axis=-1) <= FIELD_OF_VIEW_TAN * depth) & np.isfinite(depth)
     view, point = np.nonzero(inside)
     return Reconstruction(poses, np.repeat(bearings[None], len(poses), axis=0), points, view, point)
+
+
+def opaque_everywhere(scene: Reconstruction) -> Reconstruction:
+    """The scene with photos that have alpha, of which none is transparent anywhere."""
+    return replace(scene, opaque=np.stack([scene.field(view) for view in range(len(scene.centres))]))
 
 
 def ball(count: int = 400, radius: float = 1.0, seed: int = 0) -> np.ndarray:

@@ -18,6 +18,7 @@ from nerf.scene import Camera, Scene, View
 from nerf.synthetic import SyntheticScene, photograph, ring_of_cameras, still_life
 from stages.files import write_json, write_tensors
 from stages.photos import Photo, write_photos
+from tests.camera_layouts import opaque_everywhere
 from tests.small_scenes import pinhole_directions
 
 WIDTH, HEIGHT, FOCAL = 240, 180, 250.0
@@ -123,7 +124,7 @@ def _write_scene(
     points, view, point, xy = tracks
     bearings = pinhole_directions(32, 32, 32 * FOCAL / WIDTH).reshape(-1, 3).double().numpy()
     sfm = Reconstruction(poses, np.repeat(bearings[None], len(poses), 0), points, view, point)
-    found = normalise(sfm, has_alpha, None)
+    found = normalise(opaque_everywhere(sfm) if has_alpha else sfm, None)
     views = tuple(
         View(
             name,

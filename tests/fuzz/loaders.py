@@ -222,7 +222,7 @@ def _import_cameras(cameras: Path, photos: list, folder: Path) -> None:
     assert _import(cameras, photos, folder, folder / "sfm", Quiet()).outputs
     model = read_model(folder / "sfm" / "sparse")
     try:
-        found = normalise(_reconstruction(model, list(range(len(model.images))), None), False, None)
+        found = normalise(_reconstruction(model, list(range(len(model.images))), None), None)
     except ValueError as error:
         raise StageError("the scene has no scale", str(error), "-") from error
     assert (found.near > 0).all() and (found.near < found.far).all() and np.isfinite(found.far).all()

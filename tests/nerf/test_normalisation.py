@@ -9,7 +9,7 @@ from nerf.camera_paths import nearest_rotations
 from nerf.normalisation import Normalisation, normalise
 from nerf.reconstruction import Reconstruction, angles_deg, extent
 from nerf.region import find_layout
-from tests.camera_layouts import ball, ring, room, room_points, seen_by, wall, wall_points
+from tests.camera_layouts import ball, opaque_everywhere, ring, room, room_points, seen_by, wall, wall_points
 
 SCENES = {
     "around": lambda: seen_by(ring(), ball()),
@@ -47,7 +47,7 @@ def test_an_arc_that_converges_is_around_and_a_narrow_one_is_forward() -> None:
 @pytest.mark.parametrize("layout", SCENES)
 def test_the_region_holds_nearly_all_that_is_seen_and_is_filled_by_it(layout: str) -> None:
     scene = SCENES[layout]()
-    found = normalise(scene, False, None)
+    found = normalise(scene, None)
     reach = np.abs(found.scene_from_sfm.points(scene.points))[np.unique(scene.point)].max(axis=1)
     assert (reach <= 0.9).mean() >= 0.94
     assert np.quantile(reach, 0.95) > 0.35
@@ -55,7 +55,7 @@ def test_the_region_holds_nearly_all_that_is_seen_and_is_filled_by_it(layout: st
 
 @pytest.mark.parametrize("layout", SCENES)
 def test_up_becomes_z_and_the_frame_is_a_rotation(layout: str) -> None:
-    found = normalise(SCENES[layout](), False, None)
+    found = normalise(SCENES[layout](), None)
     rotation = found.scene_from_sfm.rotation
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(rotation) > 0
@@ -64,7 +64,7 @@ def test_up_becomes_z_and_the_frame_is_a_rotation(layout: str) -> None:
 
 
 def test_a_facade_faces_plus_y() -> None:
-    found = normalise(SCENES["forward"](), False, None)
+    found = normalise(SCENES["forward"](), None)
     np.testing.assert_allclose(found.scene_from_sfm.rotation, np.eye(3), atol=1e-9)
 
 
@@ -73,7 +73,7 @@ def test_far_outliers_hardly_change_the_scale(layout: str) -> None:
     clean = SCENES[layout]()
     random = np.random.default_rng(1)
     spoilt = with_points(clean, 1e4 * random.normal(size=(15, 3)), views=2)
-    before, after = region_half(normalise(clean, False, None)), region_half(normalise(spoilt, False, None))
+    before, after = region_half(normalise(clean, None)), region_half(normalise(spoilt, None))
     assert 0.8 * before < after < 1.3 * before
 
 
@@ -84,7 +84,7 @@ def test_one_far_camera_hardly_changes_the_scale(layout: str) -> None:
     from_camera[3, :, 3] += 1e3 * np.array([0.3, -0.9, 0.3])
     keep = clean.view != 3
     spoilt = dataclasses.replace(clean, from_camera=from_camera, view=clean.view[keep], point=clean.point[keep])
-    before, after = region_half(normalise(clean, False, None)), region_half(normalise(spoilt, False, None))
+    before, after = region_half(normalise(clean, None)), region_half(normalise(spoilt, None))
     assert 0.8 * before < after < 1.25 * before
 
 
@@ -101,7 +101,7 @@ def test_similar_reconstructions_give_the_same_scene(layout: str, seed: int, sca
     # the sfm frame is offset by up to a million of its own units, which float64 holds to 1e-10 of them
     shift = np.array([offset, -offset, offset / 2]) * min(1.0, scale)
     moved = scene.in_frame(turn, -turn.T @ shift / scale, scale)
-    one, other = normalise(scene, False, None), normalise(moved, False, None)
+    one, other = normalise(scene, None), normalise(moved, None)
     assert (one.layout, one.bounded, one.up.source) == (other.layout, other.bounded, other.up.source)
     np.testing.assert_allclose(
         other.scene_from_sfm.points(moved.points), one.scene_from_sfm.points(scene.points), atol=1e-5
@@ -113,8 +113,8 @@ def test_similar_reconstructions_give_the_same_scene(layout: str, seed: int, sca
 @pytest.mark.parametrize("layout", SCENES)
 @pytest.mark.parametrize("has_alpha", [False, True])
 def test_every_observed_point_but_outliers_lies_between_near_and_far(layout: str, has_alpha: bool) -> None:
-    scene = SCENES[layout]()
-    found = normalise(scene, has_alpha, None)
+    scene = opaque_everywhere(SCENES[layout]()) if has_alpha else SCENES[layout]()
+    found = normalise(scene, None)
     distance = scene.distances() * found.scene_from_sfm.scale
     assert (found.near > 0).all()
     assert (found.near[scene.view] < distance).mean() > 0.99
@@ -133,7 +133,7 @@ def test_near_lies_before_what_only_other_photos_have_points_of(views: int, behi
     close = scene.distances() < 4.0
     unmatched = (scene.view < views) & close
     matched = dataclasses.replace(scene, view=scene.view[~unmatched], point=scene.point[~unmatched])
-    found = normalise(matched, False, None)
+    found = normalise(matched, None)
     distance = scene.distances() * found.scene_from_sfm.scale
     assert (found.near[scene.view] < distance)[close].mean() > 0.99
 
@@ -142,7 +142,7 @@ def test_far_lies_behind_what_only_other_photos_have_points_of() -> None:
     scene = with_points(SCENES["around"](), np.array([0.0, 300.0, 0.0]) + ball(100, 5.0), 16)
     unmatched = ~np.isin(scene.view, [7, 9, 10]) & (scene.point >= 400)
     matched = dataclasses.replace(scene, view=scene.view[~unmatched], point=scene.point[~unmatched])
-    found = normalise(matched, False, None)
+    found = normalise(matched, None)
     assert found.far[8] > 290 * found.scene_from_sfm.scale  # it looks there, from y = -4
     assert found.far[0] == 20  # it looks away
 
@@ -150,7 +150,7 @@ def test_far_lies_behind_what_only_other_photos_have_points_of() -> None:
 def test_what_is_twenty_times_nearer_than_the_rest_of_a_photo_is_no_false_match_where_many_points_say_so() -> None:
     scene = SCENES["around"]()
     rail = scene.centres[0] + 0.05 * scene.axes[0] + 0.01 * ball(30)
-    found, clean = normalise(with_points(scene, rail, 4), False, None), normalise(scene, False, None)
+    found, clean = normalise(with_points(scene, rail, 4), None), normalise(scene, None)
     assert found.near[0] < 0.05 * found.scene_from_sfm.scale < 0.05 * clean.near[0] / 0.7 * 3
 
 
@@ -164,10 +164,10 @@ def test_points_behind_or_beside_a_photo_or_unsure_ones_say_nothing_of_its_near(
         with_them = with_points(scene, points, views + 1)
         own = (with_them.view == 0) & (with_them.point >= len(scene.points))
         return normalise(
-            dataclasses.replace(with_them, view=with_them.view[~own], point=with_them.point[~own]), False, None
+            dataclasses.replace(with_them, view=with_them.view[~own], point=with_them.point[~own]), None
         ).near[0]
 
-    clean = normalise(scene, False, None).near[0]
+    clean = normalise(scene, None).near[0]
     elsewhere = np.concatenate([centre - 0.5 * axis + jitter, centre + 0.5 * axis + 0.6 * right + jitter])
     assert near_beside(elsewhere, 3) == pytest.approx(clean, rel=0.02)
     assert near_beside(centre + 0.5 * axis + jitter, 2) == pytest.approx(clean, rel=0.02)
@@ -177,14 +177,14 @@ def test_points_behind_or_beside_a_photo_or_unsure_ones_say_nothing_of_its_near(
 
 def opaque_where(scene: Reconstruction, solid: np.ndarray) -> Reconstruction:
     """The scene with photos whose alpha leaves a solid of points, and what holds it."""
-    boxes = [extent(np.clip(scene.angles_to(view, solid), *scene.field(view))) for view in range(len(scene.centres))]
+    boxes = [extent(np.clip(scene.project(view, solid)[0], *scene.field(view))) for view in range(len(scene.centres))]
     return dataclasses.replace(scene, opaque=np.stack(boxes))
 
 
 def test_with_alpha_the_region_holds_what_is_opaque_where_only_a_spot_of_it_has_points() -> None:
     bottle = ball(4000) * [0.3, 0.3, 1.0] + [0.0, 0.0, 0.2]
     scene = opaque_where(seen_by(ring(), 0.2 * ball()), bottle)
-    found = normalise(scene, True, None)
+    found = normalise(scene, None)
     assert np.abs(found.scene_from_sfm.points(bottle)).max() <= 0.95
     assert region_half(found) == pytest.approx(1.0, rel=0.15)
 
@@ -194,7 +194,7 @@ def test_a_photo_of_a_part_and_one_that_is_mistaken_carve_nothing_away() -> None
     scene = opaque_where(seen_by(np.concatenate([ring(40), ring(2, radius=1.6)]), thing), thing)  # two see a part
     assert scene.opaque is not None
     scene.opaque[3] = [[0.2, 0.2], [0.3, 0.3]]
-    found = normalise(scene, True, None)
+    found = normalise(scene, None)
     assert np.abs(found.scene_from_sfm.points(thing)).max() <= 0.95
     assert region_half(found) == pytest.approx(1.0, rel=0.15)
 
@@ -202,7 +202,7 @@ def test_a_photo_of_a_part_and_one_that_is_mistaken_carve_nothing_away() -> None
 def test_photos_of_which_nothing_is_left_still_have_a_region() -> None:
     scene = seen_by(ring(), ball())
     nothing = dataclasses.replace(scene, opaque=np.tile([[0.45, 0.45], [0.46, 0.46]], (16, 1, 1)))
-    assert region_half(normalise(nothing, True, None)) > 0
+    assert region_half(normalise(nothing, None)) > 0
 
 
 @pytest.mark.parametrize("has_alpha", [False, True])
@@ -214,7 +214,7 @@ def test_a_camera_anywhere_has_near_before_far_and_reaches_the_region(away: floa
         seen_by(poses, ball()), points=np.zeros((0, 3)), view=np.zeros(0, int), point=np.zeros(0, int)
     )
     for scene in (cameras, seen_by(poses, ball())):
-        found = normalise(scene, has_alpha, None)
+        found = normalise(opaque_everywhere(scene) if has_alpha else scene, None)
         distance = np.linalg.norm(found.scene_from_sfm.points(scene.centres), axis=1)
         assert (found.near > 0).all() and (found.near < found.far).all()
         assert (found.near < distance).all() and (found.far > distance).all()
@@ -225,7 +225,7 @@ def test_a_telephoto_lens_far_away_sees_the_region() -> None:
     scene = seen_by(ring(radius=4.0), np.zeros((0, 3)))
     narrow = scene.bearings * [0.05, 0.05, 1.0]
     narrow /= np.linalg.norm(narrow, axis=2, keepdims=True)
-    found = normalise(dataclasses.replace(scene, bearings=narrow), False, None)
+    found = normalise(dataclasses.replace(scene, bearings=narrow), None)
     distance = np.linalg.norm(found.scene_from_sfm.points(scene.centres), axis=1)
     assert (distance > 20).all()
     assert (found.near < distance - 0.9).all() and (found.far > distance + 0.9).all()
@@ -235,7 +235,7 @@ def test_a_view_of_nothing_but_the_far_distance_has_near_before_far() -> None:
     scene = with_points(seen_by(ring(), ball()), np.array([[0.0, 1e5, 0.0]]) + ball(50), 3)
     only_far = scene.point >= 400
     keep = (scene.view != 0) | only_far
-    found = normalise(dataclasses.replace(scene, view=scene.view[keep], point=scene.point[keep]), False, None)
+    found = normalise(dataclasses.replace(scene, view=scene.view[keep], point=scene.point[keep]), None)
     assert (found.near < 0.999 * found.far).all()
 
 
@@ -245,39 +245,39 @@ def test_cameras_in_one_place_are_refused_wherever_it_is(offset: float) -> None:
     poses = scene.from_camera.copy()
     poses[:, :, 3] = offset + np.array([0.1, 0.2, 0.3]) * (1 + 1e-16 * np.arange(len(poses)))[:, None]
     with pytest.raises(ValueError, match="one place"):
-        normalise(dataclasses.replace(scene, from_camera=poses), False, None)
+        normalise(dataclasses.replace(scene, from_camera=poses), None)
 
 
 def test_only_alpha_proves_that_nothing_lies_beyond() -> None:
     around = SCENES["around"]()
-    assert normalise(around, True, None).bounded
-    assert not normalise(around, False, None).bounded, "sky and plain walls have no points"
+    assert normalise(opaque_everywhere(around), None).bounded
+    assert not normalise(around, None).bounded, "sky and plain walls have no points"
 
 
 def test_unbounded_scenes_reach_far_behind_the_farthest_point() -> None:
-    found = normalise(with_points(SCENES["around"](), 30 * ball(60), views=4), False, None)
+    found = normalise(with_points(SCENES["around"](), 30 * ball(60), views=4), None)
     assert (found.far >= 20).all()
     assert (found.far <= 1000).all()
 
 
 def test_a_full_turn_and_an_arc_are_measured() -> None:
-    assert normalise(seen_by(ring(count=36), ball()), False, None).arc_deg == pytest.approx(350, abs=1)
-    assert normalise(seen_by(ring(arc_deg=100.0), ball()), False, None).arc_deg == pytest.approx(100, abs=3)
+    assert normalise(seen_by(ring(count=36), ball()), None).arc_deg == pytest.approx(350, abs=1)
+    assert normalise(seen_by(ring(arc_deg=100.0), ball()), None).arc_deg == pytest.approx(100, abs=3)
 
 
 def test_without_points_the_cameras_frusta_give_the_region() -> None:
     scene = seen_by(ring(radius=4.0, height=0.0), np.zeros((0, 3)))
-    found = normalise(scene, True, None)
+    found = normalise(opaque_everywhere(scene), None)
     assert region_half(found) == pytest.approx(4.0 * 0.5, rel=1e-3)  # distance x tan(half field of view)
     np.testing.assert_allclose(found.scene_from_sfm.points(np.zeros(3)), 0, atol=1e-6)
     assert found.bounded
     assert 0 < found.near.min() < 4.0 * found.scene_from_sfm.scale < found.far.max() < 10
-    assert not normalise(scene, False, None).bounded
+    assert not normalise(scene, None).bounded
 
 
 @pytest.mark.parametrize("poses", [wall(), room()], ids=["forward", "inside"])
 def test_without_points_other_layouts_get_a_region_too(poses: np.ndarray) -> None:
-    found = normalise(seen_by(poses, np.zeros((0, 3))), False, None)
+    found = normalise(seen_by(poses, np.zeros((0, 3))), None)
     spread = np.linalg.norm(poses[:, :, 3] - np.median(poses[:, :, 3], axis=0), axis=1).max()
     assert spread < region_half(found) < 30 * spread
     assert (found.near > 0).all()
@@ -285,7 +285,7 @@ def test_without_points_other_layouts_get_a_region_too(poses: np.ndarray) -> Non
 
 def test_a_given_region_is_taken_as_it_is() -> None:
     scene = SCENES["around"]()
-    found = normalise(scene, False, (0.2, -0.1, 0.3, 2.5))
+    found = normalise(scene, (0.2, -0.1, 0.3, 2.5))
     np.testing.assert_allclose(found.scene_from_sfm.points(np.array([0.2, -0.1, 0.3])), 0, atol=1e-12)
     assert region_half(found) == pytest.approx(2.5)
 
@@ -294,7 +294,7 @@ def test_photos_from_one_place_without_points_have_no_scale() -> None:
     poses = ring(radius=1.0)
     poses[:, :, 3] = 0
     with pytest.raises(ValueError, match="all cameras stand in one place and no point is known"):
-        normalise(seen_by(poses, np.zeros((0, 3))), False, None)
+        normalise(seen_by(poses, np.zeros((0, 3))), None)
 
 
 def test_lego_fills_the_region_and_stays_inside(shared_data) -> None:
@@ -310,7 +310,7 @@ def test_lego_fills_the_region_and_stays_inside(shared_data) -> None:
     tangent = np.tan(content["camera_angle_x"] / 2)
     bearings = scene.bearings * [tangent / 0.5, tangent / 0.5, 1]
     scene = dataclasses.replace(scene, bearings=bearings / np.linalg.norm(bearings, axis=-1, keepdims=True))
-    found = normalise(scene, True, None)
+    found = normalise(opaque_everywhere(scene), None)
     assert found.layout == "around"
     assert found.bounded
     assert angles_deg(found.up.direction, np.array([0.0, 0.0, 1.0])) < 1e-3
