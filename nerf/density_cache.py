@@ -28,7 +28,7 @@ class DensityCache:
     def __init__(self, field: GridField, usable: Bool[Tensor, "cache"] | None = None) -> None:
         self.field, self.unusable = field, None if usable is None else ~usable
         self.thickness = torch.zeros(field.settings.cache_cells**3, device=field.table.device)
-        self.usable_cells = len(self.thickness) if usable is None else max(1, int(usable.sum()))
+        self.usable_count = len(self.thickness) if usable is None else max(1, int(usable.sum()))
         if usable is not None:
             field.occupy(field.backend.occupied_bits(usable.float(), 0.5))
 
@@ -50,7 +50,7 @@ class DensityCache:
     def _mean(self) -> float:
         """Of the usable cells; summed in rows, so that no result depends on how many threads share the work."""
         rows = self.thickness.view(-1, self.field.settings.cache_cells)
-        return float(rows.sum(-1).double().sum()) / self.usable_cells
+        return float(rows.sum(-1).double().sum()) / self.usable_count
 
     def _measure_part(self, part: int, parts: int, random: torch.Generator) -> None:
         """Measure every ``parts``-th brick, beginning with number ``part``: blocks of 2³ cells, at one point each."""
