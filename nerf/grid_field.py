@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
 
 from nerf import grid_mlp
@@ -159,10 +159,7 @@ class GridField(nn.Module):
 
     def density(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points"]:
         """Density per scene unit; zero in cells that are not sampled, and outside the box of a bounded scene."""
-        unit = unit_coordinates(points, self.settings.contracted).reshape(-1, 3)
-        sampled = is_occupied(self.bits, cell_numbers(self.settings.cache_cells, unit))
-        if not self.settings.contracted:
-            sampled &= (points.reshape(-1, 3).abs() <= BOX).all(-1)
+        unit, sampled = self._located(points)
         sigma = unit.new_zeros(len(unit))
         sigma[sampled] = self.unit_density(unit[sampled])
         return sigma.view(points.shape[:-1])
@@ -171,16 +168,25 @@ class GridField(nn.Module):
         """Density per scene unit at unit coordinates."""
         return self._density_pass(unit.clamp(0, 1)).sigma
 
-    def colour(
+    def density_and_colour(
         self, points: Float[Tensor, "*points 3"], directions: Float[Tensor, "*points 3"]
-    ) -> Float[Tensor, "*points 3"]:
-        """Colour seen by viewing rays of unit ``directions``; without meaning where the density is zero."""
-        unit = unit_coordinates(points, self.settings.contracted).reshape(-1, 3).clamp(0, 1)
+    ) -> tuple[Float[Tensor, "*points"], Float[Tensor, "*points 3"]]:
+        """What :meth:`density` says, and the colour seen by viewing rays of unit ``directions``."""
+        unit, sampled = self._located(points)
+        density = self._density_pass(unit.clamp(0, 1))
         of_rays = grid_mlp.ray_hidden(self.weights, self.of_directions(directions.reshape(-1, 3).contiguous()))
         each = torch.arange(len(unit) + 1, dtype=torch.int32, device=unit.device)  # a ray of its own for every point
         alone = Samples(each, each[:-1], unit[:, 0], unit[:, 0])
-        geometry = self._density_pass(unit).geometry
-        return grid_mlp.colour_forward(self.weights, self.backend, alone, geometry, of_rays).colour.view(points.shape)
+        colour = grid_mlp.colour_forward(self.weights, self.backend, alone, density.geometry, of_rays).colour
+        return torch.where(sampled, density.sigma, 0).view(points.shape[:-1]), colour.view(points.shape)
+
+    def _located(self, points: Float[Tensor, "*points 3"]) -> tuple[Float[Tensor, "n 3"], Bool[Tensor, "n"]]:
+        """Unit coordinates of points, and which of them lie in cells that are sampled and in a bounded scene's box."""
+        unit = unit_coordinates(points, self.settings.contracted).reshape(-1, 3)
+        sampled = is_occupied(self.bits, cell_numbers(self.settings.cache_cells, unit))
+        if not self.settings.contracted:
+            sampled &= (points.reshape(-1, 3).abs() <= BOX).all(-1)
+        return unit, sampled
 
     @torch.no_grad()
     def render(self, rays: Rays, background: Float[Tensor, "3"]) -> Rendering:

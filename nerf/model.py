@@ -33,10 +33,11 @@ class RadianceModel(Protocol):
         """Volume density sigma at points."""
         ...
 
-    def colour(
+    def density_and_colour(
         self, points: Float[Tensor, "*points 3"], directions: Float[Tensor, "*points 3"]
-    ) -> Float[Tensor, "*points 3"]:
-        """Colour emitted at points towards -directions (directions are those of the viewing rays, unit)."""
+    ) -> tuple[Float[Tensor, "*points"], Float[Tensor, "*points 3"]]:
+        """The same density, and the colour emitted at points towards -directions (those of the viewing rays, unit);
+        without meaning where the density is zero."""
         ...
 
     def render(self, rays: Rays, background: Float[Tensor, "3"]) -> Rendering:

@@ -166,14 +166,14 @@ class PaperNerf(nn.Module):
 
     def density(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points"]:
         """Density per scene unit; zero outside the cube to which an uncontracted field is cut."""
-        sigma = self.fine.density(self._coordinates(points))
-        return sigma if self.settings.contracted else torch.where((points.abs() <= BOX).all(-1), sigma, 0)
+        return self._cut(points, self.fine.density(self._coordinates(points)))
 
-    def colour(
+    def density_and_colour(
         self, points: Float[Tensor, "*points 3"], directions: Float[Tensor, "*points 3"]
-    ) -> Float[Tensor, "*points 3"]:
-        """Colour seen by viewing rays of unit ``directions``; without meaning where the density is zero."""
-        return self.fine(self._coordinates(points)[..., None, :], directions)[1][..., 0, :]
+    ) -> tuple[Float[Tensor, "*points"], Float[Tensor, "*points 3"]]:
+        """What :meth:`density` says, and the colour seen by viewing rays of unit ``directions``."""
+        sigma, colour = self.fine(self._coordinates(points)[..., None, :], directions)
+        return self._cut(points, sigma[..., 0]), colour[..., 0, :]
 
     @torch.no_grad()
     def render(self, rays: Rays, background: Float[Tensor, "3"]) -> Rendering:
@@ -204,6 +204,9 @@ class PaperNerf(nn.Module):
         with part("sampling"):
             exact = Rays(*(each.double() for each in rays))
             return exact if self.settings.contracted else clip_to_box(exact, BOX)
+
+    def _cut(self, points: Float[Tensor, "*points 3"], sigma: Float[Tensor, "*points"]) -> Float[Tensor, "*points"]:
+        return sigma if self.settings.contracted else torch.where((points.abs() <= BOX).all(-1), sigma, 0)
 
     def _coordinates(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
         return CONTRACTED_SCALE * contract(points) if self.settings.contracted else points

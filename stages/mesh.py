@@ -204,8 +204,8 @@ def _colours(
         points, views = (torch.tensor(a[some], dtype=torch.float32, device=device) for a in (vertices, directions))
         along = points[:, None] + t[:-1, None] * views[:, None]
         with torch.no_grad():
-            each = model.colour(along, views[:, None].expand_as(along))
-            seen, _ = composite(model.density(along), each, t.expand(len(points), -1), each[:, -1])
+            density, each = model.density_and_colour(along, views[:, None].expand_as(along))
+            seen, _ = composite(density, each, t.expand(len(points), -1), each[:, -1])
         colours.append(seen.colour)
     return (torch.cat(colours).clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
 

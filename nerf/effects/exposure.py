@@ -167,11 +167,12 @@ class ExposedModel:
         """The other model's."""
         return self.model.density(points)
 
-    def colour(
+    def density_and_colour(
         self, points: Float[Tensor, "*points 3"], directions: Float[Tensor, "*points 3"]
-    ) -> Float[Tensor, "*points 3"]:
-        """The other model's, exposed."""
-        return expose(self.model.colour(points, directions), self.log_gain)
+    ) -> tuple[Float[Tensor, "*points"], Float[Tensor, "*points 3"]]:
+        """The other model's density, and its colour, exposed."""
+        density, colour = self.model.density_and_colour(points, directions)
+        return density, expose(colour, self.log_gain)
 
     def render(self, rays: Rays, background: Float[Tensor, "3"]) -> Rendering:
         """The other model's rendering, exposed; the background is shown as it is."""

@@ -119,10 +119,11 @@ def test_it_is_a_radiance_model_of_the_scene_frame() -> None:
     density = model.density(points)
     assert (density[0] > 0).all() and (density[1] == 0).all()
     towards = torch.tensor([0.0, 0, 1], dtype=torch.float64)
-    colour = model.colour(points, towards.expand_as(points))
+    again, colour = model.density_and_colour(points, towards.expand_as(points))
+    torch.testing.assert_close(again, density)
     assert colour.shape == points.shape and ((colour > 0) & (colour < 1)).all()
     compiled = GridField(SMALL, 0, warp)
-    assert compiled.colour(points.float(), towards.float().expand_as(points)).shape == points.shape
+    assert compiled.density_and_colour(points.float(), towards.float().expand_as(points))[1].shape == points.shape
     assert (field(FOLDED).density(1e6 * points) > 0).all()
 
 
@@ -146,6 +147,19 @@ def test_closed_cells_are_not_seen() -> None:
     assert (rendering.opacity == 0).all()
     assert torch.equal(rendering.depth, given.far)
     assert rendering.colour[3].tolist() == [0.2, 0.4, 0.6]
+
+
+@pytest.mark.parametrize("settings", [SMALL, FOLDED])
+def test_the_density_beside_a_colour_is_the_density_zero_in_closed_cells_and_beyond_the_box(
+    settings: GridSettings,
+) -> None:
+    model = field(settings)
+    model.bits[::2] = 0
+    points = 2.4 * torch.rand(500, 3, generator=torch.Generator().manual_seed(6), dtype=torch.float64) - 1.2
+    density, colour = model.density_and_colour(points, torch.nn.functional.normalize(points, dim=-1))
+    assert 0.1 < (density > 0).double().mean() < 0.9
+    torch.testing.assert_close(density, model.density(points))
+    assert colour.isfinite().all(), "also where it is without meaning"
 
 
 def test_what_nothing_stops_ends_in_the_sky_whatever_the_background() -> None:

@@ -279,7 +279,8 @@ def test_without_view_dependence_a_point_has_one_colour() -> None:
     run = GridTrainer(GridField(replace(FIELD, view_dependence=False), 0, reference), small_bank(), TRAINER)
     psnr = [run.step(step, step / 60).psnr for step in range(60)]
     points, directions = torch.rand(50, 3) - 0.5, torch.nn.functional.normalize(torch.randn(2, 50, 3), dim=-1)
-    assert torch.equal(run.model.colour(points, directions[0]), run.model.colour(points, directions[1]))
+    one, other = (run.model.density_and_colour(points, towards)[1] for towards in directions)
+    assert torch.equal(one, other)
     assert psnr[-1] > 12 and run.model.colour_hidden.shape[0] == 16
 
 

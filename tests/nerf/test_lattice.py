@@ -36,7 +36,7 @@ class Field:
     def density(self, points):
         return self.function(points)
 
-    def colour(self, points, directions):
+    def density_and_colour(self, points, directions):
         raise NotImplementedError
 
     def render(self, rays, background):

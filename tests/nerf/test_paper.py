@@ -191,20 +191,24 @@ def test_without_hierarchical_sampling_there_is_one_network_and_one_rendering() 
 def test_without_view_dependence_colour_ignores_direction_and_has_no_weights_for_it() -> None:
     points, d = torch.rand(4, 3) - 0.5, torch.nn.functional.normalize(torch.randn(2, 4, 3), dim=-1)
     seeing, blind = PaperNerf(SMALL, 0), PaperNerf(dataclasses.replace(SMALL, view_dependence=False), 0)
-    assert not torch.allclose(seeing.colour(points, d[0]), seeing.colour(points, d[1]))
-    assert torch.equal(blind.colour(points, d[0]), blind.colour(points, d[1]))
+    one, other = (seeing.density_and_colour(points, towards)[1] for towards in d)
+    assert not torch.allclose(one, other)
+    one, other = (blind.density_and_colour(points, towards)[1] for towards in d)
+    assert torch.equal(one, other)
     assert blind.fine.colour_hidden.in_features == SMALL.width
 
 
 def test_opposite_directions_along_an_axis_are_told_apart() -> None:
     up = torch.tensor([[0.0, 0.0, 1.0]])
     model, point = PaperNerf(SMALL, 0), torch.zeros(1, 3)
-    assert not torch.allclose(model.colour(point, up), model.colour(point, -up), atol=1e-4)
+    one, other = (model.density_and_colour(point, towards)[1] for towards in (up, -up))
+    assert not torch.allclose(one, other, atol=1e-4)
 
 
 def test_no_points_are_no_trouble() -> None:
     model, none = PaperNerf(SMALL, 0), torch.zeros(0, 3)
-    assert model.density(none).shape == (0,) and model.colour(none, none).shape == (0, 3)
+    assert model.density(none).shape == (0,)
+    assert [each.shape for each in model.density_and_colour(none, none)] == [(0,), (0, 3)]
 
 
 def test_density_is_independent_of_direction_and_zero_outside_the_box() -> None:
@@ -212,6 +216,7 @@ def test_density_is_independent_of_direction_and_zero_outside_the_box() -> None:
     points = torch.tensor([[0.3, -0.2, 0.1], [0.0, BOX + 1e-3, 0.0], [2.3, -0.2, 0.1], [1e30, 0.0, 0.0]])
     sigma = model.density(points)
     assert sigma[0] > 0 and sigma[1:].tolist() == [0, 0, 0]
+    torch.testing.assert_close(model.density_and_colour(points, torch.rand(4, 3))[0], sigma)
 
 
 def test_a_contracted_field_fills_all_of_space() -> None:

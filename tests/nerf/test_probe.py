@@ -17,7 +17,7 @@ class Painted:
     def density(self, points):
         raise NotImplementedError
 
-    def colour(self, points, directions):
+    def density_and_colour(self, points, directions):
         raise NotImplementedError
 
     def render(self, rays: Rays, background):

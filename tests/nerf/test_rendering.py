@@ -18,7 +18,7 @@ class Gradient:
     def density(self, points: torch.Tensor) -> torch.Tensor:
         raise NotImplementedError
 
-    def colour(self, points: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
+    def density_and_colour(self, points: torch.Tensor, directions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         raise NotImplementedError
 
     def render(self, rays: Rays, background: torch.Tensor) -> Rendering:

@@ -23,8 +23,8 @@ class Slow:
     def density(self, points):
         return points[..., 0]
 
-    def colour(self, points, directions):
-        return points
+    def density_and_colour(self, points, directions):
+        return points[..., 0], points
 
     def render(self, rays: Rays, background: torch.Tensor) -> Rendering:
         self.now += self.seconds_per_ray * len(rays.near)

@@ -49,12 +49,12 @@ class SkyField:
     def density(self, points: Tensor) -> Tensor:
         return torch.zeros_like(points[..., 0])
 
-    def colour(self, points: Tensor, directions: Tensor) -> Tensor:
-        return torch.from_numpy(sky(directions.double().numpy())) + self.error
+    def density_and_colour(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+        return self.density(points), torch.from_numpy(sky(directions.double().numpy())) + self.error
 
     def render(self, rays: Rays, background: Tensor) -> Rendering:
         directions = rays.directions.double()
-        colour = self.colour(rays.origins, directions)
+        _, colour = self.density_and_colour(rays.origins, directions)
         opacity = (directions[:, 0] >= 0).double() if self.half else torch.ones(len(directions))
         shown = opacity[:, None] * colour + (1 - opacity[:, None]) * background
         return Rendering(shown.float(), rays.far, opacity.float())

@@ -42,7 +42,10 @@ class Solid:
     def density(self, points):
         return self.inside * torch.sigmoid(-self.distance(points) / 0.01)
 
-    def colour(self, points, directions):
+    def density_and_colour(self, points, directions):
+        return self.density(points), self.colour(points)
+
+    def colour(self, points):
         return 0.5 + points / 1.8
 
     def render(self, rays, background):
@@ -124,7 +127,7 @@ class Painted(Solid):
     def density(self, points):
         return self.inside * (self.distance(points) < 0)
 
-    def colour(self, points, directions):
+    def colour(self, points):
         distance = self.distance(points)[..., None]
         inside = torch.where(distance > -0.5 * VOXEL, torch.tensor([1.0, 0, 0]), torch.tensor([0.0, 0, 1]))
         return torch.where(distance < 0, inside, torch.ones(3))

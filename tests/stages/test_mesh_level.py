@@ -27,7 +27,7 @@ class Solid:
     def density(self, points):
         return self.outside + self.inside * torch.sigmoid(-self.distance(points) / self.softness)
 
-    def colour(self, points, directions):
+    def density_and_colour(self, points, directions):
         raise NotImplementedError
 
     def render(self, rays, background):

@@ -30,7 +30,10 @@ class Ball:
     def density(self, points):
         return (points.norm(dim=-1) < RADIUS) * 1e3
 
-    def colour(self, points, directions):
+    def density_and_colour(self, points, directions):
+        return self.density(points), self.colour(points)
+
+    def colour(self, points):
         return torch.where(points[..., :1] > 0, torch.tensor([1.0, 0, 0]), torch.tensor([0, 1.0, 0]))
 
     def render(self, rays, background):
@@ -38,7 +41,7 @@ class Ball:
         closest = rays.origins + middle[:, None] * rays.directions
         inside = RADIUS**2 - (closest**2).sum(-1)
         t = middle - inside.clamp(min=0).sqrt()
-        colour = self.colour(rays.origins + t[:, None] * rays.directions, rays.directions)
+        colour = self.colour(rays.origins + t[:, None] * rays.directions)
         hit = inside > 0
         return Rendering(torch.where(hit[:, None], colour, background), torch.where(hit, t, rays.far), hit.to(t.dtype))
 
@@ -241,7 +244,7 @@ def with_exposure(inputs, monkeypatch) -> None:
 
 
 class GreyBall(Ball):
-    def colour(self, points, directions):
+    def colour(self, points):
         return torch.full_like(points, 0.5)
 
 

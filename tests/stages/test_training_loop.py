@@ -60,7 +60,7 @@ class OneNumber:
     def density(self, points: Tensor) -> Tensor:
         raise NotImplementedError
 
-    def colour(self, points: Tensor, directions: Tensor) -> Tensor:
+    def density_and_colour(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
         raise NotImplementedError
 
     def render(self, rays: Rays, background: Tensor) -> Rendering:

@@ -217,12 +217,12 @@ class Fog:
     def density(self, points: Tensor) -> Tensor:
         return points[..., 0]
 
-    def colour(self, points: Tensor, directions: Tensor) -> Tensor:
-        return 0.5 + 0 * points
+    def density_and_colour(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+        return self.density(points), 0.5 + 0 * points
 
     def render(self, rays: Rays, background: Tensor) -> Rendering:
         opacity = rays.far
-        own = opacity[:, None] * self.colour(rays.origins, rays.directions)
+        own = opacity[:, None] * self.density_and_colour(rays.origins, rays.directions)[1]
         return Rendering(own + (1 - opacity[:, None]) * background, rays.far, opacity)
 
 
@@ -235,11 +235,13 @@ def test_an_exposed_model_shows_the_scene_at_its_gain_and_the_background_as_it_i
     assert isinstance(model, RadianceModel) and model.chunk_rays == 77
     points = torch.rand(4, 3)
     assert torch.equal(model.density(points), points[..., 0])
-    torch.testing.assert_close(model.colour(points, points), expose(torch.full((4, 3), 0.5), model.log_gain))
+    density, colour = model.density_and_colour(points, points)
+    assert torch.equal(density, points[..., 0])
+    torch.testing.assert_close(colour, expose(torch.full((4, 3), 0.5), model.log_gain))
     background = torch.tensor([0.2, 1.0, 0.4])
     seen, plain = model.render(fog_rays(), background), Fog().render(fog_rays(), background)
     torch.testing.assert_close(seen.colour[0], background)
-    torch.testing.assert_close(seen.colour[-1], model.colour(points, points)[0])
+    torch.testing.assert_close(seen.colour[-1], colour[0])
     light = own_light(plain.colour, plain.opacity, background)
     torch.testing.assert_close(seen.colour, expose(light, model.log_gain) + plain.colour - light)
     assert torch.equal(seen.depth, plain.depth) and torch.equal(seen.opacity, plain.opacity)
