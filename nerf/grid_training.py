@@ -39,24 +39,25 @@ FIRST_DISTORTION = 0.25  # of its weight
 FULL_DISTORTION_SHARE = 0.3  # of the run
 GUIDED_EVERY = 8  # one ray in so many runs to a sparse point, where some are known
 FIRST_SAMPLES_PER_RAY = 128.0
+# A ray is not free, though it may need no colour: no step has more rays than if each needed so many.
+LEAST_SAMPLES_PER_RAY = 2.0
 ADAM_BYTES = 4 * 7  # of an entry of the table: its gradient read and cleared, itself and its moments read and written
 MEMORY = 0.9  # how much of the mean of samples per ray remains after each step
 
 
 @dataclass(frozen=True)
 class GridTrainerSettings:
-    """How to train. ``samples``: colours to compute in a step; its rays are as many as are expected to need them, at
-    most ``most_rays``. ``chunks``: equal parts of a step, each computed on a core; results depend on their number, not
-    on that of the cores. ``background`` is what lies behind a scene without a sky: a colour, or another random one for
-    each ray (only for photos with alpha, where it shows the field which space is empty). ``distortion``: full weight
-    of the distortion loss, for scenes without a known background. ``depth_loss``: its weight at first, at the pixels
-    whose distance the bank knows. ``least_photos``: that must look into a cell of folded space for something to stand
-    before their foregrounds (nerf/visibility.py), or all but one where they are few."""
+    """How to train. ``samples``: colours to compute in a step; its rays are as many as are expected to need them.
+    ``chunks``: equal parts of a step, each computed on a core; results depend on their number, not on that of the
+    cores. ``background`` is what lies behind a scene without a sky: a colour, or another random one for each ray (only
+    for photos with alpha, where it shows the field which space is empty). ``distortion``: full weight of the distortion
+    loss, for scenes without a known background. ``depth_loss``: its weight at first, at the pixels whose distance the
+    bank knows. ``least_photos``: that must look into a cell of folded space for something to stand before their
+    foregrounds (nerf/visibility.py), or all but one where they are few."""
 
     seed: int
     background: tuple[float, float, float] | Literal["random"]
     samples: int = 1 << 14
-    most_rays: int = 1 << 13
     chunks: int = 1
     rate: float = 2e-2
     distortion: float = 0.0
@@ -192,8 +193,8 @@ class GridTrainer:
             tensor.copy_(state[name])
 
     def _rays_per_chunk(self) -> int:
-        wanted = int(self.settings.samples / max(1e-3, float(self.samples_per_ray)))
-        return max(1, min(wanted, self.settings.most_rays) // self.settings.chunks)
+        wanted = int(self.settings.samples / max(LEAST_SAMPLES_PER_RAY, float(self.samples_per_ray)))
+        return max(1, wanted // self.settings.chunks)
 
     def _batch(self, step: int, share: float, chunk: int, count: int) -> GridBatch:
         device = self.bank.device

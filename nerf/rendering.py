@@ -11,7 +11,7 @@ from nerf.model import RadianceModel, Rendering
 from nerf.parallel import in_order
 from nerf.rays import Rays
 
-CUDA_CHUNK = 8192  # rays
+GPU_CHUNKS = 16  # a GPU renders as much at once as so many cores, and waits for the host less often
 # A small picture is cut into so many chunks, of so many rays at least: with fewer, most cores would have nothing to do.
 CHUNKS, LEAST_CHUNK = 16, 1024
 
@@ -31,7 +31,7 @@ def render_image(
     height, width = rays.near.shape
     if chunk is None and rays.near.device.type == "cpu":
         chunk = min(model.chunk_rays, max(LEAST_CHUNK, math.ceil(height * width / CHUNKS)))
-    chunk = chunk or CUDA_CHUNK
+    chunk = chunk or GPU_CHUNKS * model.chunk_rays
     flat = Rays(*(part.reshape(height * width, *part.shape[2:]) for part in rays))
 
     def render(start: int) -> Rendering:

@@ -17,8 +17,10 @@ from nerf.rays import Rays
 from nerf.stopwatch import part
 
 HIDDEN_BEHIND = 1e-3  # transmittance below which the rest of a ray is left out
-# Samples whose densities are computed at once: in all, and per ray (docs/numbers.md).
-WAVE, SHORTEST_WAVE, LONGEST_WAVE = 1 << 14, 6, 64
+# Samples whose densities are computed at once, in all, and per ray (docs/numbers.md). A GPU waits for the host after
+# each wave, and works on a million samples as long as on a few.
+WAVE = {"cpu": 1 << 14, "cuda": 1 << 20}
+SHORTEST_WAVE, LONGEST_WAVE = 6, 64
 
 
 class Wave(NamedTuple):
@@ -48,7 +50,8 @@ def front_to_back(
     going_on, near = len(jitter), rays.near.clone()
     depth, taken = torch.zeros_like(jitter, dtype=torch.float64), 0
     while going_on and taken < lattice.most_samples:
-        of_wave = lattice._replace(most_samples=min(_wave_length(going_on), lattice.most_samples - taken))
+        length = _wave_length(going_on, jitter.device)
+        of_wave = lattice._replace(most_samples=min(length, lattice.most_samples - taken))
         with part("march"):
             samples = backend.march(occupied, of_wave, rays._replace(near=near), jitter)
             points = backend.sample_points(rays, samples, lattice.contracted)
@@ -60,6 +63,6 @@ def front_to_back(
             taken, going_on = taken + of_wave.most_samples, int((near < rays.far).sum())
 
 
-def _wave_length(rays: int) -> int:
+def _wave_length(rays: int, device: torch.device) -> int:
     """Samples per ray: few while there are many rays, so that little lies behind what stops their light."""
-    return min(max(WAVE // rays, SHORTEST_WAVE), LONGEST_WAVE)
+    return min(max(WAVE[device.type] // rays, SHORTEST_WAVE), LONGEST_WAVE)

@@ -48,11 +48,15 @@ PAPER_SIZES = {
 }
 
 
-# At first; both fall while training. Where space is folded a cell is met from farther away, and rays are longer.
+# Of the grid field at first; both fall while training. Where space is folded a cell is met from farther away, and rays
+# are longer.
 GRID_RATES = {"bounded": 2e-2, "contracted": 1e-2}
 # Colours of a step, as measured: in a box larger steps go with its closer samples; in folded space they gained nothing
 # where there are many photos and lost where there are few (docs/numbers.md).
 GRID_SAMPLES = {"bounded": 3 << 13, "contracted": 1 << 14}
+# A GPU takes steps of many more colours in the same time, whose gradients are sure enough for the larger rate
+# (docs/numbers.md).
+GPU_SAMPLES, GPU_RATE = 1 << 18, 2e-2
 
 GRID_ONLY = ("backend", "chunks", "levels", "log2_rows", "finest", "batch_samples", "ray_samples")
 PAPER_ONLY = (
@@ -215,11 +219,12 @@ def with_habits(config: Config) -> Config:
 
 
 def _grid_habits(config: Config) -> dict[str, Any]:
-    return {
-        "background": "random",
-        "learning_rate": GRID_RATES[config.space],
-        "batch_samples": GRID_SAMPLES[config.space],
-    }
+    from stages.device import compute_device
+
+    gpu = compute_device() == "cuda"
+    samples = config.batch_samples or (GPU_SAMPLES if gpu else GRID_SAMPLES[config.space])
+    rate = GPU_RATE if samples >= GPU_SAMPLES else GRID_RATES[config.space]
+    return {"background": "random", "learning_rate": rate, "batch_samples": samples}
 
 
 def _paper_habits(config: Config) -> dict[str, Any]:

@@ -30,9 +30,10 @@ DEPTH_LOSS = 0.1
 LEAST_PHOTOS = 3
 COARSEST = 16
 # Samples along a ray (docs/numbers.md): steps along the diagonal of a bounded scene's box at most, and, where space is
-# folded, steps in a finest cell and the distance from where steps grow in proportion to it.
+# folded, steps in a finest cell, of so many along an axis at most, and the distance from where steps grow in proportion
+# to it.
 MOST_STEPS = 576
-STEPS_PER_CELL = 3
+STEPS_PER_CELL, MOST_STEPPED_CELLS = 3, 1024
 EVEN_UNTIL = 0.25
 TABLE_COPIES = 6  # of the grids' features: themselves, their gradient, Adam's two moments, and twice in a checkpoint
 SAMPLE_BYTES = 4096  # that a sample of a grid field's step takes while it is computed
@@ -171,7 +172,8 @@ def grid_settings(config: "Config", sky: bool) -> "GridSettings":
 
     assert config.levels and config.log2_rows and config.finest, "plan() chooses them"
     assert config.contracted is not None and config.view_dependence is not None, "plan() takes them from stage effects"
-    shortest = 2 * CONTRACTED_BOX / (STEPS_PER_CELL * config.finest * config.ray_samples)
+    cells = min(config.finest, MOST_STEPPED_CELLS)
+    shortest = 2 * CONTRACTED_BOX / (STEPS_PER_CELL * cells * config.ray_samples)
     return GridSettings(
         levels=config.levels,
         log2_rows=config.log2_rows,

@@ -226,7 +226,7 @@ def in_one_pass(model: GridField, given: Rays, jitter: Tensor, background: Tenso
 
 
 def in_short_waves(monkeypatch: pytest.MonkeyPatch, whole: int, shortest: int, longest: int) -> None:
-    for name, length in {"WAVE": whole, "SHORTEST_WAVE": shortest, "LONGEST_WAVE": longest}.items():
+    for name, length in {"WAVE": {"cpu": whole}, "SHORTEST_WAVE": shortest, "LONGEST_WAVE": longest}.items():
         monkeypatch.setattr(f"nerf.waves.{name}", length)
 
 

@@ -19,7 +19,7 @@ from nerf.sky import sky_colour
 from nerf.training import FieldTrainer, NonFinite
 
 FIELD = GridSettings(levels=2, log2_rows=10, coarsest=4, finest=16, steps=32, cache_cells=16)
-TRAINER = GridTrainerSettings(seed=3, background="random", samples=1024, most_rays=256)
+TRAINER = GridTrainerSettings(seed=3, background="random", samples=1024)
 
 
 def small_bank(size: int = 12) -> RayBank:
@@ -71,7 +71,7 @@ def test_a_resumed_run_is_the_uninterrupted_one_bit_for_bit() -> None:
 
 
 def test_results_do_not_depend_on_the_number_of_threads() -> None:
-    settings = replace(TRAINER, samples=3 << 12, most_rays=4096)
+    settings = replace(TRAINER, samples=3 << 12)
     threads, states = torch.get_num_threads(), []
     try:
         for count in (1, 2, 3):
@@ -106,7 +106,7 @@ def test_the_gradient_of_a_batch_is_the_sum_over_its_chunks() -> None:
 
 
 def test_rays_adapt_to_the_samples_they_need() -> None:
-    run = trainer(replace(TRAINER, most_rays=10_000))
+    run = trainer()
     results = [run.step(step, 0.5) for step in range(100)]
     assert results[0].rays == 1024 // 128
     needed = results[-1].rays * float(run.samples_per_ray)

@@ -19,7 +19,7 @@ from nerf.visibility import usable_cells
 SIZE, HALF = 12, 0.5  # pixels of a photo, and half its width at a distance of one
 NEAR, FAR = 1.0, 40.0
 FIELD = GridSettings(levels=2, log2_rows=10, coarsest=4, finest=16, steps=32, cache_cells=16, contracted=True)
-TRAINER = GridTrainerSettings(seed=3, background=(0.0, 0.0, 0.0), samples=1024, most_rays=256, least_photos=3)
+TRAINER = GridTrainerSettings(seed=3, background=(0.0, 0.0, 0.0), samples=1024, least_photos=3)
 
 
 def bank(count: int = 4, half: float = HALF) -> RayBank:

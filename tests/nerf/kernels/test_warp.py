@@ -200,16 +200,18 @@ def decided_by_rounding(lattice: Lattice, rays: Rays, samples: Samples) -> Tenso
 
 
 def assert_same_march(where: Occupied, lattice: Lattice, rays: Rays, jitter: Tensor) -> Samples:
-    """Bounded, where samples are a step apart, both give the same numbers; folded, exp() and log() may differ by their
-    last digit: t by 1e-6 of itself, dt, a difference of two distances, by 1e-6 of t."""
+    """Bounded, where samples are a step apart, both give the same numbers on the CPU; folded, exp() and log() may
+    differ by their last digit: t by 1e-6 of itself, dt, a difference of two distances, by 1e-6 of t. So may everything
+    on a GPU, where torch divides by a number by multiplying with its inverse."""
     given, wanted = (backend.march(where, lattice, rays, jitter) for backend in (warp, reference))
     at, right = (places(lattice, rays, jitter, samples) for samples in (given, wanted))
     in_both, common = torch.isin(at, right), torch.isin(right, at)
     assert decided_by_rounding(lattice, rays, given)[~in_both].all(), "a sample in an empty cell"
     assert decided_by_rounding(lattice, rays, wanted)[~common].all(), "a sample was lost"
-    assert (~common).sum() <= 1e-5 * len(right) and (~in_both).sum() <= 1e-5 * len(right)
+    most = (1e-3 if right.is_cuda else 1e-5) * len(right)
+    assert (~common).sum() <= most and (~in_both).sum() <= most
     a, b = given.t[in_both], wanted.t[common]
-    tolerance = 1e-6 * b if lattice.cone else 0 * b
+    tolerance = 1e-6 * b if lattice.cone or b.is_cuda else 0 * b
     assert ((a - b).abs() <= tolerance).all()
     assert ((given.dt[in_both] - wanted.dt[common]).abs() <= tolerance).all()
     assert torch.equal(given.starts.diff().long(), torch.bincount(given.ray, minlength=len(jitter)))

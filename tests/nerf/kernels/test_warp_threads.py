@@ -57,7 +57,7 @@ def noise_bank() -> RayBank:
 
 def small_trainer() -> GridTrainer:
     field = GridSettings(levels=3, log2_rows=8, coarsest=4, finest=16, steps=32, cache_cells=8)
-    settings = GridTrainerSettings(seed=3, background="random", samples=1024, most_rays=256, chunks=4, distortion=1e-3)
+    settings = GridTrainerSettings(seed=3, background="random", samples=1024, chunks=4, distortion=1e-3)
     model = GridField(field, 0, warp)
     model.occupy(warp.occupied_bits(torch.rand(512, generator=torch.Generator().manual_seed(2)), 0.3))
     return GridTrainer(model, noise_bank(), settings)

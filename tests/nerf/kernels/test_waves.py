@@ -61,7 +61,9 @@ def test_rays_with_light_go_on_behind_their_last_sample(backend: Backend, lattic
     depth, near = ended(backend, lattice, samples, sigma, 0.2)
     for ray, count in enumerate(COUNTS):
         mine = slice(int(samples.starts[ray]), int(samples.starts[ray + 1]))
-        assert depth[ray] == pytest.approx(0.5 + float((sigma[mine] * samples.dt[mine]).double().sum()), rel=1e-6)
+        assert float(depth[ray]) == pytest.approx(
+            0.5 + float((sigma[mine] * samples.dt[mine]).double().sum()), rel=1e-6
+        )
         if count < lattice.most_samples or ray == 3:
             assert near[ray] == 9
             continue
