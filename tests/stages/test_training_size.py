@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from nerf.grid_field import GridSettings
 from nerf.scene import Camera, Scene
 from stages.effect_decisions import Decisions
-from stages.train import Config
+from stages.train import Config, with_habits
 from stages.training_data import scaled_size
 from stages.training_setup import grid_settings, has_sky
 from stages.training_size import (
@@ -129,6 +129,37 @@ def test_grids_grow_with_rays_and_pixels(scene: Scene, rays: float, factor: floa
     # Two neighbouring samples lie in the same or in neighbouring cells of the finest grid, near the cameras at least.
     cells_per_step = field.lattice.step * field.finest / (4 if folded else 1.8)
     assert cells_per_step == pytest.approx(1 / 3 if folded else max(1, math.sqrt(3) * field.finest / 576), rel=0.01)
+
+
+@pytest.mark.parametrize(("folded", "most"), [(True, 2048), (False, 1024)])
+def test_a_gpu_has_larger_fields_and_takes_larger_steps(
+    scene: Scene, folded: bool, most: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config, large = Config(contracted=folded, downscale=1.0), of_size(scene, 4000, 3000)
+    on_cpu = grid_size(config, large, 1e9), with_habits(config)
+    monkeypatch.setattr("stages.training_size.compute_device", lambda: "cuda")
+    monkeypatch.setattr("stages.device.compute_device", lambda: "cuda")
+    on_gpu = grid_size(config, large, 1e9), with_habits(config)
+    assert on_gpu[0] == {"levels": 8, "log2_rows": 20, "finest": most}
+    assert on_gpu[0]["finest"] > on_cpu[0]["finest"] and on_gpu[0]["log2_rows"] > on_cpu[0]["log2_rows"]
+    assert grid_size(config, large, 1e6) == {
+        "levels": 5 if folded else 4,
+        "log2_rows": 17,
+        "finest": 512 // (2 - folded),
+    }
+    assert (on_gpu[1].batch_samples, on_gpu[1].learning_rate) == (1 << 18, 2e-2)
+    assert (on_cpu[1].batch_samples or 0) < 1 << 15
+    few = with_habits(config.model_copy(update={"batch_samples": 1 << 14}))
+    assert few.learning_rate == (1e-2 if folded else 2e-2)
+
+
+def test_samples_follow_cells_of_a_1024th_at_most() -> None:
+    steps = [
+        grid_settings(Config(contracted=True, view_dependence=True, levels=1, log2_rows=8, finest=finest), sky=False)
+        for finest in (512, 1024, 2048)
+    ]
+    assert steps[0].shortest_step == 2 * steps[1].shortest_step == 2 * steps[2].shortest_step
+    assert steps[1].cone == steps[2].cone
 
 
 @pytest.mark.parametrize("contracted", [False, True])
