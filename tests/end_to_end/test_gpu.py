@@ -1,6 +1,5 @@
 """A GPU runs the whole chain, and trains the same field with either backend; skipped by name where there is none."""
 
-import json
 from pathlib import Path
 
 import pytest
@@ -43,7 +42,7 @@ def heldout_psnr(photos: Path, workspace: Path, *flags: str) -> float:
 def test_the_chain_ends_with_a_field_that_looks_the_same_on_the_cpu(tmp_path: Path) -> None:
     photos = write_blender_scene(tmp_path / "photos", train=14, test=3)
     assert run_command(["run", str(photos), "-o", str(tmp_path / "w.nerf"), *SMALL]) == 0
-    summary = json.loads((tmp_path / "w.nerf/output/summary.json").read_text())
+    summary = read_json(tmp_path / "w.nerf/output/summary.json")
     assert summary["psnr"] > summary["psnr_mean_image"] > 5 and summary["mesh"]["faces"] > 500
     pose = torch.tensor(ring_of_cameras(5)[0], dtype=torch.float32)
     rays = rays_of_view(pinhole_directions(40, 40, 52.0), pose, 0.5, 10.0)
