@@ -5,7 +5,6 @@ from pathlib import Path
 import pytest
 import torch
 
-from nerf.kernels import warp
 from nerf.metrics import mean_squared_error, psnr
 from nerf.rays import Rays, rays_of_view
 from nerf.rendering import render_image
@@ -13,6 +12,7 @@ from nerf.synthetic import ring_of_cameras
 from pipeline.cli import run_command
 from stages.field_files import load_field
 from stages.files import read_json
+from tests.devices import skip_without
 from tests.small_scenes import pinhole_directions, write_blender_scene
 
 pytestmark = pytest.mark.gpu
@@ -21,10 +21,7 @@ SMALL = "--train.steps 150 --train.downscale 1 --render.frames 4 --render.width 
 
 @pytest.fixture(autouse=True)
 def gpu() -> None:
-    if not torch.cuda.is_available():
-        pytest.skip("torch finds no GPU")
-    if why := warp.why_not("cuda"):
-        pytest.skip(why)
+    skip_without("cuda")
 
 
 def trained(workspace: Path) -> Path:

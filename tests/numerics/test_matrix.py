@@ -13,6 +13,7 @@ from torch import Tensor
 from nerf.kernels import Backend, reference, warp
 from nerf.numerics import Bound, Case, Measured, cotangent, error, measure
 from nerf.numerics.matrix import CASES, Row, figure, limit
+from tests.devices import skip_without
 from tests.numerics.document import DOCUMENT, ELSEWHERE, NO_FORMULA, REPEATED, STATISTICS, document
 
 ROOT = Path(__file__).parents[2]
@@ -48,8 +49,7 @@ def test_errors_keep_their_bounds_and_the_bounds_mean_something(case: Case) -> N
 @pytest.mark.gpu
 @pytest.mark.parametrize("case", CASES, ids=named)
 def test_a_gpu_keeps_the_bounds_too(case: Case) -> None:
-    if not torch.cuda.is_available() or warp.why_not("cuda"):
-        pytest.skip("torch or Warp finds no GPU")
+    skip_without("cuda")
     measured = {name: measure(case, BACKENDS[name], "cuda") for name in backends_of(case)}
     assert Row(case, measured).passed, measured
 

@@ -25,6 +25,7 @@ from nerf.kernels.warp import cache
 from nerf.kernels.warp.launch import launch
 from nerf.model import Rendering
 from nerf.rays import Rays, clip_to_box
+from tests.devices import DEVICES, skip_without
 
 TOLERANCE = 1e-5
 BOUNDED = Lattice(2 * BOX * 3**0.5 / 256, 0.0, False, 32, 1024)
@@ -32,16 +33,12 @@ FOLDED = Lattice(0.01, 0.02, True, 32, 1024)
 LATTICES = {"bounded": BOUNDED, "folded": FOLDED}
 
 
-@pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
+@pytest.fixture(params=DEVICES)
 def device(request: pytest.FixtureRequest) -> Iterator[str]:
     """Everything below runs on the CPU and, where there is one, on a GPU."""
-    name = request.param
-    if name == "cuda" and not torch.cuda.is_available():
-        pytest.skip("torch finds no GPU")
-    if why := warp.why_not(name):
-        pytest.skip(why)
-    with torch.device(name):
-        yield name
+    skip_without(request.param)
+    with torch.device(request.param):
+        yield request.param
 
 
 def generator(device: str, seed: int) -> torch.Generator:

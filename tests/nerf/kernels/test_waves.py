@@ -9,19 +9,17 @@ from torch import Tensor
 
 from nerf.kernels import Backend, Lattice, Samples, reference, warp
 from nerf.kernels.marching import lattice_coordinate
+from tests.devices import DEVICES, skip_without
 
 BACKENDS = pytest.mark.parametrize("backend", [reference, warp], ids=["reference", "warp"])
 COUNTS = (0, 4, 1, 4, 4, 0, 3, 4)
 BOUNDED, FOLDED = Lattice(0.05, 0.0, False, 8, 4), Lattice(0.05, 0.1, True, 8, 4)
 
 
-@pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)], autouse=True)
+@pytest.fixture(params=DEVICES, autouse=True)
 def device(request: pytest.FixtureRequest) -> Iterator[None]:
     """Everything below runs on the CPU and, where there is one, on a GPU."""
-    if request.param == "cuda" and not torch.cuda.is_available():
-        pytest.skip("torch finds no GPU")
-    if why := warp.why_not(request.param):
-        pytest.skip(why)
+    skip_without(request.param)
     with torch.device(request.param):
         yield
 
