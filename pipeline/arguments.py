@@ -108,7 +108,7 @@ class StatusArguments:
 
     workspace: tyro.conf.Positional[Path]
     json: bool = False
-    """One JSON object instead of text."""
+    """One JSON array instead of text."""
     verify: bool = False
     """Read every file of finished results and compare it with its sha256; exit code 1 if one is damaged."""
 

@@ -1,6 +1,7 @@
-"""The documentation agrees with the code: links, options, the table of rooms."""
+"""The documentation agrees with the code: links, options, the example in Python, the table of rooms."""
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -10,8 +11,14 @@ from pipeline.chain import STAGES
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+CHANGELOG = ROOT / "CHANGELOG.md"
+GENERATED = ROOT / "docs" / "NUMERICS.md"
+MAX_PROSE = 128
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 OPTION = re.compile(rf"--({'|'.join(STAGES)})\.([a-z][a-z0-9_-]*)")
+CALL = re.compile(r"(?m)^(?:\w+ = )?run\((\w+), \1\.Config\(.*?\)(?:, \[(.*)\])?\)$")
+CODE = re.compile(r"(?ms)^```(\w*)$\n(.*?)^```$\n")
+STUDIES = re.compile(r"(?s)<!-- studies -->.*<!-- end of studies -->")
 MODULE = re.compile(r"(?m)^\| `((?:nerf|stages|pipeline)/[\w/]+\.py)` \|")
 
 
@@ -36,11 +43,46 @@ def documented(text: str) -> set[tuple[str, str]]:
     return set(OPTION.findall(text))
 
 
-@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def anchors(text: str) -> Iterator[str]:
+    """What GitHub calls the headings of a page."""
+    seen: dict[str, int] = {}
+    for heading in re.findall(r"(?m)^#+ (.+)$", CODE.sub("", text)):
+        slug = re.sub(r"[^\w -]", "", LINK.sub("", heading).lower()).replace(" ", "-")
+        yield f"{slug}-{seen[slug]}" if slug in seen else slug
+        seen[slug] = seen.get(slug, 0) + 1
+
+
+def prose(text: str) -> list[str]:
+    """Lines that are no code, no table, no picture and not written by a program."""
+    lines = STUDIES.sub("", CODE.sub("", text)).splitlines()
+    return [line for line in lines if not line.lstrip().startswith(("|", "!["))]
+
+
+def calls_of_run(text: str) -> list[tuple[str, tuple[str, ...]]]:
+    """Stage and names of every ``run(stage, stage.Config(...), [names])``."""
+    return [(stage, tuple(re.findall(r'"(\w+)"', names))) for stage, names in CALL.findall(text)]
+
+
+@pytest.mark.parametrize("page", [*PAGES, CHANGELOG], ids=name_of)
 def test_links_lead_somewhere(page: Path):
     for target in LINK.findall(page.read_text("utf-8")):
-        if not re.match(r"[a-z]+:|#", target):
-            assert (page.parent / target.split("#")[0]).exists(), target
+        if re.match(r"[a-z]+:", target):
+            continue
+        path, _, anchor = target.partition("#")
+        other = page.parent / path if path else page
+        assert other.exists(), target
+        assert not anchor or anchor in anchors(other.read_text("utf-8")), target
+
+
+@pytest.mark.parametrize("page", [page for page in [*PAGES, CHANGELOG] if page != GENERATED], ids=name_of)
+def test_prose_is_wrapped(page: Path):
+    assert not [line for line in prose(page.read_text("utf-8")) if len(line) > MAX_PROSE]
+
+
+def test_the_example_in_python_gives_stages_what_they_need():
+    calls = calls_of_run((ROOT / "docs" / "PYTHON.md").read_text("utf-8"))
+    assert len(calls) > 5
+    assert calls == [(stage, STAGES[stage].NEEDS) for stage, _ in calls]
 
 
 def test_the_pages_are_linked():
@@ -87,3 +129,10 @@ def test_the_checks_can_fail():
     assert "cameras" in options_of("render") and "no-depth" in flags_of("render")
     assert "steppes" not in flags_of("train")
     assert MODULE.findall("| `nerf/rays.py` | rays |\nnerf/model.py") == ["nerf/rays.py"]
+    headings = "# A `b`, c_d\n```\n# e\n```\n## See [f](g)\n## A b c_d\n"
+    assert list(anchors(headings)) == ["a-b-c_d", "see-f", "a-b-c_d-1"]
+    assert prose("Words\n```\ncode\n```\n| table |\n<!-- studies -->\nx\n<!-- end of studies -->\n") == ["Words", ""]
+    assert calls_of_run('run(a, inputs)\nrun(a, a.Config())\nc = run(b, b.Config(d=(1, 2)), ["a", "e"])\n') == [
+        ("a", ()),
+        ("b", ("a", "e")),
+    ]
