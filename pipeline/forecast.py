@@ -13,10 +13,9 @@ from stages.matching_plan import about
 from stages.train import SECONDS
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from pipeline.runner import Runner
 
+UNREADABLE_PIXELS = 2_000_000  # that a photo is taken to have until ingest says what is wrong with it
 VIDEO_FRAMES = 40  # photos that a clip is taken to become, before that is known
 
 
@@ -29,6 +28,7 @@ class Photos(NamedTuple):
 
 def photos_of(settings: Settings) -> Photos | None:
     """What is to be seen of the photos without decoding any; None where they are gone or cannot be used."""
+    from stages.decoding import pixel_count
     from stages.sources import find_source
 
     try:
@@ -37,17 +37,8 @@ def photos_of(settings: Settings) -> Photos | None:
         return None
     if source.kind == "video":
         return Photos(VIDEO_FRAMES, 1.0)
-    return Photos(len(source.files), _megapixels(source.files[len(source.files) // 2]))
-
-
-def _megapixels(file: "Path") -> float:
-    from PIL import Image, UnidentifiedImageError
-
-    try:
-        with Image.open(file) as image:
-            return image.width * image.height / 1e6
-    except (OSError, UnidentifiedImageError):  # ingest says what is wrong with it, or reads it after all
-        return 2.0
+    pixels = pixel_count(source.files[len(source.files) // 2]) or UNREADABLE_PIXELS
+    return Photos(len(source.files), pixels / 1e6)
 
 
 def expected(settings: Settings, photos: Photos) -> dict[str, float | None]:

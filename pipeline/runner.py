@@ -294,7 +294,10 @@ class Runner:
         """``options`` with the seconds that the budget leaves for the stage, where it has one and they are open."""
         if self.budget is None or not _takes_what_it_is_given(options):
             return options
-        to_come = {name: self.times.get(name) for name in self.stages[self.stages.index(stage) + 1 :]}
+        # An input that has to be made again is none of the stages that were asked for.
+        order = list(STAGES)
+        later = [name for name in self.stages if order.index(name) > order.index(stage)]
+        to_come = {name: self.times.get(name) for name in later}
         wall = allotted(stage, self.budget.left, to_come, self.budget.total)
         if stage == "train" and (least := least_total({stage: None, **to_come})) > self.budget.left:
             left, took = duration(max(0.0, self.budget.left)), duration(self.budget.total)

@@ -34,7 +34,8 @@ MOST_NAMES = 5
 MOST_LETTERS = 40  # of a value, in an error
 TRANSFORMS_HINT = "Correct the file, or leave the cameras out to have them found from the photos."
 LENS_SAMPLES = 8  # pixels along each side at which a lens must have an inverse; normalise looks at more
-FISHEYE, RATIONAL = "OPENCV_FISHEYE", "FULL_OPENCV"
+FISHEYE, RATIONAL, PANORAMA = "OPENCV_FISHEYE", "FULL_OPENCV", "EQUIRECTANGULAR"
+NO_PANORAMAS = "panoramas are not supported"
 
 
 @dataclass(frozen=True)
@@ -142,8 +143,8 @@ def _camera(values: Mapping[str, Any], photo: Photo) -> Camera:
 
 def _distortion(k: list[float], p: list[float], declared: str, name: str) -> tuple[str, list[float]]:
     """COLMAP's model for these terms and its parameters after fx, fy, cx, cy."""
-    if declared == "EQUIRECTANGULAR":
-        raise _wrong(f"the camera model of frame {name!r}", "panoramas are not supported in transforms files")
+    if declared == PANORAMA:
+        raise _wrong(f"the camera model of frame {name!r}", NO_PANORAMAS)
     if declared == FISHEYE:
         return FISHEYE, k[:4]
     if any(k[3:]) and declared != RATIONAL:
@@ -276,6 +277,8 @@ def _at_size_of(photo: Photo, camera: Camera, name: str) -> Camera:
 
 def _flaw(camera: Camera) -> str | None:
     """What is wrong with intrinsics that no lens and no crop could have."""
+    if camera.model == PANORAMA:
+        return NO_PANORAMAS
     if not np.isfinite(camera.params).all():
         return f"its parameters are not finite: {', '.join(f'{value:.5g}' for value in camera.params)}"
     focal, centre = focal_lengths_and_centre(camera)

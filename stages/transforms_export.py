@@ -15,6 +15,8 @@ _MODELS = {
     "SIMPLE_RADIAL": ("OPENCV", "f cx cy k1"),
     "RADIAL": ("OPENCV", "f cx cy k1 k2"),
     "OPENCV": ("OPENCV", "fl_x fl_y cx cy k1 k2 p1 p2"),
+    "SIMPLE_FISHEYE": ("OPENCV_FISHEYE", "f cx cy"),
+    "FISHEYE": ("OPENCV_FISHEYE", "fl_x fl_y cx cy"),
     "SIMPLE_RADIAL_FISHEYE": ("OPENCV_FISHEYE", "f cx cy k1"),
     "RADIAL_FISHEYE": ("OPENCV_FISHEYE", "f cx cy k1 k2"),
     "OPENCV_FISHEYE": ("OPENCV_FISHEYE", "fl_x fl_y cx cy k1 k2 k3 k4"),
@@ -23,6 +25,9 @@ _MODELS = {
 _NEAREST = {
     "FULL_OPENCV": ("OPENCV", "fl_x fl_y cx cy k1 k2 p1 p2"),
     "FOV": ("OPENCV", "fl_x fl_y cx cy"),
+    "SIMPLE_DIVISION": ("OPENCV", "f cx cy"),
+    "DIVISION": ("OPENCV", "fl_x fl_y cx cy"),
+    "EUCM": ("OPENCV", "fl_x fl_y cx cy"),
     "THIN_PRISM_FISHEYE": ("OPENCV_FISHEYE", "fl_x fl_y cx cy k1 k2 p1 p2 k3 k4"),
     "RAD_TAN_THIN_PRISM_FISHEYE": ("OPENCV_FISHEYE", "fl_x fl_y cx cy k1 k2 k3 k4"),
 }

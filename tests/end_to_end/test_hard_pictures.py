@@ -16,6 +16,7 @@ from stages.video_frames import take_frames
 from tests.conftest import SilentProgress
 from tests.end_to_end.hard_scenes import RING, Picture, over_white, run, write_set
 from tests.fuzz.loaders import clip
+from tests.png_files import png
 
 
 def black(picture: Picture, index: int) -> Picture:
@@ -73,14 +74,6 @@ def test_photos_one_pixel_wide_are_refused_by_name(tmp_path: Path) -> None:
 
 
 # --- headers that announce more than there is
-
-
-def png(width: int, height: int, data: bytes) -> bytes:
-    def chunk(kind: bytes, content: bytes) -> bytes:
-        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
-
-    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
 
 
 def saved(kind: str) -> bytearray:

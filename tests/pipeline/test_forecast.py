@@ -13,6 +13,7 @@ from pipeline.budget import Budget
 from pipeline.chain import usual
 from pipeline.forecast import Photos, expected, photos_of, sfm_seconds
 from pipeline.settings import Settings
+from tests.png_files import png
 
 
 @pytest.fixture
@@ -30,6 +31,8 @@ def test_photos_are_counted_and_measured_without_decoding(photos: Path) -> None:
     assert photos_of(settings(photos)) == Photos(5, 0.03)
     (photos / "2.png").write_bytes(b"not an image")
     assert photos_of(settings(photos)) == Photos(5, 2.0)
+    (photos / "2.png").write_bytes(png(20_000, 12_000, b""))  # Pillow's own limit is lower than ours
+    assert photos_of(settings(photos)) == Photos(5, 240.0)
     assert photos_of(settings(photos / "gone")) is None
     (photos / "empty").mkdir()
     assert photos_of(settings(photos / "empty")) is None

@@ -241,6 +241,13 @@ def test_a_colmap_model_of_larger_photos_is_scaled(tmp_path: Path) -> None:
     np.testing.assert_array_equal(known.model.xy, [[10, 5], [20, 15], [20, 10], [40, 30]])
 
 
+def test_a_colmap_model_of_panoramas_is_refused(tmp_path: Path) -> None:
+    given = colmap_model(tmp_path, ["ä0.png", "ä1.png"])
+    write_model(tmp_path, dataclasses.replace(given, cameras=[Camera("EQUIRECTANGULAR", W, H, (float(W), float(H)))]))
+    with pytest.raises(StageError, match=r"the camera of 'ä0\.png': panoramas are not supported"):
+        read_known_cameras(tmp_path, PHOTOS, {})
+
+
 def test_a_name_that_two_photos_share_matches_neither(tmp_path: Path) -> None:
     colmap_model(tmp_path, ["ä0.png", "ä1.png"])
     photos = [photo(0, folder="left/"), photo(0, folder="right/"), photo(1)]

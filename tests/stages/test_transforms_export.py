@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from nerf.scene import Camera, Scene, Similarity, View
+from stages.colmap.model_files import PARAMETERS
 from stages.transforms_export import intrinsics, transforms
 from tests.camera_layouts import ring
 
@@ -89,6 +90,16 @@ def test_a_model_the_format_lacks_is_written_as_the_nearest_and_says_so() -> Non
     values = intrinsics(Camera("FOV", 8, 6, (5.0, 6.0, 4.0, 3.0, 0.9)))
     assert (values["camera_model"], values["fl_x"], values["cy"]) == ("OPENCV", 5.0, 3.0)
     assert values["note"] == "approximation: FOV with parameters [5.0, 6.0, 4.0, 3.0, 0.9] has no counterpart here"
+
+
+@pytest.mark.parametrize("model", sorted(PARAMETERS.keys() - {"EQUIRECTANGULAR"}))
+def test_every_lens_that_colmap_has_is_written(model: str) -> None:
+    count = PARAMETERS[model]
+    values = intrinsics(Camera(model, 8, 6, tuple(float(i + 1) for i in range(count))))
+    shared_focal = model.startswith(("SIMPLE", "RADIAL"))
+    assert (values["fl_x"], values["fl_y"]) == (1.0, 1.0 if shared_focal else 2.0)
+    assert (values["cx"], values["cy"]) == ((2.0, 3.0) if shared_focal else (3.0, 4.0))
+    assert ("FISHEYE" in model) == (values["camera_model"] == "OPENCV_FISHEYE")
 
 
 def test_an_unknown_model_is_refused() -> None:
