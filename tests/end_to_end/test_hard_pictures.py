@@ -15,7 +15,7 @@ from stages.decoding import MAX_PIXELS, DecodeError, decode
 from stages.video_frames import take_frames
 from tests.conftest import SilentProgress
 from tests.end_to_end.hard_scenes import RING, Picture, over_white, run, write_set
-from tests.fuzz.loaders import clip
+from tests.fuzz.pictures import clip
 from tests.png_files import png
 
 

@@ -6,6 +6,8 @@ from typing import Any
 
 from hypothesis import strategies as st
 
+W, H = 24, 20  # of every picture, and of the cameras that took them
+
 # Counts and offsets that parsers stumble over, and floats that arithmetic does.
 NUMBERS = [0, 1, 2**15, 2**16, 2**31 - 1, 2**31, 2**32 - 1, 2**32, 2**40, 2**63 - 1, 2**63, 2**64 - 1]
 FLOATS = [0.0, -0.0, 5e-324, 1e-300, 1e300, 1.7e308, -1e308, float("nan"), float("inf"), float("-inf")]
@@ -98,3 +100,15 @@ def json_files(valid: Any) -> st.SearchStrategy[bytes]:
     nests = st.sampled_from([b"[" * 100_000, b'{"frames":' * 2000 + b"1" + b"}" * 2000, b"[" * 900 + b"]" * 900])
     texts = trees.map(lambda tree: json.dumps(tree).encode("utf-8", "surrogatepass"))
     return st.one_of(texts, texts, texts, damaged(json.dumps(valid).encode()), nests)
+
+
+def one_of(files: dict[str, bytes]) -> st.SearchStrategy[dict[str, bytes]]:
+    """Valid files of which one is damaged."""
+    return st.sampled_from(sorted(files)).flatmap(
+        lambda name: damaged(files[name]).map(lambda new: {**files, name: new})
+    )
+
+
+def single(name: str, content: st.SearchStrategy[bytes]) -> st.SearchStrategy[dict[str, bytes]]:
+    """One file."""
+    return content.map(lambda data: {name: data})

@@ -8,7 +8,9 @@ from typing import Any
 import pytest
 from hypothesis import HealthCheck, given, settings
 
-from tests.fuzz.loaders import LOADERS, attempt, colmap_models, manifest, run_file, transforms
+from tests.fuzz.cameras import colmap_models, transforms
+from tests.fuzz.loaders import LOADERS, attempt
+from tests.fuzz.workspaces import manifest, run_file
 
 SLOW = (HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.filter_too_much)
 EXAMPLES = int(os.environ.get("FUZZ_EXAMPLES", "60"))

@@ -1,55 +1,26 @@
 """Every kind of file a camera, a phone or an accident may leave in a photo folder."""
 
 import io
-import math
 import struct
 import zlib
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from PIL import ExifTags, Image, ImageCms
+from PIL import Image, ImageCms
 
 from stages.decoding import (
     MAX_PIXELS,
     DecodeError,
-    Place,
     decode,
-    exposure_from_exif,
-    focal_from_exif,
-    place_from_exif,
 )
-
-WIDTH, HEIGHT = 48, 32
-
-
-def smooth(width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
-    """A picture without symmetry that survives JPEG."""
-    x, y = np.meshgrid(np.linspace(0, 1, width), np.linspace(0, 1, height))
-    return np.rint(255 * np.stack([0.1 + 0.8 * x, 0.9 - 0.7 * y, 0.2 + 0.5 * x * y], axis=-1)).astype(np.uint8)
-
-
-def saved(path: Path, image: Image.Image, **options: Any) -> Path:
-    image.save(path, **options)
-    return path
+from tests.stages.photo_files import HEIGHT, WIDTH, exif_with, saved, smooth
 
 
 def reason(path: Path) -> str:
     with pytest.raises(DecodeError) as caught:
         decode(path)
     return str(caught.value)
-
-
-def exif_with(orientation: int | None = None, **tags: Any) -> Image.Exif:
-    exif = Image.Exif()
-    if orientation is not None:
-        exif[ExifTags.Base.Orientation] = orientation
-    for tag in ("Make", "Model"):
-        if tag in tags:
-            exif[ExifTags.Base[tag]] = tags.pop(tag)
-    exif.get_ifd(ExifTags.IFD.Exif).update({ExifTags.Base[tag]: value for tag, value in tags.items()})
-    return exif
 
 
 def test_plain_files_keep_their_pixels_and_may_be_copied(tmp_path: Path) -> None:
@@ -60,33 +31,6 @@ def test_plain_files_keep_their_pixels_and_may_be_copied(tmp_path: Path) -> None
     jpeg = decode(saved(tmp_path / "a.jpg", Image.fromarray(pixels), quality=95))
     assert jpeg.suffix == ".jpg"
     assert 0 < np.abs(jpeg.pixels.astype(int) - pixels).mean() < 3
-
-
-@pytest.mark.parametrize("orientation", range(1, 9))
-def test_every_exif_orientation_is_baked(tmp_path: Path, orientation: int) -> None:
-    """The stored rows and columns go where EXIF 2.32 says; the law is written out per orientation."""
-    upright = smooth()
-    stored = {
-        1: upright,
-        2: upright[:, ::-1],
-        3: upright[::-1, ::-1],
-        4: upright[::-1],
-        5: upright.transpose(1, 0, 2),
-        6: upright.transpose(1, 0, 2)[::-1],
-        7: upright.transpose(1, 0, 2)[::-1, ::-1],
-        8: upright.transpose(1, 0, 2)[:, ::-1],
-    }[orientation]
-    path = saved(tmp_path / "a.png", Image.fromarray(np.ascontiguousarray(stored)), exif=exif_with(orientation))
-    decoded = decode(path)
-    assert np.array_equal(decoded.pixels, upright)
-    assert decoded.suffix == (".png" if orientation == 1 else None)
-    assert (decoded.camera_key.width, decoded.camera_key.height) == (WIDTH, HEIGHT)
-
-
-@pytest.mark.parametrize("orientation", [0, 9, 65535])
-def test_an_invalid_orientation_means_upright(tmp_path: Path, orientation: int) -> None:
-    path = saved(tmp_path / "a.png", Image.fromarray(smooth()), exif=exif_with(orientation))
-    assert np.array_equal(decode(path).pixels, smooth())
 
 
 def test_grey_of_any_depth_becomes_rgb(tmp_path: Path) -> None:
@@ -303,117 +247,3 @@ def test_size_limits_hold_before_pixels_are_decoded(tmp_path: Path) -> None:
     assert reason(saved(tmp_path / "dot.png", Image.new("RGB", (100, 3)))) == (
         "100×3 is too small; at least 16 pixels a side"
     )
-
-
-def test_focal_from_the_35_mm_equivalent_is_by_the_diagonal() -> None:
-    """A full-frame camera is its own equivalent: f mm on a 36 mm wide sensor."""
-    focal, source = focal_from_exif({"FocalLengthIn35mmFilm": 50}, 3600, 2400)
-    assert source == "FocalLengthIn35mmFilm"
-    assert focal == pytest.approx(5000, rel=1e-4)
-
-
-@pytest.mark.parametrize(("unit", "per_mm"), [(2, 25.4), (3, 10), (4, 1), (5, 1e-3)])
-def test_focal_from_the_focal_plane_follows_a_resize(unit: int, per_mm: float) -> None:
-    tags = {"FocalLength": 20.0, "FocalPlaneXResolution": 100 * per_mm, "FocalPlaneResolutionUnit": unit}
-    recorded = {"ExifImageWidth": 4000, "ExifImageHeight": 3000}
-    assert focal_from_exif(tags, 4000, 3000)[0] == pytest.approx(2000)
-    assert focal_from_exif(tags | recorded, 1000, 750) == (pytest.approx(500), "FocalPlaneXResolution")
-    assert focal_from_exif(tags | recorded, 750, 1000)[0] == pytest.approx(500)
-
-
-@pytest.mark.parametrize(
-    "tags",
-    [
-        {},
-        {"FocalLength": 20.0},
-        {"FocalLengthIn35mmFilm": 0},
-        {"FocalLengthIn35mmFilm": 65535},
-        {"FocalLengthIn35mmFilm": "wide"},
-        {"FocalLengthIn35mmFilm": float("nan")},
-        {"FocalLength": 20.0, "FocalPlaneXResolution": 100.0, "FocalPlaneResolutionUnit": 1},
-        {"FocalLengthIn35mmFilm": 50, "ExifImageWidth": 4000, "ExifImageHeight": 2000},  # cropped since
-    ],
-)
-def test_no_or_absurd_exif_tells_no_focal(tags: dict[str, object]) -> None:
-    assert focal_from_exif(tags, 4000, 3000) == (None, None)
-
-
-def test_exif_reaches_the_camera_key(tmp_path: Path) -> None:
-    tags: dict[str, Any] = {"Make": "Maker", "Model": "M1", "FocalLength": 8.0, "FocalLengthIn35mmFilm": 28}
-    wide = decode(saved(tmp_path / "a.jpg", Image.fromarray(smooth()), exif=exif_with(**tags)))
-    tags["FocalLength"] = 9.0
-    zoomed = decode(saved(tmp_path / "b.jpg", Image.fromarray(smooth()), exif=exif_with(**tags)))
-    assert wide.camera_key[:6] == ("Maker", "M1", "", WIDTH, HEIGHT, 1)
-    assert wide.focal_px == pytest.approx(28 / 43.27 * np.hypot(WIDTH, HEIGHT))
-    assert wide.camera_key != zoomed.camera_key
-
-
-def test_how_a_photo_was_exposed(tmp_path: Path) -> None:
-    tags = {"ExposureTime": 0.01, "ISOSpeedRatings": 200, "FNumber": 2.8}
-    told = decode(saved(tmp_path / "a.jpg", Image.fromarray(smooth()), exif=exif_with(**tags))).exposure_ev
-    assert told == pytest.approx(math.log2(0.01 * 200 / 2.8**2), abs=1e-3)
-    one = exposure_from_exif(tags)
-    assert one is not None
-    assert exposure_from_exif(tags | {"ExposureTime": 0.02}) == pytest.approx(one + 1)
-    assert exposure_from_exif(tags | {"ISOSpeedRatings": (100, 0)}) == pytest.approx(one - 1)
-    assert exposure_from_exif(tags | {"FNumber": 5.6}) == pytest.approx(one - 2)
-
-
-@pytest.mark.parametrize("tag", ["ExposureTime", "ISOSpeedRatings", "FNumber"])
-@pytest.mark.parametrize("value", [None, 0, -1, float("nan"), "fast", ()])
-def test_an_exposure_that_is_not_told_is_none(tag: str, value: object) -> None:
-    assert exposure_from_exif({"ExposureTime": 0.01, "ISOSpeedRatings": 200, "FNumber": 2.8, tag: value}) is None
-
-
-GREENWICH = {"GPSLatitude": (51, 28, 38.0), "GPSLatitudeRef": "N", "GPSLongitude": (0, 0, 1.8), "GPSLongitudeRef": "W"}
-
-
-@pytest.mark.parametrize("suffix", ["jpg", "png", "heic"])
-def test_where_a_photo_was_taken(tmp_path: Path, suffix: str) -> None:
-    exif = exif_with(Make="Maker")
-    numbers = {1: "S", 2: (33.0, 51.0, 24.5), 3: "E", 4: (151.0, 12.0, 54.0), 5: b"\1", 6: 4.25}
-    exif.get_ifd(ExifTags.IFD.GPSInfo).update(numbers)
-    big = Image.fromarray(smooth(96, 64))
-    decode(saved(tmp_path / "warm.png", big))  # registers HEIC
-    place = decode(saved(tmp_path / f"a.{suffix}", big, exif=exif)).place
-    assert place.latitude == pytest.approx(-(33 + 51 / 60 + 24.5 / 3600), abs=1e-6)
-    assert place.longitude == pytest.approx(151 + 12 / 60 + 54 / 3600, abs=1e-6)
-    assert place.altitude_m == pytest.approx(-4.25)
-    assert decode(tmp_path / "warm.png").place == Place()
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"GPSLatitude": (0, 0, 0), "GPSLongitude": (0, 0, 0)},  # no place found
-        {"GPSLatitude": (91, 0, 0)},
-        {"GPSLongitude": (180, 0, 1)},
-        {"GPSLatitude": (51, float("nan"), 0)},
-        {"GPSLatitude": (51, 28)},
-        {"GPSLatitude": "51.4"},
-        {"GPSLatitude": None},
-        {"GPSLongitudeRef": None},
-        {"GPSLatitudeRef": "E"},
-    ],
-)
-def test_a_place_that_cannot_be_is_none(wrong: dict[str, object]) -> None:
-    assert place_from_exif(GREENWICH | {"GPSAltitude": 46.0} | wrong) == Place()
-
-
-def test_altitudes_stand_for_themselves() -> None:
-    place = place_from_exif(GREENWICH)
-    assert place[:2] == pytest.approx((51.477222, -0.0005), abs=1e-6) and place.altitude_m is None
-    for value, level, expected in ((46.0, b"\0", 46.0), (12.5, 1, -12.5), (1e9, 0, None), (float("nan"), 0, None)):
-        tags = GREENWICH | {"GPSAltitude": value, "GPSAltitudeRef": level}
-        assert place_from_exif(tags) == Place(place.latitude, place.longitude, expected)
-
-
-@pytest.mark.parametrize("scene", ["banana", "sceaux_castle", "fern", "fox"])
-def test_focal_prior_agrees_with_colmap(shared_data: Path, scene: str) -> None:
-    import pycolmap
-
-    photo = min((shared_data / scene / "images").iterdir())
-    camera = pycolmap.infer_camera_from_image(photo)
-    focal = decode(photo).focal_px
-    assert (focal is not None) == camera.has_prior_focal_length
-    assert focal is None or focal == pytest.approx(camera.params[0], rel=1e-6)

@@ -1,4 +1,4 @@
-"""Scoring against fields and photos known in closed form, the words of the verdict, and what happens at the edges."""
+"""Scoring against fields and photos known in closed form, and what happens at the edges."""
 
 import json
 import math
@@ -22,7 +22,7 @@ from nerf.scene import Camera, Scene, Similarity, View
 from stages import evaluate
 from stages.backend import chosen_backend, load_backend
 from stages.drawing import Painter
-from stages.evaluate import Examiner, affordable, verdict
+from stages.evaluate import Examiner, affordable
 from stages.files import write_json, write_png
 from stages.right_halves import right_half_psnr
 from stages.training_data import view_pixels, view_rays
@@ -345,46 +345,6 @@ def test_affordable_is_the_largest_even_choice_within_the_budget(pixels: list[in
     if len(chosen) > 1:
         gaps = np.diff([-0.5, *chosen, len(pixels) - 0.5])
         assert gaps[1:-1].max() - gaps[1:-1].min() <= 1
-
-
-@pytest.mark.parametrize(
-    ("psnr", "ssim", "sentence"),
-    [
-        (11.2, 0.3, "Unusable: 11.2 dB is no better than the mean of the training photos (12.9 dB); "
-         "look at the camera layout, then train longer."),
-        (13.1, 0.4, "Worse than showing the nearest photo (13.1 against 14.2 dB): train longer."),
-        (17.3, 0.61, "Better than any photo nearby by 3.1 dB but soft: 17.3 dB on unseen photos, SSIM 0.61."),
-        (25.0, 0.65, "Better than any photo nearby by 10.8 dB but soft: 25.0 dB on unseen photos, SSIM 0.65."),
-        (24.0, 0.8, "Good, with fine detail missing: 24.0 dB on unseen photos, SSIM 0.80, "
-         "9.8 dB better than the nearest photo."),
-        (28.9, 0.87, "Sharp and trustworthy: 28.9 dB on unseen photos, SSIM 0.87, "
-         "14.7 dB better than the nearest photo."),
-    ],
-)  # fmt: skip
-def test_verdicts(psnr: float, ssim: float, sentence: str):
-    figures = {"psnr": psnr, "ssim": ssim, "psnr_nearest_view": 14.2, "psnr_mean_image": 12.9}
-    assert verdict(figures | {"photos_scored": 7, "width_share": 1}) == sentence
-
-
-@pytest.mark.parametrize(
-    ("width_share", "begin"),
-    [
-        (
-            0.13,
-            "Sharp as a small picture, finer detail was not looked at: 28.9 dB on unseen photos at 13% of their width",
-        ),
-        (0.5, "Sharp and trustworthy: 28.9 dB on unseen photos at 50% of their width"),
-    ],
-)
-def test_a_verdict_on_small_pictures_is_no_promise(width_share: float, begin: str):
-    figures = {"psnr": 28.9, "ssim": 0.9, "psnr_nearest_view": 14.2, "psnr_mean_image": 12.9}
-    assert verdict(figures | {"photos_scored": 7, "width_share": width_share}).startswith(begin)
-
-
-def test_photos_too_small_for_ssim_are_judged_by_psnr_alone():
-    figures = {"psnr": 28.9, "ssim": None, "psnr_nearest_view": 14.2, "psnr_mean_image": 12.9}
-    words = verdict(figures | {"photos_scored": 7, "width_share": 1})
-    assert words == "Sharp and trustworthy: 28.9 dB on unseen photos, 14.7 dB better than the nearest photo."
 
 
 def test_poses_are_fitted_to_the_field_as_it_is_and_scored_as_the_photo_was_exposed(

@@ -11,7 +11,7 @@ import pytest
 from stages.colmap.model_files import CAMERA_MODELS, read_model_files
 from stages.colmap.models import read_model, world_from_camera
 from stages.contract import StageError
-from tests.fuzz.loaders import colmap_models
+from tests.fuzz.cameras import colmap_models
 
 
 @pytest.fixture(params=["bin", "txt"])

@@ -1,7 +1,6 @@
 """The page: complete, escaped, self-contained, the same twice, and readable with stages missing."""
 
 import json
-import math
 import re
 from html.parser import HTMLParser
 from pathlib import Path
@@ -11,157 +10,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from nerf.scene import Camera, Scene, Similarity, View
 from stages import report
 from stages.contract import StageError
-from stages.files import write_json, write_tensors
+from stages.files import write_json
 from stages.tradeoff_front import recommend, table
+from tests.stages.report_workspace import LINES, PARTS, make_workspace
 from tests.stages.test_tradeoff_front import point
-
-NASTY = "<script>alert(1)</script>.jpg"
-FACTS = {
-    "mesh": {"vertices": 105_900, "faces": 211_817, "watertight": False, "components_kept": 1},
-    "train": {"train_seconds": 183.3, "restarts": 0, "rollbacks": 2},
-    "render": {"path": "orbit", "frames": 120, "width": 96, "height": 72, "fps": 24},
-}
-CAMERA_MODELS = [
-    {"group": 0, "photos": 24, "model": model, "principal_point": place, "free_parameters": free, "chosen": worse == 0}
-    | {"held_out_px": error, "worse_px": worse, "noise_px": noise, "reason": reason}
-    for model, place, free, error, worse, noise, reason in [
-        ("SIMPLE_RADIAL", "centred", 2, 0.6912, 0.0812, 0.0101, None),
-        ("OPENCV", "refined", 8, 0.6100, 0.0, 0.0, None),
-        ("OPENCV_FISHEYE", "refined", 8, None, None, None, "its distortion cannot be undone at 2.0% of the pixels"),
-    ]
-]
-PARTS = {"steps_timed": 19, "rays": 19_456, "seconds": 5.0, "core_seconds": 10.0, "floor_share": 0.6} | {
-    "rates": {"products": 80_123_456_789, "rows": 150_000_000, "bytes": 19_000_000_000},
-    "parts": [
-        {"part": "backward", "seconds": 5.0, "share": 0.5, "floor": 3.5},
-        {"part": "mlp", "seconds": 3.0, "share": 0.3, "floor": 1.9},
-        {"part": "waiting", "seconds": 1.0, "share": 0.1, "floor": None},
-        {"part": "rest", "seconds": 1.0, "share": 0.1, "floor": None},
-    ],
-    "most_rays_per_second": 7205.9,
-}
-LINES = {
-    "ingest": "24 photos 96×72, one camera",
-    "sfm": "23/24 registered, 0.61 px",
-    "normalise": "around an object, bounded",
-    "train": "180 s · 24 k rays/s · held out 21.4 dB",
-    "evaluate": "21.4 ± 0.4 dB, SSIM 0.61",
-    "render": "orbit, 120 frames",
-    "mesh": "212 k faces, 1 component, open at the back",
-}
-
-
-def make_workspace(root: Path, width: int = 96, height: int = 72, count: int = 24) -> dict[str, Path]:
-    """Folders as the stages leave them, with ``count`` cameras on a ring and one photo that did not register."""
-    inputs = {stage: root / "fox.nerf" / stage / "0123456789abcdef" for stage in LINES}
-    for stage, folder in inputs.items():
-        folder.mkdir(parents=True)
-        _write_manifest(folder, stage)
-    names = [NASTY if i == 8 else f"IMG_{i:04d}.jpg" for i in range(count)]
-    _write_photos(inputs["ingest"], names, (width, height))
-    _write_registration(inputs["sfm"], count)
-    scene = _scene(names, (width, height))
-    write_json(inputs["normalise"] / "scene.json", scene.to_json())
-    rng = np.random.default_rng(0)
-    points = {"xyz": rng.normal(0, 0.3, (2000, 3)).astype(np.float32), "rgb": _colours(rng, 2000)}
-    write_tensors(inputs["normalise"] / "points.safetensors", points)
-    _write_training(inputs["train"])
-    _write_metrics(inputs["evaluate"], scene, (width, height))
-    (inputs["render"] / "video.mp4").write_bytes(b"not really a video" * 100)
-    Image.new("RGB", (64, 48), (90, 120, 150)).save(inputs["mesh"] / "preview.png")
-    return inputs
-
-
-def _colours(rng: np.random.Generator, count: int) -> np.ndarray:
-    return rng.integers(40, 220, (count, 3)).astype(np.uint8)
-
-
-def _write_manifest(folder: Path, stage: str) -> None:
-    config = {"evaluate": {"background": "white", "downscale": None}, "ingest": {"photos": "/home/someone/fox"}}
-    machine = {"cores": 2, "gpu": None, "memory_gb": 23.5, "python": "3.11.9", "torch": "2.13.0"}
-    manifest = {"stage": stage, "config": config.get(stage, {"seed": 0}), "facts": FACTS.get(stage, {})}
-    seconds = {"sfm": 58.2, "train": 181.7, "render": 60.1}.get(stage, 2.5)
-    write_json(folder / "manifest.json", manifest | {"line": LINES[stage], "seconds": seconds, "machine": machine})
-
-
-def _write_photos(folder: Path, names: list[str], size: tuple[int, int]) -> None:
-    (folder / "images").mkdir()
-    photos = [{"name": name, "file": f"images/{i:04d}.png"} for i, name in enumerate(names)]
-    photos.append({"name": "blurred <b>.jpg", "file": "images/9999.png"})
-    refused = [{"name": "notes & sums.jpg", "reason": "not an image: text"}]
-    write_json(folder / "photos.json", {"photos": photos, "refused": refused, "frames": {}})
-    for i, _ in enumerate(names):
-        _picture(i, size).save(folder / f"images/{i:04d}.png")
-
-
-def _write_registration(folder: Path, count: int) -> None:
-    images: list[dict[str, object]] = [
-        {"file": f"{i:04d}.png", "registered": True, "reason": None, "uncertainty_px": (i + 1) / 50}
-        for i in range(count)
-    ]
-    reason = "only 12 matches with any other photo"
-    images.append({"file": "9999.png", "registered": False, "reason": reason, "uncertainty_px": None})
-    content = {"source": "sfm", "photos": count + 1, "registered": count, "reprojection_px": 0.61, "points": 8123}
-    lenses = {"camera_model": "OPENCV", "camera_models": CAMERA_MODELS}
-    write_json(folder / "registration.json", content | lenses | {"images": images})
-
-
-def _scene(names: list[str], size: tuple[int, int]) -> Scene:
-    views = []
-    for i, name in enumerate(names):
-        angle = 2 * math.pi * i / len(names)
-        forward = np.array([-math.cos(angle), -math.sin(angle), -0.3]) / math.hypot(1, 0.3)
-        right = np.cross(forward, [0, 0, 1]) / np.linalg.norm(np.cross(forward, [0, 0, 1]))
-        pose = np.stack([right, np.cross(forward, right), forward, -2.2 * forward], axis=1)
-        split = "train" if i % 4 else "test"
-        views.append(View(name, f"images/{i:04d}.png", 0, pose, 0.5, 4.0, split))
-    camera = Camera("SIMPLE_PINHOLE", *size, (1.2 * size[0], size[0] / 2, size[1] / 2))
-    return Scene((camera,), tuple(views), Similarity(1.0, np.eye(3), np.zeros(3)), True, False, "around", True)
-
-
-def _write_training(folder: Path) -> None:
-    curve = [
-        {"step": 50 * k, "seconds": 5 * 1.35**k, "train_psnr": 21 - 9 * 0.8**k, "heldout_psnr": 21.5 - 10 * 0.8**k}
-        | {"heldout_ssim": 0.8 - 0.4 * 0.8**k}
-        for k in range(13)
-    ]
-    write_json(folder / "curve.json", {"device": "cpu", "threads": 2, "points": curve})
-    write_json(folder / "field.json", {"kind": "paper", "downscale": 1.0, "steps": 600, "rays": 600_000})
-    write_json(folder / "parts.json", PARTS)
-
-
-def _write_metrics(folder: Path, scene: Scene, size: tuple[int, int]) -> None:
-    for name in ("renders", "errors"):
-        (folder / name).mkdir()
-    images = []
-    for rank, view in enumerate(scene.of_split("test")):
-        file = Path(view.file).name
-        _picture(rank * 4, size, blur=True).save(folder / "renders" / file)
-        Image.new("RGB", size, (60 + rank, 20, 80)).save(folder / "errors" / file)
-        figures = {"psnr": 19.0 + rank, "ssim": 0.5 + rank / 20, "psnr_mean_image": 12.9, "psnr_nearest_view": 14.2}
-        figures |= {"psnr_right": 18.5 + rank, "psnr_fitted_right": 23.25 + rank}
-        images.append({"name": view.name, "render": f"renders/{file}", "error": f"errors/{file}"} | figures)
-    overall = {"psnr": 21.5, "ssim": 0.62, "psnr_mean_image": 12.9, "psnr_nearest_view": 14.2}
-    overall |= {"psnr_right": 21.0, "psnr_fitted_right": 25.8}
-    counts = {
-        "background": [1.0, 1.0, 1.0],
-        "photos_scored": len(images),
-        "photos_test": len(images),
-        "width_share": 1.0,
-        "error_scale": [0, 0.3],
-    }
-    words = {"notes": ["LPIPS is not computed"], "verdict": "Better than any photo nearby by 7.3 dB but soft."}
-    write_json(folder / "metrics.json", {"psnr_interval": [21.1, 21.9], "images": images} | overall | counts | words)
-
-
-def _picture(seed: int, size: tuple[int, int], blur: bool = False) -> Image.Image:
-    """Something to look at: soft waves, sharper without ``blur``."""
-    x, y = np.meshgrid(np.linspace(0, 6, size[0]), np.linspace(0, 4, size[1]))
-    waves = np.stack([np.sin(x * (1 if blur else 3) + seed), np.cos(y * (1 if blur else 2)), np.sin(x + y)], -1)
-    return Image.fromarray((127 + 90 * waves).astype(np.uint8))
 
 
 class _Links(HTMLParser):

@@ -1,3 +1,5 @@
+"""Cameras of a few small photos, what became of each, and runs that were cut short: all of stage sfm at work."""
+
 import re
 import shutil
 import subprocess
@@ -17,28 +19,15 @@ from stages import ingest, sfm, sfm_process
 from stages.colmap.models import read_model
 from stages.contract import StageError
 from stages.files import read_json, write_png
-from stages.photos import Photo, read_photos, write_photos
+from stages.photos import read_photos, write_photos
 from stages.registration import count_done
 from stages.sfm_attempts import ATTEMPTS, NO_TIME, Journal, Tried
 from tests.blots import blots
 from tests.small_scenes import write_blender_scene
+from tests.stages.sfm_inputs import SMALL, ingested
 from tests.synthetic_photos import Quiet, SyntheticPhotos
 
 ROOT = Path(__file__).parents[2]
-SMALL = sfm.Config(max_features=1000)
-
-
-def ingested(folder: Path, images: dict[str, np.ndarray]) -> dict[str, Path]:
-    """What ingest would leave of these pictures: one camera for those of equal size."""
-    (folder / "images").mkdir(parents=True)
-    photos, sizes = [], {}
-    for name, pixels in images.items():
-        Image.fromarray(pixels).save(folder / "images" / name)
-        height, width = pixels.shape[:2]
-        group = sizes.setdefault((width, height), len(sizes))
-        photos.append(Photo(name, f"images/{name}", width, height, group, None, None, pixels.shape[2] == 4, 1.0))
-    write_photos(folder, photos, [], {})
-    return {"ingest": folder}
 
 
 @pytest.fixture(scope="module")
@@ -155,57 +144,6 @@ def test_however_the_child_ends_it_is_an_error_with_words(
     assert (tmp_path / "sfm.log").exists()
 
 
-def turned(angle: float, panorama: np.ndarray, size: tuple[int, int] = (240, 180), focal: float = 250.0) -> np.ndarray:
-    """What a camera sees of a far picture after turning about its vertical axis."""
-    import cv2
-
-    cos, sin = np.cos(angle), np.sin(angle)
-    lens = np.array([[focal, 0, size[0] / 2], [0, focal, size[1] / 2], [0, 0, 1]])
-    far = np.array([[focal, 0, panorama.shape[1] / 2], [0, focal, panorama.shape[0] / 2], [0, 0, 1]])
-    homography = far @ np.array([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]]) @ np.linalg.inv(lens)
-    return cv2.warpPerspective(panorama, homography, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
-
-
-def refusal(images: dict[str, np.ndarray], folder: Path, progress) -> StageError:
-    inputs = ingested(folder / "ingest", images)
-    with pytest.raises(StageError) as error:
-        sfm.run(SMALL, inputs, folder / "sfm", progress)
-    assert not (folder / "sfm" / "sparse").exists()
-    assert not (folder / "sfm" / "registration.json").exists()
-    return error.value
-
-
-def test_photos_without_overlap_are_refused(tmp_path: Path, progress) -> None:
-    error = refusal({f"{i}.png": blots(i, 240, 180) for i in range(4)}, tmp_path, progress)
-    assert str(error) == (
-        "the cameras of 4 photos could not be found: 0 of 6 pairs of photos share a view. "
-        "Take photos with 60–80 % overlap, so that everything is visible in at least three of them."
-    )
-
-
-def test_turning_on_the_spot_is_refused(tmp_path: Path, progress) -> None:
-    panorama = blots(0)
-    error = refusal({f"{i}.png": turned(0.12 * i - 0.3, panorama) for i in range(6)}, tmp_path, progress)
-    assert error.why == "the camera turned on the spot: 15 of 15 matching pairs differ by a rotation alone"
-    assert "Move sideways" in error.hint
-
-
-def test_identical_photos_are_refused(tmp_path: Path, progress) -> None:
-    error = refusal({f"{i}.png": blots(0, 240, 180) for i in range(3)}, tmp_path, progress)
-    assert error.why == "the photos are all the same view (3 of 3 pairs differ by less than a pixel)"
-
-
-def test_blank_photos_are_refused(tmp_path: Path, progress) -> None:
-    error = refusal({f"{i}.png": np.full((180, 240, 3), 90, np.uint8) for i in range(3)}, tmp_path, progress)
-    assert error.why == "half of the photos show fewer than 50 features"
-
-
-@pytest.mark.parametrize("count", [1, 2])
-def test_too_few_photos_are_refused_at_once(count: int, tmp_path: Path, progress) -> None:
-    error = refusal({f"{i}.png": blots(i, 240, 180) for i in range(count)}, tmp_path, progress)
-    assert error.what == f"cannot find cameras from {count} photo{'s' * (count == 2)}"
-
-
 def test_strangers_are_left_out_and_named_and_alpha_and_mixed_sizes_work(
     inputs: dict[str, Path], tmp_path: Path, progress
 ) -> None:
@@ -280,40 +218,6 @@ def test_a_known_camera_is_kept(
     assert read_model(tmp_path / "sparse").cameras == [lens]
     assert "the camera is kept as given" in progress.notes
     assert read_json(tmp_path / "registration.json")["camera_models"] == []
-
-
-@pytest.mark.parametrize(
-    ("given", "sizes", "why"),
-    [
-        (
-            {"camera_params": (250.0, 120.0, 90.0)},
-            [(240, 180)],
-            "the model that they are the parameters of is not given",
-        ),
-        (
-            {"camera_model": "RADIAL", "camera_params": (250.0, 120.0, 90.0)},
-            [(240, 180)],
-            "RADIAL takes f, cx, cy, k1, k2, got 3 numbers",
-        ),
-        (
-            {"camera_model": "SIMPLE_PINHOLE", "camera_params": (-250.0, 120.0, 90.0)},
-            [(240, 180)],
-            "a focal length is not positive",
-        ),
-        (
-            {"camera_model": "SIMPLE_PINHOLE", "camera_params": (250.0, 120.0, 90.0)},
-            [(240, 180), (180, 240)],
-            "the photos have 2 sizes (180×240, 240×180) and so several cameras",
-        ),
-    ],
-)
-def test_intrinsics_that_cannot_be_those_of_the_photos_are_refused(
-    given: dict[str, object], sizes: list[tuple[int, int]], why: str, tmp_path: Path, progress
-) -> None:
-    images = {f"{i}.png": blots(i, *sizes[i % len(sizes)]) for i in range(3)}
-    with pytest.raises(StageError) as caught:
-        sfm.run(SMALL.model_copy(update=given), ingested(tmp_path / "ingest", images), tmp_path / "sfm", progress)
-    assert (caught.value.what, caught.value.why) == ("cannot use --sfm.camera-params", why)
 
 
 def test_photos_with_gps_tell_metres_and_directions(
