@@ -1,0 +1,107 @@
+"""Warp's compositing and distortion along rays are the reference's, in value and gradient."""
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from nerf.kernels import Lattice, reference, warp
+from nerf.model import Rendering
+from tests.nerf.kernels.warp_agreement import COUNTS, LATTICES, TOLERANCE, agree, doubled, normal, packed, uniform
+
+EVEN, GROWING = LATTICES.values()
+
+
+def seen(device: str, rays: int, samples: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Colours, background and far."""
+    return uniform(device, 14, samples, 3), uniform(device, 15, rays, 3), 5 + 600 * uniform(device, 16, rays)
+
+
+def gradients(device: str, rays: int, samples: int) -> tuple[Rendering, Tensor]:
+    return (
+        Rendering(normal(device, 17, rays, 3), normal(device, 18, rays), normal(device, 19, rays)),
+        normal(device, 20, samples),
+    )
+
+
+@pytest.mark.parametrize("scale", [0.01, 1.0, 30.0, 1000.0])
+def test_compositing_and_its_gradients(device: str, scale: float) -> None:
+    samples, n = packed(device, COUNTS), sum(COUNTS)
+    inputs = samples, scale * uniform(device, 21, n), *seen(device, len(COUNTS), n)
+    agree("composite", *inputs)
+    agree("composite_backward", *inputs, *gradients(device, len(COUNTS), n))
+
+
+@pytest.mark.parametrize("density", [0.01, 1.0, 4.0, 30.0])
+@pytest.mark.parametrize("varied", [False, True])
+def test_rays_of_4096_samples(device: str, varied: bool, density: float) -> None:
+    """Equal ones, too: there the roundings of a sum all go the same way."""
+    n = 4096 * 3
+    each = uniform(device, 22, n) + 0.5 if varied else torch.ones(n, device=device)
+    samples = packed(device, [4096] * 3, 0.001 * each)
+    inputs = samples, density * each, *seen(device, 3, n)
+    _, weights = agree("composite", *inputs, tolerance=1e-6)
+    agree("composite_backward", *inputs, *gradients(device, 3, n), tolerance=1e-6)
+    for lattice in (EVEN, GROWING):
+        agree("distortion", samples, weights, lattice, tolerance=1e-6)
+        agree("distortion_backward", samples, weights, lattice, normal(device, 23, 3), tolerance=1e-6)
+
+
+THICKNESS = st.one_of(st.floats(0, 1e30), st.floats(0, 30), st.sampled_from([0.0, 1e-30, 800.0, 1e30]))
+
+
+@given(st.lists(THICKNESS, max_size=12), st.lists(THICKNESS, max_size=3))
+@settings(max_examples=200)
+def test_thickness_from_nothing_to_1e30(first: list[float], second: list[float]) -> None:
+    """Each ray by itself. What a sample adds to the gradient of its density is a difference, T g - behind - U G, of
+    numbers up to the largest |g| and |G|: the error is relative to them, as to values of 1 in the rendering."""
+    counts = [len(first), len(second)]
+    samples = packed("cpu", counts, torch.ones(sum(counts)))
+    sigma = torch.tensor([*first, *second])
+    colour, background, far = seen("cpu", 2, sum(counts))
+    inputs, grads = (samples, sigma, colour, background, far), gradients("cpu", 2, sum(counts))
+    rendering, weights = warp.composite(*inputs)
+    wanted, wanted_weights = reference.composite(*doubled(inputs))
+    assert ((weights >= 0) & (weights <= 1)).all() and ((rendering.opacity >= 0) & (rendering.opacity <= 1)).all()
+    pairs = list(zip([*rendering, weights], [*wanted, wanted_weights], strict=True))
+    scales = [1.0, float(far.max()), 1.0, 1.0]
+    on_seen, on_depth = grads[0].colour[samples.ray.long()], grads[0].depth[samples.ray.long()]
+    g = grads[1] + (on_seen * colour).sum(-1) + on_depth * samples.t
+    on_unstopped = (grads[0].colour * background).sum(-1) + grads[0].depth * far - grads[0].opacity
+    scales += [float(torch.cat([g, on_unstopped]).abs().max()), float(grads[0].colour.abs().max())]
+    pairs += zip(
+        warp.composite_backward(*inputs, *grads), reference.composite_backward(*doubled((*inputs, *grads))), strict=True
+    )
+    for (one, right), scale in zip(pairs, scales, strict=True):
+        assert one.isfinite().all()
+        assert not one.numel() or float((one - right).abs().max()) < TOLERANCE * scale
+
+
+def test_an_opaque_sample_has_exactly_no_gradient_and_hides_the_rest(device: str) -> None:
+    samples = packed(device, [4])
+    sigma = torch.tensor([0.0, 1e30, 1.0, 1.0], device=device)
+    colour, background, far = seen(device, 1, 4)
+    rendering, weights = warp.composite(samples, sigma, colour, background, far)
+    assert weights.tolist() == [0, 1, 0, 0] and torch.equal(rendering.colour[0], colour[1])
+    grad_sigma, grad_colour = warp.composite_backward(samples, sigma, colour, background, far, *gradients(device, 1, 4))
+    assert grad_sigma[0] != 0 and grad_sigma[1:].tolist() == [0, 0, 0]
+    assert grad_colour[[0, 2, 3]].abs().max() == 0
+
+
+@pytest.mark.parametrize("threshold", [0.0, 1e-3, 0.1, 1.0])
+@pytest.mark.parametrize("scale", [1.0, 100.0, 1e30])
+def test_the_visible_front(device: str, scale: float, threshold: float) -> None:
+    samples = packed(device, COUNTS)
+    sigma = scale * uniform(device, 24, sum(COUNTS))
+    front, _ = agree("visible_front", samples, sigma, threshold, tolerance=1e-30)
+    kept = len(front.t) / sum(COUNTS)
+    assert kept == 1 if threshold == 0 else 0 < kept < (0.3 if scale > 1 else 1.01)
+
+
+@pytest.mark.parametrize("lattice", LATTICES.values(), ids=LATTICES)
+def test_distortion_and_its_gradient(device: str, lattice: Lattice) -> None:
+    samples = packed(device, COUNTS)
+    weights = uniform(device, 25, sum(COUNTS))
+    agree("distortion", samples, weights, lattice)
+    agree("distortion_backward", samples, weights, lattice, normal(device, 26, len(COUNTS)))
