@@ -78,20 +78,28 @@ def _widened(
 
 
 def range_between_views(
-    centres: Float[np.ndarray, "frames 3"],
+    poses: Float[np.ndarray, "frames 3 4"],
     view_centres: Float[np.ndarray, "n 3"],
     view_near: Float[np.ndarray, "n"],
     view_far: Float[np.ndarray, "n"],
     bounded: bool,
 ) -> tuple[Float[np.ndarray, "frames"], Float[np.ndarray, "frames"]]:
-    """(near, far) for cameras that took no photo: the widest range of their three nearest neighbours among the views.
+    """(near, far) for cameras that took no photo, by their ``poses`` world_from_camera: the widest range of their three
+    nearest neighbours among the views.
 
-    In a bounded scene near counts from where rays enter the region, and far is the region's farthest corner.
+    Without bounds, what a view has before it is nearer to a camera that stands further ahead, and its far is farther
+    from one elsewhere. In a bounded scene near counts from where rays enter the region, and far is the region's
+    farthest corner.
     """
-    distance = np.linalg.norm(centres[:, None] - view_centres, axis=2)
+    centres = poses[:, :, 3]
+    offset = centres[:, None] - view_centres
+    distance = np.linalg.norm(offset, axis=2)
     nearest = np.argsort(distance, axis=1, kind="stable")[:, :3]
     if not bounded:
-        return view_near[nearest].min(axis=1), view_far[nearest].max(axis=1)
+        ahead = np.einsum("fva,fa->fv", offset, poses[:, :, 2]).clip(min=0)
+        near, far = view_near - ahead, view_far + distance
+        of_nearest = np.arange(len(centres))[:, None], nearest
+        return np.maximum(near[of_nearest].min(axis=1), LEAST_NEAR), far[of_nearest].max(axis=1)
     entry, far = _distances_to_region(centres)
     beyond_entry = (view_near - _distances_to_region(view_centres)[0])[nearest].min(axis=1)
     return np.maximum(entry + beyond_entry, LEAST_NEAR), far

@@ -147,6 +147,14 @@ class GridField(nn.Module):
         self.register_buffer("bits", torch.full((settings.cache_cells**3 // 64,), -1))  # every cell may hold something
         self.register_buffer("clearance", torch.zeros(settings.cache_cells**3 // 64, dtype=torch.uint8))
 
+    def on_cpu(self) -> "GridField":
+        """This field, or on a GPU its like in the CPU's memory."""
+        if self.table.device.type == "cpu":
+            return self
+        like = GridField(self.settings, 0, self.backend)
+        like.load_state_dict(self.state_dict())
+        return like
+
     @property
     def weights(self) -> Weights:
         """The networks."""

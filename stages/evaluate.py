@@ -218,7 +218,7 @@ class Examiner:
         assert isinstance(field, GridField), "only with a grid field does evaluate fit poses"
         rays = view_rays(self.scene, view, self.downscale)
         as_it_is = replace(self.painter, model=field).draw(rays)
-        moved = from_fitted_pose(field, rays, as_it_is, self.painter.background.cpu(), truth, used)
+        moved = from_fitted_pose(field.on_cpu(), rays, as_it_is, self.painter.background.cpu(), truth, used)
         return self._painter(view).draw(moved)
 
     def _photo(self, view: "View") -> "Tensor":

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from stages.mesh_views import ShadowMap
 
 NEEDS = ("ingest", "normalise", "train")
-VERSION = 4
+VERSION = 5
 RESUMES = False
 LINKS = ("mesh.glb", "mesh.ply", "mesh.obj")
 UNKEYED = ("seconds",)  # it decides the resolution, and that enters the key
@@ -191,7 +191,7 @@ def _colours(
     surface to one behind it.
 
     A field's colour means something where the field is dense, and a vertex is as far from there as the lattice is
-    coarse. Light that no sample stops comes from the last one.
+    coarse. Only the light that is stopped there counts; where nothing stops any, the last sample does.
     """
     import torch
 
@@ -205,8 +205,9 @@ def _colours(
         along = points[:, None] + t[:-1, None] * views[:, None]
         with torch.no_grad():
             density, each = model.density_and_colour(along, views[:, None].expand_as(along))
-            seen, _ = composite(density, each, t.expand(len(points), -1), each[:, -1])
-        colours.append(seen.colour)
+            seen, _ = composite(density, each, t.expand(len(points), -1), torch.zeros(1, 3, device=device))
+        something = seen.opacity[:, None] > 0
+        colours.append(torch.where(something, seen.colour / seen.opacity[:, None], each[:, -1]))
     return (torch.cat(colours).clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
 
 

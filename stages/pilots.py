@@ -6,7 +6,7 @@ half of such a photo and judged on its right half.
 """
 
 import time
-from statistics import mean, stdev
+from statistics import mean, median, stdev
 from typing import TYPE_CHECKING, NamedTuple
 
 from stages.contract import Inputs, Progress
@@ -77,7 +77,8 @@ def pilot_scene(inputs: Inputs, scene: "Scene", progress: Progress) -> PilotScen
     split = set_aside(scene, MOST_KEPT)
     if split is None:
         return None
-    downscale = max(1.0, max(max(camera.width, camera.height) for camera in scene.cameras) / LONG_SIDE)
+    cameras = [scene.cameras[view.camera] for view in scene.views]
+    downscale = max(1.0, median(max(camera.width, camera.height) for camera in cameras) / LONG_SIDE)
     bank = guided_bank(inputs, split, downscale, progress).to(compute_device())
     photos = [
         _Photo(

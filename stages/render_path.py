@@ -46,7 +46,7 @@ def path_rays(path: CameraPath, scene: "Scene") -> "Iterator[Rays]":
 
     views = scene.of_split("train")
     near, far = range_between_views(
-        path.poses[:, :, 3],
+        path.poses,
         np.stack([view.scene_from_camera[:, 3] for view in views]),
         np.array([view.near for view in views]),
         np.array([view.far for view in views]),

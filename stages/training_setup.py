@@ -29,12 +29,13 @@ DEPTH_LOSS = 0.1
 # Photos that must look into a cell for something to stand before their foregrounds (docs/numbers.md).
 LEAST_PHOTOS = 3
 COARSEST = 16
-# Samples along a ray (docs/numbers.md): steps along the diagonal of a bounded scene's box at most, and, where space is
-# folded, steps in a finest cell, of so many along an axis at most, and the distance from where steps grow in proportion
-# to it.
-MOST_STEPS = 576
-STEPS_PER_CELL, MOST_STEPPED_CELLS = 3, 1024
-EVEN_UNTIL = 0.25
+# Samples along a ray (docs/numbers.md).
+MOST_STEPS = 576  # in a box: along its diagonal
+STEPS_PER_CELL, MOST_STEPPED_CELLS = 3, 1024  # in folded space: in a finest cell, were there so many along an axis
+EVEN_UNTIL = 0.25  # the distance from where steps there grow in proportion to it
+MOST_SAMPLES = (
+    1024  # that reach to a distance of 23 at the shortest steps; more where --train.ray-samples asks for more
+)
 TABLE_COPIES = 6  # of the grids' features: themselves, their gradient, Adam's two moments, and twice in a checkpoint
 SAMPLE_BYTES = 4096  # that a sample of a grid field's step takes while it is computed
 ACTIVATIONS_PER_LAYER = 2  # numbers kept of each unit of the paper field for its gradient
@@ -183,6 +184,7 @@ def grid_settings(config: "Config", sky: bool) -> "GridSettings":
         steps=max(1, round(config.ray_samples * min(math.sqrt(3) * config.finest, MOST_STEPS))),
         shortest_step=shortest,
         cone=shortest / EVEN_UNTIL,
+        most_samples=math.ceil(MOST_SAMPLES * max(1.0, config.ray_samples)),
         view_dependence=config.view_dependence,
         sky=sky,
     )

@@ -3,6 +3,7 @@
 import math
 import time
 from collections.abc import Mapping
+from statistics import median
 from typing import TYPE_CHECKING
 
 from stages.device import compute_device, cores
@@ -42,15 +43,15 @@ def chosen_downscale(scene: "Scene", rays: float, used: "Mapping[str, float] | N
     Every pixel of the training photos is then drawn about once: more pixels than rays would be decoded for
     nothing, and with fewer the run would see the same ones again while finer ones were to be had. More than MOST_PHOTOS
     show the same things again, and rays are spread over things: then each has as many pixels as if it were one of so
-    many, as long as all have no more than MOST_PIXELS. The long side keeps LEAST_LONG_SIDE pixels, and photos are never
-    enlarged.
+    many, as long as all have no more than MOST_PIXELS. Long sides keep LEAST_LONG_SIDE pixels in
+    the median, and photos are never enlarged.
     """
     views, used = scene.of_split("train"), used or {}
     cameras = [scene.cameras[view.camera] for view in views]
     shares = [used.get(view.name, 1.0) for view in views]
     pixels = sum(share * camera.width * camera.height for share, camera in zip(shares, cameras, strict=True))
     drawn = max(rays, min(rays * len(views) / MOST_PHOTOS, MOST_PIXELS))
-    most = min(max(camera.width, camera.height) for camera in cameras) / LEAST_LONG_SIDE
+    most = median(max(camera.width, camera.height) for camera in cameras) / LEAST_LONG_SIDE
     return max(1.0, math.floor(10 * min(math.sqrt(pixels / drawn), most)) / 10)
 
 

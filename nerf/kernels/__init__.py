@@ -63,10 +63,11 @@ class GridLayout(NamedTuple):
 
 
 def grid_layout(levels: int, coarsest: int, finest: int, log2_rows: int, features: int) -> GridLayout:
-    """Levels growing geometrically from ``coarsest`` to ``finest`` cells (Müller et al. 2022, eq. 2), none with more
-    than 2^log2_rows rows."""
-    growth = (finest / coarsest) ** (1 / max(1, levels - 1))
-    resolutions = tuple(round(coarsest * growth**level) for level in range(levels))
+    """Levels growing geometrically from ``coarsest`` to ``finest`` cells (Müller et al. 2022, eq. 2), one alone of
+    ``finest``, none with more than 2^log2_rows rows."""
+    first = coarsest if levels > 1 else finest
+    growth = (finest / first) ** (1 / max(1, levels - 1))
+    resolutions = tuple(round(first * growth**level) for level in range(levels))
     first_rows = [0]
     for resolution in resolutions:
         first_rows.append(first_rows[-1] + min((resolution + 1) ** 3, 1 << log2_rows))

@@ -140,6 +140,21 @@ def test_colours_are_those_of_what_is_seen_first_not_of_the_emptiness_that_a_ver
     assert (colours[:, 2] < 64).mean() > 0.99, "nor blue: what is hidden by the red"
 
 
+class Sheet:
+    """A thin red sheet before nothing, where colours are white."""
+
+    def density_and_colour(self, points, directions):
+        density = 10.0 * ((points[..., 2] > 0) & (points[..., 2] < 0.5 * VOXEL))
+        red, white = torch.tensor([1.0, 0, 0]), torch.ones(3)
+        return density, torch.where(density[..., None] > 0, red, white)
+
+
+def test_a_sheet_that_lets_light_through_has_its_own_colour():
+    vertices, along_z = np.array([[0.0, 0, 0], [0.3, 0, 5.0]]), np.tile([0.0, 0, 1], (2, 1))
+    colours = mesh._colours(Sheet(), vertices, along_z, VOXEL, "cpu")
+    assert colours.tolist() == [[255, 0, 0], [255, 255, 255]], "the second vertex has nothing about it"
+
+
 def test_the_facts_are_those_of_the_files(run_mesh):
     result, folder = run_mesh(Solid(ball))
     loaded = trimesh.load_mesh(folder / "mesh.ply", process=False)

@@ -56,6 +56,14 @@ def test_more_rays_never_mean_smaller_photos(scene: Scene, rays: float, factor: 
     assert chosen_downscale(sized, rays * factor) <= chosen_downscale(sized, rays)
 
 
+def test_one_small_photo_does_not_decide_for_all(scene: Scene) -> None:
+    train = scene.of_split("train")[0]
+    views = (replace(train, camera=1), *(replace(train, name=str(i)) for i in range(9)))
+    mixed = replace(of_size(scene, 3000, 2000), views=views)
+    mixed = replace(mixed, cameras=(*mixed.cameras, Camera("PINHOLE", 160, 120, (1.0, 1.0, 0.0, 0.0))))
+    assert chosen_downscale(mixed, 1e6) == math.floor(10 * math.sqrt(9 * 6 + 0.0192)) / 10
+
+
 def test_what_masks_ignore_is_not_drawn_and_takes_no_pixels(scene: Scene) -> None:
     large = of_size(scene, 2000, 1000)
     used = {view.name: 0.25 for view in large.views}
@@ -171,6 +179,8 @@ def test_ray_samples_multiply_the_samples_along_a_ray(contracted: bool, factor: 
     assert asked.steps == pytest.approx(factor * usual.steps, abs=0.5)
     assert asked.cone == pytest.approx(usual.cone / factor)
     assert asked.lattice.step == pytest.approx(usual.lattice.step / factor, rel=0.01)
+    reach = [each.most_samples * each.lattice.step for each in (usual, asked)]
+    assert reach[1] > 0.99 * reach[0]
 
 
 @pytest.mark.parametrize("has_alpha", [False, True])

@@ -69,12 +69,13 @@ def launch(kernel: wp.Kernel, count: int, *arguments: Argument) -> None:
     """Run ``kernel`` for ``wp.tid()`` = 0 ... count - 1, on the device of its first tensor.
 
     Tensors are read as rows of what the kernel declares: (n, 8) float32 as 2 n entries of ``wp.vec4``. Raises TypeError
-    for a tensor that the kernel cannot read: of another type, not contiguous, or not a whole number of entries; and for
-    a number in place of a tensor or the other way round.
+    for a tensor that the kernel cannot read: of another type, not contiguous, not a whole number of entries, or in
+    another memory than the first; and for a number in place of a tensor or the other way round.
     """
     if count == 0:
         return
     device = next(argument.device for argument in arguments if isinstance(argument, Tensor))
+    on_gpu = device.type == "cuda"
     launches: dict[tuple[wp.Kernel, torch.device], _Recorded] = vars(_of_thread).setdefault("launches", {})
     recorded = launches.get((kernel, device))
     if recorded is None:
@@ -83,7 +84,8 @@ def launch(kernel: wp.Kernel, count: int, *arguments: Argument) -> None:
     ready = recorded.launch
     for place, (array, argument) in enumerate(zip(recorded.arrays, arguments, strict=True), 1):
         if isinstance(argument, Tensor):
-            if array is None or argument.dtype is not array.dtype or not argument.is_contiguous():
+            elsewhere = argument.is_cuda is not on_gpu
+            if array is None or elsewhere or argument.dtype is not array.dtype or not argument.is_contiguous():
                 raise TypeError(_unreadable(kernel, place, array, argument))
             entries, rest = divmod(argument.numel(), array.numbers)
             if rest:
@@ -95,7 +97,7 @@ def launch(kernel: wp.Kernel, count: int, *arguments: Argument) -> None:
         else:
             raise TypeError(_unreadable(kernel, place, array, argument))
     ready.set_dim(count)
-    ready.launch(wp.stream_from_torch(device) if device.type == "cuda" else None)
+    ready.launch(wp.stream_from_torch(device) if on_gpu else None)
 
 
 def _record(kernel: wp.Kernel, device: torch.device) -> _Recorded:
@@ -120,5 +122,5 @@ def _unreadable(kernel: wp.Kernel, place: int, array: _Array | None, argument: A
     found = str(argument)
     if isinstance(argument, Tensor):
         layout = "contiguous" if argument.is_contiguous() else "not contiguous"
-        found = f"{tuple(argument.shape)} {argument.dtype}, {layout}"
+        found = f"{tuple(argument.shape)} {argument.dtype}, {layout}, on {argument.device.type}"
     return f"{kernel.key}: {name} must be {wanted}; it is {found}"

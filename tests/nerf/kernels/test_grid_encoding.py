@@ -10,6 +10,11 @@ from nerf.kernels.reference import encode, encode_backward_points, encode_backwa
 LAYOUT = grid_layout(levels=3, coarsest=3, finest=9, log2_rows=7, features=2)
 
 
+def test_levels_grow_from_the_coarsest_to_the_finest_and_one_alone_is_the_finest() -> None:
+    assert grid_layout(levels=4, coarsest=16, finest=128, log2_rows=9, features=2).resolutions == (16, 32, 64, 128)
+    assert grid_layout(levels=1, coarsest=16, finest=128, log2_rows=9, features=2).resolutions == (128,)
+
+
 def random_inputs(layout: GridLayout = LAYOUT, count: int = 40) -> tuple[Tensor, Tensor, Tensor]:
     generator = torch.Generator().manual_seed(1)
     table = torch.randn(layout.rows, layout.features, dtype=torch.float64, generator=generator)

@@ -17,6 +17,7 @@ from nerf.kernels import Backend, grid_layout, reference, warp
 from nerf.kernels.warp import cache
 from nerf.kernels.warp.launch import launch
 from nerf.rays import Rays
+from tests.devices import skip_without
 from tests.nerf.kernels.warp_agreement import (
     BOUNDED,
     COUNTS,
@@ -298,6 +299,13 @@ def test_what_a_kernel_cannot_read_is_refused_by_name(points: Tensor, message: s
     launch(KERNEL, 8, 4, arguments[0], GOOD, arguments[2])
     with pytest.raises(TypeError, match=f"_raise: {message}"):
         launch(KERNEL, 8, 4, *arguments)
+
+
+@pytest.mark.gpu
+def test_tensors_in_two_memories_are_refused() -> None:
+    skip_without("cuda")
+    with pytest.raises(TypeError, match=r"_raise: points must be .*, contiguous, on cpu"):
+        launch(KERNEL, 8, 4, torch.zeros(64, device="cuda"), GOOD, torch.zeros(8, device="cuda"))
 
 
 def test_numbers_and_tensors_are_not_confused() -> None:
