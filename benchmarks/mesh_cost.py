@@ -25,7 +25,7 @@ from stages.device import compute_device
 from stages.field_files import load_field
 from stages.files import read_scene, read_tensors
 from stages.mesh import HALF_BOX, Config, reconstruct, write_mesh
-from stages.mesh_distance import sample_surface
+from stages.mesh_samples import sample_surface
 
 if TYPE_CHECKING:
     from nerf.scene import Scene

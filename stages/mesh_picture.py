@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from stages.mesh_preview import Viewpoint, framing, look, shade
+from stages.mesh_shading import Viewpoint, framing, look, shade
 
 if TYPE_CHECKING:
     from nerf.scene import Scene

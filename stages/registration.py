@@ -42,7 +42,6 @@ class Matches:
     keypoints: Int[np.ndarray, "photos"]
     tried: int
     pairs: Int[np.ndarray, "pairs 2"]
-    inliers: Int[np.ndarray, "pairs"]
     flat: Bool[np.ndarray, "pairs"]
     homography: Float[np.ndarray, "pairs 3 3"]
     ahead: Bool[np.ndarray, "pairs"]
@@ -109,7 +108,6 @@ def read_matches(database: Path) -> Matches:
         keypoints=np.array(keypoints, int).reshape(-1),
         tried=tried,
         pairs=pairs,
-        inliers=np.array([rows for _, rows, *_ in verified], int),
         flat=flat,
         homography=_matrices([blob for *_, blob, _ in verified]),
         ahead=ahead,

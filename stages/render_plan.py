@@ -3,8 +3,6 @@
 import math
 from typing import TYPE_CHECKING
 
-from stages.render_path import even_height
-
 if TYPE_CHECKING:
     from nerf.scene import Camera
 
@@ -39,11 +37,6 @@ def affordable(rays: float, camera: "Camera", longest: float, frames: int | None
 
 def _even(width: float) -> int:
     return max(2, 2 * int(width / 2))
-
-
-def pixels(frames: int, width: int, camera: "Camera") -> int:
-    """All pixels of a video of ``camera``'s proportions."""
-    return frames * width * even_height(width, camera)
 
 
 def longest_side(camera: "Camera", downscale: float) -> float:

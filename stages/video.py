@@ -55,15 +55,3 @@ def video_writer(path: Path, width: int, height: int, fps: int) -> "Iterator[Cal
 def _send(encoder: "subprocess.Popen[bytes]", frame: "np.ndarray") -> None:
     assert encoder.stdin is not None
     encoder.stdin.write(frame.tobytes())
-
-
-def read_video(path: Path) -> "tuple[np.ndarray, float]":
-    """All frames of a video, (n, height, width, 3) uint8, and its frames per second."""
-    import imageio_ffmpeg
-    import numpy as np
-
-    frames = imageio_ffmpeg.read_frames(str(path))
-    meta = next(frames)
-    width, height = meta["size"]
-    pixels = [np.frombuffer(frame, np.uint8).reshape(height, width, 3) for frame in frames]
-    return np.stack(pixels), float(meta["fps"])

@@ -11,6 +11,7 @@ import trimesh
 
 from pipeline.cli import run_command
 from tests.small_scenes import write_blender_scene
+from tests.video_files import read_video
 
 SUMMARY_KEYS = {
     "photos", "registered", "camera_model", "reprojection_px", "field", "train_seconds", "total_seconds", "psnr",
@@ -56,8 +57,6 @@ def test_the_mesh_opens_and_is_not_degenerate(output: Path):
 
 
 def test_the_videos_hold_their_frames(output: Path):
-    from stages.video import read_video
-
     for name in ("video.mp4", "depth.mp4"):
         frames, _ = read_video(output / name)
         assert frames.shape[0] == 4

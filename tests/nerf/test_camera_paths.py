@@ -133,3 +133,11 @@ def test_nearest_rotation_is_the_identity_on_rotations_and_ignores_scale(seed: i
 def test_average_pose_of_equal_poses_is_that_pose() -> None:
     pose = ring()[3]
     np.testing.assert_allclose(average_pose(np.tile(pose, (5, 1, 1))), pose, atol=1e-9)
+
+
+def test_looking_is_along_z_with_up_up() -> None:
+    pose = look_at(np.array([[3.0, 0, 1]]), np.zeros(3))[0]
+    np.testing.assert_allclose(pose[:, :3].T @ pose[:, :3], np.eye(3), atol=1e-12)
+    assert np.linalg.det(pose[:, :3]) == pytest.approx(1)
+    np.testing.assert_allclose(pose[:, 2], -pose[:, 3] / np.linalg.norm(pose[:, 3]))
+    assert pose[2, 1] < 0 and pose[2, 0] == 0  # image y runs down, image x is level

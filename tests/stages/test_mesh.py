@@ -10,11 +10,11 @@ import torch
 import trimesh
 from trimesh.visual import ColorVisuals
 
+from nerf.camera_paths import look_at
 from nerf.scene import Camera, Scene, Similarity, View
 from stages import field_files, mesh, mesh_picture, mesh_views
 from stages.contract import StageError
 from stages.files import write_json, write_tensors
-from stages.mesh_preview import look_at
 
 RADIUS = 0.4
 TURN = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
@@ -76,7 +76,7 @@ def scene_around(count=12):
     for number in range(count):
         angle, height = 2 * math.pi * number / count, 0.6 + 0.4 * (number % 3)
         centre = 2.0 * np.array([math.cos(angle), math.sin(angle), height])
-        pose = look_at(centre, np.zeros(3), np.array([0, 0, 1.0]))
+        pose = look_at(centre[None], np.zeros(3))[0]
         split = "test" if number % 8 == 0 else "train"
         views.append(View(f"{number}.jpg", f"images/{number}.png", 0, pose, 1.0, 6.0, split))
     camera = Camera("SIMPLE_RADIAL", 80, 60, (75.0, 40.0, 30.0, 0.02))

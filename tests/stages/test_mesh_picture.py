@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
+from nerf.camera_paths import look_at
 from nerf.scene import Camera, Scene, Similarity, View
 from stages import mesh_picture
 from stages.mesh_files import ColouredMesh
 from stages.mesh_picture import ELEVATION, picture, viewpoints
-from stages.mesh_preview import look_at
 
 CUBE = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 UP = np.array([0, 0, 1.0])
@@ -15,7 +15,7 @@ UP = np.array([0, 0, 1.0])
 
 def scene_of(layout, centres, target=(0.0, 0, 0)):
     views = tuple(
-        View(f"{i}", f"{i}", 0, look_at(np.array(c, float), np.array(target), UP), 0.1, 9.0, "train")
+        View(f"{i}", f"{i}", 0, look_at(np.array([c], float), np.array(target))[0], 0.1, 9.0, "train")
         for i, c in enumerate(centres)
     )
     camera = Camera("SIMPLE_PINHOLE", 40, 30, (40.0, 20.0, 15.0))

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import torch
 
+from nerf.camera_paths import look_at
 from nerf.lattice import Lattice
 from nerf.scene import Camera, Scene, Similarity, View
 from stages import mesh_views
 from stages.files import write_png
-from stages.mesh_preview import look_at
 from stages.mesh_views import look, shadow_maps, used_rays
 
 RADIUS = 0.5
@@ -22,7 +22,7 @@ IDENTITY = Similarity(1.0, np.eye(3), np.zeros(3))
 
 
 def scene_of(*centres, camera=PINHOLE, near=0.5, far=6.0, target=(0, 0, 0)):
-    poses = [look_at(np.array(c, float), np.array(target, float), np.array([0, 0, 1.0])) for c in centres]
+    poses = look_at(np.array(centres, float), np.array(target, float))
     views = tuple(View(f"{i}.png", f"images/{i}.png", 0, pose, near, far, "train") for i, pose in enumerate(poses))
     return Scene((camera,), views, IDENTITY, True, False, "around", True)
 

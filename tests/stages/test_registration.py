@@ -21,20 +21,19 @@ PHOTOS = [Photo(name, f"images/{name}", 60, 40, 0, None, None, False, 1.0) for n
 
 
 def matches(
-    *pairs: tuple[int, int, int],
+    *pairs: tuple[int, int],
     keypoints: int = 500,
     flat: int = 0,
     ahead: int = 0,
     shift_px: float = 9.0,
     turned: bool = True,
 ) -> Matches:
-    """Pairs as (first, second, inliers), the first so many of them ``flat`` or ``ahead``, all of them turns or none."""
-    array = np.array(pairs, int).reshape(-1, 3)
+    """The given pairs, the first so many of them ``flat`` or ``ahead``, all of them turns or none."""
+    array = np.array(pairs, int).reshape(-1, 2)
     return Matches(
         keypoints=np.full(len(NAMES), keypoints),
         tried=len(NAMES) * (len(NAMES) - 1) // 2,
-        pairs=array[:, :2],
-        inliers=array[:, 2],
+        pairs=array,
         flat=np.arange(len(array)) < flat,
         homography=np.tile(np.eye(3) if turned else np.diag([2.0, 1.0, 1.0]), (len(array), 1, 1)),
         ahead=np.arange(len(array)) < ahead,
@@ -46,9 +45,7 @@ def test_photos_left_out_of_matching_stand_in_the_account() -> None:
     photos = [
         replace(photo, near_duplicate_of="ä.jpg") if index in (0, 3) else photo for index, photo in enumerate(PHOTOS)
     ]
-    matched = account(
-        ["b.jpg", "c.jpg", "e.jpg"], matches((0, 1, 90), (1, 2, 80)), [["b.jpg", "c.jpg", "e.jpg"]], {}, {}
-    )
+    matched = account(["b.jpg", "c.jpg", "e.jpg"], matches((0, 1), (1, 2)), [["b.jpg", "c.jpg", "e.jpg"]], {}, {})
     entries = with_left_out(matched, photos)
     assert [entry["file"] for entry in entries] == NAMES
     assert [entry["reason"] for entry in entries if not entry["registered"]] == [
@@ -57,7 +54,7 @@ def test_photos_left_out_of_matching_stand_in_the_account() -> None:
     assert all(entry.keys() == entries[0].keys() for entry in entries)
 
 
-FOUR = (matches((0, 1, 90), (1, 2, 80), (2, 3, 19), (1, 3, 22)), [["a.jpg", "b.jpg", "c.jpg"]])
+FOUR = (matches((0, 1), (1, 2), (2, 3), (1, 3)), [["a.jpg", "b.jpg", "c.jpg"]])
 
 
 def reasons(found: Matches, models: list[list[str]], **support: tuple[int, int]) -> dict[str, str | None]:
@@ -88,13 +85,13 @@ def test_a_photo_that_shares_views_with_the_model_has_too_little_to_stand_on(
 
 
 def test_a_photo_may_only_be_turned_against_the_model() -> None:
-    found = matches((2, 3, 19), (1, 3, 22), (0, 1, 90), flat=2)
+    found = matches((2, 3), (1, 3), (0, 1), flat=2)
     why = "all 2 of its pairs with registered photos differ by a turn of the camera alone, or show one flat surface"
     assert reasons(found, FOUR[1], d=(3, 3))["d"] == why
 
 
 def test_a_photo_may_only_be_a_step_ahead_of_the_model() -> None:
-    steps = (2, 3, 19), (1, 3, 22), (0, 1, 90)
+    steps = (2, 3), (1, 3), (0, 1)
     why = (
         "in all 2 of its pairs with registered photos the camera moves straight towards something in the picture: "
         "too little parallax"
@@ -106,7 +103,7 @@ def test_a_photo_may_only_be_a_step_ahead_of_the_model() -> None:
 
 
 def test_groups_that_contradict_each_other_are_named() -> None:
-    found, models = matches((0, 1, 90), (3, 4, 80)), [["a.jpg", "b.jpg", "c.jpg"], ["b.jpg", "c.jpg", "d.jpg", "e.jpg"]]
+    found, models = matches((0, 1), (3, 4)), [["a.jpg", "b.jpg", "c.jpg"], ["b.jpg", "c.jpg", "d.jpg", "e.jpg"]]
     conflict = {"group": 1, "shared": 2, "elsewhere": 2}
     entries = account(NAMES, found, models, {}, dict.fromkeys(NAMES, (0, 0)), conflict)
     assert [entry["reason"] for entry in entries[:3]] == [None] * 3
@@ -121,7 +118,7 @@ def test_groups_that_contradict_each_other_are_named() -> None:
 
 
 def test_a_photo_may_share_no_view_or_belong_elsewhere() -> None:
-    told = reasons(matches((0, 1, 90), (2, 3, 80)), [["a.jpg", "b.jpg"], ["c.jpg"]])
+    told = reasons(matches((0, 1), (2, 3)), [["a.jpg", "b.jpg"], ["c.jpg"]])
     assert told == {
         "a": None,
         "b": None,
@@ -139,7 +136,7 @@ def test_a_photo_may_share_no_view_or_belong_elsewhere() -> None:
     ],
 )
 def test_a_photo_may_have_next_to_nothing_to_match(keypoints: int, why: str) -> None:
-    assert reasons(matches((0, 1, 90), keypoints=keypoints), [["a.jpg", "b.jpg"]])["e"] == why
+    assert reasons(matches((0, 1), keypoints=keypoints), [["a.jpg", "b.jpg"]])["e"] == why
 
 
 @pytest.mark.parametrize(
@@ -148,32 +145,32 @@ def test_a_photo_may_have_next_to_nothing_to_match(keypoints: int, why: str) -> 
         (matches(keypoints=20), 0, "half of the photos show fewer than 50 features"),
         (matches(), 0, "0 of 10 pairs of photos share a view"),
         (
-            matches((0, 1, 90), shift_px=0.2),
+            matches((0, 1), shift_px=0.2),
             3,
             "the photos are all the same view (1 of 10 pairs differ by less than a pixel)",
         ),
         (
-            matches((0, 1, 90), (1, 2, 90), (2, 3, 90), flat=2),
+            matches((0, 1), (1, 2), (2, 3), flat=2),
             3,
             "the camera turned on the spot: 2 of 3 matching pairs differ by a rotation alone",
         ),
         (
-            matches((0, 1, 90), (1, 2, 90), (2, 3, 90), flat=2, turned=False),
+            matches((0, 1), (1, 2), (2, 3), flat=2, turned=False),
             3,
             "the photos show one flat surface: a plane alone explains 2 of 3 matching pairs",
         ),
         (
-            matches((0, 1, 90), (1, 2, 90), (2, 3, 90), ahead=2, flat=2, turned=False),
+            matches((0, 1), (1, 2), (2, 3), ahead=2, flat=2, turned=False),
             3,
             "the camera moved straight ahead: in 2 of 3 matching pairs it goes towards something in the picture, "
             "which leaves too little parallax",
         ),
         (
-            matches((0, 1, 90)),
+            matches((0, 1)),
             0,
             "1 of 10 pairs of photos share a view, but no two of them tell the depth of the scene",
         ),
-        (matches((0, 1, 90)), 2, "only 2 photos and 7 points fit together; 1 of 10 pairs share a view"),
+        (matches((0, 1)), 2, "only 2 photos and 7 points fit together; 1 of 10 pairs share a view"),
     ],
 )
 def test_why_no_scene_can_be_made(found: Matches, registered: int, why: str) -> None:

@@ -15,8 +15,8 @@ from stages.contract import StageError
 from stages.files import read_json, write_json
 from stages.render_path import CameraPath, fitted_path, median_camera, path_from_file, resized
 from stages.transforms_export import transforms
-from stages.video import read_video
 from tests.camera_layouts import ring, wall
+from tests.video_files import read_video
 
 CAMERA = Camera("OPENCV", 160, 120, (150.0, 151.0, 82.0, 60.0, 0.05, 0.0, 0.0, 0.001))
 RADIUS = 0.6

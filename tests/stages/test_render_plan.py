@@ -3,7 +3,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from nerf.scene import Camera
-from stages.render_plan import affordable, chosen_fps, longest_side, pixels
+from stages.render_path import even_height
+from stages.render_plan import affordable, chosen_fps, longest_side
 
 LANDSCAPE = Camera("PINHOLE", 1600, 1000, (1500.0, 1500.0, 800.0, 500.0))
 PORTRAIT = Camera("PINHOLE", 1000, 1600, (1500.0, 1500.0, 500.0, 800.0))
@@ -12,6 +13,11 @@ SIDES = st.floats(200, 1600)
 
 def long_side(width: int, camera: Camera) -> float:
     return width * max(camera.width, camera.height) / camera.width
+
+
+def pixels(frames: int, width: int, camera: Camera) -> int:
+    """All pixels of a video of ``camera``'s proportions."""
+    return frames * width * even_height(width, camera)
 
 
 @given(st.floats(1, 1e10), st.sampled_from([LANDSCAPE, PORTRAIT]), SIDES)

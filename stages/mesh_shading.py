@@ -7,7 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from nerf.camera_paths import look_at
+
 SUPERSAMPLING = 2
+FIELD_OF_VIEW = 35.0  # degrees
 BLOCK = 1 << 17  # triangle-pixel pairs tested at a time: what fits into a processor's cache
 KEY_LIGHT, HEADLIGHT, SKY = 0.45, 0.30, 0.30  # shares of the shading; together a little over 1 where all agree
 TOWARDS_LIGHT = np.array([-0.5, -0.75, -0.45]) / np.linalg.norm([0.5, 0.75, 0.45])  # camera axes: upper left, behind
@@ -25,19 +28,8 @@ class Viewpoint(NamedTuple):
     height: int
 
 
-def preview(
-    vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray | None, camera: Viewpoint, shading: float = 1.0
-) -> np.ndarray:
-    """Render a mesh to (height, width, 3) uint8.
-
-    ``colours`` are one uint8 triple per vertex, or None for plain clay; ``shading`` blends from the colours as they
-    are (0) to fully lit (1). Faces that reach behind the camera are left out.
-    """
-    return shade(look(vertices, faces, camera), faces, colours, camera, shading)
-
-
 class Seen(NamedTuple):
-    """What a viewpoint sees, per subpixel on the mesh: the part of a preview worth doing once for several colours.
+    """What a viewpoint sees, per subpixel on the mesh: the part of a picture worth doing once for several colours.
 
     ``pixel`` is its flat index, ``face`` the face in front, ``share`` (n, 3) what each corner has of it, in
     perspective, ``light`` how bright it is, and ``away`` whether the face's back is seen.
@@ -51,7 +43,7 @@ class Seen(NamedTuple):
 
 
 def look(vertices: np.ndarray, faces: np.ndarray, camera: Viewpoint) -> Seen:
-    """The faces in front, and the light on them; the arguments are preview's."""
+    """The faces in front, and the light on them. Faces that reach behind the camera are left out."""
     camera = _supersampled(camera)
     points = _in_camera(vertices, camera)
     depth = points[:, 2]
@@ -65,7 +57,11 @@ def look(vertices: np.ndarray, faces: np.ndarray, camera: Viewpoint) -> Seen:
 
 
 def shade(seen: Seen, faces: np.ndarray, colours: np.ndarray | None, camera: Viewpoint, shading: float) -> np.ndarray:
-    """Colour what :func:`look` saw and average the subpixels; the other arguments are preview's."""
+    """Colour what :func:`look` saw of a mesh and average the subpixels, to (height, width, 3) uint8.
+
+    ``colours`` are one uint8 triple per vertex, or None for plain clay; ``shading`` blends from the colours as they
+    are (0) to fully lit (1).
+    """
     image = _background(_supersampled(camera))
     if colours is None:
         colour = CLAY.astype(np.float32)
@@ -161,21 +157,11 @@ def _background(camera: Viewpoint) -> np.ndarray:
     return np.repeat(rows.astype(np.float32), camera.width, axis=0)
 
 
-def look_at(centre: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """The pose [R | centre] (3, 4) of a camera at ``centre`` looking at ``target``; ``up`` must not lie on its axis."""
-    forward = (target - centre) / np.linalg.norm(target - centre)
-    right = np.cross(forward, up)
-    right /= np.linalg.norm(right)
-    return np.stack([right, np.cross(forward, right), forward, centre], axis=1)
-
-
-def framing(
-    vertices: np.ndarray, towards: np.ndarray, up: np.ndarray, width: int, height: int, field_of_view: float = 35.0
-) -> Viewpoint:
-    """A camera that shows all of ``vertices`` from direction ``towards`` (from the mesh to the camera); degrees."""
+def framing(vertices: np.ndarray, towards: np.ndarray, up: np.ndarray, width: int, height: int) -> Viewpoint:
+    """A camera that shows all of ``vertices`` from direction ``towards`` (from the mesh to the camera)."""
     towards = towards / np.linalg.norm(towards)
-    focal_px = min(width, height) / 2 / np.tan(np.radians(field_of_view) / 2)
-    pose = look_at(towards, np.zeros(3), up)
+    focal_px = min(width, height) / 2 / np.tan(np.radians(FIELD_OF_VIEW) / 2)
+    pose = look_at(towards[None], np.zeros(3), up)[0]
     turned = vertices @ pose[:, :3]
     middle = (turned.min(axis=0) + turned.max(axis=0)) / 2
     turned = turned - middle

@@ -1,21 +1,9 @@
-"""How far apart two surfaces are: area-uniform samples and two-sided nearest-neighbour distances."""
+"""Points on a surface, uniform by area."""
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     import numpy as np
-
-
-class MeshDistance(NamedTuple):
-    """Mean nearest-neighbour distances, in the units of the points.
-
-    ``accuracy``: from the reconstruction to the truth; ``completeness``: from the truth to the reconstruction;
-    ``chamfer``: their mean.
-    """
-
-    accuracy: float
-    completeness: float
-    chamfer: float
 
 
 def sample_surface(vertices: "np.ndarray", faces: "np.ndarray", count: int, seed: int) -> "np.ndarray":
@@ -36,14 +24,3 @@ def sample_surface(vertices: "np.ndarray", faces: "np.ndarray", count: int, seed
     a, b, c = corners[np.searchsorted(cumulated, along, side="right").clip(max=len(faces) - 1)].swapaxes(0, 1)
     root, share = np.sqrt(random[1])[:, None], random[2][:, None]
     return (1 - root) * a + root * (1 - share) * b + root * share * c
-
-
-def two_sided(reconstruction: "np.ndarray", truth: "np.ndarray") -> MeshDistance:
-    """Distances between two point sets (n, 3) and (m, 3). Raises ValueError when either is empty."""
-    from scipy.spatial import KDTree
-
-    if len(reconstruction) == 0 or len(truth) == 0:
-        raise ValueError(f"distance of {len(reconstruction)} to {len(truth)} points: neither may be empty")
-    accuracy = float(KDTree(truth).query(reconstruction)[0].mean())
-    completeness = float(KDTree(reconstruction).query(truth)[0].mean())
-    return MeshDistance(accuracy, completeness, (accuracy + completeness) / 2)
