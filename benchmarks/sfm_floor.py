@@ -30,6 +30,7 @@ from benchmarks.sfm_accuracy import Quiet
 from stages import ingest
 from stages.colmap.mapping import MAPPING_MODEL
 from stages.colmap.matching import STRICT_RATIO, Search, extract_features, fill_database, match_pairs, read_descriptors
+from stages.device import processors
 from stages.feature_matching import match_descriptors
 from stages.matching_plan import TIERS
 from stages.pairing import exhaustive
@@ -81,7 +82,7 @@ def blurred(path: Path, photo: Photo, search: Search) -> None:
 
 def compare(photos: list[Photo], folder: Path, database: Path) -> None:
     """Print the lines of the table."""
-    cores, search = os.cpu_count() or 1, Search(*TIERS[0])
+    cores, search = processors(), Search(*TIERS[0])
     fill_database(database, photos, MAPPING_MODEL)
     finding = seconds(lambda: extract_features(database, folder / "images", photos, search), 1)
     with pycolmap.Database.open(database) as db:

@@ -44,7 +44,7 @@ def _meaning(products: dict[int, float], reads: float, copied: float, count: int
     """What training can reach here at most: the work of a ray that nothing can save, at these rates."""
     from nerf.machine_rates import Rates
     from nerf.stopwatch import Work
-    from stages.live_line import short_count
+    from stages.amounts import short_count
 
     lines = ["at these rates, with nothing else to do and no core waiting, training would reach"]
     for where, (colours, densities) in RAYS.items():

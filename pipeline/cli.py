@@ -32,8 +32,8 @@ from pipeline.settings import (
     with_source,
 )
 from pipeline.workspace import Workspace
+from stages.amounts import duration
 from stages.contract import StageError
-from stages.live_line import duration
 
 EXIT_DEFECT, EXIT_USAGE, EXIT_WORKSPACE, EXIT_INTERRUPT, EXIT_TERMINATED = 1, 2, 3, 130, 143
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from pipeline import machine
 from pipeline.bench import bench_lines
 from pipeline.selftest import numerical_matrix
+from stages.device import processors
 
 if TYPE_CHECKING:
     import torch
@@ -30,7 +31,7 @@ def examine(folder: Path, selftest: bool = False, bench: bool = False) -> int:
     print("\n".join(f"  {name:<32} {version}" for name, version in found.items()))
     gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else "none that torch can use"
     free_gb = machine.free_bytes(folder) / 2**30
-    print(f"cores {machine.cores()} · torch threads {torch.get_num_threads()} · GPU {gpu} · {free_gb:.1f} GB free")
+    print(f"cores {processors()} · torch threads {torch.get_num_threads()} · GPU {gpu} · {free_gb:.1f} GB free")
     problems = [f"{name} is not installed" for name, version in found.items() if version == "missing"]
     if free_gb < LOW_DISK_GB:
         problems.append(f"only {free_gb:.1f} GB free: a run needs about {LOW_DISK_GB:.0f} GB")

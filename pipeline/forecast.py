@@ -4,12 +4,11 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
-from pipeline import machine
 from pipeline.budget import STARTING, least_total
 from pipeline.settings import Settings
+from stages.amounts import duration, rough_duration
 from stages.contract import StageError
-from stages.live_line import duration
-from stages.matching_plan import about
+from stages.device import processors
 from stages.train import SECONDS
 
 if TYPE_CHECKING:
@@ -50,7 +49,7 @@ def expected(settings: Settings, photos: Photos) -> dict[str, float | None]:
     known = settings.sfm.cameras is not None
     seconds: dict[str, float | None] = {
         "ingest": 0.5 + 0.015 * photos.number * photos.megapixels,
-        "sfm": 0.2 if known else sfm_seconds(photos, machine.cores()),
+        "sfm": 0.2 if known else sfm_seconds(photos, processors()),
         "normalise": 0.3,
         "effects": 10.0,  # two or three, and half a minute where a pilot has to decide
         "report": 2.0,
@@ -96,13 +95,13 @@ def promise(
     if (budget := runner.budget) is not None:
         return [in_words(budget.total, runner.time_left(budget), left)]
     usual = without_budget(runner.settings, left)
-    return [] if usual is None else [f"done in about {about(usual)}"]
+    return [] if usual is None else [f"done in about {rough_duration(usual)}"]
 
 
 def in_words(total: float, left: float, times: Mapping[str, float | None]) -> str:
     """The promise of a budget of ``total`` seconds, ``left`` of them not spent; ``times`` of what has to run."""
     least, finish = least_total(times), time.strftime("%H:%M", time.localtime(time.time() + left))
     if least > left:
-        soonest = f"about {about(least)} is the least that would do"
+        soonest = f"about {rough_duration(least)} is the least that would do"
         return f"budget {duration(total)}, too short for these photos: {soonest}; all is made as small as can be"
     return f"budget {duration(total)}, done at about {finish}"

@@ -1,16 +1,12 @@
 """Facts about this machine, for the header, the manifests and doctor; cheap, imports nothing heavy."""
 
 import importlib.metadata
-import os
 import platform
 import shutil
 from pathlib import Path
 from typing import Any
 
-
-def cores() -> int:
-    """Processors this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+from stages.device import processors
 
 
 def gpu_name() -> str | None:
@@ -50,7 +46,7 @@ def facts() -> dict[str, Any]:
 
     return {
         "system": platform.platform(),
-        "cores": cores(),
+        "cores": processors(),
         "gpu": gpu_name(),
         "memory_gb": round(psutil.virtual_memory().total / 2**30, 1),
         "python": platform.python_version(),
@@ -61,4 +57,4 @@ def facts() -> dict[str, Any]:
 def headline(workspace: Path) -> str:
     """One line for the start of a run."""
     gpu = gpu_name() or "no GPU"
-    return f"{cores()} cores, {gpu}, {free_bytes(workspace) / 2**30:.0f} GB free · workspace {workspace}"
+    return f"{processors()} cores, {gpu}, {free_bytes(workspace) / 2**30:.0f} GB free · workspace {workspace}"

@@ -18,8 +18,8 @@ from pipeline.keys import ContentIndex, config_for_key, digest, stage_key
 from pipeline.manifests import BadManifest, Manifest
 from pipeline.settings import Settings
 from pipeline.workspace import Workspace
+from stages.amounts import duration
 from stages.contract import StageConfig, StageError
-from stages.live_line import duration
 
 
 class DamagedInputs(Exception):

@@ -17,7 +17,7 @@ A stage is a module of this package with
 Importing a stage must be cheap: torch, pycolmap, kornia and their like are imported inside ``run``.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Protocol
@@ -53,6 +53,12 @@ class StageError(Exception):
 def bounded(text: str, most: int = MOST_LETTERS) -> str:
     """At most so many letters of it."""
     return text if len(text) <= most else f"{text[:most]}…"
+
+
+def listed(names: Sequence[str], most: int) -> str:
+    """``a, b and 3 more``: at most so many of them, and how many others there are."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more
 
 
 class Progress(Protocol):

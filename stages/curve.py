@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from stages.amounts import duration
 from stages.files import write_json
-from stages.live_line import duration
 
 if TYPE_CHECKING:
     from nerf.learning_curve import Gain

@@ -1,5 +1,12 @@
 """Where tensors are computed. Not a setting: it must not enter any key, so that a result is valid on any machine."""
 
+import os
+
+
+def processors() -> int:
+    """How many of the CPU's cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
 
 def compute_device() -> str:
     """ "cuda" where torch can use a GPU, else "cpu"; set CUDA_VISIBLE_DEVICES to nothing to stay on the CPU.

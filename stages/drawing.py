@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from stages.amounts import duration
 from stages.files import read_json
-from stages.live_line import duration
 
 if TYPE_CHECKING:
     from torch import Tensor

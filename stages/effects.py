@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from pydantic import Field
 
+from stages.amounts import duration
 from stages.contract import Inputs, Progress, StageConfig, StageResult
 from stages.effect_decisions import Decisions, write_decisions
 from stages.files import read_json, read_scene, read_tensors, write_json
-from stages.live_line import duration
 
 if TYPE_CHECKING:
     from nerf.evidence.evidence import Evidence

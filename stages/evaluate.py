@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field
 
+from stages.amounts import duration, short_count
 from stages.contract import Inputs, Progress, StageConfig, StageResult
 from stages.files import read_json, read_scene, write_json, write_png
 from stages.image_metrics import ERROR_SCALE, FEWEST_FOR_INTERVAL, bootstrap_interval, error_map, ssim
-from stages.live_line import duration, short_count
 from stages.spread import spread
 
 if TYPE_CHECKING:
@@ -326,7 +326,7 @@ def _line(metrics: dict[str, Any]) -> str:
     if metrics["psnr"] is None:
         return "no test photos, nothing measured"
     interval = metrics["psnr_interval"]
-    spread = f" ± {(interval[1] - interval[0]) / 2:.1f}" if interval else ""
+    deviation = f" ± {(interval[1] - interval[0]) / 2:.1f}" if interval else ""
     similarity = "" if metrics["ssim"] is None else f", SSIM {metrics['ssim']:.2f}"
     right, fitted = metrics["psnr_right"], metrics["psnr_fitted_right"]
     if right is not None and abs(fitted - right) > WORTH_SAYING:
@@ -335,7 +335,7 @@ def _line(metrics: dict[str, Any]) -> str:
     scored, test = metrics["photos_scored"], metrics["photos_test"]
     count = _photos(scored) if scored == test else f"{scored} of {test} photos"
     size = "" if metrics["width_share"] == 1 else f" at {metrics['width_share']:.0%} width"
-    return f"{metrics['psnr']:.1f}{spread} dB{similarity} · {trivial} · {count}{size}"
+    return f"{metrics['psnr']:.1f}{deviation} dB{similarity} · {trivial} · {count}{size}"
 
 
 def _how_many(scored: int, test: int) -> str:

@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stages.contract import StageError
+from stages.contract import StageError, listed
 from stages.files import first_fault, read_json, write_json
 
 if TYPE_CHECKING:
@@ -111,11 +111,8 @@ def _exposed(model: "RadianceModel", log_gain: list[float], device: str) -> "Rad
 
 def _some(names: list[str], wanted: str) -> str:
     """The names; of many only some, those like the one ``wanted`` first, and how many others there are."""
-    if len(names) <= MOST_NAMES:
-        return ", ".join(names)
-    alike = difflib.get_close_matches(wanted, names, n=MOST_NAMES, cutoff=0.4)
-    shown = [*alike, *(name for name in names if name not in alike)][:MOST_NAMES]
-    return f"{', '.join(shown)} and {len(names) - len(shown)} more"
+    alike = difflib.get_close_matches(wanted, names, n=MOST_NAMES, cutoff=0.4) if len(names) > MOST_NAMES else []
+    return listed([*alike, *(name for name in names if name not in alike)], MOST_NAMES)
 
 
 def _untrained(kind: str, settings: dict[str, Any], stored: int, device: str) -> "PaperNerf | GridField":

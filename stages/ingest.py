@@ -6,7 +6,6 @@ each photo a thumbnail, and one of its mask. The frames that are taken from a vi
 """
 
 import hashlib
-import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
@@ -20,6 +19,7 @@ from pydantic import Field
 from stages.ascii_names import ascii_files
 from stages.contract import Inputs, OptionalSourcePath, Progress, SourcePath, StageConfig, StageError, StageResult
 from stages.decoding import CameraKey, DecodeError, Place, decode
+from stages.device import processors
 from stages.files import write_png
 from stages.ingest_words import (
     all_plain,
@@ -204,7 +204,7 @@ def _workers(files: Sequence[Path]) -> int:
     needed = _BYTES_PER_PIXEL * max(1, largest)
     megapixels = f"decoding a photo of {largest / 1e6:.0f} megapixels takes"
     check_memory(needed, "the photos", megapixels, "Close other programs, or make the photos smaller.")
-    return at_once(min(os.cpu_count() or 1, _MAX_WORKERS), needed)
+    return at_once(min(processors(), _MAX_WORKERS), needed)
 
 
 def _take(file: Path, name: str, mask: Path | None, waiting: Path) -> _Taken | Refusal:

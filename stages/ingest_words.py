@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from stages.contract import Progress, StageError
+from stages.contract import Progress, StageError, listed
 from stages.photos import Photo, Refusal
 from stages.sharpness import BLURRED
 from stages.sources import Source
@@ -60,8 +60,7 @@ def _photos_are(count: int) -> str:
 
 
 def _few(names: Sequence[str]) -> str:
-    more = f" and {len(names) - MAX_NOTES} more, all in photos.json" if len(names) > MAX_NOTES else ""
-    return ", ".join(names[:MAX_NOTES]) + more
+    return listed(names, MAX_NOTES) + (", all in photos.json" if len(names) > MAX_NOTES else "")
 
 
 def too_few(source: Source, names: Sequence[str], refused: Sequence[Refusal]) -> StageError:

@@ -15,8 +15,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from stages.amounts import rough_duration
 from stages.contract import Progress, StageError
-from stages.live_line import duration
+from stages.device import processors
+from stages.sfm_process import environment
+from stages.spread import spread
 
 if TYPE_CHECKING:
     from stages.pairing import Places
@@ -81,23 +84,6 @@ class Cost(NamedTuple):
         return photos * self.per_photo + pairs * self.per_pair
 
 
-def places_of(photos: "Sequence[Photo]") -> "Places":
-    """When and where the photos were taken, as far as all of them tell."""
-    import numpy as np
-
-    from stages.pairing import Places, cartesian
-
-    times = [photo.time_s for photo in photos]
-    places = [(photo.latitude, photo.longitude) for photo in photos]
-    altitudes = [photo.altitude_m for photo in photos]
-    time_s = None if None in times else np.array(times, float)
-    position_m = None
-    if all(None not in place for place in places):
-        latitude, longitude = np.array(places, float).T
-        position_m = cartesian(latitude, longitude, None if None in altitudes else np.array(altitudes, float))
-    return Places(time_s, position_m)
-
-
 def check_matcher(matcher: "Matcher | None", places: "Places") -> None:
     """Raises StageError where a matcher was asked for that the photos do not allow."""
     if matcher == "spatial" and places.position_m is None:
@@ -122,7 +108,7 @@ def chosen(
     Nothing is measured where it could change nothing. With ``seconds_given`` to all of structure from motion, sets of
     ordinary size give way, too, where features and matches would take more than their part of it.
     """
-    from stages.pairing import can_save, choose, expected_pairs
+    from stages.pairing import can_save, choose, expected_pairs, places_of
 
     count, tiers = len(photos), tiers_of(left_open)
     pairs_open = left_open.matcher is None and can_save(count, neighbours)
@@ -138,8 +124,8 @@ def chosen(
     if matcher != left_open.matcher and matcher != "exhaustive":
         everything = expected_pairs("exhaustive", count, neighbours)
         progress.note(
-            f"{count} photos have {everything:,} pairs, about {about(everything * full.per_pair)}: "
-            f"{WAYS[matcher].format(neighbours)}, about {about(pairs * full.per_pair)}"
+            f"{count} photos have {everything:,} pairs, about {rough_duration(everything * full.per_pair)}: "
+            f"{WAYS[matcher].format(neighbours)}, about {rough_duration(pairs * full.per_pair)}"
         )
     tier, seconds = tiers[0], full.of(count, pairs)
     for less in tiers[1:]:
@@ -153,8 +139,8 @@ def chosen(
 
 def _at_most(count: int) -> float:
     """Seconds that features and all pairs of ``count`` photos take at most, before any is measured."""
-    cores = os.cpu_count() or 1
-    return Cost(*DENSEST).of(count, count * (count - 1) // 2) * max(1.0, 2 / cores)
+
+    return Cost(*DENSEST).of(count, count * (count - 1) // 2) * max(1.0, 2 / processors())
 
 
 def tiers_of(left_open: Open) -> list[Tier]:
@@ -165,23 +151,20 @@ def tiers_of(left_open: Open) -> list[Tier]:
 
 def _search_in_words(count: int, full: Tier, tier: Tier, seconds_full: float, seconds: float) -> str:
     if tier == full:
-        return f"{count} photos searched at {_in_words(tier)} and matched: about {about(seconds)}"
-    instead = f"at {_in_words(tier)} instead, about {about(seconds)}"
-    return f"{count} photos searched at {_in_words(full)} and matched take about {about(seconds_full)}: {instead}"
+        return f"{count} photos searched at {_in_words(tier)} and matched: about {rough_duration(seconds)}"
+    instead = f"at {_in_words(tier)} instead, about {rough_duration(seconds)}"
+    return (
+        f"{count} photos searched at {_in_words(full)} and matched take about {rough_duration(seconds_full)}: {instead}"
+    )
 
 
 def _in_words(tier: Tier) -> str:
     return f"{tier.max_image_size} pixels for {tier.max_features} features"
 
 
-def about(seconds: float) -> str:
-    """``40 s``, ``7 min``, ``3 h``: a time as one says it beforehand."""
-    return duration(max(1, round(seconds)) if seconds < 60 else 60 * round(seconds / 60))
-
-
 def _measured(photos: "Sequence[Photo]", images: Path, tier: Tier) -> Cost:
     """Measured in a child process, all cores at work. Raises StageError where it does not end well."""
-    some = [asdict(photo) for photo in _sample(photos, os.cpu_count() or 1)]
+    some = [asdict(photo) for photo in _sample(photos, processors())]
     job = json.dumps({"images": str(images.absolute()), "photos": some, **tier._asdict()})
     answer = subprocess.run(
         [sys.executable, *CHILD], input=job.encode(), capture_output=True, env=environment(), start_new_session=True
@@ -200,20 +183,10 @@ def _sample(photos: "Sequence[Photo]", cores: int) -> "list[Photo]":
 
     Neighbours in the list see much the same, those of different parts often nothing: both kinds of pairs are timed.
     """
-    wanted = max(FEWEST_MEASURED, cores)
-    places = wanted // 2
-    first = [int((place + 0.5) / places * len(photos)) for place in range(places)]
+    first = spread(len(photos), max(FEWEST_MEASURED, cores) // 2)
     return [
         photos[index] for index in sorted({one for index in first for one in (index, index + 1)}) if index < len(photos)
     ]
-
-
-def environment() -> dict[str, str]:
-    """Of a child process in which COLMAP runs."""
-    path = os.pathsep.join(filter(None, (str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH"))))
-    # Work is divided by photos and pairs; threads inside linear algebra would let roundings depend on the number of
-    # cores and on what else the machine does.
-    return {**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 
 
 # --- in the child

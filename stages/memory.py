@@ -7,9 +7,9 @@ shell to that of ``ulimit``. Whoever goes beyond is killed without a word, after
 from collections.abc import Iterator
 from pathlib import Path
 
+from stages.amounts import bytes_in_words
 from stages.contract import StageError
 
-GB = 2**30
 GROUPS = Path("/sys/fs/cgroup")
 OF_PROCESS = Path("/proc/self/cgroup")
 # The limit, what is taken, and under which name how much of that is files kept for speed alone: version 2, version 1.
@@ -32,18 +32,13 @@ def check_memory(needed: float, what: str, why: str, hint: str) -> None:
     free = available_bytes()
     if needed > free:
         raise StageError(
-            f"not enough memory for {what}", f"{why} {in_words(needed)} and {in_words(free)} are free", hint
+            f"not enough memory for {what}", f"{why} {bytes_in_words(needed)} and {bytes_in_words(free)} are free", hint
         )
 
 
 def at_once(count: int, each: float) -> int:
     """How many of ``count`` pieces of work that take ``each`` bytes fit into memory together, at least one."""
     return max(1, min(count, int(available_bytes() / each)))
-
-
-def in_words(count: float) -> str:
-    """``1.5 GB``, ``40 MB``: an amount of memory."""
-    return f"{count / GB:.1f} GB" if count >= 0.1 * GB else f"{count / 2**20:.0f} MB"
 
 
 def rooms_in_groups(of_process: Path, mounted: Path) -> Iterator[int]:

@@ -10,10 +10,11 @@ import numpy as np
 from jaxtyping import Float, Int
 
 if TYPE_CHECKING:
+    from stages.photos import Photo
     from stages.sfm import Matcher
 
 Pairs = Int[np.ndarray, "pairs 2"]
-Similarity = Float[np.ndarray, "photos photos"]
+Likeness = Float[np.ndarray, "photos photos"]
 
 # Matching every pair misses nothing, so it is what is done unless it takes longer than this and something else less
 # than half as long. It is as long as a standard training takes.
@@ -34,6 +35,19 @@ class Places(NamedTuple):
     position_m: Float[np.ndarray, "photos 3"] | None = None
 
 
+def places_of(photos: "Sequence[Photo]") -> Places:
+    """When and where the photos were taken, as far as all of them tell."""
+    times = [photo.time_s for photo in photos]
+    places = [(photo.latitude, photo.longitude) for photo in photos]
+    altitudes = [photo.altitude_m for photo in photos]
+    time_s = None if None in times else np.array(times, float)
+    position_m = None
+    if all(None not in place for place in places):
+        latitude, longitude = np.array(places, float).T
+        position_m = cartesian(latitude, longitude, None if None in altitudes else np.array(altitudes, float))
+    return Places(time_s, position_m)
+
+
 # --- the ways of choosing
 
 
@@ -50,7 +64,7 @@ def sequential(order: Int[np.ndarray, "photos"], overlap: int) -> Pairs:
     return union(*(np.stack([order[:-step], order[step:]], axis=1) for step in steps))
 
 
-def nearest(similarity: Similarity, neighbours: int) -> Pairs:
+def nearest(similarity: Likeness, neighbours: int) -> Pairs:
     """Each photo with its ``neighbours`` most similar; ties go to the lower number."""
     count = len(similarity)
     others = np.where(np.eye(count, dtype=bool), -np.inf, similarity)
@@ -58,7 +72,7 @@ def nearest(similarity: Similarity, neighbours: int) -> Pairs:
     return union(np.stack([np.repeat(np.arange(count), partners.shape[1]), partners.reshape(-1)], axis=1))
 
 
-def spanning_tree(similarity: Similarity) -> Pairs:
+def spanning_tree(similarity: Likeness) -> Pairs:
     """The pairs of largest similarity that connect all photos (Prim 1957)."""
     count = len(similarity)
     best, parent = similarity[0].astype(float), np.zeros(count, int)
@@ -93,13 +107,13 @@ def cartesian(
     return np.stack([around * np.cos(lam), around * np.sin(lam), (flat * normal + height) * np.sin(phi)], axis=1)
 
 
-def closeness(position_m: Float[np.ndarray, "n 3"]) -> Similarity:
+def closeness(position_m: Float[np.ndarray, "n 3"]) -> Likeness:
     """Minus the distance between any two positions, in metres."""
     return -np.sqrt(sum((axis[:, None] - axis[None]) ** 2 for axis in position_m.T))
 
 
 def pairs_of(
-    matcher: "Matcher", neighbours: int, count: int, places: Places, similarity: Callable[[], Similarity]
+    matcher: "Matcher", neighbours: int, count: int, places: Places, similarity: Callable[[], Likeness]
 ) -> Pairs:
     """The pairs to match. ``similarity`` is asked for only where it is needed.
 
@@ -120,11 +134,11 @@ def pairs_of(
     return union(sequential(order, overlap), nearest(np.where(apart, similarity(), -np.inf), loops))
 
 
-def _connected(similarity: Similarity, neighbours: int) -> Pairs:
+def _connected(similarity: Likeness, neighbours: int) -> Pairs:
     return union(nearest(similarity, neighbours), spanning_tree(similarity))
 
 
-def second_look(pairs: Pairs, missing: Sequence[int], neighbours: int, similarity: Callable[[], Similarity]) -> Pairs:
+def second_look(pairs: Pairs, missing: Sequence[int], neighbours: int, similarity: Callable[[], Likeness]) -> Pairs:
     """The pairs again, and more for photos that found no place: as many as were matched already, at most all.
 
     They go to each missing photo's most similar ones, and are at least twice as many as it had.

@@ -24,7 +24,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, NamedTuple
 
+from stages.amounts import bytes_in_words
 from stages.contract import Progress, StageError
+from stages.device import processors
 from stages.live_line import live_line
 
 if TYPE_CHECKING:
@@ -111,7 +113,7 @@ class PixelStore:
         free = available_bytes()
         fits = len(mapped) <= FITS * free
         if not fits:
-            sizes = f"{_gigabytes(len(mapped))} at this size, {_gigabytes(free)} of memory are free"
+            sizes = f"{bytes_in_words(len(mapped))} at this size, {bytes_in_words(free)} of memory are free"
             progress.note(f"the photos take {sizes}: training waits for the disk; a larger --train.downscale will not")
         if hasattr(mapped, "madvise"):  # not on Windows
             mapped.madvise(mmap.MADV_WILLNEED if fits else mmap.MADV_RANDOM)
@@ -185,7 +187,7 @@ def _write(store: PixelStore, load: Load, progress: Progress) -> None:
     partial, photos, written = store.path.with_name(f"{store.path.name}.partial"), len(store.photos), 0
 
     def describe() -> tuple[str, float]:
-        waiting = f", the disk is taking {_gigabytes(store.starts[-1])}" if written == photos else ""
+        waiting = f", the disk is taking {bytes_in_words(store.starts[-1])}" if written == photos else ""
         return f"read {written} of {photos} photos{waiting}", written / photos
 
     try:
@@ -227,17 +229,15 @@ def _workers(store: PixelStore) -> int:
     """How many photos to decode at a time: one per core, fewer where they are too large for that."""
     largest = max(photo.width * photo.height for photo in store.photos)
     affordable = DECODING_BYTES // (BYTES_PER_PIXEL[store.channels] * largest)
-    return max(1, min(os.cpu_count() or 1, affordable))
+    return max(1, min(processors(), affordable))
 
 
 def _check_room(store: PixelStore) -> None:
     free, needed = shutil.disk_usage(store.path.parent).free, store.size
     if needed > free:
-        why = f"they take {_gigabytes(needed)} at this size, and {store.path.parent} has {_gigabytes(free)} free"
+        why = (
+            f"they take {bytes_in_words(needed)} at this size, and {store.path.parent} has {bytes_in_words(free)} free"
+        )
         raise StageError(
             "no room for the pixels of the photos", why, "Free disk space, or give a larger --train.downscale."
         )
-
-
-def _gigabytes(count: float) -> str:
-    return f"{count / 2**30:.1f} GB"

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import Field
 
+from stages.amounts import duration, short_count
 from stages.contract import Inputs, Progress, StageConfig, StageError, StageResult
 from stages.files import read_json, read_scene, write_json, write_png
-from stages.live_line import duration, short_count
 from stages.render_path import BY_LAYOUT, CameraPath, PathKind, fitted_path, path_from_file, path_rays
 from stages.spread import spread
 

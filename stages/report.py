@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 from pydantic import Field
 from tyro.conf import Suppress
 
+from stages.amounts import duration, short_count
 from stages.contract import Inputs, Progress, StageConfig, StageResult
 from stages.files import read_json, read_scene, read_tensors, write_json
-from stages.live_line import duration, short_count
 from stages.training_parts import PARTS_FILE
 
 if TYPE_CHECKING:

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from stages.live_line import duration
+from stages.amounts import duration
 
 # What to do about it; the effect's own reason says what was seen.
 ADVICE = {

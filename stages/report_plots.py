@@ -5,8 +5,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
+from stages.amounts import duration
 from stages.curve import coming_doubling, heldout_curve
-from stages.live_line import duration
 
 if TYPE_CHECKING:
     import numpy as np

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field
 
-from stages.contract import Inputs, OptionalSourcePath, Progress, StageConfig, StageError, StageResult
+from stages.contract import Inputs, OptionalSourcePath, Progress, StageConfig, StageError, StageResult, listed
 from stages.files import write_json
 from stages.sfm_attempts import ATTEMPTS, JOURNAL
 from stages.sfm_process import run_child
@@ -129,7 +129,8 @@ def _import(cameras: Path, photos: "list[Photo]", ingest: Path, folder: Path, pr
 
 
 def _reconstruct(config: Config, photos: "list[Photo]", ingest: Path, folder: Path, progress: Progress) -> StageResult:
-    from stages.matching_plan import check_matcher, places_of
+    from stages.matching_plan import check_matcher
+    from stages.pairing import places_of
     from stages.registration import (
         FEWEST_POINTS,
         FEWEST_REGISTERED,
@@ -295,8 +296,7 @@ def _say_who_is_missing(photos: "Sequence[Photo]", images: list[dict[str, Any]],
     for name, reason in missing:
         by_reason.setdefault(reason, []).append(name)
     for reason, who in by_reason.items():
-        more = f" and {len(who) - MOST_NAMES} more" if len(who) > MOST_NAMES else ""
-        progress.note(f"  {', '.join(who[:MOST_NAMES])}{more}: {reason}")
+        progress.note(f"  {listed(who, MOST_NAMES)}: {reason}")
 
 
 def _result(folder: Path, source: str, images: list[dict[str, Any]], **facts: Any) -> StageResult:

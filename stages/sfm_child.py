@@ -19,6 +19,7 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
+from stages.amounts import rough_duration
 from stages.colmap.diagnosis import find_conflict, links, supports
 from stages.colmap.mapping import MAPPING_MODEL, incremental_options, map_globally, map_incrementally
 from stages.colmap.matching import (
@@ -36,8 +37,7 @@ from stages.colmap.models import load_native, write_native
 from stages.colmap.refinement import finish
 from stages.files import make_durable
 from stages.masks import write_feature_masks
-from stages.matching_plan import about, places_of
-from stages.pairing import Pairs, Similarity, pairs_of, second_look
+from stages.pairing import Likeness, Pairs, pairs_of, places_of, second_look
 from stages.photos import Photo
 from stages.registration import FEWEST_POINTS, FEWEST_REGISTERED
 from stages.sfm import Matcher
@@ -128,7 +128,7 @@ class _Work:
         return self.started + min(self.job.seconds or math.inf, self.job.max_seconds) - time.monotonic()
 
     @cached_property
-    def similarity(self) -> Similarity:
+    def similarity(self) -> Likeness:
         return look_alike(self.database, len(self.photos), self.job.seed)
 
     @cached_property
@@ -240,7 +240,8 @@ def _no_way(attempt: Attempt, missing: list[int], work: _Work) -> str | None:
     if not time_against(expected, tried, left):
         return None
     limit = "--sfm.max-seconds" if work.job.seconds is None else "the time it is given"
-    times = f"about {about(expected)} and the last adjustment, of {limit} {about(max(0.0, left))} are left"
+    rest = f"of {limit} {rough_duration(max(0.0, left))} are left"
+    times = f"about {rough_duration(expected)} and the last adjustment, {rest}"
     work.say(note=f"left out, for it would take {times}: {attempt.words}")
     return NO_TIME
 
@@ -304,7 +305,7 @@ def _match(database: Path, pairs: Pairs, max_ratio: float, work: _Work) -> None:
     def expect(left: int, seconds: float) -> None:
         count = len(work.photos)
         every = "all " if left == count * (count - 1) // 2 else ""
-        work.say(note=f"matching {every}{left:,} pairs of photos: about {about(seconds)}")
+        work.say(note=f"matching {every}{left:,} pairs of photos: about {rough_duration(seconds)}")
 
     work.begin("matching", database=str(database), pairs=len(pairs))
     match_pairs(database, pairs, work.job.seed, max_ratio, expect)

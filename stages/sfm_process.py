@@ -4,6 +4,7 @@ What it does is in stages/sfm_child.py.
 """
 
 import json
+import os
 import shutil
 import signal
 import subprocess
@@ -12,7 +13,7 @@ import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any
 
 from stages.contract import Progress, StageError
 from stages.live_line import live_line
@@ -25,10 +26,6 @@ if TYPE_CHECKING:
 # The share of the first attempt where a phase begins, and how long it is (measured on 11 to 50 photos, two cores).
 PHASES = {"features": (0.0, 0.35), "matching": (0.35, 0.5), "mapping": (0.85, 0.15)}
 FIRST_ATTEMPT, REFINING = 0.7, 0.95  # where they end and begin in the whole
-FOR_CHILD = (
-    "seed", "max_image_size", "max_features", "camera_model", "camera_params", "matcher", "neighbours", "attempts",
-    "seconds", "max_seconds",
-)  # fmt: skip
 FULL_DISK = 1 << 22  # bytes: less than the smallest of COLMAP's files that may have found no room
 CHILD = ["-m", "stages.sfm_child"]
 
@@ -42,7 +39,7 @@ def run_child(
         "images": str(images.absolute()),
         "database": str(database.absolute()),
         "photos": [asdict(photo) for photo in photos],
-        **config.model_dump(include={*FOR_CHILD}),
+        **config.model_dump(exclude={"cameras"}),
     }
     latest: dict[str, Any] = {"phase": "features", "database": job["database"], "done": 0, "pairs": 0}
     latest["attempt"] = ATTEMPTS[0].name
@@ -82,9 +79,7 @@ def _without(attempt: str, code: int, late: bool, log: Path) -> str | None:
     return f"Run again: it goes on without the attempt {attempt!r}. Log: {log}"
 
 
-def _start_child(stderr: Any) -> "subprocess.Popen[bytes]":
-    from stages.matching_plan import environment
-
+def _start_child(stderr: IO[bytes]) -> "subprocess.Popen[bytes]":
     return subprocess.Popen(
         [sys.executable, *CHILD],
         stdin=subprocess.PIPE,
@@ -95,7 +90,15 @@ def _start_child(stderr: Any) -> "subprocess.Popen[bytes]":
     )
 
 
-def _hand_over(stdin: Any, job: dict[str, Any]) -> None:
+def environment() -> dict[str, str]:
+    """Of a child process in which COLMAP runs."""
+    path = os.pathsep.join(filter(None, (str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH"))))
+    # Work is divided by photos and pairs; threads inside linear algebra would let roundings depend on the number of
+    # cores and on what else the machine does.
+    return {**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+
+
+def _hand_over(stdin: IO[bytes], job: dict[str, Any]) -> None:
     """Write the job and leave the pipe open: its end tells the child that the parent is gone."""
     try:
         stdin.write(json.dumps(job).encode() + b"\n")

@@ -4,7 +4,6 @@ Every photo is decoded once, in full size. A point's colour is the mean over a s
 of its surface in every photo, so near photos are given larger windows than far ones.
 """
 
-import os
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -12,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from stages.contract import Progress
+from stages.device import processors
 
 if TYPE_CHECKING:
     import numpy as np
@@ -280,4 +280,4 @@ def _gradients(pixels: "np.ndarray") -> "np.ndarray":
 def _workers(scene: "Scene") -> int:
     """How many photos to decode at a time: one per core, fewer where they are too large for that."""
     largest = max(camera.width * camera.height for camera in scene.cameras)
-    return max(1, min(os.cpu_count() or 1, DECODING_BYTES // (40 * largest)))
+    return max(1, min(processors(), DECODING_BYTES // (40 * largest)))

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 from pydantic import Field
 from tyro.conf import Suppress
 
+from stages.amounts import duration
 from stages.contract import Inputs, Progress, StageConfig, StageError, StageResult
 from stages.files import read_scene, write_json
-from stages.live_line import duration
 from stages.tradeoff_arms import VARIANTS, Arm, Selection, Speed, drawn_per_second, in_words, resolution_words
 
 if TYPE_CHECKING:

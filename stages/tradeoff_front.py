@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass
 from statistics import mean, stdev
 from typing import Any
 
-from stages.live_line import duration
+from stages.amounts import duration
 from stages.tradeoff_arms import VARIANTS, Arm, resolution_words
 
 WORTH_DB = 0.5  # a doubling of the time that buys less is not worth it; 0.5 dB is what one sees side by side

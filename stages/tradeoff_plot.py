@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from stages.live_line import duration
+from stages.amounts import duration
 from stages.report_plots import INK, drawing, svg_element
 from stages.tradeoff_arms import VARIANTS, resolution_words
 

@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import Field, model_validator
 from tyro.conf import Suppress
 
+from stages.amounts import short_count
 from stages.contract import Inputs, Progress, StageConfig, StageResult
 from stages.effect_decisions import read_decisions
 from stages.files import read_scene
-from stages.live_line import short_count
 from stages.photos import read_photos
 
 if TYPE_CHECKING:

@@ -20,11 +20,12 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from stages.amounts import short_count
 from stages.checkpoints import Checkpoint, latest_checkpoint, save_checkpoint
 from stages.contract import Progress, StageError
 from stages.examination import Lost, is_suspicious, not_finite, symptom_of
 from stages.files import read_json, write_durably
-from stages.live_line import live_line, short_count
+from stages.live_line import live_line
 from stages.training_parts import observed
 from stages.training_state import Budget, Pace, Probes, RunState
 

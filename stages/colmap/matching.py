@@ -1,7 +1,6 @@
 """Features and matches: everything that fills COLMAP's database. Call it in a child process."""
 
 import math
-import os
 import shutil
 import time
 from collections.abc import Callable, Container, Sequence
@@ -13,9 +12,10 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from stages.device import processors
 from stages.feature_matching import match_descriptors
 from stages.memory import at_once
-from stages.pairing import Pairs, Similarity
+from stages.pairing import Likeness, Pairs
 from stages.retrieval import photo_similarity
 
 if TYPE_CHECKING:
@@ -125,7 +125,7 @@ def extract_features(database: Path, images: Path, photos: "Sequence[Photo]", se
     options = pycolmap.FeatureExtractionOptions()
     options.max_image_size = search.max_image_size
     options.sift.max_num_features = search.max_features
-    options.num_threads = at_once(os.cpu_count() or 1, feature_bytes(photos, search))
+    options.num_threads = at_once(processors(), feature_bytes(photos, search))
     every = [photo.image_name for photo in photos]
     small = {p.image_name for p in photos if max(p.width, p.height) <= search.doubled_up_to}
     masks = search.masks
@@ -159,7 +159,7 @@ def match_pairs(
     import pycolmap
 
     options = _verification(seed)
-    with pycolmap.Database.open(database) as db, ThreadPoolExecutor(os.cpu_count()) as pool:
+    with pycolmap.Database.open(database) as db, ThreadPoolExecutor(processors()) as pool:
         todo = _spread([(i, j) for i, j in pairs.tolist() if not db.exists_two_view_geometry(i + 1, j + 1)])
         photo = lru_cache(CACHED_PHOTOS)(partial(_read_photo, db))
         for begin in range(0, len(todo), BLOCK_SIZE):
@@ -194,7 +194,7 @@ def _read_photo(db: "pycolmap.Database", photo: int) -> _Photo:
     return _Photo(camera, keypoints[:, :2], read_descriptors(db, photo))
 
 
-def look_alike(database: Path, count: int, seed: int) -> Similarity:
+def look_alike(database: Path, count: int, seed: int) -> Likeness:
     """How much any two photos look alike, by their features."""
     import pycolmap
 

@@ -89,7 +89,7 @@ def test_verified_matches_are_those_of_colmaps_own_verification(database: Path) 
 def test_the_number_of_cores_changes_nothing(database: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     results = []
     for cores in (1, 4):
-        monkeypatch.setattr("os.cpu_count", lambda cores=cores: cores)
+        monkeypatch.setattr(matching, "processors", lambda cores=cores: cores)
         copy = copy_of(database, f"{cores}.db")
         match_pairs(copy, exhaustive(COUNT), 0, 0.8)
         results.append(found(copy))

@@ -3,7 +3,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stages import matching_plan, sfm
+from stages import matching_plan, pairing, sfm
 from stages.contract import StageError
 from stages.matching_plan import (
     TIERS,
@@ -12,7 +12,6 @@ from stages.matching_plan import (
     Open,
     Tier,
     _sample,
-    about,
     check_matcher,
     chosen,
     measure,
@@ -84,7 +83,7 @@ def test_the_choice_of_pairs_follows_the_measurement_and_is_said(
 )
 def test_other_choices_have_other_words(places: Places, words: str, progress, monkeypatch: pytest.MonkeyPatch) -> None:
     costing(monkeypatch, (0.05, 0.034))
-    monkeypatch.setattr(matching_plan, "places_of", lambda _: places)
+    monkeypatch.setattr(pairing, "places_of", lambda _: places)
     chosen(FULL, photos(400), Path(), 30, progress)
     assert progress.notes[0] == f"400 photos have 79,800 pairs, about 45 min: {words}"
 
@@ -197,13 +196,6 @@ def test_places_are_needed_to_go_by_places() -> None:
     assert caught.value.what == "cannot choose pairs of photos by place"
     assert caught.value.why == "not all photos tell by EXIF where they were taken"
     assert "--sfm.matcher retrieval" in caught.value.hint
-
-
-@pytest.mark.parametrize(
-    ("seconds", "words"), [(0.01, "1 s"), (40.2, "40 s"), (95.0, "2 min"), (2713.0, "45 min"), (7300.0, "2 h 2 min")]
-)
-def test_times_are_said_roughly(seconds: float, words: str) -> None:
-    assert about(seconds) == words
 
 
 def test_where_time_is_given_sets_of_ordinary_size_give_way_too(progress, monkeypatch: pytest.MonkeyPatch) -> None:

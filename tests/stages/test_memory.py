@@ -9,7 +9,7 @@ import pytest
 from stages import memory
 from stages.colmap.matching import BYTES_PER_SEARCHED_PIXEL, Search, feature_bytes
 from stages.contract import StageError
-from stages.memory import at_once, available_bytes, check_memory, in_words, rooms_in_groups
+from stages.memory import at_once, available_bytes, check_memory, rooms_in_groups
 from stages.photos import Photo
 
 
@@ -72,10 +72,6 @@ def test_just_enough_is_enough(free, there: int, passes: bool):
 def test_pieces_at_once(free, there: int, pieces: int):
     free(there)
     assert at_once(8, 10.0) == pieces
-
-
-def test_words():
-    assert (in_words(2**30 * 1.26), in_words(2**20 * 40)) == ("1.3 GB", "40 MB")
 
 
 @pytest.mark.parametrize("size, side, searched", [((2000, 1000), 1000, 1000 * 500), ((1000, 500), 1600, 2000 * 1000)])

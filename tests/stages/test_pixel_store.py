@@ -61,7 +61,7 @@ def test_it_holds_what_was_loaded(tmp_path: Path, progress: SilentProgress, chan
     assert np.array_equal(table.numpy(), np.concatenate([pixels.reshape(-1, channels) for pixels in expected]))
     for index, pixels in enumerate(expected):
         assert np.array_equal(kept(store, index), pixels)
-    assert progress.updates[-1] == ("read 4 of 4 photos, the disk is taking 0.0 GB", 1.0)
+    assert progress.updates[-1] == ("read 4 of 4 photos, the disk is taking 0 MB", 1.0)
     assert progress.notes == []
 
 
@@ -114,7 +114,7 @@ def test_photos_are_decoded_a_few_at_a_time_and_dropped(
     ingest.mkdir()
     (ingest / "a").touch()
     store = pixel_store(ingest, "train", [StoredPhoto("a", 8, 8)] * 40, 3)
-    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    monkeypatch.setattr(module, "processors", lambda: 2)
     counting, alive, most = threading.Lock(), weakref.WeakSet(), 0
 
     class Pixels(np.ndarray):
@@ -146,7 +146,7 @@ def test_photos_are_decoded_a_few_at_a_time_and_dropped(
 def test_large_photos_are_decoded_by_fewer_workers(
     width: int, height: int, channels: int, cores: int, expected: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(os, "cpu_count", lambda: cores)
+    monkeypatch.setattr(module, "processors", lambda: cores)
     store = PixelStore(Path(), (StoredPhoto("a", width, height), StoredPhoto("b", 1, 1)), channels)
     assert module._workers(store) == expected
 
@@ -185,7 +185,7 @@ def test_more_than_memory_is_said(tmp_path: Path, progress: SilentProgress, monk
     monkeypatch.setattr(module, "FITS", 0.0)
     assert np.array_equal(store.table(progress)[:15].numpy(), painted(0).reshape(-1, 3))
     assert len(progress.notes) == 1
-    assert progress.notes[0].startswith("the photos take 0.0 GB at this size, ")
+    assert progress.notes[0].startswith("the photos take 0 MB at this size, ")
     assert progress.notes[0].endswith("training waits for the disk; a larger --train.downscale will not")
 
 

@@ -1,0 +1,34 @@
+"""Amounts in words: counts, times, bytes."""
+
+GB = 2**30
+
+
+def short_count(count: float) -> str:
+    """``950``, ``9.4 k``, ``24 k``, ``2.4 M``: a count at a glance."""
+    for unit, size in (("M", 1e6), ("k", 1e3)):
+        if count >= size:
+            return f"{count / size:.{0 if count >= 10 * size else 1}f} {unit}"
+    return f"{count:.0f}"
+
+
+def duration(seconds: float) -> str:
+    """``0.4 s``, ``58 s``, ``3 min 20 s``, ``1 h 5 min``: seconds as people say them."""
+    if seconds < 9.95:
+        return f"{seconds:.1f} s".replace(".0 s", " s")
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    big, small, units = (
+        (whole // 60, whole % 60, ("min", "s")) if whole < 3600 else (whole // 3600, whole % 3600 // 60, ("h", "min"))
+    )
+    return f"{big} {units[0]} {small} {units[1]}" if small else f"{big} {units[0]}"
+
+
+def rough_duration(seconds: float) -> str:
+    """``40 s``, ``7 min``, ``3 h``: a time as one says it beforehand."""
+    return duration(max(1, round(seconds)) if seconds < 60 else 60 * round(seconds / 60))
+
+
+def bytes_in_words(count: float) -> str:
+    """``1.5 GB``, ``40 MB``: an amount of memory or disk."""
+    return f"{count / GB:.1f} GB" if count >= 0.1 * GB else f"{count / 2**20:.0f} MB"

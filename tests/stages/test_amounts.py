@@ -1,0 +1,41 @@
+import pytest
+
+from stages.amounts import bytes_in_words, duration, rough_duration, short_count
+
+
+@pytest.mark.parametrize(
+    ("count", "text"),
+    [(7, "7"), (950, "950"), (9_400, "9.4 k"), (24_000, "24 k"), (999_000, "999 k"), (2_400_000, "2.4 M")],
+)
+def test_short_counts(count: float, text: str) -> None:
+    assert short_count(count) == text
+
+
+@pytest.mark.parametrize(
+    ("seconds", "words"),
+    [
+        (0.04, "0 s"),
+        (0.42, "0.4 s"),
+        (3.0, "3 s"),
+        (9.96, "10 s"),
+        (58.4, "58 s"),
+        (59.7, "1 min"),
+        (61.2, "1 min 1 s"),
+        (200, "3 min 20 s"),
+        (3599.6, "1 h"),
+        (3900, "1 h 5 min"),
+    ],
+)
+def test_durations(seconds: float, words: str):
+    assert duration(seconds) == words
+
+
+@pytest.mark.parametrize(
+    ("seconds", "words"), [(0.01, "1 s"), (40.2, "40 s"), (95.0, "2 min"), (2713.0, "45 min"), (7300.0, "2 h 2 min")]
+)
+def test_times_are_said_roughly(seconds: float, words: str) -> None:
+    assert rough_duration(seconds) == words
+
+
+def test_bytes() -> None:
+    assert (bytes_in_words(2**30 * 1.26), bytes_in_words(2**20 * 40)) == ("1.3 GB", "40 MB")
