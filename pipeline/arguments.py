@@ -186,7 +186,7 @@ def parse(kind: type[T], command: str, words: Sequence[str], settings: Settings 
 
 def _without_replaced(recorded: TrainConfig, words: Sequence[str]) -> TrainConfig:
     """The recorded options of training without the budgets that the one given in ``words`` stands in place of."""
-    given = {option for option in ("steps", "seconds", "preset") if _names(words, option)}
+    given = {option for option in ("steps", "seconds", "preset") if _is_given(words, option)}
     replaced: dict[str, None] = {}
     for option, other in (("steps", "seconds"), ("seconds", "steps")):
         if option in given and other not in given:
@@ -212,7 +212,7 @@ def _what_is_wrong(ending: SystemExit, box: str) -> str:
     return words + (f"; perhaps {', '.join(re.findall(r'--[a-z0-9.-]+', similar))}" if similar else "")
 
 
-def _names(words: Sequence[str], option: str) -> bool:
+def _is_given(words: Sequence[str], option: str) -> bool:
     return any(word.split("=")[0] == f"--train.{option}" for word in words)
 
 

@@ -4,7 +4,8 @@ import json
 import sys
 import threading
 import time
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -17,10 +18,6 @@ HEARTBEAT_SECONDS = 10.0  # plain output: one line at most this often, so that a
 
 class Display(Protocol):
     """How the runner speaks. ``update`` and ``note`` may be called from any thread."""
-
-    def __enter__(self) -> "Display": ...
-
-    def __exit__(self, *_: object) -> None: ...
 
     def headline(self, text: str) -> None: ...
 
@@ -57,12 +54,6 @@ def _print(text: str) -> None:
 class SilentDisplay:
     """Says nothing; for reading a workspace and for calls from Python."""
 
-    def __enter__(self) -> "SilentDisplay":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
-
     def headline(self, text: str) -> None:
         pass
 
@@ -92,12 +83,6 @@ class PlainDisplay:
         self._stage = ""
         self._last = 0.0
         self._lock = threading.Lock()
-
-    def __enter__(self) -> "PlainDisplay":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
 
     def _say(self, text: str) -> None:
         with self._lock:
@@ -135,12 +120,6 @@ class JsonDisplay:
     def __init__(self) -> None:
         self._stage, self._last = "", 0.0
         self._lock = threading.Lock()
-
-    def __enter__(self) -> "JsonDisplay":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
 
     def _event(self, event: str, **values: Any) -> None:
         with self._lock:
@@ -180,7 +159,7 @@ class RichDisplay:
         from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
         self._console = Console(highlight=False)
-        self._progress = Progress(
+        self.progress = Progress(
             SpinnerColumn(),
             TextColumn("{task.fields[stage]:<10}"),
             BarColumn(bar_width=20),
@@ -193,13 +172,6 @@ class RichDisplay:
         self._task: Any = None
         self._stage = ""
 
-    def __enter__(self) -> "RichDisplay":
-        self._progress.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._progress.stop()
-
     def headline(self, text: str) -> None:
         self._print(text, style="dim")
 
@@ -208,21 +180,21 @@ class RichDisplay:
 
     def begin(self, stage: str) -> None:
         self._stage = stage
-        self._task = self._progress.add_task("starting", total=None, stage=stage)
+        self._task = self.progress.add_task("starting", total=None, stage=stage)
 
     def update(self, message: str, done: float | None = None) -> None:
         from rich.markup import escape
 
         if self._task is not None:
             total, completed = (None, 0.0) if done is None else (1.0, done)
-            self._progress.update(self._task, description=escape(message), total=total, completed=completed)
+            self.progress.update(self._task, description=escape(message), total=total, completed=completed)
 
     def note(self, message: str) -> None:
         self._print(f"{self._stage:<10} {message}", style="yellow")
 
     def _clear(self) -> None:
         if self._task is not None:
-            self._progress.remove_task(self._task)
+            self.progress.remove_task(self._task)
             self._task = None
 
     def end(self, stage: str, line: str, seconds: float, cached: bool) -> None:
@@ -237,8 +209,14 @@ class RichDisplay:
         self._print(message, style="bold")
 
 
-def choose_display(as_json: bool) -> Display:
-    """The display that fits where the output goes."""
+@contextmanager
+def choose_display(as_json: bool) -> Iterator[Display]:
+    """The display that fits where the output goes; a terminal's line is live while the block runs."""
     if as_json:
-        return JsonDisplay()
-    return RichDisplay() if sys.stdout.isatty() else PlainDisplay()
+        yield JsonDisplay()
+    elif sys.stdout.isatty():
+        display = RichDisplay()
+        with display.progress:
+            yield display
+    else:
+        yield PlainDisplay()

@@ -114,7 +114,7 @@ def _files_of(folder: Path) -> Iterator[Path]:
 
 
 def config_for_key(
-    config: BaseModel, index: ContentIndex, replaced: Mapping[str, str], unkeyed: Iterable[str] = ()
+    config: BaseModel, index: ContentIndex, replaced: Mapping[str, str], unkeyed: Iterable[str]
 ) -> dict[str, Any]:
     """The config as JSON values, every path replaced by its content's digest, without the ``unkeyed`` options.
 

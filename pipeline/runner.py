@@ -72,7 +72,7 @@ class Runner:
         """The time that the run may take in all, where there is a limit."""
         return Budget(self.state["budget"]) if self.state.get("budget") else None
 
-    def set_budget(self, total: float | None, before: float = 0.0) -> None:
+    def set_budget(self, total: float | None, before: float) -> None:
         """Make ``total`` seconds the budget of this workspace, None for no limit. The same as before goes on.
 
         ``before``: seconds spent already on what the photos were made in.

@@ -5,7 +5,7 @@ import os
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
 
 MOST_WRONG, MOST_LETTERS = 10, 100  # options in one error, and letters of a name or value in it
-Options = TypeVar("Options", bound=BaseModel)
 
 
 class UsageError(Exception):
@@ -86,25 +85,22 @@ def _wrong_option(name: str, problem: "ErrorDetails") -> str:
     return f"{name} {bounded(str(problem['input']), MOST_LETTERS)} must {must}"
 
 
-def with_effects(settings: Options, choices: Sequence[str]) -> Options:
+def with_effects(settings: Settings, choices: Sequence[str]) -> Settings:
     """The settings of all stages with each ``NAME=on|off|auto`` as the option NAME of stage effects; the last one wins.
 
     Raises UsageError for another name or value, with those that there are.
     """
-    effects = getattr(settings, "effects", None)
-    fields = {} if effects is None else type(effects).model_fields
-    names = [name for name, field in fields.items() if {"on", "off", "auto"} <= set(get_args(field.annotation))]
+    fields = EffectsConfig.model_fields.items()
+    names = [name for name, field in fields if {"on", "off", "auto"} <= set(get_args(field.annotation))]
     chosen = {}
     for choice in choices:
         name, _, value = choice.partition("=")
         if name.replace("-", "_") not in names:
-            raise UsageError(f"--effect {choice}: no effect {name!r}; there are: {', '.join(names) or 'none'}")
+            raise UsageError(f"--effect {choice}: no effect {name!r}; there are: {', '.join(names)}")
         if value not in ("on", "off", "auto"):
             raise UsageError(f"--effect {choice}: {name} can be on, off or auto, as in --effect {name}=on")
         chosen[name.replace("-", "_")] = value
-    if effects is None or not chosen:
-        return settings
-    return settings.model_copy(update={"effects": effects.model_copy(update=chosen)})
+    return settings.model_copy(update={"effects": settings.effects.model_copy(update=chosen)})
 
 
 def with_source(settings: Settings, photos: Path, cameras: Path | None) -> Settings:

@@ -102,6 +102,6 @@ def explain(workspace: Workspace, runner: Runner, stage: str) -> list[str]:
     return lines
 
 
-def all_statuses(workspace: Workspace, runner: Runner, deep: bool = False) -> list[StageStatus]:
+def all_statuses(workspace: Workspace, runner: Runner, deep: bool) -> list[StageStatus]:
     """Every stage of the chain, in order."""
     return [status_of(workspace, runner, stage, deep) for stage in STAGES]

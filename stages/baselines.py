@@ -1,7 +1,6 @@
 """What a field must beat: the mean of the training photos, and the training photo taken from nearest by."""
 
 from collections.abc import Iterable, Sequence
-from itertools import repeat
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
@@ -23,7 +22,7 @@ class MeanPhoto(NamedTuple):
         return self.colour.expand(height, width, 3)
 
 
-def mean_photo(photos: "Iterable[Tensor]", used: "Iterable[Tensor | None] | None" = None) -> MeanPhoto:
+def mean_photo(photos: "Iterable[Tensor]", used: "Iterable[Tensor | None]") -> MeanPhoto:
     """Average (H, W, 3) photos, each of equal weight whatever its size. Raises ValueError for no photos.
 
     ``used`` says of each photo which pixels count, (H, W) bool, None all of them. Where no photo has a pixel that
@@ -33,7 +32,7 @@ def mean_photo(photos: "Iterable[Tensor]", used: "Iterable[Tensor | None] | None
 
     total, weight, colours = torch.zeros(()), torch.zeros(()), torch.zeros(3, dtype=torch.float64)
     sizes, count = set(), 0
-    for photo, mask in zip(photos, repeat(None) if used is None else used, strict=False):
+    for photo, mask in zip(photos, used, strict=True):
         sizes.add(photo.shape)
         exact = photo.double()
         if mask is not None and not mask.any():

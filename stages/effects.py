@@ -123,7 +123,7 @@ class _Study:
 
     def decide(self) -> tuple[Decisions, dict[str, Verdict]]:
         """What to model, and the reasons by effect."""
-        decisions = Decisions(view_dependence=True, unbounded=False, pose_refinement=False, exposure=None)
+        decisions = Decisions()
         verdicts: dict[str, Verdict] = {}
         # Poses before view dependence: there are two pilots, and wrong poses cost more.
         settings: dict[str, tuple[str, Any, Any]] = {  # of Decisions: its name, off, on

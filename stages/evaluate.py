@@ -16,6 +16,7 @@ from stages.contract import Inputs, Progress, StageConfig, StageResult
 from stages.files import read_json, read_scene, write_json, write_png
 from stages.image_metrics import ERROR_SCALE, FEWEST_FOR_INTERVAL, bootstrap_interval, error_map, ssim
 from stages.spread import spread
+from stages.training_setup import BLACK, WHITE
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -32,7 +33,7 @@ RESUMES = False
 LINKS = ("metrics.json", "renders", "errors")
 UNKEYED = ("seconds",)  # it decides how many photos, and that enters the key
 
-BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
+BACKGROUNDS = {"white": WHITE, "black": BLACK}
 FIGURES = ("psnr", "ssim", "psnr_mean_image", "psnr_nearest_view", "psnr_right", "psnr_fitted_right")
 TRUSTED_WIDTH = 0.5  # of the photos: below, a picture can be sharp and the field know nothing of fine detail
 WORTH_SAYING = 0.5  # dB between the two scores of right halves
@@ -126,7 +127,8 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     examiner = _examiner(config, scene, inputs, folder)
     test = scene.of_split("test")
     chosen = spread(len(test), min(config.photos or 0, len(test)))
-    notes = [_how_many(len(chosen), len(test))] if len(chosen) < len(test) else []
+    few = f"{len(chosen)} of {len(test)} test photos are scored, evenly spread"
+    notes = [few] if len(chosen) < len(test) else []
     views = [test[i] for i in chosen]
     scored = [view for view in views if (used := examiner.used(view)) is None or used.any()]
     if len(scored) < len(views):
@@ -180,8 +182,10 @@ class Examiner:
     def _score_one(self, view: "View", mean: "MeanPhoto", on_chunk: Callable[[float], None]) -> dict[str, Any]:
         from stages.baselines import nearest_view, resized
         from stages.right_halves import right_half_psnr
+        from stages.training_data import view_rays
 
-        truth, used, rendering = self._photo(view), self.used(view), self._render(view, on_chunk)
+        truth, used = self._photo(view), self.used(view)
+        rendering = self._painter(view).draw(view_rays(self.scene, view, self.downscale), on_chunk)
         image = rendering.colour.clamp(0, 1)
         right, fitted = right_half_psnr(rendering, self.painter.background.cpu(), truth, used)
         if self.fits_poses and right is not None:
@@ -230,9 +234,6 @@ class Examiner:
         from stages.training_data import view_mask
 
         return view_mask(self.ingest, self.scene, view, self.downscale)
-
-    def _render(self, view: "View", on_chunk: Callable[[float], None]) -> "Rendering":
-        from stages.training_data import view_rays
 
         return self._painter(view).draw(view_rays(self.scene, view, self.downscale), on_chunk)
 
@@ -336,10 +337,6 @@ def _line(metrics: dict[str, Any]) -> str:
     count = _photos(scored) if scored == test else f"{scored} of {test} photos"
     size = "" if metrics["width_share"] == 1 else f" at {metrics['width_share']:.0%} width"
     return f"{metrics['psnr']:.1f}{deviation} dB{similarity} · {trivial} · {count}{size}"
-
-
-def _how_many(scored: int, test: int) -> str:
-    return f"{scored} of {test} test photos are scored, evenly spread"
 
 
 def _photos(count: int) -> str:

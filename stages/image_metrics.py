@@ -12,6 +12,7 @@ ERROR_SCALE = 0.3
 """The error that error maps show brightest. Fixed, so that maps of different runs can be compared."""
 
 FEWEST_FOR_INTERVAL = 3
+RESAMPLES = 2000
 
 
 def ssim(image: "Tensor", truth: "Tensor", used: "Tensor | None" = None) -> float | None:
@@ -52,7 +53,7 @@ def error_map(image: "Tensor", truth: "Tensor", used: "Tensor | None" = None) ->
     return colormaps["magma"](error.clamp(0, 1).numpy(), bytes=True)[..., :3]
 
 
-def bootstrap_interval(values: Sequence[float], seed: int, resamples: int = 2000) -> tuple[float, float] | None:
+def bootstrap_interval(values: Sequence[float], seed: int) -> tuple[float, float] | None:
     """A 95 % interval of the mean of ``values`` by the percentile bootstrap (Efron 1979); None for fewer than three.
 
     It says how the mean would vary with other test photos of the same scene, not with another training run.
@@ -62,6 +63,6 @@ def bootstrap_interval(values: Sequence[float], seed: int, resamples: int = 2000
     if len(values) < FEWEST_FOR_INTERVAL:
         return None
     samples = np.asarray(values, dtype=np.float64)
-    chosen = np.random.default_rng(seed).integers(len(samples), size=(resamples, len(samples)))
+    chosen = np.random.default_rng(seed).integers(len(samples), size=(RESAMPLES, len(samples)))
     low, high = np.percentile(samples[chosen].mean(axis=1), [2.5, 97.5])
     return float(low), float(high)

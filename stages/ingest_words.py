@@ -121,7 +121,7 @@ def facts(source: Source, photos: Sequence[Photo], refused: Sequence[Refusal]) -
         "source": source.kind,
         "photos": len(photos),
         "refused": [{"name": refusal.name, "reason": refusal.reason} for refusal in refused],
-        "sizes": sorted([photo.width, photo.height] for photo in {(p.width, p.height): p for p in photos}.values()),
+        "sizes": sorted([width, height] for width, height in {(photo.width, photo.height) for photo in photos}),
         "cameras": len({photo.camera_group for photo in photos}),
         "focal_known": sum(photo.focal_px is not None for photo in photos),
     }

@@ -209,13 +209,14 @@ def _from_colmap(folder: Path, photos: Sequence[Photo]) -> KnownCameras:
     kept = sorted(photo_of, key=lambda i: photo_of[i].image_name)
     if not kept:
         raise _nothing_matches(folder.name)
-    cameras_of = [_checked(given, i, photo_of[i]) for i in kept]
+    own = {i: given.cameras[given.images[i].camera] for i in kept}
+    cameras_of = [_at_size_of(photo_of[i], own[i], given.images[i].file) for i in kept]
     cameras = list(dict.fromkeys(cameras_of))
     images = [
         SparseImage(photo_of[i].image_name, cameras.index(camera), given.images[i].sfm_from_camera)
         for i, camera in zip(kept, cameras_of, strict=True)
     ]
-    scales = [_scale(given.cameras[given.images[i].camera], photo_of[i]) for i in kept]
+    scales = [_scale(own[i], photo_of[i]) for i in kept]
     posed = {photo.image_name for photo in photo_of.values()}
     model, behind = given.restricted(kept, scales, cameras, images).without_points_behind()
     notes = _notes(
@@ -243,12 +244,6 @@ def _by_name(names: Sequence[str], photos: Sequence[Photo]) -> dict[int, Photo]:
             raise StageError(f"two cameras for the photo {photo.name}", f"one is that of {name!r}", TRANSFORMS_HINT)
         found[index] = photo
     return found
-
-
-def _checked(given: SparseModel, index: int, photo: Photo) -> Camera:
-    image = given.images[index]
-    camera = given.cameras[image.camera]
-    return _at_size_of(photo, camera, image.file)
 
 
 # --- both

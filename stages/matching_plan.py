@@ -100,7 +100,7 @@ def chosen(
     images: Path,
     neighbours: int,
     progress: Progress,
-    seconds_given: float | None = None,
+    seconds_given: float | None,
 ) -> Chosen:
     """What is left open, chosen by what the photos take on this machine; said where anything was measured for it.
 

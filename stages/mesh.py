@@ -75,14 +75,16 @@ class Reconstruction(NamedTuple):
 
 def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
     """Choose the resolution: from how much was trained, or by the time there is and what things take here."""
-    if config.resolution is None and config.seconds is not None:
+    if config.resolution is not None:
+        return config
+    if config.seconds is not None:
         progress.update("trying how fast the field tells its density")
         began = time.perf_counter()
         speeds = seconds_per_density(inputs["train"], HALF_BOX, CHUNK), yardstick()
         resolution = resolution_in(config.seconds - (time.perf_counter() - began), *speeds)
         return config.model_copy(update={"resolution": resolution})
     rays = read_json(inputs["train"] / "field.json")["rays"]
-    return config.model_copy(update={"resolution": config.resolution or affordable_resolution(rays)})
+    return config.model_copy(update={"resolution": affordable_resolution(rays)})
 
 
 def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> StageResult:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from stages.contract import Inputs, Progress
 from stages.effect_decisions import Decisions, photo_parts
+from stages.training_setup import BLACK
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -83,7 +84,7 @@ def pilot_scene(inputs: Inputs, scene: "Scene", progress: Progress) -> PilotScen
     photos = [
         _Photo(
             view_rays(split, view, downscale),
-            view_pixels(inputs["ingest"], split, view, downscale, (0.0, 0.0, 0.0)),
+            view_pixels(inputs["ingest"], split, view, downscale, BLACK),
             view_mask(inputs["ingest"], split, view, downscale),
         )
         for view in split.of_split("validation")
@@ -97,7 +98,7 @@ def expected_seconds(scene: "Scene", steps: int) -> float:
     from stages.device import compute_device
     from stages.training_size import seconds_per_step
 
-    arm = Decisions(view_dependence=True, unbounded=not scene.has_alpha, pose_refinement=False, exposure=None)
+    arm = Decisions(unbounded=not scene.has_alpha)
     per_step = seconds_per_step(_config(arm, steps, compute_device()), scene, arm)
     return (1 + BESIDE_TRAINING) * 2 * SEEDS * steps * per_step
 

@@ -47,16 +47,16 @@ class _Places(NamedTuple):
 
 
 def look_at_photos(
-    ingest: Path, scene: "Scene", points: "Mapping[str, np.ndarray]", progress: Progress, most: int = MOST
+    ingest: Path, scene: "Scene", points: "Mapping[str, np.ndarray]", progress: Progress
 ) -> PhotoEvidence:
     """All that is read off the pixels of the training photos, each decoded once; test photos are not looked at.
 
-    Tracks are at most ``most`` observations, whole tracks evenly drawn; ``points`` is points.safetensors of normalise.
+    Tracks are at most MOST observations, whole tracks evenly drawn; ``points`` is points.safetensors of normalise.
     Windows that a mask, transparency or the photo's edge cuts are left out."""
     import numpy as np
 
     views = scene.of_split("train")
-    tracks, xy = training_tracks(scene, points, most)
+    tracks, xy = training_tracks(scene, points, MOST)
     expected, expected_xy = _expected(scene, points, tracks)
     both, at = _joined(tracks, expected), np.concatenate([xy, expected_xy])
     window = _windows(scene, both)
@@ -80,9 +80,7 @@ def look_at_photos(
     return PhotoEvidence(both.only(there & observed), both.only(there & ~observed), gradients)
 
 
-def training_tracks(
-    scene: "Scene", points: "Mapping[str, np.ndarray]", most: int = MOST
-) -> "tuple[TrackColours, np.ndarray]":
+def training_tracks(scene: "Scene", points: "Mapping[str, np.ndarray]", most: int) -> "tuple[TrackColours, np.ndarray]":
     """The geometry of the observations of training photos, their colours still black, and their pixels (k, 2); of
     points that two of them see at least. Whole points are left out, evenly, until ``most`` observations are left."""
     import numpy as np

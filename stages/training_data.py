@@ -139,9 +139,7 @@ def view_rays(scene: "Scene", view: "View", downscale: float) -> "Rays":
     return rays_of_view(camera_directions(scene.cameras[view.camera], downscale), pose, view.near, view.far)
 
 
-def view_pixels(
-    ingest: Path, scene: "Scene", view: "View", downscale: float, background: Sequence[float] = (1.0, 1.0, 1.0)
-) -> "Tensor":
+def view_pixels(ingest: Path, scene: "Scene", view: "View", downscale: float, background: Sequence[float]) -> "Tensor":
     """The photo of a view as (H, W, 3) float32 in [0, 1], over ``background`` where it has alpha."""
     import torch
 

@@ -44,7 +44,7 @@ def observed(
     return result
 
 
-def rates_for(model: "RadianceModel", device: "torch.device", seconds: float = RATES_SECONDS) -> "Rates":
+def rates_for(model: "RadianceModel", device: "torch.device") -> "Rates":
     """This machine's rates at the sizes of a field. A field without a table reads nothing at random."""
     from nerf.grid_field import GridField
     from nerf.grid_mlp import HIDDEN
@@ -53,7 +53,7 @@ def rates_for(model: "RadianceModel", device: "torch.device", seconds: float = R
 
     rows = model.layout.rows if isinstance(model, GridField) else 1
     width = model.settings.width if isinstance(model, PaperNerf) else HIDDEN
-    return measure_rates(device, width, rows, seconds)
+    return measure_rates(device, width, rows, RATES_SECONDS)
 
 
 def parts_table(timings: dict[str, Any], rates: "Rates") -> dict[str, Any]:

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from nerf.training import FieldTrainer, TrainerSettings
     from stages.train import Config
     from stages.training_loop import TrainingRun
+    from stages.training_state import Budget
 
 FINAL_RATE = 0.1  # of the paper field's learning rate at the start
 # Weight of the distortion loss (Barron et al. 2022, who take 1e-2) in folded space, against fog and matter close before
@@ -71,14 +72,15 @@ def prepare(config: "Config", scene: "Scene", inputs: Inputs, folder: Path, prog
         aside = unseen_photos(config, inputs["ingest"], scene, "validation", device, progress)
         assert aside is not None, "stage train sets some aside"
         probes = probes._replace(target=Target(config.target_psnr, aside))
-    _say_sizes(config, bank, progress)
+    budget = budget_of(config, inputs)
+    _say_sizes(config, budget, bank, progress)
     decisions, views = read_decisions(inputs["effects"]), scene.of_split("train")
     return TrainingRun(
         lambda attempt: make_trainer(
             config, scene, bank, config.seed + attempt, photo_parts(decisions, views, bank.device)
         ),
         probes,
-        budget_of(config, inputs),
+        budget,
         folder,
         config.checkpoint_seconds,
         TrainingLog(folder, config.tensorboard),
@@ -89,12 +91,9 @@ def prepare(config: "Config", scene: "Scene", inputs: Inputs, folder: Path, prog
 def field_bytes(config: "Config", workers: int) -> float:
     """Memory on the CPU that training a field takes beside the photos, so many chunks of work at a time."""
     if config.field == "grid":
-        from nerf.kernels import grid_layout
-
         settings = grid_settings(config, sky=False)  # which is small beside the rest
-        sizes = settings.levels, settings.coarsest, settings.finest, settings.log2_rows, settings.features
         assert config.batch_samples
-        return TABLE_COPIES * 4 * settings.features * grid_layout(*sizes).rows + SAMPLE_BYTES * config.batch_samples
+        return TABLE_COPIES * 4 * settings.features * settings.layout.rows + SAMPLE_BYTES * config.batch_samples
     from nerf.training import CHUNK_RAYS
 
     sizes = paper_settings(config)
@@ -148,16 +147,14 @@ def make_trainer(
     return PaperTrainer(published, bank, paper_trainer_settings(config, scene, seed), *photo_parts)
 
 
-def _say_sizes(config: "Config", bank: "RayBank", progress: Progress) -> None:
-    steps, seconds = (
-        (config.steps, config.seconds) if config.after is None else (config.more_steps, config.more_seconds)
-    )
-    budget = ("" if config.after is None else "another ") + (f"{seconds:g} s" if steps is None else f"{steps:,} steps")
+def _say_sizes(config: "Config", budget: "Budget", bank: "RayBank", progress: Progress) -> None:
+    much = f"{budget.seconds:g} s" if budget.steps is None else f"{budget.steps:,} steps"
+    another = "" if budget.after is None else "another "
     photos = f"{len(bank.near)} photos at 1/{config.downscale:g} of their size"
     sizes = (
         f"{config.levels} grids to {config.finest}³" if config.field == "grid" else f"{config.depth} × {config.width}"
     )
-    progress.note(f"{config.field} field ({sizes}), {budget} · {photos}, {short_count(len(bank.pixels))} pixels")
+    progress.note(f"{config.field} field ({sizes}), {another}{much} · {photos}, {short_count(len(bank.pixels))} pixels")
 
 
 def has_sky(config: "Config", scene: "Scene") -> bool:

@@ -39,7 +39,7 @@ def try_run(folder: Path) -> None:
     from pipeline.cli import _reader
 
     with contextlib.chdir(folder):  # where relative paths in it lead
-        status.all_statuses(*_reader(folder))
+        status.all_statuses(*_reader(folder), deep=False)
 
 
 @cache

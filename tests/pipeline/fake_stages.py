@@ -2,7 +2,7 @@
 
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, Literal
+from typing import Any
 
 from pydantic import BaseModel
 
@@ -74,24 +74,6 @@ STAGES = {
     "sfm": _module(("ingest",), SfmConfig, _run_sfm, plan=_plan_sfm, LINKS=("deep", "log.txt")),
     "train": _module(("sfm",), TrainConfig, _run_train, RESUMES=True, LINKS=("result.json",)),
 }
-
-
-Switch = Literal["on", "off", "auto"]
-
-
-class EffectsConfig(StageConfig):
-    """Of a stage with two effects to switch and an option that is none."""
-
-    exposure: Switch = "auto"
-    view_dependence: Switch = "auto"
-    pilots: int = 2
-
-
-class SettingsWithEffects(BaseModel):
-    """Settings of a chain with that stage."""
-
-    ingest: IngestConfig = IngestConfig()
-    effects: EffectsConfig = EffectsConfig()
 
 
 class FakeSettings(BaseModel):

@@ -235,7 +235,7 @@ def go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Go:
         with Workspace(tmp_path / "w.nerf") as workspace:
             runner = Runner(workspace, settings, SilentDisplay())  # type: ignore[arg-type]
             if not resume:
-                runner.set_budget(total)
+                runner.set_budget(total, 0.0)
             began = machine.now
             ran = runner.run(stages, times=EXPECTED, replan=replan)
         return Outcome(runner.budget, ran, machine.now - began)

@@ -66,11 +66,11 @@ def test_paths_enter_by_content(tmp_path: Path):
     (tmp_path / "a.json").write_text("{}")
     (tmp_path / "b.json").write_text("{}")
     index = ContentIndex(tmp_path / "cache.json")
-    a = config_for_key(Config(cameras=tmp_path / "a.json"), index, {})
-    assert a == config_for_key(Config(cameras=tmp_path / "b.json"), index, {})
+    a = config_for_key(Config(cameras=tmp_path / "a.json"), index, {}, ())
+    assert a == config_for_key(Config(cameras=tmp_path / "b.json"), index, {}, ())
     assert a["cameras"] not in (None, str(tmp_path / "a.json"))
     with pytest.raises(StageError, match="does not exist"):
-        config_for_key(Config(cameras=tmp_path / "c.json"), index, {})
+        config_for_key(Config(cameras=tmp_path / "c.json"), index, {}, ())
 
 
 def test_hidden_files_do_not_enter_a_folders_digest(tmp_path: Path):

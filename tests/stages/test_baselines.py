@@ -22,7 +22,7 @@ def _view(name: str, centre: tuple[float, float, float] = (0, 0, 0), angle: floa
 
 def test_mean_of_photos_of_one_size_is_an_image_that_minimises_the_squared_error():
     photos = torch.rand(5, 6, 8, 3, generator=torch.Generator().manual_seed(0))
-    mean = mean_photo(photos)
+    mean = mean_photo(photos, [None] * 5)
     prediction = mean.shown_at(6, 8)
     assert torch.allclose(prediction, photos.mean(0), atol=1e-6)
     best = (photos - prediction).square().mean()
@@ -31,7 +31,9 @@ def test_mean_of_photos_of_one_size_is_an_image_that_minimises_the_squared_error
 
 
 def test_photos_of_different_sizes_have_a_mean_colour_each_photo_counting_once():
-    mean = mean_photo([torch.full((2, 2, 3), 0.2), torch.full((40, 30, 3), 0.8), torch.full((2, 2, 3), 0.2)])
+    mean = mean_photo(
+        [torch.full((2, 2, 3), 0.2), torch.full((40, 30, 3), 0.8), torch.full((2, 2, 3), 0.2)], [None] * 3
+    )
     assert mean.image is None
     assert torch.allclose(mean.shown_at(5, 7), torch.full((5, 7, 3), 0.4))
 
@@ -44,7 +46,6 @@ def test_a_mean_of_masked_photos_is_of_what_they_are_used_for():
     assert torch.allclose(mean.colour, torch.full((3,), 0.5))
     hidden = mean_photo(photos[:2], used[:2])
     assert torch.allclose(hidden.shown_at(1, 3)[0, 2], hidden.colour)
-    assert torch.equal(mean_photo(photos, [None] * 3).shown_at(1, 3), mean_photo(photos).shown_at(1, 3))
 
 
 def test_a_photo_that_is_masked_away_does_not_count():
@@ -55,7 +56,7 @@ def test_a_photo_that_is_masked_away_does_not_count():
 
 
 def test_a_test_photo_of_another_size_gets_the_mean_colour():
-    mean = mean_photo([torch.linspace(0, 1, 12).reshape(2, 2, 3)])
+    mean = mean_photo([torch.linspace(0, 1, 12).reshape(2, 2, 3)], [None])
     assert mean.shown_at(2, 2).std() > 0.1
     assert mean.shown_at(3, 2).shape == (3, 2, 3)
     assert torch.allclose(mean.shown_at(3, 2)[0, 0], mean.colour)
@@ -63,7 +64,7 @@ def test_a_test_photo_of_another_size_gets_the_mean_colour():
 
 def test_the_mean_of_nothing_is_refused():
     with pytest.raises(ValueError, match="the mean of no photos"):
-        mean_photo([])
+        mean_photo([], [])
 
 
 def test_nearest_view_weighs_position_and_direction():

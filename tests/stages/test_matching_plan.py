@@ -70,7 +70,7 @@ def test_the_choice_of_pairs_follows_the_measurement_and_is_said(
     seconds: float, matcher: str, notes: list[str], progress, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     costing(monkeypatch, (0.05, seconds))
-    assert chosen(FULL, photos(400), Path(), 30, progress) == Chosen(1600, 4096, matcher)  # type: ignore[arg-type]
+    assert chosen(FULL, photos(400), Path(), 30, progress, None) == Chosen(1600, 4096, matcher)  # type: ignore[arg-type]
     assert progress.notes == notes
 
 
@@ -84,7 +84,7 @@ def test_the_choice_of_pairs_follows_the_measurement_and_is_said(
 def test_other_choices_have_other_words(places: Places, words: str, progress, monkeypatch: pytest.MonkeyPatch) -> None:
     costing(monkeypatch, (0.05, 0.034))
     monkeypatch.setattr(pairing, "places_of", lambda _: places)
-    chosen(FULL, photos(400), Path(), 30, progress)
+    chosen(FULL, photos(400), Path(), 30, progress, None)
     assert progress.notes[0] == f"400 photos have 79,800 pairs, about 45 min: {words}"
 
 
@@ -135,7 +135,7 @@ def test_large_sets_are_searched_as_far_as_is_bearable(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     asked = costing(monkeypatch, *costs)
-    assert chosen(ALL_OPEN, photos(count), Path(), 30, progress) == Chosen(*tier, "retrieval")
+    assert chosen(ALL_OPEN, photos(count), Path(), 30, progress, None) == Chosen(*tier, "retrieval")
     assert progress.notes[1:] == [note]
     assert asked == list(TIERS[: len(costs)])
 
@@ -144,7 +144,7 @@ def test_what_is_given_stays_in_every_tier(progress, monkeypatch: pytest.MonkeyP
     assert tiers_of(Open(None, 8192, None)) == [Tier(1600, 8192), Tier(1131, 8192)]
     assert tiers_of(Open(2400, None, None)) == [Tier(2400, 4096), Tier(2400, 2048), Tier(2400, 1024)]
     asked = costing(monkeypatch, (0.36, 0.034), (0.18, 0.009))
-    every_pair = chosen(Open(None, None, "exhaustive"), photos(200), Path(), 30, progress)
+    every_pair = chosen(Open(None, None, "exhaustive"), photos(200), Path(), 30, progress, None)
     assert every_pair == Chosen(1131, 2048, "exhaustive") and len(asked) == 2
     assert len(progress.notes) == 1
 
@@ -152,14 +152,14 @@ def test_what_is_given_stays_in_every_tier(progress, monkeypatch: pytest.MonkeyP
 @pytest.mark.parametrize("count", [3, 91, 100])
 def test_sets_of_ordinary_size_are_searched_in_full(count: int, progress, monkeypatch: pytest.MonkeyPatch) -> None:
     costing(monkeypatch, (100.0, 100.0))
-    assert chosen(ALL_OPEN, photos(count), Path(), 30, progress)[:2] == (1600, 4096)
+    assert chosen(ALL_OPEN, photos(count), Path(), 30, progress, None)[:2] == (1600, 4096)
 
 
 def test_nothing_is_measured_where_it_could_change_nothing(progress, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(matching_plan, "CHILD", ["-c", "raise SystemExit('measured')"])
-    assert chosen(ALL_OPEN, photos(60), Path(), 30, progress) == Chosen(1600, 4096, "exhaustive")
+    assert chosen(ALL_OPEN, photos(60), Path(), 30, progress, None) == Chosen(1600, 4096, "exhaustive")
     with pytest.raises(StageError) as caught:
-        chosen(ALL_OPEN, photos(400), Path(), 30, progress)
+        chosen(ALL_OPEN, photos(400), Path(), 30, progress, None)
     assert (caught.value.what, caught.value.why) == ("could not measure what features and matches take", "measured")
     assert caught.value.hint == (
         "Say how, and nothing is measured: --sfm.matcher exhaustive --sfm.max-image-size 1600 --sfm.max-features 4096."

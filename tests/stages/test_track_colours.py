@@ -19,6 +19,7 @@ from stages.track_colours import (
     BRIGHTEST,
     CLIPPED_SHARE,
     DARKEST,
+    MOST,
     _expected,
     _window_means,
     look_at_photos,
@@ -102,7 +103,7 @@ def test_colours_are_those_of_the_photos(tmp_path: Path, progress: SilentProgres
 
 def test_geometry_is_that_of_the_cameras(tmp_path: Path, progress: SilentProgress) -> None:
     scene, points = photographed_points(tmp_path)
-    tracks, xy = training_tracks(scene, points)
+    tracks, xy = training_tracks(scene, points, MOST)
     view = scene.of_split("train")[tracks.view[7]]
     offset = view.scene_from_camera[:, 3] - points["xyz"][tracks.point[7]]
     np.testing.assert_allclose(tracks.distance[7], np.linalg.norm(offset))
@@ -172,7 +173,7 @@ def test_windows_are_summed_as_if_each_were_looked_at() -> None:
 
 def test_fewer_observations_are_whole_tracks(tmp_path: Path, progress: SilentProgress) -> None:
     scene, points = photographed_points(tmp_path)
-    all_of_them, some = training_tracks(scene, points)[0], training_tracks(scene, points, 60)[0]
+    all_of_them, some = training_tracks(scene, points, MOST)[0], training_tracks(scene, points, 60)[0]
     assert 30 < len(some) < 75 < len(all_of_them)
     lengths = np.bincount(all_of_them.point, minlength=POINTS)
     kept = np.bincount(some.point, minlength=POINTS)
@@ -183,7 +184,7 @@ def test_near_photos_have_larger_windows(tmp_path: Path, progress: SilentProgres
     from stages.track_colours import _windows
 
     scene, points = photographed_points(tmp_path)
-    tracks = training_tracks(scene, points)[0]
+    tracks = training_tracks(scene, points, MOST)[0]
     near = replace(tracks, footprint=np.where(tracks.view == 0, 0.5, 1.0) * 0.03)
     window = _windows(scene, near)
     paired = np.isin(near.point, near.point[near.view > 0])
@@ -215,7 +216,7 @@ def test_only_photos_nearby_are_asked_what_should_be_seen(monkeypatch: pytest.Mo
         "point": np.repeat(np.arange(each), 5),
         "xy": np.zeros((5 * each, 2)),
     }
-    tracks = training_tracks(scene, points)[0]
+    tracks = training_tracks(scene, points, MOST)[0]
     tracks = replace(tracks, point=2 * tracks.point)  # as where every second point was drawn
     points["xyz"] = points["xyz"].repeat(2, axis=0)
 

@@ -22,6 +22,7 @@ from stages.training_data import (
     view_pixels,
     view_rays,
 )
+from stages.training_setup import WHITE
 from tests.conftest import SilentProgress
 from tests.stages.photo_scene import CAMERA, FOCAL, HEIGHT, RADIUS, WIDTH, ball_photo, photographed, seen_points
 
@@ -62,7 +63,7 @@ def test_the_bank_and_the_views_are_the_same_pixels_and_rays(
     rays, colours, alpha, _ = bank.lookup(torch.arange(len(bank.pixels)))
     views = scene.of_split("train")
     assert alpha is None and len(bank.near) == len(views) == 6
-    pixels = [view_pixels(inputs["ingest"], scene, view, downscale).flatten(0, 1) for view in views]
+    pixels = [view_pixels(inputs["ingest"], scene, view, downscale, WHITE).flatten(0, 1) for view in views]
     assert torch.equal(colours, torch.cat(pixels))
     directions = [view_rays(scene, view, downscale).directions.flatten(0, 1) for view in views]
     torch.testing.assert_close(rays.directions, torch.cat(directions))
@@ -70,7 +71,7 @@ def test_the_bank_and_the_views_are_the_same_pixels_and_rays(
 
 def test_transparent_pixels_are_shown_over_the_background(tmp_path: Path, progress: SilentProgress) -> None:
     inputs, scene = photographed(tmp_path, channels=4)
-    over_white = view_pixels(inputs["ingest"], scene, scene.views[0], 1.0)
+    over_white = view_pixels(inputs["ingest"], scene, scene.views[0], 1.0, WHITE)
     torch.testing.assert_close(over_white, torch.from_numpy(ball_photo()).float() / 255)
     over_green = view_pixels(inputs["ingest"], scene, scene.views[0], 1.0, (0.0, 1.0, 0.0))
     assert over_green[0, 0].tolist() == [0, 1, 0]
@@ -108,12 +109,12 @@ def test_evaluation_reads_the_pixels_that_training_stored(
 ) -> None:
     inputs, scene = photographed(tmp_path)
     ingest, trained, unseen = inputs["ingest"], scene.of_split("train")[2], scene.of_split("test")[1]
-    decoded = [view_pixels(ingest, scene, view, 2.0) for view in (trained, unseen)]
+    decoded = [view_pixels(ingest, scene, view, 2.0, WHITE) for view in (trained, unseen)]
     for split in ("train", "test"):
         training_bank(ingest, scene, split, 2.0, progress)
     monkeypatch.setattr("stages.photos.load_pixels", None)
     for view, pixels in zip((trained, unseen), decoded, strict=True):
-        assert torch.equal(view_pixels(ingest, scene, view, 2.0), pixels)
+        assert torch.equal(view_pixels(ingest, scene, view, 2.0, WHITE), pixels)
 
 
 LENSES = {
