@@ -203,7 +203,7 @@ class GridField(nn.Module):
         From front to back in waves of a few samples per ray, so that little is computed behind what stops a ray's
         light: colour = sum over waves of T c, where T is the light that the waves before have let through.
         """
-        rays = Rays(*(part.contiguous() for part in rays))
+        rays = rays.each(Tensor.contiguous)
         seen, light = rays.far.new_zeros(len(rays.far), 4), torch.ones_like(rays.far)
         of_rays = grid_mlp.ray_hidden(self.weights, self.of_directions(rays.directions))
         for wave in self._waves(rays, torch.full_like(rays.near, 0.5)):
@@ -222,7 +222,7 @@ class GridField(nn.Module):
 
     def forward(self, rays: Rays, jitter: Float[Tensor, "rays"], background: Float[Tensor, "rays 3"]) -> GridPass:
         """Density of all samples in occupied cells; colour of those that can be seen."""
-        backend, rays = self.backend, Rays(*(part.contiguous() for part in rays))
+        backend, rays = self.backend, rays.each(Tensor.contiguous)
         background = self._behind(rays, background)
         waves = list(self._waves(rays, jitter))
         with part("march"):

@@ -202,7 +202,7 @@ class PaperNerf(nn.Module):
         """In float64, as are the points and sums on the rays: 2⁹π, the highest frequency, takes the rounding of a
         float32 point to 1e-4. The networks compute in the type of their weights."""
         with part("sampling"):
-            exact = Rays(*(each.double() for each in rays))
+            exact = rays.each(Tensor.double)
             return exact if self.settings.contracted else clip_to_box(exact, BOX)
 
     def _cut(self, points: Float[Tensor, "*points 3"], sigma: Float[Tensor, "*points"]) -> Float[Tensor, "*points"]:

@@ -102,6 +102,6 @@ def _residual(
     model: RadianceModel, probe: Probe, photo_colours: PhotoColours, photo_rays: PhotoRays
 ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"]]:
     """By how much the photos would show more than they do, and the opacity of the field."""
-    one_row = Rays(*(part[None] for part in photo_rays.forward(probe.rays, probe.view)))
+    one_row = photo_rays.forward(probe.rays, probe.view).each(lambda part: part[None])
     seen = Rendering(*(part[0] for part in render_image(model, one_row, probe.background)))
     return photo_colours.residual(Seen(seen, probe.background, probe.view), probe.colours), seen.opacity

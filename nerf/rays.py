@@ -1,5 +1,6 @@
 """Rays in the scene frame: origin, unit direction, near, far."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -14,6 +15,10 @@ class Rays(NamedTuple):
     directions: Float[Tensor, "*rays 3"]
     near: Float[Tensor, "*rays"]
     far: Float[Tensor, "*rays"]
+
+    def each(self, change: Callable[[Tensor], Tensor]) -> "Rays":
+        """Each of the four changed alike: cut, moved, reshaped."""
+        return Rays(*map(change, self))
 
 
 def rays_of_view(

@@ -32,11 +32,11 @@ def render_image(
     if chunk is None and rays.near.device.type == "cpu":
         chunk = min(model.chunk_rays, max(LEAST_CHUNK, math.ceil(height * width / CHUNKS)))
     chunk = chunk or GPU_CHUNKS * model.chunk_rays
-    flat = Rays(*(part.reshape(height * width, *part.shape[2:]) for part in rays))
+    flat = rays.each(lambda part: part.reshape(height * width, *part.shape[2:]))
 
     def render(start: int) -> Rendering:
         with torch.inference_mode():  # a property of the thread
-            return model.render(Rays(*(part[start : start + chunk] for part in flat)), background)
+            return model.render(flat.each(lambda part: part[start : start + chunk]), background)
 
     chunks = []
     for rendering in in_order(render, range(0, height * width, chunk), rays.near.device):

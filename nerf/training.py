@@ -111,7 +111,7 @@ class Batch(NamedTuple):
 
     def part(self, rows: slice) -> "Batch":
         """Some of the rays."""
-        return Batch(Rays(*(part[rows] for part in self.rays)), self.target[rows], self.view[rows], self.background)
+        return Batch(self.rays.each(lambda part: part[rows]), self.target[rows], self.view[rows], self.background)
 
 
 def over(

@@ -40,11 +40,10 @@ class Painter:
     def draw(self, rays: "Rays", on_chunk: Callable[[float], None] | None = None) -> "Rendering":
         """The picture (height, width) that ``rays`` see, on the CPU. ``on_chunk`` is told the finished share."""
         from nerf.model import Rendering
-        from nerf.rays import Rays
         from nerf.rendering import render_image
 
         device = self.background.device
-        on_device = Rays(*(part.to(device) for part in rays))
+        on_device = rays.each(lambda part: part.to(device))
         image = render_image(self.model, on_device, self.background, on_chunk=on_chunk)
         return Rendering(*(part.cpu() for part in image))
 

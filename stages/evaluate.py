@@ -116,7 +116,7 @@ def _tried_rays(scene: "Scene", side: int) -> "Rays":
     few = [test[i] for i in spread(len(test), min(TRIED_PHOTOS, len(test)))]
     cameras = [scene.cameras[view.camera] for view in few]
     photos = [view_rays(scene, v, max(c.width, c.height) / side) for v, c in zip(few, cameras, strict=True)]
-    flat = [[part.reshape(1, -1, *part.shape[2:]) for part in rays] for rays in photos]
+    flat = [rays.each(lambda part: part.reshape(1, -1, *part.shape[2:])) for rays in photos]
     return Rays(*(torch.cat(parts, dim=1) for parts in zip(*flat, strict=True)))
 
 

@@ -181,7 +181,7 @@ def _level(
         return Level(config.level, "as asked", None, True)
     every = Rays(*(torch.cat(parts) for parts in zip(*(used_rays(one) for one in maps), strict=True)))
     stride = max(1, len(every.near) // LEVEL_RAYS)
-    level = choose_level(lattice, model, Rays(*(part[::stride] for part in every)))
+    level = choose_level(lattice, model, every.each(lambda part: part[::stride]))
     progress.note(f"surface at density {level.level:.3g}: {level.reason}")
     return level
 

@@ -74,7 +74,7 @@ def choose_level(lattice: "Lattice", model: "RadianceModel", rays: "Rays") -> Le
     from stages.mesh_surface import solidity
 
     inside = box_interval(rays, lattice.low, lattice.high)
-    inside = type(rays)(*(part[inside.far > inside.near] for part in inside))
+    inside = inside.each(lambda part: part[inside.far > inside.near])
     t = ray_distances(inside, SAMPLES_PER_EDGE * max(lattice.values.shape))
     stop, peak = _stops(model, inside, t)
     stopped = torch.isfinite(stop)

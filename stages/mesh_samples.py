@@ -14,13 +14,15 @@ def sample_surface(vertices: "np.ndarray", faces: "np.ndarray", count: int, seed
     """
     import numpy as np
 
-    corners = vertices[faces].astype(np.float64)
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    cumulated = np.cumsum(np.linalg.norm(cross, axis=-1))
+    from stages.mesh_surface import face_crosses
+
+    vertices = vertices.astype(np.float64)
+    cumulated = np.cumsum(np.linalg.norm(face_crosses(vertices, faces), axis=-1))
     if len(faces) == 0 or not cumulated[-1] > 0:
         raise ValueError(f"cannot sample a mesh without area ({len(faces)} faces)")
     random = np.random.default_rng(seed).random((3, count))
     along = (np.arange(count) + random[0]) / count * cumulated[-1]
-    a, b, c = corners[np.searchsorted(cumulated, along, side="right").clip(max=len(faces) - 1)].swapaxes(0, 1)
+    drawn = np.searchsorted(cumulated, along, side="right").clip(max=len(faces) - 1)
+    a, b, c = vertices[faces[drawn]].swapaxes(0, 1)
     root, share = np.sqrt(random[1])[:, None], random[2][:, None]
     return (1 - root) * a + root * (1 - share) * b + root * share * c

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from nerf.camera_paths import look_at
+from stages.mesh_surface import face_crosses
 
 SUPERSAMPLING = 2
 FIELD_OF_VIEW = 35.0  # degrees
@@ -133,7 +134,7 @@ def _lit(
     """
     a, b, c = points[faces].swapaxes(0, 1)
     opposite = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1).astype(np.float32)
-    normals = np.cross(b - a, c - a)
+    normals = face_crosses(points, faces)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     normals = np.divide(normals, length, out=normals, where=length > 0).astype(np.float32)[face]
     row, column = np.divmod(pixel, camera.width)

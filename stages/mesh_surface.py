@@ -54,10 +54,15 @@ def extract(lattice: "Lattice", level: float) -> Surface:
     return Surface(vertices, faces.astype(np.int32))
 
 
+def face_crosses(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Of each face, the vector (m, 3) along its outward normal that is as long as twice its area."""
+    a, b, c = vertices[faces].swapaxes(0, 1)
+    return np.cross(b - a, c - a)
+
+
 def vertex_normals(surface: Surface) -> np.ndarray:
     """Unit outward normals (n, 3), averaged over a vertex's faces by area; zero for a vertex without area."""
-    a, b, c = surface.vertices[surface.faces].swapaxes(0, 1)
-    cross = np.repeat(np.cross(b - a, c - a), 3, axis=0)
+    cross = np.repeat(face_crosses(*surface), 3, axis=0)
     corner = surface.faces.reshape(-1)
     count = len(surface.vertices)
     normals = np.stack([np.bincount(corner, cross[:, axis], count) for axis in range(3)], axis=1)
@@ -67,8 +72,7 @@ def vertex_normals(surface: Surface) -> np.ndarray:
 
 def face_areas(surface: Surface) -> np.ndarray:
     """Area of each face."""
-    a, b, c = surface.vertices[surface.faces].swapaxes(0, 1)
-    return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+    return np.linalg.norm(face_crosses(*surface), axis=1) / 2
 
 
 def components(surface: Surface) -> np.ndarray:

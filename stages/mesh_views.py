@@ -64,7 +64,7 @@ def shadow_maps(
         pixels = camera.width * camera.height
         downscale = max((pixels * len(views) / RAYS) ** 0.5, max(camera.width, camera.height) / LONGEST, 1.0)
         rays = view_rays(scene, view, downscale)
-        rays = type(rays)(*(part.to(lattice.low.device) for part in rays))
+        rays = rays.each(lambda part: part.to(lattice.low.device))
         stop = stopping_distance(lattice, rays, max(lattice.values.shape)).cpu().numpy()
         widest = float((rays.directions.cpu().double().numpy() @ view.scene_from_camera[:, 2]).min())
         mask = view_mask(ingest, scene, view, max(1.0, max(camera.width, camera.height) / LONGEST_MASK))

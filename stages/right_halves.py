@@ -58,8 +58,8 @@ def from_fitted_pose(
     left, _ = halves(truth, used)
     _, log_gain = _exposed_as_left(rendering, background, truth, left)
     exposure = Exposures(log_gain[None])
-    pose = fit_pose(field, Rays(*(part[left] for part in rays)), truth[left], background, exposure, seed)
-    flat = Rays(*(part.flatten(0, 1) for part in rays))
+    pose = fit_pose(field, rays.each(lambda part: part[left]), truth[left], background, exposure, seed)
+    flat = rays.each(lambda part: part.flatten(0, 1))
     moved = pose.forward(flat, torch.zeros(len(flat.near), dtype=torch.int64))
     return Rays(*(part.view_as(whole) for part, whole in zip(moved, rays, strict=True)))
 

@@ -241,7 +241,7 @@ def _ablation_picture(
     ablated = next((t.arm for t in trials if t.arm.variant in ABLATIONS and not t.figures["failed"]), None)
     if ablated is None:
         return ()
-    write_strip(folder / "arms" / "photo.png", [window.truth for window in exam.shown])
+    write_strip(folder / "arms" / "photo.png", [exam.windows[index].truth for index in exam.shown])
     rows = [Row("photo", None, folder / "arms" / "photo.png")]
     for trial in trials:
         same = (trial.arm.downscale, trial.arm.steps, trial.arm.seed) == (

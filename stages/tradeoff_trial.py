@@ -48,9 +48,10 @@ class Exam:
     frame: int
 
     @property
-    def shown(self) -> list[Window]:
-        """The windows with the largest differences within them, the largest first."""
-        return sorted(self.windows, key=lambda window: -float(window.truth.std((0, 1)).mean()))[:SHOWN]
+    def shown(self) -> list[int]:
+        """Which windows have the largest differences within them, the largest first."""
+        contrast = [float(window.truth.std((0, 1)).mean()) for window in self.windows]
+        return sorted(range(len(contrast)), key=lambda index: -contrast[index])[:SHOWN]
 
 
 def make_exam(ingest: Path, scene: "Scene", downscale: float, count: int) -> Exam:
@@ -64,7 +65,6 @@ def make_exam(ingest: Path, scene: "Scene", downscale: float, count: int) -> Exa
 
 
 def _window(ingest: Path, scene: "Scene", view: "View", downscale: float, number: int) -> Window:
-    from nerf.rays import Rays
     from stages.training_data import view_mask, view_pixels, view_rays
     from stages.training_setup import BLACK, WHITE
 
@@ -75,7 +75,7 @@ def _window(ingest: Path, scene: "Scene", view: "View", downscale: float, number
     )
     part = (slice(top, top + WINDOW), slice(left, left + WINDOW))
     used = view_mask(ingest, scene, view, downscale)
-    rays = Rays(*(values[part].clone() for values in view_rays(scene, view, downscale)))
+    rays = view_rays(scene, view, downscale).each(lambda values: values[part].clone())
     return Window(view.name, rays, truth[part].clone(), None if used is None else used[part])
 
 
@@ -114,7 +114,7 @@ def _score(arm: Arm, exam: Exam, work: Path, folder: Path, progress: Progress) -
     painter = load_painter(work)
     gains = expected_gains(read_json(work / "field.json"), exam.scene, exam.scene.of_split("test"))
     painter.draw(exam.windows[0].rays)  # the first picture pays for memory and kernels
-    errors, similarities, drawn, seconds = [], [], {}, 0.0
+    errors, similarities, drawn, seconds = [], [], [], 0.0
     for number, window in enumerate(exam.windows):
         progress.update(f"scoring, window {number + 1} of {len(exam.windows)}", number / len(exam.windows))
         shown_as = painter.at_gain(gains[window.photo]) if gains else painter
@@ -124,10 +124,10 @@ def _score(arm: Arm, exam: Exam, work: Path, folder: Path, progress: Progress) -
         error = (image - window.truth).square().mean(-1)
         errors.append(error if window.used is None else error[window.used])
         similarities.append(ssim(image, window.truth, window.used))
-        drawn[id(window)] = image
+        drawn.append(image)
     import torch
 
-    write_strip(folder / f"{arm.name}.png", [drawn[id(window)] for window in exam.shown])
+    write_strip(folder / f"{arm.name}.png", [drawn[index] for index in exam.shown])
     known = [similarity for similarity in similarities if similarity is not None]
     rays = sum(window.rays.near.numel() for window in exam.windows)
     return {

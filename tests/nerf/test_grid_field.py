@@ -40,7 +40,7 @@ def rays(count: int = 6) -> Rays:
 def seen_by_autograd(model: GridField, given: Rays, jitter: Tensor, background: Tensor) -> Tensor:
     """The loss sum(colour * k) + sum(depth) written with plain torch, differentiable in parameters and rays."""
     settings = model.settings
-    samples = reference.march(occupied(model.bits), model.lattice, Rays(*(part.detach() for part in given)), jitter)
+    samples = reference.march(occupied(model.bits), model.lattice, given.each(lambda part: part.detach()), jitter)
     points = reference.sample_points(given, samples, settings.contracted)
     features = encoded_by_autograd(model.layout, model.table, points)
     if settings.sky:
@@ -273,7 +273,7 @@ def test_what_is_empty_follows_from_what_is_occupied() -> None:
 def test_waves_of_compiled_kernels_see_what_a_single_pass_of_them_sees(
     settings: GridSettings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    model, given = GridField(replace(settings, cache_cells=32), 0, warp), Rays(*(part.float() for part in rays(300)))
+    model, given = GridField(replace(settings, cache_cells=32), 0, warp), rays(300).each(lambda part: part.float())
     model.table.mul_(3e4)
     few = torch.randint(len(model.bits), (40,), generator=torch.Generator().manual_seed(5))
     model.occupy(torch.zeros_like(model.bits).index_fill_(0, few, -1))

@@ -124,7 +124,7 @@ def test_float32_agrees_with_the_slow_loop_at_the_published_frequencies(
     with torch.no_grad():
         renderings = model.render_training(rays, BACKGROUND.float(), None)
     assert renderings[1].colour.dtype == torch.float32
-    expected = slow(weights_of(model), settings, Rays(*(part.double() for part in rays)))
+    expected = slow(weights_of(model), settings, rays.each(lambda part: part.double()))
     assert 0 < difference(renderings, expected) < 1e-5
 
 
@@ -164,7 +164,7 @@ def test_gradients_of_every_weight_agree_with_the_slow_loop(variant: str, sizes:
     found = loss_gradients(model, rays)
     assert found.keys() == expected.keys()
     assert max(np.abs(found[name] - expected[name]).max() for name in found) < 1e-9
-    rough = loss_gradients(model.float(), Rays(*(part.float() for part in rays)))
+    rough = loss_gradients(model.float(), rays.each(lambda part: part.float()))
     assert 0 < max(np.abs(rough[name] - expected[name]).max() for name in rough) < 1e-5
 
 
@@ -245,7 +245,7 @@ def test_weights_are_a_function_of_the_seed_alone() -> None:
 
 def test_rays_may_have_any_leading_shape() -> None:
     model, rays = PaperNerf(SMALL, 0), rays_at(0.8, 6, torch.float32)
-    grid = Rays(*(part.reshape(2, 3, *part.shape[1:]) for part in rays))
+    grid = rays.each(lambda part: part.reshape(2, 3, *part.shape[1:]))
     torch.testing.assert_close(
         model.render(grid, torch.ones(3)).colour.reshape(6, 3), model.render(rays, torch.ones(3)).colour
     )

@@ -90,7 +90,7 @@ def test_density_before_near_has_no_say(rays):
     rays = rays._replace(
         near=torch.where(rays.origins[:, 0] > 1, (rays.origins[:, 0] - 0.6) / -rays.directions[:, 0], 0.5)
     )
-    rays = type(rays)(*(part[(rays.near > 0) & (rays.near < 4)] for part in rays))
+    rays = rays.each(lambda part: part[(rays.near > 0) & (rays.near < 4)])
     bare, hung = Solid(ball, 500.0), Solid(curtained, 500.0)
     without, behind = choose_level(lattice_of(bare), bare, rays), choose_level(lattice_of(hung), hung, rays)
     assert 1 / 2.4 < behind.level / without.level < 2.4  # two steps of the search at most

@@ -116,7 +116,7 @@ def test_an_empty_cache_or_no_rays_give_no_samples() -> None:
     rays = random_rays(3)
     nothing = march(occupied(torch.zeros(8, dtype=torch.int64)), BOUNDED, rays, jitter_of(rays))
     assert (nothing.starts.tolist(), len(nothing.t)) == ([0, 0, 0, 0], 0)
-    none = Rays(*(part[:0] for part in rays))
+    none = rays.each(lambda part: part[:0])
     assert march(FULL, FOLDED, none, jitter_of(none)).starts.tolist() == [0]
 
 

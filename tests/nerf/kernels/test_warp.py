@@ -16,7 +16,6 @@ from torch import Tensor
 from nerf.kernels import Backend, grid_layout, reference, warp
 from nerf.kernels.warp import cache
 from nerf.kernels.warp.launch import launch
-from nerf.rays import Rays
 from tests.devices import skip_without
 from tests.nerf.kernels.warp_agreement import (
     BOUNDED,
@@ -246,7 +245,7 @@ def test_no_rays_and_no_samples_are_fine_even_at_first(device: str, rays: int) -
     def everything() -> None:
         samples, empty, none = packed(device, counts), torch.zeros(0, device=device), torch.zeros(0, 3, device=device)
         nowhere, some = occupied_of(device, "empty", 32), random_rays(device, 320)
-        few = Rays(*(part[:rays] for part in some))
+        few = some.each(lambda part: part[:rays])
         for lattice in (BOUNDED, FOLDED):
             marched = warp.march(nowhere, lattice, few, few.near)
             assert marched.starts.tolist() == [0] * (rays + 1) and len(marched.t) == 0
