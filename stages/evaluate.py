@@ -47,17 +47,28 @@ NO_LPIPS = "LPIPS is not computed: no package in use ships its weights and nothi
 class Config(StageConfig):
     """How to compare. None is chosen for you."""
 
-    downscale: float | None = Field(default=None, ge=1)
-    """How many times smaller than the photos to score. None: the size that the field was trained at, or smaller where
-    one photo of that takes too long."""
-    background: Literal["white", "black"] | None = None
-    """What photos with alpha are shown over. None: what the field was trained over, white where that was random."""
-    photos: int | None = Field(default=None, ge=1)
-    """How many test photos to score, evenly spread. None: as many as take no longer than the training."""
-    seconds: float | None = Field(default=None, gt=0)
-    """That the stage may take. None: 30 % of the training's for drawing."""
-    seed: int = 0
-    """Of the interval."""
+    downscale: float | None = Field(
+        default=None,
+        ge=1,
+        description="How many times smaller than the photos to score. None: the size that the field was "
+        "trained at, or smaller where one photo of that takes too long.",
+    )
+    background: Literal["white", "black"] | None = Field(
+        default=None,
+        description="What photos with alpha are shown over. None: what the field was trained over, white "
+        "where that was random.",
+    )
+    photos: int | None = Field(
+        default=None,
+        ge=1,
+        description="How many test photos to score, evenly spread. None: as many as take no longer than the training.",
+    )
+    seconds: float | None = Field(
+        default=None,
+        gt=0,
+        description="Seconds that the stage may take. None: drawing takes 30 % of the training's seconds.",
+    )
+    seed: int = Field(default=0, description="Of the interval.")
 
 
 def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:

@@ -56,12 +56,19 @@ _NO_PLACE = Place()
 class Config(StageConfig):
     """Where the photos are."""
 
-    photos: SourcePath = Path()
-    """A folder of photos, a video, a transforms.json, or a folder with transforms_train.json."""
-    cameras: OptionalSourcePath = None
-    """Known cameras for a folder of photos: a transforms file or a COLMAP model."""
-    frames: int = Field(default=300, ge=FEWEST_FRAMES)
-    """The most frames that are taken from a video; of a long way of the camera they are taken in longer steps."""
+    photos: SourcePath = Field(
+        default=Path(),
+        description="A folder of photos, a video, a transforms.json, or a folder with transforms_train.json.",
+    )
+    cameras: OptionalSourcePath = Field(
+        default=None, description="Known cameras for a folder of photos: a transforms file or a COLMAP model."
+    )
+    frames: int = Field(
+        default=300,
+        ge=FEWEST_FRAMES,
+        description="The most frames that are taken from a video; of a long way of the camera they are taken "
+        "in longer steps.",
+    )
 
 
 @dataclass(frozen=True)

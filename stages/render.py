@@ -49,7 +49,9 @@ class Config(StageConfig):
     width: int | None = Field(default=None, ge=16, le=8192, description="pixels; odd numbers are rounded to even ones")
     fps: int | None = Field(default=None, ge=1, le=120, description="none: 30, fewer for fewer than 120 frames")
     seconds: float | None = Field(
-        default=None, gt=0, description="that the stage may take; none: 30 % of the training's for drawing"
+        default=None,
+        gt=0,
+        description="seconds that the stage may take; none: drawing takes 30 % of the training's seconds",
     )
     depth: bool = Field(default=True, description="write depth.mp4 too")
     like: str | None = Field(

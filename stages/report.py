@@ -18,6 +18,9 @@ from stages.files import read_json, read_scene, read_tensors, write_json
 from stages.training_parts import PARTS_FILE
 
 if TYPE_CHECKING:
+    import numpy as np
+    from PIL import Image
+
     from nerf.scene import Scene
 
 NEEDS = ("ingest", "sfm", "normalise", "effects", "train", "evaluate", "render", "mesh", "tradeoff")
@@ -40,10 +43,12 @@ class Account(StageConfig):
 class Config(StageConfig):
     """Settings of stage report."""
 
-    video_limit_mb: float = Field(default=12, ge=0)
-    """A larger video lies beside the page and not inside it."""
-    budget: Annotated[Account | None, Suppress] = None
-    """What the runner knows of the time given to the run; no flag is offered for it."""
+    video_limit_mb: float = Field(
+        default=12, ge=0, description="A larger video lies beside the page and not inside it."
+    )
+    budget: Annotated[Account | None, Suppress] = Field(
+        default=None, description="What the runner knows of the time given to the run; no flag is offered for it."
+    )
 
 
 @dataclass(frozen=True)
@@ -331,7 +336,7 @@ def _pictures(results: Results, image: dict[str, Any], width: int) -> dict[str, 
     return image | {"aspect": aspect} | {name: _jpeg_uri(picture) for name, picture in pictures.items()}
 
 
-def _opaque(pixels: Any, background: int) -> Any:
+def _opaque(pixels: "np.ndarray", background: int) -> "np.ndarray":
     """(H, W, 3) uint8 from (H, W, 3 or 4): transparent photos over a grey level, as they were scored."""
     import numpy as np
 
@@ -341,7 +346,7 @@ def _opaque(pixels: Any, background: int) -> Any:
     return np.rint(pixels[..., :3] * alpha + background * (1 - alpha)).astype(np.uint8)
 
 
-def _jpeg_uri(picture: Any) -> str:
+def _jpeg_uri(picture: "Image.Image") -> str:
     import io
 
     buffer = io.BytesIO()

@@ -14,6 +14,7 @@ from stages.decoding import (
     DecodeError,
     decode,
 )
+from tests.png_files import png_16_bit_rgb
 from tests.stages.photo_files import HEIGHT, WIDTH, exif_with, saved, smooth
 
 
@@ -53,18 +54,6 @@ def test_grey_of_any_depth_becomes_rgb(tmp_path: Path) -> None:
 def test_float_pixels_outside_their_range_are_refused(tmp_path: Path) -> None:
     path = saved(tmp_path / "hdr.tif", Image.fromarray(np.full((20, 20), 812.0, np.float32)))
     assert reason(path) == "pixel values from 812.0 to 812.0; export it with 8 or 16 bits"
-
-
-def png_16_bit_rgb(pixels: np.ndarray) -> bytes:
-    """Written by hand: Pillow cannot write it."""
-
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
-    height, width = pixels.shape[:2]
-    rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in pixels)
-    header = struct.pack(">IIBBBBB", width, height, 16, 2, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
 
 
 def test_sixteen_bit_colour_becomes_eight_and_is_not_copied(tmp_path: Path) -> None:
