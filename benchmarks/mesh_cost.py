@@ -18,13 +18,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from nerf import REGION_HALF
 from pipeline.truth import Truth, compare_with_truth
 from pipeline.workspace import Workspace
 from stages.contract import Inputs
 from stages.device import compute_device
 from stages.field_files import load_field
 from stages.files import read_scene, read_tensors
-from stages.mesh import HALF_BOX, Config, reconstruct, write_mesh
+from stages.mesh import Config, reconstruct, write_mesh
 from stages.mesh_samples import sample_surface
 
 if TYPE_CHECKING:
@@ -58,9 +59,9 @@ def to_points(mesh: "ColouredMesh", points: np.ndarray) -> str:
     """From the sparse points in the region to the mesh: median, and nine in ten, in percent of the region's size."""
     from scipy.spatial import KDTree
 
-    inside = points[np.abs(points).max(1) < HALF_BOX]
+    inside = points[np.abs(points).max(1) < REGION_HALF]
     distance = KDTree(sample_surface(mesh.vertices, mesh.faces, SAMPLES, seed=0)).query(inside)[0]
-    median, most = np.percentile(distance, [50, 90]) * 100 / (2 * HALF_BOX)
+    median, most = np.percentile(distance, [50, 90]) * 100 / (2 * REGION_HALF)
     return f"{median:.2f} | {most:.2f}"
 
 

@@ -15,3 +15,5 @@ Conventions (docs/CONVENTIONS.md has the reasons):
 * Shapes are jaxtyping annotations, checked by beartype in the tests. For that reason no module here may use
   ``from __future__ import annotations``.
 """
+
+REGION_HALF = 0.9  # half the side of the region of interest, [-0.9, 0.9]^3 of the scene frame

@@ -3,9 +3,9 @@
 import numpy as np
 from jaxtyping import Float
 
+from nerf import REGION_HALF
 from nerf.reconstruction import Reconstruction
 
-REGION_HALF = 0.9
 FEWEST_POINTS = 10  # fewer say nothing about a photo's depth range; all photos together then do
 NEAR_MARGIN = 0.7  # bare surfaces carry no points: the nearest thing may be nearer than the nearest point
 SURE_VIEWS = 3  # photos that see a point which is no false match

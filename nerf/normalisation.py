@@ -5,7 +5,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from nerf.depth_range import REGION_HALF, near_and_far
+from nerf import REGION_HALF
+from nerf.depth_range import near_and_far
 from nerf.reconstruction import Reconstruction, spatial_median
 from nerf.region import Layout, Region, find_layout, find_region, share_beyond
 from nerf.scene import Similarity

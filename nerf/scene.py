@@ -89,6 +89,10 @@ class Scene:
         """The views of one split, in order of name."""
         return tuple(view for view in self.views if view.split == split)
 
+    def indices_of(self, split: Split) -> list[int]:
+        """Where the views of one split are among all of them."""
+        return [index for index, view in enumerate(self.views) if view.split == split]
+
     def to_json(self) -> dict[str, Any]:
         """This scene as JSON values."""
         similarity = self.scene_from_sfm

@@ -29,7 +29,7 @@ More = Annotated[
     ),
 ]
 
-Budget = Annotated[
+BudgetOption = Annotated[
     str | None,
     tyro.conf.arg(metavar="DURATION", help="Wall time for the whole command, like 90s, 10m or 1h30m."),
 ]
@@ -64,7 +64,7 @@ class RunArguments:
     like: str | None = None
     """Render the video as this training photo was exposed (its name; where the effect exposure is on)."""
     effect: Effects = ()
-    budget: Budget = None
+    budget: BudgetOption = None
     until: str | None = None
     """The last stage to run."""
     more: More = None
@@ -147,7 +147,7 @@ class DemoArguments:
     settings: Annotated[Settings, tyro.conf.arg(name="")] = field(default_factory=Settings)
     common: Annotated[Common, tyro.conf.arg(name="")] = field(default_factory=Common)
     effect: Effects = ()
-    budget: Budget = None
+    budget: BudgetOption = None
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("demo")
     """Where photos and workspace go."""
 

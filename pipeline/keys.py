@@ -17,8 +17,6 @@ from pydantic import BaseModel
 from stages.contract import StageError
 from stages.sources import cannot_read
 
-KEY_LENGTH = 16  # hex digits shown in folder names: 64 bits
-
 
 def canonical_json(value: Any) -> bytes:
     """One spelling per value: sorted keys, no spaces, no NaN."""
@@ -131,5 +129,5 @@ def config_for_key(
 
 
 def stage_key(stage: str, version: int, config: Mapping[str, Any], inputs: Mapping[str, str]) -> str:
-    """The full key; folders are named by its first ``KEY_LENGTH`` digits."""
+    """The full key; folders are named by its first KEY_LENGTH digits."""
     return digest({"stage": stage, "version": version, "config": config, "inputs": inputs})

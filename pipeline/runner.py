@@ -266,7 +266,10 @@ class Runner:
         return config
 
     def _time(self, options: StageConfig) -> dict[str, float]:
-        """What a choice made for ``options`` depends on besides them: the budget, or seconds that enter no key."""
+        """The time that a plan for ``options`` reckons with: the run's budget, or the stage's own seconds; {} without.
+
+        Neither is part of a key; with another one the stage plans anew.
+        """
         if self.budget and _takes_what_it_is_given(options):
             return {"budget": self.budget.total}
         seconds = getattr(options, "seconds", None)

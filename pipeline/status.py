@@ -5,11 +5,10 @@ from typing import Any
 
 from pipeline import manifests
 from pipeline.chain import ON_REQUEST, STAGES
-from pipeline.keys import KEY_LENGTH
 from pipeline.manifests import BadManifest, Manifest
 from pipeline.runner import Job, NotReady, Runner
 from pipeline.workspace import Workspace
-from stages.contract import StageError
+from stages.contract import KEY_LENGTH, StageError
 
 
 @dataclass(frozen=True)

@@ -14,9 +14,8 @@ from filelock import FileLock, Timeout
 from pydantic import BaseModel, Field, ValidationError
 
 from pipeline import manifests
-from pipeline.keys import KEY_LENGTH
 from pipeline.manifests import BadManifest, Manifest
-from stages.contract import StageError
+from stages.contract import KEY_LENGTH, StageError
 from stages.files import first_fault, sync_folder, write_durably
 
 RUN_FILE = "run.json"

@@ -26,6 +26,7 @@ from pydantic import BaseModel, ConfigDict
 from tyro.conf import Suppress
 
 MOST_LETTERS = 600  # of each part of an error
+KEY_LENGTH = 16  # hex digits of a key that name a stage's folder: 64 bits
 
 
 class StageConfig(BaseModel):

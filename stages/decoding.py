@@ -20,8 +20,9 @@ MIN_SIDE_PX = 16
 # EPS and its like run interpreters; RAW files would be read as their thumbnails.
 _FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP", "GIF", "PPM", "HEIF", "AVIF", "JPEG2000")
 _RAW = (".dng", ".cr2", ".cr3", ".nef", ".nrw", ".arw", ".srf", ".raf", ".orf", ".rw2", ".pef", ".raw", ".iiq")
-# What COLMAP, too, accepts as focal length over the longer side.
-_FOCAL_RATIO = (0.1, 10.0)
+# Focal lengths over the longer side: 157 to 6 degrees through a pinhole, what COLMAP accepts. Others are not believed,
+# neither of EXIF nor of a lens that was fitted.
+FOCAL_RANGE = (0.1, 10.0)
 _ALTITUDES_M = (-500.0, 20_000.0)  # of shores and aircraft: beyond, a receiver has not found its place
 _SRGB_TOLERANCE = 2  # of 255: profiles closer than this to sRGB are sRGB written by another hand
 
@@ -329,7 +330,7 @@ def focal_from_exif(tags: dict[str, Any], width: int, height: int) -> tuple[floa
         focal, source = focal_35 / 43.27 * math.hypot(width, height), "FocalLengthIn35mmFilm"
     elif focal_mm and resolution and unit_mm:
         focal, source = focal_mm * resolution / unit_mm * longer / camera_longer, "FocalPlaneXResolution"
-    if focal is None or not _FOCAL_RATIO[0] <= focal / longer <= _FOCAL_RATIO[1]:
+    if focal is None or not FOCAL_RANGE[0] <= focal / longer <= FOCAL_RANGE[1]:
         return None, None
     return focal, source
 

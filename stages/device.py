@@ -11,7 +11,8 @@ def processors() -> int:
 def compute_device() -> str:
     """ "cuda" where torch can use a GPU, else "cpu"; set CUDA_VISIBLE_DEVICES to nothing to stay on the CPU.
 
-    On the CPU, cores are divided among chunks of work from now on (nerf/parallel.py).
+    Has a side effect on the CPU: from the first call on torch's own threads are off in this whole program, and its
+    cores are shared out among chunks of work instead (nerf/parallel.py).
     """
     import torch
 

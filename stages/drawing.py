@@ -86,7 +86,7 @@ class Allowance:
 
     def __init__(self, seconds: float | None, train: Path, beside: float) -> None:
         self.began, self.given, self.beside = time.perf_counter(), seconds, beside
-        self.trained = training_seconds(train)
+        self.trained = trained_seconds(train)
 
     def left(self) -> float:
         """Seconds that pictures may take."""
@@ -101,12 +101,12 @@ class Allowance:
         return f"given {duration(self.given)}, of which {duration(self.left())} are left for drawing"
 
 
-def training_seconds(train: Path) -> float:
+def trained_seconds(train: Path) -> float:
     """How long the field in ``train`` was trained, without measuring and saving."""
     return read_json(train / "curve.json")["points"][-1]["seconds"]
 
 
 def measured_speed(train: Path, sample: "Callable[[int], Rays]", largest: int) -> float:
     """Rays per second that the field in ``train`` draws on this machine, found in no more than a second or two."""
-    seconds = min(TIMED_SECONDS, TIMED_SHARE * training_seconds(train))
+    seconds = min(TIMED_SECONDS, TIMED_SHARE * trained_seconds(train))
     return load_painter(train).rays_per_second(sample, largest, seconds)

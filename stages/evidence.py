@@ -143,7 +143,7 @@ def training_residuals(
     from stages.colmap.cameras import project
 
     parts = []
-    trained = [index for index, view in enumerate(scene.views) if view.split == "train"]
+    trained = scene.indices_of("train")
     for number, index in enumerate(trained):
         of_view, pose = points["view"] == index, scene.views[index].scene_from_camera
         point, xy = points["point"][of_view].astype(int), points["xy"][of_view].astype(float)

@@ -15,7 +15,7 @@ SUSPICIOUS_DB = 3.0  # above a flat colour: batches that are no better may come 
 
 
 class Lost(Exception):
-    """A field that had passed its warm-up, or was not yet through, is no longer any good; the text says why."""
+    """The field in training is useless: not finite, empty or flat, as the text says. Training goes back or restarts."""
 
 
 def symptom_of(trainer: "FieldTrainer", probe: "Probe") -> str | None:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from pydantic import Field
 
+from nerf import REGION_HALF
 from stages.contract import Inputs, Progress, StageConfig, StageResult
 from stages.files import read_json, read_scene, read_tensors, write_png
 from stages.mesh_size import affordable_resolution, resolution_in, seconds_per_density, yardstick
@@ -32,13 +33,13 @@ RESUMES = False
 LINKS = ("mesh.glb", "mesh.ply", "mesh.obj")
 UNKEYED = ("seconds",)  # it decides the resolution, and that enters the key
 
-HALF_BOX = 0.9  # the region of interest is [-0.9, 0.9]^3 of the scene frame
 CHUNK = 1 << 16
 LEVEL_RAYS = 1024
 COLOUR_SAMPLES = 8  # through the two lattice cells about a vertex
 BYTES_PER_POINT = 20  # density, occupancy, its averages and marching cubes; 16 measured at 208³
 
 Format = Literal["glb", "ply", "obj"]
+Keep = Literal["visible", "largest", "all"]
 
 
 class Config(StageConfig):
@@ -53,7 +54,7 @@ class Config(StageConfig):
     level: float | None = Field(
         default=None, gt=0, description="density of the surface; none: where the photos' rays stop"
     )
-    keep: Literal["visible", "largest", "all"] = Field(default="visible", description="which parts of the raw surface")
+    keep: Keep = Field(default="visible", description="which parts of the raw surface")
     min_views: int = Field(default=2, ge=1, description="photos that must look at a part for it to be visible")
     min_component: float = Field(
         default=0.01, ge=0, le=1, description="smallest component kept, in areas of the largest"
@@ -63,7 +64,7 @@ class Config(StageConfig):
     frame: Literal["sfm", "scene"] = Field(default="sfm", description="frame of the coordinates in the files")
 
 
-class Reconstruction(NamedTuple):
+class Extracted(NamedTuple):
     """What the compute part hands over; ``mesh`` is in the scene frame."""
 
     mesh: "ColouredMesh"
@@ -80,7 +81,7 @@ def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
     if config.seconds is not None:
         progress.update("trying how fast the field tells its density")
         began = time.perf_counter()
-        speeds = seconds_per_density(inputs["train"], HALF_BOX, CHUNK), yardstick()
+        speeds = seconds_per_density(inputs["train"], REGION_HALF, CHUNK), yardstick()
         resolution = resolution_in(config.seconds - (time.perf_counter() - began), *speeds)
         return config.model_copy(update={"resolution": resolution})
     rays = read_json(inputs["train"] / "field.json")["rays"]
@@ -116,7 +117,7 @@ def reconstruct(
     points: "np.ndarray",
     device: str,
     progress: Progress,
-) -> Reconstruction:
+) -> Extracted:
     """The mesh of ``model`` in the scene frame, where sparse ``points`` (n, 3) are, too; ``config.resolution`` must be
     set. Masks lie in the folder of stage ``ingest``. Raises StageError without a surface."""
     from scipy.spatial import KDTree
@@ -142,7 +143,7 @@ def reconstruct(
     directions = sight.direction[cleaned.vertex[nearest]]
     colours = _colours(model, cleaned.surface.vertices[nearest], directions, voxel, device)
     mesh = ColouredMesh(*surface, vertex_normals(surface), colours)
-    return Reconstruction(mesh, level, cleaned, openness(surface, HALF_BOX, voxel), voxel)
+    return Extracted(mesh, level, cleaned, openness(surface, REGION_HALF, voxel), voxel)
 
 
 def _density(config: Config, model: "RadianceModel", device: str, progress: Progress) -> "Lattice":
@@ -157,7 +158,7 @@ def _density(config: Config, model: "RadianceModel", device: str, progress: Prog
     check_memory(
         BYTES_PER_POINT * config.resolution**3, "the mesh", f"a lattice of {config.resolution}³ points needs", hint
     )
-    corner = torch.full((3,), HALF_BOX, device=device)
+    corner = torch.full((3,), REGION_HALF, device=device)
     edge = config.resolution
 
     def report(done: float) -> None:
@@ -236,7 +237,7 @@ def write_mesh(config: Config, mesh: "ColouredMesh", scene: "Scene", folder: Pat
     return (*(f"mesh.{kind}" for kind in formats), "preview.png")
 
 
-def _facts(config: Config, result: Reconstruction, scene: "Scene") -> dict[str, object]:
+def _facts(config: Config, result: Extracted, scene: "Scene") -> dict[str, object]:
     """Plain values for the report; lengths are in the frame of the files."""
     from stages.mesh_surface import Surface, face_areas
 

@@ -1,6 +1,6 @@
 """Which parts of a raw surface to keep: what the photos cover, see and locate, without specks."""
 
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -8,9 +8,9 @@ from stages.contract import StageError
 from stages.mesh_surface import Surface, border_vertices, components, face_areas, is_watertight, keep_faces
 
 if TYPE_CHECKING:
+    from stages.mesh import Keep
     from stages.mesh_views import Sight
 
-Keep = Literal["visible", "largest", "all"]
 SEEN_SHARE = 0.1  # of a component's area; an inner cavity has none, the seen side of an object about half
 # Of a component's area, near a sparse point. Of the demo's table 41 % lies within 0.03 of one, 57 % within 0.05; of
 # sheets of sky below it nothing within 0.3 (docs/numbers.md).
@@ -30,7 +30,7 @@ class Cleaned(NamedTuple):
 
 
 def clean(
-    surface: Surface, sight: "Sight", points: np.ndarray, keep: Keep, min_views: int, min_component: float
+    surface: Surface, sight: "Sight", points: np.ndarray, keep: "Keep", min_views: int, min_component: float
 ) -> Cleaned:
     """Drop what the photos do not vouch for; ``points`` are the sparse ones (n, 3), in the frame of the surface.
 

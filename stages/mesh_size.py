@@ -6,10 +6,10 @@ from pathlib import Path
 POINTS_PER_RAY = 20  # lattice points per ray trained: about a tenth of what training cost
 LEAST_RESOLUTION, MOST_RESOLUTION = 64, 256
 TIMED_EDGES, TIMED_SECONDS = (32, 64, 96), 0.3
-# What takes time besides the densities, in surfaces of a ball like the one that :func:`yardstick` extracts: everything
-# once (visibility, level, colours, picture, files), and the rest (marching cubes, cleaning, decimation) per lattice
-# point. On an idle machine, where a ball takes 0.024 s: fox, fountain_p11 and herzjesu_p8 at 64 to 192 points per edge
-# took 2.6 to 3 s and 0.8 to 1.1 µs a point (docs/numbers.md).
+# What takes time besides the densities, in multiples of the time that the surface of a ball takes (:func:`yardstick`).
+# ONCE: what any mesh takes (visibility, level, colours, picture, files). PER_POINT: what each lattice point adds
+# (marching cubes, cleaning, decimation). Measured on an idle machine, where a ball takes 0.024 s: fox, fountain_p11 and
+# herzjesu_p8 at 64 to 192 points per edge took 2.6 to 3 s and 0.8 to 1.1 µs a point (docs/numbers.md).
 ONCE, PER_POINT = 150.0, 4.5e-5
 # A colour reads the grids as often as this many densities, once for each of its samples. It takes 3 to 4 times as
 # long as these, for the second network and because colours are not shared out among the cores (docs/numbers.md); that

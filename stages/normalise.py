@@ -220,7 +220,7 @@ def _line(found: "Normalisation", has_alpha: bool) -> str:
 
 def _facts(scene: "Scene", found: "Normalisation", observations: int) -> dict[str, Any]:
     """The decisions and the numbers behind them."""
-    from nerf.depth_range import REGION_HALF
+    from nerf import REGION_HALF
 
     return {
         "layout": scene.layout,

@@ -125,7 +125,7 @@ def account(
     models: Sequence[Sequence[str]],
     observations: Mapping[str, int],
     supports: Mapping[str, tuple[int, int]],
-    conflict: Mapping[str, int] | None = None,
+    conflict: Mapping[str, int] | None,
 ) -> list[dict[str, Any]]:
     """What became of each photo, for registration.json. ``models`` are the names in each sub-model, best first;
     ``supports`` and ``conflict`` as stages/colmap/diagnosis.py finds them."""

@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
+from nerf import REGION_HALF
 from stages.amounts import duration
 from stages.curve import coming_doubling, heldout_curve
 
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
 BLUE, ORANGE, GREY = "#3b82f6", "#f2711c", "#8a8f98"
 SPLIT_COLOURS: "dict[Split, str]" = {"train": BLUE, "test": ORANGE}
 INK = "#010203"  # drawn with this and then replaced by the page's own text colour
-BOX = 0.9  # the region of interest is [-0.9, 0.9]^3, see nerf/scene.py
 MOST_POINTS = 20_000
 ROOM_BELOW = 0.08  # of the curve's height, so that the name of the lowest line stands clear of the times
 
@@ -95,13 +95,17 @@ def _layout_svg(name: str, scene: "Scene", plane: tuple[int, int], xyz: "np.ndar
     from matplotlib.patches import Rectangle
 
     centres = np.array([view.scene_from_camera[:, 3] for view in scene.views])[:, plane]
-    low, high = np.minimum(centres.min(0), -BOX), np.maximum(centres.max(0), BOX)
+    low, high = np.minimum(centres.min(0), -REGION_HALF), np.maximum(centres.max(0), REGION_HALF)
     middle, half = (low + high) / 2, (high - low) / 2 + 0.06 * (high - low).max()
     shown = np.linspace(0, len(xyz) - 1, min(len(xyz), MOST_POINTS)).astype(int)
     with drawing((5, min(8.0, max(1.6, 5 * half[1] / half[0]))), name) as figure:
         axes = figure.add_subplot(aspect="equal")
         axes.scatter(*xyz[shown][:, plane].T, c=rgb[shown] / 255, s=2, lw=0, alpha=0.7, rasterized=True)
-        axes.add_patch(Rectangle((-BOX, -BOX), 2 * BOX, 2 * BOX, fill=False, ec=INK, ls="--", alpha=0.6))
+        axes.add_patch(
+            Rectangle(
+                (-REGION_HALF, -REGION_HALF), 2 * REGION_HALF, 2 * REGION_HALF, fill=False, ec=INK, ls="--", alpha=0.6
+            )
+        )
         for split, colour in SPLIT_COLOURS.items():
             outlines = [_outline(scene, view, 0.1 * half.max())[:, plane] for view in scene.of_split(split)]
             axes.add_collection(LineCollection(outlines, colors=colour, lw=0.9, zorder=3))

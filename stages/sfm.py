@@ -21,8 +21,9 @@ NEEDS = ("ingest",)
 VERSION = 5
 RESUMES = True
 LINKS = ("sparse",)
-# It may decide that an attempt is not made, which is said; in the key it would part a run from the matches kept for it.
-# And the time it is given decides how far features are searched, which enters the key.
+# Both may decide that an attempt is not made, which is said. A run with another limit is to go on from the matches that
+# one before it kept, so its key has to be the same. How far features are searched, which ``seconds`` decides as well,
+# enters the key by options of its own.
 UNKEYED = ("max_seconds", "seconds")
 
 CameraModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE"]
@@ -33,45 +34,74 @@ MOST_NAMES = 5
 class Config(StageConfig):
     """How cameras are found."""
 
-    cameras: OptionalSourcePath = None
-    """Known cameras: a transforms.json, a folder with transforms_train.json, or a COLMAP model."""
-    seed: int = Field(default=0, ge=0, lt=2**31)
-    """Of every random choice in matching and mapping; docs/numbers.md says how far runs were seen to repeat."""
-    max_image_size: int | None = Field(default=None, ge=100)
-    """Longer side in pixels at which features are searched; larger photos are reduced for it; None: 1600, and of
-    large sets as much as is bearable here."""
-    max_features: int | None = Field(default=None, ge=100)
-    """Features per photo, the largest ones first; matching takes time with its square; None: 4096, and of large sets
-    as many as is bearable here."""
-    camera_model: CameraModel | None = None
-    """COLMAP's camera model; None: SIMPLE_RADIAL while mapping, and then the simplest one that held-out observations
-    do not speak against."""
-    camera_params: tuple[float, ...] | None = None
-    """The numbers of --sfm.camera-model where they are known, in COLMAP's order, for photos of this size; kept."""
-    matcher: Matcher | None = None
-    """Which pairs of photos are matched: all, neighbours in time or place, or those that look alike; None: by cost."""
-    neighbours: int = Field(default=30, ge=1)
-    """Partners of each photo, where not all pairs are matched."""
-    attempts: int = Field(default=len(ATTEMPTS), ge=1, le=len(ATTEMPTS))
-    """How many ways to find the cameras are tried while photos have no place; 1: only the first."""
-    seconds: float | None = Field(default=None, gt=0)
-    """That it may take, if it can be: features are searched less far where they would take longer, and further attempts
-    that would not fit are not begun. It is not given up for it; None: as long as is bearable."""
-    max_seconds: float = Field(default=4 * 3600.0, gt=0)
-    """When structure-from-motion is given up; what was matched until then is kept for the next try. Attempts that
-    would not fit are not begun."""
+    cameras: OptionalSourcePath = Field(
+        default=None,
+        description="Known cameras: a transforms.json, a folder with transforms_train.json, or a COLMAP model.",
+    )
+    seed: int = Field(
+        default=0,
+        ge=0,
+        lt=2**31,
+        description="Of every random choice in matching and mapping; docs/numbers.md says how far runs were "
+        "seen to repeat.",
+    )
+    max_image_size: int | None = Field(
+        default=None,
+        ge=100,
+        description="Longer side in pixels at which features are searched; larger photos are reduced for it; "
+        "None: 1600, and of large sets as much as is bearable here.",
+    )
+    max_features: int | None = Field(
+        default=None,
+        ge=100,
+        description="Features per photo, the largest ones first; matching takes time with its square; None: "
+        "4096, and of large sets as many as is bearable here.",
+    )
+    camera_model: CameraModel | None = Field(
+        default=None,
+        description="COLMAP's camera model; None: SIMPLE_RADIAL while mapping, and then the simplest one that "
+        "held-out observations do not speak against.",
+    )
+    camera_params: tuple[float, ...] | None = Field(
+        default=None,
+        description="The numbers of --sfm.camera-model where they are known, in COLMAP's order, for photos of "
+        "this size; kept.",
+    )
+    matcher: Matcher | None = Field(
+        default=None,
+        description="Which pairs of photos are matched: all, neighbours in time or place, or those that look "
+        "alike; None: by cost.",
+    )
+    neighbours: int = Field(default=30, ge=1, description="Partners of each photo, where not all pairs are matched.")
+    attempts: int = Field(
+        default=len(ATTEMPTS),
+        ge=1,
+        le=len(ATTEMPTS),
+        description="How many ways to find the cameras are tried while photos have no place; 1: only the first.",
+    )
+    seconds: float | None = Field(
+        default=None,
+        gt=0,
+        description="That it may take, if it can be: features are searched less far where they would take "
+        "longer, and further attempts that would not fit are not begun. It is not given up for "
+        "it; None: as long as is bearable.",
+    )
+    max_seconds: float = Field(
+        default=4 * 3600.0,
+        gt=0,
+        description="When structure-from-motion is given up; what was matched until then is kept for the next "
+        "try. Attempts that would not fit are not begun.",
+    )
 
 
 def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
     """The config with features and pairs chosen, by what they take on this machine for some of the photos."""
     from stages.matching_plan import Open, chosen
-    from stages.photos import read_photos
 
     left_open = Open(config.max_image_size, config.max_features, config.matcher)
     if config.cameras is not None or None not in left_open:
         return config
-    photos = sorted(read_photos(inputs["ingest"]), key=lambda photo: photo.file)
-    photos = [photo for photo in photos if not photo.near_duplicate_of]
+    _, photos = _photos(inputs["ingest"])
     images = inputs["ingest"] / "images"
     answer = chosen(left_open, photos, images, config.neighbours, progress, config.seconds)
     return config.model_copy(update=answer._asdict())
@@ -79,13 +109,19 @@ def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
 
 def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> StageResult:
     """Write ``sparse/`` and registration.json. Raises StageError where no usable model comes out."""
-    from stages.photos import read_photos
-
-    photos = sorted(read_photos(inputs["ingest"]), key=lambda photo: photo.file)
+    photos, matched = _photos(inputs["ingest"])
     folder.mkdir(parents=True, exist_ok=True)
     if config.cameras is not None:
         return _import(config.cameras, photos, inputs["ingest"], folder, progress)
-    return _reconstruct(plan(config, inputs, progress), photos, inputs["ingest"], folder, progress)
+    return _reconstruct(plan(config, inputs, progress), photos, matched, inputs["ingest"], folder, progress)
+
+
+def _photos(ingest: Path) -> "tuple[list[Photo], list[Photo]]":
+    """All photos by file, and those of them that are matched: near duplicates of others are not."""
+    from stages.photos import read_photos
+
+    everything = sorted(read_photos(ingest), key=lambda photo: photo.file)
+    return everything, [photo for photo in everything if not photo.near_duplicate_of]
 
 
 # --- known cameras
@@ -128,7 +164,14 @@ def _import(cameras: Path, photos: "list[Photo]", ingest: Path, folder: Path, pr
 # --- structure-from-motion
 
 
-def _reconstruct(config: Config, photos: "list[Photo]", ingest: Path, folder: Path, progress: Progress) -> StageResult:
+def _reconstruct(
+    config: Config,
+    everything: "list[Photo]",
+    photos: "list[Photo]",
+    ingest: Path,
+    folder: Path,
+    progress: Progress,
+) -> StageResult:
     from stages.matching_plan import check_matcher
     from stages.pairing import places_of
     from stages.registration import (
@@ -141,7 +184,6 @@ def _reconstruct(config: Config, photos: "list[Photo]", ingest: Path, folder: Pa
         with_left_out,
     )
 
-    everything, photos = photos, [photo for photo in photos if not photo.near_duplicate_of]
     _check_count(photos, len(everything))
     _check_camera(config, photos)
     check_matcher(config.matcher, places_of(photos))

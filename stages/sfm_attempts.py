@@ -100,7 +100,7 @@ class Journal:
         return self.folder / name.replace(" ", "-")
 
     def left(self) -> tuple[Attempt, ...]:
-        """The attempts after the last one in the journal: what was passed over before it stays so."""
+        """What may still be tried: all after the last attempt made. What was passed over before that is left out."""
         names = [attempt.name for attempt in ATTEMPTS]
         return ATTEMPTS[names.index(self.tried[-1].name) + 1 :] if self.tried else ATTEMPTS
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from stages.contract import Progress
 from stages.device import processors
+from stages.sharpness import WIDTH
 
 if TYPE_CHECKING:
     import numpy as np
@@ -26,7 +27,6 @@ WINDOW = 1 / 200  # of the photo's longer side: what training at usual sizes mak
 LEAST_WINDOW, LARGEST_WINDOW = 5, 3.0  # pixels; times the usual window
 CLIPPED_SHARE = 0.1  # of a window's values beyond these are too many to trust its mean
 DARKEST, BRIGHTEST = 3, 252  # of 255
-GRADIENT_WIDTH = 1000  # as stages/sharpness.py
 DECODING_BYTES = 2 << 30  # of photos in memory at a time
 
 
@@ -86,7 +86,7 @@ def training_tracks(scene: "Scene", points: "Mapping[str, np.ndarray]", most: in
     import numpy as np
 
     number = np.full(len(scene.views), -1)
-    trained = [index for index, view in enumerate(scene.views) if view.split == "train"]
+    trained = scene.indices_of("train")
     number[trained] = np.arange(len(trained))
     view = number[points["view"]]
     count = np.bincount(points["point"][view >= 0], minlength=len(points["xyz"]))
@@ -165,8 +165,9 @@ def _expected(
 
 
 def _seen_nearby(tracks: "TrackColours", rank: "np.ndarray", centres: "np.ndarray", number: int) -> "np.ndarray":
-    """The observations of other photos that may tell what a training photo should show: of photos not too far from it,
-    and of these, where they are many, those of an even share of the points, whose numbers without gaps are ``rank``."""
+    """Which observations tell what training photo ``number`` should show: those of the photos near it, beside the
+    distance of what they observe. Where all photos' together would be more than MOST_LOOKED_AT, only those of every so
+    many-th point, other points for each photo. ``rank`` numbers the observed points without gaps."""
     import numpy as np
 
     from nerf.evidence.transients import NEAR_APART
@@ -258,7 +259,7 @@ def _window_means(pixels: "np.ndarray", used: "np.ndarray", corner: "np.ndarray"
 
 
 def _gradients(pixels: "np.ndarray") -> "np.ndarray":
-    """The mean of g g^T (2, 2) of the grey picture, at most GRADIENT_WIDTH wide; what is transparent is black."""
+    """The mean of g g^T (2, 2) of the grey picture, at most WIDTH wide; what is transparent is black."""
     import cv2
     import numpy as np
 
@@ -266,8 +267,8 @@ def _gradients(pixels: "np.ndarray") -> "np.ndarray":
     if pixels.shape[2] == 4:
         grey = grey * (pixels[..., 3] / np.float32(255))
     height, width = grey.shape
-    if width > GRADIENT_WIDTH:
-        size = GRADIENT_WIDTH, max(1, round(height * GRADIENT_WIDTH / width))
+    if width > WIDTH:
+        size = WIDTH, max(1, round(height * WIDTH / width))
         grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
     across = cv2.Scharr(grey, cv2.CV_32F, 1, 0, scale=1 / 32).ravel()
     down = cv2.Scharr(grey, cv2.CV_32F, 0, 1, scale=1 / 32).ravel()

@@ -15,7 +15,16 @@ from tyro.conf import Suppress
 from stages.amounts import duration
 from stages.contract import Inputs, Progress, StageConfig, StageError, StageResult
 from stages.files import read_scene, write_json
-from stages.tradeoff_arms import VARIANTS, Arm, Selection, Speed, drawn_per_second, in_words, resolution_words
+from stages.tradeoff_arms import (
+    PUBLISHED,
+    VARIANTS,
+    Arm,
+    Selection,
+    Speed,
+    drawn_per_second,
+    in_words,
+    resolution_words,
+)
 
 if TYPE_CHECKING:
     from nerf.scene import Scene
@@ -58,12 +67,12 @@ class Trial(NamedTuple):
 
 def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
     """Measure how fast this machine trains each kind of field; choose photo sizes and windows by that."""
-    from stages.tradeoff_speeds import PUBLISHED, longest_downscale, measured_speeds
+    from stages.tradeoff_speeds import measured_speeds, study_sizes
     from stages.tradeoff_trial import WINDOW
 
     scene = _scene_with_test_photos(inputs)
     speeds = measured_speeds(scene, inputs, config.seconds, progress)
-    sizes = config.sizes or longest_downscale(scene, speeds, config.seconds)
+    sizes = config.sizes or study_sizes(scene, speeds, config.seconds)
     drawn = min(drawn_per_second(name, speed) for name, speed in speeds.items() if name != PUBLISHED)
     affordable = SCORING_SHARE * config.seconds * drawn / WINDOW**2
     chosen = {
@@ -234,7 +243,7 @@ def _ablation_picture(
 ) -> tuple[str, ...]:
     """ablation.png: windows of the photos beside what the method and each variant of it draw there; the names of the
     files written, none where no ablation was run."""
-    from stages.tradeoff_arms import ABLATIONS, COMPLETE
+    from stages.tradeoff_arms import ABLATIONS, REDUCED
     from stages.tradeoff_plot import Row, write_sheet
     from stages.tradeoff_trial import write_strip
 
@@ -249,7 +258,7 @@ def _ablation_picture(
             ablated.steps,
             ablated.seed,
         )
-        if same and trial.arm.variant in (COMPLETE, *ABLATIONS) and not trial.figures["failed"]:
+        if same and trial.arm.variant in (REDUCED, *ABLATIONS) and not trial.figures["failed"]:
             score = next(p.psnr for p in points if (p.variant, p.steps) == (trial.arm.variant, trial.arm.steps))
             rows.append(Row(trial.arm.variant, score, folder / "arms" / f"{trial.arm.name}.png"))
     best = max((t for t in trials if not t.figures["failed"]), key=lambda trial: trial.figures["psnr"])

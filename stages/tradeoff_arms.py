@@ -26,6 +26,7 @@ class Variant(NamedTuple):
     speed: str
 
 
+REDUCED, PUBLISHED = "paper, reduced", "paper, published"
 VARIANTS: dict[str, Variant] = {
     "small grid": Variant("grid", {"levels": 4, "log2_rows": 17, "finest": 256}, "small grid"),
     "grid": Variant("grid", {"levels": 5, "log2_rows": 18, "finest": 512}, "grid"),
@@ -36,26 +37,24 @@ VARIANTS: dict[str, Variant] = {
     "grid, twice the samples": Variant(
         "grid samples", {"levels": 5, "log2_rows": 18, "finest": 512, "ray_samples": 2.0}, "grid"
     ),
-    "paper, reduced": Variant("paper", {"view_dependence": True}, "paper, reduced"),
-    "no hierarchical sampling": Variant("ablation", {"view_dependence": True, "hierarchical": False}, "paper, reduced"),
-    "no positional encoding": Variant(
-        "ablation", {"view_dependence": True, "positional_encoding": False}, "paper, reduced"
-    ),
-    "no view dependence": Variant("ablation", {"view_dependence": False}, "paper, reduced"),
-    "paper, published": Variant("published", {"view_dependence": True, "preset": "paper"}, "paper, published"),
+    REDUCED: Variant("paper", {"view_dependence": True}, REDUCED),
+    "no hierarchical sampling": Variant("ablation", {"view_dependence": True, "hierarchical": False}, REDUCED),
+    "no positional encoding": Variant("ablation", {"view_dependence": True, "positional_encoding": False}, REDUCED),
+    "no view dependence": Variant("ablation", {"view_dependence": False}, REDUCED),
+    PUBLISHED: Variant("published", {"view_dependence": True, "preset": "paper"}, PUBLISHED),
 }
-COMPLETE = "paper, reduced"
 ABLATIONS = tuple(name for name, variant in VARIANTS.items() if variant.family == "ablation")
 TIMED = tuple(dict.fromkeys(variant.speed for variant in VARIANTS.values()))
 
-# (rounds) of (variant, which of the study's photo sizes with the finest first, rungs with the longest first)
+# Groups of trainings: (variant, which of the study's photo sizes, which rungs of the ladder of training times). Sizes
+# count from the finest, rungs from the longest.
 FINE, MIDDLE, COARSE = 0, 1, 2
 LADDER = [("grid", MIDDLE, range(RUNGS))]
 SIZES = [("grid", FINE, range(4)), ("grid", COARSE, range(4, RUNGS))]
-METHOD = [(name, COARSE, [2]) for name in (COMPLETE, *ABLATIONS)]
+METHOD = [(name, COARSE, [2]) for name in (REDUCED, *ABLATIONS)]
 GRIDS = [("small grid", MIDDLE, [3, 5, 7]), ("large grid", FINE, [2, 1])]
 SAMPLES = [(name, MIDDLE, [2]) for name, variant in VARIANTS.items() if variant.family == "grid samples"]
-PAPER = [(COMPLETE, COARSE, [4, 1]), ("paper, published", COARSE, [0])]
+PAPER = [(REDUCED, COARSE, [4, 1]), (PUBLISHED, COARSE, [0])]
 
 
 class Speed(NamedTuple):

@@ -4,13 +4,21 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from stages.contract import Inputs, Progress
-from stages.tradeoff_arms import FEWEST_STEPS, LONGEST, TIMED, VARIANTS, Speed, field_of, photo_sizes
+from stages.tradeoff_arms import (
+    FEWEST_STEPS,
+    LONGEST,
+    PUBLISHED,
+    REDUCED,
+    TIMED,
+    VARIANTS,
+    Speed,
+    field_of,
+    photo_sizes,
+)
 
 if TYPE_CHECKING:
     from nerf.scene import Scene
     from stages.train import Config as TrainConfig
-
-REDUCED, PUBLISHED = "paper, reduced", "paper, published"
 
 
 class _Quiet:
@@ -60,7 +68,7 @@ def _work(config: "TrainConfig") -> float:
     return (2 * config.samples_coarse + config.samples_fine) * config.depth * config.width**2
 
 
-def longest_downscale(scene: "Scene", speeds: Mapping[str, Speed], seconds: float) -> tuple[float, ...]:
+def study_sizes(scene: "Scene", speeds: Mapping[str, Speed], seconds: float) -> tuple[float, ...]:
     """The photo sizes of a study of ``seconds``, see :func:`photo_sizes`."""
     from stages.training_size import chosen_downscale
 

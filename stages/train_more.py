@@ -1,20 +1,19 @@
 """Going on from the end of a finished training: with its settings, photos and cameras, for longer.
 
-A training is named ``<key>/<digest>``: the first 16 digits of its key, which name its folder in the workspace, and of
-the digest of its outputs. So the name says what was trained and not where it lies.
+A training is named ``<key>/<digest>``: the first KEY_LENGTH digits of its key, which name its folder in the
+workspace, and of the digest of its outputs. So the name says what was trained and not where it lies.
 """
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stages.contract import Inputs, StageError
+from stages.contract import KEY_LENGTH, Inputs, StageError
 from stages.files import read_json
 
 if TYPE_CHECKING:
     from stages.train import Config
-    from stages.training_state import Budget
+    from stages.training_state import TrainingBudget
 
-DIGITS = 16
 OWN = ("after", "more_steps", "more_seconds")
 # Replaced by the budget for more; or without influence on what is trained.
 FREE = (*OWN, "steps", "seconds", "preset", "checkpoint_seconds", "tensorboard")
@@ -23,7 +22,7 @@ ANEW = "Give --train.seconds or --train.steps to train anew."
 
 def training_name(key: str, outputs_digest: str) -> str:
     """The name of a finished training."""
-    return f"{key[:DIGITS]}/{outputs_digest[:DIGITS]}"
+    return f"{key[:KEY_LENGTH]}/{outputs_digest[:KEY_LENGTH]}"
 
 
 def earlier_training(name: str, inputs: Inputs) -> Path:
@@ -68,10 +67,10 @@ def _same_inputs(digests: dict[str, str], inputs: Inputs) -> None:
         raise StageError("training cannot go on", why, ANEW)
 
 
-def budget_of(config: "Config", inputs: Inputs) -> "Budget":
+def budget_of(config: "Config", inputs: Inputs) -> "TrainingBudget":
     """How long to train, and from where on."""
-    from stages.training_state import Budget
+    from stages.training_state import TrainingBudget
 
     if config.after is None:
-        return Budget(config.steps, config.seconds)
-    return Budget(config.more_steps, config.more_seconds, earlier_training(config.after, inputs))
+        return TrainingBudget(config.steps, config.seconds)
+    return TrainingBudget(config.more_steps, config.more_seconds, earlier_training(config.after, inputs))

@@ -27,7 +27,7 @@ from stages.examination import Lost, is_suspicious, not_finite, symptom_of
 from stages.files import read_json, write_durably
 from stages.live_line import live_line
 from stages.training_parts import observed
-from stages.training_state import Budget, Pace, Probes, RunState
+from stages.training_state import Pace, Probes, RunState, TrainingBudget
 
 if TYPE_CHECKING:
     from nerf.probe import ProbeResult
@@ -59,7 +59,7 @@ class TrainingRun:
         self,
         make_trainer: "Callable[[int], FieldTrainer]",
         probes: Probes,
-        budget: Budget,
+        budget: TrainingBudget,
         folder: Path,
         checkpoint_seconds: float,
         log: "TrainingLog",

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from nerf.training import FieldTrainer, TrainerSettings
     from stages.train import Config
     from stages.training_loop import TrainingRun
-    from stages.training_state import Budget
+    from stages.training_state import TrainingBudget
 
 FINAL_RATE = 0.1  # of the paper field's learning rate at the start
 # Weight of the distortion loss (Barron et al. 2022, who take 1e-2) in folded space, against fog and matter close before
@@ -31,12 +31,12 @@ DEPTH_LOSS = 0.1
 LEAST_PHOTOS = 3
 COARSEST = 16
 # Samples along a ray (docs/numbers.md).
-MOST_STEPS = 576  # in a box: along its diagonal
-STEPS_PER_CELL, MOST_STEPPED_CELLS = 3, 1024  # in folded space: in a finest cell, were there so many along an axis
-EVEN_UNTIL = 0.25  # the distance from where steps there grow in proportion to it
-MOST_SAMPLES = (
-    1024  # that reach to a distance of 23 at the shortest steps; more where --train.ray-samples asks for more
-)
+MOST_STEPS = 576  # bounded scenes: steps along the diagonal of the box
+STEPS_PER_CELL = 3  # folded space: steps in one of the finest cells
+MOST_STEPPED_CELLS = 1024  # folded space: of finer grids, steps are as long as with so many cells along an axis
+EVEN_UNTIL = 0.25  # folded space: scene units from the camera up to which steps are even; beyond, they grow
+# Folded space: at the shortest steps so many samples reach to a distance of 23; --train.ray-samples may ask for more.
+MOST_SAMPLES = 1024
 TABLE_COPIES = 6  # of the grids' features: themselves, their gradient, Adam's two moments, and twice in a checkpoint
 SAMPLE_BYTES = 4096  # that a sample of a grid field's step takes while it is computed
 ACTIVATIONS_PER_LAYER = 2  # numbers kept of each unit of the paper field for its gradient
@@ -147,7 +147,7 @@ def make_trainer(
     return PaperTrainer(published, bank, paper_trainer_settings(config, scene, seed), *photo_parts)
 
 
-def _say_sizes(config: "Config", budget: "Budget", bank: "RayBank", progress: Progress) -> None:
+def _say_sizes(config: "Config", budget: "TrainingBudget", bank: "RayBank", progress: Progress) -> None:
     much = f"{budget.seconds:g} s" if budget.steps is None else f"{budget.steps:,} steps"
     another = "" if budget.after is None else "another "
     photos = f"{len(bank.near)} photos at 1/{config.downscale:g} of their size"

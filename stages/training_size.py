@@ -37,14 +37,13 @@ LEAST_FINEST = 128
 
 
 def chosen_downscale(scene: "Scene", rays: float, used: "Mapping[str, float] | None" = None) -> float:
-    """How many times smaller than the photos to train, for a budget of ``rays``, in tenths rounded down. Of some photos
-    only a share is ``used``, by name.
+    """How many times smaller than the photos to train, for a budget of ``rays``, in tenths rounded down. ``used`` says
+    by name which share of its pixels a photo's mask leaves; of others all count.
 
-    Every pixel of the training photos is then drawn about once: more pixels than rays would be decoded for
-    nothing, and with fewer the run would see the same ones again while finer ones were to be had. More than MOST_PHOTOS
-    show the same things again, and rays are spread over things: then each has as many pixels as if it were one of so
-    many, as long as all have no more than MOST_PIXELS. Long sides keep LEAST_LONG_SIDE pixels in
-    the median, and photos are never enlarged.
+    Every pixel of the training photos is then drawn about once: of larger photos some pixels would never be drawn, and
+    of smaller ones all would be drawn again and again. More than MOST_PHOTOS photos show the same things several times.
+    Each of them keeps the pixels that it would have as one of MOST_PHOTOS, though not all are drawn then, up to
+    MOST_PIXELS in all. Long sides keep LEAST_LONG_SIDE pixels in the median, and photos are never enlarged.
     """
     views, used = scene.of_split("train"), used or {}
     cameras = [scene.cameras[view.camera] for view in views]

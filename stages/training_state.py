@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 RATE_MEMORY_SECONDS = 5.0  # how far back the measured speed and the shown PSNR look
 
 
-class Budget(NamedTuple):
+class TrainingBudget(NamedTuple):
     """How long to train: exactly one of the first two is given. Seconds count training steps alone. ``after``: the
     folder of a finished run from whose end to go on; the budget is then for what comes on top."""
 

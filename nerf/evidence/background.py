@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float, Int
 
-from nerf.depth_range import REGION_HALF
+from nerf import REGION_HALF
 from nerf.evidence.evidence import Evidence, unknown
 
 NEVER = float("inf")  # the threshold of what no share decides, and its noise: only alpha does

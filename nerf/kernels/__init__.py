@@ -23,10 +23,11 @@ from typing import NamedTuple, Protocol, runtime_checkable
 from jaxtyping import Float, Float64, Int, Int32, Int64, UInt8
 from torch import Tensor
 
+from nerf import REGION_HALF
 from nerf.model import Rendering
 from nerf.rays import Rays
 
-BOX = 0.9  # half the side of the cube that a bounded scene fills
+BOX = REGION_HALF  # half the side of the cube that a bounded scene fills
 CONTRACTED_BOX = 2.0  # half the side of the cube into which contraction folds space
 
 

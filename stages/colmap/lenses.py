@@ -7,6 +7,7 @@ from jaxtyping import Float
 
 from stages.colmap.cameras import ROUND_TRIP_PX
 from stages.colmap.observations import observations, points_in_camera
+from stages.decoding import FOCAL_RANGE
 
 if TYPE_CHECKING:
     import pycolmap
@@ -22,7 +23,6 @@ MODELS = (
 )
 FIT_POINTS = 300
 CHECKED_PIXELS = (33, 25)  # across and down, corners included
-FOCAL_RANGE = (0.1, 10.0)  # of the longer side: 157 to 6 degrees through a pinhole, as ingest believes EXIF
 FARTHEST_PRINCIPAL_POINT = 0.1  # of the image, from its centre: lenses are centred to a percent or two
 
 

@@ -9,7 +9,7 @@ import struct
 from collections.abc import Iterator
 from itertools import zip_longest
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -41,6 +41,8 @@ PARAMETERS = dict(CAMERA_MODELS.values())
 LARGEST_SIDE = 2**31 - 1
 FARTHEST = 1e30  # of anything, in its units: squares and products of three such numbers are numbers, too
 NO_POINT = -1
+
+Entry = TypeVar("Entry")
 
 
 class FileImage(NamedTuple):
@@ -91,8 +93,8 @@ def read_model_files(folder: Path) -> ModelFiles:
     return model
 
 
-def _by_id(entries: Iterator[tuple[int, object]]) -> dict[int, object]:
-    found: dict[int, object] = {}
+def _by_id(entries: Iterator[tuple[int, Entry]]) -> dict[int, Entry]:
+    found: dict[int, Entry] = {}
     for number, entry in entries:
         if number in found:
             raise ValueError(f"the id {number} is there twice")

@@ -8,7 +8,7 @@ import torch
 
 from nerf.model import Rendering
 from nerf.rays import Rays
-from stages.drawing import Allowance, Painter, training_seconds
+from stages.drawing import Allowance, Painter, trained_seconds
 from stages.files import write_json
 
 
@@ -69,7 +69,7 @@ def test_a_picture_smaller_than_the_first_one_tried_will_do() -> None:
 
 def test_training_took_as_long_as_its_curve_says(tmp_path: Path) -> None:
     write_json(tmp_path / "curve.json", {"points": [{"seconds": 2.0}, {"seconds": 61.5}]})
-    assert training_seconds(tmp_path) == 61.5
+    assert trained_seconds(tmp_path) == 61.5
 
 
 def test_pictures_have_what_is_left_of_the_time_given_or_a_share_of_the_trainings(tmp_path: Path) -> None:

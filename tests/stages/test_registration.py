@@ -45,7 +45,7 @@ def test_photos_left_out_of_matching_stand_in_the_account() -> None:
     photos = [
         replace(photo, near_duplicate_of="ä.jpg") if index in (0, 3) else photo for index, photo in enumerate(PHOTOS)
     ]
-    matched = account(["b.jpg", "c.jpg", "e.jpg"], matches((0, 1), (1, 2)), [["b.jpg", "c.jpg", "e.jpg"]], {}, {})
+    matched = account(["b.jpg", "c.jpg", "e.jpg"], matches((0, 1), (1, 2)), [["b.jpg", "c.jpg", "e.jpg"]], {}, {}, None)
     entries = with_left_out(matched, photos)
     assert [entry["file"] for entry in entries] == NAMES
     assert [entry["reason"] for entry in entries if not entry["registered"]] == [
@@ -58,13 +58,13 @@ FOUR = (matches((0, 1), (1, 2), (2, 3), (1, 3)), [["a.jpg", "b.jpg", "c.jpg"]])
 
 
 def reasons(found: Matches, models: list[list[str]], **support: tuple[int, int]) -> dict[str, str | None]:
-    entries = account(NAMES, found, models, {}, {name: support.get(name[0], (0, 0)) for name in NAMES})
+    entries = account(NAMES, found, models, {}, {name: support.get(name[0], (0, 0)) for name in NAMES}, None)
     return {entry["file"][0]: entry["reason"] for entry in entries}
 
 
 def test_the_account_tells_who_is_registered() -> None:
     nothing = dict.fromkeys(NAMES, (0, 0))
-    entries = account(NAMES, *FOUR, {"a.jpg": 60, "b.jpg": 70, "c.jpg": 50}, nothing)
+    entries = account(NAMES, *FOUR, {"a.jpg": 60, "b.jpg": 70, "c.jpg": 50}, nothing, None)
     assert [entry["registered"] for entry in entries] == [True, True, True, False, False]
     assert [entry["observations"] for entry in entries] == [60, 70, 50, 0, 0]
     assert [entry["reason"] is None for entry in entries] == [True, True, True, False, False]

@@ -21,7 +21,7 @@ from stages.checkpoints import latest_checkpoint
 from stages.contract import StageError
 from stages.training_log import TrainingLog
 from stages.training_loop import TrainingRun
-from stages.training_state import Budget, Probes
+from stages.training_state import Probes, TrainingBudget
 from stages.unseen import Target, Unseen
 
 
@@ -88,11 +88,13 @@ def unseen() -> Unseen:
 
 
 def run_in(
-    folder: Path, progress, budget: Budget | None = None, make=None, target: Target | None = None
+    folder: Path, progress, budget: TrainingBudget | None = None, make=None, target: Target | None = None
 ) -> TrainingRun:
     folder.mkdir(exist_ok=True)
     maker, probes = make or (lambda attempt: OneNumber(attempt, quiet)), Probes(probe(), unseen(), target)
-    return TrainingRun(maker, probes, budget or Budget(40, None), folder, 1e-9, TrainingLog(folder, False), progress)
+    return TrainingRun(
+        maker, probes, budget or TrainingBudget(40, None), folder, 1e-9, TrainingLog(folder, False), progress
+    )
 
 
 def number_of(run: TrainingRun) -> OneNumber:
@@ -136,7 +138,7 @@ def test_finished_and_run_again_does_nothing(tmp_path: Path, progress) -> None:
 
 
 def test_a_run_in_seconds_takes_about_that_long_and_its_share_ends_at_1(tmp_path: Path, progress) -> None:
-    run = run_in(tmp_path, progress, Budget(None, 0.3), make=lambda attempt: OneNumber(attempt, slow))
+    run = run_in(tmp_path, progress, TrainingBudget(None, 0.3), make=lambda attempt: OneNumber(attempt, slow))
     run.train()
     assert 0.2 < run.state.seconds < 0.5
     assert run.plan.share(run.state.step) == pytest.approx(1)
@@ -147,9 +149,9 @@ def test_a_run_in_seconds_takes_about_that_long_and_its_share_ends_at_1(tmp_path
 
 def test_a_resumed_run_in_seconds_replays_its_plan(tmp_path: Path, progress) -> None:
     with pytest.raises(Killed):
-        run_in(tmp_path, progress, Budget(None, 0.3), make=killed_at(30)).train()
+        run_in(tmp_path, progress, TrainingBudget(None, 0.3), make=killed_at(30)).train()
     journal = json.loads((tmp_path / "plan.json").read_text())
-    resumed = run_in(tmp_path, progress, Budget(None, 0.3), make=lambda attempt: OneNumber(attempt, slow))
+    resumed = run_in(tmp_path, progress, TrainingBudget(None, 0.3), make=lambda attempt: OneNumber(attempt, slow))
     resumed.train()
     assert [list(decision) for decision in resumed.plan.decisions] == journal
     assert resumed.state.step == journal[-1][1]
@@ -257,14 +259,14 @@ def test_every_checkpoint_loads(tmp_path: Path, progress) -> None:
 
 
 def finished(folder: Path, progress, steps: int = 40) -> Path:
-    run_in(folder, progress, Budget(steps, None)).train()
+    run_in(folder, progress, TrainingBudget(steps, None)).train()
     return folder
 
 
 def test_more_steps_begin_where_the_finished_run_ended_at_the_longer_run_s_rates(tmp_path: Path, progress) -> None:
     first = finished(tmp_path / "first", progress)
     before = {path: path.read_bytes() for path in first.rglob("*") if path.is_file()}
-    longer = run_in(tmp_path / "more", progress, Budget(20, None, first))
+    longer = run_in(tmp_path / "more", progress, TrainingBudget(20, None, first))
     longer.train()
     assert [(step, share) for step, share, _ in number_of(longer).history] == [
         (step, pytest.approx(step / 60)) for step in range(40, 60)
@@ -277,7 +279,7 @@ def test_more_steps_begin_where_the_finished_run_ended_at_the_longer_run_s_rates
 
 
 def test_more_steps_in_two_pieces_are_the_same_bytes(tmp_path: Path, progress) -> None:
-    first, budget = finished(tmp_path / "first", progress), Budget(20, None, tmp_path / "first")
+    first, budget = finished(tmp_path / "first", progress), TrainingBudget(20, None, tmp_path / "first")
     whole = run_in(tmp_path / "whole", progress, budget)
     whole.train()
     with pytest.raises(Killed):
@@ -293,9 +295,9 @@ def test_more_seconds_take_about_that_long(tmp_path: Path, progress) -> None:
     def make(attempt: int) -> OneNumber:
         return OneNumber(attempt, slow)
 
-    first = run_in(tmp_path / "first", progress, Budget(None, 0.2), make)
+    first = run_in(tmp_path / "first", progress, TrainingBudget(None, 0.2), make)
     first.train()
-    more = run_in(tmp_path / "more", progress, Budget(None, 0.2, tmp_path / "first"), make)
+    more = run_in(tmp_path / "more", progress, TrainingBudget(None, 0.2, tmp_path / "first"), make)
     assert more.plan.share(first.state.step) == pytest.approx(0.5, abs=0.05)
     more.train()
     assert 0.1 < more.state.seconds - first.state.seconds < 0.35
@@ -306,7 +308,7 @@ def test_without_a_readable_state_there_is_no_more(tmp_path: Path, progress) -> 
     for path in (first / "checkpoints").glob("*.safetensors"):
         path.write_bytes(b"")
     with pytest.raises(StageError, match="cannot be read"):
-        run_in(tmp_path / "more", progress, Budget(20, None, first))
+        run_in(tmp_path / "more", progress, TrainingBudget(20, None, first))
 
 
 class Rising(OneNumber):
@@ -332,7 +334,7 @@ class RisingLess(Rising):
 
 
 def towards(folder: Path, progress, target: float, make=Rising, steps: int = 1000) -> TrainingRun:
-    run = run_in(folder, progress, Budget(steps, None), lambda attempt: make(), Target(target, unseen()))
+    run = run_in(folder, progress, TrainingBudget(steps, None), lambda attempt: make(), Target(target, unseen()))
     run.train()
     return run
 
