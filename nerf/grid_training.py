@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Sequence
 from dataclasses import astuple, dataclass
 from functools import partial
+from itertools import pairwise
 from typing import Literal, NamedTuple
 
 import torch
@@ -145,6 +146,10 @@ class GridTrainer:
         self.mean = {name: torch.zeros_like(tensor) for name, tensor in self.parameters.items()}
         self.square = {name: torch.zeros_like(tensor) for name, tensor in self.parameters.items()}
         self.grad_table = torch.zeros_like(model.table)
+        tables = model.table, self.grad_table, self.mean["table"], self.square["table"]
+        self.levels = [
+            tuple(tensor[first:end] for tensor in tables) for first, end in pairwise(model.layout.first_rows)
+        ]
         self.samples_per_ray = torch.tensor(FIRST_SAMPLES_PER_RAY, dtype=torch.float64)
 
     def _usable(self) -> Bool[Tensor, "cache"] | None:
@@ -303,11 +308,8 @@ class GridTrainer:
         with part("scatter", Work(rows=CORNERS * sum(len(each.points) for each in parts))):
             for each in parts:
                 backend.encode_backward_table(layout, level, each.points, each.features, self.grad_table)
-        rows = slice(layout.first_rows[level], layout.first_rows[level + 1])
-        of_level = [self.model.table, self.grad_table, self.mean["table"], self.square["table"]]
-        table, grad, mean, square = (tensor[rows] for tensor in of_level)
-        with part("optimiser", Work(bytes=ADAM_BYTES * table.numel())):
-            backend.adam(table, grad, mean, square, rate, count)
+        with part("optimiser", Work(bytes=ADAM_BYTES * self.levels[level][0].numel())):
+            backend.adam(*self.levels[level], rate, count)
 
     def _update_small(
         self, names: Iterable[str], of_parts: Sequence[dict[str, Tensor]], rate: float, count: int

@@ -28,16 +28,18 @@ from nerf.model import Rendering
 from nerf.rays import Rays
 
 BOX = REGION_HALF  # half the side of the cube that a bounded scene fills
+ALIGNED_ROWS = 4  # of four features: a cache line, and a whole number of vectors for Adam
 CONTRACTED_BOX = 2.0  # half the side of the cube into which contraction folds space
 
 
 class GridLayout(NamedTuple):
     """A table that holds the vertices of several grids over the unit cube: level after level, a row per vertex.
 
-    Level l has ``resolutions[l]`` cells along each axis and owns the rows [first_rows[l], first_rows[l + 1]). Where
-    these suffice for all (R + 1)³ vertices, vertex (x, y, z) has row first_rows[l] + (x (R + 1) + y) (R + 1) + z (a
-    dense level). Otherwise their number is a power of two, and vertices share rows by the hash
-    (x ⊕ 2654435761 y ⊕ 805459861 z) mod rows, in unsigned 32-bit arithmetic (Müller et al. 2022, eq. 4).
+    Level l has ``resolutions[l]`` cells along each axis and owns the rows [first_rows[l], first_rows[l + 1]), the last
+    few of which may belong to no vertex. Where these suffice for all (R + 1)³ vertices, vertex (x, y, z) has row
+    first_rows[l] + (x (R + 1) + y) (R + 1) + z (a dense level). Otherwise their number is a power of two, and vertices
+    share rows by the hash (x ⊕ 2654435761 y ⊕ 805459861 z) mod rows, in unsigned 32-bit arithmetic (Müller et al.
+    2022, eq. 4).
     """
 
     resolutions: tuple[int, ...]
@@ -71,7 +73,8 @@ def grid_layout(levels: int, coarsest: int, finest: int, log2_rows: int, feature
     resolutions = tuple(round(first * growth**level) for level in range(levels))
     first_rows = [0]
     for resolution in resolutions:
-        first_rows.append(first_rows[-1] + min((resolution + 1) ** 3, 1 << log2_rows))
+        vertices = -(-((resolution + 1) ** 3) // ALIGNED_ROWS) * ALIGNED_ROWS
+        first_rows.append(first_rows[-1] + min(vertices, 1 << log2_rows))
     return GridLayout(resolutions, tuple(first_rows), features)
 
 

@@ -2,6 +2,7 @@
 
 import json
 import math
+from typing import Any
 from dataclasses import replace
 
 import numpy as np
@@ -151,7 +152,8 @@ class Sheet:
 
 def test_a_sheet_that_lets_light_through_has_its_own_colour():
     vertices, along_z = np.array([[0.0, 0, 0], [0.3, 0, 5.0]]), np.tile([0.0, 0, 1], (2, 1))
-    colours = mesh._colours(Sheet(), vertices, along_z, VOXEL, "cpu")
+    sheet: Any = Sheet()
+    colours = mesh._colours(sheet, vertices, along_z, VOXEL, "cpu")
     assert colours.tolist() == [[255, 0, 0], [255, 255, 255]], "the second vertex has nothing about it"
 
 

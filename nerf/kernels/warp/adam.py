@@ -25,11 +25,13 @@ def adam(
 ) -> None:
     """As in nerf.kernels.adam."""
     mean_share, square_share = 1 - MEAN_DECAY**count, 1 - SQUARE_DECAY**count
-    whole = parameter.numel() // _LANES
-    flat = [tensor.view(-1) for tensor in (parameter, gradient, mean, square)]
-    launch(_adam16, whole, rate / mean_share, 1 / square_share, *(part[: whole * _LANES] for part in flat))
-    rest = parameter.numel() - whole * _LANES
-    launch(_adam, rest, rate / mean_share, 1 / square_share, *(part[whole * _LANES :] for part in flat))
+    scales, tensors = (rate / mean_share, 1 / square_share), (parameter, gradient, mean, square)
+    whole, rest = divmod(parameter.numel(), _LANES)
+    if rest:
+        flat = [tensor.view(-1) for tensor in tensors]
+        launch(_adam, rest, *scales, *(tensor[-rest:] for tensor in flat))
+        tensors = tuple(tensor[:-rest] for tensor in flat)
+    launch(_adam16, whole, *scales, *tensors)
 
 
 @wp.func
