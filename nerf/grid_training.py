@@ -24,7 +24,6 @@ from nerf.ray_bank import RayBank
 from nerf.rays import Rays
 from nerf.sky import PRIOR as SKY_PRIOR
 from nerf.sky import RATE as SKY_RATE
-from nerf.sparse_depth import depth_loss, depth_loss_backward
 from nerf.stopwatch import Work, part
 from nerf.training import RAYS, NonFinite, StepResult, all_finite
 from nerf.visibility import usable_cells
@@ -264,8 +263,9 @@ class GridTrainer:
         if self._is_guided(share):
             each = torch.full_like(batch.distance, self.settings.depth_loss * depth_factor(share) / rays)
             places = done.rays.far, batch.distance, lattice
-            value = value + (each * depth_loss(done.samples, done.weights, done.rendering.opacity, *places)).sum()
-            of_weights, of_opacity = depth_loss_backward(done.samples, *places, each)
+            apart = backend.depth_loss(done.samples, done.weights, done.rendering.opacity, *places)
+            value = value + (each * apart).sum()
+            of_weights, of_opacity = backend.depth_loss_backward(done.samples, *places, each)
             grad_weights, grad = grad_weights + of_weights, grad._replace(opacity=grad.opacity + of_opacity)
         return Loss(value, squared_error, grad, grad_weights, photos)
 

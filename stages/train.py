@@ -51,12 +51,12 @@ PAPER_SIZES = {
 # Of the grid field at first; both fall while training. Where space is folded a cell is met from farther away, and rays
 # are longer.
 GRID_RATES = {"bounded": 2e-2, "contracted": 1e-2}
-# Colours of a step, as measured: in a box larger steps go with its closer samples; in folded space they gained nothing
-# where there are many photos and lost where there are few (docs/numbers.md).
-GRID_SAMPLES = {"bounded": 3 << 13, "contracted": 1 << 14}
-# A GPU takes steps of many more colours in the same time, whose gradients are sure enough for the larger rate
+# Colours that each part of a step computes, so each core: half of what a part takes does not depend on how many they
+# are, and fewer cost as long. In a box more of them go with its closer samples (docs/numbers.md).
+PART_SAMPLES = {"bounded": 3 << 13, "contracted": 1 << 14}
+# The largest step, which a GPU takes as fast as a small one. Its gradients are sure enough for the larger rate
 # (docs/numbers.md).
-GPU_SAMPLES, GPU_RATE = 1 << 18, 2e-2
+LARGEST_STEP, LARGE_STEP_RATE = 1 << 18, 2e-2
 
 GRID_ONLY = ("backend", "chunks", "levels", "log2_rows", "finest", "batch_samples", "ray_samples")
 PAPER_ONLY = (
@@ -195,11 +195,11 @@ def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
     config = with_habits(config)
     if config.kind == "grid":
         from stages.backend import chosen_backend, load_backend
-        from stages.device import compute_device, cores
+        from stages.device import compute_device
 
         backend = config.backend or chosen_backend(compute_device(), progress)
         load_backend(backend, compute_device(), progress)
-        config = config.model_copy(update={"backend": backend, "chunks": config.chunks or cores()})
+        config = config.model_copy(update={"backend": backend})
     if config.downscale is None or (config.kind == "grid" and None in (config.levels, config.log2_rows, config.finest)):
         from stages.training_size import chosen_downscale, grid_size, rays_in_budget
 
@@ -219,12 +219,12 @@ def with_habits(config: Config) -> Config:
 
 
 def _grid_habits(config: Config) -> dict[str, Any]:
-    from stages.device import compute_device
+    from stages.device import compute_device, cores
 
-    gpu = compute_device() == "cuda"
-    samples = config.batch_samples or (GPU_SAMPLES if gpu else GRID_SAMPLES[config.space])
-    rate = GPU_RATE if samples >= GPU_SAMPLES else GRID_RATES[config.space]
-    return {"background": "random", "learning_rate": rate, "batch_samples": samples}
+    gpu, parts = compute_device() == "cuda", config.chunks or cores()
+    samples = config.batch_samples or (LARGEST_STEP if gpu else min(LARGEST_STEP, parts * PART_SAMPLES[config.space]))
+    rate = LARGE_STEP_RATE if samples >= LARGEST_STEP else GRID_RATES[config.space]
+    return {"background": "random", "learning_rate": rate, "batch_samples": samples, "chunks": parts}
 
 
 def _paper_habits(config: Config) -> dict[str, Any]:

@@ -218,6 +218,25 @@ class Backend(Protocol):
         self, samples: Samples, weights: Float[Tensor, "samples"], lattice: Lattice, grad: Float[Tensor, "rays"]
     ) -> Float[Tensor, "samples"]: ...
 
+    def depth_loss(
+        self,
+        samples: Samples,
+        weights: Float[Tensor, "samples"],
+        opacity: Float[Tensor, "rays"],
+        far: Float[Tensor, "rays"],
+        distance: Float[Tensor, "rays"],
+        lattice: Lattice,
+    ) -> Float[Tensor, "rays"]: ...
+
+    def depth_loss_backward(
+        self,
+        samples: Samples,
+        far: Float[Tensor, "rays"],
+        distance: Float[Tensor, "rays"],
+        lattice: Lattice,
+        grad: Float[Tensor, "rays"],
+    ) -> tuple[Float[Tensor, "samples"], Float[Tensor, "rays"]]: ...
+
     def adam(
         self,
         parameter: Float[Tensor, "*shape"],

@@ -16,6 +16,7 @@ from nerf.kernels.packed_compositing import (
     distortion_backward,
     visible_front,
 )
+from nerf.kernels.sparse_depth import depth_loss, depth_loss_backward
 from nerf.kernels.waves import end_wave, pack_waves
 
 __all__ = [
@@ -25,6 +26,8 @@ __all__ = [
     "cell_corners",
     "composite",
     "composite_backward",
+    "depth_loss",
+    "depth_loss_backward",
     "distortion",
     "distortion_backward",
     "encode",

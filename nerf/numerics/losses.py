@@ -10,7 +10,6 @@ from nerf.metrics import PSNR_LIMIT, psnr
 from nerf.numerics import Bound, Case
 from nerf.numerics.light import N, light, packed
 from nerf.numerics.space import decades
-from nerf.sparse_depth import depth_loss, depth_loss_backward
 
 EVEN, GROWING = Lattice(0.05, 0.0, False, 8, 100), Lattice(0.05, 0.2, True, 8, 100)
 FAR = 1000.0
@@ -56,16 +55,16 @@ def _point_distances(like: Tensor) -> Tensor:
     return torch.tensor([770.0, 780.0, 1.0, 1e-38, 5000.0, 1e30]).to(like).repeat(len(like) // 6 + 1)[: len(like)]
 
 
-def _depth_loss(_: Backend, weights: Tensor) -> Tensor:
+def _depth_loss(backend: Backend, weights: Tensor) -> Tensor:
     samples, opacity = _far_out(weights, GROWING), weights.sum(-1)
     far = torch.full_like(opacity, FAR)
-    return depth_loss(samples, weights.reshape(-1), opacity, far, _point_distances(far), GROWING)[:, None]
+    return backend.depth_loss(samples, weights.reshape(-1), opacity, far, _point_distances(far), GROWING)[:, None]
 
 
-def _depth_loss_backward(_: Backend, grad: Tensor, weights: Tensor) -> tuple[Tensor]:
+def _depth_loss_backward(backend: Backend, grad: Tensor, weights: Tensor) -> tuple[Tensor]:
     far = torch.full_like(grad[:, 0], FAR)
     places = _far_out(weights, GROWING), far, _point_distances(far), GROWING
-    of_weights, of_opacity = depth_loss_backward(*places, grad[:, 0].contiguous())
+    of_weights, of_opacity = backend.depth_loss_backward(*places, grad[:, 0].contiguous())
     return (of_weights.view(-1, N) + of_opacity[:, None],)
 
 
@@ -112,7 +111,7 @@ CASES = [
     ),
     Case(
         formula="depth loss Σ w_i |m(t_i) − m(d)| + U |m(far) − m(d)|",
-        where="nerf/sparse_depth.py: depth_loss, depth_loss_backward",
+        where="nerf/kernels/sparse_depth.py: depth_loss, depth_loss_backward",
         domain="weights in [0, 1], 0 < d < 1e37; no point where d = 0",
         hazard="log of 0; the difference of logarithms that nearly agree is off by 5e-7",
         answer="the logarithm is taken of max(1, t/t₁); 5e-7 of the distance: points are known to 1e-3 of it at best",
@@ -123,6 +122,7 @@ CASES = [
         reference=_depth_loss_plainly,
         backward=_depth_loss_backward,
         differentiable=1,
+        kernels=True,
         value=Bound(3e-5, "one"),
         gradient=Bound(3e-5, "one"),
     ),

@@ -75,6 +75,10 @@ def test_weights_and_gradients_that_are_not_numbers_stay(backend: Backend) -> No
     lattice, weights = Lattice(0.01, 0.02, True, 8, 9), with_nan(torch.full((5,), 0.1))
     assert backend.distortion(SAMPLES, weights, lattice)[0].isnan()
     assert backend.distortion_backward(SAMPLES, weights, lattice, torch.ones(2))[0].isnan()
+    opacity, far, distance = torch.ones(2), torch.full((2,), 9.0), torch.ones(2)
+    assert backend.depth_loss(SAMPLES, weights, opacity, far, distance, lattice)[0].isnan()
+    of_weights, of_opacity = backend.depth_loss_backward(SAMPLES, far, distance, lattice, torch.full((2,), math.nan))
+    assert of_weights[0].isnan() and of_opacity[0].isnan()
     parameter, gradient, mean, square = torch.zeros(16), torch.ones(16), torch.zeros(16), torch.zeros(16)
     gradient[5] = math.nan
     backend.adam(parameter, gradient, mean, square, 0.1, 1)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from nerf.grid_field import GridSettings
 from nerf.scene import Camera, Scene
 from stages.effect_decisions import Decisions
-from stages.train import Config, with_habits
+from stages.train import LARGE_STEP_RATE, LARGEST_STEP, PART_SAMPLES, Config, with_habits
 from stages.training_data import scaled_size
 from stages.training_setup import grid_settings, has_sky
 from stages.training_size import (
@@ -143,7 +143,7 @@ def test_grids_grow_with_rays_and_pixels(scene: Scene, rays: float, factor: floa
 def test_a_gpu_has_larger_fields_and_takes_larger_steps(
     scene: Scene, folded: bool, most: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    config, large = Config(contracted=folded, downscale=1.0), of_size(scene, 4000, 3000)
+    config, large = Config(contracted=folded, downscale=1.0, chunks=2), of_size(scene, 4000, 3000)
     on_cpu = grid_size(config, large, 1e9), with_habits(config)
     monkeypatch.setattr("stages.training_size.compute_device", lambda: "cuda")
     monkeypatch.setattr("stages.device.compute_device", lambda: "cuda")
@@ -156,9 +156,17 @@ def test_a_gpu_has_larger_fields_and_takes_larger_steps(
         "finest": 512 // (2 - folded),
     }
     assert (on_gpu[1].batch_samples, on_gpu[1].learning_rate) == (1 << 18, 2e-2)
-    assert (on_cpu[1].batch_samples or 0) < 1 << 15
+    assert (on_cpu[1].batch_samples or 0) < 1 << 16
     few = with_habits(config.model_copy(update={"batch_samples": 1 << 14}))
     assert few.learning_rate == (1e-2 if folded else 2e-2)
+
+
+@pytest.mark.parametrize("folded", [True, False])
+def test_every_core_has_a_part_of_the_same_size_up_to_the_largest_step(folded: bool) -> None:
+    parts = [with_habits(Config(contracted=folded, chunks=chunks)) for chunks in (1, 2, 64)]
+    sizes = [part.batch_samples or 0 for part in parts]
+    assert sizes == [PART_SAMPLES[parts[0].space], 2 * sizes[0], LARGEST_STEP]
+    assert parts[2].learning_rate == LARGE_STEP_RATE >= (parts[1].learning_rate or 1)
 
 
 def test_samples_follow_cells_of_a_1024th_at_most() -> None:

@@ -19,6 +19,7 @@ from nerf.kernels.warp.encoding import encode, encode_backward_points, encode_ba
 from nerf.kernels.warp.launch import compile_kernels, why_not
 from nerf.kernels.warp.layers import add_ray_relu, add_ray_relu_backward, relu_backward
 from nerf.kernels.warp.marching import march, sample_points, sample_points_backward
+from nerf.kernels.warp.sparse_depth import depth_loss, depth_loss_backward
 from nerf.kernels.warp.waves import end_wave, pack_waves
 
 __all__ = [
@@ -29,6 +30,8 @@ __all__ = [
     "compile_kernels",
     "composite",
     "composite_backward",
+    "depth_loss",
+    "depth_loss_backward",
     "distortion",
     "distortion_backward",
     "encode",

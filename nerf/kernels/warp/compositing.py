@@ -69,7 +69,7 @@ def composite_backward(
 def distortion(samples: Samples, weights: Float[Tensor, "samples"], lattice: Lattice) -> Float[Tensor, "rays"]:
     """As in nerf.kernels.packed_compositing."""
     spread = weights.new_empty(len(samples.starts) - 1)
-    launch(_distortion, len(spread), _grows_from(lattice), samples.starts, samples.t, samples.dt, weights, spread)
+    launch(_distortion, len(spread), grows_from(lattice), samples.starts, samples.t, samples.dt, weights, spread)
     return spread
 
 
@@ -79,11 +79,11 @@ def distortion_backward(
     """As in nerf.kernels.packed_compositing."""
     grad_weights = torch.empty_like(weights)
     packed = samples.starts, samples.t, samples.dt, weights
-    launch(_distortion_backward, len(grad), _grows_from(lattice), *packed, grad, grad_weights)
+    launch(_distortion_backward, len(grad), grows_from(lattice), *packed, grad, grad_weights)
     return grad_weights
 
 
-def _grows_from(lattice: Lattice) -> float:
+def grows_from(lattice: Lattice) -> float:
     """The distance from which steps grow; 0 where they never do."""
     return lattice.linear_until if lattice.cone else 0.0
 
@@ -207,7 +207,7 @@ def _composite_backward(
 
 
 @wp.func
-def _position(grows_from: float, t: float):
+def position(grows_from: float, t: float):
     """Along a ray as the lattice measures it: the distance, or its logarithm where steps grow."""
     if grows_from == 0.0:
         return t
@@ -238,7 +238,7 @@ def _distortion(
     total = wp.float64(0.0)
     last = float(0.0)
     for i in range(starts[ray], starts[ray + 1]):
-        m = _position(grows_from, distances[i])
+        m = position(grows_from, distances[i])
         w = weights[i]
         own = w * _length(grows_from, distances[i], lengths[i]) / 3.0
         apart += before * wp.float64(m - last)
@@ -265,7 +265,7 @@ def _distortion_backward(
     apart = wp.float64(0.0)
     last = float(0.0)
     for i in range(start, end):
-        m = _position(grows_from, distances[i])
+        m = position(grows_from, distances[i])
         own = weights[i] * _length(grows_from, distances[i], lengths[i]) / 3.0
         apart += before * wp.float64(m - last)
         grad_weights[i] = grad[ray] * 2.0 * (float(apart) + own)
@@ -275,7 +275,7 @@ def _distortion_backward(
     apart = wp.float64(0.0)
     for step in range(end - start):
         i = end - 1 - step
-        m = _position(grows_from, distances[i])
+        m = position(grows_from, distances[i])
         apart += behind * wp.float64(last - m)
         grad_weights[i] = grad_weights[i] + grad[ray] * 2.0 * float(apart)
         behind += wp.float64(weights[i])

@@ -1,4 +1,4 @@
-"""Warp's compositing and distortion along rays are the reference's, in value and gradient."""
+"""Warp's compositing and losses along rays are the reference's, in value and gradient."""
 
 import pytest
 import torch
@@ -105,3 +105,14 @@ def test_distortion_and_its_gradient(device: str, lattice: Lattice) -> None:
     weights = uniform(device, 25, sum(COUNTS))
     agree("distortion", samples, weights, lattice)
     agree("distortion_backward", samples, weights, lattice, normal(device, 26, len(COUNTS)))
+
+
+@pytest.mark.parametrize("lattice", LATTICES.values(), ids=LATTICES)
+def test_depth_loss_and_its_gradient(device: str, lattice: Lattice) -> None:
+    samples, rays = packed(device, COUNTS), len(COUNTS)
+    weights, opacity = uniform(device, 27, sum(COUNTS)), uniform(device, 28, rays)
+    far, distance = 20 + uniform(device, 29, rays), 8 * uniform(device, 30, rays)
+    distance[::3] = 0  # no point is known
+    loss = agree("depth_loss", samples, weights, opacity, far, distance, lattice)
+    assert (loss[::3] == 0).all() and (loss[1::3] > 0).all()
+    agree("depth_loss_backward", samples, far, distance, lattice, normal(device, 31, rays))

@@ -19,6 +19,7 @@ MODULES = {
     "encoding": 3,
     "layers": 3,
     "marching": 4,
+    "sparse_depth": 2,
     "waves": 2,
 }
 

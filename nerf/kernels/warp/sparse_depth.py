@@ -1,0 +1,86 @@
+"""The loss at sparse points (``nerf.kernels.sparse_depth``): a ray is one thread's loop."""
+
+import torch
+import warp as wp
+from jaxtyping import Float
+from torch import Tensor
+
+from nerf.kernels import Lattice, Samples
+from nerf.kernels.warp.compositing import grows_from, position
+from nerf.kernels.warp.launch import launch
+
+wp.set_module_options({"enable_backward": False})
+
+
+def depth_loss(
+    samples: Samples,
+    weights: Float[Tensor, "samples"],
+    opacity: Float[Tensor, "rays"],
+    far: Float[Tensor, "rays"],
+    distance: Float[Tensor, "rays"],
+    lattice: Lattice,
+) -> Float[Tensor, "rays"]:
+    """As in nerf.kernels.sparse_depth."""
+    loss = torch.empty_like(distance)
+    packed = samples.starts, samples.t, weights
+    launch(_depth_loss, len(distance), grows_from(lattice), *packed, opacity, far, distance, loss)
+    return loss
+
+
+def depth_loss_backward(
+    samples: Samples,
+    far: Float[Tensor, "rays"],
+    distance: Float[Tensor, "rays"],
+    lattice: Lattice,
+    grad: Float[Tensor, "rays"],
+) -> tuple[Float[Tensor, "samples"], Float[Tensor, "rays"]]:
+    """As in nerf.kernels.sparse_depth."""
+    of_weights, of_opacity = torch.empty_like(samples.t), torch.empty_like(distance)
+    places = samples.starts, samples.t, far, distance
+    launch(_depth_loss_backward, len(distance), grows_from(lattice), *places, grad, of_weights, of_opacity)
+    return of_weights, of_opacity
+
+
+@wp.kernel
+def _depth_loss(
+    grows_from: float,
+    starts: wp.array[int],
+    distances: wp.array[float],
+    weights: wp.array[float],
+    opacity: wp.array[float],
+    far: wp.array[float],
+    distance: wp.array[float],
+    loss: wp.array[float],
+):
+    ray = wp.tid()
+    if distance[ray] == 0.0:
+        loss[ray] = 0.0
+        return
+    point = position(grows_from, distance[ray])
+    total = wp.float64((1.0 - opacity[ray]) * wp.abs(position(grows_from, far[ray]) - point))
+    for i in range(starts[ray], starts[ray + 1]):
+        total += wp.float64(weights[i] * wp.abs(position(grows_from, distances[i]) - point))
+    loss[ray] = float(total)
+
+
+@wp.kernel
+def _depth_loss_backward(
+    grows_from: float,
+    starts: wp.array[int],
+    distances: wp.array[float],
+    far: wp.array[float],
+    distance: wp.array[float],
+    grad: wp.array[float],
+    of_weights: wp.array[float],
+    of_opacity: wp.array[float],
+):
+    ray = wp.tid()
+    scale = wp.where(distance[ray] == 0.0, 0.0, grad[ray])
+    point = position(grows_from, distance[ray])
+    of_opacity[ray] = -scale * wp.abs(position(grows_from, far[ray]) - point)
+    if scale == 0.0:
+        for i in range(starts[ray], starts[ray + 1]):
+            of_weights[i] = 0.0
+        return
+    for i in range(starts[ray], starts[ray + 1]):
+        of_weights[i] = scale * wp.abs(position(grows_from, distances[i]) - point)
