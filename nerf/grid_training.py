@@ -308,8 +308,9 @@ class GridTrainer:
         with part("scatter", Work(rows=CORNERS * sum(len(each.points) for each in parts))):
             for each in parts:
                 backend.encode_backward_table(layout, level, each.points, each.features, self.grad_table)
-        with part("optimiser", Work(bytes=ADAM_BYTES * self.levels[level][0].numel())):
-            backend.adam(*self.levels[level], rate, count)
+        table, grad, mean, square = self.levels[level]
+        with part("optimiser", Work(bytes=ADAM_BYTES * table.numel())):
+            backend.adam(table, grad, mean, square, rate, count)
 
     def _update_small(
         self, names: Iterable[str], of_parts: Sequence[dict[str, Tensor]], rate: float, count: int
