@@ -29,7 +29,8 @@ DISTORTION = 2e-3
 DEPTH_LOSS = 0.1
 # Photos that must look into a cell for something to stand before their foregrounds (docs/numbers.md).
 LEAST_PHOTOS = 3
-COARSEST = 16
+# Cells along an axis of the coarsest grid: fewer where they have to fill all of folded space (docs/numbers.md).
+COARSEST = {"bounded": 16, "contracted": 8}
 # Samples along a ray (docs/numbers.md).
 MOST_STEPS = 576  # bounded scenes: steps along the diagonal of the box
 STEPS_PER_CELL = 3  # folded space: steps in one of the finest cells
@@ -175,7 +176,7 @@ def grid_settings(config: "Config", sky: bool) -> "GridSettings":
     return GridSettings(
         levels=config.levels,
         log2_rows=config.log2_rows,
-        coarsest=min(COARSEST, config.finest),
+        coarsest=min(COARSEST[config.space], config.finest),
         finest=config.finest,
         contracted=config.contracted,
         steps=max(1, round(config.ray_samples * min(math.sqrt(3) * config.finest, MOST_STEPS))),
