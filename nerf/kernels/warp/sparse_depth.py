@@ -21,7 +21,7 @@ def depth_loss(
     lattice: Lattice,
 ) -> Float[Tensor, "rays"]:
     """As in nerf.kernels.sparse_depth."""
-    loss = torch.empty_like(distance)
+    loss = torch.zeros_like(distance)
     packed = samples.starts, samples.t, weights
     launch(_depth_loss, len(distance), grows_from(lattice), *packed, opacity, far, distance, loss)
     return loss
@@ -35,7 +35,7 @@ def depth_loss_backward(
     grad: Float[Tensor, "rays"],
 ) -> tuple[Float[Tensor, "samples"], Float[Tensor, "rays"]]:
     """As in nerf.kernels.sparse_depth."""
-    of_weights, of_opacity = torch.empty_like(samples.t), torch.empty_like(distance)
+    of_weights, of_opacity = torch.zeros_like(samples.t), torch.zeros_like(distance)
     places = samples.starts, samples.t, far, distance
     launch(_depth_loss_backward, len(distance), grows_from(lattice), *places, grad, of_weights, of_opacity)
     return of_weights, of_opacity
@@ -54,7 +54,6 @@ def _depth_loss(
 ):
     ray = wp.tid()
     if distance[ray] == 0.0:
-        loss[ray] = 0.0
         return
     point = position(grows_from, distance[ray])
     total = wp.float64((1.0 - opacity[ray]) * wp.abs(position(grows_from, far[ray]) - point))
@@ -75,12 +74,9 @@ def _depth_loss_backward(
     of_opacity: wp.array[float],
 ):
     ray = wp.tid()
-    scale = wp.where(distance[ray] == 0.0, 0.0, grad[ray])
-    point = position(grows_from, distance[ray])
-    of_opacity[ray] = -scale * wp.abs(position(grows_from, far[ray]) - point)
-    if scale == 0.0:
-        for i in range(starts[ray], starts[ray + 1]):
-            of_weights[i] = 0.0
+    if distance[ray] == 0.0:
         return
+    point = position(grows_from, distance[ray])
+    of_opacity[ray] = -grad[ray] * wp.abs(position(grows_from, far[ray]) - point)
     for i in range(starts[ray], starts[ray + 1]):
-        of_weights[i] = scale * wp.abs(position(grows_from, distances[i]) - point)
+        of_weights[i] = grad[ray] * wp.abs(position(grows_from, distances[i]) - point)
