@@ -22,6 +22,7 @@ from nerf.parallel import in_order
 from nerf.randomness import generator
 from nerf.ray_bank import RayBank
 from nerf.rays import Rays
+from nerf.robust_loss import robust_error
 from nerf.sky import PRIOR as SKY_PRIOR
 from nerf.sky import RATE as SKY_RATE
 from nerf.stopwatch import Work, part
@@ -121,7 +122,7 @@ def depth_factor(share: float) -> float:
 
 
 class GridTrainer:
-    """Trains a grid field on the squared error of colours by Adam, and keeps its density cache. ``photo_rays`` and
+    """Trains a grid field on the robust error of colours by Adam, and keeps its density cache. ``photo_rays`` and
     ``photo_colours`` stand between the field and each photo (nerf/effects)."""
 
     def __init__(
@@ -252,9 +253,9 @@ class GridTrainer:
     def _loss(self, rays: int, share: float, done: GridPass, batch: GridBatch) -> Loss:
         seen = Seen(done.rendering, batch.background, batch.view)
         error = self.photo_colours.residual(seen, batch.target)
-        squared_error = error.square().sum() / (3 * rays)
-        grad, photos = self.photo_colours.backward(seen, error * (2 / (3 * rays)))
-        value, grad_weights = squared_error, torch.zeros_like(done.weights)
+        robust, pull = robust_error(error)
+        grad, photos = self.photo_colours.backward(seen, pull * (2 / (3 * rays)))
+        value, grad_weights = robust.sum() / (3 * rays), torch.zeros_like(done.weights)
         backend, lattice = self.model.backend, self.model.lattice
         if self.settings.distortion:
             each = torch.full_like(batch.distance, self.settings.distortion * distortion_factor(share) / rays)
@@ -267,7 +268,7 @@ class GridTrainer:
             value = value + (each * apart).sum()
             of_weights, of_opacity = backend.depth_loss_backward(done.samples, *places, each)
             grad_weights, grad = grad_weights + of_weights, grad._replace(opacity=grad.opacity + of_opacity)
-        return Loss(value, squared_error, grad, grad_weights, photos)
+        return Loss(value, error.square().sum() / (3 * rays), grad, grad_weights, photos)
 
     def _finite(self, step: int, parts: Sequence[_Part]) -> tuple[float, float]:
         """Loss and squared error as numbers, once they and all gradients are known to be finite.

@@ -4,8 +4,6 @@ Poses in transforms files are world_from_camera with OpenGL axes (x right, y up,
 OpenCV axes here and nowhere else. Photos are told apart by their own names, as ingest noted them.
 """
 
-import math
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -15,27 +13,22 @@ import numpy as np
 from jaxtyping import Float
 
 from nerf.scene import Camera
-from stages.colmap.cameras import camera_rays, focal_lengths_and_centre, rescaled
-from stages.colmap.model_files import FARTHEST, LARGEST_SIDE
+from stages.colmap.cameras import camera_rays, rescaled
+from stages.colmap.model_files import FARTHEST
 from stages.colmap.models import read_model
 from stages.contract import StageError
 from stages.photos import Photo
 from stages.sources import pose_matrix, read_transforms
 from stages.sparse_model import SparseImage, SparseModel
 from stages.transforms_export import OPENGL_FROM_OPENCV
+from stages.transforms_intrinsics import flaw_of, read_intrinsics
 
 ORTHONORMAL_WITHIN = 1e-3  # largest entry of RᵀR − 1 that is rounding; beyond it a matrix means something else
 ASPECT_WITHIN = 0.01
-# Focal lengths in widths of the picture: from 179° across to 20 seconds of arc, a telescope's.
-FOCAL_RATIOS = (0.005, 10_000.0)
-FARTHEST_CENTRE = 100.0  # in widths: where the principal point of the last corner cut out of a large picture may lie
 LARGEST_ENTRY = 1e6  # of a matrix that is looked at more closely: products of three of them are numbers
 MOST_NAMES = 5
-MOST_LETTERS = 40  # of a value, in an error
 TRANSFORMS_HINT = "Correct the file, or leave the cameras out to have them found from the photos."
 LENS_SAMPLES = 8  # pixels along each side at which a lens must have an inverse; normalise looks at more
-FISHEYE, RATIONAL, PANORAMA = "OPENCV_FISHEYE", "FULL_OPENCV", "EQUIRECTANGULAR"
-NO_PANORAMAS = "panoramas are not supported"
 
 
 @dataclass(frozen=True)
@@ -124,45 +117,11 @@ def _without_points(posed: Sequence[_Posed], source: str) -> SparseModel:
 def _camera(values: Mapping[str, Any], photo: Photo) -> Camera:
     """The intrinsics of one frame (its own values over those of the file), at the photo's size."""
     name = values["file_path"]
-
-    def number(key: str, default: float) -> float:
-        return _finite(values.get(key, default), f"{key} of frame {name!r}")
-
-    width, height = number("w", photo.width), number("h", photo.height)
-    if not all(1 <= side <= LARGEST_SIDE and side.is_integer() for side in (width, height)):
-        raise _wrong(f"the size of frame {name!r}", f"w and h are {width:g} and {height:g}")
-    fx = number("fl_x", _focal_of(values.get("camera_angle_x"), width, name))
-    fy = number("fl_y", _focal_of(values.get("camera_angle_y"), height, name) or fx)
-    pinhole = (fx, fy, number("cx", width / 2), number("cy", height / 2))
-    k = [number(f"k{i}", 0.0) for i in range(1, 7)]
-    p = [number("p1", 0.0), number("p2", 0.0)]
-    fisheye = bool(values.get("is_fisheye")) or str(values.get("camera_model", "")).endswith("FISHEYE")
-    model, distortion = _distortion(k, p, FISHEYE if fisheye else str(values.get("camera_model", "")), name)
-    return _at_size_of(photo, Camera(model, int(width), int(height), (*pinhole, *distortion)), name)
-
-
-def _distortion(k: list[float], p: list[float], declared: str, name: str) -> tuple[str, list[float]]:
-    """COLMAP's model for these terms and its parameters after fx, fy, cx, cy."""
-    if declared == PANORAMA:
-        raise _wrong(f"the camera model of frame {name!r}", NO_PANORAMAS)
-    if declared == FISHEYE:
-        return FISHEYE, k[:4]
-    if any(k[3:]) and declared != RATIONAL:
-        # In such files k4 multiplies r⁸, which no model of COLMAP has; FULL_OPENCV's k4 is a denominator's r².
-        raise _wrong(f"the distortion of frame {name!r}", "it has a k4, and its camera_model is not FULL_OPENCV")
-    if any(k[2:]):
-        return RATIONAL, [k[0], k[1], *p, *k[2:]]
-    if any(k) or any(p):
-        return "OPENCV", [k[0], k[1], *p]
-    return "PINHOLE", []
-
-
-def _focal_of(angle: Any, size: float, name: str) -> float:
-    """Focal length in pixels of a full viewing angle in radians across ``size`` pixels; 0 without an angle."""
-    if angle is None:
-        return 0.0
-    angle = _finite(angle, f"the viewing angle of frame {name!r}")
-    return 0.5 * size / math.tan(0.5 * angle) if 0 < angle < math.pi else 0.0
+    try:
+        camera = read_intrinsics(values, photo.width, photo.height)
+    except ValueError as error:
+        raise _wrong(f"the camera of frame {name!r}", str(error)) from error
+    return _at_size_of(photo, camera, name)
 
 
 def _pose(matrix: Any, name: str) -> Float[np.ndarray, "3 4"]:
@@ -187,13 +146,6 @@ def _pose(matrix: Any, name: str) -> Float[np.ndarray, "3 4"]:
         raise _wrong(f"the transform_matrix of frame {name!r}", why)
     u, _, vt = np.linalg.svd(rotation)
     return np.concatenate([u @ vt @ OPENGL_FROM_OPENCV, pose[:, 3:]], axis=1)
-
-
-def _finite(value: Any, what: str) -> float:
-    number = value if isinstance(value, int | float) and not isinstance(value, bool) else math.nan
-    if not abs(number) <= sys.float_info.max:
-        raise _wrong(what, f"it is {repr(value)[:MOST_LETTERS]}, not a finite number")
-    return float(number)
 
 
 def _wrong(what: str, why: str) -> StageError:
@@ -256,7 +208,7 @@ def _scale(camera: Camera, photo: Photo) -> tuple[float, float]:
 def _at_size_of(photo: Photo, camera: Camera, name: str) -> Camera:
     """``camera`` rescaled where the photo has another size. Raises StageError where it has another shape, too, and for
     a lens that is none."""
-    if flaw := _flaw(camera):
+    if flaw := flaw_of(camera):
         raise _wrong(f"the camera of {name!r}", flaw)
     camera_rays(camera, LENS_SAMPLES, LENS_SAMPLES)
     across, down = _scale(camera, photo)
@@ -268,23 +220,6 @@ def _at_size_of(photo: Photo, camera: Camera, name: str) -> Camera:
             f"it is for {camera.width}×{camera.height} pixels, the photo has {photo.width}×{photo.height}",
         )
     return rescaled(camera, photo.width, photo.height)
-
-
-def _flaw(camera: Camera) -> str | None:
-    """What is wrong with intrinsics that no lens and no crop could have."""
-    if camera.model == PANORAMA:
-        return NO_PANORAMAS
-    if not np.isfinite(camera.params).all():
-        return f"its parameters are not finite: {', '.join(f'{value:.5g}' for value in camera.params)}"
-    focal, centre = focal_lengths_and_centre(camera)
-    longer = max(camera.width, camera.height)
-    if not all(FOCAL_RATIOS[0] <= value / longer <= FOCAL_RATIOS[1] for value in focal):
-        pixels = " × ".join(f"{value:.5g}" for value in focal)
-        return f"a focal length of {pixels} pixels is not one for a picture of {camera.width}×{camera.height}"
-    if max(map(abs, centre), default=0.0) > FARTHEST_CENTRE * longer:
-        place = ", ".join(f"{value:.5g}" for value in centre)
-        return f"its principal point ({place}) is far outside of its {camera.width}×{camera.height} pixels"
-    return None
 
 
 def _nothing_matches(source: str) -> StageError:

@@ -92,24 +92,30 @@ def median_camera(scene: "Scene") -> "Camera":
 def path_from_file(scene: "Scene", file: Path) -> CameraPath:
     """The cameras of a transforms.json (or of a path.json that this stage wrote), which lives in the sfm frame.
 
-    Poses are OpenGL camera-to-world matrices; intrinsics stand at the top or in each frame: ``w``, ``h`` and ``fl_x``
-    (with ``fl_y``, ``cx``, ``cy``, distortion) or ``camera_angle_x``; what is missing is taken from the photos.
+    Poses are OpenGL camera-to-world matrices; intrinsics stand at the top or in each frame, and what is missing of
+    them is taken from the photos.
     Raises StageError if the file cannot be used.
     """
     import numpy as np
 
     from stages.sources import read_transforms
+    from stages.transforms_intrinsics import read_intrinsics
 
     content = read_transforms(file)
     usual = median_camera(scene)
+    focal = usual.params[0] / max(usual.width, usual.height)
     cameras, poses = [], []
     for index, frame in enumerate(content["frames"]):
         try:
-            cameras.append(_camera(content | frame, usual))
+            cameras.append(read_intrinsics(content | frame, usual.width, usual.height, focal))
             poses.append(_in_scene(frame["transform_matrix"], scene.scene_from_sfm))
         except (TypeError, ValueError, ArithmeticError) as error:
             hint = "Give numbers as output/transforms.json and output/path.json have them."
             raise StageError(f"cannot use frame {index} of {file.name}", str(error), hint) from error
+    if (side := max(max(camera.width, camera.height) for camera in cameras)) > LARGEST_SIDE:
+        raise StageError(
+            f"cannot render the frames of {file.name}", f"one is {side} pixels long", f"Give at most {LARGEST_SIDE}."
+        )
     if len({(camera.width, camera.height) for camera in cameras}) > 1:
         raise StageError(
             f"cannot make one video of {file.name}", "its frames differ in size", "Give all frames one w and h."
@@ -130,31 +136,6 @@ def _in_scene(matrix: Any, scene_from_sfm: "Similarity") -> "np.ndarray":
         raise ValueError("its transform_matrix mirrors, or has no volume")
     rotation = nearest_rotations(pose[:, :3] @ OPENGL_FROM_OPENCV)
     return scene_from_sfm.pose(np.concatenate([rotation, pose[:, 3:]], axis=1))
-
-
-def _camera(values: dict[str, Any], usual: "Camera") -> "Camera":
-    """Intrinsics under the format's names as a COLMAP camera."""
-    import math
-
-    from nerf.scene import Camera
-
-    width, height = int(values.get("w", usual.width)), int(values.get("h", usual.height))
-    if "fl_x" in values:
-        fx = float(values["fl_x"])
-    elif "camera_angle_x" in values:
-        fx = 0.5 * width / math.tan(0.5 * float(values["camera_angle_x"]))
-    else:
-        fx = usual.params[0] * max(width, height) / max(usual.width, usual.height)
-    fy = float(values.get("fl_y", fx))
-    if not (0 < width <= LARGEST_SIDE and 0 < height <= LARGEST_SIDE and 0 < fx < math.inf and 0 < fy < math.inf):
-        raise ValueError(f"size {width:.6g} x {height:.6g} with focal length {fx:g} is no camera")
-    pinhole = (fx, fy, float(values.get("cx", width / 2)), float(values.get("cy", height / 2)))
-    fisheye = values.get("camera_model") == "OPENCV_FISHEYE"
-    names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2")
-    distortion = tuple(float(values.get(name, 0.0)) for name in names)
-    if fisheye or any(distortion):
-        return Camera("OPENCV_FISHEYE" if fisheye else "OPENCV", width, height, pinhole + distortion)
-    return Camera("PINHOLE", width, height, pinhole)
 
 
 def even_height(width: int, camera: "Camera") -> int:

@@ -1,4 +1,4 @@
-"""Cases of what training minimises and what quality is told in: distortion, depth loss, PSNR."""
+"""Cases of what training minimises and what quality is told in: errors of colours, distortion, depth loss, PSNR."""
 
 from typing import Any
 
@@ -10,6 +10,7 @@ from nerf.metrics import PSNR_LIMIT, psnr
 from nerf.numerics import Bound, Case
 from nerf.numerics.light import N, light, packed
 from nerf.numerics.space import decades
+from nerf.robust_loss import LARGEST_PULL, robust_error
 
 EVEN, GROWING = Lattice(0.05, 0.0, False, 8, 100), Lattice(0.05, 0.2, True, 8, 100)
 FAR = 1000.0
@@ -78,6 +79,11 @@ def _depth_loss_plainly(weights: Tensor) -> Tensor:
     return (all_light * (m(ends) - point).abs()).sum(-1, keepdim=True)
 
 
+def _huber(error: Tensor) -> Tensor:
+    size = error.abs()
+    return torch.where(size <= LARGEST_PULL, size.square(), 2 * LARGEST_PULL * size - LARGEST_PULL**2)
+
+
 def _psnrs(_: Backend, error: Tensor) -> Tensor:
     return torch.tensor([[psnr(float(each))] for each in error[:, 0]], dtype=torch.float64)
 
@@ -125,6 +131,22 @@ CASES = [
         kernels=True,
         value=Bound(3e-5, "one"),
         gradient=Bound(3e-5, "one"),
+    ),
+    Case(
+        formula="colour loss e², 2 d |e| − d² where |e| > d",
+        where="nerf/robust_loss.py: robust_error",
+        domain="any e; NaN and ∞ stay so",
+        hazard="e² overflows beyond 1e19",
+        answer="p (2 e − p) with the pull p = clamp(e, −d, d), half the gradient",
+        tried="|e| from 1e-6 to 1; 0, ± d and their neighbours, ± 1e30",
+        typical=lambda: (decades(1, -6, 0, 256, 1),),
+        extreme=lambda: (torch.tensor([[0.0], [0.1], [-0.1], [0.1000001], [-0.0999999], [1e30], [-1e30]]),),
+        function=lambda _, error: robust_error(error)[0],
+        reference=_huber,
+        backward=lambda _, grad, error: (2 * grad * robust_error(error)[1],),
+        differentiable=1,
+        value=Bound(5e-7, "itself"),
+        gradient=Bound(5e-7, "itself"),
     ),
     Case(
         formula="PSNR −10 log₁₀ MSE",

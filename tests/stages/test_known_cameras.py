@@ -119,23 +119,23 @@ def _with(row: int, column: int, value: float) -> list[list[float]]:
         ({"transform_matrix": (matrix(1) @ np.diag([-1, 1, 1, 1])).tolist()}, r"frame './1': it mirrors"),
         ({"transform_matrix": (matrix(1) @ np.diag([2, 2, 2, 1])).tolist()}, r"no rotation: .* it scales by 2\."),
         ({"transform_matrix": np.zeros((4, 4)).tolist()}, r"no rotation: RᵀR is off by 1, and it scales by 0\."),
-        ({"fl_x": 0}, r"camera of './1': a focal length of 0 × 52 pixels is not one for a picture of 60×40"),
-        ({"fl_x": -50}, r"camera of './1': a focal length of -50 × 52 pixels is not one"),
-        ({"fl_x": 1e308}, r"camera of './1': a focal length of 1e\+308 × 52 pixels is not one"),
-        ({"fl_x": 1e-300}, r"camera of './1': a focal length of 1e-300 × 52 pixels is not one"),
-        ({"fl_x": 10**400}, r"fl_x of frame './1': it is 10{39}, not a finite number"),
-        ({"cx": -1e300}, r"camera of './1': its principal point \(-1e\+300, 19\) is far outside of its 60×40"),
-        ({"w": 10**30, "h": 10**30}, r"size of frame './1': w and h are 1e\+30 and 1e\+30"),
+        ({"fl_x": 0}, r"camera of frame './1': a focal length of 0 × 52 pixels is not one for a picture of 60×40"),
+        ({"fl_x": -50}, r"camera of frame './1': a focal length of -50 × 52 pixels is not one"),
+        ({"fl_x": 1e308}, r"camera of frame './1': a focal length of 1e\+308 × 52 pixels is not one"),
+        ({"fl_x": 1e-300}, r"camera of frame './1': a focal length of 1e-300 × 52 pixels is not one"),
+        ({"fl_x": 10**400}, r"camera of frame './1': its fl_x is 10{39}, not a finite number"),
+        ({"cx": -1e300}, r"camera of frame './1': its principal point \(-1e\+300, 19\) is far outside of its 60×40"),
+        ({"w": 10**30, "h": 10**30}, r"camera of frame './1': its w and h are 1e\+30 and 1e\+30"),
         ({"transform_matrix": _with(0, 3, 1e300)}, r"frame './1': its place is 1e\+300 units from the origin"),
         ({"transform_matrix": _with(0, 0, 1e308)}, r"frame './1': it is no rotation: 1e\+308 is in it"),
         ({"transform_matrix": _with(0, 0, 10**400)}, r"frame './1': its transform_matrix is not a matrix of numbers"),
-        ({"fl_x": math.nan}, r"fl_x of frame './1': it is nan, not a finite number"),
-        ({"cx": "31"}, r"cx of frame './1': it is '31', not a finite number"),
-        ({"k1": True}, r"k1 of frame './1': it is True, not a finite number"),
-        ({"w": 0, "h": 0}, r"size of frame './1': w and h are 0 and 0"),
+        ({"fl_x": math.nan}, r"camera of frame './1': its fl_x is nan, not a finite number"),
+        ({"cx": "31"}, r"camera of frame './1': its cx is '31', not a finite number"),
+        ({"k1": True}, r"camera of frame './1': its k1 is True, not a finite number"),
+        ({"w": 0, "h": 0}, r"camera of frame './1': its w and h are 0 and 0"),
         ({"w": 80, "h": 40}, r"camera of './1': it is for 80×40 pixels, the photo has 60×40"),
-        ({"k4": 0.1}, r"distortion of frame './1': it has a k4, and its camera_model is not FULL_OPENCV"),
-        ({"camera_model": "EQUIRECTANGULAR"}, r"camera model of frame './1': panoramas are not supported"),
+        ({"k4": 0.1}, r"camera of frame './1': it has a k4, and its camera_model is not FULL_OPENCV"),
+        ({"camera_model": "EQUIRECTANGULAR"}, r"camera of frame './1': panoramas are not supported"),
     ],
 )
 def test_what_is_no_camera_is_refused_by_name(read, changes: dict[str, Any], message: str) -> None:
@@ -144,7 +144,7 @@ def test_what_is_no_camera_is_refused_by_name(read, changes: dict[str, Any], mes
 
 
 def test_no_focal_length_at_all_is_refused(read) -> None:
-    with pytest.raises(StageError, match=r"camera of './0': a focal length of 0 × 0 pixels is not one"):
+    with pytest.raises(StageError, match=r"camera of frame './0': a focal length of 0 × 0 pixels is not one"):
         read([frame(0)])
 
 

@@ -184,6 +184,14 @@ def test_exported_cameras_come_back_as_the_photos_own(tmp_path: Path) -> None:
     assert path.cameras == (CAMERA,) * 5
 
 
+def test_a_fisheye_lens_and_a_third_radial_term_are_understood(tmp_path: Path) -> None:
+    frame = {"file_path": "r_0", "transform_matrix": np.eye(4).tolist(), "fl_x": 80, "k3": 0.01}
+    radial = given_path({"frames": [frame]}, scene_with(ring(5)), tmp_path).cameras[0]
+    assert (radial.model, radial.params[4:]) == ("FULL_OPENCV", (0, 0, 0, 0, 0.01, 0, 0, 0))
+    fisheye = given_path({"frames": [frame], "is_fisheye": True}, scene_with(ring(5)), tmp_path).cameras[0]
+    assert (fisheye.model, fisheye.params[4:]) == ("OPENCV_FISHEYE", (0, 0, 0.01, 0))
+
+
 def test_a_blender_camera_angle_is_understood_and_missing_sizes_are_the_photos(tmp_path: Path) -> None:
     frame = {"file_path": "r_0", "transform_matrix": np.eye(4).tolist()}
     camera = given_path({"camera_angle_x": np.pi / 2, "frames": [frame]}, scene_with(ring(5)), tmp_path).cameras[0]
@@ -198,12 +206,18 @@ def test_a_blender_camera_angle_is_understood_and_missing_sizes_are_the_photos(t
         ({"transform_matrix": 7}, "cannot use frame 0 of t.json: its transform_matrix is not 4 × 4"),
         ({"transform_matrix": None}, "cannot use frame 0 of t.json: its transform_matrix is not"),
         ({"transform_matrix": np.zeros((4, 4)).tolist()}, "its transform_matrix mirrors, or has no volume"),
-        ({"transform_matrix": np.eye(4).tolist(), "fl_x": -3}, "size 160 x 120 with focal length -3 is no camera"),
+        ({"transform_matrix": np.eye(4).tolist(), "fl_x": -3}, "a focal length of -3 × -3 pixels is not one"),
     ],
 )
 def test_unusable_frames_are_named(frame, words: str, tmp_path: Path) -> None:
     with pytest.raises(StageError, match=words):
         given_path({"frames": [{"file_path": "a"} | frame]}, scene_with(ring(5)), tmp_path)
+
+
+def test_frames_beyond_all_screens_are_refused(tmp_path: Path) -> None:
+    frame = {"file_path": "a", "transform_matrix": np.eye(4).tolist(), "w": 10**6, "h": 10}
+    with pytest.raises(StageError, match=r"cannot render the frames of t.json: one is 1000000 pixels long"):
+        given_path({"frames": [frame]}, scene_with(ring(5)), tmp_path)
 
 
 def test_frames_of_different_size_make_no_video(tmp_path: Path) -> None:

@@ -1,0 +1,94 @@
+"""Cameras of transforms files: nerfstudio's, instant-ngp's and Blender's names for intrinsics as COLMAP's models."""
+
+import math
+import sys
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from nerf.scene import Camera
+from stages.colmap.cameras import focal_lengths_and_centre
+from stages.colmap.model_files import LARGEST_SIDE
+
+# Focal lengths in widths of the picture: from 179° across to 20 seconds of arc, a telescope's.
+FOCAL_RATIOS = (0.005, 10_000.0)
+FARTHEST_CENTRE = 100.0  # in widths: where the principal point of the last corner cut out of a large picture may lie
+MOST_LETTERS = 40  # of a value, in an error
+FISHEYE, RATIONAL, PANORAMA = "OPENCV_FISHEYE", "FULL_OPENCV", "EQUIRECTANGULAR"
+NO_PANORAMAS = "panoramas are not supported"
+
+
+def read_intrinsics(values: Mapping[str, Any], width: int, height: int, focal: float = 0.0) -> Camera:
+    """The camera of a frame from ``w``, ``h``, ``fl_x``, ``fl_y`` or ``camera_angle_x``, ``camera_angle_y``, ``cx``,
+    ``cy``, ``k1`` …, ``p1``, ``p2`` and ``camera_model``; ``width``, ``height`` (pixels) and ``focal`` (in longer sides
+    of the picture) stand where the file has none.
+
+    Raises ValueError, saying what is wrong, for numbers that are not finite and for what no lens or crop could have.
+    """
+
+    def number(key: str, default: float) -> float:
+        return _finite(values.get(key, default), key)
+
+    w, h = number("w", width), number("h", height)
+    if not all(1 <= side <= LARGEST_SIDE and side.is_integer() for side in (w, h)):
+        raise ValueError(f"its w and h are {w:g} and {h:g}")
+    fx = number("fl_x", _focal_of(values.get("camera_angle_x"), w) or focal * max(w, h))
+    fy = number("fl_y", _focal_of(values.get("camera_angle_y"), h) or fx)
+    pinhole = (fx, fy, number("cx", w / 2), number("cy", h / 2))
+    k = [number(f"k{i}", 0.0) for i in range(1, 7)]
+    p = [number("p1", 0.0), number("p2", 0.0)]
+    declared = FISHEYE if values.get("is_fisheye") else str(values.get("camera_model", ""))
+    model, distortion = _distortion(k, p, declared)
+    camera = Camera(model, int(w), int(h), (*pinhole, *distortion))
+    if flaw := flaw_of(camera):
+        raise ValueError(flaw)
+    return camera
+
+
+def flaw_of(camera: Camera) -> str | None:
+    """What is wrong with intrinsics that no lens and no crop could have."""
+    if camera.model == PANORAMA:
+        return NO_PANORAMAS
+    if not np.isfinite(camera.params).all():
+        return f"its parameters are not finite: {', '.join(f'{value:.5g}' for value in camera.params)}"
+    focal, centre = focal_lengths_and_centre(camera)
+    longer = max(camera.width, camera.height)
+    if not all(FOCAL_RATIOS[0] <= value / longer <= FOCAL_RATIOS[1] for value in focal):
+        pixels = " × ".join(f"{value:.5g}" for value in focal)
+        return f"a focal length of {pixels} pixels is not one for a picture of {camera.width}×{camera.height}"
+    if max(map(abs, centre), default=0.0) > FARTHEST_CENTRE * longer:
+        place = ", ".join(f"{value:.5g}" for value in centre)
+        return f"its principal point ({place}) is far outside of its {camera.width}×{camera.height} pixels"
+    return None
+
+
+def _distortion(k: list[float], p: list[float], declared: str) -> tuple[str, list[float]]:
+    """COLMAP's model for these terms and its parameters after fx, fy, cx, cy."""
+    if declared == PANORAMA:
+        raise ValueError(NO_PANORAMAS)
+    if declared.endswith("FISHEYE"):
+        return FISHEYE, k[:4]
+    if any(k[3:]) and declared != RATIONAL:
+        # In such files k4 multiplies r⁸, which no model of COLMAP has; FULL_OPENCV's k4 is a denominator's r².
+        raise ValueError("it has a k4, and its camera_model is not FULL_OPENCV")
+    if any(k[2:]):
+        return RATIONAL, [k[0], k[1], *p, *k[2:]]
+    if any(k) or any(p):
+        return "OPENCV", [k[0], k[1], *p]
+    return "PINHOLE", []
+
+
+def _focal_of(angle: Any, size: float) -> float:
+    """Focal length in pixels of a full viewing angle in radians across ``size`` pixels; 0 without an angle."""
+    if angle is None:
+        return 0.0
+    angle = _finite(angle, "viewing angle")
+    return 0.5 * size / math.tan(0.5 * angle) if 0 < angle < math.pi else 0.0
+
+
+def _finite(value: Any, name: str) -> float:
+    number = value if isinstance(value, int | float) and not isinstance(value, bool) else math.nan
+    if not abs(number) <= sys.float_info.max:
+        raise ValueError(f"its {name} is {repr(value)[:MOST_LETTERS]}, not a finite number")
+    return float(number)
