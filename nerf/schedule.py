@@ -44,14 +44,14 @@ class StepPlan(NamedTuple):
         start, total, share, _ = next(decision for decision in reversed(self.decisions) if decision.from_step <= step)
         return share if total == start else share + (1 - share) * min(1.0, (step - start) / (total - start))
 
-    def revised(self, step: int, total_steps: int) -> "StepPlan":
-        """This plan with one more decision made before ``step``.
+    def revised(self, step: int, total_steps: int, share: float) -> "StepPlan":
+        """This plan with one more decision made before ``step``, when ``share`` of the run is done by the clock.
 
         Raises ValueError where that would leave no step to take, or rewrite a decision already made.
         """
         if not self.decisions[-1].from_step <= step < total_steps:
             raise ValueError(f"at step {step} the plan {self.decisions} cannot become {total_steps} steps")
-        return StepPlan((*self.decisions, Decision(step, total_steps, self.share(step), "clock")))
+        return StepPlan((*self.decisions, Decision(step, total_steps, share, "clock")))
 
     def closing(self, step: int) -> "StepPlan":
         """This plan with ``step`` as the first one of the last quarter of a run, or of what is left if that is less.
@@ -92,14 +92,16 @@ def steps_that_fit(step: int, seconds_left: float, steps_per_second: float) -> i
 
 
 def replanned(
-    plan: StepPlan, step: int, seconds_left: float, steps_per_second: float, tolerance_seconds: float
+    plan: StepPlan, step: int, seconds: float, budget: float, steps_per_second: float, tolerance: float
 ) -> StepPlan:
-    """The plan before ``step``, revised only if it would end more than ``tolerance_seconds`` early or late."""
-    expected = (plan.total_steps - step) / steps_per_second
-    if abs(expected - seconds_left) <= tolerance_seconds:
+    """The plan before ``step``, ``seconds`` of the ``budget`` being used; revised only if it would end more than
+    ``tolerance`` seconds early or late. Its share is then that of the time, so that a plan which the clock proved wrong
+    leaves no trace in the rates."""
+    left = budget - seconds
+    if abs((plan.total_steps - step) / steps_per_second - left) <= tolerance:
         return plan
-    total = steps_that_fit(step, seconds_left, steps_per_second)
-    return plan if total == plan.total_steps else plan.revised(step, total)
+    total = steps_that_fit(step, left, steps_per_second)
+    return plan if total == plan.total_steps else plan.revised(step, total, min(1.0, seconds / budget))
 
 
 def learning_rate(share: float, start: float, end: float) -> float:

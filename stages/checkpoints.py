@@ -45,9 +45,13 @@ def save_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
 
 
 def latest_checkpoint(
-    folder: Path, note: Callable[[str], None], fits: Callable[[Checkpoint], None] = lambda _: None
+    folder: Path,
+    note: Callable[[str], None],
+    fits: Callable[[Checkpoint], None] = lambda _: None,
+    remove: bool = True,
 ) -> Checkpoint | None:
-    """The newest good checkpoint, or None; every damaged one met on the way is removed and named to ``note``.
+    """The newest good checkpoint, or None; every damaged one met on the way is named to ``note``, and removed unless
+    the folder is a finished run's (``remove``).
 
     ``fits`` raises RuntimeError or TypeError for a checkpoint that is whole and belongs to something else, Lost for one
     of a field that is no good.
@@ -64,8 +68,9 @@ def latest_checkpoint(
         except (RuntimeError, TypeError) as fault:
             wrong = f"is not of this training ({' '.join(str(fault).split())})"
         note(f"the checkpoint of step {step} {wrong}; going back to the one before")
-        (folder / f"{step:09d}.json").unlink()
-        (folder / f"{step:09d}.safetensors").unlink(missing_ok=True)
+        if remove:
+            (folder / f"{step:09d}.json").unlink()
+            (folder / f"{step:09d}.safetensors").unlink(missing_ok=True)
     return None
 
 

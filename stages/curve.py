@@ -1,7 +1,8 @@
 """curve.json: quality against training time, and what it says in words.
 
-``{"device": "cpu" | "cuda", "threads", "points": [{"step", "seconds", "train_psnr", "heldout_psnr", "heldout_ssim"}
-…]}``; what cannot be measured is null. Seconds are those of training steps alone: measuring is not among them.
+``{"field": "grid" | "paper", "device": "cpu" | "cuda", "threads", "points": [{"step", "seconds", "train_psnr",
+"heldout_psnr", "heldout_ssim"} …]}``; what cannot be measured is null. Seconds are those of training steps alone:
+measuring is not among them.
 """
 
 from collections.abc import Sequence
@@ -18,11 +19,12 @@ BARS = "▁▂▃▄▅▆▇█"
 SPARK_WIDTH = 10
 
 
-def write_curve(folder: Path, points: list[dict[str, Any]]) -> None:
+def write_curve(folder: Path, field: str, points: list[dict[str, Any]]) -> None:
     """Write curve.json of a run that ends on this machine."""
     from stages.device import compute_device, cores
 
-    write_json(folder / "curve.json", {"device": compute_device(), "threads": cores(), "points": points})
+    about = {"field": field, "device": compute_device(), "threads": cores()}
+    write_json(folder / "curve.json", about | {"points": points})
 
 
 def heldout_curve(points: Sequence[dict[str, Any]]) -> list[tuple[float, float]]:
@@ -31,19 +33,20 @@ def heldout_curve(points: Sequence[dict[str, Any]]) -> list[tuple[float, float]]
     return [(seconds, psnr) for seconds, psnr in known if psnr is not None and seconds > 0]
 
 
-def coming_doubling(points: Sequence[dict[str, Any]]) -> "Gain | None":
-    """What the next doubling of the time is predicted to buy; None where the curve is too short."""
+def coming_doubling(field: str, points: Sequence[dict[str, Any]]) -> "Gain | None":
+    """What the next doubling of the time is predicted to buy; None where the curve is too short, and for the paper's
+    field, whose rate falls all the way: the prediction was fitted to the grid's."""
     from nerf.learning_curve import next_doubling
 
-    return next_doubling(heldout_curve(points), points[-1]["step"]) if points else None
+    return next_doubling(heldout_curve(points), points[-1]["step"]) if points and field == "grid" else None
 
 
-def doubling_words(points: Sequence[dict[str, Any]]) -> str | None:
-    """What the last doubling of the time bought and the next is predicted to buy; None where the curve is too short."""
+def doubling_words(points: Sequence[dict[str, Any]], coming: "Gain | None") -> str | None:
+    """What the last doubling of the time bought and what is ``coming``; None where the curve is too short."""
     from nerf.learning_curve import last_doubling
 
     curve = heldout_curve(points)
-    last, coming = last_doubling(curve), coming_doubling(points)
+    last = last_doubling(curve)
     if last is None:
         return None
     words = f"the last doubling of time, to {duration(curve[-1][0])}, bought {last:+.1f} dB on held-out photos"
@@ -52,9 +55,8 @@ def doubling_words(points: Sequence[dict[str, Any]]) -> str | None:
     return f"{words}; the next is predicted to buy {coming.db:+.1f} dB (± {coming.half_width:.1f})"
 
 
-def next_words(points: Sequence[dict[str, Any]]) -> str | None:
+def next_words(coming: "Gain | None") -> str | None:
     """:func:`doubling_words` for a line that has no room."""
-    coming = coming_doubling(points)
     return coming and f"the next doubling buys {coming.db:+.1f} ± {coming.half_width:.1f} dB"
 
 

@@ -267,17 +267,18 @@ def _curve(results: Results) -> dict[str, Any] | None:
     """The training curve, and what it says of the time, in sentences."""
     from markupsafe import Markup
 
-    from stages.curve import doubling_words, knee_words, ssim_words
+    from stages.curve import coming_doubling, doubling_words, knee_words, ssim_words
     from stages.report_plots import curve_svg
 
     if results.curve is None:
         return None
     points, metrics = results.curve["points"], results.metrics or {}
     baselines = {"nearest photo": "psnr_nearest_view", "mean image": "psnr_mean_image"}
-    svg = curve_svg(points, {name: metrics.get(key) for name, key in baselines.items()})
+    coming = coming_doubling(results.curve["field"], points)
+    svg = curve_svg(points, {name: metrics.get(key) for name, key in baselines.items()}, coming)
     if svg is None:
         return None
-    words = [doubling_words(points), knee_words(points), ssim_words(points)]
+    words = [doubling_words(points, coming), knee_words(points), ssim_words(points)]
     threads = results.curve["threads"]
     where = "a GPU" if results.curve["device"] == "cuda" else f"{threads} processor core{'' if threads == 1 else 's'}"
     return {"svg": Markup(svg), "words": [f"{word[0].upper()}{word[1:]}." for word in words if word], "where": where}

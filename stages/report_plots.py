@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING, Any
 
 from nerf import REGION_HALF
 from stages.amounts import duration
-from stages.curve import coming_doubling, heldout_curve
+from stages.curve import heldout_curve
 
 if TYPE_CHECKING:
     import numpy as np
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from nerf.learning_curve import Gain
     from nerf.scene import Scene, Split, View
 
 BLUE, ORANGE, GREY = "#3b82f6", "#f2711c", "#8a8f98"
@@ -23,9 +24,12 @@ MOST_POINTS = 20_000
 ROOM_BELOW = 0.08  # of the curve's height, so that the name of the lowest line stands clear of the times
 
 
-def curve_svg(points: Sequence[dict[str, Any]], baselines: dict[str, float | None]) -> str | None:
-    """PSNR against training seconds, one grid line per doubling of the time, with the knee and what the next doubling
-    is predicted to buy; None for fewer than two points. ``baselines`` are drawn as horizontal lines under their names.
+def curve_svg(
+    points: Sequence[dict[str, Any]], baselines: dict[str, float | None], coming: "Gain | None" = None
+) -> str | None:
+    """PSNR against training seconds, one grid line per doubling of the time, with the knee and what is ``coming``, what
+    the next doubling is predicted to buy; None for fewer than two points. ``baselines`` are drawn as horizontal lines
+    under their names.
     """
     rows = [row for row in points if row["seconds"] > 0]
     if len(rows) < 2:
@@ -37,7 +41,9 @@ def curve_svg(points: Sequence[dict[str, Any]], baselines: dict[str, float | Non
             if seen:
                 axes.plot(*zip(*seen, strict=True), color=colour, lw=2, marker="o", ms=3, label=label)
         _draw_baselines(axes, {name: psnr for name, psnr in baselines.items() if psnr is not None})
-        last = rows[-1]["seconds"] * (2 if _draw_prediction(axes, rows) else 1)
+        if coming is not None:
+            _draw_prediction(axes, rows, coming)
+        last = rows[-1]["seconds"] * (1 if coming is None else 2)
         _draw_knee(axes, heldout_curve(rows))
         _doubling_axis(axes, rows[0]["seconds"], rows[-1]["seconds"], last)
         axes.set(xlabel="training time", ylabel="PSNR (dB)")
@@ -45,15 +51,11 @@ def curve_svg(points: Sequence[dict[str, Any]], baselines: dict[str, float | Non
         return svg_element(figure)
 
 
-def _draw_prediction(axes: "Axes", rows: Sequence[dict[str, Any]]) -> bool:
-    """A dotted line on to twice the time, with its interval; False where nothing is predicted."""
-    coming = coming_doubling(rows)
-    if coming is None:
-        return False
+def _draw_prediction(axes: "Axes", rows: Sequence[dict[str, Any]], coming: "Gain") -> None:
+    """A dotted line on to twice the time, with its interval."""
     (seconds, psnr), style = heldout_curve(rows)[-1], {"color": BLUE, "lw": 1.5, "ls": (0, (1, 1.5))}
     axes.plot([seconds, 2 * seconds], [psnr, psnr + coming.db], label="predicted", **style)
     axes.errorbar(2 * seconds, psnr + coming.db, coming.half_width, color=BLUE, capsize=4, lw=1.5)
-    return True
 
 
 def _draw_knee(axes: "Axes", curve: Sequence[tuple[float, float]]) -> None:

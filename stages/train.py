@@ -53,6 +53,7 @@ PAPER_SIZES = {
 GRID_RATES = {"bounded": 2e-2, "contracted": 1e-2}
 # Colours that each part of a step computes, so each core: half of what a part takes does not depend on how many they
 # are, and fewer cost as long. In a box more of them go with its closer samples (docs/numbers.md).
+MOST_PARTS = 64
 PART_SAMPLES = {"bounded": 3 << 13, "contracted": 1 << 14}
 # The largest step, which a GPU takes as fast as a small one. Its gradients are sure enough for the larger rate
 # (docs/numbers.md).
@@ -109,7 +110,7 @@ class Config(StageConfig):
         default=None, description="grid: its kernels; none: warp where they run, torch runs anywhere"
     )
     chunks: int | None = Field(
-        default=None, ge=1, le=64, description="grid: parts of a step, each on a core; none: as many as cores"
+        default=None, ge=1, le=MOST_PARTS, description="grid: parts of a step, each on a core; none: as many as cores"
     )
     levels: int | None = Field(default=None, ge=1, le=16, description="grid: grids of features")
     log2_rows: int | None = Field(default=None, ge=8, le=24, description="grid: rows of a grid's table, as power of 2")
@@ -221,7 +222,7 @@ def with_habits(config: Config) -> Config:
 def _grid_habits(config: Config) -> dict[str, Any]:
     from stages.device import compute_device, cores
 
-    gpu, parts = compute_device() == "cuda", config.chunks or cores()
+    gpu, parts = compute_device() == "cuda", config.chunks or min(MOST_PARTS, cores())
     samples = config.batch_samples or (LARGEST_STEP if gpu else min(LARGEST_STEP, parts * PART_SAMPLES[config.space]))
     rate = LARGE_STEP_RATE if samples >= LARGEST_STEP else GRID_RATES[config.space]
     return {"background": "random", "learning_rate": rate, "batch_samples": samples, "chunks": parts}
@@ -259,7 +260,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     info["background"] = list(field_background(config, scene))
     info |= learnt_of_photos(training.trainer, scene.of_split("train"))
     save_field(folder, training.trainer.model, info)
-    write_curve(folder, training.state.curve)
+    write_curve(folder, config.kind, training.state.curve)
     progress.update("measuring what this machine can do")
     device = training.probes.train.colours.device
     parts = write_parts(folder, training.state.timings, training.trainer.model, device)
@@ -279,11 +280,12 @@ def _with_photos_aside(config: Config, scene: "Scene", progress: Progress) -> "S
 
 def _result(config: Config, training: "TrainingRun", folder: Path, parts: list[str], progress: Progress) -> StageResult:
     from stages.checkpoints import checkpoint_files
-    from stages.curve import doubling_words, target_words
+    from stages.curve import coming_doubling, doubling_words, target_words
 
     state, last = training.state, training.state.curve[-1]
-    said = [doubling_words(state.curve), target_words(config.target_psnr, state.validation_psnr, state.seconds)]
-    for words in filter(None, said):
+    doubling = doubling_words(state.curve, coming_doubling(config.kind, state.curve))
+    target = target_words(config.target_psnr, state.validation_psnr, state.seconds)
+    for words in filter(None, (doubling, target)):
         progress.note(words)
     left_behind = sorted(path.name for path in folder.glob("nonfinite_*.safetensors"))
     board = ["tensorboard"] if config.tensorboard else []
@@ -308,7 +310,7 @@ def _result(config: Config, training: "TrainingRun", folder: Path, parts: list[s
 
 def _line(config: Config, training: "TrainingRun") -> str:
     """180 s · 5.4 k steps · 24 k rays/s · held out 28.9 dB ▁▃▅▆▇█ · the next doubling buys +0.6 ± 0.4 dB."""
-    from stages.curve import next_words, sparkline, target_words
+    from stages.curve import coming_doubling, next_words, sparkline, target_words
 
     state = training.state
     heldout = state.curve[-1]["heldout_psnr"]
@@ -319,7 +321,8 @@ def _line(config: Config, training: "TrainingRun") -> str:
     parts += [
         "no photos held out" if heldout is None else f"held out {heldout:.1f} dB {sparkline(state.curve)}".rstrip()
     ]
-    parts += [next_words(state.curve), target_words(config.target_psnr, state.validation_psnr, state.seconds)]
+    parts.append(next_words(coming_doubling(config.kind, state.curve)))
+    parts.append(target_words(config.target_psnr, state.validation_psnr, state.seconds))
     if state.symptom is not None:
         parts.append(f"of no use yet: {state.symptom}")
     return " · ".join(filter(None, parts))

@@ -112,7 +112,7 @@ class TrainingRun:
 
     def _go_on(self, folder: Path) -> None:
         """Start from the end of the finished run in ``folder``, at the rate that the longer run would have there."""
-        checkpoint = latest_checkpoint(folder / "checkpoints", self.progress.note)
+        checkpoint = latest_checkpoint(folder / "checkpoints", self.progress.note, remove=False)
         if checkpoint is None:
             why = f"the last state of the training in {folder} cannot be read"
             raise StageError("training cannot go on", why, "Train anew, for longer, without --more.")
@@ -170,7 +170,7 @@ class TrainingRun:
             if self._elapsed >= self.next_measurement:
                 self._examine()
                 self._measure()
-            if self.clock_budget is not None and self.state.seconds >= self.next_planning:
+            if self.clock_budget is not None and self._planning_is_due:
                 self._replan(self.clock_budget)
             if time.monotonic() >= self.next_checkpoint:
                 self._examine()
@@ -190,17 +190,22 @@ class TrainingRun:
         self.state.rays += result.rays
         self.pace.add(seconds, result.rays, result.psnr)
 
+    @property
+    def _planning_is_due(self) -> bool:
+        """Every hundredth of the time, and before the last step: it may have been planned when steps took longer."""
+        last = self.state.step >= self.plan.total_steps - 1
+        return self.pace.count > 1 and (last or self.state.seconds >= self.next_planning)
+
     def _replan(self, budget: float) -> None:
         """Fit the number of steps to the time left. Never rewrites a decision (after a roll-back, that is)."""
         from nerf.schedule import replanned
 
-        step = self.state.step
-        self.next_planning = self.state.seconds + PLAN_SHARE * budget
+        step, tolerance = self.state.step, PLAN_SHARE * (budget - self.state.seconds_before)
+        self.next_planning = self.state.seconds + tolerance
         last = self.plan.decisions[-1]
         if not last.from_step <= step < self.plan.total_steps or last.reason == "target":
             return
-        left, tolerance = budget - self.state.seconds, PLAN_SHARE * budget
-        plan = replanned(self.plan, step, left, 1 / self.pace.seconds_per_step, tolerance)
+        plan = replanned(self.plan, step, self.state.seconds, budget, 1 / self.pace.seconds_per_step, tolerance)
         if plan is not self.plan:
             self.plan = plan
             self._write_journal()
@@ -276,7 +281,8 @@ class TrainingRun:
         if steps is not None:
             return steps
         assert seconds is not None, "one of the two is given"
-        return self.state.step + int((seconds - self.state.seconds) / self.pace.seconds_per_step)
+        per_step = self.pace.seconds_per_step or self.state.seconds / self.state.step
+        return self.state.step + int((seconds - self.state.seconds) / per_step)
 
     def _save(self) -> None:
         save_checkpoint(self.checkpoints, Checkpoint(self.state.step, self.trainer.state(), asdict(self.state)))
@@ -294,6 +300,7 @@ class TrainingRun:
 
     def _examine_at_the_end(self) -> None:
         self._examine()
+        self.state.symptom = None
         if self.state.step >= WARM_UP_STEPS:
             self._examine_fully()
         elif symptom := symptom_of(self.trainer, self.probes.train):
@@ -320,6 +327,8 @@ class TrainingRun:
             self._begin(self.state.anew(self.state.restarts, rollbacks))
         else:
             self.state.step, self.state.rollbacks = checkpoint.step, rollbacks
+            self.state.curve = [point for point in self.state.curve if point["step"] <= checkpoint.step]
+            self._plan_measurement()
         self.progress.note(f"{fault}: back to step {self.state.step:,} at half the learning rate")
 
     def _load_sound(self, checkpoint: Checkpoint) -> None:

@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from stages.unseen import Target, Unseen
 
 RATE_MEMORY_SECONDS = 5.0  # how far back the measured speed and the shown PSNR look
+MOST_OF_A_STALL = 3.0  # of the pace: as much of a longer step counts. A machine that sleeps for seconds is not slower
 
 
 class TrainingBudget(NamedTuple):
@@ -54,7 +55,10 @@ class RunState:
 
 
 class Pace:
-    """Running means of a run's speed and batch PSNR, forgetting after a few seconds. Shown, and used for planning."""
+    """Running means of a run's speed and batch PSNR, forgetting after a few seconds. Shown, and used for planning.
+
+    The first step of a process also wakes caches and libraries: it counts until there is a second one.
+    """
 
     def __init__(self) -> None:
         self.count, self.seconds_per_step, self.rays_per_step, self.psnr = 0, 0.0, 0.0, 0.0
@@ -62,7 +66,9 @@ class Pace:
     def add(self, seconds: float, rays: int, psnr: float) -> None:
         """Take one step into account."""
         self.count += 1
-        new = max(1 / self.count, 1 - math.exp(-seconds / RATE_MEMORY_SECONDS))
+        if self.count > 2:
+            seconds = min(seconds, MOST_OF_A_STALL * self.seconds_per_step)
+        new = max(1 / max(1, self.count - 1), 1 - math.exp(-seconds / RATE_MEMORY_SECONDS))
         self.seconds_per_step += new * (seconds - self.seconds_per_step)
         self.rays_per_step += new * (rays - self.rays_per_step)
         self.psnr += new * (psnr - self.psnr)

@@ -13,7 +13,7 @@ def plans(draw: st.DrawFn) -> StepPlan:
     for _ in range(draw(st.integers(0, 6))):
         earliest = plan.decisions[-1].from_step
         step = draw(st.integers(earliest, max(earliest, plan.total_steps - 1)))
-        plan = plan.revised(step, draw(st.integers(step + 1, step + 60)))
+        plan = plan.revised(step, draw(st.integers(step + 1, step + 60)), plan.share(step))
     return plan
 
 
@@ -29,7 +29,7 @@ def test_share_goes_from_0_to_1_and_never_back(plan: StepPlan) -> None:
 def test_a_decision_leaves_the_past_and_the_present_alone(plan: StepPlan, more: int, position: int) -> None:
     earliest = plan.decisions[-1].from_step
     step = earliest + position % (plan.total_steps - earliest)
-    revised = plan.revised(step, step + more)
+    revised = plan.revised(step, step + more, plan.share(step))
     assert [revised.share(s) for s in range(step + 1)] == [plan.share(s) for s in range(step + 1)]
 
 
@@ -38,7 +38,7 @@ def test_a_plan_without_revision_is_linear() -> None:
 
 
 def test_half_way_through_twice_the_steps() -> None:
-    plan = plan_of(4).revised(2, 6)
+    plan = plan_of(4).revised(2, 6, 0.5)
     assert [plan.share(step) for step in range(7)] == [0, 0.25, 0.5, 0.625, 0.75, 0.875, 1]
 
 
@@ -83,7 +83,7 @@ def test_more_steps_are_more_than_there_were(total: int) -> None:
 @pytest.mark.parametrize(("step", "total"), [(5, 5), (3, 9)])
 def test_no_decision_without_a_step_left_or_about_the_past(step: int, total: int) -> None:
     with pytest.raises(ValueError, match="cannot become"):
-        plan_of(10).revised(4, 8).revised(step, total)
+        plan_of(10).revised(4, 8, 0.4).revised(step, total, 0.5)
 
 
 def test_a_run_has_steps() -> None:
@@ -97,22 +97,28 @@ def test_a_run_on_a_steady_clock_ends_on_time(budget: float, rate: float) -> Non
     while step < plan.total_steps and step < 40:
         step += 1
         if step < plan.total_steps:
-            plan = replanned(plan, step, budget - step / rate, rate, 0.01 * budget)
+            plan = replanned(plan, step, step / rate, budget, rate, 0.01 * budget)
     # The first step is what the clock is read by, and one more is the least a plan can hold.
     assert abs(plan.total_steps / rate - budget) <= 0.01 * budget + 2 / rate
     assert len(plan.decisions) <= 2
 
 
 def test_a_run_that_turns_out_slow_is_cut_short_and_still_ends_at_1() -> None:
-    plan = replanned(plan_of(100), 50, 1.0, 10.0, 0.1)
+    plan = replanned(plan_of(100), 50, 9.0, 10.0, 10.0, 0.1)
     assert plan.total_steps == 60
-    assert plan.share(50) == 0.5
+    assert plan.share(49) == 0.49 and plan.share(50) == 0.9
     assert plan.share(60) == pytest.approx(1)
+
+
+def test_a_plan_made_too_short_leaves_no_trace_in_the_rates() -> None:
+    plan = replanned(plan_of(30), 29, 1.5, 30.0, 20.0, 0.3)
+    assert plan.total_steps == 29 + 570
+    assert plan.share(29) == 0.05
 
 
 def test_a_plan_that_is_right_enough_stands() -> None:
     plan = plan_of(100)
-    assert replanned(plan, 50, 5.05, 10.0, 0.1) is plan
+    assert replanned(plan, 50, 4.95, 10.0, 10.0, 0.1) is plan
 
 
 def test_past_the_deadline_one_step_is_left() -> None:

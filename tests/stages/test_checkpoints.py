@@ -36,6 +36,15 @@ def test_without_a_checkpoint_there_is_none(tmp_path: Path) -> None:
     assert latest_checkpoint(tmp_path / "missing", pytest.fail) is None
 
 
+def test_of_a_finished_run_nothing_is_removed(tmp_path: Path) -> None:
+    saved(tmp_path, 3, 4)
+    (tmp_path / "000000004.safetensors").write_bytes(b"")
+    before = {path.name for path in tmp_path.iterdir()}
+    found = latest_checkpoint(tmp_path, lambda _: None, remove=False)
+    assert found is not None and found.step == 3
+    assert {path.name for path in tmp_path.iterdir()} == before
+
+
 @pytest.mark.parametrize("harm", ["cut tensors", "flipped bit", "cut json", "no tensors", "empty json"])
 def test_a_damaged_one_is_named_and_the_one_before_is_used(tmp_path: Path, harm: str) -> None:
     saved(tmp_path, 3, 4)

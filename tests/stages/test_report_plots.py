@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from nerf.scene import Camera, Scene, Similarity, View
+from stages.curve import coming_doubling
 from stages.report_plots import _outline, camera_svgs, curve_svg
 
 
@@ -60,11 +61,12 @@ def test_plots_of_one_page_share_no_identifier():
 
 
 def test_the_curve_shows_what_comes_next_and_where_the_knee_is():
-    steep = curve_svg(_curve(), {}) or ""
+    steep = curve_svg(_curve(), {}, coming_doubling("grid", _curve())) or ""
     assert "predicted" in steep and "4 min 16 s" in steep and "knee" not in steep
     flat = [row | {"heldout_psnr": 20 - 8 / row["seconds"]} for row in _curve()]
     assert "knee, 16 s: twice the time bought &lt; 0.5 dB" in (curve_svg(flat, {}) or "")
     unknown = [row | {"heldout_psnr": None} for row in _curve()]
+    assert coming_doubling("grid", unknown) is None and coming_doubling("paper", _curve()) is None
     assert "predicted" not in (curve_svg(unknown, {}) or "predicted")
 
 

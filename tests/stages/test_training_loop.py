@@ -1,118 +1,21 @@
 """The loop with a field that is one number, so that every kind of trouble can be staged."""
 
-import json
 import math
 import shutil
-import time
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
-from torch import Tensor
 
-from nerf.effects import AS_GIVEN, AS_RENDERED
-from nerf.model import Rendering
-from nerf.probe import Patches, Probe
-from nerf.rays import Rays
 from nerf.training import NonFinite, StepResult
 from stages import training_loop
 from stages.checkpoints import latest_checkpoint
 from stages.contract import StageError
-from stages.training_log import TrainingLog
 from stages.training_loop import TrainingRun
-from stages.training_state import Probes, TrainingBudget
-from stages.unseen import Target, Unseen
-
-
-class Killed(BaseException):
-    """Stands for kill -9: nothing in the loop may handle it."""
-
-
-class OneNumber:
-    """Trains one number; ``trouble(step, rate_scale)`` may raise. Its model paints ``shown``, 20 dB from the truth."""
-
-    chunk_rays = 64
-    photo_rays, photo_colours = AS_GIVEN, AS_RENDERED
-
-    def __init__(self, seed: int, trouble: Callable[[int, float], None]) -> None:
-        self.seed, self.trouble = seed, trouble
-        self.value = torch.tensor(float(seed))
-        self.history: list[tuple[int, float, float]] = []
-        self.opacity, self.shown = 1.0, probe().colours + 0.1
-
-    @property
-    def model(self) -> "OneNumber":
-        return self
-
-    def step(self, step: int, share: float, rate_scale: float) -> StepResult:
-        self.trouble(step, rate_scale)
-        self.history.append((step, share, rate_scale))
-        self.value = self.value * 0.9 + rate_scale * (1 - share) * torch.sin(torch.tensor(float(step)))
-        return StepResult(float(self.value), 20.0, 4)
-
-    def state(self) -> dict[str, Tensor]:
-        return {"value": self.value}
-
-    def load_state(self, state: dict[str, Tensor]) -> None:
-        self.value = state["value"].clone()
-
-    def density(self, points: Tensor) -> Tensor:
-        raise NotImplementedError
-
-    def density_and_colour(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-        raise NotImplementedError
-
-    def render(self, rays: Rays, background: Tensor) -> Rendering:
-        return Rendering(self.shown.expand(*rays.near.shape, 3), rays.far, torch.full_like(rays.far, self.opacity))
-
-
-def quiet(step: int, rate_scale: float) -> None:
-    """No trouble."""
-
-
-def slow(step: int, rate_scale: float) -> None:
-    """Steps long enough for a clock."""
-    time.sleep(0.003)
-
-
-def probe() -> Probe:
-    """Two rays, one to see black and one grey: a flat colour leaves a mean error of 1/16."""
-    rays = Rays(torch.zeros(2, 3), torch.ones(2, 3), torch.ones(2), torch.ones(2))
-    return Probe(rays, torch.tensor([[0.0] * 3, [0.5] * 3]), torch.zeros(3), torch.tensor([0, 1]))
-
-
-def unseen() -> Unseen:
-    """The same rays; their patches are too small for SSIM."""
-    return Unseen(probe(), Patches(probe(), torch.ones(2, 1, 1, dtype=torch.bool)), torch.eye(2))
-
-
-def run_in(
-    folder: Path, progress, budget: TrainingBudget | None = None, make=None, target: Target | None = None
-) -> TrainingRun:
-    folder.mkdir(exist_ok=True)
-    maker, probes = make or (lambda attempt: OneNumber(attempt, quiet)), Probes(probe(), unseen(), target)
-    return TrainingRun(
-        maker, probes, budget or TrainingBudget(40, None), folder, 1e-9, TrainingLog(folder, False), progress
-    )
-
-
-def number_of(run: TrainingRun) -> OneNumber:
-    assert isinstance(run.trainer, OneNumber)
-    return run.trainer
-
-
-def events(folder: Path) -> list[dict]:
-    return [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
-
-
-def killed_at(step: int) -> Callable[[int], OneNumber]:
-    def trouble(now: int, rate_scale: float) -> None:
-        if now == step:
-            raise Killed
-        slow(now, rate_scale)
-
-    return lambda attempt: OneNumber(attempt, trouble)
+from stages.training_state import TrainingBudget
+from stages.unseen import Target
+from tests.stages.one_number import Killed, OneNumber, events, killed_at, number_of, probe, quiet, run_in, unseen
 
 
 def test_killed_and_resumed_is_the_same_as_uninterrupted(tmp_path: Path, progress) -> None:
@@ -135,27 +38,6 @@ def test_finished_and_run_again_does_nothing(tmp_path: Path, progress) -> None:
     again.train()
     assert number_of(again).history == []
     assert again.state == first.state
-
-
-def test_a_run_in_seconds_takes_about_that_long_and_its_share_ends_at_1(tmp_path: Path, progress) -> None:
-    run = run_in(tmp_path, progress, TrainingBudget(None, 0.3), make=lambda attempt: OneNumber(attempt, slow))
-    run.train()
-    assert 0.2 < run.state.seconds < 0.5
-    assert run.plan.share(run.state.step) == pytest.approx(1)
-    assert len(run.plan.decisions) >= 2
-    shares = [share for _, share, _ in number_of(run).history]
-    assert shares == sorted(shares) and shares[-1] < 1
-
-
-def test_a_resumed_run_in_seconds_replays_its_plan(tmp_path: Path, progress) -> None:
-    with pytest.raises(Killed):
-        run_in(tmp_path, progress, TrainingBudget(None, 0.3), make=killed_at(30)).train()
-    journal = json.loads((tmp_path / "plan.json").read_text())
-    resumed = run_in(tmp_path, progress, TrainingBudget(None, 0.3), make=lambda attempt: OneNumber(attempt, slow))
-    resumed.train()
-    assert [list(decision) for decision in resumed.plan.decisions] == journal
-    assert resumed.state.step == journal[-1][1]
-    assert number_of(resumed).history[0][1] == resumed.plan.share(30)
 
 
 def non_finite(at: int, until_rate: float) -> Callable[[int], OneNumber]:
@@ -241,6 +123,31 @@ def test_the_curve_ends_with_the_run_and_is_on_record(
     assert {"device", "threads"} & set(run.state.curve[0]) == set() and run.state.curve[0]["heldout_ssim"] is None
 
 
+def test_what_was_measured_of_steps_taken_back_is_forgotten(
+    tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(training_loop.FIRST_MEASUREMENT, "steps", 10.0)
+
+    def trouble(step: int, rate_scale: float) -> None:
+        if step == 22 and rate_scale == 1:
+            raise NonFinite("loss", step, {})
+
+    run = run_in(tmp_path, progress, make=lambda attempt: OneNumber(attempt, trouble))
+    run.next_checkpoint = math.inf
+    run.train()
+    assert run.state.rollbacks == 1
+    assert [point["step"] for point in run.state.curve] == [10, 15, 21, 29, 40]
+
+
+def test_a_field_that_more_steps_made_good_is_no_longer_of_no_use(tmp_path: Path, progress) -> None:
+    first = run_in(tmp_path / "first", progress, make=dying(1, 0.0, 0.5))
+    first.train()
+    assert first.state.symptom == "it is empty (mean opacity 0e+00)"
+    more = run_in(tmp_path / "more", progress, TrainingBudget(20, None, tmp_path / "first"))
+    more.train()
+    assert more.state.symptom is None
+
+
 def test_the_live_line_tells_step_speed_quality_and_time_left(tmp_path: Path, progress) -> None:
     run = run_in(tmp_path, progress)
     assert run._describe() == ("first step", 0.0)
@@ -289,18 +196,6 @@ def test_more_steps_in_two_pieces_are_the_same_bytes(tmp_path: Path, progress) -
     resumed.train()
     assert number_of(resumed).history[0][0] == 51
     assert torch.equal(number_of(whole).value, number_of(resumed).value)
-
-
-def test_more_seconds_take_about_that_long(tmp_path: Path, progress) -> None:
-    def make(attempt: int) -> OneNumber:
-        return OneNumber(attempt, slow)
-
-    first = run_in(tmp_path / "first", progress, TrainingBudget(None, 0.2), make)
-    first.train()
-    more = run_in(tmp_path / "more", progress, TrainingBudget(None, 0.2, tmp_path / "first"), make)
-    assert more.plan.share(first.state.step) == pytest.approx(0.5, abs=0.05)
-    more.train()
-    assert 0.1 < more.state.seconds - first.state.seconds < 0.35
 
 
 def test_without_a_readable_state_there_is_no_more(tmp_path: Path, progress) -> None:

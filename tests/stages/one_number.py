@@ -1,0 +1,109 @@
+"""A field that is one number and a training run of it, so that every kind of trouble can be staged."""
+
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from nerf.effects import AS_GIVEN, AS_RENDERED
+from nerf.model import Rendering
+from nerf.probe import Patches, Probe
+from nerf.rays import Rays
+from nerf.training import StepResult
+from stages.training_log import TrainingLog
+from stages.training_loop import TrainingRun
+from stages.training_state import Probes, TrainingBudget
+from stages.unseen import Target, Unseen
+
+
+class Killed(BaseException):
+    """Stands for kill -9: nothing in the loop may handle it."""
+
+
+class OneNumber:
+    """Trains one number; ``trouble(step, rate_scale)`` may raise. Its model paints ``shown``, 20 dB from the truth."""
+
+    chunk_rays = 64
+    photo_rays, photo_colours = AS_GIVEN, AS_RENDERED
+
+    def __init__(self, seed: int, trouble: Callable[[int, float], None]) -> None:
+        self.seed, self.trouble = seed, trouble
+        self.value = torch.tensor(float(seed))
+        self.history: list[tuple[int, float, float]] = []
+        self.opacity, self.shown = 1.0, probe().colours + 0.1
+
+    @property
+    def model(self) -> "OneNumber":
+        return self
+
+    def step(self, step: int, share: float, rate_scale: float) -> StepResult:
+        self.trouble(step, rate_scale)
+        self.history.append((step, share, rate_scale))
+        self.value = self.value * 0.9 + rate_scale * (1 - share) * torch.sin(torch.tensor(float(step)))
+        return StepResult(float(self.value), 20.0, 4)
+
+    def state(self) -> dict[str, Tensor]:
+        return {"value": self.value}
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        self.value = state["value"].clone()
+
+    def density(self, points: Tensor) -> Tensor:
+        raise NotImplementedError
+
+    def density_and_colour(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+        raise NotImplementedError
+
+    def render(self, rays: Rays, background: Tensor) -> Rendering:
+        return Rendering(self.shown.expand(*rays.near.shape, 3), rays.far, torch.full_like(rays.far, self.opacity))
+
+
+def quiet(step: int, rate_scale: float) -> None:
+    """No trouble."""
+
+
+def slow(step: int, rate_scale: float) -> None:
+    """Steps long enough for a clock."""
+    time.sleep(0.003)
+
+
+def probe() -> Probe:
+    """Two rays, one to see black and one grey: a flat colour leaves a mean error of 1/16."""
+    rays = Rays(torch.zeros(2, 3), torch.ones(2, 3), torch.ones(2), torch.ones(2))
+    return Probe(rays, torch.tensor([[0.0] * 3, [0.5] * 3]), torch.zeros(3), torch.tensor([0, 1]))
+
+
+def unseen() -> Unseen:
+    """The same rays; their patches are too small for SSIM."""
+    return Unseen(probe(), Patches(probe(), torch.ones(2, 1, 1, dtype=torch.bool)), torch.eye(2))
+
+
+def run_in(
+    folder: Path, progress, budget: TrainingBudget | None = None, make=None, target: Target | None = None
+) -> TrainingRun:
+    folder.mkdir(exist_ok=True)
+    maker, probes = make or (lambda attempt: OneNumber(attempt, quiet)), Probes(probe(), unseen(), target)
+    return TrainingRun(
+        maker, probes, budget or TrainingBudget(40, None), folder, 1e-9, TrainingLog(folder, False), progress
+    )
+
+
+def number_of(run: TrainingRun) -> OneNumber:
+    assert isinstance(run.trainer, OneNumber)
+    return run.trainer
+
+
+def events(folder: Path) -> list[dict]:
+    return [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
+
+
+def killed_at(step: int) -> Callable[[int], OneNumber]:
+    def trouble(now: int, rate_scale: float) -> None:
+        if now == step:
+            raise Killed
+        slow(now, rate_scale)
+
+    return lambda attempt: OneNumber(attempt, trouble)

@@ -1,0 +1,99 @@
+"""Runs that are given seconds: they use them, whatever single steps take."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from stages import training_loop
+from stages.training_loop import TrainingRun
+from stages.training_state import Pace, TrainingBudget
+from tests.stages.one_number import Killed, OneNumber, killed_at, number_of, run_in, slow
+
+
+def test_a_run_in_seconds_takes_about_that_long_and_its_share_ends_at_1(tmp_path: Path, progress) -> None:
+    run = run_in(tmp_path, progress, TrainingBudget(None, 0.3), make=lambda attempt: OneNumber(attempt, slow))
+    run.train()
+    assert 0.2 < run.state.seconds < 0.5
+    assert run.plan.share(run.state.step) == pytest.approx(1)
+    assert len(run.plan.decisions) >= 2
+    shares = [share for _, share, _ in number_of(run).history]
+    assert 0.8 < shares[-1] < 1
+
+
+def test_a_resumed_run_in_seconds_replays_its_plan(tmp_path: Path, progress) -> None:
+    with pytest.raises(Killed):
+        run_in(tmp_path, progress, TrainingBudget(None, 0.3), make=killed_at(30)).train()
+    journal = json.loads((tmp_path / "plan.json").read_text())
+    resumed = run_in(tmp_path, progress, TrainingBudget(None, 0.3), make=lambda attempt: OneNumber(attempt, slow))
+    resumed.train()
+    assert [list(decision) for decision in resumed.plan.decisions] == journal
+    assert resumed.state.step == journal[-1][1]
+    assert number_of(resumed).history[0][1] == resumed.plan.share(30)
+
+
+def test_more_seconds_take_about_that_long(tmp_path: Path, progress) -> None:
+    def make(attempt: int) -> OneNumber:
+        return OneNumber(attempt, slow)
+
+    first = run_in(tmp_path / "first", progress, TrainingBudget(None, 0.2), make)
+    first.train()
+    more = run_in(tmp_path / "more", progress, TrainingBudget(None, 0.2, tmp_path / "first"), make)
+    assert more.plan.share(first.state.step) == pytest.approx(0.5, abs=0.05)
+    more.train()
+    assert 0.1 < more.state.seconds - first.state.seconds < 0.35
+
+
+def run_on_a_made_up_clock(
+    folder: Path, progress, monkeypatch: pytest.MonkeyPatch, seconds: float, takes: Callable[[int], float]
+) -> TrainingRun:
+    """``takes(step)`` seconds a step, and no time at all beside the steps."""
+    now = 0.0
+
+    def step_by_step(step: int, rate_scale: float) -> None:
+        nonlocal now
+        now += takes(step)
+
+    clock = SimpleNamespace(perf_counter=lambda: now, monotonic=lambda: now)
+    monkeypatch.setattr(training_loop, "time", clock)
+    run = run_in(folder, progress, TrainingBudget(None, seconds), lambda attempt: OneNumber(attempt, step_by_step))
+    run.train()
+    return run
+
+
+@pytest.mark.parametrize(("slow_step", "lasts"), [(0, 1.0), (0, 10.0), (1, 5.0), (100, 20.0), (600, 3.0)])
+def test_one_step_that_lasts_long_does_not_end_a_run_early(
+    slow_step: int, lasts: float, tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = run_on_a_made_up_clock(
+        tmp_path, progress, monkeypatch, 60.0, lambda step: lasts if step == slow_step else 0.04
+    )
+    assert run.state.seconds == pytest.approx(60, abs=0.7)
+    assert run.state.step == pytest.approx(1 + (60 - lasts) / 0.04, rel=0.02)
+    seconds = 0.0
+    for step, share, _ in number_of(run).history:
+        seconds += lasts if step == slow_step else 0.04
+        if step not in range(slow_step, slow_step + 100):
+            assert share == pytest.approx(seconds / 60, abs=0.04)
+
+
+@pytest.mark.parametrize("factor", [0.1, 10.0])
+def test_a_machine_that_changes_its_speed_is_followed(
+    factor: float, tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = run_on_a_made_up_clock(
+        tmp_path, progress, monkeypatch, 60.0, lambda step: 0.04 if step < 500 else 0.04 * factor
+    )
+    assert run.state.seconds == pytest.approx(60, abs=1.0)
+    assert run.state.step == pytest.approx(500 + 40 / (0.04 * factor), rel=0.05)
+
+
+def test_the_pace_forgets_the_first_step_and_takes_little_of_a_stall() -> None:
+    pace = Pace()
+    pace.add(1.0, 4, 20.0)
+    assert pace.seconds_per_step == 1.0
+    for seconds in (0.04, 0.04, 0.04, 30.0):
+        pace.add(seconds, 4, 20.0)
+    assert pace.seconds_per_step == pytest.approx(0.06)
