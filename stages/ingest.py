@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     import numpy as np
 
 NEEDS: tuple[str, ...] = ()
-VERSION = 5
+VERSION = 6
 RESUMES = False
 LINKS = ("photos.json", "images", "masks")
 
@@ -305,6 +305,7 @@ def _store(taken: Sequence[_Taken], same: Mapping[str, str], folder: Path) -> li
                 time_s=photo.time_s,
                 **photo.place._asdict(),
                 exposure_ev=photo.exposure_ev,
+                orientation=photo.camera_key.orientation,
             )
         )
     return photos

@@ -1,9 +1,11 @@
 """Cameras that are known already: transforms.json, Blender's transforms_train/test.json, or a COLMAP model.
 
 Poses in transforms files are world_from_camera with OpenGL axes (x right, y up, z backward); they are turned to
-OpenCV axes here and nowhere else. Photos are told apart by their own names, as ingest noted them.
+OpenCV axes here and nowhere else. Photos are told apart by their own names, as ingest noted them. Cameras of photos as
+their files store them are turned upright as ingest turned the photos.
 """
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -17,17 +19,26 @@ from stages.colmap.cameras import camera_rays, rescaled
 from stages.colmap.model_files import FARTHEST
 from stages.colmap.models import read_model
 from stages.contract import StageError
+from stages.orientation import (
+    QUARTER_TURNS,
+    is_of_stored_pixels,
+    pixel_map,
+    same_shape,
+    stored_size,
+    turned_camera,
+    turned_pose,
+)
 from stages.photos import Photo
-from stages.sources import pose_matrix, read_transforms
+from stages.sources import MOST_LETTERS, pose_matrix, read_transforms
 from stages.sparse_model import SparseImage, SparseModel
 from stages.transforms_export import OPENGL_FROM_OPENCV
 from stages.transforms_intrinsics import flaw_of, read_intrinsics
 
 ORTHONORMAL_WITHIN = 1e-3  # largest entry of RᵀR − 1 that is rounding; beyond it a matrix means something else
-ASPECT_WITHIN = 0.01
 LARGEST_ENTRY = 1e6  # of a matrix that is looked at more closely: products of three of them are numbers
 MOST_NAMES = 5
 TRANSFORMS_HINT = "Correct the file, or leave the cameras out to have them found from the photos."
+APPROXIMATION = "approximation"  # how the note begins of a lens that is not the one it stands for
 LENS_SAMPLES = 8  # pixels along each side at which a lens must have an inverse; normalise looks at more
 
 
@@ -58,8 +69,9 @@ class KnownCameras:
 @dataclass(frozen=True)
 class _Posed:
     photo: Photo
-    camera: Camera
+    camera: Camera  # of the upright photo
     world_from_camera: Float[np.ndarray, "3 4"]
+    turns: int  # quarter turns clockwise that made the camera upright
 
 
 def read_known_cameras(cameras: Path, photos: Sequence[Photo], frames: Mapping[str, str]) -> KnownCameras:
@@ -84,9 +96,10 @@ def _from_transforms(
 ) -> KnownCameras:
     by_name = {photo.name: photo for photo in photos}
     posed: dict[str, _Posed] = {}
-    absent, test_files = [], []
+    absent, test_files, notes, approximate = [], [], [], 0
     for path in paths:
         content = read_transforms(path)
+        held_out = _held_out(content, path.name, notes)
         for frame in content["frames"]:
             name = frame["file_path"]
             photo = by_name.get(frames.get(name, ""))
@@ -96,32 +109,55 @@ def _from_transforms(
             file = photo.image_name
             if file in posed:
                 raise StageError(f"two frames for the photo {photo.name}", f"one is {name!r}", TRANSFORMS_HINT)
-            posed[file] = _Posed(photo, _camera({**content, **frame}, photo), _pose(frame["transform_matrix"], name))
-            if path == test:
+            values = {**content, **frame}
+            posed[file] = _posed(photo, frame, values)
+            approximate += str(values.get("note", "")).startswith(APPROXIMATION)
+            if path == test or PurePosixPath(name) in held_out:
                 test_files.append(file)
+    if approximate:
+        notes.append(f"the lenses of {approximate} frames are approximations, as their notes in the file say")
+    unposed = [photo.name for photo in photos if photo.image_name not in posed]
     return KnownCameras(
         model=_without_points([posed[file] for file in sorted(posed)], paths[0].name),
         test_files=sorted(test_files) if test_files else None,
-        notes=_notes(absent, [photo.name for photo in photos if photo.image_name not in posed]),
+        notes=_notes(absent, unposed, [one.turns for one in posed.values()]) + notes,
     )
+
+
+def _held_out(content: Mapping[str, Any], source: str, notes: list[str]) -> set[PurePosixPath]:
+    """The official test photos by file_path: nerfstudio's ``test_filenames``, else its ``val_filenames``. Of names that
+    no frame has, a note is left. Raises StageError where none has a frame."""
+    names = content.get("test_filenames") or content.get("val_filenames") or []
+    if not (isinstance(names, list) and all(isinstance(name, str) for name in names)):
+        raise _wrong(f"the test photos of {source}", "test_filenames (or val_filenames) is no list of names")
+    of_frames = {PurePosixPath(frame["file_path"]) for frame in content["frames"]}
+    strange = [name[:MOST_LETTERS] for name in names if PurePosixPath(name) not in of_frames]
+    if strange and len(strange) == len(names):
+        raise _wrong(f"the test photos of {source}", f"none of them is the file_path of a frame: {_few(strange)}")
+    if strange:
+        notes.append(f"{len(strange)} test photos of {source} have no frame: {_few(strange)}")
+    return set(map(PurePosixPath, names))
+
+
+def _posed(photo: Photo, frame: Mapping[str, Any], values: Mapping[str, Any]) -> _Posed:
+    """One frame, whose intrinsics are among ``values``, as the camera of the upright photo."""
+    name = frame["file_path"]
+    # A frame of our own export names the photo beside the decoded, upright picture that its camera is of.
+    upright = isinstance(frame.get("photo"), str)
+    size = (photo.width, photo.height) if upright else stored_size(photo)
+    try:
+        camera = read_intrinsics(values, *size)
+    except ValueError as error:
+        raise _wrong(f"the camera of frame {name!r}", str(error)) from error
+    turns = _turns(photo, camera, name, upright)
+    pose = turned_pose(_pose(frame["transform_matrix"], name), turns)
+    return _Posed(photo, _at_size_of(photo, turned_camera(camera, turns), name), pose, turns)
 
 
 def _without_points(posed: Sequence[_Posed], source: str) -> SparseModel:
     if not posed:
         raise _nothing_matches(source)
-    cameras = list(dict.fromkeys(p.camera for p in posed))
-    images = [SparseImage(p.photo.image_name, cameras.index(p.camera), p.world_from_camera) for p in posed]
-    return SparseModel.without_points(cameras, images)
-
-
-def _camera(values: Mapping[str, Any], photo: Photo) -> Camera:
-    """The intrinsics of one frame (its own values over those of the file), at the photo's size."""
-    name = values["file_path"]
-    try:
-        camera = read_intrinsics(values, photo.width, photo.height)
-    except ValueError as error:
-        raise _wrong(f"the camera of frame {name!r}", str(error)) from error
-    return _at_size_of(photo, camera, name)
+    return SparseModel.without_points(*_distinct(posed))
 
 
 def _pose(matrix: Any, name: str) -> Float[np.ndarray, "3 4"]:
@@ -161,19 +197,22 @@ def _from_colmap(folder: Path, photos: Sequence[Photo]) -> KnownCameras:
     kept = sorted(photo_of, key=lambda i: photo_of[i].image_name)
     if not kept:
         raise _nothing_matches(folder.name)
-    own = {i: given.cameras[given.images[i].camera] for i in kept}
-    cameras_of = [_at_size_of(photo_of[i], own[i], given.images[i].file) for i in kept]
-    cameras = list(dict.fromkeys(cameras_of))
-    images = [
-        SparseImage(photo_of[i].image_name, cameras.index(camera), given.images[i].sfm_from_camera)
-        for i, camera in zip(kept, cameras_of, strict=True)
-    ]
-    scales = [_scale(own[i], photo_of[i]) for i in kept]
-    posed = {photo.image_name for photo in photo_of.values()}
-    model, behind = given.restricted(kept, scales, cameras, images).without_points_behind()
+    posed, pixel_maps = [], []
+    for i in kept:
+        image, photo = given.images[i], photo_of[i]
+        camera = given.cameras[image.camera]
+        # A model of ours, or of the pictures that ingest wrote, has their names, and these are upright.
+        turns = _turns(photo, camera, image.file, upright=image.file == photo.image_name != photo.name)
+        upright = _at_size_of(photo, turned_camera(camera, turns), image.file)
+        posed.append(_Posed(photo, upright, turned_pose(image.sfm_from_camera, turns), turns))
+        pixel_maps.append(pixel_map(camera, turns, photo.width, photo.height))
+    cameras, images = _distinct(posed)
+    model, behind = given.restricted(kept, pixel_maps, cameras, images).without_points_behind()
+    taken = {image.file for image in images}
     notes = _notes(
         [image.file for i, image in enumerate(given.images) if i not in photo_of],
-        [photo.name for photo in photos if photo.image_name not in posed],
+        [photo.name for photo in photos if photo.image_name not in taken],
+        [one.turns for one in posed],
     )
     if behind:
         notes.append(f"{behind} observations of points behind their cameras are left out")
@@ -181,45 +220,74 @@ def _from_colmap(folder: Path, photos: Sequence[Photo]) -> KnownCameras:
 
 
 def _by_name(names: Sequence[str], photos: Sequence[Photo]) -> dict[int, Photo]:
-    """Photo by index of its image: of the same name, else alone with the same last part of the name."""
-    exact = {photo.name: photo for photo in photos} | {photo.image_name: photo for photo in photos}
-    last: dict[str, list[Photo]] = {}
-    for photo in photos:
-        last.setdefault(PurePosixPath(photo.name).name, []).append(photo)
-    alone = {name: same[0] for name, same in last.items() if len(same) == 1}
+    """Photo by index of its image: of the same name, else of the name that ingest gave it, else of the same end."""
     found: dict[int, Photo] = {}
-    for index, name in enumerate(names):
-        photo = exact.get(name) or alone.get(PurePosixPath(name).name)
-        if photo is None:
-            continue
-        if photo in found.values():
-            raise StageError(f"two cameras for the photo {photo.name}", f"one is that of {name!r}", TRANSFORMS_HINT)
-        found[index] = photo
+    taken: set[str] = set()
+    by_own, by_given = {photo.name: photo for photo in photos}, {photo.image_name: photo for photo in photos}
+    for photo_of in (by_own, by_given, _by_end(names, photos)):
+        for index, name in enumerate(names):
+            photo = photo_of.get(name)
+            if photo is not None and index not in found and photo.name not in taken:
+                found[index] = photo
+                taken.add(photo.name)
+    return found
+
+
+def _by_end(names: Sequence[str], photos: Sequence[Photo]) -> dict[str, Photo]:
+    """Photo by name of its image where one is called ``0.jpg``, say, and the other ``left/0.jpg``, and no other image
+    or photo is called ``0.jpg`` in any folder."""
+    by_last: dict[str, list[Photo]] = {}
+    for photo in photos:
+        by_last.setdefault(PurePosixPath(photo.name).name, []).append(photo)
+    images = Counter(PurePosixPath(name).name for name in names)
+    found: dict[str, Photo] = {}
+    for name in names:
+        last = PurePosixPath(name).name
+        same = by_last.get(last, [])
+        if images[last] == len(same) == 1:
+            image, photo = f"/{name}", f"/{same[0].name}"
+            if image.endswith(photo) or photo.endswith(image):
+                found[name] = same[0]
     return found
 
 
 # --- both
 
 
-def _scale(camera: Camera, photo: Photo) -> tuple[float, float]:
-    return photo.width / camera.width, photo.height / camera.height
+def _distinct(posed: Sequence[_Posed]) -> tuple[list[Camera], list[SparseImage]]:
+    """Each camera once, and the images that have them."""
+    cameras = list(dict.fromkeys(p.camera for p in posed))
+    return cameras, [SparseImage(p.photo.image_name, cameras.index(p.camera), p.world_from_camera) for p in posed]
 
 
-def _at_size_of(photo: Photo, camera: Camera, name: str) -> Camera:
-    """``camera`` rescaled where the photo has another size. Raises StageError where it has another shape, too, and for
-    a lens that is none."""
+def _turns(photo: Photo, camera: Camera, name: str, upright: bool) -> int:
+    """How many quarter turns clockwise make a given camera one of the upright photo. Raises StageError for a lens that
+    is none, and where the photo was mirrored, which no camera can be."""
     if flaw := flaw_of(camera):
         raise _wrong(f"the camera of {name!r}", flaw)
     camera_rays(camera, LENS_SAMPLES, LENS_SAMPLES)
-    across, down = _scale(camera, photo)
-    if across == down == 1:
+    if not is_of_stored_pixels(camera, photo, upright):
+        return 0
+    if photo.orientation not in QUARTER_TURNS:
+        raise StageError(
+            f"cannot use the camera of {name!r}",
+            f"the EXIF orientation {photo.orientation} of {photo.name} mirrors the photo, and no camera sees mirrored",
+            "Leave the cameras out, or make them for photos that are saved upright, without an EXIF orientation.",
+        )
+    return QUARTER_TURNS[photo.orientation]
+
+
+def _at_size_of(photo: Photo, camera: Camera, name: str) -> Camera:
+    """``camera`` rescaled where the photo has another size. Raises StageError where it has another shape, too."""
+    size = (photo.width, photo.height)
+    if (camera.width, camera.height) == size:
         return camera
-    if abs(across / down - 1) > ASPECT_WITHIN:
+    if not same_shape(camera, size):
         raise _wrong(
             f"the camera of {name!r}",
             f"it is for {camera.width}×{camera.height} pixels, the photo has {photo.width}×{photo.height}",
         )
-    return rescaled(camera, photo.width, photo.height)
+    return rescaled(camera, *size)
 
 
 def _nothing_matches(source: str) -> StageError:
@@ -230,10 +298,15 @@ def _nothing_matches(source: str) -> StageError:
     )
 
 
-def _notes(absent: Sequence[str], unposed: Sequence[str]) -> list[str]:
+def _notes(absent: Sequence[str], unposed: Sequence[str], turns: Sequence[int]) -> list[str]:
     notes = []
     for names, what in ((absent, "cameras have no photo"), (unposed, "photos have no camera and are left out")):
         if names:
-            more = ", …" if len(names) > MOST_NAMES else ""
-            notes.append(f"{len(names)} {what}: {', '.join(sorted(names)[:MOST_NAMES])}{more}")
+            notes.append(f"{len(names)} {what}: {_few(sorted(names))}")
+    if turned := sum(map(bool, turns)):
+        notes.append(f"{turned} cameras are turned upright like their photos (EXIF orientation)")
     return notes
+
+
+def _few(names: Sequence[str]) -> str:
+    return ", ".join(names[:MOST_NAMES]) + (", …" if len(names) > MOST_NAMES else "")

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from stages.sparse_model import SparseModel
 
 NEEDS = ("ingest", "sfm")
-VERSION = 6
+VERSION = 7
 RESUMES = False
 LINKS = ("transforms.json", "scene.json")
 
@@ -72,7 +72,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
         raise StageError(
             f"only {split.count('train')} of {len(split)} photos are left to train on",
             "the others are held out as test photos",
-            "Add training photos, or raise --normalise.test-every.",
+            f"Add training photos, or {'change the given split' if official else 'raise --normalise.test-every'}.",
         )
     scene = _scene(sfm, photos, [model.images[i].camera for i in order], model.cameras, found, split, has_alpha)
     write_json(folder / "scene.json", scene.to_json())

@@ -30,7 +30,8 @@ class Photo:
     place. ``time_s`` is when a frame of a video was taken, in seconds from its beginning, None for photos. The place
     is EXIF's, in degrees (north and east positive) and metres above the sea, None where it tells none; so is
     ``exposure_ev``, in stops (stages/decoding.py: exposure_from_exif). ``opaque`` holds all that is more than half
-    opaque, None without alpha; ``used_share`` is what the mask leaves of the pixels.
+    opaque, None without alpha; ``used_share`` is what the mask leaves of the pixels. ``orientation`` is EXIF's, which
+    was undone in the pixels.
     """
 
     name: str  # the user's own file name, relative to the photo folder
@@ -52,6 +53,7 @@ class Photo:
     exposure_ev: float | None = None
     opaque: Box | None = None
     used_share: float = 1.0
+    orientation: int = 1
 
     @property
     def image_name(self) -> str:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from stages.photos import Photo
 
 NEEDS = ("ingest",)
-VERSION = 5
+VERSION = 6
 RESUMES = True
 LINKS = ("sparse",)
 # Both may decide that an attempt is not made, which is said. A run with another limit is to go on from the matches that

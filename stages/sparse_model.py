@@ -67,16 +67,19 @@ class SparseModel:
     def restricted(
         self,
         kept: Sequence[int],
-        scales: Sequence[tuple[float, float]],
+        pixel_maps: Sequence[Float[np.ndarray, "2 3"]],
         cameras: list[Camera],
         images: list[SparseImage],
     ) -> "SparseModel":
         """What ``images``, which stand for the images ``kept`` of this model, see of its points.
 
-        ``scales`` (across, down) take pixels of the old images to pixels of the new ones.
+        ``pixel_maps`` take pixels (x, y, 1) of the old images to pixels of the new ones.
         """
-        order = np.concatenate([np.flatnonzero(self.view == index) for index in kept])
-        view = np.repeat(np.arange(len(kept)), [np.count_nonzero(self.view == index) for index in kept])
-        points, point = np.unique(self.point[order], return_inverse=True)
-        xy = self.xy[order] * np.array(scales)[view]
-        return SparseModel(cameras, images, self.xyz[points], self.rgb[points], self.error_px[points], view, point, xy)
+        bounds = np.searchsorted(self.view, np.arange(len(self.images) + 1))
+        own = [slice(bounds[index], bounds[index + 1]) for index in kept]
+        view = np.repeat(np.arange(len(kept)), [part.stop - part.start for part in own])
+        points, point = np.unique(np.concatenate([self.point[part] for part in own]), return_inverse=True)
+        xy = [self.xy[part] @ pixels[:, :2].T + pixels[:, 2] for part, pixels in zip(own, pixel_maps, strict=True)]
+        return SparseModel(
+            cameras, images, self.xyz[points], self.rgb[points], self.error_px[points], view, point, np.concatenate(xy)
+        )

@@ -15,6 +15,7 @@ _MODELS = {
     "SIMPLE_RADIAL": ("OPENCV", "f cx cy k1"),
     "RADIAL": ("OPENCV", "f cx cy k1 k2"),
     "OPENCV": ("OPENCV", "fl_x fl_y cx cy k1 k2 p1 p2"),
+    "FULL_OPENCV": ("FULL_OPENCV", "fl_x fl_y cx cy k1 k2 p1 p2 k3 k4 k5 k6"),
     "SIMPLE_FISHEYE": ("OPENCV_FISHEYE", "f cx cy"),
     "FISHEYE": ("OPENCV_FISHEYE", "fl_x fl_y cx cy"),
     "SIMPLE_RADIAL_FISHEYE": ("OPENCV_FISHEYE", "f cx cy k1"),
@@ -23,7 +24,6 @@ _MODELS = {
 }
 # Models that the format cannot express: their leading parameters, the rest is left out and said.
 _NEAREST = {
-    "FULL_OPENCV": ("OPENCV", "fl_x fl_y cx cy k1 k2 p1 p2"),
     "FOV": ("OPENCV", "fl_x fl_y cx cy"),
     "SIMPLE_DIVISION": ("OPENCV", "f cx cy"),
     "DIVISION": ("OPENCV", "fl_x fl_y cx cy"),
@@ -73,6 +73,8 @@ def intrinsics(camera: Camera) -> dict[str, Any]:
     if camera.model not in _MODELS | _NEAREST:
         raise ValueError(f"camera model {camera.model} has no counterpart in transforms.json")
     model, names = (_MODELS | _NEAREST)[camera.model]
+    if camera.model == "FULL_OPENCV" and not any(camera.params[9:]):
+        model = "OPENCV"  # with a k3, which nerfstudio reads, too
     values: dict[str, Any] = dict(zip(names.split(), camera.params, strict=camera.model in _MODELS))
     if (focal := values.pop("f", None)) is not None:
         values |= {"fl_x": focal, "fl_y": focal}

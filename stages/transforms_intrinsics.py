@@ -15,17 +15,24 @@ from stages.colmap.model_files import LARGEST_SIDE
 FOCAL_RATIOS = (0.005, 10_000.0)
 FARTHEST_CENTRE = 100.0  # in widths: where the principal point of the last corner cut out of a large picture may lie
 MOST_LETTERS = 40  # of a value, in an error
-FISHEYE, RATIONAL, PANORAMA = "OPENCV_FISHEYE", "FULL_OPENCV", "EQUIRECTANGULAR"
+FISHEYE, PRISM, RATIONAL, PANORAMA = "OPENCV_FISHEYE", "THIN_PRISM_FISHEYE", "FULL_OPENCV", "EQUIRECTANGULAR"
+PERSPECTIVES = ("", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", RATIONAL)
+FISHEYES = ("SIMPLE_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", FISHEYE, PRISM)
+OTHER_LENSES = ("ftheta_p0", "latlong")  # keys that declare them to instant-ngp
+NERFSTUDIOS = ("k1", "k2", "k3", "k4", "p1", "p2")  # distortion_params, in nerfstudio's order
 NO_PANORAMAS = "panoramas are not supported"
 
 
 def read_intrinsics(values: Mapping[str, Any], width: int, height: int, focal: float = 0.0) -> Camera:
     """The camera of a frame from ``w``, ``h``, ``fl_x``, ``fl_y`` or ``camera_angle_x``, ``camera_angle_y``, ``cx``,
-    ``cy``, ``k1`` …, ``p1``, ``p2`` and ``camera_model``; ``width``, ``height`` (pixels) and ``focal`` (in longer sides
-    of the picture) stand where the file has none.
+    ``cy``, ``k1`` …, ``p1``, ``p2``, ``sx1``, ``sy1`` or ``distortion_params``, and ``camera_model``; ``width``,
+    ``height`` (pixels) and ``focal`` (in longer sides of the picture) stand where the file has none.
 
-    Raises ValueError, saying what is wrong, for numbers that are not finite and for what no lens or crop could have.
+    Raises ValueError, saying what is wrong, for numbers that are not finite, for what no lens or crop could have, and
+    for lenses that are not known here.
     """
+    declared = _declared(values)
+    values = _with_named_terms(values)
 
     def number(key: str, default: float) -> float:
         return _finite(values.get(key, default), key)
@@ -37,9 +44,8 @@ def read_intrinsics(values: Mapping[str, Any], width: int, height: int, focal: f
     fy = number("fl_y", _focal_of(values.get("camera_angle_y"), h) or fx)
     pinhole = (fx, fy, number("cx", w / 2), number("cy", h / 2))
     k = [number(f"k{i}", 0.0) for i in range(1, 7)]
-    p = [number("p1", 0.0), number("p2", 0.0)]
-    declared = FISHEYE if values.get("is_fisheye") else str(values.get("camera_model", ""))
-    model, distortion = _distortion(k, p, declared)
+    p, s = [number("p1", 0.0), number("p2", 0.0)], [number("sx1", 0.0), number("sy1", 0.0)]
+    model, distortion = _distortion(k, p, s, declared)
     camera = Camera(model, int(w), int(h), (*pinhole, *distortion))
     if flaw := flaw_of(camera):
         raise ValueError(flaw)
@@ -63,12 +69,39 @@ def flaw_of(camera: Camera) -> str | None:
     return None
 
 
-def _distortion(k: list[float], p: list[float], declared: str) -> tuple[str, list[float]]:
-    """COLMAP's model for these terms and its parameters after fx, fy, cx, cy."""
+def _with_named_terms(values: Mapping[str, Any]) -> Mapping[str, Any]:
+    """``values`` with ``distortion_params`` under the names of its terms."""
+    if "distortion_params" not in values:
+        return values
+    terms = values["distortion_params"]
+    if not (isinstance(terms, list) and len(terms) == len(NERFSTUDIOS)):
+        raise ValueError(
+            f"its distortion_params are not six numbers, {', '.join(NERFSTUDIOS)} as nerfstudio orders them"
+        )
+    return {**values, **dict(zip(NERFSTUDIOS, terms, strict=True))}
+
+
+def _declared(values: Mapping[str, Any]) -> str:
+    """The lens that the values declare, "" without; one of PERSPECTIVES or FISHEYES."""
+    declared = values.get("camera_model") or ""
     if declared == PANORAMA:
         raise ValueError(NO_PANORAMAS)
-    if declared.endswith("FISHEYE"):
-        return FISHEYE, k[:4]
+    if declared not in PERSPECTIVES + FISHEYES:
+        known = ", ".join((*PERSPECTIVES[1:], *FISHEYES))
+        raise ValueError(f"its camera_model is {repr(declared)[:MOST_LETTERS]}, which is none of {known}")
+    if other := next((key for key in OTHER_LENSES if values.get(key, False) is not False), None):
+        raise ValueError(f"it has {other}: lenses of that kind are not supported")
+    return FISHEYE if values.get("is_fisheye") and declared not in FISHEYES else declared
+
+
+def _distortion(k: list[float], p: list[float], s: list[float], declared: str) -> tuple[str, list[float]]:
+    """COLMAP's model for these terms and its parameters after fx, fy, cx, cy."""
+    if declared in FISHEYES:
+        if any(k[4:]):
+            raise ValueError("it has a k5 or k6, and is a fisheye")
+        return (PRISM, [k[0], k[1], *p, k[2], k[3], *s]) if any(p) or any(s) else (FISHEYE, k[:4])
+    if any(s):
+        raise ValueError(f"it has sx1 or sy1, and its camera_model is not {PRISM}")
     if any(k[3:]) and declared != RATIONAL:
         # In such files k4 multiplies r⁸, which no model of COLMAP has; FULL_OPENCV's k4 is a denominator's r².
         raise ValueError("it has a k4, and its camera_model is not FULL_OPENCV")

@@ -140,14 +140,15 @@ def test_a_damaged_model_is_an_error_that_names_it(tmp_path: Path) -> None:
 
 def test_restricting_to_everything_changes_nothing() -> None:
     model = random_model()
-    same = model.restricted(range(5), [(1.0, 1.0)] * 5, model.cameras, model.images)
+    same = model.restricted(range(5), [np.eye(2, 3)] * 5, model.cameras, model.images)
     for name in ("xyz", "rgb", "error_px", "view", "point", "xy"):
         np.testing.assert_array_equal(getattr(same, name), getattr(model, name))
 
 
 def test_restricting_keeps_what_the_kept_images_see() -> None:
     model = random_model()
-    part = model.restricted([3, 1], [(2.0, 1.0), (1.0, 1.0)], model.cameras, [model.images[3], model.images[1]])
+    wider = np.diag([2.0, 1.0, 0.0])[:2]
+    part = model.restricted([3, 1], [wider, np.eye(2, 3)], model.cameras, [model.images[3], model.images[1]])
     for new, old, scale in ((0, 3, (2, 1)), (1, 1, (1, 1))):
         mine, theirs = part.view == new, model.view == old
         np.testing.assert_array_equal(part.xyz[part.point[mine]], model.xyz[model.point[theirs]])

@@ -1,6 +1,7 @@
 import dataclasses
 import json
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +11,10 @@ import pytest
 from nerf.scene import Camera
 from stages.colmap.models import write_model
 from stages.contract import StageError
-from stages.known_cameras import OPENGL_FROM_OPENCV, KnownCameras, read_known_cameras
+from stages.known_cameras import OPENGL_FROM_OPENCV, KnownCameras, _by_name, read_known_cameras
 from stages.photos import Photo
 from stages.sparse_model import SparseImage, SparseModel
+from stages.transforms_export import intrinsics
 
 W, H = 60, 40
 
@@ -83,6 +85,22 @@ def test_axes_turn_from_opengl_to_opencv_and_centres_stay(read) -> None:
             ("OPENCV_FISHEYE", (50, 52, 31, 19, 0.1, 0, 0, 0.3)),
         ),
         (LENS | {"k1": 0.1, "is_fisheye": True}, ("OPENCV_FISHEYE", (50, 52, 31, 19, 0.1, 0, 0, 0))),
+        (
+            LENS | {"distortion_params": [0.1, 0.02, 0.003, 0, 0.01, -0.01]},
+            ("FULL_OPENCV", (50, 52, 31, 19, 0.1, 0.02, 0.01, -0.01, 0.003, 0, 0, 0)),
+        ),
+        (
+            LENS | {"distortion_params": [0.1, 0.02, 0.03, 0.04, 0, 0], "camera_model": "OPENCV_FISHEYE"},
+            ("OPENCV_FISHEYE", (50, 52, 31, 19, 0.1, 0.02, 0.03, 0.04)),
+        ),
+        (
+            LENS | {"k1": 0.1, "k3": 0.03, "p1": 0.01, "p2": 0.02, "camera_model": "OPENCV_FISHEYE"},
+            ("THIN_PRISM_FISHEYE", (50, 52, 31, 19, 0.1, 0, 0.01, 0.02, 0.03, 0, 0, 0)),
+        ),
+        (
+            LENS | {"k4": 0.1, "sx1": 0.01, "sy1": 0.02, "camera_model": "THIN_PRISM_FISHEYE"},
+            ("THIN_PRISM_FISHEYE", (50, 52, 31, 19, 0, 0, 0, 0, 0, 0.1, 0.01, 0.02)),
+        ),
         ({"fl_x": 50}, ("PINHOLE", (50, 50, 30, 20))),
         ({"camera_angle_x": math.pi / 2}, ("PINHOLE", (30, 30, 30, 20))),
         ({"camera_angle_x": math.pi / 2, "camera_angle_y": 2 * math.atan(0.5)}, ("PINHOLE", (30, 40, 30, 20))),
@@ -136,6 +154,17 @@ def _with(row: int, column: int, value: float) -> list[list[float]]:
         ({"w": 80, "h": 40}, r"camera of './1': it is for 80×40 pixels, the photo has 60×40"),
         ({"k4": 0.1}, r"camera of frame './1': it has a k4, and its camera_model is not FULL_OPENCV"),
         ({"camera_model": "EQUIRECTANGULAR"}, r"camera of frame './1': panoramas are not supported"),
+        ({"camera_model": "FISHEYE624"}, r"frame './1': its camera_model is 'FISHEYE624', which is none of SIMPLE_PIN"),
+        ({"camera_model": "ORTHOPHOTO"}, r"frame './1': its camera_model is 'ORTHOPHOTO', which is none of"),
+        ({"camera_model": "VR180_L"}, r"frame './1': its camera_model is 'VR180_L', which is none of"),
+        ({"camera_model": "RAD_TAN_THIN_PRISM_FISHEYE"}, r"its camera_model is 'RAD_TAN_THIN_PRISM_FISHEYE', which is"),
+        ({"camera_model": ["OPENCV"]}, r"frame './1': its camera_model is \['OPENCV'\], which is none of"),
+        ({"ftheta_p0": 0.0}, r"frame './1': it has ftheta_p0: lenses of that kind are not supported"),
+        ({"distortion_params": [0.1, 0.2]}, r"frame './1': its distortion_params are not six numbers, k1, k2, k3, k4"),
+        ({"distortion_params": [0.1, 0, 0, 0, 0, None]}, r"frame './1': its p2 is None, not a finite number"),
+        ({"distortion_params": [0, 0, 0, 0.1, 0, 0]}, r"frame './1': it has a k4, and its camera_model is not FULL_"),
+        ({"is_fisheye": True, "k5": 0.1}, r"frame './1': it has a k5 or k6, and is a fisheye"),
+        ({"sx1": 0.1}, r"frame './1': it has sx1 or sy1, and its camera_model is not THIN_PRISM_FISHEYE"),
     ],
 )
 def test_what_is_no_camera_is_refused_by_name(read, changes: dict[str, Any], message: str) -> None:
@@ -185,6 +214,47 @@ def test_blender_folders_keep_their_split(tmp_path: Path, with_test: bool) -> No
     assert known.test_files == (["a2.png"] if with_test else None)
     (camera,) = known.model.cameras
     assert camera.params == pytest.approx((30, 30, 30, 20))
+
+
+@pytest.mark.parametrize(
+    ("split", "test_files"),
+    [
+        ({"train_filenames": ["0", "1"], "test_filenames": ["./2"], "val_filenames": ["./1"]}, ["a2.png"]),
+        ({"train_filenames": ["0", "1"], "val_filenames": ["2", "./1"]}, ["a1.png", "a2.png"]),
+        ({"train_filenames": ["0", "1", "2"], "test_filenames": [], "val_filenames": []}, None),
+    ],
+)
+def test_the_split_of_a_transforms_file_is_kept(read, split: dict[str, Any], test_files: list[str] | None) -> None:
+    known = read([frame(i) for i in range(3)], **LENS, **split)
+    assert known.test_files == test_files
+    assert known.notes == []
+
+
+def test_test_photos_without_a_frame_are_named(read) -> None:
+    known = read([frame(i) for i in range(3)], **LENS, test_filenames=["./2", "./7"])
+    assert known.test_files == ["a2.png"]
+    assert known.notes == ["1 test photos of transforms.json have no frame: ./7"]
+
+
+@pytest.mark.parametrize(
+    ("split", "why"),
+    [
+        (["./7", "b/2" * 999], r"none of them is the file_path of a frame: \./7, (b/2){20}$"),
+        ("./2", r"test_filenames \(or val_filenames\) is no list of names"),
+        ([2], r"test_filenames \(or val_filenames\) is no list of names"),
+    ],
+)
+def test_a_split_that_cannot_be_kept_is_refused(read, split: Any, why: str) -> None:
+    with pytest.raises(StageError) as raised:
+        read([frame(i) for i in range(3)], **LENS, test_filenames=split)
+    assert raised.value.what == "cannot use the test photos of transforms.json"
+    assert re.match(why, raised.value.why)
+
+
+def test_lenses_that_are_said_to_be_approximations_are_noted(read) -> None:
+    note = intrinsics(Camera("FOV", W, H, (50.0, 52.0, 31.0, 19.0, 0.9)))["note"]
+    known = read([frame(0, note=note), frame(1, note="by hand"), frame(2, note=note)], **LENS)
+    assert known.notes == ["the lenses of 2 frames are approximations, as their notes in the file say"]
 
 
 def colmap_model(folder: Path, names: list[str]) -> SparseModel:
@@ -255,10 +325,34 @@ def test_a_name_that_two_photos_share_matches_neither(tmp_path: Path) -> None:
     assert [image.file for image in known.model.images] == ["a1.png"]
 
 
-def test_two_cameras_for_one_photo_are_refused(tmp_path: Path) -> None:
-    colmap_model(tmp_path, ["left/ä0.png", "right/ä0.png"])
-    with pytest.raises(StageError, match=r"two cameras for the photo ä0\.png"):
-        read_known_cameras(tmp_path, PHOTOS, {})
+@pytest.mark.parametrize(
+    ("images", "own", "matches"),
+    [
+        ([], [], {}),
+        (["cam0/0.jpg"], ["cam1/0.jpg"], {}),  # a photo of another folder
+        (["cam0/0.jpg", "cam1/0.jpg"], ["cam1/0.jpg"], {1: "cam1/0.jpg"}),
+        (["cam0/0.jpg", "cam1/0.jpg"], ["0.jpg"], {}),  # whose it is cannot be known
+        (["0.jpg"], ["cam0/0.jpg", "cam1/0.jpg"], {}),
+        (["cam0/0.jpg", "0.jpg"], ["cam0/0.jpg", "cam1/0.jpg"], {0: "cam0/0.jpg"}),
+        (["set/cam0/0.jpg", "1.jpg"], ["cam0/0.jpg", "b/1.jpg"], {0: "cam0/0.jpg", 1: "b/1.jpg"}),
+        (["xcam0/0.jpg"], ["cam0/0.jpg"], {}),
+        (["ä.jpg", "a.png"], ["ä.jpg"], {0: "ä.jpg"}),  # a model with both of its names
+        (["b/a.png"], ["b/ä.jpg"], {0: "b/ä.jpg"}),
+    ],
+)
+def test_images_have_the_photos_of_their_names(images: list[str], own: list[str], matches: dict[int, str]) -> None:
+    photos = []
+    for name in own:
+        file = f"images/{name.replace('ä.jpg', 'a.png')}"
+        photos.append(Photo(name, file, W, H, 0, None, None, False, 1.0))
+    assert {index: photo.name for index, photo in _by_name(images, photos).items()} == matches
+
+
+def test_one_name_that_is_not_clear_leaves_the_other_cameras(tmp_path: Path) -> None:
+    colmap_model(tmp_path, ["left/ä0.png", "right/ä0.png", "ä1.png"])
+    known = read_known_cameras(tmp_path, PHOTOS, {})
+    assert [image.file for image in known.model.images] == ["a1.png"]
+    assert known.notes[0] == "2 cameras have no photo: left/ä0.png, right/ä0.png"
 
 
 def test_the_fox_of_instant_ngp(shared_data: Path) -> None:

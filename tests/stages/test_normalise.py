@@ -125,6 +125,12 @@ def test_an_official_split_is_kept(inputs, progress) -> None:
     assert [view.file for view in views if view.split == "test"] == ["images/02.png", "images/05.png"]
 
 
+def test_an_official_split_leaves_photos_to_train_on(inputs, progress) -> None:
+    folders = inputs(9, test_files=[f"{i:02d}.png" for i in range(9)])
+    with pytest.raises(StageError, match=r"only 0 of 9 photos are left to train on: .* or change the given split\."):
+        run(folders, progress)
+
+
 def test_equal_inputs_give_equal_bytes(inputs, progress) -> None:
     folders = inputs()
     outputs = run(folders, progress).outputs

@@ -6,6 +6,7 @@ import pytest
 from nerf.scene import Camera, Scene, Similarity, View
 from stages.colmap.model_files import PARAMETERS
 from stages.transforms_export import intrinsics, transforms
+from stages.transforms_intrinsics import read_intrinsics
 from tests.camera_layouts import ring
 
 TURN = np.array([[0.0, -1.0, 0.0], [0.6, 0.0, -0.8], [0.8, 0.0, 0.6]])
@@ -74,6 +75,14 @@ def test_region_of_interest_lies_in_the_unit_cube_of_instant_ngp() -> None:
         (Camera("SIMPLE_RADIAL", 8, 6, (5.0, 4.0, 3.0, 0.1)), {"fl_x": 5.0, "fl_y": 5.0, "cx": 4.0, "k1": 0.1}),
         (Camera("RADIAL", 8, 6, (5.0, 4.0, 3.0, 0.1, 0.2)), {"fl_y": 5.0, "k1": 0.1, "k2": 0.2}),
         (
+            Camera("FULL_OPENCV", 8, 6, tuple(map(float, range(1, 13)))),
+            {"camera_model": "FULL_OPENCV", "k2": 6.0, "p1": 7.0, "k3": 9.0, "k4": 10.0, "k6": 12.0},
+        ),
+        (
+            Camera("FULL_OPENCV", 8, 6, (*map(float, range(1, 10)), 0.0, 0.0, 0.0)),
+            {"camera_model": "OPENCV", "p1": 7.0, "k3": 9.0, "k4": 0.0},
+        ),
+        (
             Camera("OPENCV_FISHEYE", 8, 6, (5.0, 6.0, 4.0, 3.0, 0.1, 0.2, 0.3, 0.4)),
             {"camera_model": "OPENCV_FISHEYE", "fl_y": 6.0, "k3": 0.3, "k4": 0.4},
         ),
@@ -84,6 +93,19 @@ def test_camera_models_under_the_formats_names(camera: Camera, expected: dict[st
     assert values.items() >= expected.items()
     assert "f" not in values
     assert "note" not in values
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        Camera("OPENCV", 60, 40, (50.0, 52.0, 31.0, 19.0, 0.1, 0.01, 0.02, 0.03)),
+        Camera("FULL_OPENCV", 60, 40, (50.0, 52.0, 31.0, 19.0, 0.1, 0.01, 0.02, 0.03, 0.04, 0.05, 0.06, 0.07)),
+        Camera("FULL_OPENCV", 60, 40, (50.0, 52.0, 31.0, 19.0, 0.1, 0.01, 0.02, 0.03, 0.04, 0.0, 0.0, 0.0)),
+        Camera("OPENCV_FISHEYE", 60, 40, (50.0, 52.0, 31.0, 19.0, 0.1, 0.01, 0.02, 0.03)),
+    ],
+)
+def test_a_lens_comes_back_as_it_was_written(camera: Camera) -> None:
+    assert read_intrinsics(intrinsics(camera), 1, 1) == camera
 
 
 def test_a_model_the_format_lacks_is_written_as_the_nearest_and_says_so() -> None:
