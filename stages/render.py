@@ -11,6 +11,7 @@ from stages.amounts import duration, short_count
 from stages.contract import Inputs, Progress, StageConfig, StageError, StageResult
 from stages.files import read_json, read_scene, write_json, write_png
 from stages.render_path import BY_LAYOUT, CameraPath, PathKind, fitted_path, path_from_file, path_rays
+from stages.render_plan import LEAST_WIDTH
 from stages.spread import spread
 
 if TYPE_CHECKING:
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
     from stages.drawing import Allowance, Painter
 
 NEEDS = ("normalise", "train")
-VERSION = 4
+VERSION = 5
 RESUMES = False
 LINKS = ("video.mp4", "depth.mp4", "path.json")
 UNKEYED = ("seconds",)  # it decides how many frames and how large, and these enter the key
@@ -46,7 +47,9 @@ class Config(StageConfig):
         "or a path.json of ours",
     )
     frames: int | None = Field(default=None, ge=2, description="none: as many as time allows, 24 to 120 if it can be")
-    width: int | None = Field(default=None, ge=16, le=8192, description="pixels; odd numbers are rounded to even ones")
+    width: int | None = Field(
+        default=None, ge=LEAST_WIDTH, le=8192, description="pixels; odd numbers are rounded to even ones"
+    )
     fps: int | None = Field(default=None, ge=1, le=120, description="none: 30, fewer for fewer than 120 frames")
     seconds: float | None = Field(
         default=None,
