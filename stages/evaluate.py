@@ -117,17 +117,14 @@ def _affordable(config: Config, scene: "Scene", train: Path, may_shrink: bool, p
 
 def _tried_rays(scene: "Scene", side: int) -> "Rays":
     """Rays of a few test photos, reduced to a long side of ``side`` pixels, in one row each photo after the other."""
-    import torch
-
-    from nerf.rays import Rays
+    from nerf.rays import join_rays
     from stages.training_data import view_rays
 
     test = scene.of_split("test")
     few = [test[i] for i in spread(len(test), min(TRIED_PHOTOS, len(test)))]
     cameras = [scene.cameras[view.camera] for view in few]
     photos = [view_rays(scene, v, max(c.width, c.height) / side) for v, c in zip(few, cameras, strict=True)]
-    flat = [rays.each(lambda part: part.reshape(1, -1, *part.shape[2:])) for rays in photos]
-    return Rays(*(torch.cat(parts, dim=1) for parts in zip(*flat, strict=True)))
+    return join_rays((rays.each(lambda part: part.reshape(1, -1, *part.shape[2:])) for rays in photos), dim=1)
 
 
 def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> StageResult:

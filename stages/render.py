@@ -109,15 +109,13 @@ def _affordable(
 
 def _tried_rays(path: CameraPath, scene: "Scene", side: int) -> "Rays":
     """Rays of a few frames, reduced to a long side of ``side`` pixels, one above the other."""
-    import torch
-
-    from nerf.rays import Rays
+    from nerf.rays import join_rays
 
     camera = path.cameras[0]
     count = len(path.cameras)
     few = path.some(sorted(set(spread(count, TRIED_VIEWS))))
     width = max(2, 2 * round(side * camera.width / max(camera.width, camera.height) / 2))
-    return Rays(*(torch.cat(parts) for parts in zip(*path_rays(few.resized(width), scene), strict=True)))
+    return join_rays(path_rays(few.resized(width), scene))
 
 
 def _why(
