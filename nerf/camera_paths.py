@@ -15,7 +15,12 @@ SMOOTHING_DEG = 20.0  # standard deviation over azimuth within which an orbit av
 STEEPEST = 0.15  # least horizontal distance of an orbit to its axis, in distances to the target (81 degrees)
 SPIRAL_SHARE = 0.7  # quantile of the cameras' offsets that the spiral reaches
 ROUNDING = 1e-9  # of tour lengths of about 10: reversing a stretch gains more, or the search would run in circles
-FRAMES_PER_KEY = 8  # interpolated: frames between two of the cameras it visits, so that the tour is not a blur
+FRAMES_PER_KEY, LEAST_KEYS = 8, 4  # interpolated: frames for each camera it sets out for, so that it is not a blur
+MOST_CAMERAS = 1000  # that a tour knows of; of more, those farthest from each other
+NEIGHBOURS = 3  # of each camera, to which a tour may go on from it
+FINE = 16  # points of a tour for each of its steps from camera to camera
+ROUNDED_STEPS = 2  # to either side over which a tour is averaged, or, where photos stand closer, as far as
+ROUNDED_FRAMES, SMOOTH_FRAMES = 4, 120  # this many frames go: hands shake. Of fewer than 120 as if there were 120
 
 UP = np.array([0.0, 0.0, 1.0])
 Poses = Float[np.ndarray, "frames 3 4"]
@@ -88,24 +93,83 @@ def average_pose(cameras: Float[np.ndarray, "n 3 4"]) -> Float[np.ndarray, "3 4"
 
 
 def interpolated(cameras: Float[np.ndarray, "n 3 4"], frames: int) -> Poses:
-    """Through the cameras themselves along a short tour, at constant speed.
+    """From camera to neighbouring camera along a short tour, at constant speed.
 
-    At most one camera in eight frames is visited, the ones furthest from each other; a Catmull-Rom spline runs through
-    centres and rotation matrices alike, and each matrix is carried to the nearest rotation. Speed counts one
-    radian of turning as much as the cameras' median distance from their middle.
+    It sets out for one camera in eight frames, the ones farthest from each other, and gets from one to the next by way
+    of others, so that it leads around walls as the photos do. Centres and rotation matrices alike are averaged along
+    the tour, which rounds its corners, and each matrix is carried to the nearest rotation. Speed counts one radian of
+    turning as much as the cameras' median distance from their middle.
     """
     spread = np.median(np.linalg.norm(cameras[:, :, 3] - spatial_median(cameras[:, :, 3]), axis=1))
-    features = np.concatenate(
-        [cameras[:, :, :3].reshape(-1, 9) / np.sqrt(2), cameras[:, :, 3] / (spread if spread > 0 else 1.0)], axis=1
-    )
-    keys = _farthest(features, max(2, frames // FRAMES_PER_KEY))
-    keys = keys[_short_tour(features[keys])]
-    fine = np.linspace(0, len(keys) - 1, 32 * len(keys))
-    steps = np.linalg.norm(np.diff(_catmull_rom(features[keys], fine), axis=0), axis=1)
-    length = np.concatenate([[0.0], np.cumsum(steps)])
-    at = np.interp(np.linspace(0, length[-1], frames), length, fine)
-    poses = _catmull_rom(cameras[keys].reshape(-1, 12), at).reshape(-1, 3, 4)
-    return np.concatenate([nearest_rotations(poses[:, :, :3]), poses[:, :, 3:]], axis=2)
+    unit = np.append(np.full(9, np.sqrt(2)), np.full(3, spread if spread > 0 else 1.0))
+    features = np.concatenate([cameras[:, :, :3].reshape(-1, 9), cameras[:, :, 3]], axis=1) / unit
+    features = features[_farthest(features, MOST_CAMERAS)]
+    tour = features[_route(features, max(LEAST_KEYS, frames // FRAMES_PER_KEY))]
+    fine = _evenly(tour, FINE * (len(tour) - 1) + 1)
+    reach = max(ROUNDED_STEPS * FINE, ROUNDED_FRAMES * len(fine) // max(frames, SMOOTH_FRAMES))
+    path = _rotating(_rounded(fine, reach))
+    poses = _rotating(_evenly(path, frames)) * unit
+    return np.concatenate([poses[:, :9].reshape(-1, 3, 3), poses[:, 9:, None]], axis=2)
+
+
+def _evenly(path: Float[np.ndarray, "m d"], count: int) -> Float[np.ndarray, "{count} d"]:
+    """``count`` points at equal distances along straight lines from row to row, both ends among them."""
+    length = np.append(0.0, np.linalg.norm(np.diff(path, axis=0), axis=1).cumsum())
+    at = np.linspace(0, length[-1], count)
+    return np.stack([np.interp(at, length, column) for column in path.T], axis=1)
+
+
+def _rounded(path: Float[np.ndarray, "m d"], reach: int) -> Float[np.ndarray, "m d"]:
+    """Each row averaged with ``reach`` others to either side, the closer the more. Beyond its ends the path goes on
+    mirrored, so that they stay."""
+    weight = np.bartlett(2 * reach + 1) / reach
+    longer = np.pad(path, ((reach, reach), (0, 0)), mode="reflect", reflect_type="odd")
+    return np.stack([np.convolve(column, weight, mode="valid") for column in longer.T], axis=1)
+
+
+def _rotating(features: Float[np.ndarray, "m 12"]) -> Float[np.ndarray, "m 12"]:
+    """The same with its matrices carried to the nearest rotations, in the features' scale."""
+    rotation = nearest_rotations(features[:, :9].reshape(-1, 3, 3)).reshape(-1, 9) / np.sqrt(2)
+    return np.concatenate([rotation, features[:, 9:]], axis=1)
+
+
+def _route(features: Float[np.ndarray, "n d"], count: int) -> np.ndarray:
+    """Rows that follow each other on a short way through ``count`` of them, the farthest from each other.
+
+    Each step leads to a neighbour: one of the few nearest, or the next on the tree that joins all with the least
+    length. Steps cost the square of their length, so that many short ones beat a long one.
+    """
+    square = np.sum(features**2, axis=1)
+    cost = np.maximum(square[:, None] + square - 2 * features @ features.T, 0)
+    kth = min(NEIGHBOURS, len(cost) - 1)  # row by row, each the nearest to itself
+    near = cost <= np.partition(cost, kth, axis=1)[:, kth, None]
+    near[np.arange(len(cost)), _tree(cost, 0, 0.0)[1]] = True
+    cost = np.where(near | near.T, cost, np.inf)
+    keys = _farthest(features, count)
+    lengths, before = (np.stack(each) for each in zip(*(_tree(cost, int(key), 1.0) for key in keys), strict=True))
+    tour = _short_tour(lengths[:, keys])
+    route = [keys[tour[-1]]]
+    for start in tour[-2::-1]:  # from the end, as the trees say where each row was reached from
+        while route[-1] != keys[start]:
+            route.append(before[start, route[-1]])
+    return np.array(route)
+
+
+def _tree(cost: Float[np.ndarray, "n n"], start: int, carried: float) -> tuple[Float[np.ndarray, "n"], np.ndarray]:
+    """How all rows are reached from ``start``: at which cost, and from which row; ``start`` from itself.
+
+    ``carried`` is 1 for the shortest way to each (Dijkstra 1959), 0 for the least sum of all steps (Prim 1957).
+    """
+    reached, before = np.full(len(cost), np.inf), np.full(len(cost), start)
+    reached[start] = 0
+    left = np.ones(len(cost), bool)
+    for _ in cost:
+        at = int(np.argmin(np.where(left, reached, np.inf)))
+        left[at] = False
+        through = carried * reached[at] + cost[at]
+        better = left & (through < reached)
+        reached[better], before[better] = through[better], at
+    return reached, before
 
 
 def _farthest(features: Float[np.ndarray, "n d"], count: int) -> np.ndarray:
@@ -118,12 +182,11 @@ def _farthest(features: Float[np.ndarray, "n d"], count: int) -> np.ndarray:
     return np.array(chosen)
 
 
-def _short_tour(features: Float[np.ndarray, "n d"]) -> np.ndarray:
+def _short_tour(cost: Float[np.ndarray, "n n"]) -> np.ndarray:
     """An order of the rows with a short path through them: nearest neighbours, then 2-opt until nothing improves."""
-    cost = np.linalg.norm(features[:, None] - features, axis=2)
     tour = [int(np.argmax(cost.sum(axis=1)))]  # the most remote one: an end of the path
-    while len(tour) < len(features):
-        remaining = np.setdiff1d(np.arange(len(features)), tour)
+    while len(tour) < len(cost):
+        remaining = np.setdiff1d(np.arange(len(cost)), tour)
         tour.append(int(remaining[np.argmin(cost[tour[-1], remaining])]))
     best = np.array(tour)
     while (shorter := _uncrossed(best, cost)) is not None:
@@ -142,15 +205,6 @@ def _uncrossed(tour: np.ndarray, cost: Float[np.ndarray, "n n"]) -> np.ndarray |
             if before_turned + after_turned < before + after - ROUNDING:
                 return np.concatenate([tour[:i], tour[i : j + 1][::-1], tour[j + 1 :]])
     return None
-
-
-def _catmull_rom(keys: Float[np.ndarray, "n d"], at: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m d"]:
-    """The uniform Catmull-Rom spline through ``keys`` (at 0, 1, ..., n-1), its ends extended linearly."""
-    padded = np.concatenate([2 * keys[:1] - keys[1:2], keys, 2 * keys[-1:] - keys[-2:-1]])
-    segment = np.clip(at.astype(int), 0, len(keys) - 2)
-    u = (at - segment)[:, None]
-    p0, p1, p2, p3 = (padded[segment + k] for k in range(4))
-    return p1 + u / 2 * (p2 - p0 + u * (2 * p0 - 5 * p1 + 4 * p2 - p3 + u * (3 * (p1 - p2) + p3 - p0)))
 
 
 def look_at(

@@ -218,7 +218,7 @@ class GridField(nn.Module):
         nowhere, black = of_rays.new_zeros(len(of_rays)), of_rays.new_zeros(len(of_rays), 3)
         geometry = wave.density.geometry
         colour = grid_mlp.colour_forward(self.weights, self.backend, wave.samples, geometry, of_rays).colour
-        return self.backend.composite(wave.samples, wave.sigma, colour, black, nowhere)[0]
+        return self.backend.composite(wave.samples, wave.density.sigma, colour, black, nowhere)[0]
 
     def forward(self, rays: Rays, jitter: Float[Tensor, "rays"], background: Float[Tensor, "rays 3"]) -> GridPass:
         """Density of all samples in occupied cells; colour of those that can be seen."""
@@ -227,7 +227,7 @@ class GridField(nn.Module):
         waves = list(self._waves(rays, jitter))
         with part("march"):
             samples, order = backend.pack_waves([wave.samples for wave in waves])
-            sigma = torch.cat([wave.sigma for wave in waves]).index_select(0, order)
+            sigma = torch.cat([wave.density.sigma for wave in waves]).index_select(0, order)
             samples, seen = backend.visible_front(samples, sigma, HIDDEN_BEHIND)
             rows = order.index_select(0, seen)
             points = torch.cat([wave.points for wave in waves]).index_select(0, rows)

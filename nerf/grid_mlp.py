@@ -35,16 +35,7 @@ class DensityPass(NamedTuple):
     features: Float[Tensor, "samples features"]
     hidden: Float[Tensor, "samples hidden"]
     geometry: Float[Tensor, "samples geometry"]
-
-    @property
-    def sigma(self) -> Float[Tensor, "samples"]:
-        """exp(min(x, 15)) of the first output. At the limit an interval as short as 0.001 stops all light but e^-3000,
-        so that what the limit takes from the gradient is zero already."""
-        return self.geometry[:, 0].clamp(max=LARGEST_LOG_DENSITY).exp()
-
-    def select(self, index: Tensor) -> "DensityPass":
-        """The pass of some of the samples."""
-        return DensityPass(*(part.index_select(0, index) for part in self))
+    sigma: Float[Tensor, "samples"]
 
 
 class ColourPass(NamedTuple):
@@ -102,10 +93,17 @@ def colour_products(weights: Weights) -> int:
 
 
 def density_forward(weights: Weights, features: Float[Tensor, "samples features"]) -> DensityPass:
-    """Features to geometry."""
+    """Features to geometry and density."""
     with part("mlp", Work(products=density_products(weights) * len(features))):
         hidden = (features @ weights.density_hidden).relu_()
-        return DensityPass(features, hidden, hidden @ weights.density_out.T)
+        geometry = hidden @ weights.density_out.T
+        return DensityPass(features, hidden, geometry, sigma_of(geometry))
+
+
+def sigma_of(geometry: Float[Tensor, "samples geometry"]) -> Float[Tensor, "samples"]:
+    """exp(min(x, 15)) of the first output. At the limit an interval as short as 0.001 stops all light but e^-3000, so
+    that what the limit takes from the gradient is zero already."""
+    return geometry[:, 0].clamp(max=LARGEST_LOG_DENSITY).exp()
 
 
 def ray_hidden(weights: Weights, harmonics: Float[Tensor, "rays direction"]) -> Float[Tensor, "rays hidden"]:

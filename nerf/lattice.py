@@ -14,7 +14,7 @@ from torch import Tensor
 
 from nerf.model import RadianceModel
 from nerf.parallel import in_order
-from nerf.rays import Rays
+from nerf.rays import Rays, clip_to_box, points_on
 
 
 class Lattice(NamedTuple):
@@ -99,17 +99,6 @@ def trilinear(lattice: Lattice, points: Float[Tensor, "*points 3"]) -> Float[Ten
     return sampled.reshape(points.shape[:-1])
 
 
-def box_interval(rays: Rays, low: Float[Tensor, "3"], high: Float[Tensor, "3"]) -> Rays:
-    """Narrow [near, far] to the box (slab method, Kay and Kajiya 1986); far = near marks rays that miss it."""
-    tiny = torch.finfo(rays.directions.dtype).tiny
-    directions = torch.where(rays.directions.abs() < tiny, tiny, rays.directions)
-    first, second = (low - rays.origins) / directions, (high - rays.origins) / directions
-    enter = torch.maximum(rays.near, torch.minimum(first, second).amax(-1))
-    leave = torch.minimum(rays.far, torch.maximum(first, second).amin(-1))
-    hit = leave > enter
-    return rays._replace(near=torch.where(hit, enter, rays.near), far=torch.where(hit, leave, rays.near))
-
-
 def ray_distances(rays: Rays, samples: int) -> Float[Tensor, "*rays samples"]:
     """``samples`` evenly spaced distances from near to far, end points included."""
     fraction = torch.linspace(0, 1, samples, device=rays.near.device)
@@ -118,7 +107,7 @@ def ray_distances(rays: Rays, samples: int) -> Float[Tensor, "*rays samples"]:
 
 def along(lattice: Lattice, rays: Rays, t: Float[Tensor, "*rays samples"]) -> Float[Tensor, "*rays samples"]:
     """The lattice's values at distances ``t`` along the rays."""
-    return trilinear(lattice, rays.origins[..., None, :] + t[..., None] * rays.directions[..., None, :])
+    return trilinear(lattice, points_on(rays, t))
 
 
 def optical_depth(
@@ -144,6 +133,6 @@ def first_crossing(
 
 def stopping_distance(lattice: Lattice, rays: Rays, samples: int) -> Float[Tensor, "*rays"]:
     """Distance at which half of the light is lost to the density lattice: the median depth; infinite if never."""
-    rays = box_interval(rays, lattice.low, lattice.high)
+    rays = clip_to_box(rays, lattice.low, lattice.high)
     t = ray_distances(rays, samples)
     return first_crossing(optical_depth(along(lattice, rays, t), t), t, math.log(2))

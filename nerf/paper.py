@@ -203,7 +203,7 @@ class PaperNerf(nn.Module):
         float32 point to 1e-4. The networks compute in the type of their weights."""
         with part("sampling"):
             exact = rays.each(Tensor.double)
-            return exact if self.settings.contracted else clip_to_box(exact, BOX)
+            return exact if self.settings.contracted else clip_to_box(exact, -BOX, BOX)
 
     def _cut(self, points: Float[Tensor, "*points 3"], sigma: Float[Tensor, "*points"]) -> Float[Tensor, "*points"]:
         return sigma if self.settings.contracted else torch.where((points.abs() <= BOX).all(-1), sigma, 0)

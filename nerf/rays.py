@@ -1,6 +1,6 @@
 """Rays in the scene frame: origin, unit direction, near, far."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 import torch
@@ -19,6 +19,11 @@ class Rays(NamedTuple):
     def each(self, change: Callable[[Tensor], Tensor]) -> "Rays":
         """Each of the four changed alike: cut, moved, reshaped."""
         return Rays(*map(change, self))
+
+
+def join_rays(batches: Iterable[Rays], dim: int = 0) -> Rays:
+    """One batch of several, one after the other along ``dim``."""
+    return Rays(*(torch.cat(parts, dim) for parts in zip(*batches, strict=True)))
 
 
 def rays_of_view(
@@ -43,17 +48,17 @@ def points_on(rays: Rays, t: Float[Tensor, "*rays n"]) -> Float[Tensor, "*rays n
     return rays.origins[..., None, :] + t[..., None] * rays.directions[..., None, :]
 
 
-def clip_to_box(rays: Rays, half_size: float) -> Rays:
-    """Cut [near, far] to the cube [-half_size, half_size]^3 (the slab method of Kay and Kajiya 1986).
+def clip_to_box(rays: Rays, low: float | Float[Tensor, "3"], high: float | Float[Tensor, "3"]) -> Rays:
+    """Cut [near, far] to the box between the corners ``low`` and ``high`` (the slab method of Kay and Kajiya 1986).
 
-    A ray that misses the cube between near and far gets the empty interval near = far = its old far. The interval
+    A ray that misses the box between near and far gets the empty interval near = far = its old far. The interval
     says where to look, not what is seen: it carries no gradient.
     """
     with torch.no_grad():
         # A component of 0 would give 0/0 for an origin on a face; the smallest normal number gives the same slabs.
         smallest = torch.finfo(rays.directions.dtype).tiny
         directions = torch.where(rays.directions == 0, smallest, rays.directions)
-        first, second = (-half_size - rays.origins) / directions, (half_size - rays.origins) / directions
+        first, second = (low - rays.origins) / directions, (high - rays.origins) / directions
         near = torch.maximum(rays.near, torch.minimum(first, second).amax(-1))
         far = torch.minimum(rays.far, torch.maximum(first, second).amin(-1))
         hit = near < far

@@ -24,13 +24,11 @@ SHORTEST_WAVE, LONGEST_WAVE = 6, 64
 
 
 class Wave(NamedTuple):
-    """Some samples of all rays; of those whose light is used up there are none. ``sigma`` is the density's, which it
-    would compute anew each time it is asked."""
+    """Some samples of all rays; of those whose light is used up there are none."""
 
     samples: Samples
     points: Float[Tensor, "samples 3"]
     density: DensityPass
-    sigma: Float[Tensor, "samples"]
 
 
 def front_to_back(
@@ -56,10 +54,9 @@ def front_to_back(
             samples = backend.march(occupied, of_wave, rays._replace(near=near), jitter)
             points = backend.sample_points(rays, samples, lattice.contracted)
         density = density_at(points)
-        sigma = density.sigma
-        yield Wave(samples, points, density, sigma)
+        yield Wave(samples, points, density)
         with part("march"):
-            backend.end_wave(of_wave, samples, sigma, HIDDEN_BEHIND, jitter, rays.far, depth, near)
+            backend.end_wave(of_wave, samples, density.sigma, HIDDEN_BEHIND, jitter, rays.far, depth, near)
             taken, going_on = taken + of_wave.most_samples, int((near < rays.far).sum())
 
 

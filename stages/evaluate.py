@@ -14,7 +14,7 @@ from pydantic import Field
 from stages.amounts import duration, short_count
 from stages.contract import Inputs, Progress, StageConfig, StageResult
 from stages.files import read_json, read_scene, write_json, write_png
-from stages.image_metrics import ERROR_SCALE, FEWEST_FOR_INTERVAL, bootstrap_interval, error_map, ssim
+from stages.image_metrics import ERROR_SCALE, FEWEST_FOR_INTERVAL, error_map, mean_interval, ssim
 from stages.spread import spread
 from stages.training_setup import BLACK, WHITE
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from stages.drawing import Painter
 
 NEEDS = ("ingest", "normalise", "train")
-VERSION = 6
+VERSION = 7
 RESUMES = False
 LINKS = ("metrics.json", "renders", "errors")
 UNKEYED = ("seconds",)  # it decides how many photos, and that enters the key
@@ -68,7 +68,6 @@ class Config(StageConfig):
         gt=0,
         description="Seconds that the stage may take. None: drawing takes 30 % of the training's seconds.",
     )
-    seed: int = Field(default=0, description="Of the interval.")
 
 
 def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
@@ -118,17 +117,14 @@ def _affordable(config: Config, scene: "Scene", train: Path, may_shrink: bool, p
 
 def _tried_rays(scene: "Scene", side: int) -> "Rays":
     """Rays of a few test photos, reduced to a long side of ``side`` pixels, in one row each photo after the other."""
-    import torch
-
-    from nerf.rays import Rays
+    from nerf.rays import join_rays
     from stages.training_data import view_rays
 
     test = scene.of_split("test")
     few = [test[i] for i in spread(len(test), min(TRIED_PHOTOS, len(test)))]
     cameras = [scene.cameras[view.camera] for view in few]
     photos = [view_rays(scene, v, max(c.width, c.height) / side) for v, c in zip(few, cameras, strict=True)]
-    flat = [rays.each(lambda part: part.reshape(1, -1, *part.shape[2:])) for rays in photos]
-    return Rays(*(torch.cat(parts, dim=1) for parts in zip(*flat, strict=True)))
+    return join_rays((rays.each(lambda part: part.reshape(1, -1, *part.shape[2:])) for rays in photos), dim=1)
 
 
 def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> StageResult:
@@ -147,7 +143,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     for note in notes:
         progress.note(note)
     images = examiner.score(scored, progress)
-    metrics = _overall(images, len(test), examiner.downscale, notes, config.seed)
+    metrics = _overall(images, len(test), examiner.downscale, notes)
     metrics["background"] = examiner.painter.background.tolist()
     metrics["exposure"] = "as the photos taken nearest by" if examiner.gains else None
     metrics["poses_fitted"] = examiner.fits_poses
@@ -246,8 +242,6 @@ class Examiner:
 
         return view_mask(self.ingest, self.scene, view, self.downscale)
 
-        return self._painter(view).draw(view_rays(self.scene, view, self.downscale), on_chunk)
-
     def _painter(self, view: "View") -> "Painter":
         return self.painter.at_gain(self.gains[view.name]) if self.gains else self.painter
 
@@ -307,14 +301,12 @@ def verdict(metrics: dict[str, Any]) -> str:
     return what + "."
 
 
-def _overall(
-    images: list[dict[str, Any]], test_photos: int, downscale: float, notes: list[str], seed: int
-) -> dict[str, Any]:
+def _overall(images: list[dict[str, Any]], test_photos: int, downscale: float, notes: list[str]) -> dict[str, Any]:
     """The content of metrics.json."""
     metrics: dict[str, Any] = {key: _mean([image[key] for image in images]) for key in FIGURES}
     for key in ("psnr", "ssim"):
         values = [image[key] for image in images if image[key] is not None]
-        metrics[f"{key}_interval"] = bootstrap_interval(values, seed)
+        metrics[f"{key}_interval"] = mean_interval(values)
     if not images:
         notes = [*notes, "no photo was kept for testing, so nothing is measured"]
     elif len(images) < FEWEST_FOR_INTERVAL:

@@ -171,16 +171,14 @@ def _level(
     config: Config, lattice: "Lattice", model: "RadianceModel", maps: "list[ShadowMap]", progress: Progress
 ) -> "Level":
     """The level asked for, or the one chosen from a fixed share of the maps' rays."""
-    import torch
-
-    from nerf.rays import Rays
+    from nerf.rays import join_rays
     from stages.mesh_level import Level, check_range, choose_level
     from stages.mesh_views import used_rays
 
     check_range(lattice, config.level)
     if config.level is not None:
         return Level(config.level, "as asked", None, True)
-    every = Rays(*(torch.cat(parts) for parts in zip(*(used_rays(one) for one in maps), strict=True)))
+    every = join_rays(used_rays(one) for one in maps)
     stride = max(1, len(every.near) // LEVEL_RAYS)
     level = choose_level(lattice, model, every.each(lambda part: part[::stride]))
     progress.note(f"surface at density {level.level:.3g}: {level.reason}")

@@ -8,6 +8,7 @@ a ray that stops without meeting the surface, or meets it without stopping, cost
 """
 
 import math
+from operator import itemgetter
 from typing import TYPE_CHECKING, NamedTuple
 
 from stages.contract import StageError
@@ -70,10 +71,11 @@ def choose_level(lattice: "Lattice", model: "RadianceModel", rays: "Rays") -> Le
     """The density whose surface in ``lattice`` lies closest to where ``rays`` lose half of their light in ``model``."""
     import torch
 
-    from nerf.lattice import along, box_interval, first_crossing, ray_distances
+    from nerf.lattice import along, first_crossing, ray_distances
+    from nerf.rays import clip_to_box
     from stages.mesh_surface import solidity
 
-    inside = box_interval(rays, lattice.low, lattice.high)
+    inside = clip_to_box(rays, lattice.low, lattice.high)
     inside = inside.each(lambda part: part[inside.far > inside.near])
     t = ray_distances(inside, SAMPLES_PER_EDGE * max(lattice.values.shape))
     stop, peak = _stops(model, inside, t)
@@ -111,14 +113,14 @@ def _stops(model: "RadianceModel", rays: "Rays", t: "torch.Tensor") -> "tuple[to
     import torch
 
     from nerf.lattice import first_crossing
+    from nerf.rays import points_on
 
     middle = (t[:, 1:] + t[:, :-1]) / 2
     density = torch.empty_like(middle)
     with torch.no_grad():
         for row in range(0, len(t), RAYS_AT_A_TIME):
             part = slice(row, row + RAYS_AT_A_TIME)
-            points = rays.origins[part, None] + middle[part, :, None] * rays.directions[part, None]
-            density[part] = model.density(points).float()
+            density[part] = model.density(points_on(rays.each(itemgetter(part)), middle[part])).float()
     depth = torch.nn.functional.pad((density * t.diff(dim=-1)).cumsum(-1), (1, 0))
     stop = first_crossing(depth, t, math.log(2))
     return stop, torch.where(t[:, :-1] <= stop[:, None], density, 0.0).amax(-1)

@@ -78,7 +78,7 @@ def used_rays(shadow: ShadowMap) -> "Rays":
     """The rays of a map that its mask does not ignore, (n,)."""
     import torch
 
-    flat = type(shadow.rays)(*(part.flatten(0, 1) for part in shadow.rays))
+    flat = shadow.rays.each(lambda part: part.flatten(0, 1))
     if shadow.used is None:
         return flat
     rows, columns = (  # of the mask, at the middles of the rays' cells
@@ -86,7 +86,7 @@ def used_rays(shadow: ShadowMap) -> "Rays":
         for cells, pixels in zip(shadow.reach.shape, shadow.used.shape, strict=True)
     )
     used = torch.from_numpy(shadow.used[np.ix_(rows, columns)]).flatten().to(flat.near.device)
-    return type(flat)(*(part[used] for part in flat))
+    return flat.each(lambda part: part[used])
 
 
 def look(vertices: np.ndarray, normals: np.ndarray, maps: Sequence[ShadowMap], voxel: float) -> Sight:

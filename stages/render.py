@@ -11,6 +11,7 @@ from stages.amounts import duration, short_count
 from stages.contract import Inputs, Progress, StageConfig, StageError, StageResult
 from stages.files import read_json, read_scene, write_json, write_png
 from stages.render_path import BY_LAYOUT, CameraPath, PathKind, fitted_path, path_from_file, path_rays
+from stages.render_plan import LEAST_WIDTH
 from stages.spread import spread
 
 if TYPE_CHECKING:
@@ -46,7 +47,9 @@ class Config(StageConfig):
         "or a path.json of ours",
     )
     frames: int | None = Field(default=None, ge=2, description="none: as many as time allows, 24 to 120 if it can be")
-    width: int | None = Field(default=None, ge=16, le=8192, description="pixels; odd numbers are rounded to even ones")
+    width: int | None = Field(
+        default=None, ge=LEAST_WIDTH, le=8192, description="pixels; odd numbers are rounded to even ones"
+    )
     fps: int | None = Field(default=None, ge=1, le=120, description="none: 30, fewer for fewer than 120 frames")
     seconds: float | None = Field(
         default=None,
@@ -106,15 +109,13 @@ def _affordable(
 
 def _tried_rays(path: CameraPath, scene: "Scene", side: int) -> "Rays":
     """Rays of a few frames, reduced to a long side of ``side`` pixels, one above the other."""
-    import torch
-
-    from nerf.rays import Rays
+    from nerf.rays import join_rays
 
     camera = path.cameras[0]
     count = len(path.cameras)
     few = path.some(sorted(set(spread(count, TRIED_VIEWS))))
     width = max(2, 2 * round(side * camera.width / max(camera.width, camera.height) / 2))
-    return Rays(*(torch.cat(parts) for parts in zip(*path_rays(few.resized(width), scene), strict=True)))
+    return join_rays(path_rays(few.resized(width), scene))
 
 
 def _why(

@@ -52,12 +52,12 @@ def path_rays(path: CameraPath, scene: "Scene") -> "Iterator[Rays]":
         np.array([view.far for view in views]),
         scene.bounded,
     )
-    bearings = {
-        camera: torch.from_numpy(camera_rays(camera, camera.width, camera.height)) for camera in set(path.cameras)
-    }
+    bearings = last = None
     for index, camera in enumerate(path.cameras):
+        if bearings is None or camera != last:  # one camera's at a time: 25 MB at 1920×1080
+            bearings, last = torch.from_numpy(camera_rays(camera, camera.width, camera.height)), camera
         pose = torch.from_numpy(path.poses[index]).float()
-        yield rays_of_view(bearings[camera], pose, float(near[index]), float(far[index]))
+        yield rays_of_view(bearings, pose, float(near[index]), float(far[index]))
 
 
 def fitted_path(scene: "Scene", kind: PathKind, frames: int) -> CameraPath:

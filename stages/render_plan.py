@@ -8,6 +8,7 @@ if TYPE_CHECKING:
 
 MOST_FRAMES, FEWEST_FRAMES, LEAST_FRAMES = 120, 24, 6  # four smooth seconds, a turn in steps of 15°, a slide show
 LARGEST_SIDE, USUAL_SIDE, SMALL_SIDE, LEAST_SIDE = 1920, 480, 200, 32  # pixels
+LEAST_WIDTH = 16  # pixels, whatever the height: of --render.width, too
 FULL_RATE, USUAL_SECONDS = 30, 4.0
 
 
@@ -16,7 +17,7 @@ def affordable(rays: float, camera: "Camera", longest: float, frames: int | None
 
     A still has to show something before it is worth moving, and a size that shows it is enough until the motion is
     smooth. So growing ``rays`` are spent on: 6 frames up to a long side of 200, 24 frames at that, a side of 480,
-    120 frames, a side of ``longest``. Less than 6 frames of 32 pixels there is not, whatever they cost.
+    120 frames, a side of ``longest``. Less than 6 frames of 32 pixels, 16 wide, there is not, whatever they cost.
     """
     long_side = max(camera.width, camera.height)
     squares = rays / (camera.width * camera.height / long_side**2)
@@ -36,7 +37,7 @@ def affordable(rays: float, camera: "Camera", longest: float, frames: int | None
 
 
 def _even(width: float) -> int:
-    return max(2, 2 * int(width / 2))
+    return max(LEAST_WIDTH, 2 * int(width / 2))
 
 
 def longest_side(camera: "Camera", downscale: float) -> float:

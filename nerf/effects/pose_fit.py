@@ -1,5 +1,7 @@
 """Where a photo was taken from, found against a finished field: for photos that took no part in training it."""
 
+from operator import itemgetter
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -35,7 +37,7 @@ def fit_pose(
     for step in range(STEPS):
         pixel = torch.randint(len(target), (min(RAYS, len(target)),), generator=random, device=target.device)
         jitter = torch.rand(len(pixel), generator=random, device=target.device)
-        some = Rays(*(part[pixel] for part in rays))
+        some = rays.each(itemgetter(pixel))
         gradients = _gradients(model, pose, photo_colours, (some, target[pixel], background), jitter)
         rate = RATE * FINAL_RATE ** (step / (STEPS - 1))
         for name, gradient in gradients.items():

@@ -18,7 +18,7 @@ def march(occupied: Occupied, lattice: Lattice, rays: Rays, jitter: Float[Tensor
     what lies before it.
     """
     if not lattice.contracted:
-        rays = clip_to_box(rays, BOX)
+        rays = clip_to_box(rays, -BOX, BOX)
     first = lattice_coordinate(lattice, rays.near)
     counts = torch.ceil(lattice_coordinate(lattice, rays.far) - first)
     k = torch.arange(int(counts.max()) if len(counts) else 0, dtype=first.dtype, device=first.device)

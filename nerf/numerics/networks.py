@@ -119,14 +119,15 @@ def _harmonics(d: Tensor) -> Tensor:
 
 
 def _sigma(_: Backend, logarithm: Tensor) -> Tensor:
-    return DensityPass(logarithm, logarithm, logarithm).sigma[:, None]
+    return grid_mlp.sigma_of(logarithm)[:, None]
 
 
 def _sigma_backward(backend: Backend, grad: Tensor, logarithm: Tensor) -> tuple[Tensor]:
     """Alone: of a network whose hidden layer is silent, and whose colours ask for nothing."""
     geometry = torch.nn.functional.pad(logarithm, (0, GEOMETRY - 1))
     silent = torch.zeros(len(logarithm), HIDDEN).to(logarithm)
-    done = DensityPass(torch.zeros(len(logarithm), FEATURES).to(logarithm), silent, geometry)
+    features, sigma = torch.zeros(len(logarithm), FEATURES).to(logarithm), grid_mlp.sigma_of(geometry)
+    done = DensityPass(features, silent, geometry, sigma)
     of_geometry = torch.zeros_like(geometry)
     grid_mlp.density_backward(_weights(logarithm), backend, done, grad[:, 0], of_geometry)
     return (of_geometry[:, :1],)
@@ -301,7 +302,7 @@ CASES = [
     ),
     Case(
         formula="density exp(min(x, 15))",
-        where="nerf/grid_mlp.py: DensityPass, density_backward",
+        where="nerf/grid_mlp.py: sigma_of, density_backward",
         domain="all finite x",
         hazard="exp overflows beyond 88, and its gradient with it",
         answer="x is limited to 15, where 0.001 units already stop all light but e⁻³⁰⁰⁰; beyond the gradient is 0",

@@ -26,6 +26,17 @@ def steps(poses: np.ndarray) -> np.ndarray:
     return np.linalg.norm(np.diff(poses.reshape(-1, 12), axis=0), axis=1)
 
 
+def turns(poses: np.ndarray) -> np.ndarray:
+    """Degrees from frame to frame."""
+    chord = np.linalg.norm(np.diff(poses[:, :, :3], axis=0), axis=(1, 2))
+    return np.degrees(2 * np.arcsin(np.minimum(chord / np.sqrt(8), 1)))
+
+
+def facing(centres: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Cameras at ``centres`` that look along ``directions``."""
+    return np.concatenate([look_at(c[None], c + d) for c, d in zip(centres, directions, strict=True)])
+
+
 @pytest.mark.parametrize("path", PATHS)
 @pytest.mark.parametrize("frames", [2, 24, 61])
 def test_poses_are_orthonormal_and_right_handed(path: str, frames: int) -> None:
@@ -96,11 +107,11 @@ def test_spiral_stays_within_the_grid_of_cameras_and_looks_into_the_scene() -> N
     assert (poses[:, 1, 2] > 0.95).all()
 
 
-def test_interpolated_passes_through_every_camera_it_has_frames_for() -> None:
+def test_interpolated_leads_past_every_camera_it_has_frames_for() -> None:
     cameras = room(12)
     poses = interpolated(cameras, 400)
     away = np.linalg.norm((poses[:, None] - cameras).reshape(400, 12, 12), axis=2).min(axis=0)
-    assert away.max() < 0.05
+    assert away.max() < 0.5 * steps(cameras).min()
 
 
 def test_interpolated_keeps_a_constant_speed() -> None:
@@ -114,6 +125,69 @@ def test_interpolated_walks_along_a_row_of_cameras_whatever_their_order() -> Non
     x = interpolated(shuffled, 120)[:, 0, 3]
     assert np.ptp(x) == pytest.approx(8 * 0.3, rel=1e-6)
     assert np.abs(np.diff(x)).sum() == pytest.approx(8 * 0.3, rel=1e-6)
+
+
+@pytest.mark.parametrize("frames", [12, 20])
+@pytest.mark.parametrize("away", [0.0, 0.5])
+def test_interpolated_turns_steadily_where_photos_look_all_around(frames: int, away: float) -> None:
+    angle = 2 * np.pi * np.random.default_rng(0).permutation(24) / 24
+    directions = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    turned = turns(interpolated(facing(away * directions, directions), frames))
+    assert 180 <= turned.sum() < 360
+    assert turned.max() < 1.2 * np.median(turned) < 40
+
+
+@pytest.mark.parametrize("frames", [12, 24, 48, 96])
+@pytest.mark.parametrize("ahead", [True, False])
+@pytest.mark.parametrize("photos", [20, 40, 80])
+def test_interpolated_walks_around_a_wall_as_the_photos_do(frames: int, ahead: bool, photos: int) -> None:
+    """They stand along a U whose arms lie on both sides of a wall at y = 0, x < 6, and look ahead or all to +x."""
+    on_arms, angle = np.linspace(-6, 6, photos), np.linspace(-1, 1, photos) * np.pi / 2
+    straight = np.stack([6 - np.abs(on_arms), np.sign(on_arms), 0 * on_arms], axis=1)
+    bend = np.stack([6 + np.cos(angle), np.sin(angle), 0 * angle], axis=1)[:: max(1, photos // 10)]
+    directions = np.concatenate([-np.sign(on_arms), 1 - 2 * (bend[:, 1] > 0)])[:, None] * [1.0, 0, 0]
+    cameras = facing(np.concatenate([straight, bend]), directions if ahead else np.abs(directions))
+    centres = interpolated(cameras[np.random.default_rng(0).permutation(len(cameras))], frames)[:, :, 3]
+    fine = np.linspace(centres[:-1], centres[1:], 10).reshape(-1, 3)
+    assert (fine[fine[:, 0] < 6][:, 1] ** 2 > 0.5).all()
+    assert np.ptp(fine[:, 0]) > 5 and np.ptp(fine[:, 1]) > 1.9  # on both sides of it
+    assert fine[fine[:, 0] > 6, 0].max() > 6.7
+
+
+def test_interpolated_stays_as_near_to_photos_as_they_are_to_each_other() -> None:
+    """Far apart are only the ends of a way that winds through the scene: a helix of three turns."""
+    angle = np.linspace(0, 6 * np.pi, 60)
+    centres = np.stack([np.cos(angle), np.sin(angle), 0.3 * angle], axis=1)
+    cameras = facing(centres, np.tile([1.0, 0, 0], (60, 1)))
+    for frames in (24, 60, 120):
+        path = interpolated(cameras, frames)[:, :, 3]
+        away = np.linalg.norm(path[:, None] - centres, axis=2).min(axis=1)
+        assert away.max() < np.linalg.norm(centres[1] - centres[0])
+
+
+def test_interpolated_joins_groups_of_photos_where_they_are_nearest() -> None:
+    """Each of two clusters has its neighbours within; the path goes over at their corners next to each other."""
+    x, y = (part.ravel() for part in np.meshgrid(np.arange(5.0), np.arange(5.0)))
+    cluster, aside = np.stack([x, y, 0 * x], axis=1), np.array([8.0, 8, 0])
+    centres = np.concatenate([cluster, cluster + aside])
+    path = interpolated(facing(centres, np.tile([1.0, 0, 0], (50, 1))), 120)[:, :, 3]
+    between = path[(path[:, :2].min(axis=1) > 4.5) & (path[:, :2].max(axis=1) < 7.5)]
+    assert len(between) > 2
+    np.testing.assert_allclose(between[:, 0], between[:, 1], atol=0.5)
+
+
+def test_interpolated_does_not_shake_as_the_hands_did_that_took_many_photos() -> None:
+    random = np.random.default_rng(0)
+    centres = np.stack([np.linspace(0, 15, 300), *random.normal(scale=0.05, size=(2, 300))], axis=1)
+    path = interpolated(facing(centres, random.normal([1.0, 0, 0], 0.05, (300, 3))), 120)
+    moved, shaken = (np.linalg.norm(np.diff(path[:, :, 3], n, axis=0), axis=1).mean() for n in (1, 2))
+    assert shaken < 0.15 * moved
+
+
+@pytest.mark.parametrize("count", [1, 3, 30])
+def test_interpolated_stands_still_where_all_photos_are_one(count: int) -> None:
+    pose = ring()[3]
+    np.testing.assert_allclose(interpolated(np.tile(pose, (count, 1, 1)), 10), np.tile(pose, (10, 1, 1)), atol=1e-6)
 
 
 def test_paths_through_two_cameras_work() -> None:

@@ -106,7 +106,7 @@ def test_density_is_bounded_in_value_and_gradient() -> None:
     logits = torch.tensor([-1e30, -100.0, 0.0, 15.0, 16.0, 1e30])
     geometry = torch.zeros(6, 16)
     geometry[:, 0] = logits
-    sigma = grid_mlp.DensityPass(geometry, geometry, geometry).sigma
+    sigma = grid_mlp.sigma_of(geometry)
     assert sigma.isfinite().all()
     assert sigma.max() == pytest.approx(math.exp(15))
     assert sigma[2] == 1
@@ -217,11 +217,10 @@ def in_one_pass(model: GridField, given: Rays, jitter: Tensor, background: Tenso
     samples = reference.march(occupied(model.bits), model.lattice, given, jitter)
     density = model._density_pass(reference.sample_points(given, samples, model.settings.contracted))
     front, seen = reference.visible_front(samples, density.sigma, HIDDEN_BEHIND)
-    density = density.select(seen)
     of_rays = grid_mlp.ray_hidden(model.weights, reference.spherical_harmonics(given.directions))
-    colour = grid_mlp.colour_forward(model.weights, reference, front, density.geometry, of_rays).colour
+    colour = grid_mlp.colour_forward(model.weights, reference, front, density.geometry[seen], of_rays).colour
     behind = background.repeat(len(jitter), 1)
-    rendering, _ = reference.composite(front, density.sigma, colour, behind, given.far)
+    rendering, _ = reference.composite(front, density.sigma[seen], colour, behind, given.far)
     return len(samples.t), front, rendering
 
 

@@ -4,13 +4,10 @@ import math
 
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from nerf.lattice import (
     Lattice,
     along,
-    box_interval,
     density_lattice,
     first_crossing,
     occupancy,
@@ -20,7 +17,7 @@ from nerf.lattice import (
     stopping_distance,
     trilinear,
 )
-from nerf.rays import Rays
+from nerf.rays import Rays, clip_to_box
 
 LOW, HIGH = torch.tensor([-0.9, -0.9, -0.9]), torch.tensor([0.9, 0.9, 0.9])
 
@@ -105,29 +102,6 @@ def test_occupancy_is_a_half_at_the_level_and_bounded_over_sixty_decades():
     assert values[0] == 0 and values[-1] == 1 and (values.diff() >= 0).all()
 
 
-@settings(max_examples=60, deadline=None)
-@given(st.lists(st.floats(-2, 2), min_size=6, max_size=6))
-def test_the_interval_in_the_box_is_where_dense_samples_are_inside(numbers):
-    direction = torch.tensor(numbers[3:])
-    if float(direction.norm()) < 1e-2:
-        return
-    rays = make_rays([numbers[:3]], direction[None])
-    inside = box_interval(rays, LOW, HIGH)
-    t = torch.linspace(0, 10, 20001)
-    point = rays.origins + t[:, None] * rays.directions
-    within = ((point >= LOW) & (point <= HIGH)).all(-1)
-    assert float(inside.far - inside.near) == pytest.approx(float(within.sum()) * 10 / 20000, abs=2e-3)
-    if within.sum() > 4:
-        assert float(inside.near) == pytest.approx(float(t[within].min()), abs=2e-3)
-
-
-def test_rays_along_an_axis_and_rays_that_miss():
-    rays = make_rays([[-2.0, 0, 0], [-2.0, 3, 0], [0.0, 0, 0], [2.0, 0, 0]], [[1.0, 0, 0]] * 4, near=0.25)
-    inside = box_interval(rays, LOW, HIGH)
-    torch.testing.assert_close(inside.near, torch.tensor([1.1, 0.25, 0.25, 0.25]))
-    torch.testing.assert_close(inside.far, torch.tensor([2.9, 0.25, 0.9, 0.25]))
-
-
 def test_optical_depth_of_a_linear_density_is_a_parabola():
     t = torch.linspace(1, 3, 9, dtype=torch.float64)[None]
     torch.testing.assert_close(optical_depth(4 * t, t), 2 * (t**2 - 1))
@@ -150,7 +124,7 @@ def test_light_stops_half_a_transmittance_behind_the_wall(density, near):
 
 def test_what_rays_meet_is_what_lies_there():
     lattice = density_lattice(Field(linear), 9, LOW, HIGH)
-    rays = box_interval(make_rays([[-2.0, 0.3, 0.1]], [[1.0, -0.1, 0.2]]), LOW, HIGH)
+    rays = clip_to_box(make_rays([[-2.0, 0.3, 0.1]], [[1.0, -0.1, 0.2]]), LOW, HIGH)
     t = ray_distances(rays, 12)
     points = rays.origins[:, None] + t[..., None] * rays.directions[:, None]
     torch.testing.assert_close(along(lattice, rays, t)[:, 1:-1], linear(points)[:, 1:-1], atol=1e-4, rtol=0)

@@ -2,10 +2,10 @@ import math
 
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nerf.rays import Rays, clip_to_box, points_on, rays_of_view
+from nerf.rays import Rays, clip_to_box, join_rays, points_on, rays_of_view
 from tests.reference import paper_loop
 
 
@@ -16,7 +16,7 @@ def ray(origin: list[float], direction: list[float], near: float = 0, far: float
 
 
 def interval(rays: Rays, half: float = 1.0) -> tuple[float, float]:
-    cut = clip_to_box(rays, half)
+    cut = clip_to_box(rays, -half, half)
     return cut.near.item(), cut.far.item()
 
 
@@ -62,7 +62,7 @@ def test_agrees_with_the_slow_loop_and_stays_inside(origin: list[float], directi
     # A ray that runs exactly within a face may count either way.
     faces = any(abs(o) == 1 and abs(d) < 1e-12 for o, d in zip(origin, direction, strict=True))
     rays = ray(origin, direction)
-    cut = clip_to_box(rays, 1.0)
+    cut = clip_to_box(rays, -1.0, 1.0)
     assert torch.isfinite(torch.stack([cut.near, cut.far])).all()
     assert 0 <= cut.near.item() <= cut.far.item() <= 10
     if cut.near < cut.far:
@@ -70,6 +70,31 @@ def test_agrees_with_the_slow_loop_and_stays_inside(origin: list[float], directi
     if not faces:
         expected = paper_loop.box_interval(rays.origins[0].numpy(), rays.directions[0].numpy(), 0, 10, 1)
         assert interval(rays) == pytest.approx(expected, abs=1e-9)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.floats(-2, 2), min_size=6, max_size=6))
+def test_the_interval_in_any_box_is_where_dense_samples_are_inside(numbers: list[float]) -> None:
+    if math.hypot(*numbers[3:]) < 1e-2:
+        return
+    low, high = torch.tensor([-0.9, -0.5, -0.2]), torch.tensor([0.9, 0.8, 1.1])
+    rays = ray(numbers[:3], numbers[3:])
+    inside = clip_to_box(rays, low, high)
+    t = torch.linspace(0, 10, 20001)
+    point = points_on(rays, t[None])[0]
+    within = ((point >= low) & (point <= high)).all(-1)
+    assert float(inside.far - inside.near) == pytest.approx(float(within.sum()) * 10 / 20000, abs=2e-3)
+    if within.sum() > 4:
+        assert float(inside.near) == pytest.approx(float(t[within].min()), abs=2e-3)
+
+
+def test_rays_are_joined_one_after_the_other() -> None:
+    one, other = ray([1, 2, 3], [0, 0, -1]), ray([0, 0, 0], [1, 0, 0], 1, 2)
+    joined = join_rays([one, other, other])
+    assert joined.origins.tolist() == [[1, 2, 3], [0, 0, 0], [0, 0, 0]]
+    assert joined.near.tolist() == [0, 1, 1] and joined.far.tolist() == [10, 2, 2]
+    beside = join_rays((rays.each(lambda part: part[None]) for rays in (one, other)), dim=1)
+    assert beside.directions.tolist() == [[[0, 0, -1], [1, 0, 0]]] and beside.far.tolist() == [[10, 2]]
 
 
 def test_rays_of_a_view_start_at_its_centre_and_turn_with_it() -> None:

@@ -132,7 +132,7 @@ def test_axis_parallel_rays_meet_the_box_where_it_is(towards: list[float], at: f
         towards = [0.0, 1.0, 0.0]
     directions = torch.nn.functional.normalize(torch.tensor([towards]), dim=-1)
     rays = Rays(torch.tensor([[at, 0.1, -0.2]]), directions, torch.zeros(1), torch.tensor([10.0]))
-    cut = clip_to_box(rays, BOX)
+    cut = clip_to_box(rays, -BOX, BOX)
     t = torch.linspace(0, 10, 5001)
     inside = ((rays.origins + t[:, None] * directions).abs() <= BOX).all(-1).double().mean() * 10
     assert float(cut.far - cut.near) == pytest.approx(float(inside), abs=5e-3)

@@ -1,4 +1,6 @@
 import json
+import weakref
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +15,7 @@ from nerf.scene import Camera, Scene, Similarity, View
 from stages import render
 from stages.contract import StageError
 from stages.files import read_json, write_json
-from stages.render_path import CameraPath, fitted_path, median_camera, path_from_file, resized
+from stages.render_path import CameraPath, fitted_path, median_camera, path_from_file, path_rays, resized
 from stages.transforms_export import transforms
 from tests.camera_layouts import ring, wall
 from tests.video_files import read_video
@@ -169,6 +171,24 @@ def test_a_written_path_can_be_given_back_as_cameras(inputs, progress, tmp_path:
     frames, _ = read_video(inputs["render"] / "video.mp4")
     (tmp_path / "first.mp4").write_bytes(first)
     assert np.abs(frames.astype(int) - read_video(tmp_path / "first.mp4")[0]).mean() < 1
+
+
+def test_bearings_are_made_frame_by_frame_and_kept_while_the_lens_is_the_same(monkeypatch) -> None:
+    """500 lenses at full size would be 12 GB."""
+    made = []
+
+    def camera_rays(camera: Camera, width: int, height: int) -> np.ndarray:
+        made.append((camera.params[0], weakref.ref(rays := np.zeros((height, width, 3), np.float32))))
+        return rays
+
+    monkeypatch.setattr("stages.colmap.cameras.camera_rays", camera_rays)
+    lenses = [replace(CAMERA, params=(focal, *CAMERA.params[1:])) for focal in (150.0, 150.0, 151.0, 152.0)]
+    frames = path_rays(CameraPath(tuple(lenses), ring(4)), scene_with(ring(5)))
+    asked = []
+    for _ in frames:
+        asked.append([focal for focal, _ in made])
+        assert sum(rays() is not None for _, rays in made) == 1
+    assert asked == [[150], [150], [150, 151], [150, 151, 152]]
 
 
 def test_cameras_and_path_exclude_each_other(inputs, progress, tmp_path: Path) -> None:

@@ -3,6 +3,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from nerf.scene import Camera
+from stages import render
 from stages.render_path import even_height
 from stages.render_plan import affordable, chosen_fps, longest_side
 
@@ -29,6 +30,15 @@ def test_a_video_keeps_to_its_rays_unless_it_is_the_smallest_there_is(rays, came
     smallest = frames == 6 and long_side(width, camera) <= 32
     rounding = 1 + 1 / min(width, width * camera.height / camera.width)  # of the height, to an even number
     assert smallest or pixels(frames, width, camera) <= rounding * rays
+
+
+@given(st.floats(1, 1e10), st.integers(2, 8000), st.integers(2, 8000), st.floats(1, 50))
+def test_what_is_planned_for_any_photo_may_be_asked_for(rays: float, across: int, down: int, downscale: float) -> None:
+    """A plan is read back as options, so it has to keep their bounds: of narrow photos, too."""
+    camera = Camera("PINHOLE", across, down, (1.0, 1.0, 1.0, 1.0))
+    frames, width = affordable(rays, camera, longest_side(camera, downscale), None, None)
+    render.Config.model_validate({"frames": frames, "width": width, "fps": chosen_fps(frames)})
+    assert width % 2 == 0
 
 
 @given(st.floats(1e3, 1e9), st.floats(1, 10), st.sampled_from([LANDSCAPE, PORTRAIT]), SIDES)

@@ -125,7 +125,7 @@ def test_a_grid_field_that_stays_empty_is_given_up_by_name(
 ) -> None:
     inputs, _ = photographed(tmp_path, channels=4)
     monkeypatch.setattr("stages.training_loop.WARM_UP_STEPS", 3)
-    monkeypatch.setattr("nerf.grid_field.grid_mlp.DensityPass.sigma", property(lambda self: 0 * self.geometry[:, 0]))
+    monkeypatch.setattr("nerf.grid_mlp.sigma_of", lambda geometry: 0 * geometry[:, 0])
     with pytest.raises(StageError, match=r"the field does not learn: after 3 steps it is empty .* 3 different seeds"):
         trained(tmp_path / "train", inputs, progress, field="grid", steps=20)
 

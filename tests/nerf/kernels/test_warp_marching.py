@@ -27,7 +27,7 @@ from tests.nerf.kernels.warp_agreement import (
 
 def places(lattice: Lattice, rays: Rays, jitter: Tensor, samples: Samples) -> Tensor:
     """Ray and number k on the lattice of each sample, as one integer."""
-    near = rays.near if lattice.contracted else clip_to_box(rays, BOX).near
+    near = rays.near if lattice.contracted else clip_to_box(rays, -BOX, BOX).near
     ray = samples.ray.long()
     k = lattice_coordinate(lattice, samples.t) - (lattice_coordinate(lattice, near) + jitter)[ray]
     assert not len(k) or (k - k.round()).abs().max() < 0.3
