@@ -276,7 +276,8 @@ class GridTrainer:
         The table's gradient is a sum of the features' gradients with weights up to 1: finite if their norm is.
         """
         each = zip(*((chunk.loss, chunk.squared_error, chunk.norm) for chunk in parts), strict=True)
-        loss_now, error_now, norm_now = (float(torch.stack(values).sum()) for values in each)
+        # One wait for the GPU, not three.
+        loss_now, error_now, norm_now = torch.stack([torch.stack(values).sum() for values in each]).tolist()
         for quantity, value in {"loss": loss_now, "gradient": norm_now}.items():
             if not abs(value) < float("inf"):
                 raise NonFinite(quantity, step, _whole([chunk.batch for chunk in parts]))
