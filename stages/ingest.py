@@ -46,7 +46,9 @@ if TYPE_CHECKING:
 NEEDS: tuple[str, ...] = ()
 VERSION = 5
 RESUMES = False
-LINKS = ("photos.json", "images", "masks")
+LINKS = ("photos.json", "notes.json", "images", "masks")
+# What it decides here, which files are photos and which frames they are, is in the digest that stands for ``photos``.
+UNKEYED = ("cameras",)
 
 _MAX_WORKERS = 8  # each holds a few copies of one photo, up to 250 megapixels
 _BYTES_PER_PIXEL = 24  # of a photo while it is decoded, turned, packed and looked at; 22 measured for 16 bits
