@@ -4,6 +4,7 @@ Exit codes: 0 done; 2 usage; 3 the workspace; 10 to 19 the stage that failed (pi
 143 SIGTERM; 1 a defect of this program.
 """
 
+import io
 import json
 import os
 import shutil
@@ -46,8 +47,12 @@ class Terminated(BaseException):
 
 
 def main() -> None:
-    """Entry point of ``pipeline``. That nobody reads its words to the end (`pipeline … | head`) is no error."""
+    """Entry point of ``pipeline``. That nobody reads its words to the end (`pipeline … | head`) is no error; nor are
+    letters that the terminal does not have."""
     code: int | str | None = 0
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
     try:
         try:
             code = run_command(sys.argv[1:])
@@ -107,7 +112,7 @@ def _say(what: str, why: str, hint: str, as_json: bool) -> None:
     """What ended the program outside of any stage, in words, or as an event like that of a stage that failed."""
     if as_json:
         event = {"event": "error", "stage": None, "what": what, "why": why, "hint": hint}
-        print(json.dumps(event, ensure_ascii=False), flush=True)
+        print(json.dumps(event), flush=True)
         return
     print(f"pipeline: {what}", file=sys.stderr)
     if why:
@@ -284,7 +289,7 @@ def command_status(words: Sequence[str]) -> int:
     statuses = status.all_statuses(*_reader(given.workspace), given.verify)
     code = EXIT_DEFECT if given.verify and any(s.state == "damaged" for s in statuses) else 0
     if given.json:
-        print(json.dumps([asdict(s) for s in statuses], ensure_ascii=False))
+        print(json.dumps([asdict(s) for s in statuses]))
         return code
     for s in statuses:
         print(f"{s.stage:<10} {s.state:<8} {s.text}".rstrip())

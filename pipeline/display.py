@@ -123,7 +123,7 @@ class JsonDisplay:
 
     def _event(self, event: str, **values: Any) -> None:
         with self._lock:
-            _print(json.dumps({"event": event, **values}, ensure_ascii=False))
+            _print(json.dumps({"event": event, **values}))
 
     def headline(self, text: str) -> None:
         self._event("start", text=text)

@@ -8,14 +8,14 @@ device, worker counts and times never enter.
 import hashlib
 import json
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel
 
 from stages.contract import StageError
-from stages.sources import cannot_read
+from stages.sources import camera_files, cannot_read
 
 
 def canonical_json(value: Any) -> bytes:
@@ -81,16 +81,15 @@ class ContentIndex:
         return digest({os.path.relpath(file, root): value for file, value in found.items()})
 
     def of_path(self, path: Path) -> str:
-        """Digest of a file, or of all files below a folder that are neither hidden nor in a workspace of ours."""
+        """Digest of a file, or of the known cameras in a folder: no other folder is ever an option's value."""
         if path.is_file():
             return self.sha256(path)
         if not path.is_dir():
             raise StageError(f"{path} does not exist", "a setting names it", "Check the path and run again.")
         try:
-            files = list(_files_of(path))
+            return self.of_files(path, camera_files(path))
         except OSError as error:
             raise cannot_read(error.filename or path, error) from error
-        return self.of_files(path, files)
 
     def save(self) -> None:
         """Write the index if anything in it changed."""
@@ -99,16 +98,6 @@ class ContentIndex:
             temporary.write_text(json.dumps({"files": self.known, "sha256": digest(self.known)}), "utf-8")
             temporary.replace(self.path)
             self.changed = False
-
-
-def _files_of(folder: Path) -> Iterator[Path]:
-    for entry in sorted(folder.iterdir()):
-        if entry.name.startswith("."):
-            continue
-        if entry.is_file():
-            yield entry
-        elif entry.is_dir() and not (entry / "run.json").is_file():
-            yield from _files_of(entry)
 
 
 def config_for_key(

@@ -6,7 +6,7 @@ nothing. The file ends with the sha256 of all that it says: a flipped bit is fou
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -71,7 +71,7 @@ def outputs_digest(outputs: Mapping[str, dict[str, Any]]) -> str:
 
 def write(folder: Path, manifest: Manifest) -> None:
     """Write ``manifest`` durably into ``folder``."""
-    text = json.dumps(sealed(asdict(manifest)), indent=1, sort_keys=True, allow_nan=False, ensure_ascii=False)
+    text = json.dumps(sealed(asdict(manifest)), indent=1, sort_keys=True, allow_nan=False)
     write_durably(folder / NAME, (text + "\n").encode())
 
 
@@ -79,7 +79,8 @@ def read(folder: Path) -> Manifest:
     """The manifest of ``folder``. Raises FileNotFoundError, or BadManifest with the reason."""
     try:
         value = unsealed(json.loads((folder / NAME).read_text("utf-8")))
-        manifest = TypeAdapter(Manifest).validate_json(json.dumps(value), strict=True)
+        text = json.dumps(value, ensure_ascii=False).encode("utf-8", "replace")  # a path need not be Unicode
+        manifest = replace(TypeAdapter(Manifest).validate_json(text, strict=True), config=value["config"])
     except FileNotFoundError:
         raise
     except ValidationError as error:

@@ -63,6 +63,7 @@ class Runner:
         self.stages: list[str] = []
         self.times: Mapping[str, float | None] = {}
         self.works_on: str | None = None
+        self.photos: str | None = None  # their digest: they are listed once
         self.checked: set[str] = set()  # stages whose files were written or read anew by this program
         self.at_work = ""
         self.verify = False
@@ -208,6 +209,7 @@ class Runner:
         """Bring everything below ``stage`` up to date once more; what lies above the damage may change with it."""
         needed = {name for above in STAGES[stage].NEEDS if above in self.done for name in needed_for(above, STAGES)}
         self.done.clear()
+        self.photos = None  # perhaps hours after they were listed
         for name in STAGES:
             if name in needed:
                 self._bring_up_to_date(name)
@@ -311,7 +313,7 @@ class Runner:
         return options.model_copy(update={"seconds": round(seconds, 1)})
 
     def _config_for_key(self, stage: str, config: StageConfig) -> dict[str, Any]:
-        replaced = {"photos": self._photos_digest()} if stage == "ingest" else {}
+        replaced = {"photos": self.photos or self._photos_digest()} if stage == "ingest" else {}
         return config_for_key(config, self.index, replaced, getattr(STAGES[stage], "UNKEYED", ()))
 
     def _photos_digest(self) -> str:
@@ -324,8 +326,9 @@ class Runner:
         source = find_source(config.photos, config.cameras)
         self.display.update("reading the video" if source.kind == "video" else f"reading {len(source.files)} photos")
         files = self.index.of_files(source.root, (*source.files, *(mask for _, mask in source.masks)))
-        self.state["photos_digest"] = digest({"kind": source.kind, "frames": source.frames, "files": files})
-        return self.state["photos_digest"]
+        self.photos = digest({"kind": source.kind, "frames": source.frames, "files": files})
+        self.state["photos_digest"] = self.photos
+        return self.photos
 
     def find_finished(self, job: Job) -> Manifest | None:
         """The finished result for this job, if there is one; a damaged one is set aside and said aloud."""

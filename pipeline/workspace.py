@@ -171,7 +171,7 @@ class Workspace:
 
     def write_run(self, run: dict[str, Any]) -> None:
         """Write run.json durably. Raises StageError if it cannot be written."""
-        text = json.dumps(manifests.sealed(run), indent=1, sort_keys=True, allow_nan=False, ensure_ascii=False)
+        text = json.dumps(manifests.sealed(run), indent=1, sort_keys=True, allow_nan=False)
         try:
             write_durably(self.root / RUN_FILE, (text + "\n").encode())
         except OSError as error:
@@ -206,7 +206,7 @@ class Workspace:
         current = {self.folder(stage, key) for stage, key in keys.items()}
         current |= {self.partial(stage, key) for stage, key in keys.items()}
         found = (p for stage in stages if (self.root / stage).is_dir() for p in (self.root / stage).iterdir())
-        return sorted(p for p in found if p not in current)
+        return sorted(p for p in found if p.is_dir() and p not in current)  # a file there is none of ours
 
 
 def _refuse_links(root: Path) -> None:

@@ -20,12 +20,13 @@ from stages.ascii_names import ascii_files
 from stages.contract import Inputs, OptionalSourcePath, Progress, SourcePath, StageConfig, StageError, StageResult
 from stages.decoding import CameraKey, DecodeError, Place, decode
 from stages.device import processors
-from stages.files import write_png
+from stages.files import write_json, write_png
 from stages.ingest_words import (
     all_plain,
     all_the_same,
     facts,
     say,
+    say_everything,
     say_findings,
     say_masks,
     say_refused,
@@ -46,7 +47,10 @@ if TYPE_CHECKING:
 NEEDS: tuple[str, ...] = ()
 VERSION = 6
 RESUMES = False
-LINKS = ("photos.json", "images", "masks")
+NOTES = "notes.json"
+LINKS = ("photos.json", NOTES, "images", "masks")
+# What it decides here, which files are photos and which frames they are, is in the digest that stands for ``photos``.
+UNKEYED = ("cameras",)
 
 _MAX_WORKERS = 8  # each holds a few copies of one photo, up to 250 megapixels
 _BYTES_PER_PIXEL = 24  # of a photo while it is decoded, turned, packed and looked at; 22 measured for 16 bits
@@ -119,27 +123,30 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
         (folder / "images").mkdir(parents=True, exist_ok=True)
         waiting = folder / "waiting"
         waiting.mkdir(exist_ok=True)
-        taken, refused = _take_all(source, config, waiting, progress)
+        taken, refused, notes = _take_all(source, config, waiting, progress)
         if source.kind == "photos":
             taken, duplicates = _without_duplicates(taken)
             refused = sorted(refused + duplicates, key=lambda refusal: refusal.name)
+        notes += [f"{shown(t.name)}: {note}" for t in taken for note in t.notes]
+        try:
+            same = _checked(source, taken, refused, progress)
+        except StageError:
+            say_everything(refused, notes, progress)
+            raise
         say_refused(refused, progress)
-        say([f"{shown(t.name)}: {note}" for t in taken for note in t.notes], progress)
-        if len(taken) < 2:
-            raise too_few(source, [photo.name for photo in taken], refused)
-        if all(photo.one_colour for photo in taken):
-            raise all_plain([(photo.name, photo.one_colour) for photo in taken if photo.one_colour])
-        if source.kind == "photos":
-            progress.update("looking for photos that are nearly the same")
-        photos = _store(taken, _same_pictures(taken) if source.kind == "photos" else {}, folder)
+        say(notes, NOTES, progress)
+        photos = _store(taken, same, folder)
         shutil.rmtree(waiting)
         write_photos(folder, photos, refused, source.frames)
+        if notes:
+            write_json(folder / NOTES, notes)
     say_findings(photos, progress)
     masks = [photo.mask for photo in taken if photo.mask]
     turned, resized = sum(mask.turned for mask in masks), sum(mask.resized for mask in masks)
     say_masks([mask.ignored for mask in masks], turned, resized, len(photos), progress)
     return StageResult(
         outputs=("images", "photos.json", "masks") if masks else ("images", "photos.json"),
+        records=(NOTES,) if notes else (),
         line=summary(source, photos, refused),
         facts=facts(source, photos, refused),
     )
@@ -157,14 +164,17 @@ def _writing(folder: Path) -> Iterator[None]:
         ) from error
 
 
-def _take_all(source: Source, config: Config, waiting: Path, progress: Progress) -> tuple[list[_Taken], list[Refusal]]:
+def _take_all(
+    source: Source, config: Config, waiting: Path, progress: Progress
+) -> tuple[list[_Taken], list[Refusal], list[str]]:
+    """What is taken, what is refused, and notes on masks that belong to no photo."""
     if source.kind == "video":
-        return _take_video(source.files[0], config.frames, waiting, progress), []
+        return _take_video(source.files[0], config.frames, waiting, progress), [], []
     masks, strays = pair_masks([source.name(file) for file in source.files], source.masks)
-    say([f"{shown(f'masks/{file.name}')} is no photo's mask, which are called NAME.png" for file in strays], progress)
+    notes = [f"{shown(f'masks/{file.name}')} is no photo's mask, which are called NAME.png" for file in strays]
     outcomes = _decode_all(source, masks, waiting, progress)
     refused = [outcome for outcome in outcomes if isinstance(outcome, Refusal)]
-    return [outcome for outcome in outcomes if isinstance(outcome, _Taken)], refused
+    return [outcome for outcome in outcomes if isinstance(outcome, _Taken)], refused, notes
 
 
 def _take_video(video: Path, most: int, waiting: Path, progress: Progress) -> list[_Taken]:
@@ -263,6 +273,18 @@ def _without_duplicates(taken: Sequence[_Taken]) -> tuple[list[_Taken], list[Ref
     kept = [photo for photo in taken if first[photo.digest] is photo]
     repeated = [photo for photo in taken if first[photo.digest] is not photo]
     return kept, [Refusal(photo.name, f"identical to {shown(first[photo.digest].name)}") for photo in repeated]
+
+
+def _checked(source: Source, taken: Sequence[_Taken], refused: Sequence[Refusal], progress: Progress) -> dict[str, str]:
+    """Which photos are nearly the same (:func:`_same_pictures`). Raises StageError where there is no scene in them."""
+    if len(taken) < 2:
+        raise too_few(source, [photo.name for photo in taken], refused)
+    if all(photo.one_colour for photo in taken):
+        raise all_plain([(photo.name, photo.one_colour) for photo in taken if photo.one_colour])
+    if source.kind != "photos":
+        return {}
+    progress.update("looking for photos that are nearly the same")
+    return _same_pictures(taken)
 
 
 def _same_pictures(taken: Sequence[_Taken]) -> dict[str, str]:

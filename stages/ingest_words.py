@@ -16,17 +16,28 @@ def shown(name: str) -> str:
     return name if name.isprintable() else repr(name)
 
 
-def say(notes: Sequence[str], progress: Progress) -> None:
-    """The first few notes, and how many more there are."""
+def say(notes: Sequence[str], where: str, progress: Progress) -> None:
+    """The first few notes, how many more there are, and in which file all of them stand."""
     for note in notes[:MAX_NOTES]:
         progress.note(note)
     if len(notes) > MAX_NOTES:
-        progress.note(f"… and {len(notes) - MAX_NOTES} more, all in photos.json")
+        progress.note(f"… and {len(notes) - MAX_NOTES} more, all in {where}")
 
 
 def say_refused(refused: Sequence[Refusal], progress: Progress) -> None:
     """Which files are no photos, and why."""
-    say([f"refused {shown(refusal.name)}: {refusal.reason}" for refusal in refused], progress)
+    say([f"refused {shown(refusal.name)}: {refusal.reason}" for refusal in refused], "photos.json", progress)
+
+
+def say_everything(refused: Sequence[Refusal], notes: Sequence[str], progress: Progress) -> None:
+    """Every refused file, by reason, and every note, where no file will be left to look them up in."""
+    by_reason: dict[str, list[str]] = {}
+    for refusal in refused:
+        by_reason.setdefault(refusal.reason, []).append(shown(refusal.name))
+    for reason, names in by_reason.items():
+        progress.note(f"refused {', '.join(names)}: {reason}")
+    for note in notes:
+        progress.note(note)
 
 
 def say_findings(photos: Sequence[Photo], progress: Progress) -> None:

@@ -1,8 +1,8 @@
 """Stage sfm: where every photo was taken from, by structure-from-motion or from cameras that are known already."""
 
-import json
 import shutil
 from collections.abc import Sequence
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -11,7 +11,7 @@ from pydantic import Field
 
 from stages.contract import Inputs, OptionalSourcePath, Progress, StageConfig, StageError, StageResult, listed
 from stages.files import write_json
-from stages.sfm_attempts import ATTEMPTS, JOURNAL
+from stages.sfm_attempts import ATTEMPTS, JOURNAL, left_out_for_time, read_kept
 from stages.sfm_process import run_child
 
 if TYPE_CHECKING:
@@ -21,9 +21,9 @@ NEEDS = ("ingest",)
 VERSION = 6
 RESUMES = True
 LINKS = ("sparse",)
-# Both may decide that an attempt is not made, which is said. A run with another limit is to go on from the matches that
-# one before it kept, so its key has to be the same. How far features are searched, which ``seconds`` decides as well,
-# enters the key by options of its own.
+# Both may decide that an attempt is not made, which is said, in the stage's line as well. A run with another limit is
+# to go on from the matches that one before it kept, so its key has to be the same. How far features are searched, which
+# ``seconds`` decides as well, enters the key by options of its own.
 UNKEYED = ("max_seconds", "seconds")
 
 CameraModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE"]
@@ -216,7 +216,8 @@ def _reconstruct(
         test_files=None,
     )
     _forget(folder)
-    return result
+    all_placed = all(image["registered"] for image in images)
+    return result if all_placed else replace(result, line=result.line + _for_want_of_time(found["attempts"]))
 
 
 def _georeference(folder: Path, photos: "Sequence[Photo]", progress: Progress) -> dict[str, Any] | None:
@@ -300,8 +301,7 @@ def _database(folder: Path, names: Sequence[str], progress: Progress) -> Path:
     if not database.exists():
         _forget(folder)  # attempts without their matches, or those of another version of COLMAP
         return database
-    journal = folder / "attempts" / JOURNAL
-    if all(is_sound(one, names) for one in folder.glob("matches-*.db")) and (not journal.exists() or _parses(journal)):
+    if _are_sound(folder / "attempts") and all(is_sound(one, names) for one in folder.glob("matches-*.db")):
         features, pairs = count_done(database)
         progress.note(f"going on with the features of {features} photos and {pairs} matched pairs found before")
     else:
@@ -310,9 +310,10 @@ def _database(folder: Path, names: Sequence[str], progress: Progress) -> Path:
     return database
 
 
-def _parses(path: Path) -> bool:
+def _are_sound(attempts: Path) -> bool:
     try:
-        json.loads(path.read_bytes())
+        for file in attempts.glob("*.json"):
+            read_kept(file)
     except ValueError:
         return False
     return True
@@ -339,6 +340,12 @@ def _say_who_is_missing(photos: "Sequence[Photo]", images: list[dict[str, Any]],
         by_reason.setdefault(reason, []).append(name)
     for reason, who in by_reason.items():
         progress.note(f"  {listed(who, MOST_NAMES)}: {reason}")
+
+
+def _for_want_of_time(attempts: Sequence[dict[str, Any]]) -> str:
+    """What the line says of attempts that were left out: a run with more time takes this result as finished."""
+    ways = left_out_for_time(attempts)
+    return f" · {ways} way{'s' * (ways != 1)} left out for time: sfm --force" if ways else ""
 
 
 def _result(folder: Path, source: str, images: list[dict[str, Any]], **facts: Any) -> StageResult:

@@ -5,7 +5,7 @@ Each attempt changes one thing against the first and says so. What came of it is
 """
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -18,7 +18,8 @@ WORTH_STARTING_OVER = 0.1  # of all, and two at least: one may well be a strange
 WORTH_ANOTHER = 0.02
 # The lens is chosen and everything adjusted in 0.8 to 1.6 times the time of mapping (docs/numbers.md).
 FINISHING = 2.0
-NO_TIME = "too little was left of --sfm.max-seconds"
+NO_TIME, OUT_OF_TIME = "too little was left of", "ran out of time"
+GIVEN_UP, GIVEN = "--sfm.max-seconds", "the time it is given (--budget or --sfm.seconds)"
 JOURNAL, ABANDONED = "journal.json", "abandoned.json"
 
 
@@ -90,10 +91,10 @@ class Journal:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         folder.mkdir(parents=True, exist_ok=True)
-        tried, passed = _read(folder / JOURNAL) or ([], {})
+        tried, passed = read_kept(folder / JOURNAL) or ([], {})
         self.tried = [Tried(**entry) for entry in tried]
         self.passed: dict[str, str] = passed
-        self.abandoned: dict[str, str] = dict(_read(folder / ABANDONED))  # by attempt, what became of it
+        self.abandoned: dict[str, str] = dict(read_kept(folder / ABANDONED))  # by attempt, what became of it
 
     def model(self, name: str) -> Path:
         """The folder of an attempt's best sub-model."""
@@ -132,11 +133,17 @@ class Journal:
 def abandon(folder: Path, name: str, why: str) -> None:
     """Note, in the parent, what became of an attempt that is not to be made again in this folder."""
     folder.mkdir(parents=True, exist_ok=True)
-    abandoned = dict(_read(folder / ABANDONED)) | {name: why}
+    abandoned = dict(read_kept(folder / ABANDONED)) | {name: why}
     write_durably(folder / ABANDONED, json.dumps(sorted(abandoned.items())).encode())
 
 
-def _read(path: Path) -> Any:
+def left_out_for_time(account: Sequence[Mapping[str, Any]]) -> int:
+    """How many attempts of a :meth:`Journal.account` were not made, or not to their end, because time was short."""
+    return sum((row["passed"] or "").startswith((NO_TIME, f"it {OUT_OF_TIME}")) for row in account)
+
+
+def read_kept(path: Path) -> Any:
+    """What is kept in a file of the journal's folder, [] where there is none. Raises ValueError where it is damaged."""
     return json.loads(path.read_bytes()) if path.exists() else []
 
 

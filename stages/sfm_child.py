@@ -43,6 +43,8 @@ from stages.registration import FEWEST_POINTS, FEWEST_REGISTERED
 from stages.sfm import Matcher
 from stages.sfm_attempts import (
     ATTEMPTS,
+    GIVEN,
+    GIVEN_UP,
     NO_TIME,
     Attempt,
     Journal,
@@ -52,6 +54,8 @@ from stages.sfm_attempts import (
     reason_against,
     time_against,
 )
+from stages.sfm_clock import NAME as CLOCK
+from stages.sfm_clock import Clock
 
 Say = Callable[..., None]
 
@@ -111,21 +115,25 @@ class _Work:
         self.files = [photo.image_name for photo in self.photos]
         self.database, self.images = Path(job.database), Path(job.images)
         self.journal = Journal(Path(job.folder, "attempts"))
-        self.started = self.begun = time.monotonic()
+        self.clock, self.started = Clock(self.journal.folder / CLOCK), time.monotonic()
+        self.attempt = ATTEMPTS[0].name
         self.seconds: dict[str, float] = {}  # of this attempt's phases
 
     def begin(self, phase: str, **more: Any) -> None:
-        """Say that a phase begins."""
-        self.begun = time.monotonic()
+        """Say that a phase begins. Of an interrupted run features and matches are kept, while mapping starts again."""
+        self.clock.begin(f"{self.attempt}: {phase}", anew=phase == "mapping")
         self.say(phase=phase, **more)
 
     def end(self, phase: str) -> None:
-        """Note what the phase took."""
-        self.seconds[phase] = time.monotonic() - self.begun
+        """Note what the phase took, in earlier runs too."""
+        self.seconds[phase] = self.clock.end()
 
-    def left(self) -> float:
-        """Seconds that further attempts may take."""
-        return self.started + min(self.job.seconds or math.inf, self.job.max_seconds) - time.monotonic()
+    def left(self) -> tuple[float, str]:
+        """Seconds that further attempts may take, and which limit says so: the time it is given, which is for all runs
+        together, or when it is given up, which is counted in each anew."""
+        limits = {GIVEN: (self.job.seconds or math.inf) - self.clock.earlier, GIVEN_UP: self.job.max_seconds}
+        limit = min(limits, key=limits.__getitem__)
+        return self.started + limits[limit] - time.monotonic(), limit
 
     @cached_property
     def similarity(self) -> Likeness:
@@ -168,6 +176,7 @@ def reconstruct(job: Job, say: Say) -> dict[str, Any]:
     them agree (``supports``).
     """
     work = _Work(job, say)
+    work.clock.keep_always()
     _try_all(work)
     tried = work.journal.account()
     best = work.usable()
@@ -235,21 +244,20 @@ def _no_way(attempt: Attempt, missing: list[int], work: _Work) -> str | None:
     if became := work.journal.abandoned.get(attempt.name):
         work.say(note=f"left out, for it {became} last time: {attempt.words}")
         return f"it {became}"
-    tried, left, chosen_pairs = work.journal.tried, work.left(), work.job.matcher != "exhaustive"
+    tried, (left, limit), chosen_pairs = work.journal.tried, work.left(), work.job.matcher != "exhaustive"
     expected = expected_seconds(attempt, tried, len(missing) / len(work.photos), chosen_pairs)
     if not time_against(expected, tried, left):
         return None
-    limit = "--sfm.max-seconds" if work.job.seconds is None else "the time it is given"
     rest = f"of {limit} {rough_duration(max(0.0, left))} are left"
     times = f"about {rough_duration(expected)} and the last adjustment, {rest}"
     work.say(note=f"left out, for it would take {times}: {attempt.words}")
-    return NO_TIME
+    return f"{NO_TIME} {limit}"
 
 
 def _make(attempt: Attempt, missing: list[int], work: _Work) -> None:
     """Make an attempt and note what came of it."""
     work.say(attempt=attempt.name)
-    work.seconds = {}
+    work.attempt, work.seconds = attempt.name, {}
     database = _matched(attempt, missing, work)
     models = _mapped(attempt, database, work)
     tried = Tried(attempt.name, database.name, seconds=work.seconds)

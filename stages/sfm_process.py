@@ -17,7 +17,7 @@ from typing import IO, TYPE_CHECKING, Any
 
 from stages.contract import Progress, StageError
 from stages.live_line import live_line
-from stages.sfm_attempts import ATTEMPTS, abandon
+from stages.sfm_attempts import ATTEMPTS, OUT_OF_TIME, abandon
 
 if TYPE_CHECKING:
     from stages.photos import Photo
@@ -75,7 +75,7 @@ def _without(attempt: str, code: int, late: bool, log: Path) -> str | None:
         return None
     # Also where it was killed: most often for want of memory, and then it would be every time.
     became = "was killed, most often for want of memory" if code == -signal.SIGKILL else "ended the program"
-    abandon(log.parent / "attempts", attempt, "ran out of time" if late else became)
+    abandon(log.parent / "attempts", attempt, OUT_OF_TIME if late else became)
     return f"Run again: it goes on without the attempt {attempt!r}. Log: {log}"
 
 

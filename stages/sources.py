@@ -69,7 +69,11 @@ def find_source(photos: Path, cameras: Path | None = None) -> Source:
     try:
         _check_given(photos, cameras)
         source = _source(photos, cameras)
-        return source if source.kind == "video" else replace(source, masks=_list_masks(source.root, source.files))
+        if source.kind != "video":
+            return replace(source, masks=_list_masks(source.root, source.files))
+        if cameras is not None:
+            raise _cameras_of_video(source.files[0])
+        return source
     except OSError as error:
         raise cannot_read(error.filename or photos, error) from error
 
@@ -91,11 +95,11 @@ def _source(photos: Path, cameras: Path | None) -> Source:
     if cameras is None and (photos / "transforms_train.json").is_file():
         return _from_blender(photos)
     files = list_photos(root)
-    if cameras is not None and _is_video(files[0]):
-        raise _cameras_of_video(files[0])
+    if _is_video(files[0]):
+        return Source("video", root, None, files)
     if cameras is not None:
         return Source("colmap", root, _colmap_model(cameras), files)
-    return Source("video" if _is_video(files[0]) else "photos", root, None, files)
+    return Source("photos", root, None, files)
 
 
 def list_photos(root: Path) -> tuple[Path, ...]:
@@ -232,18 +236,15 @@ def _check_given(photos: Path, cameras: Path | None) -> None:
             raise StageError(
                 f"{photos} is a workspace", "it holds results, not photos", f"Go on with it: pipeline resume {photos}"
             )
-    elif _is_video(photos):
-        if cameras is not None:
-            raise _cameras_of_video(photos)
     elif (suffix := photos.suffix.lower()) in _IMAGES:
         raise StageError(
             f"{photos.name} is a single image", "a scene needs many photos from different places", _FOLDER_HINT
         )
-    elif suffix != ".json":
+    elif suffix != ".json" and not _is_video(photos):
         raise StageError(
             f"cannot use {photos.name}", "it is no folder of photos, video or transforms.json", _FOLDER_HINT
         )
-    elif cameras is not None:
+    elif cameras is not None and suffix == ".json":
         raise StageError(
             "two sources of cameras", f"{photos.name} and --cameras {cameras}", "Give the photo folder with --cameras."
         )
@@ -269,8 +270,16 @@ def _from_transforms(kind: SourceKind, root: Path, cameras: Path, *transforms: P
 
 
 def _from_blender(folder: Path) -> Source:
-    splits = [folder / f"transforms_{split}.json" for split in ("train", "test")]
-    return _from_transforms("blender", folder, folder, *(path for path in splits if path.is_file()))
+    return _from_transforms("blender", folder, folder, *camera_files(folder))
+
+
+def camera_files(folder: Path) -> tuple[Path, ...]:
+    """The files in which known cameras stand, of all that may lie in a folder: those of a Blender-style scene, else
+    those of a COLMAP model, binary ones before text; none where it holds neither."""
+    if (folder / "transforms_train.json").is_file():
+        splits = (folder / f"transforms_{split}.json" for split in ("train", "test"))
+        return tuple(path for path in splits if path.is_file())
+    return _model_files(folder)
 
 
 def _sorted_inside(root: Path, files: set[Path]) -> tuple[Path, ...]:
@@ -288,7 +297,7 @@ def _colmap_model(folder: Path) -> Path:
     """The one COLMAP model in ``folder``: itself, or below it or its ``sparse`` folder."""
     places = [folder, folder / "sparse"]
     places += [child for place in places if place.is_dir() for child in sorted(place.iterdir())]
-    models = sorted({place for place in places if _is_model(place)})
+    models = sorted({place for place in places if _model_files(place)})
     if not models:
         raise StageError(
             f"no COLMAP model in {folder}",
@@ -304,11 +313,12 @@ def _colmap_model(folder: Path) -> Path:
     return models[0]
 
 
-def _is_model(folder: Path) -> bool:
-    return any(
-        all((folder / f"{part}{extension}").is_file() for part in ("cameras", "images", "points3D"))
-        for extension in (".bin", ".txt")
-    )
+def _model_files(folder: Path) -> tuple[Path, ...]:
+    for extension in (".bin", ".txt"):
+        parts = tuple(folder / f"{part}{extension}" for part in ("cameras", "images", "points3D"))
+        if all(part.is_file() for part in parts):
+            return parts
+    return ()
 
 
 def _is_video(file: Path) -> bool:

@@ -56,10 +56,13 @@ def finish(
 
 def _finished(model: "pycolmap.Reconstruction", choice: Choice) -> Finished:
     notes, uncertainty = choice.notes, {}
+    untold = "how well the poses are known cannot be told"
     try:
         uncertainty = pose_uncertainty_px(model, choice.noise_px)
     except np.linalg.LinAlgError:
-        notes = [*notes, "how well the poses are known cannot be told: the points leave some of them free to move"]
+        notes = [*notes, f"{untold}: the points leave some of them free to move"]
+    except MemoryError as error:
+        notes = [*notes, f"{untold}: {str(error) or 'memory ran out'}"]
     return Finished(model, choice.table, notes, {model.image(i).name: px for i, px in uncertainty.items()})
 
 

@@ -5,12 +5,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
+from stages.amounts import bytes_in_words
 from stages.colmap.observations import Observations, observations, points_in_camera, residuals
+from stages.memory import available_bytes
 
 if TYPE_CHECKING:
     import pycolmap
 
 FEWEST_OBSERVATIONS = 6  # of a photo: 12 equations for 6 unknowns; with fewer its pose is not known
+MATRICES = 6  # of 6 n × 6 n float64 for n photos, that are there at once at most
 STEP = 1e-5  # of finite differences, as a share of the distance: rounding and curvature are both far below a percent
 
 
@@ -25,7 +28,8 @@ def pose_uncertainty_px(model: "pycolmap.Reconstruction", noise: float) -> dict[
     long looks like places a little far away.
 
     ``noise`` scales adjustments' soft-L1. Photos with very few observations have no entry. Raises LinAlgError where
-    the equations leave more than the frame open (points without depth).
+    the equations leave more than the frame open (points without depth), and MemoryError, with the sizes, where there
+    is no room for the covariance, which grows with the square of the number of photos.
     """
     seen = observations(model)
     counts = dict(zip(*(a.tolist() for a in np.unique(seen.image, return_counts=True)), strict=True))
@@ -36,6 +40,9 @@ def pose_uncertainty_px(model: "pycolmap.Reconstruction", noise: float) -> dict[
     ids = np.unique(seen.image)
     if not len(ids):
         return {}
+    needed, free = MATRICES * (6 * len(ids)) ** 2 * 8, available_bytes()
+    if needed > free:
+        raise MemoryError(f"it would take {bytes_in_words(needed)} and {bytes_in_words(free)} are free")
     to_pose, to_point = _jacobians(model, seen)
     covariance = _whitened_covariance(model, seen, ids, to_pose, to_point)
     sigma = _error_px(residuals(model, seen), noise, len(ids), len(np.unique(seen.point)))

@@ -235,8 +235,26 @@ def test_until_ingest_then_status_and_explain_and_clean(tmp_path: Path, capsys: 
     assert lines[1].split()[:2] == ["sfm", "never"]
     assert run_command(["explain", "ingest", workspace]) == 0
     assert "would not run" in capsys.readouterr().out
+    (tmp_path / "w.nerf/ingest/.DS_Store").write_text("of a file manager")
     assert run_command(["clean", workspace]) == 0
     assert "0.0 MB in 0 folders" in capsys.readouterr().out
+
+
+def test_what_lies_beside_known_cameras_changes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    model = tmp_path / "cameras/sparse/0"
+    for folder in (tmp_path / "photos", model):
+        folder.mkdir(parents=True)
+    for k in range(3):
+        Image.effect_noise((64, 48), 30 + k).convert("RGB").save(tmp_path / f"photos/{k}.png")
+    for part in ("cameras", "images", "points3D"):
+        (model / f"{part}.bin").write_text("1")
+    for name in ("itself", "again"):  # as many paths as there are ways through them
+        (tmp_path / "cameras" / name).symlink_to(tmp_path / "cameras")
+    words = ("--cameras", str(tmp_path / "cameras"), "--until", "ingest")
+    assert "cameras given" in run_on(tmp_path / "photos", capsys, *words)[1]
+    (tmp_path / "cameras/notes.txt").write_text("of no matter")
+    assert "nothing to do" in run_on(tmp_path / "photos", capsys, *words)[1]
+    assert "one camera" in run_on(tmp_path / "photos", capsys, "--until", "ingest")[1]
 
 
 def test_photos_that_are_taken_away_fail_their_own_stage(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -73,20 +73,36 @@ def test_paths_enter_by_content(tmp_path: Path):
         config_for_key(Config(cameras=tmp_path / "c.json"), index, {}, ())
 
 
-def test_hidden_files_do_not_enter_a_folders_digest(tmp_path: Path):
-    folder = tmp_path / "model"
-    folder.mkdir()
-    (folder / "cameras.bin").write_bytes(b"1")
+@pytest.mark.parametrize(
+    ("read", "beside"),
+    [
+        (("transforms_train.json", "transforms_test.json"), ("transforms_val.json", "cameras.bin", "train/r_0.png")),
+        (("transforms_train.json",), ("transforms_val.json",)),
+        (("cameras.bin", "images.bin", "points3D.bin"), ("cameras.txt", "rigs.bin", "points3D.ply", ".DS_Store")),
+        (("cameras.txt", "images.txt", "points3D.txt"), ("project.ini",)),
+    ],
+)
+def test_of_a_folder_the_cameras_count_that_are_read(tmp_path: Path, read: tuple[str, ...], beside: tuple[str, ...]):
+    folder = tmp_path / "cameras"
+    (folder / "train").mkdir(parents=True)
+    for name in read:
+        (folder / name).write_text("1")
     index = ContentIndex(tmp_path / "cache.json")
     before = index.of_path(folder)
-    (folder / ".DS_Store").write_bytes(b"2")
+    for name in beside:
+        (folder / name).write_text("2")
+    (folder / "itself").symlink_to(folder)
+    (folder / "again").symlink_to(folder)
     assert index.of_path(folder) == before
-    (folder / "images.bin").write_bytes(b"2")
-    assert index.of_path(folder) != before
+    assert {Path(known).name for known in index.known} == set(read)
+    for name in read:
+        (folder / name).write_text("3")
+        before, changed = index.of_path(folder), before
+        assert before != changed
 
 
 @pytest.mark.skipif(not Path("/proc/self/mem").exists(), reason="needs a file that nobody can read")
 def test_a_file_that_cannot_be_read_is_refused_in_words(tmp_path: Path):
     (tmp_path / "a.jpg").symlink_to("/proc/self/mem")
     with pytest.raises(StageError, match=r"cannot read .*a\.jpg: .+ Check that it is still there"):
-        ContentIndex(tmp_path / "index.json").of_path(tmp_path)
+        ContentIndex(tmp_path / "index.json").of_path(tmp_path / "a.jpg")

@@ -13,6 +13,7 @@ from pipeline.display import SilentDisplay
 from pipeline.failures import StageFailed
 from pipeline.runner import NotReady, Runner
 from pipeline.workspace import Workspace
+from stages import sources
 from stages.contract import StageError
 from tests.pipeline import fake_stages
 from tests.pipeline.fake_stages import FakeSettings, calls
@@ -80,6 +81,20 @@ def test_a_new_or_changed_mask_is_a_change_of_the_photos(bring: Bring, photos: P
         Image.new("L", (4, 4), level).save(photos / "masks/0.png")
         assert bring() and calls[0] == "ingest"
         assert not bring()
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_photos_are_listed_once(bring: Bring, tmp_path: Path, known: bool, monkeypatch: pytest.MonkeyPatch):
+    bring(stages=ALL if known else ("ingest",))
+    if not known:
+        Image.new("RGB", (4, 4), (9, 9, 9)).save(tmp_path / "photos/new.png")
+    workspace, runner = reader(tmp_path / "w.nerf")
+    found, listed = sources.find_source, []
+    monkeypatch.setattr(sources, "find_source", lambda *given: listed.append(given) or found(*given))
+    with workspace:
+        assert [runner.is_done(stage) for stage in ALL] == [known] * 3
+        runner.run(ALL)
+    assert len(listed) == 1
 
 
 def test_going_back_to_old_settings_runs_nothing(bring: Bring):

@@ -97,15 +97,6 @@ def test_refused_files_are_named_and_do_not_stop_the_rest(tmp_path: Path, progre
     ]
 
 
-def test_at_most_ten_refusals_are_said(tmp_path: Path, progress: Any) -> None:
-    folder = put(tmp_path / "in", "a.jpg", "b.jpg")
-    for index in range(13):
-        (folder / f"x{index:02d}.jpg").write_bytes(b"")
-    ingest.run(Config(photos=folder), {}, tmp_path / "out", progress)
-    assert len(progress.notes) == 11
-    assert progress.notes[-1] == "… and 3 more, all in photos.json"
-
-
 def test_too_few_photos_in_words_that_fit(tmp_path: Path, progress: Any) -> None:
     hint = "Take 20 to 100 overlapping photos of one scene from different places and put them into one folder."
     error = failure(put(tmp_path / "one", "a.jpg"), tmp_path / "out1", progress)

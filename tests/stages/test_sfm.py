@@ -21,7 +21,7 @@ from stages.contract import StageError
 from stages.files import read_json, write_png
 from stages.photos import read_photos, write_photos
 from stages.registration import count_done
-from stages.sfm_attempts import ATTEMPTS, NO_TIME, Journal, Tried
+from stages.sfm_attempts import ATTEMPTS, Journal, Tried
 from tests.blots import blots
 from tests.small_scenes import write_blender_scene
 from tests.stages.sfm_inputs import SMALL, ingested
@@ -308,6 +308,7 @@ def test_an_attempt_for_which_no_time_is_left_is_not_begun(
     config = SMALL.model_copy(update={"max_seconds": 240.0})
     result = sfm.run(config, with_a_stranger(inputs, tmp_path / "ingest"), tmp_path / "sfm", progress)
     assert result.line.startswith("6/7 registered, ")
+    assert result.line.endswith(" · 1 way left out for time: sfm --force")
     # All of the first time's 100 s of mapping, 1 - (6/7)² of those of matching; twice 100 s are for the adjustment.
     said = (
         "left out, for it would take about 2 min and the last adjustment, of --sfm.max-seconds 4 min are left: "
@@ -315,7 +316,7 @@ def test_an_attempt_for_which_no_time_is_left_is_not_begun(
     )
     assert said in progress.notes
     tried = {row["attempt"]: row["passed"] for row in read_json(tmp_path / "sfm/registration.json")["attempts"]}
-    assert tried["looser matching"] == NO_TIME == "too little was left of --sfm.max-seconds"
+    assert tried["looser matching"] == "too little was left of --sfm.max-seconds"
     assert tried["weaker start"] == "none of them shares a view with another photo"
 
 

@@ -1,9 +1,14 @@
+from unittest.mock import Mock
+
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from stages.colmap import uncertainty
+from stages.colmap.held_out import Choice
 from stages.colmap.observations import LEAST_NOISE_PX, noise_px, observations
+from stages.colmap.refinement import _finished
 from stages.colmap.uncertainty import _error_px, pose_uncertainty_px
 from tests.stages.lens_scene import adjust, lens, photographed
 
@@ -86,6 +91,25 @@ def test_mismatches_count_by_their_pull() -> None:
     assert gaussian == pytest.approx(0.5 / 0.929**0.5, rel=0.01)  # soft-L1 at one sigma is 93 % efficient
     residual[::20] *= 100
     assert gaussian < _error_px(residual, 0.5, 0, 0) < 1.2 * gaussian
+
+
+@pytest.mark.parametrize("how", ["foreseen", "met"])
+def test_where_there_is_no_room_for_it_that_is_said_and_the_model_stands(
+    how: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = photographed(CAMERA, photos=PHOTOS, points=POINTS)
+    room = 6 * (6 * PHOTOS) ** 2 * 8
+    monkeypatch.setattr(uncertainty, "available_bytes", lambda: room)
+    assert len(pose_uncertainty_px(model, 0.5)) == PHOTOS
+    if how == "foreseen":
+        monkeypatch.setattr(uncertainty, "available_bytes", lambda: room - 1)
+        words = "it would take 0 MB and 0 MB are free"
+    else:
+        monkeypatch.setattr(uncertainty, "_whitened_covariance", Mock(side_effect=MemoryError()))
+        words = "memory ran out"
+    finished = _finished(model, Choice(0.5, notes=["the camera is kept as given"]))
+    assert finished.model is model and finished.uncertainty_px == {}
+    assert finished.notes[1:] == [f"how well the poses are known cannot be told: {words}"]
 
 
 def test_where_nothing_was_seen_nothing_is_known() -> None:

@@ -1,0 +1,66 @@
+"""What ingest says of many files at once: the first few, where all of them stand, and all where that is nowhere."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from stages import ingest
+from stages.contract import StageError
+from stages.files import read_json
+from stages.ingest import Config
+
+
+def put(folder: Path, *names: str) -> Path:
+    """Photos of noise, no two alike."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in names:
+        picture(len(list(folder.iterdir()))).save(folder / name)
+    return folder
+
+
+def picture(seed: int) -> Image.Image:
+    return Image.fromarray(np.random.default_rng(seed).integers(0, 256, (24, 32, 3), np.uint8))
+
+
+def test_at_most_ten_refusals_are_said(tmp_path: Path, progress: Any) -> None:
+    folder = put(tmp_path / "in", "a.jpg", "b.jpg")
+    for index in range(13):
+        (folder / f"x{index:02d}.jpg").write_bytes(b"")
+    ingest.run(Config(photos=folder), {}, tmp_path / "out", progress)
+    assert len(progress.notes) == 11
+    assert progress.notes[-1] == "… and 3 more, all in photos.json"
+
+
+def test_all_notes_are_kept(tmp_path: Path, progress: Any) -> None:
+    folder = put(tmp_path / "in", "a.jpg", "b.jpg")
+    for index in range(7):
+        put(folder / "masks", f"stray{index}.png")
+    for index in range(5):
+        frames = [picture(10 * index + frame) for frame in range(2)]
+        frames[0].save(folder / f"c{index}.tif", save_all=True, append_images=frames[1:])
+    result = ingest.run(Config(photos=folder), {}, tmp_path / "out", progress)
+    assert (result.records, result.outputs) == (("notes.json",), ("images", "photos.json"))
+    notes = read_json(tmp_path / "out/notes.json")
+    assert notes[:10] == progress.notes[:10] and len(notes) == 12
+    assert notes[6] == "masks/stray6.png is no photo's mask, which are called NAME.png"
+    assert notes[7].startswith("c0.tif: ")
+    assert progress.notes[10] == "… and 2 more, all in notes.json"
+
+
+def test_where_it_fails_all_refusals_are_said_by_reason(tmp_path: Path, progress: Any) -> None:
+    folder = put(tmp_path / "in", "a.jpg")
+    put(folder / "masks", "stray.png")
+    for index in range(12):
+        (folder / f"x{index:02d}.jpg").write_text("text")
+    (folder / "y.jpg").write_bytes((folder / "a.jpg").read_bytes())
+    with pytest.raises(StageError, match="only one photo can be used"):
+        ingest.run(Config(photos=folder), {}, tmp_path / "out", progress)
+    names = ", ".join(f"x{index:02d}.jpg" for index in range(12))
+    assert progress.notes == [
+        f"refused {names}: not an image: it is text",
+        "refused y.jpg: identical to a.jpg",
+        "masks/stray.png is no photo's mask, which are called NAME.png",
+    ]
