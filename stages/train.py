@@ -321,8 +321,8 @@ def _line(config: Config, training: "TrainingRun") -> str:
     parts += [
         "no photos held out" if heldout is None else f"held out {heldout:.1f} dB {sparkline(state.curve)}".rstrip()
     ]
-    parts.append(next_words(coming_doubling(config.kind, state.curve)))
-    parts.append(target_words(config.target_psnr, state.validation_psnr, state.seconds))
+    coming = coming_doubling(config.kind, state.curve)
+    parts += [next_words(coming), target_words(config.target_psnr, state.validation_psnr, state.seconds)]
     if state.symptom is not None:
         parts.append(f"of no use yet: {state.symptom}")
     return " · ".join(filter(None, parts))
