@@ -18,11 +18,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from nerf.grid_training import CONSTANT_SHARE
-from nerf.learning_curve import FEWEST_STEPS, TYPICAL_STEPS, Curve, last_doubling
+from nerf.learning_curve import FEWEST_STEPS, Curve, last_doubling
 
 SHARE = 0.8  # of the truths that an interval is to hold
 LEAST = 0.1  # dB: by as much two seeds differ
-SHARES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)  # of what is predicted, for the interval
 MEASURED = ("heldout_psnr", "mean_10")
 Run = dict[str, Any]
 
@@ -38,26 +37,17 @@ class Case(NamedTuple):
     reached: float
 
 
-Terms = Callable[[Case, float], list[float]]
-"""What a case's prediction is linear in, for an exponent that is fitted, too."""
+Terms = Callable[[Case], list[float]]
+"""What a case's prediction is linear in."""
 
 MODELS: dict[str, Terms] = {
-    "always the same": lambda case, _: [1.0],
-    "share of the last": lambda case, _: [case.last],
-    "line in the last": lambda case, _: [1.0, case.last],
-    "line, and the gap": lambda case, _: [1.0, case.last, case.gap],
-    "share, falling": lambda case, exponent: [case.last * (TYPICAL_STEPS / case.steps) ** exponent],
+    "always the same": lambda case: [1.0],
+    "share of the last": lambda case: [case.last],
+    "share, falling": lambda case: [case.last * (1000 / case.steps) ** 0.45],
+    "line in the last": lambda case: [1.0, case.last],
+    "line, and the gap": lambda case: [1.0, case.last, case.gap],
 }
-IN_USE = "share, falling"
-EXPONENTS = tuple(np.arange(0.0, 1.05, 0.05))
-
-
-class Fit(NamedTuple):
-    exponent: float
-    constants: np.ndarray
-
-    def of(self, case: Case, terms: Terms) -> float:
-        return float(np.array(terms(case, self.exponent)) @ self.constants)
+IN_USE = "share of the last"
 
 
 def curve_of(run: Run, measured: str = "heldout_psnr") -> Curve:
@@ -91,52 +81,34 @@ def cases_of(runs: list[Run]) -> list[Case]:
     return cases
 
 
-def fitted(cases: list[Case], terms: Terms) -> Fit:
-    """Least squares, for the exponent that leaves least."""
-
-    def squares(fit: Fit) -> float:
-        return sum((case.reached - fit.of(case, terms)) ** 2 for case in cases)
-
-    reached = np.array([case.reached for case in cases])
-    fits = []
-    for exponent in EXPONENTS:
-        told = np.array([terms(case, exponent) for case in cases])
-        fits.append(Fit(float(exponent), np.linalg.lstsq(told, reached, rcond=None)[0]))
-    return min(fits, key=squares)
+def fitted(cases: list[Case], terms: Terms) -> np.ndarray:
+    """The constants of least squares."""
+    told = np.array([terms(case) for case in cases])
+    return np.linalg.lstsq(told, np.array([case.reached for case in cases]), rcond=None)[0]
 
 
-def left_out(cases: list[Case], terms: Terms) -> list[float]:
-    """Reached less predicted, of each case, by the constants of all other sets."""
-    fits = {one: fitted([case for case in cases if case.set != one], terms) for one in {case.set for case in cases}}
-    return [case.reached - fits[case.set].of(case, terms) for case in cases]
+def predicted(case: Case, terms: Terms, constants: np.ndarray) -> float:
+    return float(np.array(terms(case)) @ constants)
 
 
-class Width(NamedTuple):
-    """Half the interval around a prediction: ``least``, and a share of what is predicted."""
-
-    least: float
-    share: float
-
-    def of(self, guess: float) -> float:
-        return self.least + self.share * max(guess, 0.0)
+def others(cases: list[Case], case: Case) -> list[Case]:
+    """Those of other sets."""
+    return [other for other in cases if other.set != case.set]
 
 
-def width(cases: list[Case], terms: Terms) -> Width:
-    """The narrowest on average that holds SHARE of the truths, judged by sets that the constants do not come from."""
-    off = np.abs(left_out(cases, terms))
-    fit = fitted(cases, terms)
-    gains = np.array([max(fit.of(case, terms), 0.0) for case in cases])
-    tried = [Width(max(float(np.quantile(off - share * gains, SHARE)), LEAST), share) for share in SHARES]
-    return min(tried, key=lambda found: found.least + found.share * gains.mean())
+def half_width(cases: list[Case], terms: Terms) -> float:
+    """What holds SHARE of the truths, each judged by constants of other sets."""
+    guesses = [predicted(case, terms, fitted(others(cases, case), terms)) for case in cases]
+    off = [abs(case.reached - guess) for case, guess in zip(cases, guesses, strict=True)]
+    return max(float(np.quantile(off, SHARE)), LEAST)
 
 
 def score(cases: list[Case], terms: Terms) -> list[tuple[Case, float, float]]:
     """Each case with what is predicted of it and the half width, both without any run of its own set."""
     rows = []
     for case in cases:
-        others = [other for other in cases if other.set != case.set]
-        guess = fitted(others, terms).of(case, terms)
-        rows.append((case, guess, width(others, terms).of(guess)))
+        rest = others(cases, case)
+        rows.append((case, predicted(case, terms, fitted(rest, terms)), half_width(rest, terms)))
     return rows
 
 
@@ -151,11 +123,8 @@ def print_scores(cases: list[Case]) -> None:
     for case, guess, half in score(cases, terms):
         inside = "" if abs(case.reached - guess) <= half else "outside"
         print(f"| {case.name} | {case.last:+.2f} | {guess:+.2f} ± {half:.2f} | {case.reached:+.2f} | {inside} |")
-    fit = fitted(cases, terms)
-    found = width(cases, terms)
-    constants = ", ".join(f"{value:.3f}" for value in fit.constants)
-    print(f"\n{len(cases)} cases; of all: {constants} at an exponent of {fit.exponent:.2f},")
-    print(f"± {found.least:.2f} and {found.share:.2f} of what is predicted")
+    constants = ", ".join(f"{value:.3f}" for value in fitted(cases, terms))
+    print(f"\n{len(cases)} cases; of all: {constants}, ± {half_width(cases, terms):.2f}")
 
 
 def print_schedules(runs: list[Run]) -> None:

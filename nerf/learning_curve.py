@@ -52,12 +52,11 @@ def knee(curve: Curve) -> float | None:
     return found
 
 
-# Least squares over 30 pairs of runs of T and 2 T steps of the grid field, seven sets (docs/numbers.md): what a run
+# Least squares over 32 pairs of runs of T and 2 T steps of the grid field, eight sets (docs/numbers.md): what a run
 # gained from half of its time to its end, annealing included, against what a run of twice the time ends higher.
 FEWEST_STEPS = 500  # a shorter run is still fog, and tells nothing of a longer one
-TYPICAL_STEPS, MOST_STEPS = 1000, 4000  # of longer runs none was measured: they are taken for so long
-NEXT_OF_LAST, NEXT_EXPONENT = 0.72, 0.45  # the share at so many steps, and how it falls: doublings buy less and less
-NEXT_HALF_WIDTH = 0.34, 0.10  # dB, and of what is predicted: held four of five, each judged by the other sets
+NEXT_OF_LAST = 0.74
+NEXT_HALF_WIDTH = 0.37  # dB: held four of five, each judged by the other sets
 
 
 def next_doubling(curve: Curve, steps: int) -> Gain | None:
@@ -66,6 +65,4 @@ def next_doubling(curve: Curve, steps: int) -> Gain | None:
     last = last_doubling(curve)
     if last is None or steps < FEWEST_STEPS:
         return None
-    gain = NEXT_OF_LAST * (TYPICAL_STEPS / min(steps, MOST_STEPS)) ** NEXT_EXPONENT * last
-    least, share = NEXT_HALF_WIDTH
-    return Gain(gain, least + share * max(gain, 0.0))
+    return Gain(NEXT_OF_LAST * last, NEXT_HALF_WIDTH)
