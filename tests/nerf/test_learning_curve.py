@@ -66,5 +66,5 @@ def test_a_late_rise_undoes_a_knee():
 def test_the_next_doubling_buys_less_than_the_last(last: float):
     coming = next_doubling(straight(last), FEWEST_STEPS)
     assert coming is not None
-    assert coming.db == pytest.approx(0.74 * last) and 0 < coming.half_width < 0.5
+    assert coming.db == pytest.approx(0.71 * last) and 0 < coming.half_width < 0.5
     assert next_doubling(straight(last), FEWEST_STEPS - 1) is None
