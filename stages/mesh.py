@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from stages.mesh_views import ShadowMap
 
 NEEDS = ("ingest", "normalise", "train")
-VERSION = 5
+VERSION = 6
 RESUMES = False
 LINKS = ("mesh.glb", "mesh.ply", "mesh.obj")
 UNKEYED = ("seconds",)  # it decides the resolution, and that enters the key
@@ -249,6 +249,7 @@ def _facts(config: Config, result: Extracted, scene: "Scene") -> dict[str, objec
         "components_kept": result.cleaned.kept,
         "components_dropped": result.cleaned.dropped,
         "faces_uncovered": result.cleaned.uncovered,
+        "faces_hidden": result.cleaned.hidden,
         "level": result.level.level,
         "level_reason": result.level.reason,
         "level_miss_voxels": result.level.miss_voxels,

@@ -8,9 +8,12 @@ from stages.contract import StageError
 from stages.mesh_surface import Surface, border_vertices, components, face_areas, is_watertight, keep_faces
 
 if TYPE_CHECKING:
+    from scipy.spatial import KDTree
+
     from stages.mesh import Keep
     from stages.mesh_views import Sight
 
+HIDDEN_STEPS = 10  # from vertex to vertex, by which a face may be away from what photos see: creases and gaps close
 SEEN_SHARE = 0.1  # of a component's area; an inner cavity has none, the seen side of an object about half
 # Of a component's area, near a sparse point. Of the demo's table 41 % lies within 0.03 of one, 57 % within 0.05; of
 # sheets of sky below it nothing within 0.3 (docs/numbers.md).
@@ -20,13 +23,15 @@ FEWEST_POINTS = 50  # near the surface; fewer tell nothing of what is far from t
 
 
 class Cleaned(NamedTuple):
-    """A cleaned surface; ``uncovered`` counts the faces cut away because too few photos look there."""
+    """A cleaned surface; ``uncovered`` counts the faces cut away because too few photos look there, ``hidden`` those
+    cut because what they look at is hidden and far from all that has a place."""
 
     surface: Surface
     vertex: np.ndarray  # the old index of each vertex
     kept: int
     dropped: int
     uncovered: int
+    hidden: int
 
 
 def clean(
@@ -34,16 +39,18 @@ def clean(
 ) -> Cleaned:
     """Drop what the photos do not vouch for; ``points`` are the sparse ones (n, 3), in the frame of the surface.
 
-    ``visible`` cuts the faces that fewer than ``min_views`` photos cover (depth cannot be known from one), then
-    drops components that hardly any of those photos see (inner cavities), those that :func:`_located` has no place for,
-    and those with less than ``min_component`` of the largest one's area. ``largest`` keeps the component of largest
-    area, ``all`` everything. Raises StageError if nothing remains.
+    ``visible`` cuts the faces that fewer than ``min_views`` photos cover (depth cannot be known from one) and those
+    that so few see and no sparse point is near (sky that hangs on the back of a table), then drops components that
+    hardly any of those photos see (inner cavities), those that :func:`_located` has no place for, and those with less
+    than ``min_component`` of the largest one's area. ``largest`` keeps the component of largest area, ``all``
+    everything. Raises StageError if nothing remains.
     """
     covered = np.all(sight.covered[surface.faces] >= min_views, axis=1) | (keep != "visible")
     if not covered.any():
         why = f"none of its {len(surface.faces)} faces lies in {min_views} photos between near and far"
         raise StageError("no part of the surface is covered by the photos", why, "Try --mesh.keep all.")
-    surface, old = keep_faces(surface, covered)
+    hidden = covered & _hidden(surface, sight.seen >= min_views, points) & (keep == "visible")
+    surface, old = keep_faces(surface, covered & ~hidden)
     label = components(surface)
     count = int(label.max()) + 1
     if keep == "visible":
@@ -55,7 +62,27 @@ def clean(
         why = f"in none of its {count} components is a tenth of the area seen by {min_views} photos"
         raise StageError("no part of the surface is seen by the photos", why, "Try --mesh.keep all or --mesh.level.")
     surface, left = keep_faces(surface, good[label])
-    return Cleaned(surface, old[left], int(good.sum()), int((~good).sum()), int((~covered).sum()))
+    return Cleaned(surface, old[left], int(good.sum()), int((~good).sum()), int((~covered).sum()), int(hidden.sum()))
+
+
+def _hidden(surface: Surface, seen: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Which faces have a vertex that is neither within HIDDEN_STEPS edges of a ``seen`` one nor within reach of a
+    sparse point, (faces,) bool; none where there are too few points to tell, or where that would be all."""
+    if len(points) < FEWEST_POINTS:
+        return np.zeros(len(surface.faces), bool)
+    tree, reach = _places(points)
+    vouched = np.isfinite(tree.query(surface.vertices, distance_upper_bound=reach)[0])
+    for _ in range(HIDDEN_STEPS):
+        seen = _grown(surface.faces, seen)
+    hidden = ~(vouched | seen)[surface.faces].all(1)
+    return hidden & ~hidden.all()
+
+
+def _grown(faces: np.ndarray, marked: np.ndarray) -> np.ndarray:
+    """The ``marked`` vertices and all that share a face with one."""
+    grown = marked.copy()
+    grown[faces[marked[faces].any(1)]] = True
+    return grown
 
 
 def _worth_keeping(
@@ -80,9 +107,7 @@ def _located(surface: Surface, label: np.ndarray, area: np.ndarray, points: np.n
 
     if len(points) < FEWEST_POINTS:
         return good
-    tree = KDTree(points)
-    spacing = float(np.median(tree.query(points, 2)[0][:, 1]))
-    reach = max(REACH, REACH_IN_SPACINGS * spacing)
+    tree, reach = _places(points)
     near = np.isfinite(tree.query(surface.vertices, distance_upper_bound=reach)[0])
     certain = good & _have(label, area, near[surface.faces].any(1), LOCATED_SHARE)
 
@@ -92,6 +117,15 @@ def _located(surface: Surface, label: np.ndarray, area: np.ndarray, points: np.n
     holder = of_vertex[np.asarray(vertex)[np.isfinite(distance)]]
     held, of_certain = (int(which[holder].sum()) for which in (good, certain))
     return certain if held >= FEWEST_POINTS and of_certain >= held / 2 else good
+
+
+def _places(points: np.ndarray) -> "tuple[KDTree, float]":
+    """The sparse points, to be searched, and how near one has to be to be near."""
+    from scipy.spatial import KDTree
+
+    tree = KDTree(points)
+    spacing = float(np.median(tree.query(points, 2)[0][:, 1]))
+    return tree, max(REACH, REACH_IN_SPACINGS * spacing)
 
 
 def _have(label: np.ndarray, area: np.ndarray, marked: np.ndarray, share: float) -> np.ndarray:

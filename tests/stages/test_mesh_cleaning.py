@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from stages.contract import StageError
-from stages.mesh_cleaning import FEWEST_POINTS, REACH, clean, openness
+from stages.mesh_cleaning import FEWEST_POINTS, HIDDEN_STEPS, REACH, clean, openness
 from stages.mesh_surface import Surface
 from stages.mesh_views import Sight
 
@@ -31,6 +31,15 @@ def points_at(*corners, count=2 * FEWEST_POINTS):
     """A dense cloud of points around each of some places."""
     cloud = np.random.default_rng(0).normal(scale=REACH / 10, size=(count, 3))
     return np.concatenate([cloud + corner for corner in corners])
+
+
+def long_strip():
+    """Vertices in pairs, 0 to 100 along x, and two faces between one pair and the next."""
+    steps = np.arange(101.0)
+    edges = np.stack([np.stack([steps, 0 * steps, 0 * steps], -1), np.stack([steps, 0 * steps + 1, 0 * steps], -1)], 1)
+    first = 2 * np.arange(100)[:, None]
+    faces = np.concatenate([first + np.array(corners) for corners in ([0, 2, 1], [1, 2, 3])])
+    return edges.reshape(-1, 3), faces.astype(np.int32)
 
 
 def test_visible_keeps_what_is_seen_and_large_enough():
@@ -68,12 +77,9 @@ def test_points_far_from_all_of_the_surface_tell_nothing():
 
 def test_a_bare_wall_is_not_dropped_for_a_speck_on_it():
     """The wall has points in one corner alone: it stays if they are more than those on the speck."""
-    steps = np.arange(101.0)
-    edges = np.stack([np.stack([steps, 0 * steps, 0 * steps], -1), np.stack([steps, 0 * steps + 1, 0 * steps], -1)], 1)
-    first = 2 * np.arange(100)[:, None]
-    strip = np.concatenate([first + np.array(corners) for corners in ([0, 2, 1], [1, 2, 3])])
+    edges, strip = long_strip()
     speck = np.array([[200.0, 0, 0], [201, 0, 0], [200, 1, 0]])
-    wall = Surface(np.concatenate([edges.reshape(-1, 3), speck]), np.vstack([strip, [202, 203, 204]]).astype(np.int32))
+    wall = Surface(np.concatenate([edges, speck]), np.vstack([strip, [202, 203, 204]]).astype(np.int32))
     view = Sight(np.full(205, 5), np.full(205, 5), np.zeros((205, 3)))
     on_the_wall, on_the_speck = points_at(wall.vertices[0]), points_at(speck[0])
     both = np.concatenate([on_the_wall, on_the_speck[: len(on_the_speck) // 2]])
@@ -84,9 +90,23 @@ def test_a_bare_wall_is_not_dropped_for_a_speck_on_it():
 
 def test_faces_without_enough_photos_are_cut_before_components_are_counted():
     view = sight([5, 1], [5, 1])
-    assert clean(tetrahedra(1.0, 1.0), view, NO_POINTS, "visible", 2, 0.01)[2:] == (1, 0, 4)
+    assert clean(tetrahedra(1.0, 1.0), view, NO_POINTS, "visible", 2, 0.01)[2:] == (1, 0, 4, 0)
     view.covered[0] = 1  # three of the four faces of the first touch its first vertex
-    assert clean(tetrahedra(1.0, 1.0), view, NO_POINTS, "visible", 2, 0.01)[2:] == (1, 0, 7)
+    assert clean(tetrahedra(1.0, 1.0), view, NO_POINTS, "visible", 2, 0.01)[2:] == (1, 0, 7, 0)
+
+
+def test_what_is_hidden_and_far_from_every_sparse_point_is_cut_off():
+    """A strip of which photos see the first fifth, with points there: the rest hangs on it, a little of it stays."""
+    strip = Surface(*long_strip())
+    x = strip.vertices[:, 0]
+    view = Sight(np.full(202, 5), np.where(x <= 20, 5, 1), np.zeros((202, 3)))
+    here, face = points_at(strip.vertices[0]), points_at(*strip.vertices[[180, 182, 181]])
+    cleaned = clean(strip, view, here, "visible", 2, 0.0)
+    assert cleaned.surface.vertices[:, 0].max() == 20 + HIDDEN_STEPS
+    assert cleaned.hidden == 2 * (80 - HIDDEN_STEPS)
+    assert clean(strip, view, np.concatenate([here, face]), "visible", 2, 0.0).hidden == cleaned.hidden - 1
+    assert clean(strip, view, here[: FEWEST_POINTS - 1], "visible", 2, 0.0).hidden == 0
+    assert clean(strip, view, here, "all", 2, 0.0).hidden == 0
 
 
 @pytest.mark.parametrize(("keep", "kept"), [("largest", 1), ("all", 3)])
