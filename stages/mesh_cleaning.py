@@ -13,6 +13,9 @@ if TYPE_CHECKING:
     from stages.mesh import Keep
     from stages.mesh_views import Sight
 
+# Of the photos that look at a vertex. What is there is seen by about half of them, nine vertices in ten by a quarter;
+# what only shows itself past the edge of something else is seen by less (docs/numbers.md).
+SEEN_OF_LOOKING = 0.2
 HIDDEN_STEPS = 10  # from vertex to vertex, by which a face may be away from what photos see: creases and gaps close
 SEEN_SHARE = 0.1  # of a component's area; an inner cavity has none, the seen side of an object about half
 # Of a component's area, near a sparse point. Of the demo's table 41 % lies within 0.03 of one, 57 % within 0.05; of
@@ -24,7 +27,7 @@ FEWEST_POINTS = 50  # near the surface; fewer tell nothing of what is far from t
 
 class Cleaned(NamedTuple):
     """A cleaned surface; ``uncovered`` counts the faces cut away because too few photos look there, ``hidden`` those
-    cut because what they look at is hidden and far from all that has a place."""
+    cut because too few of these see them and no sparse point is near."""
 
     surface: Surface
     vertex: np.ndarray  # the old index of each vertex
@@ -40,16 +43,17 @@ def clean(
     """Drop what the photos do not vouch for; ``points`` are the sparse ones (n, 3), in the frame of the surface.
 
     ``visible`` cuts the faces that fewer than ``min_views`` photos cover (depth cannot be known from one) and those
-    that so few see and no sparse point is near (sky that hangs on the back of a table), then drops components that
-    hardly any of those photos see (inner cavities), those that :func:`_located` has no place for, and those with less
-    than ``min_component`` of the largest one's area. ``largest`` keeps the component of largest area, ``all``
-    everything. Raises StageError if nothing remains.
+    that too few of them see, with no sparse point near (sky that hangs on the back of a table), then drops components
+    that hardly any photos see (inner cavities), those that :func:`_located` has no place for, and those with less than
+    ``min_component`` of the largest one's area. ``largest`` keeps the component of largest area, ``all`` everything.
+    Raises StageError if nothing remains.
     """
     covered = np.all(sight.covered[surface.faces] >= min_views, axis=1) | (keep != "visible")
     if not covered.any():
         why = f"none of its {len(surface.faces)} faces lies in {min_views} photos between near and far"
         raise StageError("no part of the surface is covered by the photos", why, "Try --mesh.keep all.")
-    hidden = covered & _hidden(surface, sight.seen >= min_views, points) & (keep == "visible")
+    seen = sight.seen >= np.maximum(min_views, SEEN_OF_LOOKING * sight.covered)
+    hidden = covered & _hidden(surface, seen, points) & (keep == "visible")
     surface, old = keep_faces(surface, covered & ~hidden)
     label = components(surface)
     count = int(label.max()) + 1

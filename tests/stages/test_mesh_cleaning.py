@@ -105,6 +105,8 @@ def test_what_is_hidden_and_far_from_every_sparse_point_is_cut_off():
     assert cleaned.surface.vertices[:, 0].max() == 20 + HIDDEN_STEPS
     assert cleaned.hidden == 2 * (80 - HIDDEN_STEPS)
     assert clean(strip, view, np.concatenate([here, face]), "visible", 2, 0.0).hidden == cleaned.hidden - 1
+    past_an_edge = Sight(np.full(202, 50), np.where(x <= 20, 25, 9), np.zeros((202, 3)))
+    assert clean(strip, past_an_edge, here, "visible", 2, 0.0).hidden == cleaned.hidden
     assert clean(strip, view, here[: FEWEST_POINTS - 1], "visible", 2, 0.0).hidden == 0
     assert clean(strip, view, here, "all", 2, 0.0).hidden == 0
 
