@@ -52,9 +52,13 @@ def clean(
     if not covered.any():
         why = f"none of its {len(surface.faces)} faces lies in {min_views} photos between near and far"
         raise StageError("no part of the surface is covered by the photos", why, "Try --mesh.keep all.")
-    seen = sight.seen >= np.maximum(min_views, SEEN_OF_LOOKING * sight.covered)
-    hidden = covered & _hidden(surface, seen, points) & (keep == "visible")
-    surface, old = keep_faces(surface, covered & ~hidden)
+    surface, old = keep_faces(surface, covered)
+    hidden = 0
+    if keep == "visible":
+        seen = sight.seen[old] >= np.maximum(min_views, SEEN_OF_LOOKING * sight.covered[old])
+        cut = _hidden(surface, seen, points)
+        surface, left = keep_faces(surface, ~cut)
+        old, hidden = old[left], int(cut.sum())
     label = components(surface)
     count = int(label.max()) + 1
     if keep == "visible":
@@ -66,7 +70,7 @@ def clean(
         why = f"in none of its {count} components is a tenth of the area seen by {min_views} photos"
         raise StageError("no part of the surface is seen by the photos", why, "Try --mesh.keep all or --mesh.level.")
     surface, left = keep_faces(surface, good[label])
-    return Cleaned(surface, old[left], int(good.sum()), int((~good).sum()), int((~covered).sum()), int(hidden.sum()))
+    return Cleaned(surface, old[left], int(good.sum()), int((~good).sum()), int((~covered).sum()), hidden)
 
 
 def _hidden(surface: Surface, seen: np.ndarray, points: np.ndarray) -> np.ndarray:

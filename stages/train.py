@@ -51,9 +51,9 @@ PAPER_SIZES = {
 # Of the grid field at first; both fall while training. Where space is folded a cell is met from farther away, and rays
 # are longer.
 GRID_RATES = {"bounded": 2e-2, "contracted": 1e-2}
+MOST_PARTS = 64  # of a step
 # Colours that each part of a step computes, so each core: half of what a part takes does not depend on how many they
 # are, and fewer cost as long. In a box more of them go with its closer samples (docs/numbers.md).
-MOST_PARTS = 64
 PART_SAMPLES = {"bounded": 3 << 13, "contracted": 1 << 14}
 # The largest step, which a GPU takes as fast as a small one. Its gradients are sure enough for the larger rate
 # (docs/numbers.md).

@@ -111,6 +111,15 @@ def test_what_is_hidden_and_far_from_every_sparse_point_is_cut_off():
     assert clean(strip, view, here, "all", 2, 0.0).hidden == 0
 
 
+def test_where_all_that_is_covered_would_be_hidden_nothing_is_cut_for_it():
+    """The points lie on an end of the strip that too few photos cover."""
+    strip = Surface(*long_strip())
+    covered = strip.vertices[:, 0] > 50
+    view = Sight(np.where(covered, 5, 1), np.where(covered, 1, 0), np.zeros((202, 3)))
+    with pytest.raises(StageError, match="no part of the surface is seen by the photos"):
+        clean(strip, view, points_at(*strip.vertices[:3]), "visible", 2, 0.0)
+
+
 @pytest.mark.parametrize(("keep", "kept"), [("largest", 1), ("all", 3)])
 def test_other_rules_ignore_the_photos(keep, kept):
     cleaned = clean(tetrahedra(0.5, 1.0, 0.5), sight([0, 0, 0], [0, 0, 0]), NO_POINTS, keep, 2, 0.01)
