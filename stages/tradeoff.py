@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from stages.tradeoff_trial import Exam
 
 NEEDS = ("ingest", "normalise", "effects")
-VERSION = 4
+VERSION = 5
 RESUMES = True
 LINKS = ("tradeoff.svg", "tradeoff.png", "tradeoff.md", "tradeoff.json", "ablation.png")
 
@@ -194,7 +194,7 @@ def _written(
     config: Config, trials: Sequence[Trial], left_out: Sequence[str], exam: "Exam", folder: Path
 ) -> StageResult:
     """Write everything. What depends on the clock are records; the scores of the trainings are outputs."""
-    from stages.tradeoff_front import points_of, pooled_deviation, recommend, table
+    from stages.tradeoff_front import points_of, recommend, table
     from stages.tradeoff_plot import write_plot
 
     points = points_of(trials)
@@ -204,7 +204,6 @@ def _written(
         "recommendation": recommendation.words,
         "recommended": points.index(recommendation.point) + 1,
         "still_rising": recommendation.still_rising,
-        "pooled_deviation": pooled_deviation(points),
         "scored": _scored_on(config, exam),
         "points": table(points),
         "arms": [{**trial.arm._asdict(), **trial.figures} for trial in trials],

@@ -3,24 +3,31 @@
 A point is beaten where another takes no longer and is better. **The rule of the recommendation**: the cheapest point
 that nothing beats after which no doubling of the training time buys more than ``WORTH_DB`` beyond the spread over
 seeds. So whatever is still worth its time is worth it from there on to any later point, not to the next one only.
+
+**The rule of the spread**: a setting's is pooled over the settings nearest to it in training time, of the same kind of
+field, as many as give ``LEAST_FREEDOM`` degrees of freedom. One from two seeds alone is hardly known: of n degrees of
+freedom a standard deviation is uncertain by 1 / √(2n) of itself. But only alike ones may be pooled: after a hundred
+steps seeds differ by 2 dB, after a thousand by 0.05 (fox, docs/numbers.md).
 """
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from statistics import mean, stdev
 from typing import Any
 
 from stages.amounts import duration
-from stages.tradeoff_arms import VARIANTS, Arm, resolution_words
+from stages.tradeoff_arms import VARIANTS, Arm, field_of, resolution_words
 
 WORTH_DB = 0.5  # a doubling of the time that buys less is not worth it; 0.5 dB is what one sees side by side
+LEAST_FREEDOM = 3
 
 
 @dataclass(frozen=True)
 class Point:
     """One setting: means over its ``seeds`` trainings; ``deviation`` is the standard deviation of PSNR over them, None
-    for one. ``peak_memory_mb`` is the most of any."""
+    for one; ``spread`` that of one such training, from settings like it, too; None where no setting has several seeds.
+    ``peak_memory_mb`` is the most of any."""
 
     variant: str
     downscale: float
@@ -33,6 +40,7 @@ class Point:
     frame_seconds: float
     peak_memory_mb: float
     model_mb: float
+    spread: float | None = None
 
     @property
     def label(self) -> str:
@@ -63,6 +71,7 @@ def points_of(arms: Sequence[tuple[Arm, Mapping[str, Any]]]) -> list[Point]:
         if figures["failed"] is None:
             groups.setdefault((arm.variant, arm.downscale, arm.steps), []).append(figures)
     points = [_point(*setting, group) for setting, group in groups.items()]
+    points = [replace(point, spread=spread_at(point, points)) for point in points]
     return sorted(points, key=lambda point: point.train_seconds)
 
 
@@ -84,13 +93,17 @@ def _point(variant: str, downscale: float, steps: int, group: Sequence[Mapping[s
     )
 
 
-def pooled_deviation(points: Sequence[Point]) -> float | None:
-    """Standard deviation of one training's PSNR over seeds, from all points with several; None where none has."""
-    several = [point for point in points if point.deviation is not None]
-    if not several:
-        return None
-    freedom = sum(point.seeds - 1 for point in several)
-    return math.sqrt(sum((point.seeds - 1) * (point.deviation or 0.0) ** 2 for point in several) / freedom)
+def spread_at(point: Point, points: Sequence[Point]) -> float | None:
+    """Standard deviation over seeds of the PSNR of one training at ``point``, by the rule of this module; from other
+    kinds of fields where its own has no setting with several seeds, None where none has."""
+    several = [other for other in points if other.deviation is not None]
+    alike = [other for other in several if field_of(other.variant) == field_of(point.variant)] or several
+    squares, freedom = 0.0, 0
+    for other in sorted(alike, key=lambda other: abs(math.log(other.train_seconds / point.train_seconds))):
+        if freedom < LEAST_FREEDOM:
+            squares += (other.seeds - 1) * (other.deviation or 0.0) ** 2
+            freedom += other.seeds - 1
+    return math.sqrt(squares / freedom) if freedom else None
 
 
 def pareto_front(points: Sequence[Point]) -> list[Point]:
@@ -102,20 +115,24 @@ def pareto_front(points: Sequence[Point]) -> list[Point]:
     return front
 
 
-def knee(front: Sequence[Point], deviation: float) -> int:
+def knee(front: Sequence[Point]) -> int:
     """The index of the point to recommend, by the rule of this module; the last one where every doubling pays.
 
     Raises ValueError for no points.
     """
     for index, point in enumerate(front):
-        if all(_beyond_spread(point, later, deviation) <= _worth(point, later) for later in front[index + 1 :]):
+        if all(_gain(point, later) - _noise(point, later) <= _worth(point, later) for later in front[index + 1 :]):
             return index
     raise ValueError("a recommendation needs at least one point")
 
 
-def _beyond_spread(point: Point, later: Point, deviation: float) -> float:
-    """What ``later`` gains in dB, less one standard error of the difference."""
-    return later.psnr - point.psnr - deviation * math.sqrt(1 / point.seeds + 1 / later.seeds)
+def _gain(point: Point, later: Point) -> float:
+    return later.psnr - point.psnr
+
+
+def _noise(*points: Point) -> float:
+    """One standard error, in dB, of a point's mean or of the difference of two."""
+    return math.sqrt(sum((point.spread or 0.0) ** 2 / point.seeds for point in points))
 
 
 def _worth(point: Point, later: Point) -> float:
@@ -125,17 +142,14 @@ def _worth(point: Point, later: Point) -> float:
 
 def recommend(points: Sequence[Point]) -> Recommendation:
     """The knee of the front and what stands around it, in words. Raises ValueError for no points."""
-    front, deviation = pareto_front(points), pooled_deviation(points)
-    index = knee(front, deviation or 0.0)
-    point, best = front[index], front[-1]
-    headline = (
-        f"For this scene: {duration(point.train_seconds)} of training, {point.label}: {_decibel(point, deviation)}."
-    )
+    front = pareto_front(points)
+    point, best = front[knee(front)], front[-1]
+    headline = f"For this scene: {duration(point.train_seconds)} of training, {point.label}: {_decibel(point)}."
     words = headline
     if point is best:
         words += f" Nothing tried is better, and up to there every doubling of the time paid: {_more(points)}."
     else:
-        words += f" {_compared(point, best, deviation)}."
+        words += f" {_compared(point, best)}."
     cheaper = [other for other in front if other.train_seconds <= point.train_seconds / 2]
     if cheaper:
         lost, share = point.psnr - cheaper[-1].psnr, cheaper[-1].train_seconds / point.train_seconds
@@ -143,14 +157,15 @@ def recommend(points: Sequence[Point]) -> Recommendation:
     return Recommendation(point, headline, words, point is best)
 
 
-def _decibel(point: Point, deviation: float | None) -> str:
+def _decibel(point: Point) -> str:
     """With the spread of a mean over as many seeds."""
-    if deviation is None:
+    if point.spread is None:
         return f"{point.psnr:.1f} dB (one seed each: the spread is unknown)"
-    return f"{point.psnr:.1f} ± {deviation / math.sqrt(point.seeds):.1f} dB"
+    noise = _noise(point)
+    return f"{point.psnr:.1f} ± {noise:.1f} dB" if noise >= 0.05 else f"{point.psnr:.2f} ± {noise:.2f} dB"
 
 
-def _compared(point: Point, best: Point, deviation: float | None) -> str:
+def _compared(point: Point, best: Point) -> str:
     """What the best point does better, and for how much more time."""
     if best.variant != point.variant:
         what = f"The best tried ({best.label})"
@@ -158,9 +173,8 @@ def _compared(point: Point, best: Point, deviation: float | None) -> str:
         what = resolution_words(best.downscale).capitalize()
     else:
         what = "Training longer"
-    gain = f"gains {best.psnr - point.psnr:.1f} dB for {best.train_seconds / point.train_seconds:.1f} × the time"
-    noise = (deviation or 0.0) * math.sqrt(1 / point.seeds + 1 / best.seeds)
-    return f"{what} {gain}" + (", which is within the spread" if best.psnr - point.psnr <= noise else "")
+    gain = f"gains {_gain(point, best):.1f} dB for {best.train_seconds / point.train_seconds:.1f} × the time"
+    return f"{what} {gain}" + (", which is within the spread" if _gain(point, best) <= _noise(point, best) else "")
 
 
 def _more(points: Sequence[Point]) -> str:
