@@ -12,7 +12,7 @@ import signal
 import sys
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
@@ -32,7 +32,7 @@ from pipeline.settings import (
     with_effects,
     with_source,
 )
-from pipeline.workspace import Workspace
+from pipeline.workspace import RUN_FILE, Workspace
 from stages.amounts import duration
 from stages.contract import StageError
 
@@ -139,8 +139,9 @@ def _command(name: str) -> Callable[[Sequence[str]], int]:
 def command_run(words: Sequence[str]) -> int:
     """``pipeline run PHOTOS``: the whole chain, or a part of it."""
     given = words_of.parse(words_of.RunArguments, "run", words)
+    file = {} if given.config is None else read_toml(given.config)
     if given.config is not None:  # the file's values become the defaults that flags override
-        from_file = settings_from(read_toml(given.config), f"--config {given.config}")
+        from_file = settings_from(file, f"--config {given.config}")
         given = words_of.parse(words_of.RunArguments, "run", words, from_file)
     root, cameras = given.output or default_workspace(given.photos), given.cameras
     if given.more is not None:
@@ -148,6 +149,7 @@ def command_run(words: Sequence[str]) -> int:
         given = words_of.parse(words_of.RunArguments, "run", words, recorded)
         cameras = cameras or recorded.ingest.cameras
     asked = _like(with_effects(_more(given, root), given.effect), given.like)
+    asked = _keeping_studies(asked, root, {*file, *(word.removeprefix("--").split(".")[0] for word in words)})
     stages = chain.up_to(_known_stage(given.until or list(chain.STAGES)[-1], "--until"))
     force = frozenset[str]()
     if given.from_ is not None:
@@ -160,6 +162,20 @@ def command_run(words: Sequence[str]) -> int:
             display.failed("ingest", error)
             return chain.EXIT_CODES["ingest"]
         return _run_stages(root, settings, stages, given.common, display, force, new_budget=(budget, 0.0))
+
+
+def _keeping_studies(settings: Settings, root: Path, named: Collection[str]) -> Settings:
+    """The settings with the recorded options of the stages ON_REQUEST but those ``named``: a run that does not ask for
+    them leaves what they found where it is."""
+    if not os.path.isfile(root / RUN_FILE):
+        return settings
+    options = Workspace(root).read_run()["options"]
+    recorded = {stage: options[stage] for stage in chain.ON_REQUEST if stage in options and stage not in named}
+    try:
+        kept = settings_from(recorded, f"options recorded in {root}")
+    except UsageError:  # of another version of this program, which finds nothing by them anyway
+        return settings
+    return settings.model_copy(update={stage: getattr(kept, stage) for stage in recorded})
 
 
 def _budget(text: str | None, settings: Settings) -> float | None:

@@ -114,6 +114,24 @@ def test_a_study_is_asked_for_by_its_time(tmp_path: Path, monkeypatch: pytest.Mo
     assert seen[0][1] == ["ingest", "sfm", "normalise", "effects", "tradeoff"]
 
 
+def test_a_run_leaves_a_study_as_it_was_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    seen: list[float] = []
+    monkeypatch.setattr(
+        "pipeline.cli._run_stages", lambda root, settings, *_, **__: seen.append(settings.tradeoff.seconds)
+    )
+    photos, workspace, file = tmp_path / "photos", tmp_path / "w", tmp_path / "options.toml"
+    photos.mkdir()
+    workspace.mkdir()
+    Image.new("RGB", (40, 30)).save(photos / "a.jpg")
+    file.write_text("[tradeoff]\nseeds = 2")
+    for recorded in ({"seconds": 1200}, {"seconds": 1200, "of_another_version": 1}):
+        run = {"version": 1, "options": {"tradeoff": recorded, "mesh": {"gone": 1}}, "plans": {}, "keys": {}}
+        (workspace / "run.json").write_text(json.dumps(run))
+        for words in ([], ["--tradeoff.seconds=1800"], ["--config", str(file)], ["-o", str(tmp_path / "new")]):
+            assert not run_command(["run", str(photos), "-o", str(workspace), *words])
+    assert seen == [1200, *[1800] * 7]
+
+
 def test_the_budget_of_a_study_belongs_to_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     (tmp_path / "run.json").write_text('{"version": 1, "options": {}, "plans": {}, "keys": {}}')
     assert run_command(["mesh", str(tmp_path), "--budget", "30m"]) == 2
