@@ -96,7 +96,8 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     """Train and score arm by arm, then write tables, plot, pictures and the recommendation.
 
     Raises:
-        StageError: without held-out photos, or where not one arm could be scored.
+        StageError: without held-out photos, where not one arm could be scored, or where one could not be trained for
+            want of memory or disk.
     """
     from stages.tradeoff_trial import make_exam
 
@@ -111,7 +112,8 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
         why = "; ".join(dict.fromkeys(str(trial.figures["failed"]) for trial in trials))
         why = why or f"{duration(config.seconds)} are too short here even for {selection.left_out[0]}"
         raise StageError("the study has no result", why, "Give it more time, as in --budget 30m.")
-    return _written(config, trials, (*selection.left_out, *late), exam, folder)
+    failed = [f"{trial.arm.words} ({trial.figures['failed']})" for trial in trials if trial.figures["failed"]]
+    return _written(config, trials, (*selection.left_out, *late, *failed), exam, folder)
 
 
 def selection_of(config: Config) -> Selection:
@@ -166,11 +168,10 @@ def _run_all(
 
 
 def _trial_words(arm: Arm, figures: dict[str, Any]) -> str:
-    words = f"{arm.variant}, {resolution_words(arm.downscale)}, {arm.steps:,} steps, seed {arm.seed}: "
     if figures["failed"]:
-        return words + f"no result ({figures['failed']})"
+        return f"{arm.words}: no result ({figures['failed']})"
     again = f", started again {figures['restarts']} times" if figures["restarts"] else ""
-    return words + f"{figures['psnr']:.2f} dB in {duration(figures['train_seconds'])}{again}"
+    return f"{arm.words}: {figures['psnr']:.2f} dB in {duration(figures['train_seconds'])}{again}"
 
 
 class _ArmProgress:
@@ -215,6 +216,8 @@ def _written(
     write_plot(study, folder)
     pictures = _ablation_picture(points, trials, exam, folder)
     line = f"{len(points)} settings, {sum(row['front'] for row in study['points'])} on the front · "
+    if failed := sum(trial.figures["failed"] is not None for trial in trials):
+        line += f"{failed} of {len(trials)} trainings without a result · "
     records = ("tradeoff.json", "tradeoff.md", "tradeoff.svg", "tradeoff.png")
     facts = {"recommendation": recommendation.words, "settings": len(points), "trainings": len(trials)}
     return StageResult(("quality.json", *pictures), line + recommendation.words, records, facts)
@@ -274,7 +277,7 @@ def markdown(study: dict[str, Any]) -> str:
         shown = [f"**{cell}**" if row["front"] else cell for cell in cells(row)]
         lines.append("| " + " | ".join(shown) + " |")
     if study["left_out"]:
-        lines += ["", f"Left out for want of time: {'; '.join(study['left_out'])}."]
+        lines += ["", f"Left out, for want of time unless a reason is given: {'; '.join(study['left_out'])}."]
     return "\n".join(lines) + "\n"
 
 

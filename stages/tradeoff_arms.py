@@ -80,6 +80,11 @@ class Arm(NamedTuple):
         return f"{words}_{self.downscale:g}_{self.steps}_{self.seed}"
 
     @property
+    def words(self) -> str:
+        """``grid, half resolution, 590 steps, seed 0``."""
+        return f"{self.variant}, {resolution_words(self.downscale)}, {self.steps:,} steps, seed {self.seed}"
+
+    @property
     def options(self) -> dict[str, Any]:
         """What stage train is asked for."""
         variant = VARIANTS[self.variant]

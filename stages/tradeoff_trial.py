@@ -28,6 +28,8 @@ SHOWN = 3  # windows kept as pictures, those with most detail
 # Steps between windows that fill a square evenly, however many there are (Roberts 2018, the R2 sequence).
 STEPS_OF_PLACES = (0.7548776662466927, 0.5698402909980532)
 MEMORY_LOOK_SECONDS = 0.05
+OWN_FAULTS = ("training diverged", "the field does not learn", "nothing is left to train on")
+"""What stage train says where the arm itself is at fault: it would say so again."""
 
 
 class Window(NamedTuple):
@@ -81,7 +83,11 @@ def _window(ingest: Path, scene: "Scene", view: "View", downscale: float, number
 
 def run_arm(arm: Arm, exam: Exam, inputs: Inputs, folder: Path, progress: Progress) -> dict[str, Any]:
     """Train and score one arm, or read what an earlier attempt found; its figures, with ``failed`` (why) where the
-    field did not learn. A killed training goes on from its checkpoint."""
+    field did not learn. A killed training goes on from its checkpoint.
+
+    Raises:
+        StageError: where the machine is at fault: the arm is tried again when the study goes on.
+    """
     from stages import train
 
     found = folder / f"{arm.name}.json"
@@ -94,6 +100,10 @@ def run_arm(arm: Arm, exam: Exam, inputs: Inputs, folder: Path, progress: Progre
         try:
             result = train.run(train.Config(**arm.options), inputs, work, progress)
         except StageError as error:
+            if error.what not in OWN_FAULTS:
+                what = f"the study stopped at {arm.words}: {error.what}"
+                hint = "Close other programs or free disk space; the same command then goes on with this training."
+                raise StageError(what, error.why, hint) from error
             figures["failed"] = f"{error.what}: {error.why}"
         else:
             figures |= {name: result.facts[name] for name in ("train_seconds", "restarts")}

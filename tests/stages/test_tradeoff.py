@@ -8,7 +8,7 @@ import psutil
 import pytest
 import torch
 
-from stages import tradeoff, tradeoff_arms, tradeoff_trial
+from stages import tradeoff, tradeoff_arms, tradeoff_trial, train
 from stages.contract import StageError
 from stages.files import read_json, read_scene
 from stages.tradeoff import Config
@@ -123,8 +123,6 @@ def test_a_slow_machine_leaves_arms_out_and_names_them(
 def test_an_arm_that_does_not_learn_is_said_and_the_study_goes_on(
     tmp_path: Path, photos: dict[str, Path], progress: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from stages import train
-
     whole = train.run
 
     def diverges(config: train.Config, *rest: Any) -> Any:
@@ -133,11 +131,40 @@ def test_an_arm_that_does_not_learn_is_said_and_the_study_goes_on(
         return whole(config, *rest)
 
     monkeypatch.setattr(train, "run", diverges)
-    studied(tmp_path, photos, progress, seeds=1)
+    result = studied(tmp_path, photos, progress, seeds=1)
     study = read_json(tmp_path / "tradeoff.json")
+    named = study["left_out"][-1]
+    assert named.startswith("no positional encoding, full resolution, ") and " steps, seed 0 (training" in named
+    assert named in (tmp_path / "tradeoff.md").read_text()
+    assert f" 1 of {len(study['arms'])} trainings without a result · " in result.line
     assert "no positional encoding" not in {row["variant"] for row in study["points"]}
     assert [a["failed"] for a in study["arms"] if a["failed"]] == ["training diverged: it was told to"]
     assert any("no result (training diverged: it was told to)" in note for note in progress.notes)
+
+
+def test_want_of_memory_ends_the_study_which_goes_on_with_that_training(
+    tmp_path: Path, photos: dict[str, Path], progress: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole, asked = train.run, list[int]()
+
+    def short_of_memory(config: train.Config, *rest: Any) -> Any:
+        asked.append(config.steps or 0)
+        if len(asked) == 2:
+            raise StageError("not enough memory for the field", "5 grids take 1 TB and 8 GB are free", "Smaller ones.")
+        return whole(config, *rest)
+
+    monkeypatch.setattr(train, "run", short_of_memory)
+    small = {"seconds": 8.0, "seeds": 1}
+    with pytest.raises(StageError, match=r"stopped at grid, full resolution, \d+ steps, seed 0: not enough memory"):
+        studied(tmp_path, photos, progress, **small)
+    studied(tmp_path, photos, progress, **small)
+    assert asked[2] == asked[1], "the first one is not trained again, the second one is"
+    assert not any(arm["failed"] for arm in read_json(tmp_path / "tradeoff.json")["arms"])
+
+
+def test_what_counts_as_an_arms_own_fault_is_what_training_says() -> None:
+    said = "".join((Path(train.__file__).parent / f"training_{name}.py").read_text() for name in ("loop", "data"))
+    assert all(f'StageError("{what}"' in said for what in tradeoff_trial.OWN_FAULTS)
 
 
 def test_without_held_out_photos_there_is_no_study(tmp_path: Path, photos: dict[str, Path], progress: Any) -> None:
