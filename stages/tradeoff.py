@@ -19,6 +19,7 @@ from stages.tradeoff_arms import (
     PUBLISHED,
     VARIANTS,
     Arm,
+    Reading,
     Selection,
     Speed,
     drawn_per_second,
@@ -56,6 +57,9 @@ class Config(StageConfig):
     )
     sizes: Annotated[tuple[float, ...] | None, Suppress] = Field(default=None, description="photo sizes trained at")
     windows: Annotated[int | None, Suppress] = Field(default=None, description="of the held-out photos, scored on")
+    reading: Annotated[tuple[float, float], Suppress] = Field(
+        default=(0.0, 0.0), description="seconds to read the photos at one size, and those of the windows"
+    )
 
 
 class Trial(NamedTuple):
@@ -66,8 +70,8 @@ class Trial(NamedTuple):
 
 
 def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
-    """Measure how fast this machine trains each kind of field; choose photo sizes and windows by that."""
-    from stages.tradeoff_speeds import measured_speeds, study_sizes
+    """Measure how fast this machine trains each kind of field and reads photos; choose photo sizes and windows."""
+    from stages.tradeoff_speeds import measured_speeds, reading_seconds, study_sizes
     from stages.tradeoff_trial import WINDOW
 
     scene = _scene_with_test_photos(inputs)
@@ -75,10 +79,13 @@ def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
     sizes = config.sizes or study_sizes(scene, speeds, config.seconds)
     drawn = min(drawn_per_second(name, speed) for name, speed in speeds.items() if name != PUBLISHED)
     affordable = SCORING_SHARE * config.seconds * drawn / WINDOW**2
+    windows = min(max(FEWEST_WINDOWS, int(affordable)), MOST_WINDOWS)
+    reading = reading_seconds(scene, inputs["ingest"], windows)
     chosen = {
         "speeds": {name: (round(speed.steps, 4), round(speed.rays, 2)) for name, speed in speeds.items()},
         "sizes": sizes,
-        "windows": min(max(FEWEST_WINDOWS, int(affordable)), MOST_WINDOWS),
+        "windows": windows,
+        "reading": (round(reading.photos, 5), round(reading.windows, 5)),
         "downscale": config.downscale or sizes[0],
     }
     return config.model_copy(update=chosen)
@@ -123,7 +130,8 @@ def selection_of(config: Config) -> Selection:
 
     assert config.speeds and config.sizes and config.windows, "plan() chooses them"
     speeds = {name: Speed(*speed) for name, speed in config.speeds.items()}
-    return select(config.seconds, config.seeds, config.sizes, speeds, config.windows * WINDOW**2)
+    rays, reading = config.windows * WINDOW**2, Reading(*config.reading)
+    return select(config.seconds, config.seeds, config.sizes, speeds, rays, reading)
 
 
 def plan_words(selection: Selection, seconds: float) -> list[str]:

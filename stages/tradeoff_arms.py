@@ -11,7 +11,7 @@ LONGEST = 1 / 16
 RUNG = 1.7
 RUNGS = 8
 FEWEST_STEPS = 30  # a training of fewer says nothing of its field
-OVERHEAD = 1.2  # wall time of a training over its training seconds: the photos, the probes, the files
+OVERHEAD = 1.2  # wall time of a training over its training seconds: the probes, the files, photos read before
 DRAWING = {"grid": 0.7, "paper": 3.0}
 """Rays drawn a second over rays trained, about: drawing does less, but a grid field of few steps is fog all over."""
 SPENT_ELSEWHERE = 0.03  # of the study's time: measuring speeds before it, drawing plots after it
@@ -62,6 +62,16 @@ class Speed(NamedTuple):
 
     steps: float
     rays: float
+
+
+class Reading(NamedTuple):
+    """Seconds that photos take: all of them before the first training at a size, and those of the windows scored on."""
+
+    photos: float = 0.0
+    windows: float = 0.0
+
+
+AT_ONCE = Reading()
 
 
 class Arm(NamedTuple):
@@ -131,15 +141,23 @@ def wanted(seeds: int) -> Iterator[tuple[str, int, int, int]]:
 
 
 def select(
-    seconds: float, seeds: int, downscales: Sequence[float], speeds: Mapping[str, Speed], drawn_rays: float
+    seconds: float,
+    seeds: int,
+    downscales: Sequence[float],
+    speeds: Mapping[str, Speed],
+    drawn_rays: float,
+    reading: Reading = AT_ONCE,
 ) -> Selection:
     """The arms that fit into ``seconds``, in the order of :func:`wanted`; one that does not fit gives way to cheaper
-    ones behind it. ``drawn_rays`` are drawn to score each. Photo sizes that are the same make one arm."""
-    left, arms, left_out = seconds * (1 - SPENT_ELSEWHERE), dict[str, Arm](), dict[str, Arm]()
+    ones behind it. ``drawn_rays`` are drawn to score each, and the first of a photo size has to read the photos. Photo
+    sizes that are the same make one arm."""
+    left, arms, left_out = seconds * (1 - SPENT_ELSEWHERE) - reading.windows, dict[str, Arm](), dict[str, Arm]()
     for variant, size, rung, seed in wanted(seeds):
         arm = _arm(variant, downscales[min(size, len(downscales) - 1)], rung, seed, seconds, speeds, drawn_rays)
         if arm.name in arms:
             continue
+        if all(arm.downscale != other.downscale for other in arms.values()):
+            arm = arm._replace(seconds=arm.seconds + reading.photos)
         if arm.steps < FEWEST_STEPS or arm.seconds > left:
             left_out[arm.name] = arm
         else:

@@ -1,6 +1,8 @@
-"""How fast this machine trains each variant of a study, and which photo sizes that calls for."""
+"""How fast this machine trains each variant of a study and reads its photos, and which photo sizes that calls for."""
 
-from collections.abc import Mapping
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from stages.contract import Inputs, Progress
@@ -11,13 +13,14 @@ from stages.tradeoff_arms import (
     REDUCED,
     TIMED,
     VARIANTS,
+    Reading,
     Speed,
     field_of,
     photo_sizes,
 )
 
 if TYPE_CHECKING:
-    from nerf.scene import Scene
+    from nerf.scene import Scene, View
     from stages.train import Config as TrainConfig
 
 
@@ -66,6 +69,24 @@ def _work(config: "TrainConfig") -> float:
     """Multiplications of a ray through both networks of a paper field, about."""
     assert config.samples_coarse and config.samples_fine and config.depth and config.width
     return (2 * config.samples_coarse + config.samples_fine) * config.depth * config.width**2
+
+
+def reading_seconds(scene: "Scene", ingest: Path, windows: int) -> Reading:
+    """What the photos take by the time that one of them takes: all on all cores, those of the windows one by one."""
+    from stages.device import processors
+    from stages.photos import load_pixels
+    from stages.training_data import scaled_size
+
+    def pixels(views: "Sequence[View]") -> int:
+        return sum(scene.cameras[view.camera].width * scene.cameras[view.camera].height for view in views)
+
+    test, started = scene.of_split("test"), 0.0
+    for view in (test[-1], test[0]):  # the first one pays for imports
+        started = time.perf_counter()
+        load_pixels(ingest / view.file, *scaled_size(scene.cameras[view.camera], 2.0))
+    per_pixel = (time.perf_counter() - started) / pixels(test[:1])
+    scored = [test[number % len(test)] for number in range(windows)]
+    return Reading(per_pixel * pixels(scene.views) / processors(), per_pixel * pixels(scored))
 
 
 def study_sizes(scene: "Scene", speeds: Mapping[str, Speed], seconds: float) -> tuple[float, ...]:

@@ -90,6 +90,8 @@ def test_what_is_planned_is_what_is_run(tmp_path: Path, photos: dict[str, Path],
     assert all(steps > 0 and rays > steps for steps, rays in planned.speeds.values())
     assert planned.sizes == (1.0,) and planned.downscale == 1.0
     assert planned.windows and 6 <= planned.windows <= 32
+    photos_take, windows_take = planned.reading
+    assert 0 < photos_take < 5 and 0 < windows_take < 5
     assert Config.model_validate(planned.model_dump(mode="json")) == planned
     words = tradeoff.plan_words(tradeoff.selection_of(planned), planned.seconds)
     shares = [int(line.rsplit(", ", 1)[1].split("%")[0]) for line in words if line.endswith("of the time")]

@@ -8,6 +8,7 @@ from stages.tradeoff_arms import (
     RUNGS,
     TIMED,
     VARIANTS,
+    Reading,
     Speed,
     photo_sizes,
     resolution_words,
@@ -44,6 +45,17 @@ def test_a_plan_keeps_to_its_time(seconds: float, seeds: int, steps: float, draw
     assert all(arm.steps >= FEWEST_STEPS for arm in selection.arms)
     for name in VARIANTS:
         assert any(arm.variant == name for arm in selection.arms) or any(w.startswith(name) for w in selection.left_out)
+
+
+def test_the_first_training_at_a_size_reads_the_photos_and_the_study_those_of_its_windows() -> None:
+    arms = select(600, 1, SIZES, FAST, 1000).arms
+    told = select(600, 1, SIZES, FAST, 1000, Reading(photos=5.0, windows=7.0)).arms
+    more = {arm.name: arm.seconds for arm in told}
+    slower = [arm.downscale for arm in arms if arm.name in more and more[arm.name] == pytest.approx(arm.seconds + 5)]
+    assert sorted(slower) == list(SIZES)
+    free = select(600, 1, SIZES, FAST, 1000).seconds
+    assert sum(more.values()) <= min(free + 15, 600 - 7)
+    assert not select(600, 1, SIZES, FAST, 1000, Reading(photos=600.0)).arms
 
 
 def test_the_method_and_its_ablations_take_the_same_steps() -> None:
