@@ -16,6 +16,7 @@ from stages.amounts import duration
 from stages.contract import Inputs, Progress, StageConfig, StageError, StageResult
 from stages.files import read_scene, write_json
 from stages.tradeoff_arms import (
+    MEANINGS,
     PUBLISHED,
     VARIANTS,
     Arm,
@@ -119,8 +120,9 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
         why = "; ".join(dict.fromkeys(str(trial.figures["failed"]) for trial in trials))
         why = why or f"{duration(config.seconds)} are too short here even for {selection.left_out[0]}"
         raise StageError("the study has no result", why, "Give it more time, as in --budget 30m.")
+    workspace = inputs["normalise"].resolve().parents[1].name
     failed = [f"{trial.arm.words} ({trial.figures['failed']})" for trial in trials if trial.figures["failed"]]
-    return _written(config, trials, (*selection.left_out, *late, *failed), exam, folder)
+    return _written(config, trials, (*selection.left_out, *late, *failed), exam, folder, workspace)
 
 
 def selection_of(config: Config) -> Selection:
@@ -200,10 +202,11 @@ class _ArmProgress:
 
 
 def _written(
-    config: Config, trials: Sequence[Trial], left_out: Sequence[str], exam: "Exam", folder: Path
+    config: Config, trials: Sequence[Trial], left_out: Sequence[str], exam: "Exam", folder: Path, workspace: str
 ) -> StageResult:
-    """Write everything. What depends on the clock are records; the scores of the trainings are outputs."""
-    from stages.tradeoff_front import points_of, recommend, table
+    """Write everything. What depends on the clock are records; the scores of the trainings are outputs. ``workspace``:
+    the name of its folder, for the command to give."""
+    from stages.tradeoff_front import command, points_of, recommend, table
     from stages.tradeoff_plot import write_plot
 
     points = points_of(trials)
@@ -211,6 +214,7 @@ def _written(
     study = {
         "headline": recommendation.headline,
         "recommendation": recommendation.words,
+        "command": command(recommendation.point, workspace),
         "recommended": points.index(recommendation.point) + 1,
         "still_rising": recommendation.still_rising,
         "scored": _scored_on(config, exam),
@@ -228,7 +232,8 @@ def _written(
         line += f"{failed} of {len(trials)} trainings without a result · "
     records = ("tradeoff.json", "tradeoff.md", "tradeoff.svg", "tradeoff.png")
     facts = {"recommendation": recommendation.words, "settings": len(points), "trainings": len(trials)}
-    return StageResult(("quality.json", *pictures), line + recommendation.words, records, facts)
+    line += f"{recommendation.words} Train it: {study['command']}"
+    return StageResult(("quality.json", *pictures), line, records, facts)
 
 
 def _quality(trial: Trial) -> dict[str, Any]:
@@ -279,14 +284,21 @@ def _ablation_picture(
 
 def markdown(study: dict[str, Any]) -> str:
     """tradeoff.md: the recommendation and the table. Bold rows are those that nothing beats."""
-    lines = [study["recommendation"], "", f"Scored on {study['scored']}.", ""]
+    lines = [study["recommendation"], "", f"Train it: `{study['command']}`", "", f"Scored on {study['scored']}.", ""]
     lines += ["| " + " | ".join(COLUMNS) + " |", "|---" * len(COLUMNS) + "|"]
     for row in study["points"]:
         shown = [f"**{cell}**" if row["front"] else cell for cell in cells(row)]
         lines.append("| " + " | ".join(shown) + " |")
+    lines += ["", f"Fields: {meanings(study['points'])}."]
     if study["left_out"]:
         lines += ["", f"Left out, for want of time unless a reason is given: {'; '.join(study['left_out'])}."]
     return "\n".join(lines) + "\n"
+
+
+def meanings(rows: Sequence[dict[str, Any]]) -> str:
+    """What the fields of these points are, in words."""
+    named = {row["variant"] for row in rows}
+    return "; ".join(f"{variant}: {meaning}" for variant, meaning in MEANINGS.items() if variant in named)
 
 
 def cells(row: dict[str, Any]) -> list[str]:

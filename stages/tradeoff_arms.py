@@ -43,6 +43,19 @@ VARIANTS: dict[str, Variant] = {
     "no view dependence": Variant("ablation", {"view_dependence": False}, REDUCED),
     PUBLISHED: Variant("published", {"view_dependence": True, "preset": "paper"}, PUBLISHED),
 }
+MEANINGS = {
+    "small grid": "4 grids of features, the finest of 256³ cells",
+    "grid": "5 grids of features, the finest of 512³ cells",
+    "large grid": "6 grids of features, the finest of 1,024³ cells",
+    "grid, half the samples": "the same 5 grids, looked at in half as many places along a ray",
+    "grid, twice the samples": "the same 5 grids, looked at in twice as many places along a ray",
+    REDUCED: "the paper's two networks made small: 4 layers of 64, 32 + 32 samples along a ray",
+    "no hierarchical sampling": "one such network with as many samples, none of them placed by another",
+    "no positional encoding": "two such networks that are given bare coordinates",
+    "no view dependence": "two such networks without the direction of the ray",
+    PUBLISHED: "the paper's two networks: 8 layers of 256, 64 + 128 samples along a ray",
+}
+"""What the variants are, for whoever reads a table of them."""
 ABLATIONS = tuple(name for name, variant in VARIANTS.items() if variant.family == "ablation")
 TIMED = tuple(dict.fromkeys(variant.speed for variant in VARIANTS.values()))
 

@@ -11,6 +11,7 @@ steps seeds differ by 2 dB, after a thousand by 0.05 (fox, docs/numbers.md).
 """
 
 import math
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from statistics import mean, stdev
@@ -155,6 +156,24 @@ def recommend(points: Sequence[Point]) -> Recommendation:
         lost, share = point.psnr - cheaper[-1].psnr, cheaper[-1].train_seconds / point.train_seconds
         words += f" With {share:.0%} of the time ({cheaper[-1].label}) it is {lost:.1f} dB less."
     return Recommendation(point, headline, words, point is best)
+
+
+def command(point: Point, workspace: str) -> str:
+    """What trains the setting of ``point`` for as long in a workspace. The sizes of its field are given, for those that
+    would be chosen follow from a timing."""
+    field = {"field": "paper"} if field_of(point.variant) == "paper" else {}
+    given = {"seconds": max(1, round(point.train_seconds)), "downscale": point.downscale} | field
+    flags = [_flag(name, value) for name, value in {**given, **VARIANTS[point.variant].options}.items()]
+    return " ".join(["pipeline train", shlex.quote(workspace), *flags])
+
+
+def _flag(name: str, value: Any) -> str:
+    if name == "view_dependence":  # an option of stage effects
+        return f"--effect view_dependence={'on' if value else 'off'}"
+    flag = name.replace("_", "-")
+    if value is False:
+        return f"--train.no-{flag}"
+    return f"--train.{flag} {value if isinstance(value, str) else format(value, 'g')}"
 
 
 def _decibel(point: Point) -> str:

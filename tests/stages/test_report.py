@@ -266,6 +266,7 @@ def test_page_shows_the_study_and_leaves_its_time_out(tmp_path: Path, progress: 
     ]
     points = sorted(points, key=lambda p: p.train_seconds)
     study = {"headline": "", "recommendation": recommend(points).words, "recommended": 3, "points": table(points)}
+    study |= {"command": "pipeline train fox.nerf --train.seconds 20"}
     study |= {"scored": "6 windows of 2 held-out photos", "left_out": ["paper, published: 5 steps"]}
     write_json(inputs["tradeoff"] / "tradeoff.json", study)
     (inputs["tradeoff"] / "manifest.json").write_text('{"seconds": 1800}')
@@ -275,6 +276,8 @@ def test_page_shows_the_study_and_leaves_its_time_out(tmp_path: Path, progress: 
     for words in ("All 3 settings", "<b>23.00 ± 0.20</b>", ">18.00<", "6 windows of 2", "paper, published: 5 steps"):
         assert words in text, words
     assert "reduced, a part left out" in text, "the plot's legend"
+    assert "Train it: <code>pipeline train fox.nerf --train.seconds 20</code>" in text
+    assert "Fields: grid: 5 grids of features, the finest of 512³ cells; no view dependence: two such" in text
     assert "What each part of the method is worth" not in text, "no picture, no title"
     assert summary == summary_before, "the study's time is none of the run's"
     Image.new("RGB", (64, 48)).save(inputs["tradeoff"] / "ablation.png")

@@ -63,7 +63,10 @@ def test_a_study_from_arms_to_recommendation_and_the_same_after_a_kill(
     assert "paper, published at full resolution: 1 steps (fewer than 30)" in study["left_out"]
     assert study["points"][study["recommended"] - 1]["front"]
     assert study["recommendation"] in (tmp_path / "whole" / "tradeoff.md").read_text()
-    assert result.line.endswith(study["recommendation"])
+    assert result.line.endswith(f"{study['recommendation']} Train it: {study['command']}")
+    assert study["command"].startswith(f"pipeline train {photos['normalise'].parents[1].name} --train.seconds ")
+    text = (tmp_path / "whole" / "tradeoff.md").read_text()
+    assert f"Train it: `{study['command']}`" in text and "Fields: grid: 5 grids of features" in text
 
     count, begun = len(study["arms"]), []
     whole = tradeoff_trial._score

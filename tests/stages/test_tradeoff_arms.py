@@ -4,6 +4,8 @@ from hypothesis import strategies as st
 
 from stages.tradeoff_arms import (
     FEWEST_STEPS,
+    MEANINGS,
+    PUBLISHED,
     REDUCED,
     RUNGS,
     TIMED,
@@ -16,7 +18,7 @@ from stages.tradeoff_arms import (
     select,
     wanted,
 )
-from stages.train import Config
+from stages.train import PAPER_SIZES, Config
 
 FAST = {name: Speed(100.0, 1e6) for name in TIMED}
 SIZES = (1.0, 2.0, 4.0)
@@ -25,6 +27,18 @@ SIZES = (1.0, 2.0, 4.0)
 def test_every_variant_is_one_that_stage_train_takes() -> None:
     for arm in select(1e4, 1, SIZES, FAST, 1000).arms:
         assert Config(**arm.options).kind == ("grid" if "grid" in arm.variant else "paper")
+
+
+def test_every_variant_is_explained_with_its_sizes() -> None:
+    assert set(MEANINGS) == set(VARIANTS)
+    for name, variant in VARIANTS.items():
+        if variant.family.startswith("grid"):
+            assert f"{variant.options['levels']} grids" in MEANINGS[name]
+        if variant.family == "grid":
+            assert f"{variant.options['finest']:,}³ cells" in MEANINGS[name]
+    for name, sizes in ((REDUCED, PAPER_SIZES["small"]), (PUBLISHED, PAPER_SIZES["published"])):
+        words = "{depth} layers of {width}, {samples_coarse} + {samples_fine} samples".format(**sizes)
+        assert words in MEANINGS[name]
 
 
 def test_with_time_enough_nothing_is_left_out_and_each_arm_is_there_once() -> None:

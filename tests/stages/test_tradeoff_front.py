@@ -1,3 +1,4 @@
+import shlex
 from dataclasses import replace
 from math import log2
 from typing import Any
@@ -6,8 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stages.tradeoff_arms import Arm
-from stages.tradeoff_front import WORTH_DB, Point, knee, pareto_front, points_of, recommend, spread_at
+from pipeline.arguments import StageArguments, parse
+from pipeline.settings import with_effects
+from stages.tradeoff_arms import VARIANTS, Arm
+from stages.tradeoff_front import WORTH_DB, Point, command, knee, pareto_front, points_of, recommend, spread_at
+from stages.train import Config
 
 
 def point(seconds: float, psnr: float, **others: Any) -> Point:
@@ -93,6 +97,20 @@ def test_a_gain_within_the_spread_is_called_that() -> None:
     assert "25.0 ± 0.4 dB" in said
     assert "Training longer gains 0.3 dB for 2.0 × the time, which is within the spread." in said
     assert "within the spread" not in recommend([*points[:2], point(40, 25.9)]).words
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_the_command_of_a_setting_asks_for_what_it_was(variant: str) -> None:
+    words = shlex.split(command(point(48.6, 29.0, variant=variant, downscale=4.0), "my fox.nerf"))
+    assert words[:3] == ["pipeline", "train", "my fox.nerf"]
+    given = parse(StageArguments, "train", words[2:])
+    asked = Config(**Arm(variant, 4.0, 1, 0, 0.0).options).model_copy(update={"steps": None, "seconds": 49.0})
+    view_dependence = with_effects(given.settings, given.effect).effects.view_dependence
+    assert view_dependence == {None: "auto", True: "on", False: "off"}[asked.view_dependence]
+    assert given.settings.train.kind == asked.kind
+    assert given.settings.train == asked.model_copy(
+        update={"view_dependence": None, "field": given.settings.train.field}
+    )
 
 
 # Settings of the study of fox in docs/numbers.md: seconds, dB, deviation over two seeds.
