@@ -269,7 +269,13 @@ def _study_for(settings: Settings, budget: str, stage: str) -> Settings:
 
 
 def _recorded_settings(workspace: Workspace) -> Settings:
-    return settings_from(workspace.read_run()["options"], f"options recorded in {workspace.root}")
+    """The options in run.json. Raises StageError where this version of the program has others."""
+    try:
+        return settings_from(workspace.read_run()["options"], "recorded there")
+    except UsageError as error:
+        why = f"{error}; another version of this program wrote it"
+        hint = f"Give the photos again: pipeline run PHOTOS -o {workspace.root}. What still fits is kept."
+        raise StageError(f"cannot use the options of {workspace.root}", why, hint) from error
 
 
 def command_resume(words: Sequence[str]) -> int:

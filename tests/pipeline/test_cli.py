@@ -252,6 +252,28 @@ def test_a_budget_is_said_to_be_spent_by_a_run_and_not_by_a_stage(tmp_path: Path
     assert json.loads((tmp_path / "w.nerf/run.json").read_text())["budget"] == before
 
 
+@pytest.mark.parametrize("command", ["status", "resume", "mesh"])
+def test_options_of_another_version_are_said_to_be(tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str):
+    run = {"version": 1, "options": {"evaluate": {"seed": 1}}, "plans": {}, "keys": {}}
+    (tmp_path / "run.json").write_text(json.dumps(run))
+    assert run_command([command, str(tmp_path)]) == 3
+    text = capsys.readouterr().err
+    assert f"cannot use the options of {tmp_path}" in text
+    assert "there is no option evaluate.seed; another version of this program wrote it" in text
+    assert f"pipeline run PHOTOS -o {tmp_path}" in text
+
+
+def test_photos_given_again_replace_the_options_of_another_version(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    for folder in ("photos", "w.nerf"):
+        (tmp_path / folder).mkdir()
+    for k in range(3):
+        Image.effect_noise((64, 48), 30 + k).convert("RGB").save(tmp_path / f"photos/{k}.png")
+    run = {"version": 1, "options": {"evaluate": {"seed": 1}}, "plans": {}, "keys": {}}
+    (tmp_path / "w.nerf/run.json").write_text(json.dumps(run))
+    assert run_on(tmp_path / "photos", capsys, "--until", "ingest")[0] == 0
+    assert run_command(["status", str(tmp_path / "w.nerf")]) == 0
+
+
 def test_what_lies_beside_known_cameras_changes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     model = tmp_path / "cameras/sparse/0"
     for folder in (tmp_path / "photos", model):
