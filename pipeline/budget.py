@@ -11,6 +11,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from stages.amounts import duration
+from stages.contract import StageConfig
+
 # Of the time that is left once what cannot be planned has its own. A user waits for the field; figures, a video and a
 # mesh are there to see it by, and gain little beyond MOST_SECONDS. A training of less than half a minute is worth none.
 SHARES = {"train": 0.68, "evaluate": 0.05, "render": 0.15, "mesh": 0.12}
@@ -20,48 +23,72 @@ SFM_SHARE = 0.5  # of the budget: what structure from motion may take before it 
 PILOTS_SHARE = 0.15  # of the budget, and of what is left no more than
 PILOTS_OF_LEFT = 0.25  # this: a pilot has to leave a training that is worth it
 LARGEST_SHARE = 0.35  # of the budget: what a stage other than train may take where all before it is there already
-# Training's own seconds count steps alone. Reading the photos and timing the first steps take about STARTING; probing
-# and checkpoints 1.5 to 2 % (fox, fountain_p11 and sceaux_castle, three minutes each).
+# Training's own seconds count steps alone. Beside reading the photos, timing the first steps takes about STARTING,
+# probing and checkpoints 1.5 to 2 % (fox, fountain_p11 and sceaux_castle, three minutes each).
 STARTING, BESIDE_STEPS = 4.0, 0.02
+# Seconds that a core takes to decode a million pixels and to shrink or examine them. Decoding alone takes 0.01 to 0.02
+# for JPEG, 0.03 for PNG (fox, banana, fountain_p11), all of stage ingest 0.03; large photos take longer.
+READING = 0.04
 
 
-def allotted(stage: str, left: float, to_come: Mapping[str, float | None], total: float) -> float:
+def reading_seconds(megapixels: float, cores: int) -> float:
+    """Seconds that it takes to decode photos of so many million pixels in all, which several stages do once each."""
+    return READING * megapixels / cores
+
+
+def allotted(stage: str, left: float, to_come: Mapping[str, float | None], total: float, reading: float = 0.0) -> float:
     """Seconds that ``stage`` may take when ``left`` seconds of a budget of ``total`` are left.
 
-    ``to_come`` are the stages after it: what one is expected to take, None where it takes what it is given. Never less
-    than the least that makes sense, whatever is left.
+    ``to_come`` are the stages after it: what one is expected to take, None where it takes what it is given. Training
+    takes ``reading`` seconds before it begins. Never less than the least that makes sense, whatever is left.
     """
+    least = LEAST_SECONDS | {"train": LEAST_SECONDS["train"] + reading}
     open_ended = [name for name, seconds in to_come.items() if seconds is None and name in SHARES]
     free = left - sum(seconds or 0.0 for seconds in to_come.values())
     if stage == "sfm":
-        return max(1.0, min(SFM_SHARE * total, free - sum(LEAST_SECONDS[name] for name in open_ended)))
+        return max(1.0, min(SFM_SHARE * total, free - sum(least[name] for name in open_ended)))
     if stage == "effects":
         return max(0.0, min(PILOTS_SHARE * total, PILOTS_OF_LEFT * free))
     whole = SHARES[stage] + sum(SHARES[name] for name in open_ended)
     reserved = sum(_reserved(name, free * SHARES[name] / whole) for name in open_ended)
     most = total if stage == "train" else LARGEST_SHARE * total
-    return max(LEAST_SECONDS[stage], min(free - reserved, most))
+    return max(least[stage], min(free - reserved, most))
 
 
 def _reserved(stage: str, share: float) -> float:
     return min(max(share, LEAST_SECONDS[stage]), MOST_SECONDS.get(stage, share))
 
 
-def training_seconds(wall: float) -> float:
-    """Seconds of training steps in a stage train that takes ``wall`` seconds in all, at least half of these."""
-    return max(wall / 2, (wall - STARTING) / (1 + BESIDE_STEPS))
+def training_seconds(wall: float, reading: float = 0.0) -> float:
+    """Seconds of training steps in a stage train that takes ``wall`` seconds in all, at least half of these, and
+    ``reading`` of them to read the photos."""
+    return max(wall / 2, (wall - STARTING - reading) / (1 + BESIDE_STEPS))
 
 
-def least_total(expected: Mapping[str, float | None]) -> float:
+def least_total(expected: Mapping[str, float | None], reading: float = 0.0) -> float:
     """The smallest budget that can be kept: everything that is expected, and the least of all that can give way."""
-    return sum(LEAST_SECONDS.get(name, 0.0) if seconds is None else seconds for name, seconds in expected.items())
+    least = LEAST_SECONDS | {"train": LEAST_SECONDS["train"] + reading}
+    return sum(least.get(name, 0.0) if seconds is None else seconds for name, seconds in expected.items())
+
+
+def most_total(expected: Mapping[str, float | None], total: float) -> float:
+    """What all that is expected can take at most of a budget of ``total``: only training takes all that there is."""
+    most = {"train": total}
+    return sum(most.get(name, LARGEST_SHARE * total) if s is None else s for name, s in expected.items())
+
+
+def takes_what_it_is_given(options: StageConfig) -> bool:
+    """Whether nothing else says how long the stage works: neither seconds nor steps, nor those of ``--more``."""
+    open_ended = getattr(options, "seconds", 0.0) is None
+    return open_ended and all(getattr(options, name, None) is None for name in ("steps", "after"))
 
 
 class Budget:
     """The budget of a run as run.json keeps it: ``total`` seconds, and of each stage what was promised and spent.
 
     ``spent`` counts every attempt of the present run, also those that were killed, as far as their last sign of life;
-    what is found finished costs nothing. Once a run is over, the next one that finds work to do begins a new account.
+    what is found finished costs nothing. Once a run is over, well or not, the next one that finds work to do begins a
+    new account; so does one with other options or photos.
     """
 
     def __init__(self, state: dict[str, Any]) -> None:
@@ -70,7 +97,12 @@ class Budget:
     @staticmethod
     def new(total: float, of: str) -> dict[str, Any]:
         """A new account, for run.json; ``of`` tells runs with other options apart."""
-        return {"seconds": total, "of": of, "promised": {}, "spent": {}, "running": None, "over": False}
+        return {"seconds": total, "of": of, "photos": None} | {
+            "promised": {},
+            "spent": {},
+            "running": None,
+            "over": False,
+        }
 
     @property
     def total(self) -> float:
@@ -88,14 +120,16 @@ class Budget:
     def left(self) -> float:
         return self.total - self.spent
 
-    def continue_as(self, of: str) -> None:
-        """Work begins in a run ``of`` these options: a new account, unless it goes on with one that is not over."""
-        if not self.is_of(of):
+    def continue_as(self, of: str, photos: str) -> None:
+        """Work begins in a run ``of`` these options on ``photos`` (their digest): a new account, unless it goes on with
+        one that is not over."""
+        if not self.is_of(of, photos):
             self.state.update(self.new(self.total, of))
+        self.state["photos"] = photos
 
-    def is_of(self, of: str) -> bool:
-        """Whether this is the account of an unfinished run ``of`` these options."""
-        return not self.over and self.state["of"] == of
+    def is_of(self, of: str, photos: str) -> bool:
+        """Whether this is the account of an unfinished run ``of`` these options and photos."""
+        return not self.over and self.state["of"] == of and self.state.get("photos") in (None, photos)
 
     def begin(self, stage: str) -> None:
         """Note that work on ``stage`` has begun now."""
@@ -104,6 +138,20 @@ class Budget:
     def promise(self, stage: str, seconds: float) -> None:
         """Note what ``stage`` is given, or expected to take; the first word counts, later attempts go on under it."""
         self.state["promised"].setdefault(stage, round(seconds, 1))
+
+    def give(self, stage: str, to_come: Mapping[str, float | None], reading: float) -> float:
+        """Seconds of work that ``stage`` is given of what is left, which is promised; see :func:`allotted`."""
+        wall = allotted(stage, self.left, to_come, self.total, reading)
+        self.promise(stage, wall)
+        return round(training_seconds(wall, reading) if stage == "train" else wall, 1)
+
+    def shortage(self, to_come: Mapping[str, float | None], reading: float) -> str | None:
+        """Why the budget cannot be kept with training and all that is ``to_come``; None where it can."""
+        least = least_total({"train": None, **to_come}, reading)
+        if least <= self.left:
+            return None
+        left = f"{duration(max(0.0, self.left))} of {duration(self.total)} are left"
+        return f"{left}, the smallest of all that is to come takes about {duration(least)}"
 
     def end(self, stage: str, seconds: float) -> None:
         """Note that an attempt at ``stage`` ended, well or not, after ``seconds``."""

@@ -155,6 +155,9 @@ def command_run(words: Sequence[str]) -> int:
     if given.from_ is not None:
         force = frozenset(stages[stages.index(_known_stage(given.from_, "--from", stages)) :])
     budget = _budget(given.budget, asked)
+    if budget is not None and (studies := [stage for stage in stages if stage in chain.ON_REQUEST]):
+        later = f"`pipeline {studies[0]} {root} --budget 30m`"
+        raise UsageError(f"--budget and --until {studies[0]}: a study has a budget of its own; run first, then {later}")
     with choose_display(given.common.json) as display:
         try:
             settings = with_source(asked, given.photos, cameras)
@@ -221,16 +224,16 @@ def _run_stages(
         runner = Runner(workspace, settings, display)
         if new_budget is not None:
             runner.set_budget(*new_budget)
-        times = forecast.times(settings)
-        display.headline(" · ".join([machine.headline(root), *forecast.promise(runner, stages, force, times)]))
+        photos = forecast.photos_of(settings)
+        display.headline(" · ".join([machine.headline(root), *forecast.promise(runner, stages, force, photos)]))
         try:
             given = {"force": force, "replan": common.replan, "remember": remember, "verify": common.verify}
-            ran = runner.run(stages, times=times, **given)
+            ran = runner.run(stages, times=forecast.expected(settings, photos), **given)
         except StageFailed as failure:
             display.failed(failure.stage, failure.error)
             raise
         words = _closing_words(workspace, ran)
-        if ran and runner.budget:
+        if ran and remember and runner.budget:
             words = f"{duration(runner.budget.spent)} of {duration(runner.budget.total)} spent {words}"
         display.finished(words, _outputs(workspace))
     return 0
@@ -282,7 +285,13 @@ def _study_for(settings: Settings, budget: str, stage: str) -> Settings:
 
 
 def _recorded_settings(workspace: Workspace) -> Settings:
-    return settings_from(workspace.read_run()["options"], f"options recorded in {workspace.root}")
+    """The options in run.json. Raises StageError where this version of the program has others."""
+    try:
+        return settings_from(workspace.read_run()["options"], "recorded there")
+    except UsageError as error:
+        why = f"{error}; another version of this program wrote it"
+        hint = f"Give the photos again: pipeline run PHOTOS -o {workspace.root}. What still fits is kept."
+        raise StageError(f"cannot use the options of {workspace.root}", why, hint) from error
 
 
 def command_resume(words: Sequence[str]) -> int:

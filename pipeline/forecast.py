@@ -4,7 +4,7 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
-from pipeline.budget import STARTING, least_total
+from pipeline.budget import READING, STARTING, least_total, most_total, reading_seconds
 from pipeline.settings import Settings
 from stages.amounts import duration, rough_duration
 from stages.contract import StageError
@@ -24,6 +24,10 @@ class Photos(NamedTuple):
     number: int
     megapixels: float
 
+    def reading(self, cores: int) -> float:
+        """Seconds that it takes to decode all of them once."""
+        return reading_seconds(self.number * self.megapixels, cores)
+
 
 def photos_of(settings: Settings) -> Photos | None:
     """What is to be seen of the photos without decoding any; None where they are gone or cannot be used."""
@@ -40,68 +44,71 @@ def photos_of(settings: Settings) -> Photos | None:
     return Photos(len(source.files), pixels / 1e6)
 
 
-def expected(settings: Settings, photos: Photos) -> dict[str, float | None]:
-    """Seconds by stage; None of those that take what a budget gives them.
+def expected(settings: Settings, photos: Photos | None) -> dict[str, float | None]:
+    """Seconds by stage; None of those that take what a budget gives them. Nothing where the photos are gone.
 
     Rates were measured on two cores, on fox, fountain_p11, fern, banana, herzjesu_p8 and the demo (docs/numbers.md):
     sfm took 0.6 to 1.8 times as long, and more where photos found no place at once.
     """
-    known = settings.sfm.cameras is not None
+    if photos is None:
+        return {}
+    cores = processors()
     seconds: dict[str, float | None] = {
-        "ingest": 0.5 + 0.015 * photos.number * photos.megapixels,
-        "sfm": 0.2 if known else sfm_seconds(photos, processors()),
+        "ingest": 0.5 + photos.reading(min(cores, 8)),
+        "sfm": 0.2 if settings.sfm.cameras is not None else sfm_seconds(photos, cores),
         "normalise": 0.3,
-        "effects": 10.0,  # two or three, and half a minute where a pilot has to decide
-        "report": 2.0,
+        "effects": 10.0 + photos.reading(cores),  # two or three, and half a minute where a pilot has to decide
+        "report": 2.0 + READING * photos.megapixels * min(15, photos.number / settings.normalise.test_every),
     }
     for stage in ("train", "evaluate", "render", "mesh"):
         given = getattr(settings, stage).seconds
-        seconds[stage] = given and given + (STARTING if stage == "train" else 0.0)
+        seconds[stage] = given and given + (STARTING + photos.reading(cores) if stage == "train" else 0.0)
     return seconds
 
 
 def sfm_seconds(photos: Photos, cores: int) -> float:
-    """Features of each photo, matches of each pair or of 30 partners each, and mapping, which has one core."""
+    """Reading, features of each photo, matches of each pair or of 30 partners each, and mapping, which has one core."""
     pairs = photos.number * min(photos.number - 1, 60) / 2
     features = 0.25 * photos.number * min(photos.megapixels, 1.7)
-    return 4.0 + (features + 0.02 * pairs) * 2 / cores + 0.4 * photos.number
+    return 4.0 + photos.reading(cores) + (features + 0.02 * pairs) * 2 / cores + 0.4 * photos.number
 
 
-def without_budget(settings: Settings, times: Mapping[str, float | None]) -> float | None:
+def without_budget(settings: Settings, times: Mapping[str, float | None], reading: float) -> float | None:
     """Seconds of a run without a budget; None where training counts steps, which nobody has timed yet."""
     train = settings.train
     if train.steps is not None and "train" in times:
         return None
     trained = train.seconds or SECONDS[train.preset or "standard"]
     # What a training of three minutes is followed by (fox, fountain_p11, the demo; drawing scaled to its share now).
-    usual = {"train": trained + STARTING, "evaluate": 0.05 * trained, "render": 0.27 * trained}
+    usual = {"train": trained + STARTING + reading, "evaluate": 0.05 * trained, "render": 0.27 * trained}
     usual["mesh"] = 5.0 + 0.15 * trained
     return sum(usual.get(stage, 0.0) if seconds is None else seconds for stage, seconds in times.items())
 
 
-def times(settings: Settings) -> dict[str, float | None]:
-    """:func:`expected` of the photos that ``settings`` name; nothing where these are gone."""
-    photos = photos_of(settings)
-    return {} if photos is None else expected(settings, photos)
-
-
-def promise(
-    runner: "Runner", stages: Sequence[str], force: frozenset[str], times: Mapping[str, float | None]
-) -> list[str]:
+def promise(runner: "Runner", stages: Sequence[str], force: frozenset[str], photos: Photos | None) -> list[str]:
     """What is said at the start of a run of ``stages``: how long it takes, where anything has to run."""
+    if photos is None:
+        return []
+    times, reading = expected(runner.settings, photos), photos.reading(processors())
     left = {stage: times[stage] for stage in stages if stage in times and (stage in force or not runner.is_done(stage))}
     if set(left) <= {"report"}:
         return []
     if (budget := runner.budget) is not None:
-        return [in_words(budget.total, runner.time_left(budget), left)]
-    usual = without_budget(runner.settings, left)
+        return [in_words(budget.total, runner.time_left(budget), left, reading)]
+    usual = without_budget(runner.settings, left, reading)
     return [] if usual is None else [f"done in about {rough_duration(usual)}"]
 
 
-def in_words(total: float, left: float, times: Mapping[str, float | None]) -> str:
+def in_words(total: float, left: float, times: Mapping[str, float | None], reading: float) -> str:
     """The promise of a budget of ``total`` seconds, ``left`` of them not spent; ``times`` of what has to run."""
-    least, finish = least_total(times), time.strftime("%H:%M", time.localtime(time.time() + left))
+    least, most = least_total(times, reading), most_total(times, total)
+    if least > left and left < total:
+        needed = f"about {rough_duration(least)} is needed: give a larger --budget, or all is made as small as can be"
+        return f"budget {duration(total)}, {duration(max(0.0, left))} of it left by what was spent before; {needed}"
     if least > left:
         soonest = f"about {rough_duration(least)} is the least that would do"
         return f"budget {duration(total)}, too short for these photos: {soonest}; all is made as small as can be"
-    return f"budget {duration(total)}, done at about {finish}"
+    finish = time.strftime("%H:%M", time.localtime(time.time() + min(left, most)))
+    # Only training takes all that there is; the rest may well be done sooner.
+    trains = times.get("train", 0.0) is None
+    return f"budget {duration(total)}, done at {f'about {finish}' if trains else f'{finish} at the latest'}"

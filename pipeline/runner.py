@@ -10,16 +10,17 @@ from types import ModuleType
 from typing import Any
 
 from pipeline import attempts, machine, manifests
-from pipeline.budget import Budget, allotted, least_total, training_seconds
-from pipeline.chain import STAGES, needed_for
+from pipeline.budget import Budget, reading_seconds, takes_what_it_is_given
+from pipeline.chain import ON_REQUEST, STAGES, needed_for
 from pipeline.display import Display
-from pipeline.failures import worded
+from pipeline.failures import StageFailed, worded
 from pipeline.keys import ContentIndex, config_for_key, digest, stage_key
 from pipeline.manifests import BadManifest, Manifest
 from pipeline.settings import Settings
 from pipeline.workspace import Workspace
-from stages.amounts import duration
 from stages.contract import StageConfig, StageError
+from stages.device import processors
+from stages.photos import read_photos
 
 
 class DamagedInputs(Exception):
@@ -62,6 +63,8 @@ class Runner:
         self.done: dict[str, Manifest] = {}
         self.stages: list[str] = []
         self.times: Mapping[str, float | None] = {}
+        self.planning: dict[str, float] = {}  # seconds that it took, where it was done by this program
+        self.apart: dict[str, Any] | None = None  # the account of a stage alone, after a whole run that has its own
         self.works_on: str | None = None
         self.photos: str | None = None  # their digest: they are listed once
         self.checked: set[str] = set()  # stages whose files were written or read anew by this program
@@ -71,7 +74,8 @@ class Runner:
     @property
     def budget(self) -> Budget | None:
         """The time that the run may take in all, where there is a limit."""
-        return Budget(self.state["budget"]) if self.state.get("budget") else None
+        state = self.apart or self.state.get("budget")
+        return Budget(state) if state else None
 
     def set_budget(self, total: float | None, before: float) -> None:
         """Make ``total`` seconds the budget of this workspace, None for no limit. The same as before goes on.
@@ -88,7 +92,8 @@ class Runner:
     def time_left(self, budget: Budget) -> float:
         """Seconds of the budget that this run has: all, unless it goes on with an interrupted one."""
         budget.recover(self.workspace.root)
-        return budget.left if budget.is_of(self._options_digest()) else budget.total
+        goes_on = budget.spent and budget.is_of(self._options_digest(), self._photos_digest())
+        return budget.left if goes_on else budget.total
 
     def is_done(self, stage: str) -> bool:
         """Whether a finished result of ``stage`` is there for these options, as far as can be told beforehand."""
@@ -97,7 +102,8 @@ class Runner:
         return found
 
     def _options_digest(self) -> str:
-        return digest(self.state["options"])
+        """Of what a budget is kept for: a study has its own time."""
+        return digest({stage: options for stage, options in self.state["options"].items() if stage not in ON_REQUEST})
 
     def run(
         self,
@@ -119,7 +125,8 @@ class Runner:
         self.verify, self.force, self.stages, self.times = verify, force, list(stages), times or {}
         if self.budget:
             self.budget.recover(self.workspace.root)
-        continues = self.budget is not None and not self.budget.over
+            if self.budget.over and not remember:
+                self.apart = Budget.new(self.budget.total, self._options_digest())
         if replan:
             self.state["plans"] = {}
         if remember:
@@ -127,18 +134,23 @@ class Runner:
         self.workspace.write_run(self.state)
         try:
             ran = [self._bring_up_to_date(stage) for stage in stages]
-        except Exception:
+        except Exception as problem:
             self._unlink_outdated()
+            if isinstance(problem, StageFailed):
+                self._close_account(remember)
             raise
         except BaseException:  # a signal: whoever sent it does not wait for photos to be read
             self._unlink_after(self.at_work)
             raise
         self._unlink_outdated()
-        # One stage of an interrupted run does not end it.
-        if self.budget and (remember or not continues):
-            self.budget.close()
-        self.workspace.write_run(self.state)
+        self._close_account(remember)
         return any(ran)
+
+    def _close_account(self, whole_run: bool) -> None:
+        """A run that ended by itself, well or not, is over; one stage of an interrupted run does not end it."""
+        if self.budget and whole_run:
+            self.budget.close()
+            self.workspace.write_run(self.state)
 
     def _unlink_outdated(self) -> None:
         """Take out of ``output/`` what belongs to other settings than the current ones."""
@@ -247,8 +259,8 @@ class Runner:
     def _planned(self, stage: str, inputs: dict[str, str], folders: dict[str, Path], may_plan: bool) -> StageConfig:
         """The stage's config with every "choose for me" answered: from run.json, or by the stage's plan()."""
         module, options = STAGES[stage], getattr(self.settings, stage)
-        if stage == "report" and self.budget:
-            return module.Config.model_validate(options.model_dump() | {"budget": self.budget.account()})
+        if stage == "report" and (account := self.state.get("budget")):
+            return module.Config.model_validate(options.model_dump() | {"budget": Budget(account).account()})
         if not hasattr(module, "plan"):
             return options
         options_for_key = self._config_for_key(stage, options)
@@ -262,7 +274,9 @@ class Runner:
             raise NotReady(stage)
         self._check_inputs(folders)
         self._begin_work(stage)
+        clock = time.monotonic()
         config = module.plan(self._with_time(stage, options), folders, self.display)
+        self.planning[stage] = time.monotonic() - clock
         plans[asked] = config.model_dump(mode="json")
         self.workspace.write_run(self.state)
         return config
@@ -272,17 +286,17 @@ class Runner:
 
         Neither is part of a key; with another one the stage plans anew.
         """
-        if self.budget and _takes_what_it_is_given(options):
+        if self.budget and takes_what_it_is_given(options):
             return {"budget": self.budget.total}
         seconds = getattr(options, "seconds", None)
         return {} if seconds is None else {"seconds": seconds}
 
     def _begin_work(self, stage: str) -> None:
-        """From here on ``stage`` costs time: nothing that was found finished does."""
-        if self.budget is None or self.works_on == stage:
+        """From here on ``stage`` costs time of the budget: nothing that was found finished does, and no study."""
+        if self.budget is None or self.works_on == stage or stage in ON_REQUEST:
             return
         self.works_on = stage
-        self.budget.continue_as(self._options_digest())
+        self.budget.continue_as(self._options_digest(), self._photos_digest())
         self.budget.begin(stage)
         if (seconds := self.times.get(stage)) is not None:
             self.budget.promise(stage, seconds)
@@ -297,29 +311,27 @@ class Runner:
 
     def _with_time(self, stage: str, options: StageConfig) -> StageConfig:
         """``options`` with the seconds that the budget leaves for the stage, where it has one and they are open."""
-        if self.budget is None or not _takes_what_it_is_given(options):
+        if self.budget is None or not takes_what_it_is_given(options):
             return options
         # An input that has to be made again is none of the stages that were asked for.
         order = list(STAGES)
-        later = [name for name in self.stages if order.index(name) > order.index(stage)]
-        to_come = {name: self.times.get(name) for name in later}
-        wall = allotted(stage, self.budget.left, to_come, self.budget.total)
-        if stage == "train" and (least := least_total({stage: None, **to_come})) > self.budget.left:
-            left, took = duration(max(0.0, self.budget.left)), duration(self.budget.total)
-            why = f"{left} of {took} are left, the smallest of all that is to come takes about {duration(least)}"
+        to_come = {name: self.times.get(name) for name in self.stages if order.index(name) > order.index(stage)}
+        photos = read_photos(self.workspace.folder("ingest", self.done["ingest"].key))
+        reading = reading_seconds(sum(photo.width * photo.height for photo in photos) / 1e6, processors())
+        if stage == "train" and (why := self.budget.shortage(to_come, reading)):
             self.display.note(f"the budget cannot be kept: {why}")
-        self.budget.promise(stage, wall)
-        seconds = training_seconds(wall) if stage == "train" else wall
-        return options.model_copy(update={"seconds": round(seconds, 1)})
+        return options.model_copy(update={"seconds": self.budget.give(stage, to_come, reading)})
 
     def _config_for_key(self, stage: str, config: StageConfig) -> dict[str, Any]:
-        replaced = {"photos": self.photos or self._photos_digest()} if stage == "ingest" else {}
+        replaced = {"photos": self._photos_digest()} if stage == "ingest" else {}
         return config_for_key(config, self.index, replaced, getattr(STAGES[stage], "UNKEYED", ()))
 
     def _photos_digest(self) -> str:
         """Digest of the photos' names and bytes; the last known one where the photos are gone but were ingested."""
         from stages.sources import find_source
 
+        if self.photos is not None:
+            return self.photos
         config = self.settings.ingest
         if not config.photos.exists() and (known := self.state.get("photos_digest")):
             return known
@@ -346,7 +358,7 @@ class Runner:
         if job.stage not in self.force and (manifest := self.workspace.complete(partial, folder, job.key)):
             return manifest
         self._begin_work(job.stage)
-        spent = attempts.spent(partial)
+        spent = attempts.spent(partial) + self.planning.pop(job.stage, 0.0)
         if partial.exists() and not (job.module.RESUMES and job.stage not in self.force):
             shutil.rmtree(partial)
         partial.mkdir(parents=True, exist_ok=True)
@@ -377,12 +389,6 @@ class Runner:
         self.force -= {job.stage}
         self.at_work = ""
         return manifest
-
-
-def _takes_what_it_is_given(options: StageConfig) -> bool:
-    """Whether nothing else says how long the stage works: neither seconds nor steps, nor those of ``--more``."""
-    open_ended = getattr(options, "seconds", 0.0) is None
-    return open_ended and all(getattr(options, name, None) is None for name in ("steps", "after"))
 
 
 def _load_native_code() -> None:

@@ -1,36 +1,23 @@
 """A budget on a machine whose clock and speed are made up: it converges, whatever the machine does and however often
 it is killed."""
 
-import os
 import shutil
-from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, NamedTuple
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from PIL import Image
-from pydantic import BaseModel
 
 from pipeline.budget import LEAST_SECONDS, MOST_SECONDS, SHARES, Budget, allotted, least_total, training_seconds
-from pipeline.display import SilentDisplay
-from pipeline.runner import Runner
-from pipeline.workspace import Workspace
-from stages.contract import StageConfig, StageResult
-from stages.files import write_json
+from tests.pipeline.made_up_machine import CHAIN, Go, Killed, Machine, runs_on, spent
 
-CHAIN = ("ingest", "sfm", "normalise", "effects", "train", "evaluate", "render", "mesh", "report")
-NEEDS: dict[str, tuple[str, ...]] = {
-    "sfm": ("ingest",),
-    "normalise": ("sfm",),
-    "effects": ("normalise",),
-    "train": ("effects",),
-}
-NEEDS |= {"evaluate": ("train",), "render": ("train",), "mesh": ("train",)}
-NEEDS["report"] = ("train", "evaluate", "render", "mesh")
 OPEN = dict.fromkeys(SHARES)
+
+
+@pytest.fixture
+def go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Go:
+    return runs_on(tmp_path, monkeypatch)
+
 
 # --- the shares
 
@@ -92,160 +79,6 @@ def test_the_least_budget_is_what_has_to_be() -> None:
 
 
 # --- whole runs
-
-
-class Stage(StageConfig):
-    """A stage that works for as long as it is told, or as long as it must."""
-
-    photos: Path = Path()
-    cameras: Path | None = None
-    seconds: float | None = None
-    units: int | None = None
-    pace: float = 1.0
-
-
-class Fixed(StageConfig):
-    photos: Path = Path()
-    cameras: Path | None = None
-    budget: dict[str, Any] | None = None
-
-
-class Machine:
-    """A clock, and how many seconds a second of work takes from ``halves_at`` on and before."""
-
-    def __init__(self, slowness: float = 1.0) -> None:
-        self.now, self.slowness, self.halves_at, self.killed_at = 1000.0, slowness, float("inf"), list[float]()
-
-    def work(self, seconds: float, folder: Path | None = None) -> None:
-        """Let time pass, in quarters; a kill leaves no trace but the last file written."""
-        for _ in range(round(4 * seconds)):
-            self.now += 0.25 * self.slowness * (2 if self.now >= self.halves_at else 1)
-            if self.killed_at and self.now >= self.killed_at[0]:
-                self.killed_at.pop(0)
-                if folder is not None:
-                    self.touch(folder)
-                raise Killed
-
-    def touch(self, folder: Path) -> None:
-        (folder / "trace").write_text("x")
-        for path in (folder, folder / "trace"):
-            os.utime(path, (self.now, self.now))
-
-
-class Killed(BaseException):
-    """SIGKILL: nothing is noted down."""
-
-
-UNITS = {"evaluate": (1, 8, 1.5), "render": (6, 4000, 0.1), "mesh": (4, 400, 0.15)}
-"""Least and most, and seconds for each at full speed."""
-MUST = {"ingest": 1.5, "sfm": 40.0, "normalise": 0.3, "effects": 3.0, "report": 1.5}
-EXPECTED: dict[str, float | None] = dict.fromkeys(SHARES) | {
-    "ingest": 1.0, "sfm": 50.0, "normalise": 0.3, "effects": 10.0, "report": 2.0,
-}  # fmt: skip
-
-
-def chain(machine: Machine) -> dict[str, SimpleNamespace]:
-    """Nine stages like the real ones: some take what they take, training has a clock, the rest measure speed."""
-
-    def plan(name: str) -> Callable[..., Stage]:
-        def units(config: Stage, _inputs: object, _progress: object) -> Stage:
-            if name not in UNITS or config.units is not None:
-                return config
-            least, most, each = UNITS[name]
-            measured = machine.now
-            machine.work(0.5)
-            speed = 0.5 / (machine.now - measured)
-            assert config.seconds is not None
-            count = int(config.seconds * speed / each)
-            return config.model_copy(update={"units": max(least, min(most, count))})
-
-        return units
-
-    def run(name: str) -> Callable[..., StageResult]:
-        def work(config: Any, _inputs: object, folder: Path, _progress: object) -> StageResult:
-            if name == "train":
-                checkpoint = folder / "seconds"
-                done = float(checkpoint.read_text()) if checkpoint.exists() else 0.0
-                machine.work(3.0, folder)
-                while done < config.seconds:  # the clock decides, whatever the machine does
-                    before = machine.now
-                    machine.work(1.0, folder)
-                    done += machine.now - before
-                    checkpoint.write_text(str(done))
-            elif name in UNITS:
-                machine.work(config.units * UNITS[name][2], folder)
-            else:
-                machine.work(MUST[name], folder)
-            # A training bounded by seconds never gives the same bytes again.
-            content = {"config": config.model_dump(mode="json"), "ended": machine.now if name == "train" else None}
-            write_json(folder / "result.json", content)
-            return StageResult(("result.json",), name)
-
-        return work
-
-    def stage(name: str) -> SimpleNamespace:
-        common = {"NEEDS": NEEDS.get(name, ()), "VERSION": 1, "RESUMES": name == "train", "LINKS": ()}
-        if name in ("ingest", "normalise", "report"):
-            return SimpleNamespace(Config=Fixed, run=run(name), **common)
-        unkeyed = () if name == "train" else ("seconds",)
-        return SimpleNamespace(Config=Stage, run=run(name), plan=plan(name), UNKEYED=unkeyed, **common)
-
-    return {name: stage(name) for name in CHAIN}
-
-
-class Options(BaseModel):
-    ingest: Fixed = Fixed()
-    sfm: Stage = Stage()
-    normalise: Fixed = Fixed()
-    effects: Stage = Stage()
-    train: Stage = Stage()
-    evaluate: Stage = Stage()
-    render: Stage = Stage()
-    mesh: Stage = Stage()
-    report: Fixed = Fixed()
-
-
-class Outcome(NamedTuple):
-    """Of one command: its account, whether anything ran, and the seconds until it ended."""
-
-    budget: Budget | None
-    ran: bool
-    took: float
-
-
-Go = Callable[..., Outcome]
-
-
-@pytest.fixture
-def go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Go:
-    """Run the chain on a machine under a budget; ``resume`` goes on without naming one."""
-    photos = tmp_path / "photos"
-    photos.mkdir()
-    Image.new("RGB", (4, 4)).save(photos / "0.png")
-
-    def run(
-        machine: Machine, total: float | None, resume: bool = False, stages=CHAIN, replan=False, **options
-    ) -> Outcome:
-        clock = SimpleNamespace(monotonic=lambda: machine.now, time=lambda: machine.now)
-        monkeypatch.setattr("pipeline.runner.STAGES", chain(machine))
-        for module in ("runner", "budget", "attempts"):
-            monkeypatch.setattr(f"pipeline.{module}.time", clock)
-        monkeypatch.setattr("pipeline.runner._load_native_code", lambda: None)
-        settings = Options.model_validate({"ingest": {"photos": photos}} | options)
-        with Workspace(tmp_path / "w.nerf") as workspace:
-            runner = Runner(workspace, settings, SilentDisplay())  # type: ignore[arg-type]
-            if not resume:
-                runner.set_budget(total, 0.0)
-            began = machine.now
-            ran = runner.run(stages, times=EXPECTED, replan=replan)
-        return Outcome(runner.budget, ran, machine.now - began)
-
-    return run
-
-
-def spent(runner: Outcome) -> dict[str, float]:
-    assert runner.budget is not None
-    return runner.budget.state["spent"]
 
 
 @pytest.mark.parametrize(

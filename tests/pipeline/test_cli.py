@@ -59,6 +59,7 @@ def test_help_of_run_lists_the_stage_options(capsys: pytest.CaptureFixture[str])
         (["--budget", "10"], "'10' is not a duration; write it like 90s, 10m or 1h30m"),
         (["--budget", "2m", "--train.steps", "50"], "--budget 2m and --train.steps 50: so many steps take as "
          "long as they take; leave out one, or give --train.seconds"),
+        (["--budget", "2m", "--until", "tradeoff"], "--budget and --until tradeoff: a study has a budget of its own"),
         (["--train.stepz", "5"], "Unrecognized options: --train.stepz, 5; perhaps --train.steps"),
     ],
 )  # fmt: skip
@@ -256,6 +257,39 @@ def test_until_ingest_then_status_and_explain_and_clean(tmp_path: Path, capsys: 
     (tmp_path / "w.nerf/ingest/.DS_Store").write_text("of a file manager")
     assert run_command(["clean", workspace]) == 0
     assert "0.0 MB in 0 folders" in capsys.readouterr().out
+
+
+def test_a_budget_is_said_to_be_spent_by_a_run_and_not_by_a_stage(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    (tmp_path / "photos").mkdir()
+    for k in range(3):
+        Image.effect_noise((64, 48), 30 + k).convert("RGB").save(tmp_path / f"photos/{k}.png")
+    assert " s of 5 min spent →" in run_on(tmp_path / "photos", capsys, "--until", "ingest", "--budget", "5m")[1]
+    before = json.loads((tmp_path / "w.nerf/run.json").read_text())["budget"]
+    assert run_command(["ingest", str(tmp_path / "w.nerf"), "--force"]) == 0
+    assert "spent" not in capsys.readouterr().out
+    assert json.loads((tmp_path / "w.nerf/run.json").read_text())["budget"] == before
+
+
+@pytest.mark.parametrize("command", ["status", "resume", "mesh"])
+def test_options_of_another_version_are_said_to_be(tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str):
+    run = {"version": 1, "options": {"evaluate": {"seed": 1}}, "plans": {}, "keys": {}}
+    (tmp_path / "run.json").write_text(json.dumps(run))
+    assert run_command([command, str(tmp_path)]) == 3
+    text = capsys.readouterr().err
+    assert f"cannot use the options of {tmp_path}" in text
+    assert "there is no option evaluate.seed; another version of this program wrote it" in text
+    assert f"pipeline run PHOTOS -o {tmp_path}" in text
+
+
+def test_photos_given_again_replace_the_options_of_another_version(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    for folder in ("photos", "w.nerf"):
+        (tmp_path / folder).mkdir()
+    for k in range(3):
+        Image.effect_noise((64, 48), 30 + k).convert("RGB").save(tmp_path / f"photos/{k}.png")
+    run = {"version": 1, "options": {"evaluate": {"seed": 1}}, "plans": {}, "keys": {}}
+    (tmp_path / "w.nerf/run.json").write_text(json.dumps(run))
+    assert run_on(tmp_path / "photos", capsys, "--until", "ingest")[0] == 0
+    assert run_command(["status", str(tmp_path / "w.nerf")]) == 0
 
 
 def test_what_lies_beside_known_cameras_changes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

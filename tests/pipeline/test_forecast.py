@@ -1,5 +1,6 @@
 """What is promised at the start of a run."""
 
+import time
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -36,7 +37,7 @@ def test_photos_are_counted_and_measured_without_decoding(photos: Path) -> None:
     assert photos_of(settings(photos / "gone")) is None
     (photos / "empty").mkdir()
     assert photos_of(settings(photos / "empty")) is None
-    assert forecast.times(settings(photos / "gone")) == {}
+    assert expected(settings(photos / "gone"), None) == {}
 
 
 @pytest.mark.parametrize(
@@ -59,14 +60,16 @@ Promise = Callable[..., list[str]]
 
 @pytest.fixture
 def promise(photos: Path) -> Promise:
-    def words(budget: float | None = None, done: tuple[str, ...] = (), **stages: dict[str, Any]) -> list[str]:
+    def words(
+        budget: float | None = None, done: tuple[str, ...] = (), before: float = 0.0, **stages: dict[str, Any]
+    ) -> list[str]:
         runner: Any = SimpleNamespace(
             settings=settings(photos, **stages),
             budget=budget and Budget(Budget.new(budget, "of")),
             is_done=lambda stage: stage in done,
-            time_left=lambda budget: budget.left,
+            time_left=lambda budget: budget.left - before,
         )
-        return forecast.promise(runner, usual(), frozenset(), expected(runner.settings, Photos(50, 2.0)))
+        return forecast.promise(runner, usual(), frozenset(), Photos(50, 2.0))
 
     return words
 
@@ -89,3 +92,53 @@ def test_a_budget_is_promised_with_its_end_or_said_to_be_too_short(promise: Prom
     (words,) = promise(30.0)
     assert words.startswith("budget 30 s, too short for these photos: about ")
     assert words.endswith(" is the least that would do; all is made as small as can be")
+
+
+def test_what_earlier_attempts_took_is_told_apart_from_a_budget_too_small_for_the_photos(promise: Promise) -> None:
+    (words,) = promise(300.0, before=240.0)
+    assert words.startswith("budget 5 min, 1 min of it left by what was spent before; about ")
+    assert words.endswith(" is needed: give a larger --budget, or all is made as small as can be")
+    assert " 0 s of it left" in promise(300.0, before=400.0)[0]
+
+
+def test_no_end_is_promised_that_only_a_training_would_need(promise: Promise, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(forecast.time, "time", lambda: 1e9)
+    done = ("ingest", "sfm", "normalise", "effects", "train", "evaluate", "render")
+    most = time.strftime("%H:%M", time.localtime(1e9 + 0.35 * 3600))
+    assert promise(3600.0, done=done) == [f"budget 1 h, done at {most} at the latest"]
+    left = time.strftime("%H:%M", time.localtime(1e9 + 600))
+    assert promise(3600.0, done=done, before=3000.0) == [f"budget 1 h, done at {left} at the latest"]
+    assert promise(3600.0)[0].startswith("budget 1 h, done at about ")
+
+
+# --- reading the photos
+
+
+def test_large_photos_are_read_by_every_stage_that_looks_at_all_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    small, large, given = Photos(200, 1.7), Photos(200, 24.0), Settings.model_validate({"train": {"seconds": 60.0}})
+    monkeypatch.setattr(forecast, "processors", lambda: 2)
+    before, after = expected(given, small), expected(given, large)
+    more = {stage: (after[stage] or 0) - (before[stage] or 0) for stage in before}
+    once = large.reading(2) - small.reading(2)
+    assert once == pytest.approx(89.2)
+    assert more == pytest.approx(
+        dict.fromkeys(more, 0.0) | dict.fromkeys(("ingest", "sfm", "effects", "train"), once) | {"report": 13.38}
+    )
+    assert expected(given, large)["ingest"] == pytest.approx(0.5 + large.reading(2))
+    monkeypatch.setattr(forecast, "processors", lambda: 64)
+    assert expected(given, large)["ingest"] == pytest.approx(0.5 + large.reading(8))
+
+
+def test_small_sets_are_foretold_as_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(forecast, "processors", lambda: 2)
+    assert Photos(50, 0.75).reading(2) == pytest.approx(0.75)
+    times = expected(Settings(), Photos(50, 0.75))
+    known = {stage: seconds for stage, seconds in times.items() if seconds is not None}
+    before = {"ingest": 1.1, "sfm": 57.9, "normalise": 0.3, "effects": 10.0, "report": 2.0}
+    assert known == pytest.approx(before, abs=1.0)
+
+
+def test_a_budget_too_short_for_reading_is_said_to_be(promise: Promise) -> None:
+    times = {"train": None, "report": 2.0}
+    assert "done at about" in forecast.in_words(60.0, 60.0, times, 1.0)
+    assert "too short for these photos: about 1 min" in forecast.in_words(60.0, 60.0, times, 40.0)
