@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from nerf.reconstruction import closest_point_to_lines, spatial_median
+from nerf.region import look_at_point
 
 FULL_CIRCLE_GAP_DEG = 60.0  # cameras with no wider gap in azimuth surround the object
 SMOOTHING_DEG = 20.0  # standard deviation over azimuth within which an orbit averages the cameras' radius and height
@@ -76,14 +77,24 @@ def spiral(cameras: Float[np.ndarray, "n 3 4"], frames: int) -> Poses:
     et al. 2019, ``render_path_spiral``); its half axes are 70 % quantiles of the cameras' offsets, where the published
     code takes 90 % and with it leaves the cameras' own grid at the corners.
     """
-    mean = average_pose(cameras)
+    mean, target = average_pose(cameras), _before(cameras)
     offsets = (cameras[:, :, 3] - mean[:, 3]) @ mean[:, :3]
     reach = np.quantile(np.abs(offsets), SPIRAL_SHARE, axis=0)
     angle = 4 * np.pi * np.arange(frames) / frames
     local = reach * np.stack([np.cos(angle), -np.sin(angle), -np.sin(angle / 2)], axis=1)
-    ahead = max(-mean[:, 3] @ mean[:, 2], 0.5)  # the region's centre is the origin
-    target = mean[:, 3] + ahead * mean[:, 2]
     return look_at(mean[:, 3] + local @ mean[:, :3].T, target, up=-mean[:, 1])
+
+
+def suits_spiral(cameras: Float[np.ndarray, "n 3 4"]) -> bool:
+    """Whether the cameras, too, look at what a spiral looks at: where they reach far along a wall, or over the ground,
+    they look at what is before each of them, and all the spiral's views but a few would be of directions unseen."""
+    return look_at_point(cameras[:, :, 3], cameras[:, :, 2], _before(cameras))
+
+
+def _before(cameras: Float[np.ndarray, "n 3 4"]) -> Float[np.ndarray, "3"]:
+    """The point that the average camera looks at, as far ahead as the region's centre, which is the origin."""
+    mean = average_pose(cameras)
+    return mean[:, 3] + max(-mean[:, 3] @ mean[:, 2], 0.5) * mean[:, 2]
 
 
 def average_pose(cameras: Float[np.ndarray, "n 3 4"]) -> Float[np.ndarray, "3 4"]:
