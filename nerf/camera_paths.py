@@ -16,6 +16,7 @@ SMOOTHING_DEG = 20.0  # standard deviation over azimuth within which an orbit av
 STEEPEST = 0.15  # least horizontal distance of an orbit to its axis, in distances to the target (81 degrees)
 SPIRAL_SHARE = 0.7  # quantile of the cameras' offsets that the spiral reaches
 ROUNDING = 1e-9  # of tour lengths of about 10: reversing a stretch gains more, or the search would run in circles
+ALONG = 0.1  # sine of the angle, 6 degrees, within which a view is along a direction
 FRAMES_PER_KEY, LEAST_KEYS = 8, 4  # interpolated: frames for each camera it sets out for, so that it is not a blur
 MOST_CAMERAS = 1000  # that a tour knows of; of more, those farthest from each other
 NEIGHBOURS = 3  # of each camera, to which a tour may go on from it
@@ -121,6 +122,22 @@ def interpolated(cameras: Float[np.ndarray, "n 3 4"], frames: int) -> Poses:
     path = _rotating(_rounded(fine, reach))
     poses = _rotating(_evenly(path, frames)) * unit
     return np.concatenate([poses[:, :9].reshape(-1, 3, 3), poses[:, 9:, None]], axis=2)
+
+
+def levelled(cameras: Float[np.ndarray, "n 3 4"]) -> Float[np.ndarray, "n 3 4"]:
+    """Cameras that face one way, each turned about its own axis until its upper edge is up, or, where they look down or
+    up, on the side of +y: of a flight to and fro every other line is upside down, and a path would flip with it.
+
+    One that looks along that direction is left as it is.
+    """
+    middle = np.abs(spatial_median(cameras[:, :, 2]))
+    up = UP if middle[2] <= middle[1] + ROUNDING else np.array([0.0, 1.0, 0.0])
+    x = np.cross(cameras[:, :, 2], up)
+    clear = np.linalg.norm(x, axis=1) > ALONG
+    turned = cameras.copy()
+    z, x = cameras[clear, :, 2], _unit(x[clear])
+    turned[clear, :, :3] = np.stack([x, np.cross(z, x), z], axis=2)
+    return turned
 
 
 def _evenly(path: Float[np.ndarray, "m d"], count: int) -> Float[np.ndarray, "{count} d"]:

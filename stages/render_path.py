@@ -87,7 +87,10 @@ def fitted_path(scene: "Scene", kind: PathKind, frames: int) -> CameraPath:
         "spiral": camera_paths.spiral,
         "interpolated": camera_paths.interpolated,
     }[kind]
-    return CameraPath((median_camera(scene),) * frames, path(_poses(scene), frames))
+    poses = _poses(scene)
+    if kind == "interpolated" and scene.layout == "forward":
+        poses = camera_paths.levelled(poses)
+    return CameraPath((median_camera(scene),) * frames, path(poses, frames))
 
 
 def median_camera(scene: "Scene") -> "Camera":

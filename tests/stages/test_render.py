@@ -171,6 +171,14 @@ def test_the_layout_chooses_the_path(inputs, progress, poses, layout: Layout, up
     assert render.plan(render.Config(), inputs, progress).path == path
 
 
+def test_along_photos_that_face_one_way_the_horizon_is_level(inputs, progress) -> None:
+    poses = wall(columns=40)
+    poses[::2, :, :2] *= -1  # upside down
+    for layout, upright in (("forward", True), ("inside", False)):
+        path = fitted_path(scene_with(poses, layout), "interpolated", 30).poses
+        assert bool((path[:, 2, 1] < -0.99).all()) == upright
+
+
 def test_a_written_path_can_be_given_back_as_cameras(inputs, progress, tmp_path: Path) -> None:
     run(inputs, progress, frames=5, width=40)
     first, written = (inputs["render"] / "video.mp4").read_bytes(), inputs["render"] / "path.json"
