@@ -171,12 +171,11 @@ def test_the_layout_chooses_the_path(inputs, progress, poses, layout: Layout, up
     assert render.plan(render.Config(), inputs, progress).path == path
 
 
-def test_along_photos_that_face_one_way_the_horizon_is_level(inputs, progress) -> None:
+def test_along_photos_that_face_one_way_the_horizon_is_level() -> None:
     poses = wall(columns=40)
     poses[::2, :, :2] *= -1  # upside down
-    for layout, upright in (("forward", True), ("inside", False)):
-        path = fitted_path(scene_with(poses, layout), "interpolated", 30).poses
-        assert bool((path[:, 2, 1] < -0.99).all()) == upright
+    path = fitted_path(scene_with(poses, "forward"), "interpolated", 30).poses
+    assert (path[:, 2, 1] < -0.99).all()
 
 
 def test_a_written_path_can_be_given_back_as_cameras(inputs, progress, tmp_path: Path) -> None:
