@@ -9,12 +9,14 @@ import numpy as np
 from jaxtyping import Float
 
 from nerf.reconstruction import closest_point_to_lines, spatial_median
+from nerf.region import look_at_point
 
 FULL_CIRCLE_GAP_DEG = 60.0  # cameras with no wider gap in azimuth surround the object
 SMOOTHING_DEG = 20.0  # standard deviation over azimuth within which an orbit averages the cameras' radius and height
 STEEPEST = 0.15  # least horizontal distance of an orbit to its axis, in distances to the target (81 degrees)
 SPIRAL_SHARE = 0.7  # quantile of the cameras' offsets that the spiral reaches
 ROUNDING = 1e-9  # of tour lengths of about 10: reversing a stretch gains more, or the search would run in circles
+ALONG = 0.1  # sine of the angle, 6 degrees, within which a view is along a direction
 FRAMES_PER_KEY, LEAST_KEYS = 8, 4  # interpolated: frames for each camera it sets out for, so that it is not a blur
 MOST_CAMERAS = 1000  # that a tour knows of; of more, those farthest from each other
 NEIGHBOURS = 3  # of each camera, to which a tour may go on from it
@@ -76,14 +78,24 @@ def spiral(cameras: Float[np.ndarray, "n 3 4"], frames: int) -> Poses:
     et al. 2019, ``render_path_spiral``); its half axes are 70 % quantiles of the cameras' offsets, where the published
     code takes 90 % and with it leaves the cameras' own grid at the corners.
     """
-    mean = average_pose(cameras)
+    mean, target = average_pose(cameras), _before(cameras)
     offsets = (cameras[:, :, 3] - mean[:, 3]) @ mean[:, :3]
     reach = np.quantile(np.abs(offsets), SPIRAL_SHARE, axis=0)
     angle = 4 * np.pi * np.arange(frames) / frames
     local = reach * np.stack([np.cos(angle), -np.sin(angle), -np.sin(angle / 2)], axis=1)
-    ahead = max(-mean[:, 3] @ mean[:, 2], 0.5)  # the region's centre is the origin
-    target = mean[:, 3] + ahead * mean[:, 2]
     return look_at(mean[:, 3] + local @ mean[:, :3].T, target, up=-mean[:, 1])
+
+
+def suits_spiral(cameras: Float[np.ndarray, "n 3 4"]) -> bool:
+    """Whether the cameras, too, look at what a spiral looks at: where they reach far along a wall, or over the ground,
+    they look at what is before each of them, and all the spiral's views but a few would be of directions unseen."""
+    return look_at_point(cameras[:, :, 3], cameras[:, :, 2], _before(cameras))
+
+
+def _before(cameras: Float[np.ndarray, "n 3 4"]) -> Float[np.ndarray, "3"]:
+    """The point that the average camera looks at, as far ahead as the region's centre, which is the origin."""
+    mean = average_pose(cameras)
+    return mean[:, 3] + max(-mean[:, 3] @ mean[:, 2], 0.5) * mean[:, 2]
 
 
 def average_pose(cameras: Float[np.ndarray, "n 3 4"]) -> Float[np.ndarray, "3 4"]:
@@ -110,6 +122,22 @@ def interpolated(cameras: Float[np.ndarray, "n 3 4"], frames: int) -> Poses:
     path = _rotating(_rounded(fine, reach))
     poses = _rotating(_evenly(path, frames)) * unit
     return np.concatenate([poses[:, :9].reshape(-1, 3, 3), poses[:, 9:, None]], axis=2)
+
+
+def levelled(cameras: Float[np.ndarray, "n 3 4"]) -> Float[np.ndarray, "n 3 4"]:
+    """Cameras that face one way, each turned about its own axis until its upper edge is up, or, where they look down or
+    up, on the side of +y: of a flight to and fro every other line is upside down, and a path would flip with it.
+
+    One that looks along that direction is left as it is.
+    """
+    middle = np.abs(spatial_median(cameras[:, :, 2]))
+    up = UP if middle[2] <= middle[1] + ROUNDING else np.array([0.0, 1.0, 0.0])
+    x = np.cross(cameras[:, :, 2], up)
+    clear = np.linalg.norm(x, axis=1) > ALONG
+    turned = cameras.copy()
+    z, x = cameras[clear, :, 2], _unit(x[clear])
+    turned[clear, :, :3] = np.stack([x, np.cross(z, x), z], axis=2)
+    return turned
 
 
 def _evenly(path: Float[np.ndarray, "m d"], count: int) -> Float[np.ndarray, "{count} d"]:

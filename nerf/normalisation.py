@@ -10,10 +10,9 @@ from nerf.depth_range import near_and_far
 from nerf.reconstruction import Reconstruction, spatial_median
 from nerf.region import Layout, Region, find_layout, find_region, share_beyond
 from nerf.scene import Similarity
-from nerf.up_vector import Up, find_up
+from nerf.up_vector import Up, Witness, find_up
 
-# Shortest level heading that is one: of the mean of all photos, of the first photo (beyond rounding), of an axis.
-LEAST_HEADINGS = (0.3, 1e-6, 0.0)
+LEAST_HEADING = 0.3  # the level part of a unit vector, at least, that is one: it points no steeper than 73 deg
 # Of the distance from the origin: what places differ by that are written with twelve digits, or rounded a few times.
 ONE_PLACE = 1e-12
 LEAST_HALF = (
@@ -37,17 +36,20 @@ class Normalisation(NamedTuple):
     arc_deg: float
 
 
-def normalise(sfm: Reconstruction, roi: tuple[float, float, float, float] | None) -> Normalisation:
+def normalise(
+    sfm: Reconstruction, roi: tuple[float, float, float, float] | None, places: Witness | None = None
+) -> Normalisation:
     """Choose the scene frame: region of interest in [-0.9, 0.9]^3, +z up, +y where the photos look.
 
     ``roi`` (x, y, z, radius in the sfm frame) replaces the automatic region; the cube's half side is the radius.
+    ``places`` is up by where on Earth the photos were taken.
     The result is the same up to rounding for every similar reconstruction: x' = scale rotation (x - centre) with
     all three found from shapes alone, in float64 relative to the cameras' middle.
     Raises ValueError when the cameras stand in one place and there are no points, or where the scene is too small for
     numbers, be it at its distance from the origin or by itself.
     """
-    layout, up = find_layout(sfm), find_up(sfm)
-    rotation = _frame(up.direction, sfm.axes)
+    layout, up = find_layout(sfm), find_up(sfm, places)
+    rotation = _frame(up.direction, sfm)
     middle = spatial_median(sfm.centres)
     _check_extent(sfm, middle)
     upright = sfm.in_frame(rotation, middle)
@@ -82,17 +84,16 @@ def _check_extent(sfm: Reconstruction, middle: Float[np.ndarray, "3"]) -> None:
         )
 
 
-def _frame(up: Float[np.ndarray, "3"], axes: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3 3"]:
+def _frame(up: Float[np.ndarray, "3"], sfm: Reconstruction) -> Float[np.ndarray, "3 3"]:
     """Rotation that takes ``up`` to +z and the photos' heading to +y.
 
     The heading is where most photos look, so that walls line up with the cube; where they look everywhere, it is
-    the first photo's. Photos that look along up leave the turn about z open: the input axis furthest from up serves.
+    the first photo's. Of a photo that looks along up, the upper edge serves: flights and fields line up with it.
     """
-    level = axes - up * (axes @ up)[:, None]
-    middle = spatial_median(level)
-    candidates = np.stack([middle, level[0], (np.eye(3) - np.outer(up, up))[np.argmin(np.abs(up))]])
+    axes, ups = (vectors - np.outer(vectors @ up, up) for vectors in (sfm.axes, sfm.ups))
+    candidates = np.stack([spatial_median(axes), axes[0], ups[0]])
     lengths = np.linalg.norm(candidates, axis=1)
-    chosen = int(np.argmax(lengths > LEAST_HEADINGS))
+    chosen = int(np.argmax(lengths > LEAST_HEADING))
     y = candidates[chosen] / lengths[chosen]
     return np.stack([np.cross(y, up), y, up])
 

@@ -45,10 +45,17 @@ def find_layout(scene: Reconstruction) -> Layout:
     length = np.linalg.norm(middle)
     if length > 0 and np.quantile(angles_deg(scene.axes, middle / length), 0.8) <= FORWARD_DEG:
         return "forward"
-    towards = focus(scene) - scene.centres
+    return "around" if look_at_point(scene.centres, scene.axes, focus(scene)) else "inside"
+
+
+def look_at_point(
+    centres: Float[np.ndarray, "n 3"], axes: Float[np.ndarray, "n 3"], point: Float[np.ndarray, "3"]
+) -> bool:
+    """Whether four fifths of the photos look within CONVERGENT_DEG of a point; one that stands on it does not."""
+    towards = point - centres
     distance = np.linalg.norm(towards, axis=1, keepdims=True)
-    bearing = np.divide(towards, distance, out=-scene.axes, where=distance > 0)
-    return "around" if np.quantile(angles_deg(scene.axes, bearing), 0.8) <= CONVERGENT_DEG else "inside"
+    bearing = np.divide(towards, distance, out=-axes, where=distance > 0)
+    return bool(np.quantile(angles_deg(axes, bearing), 0.8) <= CONVERGENT_DEG)
 
 
 def find_region(scene: Reconstruction, layout: Layout) -> Region:

@@ -11,10 +11,18 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from pydantic import Field
 
-from nerf import REGION_HALF
 from stages.contract import Inputs, Progress, StageConfig, StageResult
 from stages.files import read_json, read_scene, read_tensors, write_png
-from stages.mesh_size import affordable_resolution, resolution_in, seconds_per_density, yardstick
+from stages.mesh_size import (
+    affordable_resolution,
+    flatness,
+    lattice_box,
+    point_cost,
+    points_along,
+    resolution_in,
+    seconds_per_density,
+    yardstick,
+)
 
 if TYPE_CHECKING:
     import numpy as np
@@ -28,7 +36,7 @@ if TYPE_CHECKING:
     from stages.mesh_views import ShadowMap
 
 NEEDS = ("ingest", "normalise", "train")
-VERSION = 6
+VERSION = 7
 RESUMES = False
 LINKS = ("mesh.glb", "mesh.ply", "mesh.obj")
 UNKEYED = ("seconds",)  # it decides the resolution, and that enters the key
@@ -46,7 +54,10 @@ class Config(StageConfig):
     """Settings of stage mesh."""
 
     resolution: int | None = Field(
-        default=None, ge=16, le=1024, description="lattice points per edge; none: from the training"
+        default=None,
+        ge=16,
+        le=1024,
+        description="lattice points per edge of a cube, as many in all in a flat box; none: from the training",
     )
     seconds: float | None = Field(
         default=None, gt=0, description="that the stage may take; none: about a tenth of the training"
@@ -81,8 +92,9 @@ def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
     if config.seconds is not None:
         progress.update("trying how fast the field tells its density")
         began = time.perf_counter()
-        speeds = seconds_per_density(inputs["train"], REGION_HALF, CHUNK), yardstick()
-        resolution = resolution_in(config.seconds - (time.perf_counter() - began), *speeds)
+        box = lattice_box(read_scene(inputs["normalise"]).layout, _sparse_points(inputs["normalise"]))
+        speeds = seconds_per_density(inputs["train"], box, CHUNK), yardstick()
+        resolution = resolution_in(config.seconds - (time.perf_counter() - began), *speeds, flatness(box))
         return config.model_copy(update={"resolution": resolution})
     rays = read_json(inputs["train"] / "field.json")["rays"]
     return config.model_copy(update={"resolution": affordable_resolution(rays)})
@@ -97,7 +109,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     device = compute_device()
     model, _ = load_field(inputs["train"], device)
     config = plan(config, inputs, progress)
-    points = read_tensors(inputs["normalise"] / "points.safetensors")["xyz"].astype(float)
+    points = _sparse_points(inputs["normalise"])
     result = reconstruct(config, model, scene, inputs["ingest"], points, device, progress)
     progress.update("writing", 0.95)
     outputs = write_mesh(config, result.mesh, scene, folder)
@@ -107,6 +119,11 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     if not result.level.clear:
         line += "; the field has no clear surface yet, train for longer"
     return StageResult(outputs, line, facts=_facts(config, result, scene))
+
+
+def _sparse_points(normalise: Path) -> "np.ndarray":
+    """(n, 3) in the scene frame."""
+    return read_tensors(normalise / "points.safetensors")["xyz"].astype(float)
 
 
 def reconstruct(
@@ -127,7 +144,8 @@ def reconstruct(
     from stages.mesh_surface import decimate, extract, vertex_normals
     from stages.mesh_views import look, shadow_maps
 
-    lattice = _density(config, model, device, progress)
+    box = lattice_box(scene.layout, points)
+    lattice = _density(config, model, box, device, progress)
     voxel = float(lattice.spacing().max())
     views = scene.of_split("train")
     maps = shadow_maps(lattice, scene, ingest, views, lambda done: progress.update("visibility", 0.6 + 0.2 * done))
@@ -143,28 +161,26 @@ def reconstruct(
     directions = sight.direction[cleaned.vertex[nearest]]
     colours = _colours(model, cleaned.surface.vertices[nearest], directions, voxel, device)
     mesh = ColouredMesh(*surface, vertex_normals(surface), colours)
-    return Extracted(mesh, level, cleaned, openness(surface, REGION_HALF, voxel), voxel)
+    return Extracted(mesh, level, cleaned, openness(surface, box, voxel), voxel)
 
 
-def _density(config: Config, model: "RadianceModel", device: str, progress: Progress) -> "Lattice":
+def _density(config: Config, model: "RadianceModel", box: "np.ndarray", device: str, progress: Progress) -> "Lattice":
     import torch
 
     from nerf.lattice import density_lattice
     from stages.memory import available_bytes, check_memory
 
     assert config.resolution is not None
-    fits = int((available_bytes() / BYTES_PER_POINT) ** (1 / 3)) // 16 * 16
+    needed = BYTES_PER_POINT * point_cost(flatness(box))
+    fits = int((available_bytes() / needed) ** (1 / 3)) // 16 * 16
     hint = f"Try --mesh.resolution {fits}." if fits >= 16 else "Close other programs."
-    check_memory(
-        BYTES_PER_POINT * config.resolution**3, "the mesh", f"a lattice of {config.resolution}³ points needs", hint
-    )
-    corner = torch.full((3,), REGION_HALF, device=device)
-    edge = config.resolution
+    check_memory(needed * config.resolution**3, "the mesh", f"a lattice of {config.resolution}³ points needs", hint)
+    low, high = torch.tensor(box, dtype=torch.float32, device=device)
 
     def report(done: float) -> None:
-        progress.update(f"density at {edge}³ points", 0.6 * done)
+        progress.update(f"density at {config.resolution}³ points", 0.6 * done)
 
-    return density_lattice(model, edge, -corner, corner, CHUNK, report)
+    return density_lattice(model, points_along(box, config.resolution), low, high, CHUNK, report)
 
 
 def _level(

@@ -141,13 +141,13 @@ def _have(label: np.ndarray, area: np.ndarray, marked: np.ndarray, share: float)
     return np.bincount(label, area * marked) >= share * np.bincount(label, area)
 
 
-def openness(surface: Surface, half_box: float, voxel: float) -> str:
-    """Where the surface ends: "watertight", or "open" and the places, for a lattice over [-half_box, half_box]^3."""
+def openness(surface: Surface, box: np.ndarray, voxel: float) -> str:
+    """Where the surface ends: "watertight", or "open" and the places, for a lattice over a box (2, 3)."""
     if is_watertight(surface):
         return "watertight"
     border = border_vertices(surface)
     if len(border) == 0:
         return "closed, but not a manifold"
-    at_box = np.abs(border).max(axis=1) > half_box - voxel / 2
+    at_box = ((border < box[0] + voxel / 2) | (border > box[1] - voxel / 2)).any(axis=1)
     places = [("at the box", at_box.any()), ("where too few photos look", not at_box.all())]
     return "open " + " and ".join(place for place, present in places if present)

@@ -1,7 +1,25 @@
-"""How fine a mesh's lattice can be in the time there is."""
+"""Where a mesh's lattice lies, and how fine it can be in the time there is.
 
+A box is (2, 3): its lowest and its highest corner, in the scene frame. ``resolution`` is the number of lattice points
+per edge of a cube; a flat box has about as many points in all, and cubic voxels, smaller ones.
+"""
+
+import math
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+from nerf import REGION_HALF
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from nerf.region import Layout
+
+# A box is cut along one axis, that of the least extent of the sparse points, if these tell of the scene: so many, along
+# another axis over half of the cube, along this one over less. They may be few where walls are bare: MARGIN is added on
+# either side, in sides of the cube, and the few points beyond OUTERMOST, some of them false, say nothing.
+FEWEST_POINTS, SPANNED, MARGIN, OUTERMOST = 500, 0.5, 0.05, 0.001
 
 POINTS_PER_RAY = 20  # lattice points per ray trained: about a tenth of what training cost
 LEAST_RESOLUTION, MOST_RESOLUTION = 64, 256
@@ -16,31 +34,72 @@ ONCE, PER_POINT = 150.0, 4.5e-5
 # is in ONCE. Surfaces have 3 to 5 vertices for each point of a side of the lattice, and decimation leaves 150,000.
 COLOURED, VERTICES_PER_FACE, MOST_VERTICES = 8, 5, 150_000
 BALL_EDGE, BALL_TIMES = 96, 3
+# Of PER_POINT, and of the memory. Measured: a plain's lattice in a box with 3.5 times the surface took 1.2 times the
+# seconds and 1.5 times the memory. Surfaces of photos are twice as large.
+SURFACE_SHARE = 1 / 3
 
 
 def affordable_resolution(rays: int) -> int:
-    """Lattice points per edge that cost about a tenth of the training of ``rays``, a multiple of 16 in 96 ... 256."""
+    """The resolution whose points cost about a tenth of the training of ``rays``, a multiple of 16 in 96 ... 256."""
     edge = (POINTS_PER_RAY * rays) ** (1 / 3)
     return min(MOST_RESOLUTION, max(96, round(edge / 16) * 16))
 
 
-def resolution_in(seconds: float, per_density: float, per_ball: float) -> int:
-    """Lattice points per edge, a multiple of 16 in 64 ... 256, of a mesh that takes ``seconds`` where a density takes
-    ``per_density`` and the surface of a ball ``per_ball`` seconds."""
+def lattice_box(layout: "Layout", points: "np.ndarray") -> "np.ndarray":
+    """The box for the lattice: the region of interest, or where the scene is flat (ground from the air, a façade, the
+    floor of a house) the slice of it that sparse ``points`` (n, 3) lie in.
+
+    Not where photos were taken around an object: that may be bare at its top, and points on what it stands on do not
+    tell how far it reaches.
+    """
+    import numpy as np
+
+    cube = np.array([[-REGION_HALF] * 3, [REGION_HALF] * 3])
+    points = points[(np.abs(points) <= REGION_HALF).all(axis=1)]
+    if layout == "around" or len(points) < FEWEST_POINTS:
+        return cube
+    low, high = np.quantile(points, [OUTERMOST, 1 - OUTERMOST], axis=0)
+    flat, side = int((high - low).argmin()), 2 * REGION_HALF
+    bottom, top = low[flat] - MARGIN * side, high[flat] + MARGIN * side
+    if (high - low).max() >= SPANNED * side >= top - bottom:
+        cube[:, flat] = max(bottom, -REGION_HALF), min(top, REGION_HALF)
+    return cube
+
+
+def points_along(box: "np.ndarray", resolution: int) -> int:
+    """Lattice points along the longest edge of a box."""
+    sides = (box[1] - box[0]).tolist()
+    return round((resolution - 1) * max(sides) / math.prod(sides) ** (1 / 3)) + 1
+
+
+def flatness(box: "np.ndarray") -> float:
+    """How many times as many voxels of a box may be cut by a surface as of a cube with as many voxels in all."""
+    sides = (box[1] - box[0]).tolist()
+    return math.prod(sides) ** (1 / 3) / min(sides)
+
+
+def point_cost(flatness: float) -> float:
+    """What a lattice point takes besides its density, in those of a cube: a part of it is its share in the surface."""
+    return 1 + SURFACE_SHARE * (flatness - 1)
+
+
+def resolution_in(seconds: float, per_density: float, per_ball: float, flatness: float = 1.0) -> int:
+    """The resolution, a multiple of 16 in 64 ... 256, of a mesh that takes ``seconds`` where a density takes
+    ``per_density`` and the surface of a ball ``per_ball`` seconds, in a box of that :func:`flatness`."""
     edges = range(LEAST_RESOLUTION, MOST_RESOLUTION + 1, 16)
-    fitting = [edge for edge in edges if seconds_of(edge, per_density, per_ball) <= seconds]
+    fitting = [edge for edge in edges if seconds_of(edge, per_density, per_ball, flatness) <= seconds]
     return max(fitting, default=LEAST_RESOLUTION)
 
 
-def seconds_of(edge: int, per_density: float, per_ball: float) -> float:
-    """What a mesh of ``edge`` lattice points per edge is expected to take."""
-    densities = edge**3 + COLOURED * min(VERTICES_PER_FACE * edge**2, MOST_VERTICES)
-    return densities * per_density + (ONCE + PER_POINT * edge**3) * per_ball
+def seconds_of(resolution: int, per_density: float, per_ball: float, flatness: float = 1.0) -> float:
+    """What a mesh is expected to take."""
+    vertices = min(VERTICES_PER_FACE * resolution**2 * flatness, MOST_VERTICES)
+    densities = resolution**3 + COLOURED * vertices
+    return densities * per_density + (ONCE + PER_POINT * resolution**3 * point_cost(flatness)) * per_ball
 
 
-def seconds_per_density(train: Path, half_box: float, chunk: int) -> float:
-    """Measured: larger lattices of the field in ``train`` over [-half_box, half_box]³ until one takes long enough to
-    tell."""
+def seconds_per_density(train: Path, box: "np.ndarray", chunk: int) -> float:
+    """Measured: larger lattices of the field in ``train`` over a box until one takes long enough to tell."""
     import torch
 
     from nerf.lattice import density_lattice
@@ -49,16 +108,16 @@ def seconds_per_density(train: Path, half_box: float, chunk: int) -> float:
 
     device = compute_device()
     model, _ = load_field(train, device)
-    corner = torch.full((3,), half_box, device=device)
-    density_lattice(model, TIMED_EDGES[0], -corner, corner, chunk)  # the first pays for memory and kernels
+    low, high = torch.tensor(box, dtype=torch.float32, device=device)
+    density_lattice(model, TIMED_EDGES[0], low, high, chunk)  # the first pays for memory and kernels
     seconds = per_point = 0.0
     for edge in TIMED_EDGES:
         if seconds >= TIMED_SECONDS:
             break
         began = time.perf_counter()
-        density_lattice(model, edge, -corner, corner, chunk).values.cpu()
+        count = density_lattice(model, points_along(box, edge), low, high, chunk).values.cpu().numel()
         seconds = time.perf_counter() - began
-        per_point = seconds / edge**3
+        per_point = seconds / count
     return per_point
 
 

@@ -16,11 +16,12 @@ if TYPE_CHECKING:
     from nerf.normalisation import Normalisation
     from nerf.reconstruction import Reconstruction
     from nerf.scene import Camera, Scene, Split
+    from nerf.up_vector import Witness
     from stages.photos import Box, Photo
     from stages.sparse_model import SparseModel
 
 NEEDS = ("ingest", "sfm")
-VERSION = 7
+VERSION = 8
 RESUMES = False
 LINKS = ("transforms.json", "scene.json")
 
@@ -58,13 +59,14 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     )
     photos, order = [photo for photo, _ in posed], [i for _, i in posed]
     has_alpha = _has_alpha(photos, progress)
-    official = read_json(inputs["sfm"] / "registration.json")["test_files"]
+    registration = read_json(inputs["sfm"] / "registration.json")
+    official = registration["test_files"]
     split = _split(photos, config.test_every, official)
     # What is opaque in a test photo decides nothing.
     boxes = [photo.opaque if part == "train" else None for photo, part in zip(photos, split, strict=True)]
     sfm = _reconstruction(model, order, boxes if has_alpha else None)
     try:
-        found = normalise(sfm, config.roi)
+        found = normalise(sfm, config.roi, _up_by_gps(registration["georeference"], sfm, photos))
     except ValueError as error:
         hint = "Take photos from different places, or give --normalise.roi."
         raise StageError("the scene has no scale", str(error), hint) from error
@@ -136,6 +138,18 @@ def _reconstruction(model: "SparseModel", order: list[int], boxes: "Sequence[Box
         point=model.point,
         opaque=opaque,
     )
+
+
+def _up_by_gps(georeference: dict[str, Any] | None, sfm: "Reconstruction", photos: "list[Photo]") -> "Witness | None":
+    """Up by where GPS says that the photos were taken; None where it says nothing, or does not say how high."""
+    import numpy as np
+
+    from nerf.up_vector import up_by_places
+
+    located = [photo.latitude is not None and photo.longitude is not None for photo in photos]
+    if georeference is None or any(photo.altitude_m is None for photo, has in zip(photos, located, strict=True) if has):
+        return None
+    return up_by_places(sfm.centres[located], np.array(georeference["enu_from_sfm"]), georeference["error_m"])
 
 
 def _within(rays: "np.ndarray", box: "Box | None") -> "np.ndarray":

@@ -10,7 +10,7 @@ from pydantic import Field
 from stages.amounts import duration, short_count
 from stages.contract import Inputs, Progress, StageConfig, StageError, StageResult
 from stages.files import read_json, read_scene, write_json, write_png
-from stages.render_path import BY_LAYOUT, CameraPath, PathKind, fitted_path, path_from_file, path_rays
+from stages.render_path import CameraPath, PathKind, fitted_path, path_from_file, path_rays, usual_path
 from stages.render_plan import LEAST_WIDTH
 from stages.spread import spread
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from stages.drawing import Allowance, Painter
 
 NEEDS = ("normalise", "train")
-VERSION = 5
+VERSION = 6
 RESUMES = False
 LINKS = ("video.mp4", "depth.mp4", "path.json")
 UNKEYED = ("seconds",)  # it decides how many frames and how large, and these enter the key
@@ -39,7 +39,7 @@ class Config(StageConfig):
 
     path: PathKind | None = Field(
         default=None,
-        description="none: orbit around an object, spiral before a scene, interpolated within one",
+        description="none: orbit around an object, spiral before a scene, interpolated within one or far along it",
     )
     cameras: Path | None = Field(
         default=None,
@@ -72,7 +72,7 @@ def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
     _check(config)
     scene = read_scene(inputs["normalise"])
     if config.cameras is None:
-        config = config.model_copy(update={"path": config.path or BY_LAYOUT[scene.layout]})
+        config = config.model_copy(update={"path": config.path or usual_path(scene)})
     path = _path(config, scene)
     frames = len(path.cameras) if config.cameras else config.frames
     width = config.width

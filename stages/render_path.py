@@ -1,5 +1,7 @@
 """Which cameras the video is seen through: a path fitted to the photos, or cameras from a file."""
 
+import math
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,7 +16,6 @@ if TYPE_CHECKING:
     from nerf.scene import Camera, Scene, Similarity
 
 PathKind = Literal["orbit", "spiral", "interpolated"]
-BY_LAYOUT: dict[str, PathKind] = {"around": "orbit", "forward": "spiral", "inside": "interpolated"}
 LARGEST_SIDE = 2**15  # pixels: four times as many as any screen has
 LEAST_FOCAL = 0.5  # in widths: a pinhole wider than 90 degrees stretches its corners
 
@@ -60,30 +61,53 @@ def path_rays(path: CameraPath, scene: "Scene") -> "Iterator[Rays]":
         yield rays_of_view(bearings, pose, float(near[index]), float(far[index]))
 
 
-def fitted_path(scene: "Scene", kind: PathKind, frames: int) -> CameraPath:
-    """A path among the training photos, through an undistorted camera of median focal length."""
+def usual_path(scene: "Scene") -> PathKind:
+    """Around an object an orbit, if it is known about which axis; before a scene a spiral, if the photos look where
+    it looks; else along the photos."""
+    from nerf.camera_paths import suits_spiral
+
+    if scene.layout == "around" and scene.up_known:
+        return "orbit"
+    return "spiral" if scene.layout == "forward" and suits_spiral(_poses(scene)) else "interpolated"
+
+
+def _poses(scene: "Scene") -> "np.ndarray":
+    """Of the training photos, (n, 3, 4)."""
     import numpy as np
 
+    return np.stack([view.scene_from_camera for view in scene.of_split("train")])
+
+
+def fitted_path(scene: "Scene", kind: PathKind, frames: int) -> CameraPath:
+    """A path among the training photos, through an undistorted camera of median focal length."""
     from nerf import camera_paths
 
-    views = np.stack([view.scene_from_camera for view in scene.of_split("train")])
     path = {
         "orbit": camera_paths.orbit,
         "spiral": camera_paths.spiral,
         "interpolated": camera_paths.interpolated,
     }[kind]
-    return CameraPath((median_camera(scene),) * frames, path(views, frames))
+    poses = _poses(scene)
+    if kind == "interpolated" and scene.layout == "forward":
+        poses = camera_paths.levelled(poses)
+    return CameraPath((median_camera(scene),) * frames, path(poses, frames))
 
 
 def median_camera(scene: "Scene") -> "Camera":
-    """The most usual photo size with the median focal length, as a pinhole with a centred principal point."""
+    """The most usual photo size with the median focal length, as a pinhole with a centred principal point.
+
+    Of sizes that are equally usual (each photo may have been cut by hand) it is the median in shape and in area.
+    """
     import numpy as np
 
     from nerf.scene import Camera
 
     cameras = [scene.cameras[view.camera] for view in scene.of_split("train")]
-    sizes = [(camera.width, camera.height) for camera in cameras]
-    width, height = max(sorted(set(sizes)), key=sizes.count)
+    counts = Counter((camera.width, camera.height) for camera in cameras)
+    most = max(counts.values())
+    usual = [size for size, count in counts.items() if count == most]
+    shape, area = (sorted(each)[len(usual) // 2] for each in ([w / h for w, h in usual], [w * h for w, h in usual]))
+    width, height = round(math.sqrt(area * shape)), round(math.sqrt(area / shape))
     relative = float(np.median([c.params[0] / max(c.width, c.height) for c in cameras]))
     focal = max(relative * max(width, height), LEAST_FOCAL * width)
     return Camera("PINHOLE", width, height, (focal, focal, width / 2, height / 2))

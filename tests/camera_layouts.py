@@ -49,6 +49,22 @@ def wall(rows: int = 4, columns: int = 6, spacing: float = 0.3, distance: float 
     return np.concatenate([look_at(c[None], c + np.array([0.0, 1.0, 0.0])) for c in centres])
 
 
+def survey(lines: int = 6, photos: int = 8, spacing: float = 30.0, height: float = 80.0) -> np.ndarray:
+    """A flight over the ground along x, to and fro: each line of photos is turned against the one before it, and all
+    look straight down."""
+    x, y = np.meshgrid(np.arange(photos) - (photos - 1) / 2, np.arange(lines) - (lines - 1) / 2)
+    centres = np.stack([spacing * x.ravel(), spacing * y.ravel(), np.full(x.size, height)], axis=1)
+    fro = np.repeat(np.arange(lines) % 2, photos) > 0
+    ahead = np.where(fro[:, None], [-1.0, 0, 0], [1.0, 0, 0])
+    downwards = [look_at(c[None], c - [0, 0, 1.0], up=up) for c, up in zip(centres, ahead, strict=True)]
+    return np.concatenate(downwards)
+
+
+def ground(extent: float = 200.0, relief: float = 5.0, count: int = 3000, seed: int = 0) -> np.ndarray:
+    """Points on rough ground at z = 0."""
+    return np.random.default_rng(seed).uniform([-extent, -extent, 0], [extent, extent, relief], size=(count, 3))
+
+
 def wall_points(count: int = 600, depth: float = 0.3, seed: int = 0) -> np.ndarray:
     """Points on a rough wall at y = 0."""
     random = np.random.default_rng(seed)

@@ -3,8 +3,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nerf.camera_paths import average_pose, interpolated, look_at, nearest_rotations, orbit, spiral
-from tests.camera_layouts import ring, room, wall
+from nerf.camera_paths import (
+    average_pose,
+    interpolated,
+    levelled,
+    look_at,
+    nearest_rotations,
+    orbit,
+    spiral,
+    suits_spiral,
+)
+from tests.camera_layouts import ring, room, survey, wall
 
 PATHS = {
     "orbit of a circle": lambda n: orbit(ring(), n),
@@ -105,6 +114,38 @@ def test_spiral_stays_within_the_grid_of_cameras_and_looks_into_the_scene() -> N
     assert (poses[:, :, 3] <= high + 1e-9).all()
     assert np.ptp(poses[:, 0, 3]) > 0.5 * (high - low)[0]
     assert (poses[:, 1, 2] > 0.95).all()
+
+
+@pytest.mark.parametrize(
+    ("cameras", "suits"),
+    [
+        (wall(), True),
+        (ring(arc_deg=30.0), True),
+        (wall(rows=2, columns=30, spacing=0.6), False),  # 18 wide, from 4 away
+        (survey() / np.array([1, 1, 1, 100.0]), False),
+    ],
+    ids=["grid", "arc", "facade", "survey"],
+)
+def test_a_spiral_suits_photos_that_look_where_it_looks(cameras: np.ndarray, suits: bool) -> None:
+    assert suits_spiral(cameras) == suits
+    asked = spiral(cameras, 48) if suits else interpolated(cameras, 48)
+    off = np.degrees(np.arccos(np.clip(asked[:, :, 2] @ cameras[:, :, 2].T, -1, 1))).min(axis=1)
+    assert off.max() < 15  # from the direction of some photo
+
+
+def test_a_video_of_flights_to_and_fro_does_not_flip_with_them() -> None:
+    flown = survey(9, 9) / np.array([1, 1, 1, 100.0])
+    assert turns(interpolated(flown, 120)).max() > 150
+    assert turns(interpolated(levelled(flown), 120)).max() < 1e-3
+    np.testing.assert_allclose(levelled(flown)[:, :, 2:], flown[:, :, 2:], atol=1e-12)
+
+
+def test_photos_of_a_wall_that_lie_on_their_side_are_set_upright() -> None:
+    upright = facing(wall()[:, :, 3], np.random.default_rng(0).normal([0, 1.0, 0], 0.2, (24, 3)))
+    upright[3, :, :3] = [[1, 0, 0], [0, -1, 0], [0, 0, -1]]  # looks straight down: nothing to set
+    turned = upright.copy()
+    turned[::2, :, 0], turned[::2, :, 1] = upright[::2, :, 1], -upright[::2, :, 0]
+    np.testing.assert_allclose(levelled(turned), upright, atol=1e-12)
 
 
 def test_interpolated_leads_past_every_camera_it_has_frames_for() -> None:

@@ -9,7 +9,19 @@ from nerf.camera_paths import nearest_rotations
 from nerf.normalisation import Normalisation, normalise
 from nerf.reconstruction import Reconstruction, angles_deg, extent
 from nerf.region import find_layout
-from tests.camera_layouts import ball, opaque_everywhere, ring, room, room_points, seen_by, wall, wall_points
+from nerf.up_vector import Witness
+from tests.camera_layouts import (
+    ball,
+    ground,
+    opaque_everywhere,
+    ring,
+    room,
+    room_points,
+    seen_by,
+    survey,
+    wall,
+    wall_points,
+)
 
 SCENES = {
     "around": lambda: seen_by(ring(), ball()),
@@ -66,6 +78,19 @@ def test_up_becomes_z_and_the_frame_is_a_rotation(layout: str) -> None:
 def test_a_facade_faces_plus_y() -> None:
     found = normalise(SCENES["forward"](), None)
     np.testing.assert_allclose(found.scene_from_sfm.rotation, np.eye(3), atol=1e-9)
+
+
+@pytest.mark.parametrize("shaken", [0.0, 0.02])
+def test_the_ground_lies_flat_and_in_line_with_the_flight_over_it(shaken: float) -> None:
+    """Where photos look along up their axes have no heading but noise."""
+    poses = survey()
+    poses[:, :, :3] = nearest_rotations(poses[:, :, :3] + np.random.default_rng(1).normal(0, shaken, (48, 3, 3)))
+    found = normalise(seen_by(poses, ground()), None, Witness(0.01, np.array([0.0, 0, 1]), "GPS"))
+    assert (found.layout, found.up.known) == ("forward", True)
+    xyz = found.scene_from_sfm.points(ground(relief=0.0))
+    assert np.ptp(xyz[:, 2]) < 0.06
+    east = found.scene_from_sfm.rotation @ [1.0, 0, 0]
+    assert np.abs(east).max() > 0.998
 
 
 @pytest.mark.parametrize("layout", SCENES)

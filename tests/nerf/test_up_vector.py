@@ -3,8 +3,8 @@ import pytest
 
 from nerf.camera_paths import nearest_rotations
 from nerf.reconstruction import angles_deg
-from nerf.up_vector import find_up
-from tests.camera_layouts import ball, ring, seen_by, wall
+from nerf.up_vector import find_up, up_by_places
+from tests.camera_layouts import ball, ring, seen_by, survey, wall
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -71,3 +71,56 @@ def test_opposite_cameras_have_no_up_rather_than_nan() -> None:
     up = find_up(seen_by(poses, ball()))
     assert not up.known
     assert np.isfinite(up.direction).all()
+
+
+@pytest.mark.parametrize("turned", [90.0, -90.0])
+@pytest.mark.parametrize("seed", range(3))
+def test_photos_all_around_that_lie_on_their_side_take_up_from_their_standpoints(turned: float, seed: int) -> None:
+    """Their upper edges cancel: the median of them is noise, and lies in the ring's plane."""
+    random = np.random.default_rng(seed)
+    poses = rolled(ring(count=24), turned + random.normal(0, 3, 24))
+    poses[:, :, 3] += random.normal(0, 0.1, (24, 3))
+    up = find_up(seen_by(poses, ball()))
+    assert (up.known, up.source) == (True, "level standpoints")
+    assert 0 < angles_deg(up.direction, UP) < 5
+
+
+def test_photos_on_their_side_that_look_neither_down_nor_up_have_no_up() -> None:
+    assert not find_up(seen_by(rolled(ring(height=0.1), np.full(16, 90.0)), ball())).known
+
+
+def test_flights_to_and_fro_over_the_ground_know_up() -> None:
+    up = find_up(seen_by(survey(), ball()))
+    assert (up.known, up.source) == (True, "level standpoints")
+    assert angles_deg(up.direction, UP) < 1e-5
+
+
+@pytest.mark.parametrize(("error_m", "right"), [(0.5, True), (2.0, True), (6.0, False)])
+def test_places_tell_the_ground_from_a_wall_unless_they_are_too_far_off(error_m: float, right: bool) -> None:
+    """All photos are turned one way, in a frame of its own scale and turn; 60 m of flight to either side."""
+    turn = nearest_rotations(np.random.default_rng(3).normal(size=(3, 3)))
+    poses = survey(lines=7)
+    poses[:, :, :3] = poses[0, :, :3]
+    sfm = seen_by(poses, ball()).in_frame(turn, np.array([5.0, 3, -2]), 0.1)
+    enu_from_sfm = np.eye(4)
+    enu_from_sfm[:3, :3] = 10 * turn.T
+    places = up_by_places(sfm.centres, enu_from_sfm, error_m)
+    assert places.tilt == pytest.approx(error_m / 60, rel=1e-6)  # the standard deviation of 7 lines, 30 m apart
+    assert find_up(sfm).source == "upper edges"
+    up = find_up(sfm, places)
+    assert (up.known, up.source) == (True, "GPS" if right else "upper edges")
+    assert (angles_deg(up.direction, turn @ UP) < 1e-5) == right
+
+
+def test_the_more_certain_of_horizons_and_places_decides() -> None:
+    tilted = np.eye(4)
+    tilted[:3, :3] = nearest_rotations(np.array([[1.0, 0, 0], [0, 1, 0.05], [0, -0.05, 1]]))
+    for roll, source in ((0.0, "level horizons"), (8.0, "GPS")):
+        poses = rolled(ring(count=24), np.random.default_rng(0).normal(0, roll, 24))
+        poses[:, 2, 3] += np.random.default_rng(1).normal(0, 1, 24)
+        scene = seen_by(poses, ball())
+        assert find_up(scene, up_by_places(scene.centres, tilted, 0.05)).source == source
+
+
+def test_places_along_a_line_leave_open_how_the_scene_rolls_about_it() -> None:
+    assert up_by_places(np.linspace(0, 90, 10)[:, None] * [1.0, 2, 0], np.eye(4), 0.1).tilt > 1e9

@@ -244,6 +244,19 @@ def test_a_plain_ends_at_the_box_or_where_the_photos_end(run_mesh):
     assert "where too few photos look" in near_part.line
 
 
+def test_flat_scenes_have_smaller_voxels(run_mesh):
+    """The same plain, by points on it that photos have which do not stand around it."""
+    points = np.random.default_rng(0).uniform([-0.9, -0.9, -0.25], [0.9, 0.9, -0.15], (1000, 3)).astype(np.float32)
+    scene = replace(scene_around(), layout="inside")
+    cube, _ = run_mesh(Solid(plain), scene=scene, frame="scene")
+    result, folder = run_mesh(Solid(plain), folder="flat", scene=scene, points=points, frame="scene")
+    assert cube.facts["voxel"] == pytest.approx(VOXEL) and 0.4 * VOXEL < result.facts["voxel"] < 0.6 * VOXEL
+    assert (result.facts["resolution"], result.facts["ends"]) == (48, cube.facts["ends"])
+    assert result.facts["surface_area"] == pytest.approx(cube.facts["surface_area"], rel=0.02)
+    heights = np.asarray(trimesh.load_mesh(folder / "mesh.ply", process=False).vertices)[:, 2]
+    assert np.abs(heights + 0.2).max() < 0.5 * VOXEL
+
+
 def test_decimation_leaves_as_many_faces_as_asked_for(run_mesh):
     result, _ = run_mesh(Solid(ball), max_faces=1000)
     assert 900 <= result.facts["faces"] <= 1000
@@ -273,6 +286,19 @@ def test_a_lattice_beyond_memory_is_refused_with_one_that_fits(run_mesh, monkeyp
     with pytest.raises(StageError, match="not enough memory for the mesh") as error:
         run_mesh(Solid(ball), resolution=64)
     assert error.value.hint == "Try --mesh.resolution 32."
+
+
+def test_the_resolution_that_fits_into_seconds_is_that_of_the_box(run_mesh, monkeypatch):
+    asked = []
+    monkeypatch.setattr(mesh, "yardstick", lambda: 0.02)
+    monkeypatch.setattr(mesh, "seconds_per_density", lambda train, box, chunk: asked.append(box) or 2e-7)
+    points = np.random.default_rng(0).uniform([-0.9, -0.9, -0.25], [0.9, 0.9, -0.15], (1000, 3)).astype(np.float32)
+    for layout in ("around", "inside"):
+        scene = replace(scene_around(), layout=layout)
+        run_mesh(Solid(plain), scene=scene, points=points, resolution=None, seconds=1.0)
+    cube, flat = asked
+    assert np.ptp(cube, axis=0).tolist() == [1.8, 1.8, 1.8]
+    assert np.ptp(flat, axis=0) == pytest.approx([1.8, 1.8, 0.28], abs=0.01)
 
 
 def test_fog_becomes_a_mesh_that_says_it_is_fog(run_mesh, progress):

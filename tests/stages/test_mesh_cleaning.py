@@ -156,4 +156,4 @@ def sheet(low, high):
     ],
 )
 def test_the_end_of_a_surface_is_named(surface, words):
-    assert openness(surface, 0.9, 0.02) == words
+    assert openness(surface, np.array([[-0.9] * 3, [0.9] * 3]), 0.02) == words

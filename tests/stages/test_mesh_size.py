@@ -2,11 +2,28 @@
 
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stages.mesh_size import ONCE, affordable_resolution, resolution_in, seconds_of, yardstick
+from nerf import REGION_HALF
+from stages.mesh_size import (
+    FEWEST_POINTS,
+    MARGIN,
+    ONCE,
+    affordable_resolution,
+    flatness,
+    lattice_box,
+    points_along,
+    resolution_in,
+    seconds_of,
+    yardstick,
+)
+
+CUBE = np.array([[-REGION_HALF] * 3, [REGION_HALF] * 3])
+GROUND = np.random.default_rng(0).uniform([-0.8, -0.8, -0.3], [0.8, 0.8, -0.1], (2000, 3))
+FACADE = GROUND[:, [0, 2, 1]] * [1, 1, 0.2]
 
 
 def test_the_resolution_grows_with_the_time_and_falls_with_what_things_take():
@@ -35,3 +52,46 @@ def test_the_yardstick_is_the_best_of_a_few(monkeypatch: pytest.MonkeyPatch):
     ticks = iter([0.0, 5.0, 10.0, 12.0, 20.0, 29.0])
     monkeypatch.setattr("stages.mesh_size.time", SimpleNamespace(perf_counter=lambda: next(ticks)))
     assert yardstick() == 2.0
+
+
+@pytest.mark.parametrize(("points", "flat"), [(GROUND, 2), (FACADE, 1)])
+@pytest.mark.parametrize("layout", ["forward", "inside"])
+def test_the_lattice_of_a_flat_scene_spans_the_slice_that_its_points_lie_in(points, flat, layout):
+    stray = np.array([[0.1, 0.1, 0.85], [0.5, 0.85, 0.1], [0.0, 0.0, 30.0]])
+    box = lattice_box(layout, np.concatenate([points, stray]))
+    ends = np.quantile(points[:, flat], [0, 1]) + np.array([-1, 1]) * 2 * REGION_HALF * MARGIN
+    np.testing.assert_allclose(box[:, flat], ends, atol=0.02)
+    rest = [axis for axis in range(3) if axis != flat]
+    np.testing.assert_array_equal(box[:, rest], CUBE[:, rest])
+
+
+@pytest.mark.parametrize(
+    ("points", "layout"),
+    [
+        (GROUND, "around"),  # the vase on the table is bare
+        (GROUND * [0.5, 0.5, 1], "forward"),  # a poster on a bare wall
+        (GROUND * [1, 1, 5] + [0, 0, 0.8], "forward"),
+        (GROUND[: FEWEST_POINTS - 1], "forward"),
+        (GROUND[:0], "forward"),
+        (GROUND + np.array([0, 0, 5]), "inside"),
+    ],
+)
+def test_the_lattice_spans_the_region_where_points_do_not_tell_that_it_is_flat(points, layout):
+    np.testing.assert_array_equal(lattice_box(layout, points), CUBE)
+
+
+@pytest.mark.parametrize("resolution", [16, 48, 77, 256])
+def test_a_flat_box_has_as_many_points_and_smaller_voxels(resolution):
+    assert points_along(CUBE, resolution) == resolution and flatness(CUBE) == pytest.approx(1)
+    box = lattice_box("forward", GROUND)
+    along = points_along(box, resolution)
+    per_edge = (box[1] - box[0]) / 1.8 * (along - 1) + 1
+    assert along > 1.3 * resolution
+    assert per_edge.prod() == pytest.approx(resolution**3, rel=2 / resolution)
+    cut = flatness(box) * resolution**2
+    assert cut == pytest.approx(along**2, rel=2 / resolution)
+
+
+def test_a_flat_scene_has_more_surface_for_its_points_which_takes_time():
+    assert seconds_of(128, 2e-7, 0.02, 2.0) > seconds_of(128, 2e-7, 0.02)
+    assert resolution_in(10.0, 2e-7, 0.02, 3.0) < resolution_in(10.0, 2e-7, 0.02)

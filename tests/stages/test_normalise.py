@@ -1,15 +1,17 @@
 import json
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from nerf.camera_paths import nearest_rotations
 from nerf.scene import Camera
 from stages import normalise
 from stages.contract import StageError
 from stages.files import read_json, read_scene, read_tensors
-from stages.photos import Photo, write_photos
+from stages.photos import Photo, read_photos, write_photos
 from tests.camera_layouts import ball, ring, seen_by
 
 CAMERA = Camera("PINHOLE", 400, 400, (400.0, 400.0, 200.0, 200.0))
@@ -20,9 +22,16 @@ def inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Builds the folders of ingest and sfm for a ring of photos around a ball of points; COLMAP lists them reversed."""
 
     def build(
-        count: int = 17, transparent: int = 0, test_files: list[str] | None = None, one_place: bool = False
+        count: int = 17,
+        transparent: int = 0,
+        test_files: list[str] | None = None,
+        one_place: bool = False,
+        crooked: bool = False,
     ) -> dict[str, Path]:
         poses = ring(count)
+        if crooked:
+            shaken = poses + np.random.default_rng(0).normal(0, 0.02, poses.shape)
+            poses = np.concatenate([nearest_rotations(shaken[:, :, :3]), shaken[:, :, 3:]], axis=2)
         if one_place:
             poses[:, :, 3] = 0
         scene = seen_by(poses, np.zeros((0, 3)) if one_place else ball())
@@ -34,7 +43,7 @@ def inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
             for i in range(count)
         ]
         write_photos(folders["ingest"], photos, [], {})
-        (folders["sfm"] / "registration.json").write_text(json.dumps({"test_files": test_files}))
+        (folders["sfm"] / "registration.json").write_text(json.dumps({"test_files": test_files, "georeference": None}))
         model = SimpleNamespace(
             cameras=[CAMERA],
             images=[
@@ -85,6 +94,21 @@ def test_the_line_says_what_was_decided(inputs, progress) -> None:
     result = run(inputs(), progress)
     assert result.line == "360° around an object, background unbounded · up from level horizons"
     assert result.facts["train"] + result.facts["test"] == 17
+
+
+@pytest.mark.parametrize(("altitude_m", "source"), [(408.0, "GPS"), (None, "level standpoints")])
+def test_up_is_that_of_the_photos_gps_where_it_tells_heights(inputs, progress, altitude_m, source) -> None:
+    """Photos that are not quite level, half of them with places off by 0.1 m of hundreds."""
+    folders = inputs(crooked=True)
+    photos = read_photos(folders["ingest"])
+    located = [replace(photo, latitude=47.0, longitude=8.0, altitude_m=altitude_m) for photo in photos]
+    write_photos(folders["ingest"], [*located[:9], *photos[9:]], [], {})
+    georeference = {"enu_from_sfm": np.diag([100.0, 100, 100, 1]).tolist(), "error_m": 0.1}
+    registration = {"test_files": None, "georeference": georeference}
+    (folders["sfm"] / "registration.json").write_text(json.dumps(registration))
+    result = run(folders, progress)
+    assert result.line.endswith(f"up from {source}")
+    assert (result.facts["up"], result.facts["up_known"]) == (source, True)
 
 
 def test_alpha_makes_the_background_known(inputs, progress) -> None:

@@ -155,10 +155,27 @@ def test_nothing_is_timed_where_nothing_is_open(inputs, progress) -> None:
     assert (config.frames, config.width, config.fps, progress.notes) == (8, 80, 2, [])
 
 
-@pytest.mark.parametrize(("layout", "path"), [("around", "orbit"), ("forward", "spiral"), ("inside", "interpolated")])
-def test_the_layout_chooses_the_path(inputs, progress, layout: Layout, path: str) -> None:
-    write_json(inputs["normalise"] / "scene.json", scene_with(wall(), layout).to_json())
+@pytest.mark.parametrize(
+    ("poses", "layout", "up_known", "path"),
+    [
+        (wall(), "around", True, "orbit"),
+        (ring(), "around", False, "interpolated"),  # about which axis?
+        (wall(), "forward", False, "spiral"),
+        (wall(columns=40), "forward", True, "interpolated"),  # 12 wide, from 4 away
+        (wall(), "inside", True, "interpolated"),
+    ],
+)
+def test_the_layout_chooses_the_path(inputs, progress, poses, layout: Layout, up_known: bool, path: str) -> None:
+    scene = replace(scene_with(poses, layout), up_known=up_known)
+    write_json(inputs["normalise"] / "scene.json", scene.to_json())
     assert render.plan(render.Config(), inputs, progress).path == path
+
+
+def test_along_photos_that_face_one_way_the_horizon_is_level() -> None:
+    poses = wall(columns=40)
+    poses[::2, :, :2] *= -1  # upside down
+    path = fitted_path(scene_with(poses, "forward"), "interpolated", 30).poses
+    assert (path[:, 2, 1] < -0.99).all()
 
 
 def test_a_written_path_can_be_given_back_as_cameras(inputs, progress, tmp_path: Path) -> None:
@@ -253,6 +270,23 @@ def test_the_median_camera_has_no_distortion_and_the_photos_angle_of_view() -> N
     half = resized(camera, 80)
     assert (half.width, half.height, half.params) == (80, 60, (75.0, 75.0, 40.0, 30.0))
     assert fitted_path(scene, "orbit", 7).cameras == (camera,) * 7
+
+
+@pytest.mark.parametrize(
+    ("sizes", "size"),
+    [
+        ([(160, 120), (160, 120), (120, 160)], (160, 120)),
+        ([(120, 160), (160, 120)], (160, 120)),
+        ([(50, 40), (400, 301), (404, 300), (410, 300), (300, 402)], (400, 301)),  # each cut by hand
+        ([(100, 80), (100, 80), (400, 301), (404, 300), (410, 300)], (100, 80)),
+    ],
+)
+def test_the_median_camera_has_the_usual_size_or_the_median_of_those_that_are_equally_usual(sizes, size) -> None:
+    cameras = [Camera("PINHOLE", w, h, (150.0, 150.0, w / 2, h / 2)) for w, h in sizes]
+    scene = scene_with(ring(1 + len(sizes)))  # the first is a test photo
+    views = [replace(view, camera=max(0, index - 1)) for index, view in enumerate(scene.views)]
+    camera = median_camera(replace(scene, cameras=tuple(cameras), views=tuple(views)))
+    assert (camera.width, camera.height) == size
 
 
 def test_a_fisheye_is_shown_no_wider_than_a_right_angle() -> None:
