@@ -31,6 +31,8 @@ from stages.ingest_words import (
     say_findings,
     say_masks,
     say_refused,
+    say_unused,
+    set_aside,
     shown,
     summary,
     too_few,
@@ -124,6 +126,7 @@ class _Taken:
 def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> StageResult:
     """Decode the photos of ``config`` into ``folder``. Raises StageError if fewer than two can be used."""
     source = find_source(config.photos, config.cameras)
+    say_unused(source, progress)
     with _writing(folder):
         (folder / "images").mkdir(parents=True, exist_ok=True)
         waiting = folder / "waiting"
@@ -176,7 +179,8 @@ def _take_all(
     if source.kind == "video":
         return _take_video(source.files[0], config.frames, waiting, progress), [], []
     masks, strays = pair_masks([source.name(file) for file in source.files], source.masks)
-    notes = [f"{shown(f'masks/{file.name}')} is no photo's mask, which are called NAME.png" for file in strays]
+    notes = set_aside(source.set_aside)
+    notes += [f"{shown(f'masks/{file.name}')} is no photo's mask, which are called NAME.png" for file in strays]
     outcomes = _decode_all(source, masks, waiting, progress)
     refused = [outcome for outcome in outcomes if isinstance(outcome, Refusal)]
     return [outcome for outcome in outcomes if isinstance(outcome, _Taken)], refused, notes

@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 FLOW_WIDTH = 500  # pixels of the frames on which motion is measured
 MOST_CORNERS, FEWEST_CORNERS = 150, 10
 # All in widths of the picture. Photos should share 60 to 80 % with their neighbours: frames a LONG_STEP apart do so
-# with three on each side. A clip that gives few frames is taken in shorter steps, down to STEP, until they are PLENTY: more
-# would hardly tell more of the scene, and each takes as long as any photo.
+# with three on each side. A clip that gives few frames is taken in shorter steps, down to STEP, until they are PLENTY:
+# more would hardly tell more of the scene, and each takes as long as any photo.
 STEP, LONG_STEP = 0.05, 0.12
 PLENTY = 100
 WAY_PER_SECOND = 0.2  # of somebody who walks around a thing or through a room, filming
