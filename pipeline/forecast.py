@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from pipeline.runner import Runner
 
 UNREADABLE_PIXELS = 2_000_000  # that a photo is taken to have until ingest says what is wrong with it
-VIDEO_FRAMES = 40  # photos that a clip is taken to become, before that is known
 
 
 class Photos(NamedTuple):
@@ -33,13 +32,15 @@ def photos_of(settings: Settings) -> Photos | None:
     """What is to be seen of the photos without decoding any; None where they are gone or cannot be used."""
     from stages.decoding import pixel_count
     from stages.sources import find_source
+    from stages.video_frames import expected_frames
 
     try:
         source = find_source(settings.ingest.photos, settings.ingest.cameras)
+        if source.kind == "video":
+            number, width, height = expected_frames(source.files[0], settings.ingest.frames)
+            return Photos(number, width * height / 1e6)
     except StageError:  # ingest says what is wrong with them, where it has to run at all
         return None
-    if source.kind == "video":
-        return Photos(VIDEO_FRAMES, 1.0)
     pixels = pixel_count(source.files[len(source.files) // 2]) or UNREADABLE_PIXELS
     return Photos(len(source.files), pixels / 1e6)
 

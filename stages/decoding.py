@@ -11,6 +11,9 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from stages.colour_profiles import to_srgb
+from stages.panoramas import is_panorama
+
 if TYPE_CHECKING:
     import numpy as np
     from PIL import Image
@@ -19,12 +22,12 @@ MAX_PIXELS = 250_000_000
 MIN_SIDE_PX = 16
 # EPS and its like run interpreters; RAW files would be read as their thumbnails.
 _FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP", "GIF", "PPM", "HEIF", "AVIF", "JPEG2000")
+_LOSSY = ("JPEG", "MPO", "HEIF", "AVIF")
 _RAW = (".dng", ".cr2", ".cr3", ".nef", ".nrw", ".arw", ".srf", ".raf", ".orf", ".rw2", ".pef", ".raw", ".iiq")
 # Focal lengths over the longer side: 157 to 6 degrees through a pinhole, what COLMAP accepts. Others are not believed,
 # neither of EXIF nor of a lens that was fitted.
 FOCAL_RANGE = (0.1, 10.0)
 _ALTITUDES_M = (-500.0, 20_000.0)  # of shores and aircraft: beyond, a receiver has not found its place
-_SRGB_TOLERANCE = 2  # of 255: profiles closer than this to sRGB are sRGB written by another hand
 
 
 class DecodeError(Exception):
@@ -57,8 +60,8 @@ class Decoded:
     """One image, upright, sRGB. ``focal_px`` is for these pixels, None where EXIF tells none or an absurd one.
 
     ``suffix`` is ".jpg" or ".png" if the file's own bytes already say exactly this to any program (8-bit RGB or
-    RGBA, sRGB, upright, one frame), so that they can be copied; otherwise None. ``notes`` tell what was assumed,
-    ``exposure_ev`` is what :func:`exposure_from_exif` tells.
+    RGBA, sRGB, upright, one frame), so that they can be copied; otherwise None. ``lossy`` is a file that was compressed
+    with losses. ``notes`` tell what was assumed, ``exposure_ev`` is what :func:`exposure_from_exif` tells.
     """
 
     pixels: "np.ndarray"  # (h, w, 3 or 4) uint8
@@ -68,6 +71,8 @@ class Decoded:
     place: Place
     exposure_ev: float | None
     suffix: str | None
+    lossy: bool
+    panorama: bool
     notes: tuple[str, ...]
 
 
@@ -76,9 +81,9 @@ def decode(path: Path) -> Decoded:
     if path.suffix.lower() in _RAW:
         raise DecodeError("camera raw files are not read; export JPEG, PNG or TIFF")
     with _open(path) as image:
-        stored_plainly = _is_plain(image)
+        stored_plainly, lossy = _is_plain(image), _is_lossy(image, path)
         _load(image)
-        return _convert(image, stored_plainly)
+        return _convert(image, stored_plainly, lossy)
 
 
 @cache
@@ -154,13 +159,13 @@ def _unrecognised(path: Path) -> str:
     return "not an image of a known format"
 
 
-def _convert(image: "Image.Image", stored_plainly: bool) -> Decoded:
+def _convert(image: "Image.Image", stored_plainly: bool, lossy: bool) -> Decoded:
     """The loaded image as upright sRGB."""
     import numpy as np
 
     notes: list[str] = []
     tags, orientation = _exif(image, notes)
-    converted, is_srgb = _to_srgb(_to_eight_bit(image), image.info.get("icc_profile"), notes)
+    converted, is_srgb = to_srgb(_to_eight_bit(image), image.info.get("icc_profile"), notes)
     pixels = np.asarray(upright(converted, orientation))
     opaque = pixels.shape[2] == 4 and bool((pixels[..., 3] == 255).all())
     pixels = np.ascontiguousarray(pixels[..., :3] if opaque else pixels)
@@ -176,6 +181,8 @@ def _convert(image: "Image.Image", stored_plainly: bool) -> Decoded:
         place=place_from_exif(tags),
         exposure_ev=exposure_from_exif(tags),
         suffix=(".png" if image.format == "PNG" else ".jpg") if copy else None,
+        lossy=lossy,
+        panorama=is_panorama(pixels, image.info.get("xmp")),
         notes=tuple(notes),
     )
 
@@ -187,6 +194,13 @@ def _is_plain(image: "Image.Image") -> bool:
     if image.format != "PNG" or getattr(image, "n_frames", 1) > 1 or "transparency" in image.info:
         return False
     return image.tile[0].args in ("RGB", "RGBA")  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def _is_lossy(image: "Image.Image", path: Path) -> bool:
+    if image.format == "WEBP":
+        with path.open("rb") as file:
+            return file.read(16).endswith(b"VP8 ")
+    return image.format in _LOSSY
 
 
 def _frame_count(image: "Image.Image") -> int:
@@ -240,40 +254,6 @@ def _quantised(image: "Image.Image") -> "Image.Image":
     if not (values.min() >= 0 and values.max() <= limit):
         raise DecodeError(f"pixel values from {values.min()} to {values.max()}; export it with 8 or 16 bits")
     return _pillow().fromarray(np.rint(values * (255 / limit)).astype(np.uint8))
-
-
-def _to_srgb(image: "Image.Image", profile: bytes | None, notes: list[str]) -> "tuple[Image.Image, bool]":
-    """``image`` as RGB or RGBA in sRGB, and whether its values already were sRGB."""
-    import io
-
-    from PIL import ImageCms
-
-    mode = "RGBA" if image.mode in ("LA", "RGBA") else "RGB"
-    if not profile:
-        return image.convert(mode), True
-    source = image.convert("RGBA") if image.mode == "LA" else image
-    try:
-        transform = ImageCms.buildTransform(
-            ImageCms.ImageCmsProfile(io.BytesIO(profile)), ImageCms.createProfile("sRGB"), source.mode, mode
-        )
-        if source.mode == mode and _is_identity(transform, mode):
-            return source, True
-        converted = ImageCms.applyTransform(source, transform) or source  # None only for in-place work
-    except (ImageCms.PyCMSError, OSError, ValueError) as error:
-        notes.append(f"colour profile ignored ({error})")
-        return image.convert(mode), False
-    return converted, False
-
-
-def _is_identity(transform: Any, mode: str) -> bool:
-    import numpy as np
-    from PIL import ImageCms
-
-    levels = np.arange(0, 256, 15, dtype=np.uint8)
-    cube = np.stack(np.meshgrid(levels, levels, levels), axis=-1).reshape(len(levels), -1, 3)
-    before = _pillow().fromarray(cube).convert(mode)
-    after = ImageCms.applyTransform(before, transform)
-    return int(np.abs(np.asarray(before, int) - np.asarray(after, int)).max()) <= _SRGB_TOLERANCE
 
 
 def upright(image: "Image.Image", orientation: int) -> "Image.Image":

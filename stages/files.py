@@ -1,4 +1,4 @@
-"""Files: JSON, safetensors and PNG, written so that equal content is equal bytes, and durably where that matters."""
+"""Files: JSON, safetensors, PNG and JPEG, written so that equal content is equal bytes; durably where it matters."""
 
 import json
 import os
@@ -109,6 +109,14 @@ def write_png(path: Path, pixels: "np.ndarray") -> None:
 
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(pixels).save(path, format="PNG", compress_level=1)
+
+
+def write_jpeg(path: Path, pixels: "np.ndarray", quality: int) -> None:
+    """Write (height, width, 3) uint8, colours at full size: averaged over 2 × 2 pixels they would lose more than all
+    the rest."""
+    from PIL import Image
+
+    Image.fromarray(pixels).save(path, format="JPEG", quality=quality, subsampling=0)
 
 
 def read_scene(folder: Path) -> "Scene":

@@ -1,8 +1,9 @@
 """Stage ingest: every photo decoded once, upright, 8-bit sRGB, under an ASCII name; what is unusable named.
 
-A file that already is plain (8-bit RGB or RGBA, sRGB, upright JPEG or PNG) is copied byte for byte; everything
-else is written as PNG. Each photo is decoded by one worker and dropped again, so memory holds one per worker, and of
-each photo a thumbnail, and one of its mask. The frames that are taken from a video are written as JPEG.
+A file that already is plain (8-bit RGB or RGBA, sRGB, upright JPEG or PNG) is copied byte for byte; everything else is
+written anew: as JPEG of high quality where the file was compressed with losses and has no alpha, otherwise as PNG. Each
+photo is decoded by one worker and dropped again, so memory holds one per worker, and of each photo a thumbnail, and one
+of its mask. The frames that are taken from a video are written as JPEG.
 """
 
 import hashlib
@@ -20,7 +21,7 @@ from stages.ascii_names import ascii_files
 from stages.contract import Inputs, OptionalSourcePath, Progress, SourcePath, StageConfig, StageError, StageResult
 from stages.decoding import CameraKey, DecodeError, Place, decode
 from stages.device import processors
-from stages.files import write_json, write_png
+from stages.files import write_jpeg, write_json, write_png
 from stages.ingest_words import (
     all_plain,
     all_the_same,
@@ -30,12 +31,15 @@ from stages.ingest_words import (
     say_findings,
     say_masks,
     say_refused,
+    say_unused,
+    set_aside,
     shown,
     summary,
     too_few,
 )
 from stages.masks import pair_masks, read_mask
 from stages.near_duplicates import near_duplicates, small, thumbnail
+from stages.panoramas import CUT_IT
 from stages.photos import Box, Photo, Refusal, opaque_box, write_photos
 from stages.sharpness import one_colour, relative_sharpness, sharpness
 from stages.sources import Source, find_source
@@ -45,7 +49,7 @@ if TYPE_CHECKING:
     import numpy as np
 
 NEEDS: tuple[str, ...] = ()
-VERSION = 6
+VERSION = 7
 RESUMES = False
 NOTES = "notes.json"
 LINKS = ("photos.json", NOTES, "images", "masks")
@@ -54,6 +58,9 @@ UNKEYED = ("cameras",)
 
 _MAX_WORKERS = 8  # each holds a few copies of one photo, up to 250 megapixels
 _BYTES_PER_PIXEL = 24  # of a photo while it is decoded, turned, packed and looked at; 22 measured for 16 bits
+# 46 to 51 dB from the pixels, in a third of a PNG's bytes (fox, fern, sceaux_castle, banana, fountain_p11): far closer
+# than the file, at 90 or so, is to what the camera saw.
+_JPEG_QUALITY = 97
 _NO_PLACE = Place()
 
 
@@ -119,6 +126,7 @@ class _Taken:
 def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> StageResult:
     """Decode the photos of ``config`` into ``folder``. Raises StageError if fewer than two can be used."""
     source = find_source(config.photos, config.cameras)
+    say_unused(source, progress)
     with _writing(folder):
         (folder / "images").mkdir(parents=True, exist_ok=True)
         waiting = folder / "waiting"
@@ -171,7 +179,8 @@ def _take_all(
     if source.kind == "video":
         return _take_video(source.files[0], config.frames, waiting, progress), [], []
     masks, strays = pair_masks([source.name(file) for file in source.files], source.masks)
-    notes = [f"{shown(f'masks/{file.name}')} is no photo's mask, which are called NAME.png" for file in strays]
+    notes = set_aside(source.set_aside)
+    notes += [f"{shown(f'masks/{file.name}')} is no photo's mask, which are called NAME.png" for file in strays]
     outcomes = _decode_all(source, masks, waiting, progress)
     refused = [outcome for outcome in outcomes if isinstance(outcome, Refusal)]
     return [outcome for outcome in outcomes if isinstance(outcome, _Taken)], refused, notes
@@ -231,15 +240,20 @@ def _take(file: Path, name: str, mask: Path | None, waiting: Path) -> _Taken | R
         taken_mask = mask and _take_mask(mask, decoded.camera_key, waiting.with_suffix(".mask"))
     except DecodeError as error:
         return Refusal(name, str(error))
+    if decoded.panorama:
+        return Refusal(name, f"a panorama: {CUT_IT.format('PHOTO')}")
     pixels = decoded.pixels
+    lossy = decoded.lossy and pixels.shape[2] == 3
     if decoded.suffix:
         shutil.copyfile(file, waiting)
+    elif lossy:
+        write_jpeg(waiting, pixels, _JPEG_QUALITY)
     else:
         write_png(waiting, pixels)
     return _Taken(
         name=name,
         waiting=waiting,
-        suffix=decoded.suffix or ".png",
+        suffix=decoded.suffix or (".jpg" if lossy else ".png"),
         camera_key=decoded.camera_key,
         sharpness=sharpness(pixels),
         focal_source=decoded.focal_source,

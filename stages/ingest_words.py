@@ -1,11 +1,14 @@
 """What ingest says: files that are refused, what photos are like beside each other, the summary."""
 
-from collections.abc import Sequence
+import os
+import shlex
+from collections.abc import Mapping, Sequence
 
 from stages.contract import Progress, StageError, listed
 from stages.photos import Photo, Refusal
 from stages.sharpness import BLURRED
-from stages.sources import Source
+from stages.sources import Source, unused_cameras, unused_masks
+from stages.twins import is_mask
 
 MAX_NOTES = 10
 HINT = "Take 20 to 100 overlapping photos of one scene from different places and put them into one folder."
@@ -38,6 +41,28 @@ def say_everything(refused: Sequence[Refusal], notes: Sequence[str], progress: P
         progress.note(f"refused {', '.join(names)}: {reason}")
     for note in notes:
         progress.note(note)
+
+
+def say_unused(source: Source, progress: Progress) -> None:
+    """What lies with the photos and could be used, and how."""
+    if (cameras := unused_cameras(source)) is not None:
+        place, option = shown(str(cameras)), shown(f"--cameras {shlex.quote(str(cameras))}")
+        progress.note(f"cameras lie in {place} and are not used: {option} would use them")
+    if unused_masks(source):
+        progress.note("masks lie in mask/ and are not used: they would be if it were called masks/ (black is ignored)")
+
+
+def set_aside(files: Mapping[str, str]) -> list[str]:
+    """Notes on files that are not taken for photos, {file: the photo that it belongs to}."""
+    if not files:
+        return []
+    named = [f"{shown(name)} (of {shown(photo)})" for name, photo in sorted(files.items())]
+    count = "1 file is" if len(files) == 1 else f"{len(files)} files are"
+    notes = [f"{count} set aside, named as a mask, depth map or other copy of a photo: {listed(named, 3)}"]
+    if mask := next((name for name in sorted(files) if is_mask(name)), None):
+        place = f"masks/{os.path.splitext(files[mask])[0]}.png"
+        notes.append(f"to be used as a mask, whose black is ignored, {shown(mask)} would have to be {shown(place)}")
+    return notes
 
 
 def say_findings(photos: Sequence[Photo], progress: Progress) -> None:

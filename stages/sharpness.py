@@ -14,12 +14,13 @@ BLURRED = 0.25
 
 
 def sharpness(pixels: "np.ndarray") -> float:
-    """Variance of the Laplacian (Pech-Pacheco et al. 2000) of the grey image, at most WIDTH pixels wide."""
+    """Variance of the Laplacian (Pech-Pacheco et al. 2000) of the grey image, at most WIDTH pixels wide, of (h, w) or
+    (h, w, 3 or 4) uint8."""
     import cv2
     import numpy as np
 
-    grey = cv2.cvtColor(pixels[..., :3], cv2.COLOR_RGB2GRAY)
-    if pixels.shape[2] == 4:  # what is transparent has no sharpness
+    grey = pixels if pixels.ndim == 2 else cv2.cvtColor(pixels[..., :3], cv2.COLOR_RGB2GRAY)
+    if pixels.shape[2:] == (4,):  # what is transparent has no sharpness
         grey = np.rint(grey * (pixels[..., 3] / 255.0)).astype(np.uint8)
     height, width = grey.shape
     if width > WIDTH:

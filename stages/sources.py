@@ -6,12 +6,14 @@ Cheap: lists folders and reads at most the JSON of a transforms file, never an i
 import json
 import os
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from stages.contract import StageError
+from stages.twins import twins
 
 if TYPE_CHECKING:
     import numpy as np
@@ -44,7 +46,8 @@ class Source:
     one COLMAP model. ``files`` are the files to decode, in order of their names relative to ``root``; some may turn
     out to be no images, and files named by a transforms file may be missing. ``frames`` maps each file_path of a
     transforms file, as it is written there, to the name of its photo. ``masks`` are all files in folders named masks,
-    each after the name, relative to ``root``, that it would have without such a folder in it.
+    each after the name, relative to ``root``, that it would have without such a folder in it. ``set_aside`` are files
+    in a folder of photos that belong to one of them by their names, as a depth map does, and that photo, by name.
     """
 
     kind: SourceKind
@@ -53,6 +56,7 @@ class Source:
     files: tuple[Path, ...]
     frames: Mapping[str, str] = field(default_factory=dict)
     masks: tuple[tuple[str, Path], ...] = ()
+    set_aside: Mapping[str, str] = field(default_factory=dict)
 
     def name(self, file: Path) -> str:
         """The name of one of ``files``: relative to ``root``, with forward slashes, always encodable as UTF-8."""
@@ -97,9 +101,35 @@ def _source(photos: Path, cameras: Path | None) -> Source:
     files = list_photos(root)
     if _is_video(files[0]):
         return Source("video", root, None, files)
+    set_aside = twins([_name(root, file) for file in files])
+    files = tuple(file for file in files if _name(root, file) not in set_aside)
     if cameras is not None:
-        return Source("colmap", root, _colmap_model(cameras), files)
-    return Source("photos", root, None, files)
+        return Source("colmap", root, _colmap_model(cameras), files, set_aside=set_aside)
+    return Source("photos", root, None, files, set_aside=set_aside)
+
+
+def unused_cameras(source: Source) -> Path | None:
+    """What lies with photos that were given without cameras and could be given as their cameras: the one COLMAP model
+    in a ``sparse`` folder, or a transforms.json that names some of them."""
+    if source.kind != "photos":
+        return None
+    places = (source.root.parent, source.root) if source.root.name == "images" else (source.root,)
+    for place in places:
+        with suppress(StageError, OSError):
+            return _colmap_model(place / "sparse")
+    for file in (place / "transforms.json" for place in places):
+        with suppress(StageError, OSError):
+            if set(_from_transforms("transforms", source.root, file, file).files) & set(source.files):
+                return file
+    return None
+
+
+def unused_masks(source: Source) -> bool:
+    """Whether a ``mask`` folder beside ``images`` would hold masks of the photos if it were called ``masks``."""
+    folder = source.root.parent / "mask"
+    if source.root.name != "images" or source.masks or not folder.is_dir():
+        return False
+    return bool({file.stem for file in folder.glob("*.png")} & {file.stem for file in source.files})
 
 
 def list_photos(root: Path) -> tuple[Path, ...]:

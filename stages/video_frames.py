@@ -1,9 +1,10 @@
 """The frames of a video that become photos: sharp ones, each a step of the camera away from the last.
 
-The video is decoded twice, a frame at a time: first to measure, on small grey frames, how far the picture has moved
-and how sharp it is, then to write the chosen ones.
+The video is decoded twice, a frame at a time: first to measure, on frames made small and grey, how far the picture has
+moved and how sharp it is, then to write the chosen ones.
 """
 
+import math
 import os
 from bisect import bisect_left
 from collections.abc import Iterator, Sequence
@@ -13,8 +14,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from stages.contract import Progress, StageError
+from stages.files import write_jpeg
 from stages.optical_flow import corners, follow_both_ways
-from stages.sharpness import sharpness
+from stages.panoramas import CUT_IT, is_panorama
+from stages.sharpness import WIDTH, sharpness
 
 if TYPE_CHECKING:
     import cv2
@@ -22,9 +25,12 @@ if TYPE_CHECKING:
 
 FLOW_WIDTH = 500  # pixels of the frames on which motion is measured
 MOST_CORNERS, FEWEST_CORNERS = 150, 10
-# All in widths of the picture. Frames a STEP apart share 95 % of it, so that a point that crosses the picture is in
-# about twenty of them and frames four to eight apart have the 60-80 % overlap that photos should have.
-STEP = 0.05
+# All in widths of the picture. Photos should share 60 to 80 % with their neighbours: frames a LONG_STEP apart do so
+# with three on each side. A clip that gives few frames is taken in shorter steps, down to STEP, until they are PLENTY:
+# more would hardly tell more of the scene, and each takes as long as any photo.
+STEP, LONG_STEP = 0.05, 0.12
+PLENTY = 100
+WAY_PER_SECOND = 0.2  # of somebody who walks around a thing or through a room, filming
 # Of the ways of the corners: walking around a thing, and towards it, hardly moves what is in the middle of the picture.
 MOVED_QUANTILE = 0.75
 # Less than this is not added up: the tremble of a hand, or noise, would become a way.
@@ -33,7 +39,7 @@ LEAST_MOTION = 0.01
 # nothing is known to be shared.
 FOLLOWED_SHARE, LOST = 1 / 3, 1.0
 FEWEST_FRAMES = 3  # as sfm needs
-JPEG_QUALITY = 95  # without chroma subsampling: far closer to the frame than the video is to what the camera saw
+JPEG_QUALITY = 95  # far closer to the frame than the video is to what the camera saw
 
 
 @dataclass(frozen=True)
@@ -76,11 +82,28 @@ def take_frames(video: Path, most: int, folder: Path, progress: Progress) -> lis
 
 def choose_frames(frames: Sequence[Frame], most: int) -> list[int]:
     """The numbers of the frames to take: after each one the sharpest of those that are half a step to one and a half
-    steps further, or else the next one there is. Steps grow from STEP until there are no more than ``most``."""
+    steps further, or else the next one there is. Steps grow from STEP to LONG_STEP until there are no more than PLENTY,
+    and beyond that until there are no more than ``most``."""
     paths, step = [frame.path for frame in frames], STEP
-    while len(chosen := _chosen_by(paths, frames, step)) > most:
-        step *= max(1.01, len(chosen) / most)
+    chosen = _chosen_by(paths, frames, step)
+    for enough, longest in ((PLENTY, LONG_STEP), (most, math.inf)):
+        while len(chosen) > enough and step < longest:
+            step = min(longest, step * max(1.01, len(chosen) / enough))
+            chosen = _chosen_by(paths, frames, step)
     return chosen
+
+
+def expected_frames(video: Path, most: int) -> tuple[int, int, int]:
+    """How many frames are likely to be taken, by how long the container says that the video is, and their width and
+    height. Raises StageError where it cannot be opened."""
+    import cv2
+
+    with _opened(video) as capture:
+        width, height = (int(capture.get(side)) for side in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+        count, rate = capture.get(cv2.CAP_PROP_FRAME_COUNT), capture.get(cv2.CAP_PROP_FPS)
+    way = WAY_PER_SECOND * count / rate if count > 0 and rate > 0 else PLENTY * STEP
+    expected = max(min(way / STEP, PLENTY), way / LONG_STEP)
+    return min(most, max(FEWEST_FRAMES, round(expected))), width, height
 
 
 def _chosen_by(paths: Sequence[float], frames: Sequence[Frame], step: float) -> list[int]:
@@ -104,9 +127,12 @@ def _measure(video: Path, progress: Progress) -> list[Frame]:
     with _opened(video) as capture:
         announced = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
         while (answer := capture.read())[0]:
-            picture = cv2.cvtColor(answer[1], cv2.COLOR_BGR2RGB)
+            if not frames and is_panorama(answer[1]):
+                raise _panoramas(video)
+            # Grey first: shrinking a large frame takes longer than all the rest, and three times as long in colour.
+            grey = _at_most(cv2.cvtColor(answer[1], cv2.COLOR_BGR2GRAY), WIDTH)
             time_s = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
-            frames.append(Frame(time_s, motion.path_to(picture), sharpness(picture)))
+            frames.append(Frame(time_s, motion.path_to(_at_most(grey, FLOW_WIDTH)), sharpness(grey)))
             if len(frames) % 10 == 0:
                 share = len(frames) / announced / 2 if announced >= len(frames) else None
                 progress.update(f"looked at {len(frames)} frames of {video.name}", share)
@@ -115,6 +141,16 @@ def _measure(video: Path, progress: Progress) -> list[Frame]:
     if len(frames) < 0.98 * announced:  # a container may count a frame or two too many
         progress.note(f"only {len(frames)} of {announced} frames of {video.name} can be decoded: is the file whole?")
     return frames
+
+
+def _at_most(grey: "np.ndarray", most: int) -> "np.ndarray":
+    """A grey picture made no wider than ``most`` pixels."""
+    import cv2
+
+    height, width = grey.shape
+    if width <= most:
+        return grey
+    return cv2.resize(grey, (most, max(1, round(height * most / width))), interpolation=cv2.INTER_AREA)
 
 
 class _Motion:
@@ -127,14 +163,8 @@ class _Motion:
         self.start: np.ndarray | None = None  # where corners are followed from
         self.corners: np.ndarray | None = None
 
-    def path_to(self, picture: "np.ndarray") -> float:
-        """The way to the next frame, (h, w, 3) uint8, in widths of the picture. It never goes back."""
-        import cv2
-
-        height, width = picture.shape[:2]
-        scale = min(1.0, FLOW_WIDTH / width)
-        size = max(1, round(width * scale)), max(1, round(height * scale))
-        grey = cv2.cvtColor(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY)
+    def path_to(self, grey: "np.ndarray") -> float:
+        """The way to the next frame, (h, w) uint8, in widths of the picture. It never goes back."""
         moved = self._moved(grey)
         self.path = max(self.path, self.path_of_start + moved)
         if self.corners is None or moved >= LEAST_MOTION or len(self.corners) < FEWEST_CORNERS:
@@ -159,7 +189,6 @@ def _write(
     video: Path, frames: Sequence[Frame], chosen: Sequence[int], folder: Path, progress: Progress
 ) -> Iterator[TakenFrame]:
     import cv2
-    from PIL import Image
 
     wanted = set(chosen)
     with _opened(video) as capture:
@@ -170,7 +199,7 @@ def _write(
                 continue
             picture = cv2.cvtColor(capture.retrieve()[1], cv2.COLOR_BGR2RGB)
             file = folder / f"{number:06d}"
-            Image.fromarray(picture).save(file, format="JPEG", quality=JPEG_QUALITY, subsampling=0)
+            write_jpeg(file, picture, JPEG_QUALITY)
             height, width = picture.shape[:2]
             time_s = round(frames[number].time_s - frames[0].time_s, 4)
             yield TakenFrame(number, time_s, frames[number].sharpness, file, width, height)
@@ -198,6 +227,11 @@ def _undecodable(video: Path, why: str) -> StageError:
     return StageError(
         f"cannot decode the video {video.name}", why, f"Convert it first: ffmpeg -i {video.name} converted.mp4"
     )
+
+
+def _panoramas(video: Path) -> StageError:
+    hint = CUT_IT.format(video.name).replace(" 0.jpg", " 0.mp4")
+    return StageError(f"cannot take photos from {video.name}", "its frames are panoramas", f"C{hint[1:]}.")
 
 
 def _no_way(video: Path, frames: Sequence[Frame]) -> StageError:

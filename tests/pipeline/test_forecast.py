@@ -6,6 +6,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 from PIL import Image
 
@@ -14,6 +15,7 @@ from pipeline.budget import Budget
 from pipeline.chain import usual
 from pipeline.forecast import Photos, expected, photos_of, sfm_seconds
 from pipeline.settings import Settings
+from stages.video import video_writer
 from tests.png_files import png
 
 
@@ -25,7 +27,7 @@ def photos(tmp_path: Path) -> Path:
 
 
 def settings(photos: Path, **stages: dict[str, Any]) -> Settings:
-    return Settings.model_validate({"ingest": {"photos": photos}} | stages)
+    return Settings.model_validate(stages | {"ingest": {"photos": photos} | stages.get("ingest", {})})
 
 
 def test_photos_are_counted_and_measured_without_decoding(photos: Path) -> None:
@@ -38,6 +40,16 @@ def test_photos_are_counted_and_measured_without_decoding(photos: Path) -> None:
     (photos / "empty").mkdir()
     assert photos_of(settings(photos / "empty")) is None
     assert expected(settings(photos / "gone"), None) == {}
+
+
+def test_of_a_video_its_length_and_size_tell(tmp_path: Path) -> None:
+    with video_writer(tmp_path / "a.mp4", 200, 160, 10) as write:
+        for _ in range(150):
+            write(np.zeros((160, 200, 3), np.uint8))
+    assert photos_of(settings(tmp_path / "a.mp4")) == Photos(60, 0.032)
+    assert photos_of(settings(tmp_path / "a.mp4", ingest={"frames": 30})) == Photos(30, 0.032)
+    (tmp_path / "a.mp4").write_bytes(b"no video")
+    assert photos_of(settings(tmp_path / "a.mp4")) is None
 
 
 @pytest.mark.parametrize(

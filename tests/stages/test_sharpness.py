@@ -13,6 +13,7 @@ def test_the_variance_of_the_laplacian_in_closed_form() -> None:
     y, x = np.mgrid[:20, :30]
     board = np.where((x + y) % 2, 140, 100).astype(np.uint8)
     assert sharpness(np.dstack([board] * 3)) == pytest.approx((8 * 20) ** 2, rel=1e-3)
+    assert sharpness(board) == sharpness(np.dstack([board] * 3))
     assert sharpness(np.full((20, 30, 3), 77, np.uint8)) == 0
 
 

@@ -13,7 +13,17 @@ from PIL import Image
 
 from stages.contract import StageError
 from stages.video import video_writer
-from stages.video_frames import LOST, STEP, Frame, TakenFrame, choose_frames, take_frames
+from stages.video_frames import (
+    LONG_STEP,
+    LOST,
+    PLENTY,
+    STEP,
+    Frame,
+    TakenFrame,
+    choose_frames,
+    expected_frames,
+    take_frames,
+)
 from tests.blots import blots, cut_out
 
 WIDTH, HEIGHT, FPS = 160, 120, 10
@@ -79,6 +89,16 @@ def test_long_ways_are_taken_in_longer_steps(tmp_path: Path, progress: Any) -> N
     assert len(list((tmp_path / "few").iterdir())) == len(few)
 
 
+def test_large_frames_are_shrunk_once(tmp_path: Path, progress: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    wall, sizes = blots(0, 1800, 100), []
+    with video_writer(tmp_path / "a.mp4", 1200, 64, FPS) as write:
+        for step in range(4):
+            write(cut_out(wall, 100 * step, 10, 1200, 64))
+    monkeypatch.setattr("stages.video_frames.sharpness", lambda picture: float(sizes.append(picture.shape) or 0))
+    assert len(taken(tmp_path / "a.mp4", tmp_path / "out", progress)) == 4
+    assert sizes == [(53, 1000)] * 4
+
+
 @pytest.mark.parametrize("threads", [1, 2])
 def test_the_same_video_gives_the_same_bytes(threads: int, tmp_path: Path, progress: Any) -> None:
     path, before = clip(tmp_path / "a.mp4", panned(*np.arange(20) / 40)), cv2.getNumThreads()
@@ -129,6 +149,36 @@ def test_laws_of_the_choice(steps: list[tuple[float, float]], most: int) -> None
     every = choose_frames(frames, 1000)
     assert paths[-1] - paths[every[-1]] < STEP / 2
     assert len(every) > most or chosen == every  # steps grow only where they must
+
+
+@pytest.mark.parametrize(
+    ("way", "most", "step"),
+    [
+        (2, 300, STEP),
+        (5, 300, STEP),
+        (8, 300, 8 / PLENTY),
+        (12, 300, LONG_STEP),
+        (30, 300, LONG_STEP),
+        (30, 60, 30 / 60),
+        (60, 300, 60 / 300),
+        (8, 50, 8 / 50),
+    ],
+)
+def test_steps_are_longer_where_there_are_plenty_of_frames(way: float, most: int, step: float) -> None:
+    random = np.random.default_rng(0)
+    frames = [Frame(0.0, float(path), float(random.random())) for path in np.arange(0, way, 0.005)]
+    chosen = choose_frames(frames, most)
+    assert len(chosen) <= most and 0.8 * way / step < len(chosen) < 1.1 * way / step + 2
+    steps = np.diff([frames[number].path for number in chosen])
+    assert steps.max() <= 1.5 * 1.25 * step
+
+
+@pytest.mark.parametrize(
+    ("frames", "most", "expected"), [(20, 300, 8), (400, 300, 100), (900, 300, 150), (900, 120, 120)]
+)
+def test_frames_are_foretold_from_the_length(frames: int, most: int, expected: int, tmp_path: Path) -> None:
+    still = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    assert expected_frames(clip(tmp_path / "a.mp4", [still] * frames), most) == (expected, WIDTH, HEIGHT)
 
 
 def refusal(path: Path, folder: Path, progress: Any) -> StageError:

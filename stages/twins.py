@@ -1,0 +1,58 @@
+"""Files that are no photos but belong to one: masks, depth maps, normals, masked copies. Told by their names alone."""
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import PurePosixPath
+
+# a_mask.png and a.depth_2.tif belong to a.jpg; mask/a.png and depth_maps/a.png to image/a.jpg, or to a.jpg beside them.
+_ENDING = re.compile(r"(.+)[ ._-](masks?|masked|depth|depthmap|normals?|alpha|matte)([ ._-]?\d+)?", re.IGNORECASE)
+_FOLDER = re.compile(r"(masks?|masked|depths?)(maps?)?($|[._-]|\d)|normals?([._-]?maps?)?$", re.IGNORECASE)
+_COLOUR = re.compile(r"(.+)[ ._-](colou?r|rgb|image)", re.IGNORECASE)  # a.color.jpg beside a.depth.png
+_MASK = re.compile(r"(.+[ ._-])?masks?([ ._-]?\d+)?", re.IGNORECASE)
+
+_Place = tuple[PurePosixPath, str]  # a folder, and what a photo in it is called
+
+
+def twins(names: Sequence[str]) -> dict[str, str]:
+    """{file: the photo that it belongs to}, all named relative to the photo folder."""
+    files = [PurePosixPath(name) for name in names]
+    photos: dict[_Place, PurePosixPath] = {}
+    for file in files:
+        photos.setdefault((file.parent, _plain(file.stem)), file)
+    beside: dict[PurePosixPath, list[PurePosixPath]] = {}
+    for folder in sorted({folder for file in files for folder in file.parents}):
+        if not _FOLDER.match(folder.name):
+            beside.setdefault(folder.parent, []).append(folder)
+    found = {}
+    for file in files:
+        places = _places(file, beside)
+        if photo := next((photos[place] for place in places if photos.get(place, file) != file), None):
+            found[str(file)] = str(photo)
+    return found
+
+
+def is_mask(name: str) -> bool:
+    """Whether such a file is by its name a mask, rather than a depth map, say, or a masked copy."""
+    file = PurePosixPath(name)
+    return any(_MASK.fullmatch(part) for part in (*file.parts[:-1], file.stem))
+
+
+def _places(file: PurePosixPath, beside: Mapping[PurePosixPath, Sequence[PurePosixPath]]) -> Iterator[_Place]:
+    """Where the photo may lie that a file belongs to. ``beside``: the folders of photos in each folder."""
+    ending = _ENDING.fullmatch(file.stem)
+    stems = [_plain(ending[1])] if ending else []
+    yield from ((file.parent, stem) for stem in stems)
+    stems.append(_plain(file.stem))
+    for holder in file.parents:
+        if _FOLDER.match(holder.name):
+            inside = file.parent.relative_to(holder)
+            folders = (*beside.get(holder.parent, ()), holder.parent)
+            yield from ((folder / inside, stem) for folder in folders for stem in stems)
+
+
+def _plain(stem: str) -> str:
+    """A name without what says that it is the photo; a number without leading zeros, which a mask's has fewer of in
+    some sets."""
+    colour = _COLOUR.fullmatch(stem)
+    stem = colour[1] if colour else stem
+    return stem.lstrip("0") or "0" if stem.isdecimal() else stem
