@@ -32,6 +32,7 @@ LARGEST = {"levels": 64, "features": 256, "log2_rows": 30, "finest": 2**20, "cac
     "steps": 10**6,
     "most_samples": 10**6,
 }
+DRAWN_CLOSER = 2  # samples of a drawn ray for one in training (docs/numbers.md: Samples along a ray)
 CORNERS = 8  # of a cell: rows that a point reads of each grid
 
 
@@ -84,6 +85,17 @@ class GridSettings:
         step = 2 * BOX * math.sqrt(3) / self.steps
         return Lattice(step, 0.0, False, self.cache_cells, self.most_samples)
 
+    @property
+    def drawn_lattice(self) -> Lattice:
+        """Of the samples of rays that are only drawn: ``DRAWN_CLOSER`` in folded space.
+
+        Training jitters samples that stand a few finest cells apart, so that over many steps it meets what lies between
+        them; a drawing stands at fixed places, once, and would show the gaps as shells. In a box they are closer.
+        """
+        lattice, closer = self.lattice, DRAWN_CLOSER if self.contracted else 1
+        step, cone, most = lattice.step / closer, lattice.cone / closer, closer * lattice.most_samples
+        return lattice._replace(step=step, cone=cone, most_samples=most)
+
 
 class GridPass(NamedTuple):
     """What a rendering computed on its way, for :meth:`GridField.backward`; ``marched`` counts all densities asked."""
@@ -130,7 +142,7 @@ class GridField(nn.Module):
     def __init__(self, settings: GridSettings, seed: int, backend: Backend) -> None:
         super().__init__()
         self.settings, self.backend = settings, backend
-        self.layout, self.lattice = settings.layout, settings.lattice
+        self.layout, self.lattice, self.drawn_lattice = settings.layout, settings.lattice, settings.drawn_lattice
         random = generator("cpu", seed, 0)
         shape = (self.layout.rows, settings.features)
         self.register_buffer("table", (2 * torch.rand(shape, generator=random) - 1) * INITIAL_FEATURE)
@@ -206,7 +218,7 @@ class GridField(nn.Module):
         rays = rays.each(Tensor.contiguous)
         seen, light = rays.far.new_zeros(len(rays.far), 4), torch.ones_like(rays.far)
         of_rays = grid_mlp.ray_hidden(self.weights, self.of_directions(rays.directions))
-        for wave in self._waves(rays, torch.full_like(rays.near, 0.5)):
+        for wave in self._waves(rays, torch.full_like(rays.near, 0.5), self.drawn_lattice):
             alone = self._composited(wave, of_rays)
             seen += light[:, None] * torch.cat([alone.colour, alone.depth[:, None]], -1)
             light *= 1 - alone.opacity
@@ -224,7 +236,7 @@ class GridField(nn.Module):
         """Density of all samples in occupied cells; colour of those that can be seen."""
         backend, rays = self.backend, rays.each(Tensor.contiguous)
         background = self._behind(rays, background)
-        waves = list(self._waves(rays, jitter))
+        waves = list(self._waves(rays, jitter, self.lattice))
         with part("march"):
             samples, order = backend.pack_waves([wave.samples for wave in waves])
             sigma = torch.cat([wave.density.sigma for wave in waves]).index_select(0, order)
@@ -276,9 +288,9 @@ class GridField(nn.Module):
     def _behind(self, rays: Rays, background: Float[Tensor, "*#rays 3"]) -> Float[Tensor, "*#rays 3"]:
         return sky_colour(self.backend, self.sky, rays.directions) if self.settings.sky else background
 
-    def _waves(self, rays: Rays, jitter: Float[Tensor, "rays"]) -> Iterator[Wave]:
+    def _waves(self, rays: Rays, jitter: Float[Tensor, "rays"], lattice: Lattice) -> Iterator[Wave]:
         return front_to_back(
-            self.backend, Occupied(self.bits, self.clearance), self.lattice, self._density_pass, rays, jitter
+            self.backend, Occupied(self.bits, self.clearance), lattice, self._density_pass, rays, jitter
         )
 
     def _density_pass(self, unit: Float[Tensor, "points 3"]) -> DensityPass:

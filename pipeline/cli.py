@@ -149,7 +149,7 @@ def command_run(words: Sequence[str]) -> int:
         given = words_of.parse(words_of.RunArguments, "run", words, recorded)
         cameras = cameras or recorded.ingest.cameras
     asked = _like(with_effects(_more(given, root), given.effect), given.like)
-    asked = _keeping_studies(asked, root, {*file, *(word.removeprefix("--").split(".")[0] for word in words)})
+    asked = _keeping_studies(asked, root, words, file)
     stages = chain.up_to(_known_stage(given.until or list(chain.STAGES)[-1], "--until"))
     force = frozenset[str]()
     if given.from_ is not None:
@@ -167,9 +167,10 @@ def command_run(words: Sequence[str]) -> int:
         return _run_stages(root, settings, stages, given.common, display, force, new_budget=(budget, 0.0))
 
 
-def _keeping_studies(settings: Settings, root: Path, named: Collection[str]) -> Settings:
-    """The settings with the recorded options of the stages ON_REQUEST but those ``named``: a run that does not ask for
-    them leaves what they found where it is."""
+def _keeping_studies(settings: Settings, root: Path, words: Sequence[str], file: Collection[str] = ()) -> Settings:
+    """The settings with the recorded options of the stages ON_REQUEST but those that the command's ``words`` or tables
+    of the ``file`` of --config name: a run that does not ask for them leaves what they found where it is."""
+    named = {*file, *(word.removeprefix("--").split(".")[0] for word in words)}
     if not os.path.isfile(root / RUN_FILE):
         return settings
     options = Workspace(root).read_run()["options"]
@@ -361,6 +362,7 @@ def command_demo(words: Sequence[str]) -> int:
     budget = _budget(given.budget, given.settings)
     asked = with_effects(given.settings, given.effect)
     photos, root = given.output / "photos", given.output / "demo.nerf"
+    asked = _keeping_studies(asked, root, words)
     with choose_display(given.common.json) as display:
         display.begin("photos")
         line, seconds = demo.photograph(photos, display)

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from nerf import grid_mlp, sky
 from nerf.grid_field import GridField, GridSettings
-from nerf.kernels import GridLayout, Samples, reference, warp
+from nerf.kernels import GridLayout, Lattice, Samples, reference, warp
 from nerf.kernels.cache import occupied
 from nerf.model import RadianceModel, Rendering
 from nerf.rays import Rays
@@ -140,6 +140,19 @@ def test_density_agrees_with_what_rays_see() -> None:
     assert rendering.opacity.min() > 0.05 and samples.dt.max() == pytest.approx(step)
 
 
+def test_folded_space_is_drawn_with_closer_samples_than_it_is_trained_with() -> None:
+    """The opacity of a drawn ray by the middle rule on a lattice of half the steps; a box keeps its own."""
+    model, given = field(FOLDED), rays()
+    closer = model.lattice._replace(step=model.lattice.step / 2, cone=model.lattice.cone / 2, most_samples=2048)
+    middle = torch.full((6,), 0.5, dtype=torch.float64)
+    samples = reference.march(occupied(model.bits), closer, given, middle)
+    points = given.origins[samples.ray] + samples.t[:, None] * given.directions[samples.ray]
+    depth = torch.zeros(6, dtype=torch.float64).index_add(0, samples.ray.long(), model.density(points) * samples.dt)
+    drawn = model.render(given, torch.zeros(3, dtype=torch.float64))
+    torch.testing.assert_close(drawn.opacity, -torch.expm1(-depth), rtol=0, atol=2e-3)
+    assert field().drawn_lattice == field().lattice
+
+
 def test_closed_cells_are_not_seen() -> None:
     model, given = field(), rays()
     model.occupy(torch.zeros_like(model.bits))
@@ -212,9 +225,11 @@ def in_waves(model: GridField, given: Rays, background: Tensor) -> tuple[Renderi
         return model.render(given, background), asked[0]
 
 
-def in_one_pass(model: GridField, given: Rays, jitter: Tensor, background: Tensor) -> tuple[int, Samples, Rendering]:
-    """How many samples stand in occupied cells, those that can be seen, and what the rays see; no waves."""
-    samples = reference.march(occupied(model.bits), model.lattice, given, jitter)
+def in_one_pass(
+    model: GridField, lattice: Lattice, given: Rays, jitter: Tensor, background: Tensor
+) -> tuple[int, Samples, Rendering]:
+    """How many samples of a lattice stand in occupied cells, those that can be seen, and what rays see; no waves."""
+    samples = reference.march(occupied(model.bits), lattice, given, jitter)
     density = model._density_pass(reference.sample_points(given, samples, model.settings.contracted))
     front, seen = reference.visible_front(samples, density.sigma, HIDDEN_BEHIND)
     of_rays = grid_mlp.ray_hidden(model.weights, reference.spherical_harmonics(given.directions))
@@ -237,8 +252,7 @@ def test_waves_through_thin_fog_see_what_a_single_pass_sees(
     in_short_waves(monkeypatch, *lengths)
     model, given, background = field(settings), rays(40), torch.tensor([0.2, 0.4, 0.6], dtype=torch.float64)
     model.occupy(model.bits.random_(generator=torch.Generator().manual_seed(5)))  # half of the cells are closed
-    middle = torch.full_like(given.near, 0.5)
-    marched, front, whole = in_one_pass(model, given, middle, background)
+    marched, front, whole = in_one_pass(model, model.drawn_lattice, given, torch.full_like(given.near, 0.5), background)
     waves, asked = in_waves(model, given, background)
     assert asked == marched == len(front.t) > 40
     assert whole.opacity.min() < 0.5 < whole.opacity.max()
@@ -249,7 +263,7 @@ def test_waves_through_thin_fog_see_what_a_single_pass_sees(
 def test_waves_end_soon_behind_what_stops_the_light(settings: GridSettings, monkeypatch: pytest.MonkeyPatch) -> None:
     in_short_waves(monkeypatch, 80, 2, 64)
     model, given, background = dense_field(settings), rays(40), torch.tensor([0.2, 0.4, 0.6], dtype=torch.float64)
-    marched, front, whole = in_one_pass(model, given, torch.full_like(given.near, 0.5), background)
+    marched, front, whole = in_one_pass(model, model.drawn_lattice, given, torch.full_like(given.near, 0.5), background)
     waves, asked = in_waves(model, given, background)
     assert len(front.t) < asked < 0.7 * marched
     assert whole.opacity.min() > 0.99
@@ -296,7 +310,7 @@ def test_training_keeps_the_samples_of_a_single_pass_whatever_the_waves(
     model.occupy(model.bits.random_(generator=torch.Generator().manual_seed(5)))
     jitter = torch.rand(40, generator=torch.Generator().manual_seed(6), dtype=torch.float64)
     background = torch.tensor([0.2, 0.4, 0.6], dtype=torch.float64)
-    marched, front, whole = in_one_pass(model, given, jitter, background)
+    marched, front, whole = in_one_pass(model, model.lattice, given, jitter, background)
     done = model.forward(given, jitter, background.repeat(40, 1))
     assert done.marched < marched if dense else done.marched == marched
     assert torch.equal(done.samples.starts, front.starts) and torch.equal(done.samples.ray, front.ray)
