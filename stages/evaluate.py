@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from stages.drawing import Painter
 
 NEEDS = ("ingest", "normalise", "train")
-VERSION = 7
+VERSION = 8
 RESUMES = False
 LINKS = ("metrics.json", "renders", "errors")
 UNKEYED = ("seconds",)  # it decides how many photos, and that enters the key
