@@ -233,10 +233,12 @@ def _try_all(work: _Work) -> None:
 
 def _no_use(attempt: Attempt, missing: list[int], work: _Work) -> str | None:
     """Why the attempt cannot help, None if it can."""
-    some, flat = links(work.latest(), {work.files[number] for number in missing})
-    count = len(work.photos)
-    lens_is_given = work.job.camera_model is not None
-    return reason_against(attempt, Situation(len(missing), count, some, flat and len(missing) == count, lens_is_given))
+    groups = best.groups if (best := work.usable()) else [[]]
+    linked, flat = links(work.latest(), set(groups[0]))
+    alone = {work.files[number] for number in missing}.difference(*groups)
+    count, lens_is_given = len(work.photos), work.job.camera_model is not None
+    now = Situation(len(missing), len(alone), count, linked, flat and len(missing) == count, lens_is_given)
+    return reason_against(attempt, now)
 
 
 def _no_way(attempt: Attempt, missing: list[int], work: _Work) -> str | None:

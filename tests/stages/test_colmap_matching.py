@@ -7,6 +7,7 @@ import pycolmap
 import pytest
 
 from stages.colmap import matching
+from stages.colmap.diagnosis import links
 from stages.colmap.matching import fill_database, look_alike, match_pairs
 from stages.pairing import exhaustive
 from stages.photos import Photo
@@ -123,3 +124,23 @@ def test_photos_of_the_same_points_look_alike(database: Path) -> None:
     alike = look_alike(database, COUNT, seed=0)
     assert alike.shape == (COUNT, COUNT)
     assert alike[:-1, -1].max() < alike[:-1, :-1].min()
+
+
+def test_photos_without_a_place_are_joined_by_their_matches_with_those_that_have_one(database: Path) -> None:
+    match_pairs(database, exhaustive(COUNT), 0, 0.8)
+    names = [f"{i}.png" for i in range(COUNT)]
+    assert links(database, set(names[:-2])).join
+    assert not links(database, set(names[:-1])).join
+    assert not links(database, {names[-1]}).join, "five that share views with each other alone"
+    assert links(database, set()).join, "no place: any pair is one to begin with"
+
+
+def test_few_matches_with_each_of_several_photos_join_as_well(database: Path) -> None:
+    match_pairs(database, exhaustive(COUNT), 0, 0.8)
+    placed = {f"{i}.png" for i in range(COUNT - 1)}
+    for photo, expected in ((1, False), (2, True)):
+        with pycolmap.Database.open(database) as db:
+            db.delete_two_view_geometry(photo, COUNT)
+            few = pycolmap.TwoViewGeometry(inlier_matches=np.tile(np.arange(20, dtype=np.uint32)[:, None], 2), config=2)
+            db.write_two_view_geometry(photo, COUNT, few)
+        assert links(database, placed).join == expected

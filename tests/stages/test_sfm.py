@@ -159,8 +159,8 @@ def test_strangers_are_left_out_and_named_and_alpha_and_mixed_sizes_work(
         "matching 8 pairs of photos: …",
         "passed over, for 1 of 9 photos missing is not worth starting over: verifying and mapping again, as if through "
         "a fisheye lens; searching twice as many features at twice the size",
-        "passed over, for none of them shares a view with another photo: mapping again, asking less of the first pair; "
-        "mapping again, with another seed; mapping again, all photos at once",
+        "passed over, for the missing photos share too little with the others: mapping again, asking less of the first "
+        "pair; mapping again, with another seed; mapping again, all photos at once",
         "1 of 9 photos found no place and are left out:",
         "  stranger.png: it shares no view with any other photo",
     ]
@@ -317,7 +317,7 @@ def test_an_attempt_for_which_no_time_is_left_is_not_begun(
     assert said in progress.notes
     tried = {row["attempt"]: row["passed"] for row in read_json(tmp_path / "sfm/registration.json")["attempts"]}
     assert tried["looser matching"] == "too little was left of --sfm.max-seconds"
-    assert tried["weaker start"] == "none of them shares a view with another photo"
+    assert tried["weaker start"] == "the missing photos share too little with the others"
 
 
 def test_attempts_whose_matches_are_gone_are_forgotten(
