@@ -171,9 +171,9 @@ def reconstruct(job: Job, say: Say) -> dict[str, Any]:
 
     Returns the ``database`` that was used in the end, the files in each sub-model, best first (``models``), the
     ``attempts`` that were made or passed over, and of the best model: the ``conflict`` with another one, ``points``,
-    mean ``reprojection_px``, ``camera_model``, the comparison of ``camera_models``, by file ``observations`` and
-    ``uncertainty_px``, and for every photo without a place how many of its features are points of it and how many of
-    them agree (``supports``).
+    mean ``reprojection_px``, ``camera_model``, the comparison of ``camera_models``, by file ``observations``,
+    ``uncertainty_px`` and, where a camera cannot be used, why (``left_out``), and for every photo without a place how
+    many of its features are points of it and how many of them agree (``supports``).
     """
     work = _Work(job, say)
     work.clock.keep_always()
@@ -200,6 +200,7 @@ def reconstruct(job: Job, say: Say) -> dict[str, Any]:
         "models": [_files(model), *best.groups[1:]],
         "observations": {image.name: image.num_points3D for image in registered},
         "uncertainty_px": finished.uncertainty_px,
+        "left_out": finished.left_out,
         "points": model.num_points3D(),
         "reprojection_px": model.compute_mean_reprojection_error(),
         "camera_model": "/".join(sorted({model.camera(image.camera_id).model_name for image in registered})),
