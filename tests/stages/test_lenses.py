@@ -115,8 +115,11 @@ def test_where_every_candidate_is_absurd_the_camera_stays(monkeypatch: pytest.Mo
 
 def test_a_few_photos_with_absurd_cameras_do_not_decide_for_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(lenses, "flaw", lambda camera: "it is absurd" if camera.camera_id == 5 else flaw(camera))
-    choice = choose(mapped(photographed(*5 * [BARREL], points=100)), 0)  # two photos each
-    assert choice.lenses == dict.fromkeys(range(1, 6), Lens("SIMPLE_RADIAL", False))
+    choice = choose(mapped(photographed(*5 * [PINHOLE], points=100)), 0)  # two photos each
+    assert choice.lenses == dict.fromkeys(range(1, 6), Lens("SIMPLE_PINHOLE", False))
+    monkeypatch.setattr(lenses, "flaw", lambda camera: "it is absurd" if camera.camera_id > 3 else flaw(camera))
+    choice = choose(mapped(photographed(*5 * [PINHOLE], points=100)), 0)
+    assert choice.lenses == dict.fromkeys(range(1, 6), Lens("SIMPLE_RADIAL", False)), "as mapping had them"
 
 
 def test_one_observation_a_point_is_held_out_and_two_are_left() -> None:
