@@ -30,6 +30,7 @@ from stages.colmap.matching import (
     copy_without_matches_of,
     extract_features,
     fill_database,
+    hold_open,
     look_alike,
     match_pairs,
 )
@@ -115,12 +116,15 @@ class _Work:
         self.files = [photo.image_name for photo in self.photos]
         self.database, self.images = Path(job.database), Path(job.images)
         self.journal = Journal(Path(job.folder, "attempts"))
+        self.held = hold_open(self.database)  # the parent reads in it how far we are
         self.clock, self.started = Clock(self.journal.folder / CLOCK), time.monotonic()
         self.attempt = ATTEMPTS[0].name
         self.seconds: dict[str, float] = {}  # of this attempt's phases
 
     def begin(self, phase: str, **more: Any) -> None:
         """Say that a phase begins. Of an interrupted run features and matches are kept, while mapping starts again."""
+        if database := more.get("database"):
+            self.held = hold_open(Path(database))
         self.clock.begin(f"{self.attempt}: {phase}", anew=phase == "mapping")
         self.say(phase=phase, **more)
 
