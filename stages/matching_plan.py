@@ -30,7 +30,7 @@ FEWEST_MEASURED = 4
 CHILD = ["-m", "stages.matching_plan"]
 WAYS = {
     "sequential": "neighbours in time, {} each",
-    "spatial": "the {} nearest places of each",
+    "spatial": "neighbours by place and looks, {} each",
     "retrieval": "retrieval of {} neighbours each",
 }
 

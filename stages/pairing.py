@@ -88,6 +88,17 @@ def spanning_tree(similarity: Likeness) -> Pairs:
     return union(np.array(pairs, int).reshape(-1, 2))
 
 
+def spatial(position_m: Float[np.ndarray, "photos 3"], similarity: Likeness, neighbours: int) -> Pairs:
+    """Each photo with its ``neighbours``: half of them nearest by place, the others its most similar among the rest.
+
+    Positions may be off by more than photos are apart, or the same for dozens of them: looks make up for that.
+    """
+    near = nearest(closeness(position_m), neighbours // 2)
+    rest = similarity.astype(float)
+    rest[tuple(near.T)] = rest[tuple(near.T[::-1])] = -np.inf
+    return union(near, nearest(rest, neighbours - neighbours // 2), spanning_tree(similarity))
+
+
 def union(*pairs: Int[np.ndarray, "n 2"]) -> Pairs:
     """Each pair that is in any of them once, whichever way round it was written."""
     together = np.sort(np.concatenate([np.zeros((0, 2), int), *pairs]), axis=1)
@@ -122,20 +133,16 @@ def pairs_of(
     if matcher == "exhaustive":
         return exhaustive(count)
     if matcher == "retrieval":
-        return _connected(similarity(), neighbours)
+        return union(nearest(similarity(), neighbours), spanning_tree(similarity()))
     if matcher == "spatial":
         assert places.position_m is not None
-        return _connected(closeness(places.position_m), neighbours)
+        return spatial(places.position_m, similarity(), neighbours)
     order = np.arange(count) if places.time_s is None else np.argsort(places.time_s, kind="stable")
     loops = max(1, neighbours // LOOPS)
     overlap = max(1, (neighbours - loops) // 2)
     when = np.argsort(order)
     apart = np.abs(when[:, None] - when[None]) > overlap
     return union(sequential(order, overlap), nearest(np.where(apart, similarity(), -np.inf), loops))
-
-
-def _connected(similarity: Likeness, neighbours: int) -> Pairs:
-    return union(nearest(similarity, neighbours), spanning_tree(similarity))
 
 
 def second_look(pairs: Pairs, missing: Sequence[int], neighbours: int, similarity: Callable[[], Likeness]) -> Pairs:
@@ -177,6 +184,6 @@ def choose(count: int, neighbours: int, seconds_per_pair: float, places: Places)
 
 
 def _is_spread_out(position_m: Float[np.ndarray, "photos 3"], neighbours: int) -> bool:
-    """Whether neighbourhoods are larger than the error of positions."""
+    """Whether neighbourhoods are larger than the error of positions, as far as these can tell: indoors it is larger."""
     farthest = np.sort(-closeness(position_m), axis=1)[:, min(neighbours, len(position_m) - 1)]
     return bool(np.median(farthest) > GPS_ERROR_M)

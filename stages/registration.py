@@ -126,15 +126,18 @@ def account(
     observations: Mapping[str, int],
     supports: Mapping[str, tuple[int, int]],
     conflict: Mapping[str, int] | None,
+    left_out: Mapping[str, str],
 ) -> list[dict[str, Any]]:
     """What became of each photo, for registration.json. ``models`` are the names in each sub-model, best first;
-    ``supports`` and ``conflict`` as stages/colmap/diagnosis.py finds them."""
+    ``supports`` and ``conflict`` as stages/colmap/diagnosis.py finds them; ``left_out`` says why a camera cannot be
+    used, by name."""
     contradicted = set(models[conflict["group"]]) if conflict else set()
     entries = []
     for index, name in enumerate(names):
         reason = None if name in models[0] else _reason(index, names, matches, models, supports[name])
         if reason and conflict and name in contradicted:
             reason = _contradiction(models, conflict)
+        reason = left_out.get(name, reason)
         entries.append(
             {
                 "file": name,

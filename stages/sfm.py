@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from stages.photos import Photo
 
 NEEDS = ("ingest",)
-VERSION = 6
+VERSION = 7
 RESUMES = True
 LINKS = ("sparse",)
 # Both may decide that an attempt is not made, which is said, in the stage's line as well. A run with another limit is
@@ -197,7 +197,9 @@ def _reconstruct(
         # By the strict matches of the first attempt: later ones let in many that are false.
         raise why_no_model(photos, read_matches(database), len(models[0]) if models else 0, points)
     matches = read_matches(Path(found["database"]))
-    images = account(names, matches, models, found["observations"], found["supports"], found["conflict"])
+    images = account(
+        names, matches, models, found["observations"], found["supports"], found["conflict"], found["left_out"]
+    )
     if found["conflict"]:
         progress.note(repeated_structure(models, found["conflict"]))
     _say_who_is_missing(photos, images, progress)

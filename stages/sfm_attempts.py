@@ -12,8 +12,9 @@ from typing import Any, Literal, NamedTuple
 
 from stages.files import write_durably
 
-# New features, or another idea of the lens, cost as much as the first attempt: they wait until so many are missing.
-WORTH_STARTING_OVER = 0.1  # of all, and two at least: one may well be a stranger
+# Another beginning maps all photos anew, new features or another idea of the lens cost as much as the first attempt:
+# they wait until so many are missing. Where the model holds all but a few, its beginning and its lens are not at fault.
+WORTH_STARTING_OVER = 0.1  # of all; for features and the lens two at least, since one may well be a stranger
 # Nor is mapping again, minutes of many photos, for a blurred one among them: the others show what it shows.
 WORTH_ANOTHER = 0.02
 # The lens is chosen and everything adjusted in 0.8 to 1.6 times the time of mapping (docs/numbers.md).
@@ -168,10 +169,12 @@ def time_against(expected: float, tried: Sequence[Tried], left: float) -> bool:
 
 
 class Situation(NamedTuple):
-    """What the attempts so far have left: ``missing`` of ``photos`` have no place; ``linked``: one of them shares a
-    view with another photo; ``flat``: there is no model, and a plane or a turn explains next to all pairs."""
+    """What the attempts so far have left: ``missing`` of ``photos`` have no place, and ``alone`` of these none in any
+    other sub-model either; ``linked``: their matches with photos that have a place, or if none has any with each other,
+    are enough for one; ``flat``: there is no model, and a plane or a turn explains next to all pairs."""
 
     missing: int
+    alone: int
     photos: int
     linked: bool
     flat: bool
@@ -183,11 +186,15 @@ def reason_against(attempt: Attempt, now: Situation) -> str | None:
     if now.flat and attempt.matches != "loose":
         return "the photos tell nothing of depth"
     if attempt.matches == "same" and not now.linked:
-        return "none of them shares a view with another photo"
+        return "the missing photos share too little with the others"
     if attempt.matches == "fisheye" and now.lens_is_given:
         return "the camera model is given"
     if now.missing < WORTH_ANOTHER * now.photos:
         return f"{now.missing} of {now.photos} photos missing is not worth mapping again"
-    if attempt.matches in ("fisheye", "rich") and now.missing < max(2, WORTH_STARTING_OVER * now.photos):
+    from_nothing = attempt.matches in ("fisheye", "rich")
+    worth = max(2 * from_nothing, WORTH_STARTING_OVER * now.photos)
+    if attempt.matches != "loose" and now.missing < worth:
         return f"{now.missing} of {now.photos} photos missing is not worth starting over"
+    if from_nothing and not now.linked and now.alone < worth:  # neither the lens nor features are what they lack
+        return "the missing photos fit together among themselves and share too little with the others"
     return None

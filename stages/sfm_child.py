@@ -30,6 +30,7 @@ from stages.colmap.matching import (
     copy_without_matches_of,
     extract_features,
     fill_database,
+    hold_open,
     look_alike,
     match_pairs,
 )
@@ -115,12 +116,15 @@ class _Work:
         self.files = [photo.image_name for photo in self.photos]
         self.database, self.images = Path(job.database), Path(job.images)
         self.journal = Journal(Path(job.folder, "attempts"))
+        self.held = hold_open(self.database)  # the parent reads in it how far we are
         self.clock, self.started = Clock(self.journal.folder / CLOCK), time.monotonic()
         self.attempt = ATTEMPTS[0].name
         self.seconds: dict[str, float] = {}  # of this attempt's phases
 
     def begin(self, phase: str, **more: Any) -> None:
         """Say that a phase begins. Of an interrupted run features and matches are kept, while mapping starts again."""
+        if database := more.get("database"):
+            self.held = hold_open(Path(database))
         self.clock.begin(f"{self.attempt}: {phase}", anew=phase == "mapping")
         self.say(phase=phase, **more)
 
@@ -171,9 +175,9 @@ def reconstruct(job: Job, say: Say) -> dict[str, Any]:
 
     Returns the ``database`` that was used in the end, the files in each sub-model, best first (``models``), the
     ``attempts`` that were made or passed over, and of the best model: the ``conflict`` with another one, ``points``,
-    mean ``reprojection_px``, ``camera_model``, the comparison of ``camera_models``, by file ``observations`` and
-    ``uncertainty_px``, and for every photo without a place how many of its features are points of it and how many of
-    them agree (``supports``).
+    mean ``reprojection_px``, ``camera_model``, the comparison of ``camera_models``, by file ``observations``,
+    ``uncertainty_px`` and, where a camera cannot be used, why (``left_out``), and for every photo without a place how
+    many of its features are points of it and how many of them agree (``supports``).
     """
     work = _Work(job, say)
     work.clock.keep_always()
@@ -200,6 +204,7 @@ def reconstruct(job: Job, say: Say) -> dict[str, Any]:
         "models": [_files(model), *best.groups[1:]],
         "observations": {image.name: image.num_points3D for image in registered},
         "uncertainty_px": finished.uncertainty_px,
+        "left_out": finished.left_out,
         "points": model.num_points3D(),
         "reprojection_px": model.compute_mean_reprojection_error(),
         "camera_model": "/".join(sorted({model.camera(image.camera_id).model_name for image in registered})),
@@ -233,10 +238,12 @@ def _try_all(work: _Work) -> None:
 
 def _no_use(attempt: Attempt, missing: list[int], work: _Work) -> str | None:
     """Why the attempt cannot help, None if it can."""
-    some, flat = links(work.latest(), {work.files[number] for number in missing})
-    count = len(work.photos)
-    lens_is_given = work.job.camera_model is not None
-    return reason_against(attempt, Situation(len(missing), count, some, flat and len(missing) == count, lens_is_given))
+    groups = best.groups if (best := work.usable()) else [[]]
+    linked, flat = links(work.latest(), set(groups[0]))
+    alone = {work.files[number] for number in missing}.difference(*groups)
+    count, lens_is_given = len(work.photos), work.job.camera_model is not None
+    now = Situation(len(missing), len(alone), count, linked, flat and len(missing) == count, lens_is_given)
+    return reason_against(attempt, now)
 
 
 def _no_way(attempt: Attempt, missing: list[int], work: _Work) -> str | None:

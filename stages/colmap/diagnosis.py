@@ -1,5 +1,6 @@
 """Why a photo has no place in a model. Call it in a child process."""
 
+from collections import Counter
 from collections.abc import Container, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -8,6 +9,7 @@ import numpy as np
 
 from stages.degeneracy import elsewhere
 from stages.registration import FLAT_CONFIGS
+from stages.sfm_attempts import FEWEST_MATCHES
 
 if TYPE_CHECKING:
     import pycolmap
@@ -18,25 +20,34 @@ FEWEST_ELSEWHERE, SHARE_ELSEWHERE = 2, 0.2
 
 
 class Links(NamedTuple):
-    """What the verified pairs of photos say: whether one of the photos asked for has any, and whether next to all are
-    explained by a plane or a turn of the camera alone."""
+    """What the verified pairs of photos say: whether any of them ``join`` photos that have a place to photos that have
+    none, and whether next to all are explained by a plane or a turn of the camera alone (``flat``)."""
 
-    some: bool
+    join: bool
     flat: bool
 
 
-def links(database: Path, names: Container[str]) -> Links:
-    """Of the photos with these names, and of all."""
+def links(database: Path, placed: Container[str]) -> Links:
+    """Of all photos, those in ``placed`` having a place.
+
+    They are joined where one photo has as many matches with all photos of the other side as mapping asks of a photo:
+    with fewer, none could be added to the others, whichever side mapping began on. While none has a place every pair
+    is one to begin with.
+    """
     import pycolmap
 
-    some, flat = False, []
+    across: Counter[int] = Counter()
+    flat: list[bool] = []
     with pycolmap.Database.open(database) as db:
-        name = {image.image_id: image.name for image in db.read_all_images()}
+        has_place = {image.image_id: image.name in placed for image in db.read_all_images()}
         for pair_id, geometry in zip(*db.read_two_view_geometries(), strict=True):
-            if len(geometry.inlier_matches):
-                some = some or any(name[number] in names for number in pycolmap.pair_id_to_image_pair(pair_id))
+            if count := len(geometry.inlier_matches):
+                pair = pycolmap.pair_id_to_image_pair(pair_id)
+                if has_place[pair[0]] != has_place[pair[1]]:
+                    across.update(dict.fromkeys(pair, count))
                 flat.append(int(geometry.config) in FLAT_CONFIGS)
-    return Links(some, sum(flat) > MOSTLY * len(flat))
+    join = max(across.values(), default=0) >= FEWEST_MATCHES if any(has_place.values()) else bool(flat)
+    return Links(join, sum(flat) > MOSTLY * len(flat))
 
 
 def find_conflict(models: "Sequence[pycolmap.Reconstruction]") -> dict[str, Any] | None:

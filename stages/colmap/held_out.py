@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from stages.colmap.lenses import MODELS, Lens, equip, flaw
+from stages.colmap.lenses import MODELS, Lens, equip, flaws
 from stages.colmap.observations import Observations, noise_px, observations, residuals
 
 if TYPE_CHECKING:
@@ -26,6 +26,7 @@ FEWEST_HELD_OUT = 50  # the spread of so many is known to a tenth, 1/√(2 · 50
 CAP_PX = 4.0  # what is farther off is a mismatch, as for COLMAP's own filter, and counts as this
 CELLS = 4  # neighbours in a photo err alike, so the noise is that of the means of 4 × 4 parts of each photo
 MOST_ITERATIONS = 50
+FEW_ABSURD = 0.2  # of the photos may have absurd cameras: these are put right in the end, and decide for no others
 NOISE_MULTIPLES = 3.0  # with a dozen rivals two standard errors are often exceeded by chance, three hardly ever
 
 
@@ -35,7 +36,7 @@ class Trial(NamedTuple):
     lens: Lens
     error_px: Float[np.ndarray, "n"]  # of each held-out observation
     noise_px: float  # of the observations it was adjusted to
-    flaw: str | None  # of one of its cameras
+    flaw: str | None  # of one of its cameras, where more than a few photos have such
 
 
 class Verdict(NamedTuple):
@@ -179,8 +180,9 @@ def _trials(
             _adjust(model, principal_point, noise)
             length = np.linalg.norm(residuals(model, held_out), axis=1)
             error = np.where(length < CAP_PX, length, CAP_PX)  # a point behind the camera (NaN) counts as far off
-            flaws = filter(None, map(flaw, map(model.camera, cameras)))
-            yield Trial(Lens(name, principal_point), error, noise_px(model, trained), next(flaws, None))
+            absurd = list(flaws(model).values())
+            why = absurd[0] if len(absurd) > FEW_ABSURD * model.num_reg_images() else None
+            yield Trial(Lens(name, principal_point), error, noise_px(model, trained), why)
 
 
 def _adjust(model: "pycolmap.Reconstruction", principal_point: bool, noise: float) -> None:

@@ -115,3 +115,10 @@ def flaw(camera: "pycolmap.Camera") -> str | None:
     again = np.asarray(camera.img_from_cam(np.asarray(camera.cam_ray_from_img(pixels))))
     lost = 1 - np.count_nonzero(np.abs(again - pixels).max(axis=1) < ROUND_TRIP_PX) / len(pixels)  # NaN is lost
     return f"its distortion cannot be undone at {lost:.1%} of the pixels" if lost else None
+
+
+def flaws(model: "pycolmap.Reconstruction") -> dict[int, str]:
+    """The registered photos whose camera is absurd, by image id, and what makes it so."""
+    camera_of = {i: model.image(i).camera_id for i in sorted(model.reg_image_ids())}
+    found = {camera_id: flaw(model.camera(camera_id)) for camera_id in set(camera_of.values())}
+    return {i: why for i, camera_id in camera_of.items() if (why := found[camera_id])}

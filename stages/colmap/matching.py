@@ -5,6 +5,7 @@ import shutil
 import time
 from collections.abc import Callable, Container, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from functools import lru_cache, partial
 from itertools import combinations, product
 from pathlib import Path
@@ -32,7 +33,24 @@ BLOCK_SIZE = 32  # pairs of photos that are committed at once (progress, resumin
 FISHEYE_MODEL = "SIMPLE_RADIAL_FISHEYE"
 FISHEYE_ANGLE_DEG = 150.0
 BYTES_PER_SEARCHED_PIXEL = 100  # 77 to 86 measured on photos of 1024 to 3200 pixels
+OPENINGS, PAUSE_SECONDS = 50, 0.1  # a reader holds the lock for milliseconds
 CACHED_PHOTOS = 256  # whose features are held in memory, about half a megabyte each
+
+
+def hold_open(database: Path) -> "pycolmap.Database":
+    """A connection to keep for as long as another process reads along.
+
+    Whoever opens the database first or closes it last has to be alone in it, and COLMAP does not wait for that: it
+    fails. With this connection there no other one is the first or the last. Raises RuntimeError where it cannot be
+    opened for seconds.
+    """
+    import pycolmap
+
+    for _ in range(OPENINGS - 1):
+        with suppress(RuntimeError):
+            return pycolmap.Database.open(database)
+        time.sleep(PAUSE_SECONDS)
+    return pycolmap.Database.open(database)
 
 
 def fill_database(

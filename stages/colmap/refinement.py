@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from stages.colmap.held_out import Choice, adjustment_options, choose
-from stages.colmap.lenses import MODELS, equip
+from stages.colmap.lenses import MODELS, equip, flaws
 from stages.colmap.mapping import pipeline_options
 from stages.colmap.observations import noise_px, observations
 from stages.colmap.uncertainty import pose_uncertainty_px
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 # The first choice can only go by what mapping's lens let in. Where another one lets in a tenth more, mostly from the
 # borders of wide photos, that is where it shows what it is worth.
 MANY_MORE = 1.1
+SIMPLEST = MODELS[0]
 
 
 @dataclass(frozen=True)
@@ -28,6 +29,7 @@ class Finished:
     camera_models: list[dict[str, Any]]  # the comparison, a row per candidate (registration.json)
     notes: list[str]
     uncertainty_px: dict[str, float]  # by the image's name
+    left_out: dict[str, str]  # by the image's name, why its camera cannot be used: it has no place any more
 
 
 def finish(
@@ -36,7 +38,8 @@ def finish(
     """Choose the camera model by held-out observations, unless it is given, and adjust everything with it.
 
     Of a given model it is only chosen whether its principal point is refined; a known lens is kept as it is. Where
-    many more observations fit the chosen lens than mapping's, the choice is made again with them.
+    many more observations fit the chosen lens than mapping's, the choice is made again with them. No camera of the
+    model is absurd in the end, unless those of most photos are.
     """
     import pycolmap
 
@@ -44,17 +47,49 @@ def finish(
         choice = Choice(noise_px(mapped, observations(mapped)), notes=["the camera is kept as given"])
         model = pycolmap.Reconstruction(mapped)
         _adjust(model, database, seed, set(model.cameras), adjustment_options(False, choice.noise_px))
-        return _finished(model, choice)
+        return _finished(model, choice, {})
     models = (camera_model,) if camera_model else MODELS
     choice = choose(mapped, seed, models)
     model = _adjusted(mapped, database, seed, choice)
     if model.compute_num_observations() > MANY_MORE * mapped.compute_num_observations():
         choice = choose(model, seed, models)
         model = _adjusted(model, database, seed, choice)
-    return _finished(model, choice)
+    _simplify_absurd(model, database, seed, choice)
+    return _finished(model, choice, _leave_out(model, flaws(model)))
 
 
-def _finished(model: "pycolmap.Reconstruction", choice: Choice) -> Finished:
+def _simplify_absurd(model: "pycolmap.Reconstruction", database: Path, seed: int, choice: Choice) -> None:
+    """Make pinholes of absurd cameras, fisheyes excepted, and adjust everything but the other cameras.
+
+    They are mostly those of few photos, that show too little to be judged by, or were judged by what others show.
+    """
+    absurd = {i: why for i, why in flaws(model).items() if not _camera(model, i).model_name.endswith("FISHEYE")}
+    if not absurd:
+        return
+    cameras = {_camera(model, image_id).camera_id for image_id in absurd}
+    equip(model, dict.fromkeys(cameras, SIMPLEST))
+    _adjust(model, database, seed, set(model.cameras) - cameras, adjustment_options(False, choice.noise_px))
+    photos = f"{len(absurd)} photo{'s' * (len(absurd) != 1)}"
+    choice.notes.append(f"{photos}: the camera came out absurd ({next(iter(absurd.values()))}): {SIMPLEST} instead")
+
+
+def _camera(model: "pycolmap.Reconstruction", image_id: int) -> "pycolmap.Camera":
+    return model.camera(model.image(image_id).camera_id)
+
+
+def _leave_out(model: "pycolmap.Reconstruction", absurd: dict[int, str]) -> dict[str, str]:
+    """Take these photos out of the model: by name why. None where they are most of all: what is left is no scene."""
+    if not absurd or 2 * len(absurd) >= model.num_reg_images():
+        return {}
+    reasons = {model.image(image_id).name: f"its camera came out absurd: {why}" for image_id, why in absurd.items()}
+    for image_id in absurd:
+        model.deregister_frame(model.image(image_id).frame_id)
+    model.tear_down()  # their cameras go too
+    model.update_point_3d_errors()
+    return reasons
+
+
+def _finished(model: "pycolmap.Reconstruction", choice: Choice, left_out: dict[str, str]) -> Finished:
     notes, uncertainty = choice.notes, {}
     untold = "how well the poses are known cannot be told"
     try:
@@ -63,7 +98,8 @@ def _finished(model: "pycolmap.Reconstruction", choice: Choice) -> Finished:
         notes = [*notes, f"{untold}: the points leave some of them free to move"]
     except MemoryError as error:
         notes = [*notes, f"{untold}: {str(error) or 'memory ran out'}"]
-    return Finished(model, choice.table, notes, {model.image(i).name: px for i, px in uncertainty.items()})
+    by_name = {model.image(i).name: px for i, px in uncertainty.items()}
+    return Finished(model, choice.table, notes, by_name, left_out)
 
 
 def _adjusted(

@@ -1,5 +1,7 @@
 """Matching into COLMAP's database, on features that a synthetic scene of points would have."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +9,8 @@ import pycolmap
 import pytest
 
 from stages.colmap import matching
-from stages.colmap.matching import fill_database, look_alike, match_pairs
+from stages.colmap.diagnosis import links
+from stages.colmap.matching import fill_database, hold_open, look_alike, match_pairs
 from stages.pairing import exhaustive
 from stages.photos import Photo
 from tests.stages.test_feature_matching import random_descriptors
@@ -123,3 +126,49 @@ def test_photos_of_the_same_points_look_alike(database: Path) -> None:
     alike = look_alike(database, COUNT, seed=0)
     assert alike.shape == (COUNT, COUNT)
     assert alike[:-1, -1].max() < alike[:-1, :-1].min()
+
+
+def test_photos_without_a_place_are_joined_by_their_matches_with_those_that_have_one(database: Path) -> None:
+    match_pairs(database, exhaustive(COUNT), 0, 0.8)
+    names = [f"{i}.png" for i in range(COUNT)]
+    assert links(database, set(names[:-2])).join
+    assert not links(database, set(names[:-1])).join
+    assert not links(database, {names[-1]}).join, "five that share views with each other alone"
+    assert links(database, set()).join, "no place: any pair is one to begin with"
+
+
+def test_few_matches_with_each_of_several_photos_join_as_well(database: Path) -> None:
+    match_pairs(database, exhaustive(COUNT), 0, 0.8)
+    placed = {f"{i}.png" for i in range(COUNT - 1)}
+    for photo, expected in ((1, False), (2, True)):
+        with pycolmap.Database.open(database) as db:
+            db.delete_two_view_geometry(photo, COUNT)
+            few = pycolmap.TwoViewGeometry(inlier_matches=np.tile(np.arange(20, dtype=np.uint32)[:, None], 2), config=2)
+            db.write_two_view_geometry(photo, COUNT, few)
+        assert links(database, placed).join == expected
+
+
+READER = """
+import sys
+from pathlib import Path
+from stages.registration import count_done
+print("ready", flush=True)
+while True:
+    count_done(Path(sys.argv[1]))
+"""
+
+
+def test_a_database_that_is_held_open_can_be_opened_while_another_process_reads_along(database: Path) -> None:
+    reader = subprocess.Popen(
+        [sys.executable, "-c", READER, str(database)], stdout=subprocess.PIPE, cwd=Path(__file__).parents[2]
+    )
+    try:
+        assert reader.stdout and reader.stdout.readline() == b"ready\n"
+        held = hold_open(database)
+        for _ in range(500):  # without it one in ten or twenty fails
+            with pycolmap.Database.open(database) as db:
+                assert db.num_images() == COUNT
+        held.close()
+    finally:
+        reader.kill()
+        reader.wait()

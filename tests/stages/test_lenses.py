@@ -1,16 +1,20 @@
 import re
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 
 from nerf.scene import Camera
-from stages.colmap import held_out, refinement
+from stages.colmap import lenses, refinement
 from stages.colmap.cameras import native
 from stages.colmap.held_out import Choice, choose, hold_out, paired
 from stages.colmap.lenses import MODELS, Lens, equip, flaw
 from stages.colmap.observations import noise_px, observations, residuals
 from tests.stages.lens_scene import HEIGHT, WIDTH, adjust, lens, mapped, photographed
+
+if TYPE_CHECKING:
+    import pycolmap
 
 CENTRE = (WIDTH / 2, HEIGHT / 2)
 PINHOLE = lens("SIMPLE_PINHOLE", 900, *CENTRE)
@@ -102,11 +106,20 @@ def test_cameras_with_few_photos_are_judged_together() -> None:
 
 
 def test_where_every_candidate_is_absurd_the_camera_stays(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(held_out, "flaw", lambda camera: "it is absurd")
+    monkeypatch.setattr(lenses, "flaw", lambda camera: "it is absurd")
     choice = choose(mapped(photographed(PINHOLE, photos=6, points=80)), 0)
     assert choice.lenses == {1: Lens("SIMPLE_RADIAL", False)}
     assert {row["reason"] for row in choice.table} == {"it is absurd"}
     assert choice.notes[0].endswith("every candidate comes out absurd, so it stays as mapping had it")
+
+
+def test_a_few_photos_with_absurd_cameras_do_not_decide_for_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lenses, "flaw", lambda camera: "it is absurd" if camera.camera_id == 5 else flaw(camera))
+    choice = choose(mapped(photographed(*5 * [PINHOLE], points=100)), 0)  # two photos each
+    assert choice.lenses == dict.fromkeys(range(1, 6), Lens("SIMPLE_PINHOLE", False))
+    monkeypatch.setattr(lenses, "flaw", lambda camera: "it is absurd" if camera.camera_id > 3 else flaw(camera))
+    choice = choose(mapped(photographed(*5 * [PINHOLE], points=100)), 0)
+    assert choice.lenses == dict.fromkeys(range(1, 6), Lens("SIMPLE_RADIAL", False)), "as mapping had them"
 
 
 def test_one_observation_a_point_is_held_out_and_two_are_left() -> None:
@@ -206,3 +219,42 @@ def test_where_the_chosen_lens_lets_many_more_observations_in_it_is_chosen_again
     asked.clear()
     refinement.finish(many, Path("matches.db"), 0, None, False)
     assert asked == [many]
+
+
+def with_a_bad_lens(monkeypatch: pytest.MonkeyPatch, *cameras: Camera) -> "pycolmap.Reconstruction":
+    """What the last adjustment would leave: the last camera bends rays so far that the photo's corners have none."""
+    model = photographed(*cameras, points=300)
+    bad = model.camera(len(cameras))
+    bad.model, bad.params = native(lens("SIMPLE_RADIAL", 800, *CENTRE, -0.5)).model, [800, *CENTRE, -0.5]
+    monkeypatch.setattr(refinement, "choose", lambda *_: Choice(0.5))
+    monkeypatch.setattr(refinement, "_adjusted", lambda *_: model)
+    monkeypatch.setattr(refinement, "_adjust", lambda model, *_: adjust(model))
+    return model
+
+
+def test_a_camera_that_comes_out_absurd_becomes_a_pinhole(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = with_a_bad_lens(monkeypatch, *5 * [PINHOLE])
+    finished = refinement.finish(model, Path("matches.db"), 0, None, False)
+    assert finished.model.camera(5).model_name == "SIMPLE_PINHOLE"
+    assert finished.model.camera(5).mean_focal_length() == pytest.approx(900, rel=0.005)
+    assert finished.left_out == {} and finished.model.num_reg_images() == 10
+    assert re.fullmatch(
+        r"2 photos: the camera came out absurd \(its distortion .* of the pixels\): SIMPLE_PINHOLE instead",
+        finished.notes[-1],
+    )
+
+
+def test_photos_whose_camera_stays_absurd_lose_their_places(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = with_a_bad_lens(monkeypatch, *5 * [PINHOLE])
+    monkeypatch.setattr(lenses, "flaw", lambda camera: "it is absurd" if camera.camera_id == 5 else None)
+    finished = refinement.finish(model, Path("matches.db"), 0, None, False)
+    assert finished.left_out == dict.fromkeys(("04.jpg", "09.jpg"), "its camera came out absurd: it is absurd")
+    assert finished.model.num_reg_images() == len(finished.uncertainty_px) == 8
+    assert sorted(finished.model.cameras) == [1, 2, 3, 4]
+
+
+def test_where_most_cameras_are_absurd_none_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = with_a_bad_lens(monkeypatch, PINHOLE)
+    monkeypatch.setattr(lenses, "flaw", lambda camera: "it is absurd")
+    finished = refinement.finish(model, Path("matches.db"), 0, None, False)
+    assert finished.left_out == {} and finished.model.num_reg_images() == 10

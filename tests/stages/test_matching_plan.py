@@ -78,7 +78,7 @@ def test_the_choice_of_pairs_follows_the_measurement_and_is_said(
     ("places", "words"),
     [
         (Places(time_s=np.arange(400.0)), "neighbours in time, 30 each, about 5 min"),
-        (Places(position_m=9.0 * np.arange(1200.0).reshape(400, 3)), "the 30 nearest places of each, about 5 min"),
+        (Places(position_m=9.0 * np.indices((400, 3))[0]), "neighbours by place and looks, 30 each, about 5 min"),
     ],
 )
 def test_other_choices_have_other_words(places: Places, words: str, progress, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -151,8 +151,25 @@ def test_nearest_places_are_those_next_door() -> None:
     """A walk along the date line: the k nearest of a photo are its neighbours along the way."""
     steps = np.arange(20)
     places = cartesian(10 + 1e-4 * steps, np.where(steps % 2, 180.0, -180.0), None)
-    pairs = pairs_of("spatial", 2, 20, Places(position_m=places), unused)
-    assert pairs.tolist() == union(np.stack([steps[:-1], steps[1:]], axis=1), np.array([[0, 2], [17, 19]])).tolist()
+    walk = union(np.stack([steps[:-1], steps[1:]], axis=1), np.array([[0, 2], [17, 19]]))
+    assert nearest(closeness(places), 2).tolist() == walk.tolist()
+    alike = similarity(20)
+    pairs = pairs_of("spatial", 4, 20, Places(position_m=places), lambda: alike)
+    assert is_proper(pairs) and groups(pairs, 20) == 1
+    assert {*map(tuple, walk.tolist())} < {*map(tuple, pairs.tolist())}
+    assert min(map(len, partners(pairs, 20))) >= 4
+
+
+@pytest.mark.parametrize("error_m", [15.0, 0.0], ids=["scattered indoors", "one stale fix"])
+def test_where_positions_tell_nothing_looks_choose_half_of_the_partners(error_m: float) -> None:
+    """Photos around a room: its likest are partners of each, whatever GPS says."""
+    angle = 2 * np.pi * np.arange(120) / 120
+    alike = np.cos(angle[:, None] - angle[None])
+    places = np.random.default_rng(0).normal(0, error_m, (120, 3))
+    found = partners(pairs_of("spatial", 30, 120, Places(position_m=places), lambda: alike), 120)
+    likest = partners(nearest(alike, 14), 120)
+    assert all(mine <= theirs for mine, theirs in zip(likest, found, strict=True))
+    assert sum(map(len, found)) <= 2 * expected_pairs("spatial", 120, 30) * 1.2
 
 
 def test_a_second_look_takes_as_many_pairs_again_for_the_missing() -> None:

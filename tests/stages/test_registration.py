@@ -45,7 +45,8 @@ def test_photos_left_out_of_matching_stand_in_the_account() -> None:
     photos = [
         replace(photo, near_duplicate_of="ä.jpg") if index in (0, 3) else photo for index, photo in enumerate(PHOTOS)
     ]
-    matched = account(["b.jpg", "c.jpg", "e.jpg"], matches((0, 1), (1, 2)), [["b.jpg", "c.jpg", "e.jpg"]], {}, {}, None)
+    names = ["b.jpg", "c.jpg", "e.jpg"]
+    matched = account(names, matches((0, 1), (1, 2)), [names], {}, {}, None, {})
     entries = with_left_out(matched, photos)
     assert [entry["file"] for entry in entries] == NAMES
     assert [entry["reason"] for entry in entries if not entry["registered"]] == [
@@ -58,16 +59,22 @@ FOUR = (matches((0, 1), (1, 2), (2, 3), (1, 3)), [["a.jpg", "b.jpg", "c.jpg"]])
 
 
 def reasons(found: Matches, models: list[list[str]], **support: tuple[int, int]) -> dict[str, str | None]:
-    entries = account(NAMES, found, models, {}, {name: support.get(name[0], (0, 0)) for name in NAMES}, None)
+    entries = account(NAMES, found, models, {}, {name: support.get(name[0], (0, 0)) for name in NAMES}, None, {})
     return {entry["file"][0]: entry["reason"] for entry in entries}
 
 
 def test_the_account_tells_who_is_registered() -> None:
     nothing = dict.fromkeys(NAMES, (0, 0))
-    entries = account(NAMES, *FOUR, {"a.jpg": 60, "b.jpg": 70, "c.jpg": 50}, nothing, None)
+    entries = account(NAMES, *FOUR, {"a.jpg": 60, "b.jpg": 70, "c.jpg": 50}, nothing, None, {})
     assert [entry["registered"] for entry in entries] == [True, True, True, False, False]
     assert [entry["observations"] for entry in entries] == [60, 70, 50, 0, 0]
     assert [entry["reason"] is None for entry in entries] == [True, True, True, False, False]
+
+
+def test_a_photo_whose_camera_cannot_be_used_has_that_reason() -> None:
+    why = "its camera came out absurd: its parameters are not finite"
+    entries = account(NAMES, *FOUR, {}, dict.fromkeys(NAMES, (60, 60)), None, {"d.jpg": why})
+    assert [entry["reason"] for entry in entries][3] == why
 
 
 @pytest.mark.parametrize(
@@ -105,7 +112,7 @@ def test_a_photo_may_only_be_a_step_ahead_of_the_model() -> None:
 def test_groups_that_contradict_each_other_are_named() -> None:
     found, models = matches((0, 1), (3, 4)), [["a.jpg", "b.jpg", "c.jpg"], ["b.jpg", "c.jpg", "d.jpg", "e.jpg"]]
     conflict = {"group": 1, "shared": 2, "elsewhere": 2}
-    entries = account(NAMES, found, models, {}, dict.fromkeys(NAMES, (0, 0)), conflict)
+    entries = account(NAMES, found, models, {}, dict.fromkeys(NAMES, (0, 0)), conflict, {})
     assert [entry["reason"] for entry in entries[:3]] == [None] * 3
     assert {entry["reason"] for entry in entries[3:]} == {
         "it belongs to a group of 4 photos that shares 2 with this one and puts 2 of them elsewhere: "

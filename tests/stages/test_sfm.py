@@ -159,8 +159,8 @@ def test_strangers_are_left_out_and_named_and_alpha_and_mixed_sizes_work(
         "matching 8 pairs of photos: …",
         "passed over, for 1 of 9 photos missing is not worth starting over: verifying and mapping again, as if through "
         "a fisheye lens; searching twice as many features at twice the size",
-        "passed over, for none of them shares a view with another photo: mapping again, asking less of the first pair; "
-        "mapping again, with another seed; mapping again, all photos at once",
+        "passed over, for the missing photos share too little with the others: mapping again, asking less of the first "
+        "pair; mapping again, with another seed; mapping again, all photos at once",
         "1 of 9 photos found no place and are left out:",
         "  stranger.png: it shares no view with any other photo",
     ]
@@ -244,6 +244,31 @@ def test_photos_with_gps_tell_metres_and_directions(
     assert any(note.startswith("GPS of 12 photos: one unit is ") for note in progress.notes)
 
 
+@pytest.mark.parametrize("always", [False, True], ids=["mended", "left out"])
+def test_the_camera_of_one_photo_that_comes_out_absurd_does_not_end_the_run(
+    always: bool, inputs: dict[str, Path], tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    images = {path.name: np.asarray(Image.open(path)) for path in sorted((inputs["ingest"] / "images").iterdir())[:8]}
+    images["photo_003.jpg"] = np.ascontiguousarray(images["photo_003.jpg"][:, 10:230])  # another size, another camera
+    absurd = "camera.width == 220" if always else "camera.width == 220 and camera.model_name != 'SIMPLE_PINHOLE'"
+    child = (
+        "import stages.colmap.lenses as lenses, stages.sfm_child as c\n"
+        f"lenses.flaw = lambda camera: 'it is absurd' if {absurd} else None\n"
+        "c.main()"
+    )
+    monkeypatch.setattr(sfm_process, "CHILD", ["-c", child])
+    sfm.run(SMALL, ingested(tmp_path / "ingest", images), tmp_path / "sfm", progress)
+    assert "1 photo: the camera came out absurd (it is absurd): SIMPLE_PINHOLE instead" in progress.notes
+    account, model = read_json(tmp_path / "sfm/registration.json"), read_model(tmp_path / "sfm/sparse")
+    reasons = {image["file"]: image["reason"] for image in account["images"] if not image["registered"]}
+    assert reasons == ({"photo_003.jpg": "its camera came out absurd: it is absurd"} if always else {})
+    assert [camera.model for camera in model.cameras if camera.width == 220] == ([] if always else ["SIMPLE_PINHOLE"])
+    assert len(model.images) == account["registered"] == 8 - len(reasons)
+    assert [image["observations"] for image in account["images"] if image["registered"]] == (
+        np.bincount(model.view).tolist()
+    )
+
+
 def with_a_stranger(inputs: dict[str, Path], folder: Path) -> dict[str, Path]:
     """Six photos and one of another scene: the first attempt leaves it without a place."""
     images = {path.name: np.asarray(Image.open(path)) for path in sorted((inputs["ingest"] / "images").iterdir())[:6]}
@@ -317,7 +342,7 @@ def test_an_attempt_for_which_no_time_is_left_is_not_begun(
     assert said in progress.notes
     tried = {row["attempt"]: row["passed"] for row in read_json(tmp_path / "sfm/registration.json")["attempts"]}
     assert tried["looser matching"] == "too little was left of --sfm.max-seconds"
-    assert tried["weaker start"] == "none of them shares a view with another photo"
+    assert tried["weaker start"] == "the missing photos share too little with the others"
 
 
 def test_attempts_whose_matches_are_gone_are_forgotten(

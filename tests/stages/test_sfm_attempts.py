@@ -98,7 +98,9 @@ def test_what_ended_the_program_is_remembered(tmp_path: Path) -> None:
     assert abandoned == {"all at once": "ended the program", "fisheye": "ran out of time"}
 
 
-PLAIN = Situation(missing=1, photos=50, linked=True, flat=False, lens_is_given=False)
+PLAIN = Situation(missing=5, alone=5, photos=50, linked=True, flat=False, lens_is_given=False)
+TOO_LITTLE = "the missing photos share too little with the others"
+APART = "the missing photos fit together among themselves and share too little with the others"
 
 
 @pytest.mark.parametrize(
@@ -106,16 +108,26 @@ PLAIN = Situation(missing=1, photos=50, linked=True, flat=False, lens_is_given=F
     [
         ("looser matching", {"linked": False, "flat": True}, None),
         ("weaker start", {}, None),
-        ("weaker start", {"linked": False, "missing": 40}, "none of them shares a view with another photo"),
+        ("weaker start", {"linked": False, "missing": 40}, TOO_LITTLE),
+        ("weaker start", {"missing": 4}, "4 of 50 photos missing is not worth starting over"),
+        ("other seed", {"missing": 9, "photos": 300}, "9 of 300 photos missing is not worth starting over"),
+        ("all at once", {"missing": 9, "photos": 300}, "9 of 300 photos missing is not worth starting over"),
+        ("looser matching", {"missing": 9, "photos": 300}, None),
+        ("other seed", {"missing": 1, "photos": 8}, None),
         ("weaker start", {"flat": True}, "the photos tell nothing of depth"),
-        ("all at once", {"linked": False}, "none of them shares a view with another photo"),
+        ("all at once", {"linked": False}, TOO_LITTLE),
+        ("looser matching", {"missing": 150, "alone": 0, "photos": 300, "linked": False}, None),
+        ("fisheye", {"missing": 150, "alone": 3, "photos": 300, "linked": False}, APART),
+        ("more features", {"missing": 150, "alone": 3, "photos": 300, "linked": False}, APART),
+        ("more features", {"missing": 150, "alone": 30, "photos": 300, "linked": False}, None),
+        ("more features", {"missing": 150, "alone": 3, "photos": 300}, None),
         ("fisheye", {"missing": 40}, None),
         ("fisheye", {"missing": 40, "lens_is_given": True}, "the camera model is given"),
         ("fisheye", {"missing": 4}, "4 of 50 photos missing is not worth starting over"),
-        ("weaker start", {"photos": 51}, "1 of 51 photos missing is not worth mapping again"),
+        ("weaker start", {"missing": 1, "photos": 51}, "1 of 51 photos missing is not worth mapping again"),
         ("looser matching", {"missing": 5, "photos": 300}, "5 of 300 photos missing is not worth mapping again"),
         ("looser matching", {"missing": 6, "photos": 300}, None),
-        ("more features", {"missing": 5, "linked": False, "lens_is_given": True}, None),
+        ("more features", {"linked": False, "lens_is_given": True}, None),
         ("more features", {"missing": 4}, "4 of 50 photos missing is not worth starting over"),
         ("more features", {"missing": 1, "photos": 8}, "1 of 8 photos missing is not worth starting over"),
         ("more features", {"missing": 2, "photos": 8}, None),

@@ -107,7 +107,7 @@ def test_where_there_is_no_room_for_it_that_is_said_and_the_model_stands(
     else:
         monkeypatch.setattr(uncertainty, "_whitened_covariance", Mock(side_effect=MemoryError()))
         words = "memory ran out"
-    finished = _finished(model, Choice(0.5, notes=["the camera is kept as given"]))
+    finished = _finished(model, Choice(0.5, notes=["the camera is kept as given"]), {})
     assert finished.model is model and finished.uncertainty_px == {}
     assert finished.notes[1:] == [f"how well the poses are known cannot be told: {words}"]
 
