@@ -145,7 +145,9 @@ class Config(StageConfig):
         default=None, description="paper: of coarse samples; none: log if contracted"
     )
 
-    checkpoint_seconds: float = Field(default=30.0, gt=0, description="between checkpoints")
+    checkpoint_seconds: float | None = Field(
+        default=None, gt=0, description="between checkpoints; none: a twentieth of the seconds, 30 at most"
+    )
     tensorboard: bool = Field(default=False, description="write the curve for TensorBoard, too")
 
     @model_validator(mode="after")
