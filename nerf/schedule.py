@@ -36,6 +36,11 @@ class StepPlan(NamedTuple):
         """How many steps the run has, by the latest decision."""
         return self.decisions[-1].total_steps
 
+    @property
+    def is_whole(self) -> bool:
+        """Whether the share never fell to go on from an end: that of another run, or one short of a target."""
+        return all(decision.reason != "more" for decision in self.decisions)
+
     def share(self, step: int) -> float:
         """The share of the run done before ``step``, 1 at the end.
 

@@ -58,6 +58,7 @@ def test_more_steps_take_the_share_back_to_that_of_the_longer_run(plan: StepPlan
     for step in range(done, done + more + 1):
         assert longer.share(step) == pytest.approx(whole.share(step), abs=1e-12)
     assert longer.extended(done + more + yet_more).share(done + more) == (done + more) / (done + more + yet_more)
+    assert plan.is_whole and not longer.is_whole
 
 
 @given(st.integers(1, 500), st.data())
