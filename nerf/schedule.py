@@ -3,7 +3,7 @@
 ``share`` is how much of a run is done, from 0 to 1; everything that changes while training is a function of it.
 A run bounded by steps knows its share exactly. A run bounded by seconds estimates how many steps will fit, and
 revises the estimate when the clock disagrees; the decisions are data (:class:`StepPlan`), so a resumed run that
-replays them gives every step the learning rate it had before.
+replays them gives every step the learning rate it had before, and goes on from there by steps or by the clock.
 """
 
 import math
@@ -36,6 +36,11 @@ class StepPlan(NamedTuple):
         """How many steps the run has, by the latest decision."""
         return self.decisions[-1].total_steps
 
+    @property
+    def is_whole(self) -> bool:
+        """Whether the share never fell to go on from an end: that of another run, or one short of a target."""
+        return all(decision.reason != "more" for decision in self.decisions)
+
     def share(self, step: int) -> float:
         """The share of the run done before ``step``, 1 at the end.
 
@@ -52,6 +57,10 @@ class StepPlan(NamedTuple):
         if not self.decisions[-1].from_step <= step < total_steps:
             raise ValueError(f"at step {step} the plan {self.decisions} cannot become {total_steps} steps")
         return StepPlan((*self.decisions, Decision(step, total_steps, share, "clock")))
+
+    def until(self, step: int) -> "StepPlan":
+        """The decisions made up to ``step``: later ones are about steps that are to be taken once more."""
+        return StepPlan(tuple(decision for decision in self.decisions if decision.from_step <= step))
 
     def closing(self, step: int) -> "StepPlan":
         """This plan with ``step`` as the first one of the last quarter of a run, or of what is left if that is less.

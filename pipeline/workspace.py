@@ -202,9 +202,13 @@ class Workspace:
             _remove(self.root / "output" / Path(name).name)
 
     def stale_folders(self, keys: dict[str, str], stages: list[str]) -> list[Path]:
-        """Stage folders that run.json does not use: other keys, abandoned partials, damaged ones."""
+        """Stage folders that run.json does not use: other keys, abandoned partials, damaged ones. It uses the training
+        that the recorded one goes on from."""
         current = {self.folder(stage, key) for stage, key in keys.items()}
         current |= {self.partial(stage, key) for stage, key in keys.items()}
+        after = self.read_run()["options"].get("train", {}).get("after")
+        if isinstance(after, str):
+            current.add(self.folder("train", after))
         found = (p for stage in stages if (self.root / stage).is_dir() for p in (self.root / stage).iterdir())
         return sorted(p for p in found if p.is_dir() and p not in current)  # a file there is none of ours
 

@@ -1,8 +1,8 @@
 """curve.json: quality against training time, and what it says in words.
 
-``{"field": "grid" | "paper", "device": "cpu" | "cuda", "threads", "points": [{"step", "seconds", "train_psnr",
+``{"field": "grid" | "paper", "device": "cpu" | "cuda", "threads", "whole", "points": [{"step", "seconds", "train_psnr",
 "heldout_psnr", "heldout_ssim"} …]}``; what cannot be measured is null. Seconds are those of training steps alone:
-measuring is not among them.
+measuring is not among them. ``whole``: the rate fell once, at the end, and never rose again to go on.
 """
 
 from collections.abc import Sequence
@@ -19,11 +19,11 @@ BARS = "▁▂▃▄▅▆▇█"
 SPARK_WIDTH = 10
 
 
-def write_curve(folder: Path, field: str, points: list[dict[str, Any]]) -> None:
+def write_curve(folder: Path, field: str, whole: bool, points: list[dict[str, Any]]) -> None:
     """Write curve.json of a run that ends on this machine."""
     from stages.device import compute_device, cores
 
-    about = {"field": field, "device": compute_device(), "threads": cores()}
+    about = {"field": field, "device": compute_device(), "threads": cores(), "whole": whole}
     write_json(folder / "curve.json", about | {"points": points})
 
 
@@ -33,12 +33,13 @@ def heldout_curve(points: Sequence[dict[str, Any]]) -> list[tuple[float, float]]
     return [(seconds, psnr) for seconds, psnr in known if psnr is not None and seconds > 0]
 
 
-def coming_doubling(field: str, points: Sequence[dict[str, Any]]) -> "Gain | None":
-    """What the next doubling of the time is predicted to buy; None where the curve is too short, and for the paper's
-    field, whose rate falls all the way: the prediction was fitted to the grid's."""
+def coming_doubling(field: str, whole: bool, points: Sequence[dict[str, Any]]) -> "Gain | None":
+    """What the next doubling of the time is predicted to buy; None where the curve is too short, and for what the
+    prediction was not fitted to: the paper's field, whose rate falls all the way, and a run that is not ``whole``,
+    where half of the time may have ended annealed, too."""
     from nerf.learning_curve import next_doubling
 
-    return next_doubling(heldout_curve(points), points[-1]["step"]) if points and field == "grid" else None
+    return next_doubling(heldout_curve(points), points[-1]["step"]) if points and field == "grid" and whole else None
 
 
 def doubling_words(points: Sequence[dict[str, Any]], coming: "Gain | None") -> str | None:
@@ -49,7 +50,7 @@ def doubling_words(points: Sequence[dict[str, Any]], coming: "Gain | None") -> s
     last = last_doubling(curve)
     if last is None:
         return None
-    words = f"the last doubling of time, to {duration(curve[-1][0])}, bought {last:+.1f} dB on held-out photos"
+    words = f"the last doubling of training time, to {duration(curve[-1][0])}, bought {last:+.1f} dB on held-out photos"
     if coming is None:
         return words
     return f"{words}; the next is predicted to buy {coming.db:+.1f} dB (± {coming.half_width:.1f})"
@@ -57,7 +58,7 @@ def doubling_words(points: Sequence[dict[str, Any]], coming: "Gain | None") -> s
 
 def next_words(coming: "Gain | None") -> str | None:
     """:func:`doubling_words` for a line that has no room."""
-    return coming and f"the next doubling buys {coming.db:+.1f} ± {coming.half_width:.1f} dB"
+    return coming and f"twice the training time is predicted to buy {coming.db:+.1f} ± {coming.half_width:.1f} dB"
 
 
 def target_words(target: float | None, reached: float | None, seconds: float) -> str | None:

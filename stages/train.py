@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from stages.training_loop import TrainingRun
 
 NEEDS = ("ingest", "normalise", "effects")
-VERSION = 15
+VERSION = 16
 RESUMES = True
 LINKS = ("curve.json",)
 UNKEYED = ("checkpoint_seconds", "tensorboard")
@@ -145,7 +145,9 @@ class Config(StageConfig):
         default=None, description="paper: of coarse samples; none: log if contracted"
     )
 
-    checkpoint_seconds: float = Field(default=30.0, gt=0, description="between checkpoints")
+    checkpoint_seconds: float | None = Field(
+        default=None, gt=0, description="between checkpoints; none: a twentieth of the seconds, 30 at most"
+    )
     tensorboard: bool = Field(default=False, description="write the curve for TensorBoard, too")
 
     @model_validator(mode="after")
@@ -260,7 +262,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     info["background"] = list(field_background(config, scene))
     info |= learnt_of_photos(training.trainer, scene.of_split("train"))
     save_field(folder, training.trainer.model, info)
-    write_curve(folder, config.kind, training.state.curve)
+    write_curve(folder, config.kind, training.plan.is_whole, training.state.curve)
     progress.update("measuring what this machine can do")
     device = training.probes.train.colours.device
     parts = write_parts(folder, training.state.timings, training.trainer.model, device)
@@ -283,8 +285,8 @@ def _result(config: Config, training: "TrainingRun", folder: Path, parts: list[s
     from stages.curve import coming_doubling, doubling_words, target_words
 
     state, last = training.state, training.state.curve[-1]
-    doubling = doubling_words(state.curve, coming_doubling(config.kind, state.curve))
-    target = target_words(config.target_psnr, state.validation_psnr, state.seconds)
+    doubling = doubling_words(state.curve, coming_doubling(config.kind, training.plan.is_whole, state.curve))
+    target = target_words(state.open_target(config.target_psnr), state.validation_psnr, state.seconds)
     for words in filter(None, (doubling, target)):
         progress.note(words)
     left_behind = sorted(path.name for path in folder.glob("nonfinite_*.safetensors"))
@@ -309,20 +311,20 @@ def _result(config: Config, training: "TrainingRun", folder: Path, parts: list[s
 
 
 def _line(config: Config, training: "TrainingRun") -> str:
-    """180 s · 5.4 k steps · 24 k rays/s · held out 28.9 dB ▁▃▅▆▇█ · the next doubling buys +0.6 ± 0.4 dB."""
+    """180 s · 5.4 k steps · 24 k rays/s · held out 28.9 dB, over time ▁▃▅▆▇█ · twice the training time is predicted to
+    buy +0.6 ± 0.4 dB."""
     from stages.curve import coming_doubling, next_words, sparkline, target_words
 
     state = training.state
     heldout = state.curve[-1]["heldout_psnr"]
-    parts = [f"{state.seconds:.0f} s"]
-    if config.after is not None:
-        parts[0] += f", {state.seconds_before:.0f} s of them before"
+    before = "" if config.after is None else f", {state.seconds_before:.0f} s of them before"
+    parts: list[str | None] = [f"{state.seconds:.0f} s{before}"]
     parts += [f"{short_count(state.step)} steps", f"{short_count(state.rays / state.seconds)} rays/s"]
-    parts += [
-        "no photos held out" if heldout is None else f"held out {heldout:.1f} dB {sparkline(state.curve)}".rstrip()
-    ]
-    coming = coming_doubling(config.kind, state.curve)
-    parts += [next_words(coming), target_words(config.target_psnr, state.validation_psnr, state.seconds)]
+    spark = sparkline(state.curve)
+    rising = f", over time {spark}" if spark else ""
+    parts.append("no photos held out" if heldout is None else f"held out {heldout:.1f} dB{rising}")
+    parts.append(next_words(coming_doubling(config.kind, training.plan.is_whole, state.curve)))
+    parts.append(target_words(state.open_target(config.target_psnr), state.validation_psnr, state.seconds))
     if state.symptom is not None:
         parts.append(f"of no use yet: {state.symptom}")
     return " · ".join(filter(None, parts))

@@ -2,7 +2,8 @@
 
 What can happen to a run, and what the loop does:
 
-* killed: goes on from the last good checkpoint; the journal of step plans gives every step its old learning rate;
+* killed: goes on from the last good checkpoint; the journal of step plans gives every step its old learning rate. A
+  run in seconds goes on by the clock: what was trained since that checkpoint is lost, and its time is spent;
 * a loss or gradient stops being finite: the batch is kept, the state rolled back and the rate halved, three times;
 * the field is dead after the warm-up (empty, or no better than one flat colour): another seed, twice at most;
 * it is so later, or at the end: back to the last checkpoint, like after a loss that is not finite. A run that ends
@@ -20,14 +21,14 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from stages.amounts import short_count
 from stages.checkpoints import Checkpoint, latest_checkpoint, save_checkpoint
 from stages.contract import Progress, StageError
 from stages.examination import Lost, is_suspicious, not_finite, symptom_of
 from stages.files import read_json, write_durably
 from stages.live_line import live_line
 from stages.training_parts import observed
-from stages.training_state import Pace, Probes, RunState, TrainingBudget
+from stages.training_state import Pace, Probes, RunState, TrainingBudget, checkpoint_interval, lost_seconds
+from stages.training_words import going_on_words, live_words, lost_words, reached_before_words, steering_words
 
 if TYPE_CHECKING:
     from nerf.probe import ProbeResult
@@ -47,6 +48,7 @@ MOST_MEASURING = 0.05  # of a run in seconds: the share of the time that may go 
 ANNEALING_DB = 1.0
 PLAN_SHARE = 0.01  # of a budget in seconds: how often the clock is looked at, and how far off a plan may be
 PROVISIONAL_STEPS = 1_000_000  # the plan of a run in seconds until its first step has been timed
+MOST_LOST = 0.5  # of a run in seconds: however often it is killed, it has the other half to come to something
 
 
 class TrainingRun:
@@ -61,14 +63,14 @@ class TrainingRun:
         probes: Probes,
         budget: TrainingBudget,
         folder: Path,
-        checkpoint_seconds: float,
+        checkpoint_seconds: float | None,
         log: "TrainingLog",
         progress: Progress,
     ) -> None:
         self.make_trainer, self.probes, self.budget = make_trainer, probes, budget
         self.folder, self.checkpoint_seconds = folder, checkpoint_seconds
         self.log, self.progress = log, progress
-        self.checkpoints, self.journal = folder / "checkpoints", folder / "plan.json"
+        self.checkpoints, self.journal, self.spent = folder / "checkpoints", folder / "plan.json", folder / "spent.txt"
         self.pace, self.next_planning = Pace(), 0.0
         checkpoint = latest_checkpoint(self.checkpoints, progress.note, self._fits)
         if checkpoint is None and budget.after is not None:
@@ -77,6 +79,8 @@ class TrainingRun:
             self._begin(RunState(**checkpoint.facts) if checkpoint else RunState())
         else:
             self._resume(checkpoint)
+        if words := lost_words(self.lost):
+            progress.note(words)
 
     def train(self) -> None:
         """Train to the end of the budget. Raises StageError where the field diverges or stays dead."""
@@ -104,6 +108,7 @@ class TrainingRun:
 
         self.state = state
         self.trainer: FieldTrainer = self.make_trainer(state.restarts)
+        self.lost = lost_seconds(self.spent, state)
         steps, self.clock_budget = self._limits()
         self.plan: StepPlan = plan_of(steps or PROVISIONAL_STEPS)
         self._plan_measurement()
@@ -122,6 +127,7 @@ class TrainingRun:
             why = f"the training in {folder} is of another version of this program: {error}"
             raise StageError("training cannot go on", why, "Train anew, for longer, without --more.") from error
         self.state.steps_before, self.state.seconds_before = step, seconds = self.state.step, self.state.seconds
+        self.state.validation_before = self.state.validation_psnr
         steps, self.clock_budget = self._limits()
         if steps is None:
             assert self.budget.seconds is not None, "one of the two is given"
@@ -131,25 +137,34 @@ class TrainingRun:
         self._save()
         self.log.event("extended", step, total_steps=self.plan.total_steps)
         self.progress.note(f"going on from the {step:,} steps of the finished training, in {self.plan.total_steps:,}")
+        if self.probes.target is not None and self.state.open_target(self.probes.target.psnr) is None:
+            self.progress.note(reached_before_words(self.probes.target.psnr))
 
     def _limits(self) -> tuple[int | None, float | None]:
-        """The steps or seconds after which the run ends at the latest, those of earlier runs included."""
+        """The steps or seconds after which the run ends at the latest, those of earlier runs included; of the seconds
+        less what was lost."""
         steps, seconds, _ = self.budget
         if steps is not None:
             return self.state.steps_before + steps, None
         assert seconds is not None, "one of the two is given"
-        return None, self.state.seconds_before + seconds
+        return None, self.state.seconds_before + seconds - min(self.lost, MOST_LOST * seconds)
 
     def _fits(self, checkpoint: Checkpoint) -> None:
         """Raise RuntimeError for the state of another field, TypeError for facts that are not a run's."""
         self.make_trainer(RunState(**checkpoint.facts).restarts).load_state(checkpoint.tensors)
 
     def _resume(self, checkpoint: Checkpoint) -> None:
-        """Go on from a checkpoint, by the plan that held when the run was killed: its steps are now counted."""
+        """Go on from a checkpoint by the plan that held there; a run in seconds decides anew what it decided later."""
         self._load(checkpoint, self.journal)
-        self.next_checkpoint = time.monotonic() + self.checkpoint_seconds
+        _, self.clock_budget = self._limits()
+        left = None
+        if self.clock_budget is not None:
+            left = self.clock_budget - self.state.seconds
+            self.plan = self.plan.until(self.state.step)
+            self._write_journal()
+        self._plan_checkpoint()
         self.log.event("resumed", self.state.step)
-        self.progress.note(f"going on from step {self.state.step:,} of {self.plan.total_steps:,}")
+        self.progress.note(going_on_words(self.state.step, self.plan.total_steps, left))
 
     def _load(self, checkpoint: Checkpoint, journal: Path) -> None:
         from nerf.schedule import Decision, StepPlan
@@ -158,7 +173,7 @@ class TrainingRun:
         self.trainer = self.make_trainer(self.state.restarts)
         self.trainer.load_state(checkpoint.tensors)
         self.plan = StepPlan(tuple(Decision(*decision) for decision in read_json(journal)))
-        self.clock_budget = None
+        self.lost = lost_seconds(self.spent, self.state)
         self._plan_measurement()
 
     def _take_steps(self) -> None:
@@ -202,6 +217,7 @@ class TrainingRun:
 
         step, tolerance = self.state.step, PLAN_SHARE * (budget - self.state.seconds_before)
         self.next_planning = self.state.seconds + tolerance
+        self.spent.write_text(f"{self.state.seconds + self.lost:.3f}")
         last = self.plan.decisions[-1]
         if not last.from_step <= step < self.plan.total_steps or last.reason == "target":
             return
@@ -252,9 +268,10 @@ class TrainingRun:
         step, decided = self.state.step, self.plan.decisions[-1]
         self.state.validation_psnr = round(look(self.trainer, target.photos).psnr, 3)
         self.log.event("validated", step, psnr=self.state.validation_psnr)
-        if step <= decided.from_step:
+        if step <= decided.from_step or self.state.open_target(target.psnr) is None:
             return
-        failed = sum(decision.reason == "target" for decision in self.plan.decisions)
+        own = (decision for decision in self.plan.decisions if decision.from_step > self.state.steps_before)
+        failed = sum(decision.reason == "target" for decision in own)
         missing = target.psnr - self.state.validation_psnr
         plan = self.plan
         if missing <= 0:
@@ -269,11 +286,7 @@ class TrainingRun:
             self._write_journal()
             self.log.event("steered", step, total_steps=plan.total_steps)
             if plan.total_steps > step:
-                seen = (
-                    f"{self.state.validation_psnr:.1f} of {target.psnr:g} dB on photos set aside after {step:,} steps"
-                )
-                and_now = "annealing over" if plan.decisions[-1].reason == "target" else "going on for"
-                self.progress.note(f"{seen}: {and_now} {plan.total_steps - step:,} more")
+                self.progress.note(steering_words(self.state, target.psnr, plan))
 
     def _most_steps(self) -> int:
         """How many steps the budget allows for."""
@@ -285,8 +298,12 @@ class TrainingRun:
         return self.state.step + int((seconds - self.state.seconds) / per_step)
 
     def _save(self) -> None:
+        started = time.monotonic()
         save_checkpoint(self.checkpoints, Checkpoint(self.state.step, self.trainer.state(), asdict(self.state)))
-        self.next_checkpoint = time.monotonic() + self.checkpoint_seconds
+        self._plan_checkpoint(time.monotonic() - started)
+
+    def _plan_checkpoint(self, cost: float = 0.0) -> None:
+        self.next_checkpoint = time.monotonic() + (self.checkpoint_seconds or checkpoint_interval(self.budget, cost))
 
     def _write_journal(self) -> None:
         write_durably(self.journal, json.dumps(self.plan.decisions).encode())
@@ -371,14 +388,10 @@ class TrainingRun:
         self._begin(self.state.anew(restarts, rollbacks=0))
 
     def _describe(self) -> tuple[str, float]:
-        """The live line: step, speed, quality, time left."""
-        step, total, pace = self.state.step, self.plan.total_steps, self.pace
-        if not pace.count:
+        """The live line, and the share of the run that is done."""
+        if not self.pace.count:
             return "first step", 0.0
-        left = (total - step) * pace.seconds_per_step
+        left = (self.plan.total_steps - self.state.step) * self.pace.seconds_per_step
         if self.clock_budget is not None:
             left = max(0.0, self.clock_budget - self.state.seconds)
-        measured = [point["heldout_psnr"] for point in self.state.curve if point["heldout_psnr"] is not None]
-        heldout = f" · held out {measured[-1]:.1f} dB" if measured else ""
-        speed = f"{short_count(pace.rays_per_step / pace.seconds_per_step)} rays/s"
-        return f"step {step:,} · {speed} · train {pace.psnr:.1f} dB{heldout} · {left:.0f} s left", self.plan.share(step)
+        return live_words(self.state, self.pace, left), self.plan.share(self.state.step)

@@ -10,6 +10,8 @@ if TYPE_CHECKING:
     from stages.unseen import Target, Unseen
 
 RATE_MEMORY_SECONDS = 5.0  # how far back the measured speed and the shown PSNR look
+# Between checkpoints: at most this. Of a run in seconds a twentieth of them, if saving takes no more than a hundredth.
+CHECKPOINT_SECONDS, CHECKPOINT_SHARE, MOST_SAVING = 30.0, 0.05, 0.01
 MOST_OF_A_STALL = 3.0  # of the pace: as much of a longer step counts. A machine that sleeps for seconds is not slower
 
 
@@ -45,13 +47,34 @@ class RunState:
     validation_psnr: float | None = None
     steps_before: int = 0  # of the finished run that this one goes on from
     seconds_before: float = 0.0
+    validation_before: float | None = None
     timings: dict[str, Any] = field(default_factory=dict)
     symptom: str | None = None  # of a field that ended within its warm-up
 
     def anew(self, restarts: int, rollbacks: int) -> "RunState":
-        """The state of a run that begins again with fresh weights: only what was spent is kept."""
-        spent = {name: getattr(self, name) for name in ("seconds", "rays", "steps_before", "seconds_before")}
-        return RunState(restarts=restarts, rollbacks=rollbacks, **spent)
+        """The state of a run that begins again with fresh weights: only what was spent is kept, and what was before."""
+        names = ("seconds", "rays", "steps_before", "seconds_before", "validation_before")
+        return RunState(restarts=restarts, rollbacks=rollbacks, **{name: getattr(self, name) for name in names})
+
+    def open_target(self, psnr: float | None) -> float | None:
+        """The target, unless the finished run that this one goes on from has reached it: more was asked for since."""
+        reached = psnr is not None and self.validation_before is not None and self.validation_before >= psnr
+        return None if reached else psnr
+
+
+def checkpoint_interval(budget: TrainingBudget, cost: float) -> float:
+    """Seconds until the next checkpoint, where nobody says; the last one took ``cost`` seconds."""
+    wanted = CHECKPOINT_SECONDS if budget.seconds is None else CHECKPOINT_SHARE * budget.seconds
+    return min(CHECKPOINT_SECONDS, max(wanted, cost / MOST_SAVING))
+
+
+def lost_seconds(spent: Path, state: RunState) -> float:
+    """How much more training than ``state`` knows of a killed run has noted in the file ``spent``; 0 if it cannot be
+    read."""
+    try:
+        return max(0.0, float(spent.read_text()) - state.seconds)
+    except (OSError, ValueError):
+        return 0.0
 
 
 class Pace:

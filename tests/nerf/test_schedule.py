@@ -33,6 +33,13 @@ def test_a_decision_leaves_the_past_and_the_present_alone(plan: StepPlan, more: 
     assert [revised.share(s) for s in range(step + 1)] == [plan.share(s) for s in range(step + 1)]
 
 
+@given(plans(), st.integers(0, 60))
+def test_a_plan_without_its_later_decisions_is_the_one_that_held(plan: StepPlan, step: int) -> None:
+    earlier = plan.until(step)
+    assert [earlier.share(s) for s in range(step + 1)] == [plan.share(s) for s in range(step + 1)]
+    assert earlier.decisions[-1].from_step <= step and plan.decisions[: len(earlier.decisions)] == earlier.decisions
+
+
 def test_a_plan_without_revision_is_linear() -> None:
     assert [plan_of(4).share(step) for step in range(5)] == [0, 0.25, 0.5, 0.75, 1]
 
@@ -51,6 +58,7 @@ def test_more_steps_take_the_share_back_to_that_of_the_longer_run(plan: StepPlan
     for step in range(done, done + more + 1):
         assert longer.share(step) == pytest.approx(whole.share(step), abs=1e-12)
     assert longer.extended(done + more + yet_more).share(done + more) == (done + more) / (done + more + yet_more)
+    assert plan.is_whole and not longer.is_whole
 
 
 @given(st.integers(1, 500), st.data())

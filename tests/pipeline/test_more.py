@@ -43,6 +43,7 @@ def test_more_has_a_folder_of_its_own_and_a_chain_of_them(trained, monkeypatch: 
     assert (first / "manifest.json").read_bytes() == before, "the first stays as it was"
     linked = (Path(workspace) / "output" / "curve.json").resolve()
     assert linked == (second / "curve.json").resolve()
+    assert [json.loads((folder / "curve.json").read_text())["whole"] for folder in (first, second)] == [True, False]
 
     moved = Path(workspace).rename(Path(workspace).with_name("moved.nerf"))
     try:
@@ -62,7 +63,7 @@ def test_an_interrupted_more_is_taken_up_by_the_same_words(trained, monkeypatch:
     photos, workspace = trained
     words = ["run", photos, "-o", workspace, "--until", "train", "--more", "9steps"]
     assert run_command(["train", workspace, "--train.steps", "12"]) == 0
-    step = GridTrainer.step
+    first, step = result(workspace), GridTrainer.step
 
     def interrupted(self: GridTrainer, number: int, *rest: float):
         if number == 15:
@@ -72,6 +73,8 @@ def test_an_interrupted_more_is_taken_up_by_the_same_words(trained, monkeypatch:
     with monkeypatch.context() as patch:
         patch.setattr(GridTrainer, "step", interrupted)
         assert run_command([*words, "--train.checkpoint-seconds", "1e-9"]) == 130
+    assert run_command(["clean", workspace]) == 0
+    assert (first / "field.safetensors").is_file(), "the training goes on from it"
     assert run_command(words) == 0
     assert steps_of(workspace) == 21
     cut = (result(workspace) / "field.safetensors").read_bytes()

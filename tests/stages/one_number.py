@@ -82,13 +82,17 @@ def unseen() -> Unseen:
 
 
 def run_in(
-    folder: Path, progress, budget: TrainingBudget | None = None, make=None, target: Target | None = None
+    folder: Path,
+    progress,
+    budget: TrainingBudget | None = None,
+    make=None,
+    target: Target | None = None,
+    checkpoint_seconds: float | None = 1e-9,
 ) -> TrainingRun:
     folder.mkdir(exist_ok=True)
     maker, probes = make or (lambda attempt: OneNumber(attempt, quiet)), Probes(probe(), unseen(), target)
-    return TrainingRun(
-        maker, probes, budget or TrainingBudget(40, None), folder, 1e-9, TrainingLog(folder, False), progress
-    )
+    budget, log = budget or TrainingBudget(40, None), TrainingLog(folder, False)
+    return TrainingRun(maker, probes, budget, folder, checkpoint_seconds, log, progress)
 
 
 def number_of(run: TrainingRun) -> OneNumber:

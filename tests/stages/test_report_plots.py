@@ -61,12 +61,13 @@ def test_plots_of_one_page_share_no_identifier():
 
 
 def test_the_curve_shows_what_comes_next_and_where_the_knee_is():
-    steep = curve_svg(_curve(), {}, coming_doubling("grid", _curve())) or ""
+    steep = curve_svg(_curve(), {}, coming_doubling("grid", True, _curve())) or ""
     assert "predicted" in steep and "4 min 16 s" in steep and "knee" not in steep
     flat = [row | {"heldout_psnr": 20 - 8 / row["seconds"]} for row in _curve()]
     assert "knee, 16 s: twice the time bought &lt; 0.5 dB" in (curve_svg(flat, {}) or "")
     unknown = [row | {"heldout_psnr": None} for row in _curve()]
-    assert coming_doubling("grid", unknown) is None and coming_doubling("paper", _curve()) is None
+    for about in (("grid", True, unknown), ("paper", True, _curve()), ("grid", False, _curve())):
+        assert coming_doubling(*about) is None
     assert "predicted" not in (curve_svg(unknown, {}) or "predicted")
 
 

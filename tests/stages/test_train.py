@@ -52,7 +52,7 @@ def test_photos_become_a_field_that_beats_a_flat_colour(tmp_path: Path, progress
     _, info = load_field(tmp_path / "train")
     assert (info["steps"], info["rays"], info["downscale"], info["background"]) == (120, 120 * 64, 1.0, [1, 1, 1])
     assert result.facts["steps"] == 120 and result.facts["restarts"] == result.facts["rollbacks"] == 0
-    assert f"held out {result.facts['heldout_psnr']:.1f} dB " in result.line
+    assert f"held out {result.facts['heldout_psnr']:.1f} dB, over time ▁" in result.line
     curve = read_json(tmp_path / "train" / "curve.json")
     assert (curve["device"], curve["threads"]) == ("cpu", cores())
     last = curve["points"][-1]

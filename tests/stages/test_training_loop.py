@@ -260,6 +260,38 @@ def test_annealing_that_does_not_suffice_is_undone(tmp_path: Path, progress) -> 
     assert (back.total_steps, back.share) == (1000, back.from_step / 1000)
 
 
+def more_towards(folder: Path, progress, target: float, first: Path, make=Rising) -> TrainingRun:
+    run = run_in(folder, progress, TrainingBudget(600, None, first), lambda attempt: make(), Target(target, unseen()))
+    run.train()
+    return run
+
+
+def test_a_target_that_was_reached_does_not_end_more_steps(tmp_path: Path, progress) -> None:
+    class Mortal(Rising):
+        def step(self, step: int, share: float, rate_scale: float) -> StepResult:
+            if step == 500:
+                raise Killed
+            return super().step(step, share, rate_scale)
+
+    first = towards(tmp_path / "first", progress, 20.0)
+    with pytest.raises(Killed):
+        more_towards(tmp_path / "more", progress, 20.0, tmp_path / "first", Mortal)
+    more = more_towards(tmp_path / "more", progress, 20.0, tmp_path / "first")
+    assert more.state.step == first.state.step + 600 and more.plan.share(more.state.step) == pytest.approx(1)
+    assert reasons(more) == [*reasons(first), "more"]
+    assert progress.notes.count("20 dB are reached already: training goes on for all that was asked for") == 1
+    assert more.state.open_target(20.0) is None and first.state.open_target(20.0) == 20.0
+
+
+def test_more_steps_towards_a_higher_target_anneal_as_if_none_had_been(tmp_path: Path, progress) -> None:
+    first = towards(tmp_path / "first", progress, 20.0)
+    more = more_towards(tmp_path / "more", progress, 20.8, tmp_path / "first")
+    assert more.state.validation_psnr is not None and 20.8 <= more.state.validation_psnr < 21.1
+    closing = more.plan.decisions[len(first.plan.decisions) + 1]
+    seen = {e["step"]: e["psnr"] for e in events(tmp_path / "more") if e["event"] == "validated"}
+    assert closing.reason == "target" and 19.8 <= seen[closing.from_step] < 20.3, "within 1 dB, not a part of that"
+
+
 @pytest.mark.parametrize("at", [70, 225, 250])
 def test_a_run_to_a_target_in_two_pieces_is_the_same(at: int, tmp_path: Path, progress) -> None:
     class Mortal(Rising):
