@@ -56,7 +56,8 @@ class Similarity:
 @dataclass(frozen=True)
 class View:
     """One photo with its pose. ``near`` and ``far`` are distances along the unit ray in scene units. ``mask`` is a grey
-    picture of the photo's size inside ingest's folder, 0 where the photo is to be ignored; None: nowhere."""
+    picture of the photo's size inside ingest's folder, 0 where the photo is to be ignored; None: nowhere. ``cut_out``:
+    to be ignored as well is what the photo's own alpha makes more transparent than opaque."""
 
     name: str  # the photo's own name
     file: str  # the decoded image inside ingest's folder
@@ -66,6 +67,7 @@ class View:
     far: float
     split: Split
     mask: str | None = None
+    cut_out: bool = False
 
 
 @dataclass(frozen=True)
@@ -73,7 +75,7 @@ class Scene:
     """Everything that training and rendering need to know of the geometry.
 
     ``bounded``: all that the photos show lies inside the region of interest; otherwise space beyond it is
-    contracted (nerf/contraction.py). ``has_alpha``: the photos carry a known background. ``layout`` is how the
+    contracted (nerf/contraction.py). ``has_alpha``: the photos' alpha says what is background. ``layout`` is how the
     cameras stand: around an object, looking outward or through a room, or all facing one way.
     """
 

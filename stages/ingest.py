@@ -36,7 +36,7 @@ from stages.ingest_words import (
 )
 from stages.masks import pair_masks, read_mask
 from stages.near_duplicates import near_duplicates, small, thumbnail
-from stages.photos import Box, Photo, Refusal, opaque_box, write_photos
+from stages.photos import Box, Photo, Refusal, opaque_box, opaque_share, write_photos
 from stages.sharpness import one_colour, relative_sharpness, sharpness
 from stages.sources import Source, find_source
 from stages.video_frames import FEWEST_FRAMES, take_frames
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     import numpy as np
 
 NEEDS: tuple[str, ...] = ()
-VERSION = 6
+VERSION = 7
 RESUMES = False
 NOTES = "notes.json"
 LINKS = ("photos.json", NOTES, "images", "masks")
@@ -55,6 +55,9 @@ UNKEYED = ("cameras",)
 _MAX_WORKERS = 8  # each holds a few copies of one photo, up to 250 megapixels
 _BYTES_PER_PIXEL = 24  # of a photo while it is decoded, turned, packed and looked at; 22 measured for 16 bits
 _NO_PLACE = Place()
+# Of the pixels, that have to be more transparent than opaque in a photo with alpha. Fewer are scratches: where they are
+# wrong by half of all that a value can be, they cost what is 0.3 dB at 30 dB (nerf/evidence/evidence.py).
+_LEAST_TRANSPARENT = 3e-4
 
 
 class Config(StageConfig):
@@ -97,7 +100,7 @@ class _Taken:
     camera_key: CameraKey
     sharpness: float
     focal_source: str | None = None
-    has_alpha: bool = False
+    opaque_share: float = 1.0
     one_colour: str | None = None
     place: Place = _NO_PLACE
     exposure_ev: float | None = None
@@ -243,7 +246,7 @@ def _take(file: Path, name: str, mask: Path | None, waiting: Path) -> _Taken | R
         camera_key=decoded.camera_key,
         sharpness=sharpness(pixels),
         focal_source=decoded.focal_source,
-        has_alpha=pixels.shape[2] == 4 and bool((pixels[..., 3] < 255).any()),
+        opaque_share=opaque_share(pixels),
         one_colour=one_colour(pixels),
         place=decoded.place,
         exposure_ev=decoded.exposure_ev,
@@ -317,8 +320,9 @@ def _store(taken: Sequence[_Taken], same: Mapping[str, str], folder: Path) -> li
                 camera_group=groups[index],
                 focal_px=photo.camera_key.focal_px,
                 focal_source=photo.focal_source,
-                has_alpha=photo.has_alpha,
+                has_alpha=1 - photo.opaque_share >= _LEAST_TRANSPARENT,
                 opaque=photo.opaque,
+                opaque_share=photo.opaque_share,
                 used_share=1 - photo.mask.ignored if photo.mask else 1.0,
                 sharpness=photo.sharpness,
                 relative_sharpness=relative[index],

@@ -9,6 +9,7 @@ from pydantic import Field
 
 from stages.contract import Inputs, Progress, StageConfig, StageError, StageResult
 from stages.files import read_json, write_json, write_tensors
+from stages.photos import WHOLE
 
 if TYPE_CHECKING:
     import numpy as np
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     from stages.sparse_model import SparseModel
 
 NEEDS = ("ingest", "sfm")
-VERSION = 7
+VERSION = 8
 RESUMES = False
 LINKS = ("transforms.json", "scene.json")
 
@@ -57,7 +58,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
         ((by_file[f"images/{image.file}"], i) for i, image in enumerate(model.images)), key=lambda pair: pair[0].name
     )
     photos, order = [photo for photo, _ in posed], [i for _, i in posed]
-    has_alpha = _has_alpha(photos, progress)
+    has_alpha = _has_alpha(photos, progress, tracked=len(model.view) > 0)
     official = read_json(inputs["sfm"] / "registration.json")["test_files"]
     split = _split(photos, config.test_every, official)
     # What is opaque in a test photo decides nothing.
@@ -74,13 +75,18 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
             "the others are held out as test photos",
             f"Add training photos, or {'change the given split' if official else 'raise --normalise.test-every'}.",
         )
-    scene = _scene(sfm, photos, [model.images[i].camera for i in order], model.cameras, found, split, has_alpha)
+    if has_alpha and not found.bounded:
+        progress.note(
+            f"{found.beyond_alpha:.1%} of what is tracked lies beyond what the photos' alpha leaves: the scene goes on "
+            "there, and transparent parts are ignored, as masked ones are"
+        )
+    scene = _scene(sfm, photos, [model.images[i].camera for i in order], model.cameras, found, split)
     write_json(folder / "scene.json", scene.to_json())
     write_tensors(folder / "points.safetensors", _points(model, sfm, found))
     write_json(folder / "transforms.json", transforms(scene))
     return StageResult(
         outputs=("scene.json", "points.safetensors", "transforms.json"),
-        line=_line(found, has_alpha),
+        line=_line(found),
         facts=_facts(scene, found, len(model.view)),
     )
 
@@ -100,15 +106,19 @@ def _check(config: Config, views: int) -> None:
         )
 
 
-def _has_alpha(photos: "list[Photo]", progress: Progress) -> bool:
-    """Whether the photos say what is background: most have transparent parts. The others are said to be exceptions."""
+def _has_alpha(photos: "list[Photo]", progress: Progress, tracked: bool) -> bool:
+    """Whether the photos may say what is background: most have transparent parts, and those of most of them take up an
+    edge at least, as what is behind a thing does; what undistorting or stitching leaves in the corners does not. Where
+    nothing is tracked, which would tell, all alpha counts. The others are said to be exceptions."""
     transparent = sum(photo.has_alpha for photo in photos)
+    framing = sum(photo.has_alpha and photo.opaque != WHOLE for photo in photos) if tracked else transparent
     opaque = len(photos) - transparent
-    has_alpha = transparent > opaque
+    has_alpha = transparent > opaque and 2 * framing > transparent
     if has_alpha and opaque:
         progress.note(f"{opaque} of {len(photos)} photos have no transparent parts: taken as opaque everywhere")
     elif transparent and not has_alpha:
-        progress.note(f"{transparent} of {len(photos)} photos have transparent parts: laid over white, most have none")
+        why = "most photos have none" if transparent <= opaque else "they take up no whole edge, as a background does"
+        progress.note(f"transparent parts of {transparent} of {len(photos)} photos are ignored like masked ones: {why}")
     return has_alpha
 
 
@@ -162,9 +172,8 @@ def _scene(
     cameras: "Sequence[Camera]",
     found: "Normalisation",
     split: "list[Split]",
-    has_alpha: bool,
 ) -> "Scene":
-    """The scene, its views in order of name."""
+    """The scene, its views in order of name. Alpha that is no background cuts its photo out."""
     from nerf.scene import Scene, View
 
     views = tuple(
@@ -177,6 +186,7 @@ def _scene(
             far=float(found.far[i]),
             split=split[i],
             mask=photo.mask,
+            cut_out=photo.has_alpha and not found.bounded,
         )
         for i, photo in enumerate(photos)
     )
@@ -185,7 +195,7 @@ def _scene(
         views=views,
         scene_from_sfm=found.scene_from_sfm,
         bounded=found.bounded,
-        has_alpha=has_alpha,
+        has_alpha=found.bounded,
         layout=found.layout,
         up_known=found.up.known,
     )
@@ -205,7 +215,7 @@ def _points(model: "SparseModel", sfm: "Reconstruction", found: "Normalisation")
     }
 
 
-def _line(found: "Normalisation", has_alpha: bool) -> str:
+def _line(found: "Normalisation") -> str:
     """What was decided, for the user."""
     arc = 360 if found.arc_deg > FULL_TURN_DEG else round(found.arc_deg / 10) * 10
     layout = {
@@ -213,7 +223,7 @@ def _line(found: "Normalisation", has_alpha: bool) -> str:
         "inside": "inside a space, looking around",
         "forward": "photos facing one way",
     }[found.layout]
-    background = "transparent" if has_alpha else "unbounded"
+    background = "transparent" if found.bounded else "unbounded"
     up = f"up from {found.up.source}" if found.up.known else "no up: the cameras disagree"
     return f"{layout}, background {background} · {up}"
 

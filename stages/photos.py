@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
 Box = tuple[float, float, float, float]
 """Left, top, right and bottom of a rectangle, as shares of a photo's width and height."""
+WHOLE: Box = (0.0, 0.0, 1.0, 1.0)
+OPAQUE_FROM = 128  # of 255: from here on a pixel is more opaque than transparent
 
 
 @dataclass(frozen=True)
@@ -30,8 +32,8 @@ class Photo:
     place. ``time_s`` is when a frame of a video was taken, in seconds from its beginning, None for photos. The place
     is EXIF's, in degrees (north and east positive) and metres above the sea, None where it tells none; so is
     ``exposure_ev``, in stops (stages/decoding.py: exposure_from_exif). ``opaque`` holds all that is more than half
-    opaque, None without alpha; ``used_share`` is what the mask leaves of the pixels. ``orientation`` is EXIF's, which
-    was undone in the pixels.
+    opaque, None without alpha; ``opaque_share`` is how many of the pixels that are, ``has_alpha``: not nearly all.
+    ``used_share`` is what the mask leaves of the pixels. ``orientation`` is EXIF's, which was undone in the pixels.
     """
 
     name: str  # the user's own file name, relative to the photo folder
@@ -52,6 +54,7 @@ class Photo:
     altitude_m: float | None = None
     exposure_ev: float | None = None
     opaque: Box | None = None
+    opaque_share: float = 1.0
     used_share: float = 1.0
     orientation: int = 1
 
@@ -108,13 +111,18 @@ def opaque_box(pixels: "np.ndarray") -> Box | None:
 
     if pixels.shape[2] != 4:
         return None
-    opaque = pixels[..., 3] > 127
+    opaque = pixels[..., 3] >= OPAQUE_FROM
     if not opaque.any() or opaque.all():
         return None
     height, width = opaque.shape
     columns, rows = np.flatnonzero(opaque.any(axis=0)), np.flatnonzero(opaque.any(axis=1))
     left, right = float(columns[0]) / width, float(columns[-1] + 1) / width
     return left, float(rows[0]) / height, right, float(rows[-1] + 1) / height
+
+
+def opaque_share(pixels: "np.ndarray") -> float:
+    """How many of the pixels of (h, w, 3 or 4) uint8 are more opaque than transparent."""
+    return float((pixels[..., 3] >= OPAQUE_FROM).mean()) if pixels.shape[2] == 4 else 1.0
 
 
 def load_pixels(path: Path, width: int, height: int) -> "np.ndarray":

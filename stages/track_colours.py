@@ -208,14 +208,14 @@ def _look(ingest: Path, scene: "Scene", view: "View", places: _Places) -> "tuple
     mean of g g^T."""
     import numpy as np
 
-    from stages.masks import load_mask
+    from stages.masks import used_part
     from stages.photos import load_pixels
 
     width, height = _size(scene, view)
     pixels = load_pixels(ingest / view.file, width, height)
-    used = np.ones(pixels.shape[:2], bool) if pixels.shape[2] == 3 else pixels[..., 3] == 255
-    if view.mask:
-        used = used & load_mask(ingest / view.mask, width, height)
+    used = pixels[..., 3] == 255 if scene.has_alpha and pixels.shape[2] == 4 else np.ones(pixels.shape[:2], bool)
+    if (part := used_part(ingest, view, width, height)) is not None:
+        used = used & part
     seen = np.full((len(places.xy), 5), np.nan)
     corner = np.floor(places.xy).astype(int) - places.window[:, None] // 2
     whole = ((corner >= 0) & (corner + places.window[:, None] <= [width, height])).all(axis=1)

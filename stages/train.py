@@ -206,12 +206,18 @@ def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
 
         progress.update("trying how fast this machine trains")
         rays = rays_in_budget(config, scene, decisions)
-        masked = any(view.mask for view in scene.views)
-        used = {photo.name: photo.used_share for photo in read_photos(inputs["ingest"])} if masked else {}
-        config = _filled(config, {"downscale": chosen_downscale(scene, rays, used)})
+        config = _filled(config, {"downscale": chosen_downscale(scene, rays, _used_shares(inputs["ingest"], scene))})
         if config.kind == "grid":
             config = _filled(config, grid_size(config, scene, rays))
     return config
+
+
+def _used_shares(ingest: Path, scene: "Scene") -> dict[str, float]:
+    """By name, which share of the pixels of photos is to be used; of photos that are not named all of it is."""
+    partly = {view.file: view for view in scene.views if view.mask or view.cut_out}
+    photos = [photo for photo in read_photos(ingest) if photo.file in partly] if partly else []
+    cut_out = {photo.name: photo.opaque_share if partly[photo.file].cut_out else 1.0 for photo in photos}
+    return {photo.name: min(photo.used_share, cut_out[photo.name]) for photo in photos}
 
 
 def with_habits(config: Config) -> Config:

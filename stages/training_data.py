@@ -81,9 +81,8 @@ def training_bank(ingest: Path, scene: "Scene", split: "Split", downscale: float
             far=torch.tensor([view.far for view in views]),
         ),
     )
-    if not any(view.mask for view in views):
-        return bank
-    return _masked(bank, [view_mask(ingest, scene, view, downscale) for view in views], split, progress)
+    used_parts = [view_mask(ingest, scene, view, downscale) for view in views]
+    return bank if all(part is None for part in used_parts) else _masked(bank, used_parts, split, progress)
 
 
 def guided_bank(inputs: Inputs, scene: "Scene", downscale: float, progress: Progress) -> "RayBank":
@@ -122,11 +121,10 @@ def view_mask(ingest: Path, scene: "Scene", view: "View", downscale: float) -> "
     """Which pixels of a view are to be used, (H, W) bool; None: all of them."""
     import torch
 
-    from stages.masks import load_mask
+    from stages.masks import used_part
 
-    if view.mask is None:
-        return None
-    return torch.from_numpy(load_mask(ingest / view.mask, *scaled_size(scene.cameras[view.camera], downscale)))
+    used = used_part(ingest, view, *scaled_size(scene.cameras[view.camera], downscale))
+    return None if used is None else torch.from_numpy(used)
 
 
 def view_rays(scene: "Scene", view: "View", downscale: float) -> "Rays":
@@ -170,7 +168,7 @@ def _store(ingest: Path, scene: "Scene", split: "Split", downscale: float) -> "P
 
 
 def _decoded_pixels(ingest: Path, scene: "Scene", view: "View", downscale: float) -> "np.ndarray":
-    """The photo of a view as uint8: (H, W, 4) in a scene with alpha, else (H, W, 3) with stray alpha over white."""
+    """The photo of a view as uint8: (H, W, 4) in a scene with alpha, else (H, W, 3) as it is below its alpha."""
     import numpy as np
 
     from stages.photos import load_pixels
@@ -178,7 +176,4 @@ def _decoded_pixels(ingest: Path, scene: "Scene", view: "View", downscale: float
     pixels = load_pixels(ingest / view.file, *scaled_size(scene.cameras[view.camera], downscale))
     if scene.has_alpha and pixels.shape[2] == 3:  # a photo without transparent parts covers every pixel
         return np.concatenate([pixels, np.full_like(pixels[..., :1], 255)], axis=2)
-    if scene.has_alpha or pixels.shape[2] == 3:
-        return pixels
-    alpha = pixels[..., 3:].astype(np.float32) / 255
-    return np.rint(255 + alpha * (pixels[..., :3] - 255.0)).astype(np.uint8)
+    return pixels if scene.has_alpha else np.ascontiguousarray(pixels[..., :3])

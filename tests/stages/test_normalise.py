@@ -9,7 +9,7 @@ from nerf.scene import Camera
 from stages import normalise
 from stages.contract import StageError
 from stages.files import read_json, read_scene, read_tensors
-from stages.photos import Photo, write_photos
+from stages.photos import WHOLE, Box, Photo, write_photos
 from tests.camera_layouts import ball, ring, seen_by
 
 CAMERA = Camera("PINHOLE", 400, 400, (400.0, 400.0, 200.0, 200.0))
@@ -20,17 +20,24 @@ def inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Builds the folders of ingest and sfm for a ring of photos around a ball of points; COLMAP lists them reversed."""
 
     def build(
-        count: int = 17, transparent: int = 0, test_files: list[str] | None = None, one_place: bool = False
+        count: int = 17,
+        transparent: int = 0,
+        test_files: list[str] | None = None,
+        one_place: bool = False,
+        opaque: Box | None = None,
+        around: float = 0.0,
     ) -> dict[str, Path]:
         poses = ring(count)
         if one_place:
             poses[:, :, 3] = 0
-        scene = seen_by(poses, np.zeros((0, 3)) if one_place else ball())
+        # ``around`` so far about the ball there are points, too, a tenth as many as the photos see of it
+        ring_about = around * ring(40, 1.0, 0.0)[:, :, 3] if around else np.zeros((0, 3))
+        scene = seen_by(poses, np.zeros((0, 3)) if one_place else np.concatenate([ball(), ring_about]))
         folders = {name: tmp_path / name for name in ("ingest", "sfm", "normalise")}
         for folder in folders.values():
             folder.mkdir(exist_ok=True)
         photos = [
-            Photo(f"ä {i:02d}.jpg", f"images/{i:02d}.png", 400, 400, 0, None, None, i < transparent, 1.0)
+            Photo(f"ä {i:02d}.jpg", f"images/{i:02d}.png", 400, 400, 0, None, None, i < transparent, 1.0, opaque=opaque)
             for i in range(count)
         ]
         write_photos(folders["ingest"], photos, [], {})
@@ -100,7 +107,7 @@ def test_alpha_makes_the_background_known(inputs, progress) -> None:
     ("transparent", "has_alpha", "note"),
     [
         (16, True, "1 of 17 photos have no transparent parts: taken as opaque everywhere"),
-        (1, False, "1 of 17 photos have transparent parts: laid over white, most have none"),
+        (1, False, "transparent parts of 1 of 17 photos are ignored like masked ones: most photos have none"),
     ],
 )
 def test_most_photos_decide_on_alpha_and_exceptions_are_named(inputs, progress, transparent, has_alpha, note) -> None:
@@ -108,6 +115,39 @@ def test_most_photos_decide_on_alpha_and_exceptions_are_named(inputs, progress, 
     run(folders, progress)
     scene = read_scene(folders["normalise"])
     assert (scene.has_alpha, scene.bounded, progress.notes) == (has_alpha, has_alpha, [note])
+    assert [view.cut_out for view in scene.views] == [not has_alpha and i < transparent for i in range(17)]
+
+
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        (
+            {"opaque": WHOLE},
+            "transparent parts of 17 of 17 photos are ignored like masked ones: they take up no whole edge",
+        ),
+        (
+            {"opaque": (0.0, 0.3, 1.0, 1.0), "around": 20.0},
+            " of what is tracked lies beyond what the photos' alpha leaves",
+        ),
+    ],
+    ids=["corners", "sky"],
+)
+def test_alpha_is_no_background_where_the_scene_goes_on(inputs, progress, given, says) -> None:
+    """Corners left by undistorting; and a sky cut out of photos that show the distance."""
+    folders = inputs(transparent=17, **given)
+    assert "background unbounded" in run(folders, progress).line
+    scene = read_scene(folders["normalise"])
+    assert not scene.has_alpha and not scene.bounded
+    assert all(view.cut_out for view in scene.views)
+    assert len(progress.notes) == 1 and says in progress.notes[0]
+
+
+def test_where_nothing_is_tracked_alpha_is_the_background(inputs, progress, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tests.stages.test_normalise.ball", lambda: np.zeros((0, 3)))
+    folders = inputs(transparent=17, opaque=WHOLE)
+    run(folders, progress)
+    scene = read_scene(folders["normalise"])
+    assert scene.has_alpha and scene.bounded and not any(view.cut_out for view in scene.views)
 
 
 @pytest.mark.parametrize(("count", "held_out"), [(3, [0]), (8, [0]), (9, [0, 8]), (17, [0, 8, 16])])

@@ -121,17 +121,25 @@ def test_test_photos_are_not_opened(tmp_path: Path, progress: SilentProgress) ->
     assert len(look_at_photos(tmp_path, scene, points, progress).tracks) > 60
 
 
-def test_masked_and_transparent_windows_are_left_out(tmp_path: Path, progress: SilentProgress) -> None:
+@pytest.mark.parametrize("background", [True, False], ids=["alpha is the background", "alpha cuts out"])
+def test_masked_and_transparent_windows_are_left_out(
+    tmp_path: Path, progress: SilentProgress, background: bool
+) -> None:
     scene, points = photographed_points(tmp_path)
     whole = look_at_photos(tmp_path, scene, points, progress).tracks
     mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
     mask[:, 320:] = 0
     write_png(tmp_path / "masks/1.png.png", mask)
     with Image.open(tmp_path / "images/2.png") as image:
-        pixels = np.dstack([np.asarray(image), mask])
+        pixels = np.dstack([np.asarray(image), mask if background else np.maximum(mask, 1) - 1])  # 254 is not 255
     write_png(tmp_path / "images/2.png", pixels)
-    views = [replace(view, mask="masks/1.png.png" if view.name == "1.png" else None) for view in scene.views]
-    cut = look_at_photos(tmp_path, replace(scene, views=tuple(views)), points, progress).tracks
+    masks = {"1.png": "masks/1.png.png"}
+    views = [
+        replace(view, mask=masks.get(view.name), cut_out=view.name == "2.png" and not background)
+        for view in scene.views
+    ]
+    scene = replace(scene, views=tuple(views), has_alpha=background)
+    cut = look_at_photos(tmp_path, scene, points, progress).tracks
     for number in range(6):
         of_view = points["view"] == 1 + number + (number > 2)
         reaching = np.count_nonzero(np.floor(points["xy"][of_view, 0]) + 2 >= 320)  # windows of five pixels
