@@ -9,7 +9,7 @@ from PIL import Image
 
 import stages.track_colours
 from nerf.evidence import transients
-from nerf.evidence.exposure import EV
+from nerf.evidence.exposure import EV, fit_exposure
 from nerf.scene import Camera, Scene, View
 from stages.colmap.cameras import focal_and_centre
 from stages.evidence import scene_evidence, training_residuals
@@ -157,6 +157,24 @@ def test_clipped_windows_are_saturated(tmp_path: Path, progress: SilentProgress)
     assert np.array_equal(tracks.saturated, bright)
 
 
+def test_a_channel_that_is_dark_beside_the_others_leaves_them_their_gains(
+    tmp_path: Path, progress: SilentProgress
+) -> None:
+    """Photos by lamplight: their blue is cut off nearly everywhere."""
+    scene, points = photographed_points(tmp_path, np.linspace(0.8, 1.4, VIEWS))
+    by_day = fit_exposure(look_at_photos(tmp_path, scene, points, progress).tracks)
+    for number, file in enumerate(sorted((tmp_path / "images").iterdir())):
+        with Image.open(file) as image:
+            pixels = np.asarray(image).copy()
+        pixels[..., 2] = np.random.default_rng(number).integers(0, 3, pixels.shape[:2])
+        write_png(file, pixels)
+    tracks = look_at_photos(tmp_path, scene, points, progress).tracks
+    by_night = fit_exposure(tracks)
+    assert not tracks.saturated.any() and by_night.known.all()
+    np.testing.assert_allclose(by_night.log_gain[:, :2], by_day.log_gain[:, :2], atol=0.02)
+    assert np.ptp(by_night.log_gain[:, 0]) > 0.5
+
+
 def test_windows_are_summed_as_if_each_were_looked_at() -> None:
     draw = np.random.default_rng(0)
     pixels = draw.integers(0, 256, (300, 400, 4), dtype=np.uint8)
@@ -170,7 +188,8 @@ def test_windows_are_summed_as_if_each_were_looked_at() -> None:
     direct = []
     for (x, y), width in zip(corner, side, strict=True):
         window = pixels[y : y + width, x : x + width, :3].reshape(-1, 3)
-        clipped = ((window <= DARKEST) | (window >= BRIGHTEST)).mean(axis=0).max() > CLIPPED_SHARE
+        lightest = window.max(axis=1)
+        clipped = ((lightest <= DARKEST) | (lightest >= BRIGHTEST)).mean() > CLIPPED_SHARE
         whole = used[y : y + width, x : x + width].all()
         row = [*window.mean(axis=0) / 255, clipped, window.mean(axis=1).std() / 255]
         direct.append(row if whole else [np.nan] * 5)
