@@ -84,8 +84,8 @@ def test_a_photo_that_is_badly_measured_decides_nothing(deviation_ev: float, cal
         assert "; 1 photos do not count, their gains are not known to 0.1 EV; EXIF tells of 0 EV" in found.words
         bent = tone_evidence(fit._replace(contrast=np.eye(12)[4], contrast_error=fit.contrast_error + np.eye(12)[4]))
         assert bent.called_for is False
-    unsure = exposure_evidence(fit._replace(error=fit.error + EV))
-    assert unsure.called_for is None and "do not count" not in unsure.words, "better than nothing"
+        unsure = exposure_evidence(fit._replace(error=fit.error + EV))
+        assert unsure.called_for is None and "do not count" not in unsure.words, "better than nothing"
 
 
 def test_what_cameras_wrote_is_laid_beside_the_gains_and_decides_nothing() -> None:
