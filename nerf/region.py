@@ -96,13 +96,14 @@ def _reach(scene: Reconstruction, centre: Float[np.ndarray, "3"]) -> Float[np.nd
 
 
 def _grown(cube: Region, scene: Reconstruction) -> Region:
-    """Let the cube hold the whole scene where that costs little (or where alpha says that there is no more)."""
+    """Let the cube hold the whole scene where that costs little; or as much of it as costs little where alpha says that
+    there is no more, for then what is beyond is not shown at all."""
     if not len(scene.point):
         return cube
     whole = float(np.quantile(_reach(scene, cube.centre), WHOLE))
-    if scene.opaque is not None or whole <= GROWTH * cube.half:
-        return Region(cube.centre, max(cube.half, whole))
-    return cube
+    if whole > GROWTH * cube.half and scene.opaque is None:
+        return cube
+    return Region(cube.centre, max(cube.half, min(whole, GROWTH * cube.half)))
 
 
 def _near_by(scene: Reconstruction) -> Bool[np.ndarray, "n"]:

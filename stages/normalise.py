@@ -9,7 +9,6 @@ from pydantic import Field
 
 from stages.contract import Inputs, Progress, StageConfig, StageError, StageResult
 from stages.files import read_json, write_json, write_tensors
-from stages.photos import WHOLE
 
 if TYPE_CHECKING:
     import numpy as np
@@ -107,19 +106,25 @@ def _check(config: Config, views: int) -> None:
 
 
 def _has_alpha(photos: "list[Photo]", progress: Progress, tracked: bool) -> bool:
-    """Whether the photos may say what is background: most have transparent parts, and those of most of them take up an
-    edge at least, as what is behind a thing does; what undistorting or stitching leaves in the corners does not. Where
-    nothing is tracked, which would tell, all alpha counts. The others are said to be exceptions."""
+    """Whether the photos may say what is background: most have transparent parts, and most of these show what is opaque
+    from one of its sides to the other, as one sees a thing. Outdoors without a sky one does not, nor in photos with
+    empty corners. Where nothing is tracked, which would tell, all alpha counts. Exceptions are said."""
     transparent = sum(photo.has_alpha for photo in photos)
-    framing = sum(photo.has_alpha and photo.opaque != WHOLE for photo in photos) if tracked else transparent
+    framing = sum(photo.has_alpha and _ends_within(photo.opaque) for photo in photos) if tracked else transparent
     opaque = len(photos) - transparent
     has_alpha = transparent > opaque and 2 * framing > transparent
     if has_alpha and opaque:
         progress.note(f"{opaque} of {len(photos)} photos have no transparent parts: taken as opaque everywhere")
     elif transparent and not has_alpha:
-        why = "most photos have none" if transparent <= opaque else "they take up no whole edge, as a background does"
+        why = "most photos have none" if transparent <= opaque else "what is opaque is seen whole in few"
         progress.note(f"transparent parts of {transparent} of {len(photos)} photos are ignored like masked ones: {why}")
     return has_alpha
+
+
+def _ends_within(opaque: "Box | None") -> bool:
+    """Whether what is opaque, nothing at all too, ends within its photo on the left and right, or above and below."""
+    left, top, right, bottom = opaque or (1.0, 1.0, 0.0, 0.0)
+    return (left > 0 and right < 1) or (top > 0 and bottom < 1)
 
 
 def _reconstruction(model: "SparseModel", order: list[int], boxes: "Sequence[Box | None] | None") -> "Reconstruction":

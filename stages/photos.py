@@ -14,7 +14,6 @@ if TYPE_CHECKING:
 
 Box = tuple[float, float, float, float]
 """Left, top, right and bottom of a rectangle, as shares of a photo's width and height."""
-WHOLE: Box = (0.0, 0.0, 1.0, 1.0)
 OPAQUE_FROM = 128  # of 255: from here on a pixel is more opaque than transparent
 
 

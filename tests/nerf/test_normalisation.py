@@ -194,6 +194,7 @@ def test_alpha_is_no_background_where_the_scene_goes_on_beyond_what_it_leaves() 
     scene = opaque_where(seen_by(ring(), ball()), thing)
     few = normalise(with_points(scene, 20 * ball(3), views=16), None)  # wrong, half a percent of what is seen
     assert few.bounded and 0 < few.beyond_alpha < 0.01
+    assert region_half(few) < 1.3 * region_half(normalise(scene, None))
     many = with_points(scene, 20 * ball(30), views=16)
     found, opaque = normalise(many, None), normalise(dataclasses.replace(many, opaque=None), None)
     assert not found.bounded and found.beyond_alpha > 0.03

@@ -9,7 +9,7 @@ from nerf.scene import Camera
 from stages import normalise
 from stages.contract import StageError
 from stages.files import read_json, read_scene, read_tensors
-from stages.photos import WHOLE, Box, Photo, write_photos
+from stages.photos import Box, Photo, write_photos
 from tests.camera_layouts import ball, ring, seen_by
 
 CAMERA = Camera("PINHOLE", 400, 400, (400.0, 400.0, 200.0, 200.0))
@@ -118,23 +118,23 @@ def test_most_photos_decide_on_alpha_and_exceptions_are_named(inputs, progress, 
     assert [view.cut_out for view in scene.views] == [not has_alpha and i < transparent for i in range(17)]
 
 
+CROPPED = "transparent parts of 17 of 17 photos are ignored like masked ones: what is opaque is seen whole in few"
+BEYOND = " of what is tracked lies beyond what the photos' alpha leaves"
+
+
 @pytest.mark.parametrize(
-    ("given", "says"),
+    ("opaque", "around", "says"),
     [
-        (
-            {"opaque": WHOLE},
-            "transparent parts of 17 of 17 photos are ignored like masked ones: they take up no whole edge",
-        ),
-        (
-            {"opaque": (0.0, 0.3, 1.0, 1.0), "around": 20.0},
-            " of what is tracked lies beyond what the photos' alpha leaves",
-        ),
+        ((0.0, 0.0, 1.0, 1.0), 0.0, CROPPED),
+        ((0.0, 0.3, 1.0, 1.0), 0.0, CROPPED),
+        ((0.2, 0.3, 0.8, 1.0), 20.0, BEYOND),
     ],
-    ids=["corners", "sky"],
+    ids=["empty corners", "no sky", "the distance"],
 )
-def test_alpha_is_no_background_where_the_scene_goes_on(inputs, progress, given, says) -> None:
-    """Corners left by undistorting; and a sky cut out of photos that show the distance."""
-    folders = inputs(transparent=17, **given)
+def test_alpha_is_no_background_where_the_scene_goes_on(
+    inputs, progress, opaque: Box, around: float, says: str
+) -> None:
+    folders = inputs(transparent=17, opaque=opaque, around=around)
     assert "background unbounded" in run(folders, progress).line
     scene = read_scene(folders["normalise"])
     assert not scene.has_alpha and not scene.bounded
@@ -142,9 +142,16 @@ def test_alpha_is_no_background_where_the_scene_goes_on(inputs, progress, given,
     assert len(progress.notes) == 1 and says in progress.notes[0]
 
 
+@pytest.mark.parametrize("opaque", [None, (0.2, 0.3, 0.8, 1.0), (0.0, 0.3, 1.0, 0.9)])
+def test_alpha_is_the_background_of_a_thing_that_is_seen_whole(inputs, progress, opaque: Box | None) -> None:
+    folders = inputs(transparent=17, opaque=opaque)
+    run(folders, progress)
+    assert read_scene(folders["normalise"]).has_alpha and progress.notes == []
+
+
 def test_where_nothing_is_tracked_alpha_is_the_background(inputs, progress, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tests.stages.test_normalise.ball", lambda: np.zeros((0, 3)))
-    folders = inputs(transparent=17, opaque=WHOLE)
+    folders = inputs(transparent=17, opaque=(0.0, 0.0, 1.0, 1.0))
     run(folders, progress)
     scene = read_scene(folders["normalise"])
     assert scene.has_alpha and scene.bounded and not any(view.cut_out for view in scene.views)
