@@ -217,10 +217,11 @@ def test_what_masks_ignore_does_not_count_for_the_size_of_the_photos(
         inputs, scene = photographed(tmp_path / name, mask=given)
         scene = replace(scene, views=tuple(replace(view, cut_out=cut_out) for view in scene.views))
         write_json(inputs["normalise"] / "scene.json", scene.to_json())
-        shares = {"used_share": 1.0 if given is None else 0.25, "opaque_share": 0.25}  # which alone cuts nothing out
-        photos = [
-            Photo(v.name, v.file, WIDTH, HEIGHT, 0, None, None, True, 1.0, mask=v.mask, **shares) for v in scene.views
-        ]
+        plain = Photo(
+            "", "", WIDTH, HEIGHT, 0, None, None, True, 1.0, opaque_share=0.25
+        )  # which alone cuts nothing out
+        share = 1.0 if given is None else 0.25
+        photos = [replace(plain, name=v.name, file=v.file, mask=v.mask, used_share=share) for v in scene.views]
         write_photos(inputs["ingest"], photos, [], {})
         chosen.append(train.plan(Config(**sizes), inputs, progress).downscale)
     assert chosen[0] == pytest.approx(2 * chosen[1], abs=0.2) and chosen[1] == chosen[2] > 1
