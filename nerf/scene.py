@@ -56,8 +56,7 @@ class Similarity:
 @dataclass(frozen=True)
 class View:
     """One photo with its pose. ``near`` and ``far`` are distances along the unit ray in scene units. ``mask`` is a grey
-    picture of the photo's size inside ingest's folder, 0 where the photo is to be ignored; None: nowhere. ``cut_out``:
-    to be ignored as well is what the photo's own alpha makes more transparent than opaque."""
+    picture of the photo's size inside ingest's folder, 0 where the photo is to be ignored; None: nowhere."""
 
     name: str  # the photo's own name
     file: str  # the decoded image inside ingest's folder
@@ -67,7 +66,6 @@ class View:
     far: float
     split: Split
     mask: str | None = None
-    cut_out: bool = False
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,7 @@ from stages.ingest_words import (
 )
 from stages.masks import pair_masks, read_mask
 from stages.near_duplicates import near_duplicates, small, thumbnail
-from stages.photos import Box, Photo, Refusal, opaque_box, opaque_share, write_photos
+from stages.photos import OPAQUE_FROM, Box, Photo, Refusal, opaque_box, write_photos
 from stages.sharpness import one_colour, relative_sharpness, sharpness
 from stages.sources import Source, find_source
 from stages.video_frames import FEWEST_FRAMES, take_frames
@@ -100,7 +100,7 @@ class _Taken:
     camera_key: CameraKey
     sharpness: float
     focal_source: str | None = None
-    opaque_share: float = 1.0
+    opaque_share: float | None = None  # that a mask beside ``waiting`` leaves; None without alpha
     one_colour: str | None = None
     place: Place = _NO_PLACE
     exposure_ev: float | None = None
@@ -147,8 +147,9 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     masks = [photo.mask for photo in taken if photo.mask]
     turned, resized = sum(mask.turned for mask in masks), sum(mask.resized for mask in masks)
     say_masks([mask.ignored for mask in masks], turned, resized, len(photos), progress)
+    opaque = any(photo.has_alpha for photo in photos)
     return StageResult(
-        outputs=("images", "photos.json", "masks") if masks else ("images", "photos.json"),
+        outputs=("images", "photos.json", *["masks"] * bool(masks), *["opaque"] * opaque),
         records=(NOTES,) if notes else (),
         line=summary(source, photos, refused),
         facts=facts(source, photos, refused),
@@ -246,7 +247,7 @@ def _take(file: Path, name: str, mask: Path | None, waiting: Path) -> _Taken | R
         camera_key=decoded.camera_key,
         sharpness=sharpness(pixels),
         focal_source=decoded.focal_source,
-        opaque_share=opaque_share(pixels),
+        opaque_share=_take_opaque(pixels, taken_mask, waiting),
         one_colour=one_colour(pixels),
         place=decoded.place,
         exposure_ev=decoded.exposure_ev,
@@ -266,6 +267,22 @@ def _take_mask(file: Path, photo: CameraKey, waiting: Path) -> _TakenMask | None
         return None
     write_png(waiting, mask.pixels)
     return _TakenMask(waiting, ignored, small(mask.pixels), mask.turned, mask.resized)
+
+
+def _take_opaque(pixels: "np.ndarray", mask: _TakenMask | None, waiting: Path) -> float | None:
+    """The share of the pixels of a photo with alpha that are more opaque than transparent and that its mask leaves; a
+    mask of these is left beside it. None without alpha."""
+    import numpy as np
+    from PIL import Image
+
+    opaque = pixels[..., 3] >= OPAQUE_FROM if pixels.shape[2] == 4 else np.ones(pixels.shape[:2], bool)
+    if 1 - opaque.mean() < _LEAST_TRANSPARENT:
+        return None
+    if mask:
+        with Image.open(mask.waiting) as picture:
+            opaque &= np.asarray(picture) > 0
+    write_png(waiting.with_suffix(".opaque"), np.where(opaque, np.uint8(255), np.uint8(0)))
+    return float(opaque.mean())
 
 
 def _without_duplicates(taken: Sequence[_Taken]) -> tuple[list[_Taken], list[Refusal]]:
@@ -311,6 +328,9 @@ def _store(taken: Sequence[_Taken], same: Mapping[str, str], folder: Path) -> li
         _move(photo.waiting, folder / "images" / file)
         if photo.mask:
             _move(photo.mask.waiting, folder / "masks" / f"{file}.png")
+        has_alpha = photo.opaque_share is not None
+        if has_alpha:
+            _move(photo.waiting.with_suffix(".opaque"), folder / "opaque" / f"{file}.png")
         photos.append(
             Photo(
                 name=photo.name,
@@ -320,9 +340,10 @@ def _store(taken: Sequence[_Taken], same: Mapping[str, str], folder: Path) -> li
                 camera_group=groups[index],
                 focal_px=photo.camera_key.focal_px,
                 focal_source=photo.focal_source,
-                has_alpha=1 - photo.opaque_share >= _LEAST_TRANSPARENT,
+                has_alpha=has_alpha,
                 opaque=photo.opaque,
-                opaque_share=photo.opaque_share,
+                opaque_mask=f"opaque/{file}.png" if has_alpha else None,
+                opaque_share=1.0 if photo.opaque_share is None else photo.opaque_share,
                 used_share=1 - photo.mask.ignored if photo.mask else 1.0,
                 sharpness=photo.sharpness,
                 relative_sharpness=relative[index],

@@ -3,8 +3,6 @@
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import reduce
-from operator import and_
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,7 +12,6 @@ from stages.files import write_png
 if TYPE_CHECKING:
     import numpy as np
 
-    from nerf.scene import View
     from stages.photos import Photo
 
 USE_FROM = 128  # of 255: from here on a pixel counts as used
@@ -92,24 +89,15 @@ def _turned(pixels: "np.ndarray", orientation: int) -> "np.ndarray":
     return np.ascontiguousarray(upright(Image.fromarray(pixels), orientation))
 
 
-def used_part(ingest: Path, view: "View", width: int, height: int) -> "np.ndarray | None":
-    """Which pixels of a view's photo, made this small, are to be used, (height, width) bool: those into which nothing
-    goes that its mask ignores or, where it is cut out, that is more transparent than opaque. None: all of them."""
-    files = [file for file in (view.mask, view.file if view.cut_out else None) if file is not None]
-    parts = [load_mask(ingest / file, width, height) for file in files]
-    return reduce(and_, parts) if parts else None
-
-
 def load_mask(path: Path, width: int, height: int) -> "np.ndarray":
-    """A mask that ingest wrote, or a photo's alpha, as (height, width) bool at the photo's reduced size, True where
-    every pixel that goes into one is to be used."""
+    """A mask that ingest wrote as (height, width) bool at a photo's reduced size, True where every pixel that goes into
+    one is to be used."""
     import cv2
     import numpy as np
     from PIL import Image
 
     with Image.open(path) as image:
-        light = image.getchannel("A") if image.mode == "RGBA" else image
-        ignored = (np.asarray(light) < USE_FROM).astype(np.float32)
+        ignored = (np.asarray(image) == 0).astype(np.float32)
     if ignored.shape != (height, width):
         ignored = cv2.resize(ignored, (width, height), interpolation=cv2.INTER_AREA)
     return ignored == 0

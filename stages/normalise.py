@@ -178,7 +178,7 @@ def _scene(
     found: "Normalisation",
     split: "list[Split]",
 ) -> "Scene":
-    """The scene, its views in order of name. Alpha that is no background cuts its photo out."""
+    """The scene, its views in order of name. Alpha that is no background is one more mask."""
     from nerf.scene import Scene, View
 
     views = tuple(
@@ -190,8 +190,7 @@ def _scene(
             near=float(found.near[i]),
             far=float(found.far[i]),
             split=split[i],
-            mask=photo.mask,
-            cut_out=photo.has_alpha and not found.bounded,
+            mask=photo.mask if found.bounded else photo.opaque_mask or photo.mask,
         )
         for i, photo in enumerate(photos)
     )

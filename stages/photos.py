@@ -31,8 +31,9 @@ class Photo:
     place. ``time_s`` is when a frame of a video was taken, in seconds from its beginning, None for photos. The place
     is EXIF's, in degrees (north and east positive) and metres above the sea, None where it tells none; so is
     ``exposure_ev``, in stops (stages/decoding.py: exposure_from_exif). ``opaque`` holds all that is more than half
-    opaque, None without alpha; ``opaque_share`` is how many of the pixels that are, ``has_alpha``: not nearly all.
-    ``used_share`` is what the mask leaves of the pixels. ``orientation`` is EXIF's, which was undone in the pixels.
+    opaque, None without alpha. ``has_alpha``: not nearly all of it is; ``opaque_mask`` is a mask that ignores the rest
+    beside what ``mask`` does. ``used_share`` and ``opaque_share`` are what the two masks leave of the pixels.
+    ``orientation`` is EXIF's, which was undone in the pixels.
     """
 
     name: str  # the user's own file name, relative to the photo folder
@@ -53,6 +54,7 @@ class Photo:
     altitude_m: float | None = None
     exposure_ev: float | None = None
     opaque: Box | None = None
+    opaque_mask: str | None = None  # "opaque/….png", relative to ingest's folder
     opaque_share: float = 1.0
     used_share: float = 1.0
     orientation: int = 1
@@ -80,8 +82,8 @@ def write_photos(folder: Path, photos: Sequence[Photo], refused: Sequence[Refusa
 def read_photos(ingest_folder: Path) -> list[Photo]:
     """The photos of a finished ingest, in order of their names. Raises StageError if photos.json is damaged."""
     photos = _read(ingest_folder).photos
-    for file in (file for photo in photos for file in (photo.file, photo.mask) if file is not None):
-        if not re.fullmatch(r"(images|masks)(/[\w-][\w.-]*)+", file, re.ASCII):
+    for file in (f for photo in photos for f in (photo.file, photo.mask, photo.opaque_mask) if f is not None):
+        if not re.fullmatch(r"(images|masks|opaque)(/[\w-][\w.-]*)+", file, re.ASCII):
             raise damaged("photos.json", f"{file[:40]!r} is no file of this folder")
     return photos
 
@@ -117,11 +119,6 @@ def opaque_box(pixels: "np.ndarray") -> Box | None:
     columns, rows = np.flatnonzero(opaque.any(axis=0)), np.flatnonzero(opaque.any(axis=1))
     left, right = float(columns[0]) / width, float(columns[-1] + 1) / width
     return left, float(rows[0]) / height, right, float(rows[-1] + 1) / height
-
-
-def opaque_share(pixels: "np.ndarray") -> float:
-    """How many of the pixels of (h, w, 3 or 4) uint8 are more opaque than transparent."""
-    return float((pixels[..., 3] >= OPAQUE_FROM).mean()) if pixels.shape[2] == 4 else 1.0
 
 
 def load_pixels(path: Path, width: int, height: int) -> "np.ndarray":

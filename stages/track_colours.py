@@ -211,14 +211,14 @@ def _look(ingest: Path, scene: "Scene", view: "View", places: _Places) -> "tuple
     mean of g g^T."""
     import numpy as np
 
-    from stages.masks import used_part
+    from stages.masks import load_mask
     from stages.photos import load_pixels
 
     width, height = _size(scene, view)
     pixels = load_pixels(ingest / view.file, width, height)
     used = pixels[..., 3] == 255 if scene.has_alpha and pixels.shape[2] == 4 else np.ones(pixels.shape[:2], bool)
-    if (part := used_part(ingest, view, width, height)) is not None:
-        used = used & part
+    if view.mask:
+        used = used & load_mask(ingest / view.mask, width, height)
     seen = np.full((len(places.xy), 5), np.nan)
     corner = np.floor(places.xy).astype(int) - places.window[:, None] // 2
     whole = ((corner >= 0) & (corner + places.window[:, None] <= [width, height])).all(axis=1)
@@ -246,13 +246,14 @@ def _window_means(pixels: "np.ndarray", used: "np.ndarray", corner: "np.ndarray"
 
     result = np.empty((len(corner), 5))
     grey = np.zeros(pixels.shape[:2], np.float32)  # three times, a whole number
+    lightest = np.zeros(pixels.shape[:2], np.uint8)
     for channel in range(3):
         plane = cv2.extractChannel(pixels, channel)
         result[:, channel] = summed(plane) / (255 * area)
         grey += plane
+        lightest = np.maximum(lightest, plane)
     grey_sum = summed(grey)
     grey_squares = summed(np.multiply(grey, grey, out=grey))
-    lightest = pixels[..., :3].max(axis=2)
     beyond = ((lightest <= DARKEST) | (lightest >= BRIGHTEST)).view(np.uint8)
     result[:, 3] = summed(beyond) > CLIPPED_SHARE * area
     result[:, 4] = np.sqrt(area * grey_squares - grey_sum**2) / (area * 3 * 255)

@@ -213,11 +213,11 @@ def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
 
 
 def _used_shares(ingest: Path, scene: "Scene") -> dict[str, float]:
-    """By name, which share of the pixels of photos is to be used; of photos that are not named all of it is."""
-    partly = {view.file: view for view in scene.views if view.mask or view.cut_out}
-    photos = [photo for photo in read_photos(ingest) if photo.file in partly] if partly else []
-    cut_out = {photo.name: photo.opaque_share if partly[photo.file].cut_out else 1.0 for photo in photos}
-    return {photo.name: min(photo.used_share, cut_out[photo.name]) for photo in photos}
+    """By name, which share of its pixels a photo's mask leaves; photos that are not named have none."""
+    masks = {view.file: view.mask for view in scene.views if view.mask}
+    photos = [photo for photo in read_photos(ingest) if photo.file in masks] if masks else []
+    cut_out = {photo.name for photo in photos if masks[photo.file] == photo.opaque_mask}
+    return {photo.name: photo.opaque_share if photo.name in cut_out else photo.used_share for photo in photos}
 
 
 def with_habits(config: Config) -> Config:

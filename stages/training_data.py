@@ -81,8 +81,9 @@ def training_bank(ingest: Path, scene: "Scene", split: "Split", downscale: float
             far=torch.tensor([view.far for view in views]),
         ),
     )
-    used_parts = [view_mask(ingest, scene, view, downscale) for view in views]
-    return bank if all(part is None for part in used_parts) else _masked(bank, used_parts, split, progress)
+    if not any(view.mask for view in views):
+        return bank
+    return _masked(bank, [view_mask(ingest, scene, view, downscale) for view in views], split, progress)
 
 
 def guided_bank(inputs: Inputs, scene: "Scene", downscale: float, progress: Progress) -> "RayBank":
@@ -121,10 +122,11 @@ def view_mask(ingest: Path, scene: "Scene", view: "View", downscale: float) -> "
     """Which pixels of a view are to be used, (H, W) bool; None: all of them."""
     import torch
 
-    from stages.masks import used_part
+    from stages.masks import load_mask
 
-    used = used_part(ingest, view, *scaled_size(scene.cameras[view.camera], downscale))
-    return None if used is None else torch.from_numpy(used)
+    if view.mask is None:
+        return None
+    return torch.from_numpy(load_mask(ingest / view.mask, *scaled_size(scene.cameras[view.camera], downscale)))
 
 
 def view_rays(scene: "Scene", view: "View", downscale: float) -> "Rays":

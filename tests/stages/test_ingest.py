@@ -362,6 +362,7 @@ def test_an_alpha_channel_without_transparent_parts_is_none(tmp_path: Path, prog
     photos = read_photos(tmp_path / "out")
     assert [photo.has_alpha for photo in photos] == [False, False, False, True]
     assert [photo.opaque_share for photo in photos] == [1, 1, 1, 1 - 1 / (32 * 24)]
+    assert [photo.opaque_mask for photo in photos] == [None, None, None, "opaque/d.png.png"]
 
 
 def test_a_full_disk_is_said_in_words(tmp_path: Path, progress: Any, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -37,8 +38,12 @@ def inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         for folder in folders.values():
             folder.mkdir(exist_ok=True)
         photos = [
-            Photo(f"ä {i:02d}.jpg", f"images/{i:02d}.png", 400, 400, 0, None, None, i < transparent, 1.0, opaque=opaque)
+            Photo(f"ä {i:02d}.jpg", f"images/{i:02d}.png", 400, 400, 0, None, None, i < transparent, 1.0)
             for i in range(count)
+        ]
+        photos = [
+            replace(photo, opaque=opaque, opaque_mask=f"opaque/{i:02d}.png") if photo.has_alpha else photo
+            for i, photo in enumerate(photos)
         ]
         write_photos(folders["ingest"], photos, [], {})
         (folders["sfm"] / "registration.json").write_text(json.dumps({"test_files": test_files}))
@@ -115,7 +120,9 @@ def test_most_photos_decide_on_alpha_and_exceptions_are_named(inputs, progress, 
     run(folders, progress)
     scene = read_scene(folders["normalise"])
     assert (scene.has_alpha, scene.bounded, progress.notes) == (has_alpha, has_alpha, [note])
-    assert [view.cut_out for view in scene.views] == [not has_alpha and i < transparent for i in range(17)]
+    assert [view.mask for view in scene.views] == [
+        f"opaque/{i:02d}.png" if not has_alpha and i < transparent else None for i in range(17)
+    ]
 
 
 CROPPED = "transparent parts of 17 of 17 photos are ignored like masked ones: what is opaque is seen whole in few"
@@ -138,7 +145,7 @@ def test_alpha_is_no_background_where_the_scene_goes_on(
     assert "background unbounded" in run(folders, progress).line
     scene = read_scene(folders["normalise"])
     assert not scene.has_alpha and not scene.bounded
-    assert all(view.cut_out for view in scene.views)
+    assert [view.mask for view in scene.views] == [f"opaque/{i:02d}.png" for i in range(17)]
     assert len(progress.notes) == 1 and says in progress.notes[0]
 
 
@@ -154,7 +161,7 @@ def test_where_nothing_is_tracked_alpha_is_the_background(inputs, progress, monk
     folders = inputs(transparent=17, opaque=(0.0, 0.0, 1.0, 1.0))
     run(folders, progress)
     scene = read_scene(folders["normalise"])
-    assert scene.has_alpha and scene.bounded and not any(view.cut_out for view in scene.views)
+    assert scene.has_alpha and scene.bounded and not any(view.mask for view in scene.views)
 
 
 @pytest.mark.parametrize(("count", "held_out"), [(3, [0]), (8, [0]), (9, [0, 8]), (17, [0, 8, 16])])

@@ -133,11 +133,8 @@ def test_masked_and_transparent_windows_are_left_out(
     with Image.open(tmp_path / "images/2.png") as image:
         pixels = np.dstack([np.asarray(image), mask if background else np.maximum(mask, 1) - 1])  # 254 is not 255
     write_png(tmp_path / "images/2.png", pixels)
-    masks = {"1.png": "masks/1.png.png"}
-    views = [
-        replace(view, mask=masks.get(view.name), cut_out=view.name == "2.png" and not background)
-        for view in scene.views
-    ]
+    masks = {"1.png": "masks/1.png.png"} | ({} if background else {"2.png": "masks/1.png.png"})
+    views = [replace(view, mask=masks.get(view.name)) for view in scene.views]
     scene = replace(scene, views=tuple(views), has_alpha=background)
     cut = look_at_photos(tmp_path, scene, points, progress).tracks
     for number in range(6):

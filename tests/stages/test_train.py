@@ -13,7 +13,7 @@ from stages import train
 from stages.contract import Progress, StageError
 from stages.device import cores
 from stages.field_files import load_field
-from stages.files import read_json, write_json
+from stages.files import read_json
 from stages.photos import Photo, write_photos
 from stages.train import Config
 from tests.stages.photo_scene import HEIGHT, WIDTH, photographed
@@ -213,15 +213,13 @@ def test_what_masks_ignore_does_not_count_for_the_size_of_the_photos(
     mask[: HEIGHT // 4] = 255
     sizes: dict[str, Any] = {"levels": 2, "log2_rows": 8, "finest": 16, "batch_samples": 256, "steps": 2}
     chosen = []
-    for name, given, cut_out in (("all", None, False), ("some", mask, False), ("cut out", None, True)):
+    for name, given, opaque in (("all", None, None), ("some", mask, None), ("cut out", mask, "yes")):
         inputs, scene = photographed(tmp_path / name, mask=given)
-        scene = replace(scene, views=tuple(replace(view, cut_out=cut_out) for view in scene.views))
-        write_json(inputs["normalise"] / "scene.json", scene.to_json())
-        plain = Photo(
-            "", "", WIDTH, HEIGHT, 0, None, None, True, 1.0, opaque_share=0.25
-        )  # which alone cuts nothing out
-        share = 1.0 if given is None else 0.25
-        photos = [replace(plain, name=v.name, file=v.file, mask=v.mask, used_share=share) for v in scene.views]
+        plain = Photo("", "", WIDTH, HEIGHT, 0, None, None, True, 1.0, opaque_share=0.25)
+        photos = [
+            replace(plain, name=v.name, file=v.file, used_share=0.5 if opaque else 0.25, opaque_mask=opaque and v.mask)
+            for v in scene.views
+        ]
         write_photos(inputs["ingest"], photos, [], {})
         chosen.append(train.plan(Config(**sizes), inputs, progress).downscale)
     assert chosen[0] == pytest.approx(2 * chosen[1], abs=0.2) and chosen[1] == chosen[2] > 1

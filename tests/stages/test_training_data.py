@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from nerf.ray_bank import Placement, ray_bank
 from nerf.scene import Camera
 from stages.contract import StageError
-from stages.files import write_tensors
+from stages.files import write_png, write_tensors
 from stages.training_data import (
     MOST_PATCHES,
     camera_directions,
@@ -83,7 +83,9 @@ def test_alpha_that_is_no_background_is_ignored_like_what_a_mask_ignores(
     downscale: float, tmp_path: Path, progress: SilentProgress
 ) -> None:
     inputs, scene = photographed(tmp_path, channels=4)
-    opaque = replace(scene, has_alpha=False, views=tuple(replace(view, cut_out=True) for view in scene.views))
+    write_png(inputs["ingest"] / "opaque/all.png", ball_photo(4)[..., 3].copy())
+    views = tuple(replace(view, mask="opaque/all.png") for view in scene.views)
+    opaque = replace(scene, has_alpha=False, views=views)
     bank = training_bank(inputs["ingest"], opaque, "train", downscale, progress)
     assert bank.pixels.shape[1] == 3
     used = view_mask(inputs["ingest"], opaque, opaque.views[1], downscale)
