@@ -1,5 +1,6 @@
 """The similarity that carries a reconstruction into the scene frame, and all that is decided along with it."""
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -8,7 +9,7 @@ from jaxtyping import Float
 from nerf import REGION_HALF
 from nerf.depth_range import near_and_far
 from nerf.reconstruction import Reconstruction, spatial_median
-from nerf.region import Layout, Region, find_layout, find_region, share_beyond
+from nerf.region import GOES_ON, Layout, Region, beyond_alpha, find_layout, find_region, share_beyond
 from nerf.scene import Similarity
 from nerf.up_vector import Up, Witness, find_up
 
@@ -23,7 +24,9 @@ LEAST_HALF = (
 class Normalisation(NamedTuple):
     """The scene frame and what is known of the scene in it.
 
-    ``beyond`` is the share of observations outside the region, ``arc_deg`` how far the cameras reach around it.
+    ``bounded``: the photos have alpha, and the points agree that there is no more than it leaves; ``beyond_alpha`` is
+    the share of observations that do not. ``beyond`` is the share of observations outside the region, ``arc_deg`` how
+    far the cameras reach around it.
     """
 
     scene_from_sfm: Similarity
@@ -32,6 +35,7 @@ class Normalisation(NamedTuple):
     up: Up  # in the sfm frame
     near: Float[np.ndarray, "n"]
     far: Float[np.ndarray, "n"]
+    beyond_alpha: float
     beyond: float
     arc_deg: float
 
@@ -53,6 +57,9 @@ def normalise(
     middle = spatial_median(sfm.centres)
     _check_extent(sfm, middle)
     upright = sfm.in_frame(rotation, middle)
+    contradicted = 0.0 if upright.opaque is None else beyond_alpha(upright, layout)
+    if contradicted >= GOES_ON:
+        upright = replace(upright, opaque=None)
     region = find_region(upright, layout) if roi is None else Region(rotation @ (np.array(roi[:3]) - middle), roi[3])
     if not region.half >= LEAST_HALF:
         raise ValueError(f"it is {region.half:.2g} units large, and {LEAST_HALF:g} is the least")
@@ -60,7 +67,7 @@ def normalise(
     centre = middle + rotation.T @ region.centre
     scene = upright.in_frame(np.eye(3), region.centre, scale)
     # Points cannot prove that nothing lies beyond the cube: sky and plain walls have none. Only alpha does.
-    bounded = sfm.opaque is not None
+    bounded = upright.opaque is not None
     near, far = near_and_far(scene, bounded)
     return Normalisation(
         scene_from_sfm=Similarity(scale, rotation, -scale * (rotation @ centre)),
@@ -69,6 +76,7 @@ def normalise(
         up=up,
         near=near,
         far=far,
+        beyond_alpha=contradicted,
         beyond=share_beyond(scene, np.zeros(3), REGION_HALF),
         arc_deg=_arc_deg(scene.centres),
     )

@@ -25,6 +25,9 @@ CARVED = 48  # points along an edge of the cube that is carved
 MOST_CARVING = 200  # photos that carve it; more tell no more
 MISTAKEN = 0.05  # of the photos in which a point is: so many may call it background by mistake
 GROWTH = 1.25  # a cube that becomes WHOLE by growing at most this much is grown
+# Share of the observations beyond the cube from which on a scene goes on there, whatever alpha says: ten times what
+# WHOLE leaves to points that are wrong.
+GOES_ON = 0.01
 
 
 class Region(NamedTuple):
@@ -67,13 +70,25 @@ def find_region(scene: Reconstruction, layout: Layout) -> Region:
     held whole.
     Raises ValueError when the cameras stand in one place and there are no points to give a scale.
     """
-    if layout == "around" and scene.opaque is not None:
-        cube = _carved(scene, scene.opaque)
-    else:
-        cube = {"around": _around, "forward": _forward, "inside": _inside}[layout](scene)
+    cube = _ungrown(scene, layout)
     if not cube.half > 0:
         raise ValueError("all cameras stand in one place and no point is known")
     return _grown(cube, scene)
+
+
+def beyond_alpha(scene: Reconstruction, layout: Layout) -> float:
+    """The share of observations that contradict photos with alpha, by which there is no more than the cube: their
+    points lie beyond it even when it is grown. 0 without observations."""
+    if not len(scene.point):
+        return 0.0
+    cube = _ungrown(scene, layout)
+    return share_beyond(scene, cube.centre, GROWTH * cube.half)
+
+
+def _ungrown(scene: Reconstruction, layout: Layout) -> Region:
+    if layout == "around" and scene.opaque is not None:
+        return _carved(scene, scene.opaque)
+    return {"around": _around, "forward": _forward, "inside": _inside}[layout](scene)
 
 
 def share_beyond(scene: Reconstruction, centre: Float[np.ndarray, "3"], half: float) -> float:
@@ -88,13 +103,14 @@ def _reach(scene: Reconstruction, centre: Float[np.ndarray, "3"]) -> Float[np.nd
 
 
 def _grown(cube: Region, scene: Reconstruction) -> Region:
-    """Let the cube hold the whole scene where that costs little (or where alpha says that there is no more)."""
+    """Let the cube hold the whole scene where that costs little; or as much of it as costs little where alpha says that
+    there is no more, for then what is beyond is not shown at all."""
     if not len(scene.point):
         return cube
     whole = float(np.quantile(_reach(scene, cube.centre), WHOLE))
-    if scene.opaque is not None or whole <= GROWTH * cube.half:
-        return Region(cube.centre, max(cube.half, whole))
-    return cube
+    if whole > GROWTH * cube.half and scene.opaque is None:
+        return cube
+    return Region(cube.centre, max(cube.half, min(whole, GROWTH * cube.half)))
 
 
 def _near_by(scene: Reconstruction) -> Bool[np.ndarray, "n"]:

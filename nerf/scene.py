@@ -73,7 +73,7 @@ class Scene:
     """Everything that training and rendering need to know of the geometry.
 
     ``bounded``: all that the photos show lies inside the region of interest; otherwise space beyond it is
-    contracted (nerf/contraction.py). ``has_alpha``: the photos carry a known background. ``layout`` is how the
+    contracted (nerf/contraction.py). ``has_alpha``: the photos' alpha says what is background. ``layout`` is how the
     cameras stand: around an object, looking outward or through a room, or all facing one way.
     """
 

@@ -62,7 +62,7 @@ class RunArguments:
     cameras: Path | None = None
     """Known cameras for these photos: a transforms.json or a COLMAP model folder."""
     like: str | None = None
-    """Render the video as this training photo was exposed (its name; where the effect exposure is on)."""
+    """Render the video as this photo was exposed (its name; where the effect exposure is on)."""
     effect: Effects = ()
     budget: BudgetOption = None
     until: str | None = None
@@ -85,7 +85,7 @@ class StageArguments:
     cameras: Path | None = None
     """render only: a file with the cameras to render, like output/transforms.json."""
     like: str | None = None
-    """render only: render the video as this training photo was exposed (its name)."""
+    """render only: render the video as this photo was exposed (its name)."""
     effect: Effects = ()
     budget: str | None = None
     """tradeoff only: how long the study may take, as in 30m."""

@@ -62,21 +62,16 @@ class Painter:
             side = min(math.ceil(side * math.sqrt(2)), largest)
 
 
-def load_painter(train: Path, background: tuple[float, ...] | None = None, like: str | None = None) -> Painter:
-    """The field that stage train left in ``train``, over ``background``, which a field with a
-    sky does not show; None: what it was trained to stand before.
-
-    ``like`` names the training photo whose exposure it is shown at; None: the neutral one.
-    """
+def load_painter(train: Path, background: tuple[float, ...] | None = None) -> Painter:
+    """The field that stage train left in ``train``, over ``background``, which a field with a sky does not show; None:
+    what it was trained to stand before. One that models exposure is shown at its neutral one."""
     import torch
 
     from stages.device import compute_device
-    from stages.field_files import load_field, seen_like
+    from stages.field_files import load_field
 
     device = compute_device()
     model, info = load_field(train, device)
-    if like is not None:
-        model = seen_like(model, info, like, device)
     return Painter(model, torch.tensor(info["background"] if background is None else background, device=device))
 
 

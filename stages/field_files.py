@@ -1,21 +1,18 @@
 """A trained field on disk: ``field.safetensors`` (weights) and ``field.json`` (what they belong to)."""
 
-import difflib
 import json
 import math
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stages.contract import StageError, listed
+from stages.contract import StageError
 from stages.files import first_fault, read_json, write_json
 
 if TYPE_CHECKING:
     from nerf.grid_field import GridField
     from nerf.model import RadianceModel
     from nerf.paper import PaperNerf
-
-MOST_NAMES = 8  # of photos, in an error
 
 
 def save_field(folder: Path, model: "RadianceModel", info: dict[str, Any]) -> None:
@@ -40,7 +37,7 @@ def save_field(folder: Path, model: "RadianceModel", info: dict[str, Any]) -> No
 def load_field(folder: Path, device: str = "cpu") -> "tuple[RadianceModel, dict[str, Any]]":
     """The field in ``folder``, ready to render, and the content of its field.json.
 
-    One that models exposure comes at its neutral one, wrapped in an ExposedModel; :func:`seen_like` gives others.
+    One that models exposure comes at its neutral one, wrapped in an ExposedModel.
 
     Raises:
         StageError: if the files are missing or damaged, or another version of the program wrote them.
@@ -73,24 +70,6 @@ def load_field(folder: Path, device: str = "cpu") -> "tuple[RadianceModel, dict[
     return model if neutral is None else _exposed(model, neutral, device), info
 
 
-def seen_like(model: "RadianceModel", info: dict[str, Any], photo: str, device: str) -> "RadianceModel":
-    """A field from :func:`load_field` as the training photo of that name saw it.
-
-    Raises:
-        StageError: if the field models no exposure, or has none of that photo.
-    """
-    from nerf.effects.exposure import ExposedModel
-
-    what, among = f"no exposure of {photo} is known", info.get("exposure")
-    if among is None or not isinstance(model, ExposedModel):
-        why = "all photos share one exposure: the effect is off for this scene"
-        raise StageError(what, why, "Leave out --render.like, or train with --effect exposure=on.")
-    if photo not in among["photos"]:
-        why = f"the field knows those of the training photos: {_some(sorted(among['photos']), photo)}"
-        raise StageError(what, why, "Give one of these names to --render.like.")
-    return _exposed(model.model, among["photos"][photo], device)
-
-
 def _neutral(info: dict[str, Any]) -> list[float] | None:
     """The neutral log gains, None where exposure is not modelled. Raises ValueError for what are no gains."""
     if info.get("exposure") is None:
@@ -107,12 +86,6 @@ def _exposed(model: "RadianceModel", log_gain: list[float], device: str) -> "Rad
     from nerf.effects.exposure import ExposedModel
 
     return ExposedModel(model, torch.tensor(log_gain, dtype=torch.float32, device=device))
-
-
-def _some(names: list[str], wanted: str) -> str:
-    """The names; of many only some, those like the one ``wanted`` first, and how many others there are."""
-    alike = difflib.get_close_matches(wanted, names, n=MOST_NAMES, cutoff=0.4) if len(names) > MOST_NAMES else []
-    return listed([*alike, *(name for name in names if name not in alike)], MOST_NAMES)
 
 
 def _untrained(kind: str, settings: dict[str, Any], stored: int, device: str) -> "PaperNerf | GridField":

@@ -40,7 +40,7 @@ from stages.ingest_words import (
 from stages.masks import pair_masks, read_mask
 from stages.near_duplicates import near_duplicates, small, thumbnail
 from stages.panoramas import CUT_IT
-from stages.photos import Box, Photo, Refusal, opaque_box, write_photos
+from stages.photos import OPAQUE_FROM, Box, Photo, Refusal, opaque_box, write_photos
 from stages.sharpness import one_colour, relative_sharpness, sharpness
 from stages.sources import Source, find_source
 from stages.video_frames import FEWEST_FRAMES, take_frames
@@ -62,6 +62,9 @@ _BYTES_PER_PIXEL = 24  # of a photo while it is decoded, turned, packed and look
 # than the file, at 90 or so, is to what the camera saw.
 _JPEG_QUALITY = 97
 _NO_PLACE = Place()
+# Of the pixels, that have to be more transparent than opaque in a photo with alpha. Fewer are scratches: where they are
+# wrong by half of all that a value can be, they cost what is 0.3 dB at 30 dB (nerf/evidence/evidence.py).
+_LEAST_TRANSPARENT = 3e-4
 
 
 class Config(StageConfig):
@@ -104,7 +107,7 @@ class _Taken:
     camera_key: CameraKey
     sharpness: float
     focal_source: str | None = None
-    has_alpha: bool = False
+    opaque_share: float | None = None  # that a mask beside ``waiting`` leaves; None without alpha
     one_colour: str | None = None
     place: Place = _NO_PLACE
     exposure_ev: float | None = None
@@ -152,8 +155,9 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     masks = [photo.mask for photo in taken if photo.mask]
     turned, resized = sum(mask.turned for mask in masks), sum(mask.resized for mask in masks)
     say_masks([mask.ignored for mask in masks], turned, resized, len(photos), progress)
+    opaque = any(photo.has_alpha for photo in photos)
     return StageResult(
-        outputs=("images", "photos.json", "masks") if masks else ("images", "photos.json"),
+        outputs=("images", "photos.json", *["masks"] * bool(masks), *["opaque"] * opaque),
         records=(NOTES,) if notes else (),
         line=summary(source, photos, refused),
         facts=facts(source, photos, refused),
@@ -257,7 +261,7 @@ def _take(file: Path, name: str, mask: Path | None, waiting: Path) -> _Taken | R
         camera_key=decoded.camera_key,
         sharpness=sharpness(pixels),
         focal_source=decoded.focal_source,
-        has_alpha=pixels.shape[2] == 4 and bool((pixels[..., 3] < 255).any()),
+        opaque_share=_take_opaque(pixels, taken_mask, waiting),
         one_colour=one_colour(pixels),
         place=decoded.place,
         exposure_ev=decoded.exposure_ev,
@@ -277,6 +281,22 @@ def _take_mask(file: Path, photo: CameraKey, waiting: Path) -> _TakenMask | None
         return None
     write_png(waiting, mask.pixels)
     return _TakenMask(waiting, ignored, small(mask.pixels), mask.turned, mask.resized)
+
+
+def _take_opaque(pixels: "np.ndarray", mask: _TakenMask | None, waiting: Path) -> float | None:
+    """The share of the pixels of a photo with alpha that are more opaque than transparent and that its mask leaves; a
+    mask of these is left beside it. None without alpha."""
+    import numpy as np
+    from PIL import Image
+
+    opaque = pixels[..., 3] >= OPAQUE_FROM if pixels.shape[2] == 4 else np.ones(pixels.shape[:2], bool)
+    if 1 - opaque.mean() < _LEAST_TRANSPARENT:
+        return None
+    if mask:
+        with Image.open(mask.waiting) as picture:
+            opaque &= np.asarray(picture) > 0
+    write_png(waiting.with_suffix(".opaque"), np.where(opaque, np.uint8(255), np.uint8(0)))
+    return float(opaque.mean())
 
 
 def _without_duplicates(taken: Sequence[_Taken]) -> tuple[list[_Taken], list[Refusal]]:
@@ -322,6 +342,9 @@ def _store(taken: Sequence[_Taken], same: Mapping[str, str], folder: Path) -> li
         _move(photo.waiting, folder / "images" / file)
         if photo.mask:
             _move(photo.mask.waiting, folder / "masks" / f"{file}.png")
+        has_alpha = photo.opaque_share is not None
+        if has_alpha:
+            _move(photo.waiting.with_suffix(".opaque"), folder / "opaque" / f"{file}.png")
         photos.append(
             Photo(
                 name=photo.name,
@@ -331,8 +354,10 @@ def _store(taken: Sequence[_Taken], same: Mapping[str, str], folder: Path) -> li
                 camera_group=groups[index],
                 focal_px=photo.camera_key.focal_px,
                 focal_source=photo.focal_source,
-                has_alpha=photo.has_alpha,
+                has_alpha=has_alpha,
                 opaque=photo.opaque,
+                opaque_mask=f"opaque/{file}.png" if has_alpha else None,
+                opaque_share=1.0 if photo.opaque_share is None else photo.opaque_share,
                 used_share=1 - photo.mask.ignored if photo.mask else 1.0,
                 sharpness=photo.sharpness,
                 relative_sharpness=relative[index],

@@ -58,7 +58,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
         ((by_file[f"images/{image.file}"], i) for i, image in enumerate(model.images)), key=lambda pair: pair[0].name
     )
     photos, order = [photo for photo, _ in posed], [i for _, i in posed]
-    has_alpha = _has_alpha(photos, progress)
+    has_alpha = _has_alpha(photos, progress, tracked=len(model.view) > 0)
     registration = read_json(inputs["sfm"] / "registration.json")
     official = registration["test_files"]
     split = _split(photos, config.test_every, official)
@@ -76,13 +76,18 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
             "the others are held out as test photos",
             f"Add training photos, or {'change the given split' if official else 'raise --normalise.test-every'}.",
         )
-    scene = _scene(sfm, photos, [model.images[i].camera for i in order], model.cameras, found, split, has_alpha)
+    if has_alpha and not found.bounded:
+        progress.note(
+            f"{found.beyond_alpha:.1%} of what is tracked lies beyond what the photos' alpha leaves: the scene goes on "
+            "there, and transparent parts are ignored, as masked ones are"
+        )
+    scene = _scene(sfm, photos, [model.images[i].camera for i in order], model.cameras, found, split)
     write_json(folder / "scene.json", scene.to_json())
     write_tensors(folder / "points.safetensors", _points(model, sfm, found))
     write_json(folder / "transforms.json", transforms(scene))
     return StageResult(
         outputs=("scene.json", "points.safetensors", "transforms.json"),
-        line=_line(found, has_alpha),
+        line=_line(found),
         facts=_facts(scene, found, len(model.view)),
     )
 
@@ -102,16 +107,26 @@ def _check(config: Config, views: int) -> None:
         )
 
 
-def _has_alpha(photos: "list[Photo]", progress: Progress) -> bool:
-    """Whether the photos say what is background: most have transparent parts. The others are said to be exceptions."""
+def _has_alpha(photos: "list[Photo]", progress: Progress, tracked: bool) -> bool:
+    """Whether the photos may say what is background: most have transparent parts, and most of these show what is opaque
+    from one of its sides to the other, as one sees a thing. Outdoors without a sky one does not, nor in photos with
+    empty corners. Where nothing is tracked, which would tell, all alpha counts. Exceptions are said."""
     transparent = sum(photo.has_alpha for photo in photos)
+    framing = sum(photo.has_alpha and _ends_within(photo.opaque) for photo in photos) if tracked else transparent
     opaque = len(photos) - transparent
-    has_alpha = transparent > opaque
+    has_alpha = transparent > opaque and 2 * framing > transparent
     if has_alpha and opaque:
         progress.note(f"{opaque} of {len(photos)} photos have no transparent parts: taken as opaque everywhere")
     elif transparent and not has_alpha:
-        progress.note(f"{transparent} of {len(photos)} photos have transparent parts: laid over white, most have none")
+        why = "most photos have none" if transparent <= opaque else "what is opaque is seen whole in few"
+        progress.note(f"transparent parts of {transparent} of {len(photos)} photos are ignored like masked ones: {why}")
     return has_alpha
+
+
+def _ends_within(opaque: "Box | None") -> bool:
+    """Whether what is opaque, nothing at all too, ends within its photo on the left and right, or above and below."""
+    left, top, right, bottom = opaque or (1.0, 1.0, 0.0, 0.0)
+    return (left > 0 and right < 1) or (top > 0 and bottom < 1)
 
 
 def _reconstruction(model: "SparseModel", order: list[int], boxes: "Sequence[Box | None] | None") -> "Reconstruction":
@@ -176,9 +191,8 @@ def _scene(
     cameras: "Sequence[Camera]",
     found: "Normalisation",
     split: "list[Split]",
-    has_alpha: bool,
 ) -> "Scene":
-    """The scene, its views in order of name."""
+    """The scene, its views in order of name. Alpha that is no background is one more mask."""
     from nerf.scene import Scene, View
 
     views = tuple(
@@ -190,7 +204,7 @@ def _scene(
             near=float(found.near[i]),
             far=float(found.far[i]),
             split=split[i],
-            mask=photo.mask,
+            mask=photo.mask if found.bounded else photo.opaque_mask or photo.mask,
         )
         for i, photo in enumerate(photos)
     )
@@ -199,7 +213,7 @@ def _scene(
         views=views,
         scene_from_sfm=found.scene_from_sfm,
         bounded=found.bounded,
-        has_alpha=has_alpha,
+        has_alpha=found.bounded,
         layout=found.layout,
         up_known=found.up.known,
     )
@@ -219,7 +233,7 @@ def _points(model: "SparseModel", sfm: "Reconstruction", found: "Normalisation")
     }
 
 
-def _line(found: "Normalisation", has_alpha: bool) -> str:
+def _line(found: "Normalisation") -> str:
     """What was decided, for the user."""
     arc = 360 if found.arc_deg > FULL_TURN_DEG else round(found.arc_deg / 10) * 10
     layout = {
@@ -227,7 +241,7 @@ def _line(found: "Normalisation", has_alpha: bool) -> str:
         "inside": "inside a space, looking around",
         "forward": "photos facing one way",
     }[found.layout]
-    background = "transparent" if has_alpha else "unbounded"
+    background = "transparent" if found.bounded else "unbounded"
     up = f"up from {found.up.source}" if found.up.known else "no up: the cameras disagree"
     return f"{layout}, background {background} · {up}"
 

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
 Box = tuple[float, float, float, float]
 """Left, top, right and bottom of a rectangle, as shares of a photo's width and height."""
+OPAQUE_FROM = 128  # of 255: from here on a pixel is more opaque than transparent
 
 
 @dataclass(frozen=True)
@@ -30,8 +31,9 @@ class Photo:
     place. ``time_s`` is when a frame of a video was taken, in seconds from its beginning, None for photos. The place
     is EXIF's, in degrees (north and east positive) and metres above the sea, None where it tells none; so is
     ``exposure_ev``, in stops (stages/decoding.py: exposure_from_exif). ``opaque`` holds all that is more than half
-    opaque, None without alpha; ``used_share`` is what the mask leaves of the pixels. ``orientation`` is EXIF's, which
-    was undone in the pixels.
+    opaque, None without alpha. ``has_alpha``: not nearly all of it is; ``opaque_mask`` is a mask that ignores the rest
+    beside what ``mask`` does. ``used_share`` and ``opaque_share`` are what the two masks leave of the pixels.
+    ``orientation`` is EXIF's, which was undone in the pixels.
     """
 
     name: str  # the user's own file name, relative to the photo folder
@@ -52,6 +54,8 @@ class Photo:
     altitude_m: float | None = None
     exposure_ev: float | None = None
     opaque: Box | None = None
+    opaque_mask: str | None = None  # "opaque/….png", relative to ingest's folder
+    opaque_share: float = 1.0
     used_share: float = 1.0
     orientation: int = 1
 
@@ -78,8 +82,8 @@ def write_photos(folder: Path, photos: Sequence[Photo], refused: Sequence[Refusa
 def read_photos(ingest_folder: Path) -> list[Photo]:
     """The photos of a finished ingest, in order of their names. Raises StageError if photos.json is damaged."""
     photos = _read(ingest_folder).photos
-    for file in (file for photo in photos for file in (photo.file, photo.mask) if file is not None):
-        if not re.fullmatch(r"(images|masks)(/[\w-][\w.-]*)+", file, re.ASCII):
+    for file in (f for photo in photos for f in (photo.file, photo.mask, photo.opaque_mask) if f is not None):
+        if not re.fullmatch(r"(images|masks|opaque)(/[\w-][\w.-]*)+", file, re.ASCII):
             raise damaged("photos.json", f"{file[:40]!r} is no file of this folder")
     return photos
 
@@ -108,7 +112,7 @@ def opaque_box(pixels: "np.ndarray") -> Box | None:
 
     if pixels.shape[2] != 4:
         return None
-    opaque = pixels[..., 3] > 127
+    opaque = pixels[..., 3] >= OPAQUE_FROM
     if not opaque.any() or opaque.all():
         return None
     height, width = opaque.shape

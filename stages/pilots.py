@@ -6,11 +6,12 @@ half of such a photo and judged on its right half.
 """
 
 import time
-from statistics import mean, median, stdev
+from statistics import mean, median
 from typing import TYPE_CHECKING, NamedTuple
 
 from stages.contract import Inputs, Progress
 from stages.effect_decisions import Decisions, photo_parts
+from stages.image_metrics import FEWEST_FOR_INTERVAL, mean_interval
 from stages.training_setup import BLACK
 
 if TYPE_CHECKING:
@@ -23,18 +24,18 @@ if TYPE_CHECKING:
     from stages.train import Config as TrainConfig
 
 LONG_SIDE = 200  # pixels of the photos in a pilot
-MOST_KEPT = 4  # of the training photos, to judge by
+MOST_KEPT = 4  # of the training photos, to judge by; with fewer than FEWEST_FOR_INTERVAL their own noise is not known
 SEEDS = 3
 BATCH_SAMPLES = 1 << 13  # half the usual: a pilot has to be short, and is judged early
 CHUNKS = 4  # fixed, so that a pilot ends the same whatever the machine
 BESIDE_TRAINING = 0.3  # of the time of the trainings: reading photos, the warm-up, scoring
-SURE = 2.0  # standard errors by which a gain must exceed 0,
-LEAST_GAIN_DB = 0.1  # and this, which nobody sees
+LEAST_GAIN_DB = 0.1  # a gain must exceed its noise, and this, which nobody sees
 
 
 class Pilot(NamedTuple):
-    """What switching an effect on gained on the photos kept back, in dB: mean and standard error over seeds and photos,
-    and the seconds it took. ``cost`` is the share by which it made training slower."""
+    """What switching an effect on gained on the photos kept back, in dB: the mean, and half of its 95 % interval, over
+    seeds or over photos, whichever is wider; and the seconds it took. ``cost`` is the share by which it made training
+    slower."""
 
     gain_db: float
     noise_db: float
@@ -44,12 +45,12 @@ class Pilot(NamedTuple):
     @property
     def pays(self) -> bool:
         """Whether the gain is more than its noise."""
-        return self.gain_db > max(SURE * self.noise_db, LEAST_GAIN_DB)
+        return self.gain_db > max(self.noise_db, LEAST_GAIN_DB)
 
     @property
     def hurts(self) -> bool:
         """Whether leaving it out would gain as clearly."""
-        return -self.gain_db > max(SURE * self.noise_db, LEAST_GAIN_DB)
+        return -self.gain_db > max(self.noise_db, LEAST_GAIN_DB)
 
 
 class _Photo(NamedTuple):
@@ -75,7 +76,7 @@ def pilot_scene(inputs: Inputs, scene: "Scene", progress: Progress) -> PilotScen
     from stages.training_data import guided_bank, view_mask, view_pixels, view_rays
     from stages.unseen import set_aside
 
-    split = set_aside(scene, MOST_KEPT)
+    split = set_aside(scene, MOST_KEPT, FEWEST_FOR_INTERVAL)
     if split is None:
         return None
     cameras = [scene.cameras[view.camera] for view in scene.views]
@@ -90,7 +91,7 @@ def pilot_scene(inputs: Inputs, scene: "Scene", progress: Progress) -> PilotScen
         for view in split.of_split("validation")
     ]
     kept = tuple(photo for photo in photos if enough(photo.colours, photo.used))
-    return PilotScene(split, bank, kept) if kept else None
+    return PilotScene(split, bank, kept) if len(kept) >= FEWEST_FOR_INTERVAL else None
 
 
 def expected_seconds(scene: "Scene", steps: int) -> float:
@@ -124,10 +125,12 @@ def run_pilot(trial: PilotScene, off: Decisions, on: Decisions, steps: int, seed
 
 
 def _noise(gains: list[list[float]]) -> float:
-    """Standard error of the mean gain: the seeds' own, or the photos' where that is more."""
+    """Half of the mean gain's 95 % interval by Student's t, which knows how few they are: the seeds' own, or the
+    photos' where that is more."""
     of_seeds = [mean(of_seed) for of_seed in gains]
     of_photos = [mean(of_photo) for of_photo in zip(*gains, strict=True)]
-    return max(stdev(each) / len(each) ** 0.5 for each in (of_seeds, of_photos) if len(each) > 1)
+    intervals = [interval for each in (of_seeds, of_photos) if (interval := mean_interval(each)) is not None]
+    return max((high - low) / 2 for low, high in intervals)
 
 
 def _trained(trial: PilotScene, arm: Decisions, steps: int, seed: int) -> "GridField":

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     import numpy as np
     from torch import Tensor
 
-VERSION = 2  # raised when the same photos would give other pixels
+VERSION = 3  # raised when the same photos would give other pixels
 DECODING_BYTES = 1 << 30  # how much memory may go into photos that are being decoded at a time
 BYTES_PER_PIXEL = {3: 16, 4: 64}  # that decoding and shrinking a photo takes, by channels
 CHECKSUM_BYTES = 4

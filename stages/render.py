@@ -1,5 +1,6 @@
 """Stage render: a video of the field, and one of its depth."""
 
+import difflib
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,6 +17,7 @@ from stages.spread import spread
 
 if TYPE_CHECKING:
     import numpy as np
+    from torch import Tensor
 
     from nerf.model import Rendering
     from nerf.rays import Rays
@@ -59,7 +61,7 @@ class Config(StageConfig):
     depth: bool = Field(default=True, description="write depth.mp4 too")
     like: str | None = Field(
         default=None,
-        description="name of a training photo to render as it was exposed, where photos differ; none: neutral",
+        description="name of a photo to render as it was exposed, where photos differ; none: neutral",
     )
     save_frames: bool = Field(default=False, description="keep every frame as PNG in frames/")
 
@@ -152,8 +154,9 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     config = plan(config, inputs, progress)
     assert config.width is not None and config.fps is not None
     scene = read_scene(inputs["normalise"])
-    painter = load_painter(inputs["train"], like=config.like)
-    exposure = _exposure(config, inputs["train"])
+    painter = load_painter(inputs["train"])
+    gain, exposure = _exposure(config.like, inputs["train"], scene, progress)
+    painter = painter if gain is None else painter.at_gain(gain)
     path = _path(config, scene).resized(config.width)
     _check_memory(path)
     write_json(folder / "path.json", _path_json(path, scene, config.fps))
@@ -259,11 +262,31 @@ def _path_json(path: CameraPath, scene: "Scene", fps: int) -> dict[str, Any]:
     return (intrinsics(path.cameras[0]) if shared else {}) | {"fps": fps, "frames": frames}
 
 
-def _exposure(config: Config, train: Path) -> str | None:
-    """At which exposure the video is, in words; None where the field has only one."""
-    if read_json(train / "field.json").get("exposure") is None:
-        return None
-    return "neutral exposure" if config.like is None else f"exposed like {config.like}"
+def _exposure(like: str | None, train: Path, scene: "Scene", progress: Progress) -> "tuple[Tensor | None, str | None]":
+    """The log gain (3,) of the video, None as the field comes, and this in words, None where the field has only one.
+
+    Training is over when this is found out: a photo of which no exposure is known is no error, but what is taken
+    instead is said.
+    """
+    import torch
+
+    from stages.effect_decisions import expected_gains
+
+    field = read_json(train / "field.json")
+    if (known := field.get("exposure")) is None:
+        if like is not None:
+            progress.note(f"exposure is not modelled: all photos count as exposed alike, and the video like {like}")
+        return None, None
+    if like is None:
+        return None, "neutral exposure"
+    if like in known["photos"]:
+        return torch.tensor(known["photos"][like]), f"exposed like {like}"
+    if unseen := [view for view in scene.views if view.name == like]:
+        progress.note(f"{like} was not trained on: its exposure is what the photos taken nearest by let expect")
+        return expected_gains(field, scene, unseen)[like], f"exposed as expected of {like}"
+    near = difflib.get_close_matches(like, known["photos"], n=3)
+    progress.note(f"no photo {like} has a camera: neutral exposure" + (f"; perhaps {', '.join(near)}" if near else ""))
+    return None, "neutral exposure"
 
 
 def _facts(config: Config, path: CameraPath) -> dict[str, Any]:

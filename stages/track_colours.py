@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+from nerf import FULL
 from stages.contract import Progress
 from stages.device import processors
 from stages.sharpness import WIDTH
@@ -25,8 +26,10 @@ MOST_EXPECTED = 1000  # places per photo where a point should be seen and was no
 MOST_LOOKED_AT = 12_000_000  # observations of photos nearby that tell these places, for all photos: two seconds
 WINDOW = 1 / 200  # of the photo's longer side: what training at usual sizes makes one pixel or two of
 LEAST_WINDOW, LARGEST_WINDOW = 5, 3.0  # pixels; times the usual window
-CLIPPED_SHARE = 0.1  # of a window's values beyond these are too many to trust its mean
-DARKEST, BRIGHTEST = 3, 252  # of 255
+# So many of a window's pixels whose brightest channel is beyond these are too many to trust its mean. A channel that is
+# dark beside another one is what lamps and the night look like; it hardly weighs (nerf/evidence/tracks.py: log_noise).
+CLIPPED_SHARE = 0.1
+DARKEST, BRIGHTEST = 3, FULL  # of 255
 DECODING_BYTES = 2 << 30  # of photos in memory at a time
 
 
@@ -213,7 +216,7 @@ def _look(ingest: Path, scene: "Scene", view: "View", places: _Places) -> "tuple
 
     width, height = _size(scene, view)
     pixels = load_pixels(ingest / view.file, width, height)
-    used = np.ones(pixels.shape[:2], bool) if pixels.shape[2] == 3 else pixels[..., 3] == 255
+    used = pixels[..., 3] == 255 if scene.has_alpha and pixels.shape[2] == 4 else np.ones(pixels.shape[:2], bool)
     if view.mask:
         used = used & load_mask(ingest / view.mask, width, height)
     seen = np.full((len(places.xy), 5), np.nan)
@@ -242,17 +245,17 @@ def _window_means(pixels: "np.ndarray", used: "np.ndarray", corner: "np.ndarray"
         return upto[bottom, right] - upto[bottom, left] - upto[top, right] + upto[top, left]
 
     result = np.empty((len(corner), 5))
-    clipped = np.zeros(len(corner), bool)
     grey = np.zeros(pixels.shape[:2], np.float32)  # three times, a whole number
+    lightest = np.zeros(pixels.shape[:2], np.uint8)
     for channel in range(3):
         plane = cv2.extractChannel(pixels, channel)
         result[:, channel] = summed(plane) / (255 * area)
-        beyond = ((plane <= DARKEST) | (plane >= BRIGHTEST)).view(np.uint8)
-        clipped |= summed(beyond) > CLIPPED_SHARE * area
         grey += plane
+        lightest = np.maximum(lightest, plane)
     grey_sum = summed(grey)
     grey_squares = summed(np.multiply(grey, grey, out=grey))
-    result[:, 3] = clipped
+    beyond = ((lightest <= DARKEST) | (lightest >= BRIGHTEST)).view(np.uint8)
+    result[:, 3] = summed(beyond) > CLIPPED_SHARE * area
     result[:, 4] = np.sqrt(area * grey_squares - grey_sum**2) / (area * 3 * 255)
     result[summed(used.view(np.uint8)) < area] = np.nan
     return result

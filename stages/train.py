@@ -208,12 +208,18 @@ def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
 
         progress.update("trying how fast this machine trains")
         rays = rays_in_budget(config, scene, decisions)
-        masked = any(view.mask for view in scene.views)
-        used = {photo.name: photo.used_share for photo in read_photos(inputs["ingest"])} if masked else {}
-        config = _filled(config, {"downscale": chosen_downscale(scene, rays, used)})
+        config = _filled(config, {"downscale": chosen_downscale(scene, rays, _used_shares(inputs["ingest"], scene))})
         if config.kind == "grid":
             config = _filled(config, grid_size(config, scene, rays))
     return config
+
+
+def _used_shares(ingest: Path, scene: "Scene") -> dict[str, float]:
+    """By name, which share of its pixels a photo's mask leaves; photos that are not named have none."""
+    masks = {view.file: view.mask for view in scene.views if view.mask}
+    photos = [photo for photo in read_photos(ingest) if photo.file in masks] if masks else []
+    cut_out = {photo.name for photo in photos if masks[photo.file] == photo.opaque_mask}
+    return {photo.name: photo.opaque_share if photo.name in cut_out else photo.used_share for photo in photos}
 
 
 def with_habits(config: Config) -> Config:

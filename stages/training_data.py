@@ -170,7 +170,7 @@ def _store(ingest: Path, scene: "Scene", split: "Split", downscale: float) -> "P
 
 
 def _decoded_pixels(ingest: Path, scene: "Scene", view: "View", downscale: float) -> "np.ndarray":
-    """The photo of a view as uint8: (H, W, 4) in a scene with alpha, else (H, W, 3) with stray alpha over white."""
+    """The photo of a view as uint8: (H, W, 4) in a scene with alpha, else (H, W, 3) as it is below its alpha."""
     import numpy as np
 
     from stages.photos import load_pixels
@@ -178,7 +178,4 @@ def _decoded_pixels(ingest: Path, scene: "Scene", view: "View", downscale: float
     pixels = load_pixels(ingest / view.file, *scaled_size(scene.cameras[view.camera], downscale))
     if scene.has_alpha and pixels.shape[2] == 3:  # a photo without transparent parts covers every pixel
         return np.concatenate([pixels, np.full_like(pixels[..., :1], 255)], axis=2)
-    if scene.has_alpha or pixels.shape[2] == 3:
-        return pixels
-    alpha = pixels[..., 3:].astype(np.float32) / 255
-    return np.rint(255 + alpha * (pixels[..., :3] - 255.0)).astype(np.uint8)
+    return pixels if scene.has_alpha else np.ascontiguousarray(pixels[..., :3])

@@ -95,11 +95,12 @@ def with_validation(scene: "Scene") -> "Scene":
     return split
 
 
-def set_aside(scene: "Scene", most: int) -> "Scene | None":
-    """``scene`` with every eighth training photo, at most ``most``, evenly spread, in the split "validation"; None
-    where too few would be left to train on. Views keep their places, by which sparse points know them."""
+def set_aside(scene: "Scene", most: int, least: int = 1) -> "Scene | None":
+    """``scene`` with every eighth training photo, ``least`` to ``most`` in all, evenly spread, in the split
+    "validation"; None where too few would be left to train on. Views keep their places, by which sparse points know
+    them."""
     train = scene.of_split("train")
-    count = min(most, len(train) // VALIDATION_EVERY) or 1
+    count = max(least, min(most, len(train) // VALIDATION_EVERY))
     if len(train) - count < FEWEST_LEFT:
         return None
     chosen = {train[i].name for i in spread(len(train), count)}

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerf import FULL
 from nerf.effects import Seen
 from nerf.effects.exposure import expose, expose_backward
 from nerf.model import Rendering
@@ -52,10 +53,10 @@ class Exposures:
 
     def residual(self, seen: Seen, target: Float[Tensor, "rays 3"]) -> Float[Tensor, "rays 3"]:
         """e(C - (1 - o) b) + (1 - o) b less the target, with e of nerf/effects/exposure.py and opacity o; 0 where the
-        photo is full and would be: a photo ends at 1, and does not tell by how much it was exceeded."""
+        photo is FULL and would be: a photo ends at 1, and does not tell by how much it was exceeded."""
         own, behind = _parts(seen)
         shown = expose(own, self.log_gain.index_select(0, seen.view)) + behind
-        return torch.where((shown > 1) & (target >= 1), 0.0, shown - target)
+        return torch.where((shown > 1) & (target >= FULL / 255), 0.0, shown - target)
 
     def backward(self, seen: Seen, grad: Float[Tensor, "rays 3"]) -> tuple[Rendering, dict[str, Tensor]]:
         """By the chain rule: the opacity moves both terms. ``grad`` is 0 where the residual was cut to 0."""

@@ -151,21 +151,32 @@ def _contrast(
 def exposure_evidence(fit: ExposureFit, told: Float[np.ndarray, "views"] | None = None) -> Evidence:
     """Whether photos differ in exposure (or white balance): the deviation of gains over photos and channels, EV.
 
-    The noise, that of one gain, is taken off in quadrature, so that noise alone is no difference. ``told`` is what the
-    camera wrote of each photo's exposure (EV up to a constant, NaN where nothing): a cross-check, which decides nothing
-    because programs that develop photos change exposures and leave what was written.
+    The noise, that of one usual gain, is beside it; what all gains have is taken off in quadrature, so that noise alone
+    is no difference. Photos whose noise is an effect itself do not count, for a few would hide the others' gains, or
+    pass for a difference. ``told`` is what the camera wrote of each photo's exposure (EV up to a constant, NaN where
+    nothing): a cross-check, which decides nothing because programs that develop photos change exposures and leave what
+    was written.
     """
     if not fit.known.any():
         return unknown("EV", THRESHOLD_EV, fit.unknown_because, None)
-    gain, error = fit.log_gain[fit.known] / EV, fit.error[fit.known] / EV
-    noise = float(np.sqrt(np.mean(error**2)))
-    spread = float(np.sqrt(max(np.mean((gain - gain.mean(axis=0)) ** 2) - noise**2, 0.0)))
+    counted = _well_measured(fit.known, fit.error.max(axis=1) / EV)
+    gain, error = fit.log_gain[counted] / EV, fit.error[counted] / EV
+    noise = float(np.median(error))
+    spread = float(np.sqrt(max(np.mean((gain - gain.mean(axis=0)) ** 2) - np.mean(error**2), 0.0)))
     span = float(np.ptp(gain.mean(axis=1)))
     ratio = f"{span / noise:.0f} × their noise" if noise > 0 else "without noise"
     alone = int(np.count_nonzero(~fit.known))
     left_out = f"; {alone} photos share hardly any points with the others" if alone else ""
-    checked = "" if told is None else _beside_told(gain.mean(axis=1), told[fit.known])
+    unsure = int(np.count_nonzero(fit.known & ~counted))
+    left_out += f"; {unsure} photos do not count, their gains are not known to {THRESHOLD_EV:.1g} EV" if unsure else ""
+    checked = "" if told is None else _beside_told(gain.mean(axis=1), told[counted])
     return judged(spread, noise, THRESHOLD_EV, "EV", f"gains span {span:.2g} EV, {ratio}{left_out}{checked}")
+
+
+def _well_measured(known: Bool[np.ndarray, "views"], error_ev: Float[np.ndarray, "views"]) -> Bool[np.ndarray, "views"]:
+    """The photos whose noise is below the threshold; all that are known where fewer than two are."""
+    well = known & (error_ev < THRESHOLD_EV)
+    return well if np.count_nonzero(well) > 1 else known
 
 
 def _beside_told(gain: Float[np.ndarray, "known"], told: Float[np.ndarray, "known"]) -> str:
@@ -185,7 +196,9 @@ def tone_evidence(fit: ExposureFit) -> Evidence:
     if not known.any() or fit.brightness_spread == 0:
         return unknown("EV", THRESHOLD_EV, fit.unknown_because, False)
     scale = fit.brightness_spread / EV
-    noise = float(np.sqrt(np.mean(fit.contrast_error[known] ** 2))) * scale
-    spread = float(np.sqrt(max(np.mean((fit.contrast[known] * scale) ** 2) - noise**2, 0.0)))
+    counted = _well_measured(known, fit.contrast_error * scale)
+    contrast, error = fit.contrast[counted] * scale, fit.contrast_error[counted] * scale
+    noise = float(np.median(error))
+    spread = float(np.sqrt(max(np.mean(contrast**2) - np.mean(error**2), 0.0)))
     words = f"gains differ by {spread:.2g} EV between bright and dark points, ± {noise:.1g}"
     return judged(spread, noise, THRESHOLD_EV, "EV", words)

@@ -19,7 +19,7 @@ class TrackColours:
     view: Int[np.ndarray, "k"]
     point: Int[np.ndarray, "k"]
     colour: Float[np.ndarray, "k 3"]  # sRGB in [0, 1], mean over a small window
-    saturated: Bool[np.ndarray, "k"]  # any channel near 0 or 1 in the window: not used in fits
+    saturated: Bool[np.ndarray, "k"]  # any channel near 1 in the window, or all near 0: not used in fits
     radius: Float[np.ndarray, "k"]  # from the principal point, half diagonals
     towards: Float[np.ndarray, "k 3"]  # unit vector from the point to the camera, scene frame
     distance: Float[np.ndarray, "k"]  # from the camera to the point, scene units

@@ -99,16 +99,23 @@ class TwoWay:
     def slope(
         self, y: Float[np.ndarray, "m"], x: Float[np.ndarray, "m"], weight: Float[np.ndarray, "m"]
     ) -> tuple[float, float]:
-        """How ``y`` follows ``x`` within photos and points alike, and the slope's standard error (clustered by point);
-        (0, inf) where ``x`` does not vary within them."""
+        """How ``y`` follows ``x`` within photos and points alike, and the slope's standard error; (0, inf) where ``x``
+        does not vary within them.
+
+        It is clustered by point or by photo, whichever is more: light that falls from one side follows ``x`` in all of
+        a photo, and more points of it tell no more. n photos have n / (n - 1) times that variance: their sum is 0.
+        """
         across = self.rest(x, weight)
         size = float(np.sum(weight * across**2))
         if not size > CONSTANT * float(np.sum(weight * x**2)):
             return 0.0, float("inf")
         rest = self.rest(y, weight)
         slope = float(np.sum(weight * across * rest)) / size
-        score = np.bincount(self.point, weight * across * (rest - slope * across))
-        return slope, float(np.sqrt(np.sum(score**2))) / size
+        score = weight * across * (rest - slope * across)
+        of_points, of_photos = np.bincount(self.point, score), self.per_view(score)
+        photos = max(np.count_nonzero(of_photos), 2)
+        variance = max(np.sum(of_points**2), photos / (photos - 1) * np.sum(of_photos**2))
+        return slope, float(np.sqrt(variance)) / size
 
 
 def two_way(view: Int[np.ndarray, "m"], point: Int[np.ndarray, "m"], views: int) -> TwoWay:

@@ -214,6 +214,19 @@ def test_with_alpha_the_region_holds_what_is_opaque_where_only_a_spot_of_it_has_
     assert region_half(found) == pytest.approx(1.0, rel=0.15)
 
 
+def test_alpha_is_no_background_where_the_scene_goes_on_beyond_what_it_leaves() -> None:
+    thing = ball(4000)
+    scene = opaque_where(seen_by(ring(), ball()), thing)
+    few = normalise(with_points(scene, 20 * ball(3), views=16), None)  # wrong, half a percent of what is seen
+    assert few.bounded and 0 < few.beyond_alpha < 0.01
+    assert region_half(few) < 1.3 * region_half(normalise(scene, None))
+    many = with_points(scene, 20 * ball(30), views=16)
+    found, opaque = normalise(many, None), normalise(dataclasses.replace(many, opaque=None), None)
+    assert not found.bounded and found.beyond_alpha > 0.03
+    assert region_half(found) == region_half(opaque)
+    np.testing.assert_array_equal(found.far, opaque.far)
+
+
 def test_a_photo_of_a_part_and_one_that_is_mistaken_carve_nothing_away() -> None:
     thing = ball(4000)
     scene = opaque_where(seen_by(np.concatenate([ring(40), ring(2, radius=1.6)]), thing), thing)  # two see a part

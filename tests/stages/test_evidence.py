@@ -56,7 +56,7 @@ def test_errors_of_poses_are_those_of_a_photo_of_a_thousand_pixels(
     found = [geometric(tmp_path / str(width), width, shift)["pose_refinement"] for width in (800, 4000)]
     for one in found:
         assert one.statistic == pytest.approx(max(1000 * shift, 0.5), rel=0.05) and one.called_for is called_for
-        assert one.unit == "px at 1000" and one.words.startswith("at 1000 pixels photos are off by ")
+        assert one.unit == "px at 1000" and one.words.startswith("at 1000 pixels a quarter of the photos are off by ")
         assert one.words.endswith("; poses uncertain by 0.5 px")
 
 

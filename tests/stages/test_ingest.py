@@ -354,12 +354,15 @@ def test_what_is_opaque_is_noted(tmp_path: Path, progress: Any) -> None:
 
 def test_an_alpha_channel_without_transparent_parts_is_none(tmp_path: Path, progress: Any) -> None:
     put(tmp_path / "in", "a.jpg")
-    for name, alpha in (("b.png", 255), ("c.png", 254)):
-        with_alpha = picture(1)
-        with_alpha.putalpha(alpha)
-        with_alpha.save(tmp_path / "in" / name)
+    for name, alpha in (("b.png", 255), ("c.png", 254), ("d.png", 127)):
+        with_alpha = np.dstack([np.asarray(picture(1)), np.full((24, 32), 254, np.uint8)])
+        with_alpha[4, 3, 3] = alpha
+        Image.fromarray(with_alpha).save(tmp_path / "in" / name)
     ingest.run(Config(photos=tmp_path / "in"), {}, tmp_path / "out", progress)
-    assert [photo.has_alpha for photo in read_photos(tmp_path / "out")] == [False, False, True]
+    photos = read_photos(tmp_path / "out")
+    assert [photo.has_alpha for photo in photos] == [False, False, False, True]
+    assert [photo.opaque_share for photo in photos] == [1, 1, 1, 1 - 1 / (32 * 24)]
+    assert [photo.opaque_mask for photo in photos] == [None, None, None, "opaque/d.png.png"]
 
 
 def test_a_full_disk_is_said_in_words(tmp_path: Path, progress: Any, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,6 +1,7 @@
 """Which file is whose mask, how it is made to fit, and what COLMAP and training get of it."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,10 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
+from stages import ingest
 from stages.decoding import DecodeError
 from stages.files import write_png
 from stages.masks import load_mask, pair_masks, read_mask, write_feature_masks
-from stages.photos import Photo
+from stages.photos import Photo, read_photos
+from tests.stages.test_ingest import mask_for, picture, put
 
 WIDTH, HEIGHT = 48, 32
 
@@ -146,3 +149,22 @@ def test_a_reduced_mask_uses_only_what_is_used_as_a_whole(tmp_path: Path) -> Non
     assert np.array_equal(load_mask(file, WIDTH, HEIGHT), ignoring(21, 0) > 0)
     assert np.array_equal(load_mask(file, 12, 8), np.broadcast_to(np.arange(12) < 5, (8, 12)))
     assert np.array_equal(load_mask(file, 7, 3), np.broadcast_to(np.arange(7) < 3, (3, 7)))  # 3 / 7 of 48 is 20.6
+
+
+def test_what_alpha_and_mask_leave_is_a_mask_of_its_own(tmp_path: Path, progress: Any) -> None:
+    folder = put(tmp_path / "in", "a.jpg")
+    alpha = np.full((24, 32), 255, np.uint8)
+    alpha[:6], alpha[6] = 127, 128
+    for name in ("b.png", "c.png"):
+        Image.fromarray(np.dstack([np.asarray(picture(ord(name[0]))), alpha])).save(folder / name)
+    mask_for(folder, "masks/c.png", 8)
+    result = ingest.run(ingest.Config(photos=folder), {}, tmp_path / "out", progress)
+    assert result.outputs == ("images", "photos.json", "masks", "opaque")
+    photos = read_photos(tmp_path / "out")
+    assert [(photo.used_share, photo.opaque_share) for photo in photos] == [(1, 1), (1, 0.75), (0.75, 0.5625)]
+    for photo, columns in zip(photos[1:], (0, 8), strict=True):
+        assert photo.opaque_mask == f"opaque/{photo.name}.png"
+        opaque = np.asarray(Image.open(tmp_path / "out" / photo.opaque_mask))
+        wanted = np.where(alpha > 127, 255, 0)
+        wanted[:, :columns] = 0
+        assert np.array_equal(opaque, wanted)

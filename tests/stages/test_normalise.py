@@ -11,7 +11,7 @@ from nerf.scene import Camera
 from stages import normalise
 from stages.contract import StageError
 from stages.files import read_json, read_scene, read_tensors
-from stages.photos import Photo, read_photos, write_photos
+from stages.photos import Box, Photo, read_photos, write_photos
 from tests.camera_layouts import ball, ring, seen_by
 
 CAMERA = Camera("PINHOLE", 400, 400, (400.0, 400.0, 200.0, 200.0))
@@ -27,6 +27,8 @@ def inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         test_files: list[str] | None = None,
         one_place: bool = False,
         crooked: bool = False,
+        opaque: Box | None = None,
+        around: float = 0.0,
     ) -> dict[str, Path]:
         poses = ring(count)
         if crooked:
@@ -34,13 +36,19 @@ def inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
             poses = np.concatenate([nearest_rotations(shaken[:, :, :3]), shaken[:, :, 3:]], axis=2)
         if one_place:
             poses[:, :, 3] = 0
-        scene = seen_by(poses, np.zeros((0, 3)) if one_place else ball())
+        # ``around`` so far about the ball there are points, too, a tenth as many as the photos see of it
+        ring_about = around * ring(40, 1.0, 0.0)[:, :, 3] if around else np.zeros((0, 3))
+        scene = seen_by(poses, np.zeros((0, 3)) if one_place else np.concatenate([ball(), ring_about]))
         folders = {name: tmp_path / name for name in ("ingest", "sfm", "normalise")}
         for folder in folders.values():
             folder.mkdir(exist_ok=True)
         photos = [
             Photo(f"ä {i:02d}.jpg", f"images/{i:02d}.png", 400, 400, 0, None, None, i < transparent, 1.0)
             for i in range(count)
+        ]
+        photos = [
+            replace(photo, opaque=opaque, opaque_mask=f"opaque/{i:02d}.png") if photo.has_alpha else photo
+            for i, photo in enumerate(photos)
         ]
         write_photos(folders["ingest"], photos, [], {})
         (folders["sfm"] / "registration.json").write_text(json.dumps({"test_files": test_files, "georeference": None}))
@@ -124,7 +132,7 @@ def test_alpha_makes_the_background_known(inputs, progress) -> None:
     ("transparent", "has_alpha", "note"),
     [
         (16, True, "1 of 17 photos have no transparent parts: taken as opaque everywhere"),
-        (1, False, "1 of 17 photos have transparent parts: laid over white, most have none"),
+        (1, False, "transparent parts of 1 of 17 photos are ignored like masked ones: most photos have none"),
     ],
 )
 def test_most_photos_decide_on_alpha_and_exceptions_are_named(inputs, progress, transparent, has_alpha, note) -> None:
@@ -132,6 +140,48 @@ def test_most_photos_decide_on_alpha_and_exceptions_are_named(inputs, progress, 
     run(folders, progress)
     scene = read_scene(folders["normalise"])
     assert (scene.has_alpha, scene.bounded, progress.notes) == (has_alpha, has_alpha, [note])
+    assert [view.mask for view in scene.views] == [
+        f"opaque/{i:02d}.png" if not has_alpha and i < transparent else None for i in range(17)
+    ]
+
+
+CROPPED = "transparent parts of 17 of 17 photos are ignored like masked ones: what is opaque is seen whole in few"
+BEYOND = " of what is tracked lies beyond what the photos' alpha leaves"
+
+
+@pytest.mark.parametrize(
+    ("opaque", "around", "says"),
+    [
+        ((0.0, 0.0, 1.0, 1.0), 0.0, CROPPED),
+        ((0.0, 0.3, 1.0, 1.0), 0.0, CROPPED),
+        ((0.2, 0.3, 0.8, 1.0), 20.0, BEYOND),
+    ],
+    ids=["empty corners", "no sky", "the distance"],
+)
+def test_alpha_is_no_background_where_the_scene_goes_on(
+    inputs, progress, opaque: Box, around: float, says: str
+) -> None:
+    folders = inputs(transparent=17, opaque=opaque, around=around)
+    assert "background unbounded" in run(folders, progress).line
+    scene = read_scene(folders["normalise"])
+    assert not scene.has_alpha and not scene.bounded
+    assert [view.mask for view in scene.views] == [f"opaque/{i:02d}.png" for i in range(17)]
+    assert len(progress.notes) == 1 and says in progress.notes[0]
+
+
+@pytest.mark.parametrize("opaque", [None, (0.2, 0.3, 0.8, 1.0), (0.0, 0.3, 1.0, 0.9)])
+def test_alpha_is_the_background_of_a_thing_that_is_seen_whole(inputs, progress, opaque: Box | None) -> None:
+    folders = inputs(transparent=17, opaque=opaque)
+    run(folders, progress)
+    assert read_scene(folders["normalise"]).has_alpha and progress.notes == []
+
+
+def test_where_nothing_is_tracked_alpha_is_the_background(inputs, progress, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tests.stages.test_normalise.ball", lambda: np.zeros((0, 3)))
+    folders = inputs(transparent=17, opaque=(0.0, 0.0, 1.0, 1.0))
+    run(folders, progress)
+    scene = read_scene(folders["normalise"])
+    assert scene.has_alpha and scene.bounded and not any(view.mask for view in scene.views)
 
 
 @pytest.mark.parametrize(("count", "held_out"), [(3, [0]), (8, [0]), (9, [0, 8]), (17, [0, 8, 16])])

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -53,20 +54,34 @@ def test_a_wrong_exposure_loses(trial: PilotScene) -> None:
 
 
 def test_too_few_photos_make_no_pilot(tmp_path: Path) -> None:
-    inputs, scene = photographed(tmp_path, views=5)
-    assert pilot_scene(inputs, scene, Quiet()) is None
+    made = {}
+    for views in (5, 8, 10):
+        inputs, scene = photographed(tmp_path / str(views), views=views)
+        made[len(scene.of_split("train"))] = pilot_scene(inputs, scene, Quiet())
+    assert [count for count, trial in made.items() if trial is not None] == [7]
+    assert len(made[7].kept) == 3
 
 
 @pytest.mark.parametrize(
-    ("gain", "noise", "pays"), [(1.0, 0.4, True), (1.0, 0.6, False), (0.05, 0.0, False), (-1.0, 0.1, False)]
+    ("gain", "noise", "pays"), [(1.0, 0.9, True), (1.0, 1.1, False), (0.05, 0.0, False), (-1.0, 0.1, False)]
 )
 def test_what_pays_is_more_than_noise_and_than_nothing(gain: float, noise: float, pays: bool) -> None:
     assert Pilot(gain, noise, 0.0, 1.0).pays is pays
 
 
 def test_noise_is_that_of_seeds_or_of_photos_whichever_is_more() -> None:
-    assert pilots._noise([[1.0, 1.0], [3.0, 3.0], [2.0, 2.0]]) == pytest.approx(1 / 3**0.5)
-    assert pilots._noise([[1.0, 3.0], [1.0, 3.0], [1.0, 3.0]]) == pytest.approx(1.0)
+    student = 4.303 / 3**0.5  # 97.5 % for three, over the root of how many
+    assert pilots._noise([[1.0] * 3, [3.0] * 3, [2.0] * 3]) == pytest.approx(student, rel=1e-3)
+    assert pilots._noise([[1.0, 5.0, 3.0]] * 3) == pytest.approx(2 * student, rel=1e-3)
+
+
+def test_an_effect_that_gains_nothing_rarely_pays() -> None:
+    draw = np.random.default_rng(0)
+    paid = 0
+    for _ in range(2000):
+        gains = (draw.normal(size=(3, 1)) + 0.1 * draw.normal(size=(3, 3))).tolist()  # of three seeds, of three photos
+        paid += Pilot(sum(map(sum, gains)) / 9, pilots._noise(gains), 0.0, 1.0).pays
+    assert 0.005 < paid / 2000 < 0.035
 
 
 def test_a_photos_pose_is_found_against_a_finished_field(trial: PilotScene) -> None:

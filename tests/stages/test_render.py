@@ -305,6 +305,7 @@ def test_speed_is_a_record_and_path_an_output(inputs, progress) -> None:
 def with_exposure(inputs, monkeypatch) -> None:
     """The ball as a field with an exposure of its own and one photo a stop brighter."""
     photos = {"bright.jpg": [np.log(2)] * 3, "dark.jpg": [-np.log(2)] * 3}
+    photos |= {f"{number}.jpg": [np.log(2)] * 3 for number in range(1, 12)}
     info = read_json(inputs["train"] / "field.json") | {"exposure": {"neutral": [0.0] * 3, "photos": photos}}
     write_json(inputs["train"] / "field.json", info)
     shown = ExposedModel(GreyBall(), torch.zeros(3))
@@ -335,14 +336,26 @@ def test_a_field_with_exposure_is_rendered_at_a_stated_one(
 def test_a_field_without_exposure_says_nothing_of_it(inputs, progress) -> None:
     result = run(inputs, progress, frames=2, width=40)
     assert "exposure" not in result.facts and "expos" not in result.line
-    with pytest.raises(StageError, match=r"no exposure of a\.jpg is known: all photos share one exposure"):
-        run(inputs, progress, frames=2, width=40, like="a.jpg")
+    progress.notes.clear()
+    assert "exposure" not in run(inputs, progress, frames=2, width=40, like="3.jpg").facts
+    assert progress.notes == ["exposure is not modelled: all photos count as exposed alike, and the video like 3.jpg"]
 
 
-def test_a_photo_without_exposure_is_refused(inputs, progress, monkeypatch) -> None:
+@pytest.mark.parametrize(
+    ("like", "level", "exposure", "note"),
+    [
+        ("0.jpg", 0.6858, "exposed as expected of 0.jpg", "0.jpg was not trained on: its exposure is what the photos"),
+        ("lark.jpg", 0.5, "neutral exposure", "no photo lark.jpg has a camera: neutral exposure; perhaps dark.jpg"),
+    ],
+)
+def test_a_photo_without_exposure_of_its_own_is_no_error_after_the_training(
+    inputs, progress, monkeypatch, like: str, level: float, exposure: str, note: str
+) -> None:
     with_exposure(inputs, monkeypatch)
-    with pytest.raises(StageError, match=r"no exposure of a\.jpg is known: .* bright\.jpg"):
-        run(inputs, progress, frames=2, width=40, like="a.jpg")
+    result = run(inputs, progress, frames=2, width=40, like=like, save_frames=True)
+    assert result.facts["exposure"] == exposure and progress.notes[-1].startswith(note)
+    frame = np.asarray(Image.open(inputs["render"] / "frames/00000.png"))
+    assert np.abs(frame[15, 20] / 255 - level).max() < 0.004
 
 
 @pytest.mark.parametrize("seconds", [3.0, 10.0, 60.0])

@@ -9,7 +9,7 @@ from PIL import Image
 
 import stages.track_colours
 from nerf.evidence import transients
-from nerf.evidence.exposure import EV
+from nerf.evidence.exposure import EV, fit_exposure
 from nerf.scene import Camera, Scene, View
 from stages.colmap.cameras import focal_and_centre
 from stages.evidence import scene_evidence, training_residuals
@@ -121,17 +121,22 @@ def test_test_photos_are_not_opened(tmp_path: Path, progress: SilentProgress) ->
     assert len(look_at_photos(tmp_path, scene, points, progress).tracks) > 60
 
 
-def test_masked_and_transparent_windows_are_left_out(tmp_path: Path, progress: SilentProgress) -> None:
+@pytest.mark.parametrize("background", [True, False], ids=["alpha is the background", "alpha cuts out"])
+def test_masked_and_transparent_windows_are_left_out(
+    tmp_path: Path, progress: SilentProgress, background: bool
+) -> None:
     scene, points = photographed_points(tmp_path)
     whole = look_at_photos(tmp_path, scene, points, progress).tracks
     mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
     mask[:, 320:] = 0
     write_png(tmp_path / "masks/1.png.png", mask)
     with Image.open(tmp_path / "images/2.png") as image:
-        pixels = np.dstack([np.asarray(image), mask])
+        pixels = np.dstack([np.asarray(image), mask if background else np.maximum(mask, 1) - 1])  # 254 is not 255
     write_png(tmp_path / "images/2.png", pixels)
-    views = [replace(view, mask="masks/1.png.png" if view.name == "1.png" else None) for view in scene.views]
-    cut = look_at_photos(tmp_path, replace(scene, views=tuple(views)), points, progress).tracks
+    masks = {"1.png": "masks/1.png.png"} | ({} if background else {"2.png": "masks/1.png.png"})
+    views = [replace(view, mask=masks.get(view.name)) for view in scene.views]
+    scene = replace(scene, views=tuple(views), has_alpha=background)
+    cut = look_at_photos(tmp_path, scene, points, progress).tracks
     for number in range(6):
         of_view = points["view"] == 1 + number + (number > 2)
         reaching = np.count_nonzero(np.floor(points["xy"][of_view, 0]) + 2 >= 320)  # windows of five pixels
@@ -149,6 +154,24 @@ def test_clipped_windows_are_saturated(tmp_path: Path, progress: SilentProgress)
     assert np.array_equal(tracks.saturated, bright)
 
 
+def test_a_channel_that_is_dark_beside_the_others_leaves_them_their_gains(
+    tmp_path: Path, progress: SilentProgress
+) -> None:
+    """Photos by lamplight: their blue is cut off nearly everywhere."""
+    scene, points = photographed_points(tmp_path, np.linspace(0.8, 1.4, VIEWS))
+    by_day = fit_exposure(look_at_photos(tmp_path, scene, points, progress).tracks)
+    for number, file in enumerate(sorted((tmp_path / "images").iterdir())):
+        with Image.open(file) as image:
+            pixels = np.asarray(image).copy()
+        pixels[..., 2] = np.random.default_rng(number).integers(0, 3, pixels.shape[:2])
+        write_png(file, pixels)
+    tracks = look_at_photos(tmp_path, scene, points, progress).tracks
+    by_night = fit_exposure(tracks)
+    assert not tracks.saturated.any() and by_night.known.all()
+    np.testing.assert_allclose(by_night.log_gain[:, :2], by_day.log_gain[:, :2], atol=0.02)
+    assert np.ptp(by_night.log_gain[:, 0]) > 0.5
+
+
 def test_windows_are_summed_as_if_each_were_looked_at() -> None:
     draw = np.random.default_rng(0)
     pixels = draw.integers(0, 256, (300, 400, 4), dtype=np.uint8)
@@ -162,7 +185,8 @@ def test_windows_are_summed_as_if_each_were_looked_at() -> None:
     direct = []
     for (x, y), width in zip(corner, side, strict=True):
         window = pixels[y : y + width, x : x + width, :3].reshape(-1, 3)
-        clipped = ((window <= DARKEST) | (window >= BRIGHTEST)).mean(axis=0).max() > CLIPPED_SHARE
+        lightest = window.max(axis=1)
+        clipped = ((lightest <= DARKEST) | (lightest >= BRIGHTEST)).mean() > CLIPPED_SHARE
         whole = used[y : y + width, x : x + width].all()
         row = [*window.mean(axis=0) / 255, clipped, window.mean(axis=1).std() / 255]
         direct.append(row if whole else [np.nan] * 5)

@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -212,16 +213,16 @@ def test_what_masks_ignore_does_not_count_for_the_size_of_the_photos(
     mask[: HEIGHT // 4] = 255
     sizes: dict[str, Any] = {"levels": 2, "log2_rows": 8, "finest": 16, "batch_samples": 256, "steps": 2}
     chosen = []
-    for name, given in (("all", None), ("some", mask)):
+    for name, given, opaque in (("all", None, None), ("some", mask, None), ("cut out", mask, "yes")):
         inputs, scene = photographed(tmp_path / name, mask=given)
-        share = 1.0 if given is None else 0.25
+        plain = Photo("", "", WIDTH, HEIGHT, 0, None, None, True, 1.0, opaque_share=0.25)
         photos = [
-            Photo(v.name, v.file, WIDTH, HEIGHT, 0, None, None, False, 1.0, mask=v.mask, used_share=share)
+            replace(plain, name=v.name, file=v.file, used_share=0.5 if opaque else 0.25, opaque_mask=opaque and v.mask)
             for v in scene.views
         ]
         write_photos(inputs["ingest"], photos, [], {})
         chosen.append(train.plan(Config(**sizes), inputs, progress).downscale)
-    assert chosen[0] == pytest.approx(2 * chosen[1], abs=0.2) and chosen[1] > 1
+    assert chosen[0] == pytest.approx(2 * chosen[1], abs=0.2) and chosen[1] == chosen[2] > 1
 
 
 def test_plan_answers_everything_for_the_paper_field(

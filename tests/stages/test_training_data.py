@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from nerf.ray_bank import Placement, ray_bank
 from nerf.scene import Camera
 from stages.contract import StageError
-from stages.files import write_tensors
+from stages.files import write_png, write_tensors
 from stages.training_data import (
     MOST_PATCHES,
     camera_directions,
@@ -78,12 +78,22 @@ def test_transparent_pixels_are_shown_over_the_background(tmp_path: Path, progre
     assert training_bank(inputs["ingest"], scene, "train", 1.0, progress).pixels.shape[1] == 4
 
 
-def test_stray_alpha_in_an_opaque_scene_is_laid_over_white(tmp_path: Path, progress: SilentProgress) -> None:
+@pytest.mark.parametrize("downscale", [1.0, 2.0])
+def test_alpha_that_is_no_background_is_ignored_like_what_a_mask_ignores(
+    downscale: float, tmp_path: Path, progress: SilentProgress
+) -> None:
     inputs, scene = photographed(tmp_path, channels=4)
-    opaque = replace(scene, has_alpha=False)
-    bank = training_bank(inputs["ingest"], opaque, "train", 1.0, progress)
+    write_png(inputs["ingest"] / "opaque/all.png", ball_photo(4)[..., 3].copy())
+    views = tuple(replace(view, mask="opaque/all.png") for view in scene.views)
+    opaque = replace(scene, has_alpha=False, views=views)
+    bank = training_bank(inputs["ingest"], opaque, "train", downscale, progress)
     assert bank.pixels.shape[1] == 3
-    assert torch.equal(bank.pixels[: WIDTH * HEIGHT], torch.from_numpy(ball_photo()).flatten(0, 1))
+    used = view_mask(inputs["ingest"], opaque, opaque.views[1], downscale)
+    assert used is not None and 0 < used.float().mean() < 0.5
+    assert bank.drawable == 6 * used.sum()
+    drawn = bank.sample(200, torch.Generator().manual_seed(0))[1] * 255
+    assert torch.equal(drawn, torch.tensor([30.0, 60.0, 200.0]).expand(200, 3)), "no white of what was cut out"
+    assert view_mask(inputs["ingest"], scene, scene.views[1], downscale) is None
 
 
 def test_an_opaque_photo_in_a_scene_with_alpha_covers_every_pixel(tmp_path: Path, progress: SilentProgress) -> None:

@@ -58,10 +58,15 @@ def test_backward_is_the_derivative_of_the_residual() -> None:
 def test_a_full_pixel_asks_for_no_more_than_being_full() -> None:
     bright = seen(torch.full((4, 3), 0.95, dtype=torch.float64), torch.ones(4, dtype=torch.float64))
     part = Exposures(torch.full((3, 3), math.log(2), dtype=torch.float64))
-    assert (part.residual(bright, torch.ones(4, 3).double()) == 0).all()
-    assert (part.residual(bright, torch.full((4, 3), 0.9).double()) > 0.1).all(), (
-        "too bright where the photo is not full"
-    )
+    for full in (252, 255):  # of 255, in the precision of training, too
+        assert (part.residual(bright, torch.full((4, 3), full / 255).double()) == 0).all()
+        single = seen(torch.full((4, 3), 0.95), torch.ones(4))._replace(background=BACKGROUND.float())
+        brighter = Exposures(torch.full((3, 3), math.log(2)))
+        assert (brighter.residual(single, torch.full((4, 3), full, dtype=torch.uint8) / 255) == 0).all()
+    for within in (251 / 255, 0.9):
+        assert (part.residual(bright, torch.full((4, 3), within).double()) > 0.1).all(), (
+            "too bright where the photo is not full"
+        )
 
 
 def test_the_darkest_photo_shows_the_field_as_it_is_and_the_mean_gain_is_kept() -> None:

@@ -72,6 +72,22 @@ def test_the_least_difference_is_called_for() -> None:
         assert 0.9 < found.statistic / (1.15 * THRESHOLD_EV) < 1.1
 
 
+@pytest.mark.parametrize(("deviation_ev", "called_for"), [(0.0, False), (0.2, True)])
+def test_a_photo_that_is_badly_measured_decides_nothing(deviation_ev: float, called_for: bool) -> None:
+    for seed in SEEDS:
+        fit = fit_exposure(photographed_points(seed, log_gain=drawn_gains(seed, 12, 1.0) * deviation_ev))
+        assert exposure_evidence(fit).called_for is called_for
+        gain, error = fit.log_gain.copy(), fit.error.copy()
+        gain[4, 0], error[4, 0] = gain[4, 0] + 1.2 * EV, EV
+        found = exposure_evidence(fit._replace(log_gain=gain, error=error), np.zeros(12))
+        assert found.called_for is called_for, found
+        assert "; 1 photos do not count, their gains are not known to 0.1 EV; EXIF tells of 0 EV" in found.words
+        bent = tone_evidence(fit._replace(contrast=np.eye(12)[4], contrast_error=fit.contrast_error + np.eye(12)[4]))
+        assert bent.called_for is False
+        unsure = exposure_evidence(fit._replace(error=fit.error + EV))
+        assert unsure.called_for is None and "do not count" not in unsure.words, "better than nothing"
+
+
 def test_what_cameras_wrote_is_laid_beside_the_gains_and_decides_nothing() -> None:
     gain = np.linspace(-0.5, 0.5, 12) * EV
     fit = fit_exposure(photographed_points(3, log_gain=gain))

@@ -104,10 +104,24 @@ def test_wrong_poses_are_seen(shift_px: float, turn: float, size_px: float) -> N
         assert abs(found.statistic / size_px - 1) < 0.15
 
 
-def test_uncertain_poses_call_for_refinement() -> None:
+def test_uncertain_poses_leave_refinement_open() -> None:
     power, expected = common_residuals(*residuals(0, 0, 0), views=10)
-    assert pose_evidence(power, expected, np.full(10, 1.5)).called_for is True
-    assert pose_evidence(power, expected, np.full(10, 0.4)).called_for is None
+    none = np.full(10, np.nan)
+    for stated, called_for in ((1.5, None), (0.4, None), (0.2, False)):
+        assert pose_evidence(power, expected, np.full(10, stated)).called_for is called_for
+        assert pose_evidence(none, none, np.full(10, stated)).called_for is called_for
+
+
+@pytest.mark.parametrize(("bad", "called_for"), [(1, False), (10, False), (30, True)])
+def test_a_few_photos_do_not_call_for_refining_all(bad: int, called_for: bool) -> None:
+    draw = np.random.default_rng(0)
+    expected = draw.uniform(1e-3, 4e-3, 100)
+    power = expected * draw.chisquare(4, 100) / 4
+    stated = np.full(100, 0.03)
+    stated[:bad] = 7.0
+    assert pose_evidence(power, expected, stated).called_for is (None if called_for else False)
+    power[:bad] += 7.0**2
+    assert pose_evidence(power, expected, np.full(100, 0.03)).called_for is called_for
 
 
 def test_photos_with_too_few_points_are_left_out() -> None:

@@ -65,6 +65,18 @@ def test_the_slope_is_that_of_least_squares_with_its_error() -> None:
     assert 0.85 < np.std(off) < 1.25 and abs(np.mean(off)) < 0.3
 
 
+def test_a_slope_of_each_photos_own_is_no_slope_of_all() -> None:
+    """Light from one side: what a photo has in common is one draw, however many of its points show it."""
+    draw = np.random.default_rng(8)
+    layout, weight = two_way(draw.integers(0, 20, 2000), np.repeat(np.arange(400), 5), 20), np.ones(2000)
+    x, off = draw.normal(size=2000), []
+    for _ in range(100):
+        y = draw.normal(size=20)[layout.view] * x + 0.1 * draw.normal(size=2000)
+        slope, error = layout.slope(y, x, weight)
+        off.append(slope / error)
+    assert 0.7 < np.std(off) < 2, "5 by points alone"
+
+
 def test_no_slope_over_what_belongs_to_photos() -> None:
     layout, weight = drawn(8)
     slope, error = layout.slope(np.random.default_rng(9).normal(size=200), 1.0 * layout.view, weight)
