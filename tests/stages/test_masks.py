@@ -163,8 +163,9 @@ def test_what_alpha_and_mask_leave_is_a_mask_of_its_own(tmp_path: Path, progress
     photos = read_photos(tmp_path / "out")
     assert [(photo.used_share, photo.opaque_share) for photo in photos] == [(1, 1), (1, 0.75), (0.75, 0.5625)]
     for photo, columns in zip(photos[1:], (0, 8), strict=True):
-        assert photo.opaque_mask == f"opaque/{photo.name}.png"
-        opaque = np.asarray(Image.open(tmp_path / "out" / photo.opaque_mask))
+        file = f"opaque/{photo.name}.png"
+        assert photo.opaque_mask == file
+        opaque = np.asarray(Image.open(tmp_path / "out" / file))
         wanted = np.where(alpha > 127, 255, 0)
         wanted[:, :columns] = 0
         assert np.array_equal(opaque, wanted)
