@@ -12,7 +12,6 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from pipeline import chain
 from pipeline.cli import run_command
 from pipeline.display import Display, JsonDisplay, PlainDisplay, end_line
 from pipeline.settings import Settings, default_workspace
@@ -99,52 +98,6 @@ def test_a_photo_to_render_like_has_to_be_there(tmp_path: Path, capsys: pytest.C
     assert run_command(["run", str(tmp_path), "-o", str(tmp_path / "w"), "--like", "IMG_1.jpeg"]) == 2
     assert "--like IMG_1.jpeg: no photo has that name; perhaps IMG_1.jpg" in capsys.readouterr().err
     assert not (tmp_path / "w").exists()
-
-
-def test_a_study_is_asked_for_by_its_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    seen: list[tuple[Settings, list[str]]] = []
-
-    def remember(_root: Path, settings: Settings, stages: list[str], *_: object, **__: object) -> None:
-        seen.append((settings, stages))
-
-    monkeypatch.setattr("pipeline.cli._run_stages", remember)
-    (tmp_path / "run.json").write_text('{"version": 1, "options": {}, "plans": {}, "keys": {}}')
-    run_command(["tradeoff", str(tmp_path), "--budget", "30m"])
-    run_command(["tradeoff", str(tmp_path), "--tradeoff.seconds", "60"])
-    assert [settings.tradeoff.seconds for settings, _ in seen] == [1800, 60]
-    assert seen[0][1] == ["ingest", "sfm", "normalise", "effects", "tradeoff"]
-
-
-def test_a_run_leaves_a_study_as_it_was_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    seen: list[float] = []
-    monkeypatch.setattr(
-        "pipeline.cli._run_stages", lambda root, settings, *_, **__: seen.append(settings.tradeoff.seconds)
-    )
-    photos, workspace, file = tmp_path / "photos", tmp_path / "w", tmp_path / "options.toml"
-    photos.mkdir()
-    workspace.mkdir()
-    Image.new("RGB", (40, 30)).save(photos / "a.jpg")
-    file.write_text("[tradeoff]\nseeds = 2")
-    for recorded in ({"seconds": 1200}, {"seconds": 1200, "of_another_version": 1}):
-        run = {"version": 1, "options": {"tradeoff": recorded, "mesh": {"gone": 1}}, "plans": {}, "keys": {}}
-        (workspace / "run.json").write_text(json.dumps(run))
-        for words in ([], ["--tradeoff.seconds=1800"], ["--config", str(file)], ["-o", str(tmp_path / "new")]):
-            assert not run_command(["run", str(photos), "-o", str(workspace), *words])
-    assert seen == [1200, *[1800] * 7]
-
-
-def test_the_budget_of_a_study_belongs_to_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    (tmp_path / "run.json").write_text('{"version": 1, "options": {}, "plans": {}, "keys": {}}')
-    assert run_command(["mesh", str(tmp_path), "--budget", "30m"]) == 2
-    assert "--budget belongs to `pipeline tradeoff`, not to mesh" in capsys.readouterr().err
-    assert run_command(["tradeoff", str(tmp_path), "--budget", "soon"]) == 2
-    assert "'soon' is not a duration" in capsys.readouterr().err
-
-
-def test_a_run_has_no_study_unless_it_is_named():
-    assert "tradeoff" not in chain.usual() and chain.usual()[-1] == "report"
-    assert "tradeoff" not in chain.up_to("mesh") and chain.up_to("tradeoff")[-1] == "tradeoff"
-    assert chain.needed_for("report") == ["report"]
 
 
 def test_like_belongs_to_render(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):
