@@ -32,7 +32,7 @@ LARGEST = {"levels": 64, "features": 256, "log2_rows": 30, "finest": 2**20, "cac
     "steps": 10**6,
     "most_samples": 10**6,
 }
-DRAWN_CLOSER = 2  # samples of a drawn ray for one in training (docs/numbers.md: Samples along a ray)
+DRAWN_CLOSER = 1.5  # samples of a drawn ray for one in training (docs/numbers.md: Samples along a ray)
 CORNERS = 8  # of a cell: rows that a point reads of each grid
 
 
@@ -93,7 +93,7 @@ class GridSettings:
         them; a drawing stands at fixed places, once, and would show the gaps as shells. In a box they are closer.
         """
         lattice, closer = self.lattice, DRAWN_CLOSER if self.contracted else 1
-        step, cone, most = lattice.step / closer, lattice.cone / closer, closer * lattice.most_samples
+        step, cone, most = lattice.step / closer, lattice.cone / closer, math.ceil(closer * lattice.most_samples)
         return lattice._replace(step=step, cone=cone, most_samples=most)
 
 

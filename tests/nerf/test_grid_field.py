@@ -141,9 +141,9 @@ def test_density_agrees_with_what_rays_see() -> None:
 
 
 def test_folded_space_is_drawn_with_closer_samples_than_it_is_trained_with() -> None:
-    """The opacity of a drawn ray by the middle rule on a lattice of half the steps; a box keeps its own."""
+    """The opacity of a drawn ray by the middle rule on a lattice of shorter steps; a box keeps its own."""
     model, given = field(FOLDED), rays()
-    closer = model.lattice._replace(step=model.lattice.step / 2, cone=model.lattice.cone / 2, most_samples=2048)
+    closer = model.lattice._replace(step=model.lattice.step / 1.5, cone=model.lattice.cone / 1.5, most_samples=1536)
     middle = torch.full((6,), 0.5, dtype=torch.float64)
     samples = reference.march(occupied(model.bits), closer, given, middle)
     points = given.origins[samples.ray] + samples.t[:, None] * given.directions[samples.ray]
