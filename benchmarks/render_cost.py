@@ -51,7 +51,7 @@ def samples_of(model: RadianceModel) -> str:
     if isinstance(model, ExposedModel):
         return samples_of(model.model)
     if isinstance(model, GridField):
-        step, bounded = model.settings.shortest_step, f"{model.settings.steps} along the box's diagonal"
+        step, bounded = model.drawn_lattice.step, f"{model.settings.steps} along the box's diagonal"
         return f"steps from {step:.4f}" if model.settings.contracted else bounded
     assert isinstance(model, PaperNerf)
     return f"{model.settings.samples_coarse} + {model.settings.samples_fine}"

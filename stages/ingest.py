@@ -39,7 +39,7 @@ from stages.ingest_words import (
 )
 from stages.masks import pair_masks, read_mask
 from stages.near_duplicates import near_duplicates, small, thumbnail
-from stages.panoramas import CUT_IT
+from stages.panoramas import cutting_advice
 from stages.photos import OPAQUE_FROM, Box, Photo, Refusal, opaque_box, write_photos
 from stages.sharpness import one_colour, relative_sharpness, sharpness
 from stages.sources import Source, find_source
@@ -245,7 +245,7 @@ def _take(file: Path, name: str, mask: Path | None, waiting: Path) -> _Taken | R
     except DecodeError as error:
         return Refusal(name, str(error))
     if decoded.panorama:
-        return Refusal(name, f"a panorama: {CUT_IT.format('PHOTO')}")
+        return Refusal(name, f"a panorama: {cutting_advice('PHOTO', '0.jpg')}")
     pixels = decoded.pixels
     lossy = decoded.lossy and pixels.shape[2] == 3
     if decoded.suffix:

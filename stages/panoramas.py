@@ -6,11 +6,6 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     import numpy as np
 
-# What to do about one; {} stands for what ffmpeg is to read.
-CUT_IT = (
-    "cut it into perspective views, for example with ffmpeg -i {} "
-    "-vf v360=e:flat:h_fov=90:v_fov=90:w=1500:h=1500:yaw=0 0.jpg, and so for yaw 60, 120, 180, -60 and -120"
-)
 # Photo Sphere XMP metadata, as an attribute or an element. Views that were cut out of a panorama may have kept it.
 _TAG = re.compile(rb"GPano:ProjectionType\s*(=\s*[\"']|>)\s*(equirectangular|cylindrical)", re.IGNORECASE)
 LEAST_ASPECT = 1.9  # of a panorama by its tag: a whole one has 2, a view cut out of one less
@@ -34,6 +29,12 @@ def is_panorama(pixels: "np.ndarray", xmp: str | bytes | None = None) -> bool:
     if width >= LEAST_ASPECT * height and _TAG.search(content):
         return True
     return width == 2 * height and _goes_round(pixels)
+
+
+def cutting_advice(source: str, view: str) -> str:
+    """What to do about a panorama that ffmpeg reads from ``source``; it would write one view to ``view``."""
+    ffmpeg = f"ffmpeg -i {source} -vf v360=e:flat:h_fov=90:v_fov=90:w=1500:h=1500:yaw=0 {view}"
+    return f"cut it into perspective views, for example with {ffmpeg}, and so for yaw 60, 120, 180, -60 and -120"
 
 
 def _goes_round(pixels: "np.ndarray") -> bool:

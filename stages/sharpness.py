@@ -22,10 +22,17 @@ def sharpness(pixels: "np.ndarray") -> float:
     grey = pixels if pixels.ndim == 2 else cv2.cvtColor(pixels[..., :3], cv2.COLOR_RGB2GRAY)
     if pixels.shape[2:] == (4,):  # what is transparent has no sharpness
         grey = np.rint(grey * (pixels[..., 3] / 255.0)).astype(np.uint8)
+    return float(f"{cv2.Laplacian(at_most(grey, WIDTH), cv2.CV_64F).var():.4g}")
+
+
+def at_most(grey: "np.ndarray", most: int) -> "np.ndarray":
+    """A grey picture, (h, w) uint8, made no wider than ``most`` pixels."""
+    import cv2
+
     height, width = grey.shape
-    if width > WIDTH:
-        grey = cv2.resize(grey, (WIDTH, max(1, round(height * WIDTH / width))), interpolation=cv2.INTER_AREA)
-    return float(f"{cv2.Laplacian(grey, cv2.CV_64F).var():.4g}")
+    if width <= most:
+        return grey
+    return cv2.resize(grey, (most, max(1, round(height * most / width))), interpolation=cv2.INTER_AREA)
 
 
 def relative_sharpness(values: Sequence[float], groups: Sequence[int]) -> list[float | None]:

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING
 from stages.contract import Progress, StageError
 from stages.files import write_jpeg
 from stages.optical_flow import corners, follow_both_ways
-from stages.panoramas import CUT_IT, is_panorama
-from stages.sharpness import WIDTH, sharpness
+from stages.panoramas import cutting_advice, is_panorama
+from stages.sharpness import WIDTH, at_most, sharpness
 
 if TYPE_CHECKING:
     import cv2
@@ -130,9 +130,9 @@ def _measure(video: Path, progress: Progress) -> list[Frame]:
             if not frames and is_panorama(answer[1]):
                 raise _panoramas(video)
             # Grey first: shrinking a large frame takes longer than all the rest, and three times as long in colour.
-            grey = _at_most(cv2.cvtColor(answer[1], cv2.COLOR_BGR2GRAY), WIDTH)
+            grey = at_most(cv2.cvtColor(answer[1], cv2.COLOR_BGR2GRAY), WIDTH)
             time_s = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
-            frames.append(Frame(time_s, motion.path_to(_at_most(grey, FLOW_WIDTH)), sharpness(grey)))
+            frames.append(Frame(time_s, motion.path_to(at_most(grey, FLOW_WIDTH)), sharpness(grey)))
             if len(frames) % 10 == 0:
                 share = len(frames) / announced / 2 if announced >= len(frames) else None
                 progress.update(f"looked at {len(frames)} frames of {video.name}", share)
@@ -141,16 +141,6 @@ def _measure(video: Path, progress: Progress) -> list[Frame]:
     if len(frames) < 0.98 * announced:  # a container may count a frame or two too many
         progress.note(f"only {len(frames)} of {announced} frames of {video.name} can be decoded: is the file whole?")
     return frames
-
-
-def _at_most(grey: "np.ndarray", most: int) -> "np.ndarray":
-    """A grey picture made no wider than ``most`` pixels."""
-    import cv2
-
-    height, width = grey.shape
-    if width <= most:
-        return grey
-    return cv2.resize(grey, (most, max(1, round(height * most / width))), interpolation=cv2.INTER_AREA)
 
 
 class _Motion:
@@ -230,8 +220,9 @@ def _undecodable(video: Path, why: str) -> StageError:
 
 
 def _panoramas(video: Path) -> StageError:
-    hint = CUT_IT.format(video.name).replace(" 0.jpg", " 0.mp4")
-    return StageError(f"cannot take photos from {video.name}", "its frames are panoramas", f"C{hint[1:]}.")
+    advice = cutting_advice(video.name, "0.mp4")
+    what, why = f"cannot take photos from {video.name}", "its frames are panoramas"
+    return StageError(what, why, f"{advice[0].upper()}{advice[1:]}.")
 
 
 def _no_way(video: Path, frames: Sequence[Frame]) -> StageError:
