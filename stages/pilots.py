@@ -1,7 +1,7 @@
 """Short paired trainings that tell what an effect is worth, on photos kept back from the training photos.
 
 Both arms have the same seed, rays and number of steps and differ in nothing but the effect. The photos kept back have
-an exposure (and, where poses are at stake, a pose) of their own, which neither arm knows: both are fitted to the left
+an exposure (and, where an arm refines poses, a pose) of their own, which neither arm knows: both are fitted to the left
 half of such a photo and judged on its right half.
 """
 
@@ -108,7 +108,7 @@ def run_pilot(trial: PilotScene, off: Decisions, on: Decisions, steps: int, seed
     """Train both arms for each seed and compare. Raises NonFinite where an arm diverges."""
     started, gains = time.perf_counter(), []
     arms, seconds = {"off": off, "on": on}, {"off": 0.0, "on": 0.0}
-    poses = off.pose_refinement != on.pose_refinement
+    poses = off.pose_refinement or on.pose_refinement  # where no arm refines them, they are taken as right
     _trained(trial, off, 1, seed)  # pays for kernels and memory
     for number in range(SEEDS):
         scores: dict[str, list[float]] = {}

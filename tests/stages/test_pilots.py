@@ -20,6 +20,7 @@ from tests.stages.photo_scene import photographed
 from tests.synthetic_photos import Quiet
 
 PLAIN = Decisions(view_dependence=True, unbounded=False)
+REFINED = replace(PLAIN, pose_refinement=True)
 
 
 @pytest.fixture(scope="module")
@@ -51,6 +52,29 @@ def test_a_wrong_exposure_loses(trial: PilotScene) -> None:
     wrong = replace(PLAIN, exposure={name: [3.0 * (i % 2)] * 3 for i, name in enumerate(names)})
     pilot = run_pilot(trial, wrong, PLAIN, 40, 0, Quiet())
     assert 0.5 < pilot.gain_db < 30 and pilot.pays and pilot.seconds > 0
+
+
+@pytest.mark.parametrize(
+    ("off", "on", "fitted"),
+    [
+        (PLAIN, REFINED, True),
+        (replace(REFINED, view_dependence=False), REFINED, True),
+        (replace(PLAIN, view_dependence=False), PLAIN, False),
+    ],
+)
+def test_poses_of_photos_kept_back_are_fitted_wherever_an_arm_refines_poses(
+    trial: PilotScene, monkeypatch: pytest.MonkeyPatch, off: Decisions, on: Decisions, fitted: bool
+) -> None:
+    asked: list[bool] = []
+
+    def score(_field: object, _photo: object, poses: bool, _seed: int) -> float:
+        asked.append(poses)
+        return 20.0
+
+    monkeypatch.setattr(pilots, "_trained", lambda *_: None)
+    monkeypatch.setattr(pilots, "_score", score)
+    run_pilot(trial, off, on, 1, 0, Quiet())
+    assert asked == [fitted] * (2 * pilots.SEEDS * len(trial.kept))
 
 
 def test_too_few_photos_make_no_pilot(tmp_path: Path) -> None:
