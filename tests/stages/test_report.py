@@ -158,6 +158,20 @@ def test_page_shows_both_scores_of_right_halves_with_what_they_mean(tmp_path: Pa
     assert "Right halves" not in html and '<td class="number">–</td><td class="number">–</td></tr>' in html
 
 
+def test_page_shows_what_fitted_poses_add_apart_from_fitted_exposures(tmp_path: Path, progress: Any):
+    inputs = make_workspace(tmp_path)
+    html, _ = _run(inputs, tmp_path / "out", progress)
+    assert "pose fitted" not in html
+    path = inputs["evaluate"] / "metrics.json"
+    metrics = json.loads(path.read_text("utf-8"))
+    images = [image | {"psnr_posed_right": image["psnr_fitted_right"] + 2} for image in metrics["images"]]
+    write_json(path, metrics | {"psnr_posed_right": 27.8, "poses_fitted": True, "images": images})
+    html, _ = _run(inputs, tmp_path / "posed", progress)
+    assert "right half, exposure and pose fitted on the left (dB)</th>" in html
+    assert '<td class="number">23.50</td><td class="number">28.25</td><td class="number">30.25</td></tr>' in html
+    assert "25.8 dB with the exposure of each photo fitted" in html and "pose fitted there, too: 27.8 dB" in html
+
+
 def effect(on: bool, reason: str, **figures: Any) -> dict[str, Any]:
     """An entry of effects.json."""
     nothing = dict.fromkeys(("statistic", "threshold", "noise", "pilot_gain_db", "pilot_noise_db", "cost"))
