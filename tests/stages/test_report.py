@@ -158,6 +158,16 @@ def test_page_shows_both_scores_of_right_halves_with_what_they_mean(tmp_path: Pa
     assert "Right halves" not in html and '<td class="number">–</td><td class="number">–</td></tr>' in html
 
 
+def test_page_says_how_unseen_photos_were_exposed(tmp_path: Path, progress: Any):
+    inputs = make_workspace(tmp_path)
+    assert "was drawn exposed" not in _run(inputs, tmp_path / "out", progress)[0]
+    path = inputs["evaluate"] / "metrics.json"
+    metrics = json.loads(path.read_text("utf-8"))
+    write_json(path, metrics | {"exposure": "as the photos taken nearest by"})
+    html, _ = _run(inputs, tmp_path / "exposed", progress)
+    assert "each was drawn exposed as the photos taken nearest by, four training photos, without a look at itself" in html
+
+
 def test_page_shows_what_fitted_poses_add_apart_from_fitted_exposures(tmp_path: Path, progress: Any):
     inputs = make_workspace(tmp_path)
     html, _ = _run(inputs, tmp_path / "out", progress)
