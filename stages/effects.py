@@ -51,7 +51,11 @@ class Config(StageConfig):
     pilots: int | None = Field(
         default=None, ge=0, description=f"how many at most; none: {MOST_PILOTS}, fewer where there is no time for them"
     )
-    seconds: float | None = Field(default=None, ge=0, description="that pilots may take; none: as long as they take")
+    seconds: float | None = Field(
+        default=None,
+        ge=0,
+        description="that pilots may take; none: by the run, where it counts steps as long as they take",
+    )
     seed: int = Field(default=0, description="of the pilots")
 
 
