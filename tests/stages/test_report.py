@@ -193,7 +193,7 @@ EFFECTS = {
     "exposure": effect(
         True, "gains span 0.8 EV", statistic=0.8, threshold=0.05, noise=0.016, unit="EV", seconds=2.5, cost=0.04
     ),
-    "view_dependence": effect(True, "it pays", pilot_gain_db=0.94, pilot_noise_db=0.21),
+    "view_dependence": effect(True, "it pays", pilot_gain_db=0.94, pilot_noise_db=0.21, seconds=0.02),
     "blur": effect(True, "<i>smeared</i>", modelled=False, statistic=4.0, threshold=2.5, unit="px"),
     "mirrors": effect(False, "none seen", modelled=False),
 }
@@ -219,12 +219,12 @@ def test_page_shows_what_the_photos_call_for(tmp_path: Path, progress: Any):
         "noise",
         "gain in pilot",
         "costs when on",
-        "pilot took",
+        "deciding took",
         "why",
     ]
     assert rows[1:] == [
         ["exposure", "<b>on</b>", "0.8 EV", "0.05 EV", "0.016 EV", "–", "+4% time", "2.5 s", "gains span 0.8 EV"],
-        ["view dependence", "<b>on</b>", "–", "–", "–", "+0.9 ± 0.2 dB", "–", "–", "it pays"],
+        ["view dependence", "<b>on</b>", "–", "–", "–", "+0.9 ± 0.2 dB", "–", "&lt; 0.1 s", "it pays"],
         ["background", "off", "–", "–", "–", "–", "–", "–", "no pixel looks beyond the region"],
     ]
     flags = re.findall(r"<li>(.*?)</li>", section)
