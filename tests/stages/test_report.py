@@ -195,7 +195,6 @@ EFFECTS = {
     ),
     "view_dependence": effect(True, "it pays", pilot_gain_db=0.94, pilot_noise_db=0.21, seconds=0.02),
     "blur": effect(True, "<i>smeared</i>", modelled=False, statistic=4.0, threshold=2.5, unit="px"),
-    "mirrors": effect(False, "none seen", modelled=False),
 }
 
 
