@@ -165,7 +165,7 @@ def test_page_says_how_unseen_photos_were_exposed(tmp_path: Path, progress: Any)
     metrics = json.loads(path.read_text("utf-8"))
     write_json(path, metrics | {"exposure": "as the photos taken nearest by"})
     html, _ = _run(inputs, tmp_path / "exposed", progress)
-    assert "each was drawn exposed as the photos taken nearest by, four training photos, without a look at itself" in html
+    assert "each was drawn exposed as the photos taken nearest by, four training photos, without a look at" in html
 
 
 def test_page_shows_what_fitted_poses_add_apart_from_fitted_exposures(tmp_path: Path, progress: Any):
@@ -195,6 +195,7 @@ EFFECTS = {
     ),
     "view_dependence": effect(True, "it pays", pilot_gain_db=0.94, pilot_noise_db=0.21, seconds=0.02),
     "blur": effect(True, "<i>smeared</i>", modelled=False, statistic=4.0, threshold=2.5, unit="px"),
+    "tone": effect(False, "none seen", modelled=False),
 }
 
 
