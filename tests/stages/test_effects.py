@@ -10,7 +10,9 @@ from nerf.evidence.evidence import Evidence
 from nerf.evidence.exposure import ExposureFit, fit_exposure
 from nerf.evidence.tracks import TrackColours
 from nerf.training import NonFinite
-from stages import effects, evidence, pilots
+from pipeline import manifests
+from pipeline.keys import stage_key
+from stages import effects, evidence, pilots, train
 from stages.effect_decisions import Decisions, read_decisions, write_decisions
 from stages.evidence import SceneEvidence
 from stages.files import write_json
@@ -159,6 +161,26 @@ def test_what_was_asked_for_is_done(decided: Callable, value: effects.Switch) ->
     assert not tried and (decisions.exposure is not None) is on
     assert (decisions.view_dependence, decisions.unbounded, decisions.pose_refinement) == (on, on, on)
     assert table["exposure"]["reason"] == "asked for; one of two"
+
+
+def training_key(effects_folder: Path) -> str:
+    """The key of a training that rests on these decisions."""
+    outputs = manifests.describe_outputs(effects_folder, ("decisions.json",))
+    return stage_key("train", train.VERSION, {}, {"effects": manifests.outputs_digest(outputs)})
+
+
+@pytest.mark.parametrize("said", [False, None])
+def test_what_evidence_or_a_pilot_switches_off_trains_as_what_was_asked_to_be_off(
+    decided: Callable, tmp_path: Path, said: bool | None
+) -> None:
+    names = ("exposure", "view_dependence", "background", "pose_refinement")
+    told = {name: found(said if name in ("exposure", "pose_refinement") else False) for name in names}
+    by_evidence, *_ = decided(effects.Config(pilots=3), -1.0, **told)
+    by_request, *_ = decided(effects.Config(**dict.fromkeys(names, "off")), **dict.fromkeys(names, found(True)))
+    decided(effects.Config(exposure="on"), -1.0, **told)
+    off, asked, on = (training_key(tmp_path / f"effects{number}") for number in (1, 2, 3))
+    assert by_evidence == by_request == Decisions(view_dependence=False)
+    assert off == asked != on
 
 
 def test_decisions_are_read_as_they_were_written(tmp_path: Path) -> None:
