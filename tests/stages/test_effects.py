@@ -176,7 +176,8 @@ def test_what_evidence_or_a_pilot_switches_off_trains_as_what_was_asked_to_be_of
     names = ("exposure", "view_dependence", "background", "pose_refinement")
     told = {name: found(said if name in ("exposure", "pose_refinement") else False) for name in names}
     by_evidence, *_ = decided(effects.Config(pilots=3), -1.0, **told)
-    by_request, *_ = decided(effects.Config(**dict.fromkeys(names, "off")), **dict.fromkeys(names, found(True)))
+    all_off = effects.Config.model_validate(dict.fromkeys(names, "off"))
+    by_request, *_ = decided(all_off, **dict.fromkeys(names, found(True)))
     decided(effects.Config(exposure="on"), -1.0, **told)
     off, asked, on = (training_key(tmp_path / f"effects{number}") for number in (1, 2, 3))
     assert by_evidence == by_request == Decisions(view_dependence=False)
