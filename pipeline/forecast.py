@@ -4,12 +4,15 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
+from pipeline import manifests
 from pipeline.budget import READING, STARTING, least_total, most_total, reading_seconds
+from pipeline.manifests import BadManifest
 from pipeline.settings import Settings
 from stages.amounts import duration, rough_duration
 from stages.contract import StageError
 from stages.device import processors
 from stages.train import SECONDS
+from stages.train import Config as TrainConfig
 
 if TYPE_CHECKING:
     from pipeline.runner import Runner
@@ -46,7 +49,8 @@ def photos_of(settings: Settings) -> Photos | None:
 
 
 def expected(settings: Settings, photos: Photos | None) -> dict[str, float | None]:
-    """Seconds by stage; None of those that take what a budget gives them. Nothing where the photos are gone.
+    """Seconds by stage; None of those that take what a budget gives them, and of a training in steps, which nobody has
+    timed yet. Nothing where the photos are gone.
 
     Rates were measured on two cores, on fox, fountain_p11, fern, banana, herzjesu_p8 and the demo (docs/numbers.md):
     sfm took 0.6 to 1.8 times as long, and more where photos found no place at once.
@@ -61,10 +65,14 @@ def expected(settings: Settings, photos: Photos | None) -> dict[str, float | Non
         "effects": 10.0 + photos.reading(cores),  # two or three, and half a minute where a pilot has to decide
         "report": 2.0 + READING * photos.megapixels * min(15, photos.number / settings.normalise.test_every),
     }
-    for stage in ("train", "evaluate", "render", "mesh"):
-        given = getattr(settings, stage).seconds
-        seconds[stage] = given and given + (STARTING + photos.reading(cores) if stage == "train" else 0.0)
-    return seconds
+    given = settings.train.seconds if settings.train.after is None else settings.train.more_seconds
+    seconds["train"] = given and given + STARTING + photos.reading(cores)
+    return seconds | {stage: getattr(settings, stage).seconds for stage in ("evaluate", "render", "mesh")}
+
+
+def counts_steps(train: TrainConfig) -> bool:
+    """Whether the training ends after so many steps, however long they take."""
+    return (train.steps if train.after is None else train.more_steps) is not None
 
 
 def sfm_seconds(photos: Photos, cores: int) -> float:
@@ -74,30 +82,54 @@ def sfm_seconds(photos: Photos, cores: int) -> float:
     return 4.0 + photos.reading(cores) + (features + 0.02 * pairs) * 2 / cores + 0.4 * photos.number
 
 
-def without_budget(settings: Settings, times: Mapping[str, float | None], reading: float) -> float | None:
-    """Seconds of a run without a budget; None where training counts steps, which nobody has timed yet."""
-    train = settings.train
-    if train.steps is not None and "train" in times:
+def trained_in_all(runner: "Runner", trains: bool) -> float | None:
+    """Seconds of training steps behind the field that the later stages will meet, by which they give themselves time:
+    to come where the run ``trains``, else those of the finished training. None where nobody can tell."""
+    train = runner.settings.train
+    if not trains:
+        finished = runner.found("train")
+        return finished and finished.facts["train_seconds"]
+    if counts_steps(train):
         return None
-    trained = train.seconds or SECONDS[train.preset or "standard"]
-    # What a training of three minutes is followed by (fox, fountain_p11, the demo; drawing scaled to its share now).
-    usual = {"train": trained + STARTING + reading, "evaluate": 0.05 * trained, "render": 0.27 * trained}
-    usual["mesh"] = 5.0 + 0.15 * trained
-    return sum(usual.get(stage, 0.0) if seconds is None else seconds for stage, seconds in times.items())
+    if train.after is None:
+        return train.seconds or SECONDS[train.preset or "standard"]
+    try:
+        before = manifests.read(runner.workspace.folder("train", train.after))
+    except (FileNotFoundError, BadManifest):  # stage train says why it cannot go on
+        return None
+    assert train.more_seconds is not None, "one of the two is given"
+    return before.facts["train_seconds"] + train.more_seconds
+
+
+def without_budget(
+    train: TrainConfig, times: Mapping[str, float | None], reading: float, trained: float | None
+) -> dict[str, float | None]:
+    """``times`` of a run without a budget, after ``trained`` seconds of training in all; None where nobody can tell."""
+    usual: dict[str, float] = {}
+    if not counts_steps(train):
+        usual["train"] = SECONDS[train.preset or "standard"] + STARTING + reading
+    if trained is not None:
+        # What a training of three minutes is followed by (fox, fountain_p11, the demo; drawing scaled to its share).
+        usual |= {"evaluate": 0.05 * trained, "render": 0.27 * trained, "mesh": 5.0 + 0.15 * trained}
+    return {stage: usual.get(stage) if seconds is None else seconds for stage, seconds in times.items()}
 
 
 def promise(runner: "Runner", stages: Sequence[str], force: frozenset[str], photos: Photos | None) -> list[str]:
     """What is said at the start of a run of ``stages``: how long it takes, where anything has to run."""
     if photos is None:
         return []
-    times, reading = expected(runner.settings, photos), photos.reading(processors())
-    left = {stage: times[stage] for stage in stages if stage in times and (stage in force or not runner.is_done(stage))}
-    if set(left) <= {"report"}:
+    train, times, reading = runner.settings.train, expected(runner.settings, photos), photos.reading(processors())
+    left = {name: times[name] for name in stages if name in times and (name in force or runner.found(name) is None)}
+    trains = "train" in left
+    if set(left) <= {"report"} or (trains and counts_steps(train)):
         return []
-    if (budget := runner.budget) is not None:
+    more_alone = train.after is not None and trains and set(left) <= {"train", "report"}
+    if (budget := runner.budget) is not None and not more_alone:
         return [in_words(budget.total, runner.time_left(budget), left, reading)]
-    usual = without_budget(runner.settings, left, reading)
-    return [] if usual is None else [f"done in about {rough_duration(usual)}"]
+    trained = trained_in_all(runner, trains) if None in left.values() else None
+    known = without_budget(train, left, reading, trained).values()
+    seconds = [value for value in known if value is not None]
+    return [f"done in about {rough_duration(sum(seconds))}"] if len(seconds) == len(known) else []
 
 
 def in_words(total: float, left: float, times: Mapping[str, float | None], reading: float) -> str:

@@ -95,9 +95,9 @@ class Runner:
         goes_on = budget.spent and budget.is_of(self._options_digest(), self._photos_digest())
         return budget.left if goes_on else budget.total
 
-    def is_done(self, stage: str) -> bool:
-        """Whether a finished result of ``stage`` is there for these options, as far as can be told beforehand."""
-        found = bool(self.state["keys"]) and self._upstream(stage, "report") is not None
+    def found(self, stage: str) -> Manifest | None:
+        """The finished result of ``stage`` for these options, as far as can be told beforehand; None without one."""
+        found = self._upstream(stage, "report") if self.state["keys"] else None
         self.done.clear()  # what runs now may make it outdated
         return found
 
