@@ -9,7 +9,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from pipeline import attempts, machine, manifests
+from pipeline import attempts, heartbeat, machine, manifests
 from pipeline.budget import Budget, reading_seconds, takes_what_it_is_given
 from pipeline.chain import ON_REQUEST, STAGES, needed_for
 from pipeline.display import Display
@@ -275,7 +275,8 @@ class Runner:
         self._check_inputs(folders)
         self._begin_work(stage)
         clock = time.monotonic()
-        config = module.plan(self._with_time(stage, options), folders, self.display)
+        with heartbeat.beating(self.workspace.root / heartbeat.NAME):
+            config = module.plan(self._with_time(stage, options), folders, self.display)
         self.planning[stage] = time.monotonic() - clock
         plans[asked] = config.model_dump(mode="json")
         self.workspace.write_run(self.state)
@@ -354,6 +355,8 @@ class Runner:
             return None
 
     def _execute(self, job: Job) -> Manifest:
+        from stages.colmap import load
+
         partial, folder = self.workspace.partial(job.stage, job.key), self.workspace.folder(job.stage, job.key)
         if job.stage not in self.force and (manifest := self.workspace.complete(partial, folder, job.key)):
             return manifest
@@ -364,10 +367,11 @@ class Runner:
         partial.mkdir(parents=True, exist_ok=True)
         attempts.begin(partial, spent)
         self.workspace.write_run(self.state)
-        _load_native_code()
+        load()
         started, clock = datetime.now(UTC), time.monotonic()
         self.at_work = job.stage
-        result = job.module.run(job.config, job.folders, partial, self.display)
+        with heartbeat.beating(partial / attempts.NAME):
+            result = job.module.run(job.config, job.folders, partial, self.display)
         outputs = manifests.describe_outputs(partial, result.outputs)
         manifest = Manifest(
             stage=job.stage,
@@ -389,10 +393,3 @@ class Runner:
         self.force -= {job.stage}
         self.at_work = ""
         return manifest
-
-
-def _load_native_code() -> None:
-    """COLMAP's import changes how signals are handled; once it is over, they are ours again."""
-    from stages.colmap import load
-
-    load()
