@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field, model_validator
-from tyro.conf import Suppress
+from tyro.conf import Suppress, arg
 
 from stages.amounts import short_count
 from stages.contract import Inputs, Progress, StageConfig, StageResult
@@ -83,7 +83,7 @@ class Config(StageConfig):
         "paper: the networks as published, for an hour; none: standard",
     )
     seconds: float | None = Field(default=None, gt=0, description="train so long; none, without steps: by the preset")
-    target_psnr: float | None = Field(
+    target_psnr: Annotated[float | None, arg(aliases=("--target-psnr",))] = Field(
         default=None,
         gt=0,
         le=100,

@@ -91,7 +91,7 @@ def with_validation(scene: "Scene") -> "Scene":
     if split is None:
         count = len(scene.of_split("train"))
         why = f"photos to decide by have to be set aside, and of {count} training photos too few would be left"
-        raise StageError("no target can be trained to", why, "Leave out --train.target-psnr.")
+        raise StageError("no target can be trained to", why, "Leave out --target-psnr.")
     return split
 
 
