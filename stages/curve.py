@@ -1,8 +1,9 @@
 """curve.json: quality against training time, and what it says in words.
 
-``{"field": "grid" | "paper", "device": "cpu" | "cuda", "threads", "whole", "points": [{"step", "seconds", "train_psnr",
-"heldout_psnr", "heldout_ssim"} …]}``; what cannot be measured is null. Seconds are those of training steps alone:
-measuring is not among them. ``whole``: the rate fell once, at the end, and never rose again to go on.
+``{"field": "grid" | "paper", "downscale", "device": "cpu" | "cuda", "threads", "whole", "points": [{"step", "seconds",
+"train_psnr", "heldout_psnr", "heldout_ssim"} …]}``; what cannot be measured is null. ``downscale`` is that of the
+photos, those measured on included. Seconds are those of training steps alone: measuring is not among them. ``whole``:
+the rate fell once, at the end, and never rose again to go on.
 """
 
 from collections.abc import Sequence
@@ -19,11 +20,11 @@ BARS = "▁▂▃▄▅▆▇█"
 SPARK_WIDTH = 10
 
 
-def write_curve(folder: Path, field: str, whole: bool, points: list[dict[str, Any]]) -> None:
+def write_curve(folder: Path, field: str, downscale: float, whole: bool, points: list[dict[str, Any]]) -> None:
     """Write curve.json of a run that ends on this machine."""
     from stages.device import compute_device, cores
 
-    about = {"field": field, "device": compute_device(), "threads": cores(), "whole": whole}
+    about = {"field": field, "downscale": downscale, "device": compute_device(), "threads": cores(), "whole": whole}
     write_json(folder / "curve.json", about | {"points": points})
 
 

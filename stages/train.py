@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from stages.training_loop import TrainingRun
 
 NEEDS = ("ingest", "normalise", "effects")
-VERSION = 16
+VERSION = 17
 RESUMES = True
 LINKS = ("curve.json",)
 UNKEYED = ("checkpoint_seconds", "tensorboard")
@@ -268,7 +268,8 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     info["background"] = list(field_background(config, scene))
     info |= learnt_of_photos(training.trainer, scene.of_split("train"))
     save_field(folder, training.trainer.model, info)
-    write_curve(folder, config.kind, training.plan.is_whole, training.state.curve)
+    assert config.downscale is not None, "plan() chooses it"
+    write_curve(folder, config.kind, config.downscale, training.plan.is_whole, training.state.curve)
     progress.update("measuring what this machine can do")
     device = training.probes.train.colours.device
     parts = write_parts(folder, training.state.timings, training.trainer.model, device)
