@@ -114,22 +114,35 @@ def without_budget(
     return {stage: usual.get(stage) if seconds is None else seconds for stage, seconds in times.items()}
 
 
-def promise(runner: "Runner", stages: Sequence[str], force: frozenset[str], photos: Photos | None) -> list[str]:
-    """What is said at the start of a run of ``stages``: how long it takes, where anything has to run."""
+class Forecast(NamedTuple):
+    """What is said at the start of a run, and the seconds that its stages are expected to take; None of those that a
+    budget gives their time, and where nobody can tell."""
+
+    words: list[str]
+    times: Mapping[str, float | None]
+
+
+def foretell(runner: "Runner", stages: Sequence[str], force: frozenset[str], photos: Photos | None) -> Forecast:
+    """How long a run of ``stages`` takes: in words, where anything has to run and it can be told, and by stage."""
     if photos is None:
-        return []
+        return Forecast([], {})
     train, times, reading = runner.settings.train, expected(runner.settings, photos), photos.reading(processors())
-    left = {name: times[name] for name in stages if name in times and (name in force or runner.found(name) is None)}
+    left = [name for name in stages if name in times and (name in force or runner.found(name) is None)]
     trains = "train" in left
-    if set(left) <= {"report"} or (trains and counts_steps(train)):
-        return []
     more_alone = train.after is not None and trains and set(left) <= {"train", "report"}
-    if (budget := runner.budget) is not None and not more_alone:
-        return [in_words(budget.total, runner.time_left(budget), left, reading)]
-    trained = trained_in_all(runner, trains) if None in left.values() else None
-    known = without_budget(train, left, reading, trained).values()
-    seconds = [value for value in known if value is not None]
-    return [f"done in about {rough_duration(sum(seconds))}"] if len(seconds) == len(known) else []
+    budget = None if more_alone else runner.budget
+    if budget is None:
+        asked = {name: times[name] for name in stages if name in times}
+        trained = trained_in_all(runner, trains) if None in asked.values() else None
+        times = without_budget(train, asked, reading, trained)
+    if set(left) <= {"report"} or (trains and counts_steps(train)):
+        return Forecast([], times)
+    of_left = {name: times[name] for name in left}
+    if budget is not None:
+        return Forecast([in_words(budget.total, runner.time_left(budget), of_left, reading)], times)
+    known = [seconds for seconds in of_left.values() if seconds is not None]
+    words = f"done in about {rough_duration(sum(known))}, about {_clock(sum(known))}"
+    return Forecast([words] if len(known) == len(left) else [], times)
 
 
 def in_words(total: float, left: float, times: Mapping[str, float | None], reading: float) -> str:
@@ -141,7 +154,12 @@ def in_words(total: float, left: float, times: Mapping[str, float | None], readi
     if least > left:
         soonest = f"about {rough_duration(least)} is the least that would do"
         return f"budget {duration(total)}, too short for these photos: {soonest}; all is made as small as can be"
-    finish = time.strftime("%H:%M", time.localtime(time.time() + min(left, most)))
+    finish = _clock(min(left, most))
     # Only training takes all that there is; the rest may well be done sooner.
     trains = times.get("train", 0.0) is None
     return f"budget {duration(total)}, done at {f'about {finish}' if trains else f'{finish} at the latest'}"
+
+
+def _clock(seconds: float) -> str:
+    """The time of day in so many seconds."""
+    return time.strftime("%H:%M", time.localtime(time.time() + seconds))

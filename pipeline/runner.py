@@ -119,8 +119,8 @@ class Runner:
 
         ``force`` names stages that run again even where a finished result exists; ``replan`` forgets what was
         chosen for the user before; ``remember`` makes ``stages`` what `pipeline resume` repeats; ``times`` are the
-        seconds that stages are expected to take (pipeline/forecast.py), for a budget; ``verify`` reads every file of a
-        finished result before it counts as finished.
+        seconds that stages are expected to take (pipeline/forecast.py), for a budget and the report; ``verify`` reads
+        every file of a finished result before it counts as finished.
         """
         self.verify, self.force, self.stages, self.times = verify, force, list(stages), times or {}
         if self.budget:
@@ -385,6 +385,7 @@ class Runner:
             facts=result.facts,
             line=result.line,
             seconds=round(spent + time.monotonic() - clock, 3),
+            expected=None if (expected := self.times.get(job.stage)) is None else round(expected, 1),
             started=started.isoformat(timespec="seconds"),
             machine=machine.facts(),
         )

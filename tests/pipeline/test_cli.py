@@ -221,10 +221,13 @@ def test_until_ingest_then_status_and_explain_and_clean(tmp_path: Path, capsys: 
     for k in range(3):
         Image.effect_noise((64, 48), 30 + k).convert("RGB").save(tmp_path / f"photos/{k}.png")
     workspace = str(tmp_path / "w.nerf")
-    assert run_on(tmp_path / "photos", capsys, "--until", "ingest")[0] == 0
+    code, text = run_on(tmp_path / "photos", capsys, "--until", "ingest")
+    assert code == 0 and " · done in about 1 s, about " in text
+    (manifest,) = (tmp_path / "w.nerf/ingest").glob("*/manifest.json")
+    assert 0.4 < json.loads(manifest.read_text())["expected"] < 0.7, "kept for the report"
     code, text = run_on(tmp_path / "photos", capsys, "--until", "ingest")
     assert code == 0
-    assert "nothing to do" in text
+    assert "nothing to do" in text and "done in" not in text
     assert run_command(["status", workspace]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].split()[:2] == ["ingest", "cached"]

@@ -70,6 +70,7 @@ def test_known_cameras_take_no_time() -> None:
 
 Promise = Callable[..., list[str]]
 BEFORE_TRAINING = ("ingest", "sfm", "normalise", "effects")
+NOW = 1e9
 TRAINED = 180.0  # seconds of the finished training that the workspace of ``promise`` has
 
 
@@ -81,7 +82,8 @@ def finished(stage: str) -> Manifest:
 
 
 @pytest.fixture
-def promise(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Promise:
+def promise(photos: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Promise:
+    monkeypatch.setattr(forecast.time, "time", lambda: NOW)
     folder = tmp_path_factory.mktemp("training")
     manifests.write(folder, finished("train"))
 
@@ -99,7 +101,13 @@ def promise(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Promise:
             time_left=lambda budget: budget.left - before,
             workspace=SimpleNamespace(folder=lambda stage, name: folder if name == "there" else folder / name),
         )
-        return forecast.promise(runner, names, frozenset(), Photos(50, 2.0))
+        foretold = forecast.foretell(runner, names, frozenset(), Photos(50, 2.0))
+        known = [foretold.times[name] for name in names if name not in done]
+        for said in foretold.words:
+            if said.startswith("done in"):  # and until when, which is the sum of the stages' times
+                finish = time.localtime(NOW + sum(seconds or 0.0 for seconds in known))
+                assert None not in known and said.endswith(f", about {time.strftime('%H:%M', finish)}")
+        return [said.split(", about ")[0] if said.startswith("done in") else said for said in foretold.words]
 
     return words
 
@@ -184,12 +192,11 @@ def test_what_earlier_attempts_took_is_told_apart_from_a_budget_too_small_for_th
     assert " 0 s of it left" in promise(300.0, before=400.0)[0]
 
 
-def test_no_end_is_promised_that_only_a_training_would_need(promise: Promise, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(forecast.time, "time", lambda: 1e9)
+def test_no_end_is_promised_that_only_a_training_would_need(promise: Promise) -> None:
     done = ("ingest", "sfm", "normalise", "effects", "train", "evaluate", "render")
-    most = time.strftime("%H:%M", time.localtime(1e9 + 0.35 * 3600))
+    most = time.strftime("%H:%M", time.localtime(NOW + 0.35 * 3600))
     assert promise(3600.0, done=done) == [f"budget 1 h, done at {most} at the latest"]
-    left = time.strftime("%H:%M", time.localtime(1e9 + 600))
+    left = time.strftime("%H:%M", time.localtime(NOW + 600))
     assert promise(3600.0, done=done, before=3000.0) == [f"budget 1 h, done at {left} at the latest"]
     assert promise(3600.0)[0].startswith("budget 1 h, done at about ")
 
