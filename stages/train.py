@@ -186,11 +186,15 @@ class Config(StageConfig):
 def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
     """Everything that was left open: field and budget, what stage effects decided, then sizes and the photos' size; or
     all of it as the finished training has it that is to go on."""
-    if config.after is not None:
-        from stages.train_more import continued
-
-        return continued(config, inputs)
     scene, decisions = read_scene(inputs["normalise"]), read_decisions(inputs["effects"])
+    if config.after is not None:
+        from stages.train_more import continued, larger_photos_words
+
+        whole = continued(config, inputs)
+        open_size = config.downscale is None  # what the user gave is what they want
+        if open_size and (words := larger_photos_words(whole, inputs, scene, _used_shares(inputs["ingest"], scene))):
+            progress.note(words)
+        return whole
     preset = config.preset or "standard"
     seconds = SECONDS[preset] if config.steps is None and config.seconds is None else config.seconds
     config = config.model_copy(update={"field": config.kind, "preset": preset, "seconds": seconds})
