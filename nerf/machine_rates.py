@@ -15,8 +15,8 @@ from nerf.stopwatch import Stopwatch, Work
 
 PRODUCT_ROWS = 1 << 13  # points that one product has, as in a chunk of a step
 GATHERED = 1 << 17  # rows read at once, of 4 float32, as a grid's table has them
-# float32 that all cores together copy at once: 128 MB read and as much written, more than their shared cache holds (60 to
-# 105 MB on servers); each at least LEAST_STREAMED, which its own cache does not.
+# float32 that all cores together copy at once: 128 MB read and as much written, more than their shared cache holds (60
+# to 105 MB on servers); each at least LEAST_STREAMED, which its own cache does not.
 STREAMED, LEAST_STREAMED = 1 << 25, 1 << 22
 FEWEST_RUNS = 3
 

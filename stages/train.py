@@ -322,8 +322,8 @@ def _result(config: Config, training: "TrainingRun", folder: Path, parts: list[s
 
 
 def _line(config: Config, training: "TrainingRun") -> str:
-    """180 s · 5.4 k steps · 24 k rays/s · held out 28.9 dB, over time ▁▃▅▆▇█ · as long again (--more 3m) is predicted to
-    buy +0.6 ± 0.4 dB."""
+    """180 s · 5.4 k steps · 24 k rays/s · held out 28.9 dB, over time ▁▃▅▆▇█ · as long again (--more 3m) is predicted
+    to buy +0.6 ± 0.4 dB."""
     from stages.curve import coming_doubling, next_words, sparkline, target_words
 
     state = training.state

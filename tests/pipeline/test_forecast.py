@@ -84,6 +84,7 @@ def finished(stage: str) -> Manifest:
 @pytest.fixture
 def promise(photos: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Promise:
     monkeypatch.setattr(forecast.time, "time", lambda: NOW)
+    monkeypatch.setattr(forecast, "processors", lambda: 2)
     folder = tmp_path_factory.mktemp("training")
     manifests.write(folder, finished("train"))
 
@@ -124,7 +125,9 @@ def test_what_is_there_already_is_not_waited_for(promise: Promise) -> None:
     assert promise(done=tuple(usual())) == [] == promise(600.0, done=tuple(usual()))
 
 
-def test_what_follows_a_finished_training_goes_by_its_seconds(promise: Promise, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_follows_a_finished_training_goes_by_its_seconds(
+    promise: Promise, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Whatever the options would train for now, steps included."""
     monkeypatch.setattr(f"{__name__}.TRAINED", 1800.0)
     done = (*BEFORE_TRAINING, "train")
