@@ -15,7 +15,9 @@ from nerf.stopwatch import Stopwatch, Work
 
 PRODUCT_ROWS = 1 << 13  # points that one product has, as in a chunk of a step
 GATHERED = 1 << 17  # rows read at once, of 4 float32, as a grid's table has them
-STREAMED = 1 << 22  # numbers copied at once: 32 MB read and written, more than caches hold
+# float32 that all cores together copy at once: 128 MB read and as much written, more than their shared cache holds (60
+# to 105 MB on servers); each at least LEAST_STREAMED, which its own cache does not.
+STREAMED, LEAST_STREAMED = 1 << 25, 1 << 22
 FEWEST_RUNS = 3
 
 
@@ -69,13 +71,23 @@ def measure_gather(device: torch.device, rows: int, seconds: float) -> float:
 
 def measure_copy(device: torch.device, seconds: float) -> float:
     """Bytes that a core reads and writes in a second, copying."""
+    count = copied_bytes(device) // 4
 
     def make() -> Callable[[], object]:
-        much = torch.ones(STREAMED, device=device)
+        much = torch.ones(count, device=device)
         there = torch.empty_like(much)
         return lambda: there.copy_(much)
 
-    return 2 * 4 * STREAMED / _best_on_every_core(make, device, seconds)
+    return 2 * 4 * count / _best_on_every_core(make, device, seconds)
+
+
+def copied_bytes(device: torch.device) -> int:
+    """How much each core copies at once in :func:`measure_copy`."""
+    return 4 * max(LEAST_STREAMED, STREAMED // _cores(device))
+
+
+def _cores(device: torch.device) -> int:
+    return workers() if device.type == "cpu" else 1
 
 
 def _best_on_every_core(make: Callable[[], Callable[[], object]], device: torch.device, seconds: float) -> float:
@@ -90,6 +102,5 @@ def _best_on_every_core(make: Callable[[], Callable[[], object]], device: torch.
             found.append(clock.now() - started)
         return min(found)
 
-    cores = workers() if device.type == "cpu" else 1
-    each = list(in_order(best, range(cores), device))
-    return sum(each) / cores
+    each = list(in_order(best, range(_cores(device)), device))
+    return sum(each) / len(each)

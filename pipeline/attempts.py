@@ -1,7 +1,8 @@
 """How long earlier attempts at a stage took, so that a stage's time is that of all its attempts.
 
-A killed program cannot say when it died; the last file that it wrote tells. The machine's own running time, which no
-one sets, keeps a clock that was put forward from counting as work.
+A killed program cannot say when it died; the last file that it wrote tells, or NAME, which is touched as long as the
+stage runs (pipeline/heartbeat.py). The machine's own running time, which no one sets, keeps a clock that was put
+forward from counting as work.
 """
 
 import json

@@ -16,7 +16,8 @@ PAPER_RAYS = {"paper field as published": (8, 256, 64, 128), "paper field 4 × 6
 
 def bench_lines(device: "torch.device") -> list[str]:
     """Measure, and the table in lines."""
-    from nerf.machine_rates import measure_copy, measure_gather, measure_products
+    from nerf.machine_rates import copied_bytes, measure_copy, measure_gather, measure_products
+    from stages.amounts import bytes_in_words
     from stages.device import compute_device, cores
 
     compute_device()
@@ -30,7 +31,8 @@ def bench_lines(device: "torch.device") -> list[str]:
         lines.append(_line(f"matrix products (8192, {width}) × ({width}, {width})", rate / 1e9, count, "GFLOP/s"))
     for name, rate in reads.items():
         lines.append(_line(f"random reads of 16 bytes, table of {name} rows", rate / 1e6, count, "million/s"))
-    lines.append(_line("memory, copying 16 MB", copied / 1e9, count, "GB/s"))
+    size = bytes_in_words(copied_bytes(device))
+    lines.append(_line(f"memory, copying {size} (read and written)", copied / 1e9, count, "GB/s"))
     return [*lines, *_meaning(products, reads["2²⁰"], copied, count)]
 
 

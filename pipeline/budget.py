@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from pipeline import heartbeat
 from stages.amounts import duration
 from stages.contract import StageConfig
 from stages.device import processors
@@ -104,9 +105,9 @@ def takes_what_it_is_given(options: StageConfig) -> bool:
 class Budget:
     """The budget of a run as run.json keeps it: ``total`` seconds, and of each stage what was promised and spent.
 
-    ``spent`` counts every attempt of the present run, also those that were killed, as far as their last sign of life;
-    what is found finished costs nothing. Once a run is over, well or not, the next one that finds work to do begins a
-    new account; so does one with other options or photos.
+    ``spent`` counts every attempt of the present run, also those that were killed, as far as their last sign of life
+    (pipeline/heartbeat.py); what is found finished costs nothing. Once a run is over, well or not, the next one that
+    finds work to do begins a new account; so does one with other options or photos.
     """
 
     def __init__(self, state: dict[str, Any]) -> None:
@@ -178,10 +179,10 @@ class Budget:
         self.state["running"] = None
 
     def recover(self, root: Path) -> None:
-        """Count an attempt that was killed: until the last file that it wrote in the workspace ``root``."""
+        """Count an attempt that was killed: until its last sign of life in the workspace ``root``."""
         running = self.state["running"]
         if running is not None:
-            files = (root / running["stage"]).rglob("*")
+            files = (*(root / running["stage"]).rglob("*"), *root.glob(heartbeat.NAME))
             last = max((path.lstat().st_mtime for path in files), default=0.0)
             self.end(running["stage"], max(0.0, last - running["began"]))
 

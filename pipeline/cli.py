@@ -225,11 +225,11 @@ def _run_stages(
         runner = Runner(workspace, settings, display)
         if new_budget is not None:
             runner.set_budget(*new_budget)
-        photos = forecast.photos_of(settings)
-        display.headline(" · ".join([machine.headline(root), *forecast.promise(runner, stages, force, photos)]))
+        foretold = forecast.foretell(runner, stages, force, forecast.photos_of(settings))
+        display.headline(" · ".join([machine.headline(root), *foretold.words]))
         try:
             given = {"force": force, "replan": common.replan, "remember": remember, "verify": common.verify}
-            ran = runner.run(stages, times=forecast.expected(settings, photos), **given)
+            ran = runner.run(stages, times=foretold.times, **given)
         except StageFailed as failure:
             display.failed(failure.stage, failure.error)
             raise

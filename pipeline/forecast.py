@@ -4,6 +4,7 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
+from pipeline import manifests
 from pipeline.budget import (
     READING,
     STARTING,
@@ -14,11 +15,13 @@ from pipeline.budget import (
     reading_seconds,
     takes_what_it_is_given,
 )
+from pipeline.manifests import BadManifest
 from pipeline.settings import Settings
 from stages.amounts import duration, rough_duration
 from stages.contract import StageError
 from stages.device import processors
 from stages.train import SECONDS
+from stages.train import Config as TrainConfig
 
 if TYPE_CHECKING:
     from pipeline.runner import Runner
@@ -55,7 +58,8 @@ def photos_of(settings: Settings) -> Photos | None:
 
 
 def expected(settings: Settings, photos: Photos | None) -> dict[str, float | None]:
-    """Seconds by stage; None of those that take what a budget gives them. Nothing where the photos are gone.
+    """Seconds by stage; None of those that take what a budget gives them, and of a training in steps, which nobody has
+    timed yet. Nothing where the photos are gone.
 
     Rates were measured on two cores, on fox, fountain_p11, fern, banana, herzjesu_p8 and the demo (docs/numbers.md):
     sfm took 0.6 to 1.8 times as long, and more where photos found no place at once.
@@ -70,10 +74,14 @@ def expected(settings: Settings, photos: Photos | None) -> dict[str, float | Non
         "effects": 10.0 + photos.reading(cores),  # two or three, and half a minute where a pilot has to decide
         "report": 2.0 + READING * photos.megapixels * min(15, photos.number / settings.normalise.test_every),
     }
-    for stage in ("train", "evaluate", "render", "mesh"):
-        given = getattr(settings, stage).seconds
-        seconds[stage] = given and given + (STARTING + photos.reading(cores) if stage == "train" else 0.0)
-    return seconds
+    given = settings.train.seconds if settings.train.after is None else settings.train.more_seconds
+    seconds["train"] = given and given + STARTING + photos.reading(cores)
+    return seconds | {stage: getattr(settings, stage).seconds for stage in ("evaluate", "render", "mesh")}
+
+
+def counts_steps(train: TrainConfig) -> bool:
+    """Whether the training ends after so many steps, however long they take."""
+    return (train.steps if train.after is None else train.more_steps) is not None
 
 
 def sfm_seconds(photos: Photos, cores: int) -> float:
@@ -83,28 +91,51 @@ def sfm_seconds(photos: Photos, cores: int) -> float:
     return 4.0 + photos.reading(cores) + (features + 0.02 * pairs) * 2 / cores + 0.4 * photos.number
 
 
-def without_budget(settings: Settings, times: Mapping[str, float | None], reading: float) -> float | None:
-    """Seconds of a run without a budget; None where training counts steps, which nobody has timed yet."""
-    if settings.train.steps is not None and "train" in times:
+def trained_in_all(runner: "Runner", trains: bool) -> float | None:
+    """Seconds of training steps behind the field that the later stages will meet, by which they give themselves time:
+    to come where the run ``trains``, else those of the finished training. None where nobody can tell."""
+    train = runner.settings.train
+    if not trains:
+        finished = runner.found("train")
+        return finished and finished.facts["train_seconds"]
+    if counts_steps(train):
         return None
-    trained = trained_seconds(settings)
-    # What a training of three minutes is followed by (fox, fountain_p11, the demo; drawing scaled to its share now).
-    usual = {"train": trained + STARTING + reading, "evaluate": 0.05 * trained, "render": 0.27 * trained}
-    usual["mesh"] = 5.0 + 0.15 * trained
-    return sum(usual.get(stage, 0.0) if seconds is None else seconds for stage, seconds in times.items())
+    if train.after is None:
+        return trained_seconds(train)
+    try:
+        before = manifests.read(runner.workspace.folder("train", train.after))
+    except (FileNotFoundError, BadManifest):  # stage train says why it cannot go on
+        return None
+    assert train.more_seconds is not None, "one of the two is given"
+    return before.facts["train_seconds"] + train.more_seconds
 
 
-def trained_seconds(settings: Settings) -> float:
-    """Of training where it counts no steps: those asked for, or the preset's."""
-    return settings.train.seconds or SECONDS[settings.train.preset or "standard"]
+def without_budget(
+    train: TrainConfig, times: Mapping[str, float | None], reading: float, trained: float | None
+) -> dict[str, float | None]:
+    """``times`` of a run without a budget, after ``trained`` seconds of training in all; None where nobody can tell."""
+    usual: dict[str, float] = {}
+    if not counts_steps(train):
+        usual["train"] = trained_seconds(train) + STARTING + reading
+    if trained is not None:
+        # What a training of three minutes is followed by (fox, fountain_p11, the demo; drawing scaled to its share).
+        usual |= {"evaluate": 0.05 * trained, "render": 0.27 * trained, "mesh": 5.0 + 0.15 * trained}
+    return {stage: usual.get(stage) if seconds is None else seconds for stage, seconds in times.items()}
+
+
+def trained_seconds(train: TrainConfig) -> float:
+    """Of a training from the beginning that counts no steps: those asked for, or the preset's."""
+    return train.seconds or SECONDS[train.preset or "standard"]
 
 
 def pilots_seconds(settings: Settings, times: Mapping[str, float | None], reading: float) -> float | None:
     """Seconds that pilots may take in a run without a budget, whose stages take ``times``: their part of what it is
     expected to take. None, for as long as they take, where that is not known: a run that counts steps is to end the
     same on every machine."""
-    total = without_budget(settings, times, reading)
-    return for_pilots(total, reading) if total else None
+    if not times or counts_steps(settings.train):
+        return None
+    whole = without_budget(settings.train, times, reading, trained_seconds(settings.train))
+    return for_pilots(sum(seconds or 0.0 for seconds in whole.values()), reading)
 
 
 def reckoned_with(stage: str, settings: Settings, budget: Budget | None) -> dict[str, float]:
@@ -116,22 +147,38 @@ def reckoned_with(stage: str, settings: Settings, budget: Budget | None) -> dict
         return {} if seconds is None else {"seconds": seconds}
     if budget is not None:
         return {"budget": budget.total}
-    limited = stage == "effects" and settings.train.steps is None
-    return {"training": trained_seconds(settings)} if limited else {}
+    limited = stage == "effects" and not counts_steps(settings.train)
+    return {"training": trained_seconds(settings.train)} if limited else {}
 
 
-def promise(runner: "Runner", stages: Sequence[str], force: frozenset[str], photos: Photos | None) -> list[str]:
-    """What is said at the start of a run of ``stages``: how long it takes, where anything has to run."""
+class Forecast(NamedTuple):
+    """What is said at the start of a run, and the seconds that its stages are expected to take; None of those that a
+    budget gives their time, and where nobody can tell."""
+
+    words: list[str]
+    times: Mapping[str, float | None]
+
+
+def foretell(runner: "Runner", stages: Sequence[str], force: frozenset[str], photos: Photos | None) -> Forecast:
+    """How long a run of ``stages`` takes: in words, where anything has to run and it can be told, and by stage."""
     if photos is None:
-        return []
-    times, reading = expected(runner.settings, photos), photos.reading(processors())
-    left = {stage: times[stage] for stage in stages if stage in times and (stage in force or not runner.is_done(stage))}
-    if set(left) <= {"report"}:
-        return []
-    if (budget := runner.budget) is not None:
-        return [in_words(budget.total, runner.time_left(budget), left, reading)]
-    usual = without_budget(runner.settings, left, reading)
-    return [] if usual is None else [f"done in about {rough_duration(usual)}"]
+        return Forecast([], {})
+    train, times, reading = runner.settings.train, expected(runner.settings, photos), photos.reading(processors())
+    left = [name for name in stages if name in times and (name in force or runner.found(name) is None)]
+    trains = "train" in left
+    more_alone = train.after is not None and trains and set(left) <= {"train", "report"}
+    budget = None if more_alone else runner.budget
+    if budget is None:
+        unknown = None in (times[name] for name in stages if name in times)
+        times = without_budget(train, times, reading, trained_in_all(runner, trains) if unknown else None)
+    if set(left) <= {"report"} or (trains and counts_steps(train)):
+        return Forecast([], times)
+    of_left = {name: times[name] for name in left}
+    if budget is not None:
+        return Forecast([in_words(budget.total, runner.time_left(budget), of_left, reading)], times)
+    known = [seconds for seconds in of_left.values() if seconds is not None]
+    words = f"done in about {rough_duration(sum(known))}, about {_clock(sum(known))}"
+    return Forecast([words] if len(known) == len(left) else [], times)
 
 
 def in_words(total: float, left: float, times: Mapping[str, float | None], reading: float) -> str:
@@ -143,7 +190,12 @@ def in_words(total: float, left: float, times: Mapping[str, float | None], readi
     if least > left:
         soonest = f"about {rough_duration(least)} is the least that would do"
         return f"budget {duration(total)}, too short for these photos: {soonest}; all is made as small as can be"
-    finish = time.strftime("%H:%M", time.localtime(time.time() + min(left, most)))
+    finish = _clock(min(left, most))
     # Only training takes all that there is; the rest may well be done sooner.
     trains = times.get("train", 0.0) is None
     return f"budget {duration(total)}, done at {f'about {finish}' if trains else f'{finish} at the latest'}"
+
+
+def _clock(seconds: float) -> str:
+    """The time of day in so many seconds."""
+    return time.strftime("%H:%M", time.localtime(time.time() + seconds))

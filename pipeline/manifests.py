@@ -25,7 +25,8 @@ class BadManifest(Exception):
 
 @dataclass(frozen=True)
 class Manifest:
-    """One finished stage. ``outputs`` and ``records`` map relative paths to {"size", "sha256"}."""
+    """One finished stage. ``outputs`` and ``records`` map relative paths to {"size", "sha256"}; ``expected`` are the
+    seconds that were foretold, None where nobody could tell or a budget gave them."""
 
     stage: str
     version: int
@@ -40,6 +41,7 @@ class Manifest:
     seconds: float
     started: str
     machine: dict[str, Any] = field(default_factory=dict)
+    expected: float | None = None
 
 
 def files_below(folder: Path, names: tuple[str, ...]) -> list[str]:

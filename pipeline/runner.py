@@ -9,7 +9,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from pipeline import attempts, machine, manifests
+from pipeline import attempts, heartbeat, machine, manifests
 from pipeline.budget import Budget, reading_of, takes_what_it_is_given
 from pipeline.chain import ON_REQUEST, STAGES, needed_for
 from pipeline.display import Display
@@ -94,9 +94,9 @@ class Runner:
         goes_on = budget.spent and budget.is_of(self._options_digest(), self._photos_digest())
         return budget.left if goes_on else budget.total
 
-    def is_done(self, stage: str) -> bool:
-        """Whether a finished result of ``stage`` is there for these options, as far as can be told beforehand."""
-        found = bool(self.state["keys"]) and self._upstream(stage, "report") is not None
+    def found(self, stage: str) -> Manifest | None:
+        """The finished result of ``stage`` for these options, as far as can be told beforehand; None without one."""
+        found = self._upstream(stage, "report") if self.state["keys"] else None
         self.done.clear()  # what runs now may make it outdated
         return found
 
@@ -118,8 +118,8 @@ class Runner:
 
         ``force`` names stages that run again even where a finished result exists; ``replan`` forgets what was
         chosen for the user before; ``remember`` makes ``stages`` what `pipeline resume` repeats; ``times`` are the
-        seconds that stages are expected to take (pipeline/forecast.py), for a budget; ``verify`` reads every file of a
-        finished result before it counts as finished.
+        seconds that stages are expected to take (pipeline/forecast.py), for a budget and the report; ``verify`` reads
+        every file of a finished result before it counts as finished.
         """
         self.verify, self.force, self.stages, self.times = verify, force, list(stages), times or {}
         if self.budget:
@@ -275,7 +275,8 @@ class Runner:
         self._check_inputs(folders)
         self._begin_work(stage)
         clock = time.monotonic()
-        config = module.plan(self._with_time(stage, options), folders, self.display)
+        with heartbeat.beating(self.workspace.root / heartbeat.NAME):
+            config = module.plan(self._with_time(stage, options), folders, self.display)
         self.planning[stage] = time.monotonic() - clock
         plans[asked] = config.model_dump(mode="json")
         self.workspace.write_run(self.state)
@@ -346,6 +347,8 @@ class Runner:
             return None
 
     def _execute(self, job: Job) -> Manifest:
+        from stages.colmap import load
+
         partial, folder = self.workspace.partial(job.stage, job.key), self.workspace.folder(job.stage, job.key)
         if job.stage not in self.force and (manifest := self.workspace.complete(partial, folder, job.key)):
             return manifest
@@ -356,10 +359,11 @@ class Runner:
         partial.mkdir(parents=True, exist_ok=True)
         attempts.begin(partial, spent)
         self.workspace.write_run(self.state)
-        _load_native_code()
+        load()
         started, clock = datetime.now(UTC), time.monotonic()
         self.at_work = job.stage
-        result = job.module.run(job.config, job.folders, partial, self.display)
+        with heartbeat.beating(partial / attempts.NAME):
+            result = job.module.run(job.config, job.folders, partial, self.display)
         outputs = manifests.describe_outputs(partial, result.outputs)
         manifest = Manifest(
             stage=job.stage,
@@ -373,6 +377,7 @@ class Runner:
             facts=result.facts,
             line=result.line,
             seconds=round(spent + time.monotonic() - clock, 3),
+            expected=None if (expected := self.times.get(job.stage)) is None else round(expected, 1),
             started=started.isoformat(timespec="seconds"),
             machine=machine.facts(),
         )
@@ -381,10 +386,3 @@ class Runner:
         self.force -= {job.stage}
         self.at_work = ""
         return manifest
-
-
-def _load_native_code() -> None:
-    """COLMAP's import changes how signals are handled; once it is over, they are ours again."""
-    from stages.colmap import load
-
-    load()

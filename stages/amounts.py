@@ -29,6 +29,15 @@ def rough_duration(seconds: float) -> str:
     return duration(max(1, round(seconds)) if seconds < 60 else 60 * round(seconds / 60))
 
 
+def duration_option(seconds: float) -> str:
+    """``75s``, ``3m``, ``1h30m``: a time as ``--more`` and ``--budget`` take it, from ten minutes on in whole ones."""
+    whole = max(1, round(seconds))
+    if whole < 600 and whole % 60:
+        return f"{whole}s"
+    hours, minutes = divmod(round(whole / 60), 60)
+    return (f"{hours}h" if hours else "") + (f"{minutes}m" if minutes else "")
+
+
 def bytes_in_words(count: float) -> str:
     """``1.5 GB``, ``40 MB``: an amount of memory or disk."""
     return f"{count / GB:.1f} GB" if count >= 0.1 * GB else f"{count / 2**20:.0f} MB"

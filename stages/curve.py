@@ -1,15 +1,16 @@
 """curve.json: quality against training time, and what it says in words.
 
-``{"field": "grid" | "paper", "device": "cpu" | "cuda", "threads", "whole", "points": [{"step", "seconds", "train_psnr",
-"heldout_psnr", "heldout_ssim"} …]}``; what cannot be measured is null. Seconds are those of training steps alone:
-measuring is not among them. ``whole``: the rate fell once, at the end, and never rose again to go on.
+``{"field": "grid" | "paper", "downscale", "device": "cpu" | "cuda", "threads", "whole", "points": [{"step", "seconds",
+"train_psnr", "heldout_psnr", "heldout_ssim"} …]}``; what cannot be measured is null. ``downscale`` is that of the
+photos, those measured on included. Seconds are those of training steps alone: measuring is not among them. ``whole``:
+the rate fell once, at the end, and never rose again to go on.
 """
 
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stages.amounts import duration
+from stages.amounts import duration, duration_option
 from stages.files import write_json
 
 if TYPE_CHECKING:
@@ -19,11 +20,11 @@ BARS = "▁▂▃▄▅▆▇█"
 SPARK_WIDTH = 10
 
 
-def write_curve(folder: Path, field: str, whole: bool, points: list[dict[str, Any]]) -> None:
+def write_curve(folder: Path, field: str, downscale: float, whole: bool, points: list[dict[str, Any]]) -> None:
     """Write curve.json of a run that ends on this machine."""
     from stages.device import compute_device, cores
 
-    about = {"field": field, "device": compute_device(), "threads": cores(), "whole": whole}
+    about = {"field": field, "downscale": downscale, "device": compute_device(), "threads": cores(), "whole": whole}
     write_json(folder / "curve.json", about | {"points": points})
 
 
@@ -34,9 +35,9 @@ def heldout_curve(points: Sequence[dict[str, Any]]) -> list[tuple[float, float]]
 
 
 def coming_doubling(field: str, whole: bool, points: Sequence[dict[str, Any]]) -> "Gain | None":
-    """What the next doubling of the time is predicted to buy; None where the curve is too short, and for what the
-    prediction was not fitted to: the paper's field, whose rate falls all the way, and a run that is not ``whole``,
-    where half of the time may have ended annealed, too."""
+    """What the next doubling of the time is predicted to buy at the same sizes of photos and field, as ``--more`` keeps
+    them; None where the curve is too short, and for what the prediction was not fitted to: the paper's field, whose
+    rate falls all the way, and a run that is not ``whole``, where half of the time may have ended annealed, too."""
     from nerf.learning_curve import next_doubling
 
     return next_doubling(heldout_curve(points), points[-1]["step"]) if points and field == "grid" and whole else None
@@ -53,12 +54,19 @@ def doubling_words(points: Sequence[dict[str, Any]], coming: "Gain | None") -> s
     words = f"the last doubling of training time, to {duration(curve[-1][0])}, bought {last:+.1f} dB on held-out photos"
     if coming is None:
         return words
-    return f"{words}; the next is predicted to buy {coming.db:+.1f} dB (± {coming.half_width:.1f})"
+    words += " (less over a run of half the time, which would have ended above this curve)"
+    again = f"as long again at these sizes ({_more(points)})"
+    return f"{words}; {again} is predicted to buy {coming.db:+.1f} dB (± {coming.half_width:.1f})"
 
 
-def next_words(coming: "Gain | None") -> str | None:
+def next_words(points: Sequence[dict[str, Any]], coming: "Gain | None") -> str | None:
     """:func:`doubling_words` for a line that has no room."""
-    return coming and f"twice the training time is predicted to buy {coming.db:+.1f} ± {coming.half_width:.1f} dB"
+    gain = coming and f"{coming.db:+.1f} ± {coming.half_width:.1f} dB"
+    return gain and f"as long again ({_more(points)}) is predicted to buy {gain}"
+
+
+def _more(points: Sequence[dict[str, Any]]) -> str:
+    return f"--more {duration_option(points[-1]['seconds'])}"
 
 
 def target_words(target: float | None, reached: float | None, seconds: float) -> str | None:

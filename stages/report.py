@@ -115,11 +115,18 @@ def summarise(results: Results) -> dict[str, Any]:
         "train_seconds": manifests["train"]["facts"]["train_seconds"] if "train" in manifests else None,
         "total_seconds": round(sum(manifest["seconds"] for manifest in manifests.values()), 3),
         "stage_seconds": {stage: manifest["seconds"] for stage, manifest in manifests.items()},
+        "expected_seconds": _expected(manifests),
         "training_parts": results.parts,
         **{key: metrics.get(key) for key in ("psnr", "ssim", "psnr_mean_image", "psnr_nearest_view")},
         "mesh": mesh and {key: mesh[key] for key in ("vertices", "faces", "watertight")},
         "verdict": metrics.get("verdict", "Not measured: stage evaluate has not run."),
     }
+
+
+def _expected(manifests: Mapping[str, dict[str, Any]]) -> dict[str, float]:
+    """The seconds that stages were expected to take before their run began, where anybody could tell."""
+    known = {stage: manifest.get("expected") for stage, manifest in manifests.items()}
+    return {stage: seconds for stage, seconds in known.items() if seconds is not None}
 
 
 def page(results: Results, summary: dict[str, Any], config: Config) -> str:
@@ -144,6 +151,7 @@ def page(results: Results, summary: dict[str, Any], config: Config) -> str:
         registration=results.registration,
         manifests=results.manifests,
         budget=config.budget,
+        expected={} if config.budget else summary["expected_seconds"],
         settings=_settings(results.manifests),
         refused=results.photos["refused"] if results.photos else [],
         missing=_missing(results),

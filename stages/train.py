@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field, model_validator
-from tyro.conf import Suppress
+from tyro.conf import Suppress, arg
 
 from stages.amounts import short_count
 from stages.contract import Inputs, Progress, StageConfig, StageResult
@@ -83,7 +83,7 @@ class Config(StageConfig):
         "paper: the networks as published, for an hour; none: standard",
     )
     seconds: float | None = Field(default=None, gt=0, description="train so long; none, without steps: by the preset")
-    target_psnr: float | None = Field(
+    target_psnr: Annotated[float | None, arg(aliases=("--target-psnr",))] = Field(
         default=None,
         gt=0,
         le=100,
@@ -186,11 +186,15 @@ class Config(StageConfig):
 def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
     """Everything that was left open: field and budget, what stage effects decided, then sizes and the photos' size; or
     all of it as the finished training has it that is to go on."""
-    if config.after is not None:
-        from stages.train_more import continued
-
-        return continued(config, inputs)
     scene, decisions = read_scene(inputs["normalise"]), read_decisions(inputs["effects"])
+    if config.after is not None:
+        from stages.train_more import continued, larger_photos_words
+
+        whole = continued(config, inputs)
+        open_size = config.downscale is None  # what the user gave is what they want
+        if open_size and (words := larger_photos_words(whole, inputs, scene, _used_shares(inputs["ingest"], scene))):
+            progress.note(words)
+        return whole
     preset = config.preset or "standard"
     seconds = SECONDS[preset] if config.steps is None and config.seconds is None else config.seconds
     config = config.model_copy(update={"field": config.kind, "preset": preset, "seconds": seconds})
@@ -268,7 +272,8 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     info["background"] = list(field_background(config, scene))
     info |= learnt_of_photos(training.trainer, scene.of_split("train"))
     save_field(folder, training.trainer.model, info)
-    write_curve(folder, config.kind, training.plan.is_whole, training.state.curve)
+    assert config.downscale is not None, "plan() chooses it"
+    write_curve(folder, config.kind, config.downscale, training.plan.is_whole, training.state.curve)
     progress.update("measuring what this machine can do")
     device = training.probes.train.colours.device
     parts = write_parts(folder, training.state.timings, training.trainer.model, device)
@@ -317,8 +322,8 @@ def _result(config: Config, training: "TrainingRun", folder: Path, parts: list[s
 
 
 def _line(config: Config, training: "TrainingRun") -> str:
-    """180 s · 5.4 k steps · 24 k rays/s · held out 28.9 dB, over time ▁▃▅▆▇█ · twice the training time is predicted to
-    buy +0.6 ± 0.4 dB."""
+    """180 s · 5.4 k steps · 24 k rays/s · held out 28.9 dB, over time ▁▃▅▆▇█ · as long again (--more 3m) is predicted
+    to buy +0.6 ± 0.4 dB."""
     from stages.curve import coming_doubling, next_words, sparkline, target_words
 
     state = training.state
@@ -329,7 +334,7 @@ def _line(config: Config, training: "TrainingRun") -> str:
     spark = sparkline(state.curve)
     rising = f", over time {spark}" if spark else ""
     parts.append("no photos held out" if heldout is None else f"held out {heldout:.1f} dB{rising}")
-    parts.append(next_words(coming_doubling(config.kind, training.plan.is_whole, state.curve)))
+    parts.append(next_words(state.curve, coming_doubling(config.kind, training.plan.is_whole, state.curve)))
     parts.append(target_words(state.open_target(config.target_psnr), state.validation_psnr, state.seconds))
     if state.symptom is not None:
         parts.append(f"of no use yet: {state.symptom}")

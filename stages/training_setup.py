@@ -55,7 +55,7 @@ def prepare(config: "Config", scene: "Scene", inputs: Inputs, folder: Path, prog
     from stages.training_log import TrainingLog
     from stages.training_loop import TrainingRun
     from stages.training_state import Probes
-    from stages.unseen import PROBE_RAYS, Target, unseen_photos
+    from stages.unseen import PROBE_RAYS, PROBE_SEED, Target, unseen_photos
 
     assert config.downscale is not None, "plan() chooses it"
     device = compute_device()
@@ -66,7 +66,7 @@ def prepare(config: "Config", scene: "Scene", inputs: Inputs, folder: Path, prog
     shown_over = torch.tensor(field_background(config, scene), device=device)
 
     probes = Probes(
-        make_probe(bank, PROBE_RAYS, shown_over, config.seed),
+        make_probe(bank, PROBE_RAYS, shown_over, PROBE_SEED),
         unseen_photos(config, inputs["ingest"], scene, "test", device, progress),
     )
     if config.target_psnr is not None:

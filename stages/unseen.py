@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from stages.train import Config
 
 PROBE_RAYS = 2048
+PROBE_SEED = 0  # whatever the training's: curves of different seeds differ by what was trained, not by the pixels
 # SSIM looks at windows of 11 pixels. Many small squares tell more of the photos than a few large ones; together they
 # take twice the rays of the probe.
 PATCHES, PATCH_SIDE = 16, 16
@@ -50,7 +51,7 @@ class Look(NamedTuple):
 def unseen_photos(
     config: "Config", ingest: Path, scene: "Scene", split: "Split", device: str, progress: Progress
 ) -> Unseen | None:
-    """Of the photos of a split; None where it has none. Always the same pixels for the same seed."""
+    """Of the photos of a split; None where it has none. Always the same pixels."""
     import kornia.metrics  # noqa: F401 # takes seconds, which would count as the cost of the first measurement
     import torch
 
@@ -65,8 +66,8 @@ def unseen_photos(
     bank = training_bank(ingest, scene, split, config.downscale, progress).to(device)
     shown_over = torch.tensor(field_background(config, scene), device=device)
     return Unseen(
-        make_probe(bank, PROBE_RAYS, shown_over, config.seed),
-        make_patches(bank, PATCHES, PATCH_SIDE, shown_over, config.seed),
+        make_probe(bank, PROBE_RAYS, shown_over, PROBE_SEED),
+        make_patches(bank, PATCHES, PATCH_SIDE, shown_over, PROBE_SEED),
         told_by_neighbours(scene, scene.of_split(split)),
     )
 
@@ -91,7 +92,7 @@ def with_validation(scene: "Scene") -> "Scene":
     if split is None:
         count = len(scene.of_split("train"))
         why = f"photos to decide by have to be set aside, and of {count} training photos too few would be left"
-        raise StageError("no target can be trained to", why, "Leave out --train.target-psnr.")
+        raise StageError("no target can be trained to", why, "Leave out --target-psnr.")
     return split
 
 

@@ -10,12 +10,21 @@ CPU = torch.device("cpu")
 
 def test_rates_are_those_of_a_computer_and_no_random_state_changes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(machine_rates, "STREAMED", 1 << 18)
+    monkeypatch.setattr(machine_rates, "LEAST_STREAMED", 1 << 16)
     monkeypatch.setattr(machine_rates, "GATHERED", 1 << 12)
     before = torch.get_rng_state()
     rates = measure_rates(CPU, width=16, rows=1 << 10, seconds=0.05)
     assert torch.equal(before, torch.get_rng_state())
     for rate in rates:
         assert 1e6 < rate < 1e14
+
+
+@pytest.mark.parametrize("cores", [1, 2, 16, 256])
+def test_what_is_copied_fits_into_no_cache(cores: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(machine_rates, "workers", lambda: cores)
+    each = 2 * machine_rates.copied_bytes(CPU)
+    assert each * cores > 2 * 105e6 and each > 16e6
+    assert each * cores < 2e9 or each < 64e6, "nor is it a burden to a machine of many cores"
 
 
 def test_the_same_again_is_about_as_fast(monkeypatch: pytest.MonkeyPatch) -> None:

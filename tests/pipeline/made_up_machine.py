@@ -1,7 +1,8 @@
 """A whole chain of stages on a machine whose clock and speed are made up, for budgets."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -12,8 +13,9 @@ from pydantic import BaseModel
 
 from pipeline.budget import SHARES, Budget, reading_seconds
 from pipeline.display import SilentDisplay
+from pipeline.heartbeat import BEAT
 from pipeline.runner import Runner
-from pipeline.workspace import Workspace
+from pipeline.workspace import RUN_FILE, Workspace
 from stages.contract import StageConfig, StageError, StageResult
 from stages.device import processors
 from stages.files import write_json
@@ -43,6 +45,7 @@ class Stage(StageConfig):
 class Training(Stage):
     steps: int | None = None
     preset: str | None = None
+    after: str | None = None
 
 
 class Fixed(StageConfig):
@@ -57,25 +60,44 @@ class Machine:
     def __init__(self, slowness: float = 1.0) -> None:
         self.now, self.slowness, self.halves_at, self.killed_at = 1000.0, slowness, float("inf"), list[float]()
         self.megapixels, self.refuses = 0.0, ""  # of the photos, and the stage that cannot do what it is asked to
+        self.planning = 0.5  # seconds that a plan takes
+        self.killed_planning = ""  # the stage that is killed 15 seconds after its planning began
+        self.root = Path()  # the workspace
+        self.alive: Path | None = None  # what is touched while a stage is at work
+        self.next_beat = 0.0
 
-    def work(self, seconds: float, folder: Path | None = None) -> None:
-        """Let time pass, in quarters; a kill leaves no trace but the last file written."""
+    def work(self, seconds: float) -> None:
+        """Let time pass, in quarters. A kill leaves what is on the disk, each file with the time of its writing."""
+        self.date_files()
         for _ in range(round(4 * seconds)):
             self.now += 0.25 * self.slowness * (2 if self.now >= self.halves_at else 1)
             if self.killed_at and self.now >= self.killed_at[0]:
                 self.killed_at.pop(0)
-                if folder is not None:
-                    self.touch(folder)
-                raise Killed
+                raise Killed((self.root / RUN_FILE).read_bytes())
+            if self.alive is not None and self.now >= self.next_beat:
+                self.next_beat = self.now + BEAT
+                self.alive.touch()
+                self.date_files()
 
-    def touch(self, folder: Path) -> None:
-        (folder / "trace").write_text("x")
-        for path in (folder, folder / "trace"):
-            os.utime(path, (self.now, self.now))
+    def date_files(self) -> None:
+        """Whatever was written since the clock last moved was written now, by this machine's clock."""
+        for path in self.root.rglob("*"):
+            if path.lstat().st_mtime > REAL_TIMES:
+                os.utime(path, (self.now, self.now), follow_symlinks=False)
+
+    @contextmanager
+    def beating(self, file: Path) -> Iterator[None]:
+        """pipeline/heartbeat.py, by this machine's clock."""
+        self.alive, self.next_beat = file, self.now + BEAT
+        yield
+        self.alive = None
+
+
+REAL_TIMES = 1e9  # later than any time on a machine that is made up
 
 
 class Killed(BaseException):
-    """SIGKILL: nothing is noted down."""
+    """SIGKILL: nothing is noted down. Holds run.json as it was."""
 
 
 UNITS = {"evaluate": (1, 8, 1.5), "render": (6, 4000, 0.1), "mesh": (4, 400, 0.15)}
@@ -95,8 +117,10 @@ def chain(machine: Machine) -> dict[str, SimpleNamespace]:
                 return config
             least, most, each = UNITS[name]
             measured = machine.now
-            machine.work(0.5)
-            speed = 0.5 / (machine.now - measured)
+            if name == machine.killed_planning:
+                machine.killed_planning, machine.killed_at = "", [machine.now + 15]
+            machine.work(machine.planning)
+            speed = machine.planning / (machine.now - measured)
             assert config.seconds is not None
             count = int(config.seconds * speed / each)
             return config.model_copy(update={"units": max(least, min(most, count))})
@@ -108,18 +132,18 @@ def chain(machine: Machine) -> dict[str, SimpleNamespace]:
             if name == "train":
                 checkpoint = folder / "seconds"
                 done = float(checkpoint.read_text()) if checkpoint.exists() else 0.0
-                machine.work(3.0 + reading_seconds(machine.megapixels, processors()), folder)
+                machine.work(3.0 + reading_seconds(machine.megapixels, processors()))
                 while done < config.seconds:  # the clock decides, whatever the machine does
                     before = machine.now
-                    machine.work(1.0, folder)
+                    machine.work(1.0)
                     done += machine.now - before
                     checkpoint.write_text(str(done))
             elif name in UNITS:
-                machine.work(config.units * UNITS[name][2], folder)
+                machine.work(config.units * UNITS[name][2])
             elif name == "tradeoff":
-                machine.work(config.seconds, folder)
+                machine.work(config.seconds)
             else:
-                machine.work(MUST[name], folder)
+                machine.work(MUST[name])
             if name == machine.refuses:
                 raise StageError("it cannot be done", "nothing overlaps", "Add photos.")
             if name == "ingest":
@@ -182,14 +206,20 @@ def runs_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Go:
         monkeypatch.setattr("pipeline.runner.STAGES", chain(machine))
         for module in ("runner", "budget", "attempts"):
             monkeypatch.setattr(f"pipeline.{module}.time", clock)
-        monkeypatch.setattr("pipeline.runner._load_native_code", lambda: None)
+        monkeypatch.setattr("stages.colmap.load", lambda: None)
+        monkeypatch.setattr("pipeline.heartbeat.beating", machine.beating)
         settings = Options.model_validate({"ingest": {"photos": photos}} | options)
-        with Workspace(tmp_path / "w.nerf") as workspace:
+        machine.root, machine.alive = tmp_path / "w.nerf", None
+        with Workspace(machine.root) as workspace:
             runner = Runner(workspace, settings, SilentDisplay())  # type: ignore[arg-type]
             if not resume:
                 runner.set_budget(total, 0.0)
             began = machine.now
-            ran = runner.run(stages, times=EXPECTED, replan=replan, remember=not alone)
+            try:
+                ran = runner.run(stages, times=EXPECTED, replan=replan, remember=not alone)
+            except Killed as kill:  # what the runner notes as it is left, no killed program does
+                (machine.root / RUN_FILE).write_bytes(kill.args[0])
+                raise
         return Outcome(runner.budget, ran, machine.now - began)
 
     return run

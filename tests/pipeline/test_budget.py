@@ -20,7 +20,7 @@ from pipeline.budget import (
     training_seconds,
 )
 from pipeline.forecast import without_budget
-from pipeline.settings import Settings
+from pipeline.heartbeat import BEAT
 from stages.files import read_json
 from stages.train import Config as TrainConfig
 from tests.pipeline.made_up_machine import CHAIN, EXPECTED, Go, Killed, Machine, runs_on, spent
@@ -154,8 +154,9 @@ def given_to_pilots(workspace: Path) -> list[float | None]:
 
 def test_without_a_budget_pilots_have_their_part_of_the_usual_run(go: Go, tmp_path: Path) -> None:
     others = {name: {"seconds": 5.0} for name in ("evaluate", "render", "mesh")}
-    total = without_budget(Settings(train=TrainConfig(seconds=200.0)), EXPECTED, 0.0)
-    assert total is not None and total > 200
+    whole = without_budget(TrainConfig(seconds=200.0), EXPECTED, 0.0, 200.0)
+    total = sum(seconds or 0.0 for seconds in whole.values())
+    assert total > 200
     go(Machine(), None, train={"seconds": 200.0}, **others)
     assert given_to_pilots(tmp_path / "w.nerf") == [pytest.approx(for_pilots(total, 0.0))]
     assert 0 < for_pilots(total, 0.0) < 0.15 * total
@@ -169,8 +170,9 @@ def test_where_training_counts_steps_pilots_take_what_they_take(go: Go, tmp_path
     assert given_to_pilots(tmp_path / "w.nerf") == [None]
 
 
-@pytest.mark.parametrize("kills", [[30.0], [100.0], [100.0, 170.0], [225.0], [255.0, 270.0]])
+@pytest.mark.parametrize("kills", [[30.0], [100.0], [100.0, 170.0], [225.0], [255.0, 270.0], [20.0, 40.0, 60.0]])
 def test_a_kill_and_a_resume_keep_the_total(go: Go, kills: list[float]) -> None:
+    """Also in stages that write nothing before their end: all but train."""
     machine = Machine()
     machine.killed_at = [machine.now + when for when in kills]
     worked = 0.0
@@ -184,7 +186,19 @@ def test_a_kill_and_a_resume_keep_the_total(go: Go, kills: list[float]) -> None:
         machine.killed_at = [when + later for when in machine.killed_at]
     runner = go(machine, 300.0, resume=True)
     assert worked + runner.took == pytest.approx(300, rel=0.1)
-    assert sum(spent(runner).values()) == pytest.approx(worked + runner.took, abs=3)
+    assert sum(spent(runner).values()) == pytest.approx(worked + runner.took, abs=1 + BEAT * len(kills))
+
+
+@pytest.mark.parametrize("stage", ["evaluate", "render", "mesh"])
+def test_a_kill_while_a_stage_is_planned_is_not_free(go: Go, stage: str) -> None:
+    machine = Machine()
+    machine.planning, machine.killed_planning, began = 20.0, stage, machine.now
+    with pytest.raises(Killed):
+        go(machine, 300.0)
+    worked = machine.now - began
+    machine.now += 5000.0
+    runner = go(machine, 300.0, resume=True)
+    assert sum(spent(runner).values()) == pytest.approx(worked + runner.took, abs=1 + BEAT)
 
 
 def test_other_options_are_another_run_with_its_whole_budget(go: Go) -> None:

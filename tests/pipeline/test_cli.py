@@ -53,6 +53,8 @@ def test_help_of_run_lists_the_stage_options(capsys: pytest.CaptureFixture[str])
         (["--train.steps", "5", "--train.seconds", "5"], "--train: steps (5) and seconds (5) are two budgets"),
         (["--train.steps", "many"], "--train.steps: 'many' does not fit {None}|INT (pipeline run --help)"),
         (["--train.field", "foo"], "invalid choice 'foo' for argument '--train.field'. Expected one of ("),
+        (["--target-psnr", "0"], "--train.target-psnr 0.0 must be greater than 0 (pipeline run --help)"),
+        (["--target-psnr", "lots"], "'lots' does not fit {None}|FLOAT"),
         (["--effect", "lens_flare=on"], "--effect lens_flare=on: no effect 'lens_flare'; there are: "),
         (["--effect", "lens_flare=on", "--effect", "fog=on"], "--effect lens_flare=on: no effect"),
         (["--budget", "10"], "'10' is not a duration; write it like 90s, 10m or 1h30m"),
@@ -91,6 +93,28 @@ def test_like_is_an_option_of_render_whichever_way_it_is_spelt(tmp_path: Path, m
     for words in (["--like", "a.jpg"], ["--render.like", "a.jpg"], []):
         run_command(["run", str(tmp_path / "photos"), *words])
     assert seen == ["a.jpg", "a.jpg", None]
+
+
+def test_a_target_is_an_option_of_train_whichever_way_it_is_spelt(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    seen: list[float | None] = []
+    monkeypatch.setattr(
+        "pipeline.cli._run_stages", lambda root, settings, *_, **__: seen.append(settings.train.target_psnr)
+    )
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "w").mkdir()
+    (tmp_path / "w/run.json").write_text(json.dumps({"version": 1, "options": {}, "plans": {}, "keys": {}}))
+    Image.new("RGB", (40, 30)).save(tmp_path / "photos/a.jpg")
+    for words in (["--target-psnr", "28"], ["--train.target-psnr", "28"], ["--target-psnr=None"], []):
+        run_command(["run", str(tmp_path / "photos"), *words])
+        run_command(["train", str(tmp_path / "w"), *words])
+    assert seen == [28, 28, 28, 28, None, None, None, None]
+
+
+def test_help_names_the_target_by_its_short_name(capsys: pytest.CaptureFixture[str]):
+    for command in ("run", "train"):
+        with pytest.raises(SystemExit):
+            run_command([command, "--help"])
+        assert "--target-psnr" in capsys.readouterr().out.replace("--train.target-psnr", "")
 
 
 def test_a_photo_to_render_like_has_to_be_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
@@ -197,10 +221,13 @@ def test_until_ingest_then_status_and_explain_and_clean(tmp_path: Path, capsys: 
     for k in range(3):
         Image.effect_noise((64, 48), 30 + k).convert("RGB").save(tmp_path / f"photos/{k}.png")
     workspace = str(tmp_path / "w.nerf")
-    assert run_on(tmp_path / "photos", capsys, "--until", "ingest")[0] == 0
+    code, text = run_on(tmp_path / "photos", capsys, "--until", "ingest")
+    assert code == 0 and " · done in about 1 s, about " in text
+    (manifest,) = (tmp_path / "w.nerf/ingest").glob("*/manifest.json")
+    assert 0.4 < json.loads(manifest.read_text())["expected"] < 0.7, "kept for the report"
     code, text = run_on(tmp_path / "photos", capsys, "--until", "ingest")
     assert code == 0
-    assert "nothing to do" in text
+    assert "nothing to do" in text and "done in" not in text
     assert run_command(["status", workspace]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].split()[:2] == ["ingest", "cached"]

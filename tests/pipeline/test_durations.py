@@ -6,6 +6,7 @@ from hypothesis import strategies as st
 
 from pipeline.durations import seconds_from
 from pipeline.settings import UsageError
+from stages.amounts import duration_option
 
 
 @given(st.integers(0, 99), st.integers(0, 59), st.integers(0, 59))
@@ -13,6 +14,11 @@ def test_parts_add_up(hours: int, minutes: int, seconds: int):
     written = "".join(f"{n}{unit}" for n, unit in ((hours, "h"), (minutes, "m"), (seconds, "s")) if n)
     if written:
         assert seconds_from(written) == 3600 * hours + 60 * minutes + seconds
+
+
+@given(st.floats(0.5, 1e6))
+def test_what_is_proposed_can_be_given(seconds: float):
+    assert seconds_from(duration_option(seconds)) == pytest.approx(seconds, abs=0.5 if seconds < 599 else 30.5)
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,7 @@
 """What is promised at the start of a run."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipeline import forecast
+from pipeline import forecast, manifests
 from pipeline.budget import BESIDE_PILOTS, Budget
 from pipeline.chain import usual
 from pipeline.forecast import (
@@ -22,6 +22,7 @@ from pipeline.forecast import (
     sfm_seconds,
     without_budget,
 )
+from pipeline.manifests import Manifest
 from pipeline.settings import Settings
 from stages.effects import Config as EffectsConfig
 from stages.train import Config as TrainConfig
@@ -78,20 +79,46 @@ def test_known_cameras_take_no_time() -> None:
 
 
 Promise = Callable[..., list[str]]
+BEFORE_TRAINING = ("ingest", "sfm", "normalise", "effects")
+NOW = 1e9
+TRAINED = 180.0  # seconds of the finished training that the workspace of ``promise`` has
+
+
+def finished(stage: str) -> Manifest:
+    none: dict[str, Any] = {}
+    facts = {"train_seconds": TRAINED} if stage == "train" else none
+    digest = manifests.outputs_digest(none)
+    return Manifest(stage, 1, "0" * 64, none, {}, none, digest, none, facts, "", 190.0, "2026-01-01T00:00:00+00:00")
 
 
 @pytest.fixture
-def promise(photos: Path) -> Promise:
+def promise(photos: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Promise:
+    monkeypatch.setattr(forecast.time, "time", lambda: NOW)
+    monkeypatch.setattr(forecast, "processors", lambda: 2)
+    folder = tmp_path_factory.mktemp("training")
+    manifests.write(folder, finished("train"))
+
     def words(
-        budget: float | None = None, done: tuple[str, ...] = (), before: float = 0.0, **stages: dict[str, Any]
+        budget: float | None = None,
+        done: tuple[str, ...] = (),
+        before: float = 0.0,
+        names: Sequence[str] = tuple(usual()),
+        **stages: dict[str, Any],
     ) -> list[str]:
         runner: Any = SimpleNamespace(
             settings=settings(photos, **stages),
             budget=budget and Budget(Budget.new(budget, "of")),
-            is_done=lambda stage: stage in done,
+            found=lambda stage: finished(stage) if stage in done else None,
             time_left=lambda budget: budget.left - before,
+            workspace=SimpleNamespace(folder=lambda stage, name: folder if name == "there" else folder / name),
         )
-        return forecast.promise(runner, usual(), frozenset(), Photos(50, 2.0))
+        foretold = forecast.foretell(runner, names, frozenset(), Photos(50, 2.0))
+        known = [foretold.times[name] for name in names if name not in done]
+        for said in foretold.words:
+            if said.startswith("done in"):  # and until when, which is the sum of the stages' times
+                finish = time.localtime(NOW + sum(seconds or 0.0 for seconds in known))
+                assert None not in known and said.endswith(f", about {time.strftime('%H:%M', finish)}")
+        return [said.split(", about ")[0] if said.startswith("done in") else said for said in foretold.words]
 
     return words
 
@@ -105,8 +132,7 @@ def test_a_run_without_a_budget_is_foretold_in_minutes(promise: Promise) -> None
 
 def test_pilots_have_a_limit_where_the_time_of_the_run_is_known() -> None:
     times, reading = expected(Settings(), Photos(50, 2.0)), 2.0
-    total = without_budget(Settings(), times, reading)
-    assert total is not None
+    total = sum(seconds or 0.0 for seconds in without_budget(TrainConfig(), times, reading, 180.0).values())
     seconds = pilots_seconds(Settings(), times, reading)
     assert seconds is not None and seconds + reading + BESIDE_PILOTS == pytest.approx(0.15 * total)
     assert pilots_seconds(Settings(), {}, reading) is None, "nothing is known of the run"
@@ -127,8 +153,63 @@ def test_pilots_are_planned_anew_with_another_training_and_nothing_else_is() -> 
 
 
 def test_what_is_there_already_is_not_waited_for(promise: Promise) -> None:
-    assert promise(done=("ingest", "sfm", "normalise", "effects", "train")) == ["done in about 2 min"]
+    assert promise(done=(*BEFORE_TRAINING, "train")) == ["done in about 2 min"]
     assert promise(done=tuple(usual())) == [] == promise(600.0, done=tuple(usual()))
+
+
+def test_what_follows_a_finished_training_goes_by_its_seconds(
+    promise: Promise, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever the options would train for now, steps included."""
+    monkeypatch.setattr(f"{__name__}.TRAINED", 1800.0)
+    done = (*BEFORE_TRAINING, "train")
+    for options in ({}, {"steps": 500}, {"after": "there", "more_steps": 500}):
+        assert promise(done=done, train=options) == ["done in about 14 min"]
+
+
+# --- going on from a finished training
+
+
+@pytest.mark.parametrize(
+    ("names", "train", "words"),
+    [
+        # 600 s and what beside them; then shares of 780 s.
+        (usual(), {"more_seconds": 600.0}, ["done in about 16 min"]),
+        (usual(), {"more_seconds": 600.0, "seconds": 30.0}, ["done in about 16 min"]),
+        (usual(), {"more_seconds": 20.0, "preset": "high"}, ["done in about 2 min"]),
+        (("train", "report"), {"more_seconds": 600.0}, ["done in about 10 min"]),
+        (usual(), {"more_steps": 500}, []),
+        (("train", "report"), {"more_steps": 500, "seconds": 30.0}, []),
+        (usual(), {"more_seconds": 600.0, "after": "gone"}, []),
+    ],
+)
+def test_more_is_foretold_by_what_comes_on_top(
+    promise: Promise, names: Sequence[str], train: dict[str, Any], words: list[str]
+) -> None:
+    assert promise(done=BEFORE_TRAINING, names=names, train={"after": "there"} | train) == words
+
+
+@pytest.mark.parametrize(
+    ("train", "words"),
+    [
+        ({"after": "there", "more_seconds": 600.0}, ["done in about 10 min"]),
+        ({"after": "there", "more_steps": 500}, []),
+        ({"steps": 500}, []),
+    ],
+)
+def test_a_training_that_ends_by_itself_is_not_promised_within_the_workspaces_budget(
+    promise: Promise, train: dict[str, Any], words: list[str]
+) -> None:
+    names = (*BEFORE_TRAINING, "train", "report")
+    assert promise(120.0, done=BEFORE_TRAINING, names=names, train=train) == words
+
+
+def test_more_is_part_of_what_a_budget_is_expected_to_pay_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(forecast, "processors", lambda: 2)
+    given = {"train": {"after": "there", "more_seconds": 600.0, "seconds": 30.0}}
+    assert expected(Settings.model_validate(given), Photos(50, 0.75))["train"] == pytest.approx(604.75)
+    given["train"] |= {"more_seconds": None, "more_steps": 9}
+    assert expected(Settings.model_validate(given), Photos(50, 0.75))["train"] is None
 
 
 def test_a_budget_is_promised_with_its_end_or_said_to_be_too_short(promise: Promise) -> None:
@@ -146,12 +227,11 @@ def test_what_earlier_attempts_took_is_told_apart_from_a_budget_too_small_for_th
     assert " 0 s of it left" in promise(300.0, before=400.0)[0]
 
 
-def test_no_end_is_promised_that_only_a_training_would_need(promise: Promise, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(forecast.time, "time", lambda: 1e9)
+def test_no_end_is_promised_that_only_a_training_would_need(promise: Promise) -> None:
     done = ("ingest", "sfm", "normalise", "effects", "train", "evaluate", "render")
-    most = time.strftime("%H:%M", time.localtime(1e9 + 0.35 * 3600))
+    most = time.strftime("%H:%M", time.localtime(NOW + 0.35 * 3600))
     assert promise(3600.0, done=done) == [f"budget 1 h, done at {most} at the latest"]
-    left = time.strftime("%H:%M", time.localtime(1e9 + 600))
+    left = time.strftime("%H:%M", time.localtime(NOW + 600))
     assert promise(3600.0, done=done, before=3000.0) == [f"budget 1 h, done at {left} at the latest"]
     assert promise(3600.0)[0].startswith("budget 1 h, done at about ")
 

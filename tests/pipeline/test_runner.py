@@ -92,7 +92,7 @@ def test_photos_are_listed_once(bring: Bring, tmp_path: Path, known: bool, monke
     found, listed = sources.find_source, []
     monkeypatch.setattr(sources, "find_source", lambda *given: listed.append(given) or found(*given))
     with workspace:
-        assert [runner.is_done(stage) for stage in ALL] == [known] * 3
+        assert [runner.found(stage) is not None for stage in ALL] == [known] * 3
         runner.run(ALL)
     assert len(listed) == 1
 

@@ -1,6 +1,6 @@
 import pytest
 
-from stages.amounts import bytes_in_words, duration, rough_duration, short_count
+from stages.amounts import bytes_in_words, duration, duration_option, rough_duration, short_count
 
 
 @pytest.mark.parametrize(
@@ -35,6 +35,14 @@ def test_durations(seconds: float, words: str):
 )
 def test_times_are_said_roughly(seconds: float, words: str) -> None:
     assert rough_duration(seconds) == words
+
+
+@pytest.mark.parametrize(
+    ("seconds", "words"),
+    [(0.2, "1s"), (75.3, "75s"), (180.02, "3m"), (599.7, "10m"), (754.0, "13m"), (3600.0, "1h"), (5430.0, "1h30m")],
+)
+def test_times_as_options(seconds: float, words: str) -> None:
+    assert duration_option(seconds) == words
 
 
 def test_bytes() -> None:

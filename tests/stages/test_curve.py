@@ -9,10 +9,13 @@ POINTS = [{"seconds": 10.0 * 2**k, "heldout_psnr": 20.0 + k} for k in range(5)]
 def test_the_last_doubling_and_the_next_are_those_of_training_time() -> None:
     last = "the last doubling of training time, to 2 min 40 s, bought +1.0 dB on held-out photos"
     assert doubling_words(POINTS, None) == last
-    assert doubling_words(POINTS, Gain(0.71, 0.37)) == f"{last}; the next is predicted to buy +0.7 dB (± 0.4)"
+    less = "(less over a run of half the time, which would have ended above this curve)"
+    again = "as long again at these sizes (--more 160s) is predicted to buy +0.7 dB (± 0.4)"
+    assert doubling_words(POINTS, Gain(0.71, 0.37)) == f"{last} {less}; {again}"
     assert doubling_words(POINTS[-1:], None) is None
 
 
 def test_in_a_line_it_is_said_of_what() -> None:
-    assert next_words(Gain(0.71, 0.37)) == "twice the training time is predicted to buy +0.7 ± 0.4 dB"
-    assert next_words(None) is None
+    said = "as long again (--more 160s) is predicted to buy +0.7 ± 0.4 dB"
+    assert next_words(POINTS, Gain(0.71, 0.37)) == said
+    assert next_words(POINTS, None) is None

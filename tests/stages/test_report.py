@@ -12,7 +12,7 @@ from PIL import Image
 
 from stages import report
 from stages.contract import StageError
-from stages.files import write_json
+from stages.files import read_json, write_json
 from stages.tradeoff_front import recommend, table
 from tests.stages.report_workspace import LINES, PARTS, make_workspace
 from tests.stages.test_tradeoff_front import point
@@ -55,6 +55,7 @@ def test_summary_has_exactly_the_promised_keys(inputs: dict[str, Path], tmp_path
         "total_seconds": pytest.approx(58.2 + 181.7 + 60.1 + 4 * 2.5),
         "stage_seconds": {"ingest": 2.5, "sfm": 58.2, "normalise": 2.5, "train": 181.7}
         | {"evaluate": 2.5, "render": 60.1, "mesh": 2.5},
+        "expected_seconds": {},
         "training_parts": PARTS,
         "psnr": 21.5,
         "ssim": 0.62,
@@ -76,6 +77,22 @@ def test_a_budget_is_shown_promised_beside_spent_and_in_all(inputs: dict[str, Pa
             for line in re.findall("<tr>.*</tr>", html.split("How it was made")[1])) if len(row) == 6}  # fmt: skip
     assert rows["sfm"] == ["50 s", "–"] and rows["train"] == ["2 min 50 s", "2 min 46 s"] and rows["mesh"][1] == "12 s"
     assert "Given 5 min" not in _run(inputs, tmp_path / "without", progress)[0]
+
+
+def test_without_a_budget_what_was_expected_stands_beside_what_was_spent(tmp_path: Path, progress: Any):
+    inputs = make_workspace(tmp_path)
+    for stage, seconds in (("sfm", 50.0), ("train", 184.0), ("mesh", None)):
+        manifest = read_json(inputs[stage] / "manifest.json")
+        write_json(inputs[stage] / "manifest.json", manifest | {"expected": seconds})
+    html, summary = _run(inputs, tmp_path / "out", progress)
+    assert summary["expected_seconds"] == {"sfm": 50.0, "train": 184.0}
+    made = html.split("How it was made")[1]
+    assert "without a budget it is no promise" in made and '<th class="number">expected</th>' in made
+    rows = {row[0]: row[2:4] for row in ([re.sub("<[^>]+>", "", c) for c in re.findall("<td.*?</td>", line)]
+            for line in re.findall("<tr>.*</tr>", made)) if len(row) == 5}  # fmt: skip
+    assert rows["sfm"] == ["50 s", "58 s"] and rows["train"] == ["3 min 4 s", "3 min 2 s"] and rows["mesh"][0] == "–"
+    account = {"seconds": 300.0, "promised": {}, "spent": {}}
+    assert '<th class="number">expected</th>' not in _run(inputs, tmp_path / "budget", progress, budget=account)[0]
 
 
 def test_page_loads_nothing_from_elsewhere(inputs: dict[str, Path], tmp_path: Path, progress: Any):

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from pydantic import ValidationError
 
 from nerf.grid_training import GridTrainer
@@ -16,6 +17,8 @@ from stages.field_files import load_field
 from stages.files import read_json
 from stages.photos import Photo, write_photos
 from stages.train import Config
+from stages.training_setup import prepare
+from stages.unseen import with_validation
 from tests.stages.photo_scene import HEIGHT, WIDTH, photographed
 
 TINY: dict[str, Any] = {
@@ -55,7 +58,7 @@ def test_photos_become_a_field_that_beats_a_flat_colour(tmp_path: Path, progress
     assert result.facts["steps"] == 120 and result.facts["restarts"] == result.facts["rollbacks"] == 0
     assert f"held out {result.facts['heldout_psnr']:.1f} dB, over time ▁" in result.line
     curve = read_json(tmp_path / "train" / "curve.json")
-    assert (curve["device"], curve["threads"]) == ("cpu", cores())
+    assert (curve["device"], curve["threads"], curve["downscale"]) == ("cpu", cores(), 1.0)
     last = curve["points"][-1]
     assert [point["step"] for point in curve["points"]] == [64, 91, 120]
     assert set(last) == {"step", "seconds", "train_psnr", "heldout_psnr", "heldout_ssim"}
@@ -261,6 +264,21 @@ def test_the_published_preset_is_the_published_model(tmp_path: Path, progress: P
     assert (planned.samples_coarse, planned.samples_fine) == (64, 128)
     assert (planned.batch_rays, planned.learning_rate) == (1024, 5e-4)
     assert (planned.contracted, planned.spacing) == (True, "log")
+
+
+def test_every_seed_is_measured_on_the_same_pixels(tmp_path: Path, progress) -> None:
+    inputs, scene = photographed(tmp_path, views=12)
+    scene = with_validation(scene)
+    found = []
+    for seed in (0, 5):
+        (folder := tmp_path / f"train{seed}").mkdir()
+        config = train.plan(Config(**TINY, steps=1, seed=seed, target_psnr=20.0), inputs, progress)
+        probes = prepare(config, scene, inputs, folder, progress).probes
+        assert probes.heldout and probes.target
+        unseen = (probes.heldout, probes.target.photos)
+        others = (probe for each in unseen for probe in (each.probe, each.patches.probe))
+        found.append([probe.colours for probe in (probes.train, *others)])
+    assert len(found[0]) == 5 and all(torch.equal(*pair) for pair in zip(*found, strict=True))
 
 
 def test_a_run_in_seconds_keeps_to_them(tmp_path: Path, progress) -> None:

@@ -1,0 +1,70 @@
+"""Going on from a finished training: what is said of the sizes that it keeps."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from nerf.scene import Camera, Scene
+from stages import train
+from stages.files import read_json, write_json
+from stages.train import Config
+from stages.train_more import larger_photos_words, training_name
+from tests.stages.photo_scene import photographed
+
+DIGEST = "d" * 64
+NAME = training_name("k" * 64, DIGEST)
+
+
+@pytest.fixture
+def inputs(tmp_path: Path) -> dict[str, Path]:
+    """Those of a workspace whose finished training took 60 s for 1,000 steps, 3 million rays of photos at 1/2."""
+    made, _ = photographed(tmp_path / "made")
+    inputs = {}
+    for stage, folder in made.items():
+        inputs[stage] = tmp_path / "w" / stage / "key"
+        inputs[stage].parent.mkdir(parents=True)
+        folder.rename(inputs[stage])
+        write_json(inputs[stage] / "manifest.json", {"outputs_digest": DIGEST})
+    scene = Scene.from_json(read_json(inputs["normalise"] / "scene.json"))
+    write_json(inputs["normalise"] / "scene.json", photographed_large(scene).to_json())
+    before = tmp_path / "w" / "train" / NAME.split("/")[0]
+    before.mkdir(parents=True)
+    config = Config(field="paper", steps=1000, downscale=2.0, contracted=False, view_dependence=False).model_dump()
+    manifest: dict[str, Any] = {"outputs_digest": DIGEST, "facts": {"train_seconds": 60.0}, "config": config}
+    write_json(before / "manifest.json", manifest | {"inputs": dict.fromkeys(made, DIGEST)})
+    write_json(before / "field.json", {"steps": 1000, "rays": 3_000_000})
+    return inputs
+
+
+def photographed_large(scene: Scene) -> Scene:
+    """Six training photos of 2 megapixels: at half their width they have 3 million pixels."""
+    return replace(scene, cameras=(Camera("PINHOLE", 2000, 1000, (1700.0, 1700.0, 1000.0, 500.0)),))
+
+
+def words(inputs: dict[str, Path], **more: Any) -> str | None:
+    scene = Scene.from_json(read_json(inputs["normalise"] / "scene.json"))
+    return larger_photos_words(Config(after=NAME, downscale=2.0, **more), inputs, scene, {})
+
+
+def test_photos_that_would_be_larger_by_a_fifth_are_named_with_the_way_to_them(inputs: dict[str, Path]) -> None:
+    stay = "photos stay at 1/2 of their size and the field as large as it is"
+    anew = "4 min from the start would have them at 1/1: --train.seconds 240, or a larger --budget, trains anew"
+    assert words(inputs, more_seconds=180.0) == f"{stay}; {anew}"
+    anew = "2,000 steps from the start would have them at 1/1.4: --train.steps 2000 trains anew"
+    assert words(inputs, more_steps=1000) == f"{stay}; {anew}"
+
+
+def test_a_little_more_is_worth_no_word(inputs: dict[str, Path]) -> None:
+    assert words(inputs, more_seconds=20.0) is None and words(inputs, more_steps=300) is None
+
+
+def test_it_is_said_once_and_not_of_a_size_that_was_asked_for(inputs: dict[str, Path], progress: Any) -> None:
+    open_size = Config(after=NAME, more_seconds=180.0)
+    whole = train.plan(open_size, inputs, progress)
+    assert (whole.downscale, whole.more_seconds) == (2.0, 180.0)
+    assert sum(note.startswith("photos stay at 1/2 of their size") for note in progress.notes) == 1
+    for settled in (whole, open_size.model_copy(update={"downscale": 2.0})):
+        assert train.plan(settled, inputs, progress) == whole
+    assert len(progress.notes) == 1
