@@ -3,8 +3,8 @@
     python -m benchmarks.fast_field ../shared/data --workspaces /tmp/fast_field [--only lego_400 fox]
 
 Every line is `pipeline train WORKSPACE --train.seconds S --train.downscale D` and `pipeline evaluate` on all held-out
-photos, from cameras that are found once for each set. Frame: one held-out view at the size in the table, drawn on all
-cores. Run it on an idle machine.
+photos, from cameras that are found once for each set. Samples are points whose colour was computed. Frame: one held-out
+view at the size in the table, drawn on all cores. Run it on an idle machine.
 """
 
 import argparse
@@ -19,7 +19,11 @@ from benchmarks.nerfacto import HERE, pipeline, stage_folder
 from stages.files import read_json, read_scene
 
 EVERY_PHOTO = 10**6
-HEAD = "| set / downscale | s | grids | steps | rays/s | PSNR (dB) | SSIM | frame | GB |\n" + 9 * "|---" + "|"
+HEAD = (
+    "| set / downscale | s | grids | steps | rays/s | samples/s | PSNR (dB) | SSIM | frame | GB |\n"
+    + 10 * "|---"
+    + "|"
+)
 
 
 class Case(NamedTuple):
@@ -82,7 +86,7 @@ def row(workspace: Path, case: Case, memory: float) -> str:
     frame, size = frame_seconds(workspace, case.frame_width)
     sizes = f"{field['levels']} × 2^{field['log2_rows']} to {field['finest']}"
     quality = f"{metrics['psnr']:.2f} | {metrics['ssim']:.3f}"
-    speed = f"{facts['steps']:,} | {facts['rays_per_second']:,.0f}"
+    speed = f"{facts['steps']:,} | {facts['rays_per_second']:,.0f} | {facts['samples_per_second']:,.0f}"
     where = f"{case.name} / {case.downscale:g} | {case.seconds:g} | {sizes}"
     return f"| {where} | {speed} | {quality} | {frame:.2f} s at {size} | {memory:.1f} |"
 

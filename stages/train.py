@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from stages.training_loop import TrainingRun
 
 NEEDS = ("ingest", "normalise", "effects")
-VERSION = 16
+VERSION = 17
 RESUMES = True
 LINKS = ("curve.json",)
 UNKEYED = ("checkpoint_seconds", "tensorboard")
@@ -302,6 +302,7 @@ def _result(config: Config, training: "TrainingRun", folder: Path, parts: list[s
         "steps": state.step,
         "train_seconds": round(state.seconds, 3),
         "rays_per_second": round(state.rays / state.seconds, 1),
+        "samples_per_second": round(state.samples / state.seconds, 1),
         "train_psnr": last["train_psnr"],
         "heldout_psnr": last["heldout_psnr"],
         "validation_psnr": state.validation_psnr,
