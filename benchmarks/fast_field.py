@@ -21,9 +21,7 @@ from stages.files import read_json, read_scene
 
 EVERY_PHOTO = 10**6
 HEAD = (
-    "| set / downscale | s | grids | steps | rays/s | samples/s | PSNR (dB) | SSIM | frame | GB |\n"
-    + 10 * "|---"
-    + "|"
+    "| set / downscale | s | grids | steps | rays/s | samples/s | PSNR (dB) | SSIM | frame | GB |\n" + 10 * "|---" + "|"
 )
 
 

@@ -1,4 +1,4 @@
-"""What `pipeline doctor --bench` says that training could reach: the work of a ray is that of the product's own step."""
+"""What `pipeline doctor --bench` says that training could reach: the work of a ray is that of the steps taken here."""
 
 import pytest
 import torch
