@@ -1,54 +1,74 @@
 """Where a training step of the grid field spends its time, beside what this machine can do.
 
-    python -m benchmarks.grid_parts ../shared/data/lego_400 [--downscale 2] [--cores 1]
+    python -m benchmarks.grid_parts ../shared/data/lego_400 --workspace /tmp/lego.nerf [--seconds 300] [--downscale 1]
 
-The same account as every run keeps (stages/training_parts.py), of more steps one after another.
+The steps are those of `pipeline train WORKSPACE --train.seconds S --train.downscale D`: photos, cameras and effects are
+those of the workspace, sizes, colours in a step and its parts what stage train chooses here. The same account as every
+run keeps (stages/training_parts.py), of more steps one after another; samples are points whose colour was computed.
 """
 
 import argparse
-import time
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from benchmarks.grid_field import read_bank
-from nerf.grid_field import GridField, GridSettings
-from nerf.grid_training import GridTrainer, GridTrainerSettings
-from nerf.kernels import warp
-from nerf.parallel import take_over_cores
+from benchmarks.nerfacto import pipeline, stage_folder
+from benchmarks.pixel_store import Spoken
+from nerf.training import FieldTrainer
+from stages.device import compute_device, cores
+from stages.effect_decisions import photo_parts, read_decisions
+from stages.files import read_scene
+from stages.train import Config, plan
+from stages.training_data import guided_bank
 from stages.training_parts import FIRST_TIMED, observed, parts_table, rates_for
+from stages.training_setup import make_trainer
 
-CPU = torch.device("cpu")
+LINKED = {"ingest": "photos.json", "normalise": "scene.json", "effects": "effects.json"}
 WARM_STEPS, TIMED_STEPS = 300, 60
 SHARE = 0.1  # of the run: the learning rate is still whole
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--downscale", type=int, default=2)
-    parser.add_argument("--cores", type=int, default=1)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("photos", type=Path)
+    parser.add_argument("--workspace", type=Path, required=True, help="made if it is not there")
+    parser.add_argument("--seconds", type=float, help="of training that sizes are for; none: the standard preset's")
+    parser.add_argument("--downscale", type=float, help="photo width / trained width; none: as the seconds allow")
+    parser.add_argument("--cores", type=int, help="none: all")
     given = parser.parse_args()
-    torch.set_num_threads(given.cores)
-    take_over_cores()
-    model = GridField(GridSettings(5, 4, 18, 16, 384), 0, warp)
-    bank = read_bank(given.folder, "train", given.downscale, 1)
-    trainer = GridTrainer(model, bank, GridTrainerSettings(0, "random", chunks=2))
+    workspace = given.workspace.absolute()
+    pipeline("run", given.photos.absolute(), "-o", workspace, "--until", "effects")
+    if given.cores:
+        torch.set_num_threads(given.cores)
+    trainer = prepared(workspace, Config(seconds=given.seconds, downscale=given.downscale))
     for step in range(WARM_STEPS):
-        trainer.step(step, SHARE)
+        trainer.step(step, SHARE, 1.0)
     timings: dict[str, Any] = {}
-    started = time.perf_counter()
+    device = torch.device(compute_device())
     for step in range(WARM_STEPS, WARM_STEPS + TIMED_STEPS):
-        observed(partial(trainer.step, step, SHARE), FIRST_TIMED, timings, CPU)
-    seconds = time.perf_counter() - started
-    report(parts_table(timings, rates_for(model, CPU)), seconds)
+        observed(partial(trainer.step, step, SHARE, 1.0), FIRST_TIMED, timings, device)
+    report(parts_table(timings, rates_for(trainer.model, device)))
 
 
-def report(table: dict[str, Any], seconds: float) -> None:
+def prepared(workspace: Path, asked: Config) -> FieldTrainer:
+    """A fresh field with all that its first step needs, as stage train makes it; prints the sizes it chose."""
+    inputs = {stage: stage_folder(workspace, output) for stage, output in LINKED.items()}
+    scene, config = read_scene(inputs["normalise"]), plan(asked, inputs, Spoken())
+    assert config.downscale, "plan() chooses it"
+    sizes = f"{config.levels} grids of 2^{config.log2_rows} rows to {config.finest}³, photos at 1/{config.downscale:g}"
+    of_step = f"{config.batch_samples:,} colours in a step of {config.chunks} parts, {cores()} cores at work"
+    print(f"{sizes}, {of_step}", flush=True)
+    bank = guided_bank(inputs, scene, config.downscale, Spoken()).to(compute_device())
+    of_photos = photo_parts(read_decisions(inputs["effects"]), scene.of_split("train"), bank.device)
+    return make_trainer(config, scene, bank, config.seed, of_photos)
+
+
+def report(table: dict[str, Any]) -> None:
     """Print the table."""
-    print(f"{table['rays'] / seconds:,.0f} rays/s, {1e3 * seconds / TIMED_STEPS:.1f} ms a step")
+    speeds = "  ".join(f"{table[name] / table['seconds']:,.0f} {name}/s" for name in ("rays", "samples", "densities"))
+    print(f"{speeds}  {1e3 * table['seconds'] / TIMED_STEPS:.1f} ms a step, of {cores()} cores:")
     for row in table["parts"]:
         least = f"{1e3 * row['floor'] / TIMED_STEPS:6.2f} ms at the machine's rates" if row["floor"] else ""
         print(f"  {row['part']:10s} {1e3 * row['seconds'] / TIMED_STEPS:6.2f} ms {100 * row['share']:5.1f} %  {least}")

@@ -133,7 +133,8 @@ def lacks(python: Path) -> str | None:
         probe = subprocess.run(command, capture_output=True, text=True)
     except OSError as error:
         return f"{python}: {error.strerror}"
-    return probe.stderr.strip().splitlines()[-1] if probe.returncode else None
+    said = probe.stderr.strip().splitlines() or [f"{python} ended with status {probe.returncode} and without a word"]
+    return said[-1] if probe.returncode else None
 
 
 def train_nerfacto(python: Path, *arguments: Any) -> Iterator[Point]:

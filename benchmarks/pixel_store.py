@@ -2,14 +2,17 @@
 
     python -m benchmarks.pixel_store [--photos 500] [--downscale 1] [--folder DIR]
 
-Makes synthetic photos of 12 megapixels (JPEG), builds their store, draws batches from it, and prints seconds, bytes
-and the peak memory of this process. ``file`` memory is the mapped store: the system takes it back when it needs it;
-``own`` memory is not given back. ``from the disk`` is a batch right after the store was dropped from memory: what
-every batch costs, at worst, where the store is much larger than memory. The last lines take the same batches from
-plain memory, for comparison.
+Makes synthetic photos of 12 megapixels (JPEG), builds their store, trains on it, draws batches from it, and prints
+seconds, bytes and peak memory. ``file`` memory is the mapped store: the system takes it back when it needs it; ``own``
+memory is not given back. Training has a process of its own, whose memory is told: the first steps that stage train
+would take, of a field as large as it makes them. ``from the disk`` is a batch right after the store was dropped from
+memory: what every batch costs, at worst, where the store is much larger than memory. The last lines take the same
+batches from plain memory, for comparison.
 """
 
 import argparse
+import itertools
+import math
 import mmap
 import os
 import resource
@@ -17,6 +20,8 @@ import statistics
 import tempfile
 import time
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -26,12 +31,19 @@ from nerf.randomness import generator
 from nerf.ray_bank import RayBank
 from nerf.scene import Camera, Scene, Similarity, View
 from stages import pixel_store
+from stages.backend import chosen_backend
+from stages.device import compute_device
+from stages.memory import available_bytes
+from stages.train import Config, with_habits
 from stages.training_data import training_bank
+from stages.training_setup import make_trainer
+from stages.training_size import grid_size
 
 WIDTH, HEIGHT = 4000, 3000
 DIFFERENT = 4  # photos that are painted; the others are copies
 BATCHES = (4096, 8192)
 REPEATS = 100
+STEPS = 50  # of training
 
 
 class Spoken:
@@ -86,6 +98,19 @@ def draw(bank: RayBank, where: str, repeats: int = REPEATS) -> None:
         print(f"{count} rays, {where:<16}{milliseconds(lambda n=count: bank.sample(n, random), repeats)}")
 
 
+def train(ingest: Path, scene: Scene, downscale: float) -> str:
+    """The time of a step of training on a store that has been made, and the memory of the process that took it."""
+    device = compute_device()
+    asked = Config(field="grid", contracted=True, view_dependence=True, downscale=downscale)
+    config = with_habits(asked.model_copy(update={"backend": chosen_backend(device, Spoken())}))
+    config = config.model_copy(update=grid_size(config, scene, rays=math.inf))
+    bank = training_bank(ingest, scene, "train", downscale, Spoken()).to(device)
+    trainer, step = make_trainer(config, scene, bank, config.seed), itertools.count()
+    taken = milliseconds(lambda: trainer.step(next(step), 0.0, 1.0), STEPS)
+    sizes = f"{config.levels} grids of 2^{config.log2_rows} rows, {config.batch_samples:,} colours in a step"
+    return f"{STEPS} steps of training ({sizes}):{taken} each; {memory()}"
+
+
 def drop_from_memory(store: Path) -> None:
     """Let the system forget a file that nobody has mapped."""
     descriptor = os.open(store, os.O_RDONLY)
@@ -117,6 +142,8 @@ def measure(ingest: Path, photos: int, downscale: float) -> None:
     opened()
     (store,) = (path for path in ingest.with_name("ingest.pixels").iterdir() if not path.suffix)
     print(f"the store was made: {store.stat().st_size / 1e9:.2f} GB")
+    with ProcessPoolExecutor(1, get_context("spawn")) as alone:
+        print(alone.submit(train, ingest, scene, downscale).result())
     warm(opened())
     drop_from_memory(store)
     pixel_store.FITS = 0.0  # as if memory were too small for it
@@ -129,7 +156,10 @@ def warm(bank: RayBank) -> None:
     bank.pixels.view(-1)[:: mmap.PAGESIZE].sum()
     draw(bank, "mapped")
     print(memory())
-    draw(bank._replace(pixels=bank.pixels.clone()), "plain memory")
+    if bank.pixels.numel() > pixel_store.FITS * available_bytes():
+        print("left out: the same from plain memory, which has no room for them")
+    else:
+        draw(bank._replace(pixels=bank.pixels.clone()), "plain memory")
 
 
 if __name__ == "__main__":

@@ -92,7 +92,8 @@ class Loss(NamedTuple):
 
 
 class _Part(NamedTuple):
-    """What one chunk of a batch contributes to it: loss, gradients and their norm, the thickness of cells it met."""
+    """What one chunk of a batch contributes to it: loss, gradients and their norm, the thickness of cells it met, and
+    how many densities it asked for."""
 
     batch: GridBatch
     loss: Tensor
@@ -104,6 +105,7 @@ class _Part(NamedTuple):
     photos: dict[str, Tensor]
     norm: Tensor
     thickness: Float[Tensor, "samples"]
+    densities: int
 
 
 def rate_factor(step: int, share: float) -> float:
@@ -172,7 +174,7 @@ class GridTrainer:
         samples = sum(len(each.points) for each in parts)
         rays *= self.settings.chunks
         self.samples_per_ray.mul_(MEMORY).add_((1 - MEMORY) * samples / rays)
-        return StepResult(loss, psnr(error), rays)
+        return StepResult(loss, psnr(error), rays, samples, sum(each.densities for each in parts))
 
     def state(self) -> dict[str, Tensor]:
         """Weights and cache bits as ``model.<name>``, what is learnt of photos as ``photo.<name>``, Adam's moments as
@@ -242,7 +244,7 @@ class GridTrainer:
         weights, features, *_ = gradients
         norm = torch.nn.utils.get_total_norm([*weights, features, *sky.values(), *photos.values()])
         of_loss = loss.value, loss.squared_error
-        return _Part(batch, *of_loss, weights, features, done.points, sky, photos, norm, done.thickness)
+        return _Part(batch, *of_loss, weights, features, done.points, sky, photos, norm, done.thickness, done.marched)
 
     def _backward_work(self, done: GridPass) -> Work:
         weights = self.model.weights

@@ -34,11 +34,14 @@ ADAM_BYTES = 4 * 7  # of a weight: its gradient read, itself and its moments rea
 
 
 class StepResult(NamedTuple):
-    """What one step did: its loss, the PSNR (dB) of the final rendering on its batch, and how many rays it drew."""
+    """What one step did: its loss, the PSNR (dB) of the final rendering on its batch, how many rays it drew, how many
+    samples (points on them whose colour it computed), and how many points whose density it asked for."""
 
     loss: float
     psnr: float
     rays: int
+    samples: int
+    densities: int
 
 
 class FieldTrainer(Protocol):
@@ -182,7 +185,8 @@ class PaperTrainer:
         with torch.no_grad():
             for of_photos in self.photo_parts:
                 of_photos.settle()
-        return StepResult(loss, psnr(error), self.settings.batch_rays)
+        rays, queries = self.settings.batch_rays, self.settings.batch_rays * self.model.settings.queries_per_ray
+        return StepResult(loss, psnr(error), rays, samples=queries, densities=queries)
 
     def _part(self, batch: Batch, step: int, start: int) -> _Part:
         """What a slice of the batch adds to loss and gradient; it draws its samples from its own random numbers."""

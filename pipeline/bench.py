@@ -9,8 +9,10 @@ if TYPE_CHECKING:
 
 SECONDS = 0.3  # for each rate
 TABLES = {"2¹⁷": 1 << 17, "2²⁰": 1 << 20}  # rows: of one grid, of all five of a large field
-# Of a ray while the grid field trains, about (docs/numbers.md): colours computed, densities looked at.
-RAYS = {"around an object": (8, 12), "in unbounded space": (16, 37)}
+# Of a ray while the grid field trains: densities asked for, beside the colours of stages/training_size.py. Over a run
+# fern and fountain_p11 ask for 1.9 for each colour (parts.json); lego_400 asked for 1.5 before samples stood closer.
+DENSITIES = {"bounded": 12, "contracted": 23}
+WHERE = {"bounded": "around an object", "contracted": "in unbounded space"}
 PAPER_RAYS = {"paper field as published": (8, 256, 64, 128), "paper field 4 × 64": (4, 64, 32, 32)}
 
 
@@ -47,11 +49,13 @@ def _meaning(products: dict[int, float], reads: float, copied: float, count: int
     from nerf.machine_rates import Rates
     from nerf.stopwatch import Work
     from stages.amounts import short_count
+    from stages.training_size import SAMPLES_PER_RAY
 
     lines = ["at these rates, with nothing else to do and no core waiting, training would reach"]
-    for where, (colours, densities) in RAYS.items():
-        most = count / Rates(products[64], reads, copied).seconds(grid_work(colours, densities))
-        text = f"grid field {where} ({colours} colours, {densities} densities a ray)"
+    for space, densities in DENSITIES.items():
+        work = grid_work(space == "contracted", densities)
+        most = count / Rates(products[64], reads, copied).seconds(work)
+        text = f"grid field {WHERE[space]} ({SAMPLES_PER_RAY[space]} colours, {densities} densities a ray)"
         lines.append(f"  {short_count(most):>8} rays/s  {text}")
     for name, sizes in PAPER_RAYS.items():
         most = count / Rates(products[sizes[1]], reads, copied).seconds(Work(products=paper_products(*sizes)))
@@ -59,19 +63,26 @@ def _meaning(products: dict[int, float], reads: float, copied: float, count: int
     return lines
 
 
-def grid_work(colours: int, densities: int) -> "Work":
-    """Of a ray of a large grid field in training, its share of the optimiser's included."""
+def grid_work(contracted: bool, densities: float) -> "Work":
+    """Of a ray in training, its share of the optimiser's included: a large field, in the steps that stage train takes
+    on this machine."""
     from nerf import grid_mlp
-    from nerf.grid_field import CORNERS, GridField, GridSettings
-    from nerf.grid_training import ADAM_BYTES, GridTrainerSettings
+    from nerf.grid_field import CORNERS, GridField
+    from nerf.grid_training import ADAM_BYTES
     from nerf.kernels import reference
     from nerf.stopwatch import Work
+    from stages.device import compute_device
+    from stages.train import Config, with_habits
+    from stages.training_setup import grid_settings
+    from stages.training_size import SAMPLES_PER_RAY, rays_per_step, timed_settings
 
-    model = GridField(GridSettings(), 0, reference)
+    asked = Config(field="grid", contracted=contracted, view_dependence=True)
+    config = timed_settings(with_habits(asked), compute_device())
+    model = GridField(grid_settings(config, sky=False), 0, reference)
     density, colour = grid_mlp.density_products(model.weights), grid_mlp.colour_products(model.weights)
+    colours = SAMPLES_PER_RAY[config.space]
     rows = CORNERS * model.settings.levels * (densities + colours)
-    steps_per_ray = colours / GridTrainerSettings(0, "random").samples
-    adam = ADAM_BYTES * model.table.numel() * steps_per_ray
+    adam = ADAM_BYTES * model.table.numel() / rays_per_step(config)
     return Work(densities * density + colours * (colour + 2 * (density + colour)), rows, adam)
 
 

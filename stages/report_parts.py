@@ -32,5 +32,5 @@ def parts_bar(table: dict[str, Any] | None) -> dict[str, Any] | None:
     for row in rows:
         row["percent"] = 100 * row["share"]
         row["of_rate"] = 100 * row["floor"] / row["seconds"] if row["floor"] and row["seconds"] else None
-    speed = table["rays"] / table["seconds"]
-    return table | {"rows": rows, "rays_per_second": speed, "reached": 100 * table["floor_share"]}
+    speeds = {f"{name}_per_second": table[name] / table["seconds"] for name in ("rays", "samples")}
+    return table | speeds | {"rows": rows, "reached": 100 * table["floor_share"]}

@@ -307,6 +307,7 @@ def _result(config: Config, training: "TrainingRun", folder: Path, parts: list[s
         "steps": state.step,
         "train_seconds": round(state.seconds, 3),
         "rays_per_second": round(state.rays / state.seconds, 1),
+        "samples_per_second": round(state.samples / state.seconds, 1),
         "train_psnr": last["train_psnr"],
         "heldout_psnr": last["heldout_psnr"],
         "validation_psnr": state.validation_psnr,

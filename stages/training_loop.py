@@ -203,6 +203,7 @@ class TrainingRun:
         self.state.step += 1
         self.state.seconds += seconds
         self.state.rays += result.rays
+        self.state.samples += result.samples
         self.pace.add(seconds, result.rays, result.psnr)
 
     @property

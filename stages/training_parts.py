@@ -36,7 +36,8 @@ def observed(
         result = take()
     seconds = time.perf_counter() - started
     cores = workers() if device.type == "cpu" else 1
-    for name, amount in {"steps": 1, "rays": result.rays, "seconds": seconds, "core_seconds": cores * seconds}.items():
+    amounts = {"steps": 1, "rays": result.rays, "samples": result.samples, "densities": result.densities}
+    for name, amount in (amounts | {"seconds": seconds, "core_seconds": cores * seconds}).items():
         timings[name] = timings.get(name, 0) + amount
     parts = timings.setdefault("parts", {})
     for name, spent in stopwatch.parts.items():
@@ -59,6 +60,7 @@ def rates_for(model: "RadianceModel", device: "torch.device") -> "Rates":
 def parts_table(timings: dict[str, Any], rates: "Rates") -> dict[str, Any]:
     """The content of parts.json, from what :func:`observed` noted of at least one step.
 
+    ``samples`` are points whose colour was computed, ``densities`` points whose density was asked for.
     Shares are of the cores' time, and sum to 1: what no core computed is ``waiting``. ``floor`` is the time that a
     part's work takes at ``rates``; null for parts whose work is not of that kind. ``floor_share`` is of what was
     computed.
@@ -72,7 +74,7 @@ def parts_table(timings: dict[str, Any], rates: "Rates") -> dict[str, Any]:
     ordered = sorted(spent.items(), key=lambda entry: -entry[1][0])
     return {
         "steps_timed": timings["steps"],
-        "rays": timings["rays"],
+        **{name: timings[name] for name in ("rays", "samples", "densities")},
         "seconds": round(timings["seconds"], 4),
         "core_seconds": round(whole, 4),
         "rates": {name: round(rate) for name, rate in rates._asdict().items()},

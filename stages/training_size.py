@@ -82,7 +82,7 @@ def rays_in_budget(config: "Config", scene: "Scene", decisions: "Decisions") -> 
 
 def rays_per_second(config: "Config", scene: "Scene", decisions: "Decisions") -> float:
     """Measured training speed."""
-    config = _timed(config, compute_device())
+    config = timed_settings(config, compute_device())
     return rays_per_step(config) / seconds_per_step(config, scene, decisions)
 
 
@@ -100,7 +100,7 @@ def seconds_per_step(config: "Config", scene: "Scene", decisions: "Decisions") -
     return (time.perf_counter() - started) / steps
 
 
-def _timed(config: "Config", device: str) -> "Config":
+def timed_settings(config: "Config", device: str) -> "Config":
     """Settings under which speed is measured before the grids' sizes are known."""
     if config.field == "paper":
         assert config.batch_rays is not None

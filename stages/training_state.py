@@ -35,12 +35,13 @@ class Probes(NamedTuple):
 
 @dataclass
 class RunState:
-    """What a checkpoint keeps beside the tensors. ``seconds`` and ``rays`` include what was discarded, and what was
-    done before in the finished run that this one goes on from."""
+    """What a checkpoint keeps beside the tensors. ``seconds``, ``rays`` and ``samples`` include what was discarded, and
+    what was done before in the finished run that this one goes on from."""
 
     step: int = 0
     seconds: float = 0.0
     rays: int = 0
+    samples: int = 0
     restarts: int = 0
     rollbacks: int = 0
     curve: list[dict[str, Any]] = field(default_factory=list)
@@ -53,7 +54,7 @@ class RunState:
 
     def anew(self, restarts: int, rollbacks: int) -> "RunState":
         """The state of a run that begins again with fresh weights: only what was spent is kept, and what was before."""
-        names = ("seconds", "rays", "steps_before", "seconds_before", "validation_before")
+        names = ("seconds", "rays", "samples", "steps_before", "seconds_before", "validation_before")
         return RunState(restarts=restarts, rollbacks=rollbacks, **{name: getattr(self, name) for name in names})
 
     def open_target(self, psnr: float | None) -> float | None:

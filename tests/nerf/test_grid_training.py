@@ -110,6 +110,7 @@ def test_rays_adapt_to_the_samples_they_need() -> None:
     run = trainer()
     results = [run.step(step, 0.5) for step in range(100)]
     assert results[0].rays == 1024 // 128
+    assert results[0].rays < results[0].samples <= results[0].densities <= results[0].rays * FIELD.lattice.most_samples
     needed = results[-1].rays * float(run.samples_per_ray)
     assert 0.7 * 1024 < needed < 1.4 * 1024
     assert results[-1].rays > 5 * results[0].rays

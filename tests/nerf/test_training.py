@@ -92,6 +92,7 @@ def test_the_loss_is_the_sum_of_both_renderings_mean_squared_errors() -> None:
     assert alone.loss == pytest.approx(10 ** (-alone.psnr / 10), rel=1e-5)
     assert both.loss > 1.2 * 10 ** (-both.psnr / 10)
     assert both.rays == TRAINER.batch_rays
+    assert both.samples == both.densities == both.rays * FIELD.queries_per_ray
 
 
 @pytest.mark.parametrize(("broken", "quantity"), [("loss", "loss"), ("gradient", "gradient")])

@@ -6,7 +6,10 @@ import re
 import pytest
 
 from nerf import machine_rates
+from nerf.grid_training import ADAM_BYTES
 from pipeline import bench, cli, doctor
+from stages.train import PART_SAMPLES
+from stages.training_size import SAMPLES_PER_RAY
 
 
 @pytest.fixture
@@ -26,12 +29,29 @@ def test_every_rate_has_a_line_with_figures_of_a_computer(quick: None, capsys: p
         assert 0 < float(one) < 1e6 and math.isfinite(float(one)), (name, unit)
         assert not every or float(every) >= float(one)
     reached = re.findall(r"^ +([\d.]+ ?[kM]?) rays/s  (.+)$", out, re.M)
-    assert [name.split(" (")[0] for _, name in reached] == [f"grid field {where}" for where in bench.RAYS] + [
-        *bench.PAPER_RAYS
-    ]
+    for space, where in bench.WHERE.items():
+        (name,) = (name for _, name in reached if where in name)
+        assert f"({SAMPLES_PER_RAY[space]} colours, {bench.DENSITIES[space]} densities a ray)" in name
+    assert len(reached) == len(bench.WHERE) + len(bench.PAPER_RAYS)
     assert all(float(speed.rstrip("kM ")) > 0 for speed, _ in reached)
 
 
 def test_it_is_measured_only_if_asked_for(quick: None, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.run_command(["doctor"]) == 0
     assert "GFLOP/s" not in (out := capsys.readouterr().out) and "rays/s" not in out
+
+
+@pytest.mark.parametrize("space", ["bounded", "contracted"])
+def test_the_optimiser_is_shared_by_as_many_rays_as_a_step_has_on_this_machine(
+    space: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("stages.device.compute_device", lambda: "cpu")
+    works = []
+    for count in (1, 4):
+        monkeypatch.setattr("stages.device.cores", lambda count=count: count)
+        works.append(bench.grid_work(space == "contracted", 20))
+    one, four = works
+    assert one.bytes == pytest.approx(4 * four.bytes)
+    assert (one.products, one.rows) == (four.products, four.rows)
+    entries = one.bytes / ADAM_BYTES * PART_SAMPLES[space] / SAMPLES_PER_RAY[space]
+    assert 3 * 2**18 < entries / 4 <= 5 * 2**18, "five grids of four features, the coarse ones small"

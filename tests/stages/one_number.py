@@ -43,7 +43,7 @@ class OneNumber:
         self.trouble(step, rate_scale)
         self.history.append((step, share, rate_scale))
         self.value = self.value * 0.9 + rate_scale * (1 - share) * torch.sin(torch.tensor(float(step)))
-        return StepResult(float(self.value), 20.0, 4)
+        return StepResult(float(self.value), 20.0, rays=4, samples=12, densities=20)
 
     def state(self) -> dict[str, Tensor]:
         return {"value": self.value}

@@ -24,7 +24,10 @@ CAMERA_MODELS = [
         ("OPENCV_FISHEYE", "refined", 8, None, None, None, "its distortion cannot be undone at 2.0% of the pixels"),
     ]
 ]
-PARTS = {"steps_timed": 19, "rays": 19_456, "seconds": 5.0, "core_seconds": 10.0, "floor_share": 0.6} | {
+PARTS = {"steps_timed": 19, "seconds": 5.0, "core_seconds": 10.0, "floor_share": 0.6} | {
+    "rays": 19_456,
+    "samples": 243_200,
+    "densities": 583_680,
     "rates": {"products": 80_123_456_789, "rows": 150_000_000, "bytes": 19_000_000_000},
     "parts": [
         {"part": "backward", "seconds": 5.0, "share": 0.5, "floor": 3.5},

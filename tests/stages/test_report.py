@@ -396,6 +396,7 @@ def test_training_shows_where_its_time_went(inputs: dict[str, Path], tmp_path: P
     assert (
         "take 60% of the time it was computed in" in html and "it would be 7.2 k rays/s; these steps made 3.9 k" in html
     )
+    assert "They computed 49 k samples/s: colours of 12.5 points of a ray, after densities of 30.0." in html
     widths = [float(width) for width in re.findall(r'<i style="width: ([\d.]+)%; background', html)]
     assert widths == [50, 30, 10, 10]
 

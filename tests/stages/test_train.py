@@ -75,6 +75,8 @@ def test_the_grid_field_trains_from_photos_too(tmp_path: Path, progress) -> None
     assert (info["kind"], info["background"], result.facts["field"]) == ("grid", [1, 1, 1], "grid")
     assert (info["settings"]["levels"], info["settings"]["finest"]) == (2, 32)
     assert 120 * 8 < info["rays"] < 120 * 8192
+    colours = result.facts["samples_per_second"] / result.facts["rays_per_second"]
+    assert 0.5 < colours < 100, "of a ray"
     assert progress.notes[0] == "grid field (2 grids to 32³), 120 steps · 6 photos at 1/1 of their size, 2.3 k pixels"
 
 

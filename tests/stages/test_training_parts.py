@@ -27,6 +27,7 @@ RATES = Rates(1e10, 1e8, 1e10)
 GRID_PARTS = {"batch", "march", "gather", "encode", "mlp", "composite", "backward", "scatter", "optimiser", "cache"}
 PAPER_PARTS = {"batch", "sampling", "encode", "mlp", "composite", "backward", "optimiser"}
 PAPER: dict[str, Any] = {"depth": 3, "width": 16, "skip": 1, "samples_coarse": 8, "samples_fine": 8}
+COUNTED: dict[str, Any] = {"steps": 1, "rays": 8, "samples": 80, "densities": 200, "seconds": 1.0, "core_seconds": 1.0}
 
 
 def bank() -> RayBank:
@@ -68,9 +69,12 @@ def test_shares_sum_to_one_and_every_part_is_there(kind: str, monkeypatch: pytes
     monkeypatch.setattr("stages.training_parts.TIMED_EVERY", 1)
     monkeypatch.setattr("stages.training_parts.FIRST_TIMED", 0)
     of, timings = trainer(kind), {}
-    rays = sum(timed_step(of, step, timings).rays for step in range(5))
+    results = [timed_step(of, step, timings) for step in range(5)]
     table = parts_table(timings, RATES)
-    assert (table["steps_timed"], table["rays"]) == (5, rays)
+    assert table["steps_timed"] == 5
+    for name in ("rays", "samples", "densities"):
+        assert table[name] == sum(getattr(result, name) for result in results) > 0, name
+    assert table["samples"] <= table["densities"], "a colour is computed where the density lets it be seen"
     assert sum(row["share"] for row in table["parts"]) == pytest.approx(1, abs=1e-3)
     assert sum(row["seconds"] for row in table["parts"]) == pytest.approx(table["core_seconds"], abs=2e-3)
     names = {row["part"] for row in table["parts"]}
@@ -121,12 +125,14 @@ def test_rows_are_eight_corners_of_each_grid_of_each_point() -> None:
 
     of.model.backend = Counting()  # type: ignore[assignment]
     timed_step(of, FIRST_TIMED, timings)
+    assert timings["densities"] == points[0]
     assert timings["parts"]["gather"][2] == 8 * 2 * points[0]
-    assert 0 < timings["parts"]["scatter"][2] <= timings["parts"]["gather"][2]
+    assert timings["parts"]["scatter"][2] == 8 * 2 * timings["samples"]
+    assert 0 < timings["samples"] <= timings["densities"]
 
 
 def test_the_floor_is_work_over_rate_and_waiting_is_the_rest() -> None:
-    timings = {"steps": 2, "rays": 100, "seconds": 1.0, "core_seconds": 2.0}
+    timings: dict[str, Any] = COUNTED | {"steps": 2, "rays": 100, "core_seconds": 2.0}
     timings["parts"] = {"mlp": [1.0, 2e9, 0.0, 0.0], "gather": [0.5, 0.0, 1e7, 0.0], "rest": [0.25, 0.0, 0.0, 0.0]}
     table = parts_table(timings, RATES)
     rows = {row["part"]: row for row in table["parts"]}
@@ -138,16 +144,17 @@ def test_the_floor_is_work_over_rate_and_waiting_is_the_rest() -> None:
 
 
 def test_threads_that_overlap_never_make_waiting_negative() -> None:
-    timings = {"steps": 1, "rays": 1, "seconds": 1.0, "core_seconds": 1.0, "parts": {"mlp": [1.1, 0.0, 0.0, 0.0]}}
+    timings = COUNTED | {"parts": {"mlp": [1.1, 0.0, 0.0, 0.0]}}
     table = parts_table(timings, RATES)
     assert {row["part"]: row["share"] for row in table["parts"]} == {"mlp": 1.0, "waiting": 0.0}
     assert table["most_rays_per_second"] is None
 
 
 def test_the_page_has_a_row_per_part_and_nothing_where_nothing_was_timed() -> None:
-    timings = {"steps": 1, "rays": 8, "seconds": 1.0, "core_seconds": 1.0, "parts": {"mlp": [0.5, 1e9, 0.0, 0.0]}}
+    timings = COUNTED | {"parts": {"mlp": [0.5, 1e9, 0.0, 0.0]}}
     bar = parts_bar(parts_table(timings, RATES))
     assert bar is not None and parts_bar(None) is None
+    assert (bar["rays_per_second"], bar["samples_per_second"]) == (8, 80)
     assert [(row["part"], row["percent"], row["of_rate"]) for row in bar["rows"]] == [
         ("mlp", 50.0, pytest.approx(20.0)),
         ("waiting", 50.0, None),
