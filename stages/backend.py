@@ -1,4 +1,4 @@
-"""Which kernels compute the grid field: Warp's where they run, else torch's."""
+"""Which kernels compute the grid field: Warp's where they run, else torch's; these stay with what they trained."""
 
 import contextlib
 import os
@@ -20,6 +20,23 @@ def chosen_backend(device: str, progress: Progress | None = None) -> BackendName
     if why and progress:
         progress.note(f"the grid field is computed by torch alone, several times slower: {why}")
     return "torch" if why else "warp"
+
+
+def backend_of_field(trained_with: BackendName, device: str, progress: Progress | None = None) -> BackendName:
+    """For a field that is trained: torch stays, for who asked for it may have fled from Warp, and is said; one that
+    Warp trained is free to take :func:`chosen_backend`."""
+    if trained_with == "warp":
+        return chosen_backend(device, progress)
+    if progress:
+        progress.note("the grid field is computed by torch alone, as it was trained: several times slower than by Warp")
+    return "torch"
+
+
+def backend_name(backend: "Backend") -> BackendName:
+    """What :func:`load_backend` calls it."""
+    from nerf.kernels import reference
+
+    return "torch" if backend is reference else "warp"
 
 
 def load_backend(name: BackendName, device: str, progress: Progress | None = None) -> "Backend":

@@ -107,7 +107,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
 
     scene = read_scene(inputs["normalise"])
     device = compute_device()
-    model, _ = load_field(inputs["train"], device)
+    model, _ = load_field(inputs["train"], device, progress)
     config = plan(config, inputs, progress)
     points = _sparse_points(inputs["normalise"])
     result = reconstruct(config, model, scene, inputs["ingest"], points, device, progress)

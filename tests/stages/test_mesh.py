@@ -97,7 +97,7 @@ def run_mesh(tmp_path, progress, monkeypatch):
         write_json(inputs["normalise"] / "scene.json", (scene or scene_around()).to_json())
         write_tensors(inputs["normalise"] / "points.safetensors", {"xyz": points})
         write_json(inputs["train"] / "field.json", {"rays": 1000})
-        monkeypatch.setattr(field_files, "load_field", lambda folder, device="cpu": (model, {"rays": 1000}))
+        monkeypatch.setattr(field_files, "load_field", lambda *_: (model, {"rays": 1000}))
         config = mesh.Config.model_validate({"resolution": 48} | settings)
         return mesh.run(config, inputs, tmp_path / folder, progress), tmp_path / folder
 
