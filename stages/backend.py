@@ -16,7 +16,7 @@ BackendName = Literal["warp", "torch"]
 
 def chosen_backend(device: str, progress: Progress | None = None) -> BackendName:
     """ "warp" if its kernels run on ``device`` ("cpu" or "cuda"), else "torch"; then the reason is said."""
-    why = _why_not_warp(device)
+    why = why_not_warp(device)
     if why and progress:
         progress.note(f"the grid field is computed by torch alone, several times slower: {why}")
     return "torch" if why else "warp"
@@ -49,7 +49,7 @@ def load_backend(name: BackendName, device: str, progress: Progress | None = Non
         from nerf.kernels import reference
 
         return reference
-    if why := _why_not_warp(device):
+    if why := why_not_warp(device):
         raise StageError("cannot use the Warp kernels", why, "Use --train.backend torch.")
     from nerf.kernels import warp as kernels
 
@@ -59,7 +59,8 @@ def load_backend(name: BackendName, device: str, progress: Progress | None = Non
     return kernels
 
 
-def _why_not_warp(device: str) -> str | None:
+def why_not_warp(device: str) -> str | None:
+    """What keeps Warp's kernels from running on ``device`` ("cpu" or "cuda"), None if nothing does."""
     try:
         with _without_native_stderr():
             from nerf.kernels import warp as kernels

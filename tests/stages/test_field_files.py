@@ -128,7 +128,7 @@ def test_a_field_keeps_to_torch_if_that_trained_it(trained_with: BackendName, tm
 
 def test_a_field_of_warp_is_read_without_it_and_the_reason_said(tmp_path: Path, progress, monkeypatch) -> None:
     save_field(tmp_path, GridField(GRID, 5, load_backend("warp", "cpu")), INFO)
-    monkeypatch.setattr("stages.backend._why_not_warp", lambda device: "it is not there")
+    monkeypatch.setattr("stages.backend.why_not_warp", lambda device: "it is not there")
     loaded, _ = load_field(tmp_path, "cpu", progress)
     assert isinstance(loaded, GridField)
     assert backend_name(loaded.backend) == "torch"
