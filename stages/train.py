@@ -203,14 +203,18 @@ def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
         backend = config.backend or chosen_backend(compute_device(), progress)
         load_backend(backend, compute_device(), progress)
         config = config.model_copy(update={"backend": backend})
-    if config.downscale is None or (config.kind == "grid" and None in (config.levels, config.log2_rows, config.finest)):
-        from stages.training_size import chosen_downscale, grid_size, rays_in_budget
+    grids_open = config.kind == "grid" and None in (config.levels, config.log2_rows, config.finest)
+    if config.downscale is None or grids_open:
+        from stages.training_size import chosen_downscale, grid_size, rays_in_budget, reason_words
 
         progress.update("trying how fast this machine trains")
         rays = rays_in_budget(config, scene, decisions)
-        config = _filled(config, {"downscale": chosen_downscale(scene, rays, _used_shares(inputs["ingest"], scene))})
-        if config.kind == "grid":
-            config = _filled(config, grid_size(config, scene, rays))
+        progress.note(reason_words(config, rays))
+        if config.downscale is None:
+            downscale = chosen_downscale(scene, rays, _used_shares(inputs["ingest"], scene), progress)
+            config = config.model_copy(update={"downscale": downscale})
+        if grids_open:
+            config = _filled(config, grid_size(config, scene, rays, progress))
     return config
 
 
