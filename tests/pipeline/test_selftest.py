@@ -45,7 +45,9 @@ def test_the_matrix_is_measured_only_if_asked_for(monkeypatch, capsys: pytest.Ca
     assert "problem: the matrix was measured" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("why, line", [(None, "grid field: warp"), ("it is old", "grid field: torch, because it is old")])
+@pytest.mark.parametrize(
+    "why, line", [(None, "grid field: warp"), ("it is old", "grid field: torch, because it is old")]
+)
 def test_the_kernels_of_the_grid_field_are_those_that_train_would_choose(why, line, monkeypatch, capsys) -> None:
     monkeypatch.setattr(doctor, "self_test", lambda device: [])
     monkeypatch.setattr(doctor, "why_not_warp", lambda device: why)

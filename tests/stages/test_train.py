@@ -82,7 +82,8 @@ def test_that_samples_stand_farther_apart_with_distance_is_said(tmp_path: Path, 
     inputs, _ = photographed(tmp_path, bounded=False)
     trained(tmp_path / "train", inputs, progress, field="grid", chunks=1, backend="torch", steps=1)
     assert progress.notes[1] == (
-        "1,024 colours a step in 1 part, by torch · samples every 0.042 scene units, from 0.25 on every 16.7% of the distance"
+        "1,024 colours a step in 1 part, by torch · samples every 0.042 scene units, "
+        "from 0.25 on every 16.7% of the distance"
     )
 
 
@@ -196,7 +197,7 @@ def test_options_of_the_paper_field_ask_for_it() -> None:
 
 def test_every_option_is_shared_or_of_one_field() -> None:
     shared = {"field", "preset", "steps", "seconds", "learning_rate", "seed", "downscale", "background", "contracted"}
-    shared |= {"view_dependence", "checkpoint_seconds", "tensorboard", "target_psnr"}
+    shared |= {"view_dependence", "checkpoint_seconds", "tensorboard", "target_psnr", "matmul"}
     shared |= {"after", "more_steps", "more_seconds"}
     assert sorted([*shared, *train.GRID_ONLY, *train.PAPER_ONLY]) == sorted(Config.model_fields)
 
