@@ -63,9 +63,7 @@ class Painter:
             side = min(math.ceil(side * math.sqrt(2)), largest)
 
 
-def load_painter(
-    train: Path, background: tuple[float, ...] | None = None, progress: Progress | None = None
-) -> Painter:
+def load_painter(train: Path, background: tuple[float, ...] | None = None, progress: Progress | None = None) -> Painter:
     """The field that stage train left in ``train``, over ``background``, which a field with a sky does not show; None:
     what it was trained to stand before. One that models exposure is shown at its neutral one. ``progress`` is told
     where the field is computed by torch's kernels alone."""
