@@ -33,6 +33,7 @@ LARGEST = {"levels": 64, "features": 256, "log2_rows": 30, "finest": 2**20, "cac
     "most_samples": 10**6,
 }
 DRAWN_CLOSER = 1.5  # samples of a drawn ray for one in training (docs/numbers.md: Samples along a ray)
+THIN = 1e-2  # optical thickness below which a sample of training stands for others like it (docs/numbers.md)
 CORNERS = 8  # of a cell: rows that a point reads of each grid
 
 
@@ -98,13 +99,15 @@ class GridSettings:
 
 
 class GridPass(NamedTuple):
-    """What a rendering computed on its way, for :meth:`GridField.backward`; ``marched`` counts all densities asked."""
+    """What a rendering computed on its way, for :meth:`GridField.backward`; ``marched`` counts all densities asked,
+    ``thickness`` is of the samples' own intervals, not of what they stand for."""
 
     rays: Rays
     background: Float[Tensor, "rays 3"]
     marched: int
     samples: Samples
     points: Float[Tensor, "samples 3"]
+    thickness: Float[Tensor, "samples"]
     density: DensityPass
     harmonics: Float[Tensor, "rays direction"]
     colour: ColourPass
@@ -232,26 +235,35 @@ class GridField(nn.Module):
         colour = grid_mlp.colour_forward(self.weights, self.backend, wave.samples, geometry, of_rays).colour
         return self.backend.composite(wave.samples, wave.density.sigma, colour, black, nowhere)[0]
 
-    def forward(self, rays: Rays, jitter: Float[Tensor, "rays"], background: Float[Tensor, "rays 3"]) -> GridPass:
-        """Density of all samples in occupied cells; colour of those that can be seen."""
+    def forward(
+        self,
+        rays: Rays,
+        jitter: Float[Tensor, "rays"],
+        offset: Float[Tensor, "rays"],
+        background: Float[Tensor, "rays 3"],
+    ) -> GridPass:
+        """Density of all samples in occupied cells; colour of those that can be seen, thin ones standing for others
+        like them (``Backend.visible_samples``, which ``offset`` is for)."""
         backend, rays = self.backend, rays.each(Tensor.contiguous)
         background = self._behind(rays, background)
         waves = list(self._waves(rays, jitter, self.lattice))
         with part("march"):
-            samples, order = backend.pack_waves([wave.samples for wave in waves])
+            marched, order = backend.pack_waves([wave.samples for wave in waves])
             sigma = torch.cat([wave.density.sigma for wave in waves]).index_select(0, order)
-            samples, seen = backend.visible_front(samples, sigma, HIDDEN_BEHIND)
+            samples, seen = backend.visible_samples(marched, sigma, HIDDEN_BEHIND, THIN, offset)
             rows = order.index_select(0, seen)
             points = torch.cat([wave.points for wave in waves]).index_select(0, rows)
             of_waves = zip(*(wave.density for wave in waves), strict=True)
             density = DensityPass(*(torch.cat(parts).index_select(0, rows) for parts in of_waves))
+            thickness = density.sigma * marched.dt.index_select(0, seen)
         with part("encode"):
             harmonics = self.of_directions(rays.directions)
             of_rays = grid_mlp.ray_hidden(self.weights, harmonics)
         colour = grid_mlp.colour_forward(self.weights, backend, samples, density.geometry, of_rays)
         with part("composite"):
             rendering, weights = backend.composite(samples, density.sigma, colour.colour, background, rays.far)
-        return GridPass(rays, background, len(order), samples, points, density, harmonics, colour, rendering, weights)
+        of_samples = samples, points, thickness, density
+        return GridPass(rays, background, len(order), *of_samples, harmonics, colour, rendering, weights)
 
     def backward(self, done: GridPass, grad: Rendering, grad_weights: Float[Tensor, "samples"]) -> GridGradients:
         """Gradients of a loss, given those of the rendering and of the samples' weights."""

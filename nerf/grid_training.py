@@ -67,13 +67,15 @@ class GridTrainerSettings:
 
 
 class GridBatch(NamedTuple):
-    """Rays with the colour each should see over its background, where its samples stand in their intervals, whose view
-    it belongs to, and how far away is the sparse point that it runs to; 0: to none."""
+    """Rays with the colour each should see over its background, where its samples stand in their intervals and which of
+    its thin ones are kept (both in [0, 1)), whose view it belongs to, and how far away is the sparse point that it runs
+    to; 0: to none."""
 
     rays: Rays
     target: Float[Tensor, "rays 3"]
     background: Float[Tensor, "rays 3"]
     jitter: Float[Tensor, "rays"]
+    offset: Float[Tensor, "rays"]
     view: Int[Tensor, "rays"]
     distance: Float[Tensor, "rays"]
 
@@ -216,8 +218,8 @@ class GridTrainer:
         else:
             background = torch.tensor(self.settings.background, device=device).repeat(count, 1)
         target = colour if alpha is None else torch.lerp(background, colour, alpha[:, None])
-        jitter = torch.rand(count, generator=random, device=device)
-        return GridBatch(rays, target, background, jitter, view, distance)
+        jitter, offset = torch.rand(2, count, generator=random, device=device)
+        return GridBatch(rays, target, background, jitter, offset, view, distance)
 
     def _is_guided(self, share: float) -> bool:
         return self.bank.known is not None and self.settings.depth_loss * depth_factor(share) > 0
@@ -229,7 +231,7 @@ class GridTrainer:
             seen_along = self.photo_rays.forward(batch.rays, batch.view)
             if not all_finite(seen_along):
                 raise NonFinite(RAYS, step, _whole([batch]))
-        done = self.model.forward(seen_along, batch.jitter, batch.background)
+        done = self.model.forward(seen_along, batch.jitter, batch.offset, batch.background)
         with part("composite"):
             loss = self._loss(rays * self.settings.chunks, share, done, batch)
         with part("backward", self._backward_work(done)):
@@ -238,11 +240,9 @@ class GridTrainer:
             photos = loss.grad_photos | self.photo_rays.backward(batch.rays, batch.view, grad_rays)
             sky = {name: self.model.sky_backward(done, gradients) for name in self.sky}
         weights, features, *_ = gradients
-        thickness = done.density.sigma * done.samples.dt
         norm = torch.nn.utils.get_total_norm([*weights, features, *sky.values(), *photos.values()])
-        return _Part(
-            batch, loss.value, loss.squared_error, weights, features, done.points, sky, photos, norm, thickness
-        )
+        of_loss = loss.value, loss.squared_error
+        return _Part(batch, *of_loss, weights, features, done.points, sky, photos, norm, done.thickness)
 
     def _backward_work(self, done: GridPass) -> Work:
         weights = self.model.weights

@@ -6,6 +6,7 @@ quicker structure from motion, a kill. Structure from motion cannot be planned t
 that the rest is fitted around; training gets most of what is left.
 """
 
+import math
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,6 +14,8 @@ from typing import Any
 
 from stages.amounts import duration
 from stages.contract import StageConfig
+from stages.device import processors
+from stages.photos import read_photos
 
 # Of the time that is left once what cannot be planned has its own. A user waits for the field; figures, a video and a
 # mesh are there to see it by, and gain little beyond MOST_SECONDS. A training of less than half a minute is worth none.
@@ -20,8 +23,10 @@ SHARES = {"train": 0.68, "evaluate": 0.05, "render": 0.15, "mesh": 0.12}
 LEAST_SECONDS = {"train": 30.0, "evaluate": 2.0, "render": 4.0, "mesh": 8.0}
 MOST_SECONDS = {"evaluate": 60.0, "render": 300.0, "mesh": 60.0}
 SFM_SHARE = 0.5  # of the budget: what structure from motion may take before it searches fewer features
-PILOTS_SHARE = 0.15  # of the budget, and of what is left no more than
-PILOTS_OF_LEFT = 0.25  # this: a pilot has to leave a training that is worth it
+EFFECTS_SHARE = 0.15  # of the run: what stage effects may take, and of what is left of a budget no more than
+EFFECTS_OF_LEFT = 0.25  # this: a pilot has to leave a training that is worth it
+# Of that, beside reading the photos: statistics take one or two seconds (docs/numbers.md), timing a pilot as much.
+BESIDE_PILOTS = 4.0
 LARGEST_SHARE = 0.35  # of the budget: what a stage other than train may take where all before it is there already
 # Training's own seconds count steps alone. Beside reading the photos, timing the first steps takes about STARTING,
 # probing and checkpoints 1.5 to 2 % (fox, fountain_p11 and sceaux_castle, three minutes each).
@@ -36,11 +41,24 @@ def reading_seconds(megapixels: float, cores: int) -> float:
     return READING * megapixels / cores
 
 
+def reading_of(ingest: Path) -> float:
+    """:func:`reading_seconds` on this machine, of the photos that stage ingest left in a folder."""
+    megapixels = sum(photo.width * photo.height for photo in read_photos(ingest)) / 1e6
+    return reading_seconds(megapixels, processors())
+
+
+def for_pilots(total: float, reading: float, most: float = math.inf) -> float:
+    """Seconds of a run of ``total`` that pilots may take: EFFECTS_SHARE, and ``most`` at most, less what stage effects
+    takes without any."""
+    return max(0.0, min(EFFECTS_SHARE * total, most) - BESIDE_PILOTS - reading)
+
+
 def allotted(stage: str, left: float, to_come: Mapping[str, float | None], total: float, reading: float = 0.0) -> float:
     """Seconds that ``stage`` may take when ``left`` seconds of a budget of ``total`` are left.
 
     ``to_come`` are the stages after it: what one is expected to take, None where it takes what it is given. Training
-    takes ``reading`` seconds before it begins. Never less than the least that makes sense, whatever is left.
+    and effects, whose seconds are those of its pilots, take ``reading`` seconds before they begin. Never less than the
+    least that makes sense, whatever is left.
     """
     least = LEAST_SECONDS | {"train": LEAST_SECONDS["train"] + reading}
     open_ended = [name for name, seconds in to_come.items() if seconds is None and name in SHARES]
@@ -48,7 +66,7 @@ def allotted(stage: str, left: float, to_come: Mapping[str, float | None], total
     if stage == "sfm":
         return max(1.0, min(SFM_SHARE * total, free - sum(least[name] for name in open_ended)))
     if stage == "effects":
-        return max(0.0, min(PILOTS_SHARE * total, PILOTS_OF_LEFT * free))
+        return for_pilots(total, reading, EFFECTS_OF_LEFT * free)
     whole = SHARES[stage] + sum(SHARES[name] for name in open_ended)
     reserved = sum(_reserved(name, free * SHARES[name] / whole) for name in open_ended)
     most = total if stage == "train" else LARGEST_SHARE * total

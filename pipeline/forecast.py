@@ -4,7 +4,16 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
-from pipeline.budget import READING, STARTING, least_total, most_total, reading_seconds
+from pipeline.budget import (
+    READING,
+    STARTING,
+    Budget,
+    for_pilots,
+    least_total,
+    most_total,
+    reading_seconds,
+    takes_what_it_is_given,
+)
 from pipeline.settings import Settings
 from stages.amounts import duration, rough_duration
 from stages.contract import StageError
@@ -76,14 +85,39 @@ def sfm_seconds(photos: Photos, cores: int) -> float:
 
 def without_budget(settings: Settings, times: Mapping[str, float | None], reading: float) -> float | None:
     """Seconds of a run without a budget; None where training counts steps, which nobody has timed yet."""
-    train = settings.train
-    if train.steps is not None and "train" in times:
+    if settings.train.steps is not None and "train" in times:
         return None
-    trained = train.seconds or SECONDS[train.preset or "standard"]
+    trained = trained_seconds(settings)
     # What a training of three minutes is followed by (fox, fountain_p11, the demo; drawing scaled to its share now).
     usual = {"train": trained + STARTING + reading, "evaluate": 0.05 * trained, "render": 0.27 * trained}
     usual["mesh"] = 5.0 + 0.15 * trained
     return sum(usual.get(stage, 0.0) if seconds is None else seconds for stage, seconds in times.items())
+
+
+def trained_seconds(settings: Settings) -> float:
+    """Of training where it counts no steps: those asked for, or the preset's."""
+    return settings.train.seconds or SECONDS[settings.train.preset or "standard"]
+
+
+def pilots_seconds(settings: Settings, times: Mapping[str, float | None], reading: float) -> float | None:
+    """Seconds that pilots may take in a run without a budget, whose stages take ``times``: their part of what it is
+    expected to take. None, for as long as they take, where that is not known: a run that counts steps is to end the
+    same on every machine."""
+    total = without_budget(settings, times, reading)
+    return for_pilots(total, reading) if total else None
+
+
+def reckoned_with(stage: str, settings: Settings, budget: Budget | None) -> dict[str, float]:
+    """The time that a plan of ``stage`` rests on: the run's budget, the stage's own seconds or, for pilots, training's;
+    {} without. It is part of no key; with another one the stage plans anew."""
+    options = getattr(settings, stage)
+    if not takes_what_it_is_given(options):
+        seconds = getattr(options, "seconds", None)
+        return {} if seconds is None else {"seconds": seconds}
+    if budget is not None:
+        return {"budget": budget.total}
+    limited = stage == "effects" and settings.train.steps is None
+    return {"training": trained_seconds(settings)} if limited else {}
 
 
 def promise(runner: "Runner", stages: Sequence[str], force: frozenset[str], photos: Photos | None) -> list[str]:

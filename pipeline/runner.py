@@ -10,17 +10,16 @@ from types import ModuleType
 from typing import Any
 
 from pipeline import attempts, machine, manifests
-from pipeline.budget import Budget, reading_seconds, takes_what_it_is_given
+from pipeline.budget import Budget, reading_of, takes_what_it_is_given
 from pipeline.chain import ON_REQUEST, STAGES, needed_for
 from pipeline.display import Display
 from pipeline.failures import StageFailed, worded
+from pipeline.forecast import pilots_seconds, reckoned_with
 from pipeline.keys import ContentIndex, config_for_key, digest, stage_key
 from pipeline.manifests import BadManifest, Manifest
 from pipeline.settings import Settings
 from pipeline.workspace import Workspace
 from stages.contract import StageConfig, StageError
-from stages.device import processors
-from stages.photos import read_photos
 
 
 class DamagedInputs(Exception):
@@ -264,7 +263,8 @@ class Runner:
         if not hasattr(module, "plan"):
             return options
         options_for_key = self._config_for_key(stage, options)
-        asked = digest({"version": module.VERSION, "options": options_for_key, "inputs": inputs} | self._time(options))
+        time_given = reckoned_with(stage, self.settings, self.budget)
+        asked = digest({"version": module.VERSION, "options": options_for_key, "inputs": inputs} | time_given)
         plans = self.state["plans"].setdefault(stage, {})
         if asked in plans:
             # Paths are taken as given now: the plan was made for equal content, wherever that lay then.
@@ -280,16 +280,6 @@ class Runner:
         plans[asked] = config.model_dump(mode="json")
         self.workspace.write_run(self.state)
         return config
-
-    def _time(self, options: StageConfig) -> dict[str, float]:
-        """The time that a plan for ``options`` reckons with: the run's budget, or the stage's own seconds; {} without.
-
-        Neither is part of a key; with another one the stage plans anew.
-        """
-        if self.budget and takes_what_it_is_given(options):
-            return {"budget": self.budget.total}
-        seconds = getattr(options, "seconds", None)
-        return {} if seconds is None else {"seconds": seconds}
 
     def _begin_work(self, stage: str) -> None:
         """From here on ``stage`` costs time of the budget: nothing that was found finished does, and no study."""
@@ -310,14 +300,16 @@ class Runner:
             self.workspace.write_run(self.state)
 
     def _with_time(self, stage: str, options: StageConfig) -> StageConfig:
-        """``options`` with the seconds that the budget leaves for the stage, where it has one and they are open."""
-        if self.budget is None or not takes_what_it_is_given(options):
+        """``options`` with the seconds that the budget leaves for the stage, where these are open; without a budget
+        only pilots have a limit."""
+        if not takes_what_it_is_given(options) or (self.budget is None and stage != "effects"):
             return options
+        reading = reading_of(self.workspace.folder("ingest", self.done["ingest"].key))
+        if self.budget is None:
+            return options.model_copy(update={"seconds": pilots_seconds(self.settings, self.times, reading)})
         # An input that has to be made again is none of the stages that were asked for.
         order = list(STAGES)
         to_come = {name: self.times.get(name) for name in self.stages if order.index(name) > order.index(stage)}
-        photos = read_photos(self.workspace.folder("ingest", self.done["ingest"].key))
-        reading = reading_seconds(sum(photo.width * photo.height for photo in photos) / 1e6, processors())
         if stage == "train" and (why := self.budget.shortage(to_come, reading)):
             self.display.note(f"the budget cannot be kept: {why}")
         return options.model_copy(update={"seconds": self.budget.give(stage, to_come, reading)})

@@ -1,8 +1,10 @@
 """What stage effects decided, as the stages after it read it: ``decisions.json``."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from statistics import fmean
 from typing import TYPE_CHECKING, Any
 
 from stages.files import read_dataclass, write_json
@@ -85,6 +87,17 @@ def expected_gains(field: dict[str, Any], scene: "Scene", unseen: "Sequence[View
     known = torch.tensor([photos[view.name] for view in scene.of_split("train")])
     gains = told_by_neighbours(scene, unseen) @ known
     return dict(zip((view.name for view in unseen), gains, strict=True))
+
+
+def neutral_in_words(field: dict[str, Any]) -> str | None:
+    """At which exposure a field with this field.json is shown, in stops (EV) above the photo with the least one, the
+    three channels on the mean; None where exposure is not modelled."""
+    if field.get("exposure") is None:
+        return None
+    neutral = fmean(field["exposure"]["neutral"])
+    least = min((fmean(gains) for gains in field["exposure"]["photos"].values()), default=neutral)
+    stops = round((neutral - least) / math.log(2), 2) + 0.0  # no -0
+    return f"neutral exposure, {stops:+.2f} EV over the least exposed photo"
 
 
 def learnt_of_photos(trainer: "FieldTrainer", views: "Sequence[View]") -> dict[str, Any]:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from stages.pilots import Pilot, PilotScene
 
 NEEDS = ("ingest", "sfm", "normalise")
-VERSION = 6
+VERSION = 7
 RESUMES = False
 LINKS = ("effects.json",)
 UNKEYED = ("seconds",)  # it decides how many pilots, and that enters the key
@@ -51,16 +51,21 @@ class Config(StageConfig):
     pilots: int | None = Field(
         default=None, ge=0, description=f"how many at most; none: {MOST_PILOTS}, fewer where there is no time for them"
     )
-    seconds: float | None = Field(default=None, ge=0, description="that pilots may take; none: as long as they take")
+    seconds: float | None = Field(
+        default=None,
+        ge=0,
+        description="that pilots may take; none: by the run, where it counts steps as long as they take",
+    )
     seed: int = Field(default=0, description="of the pilots")
 
 
 class Verdict(NamedTuple):
-    """Whether an effect is on, and why."""
+    """Whether an effect is on, and why, and the ``seconds`` that it took to come to that, the statistic apart."""
 
     on: bool
     reason: str
     pilot: "Pilot | None" = None
+    seconds: float = 0.0
 
 
 def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
@@ -98,7 +103,8 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     write_decisions(folder, decisions)
     lens = lens_evidence(registration)
     evidence, verdicts["lens"] = found.of | {"lens": lens}, Verdict(bool(lens.called_for), lens.words)
-    table = {name: _entry(verdicts.get(name), evidence[name]) for name in ORDER if name in evidence}
+    seconds = found.seconds | {"lens": 0.0}  # which stage sfm chose
+    table = {name: _entry(verdicts.get(name), evidence[name], seconds[name]) for name in ORDER if name in evidence}
     write_json(folder / "effects.json", table)
     facts = {"on": [name for name, entry in table.items() if entry["on"]], "statistics_seconds": statistics_seconds}
     return StageResult(("decisions.json",), _line(table), ("effects.json",), facts)
@@ -134,7 +140,9 @@ class _Study:
         }
         for name, (setting, *values) in settings.items():
             off, on = (replace(decisions, **{setting: value}) for value in values)
-            verdicts[name] = self._verdict(name, off, on)
+            began = time.perf_counter()
+            verdict = self._verdict(name, off, on)
+            verdicts[name] = verdict._replace(seconds=time.perf_counter() - began)
             decisions = on if verdicts[name].on else off
         return decisions, verdicts
 
@@ -181,8 +189,8 @@ class _Study:
         return Verdict(stays, f"{words}; {gain}", pilot)
 
 
-def _entry(verdict: Verdict | None, evidence: "Evidence") -> dict[str, Any]:
-    """One effect in effects.json; without a verdict it is one that is decided elsewhere or only seen."""
+def _entry(verdict: Verdict | None, evidence: "Evidence", seconds: float) -> dict[str, Any]:
+    """One effect in effects.json, whose statistic took ``seconds``; without a verdict it is only seen."""
     pilot = verdict.pilot if verdict else None
     return {
         "on": verdict.on if verdict else bool(evidence.called_for),
@@ -194,7 +202,7 @@ def _entry(verdict: Verdict | None, evidence: "Evidence") -> dict[str, Any]:
         "pilot_gain_db": pilot.gain_db if pilot else None,
         "pilot_noise_db": pilot.noise_db if pilot else None,
         "cost": pilot.cost if pilot else None,
-        "seconds": round(pilot.seconds, 3) if pilot else 0.0,
+        "seconds": round(seconds + (verdict.seconds if verdict else 0.0), 3),
         "reason": verdict.reason if verdict else evidence.words,
     }
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from pydantic import Field
 
 from stages.amounts import duration, short_count
-from stages.contract import Inputs, Progress, StageConfig, StageResult
+from stages.contract import Inputs, Progress, StageConfig, StageError, StageResult
 from stages.files import read_json, read_scene, write_json, write_png
 from stages.image_metrics import ERROR_SCALE, FEWEST_FOR_INTERVAL, error_map, mean_interval, ssim
 from stages.spread import spread
@@ -28,15 +28,16 @@ if TYPE_CHECKING:
     from stages.drawing import Painter
 
 NEEDS = ("ingest", "normalise", "train")
-VERSION = 8
+VERSION = 9
 RESUMES = False
 LINKS = ("metrics.json", "renders", "errors")
 UNKEYED = ("seconds",)  # it decides how many photos, and that enters the key
 
 BACKGROUNDS = {"white": WHITE, "black": BLACK}
-FIGURES = ("psnr", "ssim", "psnr_mean_image", "psnr_nearest_view", "psnr_right", "psnr_fitted_right")
+RIGHT_HALVES = ("psnr_right", "psnr_fitted_right", "psnr_posed_right")
+FIGURES = ("psnr", "ssim", "psnr_mean_image", "psnr_nearest_view", *RIGHT_HALVES)
 TRUSTED_WIDTH = 0.5  # of the photos: below, a picture can be sharp and the field know nothing of fine detail
-WORTH_SAYING = 0.5  # dB between the two scores of right halves
+WORTH_SAYING = 0.5  # dB between two scores of right halves
 LEAST_SIDE = 128  # pixels of the longer side of a photo that is scored, where there is a choice
 READING = 0.25  # seconds for each photo of the set where it is read at another size than the field was trained at
 BESIDE_DRAWING = 0.05  # seconds for each photo of the set, to read it: the mean image is one of them all
@@ -62,6 +63,11 @@ class Config(StageConfig):
         default=None,
         ge=1,
         description="How many test photos to score, evenly spread. None: as many as take no longer than the training.",
+    )
+    fit_poses: Literal["auto", "on", "off"] = Field(
+        default="auto",
+        description="Score right halves at poses fitted on the left halves, too. auto: where training refined poses. "
+        "A grid field's only.",
     )
     seconds: float | None = Field(
         default=None,
@@ -156,7 +162,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
 class Examiner:
     """Draws test views at 1/``downscale`` of the photos' size and compares them with what the camera saw, less what
     masks ignore. ``gains`` are the exposures expected of photos by their names, where exposure is modelled;
-    ``fits_poses``: the second score has the photo's pose fitted, too, for poses were refined in training."""
+    ``fits_poses``: right halves have a third score, with the photo's pose fitted, too."""
 
     scene: "Scene"
     ingest: Path
@@ -194,10 +200,11 @@ class Examiner:
         truth, used = self._photo(view), self.used(view)
         rendering = self._painter(view).draw(view_rays(self.scene, view, self.downscale), on_chunk)
         image = rendering.colour.clamp(0, 1)
-        right, fitted = right_half_psnr(rendering, self.painter.background.cpu(), truth, used)
+        background = self.painter.background.cpu()
+        right, fitted = right_half_psnr(rendering, background, truth, used)
+        posed = None
         if self.fits_poses and right is not None:
-            moved = self._from_fitted_pose(view, truth, used)
-            _, fitted = right_half_psnr(moved, self.painter.background.cpu(), truth, used)
+            _, posed = right_half_psnr(self._from_fitted_pose(view, truth, used), background, truth, used)
         height, width = truth.shape[:2]
         nearest = nearest_view(view, self.scene.of_split("train"))
         # The decoded file has an ASCII name that is unique up to its suffix; the photo's own may be anything.
@@ -212,6 +219,7 @@ class Examiner:
             "psnr_nearest_view": _psnr(resized(self._photo(nearest), height, width), truth, used),
             "psnr_right": right,
             "psnr_fitted_right": fitted,
+            "psnr_posed_right": posed,
             "nearest_view": nearest.name,
             "render": f"renders/{file}",
             "error": f"errors/{file}",
@@ -256,8 +264,17 @@ def _examiner(config: Config, scene: "Scene", inputs: Inputs, folder: Path, prog
     painter = load_painter(inputs["train"], BACKGROUNDS[chosen] if chosen else None, progress)
     field = read_json(inputs["train"] / "field.json")
     gains = expected_gains(field, scene, scene.of_split("test"))
-    fits_poses = "poses" in field and field["kind"] == "grid"
-    return Examiner(scene, inputs["ingest"], folder, painter, gains, fits_poses, config.downscale)
+    return Examiner(scene, inputs["ingest"], folder, painter, gains, fits_poses(config, field), config.downscale)
+
+
+def fits_poses(config: Config, field: dict[str, Any]) -> bool:
+    """Whether to score at fitted poses a field with this field.json. Raises StageError where it has no gradients for
+    that."""
+    fittable = field["kind"] == "grid"
+    if config.fit_poses == "on" and not fittable:
+        why = f"this is a {field['kind']} field, and only a grid field tells the gradients of its rays"
+        raise StageError("cannot fit poses of test photos", why, "Give --evaluate.fit-poses auto.")
+    return fittable and (config.fit_poses == "on" or (config.fit_poses == "auto" and "poses" in field))
 
 
 def affordable(pixels: Sequence[int], budget: float) -> list[int]:
@@ -332,14 +349,21 @@ def _line(metrics: dict[str, Any]) -> str:
     interval = metrics["psnr_interval"]
     deviation = f" ± {(interval[1] - interval[0]) / 2:.1f}" if interval else ""
     similarity = "" if metrics["ssim"] is None else f", SSIM {metrics['ssim']:.2f}"
-    right, fitted = metrics["psnr_right"], metrics["psnr_fitted_right"]
-    if right is not None and abs(fitted - right) > WORTH_SAYING:
-        similarity += f" · right halves {right:.1f} dB, {fitted:.1f} dB with its exposure fitted on the left half"
+    similarity += _right_halves(metrics)
     trivial = f"nearest photo {metrics['psnr_nearest_view']:.1f} dB, mean image {metrics['psnr_mean_image']:.1f} dB"
     scored, test = metrics["photos_scored"], metrics["photos_test"]
     count = _photos(scored) if scored == test else f"{scored} of {test} photos"
     size = "" if metrics["width_share"] == 1 else f" at {metrics['width_share']:.0%} width"
     return f"{metrics['psnr']:.1f}{deviation} dB{similarity} · {trivial} · {count}{size}"
+
+
+def _right_halves(metrics: dict[str, Any]) -> str:
+    """The scores of right halves, where what is fitted on the left ones makes a difference worth saying."""
+    right, fitted, posed = (metrics[key] for key in RIGHT_HALVES)
+    if right is None or all(abs(score - right) <= WORTH_SAYING for score in (fitted, posed) if score is not None):
+        return ""
+    words = f" · right halves {right:.1f} dB, {fitted:.1f} dB with its exposure fitted on the left half"
+    return words if posed is None else f"{words}, {posed:.1f} dB with its pose, too"
 
 
 def _photos(count: int) -> str:

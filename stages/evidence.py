@@ -1,6 +1,8 @@
 """All statistics of a scene: what its sparse model and its training photos say about each optional effect."""
 
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -14,16 +16,47 @@ if TYPE_CHECKING:
     from nerf.scene import Scene
 
 
+PHOTOMETRIC = (
+    *("exposure", "tone", "view_dependence", "vignetting"),
+    *("transients", "scale", "participating_media", "blur"),
+)
+GEOMETRIC = ("background", "pose_refinement", "rolling_shutter")
 PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")
 REFERENCE_PX = 1000  # the longer side, as nerf/evidence/poses.py says in its unit
 GAIN_DIGITS = 4  # of logarithms: a hundredth of what they are known to
 
 
 class SceneEvidence(NamedTuple):
-    """The evidence by effect, and the gains that effects may begin with, of the training photos in order of name."""
+    """The evidence by effect, the gains that effects may begin with, of the training photos in order of name, and the
+    ``seconds`` that the evidence took, by effect."""
 
     of: "dict[str, Evidence]"
     exposure: "ExposureFit"
+    seconds: dict[str, float]
+
+
+class Clock:
+    """Seconds by effect; of what serves several, each has an equal part."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def runs_for(self, *names: str) -> Iterator[None]:
+        """While the block lasts."""
+        started = time.perf_counter()
+        yield
+        part = (time.perf_counter() - started) / len(names)
+        for name in names:
+            self.seconds[name] = self.seconds.get(name, 0.0) + part
+
+    def timed(self, statistics: "Mapping[str, Callable[[], Evidence]]") -> "dict[str, Evidence]":
+        """What each of them says; each counts for its own name."""
+        said = {}
+        for name, statistic in statistics.items():
+            with self.runs_for(name):
+                said[name] = statistic()
+        return said
 
 
 def scene_evidence(
@@ -46,23 +79,28 @@ def scene_evidence(
     from nerf.evidence.vignetting import vignetting_evidence
     from stages.track_colours import look_at_photos
 
-    looked = look_at_photos(ingest, scene, points, progress)
-    progress.update("fitting the photos' exposures")
-    fit, tracks = fit_exposure(looked.tracks), looked.tracks
-    of = {
-        "exposure": exposure_evidence(fit, told_exposures(ingest, scene)),
-        "tone": tone_evidence(fit),
-        "view_dependence": view_dependence_evidence(tracks, fit),
-        "vignetting": vignetting_evidence(tracks, fit),
-        "transients": transients_evidence(tracks, fit, looked.expected),
-        "scale": scale_evidence(tracks),
-        "participating_media": media_evidence(tracks, fit),
-        "blur": blur_evidence(looked.gradients),
-    }
+    clock = Clock()
+    with clock.runs_for(*PHOTOMETRIC):
+        looked = look_at_photos(ingest, scene, points, progress)
+        progress.update("fitting the photos' exposures")
+        fit, tracks = fit_exposure(looked.tracks), looked.tracks
+    of = clock.timed(
+        {
+            "exposure": lambda: exposure_evidence(fit, told_exposures(ingest, scene)),
+            "tone": lambda: tone_evidence(fit),
+            "view_dependence": lambda: view_dependence_evidence(tracks, fit),
+            "vignetting": lambda: vignetting_evidence(tracks, fit),
+            "transients": lambda: transients_evidence(tracks, fit, looked.expected),
+            "scale": lambda: scale_evidence(tracks),
+            "participating_media": lambda: media_evidence(tracks, fit),
+            "blur": lambda: blur_evidence(looked.gradients),
+        }
+    )
+    of |= geometric_evidence(ingest, scene, points, uncertainty_px, clock)
     # What is trained begins with the gains: logarithms that differ in their last digits from processor to processor
     # must not make another field.
     gains = np.round(fit.log_gain, GAIN_DIGITS) + 0.0  # no -0
-    return SceneEvidence(of | geometric_evidence(ingest, scene, points, uncertainty_px), fit._replace(log_gain=gains))
+    return SceneEvidence(of, fit._replace(log_gain=gains), clock.seconds)
 
 
 def told_exposures(ingest: Path, scene: "Scene") -> "np.ndarray":
@@ -100,6 +138,7 @@ def geometric_evidence(
     scene: "Scene",
     points: "Mapping[str, np.ndarray]",
     uncertainty_px: Mapping[str, float | None],
+    clock: Clock,
 ) -> "dict[str, Evidence]":
     """What is told by places alone. Errors are laid on photos of REFERENCE_PX, for which thresholds are derived."""
     import numpy as np
@@ -109,20 +148,30 @@ def geometric_evidence(
     from nerf.evidence.rolling_shutter import motion_to_next, rolling_shutter_evidence
 
     views = scene.of_split("train")
-    xy, view, point, residual = training_residuals(scene, points)
-    size = np.array([[scene.cameras[one.camera].width, scene.cameras[one.camera].height] for one in views], float)
-    stated = np.array([uncertainty_px.get(one.file) for one in views], float)  # None becomes NaN
-    usual = REFERENCE_PX / size.max(axis=1)
-    residual, stated = residual * usual[view, None], stated * usual
-    motion = np.full((len(views), 2), np.nan)
-    if _is_video(ingest, [one.file for one in views]):
-        motion = motion_to_next(xy * usual[view, None], point, view, len(views))
-    untracked = untracked_share(xy / size[view], view, len(views))
-    return {
-        "background": background_evidence(points["xyz"].astype(float), point, scene.has_alpha, untracked),
-        "pose_refinement": pose_evidence(*common_residuals(residual, xy, view, len(views)), stated),
-        "rolling_shutter": rolling_shutter_evidence(residual, xy[:, 1] / size[view, 1], motion, view),
-    }
+    with clock.runs_for(*GEOMETRIC):
+        xy, view, point, residual = training_residuals(scene, points)
+        size = np.array([[scene.cameras[one.camera].width, scene.cameras[one.camera].height] for one in views], float)
+        stated = np.array([uncertainty_px.get(one.file) for one in views], float)  # None becomes NaN
+        usual = REFERENCE_PX / size.max(axis=1)
+        residual, stated = residual * usual[view, None], stated * usual
+
+    def background() -> "Evidence":
+        untracked = untracked_share(xy / size[view], view, len(views))
+        return background_evidence(points["xyz"].astype(float), point, scene.has_alpha, untracked)
+
+    def rolling_shutter() -> "Evidence":
+        motion = np.full((len(views), 2), np.nan)
+        if _is_video(ingest, [one.file for one in views]):
+            motion = motion_to_next(xy * usual[view, None], point, view, len(views))
+        return rolling_shutter_evidence(residual, xy[:, 1] / size[view, 1], motion, view)
+
+    return clock.timed(
+        {
+            "background": background,
+            "pose_refinement": lambda: pose_evidence(*common_residuals(residual, xy, view, len(views)), stated),
+            "rolling_shutter": rolling_shutter,
+        }
+    )
 
 
 def _is_video(ingest: Path, files: Sequence[str]) -> bool:

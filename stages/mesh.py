@@ -103,11 +103,12 @@ def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
 def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> StageResult:
     """Extract the mesh and write it in every format asked for, with a picture of it."""
     from stages.device import compute_device
+    from stages.effect_decisions import neutral_in_words
     from stages.field_files import load_field
 
     scene = read_scene(inputs["normalise"])
     device = compute_device()
-    model, _ = load_field(inputs["train"], device, progress)
+    model, info = load_field(inputs["train"], device, progress)
     config = plan(config, inputs, progress)
     points = _sparse_points(inputs["normalise"])
     result = reconstruct(config, model, scene, inputs["ingest"], points, device, progress)
@@ -118,7 +119,10 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     line = f"{count}, {parts} component{'s' * (parts > 1)}, {result.ends}"
     if not result.level.clear:
         line += "; the field has no clear surface yet, train for longer"
-    return StageResult(outputs, line, facts=_facts(config, result, scene))
+    exposure = neutral_in_words(info)
+    line += "" if exposure is None else f" · {exposure}"
+    facts = _facts(config, result, scene) | ({} if exposure is None else {"exposure": exposure})
+    return StageResult(outputs, line, facts=facts)
 
 
 def _sparse_points(normalise: Path) -> "np.ndarray":

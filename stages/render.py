@@ -270,23 +270,24 @@ def _exposure(like: str | None, train: Path, scene: "Scene", progress: Progress)
     """
     import torch
 
-    from stages.effect_decisions import expected_gains
+    from stages.effect_decisions import expected_gains, neutral_in_words
 
     field = read_json(train / "field.json")
+    neutral = neutral_in_words(field)
     if (known := field.get("exposure")) is None:
         if like is not None:
             progress.note(f"exposure is not modelled: all photos count as exposed alike, and the video like {like}")
         return None, None
     if like is None:
-        return None, "neutral exposure"
+        return None, neutral
     if like in known["photos"]:
         return torch.tensor(known["photos"][like]), f"exposed like {like}"
     if unseen := [view for view in scene.views if view.name == like]:
         progress.note(f"{like} was not trained on: its exposure is what the photos taken nearest by let expect")
         return expected_gains(field, scene, unseen)[like], f"exposed as expected of {like}"
     near = difflib.get_close_matches(like, known["photos"], n=3)
-    progress.note(f"no photo {like} has a camera: neutral exposure" + (f"; perhaps {', '.join(near)}" if near else ""))
-    return None, "neutral exposure"
+    progress.note(f"no photo {like} has a camera: {neutral}" + (f"; perhaps {', '.join(near)}" if near else ""))
+    return None, neutral
 
 
 def _facts(config: Config, path: CameraPath) -> dict[str, Any]:

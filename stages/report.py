@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from nerf.scene import Scene
 
 NEEDS = ("ingest", "sfm", "normalise", "effects", "train", "evaluate", "render", "mesh", "tradeoff")
-VERSION = 4
+VERSION = 5
 RESUMES = False
 LINKS = ("report.html", "summary.json")
 

@@ -4,6 +4,7 @@ from typing import Any
 
 from stages.amounts import duration
 
+SHORTEST = 0.1  # seconds that are shown as a number
 # What to do about it; the effect's own reason says what was seen.
 ADVICE = {
     "blur": "Hold the camera still, lock the focus, give more light, and leave blurred photos out.",
@@ -40,6 +41,13 @@ def _row(name: str, entry: dict[str, Any]) -> dict[str, Any]:
         **{key: "–" if figure is None else f"{figure:.3g}{unit}" for key, figure in figures.items()},
         "pilot": "–" if gain is None else f"{gain:+.1f}" + ("" if noise is None else f" ± {noise:.1f}") + " dB",
         "cost": "–" if entry["cost"] is None else f"{entry['cost']:+.0%} time",
-        "seconds": duration(entry["seconds"]) if entry["seconds"] else "–",
+        "seconds": _took(entry["seconds"]),
         "reason": entry["reason"],
     }
+
+
+def _took(seconds: float) -> str:
+    """A dash where another stage decided."""
+    if not seconds:
+        return "–"
+    return duration(seconds) if seconds >= SHORTEST else f"< {duration(SHORTEST)}"

@@ -186,8 +186,13 @@ class Backend(Protocol):
 
     def pack_waves(self, waves: Sequence[Samples]) -> tuple[Samples, Int32[Tensor, "samples"]]: ...
 
-    def visible_front(
-        self, samples: Samples, sigma: Float[Tensor, "samples"], threshold: float
+    def visible_samples(
+        self,
+        samples: Samples,
+        sigma: Float[Tensor, "samples"],
+        threshold: float,
+        thin: float,
+        offset: Float[Tensor, "rays"],
     ) -> tuple[Samples, Int32[Tensor, "kept"]]: ...
 
     def composite(

@@ -20,20 +20,40 @@ from nerf.kernels.marching import lattice_measure
 from nerf.model import Rendering
 
 OPAQUE = 800.0
+LEAST_CHANCE = 1 / 16  # of a thin sample to be kept, so that no interval becomes more than 16 times as long
 
 
-def visible_front(
-    samples: Samples, sigma: Float[Tensor, "samples"], threshold: float
+def visible_samples(
+    samples: Samples, sigma: Float[Tensor, "samples"], threshold: float, thin: float, offset: Float[Tensor, "rays"]
 ) -> tuple[Samples, Int32[Tensor, "kept"]]:
-    """The samples before which the transmittance is still ``threshold`` or more, and their numbers among all.
+    """The samples that are worth a colour, and their numbers among all.
 
-    What remains of a ray is its front part; ``threshold`` 0 keeps everything. ``sigma`` must be the density that will
-    be composited: older ones (the cache's) would hide a surface from the very gradient that is to move it.
+    These lie in the front part of their ray, before which the transmittance is still ``threshold`` or more; 0 keeps
+    everything. ``sigma`` must be the density that will be composited: older ones (the cache's) would hide a surface
+    from the very gradient that is to move it.
+
+    Of those thinner than ``thin`` each is kept with the chance p = max(tau / thin, LEAST_CHANCE), and its interval is
+    made 1 / p times as long: it stands for others like it, so that sums of tau f over a ray keep their expectation, and
+    so do gradients of densities. Chances are added up along the ray, beginning with ``offset``, a random number in
+    [0, 1), and a sample is kept where the sum reaches a whole number (systematic sampling; Carpenter et al. 1999), so
+    that thin fog is sampled evenly. ``thin`` 0 keeps all.
     """
-    index = (_stopping(samples, sigma).before >= threshold).nonzero()[:, 0]
+    chance = _chance(sigma * samples.dt, thin)
+    of_thin = torch.where(chance < 1, chance, 0).double()
+    before = _sums_before(samples, of_thin) + offset.double().index_select(0, samples.ray)
+    kept = ~(chance < 1) | ((before + of_thin).floor() > before.floor())
+    index = (kept & (_stopping(samples, sigma).before >= threshold)).nonzero()[:, 0]
     starts = torch.searchsorted(index, samples.starts.long(), out_int32=True)
     index = index.int()
-    return Samples(starts, *(part.index_select(0, index) for part in samples[1:])), index
+    ray, t, dt = (each.index_select(0, index) for each in (samples.ray, samples.t, samples.dt / chance))
+    return Samples(starts, ray, t, dt), index
+
+
+def _chance(tau: Float[Tensor, "samples"], thin: float) -> Float[Tensor, "samples"]:
+    """Of a sample to be kept; 1 for what is no number, that it may be noticed."""
+    if not thin:
+        return torch.ones_like(tau)
+    return (tau / thin).clamp(LEAST_CHANCE, 1).nan_to_num(nan=1)
 
 
 def composite(

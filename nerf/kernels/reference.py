@@ -14,7 +14,7 @@ from nerf.kernels.packed_compositing import (
     composite_backward,
     distortion,
     distortion_backward,
-    visible_front,
+    visible_samples,
 )
 from nerf.kernels.sparse_depth import depth_loss, depth_loss_backward
 from nerf.kernels.waves import end_wave, pack_waves
@@ -43,5 +43,5 @@ __all__ = [
     "sample_points_backward",
     "spherical_harmonics",
     "spherical_harmonics_backward",
-    "visible_front",
+    "visible_samples",
 ]

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from nerf import grid_mlp, sky
-from nerf.grid_field import GridField, GridSettings
+from nerf.grid_field import THIN, GridField, GridSettings
 from nerf.kernels import GridLayout, Lattice, Samples, reference, warp
 from nerf.kernels.cache import occupied
 from nerf.model import RadianceModel, Rendering
@@ -77,11 +77,12 @@ def encoded_by_autograd(layout: GridLayout, table: Tensor, points: Tensor) -> Te
 
 
 @pytest.mark.parametrize("settings", [SMALL, FOLDED, OUTDOORS])
-def test_all_gradients_are_those_of_autograd(settings: GridSettings) -> None:
+def test_all_gradients_are_those_of_autograd(settings: GridSettings, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("nerf.grid_field.THIN", 0)
     model, given = field(settings), rays()
     jitter = torch.rand(6, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
     background = torch.rand(6, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
-    done = model.forward(given, jitter, background)
+    done = model.forward(given, jitter, jitter, background)
     assert done.marched == len(done.samples.t), "these are to be compared without early termination"
     ones = torch.ones(6, dtype=torch.float64)
     grad = Rendering(torch.tensor([1.0, 2.0, -3.0], dtype=torch.float64).expand(6, 3), ones, 0 * ones)
@@ -226,12 +227,12 @@ def in_waves(model: GridField, given: Rays, background: Tensor) -> tuple[Renderi
 
 
 def in_one_pass(
-    model: GridField, lattice: Lattice, given: Rays, jitter: Tensor, background: Tensor
+    model: GridField, lattice: Lattice, given: Rays, jitter: Tensor, background: Tensor, thin: float = 0
 ) -> tuple[int, Samples, Rendering]:
     """How many samples of a lattice stand in occupied cells, those that can be seen, and what rays see; no waves."""
     samples = reference.march(occupied(model.bits), lattice, given, jitter)
     density = model._density_pass(reference.sample_points(given, samples, model.settings.contracted))
-    front, seen = reference.visible_front(samples, density.sigma, HIDDEN_BEHIND)
+    front, seen = reference.visible_samples(samples, density.sigma, HIDDEN_BEHIND, thin, jitter)
     of_rays = grid_mlp.ray_hidden(model.weights, reference.spherical_harmonics(given.directions))
     colour = grid_mlp.colour_forward(model.weights, reference, front, density.geometry[seen], of_rays).colour
     behind = background.repeat(len(jitter), 1)
@@ -310,20 +311,47 @@ def test_training_keeps_the_samples_of_a_single_pass_whatever_the_waves(
     model.occupy(model.bits.random_(generator=torch.Generator().manual_seed(5)))
     jitter = torch.rand(40, generator=torch.Generator().manual_seed(6), dtype=torch.float64)
     background = torch.tensor([0.2, 0.4, 0.6], dtype=torch.float64)
-    marched, front, whole = in_one_pass(model, model.lattice, given, jitter, background)
-    done = model.forward(given, jitter, background.repeat(40, 1))
+    marched, front, whole = in_one_pass(model, model.lattice, given, jitter, background, THIN)
+    done = model.forward(given, jitter, jitter, background.repeat(40, 1))
     assert done.marched < marched if dense else done.marched == marched
     assert torch.equal(done.samples.starts, front.starts) and torch.equal(done.samples.ray, front.ray)
     torch.testing.assert_close(done.samples[2:], front[2:], rtol=1e-9, atol=1e-12)
     torch.testing.assert_close(tuple(done.rendering), tuple(whole), rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.parametrize("settings", [replace(SMALL, steps=500), replace(FOLDED, shortest_step=0.005, cone=0.01)])
+def test_thin_samples_that_stand_for_others_keep_picture_and_gradients(
+    settings: GridSettings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On average over the offsets, but for what second order in a thin sample's thickness makes of it."""
+    model, given, draws = field(settings), rays(40), 64
+    jitter = torch.rand(40, generator=torch.Generator().manual_seed(6), dtype=torch.float64)
+    background = torch.tensor([0.2, 0.4, 0.6], dtype=torch.float64).expand(40, 3)
+    grad = Rendering(torch.full_like(background, 1.0), torch.zeros(40).double(), torch.zeros(40).double())
+
+    def seen_and_gradients(offset: float) -> tuple[int, list[Tensor]]:
+        done = model.forward(given, jitter, torch.full_like(jitter, offset), background)
+        gradients = model.backward(done, grad, torch.zeros_like(done.weights))
+        chance = done.thickness / (done.density.sigma * done.samples.dt)
+        assert 1 / 17 < chance.min() <= chance.max() < 1.001
+        return len(done.points), [*done.rendering, *gradients.weights]
+
+    with monkeypatch.context() as patch:
+        patch.setattr("nerf.grid_field.THIN", 0)
+        every, wanted = seen_and_gradients(0.0)
+    counts, found = zip(*(seen_and_gradients((draw + 0.5) / draws) for draw in range(draws)), strict=True)
+    assert max(counts) < 0.7 * every
+    for each, right in zip(zip(*found, strict=True), wanted, strict=True):
+        mean = torch.stack(each).mean(0)
+        assert (mean - right).abs().max() < 0.02 * right.abs().max()
+
+
 def test_a_ray_ends_after_the_most_samples_it_may_have(monkeypatch: pytest.MonkeyPatch) -> None:
     in_short_waves(monkeypatch, 1, 3, 3)
     model, given = field(replace(SMALL, most_samples=7)), rays(40)
     middle = torch.full_like(given.near, 0.5)
-    done = model.forward(given, middle, torch.zeros(40, 3, dtype=torch.float64))
-    assert done.samples.starts.diff().max() == 7
+    done = model.forward(given, middle, middle, torch.zeros(40, 3, dtype=torch.float64))
+    assert done.marched == 7 * 40 and done.samples.starts.diff().max() <= 7
 
 
 def dense_field(settings: GridSettings) -> GridField:

@@ -97,7 +97,7 @@ def test_the_gradient_of_a_batch_is_the_sum_over_its_chunks() -> None:
         Rays(*(torch.cat(part) for part in zip(*(part.batch.rays for part in parts), strict=True))),
         *(torch.cat(part) for part in zip(*(part.batch[1:] for part in parts), strict=True)),
     )
-    done = run.model.forward(whole.rays, whole.jitter, whole.background)
+    done = run.model.forward(whole.rays, whole.jitter, whole.offset, whole.background)
     loss = run._loss(4 * rays, 0.25, done, whole)
     gradients = run.model.backward(done, loss.grad, loss.grad_weights)
     summed = [torch.stack(of_parts).sum(0) for of_parts in zip(*(part.weights for part in parts), strict=True)]
@@ -146,7 +146,7 @@ def test_a_non_finite_step_changes_nothing_and_shows_its_batch(
         run.step(1, 0.5)
     for name, tensor in run.state().items():
         torch.testing.assert_close(tensor, before[name], rtol=0, atol=0, equal_nan=True)
-    assert set(caught.value.batch) == {*Rays._fields, "target", "background", "jitter", "view", "distance"}
+    assert set(caught.value.batch) == {*Rays._fields, "target", "background", "jitter", "offset", "view", "distance"}
 
 
 def test_the_rate_scale_scales_the_update() -> None:
@@ -335,7 +335,7 @@ def test_the_depth_loss_fades_in_value_and_gradient() -> None:
     run = trainer(replace(TRAINER, depth_loss=0.1))
     run.bank = run.bank.with_distances(torch.tensor([78]), torch.tensor([3.0]))
     batch = run._batch(0, 0.0, 0, 64)
-    done = run.model.forward(batch.rays, batch.jitter, batch.background)
+    done = run.model.forward(batch.rays, batch.jitter, batch.offset, batch.background)
     early, late, over = (run._loss(64, share, done, batch) for share in (0.25, 0.75, 1.0))
     of_depth = [float(loss.value - over.value) for loss in (early, late)]
     assert of_depth[0] == pytest.approx(3 * of_depth[1]) and of_depth[1] > 0

@@ -40,6 +40,11 @@ class Stage(StageConfig):
     pace: float = 1.0
 
 
+class Training(Stage):
+    steps: int | None = None
+    preset: str | None = None
+
+
 class Fixed(StageConfig):
     photos: Path = Path()
     cameras: Path | None = None
@@ -134,7 +139,8 @@ def chain(machine: Machine) -> dict[str, SimpleNamespace]:
         if name in ("ingest", "normalise", "report"):
             return SimpleNamespace(Config=Fixed, run=run(name), **common)
         unkeyed = () if name == "train" else ("seconds",)
-        return SimpleNamespace(Config=Stage, run=run(name), plan=plan(name), UNKEYED=unkeyed, **common)
+        config = Training if name == "train" else Stage
+        return SimpleNamespace(Config=config, run=run(name), plan=plan(name), UNKEYED=unkeyed, **common)
 
     return {name: stage(name) for name in (*CHAIN[:-1], "tradeoff", "report")}
 
@@ -144,7 +150,7 @@ class Options(BaseModel):
     sfm: Stage = Stage()
     normalise: Fixed = Fixed()
     effects: Stage = Stage()
-    train: Stage = Stage()
+    train: Training = Training()
     evaluate: Stage = Stage()
     render: Stage = Stage()
     mesh: Stage = Stage()

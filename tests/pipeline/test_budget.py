@@ -8,8 +8,22 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.budget import LEAST_SECONDS, MOST_SECONDS, SHARES, Budget, allotted, least_total, training_seconds
-from tests.pipeline.made_up_machine import CHAIN, Go, Killed, Machine, runs_on, spent
+from pipeline.budget import (
+    BESIDE_PILOTS,
+    LEAST_SECONDS,
+    MOST_SECONDS,
+    SHARES,
+    Budget,
+    allotted,
+    for_pilots,
+    least_total,
+    training_seconds,
+)
+from pipeline.forecast import without_budget
+from pipeline.settings import Settings
+from stages.files import read_json
+from stages.train import Config as TrainConfig
+from tests.pipeline.made_up_machine import CHAIN, EXPECTED, Go, Killed, Machine, runs_on, spent
 
 OPEN = dict.fromkeys(SHARES)
 
@@ -62,10 +76,12 @@ def test_structure_from_motion_leaves_the_rest_its_least() -> None:
     assert allotted("sfm", 10.0, OPEN, 60.0) == 1.0
 
 
-def test_pilots_never_take_more_than_their_part() -> None:
-    assert allotted("effects", 500.0, OPEN, 600.0) == 90.0
-    assert allotted("effects", 80.0, OPEN, 600.0) == 20.0
+def test_pilots_and_statistics_never_take_more_than_their_part() -> None:
+    assert allotted("effects", 500.0, OPEN, 600.0) == 90.0 - BESIDE_PILOTS
+    assert allotted("effects", 500.0, OPEN, 600.0, 30.0) == 60.0 - BESIDE_PILOTS
+    assert allotted("effects", 80.0, OPEN, 600.0) == 20.0 - BESIDE_PILOTS
     assert allotted("effects", -5.0, OPEN, 600.0) == 0.0
+    assert allotted("effects", 500.0, OPEN, 600.0, 100.0) == 0.0
 
 
 @pytest.mark.parametrize("wall", [5.0, 20.0, 300.0])
@@ -129,6 +145,28 @@ def test_without_a_budget_again_its_choices_are_forgotten_but_not_lost(go: Go) -
     plain = go(machine, None, **given)
     assert plain.budget is None and plain.ran
     assert not go(machine, None, **given).ran
+
+
+def given_to_pilots(workspace: Path) -> list[float | None]:
+    """The seconds that stage effects was given, of every result that it left."""
+    return sorted(read_json(file)["config"]["seconds"] for file in workspace.glob("effects/*/result.json"))
+
+
+def test_without_a_budget_pilots_have_their_part_of_the_usual_run(go: Go, tmp_path: Path) -> None:
+    others = {name: {"seconds": 5.0} for name in ("evaluate", "render", "mesh")}
+    total = without_budget(Settings(train=TrainConfig(seconds=200.0)), EXPECTED, 0.0)
+    assert total is not None and total > 200
+    go(Machine(), None, train={"seconds": 200.0}, **others)
+    assert given_to_pilots(tmp_path / "w.nerf") == [pytest.approx(for_pilots(total, 0.0))]
+    assert 0 < for_pilots(total, 0.0) < 0.15 * total
+    ran = go(Machine(), None, train={"seconds": 200.0}, **others).ran
+    assert not ran, "the plan stands"
+
+
+def test_where_training_counts_steps_pilots_take_what_they_take(go: Go, tmp_path: Path) -> None:
+    others = {name: {"seconds": 5.0} for name in ("evaluate", "render", "mesh")}
+    go(Machine(), None, train={"steps": 5, "seconds": 20.0}, **others)
+    assert given_to_pilots(tmp_path / "w.nerf") == [None]
 
 
 @pytest.mark.parametrize("kills", [[30.0], [100.0], [100.0, 170.0], [225.0], [255.0, 270.0]])

@@ -11,10 +11,20 @@ import pytest
 from PIL import Image
 
 from pipeline import forecast
-from pipeline.budget import Budget
+from pipeline.budget import BESIDE_PILOTS, Budget
 from pipeline.chain import usual
-from pipeline.forecast import Photos, expected, photos_of, sfm_seconds
+from pipeline.forecast import (
+    Photos,
+    expected,
+    photos_of,
+    pilots_seconds,
+    reckoned_with,
+    sfm_seconds,
+    without_budget,
+)
 from pipeline.settings import Settings
+from stages.effects import Config as EffectsConfig
+from stages.train import Config as TrainConfig
 from stages.video import video_writer
 from tests.png_files import png
 
@@ -91,6 +101,29 @@ def test_a_run_without_a_budget_is_foretold_in_minutes(promise: Promise) -> None
     assert promise(train={"seconds": 900.0}) == ["done in about 24 min"]
     assert promise(train={"preset": "draft"}) == ["done in about 2 min"]
     assert promise(train={"steps": 500}) == []
+
+
+def test_pilots_have_a_limit_where_the_time_of_the_run_is_known() -> None:
+    times, reading = expected(Settings(), Photos(50, 2.0)), 2.0
+    total = without_budget(Settings(), times, reading)
+    assert total is not None
+    seconds = pilots_seconds(Settings(), times, reading)
+    assert seconds is not None and seconds + reading + BESIDE_PILOTS == pytest.approx(0.15 * total)
+    assert pilots_seconds(Settings(), {}, reading) is None, "nothing is known of the run"
+    assert pilots_seconds(Settings(train=TrainConfig(steps=500)), times, reading) is None
+    assert pilots_seconds(Settings(), times, 300.0) == 0.0, "reading alone takes longer"
+
+
+def test_pilots_are_planned_anew_with_another_training_and_nothing_else_is() -> None:
+    draft, counted = Settings(train=TrainConfig(preset="draft")), Settings(train=TrainConfig(steps=500))
+    assert reckoned_with("effects", Settings(), None) == {"training": 180.0}
+    assert reckoned_with("effects", draft, None) == {"training": 30.0}
+    assert reckoned_with("effects", counted, None) == {}
+    assert reckoned_with("render", draft, None) == {}
+    budget = Budget(Budget.new(60.0, "of"))
+    assert reckoned_with("effects", draft, budget) == {"budget": 60.0} == reckoned_with("render", draft, budget)
+    given = Settings(effects=EffectsConfig(seconds=7.0))
+    assert reckoned_with("effects", given, None) == {"seconds": 7.0} == reckoned_with("effects", given, budget)
 
 
 def test_what_is_there_already_is_not_waited_for(promise: Promise) -> None:

@@ -1,6 +1,7 @@
 import json
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,7 +10,9 @@ from nerf.evidence.evidence import Evidence
 from nerf.evidence.exposure import ExposureFit, fit_exposure
 from nerf.evidence.tracks import TrackColours
 from nerf.training import NonFinite
-from stages import effects, evidence, pilots
+from pipeline import manifests
+from pipeline.keys import stage_key
+from stages import effects, evidence, pilots, train
 from stages.effect_decisions import Decisions, read_decisions, write_decisions
 from stages.evidence import SceneEvidence
 from stages.files import write_json
@@ -37,18 +40,22 @@ def decided(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tu
     inputs["sfm"].mkdir()
     write_json(inputs["sfm"] / "registration.json", {"images": [], "camera_models": []})
     count = len(scene.of_split("train"))
+    now = [0.0]  # only pilots take time
+    monkeypatch.setattr(effects, "time", SimpleNamespace(perf_counter=lambda: now[0]))
 
     def run(
         config: effects.Config, gain: float = 1.0, pilot: Callable | None = None, **given: Evidence
     ) -> tuple[Decisions, dict, str, list[str]]:
         told = {name: found(value) for name, value in CLEAR.items()} | given
         exposure = replace_gain(fit_exposure(TrackColours.empty(count)), 0.5)
-        monkeypatch.setattr(evidence, "scene_evidence", lambda *_: SceneEvidence(told, exposure))
+        took = {name: 0.25 if name == "exposure" else 0.5 for name in told}
+        monkeypatch.setattr(evidence, "scene_evidence", lambda *_: SceneEvidence(told, exposure, took))
         tried: list[str] = []
 
         def run_pilot(_trial: object, off: Decisions, on: Decisions, *_rest: object) -> Pilot:
             tried.extend(name for name, value in vars(on).items() if value != getattr(off, name))
-            return Pilot(gain, 0.2, 0.05, 3.0)
+            now[0] += 3.0
+            return Pilot(gain, 0.2, 0.05)
 
         monkeypatch.setattr(pilots, "run_pilot", pilot or run_pilot)
         folder = tmp_path / f"effects{len(list(tmp_path.iterdir()))}"
@@ -68,6 +75,8 @@ def test_clear_evidence_decides_without_a_pilot(decided: Callable) -> None:
         "view dependence on (one of two) · background on (one of two) · 3 off · "
         "seen, not modelled: vignetting (one of two)"
     )
+    assert table["vignetting"]["seconds"] == 0.5
+    assert table["lens"]["seconds"] == 0.0, "stage sfm chose it"
     assert table["exposure"] == {
         "on": False,
         "modelled": True,
@@ -78,7 +87,7 @@ def test_clear_evidence_decides_without_a_pilot(decided: Callable) -> None:
         "pilot_gain_db": None,
         "pilot_noise_db": None,
         "cost": None,
-        "seconds": 0.0,
+        "seconds": 0.25,
         "reason": "one of two",
     }
     assert table["vignetting"]["on"] and not table["vignetting"]["modelled"]
@@ -90,7 +99,7 @@ def test_a_pilot_decides_in_the_grey_zone_by_its_gain_against_its_noise(
 ) -> None:
     decisions, table, _, tried = decided(effects.Config(), gain, exposure=found(None))
     assert tried == ["exposure"] and (decisions.exposure is not None) is on
-    assert (table["exposure"]["pilot_gain_db"], table["exposure"]["seconds"]) == (gain, 3.0)
+    assert (table["exposure"]["pilot_gain_db"], table["exposure"]["seconds"]) == (gain, 3.25)
     assert table["exposure"]["reason"] == f"one of two; a pilot gained {gain:+.2f} ± 0.20 dB"
 
 
@@ -152,6 +161,27 @@ def test_what_was_asked_for_is_done(decided: Callable, value: effects.Switch) ->
     assert not tried and (decisions.exposure is not None) is on
     assert (decisions.view_dependence, decisions.unbounded, decisions.pose_refinement) == (on, on, on)
     assert table["exposure"]["reason"] == "asked for; one of two"
+
+
+def training_key(effects_folder: Path) -> str:
+    """The key of a training that rests on these decisions."""
+    outputs = manifests.describe_outputs(effects_folder, ("decisions.json",))
+    return stage_key("train", train.VERSION, {}, {"effects": manifests.outputs_digest(outputs)})
+
+
+@pytest.mark.parametrize("said", [False, None])
+def test_what_evidence_or_a_pilot_switches_off_trains_as_what_was_asked_to_be_off(
+    decided: Callable, tmp_path: Path, said: bool | None
+) -> None:
+    names = ("exposure", "view_dependence", "background", "pose_refinement")
+    told = {name: found(said if name in ("exposure", "pose_refinement") else False) for name in names}
+    by_evidence, *_ = decided(effects.Config(pilots=3), -1.0, **told)
+    all_off = effects.Config.model_validate(dict.fromkeys(names, "off"))
+    by_request, *_ = decided(all_off, **dict.fromkeys(names, found(True)))
+    decided(effects.Config(exposure="on"), -1.0, **told)
+    off, asked, on = (training_key(tmp_path / f"effects{number}") for number in (1, 2, 3))
+    assert by_evidence == by_request == Decisions(view_dependence=False)
+    assert off == asked != on
 
 
 def test_decisions_are_read_as_they_were_written(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """What registration.json and the places of observations say, without a photo."""
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 
 from nerf.evidence.evidence import Evidence
 from nerf.scene import Camera, Scene, Similarity, View
-from stages.evidence import geometric_evidence, lens_evidence
+from stages.evidence import Clock, geometric_evidence, lens_evidence
 from stages.photos import Photo, write_photos
 from tests.stages.photo_scene import pose_towards_origin
 
@@ -46,7 +47,22 @@ def geometric(folder: Path, width: int, shift: float, readout: float = 0.0) -> d
     }
     camera = Camera("PINHOLE", width, height, (focal, focal, width / 2, height / 2))
     scene = Scene((camera,), tuple(views), Similarity(1.0, np.eye(3), np.zeros(3)), False, False, "around", True)
-    return geometric_evidence(folder, scene, points, {view.file: width / 2000 for view in views})
+    return geometric_evidence(folder, scene, points, {view.file: width / 2000 for view in views}, Clock())
+
+
+def test_what_serves_several_effects_is_shared_out_among_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [0.0]
+    monkeypatch.setattr("stages.evidence.time", SimpleNamespace(perf_counter=lambda: now[0]))
+
+    def works(seconds: float, said: Any = None) -> Any:
+        now[0] += seconds
+        return said
+
+    clock = Clock()
+    with clock.runs_for("a", "b"):
+        works(3.0)
+    assert clock.timed({"b": lambda: works(2.0, "of b"), "c": lambda: works(0.5, "of c")}) == {"b": "of b", "c": "of c"}
+    assert clock.seconds == {"a": 1.5, "b": 3.5, "c": 0.5}
 
 
 @pytest.mark.parametrize(("shift", "called_for"), [(0.0002, None), (0.001, True)])

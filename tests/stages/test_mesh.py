@@ -90,14 +90,15 @@ def run_mesh(tmp_path, progress, monkeypatch):
     for module, name, small in SMALL:
         monkeypatch.setattr(module, name, small)
 
-    def run(model, folder="mesh", scene=None, points=NO_POINTS, **settings):
+    def run(model, folder="mesh", scene=None, points=NO_POINTS, learnt=None, **settings):
         inputs = {name: tmp_path / name for name in mesh.NEEDS}
         for path in (*inputs.values(), tmp_path / folder):
             path.mkdir(exist_ok=True)
         write_json(inputs["normalise"] / "scene.json", (scene or scene_around()).to_json())
         write_tensors(inputs["normalise"] / "points.safetensors", {"xyz": points})
-        write_json(inputs["train"] / "field.json", {"rays": 1000})
-        monkeypatch.setattr(field_files, "load_field", lambda *_: (model, {"rays": 1000}))
+        info = {"rays": 1000} | (learnt or {})
+        write_json(inputs["train"] / "field.json", info)
+        monkeypatch.setattr(field_files, "load_field", lambda *_: (model, info))
         config = mesh.Config.model_validate({"resolution": 48} | settings)
         return mesh.run(config, inputs, tmp_path / folder, progress), tmp_path / folder
 
@@ -169,6 +170,16 @@ def test_the_facts_are_those_of_the_files(run_mesh):
     assert (facts["components_kept"], facts["components_dropped"], facts["faces_uncovered"]) == (1, 0, 0)
     assert (facts["resolution"], facts["frame"]) == (48, "sfm")
     assert 0 < facts["level"] < 300 and 0 < facts["level_miss_voxels"] < 0.5
+
+
+def test_colours_at_a_neutral_exposure_say_at_which(run_mesh):
+    result, _ = run_mesh(Solid(ball))
+    assert "exposure" not in result.facts and "expos" not in result.line
+    stop = math.log(2)
+    photos = {"a.jpg": [0.0, 0.1 * stop, 0.2 * stop], "b.jpg": [stop] * 3, "c.jpg": [2 * stop] * 3}
+    result, _ = run_mesh(Solid(ball), "exposed", learnt={"exposure": {"neutral": [stop] * 3, "photos": photos}})
+    assert result.facts["exposure"] == "neutral exposure, +0.90 EV over the least exposed photo"
+    assert result.line.endswith("watertight · neutral exposure, +0.90 EV over the least exposed photo")
 
 
 def test_glb_stands_upright_and_the_scene_frame_can_be_had(run_mesh):

@@ -20,6 +20,7 @@ from tests.stages.photo_scene import photographed
 from tests.synthetic_photos import Quiet
 
 PLAIN = Decisions(view_dependence=True, unbounded=False)
+REFINED = replace(PLAIN, pose_refinement=True)
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +51,30 @@ def test_a_wrong_exposure_loses(trial: PilotScene) -> None:
     names = [view.name for view in trial.scene.of_split("train")]
     wrong = replace(PLAIN, exposure={name: [3.0 * (i % 2)] * 3 for i, name in enumerate(names)})
     pilot = run_pilot(trial, wrong, PLAIN, 40, 0, Quiet())
-    assert 0.5 < pilot.gain_db < 30 and pilot.pays and pilot.seconds > 0
+    assert 0.5 < pilot.gain_db < 30 and pilot.pays
+
+
+@pytest.mark.parametrize(
+    ("off", "on", "fitted"),
+    [
+        (PLAIN, REFINED, True),
+        (replace(REFINED, view_dependence=False), REFINED, True),
+        (replace(PLAIN, view_dependence=False), PLAIN, False),
+    ],
+)
+def test_poses_of_photos_kept_back_are_fitted_wherever_an_arm_refines_poses(
+    trial: PilotScene, monkeypatch: pytest.MonkeyPatch, off: Decisions, on: Decisions, fitted: bool
+) -> None:
+    asked: list[bool] = []
+
+    def score(_field: object, _photo: object, poses: bool, _seed: int) -> float:
+        asked.append(poses)
+        return 20.0
+
+    monkeypatch.setattr(pilots, "_trained", lambda *_: None)
+    monkeypatch.setattr(pilots, "_score", score)
+    run_pilot(trial, off, on, 1, 0, Quiet())
+    assert asked == [fitted] * (2 * pilots.SEEDS * len(trial.kept))
 
 
 def test_too_few_photos_make_no_pilot(tmp_path: Path) -> None:
@@ -66,7 +90,7 @@ def test_too_few_photos_make_no_pilot(tmp_path: Path) -> None:
     ("gain", "noise", "pays"), [(1.0, 0.9, True), (1.0, 1.1, False), (0.05, 0.0, False), (-1.0, 0.1, False)]
 )
 def test_what_pays_is_more_than_noise_and_than_nothing(gain: float, noise: float, pays: bool) -> None:
-    assert Pilot(gain, noise, 0.0, 1.0).pays is pays
+    assert Pilot(gain, noise, 0.0).pays is pays
 
 
 def test_noise_is_that_of_seeds_or_of_photos_whichever_is_more() -> None:
@@ -80,7 +104,7 @@ def test_an_effect_that_gains_nothing_rarely_pays() -> None:
     paid = 0
     for _ in range(2000):
         gains = (draw.normal(size=(3, 1)) + 0.1 * draw.normal(size=(3, 3))).tolist()  # of three seeds, of three photos
-        paid += Pilot(sum(map(sum, gains)) / 9, pilots._noise(gains), 0.0, 1.0).pays
+        paid += Pilot(sum(map(sum, gains)) / 9, pilots._noise(gains), 0.0).pays
     assert 0.005 < paid / 2000 < 0.035
 
 

@@ -302,6 +302,9 @@ def test_speed_is_a_record_and_path_an_output(inputs, progress) -> None:
     assert (content["w"], content["h"], content["fps"]) == (40, 30, 1)
 
 
+NEUTRAL = "neutral exposure, +1.00 EV over the least exposed photo"
+
+
 def with_exposure(inputs, monkeypatch) -> None:
     """The ball as a field with an exposure of its own and one photo a stop brighter."""
     photos = {"bright.jpg": [np.log(2)] * 3, "dark.jpg": [-np.log(2)] * 3}
@@ -319,7 +322,7 @@ class GreyBall(Ball):
 
 @pytest.mark.parametrize(
     ("like", "level", "words"),
-    [(None, 0.5, "neutral exposure"), ("bright.jpg", 0.6858, "exposed like bright.jpg"),
+    [(None, 0.5, NEUTRAL), ("bright.jpg", 0.6858, "exposed like bright.jpg"),
      ("dark.jpg", 0.3608, "exposed like dark.jpg")],
 )  # fmt: skip
 def test_a_field_with_exposure_is_rendered_at_a_stated_one(
@@ -345,7 +348,7 @@ def test_a_field_without_exposure_says_nothing_of_it(inputs, progress) -> None:
     ("like", "level", "exposure", "note"),
     [
         ("0.jpg", 0.6858, "exposed as expected of 0.jpg", "0.jpg was not trained on: its exposure is what the photos"),
-        ("lark.jpg", 0.5, "neutral exposure", "no photo lark.jpg has a camera: neutral exposure; perhaps dark.jpg"),
+        ("lark.jpg", 0.5, NEUTRAL, f"no photo lark.jpg has a camera: {NEUTRAL}; perhaps dark.jpg"),
     ],
 )
 def test_a_photo_without_exposure_of_its_own_is_no_error_after_the_training(

@@ -158,6 +158,30 @@ def test_page_shows_both_scores_of_right_halves_with_what_they_mean(tmp_path: Pa
     assert "Right halves" not in html and '<td class="number">–</td><td class="number">–</td></tr>' in html
 
 
+def test_page_says_how_unseen_photos_were_exposed(tmp_path: Path, progress: Any):
+    inputs = make_workspace(tmp_path)
+    assert "was drawn exposed" not in _run(inputs, tmp_path / "out", progress)[0]
+    path = inputs["evaluate"] / "metrics.json"
+    metrics = json.loads(path.read_text("utf-8"))
+    write_json(path, metrics | {"exposure": "as the photos taken nearest by"})
+    html, _ = _run(inputs, tmp_path / "exposed", progress)
+    assert "each was drawn exposed as the photos taken nearest by, four training photos, without a look at" in html
+
+
+def test_page_shows_what_fitted_poses_add_apart_from_fitted_exposures(tmp_path: Path, progress: Any):
+    inputs = make_workspace(tmp_path)
+    html, _ = _run(inputs, tmp_path / "out", progress)
+    assert "pose fitted" not in html
+    path = inputs["evaluate"] / "metrics.json"
+    metrics = json.loads(path.read_text("utf-8"))
+    images = [image | {"psnr_posed_right": image["psnr_fitted_right"] + 2} for image in metrics["images"]]
+    write_json(path, metrics | {"psnr_posed_right": 27.8, "poses_fitted": True, "images": images})
+    html, _ = _run(inputs, tmp_path / "posed", progress)
+    assert "right half, exposure and pose fitted on the left (dB)</th>" in html
+    assert '<td class="number">23.50</td><td class="number">28.25</td><td class="number">30.25</td></tr>' in html
+    assert "25.8 dB with the exposure of each photo fitted" in html and "pose fitted there, too: 27.8 dB" in html
+
+
 def effect(on: bool, reason: str, **figures: Any) -> dict[str, Any]:
     """An entry of effects.json."""
     nothing = dict.fromkeys(("statistic", "threshold", "noise", "pilot_gain_db", "pilot_noise_db", "cost"))
@@ -169,9 +193,9 @@ EFFECTS = {
     "exposure": effect(
         True, "gains span 0.8 EV", statistic=0.8, threshold=0.05, noise=0.016, unit="EV", seconds=2.5, cost=0.04
     ),
-    "view_dependence": effect(True, "it pays", pilot_gain_db=0.94, pilot_noise_db=0.21),
+    "view_dependence": effect(True, "it pays", pilot_gain_db=0.94, pilot_noise_db=0.21, seconds=0.02),
     "blur": effect(True, "<i>smeared</i>", modelled=False, statistic=4.0, threshold=2.5, unit="px"),
-    "mirrors": effect(False, "none seen", modelled=False),
+    "tone": effect(False, "none seen", modelled=False),
 }
 
 
@@ -195,12 +219,12 @@ def test_page_shows_what_the_photos_call_for(tmp_path: Path, progress: Any):
         "noise",
         "gain in pilot",
         "costs when on",
-        "pilot took",
+        "deciding took",
         "why",
     ]
     assert rows[1:] == [
         ["exposure", "<b>on</b>", "0.8 EV", "0.05 EV", "0.016 EV", "–", "+4% time", "2.5 s", "gains span 0.8 EV"],
-        ["view dependence", "<b>on</b>", "–", "–", "–", "+0.9 ± 0.2 dB", "–", "–", "it pays"],
+        ["view dependence", "<b>on</b>", "–", "–", "–", "+0.9 ± 0.2 dB", "–", "&lt; 0.1 s", "it pays"],
         ["background", "off", "–", "–", "–", "–", "–", "–", "no pixel looks beyond the region"],
     ]
     flags = re.findall(r"<li>(.*?)</li>", section)

@@ -294,6 +294,7 @@ def test_all_evidence_of_a_scene(tmp_path: Path, progress: SilentProgress) -> No
     assert found.of["rolling_shutter"].words == "no video, or one that hardly moves: nothing known"
     for name, evidence in found.of.items():
         assert np.isfinite(evidence.statistic) and evidence.words, name
+    assert set(found.seconds) == set(found.of) and min(found.seconds.values()) > 0
 
 
 def test_no_evidence_without_points(tmp_path: Path, progress: SilentProgress) -> None:

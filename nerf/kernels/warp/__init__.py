@@ -12,7 +12,7 @@ from nerf.kernels.warp.compositing import (
     composite_backward,
     distortion,
     distortion_backward,
-    visible_front,
+    visible_samples,
 )
 from nerf.kernels.warp.directions import spherical_harmonics, spherical_harmonics_backward
 from nerf.kernels.warp.encoding import encode, encode_backward_points, encode_backward_table
@@ -47,6 +47,6 @@ __all__ = [
     "sample_points_backward",
     "spherical_harmonics",
     "spherical_harmonics_backward",
-    "visible_front",
+    "visible_samples",
     "why_not",
 ]

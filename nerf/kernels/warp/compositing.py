@@ -10,27 +10,29 @@ from jaxtyping import Float, Int32
 from torch import Tensor
 
 from nerf.kernels import Lattice, Samples
-from nerf.kernels.packed_compositing import OPAQUE
+from nerf.kernels.packed_compositing import LEAST_CHANCE, OPAQUE
 from nerf.kernels.warp.launch import launch
 from nerf.model import Rendering
 
 wp.set_module_options({"enable_backward": False})
 
 _OPAQUE = wp.constant(OPAQUE)
+_LEAST_CHANCE = wp.constant(LEAST_CHANCE)
 
 
-def visible_front(
-    samples: Samples, sigma: Float[Tensor, "samples"], threshold: float
+def visible_samples(
+    samples: Samples, sigma: Float[Tensor, "samples"], threshold: float, thin: float, offset: Float[Tensor, "rays"]
 ) -> tuple[Samples, Int32[Tensor, "kept"]]:
     """As in nerf.kernels.packed_compositing."""
     rays, device = len(samples.starts) - 1, sigma.device
     counts = torch.empty(rays, dtype=torch.int32, device=device)
-    launch(_count_visible, rays, samples.starts, samples.dt, sigma, threshold, counts)
+    launch(_count_visible, rays, samples.starts, samples.dt, sigma, threshold, thin, offset, counts)
     starts = torch.nn.functional.pad(counts.cumsum(0, dtype=torch.int32), (1, 0))
     total = int(starts[-1])
     index, ray = (torch.empty(total, dtype=torch.int32, device=device) for _ in range(2))
     t, dt = (torch.empty(total, device=device) for _ in range(2))
-    launch(_keep_front, rays, samples.starts, starts, samples.t, samples.dt, index, ray, t, dt)
+    packed = samples.t, samples.dt, sigma
+    launch(_keep_visible, rays, samples.starts, starts, *packed, thin, offset, index, ray, t, dt)
     return Samples(starts, ray, t, dt), index
 
 
@@ -103,38 +105,77 @@ def _stopped(tau: float):
     return 1.0 - wp.exp(-tau)
 
 
+@wp.func
+def _chance(tau: float, thin: float):
+    """Of a sample to be kept; 1 for what is no number."""
+    if tau < thin:
+        return wp.max(tau / thin, _LEAST_CHANCE)
+    return 1.0
+
+
 @wp.kernel
 def _count_visible(
-    starts: wp.array[int], lengths: wp.array[float], sigma: wp.array[float], threshold: float, counts: wp.array[int]
+    starts: wp.array[int],
+    lengths: wp.array[float],
+    sigma: wp.array[float],
+    threshold: float,
+    thin: float,
+    offsets: wp.array[float],
+    counts: wp.array[int],
 ):
     ray = wp.tid()
     tau = wp.float64(0.0)
+    chances = wp.float64(offsets[ray])
+    count = int(0)
     i = int(starts[ray])
     end = starts[ray + 1]
     while i < end and wp.exp(-float(tau)) >= threshold:
-        tau += wp.float64(thickness(sigma[i], lengths[i]))
+        more = thickness(sigma[i], lengths[i])
+        tau += wp.float64(more)
+        chance = _chance(more, thin)
+        if chance < 1.0:
+            before = wp.floor(chances)
+            chances += wp.float64(chance)
+            count += int(wp.floor(chances) - before)
+        else:
+            count += 1
         i += 1
-    counts[ray] = i - starts[ray]
+    counts[ray] = count
 
 
 @wp.kernel
-def _keep_front(
+def _keep_visible(
     starts: wp.array[int],
     kept_starts: wp.array[int],
     distances: wp.array[float],
     lengths: wp.array[float],
+    sigma: wp.array[float],
+    thin: float,
+    offsets: wp.array[float],
     index: wp.array[int],
     rays: wp.array[int],
     kept_distances: wp.array[float],
     kept_lengths: wp.array[float],
 ):
     ray = wp.tid()
-    behind = starts[ray] - kept_starts[ray]
-    for i in range(kept_starts[ray], kept_starts[ray + 1]):
-        index[i] = i + behind
-        rays[i] = ray
-        kept_distances[i] = distances[i + behind]
-        kept_lengths[i] = lengths[i + behind]
+    chances = wp.float64(offsets[ray])
+    place = int(kept_starts[ray])
+    end = kept_starts[ray + 1]
+    i = int(starts[ray])
+    while place < end:
+        chance = _chance(thickness(sigma[i], lengths[i]), thin)
+        kept = bool(True)
+        if chance < 1.0:
+            before = wp.floor(chances)
+            chances += wp.float64(chance)
+            kept = wp.floor(chances) > before
+        if kept:
+            index[place] = i
+            rays[place] = ray
+            kept_distances[place] = distances[i]
+            kept_lengths[place] = lengths[i] / chance
+            place += 1
+        i += 1
 
 
 @wp.kernel

@@ -8,7 +8,8 @@ from torch import Tensor
 
 from nerf import compositing
 from nerf.kernels import Lattice, Samples
-from nerf.kernels.reference import composite, composite_backward, distortion, distortion_backward, visible_front
+from nerf.kernels.packed_compositing import LEAST_CHANCE
+from nerf.kernels.reference import composite, composite_backward, distortion, distortion_backward, visible_samples
 from nerf.model import Rendering
 
 COUNTS = (3, 0, 7, 1, 0, 12)
@@ -121,10 +122,10 @@ def test_an_opaque_sample_hides_all_behind_it_and_has_no_gradient() -> None:
     assert grad_sigma[0] != 0
 
 
-def test_the_visible_front_ends_where_too_little_light_is_left() -> None:
+def test_the_visible_samples_end_where_too_little_light_is_left() -> None:
     samples = packed()
     sigma, _ = field(samples, 60.0)
-    kept, index = visible_front(samples, sigma, 0.1)
+    kept, index = visible_samples(samples, sigma, 0.1, 0.0, torch.zeros(6))
     wanted = []
     for ray in range(len(COUNTS)):
         light = 1.0
@@ -135,7 +136,7 @@ def test_the_visible_front_ends_where_too_little_light_is_left() -> None:
     assert index.tolist() == wanted and 5 < len(wanted) < 20
     assert torch.equal(kept.t, samples.t[index]) and torch.equal(kept.dt, samples.dt[index])
     assert torch.equal(kept.starts.diff().long(), torch.bincount(kept.ray, minlength=6))
-    everything, _ = visible_front(samples, sigma, 0.0)
+    everything, _ = visible_samples(samples, sigma, 0.0, 0.0, torch.zeros(6))
     assert all(torch.equal(a, b) for a, b in zip(everything, samples, strict=True))
 
 
@@ -143,11 +144,52 @@ def test_leaving_out_the_hidden_changes_a_rendering_by_less_than_the_threshold()
     samples = packed((12,) * 20)
     sigma, colour = field(samples, 200.0)
     background, far = surroundings(20)
-    kept, index = visible_front(samples, sigma, 1e-3)
+    kept, index = visible_samples(samples, sigma, 1e-3, 0.0, torch.zeros(20))
     full, _ = composite(samples, sigma, colour, background, far)
     front, _ = composite(kept, sigma[index], colour[index], background, far)
     assert len(index) < 0.8 * len(sigma)
     assert 0 < (full.colour - front.colour).abs().max() < 1e-3
+
+
+def test_thin_samples_are_kept_where_their_chances_add_up_to_whole_numbers() -> None:
+    samples, thin = packed((12, 0, 40)), 0.1
+    sigma, _ = field(samples)
+    kept, index = visible_samples(samples, sigma, 0.1, thin, torch.tensor([0.3, 0.0, 0.9]))
+    wanted, lengths = [], []
+    for ray, offset in enumerate((0.3, 0.0, 0.9)):
+        light, chances = 1.0, offset
+        for i in range(int(samples.starts[ray]), int(samples.starts[ray + 1])):
+            tau = sigma[i].item() * samples.dt[i].item()
+            chance = min(max(tau / thin, LEAST_CHANCE), 1.0)
+            before, chances = math.floor(chances), chances + (chance if chance < 1 else 0)
+            if light >= 0.1 and (chance == 1 or math.floor(chances) > before):
+                wanted.append(i)
+                lengths.append(samples.dt[i].item() / chance)
+            light *= math.exp(-tau)
+    assert index.tolist() == wanted and 5 < len(wanted) < 40
+    torch.testing.assert_close(kept.dt.tolist(), lengths)
+    assert torch.equal(kept.t, samples.t[index]) and torch.equal(kept.ray, samples.ray[index])
+    assert torch.equal(kept.starts.diff().long(), torch.bincount(kept.ray, minlength=3))
+
+
+@pytest.mark.parametrize("thin", [0.01, 0.1, 1.0])
+def test_over_all_offsets_each_length_is_what_it_was(thin: float) -> None:
+    """So sums of tau f are kept in expectation, and thick samples and what is no number are always there."""
+    samples, draws = packed((200,)), 2000
+    sigma, _ = field(samples, 2.0)
+    sigma[::5], sigma[7::50] = 0, 50
+    sigma[150:] = math.nan  # of what follows nothing is visible
+    total, least = torch.zeros_like(sigma), len(sigma)
+    for offset in (torch.arange(draws) + 0.5) / draws:
+        kept, index = visible_samples(samples, sigma, 0.0, thin, offset[None])
+        total[index] += kept.dt / draws
+        least = min(least, len(index))
+    tau = sigma * samples.dt
+    assert torch.equal((total / samples.dt > 0), torch.arange(200) <= 150)
+    torch.testing.assert_close(total[:151], samples.dt[:151], rtol=1.01 / draws / LEAST_CHANCE, atol=0)
+    thick = (tau >= thin)[:150]
+    assert (tau[:150] >= thin).sum() < least < 151
+    assert (total[:150][thick] / samples.dt[:150][thick] - 1).abs().max() < 1e-12
 
 
 @pytest.mark.parametrize("lattice", [EVEN, GROWING])
@@ -184,5 +226,5 @@ def test_no_samples_show_the_background() -> None:
     empty = torch.zeros(0, dtype=torch.float64)
     rendering, _ = composite(samples, empty, empty.view(0, 3), background, far)
     assert torch.equal(rendering.colour, background) and torch.equal(rendering.depth, far)
-    assert visible_front(samples, empty, 0.5)[0].starts.tolist() == [0, 0, 0]
+    assert visible_samples(samples, empty, 0.5, 0.1, far)[0].starts.tolist() == [0, 0, 0]
     assert distortion(samples, empty, EVEN).tolist() == [0, 0]

@@ -257,7 +257,7 @@ def test_no_rays_and_no_samples_are_fine_even_at_first(device: str, rays: int) -
         features = agree("encode", layout, table, none)
         agree("encode_backward_points", layout, table, none, features)
         warp.encode_backward_table(layout, 0, none, features, table)
-        agree("visible_front", samples, empty, 0.5)
+        agree("visible_samples", samples, empty, 0.5, 0.1, few.near)
         agree("spherical_harmonics", few.directions)
         agree("pack_waves", [samples, samples])
         depth, near = torch.zeros(rays, dtype=torch.float64, device=device), few.near.clone()

@@ -1,5 +1,7 @@
 """Warp's compositing and losses along rays are the reference's, in value and gradient."""
 
+import math
+
 import pytest
 import torch
 from hypothesis import given, settings
@@ -91,12 +93,30 @@ def test_an_opaque_sample_has_exactly_no_gradient_and_hides_the_rest(device: str
 
 @pytest.mark.parametrize("threshold", [0.0, 1e-3, 0.1, 1.0])
 @pytest.mark.parametrize("scale", [1.0, 100.0, 1e30])
-def test_the_visible_front(device: str, scale: float, threshold: float) -> None:
-    samples = packed(device, COUNTS)
+def test_the_visible_samples(device: str, scale: float, threshold: float) -> None:
+    samples, offset = packed(device, COUNTS), uniform(device, 32, len(COUNTS))
     sigma = scale * uniform(device, 24, sum(COUNTS))
-    front, _ = agree("visible_front", samples, sigma, threshold, tolerance=1e-30)
+    front, _ = agree("visible_samples", samples, sigma, threshold, 0.0, offset, tolerance=1e-30)
     kept = len(front.t) / sum(COUNTS)
     assert kept == 1 if threshold == 0 else 0 < kept < (0.3 if scale > 1 else 1.01)
+
+
+@pytest.mark.parametrize("thin", [1e-3, 1e-2, 1.0])
+@pytest.mark.parametrize("scale", [0.0, 0.1, 3.0])
+def test_the_visible_samples_without_most_of_the_thin_ones(device: str, scale: float, thin: float) -> None:
+    samples, offset = packed(device, COUNTS), uniform(device, 32, len(COUNTS))
+    sigma = scale * uniform(device, 24, sum(COUNTS)) ** 3
+    every, _ = warp.visible_samples(samples, sigma, 1e-3, 0.0, offset)
+    some, _ = agree("visible_samples", samples, sigma, 1e-3, thin, offset, tolerance=1e-6)
+    assert len(some.t) < len(every.t)
+    if not scale:
+        assert len(some.t) == pytest.approx(len(every.t) / 16, rel=0.2)
+
+
+def test_a_density_that_is_no_number_is_visible(device: str) -> None:
+    samples, sigma = packed(device, [4]), torch.tensor([1e-6, math.nan, 1.0, 1.0], device=device)
+    for backend in (reference, warp):
+        assert backend.visible_samples(samples, sigma, 1e-3, 1e-2, uniform(device, 32, 1))[1].tolist() == [1]
 
 
 @pytest.mark.parametrize("lattice", LATTICES.values(), ids=LATTICES)

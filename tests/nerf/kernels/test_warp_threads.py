@@ -115,7 +115,7 @@ def everything(seed: int) -> list[Tensor]:
     grad_points = warp.encode_backward_points(layout, table, points, features)
     grad_rays = warp.sample_points_backward(rays, samples, lattice.contracted, grad_points)
     sigma, colour = features[:, 0].exp(), features[:, 1:4].sigmoid()
-    front, kept = warp.visible_front(samples, sigma, 0.1)
+    front, kept = warp.visible_samples(samples, sigma, 0.1, 0.5, torch.rand(count, generator=random))
     background = torch.rand(count, 3, generator=random)
     rendering, weights = warp.composite(samples, sigma, colour, background, rays.far)
     ones = Rendering(*(torch.ones_like(part) for part in rendering))

@@ -79,7 +79,7 @@ def test_the_light_decides_as_it_does_for_visible_samples(backend: Backend) -> N
     backend.end_wave(BOUNDED, samples, sigma, 0.8, jitters(200), torch.full((200,), 9.0), depth, near)
     more = wave_of((5,) * 200)
     longer = more._replace(dt=with_fifth(samples.dt))
-    front, _ = backend.visible_front(longer, with_fifth(sigma), 0.8)
+    front, _ = backend.visible_samples(longer, with_fifth(sigma), 0.8, 0.0, jitters(200))
     goes_on = front.starts.diff() == 5
     assert 20 < goes_on.sum() < 180 and torch.equal(near < 9, goes_on)
 
