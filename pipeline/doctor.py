@@ -7,18 +7,19 @@ from pathlib import Path
 from pipeline import machine
 from pipeline.bench import bench_lines
 from pipeline.selftest import numerical_matrix, self_test
+from stages.backend import why_not_warp
 from stages.device import processors
 
 PACKAGES = (
-    "torch", "pycolmap", "kornia", "opencv-contrib-python-headless", "trimesh", "numpy", "scikit-image", "pillow",
-    "safetensors", "imageio-ffmpeg",
+    "torch", "pycolmap", "warp-lang", "kornia", "opencv-contrib-python-headless", "trimesh", "numpy", "scikit-image",
+    "pillow", "safetensors", "imageio-ffmpeg",
 )  # fmt: skip
 LOW_DISK_GB = 2.0
 
 
 def examine(folder: Path, selftest: bool, bench: bool) -> int:
-    """Print versions, device, threads, free disk and the self-test, the long one and the machine's rates if asked for.
-    0 if all is well, 1 otherwise."""
+    """Print versions, device, threads, free disk, the grid field's kernels and the self-test, the long one and the
+    machine's rates if asked for. 0 if all is well, 1 otherwise."""
     import torch
 
     print(f"python {platform.python_version()} on {platform.platform()}")
@@ -31,6 +32,7 @@ def examine(folder: Path, selftest: bool, bench: bool) -> int:
     if free_gb < LOW_DISK_GB:
         problems.append(f"only {free_gb:.1f} GB free: a run needs about {LOW_DISK_GB:.0f} GB")
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    print(_grid_field_line(device.type))
     problems += [f"self-test: {name}: {error}" for name, error in self_test(device) if error]
     if selftest:
         problems += numerical_matrix(device.type)
@@ -38,3 +40,9 @@ def examine(folder: Path, selftest: bool, bench: bool) -> int:
         print("\n".join(bench_lines(device)))
     print("\n".join(f"problem: {problem}" for problem in problems) or "all well")
     return 1 if problems else 0
+
+
+def _grid_field_line(device: str) -> str:
+    """Which kernels stage train would choose for the grid field, and why not Warp's."""
+    why = why_not_warp(device)
+    return f"grid field: torch, because {why}" if why else "grid field: warp"

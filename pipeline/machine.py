@@ -50,7 +50,7 @@ def facts() -> dict[str, Any]:
         "gpu": gpu_name(),
         "memory_gb": round(psutil.virtual_memory().total / 2**30, 1),
         "python": platform.python_version(),
-        **versions(("torch", "pycolmap")),
+        **versions(("torch", "pycolmap", "warp-lang")),
     }
 
 

@@ -1,4 +1,4 @@
-"""Which kernels compute the grid field: Warp's where they run, else torch's."""
+"""Which kernels compute the grid field: Warp's where they run, else torch's; these stay with what they trained."""
 
 import contextlib
 import os
@@ -16,10 +16,27 @@ BackendName = Literal["warp", "torch"]
 
 def chosen_backend(device: str, progress: Progress | None = None) -> BackendName:
     """ "warp" if its kernels run on ``device`` ("cpu" or "cuda"), else "torch"; then the reason is said."""
-    why = _why_not_warp(device)
+    why = why_not_warp(device)
     if why and progress:
         progress.note(f"the grid field is computed by torch alone, several times slower: {why}")
     return "torch" if why else "warp"
+
+
+def backend_of_field(trained_with: BackendName, device: str, progress: Progress | None = None) -> BackendName:
+    """For a field that is trained: torch stays, for who asked for it may have fled from Warp, and is said; one that
+    Warp trained is free to take :func:`chosen_backend`."""
+    if trained_with == "warp":
+        return chosen_backend(device, progress)
+    if progress:
+        progress.note("the grid field is computed by torch alone, as it was trained: several times slower than by Warp")
+    return "torch"
+
+
+def backend_name(backend: "Backend") -> BackendName:
+    """What :func:`load_backend` calls it."""
+    from nerf.kernels import reference
+
+    return "torch" if backend is reference else "warp"
 
 
 def load_backend(name: BackendName, device: str, progress: Progress | None = None) -> "Backend":
@@ -32,7 +49,7 @@ def load_backend(name: BackendName, device: str, progress: Progress | None = Non
         from nerf.kernels import reference
 
         return reference
-    if why := _why_not_warp(device):
+    if why := why_not_warp(device):
         raise StageError("cannot use the Warp kernels", why, "Use --train.backend torch.")
     from nerf.kernels import warp as kernels
 
@@ -42,7 +59,8 @@ def load_backend(name: BackendName, device: str, progress: Progress | None = Non
     return kernels
 
 
-def _why_not_warp(device: str) -> str | None:
+def why_not_warp(device: str) -> str | None:
+    """What keeps Warp's kernels from running on ``device`` ("cpu" or "cuda"), None if nothing does."""
     try:
         with _without_native_stderr():
             from nerf.kernels import warp as kernels

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from stages.amounts import duration
+from stages.contract import Progress
 from stages.files import read_json
 
 if TYPE_CHECKING:
@@ -62,16 +63,17 @@ class Painter:
             side = min(math.ceil(side * math.sqrt(2)), largest)
 
 
-def load_painter(train: Path, background: tuple[float, ...] | None = None) -> Painter:
+def load_painter(train: Path, background: tuple[float, ...] | None = None, progress: Progress | None = None) -> Painter:
     """The field that stage train left in ``train``, over ``background``, which a field with a sky does not show; None:
-    what it was trained to stand before. One that models exposure is shown at its neutral one."""
+    what it was trained to stand before. One that models exposure is shown at its neutral one. ``progress`` is told
+    where the field is computed by torch's kernels alone."""
     import torch
 
     from stages.device import compute_device
     from stages.field_files import load_field
 
     device = compute_device()
-    model, info = load_field(train, device)
+    model, info = load_field(train, device, progress)
     return Painter(model, torch.tensor(info["background"] if background is None else background, device=device))
 
 

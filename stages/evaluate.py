@@ -137,7 +137,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     """Render the test photos, compare, and write metrics.json, renders/ and errors/."""
     scene = read_scene(inputs["normalise"])
     config = plan(config, inputs, progress)
-    examiner = _examiner(config, scene, inputs, folder)
+    examiner = _examiner(config, scene, inputs, folder, progress)
     test = scene.of_split("test")
     chosen = spread(len(test), min(config.photos or 0, len(test)))
     few = f"{len(chosen)} of {len(test)} test photos are scored, evenly spread"
@@ -254,14 +254,14 @@ class Examiner:
         return self.painter.at_gain(self.gains[view.name]) if self.gains else self.painter
 
 
-def _examiner(config: Config, scene: "Scene", inputs: Inputs, folder: Path) -> Examiner:
+def _examiner(config: Config, scene: "Scene", inputs: Inputs, folder: Path, progress: Progress) -> Examiner:
     """Load the field; data with alpha goes over the background asked for, the rest over what the field expects."""
     from stages.drawing import load_painter
     from stages.effect_decisions import expected_gains
 
     assert config.downscale is not None
     chosen = config.background if scene.has_alpha else None
-    painter = load_painter(inputs["train"], BACKGROUNDS[chosen] if chosen else None)
+    painter = load_painter(inputs["train"], BACKGROUNDS[chosen] if chosen else None, progress)
     field = read_json(inputs["train"] / "field.json")
     gains = expected_gains(field, scene, scene.of_split("test"))
     return Examiner(scene, inputs["ingest"], folder, painter, gains, fits_poses(config, field), config.downscale)

@@ -4,9 +4,10 @@ import json
 import math
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
-from stages.contract import StageError
+from stages.backend import BackendName, backend_name, backend_of_field, load_backend
+from stages.contract import Progress, StageError
 from stages.files import first_fault, read_json, write_json
 
 if TYPE_CHECKING:
@@ -16,7 +17,8 @@ if TYPE_CHECKING:
 
 
 def save_field(folder: Path, model: "RadianceModel", info: dict[str, Any]) -> None:
-    """Write a field; ``info`` says what it was trained on: background, downscale, steps, rays.
+    """Write a field; ``info`` says what it was trained on: background, downscale, steps, rays. What computes a grid
+    field is written, too.
 
     Raises:
         TypeError: for a kind of field that has no file format.
@@ -28,16 +30,21 @@ def save_field(folder: Path, model: "RadianceModel", info: dict[str, Any]) -> No
 
     if not isinstance(model, PaperNerf | GridField):
         raise TypeError(f"no file format for a {type(model).__name__}")
-    kind = "grid" if isinstance(model, GridField) else "paper"
+    kind = {"kind": "paper"}
+    if isinstance(model, GridField):
+        kind = {"kind": "grid", "backend": backend_name(model.backend)}
     weights = {name: tensor.detach().cpu().contiguous() for name, tensor in model.state_dict().items()}
     (folder / "field.safetensors").write_bytes(save(weights))
-    write_json(folder / "field.json", {"kind": kind, "settings": asdict(model.settings), **info})
+    write_json(folder / "field.json", {**kind, "settings": asdict(model.settings), **info})
 
 
-def load_field(folder: Path, device: str = "cpu") -> "tuple[RadianceModel, dict[str, Any]]":
+def load_field(
+    folder: Path, device: str = "cpu", progress: Progress | None = None
+) -> "tuple[RadianceModel, dict[str, Any]]":
     """The field in ``folder``, ready to render, and the content of its field.json.
 
-    One that models exposure comes at its neutral one, wrapped in an ExposedModel.
+    One that models exposure comes at its neutral one, wrapped in an ExposedModel. ``progress`` is told why a grid field
+    is computed by torch's kernels: they trained it, or Warp's do not run on ``device``.
 
     Raises:
         StageError: if the files are missing or damaged, or another version of the program wrote them.
@@ -49,7 +56,7 @@ def load_field(folder: Path, device: str = "cpu") -> "tuple[RadianceModel, dict[
     info = read_json(folder / "field.json")
     try:
         weights = folder / "field.safetensors"
-        model = _untrained(info["kind"], info["settings"], weights.stat().st_size, device)
+        model = _untrained(info, weights.stat().st_size, device, progress)
         model.load_state_dict(load_file(weights))
         neutral = _neutral(info)
     except ValidationError as error:
@@ -88,15 +95,15 @@ def _exposed(model: "RadianceModel", log_gain: list[float], device: str) -> "Rad
     return ExposedModel(model, torch.tensor(log_gain, dtype=torch.float32, device=device))
 
 
-def _untrained(kind: str, settings: dict[str, Any], stored: int, device: str) -> "PaperNerf | GridField":
-    """The field of these settings; ``stored`` is the size of its weights in bytes, which it must not exceed. Raises
-    ValueError, before anything is allocated."""
+def _untrained(info: dict[str, Any], stored: int, device: str, progress: Progress | None) -> "PaperNerf | GridField":
+    """The field that ``info`` describes; ``stored`` is the size of its weights in bytes, which it must not exceed.
+    Raises ValueError, before anything is allocated."""
     from pydantic import TypeAdapter
 
     from nerf.grid_field import GridField, GridSettings
     from nerf.paper import PaperNerf, PaperSettings
-    from stages.backend import chosen_backend, load_backend
 
+    kind, settings = info["kind"], info["settings"]
     if kind not in ("grid", "paper"):
         raise ValueError(f"a field of kind {kind!r} is unknown to this version")
     text = json.dumps(settings)
@@ -104,11 +111,20 @@ def _untrained(kind: str, settings: dict[str, Any], stored: int, device: str) ->
         grid = GridSettings(**settings)  # which refuses unknown names; their types are checked next
         TypeAdapter(GridSettings).validate_json(text, strict=True)
         _check_size(grid.layout.rows * grid.features, stored)
-        return GridField(grid, 0, load_backend(chosen_backend(device), device))
+        return GridField(grid, 0, load_backend(backend_of_field(_trained_with(info), device, progress), device))
     paper = PaperSettings(**settings)
     TypeAdapter(PaperSettings).validate_json(text, strict=True)
     _check_size(paper.depth * paper.width**2, stored)
     return PaperNerf(paper, seed=0)
+
+
+def _trained_with(info: dict[str, Any]) -> BackendName:
+    """Raises ValueError where that is not said, or no backend."""
+    if "backend" not in info:
+        raise ValueError("an earlier version of this program wrote it, which did not say with which kernels it trained")
+    if info["backend"] not in get_args(BackendName):
+        raise ValueError(f"kernels called {info['backend']!r} are unknown to this version")
+    return info["backend"]
 
 
 def _check_size(numbers: int, stored: int) -> None:

@@ -27,6 +27,16 @@ def available_bytes() -> int:
     return max(0, min(rooms))
 
 
+def available_on(device: str) -> int:
+    """Memory that tensors on ``device`` ("cpu" or "cuda") may still take; what torch holds in reserve on a GPU is
+    free, too."""
+    if device == "cpu":
+        return available_bytes()
+    import torch
+
+    return torch.cuda.mem_get_info()[0] + torch.cuda.memory_reserved() - torch.cuda.memory_allocated()
+
+
 def check_memory(needed: float, what: str, why: str, hint: str) -> None:
     """Raises StageError where ``what`` needs more than there is; ``why`` says what takes that much."""
     free = available_bytes()

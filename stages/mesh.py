@@ -108,7 +108,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
 
     scene = read_scene(inputs["normalise"])
     device = compute_device()
-    model, info = load_field(inputs["train"], device)
+    model, info = load_field(inputs["train"], device, progress)
     config = plan(config, inputs, progress)
     points = _sparse_points(inputs["normalise"])
     result = reconstruct(config, model, scene, inputs["ingest"], points, device, progress)

@@ -154,7 +154,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     config = plan(config, inputs, progress)
     assert config.width is not None and config.fps is not None
     scene = read_scene(inputs["normalise"])
-    painter = load_painter(inputs["train"])
+    painter = load_painter(inputs["train"], progress=progress)
     gain, exposure = _exposure(config.like, inputs["train"], scene, progress)
     painter = painter if gain is None else painter.at_gain(gain)
     path = _path(config, scene).resized(config.width)

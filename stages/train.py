@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from stages.training_loop import TrainingRun
 
 NEEDS = ("ingest", "normalise", "effects")
-VERSION = 17
+VERSION = 18
 RESUMES = True
 LINKS = ("curve.json",)
 UNKEYED = ("checkpoint_seconds", "tensorboard")
@@ -97,6 +97,11 @@ class Config(StageConfig):
     )
     background: Literal["white", "black", "random"] | None = Field(
         default=None, description="behind photos with transparency; none: random for grid, white for paper"
+    )
+    matmul: Literal["highest", "medium"] | None = Field(
+        default=None,
+        description="torch's precision of matrix products; none: highest, of a run in seconds medium where that is "
+        "measured to be faster and about as exact",
     )
     # `--more` gives these.
     after: Annotated[str | None, Suppress] = Field(default=None, description="go on from this finished training,")
@@ -207,14 +212,22 @@ def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
         backend = config.backend or chosen_backend(compute_device(), progress)
         load_backend(backend, compute_device(), progress)
         config = config.model_copy(update={"backend": backend})
-    if config.downscale is None or (config.kind == "grid" and None in (config.levels, config.log2_rows, config.finest)):
-        from stages.training_size import chosen_downscale, grid_size, rays_in_budget
+    if config.matmul is None:
+        from stages.training_precision import chosen_precision
+
+        config = config.model_copy(update={"matmul": chosen_precision(config, progress)})
+    grids_open = config.kind == "grid" and None in (config.levels, config.log2_rows, config.finest)
+    if config.downscale is None or grids_open:
+        from stages.training_size import chosen_downscale, grid_size, rays_in_budget, reason_words
 
         progress.update("trying how fast this machine trains")
         rays = rays_in_budget(config, scene, decisions)
-        config = _filled(config, {"downscale": chosen_downscale(scene, rays, _used_shares(inputs["ingest"], scene))})
-        if config.kind == "grid":
-            config = _filled(config, grid_size(config, scene, rays))
+        progress.note(reason_words(config, rays))
+        if config.downscale is None:
+            downscale = chosen_downscale(scene, rays, _used_shares(inputs["ingest"], scene), progress)
+            config = config.model_copy(update={"downscale": downscale})
+        if grids_open:
+            config = _filled(config, grid_size(config, scene, rays, progress))
     return config
 
 
@@ -257,17 +270,21 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     Raises:
         StageError: if training diverges or the field does not learn, every remedy of ours having failed.
     """
+    from nerf.product_precision import products_at
     from stages.curve import write_curve
     from stages.effect_decisions import learnt_of_photos
     from stages.field_files import save_field
     from stages.training_parts import write_parts
+    from stages.training_precision import say_if_inexact
     from stages.training_setup import field_background, prepare
 
     config, scene = plan(config, inputs, progress), read_scene(inputs["normalise"])
     if config.target_psnr is not None:
         scene = _with_photos_aside(config, scene, progress)
     training = prepare(config, scene, inputs, folder, progress)
-    training.train()
+    say_if_inexact(config, progress)
+    with products_at(config.matmul):
+        training.train()
     info = {"downscale": config.downscale, "steps": training.state.step, "rays": training.state.rays}
     info["background"] = list(field_background(config, scene))
     info |= learnt_of_photos(training.trainer, scene.of_split("train"))
@@ -276,7 +293,8 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     write_curve(folder, config.kind, config.downscale, training.plan.is_whole, training.state.curve)
     progress.update("measuring what this machine can do")
     device = training.probes.train.colours.device
-    parts = write_parts(folder, training.state.timings, training.trainer.model, device)
+    with products_at(config.matmul):
+        parts = write_parts(folder, training.state.timings, training.trainer.model, device)
     return _result(config, training, folder, parts, progress)
 
 
@@ -294,6 +312,7 @@ def _with_photos_aside(config: Config, scene: "Scene", progress: Progress) -> "S
 def _result(config: Config, training: "TrainingRun", folder: Path, parts: list[str], progress: Progress) -> StageResult:
     from stages.checkpoints import checkpoint_files
     from stages.curve import coming_doubling, doubling_words, target_words
+    from stages.training_precision import precision_facts
 
     state, last = training.state, training.state.curve[-1]
     doubling = doubling_words(state.curve, coming_doubling(config.kind, training.plan.is_whole, state.curve))
@@ -316,6 +335,7 @@ def _result(config: Config, training: "TrainingRun", folder: Path, parts: list[s
         "restarts": state.restarts,
         "rollbacks": state.rollbacks,
         "symptom": state.symptom,
+        **precision_facts(config),
     }
     final = checkpoint_files(training.checkpoints, state.step)
     records = ("curve.json", "log.jsonl", "plan.json", *parts, *final, *left_behind, *board)

@@ -56,8 +56,8 @@ def continued(config: "Config", inputs: Inputs) -> "Config":
     given = {name: value for name, value in config.model_dump(mode="json").items() if value is not None}
     free = {*FREE, "target_psnr"} if settings["target_psnr"] is not None else FREE
     for name, value in given.items():
-        if name not in free and value != settings[name]:
-            why = f"{name} is {value} now and was {settings[name]}"
+        if name not in free and value != settings.get(name):
+            why = f"{name} is {value} now and was {settings.get(name)}"
             raise StageError("training cannot go on with other settings", why, ANEW)
     own = {name: getattr(config, name) for name in (*OWN, "checkpoint_seconds", "tensorboard")}
     target = {"target_psnr": config.target_psnr or settings["target_psnr"]}

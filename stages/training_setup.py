@@ -152,10 +152,21 @@ def _say_sizes(config: "Config", budget: "TrainingBudget", bank: "RayBank", prog
     much = f"{budget.seconds:g} s" if budget.steps is None else f"{budget.steps:,} steps"
     another = "" if budget.after is None else "another "
     photos = f"{len(bank.near)} photos at 1/{config.downscale:g} of their size"
-    sizes = (
-        f"{config.levels} grids to {config.finest}³" if config.field == "grid" else f"{config.depth} × {config.width}"
-    )
+    grid = config.field == "grid"
+    grids = f"{config.levels} grids of up to 2^{config.log2_rows} rows, to {config.finest}³"
+    sizes = grids if grid else f"{config.depth} × {config.width}"
     progress.note(f"{config.field} field ({sizes}), {another}{much} · {photos}, {short_count(len(bank.pixels))} pixels")
+    if grid:
+        progress.note(_step_words(config))
+
+
+def _step_words(config: "Config") -> str:
+    """Of the grid field: how a step is divided and what computes it, and where samples stand along a ray."""
+    lattice = grid_settings(config, sky=False).lattice
+    growing = f", from {lattice.linear_until:g} on every {lattice.cone:.1%} of the distance" if lattice.cone else ""
+    parts = f"{config.chunks} part{'' if config.chunks == 1 else 's'}"
+    step = f"{config.batch_samples:,} colours a step in {parts}, by {config.backend}"
+    return f"{step} · samples every {lattice.step:.2g} scene units{growing}"
 
 
 def has_sky(config: "Config", scene: "Scene") -> bool:

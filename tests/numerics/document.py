@@ -36,6 +36,8 @@ ELSEWHERE = {
     "nerf/probe.py": "mean colour, PSNR, patches of pixels: tests/nerf/test_probe.py",
     "nerf/training.py": "sums of chunks; refuses what is not finite before the update: tests/nerf/test_training.py",
     "nerf/grid_training.py": "likewise: tests/nerf/test_grid_training.py",
+    "nerf/product_precision.py": "lets products be off by 1e-4 beside float64, where that is faster: "
+    "tests/nerf/test_product_precision.py",
     "nerf/schedule.py": "rates within the range they are given, in float64: tests/nerf/test_schedule.py",
     "nerf/learning_curve.py": "interpolation in log time, in float64: tests/nerf/test_learning_curve.py",
     "nerf/reconstruction.py": "float64, relative to the cameras' middle: tests/nerf/test_reconstruction.py",

@@ -1,10 +1,12 @@
 """``pipeline doctor --selftest``: the table is whole, and what is off is said and ends in exit code 1."""
 
+from importlib.metadata import version
+
 import pytest
 
 from nerf.numerics import matrix
 from nerf.numerics.matrix import CASES
-from pipeline import cli, doctor, selftest
+from pipeline import cli, doctor, machine, selftest
 
 
 def test_every_formula_has_a_line_for_each_backend(capsys: pytest.CaptureFixture[str]) -> None:
@@ -18,7 +20,7 @@ def test_every_formula_has_a_line_for_each_backend(capsys: pytest.CaptureFixture
 
 
 def test_without_warp_torch_alone_is_measured(monkeypatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr("stages.backend._why_not_warp", lambda device: "it is not there")
+    monkeypatch.setattr("stages.backend.why_not_warp", lambda device: "it is not there")
     monkeypatch.setattr(matrix, "CASES", [case for case in CASES if case.kernels][:1])
     assert selftest.numerical_matrix("cpu") == []
     assert " torch " in (out := capsys.readouterr().out) and " warp " not in out
@@ -41,3 +43,19 @@ def test_the_matrix_is_measured_only_if_asked_for(monkeypatch, capsys: pytest.Ca
     assert cli.run_command(["doctor"]) == 0 and "matrix" not in capsys.readouterr().out
     assert cli.run_command(["doctor", "--selftest"]) == 1
     assert "problem: the matrix was measured" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "why, line", [(None, "grid field: warp"), ("it is old", "grid field: torch, because it is old")]
+)
+def test_the_kernels_of_the_grid_field_are_those_that_train_would_choose(why, line, monkeypatch, capsys) -> None:
+    monkeypatch.setattr(doctor, "self_test", lambda device: [])
+    monkeypatch.setattr(doctor, "why_not_warp", lambda device: why)
+    assert cli.run_command(["doctor"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert line in lines
+    assert f"  {'warp-lang':<32} {version('warp-lang')}" in lines
+
+
+def test_manifests_know_the_version_of_warp() -> None:
+    assert machine.facts()["warp-lang"] == version("warp-lang")

@@ -1,15 +1,17 @@
+import contextlib
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import pytest
 
 import nerf.kernels
 from nerf.kernels import reference, warp
-from stages import train
+from stages import evaluate, mesh, render, train
 from stages.backend import chosen_backend, load_backend
-from stages.contract import StageError
+from stages.contract import StageConfig, StageError
 from stages.field_files import load_field
 from stages.train import Config
 from tests.stages.photo_scene import photographed
@@ -18,6 +20,7 @@ ROOT = Path(__file__).parents[2]
 TINY: dict[str, Any] = {"levels": 2, "log2_rows": 10, "finest": 32, "batch_samples": 1024, "downscale": 1.0}
 OLD_DRIVER = "Warp 1.19.0 finds no CUDA driver that is new enough for it"
 NOTE = "the grid field is computed by torch alone, several times slower: "
+AS_TRAINED = "the grid field is computed by torch alone, as it was trained: several times slower than by Warp"
 
 
 @pytest.fixture
@@ -110,3 +113,22 @@ def test_both_backends_train_the_same_field_from_photos(tmp_path: Path, progress
     flat = 11.0  # dB, of the best single colour
     assert flat + 2 < heldout["torch"] < 60
     assert heldout["warp"] == pytest.approx(heldout["torch"], abs=0.1)
+
+
+LATER: dict[ModuleType, StageConfig] = {
+    evaluate: evaluate.Config(photos=1),
+    render: render.Config(frames=2, width=16),
+    mesh: mesh.Config(resolution=16),
+}
+
+
+@pytest.mark.parametrize("stage", LATER, ids=lambda stage: stage.__name__)
+def test_what_torch_trained_stays_with_torch_in_every_stage(stage: ModuleType, tmp_path: Path, progress) -> None:
+    inputs, _ = photographed(tmp_path, channels=4)
+    for name in ("train", "later"):
+        (tmp_path / name).mkdir()
+    train.run(Config(**TINY, backend="torch", steps=2), inputs, tmp_path / "train", progress)
+    assert AS_TRAINED not in progress.notes
+    with contextlib.suppress(StageError):  # two steps may leave no surface
+        stage.run(LATER[stage], inputs | {"train": tmp_path / "train"}, tmp_path / "later", progress)
+    assert progress.notes.count(AS_TRAINED) == 1

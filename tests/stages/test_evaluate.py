@@ -100,7 +100,7 @@ def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Make:
         write_json(inputs["train"] / "curve.json", {"points": [{"seconds": 2.0}]})
         monkeypatch.setattr("stages.drawing.Painter.rays_per_second", lambda *_: speed)
         monkeypatch.setattr("stages.device.compute_device", lambda: "cpu")
-        monkeypatch.setattr("stages.field_files.load_field", lambda _folder, _device: (field or SkyField(), info))
+        monkeypatch.setattr("stages.field_files.load_field", lambda *_: (field or SkyField(), info))
         return inputs
 
     return build

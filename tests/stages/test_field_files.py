@@ -8,7 +8,7 @@ from nerf.effects.exposure import ExposedModel
 from nerf.grid_field import GridField, GridSettings
 from nerf.paper import PaperNerf, PaperSettings
 from nerf.rays import Rays
-from stages.backend import chosen_backend, load_backend
+from stages.backend import BackendName, backend_name, chosen_backend, load_backend
 from stages.contract import StageError
 from stages.field_files import load_field, save_field
 from stages.files import read_json, write_json
@@ -19,6 +19,7 @@ KERNELS = load_backend(chosen_backend("cpu"), "cpu")
 OUTDOORS = GridField(replace(GRID, sky=True), 5, KERNELS)
 OUTDOORS.sky.normal_(generator=torch.Generator().manual_seed(6))
 KINDS = {"paper": PaperNerf(SMALL, seed=5), "grid": GridField(GRID, 5, KERNELS), "sky": OUTDOORS}
+BY_TORCH = "the grid field is computed by torch alone, as it was trained"
 INFO = {"background": [1.0, 1.0, 1.0], "downscale": 2.5, "steps": 7, "rays": 700}
 
 
@@ -114,3 +115,38 @@ def test_damaged_exposure_is_refused_in_words(harm: dict[str, object], tmp_path:
     save_field(tmp_path, KINDS["paper"], INFO | {"exposure": EXPOSURE | harm})
     with pytest.raises(StageError, match=r"cannot read the trained field: "):
         load_field(tmp_path)
+
+
+@pytest.mark.parametrize("trained_with", ["warp", "torch"])
+def test_a_field_keeps_to_torch_if_that_trained_it(trained_with: BackendName, tmp_path: Path, progress) -> None:
+    save_field(tmp_path, GridField(GRID, 5, load_backend(trained_with, "cpu")), INFO)
+    loaded, info = load_field(tmp_path, "cpu", progress)
+    assert isinstance(loaded, GridField)
+    assert backend_name(loaded.backend) == info["backend"] == trained_with
+    assert [note.split(":")[0] for note in progress.notes] == [BY_TORCH] * (trained_with == "torch")
+
+
+def test_a_field_of_warp_is_read_without_it_and_the_reason_said(tmp_path: Path, progress, monkeypatch) -> None:
+    save_field(tmp_path, GridField(GRID, 5, load_backend("warp", "cpu")), INFO)
+    monkeypatch.setattr("stages.backend.why_not_warp", lambda device: "it is not there")
+    loaded, _ = load_field(tmp_path, "cpu", progress)
+    assert isinstance(loaded, GridField)
+    assert backend_name(loaded.backend) == "torch"
+    assert progress.notes == ["the grid field is computed by torch alone, several times slower: it is not there"]
+
+
+@pytest.mark.parametrize(
+    "backend, why",
+    [
+        (None, "an earlier version of this program wrote it, which did not say with which kernels it trained"),
+        ("numba", "kernels called 'numba' are unknown to this version"),
+    ],
+)
+def test_a_field_of_unknown_kernels_is_refused_in_words(backend: str | None, why: str, tmp_path: Path) -> None:
+    save_field(tmp_path, KINDS["grid"], INFO)
+    info = read_json(tmp_path / "field.json")
+    del info["backend"]
+    write_json(tmp_path / "field.json", info if backend is None else info | {"backend": backend})
+    with pytest.raises(StageError) as refused:
+        load_field(tmp_path)
+    assert (refused.value.why, refused.value.hint) == (why, "Run stage train again.")

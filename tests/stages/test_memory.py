@@ -9,7 +9,7 @@ import pytest
 from stages import memory
 from stages.colmap.matching import BYTES_PER_SEARCHED_PIXEL, Search, feature_bytes
 from stages.contract import StageError
-from stages.memory import at_once, available_bytes, check_memory, rooms_in_groups
+from stages.memory import at_once, available_bytes, available_on, check_memory, rooms_in_groups
 from stages.photos import Photo
 
 
@@ -80,3 +80,10 @@ def test_features_are_searched_on_reduced_or_doubled_photos(size: tuple[int, int
         feature_bytes([Photo("a", "images/a.png", *size, 0, None, None, False, 1.0)], Search(side, 100))
         == BYTES_PER_SEARCHED_PIXEL * searched
     )
+
+
+def test_what_is_free_where_tensors_go(free, monkeypatch: pytest.MonkeyPatch):
+    free(77)
+    for name, value in {"mem_get_info": (100, 1000), "memory_reserved": 30, "memory_allocated": 10}.items():
+        monkeypatch.setattr(f"torch.cuda.{name}", lambda value=value: value)
+    assert (available_on("cpu"), available_on("cuda")) == (77, 120)

@@ -68,7 +68,7 @@ def inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Path]:
     write_json(folders["train"] / "field.json", info)
     write_json(folders["train"] / "curve.json", {"points": [{"step": 9, "seconds": 10.0}]})
     monkeypatch.setattr("stages.drawing.Painter.rays_per_second", lambda self, sample, largest, seconds: 30_000)
-    monkeypatch.setattr("stages.field_files.load_field", lambda folder, device="cpu": (Ball(), info))
+    monkeypatch.setattr("stages.field_files.load_field", lambda *_: (Ball(), info))
     return folders
 
 
@@ -312,7 +312,7 @@ def with_exposure(inputs, monkeypatch) -> None:
     info = read_json(inputs["train"] / "field.json") | {"exposure": {"neutral": [0.0] * 3, "photos": photos}}
     write_json(inputs["train"] / "field.json", info)
     shown = ExposedModel(GreyBall(), torch.zeros(3))
-    monkeypatch.setattr("stages.field_files.load_field", lambda folder, device="cpu": (shown, info))
+    monkeypatch.setattr("stages.field_files.load_field", lambda *_: (shown, info))
 
 
 class GreyBall(Ball):

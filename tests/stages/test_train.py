@@ -68,7 +68,7 @@ def test_photos_become_a_field_that_beats_a_flat_colour(tmp_path: Path, progress
 
 def test_the_grid_field_trains_from_photos_too(tmp_path: Path, progress) -> None:
     inputs, _ = photographed(tmp_path, channels=4)
-    result = trained(tmp_path / "train", inputs, progress, field="grid", steps=120)
+    result = trained(tmp_path / "train", inputs, progress, field="grid", chunks=2, steps=120)
     flat = 11.0  # dB, of the best single colour
     assert flat + 2 < result.facts["heldout_psnr"] < 60
     _, info = load_field(tmp_path / "train")
@@ -77,7 +77,19 @@ def test_the_grid_field_trains_from_photos_too(tmp_path: Path, progress) -> None
     assert 120 * 8 < info["rays"] < 120 * 8192
     colours = result.facts["samples_per_second"] / result.facts["rays_per_second"]
     assert 0.5 < colours < 100, "of a ray"
-    assert progress.notes[0] == "grid field (2 grids to 32³), 120 steps · 6 photos at 1/1 of their size, 2.3 k pixels"
+    assert progress.notes[:2] == [
+        "grid field (2 grids of up to 2^10 rows, to 32³), 120 steps · 6 photos at 1/1 of their size, 2.3 k pixels",
+        "1,024 colours a step in 2 parts, by warp · samples every 0.057 scene units",
+    ]
+
+
+def test_that_samples_stand_farther_apart_with_distance_is_said(tmp_path: Path, progress) -> None:
+    inputs, _ = photographed(tmp_path, bounded=False)
+    trained(tmp_path / "train", inputs, progress, field="grid", chunks=1, backend="torch", steps=1)
+    assert progress.notes[1] == (
+        "1,024 colours a step in 1 part, by torch · samples every 0.042 scene units, "
+        "from 0.25 on every 16.7% of the distance"
+    )
 
 
 @pytest.mark.parametrize("field", TRAINERS)
@@ -190,19 +202,20 @@ def test_options_of_the_paper_field_ask_for_it() -> None:
 
 def test_every_option_is_shared_or_of_one_field() -> None:
     shared = {"field", "preset", "steps", "seconds", "learning_rate", "seed", "downscale", "background", "contracted"}
-    shared |= {"view_dependence", "checkpoint_seconds", "tensorboard", "target_psnr"}
+    shared |= {"view_dependence", "checkpoint_seconds", "tensorboard", "target_psnr", "matmul"}
     shared |= {"after", "more_steps", "more_seconds"}
     assert sorted([*shared, *train.GRID_ONLY, *train.PAPER_ONLY]) == sorted(Config.model_fields)
 
 
 @pytest.mark.parametrize("bounded", [True, False])
 def test_plan_answers_everything_for_the_grid_field(
-    bounded: bool, tmp_path: Path, progress: Progress, monkeypatch: pytest.MonkeyPatch
+    bounded: bool, tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("stages.training_size.TIMED_SECONDS", 0.01)
     inputs, _ = photographed(tmp_path, bounded=bounded)
     planned = train.plan(Config(), inputs, progress)
     assert (planned.field, planned.seconds, planned.contracted) == ("grid", 180, not bounded)
+    assert any(note.startswith("180 s on this machine draw about ") for note in progress.notes)
     assert (planned.downscale, planned.background) == (1.0, "random")
     assert planned.levels and planned.log2_rows and planned.finest and planned.batch_samples
     assert planned.learning_rate == train.GRID_RATES["bounded" if bounded else "contracted"]

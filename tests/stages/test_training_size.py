@@ -11,7 +11,7 @@ from nerf.scene import Camera, Scene
 from stages.effect_decisions import Decisions
 from stages.train import LARGE_STEP_RATE, LARGEST_STEP, PART_SAMPLES, Config, with_habits
 from stages.training_data import scaled_size
-from stages.training_setup import grid_settings, has_sky
+from stages.training_setup import field_bytes, grid_settings, has_sky
 from stages.training_size import (
     LEAST_LONG_SIDE,
     MOST_PHOTOS,
@@ -20,6 +20,7 @@ from stages.training_size import (
     grid_size,
     rays_in_budget,
     rays_per_second,
+    reason_words,
 )
 from tests.stages.photo_scene import photographed
 
@@ -143,14 +144,16 @@ def test_grids_grow_with_rays_and_pixels(scene: Scene, rays: float, factor: floa
 def test_a_gpu_has_larger_fields_and_takes_larger_steps(
     scene: Scene, folded: bool, most: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    config, large = Config(contracted=folded, downscale=1.0, chunks=2), of_size(scene, 4000, 3000)
-    on_cpu = grid_size(config, large, 1e9), with_habits(config)
+    config = Config(field="grid", contracted=folded, view_dependence=True, downscale=1.0, chunks=2)
+    large = of_size(scene, 4000, 3000)
+    on_cpu = grid_size(with_habits(config), large, 1e9), with_habits(config)
     monkeypatch.setattr("stages.training_size.compute_device", lambda: "cuda")
     monkeypatch.setattr("stages.device.compute_device", lambda: "cuda")
-    on_gpu = grid_size(config, large, 1e9), with_habits(config)
+    monkeypatch.setattr("stages.training_size.available_on", {"cuda": 80e9}.get)
+    on_gpu = grid_size(with_habits(config), large, 1e9), with_habits(config)
     assert on_gpu[0] == {"levels": 8, "log2_rows": 20, "finest": most}
     assert on_gpu[0]["finest"] > on_cpu[0]["finest"] and on_gpu[0]["log2_rows"] > on_cpu[0]["log2_rows"]
-    assert grid_size(config, large, 1e6) == {
+    assert grid_size(with_habits(config), large, 1e6) == {
         "levels": 5 if folded else 4,
         "log2_rows": 17,
         "finest": 512 // (2 - folded),
@@ -196,3 +199,57 @@ def test_ray_samples_multiply_the_samples_along_a_ray(contracted: bool, factor: 
 def test_a_sky_is_where_space_has_no_end_and_no_alpha_tells(scene: Scene, contracted: bool, has_alpha: bool) -> None:
     config = GRID.model_copy(update={"contracted": contracted})
     assert has_sky(config, replace(scene, has_alpha=has_alpha)) is (contracted and not has_alpha)
+
+
+def test_the_reason_for_sizes_is_the_budget() -> None:
+    reason = "100 steps draw about 1.0 M rays and compute 8.0 M colours: sizes left open are chosen for that"
+    assert reason_words(GRID, 1e6) == reason
+    assert reason_words(PAPER, 950) == "10 s on this machine draw about 950 rays: sizes left open are chosen for that"
+
+
+FOLDED = GRID.model_copy(update={"contracted": True, "downscale": 1.0})
+LARGEST, MIDDLE, SMALLEST = (
+    {"levels": levels, "log2_rows": log2_rows, "finest": finest}
+    for levels, log2_rows, finest in ((6, 18, 1024), (5, 18, 512), (5, 17, 512))
+)
+NEEDED = field_bytes(FOLDED.model_copy(update=LARGEST), 1)
+
+
+@pytest.mark.parametrize(
+    "free, own, chosen",
+    [
+        (2 * NEEDED, {}, LARGEST),
+        (2 * NEEDED - 1, {}, MIDDLE),
+        (0.0, {}, SMALLEST),
+        (2 * NEEDED, {"log2_rows": 20}, SMALLEST),
+    ],
+)
+def test_grids_take_half_of_the_free_memory_at_most(
+    scene: Scene, free: float, own: dict[str, int], chosen: dict[str, int], monkeypatch: pytest.MonkeyPatch, progress
+) -> None:
+    monkeypatch.setattr("stages.training_size.available_on", {"cpu": free}.get)
+    config = FOLDED.model_copy(update=own)
+    assert grid_size(config, of_size(scene, 4000, 3000), 1e9, progress) == chosen
+    said = "5 grids of up to 2^{log2_rows} rows: 6 grids of up to 2^18 rows, which the budget could fill, take "
+    assert [note.startswith(said.format(**chosen)) for note in progress.notes] == [True] * (chosen is not LARGEST)
+
+
+@pytest.mark.parametrize(
+    "device, free, has_alpha, downscale",
+    [
+        ("cuda", 72e6, False, 1.0),
+        ("cuda", 71e6, False, 1.1),
+        ("cuda", 18e6, False, 2.0),
+        ("cuda", 18e6, True, 2.4),
+        ("cpu", 18e6, False, 1.0),
+    ],
+)
+def test_the_pixels_take_half_of_a_gpus_free_memory_at_most(
+    scene: Scene, device: str, free: float, has_alpha: bool, downscale: float, monkeypatch: pytest.MonkeyPatch, progress
+) -> None:
+    monkeypatch.setattr("stages.training_size.compute_device", lambda: device)
+    monkeypatch.setattr("stages.training_size.available_on", {"cuda": free}.get)
+    large = replace(of_size(scene, 2000, 1000), has_alpha=has_alpha)  # six photos, 36 MB without alpha
+    assert chosen_downscale(large, 12e6, progress=progress) == downscale
+    said = f"photos at 1/{downscale:g} of their size: at 1/1, which the budget could make use of, their pixels take "
+    assert [note.startswith(said) for note in progress.notes] == [True] * (downscale > 1)
