@@ -1,5 +1,7 @@
 """Warp's compositing and losses along rays are the reference's, in value and gradient."""
 
+import math
+
 import pytest
 import torch
 from hypothesis import given, settings
@@ -116,3 +118,22 @@ def test_depth_loss_and_its_gradient(device: str, lattice: Lattice) -> None:
     loss = agree("depth_loss", samples, weights, opacity, far, distance, lattice)
     assert (loss[::3] == 0).all() and (loss[1::3] > 0).all()
     agree("depth_loss_backward", samples, far, distance, lattice, normal(device, 31, rays))
+@pytest.mark.parametrize("step", [1e-5, 0.002, 0.02, 0.5, 4.0])
+def test_losses_of_light_that_ends_close_together_far_out(device: str, step: float) -> None:
+    """Half of it in each of two neighbours at about 768, or at a sample before a point: their difference is the loss,
+    and that of their logarithms, each rounded, is off by 1e-4 of it."""
+    counts = [2, 40, 128]
+    samples = packed(device, counts, 768 * step * (0.5 + uniform(device, 32, sum(counts))))
+    samples = samples._replace(t=768 + samples.t)
+    pairs, alone = torch.zeros(2, sum(counts), device=device)
+    pairs[[0, 1, 20, 21, -2, -1]], alone[samples.starts[:-1].long()] = 0.5, 1.0
+    for weights in (pairs, alone, uniform(device, 25, sum(counts))):
+        agree("distortion", samples, weights, GROWING, tolerance=1e-6)
+        agree("distortion_backward", samples, weights, GROWING, normal(device, 26, 3), tolerance=1e-6)
+    full, far = torch.ones(3, device=device), torch.full((3,), 1e6, device=device)
+    behind = samples.t[samples.starts[:-1].long() + 1]
+    agree("depth_loss", samples, alone, full, far, behind, GROWING, tolerance=1e-6)
+    nearest = agree("depth_loss_backward", samples, far, behind, GROWING, full)[0][0]
+    assert float(nearest) == pytest.approx(math.log(float(behind[0]) / float(samples.t[0])), rel=1e-6)
+
+
