@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from stages.tradeoff_trial import Exam
 
 NEEDS = ("ingest", "normalise", "effects")
-VERSION = 5
+VERSION = 6
 RESUMES = True
 LINKS = ("tradeoff.svg", "tradeoff.png", "tradeoff.md", "tradeoff.json", "ablation.png")
 

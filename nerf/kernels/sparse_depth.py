@@ -26,11 +26,11 @@ def depth_loss(
     and d the ``distance`` of its point; 0 for rays whose d is 0, of which none is known.
 
     Positions m are measured as in the distortion loss (nerf/kernels/marching.py: lattice_measure), so that where steps
-    grow a tenth too far costs the same at any distance.
+    grow a tenth too far costs the same at any distance. In float64: logarithms of nearly the same distance cancel.
     """
     of_samples, of_rest = _apart(samples, far, distance, lattice)
     rest = (1 - opacity) * of_rest
-    return rest.index_add(0, samples.ray, weights * of_samples)
+    return rest.index_add(0, samples.ray, weights * of_samples).to(weights.dtype)
 
 
 def depth_loss_backward(
@@ -42,14 +42,15 @@ def depth_loss_backward(
 ) -> tuple[Float[Tensor, "samples"], Float[Tensor, "rays"]]:
     """Gradients of the weights and of the opacities."""
     of_samples, of_rest = _apart(samples, far, distance, lattice)
-    return grad.index_select(0, samples.ray) * of_samples, -grad * of_rest
+    of_weights = grad.index_select(0, samples.ray) * of_samples
+    return of_weights.to(grad.dtype), (-grad * of_rest).to(grad.dtype)
 
 
 def _apart(
     samples: Samples, far: Float[Tensor, "rays"], distance: Float[Tensor, "rays"], lattice: Lattice
 ) -> tuple[Float[Tensor, "samples"], Float[Tensor, "rays"]]:
-    """How far samples and the ends of rays are from their point; 0 on rays without one."""
-    known, point = distance > 0, lattice_measure(lattice, distance)
-    of_samples = (lattice_measure(lattice, samples.t) - point.index_select(0, samples.ray)).abs()
-    of_rest = (lattice_measure(lattice, far) - point).abs()
+    """How far samples and the ends of rays are from their point, float64; 0 on rays without one."""
+    known, point = distance > 0, lattice_measure(lattice, distance.double())
+    of_samples = (lattice_measure(lattice, samples.t.double()) - point.index_select(0, samples.ray)).abs()
+    of_rest = (lattice_measure(lattice, far.double()) - point).abs()
     return of_samples * known.index_select(0, samples.ray), of_rest * known

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from nerf import grid_mlp, sky
 from nerf.grid_field import THIN, GridField, GridSettings
-from nerf.kernels import GridLayout, Lattice, Samples, reference, warp
+from nerf.kernels import Backend, GridLayout, Lattice, Samples, reference, warp
 from nerf.kernels.cache import occupied
 from nerf.model import RadianceModel, Rendering
 from nerf.rays import Rays
@@ -16,6 +16,8 @@ from nerf.waves import HIDDEN_BEHIND
 SMALL = GridSettings(levels=2, log2_rows=9, coarsest=3, finest=9, steps=24, cache_cells=8)
 FOLDED = replace(SMALL, contracted=True, shortest_step=0.1, cone=0.2)
 OUTDOORS = replace(FOLDED, sky=True)
+DIFFUSE = replace(SMALL, view_dependence=False)
+BACKENDS = pytest.mark.parametrize("backend", [reference, warp], ids=["reference", "warp"])
 
 
 def field(settings: GridSettings = SMALL, seed: int = 1) -> GridField:
@@ -49,7 +51,7 @@ def seen_by_autograd(model: GridField, given: Rays, jitter: Tensor, background: 
     weights = model.weights
     geometry = torch.relu(features @ weights.density_hidden) @ weights.density_out.T
     sigma = geometry[:, 0].clamp(max=15).exp()
-    harmonics = reference.spherical_harmonics(given.directions)[samples.ray]
+    harmonics = model.of_directions(given.directions)[samples.ray]
     hidden = torch.relu(torch.cat([geometry, harmonics], -1) @ weights.colour_hidden)
     rendering, _ = reference.composite(
         samples, sigma, torch.sigmoid(hidden @ weights.colour_out.T), background, given.far
@@ -76,7 +78,7 @@ def encoded_by_autograd(layout: GridLayout, table: Tensor, points: Tensor) -> Te
     return torch.cat(features, -1)
 
 
-@pytest.mark.parametrize("settings", [SMALL, FOLDED, OUTDOORS])
+@pytest.mark.parametrize("settings", [SMALL, FOLDED, OUTDOORS, DIFFUSE])
 def test_all_gradients_are_those_of_autograd(settings: GridSettings, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("nerf.grid_field.THIN", 0)
     model, given = field(settings), rays()
@@ -189,6 +191,39 @@ def test_what_nothing_stops_ends_in_the_sky_whatever_the_background() -> None:
 def test_a_new_sky_is_grey_all_around() -> None:
     model = GridField(OUTDOORS, 1, reference)
     assert (sky.sky_colour(reference, model.sky, torch.nn.functional.normalize(torch.randn(99, 3))) == 0.5).all()
+
+
+@BACKENDS
+def test_a_new_sky_is_a_grey_background_bit_for_bit(backend: Backend) -> None:
+    with_sky, without = GridField(OUTDOORS, 1, backend), GridField(FOLDED, 1, backend)
+    assert_same_field(with_sky, without)
+    assert with_sky.state_dict().keys() - without.state_dict().keys() == {"sky"}
+
+
+@BACKENDS
+def test_view_dependence_without_weight_is_a_diffuse_field_bit_for_bit(backend: Backend) -> None:
+    dependent, diffuse = GridField(SMALL, 1, backend), GridField(DIFFUSE, 1, backend)
+    dependent.colour_hidden[grid_mlp.GEOMETRY :] = 0
+    weights = dependent.state_dict()
+    diffuse.load_state_dict(weights | {"colour_hidden": weights["colour_hidden"][: grid_mlp.GEOMETRY]})
+    assert_same_field(dependent, diffuse)
+
+
+def assert_same_field(one: GridField, other: GridField) -> None:
+    """What two fields let rays see before grey, drawn and in training, and what both have of gradients."""
+    given, grey = rays(40).each(lambda part: part.float()), torch.full((3,), 0.5)
+    for model in (one, other):
+        model.table.mul_(2e4)
+    for found, wanted in zip(one.render(given, grey), other.render(given, grey), strict=True):
+        assert torch.equal(found, wanted) and found.std() > 0.001
+    jitter = torch.rand(40, generator=torch.Generator().manual_seed(3))
+    done = [model.forward(given, jitter, jitter, grey.repeat(40, 1)) for model in (one, other)]
+    assert all(torch.equal(*both) for both in zip(*(passed.rendering for passed in done), strict=True))
+    grad = Rendering(torch.ones(40, 3), torch.ones(40), torch.zeros(40))
+    gradients = [model.backward(passed, grad, passed.weights) for model, passed in zip((one, other), done, strict=True)]
+    assert torch.equal(gradients[0].features, gradients[1].features) and gradients[0].features.any()
+    for found, wanted in zip(*(each.weights for each in gradients), strict=True):
+        assert torch.equal(found[: len(wanted)], wanted) and wanted.any()
 
 
 def test_parameters_depend_on_the_seed_alone() -> None:

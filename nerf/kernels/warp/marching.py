@@ -292,12 +292,13 @@ def _sample_points_backward(
     grad_directions: wp.array[wp.vec3],
 ):
     ray = wp.tid()
-    on_origin = wp.vec3(0.0)
-    on_direction = wp.vec3(0.0)
+    # In float64: of a ray of 4096 equal gradients a float32 sum loses more than 1e-5.
+    on_origin = wp.vec3d()
+    on_direction = wp.vec3d()
     for i in range(starts[ray], starts[ray + 1]):
         t = distances[i]
         grad = _unit_backward(contracted, origins[ray] + t * directions[ray], grad_points[i])
-        on_origin += grad
-        on_direction += t * grad
-    grad_origins[ray] = on_origin
-    grad_directions[ray] = on_direction
+        on_origin += wp.vec3d(grad)
+        on_direction += wp.vec3d(t * grad)
+    grad_origins[ray] = wp.vec3(on_origin)
+    grad_directions[ray] = wp.vec3(on_direction)

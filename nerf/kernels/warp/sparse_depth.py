@@ -6,7 +6,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf.kernels import Lattice, Samples
-from nerf.kernels.warp.compositing import grows_from, position
+from nerf.kernels.warp.compositing import apart, grows_from
 from nerf.kernels.warp.launch import launch
 
 wp.set_module_options({"enable_backward": False})
@@ -55,10 +55,10 @@ def _depth_loss(
     ray = wp.tid()
     if distance[ray] == 0.0:
         return
-    point = position(grows_from, distance[ray])
-    total = wp.float64((1.0 - opacity[ray]) * wp.abs(position(grows_from, far[ray]) - point))
+    point = distance[ray]
+    total = wp.float64((1.0 - opacity[ray]) * wp.abs(apart(grows_from, point, far[ray])))
     for i in range(starts[ray], starts[ray + 1]):
-        total += wp.float64(weights[i] * wp.abs(position(grows_from, distances[i]) - point))
+        total += wp.float64(weights[i] * wp.abs(apart(grows_from, point, distances[i])))
     loss[ray] = float(total)
 
 
@@ -76,7 +76,7 @@ def _depth_loss_backward(
     ray = wp.tid()
     if distance[ray] == 0.0:
         return
-    point = position(grows_from, distance[ray])
-    of_opacity[ray] = -grad[ray] * wp.abs(position(grows_from, far[ray]) - point)
+    point = distance[ray]
+    of_opacity[ray] = -grad[ray] * wp.abs(apart(grows_from, point, far[ray]))
     for i in range(starts[ray], starts[ray + 1]):
-        of_weights[i] = grad[ray] * wp.abs(position(grows_from, distances[i]) - point)
+        of_weights[i] = grad[ray] * wp.abs(apart(grows_from, point, distances[i]))

@@ -69,6 +69,23 @@ def test_a_full_pixel_asks_for_no_more_than_being_full() -> None:
         )
 
 
+@pytest.mark.parametrize("log_gain", [-1e30, -16.0, -1e-30, 0.0, 1e-30, 16.0, 1e30])
+@pytest.mark.parametrize("kind", [torch.float32, torch.float64])
+def test_extremes_are_finite_in_value_and_gradient(log_gain: float, kind: torch.dtype) -> None:
+    """Colours of nothing to 1e30 before every opacity, shown by photos of every gain, black and full."""
+    colours, opacities = torch.tensor([0.0, 1e-30, 0.04, 1.0, 1e12, 1e30]), torch.tensor([0.0, 1e-7, 1.0])
+    colour, opacity = (part.flatten().to(kind) for part in torch.meshgrid(colours, opacities, indexing="ij"))
+    rendering = Rendering(colour[:, None].repeat(1, 3), 0 * opacity, opacity)
+    given = Seen(rendering, BACKGROUND.to(kind), torch.zeros(len(colour), dtype=torch.int64))
+    part = Exposures(torch.full((1, 3), log_gain, dtype=kind))
+    for target in (0.0, 1.0):
+        residual = part.residual(given, torch.full_like(rendering.colour, target))
+        assert residual.isfinite().all() and residual.abs().max() > 0.1
+        of_rendering, of_parameters = part.backward(given, residual.clamp(-0.1, 0.1))  # as robust errors pull
+        assert all(each.isfinite().all() for each in (*of_rendering, *of_parameters.values()))
+        assert of_rendering.colour.abs().max() > 0
+
+
 def test_the_darkest_photo_shows_the_field_as_it_is_and_the_mean_gain_is_kept() -> None:
     part = Exposures.of_tracks(GAINS)
     assert torch.equal(part.log_gain.amin(0), torch.zeros(3).double())

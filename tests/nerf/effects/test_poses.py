@@ -1,4 +1,6 @@
+import pytest
 import torch
+from torch import Tensor
 
 from nerf.effects.poses import RefinedPoses
 from nerf.rays import Rays
@@ -41,6 +43,25 @@ def test_backward_is_the_derivative_of_forward() -> None:
     expected = torch.autograd.grad((moved.origins * weights[0]).sum() + (moved.directions * weights[1]).sum(), leaves)
     torch.testing.assert_close(list(by_hand.values()), list(expected), rtol=1e-5, atol=1e-6)
     assert list(by_hand) == list(poses.parameters)
+
+
+@pytest.mark.parametrize("radians", [0.0, 1e-4, 1.0, 3.1])
+def test_its_derivatives_are_those_of_differences_at_every_size(radians: float) -> None:
+    random = torch.Generator().manual_seed(3)
+    axes = torch.nn.functional.normalize(torch.randn(3, 3, generator=random, dtype=torch.float64), dim=-1)
+    poses, given = RefinedPoses(torch.zeros(3, 3).double()), rays().each(Tensor.double)
+
+    def moved(turn: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
+        poses.turn, poses.shift = turn, shift
+        there = poses.forward(given, VIEW)
+        return there.origins, there.directions
+
+    parts = [(radians * axes).requires_grad_(), (radians * axes.flip(0)).requires_grad_()]
+    assert torch.autograd.gradcheck(moved, parts)
+    weights = torch.randn(2, 6, 3, generator=random, dtype=torch.float64)
+    expected = torch.autograd.grad(moved(parts[0], parts[1]), parts, list(weights))
+    by_hand = poses.backward(given, VIEW, lambda: (weights[0], weights[1]))
+    torch.testing.assert_close(list(by_hand.values()), list(expected), rtol=1e-12, atol=1e-12)
 
 
 def ring(count: int = 8) -> torch.Tensor:

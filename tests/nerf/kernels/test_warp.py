@@ -75,6 +75,17 @@ def test_encoding(device: str, layout) -> None:
 
 
 @pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
+def test_encoding_of_any_points(device: str, layout) -> None:
+    """In float32 on both sides: which cell a point is in, and where in it, is rounded alike."""
+    table, points = normal(device, 2, layout.rows, 4), 1.4 * uniform(device, 39, 3001, 3) - 0.2
+    assert not torch.equal(points, (points * 8192).round() / 8192)
+    features = warp.encode(layout, table, points)
+    assert relative_error(features, reference.encode(layout, table, points)) < TOLERANCE
+    of_points = warp.encode_backward_points(layout, table, points, features)
+    assert relative_error(of_points, reference.encode_backward_points(layout, table, points, features)) < TOLERANCE
+
+
+@pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
 def test_gradients_of_the_encoding(device: str, layout) -> None:
     table, points = normal(device, 2, layout.rows, 4), grid_points(device)
     grad = normal(device, 3, len(points), layout.width)

@@ -10,7 +10,18 @@ from torch import Tensor
 
 from nerf.kernels import Lattice, reference, warp
 from nerf.model import Rendering
-from tests.nerf.kernels.warp_agreement import COUNTS, LATTICES, TOLERANCE, agree, doubled, normal, packed, uniform
+from tests.nerf.kernels.warp_agreement import (
+    COUNTS,
+    LATTICES,
+    TOLERANCE,
+    agree,
+    doubled,
+    normal,
+    packed,
+    random_rays,
+    relative_error,
+    uniform,
+)
 
 EVEN, GROWING = LATTICES.values()
 
@@ -48,6 +59,45 @@ def test_rays_of_4096_samples(device: str, varied: bool, density: float) -> None
     for lattice in (EVEN, GROWING):
         agree("distortion", samples, weights, lattice, tolerance=1e-6)
         agree("distortion_backward", samples, weights, lattice, normal(device, 23, 3), tolerance=1e-6)
+
+
+@pytest.mark.parametrize("varied", [False, True])
+def test_other_sums_along_rays_of_4096_samples(device: str, varied: bool) -> None:
+    n = 4096 * 3
+    each = uniform(device, 22, n) + 0.5 if varied else torch.ones(n, device=device)
+    samples = packed(device, [4096] * 3, 0.001 * each)
+    rays = random_rays(device, 32).each(lambda part: part[-3:])
+    for contracted in (False, True):
+        grad = 0.1 * each[:, None].repeat(1, 3)
+        agree("sample_points_backward", rays, samples, contracted, grad, tolerance=1e-6)
+    weights, opacity, distance = each / 5000, uniform(device, 28, 3), torch.tensor([0.05, 2.0, 5.0], device=device)
+    for lattice in (EVEN, GROWING):
+        agree("depth_loss", samples, weights, opacity, rays.far, distance, lattice, tolerance=1e-6)
+        agree("depth_loss_backward", samples, rays.far, distance, lattice, normal(device, 23, 3), tolerance=1e-6)
+    hidden = (0.1 * each[:, None] - 0.06).relu().repeat(1, 64)
+    given = 0.1 * each[:, None].repeat(1, 64)
+    wanted = given.double()
+    of_ray = warp.add_ray_relu_backward(samples, hidden, given)
+    assert relative_error(of_ray, reference.add_ray_relu_backward(samples, hidden.double(), wanted)) < 5e-6
+
+
+@pytest.mark.parametrize("varied", [False, True])
+def test_waves_of_4096_samples(device: str, varied: bool) -> None:
+    n = 4096 * 3
+    each = uniform(device, 22, n) + 0.5 if varied else torch.ones(n, device=device)
+    samples, jitter = packed(device, [4096] * 3, 0.001 * each), uniform(device, 33, 3)
+    far, light_left = torch.full((3,), 9.0, device=device), 0.2
+    for lattice in (EVEN._replace(most_samples=4096), GROWING._replace(most_samples=4096)):
+        depths, nears = [], []
+        for backend, kind in ((warp, torch.float32), (reference, torch.float64)):
+            depth, near = torch.full((3,), 0.1, dtype=torch.float64, device=device), torch.zeros(3, dtype=kind)
+            arguments = samples, 0.3 * each, light_left, jitter, far
+            arguments = arguments if backend is warp else doubled(arguments)
+            backend.end_wave(lattice, *arguments, depth, near)
+            depths.append(depth)
+            nears.append(near)
+        assert (depths[0] > 1).all() and float((depths[0] / depths[1] - 1).abs().max()) < 1e-6
+        assert ((nears[1] > 4) & (nears[1] < 9)).all() and relative_error(*nears) < TOLERANCE
 
 
 THICKNESS = st.one_of(st.floats(0, 1e30), st.floats(0, 30), st.sampled_from([0.0, 1e-30, 800.0, 1e30]))
@@ -125,6 +175,25 @@ def test_distortion_and_its_gradient(device: str, lattice: Lattice) -> None:
     weights = uniform(device, 25, sum(COUNTS))
     agree("distortion", samples, weights, lattice)
     agree("distortion_backward", samples, weights, lattice, normal(device, 26, len(COUNTS)))
+
+
+@pytest.mark.parametrize("step", [1e-5, 0.002, 0.02, 0.5, 4.0])
+def test_losses_of_light_that_ends_close_together_far_out(device: str, step: float) -> None:
+    """Half of it in each of two neighbours at about 768, or at a sample before a point: their difference is the loss,
+    and that of their logarithms, each rounded, is off by 1e-4 of it."""
+    counts = [2, 40, 128]
+    samples = packed(device, counts, 768 * step * (0.5 + uniform(device, 32, sum(counts))))
+    samples = samples._replace(t=768 + samples.t)
+    pairs, alone = torch.zeros(2, sum(counts), device=device)
+    pairs[[0, 1, 20, 21, -2, -1]], alone[samples.starts[:-1].long()] = 0.5, 1.0
+    for weights in (pairs, alone, uniform(device, 25, sum(counts))):
+        agree("distortion", samples, weights, GROWING, tolerance=1e-6)
+        agree("distortion_backward", samples, weights, GROWING, normal(device, 26, 3), tolerance=1e-6)
+    full, far = torch.ones(3, device=device), torch.full((3,), 1e6, device=device)
+    behind = samples.t[samples.starts[:-1].long() + 1]
+    agree("depth_loss", samples, alone, full, far, behind, GROWING, tolerance=1e-6)
+    nearest = agree("depth_loss_backward", samples, far, behind, GROWING, full)[0][0]
+    assert float(nearest) == pytest.approx(math.log(float(behind[0]) / float(samples.t[0])), rel=1e-6)
 
 
 @pytest.mark.parametrize("lattice", LATTICES.values(), ids=LATTICES)

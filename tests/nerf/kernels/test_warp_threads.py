@@ -7,6 +7,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -49,18 +50,29 @@ def noise_bank() -> RayBank:
     y, x = torch.meshgrid(grid, grid, indexing="ij")
     bearings = torch.nn.functional.normalize(torch.stack([x, y, torch.ones_like(x)], -1), dim=-1)
     photo = torch.randint(256, (12, 12, 4), generator=torch.Generator().manual_seed(1), dtype=torch.uint8)
+    photo[:6, :, 3] = 255
     front = torch.tensor([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, -3]])
     back = torch.tensor([[-1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 3]])
     near, far = torch.full((2,), 1.0), torch.full((2,), 5.0)
     return build_ray_bank([photo] * 2, [0, 0], [bearings], torch.stack([front, back]), near, far)
 
 
-def small_trainer() -> GridTrainer:
-    field = GridSettings(levels=3, log2_rows=8, coarsest=4, finest=16, steps=32, cache_cells=8)
-    settings = GridTrainerSettings(seed=3, background="random", samples=1024, chunks=4, distortion=1e-3)
+BOUNDED = GridSettings(levels=3, log2_rows=8, coarsest=4, finest=16, steps=32, cache_cells=8)
+OUTDOORS = replace(BOUNDED, contracted=True, shortest_step=0.1, cone=0.1, sky=True)
+
+
+def small_trainer(field: GridSettings) -> GridTrainer:
+    """A step has sixteen rays, two of which run to points whose distance is known."""
+    background = (0.0, 0.0, 0.0) if field.sky else "random"
+    settings = GridTrainerSettings(3, background, samples=512, chunks=4, distortion=1e-3, depth_loss=0.1)
     model = GridField(field, 0, warp)
     model.occupy(warp.occupied_bits(torch.rand(512, generator=torch.Generator().manual_seed(2)), 0.3))
-    return GridTrainer(model, noise_bank(), settings)
+    opaque = (noise_bank().pixels[:, 3] == 255).nonzero()[:, 0]
+    trainer = GridTrainer(
+        model, noise_bank().with_distances(opaque, torch.full_like(opaque, 3.0, dtype=torch.float32)), settings
+    )
+    trainer.samples_per_ray.fill_(32)
+    return trainer
 
 
 def copied(state: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -75,11 +87,14 @@ def run_briefly(trainer: GridTrainer, start: dict[str, Tensor]) -> dict[str, Ten
     return trainer.state()
 
 
+@pytest.mark.parametrize("field", [BOUNDED, OUTDOORS], ids=["bounded", "outdoors"])
 def test_a_training_run_has_the_same_bits_again_and_again_on_any_number_of_threads(
-    use_cores: Callable[[int], None], monkeypatch: pytest.MonkeyPatch
+    field: GridSettings, use_cores: Callable[[int], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("nerf.density_cache.CHUNK", 128)  # so that even this small cache is measured in several
-    trainer, used = small_trainer(), set[int]()
+    trainer, used = small_trainer(field), set[int]()
+    guided = [int((trainer._batch(0, 0.0, chunk, trainer._rays_per_chunk()).distance > 0).sum()) for chunk in range(4)]
+    assert sum(guided) == 2 and trainer._rays_per_chunk() == 4
     forward = trainer.model.forward
     monkeypatch.setattr(trainer.model, "forward", lambda *chunk: used.add(threading.get_ident()) or forward(*chunk))
     start = copied(trainer.state())
@@ -87,6 +102,7 @@ def test_a_training_run_has_the_same_bits_again_and_again_on_any_number_of_threa
     wanted = copied(run_briefly(trainer, start))
     changed = {name for name in wanted if not torch.equal(wanted[name], start[name])}
     assert {"model.table", "model.bits", "thickness", "mean.table", "square.colour_out"} <= changed
+    assert ("model.sky" in changed) == field.sky
     for repeat in range(200):
         use_cores(count := (1, 2, 4)[repeat % 3])
         found = run_briefly(trainer, start)
@@ -96,7 +112,7 @@ def test_a_training_run_has_the_same_bits_again_and_again_on_any_number_of_threa
 
 
 def everything(seed: int) -> list[Tensor]:
-    """What nearly all kernels make of random numbers."""
+    """What all kernels make of random numbers."""
     random = torch.Generator().manual_seed(seed)
     lattice, layout = Lattice(0.02, 0.05, seed % 2 == 1, 8, 64), grid_layout(3, 4, 16, 8, 4)
     count = 40 + 7 * seed
@@ -122,17 +138,27 @@ def everything(seed: int) -> list[Tensor]:
     grad_field = warp.composite_backward(samples, sigma, colour, background, rays.far, ones, weights)
     spread = warp.distortion(samples, weights, lattice)
     grad_weights = warp.distortion_backward(samples, weights, lattice, spread)
+    known = torch.rand(count, generator=random) + 1
+    apart = warp.depth_loss(samples, weights, rendering.opacity, rays.far, known, lattice)
+    grad_apart = warp.depth_loss_backward(samples, rays.far, known, lattice, apart)
+    depth, near = torch.zeros(count, dtype=torch.float64), rays.near.clone()
+    warp.end_wave(lattice, samples, sigma, 0.1, known - 1, rays.far, depth, near)
+    waves, order = warp.pack_waves([samples, front])
+    harmonics = warp.spherical_harmonics(directions)
+    grad_directions = warp.spherical_harmonics_backward(directions, harmonics)
     hidden = torch.randn(len(samples.t), 64, generator=random)
     warp.add_ray_relu(samples, hidden, torch.randn(count, 64, generator=random))
-    grad_hidden = hidden.clone()
+    grad_hidden, grad_rectified = hidden.clone(), hidden + 1
     of_ray = warp.add_ray_relu_backward(samples, hidden, grad_hidden)
+    warp.relu_backward(hidden, grad_rectified)
     adam = [torch.randn(layout.rows, 4, generator=random), grad_table.clone(), grad_table.clone(), grad_table.abs()]
     warp.adam(adam[0], adam[1], adam[2], adam[3], 1e-2, 3)
     thickness = torch.rand(512, generator=random)
     warp.raise_cache(8, thickness, points, sigma)
     return [
         *(bits, *samples, points, features, grad_table, grad_points, *grad_rays, *front, kept, *rendering, weights),
-        *(*grad_field, spread, grad_weights, hidden, grad_hidden, of_ray, *adam, thickness),
+        *(*grad_field, spread, grad_weights, apart, *grad_apart, depth, near, *waves, order),
+        *(harmonics, grad_directions, hidden, grad_hidden, grad_rectified, of_ray, *adam, thickness),
     ]
 
 
