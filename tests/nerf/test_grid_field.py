@@ -80,7 +80,7 @@ def encoded_by_autograd(layout: GridLayout, table: Tensor, points: Tensor) -> Te
 
 @pytest.mark.parametrize("settings", [SMALL, FOLDED, OUTDOORS, DIFFUSE])
 def test_all_gradients_are_those_of_autograd(settings: GridSettings, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nerf.grid_field.THIN", 0)
+    monkeypatch.setattr("nerf.grid_field.THIN", 0.0)
     model, given = field(settings), rays()
     jitter = torch.rand(6, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
     background = torch.rand(6, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
@@ -262,7 +262,7 @@ def in_waves(model: GridField, given: Rays, background: Tensor) -> tuple[Renderi
 
 
 def in_one_pass(
-    model: GridField, lattice: Lattice, given: Rays, jitter: Tensor, background: Tensor, thin: float = 0
+    model: GridField, lattice: Lattice, given: Rays, jitter: Tensor, background: Tensor, thin: float = 0.0
 ) -> tuple[int, Samples, Rendering]:
     """How many samples of a lattice stand in occupied cells, those that can be seen, and what rays see; no waves."""
     samples = reference.march(occupied(model.bits), lattice, given, jitter)
@@ -372,7 +372,7 @@ def test_thin_samples_that_stand_for_others_keep_picture_and_gradients(
         return len(done.points), [*done.rendering, *gradients.weights]
 
     with monkeypatch.context() as patch:
-        patch.setattr("nerf.grid_field.THIN", 0)
+        patch.setattr("nerf.grid_field.THIN", 0.0)
         every, wanted = seen_and_gradients(0.0)
     counts, found = zip(*(seen_and_gradients((draw + 0.5) / draws) for draw in range(draws)), strict=True)
     assert max(counts) < 0.7 * every
