@@ -233,7 +233,8 @@ class Runner:
         """
         module = STAGES[stage]
         upstream = {name: m for name in module.NEEDS if (m := self._upstream(name, stage)) is not None}
-        folders = {name: self.workspace.folder(name, m.key) for name, m in upstream.items()}
+        beside = {name: m for name in getattr(module, "OPTIONAL", ()) if (m := self._upstream(name, "report"))}
+        folders = {name: self.workspace.folder(name, m.key) for name, m in (upstream | beside).items()}
         # The report shows timings and logs too, so it depends on whole manifests and not only on outputs.
         if stage == "report":
             inputs = {name: manifests.file_sha256(folders[name] / manifests.NAME) for name in upstream}
@@ -245,7 +246,7 @@ class Runner:
         return Job(stage, config, key_config, inputs, folders, key)
 
     def _upstream(self, name: str, stage: str) -> Manifest | None:
-        """The current result of ``name``. Only the report does without: it is written from whatever is there."""
+        """The current result of ``name``. Only "report" does without: it takes what is there, as OPTIONAL does."""
         if name not in self.done:
             try:
                 key = self.resolve(name, may_plan=False).key

@@ -296,7 +296,7 @@ def _study(results: Results) -> dict[str, Any] | None:
     """The study of cost and quality: recommendation, plot, table, and the ablation's pictures where there are any."""
     from markupsafe import Markup
 
-    from stages.tradeoff import COLUMNS, cells, meanings
+    from stages.tradeoff import COLUMNS, cells, drawing_words, meanings
     from stages.tradeoff_plot import plot_svg
 
     if results.study is None:
@@ -306,8 +306,9 @@ def _study(results: Results) -> dict[str, Any] | None:
         "svg": Markup(plot_svg(results.study)),
         "columns": COLUMNS,
         "fields": meanings(results.study["points"]),
+        "drawing": drawing_words(results.study["points"]),
         "rows": [{"cells": cells(row), "front": row["front"]} for row in results.study["points"]],
-        "ablation": _data_uri(ablation.read_bytes(), "image/png") if ablation.exists() else None,
+        "sheet": _data_uri(ablation.read_bytes(), "image/png") if ablation.exists() else None,
     }
 
 

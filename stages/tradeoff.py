@@ -1,11 +1,13 @@
 """Stage tradeoff: a study of what quality costs on this scene and this machine.
 
 Fields of several kinds and sizes are trained for several times, at several photo sizes, with several seeds; each is
-scored on the same pixels of the held-out photos. What nothing beats is drawn as a front, and one point of it is
-recommended. The stage is no part of the usual chain: it runs when it is asked for.
+scored on the same pixels of the held-out photos, and so is the field that the workspace has already. What nothing beats
+is drawn as a front, and one point of it is recommended. The stage is no part of the usual chain: it runs when it is
+asked for.
 """
 
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
@@ -17,7 +19,8 @@ from stages.contract import Inputs, Progress, StageConfig, StageError, StageResu
 from stages.files import read_scene, write_json
 from stages.tradeoff_arms import (
     MEANINGS,
-    PUBLISHED,
+    OWN,
+    THINNED,
     VARIANTS,
     Arm,
     Reading,
@@ -34,6 +37,7 @@ if TYPE_CHECKING:
     from stages.tradeoff_trial import Exam
 
 NEEDS = ("ingest", "normalise", "effects")
+OPTIONAL = ("train",)
 VERSION = 6
 RESUMES = True
 LINKS = ("tradeoff.svg", "tradeoff.png", "tradeoff.md", "tradeoff.json", "ablation.png")
@@ -78,7 +82,8 @@ def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
     scene = _scene_with_test_photos(inputs)
     speeds = measured_speeds(scene, inputs, config.seconds, progress)
     sizes = config.sizes or study_sizes(scene, speeds, config.seconds)
-    drawn = min(drawn_per_second(name, speed) for name, speed in speeds.items() if name != PUBLISHED)
+    quick = [name for name in speeds if VARIANTS[name].family != "published"]
+    drawn = min(drawn_per_second(name, speeds[name]) for name in quick)
     affordable = SCORING_SHARE * config.seconds * drawn / WINDOW**2
     windows = min(max(FEWEST_WINDOWS, int(affordable)), MOST_WINDOWS)
     reading = reading_seconds(scene, inputs["ingest"], windows)
@@ -107,38 +112,54 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
         StageError: without held-out photos, where not one arm could be scored, or where one could not be trained for
             want of memory or disk.
     """
+    from stages.tradeoff_clock import counted
+    from stages.tradeoff_own import own_point
     from stages.tradeoff_trial import make_exam
 
     config = config if config.speeds else plan(config, inputs, progress)
-    assert config.windows and config.downscale, "plan() chooses them"
+    assert config.windows and config.downscale and config.sizes, "plan() chooses them"
     scene, selection = _scene_with_test_photos(inputs), selection_of(config)
-    for line in plan_words(selection, config.seconds):
+    for line in (promise(selection, folder / "arms"), *plan_words(selection, config.seconds)):
         progress.note(line)
-    exam = make_exam(inputs["ingest"], scene, config.downscale, config.windows)
-    trials, late = _run_all(config, selection, exam, inputs, folder, progress)
+    with counted(folder / "clock.json") as spent:
+        exam = make_exam(inputs["ingest"], scene, config.downscale, config.windows, config.sizes[-1])
+        trials, late = _run_all(config, selection, exam, inputs, folder, progress, spent)
+        own = own_point(exam, inputs, folder / "arms", progress)
     if all(trial.figures["failed"] for trial in trials):
         why = "; ".join(dict.fromkeys(str(trial.figures["failed"]) for trial in trials))
         why = why or f"{duration(config.seconds)} are too short here even for {selection.left_out[0]}"
         raise StageError("the study has no result", why, "Give it more time, as in --budget 30m.")
     workspace = inputs["normalise"].resolve().parents[1].name
     failed = [f"{trial.arm.words} ({trial.figures['failed']})" for trial in trials if trial.figures["failed"]]
-    return _written(config, trials, (*selection.left_out, *late, *failed), exam, folder, workspace)
+    return _written(config, trials, own, (*selection.left_out, *late, *failed), exam, folder, workspace)
 
 
 def selection_of(config: Config) -> Selection:
     """The arms of a planned study."""
-    from stages.tradeoff_arms import select
-    from stages.tradeoff_trial import WINDOW
+    from stages.tradeoff_arms import SMALL_SIDE, select
+    from stages.tradeoff_trial import SHOWN, WINDOW
 
     assert config.speeds and config.sizes and config.windows, "plan() chooses them"
     speeds = {name: Speed(*speed) for name, speed in config.speeds.items()}
-    rays, reading = config.windows * WINDOW**2, Reading(*config.reading)
+    rays, reading = config.windows * WINDOW**2 + SHOWN * SMALL_SIDE**2, Reading(*config.reading)
     return select(config.seconds, config.seeds, config.sizes, speeds, rays, reading)
+
+
+def promise(selection: Selection, arms: Path) -> str:
+    """How many trainings there are to do, some of which an earlier attempt has left in the folder ``arms``, and when
+    they are expected to be done."""
+    from stages.tradeoff_trial import figures_file
+
+    to_do = [arm for arm in selection.arms if not figures_file(arm, arms).exists()]
+    seconds = sum(arm.seconds for arm in to_do)
+    there = f", {len(selection.arms) - len(to_do)} of them there" if len(to_do) < len(selection.arms) else ""
+    finish = time.strftime("%H:%M", time.localtime(time.time() + seconds))
+    return f"{len(selection.arms)} trainings{there}: done at about {finish}, in {duration(seconds)}"
 
 
 def plan_words(selection: Selection, seconds: float) -> list[str]:
     """What will be trained, a line for each variant with its share of the time, and what is left out."""
-    lines = [f"{len(selection.arms)} trainings, about {duration(selection.seconds)} of {duration(seconds)}"]
+    lines = [f"about {duration(selection.seconds)} of {duration(seconds)} in all"]
     for variant in VARIANTS:
         arms = [arm for arm in selection.arms if arm.variant == variant]
         if arms:
@@ -155,21 +176,29 @@ def plan_words(selection: Selection, seconds: float) -> list[str]:
 
 
 def _run_all(
-    config: Config, selection: Selection, exam: "Exam", inputs: Inputs, folder: Path, progress: Progress
+    config: Config,
+    selection: Selection,
+    exam: "Exam",
+    inputs: Inputs,
+    folder: Path,
+    progress: Progress,
+    spent: Callable[[], float],
 ) -> tuple[list[Trial], tuple[str, ...]]:
-    """Every arm that the time allows, and those that it did not because the machine was slower than measured."""
-    from stages.tradeoff_trial import run_arm
+    """Every arm that the time allows, and those that it did not because the machine was slower than measured. ``spent``
+    tells the seconds that the study has taken so far, attempts that were killed included."""
+    from stages.tradeoff_trial import figures_file, run_arm
 
-    trials, late, spent, expected = list[Trial](), list[Arm](), 0.0, 0.0
+    trials, late, worked, expected, arms = list[Trial](), list[Arm](), 0.0, 0.0, folder / "arms"
     for number, arm in enumerate(selection.arms, 1):
-        slowness = spent / expected if expected else 1.0
-        if spent + arm.seconds * slowness > (1 + LATE) * config.seconds:
+        slowness = worked / expected if expected else 1.0
+        too_late = spent() + arm.seconds * slowness > (1 + LATE) * config.seconds
+        if too_late and not figures_file(arm, arms).exists():
             late.append(arm)
             continue
-        inner = _ArmProgress(progress, f"{number}/{len(selection.arms)} {arm.variant}", spent / config.seconds)
-        figures = run_arm(arm, exam, inputs, folder / "arms", inner)
+        inner = _ArmProgress(progress, f"{number}/{len(selection.arms)} {arm.variant}", spent() / config.seconds)
+        figures = run_arm(arm, exam, inputs, arms, inner)
         trials.append(Trial(arm, figures))
-        spent, expected = spent + figures["wall_seconds"], expected + arm.seconds
+        worked, expected = worked + figures["wall_seconds"], expected + arm.seconds
         progress.note(f"{number}/{len(selection.arms)} {_trial_words(arm, figures)}")
     named = in_words(late)
     if late:
@@ -202,23 +231,32 @@ class _ArmProgress:
 
 
 def _written(
-    config: Config, trials: Sequence[Trial], left_out: Sequence[str], exam: "Exam", folder: Path, workspace: str
+    config: Config,
+    trials: Sequence[Trial],
+    own: "Point | None",
+    left_out: Sequence[str],
+    exam: "Exam",
+    folder: Path,
+    workspace: str,
 ) -> StageResult:
-    """Write everything. What depends on the clock are records; the scores of the trainings are outputs. ``workspace``:
-    the name of its folder, for the command to give."""
+    """Write everything. What depends on the clock are records, and so is what the workspace's ``own`` field says; the
+    scores of the trainings are outputs. ``workspace``: the name of its folder, for the command to give."""
+    from stages.tradeoff_ablation import ablation_picture, worth_words
     from stages.tradeoff_front import command, points_of, recommend, table
     from stages.tradeoff_plot import write_plot
 
-    points = points_of(trials)
+    points = points_of(trials, own)
     recommendation = recommend(points)
+    chosen = recommendation.point
     study = {
         "headline": recommendation.headline,
         "recommendation": recommendation.words,
-        "command": command(recommendation.point, workspace),
-        "recommended": points.index(recommendation.point) + 1,
+        "command": None if chosen.variant == OWN else command(chosen, workspace),
+        "recommended": points.index(chosen) + 1,
         "still_rising": recommendation.still_rising,
-        "scored": _scored_on(config, exam),
+        "scored": _scored_on(config, exam, [trial.arm for trial in trials]),
         "points": table(points),
+        "ablation": worth_words(trials),
         "arms": [{**trial.arm._asdict(), **trial.figures} for trial in trials],
         "left_out": list(left_out),
     }
@@ -226,14 +264,18 @@ def _written(
     write_json(folder / "quality.json", [_quality(trial) for trial in trials])
     (folder / "tradeoff.md").write_text(markdown(study), "utf-8")
     write_plot(study, folder)
-    pictures = _ablation_picture(points, trials, exam, folder)
+    pictures = ablation_picture(trials, exam, folder)
     line = f"{len(points)} settings, {sum(row['front'] for row in study['points'])} on the front · "
     if failed := sum(trial.figures["failed"] is not None for trial in trials):
         line += f"{failed} of {len(trials)} trainings without a result · "
     records = ("tradeoff.json", "tradeoff.md", "tradeoff.svg", "tradeoff.png")
     facts = {"recommendation": recommendation.words, "settings": len(points), "trainings": len(trials)}
-    line += f"{recommendation.words} Train it: {study['command']}"
+    line += f"{recommendation.words} {_train_it(study['command'], '')}"
     return StageResult(("quality.json", *pictures), line, records, facts)
+
+
+def _train_it(command: str | None, quote: str) -> str:
+    return "The workspace has it already." if command is None else f"Train it: {quote}{command}{quote}"
 
 
 def _quality(trial: Trial) -> dict[str, Any]:
@@ -242,57 +284,39 @@ def _quality(trial: Trial) -> dict[str, Any]:
     return {**trial.arm.options, "variant": trial.arm.variant, **figures}
 
 
-def _scored_on(config: Config, exam: "Exam") -> str:
+def _scored_on(config: Config, exam: "Exam", arms: Sequence[Arm]) -> str:
     from stages.tradeoff_trial import WINDOW
 
     photos = len({window.photo for window in exam.windows})
     assert config.downscale
+    slow = ", ".join(dict.fromkeys(arm.variant for arm in arms if arm.every > 1))
+    thinned = f"; {slow}: one in {THINNED} of their rows and columns, for drawing all would take too long"
     return (
         f"{len(exam.windows)} windows of {WINDOW} × {WINDOW} pixels of {photos} held-out photo{'s' * (photos > 1)} "
-        f"at {resolution_words(config.downscale)}, the same for all"
+        f"at {resolution_words(config.downscale)}, the same for all{thinned if slow else ''}"
     )
-
-
-def _ablation_picture(
-    points: "Sequence[Point]", trials: Sequence[Trial], exam: "Exam", folder: Path
-) -> tuple[str, ...]:
-    """ablation.png: windows of the photos beside what the method and each variant of it draw there; the names of the
-    files written, none where no ablation was run."""
-    from stages.tradeoff_arms import ABLATIONS, REDUCED
-    from stages.tradeoff_plot import Row, write_sheet
-    from stages.tradeoff_trial import write_strip
-
-    ablated = next((t.arm for t in trials if t.arm.variant in ABLATIONS and not t.figures["failed"]), None)
-    if ablated is None:
-        return ()
-    write_strip(folder / "arms" / "photo.png", [exam.windows[index].truth for index in exam.shown])
-    rows = [Row("photo", None, folder / "arms" / "photo.png")]
-    for trial in trials:
-        same = (trial.arm.downscale, trial.arm.steps, trial.arm.seed) == (
-            ablated.downscale,
-            ablated.steps,
-            ablated.seed,
-        )
-        if same and trial.arm.variant in (REDUCED, *ABLATIONS) and not trial.figures["failed"]:
-            score = next(p.psnr for p in points if (p.variant, p.steps) == (trial.arm.variant, trial.arm.steps))
-            rows.append(Row(trial.arm.variant, score, folder / "arms" / f"{trial.arm.name}.png"))
-    best = max((t for t in trials if not t.figures["failed"]), key=lambda trial: trial.figures["psnr"])
-    rows.append(Row(f"best: {best.arm.variant}", best.figures["psnr"], folder / "arms" / f"{best.arm.name}.png"))
-    write_sheet(rows, folder / "ablation.png")
-    return ("ablation.png",)
 
 
 def markdown(study: dict[str, Any]) -> str:
     """tradeoff.md: the recommendation and the table. Bold rows are those that nothing beats."""
-    lines = [study["recommendation"], "", f"Train it: `{study['command']}`", "", f"Scored on {study['scored']}.", ""]
+    lines = [study["recommendation"], "", _train_it(study["command"], "`"), "", f"Scored on {study['scored']}.", ""]
     lines += ["| " + " | ".join(COLUMNS) + " |", "|---" * len(COLUMNS) + "|"]
     for row in study["points"]:
         shown = [f"**{cell}**" if row["front"] else cell for cell in cells(row)]
         lines.append("| " + " | ".join(shown) + " |")
-    lines += ["", f"Fields: {meanings(study['points'])}."]
+    lines += ["", drawing_words(study["points"]), "", f"Fields: {meanings(study['points'])}."]
+    if study["ablation"]:
+        lines += ["", study["ablation"]]
     if study["left_out"]:
         lines += ["", f"Left out, for want of time unless a reason is given: {'; '.join(study['left_out'])}."]
     return "\n".join(lines) + "\n"
+
+
+def drawing_words(rows: Sequence[dict[str, Any]]) -> str:
+    """What the front does not tell."""
+    row = next(row for row in rows if row["cheapest_drawn"])
+    least = f"number {row['number']} is drawn in the least time, {row['frame_seconds']:.2f} s a frame"
+    return f"The front is of training time and quality only. Of its points {least} (◂)."
 
 
 def meanings(rows: Sequence[dict[str, Any]]) -> str:
@@ -304,16 +328,17 @@ def meanings(rows: Sequence[dict[str, Any]]) -> str:
 def cells(row: dict[str, Any]) -> list[str]:
     """A point's row of the table, as COLUMNS has it."""
     spread = "" if row["deviation"] is None else f" ± {row['deviation']:.2f}"
+    spread_ssim = "" if row["ssim_deviation"] is None else f" ± {row['ssim_deviation']:.3f}"
     return [
         str(row["number"]),
         row["variant"],
         resolution_words(row["downscale"]),
         f"{row['steps']:,}",
         f"{row['train_seconds']:.1f} s",
-        f"{row['frame_seconds']:.2f} s",
-        f"{row['peak_memory_mb']:,.0f} MB",
+        f"{row['frame_seconds']:.2f} s" + " ◂" * row["cheapest_drawn"],
+        "–" if row["peak_memory_mb"] is None else f"{row['peak_memory_mb']:,.0f} MB",
         f"{row['model_mb']:.1f} MB",
         f"{row['psnr']:.2f}{spread}",
-        "–" if row["ssim"] is None else f"{row['ssim']:.3f}",
+        "–" if row["ssim"] is None else f"{row['ssim']:.3f}{spread_ssim}",
         str(row["seeds"]),
     ]

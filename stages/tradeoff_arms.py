@@ -4,14 +4,20 @@ An *arm* is one training: a variant of a field, a photo size, a number of steps,
 of training times takes ``LONGEST`` of the study's time, each further one ``RUNG`` times less.
 """
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
-LONGEST = 1 / 16
+LONGEST = 1 / 20
 RUNG = 1.7
-RUNGS = 8
+RUNGS = 6
 FEWEST_STEPS = 30  # a training of fewer says nothing of its field
+SMALL_SIDE = 128  # pixels: of photos for the paper's networks, which learn nothing finer in so little time
 OVERHEAD = 1.2  # wall time of a training over its training seconds: the probes, the files, photos read before
+PROBED_RAYS = 6144  # drawn at the end of a training, which takes long only where a field is drawn slowly
+MOST_SCORING = 0.03  # of the study's time, for one score: where it would take more, only one pixel of
+THINNED = 4  # along both axes of the windows is drawn
+MOST_SHARE = 1 / 6  # of the study's time, for one training
 DRAWING = {"grid": 0.7, "paper": 3.0}
 """Rays drawn a second over rays trained, about: drawing does less, but a grid field of few steps is fog all over."""
 SPENT_ELSEWHERE = 0.03  # of the study's time: measuring speeds before it, drawing plots after it
@@ -19,29 +25,36 @@ SPENT_ELSEWHERE = 0.03  # of the study's time: measuring speeds before it, drawi
 
 class Variant(NamedTuple):
     """A field as stage train is asked for it. ``family`` groups variants in the plot; ``speed`` names the variant whose
-    number of steps this one takes, so that the two differ in nothing else."""
+    number of steps this one takes, so that the two differ in nothing else, and ``cost`` is what a ray of this one takes
+    beside a ray of that; with less than ``fewest`` steps it is not trained."""
 
     family: str
     options: Mapping[str, Any]
     speed: str
+    cost: float = 1.0
+    fewest: int = FEWEST_STEPS
 
 
-REDUCED, PUBLISHED = "paper, reduced", "paper, published"
+REDUCED, PUBLISHED, FEWER_RAYS = "paper, reduced", "paper, published", "paper, published, 64 rays a step"
+OWN = "this workspace's field"  # no variant that a study trains: it is there, and is scored like the others
+WHOLE: Mapping[str, Any] = {"view_dependence": True, "batch_rays": 256}
+"""The reduced method with all its parts. Half the rays that stage train would give it, for twice the steps."""
+FIVE: Mapping[str, Any] = {"levels": 5, "log2_rows": 18, "finest": 512}
+FULL: Mapping[str, Any] = {"view_dependence": True, "preset": "paper"}
 VARIANTS: dict[str, Variant] = {
     "small grid": Variant("grid", {"levels": 4, "log2_rows": 17, "finest": 256}, "small grid"),
-    "grid": Variant("grid", {"levels": 5, "log2_rows": 18, "finest": 512}, "grid"),
+    "grid": Variant("grid", FIVE, "grid"),
     "large grid": Variant("grid", {"levels": 6, "log2_rows": 19, "finest": 1024}, "large grid"),
-    "grid, half the samples": Variant(
-        "grid samples", {"levels": 5, "log2_rows": 18, "finest": 512, "ray_samples": 0.5}, "grid"
-    ),
-    "grid, twice the samples": Variant(
-        "grid samples", {"levels": 5, "log2_rows": 18, "finest": 512, "ray_samples": 2.0}, "grid"
-    ),
-    REDUCED: Variant("paper", {"view_dependence": True}, REDUCED),
-    "no hierarchical sampling": Variant("ablation", {"view_dependence": True, "hierarchical": False}, REDUCED),
-    "no positional encoding": Variant("ablation", {"view_dependence": True, "positional_encoding": False}, REDUCED),
-    "no view dependence": Variant("ablation", {"view_dependence": False}, REDUCED),
-    PUBLISHED: Variant("published", {"view_dependence": True, "preset": "paper"}, PUBLISHED),
+    "grid, half the samples": Variant("grid samples", {**FIVE, "ray_samples": 0.5}, "grid"),
+    "grid, twice the samples": Variant("grid samples", {**FIVE, "ray_samples": 2.0}, "grid"),
+    REDUCED: Variant("paper", WHOLE, REDUCED),
+    "paper, half the samples": Variant("paper", {**WHOLE, "samples_coarse": 16, "samples_fine": 16}, REDUCED, 0.5),
+    "paper, twice the samples": Variant("paper", {**WHOLE, "samples_coarse": 64, "samples_fine": 64}, REDUCED, 2.0),
+    "no hierarchical sampling": Variant("ablation", {**WHOLE, "hierarchical": False}, REDUCED),
+    "no positional encoding": Variant("ablation", {**WHOLE, "positional_encoding": False}, REDUCED),
+    "no view dependence": Variant("ablation", {**WHOLE, "view_dependence": False}, REDUCED),
+    PUBLISHED: Variant("published", FULL, PUBLISHED, fewest=300),
+    FEWER_RAYS: Variant("published", {**FULL, "batch_rays": 64}, FEWER_RAYS),
 }
 MEANINGS = {
     "small grid": "4 grids of features, the finest of 256³ cells",
@@ -49,25 +62,34 @@ MEANINGS = {
     "large grid": "6 grids of features, the finest of 1,024³ cells",
     "grid, half the samples": "the same 5 grids, looked at in half as many places along a ray",
     "grid, twice the samples": "the same 5 grids, looked at in twice as many places along a ray",
-    REDUCED: "the paper's two networks made small: 4 layers of 64, 32 + 32 samples along a ray",
+    REDUCED: "the paper's two networks made small: 4 layers of 64, 32 + 32 samples along a ray, 256 rays a step",
+    "paper, half the samples": "two such networks with 16 + 16 samples along a ray, for as many steps",
+    "paper, twice the samples": "two such networks with 64 + 64 samples along a ray, for as many steps",
     "no hierarchical sampling": "one such network with as many samples, none of them placed by another",
     "no positional encoding": "two such networks that are given bare coordinates",
     "no view dependence": "two such networks without the direction of the ray",
-    PUBLISHED: "the paper's two networks: 8 layers of 256, 64 + 128 samples along a ray",
+    PUBLISHED: "the paper's two networks: 8 layers of 256, 64 + 128 samples along a ray, 1,024 rays a step",
+    FEWER_RAYS: "the same, 8 layers of 256, 64 + 128 samples along a ray, but 64 rays a step instead of 1,024",
+    OWN: "what the workspace had when the study was made, with the seconds of its own training",
 }
 """What the variants are, for whoever reads a table of them."""
 ABLATIONS = tuple(name for name, variant in VARIANTS.items() if variant.family == "ablation")
 TIMED = tuple(dict.fromkeys(variant.speed for variant in VARIANTS.values()))
 
 # Groups of trainings: (variant, which of the study's photo sizes, which rungs of the ladder of training times). Sizes
-# count from the finest, rungs from the longest.
-FINE, MIDDLE, COARSE = 0, 1, 2
-LADDER = [("grid", MIDDLE, range(RUNGS))]
-SIZES = [("grid", FINE, range(4)), ("grid", COARSE, range(4, RUNGS))]
-METHOD = [(name, COARSE, [2]) for name in (REDUCED, *ABLATIONS)]
-GRIDS = [("small grid", MIDDLE, [3, 5, 7]), ("large grid", FINE, [2, 1])]
-SAMPLES = [(name, MIDDLE, [2]) for name, variant in VARIANTS.items() if variant.family == "grid samples"]
-PAPER = [(REDUCED, COARSE, [4, 1]), (PUBLISHED, COARSE, [0])]
+# count from the finest, rungs from the longest; SMALL is the size for the paper's networks.
+FINE, MIDDLE, COARSE, SMALL = 0, 1, 2, -1
+Groups = Sequence[tuple[str, int, Sequence[int]]]
+LADDER: Groups = [("grid", MIDDLE, range(RUNGS)), ("grid", FINE, [0, 1]), ("grid", COARSE, range(3, RUNGS))]
+METHOD: Groups = [(name, SMALL, [1]) for name in (REDUCED, *ABLATIONS)]
+SMALLER: Groups = [("small grid", MIDDLE, [2])]
+LAST: Groups = [("grid", MIDDLE, [0]), ("grid", FINE, [0])]
+SAMPLES: Groups = [(name, MIDDLE, [2, 3]) for name, v in VARIANTS.items() if v.family == "grid samples"]
+PAPER: Groups = [(PUBLISHED, SMALL, [1]), (FEWER_RAYS, SMALL, [1]), ("paper, half the samples", SMALL, [1])]
+SPREAD: Groups = [("grid", MIDDLE, range(1, RUNGS))]
+SIZES: Groups = [("small grid", MIDDLE, [3, 1]), ("large grid", FINE, [1, 0]), ("grid", FINE, [2])]
+LONGER: Groups = [("paper, twice the samples", SMALL, [1]), (REDUCED, SMALL, [0])]
+ONCE: Groups = [*METHOD, *LADDER, *SMALLER, *SAMPLES, *PAPER, *SIZES, *LONGER]
 
 
 class Speed(NamedTuple):
@@ -88,13 +110,15 @@ AT_ONCE = Reading()
 
 
 class Arm(NamedTuple):
-    """One training of a study. ``seconds`` is what it is expected to take in all."""
+    """One training of a study. ``seconds`` is what it is expected to take in all; of ``every`` so many pixels of the
+    windows, along both axes, it is scored on one."""
 
     variant: str
     downscale: float
     steps: int
     seed: int
     seconds: float
+    every: int = 1
 
     @property
     def name(self) -> str:
@@ -128,25 +152,33 @@ class Selection(NamedTuple):
 
 
 def drawn_per_second(variant: str, speed: Speed) -> float:
-    """Rays of pictures a second, expected of a variant that trains at ``speed``."""
-    return speed.rays * DRAWING[field_of(variant)]
+    """Rays of pictures a second, expected of a variant whose ``speed`` of training, or that of the one it is timed as,
+    is known."""
+    return speed.rays * DRAWING[field_of(variant)] / VARIANTS[variant].cost
 
 
-def field_of(variant: str) -> str:
+def family_of(variant: str) -> str:
+    """Of variants that belong together in the plot."""
+    return "own" if variant == OWN else VARIANTS[variant].family
+
+
+def field_of(variant: str) -> Literal["grid", "paper"]:
     """The kind of field of a variant, as stage train calls it."""
     return "grid" if VARIANTS[variant].family.startswith("grid") else "paper"
 
 
 def wanted(seeds: int) -> Iterator[tuple[str, int, int, int]]:
-    """(variant, photo size, rung, seed) of all arms, the most informative first: the grid's ladder; photo sizes; the
-    ablation; second seeds of the ladder; sizes and samples of grids; the paper's networks; every other seed."""
-    once = [*LADDER, *SIZES, *METHOD]
-    spread, rest = [("grid", MIDDLE, range(2, RUNGS))], [*GRIDS, *SAMPLES, *PAPER]
-    rounds = [(once, 0), *([(spread, 1)] if seeds > 1 else []), (rest, 0)]
-    rounds += [([*METHOD, *once, *rest], seed) for seed in range(1, seeds)]
+    """(variant, photo size, rung, seed) of all arms, the most informative first: the grid's ladder, the ablation and a
+    smaller grid; second seeds of the ladder's last rungs and of the ablation; samples; the published networks; second
+    seeds of the ladder's other rungs; sizes of grids; every other seed."""
+    rounds: list[tuple[Groups, int]] = [([*LADDER, *METHOD, *SMALLER], 0)]
+    rounds += [([*LAST, *METHOD], 1)] if seeds > 1 else []
+    rounds += [([*SAMPLES, *PAPER], 0)]
+    rounds += [(SPREAD, 1)] if seeds > 1 else []
+    rounds += [([*SIZES, *LONGER], 0), *((ONCE, seed) for seed in range(1, seeds))]
     said = set()
-    for entries, seed in rounds:
-        for variant, size, rungs in entries:
+    for groups, seed in rounds:
+        for variant, size, rungs in groups:
             for rung in rungs:
                 if (key := (variant, size, rung, seed)) not in said:
                     said.add(key)
@@ -162,16 +194,21 @@ def select(
     reading: Reading = AT_ONCE,
 ) -> Selection:
     """The arms that fit into ``seconds``, in the order of :func:`wanted`; one that does not fit gives way to cheaper
-    ones behind it. ``drawn_rays`` are drawn to score each, and the first of a photo size has to read the photos. Photo
-    sizes that are the same make one arm."""
+    ones behind it.
+
+    ``downscales`` are the photo sizes, the last one that for the paper's networks; sizes that are the same make one
+    arm. ``drawn_rays`` are drawn to score each, and the first of a photo size has to read the photos. The published
+    networks take fewer rays a step only where there is no time for as many as published.
+    """
     left, arms, left_out = seconds * (1 - SPENT_ELSEWHERE) - reading.windows, dict[str, Arm](), dict[str, Arm]()
     for variant, size, rung, seed in wanted(seeds):
-        arm = _arm(variant, downscales[min(size, len(downscales) - 1)], rung, seed, seconds, speeds, drawn_rays)
-        if arm.name in arms:
+        downscale = downscales[-1 if size == SMALL else min(size, max(0, len(downscales) - 2))]
+        arm = _arm(variant, downscale, rung, seed, seconds, speeds, drawn_rays)
+        if arm.name in arms or (variant == FEWER_RAYS and any(a.variant == PUBLISHED for a in arms.values())):
             continue
         if all(arm.downscale != other.downscale for other in arms.values()):
             arm = arm._replace(seconds=arm.seconds + reading.photos)
-        if arm.steps < FEWEST_STEPS or arm.seconds > left:
+        if arm.steps < VARIANTS[variant].fewest or arm.seconds > min(left, MOST_SHARE * seconds):
             left_out[arm.name] = arm
         else:
             arms[arm.name] = arm
@@ -190,8 +227,10 @@ def _arm(
 ) -> Arm:
     speed, trained = speeds[VARIANTS[variant].speed], seconds * LONGEST / RUNG**rung
     steps = max(1, round_to_two_digits(trained * speed.steps))
-    scoring = drawn_rays / drawn_per_second(variant, speed)
-    return Arm(variant, downscale, steps, seed, OVERHEAD * steps / speed.steps + scoring)
+    drawn = drawn_per_second(variant, speed)
+    every = 1 if drawn_rays / drawn <= MOST_SCORING * seconds else THINNED
+    training = OVERHEAD * VARIANTS[variant].cost * steps / speed.steps
+    return Arm(variant, downscale, steps, seed, training + (PROBED_RAYS + drawn_rays / every**2) / drawn, every)
 
 
 def round_to_two_digits(value: float) -> int:
@@ -203,10 +242,11 @@ def in_words(arms: Sequence[Arm]) -> tuple[str, ...]:
     """``grid at half resolution: 26, 15 steps (fewer than 30)``, and how many further seeds."""
     groups: dict[tuple[str, float, bool], list[int]] = {}
     for arm in (arm for arm in arms if arm.seed == 0):
-        groups.setdefault((arm.variant, arm.downscale, arm.steps < FEWEST_STEPS), []).append(arm.steps)
+        few = arm.steps < VARIANTS[arm.variant].fewest
+        groups.setdefault((arm.variant, arm.downscale, few), []).append(arm.steps)
     words = [
         f"{variant} at {resolution_words(downscale)}: {', '.join(f'{count:,}' for count in steps)} steps"
-        + f" (fewer than {FEWEST_STEPS})" * few
+        + f" (fewer than {VARIANTS[variant].fewest})" * few
         for (variant, downscale, few), steps in groups.items()
     ]
     seeds = sum(arm.seed > 0 for arm in arms)
@@ -220,9 +260,11 @@ def resolution_words(downscale: float) -> str:
     return names.get(downscale, f"1/{downscale:g} of the resolution")
 
 
-def photo_sizes(chosen: float, largest: float) -> tuple[float, ...]:
+def photo_sizes(chosen: float, largest: float, longer_side: float) -> tuple[float, ...]:
     """The downscales of a study, the finest first: half of the one ``chosen`` for its longest training, so that finer
-    photos have their chance, twice and four times that, whole numbers; none beyond ``largest``, none nearly another."""
+    photos have their chance, twice and four times that, whole numbers; none beyond ``largest``, none nearly another.
+    Then that for the paper's networks: it leaves at most SMALL_SIDE of ``longer_side`` pixels."""
     most = max(1, int(largest))
     sizes = [float(min(max(1, round(chosen / 2)) * factor, most)) for factor in (1, 2, 4)]
-    return tuple(size for index, size in enumerate(sizes) if index == 0 or size > 1.25 * sizes[index - 1])
+    kept = [size for index, size in enumerate(sizes) if index == 0 or size > 1.25 * sizes[index - 1]]
+    return (*kept, float(max(1, math.ceil(longer_side / SMALL_SIDE))))

@@ -15,10 +15,10 @@ import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from statistics import mean, stdev
-from typing import Any
+from typing import Any, Literal
 
 from stages.amounts import duration
-from stages.tradeoff_arms import VARIANTS, Arm, field_of, resolution_words
+from stages.tradeoff_arms import OWN, VARIANTS, Arm, field_of, resolution_words
 
 WORTH_DB = 0.5  # a doubling of the time that buys less is not worth it; 0.5 dB is what one sees side by side
 LEAST_FREEDOM = 3
@@ -27,19 +27,22 @@ LEAST_FREEDOM = 3
 @dataclass(frozen=True)
 class Point:
     """One setting: means over its ``seeds`` trainings; ``deviation`` is the standard deviation of PSNR over them, None
-    for one; ``spread`` that of one such training, from settings like it, too; None where no setting has several seeds.
-    ``peak_memory_mb`` is the most of any."""
+    for one, ``ssim_deviation`` that of SSIM; ``spread`` that of one such training's PSNR, from settings like it, too;
+    None where no setting has several seeds. ``peak_memory_mb`` is the most of any, None of what was not trained
+    here."""
 
     variant: str
+    field: Literal["grid", "paper"]
     downscale: float
     steps: int
     seeds: int
     psnr: float
     deviation: float | None
     ssim: float | None
+    ssim_deviation: float | None
     train_seconds: float
     frame_seconds: float
-    peak_memory_mb: float
+    peak_memory_mb: float | None
     model_mb: float
     spread: float | None = None
 
@@ -47,11 +50,6 @@ class Point:
     def label(self) -> str:
         """``grid, half resolution``."""
         return f"{self.variant}, {resolution_words(self.downscale)}"
-
-    @property
-    def family(self) -> str:
-        """Of variants that belong together."""
-        return VARIANTS[self.variant].family
 
 
 @dataclass(frozen=True)
@@ -65,13 +63,14 @@ class Recommendation:
     still_rising: bool
 
 
-def points_of(arms: Sequence[tuple[Arm, Mapping[str, Any]]]) -> list[Point]:
-    """One point for all seeds of a setting, by training time. Arms that failed make none."""
+def points_of(arms: Sequence[tuple[Arm, Mapping[str, Any]]], own: Point | None = None) -> list[Point]:
+    """One point for all seeds of a setting, and that of the workspace's ``own`` field, by training time. Arms that
+    failed make none."""
     groups: dict[tuple[str, float, int], list[Mapping[str, Any]]] = {}
     for arm, figures in arms:
         if figures["failed"] is None:
             groups.setdefault((arm.variant, arm.downscale, arm.steps), []).append(figures)
-    points = [_point(*setting, group) for setting, group in groups.items()]
+    points = [_point(*setting, group) for setting, group in groups.items()] + ([] if own is None else [own])
     points = [replace(point, spread=spread_at(point, points)) for point in points]
     return sorted(points, key=lambda point: point.train_seconds)
 
@@ -81,12 +80,14 @@ def _point(variant: str, downscale: float, steps: int, group: Sequence[Mapping[s
     similarities = [figures["ssim"] for figures in group if figures["ssim"] is not None]
     return Point(
         variant=variant,
+        field=field_of(variant),
         downscale=downscale,
         steps=steps,
         seeds=len(group),
         psnr=mean(scores),
         deviation=stdev(scores) if len(scores) > 1 else None,
         ssim=mean(similarities) if similarities else None,
+        ssim_deviation=stdev(similarities) if len(similarities) > 1 else None,
         train_seconds=mean(figures["train_seconds"] for figures in group),
         frame_seconds=mean(figures["frame_seconds"] for figures in group),
         peak_memory_mb=max(figures["peak_memory_mb"] for figures in group),
@@ -98,7 +99,7 @@ def spread_at(point: Point, points: Sequence[Point]) -> float | None:
     """Standard deviation over seeds of the PSNR of one training at ``point``, by the rule of this module; from other
     kinds of fields where its own has no setting with several seeds, None where none has."""
     several = [other for other in points if other.deviation is not None]
-    alike = [other for other in several if field_of(other.variant) == field_of(point.variant)] or several
+    alike = [other for other in several if other.field == point.field] or several
     squares, freedom = 0.0, 0
     for other in sorted(alike, key=lambda other: abs(math.log(other.train_seconds / point.train_seconds))):
         if freedom < LEAST_FREEDOM:
@@ -155,7 +156,21 @@ def recommend(points: Sequence[Point]) -> Recommendation:
     if cheaper:
         lost, share = point.psnr - cheaper[-1].psnr, cheaper[-1].train_seconds / point.train_seconds
         words += f" With {share:.0%} of the time ({cheaper[-1].label}) it is {lost:.1f} dB less."
+    own = next((other for other in points if other.variant == OWN), None)
+    if own is not None and own is not point:
+        words += f" {_placed(own, front)}."
     return Recommendation(point, headline, words, point is best)
+
+
+def _placed(own: Point, front: Sequence[Point]) -> str:
+    """Whether the workspace's field is on the front, and what beats it where it is not."""
+    what = f"{OWN.capitalize()} ({duration(own.train_seconds)}, {own.psnr:.1f} dB)"
+    if own in front:
+        return f"{what} is on the front: nothing tried is as good in less time"
+    better = next(other for other in front if other.psnr >= own.psnr)
+    than = f"{better.label} has {better.psnr:.1f} dB after {duration(better.train_seconds)}"
+    near = ", which is within the spread" if _gain(own, better) <= _noise(own, better) else ""
+    return f"{what} is not on the front: {than}{near}"
 
 
 def command(point: Point, workspace: str) -> str:
@@ -203,9 +218,11 @@ def _more(points: Sequence[Point]) -> str:
 
 def table(points: Sequence[Point]) -> list[dict[str, Any]]:
     """Rows for the report and the page, by training time: a point's figures, its ``number``, whether it is on the
-    ``front``."""
+    ``front``, and whether it is the one of the front that is ``cheapest_drawn``."""
     front = pareto_front(points)
+    drawn = min(front, key=lambda point: point.frame_seconds)
     return [
-        {**asdict(point), "number": number, "label": point.label, "front": point in front}
+        {**asdict(point), "number": number, "label": point.label}
+        | {"front": point in front, "cheapest_drawn": point is drawn}
         for number, point in enumerate(points, 1)
     ]

@@ -3,13 +3,14 @@
 Equal data gives equal bytes.
 """
 
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from stages.amounts import duration
 from stages.report_plots import INK, drawing, svg_element
-from stages.tradeoff_arms import VARIANTS, resolution_words
+from stages.tradeoff_arms import OWN, family_of, resolution_words
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -22,24 +23,26 @@ FAMILIES = {
     "paper": ("D", "#d55e00", "paper's networks, reduced"),
     "ablation": ("v", "#cc79a7", "reduced, a part left out"),
     "published": ("P", "#e69f00", "paper's networks, published"),
+    "own": ("*", "#009e73", "this workspace's field"),
 }
 SIZE = (10.5, 6.2)  # inches
 MARK = 6.5  # points
-LARGER = {"small grid": 0.7, "large grid": 1.4}
+LARGER = {"small grid": 0.7, "large grid": 1.4, OWN: 1.8}
 NAMES = 0.32  # of the axis of the times: room at the left for the first name
 TICKS = [*(k * 10.0**e for e in (-2, -1, 0) for k in (1, 2, 5)), 10.0, 20.0, 30.0]
 TICKS += [*(60.0 * k for k in (1, 2, 5, 10, 20, 30)), *(3600.0 * k for k in (1, 2, 5, 10, 20))]
 LETTER = 8.5  # points, of labels
 GAP = 1.25  # lines between labels of the front
 DPI = 160
-SHOT = 192  # pixels of a window in the sheet
+SHOT = 192  # pixels of a photo's height in the sheet
+LETTERS_PER_INCH = 14  # of LETTER points, about
 
 
 class Row(NamedTuple):
-    """A row of the ablation's sheet: what it shows, its PSNR, a picture with the windows side by side."""
+    """A row of the ablation's sheet: what it shows, lines of words below that, a picture with photos side by side."""
 
     name: str
-    psnr: float | None
+    words: tuple[str, ...]
     strip: Path
 
 
@@ -69,7 +72,7 @@ def draw(figure: "Figure", study: dict[str, Any]) -> None:
     front = [row for row in rows if row["front"]]
     axes.set_xscale("log")
     for family, (marker, colour, name) in FAMILIES.items():
-        own = [row for row in rows if VARIANTS[row["variant"]].family == family]
+        own = [row for row in rows if family_of(row["variant"]) == family]
         for row in own:
             spread, size = row["deviation"] or 0.0, MARK * LARGER.get(row["variant"], 1.0)
             axes.errorbar(row["train_seconds"], row["psnr"], spread, fmt=marker, color=colour, ms=size, lw=1, zorder=3)
@@ -130,20 +133,25 @@ def _name_the_front(axes: "Axes", front: Sequence[dict[str, Any]]) -> None:
     axes.set_ylim(low, max(high, y + line))
 
 
-def write_sheet(rows: Sequence[Row], path: Path) -> None:
-    """The rows one below the other, each under its name and PSNR at the left, windows enlarged without smoothing."""
+def write_sheet(rows: Sequence[Row], line: str, path: Path) -> None:
+    """The rows one below the other, each with its words at the left, photos enlarged without smoothing; then the
+    ``line``."""
     from PIL import Image
 
     strips = [Image.open(row.strip).convert("RGB") for row in rows]
     tall, names = SHOT / DPI, 2.1  # inches of a row and of the margin for names
     width = names + tall * strips[0].width / strips[0].height
-    with drawing((width, len(rows) * tall), "ablation") as figure:
+    lines = textwrap.wrap(line, int(LETTERS_PER_INCH * width))
+    foot = (len(lines) + 1) * GAP * LETTER / 72
+    height = len(rows) * tall + foot
+    with drawing((width, height), "ablation") as figure:
         figure.set_layout_engine("none")  # every axes has its place below
         for number, (row, strip) in enumerate(zip(rows, strips, strict=True)):
-            bottom = 1 - (number + 1) / len(rows)
-            axes = figure.add_axes((names / width, bottom, 1 - names / width, 0.97 / len(rows)))
+            bottom = 1 - (number + 1) * tall / height
+            axes = figure.add_axes((names / width, bottom, 1 - names / width, 0.97 * tall / height))
             axes.imshow(strip, interpolation="nearest", aspect="auto")
             axes.set_axis_off()
-            score = "" if row.psnr is None else f"\n{row.psnr:.1f} dB"
-            axes.text(-0.02, 0.5, row.name + score, transform=axes.transAxes, ha="right", va="center", size=9.5)
+            words = "\n".join([row.name, *row.words])
+            axes.text(-0.02, 0.5, words, transform=axes.transAxes, ha="right", va="center", size=9.5)
+        figure.text(0.5, 0.5 * foot / height, "\n".join(lines), ha="center", va="center", size=LETTER)
         figure.savefig(path, dpi=DPI, facecolor="#ffffff", metadata={"Software": None})

@@ -3,13 +3,12 @@
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from statistics import median
 from typing import TYPE_CHECKING
 
 from stages.contract import Inputs, Progress
 from stages.tradeoff_arms import (
-    FEWEST_STEPS,
     LONGEST,
-    PUBLISHED,
     REDUCED,
     TIMED,
     VARIANTS,
@@ -47,9 +46,9 @@ def measured_speeds(scene: "Scene", inputs: Inputs, seconds: float, progress: Pr
     for number, name in enumerate(TIMED):
         progress.update(f"trying how fast this machine trains: {name}", number / len(TIMED))
         config = _planned(name, inputs, progress)
-        if name == PUBLISHED:
+        if VARIANTS[name].family == "published":
             rays = speeds[REDUCED].rays * _work(_planned(REDUCED, inputs, progress)) / _work(config)
-            if LONGEST * seconds * rays < FEWEST_STEPS * rays_per_step(config):
+            if LONGEST * seconds * rays < VARIANTS[name].fewest * rays_per_step(config):
                 speeds[name] = Speed(rays / rays_per_step(config), rays)
                 continue
         rays = rays_per_second(config, scene, decisions)
@@ -94,4 +93,6 @@ def study_sizes(scene: "Scene", speeds: Mapping[str, Speed], seconds: float) -> 
     from stages.training_size import chosen_downscale
 
     smallest = chosen_downscale(scene, rays=1.0)  # as small as photos are ever made
-    return photo_sizes(chosen_downscale(scene, LONGEST * seconds * speeds["grid"].rays), smallest)
+    cameras = [scene.cameras[view.camera] for view in scene.of_split("train")]
+    longer_side = median(max(camera.width, camera.height) for camera in cameras)
+    return photo_sizes(chosen_downscale(scene, LONGEST * seconds * speeds["grid"].rays), smallest, longer_side)

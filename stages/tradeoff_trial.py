@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from nerf.scene import Scene, View
 
 WINDOW = 64  # pixels along an edge
-SHOWN = 3  # windows kept as pictures, those with most detail
+SHOWN = 3  # held-out photos kept as pictures
 # Steps between windows that fill a square evenly, however many there are (Roberts 2018, the R2 sequence).
 STEPS_OF_PLACES = (0.7548776662466927, 0.5698402909980532)
 MEMORY_LOOK_SECONDS = 0.05
@@ -33,52 +33,58 @@ OWN_FAULTS = ("training diverged", "the field does not learn", "nothing is left 
 
 
 class Window(NamedTuple):
-    """A part of a held-out photo: rays and colours (h, w, …), and which pixels count (None: all)."""
+    """A held-out photo or a part of one: rays and colours (h, w, …), and which pixels count (None: all)."""
 
     photo: str
     rays: "Rays"
     truth: "Tensor"
     used: "Tensor | None"
 
+    def part(self, place: tuple[slice, slice]) -> "Window":
+        """Some of its rows and columns."""
+        used = None if self.used is None else self.used[place]
+        return Window(self.photo, self.rays.each(lambda v: v[place].clone()), self.truth[place].clone(), used)
+
 
 @dataclass(frozen=True)
 class Exam:
-    """What every arm of a study is scored on; make it with :func:`make_exam`. ``frame`` is a whole photo's pixels."""
+    """What every arm of a study is scored on, and whole photos to see it by; make it with :func:`make_exam`. ``frame``
+    is a whole photo's pixels at the size scored at."""
 
     scene: "Scene"
     windows: tuple[Window, ...]
+    photos: tuple[Window, ...]
     frame: int
 
-    @property
-    def shown(self) -> list[int]:
-        """Which windows have the largest differences within them, the largest first."""
-        contrast = [float(window.truth.std((0, 1)).mean()) for window in self.windows]
-        return sorted(range(len(contrast)), key=lambda index: -contrast[index])[:SHOWN]
 
-
-def make_exam(ingest: Path, scene: "Scene", downscale: float, count: int) -> Exam:
-    """``count`` windows spread over the held-out photos at 1/``downscale`` of their size."""
+def make_exam(ingest: Path, scene: "Scene", downscale: float, count: int, small: float) -> Exam:
+    """``count`` windows spread over the held-out photos at 1/``downscale`` of their size, and SHOWN of these photos at
+    1/``small``."""
+    from stages.spread import spread
     from stages.training_data import scaled_size
 
     test = scene.of_split("test")
     windows = tuple(_window(ingest, scene, test[i % len(test)], downscale, i) for i in range(count))
+    photos = tuple(_photo(ingest, scene, test[i], small) for i in spread(len(test), min(SHOWN, len(test))))
     width, height = scaled_size(scene.cameras[test[0].camera], downscale)
-    return Exam(scene, windows, width * height)
+    return Exam(scene, windows, photos, width * height)
 
 
-def _window(ingest: Path, scene: "Scene", view: "View", downscale: float, number: int) -> Window:
+def _photo(ingest: Path, scene: "Scene", view: "View", downscale: float) -> Window:
     from stages.training_data import view_mask, view_pixels, view_rays
     from stages.training_setup import BLACK, WHITE
 
     truth = view_pixels(ingest, scene, view, downscale, WHITE if scene.has_alpha else BLACK)
+    return Window(view.name, view_rays(scene, view, downscale), truth, view_mask(ingest, scene, view, downscale))
+
+
+def _window(ingest: Path, scene: "Scene", view: "View", downscale: float, number: int) -> Window:
+    whole = _photo(ingest, scene, view, downscale)
     top, left = (
         int((0.5 + number * step) % 1 * (max(0, size - WINDOW) + 1))
-        for step, size in zip(STEPS_OF_PLACES, truth.shape[:2], strict=True)
+        for step, size in zip(STEPS_OF_PLACES, whole.truth.shape[:2], strict=True)
     )
-    part = (slice(top, top + WINDOW), slice(left, left + WINDOW))
-    used = view_mask(ingest, scene, view, downscale)
-    rays = view_rays(scene, view, downscale).each(lambda values: values[part].clone())
-    return Window(view.name, rays, truth[part].clone(), None if used is None else used[part])
+    return whole.part((slice(top, top + WINDOW), slice(left, left + WINDOW)))
 
 
 def run_arm(arm: Arm, exam: Exam, inputs: Inputs, folder: Path, progress: Progress) -> dict[str, Any]:
@@ -90,7 +96,7 @@ def run_arm(arm: Arm, exam: Exam, inputs: Inputs, folder: Path, progress: Progre
     """
     from stages import train
 
-    found = folder / f"{arm.name}.json"
+    found = figures_file(arm, folder)
     if found.exists():
         return read_json(found)
     started, work = time.perf_counter(), folder / arm.name
@@ -107,45 +113,74 @@ def run_arm(arm: Arm, exam: Exam, inputs: Inputs, folder: Path, progress: Progre
             figures["failed"] = f"{error.what}: {error.why}"
         else:
             figures |= {name: result.facts[name] for name in ("train_seconds", "restarts")}
-            figures |= _score(arm, exam, work, folder, progress)
+            figures |= score(work, exam, progress, arm.every)
+            if arm.every == 1:
+                write_strip(strip_file(arm, folder), draw_photos(work, exam))
     figures |= {"peak_memory_mb": round(peak() / 1e6), "wall_seconds": round(time.perf_counter() - started, 3)}
     write_json(found, figures)
     shutil.rmtree(work)
     return figures
 
 
-def _score(arm: Arm, exam: Exam, work: Path, folder: Path, progress: Progress) -> dict[str, Any]:
-    """PSNR over the pixels of all windows, mean SSIM, seconds a frame; the shown windows as a picture."""
+def figures_file(arm: Arm, folder: Path) -> Path:
+    """Where the figures of an arm that was run are kept."""
+    return folder / f"{arm.name}.json"
+
+
+def strip_file(arm: Arm, folder: Path) -> Path:
+    """Where the pictures of an arm that was scored on all pixels are kept."""
+    return folder / f"{arm.name}.png"
+
+
+def score(field: Path, exam: Exam, progress: Progress, every: int = 1) -> dict[str, Any]:
+    """Of the field that stage train left in a folder: PSNR over the pixels of all windows, mean SSIM, seconds a frame.
+    ``every``: one of so many pixels is drawn, along both axes; then there is no SSIM."""
     from nerf.metrics import psnr
-    from stages.drawing import load_painter
-    from stages.effect_decisions import expected_gains
     from stages.image_metrics import ssim
 
-    painter = load_painter(work)
-    gains = expected_gains(read_json(work / "field.json"), exam.scene, exam.scene.of_split("test"))
-    painter.draw(exam.windows[0].rays)  # the first picture pays for memory and kernels
-    errors, similarities, drawn, seconds = [], [], [], 0.0
-    for number, window in enumerate(exam.windows):
-        progress.update(f"scoring, window {number + 1} of {len(exam.windows)}", number / len(exam.windows))
-        shown_as = painter.at_gain(gains[window.photo]) if gains else painter
+    thinned = slice(None, None, every)
+    windows = [window.part((thinned, thinned)) for window in exam.windows]
+    paint = _painter(field, exam)
+    paint(windows[0])  # the first picture pays for memory and kernels
+    errors, similarities, seconds = [], [], 0.0
+    for number, window in enumerate(windows):
+        progress.update(f"scoring, window {number + 1} of {len(windows)}", number / len(windows))
         started = time.perf_counter()
-        image = shown_as.draw(window.rays).colour.clamp(0, 1)
+        image = paint(window)
         seconds += time.perf_counter() - started
         error = (image - window.truth).square().mean(-1)
         errors.append(error if window.used is None else error[window.used])
-        similarities.append(ssim(image, window.truth, window.used))
-        drawn.append(image)
+        similarities.append(ssim(image, window.truth, window.used) if every == 1 else None)
     import torch
 
-    write_strip(folder / f"{arm.name}.png", [drawn[index] for index in exam.shown])
     known = [similarity for similarity in similarities if similarity is not None]
-    rays = sum(window.rays.near.numel() for window in exam.windows)
+    rays = sum(window.rays.near.numel() for window in windows)
     return {
         "psnr": round(psnr(float(torch.cat([error.flatten() for error in errors]).mean())), 4),
         "ssim": round(sum(known) / len(known), 5) if known else None,
-        "model_mb": round((work / "field.safetensors").stat().st_size / 1e6, 3),
+        "model_mb": round((field / "field.safetensors").stat().st_size / 1e6, 3),
         "frame_seconds": round(seconds * exam.frame / rays, 4),
     }
+
+
+def draw_photos(field: Path, exam: Exam) -> "list[Tensor]":
+    """The photos of ``exam`` as the field in a folder has them."""
+    return list(map(_painter(field, exam), exam.photos))
+
+
+def _painter(field: Path, exam: Exam) -> "Callable[[Window], Tensor]":
+    """What draws a window by the field in a folder, in [0, 1], exposed as its photo is expected to be."""
+    from stages.drawing import load_painter
+    from stages.effect_decisions import expected_gains
+
+    painter = load_painter(field)
+    gains = expected_gains(read_json(field / "field.json"), exam.scene, exam.scene.of_split("test"))
+
+    def paint(window: Window) -> "Tensor":
+        shown_as = painter.at_gain(gains[window.photo]) if gains else painter
+        return shown_as.draw(window.rays).colour.clamp(0, 1)
+
+    return paint
 
 
 def write_strip(path: Path, windows: "list[Tensor]") -> None:

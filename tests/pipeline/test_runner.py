@@ -167,6 +167,24 @@ def test_options_that_cannot_change_the_result_do_not_run_it_again(bring: Bring,
     assert calls == []
 
 
+def test_what_a_stage_reads_where_it_is_there_neither_runs_for_it_nor_makes_it_stale(
+    bring: Bring, monkeypatch: pytest.MonkeyPatch
+):
+    train, seen = fake_stages.STAGES["train"], list[set[str]]()
+    whole = train.run
+    monkeypatch.setattr(train, "NEEDS", ("ingest",))
+    monkeypatch.setattr(train, "OPTIONAL", ("sfm",), raising=False)
+    monkeypatch.setattr(
+        train, "run", lambda config, inputs, *rest: seen.append({*inputs}) or whole(config, inputs, *rest)
+    )
+    bring(stages=("ingest", "train"))
+    bring(stages=("ingest", "sfm"))
+    bring(stages=("ingest", "train"))
+    assert seen == [{"ingest"}]
+    bring(stages=("ingest", "train"), force=frozenset({"train"}))
+    assert seen[1:] == [{"ingest", "sfm"}]
+
+
 def test_output_shows_nothing_of_other_settings(bring: Bring, tmp_path: Path):
     bring()
     output = tmp_path / "w.nerf/output"

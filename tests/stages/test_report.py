@@ -307,7 +307,7 @@ def test_page_shows_the_study_and_leaves_its_time_out(tmp_path: Path, progress: 
     ]
     points = sorted(points, key=lambda p: p.train_seconds)
     study = {"headline": "", "recommendation": recommend(points).words, "recommended": 3, "points": table(points)}
-    study |= {"command": "pipeline train fox.nerf --train.seconds 20"}
+    study |= {"command": "pipeline train fox.nerf --train.seconds 20", "ablation": "Against the complete one: −2 dB."}
     study |= {"scored": "6 windows of 2 held-out photos", "left_out": ["paper, published: 5 steps"]}
     write_json(inputs["tradeoff"] / "tradeoff.json", study)
     (inputs["tradeoff"] / "manifest.json").write_text('{"seconds": 1800}')
@@ -318,11 +318,16 @@ def test_page_shows_the_study_and_leaves_its_time_out(tmp_path: Path, progress: 
         assert words in text, words
     assert "reduced, a part left out" in text, "the plot's legend"
     assert "Train it: <code>pipeline train fox.nerf --train.seconds 20</code>" in text
+    assert "number 1 is drawn in the least time, 1.00 s a frame" in text
     assert "Fields: grid: 5 grids of features, the finest of 512³ cells; no view dependence: two such" in text
     assert "What each part of the method is worth" not in text, "no picture, no title"
     assert summary == summary_before, "the study's time is none of the run's"
     Image.new("RGB", (64, 48)).save(inputs["tradeoff"] / "ablation.png")
-    assert "What each part of the method is worth" in _run(inputs, tmp_path / "pictures", progress)[0]
+    study |= {"command": None}
+    write_json(inputs["tradeoff"] / "tradeoff.json", study)
+    text = _run(inputs, tmp_path / "pictures", progress)[0]
+    assert "What each part of the method is worth" in text and "Against the complete one: −2 dB." in text
+    assert "The workspace has it already." in text and "Train it" not in text
 
 
 def test_a_large_video_lies_beside_the_page(inputs: dict[str, Path], tmp_path: Path, progress: Any):

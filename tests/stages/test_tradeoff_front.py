@@ -9,8 +9,18 @@ from hypothesis import strategies as st
 
 from pipeline.arguments import StageArguments, parse
 from pipeline.settings import with_effects
-from stages.tradeoff_arms import VARIANTS, Arm
-from stages.tradeoff_front import WORTH_DB, Point, command, knee, pareto_front, points_of, recommend, spread_at
+from stages.tradeoff_arms import OWN, VARIANTS, Arm, field_of
+from stages.tradeoff_front import (
+    WORTH_DB,
+    Point,
+    command,
+    knee,
+    pareto_front,
+    points_of,
+    recommend,
+    spread_at,
+    table,
+)
 from stages.train import Config
 
 
@@ -18,6 +28,8 @@ def point(seconds: float, psnr: float, **others: Any) -> Point:
     """A made-up result."""
     usual: dict[str, Any] = {"variant": "grid", "downscale": 2.0, "seeds": 1, "deviation": None, "ssim": 0.9}
     usual |= {"frame_seconds": 1.0, "peak_memory_mb": 500, "model_mb": 10.0, "steps": round(10 * seconds)}
+    variant = others.get("variant", "grid")
+    usual |= {"ssim_deviation": None, "field": "grid" if variant == OWN else field_of(variant)}
     return Point(psnr=psnr, train_seconds=seconds, **(usual | others))
 
 
@@ -144,17 +156,43 @@ def test_a_small_spread_has_its_digits() -> None:
 
 
 def test_seeds_of_a_setting_make_one_point() -> None:
-    figures = {"failed": None, "ssim": 0.8, "frame_seconds": 1.0, "peak_memory_mb": 5, "model_mb": 1.0}
+    figures = {"failed": None, "frame_seconds": 1.0, "peak_memory_mb": 5, "model_mb": 1.0}
     trials = [
-        (Arm("grid", 2.0, 100, seed, 0.0), {**figures, "psnr": 20.0 + seed, "train_seconds": 10.0 + seed})
+        (
+            Arm("grid", 2.0, 100, seed, 0.0),
+            {**figures, "psnr": 20.0 + seed, "ssim": 0.8 + 0.01 * seed, "train_seconds": 10.0 + seed},
+        )
         for seed in range(3)
     ]
     trials += [(Arm("grid", 4.0, 100, 0, 0.0), {**figures, "psnr": 18.0, "train_seconds": 4.0, "ssim": None})]
     trials += [(Arm("small grid", 4.0, 100, 0, 0.0), {"failed": "it diverged"})]
     alone, three = points_of(trials)
     assert (three.psnr, three.deviation, three.seeds, three.train_seconds) == (21.0, 1.0, 3, 11.0)
-    assert (alone.psnr, alone.deviation, alone.seeds, alone.ssim) == (18.0, None, 1, None)
+    assert (three.ssim, three.ssim_deviation) == (pytest.approx(0.81), pytest.approx(0.01))
+    assert (alone.psnr, alone.deviation, alone.seeds) == (18.0, None, 1) and alone.ssim is alone.ssim_deviation is None
     assert alone.spread == three.spread == 1.0 and points_of(trials[3:])[0].spread is None
+    own = point(180.0, 22.0, variant=OWN)
+    assert points_of(trials, own)[-1] == replace(own, spread=1.0)
+
+
+def test_the_workspaces_own_field_is_placed() -> None:
+    tried = [*ladder([3.0, 0.2]), point(160, 24.2, variant=OWN, downscale=1.0)]
+    said = recommend(tried)
+    assert "The best tried (this workspace's field, full resolution) gains 1.2 dB for 8.0 × the time." in said.words
+    assert "This workspace's field (2 min 40 s, 24.2 dB) is on the front: nothing tried is as good" in said.words
+    beaten = recommend([*tried[:-1], point(160, 22.5, variant=OWN)])
+    assert beaten.words.endswith(
+        "This workspace's field (2 min 40 s, 22.5 dB) is not on the front: "
+        "grid, half resolution has 23.0 dB after 20 s."
+    )
+    best = recommend([*tried[:-1], point(160, 30.0, variant=OWN)])
+    assert best.point.variant == OWN and best.still_rising and "on the front" not in best.words
+
+
+def test_the_point_of_the_front_that_is_drawn_fastest_is_marked() -> None:
+    points = [point(10, 20, frame_seconds=3.0), point(15, 19, frame_seconds=0.5), point(20, 23, frame_seconds=1.0)]
+    rows = table(points)
+    assert [row["cheapest_drawn"] for row in rows] == [False, False, True], "the fastest of all is beaten"
 
 
 def test_the_spread_weighs_settings_by_their_seeds_and_takes_no_more_than_it_needs() -> None:
