@@ -36,9 +36,9 @@ def fit_pose(
     mean, square = ({name: torch.zeros_like(part) for name, part in pose.parameters.items()} for _ in range(2))
     for step in range(STEPS):
         pixel = torch.randint(len(target), (min(RAYS, len(target)),), generator=random, device=target.device)
-        jitter = torch.rand(len(pixel), generator=random, device=target.device)
+        places = torch.rand(2, len(pixel), generator=random, device=target.device)
         some = rays.each(itemgetter(pixel))
-        gradients = _gradients(model, pose, photo_colours, (some, target[pixel], background), jitter)
+        gradients = _gradients(model, pose, photo_colours, (some, target[pixel], background), places)
         rate = RATE * FINAL_RATE ** (step / (STEPS - 1))
         for name, gradient in gradients.items():
             model.backend.adam(pose.parameters[name], gradient, mean[name], square[name], rate, step + 1)
@@ -50,12 +50,13 @@ def _gradients(
     pose: RefinedPoses,
     photo_colours: PhotoColours,
     pixels: tuple[Rays, Float[Tensor, "pixels 3"], Float[Tensor, "3"]],
-    jitter: Float[Tensor, "pixels"],
+    places: Float[Tensor, "2 pixels"],
 ) -> dict[str, Tensor]:
-    """Of the mean squared error on ``pixels`` (rays, colours, the background behind them), by the pose."""
+    """Of the mean squared error on ``pixels`` (rays, colours, the background behind them), by the pose. ``places``:
+    where samples stand in their intervals, and which thin ones are kept."""
     rays, target, background = pixels
     view = torch.zeros(len(target), dtype=torch.int64, device=target.device)
-    done = model.forward(pose.forward(rays, view), jitter, background.expand_as(target).contiguous())
+    done = model.forward(pose.forward(rays, view), *places, background.expand_as(target).contiguous())
     seen = Seen(done.rendering, background, view)
     residual = photo_colours.residual(seen, target)
     grad, _ = photo_colours.backward(seen, residual * (2 / residual.numel()))
