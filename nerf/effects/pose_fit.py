@@ -56,7 +56,8 @@ def _gradients(
     where samples stand in their intervals, and which thin ones are kept."""
     rays, target, background = pixels
     view = torch.zeros(len(target), dtype=torch.int64, device=target.device)
-    done = model.forward(pose.forward(rays, view), *places, background.expand_as(target).contiguous())
+    jitter, offset = places
+    done = model.forward(pose.forward(rays, view), jitter, offset, background.expand_as(target).contiguous())
     seen = Seen(done.rendering, background, view)
     residual = photo_colours.residual(seen, target)
     grad, _ = photo_colours.backward(seen, residual * (2 / residual.numel()))
