@@ -51,9 +51,7 @@ def visible_samples(
 
 def _chance(tau: Float[Tensor, "samples"], thin: float) -> Float[Tensor, "samples"]:
     """Of a sample to be kept; 1 for what is no number, that it may be noticed."""
-    if not thin:
-        return torch.ones_like(tau)
-    return (tau / thin).clamp(LEAST_CHANCE, 1).nan_to_num(nan=1)
+    return torch.where(tau < thin, (tau / thin).clamp(min=LEAST_CHANCE), 1)
 
 
 def composite(

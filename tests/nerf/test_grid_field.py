@@ -375,7 +375,7 @@ def test_thin_samples_that_stand_for_others_keep_picture_and_gradients(
         patch.setattr("nerf.grid_field.THIN", 0.0)
         every, wanted = seen_and_gradients(0.0)
     counts, found = zip(*(seen_and_gradients((draw + 0.5) / draws) for draw in range(draws)), strict=True)
-    assert max(counts) < 0.7 * every
+    assert max(counts) < 0.9 * every
     for each, right in zip(zip(*found, strict=True), wanted, strict=True):
         mean = torch.stack(each).mean(0)
         assert (mean - right).abs().max() < 0.02 * right.abs().max()

@@ -1,12 +1,15 @@
 """A workspace as the stages leave it, made up: what the tests of the report show."""
 
+import json
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
 
 from nerf.scene import Camera, Scene, Similarity, View
+from stages import report
 from stages.files import write_json, write_tensors
 
 NASTY = "<script>alert(1)</script>.jpg"
@@ -158,3 +161,11 @@ def _picture(seed: int, size: tuple[int, int], blur: bool = False) -> Image.Imag
     x, y = np.meshgrid(np.linspace(0, 6, size[0]), np.linspace(0, 4, size[1]))
     waves = np.stack([np.sin(x * (1 if blur else 3) + seed), np.cos(y * (1 if blur else 2)), np.sin(x + y)], -1)
     return Image.fromarray((127 + 90 * waves).astype(np.uint8))
+
+
+def written(inputs: dict[str, Path], folder: Path, progress: Any, **settings: Any) -> tuple[str, dict[str, Any]]:
+    """The page and the summary of a workspace."""
+    folder.mkdir()
+    result = report.run(report.Config(**settings), inputs, folder, progress)
+    assert result.outputs == ("report.html", "summary.json")
+    return (folder / "report.html").read_text("utf-8"), json.loads((folder / "summary.json").read_text("utf-8"))

@@ -14,7 +14,7 @@ from stages import report
 from stages.contract import StageError
 from stages.files import read_json, write_json
 from stages.tradeoff_front import recommend, table
-from tests.stages.report_workspace import LINES, PARTS, make_workspace
+from tests.stages.report_workspace import LINES, PARTS, make_workspace, written
 from tests.stages.test_tradeoff_front import point
 
 
@@ -31,20 +31,13 @@ class _Links(HTMLParser):
         self.links += [value or "" for name, value in attrs if name in ("src", "href", "srcset", "poster")]
 
 
-def _run(inputs: dict[str, Path], folder: Path, progress: Any, **settings: Any) -> tuple[str, dict[str, Any]]:
-    folder.mkdir()
-    result = report.run(report.Config(**settings), inputs, folder, progress)
-    assert result.outputs == ("report.html", "summary.json")
-    return (folder / "report.html").read_text("utf-8"), json.loads((folder / "summary.json").read_text("utf-8"))
-
-
 @pytest.fixture(scope="module")
 def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return make_workspace(tmp_path_factory.mktemp("report"))
 
 
 def test_summary_has_exactly_the_promised_keys(inputs: dict[str, Path], tmp_path: Path, progress: Any):
-    _, summary = _run(inputs, tmp_path / "out", progress)
+    _, summary = written(inputs, tmp_path / "out", progress)
     assert summary == {
         "photos": 25,
         "registered": 24,
@@ -69,14 +62,14 @@ def test_summary_has_exactly_the_promised_keys(inputs: dict[str, Path], tmp_path
 
 def test_a_budget_is_shown_promised_beside_spent_and_in_all(inputs: dict[str, Path], tmp_path: Path, progress: Any):
     account = {"seconds": 300.0, "promised": {"sfm": 50.0, "train": 170.0}, "spent": {"train": 166.0, "mesh": 12.0}}
-    html, summary = _run(inputs, tmp_path / "out", progress, budget=account)
+    html, summary = written(inputs, tmp_path / "out", progress, budget=account)
     assert summary["budget"] == account
     text = " ".join(re.sub("<[^>]+>", " ", html).split())
     assert "Given 5 min in all; 2 min 58 s spent before this page was written." in text
     rows = {row[0]: row[2:4] for row in ([re.sub("<[^>]+>", "", c) for c in re.findall("<td.*?</td>", line)]
             for line in re.findall("<tr>.*</tr>", html.split("How it was made")[1])) if len(row) == 6}  # fmt: skip
     assert rows["sfm"] == ["50 s", "–"] and rows["train"] == ["2 min 50 s", "2 min 46 s"] and rows["mesh"][1] == "12 s"
-    assert "Given 5 min" not in _run(inputs, tmp_path / "without", progress)[0]
+    assert "Given 5 min" not in written(inputs, tmp_path / "without", progress)[0]
 
 
 def test_without_a_budget_what_was_expected_stands_beside_what_was_spent(tmp_path: Path, progress: Any):
@@ -84,7 +77,7 @@ def test_without_a_budget_what_was_expected_stands_beside_what_was_spent(tmp_pat
     for stage, seconds in (("sfm", 50.0), ("train", 184.0), ("mesh", None)):
         manifest = read_json(inputs[stage] / "manifest.json")
         write_json(inputs[stage] / "manifest.json", manifest | {"expected": seconds})
-    html, summary = _run(inputs, tmp_path / "out", progress)
+    html, summary = written(inputs, tmp_path / "out", progress)
     assert summary["expected_seconds"] == {"sfm": 50.0, "train": 184.0}
     made = html.split("How it was made")[1]
     assert "without a budget it is no promise" in made and '<th class="number">expected</th>' in made
@@ -92,11 +85,11 @@ def test_without_a_budget_what_was_expected_stands_beside_what_was_spent(tmp_pat
             for line in re.findall("<tr>.*</tr>", made)) if len(row) == 5}  # fmt: skip
     assert rows["sfm"] == ["50 s", "58 s"] and rows["train"] == ["3 min 4 s", "3 min 2 s"] and rows["mesh"][0] == "–"
     account = {"seconds": 300.0, "promised": {}, "spent": {}}
-    assert '<th class="number">expected</th>' not in _run(inputs, tmp_path / "budget", progress, budget=account)[0]
+    assert '<th class="number">expected</th>' not in written(inputs, tmp_path / "budget", progress, budget=account)[0]
 
 
 def test_page_loads_nothing_from_elsewhere(inputs: dict[str, Path], tmp_path: Path, progress: Any):
-    html, _ = _run(inputs, tmp_path / "out", progress)
+    html, _ = written(inputs, tmp_path / "out", progress)
     parser = _Links()
     parser.feed(html)
     assert len(parser.links) > 15
@@ -106,20 +99,20 @@ def test_page_loads_nothing_from_elsewhere(inputs: dict[str, Path], tmp_path: Pa
 
 
 def test_names_of_photos_are_escaped(inputs: dict[str, Path], tmp_path: Path, progress: Any):
-    html, _ = _run(inputs, tmp_path / "out", progress)
+    html, _ = written(inputs, tmp_path / "out", progress)
     assert "<script" not in html and "&lt;script&gt;alert(1)&lt;/script&gt;.jpg" in html
     assert "blurred &lt;b&gt;.jpg" in html and "notes &amp; sums.jpg" in html
 
 
 def test_page_is_the_same_twice_and_gives_no_folder_away(inputs: dict[str, Path], tmp_path: Path, progress: Any):
-    html, _ = _run(inputs, tmp_path / "out", progress)
-    assert html == _run(inputs, tmp_path / "again", progress)[0]
+    html, _ = written(inputs, tmp_path / "out", progress)
+    assert html == written(inputs, tmp_path / "again", progress)[0]
     assert str(inputs["train"].parents[2]) not in html and "/home/someone" not in html
     assert "pipeline resume fox.nerf" in html
 
 
 def test_page_tells_what_a_person_wants_to_know_in_that_order(inputs: dict[str, Path], tmp_path: Path, progress: Any):
-    html, _ = _run(inputs, tmp_path / "out", progress)
+    html, _ = written(inputs, tmp_path / "out", progress)
     story = [
         "Better than any photo nearby by 7.3 dB but soft.",
         "21.5 <span>dB ± 0.4</span>",
@@ -145,7 +138,7 @@ def test_page_tells_what_a_person_wants_to_know_in_that_order(inputs: dict[str, 
 
 def test_page_shows_the_evidence_for_the_camera_model(tmp_path: Path, progress: Any):
     inputs = make_workspace(tmp_path)
-    html, _ = _run(inputs, tmp_path / "out", progress)
+    html, _ = written(inputs, tmp_path / "out", progress)
     assert "<summary>Camera model: OPENCV, principal point refined</summary>" in html
     assert "by more than 3 times the noise of the difference" in html
     for cells in ('0.6912</td><td class="number">0.0812 ± 0.0101</td><td></td>', "<td>chosen</td>"):
@@ -157,107 +150,8 @@ def test_page_shows_the_evidence_for_the_camera_model(tmp_path: Path, progress: 
     registration = json.loads(path.read_text("utf-8"))
     unknown = [image | {"uncertainty_px": None} for image in registration["images"]]
     write_json(path, registration | {"camera_models": [], "images": unknown})  # as with given cameras
-    html, _ = _run(inputs, tmp_path / "given", progress)
+    html, _ = written(inputs, tmp_path / "given", progress)
     assert "Camera model:" not in html and "pose is known" not in html
-
-
-def test_page_shows_both_scores_of_right_halves_with_what_they_mean(tmp_path: Path, progress: Any):
-    inputs = make_workspace(tmp_path)
-    html, _ = _run(inputs, tmp_path / "out", progress)
-    assert "right half, exposure fitted on the left (dB)</th>" in html
-    assert '<td class="number">23.50</td><td class="number">28.25</td></tr>' in html
-    assert "Right halves of the photos alone: 21.0 dB, and 25.8 dB with the exposure of each photo fitted" in html
-    path = inputs["evaluate"] / "metrics.json"
-    metrics = json.loads(path.read_text("utf-8"))
-    unknown = {"psnr_right": None, "psnr_fitted_right": None}
-    write_json(path, metrics | unknown | {"images": [image | unknown for image in metrics["images"]]})
-    html, _ = _run(inputs, tmp_path / "unknown", progress)
-    assert "Right halves" not in html and '<td class="number">–</td><td class="number">–</td></tr>' in html
-
-
-def test_page_says_how_unseen_photos_were_exposed(tmp_path: Path, progress: Any):
-    inputs = make_workspace(tmp_path)
-    assert "was drawn exposed" not in _run(inputs, tmp_path / "out", progress)[0]
-    path = inputs["evaluate"] / "metrics.json"
-    metrics = json.loads(path.read_text("utf-8"))
-    write_json(path, metrics | {"exposure": "as the photos taken nearest by"})
-    html, _ = _run(inputs, tmp_path / "exposed", progress)
-    assert "each was drawn exposed as the photos taken nearest by, four training photos, without a look at" in html
-
-
-def test_page_shows_what_fitted_poses_add_apart_from_fitted_exposures(tmp_path: Path, progress: Any):
-    inputs = make_workspace(tmp_path)
-    html, _ = _run(inputs, tmp_path / "out", progress)
-    assert "pose fitted" not in html
-    path = inputs["evaluate"] / "metrics.json"
-    metrics = json.loads(path.read_text("utf-8"))
-    images = [image | {"psnr_posed_right": image["psnr_fitted_right"] + 2} for image in metrics["images"]]
-    write_json(path, metrics | {"psnr_posed_right": 27.8, "poses_fitted": True, "images": images})
-    html, _ = _run(inputs, tmp_path / "posed", progress)
-    assert "right half, exposure and pose fitted on the left (dB)</th>" in html
-    assert '<td class="number">23.50</td><td class="number">28.25</td><td class="number">30.25</td></tr>' in html
-    assert "25.8 dB with the exposure of each photo fitted" in html and "pose fitted there, too: 27.8 dB" in html
-
-
-def effect(on: bool, reason: str, **figures: Any) -> dict[str, Any]:
-    """An entry of effects.json."""
-    nothing = dict.fromkeys(("statistic", "threshold", "noise", "pilot_gain_db", "pilot_noise_db", "cost"))
-    return nothing | {"on": on, "modelled": True, "unit": "", "seconds": 0.0, "reason": reason} | figures
-
-
-EFFECTS = {
-    "background": effect(False, "no pixel looks beyond the region"),
-    "exposure": effect(
-        True, "gains span 0.8 EV", statistic=0.8, threshold=0.05, noise=0.016, unit="EV", seconds=2.5, cost=0.04
-    ),
-    "view_dependence": effect(True, "it pays", pilot_gain_db=0.94, pilot_noise_db=0.21, seconds=0.02),
-    "blur": effect(True, "<i>smeared</i>", modelled=False, statistic=4.0, threshold=2.5, unit="px"),
-    "tone": effect(False, "none seen", modelled=False),
-}
-
-
-def test_page_shows_what_the_photos_call_for(tmp_path: Path, progress: Any):
-    inputs = make_workspace(tmp_path)
-    assert "Effects of these photos" not in _run(inputs, tmp_path / "without", progress)[0]
-    inputs["effects"] = tmp_path / "fox.nerf" / "effects" / "0123456789abcdef"
-    inputs["effects"].mkdir(parents=True)
-    manifest = json.loads((inputs["train"] / "manifest.json").read_text("utf-8"))
-    write_json(inputs["effects"] / "manifest.json", manifest | {"stage": "effects", "config": {}, "facts": {}})
-    write_json(inputs["effects"] / "effects.json", EFFECTS)
-    html, _ = _run(inputs, tmp_path / "out", progress)
-    section = html[html.index("Effects of these photos") : html.index("Where the cameras stood")]
-    cells = re.findall(r"<t[dh](?: [^>]*)?>(.*?)</t[dh]>", section)
-    rows = [cells[i : i + 9] for i in range(0, len(cells), 9)]
-    assert rows[0] == [
-        "effect",
-        "",
-        "statistic",
-        "threshold",
-        "noise",
-        "gain in pilot",
-        "costs when on",
-        "deciding took",
-        "why",
-    ]
-    assert rows[1:] == [
-        ["exposure", "<b>on</b>", "0.8 EV", "0.05 EV", "0.016 EV", "–", "+4% time", "2.5 s", "gains span 0.8 EV"],
-        ["view dependence", "<b>on</b>", "–", "–", "–", "+0.9 ± 0.2 dB", "–", "&lt; 0.1 s", "it pays"],
-        ["background", "off", "–", "–", "–", "–", "–", "–", "no pixel looks beyond the region"],
-    ]
-    flags = re.findall(r"<li>(.*?)</li>", section)
-    assert flags == [
-        "blur: &lt;i&gt;smeared&lt;/i&gt; (4 px, threshold 2.5 px). Hold the camera still, lock the focus, give more "
-        "light, and leave blurred photos out."
-    ]
-
-
-def test_without_flags_there_is_no_list_of_them(tmp_path: Path, progress: Any):
-    inputs = make_workspace(tmp_path) | {"effects": tmp_path / "effects"}
-    inputs["effects"].mkdir()
-    write_json(inputs["effects"] / "manifest.json", json.loads((inputs["mesh"] / "manifest.json").read_text("utf-8")))
-    write_json(inputs["effects"] / "effects.json", {"exposure": EFFECTS["exposure"]})
-    html, _ = _run(inputs, tmp_path / "out", progress)
-    assert "Effects of these photos" in html and "not modelled" not in html
 
 
 ATTEMPTS = [
@@ -278,7 +172,7 @@ def test_page_shows_what_was_tried_to_find_the_cameras(tmp_path: Path, progress:
     path = inputs["sfm"] / "registration.json"
     registration = json.loads(path.read_text("utf-8"))
     write_json(path, registration | {"attempts": ATTEMPTS})
-    html, _ = _run(inputs, tmp_path / "out", progress)
+    html, _ = written(inputs, tmp_path / "out", progress)
     assert "<summary>Ways tried to find the cameras: 5</summary>" in html
     row = re.compile(r"<tr><td>([^<]*)</td><td[^>]*>([^<]*)</td><td[^>]*>([^<]*)</td><td[^>]*>([^<]*)</td><td>([^<]*)<")
     table = html[html.index("Ways tried") :].partition("</table>")[0]
@@ -291,13 +185,13 @@ def test_page_shows_what_was_tried_to_find_the_cameras(tmp_path: Path, progress:
         ("all at once", "23", "8,123", "0.75", "a larger error"),
     ]
     write_json(path, registration | {"attempts": ATTEMPTS[2:3]})  # the first was enough
-    html, _ = _run(inputs, tmp_path / "one", progress)
+    html, _ = written(inputs, tmp_path / "one", progress)
     assert "Ways tried" not in html
 
 
 def test_page_shows_the_study_and_leaves_its_time_out(tmp_path: Path, progress: Any):
     inputs = make_workspace(tmp_path)
-    before, summary_before = _run(inputs, tmp_path / "before", progress)
+    before, summary_before = written(inputs, tmp_path / "before", progress)
     inputs["tradeoff"] = tmp_path / "fox.nerf" / "tradeoff" / "0123456789abcdef"
     inputs["tradeoff"].mkdir(parents=True)
     points = [
@@ -312,7 +206,7 @@ def test_page_shows_the_study_and_leaves_its_time_out(tmp_path: Path, progress: 
     write_json(inputs["tradeoff"] / "tradeoff.json", study)
     (inputs["tradeoff"] / "manifest.json").write_text('{"seconds": 1800}')
     assert "What quality costs here" not in before
-    text, summary = _run(inputs, tmp_path / "out", progress)
+    text, summary = written(inputs, tmp_path / "out", progress)
     assert "What quality costs here" in text and study["recommendation"] in text
     for words in ("All 3 settings", "<b>23.00 ± 0.20</b>", ">18.00<", "6 windows of 2", "paper, published: 5 steps"):
         assert words in text, words
@@ -325,13 +219,13 @@ def test_page_shows_the_study_and_leaves_its_time_out(tmp_path: Path, progress: 
     Image.new("RGB", (64, 48)).save(inputs["tradeoff"] / "ablation.png")
     study |= {"command": None}
     write_json(inputs["tradeoff"] / "tradeoff.json", study)
-    text = _run(inputs, tmp_path / "pictures", progress)[0]
+    text = written(inputs, tmp_path / "pictures", progress)[0]
     assert "What each part of the method is worth" in text and "Against the complete one: −2 dB." in text
     assert "The workspace has it already." in text and "Train it" not in text
 
 
 def test_a_large_video_lies_beside_the_page(inputs: dict[str, Path], tmp_path: Path, progress: Any):
-    html, _ = _run(inputs, tmp_path / "out", progress, video_limit_mb=0.001)
+    html, _ = written(inputs, tmp_path / "out", progress, video_limit_mb=0.001)
     assert 'src="video.mp4"' in html and "data:video" not in html
 
 
@@ -340,7 +234,7 @@ def test_page_reads_well_when_later_stages_are_missing(
     last: str, inputs: dict[str, Path], tmp_path: Path, progress: Any
 ):
     stages = list(LINES)[: list(LINES).index(last) + 1]
-    html, summary = _run({stage: inputs[stage] for stage in stages}, tmp_path / "out", progress)
+    html, summary = written({stage: inputs[stage] for stage in stages}, tmp_path / "out", progress)
     assert LINES[last] in html and "None" not in html and "Undefined" not in html
     assert summary["mesh"] is None
     assert (summary["psnr"] is None) == (last not in ("evaluate", "render"))
@@ -354,7 +248,7 @@ def test_without_test_photos_the_page_says_so(tmp_path: Path, progress: Any):
     metrics = json.loads(path.read_text("utf-8"))
     nothing = dict.fromkeys(("psnr", "ssim", "psnr_interval", "psnr_mean_image", "psnr_nearest_view"))
     write_json(path, metrics | nothing | {"images": [], "verdict": "Not measured.", "notes": ["no photo was kept"]})
-    html, _ = _run(inputs, tmp_path / "out", progress)
+    html, _ = written(inputs, tmp_path / "out", progress)
     assert "No photo was kept." in html and "None" not in html
 
 
@@ -366,7 +260,7 @@ def test_few_test_photos_are_all_shown(tests: int, roles: list[str], tmp_path: P
     path = inputs["evaluate"] / "metrics.json"
     metrics = json.loads(path.read_text("utf-8"))
     write_json(path, metrics | {"images": metrics["images"][:tests]})
-    html, _ = _run(inputs, tmp_path / "out", progress)
+    html, _ = written(inputs, tmp_path / "out", progress)
     assert re.findall(r'<span class="tag">([^<]+)</span>', html) == roles
     assert "<details>\n<summary>All" not in html
 
@@ -381,7 +275,7 @@ def test_a_finished_stage_that_lost_a_file_is_an_error_with_its_name(tmp_path: P
     inputs = make_workspace(tmp_path)
     (inputs["train"] / "curve.json").unlink()
     with pytest.raises(StageError, match=r"cannot read curve\.json"):
-        _run(inputs, tmp_path / "out", progress)
+        written(inputs, tmp_path / "out", progress)
 
 
 @pytest.mark.parametrize(
@@ -395,7 +289,7 @@ def test_settings_in_words(value: Any, words: str):
 
 
 def test_training_shows_where_its_time_went(inputs: dict[str, Path], tmp_path: Path, progress: Any):
-    html, _ = _run(inputs, tmp_path / "out", progress)
+    html, _ = written(inputs, tmp_path / "out", progress)
     assert "<h3>Where training spent its time</h3>" in html
     assert re.search(r"backward</td>.*?50\.0%.*?70%", html)
     assert (
@@ -408,7 +302,7 @@ def test_training_shows_where_its_time_went(inputs: dict[str, Path], tmp_path: P
 
 def test_a_training_without_timed_steps_is_no_fault(inputs: dict[str, Path], tmp_path: Path, progress: Any):
     (inputs["train"] / "parts.json").unlink()
-    html, summary = _run(inputs, tmp_path / "out", progress)
+    html, summary = written(inputs, tmp_path / "out", progress)
     assert "Where training spent its time" not in html and summary["training_parts"] is None
 
 
@@ -417,5 +311,5 @@ def test_a_field_of_no_use_is_named(inputs: dict[str, Path], tmp_path: Path, pro
     manifest = json.loads(path.read_text("utf-8"))
     manifest["facts"]["symptom"] = "it is empty (mean opacity 0e+00)"
     write_json(path, manifest)
-    html, _ = _run(inputs, tmp_path / "out", progress)
+    html, _ = written(inputs, tmp_path / "out", progress)
     assert "<b>The field is of no use yet:</b> it is empty (mean opacity 0e+00)." in html
