@@ -16,6 +16,7 @@ import torch
 
 from benchmarks.nerfacto import pipeline, stage_folder
 from benchmarks.pixel_store import Spoken
+from nerf.product_precision import products_at
 from nerf.training import FieldTrainer
 from stages.device import compute_device, cores
 from stages.effect_decisions import photo_parts, read_decisions
@@ -42,18 +43,20 @@ def main() -> None:
     pipeline("run", given.photos.absolute(), "-o", workspace, "--until", "effects")
     if given.cores:
         torch.set_num_threads(given.cores)
-    trainer = prepared(workspace, Config(seconds=given.seconds, downscale=given.downscale))
-    for step in range(WARM_STEPS):
-        trainer.step(step, SHARE, 1.0)
+    config, trainer = prepared(workspace, Config(seconds=given.seconds, downscale=given.downscale))
     timings: dict[str, Any] = {}
     device = torch.device(compute_device())
-    for step in range(WARM_STEPS, WARM_STEPS + TIMED_STEPS):
-        observed(partial(trainer.step, step, SHARE, 1.0), FIRST_TIMED, timings, device)
-    report(parts_table(timings, rates_for(trainer.model, device)))
+    with products_at(config.matmul):
+        for step in range(WARM_STEPS):
+            trainer.step(step, SHARE, 1.0)
+        for step in range(WARM_STEPS, WARM_STEPS + TIMED_STEPS):
+            observed(partial(trainer.step, step, SHARE, 1.0), FIRST_TIMED, timings, device)
+        report(parts_table(timings, rates_for(trainer.model, device)))
 
 
-def prepared(workspace: Path, asked: Config) -> FieldTrainer:
-    """A fresh field with all that its first step needs, as stage train makes it; prints the sizes it chose."""
+def prepared(workspace: Path, asked: Config) -> tuple[Config, FieldTrainer]:
+    """A fresh field with all that its first step needs, as stage train makes it, and the settings that the stage chose,
+    which are printed."""
     inputs = {stage: stage_folder(workspace, output) for stage, output in LINKED.items()}
     scene, config = read_scene(inputs["normalise"]), plan(asked, inputs, Spoken())
     assert config.downscale, "plan() chooses it"
@@ -62,7 +65,7 @@ def prepared(workspace: Path, asked: Config) -> FieldTrainer:
     print(f"{sizes}, {of_step}", flush=True)
     bank = guided_bank(inputs, scene, config.downscale, Spoken()).to(compute_device())
     of_photos = photo_parts(read_decisions(inputs["effects"]), scene.of_split("train"), bank.device)
-    return make_trainer(config, scene, bank, config.seed, of_photos)
+    return config, make_trainer(config, scene, bank, config.seed, of_photos)
 
 
 def report(table: dict[str, Any]) -> None:

@@ -10,8 +10,8 @@ if TYPE_CHECKING:
 SECONDS = 0.3  # for each rate
 TABLES = {"2¹⁷": 1 << 17, "2²⁰": 1 << 20}  # rows: of one grid, of all five of a large field
 # Of a ray while the grid field trains: densities asked for, beside the colours of stages/training_size.py. Over a run
-# fern and fountain_p11 ask for 1.9 for each colour (parts.json); lego_400 asked for 1.5 before samples stood closer.
-DENSITIES = {"bounded": 12, "contracted": 23}
+# lego_400, fox, banana and fountain_p11 ask for 2.3 to 2.9 for each colour (docs/numbers.md).
+DENSITIES = {"bounded": 7, "contracted": 24}
 WHERE = {"bounded": "around an object", "contracted": "in unbounded space"}
 PAPER_RAYS = {"paper field as published": (8, 256, 64, 128), "paper field 4 × 64": (4, 64, 32, 32)}
 

@@ -132,7 +132,7 @@ def pilots_seconds(settings: Settings, times: Mapping[str, float | None], readin
     """Seconds that pilots may take in a run without a budget, whose stages take ``times``: their part of what it is
     expected to take. None, for as long as they take, where that is not known: a run that counts steps is to end the
     same on every machine."""
-    if not times or counts_steps(settings.train):
+    if not times or settings.train.steps is not None:
         return None
     whole = without_budget(settings.train, times, reading, trained_seconds(settings.train))
     return for_pilots(sum(seconds or 0.0 for seconds in whole.values()), reading)
@@ -147,7 +147,8 @@ def reckoned_with(stage: str, settings: Settings, budget: Budget | None) -> dict
         return {} if seconds is None else {"seconds": seconds}
     if budget is not None:
         return {"budget": budget.total}
-    limited = stage == "effects" and not counts_steps(settings.train)
+    # What --more adds changes no pilot: the field that goes on stands on their decisions.
+    limited = stage == "effects" and settings.train.steps is None
     return {"training": trained_seconds(settings.train)} if limited else {}
 
 

@@ -41,6 +41,7 @@ WORTH_SAYING = 0.5  # dB between two scores of right halves
 LEAST_SIDE = 128  # pixels of the longer side of a photo that is scored, where there is a choice
 READING = 0.25  # seconds for each photo of the set where it is read at another size than the field was trained at
 BESIDE_DRAWING = 0.05  # seconds for each photo of the set, to read it: the mean image is one of them all
+DRAWINGS_TO_FIT = 3  # of a photo scored at a fitted pose: the raw one, one to fit by and the fitted one
 TRIED_PHOTOS = 4  # to see how fast the field draws them
 NO_LPIPS = "LPIPS is not computed: no package in use ships its weights and nothing is downloaded"
 
@@ -98,7 +99,8 @@ def _affordable(config: Config, scene: "Scene", train: Path, may_shrink: bool, p
     test = scene.of_split("test")
     allowance = Allowance(config.seconds, train, BESIDE_DRAWING * len(scene.views))
     cameras = [scene.cameras[view.camera] for view in test]
-    pixels = [math.prod(scaled_size(camera, config.downscale)) for camera in cameras]
+    drawings = DRAWINGS_TO_FIT if fits_poses(config, read_json(train / "field.json")) else 1
+    pixels = [drawings * math.prod(scaled_size(camera, config.downscale)) for camera in cameras]
     progress.update("trying how fast the field draws")
     largest = max(1, int(min(max(c.width, c.height) for c in cameras) / config.downscale))
     speed = measured_speed(train, lambda side: _tried_rays(scene, side), largest)

@@ -67,7 +67,7 @@ def continued(config: "Config", inputs: Inputs) -> "Config":
 def larger_photos_words(config: "Config", inputs: Inputs, scene: "Scene", used: Mapping[str, float]) -> str | None:
     """That as long a training from the start would take photos larger by more than NAMED_GAIN than those of ``config``,
     which goes on with what it has; None where it would not. ``used``: as for :func:`chosen_downscale`."""
-    from stages.training_size import chosen_downscale
+    from stages.training_size import chosen_downscale, rays_per_step
 
     assert config.after is not None and config.downscale is not None, "continued() has them"
     folder = earlier_training(config.after, inputs)
@@ -81,7 +81,7 @@ def larger_photos_words(config: "Config", inputs: Inputs, scene: "Scene", used: 
         seconds = trained + config.more_seconds
         longer, much = seconds / trained, duration(seconds)
         anew = f"--train.seconds {seconds:.0f}, or a larger --budget,"
-    would = chosen_downscale(scene, before["rays"] * longer, used)
+    would = chosen_downscale(scene, before["steps"] * rays_per_step(config) * longer, used)
     if config.downscale <= (1 + NAMED_GAIN) * would:
         return None
     stay = f"photos stay at 1/{config.downscale:g} of their size and the field as large as it is"

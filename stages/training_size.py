@@ -26,7 +26,7 @@ TIMED_SECONDS = 1.0
 MOST_TIMED_RAYS = {"cpu": 256, "cuda": 1 << 20}
 """For each core: one chunk of a batch. More keep a CPU no busier and make the published model's steps long; a GPU needs
 many."""
-SAMPLES_PER_RAY = {"bounded": 8, "contracted": 12}
+SAMPLES_PER_RAY = {"bounded": 3, "contracted": 10}
 """Colours that the grid field computes for a ray, over a run: measured on lego_400 and five photo sets
 (docs/numbers.md)."""
 GRID_SIZES = {
