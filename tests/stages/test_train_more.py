@@ -17,9 +17,12 @@ DIGEST = "d" * 64
 NAME = training_name("k" * 64, DIGEST)
 
 
+FIELD: dict[str, Any] = {"field": "paper", "batch_rays": 3000}
+
+
 @pytest.fixture
 def inputs(tmp_path: Path) -> dict[str, Path]:
-    """Those of a workspace whose finished training took 60 s for 1,000 steps, 3 million rays of photos at 1/2."""
+    """Those of a workspace whose finished training took 60 s for 1,000 steps of 3,000 rays of photos at 1/2."""
     made, _ = photographed(tmp_path / "made")
     inputs = {}
     for stage, folder in made.items():
@@ -31,10 +34,10 @@ def inputs(tmp_path: Path) -> dict[str, Path]:
     write_json(inputs["normalise"] / "scene.json", photographed_large(scene).to_json())
     before = tmp_path / "w" / "train" / NAME.split("/")[0]
     before.mkdir(parents=True)
-    config = Config(field="paper", steps=1000, downscale=2.0, contracted=False, view_dependence=False).model_dump()
+    config = Config(steps=1000, downscale=2.0, contracted=False, view_dependence=False, **FIELD).model_dump()
     manifest: dict[str, Any] = {"outputs_digest": DIGEST, "facts": {"train_seconds": 60.0}, "config": config}
     write_json(before / "manifest.json", manifest | {"inputs": dict.fromkeys(made, DIGEST)})
-    write_json(before / "field.json", {"steps": 1000, "rays": 3_000_000})
+    write_json(before / "field.json", {"steps": 1000})
     return inputs
 
 
@@ -45,7 +48,8 @@ def photographed_large(scene: Scene) -> Scene:
 
 def words(inputs: dict[str, Path], **more: Any) -> str | None:
     scene = Scene.from_json(read_json(inputs["normalise"] / "scene.json"))
-    return larger_photos_words(Config(after=NAME, downscale=2.0, **more), inputs, scene, {})
+    config = Config(after=NAME, downscale=2.0, **more).model_copy(update=FIELD)
+    return larger_photos_words(config, inputs, scene, {})
 
 
 def test_photos_that_would_be_larger_by_a_fifth_are_named_with_the_way_to_them(inputs: dict[str, Path]) -> None:

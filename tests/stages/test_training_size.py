@@ -202,7 +202,7 @@ def test_a_sky_is_where_space_has_no_end_and_no_alpha_tells(scene: Scene, contra
 
 
 def test_the_reason_for_sizes_is_the_budget() -> None:
-    reason = "100 steps draw about 1.0 M rays and compute 8.0 M colours: sizes left open are chosen for that"
+    reason = "100 steps draw about 1.0 M rays and compute 3.0 M colours: sizes left open are chosen for that"
     assert reason_words(GRID, 1e6) == reason
     assert reason_words(PAPER, 950) == "10 s on this machine draw about 950 rays: sizes left open are chosen for that"
 
