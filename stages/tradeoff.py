@@ -251,7 +251,7 @@ def _written(
     study = {
         "headline": recommendation.headline,
         "recommendation": recommendation.words,
-        "command": None if chosen.variant == OWN else command(chosen, workspace),
+        "command": command(chosen, workspace),
         "recommended": points.index(chosen) + 1,
         "still_rising": recommendation.still_rising,
         "scored": _scored_on(config, exam, [trial.arm for trial in trials]),
@@ -270,12 +270,8 @@ def _written(
         line += f"{failed} of {len(trials)} trainings without a result · "
     records = ("tradeoff.json", "tradeoff.md", "tradeoff.svg", "tradeoff.png")
     facts = {"recommendation": recommendation.words, "settings": len(points), "trainings": len(trials)}
-    line += f"{recommendation.words} {_train_it(study['command'], '')}"
+    line += f"{recommendation.words} Train it: {study['command']}"
     return StageResult(("quality.json", *pictures), line, records, facts)
-
-
-def _train_it(command: str | None, quote: str) -> str:
-    return "The workspace has it already." if command is None else f"Train it: {quote}{command}{quote}"
 
 
 def _quality(trial: Trial) -> dict[str, Any]:
@@ -299,7 +295,7 @@ def _scored_on(config: Config, exam: "Exam", arms: Sequence[Arm]) -> str:
 
 def markdown(study: dict[str, Any]) -> str:
     """tradeoff.md: the recommendation and the table. Bold rows are those that nothing beats."""
-    lines = [study["recommendation"], "", _train_it(study["command"], "`"), "", f"Scored on {study['scored']}.", ""]
+    lines = [study["recommendation"], "", f"Train it: `{study['command']}`", "", f"Scored on {study['scored']}.", ""]
     lines += ["| " + " | ".join(COLUMNS) + " |", "|---" * len(COLUMNS) + "|"]
     for row in study["points"]:
         shown = [f"**{cell}**" if row["front"] else cell for cell in cells(row)]
@@ -331,7 +327,7 @@ def cells(row: dict[str, Any]) -> list[str]:
     spread_ssim = "" if row["ssim_deviation"] is None else f" ± {row['ssim_deviation']:.3f}"
     return [
         str(row["number"]),
-        row["variant"],
+        row["variant"] + " ★" * (row["variant"] == OWN),
         resolution_words(row["downscale"]),
         f"{row['steps']:,}",
         f"{row['train_seconds']:.1f} s",

@@ -217,11 +217,8 @@ def test_page_shows_the_study_and_leaves_its_time_out(tmp_path: Path, progress: 
     assert "What each part of the method is worth" not in text, "no picture, no title"
     assert summary == summary_before, "the study's time is none of the run's"
     Image.new("RGB", (64, 48)).save(inputs["tradeoff"] / "ablation.png")
-    study |= {"command": None}
-    write_json(inputs["tradeoff"] / "tradeoff.json", study)
     text = written(inputs, tmp_path / "pictures", progress)[0]
     assert "What each part of the method is worth" in text and "Against the complete one: −2 dB." in text
-    assert "The workspace has it already." in text and "Train it" not in text
 
 
 def test_a_large_video_lies_beside_the_page(inputs: dict[str, Path], tmp_path: Path, progress: Any):

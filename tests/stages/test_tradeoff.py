@@ -175,7 +175,8 @@ def test_the_field_of_the_workspace_is_a_point_and_no_output(
     assert (points[OWN]["train_seconds"], points[OWN]["steps"]) == (facts["train_seconds"], 70)
     assert 5 < points[OWN]["psnr"] < 60 and points[OWN]["peak_memory_mb"] is None
     assert OWN not in {row["variant"] for row in read_json(tmp_path / "none" / "tradeoff.json")["points"]}
-    assert "This workspace's field (" in (tmp_path / "own" / "tradeoff.md").read_text()
+    text = (tmp_path / "own" / "tradeoff.md").read_text()
+    assert "This workspace's field (" in text and "this workspace's field ★ |" in text
 
 
 def test_a_field_that_is_drawn_slowly_is_scored_on_some_pixels_of_the_same_windows(
