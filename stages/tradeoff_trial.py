@@ -31,6 +31,8 @@ MEMORY_LOOK_SECONDS = 0.05
 OWN_FAULTS = ("training diverged", "the field does not learn", "nothing is left to train on")
 """What stage train says where the arm itself is at fault: it would say so again."""
 
+Colour = tuple[float, float, float]
+
 
 class Window(NamedTuple):
     """A held-out photo or a part of one: rays and colours (h, w, …), and which pixels count (None: all)."""
@@ -49,12 +51,14 @@ class Window(NamedTuple):
 @dataclass(frozen=True)
 class Exam:
     """What every arm of a study is scored on, and whole photos to see it by; make it with :func:`make_exam`. ``frame``
-    is a whole photo's pixels at the size scored at."""
+    is a whole photo's pixels at the size scored at; ``background`` is what photos and fields are shown over, whatever a
+    field was trained over."""
 
     scene: "Scene"
     windows: tuple[Window, ...]
     photos: tuple[Window, ...]
     frame: int
+    background: Colour
 
 
 def make_exam(ingest: Path, scene: "Scene", downscale: float, count: int, small: float) -> Exam:
@@ -62,24 +66,25 @@ def make_exam(ingest: Path, scene: "Scene", downscale: float, count: int, small:
     1/``small``."""
     from stages.spread import spread
     from stages.training_data import scaled_size
-
-    test = scene.of_split("test")
-    windows = tuple(_window(ingest, scene, test[i % len(test)], downscale, i) for i in range(count))
-    photos = tuple(_photo(ingest, scene, test[i], small) for i in spread(len(test), min(SHOWN, len(test))))
-    width, height = scaled_size(scene.cameras[test[0].camera], downscale)
-    return Exam(scene, windows, photos, width * height)
-
-
-def _photo(ingest: Path, scene: "Scene", view: "View", downscale: float) -> Window:
-    from stages.training_data import view_mask, view_pixels, view_rays
     from stages.training_setup import BLACK, WHITE
 
-    truth = view_pixels(ingest, scene, view, downscale, WHITE if scene.has_alpha else BLACK)
+    test, background = scene.of_split("test"), WHITE if scene.has_alpha else BLACK
+    windows = tuple(_window(ingest, scene, test[i % len(test)], downscale, background, i) for i in range(count))
+    shown = [test[i] for i in spread(len(test), min(SHOWN, len(test)))]
+    photos = tuple(_photo(ingest, scene, view, small, background) for view in shown)
+    width, height = scaled_size(scene.cameras[test[0].camera], downscale)
+    return Exam(scene, windows, photos, width * height, background)
+
+
+def _photo(ingest: Path, scene: "Scene", view: "View", downscale: float, background: Colour) -> Window:
+    from stages.training_data import view_mask, view_pixels, view_rays
+
+    truth = view_pixels(ingest, scene, view, downscale, background)
     return Window(view.name, view_rays(scene, view, downscale), truth, view_mask(ingest, scene, view, downscale))
 
 
-def _window(ingest: Path, scene: "Scene", view: "View", downscale: float, number: int) -> Window:
-    whole = _photo(ingest, scene, view, downscale)
+def _window(ingest: Path, scene: "Scene", view: "View", downscale: float, background: Colour, number: int) -> Window:
+    whole = _photo(ingest, scene, view, downscale, background)
     top, left = (
         int((0.5 + number * step) % 1 * (max(0, size - WINDOW) + 1))
         for step, size in zip(STEPS_OF_PLACES, whole.truth.shape[:2], strict=True)
@@ -169,11 +174,12 @@ def draw_photos(field: Path, exam: Exam) -> "list[Tensor]":
 
 
 def _painter(field: Path, exam: Exam) -> "Callable[[Window], Tensor]":
-    """What draws a window by the field in a folder, in [0, 1], exposed as its photo is expected to be."""
+    """What draws a window by the field in a folder, in [0, 1], over what photos are over, exposed as its photo is
+    expected to be."""
     from stages.drawing import load_painter
     from stages.effect_decisions import expected_gains
 
-    painter = load_painter(field)
+    painter = load_painter(field, exam.background)
     gains = expected_gains(read_json(field / "field.json"), exam.scene, exam.scene.of_split("test"))
 
     def paint(window: Window) -> "Tensor":

@@ -190,6 +190,21 @@ def test_a_field_that_is_drawn_slowly_is_scored_on_some_pixels_of_the_same_windo
     assert 0 < abs(whole["psnr"] - thinned["psnr"]) < 2
 
 
+def test_a_field_trained_over_black_is_scored_over_what_the_photos_are_over(
+    tmp_path: Path, photos: dict[str, Path], progress: Any
+) -> None:
+    white, black = tmp_path / "white", tmp_path / "black"
+    white.mkdir()
+    train.run(train.Config(steps=70, downscale=1.0, **TINY_GRID), photos, white, progress)
+    shutil.copytree(white, black)
+    field = read_json(white / "field.json")
+    write_json(black / "field.json", field | {"background": [0.0, 0.0, 0.0]})
+    exam = tradeoff_trial.make_exam(photos["ingest"], read_scene(photos["normalise"]), 1.0, 4, 1.0)
+    assert list(exam.background) == field["background"] == [1.0, 1.0, 1.0]
+    scores = [tradeoff_trial.score(folder, exam, progress)["psnr"] for folder in (white, black)]
+    assert scores[0] == scores[1]
+
+
 def test_an_arm_that_does_not_learn_is_said_and_the_study_goes_on(
     tmp_path: Path, photos: dict[str, Path], progress: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
