@@ -33,7 +33,7 @@ from stages.tradeoff_arms import (
 
 if TYPE_CHECKING:
     from nerf.scene import Scene
-    from stages.tradeoff_front import Point
+    from stages.tradeoff_own import Own
     from stages.tradeoff_trial import Exam
 
 NEEDS = ("ingest", "normalise", "effects")
@@ -113,7 +113,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
             want of memory or disk.
     """
     from stages.tradeoff_clock import counted
-    from stages.tradeoff_own import own_point
+    from stages.tradeoff_own import own_field
     from stages.tradeoff_trial import make_exam
 
     config = config if config.speeds else plan(config, inputs, progress)
@@ -124,7 +124,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     with counted(folder / "clock.json") as spent:
         exam = make_exam(inputs["ingest"], scene, config.downscale, config.windows, config.sizes[-1])
         trials, late = _run_all(config, selection, exam, inputs, folder, progress, spent)
-        own = own_point(exam, inputs, folder / "arms", progress)
+        own = own_field(exam, inputs, folder / "arms", config.seconds, progress)
     if all(trial.figures["failed"] for trial in trials):
         why = "; ".join(dict.fromkeys(str(trial.figures["failed"]) for trial in trials))
         why = why or f"{duration(config.seconds)} are too short here even for {selection.left_out[0]}"
@@ -233,7 +233,7 @@ class _ArmProgress:
 def _written(
     config: Config,
     trials: Sequence[Trial],
-    own: "Point | None",
+    own: "Own | None",
     left_out: Sequence[str],
     exam: "Exam",
     folder: Path,
@@ -245,16 +245,18 @@ def _written(
     from stages.tradeoff_front import command, points_of, recommend, table
     from stages.tradeoff_plot import write_plot
 
-    points = points_of(trials, own)
+    points = points_of(trials, own.point if own else None)
     recommendation = recommend(points)
     chosen = recommendation.point
+    thinned = [trial.arm.variant for trial in trials if trial.arm.every > 1]
+    thinned += [OWN] if own and own.every > 1 else []
     study = {
         "headline": recommendation.headline,
         "recommendation": recommendation.words,
         "command": command(chosen, workspace),
         "recommended": points.index(chosen) + 1,
         "still_rising": recommendation.still_rising,
-        "scored": _scored_on(config, exam, [trial.arm for trial in trials]),
+        "scored": _scored_on(config, exam, thinned),
         "points": table(points),
         "ablation": worth_words(trials),
         "arms": [{**trial.arm._asdict(), **trial.figures} for trial in trials],
@@ -280,16 +282,17 @@ def _quality(trial: Trial) -> dict[str, Any]:
     return {**trial.arm.options, "variant": trial.arm.variant, **figures}
 
 
-def _scored_on(config: Config, exam: "Exam", arms: Sequence[Arm]) -> str:
+def _scored_on(config: Config, exam: "Exam", thinned: Sequence[str]) -> str:
+    """What scores are of; ``thinned`` are the variants that are scored on fewer pixels."""
     from stages.tradeoff_trial import WINDOW
 
     photos = len({window.photo for window in exam.windows})
     assert config.downscale
-    slow = ", ".join(dict.fromkeys(arm.variant for arm in arms if arm.every > 1))
-    thinned = f"; {slow}: one in {THINNED} of their rows and columns, for drawing all would take too long"
+    slow = ", ".join(dict.fromkeys(thinned))
+    but = f"; {slow}: one in {THINNED} of their rows and columns, for drawing all would take too long"
     return (
         f"{len(exam.windows)} windows of {WINDOW} × {WINDOW} pixels of {photos} held-out photo{'s' * (photos > 1)} "
-        f"at {resolution_words(config.downscale)}, the same for all{thinned if slow else ''}"
+        f"at {resolution_words(config.downscale)}, the same for all{but if slow else ''}"
     )
 
 

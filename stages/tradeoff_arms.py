@@ -228,9 +228,15 @@ def _arm(
     speed, trained = speeds[VARIANTS[variant].speed], seconds * LONGEST / RUNG**rung
     steps = max(1, round_to_two_digits(trained * speed.steps))
     drawn = drawn_per_second(variant, speed)
-    every = 1 if drawn_rays / drawn <= MOST_SCORING * seconds else THINNED
+    every = scored_every(drawn_rays / drawn, seconds)
     training = OVERHEAD * VARIANTS[variant].cost * steps / speed.steps
     return Arm(variant, downscale, steps, seed, training + (PROBED_RAYS + drawn_rays / every**2) / drawn, every)
+
+
+def scored_every(drawing: float, seconds: float) -> int:
+    """Of so many pixels of the windows, along both axes, one is scored: all, unless ``drawing`` them takes too many of
+    a study's ``seconds``."""
+    return 1 if drawing <= MOST_SCORING * seconds else THINNED
 
 
 def round_to_two_digits(value: float) -> int:

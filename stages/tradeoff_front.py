@@ -184,8 +184,8 @@ def _ended(point: Point, tried: Sequence[Point], rising: bool) -> str:
     if rising:
         longest = max(other.train_seconds for other in tried if other.field == point.field)
         return (
-            "Nothing tried is better, and up to there every doubling of the time paid: no field of its kind was trained "
-            f"for longer than {duration(longest)}, a larger --budget tries longer ones"
+            "Nothing tried is better, and up to there every doubling of the time paid: no field of its kind was "
+            f"trained for longer than {duration(longest)}, a larger --budget tries longer ones"
         )
     if len(tried) == 1:
         return "Only one setting was tried"

@@ -4,6 +4,7 @@ Every field is scored on the same pixels at the same size, whatever size it was 
 photos because the published networks would take longer to draw those than to be trained.
 """
 
+import math
 import shutil
 import threading
 import time
@@ -166,6 +167,18 @@ def score(field: Path, exam: Exam, progress: Progress, every: int = 1) -> dict[s
         "model_mb": round((field / "field.safetensors").stat().st_size / 1e6, 3),
         "frame_seconds": round(seconds * exam.frame / rays, 4),
     }
+
+
+def drawing_seconds(field: Path, exam: Exam) -> float:
+    """What drawing all windows of ``exam`` by the field in a folder takes here, told by parts of one of them."""
+    from stages.drawing import TIMED_SECONDS, load_painter
+
+    def sample(side: int) -> "Rays":
+        some = slice(None, None, math.ceil(WINDOW / side))
+        return exam.windows[0].part((some, some)).rays
+
+    rays = sum(window.rays.near.numel() for window in exam.windows)
+    return rays / load_painter(field, exam.background).rays_per_second(sample, WINDOW, TIMED_SECONDS)
 
 
 def draw_photos(field: Path, exam: Exam) -> "list[Tensor]":

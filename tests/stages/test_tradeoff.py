@@ -9,11 +9,12 @@ import psutil
 import pytest
 import torch
 
-from stages import tradeoff, tradeoff_arms, tradeoff_clock, tradeoff_trial, train
+from stages import tradeoff, tradeoff_arms, tradeoff_clock, tradeoff_own, tradeoff_trial, train
 from stages.contract import StageError
 from stages.files import read_json, read_scene, write_json
 from stages.tradeoff import Config
 from stages.tradeoff_arms import FEWER_RAYS, OWN, PUBLISHED, VARIANTS, Arm
+from stages.tradeoff_own import own_field
 from tests.stages.photo_scene import photographed
 
 TINY_GRID: dict[str, Any] = {"levels": 2, "log2_rows": 10, "finest": 32, "batch_samples": 1024}
@@ -177,6 +178,28 @@ def test_the_field_of_the_workspace_is_a_point_and_no_output(
     assert OWN not in {row["variant"] for row in read_json(tmp_path / "none" / "tradeoff.json")["points"]}
     text = (tmp_path / "own" / "tradeoff.md").read_text()
     assert "This workspace's field (" in text and "this workspace's field ★ |" in text
+
+
+def test_the_field_of_the_workspace_is_scored_on_some_pixels_where_it_is_drawn_slowly_and_that_is_said(
+    tmp_path: Path, photos: dict[str, Path], progress: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own, kind = tmp_path / "train" / "0123456789abcdef", {"field": "paper", **TINY_PAPER}
+    own.mkdir(parents=True)
+    facts = train.run(train.Config(steps=70, downscale=1.0, **kind), photos, own, progress).facts
+    write_json(own / "manifest.json", {"facts": facts})
+    exam = tradeoff_trial.make_exam(photos["ingest"], read_scene(photos["normalise"]), 1.0, 4, 1.0)
+    assert 0 < tradeoff_trial.drawing_seconds(own, exam) < 10
+    for seconds, every in ((1e3, 1), (1e-6, 4)):
+        folder = tmp_path / str(every)
+        folder.mkdir()
+        found = own_field(exam, photos | {"train": own}, folder, seconds, progress)
+        assert found and (found.every, found.key) == (every, "0123456789abcdef")
+        assert (found.point.ssim is None) == (every > 1) and found.point.field == "paper"
+        assert own_field(exam, photos | {"train": own}, folder, 1e3, progress) == found, "as an earlier attempt found"
+    monkeypatch.setattr(tradeoff_own, "scored_every", lambda *_: 4)
+    studied(tmp_path / "study", photos | {"train": own}, progress, seeds=1, seconds=8.0)
+    scored = read_json(tmp_path / "study" / "tradeoff.json")["scored"]
+    assert "; this workspace's field: one in 4 of their rows and columns, for drawing all would take" in scored
 
 
 def test_a_field_that_is_drawn_slowly_is_scored_on_some_pixels_of_the_same_windows(
