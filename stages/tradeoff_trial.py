@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from stages.contract import Inputs, Progress, StageError
 from stages.files import read_json, write_json
-from stages.tradeoff_arms import Arm
+from stages.tradeoff_arms import SMALL_SIDE, Arm
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -64,7 +64,7 @@ class Exam:
 
 def make_exam(ingest: Path, scene: "Scene", downscale: float, count: int, small: float) -> Exam:
     """``count`` windows spread over the held-out photos at 1/``downscale`` of their size, and SHOWN of these photos at
-    1/``small``."""
+    1/``small``, large ones still smaller: of at most SMALL_SIDE pixels, which the study has time to draw."""
     from stages.spread import spread
     from stages.training_data import scaled_size
     from stages.training_setup import BLACK, WHITE
@@ -72,7 +72,9 @@ def make_exam(ingest: Path, scene: "Scene", downscale: float, count: int, small:
     test, background = scene.of_split("test"), WHITE if scene.has_alpha else BLACK
     windows = tuple(_window(ingest, scene, test[i % len(test)], downscale, background, i) for i in range(count))
     shown = [test[i] for i in spread(len(test), min(SHOWN, len(test)))]
-    photos = tuple(_photo(ingest, scene, view, small, background) for view in shown)
+    sides = [max(camera.width, camera.height) for camera in (scene.cameras[view.camera] for view in shown)]
+    sizes = [max(small, side / SMALL_SIDE) for side in sides]
+    photos = tuple(_photo(ingest, scene, *each, background) for each in zip(shown, sizes, strict=True))
     width, height = scaled_size(scene.cameras[test[0].camera], downscale)
     return Exam(scene, windows, photos, width * height, background)
 
@@ -203,14 +205,17 @@ def _painter(field: Path, exam: Exam) -> "Callable[[Window], Tensor]":
 
 
 def write_strip(path: Path, windows: "list[Tensor]") -> None:
-    """Pictures (h, w, 3) in [0, 1] side by side as a PNG, cut to the smallest."""
-    import torch
+    """Pictures (h, w, 3) in [0, 1] side by side as a PNG, as high as the lowest."""
+    import cv2
+    import numpy as np
 
     from stages.files import write_png
 
-    height, width = (min(window.shape[axis] for window in windows) for axis in (0, 1))
-    row = torch.cat([window[:height, :width] for window in windows], dim=1)
-    write_png(path, (row * 255).round().byte().numpy())
+    height = min(window.shape[0] for window in windows)
+    sizes = [(max(1, round(window.shape[1] * height / window.shape[0])), height) for window in windows]
+    pairs = zip(windows, sizes, strict=True)
+    pictures = [cv2.resize(window.numpy(), size, interpolation=cv2.INTER_AREA) for window, size in pairs]
+    write_png(path, np.rint(np.concatenate(pictures, axis=1) * 255).astype(np.uint8))
 
 
 @contextmanager

@@ -1,6 +1,7 @@
 import shutil
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -8,7 +9,9 @@ from typing import Any
 import psutil
 import pytest
 import torch
+from PIL import Image
 
+from nerf.scene import Camera
 from stages import tradeoff, tradeoff_arms, tradeoff_clock, tradeoff_own, tradeoff_trial, train
 from stages.contract import StageError
 from stages.files import read_json, read_scene, write_json
@@ -312,6 +315,23 @@ def test_windows_are_parts_of_the_photos(photos: dict[str, Path], monkeypatch: p
         assert len(places) == 1
         y, x = places[0]
         assert torch.equal(truth[y : y + 8, x : x + 8], window.truth)
+
+
+def test_large_photos_among_small_ones_are_drawn_small_and_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tradeoff_trial, "SMALL_SIDE", 12)
+    inputs, scene = photographed(tmp_path)
+    large = Camera("PINHOLE", 240, 120, (200.0, 200.0, 120.0, 60.0))
+    Image.new("RGB", (240, 120), "red").save(inputs["ingest"] / scene.views[4].file)
+    views = (*scene.views[:4], replace(scene.views[4], camera=1), *scene.views[5:])
+    scene = replace(scene, cameras=(*scene.cameras, large), views=views)
+    exam = tradeoff_trial.make_exam(inputs["ingest"], scene, 1.0, 2, 2.0)
+    assert [photo.truth.shape for photo in exam.photos] == [(8, 12, 3), (6, 12, 3)]
+    tradeoff_trial.write_strip(tmp_path / "strip.png", [photo.truth for photo in exam.photos])
+    with Image.open(tmp_path / "strip.png") as strip:
+        assert strip.size == (9 + 12, 6), "nothing is cut off"
+        assert strip.getpixel((20, 5)) == (255, 0, 0) and strip.getpixel((0, 5)) == (255, 255, 255)
 
 
 def test_memory_is_looked_at_while_the_block_runs() -> None:
