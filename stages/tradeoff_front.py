@@ -7,9 +7,10 @@ Front and recommendation are of what the study trained: the workspace's own fiel
 study has time for, would else be the answer for every scene. It is placed beside them.
 
 **The rule of the spread**: a setting's is pooled over the settings nearest to it in training time, of the same kind of
-field, as many as give ``LEAST_FREEDOM`` degrees of freedom. One from two seeds alone is hardly known: of n degrees of
-freedom a standard deviation is uncertain by 1 / √(2n) of itself. But only alike ones may be pooled: after a hundred
-steps seeds differ by 2 dB, after a thousand by 0.05 (fox, docs/numbers.md).
+field, as many as give ``LEAST_FREEDOM`` degrees of freedom, but, where nearer ones tell something, none that took more
+than ``ALIKE`` times as long or as short. One from two seeds alone is hardly known: of n degrees of freedom a standard
+deviation is uncertain by 1 / √(2n) of itself. But only alike ones may be pooled: after a hundred steps seeds differ by
+2 dB, after a thousand by 0.05 (fox, docs/numbers.md).
 """
 
 import math
@@ -24,6 +25,7 @@ from stages.tradeoff_arms import OWN, VARIANTS, Arm, field_of, resolution_words
 
 WORTH_DB = 0.5  # a doubling of the time that buys less is not worth it; 0.5 dB is what one sees side by side
 LEAST_FREEDOM = 3
+ALIKE = 5.0  # times the seconds of a training: three rungs of the ladder
 MUCH_LONGER = 1.2  # times the seconds of a training: those of about its time tell nothing of more time
 
 
@@ -105,8 +107,12 @@ def spread_at(point: Point, points: Sequence[Point]) -> float | None:
     several = [other for other in points if other.deviation is not None]
     alike = [other for other in several if other.field == point.field] or several
     squares, freedom = 0.0, 0
-    for other in sorted(alike, key=lambda other: abs(math.log(other.train_seconds / point.train_seconds))):
-        if freedom < LEAST_FREEDOM:
+
+    def distance(other: Point) -> float:
+        return abs(math.log(other.train_seconds / point.train_seconds))
+
+    for other in sorted(alike, key=distance):
+        if freedom == 0 or (freedom < LEAST_FREEDOM and distance(other) <= math.log(ALIKE)):
             squares += (other.seeds - 1) * (other.deviation or 0.0) ** 2
             freedom += other.seeds - 1
     return math.sqrt(squares / freedom) if freedom else None

@@ -151,6 +151,15 @@ def test_the_spread_of_one_kind_of_field_is_not_that_of_another_unless_nothing_e
     assert spread_at(ablated, [grid, ablated]) == pytest.approx(0.1)
 
 
+def test_the_ends_of_a_ladder_keep_their_own_spread() -> None:
+    """Where the time was too short for second seeds in between."""
+    ends = [point(4, 14, seeds=2, deviation=1.7), *(point(s, 30, seeds=2, deviation=0.05) for s in (60, 61))]
+    between = [point(s, 20) for s in (7, 12, 20, 35)]
+    points = [*ends, *between]
+    assert [spread_at(p, points) for p in ends] == [pytest.approx(d) for d in (1.7, 0.05, 0.05)]
+    assert [spread_at(p, points) for p in between[::3]] == [pytest.approx(d) for d in (1.7, 0.05)]
+
+
 def test_a_small_spread_has_its_digits() -> None:
     assert "23.00 ± 0.02 dB" in recommend(ladder([3.0, 0.1], seeds=4, spread=0.04)).words
 
