@@ -54,7 +54,7 @@ class Config(StageConfig):
     seconds: float = Field(default=1800.0, gt=0, description="for all trainings and scores; --budget 30m says the same")
     seeds: int = Field(default=3, ge=1, le=9, description="trainings of one setting at most, as far as the time goes")
     downscale: float | None = Field(
-        default=None, ge=1, description="photo width / width that all are scored at; none: the finest trained at"
+        default=None, ge=1, description="photo width / width that all are scored at; none: the finest of the study"
     )
     # Measured or chosen by plan(); no flag is offered for them.
     speeds: Annotated[dict[str, tuple[float, float]] | None, Suppress] = Field(
@@ -184,25 +184,27 @@ def _run_all(
     progress: Progress,
     spent: Callable[[], float],
 ) -> tuple[list[Trial], tuple[str, ...]]:
-    """Every arm that the time allows, and those that it did not because the machine was slower than measured. ``spent``
-    tells the seconds that the study has taken so far, attempts that were killed included."""
+    """Every arm that the time allows, the first one in any case, and those that it does not. ``spent`` tells the seconds
+    that the study has taken so far, attempts that were killed included: whatever these took, asking again helps."""
     from stages.tradeoff_trial import figures_file, run_arm
 
     trials, late, worked, expected, arms = list[Trial](), list[Arm](), 0.0, 0.0, folder / "arms"
+    slowness = 1.0
     for number, arm in enumerate(selection.arms, 1):
-        slowness = worked / expected if expected else 1.0
         too_late = spent() + arm.seconds * slowness > (1 + LATE) * config.seconds
-        if too_late and not figures_file(arm, arms).exists():
+        if trials and too_late and not figures_file(arm, arms).exists():
             late.append(arm)
             continue
         inner = _ArmProgress(progress, f"{number}/{len(selection.arms)} {arm.variant}", spent() / config.seconds)
         figures = run_arm(arm, exam, inputs, arms, inner)
         trials.append(Trial(arm, figures))
         worked, expected = worked + figures["wall_seconds"], expected + arm.seconds
+        slowness = worked / expected
         progress.note(f"{number}/{len(selection.arms)} {_trial_words(arm, figures)}")
     named = in_words(late)
     if late:
-        progress.note(f"the machine is slower than when it was measured; not trained: {'; '.join(named)}")
+        why = "the machine is slower than when it was measured" if slowness > 1 else "no time left"
+        progress.note(f"{why}; not trained: {'; '.join(named)}")
     return trials, named
 
 
@@ -258,7 +260,8 @@ def _written(
         "still_rising": recommendation.still_rising,
         "scored": _scored_on(config, exam, thinned),
         "points": table(points),
-        "ablation": worth_words(trials),
+        "own": own and {"train": own.key, "every": own.every},
+        "ablation": worth_words(trials, config.downscale or 1.0),
         "arms": [{**trial.arm._asdict(), **trial.figures} for trial in trials],
         "left_out": list(left_out),
     }
@@ -266,7 +269,7 @@ def _written(
     write_json(folder / "quality.json", [_quality(trial) for trial in trials])
     (folder / "tradeoff.md").write_text(markdown(study), "utf-8")
     write_plot(study, folder)
-    pictures = ablation_picture(trials, exam, folder)
+    pictures = ablation_picture(trials, exam, study["ablation"], folder)
     line = f"{len(points)} settings, {sum(row['front'] for row in study['points'])} on the front · "
     if failed := sum(trial.figures["failed"] is not None for trial in trials):
         line += f"{failed} of {len(trials)} trainings without a result · "

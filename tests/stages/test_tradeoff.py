@@ -161,6 +161,19 @@ def test_what_a_killed_attempt_took_is_time_of_the_study(
     assert 0.9 * CONFIG["seconds"] < now[0] - 100 <= 1.1 * CONFIG["seconds"]
     first, again = (note for note in progress.notes if "done at about" in note)
     assert " trainings: done at about " in first and " trainings, 3 of them there: done at about " in again
+    assert any(note.startswith("no time left; not trained: ") for note in progress.notes)
+    assert not any("slower" in note for note in progress.notes), "the kill took the time"
+
+
+def test_a_study_whose_killed_attempts_took_all_its_time_still_has_a_result(
+    tmp_path: Path, photos: dict[str, Path], progress: Any, now: list[float]
+) -> None:
+    for _ in range(3):
+        now[2] = 1
+        with pytest.raises(Killed):
+            studied(tmp_path, photos, progress)
+    studied(tmp_path, photos, progress)
+    assert len(read_json(tmp_path / "tradeoff.json")["arms"]) == 1
 
 
 def test_the_field_of_the_workspace_is_a_point_and_no_output(
@@ -178,6 +191,7 @@ def test_the_field_of_the_workspace_is_a_point_and_no_output(
     points = {row["variant"]: row for row in read_json(tmp_path / "own" / "tradeoff.json")["points"]}
     assert (points[OWN]["train_seconds"], points[OWN]["steps"]) == (facts["train_seconds"], 70)
     assert 5 < points[OWN]["psnr"] < 60 and points[OWN]["peak_memory_mb"] is None
+    assert read_json(tmp_path / "own" / "tradeoff.json")["own"]["train"] == own.name
     assert OWN not in {row["variant"] for row in read_json(tmp_path / "none" / "tradeoff.json")["points"]}
     text = (tmp_path / "own" / "tradeoff.md").read_text()
     assert "This workspace's field (" in text and "this workspace's field ★ |" in text
