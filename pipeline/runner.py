@@ -198,7 +198,7 @@ class Runner:
         return job, self._execute(job), True
 
     def _check_inputs(self, stage: str, folders: dict[str, Path]) -> None:
-        """Compare all that ``stage`` is about to read with its sha256. Raises DamagedInputs after setting the bad aside.
+        """Compare all that ``stage`` is to read with its sha256. Raises DamagedInputs after setting the bad aside.
         What it reads only where that is there stays in place and leaves ``folders``: nobody makes that again here.
 
         Once per program and stage: what this program wrote itself was hashed when it was written.

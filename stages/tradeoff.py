@@ -184,8 +184,8 @@ def _run_all(
     progress: Progress,
     spent: Callable[[], float],
 ) -> tuple[list[Trial], tuple[str, ...]]:
-    """Every arm that the time allows, the first one in any case, and those that it does not. ``spent`` tells the seconds
-    that the study has taken so far, attempts that were killed included: whatever these took, asking again helps."""
+    """Every arm that the time allows, the first one in any case: whatever killed attempts took, asking again helps. And
+    those that it does not. ``spent`` tells the seconds that the study has taken so far, such attempts included."""
     from stages.tradeoff_trial import figures_file, run_arm
 
     trials, late, worked, expected, arms = list[Trial](), list[Arm](), 0.0, 0.0, folder / "arms"

@@ -218,7 +218,7 @@ def test_page_shows_the_study_and_leaves_its_time_out(tmp_path: Path, progress: 
     assert "the star" not in text and "before the present one" not in text
     assert summary == summary_before, "the study's time is none of the run's"
     Image.new("RGB", (64, 48)).save(inputs["tradeoff"] / "ablation.png")
-    for key, older in (("0123456789abcdef", True), (inputs["train"].resolve().name, False)):
+    for key, older in (("fedcba9876543210", True), (inputs["train"].resolve().name, False)):
         study |= {"own": {"train": key, "every": 1}}
         write_json(inputs["tradeoff"] / "tradeoff.json", study)
         text = written(inputs, tmp_path / f"pictures_{older}", progress)[0]
