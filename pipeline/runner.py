@@ -190,29 +190,37 @@ class Runner:
             manifest = None if stage in self.force else self.find_finished(job)
             if manifest is not None:
                 return job, manifest, False
-            self._check_inputs(job.folders)
+            self._check_inputs(stage, job.folders)
         except DamagedInputs:
             self._make_inputs_again(stage)
             return self._found_or_made(stage)
         self.workspace.unlink_outputs(job.module.LINKS)
         return job, self._execute(job), True
 
-    def _check_inputs(self, folders: Mapping[str, Path]) -> None:
-        """Compare all that a stage is about to read with its sha256. Raises DamagedInputs after setting the bad aside.
+    def _check_inputs(self, stage: str, folders: dict[str, Path]) -> None:
+        """Compare all that ``stage`` is to read with its sha256. Raises DamagedInputs after setting the bad aside.
+        What it reads only where that is there stays in place and leaves ``folders``: nobody makes that again here.
 
         Once per program and stage: what this program wrote itself was hashed when it was written.
         """
         damaged = False
-        for name in folders:
-            if name in self.checked:
-                continue
+        for name in [name for name in folders if name not in self.checked]:
             self.display.update(f"checking the files of {name}")
+            needed = name in STAGES[stage].NEEDS
             try:
-                self.workspace.finished(name, self.done[name].key, deep=True)
+                if needed:
+                    self.workspace.finished(name, self.done[name].key, deep=True)
+                else:
+                    manifests.check_outputs(folders[name], self.done[name], deep=True)
                 self.checked.add(name)
             except BadManifest as problem:
-                self.display.note(f"set aside as .bad and made again: {problem}")
-                damaged = True
+                damaged = damaged or needed
+                if needed:
+                    self.display.note(f"set aside as .bad and made again: {problem}")
+                else:
+                    del folders[name]
+                    again = f"`pipeline resume --verify` makes it again ({problem})"
+                    self.display.note(f"{name} is damaged: left out; {again}")
         if damaged:
             raise DamagedInputs
 
@@ -273,7 +281,7 @@ class Runner:
             return module.Config.model_validate(plans[asked] | options.model_dump(include=paths))
         if not may_plan:
             raise NotReady(stage)
-        self._check_inputs(folders)
+        self._check_inputs(stage, folders)
         self._begin_work(stage)
         clock = time.monotonic()
         with heartbeat.beating(self.workspace.root / heartbeat.NAME):

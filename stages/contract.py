@@ -4,7 +4,8 @@ A stage is a module of this package with
 
 * ``NEEDS: tuple[str, ...]``: the stages whose finished folders it reads;
 * optionally ``OPTIONAL: tuple[str, ...]``: stages whose finished folders it reads where they are there: they are no
-  part of its key and are not brought up to date for it, so no output may depend on them;
+  part of its key and are not brought up to date for it, nor given to it where damaged, so no output may depend on
+  them;
 * ``VERSION: int``: raised whenever the same config and inputs would give other outputs than before;
 * ``RESUMES: bool``: whether it can go on from its own half-written folder (otherwise it starts clean);
 * ``LINKS: tuple[str, ...]``: the outputs or records shown in ``<workspace>/output/``;

@@ -301,13 +301,15 @@ def _study(results: Results) -> dict[str, Any] | None:
 
     if results.study is None:
         return None
-    ablation = results.inputs["tradeoff"] / "ablation.png"
+    ablation, own = results.inputs["tradeoff"] / "ablation.png", results.study["own"]
+    train = results.inputs.get("train")
     return results.study | {
         "svg": Markup(plot_svg(results.study)),
         "columns": COLUMNS,
         "fields": meanings(results.study["points"]),
         "drawing": drawing_words(results.study["points"]),
         "rows": [{"cells": cells(row), "front": row["front"]} for row in results.study["points"]],
+        "own_is_older": own and train and own["train"] != train.resolve().name,
         "sheet": _data_uri(ablation.read_bytes(), "image/png") if ablation.exists() else None,
     }
 

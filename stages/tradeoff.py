@@ -33,7 +33,7 @@ from stages.tradeoff_arms import (
 
 if TYPE_CHECKING:
     from nerf.scene import Scene
-    from stages.tradeoff_front import Point
+    from stages.tradeoff_own import Own
     from stages.tradeoff_trial import Exam
 
 NEEDS = ("ingest", "normalise", "effects")
@@ -54,7 +54,7 @@ class Config(StageConfig):
     seconds: float = Field(default=1800.0, gt=0, description="for all trainings and scores; --budget 30m says the same")
     seeds: int = Field(default=3, ge=1, le=9, description="trainings of one setting at most, as far as the time goes")
     downscale: float | None = Field(
-        default=None, ge=1, description="photo width / width that all are scored at; none: the finest trained at"
+        default=None, ge=1, description="photo width / width that all are scored at; none: the finest of the study"
     )
     # Measured or chosen by plan(); no flag is offered for them.
     speeds: Annotated[dict[str, tuple[float, float]] | None, Suppress] = Field(
@@ -113,7 +113,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
             want of memory or disk.
     """
     from stages.tradeoff_clock import counted
-    from stages.tradeoff_own import own_point
+    from stages.tradeoff_own import own_field
     from stages.tradeoff_trial import make_exam
 
     config = config if config.speeds else plan(config, inputs, progress)
@@ -124,7 +124,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     with counted(folder / "clock.json") as spent:
         exam = make_exam(inputs["ingest"], scene, config.downscale, config.windows, config.sizes[-1])
         trials, late = _run_all(config, selection, exam, inputs, folder, progress, spent)
-        own = own_point(exam, inputs, folder / "arms", progress)
+        own = own_field(exam, inputs, folder / "arms", config.seconds, progress)
     if all(trial.figures["failed"] for trial in trials):
         why = "; ".join(dict.fromkeys(str(trial.figures["failed"]) for trial in trials))
         why = why or f"{duration(config.seconds)} are too short here even for {selection.left_out[0]}"
@@ -184,25 +184,27 @@ def _run_all(
     progress: Progress,
     spent: Callable[[], float],
 ) -> tuple[list[Trial], tuple[str, ...]]:
-    """Every arm that the time allows, and those that it did not because the machine was slower than measured. ``spent``
-    tells the seconds that the study has taken so far, attempts that were killed included."""
+    """Every arm that the time allows, the first one in any case: whatever killed attempts took, asking again helps. And
+    those that it does not. ``spent`` tells the seconds that the study has taken so far, such attempts included."""
     from stages.tradeoff_trial import figures_file, run_arm
 
     trials, late, worked, expected, arms = list[Trial](), list[Arm](), 0.0, 0.0, folder / "arms"
+    slowness = 1.0
     for number, arm in enumerate(selection.arms, 1):
-        slowness = worked / expected if expected else 1.0
         too_late = spent() + arm.seconds * slowness > (1 + LATE) * config.seconds
-        if too_late and not figures_file(arm, arms).exists():
+        if trials and too_late and not figures_file(arm, arms).exists():
             late.append(arm)
             continue
         inner = _ArmProgress(progress, f"{number}/{len(selection.arms)} {arm.variant}", spent() / config.seconds)
         figures = run_arm(arm, exam, inputs, arms, inner)
         trials.append(Trial(arm, figures))
         worked, expected = worked + figures["wall_seconds"], expected + arm.seconds
+        slowness = worked / expected
         progress.note(f"{number}/{len(selection.arms)} {_trial_words(arm, figures)}")
     named = in_words(late)
     if late:
-        progress.note(f"the machine is slower than when it was measured; not trained: {'; '.join(named)}")
+        why = "the machine is slower than when it was measured" if slowness > 1 else "no time left"
+        progress.note(f"{why}; not trained: {'; '.join(named)}")
     return trials, named
 
 
@@ -233,7 +235,7 @@ class _ArmProgress:
 def _written(
     config: Config,
     trials: Sequence[Trial],
-    own: "Point | None",
+    own: "Own | None",
     left_out: Sequence[str],
     exam: "Exam",
     folder: Path,
@@ -245,18 +247,21 @@ def _written(
     from stages.tradeoff_front import command, points_of, recommend, table
     from stages.tradeoff_plot import write_plot
 
-    points = points_of(trials, own)
+    points = points_of(trials, own.point if own else None)
     recommendation = recommend(points)
     chosen = recommendation.point
+    thinned = [trial.arm.variant for trial in trials if trial.arm.every > 1]
+    thinned += [OWN] if own and own.every > 1 else []
     study = {
         "headline": recommendation.headline,
         "recommendation": recommendation.words,
-        "command": None if chosen.variant == OWN else command(chosen, workspace),
+        "command": command(chosen, workspace),
         "recommended": points.index(chosen) + 1,
         "still_rising": recommendation.still_rising,
-        "scored": _scored_on(config, exam, [trial.arm for trial in trials]),
+        "scored": _scored_on(config, exam, thinned),
         "points": table(points),
-        "ablation": worth_words(trials),
+        "own": own and {"train": own.key, "every": own.every},
+        "ablation": worth_words(trials, config.downscale or 1.0),
         "arms": [{**trial.arm._asdict(), **trial.figures} for trial in trials],
         "left_out": list(left_out),
     }
@@ -264,18 +269,14 @@ def _written(
     write_json(folder / "quality.json", [_quality(trial) for trial in trials])
     (folder / "tradeoff.md").write_text(markdown(study), "utf-8")
     write_plot(study, folder)
-    pictures = ablation_picture(trials, exam, folder)
+    pictures = ablation_picture(trials, exam, study["ablation"], folder)
     line = f"{len(points)} settings, {sum(row['front'] for row in study['points'])} on the front · "
     if failed := sum(trial.figures["failed"] is not None for trial in trials):
         line += f"{failed} of {len(trials)} trainings without a result · "
     records = ("tradeoff.json", "tradeoff.md", "tradeoff.svg", "tradeoff.png")
     facts = {"recommendation": recommendation.words, "settings": len(points), "trainings": len(trials)}
-    line += f"{recommendation.words} {_train_it(study['command'], '')}"
+    line += f"{recommendation.words} Train it: {study['command']}"
     return StageResult(("quality.json", *pictures), line, records, facts)
-
-
-def _train_it(command: str | None, quote: str) -> str:
-    return "The workspace has it already." if command is None else f"Train it: {quote}{command}{quote}"
 
 
 def _quality(trial: Trial) -> dict[str, Any]:
@@ -284,22 +285,23 @@ def _quality(trial: Trial) -> dict[str, Any]:
     return {**trial.arm.options, "variant": trial.arm.variant, **figures}
 
 
-def _scored_on(config: Config, exam: "Exam", arms: Sequence[Arm]) -> str:
+def _scored_on(config: Config, exam: "Exam", thinned: Sequence[str]) -> str:
+    """What scores are of; ``thinned`` are the variants that are scored on fewer pixels."""
     from stages.tradeoff_trial import WINDOW
 
     photos = len({window.photo for window in exam.windows})
     assert config.downscale
-    slow = ", ".join(dict.fromkeys(arm.variant for arm in arms if arm.every > 1))
-    thinned = f"; {slow}: one in {THINNED} of their rows and columns, for drawing all would take too long"
+    slow = ", ".join(dict.fromkeys(thinned))
+    but = f"; {slow}: one in {THINNED} of their rows and columns, for drawing all would take too long"
     return (
         f"{len(exam.windows)} windows of {WINDOW} × {WINDOW} pixels of {photos} held-out photo{'s' * (photos > 1)} "
-        f"at {resolution_words(config.downscale)}, the same for all{thinned if slow else ''}"
+        f"at {resolution_words(config.downscale)}, the same for all{but if slow else ''}"
     )
 
 
 def markdown(study: dict[str, Any]) -> str:
     """tradeoff.md: the recommendation and the table. Bold rows are those that nothing beats."""
-    lines = [study["recommendation"], "", _train_it(study["command"], "`"), "", f"Scored on {study['scored']}.", ""]
+    lines = [study["recommendation"], "", f"Train it: `{study['command']}`", "", f"Scored on {study['scored']}.", ""]
     lines += ["| " + " | ".join(COLUMNS) + " |", "|---" * len(COLUMNS) + "|"]
     for row in study["points"]:
         shown = [f"**{cell}**" if row["front"] else cell for cell in cells(row)]
@@ -331,7 +333,7 @@ def cells(row: dict[str, Any]) -> list[str]:
     spread_ssim = "" if row["ssim_deviation"] is None else f" ± {row['ssim_deviation']:.3f}"
     return [
         str(row["number"]),
-        row["variant"],
+        row["variant"] + " ★" * (row["variant"] == OWN),
         resolution_words(row["downscale"]),
         f"{row['steps']:,}",
         f"{row['train_seconds']:.1f} s",

@@ -48,8 +48,8 @@ def worth(trials: Trials) -> list[Worth]:
     return found
 
 
-def worth_words(trials: Trials) -> str | None:
-    """The differences in a sentence; None where there are none."""
+def worth_words(trials: Trials, scored_at: float) -> str | None:
+    """The differences in a sentence, of scores at 1/``scored_at`` of the resolution; None where there are none."""
     found = worth(trials)
     if not found:
         return None
@@ -57,13 +57,13 @@ def worth_words(trials: Trials) -> str | None:
     seeds = max(part.seeds for part in found)
     pairs = f"seed by seed, of {seeds} seeds (± their standard deviation)" if seeds > 1 else "of one seed"
     differences = "; ".join(f"{part.variant} {part.words}" for part in found)
-    where = f"{arm.steps:,} steps each, on photos at {resolution_words(arm.downscale)}"
-    return f"Against the complete reduced method, {pairs}: {differences}; {where}."
+    sizes = f"trained on photos at {resolution_words(arm.downscale)}, scored at {resolution_words(scored_at)}"
+    return f"Against the complete reduced method, {pairs}: {differences}; {arm.steps:,} steps each, {sizes}."
 
 
-def ablation_picture(trials: Trials, exam: "Exam", folder: Path) -> tuple[str, ...]:
-    """ablation.png: held-out photos beside what the method, each variant of it and the study's best field make of them;
-    the names of the files written, none where no ablation was run."""
+def ablation_picture(trials: Trials, exam: "Exam", words: str | None, folder: Path) -> tuple[str, ...]:
+    """ablation.png: held-out photos beside what the method, each variant of it and the study's best field make of them,
+    and ``words`` below; the names of the files written, none where no ablation was run."""
     from stages.tradeoff_plot import Row, write_sheet
 
     done = [(arm, figures) for arm, figures in trials if figures["failed"] is None and arm.every == 1]
@@ -76,9 +76,9 @@ def ablation_picture(trials: Trials, exam: "Exam", folder: Path) -> tuple[str, .
     for arm, figures in done:
         same = (arm.downscale, arm.steps, arm.seed) == (ablated.downscale, ablated.steps, ablated.seed)
         if same and arm.variant in (REDUCED, *ABLATIONS):
-            words = [f"{figures['psnr']:.1f} dB", *([worths[arm.variant]] if arm.variant in worths else [])]
-            rows.append(Row(arm.variant, tuple(words), strip_file(arm, arms)))
+            lines = [f"{figures['psnr']:.1f} dB", *([worths[arm.variant]] if arm.variant in worths else [])]
+            rows.append(Row(arm.variant, tuple(lines), strip_file(arm, arms)))
     best, figures = max(done, key=lambda trial: trial[1]["psnr"])
     rows.append(Row(f"best: {best.variant}", (f"{figures['psnr']:.1f} dB",), strip_file(best, arms)))
-    write_sheet(rows, worth_words(trials) or "", folder / "ablation.png")
+    write_sheet(rows, words or "", folder / "ablation.png")
     return ("ablation.png",)

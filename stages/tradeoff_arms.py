@@ -83,10 +83,10 @@ Groups = Sequence[tuple[str, int, Sequence[int]]]
 LADDER: Groups = [("grid", MIDDLE, range(RUNGS)), ("grid", FINE, [0, 1]), ("grid", COARSE, range(3, RUNGS))]
 METHOD: Groups = [(name, SMALL, [1]) for name in (REDUCED, *ABLATIONS)]
 SMALLER: Groups = [("small grid", MIDDLE, [2])]
-LAST: Groups = [("grid", MIDDLE, [0]), ("grid", FINE, [0])]
+ENDS: Groups = [("grid", MIDDLE, [0, RUNGS - 1]), ("grid", FINE, [0])]
 SAMPLES: Groups = [(name, MIDDLE, [2, 3]) for name, v in VARIANTS.items() if v.family == "grid samples"]
 PAPER: Groups = [(PUBLISHED, SMALL, [1]), (FEWER_RAYS, SMALL, [1]), ("paper, half the samples", SMALL, [1])]
-SPREAD: Groups = [("grid", MIDDLE, range(1, RUNGS))]
+SPREAD: Groups = [("grid", MIDDLE, range(1, RUNGS - 1))]
 SIZES: Groups = [("small grid", MIDDLE, [3, 1]), ("large grid", FINE, [1, 0]), ("grid", FINE, [2])]
 LONGER: Groups = [("paper, twice the samples", SMALL, [1]), (REDUCED, SMALL, [0])]
 ONCE: Groups = [*METHOD, *LADDER, *SMALLER, *SAMPLES, *PAPER, *SIZES, *LONGER]
@@ -169,10 +169,10 @@ def field_of(variant: str) -> Literal["grid", "paper"]:
 
 def wanted(seeds: int) -> Iterator[tuple[str, int, int, int]]:
     """(variant, photo size, rung, seed) of all arms, the most informative first: the grid's ladder, the ablation and a
-    smaller grid; second seeds of the ladder's last rungs and of the ablation; samples; the published networks; second
+    smaller grid; second seeds of the ladder's ends and of the ablation; samples; the published networks; second
     seeds of the ladder's other rungs; sizes of grids; every other seed."""
     rounds: list[tuple[Groups, int]] = [([*LADDER, *METHOD, *SMALLER], 0)]
-    rounds += [([*LAST, *METHOD], 1)] if seeds > 1 else []
+    rounds += [([*ENDS, *METHOD], 1)] if seeds > 1 else []
     rounds += [([*SAMPLES, *PAPER], 0)]
     rounds += [(SPREAD, 1)] if seeds > 1 else []
     rounds += [([*SIZES, *LONGER], 0), *((ONCE, seed) for seed in range(1, seeds))]
@@ -228,9 +228,15 @@ def _arm(
     speed, trained = speeds[VARIANTS[variant].speed], seconds * LONGEST / RUNG**rung
     steps = max(1, round_to_two_digits(trained * speed.steps))
     drawn = drawn_per_second(variant, speed)
-    every = 1 if drawn_rays / drawn <= MOST_SCORING * seconds else THINNED
+    every = scored_every(drawn_rays / drawn, seconds)
     training = OVERHEAD * VARIANTS[variant].cost * steps / speed.steps
     return Arm(variant, downscale, steps, seed, training + (PROBED_RAYS + drawn_rays / every**2) / drawn, every)
+
+
+def scored_every(drawing: float, seconds: float) -> int:
+    """Of so many pixels of the windows, along both axes, one is scored: all, unless ``drawing`` them takes too many of
+    a study's ``seconds``."""
+    return 1 if drawing <= MOST_SCORING * seconds else THINNED
 
 
 def round_to_two_digits(value: float) -> int:

@@ -3,11 +3,14 @@
 A point is beaten where another takes no longer and is better. **The rule of the recommendation**: the cheapest point
 that nothing beats after which no doubling of the training time buys more than ``WORTH_DB`` beyond the spread over
 seeds. So whatever is still worth its time is worth it from there on to any later point, not to the next one only.
+Front and recommendation are of what the study trained: the workspace's own field, mostly trained for longer than a
+study has time for, would else be the answer for every scene. It is placed beside them.
 
 **The rule of the spread**: a setting's is pooled over the settings nearest to it in training time, of the same kind of
-field, as many as give ``LEAST_FREEDOM`` degrees of freedom. One from two seeds alone is hardly known: of n degrees of
-freedom a standard deviation is uncertain by 1 / √(2n) of itself. But only alike ones may be pooled: after a hundred
-steps seeds differ by 2 dB, after a thousand by 0.05 (fox, docs/numbers.md).
+field, as many as give ``LEAST_FREEDOM`` degrees of freedom, but, where nearer ones tell something, none that took more
+than ``ALIKE`` times as long or as short. One from two seeds alone is hardly known: of n degrees of freedom a standard
+deviation is uncertain by 1 / √(2n) of itself. But only alike ones may be pooled: after a hundred steps seeds differ by
+2 dB, after a thousand by 0.05 (fox, docs/numbers.md).
 """
 
 import math
@@ -22,6 +25,8 @@ from stages.tradeoff_arms import OWN, VARIANTS, Arm, field_of, resolution_words
 
 WORTH_DB = 0.5  # a doubling of the time that buys less is not worth it; 0.5 dB is what one sees side by side
 LEAST_FREEDOM = 3
+ALIKE = 5.0  # times the seconds of a training: three rungs of the ladder
+MUCH_LONGER = 1.2  # times the seconds of a training: those of about its time tell nothing of more time
 
 
 @dataclass(frozen=True)
@@ -55,7 +60,8 @@ class Point:
 @dataclass(frozen=True)
 class Recommendation:
     """A point, and why in words, which begin with the ``headline``; ``still_rising`` where the longest trainings were
-    still worth their time."""
+    still worth their time: the point is the best of several on the front, and none of its kind was trained for
+    ``MUCH_LONGER`` times its seconds."""
 
     point: Point
     headline: str
@@ -101,8 +107,12 @@ def spread_at(point: Point, points: Sequence[Point]) -> float | None:
     several = [other for other in points if other.deviation is not None]
     alike = [other for other in several if other.field == point.field] or several
     squares, freedom = 0.0, 0
-    for other in sorted(alike, key=lambda other: abs(math.log(other.train_seconds / point.train_seconds))):
-        if freedom < LEAST_FREEDOM:
+
+    def distance(other: Point) -> float:
+        return abs(math.log(other.train_seconds / point.train_seconds))
+
+    for other in sorted(alike, key=distance):
+        if freedom == 0 or (freedom < LEAST_FREEDOM and distance(other) <= math.log(ALIKE)):
             squares += (other.seeds - 1) * (other.deviation or 0.0) ** 2
             freedom += other.seeds - 1
     return math.sqrt(squares / freedom) if freedom else None
@@ -142,35 +152,64 @@ def _worth(point: Point, later: Point) -> float:
     return WORTH_DB * math.log2(later.train_seconds / point.train_seconds)
 
 
+def trained(points: Sequence[Point]) -> list[Point]:
+    """Those that the study trained: all but the workspace's own field."""
+    return [point for point in points if point.variant != OWN]
+
+
 def recommend(points: Sequence[Point]) -> Recommendation:
-    """The knee of the front and what stands around it, in words. Raises ValueError for no points."""
-    front = pareto_front(points)
+    """The knee of the front and what stands around it, in words; the workspace's own field is placed beside it. Raises
+    ValueError where the study trained nothing."""
+    tried = trained(points)
+    front = pareto_front(tried)
     point, best = front[knee(front)], front[-1]
     headline = f"For this scene: {duration(point.train_seconds)} of training, {point.label}: {_decibel(point)}."
-    words = headline
-    if point is best:
-        words += f" Nothing tried is better, and up to there every doubling of the time paid: {_more(points)}."
-    else:
-        words += f" {_compared(point, best)}."
+    words, rising = headline, point is best and _still_rising(front, tried)
+    words += f" {_ended(point, tried, rising) if point is best else _compared(point, best)}."
     cheaper = [other for other in front if other.train_seconds <= point.train_seconds / 2]
     if cheaper:
         lost, share = point.psnr - cheaper[-1].psnr, cheaper[-1].train_seconds / point.train_seconds
         words += f" With {share:.0%} of the time ({cheaper[-1].label}) it is {lost:.1f} dB less."
-    own = next((other for other in points if other.variant == OWN), None)
-    if own is not None and own is not point:
-        words += f" {_placed(own, front)}."
-    return Recommendation(point, headline, words, point is best)
+    for own in (other for other in points if other.variant == OWN):
+        words += f" {_placed(own, point, front)}."
+    return Recommendation(point, headline, words, rising)
 
 
-def _placed(own: Point, front: Sequence[Point]) -> str:
-    """Whether the workspace's field is on the front, and what beats it where it is not."""
+def _longer(point: Point, tried: Sequence[Point]) -> bool:
+    """Whether a field of its kind had clearly more time."""
+    return any(p.train_seconds > MUCH_LONGER * point.train_seconds for p in tried if p.field == point.field)
+
+
+def _still_rising(front: Sequence[Point], tried: Sequence[Point]) -> bool:
+    """Whether the last point of the front may be there for want of time only."""
+    return len(front) > 1 and not _longer(front[-1], tried)
+
+
+def _ended(point: Point, tried: Sequence[Point], rising: bool) -> str:
+    """Why nothing is recommended beyond ``point``, the best one."""
+    if rising:
+        longest = max(other.train_seconds for other in tried if other.field == point.field)
+        return (
+            "Nothing tried is better, and up to there every doubling of the time paid: no field of its kind was "
+            f"trained for longer than {duration(longest)}, a larger --budget tries longer ones"
+        )
+    if len(tried) == 1:
+        return "Only one setting was tried"
+    return "Nothing tried is better" + (": longer trainings were no better" if _longer(point, tried) else "")
+
+
+def _placed(own: Point, point: Point, front: Sequence[Point]) -> str:
+    """What the workspace's field has more or less than the ``point`` recommended, or what beats it."""
     what = f"{OWN.capitalize()} ({duration(own.train_seconds)}, {own.psnr:.1f} dB)"
-    if own in front:
-        return f"{what} is on the front: nothing tried is as good in less time"
-    better = next(other for other in front if other.psnr >= own.psnr)
-    than = f"{better.label} has {better.psnr:.1f} dB after {duration(better.train_seconds)}"
-    near = ", which is within the spread" if _gain(own, better) <= _noise(own, better) else ""
-    return f"{what} is not on the front: {than}{near}"
+    better = next((p for p in front if p.train_seconds <= own.train_seconds and p.psnr >= own.psnr), None)
+    if better is not None:
+        near = ", which is within the spread" if _gain(own, better) <= _noise(own, better) else ""
+        return f"{what} is beaten by {better.label}: {better.psnr:.1f} dB after {duration(better.train_seconds)}{near}"
+    gain, times = _gain(point, own), f"for {own.train_seconds / point.train_seconds:.1f} × the time"
+    near = ", which is within the spread" if abs(gain) <= _noise(point, own) else ""
+    if gain < 0:
+        return f"{what} is {-gain:.1f} dB below the one recommended {times}{near}"
+    return f"{what} gains {gain:.1f} dB over the one recommended {times}{near}"
 
 
 def command(point: Point, workspace: str) -> str:
@@ -211,15 +250,10 @@ def _compared(point: Point, best: Point) -> str:
     return f"{what} {gain}" + (", which is within the spread" if _gain(point, best) <= _noise(point, best) else "")
 
 
-def _more(points: Sequence[Point]) -> str:
-    longest = max(point.train_seconds for point in points)
-    return f"no training here was longer than {duration(longest)}, a larger --budget tries longer ones"
-
-
 def table(points: Sequence[Point]) -> list[dict[str, Any]]:
     """Rows for the report and the page, by training time: a point's figures, its ``number``, whether it is on the
-    ``front``, and whether it is the one of the front that is ``cheapest_drawn``."""
-    front = pareto_front(points)
+    ``front`` of the study's own trainings, and whether it is the one of the front that is ``cheapest_drawn``."""
+    front = pareto_front(trained(points))
     drawn = min(front, key=lambda point: point.frame_seconds)
     return [
         {**asdict(point), "number": number, "label": point.label}

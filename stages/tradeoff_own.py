@@ -5,26 +5,39 @@ they are of this machine only where it was trained here.
 """
 
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from stages.contract import Inputs, Progress
 from stages.files import read_json, write_json
-from stages.tradeoff_arms import OWN, THINNED
+from stages.tradeoff_arms import OWN, scored_every
 from stages.tradeoff_front import Point
-from stages.tradeoff_trial import Exam, score
+from stages.tradeoff_trial import Exam, drawing_seconds, score
 
 
-def own_point(exam: Exam, inputs: Inputs, folder: Path, progress: Progress) -> Point | None:
-    """Score what stage train left, or read the score of an earlier attempt; None where it has left nothing. A field of
-    the paper's networks is scored on fewer pixels: it may be the published ones, which are slow to draw."""
+class Own(NamedTuple):
+    """The field's point; of ``every`` so many pixels of the windows, along both axes, it was scored on one; ``key`` is
+    the name of its training's folder."""
+
+    point: Point
+    every: int
+    key: str
+
+
+def own_field(exam: Exam, inputs: Inputs, folder: Path, seconds: float, progress: Progress) -> Own | None:
+    """Score what stage train left, or read the score of an earlier attempt; None where it has left nothing. It may be
+    the published networks, which are slow to draw: a trial tells on how many pixels a study of ``seconds`` can score
+    it."""
     train = inputs.get("train")
     if train is None:
         return None
-    kept, manifest = folder / f"own_{train.resolve().name}.json", read_json(train / "manifest.json")
+    key, facts = train.resolve().name, read_json(train / "manifest.json")["facts"]
+    kept = folder / f"own_{key}.json"
     if not kept.exists():
         progress.update(f"scoring {OWN}")
-        write_json(kept, score(train, exam, progress, 1 if manifest["facts"]["field"] == "grid" else THINNED))
-    return _point(manifest["facts"], read_json(kept))
+        every = scored_every(drawing_seconds(train, exam), seconds)
+        write_json(kept, {"every": every, "figures": score(train, exam, progress, every)})
+    found = read_json(kept)
+    return Own(_point(facts, found["figures"]), found["every"], key)
 
 
 def _point(facts: dict[str, Any], figures: dict[str, Any]) -> Point:

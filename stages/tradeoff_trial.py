@@ -4,6 +4,7 @@ Every field is scored on the same pixels at the same size, whatever size it was 
 photos because the published networks would take longer to draw those than to be trained.
 """
 
+import math
 import shutil
 import threading
 import time
@@ -15,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from stages.contract import Inputs, Progress, StageError
 from stages.files import read_json, write_json
-from stages.tradeoff_arms import Arm
+from stages.tradeoff_arms import SMALL_SIDE, Arm
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -30,6 +31,8 @@ STEPS_OF_PLACES = (0.7548776662466927, 0.5698402909980532)
 MEMORY_LOOK_SECONDS = 0.05
 OWN_FAULTS = ("training diverged", "the field does not learn", "nothing is left to train on")
 """What stage train says where the arm itself is at fault: it would say so again."""
+
+Colour = tuple[float, float, float]
 
 
 class Window(NamedTuple):
@@ -49,37 +52,42 @@ class Window(NamedTuple):
 @dataclass(frozen=True)
 class Exam:
     """What every arm of a study is scored on, and whole photos to see it by; make it with :func:`make_exam`. ``frame``
-    is a whole photo's pixels at the size scored at."""
+    is a whole photo's pixels at the size scored at; ``background`` is what photos and fields are shown over, whatever a
+    field was trained over."""
 
     scene: "Scene"
     windows: tuple[Window, ...]
     photos: tuple[Window, ...]
     frame: int
+    background: Colour
 
 
 def make_exam(ingest: Path, scene: "Scene", downscale: float, count: int, small: float) -> Exam:
     """``count`` windows spread over the held-out photos at 1/``downscale`` of their size, and SHOWN of these photos at
-    1/``small``."""
+    1/``small``, large ones still smaller: of at most SMALL_SIDE pixels, which the study has time to draw."""
     from stages.spread import spread
     from stages.training_data import scaled_size
-
-    test = scene.of_split("test")
-    windows = tuple(_window(ingest, scene, test[i % len(test)], downscale, i) for i in range(count))
-    photos = tuple(_photo(ingest, scene, test[i], small) for i in spread(len(test), min(SHOWN, len(test))))
-    width, height = scaled_size(scene.cameras[test[0].camera], downscale)
-    return Exam(scene, windows, photos, width * height)
-
-
-def _photo(ingest: Path, scene: "Scene", view: "View", downscale: float) -> Window:
-    from stages.training_data import view_mask, view_pixels, view_rays
     from stages.training_setup import BLACK, WHITE
 
-    truth = view_pixels(ingest, scene, view, downscale, WHITE if scene.has_alpha else BLACK)
+    test, background = scene.of_split("test"), WHITE if scene.has_alpha else BLACK
+    windows = tuple(_window(ingest, scene, test[i % len(test)], downscale, background, i) for i in range(count))
+    shown = [test[i] for i in spread(len(test), min(SHOWN, len(test)))]
+    sides = [max(camera.width, camera.height) for camera in (scene.cameras[view.camera] for view in shown)]
+    sizes = [max(small, side / SMALL_SIDE) for side in sides]
+    photos = tuple(_photo(ingest, scene, *each, background) for each in zip(shown, sizes, strict=True))
+    width, height = scaled_size(scene.cameras[test[0].camera], downscale)
+    return Exam(scene, windows, photos, width * height, background)
+
+
+def _photo(ingest: Path, scene: "Scene", view: "View", downscale: float, background: Colour) -> Window:
+    from stages.training_data import view_mask, view_pixels, view_rays
+
+    truth = view_pixels(ingest, scene, view, downscale, background)
     return Window(view.name, view_rays(scene, view, downscale), truth, view_mask(ingest, scene, view, downscale))
 
 
-def _window(ingest: Path, scene: "Scene", view: "View", downscale: float, number: int) -> Window:
-    whole = _photo(ingest, scene, view, downscale)
+def _window(ingest: Path, scene: "Scene", view: "View", downscale: float, background: Colour, number: int) -> Window:
+    whole = _photo(ingest, scene, view, downscale, background)
     top, left = (
         int((0.5 + number * step) % 1 * (max(0, size - WINDOW) + 1))
         for step, size in zip(STEPS_OF_PLACES, whole.truth.shape[:2], strict=True)
@@ -163,17 +171,30 @@ def score(field: Path, exam: Exam, progress: Progress, every: int = 1) -> dict[s
     }
 
 
+def drawing_seconds(field: Path, exam: Exam) -> float:
+    """What drawing all windows of ``exam`` by the field in a folder takes here, told by parts of one of them."""
+    from stages.drawing import TIMED_SECONDS, load_painter
+
+    def sample(side: int) -> "Rays":
+        some = slice(None, None, math.ceil(WINDOW / side))
+        return exam.windows[0].part((some, some)).rays
+
+    rays = sum(window.rays.near.numel() for window in exam.windows)
+    return rays / load_painter(field, exam.background).rays_per_second(sample, WINDOW, TIMED_SECONDS)
+
+
 def draw_photos(field: Path, exam: Exam) -> "list[Tensor]":
     """The photos of ``exam`` as the field in a folder has them."""
     return list(map(_painter(field, exam), exam.photos))
 
 
 def _painter(field: Path, exam: Exam) -> "Callable[[Window], Tensor]":
-    """What draws a window by the field in a folder, in [0, 1], exposed as its photo is expected to be."""
+    """What draws a window by the field in a folder, in [0, 1], over what photos are over, exposed as its photo is
+    expected to be."""
     from stages.drawing import load_painter
     from stages.effect_decisions import expected_gains
 
-    painter = load_painter(field)
+    painter = load_painter(field, exam.background)
     gains = expected_gains(read_json(field / "field.json"), exam.scene, exam.scene.of_split("test"))
 
     def paint(window: Window) -> "Tensor":
@@ -184,14 +205,17 @@ def _painter(field: Path, exam: Exam) -> "Callable[[Window], Tensor]":
 
 
 def write_strip(path: Path, windows: "list[Tensor]") -> None:
-    """Pictures (h, w, 3) in [0, 1] side by side as a PNG, cut to the smallest."""
-    import torch
+    """Pictures (h, w, 3) in [0, 1] side by side as a PNG, as high as the lowest."""
+    import cv2
+    import numpy as np
 
     from stages.files import write_png
 
-    height, width = (min(window.shape[axis] for window in windows) for axis in (0, 1))
-    row = torch.cat([window[:height, :width] for window in windows], dim=1)
-    write_png(path, (row * 255).round().byte().numpy())
+    height = min(window.shape[0] for window in windows)
+    sizes = [(max(1, round(window.shape[1] * height / window.shape[0])), height) for window in windows]
+    pairs = zip(windows, sizes, strict=True)
+    pictures = [cv2.resize(window.numpy(), size, interpolation=cv2.INTER_AREA) for window, size in pairs]
+    write_png(path, np.rint(np.concatenate(pictures, axis=1) * 255).astype(np.uint8))
 
 
 @contextmanager

@@ -185,6 +185,29 @@ def test_what_a_stage_reads_where_it_is_there_neither_runs_for_it_nor_makes_it_s
     assert seen[1:] == [{"ingest", "sfm"}]
 
 
+def test_a_damaged_input_that_is_only_read_where_it_is_there_is_left_out_and_left_in_place(
+    bring: Bring, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    train, seen, notes = fake_stages.STAGES["train"], list[set[str]](), list[str]()
+    whole = train.run
+    monkeypatch.setattr(train, "NEEDS", ("ingest",))
+    monkeypatch.setattr(train, "OPTIONAL", ("sfm",), raising=False)
+    monkeypatch.setattr(
+        train, "run", lambda config, inputs, *rest: seen.append({*inputs}) or whole(config, inputs, *rest)
+    )
+    monkeypatch.setattr(SilentDisplay, "note", lambda _, message: notes.append(message))
+    bring(stages=("ingest", "sfm"))
+    (folder,) = (tmp_path / "w.nerf/sfm").iterdir()
+    flip(folder / "deep/number.json")
+    bring(stages=("ingest", "train"))
+    assert seen == [{"ingest"}] and calls == ["train"]
+    assert [p.name for p in folder.parent.iterdir()] == [folder.name], "nobody would make it again"
+    (note,) = notes
+    assert note.startswith("sfm is damaged: left out; `pipeline resume --verify` makes it again (")
+    bring(stages=("ingest", "sfm", "train"), verify=True, force={"train"})
+    assert "sfm" in calls and seen[1:] == [{"ingest", "sfm"}]
+
+
 def test_output_shows_nothing_of_other_settings(bring: Bring, tmp_path: Path):
     bring()
     output = tmp_path / "w.nerf/output"

@@ -202,7 +202,7 @@ def test_page_shows_the_study_and_leaves_its_time_out(tmp_path: Path, progress: 
     points = sorted(points, key=lambda p: p.train_seconds)
     study = {"headline": "", "recommendation": recommend(points).words, "recommended": 3, "points": table(points)}
     study |= {"command": "pipeline train fox.nerf --train.seconds 20", "ablation": "Against the complete one: −2 dB."}
-    study |= {"scored": "6 windows of 2 held-out photos", "left_out": ["paper, published: 5 steps"]}
+    study |= {"own": None, "scored": "6 windows of 2 held-out photos", "left_out": ["paper, published: 5 steps"]}
     write_json(inputs["tradeoff"] / "tradeoff.json", study)
     (inputs["tradeoff"] / "manifest.json").write_text('{"seconds": 1800}')
     assert "What quality costs here" not in before
@@ -215,13 +215,16 @@ def test_page_shows_the_study_and_leaves_its_time_out(tmp_path: Path, progress: 
     assert "number 1 is drawn in the least time, 1.00 s a frame" in text
     assert "Fields: grid: 5 grids of features, the finest of 512³ cells; no view dependence: two such" in text
     assert "What each part of the method is worth" not in text, "no picture, no title"
+    assert "the star" not in text and "before the present one" not in text
     assert summary == summary_before, "the study's time is none of the run's"
     Image.new("RGB", (64, 48)).save(inputs["tradeoff"] / "ablation.png")
-    study |= {"command": None}
-    write_json(inputs["tradeoff"] / "tradeoff.json", study)
-    text = written(inputs, tmp_path / "pictures", progress)[0]
+    for key, older in (("fedcba9876543210", True), (inputs["train"].resolve().name, False)):
+        study |= {"own": {"train": key, "every": 1}}
+        write_json(inputs["tradeoff"] / "tradeoff.json", study)
+        text = written(inputs, tmp_path / f"pictures_{older}", progress)[0]
+        assert "Every mark is a setting, the star the workspace's own field, scored on" in text
+        assert ("own field of this study was trained before the present one." in text) == older
     assert "What each part of the method is worth" in text and "Against the complete one: −2 dB." in text
-    assert "The workspace has it already." in text and "Train it" not in text
 
 
 def test_a_large_video_lies_beside_the_page(inputs: dict[str, Path], tmp_path: Path, progress: Any):

@@ -1,6 +1,7 @@
 import shutil
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -8,12 +9,15 @@ from typing import Any
 import psutil
 import pytest
 import torch
+from PIL import Image
 
-from stages import tradeoff, tradeoff_arms, tradeoff_clock, tradeoff_trial, train
+from nerf.scene import Camera
+from stages import tradeoff, tradeoff_arms, tradeoff_clock, tradeoff_own, tradeoff_trial, train
 from stages.contract import StageError
 from stages.files import read_json, read_scene, write_json
 from stages.tradeoff import Config
 from stages.tradeoff_arms import FEWER_RAYS, OWN, PUBLISHED, VARIANTS, Arm
+from stages.tradeoff_own import own_field
 from tests.stages.photo_scene import photographed
 
 TINY_GRID: dict[str, Any] = {"levels": 2, "log2_rows": 10, "finest": 32, "batch_samples": 1024}
@@ -157,6 +161,19 @@ def test_what_a_killed_attempt_took_is_time_of_the_study(
     assert 0.9 * CONFIG["seconds"] < now[0] - 100 <= 1.1 * CONFIG["seconds"]
     first, again = (note for note in progress.notes if "done at about" in note)
     assert " trainings: done at about " in first and " trainings, 3 of them there: done at about " in again
+    assert any(note.startswith("no time left; not trained: ") for note in progress.notes)
+    assert not any("slower" in note for note in progress.notes), "the kill took the time"
+
+
+def test_a_study_whose_killed_attempts_took_all_its_time_still_has_a_result(
+    tmp_path: Path, photos: dict[str, Path], progress: Any, now: list[float]
+) -> None:
+    for _ in range(3):
+        now[2] = 1
+        with pytest.raises(Killed):
+            studied(tmp_path, photos, progress)
+    studied(tmp_path, photos, progress)
+    assert len(read_json(tmp_path / "tradeoff.json")["arms"]) == 1
 
 
 def test_the_field_of_the_workspace_is_a_point_and_no_output(
@@ -174,8 +191,32 @@ def test_the_field_of_the_workspace_is_a_point_and_no_output(
     points = {row["variant"]: row for row in read_json(tmp_path / "own" / "tradeoff.json")["points"]}
     assert (points[OWN]["train_seconds"], points[OWN]["steps"]) == (facts["train_seconds"], 70)
     assert 5 < points[OWN]["psnr"] < 60 and points[OWN]["peak_memory_mb"] is None
+    assert read_json(tmp_path / "own" / "tradeoff.json")["own"]["train"] == own.name
     assert OWN not in {row["variant"] for row in read_json(tmp_path / "none" / "tradeoff.json")["points"]}
-    assert "This workspace's field (" in (tmp_path / "own" / "tradeoff.md").read_text()
+    text = (tmp_path / "own" / "tradeoff.md").read_text()
+    assert "This workspace's field (" in text and "this workspace's field ★ |" in text
+
+
+def test_the_field_of_the_workspace_is_scored_on_some_pixels_where_it_is_drawn_slowly_and_that_is_said(
+    tmp_path: Path, photos: dict[str, Path], progress: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own, kind = tmp_path / "train" / "0123456789abcdef", {"field": "paper", **TINY_PAPER}
+    own.mkdir(parents=True)
+    facts = train.run(train.Config(steps=70, downscale=1.0, **kind), photos, own, progress).facts
+    write_json(own / "manifest.json", {"facts": facts})
+    exam = tradeoff_trial.make_exam(photos["ingest"], read_scene(photos["normalise"]), 1.0, 4, 1.0)
+    assert 0 < tradeoff_trial.drawing_seconds(own, exam) < 10
+    for seconds, every in ((1e3, 1), (1e-6, 4)):
+        folder = tmp_path / str(every)
+        folder.mkdir()
+        found = own_field(exam, photos | {"train": own}, folder, seconds, progress)
+        assert found and (found.every, found.key) == (every, "0123456789abcdef")
+        assert (found.point.ssim is None) == (every > 1) and found.point.field == "paper"
+        assert own_field(exam, photos | {"train": own}, folder, 1e3, progress) == found, "as an earlier attempt found"
+    monkeypatch.setattr(tradeoff_own, "scored_every", lambda *_: 4)
+    studied(tmp_path / "study", photos | {"train": own}, progress, seeds=1, seconds=8.0)
+    scored = read_json(tmp_path / "study" / "tradeoff.json")["scored"]
+    assert "; this workspace's field: one in 4 of their rows and columns, for drawing all would take" in scored
 
 
 def test_a_field_that_is_drawn_slowly_is_scored_on_some_pixels_of_the_same_windows(
@@ -187,6 +228,21 @@ def test_a_field_that_is_drawn_slowly_is_scored_on_some_pixels_of_the_same_windo
     whole, thinned = (tradeoff_trial.score(tmp_path, exam, progress, every) for every in (1, 4))
     assert whole["ssim"] is not None and thinned["ssim"] is None
     assert 0 < abs(whole["psnr"] - thinned["psnr"]) < 2
+
+
+def test_a_field_trained_over_black_is_scored_over_what_the_photos_are_over(
+    tmp_path: Path, photos: dict[str, Path], progress: Any
+) -> None:
+    white, black = tmp_path / "white", tmp_path / "black"
+    white.mkdir()
+    train.run(train.Config(steps=70, downscale=1.0, **TINY_GRID), photos, white, progress)
+    shutil.copytree(white, black)
+    field = read_json(white / "field.json")
+    write_json(black / "field.json", field | {"background": [0.0, 0.0, 0.0]})
+    exam = tradeoff_trial.make_exam(photos["ingest"], read_scene(photos["normalise"]), 1.0, 4, 1.0)
+    assert list(exam.background) == field["background"] == [1.0, 1.0, 1.0]
+    scores = [tradeoff_trial.score(folder, exam, progress)["psnr"] for folder in (white, black)]
+    assert scores[0] == scores[1]
 
 
 def test_an_arm_that_does_not_learn_is_said_and_the_study_goes_on(
@@ -273,6 +329,23 @@ def test_windows_are_parts_of_the_photos(photos: dict[str, Path], monkeypatch: p
         assert len(places) == 1
         y, x = places[0]
         assert torch.equal(truth[y : y + 8, x : x + 8], window.truth)
+
+
+def test_large_photos_among_small_ones_are_drawn_small_and_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tradeoff_trial, "SMALL_SIDE", 12)
+    inputs, scene = photographed(tmp_path)
+    large = Camera("PINHOLE", 240, 120, (200.0, 200.0, 120.0, 60.0))
+    Image.new("RGB", (240, 120), "red").save(inputs["ingest"] / scene.views[4].file)
+    views = (*scene.views[:4], replace(scene.views[4], camera=1), *scene.views[5:])
+    scene = replace(scene, cameras=(*scene.cameras, large), views=views)
+    exam = tradeoff_trial.make_exam(inputs["ingest"], scene, 1.0, 2, 2.0)
+    assert [photo.truth.shape for photo in exam.photos] == [(8, 12, 3), (6, 12, 3)]
+    tradeoff_trial.write_strip(tmp_path / "strip.png", [photo.truth for photo in exam.photos])
+    with Image.open(tmp_path / "strip.png") as strip:
+        assert strip.size == (9 + 12, 6), "nothing is cut off"
+        assert strip.getpixel((20, 5)) == (255, 0, 0) and strip.getpixel((0, 5)) == (255, 255, 255)
 
 
 def test_memory_is_looked_at_while_the_block_runs() -> None:
