@@ -368,7 +368,7 @@ class Runner:
         partial.mkdir(parents=True, exist_ok=True)
         attempts.begin(partial, spent)
         self.workspace.write_run(self.state)
-        load()
+        load()  # which changes how signals are handled; once it is over, they are ours again
         started, clock = datetime.now(UTC), time.monotonic()
         self.at_work = job.stage
         with heartbeat.beating(partial / attempts.NAME):

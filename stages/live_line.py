@@ -1,10 +1,10 @@
 """A live line that keeps moving while a long step computes."""
 
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from stages.contract import Progress
+from stages.periodically import periodically
 
 PERIOD_SECONDS = 0.5
 
@@ -15,17 +15,12 @@ def live_line(progress: Progress, describe: Callable[[], tuple[str, float | None
 
     ``describe`` is called from another thread; what it reads may change under it but must not be taken apart.
     """
-    over = threading.Event()
 
     def speak() -> None:
-        while not over.wait(PERIOD_SECONDS):
-            progress.update(*describe())
-
-    thread = threading.Thread(target=speak, daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        over.set()
-        thread.join()
         progress.update(*describe())
+
+    try:
+        with periodically(PERIOD_SECONDS, speak):
+            yield
+    finally:
+        speak()

@@ -6,7 +6,6 @@ photos because the published networks would take longer to draw those than to be
 
 import math
 import shutil
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -16,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from stages.contract import Inputs, Progress, StageError
 from stages.files import read_json, write_json
+from stages.periodically import periodically
 from stages.tradeoff_arms import SMALL_SIDE, Arm
 
 if TYPE_CHECKING:
@@ -233,17 +233,11 @@ def peak_memory() -> Iterator[Callable[[], int]]:
         return
     import psutil
 
-    process, most, over = psutil.Process(), [0], threading.Event()
+    process, most = psutil.Process(), [0]
 
     def look() -> None:
-        while not over.wait(MEMORY_LOOK_SECONDS):
-            most[0] = max(most[0], process.memory_info().rss)
+        most[0] = max(most[0], process.memory_info().rss)
 
-    most[0] = process.memory_info().rss
-    watcher = threading.Thread(target=look, daemon=True)
-    watcher.start()
-    try:
+    look()
+    with periodically(MEMORY_LOOK_SECONDS, look):
         yield lambda: most[0]
-    finally:
-        over.set()
-        watcher.join()
