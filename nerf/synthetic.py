@@ -20,6 +20,7 @@ from nerf.camera_paths import look_at
 from nerf.rays import Rays, rays_of_view
 from nerf.shapes import Box, Frustum, Points, Shape, Sphere, Torus, Values, dot
 from nerf.solid_texture import Noise, make_noise, mix
+from nerf.srgb import linear_to_srgb
 
 TABLE_RADIUS = 1.0
 SUN = (0.53, -0.40, 0.75)
@@ -95,7 +96,7 @@ class SyntheticScene(NamedTuple):
         reflectance, normal[hit] = self._surface(points, owner[hit])
         colour[hit] = self._shade(points, normal[hit], reflectance, directions)
         colour[~hit] = self._sky(rays.directions[~hit])
-        return Trace(_srgb(colour), depth, normal, hit)
+        return Trace(linear_to_srgb(colour.clamp(0, 1)), depth, normal, hit)
 
     def _surface(self, points: Float[Tensor, "n 3"], owner: Tensor) -> tuple[Tensor, Tensor]:
         """Reflectance and outward normal of surface points of the solids named by ``owner``."""
@@ -158,12 +159,6 @@ class SyntheticScene(NamedTuple):
         for index, solid in enumerate(self.solids):
             outside &= (owner == index) | (solid.distance(points) > 0)
         return points[outside], normals[outside]
-
-
-def _srgb(linear: Tensor) -> Tensor:
-    """IEC 61966-2-1 encoding of linear light, clipped to what a photo can show."""
-    linear = linear.clamp(0, 1)
-    return torch.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear.clamp(min=1e-3) ** (1 / 2.4) - 0.055)
 
 
 def photograph(

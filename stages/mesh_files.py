@@ -19,6 +19,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from nerf.srgb import linear_light
+
 FLOAT, UNSIGNED_INT, UNSIGNED_SHORT = 5126, 5125, 5123  # glTF component types
 ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
 Z_UP_TO_Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
@@ -130,8 +132,7 @@ def _accessor(view: int, name: str, block: np.ndarray) -> dict[str, Any]:
 
 def _linear_rgba(colours: np.ndarray) -> np.ndarray:
     """sRGB bytes to linear 16 bits (IEC 61966-2-1), opaque; 8 linear bits would band in the dark."""
-    encoded = colours / 255
-    linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+    linear = linear_light(colours / 255)
     alpha = np.ones((len(colours), 1))
     return np.rint(np.concatenate([linear, alpha], axis=1) * 65535).astype("<u2")
 

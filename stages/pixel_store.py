@@ -84,7 +84,12 @@ class PixelStore:
 
     def damaged(self) -> list[str]:
         """The files of the photos whose pixels are no longer those that were written; reads all of a whole store."""
-        return [photo.file for index, photo in enumerate(self.photos) if self.photo(index) is None]
+        import torch
+
+        from nerf.parallel import in_order
+
+        sound = in_order(lambda index: self.photo(index) is not None, range(len(self.photos)), torch.device("cpu"))
+        return [photo.file for photo, is_sound in zip(self.photos, sound, strict=True) if not is_sound]
 
     def photo(self, index: int) -> "np.ndarray | None":
         """The pixels of one photo, read into memory; None where they are no longer those that were written."""

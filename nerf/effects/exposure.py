@@ -1,8 +1,8 @@
 """Exposure: photos of one scene taken at different gains, one per channel (which is white balance, too).
 
 A gain acts on light, photos are sRGB: what a photo of log gain g shows of a colour c is s(exp(g) s⁻¹(c)), where s is
-the transfer curve of sRGB (IEC 61966-2-1), straight up to a knee and a power above it. Gains are natural logarithms, so
-they add up: expose(expose(c, a), b) is expose(c, a + b), and g = log 2 is one stop (EV).
+the transfer curve of sRGB (nerf/srgb.py). Gains are natural logarithms, so they add up: expose(expose(c, a), b) is
+expose(c, a + b), and g = log 2 is one stop (EV).
 
 From power to power no light has to be computed: s(exp(g) s⁻¹(c)) = k (c + 0.055) - 0.055 with k = exp(g / 2.4), which
 is c + (k - 1) (c + 0.055). That keeps colours as large as 1e30 finite, and c exactly what it is where g is 0.
@@ -16,10 +16,8 @@ from torch import Tensor
 
 from nerf.model import RadianceModel, Rendering
 from nerf.rays import Rays
+from nerf.srgb import KNEE, OFFSET, POWER, SLOPE, linear_to_srgb, srgb_to_linear
 
-SLOPE, OFFSET, POWER = 12.92, 0.055, 2.4
-KNEE = 0.04045  # of sRGB; in linear light KNEE / SLOPE
-BRIGHTEST = 1e12  # sRGB; its light is 5e28, and far brighter colours have one that float32 cannot hold
 LARGEST = 16.0  # of a log gain, either way: 23 stops, beyond what any camera spans
 
 DARKEST, LIGHTEST = 2 / 255, 253 / 255  # within, 8 bits tell a photo's log gain
@@ -28,20 +26,6 @@ ITERATIONS = 8  # with each of the two weights
 HUBER, TUKEY = 1.345, 4.685  # standard deviations: 95 % of the efficiency of least squares on Gaussian noise
 OF_GAUSSIAN = 1.4826  # standard deviation of Gaussian noise by its median absolute value
 FINEST = 1 / 255  # no residual spreads less than a step of the photos
-
-
-def srgb_to_linear(c: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """Light of sRGB colours, s⁻¹; 0 below 0, and no more than that of BRIGHTEST. Inverse: :func:`linear_to_srgb`."""
-    c = c.clamp(0, BRIGHTEST)
-    power = ((c.clamp(min=KNEE) + OFFSET) / (1 + OFFSET)) ** POWER
-    return torch.where(c > KNEE, power, c / SLOPE)
-
-
-def linear_to_srgb(l: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:  # noqa: E741
-    """sRGB colours of light, s; 0 below 0. Inverse: :func:`srgb_to_linear`."""
-    light = l.clamp(min=0)
-    power = (1 + OFFSET) * light.clamp(min=KNEE / SLOPE) ** (1 / POWER) - OFFSET  # no power of 0: its slope is infinite
-    return torch.where(light > KNEE / SLOPE, power, light * SLOPE)
 
 
 def expose(colour: Float[Tensor, "*n 3"], log_gain: Float[Tensor, "*#n 3"]) -> Float[Tensor, "*n 3"]:

@@ -5,8 +5,9 @@ from jaxtyping import Float
 
 from nerf.evidence.evidence import Evidence, judged, unknown
 from nerf.evidence.exposure import ExposureFit
-from nerf.evidence.tracks import TrackColours, linear_light
+from nerf.evidence.tracks import TrackColours
 from nerf.evidence.two_way import two_way
+from nerf.srgb import linear_light
 
 # Light through a medium is J exp(-b d) + A (1 - exp(-b d)) (Koschmieder 1924) with A nearly grey: the difference of the
 # largest and the least channel falls as exp(-b d). Over their mean it does too, for colours about as bright as A, and

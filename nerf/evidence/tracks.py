@@ -5,8 +5,8 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-SLOPE, OFFSET, POWER = 12.92, 0.055, 2.4  # the transfer curve of sRGB, IEC 61966-2-1
-KNEE = 0.04045  # of sRGB values; below it the curve is straight
+from nerf.srgb import KNEE, OFFSET, POWER, linear_light
+
 MOST_IN_TRACK = 64  # observations of one point that enter a fit: their number of pairs is what a fit costs
 
 
@@ -65,18 +65,6 @@ def within_groups(labels: Int[np.ndarray, "n"]) -> tuple[Int[np.ndarray, "n"], I
     _, start, count = np.unique(labels, return_index=True, return_counts=True)
     length = np.repeat(count, count)
     return np.arange(len(labels)) - np.repeat(start, count), length
-
-
-def linear_light(colour: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-    """sRGB values as light. Inverse: :func:`srgb_values`."""
-    power = ((np.maximum(colour, KNEE) + OFFSET) / (1 + OFFSET)) ** POWER
-    return np.where(colour <= KNEE, colour / SLOPE, power)
-
-
-def srgb_values(light: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-    """Light as sRGB values, not clipped; NaN stays. Inverse: :func:`linear_light`."""
-    power = (1 + OFFSET) * np.maximum(light, KNEE / SLOPE) ** (1 / POWER) - OFFSET
-    return np.where(light <= KNEE / SLOPE, SLOPE * light, power)
 
 
 def log_light(colour: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:

@@ -10,7 +10,8 @@ from jaxtyping import Bool, Float, Int
 
 from nerf.evidence.evidence import OF_GAUSSIAN, Evidence, judged, unknown
 from nerf.evidence.exposure import ExposureFit
-from nerf.evidence.tracks import TrackColours, linear_light, srgb_values
+from nerf.evidence.tracks import TrackColours
+from nerf.srgb import linear_light, srgb_values
 
 OUTLIER = 0.1  # sRGB value, rms of the channels: ten times what a good photo is off by
 FEWEST_POINTS = 20  # in a photo, for a share of them to mean something

@@ -12,8 +12,9 @@ from jaxtyping import Float, Int
 
 from nerf.evidence.evidence import HARM, Evidence, judged, unknown
 from nerf.evidence.exposure import ExposureFit
-from nerf.evidence.tracks import OFFSET, POWER, TrackColours, log_light
+from nerf.evidence.tracks import TrackColours, log_light
 from nerf.evidence.two_way import TwoWay
+from nerf.srgb import OFFSET, POWER
 
 THRESHOLD = 2 * HARM  # deviation of colours, sRGB values: a field of diffuse colours has it as its error
 FEWEST_PAIRS = 60  # in each of the two ranges of angles

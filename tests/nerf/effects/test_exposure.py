@@ -14,40 +14,25 @@ from nerf.effects.exposure import (
     expose,
     expose_backward,
     fit_log_gain,
-    linear_to_srgb,
     own_light,
-    srgb_to_linear,
 )
 from nerf.model import RadianceModel, Rendering
 from nerf.rays import Rays
+from nerf.srgb import KNEE, linear_to_srgb, srgb_to_linear
 
-EXTREMES = [0.0, 1e-30, 1e-8, 0.04, exposure.KNEE, 0.0405, 0.5, 1.0, 2.0, 1e4, 1e12, 1e20, 1e30]
+EXTREMES = [0.0, 1e-30, 1e-8, 0.04, KNEE, 0.0405, 0.5, 1.0, 2.0, 1e4, 1e12, 1e20, 1e30]
 gains = st.floats(-3, 3)
 
 
 def colours(count: int = 3000, brightest: float = 1.2) -> Tensor:
     """In float64, half of them about the knee."""
     random = torch.Generator().manual_seed(1)
-    scale = torch.where(torch.arange(count) % 2 == 0, brightest, 3 * exposure.KNEE)[:, None]
+    scale = torch.where(torch.arange(count) % 2 == 0, brightest, 3 * KNEE)[:, None]
     return scale * torch.rand(count, 3, generator=random, dtype=torch.float64)
 
 
 def gain(*logs: float) -> Tensor:
     return torch.tensor(logs if len(logs) == 3 else logs * 3, dtype=torch.float64)
-
-
-def test_the_curve_is_that_of_the_standard():
-    srgb = torch.tensor([0.0, 0.02, 0.2, 0.5, 0.735357, 1.0], dtype=torch.float64)
-    light = torch.tensor([0.0, 0.02 / 12.92, 0.033105, 0.214041, 0.5, 1.0], dtype=torch.float64)
-    torch.testing.assert_close(srgb_to_linear(srgb), light, atol=1e-6, rtol=0)
-    torch.testing.assert_close(linear_to_srgb(light), srgb, atol=2e-6, rtol=0)
-
-
-@given(st.floats(0, 1e9))
-def test_the_two_curves_undo_each_other(colour: float):
-    c = torch.tensor([colour], dtype=torch.float64)
-    torch.testing.assert_close(linear_to_srgb(srgb_to_linear(c)), c, atol=1e-7, rtol=1e-12)
-    torch.testing.assert_close(srgb_to_linear(linear_to_srgb(c)), c, atol=1e-8, rtol=1e-12)
 
 
 @pytest.mark.parametrize("log_gain", [-2.0, -0.5, 0.1, 0.7, 2.5])
@@ -87,19 +72,6 @@ def test_what_is_below_black_is_black():
     shown.sum().backward()
     assert (shown == 0).all() and c.grad is not None and (c.grad == 0).all()
     assert log_gain.grad is not None and (log_gain.grad == 0).all()
-    for curve in (srgb_to_linear, linear_to_srgb):
-        dark = torch.tensor([-1.0, -1e30], requires_grad=True)
-        curve(dark).sum().backward()
-        assert (curve(dark) == 0).all() and dark.grad is not None and (dark.grad == 0).all()
-
-
-@pytest.mark.parametrize("curve", [srgb_to_linear, linear_to_srgb])
-def test_the_curves_stay_finite(curve):
-    values = torch.tensor(EXTREMES, requires_grad=True)
-    shown = curve(values)
-    shown.sum().backward()
-    assert torch.isfinite(shown).all() and values.grad is not None and torch.isfinite(values.grad).all()
-    assert (shown.diff() >= 0).all() and (values.grad[:9] > 0).all()
 
 
 @pytest.mark.parametrize("log_gain", [-1e30, -30.0, -16.0, -1.0, 0.0, 1.0, 16.0, 30.0, 1e30])
@@ -116,7 +88,7 @@ def test_exposing_stays_finite(log_gain: float):
 
 def test_gradients_are_those_of_finite_differences():
     c, g = colours(40), gain(-0.6, 0.2, 0.9) * torch.linspace(-1, 1, 40, dtype=torch.float64)[:, None]
-    on_one_side = ((c - exposure.KNEE).abs() > 1e-4) & ((expose(c, g) - exposure.KNEE).abs() > 1e-4)
+    on_one_side = ((c - KNEE).abs() > 1e-4) & ((expose(c, g) - KNEE).abs() > 1e-4)
     rows = on_one_side.all(-1)
     assert rows.sum() > 20
     c, g = c[rows].requires_grad_(), g[rows].requires_grad_()

@@ -7,7 +7,8 @@ import pytest
 
 from nerf.evidence import media, transients, view_dependence, vignetting
 from nerf.evidence.exposure import EV, fit_exposure
-from nerf.evidence.tracks import TrackColours, linear_light
+from nerf.evidence.tracks import TrackColours
+from nerf.srgb import linear_light
 from tests.nerf.evidence.photographed_points import encoded, photographed_points
 
 SEEDS = range(20)

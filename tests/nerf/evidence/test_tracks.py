@@ -2,19 +2,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nerf.evidence.tracks import MOST_IN_TRACK, TrackColours, linear_light, log_light, log_noise, srgb_values, usable
-from tests.nerf.evidence.photographed_points import encoded, photographed_points
-
-
-@given(st.floats(0, 1))
-def test_light_and_values_are_inverse(light: float) -> None:
-    np.testing.assert_allclose(linear_light(encoded(np.array([light]))), light, atol=1e-6)
-    np.testing.assert_allclose(linear_light(srgb_values(np.array([light]))), light, atol=1e-12)
-    np.testing.assert_allclose(srgb_values(np.array([light])), encoded(np.array([light])), atol=1e-6)
-
-
-def test_light_beyond_the_brightest_value_is_not_clipped() -> None:
-    np.testing.assert_allclose(srgb_values(np.array([-1.0, 2.0, np.nan])), [-12.92, 1.3533, np.nan], atol=1e-4)
+from nerf.evidence.tracks import MOST_IN_TRACK, TrackColours, log_light, log_noise, usable
+from tests.nerf.evidence.photographed_points import photographed_points
 
 
 @given(st.floats(0.01, 0.99))

@@ -1,0 +1,102 @@
+"""Does any effect forced the other way beat what stage effects decided? Trains real sets with each choice.
+
+    python -m benchmarks.forced_effects ../shared/data fox fern --workspaces /tmp/forced [--seeds 0 1 2] [--steps 800]
+
+For every set: `pipeline run SET --until effects`, then for every seed a training with what was decided and one more for
+each modelled effect, decided the other way round, the rest as it was; all with as many steps, scored on all held-out
+photos. A line is a choice forced, and what the decision gains over it: the mean over seeds of the differences, ± two
+standard errors. "raw": nothing fitted; "fitted": right halves with the exposure fitted on the left ones; "posed": with
+the pose fitted there, too, which is what pose refinement is judged by. Bold: forced, it is better by more than 0.3 dB
+beyond two standard errors, so the decision was wrong. Nothing is timed, so two of them can run side by side. What is
+in FOLDER/SET.json already is not trained again.
+"""
+
+import argparse
+import json
+import math
+import shutil
+from pathlib import Path
+from statistics import mean, stdev
+from typing import Any
+
+from benchmarks.nerfacto import pipeline, stage_folder
+from stages.files import read_json
+
+EFFECTS = ("exposure", "view_dependence", "background", "pose_refinement")
+FIGURES = {"raw": "psnr", "fitted": "psnr_fitted_right", "posed": "psnr_posed_right"}
+JUDGED_BY = {"pose_refinement": "posed"}  # the others: raw
+TOLERATED = 0.3  # dB
+EVERY_PHOTO = 10**6
+Scores = dict[str, dict[str, float | None]]
+"""By the effect that is forced, "" for none, and the seed: the figures."""
+
+
+def decided(photos: Path, workspace: Path) -> dict[str, bool]:
+    """Which of the modelled effects stage effects has on."""
+    if not (workspace / "output" / "effects.json").exists():
+        pipeline("run", photos, "-o", workspace, "--until", "effects")
+    table = read_json(stage_folder(workspace, "effects.json") / "effects.json")
+    return {name: table[name]["on"] for name in EFFECTS}
+
+
+def scored(workspace: Path, effects: dict[str, bool], seed: int, steps: int) -> dict[str, float | None]:
+    """The figures of a training with these effects; its field is removed again."""
+    choices = [f"--effects.{name.replace('_', '-')}={'on' if on else 'off'}" for name, on in effects.items()]
+    pipeline("effects", workspace, *choices)
+    pipeline("train", workspace, "--train.steps", str(steps), "--train.seed", str(seed))
+    pipeline("evaluate", workspace, "--evaluate.photos", str(EVERY_PHOTO), "--evaluate.fit-poses", "on")
+    metrics = read_json(stage_folder(workspace, "metrics.json") / "metrics.json")
+    for output in ("metrics.json", "curve.json"):
+        shutil.rmtree(stage_folder(workspace, output))
+    return {name: metrics[key] for name, key in FIGURES.items()}
+
+
+def gain(scores: Scores, forced: str, figure: str, seeds: list[int]) -> tuple[float, float] | None:
+    """What the decision gains over a forced choice, and two standard errors; None where it has no such figure."""
+    pairs = [(scores[f" {seed}"][figure], scores[f"{forced} {seed}"][figure]) for seed in seeds]
+    gains = [kept - other for kept, other in pairs if kept is not None and other is not None]
+    if len(gains) < len(seeds):
+        return None
+    return mean(gains), 2 * stdev(gains) / math.sqrt(len(gains)) if len(gains) > 1 else math.inf
+
+
+def row(name: str, forced: str, on: bool, scores: Scores, seeds: list[int]) -> str:
+    """A line of the table."""
+    cells = []
+    for figure in FIGURES:
+        found = gain(scores, forced, figure, seeds)
+        words = "" if found is None else f"{found[0]:+.2f} ± {found[1]:.2f}"
+        wrong = found is not None and figure == JUDGED_BY.get(forced, "raw") and found[0] + found[1] < -TOLERATED
+        cells.append(f"**{words}**" if wrong else words)
+    return f"| {name} | {forced} {'off' if on else 'on'} | {' | '.join(cells)} |"
+
+
+def main() -> None:
+    """Train what is missing and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("data", type=Path, help="the folder of the sets")
+    parser.add_argument("sets", nargs="+")
+    parser.add_argument("--workspaces", type=Path, required=True)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    parser.add_argument("--steps", type=int, default=800)
+    given = parser.parse_args()
+    print(f"| set | forced | {' | '.join(FIGURES)} |\n|---|---|---|---|---|")
+    for name in given.sets:
+        workspace, record = given.workspaces / f"{name}.nerf", given.workspaces / f"{name}.json"
+        made: dict[str, Any] = json.loads(record.read_text()) if record.exists() else {"scores": {}}
+        if "decided" not in made:
+            made["decided"] = decided(given.data / name, workspace)
+        for seed in given.seeds:
+            for forced in ("", *EFFECTS):
+                effects = {effect: on != (effect == forced) for effect, on in made["decided"].items()}
+                if f"{forced} {seed}" not in made["scores"]:
+                    made["scores"][f"{forced} {seed}"] = scored(workspace, effects, seed, given.steps)
+                    record.write_text(json.dumps(made, indent=1))
+        raw = [made["scores"][f" {seed}"]["raw"] for seed in given.seeds]
+        print(f"| {name} | nothing | {mean(raw):.2f} dB | | |")
+        for effect, on in made["decided"].items():
+            print(row(name, effect, on, made["scores"], given.seeds), flush=True)
+
+
+if __name__ == "__main__":
+    main()
