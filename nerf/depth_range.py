@@ -70,8 +70,8 @@ def _widened(
     _, shown = scene.project(view, points[beyond])
     distance = np.sort(distance[beyond][shown])
     nearer, farther = distance[distance < low], distance[distance > high]
-    if len(nearer) >= FEWEST_POINTS:
-        low = max(float(nearer[FEWEST_POINTS - 1]), LEAST_NEAR)
+    if len(nearer) >= FEWEST_POINTS:  # below LEAST_NEAR in a large scene alone, by what the photo sees itself
+        low = min(low, max(float(nearer[FEWEST_POINTS - 1]), LEAST_NEAR))
     if len(farther) >= FEWEST_POINTS:
         high = float(farther[-FEWEST_POINTS])
     return low, high
@@ -89,17 +89,19 @@ def range_between_views(
 
     Without bounds, what a view has before it is nearer to a camera that stands further ahead, and its far is farther
     from one elsewhere. In a bounded scene near counts from where rays enter the region, and far is the region's
-    farthest corner.
+    farthest corner. No near is below LEAST_NEAR, or below the nearest of its neighbours' where the scene is so large
+    that theirs are.
     """
     centres = poses[:, :, 3]
     offset = centres[:, None] - view_centres
     distance = np.linalg.norm(offset, axis=2)
     nearest = np.argsort(distance, axis=1, kind="stable")[:, :3]
+    least = np.minimum(view_near[nearest].min(axis=1), LEAST_NEAR)
     if not bounded:
         ahead = np.einsum("fva,fa->fv", offset, poses[:, :, 2]).clip(min=0)
         near, far = view_near - ahead, view_far + distance
         of_nearest = np.arange(len(centres))[:, None], nearest
-        return np.maximum(near[of_nearest].min(axis=1), LEAST_NEAR), far[of_nearest].max(axis=1)
+        return np.maximum(near[of_nearest].min(axis=1), least), far[of_nearest].max(axis=1)
     entry, far = _distances_to_region(centres)
     beyond_entry = (view_near - _distances_to_region(view_centres)[0])[nearest].min(axis=1)
-    return np.maximum(entry + beyond_entry, LEAST_NEAR), far
+    return np.maximum(entry + beyond_entry, least), far

@@ -94,9 +94,11 @@ class RayBank(NamedTuple):
     def with_distances(self, pixel: Int[Tensor, "known"], distance: Float[Tensor, "known"]) -> "RayBank":
         """This bank, which knows how far away is what these pixels show (scene units, along the ray).
 
-        Left out are pixels that may not be drawn (so give the masks first) and those that are not wholly opaque, whose
-        light ends in part elsewhere."""
-        kept = self.may_be_drawn(pixel)
+        Left out are pixels that may not be drawn (so give the masks first), those that are not wholly opaque, whose
+        light ends in part elsewhere, and distances that are not between near and far of their views: no sample stands
+        there, and what does would be pulled to the end of the ray."""
+        near, far = self.geometry[12:].index_select(1, torch.searchsorted(self.first_pixel, pixel, right=True) - 1)[:2]
+        kept = self.may_be_drawn(pixel) & (near < distance) & (distance < far)
         if self.pixels.shape[1] == 4:
             kept &= self.pixels.index_select(0, pixel)[:, 3] == 255
         return self._knowing(pixel[kept], distance[kept].float())

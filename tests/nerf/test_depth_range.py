@@ -30,6 +30,13 @@ def test_what_photos_have_before_them_is_nearer_from_further_ahead() -> None:
     assert ranges((0.0, 0, -1.0))[0] == LEAST_NEAR
 
 
+def test_where_photos_see_nearer_than_usual_so_do_cameras_between_them() -> None:
+    """As above the ground in a survey that is long beside its height."""
+    pose = np.concatenate([np.eye(3), PHOTOS[0][:, None]], axis=1)[None]
+    near, _ = range_between_views(pose, PHOTOS, 0.01 * NEAR, FAR, bounded=False)
+    assert near[0] == pytest.approx(0.01 * NEAR[0])
+
+
 def test_from_far_away_everything_is_within_far() -> None:
     assert ranges((0.0, 0, -32.5))[1] == pytest.approx(np.hypot(30, 0.5) + 30)
 

@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nerf.camera_paths import nearest_rotations
+from nerf.depth_range import LEAST_NEAR
 from nerf.normalisation import Normalisation, normalise
 from nerf.reconstruction import Reconstruction, angles_deg, extent
 from nerf.region import find_layout
@@ -177,6 +178,18 @@ def test_what_is_twenty_times_nearer_than_the_rest_of_a_photo_is_no_false_match_
     rail = scene.centres[0] + 0.05 * scene.axes[0] + 0.01 * ball(30)
     found, clean = normalise(with_points(scene, rail, 4), None), normalise(scene, None)
     assert found.near[0] < 0.05 * found.scene_from_sfm.scale < 0.05 * clean.near[0] / 0.7 * 3
+
+
+def test_in_a_scene_that_is_large_beside_its_distances_near_lies_before_what_photos_see() -> None:
+    """A flight of 3 km at 40 m, over ground with a mast on it that photo 0 has no points of."""
+    scene = seen_by(survey(lines=2, photos=100, height=40.0), ground(1500.0, 5.0, 40_000))
+    mast = scene.centres[0] + 30.0 * scene.axes[0] + ball(12)
+    with_mast = with_points(scene, mast, 4)
+    own = (with_mast.view == 0) & (with_mast.point >= len(scene.points))
+    found = normalise(dataclasses.replace(with_mast, view=with_mast.view[~own], point=with_mast.point[~own]), None)
+    distance = found.scene_from_sfm.scale * scene.distances()
+    assert distance.max() < LEAST_NEAR
+    assert (found.near[scene.view] < distance).mean() > 0.999
 
 
 def test_points_behind_or_beside_a_photo_or_unsure_ones_say_nothing_of_its_near() -> None:

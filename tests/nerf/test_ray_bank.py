@@ -157,10 +157,10 @@ def test_without_masks_the_same_pixels_are_drawn_as_ever() -> None:
 def test_known_distances_are_drawn_with_their_pixels_as_often_as_each_other() -> None:
     bank, *_ = scattered()
     assert bank.known is None and bank.with_distances(torch.zeros(0).long(), torch.zeros(0)).known is None
-    known = bank.with_distances(torch.tensor([3, 30, 3]), torch.tensor([1.5, 2.5, 3.5]))
+    known = bank.with_distances(torch.tensor([3, 30, 3]), torch.tensor([1.5, 4.5, 3.5]))
     pixel, distance = known.draw_known(3000, generator("cpu", 0))
     pairs, counts = torch.stack([pixel.float(), distance], 1).unique(dim=0, return_counts=True)
-    assert pairs.tolist() == [[3, 1.5], [3, 3.5], [30, 2.5]]
+    assert pairs.tolist() == [[3, 1.5], [3, 3.5], [30, 4.5]]
     assert (counts - 1000).abs().max() < 100
     again, *_ = known.draw_known(3000, generator("cpu", 0))
     assert torch.equal(pixel, again)
@@ -172,9 +172,18 @@ def test_distances_of_pixels_that_masks_ignore_are_forgotten() -> None:
     ignored = torch.zeros(SIZES[0], dtype=torch.bool)
     ignored[0] = True
     masked = bank.without([ignored, None, None])
-    known = masked.with_distances(torch.tensor([3, 30]), torch.tensor([1.5, 2.5])).known
+    known = masked.with_distances(torch.tensor([3, 30]), torch.tensor([1.5, 4.5])).known
     assert known is not None and known.tolist() == [30]
     assert masked.with_distances(torch.tensor([3]), torch.tensor([1.5])).known is None
+
+
+def test_distances_beyond_near_and_far_are_forgotten() -> None:
+    bank, *_ = scattered()
+    rays, _ = bank.rays(torch.tensor([3]))
+    near, far = float(rays.near), float(rays.far)
+    distance = torch.tensor([0.9 * near, near, 1.1 * near, 0.9 * far, far, 1.1 * far])
+    known = bank.with_distances(torch.full((6,), 3), distance).distance
+    assert known is not None and known.tolist() == distance[2:4].tolist()
 
 
 def test_distances_of_pixels_that_are_not_opaque_are_forgotten() -> None:
@@ -188,10 +197,10 @@ def test_distances_of_pixels_that_are_not_opaque_are_forgotten() -> None:
 def test_distances_that_end_outside_of_a_cube_are_forgotten() -> None:
     bank, *_ = scattered()
     rays = bank.lookup(torch.tensor([3, 3])).rays
-    distance = torch.tensor([0.5, 90.0])
+    distance = torch.tensor([1.5, 5.5])
     ends = (rays.origins + distance[:, None] * rays.directions).abs().amax(-1)
     known = bank.with_distances(torch.tensor([3, 3]), distance)
     kept = known.known_within(float(ends[0]) + 1e-3).distance
-    assert kept is not None and kept.tolist() == [0.5]
+    assert kept is not None and kept.tolist() == [1.5]
     assert known.known_within(float(ends[0]) - 1e-3).known is None
     assert bank.known_within(1.0) is bank
