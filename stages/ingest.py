@@ -325,7 +325,8 @@ def _same_pictures(taken: Sequence[_Taken]) -> dict[str, str]:
     """{photo that is left out of matching: the one it is nearly the same picture as}, by name. Raises StageError where
     one picture is all there is."""
     thumbnails = [photo.thumbnail for photo in taken if photo.thumbnail is not None]
-    same = near_duplicates(thumbnails, [photo.sharpness for photo in taken])
+    pixels = [photo.camera_key.width * photo.camera_key.height for photo in taken]
+    same = near_duplicates(thumbnails, [photo.sharpness for photo in taken], pixels)
     if len(same) == len(taken) - 1:
         raise all_the_same(len(taken))
     return {taken[index].name: taken[kept].name for index, kept in sorted(same.items())}
