@@ -33,6 +33,13 @@ from tests.stages.test_sources import touch
         ("a.jpg", "Depth_Maps/a.png"),
         ("left/images/a.jpg", "left/Masks/a_mask.png"),
         ("rgb/left/7.jpg", "normals/left/007.png"),
+        ("rgb/7.jpg", "normal/7.png"),
+        ("images/7.jpg", "confidence/7.png"),  # Polycam
+        ("rgb/7.png", "conf/7.png"),
+        ("color/7.jpg", "label-filt/7.png"),  # ScanNet
+        ("rgb/7.png", "semantic_class/7.png"),
+        ("a/7.jpg", "a/Instances/7.tif"),
+        ("rgb/7.jpg", "segmentation/7.png"),
     ],
 )
 def test_a_twin_has_the_name_of_its_photo(photo: str, twin: str) -> None:
@@ -50,6 +57,10 @@ def test_a_twin_has_the_name_of_its_photo(photo: str, twin: str) -> None:
         ("depth/1.jpg", "mask/1.jpg"),
         ("rgb/1305031102.175304.png", "depth/1305031102.160407.png"),  # TUM: of no photo by name
         ("normal_light/1.jpg", "flash/1.jpg"),
+        ("normal_light/1.png", "flash/1.png"),
+        ("wide/1.jpg", "normal/1.jpg", "tele/1.jpg", "wide/2.heic", "normal/2.HEIC"),
+        ("IMG_1.jpg", "IMG_1_normal.jpg", "IMG_1_bright.jpg"),
+        ("front/1.jpg", "label/1.jpg", "confirmed/1.png", "instanced/1.png"),
         ("left/1.jpg", "right/1.jpg", "maskenball/1.jpg", "a/left/1.jpg", "b/mask/2.jpg"),
     ],
 )
@@ -57,9 +68,11 @@ def test_what_may_be_a_photo_of_its_own_stays(names: tuple[str, ...]) -> None:
     assert twins(names) == {}
 
 
-parts = st.sampled_from(["a", "b_mask", "mask", "0", "00", "depth", "a_depth", "image", "a.color", "a_mask_depth"])
+colours, maps = ["a", "0", "00", "image", "a.color"], ["a_depth", "a_mask_depth", "a_normal", "b_mask"]
+parts = st.sampled_from([*colours, *maps, "depth", "mask", "normal", "conf", "label"])
+endings = st.sampled_from([".png", ".jpg"])
 names_of_files = st.lists(
-    st.lists(parts, min_size=1, max_size=3).map(lambda some: "/".join(some) + ".png"), unique=True
+    st.builds(lambda some, kind: "/".join(some) + kind, st.lists(parts, min_size=1, max_size=3), endings), unique=True
 )
 
 
@@ -71,6 +84,13 @@ def test_every_twin_leads_to_a_photo_that_stays(names: list[str]) -> None:
         for _ in names:
             name = found.get(name, name)
         assert name not in found
+
+
+def test_a_map_belongs_to_the_photo_and_not_to_another_map() -> None:
+    maps = [f"{folder}/1.png" for folder in ("conf", "depth", "instance", "label", "normal", "semantics")]
+    assert twins([*maps, "rgb/1.jpg"]) == dict.fromkeys(maps, "rgb/1.jpg")
+    assert twins([*maps[:3], "label/1.jpg"]) == dict.fromkeys(maps[:3], "label/1.jpg")
+    assert twins(maps) == {}
 
 
 def test_sources_list_photos_without_their_twins(tmp_path: Path) -> None:
