@@ -1,8 +1,11 @@
-"""Files that are no photos but belong to one: masks, depth maps, normals, masked copies. Told by their names alone."""
+"""Files that are no photos but belong to one: masks, depth maps, normals, masked copies. Told by their names, and
+depth maps by their values, too."""
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import PurePosixPath
+
+from stages.decoding import Stored
 
 # a_mask.png and a.depth_2.tif belong to a.jpg; mask/a.png and depth_maps/a.png to image/a.jpg, or to a.jpg beside them.
 _ENDING = re.compile(r"(.+)[ ._-](masks?|masked|depth|depthmap|normals?|alpha|matte)([ ._-]?\d+)?", re.IGNORECASE)
@@ -15,6 +18,9 @@ _PERHAPS = re.compile(
 )
 _COLOUR = re.compile(r"(.+)[ ._-](colou?r|rgb|image)", re.IGNORECASE)  # a.color.jpg beside a.depth.png
 _MASK = re.compile(r"(.+[ ._-])?masks?([ ._-]?\d+)?", re.IGNORECASE)
+
+# Of a depth map there is a photo, but for a few that were lost; of photos in grey there need not be any in colour.
+_COLOURED = 0.9
 
 _Place = tuple[PurePosixPath, str]  # a folder, and what a photo in it is called
 
@@ -34,6 +40,14 @@ def twins(names: Sequence[str]) -> dict[str, str]:
         if photo := next((photos[place] for place in places if photos.get(place, file) != file), None):
             found[str(file)] = str(photo)
     return found
+
+
+def depth_maps(stored: Mapping[str, Stored]) -> set[str]:
+    """Which files are depth maps by their values, whatever they are called: those in deep grey, where there are about
+    as many in colour. ``stored`` is how each file stores its values, by its name."""
+    deep = {name for name, kind in stored.items() if kind == "deep grey"}
+    colour = sum(kind == "colour" for kind in stored.values())
+    return deep if colour >= _COLOURED * len(deep) else set()
 
 
 def is_mask(name: str) -> bool:

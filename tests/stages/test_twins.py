@@ -12,10 +12,11 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from stages import ingest
+from stages.decoding import Stored
 from stages.ingest import Config
 from stages.photos import read_photos
 from stages.sources import find_source
-from stages.twins import is_mask, twins
+from stages.twins import depth_maps, is_mask, twins
 from tests.stages.test_sources import touch
 
 
@@ -123,6 +124,50 @@ def test_what_is_set_aside_is_said_and_a_mask_can_be_used_as_is_said(tmp_path: P
     shutil.move(tmp_path / "in/mask/0.png", tmp_path / "in/masks/image/0.png")
     ingest.run(Config(photos=tmp_path / "in"), {}, tmp_path / "again", progress)
     assert [photo.used_share for photo in read_photos(tmp_path / "again")] == [0.75, 1, 1, 1, 1]
+
+
+def put_depth(file: Path, seed: int, kind: type) -> None:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    depth = np.random.default_rng(seed).integers(0, 60000, (24, 32))
+    Image.fromarray((depth / 60000 if kind is np.float32 else depth).astype(kind)).save(file)
+
+
+@pytest.mark.parametrize(
+    ("photo", "depth", "kind"),
+    [
+        ("frame00000{}.png", "deep00000{}.png", np.uint16),  # side by side, as Replica has it
+        ("rgb/rgb_{}.png", "depth/depth_{}.png", np.uint16),
+        ("rgb/1.{}1.png", "depth/1.{}2.png", np.uint16),  # time stamps of two sensors, as TUM has them
+        ("a/{}.png", "lowres_depth/{}.tif", np.uint16),  # ARKitScenes
+        ("a/{}.png", "b/{}.tif", np.float32),
+    ],
+)
+def test_depth_maps_are_told_by_their_values(photo: str, depth: str, kind: type, tmp_path: Path, progress: Any) -> None:
+    for index in range(4):
+        put_depth(tmp_path / "in" / depth.format(index), 9 + index, kind)
+        put(tmp_path / "in" / photo.format(index), index)
+    ingest.run(Config(photos=tmp_path / "in"), {}, tmp_path / "out", progress)
+    assert [one.name for one in read_photos(tmp_path / "out")] == [photo.format(index) for index in range(4)]
+    named = [depth.format(index) for index in range(4)]
+    assert progress.notes == [
+        "4 files are set aside as depth maps, being grey of 16 bits or of floats among photos in colour: "
+        f"{named[0]}, {named[1]}, {named[2]} and 1 more"
+    ]
+
+
+def kinds(deep: int, grey: int, colour: int) -> dict[str, Stored]:
+    counts: dict[Stored, int] = {"deep grey": deep, "grey": grey, "colour": colour}
+    every = [kind for kind, count in counts.items() for _ in range(count)]
+    return {str(index): kind for index, kind in enumerate(every)}
+
+
+@pytest.mark.parametrize(("deep", "grey", "colour", "aside"), [
+    (10, 0, 10, 10), (10, 0, 9, 10), (3, 10, 10, 3), (10, 0, 8, 0), (10, 10, 8, 0), (10, 10, 0, 0), (0, 5, 5, 0),
+])  # fmt: skip
+def test_photos_in_deep_grey_are_photos_where_fewer_are_in_colour(
+    deep: int, grey: int, colour: int, aside: int
+) -> None:
+    assert depth_maps(kinds(deep, grey, colour)) == {str(index) for index in range(aside)}
 
 
 def test_a_mask_folder_beside_images_is_said_to_be_unused(tmp_path: Path, progress: Any) -> None:
