@@ -88,8 +88,10 @@ def decode(path: Path) -> Decoded:
         raise DecodeError("camera raw files are not read; export JPEG, PNG or TIFF")
     with _open(path) as image:
         stored_plainly, lossy = _is_plain(image), _is_lossy(image, path)
+        # Pillow turns TIFFs while it loads them, and forgets how.
+        turned = _exif(image, [])[1] if image.format == "TIFF" else None
         _load(image)
-        return _convert(image, stored_plainly, lossy)
+        return _convert(image, stored_plainly, lossy, turned)
 
 
 @cache
@@ -165,14 +167,14 @@ def _unrecognised(path: Path) -> str:
     return "not an image of a known format"
 
 
-def _convert(image: "Image.Image", stored_plainly: bool, lossy: bool) -> Decoded:
-    """The loaded image as upright sRGB."""
+def _convert(image: "Image.Image", stored_plainly: bool, lossy: bool, turned: int | None) -> Decoded:
+    """The loaded image as upright sRGB; ``turned`` is the EXIF orientation where it has been undone already."""
     import numpy as np
 
     notes: list[str] = []
     tags, orientation = _exif(image, notes)
     converted, is_srgb = to_srgb(_to_eight_bit(image), image.info.get("icc_profile"), notes)
-    pixels = np.asarray(upright(converted, orientation))
+    pixels = np.asarray(converted if turned else upright(converted, orientation))
     opaque = pixels.shape[2] == 4 and bool((pixels[..., 3] == 255).all())
     pixels = np.ascontiguousarray(pixels[..., :3] if opaque else pixels)
     focal_px, focal_source = focal_from_exif(tags, *image.size)
@@ -183,7 +185,7 @@ def _convert(image: "Image.Image", stored_plainly: bool, lossy: bool) -> Decoded
         pixels=pixels,
         focal_px=focal_px,
         focal_source=focal_source,
-        camera_key=_camera_key(tags, pixels.shape[1], pixels.shape[0], orientation, focal_px),
+        camera_key=_camera_key(tags, pixels.shape[1], pixels.shape[0], turned or orientation, focal_px),
         place=place_from_exif(tags),
         exposure_ev=exposure_from_exif(tags),
         suffix=(".png" if image.format == "PNG" else ".jpg") if copy else None,

@@ -156,9 +156,10 @@ def test_depth_maps_are_told_by_their_values(photo: str, depth: str, kind: type,
 
 
 def kinds(deep: int, grey: int, colour: int) -> dict[str, Stored]:
-    counts: dict[Stored, int] = {"deep grey": deep, "grey": grey, "colour": colour}
-    every = [kind for kind, count in counts.items() for _ in range(count)]
-    return {str(index): kind for index, kind in enumerate(every)}
+    found: dict[str, Stored] = {}
+    for index in range(deep + grey + colour):
+        found[str(index)] = "deep grey" if index < deep else "grey" if index < deep + grey else "colour"
+    return found
 
 
 @pytest.mark.parametrize(("deep", "grey", "colour", "aside"), [
