@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from stages.colour_profiles import to_srgb
 from stages.panoramas import is_panorama
@@ -22,12 +22,16 @@ MAX_PIXELS = 250_000_000
 MIN_SIDE_PX = 16
 # EPS and its like run interpreters; RAW files would be read as their thumbnails.
 _FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP", "GIF", "PPM", "HEIF", "AVIF", "JPEG2000")
+_DEEP_GREY = ("I", "I;16", "I;16L", "I;16B", "F")
 _LOSSY = ("JPEG", "MPO", "HEIF", "AVIF")
 _RAW = (".dng", ".cr2", ".cr3", ".nef", ".nrw", ".arw", ".srf", ".raf", ".orf", ".rw2", ".pef", ".raw", ".iiq")
 # Focal lengths over the longer side: 157 to 6 degrees through a pinhole, what COLMAP accepts. Others are not believed,
 # neither of EXIF nor of a lens that was fitted.
 FOCAL_RANGE = (0.1, 10.0)
 _ALTITUDES_M = (-500.0, 20_000.0)  # of shores and aircraft: beyond, a receiver has not found its place
+
+
+Stored = Literal["colour", "grey", "deep grey"]  # the last of 16 bits or of floats
 
 
 class DecodeError(Exception):
@@ -60,8 +64,9 @@ class Decoded:
     """One image, upright, sRGB. ``focal_px`` is for these pixels, None where EXIF tells none or an absurd one.
 
     ``suffix`` is ".jpg" or ".png" if the file's own bytes already say exactly this to any program (8-bit RGB or
-    RGBA, sRGB, upright, one frame), so that they can be copied; otherwise None. ``lossy`` is a file that was compressed
-    with losses. ``notes`` tell what was assumed, ``exposure_ev`` is what :func:`exposure_from_exif` tells.
+    RGBA, sRGB, upright, one frame), so that they can be copied; otherwise None. ``stored`` is what kind of values it
+    has. ``lossy`` is a file that was compressed with losses. ``notes`` tell what was assumed, ``exposure_ev`` is what
+    :func:`exposure_from_exif` tells.
     """
 
     pixels: "np.ndarray"  # (h, w, 3 or 4) uint8
@@ -71,6 +76,7 @@ class Decoded:
     place: Place
     exposure_ev: float | None
     suffix: str | None
+    stored: Stored
     lossy: bool
     panorama: bool
     notes: tuple[str, ...]
@@ -82,8 +88,10 @@ def decode(path: Path) -> Decoded:
         raise DecodeError("camera raw files are not read; export JPEG, PNG or TIFF")
     with _open(path) as image:
         stored_plainly, lossy = _is_plain(image), _is_lossy(image, path)
+        # Pillow turns TIFFs while it loads them, and forgets how.
+        turned = _exif(image, [])[1] if image.format == "TIFF" else None
         _load(image)
-        return _convert(image, stored_plainly, lossy)
+        return _convert(image, stored_plainly, lossy, turned)
 
 
 @cache
@@ -159,14 +167,14 @@ def _unrecognised(path: Path) -> str:
     return "not an image of a known format"
 
 
-def _convert(image: "Image.Image", stored_plainly: bool, lossy: bool) -> Decoded:
-    """The loaded image as upright sRGB."""
+def _convert(image: "Image.Image", stored_plainly: bool, lossy: bool, turned: int | None) -> Decoded:
+    """The loaded image as upright sRGB; ``turned`` is the EXIF orientation where it has been undone already."""
     import numpy as np
 
     notes: list[str] = []
     tags, orientation = _exif(image, notes)
     converted, is_srgb = to_srgb(_to_eight_bit(image), image.info.get("icc_profile"), notes)
-    pixels = np.asarray(upright(converted, orientation))
+    pixels = np.asarray(converted if turned else upright(converted, orientation))
     opaque = pixels.shape[2] == 4 and bool((pixels[..., 3] == 255).all())
     pixels = np.ascontiguousarray(pixels[..., :3] if opaque else pixels)
     focal_px, focal_source = focal_from_exif(tags, *image.size)
@@ -177,10 +185,11 @@ def _convert(image: "Image.Image", stored_plainly: bool, lossy: bool) -> Decoded
         pixels=pixels,
         focal_px=focal_px,
         focal_source=focal_source,
-        camera_key=_camera_key(tags, pixels.shape[1], pixels.shape[0], orientation, focal_px),
+        camera_key=_camera_key(tags, pixels.shape[1], pixels.shape[0], turned or orientation, focal_px),
         place=place_from_exif(tags),
         exposure_ev=exposure_from_exif(tags),
         suffix=(".png" if image.format == "PNG" else ".jpg") if copy else None,
+        stored=_stored(image.mode),
         lossy=lossy,
         panorama=is_panorama(pixels, image.info.get("xmp")),
         notes=tuple(notes),
@@ -194,6 +203,12 @@ def _is_plain(image: "Image.Image") -> bool:
     if image.format != "PNG" or getattr(image, "n_frames", 1) > 1 or "transparency" in image.info:
         return False
     return image.tile[0].args in ("RGB", "RGBA")  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def _stored(mode: str) -> Stored:
+    if mode in _DEEP_GREY:
+        return "deep grey"
+    return "grey" if mode in ("1", "L", "LA") else "colour"
 
 
 def _is_lossy(image: "Image.Image", path: Path) -> bool:
@@ -231,7 +246,7 @@ def _what_is_missing(image: Any, error: OSError) -> str:
 
 def _to_eight_bit(image: "Image.Image") -> "Image.Image":
     """``image`` in mode L, LA, RGB, RGBA or CMYK."""
-    if image.mode in ("I", "I;16", "I;16L", "I;16B", "F"):
+    if image.mode in _DEEP_GREY:
         return _quantised(image)
     if image.has_transparency_data:
         return image if image.mode in ("LA", "RGBA") else image.convert("RGBA")

@@ -19,7 +19,7 @@ from pydantic import Field
 
 from stages.ascii_names import ascii_files
 from stages.contract import Inputs, OptionalSourcePath, Progress, SourcePath, StageConfig, StageError, StageResult
-from stages.decoding import CameraKey, DecodeError, Place, decode
+from stages.decoding import CameraKey, DecodeError, Place, Stored, decode
 from stages.device import processors
 from stages.files import write_jpeg, write_json, write_png
 from stages.ingest_words import (
@@ -33,6 +33,7 @@ from stages.ingest_words import (
     say_refused,
     say_unused,
     set_aside,
+    set_aside_by_values,
     shown,
     summary,
     too_few,
@@ -43,6 +44,7 @@ from stages.panoramas import cutting_advice
 from stages.photos import OPAQUE_FROM, Box, Photo, Refusal, opaque_box, write_photos
 from stages.sharpness import one_colour, relative_sharpness, sharpness
 from stages.sources import Source, find_source
+from stages.twins import depth_maps
 from stages.video_frames import FEWEST_FRAMES, take_frames
 
 if TYPE_CHECKING:
@@ -106,6 +108,7 @@ class _Taken:
     suffix: str  # of the stored file
     camera_key: CameraKey
     sharpness: float
+    stored: Stored = "colour"
     focal_source: str | None = None
     opaque_share: float | None = None  # that a mask beside ``waiting`` leaves; None without alpha
     one_colour: str | None = None
@@ -136,6 +139,9 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
         waiting.mkdir(exist_ok=True)
         taken, refused, notes = _take_all(source, config, waiting, progress)
         if source.kind == "photos":
+            deep = depth_maps({photo.name: photo.stored for photo in taken})
+            taken = [photo for photo in taken if photo.name not in deep]
+            notes += set_aside_by_values(sorted(deep))
             taken, duplicates = _without_duplicates(taken)
             refused = sorted(refused + duplicates, key=lambda refusal: refusal.name)
         notes += [f"{shown(t.name)}: {note}" for t in taken for note in t.notes]
@@ -260,6 +266,7 @@ def _take(file: Path, name: str, mask: Path | None, waiting: Path) -> _Taken | R
         suffix=decoded.suffix or (".jpg" if lossy else ".png"),
         camera_key=decoded.camera_key,
         sharpness=sharpness(pixels),
+        stored=decoded.stored,
         focal_source=decoded.focal_source,
         opaque_share=_take_opaque(pixels, taken_mask, waiting),
         one_colour=one_colour(pixels),
@@ -325,7 +332,8 @@ def _same_pictures(taken: Sequence[_Taken]) -> dict[str, str]:
     """{photo that is left out of matching: the one it is nearly the same picture as}, by name. Raises StageError where
     one picture is all there is."""
     thumbnails = [photo.thumbnail for photo in taken if photo.thumbnail is not None]
-    same = near_duplicates(thumbnails, [photo.sharpness for photo in taken])
+    pixels = [photo.camera_key.width * photo.camera_key.height for photo in taken]
+    same = near_duplicates(thumbnails, [photo.sharpness for photo in taken], pixels)
     if len(same) == len(taken) - 1:
         raise all_the_same(len(taken))
     return {taken[index].name: taken[kept].name for index, kept in sorted(same.items())}

@@ -65,6 +65,15 @@ def set_aside(files: Mapping[str, str]) -> list[str]:
     return notes
 
 
+def set_aside_by_values(files: Sequence[str]) -> list[str]:
+    """A note on files among colour photos whose values are those of depth maps."""
+    if not files:
+        return []
+    count = "1 file is" if len(files) == 1 else f"{len(files)} files are"
+    named = listed([shown(name) for name in files], 3)
+    return [f"{count} set aside as depth maps, being grey of 16 bits or of floats among photos in colour: {named}"]
+
+
 def say_findings(photos: Sequence[Photo], progress: Progress) -> None:
     """Which photos are nearly the same picture, and which are blurred."""
     same = [f"{shown(p.name)} (as {shown(p.near_duplicate_of)})" for p in photos if p.near_duplicate_of]

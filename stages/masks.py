@@ -78,8 +78,9 @@ def read_mask(file: Path, width: int, height: int, orientation: int) -> Mask:
 
 
 def _same_shape(found: tuple[int, int], wanted: tuple[int, int]) -> bool:
-    """Whether a size is another one in a smaller or larger copy, rounded to whole pixels."""
-    return abs(found[0] * wanted[1] - found[1] * wanted[0]) <= max(wanted)
+    """Whether a size is another one in a smaller or larger copy, rounded to whole pixels: both sides of the smaller one
+    may be off by half a pixel, each of which counts as often as the larger one is wide or high."""
+    return abs(found[0] * wanted[1] - found[1] * wanted[0]) <= max(*found, *wanted)
 
 
 def _turned(pixels: "np.ndarray", orientation: int) -> "np.ndarray":

@@ -39,6 +39,8 @@ LEAST_MOTION = 0.01
 # nothing is known to be shared.
 FOLLOWED_SHARE, LOST = 1 / 3, 1.0
 FEWEST_FRAMES = 3  # as sfm needs
+# Widths over heights of pixels: what is stored for tape has 8/11 to 2; others are not believed, 0 is not known.
+PIXEL_ASPECTS = (0.25, 4.0)
 JPEG_QUALITY = 95  # far closer to the frame than the video is to what the camera saw
 
 
@@ -66,7 +68,8 @@ class TakenFrame:
 def take_frames(video: Path, most: int, folder: Path, progress: Progress) -> list[TakenFrame]:
     """Write at most ``most`` frames of ``video`` into ``folder``. Raises StageError where there is nothing to take.
 
-    The frames stand upright: what the video says of its rotation is undone.
+    The frames stand upright and their pixels are square: what the video says of its rotation and of the shape of its
+    pixels is undone.
     """
     frames = _measure(video, progress)
     chosen = choose_frames(frames, most)
@@ -100,10 +103,11 @@ def expected_frames(video: Path, most: int) -> tuple[int, int, int]:
 
     with _opened(video) as capture:
         width, height = (int(capture.get(side)) for side in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+        across, down = _stretch(capture)
         count, rate = capture.get(cv2.CAP_PROP_FRAME_COUNT), capture.get(cv2.CAP_PROP_FPS)
     way = WAY_PER_SECOND * count / rate if count > 0 and rate > 0 else PLENTY * STEP
     expected = max(min(way / STEP, PLENTY), way / LONG_STEP)
-    return min(most, max(FEWEST_FRAMES, round(expected))), width, height
+    return min(most, max(FEWEST_FRAMES, round(expected))), round(width * across), round(height * down)
 
 
 def _chosen_by(paths: Sequence[float], frames: Sequence[Frame], step: float) -> list[int]:
@@ -125,12 +129,13 @@ def _measure(video: Path, progress: Progress) -> list[Frame]:
     frames: list[Frame] = []
     motion = _Motion()
     with _opened(video) as capture:
-        announced = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        announced, stretch = int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), _stretch(capture)
         while (answer := capture.read())[0]:
-            if not frames and is_panorama(answer[1]):
+            frame = _with_square_pixels(answer[1], stretch)
+            if not frames and is_panorama(frame):
                 raise _panoramas(video)
             # Grey first: shrinking a large frame takes longer than all the rest, and three times as long in colour.
-            grey = at_most(cv2.cvtColor(answer[1], cv2.COLOR_BGR2GRAY), WIDTH)
+            grey = at_most(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), WIDTH)
             time_s = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
             frames.append(Frame(time_s, motion.path_to(at_most(grey, FLOW_WIDTH)), sharpness(grey)))
             if len(frames) % 10 == 0:
@@ -182,12 +187,14 @@ def _write(
 
     wanted = set(chosen)
     with _opened(video) as capture:
+        stretch = _stretch(capture)
         for number in range(max(chosen) + 1):
             if not capture.grab():
                 raise _undecodable(video, f"frame {number} could be decoded before and cannot now")
             if number not in wanted:
                 continue
-            picture = cv2.cvtColor(capture.retrieve()[1], cv2.COLOR_BGR2RGB)
+            frame = _with_square_pixels(capture.retrieve()[1], stretch)
+            picture = cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)
             file = folder / f"{number:06d}"
             write_jpeg(file, picture, JPEG_QUALITY)
             height, width = picture.shape[:2]
@@ -211,6 +218,27 @@ def _opened(video: Path) -> "Iterator[cv2.VideoCapture]":
         yield capture
     finally:
         capture.release()
+
+
+def _stretch(capture: "cv2.VideoCapture") -> tuple[float, float]:
+    """By how much upright frames have to be stretched across and down for their pixels to be square: across, by the
+    sample aspect ratio, as players do it, unless they were turned by a quarter."""
+    import cv2
+
+    wide, high = capture.get(cv2.CAP_PROP_SAR_NUM), capture.get(cv2.CAP_PROP_SAR_DEN)
+    if not PIXEL_ASPECTS[0] * high <= wide <= PIXEL_ASPECTS[1] * high or not high:
+        return 1.0, 1.0
+    turned = capture.get(cv2.CAP_PROP_ORIENTATION_META) % 180 != 0
+    return (1.0, wide / high) if turned else (wide / high, 1.0)
+
+
+def _with_square_pixels(frame: "np.ndarray", stretch: tuple[float, float]) -> "np.ndarray":
+    import cv2
+
+    if stretch == (1.0, 1.0):
+        return frame
+    height, width = frame.shape[:2]
+    return cv2.resize(frame, (round(width * stretch[0]), round(height * stretch[1])), interpolation=cv2.INTER_CUBIC)
 
 
 def _undecodable(video: Path, why: str) -> StageError:

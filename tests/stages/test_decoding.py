@@ -49,6 +49,7 @@ def test_grey_of_any_depth_becomes_rgb(tmp_path: Path) -> None:
         decoded = decode(saved(tmp_path / name, image))
         assert np.abs(decoded.pixels.astype(int) - expected).max() <= (3 if name == "l.jpg" else 0), name
         assert decoded.suffix is None, name
+        assert decoded.stored == ("deep grey" if name in ("i16.png", "i16.tif", "f.tif") else "grey")
 
 
 def test_float_pixels_outside_their_range_are_refused(tmp_path: Path) -> None:
@@ -61,7 +62,7 @@ def test_sixteen_bit_colour_becomes_eight_and_is_not_copied(tmp_path: Path) -> N
     path.write_bytes(png_16_bit_rgb(smooth().astype(np.uint16) * 257))
     decoded = decode(path)
     assert np.array_equal(decoded.pixels, smooth())
-    assert decoded.suffix is None
+    assert (decoded.suffix, decoded.stored) == (None, "colour")
 
 
 def test_sixteen_bit_colour_tiffs_and_alpha(tmp_path: Path) -> None:

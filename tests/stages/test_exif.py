@@ -19,7 +19,10 @@ from tests.stages.photo_files import HEIGHT, WIDTH, exif_with, saved, smooth
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
-def test_every_exif_orientation_is_baked(tmp_path: Path, orientation: int) -> None:
+@pytest.mark.parametrize(("suffix", "options"), [("png", {}), ("tif", {}), ("tif", {"compression": "tiff_lzw"})])
+def test_every_exif_orientation_is_baked(
+    tmp_path: Path, suffix: str, options: dict[str, Any], orientation: int
+) -> None:
     """The stored rows and columns go where EXIF 2.32 says; the law is written out per orientation."""
     upright = smooth()
     stored = {
@@ -32,11 +35,11 @@ def test_every_exif_orientation_is_baked(tmp_path: Path, orientation: int) -> No
         7: upright.transpose(1, 0, 2)[::-1, ::-1],
         8: upright.transpose(1, 0, 2)[:, ::-1],
     }[orientation]
-    path = saved(tmp_path / "a.png", Image.fromarray(np.ascontiguousarray(stored)), exif=exif_with(orientation))
-    decoded = decode(path)
+    exif, path = exif_with(orientation, Make="Maker"), tmp_path / f"a.{suffix}"
+    decoded = decode(saved(path, Image.fromarray(np.ascontiguousarray(stored)), exif=exif, **options))
     assert np.array_equal(decoded.pixels, upright)
-    assert decoded.suffix == (".png" if orientation == 1 else None)
-    assert (decoded.camera_key.width, decoded.camera_key.height) == (WIDTH, HEIGHT)
+    assert decoded.suffix == (".png" if (suffix, orientation) == ("png", 1) else None)
+    assert decoded.camera_key[:6] == ("Maker", "", "", WIDTH, HEIGHT, orientation)
 
 
 @pytest.mark.parametrize("orientation", [0, 9, 65535])

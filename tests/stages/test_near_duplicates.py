@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from stages.near_duplicates import near_duplicates, small, thumbnail
+from stages.sharpness import sharpness
 from tests.blots import blots, cut_out
 
 WIDTH, HEIGHT = 400, 300
@@ -21,8 +22,9 @@ def seen(x: float, y: float = 0, parallax: float = 0, noise: int = 0, picture: n
     return view
 
 
-def found(*pictures: np.ndarray, sharpness: tuple[float, ...] = ()) -> dict[int, int]:
-    return near_duplicates([thumbnail(one) for one in pictures], sharpness or (1.0,) * len(pictures))
+def found(*pictures: np.ndarray, sharp: tuple[float, ...] = ()) -> dict[int, int]:
+    pixels = [one.shape[0] * one.shape[1] for one in pictures]
+    return near_duplicates([thumbnail(one) for one in pictures], sharp or (1.0,) * len(pictures), pixels)
 
 
 def test_a_burst_without_any_motion_is_found_through_the_noise() -> None:
@@ -75,8 +77,37 @@ def test_other_pictures_are_kept() -> None:
 
 def test_the_sharpest_stays_and_of_equals_the_first() -> None:
     same = [seen(0, noise=index) for index in (1, 2, 3)]
-    assert found(*same, sharpness=(1.0, 3.0, 2.0)) == {0: 1, 2: 1}
-    assert found(*same, sharpness=(1.0, 1.0, 1.0)) == {1: 0, 2: 0}
+    assert found(*same, sharp=(1.0, 3.0, 2.0)) == {0: 1, 2: 1}
+    assert found(*same, sharp=(1.0, 1.0, 1.0)) == {1: 0, 2: 0}
+
+
+def reduced(picture: np.ndarray, width: int) -> np.ndarray:
+    import cv2
+
+    height = round(picture.shape[0] * width / picture.shape[1])
+    return cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
+
+
+@pytest.mark.parametrize("height", [720, 721, 810])
+@pytest.mark.parametrize("width", [200, 341, 500, 800])
+def test_of_a_photo_and_its_reduced_copy_the_photo_stays(width: int, height: int) -> None:
+    """Whatever is rounded: the thumbnails of some copies are a row lower than those of their photos."""
+    photo = cut_out(blots(2, 1100, 900), 5, 5, 1080, height)
+    copy = reduced(photo, width)
+    values = (sharpness(copy), sharpness(photo))
+    assert values[0] > 1.5 * values[1]  # a reduced copy has the sharper edges
+    assert found(copy, photo, sharp=values) == {0: 1}
+
+
+def test_of_a_photo_and_its_crop_by_a_few_per_cent_the_sharper_stays() -> None:
+    photo, crop = seen(0, noise=1), seen(0, noise=2)[2:-2, 3:-3]
+    assert found(photo, crop, sharp=(1.0, 2.0)) == {0: 1}
+    assert found(photo, crop, sharp=(2.0, 1.0)) == {1: 0}
+
+
+def test_a_smaller_photo_from_elsewhere_is_kept() -> None:
+    assert found(seen(0), reduced(seen(16), 200)) == {}
+    assert found(seen(0, parallax=0.01), reduced(seen(0, parallax=5), 250)) == {}
 
 
 def test_of_a_slow_walk_enough_is_kept() -> None:
@@ -92,7 +123,7 @@ def test_blank_pictures_and_other_shapes_say_nothing() -> None:
     blank = np.full((HEIGHT, WIDTH, 3), 90, np.uint8)
     assert found(blank, blank) == {}
     assert found(seen(0), np.rot90(seen(0)).copy(), seen(0)[:, :-60].copy()) == {}
-    assert near_duplicates([], []) == {}
+    assert near_duplicates([], [], []) == {}
 
 
 def test_what_is_transparent_counts_as_black() -> None:
@@ -111,9 +142,9 @@ def test_what_turns_before_a_background_that_never_moves_is_another_picture_wher
         view[130:170, 180:220] = cut_out(NEAR, 50 + turned, 50, 40, 40)
     mask[130:170, 180:220] = 255
     assert found(one, other) == {1: 0}
-    assert near_duplicates([thumbnail(view, small(mask)) for view in (one, other)], (1.0, 1.0)) == {}
+    assert near_duplicates([thumbnail(view, small(mask)) for view in (one, other)], (1.0, 1.0), (1, 1)) == {}
     whole = np.full((HEIGHT, WIDTH), 255, np.uint8)
-    assert near_duplicates([thumbnail(view, small(whole)) for view in (one, other)], (1.0, 1.0)) == {1: 0}
+    assert near_duplicates([thumbnail(view, small(whole)) for view in (one, other)], (1.0, 1.0), (1, 1)) == {1: 0}
 
 
 def test_the_answer_does_not_depend_on_threads() -> None:

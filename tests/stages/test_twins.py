@@ -12,10 +12,11 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from stages import ingest
+from stages.decoding import Stored
 from stages.ingest import Config
 from stages.photos import read_photos
 from stages.sources import find_source
-from stages.twins import is_mask, twins
+from stages.twins import depth_maps, is_mask, twins
 from tests.stages.test_sources import touch
 
 
@@ -33,6 +34,13 @@ from tests.stages.test_sources import touch
         ("a.jpg", "Depth_Maps/a.png"),
         ("left/images/a.jpg", "left/Masks/a_mask.png"),
         ("rgb/left/7.jpg", "normals/left/007.png"),
+        ("rgb/7.jpg", "normal/7.png"),
+        ("images/7.jpg", "confidence/7.png"),  # Polycam
+        ("rgb/7.png", "conf/7.png"),
+        ("color/7.jpg", "label-filt/7.png"),  # ScanNet
+        ("rgb/7.png", "semantic_class/7.png"),
+        ("a/7.jpg", "a/Instances/7.tif"),
+        ("rgb/7.jpg", "segmentation/7.png"),
     ],
 )
 def test_a_twin_has_the_name_of_its_photo(photo: str, twin: str) -> None:
@@ -50,6 +58,10 @@ def test_a_twin_has_the_name_of_its_photo(photo: str, twin: str) -> None:
         ("depth/1.jpg", "mask/1.jpg"),
         ("rgb/1305031102.175304.png", "depth/1305031102.160407.png"),  # TUM: of no photo by name
         ("normal_light/1.jpg", "flash/1.jpg"),
+        ("normal_light/1.png", "flash/1.png"),
+        ("wide/1.jpg", "normal/1.jpg", "tele/1.jpg", "wide/2.heic", "normal/2.HEIC"),
+        ("IMG_1.jpg", "IMG_1_normal.jpg", "IMG_1_bright.jpg"),
+        ("front/1.jpg", "label/1.jpg", "confirmed/1.png", "instanced/1.png"),
         ("left/1.jpg", "right/1.jpg", "maskenball/1.jpg", "a/left/1.jpg", "b/mask/2.jpg"),
     ],
 )
@@ -57,9 +69,11 @@ def test_what_may_be_a_photo_of_its_own_stays(names: tuple[str, ...]) -> None:
     assert twins(names) == {}
 
 
-parts = st.sampled_from(["a", "b_mask", "mask", "0", "00", "depth", "a_depth", "image", "a.color", "a_mask_depth"])
+colours, maps = ["a", "0", "00", "image", "a.color"], ["a_depth", "a_mask_depth", "a_normal", "b_mask"]
+parts = st.sampled_from([*colours, *maps, "depth", "mask", "normal", "conf", "label"])
+endings = st.sampled_from([".png", ".jpg"])
 names_of_files = st.lists(
-    st.lists(parts, min_size=1, max_size=3).map(lambda some: "/".join(some) + ".png"), unique=True
+    st.builds(lambda some, kind: "/".join(some) + kind, st.lists(parts, min_size=1, max_size=3), endings), unique=True
 )
 
 
@@ -71,6 +85,13 @@ def test_every_twin_leads_to_a_photo_that_stays(names: list[str]) -> None:
         for _ in names:
             name = found.get(name, name)
         assert name not in found
+
+
+def test_a_map_belongs_to_the_photo_and_not_to_another_map() -> None:
+    maps = [f"{folder}/1.png" for folder in ("conf", "depth", "instance", "label", "normal", "semantics")]
+    assert twins([*maps, "rgb/1.jpg"]) == dict.fromkeys(maps, "rgb/1.jpg")
+    assert twins([*maps[:3], "label/1.jpg"]) == dict.fromkeys(maps[:3], "label/1.jpg")
+    assert twins(maps) == {}
 
 
 def test_sources_list_photos_without_their_twins(tmp_path: Path) -> None:
@@ -103,6 +124,51 @@ def test_what_is_set_aside_is_said_and_a_mask_can_be_used_as_is_said(tmp_path: P
     shutil.move(tmp_path / "in/mask/0.png", tmp_path / "in/masks/image/0.png")
     ingest.run(Config(photos=tmp_path / "in"), {}, tmp_path / "again", progress)
     assert [photo.used_share for photo in read_photos(tmp_path / "again")] == [0.75, 1, 1, 1, 1]
+
+
+def put_depth(file: Path, seed: int, kind: type) -> None:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    depth = np.random.default_rng(seed).integers(0, 60000, (24, 32))
+    Image.fromarray((depth / 60000 if kind is np.float32 else depth).astype(kind)).save(file)
+
+
+@pytest.mark.parametrize(
+    ("photo", "depth", "kind"),
+    [
+        ("frame00000{}.png", "deep00000{}.png", np.uint16),  # side by side, as Replica has it
+        ("rgb/rgb_{}.png", "depth/depth_{}.png", np.uint16),
+        ("rgb/1.{}1.png", "depth/1.{}2.png", np.uint16),  # time stamps of two sensors, as TUM has them
+        ("a/{}.png", "lowres_depth/{}.tif", np.uint16),  # ARKitScenes
+        ("a/{}.png", "b/{}.tif", np.float32),
+    ],
+)
+def test_depth_maps_are_told_by_their_values(photo: str, depth: str, kind: type, tmp_path: Path, progress: Any) -> None:
+    for index in range(4):
+        put_depth(tmp_path / "in" / depth.format(index), 9 + index, kind)
+        put(tmp_path / "in" / photo.format(index), index)
+    ingest.run(Config(photos=tmp_path / "in"), {}, tmp_path / "out", progress)
+    assert [one.name for one in read_photos(tmp_path / "out")] == [photo.format(index) for index in range(4)]
+    named = [depth.format(index) for index in range(4)]
+    assert progress.notes == [
+        "4 files are set aside as depth maps, being grey of 16 bits or of floats among photos in colour: "
+        f"{named[0]}, {named[1]}, {named[2]} and 1 more"
+    ]
+
+
+def kinds(deep: int, grey: int, colour: int) -> dict[str, Stored]:
+    found: dict[str, Stored] = {}
+    for index in range(deep + grey + colour):
+        found[str(index)] = "deep grey" if index < deep else "grey" if index < deep + grey else "colour"
+    return found
+
+
+@pytest.mark.parametrize(("deep", "grey", "colour", "aside"), [
+    (10, 0, 10, 10), (10, 0, 9, 10), (3, 10, 10, 3), (10, 0, 8, 0), (10, 10, 8, 0), (10, 10, 0, 0), (0, 5, 5, 0),
+])  # fmt: skip
+def test_photos_in_deep_grey_are_photos_where_fewer_are_in_colour(
+    deep: int, grey: int, colour: int, aside: int
+) -> None:
+    assert depth_maps(kinds(deep, grey, colour)) == {str(index) for index in range(aside)}
 
 
 def test_a_mask_folder_beside_images_is_said_to_be_unused(tmp_path: Path, progress: Any) -> None:

@@ -125,6 +125,33 @@ def test_a_turned_video_stands_upright(turn: int, quarters: int, tmp_path: Path,
     assert np.abs(first - expected).mean() < 12
 
 
+@pytest.mark.parametrize(
+    ("aspect", "turn", "size"),
+    [
+        ("4/3", 0, (213, 120)),  # HDV, which stores 1440 × 1080 for 1920 × 1080
+        ("4/3", 90, (120, 213)),
+        ("8/11", 0, (116, 120)),
+        ("0", 0, (160, 120)),  # not known
+        ("100/1", 0, (160, 120)),  # not believed
+    ],
+)
+def test_pixels_become_square(aspect: str, turn: int, size: tuple[int, int], tmp_path: Path, progress: Any) -> None:
+    import imageio_ffmpeg
+
+    pictures = panned(*np.arange(6) / 6)
+    square, stored = clip(tmp_path / "a.mp4", pictures), tmp_path / "b.mp4"
+    ffmpeg = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-display_rotation", str(turn), "-i", str(square)]
+    subprocess.run(
+        [*ffmpeg, "-c", "copy", "-bsf:v", f"h264_metadata=sample_aspect_ratio={aspect}", str(stored)], check=True
+    )
+    assert expected_frames(stored, 300)[1:] == size
+    frames = taken(stored, tmp_path / "out", progress)
+    assert {(frame.width, frame.height) for frame in frames} == {size}
+    first = np.asarray(Image.open(frames[0].file)).astype(int)
+    expected = cv2.resize(np.rot90(pictures[0], turn // 90), size, interpolation=cv2.INTER_CUBIC)
+    assert np.abs(first - expected).mean() < 12
+
+
 def test_a_cut_is_a_step_and_black_frames_are_none(tmp_path: Path, progress: Any) -> None:
     other = blots(5, 800, 200)
     black = [np.zeros((HEIGHT, WIDTH, 3), np.uint8)] * 5
