@@ -29,9 +29,9 @@ from stages.orientation import (
     turned_pose,
 )
 from stages.photos import Photo
-from stages.sources import MOST_LETTERS, pose_matrix, read_transforms
 from stages.sparse_model import SparseImage, SparseModel
 from stages.transforms_export import OPENGL_FROM_OPENCV
+from stages.transforms_files import MOST_LETTERS, TRAIN, pose_matrix, read_splits
 from stages.transforms_intrinsics import flaw_of, read_intrinsics
 
 ORTHONORMAL_WITHIN = 1e-3  # largest entry of RᵀR − 1 that is rounding; beyond it a matrix means something else
@@ -80,26 +80,21 @@ def read_known_cameras(cameras: Path, photos: Sequence[Photo], frames: Mapping[s
     Raises StageError, naming the frame, for anything that is no camera: numbers that are not finite, a focal length
     that is not positive, a rotation that is scaled or mirrored; and where no frame has a photo.
     """
-    if cameras.is_file():
-        return _from_transforms((cameras,), photos, frames, test=None)
-    if (train := cameras / "transforms_train.json").is_file():
-        test = cameras / "transforms_test.json"
-        return _from_transforms((train, test) if test.is_file() else (train,), photos, frames, test)
+    if cameras.is_file() or (cameras / TRAIN).is_file():
+        return _from_transforms(cameras, photos, frames)
     return _from_colmap(cameras, photos)
 
 
 # --- transforms files
 
 
-def _from_transforms(
-    paths: Sequence[Path], photos: Sequence[Photo], frames: Mapping[str, str], test: Path | None
-) -> KnownCameras:
+def _from_transforms(cameras: Path, photos: Sequence[Photo], frames: Mapping[str, str]) -> KnownCameras:
     by_name = {photo.name: photo for photo in photos}
     posed: dict[str, _Posed] = {}
-    absent, test_files, notes, approximate = [], [], [], 0
-    for path in paths:
-        content = read_transforms(path)
-        held_out = _held_out(content, path.name, notes)
+    absent, test_files, approximate = [], [], 0
+    splits, notes = read_splits(cameras)
+    for where, content in splits:
+        held_out = _held_out(content, where, notes)
         for frame in content["frames"]:
             name = frame["file_path"]
             photo = by_name.get(frames.get(name, ""))
@@ -112,13 +107,13 @@ def _from_transforms(
             values = {**content, **frame}
             posed[file] = _posed(photo, frame, values)
             approximate += str(values.get("note", "")).startswith(APPROXIMATION)
-            if path == test or PurePosixPath(name) in held_out:
+            if PurePosixPath(name) in held_out:
                 test_files.append(file)
     if approximate:
         notes.append(f"the lenses of {approximate} frames are approximations, as their notes in the file say")
     unposed = [photo.name for photo in photos if photo.image_name not in posed]
     return KnownCameras(
-        model=_without_points([posed[file] for file in sorted(posed)], paths[0].name),
+        model=_without_points([posed[file] for file in sorted(posed)], splits[0][0]),
         test_files=sorted(test_files) if test_files else None,
         notes=_notes(absent, unposed, [one.turns for one in posed.values()]) + notes,
     )

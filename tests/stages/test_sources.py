@@ -81,6 +81,8 @@ def test_blender_scenes_keep_train_and_test(tmp_path: Path) -> None:
     assert (source.kind, source.root, source.cameras) == ("blender", tmp_path, tmp_path)
     assert source.frames == {"./train/r_0": "train/r_0.png", "./test/r_0": "test/r_0.png"}
     assert names(source) == ["test/r_0.png", "train/r_0.png"]
+    (tmp_path / "transforms_test.json").unlink()
+    assert names(find_source(tmp_path)) == ["train/r_0.png", "val/r_0.png"]
 
 
 @pytest.mark.parametrize("place", [".", "elsewhere"])
@@ -147,7 +149,7 @@ def test_frames_may_not_leave_their_folder(tmp_path: Path, file_path: str) -> No
     [
         ("{", "it is not JSON"),
         ("[1]", "it has no list named 'frames'"),
-        ('{"frames": []}', "it has no list named 'frames'"),
+        ('{"frames": []}', "its list 'frames' is empty"),
         ('{"frames": [{"file_path": "a.jpg"}]}', "frame 0 lacks file_path or transform_matrix"),
         ('{"frames": [{"file_path": 3, "transform_matrix": []}]}', "frame 0 lacks file_path or transform_matrix"),
         ("[" * 100_000, "it is not JSON"),
