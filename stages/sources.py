@@ -4,6 +4,7 @@ Cheap: lists folders and reads at most the JSON of a transforms file, never an i
 """
 
 import os
+import re
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -27,6 +28,7 @@ _NOT_PHOTOS = (
 _VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".3gp", ".mts", ".m2ts", ".wmv", ".lrv")
 # fmt: on
 _IMAGES = (".jpg", ".jpeg", ".png", ".heic", ".heif", ".tif", ".tiff", ".webp", ".bmp", ".avif", ".gif")
+_HAS_BESIDE = re.compile(r"images(_\d+)?|input|photos")  # folders of photos beside which their masks may lie
 _EXTENSIONS_TRIED = ("", ".png", ".jpg", ".jpeg")
 _FOLDER_HINT = "Give the folder that holds the photos: pipeline run FOLDER"
 
@@ -118,12 +120,13 @@ def unused_cameras(source: Source) -> Path | None:
     return None
 
 
-def unused_masks(source: Source) -> bool:
-    """Whether a ``mask`` folder beside ``images`` would hold masks of the photos if it were called ``masks``."""
-    folder = source.root.parent / "mask"
-    if source.root.name != "images" or source.masks or not folder.is_dir():
-        return False
-    return bool({file.stem for file in folder.glob("*.png")} & {file.stem for file in source.files})
+def unused_masks(source: Source) -> Path | None:
+    """A folder beside photos that have no masks, in which there would be some if it were their ``masks`` folder."""
+    if source.masks:
+        return None
+    wanted = {stem for file in source.files for stem in (file.stem, file.name)}
+    folders = (source.root.parent / name for name in ("masks", "mask"))
+    return next((folder for folder in folders if wanted & {file.stem for file in folder.glob("*.png")}), None)
 
 
 def list_photos(root: Path) -> tuple[Path, ...]:
@@ -161,12 +164,13 @@ def _files_below(root: Path, enters: Callable[[Path], bool]) -> list[Path]:
 
 
 def _list_masks(root: Path, files: tuple[Path, ...]) -> tuple[tuple[str, Path], ...]:
-    """What lies in a ``masks`` folder in ``root``, in any folder of photos below it, or beside ``root`` where that is
-    an ``images`` folder. See :class:`Source`."""
-    holders = {holder for file in files for holder in file.parents if holder.is_relative_to(root)} | {root}
-    places = [(holder / "masks", holder.relative_to(root)) for holder in sorted(holders)]
-    if root.name == "images":
-        places.append((root.parent / "masks", Path()))
+    """What lies in a ``masks`` folder in ``root`` or in any folder of photos below it, or beside one of these that is
+    called as folders of nothing but photos are. See :class:`Source`."""
+    holders = sorted({holder for file in files for holder in file.parents if holder.is_relative_to(root)} | {root})
+    places = [(holder / "masks", holder.relative_to(root)) for holder in holders]
+    places += [
+        (holder.parent / "masks", holder.relative_to(root)) for holder in holders if _HAS_BESIDE.fullmatch(holder.name)
+    ]
     found = []
     for masks, stands_in in places:
         if masks.is_dir():

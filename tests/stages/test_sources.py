@@ -228,7 +228,15 @@ def test_masks_may_lie_beside_an_images_folder(tmp_path: Path, given: str) -> No
     touch(tmp_path, "images/a.jpg", "images/sub/b.jpg", "masks/a.png", "masks/sub/b.png")
     assert [name for name, _ in find_source(tmp_path / given).masks] == ["a.png", "sub/b.png"]
     cameras = transforms(tmp_path / "transforms.json", "images/a.jpg")
-    assert [name for name, _ in find_source(cameras).masks] == ["a.png", "sub/b.png"]
+    assert {"a.png", "sub/b.png"} <= {name for name, _ in find_source(cameras).masks}
+
+
+@pytest.mark.parametrize("folder", ["images_4", "input", "photos"])
+def test_masks_may_lie_beside_other_folders_of_photos(tmp_path: Path, folder: str) -> None:
+    touch(tmp_path, f"{folder}/a.jpg", "masks/a.png", "other/a.jpg")
+    assert [name for name, _ in find_source(tmp_path / folder).masks] == ["a.png"]
+    assert [name for name, _ in find_source(tmp_path).masks] == ["a.png", f"{folder}/a.png"]
+    assert find_source(tmp_path / "other").masks == ()
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")
