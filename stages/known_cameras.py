@@ -21,6 +21,7 @@ from stages.colmap.models import read_model
 from stages.contract import StageError
 from stages.orientation import (
     QUARTER_TURNS,
+    fits_only_upright,
     is_of_stored_pixels,
     pixel_map,
     same_shape,
@@ -29,6 +30,7 @@ from stages.orientation import (
     turned_pose,
 )
 from stages.photos import Photo
+from stages.sources import account_of_ours
 from stages.sparse_model import SparseImage, SparseModel
 from stages.transforms_export import OPENGL_FROM_OPENCV
 from stages.transforms_files import MOST_LETTERS, TRAIN, pose_matrix, read_splits
@@ -193,11 +195,11 @@ def _from_colmap(folder: Path, photos: Sequence[Photo]) -> KnownCameras:
     if not kept:
         raise _nothing_matches(folder.name)
     posed, pixel_maps = [], []
+    all_upright = _is_of_upright_photos(folder, given, photo_of)
     for i in kept:
         image, photo = given.images[i], photo_of[i]
         camera = given.cameras[image.camera]
-        # A model of ours, or of the pictures that ingest wrote, has their names, and these are upright.
-        turns = _turns(photo, camera, image.file, upright=image.file == photo.image_name != photo.name)
+        turns = _turns(photo, camera, image.file, all_upright)
         upright = _at_size_of(photo, turned_camera(camera, turns), image.file)
         posed.append(_Posed(photo, upright, turned_pose(image.sfm_from_camera, turns), turns))
         pixel_maps.append(pixel_map(camera, turns, photo.width, photo.height))
@@ -212,6 +214,18 @@ def _from_colmap(folder: Path, photos: Sequence[Photo]) -> KnownCameras:
     if behind:
         notes.append(f"{behind} observations of points behind their cameras are left out")
     return KnownCameras(model, None, notes)
+
+
+def _is_of_upright_photos(folder: Path, given: SparseModel, photo_of: Mapping[int, Photo]) -> bool:
+    """Whether a model is of photos that were turned upright first, as its shapes alone do not tell of half turns and
+    squares: it is one of ours, or of the pictures that ingest wrote, or fits a photo only when that is upright."""
+    pairs = [(given.images[i], photo) for i, photo in photo_of.items()]
+    has_names_of_ingest = all(image.file == photo.image_name for image, photo in pairs)
+    return (
+        account_of_ours(folder) is not None
+        or (has_names_of_ingest and any(photo.image_name != photo.name for _, photo in pairs))
+        or any(fits_only_upright(given.cameras[image.camera], photo) for image, photo in pairs)
+    )
 
 
 def _by_name(names: Sequence[str], photos: Sequence[Photo]) -> dict[int, Photo]:

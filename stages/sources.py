@@ -249,10 +249,18 @@ def _from_transforms(kind: SourceKind, root: Path, cameras: Path) -> Source:
 
 def camera_files(folder: Path) -> tuple[Path, ...]:
     """The files in which known cameras stand, of all that may lie in a folder: those of a Blender-style scene, else
-    those of a COLMAP model, binary ones before text; none where it holds neither."""
+    those of a COLMAP model, binary ones before text, with the account of one of ours; none where it holds neither."""
     if (folder / TRAIN).is_file():
         return tuple(path for name in (TRAIN, *HELD_OUT) if (path := folder / name).is_file())
-    return _model_files(folder)
+    account = account_of_ours(folder)
+    return (*_model_files(folder), *(() if account is None else (account,)))
+
+
+def account_of_ours(model: Path) -> Path | None:
+    """The registration.json beside a COLMAP model that stage sfm wrote, in its own folder or in ``output/``; None
+    without."""
+    account = model.parent / "registration.json"
+    return account if model.name == "sparse" and account.is_file() else None
 
 
 def _sorted_inside(root: Path, files: set[Path]) -> tuple[Path, ...]:
