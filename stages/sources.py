@@ -181,11 +181,12 @@ def _list_masks(root: Path, files: tuple[Path, ...]) -> tuple[tuple[str, Path], 
 
 def _frame_file(names: tuple[str, ...], folders: tuple[Path, ...]) -> Path:
     """The photo that the first of ``names`` stands for in the first of ``folders`` that has it; a missing extension is
-    completed.
+    completed, and where there is no such file a name is tried as Windows means it, with backslashes between folders.
 
     A photo that is nowhere is returned as if it were in the first folder, and refused when it is to be decoded.
     """
-    for name, folder, extension in product(names, folders, _EXTENSIONS_TRIED):
+    of_windows = tuple(name.replace("\\", "/") for name in names if "\\" in name)
+    for name, folder, extension in product(names + of_windows, folders, _EXTENSIONS_TRIED):
         file = _inside(folder, name + extension)
         if file.is_file():
             return file

@@ -22,7 +22,7 @@ def read_transforms(transforms: Path, *, may_be_empty: bool = False) -> dict[str
     ``transform_matrix``. Raises StageError otherwise."""
     what = f"cannot use {transforms.name}"
     try:
-        content = json.loads(transforms.read_text("utf-8"))
+        content = json.loads(transforms.read_text("utf-8-sig"))  # -sig: Windows writes a byte order mark
     except (ValueError, RecursionError) as error:
         raise StageError(f"cannot read {transforms.name}", f"it is not JSON ({error})", _HINT) from error
     if not isinstance(content, dict) or not isinstance(content.get("frames"), list):

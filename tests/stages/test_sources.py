@@ -135,6 +135,17 @@ def test_an_export_of_ours_finds_the_photos_by_their_own_names(tmp_path: Path) -
     assert (source.files, source.frames) == ((photos / "ä.jpg",), {"images/a-1.jpg": "ä.jpg"})
 
 
+def test_a_transforms_file_that_was_written_on_windows(tmp_path: Path) -> None:
+    touch(tmp_path, "train/0001.png", "train\\0002.png", "train/0002.png")
+    written = ["train\\0001", ".\\train\\0002.png", "train\\0002", "gone\\0.png"]
+    cameras = transforms(tmp_path / "transforms.json", *written)
+    cameras.write_bytes(b"\xef\xbb\xbf" + cameras.read_bytes())
+    photos = ["train/0001.png", "train/0002.png", "train\\0002.png", "gone\\0.png"]
+    assert list(find_source(cameras).frames.values()) == photos
+    error = refusal(transforms(tmp_path / "transforms.json", "..\\secret.jpg"))
+    assert (error.what, error.why) == ("refused the photo '../secret.jpg'", f"it leads out of the folder {tmp_path}")
+
+
 @pytest.mark.parametrize("file_path", ["../secret.jpg", "/etc/passwd", "images/../../secret", "link/secret.jpg", "a\0"])
 def test_frames_may_not_leave_their_folder(tmp_path: Path, file_path: str) -> None:
     touch(tmp_path, "secret.jpg", "scene/images/a.jpg")
