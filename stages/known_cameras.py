@@ -5,6 +5,7 @@ OpenCV axes here and nowhere else. Photos are told apart by their own names, as 
 their files store them are turned upright as ingest turned the photos.
 """
 
+import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -211,6 +212,8 @@ def _from_colmap(folder: Path, photos: Sequence[Photo]) -> KnownCameras:
         [photo.name for photo in photos if photo.image_name not in taken],
         [one.turns for one in posed],
     )
+    if others := [pair for i in kept if (pair := _other_ending(given.images[i].file, photo_of[i]))]:
+        notes.append(f"{len(others)} photos have the cameras of files with another ending: {_few(others)}")
     if behind:
         notes.append(f"{behind} observations of points behind their cameras are left out")
     return KnownCameras(model, None, notes)
@@ -229,11 +232,12 @@ def _is_of_upright_photos(folder: Path, given: SparseModel, photo_of: Mapping[in
 
 
 def _by_name(names: Sequence[str], photos: Sequence[Photo]) -> dict[int, Photo]:
-    """Photo by index of its image: of the same name, else of the name that ingest gave it, else of the same end."""
+    """Photo by index of its image: of the same name, else of the name that ingest gave it, else of the same end, else
+    of the same name but for its ending."""
     found: dict[int, Photo] = {}
     taken: set[str] = set()
     by_own, by_given = {photo.name: photo for photo in photos}, {photo.image_name: photo for photo in photos}
-    for photo_of in (by_own, by_given, _by_end(names, photos)):
+    for photo_of in (by_own, by_given, _by_end(names, photos), _by_path(names, photos)):
         for index, name in enumerate(names):
             photo = photo_of.get(name)
             if photo is not None and index not in found and photo.name not in taken:
@@ -258,6 +262,26 @@ def _by_end(names: Sequence[str], photos: Sequence[Photo]) -> dict[str, Photo]:
             if image.endswith(photo) or photo.endswith(image):
                 found[name] = same[0]
     return found
+
+
+def _by_path(names: Sequence[str], photos: Sequence[Photo]) -> dict[str, Photo]:
+    """Photo by name of its image where these are ``left/0.png`` and ``left/0.jpg``, say, and no other image or photo is
+    called ``left/0`` with any ending."""
+    images = Counter(map(_without_ending, names))
+    own = Counter(_without_ending(photo.name) for photo in photos)
+    by_path = {path: photo for photo in photos if own[path := _without_ending(photo.name)] == 1}
+    paths = {name: path for name in names if images[path := _without_ending(name)] == 1}
+    return {name: by_path[path] for name, path in paths.items() if path in by_path}
+
+
+def _other_ending(name: str, photo: Photo) -> str | None:
+    """A photo and its image in words, where :func:`_by_path` brought them together."""
+    same = name == photo.image_name or PurePosixPath(name).name == PurePosixPath(photo.name).name
+    return None if same else f"{photo.name} ({name})"
+
+
+def _without_ending(name: str) -> str:
+    return os.path.splitext(name)[0]
 
 
 # --- both
