@@ -53,11 +53,11 @@ def read_splits(cameras: Path) -> tuple[list[tuple[str, dict[str, Any]]], list[s
     """
     if cameras.is_file():
         train, content = cameras.name, read_transforms(cameras)
-        held_out = [_test_frames(cameras.name, content)] if "test_frames" in content else []
+        held_out = iter([_test_frames(cameras.name, content)] if "test_frames" in content else [])
     else:
         train, content = TRAIN, read_transforms(cameras / TRAIN)
         given = [name for name in HELD_OUT if (cameras / name).is_file()]
-        held_out = [(name, read_transforms(cameras / name, may_be_empty=True)) for name in given]
+        held_out = ((name, read_transforms(cameras / name, may_be_empty=True)) for name in given)  # read as needed
     notes = []
     trained_on = {PurePosixPath(frame["file_path"]): frame["transform_matrix"] for frame in content["frames"]}
     for where, other in held_out:

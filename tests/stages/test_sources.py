@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from stages.contract import StageError
-from stages.sources import Source, find_source
+from stages.sources import Source, camera_files, find_source
 
 
 def touch(folder: Path, *names: str) -> Path:
@@ -114,6 +114,13 @@ def test_a_photo_folder_with_a_colmap_model(tmp_path: Path, given: str, extensio
     source = find_source(tmp_path / "photos", tmp_path / given)
     assert (source.kind, source.cameras) == ("colmap", tmp_path / "model/sparse/0")
     assert names(source) == ["a.jpg"]
+
+
+def test_the_account_of_a_model_of_ours_says_what_its_cameras_are(tmp_path: Path) -> None:
+    sparse = touch(tmp_path, "registration.json", *(f"sparse/{name}" for name in COLMAP)) / "sparse"
+    assert [file.name for file in camera_files(sparse)] == [*COLMAP, "registration.json"]
+    other = sparse.rename(tmp_path / "0")
+    assert [file.name for file in camera_files(other)] == COLMAP
 
 
 def test_several_colmap_models_are_listed_never_guessed(tmp_path: Path) -> None:

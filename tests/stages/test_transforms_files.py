@@ -67,6 +67,13 @@ def test_one_photo_in_two_places_is_an_error_still(tmp_path: Path) -> None:
         known(tmp_path, train=TRAIN, test=[frame("train/0", 9)])
 
 
+def test_validation_photos_that_are_not_needed_are_not_read(tmp_path: Path) -> None:
+    (tmp_path / "transforms_val.json").write_text("{")
+    assert known(tmp_path, train=TRAIN, test=TEST).test_files == ["test/0.png"]
+    with pytest.raises(StageError, match=r"cannot read transforms_val\.json"):
+        known(tmp_path, train=TRAIN, test=[])
+
+
 def test_the_test_frames_of_a_single_file_are_its_test_photos(tmp_path: Path) -> None:
     file = tmp_path / "transforms.json"
     file.write_text(json.dumps({**LENS, "frames": TRAIN, "test_frames": TEST}))
