@@ -5,7 +5,7 @@ Cheap: lists folders and reads at most the JSON of a transforms file, never an i
 
 import os
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import product
@@ -149,18 +149,28 @@ def list_photos(root: Path) -> tuple[Path, ...]:
     return tuple(photos)
 
 
+def is_gone(photos: Path) -> bool:
+    """Whether nothing is left of PHOTOS, or only a folder without files: a drive that is not there leaves one, too."""
+    try:
+        empty = photos.is_dir() and next(_walk(_photo_root(photos), _is_photo_folder), None) is None
+        return empty or not photos.exists()
+    except OSError:  # said by find_source
+        return False
+
+
 def _files_below(root: Path, enters: Callable[[Path], bool]) -> list[Path]:
     """The files below ``root`` that are not hidden, in folders that one ``enters``, sorted by relative name."""
+    return sorted(_walk(root, enters), key=lambda file: file.relative_to(root).as_posix())
 
+
+def _walk(root: Path, enters: Callable[[Path], bool]) -> Iterator[Path]:
     def fail(error: OSError) -> None:
         raise error
 
-    found: list[Path] = []
     for folder, subfolders, names in os.walk(root, onerror=fail):
         here = Path(folder)
         subfolders[:] = [s for s in subfolders if enters(here / s)]
-        found += [here / name for name in names if not name.startswith(".") and (here / name).is_file()]
-    return sorted(found, key=lambda file: file.relative_to(root).as_posix())
+        yield from (here / name for name in names if not name.startswith(".") and (here / name).is_file())
 
 
 def _list_masks(root: Path, files: tuple[Path, ...]) -> tuple[tuple[str, Path], ...]:
@@ -249,7 +259,7 @@ def _from_transforms(kind: SourceKind, root: Path, cameras: Path) -> Source:
 
 
 def camera_files(folder: Path) -> tuple[Path, ...]:
-    """The files in which known cameras stand, of all that may lie in a folder: those of a Blender-style scene, else
+    """The files in which known cameras may stand, of all that lie in a folder: those of a Blender-style scene, else
     those of a COLMAP model, binary ones before text, with the account of one of ours; none where it holds neither."""
     if (folder / TRAIN).is_file():
         return tuple(path for name in (TRAIN, *HELD_OUT) if (path := folder / name).is_file())
