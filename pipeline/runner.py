@@ -156,8 +156,8 @@ class Runner:
         for stage, module in STAGES.items():
             try:
                 current = stage in self.done or self._upstream(stage, "report") is not None
-            except StageError:  # photos or a file that a setting names are gone: said where that stage runs
-                current = False
+            except StageError:  # photos or a file that a setting names cannot be read: said where that stage runs
+                continue
             if not current:
                 self.workspace.unlink_outputs(module.LINKS)
 
@@ -330,12 +330,12 @@ class Runner:
 
     def _photos_digest(self) -> str:
         """Digest of the photos' names and bytes; the last known one where the photos are gone but were ingested."""
-        from stages.sources import find_source
+        from stages.sources import find_source, is_gone
 
         if self.photos is not None:
             return self.photos
         config = self.settings.ingest
-        if not config.photos.exists() and (known := self.state.get("photos_digest")):
+        if (known := self.state.get("photos_digest")) and is_gone(config.photos):
             return known
         source = find_source(config.photos, config.cameras)
         self.display.update("reading the video" if source.kind == "video" else f"reading {len(source.files)} photos")

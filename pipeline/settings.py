@@ -51,7 +51,7 @@ class Settings(BaseModel):
 def read_toml(path: Path) -> dict[str, Any]:
     """The options in a TOML file: tables named by stage, the same keys as the flags."""
     try:
-        return tomllib.loads(path.read_text("utf-8"))
+        return tomllib.loads(path.read_text("utf-8-sig"))  # -sig: Windows writes a byte order mark
     except OSError as error:
         raise UsageError(f"--config {path}: {error.strerror}") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:

@@ -48,8 +48,9 @@ def say_unused(source: Source, progress: Progress) -> None:
     if (cameras := unused_cameras(source)) is not None:
         place, option = shown(str(cameras)), shown(f"--cameras {shlex.quote(str(cameras))}")
         progress.note(f"cameras lie in {place} and are not used: {option} would use them")
-    if unused_masks(source):
-        progress.note("masks lie in mask/ and are not used: they would be if it were called masks/ (black is ignored)")
+    if (masks := unused_masks(source)) is not None:
+        lie, wanted = shown(str(masks)), shown(str(source.root / "masks"))
+        progress.note(f"masks lie in {lie} and are not used: in {wanted} they would be (black is ignored)")
 
 
 def set_aside(files: Mapping[str, str]) -> list[str]:

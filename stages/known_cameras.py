@@ -5,6 +5,7 @@ OpenCV axes here and nowhere else. Photos are told apart by their own names, as 
 their files store them are turned upright as ingest turned the photos.
 """
 
+import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -21,6 +22,7 @@ from stages.colmap.models import read_model
 from stages.contract import StageError
 from stages.orientation import (
     QUARTER_TURNS,
+    fits_only_upright,
     is_of_stored_pixels,
     pixel_map,
     same_shape,
@@ -29,9 +31,10 @@ from stages.orientation import (
     turned_pose,
 )
 from stages.photos import Photo
-from stages.sources import MOST_LETTERS, pose_matrix, read_transforms
+from stages.sources import account_of_ours
 from stages.sparse_model import SparseImage, SparseModel
 from stages.transforms_export import OPENGL_FROM_OPENCV
+from stages.transforms_files import MOST_LETTERS, TRAIN, pose_matrix, read_splits
 from stages.transforms_intrinsics import flaw_of, read_intrinsics
 
 ORTHONORMAL_WITHIN = 1e-3  # largest entry of RᵀR − 1 that is rounding; beyond it a matrix means something else
@@ -80,26 +83,21 @@ def read_known_cameras(cameras: Path, photos: Sequence[Photo], frames: Mapping[s
     Raises StageError, naming the frame, for anything that is no camera: numbers that are not finite, a focal length
     that is not positive, a rotation that is scaled or mirrored; and where no frame has a photo.
     """
-    if cameras.is_file():
-        return _from_transforms((cameras,), photos, frames, test=None)
-    if (train := cameras / "transforms_train.json").is_file():
-        test = cameras / "transforms_test.json"
-        return _from_transforms((train, test) if test.is_file() else (train,), photos, frames, test)
+    if cameras.is_file() or (cameras / TRAIN).is_file():
+        return _from_transforms(cameras, photos, frames)
     return _from_colmap(cameras, photos)
 
 
 # --- transforms files
 
 
-def _from_transforms(
-    paths: Sequence[Path], photos: Sequence[Photo], frames: Mapping[str, str], test: Path | None
-) -> KnownCameras:
+def _from_transforms(cameras: Path, photos: Sequence[Photo], frames: Mapping[str, str]) -> KnownCameras:
     by_name = {photo.name: photo for photo in photos}
     posed: dict[str, _Posed] = {}
-    absent, test_files, notes, approximate = [], [], [], 0
-    for path in paths:
-        content = read_transforms(path)
-        held_out = _held_out(content, path.name, notes)
+    absent, test_files, approximate = [], [], 0
+    splits, notes = read_splits(cameras)
+    for where, content in splits:
+        held_out = _held_out(content, where, notes)
         for frame in content["frames"]:
             name = frame["file_path"]
             photo = by_name.get(frames.get(name, ""))
@@ -112,13 +110,13 @@ def _from_transforms(
             values = {**content, **frame}
             posed[file] = _posed(photo, frame, values)
             approximate += str(values.get("note", "")).startswith(APPROXIMATION)
-            if path == test or PurePosixPath(name) in held_out:
+            if PurePosixPath(name) in held_out:
                 test_files.append(file)
     if approximate:
         notes.append(f"the lenses of {approximate} frames are approximations, as their notes in the file say")
     unposed = [photo.name for photo in photos if photo.image_name not in posed]
     return KnownCameras(
-        model=_without_points([posed[file] for file in sorted(posed)], paths[0].name),
+        model=_without_points([posed[file] for file in sorted(posed)], splits[0][0]),
         test_files=sorted(test_files) if test_files else None,
         notes=_notes(absent, unposed, [one.turns for one in posed.values()]) + notes,
     )
@@ -198,11 +196,11 @@ def _from_colmap(folder: Path, photos: Sequence[Photo]) -> KnownCameras:
     if not kept:
         raise _nothing_matches(folder.name)
     posed, pixel_maps = [], []
+    all_upright = _is_of_upright_photos(folder, given, photo_of)
     for i in kept:
         image, photo = given.images[i], photo_of[i]
         camera = given.cameras[image.camera]
-        # A model of ours, or of the pictures that ingest wrote, has their names, and these are upright.
-        turns = _turns(photo, camera, image.file, upright=image.file == photo.image_name != photo.name)
+        turns = _turns(photo, camera, image.file, all_upright)
         upright = _at_size_of(photo, turned_camera(camera, turns), image.file)
         posed.append(_Posed(photo, upright, turned_pose(image.sfm_from_camera, turns), turns))
         pixel_maps.append(pixel_map(camera, turns, photo.width, photo.height))
@@ -214,17 +212,32 @@ def _from_colmap(folder: Path, photos: Sequence[Photo]) -> KnownCameras:
         [photo.name for photo in photos if photo.image_name not in taken],
         [one.turns for one in posed],
     )
+    if others := [pair for i in kept if (pair := _other_ending(given.images[i].file, photo_of[i]))]:
+        notes.append(f"{len(others)} photos have the cameras of files with another ending: {_few(others)}")
     if behind:
         notes.append(f"{behind} observations of points behind their cameras are left out")
     return KnownCameras(model, None, notes)
 
 
+def _is_of_upright_photos(folder: Path, given: SparseModel, photo_of: Mapping[int, Photo]) -> bool:
+    """Whether a model is of photos that were turned upright first, as its shapes alone do not tell of half turns and
+    squares: it is one of ours, or of the pictures that ingest wrote, or fits a photo only when that is upright."""
+    pairs = [(given.images[i], photo) for i, photo in photo_of.items()]
+    has_names_of_ingest = all(image.file == photo.image_name for image, photo in pairs)
+    return (
+        account_of_ours(folder) is not None
+        or (has_names_of_ingest and any(photo.image_name != photo.name for _, photo in pairs))
+        or any(fits_only_upright(given.cameras[image.camera], photo) for image, photo in pairs)
+    )
+
+
 def _by_name(names: Sequence[str], photos: Sequence[Photo]) -> dict[int, Photo]:
-    """Photo by index of its image: of the same name, else of the name that ingest gave it, else of the same end."""
+    """Photo by index of its image: of the same name, else of the name that ingest gave it, else of the same end, else
+    of the same name but for its ending."""
     found: dict[int, Photo] = {}
     taken: set[str] = set()
     by_own, by_given = {photo.name: photo for photo in photos}, {photo.image_name: photo for photo in photos}
-    for photo_of in (by_own, by_given, _by_end(names, photos)):
+    for photo_of in (by_own, by_given, _by_end(names, photos), _by_path(names, photos)):
         for index, name in enumerate(names):
             photo = photo_of.get(name)
             if photo is not None and index not in found and photo.name not in taken:
@@ -249,6 +262,26 @@ def _by_end(names: Sequence[str], photos: Sequence[Photo]) -> dict[str, Photo]:
             if image.endswith(photo) or photo.endswith(image):
                 found[name] = same[0]
     return found
+
+
+def _by_path(names: Sequence[str], photos: Sequence[Photo]) -> dict[str, Photo]:
+    """Photo by name of its image where these are ``left/0.png`` and ``left/0.jpg``, say, and no other image or photo is
+    called ``left/0`` with any ending."""
+    images = Counter(map(_without_ending, names))
+    own = Counter(_without_ending(photo.name) for photo in photos)
+    by_path = {path: photo for photo in photos if own[path := _without_ending(photo.name)] == 1}
+    paths = {name: path for name in names if images[path := _without_ending(name)] == 1}
+    return {name: by_path[path] for name, path in paths.items() if path in by_path}
+
+
+def _other_ending(name: str, photo: Photo) -> str | None:
+    """A photo and its image in words, where :func:`_by_path` brought them together."""
+    same = name == photo.image_name or PurePosixPath(name).name == PurePosixPath(photo.name).name
+    return None if same else f"{photo.name} ({name})"
+
+
+def _without_ending(name: str) -> str:
+    return os.path.splitext(name)[0]
 
 
 # --- both

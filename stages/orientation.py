@@ -29,6 +29,11 @@ def same_shape(camera: Camera, size: tuple[int, int]) -> bool:
     return abs(size[0] * camera.height / (camera.width * size[1]) - 1) <= ASPECT_WITHIN
 
 
+def fits_only_upright(camera: Camera, photo: Photo) -> bool:
+    """Whether the photo has the camera's shape once it is upright, and not as its file stores it."""
+    return same_shape(camera, (photo.width, photo.height)) and not same_shape(camera, stored_size(photo))
+
+
 def is_of_stored_pixels(camera: Camera, photo: Photo, upright: bool) -> bool:
     """Whether a given camera is one of the photo as its file stores it, turned or mirrored. The shape tells; where both
     would do (a half turn, a square), it is, unless it is known to be ``upright``."""

@@ -122,7 +122,7 @@ def path_from_file(scene: "Scene", file: Path) -> CameraPath:
     """
     import numpy as np
 
-    from stages.sources import read_transforms
+    from stages.transforms_files import read_transforms
     from stages.transforms_intrinsics import read_intrinsics
 
     content = read_transforms(file)
@@ -152,8 +152,8 @@ def _in_scene(matrix: Any, scene_from_sfm: "Similarity") -> "np.ndarray":
     import numpy as np
 
     from nerf.camera_paths import nearest_rotations
-    from stages.sources import pose_matrix
     from stages.transforms_export import OPENGL_FROM_OPENCV
+    from stages.transforms_files import pose_matrix
 
     pose = pose_matrix(matrix)
     if not np.linalg.det(pose[:, :3]) > 0:

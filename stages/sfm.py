@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 NEEDS = ("ingest",)
 VERSION = 7
 RESUMES = True
-LINKS = ("sparse",)
+LINKS = ("sparse", "registration.json")
 # Both may decide that an attempt is not made, which is said, in the stage's line as well. A run with another limit is
 # to go on from the matches that one before it kept, so its key has to be the same. How far features are searched, which
 # ``seconds`` decides as well, enters the key by options of its own.

@@ -3,21 +3,18 @@
 Cheap: lists folders and reads at most the JSON of a transforms file, never an image.
 """
 
-import json
 import os
-from collections.abc import Callable, Mapping
+import re
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Literal
 
 from stages.contract import StageError
+from stages.transforms_files import HELD_OUT, MOST_LETTERS, TRAIN, photo_names, read_splits
 from stages.twins import twins
-
-if TYPE_CHECKING:
-    import numpy as np
-    from jaxtyping import Float
 
 SourceKind = Literal["photos", "video", "transforms", "blender", "colmap"]
 
@@ -31,9 +28,8 @@ _NOT_PHOTOS = (
 _VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".3gp", ".mts", ".m2ts", ".wmv", ".lrv")
 # fmt: on
 _IMAGES = (".jpg", ".jpeg", ".png", ".heic", ".heif", ".tif", ".tiff", ".webp", ".bmp", ".avif", ".gif")
+_HAS_BESIDE = re.compile(r"images(_\d+)?|input|photos")  # folders of photos beside which their masks may lie
 _EXTENSIONS_TRIED = ("", ".png", ".jpg", ".jpeg")
-LONGEST_PATH, LONGEST_NAME = 2000, 250  # bytes, with room for an extension
-MOST_LETTERS = 60  # of a name, in an error
 _FOLDER_HINT = "Give the folder that holds the photos: pipeline run FOLDER"
 
 
@@ -92,12 +88,12 @@ def _source(photos: Path, cameras: Path | None) -> Source:
     if photos.is_file() and _is_video(photos):
         return Source("video", photos.parent, None, (photos,))
     if photos.is_file():
-        return _from_transforms("transforms", photos.parent, photos, photos)
+        return _from_transforms("transforms", photos.parent, photos)
     root = _photo_root(photos)
     if cameras is not None and cameras.is_file():
-        return _from_transforms("transforms", root, cameras, cameras)
-    if cameras is None and (photos / "transforms_train.json").is_file():
-        return _from_blender(photos)
+        return _from_transforms("transforms", root, cameras)
+    if cameras is None and (photos / TRAIN).is_file():
+        return _from_transforms("blender", photos, photos)
     files = list_photos(root)
     if _is_video(files[0]):
         return Source("video", root, None, files)
@@ -119,17 +115,18 @@ def unused_cameras(source: Source) -> Path | None:
             return _colmap_model(place / "sparse")
     for file in (place / "transforms.json" for place in places):
         with suppress(StageError, OSError):
-            if set(_from_transforms("transforms", source.root, file, file).files) & set(source.files):
+            if set(_from_transforms("transforms", source.root, file).files) & set(source.files):
                 return file
     return None
 
 
-def unused_masks(source: Source) -> bool:
-    """Whether a ``mask`` folder beside ``images`` would hold masks of the photos if it were called ``masks``."""
-    folder = source.root.parent / "mask"
-    if source.root.name != "images" or source.masks or not folder.is_dir():
-        return False
-    return bool({file.stem for file in folder.glob("*.png")} & {file.stem for file in source.files})
+def unused_masks(source: Source) -> Path | None:
+    """A folder beside photos that have no masks, in which there would be some if it were their ``masks`` folder."""
+    if source.masks:
+        return None
+    wanted = {stem for file in source.files for stem in (file.stem, file.name)}
+    folders = (source.root.parent / name for name in ("masks", "mask"))
+    return next((folder for folder in folders if wanted & {file.stem for file in folder.glob("*.png")}), None)
 
 
 def list_photos(root: Path) -> tuple[Path, ...]:
@@ -152,27 +149,38 @@ def list_photos(root: Path) -> tuple[Path, ...]:
     return tuple(photos)
 
 
+def is_gone(photos: Path) -> bool:
+    """Whether nothing is left of PHOTOS, or only a folder without files: a drive that is not there leaves one, too."""
+    try:
+        empty = photos.is_dir() and next(_walk(_photo_root(photos), _is_photo_folder), None) is None
+        return empty or not photos.exists()
+    except OSError:  # said by find_source
+        return False
+
+
 def _files_below(root: Path, enters: Callable[[Path], bool]) -> list[Path]:
     """The files below ``root`` that are not hidden, in folders that one ``enters``, sorted by relative name."""
+    return sorted(_walk(root, enters), key=lambda file: file.relative_to(root).as_posix())
 
+
+def _walk(root: Path, enters: Callable[[Path], bool]) -> Iterator[Path]:
     def fail(error: OSError) -> None:
         raise error
 
-    found: list[Path] = []
     for folder, subfolders, names in os.walk(root, onerror=fail):
         here = Path(folder)
         subfolders[:] = [s for s in subfolders if enters(here / s)]
-        found += [here / name for name in names if not name.startswith(".") and (here / name).is_file()]
-    return sorted(found, key=lambda file: file.relative_to(root).as_posix())
+        yield from (here / name for name in names if not name.startswith(".") and (here / name).is_file())
 
 
 def _list_masks(root: Path, files: tuple[Path, ...]) -> tuple[tuple[str, Path], ...]:
-    """What lies in a ``masks`` folder in ``root``, in any folder of photos below it, or beside ``root`` where that is
-    an ``images`` folder. See :class:`Source`."""
-    holders = {holder for file in files for holder in file.parents if holder.is_relative_to(root)} | {root}
-    places = [(holder / "masks", holder.relative_to(root)) for holder in sorted(holders)]
-    if root.name == "images":
-        places.append((root.parent / "masks", Path()))
+    """What lies in a ``masks`` folder in ``root`` or in any folder of photos below it, or beside one of these that is
+    called as folders of nothing but photos are. See :class:`Source`."""
+    holders = sorted({holder for file in files for holder in file.parents if holder.is_relative_to(root)} | {root})
+    places = [(holder / "masks", holder.relative_to(root)) for holder in holders]
+    places += [
+        (holder.parent / "masks", holder.relative_to(root)) for holder in holders if _HAS_BESIDE.fullmatch(holder.name)
+    ]
     found = []
     for masks, stands_in in places:
         if masks.is_dir():
@@ -181,63 +189,14 @@ def _list_masks(root: Path, files: tuple[Path, ...]) -> tuple[tuple[str, Path], 
     return tuple(found)
 
 
-def read_transforms(transforms: Path) -> dict[str, Any]:
-    """The content of a transforms file, checked to hold a list ``frames`` of objects with ``file_path`` and
-    ``transform_matrix``. Raises StageError otherwise."""
-    hint = "Give a transforms.json as nerfstudio, instant-ngp or the NeRF-synthetic scenes write it."
-    try:
-        content = json.loads(transforms.read_text("utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise StageError(f"cannot read {transforms.name}", f"it is not JSON ({error})", hint) from error
-    frames = content.get("frames") if isinstance(content, dict) else None
-    if not isinstance(frames, list) or not frames:
-        raise StageError(f"cannot use {transforms.name}", "it has no list named 'frames'", hint)
-    for index, frame in enumerate(frames):
-        if not (isinstance(frame, dict) and isinstance(frame.get("file_path"), str) and "transform_matrix" in frame):
-            raise StageError(
-                f"cannot use {transforms.name}", f"frame {index} lacks file_path or transform_matrix", hint
-            )
-        if wrong := next((name for name in _names(frame) if not _is_name(name)), None):
-            why = f"no file can have the name of frame {index}, {ascii(wrong)[:MOST_LETTERS]}"
-            raise StageError(f"cannot use {transforms.name}", why, hint)
-    return content
-
-
-def pose_matrix(matrix: Any) -> "Float[np.ndarray, '3 4']":
-    """The first three rows of a frame's ``transform_matrix``. Raises ValueError for what is no matrix of that shape."""
-    import numpy as np
-
-    try:
-        pose = np.array(matrix, np.float64)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise ValueError("its transform_matrix is not a matrix of numbers") from error
-    if pose.shape not in ((3, 4), (4, 4)) or not np.isfinite(pose[:3]).all():
-        raise ValueError("its transform_matrix is not 4 × 4 (or 3 × 4) finite numbers")
-    return pose[:3]
-
-
-def _names(frame: dict[str, Any]) -> tuple[str, ...]:
-    """What a frame calls its photo: in a file of ours by its own name first (``photo``), then ``file_path``."""
-    own = frame.get("photo")
-    return (own, frame["file_path"]) if isinstance(own, str) else (frame["file_path"],)
-
-
-def _is_name(file_path: str) -> bool:
-    """Whether it can be written as UTF-8 and is of a length that file systems take."""
-    try:
-        parts = file_path.encode().split(b"/")
-    except UnicodeEncodeError:
-        return False
-    return sum(map(len, parts)) <= LONGEST_PATH and max(map(len, parts)) <= LONGEST_NAME
-
-
 def _frame_file(names: tuple[str, ...], folders: tuple[Path, ...]) -> Path:
     """The photo that the first of ``names`` stands for in the first of ``folders`` that has it; a missing extension is
-    completed.
+    completed, and where there is no such file a name is tried as Windows means it, with backslashes between folders.
 
     A photo that is nowhere is returned as if it were in the first folder, and refused when it is to be decoded.
     """
-    for name, folder, extension in product(names, folders, _EXTENSIONS_TRIED):
+    of_windows = tuple(name.replace("\\", "/") for name in names if "\\" in name)
+    for name, folder, extension in product(names + of_windows, folders, _EXTENSIONS_TRIED):
         file = _inside(folder, name + extension)
         if file.is_file():
             return file
@@ -289,27 +248,30 @@ def _is_photo_folder(folder: Path) -> bool:
     return not folder.name.startswith(".") and folder.name != "masks" and not (folder / "run.json").is_file()
 
 
-def _from_transforms(kind: SourceKind, root: Path, cameras: Path, *transforms: Path) -> Source:
-    files: dict[str, Path] = {}
-    for path in transforms:
-        folders = (root,) if path.parent == root else (root, root.parent, path.parent)
-        frames = read_transforms(path)["frames"]
-        files |= {frame["file_path"]: _frame_file(_names(frame), folders) for frame in frames}
+def _from_transforms(kind: SourceKind, root: Path, cameras: Path) -> Source:
+    place = cameras.parent if cameras.is_file() else cameras
+    folders = (root,) if place == root else (root, root.parent, place)
+    splits, _ = read_splits(cameras)
+    frames = [frame for _, content in splits for frame in content["frames"]]
+    files = {frame["file_path"]: _frame_file(photo_names(frame), folders) for frame in frames}
     in_order = _sorted_inside(root, set(files.values()))
     return Source(kind, root, cameras, in_order, {path: _name(root, file) for path, file in files.items()})
 
 
-def _from_blender(folder: Path) -> Source:
-    return _from_transforms("blender", folder, folder, *camera_files(folder))
-
-
 def camera_files(folder: Path) -> tuple[Path, ...]:
-    """The files in which known cameras stand, of all that may lie in a folder: those of a Blender-style scene, else
-    those of a COLMAP model, binary ones before text; none where it holds neither."""
-    if (folder / "transforms_train.json").is_file():
-        splits = (folder / f"transforms_{split}.json" for split in ("train", "test"))
-        return tuple(path for path in splits if path.is_file())
-    return _model_files(folder)
+    """The files in which known cameras may stand, of all that lie in a folder: those of a Blender-style scene, else
+    those of a COLMAP model, binary ones before text, with the account of one of ours; none where it holds neither."""
+    if (folder / TRAIN).is_file():
+        return tuple(path for name in (TRAIN, *HELD_OUT) if (path := folder / name).is_file())
+    account = account_of_ours(folder)
+    return (*_model_files(folder), *(() if account is None else (account,)))
+
+
+def account_of_ours(model: Path) -> Path | None:
+    """The registration.json beside a COLMAP model that stage sfm wrote, in its own folder or in ``output/``; None
+    without."""
+    account = model.parent / "registration.json"
+    return account if model.name == "sparse" and account.is_file() else None
 
 
 def _sorted_inside(root: Path, files: set[Path]) -> tuple[Path, ...]:

@@ -31,12 +31,25 @@ def camera_rays(camera: Camera, width: int, height: int) -> Float[np.ndarray, "h
         lost += int(np.count_nonzero(~(miss < ROUND_TRIP_PX)))  # NaN counts as lost
         rays[row] = bearings
     if lost:
+        crop = "crop photos and cameras to the square inside the lens's circle"
+        other = crop if is_fisheye(camera.model) else "choose a simpler --sfm.camera-model"
         raise StageError(
             f"the {camera.model} camera has no ray for {lost / (width * height):.1%} of its pixels",
-            f"its distortion cannot be undone there (parameters {', '.join(f'{p:.5g}' for p in camera.params)})",
-            "Check the distortion of the given cameras, or choose a simpler --sfm.camera-model.",
+            f"{why_no_ray(camera.model)} there (parameters {', '.join(f'{p:.5g}' for p in camera.params)})",
+            f"Check the distortion of the given cameras, or {other}.",
         )
     return rays
+
+
+def why_no_ray(model: str) -> str:
+    """What may be the matter where a camera of this model has no ray: COLMAP's fisheyes end at 90° from the axis, and
+    the bearings that they give further out are of other pixels."""
+    return f"{'it looks beyond 90° from its axis or ' if is_fisheye(model) else ''}its distortion cannot be undone"
+
+
+def is_fisheye(model: str) -> bool:
+    """Whether a camera model is one of angles, which may be made for very wide lenses."""
+    return model.endswith("FISHEYE")
 
 
 def project(camera: Camera, points_camera: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:

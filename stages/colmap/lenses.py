@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from stages.colmap.cameras import ROUND_TRIP_PX
+from stages.colmap.cameras import ROUND_TRIP_PX, is_fisheye, why_no_ray
 from stages.colmap.observations import observations, points_in_camera
 from stages.decoding import FOCAL_RANGE
 
@@ -47,7 +47,7 @@ class Lens(NamedTuple):
         Ordinary lenses are made to draw straight lines straight, and at their angles a fisheye's series describes
         much the same rays. So a fisheye model counts as less simple than all others, however few its numbers.
         """
-        return self.model.endswith("FISHEYE"), self.free_parameters
+        return is_fisheye(self.model), self.free_parameters
 
     @property
     def place(self) -> str:
@@ -114,7 +114,7 @@ def flaw(camera: "pycolmap.Camera") -> str | None:
     pixels = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     again = np.asarray(camera.img_from_cam(np.asarray(camera.cam_ray_from_img(pixels))))
     lost = 1 - np.count_nonzero(np.abs(again - pixels).max(axis=1) < ROUND_TRIP_PX) / len(pixels)  # NaN is lost
-    return f"its distortion cannot be undone at {lost:.1%} of the pixels" if lost else None
+    return f"{why_no_ray(camera.model_name)} at {lost:.1%} of the pixels" if lost else None
 
 
 def flaws(model: "pycolmap.Reconstruction") -> dict[int, str]:

@@ -194,7 +194,7 @@ def _binary_points(path: Path) -> Iterator[tuple[int, FilePoint]]:
 
 
 def _lines(path: Path) -> list[str]:
-    return [line for line in path.read_text("utf-8", "backslashreplace").split("\n") if not line.startswith("#")]
+    return [line for line in path.read_text("utf-8-sig", "backslashreplace").split("\n") if not line.startswith("#")]
 
 
 def _fields(line: str, least: int) -> list[str]:

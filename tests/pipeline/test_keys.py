@@ -76,8 +76,8 @@ def test_paths_enter_by_content(tmp_path: Path):
 @pytest.mark.parametrize(
     ("read", "beside"),
     [
-        (("transforms_train.json", "transforms_test.json"), ("transforms_val.json", "cameras.bin", "train/r_0.png")),
-        (("transforms_train.json",), ("transforms_val.json",)),
+        (("transforms_train.json", "transforms_test.json"), ("transforms.json", "cameras.bin", "train/r_0.png")),
+        (("transforms_train.json", "transforms_val.json"), ("cameras.bin",)),
         (("cameras.bin", "images.bin", "points3D.bin"), ("cameras.txt", "rigs.bin", "points3D.ply", ".DS_Store")),
         (("cameras.txt", "images.txt", "points3D.txt"), ("project.ini",)),
     ],

@@ -1,8 +1,10 @@
-"""Effects by name on the command line."""
+"""Options from a file, and effects by name on the command line."""
+
+from pathlib import Path
 
 import pytest
 
-from pipeline.settings import Settings, UsageError, with_effects
+from pipeline.settings import Settings, UsageError, read_toml, with_effects
 from stages.effects import Config
 
 EFFECTS = "exposure, view_dependence, background, pose_refinement"
@@ -38,3 +40,8 @@ def test_wrong_effects_are_named_with_those_that_there_are(choice: str, words: s
     with pytest.raises(UsageError) as error:
         with_effects(Settings(), [choice])
     assert str(error.value) == words
+
+
+def test_a_file_may_begin_with_the_byte_order_mark_of_windows(tmp_path: Path):
+    (tmp_path / "a.toml").write_bytes(b"\xef\xbb\xbf[train]\r\nsteps = 3\r\n")
+    assert read_toml(tmp_path / "a.toml") == {"train": {"steps": 3}}

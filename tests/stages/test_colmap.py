@@ -1,3 +1,4 @@
+import re
 from pathlib import Path
 
 import numpy as np
@@ -5,8 +6,9 @@ import pytest
 
 from nerf.scene import Camera
 from nerf.synthetic import ring_of_cameras
-from stages.colmap.cameras import camera_rays, is_valid, project, rescaled
+from stages.colmap.cameras import camera_rays, is_valid, native, project, rescaled
 from stages.colmap.diagnosis import find_conflict
+from stages.colmap.lenses import flaw
 from stages.colmap.models import load_native, read_model, write_model
 from stages.contract import StageError
 from stages.sparse_model import SparseImage, SparseModel
@@ -53,6 +55,21 @@ def test_rays_of_a_pinhole_are_what_they_should_be() -> None:
 def test_distortion_that_cannot_be_undone_is_refused_with_its_share(k: float) -> None:
     with pytest.raises(StageError, match=r"the SIMPLE_RADIAL camera has no ray for \d+\.\d% of its pixels"):
         camera_rays(lens("SIMPLE_RADIAL", 30.0, 30.0, 20.0, k), W, H)
+
+
+@pytest.mark.parametrize(("model", "focals", "terms"), [("SIMPLE_FISHEYE", 1, 0), ("OPENCV_FISHEYE", 2, 4)])
+def test_a_fisheye_of_180_degrees_is_to_be_cropped(model: str, focals: int, terms: int) -> None:
+    def cropped_to(side: int) -> Camera:
+        """Of a lens whose circle is 100 pixels across."""
+        return Camera(model, side, side, (50 / (np.pi / 2),) * focals + (side / 2, side / 2) + (0.0,) * terms)
+
+    with pytest.raises(StageError, match=rf"the {model} camera has no ray for \d+\.\d% of its pixels") as raised:
+        camera_rays(cropped_to(100), 100, 100)
+    assert raised.value.why.startswith("it looks beyond 90° from its axis or its distortion cannot be undone there (")
+    assert raised.value.hint.endswith("or crop photos and cameras to the square inside the lens's circle.")
+    assert re.match(r"it looks beyond 90° .* at \d+\.\d% of the pixels", str(flaw(native(cropped_to(100)))))
+    assert camera_rays(cropped_to(70), 70, 70)[..., 2].min() > 0
+    assert flaw(native(cropped_to(70))) is None
 
 
 def test_points_behind_the_camera_project_nowhere() -> None:

@@ -11,6 +11,7 @@ from stages import ingest
 from stages.contract import StageError
 from stages.files import read_json
 from stages.ingest import Config
+from stages.photos import read_photos
 
 
 def put(folder: Path, *names: str) -> Path:
@@ -48,6 +49,16 @@ def test_all_notes_are_kept(tmp_path: Path, progress: Any) -> None:
     assert notes[6] == "masks/stray6.png is no photo's mask, which are called NAME.png"
     assert notes[7].startswith("c0.tif: ")
     assert progress.notes[10] == "… and 2 more, all in notes.json"
+
+
+def test_masks_beside_a_folder_of_photos_are_used_and_strays_said_once(tmp_path: Path, progress: Any) -> None:
+    put(tmp_path / "in/photos", "a.jpg", "b.jpg")
+    (tmp_path / "in/masks").mkdir()
+    for name in ("a.png", "stray.png"):
+        Image.fromarray(np.eye(24, 32, dtype=np.uint8) * 255).save(tmp_path / "in/masks" / name)
+    ingest.run(Config(photos=tmp_path / "in"), {}, tmp_path / "out", progress)
+    assert [photo.mask is not None for photo in read_photos(tmp_path / "out")] == [True, False]
+    assert sum("masks/stray.png is no photo's mask" in note for note in progress.notes) == 1
 
 
 def test_where_it_fails_all_refusals_are_said_by_reason(tmp_path: Path, progress: Any) -> None:

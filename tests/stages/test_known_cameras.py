@@ -338,6 +338,10 @@ def test_a_name_that_two_photos_share_matches_neither(tmp_path: Path) -> None:
         (["xcam0/0.jpg"], ["cam0/0.jpg"], {}),
         (["ä.jpg", "a.png"], ["ä.jpg"], {0: "ä.jpg"}),  # a model with both of its names
         (["b/a.png"], ["b/ä.jpg"], {0: "b/ä.jpg"}),
+        (["0.jpg", "b/1.JPG", "2"], ["0.png", "b/1.jpg", "2.png"], {0: "0.png", 1: "b/1.jpg", 2: "2.png"}),
+        (["b/0.jpg", "1.jpg"], ["0.png", "b/1.png"], {}),  # of another folder as well
+        (["0.jpg", "1.jpg", "1.jpeg"], ["0.png", "0.tif", "1.png"], {}),
+        (["0.jpg", "0.png"], ["0.png"], {1: "0.png"}),
     ],
 )
 def test_images_have_the_photos_of_their_names(images: list[str], own: list[str], matches: dict[int, str]) -> None:
@@ -346,6 +350,13 @@ def test_images_have_the_photos_of_their_names(images: list[str], own: list[str]
         file = f"images/{name.replace('ä.jpg', 'a.png')}"
         photos.append(Photo(name, file, W, H, 0, None, None, False, 1.0))
     assert {index: photo.name for index, photo in _by_name(images, photos).items()} == matches
+
+
+def test_cameras_of_photos_with_another_ending_are_taken_and_named(tmp_path: Path) -> None:
+    colmap_model(tmp_path, ["ä0.jpg", "a1.png", "ä2.png"])
+    known = read_known_cameras(tmp_path, PHOTOS, {})
+    assert [image.file for image in known.model.images] == ["a0.png", "a1.png", "a2.png"]
+    assert known.notes == ["1 photos have the cameras of files with another ending: ä0.png (ä0.jpg)"]
 
 
 def test_one_name_that_is_not_clear_leaves_the_other_cameras(tmp_path: Path) -> None:

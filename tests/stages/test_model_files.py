@@ -43,6 +43,12 @@ def test_it_reads_what_colmap_reads(model: Path) -> None:
     assert ours.cameras[0].params == tuple(theirs.camera(1).params)
 
 
+def test_text_may_begin_with_the_byte_order_mark_of_windows(tmp_path: Path) -> None:
+    for name, content in colmap_models()["txt"].items():
+        (tmp_path / name).write_bytes(b"\xef\xbb\xbf" + content)
+    assert len(read_model(tmp_path).images) == 3
+
+
 @pytest.mark.parametrize("scale", [1e-300, 1e-9, 1.0, 1e9, 1e300])
 def test_quaternions_need_no_length(scale: float) -> None:
     pose = np.array([0.1, -0.5, 0.7, 0.2, 1.0, 2.0, 3.0])

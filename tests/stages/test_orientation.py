@@ -1,5 +1,6 @@
 """Cameras given for photos as their files store them, and what ingest turned upright of these."""
 
+import dataclasses
 import json
 import math
 from pathlib import Path
@@ -132,6 +133,32 @@ def test_our_own_export_is_of_upright_photos_and_comes_back(orientation: int, tm
     np.testing.assert_allclose([c.params for c in again.cameras], [c.params for c in first.cameras], atol=1e-9)
     poses, as_before = ([image.sfm_from_camera for image in model.images] for model in (again, first))
     np.testing.assert_allclose(poses, as_before, atol=1e-9)
+
+
+@pytest.mark.parametrize(("orientation", "width", "height"), [(3, WIDTH, HEIGHT), (6, WIDTH, HEIGHT), (8, 50, 50)])
+def test_our_own_model_is_of_upright_photos_and_comes_back(
+    orientation: int, width: int, height: int, tmp_path: Path, progress: Any
+) -> None:
+    names = photo_set(tmp_path / "photos", orientation, width=width, height=height)
+    given = tmp_path / "given.json"
+    given.write_text(json.dumps({**LENS, "w": width, "h": height, "frames": frames_of(names)}))
+    first, _ = imported(given, tmp_path / "photos", tmp_path / "first", progress)
+    again, _ = imported(tmp_path / "first/sfm/sparse", tmp_path / "photos", tmp_path / "again", progress)
+    np.testing.assert_allclose([c.params for c in again.cameras], [c.params for c in first.cameras], atol=1e-9)
+    poses, as_before = ([image.sfm_from_camera for image in model.images] for model in (again, first))
+    np.testing.assert_allclose(poses, as_before, atol=1e-9)
+
+
+@pytest.mark.parametrize("alone", [True, False])
+def test_one_camera_that_only_fits_upright_tells_it_of_all(alone: bool, tmp_path: Path) -> None:
+    turned = dataclasses.replace(turned_photo(3), file="images/p.jpg")
+    photos = [turned] if alone else [turned, dataclasses.replace(turned_photo(6, "q.jpg"), file="images/q.jpg")]
+    cameras = [dataclasses.replace(OPENCV, width=photo.width, height=photo.height) for photo in photos]
+    images = [SparseImage(photo.name, i, pose) for i, (photo, pose) in enumerate(zip(photos, ring(5), strict=False))]
+    write_model(tmp_path, SparseModel.without_points(cameras, images))
+    known = read_known_cameras(tmp_path, photos, {})
+    turns = ["1 cameras are turned upright like their photos (EXIF orientation)"]
+    assert known.notes == (turns if alone else [])
 
 
 def turned_photo(orientation: int, name: str = "p.jpg") -> Photo:

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from stages.contract import StageError
-from stages.sources import Source, find_source
+from stages.sources import Source, camera_files, find_source
 
 
 def touch(folder: Path, *names: str) -> Path:
@@ -81,6 +81,8 @@ def test_blender_scenes_keep_train_and_test(tmp_path: Path) -> None:
     assert (source.kind, source.root, source.cameras) == ("blender", tmp_path, tmp_path)
     assert source.frames == {"./train/r_0": "train/r_0.png", "./test/r_0": "test/r_0.png"}
     assert names(source) == ["test/r_0.png", "train/r_0.png"]
+    (tmp_path / "transforms_test.json").unlink()
+    assert names(find_source(tmp_path)) == ["train/r_0.png", "val/r_0.png"]
 
 
 @pytest.mark.parametrize("place", [".", "elsewhere"])
@@ -114,6 +116,13 @@ def test_a_photo_folder_with_a_colmap_model(tmp_path: Path, given: str, extensio
     assert names(source) == ["a.jpg"]
 
 
+def test_the_account_of_a_model_of_ours_says_what_its_cameras_are(tmp_path: Path) -> None:
+    sparse = touch(tmp_path, "registration.json", *(f"sparse/{name}" for name in COLMAP)) / "sparse"
+    assert [file.name for file in camera_files(sparse)] == [*COLMAP, "registration.json"]
+    other = sparse.rename(tmp_path / "0")
+    assert [file.name for file in camera_files(other)] == COLMAP
+
+
 def test_several_colmap_models_are_listed_never_guessed(tmp_path: Path) -> None:
     touch(tmp_path, "photos/a.jpg", *(f"m/sparse/{index}/{name}" for index in (0, 1) for name in COLMAP))
     error = refusal(tmp_path / "photos", tmp_path / "m")
@@ -133,6 +142,17 @@ def test_an_export_of_ours_finds_the_photos_by_their_own_names(tmp_path: Path) -
     assert (source.files, source.frames) == ((photos / "ä.jpg",), {"images/a-1.jpg": "ä.jpg"})
 
 
+def test_a_transforms_file_that_was_written_on_windows(tmp_path: Path) -> None:
+    touch(tmp_path, "train/0001.png", "train\\0002.png", "train/0002.png")
+    written = ["train\\0001", ".\\train\\0002.png", "train\\0002", "gone\\0.png"]
+    cameras = transforms(tmp_path / "transforms.json", *written)
+    cameras.write_bytes(b"\xef\xbb\xbf" + cameras.read_bytes())
+    photos = ["train/0001.png", "train/0002.png", "train\\0002.png", "gone\\0.png"]
+    assert list(find_source(cameras).frames.values()) == photos
+    error = refusal(transforms(tmp_path / "transforms.json", "..\\secret.jpg"))
+    assert (error.what, error.why) == ("refused the photo '../secret.jpg'", f"it leads out of the folder {tmp_path}")
+
+
 @pytest.mark.parametrize("file_path", ["../secret.jpg", "/etc/passwd", "images/../../secret", "link/secret.jpg", "a\0"])
 def test_frames_may_not_leave_their_folder(tmp_path: Path, file_path: str) -> None:
     touch(tmp_path, "secret.jpg", "scene/images/a.jpg")
@@ -147,7 +167,7 @@ def test_frames_may_not_leave_their_folder(tmp_path: Path, file_path: str) -> No
     [
         ("{", "it is not JSON"),
         ("[1]", "it has no list named 'frames'"),
-        ('{"frames": []}', "it has no list named 'frames'"),
+        ('{"frames": []}', "its list 'frames' is empty"),
         ('{"frames": [{"file_path": "a.jpg"}]}', "frame 0 lacks file_path or transform_matrix"),
         ('{"frames": [{"file_path": 3, "transform_matrix": []}]}', "frame 0 lacks file_path or transform_matrix"),
         ("[" * 100_000, "it is not JSON"),
@@ -226,7 +246,15 @@ def test_masks_may_lie_beside_an_images_folder(tmp_path: Path, given: str) -> No
     touch(tmp_path, "images/a.jpg", "images/sub/b.jpg", "masks/a.png", "masks/sub/b.png")
     assert [name for name, _ in find_source(tmp_path / given).masks] == ["a.png", "sub/b.png"]
     cameras = transforms(tmp_path / "transforms.json", "images/a.jpg")
-    assert [name for name, _ in find_source(cameras).masks] == ["a.png", "sub/b.png"]
+    assert {"a.png", "sub/b.png"} <= {name for name, _ in find_source(cameras).masks}
+
+
+@pytest.mark.parametrize("folder", ["images_4", "input", "photos"])
+def test_masks_may_lie_beside_other_folders_of_photos(tmp_path: Path, folder: str) -> None:
+    touch(tmp_path, f"{folder}/a.jpg", "masks/a.png", "other/a.jpg")
+    assert [name for name, _ in find_source(tmp_path / folder).masks] == ["a.png"]
+    assert [name for name, _ in find_source(tmp_path).masks] == ["a.png", f"{folder}/a.png"]
+    assert find_source(tmp_path / "other").masks == ()
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")

@@ -171,18 +171,22 @@ def test_photos_in_deep_grey_are_photos_where_fewer_are_in_colour(
     assert depth_maps(kinds(deep, grey, colour)) == {str(index) for index in range(aside)}
 
 
-def test_a_mask_folder_beside_images_is_said_to_be_unused(tmp_path: Path, progress: Any) -> None:
-    words = "masks lie in mask/ and are not used: they would be if it were called masks/ (black is ignored)"
+@pytest.mark.parametrize(("photos", "masks"), [("images", "mask"), ("frames", "masks"), ("frames", "mask")])
+def test_masks_beside_photos_that_are_not_used_are_named(
+    photos: str, masks: str, tmp_path: Path, progress: Any
+) -> None:
+    folder, unused = tmp_path / "in" / photos, tmp_path / "in" / masks
+    words = f"masks lie in {unused} and are not used: in {folder / 'masks'} they would be (black is ignored)"
     for index in range(2):
-        put(tmp_path / f"in/images/{index}.png", index)
-    touch(tmp_path / "in", "mask/notes.txt")
-    ingest.run(Config(photos=tmp_path / "in"), {}, tmp_path / "1", progress)
+        put(folder / f"{index}.png", index)
+    touch(unused, "notes.txt", "of another.png")
+    ingest.run(Config(photos=folder), {}, tmp_path / "1", progress)
     assert progress.notes == []
-    Image.fromarray(np.eye(24, 32, dtype=np.uint8) * 255).save(tmp_path / "in/mask/0.png")
-    ingest.run(Config(photos=tmp_path / "in"), {}, tmp_path / "2", progress)
+    Image.fromarray(np.eye(24, 32, dtype=np.uint8) * 255).save(unused / "0.png.png")
+    ingest.run(Config(photos=folder), {}, tmp_path / "2", progress)
     assert progress.notes == [words]
-    (tmp_path / "in/mask").rename(tmp_path / "in/masks")
-    ingest.run(Config(photos=tmp_path / "in"), {}, tmp_path / "3", progress)
+    unused.rename(folder / "masks")
+    ingest.run(Config(photos=folder), {}, tmp_path / "3", progress)
     assert words not in progress.notes[1:] and read_photos(tmp_path / "3")[0].mask is not None
 
 

@@ -1,0 +1,119 @@
+"""Transforms files: what stands in them, and which of their frames are held out."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, Any
+
+from stages.contract import StageError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from jaxtyping import Float
+
+TRAIN, HELD_OUT = "transforms_train.json", ("transforms_test.json", "transforms_val.json")  # of a Blender-style folder
+LONGEST_PATH, LONGEST_NAME = 2000, 250  # bytes, with room for an extension
+MOST_LETTERS = 60  # of a name, in an error
+_HINT = "Give a transforms.json as nerfstudio, instant-ngp or the NeRF-synthetic scenes write it."
+
+
+def read_transforms(transforms: Path, *, may_be_empty: bool = False) -> dict[str, Any]:
+    """The content of a transforms file, checked to hold a list ``frames`` of objects with ``file_path`` and
+    ``transform_matrix``. Raises StageError otherwise."""
+    what = f"cannot use {transforms.name}"
+    try:
+        content = json.loads(transforms.read_text("utf-8-sig"))  # -sig: Windows writes a byte order mark
+    except (ValueError, RecursionError) as error:
+        raise StageError(f"cannot read {transforms.name}", f"it is not JSON ({error})", _HINT) from error
+    if not isinstance(content, dict) or not isinstance(content.get("frames"), list):
+        raise StageError(what, "it has no list named 'frames'", _HINT)
+    if not (content["frames"] or may_be_empty):
+        raise StageError(what, "its list 'frames' is empty", _HINT)
+    _check_frames(content["frames"], what)
+    return content
+
+
+def _check_frames(frames: list[Any], what: str) -> None:
+    for index, frame in enumerate(frames):
+        if not (isinstance(frame, dict) and isinstance(frame.get("file_path"), str) and "transform_matrix" in frame):
+            raise StageError(what, f"frame {index} lacks file_path or transform_matrix", _HINT)
+        if wrong := next((name for name in photo_names(frame) if not _is_name(name)), None):
+            why = f"no file can have the name of frame {index}, {ascii(wrong)[:MOST_LETTERS]}"
+            raise StageError(what, why, _HINT)
+
+
+def read_splits(cameras: Path) -> tuple[list[tuple[str, dict[str, Any]]], list[str]]:
+    """All frames of a transforms file or of a Blender-style folder: (where they stand, content of such a file), those
+    held out last, with all of them as ``test_filenames``; and notes.
+
+    Held out are the frames of transforms_test.json, else those of transforms_val.json, or the ``test_frames`` of a
+    single file. Some loaders cannot do without such a file, so it may be empty, or repeat the frames to train on: these
+    are left out of it, and where that leaves none it is as if there were no file. Raises StageError as
+    :func:`read_transforms` does.
+    """
+    if cameras.is_file():
+        train, content = cameras.name, read_transforms(cameras)
+        held_out = iter([_test_frames(cameras.name, content)] if "test_frames" in content else [])
+    else:
+        train, content = TRAIN, read_transforms(cameras / TRAIN)
+        given = [name for name in HELD_OUT if (cameras / name).is_file()]
+        held_out = ((name, read_transforms(cameras / name, may_be_empty=True)) for name in given)  # read as needed
+    notes = []
+    trained_on = {PurePosixPath(frame["file_path"]): frame["transform_matrix"] for frame in content["frames"]}
+    for where, other in held_out:
+        own = [frame for frame in other["frames"] if not _is_copy(frame, trained_on)]
+        if repeated := len(other["frames"]) - len(own):
+            notes.append(f"{where} repeats {repeated} frames of {train}: they stay photos to train on")
+        if own:
+            if where == HELD_OUT[1]:
+                notes.append(f"the test photos are those of {where}: {HELD_OUT[0]} gives none")
+            names = [frame["file_path"] for frame in own]
+            return [(train, content), (where, other | {"frames": own, "test_filenames": names})], notes
+    return [(train, content)], notes
+
+
+def _is_copy(frame: dict[str, Any], trained_on: Mapping[PurePosixPath, Any]) -> bool:
+    """Whether a frame has the photo and the pose of one in ``trained_on``, matrices by file_path."""
+    if (path := PurePosixPath(frame["file_path"])) not in trained_on:
+        return False
+    try:
+        return bool((pose_matrix(frame["transform_matrix"]) == pose_matrix(trained_on[path])).all())
+    except ValueError:  # no matrix: said with the frame's name where cameras are read
+        return False
+
+
+def _test_frames(file: str, content: dict[str, Any]) -> tuple[str, dict[str, Any]]:
+    """The frames that lie under ``test_frames``, as ScanNet++ has them, as a file of their own."""
+    where, frames = f"test_frames of {file}", content["test_frames"]
+    if not isinstance(frames, list):
+        raise StageError(f"cannot use {where}", "it is no list", _HINT)
+    _check_frames(frames, f"cannot use {where}")
+    return where, content | {"frames": frames}
+
+
+def pose_matrix(matrix: Any) -> "Float[np.ndarray, '3 4']":
+    """The first three rows of a frame's ``transform_matrix``. Raises ValueError for what is no matrix of that shape."""
+    import numpy as np
+
+    try:
+        pose = np.array(matrix, np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ValueError("its transform_matrix is not a matrix of numbers") from error
+    if pose.shape not in ((3, 4), (4, 4)) or not np.isfinite(pose[:3]).all():
+        raise ValueError("its transform_matrix is not 4 × 4 (or 3 × 4) finite numbers")
+    return pose[:3]
+
+
+def photo_names(frame: dict[str, Any]) -> tuple[str, ...]:
+    """What a frame calls its photo: in a file of ours by its own name first (``photo``), then ``file_path``."""
+    own = frame.get("photo")
+    return (own, frame["file_path"]) if isinstance(own, str) else (frame["file_path"],)
+
+
+def _is_name(file_path: str) -> bool:
+    """Whether it can be written as UTF-8 and is of a length that file systems take."""
+    try:
+        parts = file_path.encode().split(b"/")
+    except UnicodeEncodeError:
+        return False
+    return sum(map(len, parts)) <= LONGEST_PATH and max(map(len, parts)) <= LONGEST_NAME

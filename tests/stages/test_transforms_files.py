@@ -1,0 +1,97 @@
+"""Which frames of transforms files are held out."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from stages.contract import StageError
+from stages.known_cameras import KnownCameras, read_known_cameras
+from stages.photos import Photo
+from stages.transforms_files import read_transforms
+
+LENS = {"camera_angle_x": 0.7}
+
+
+def frame(name: str, place: float) -> dict[str, Any]:
+    matrix = np.eye(4)
+    matrix[0, 3] = place
+    return {"file_path": name, "transform_matrix": matrix.tolist()}
+
+
+TRAIN = [frame("train/0", 0), frame("train/1", 1)]
+TEST, VAL = [frame("test/0", 2)], [frame("val/0", 3)]
+COPY = [frame("./train/0", 0), frame("train/1", 1)]
+
+
+def known(folder: Path, **splits: list[dict[str, Any]]) -> KnownCameras:
+    """A Blender-style folder with these files, read."""
+    folder.mkdir(exist_ok=True)
+    for split, frames in splits.items():
+        (folder / f"transforms_{split}.json").write_text(json.dumps({**LENS, "frames": frames}))
+    return read_known_cameras(folder, PHOTOS, NAMES)
+
+
+NAMES = {f["file_path"]: f"{f['file_path']}.png".removeprefix("./") for f in (*TRAIN, *TEST, *VAL, *COPY)}
+PHOTOS = [Photo(name, f"images/{name}", 6, 4, 0, None, None, False, 1.0) for name in sorted(set(NAMES.values()))]
+REPEATS = "transforms_test.json repeats 2 frames of transforms_train.json: they stay photos to train on"
+FROM_VAL = "the test photos are those of transforms_val.json: transforms_test.json gives none"
+
+
+@pytest.mark.parametrize(
+    ("splits", "test_files", "notes"),
+    [
+        ({"test": TEST, "val": VAL}, ["test/0.png"], []),
+        ({"test": COPY}, None, [REPEATS]),
+        ({"test": COPY + TEST}, ["test/0.png"], [REPEATS]),
+        ({"test": COPY, "val": VAL}, ["val/0.png"], [REPEATS, FROM_VAL]),
+        ({"test": []}, None, []),
+        ({"test": [], "val": VAL}, ["val/0.png"], [FROM_VAL]),
+        ({"val": VAL}, ["val/0.png"], [FROM_VAL]),
+        ({"test": [], "val": []}, None, []),
+    ],
+)
+def test_the_test_photos_of_blender_folders(
+    splits: dict[str, list[dict[str, Any]]], test_files: list[str] | None, notes: list[str], tmp_path: Path
+) -> None:
+    found = known(tmp_path, train=TRAIN, **splits)
+    assert found.test_files == test_files
+    assert [note for note in found.notes if "have no camera" not in note] == notes
+    assert {"train/0.png", "train/1.png"} <= {image.file for image in found.model.images}
+
+
+def test_one_photo_in_two_places_is_an_error_still(tmp_path: Path) -> None:
+    with pytest.raises(StageError, match=r"two frames for the photo train/0\.png"):
+        known(tmp_path, train=TRAIN, test=[frame("train/0", 9)])
+
+
+def test_validation_photos_that_are_not_needed_are_not_read(tmp_path: Path) -> None:
+    (tmp_path / "transforms_val.json").write_text("{")
+    assert known(tmp_path, train=TRAIN, test=TEST).test_files == ["test/0.png"]
+    with pytest.raises(StageError, match=r"cannot read transforms_val\.json"):
+        known(tmp_path, train=TRAIN, test=[])
+
+
+def test_the_test_frames_of_a_single_file_are_its_test_photos(tmp_path: Path) -> None:
+    file = tmp_path / "transforms.json"
+    file.write_text(json.dumps({**LENS, "frames": TRAIN, "test_frames": TEST}))
+    found = read_known_cameras(file, PHOTOS, NAMES)
+    assert (len(found.model.images), found.test_files) == (3, ["test/0.png"])
+    file.write_text(json.dumps({**LENS, "frames": TRAIN, "test_frames": COPY}))
+    found = read_known_cameras(file, PHOTOS, NAMES)
+    assert found.test_files is None
+    repeats = "test_frames of transforms.json repeats 2 frames of transforms.json: they stay photos to train on"
+    assert found.notes[-1] == repeats
+    for wrong, why in (({}, "it is no list"), ([{}], "frame 0 lacks file_path or transform_matrix")):
+        file.write_text(json.dumps({**LENS, "frames": TRAIN, "test_frames": wrong}))
+        with pytest.raises(StageError) as raised:
+            read_known_cameras(file, PHOTOS, NAMES)
+        assert (raised.value.what, raised.value.why) == ("cannot use test_frames of transforms.json", why)
+
+
+def test_a_file_without_frames_is_no_path_to_render(tmp_path: Path) -> None:
+    (tmp_path / "path.json").write_text('{"frames": []}')
+    with pytest.raises(StageError, match="its list 'frames' is empty"):
+        read_transforms(tmp_path / "path.json")
