@@ -141,9 +141,8 @@ def _trained(trial: PilotScene, arm: Decisions, steps: int, seed: int) -> "GridF
     from nerf.grid_field import GridField
     from stages.training_setup import make_trainer
 
-    device = trial.bank.device
-    parts = photo_parts(arm, trial.scene.of_split("train"), device)
-    trainer = make_trainer(_config(arm, steps, device.type), trial.scene, trial.bank, seed, parts)
+    parts = photo_parts(arm, trial.scene.of_split("train"), trial.bank)
+    trainer = make_trainer(_config(arm, steps, trial.bank.device.type), trial.scene, trial.bank, seed, parts)
     for step in range(steps):
         trainer.step(step, step / steps, 1.0)
     assert isinstance(trainer.model, GridField)
