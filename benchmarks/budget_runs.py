@@ -113,7 +113,7 @@ class RunningMean:
 
 def train_run(bench: Bench, seed: int, steps: int, schedule: str) -> dict[str, Any]:
     """One run, measured at geometric steps."""
-    parts = photo_parts(bench.decisions, bench.scene.of_split("train"), bench.bank.device)
+    parts = photo_parts(bench.decisions, bench.scene.of_split("train"), bench.bank)
     trainer = make_trainer(bench.config, bench.scene, bench.bank, seed, parts)
     assert isinstance(trainer, GridTrainer)
     means = {name: RunningMean(trainer, exponent) for name, exponent in MEANS.items()}

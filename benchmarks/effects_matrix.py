@@ -83,7 +83,7 @@ def decide(folder: Path, made: Effects, seed: int) -> Outcome:
 def gains(found: Outcome, wanted: Cell, steps: int) -> str:
     """What each effect that a scene calls for gains over leaving it out, in dB."""
     trial = pilot_scene(found.inputs, read_scene(found.inputs["normalise"]), Quiet())
-    assert trial is not None
+    assert not isinstance(trial, str), trial
     called_for = (wanted.on & found.on) | ({"view_dependence"} if wanted.made.highlight else set())
     without = {
         "exposure": {"exposure": None},

@@ -64,7 +64,7 @@ def prepared(workspace: Path, asked: Config) -> tuple[Config, FieldTrainer]:
     of_step = f"{config.batch_samples:,} colours in a step of {config.chunks} parts, {cores()} cores at work"
     print(f"{sizes}, {of_step}", flush=True)
     bank = guided_bank(inputs, scene, config.downscale, Spoken()).to(compute_device())
-    of_photos = photo_parts(read_decisions(inputs["effects"]), scene.of_split("train"), bank.device)
+    of_photos = photo_parts(read_decisions(inputs["effects"]), scene.of_split("train"), bank)
     return config, make_trainer(config, scene, bank, config.seed, of_photos)
 
 

@@ -71,6 +71,17 @@ class RayBank(NamedTuple):
         """Per view, where rays begin."""
         return self.geometry[12]
 
+    @property
+    def viewing_distance(self) -> Float[Tensor, "views"] | None:
+        """Per view, the median of how far away its known pixels show something (scene units): of all that are known
+        where it has none; None where nothing is known."""
+        if self.known is None or self.distance is None:
+            return None
+        view = torch.searchsorted(self.first_pixel, self.known, right=True).sub_(1)
+        counts = torch.bincount(view, minlength=len(self.near)).tolist()
+        of_all, of_views = self.distance.median(), self.distance[view.argsort(stable=True)].split(counts)
+        return torch.stack([each.median() if len(each) else of_all for each in of_views])
+
     def to(self, device: torch.device | str) -> "RayBank":
         """This bank with its tables on ``device``."""
         moved = {name: table.to(device) for name, table in self._asdict().items() if table is not None}

@@ -6,33 +6,52 @@ often can, where it is dark or plain. A field puts it there, in the way of every
 at the sparse points nearest to it, there is nothing but what several photos look at.
 """
 
+from functools import partial
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.utils.weak import WeakTensorKeyDictionary
 
 from nerf.contraction import uncontract
 from nerf.depth_range import NEAR_MARGIN
 from nerf.kernels import CONTRACTED_BOX
 from nerf.kernels.cache import cell_corners, grown
+from nerf.parallel import in_order
 from nerf.ray_bank import RayBank
 
 SIDE = 64  # coarse cells along an edge of the unit cube
 EDGE_PIXELS = 16  # along each side of a photo, from which its field of view is known
+TOGETHER = 16  # photos that look at once, on all cores, at what is undecided; fixed, whatever the cores
+
+
+# Of banks that are in use, by their geometry: all trainers of a run ask for the same, and so do all of its pilots.
+_answers = WeakTensorKeyDictionary()
 
 
 def usable_cells(bank: RayBank, least: int, cells: int) -> Bool[Tensor, "cache"]:
     """Which of ``cells``³ cells of folded space, in the order of ``nerf.kernels.cache``, may hold something: those
     whose middles ``least`` photos of ``bank`` look at, or one, from where its foreground begins; and a coarse cell
-    around them. What hides them, and masks, count for nothing."""
-    side = min(SIDE, cells)
+    around them. What hides them, and masks, count for nothing. Found once for a bank; not to be written to."""
+    answers: dict[tuple[int, int], Tensor] = _answers.setdefault(bank.geometry, {})
+    if (least, cells) not in answers:
+        answers[least, cells] = _usable_cells(bank, least, cells)
+    return answers[least, cells]
+
+
+def _usable_cells(bank: RayBank, least: int, cells: int) -> Bool[Tensor, "cache"]:
+    side, views = min(SIDE, cells), range(len(bank.near))
     middles = _middles(side, bank.device)
-    photos = torch.zeros(side**3, dtype=torch.int32, device=bank.device)
     undecided = torch.arange(side**3, device=bank.device)
-    for view in range(len(bank.near)):
-        seen, in_foreground = _looked_at(bank, view, middles)
-        photos[undecided] += seen
-        still = (~in_foreground & (photos[undecided] < least)).nonzero()[:, 0]
-        undecided, middles = undecided[still], middles[:, still]
+    photos = torch.zeros_like(undecided)
+    for first in range(0, len(views), TOGETHER):
+        decided = torch.zeros_like(undecided, dtype=torch.bool)
+        together = views[first : first + TOGETHER]
+        for seen, in_foreground in in_order(partial(_looked_at, bank, middles), together, bank.device):
+            photos += seen
+            decided |= in_foreground
+        still = (~decided & (photos < least)).nonzero()[:, 0]
+        undecided, photos, middles = undecided[still], photos[still], middles[:, still]
     usable = torch.ones(side**3, dtype=torch.bool, device=bank.device)
     usable[undecided] = False
     corners = cell_corners(cells, torch.arange(cells**3, device=bank.device))
@@ -47,7 +66,7 @@ def _middles(side: int, device: torch.device) -> Float[Tensor, "3 cells"]:
 
 
 def _looked_at(
-    bank: RayBank, view: int, points: Float[Tensor, "3 points"]
+    bank: RayBank, points: Float[Tensor, "3 points"], view: int
 ) -> tuple[Bool[Tensor, "points"], Bool[Tensor, "points"]]:
     """Which points a photo may show between near and far, and which of these are no nearer than its foreground."""
     geometry = bank.geometry[:, view]

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     import torch
 
     from nerf.effects import PhotoColours, PhotoRays
+    from nerf.ray_bank import RayBank
     from nerf.scene import Scene, View
     from nerf.training import FieldTrainer
 
@@ -45,10 +46,8 @@ def read_decisions(folder: Path) -> Decisions:
     return read_dataclass(folder / "decisions.json", Decisions)
 
 
-def photo_parts(
-    decisions: Decisions, views: "Sequence[View]", device: "torch.device"
-) -> "tuple[PhotoRays, PhotoColours]":
-    """What stands between the field and the photos ``views``, in their order."""
+def photo_parts(decisions: Decisions, views: "Sequence[View]", bank: "RayBank") -> "tuple[PhotoRays, PhotoColours]":
+    """What stands between the field and the photos ``views`` of ``bank``, in their order."""
     import numpy as np
     import torch
 
@@ -59,8 +58,10 @@ def photo_parts(
     rays = AS_GIVEN
     if decisions.pose_refinement:
         centres = np.stack([view.scene_from_camera[:, 3] for view in views])
-        rays = RefinedPoses(torch.tensor(centres, dtype=torch.float32, device=device))
-    colours = AS_RENDERED if decisions.exposure is None else Exposures.of_tracks(decisions.log_gain(views).to(device))
+        placed = torch.tensor(centres, dtype=torch.float32, device=bank.device)
+        rays = RefinedPoses(placed, bank.viewing_distance)
+    gains = None if decisions.exposure is None else decisions.log_gain(views).to(bank.device)
+    colours = AS_RENDERED if gains is None else Exposures.of_tracks(gains)
     return rays, colours
 
 

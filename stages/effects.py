@@ -125,7 +125,7 @@ class _Study:
         self.config, self.scene, self.inputs, self.gains = config, scene, inputs, gains
         self.evidence, self.progress = evidence, progress
         self.pilots = 0
-        self.trial: PilotScene | None = None
+        self.trial: PilotScene | str | None = None
 
     def decide(self) -> tuple[Decisions, dict[str, Verdict]]:
         """What to model, and the reasons by effect."""
@@ -171,13 +171,13 @@ class _Study:
             return f"{self.pilots} were made already" if self.pilots else "there is no time for one"
         if self.trial is None:
             self.trial = pilot_scene(self.inputs, self.scene, self.progress)
-        return "too few training photos" if self.trial is None else None
+        return self.trial if isinstance(self.trial, str) else None
 
     def _piloted(self, name: str, off: Decisions, on: Decisions, default: bool) -> Verdict:
         from nerf.training import NonFinite
         from stages.pilots import run_pilot
 
-        assert self.trial is not None
+        assert self.trial is not None and not isinstance(self.trial, str), "a reason against pilots is heard before"
         self.pilots += 1
         words = self.evidence[name].words
         try:

@@ -67,19 +67,23 @@ class PilotScene(NamedTuple):
     kept: "tuple[_Photo, ...]"
 
 
-def pilot_scene(inputs: Inputs, scene: "Scene", progress: Progress) -> PilotScene | None:
-    """Small photos to train on and to judge by, both from the training photos; None where there are too few."""
+def pilot_scene(inputs: Inputs, scene: "Scene", progress: Progress) -> PilotScene | str:
+    """Small photos to train on and to judge by, both from the training photos; or why there can be no pilot."""
     from stages.device import compute_device
     from stages.right_halves import enough
-    from stages.training_data import guided_bank, view_mask, view_pixels, view_rays
+    from stages.training_data import NothingLeft, guided_bank, view_mask, view_pixels, view_rays
     from stages.unseen import set_aside
 
     split = set_aside(scene, MOST_KEPT, FEWEST_FOR_INTERVAL)
     if split is None:
-        return None
+        return "too few training photos"
     cameras = [scene.cameras[view.camera] for view in scene.views]
     downscale = max(1.0, median(max(camera.width, camera.height) for camera in cameras) / LONG_SIDE)
-    bank = guided_bank(inputs, split, downscale, progress).to(compute_device())
+    size = f"1/{downscale:.3g} of their size"
+    try:
+        bank = guided_bank(inputs, split, downscale, progress).to(compute_device())
+    except NothingLeft:  # of a thin thing, of which larger photos show enough
+        return f"masks leave nothing of the training photos at {size}"
     photos = [
         _Photo(
             view_rays(split, view, downscale),
@@ -89,7 +93,9 @@ def pilot_scene(inputs: Inputs, scene: "Scene", progress: Progress) -> PilotScen
         for view in split.of_split("validation")
     ]
     kept = tuple(photo for photo in photos if enough(photo.colours, photo.used))
-    return PilotScene(split, bank, kept) if len(kept) >= FEWEST_FOR_INTERVAL else None
+    if len(kept) < FEWEST_FOR_INTERVAL:
+        return f"too few training photos show enough at {size}"
+    return PilotScene(split, bank, kept)
 
 
 def expected_seconds(scene: "Scene", steps: int) -> float:
@@ -135,9 +141,8 @@ def _trained(trial: PilotScene, arm: Decisions, steps: int, seed: int) -> "GridF
     from nerf.grid_field import GridField
     from stages.training_setup import make_trainer
 
-    device = trial.bank.device
-    parts = photo_parts(arm, trial.scene.of_split("train"), device)
-    trainer = make_trainer(_config(arm, steps, device.type), trial.scene, trial.bank, seed, parts)
+    parts = photo_parts(arm, trial.scene.of_split("train"), trial.bank)
+    trainer = make_trainer(_config(arm, steps, trial.bank.device.type), trial.scene, trial.bank, seed, parts)
     for step in range(steps):
         trainer.step(step, step / steps, 1.0)
     assert isinstance(trainer.model, GridField)

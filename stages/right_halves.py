@@ -5,6 +5,7 @@ gain (per channel, in linear light) is fitted on the left half of the photo; the
 comparison, without.
 """
 
+import math
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -58,10 +59,18 @@ def from_fitted_pose(
     left, _ = halves(truth, used)
     _, log_gain = _exposed_as_left(rendering, background, truth, left)
     exposure = Exposures(log_gain[None])
-    pose = fit_pose(field, rays.each(lambda part: part[left]), truth[left], background, exposure, seed)
+    distance = viewing_distance(rendering, left)
+    pose = fit_pose(field, rays.each(lambda part: part[left]), truth[left], background, exposure, seed, distance)
     flat = rays.each(lambda part: part.flatten(0, 1))
     moved = pose.forward(flat, torch.zeros(len(flat.near), dtype=torch.int64))
     return Rays(*(part.view_as(whole) for part, whole in zip(moved, rays, strict=True)))
+
+
+def viewing_distance(rendering: "Rendering", pixels: "Tensor") -> float:
+    """How far away is what a rendering (H, W) shows at some pixels, (H, W) bool: the median (scene units) of those that
+    are more opaque than not; infinite where none is."""
+    depth = rendering.depth[pixels & (rendering.opacity > 0.5)]
+    return float(depth.median()) if len(depth) else math.inf
 
 
 def _exposed_as_left(

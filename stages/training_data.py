@@ -23,6 +23,10 @@ if TYPE_CHECKING:
 MOST_PATCHES = 192
 
 
+class NothingLeft(StageError):
+    """Masks leave no pixel of some photos at a reduced size."""
+
+
 def scaled_size(camera: "Camera", downscale: float) -> tuple[int, int]:
     """(width, height) of a camera's photos made ``downscale`` times smaller, rounded half up, at least one pixel."""
     return max(1, int(camera.width / downscale + 0.5)), max(1, int(camera.height / downscale + 0.5))
@@ -55,7 +59,7 @@ def patch_bearings(camera: "Camera", downscale: float) -> "Tensor":
 
 def training_bank(ingest: Path, scene: "Scene", split: "Split", downscale: float, progress: Progress) -> "RayBank":
     """All pixels and rays of one split, on the CPU; the pixels are mapped from the pixel store, which is made if need
-    be. What masks ignore is never drawn. Raises StageError where they leave nothing."""
+    be. What masks ignore is never drawn. Raises NothingLeft where they leave nothing."""
     import numpy as np
     import torch
 
@@ -113,7 +117,7 @@ def _masked(bank: "RayBank", used: "Sequence[Tensor | None]", split: "Split", pr
         bank = bank.without([None if mask is None else ~mask for mask in used])
     except ValueError as error:
         why = f"{error} of the {split} photos at this size"
-        raise StageError("nothing is left to train on", why, "Give a smaller --train.downscale.") from error
+        raise NothingLeft("nothing is left to train on", why, "Give a smaller --train.downscale.") from error
     progress.note(f"masks leave {bank.drawable / len(bank.pixels):.0%} of the pixels of the {split} photos")
     return bank
 

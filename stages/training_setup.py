@@ -77,9 +77,7 @@ def prepare(config: "Config", scene: "Scene", inputs: Inputs, folder: Path, prog
     _say_sizes(config, budget, bank, progress)
     decisions, views = read_decisions(inputs["effects"]), scene.of_split("train")
     return TrainingRun(
-        lambda attempt: make_trainer(
-            config, scene, bank, config.seed + attempt, photo_parts(decisions, views, bank.device)
-        ),
+        lambda attempt: make_trainer(config, scene, bank, config.seed + attempt, photo_parts(decisions, views, bank)),
         probes,
         budget,
         folder,

@@ -141,7 +141,7 @@ def seconds_per_step(config: "Config", scene: "Scene", decisions: "Decisions") -
 
     device = compute_device()
     bank = _grey_bank(scene).to(device)
-    parts = photo_parts(decisions, scene.of_split("train")[:1], bank.device)
+    parts = photo_parts(decisions, scene.of_split("train")[:1], bank)
     trainer = make_trainer(config, scene, bank, seed=0, photo_parts=parts)
     with products_at(config.matmul):
         trainer.step(0, 0.0, 1.0)  # the first step pays for memory and kernels

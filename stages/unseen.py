@@ -51,19 +51,26 @@ class Look(NamedTuple):
 def unseen_photos(
     config: "Config", ingest: Path, scene: "Scene", split: "Split", device: str, progress: Progress
 ) -> Unseen | None:
-    """Of the photos of a split; None where it has none. Always the same pixels."""
+    """Of the photos of a split; None where it has none, or where masks leave nothing of its test photos, which decide
+    nothing: then ``progress`` is told. Always the same pixels."""
     import kornia.metrics  # noqa: F401 # takes seconds, which would count as the cost of the first measurement
     import torch
 
     from nerf.probe import make_patches, make_probe
     from stages.effect_decisions import told_by_neighbours
-    from stages.training_data import training_bank
+    from stages.training_data import NothingLeft, training_bank
     from stages.training_setup import field_background
 
     if not scene.of_split(split):
         return None
     assert config.downscale is not None, "plan() chooses it"
-    bank = training_bank(ingest, scene, split, config.downscale, progress).to(device)
+    try:
+        bank = training_bank(ingest, scene, split, config.downscale, progress).to(device)
+    except NothingLeft as nothing:
+        if split != "test":
+            raise
+        progress.note(f"held-out quality is not measured while training: {nothing.why}")
+        return None
     shown_over = torch.tensor(field_background(config, scene), device=device)
     return Unseen(
         make_probe(bank, PROBE_RAYS, shown_over, PROBE_SEED),

@@ -7,14 +7,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf.effects import AS_RENDERED, PhotoColours, Seen
-from nerf.effects.poses import RefinedPoses
+from nerf.effects.poses import LARGEST_UNIT, RefinedPoses
 from nerf.grid_field import GridField
 from nerf.randomness import generator
 from nerf.rays import Rays
 
 STEPS = 40
 RAYS = 256  # looked at in a step
-RATE = 3e-3  # radians and scene units at first, falling exponentially to
+RATE = 3e-3  # radians and units of shift at first, falling exponentially to
 FINAL_RATE = 0.1  # of it
 
 
@@ -25,14 +25,16 @@ def fit_pose(
     background: Float[Tensor, "3"],
     photo_colours: PhotoColours = AS_RENDERED,
     seed: int = 0,
+    distance: float = LARGEST_UNIT,
 ) -> RefinedPoses:
     """The correction of one photo's pose that makes the field look most like it, by Adam on the squared error.
 
     ``rays`` and ``target`` are pixels of that photo (those by which the pose may be judged), ``photo_colours`` says
-    what the photo makes of colours; both it and the field stay as they are. The correction and ``photo_colours`` know
-    a single view, 0.
+    what the photo makes of colours; both it and the field stay as they are. ``distance`` (scene units) is that of what
+    the photo shows. The correction and ``photo_colours`` know a single view, 0.
     """
-    pose, random = RefinedPoses(torch.zeros(1, 3, device=target.device)), generator(target.device, seed)
+    here = torch.zeros(1, 3, device=target.device)
+    pose, random = RefinedPoses(here, here.new_tensor([distance])), generator(target.device, seed)
     mean, square = ({name: torch.zeros_like(part) for name, part in pose.parameters.items()} for _ in range(2))
     for step in range(STEPS):
         pixel = torch.randint(len(target), (min(RAYS, len(target)),), generator=random, device=target.device)

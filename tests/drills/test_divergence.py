@@ -303,7 +303,7 @@ def with_photo_parts(monkeypatch: pytest.MonkeyPatch, what: str) -> None:
     """Train with poses or gains of photos, whatever the effects say."""
     from nerf.effects import AS_GIVEN, AS_RENDERED
 
-    def parts(decisions: Any, views: Any, device: torch.device):
+    def parts(decisions: Any, views: Any, bank: Any):
         centres = torch.tensor([view.scene_from_camera[:, 3] for view in views], dtype=torch.float32)
         return (
             (RefinedPoses(centres), AS_RENDERED)

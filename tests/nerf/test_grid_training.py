@@ -244,7 +244,7 @@ def test_the_gradient_of_poses_is_that_of_the_loss(seed: int) -> None:
     for step in range(60):
         run.step(step, 0.84)  # at a third of the rate
     by_hand = run._part(7, 0.5, 128, 0).photos
-    assert set(by_hand) == {"turn", "shift"}
+    assert set(by_hand) == {"turn", "offset"}
 
     def difference(part: Tensor, view: int, axis: int) -> float:
         losses = []
@@ -274,7 +274,7 @@ def test_what_is_learnt_of_photos_is_part_of_the_state() -> None:
     for step in range(10, 20):
         second.step(step, step / 20)
     assert same(whole.state(), second.state())
-    assert {"photo.turn", "photo.shift", "photo.log_gain", "mean.turn"} <= whole.state().keys()
+    assert {"photo.turn", "photo.offset", "photo.log_gain", "mean.turn"} <= whole.state().keys()
     with pytest.raises(RuntimeError, match="photo"):
         trainer().load_state(whole.state())
 

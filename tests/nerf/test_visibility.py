@@ -2,10 +2,12 @@
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
 
+from nerf import visibility
 from nerf.contraction import uncontract
 from nerf.depth_range import NEAR_MARGIN
 from nerf.grid_field import GridField, GridSettings
@@ -76,6 +78,38 @@ def test_a_cell_is_usable_where_enough_photos_look_or_one_from_its_foreground_on
     assert not (usable & ~grown(grown(cube))[x, y, z]).any(), "and others are next to one"
     if half < 0.2:  # wide photos see what is right before the others from their foregrounds on
         assert (~usable & (photos > 0)).any() == (least > 1)
+
+
+def test_photos_that_look_together_find_what_each_finds_after_the_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    threads, found = torch.get_num_threads(), []
+    try:
+        for count, together in ((1, 1), (2, 2), (2, 16)):
+            torch.set_num_threads(count)
+            monkeypatch.setattr(visibility, "TOGETHER", together)
+            found.append(usable_cells(bank(5, 0.15), 3, 64))
+    finally:
+        torch.set_num_threads(threads)
+    assert 0 < found[0].float().mean() < 1
+    assert torch.equal(found[0], found[1]) and torch.equal(found[0], found[2])
+
+
+def test_all_trainers_of_a_bank_ask_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[int] = []
+
+    def looked_at(*given: Any) -> tuple[torch.Tensor, torch.Tensor]:
+        asked.append(given[-1])
+        return own(*given)
+
+    own = visibility._looked_at
+    monkeypatch.setattr(visibility, "_looked_at", looked_at)
+    views = knowing(bank())
+    fields = [GridField(FIELD, seed, reference) for seed in (0, 1)]
+    for field in fields:
+        GridTrainer(field, views, TRAINER)
+    assert asked == [0, 1, 2, 3] and torch.equal(fields[0].bits, fields[1].bits)
+    usable_cells(bank(), 3, 16)
+    usable_cells(views, 2, 16)
+    assert len(asked) == 12, "another bank, and another question"
 
 
 def test_what_one_photo_sees_alone_before_its_foreground_is_left_empty() -> None:

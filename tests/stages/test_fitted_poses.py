@@ -1,21 +1,24 @@
 """When test photos are scored at fitted poses, what is scored there, and that it is said."""
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
 
 from nerf.effects.exposure import ExposedModel
+from nerf.effects.poses import RefinedPoses
 from nerf.grid_field import GridField, GridSettings
 from nerf.model import Rendering
 from nerf.rays import Rays
 from stages import evaluate
 from stages.backend import chosen_backend, load_backend
 from stages.drawing import Painter
+from stages.effect_decisions import Decisions, learnt_of_photos, photo_parts
 from stages.evaluate import Examiner
-from stages.right_halves import right_half_psnr
-from stages.training_data import view_pixels, view_rays
+from stages.right_halves import from_fitted_pose, right_half_psnr
+from stages.training_data import training_bank, view_pixels, view_rays
 from tests.stages.photo_scene import photographed
 from tests.synthetic_photos import Quiet
 
@@ -44,6 +47,33 @@ def test_poses_are_fitted_to_the_field_as_it_is_and_scored_as_the_photo_was_expo
     _, posed = right_half_psnr(exposed.draw(rays._replace(near=rays.near + 0.5)), torch.zeros(3), truth)
     assert scored["psnr_right"] == pytest.approx(right) and scored["psnr_fitted_right"] == pytest.approx(fitted)
     assert scored["psnr_posed_right"] == pytest.approx(posed)
+
+
+def test_refined_poses_are_learnt_in_units_of_what_photos_see_and_written_in_scene_units(tmp_path: Path) -> None:
+    inputs, scene = photographed(tmp_path)
+    views = scene.of_split("train")
+    bank = training_bank(inputs["ingest"], scene, "train", 1.0, Quiet())
+    near = bank.with_distances(bank.first_pixel[:-1] + 5, torch.full((len(views),), 0.25))
+    rays, colours = photo_parts(Decisions(pose_refinement=True), views, near)
+    rays.parameters["offset"][1] = torch.tensor([1.0, 0.0, -2.0])
+    trainer: Any = SimpleNamespace(photo_rays=rays, photo_colours=colours)
+    learnt = learnt_of_photos(trainer, views)["poses"]
+    assert learnt[views[1].name] == [0.0, 0.0, 0.0, 0.25, 0.0, -0.5] and learnt[views[0].name] == [0.0] * 6
+
+
+def test_a_test_photos_pose_is_fitted_in_units_of_what_it_sees(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[float] = []
+
+    def fit(*given: Any) -> RefinedPoses:
+        asked.append(given[-1])
+        return RefinedPoses(torch.zeros(1, 3))
+
+    monkeypatch.setattr("nerf.effects.pose_fit.fit_pose", fit)
+    some, whole = torch.rand(8, 40, 3), torch.ones(8, 40)
+    rays = Rays(some, some, whole, whole)
+    field: Any = None
+    from_fitted_pose(field, rays, Rendering(some, 0.25 * whole, whole), torch.zeros(3), some, None)
+    assert asked == [0.25]
 
 
 @pytest.mark.parametrize(

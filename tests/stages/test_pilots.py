@@ -16,7 +16,7 @@ from stages.effect_decisions import Decisions, expected_gains, told_by_neighbour
 from stages.files import read_scene
 from stages.pilots import Pilot, PilotScene, pilot_scene, run_pilot
 from tests.effect_scenes import Effects, effect_scene
-from tests.stages.photo_scene import photographed
+from tests.stages.photo_scene import HEIGHT, WIDTH, photographed
 from tests.synthetic_photos import Quiet
 
 PLAIN = Decisions(view_dependence=True, unbounded=False)
@@ -31,7 +31,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 @pytest.fixture(scope="module")
 def trial(inputs: dict[str, Path]) -> PilotScene:
     made = pilot_scene(inputs, read_scene(inputs["normalise"]), Quiet())
-    assert made is not None
+    assert not isinstance(made, str), made
     return made
 
 
@@ -82,8 +82,26 @@ def test_too_few_photos_make_no_pilot(tmp_path: Path) -> None:
     for views in (5, 8, 10):
         inputs, scene = photographed(tmp_path / str(views), views=views)
         made[len(scene.of_split("train"))] = pilot_scene(inputs, scene, Quiet())
-    assert [count for count, trial in made.items() if trial is not None] == [7]
-    assert len(made[7].kept) == 3
+    assert made[3] == made[6] == "too few training photos"
+    assert isinstance(made[7], PilotScene) and len(made[7].kept) == 3
+
+
+@pytest.mark.parametrize(
+    ("left", "why"),
+    [
+        ((4, 4), "masks leave nothing of the training photos at 1/2 of their size"),
+        ((slice(4, 8), slice(4, 8)), "too few training photos show enough at 1/2 of their size"),
+    ],
+    ids=["a dot", "a small square"],
+)
+def test_photos_of_which_masks_leave_too_little_at_its_size_make_no_pilot(
+    left: tuple, why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pilots, "LONG_SIDE", WIDTH // 2)
+    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+    mask[left] = 255
+    inputs, scene = photographed(tmp_path, views=10, mask=mask)
+    assert pilot_scene(inputs, scene, Quiet()) == why
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from nerf.effects.exposure import expose
 from nerf.model import Rendering
-from stages.right_halves import FEWEST_PIXELS, right_half_psnr
+from stages.right_halves import FEWEST_PIXELS, right_half_psnr, viewing_distance
 
 BLACK = torch.zeros(3)
 
@@ -73,6 +73,14 @@ def test_the_background_has_no_exposure():
 
     raw, fitted = right_half_psnr(rendering(over(own), opacity), white, over(expose(own, gain(-0.8))))
     assert raw is not None and fitted is not None and fitted > 70 > 25 > raw
+
+
+def test_a_photos_viewing_distance_is_that_of_what_is_opaque_where_it_may_be_judged():
+    depth, opacity = torch.tensor([[1.0, 2.0, 3.0, 50.0], [9.0, 9.0, 9.0, 9.0]]), torch.ones(2, 4)
+    left = torch.tensor([[True] * 4, [False] * 4])
+    opacity[0, 3] = 0.4
+    assert viewing_distance(Rendering(torch.zeros(2, 4, 3), depth, opacity), left) == 2
+    assert viewing_distance(Rendering(torch.zeros(2, 4, 3), depth, 0 * opacity), left) == math.inf
 
 
 def test_colours_beyond_white_are_white():

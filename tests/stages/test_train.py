@@ -18,7 +18,7 @@ from stages.files import read_json
 from stages.photos import Photo, write_photos
 from stages.train import Config
 from stages.training_setup import prepare
-from stages.unseen import with_validation
+from stages.unseen import unseen_photos, with_validation
 from tests.stages.photo_scene import HEIGHT, WIDTH, photographed
 
 TINY: dict[str, Any] = {
@@ -170,6 +170,19 @@ def test_without_test_photos_nothing_is_held_out(tmp_path: Path, progress) -> No
     result = trained(tmp_path / "train", inputs, progress, steps=2)
     assert result.facts["heldout_psnr"] is None
     assert "no photos held out" in result.line
+
+
+def test_test_photos_of_which_masks_leave_nothing_stop_no_training(tmp_path: Path, progress) -> None:
+    """Validation photos, by which a run is to end, do."""
+    dot = np.zeros((HEIGHT, WIDTH), np.uint8)
+    dot[4, 4] = 255
+    inputs, masked = photographed(tmp_path, mask=dot)
+    config = Config(downscale=2.0)
+    assert unseen_photos(config, inputs["ingest"], masked, "test", "cpu", progress) is None
+    why = "the masks ignore every pixel of the test photos at this size"
+    assert progress.notes == [f"held-out quality is not measured while training: {why}"]
+    with pytest.raises(StageError, match="nothing is left"):
+        unseen_photos(config, inputs["ingest"], with_validation(masked), "validation", "cpu", progress)
 
 
 def test_two_budgets_are_refused_in_words() -> None:

@@ -1,8 +1,11 @@
+from functools import partial
+
 import pytest
 import torch
 from torch import Tensor
 
-from nerf.effects.poses import RefinedPoses
+from nerf.effects.poses import RATE, RefinedPoses
+from nerf.kernels import reference
 from nerf.rays import Rays
 
 
@@ -15,6 +18,14 @@ def rays(count: int = 6) -> Rays:
 VIEW = torch.tensor([0, 2, 2, 1, 0, 2])
 
 
+def test_things_a_unit_away_or_farther_have_the_unit_one() -> None:
+    """And then an offset is a shift, to the bit."""
+    poses, farther = RefinedPoses(ring()), RefinedPoses(ring(), torch.full((8,), 3.0))
+    poses.offset += torch.randn(8, 3, generator=torch.Generator().manual_seed(4))
+    assert torch.equal(poses.shift, poses.offset) and torch.equal(poses.unit, farther.unit)
+    assert torch.equal(poses.gauge, farther.gauge)
+
+
 def test_a_correction_of_nothing_changes_no_bit() -> None:
     same = RefinedPoses(torch.zeros(3, 3)).forward(rays(), VIEW)
     assert all(torch.equal(a, b) for a, b in zip(same, rays(), strict=True))
@@ -22,7 +33,7 @@ def test_a_correction_of_nothing_changes_no_bit() -> None:
 
 def test_rays_turn_and_shift_with_their_own_camera() -> None:
     poses = RefinedPoses(torch.zeros(3, 3))
-    poses.turn[2], poses.shift[1] = torch.tensor([0, 0, torch.pi / 2]), torch.tensor([1.0, 2, 3])
+    poses.turn[2], poses.offset[1] = torch.tensor([0, 0, torch.pi / 2]), torch.tensor([1.0, 2, 3])
     moved, before = poses.forward(rays(), VIEW), rays()
     quarter = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     torch.testing.assert_close(moved.directions[VIEW == 2], before.directions[VIEW == 2] @ quarter.T)
@@ -52,7 +63,7 @@ def test_its_derivatives_are_those_of_differences_at_every_size(radians: float) 
     poses, given = RefinedPoses(torch.zeros(3, 3).double()), rays().each(Tensor.double)
 
     def moved(turn: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
-        poses.turn, poses.shift = turn, shift
+        poses.turn, poses.offset = turn, shift
         there = poses.forward(given, VIEW)
         return there.origins, there.directions
 
@@ -69,13 +80,14 @@ def ring(count: int = 8) -> torch.Tensor:
     return torch.stack([3 * angle.cos() + 1, 3 * angle.sin(), 0.2 * (5 * angle).sin()], -1)
 
 
-def test_what_all_cameras_share_is_taken_out() -> None:
-    poses, centres = RefinedPoses(ring()), ring()
+@pytest.mark.parametrize("distance", [None, torch.tensor([0.1, 0.3, 5.0, 0.2, 0.7, 1.0, 0.4, 0.1])])
+def test_what_all_cameras_share_is_taken_out(distance: Tensor | None) -> None:
+    poses, centres = RefinedPoses(ring(), distance), ring()
     turn, shift = torch.tensor([0.01, -0.02, 0.03]), torch.tensor([0.1, 0.2, -0.3])
     poses.turn += turn
-    poses.shift += shift + torch.linalg.cross(turn.expand_as(centres), centres) + 0.05 * centres
+    poses.offset += (shift + torch.linalg.cross(turn.expand_as(centres), centres) + 0.05 * centres) / poses.unit
     poses.settle()
-    assert poses.turn.abs().max() < 1e-6 and poses.shift.abs().max() < 1e-6
+    assert poses.turn.abs().max() < 1e-6 and poses.offset.abs().max() < 2e-6
 
 
 def test_what_is_a_cameras_own_stays() -> None:
@@ -86,6 +98,50 @@ def test_what_is_a_cameras_own_stays() -> None:
     poses.settle()
     torch.testing.assert_close(poses.turn, once)  # a projection
     assert poses.turn[3, 1] > 0.01 and poses.turn[[0, 1, 2, 4, 5, 6, 7]].abs().max() < 0.01
+
+
+def refined(scale: float) -> tuple[RefinedPoses, float]:
+    """Poses that were jittered, after some steps towards noisy pictures of known points half a unit away, in a scene
+    made so many times larger; and how far off (radians) points then appear at most in the mean of a view."""
+    random = torch.Generator().manual_seed(5)
+    points = 0.25 * torch.randn(60, 3, generator=random)
+    view = torch.arange(8).repeat_interleave(60)
+    towards = points.repeat(8, 1) - ring()[view] / 5
+    distance, directions = towards.norm(dim=-1), torch.nn.functional.normalize(towards, dim=-1)
+    median = distance.view(8, 60).median(1).values
+    wrong = RefinedPoses(ring() / 5, median)
+    wrong.turn += 0.02 * torch.randn(8, 3, generator=random)
+    wrong.offset += 0.02 * torch.randn(8, 3, generator=random)
+    wrong.settle()
+    origins = ring()[view] / 5
+    given = wrong.forward(Rays(origins, directions, torch.ones(480), torch.ones(480)), view)
+    given = given._replace(origins=scale * given.origins)
+    poses = RefinedPoses(scale * ring() / 5, scale * median)
+    moments = [{name: torch.zeros(8, 3) for name in poses.parameters} for _ in range(2)]
+
+    def off(moved: Rays, noise: Tensor) -> Tensor:
+        seen = torch.nn.functional.normalize(scale * points.repeat(8, 1) - moved.origins, dim=-1)
+        return seen - moved.directions + noise
+
+    for step in range(150):
+        noise = 5e-3 * torch.randn(480, 3, generator=random)
+        moved = poses.forward(given, view).each(lambda part: part.detach().requires_grad_())
+        of_origins, of_directions = torch.autograd.grad(off(moved, noise).square().mean(), moved[:2])
+        gradients = poses.backward(given, view, partial(lambda *both: both, of_origins, of_directions))
+        for name, gradient in gradients.items():
+            mean, square = moments[0][name], moments[1][name]
+            reference.adam(poses.parameters[name], gradient, mean, square, RATE, step + 1)
+        poses.settle()
+    left = off(poses.forward(given, view), torch.zeros(480, 3)).view(8, 60, 3).mean(1).norm(dim=-1)
+    return poses, float(left.max())
+
+
+def test_in_a_small_scene_poses_are_refined_as_well_as_in_a_large_one() -> None:
+    (large, off), (small, off_in_small) = refined(1.0), refined(1 / 20)
+    assert 1e-5 < off < 2e-3, "by less than a photo's noise"
+    assert off_in_small == pytest.approx(off, rel=0.02)
+    torch.testing.assert_close(small.turn, large.turn, rtol=1e-2, atol=1e-5)
+    torch.testing.assert_close(20 * small.shift, large.shift, rtol=1e-2, atol=1e-5)
 
 
 def test_cameras_in_one_place_have_a_gauge_too() -> None:

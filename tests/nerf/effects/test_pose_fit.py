@@ -1,0 +1,40 @@
+"""The pose of a photo, found in a field; that it is found at all is tested on photos (tests/stages/test_pilots.py)."""
+
+import torch
+from torch import Tensor
+
+from nerf.effects.pose_fit import fit_pose
+from nerf.grid_field import GridField, GridGradients, GridPass, GridSettings
+from nerf.kernels import reference
+from nerf.rays import Rays
+
+SMALLER = 1 / 16  # a power of two: numbers that differ by it have the same digits
+FIELD = GridSettings(levels=2, log2_rows=10, coarsest=4, finest=16, steps=32, cache_cells=16)
+
+
+class Small(GridField):
+    """What the same field is in a scene that is smaller by SMALLER."""
+
+    def forward(self, rays: Rays, jitter: Tensor, offset: Tensor, background: Tensor) -> GridPass:
+        large = Rays(rays.origins / SMALLER, rays.directions, rays.near / SMALLER, rays.far / SMALLER)
+        return super().forward(large, jitter, offset, background)
+
+    def rays_backward(self, done: GridPass, gradients: GridGradients) -> tuple[Tensor, Tensor]:
+        origins, directions = super().rays_backward(done, gradients)
+        return origins / SMALLER, directions
+
+
+def test_the_pose_found_in_a_smaller_scene_is_the_same_but_smaller() -> None:
+    random = torch.Generator().manual_seed(1)
+    directions = 0.3 * torch.randn(100, 3, generator=random) + torch.tensor([0.0, 0, 1])
+    directions = torch.nn.functional.normalize(directions, dim=-1)
+    near, far = torch.full((100,), 0.5), torch.full((100,), 3.0)
+    target, black = torch.rand(100, 3, generator=random), torch.zeros(3)
+    found = []
+    for field, scale in ((GridField(FIELD, 0, reference), 1.0), (Small(FIELD, 0, reference), SMALLER)):
+        field.table *= 3000  # something to be seen
+        rays = Rays(scale * torch.tensor([0.0, 0, -1.5]).repeat(100, 1), directions, scale * near, scale * far)
+        found.append(fit_pose(field, rays, target, black, distance=scale))
+    large, small = found
+    assert float(large.turn.norm()) > 1e-3 < float(large.shift.norm())
+    assert torch.equal(small.turn, large.turn) and torch.equal(small.shift, SMALLER * large.shift)
