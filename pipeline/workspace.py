@@ -20,7 +20,7 @@ from pipeline import manifests
 from pipeline.chain import STAGES
 from pipeline.manifests import BadManifest, Manifest
 from stages.contract import KEY_LENGTH, StageError
-from stages.files import first_fault, sync_folder, write_durably
+from stages.files import first_fault, sync_file, sync_folder, write_durably
 
 RUN_FILE = "run.json"
 RUN_VERSION = 1
@@ -128,8 +128,7 @@ class Workspace:
         From the manifest on a kill loses nothing: :meth:`complete` does the rest.
         """
         for name in (*manifest.outputs, *manifest.records):
-            with (partial / name).open("rb") as stream:
-                os.fsync(stream.fileno())
+            sync_file(partial / name)
         manifests.write(partial, manifest)
         self._tidy(partial, {*manifest.outputs, *manifest.records, manifests.NAME})
         if folder.exists():  # a forced run of the same key: the old result makes way at the last moment

@@ -69,9 +69,14 @@ def write_durably(path: Path, content: bytes) -> None:
 def make_durable(folder: Path) -> None:
     """Have every file of a folder, and the folder, on the disk."""
     for path in folder.iterdir():
-        with path.open("rb") as stream:
-            os.fsync(stream.fileno())
+        sync_file(path)
     sync_folder(folder)
+
+
+def sync_file(path: Path) -> None:
+    """Have what a file holds on the disk."""
+    with path.open("r+b") as stream:  # Windows syncs only what may be written to
+        os.fsync(stream.fileno())
 
 
 def sync_folder(folder: Path) -> None:

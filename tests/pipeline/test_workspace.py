@@ -1,13 +1,18 @@
 """What a workspace does to files: its own are shown, replaced and removed; what others put there stays."""
 
+import errno
+import os
+import stat
 from pathlib import Path
 
 import pytest
 from PIL import Image
 
 from pipeline.cli import run_command
+from pipeline.manifests import Manifest, describe_outputs, outputs_digest
 from pipeline.workspace import Workspace
 from stages.contract import StageError
+from stages.files import make_durable
 
 KEY = "0123456789abcdef"
 
@@ -69,3 +74,27 @@ def test_clean_takes_only_what_is_named_by_a_key(tmp_path: Path):
         (tmp_path / name).mkdir(parents=True)
     stale = Workspace(tmp_path).stale_folders({}, ["train"])
     assert [path.name for path in stale] == [KEY, f"{KEY}.bad", f"{KEY}.partial"]
+
+
+def test_files_are_synced_where_that_takes_the_right_to_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    fcntl = pytest.importorskip("fcntl", reason="the system itself asks for that right")
+
+    def fsync(descriptor: int) -> None:
+        """As on Windows."""
+        if stat.S_ISREG(os.fstat(descriptor).st_mode):
+            if fcntl.fcntl(descriptor, fcntl.F_GETFL) & os.O_ACCMODE == os.O_RDONLY:
+                raise OSError(errno.EBADF, "Bad file descriptor")
+            synced.append(descriptor)
+
+    synced = list[int]()
+    monkeypatch.setattr(os, "fsync", fsync)
+    workspace = Workspace(tmp_path)
+    partial, folder = workspace.partial("mesh", KEY), workspace.folder("mesh", KEY)
+    partial.mkdir(parents=True)
+    (partial / "mesh.ply").write_text("a mesh")
+    make_durable(partial)
+    outputs = describe_outputs(partial, ("mesh.ply",))
+    digest = outputs_digest(outputs)
+    workspace.finish(partial, folder, Manifest("mesh", 1, KEY, {}, {}, outputs, digest, {}, {}, "", 1.0, "now"))
+    assert len(synced) == 3, "the mesh twice, and the manifest"
+    assert workspace.finished("mesh", KEY, deep=True)
