@@ -71,7 +71,7 @@ def pilot_scene(inputs: Inputs, scene: "Scene", progress: Progress) -> PilotScen
     """Small photos to train on and to judge by, both from the training photos; None where there are too few."""
     from stages.device import compute_device
     from stages.right_halves import enough
-    from stages.training_data import guided_bank, view_mask, view_pixels, view_rays
+    from stages.training_data import PhotoReader, guided_bank, view_mask, view_rays
     from stages.unseen import set_aside
 
     split = set_aside(scene, MOST_KEPT, FEWEST_FOR_INTERVAL)
@@ -80,10 +80,11 @@ def pilot_scene(inputs: Inputs, scene: "Scene", progress: Progress) -> PilotScen
     cameras = [scene.cameras[view.camera] for view in scene.views]
     downscale = max(1.0, median(max(camera.width, camera.height) for camera in cameras) / LONG_SIDE)
     bank = guided_bank(inputs, split, downscale, progress).to(compute_device())
+    reader = PhotoReader(inputs["ingest"], split, downscale)
     photos = [
         _Photo(
             view_rays(split, view, downscale),
-            view_pixels(inputs["ingest"], split, view, downscale, BLACK),
+            reader.pixels(view, BLACK),
             view_mask(inputs["ingest"], split, view, downscale),
         )
         for view in split.of_split("validation")

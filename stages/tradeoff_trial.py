@@ -84,9 +84,9 @@ def make_exam(ingest: Path, scene: "Scene", downscale: float, count: int, small:
 
 
 def _photo(ingest: Path, scene: "Scene", view: "View", downscale: float, background: Colour) -> Window:
-    from stages.training_data import view_mask, view_pixels, view_rays
+    from stages.training_data import PhotoReader, view_mask, view_rays
 
-    truth = view_pixels(ingest, scene, view, downscale, background)
+    truth = PhotoReader(ingest, scene, downscale).pixels(view, background)
     return Window(view.name, view_rays(scene, view, downscale), truth, view_mask(ingest, scene, view, downscale))
 
 
