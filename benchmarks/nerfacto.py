@@ -71,15 +71,16 @@ def score_ours(workspace: Path) -> float:
     from stages.drawing import load_painter
     from stages.effect_decisions import expected_gains
     from stages.files import read_json, read_scene
-    from stages.training_data import view_pixels, view_rays
+    from stages.training_data import PhotoReader, view_rays
     from stages.training_setup import WHITE
 
     scene, train = read_scene(stage_folder(workspace, "scene.json")), stage_folder(workspace, "curve.json")
     painter, info = load_painter(train), read_json(train / "field.json")
     gains = expected_gains(info, scene, scene.of_split("test"))
     ingest, values = stage_folder(workspace, "photos.json"), []
+    reader = PhotoReader(ingest, scene, info["downscale"])
     for view in scene.of_split("test"):
-        truth = view_pixels(ingest, scene, view, info["downscale"], WHITE)
+        truth = reader.pixels(view, WHITE)
         at_gain = painter.at_gain(gains[view.name]) if gains else painter
         picture = at_gain.draw(view_rays(scene, view, info["downscale"])).colour.clamp(0, 1)
         values.append(psnr(mean_squared_error(picture, truth)))
@@ -92,7 +93,7 @@ def export(workspace: Path, downscale: float, target: Path) -> tuple[int, int]:
     from PIL import Image
 
     from stages.files import read_json, read_scene, write_json
-    from stages.training_data import scaled_size, view_pixels
+    from stages.training_data import PhotoReader, scaled_size
     from stages.training_setup import WHITE
 
     ingest, normalise = stage_folder(workspace, "photos.json"), stage_folder(workspace, "scene.json")
@@ -100,10 +101,11 @@ def export(workspace: Path, downscale: float, target: Path) -> tuple[int, int]:
     (width, height), *others = {scaled_size(camera, downscale) for camera in scene.cameras}
     if scene.has_alpha or others:
         raise SystemExit("this comparison takes opaque photos of one size")
+    reader = PhotoReader(ingest, scene, downscale)
     for view in scene.views:
         file = target / renamed(view.file)
         file.parent.mkdir(parents=True, exist_ok=True)
-        pixels = view_pixels(ingest, scene, view, downscale, WHITE).numpy()
+        pixels = reader.pixels(view, WHITE).numpy()
         Image.fromarray(np.rint(255 * pixels).astype(np.uint8)).save(file)
     write_json(target / "transforms.json", shrunk(read_json(normalise / "transforms.json"), width, height))
     return width, height

@@ -25,7 +25,7 @@ from stages.effect_decisions import expected_gains
 from stages.files import read_json, read_scene
 from stages.spread import spread
 from stages.tradeoff_arms import resolution_words
-from stages.training_data import view_pixels, view_rays
+from stages.training_data import PhotoReader, view_rays
 
 
 def with_samples(model: RadianceModel, factor: float) -> RadianceModel:
@@ -62,12 +62,12 @@ def measured(painter: Painter, folders: dict[str, Path], downscale: float, photo
     scene = read_scene(folders["normalise"])
     test = scene.of_split("test")
     gains = expected_gains(read_json(folders["train"] / "field.json"), scene, test)
-    seconds, scores = [], []
+    reader, seconds, scores = PhotoReader(folders["ingest"], scene, downscale), [], []
     for index in spread(len(test), min(photos, len(test))):
         view = test[index]
         shown = painter.at_gain(gains[view.name]) if gains else painter
         rays = view_rays(scene, view, downscale)
-        truth = view_pixels(folders["ingest"], scene, view, downscale, painter.background.tolist())
+        truth = reader.pixels(view, painter.background.tolist())
         started = time.perf_counter()
         picture = shown.draw(rays).colour.clamp(0, 1)
         seconds.append(time.perf_counter() - started)

@@ -82,9 +82,12 @@ def measure(
     photo_colours: PhotoColours = AS_RENDERED,
     photo_rays: PhotoRays = AS_GIVEN,
 ) -> ProbeResult:
-    """Render the probe and compare it with the photos, as ``photo_rays`` and ``photo_colours`` have them."""
-    residual, opacity = _residual(model, probe, photo_colours, photo_rays)
-    return ProbeResult(psnr(float(residual.square().mean())), float(opacity.mean()))
+    """Render the probe and compare it with the photos, as ``photo_rays`` and ``photo_colours`` have them.
+
+    Raises ValueError where what it shows is no finite number.
+    """
+    shown, opacity = _shown(model, probe, photo_colours, photo_rays)
+    return ProbeResult(psnr(mean_squared_error(shown, probe.colours)), float(opacity.mean()))
 
 
 @torch.no_grad()
@@ -92,16 +95,17 @@ def pictures(
     model: RadianceModel, patches: Patches, photo_colours: PhotoColours = AS_RENDERED
 ) -> tuple[Float[Tensor, "patches side side 3"], Float[Tensor, "patches side side 3"]]:
     """What the field shows of the patches, in [0, 1], and what the photos show."""
-    truth = patches.probe.colours
-    residual, _ = _residual(model, patches.probe, photo_colours, AS_GIVEN)
+    shown, _ = _shown(model, patches.probe, photo_colours, AS_GIVEN)
     shape = (*patches.used.shape, 3)
-    return (truth + residual).clamp(0, 1).view(shape), truth.view(shape)
+    return shown.view(shape), patches.probe.colours.view(shape)
 
 
-def _residual(
+def _shown(
     model: RadianceModel, probe: Probe, photo_colours: PhotoColours, photo_rays: PhotoRays
 ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"]]:
-    """By how much the photos would show more than they do, and the opacity of the field."""
+    """What the field shows in the photos' place, in [0, 1] as they are, and its opacity. What is no finite number stays
+    that."""
     one_row = photo_rays.forward(probe.rays, probe.view).each(lambda part: part[None])
     seen = Rendering(*(part[0] for part in render_image(model, one_row, probe.background)))
-    return photo_colours.residual(Seen(seen, probe.background, probe.view), probe.colours), seen.opacity
+    shown = probe.colours + photo_colours.residual(Seen(seen, probe.background, probe.view), probe.colours)
+    return torch.where(shown.isfinite(), shown.clamp(0, 1), shown), seen.opacity

@@ -1,13 +1,14 @@
 """What the user sees while stages run: a live line on a terminal, plain lines when piped, JSON lines for scripts."""
 
 import json
+import os
 import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TextIO
 
 from stages.amounts import duration
 from stages.contract import StageError
@@ -45,10 +46,32 @@ def error_text(stage: str, error: StageError) -> str:
     return f"{stage} failed: {error.what}\n  why: {error.why}\n  try: {error.hint}"
 
 
-def _print(text: str) -> None:
-    """At once; the run goes on where nobody reads along any more."""
-    with suppress(BrokenPipeError):
-        print(text, flush=True)
+class _Unread:
+    """A stream that loses what it cannot write: that its reader or its terminal is gone, or the disk under a log full,
+    ends no run."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        with suppress(OSError):
+            self._stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        with suppress(OSError):
+            self._stream.flush()
+
+    def leave(self) -> None:
+        """What is left of a failed write would be tried again when the program ends, and make that a failure."""
+        try:
+            self._stream.flush()
+        except OSError:
+            with open(os.devnull, "w") as nowhere:
+                os.dup2(nowhere.fileno(), self._stream.fileno())
 
 
 class SilentDisplay:
@@ -86,7 +109,7 @@ class PlainDisplay:
 
     def _say(self, text: str) -> None:
         with self._lock:
-            _print(text)
+            print(text, flush=True)
 
     def headline(self, text: str) -> None:
         self._say(text)
@@ -123,7 +146,7 @@ class JsonDisplay:
 
     def _event(self, event: str, **values: Any) -> None:
         with self._lock:
-            _print(json.dumps({"event": event, **values}))
+            print(json.dumps({"event": event, **values}), flush=True)
 
     def headline(self, text: str) -> None:
         self._event("start", text=text)
@@ -211,12 +234,19 @@ class RichDisplay:
 
 @contextmanager
 def choose_display(as_json: bool) -> Iterator[Display]:
-    """The display that fits where the output goes; a terminal's line is live while the block runs."""
-    if as_json:
-        yield JsonDisplay()
-    elif sys.stdout.isatty():
-        display = RichDisplay()
-        with display.progress:
-            yield display
-    else:
-        yield PlainDisplay()
+    """The display that fits where the output goes; a terminal's line is live while the block runs, which goes on where
+    nobody reads along any more."""
+    out, errors = _Unread(sys.stdout), _Unread(sys.stderr)
+    try:
+        with redirect_stdout(out), redirect_stderr(errors):
+            if as_json:
+                yield JsonDisplay()
+            elif out.isatty():
+                display = RichDisplay()
+                with display.progress:
+                    yield display
+            else:
+                yield PlainDisplay()
+    finally:
+        out.leave()
+        errors.leave()

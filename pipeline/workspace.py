@@ -1,12 +1,15 @@
 """A workspace on disk: one folder per stage and key, run.json, the output links, one lock.
 
 ``<workspace>/<stage>/<key16>/`` is finished and immutable; ``<key16>.partial/`` is work in progress; ``output/``
-links the latest results; ``run.json`` holds the options, the planned settings and the key each stage uses.
+links the latest results; ``run.json`` holds the options, the planned settings and the key each stage uses. A folder may
+hold other things as well: what this program did not put there it neither replaces nor removes.
 """
 
 import json
 import os
+import re
 import shutil
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,12 +17,15 @@ from filelock import FileLock, Timeout
 from pydantic import BaseModel, Field, ValidationError
 
 from pipeline import manifests
+from pipeline.chain import STAGES
 from pipeline.manifests import BadManifest, Manifest
 from stages.contract import KEY_LENGTH, StageError
-from stages.files import first_fault, sync_folder, write_durably
+from stages.files import first_fault, sync_file, sync_folder, write_durably
 
 RUN_FILE = "run.json"
 RUN_VERSION = 1
+COPIES = ".copies"  # names of what in output/ is no link but a copy, one a line
+_KEY = re.compile(rf"[0-9a-f]{{{KEY_LENGTH}}}(\.|$)")
 
 
 class _RunFile(BaseModel):
@@ -53,6 +59,7 @@ class Workspace:
         try:
             self.root.mkdir(parents=True, exist_ok=True)
             _refuse_links(self.root)
+            self._refuse_strangers(name for module in STAGES.values() for name in module.LINKS)
             self._lock.acquire(timeout=0)
             (self.root / ".lock.pid").write_text(f"{os.getpid()}\n")
         except Timeout:
@@ -121,8 +128,7 @@ class Workspace:
         From the manifest on a kill loses nothing: :meth:`complete` does the rest.
         """
         for name in (*manifest.outputs, *manifest.records):
-            with (partial / name).open("rb") as stream:
-                os.fsync(stream.fileno())
+            sync_file(partial / name)
         manifests.write(partial, manifest)
         self._tidy(partial, {*manifest.outputs, *manifest.records, manifests.NAME})
         if folder.exists():  # a forced run of the same key: the old result makes way at the last moment
@@ -178,28 +184,54 @@ class Workspace:
             raise self._cannot_write(error) from error
 
     def link_outputs(self, folder: Path, names: tuple[str, ...]) -> None:
-        """Point ``output/<name>`` at the files of a finished folder; copies where links are not allowed."""
-        output = self.root / "output"
-        output.mkdir(exist_ok=True)
+        """Point ``output/<name>`` at the files of a finished folder; copies where links are not allowed.
+
+        Raises StageError where something else lies there.
+        """
+        (self.root / "output").mkdir(exist_ok=True)
+        self._refuse_strangers(names)
         for name in names:
-            source, link = folder / name, output / Path(name).name
+            source, shown = folder / name, self._shown(name)
             if not source.exists():
-                _remove(link)
+                _remove(shown)
                 continue
-            temporary = output / f".{link.name}.tmp"
+            temporary = shown.with_name(f".{shown.name}.tmp")
             _remove(temporary)
             try:
-                temporary.symlink_to(os.path.relpath(source, output), target_is_directory=source.is_dir())
+                temporary.symlink_to(os.path.relpath(source, shown.parent), target_is_directory=source.is_dir())
             except OSError:  # Windows without the privilege, or a file system without links
                 shutil.copytree(source, temporary) if source.is_dir() else shutil.copy2(source, temporary)
-            if link.is_dir() and not link.is_symlink():
-                _remove(link)
-            temporary.replace(link)
+                write_durably(self.root / COPIES, "\n".join(sorted({*self._copies(), shown.name})).encode())
+            if shown.is_dir() and not shown.is_symlink():
+                _remove(shown)
+            temporary.replace(shown)
 
     def unlink_outputs(self, names: tuple[str, ...]) -> None:
         """Take ``output/<name>`` away, so that nothing there looks more current than it is."""
-        for name in names:
-            _remove(self.root / "output" / Path(name).name)
+        for shown in map(self._shown, names):
+            if self._is_ours(shown):
+                _remove(shown)
+
+    def _shown(self, name: str) -> Path:
+        """Where an output or record is shown."""
+        return self.root / "output" / Path(name).name
+
+    def _copies(self) -> list[str]:
+        copies = self.root / COPIES
+        return copies.read_text("utf-8", "replace").splitlines() if copies.exists() else []
+
+    def _is_ours(self, shown: Path) -> bool:
+        return shown.is_symlink() or shown.name in self._copies()
+
+    def _refuse_strangers(self, names: Iterable[str]) -> None:
+        """What lies under the name of a result and is no link or copy of ours would be lost to it."""
+        for shown in map(self._shown, names):
+            if shown.exists() and not self._is_ours(shown):
+                raise StageError(
+                    f"{shown} is none of this program's results",
+                    "one of that name is to be shown there, and what is there would be lost",
+                    "Move it elsewhere, or give another folder with -o.",
+                )
 
     def stale_folders(self, keys: dict[str, str], stages: list[str]) -> list[Path]:
         """Stage folders that run.json does not use: other keys, abandoned partials, damaged ones. It uses the training
@@ -210,7 +242,7 @@ class Workspace:
         if isinstance(after, str):
             current.add(self.folder("train", after))
         found = (p for stage in stages if (self.root / stage).is_dir() for p in (self.root / stage).iterdir())
-        return sorted(p for p in found if p.is_dir() and p not in current)  # a file there is none of ours
+        return sorted(p for p in found if p.is_dir() and _KEY.match(p.name) and p not in current)  # others are not ours
 
 
 def _refuse_links(root: Path) -> None:

@@ -6,6 +6,7 @@ PSNR is taken from the float picture in [0, 1], per photo; figures over all phot
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from nerf.scene import Scene, View
     from stages.baselines import MeanPhoto
     from stages.drawing import Painter
+    from stages.training_data import PhotoReader
 
 NEEDS = ("ingest", "normalise", "train")
 VERSION = 9
@@ -242,10 +244,14 @@ class Examiner:
         moved = from_fitted_pose(field.on_cpu(), rays, as_it_is, self.painter.background.cpu(), truth, used)
         return self._painter(view).draw(moved)
 
-    def _photo(self, view: "View") -> "Tensor":
-        from stages.training_data import view_pixels
+    @cached_property
+    def _reader(self) -> "PhotoReader":
+        from stages.training_data import PhotoReader
 
-        return view_pixels(self.ingest, self.scene, view, self.downscale, self.painter.background.tolist())
+        return PhotoReader(self.ingest, self.scene, self.downscale)
+
+    def _photo(self, view: "View") -> "Tensor":
+        return self._reader.pixels(view, self.painter.background.tolist())
 
     def used(self, view: "View") -> "Tensor | None":
         from stages.training_data import view_mask

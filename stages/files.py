@@ -18,7 +18,16 @@ T = TypeVar("T")
 
 def write_json(path: Path, value: Any) -> None:
     """Write ``value`` with sorted keys and round-trip floats. Raises ValueError on NaN or infinity."""
-    path.write_text(json.dumps(value, sort_keys=True, indent=1, allow_nan=False, ensure_ascii=False) + "\n", "utf-8")
+    path.write_text(_as_json(value), "utf-8")
+
+
+def write_json_durably(path: Path, value: Any) -> None:
+    """:func:`write_json`, after a kill, a power cut or on a full disk whole or not at all."""
+    write_durably(path, _as_json(value).encode())
+
+
+def _as_json(value: Any) -> str:
+    return json.dumps(value, sort_keys=True, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
 
 
 def read_json(path: Path) -> Any:
@@ -69,9 +78,14 @@ def write_durably(path: Path, content: bytes) -> None:
 def make_durable(folder: Path) -> None:
     """Have every file of a folder, and the folder, on the disk."""
     for path in folder.iterdir():
-        with path.open("rb") as stream:
-            os.fsync(stream.fileno())
+        sync_file(path)
     sync_folder(folder)
+
+
+def sync_file(path: Path) -> None:
+    """Have what a file holds on the disk."""
+    with path.open("r+b") as stream:  # Windows syncs only what may be written to
+        os.fsync(stream.fileno())
 
 
 def sync_folder(folder: Path) -> None:

@@ -71,7 +71,7 @@ def pilot_scene(inputs: Inputs, scene: "Scene", progress: Progress) -> PilotScen
     """Small photos to train on and to judge by, both from the training photos; or why there can be no pilot."""
     from stages.device import compute_device
     from stages.right_halves import enough
-    from stages.training_data import NothingLeft, guided_bank, view_mask, view_pixels, view_rays
+    from stages.training_data import NothingLeft, PhotoReader, guided_bank, view_mask, view_rays
     from stages.unseen import set_aside
 
     split = set_aside(scene, MOST_KEPT, FEWEST_FOR_INTERVAL)
@@ -84,10 +84,11 @@ def pilot_scene(inputs: Inputs, scene: "Scene", progress: Progress) -> PilotScen
         bank = guided_bank(inputs, split, downscale, progress).to(compute_device())
     except NothingLeft:  # of a thin thing, of which larger photos show enough
         return f"masks leave nothing of the training photos at {size}"
+    reader = PhotoReader(inputs["ingest"], split, downscale)
     photos = [
         _Photo(
             view_rays(split, view, downscale),
-            view_pixels(inputs["ingest"], split, view, downscale, BLACK),
+            reader.pixels(view, BLACK),
             view_mask(inputs["ingest"], split, view, downscale),
         )
         for view in split.of_split("validation")

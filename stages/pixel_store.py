@@ -21,6 +21,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, NamedTuple
 
@@ -60,7 +61,7 @@ class PixelStore:
     photos: tuple[StoredPhoto, ...]
     channels: int
 
-    @property
+    @cached_property
     def starts(self) -> list[int]:
         """At which byte each photo begins, and at last where the last one ends."""
         starts = [0]

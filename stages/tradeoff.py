@@ -148,9 +148,9 @@ def selection_of(config: Config) -> Selection:
 def promise(selection: Selection, arms: Path) -> str:
     """How many trainings there are to do, some of which an earlier attempt has left in the folder ``arms``, and when
     they are expected to be done."""
-    from stages.tradeoff_trial import figures_file
+    from stages.tradeoff_trial import figures_file, kept
 
-    to_do = [arm for arm in selection.arms if not figures_file(arm, arms).exists()]
+    to_do = [arm for arm in selection.arms if kept(figures_file(arm, arms)) is None]
     seconds = sum(arm.seconds for arm in to_do)
     there = f", {len(selection.arms) - len(to_do)} of them there" if len(to_do) < len(selection.arms) else ""
     finish = time.strftime("%H:%M", time.localtime(time.time() + seconds))
@@ -186,13 +186,13 @@ def _run_all(
 ) -> tuple[list[Trial], tuple[str, ...]]:
     """Every arm that the time allows, the first one in any case: whatever killed attempts took, asking again helps. And
     those that it does not. ``spent`` tells the seconds that the study has taken so far, such attempts included."""
-    from stages.tradeoff_trial import figures_file, run_arm
+    from stages.tradeoff_trial import figures_file, kept, run_arm
 
     trials, late, worked, expected, arms = list[Trial](), list[Arm](), 0.0, 0.0, folder / "arms"
     slowness = 1.0
     for number, arm in enumerate(selection.arms, 1):
         too_late = spent() + arm.seconds * slowness > (1 + LATE) * config.seconds
-        if trials and too_late and not figures_file(arm, arms).exists():
+        if trials and too_late and kept(figures_file(arm, arms)) is None:
             late.append(arm)
             continue
         inner = _ArmProgress(progress, f"{number}/{len(selection.arms)} {arm.variant}", spent() / config.seconds)

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from stages.contract import Inputs, Progress
-from stages.files import read_json, write_json
+from stages.files import read_json, write_json_durably
 from stages.tradeoff_arms import OWN, scored_every
 from stages.tradeoff_front import Point
-from stages.tradeoff_trial import Exam, drawing_seconds, score
+from stages.tradeoff_trial import Exam, drawing_seconds, kept, score
 
 
 class Own(NamedTuple):
@@ -31,12 +31,12 @@ def own_field(exam: Exam, inputs: Inputs, folder: Path, seconds: float, progress
     if train is None:
         return None
     key, facts = train.resolve().name, read_json(train / "manifest.json")["facts"]
-    kept = folder / f"own_{key}.json"
-    if not kept.exists():
+    file = folder / f"own_{key}.json"
+    if (found := kept(file)) is None:
         progress.update(f"scoring {OWN}")
         every = scored_every(drawing_seconds(train, exam), seconds)
-        write_json(kept, {"every": every, "figures": score(train, exam, progress, every)})
-    found = read_json(kept)
+        found = {"every": every, "figures": score(train, exam, progress, every)}
+        write_json_durably(file, found)
     return Own(_point(facts, found["figures"]), found["every"], key)
 
 

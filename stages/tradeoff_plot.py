@@ -3,6 +3,7 @@
 Equal data gives equal bytes.
 """
 
+import math
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
@@ -32,6 +33,8 @@ NAMES = 0.32  # of the axis of the times: room at the left for the first name
 TICKS = [*(k * 10.0**e for e in (-2, -1, 0) for k in (1, 2, 5)), 10.0, 20.0, 30.0]
 TICKS += [*(60.0 * k for k in (1, 2, 5, 10, 20, 30)), *(3600.0 * k for k in (1, 2, 5, 10, 20))]
 LETTER = 8.5  # points, of labels
+NUMBER = LETTER - 1.5  # points, of other points' numbers
+LETTER_WIDTH = 0.6  # of its size
 GAP = 1.25  # lines between labels of the front
 DPI = 160
 SHOT = 192  # pixels of a photo's height in the sheet
@@ -44,6 +47,14 @@ class Row(NamedTuple):
     name: str
     words: tuple[str, ...]
     strip: Path
+
+
+class Label(NamedTuple):
+    """Where the label of some points stands, in points of 1/72 inch, and their numbers."""
+
+    x: float
+    y: float
+    numbers: tuple[int, ...]
 
 
 def write_plot(study: dict[str, Any], folder: Path) -> None:
@@ -85,8 +96,8 @@ def draw(figure: "Figure", study: dict[str, Any]) -> None:
     ring = {"s": 190, "facecolors": "none", "edgecolors": INK, "linewidths": 1.6, "zorder": 4}
     axes.scatter([best["train_seconds"]], [best["psnr"]], label="recommended", **ring)
     _frame(axes, rows)
-    _number_the_others(axes, rows)
     _name_the_front(axes, front)
+    _number_the_others(axes, rows)
     axes.legend(
         frameon=False, loc="lower left", bbox_to_anchor=(0, 1), ncols=3, borderaxespad=0.2, fontsize=LETTER + 0.5
     )
@@ -108,10 +119,38 @@ def _frame(axes: "Axes", rows: Sequence[dict[str, Any]]) -> None:
 
 
 def _number_the_others(axes: "Axes", rows: Sequence[dict[str, Any]]) -> None:
-    style = {"textcoords": "offset points", "size": LETTER - 1.5, "alpha": 0.75, "ha": "left", "va": "top"}
-    for row in rows:
-        if not row["front"]:
-            axes.annotate(str(row["number"]), (row["train_seconds"], row["psnr"]), (4, -2), **style)
+    """Numbers at the lower right of the other points, those of points that lie together side by side: ``17, 18``."""
+    style = {"textcoords": "offset points", "size": NUMBER, "alpha": 0.75, "ha": "left", "va": "top"}
+    (low, high), (left, right) = axes.get_ylim(), axes.get_xlim()
+    width, height = (72 * 0.8 * inches for inches in SIZE)
+
+    def place(row: dict[str, Any]) -> tuple[float, float]:
+        """In points, about."""
+        across = math.log(row["train_seconds"] / left) / math.log(right / left)
+        return width * across, height * (row["psnr"] - low) / (high - low)
+
+    labels = [Label(*place(row), (row["number"],)) for row in rows if not row["front"]]
+    for x, y, numbers in side_by_side(labels):
+        at = left * (right / left) ** (x / width), low + (high - low) * y / height
+        axes.annotate(", ".join(map(str, numbers)), at, (4, -2), **style)
+
+
+def side_by_side(labels: Sequence[Label]) -> list[Label]:
+    """``labels`` with those that would lie on each other made one, by number, at the rightmost place of theirs."""
+    apart: list[Label] = []
+    for label in sorted(labels):
+        while near := next((other for other in apart if _overlap(label, other)), None):
+            apart.remove(near)
+            x, y = max(near, label)[:2]
+            label = Label(x, y, tuple(sorted(near.numbers + label.numbers)))
+        apart.append(label)
+    return apart
+
+
+def _overlap(label: Label, other: Label) -> bool:
+    first, second = sorted((label, other))
+    wide = LETTER_WIDTH * NUMBER * len(", ".join(map(str, first.numbers)))
+    return second.x - first.x < wide and abs(second.y - first.y) < GAP * NUMBER
 
 
 def _name_the_front(axes: "Axes", front: Sequence[dict[str, Any]]) -> None:

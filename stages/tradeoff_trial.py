@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from stages.contract import Inputs, Progress, StageError
-from stages.files import read_json, write_json
+from stages.files import read_json, sync_file, write_json_durably
 from stages.periodically import periodically
-from stages.tradeoff_arms import SMALL_SIDE, Arm
+from stages.tradeoff_arms import SMALL_SIDE, THINNED, Arm
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -28,6 +28,8 @@ WINDOW = 64  # pixels along an edge
 SHOWN = 3  # held-out photos kept as pictures
 # Steps between windows that fill a square evenly, however many there are (Roberts 2018, the R2 sequence).
 STEPS_OF_PLACES = (0.7548776662466927, 0.5698402909980532)
+ENOUGH = 0.25  # of a window's pixels that masks leave
+PLACES = 256  # in a photo that are looked at for a window with ENOUGH
 MEMORY_LOOK_SECONDS = 0.05
 OWN_FAULTS = ("training diverged", "the field does not learn", "nothing is left to train on")
 """What stage train says where the arm itself is at fault: it would say so again."""
@@ -70,7 +72,9 @@ def make_exam(ingest: Path, scene: "Scene", downscale: float, count: int, small:
     from stages.training_setup import BLACK, WHITE
 
     test, background = scene.of_split("test"), WHITE if scene.has_alpha else BLACK
-    windows = tuple(_window(ingest, scene, test[i % len(test)], downscale, background, i) for i in range(count))
+    whole = (_photo(ingest, scene, test[i % len(test)], downscale, background) for i in range(count))
+    windows = tuple(photo.part(_place(photo, i, count)) for i, photo in enumerate(whole))
+    _check_used(windows)
     shown = [test[i] for i in spread(len(test), min(SHOWN, len(test)))]
     sides = [max(camera.width, camera.height) for camera in (scene.cameras[view.camera] for view in shown)]
     sizes = [max(small, side / SMALL_SIDE) for side in sides]
@@ -80,19 +84,37 @@ def make_exam(ingest: Path, scene: "Scene", downscale: float, count: int, small:
 
 
 def _photo(ingest: Path, scene: "Scene", view: "View", downscale: float, background: Colour) -> Window:
-    from stages.training_data import view_mask, view_pixels, view_rays
+    from stages.training_data import PhotoReader, view_mask, view_rays
 
-    truth = view_pixels(ingest, scene, view, downscale, background)
+    truth = PhotoReader(ingest, scene, downscale).pixels(view, background)
     return Window(view.name, view_rays(scene, view, downscale), truth, view_mask(ingest, scene, view, downscale))
 
 
-def _window(ingest: Path, scene: "Scene", view: "View", downscale: float, background: Colour, number: int) -> Window:
-    whole = _photo(ingest, scene, view, downscale, background)
-    top, left = (
-        int((0.5 + number * step) % 1 * (max(0, size - WINDOW) + 1))
-        for step, size in zip(STEPS_OF_PLACES, whole.truth.shape[:2], strict=True)
-    )
-    return whole.part((slice(top, top + WINDOW), slice(left, left + WINDOW)))
+def _place(photo: Window, number: int, count: int) -> tuple[slice, slice]:
+    """Where the ``number``-th of ``count`` windows lies in its photo: at its place of the R2 sequence or, where masks
+    leave less than ENOUGH of that, at the first with as much of every ``count``-th place from there on, which are no
+    other window's; of PLACES the one of which they leave most."""
+    best, most = (slice(None), slice(None)), -1.0
+    for turn in range(number, number + PLACES * count, count):
+        top, left = (
+            int((0.5 + turn * step) % 1 * (max(0, size - WINDOW) + 1))
+            for step, size in zip(STEPS_OF_PLACES, photo.truth.shape[:2], strict=True)
+        )
+        place = slice(top, top + WINDOW), slice(left, left + WINDOW)
+        left_over = 1.0 if photo.used is None else float(photo.used[place].float().mean())
+        if left_over > most:
+            best, most = place, left_over
+        if most >= ENOUGH:
+            break
+    return best
+
+
+def _check_used(windows: tuple[Window, ...]) -> None:
+    """Raise StageError unless some of the pixels that every arm is scored on are to be used."""
+    thinned = slice(None, None, THINNED)
+    if not any(window.used is None or window.used[thinned, thinned].any() for window in windows):
+        why = "masks leave next to nothing of the held-out photos at this size"
+        raise StageError("nothing to score a study by", why, "Lower --normalise.test-every, or ignore less.")
 
 
 def run_arm(arm: Arm, exam: Exam, inputs: Inputs, folder: Path, progress: Progress) -> dict[str, Any]:
@@ -104,9 +126,8 @@ def run_arm(arm: Arm, exam: Exam, inputs: Inputs, folder: Path, progress: Progre
     """
     from stages import train
 
-    found = figures_file(arm, folder)
-    if found.exists():
-        return read_json(found)
+    if (found := kept(figures_file(arm, folder))) is not None:
+        return found
     started, work = time.perf_counter(), folder / arm.name
     work.mkdir(parents=True, exist_ok=True)
     figures: dict[str, Any] = {"failed": None}
@@ -124,10 +145,20 @@ def run_arm(arm: Arm, exam: Exam, inputs: Inputs, folder: Path, progress: Progre
             figures |= score(work, exam, progress, arm.every)
             if arm.every == 1:
                 write_strip(strip_file(arm, folder), draw_photos(work, exam))
+                sync_file(strip_file(arm, folder))  # before the figures, with which the arm counts as done
     figures |= {"peak_memory_mb": round(peak() / 1e6), "wall_seconds": round(time.perf_counter() - started, 3)}
-    write_json(found, figures)
+    write_json_durably(figures_file(arm, folder), figures)
     shutil.rmtree(work)
     return figures
+
+
+def kept(file: Path) -> dict[str, Any] | None:
+    """What an earlier attempt at a study found and kept; None where it did not, or where the file is damaged: it is
+    then found anew."""
+    try:
+        return read_json(file)
+    except StageError:
+        return None
 
 
 def figures_file(arm: Arm, folder: Path) -> Path:

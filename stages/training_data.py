@@ -143,25 +143,32 @@ def view_rays(scene: "Scene", view: "View", downscale: float) -> "Rays":
     return rays_of_view(camera_directions(scene.cameras[view.camera], downscale), pose, view.near, view.far)
 
 
-def view_pixels(ingest: Path, scene: "Scene", view: "View", downscale: float, background: Sequence[float]) -> "Tensor":
-    """The photo of a view as (H, W, 3) float32 in [0, 1], over ``background`` where it has alpha."""
-    import torch
+class PhotoReader:
+    """The photos of a scene at 1/``downscale`` of their size, one by one. To be held while many are read: where those
+    of a split are stored is told by a look at every one of them, once."""
 
-    from nerf.training import over
+    def __init__(self, ingest: Path, scene: "Scene", downscale: float) -> None:
+        self.ingest, self.scene, self.downscale = ingest, scene, downscale
+        self._stores: dict[Split, tuple[PixelStore, dict[str, int]]] = {}
 
-    pixels = torch.tensor(_pixels(ingest, scene, view, downscale)).float() / 255
-    alpha = pixels[..., 3] if scene.has_alpha else None
-    return over(pixels[..., :3], alpha, torch.tensor(background, dtype=torch.float32))
+    def pixels(self, view: "View", background: Sequence[float]) -> "Tensor":
+        """The photo of a view as (H, W, 3) float32 in [0, 1], over ``background`` where it has alpha."""
+        import torch
 
+        from nerf.training import over
 
-def _pixels(ingest: Path, scene: "Scene", view: "View", downscale: float) -> "np.ndarray":
-    """The photo of a view as uint8, out of the pixel store where that is there."""
-    store = _store(ingest, scene, view.split, downscale)
-    if store.is_whole:
-        stored = store.photo([photo.file for photo in store.photos].index(view.file))
-        if stored is not None:
-            return stored
-    return _decoded_pixels(ingest, scene, view, downscale)
+        pixels = torch.tensor(self._pixels(view)).float() / 255
+        alpha = pixels[..., 3] if self.scene.has_alpha else None
+        return over(pixels[..., :3], alpha, torch.tensor(background, dtype=torch.float32))
+
+    def _pixels(self, view: "View") -> "np.ndarray":
+        """The photo of a view as uint8, out of the pixel store where that is there."""
+        if view.split not in self._stores:
+            store = _store(self.ingest, self.scene, view.split, self.downscale)
+            self._stores[view.split] = store, {photo.file: index for index, photo in enumerate(store.photos)}
+        store, places = self._stores[view.split]
+        stored = store.photo(places[view.file]) if store.is_whole else None
+        return _decoded_pixels(self.ingest, self.scene, view, self.downscale) if stored is None else stored
 
 
 def _store(ingest: Path, scene: "Scene", split: "Split", downscale: float) -> "PixelStore":

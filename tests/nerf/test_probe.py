@@ -1,5 +1,6 @@
 import math
 
+import pytest
 import torch
 
 from nerf.metrics import PSNR_LIMIT
@@ -92,3 +93,18 @@ def test_patches_know_what_masks_ignore() -> None:
 def test_a_picture_is_as_bright_as_a_photo_can_be() -> None:
     shown, _ = pictures(Painted(), make_patches(two_photos(grey=1.5), 4, 9, torch.zeros(3), seed=1))
     assert (shown == 1).all()
+
+
+def test_a_score_is_of_colours_as_bright_as_a_photo_can_be() -> None:
+    too_bright, white = (
+        measure(Painted(), make_probe(two_photos(grey), 50, torch.zeros(3), seed=0)).psnr for grey in (1.5, 1.0)
+    )
+    assert too_bright == white
+
+
+@pytest.mark.parametrize("value", [math.inf, math.nan])
+def test_what_is_no_finite_number_has_no_score(value: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    painted = Painted.render
+    monkeypatch.setattr(Painted, "render", lambda *given: painted(*given)._replace(colour=value * torch.ones(1, 50, 3)))
+    with pytest.raises(ValueError, match="mean squared error"):
+        measure(Painted(), make_probe(two_photos(), 50, torch.zeros(3), seed=0))

@@ -13,7 +13,6 @@ import pytest
 from PIL import Image
 
 from pipeline.cli import run_command
-from pipeline.display import Display, JsonDisplay, PlainDisplay, end_line
 from pipeline.settings import Settings, default_workspace
 
 
@@ -343,35 +342,6 @@ def test_words_that_nobody_reads_are_no_error(words: list[str]):
     assert process.stdout is not None and process.stderr is not None
     process.stdout.close()
     assert process.stderr.read() == "" and process.wait() == 0
-
-
-@pytest.mark.parametrize("display", [PlainDisplay(), JsonDisplay()])
-def test_a_run_goes_on_when_nobody_reads_along(display: Display, monkeypatch: pytest.MonkeyPatch):
-    read, write = os.pipe()
-    os.close(read)
-    with open(write, "w") as unread:
-        monkeypatch.setattr(sys, "stdout", unread)
-        display.headline("two cores")
-        display.begin("train")
-        display.note("said to nobody")
-        monkeypatch.undo()
-        with pytest.raises(BrokenPipeError):
-            unread.flush()
-        os.dup2(os.open(os.devnull, os.O_WRONLY), write)
-
-
-def test_end_lines():
-    assert end_line("sfm", "all good", 61.0, cached=False) == "sfm        all good  [1 min 1 s]"
-    assert end_line("sfm", "all good", 61.0, cached=True) == "sfm        all good  [cached]"
-
-
-def test_plain_output_is_not_flooded(capsys: pytest.CaptureFixture[str]):
-    display = PlainDisplay()
-    display.begin("train")
-    for k in range(1000):
-        display.update(f"step {k}", k / 1000)
-    display.note("a line that stays")
-    assert capsys.readouterr().out == "train      a line that stays\n"
 
 
 def test_a_budget_and_more_are_two_budgets(

@@ -18,7 +18,7 @@ from stages.drawing import Painter
 from stages.effect_decisions import Decisions, learnt_of_photos, photo_parts
 from stages.evaluate import Examiner
 from stages.right_halves import from_fitted_pose, right_half_psnr
-from stages.training_data import training_bank, view_pixels, view_rays
+from stages.training_data import PhotoReader, training_bank, view_rays
 from tests.stages.photo_scene import photographed
 from tests.synthetic_photos import Quiet
 
@@ -42,7 +42,8 @@ def test_poses_are_fitted_to_the_field_as_it_is_and_scored_as_the_photo_was_expo
     (scored,) = examiner.score([view], Quiet())
     rays = view_rays(scene, view, 1.0)
     assert given[0][0] is field and torch.equal(given[0][1], plain.draw(rays).colour)
-    truth, exposed = view_pixels(inputs["ingest"], scene, view, 1.0, (0.0,) * 3), neutral.at_gain(gain)
+    truth = PhotoReader(inputs["ingest"], scene, 1.0).pixels(view, (0.0,) * 3)
+    exposed = neutral.at_gain(gain)
     right, fitted = right_half_psnr(exposed.draw(rays), torch.zeros(3), truth)
     _, posed = right_half_psnr(exposed.draw(rays._replace(near=rays.near + 0.5)), torch.zeros(3), truth)
     assert scored["psnr_right"] == pytest.approx(right) and scored["psnr_fitted_right"] == pytest.approx(fitted)

@@ -24,7 +24,7 @@ SIZES = [(5, 3), (4, 2), (7, 6), (5, 3)]  # (width, height)
 
 
 def store_of(folder: Path, channels: int = 3, name: str = "train") -> PixelStore:
-    ingest = folder / "0123"
+    ingest = folder / "0123456789abcdef"
     ingest.mkdir(exist_ok=True)
     photos = [StoredPhoto(f"{index}.png", *size) for index, size in enumerate(SIZES)]
     for photo in photos:
@@ -69,7 +69,7 @@ def test_it_is_made_once_and_lies_beside_ingest(tmp_path: Path, progress: Silent
     fill(store_of(tmp_path), painted, progress)
     again = store_of(tmp_path)
     fill(again, never, progress)
-    assert again.path.parent == tmp_path / "0123.pixels"
+    assert again.path.parent == tmp_path / "0123456789abcdef.pixels"
     assert sorted(path.name for path in again.path.parent.iterdir() if path.suffix != ".lock") == [again.path.name]
 
 
@@ -77,7 +77,7 @@ def test_another_content_is_another_store(tmp_path: Path) -> None:
     first = store_of(tmp_path)
     assert store_of(tmp_path).path == first.path
     others = [store_of(tmp_path, channels=4), store_of(tmp_path, name="test")]
-    ingest, photos = tmp_path / "0123", list(first.photos)
+    ingest, photos = tmp_path / "0123456789abcdef", list(first.photos)
     others.append(pixel_store(ingest, "train", photos[:3], 3))
     others.append(pixel_store(ingest, "train", [photos[0]._replace(width=4), *photos[1:]], 3))
     os.utime(ingest / photos[0].file, ns=(0, 0))
@@ -92,7 +92,7 @@ def test_clean_takes_it_away(tmp_path: Path, progress: SilentProgress) -> None:
     (tmp_path / "ingest").mkdir()
     store = store_of(tmp_path / "ingest")
     fill(store, painted, progress)
-    stale = Workspace(tmp_path).stale_folders({"ingest": "0123"}, ["ingest"])
+    stale = Workspace(tmp_path).stale_folders({"ingest": "0123456789abcdef"}, ["ingest"])
     assert stale == [store.path.parent]
 
 

@@ -308,7 +308,7 @@ def test_too_little_time_is_said_with_numbers(tmp_path: Path, photos: dict[str, 
 
 
 def test_windows_are_parts_of_the_photos(photos: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> None:
-    from stages.training_data import view_pixels, view_rays
+    from stages.training_data import PhotoReader, view_rays
     from stages.training_setup import WHITE
 
     monkeypatch.setattr(tradeoff_trial, "WINDOW", 8)
@@ -319,7 +319,7 @@ def test_windows_are_parts_of_the_photos(photos: dict[str, Path], monkeypatch: p
     assert [photo.truth.shape for photo in exam.photos] == [(8, 12, 3)] * 2
     for window in exam.windows:
         view = next(v for v in scene.views if v.name == window.photo)
-        truth, rays = view_pixels(photos["ingest"], scene, view, 1.0, WHITE), view_rays(scene, view, 1.0)
+        truth, rays = PhotoReader(photos["ingest"], scene, 1.0).pixels(view, WHITE), view_rays(scene, view, 1.0)
         places = [
             (y, x)
             for y in range(9)

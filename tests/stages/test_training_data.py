@@ -1,5 +1,6 @@
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,15 +12,16 @@ from nerf.ray_bank import Placement, ray_bank
 from nerf.scene import Camera
 from stages.contract import StageError
 from stages.files import write_png, write_tensors
+from stages.pixel_store import PixelStore, pixel_store
 from stages.training_data import (
     MOST_PATCHES,
+    PhotoReader,
     camera_directions,
     guided_bank,
     patch_bearings,
     scaled_size,
     training_bank,
     view_mask,
-    view_pixels,
     view_rays,
 )
 from stages.training_setup import WHITE
@@ -63,7 +65,8 @@ def test_the_bank_and_the_views_are_the_same_pixels_and_rays(
     rays, colours, alpha, _ = bank.lookup(torch.arange(len(bank.pixels)))
     views = scene.of_split("train")
     assert alpha is None and len(bank.near) == len(views) == 6
-    pixels = [view_pixels(inputs["ingest"], scene, view, downscale, WHITE).flatten(0, 1) for view in views]
+    reader = PhotoReader(inputs["ingest"], scene, downscale)
+    pixels = [reader.pixels(view, WHITE).flatten(0, 1) for view in views]
     assert torch.equal(colours, torch.cat(pixels))
     directions = [view_rays(scene, view, downscale).directions.flatten(0, 1) for view in views]
     torch.testing.assert_close(rays.directions, torch.cat(directions))
@@ -71,9 +74,10 @@ def test_the_bank_and_the_views_are_the_same_pixels_and_rays(
 
 def test_transparent_pixels_are_shown_over_the_background(tmp_path: Path, progress: SilentProgress) -> None:
     inputs, scene = photographed(tmp_path, channels=4)
-    over_white = view_pixels(inputs["ingest"], scene, scene.views[0], 1.0, WHITE)
+    reader = PhotoReader(inputs["ingest"], scene, 1.0)
+    over_white = reader.pixels(scene.views[0], WHITE)
     torch.testing.assert_close(over_white, torch.from_numpy(ball_photo()).float() / 255)
-    over_green = view_pixels(inputs["ingest"], scene, scene.views[0], 1.0, (0.0, 1.0, 0.0))
+    over_green = reader.pixels(scene.views[0], (0.0, 1.0, 0.0))
     assert over_green[0, 0].tolist() == [0, 1, 0]
     assert training_bank(inputs["ingest"], scene, "train", 1.0, progress).pixels.shape[1] == 4
 
@@ -119,12 +123,29 @@ def test_evaluation_reads_the_pixels_that_training_stored(
 ) -> None:
     inputs, scene = photographed(tmp_path)
     ingest, trained, unseen = inputs["ingest"], scene.of_split("train")[2], scene.of_split("test")[1]
-    decoded = [view_pixels(ingest, scene, view, 2.0, WHITE) for view in (trained, unseen)]
+    reader = PhotoReader(ingest, scene, 2.0)
+    decoded = [reader.pixels(view, WHITE) for view in (trained, unseen)]
     for split in ("train", "test"):
         training_bank(ingest, scene, split, 2.0, progress)
     monkeypatch.setattr("stages.photos.load_pixels", None)
     for view, pixels in zip((trained, unseen), decoded, strict=True):
-        assert torch.equal(view_pixels(ingest, scene, view, 2.0, WHITE), pixels)
+        assert torch.equal(reader.pixels(view, WHITE), pixels)
+
+
+def test_where_photos_are_stored_is_found_out_once_for_each_split(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def found_out(ingest: Path, name: str, *rest: Any) -> PixelStore:
+        asked.append(name)
+        return pixel_store(ingest, name, *rest)
+
+    inputs, scene = photographed(tmp_path)
+    asked = list[str]()
+    monkeypatch.setattr("stages.pixel_store.pixel_store", found_out)
+    reader = PhotoReader(inputs["ingest"], scene, 1.0)
+    for view in scene.views:
+        reader.pixels(view, WHITE)
+    assert sorted(asked) == ["test", "train"]
 
 
 LENSES = {

@@ -1,0 +1,82 @@
+"""What the user sees while stages run; and that a run goes on where nobody sees it."""
+
+import json
+import os
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from pipeline.display import Display, PlainDisplay, choose_display, end_line
+from stages.contract import StageError
+
+
+def say_everything(display: Display) -> None:
+    display.headline("two cores")
+    for stage in ("sfm", "train"):
+        display.begin(stage)
+        display.update("step 1", 0.5)
+        display.note("a note " * 2000)  # more than a buffer holds
+        display.end(stage, "it is done", 1.0, cached=False)
+    display.failed("train", StageError("what", "why", "what to try"))
+    display.finished("at last", {})
+
+
+@pytest.mark.parametrize("as_json", [False, True], ids=["plain", "json"])
+@pytest.mark.parametrize("fault", ["nobody reads", "full disk"])
+def test_a_run_goes_on_when_nothing_can_be_said(as_json: bool, fault: str, monkeypatch: pytest.MonkeyPatch):
+    if fault == "full disk" and not Path("/dev/full").exists():
+        pytest.skip("this system has no disk that is always full")
+    read, write = os.pipe()
+    os.close(read)
+    with open(write, "w") as pipe, open("/dev/full" if fault == "full disk" else os.devnull, "w") as full:
+        unread = pipe if fault == "nobody reads" else full
+        for name in ("stdout", "stderr"):
+            monkeypatch.setattr(sys, name, unread)
+        with choose_display(as_json) as display:
+            say_everything(display)
+        unread.flush()
+        monkeypatch.undo()
+
+
+@pytest.mark.skipif(not hasattr(os, "openpty"), reason="terminals of another kind")
+def test_a_run_goes_on_when_its_terminal_is_closed(monkeypatch: pytest.MonkeyPatch):
+    faults = list[object]()
+    monkeypatch.setattr(threading, "excepthook", faults.append)
+    master, slave = os.openpty()
+    with open(slave, "w") as terminal:
+        for name in ("stdout", "stderr"):
+            monkeypatch.setattr(sys, name, terminal)
+        with choose_display(as_json=False) as display:
+            display.headline("two cores")
+            assert b"two cores" in os.read(master, 4096)
+            os.close(master)
+            with pytest.raises(OSError, match="Input/output error"):
+                os.write(slave, b"nobody is there")
+            say_everything(display)
+        terminal.flush()
+        monkeypatch.undo()
+    assert faults == []
+
+
+def test_events_are_lines_of_json(capsys: pytest.CaptureFixture[str]):
+    with choose_display(as_json=True) as display:
+        say_everything(display)
+    events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    kinds = ["start", *["begin", "progress", "note", "end"] * 2, "error", "finished"]
+    assert [event["event"] for event in events] == kinds
+
+
+def test_end_lines():
+    assert end_line("sfm", "all good", 61.0, cached=False) == "sfm        all good  [1 min 1 s]"
+    assert end_line("sfm", "all good", 61.0, cached=True) == "sfm        all good  [cached]"
+
+
+def test_plain_output_is_not_flooded(capsys: pytest.CaptureFixture[str]):
+    display = PlainDisplay()
+    display.begin("train")
+    for k in range(1000):
+        display.update(f"step {k}", k / 1000)
+    display.note("a line that stays")
+    assert capsys.readouterr().out == "train      a line that stays\n"

@@ -1,0 +1,100 @@
+"""What a workspace does to files: its own are shown, replaced and removed; what others put there stays."""
+
+import errno
+import os
+import stat
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from pipeline.cli import run_command
+from pipeline.manifests import Manifest, describe_outputs, outputs_digest
+from pipeline.workspace import Workspace
+from stages.contract import StageError
+from stages.files import make_durable
+
+KEY = "0123456789abcdef"
+
+
+def result(root: Path, number: int) -> Path:
+    """A finished stage with a file and a folder to show."""
+    folder = root / "mesh" / f"{number:016x}"
+    (folder / "images").mkdir(parents=True)
+    (folder / "images/a.png").write_text(f"picture {number}")
+    (folder / "mesh.ply").write_text(f"mesh {number}")
+    return folder
+
+
+def test_photos_below_the_folder_for_the_results_are_safe(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    photos = tmp_path / "project/output/images"
+    photos.mkdir(parents=True)
+    for k in range(3):
+        Image.new("RGB", (4, 4), (k, 0, 0)).save(photos / f"{k}.png")
+    assert run_command(["run", str(photos), "-o", str(tmp_path / "project")]) == 3
+    assert f"{photos} is none of this program's results" in capsys.readouterr().err
+    assert len([*photos.iterdir()]) == 3
+    assert [path.name for path in (tmp_path / "project").iterdir()] == ["output"], "nothing has been written"
+
+
+def test_what_others_put_into_output_stays(tmp_path: Path):
+    names = ("images", "mesh.ply")
+    with Workspace(tmp_path) as workspace:
+        folder = result(tmp_path, 1)
+        (tmp_path / "output").mkdir()
+        (tmp_path / "output/mesh.ply").write_text("of another program")
+        workspace.unlink_outputs(names)
+        with pytest.raises(StageError, match="none of this program's results"):
+            workspace.link_outputs(folder, names)
+    with pytest.raises(StageError, match="none of this program's results"), Workspace(tmp_path):
+        pass
+    assert (tmp_path / "output/mesh.ply").read_text() == "of another program"
+
+
+def test_copies_make_way_where_links_are_not_allowed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def not_allowed(*_: object, **__: object) -> None:
+        raise OSError(22, "A required privilege is not held by the client")
+
+    monkeypatch.setattr(Path, "symlink_to", not_allowed)
+    names, output = ("images", "mesh.ply"), tmp_path / "output"
+    for number in (1, 2):
+        with Workspace(tmp_path) as workspace:
+            workspace.link_outputs(result(tmp_path, number), names)
+        assert (output / "mesh.ply").read_text() == f"mesh {number}"
+        assert (output / "images/a.png").read_text() == f"picture {number}"
+    monkeypatch.undo()
+    workspace.link_outputs(result(tmp_path, 3), names[:1])
+    assert (output / "images").is_symlink() and not (output / "mesh.ply").is_symlink()
+    workspace.unlink_outputs(names)
+    assert not any(output.iterdir())
+
+
+def test_clean_takes_only_what_is_named_by_a_key(tmp_path: Path):
+    for name in ("train/images", f"train/{KEY}", f"train/{KEY}.partial", f"train/{KEY}.bad"):
+        (tmp_path / name).mkdir(parents=True)
+    stale = Workspace(tmp_path).stale_folders({}, ["train"])
+    assert [path.name for path in stale] == [KEY, f"{KEY}.bad", f"{KEY}.partial"]
+
+
+def test_files_are_synced_where_that_takes_the_right_to_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    fcntl = pytest.importorskip("fcntl", reason="the system itself asks for that right")
+
+    def fsync(descriptor: int) -> None:
+        """As on Windows."""
+        if stat.S_ISREG(os.fstat(descriptor).st_mode):
+            if fcntl.fcntl(descriptor, fcntl.F_GETFL) & os.O_ACCMODE == os.O_RDONLY:
+                raise OSError(errno.EBADF, "Bad file descriptor")
+            synced.append(descriptor)
+
+    synced = list[int]()
+    monkeypatch.setattr(os, "fsync", fsync)
+    workspace = Workspace(tmp_path)
+    partial, folder = workspace.partial("mesh", KEY), workspace.folder("mesh", KEY)
+    partial.mkdir(parents=True)
+    (partial / "mesh.ply").write_text("a mesh")
+    make_durable(partial)
+    outputs = describe_outputs(partial, ("mesh.ply",))
+    digest = outputs_digest(outputs)
+    workspace.finish(partial, folder, Manifest("mesh", 1, KEY, {}, {}, outputs, digest, {}, {}, "", 1.0, "now"))
+    assert len(synced) == 3, "the mesh twice, and the manifest"
+    assert workspace.finished("mesh", KEY, deep=True)
