@@ -276,9 +276,11 @@ class Runner:
         asked = digest({"version": module.VERSION, "options": options_for_key, "inputs": inputs} | time_given)
         plans = self.state["plans"].setdefault(stage, {})
         if asked in plans:
-            # Paths are taken as given now: the plan was made for equal content, wherever that lay then.
-            paths = {name for name, value in options if isinstance(value, Path)}
-            return module.Config.model_validate(plans[asked] | options.model_dump(include=paths))
+            # Taken as given now: paths, for the plan was made for equal content, wherever that lay then, and what is
+            # part of no key. But seconds stay: where they are open, a budget gave the plan its own.
+            now = {name for name, value in options if isinstance(value, Path)}
+            now |= {*getattr(module, "UNKEYED", ())} - {"seconds"}
+            return module.Config.model_validate(plans[asked] | options.model_dump(include=now))
         if not may_plan:
             raise NotReady(stage)
         self._check_inputs(stage, folders)
