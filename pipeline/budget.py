@@ -13,6 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from pipeline import heartbeat
+from pipeline.chain import ON_REQUEST
+from pipeline.settings import Settings
 from stages.amounts import duration
 from stages.contract import StageConfig
 from stages.device import processors
@@ -100,6 +102,11 @@ def takes_what_it_is_given(options: StageConfig) -> bool:
     """Whether nothing else says how long the stage works: neither seconds nor steps, nor those of ``--more``."""
     open_ended = getattr(options, "seconds", 0.0) is None
     return open_ended and all(getattr(options, name, None) is None for name in ("steps", "after"))
+
+
+def has_its_own_time(stage: str, settings: Settings) -> bool:
+    """Whether ``stage`` is charged to no run's budget: a study, and training that goes on (``--more``)."""
+    return stage in ON_REQUEST or (stage == "train" and settings.train.after is not None)
 
 
 class Budget:

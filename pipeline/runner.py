@@ -10,7 +10,7 @@ from types import ModuleType
 from typing import Any
 
 from pipeline import attempts, heartbeat, machine, manifests
-from pipeline.budget import Budget, reading_of, takes_what_it_is_given
+from pipeline.budget import Budget, has_its_own_time, reading_of, takes_what_it_is_given
 from pipeline.chain import ON_REQUEST, STAGES, needed_for
 from pipeline.display import Display
 from pipeline.failures import StageFailed, worded
@@ -294,8 +294,8 @@ class Runner:
         return config
 
     def _begin_work(self, stage: str) -> None:
-        """From here on ``stage`` costs time of the budget: nothing that was found finished does, and no study."""
-        if self.budget is None or self.works_on == stage or stage in ON_REQUEST:
+        """From here on ``stage`` costs time of the budget, which nothing does that was found finished."""
+        if self.budget is None or self.works_on == stage or has_its_own_time(stage, self.settings):
             return
         self.works_on = stage
         self.budget.continue_as(self._options_digest(), self._photos_digest())
@@ -321,7 +321,8 @@ class Runner:
             return options.model_copy(update={"seconds": pilots_seconds(self.settings, self.times, reading)})
         # An input that has to be made again is none of the stages that were asked for.
         order = list(STAGES)
-        to_come = {name: self.times.get(name) for name in self.stages if order.index(name) > order.index(stage)}
+        after = (name for name in self.stages if order.index(name) > order.index(stage))
+        to_come = {name: self.times.get(name) for name in after if not has_its_own_time(name, self.settings)}
         if stage == "train" and (why := self.budget.shortage(to_come, reading)):
             self.display.note(f"the budget cannot be kept: {why}")
         return options.model_copy(update={"seconds": self.budget.give(stage, to_come, reading)})

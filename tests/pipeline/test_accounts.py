@@ -92,6 +92,21 @@ def test_one_stage_does_not_end_an_interrupted_run(go: Go) -> None:
     assert 100 + alone.took + resumed.took < 300 + sum(LEAST_SECONDS.values())
 
 
+@pytest.mark.parametrize("alone", [True, False])
+def test_more_is_charged_to_no_budget_also_after_a_kill(go: Go, alone: bool) -> None:
+    machine, more = Machine(), {"after": "there", "seconds": 600.0}
+    go(machine, 300.0)
+    stages = ("ingest", "sfm", "normalise", "effects", "train", "report")
+    machine.killed_at = [machine.now + 500]
+    with pytest.raises(Killed):
+        go(machine, None, resume=True, alone=alone, stages=stages, train=more)
+    resumed = go(machine, None, resume=True, train=more)
+    assert resumed.budget is not None
+    account = resumed.budget.account()
+    assert set(account["promised"]) == set(account["spent"]) == {"evaluate", "render", "mesh"}
+    assert all(seconds > 0.3 * 300 for seconds in account["promised"].values())
+
+
 def test_what_planning_takes_is_part_of_the_time_of_a_stage(go: Go, tmp_path: Path) -> None:
     runner = go(Machine(), 300.0)
     for stage in ("evaluate", "render", "mesh"):

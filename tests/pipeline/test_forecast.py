@@ -204,7 +204,13 @@ def test_a_training_that_ends_by_itself_is_not_promised_within_the_workspaces_bu
     assert promise(120.0, done=BEFORE_TRAINING, names=names, train=train) == words
 
 
-def test_more_is_part_of_what_a_budget_is_expected_to_pay_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_follows_more_is_promised_by_the_budget_and_more_beside_it(promise: Promise) -> None:
+    given: dict[str, Any] = {"train": {"after": "there", "more_seconds": 600.0}, "done": BEFORE_TRAINING}
+    end = time.strftime("%H:%M", time.localtime(NOW + 606 + 300))
+    assert promise(300.0, **given) == [f"budget 5 min and 10 min beside it, done at {end} at the latest"]
+
+
+def test_more_takes_what_was_asked_for_and_what_comes_beside_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(forecast, "processors", lambda: 2)
     given = {"train": {"after": "there", "more_seconds": 600.0, "seconds": 30.0}}
     assert expected(Settings.model_validate(given), Photos(50, 0.75))["train"] == pytest.approx(604.75)
