@@ -3,51 +3,25 @@
 import shutil
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
-from pipeline import attempts, heartbeat, machine, manifests
-from pipeline.budget import Budget, has_its_own_time, reading_of, takes_what_it_is_given
+from pipeline import machine, manifests
+from pipeline.budget import ALIVE, Budget, has_its_own_time, reading_of, takes_what_it_is_given
 from pipeline.chain import ON_REQUEST, STAGES, needed_for
 from pipeline.display import Display
 from pipeline.failures import StageFailed, worded
 from pipeline.forecast import pilots_seconds, reckoned_with
+from pipeline.job import DamagedInputs, Job, NotReady
 from pipeline.keys import ContentIndex, config_for_key, digest, stage_key
 from pipeline.manifests import BadManifest, Manifest
 from pipeline.settings import Settings
 from pipeline.workspace import Workspace
 from stages.contract import StageConfig, StageError
+from stages.stopwatch import counted, keep, kept
 
-
-class DamagedInputs(Exception):
-    """A stage was about to read files that are not what was written; they have been set aside."""
-
-
-class NotReady(Exception):
-    """A stage's key cannot be known yet: ``upstream`` (or the stage itself) has no current result or plan."""
-
-    def __init__(self, upstream: str) -> None:
-        super().__init__(upstream)
-        self.upstream = upstream
-
-
-@dataclass(frozen=True)
-class Job:
-    """One stage with everything that decides its key."""
-
-    stage: str
-    config: StageConfig
-    key_config: dict[str, Any]
-    inputs: dict[str, str]  # upstream stage -> outputs digest
-    folders: dict[str, Path]  # upstream stage -> finished folder
-    key: str
-
-    @property
-    def module(self) -> ModuleType:
-        return STAGES[self.stage]
+ATTEMPTS = "attempts.json"  # in a partial folder: seconds of all attempts at the stage, planning included
 
 
 class Runner:
@@ -251,7 +225,7 @@ class Runner:
         config = self._planned(stage, inputs, folders, may_plan)
         key_config = self._config_for_key(stage, config)
         key = stage_key(stage, module.VERSION, key_config, inputs)
-        return Job(stage, config, key_config, inputs, folders, key)
+        return Job(stage, module, config, key_config, inputs, folders, key)
 
     def _upstream(self, name: str, stage: str) -> Manifest | None:
         """The current result of ``name``. Only "report" does without: it takes what is there, as OPTIONAL does."""
@@ -286,7 +260,7 @@ class Runner:
         self._check_inputs(stage, folders)
         self._begin_work(stage)
         clock = time.monotonic()
-        with heartbeat.beating(self.workspace.root / heartbeat.NAME):
+        with counted(self.workspace.root / ALIVE):
             config = module.plan(self._with_time(stage, options), folders, self.display)
         self.planning[stage] = time.monotonic() - clock
         plans[asked] = config.model_dump(mode="json")
@@ -299,6 +273,7 @@ class Runner:
             return
         self.works_on = stage
         self.budget.continue_as(self._options_digest(), self._photos_digest())
+        (self.workspace.root / ALIVE).unlink(missing_ok=True)
         self.budget.begin(stage)
         if (seconds := self.times.get(stage)) is not None:
             self.budget.promise(stage, seconds)
@@ -365,16 +340,16 @@ class Runner:
         if job.stage not in self.force and (manifest := self.workspace.complete(partial, folder, job.key)):
             return manifest
         self._begin_work(job.stage)
-        spent = attempts.spent(partial) + self.planning.pop(job.stage, 0.0)
+        before = kept(partial / ATTEMPTS) + self.planning.pop(job.stage, 0.0)
         if partial.exists() and not (job.module.RESUMES and job.stage not in self.force):
             shutil.rmtree(partial)
         partial.mkdir(parents=True, exist_ok=True)
-        attempts.begin(partial, spent)
+        keep(partial / ATTEMPTS, before)
         self.workspace.write_run(self.state)
         load()  # which changes how signals are handled; once it is over, they are ours again
-        started, clock = datetime.now(UTC), time.monotonic()
+        started = datetime.now(UTC)
         self.at_work = job.stage
-        with heartbeat.beating(partial / attempts.NAME):
+        with counted(self.workspace.root / ALIVE), counted(partial / ATTEMPTS) as spent:
             result = job.module.run(job.config, job.folders, partial, self.display)
         outputs = manifests.describe_outputs(partial, result.outputs)
         manifest = Manifest(
@@ -388,7 +363,7 @@ class Runner:
             records=manifests.describe_outputs(partial, result.records),
             facts=result.facts,
             line=result.line,
-            seconds=round(spent + time.monotonic() - clock, 3),
+            seconds=round(spent(), 3),
             expected=None if (expected := self.times.get(job.stage)) is None else round(expected, 1),
             started=started.isoformat(timespec="seconds"),
             machine=machine.facts(),
