@@ -16,6 +16,7 @@ from pipeline.budget import (
     reading_seconds,
     takes_what_it_is_given,
 )
+from pipeline.chain import ON_REQUEST
 from pipeline.manifests import BadManifest
 from pipeline.settings import Settings
 from stages.amounts import duration, rough_duration
@@ -166,7 +167,7 @@ def foretell(runner: "Runner", stages: Sequence[str], force: frozenset[str], pho
     if photos is None:
         return Forecast([], {})
     train, times, reading = runner.settings.train, expected(runner.settings, photos), photos.reading(processors())
-    left = [name for name in stages if name in times and (name in force or runner.found(name) is None)]
+    left = [name for name in stages if name in force or runner.found(name) is None]
     trains = "train" in left
     apart = [name for name in left if has_its_own_time(name, runner.settings)]
     budget = None if apart and set(left) <= {*apart, "report"} else runner.budget
@@ -175,7 +176,8 @@ def foretell(runner: "Runner", stages: Sequence[str], force: frozenset[str], pho
         times = without_budget(train, times, reading, trained_in_all(runner, trains) if unknown else None)
     if set(left) <= {"report"} or (trains and counts_steps(train)):
         return Forecast([], times)
-    of_left = {name: times[name] for name in left}
+    studies = {name: getattr(runner.settings, name).seconds for name in ON_REQUEST}  # words alone: no run pays for them
+    of_left = {name: seconds for name, seconds in {**times, **studies}.items() if name in left}
     if budget is not None:
         beside = sum(of_left.pop(name) or 0.0 for name in apart)
         return Forecast([in_words(budget.total, runner.time_left(budget), of_left, reading, beside)], times)

@@ -39,6 +39,7 @@ class Runner:
         self.planning: dict[str, float] = {}  # seconds that it took, where it was done by this program
         self.apart: dict[str, Any] | None = None  # the account of a stage alone, after a whole run that has its own
         self.works_on: str | None = None
+        self.started: dict[str, float] = {}  # when each stage did, later by what an input cost that was made again
         self.photos: str | None = None  # their digest: they are listed once
         self.checked: set[str] = set()  # stages whose files were written or read anew by this program
         self.at_work = ""
@@ -142,7 +143,7 @@ class Runner:
                 self.workspace.unlink_outputs(module.LINKS)
 
     def _bring_up_to_date(self, stage: str) -> bool:
-        started = time.monotonic()
+        self.started[stage] = time.monotonic()
         self.display.begin(stage)
         try:
             with worded(stage):
@@ -151,9 +152,9 @@ class Runner:
                 self.workspace.write_run(self.state)
                 self.index.save()
         finally:
-            self._end_work(stage, time.monotonic() - started)
+            self._end_work(stage)
         self.done[stage] = manifest
-        self.display.end(stage, manifest.line, time.monotonic() - started, cached=not ran)
+        self.display.end(stage, manifest.line, time.monotonic() - self.started[stage], cached=not ran)
         return ran
 
     def _found_or_made(self, stage: str) -> tuple[Job, Manifest, bool]:
@@ -201,11 +202,13 @@ class Runner:
     def _make_inputs_again(self, stage: str) -> None:
         """Bring everything below ``stage`` up to date once more; what lies above the damage may change with it."""
         needed = {name for above in STAGES[stage].NEEDS if above in self.done for name in needed_for(above, STAGES)}
+        clock = time.monotonic()
         self.done.clear()
         self.photos = None  # perhaps hours after they were listed
         for name in STAGES:
             if name in needed:
                 self._bring_up_to_date(name)
+        self.started[stage] += time.monotonic() - clock  # each has its own account
         self.display.begin(stage)
 
     def resolve(self, stage: str, *, may_plan: bool = True) -> Job:
@@ -271,6 +274,8 @@ class Runner:
         """From here on ``stage`` costs time of the budget, which nothing does that was found finished."""
         if self.budget is None or self.works_on == stage or has_its_own_time(stage, self.settings):
             return
+        if stage == "report" and self.budget.over:  # it shows that account, and would be out of date with another
+            return
         self.works_on = stage
         self.budget.continue_as(self._options_digest(), self._photos_digest())
         (self.workspace.root / ALIVE).unlink(missing_ok=True)
@@ -279,10 +284,10 @@ class Runner:
             self.budget.promise(stage, seconds)
         self.workspace.write_run(self.state)
 
-    def _end_work(self, stage: str, seconds: float) -> None:
+    def _end_work(self, stage: str) -> None:
         """Note what ``stage`` cost, where it did."""
         if self.budget and self.works_on == stage:
-            self.budget.end(stage, seconds)
+            self.budget.end(stage, time.monotonic() - self.started[stage])
             self.works_on = None
             self.workspace.write_run(self.state)
 
