@@ -239,6 +239,10 @@ class Runner:
             except (NotReady, FileNotFoundError, BadManifest):
                 if stage != "report":
                     raise NotReady(name) from None
+            except StageError:  # a file that a setting names is gone: the stage says so where it runs
+                rest_on_it = any(name in module.NEEDS for later, module in STAGES.items() if later != "report")
+                if stage != "report" or rest_on_it:
+                    raise
         return self.done.get(name)
 
     def _planned(self, stage: str, inputs: dict[str, str], folders: dict[str, Path], may_plan: bool) -> StageConfig:
