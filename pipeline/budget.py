@@ -7,16 +7,17 @@ that the rest is fitted around; training gets most of what is left.
 """
 
 import math
-import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pipeline import heartbeat
+from pipeline.chain import ON_REQUEST
+from pipeline.settings import Settings
 from stages.amounts import duration
 from stages.contract import StageConfig
 from stages.device import processors
 from stages.photos import read_photos
+from stages.stopwatch import kept
 
 # Of the time that is left once what cannot be planned has its own. A user waits for the field; figures, a video and a
 # mesh are there to see it by, and gain little beyond MOST_SECONDS. A training of less than half a minute is worth none.
@@ -35,6 +36,7 @@ STARTING, BESIDE_STEPS = 4.0, 0.02
 # Seconds that a core takes to decode a million pixels and to shrink or examine them. Decoding alone takes 0.01 to 0.02
 # for JPEG, 0.03 for PNG (fox, banana, fountain_p11), all of stage ingest 0.03; large photos take longer.
 READING = 0.04
+ALIVE = ".alive"  # in the workspace: what the stage at work has cost so far (stages/stopwatch.py)
 
 
 def reading_seconds(megapixels: float, cores: int) -> float:
@@ -102,11 +104,16 @@ def takes_what_it_is_given(options: StageConfig) -> bool:
     return open_ended and all(getattr(options, name, None) is None for name in ("steps", "after"))
 
 
+def has_its_own_time(stage: str, settings: Settings) -> bool:
+    """Whether ``stage`` is charged to no run's budget: a study, and training that goes on (``--more``)."""
+    return stage in ON_REQUEST or (stage == "train" and settings.train.after is not None)
+
+
 class Budget:
     """The budget of a run as run.json keeps it: ``total`` seconds, and of each stage what was promised and spent.
 
     ``spent`` counts every attempt of the present run, also those that were killed, as far as their last sign of life
-    (pipeline/heartbeat.py); what is found finished costs nothing. Once a run is over, well or not, the next one that
+    (ALIVE); what is found finished costs nothing. Once a run is over, well or not, the next one that
     finds work to do begins a new account; so does one with other options or photos.
     """
 
@@ -152,7 +159,7 @@ class Budget:
 
     def begin(self, stage: str) -> None:
         """Note that work on ``stage`` has begun now."""
-        self.state["running"] = {"stage": stage, "began": time.time()}
+        self.state["running"] = {"stage": stage}
 
     def promise(self, stage: str, seconds: float) -> None:
         """Note what ``stage`` is given, or expected to take; the first word counts, later attempts go on under it."""
@@ -180,11 +187,8 @@ class Budget:
 
     def recover(self, root: Path) -> None:
         """Count an attempt that was killed: until its last sign of life in the workspace ``root``."""
-        running = self.state["running"]
-        if running is not None:
-            files = (*(root / running["stage"]).rglob("*"), *root.glob(heartbeat.NAME))
-            last = max((path.lstat().st_mtime for path in files), default=0.0)
-            self.end(running["stage"], max(0.0, last - running["began"]))
+        if (running := self.state["running"]) is not None:
+            self.end(running["stage"], kept(root / ALIVE))
 
     def close(self) -> None:
         """The run has come to its end: what is done from now on is another one."""

@@ -26,6 +26,7 @@ from pipeline.runner import Runner
 from pipeline.settings import (
     Settings,
     UsageError,
+    check_workspace,
     default_workspace,
     read_toml,
     settings_from,
@@ -144,6 +145,7 @@ def command_run(words: Sequence[str]) -> int:
         from_file = settings_from(file, f"--config {given.config}")
         given = words_of.parse(words_of.RunArguments, "run", words, from_file)
     root, cameras = given.output or default_workspace(given.photos), given.cameras
+    check_workspace(root, given.photos)
     if given.more is not None:
         recorded = _recorded_settings(Workspace.existing(root))
         given = words_of.parse(words_of.RunArguments, "run", words, recorded)

@@ -35,15 +35,18 @@ def photograph(folder: Path, progress: Progress) -> tuple[str, float]:
     """Write the demo's photos into ``folder`` and truth.json beside it, unless they are there already.
 
     Returns a line for the user and the seconds it took, 0 if nothing was to be done. Raises StageError if the
-    folder holds anything else.
+    folder holds anything else, or cannot be written.
     """
     truth = demo_truth(LENS, PHOTOS, SEED)
     line = f"{PHOTOS} photos {LENS.width}×{LENS.height} of a still life, every camera and surface known"
-    _refuse_strangers(folder, truth)
-    if _is_done(folder, truth):
-        return line, 0.0
-    started = time.monotonic()
-    write_photos(folder, truth, progress)
+    try:
+        _refuse_strangers(folder, truth)
+        if _is_done(folder, truth):
+            return line, 0.0
+        started = time.monotonic()
+        write_photos(folder, truth, progress)
+    except OSError as error:
+        raise _cannot_write(folder, error.strerror or str(error), "a folder with room that you may write to") from error
     return line, time.monotonic() - started
 
 
@@ -122,8 +125,8 @@ def _is_done(folder: Path, truth: Truth) -> bool:
 def _refuse_strangers(folder: Path, truth: Truth) -> None:
     others = sorted(p.name for p in folder.iterdir() if p.name not in truth.poses) if folder.is_dir() else []
     if others:
-        raise StageError(
-            f"cannot write the demo's photos to {folder}",
-            f"it holds {others[0]}, which is not one of them",
-            "Give an empty folder: pipeline demo -o FOLDER",
-        )
+        raise _cannot_write(folder, f"it holds {others[0]}, which is not one of them", "an empty folder")
+
+
+def _cannot_write(folder: Path, why: str, better: str) -> StageError:
+    return StageError(f"cannot write the demo's photos to {folder}", why, f"Give {better}: pipeline demo -o FOLDER")

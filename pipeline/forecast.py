@@ -10,11 +10,13 @@ from pipeline.budget import (
     STARTING,
     Budget,
     for_pilots,
+    has_its_own_time,
     least_total,
     most_total,
     reading_seconds,
     takes_what_it_is_given,
 )
+from pipeline.chain import ON_REQUEST
 from pipeline.manifests import BadManifest
 from pipeline.settings import Settings
 from stages.amounts import duration, rough_duration
@@ -165,36 +167,40 @@ def foretell(runner: "Runner", stages: Sequence[str], force: frozenset[str], pho
     if photos is None:
         return Forecast([], {})
     train, times, reading = runner.settings.train, expected(runner.settings, photos), photos.reading(processors())
-    left = [name for name in stages if name in times and (name in force or runner.found(name) is None)]
+    left = [name for name in stages if name in force or runner.found(name) is None]
     trains = "train" in left
-    more_alone = train.after is not None and trains and set(left) <= {"train", "report"}
-    budget = None if more_alone else runner.budget
+    apart = [name for name in left if has_its_own_time(name, runner.settings)]
+    budget = None if apart and set(left) <= {*apart, "report"} else runner.budget
     if budget is None:
         unknown = None in (times[name] for name in stages if name in times)
         times = without_budget(train, times, reading, trained_in_all(runner, trains) if unknown else None)
     if set(left) <= {"report"} or (trains and counts_steps(train)):
         return Forecast([], times)
-    of_left = {name: times[name] for name in left}
+    studies = {name: getattr(runner.settings, name).seconds for name in ON_REQUEST}  # words alone: no run pays for them
+    of_left = {name: seconds for name, seconds in {**times, **studies}.items() if name in left}
     if budget is not None:
-        return Forecast([in_words(budget.total, runner.time_left(budget), of_left, reading)], times)
+        beside = sum(of_left.pop(name) or 0.0 for name in apart)
+        return Forecast([in_words(budget.total, runner.time_left(budget), of_left, reading, beside)], times)
     known = [seconds for seconds in of_left.values() if seconds is not None]
     words = f"done in about {rough_duration(sum(known))}, about {_clock(sum(known))}"
     return Forecast([words] if len(known) == len(left) else [], times)
 
 
-def in_words(total: float, left: float, times: Mapping[str, float | None], reading: float) -> str:
-    """The promise of a budget of ``total`` seconds, ``left`` of them not spent; ``times`` of what has to run."""
+def in_words(total: float, left: float, times: Mapping[str, float | None], reading: float, beside: float = 0.0) -> str:
+    """The promise of a budget of ``total`` seconds, ``left`` of them not spent; ``times`` of what has to run by it, and
+    ``beside`` it the seconds of what has a time of its own."""
     least, most = least_total(times, reading), most_total(times, total)
+    given = f"budget {duration(total)}" + (f" and {rough_duration(beside)} beside it" if beside else "")
     if least > left and left < total:
         needed = f"about {rough_duration(least)} is needed: give a larger --budget, or all is made as small as can be"
-        return f"budget {duration(total)}, {duration(max(0.0, left))} of it left by what was spent before; {needed}"
+        return f"{given}, {duration(max(0.0, left))} of it left by what was spent before; {needed}"
     if least > left:
         soonest = f"about {rough_duration(least)} is the least that would do"
-        return f"budget {duration(total)}, too short for these photos: {soonest}; all is made as small as can be"
-    finish = _clock(min(left, most))
+        return f"{given}, too short for these photos: {soonest}; all is made as small as can be"
+    finish = _clock(min(left, most) + beside)
     # Only training takes all that there is; the rest may well be done sooner.
     trains = times.get("train", 0.0) is None
-    return f"budget {duration(total)}, done at {f'about {finish}' if trains else f'{finish} at the latest'}"
+    return f"{given}, done at {f'about {finish}' if trains else f'{finish} at the latest'}"
 
 
 def _clock(seconds: float) -> str:

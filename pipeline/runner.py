@@ -3,51 +3,25 @@
 import shutil
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
-from pipeline import attempts, heartbeat, machine, manifests
-from pipeline.budget import Budget, reading_of, takes_what_it_is_given
+from pipeline import machine, manifests
+from pipeline.budget import ALIVE, Budget, has_its_own_time, reading_of, takes_what_it_is_given
 from pipeline.chain import ON_REQUEST, STAGES, needed_for
 from pipeline.display import Display
 from pipeline.failures import StageFailed, worded
 from pipeline.forecast import pilots_seconds, reckoned_with
+from pipeline.job import DamagedInputs, Job, NotReady
 from pipeline.keys import ContentIndex, config_for_key, digest, stage_key
 from pipeline.manifests import BadManifest, Manifest
 from pipeline.settings import Settings
 from pipeline.workspace import Workspace
 from stages.contract import StageConfig, StageError
+from stages.stopwatch import counted, keep, kept
 
-
-class DamagedInputs(Exception):
-    """A stage was about to read files that are not what was written; they have been set aside."""
-
-
-class NotReady(Exception):
-    """A stage's key cannot be known yet: ``upstream`` (or the stage itself) has no current result or plan."""
-
-    def __init__(self, upstream: str) -> None:
-        super().__init__(upstream)
-        self.upstream = upstream
-
-
-@dataclass(frozen=True)
-class Job:
-    """One stage with everything that decides its key."""
-
-    stage: str
-    config: StageConfig
-    key_config: dict[str, Any]
-    inputs: dict[str, str]  # upstream stage -> outputs digest
-    folders: dict[str, Path]  # upstream stage -> finished folder
-    key: str
-
-    @property
-    def module(self) -> ModuleType:
-        return STAGES[self.stage]
+ATTEMPTS = "attempts.json"  # in a partial folder: seconds of all attempts at the stage, planning included
 
 
 class Runner:
@@ -65,6 +39,7 @@ class Runner:
         self.planning: dict[str, float] = {}  # seconds that it took, where it was done by this program
         self.apart: dict[str, Any] | None = None  # the account of a stage alone, after a whole run that has its own
         self.works_on: str | None = None
+        self.started: dict[str, float] = {}  # when each stage did, later by what an input cost that was made again
         self.photos: str | None = None  # their digest: they are listed once
         self.checked: set[str] = set()  # stages whose files were written or read anew by this program
         self.at_work = ""
@@ -168,7 +143,7 @@ class Runner:
                 self.workspace.unlink_outputs(module.LINKS)
 
     def _bring_up_to_date(self, stage: str) -> bool:
-        started = time.monotonic()
+        self.started[stage] = time.monotonic()
         self.display.begin(stage)
         try:
             with worded(stage):
@@ -177,9 +152,9 @@ class Runner:
                 self.workspace.write_run(self.state)
                 self.index.save()
         finally:
-            self._end_work(stage, time.monotonic() - started)
+            self._end_work(stage)
         self.done[stage] = manifest
-        self.display.end(stage, manifest.line, time.monotonic() - started, cached=not ran)
+        self.display.end(stage, manifest.line, time.monotonic() - self.started[stage], cached=not ran)
         return ran
 
     def _found_or_made(self, stage: str) -> tuple[Job, Manifest, bool]:
@@ -227,11 +202,13 @@ class Runner:
     def _make_inputs_again(self, stage: str) -> None:
         """Bring everything below ``stage`` up to date once more; what lies above the damage may change with it."""
         needed = {name for above in STAGES[stage].NEEDS if above in self.done for name in needed_for(above, STAGES)}
+        clock = time.monotonic()
         self.done.clear()
         self.photos = None  # perhaps hours after they were listed
         for name in STAGES:
             if name in needed:
                 self._bring_up_to_date(name)
+        self.started[stage] += time.monotonic() - clock  # each has its own account
         self.display.begin(stage)
 
     def resolve(self, stage: str, *, may_plan: bool = True) -> Job:
@@ -251,7 +228,7 @@ class Runner:
         config = self._planned(stage, inputs, folders, may_plan)
         key_config = self._config_for_key(stage, config)
         key = stage_key(stage, module.VERSION, key_config, inputs)
-        return Job(stage, config, key_config, inputs, folders, key)
+        return Job(stage, module, config, key_config, inputs, folders, key)
 
     def _upstream(self, name: str, stage: str) -> Manifest | None:
         """The current result of ``name``. Only "report" does without: it takes what is there, as OPTIONAL does."""
@@ -262,6 +239,10 @@ class Runner:
             except (NotReady, FileNotFoundError, BadManifest):
                 if stage != "report":
                     raise NotReady(name) from None
+            except StageError:  # a file that a setting names is gone: the stage says so where it runs
+                rest_on_it = any(name in module.NEEDS for later, module in STAGES.items() if later != "report")
+                if stage != "report" or rest_on_it:
+                    raise
         return self.done.get(name)
 
     def _planned(self, stage: str, inputs: dict[str, str], folders: dict[str, Path], may_plan: bool) -> StageConfig:
@@ -276,15 +257,17 @@ class Runner:
         asked = digest({"version": module.VERSION, "options": options_for_key, "inputs": inputs} | time_given)
         plans = self.state["plans"].setdefault(stage, {})
         if asked in plans:
-            # Paths are taken as given now: the plan was made for equal content, wherever that lay then.
-            paths = {name for name, value in options if isinstance(value, Path)}
-            return module.Config.model_validate(plans[asked] | options.model_dump(include=paths))
+            # Taken as given now: paths, for the plan was made for equal content, wherever that lay then, and what is
+            # part of no key. But seconds stay: where they are open, a budget gave the plan its own.
+            now = {name for name, value in options if isinstance(value, Path)}
+            now |= {*getattr(module, "UNKEYED", ())} - {"seconds"}
+            return module.Config.model_validate(plans[asked] | options.model_dump(include=now))
         if not may_plan:
             raise NotReady(stage)
         self._check_inputs(stage, folders)
         self._begin_work(stage)
         clock = time.monotonic()
-        with heartbeat.beating(self.workspace.root / heartbeat.NAME):
+        with counted(self.workspace.root / ALIVE):
             config = module.plan(self._with_time(stage, options), folders, self.display)
         self.planning[stage] = time.monotonic() - clock
         plans[asked] = config.model_dump(mode="json")
@@ -292,20 +275,23 @@ class Runner:
         return config
 
     def _begin_work(self, stage: str) -> None:
-        """From here on ``stage`` costs time of the budget: nothing that was found finished does, and no study."""
-        if self.budget is None or self.works_on == stage or stage in ON_REQUEST:
+        """From here on ``stage`` costs time of the budget, which nothing does that was found finished."""
+        if self.budget is None or self.works_on == stage or has_its_own_time(stage, self.settings):
+            return
+        if stage == "report" and self.budget.over:  # it shows that account, and would be out of date with another
             return
         self.works_on = stage
         self.budget.continue_as(self._options_digest(), self._photos_digest())
+        (self.workspace.root / ALIVE).unlink(missing_ok=True)
         self.budget.begin(stage)
         if (seconds := self.times.get(stage)) is not None:
             self.budget.promise(stage, seconds)
         self.workspace.write_run(self.state)
 
-    def _end_work(self, stage: str, seconds: float) -> None:
+    def _end_work(self, stage: str) -> None:
         """Note what ``stage`` cost, where it did."""
         if self.budget and self.works_on == stage:
-            self.budget.end(stage, seconds)
+            self.budget.end(stage, time.monotonic() - self.started[stage])
             self.works_on = None
             self.workspace.write_run(self.state)
 
@@ -319,7 +305,8 @@ class Runner:
             return options.model_copy(update={"seconds": pilots_seconds(self.settings, self.times, reading)})
         # An input that has to be made again is none of the stages that were asked for.
         order = list(STAGES)
-        to_come = {name: self.times.get(name) for name in self.stages if order.index(name) > order.index(stage)}
+        after = (name for name in self.stages if order.index(name) > order.index(stage))
+        to_come = {name: self.times.get(name) for name in after if not has_its_own_time(name, self.settings)}
         if stage == "train" and (why := self.budget.shortage(to_come, reading)):
             self.display.note(f"the budget cannot be kept: {why}")
         return options.model_copy(update={"seconds": self.budget.give(stage, to_come, reading)})
@@ -362,16 +349,16 @@ class Runner:
         if job.stage not in self.force and (manifest := self.workspace.complete(partial, folder, job.key)):
             return manifest
         self._begin_work(job.stage)
-        spent = attempts.spent(partial) + self.planning.pop(job.stage, 0.0)
+        before = kept(partial / ATTEMPTS) + self.planning.pop(job.stage, 0.0)
         if partial.exists() and not (job.module.RESUMES and job.stage not in self.force):
             shutil.rmtree(partial)
         partial.mkdir(parents=True, exist_ok=True)
-        attempts.begin(partial, spent)
+        keep(partial / ATTEMPTS, before)
         self.workspace.write_run(self.state)
         load()  # which changes how signals are handled; once it is over, they are ours again
-        started, clock = datetime.now(UTC), time.monotonic()
+        started = datetime.now(UTC)
         self.at_work = job.stage
-        with heartbeat.beating(partial / attempts.NAME):
+        with counted(self.workspace.root / ALIVE), counted(partial / ATTEMPTS) as spent:
             result = job.module.run(job.config, job.folders, partial, self.display)
         outputs = manifests.describe_outputs(partial, result.outputs)
         manifest = Manifest(
@@ -385,7 +372,7 @@ class Runner:
             records=manifests.describe_outputs(partial, result.records),
             facts=result.facts,
             line=result.line,
-            seconds=round(spent + time.monotonic() - clock, 3),
+            seconds=round(spent(), 3),
             expected=None if (expected := self.times.get(job.stage)) is None else round(expected, 1),
             started=started.isoformat(timespec="seconds"),
             machine=machine.facts(),

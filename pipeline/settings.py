@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, get_args
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+from pipeline.workspace import RUN_FILE
 from stages.contract import StageError, bounded
 from stages.effects import Config as EffectsConfig
 from stages.evaluate import Config as EvaluateConfig
@@ -121,6 +122,14 @@ def with_source(settings: Settings, photos: Path, cameras: Path | None) -> Setti
             "sfm": settings.sfm.model_copy(update={"cameras": imported}),
         }
     )
+
+
+def check_workspace(root: Path, photos: Path) -> None:
+    """Raises UsageError where the workspace would lie right among the photos: what a run writes is none of them."""
+    places = [place for place in (photos, photos / "images") if not (place / RUN_FILE).is_file()]
+    if photos.is_dir() and os.path.realpath(root) in map(os.path.realpath, places):
+        better = f"leave -o out, which writes to {default_workspace(photos)}, or name another"
+        raise UsageError(f"-o {root}: that is a folder of photos; {better}")
 
 
 def default_workspace(photos: Path) -> Path:

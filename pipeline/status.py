@@ -5,8 +5,9 @@ from typing import Any
 
 from pipeline import manifests
 from pipeline.chain import ON_REQUEST, STAGES
+from pipeline.job import Job, NotReady
 from pipeline.manifests import BadManifest, Manifest
-from pipeline.runner import Job, NotReady, Runner
+from pipeline.runner import Runner
 from pipeline.workspace import Workspace
 from stages.contract import KEY_LENGTH, StageError
 

@@ -112,7 +112,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
         StageError: without held-out photos, where not one arm could be scored, or where one could not be trained for
             want of memory or disk.
     """
-    from stages.tradeoff_clock import counted
+    from stages.stopwatch import counted
     from stages.tradeoff_own import own_field
     from stages.tradeoff_trial import make_exam
 

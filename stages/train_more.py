@@ -29,6 +29,11 @@ def training_name(key: str, outputs_digest: str) -> str:
     return f"{key[:KEY_LENGTH]}/{outputs_digest[:KEY_LENGTH]}"
 
 
+def cannot_go_on(why: str) -> StageError:
+    """The error for a finished training whose last state is of no use here."""
+    return StageError("training cannot go on", why, "Train anew, for longer, without --more.")
+
+
 def earlier_training(name: str, inputs: Inputs) -> Path:
     """The folder of a finished training in the workspace of ``inputs``.
 

@@ -26,6 +26,7 @@ from stages.contract import Progress, StageError
 from stages.examination import Lost, is_suspicious, not_finite, symptom_of
 from stages.files import read_json, write_durably
 from stages.live_line import live_line
+from stages.train_more import cannot_go_on
 from stages.training_parts import observed
 from stages.training_state import Pace, Probes, RunState, TrainingBudget, checkpoint_interval, lost_seconds
 from stages.training_words import going_on_words, live_words, lost_words, reached_before_words, steering_words
@@ -119,13 +120,13 @@ class TrainingRun:
         """Start from the end of the finished run in ``folder``, at the rate that the longer run would have there."""
         checkpoint = latest_checkpoint(folder / "checkpoints", self.progress.note, remove=False)
         if checkpoint is None:
-            why = f"the last state of the training in {folder} cannot be read"
-            raise StageError("training cannot go on", why, "Train anew, for longer, without --more.")
+            raise cannot_go_on(f"the last state of the training in {folder} cannot be read")
         try:
             self._load(checkpoint, folder / "plan.json")
-        except RuntimeError as error:
-            why = f"the training in {folder} is of another version of this program: {error}"
-            raise StageError("training cannot go on", why, "Train anew, for longer, without --more.") from error
+        except (RuntimeError, TypeError) as error:
+            raise cannot_go_on(f"the training in {folder} is of another version of this program: {error}") from error
+        if self.state.step < self.plan.total_steps:
+            raise cannot_go_on(f"the last state of the training in {folder} cannot be read, only an earlier one")
         self.state.steps_before, self.state.seconds_before = step, seconds = self.state.step, self.state.seconds
         self.state.validation_before = self.state.validation_psnr
         steps, self.clock_budget = self._limits()

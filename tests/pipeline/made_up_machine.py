@@ -1,6 +1,5 @@
 """A whole chain of stages on a machine whose clock and speed are made up, for budgets."""
 
-import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,12 +12,11 @@ from pydantic import BaseModel
 
 from pipeline.budget import SHARES, Budget, reading_seconds
 from pipeline.display import SilentDisplay
-from pipeline.heartbeat import BEAT
 from pipeline.runner import Runner
 from pipeline.workspace import RUN_FILE, Workspace
 from stages.contract import StageConfig, StageError, StageResult
 from stages.device import processors
-from stages.files import write_json
+from stages.files import write_durably, write_json
 from stages.photos import Photo, write_photos
 
 CHAIN = ("ingest", "sfm", "normalise", "effects", "train", "evaluate", "render", "mesh", "report")
@@ -63,37 +61,36 @@ class Machine:
         self.planning = 0.5  # seconds that a plan takes
         self.killed_planning = ""  # the stage that is killed 15 seconds after its planning began
         self.root = Path()  # the workspace
-        self.alive: Path | None = None  # what is touched while a stage is at work
-        self.next_beat = 0.0
+        self.beats = dict[Callable[[], object], tuple[float, float]]()  # what is done every so often, and when next
+        self.dead = False
 
     def work(self, seconds: float) -> None:
-        """Let time pass, in quarters. A kill leaves what is on the disk, each file with the time of its writing."""
-        self.date_files()
+        """Let time pass, in quarters. A kill leaves what is on the disk."""
         for _ in range(round(4 * seconds)):
             self.now += 0.25 * self.slowness * (2 if self.now >= self.halves_at else 1)
             if self.killed_at and self.now >= self.killed_at[0]:
                 self.killed_at.pop(0)
+                self.dead = True
                 raise Killed((self.root / RUN_FILE).read_bytes())
-            if self.alive is not None and self.now >= self.next_beat:
-                self.next_beat = self.now + BEAT
-                self.alive.touch()
-                self.date_files()
-
-    def date_files(self) -> None:
-        """Whatever was written since the clock last moved was written now, by this machine's clock."""
-        for path in self.root.rglob("*"):
-            if path.lstat().st_mtime > REAL_TIMES:
-                os.utime(path, (self.now, self.now), follow_symlinks=False)
+            for act, (every, due) in list(self.beats.items()):
+                if self.now >= due:
+                    self.beats[act] = every, self.now + every
+                    act()
 
     @contextmanager
-    def beating(self, file: Path) -> Iterator[None]:
-        """pipeline/heartbeat.py, by this machine's clock."""
-        self.alive, self.next_beat = file, self.now + BEAT
-        yield
-        self.alive = None
+    def periodically(self, seconds: float, act: Callable[[], object]) -> Iterator[None]:
+        """stages/periodically.py, by this machine's clock."""
+        self.beats[act] = seconds, self.now + seconds
+        try:
+            yield
+        finally:
+            del self.beats[act]
 
-
-REAL_TIMES = 1e9  # later than any time on a machine that is made up
+    def write_durably(self, path: Path, content: bytes) -> None:
+        """stages/files.py, for those who note how long they worked: a killed program does so no more."""
+        if self.dead:
+            raise OSError
+        write_durably(path, content)
 
 
 class Killed(BaseException):
@@ -202,14 +199,15 @@ def runs_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Go:
     def run(
         machine: Machine, total: float | None, resume=False, stages=CHAIN, replan=False, alone=False, **options
     ) -> Outcome:
-        clock = SimpleNamespace(monotonic=lambda: machine.now, time=lambda: machine.now)
+        clock = SimpleNamespace(monotonic=lambda: machine.now)
         monkeypatch.setattr("pipeline.runner.STAGES", chain(machine))
-        for module in ("runner", "budget", "attempts"):
-            monkeypatch.setattr(f"pipeline.{module}.time", clock)
+        monkeypatch.setattr("pipeline.runner.time", clock)
+        monkeypatch.setattr("stages.stopwatch.time", clock)
         monkeypatch.setattr("stages.colmap.load", lambda: None)
-        monkeypatch.setattr("pipeline.heartbeat.beating", machine.beating)
+        monkeypatch.setattr("stages.stopwatch.periodically", machine.periodically)
+        monkeypatch.setattr("stages.stopwatch.write_durably", machine.write_durably)
         settings = Options.model_validate({"ingest": {"photos": photos}} | options)
-        machine.root, machine.alive = tmp_path / "w.nerf", None
+        machine.root, machine.dead = tmp_path / "w.nerf", False
         with Workspace(machine.root) as workspace:
             runner = Runner(workspace, settings, SilentDisplay())  # type: ignore[arg-type]
             if not resume:

@@ -1,5 +1,6 @@
 """What is charged to a budget, when an account ends, and which one the report shows."""
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -71,6 +72,16 @@ def test_a_study_between_a_kill_and_a_resume_leaves_what_was_left(go: Go) -> Non
     assert 100 + resumed.took == pytest.approx(300, rel=0.1)
 
 
+def test_a_report_alone_keeps_the_account_of_the_run(go: Go, tmp_path: Path) -> None:
+    machine = Machine()
+    go(machine, 300.0)
+    before = reported(tmp_path)
+    (report,) = (tmp_path / "w.nerf/report").iterdir()
+    shutil.rmtree(report)
+    assert go(machine, 300.0).ran
+    assert not go(machine, 300.0).ran and reported(tmp_path) == before
+
+
 def test_a_stage_alone_after_a_run_keeps_the_account_of_the_run(go: Go, tmp_path: Path) -> None:
     machine = Machine()
     go(machine, 300.0)
@@ -92,6 +103,21 @@ def test_one_stage_does_not_end_an_interrupted_run(go: Go) -> None:
     assert 100 + alone.took + resumed.took < 300 + sum(LEAST_SECONDS.values())
 
 
+@pytest.mark.parametrize("alone", [True, False])
+def test_more_is_charged_to_no_budget_also_after_a_kill(go: Go, alone: bool) -> None:
+    machine, more = Machine(), {"after": "there", "seconds": 600.0}
+    go(machine, 300.0)
+    stages = ("ingest", "sfm", "normalise", "effects", "train", "report")
+    machine.killed_at = [machine.now + 500]
+    with pytest.raises(Killed):
+        go(machine, None, resume=True, alone=alone, stages=stages, train=more)
+    resumed = go(machine, None, resume=True, train=more)
+    assert resumed.budget is not None
+    account = resumed.budget.account()
+    assert set(account["promised"]) == set(account["spent"]) == {"evaluate", "render", "mesh"}
+    assert all(seconds > 0.3 * 300 for seconds in account["promised"].values())
+
+
 def test_what_planning_takes_is_part_of_the_time_of_a_stage(go: Go, tmp_path: Path) -> None:
     runner = go(Machine(), 300.0)
     for stage in ("evaluate", "render", "mesh"):
@@ -108,6 +134,16 @@ def test_a_plan_that_is_found_again_counts_once(go: Go, tmp_path: Path) -> None:
     (stage,) = [name for name in ("render", "mesh") if name not in done][:1]
     resumed = go(machine, 300.0)
     assert manifest(tmp_path, stage)["seconds"] == pytest.approx(spent(resumed)[stage], abs=0.3)
+
+
+def test_an_input_that_is_made_again_is_charged_once(go: Go, tmp_path: Path) -> None:
+    machine = Machine()
+    go(machine, 300.0)
+    shutil.rmtree(tmp_path / "w.nerf/mesh")
+    (result,) = (tmp_path / "w.nerf/train").glob("*/result.json")
+    result.write_text(result.read_text().replace("1", "2"))
+    again = go(machine, None, resume=True)
+    assert sum(spent(again).values()) == pytest.approx(again.took, abs=1)
 
 
 # --- reading the photos

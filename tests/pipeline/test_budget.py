@@ -1,6 +1,7 @@
 """A budget on a machine whose clock and speed are made up: it converges, whatever the machine does and however often
 it is killed."""
 
+import os
 import shutil
 from pathlib import Path
 
@@ -20,8 +21,8 @@ from pipeline.budget import (
     training_seconds,
 )
 from pipeline.forecast import without_budget
-from pipeline.heartbeat import BEAT
 from stages.files import read_json
+from stages.stopwatch import BEAT
 from stages.train import Config as TrainConfig
 from tests.pipeline.made_up_machine import CHAIN, EXPECTED, Go, Killed, Machine, runs_on, spent
 
@@ -187,6 +188,17 @@ def test_a_kill_and_a_resume_keep_the_total(go: Go, kills: list[float]) -> None:
     runner = go(machine, 300.0, resume=True)
     assert worked + runner.took == pytest.approx(300, rel=0.1)
     assert sum(spent(runner).values()) == pytest.approx(worked + runner.took, abs=1 + BEAT * len(kills))
+
+
+def test_what_a_kill_took_with_it_is_not_told_by_the_times_of_files(go: Go, tmp_path: Path) -> None:
+    """As after a copy, or after a clock that was put forward."""
+    machine = Machine()
+    machine.killed_at = [machine.now + 100]
+    with pytest.raises(Killed):
+        go(machine, 300.0)
+    for path in (tmp_path / "w.nerf").rglob("*"):
+        os.utime(path, (1e10, 1e10))
+    assert 100 + go(machine, 300.0, resume=True).took == pytest.approx(300, rel=0.1)
 
 
 @pytest.mark.parametrize("stage", ["evaluate", "render", "mesh"])

@@ -10,7 +10,7 @@ from nerf.rays import rays_of_view
 from nerf.scene import Camera
 from nerf.synthetic import still_life
 from pipeline import demo
-from pipeline.cli import command_demo
+from pipeline.cli import command_demo, run_command
 from pipeline.settings import Settings
 from pipeline.truth import Truth
 from stages.colmap.cameras import camera_rays
@@ -58,6 +58,14 @@ def test_photos_of_the_user_are_left_alone(tmp_path: Path, progress):
     assert caught.value.why == "it holds holiday.jpg, which is not one of them"
     assert caught.value.hint == "Give an empty folder: pipeline demo -o FOLDER"
     assert [path.name for path in photos.iterdir()] == ["holiday.jpg"]
+
+
+def test_a_place_that_cannot_be_written_is_said_to_be(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    (tmp_path / "file").write_text("no folder")
+    assert run_command(["demo", "-o", str(tmp_path / "file")]) == 3
+    said = capsys.readouterr().err
+    assert f"cannot write the demo's photos to {tmp_path / 'file/photos'}\n  why: Not a directory\n" in said
+    assert said.endswith("try: Give a folder with room that you may write to: pipeline demo -o FOLDER\n")
 
 
 def test_a_photo_shows_what_the_true_camera_sees(synthetic_photos: SyntheticPhotos):

@@ -113,7 +113,8 @@ def promise(photos: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch:
             workspace=SimpleNamespace(folder=lambda stage, name: folder if name == "there" else folder / name),
         )
         foretold = forecast.foretell(runner, names, frozenset(), Photos(50, 2.0))
-        known = [foretold.times[name] for name in names if name not in done]
+        waits = {**foretold.times, "tradeoff": runner.settings.tradeoff.seconds}
+        known = [waits[name] for name in names if name not in done]
         for said in foretold.words:
             if said.startswith("done in"):  # and until when, which is the sum of the stages' times
                 finish = time.localtime(NOW + sum(seconds or 0.0 for seconds in known))
@@ -204,7 +205,23 @@ def test_a_training_that_ends_by_itself_is_not_promised_within_the_workspaces_bu
     assert promise(120.0, done=BEFORE_TRAINING, names=names, train=train) == words
 
 
-def test_more_is_part_of_what_a_budget_is_expected_to_pay_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_follows_more_is_promised_by_the_budget_and_more_beside_it(promise: Promise) -> None:
+    given: dict[str, Any] = {"train": {"after": "there", "more_seconds": 600.0}, "done": BEFORE_TRAINING}
+    end = time.strftime("%H:%M", time.localtime(NOW + 606 + 300))
+    assert promise(300.0, **given) == [f"budget 5 min and 10 min beside it, done at {end} at the latest"]
+
+
+def test_a_study_is_foretold_with_what_it_needs(promise: Promise) -> None:
+    study: dict[str, Any] = {"names": (*BEFORE_TRAINING, "tradeoff", "report"), "tradeoff": {"seconds": 1800.0}}
+    assert promise(done=(*BEFORE_TRAINING, "report"), **study) == ["done in about 30 min"]
+    assert promise(300.0, done=(*BEFORE_TRAINING, "report"), **study) == ["done in about 30 min"]
+    assert promise(done=(*BEFORE_TRAINING, "tradeoff", "report"), **study) == []
+    assert promise(done=(), **study) == ["done in about 31 min"]
+    (words,) = promise(300.0, done=BEFORE_TRAINING[:3], **study)
+    assert words.startswith("budget 5 min and 30 min beside it, done at ")
+
+
+def test_more_takes_what_was_asked_for_and_what_comes_beside_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(forecast, "processors", lambda: 2)
     given = {"train": {"after": "there", "more_seconds": 600.0, "seconds": 30.0}}
     assert expected(Settings.model_validate(given), Photos(50, 0.75))["train"] == pytest.approx(604.75)

@@ -11,7 +11,8 @@ from PIL import Image
 from pipeline import status
 from pipeline.display import SilentDisplay
 from pipeline.failures import StageFailed
-from pipeline.runner import NotReady, Runner
+from pipeline.job import NotReady
+from pipeline.runner import Runner
 from pipeline.workspace import Workspace
 from stages import sources
 from stages.contract import StageError

@@ -1,9 +1,11 @@
-"""Options from a file, and effects by name on the command line."""
+"""Options from a file, effects by name on the command line, and workspaces that would lie among the photos."""
 
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
+from pipeline.cli import run_command
 from pipeline.settings import Settings, UsageError, read_toml, with_effects
 from stages.effects import Config
 
@@ -45,3 +47,27 @@ def test_wrong_effects_are_named_with_those_that_there_are(choice: str, words: s
 def test_a_file_may_begin_with_the_byte_order_mark_of_windows(tmp_path: Path):
     (tmp_path / "a.toml").write_bytes(b"\xef\xbb\xbf[train]\r\nsteps = 3\r\n")
     assert read_toml(tmp_path / "a.toml") == {"train": {"steps": 3}}
+
+
+@pytest.mark.parametrize(("photos", "workspace"), [("set", "set"), (".", "."), ("set", "set/images"), ("set", "link")])
+def test_nothing_is_written_among_the_photos(
+    photos: str, workspace: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    (tmp_path / "set/images").mkdir(parents=True)
+    Image.new("RGB", (4, 4)).save(tmp_path / "set/images/0.png")
+    (tmp_path / "link").symlink_to("set")
+    monkeypatch.chdir(tmp_path)
+    before = sorted(tmp_path.rglob("*"))
+    assert run_command(["run", photos, "-o", workspace]) == 2
+    assert f"pipeline: -o {workspace}: that is a folder of photos; leave -o out" in capsys.readouterr().err
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_workspace_beside_its_photos_is_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    (tmp_path / "set/images").mkdir(parents=True)
+    for k in range(3):
+        Image.effect_noise((64, 48), 30 + k).save(tmp_path / f"set/images/{k}.png")
+    words = ["run", str(tmp_path / "set/images"), "-o", str(tmp_path / "set"), "--until", "ingest"]
+    assert [run_command(words), run_command(words)] == [0, 0]
+    assert run_command(["run", str(tmp_path / "set"), "-o", str(tmp_path / "set")]) == 10
+    assert "is a workspace" in capsys.readouterr().err

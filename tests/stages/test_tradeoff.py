@@ -12,7 +12,7 @@ import torch
 from PIL import Image
 
 from nerf.scene import Camera
-from stages import tradeoff, tradeoff_arms, tradeoff_clock, tradeoff_own, tradeoff_trial, train
+from stages import stopwatch, tradeoff, tradeoff_arms, tradeoff_own, tradeoff_trial, train
 from stages.contract import StageError
 from stages.files import read_json, read_scene, write_json
 from stages.tradeoff import Config
@@ -132,7 +132,7 @@ def now(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[float]:
         return read_json(found)
 
     monkeypatch.setattr(tradeoff_trial, "run_arm", trained)
-    monkeypatch.setattr(tradeoff_clock, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    monkeypatch.setattr(stopwatch, "time", SimpleNamespace(monotonic=lambda: now[0]))
     monkeypatch.setattr(tradeoff, "LATE", 0.1)
     monkeypatch.setattr(tradeoff_arms, "SPENT_ELSEWHERE", 0.0)
     return now

@@ -1,0 +1,33 @@
+"""One stage to be brought up to date: what decides its key, and why that may not be known."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from stages.contract import StageConfig
+
+
+class DamagedInputs(Exception):
+    """A stage was about to read files that are not what was written; they have been set aside."""
+
+
+class NotReady(Exception):
+    """A stage's key cannot be known yet: ``upstream`` (or the stage itself) has no current result or plan."""
+
+    def __init__(self, upstream: str) -> None:
+        super().__init__(upstream)
+        self.upstream = upstream
+
+
+@dataclass(frozen=True)
+class Job:
+    """One stage with everything that decides its key."""
+
+    stage: str
+    module: ModuleType
+    config: StageConfig
+    key_config: dict[str, Any]
+    inputs: dict[str, str]  # upstream stage -> outputs digest
+    folders: dict[str, Path]  # upstream stage -> finished folder
+    key: str

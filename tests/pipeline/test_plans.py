@@ -1,0 +1,55 @@
+"""What of a plan stands, and what is taken as it is given now."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from PIL import Image
+
+from pipeline.display import SilentDisplay
+from pipeline.failures import StageFailed
+from pipeline.runner import Runner
+from pipeline.workspace import Workspace
+from stages.files import read_json
+from tests.pipeline import fake_stages, made_up_machine
+from tests.pipeline.fake_stages import FakeSettings, calls
+
+Bring = Callable[..., None]
+
+
+@pytest.fixture
+def bring(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Bring:
+    """Runs stages ingest and sfm of the fake chain with options of sfm."""
+    monkeypatch.setattr("pipeline.runner.STAGES", fake_stages.STAGES)
+    (tmp_path / "photos").mkdir()
+    Image.new("RGB", (4, 4)).save(tmp_path / "photos/0.png")
+
+    def go(**sfm: Any) -> None:
+        calls.clear()
+        settings = FakeSettings.model_validate({"ingest": {"photos": tmp_path / "photos"}, "sfm": sfm})
+        with Workspace(tmp_path / "w.nerf") as workspace:
+            Runner(workspace, settings, SilentDisplay()).run(("ingest", "sfm"))  # type: ignore[arg-type]
+
+    return go
+
+
+def test_what_is_part_of_no_key_can_be_changed_after_it_was_planned(
+    bring: Bring, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As a longer --sfm.max-seconds, once a shorter one was not enough."""
+    monkeypatch.setattr(fake_stages.STAGES["sfm"], "UNKEYED", ("fail",), raising=False)
+    with pytest.raises(StageFailed):
+        bring(fail=True)
+    bring(fail=False)
+    assert calls == ["sfm"], "the plan stands"
+
+
+def test_seconds_that_a_budget_gave_stand_after_a_kill(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    go, machine = made_up_machine.runs_on(tmp_path, monkeypatch), made_up_machine.Machine()
+    machine.killed_at = [machine.now + 20]
+    with pytest.raises(made_up_machine.Killed):
+        go(machine, 300.0)
+    go(machine, 300.0, resume=True)
+    (result,) = (tmp_path / "w.nerf/sfm").glob("*/result.json")
+    assert read_json(result)["config"]["seconds"] == 150.0
