@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 NEEDS = ("ingest", "normalise", "effects")
 OPTIONAL = ("train",)
-VERSION = 6
+VERSION = 7
 RESUMES = True
 LINKS = ("tradeoff.svg", "tradeoff.png", "tradeoff.md", "tradeoff.json", "ablation.png")
 
