@@ -17,6 +17,7 @@ from stages.contract import Inputs, Progress, StageError
 from stages.files import read_json, sync_file, write_json_durably
 from stages.periodically import periodically
 from stages.tradeoff_arms import SMALL_SIDE, THINNED, Arm
+from stages.training_data import NOTHING_LEFT
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -31,7 +32,7 @@ STEPS_OF_PLACES = (0.7548776662466927, 0.5698402909980532)
 ENOUGH = 0.25  # of a window's pixels that masks leave
 PLACES = 256  # in a photo that are looked at for a window with ENOUGH
 MEMORY_LOOK_SECONDS = 0.05
-OWN_FAULTS = ("training diverged", "the field does not learn", "nothing is left to train on")
+OWN_FAULTS = ("training diverged", "the field does not learn", NOTHING_LEFT)
 """What stage train says where the arm itself is at fault: it would say so again."""
 
 Colour = tuple[float, float, float]

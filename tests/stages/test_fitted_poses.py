@@ -54,7 +54,7 @@ def test_refined_poses_are_learnt_in_units_of_what_photos_see_and_written_in_sce
     inputs, scene = photographed(tmp_path)
     views = scene.of_split("train")
     bank = training_bank(inputs["ingest"], scene, "train", 1.0, Quiet())
-    near = bank.with_distances(bank.first_pixel[:-1] + 5, torch.full((len(views),), 0.25))
+    near = bank._replace(known=bank.first_pixel[:-1] + 5, distance=torch.full((len(views),), 0.25))
     rays, colours = photo_parts(Decisions(pose_refinement=True), views, near)
     rays.parameters["offset"][1] = torch.tensor([1.0, 0.0, -2.0])
     trainer: Any = SimpleNamespace(photo_rays=rays, photo_colours=colours)
