@@ -6,6 +6,7 @@ often can, where it is dark or plain. A field puts it there, in the way of every
 at the sparse points nearest to it, there is nothing but what several photos look at.
 """
 
+from collections.abc import MutableMapping
 from functools import partial
 
 import torch
@@ -26,14 +27,14 @@ TOGETHER = 16  # photos that look at once, on all cores, at what is undecided; f
 
 
 # Of banks that are in use, by their geometry: all trainers of a run ask for the same, and so do all of its pilots.
-_answers = WeakTensorKeyDictionary()
+_answers: MutableMapping[Tensor, dict[tuple[int, int], Tensor]] = WeakTensorKeyDictionary()
 
 
 def usable_cells(bank: RayBank, least: int, cells: int) -> Bool[Tensor, "cache"]:
     """Which of ``cells``³ cells of folded space, in the order of ``nerf.kernels.cache``, may hold something: those
     whose middles ``least`` photos of ``bank`` look at, or one, from where its foreground begins; and a coarse cell
     around them. What hides them, and masks, count for nothing. Found once for a bank; not to be written to."""
-    answers: dict[tuple[int, int], Tensor] = _answers.setdefault(bank.geometry, {})
+    answers = _answers.setdefault(bank.geometry, {})
     if (least, cells) not in answers:
         answers[least, cells] = _usable_cells(bank, least, cells)
     return answers[least, cells]

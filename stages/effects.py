@@ -4,9 +4,10 @@ import math
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 from pydantic import Field
+from tyro.conf import Suppress
 
 from stages.amounts import duration
 from stages.contract import Inputs, Progress, StageConfig, StageResult
@@ -51,6 +52,9 @@ class Config(StageConfig):
     pilots: int | None = Field(
         default=None, ge=0, description=f"how many at most; none: {MOST_PILOTS}, fewer where there is no time for them"
     )
+    fitting_pilots: Annotated[int | None, Suppress] = Field(
+        default=None, ge=0, description="of these, how many may fit poses; none: all"
+    )
     seconds: float | None = Field(
         default=None,
         ge=0,
@@ -69,7 +73,8 @@ class Verdict(NamedTuple):
 
 
 def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
-    """How many pilots there may be: as many as fit into the time, by what a step takes on this machine."""
+    """How many pilots there may be: as many as fit into the time, by what a step takes on this machine. And how many of
+    these may fit poses, which takes longer."""
     if config.pilots is not None:
         return config
     if config.seconds is None or not config.pilot_steps:
@@ -79,12 +84,13 @@ def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
     from stages.pilots import expected_seconds
 
     progress.update("trying how long a pilot would take")
-    took = expected_seconds(read_scene(inputs["normalise"]), config.pilot_steps)
+    took, fitting = expected_seconds(read_scene(inputs["normalise"]), config.pilot_steps)
     pilots = min(MOST_PILOTS, int(config.seconds / took))
+    more = (config.seconds - pilots * took) / (fitting - took)
     if pilots < MOST_PILOTS:
         count = "none" if not pilots else "one at most"
         progress.note(f"a pilot takes about {duration(took)} here, {duration(config.seconds)} are given: {count}")
-    return config.model_copy(update={"pilots": pilots})
+    return config.model_copy(update={"pilots": pilots, "fitting_pilots": min(pilots, int(more))})
 
 
 def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> StageResult:
@@ -124,7 +130,7 @@ class _Study:
     ) -> None:
         self.config, self.scene, self.inputs, self.gains = config, scene, inputs, gains
         self.evidence, self.progress = evidence, progress
-        self.pilots = 0
+        self.pilots = self.fitting_pilots = 0
         self.trial: PilotScene | str | None = None
 
     def decide(self) -> tuple[Decisions, dict[str, Verdict]]:
@@ -158,27 +164,30 @@ class _Study:
         default = name in PART_OF_THE_METHOD
         if math.isinf(evidence.noise):
             return Verdict(default, evidence.words)
-        if why := self._why_no_pilot():
+        if why := self._why_no_pilot(off, on):
             return Verdict(default, f"{evidence.words}; not clear, and no pilot: {why}")
         return self._piloted(name, off, on, default)
 
-    def _why_no_pilot(self) -> str | None:
-        from stages.pilots import pilot_scene
+    def _why_no_pilot(self, off: Decisions, on: Decisions) -> str | None:
+        from stages.pilots import fits_poses, pilot_scene
 
         if not self.config.pilot_steps:
             return "none was wanted"
         if self.pilots == self.config.pilots:
             return f"{self.pilots} were made already" if self.pilots else "there is no time for one"
+        if fits_poses(off, on) and self.fitting_pilots == self.config.fitting_pilots:
+            return "there is no time for one that fits poses"
         if self.trial is None:
             self.trial = pilot_scene(self.inputs, self.scene, self.progress)
         return self.trial if isinstance(self.trial, str) else None
 
     def _piloted(self, name: str, off: Decisions, on: Decisions, default: bool) -> Verdict:
         from nerf.training import NonFinite
-        from stages.pilots import run_pilot
+        from stages.pilots import fits_poses, run_pilot
 
         assert self.trial is not None and not isinstance(self.trial, str), "a reason against pilots is heard before"
         self.pilots += 1
+        self.fitting_pilots += fits_poses(off, on)
         words = self.evidence[name].words
         try:
             pilot = run_pilot(self.trial, off, on, self.config.pilot_steps, self.config.seed, self.progress)

@@ -9,7 +9,7 @@ import time
 from statistics import mean, median
 from typing import TYPE_CHECKING, NamedTuple
 
-from stages.contract import Inputs, Progress
+from stages.contract import Inputs, Progress, StageError
 from stages.effect_decisions import Decisions, photo_parts
 from stages.image_metrics import FEWEST_FOR_INTERVAL, mean_interval
 from stages.training_setup import BLACK
@@ -29,6 +29,9 @@ SEEDS = 3
 BATCH_SAMPLES = 1 << 13  # half the usual: a pilot has to be short, and is judged early
 CHUNKS = 4  # fixed, so that a pilot ends the same whatever the machine
 BESIDE_TRAINING = 0.3  # of the time of the trainings: reading photos, the warm-up, scoring
+# Of a pilot's training, on one core, that take as long as fitting the pose of a photo kept back and drawing it again:
+# 7 in the scenes of tests/effect_scenes.py where alpha ends space, 20 to 26 where nothing does.
+STEPS_PER_FIT = 25
 LEAST_GAIN_DB = 0.1  # a gain must exceed its noise, and this, which nobody sees
 
 
@@ -71,7 +74,7 @@ def pilot_scene(inputs: Inputs, scene: "Scene", progress: Progress) -> PilotScen
     """Small photos to train on and to judge by, both from the training photos; or why there can be no pilot."""
     from stages.device import compute_device
     from stages.right_halves import enough
-    from stages.training_data import NothingLeft, guided_bank, view_mask, view_pixels, view_rays
+    from stages.training_data import NOTHING_LEFT, guided_bank, view_mask, view_pixels, view_rays
     from stages.unseen import set_aside
 
     split = set_aside(scene, MOST_KEPT, FEWEST_FOR_INTERVAL)
@@ -82,7 +85,10 @@ def pilot_scene(inputs: Inputs, scene: "Scene", progress: Progress) -> PilotScen
     size = f"1/{downscale:.3g} of their size"
     try:
         bank = guided_bank(inputs, split, downscale, progress).to(compute_device())
-    except NothingLeft:  # of a thin thing, of which larger photos show enough
+    except StageError as error:
+        if error.what != NOTHING_LEFT:
+            raise
+        # Larger photos may show enough of a thin thing.
         return f"masks leave nothing of the training photos at {size}"
     photos = [
         _Photo(
@@ -98,21 +104,30 @@ def pilot_scene(inputs: Inputs, scene: "Scene", progress: Progress) -> PilotScen
     return PilotScene(split, bank, kept)
 
 
-def expected_seconds(scene: "Scene", steps: int) -> float:
-    """What a pilot takes here: its trainings, by a few steps of a fresh field, and what goes on beside them."""
-    from stages.device import compute_device
+def fits_poses(off: Decisions, on: Decisions) -> bool:
+    """Whether a pilot of these two arms finds out where photos kept back were taken from: where neither refines poses,
+    they are taken as right."""
+    return off.pose_refinement or on.pose_refinement
+
+
+def expected_seconds(scene: "Scene", steps: int) -> tuple[float, float]:
+    """What a pilot takes here: its trainings, by a few steps of a fresh field, and what goes on beside them; and what a
+    pilot takes that fits poses, too."""
+    from stages.device import compute_device, cores
     from stages.training_size import seconds_per_step
 
-    arm = Decisions(unbounded=not scene.has_alpha)
-    per_step = seconds_per_step(_config(arm, steps, compute_device()), scene, arm)
-    return (1 + BESIDE_TRAINING) * 2 * SEEDS * steps * per_step
+    arm, device = Decisions(unbounded=not scene.has_alpha), compute_device()
+    per_step = seconds_per_step(_config(arm, steps, device), scene, arm, device)
+    trainings = (1 + BESIDE_TRAINING) * 2 * SEEDS * steps * per_step
+    on_cpu = per_step if device == "cpu" else seconds_per_step(_config(arm, steps, "cpu"), scene, arm, "cpu")
+    return trainings, trainings + 2 * SEEDS * MOST_KEPT * STEPS_PER_FIT * on_cpu * min(CHUNKS, cores())
 
 
 def run_pilot(trial: PilotScene, off: Decisions, on: Decisions, steps: int, seed: int, progress: Progress) -> Pilot:
     """Train both arms for each seed and compare. Raises NonFinite where an arm diverges."""
     gains: list[list[float]] = []
     arms, seconds = {"off": off, "on": on}, {"off": 0.0, "on": 0.0}
-    poses = off.pose_refinement or on.pose_refinement  # where no arm refines them, they are taken as right
+    poses = fits_poses(off, on)
     _trained(trial, off, 1, seed)  # pays for kernels and memory
     for number in range(SEEDS):
         scores: dict[str, list[float]] = {}

@@ -131,15 +131,15 @@ def rays_in_budget(config: "Config", scene: "Scene", decisions: "Decisions") -> 
 
 def rays_per_second(config: "Config", scene: "Scene", decisions: "Decisions") -> float:
     """Measured training speed."""
-    config = timed_settings(config, compute_device())
-    return rays_per_step(config) / seconds_per_step(config, scene, decisions)
+    device = compute_device()
+    config = timed_settings(config, device)
+    return rays_per_step(config) / seconds_per_step(config, scene, decisions, device)
 
 
-def seconds_per_step(config: "Config", scene: "Scene", decisions: "Decisions") -> float:
+def seconds_per_step(config: "Config", scene: "Scene", decisions: "Decisions", device: str) -> float:
     """Measured: steps of a fresh field of known sizes, with its effects, on a grey picture, for about a second."""
     from nerf.product_precision import products_at
 
-    device = compute_device()
     bank = _grey_bank(scene).to(device)
     parts = photo_parts(decisions, scene.of_split("train")[:1], bank)
     trainer = make_trainer(config, scene, bank, seed=0, photo_parts=parts)

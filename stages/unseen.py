@@ -58,7 +58,7 @@ def unseen_photos(
 
     from nerf.probe import make_patches, make_probe
     from stages.effect_decisions import told_by_neighbours
-    from stages.training_data import NothingLeft, training_bank
+    from stages.training_data import NOTHING_LEFT, training_bank
     from stages.training_setup import field_background
 
     if not scene.of_split(split):
@@ -66,10 +66,10 @@ def unseen_photos(
     assert config.downscale is not None, "plan() chooses it"
     try:
         bank = training_bank(ingest, scene, split, config.downscale, progress).to(device)
-    except NothingLeft as nothing:
-        if split != "test":
+    except StageError as error:
+        if split != "test" or error.what != NOTHING_LEFT:
             raise
-        progress.note(f"held-out quality is not measured while training: {nothing.why}")
+        progress.note(f"held-out quality is not measured while training: {error.why}")
         return None
     shown_over = torch.tensor(field_background(config, scene), device=device)
     return Unseen(

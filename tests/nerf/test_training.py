@@ -170,4 +170,4 @@ def test_what_is_learnt_of_photos_is_trained_and_resumed() -> None:
         second.step(step, step / 12)
     assert same(whole.state(), second.state())
     moved = {name: (part.detach() - begun[name]).abs().max() for name, part in whole.photo_parameters.items()}
-    assert set(moved) == {"turn", "shift", "log_gain"} and all(1e-4 < change < 0.2 for change in moved.values())
+    assert set(moved) == {"turn", "offset", "log_gain"} and all(1e-4 < change < 0.2 for change in moved.values())

@@ -211,10 +211,30 @@ def test_real_evidence_of_a_synthetic_scene(tmp_path: Path, made: Effects, on: s
 def test_pilots_are_made_as_far_as_they_fit(
     decided: Callable, monkeypatch: pytest.MonkeyPatch, seconds: float, pilots_made: int
 ) -> None:
-    monkeypatch.setattr(pilots, "expected_seconds", lambda *_: 30.0)
+    monkeypatch.setattr(pilots, "expected_seconds", lambda *_: (30.0, 31.0))
     grey = {name: found(None) for name in ("exposure", "pose_refinement")}
     _, table, _, tried = decided(effects.Config(seconds=seconds), 1.0, **grey)
     assert len(tried) == pilots_made
     assert (table["pose_refinement"]["reason"] == "one of two; not clear, and no pilot: there is no time for one") == (
         pilots_made == 0
     )
+
+
+@pytest.mark.parametrize(
+    ("seconds", "made"),
+    [
+        (59.0, ["view_dependence"]),
+        (61.0, ["pose_refinement"]),
+        (99.0, ["view_dependence"]),
+        (101.0, ["pose_refinement", "view_dependence"]),
+    ],
+)
+def test_a_pilot_that_fits_poses_has_to_fit_into_the_time_beside_the_others(
+    decided: Callable, monkeypatch: pytest.MonkeyPatch, seconds: float, made: list[str]
+) -> None:
+    monkeypatch.setattr(pilots, "expected_seconds", lambda *_: (40.0, 60.0))
+    grey = {name: found(None) for name in ("pose_refinement", "view_dependence")}
+    _, table, _, tried = decided(effects.Config(seconds=seconds), -1.0, **grey)
+    assert tried == made
+    why = "one of two; not clear, and no pilot: there is no time for one that fits poses"
+    assert (table["pose_refinement"]["reason"] == why) == ("pose_refinement" not in made)

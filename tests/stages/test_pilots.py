@@ -77,6 +77,22 @@ def test_poses_of_photos_kept_back_are_fitted_wherever_an_arm_refines_poses(
     assert asked == [fitted] * (2 * pilots.SEEDS * len(trial.kept))
 
 
+@pytest.mark.parametrize(("device", "fit"), [("cpu", 0.02), ("cuda", 0.5)])
+def test_a_pilot_is_foretold_by_its_steps_and_the_poses_that_it_fits_on_the_cpu(
+    inputs: dict[str, Path], monkeypatch: pytest.MonkeyPatch, device: str, fit: float
+) -> None:
+    on = {"cpu": fit, "cuda": 0.02}  # seconds of a step
+    monkeypatch.setattr("stages.device.compute_device", lambda: device)
+    monkeypatch.setattr("stages.device.cores", lambda: 16)
+    monkeypatch.setattr("stages.backend.chosen_backend", lambda _device: "torch")
+    monkeypatch.setattr("stages.training_size.seconds_per_step", lambda *given: on[given[-1]])
+    scene = read_scene(inputs["normalise"])
+    without, fitting = pilots.expected_seconds(scene, 100)
+    assert without == pytest.approx(1.3 * 6 * 100 * 0.02)
+    of_fits = 6 * 4 * pilots.STEPS_PER_FIT * 4 * fit  # of a step's four chunks each on one core
+    assert fitting - without == pytest.approx(of_fits)
+
+
 def test_too_few_photos_make_no_pilot(tmp_path: Path) -> None:
     made = {}
     for views in (5, 8, 10):
