@@ -130,11 +130,11 @@ class Runner:
         """Take out of ``output/`` what belongs to other settings than the current ones."""
         for stage, module in STAGES.items():
             try:
-                current = stage in self.done or self._upstream(stage, "report") is not None
+                self._upstream(stage, "output")
+            except NotReady:
+                self.workspace.unlink_outputs(module.LINKS)
             except StageError:  # photos or a file that a setting names cannot be read: said where that stage runs
                 continue
-            if not current:
-                self.workspace.unlink_outputs(module.LINKS)
 
     def _unlink_after(self, stage: str) -> None:
         """Take out of ``output/`` what rests on ``stage``, which was at work; nothing where none was."""

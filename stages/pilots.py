@@ -30,7 +30,7 @@ BATCH_SAMPLES = 1 << 13  # half the usual: a pilot has to be short, and is judge
 CHUNKS = 4  # fixed, so that a pilot ends the same whatever the machine
 BESIDE_TRAINING = 0.3  # of the time of the trainings: reading photos, the warm-up, scoring
 # Of a pilot's training, on one core, that take as long as fitting the pose of a photo kept back and drawing it again:
-# of the scenes of tests/effect_scenes.py 7 where alpha ends space, 20 to 26 where nothing does.
+# 7 in the scenes of tests/effect_scenes.py where alpha ends space, 20 to 26 where nothing does.
 STEPS_PER_FIT = 25
 LEAST_GAIN_DB = 0.1  # a gain must exceed its noise, and this, which nobody sees
 
