@@ -170,9 +170,9 @@ def test_known_distances_are_drawn_with_their_pixels_as_often_as_each_other() ->
 def test_how_far_away_views_look_is_the_median_of_what_they_are_known_to_show() -> None:
     bank, *_ = scattered()
     assert bank.viewing_distance is None
-    known = bank.with_distances(torch.tensor([30, 3, 37, 4, 23]), torch.tensor([0.5, 3.0, 2.0, 1.0, 0.25]))
+    known = bank.with_distances(torch.tensor([30, 3, 37, 4, 23]), torch.tensor([4.5, 3.0, 5.0, 1.5, 3.25]))
     assert known.viewing_distance is not None
-    assert known.viewing_distance.tolist() == [1.0, 1.0, 0.5], "the second view has none, and that of all"
+    assert known.viewing_distance.tolist() == [1.5, 3.25, 4.5], "the second view has none, and that of all"
 
 
 def test_distances_of_pixels_that_masks_ignore_are_forgotten() -> None:

@@ -24,13 +24,14 @@ ELSEWHERE = {
     "tests/nerf/test_visibility.py",
     "nerf/ray_bank.py": "bearings linear within a patch, of length 1/2 or more before they are divided by it: "
     "tests/nerf/test_ray_bank.py",
+    "nerf/srgb.py": "the standard's own curve, its inverse, from nothing to 1e30: tests/nerf/test_srgb.py",
     "nerf/effects/exposure.py": "powers taken between powers, without light in between; value, gradient, extremes: "
     "tests/nerf/effects/test_exposure.py",
     "nerf/effects/exposures.py": "gains of a photo's rays, from nothing to 1e30: tests/nerf/effects/test_exposures.py",
     "nerf/effects/rotations.py": "its series below 0.1 radians, against the matrix exponential from 0 to beyond π: "
     "tests/nerf/effects/test_rotations.py",
     "nerf/effects/poses.py": "turns and shifts of rays, up to 3.1 radians: tests/nerf/effects/test_poses.py",
-    "nerf/effects/pose_fit.py": "a search: tests/stages/test_pilots.py",
+    "nerf/effects/pose_fit.py": "a search: tests/stages/test_pilots.py, tests/nerf/effects/test_pose_fit.py",
     "nerf/pose_distance.py": "float64, ratios of distances: tests/nerf/test_pose_distance.py",
     "nerf/rendering.py": "cuts pictures into chunks: tests/nerf/test_rendering.py",
     "nerf/probe.py": "mean colour, PSNR, patches of pixels: tests/nerf/test_probe.py",

@@ -289,7 +289,7 @@ def test_want_of_memory_ends_the_study_which_goes_on_with_that_training(
 
 def test_what_counts_as_an_arms_own_fault_is_what_training_says() -> None:
     said = "".join((Path(train.__file__).parent / f"training_{name}.py").read_text() for name in ("loop", "data"))
-    assert all(f'StageError("{what}"' in said for what in tradeoff_trial.OWN_FAULTS)
+    assert all(f'"{what}"' in said for what in tradeoff_trial.OWN_FAULTS)
 
 
 def test_without_held_out_photos_there_is_no_study(tmp_path: Path, photos: dict[str, Path], progress: Any) -> None:
