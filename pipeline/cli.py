@@ -18,7 +18,7 @@ from pathlib import Path
 
 from pipeline import arguments as words_of
 from pipeline import chain, forecast, machine, status
-from pipeline.display import Display, SilentDisplay, choose_display
+from pipeline.display import Display, SilentDisplay, Unread, choose_display
 from pipeline.durations import seconds_from
 from pipeline.failures import StageFailed
 from pipeline.more import with_more
@@ -115,9 +115,10 @@ def _say(what: str, why: str, hint: str, as_json: bool) -> None:
         event = {"event": "error", "stage": None, "what": what, "why": why, "hint": hint}
         print(json.dumps(event), flush=True)
         return
-    print(f"pipeline: {what}", file=sys.stderr)
-    if why:
-        print(f"  why: {why}\n  try: {hint}", file=sys.stderr)
+    reason = f"\n  why: {why}\n  try: {hint}" if why else ""
+    errors = Unread(sys.stderr)  # where nobody reads along, the exit code still tells
+    print(f"pipeline: {what}{reason}", file=errors)
+    errors.leave()
 
 
 def _command(name: str) -> Callable[[Sequence[str]], int]:

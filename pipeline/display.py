@@ -46,7 +46,7 @@ def error_text(stage: str, error: StageError) -> str:
     return f"{stage} failed: {error.what}\n  why: {error.why}\n  try: {error.hint}"
 
 
-class _Unread:
+class Unread:
     """A stream that loses what it cannot write: that its reader or its terminal is gone, or the disk under a log full,
     ends no run."""
 
@@ -236,7 +236,7 @@ class RichDisplay:
 def choose_display(as_json: bool) -> Iterator[Display]:
     """The display that fits where the output goes; a terminal's line is live while the block runs, which goes on where
     nobody reads along any more."""
-    out, errors = _Unread(sys.stdout), _Unread(sys.stderr)
+    out, errors = Unread(sys.stdout), Unread(sys.stderr)
     try:
         with redirect_stdout(out), redirect_stderr(errors):
             if as_json:

@@ -59,7 +59,9 @@ class Workspace:
         try:
             self.root.mkdir(parents=True, exist_ok=True)
             _refuse_links(self.root)
-            self._refuse_strangers(name for module in STAGES.values() for name in module.LINKS)
+            names = [name for module in STAGES.values() for name in module.LINKS]
+            self._adopt_copies(names)
+            self._refuse_strangers(names)
             self._lock.acquire(timeout=0)
             (self.root / ".lock.pid").write_text(f"{os.getpid()}\n")
         except Timeout:
@@ -201,7 +203,7 @@ class Workspace:
                 temporary.symlink_to(os.path.relpath(source, shown.parent), target_is_directory=source.is_dir())
             except OSError:  # Windows without the privilege, or a file system without links
                 shutil.copytree(source, temporary) if source.is_dir() else shutil.copy2(source, temporary)
-                write_durably(self.root / COPIES, "\n".join(sorted({*self._copies(), shown.name})).encode())
+                self._note_copies([*self._copies(), shown.name])
             if shown.is_dir() and not shown.is_symlink():
                 _remove(shown)
             temporary.replace(shown)
@@ -219,6 +221,17 @@ class Workspace:
     def _copies(self) -> list[str]:
         copies = self.root / COPIES
         return copies.read_text("utf-8", "replace").splitlines() if copies.exists() else []
+
+    def _note_copies(self, names: Iterable[str]) -> None:
+        write_durably(self.root / COPIES, "\n".join(sorted(set(names))).encode())
+
+    def _adopt_copies(self, names: Iterable[str]) -> None:
+        """Where no result in ``output/`` is a link and none is noted as a copy, the workspace was zipped or copied in a
+        way that put files in place of its links."""
+        results = [shown for shown in map(self._shown, names) if shown.exists()]
+        lost = results and not any(shown.is_symlink() for shown in results) and not self._copies()
+        if lost and (self.root / RUN_FILE).exists():
+            self._note_copies(shown.name for shown in results)
 
     def _is_ours(self, shown: Path) -> bool:
         return shown.is_symlink() or shown.name in self._copies()

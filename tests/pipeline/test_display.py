@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from pipeline.cli import run_command
 from pipeline.display import Display, PlainDisplay, choose_display, end_line
 from stages.contract import StageError
 
@@ -82,3 +83,12 @@ def test_plain_output_is_not_flooded(capsys: pytest.CaptureFixture[str]):
         display.update(f"step {k}", k / 1000)
     display.note("a line that stays")
     assert capsys.readouterr().out == "train      a line that stays\n"
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no disk that is always full")
+def test_an_error_that_cannot_be_said_keeps_its_exit_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    with open("/dev/full", "w") as full:
+        monkeypatch.setattr(sys, "stderr", full)
+        assert run_command(["status", str(tmp_path)]) == 3
+        full.flush()  # as the program does when it ends
+        monkeypatch.undo()

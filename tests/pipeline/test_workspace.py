@@ -2,6 +2,7 @@
 
 import errno
 import os
+import shutil
 import stat
 from pathlib import Path
 
@@ -67,6 +68,18 @@ def test_copies_make_way_where_links_are_not_allowed(tmp_path: Path, monkeypatch
     assert (output / "images").is_symlink() and not (output / "mesh.ply").is_symlink()
     workspace.unlink_outputs(names)
     assert not any(output.iterdir())
+
+
+def test_a_workspace_that_was_copied_without_its_links_is_one(tmp_path: Path):
+    names, first, again = ("images", "mesh.ply"), tmp_path / "first", tmp_path / "again"
+    with Workspace(first) as workspace:
+        workspace.write_run({"options": {}, "keys": {}, "plans": {}})
+        workspace.link_outputs(result(first, 1), names)
+    shutil.copytree(first, again)
+    assert not (again / "output/images").is_symlink()
+    with Workspace(again) as workspace:
+        workspace.link_outputs(result(again, 2), names)
+    assert (again / "output/images").is_symlink() and (again / "output/mesh.ply").read_text() == "mesh 2"
 
 
 def test_clean_takes_only_what_is_named_by_a_key(tmp_path: Path):
