@@ -304,7 +304,7 @@ def with_photo_parts(monkeypatch: pytest.MonkeyPatch, what: str) -> None:
     from nerf.effects import AS_GIVEN, AS_RENDERED
 
     def parts(decisions: Any, views: Any, bank: Any):
-        centres = torch.tensor([view.scene_from_camera[:, 3] for view in views], dtype=torch.float32)
+        centres = torch.tensor(np.stack([view.scene_from_camera[:, 3] for view in views]), dtype=torch.float32)
         return (
             (RefinedPoses(centres), AS_RENDERED)
             if what == "poses"
