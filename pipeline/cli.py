@@ -61,7 +61,7 @@ def main() -> None:
             code = ending.code
         sys.stdout.flush()
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        Unread(sys.stdout).leave()
     sys.exit(code)
 
 

@@ -190,9 +190,7 @@ def _take_all(
         return _take_video(source.files[0], config.frames, waiting, progress), [], []
     masks, strays = pair_masks([source.name(file) for file in source.files], source.masks)
     notes = set_aside(source.set_aside)
-    notes += [
-        f"{shown(f'masks/{file.name}')} is no photo's mask, which are called NAME.png" for file in dict.fromkeys(strays)
-    ]
+    notes += [f"{shown(f'masks/{file.name}')} is no photo's mask, which are called NAME.png" for file in strays]
     outcomes = _decode_all(source, masks, waiting, progress)
     refused = [outcome for outcome in outcomes if isinstance(outcome, Refusal)]
     return [outcome for outcome in outcomes if isinstance(outcome, _Taken)], refused, notes

@@ -27,7 +27,8 @@ class Mask:
 
 
 def pair_masks(names: Sequence[str], masks: Sequence[tuple[str, Path]]) -> tuple[dict[str, Path], list[Path]]:
-    """The mask file of each photo that has one, by the photo's name, and the files that are no photo's mask.
+    """The mask file of each photo that has one, by the photo's name, and the files that are no photo's mask, each
+    once though it may stand for several names.
 
     A photo's mask is called after it, with its ending or without, and ends in .png.
     """
@@ -42,7 +43,7 @@ def pair_masks(names: Sequence[str], masks: Sequence[tuple[str, Path]]) -> tuple
         if file := next((by_name[one] for one in wanted if one in by_name), None):
             found[name] = file
     used = set(found.values())
-    return found, [file for _, file in masks if file not in used]
+    return found, list(dict.fromkeys(file for _, file in masks if file not in used))
 
 
 def read_mask(file: Path, width: int, height: int, orientation: int) -> Mask:
