@@ -17,9 +17,11 @@ import torch
 from benchmarks.nerfacto import pipeline, stage_folder
 from benchmarks.pixel_store import Spoken
 from nerf.product_precision import products_at
+from nerf.ray_bank import RayBank
+from nerf.scene import Scene
 from nerf.training import FieldTrainer
 from stages.device import compute_device, cores
-from stages.effect_decisions import photo_parts, read_decisions
+from stages.effect_decisions import Decisions, photo_parts, read_decisions
 from stages.files import read_scene
 from stages.train import Config, plan
 from stages.training_data import guided_bank
@@ -57,6 +59,12 @@ def main() -> None:
 def prepared(workspace: Path, asked: Config) -> tuple[Config, FieldTrainer]:
     """A fresh field with all that its first step needs, as stage train makes it, and the settings that the stage chose,
     which are printed."""
+    config, scene, bank, decisions = loaded(workspace, asked)
+    return config, make_trainer(config, scene, bank, config.seed, photo_parts(decisions, scene.of_split("train"), bank))
+
+
+def loaded(workspace: Path, asked: Config) -> tuple[Config, Scene, RayBank, Decisions]:
+    """What a fresh field is made of: the settings that stage train chose, which are printed, and its inputs."""
     inputs = {stage: stage_folder(workspace, output) for stage, output in LINKED.items()}
     scene, config = read_scene(inputs["normalise"]), plan(asked, inputs, Spoken())
     assert config.downscale, "plan() chooses it"
@@ -64,8 +72,7 @@ def prepared(workspace: Path, asked: Config) -> tuple[Config, FieldTrainer]:
     of_step = f"{config.batch_samples:,} colours in a step of {config.chunks} parts, {cores()} cores at work"
     print(f"{sizes}, {of_step}", flush=True)
     bank = guided_bank(inputs, scene, config.downscale, Spoken()).to(compute_device())
-    of_photos = photo_parts(read_decisions(inputs["effects"]), scene.of_split("train"), bank)
-    return config, make_trainer(config, scene, bank, config.seed, of_photos)
+    return config, scene, bank, read_decisions(inputs["effects"])
 
 
 def report(table: dict[str, Any]) -> None:

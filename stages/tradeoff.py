@@ -76,7 +76,7 @@ class Trial(NamedTuple):
 
 def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
     """Measure how fast this machine trains each kind of field and reads photos; choose photo sizes and windows."""
-    from stages.tradeoff_speeds import measured_speeds, reading_seconds, study_sizes
+    from stages.tradeoff_speeds import measured_speeds, measured_reading, study_sizes
     from stages.tradeoff_trial import WINDOW
 
     scene = _scene_with_test_photos(inputs)
@@ -86,7 +86,7 @@ def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
     drawn = min(drawn_per_second(name, speeds[name]) for name in quick)
     affordable = SCORING_SHARE * config.seconds * drawn / WINDOW**2
     windows = min(max(FEWEST_WINDOWS, int(affordable)), MOST_WINDOWS)
-    reading = reading_seconds(scene, inputs["ingest"], windows)
+    reading = measured_reading(scene, inputs["ingest"], windows)
     chosen = {
         "speeds": {name: (round(speed.steps, 4), round(speed.rays, 2)) for name, speed in speeds.items()},
         "sizes": sizes,

@@ -70,7 +70,7 @@ def _work(config: "TrainConfig") -> float:
     return (2 * config.samples_coarse + config.samples_fine) * config.depth * config.width**2
 
 
-def reading_seconds(scene: "Scene", ingest: Path, windows: int) -> Reading:
+def measured_reading(scene: "Scene", ingest: Path, windows: int) -> Reading:
     """What the photos take by the time that one of them takes: all on all cores, those of the windows one by one."""
     from stages.device import processors
     from stages.photos import load_pixels

@@ -1,0 +1,109 @@
+"""What effects add to a training step, and what those take that are off.
+
+    python -m benchmarks.effect_costs ../shared/data/fox --workspace /tmp/fox.nerf [--seconds 60] [--rounds 60]
+
+Trains the same field with every choice, a step of each in turn, and prints the median of each step's time over that of
+the step beside it in which no effect of photos is on (as many colours a step everywhere). "off": how much of that step
+passes in the parts that stand in place of effects which are off (nerf/effects), where one trainer that knows of no
+effects would only take the difference of two colours; so it is a bound from above.
+"""
+
+import argparse
+import time
+from dataclasses import replace
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from benchmarks.grid_parts import loaded
+from benchmarks.nerfacto import pipeline
+from nerf.effects import AS_GIVEN, AS_RENDERED
+from nerf.product_precision import products_at
+from nerf.ray_bank import RayBank
+from nerf.scene import Scene
+from nerf.training import FieldTrainer
+from stages.effect_decisions import Decisions, photo_parts
+from stages.train import Config
+from stages.training_setup import make_trainer
+
+WARM_STEPS = 300
+SHARE = 0.1  # of the run: the learning rate is still whole
+
+
+class Timed:
+    """Stands in place of a part and keeps how many seconds pass in each thing it does, on whichever thread."""
+
+    def __init__(self, part: Any) -> None:
+        self.part = part
+        self.seconds: list[float] = []
+
+    def __getattr__(self, name: str) -> Any:
+        found = getattr(self.part, name)
+        if not callable(found):
+            return found
+
+        def timed(*given: Any) -> Any:
+            began = time.perf_counter()
+            made = found(*given)
+            self.seconds.append(time.perf_counter() - began)
+            return made
+
+        return timed
+
+
+def arms(
+    config: Config, scene: Scene, bank: RayBank, decided: Decisions, neutral: tuple[Timed, Timed]
+) -> dict[str, FieldTrainer]:
+    """A trainer for each choice; ``neutral`` stand in the first one."""
+    views = scene.of_split("train")
+    none = replace(decided, view_dependence=True, pose_refinement=False, exposure=None)
+    gains = decided.exposure or {view.name: [0.0, 0.0, 0.0] for view in views}
+    choices = {
+        "exposure": replace(none, exposure=gains),
+        "pose refinement": replace(none, pose_refinement=True),
+        "both": replace(none, exposure=gains, pose_refinement=True),
+        "no view dependence": replace(none, view_dependence=False),
+    }
+
+    def trainer(decisions: Decisions, parts: Any) -> FieldTrainer:
+        of_choice = config.model_copy(update={"view_dependence": decisions.view_dependence})
+        return make_trainer(of_choice, scene, bank, config.seed, parts)
+
+    return {"off": trainer(none, neutral)} | {
+        name: trainer(each, photo_parts(each, views, bank)) for name, each in choices.items()
+    }
+
+
+def main() -> None:
+    """Print a line for each choice."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("photos", type=Path)
+    parser.add_argument("--workspace", type=Path, required=True, help="made if it is not there")
+    parser.add_argument("--seconds", type=float, default=60.0, help="of training that sizes are for")
+    parser.add_argument("--rounds", type=int, default=60, help="steps of each choice that are timed")
+    given = parser.parse_args()
+    workspace = given.workspace.absolute()
+    pipeline("run", given.photos.absolute(), "-o", workspace, "--until", "effects")
+    config, scene, bank, decided = loaded(workspace, Config(seconds=given.seconds))
+    neutral = Timed(AS_GIVEN), Timed(AS_RENDERED)
+    trainers = arms(config, scene, bank, decided, neutral)
+    seconds: dict[str, list[float]] = {name: [] for name in trainers}
+    with products_at(config.matmul):
+        for each in trainers.values():
+            for step in range(WARM_STEPS):
+                each.step(step, SHARE, 1.0)
+        for part in neutral:
+            part.seconds.clear()
+        for step in range(WARM_STEPS, WARM_STEPS + given.rounds):
+            for name, each in trainers.items():
+                began = time.perf_counter()
+                each.step(step, SHARE, 1.0)
+                seconds[name].append(time.perf_counter() - began)
+    off = seconds.pop("off")
+    print(f"off: {sum(sum(part.seconds) for part in neutral) / sum(off):.3%} of {1e3 * median(off):.1f} ms a step")
+    for name, mine in seconds.items():
+        print(f"{name}: {median(a / b for a, b in zip(mine, off, strict=True)) - 1:+.1%}")
+
+
+if __name__ == "__main__":
+    main()
