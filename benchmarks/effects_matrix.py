@@ -37,19 +37,21 @@ def cell(made: Effects, on: str = "", seen: str = "") -> Cell:
     return Cell(made, frozenset(on.split()), frozenset(seen.split()))
 
 
+MIRROR = 3.0  # times white: a mirrored sun is brighter than anything that is lit by it
+
 CELLS = {
     "plain": cell(Effects(), "background"),
     "exposure": cell(Effects(exposure_ev=1.0), "background exposure"),
-    "highlights": cell(Effects(highlight=1.0), "background"),
+    "highlights": cell(Effects(highlight=MIRROR), "background"),
     "alpha": cell(Effects(alpha=True)),
     "poses, 1 px": cell(Effects(jitter_px=1.0), "background pose_refinement"),
     "poses, 3 px": cell(Effects(jitter_px=3.0), "background pose_refinement"),
     "poses, 5 px": cell(Effects(jitter_px=5.0), "background pose_refinement"),
     "exposure, alpha": cell(Effects(exposure_ev=1.0, alpha=True), "exposure"),
-    "exposure, highlights": cell(Effects(exposure_ev=1.0, highlight=1.0), "background exposure"),
+    "exposure, highlights": cell(Effects(exposure_ev=1.0, highlight=MIRROR), "background exposure"),
     "exposure, poses": cell(Effects(exposure_ev=1.0, jitter_px=3.0), "background exposure pose_refinement"),
-    "highlights, alpha": cell(Effects(highlight=1.0, alpha=True)),
-    "highlights, poses": cell(Effects(highlight=1.0, jitter_px=3.0), "background pose_refinement"),
+    "highlights, alpha": cell(Effects(highlight=MIRROR, alpha=True)),
+    "highlights, poses": cell(Effects(highlight=MIRROR, jitter_px=3.0), "background pose_refinement"),
     "poses, alpha": cell(Effects(jitter_px=3.0, alpha=True), "pose_refinement"),
     "vignetting": cell(Effects(vignetting_ev=1.0), "background", "vignetting"),
     "passers-by": cell(Effects(strangers=0.15), "background", "transients"),

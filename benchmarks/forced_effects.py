@@ -4,11 +4,12 @@
 
 For every set: `pipeline run SET --until effects`, then for every seed a training with what was decided and one more for
 each modelled effect, decided the other way round, the rest as it was; all with as many steps, scored on all held-out
-photos. A line is a choice forced, and what the decision gains over it: the mean over seeds of the differences, ± two
-standard errors. "raw": nothing fitted; "fitted": right halves with the exposure fitted on the left ones; "posed": with
-the pose fitted there, too, which is what pose refinement is judged by. Bold: forced, it is better by more than 0.3 dB
-beyond two standard errors, so the decision was wrong. Nothing is timed, so two of them can run side by side. What is
-in FOLDER/SET.json already is not trained again.
+photos at the size that the first of them trained (what is forced may change what stage train makes of the photos). A
+line is a choice forced, and what the decision gains over it: the mean over seeds of the differences, ± two standard
+errors. "raw": nothing fitted; "fitted": right halves with the exposure fitted on the left ones; "posed": with the pose
+fitted there, too, which is what pose refinement is judged by. Bold: forced, it is better by more than 0.3 dB beyond two
+standard errors, so the decision was wrong. Nothing is timed, so two of them can run side by side. What is in
+FOLDER/SET.json already is not trained again.
 """
 
 import argparse
@@ -39,16 +40,21 @@ def decided(photos: Path, workspace: Path) -> dict[str, bool]:
     return {name: table[name]["on"] for name in EFFECTS}
 
 
-def scored(workspace: Path, effects: dict[str, bool], seed: int, steps: int) -> dict[str, float | None]:
-    """The figures of a training with these effects; its field is removed again."""
+def scored(
+    workspace: Path, effects: dict[str, bool], seed: int, steps: int, downscale: float | None
+) -> tuple[dict[str, float | None], float]:
+    """The figures of a training with these effects at photos / ``downscale``, None for the size that it trained, and
+    which that was; its field is removed again."""
     choices = [f"--effects.{name.replace('_', '-')}={'on' if on else 'off'}" for name, on in effects.items()]
     pipeline("effects", workspace, *choices)
     pipeline("train", workspace, "--train.steps", str(steps), "--train.seed", str(seed))
-    pipeline("evaluate", workspace, "--evaluate.photos", str(EVERY_PHOTO), "--evaluate.fit-poses", "on")
+    trained = read_json(stage_folder(workspace, "curve.json") / "field.json")["downscale"]
+    size = ("--evaluate.downscale", str(downscale or trained))
+    pipeline("evaluate", workspace, "--evaluate.photos", str(EVERY_PHOTO), "--evaluate.fit-poses", "on", *size)
     metrics = read_json(stage_folder(workspace, "metrics.json") / "metrics.json")
     for output in ("metrics.json", "curve.json"):
         shutil.rmtree(stage_folder(workspace, output))
-    return {name: metrics[key] for name, key in FIGURES.items()}
+    return {name: metrics[key] for name, key in FIGURES.items()}, trained
 
 
 def gain(scores: Scores, forced: str, figure: str, seeds: list[int]) -> tuple[float, float] | None:
@@ -90,7 +96,9 @@ def main() -> None:
             for forced in ("", *EFFECTS):
                 effects = {effect: on != (effect == forced) for effect, on in made["decided"].items()}
                 if f"{forced} {seed}" not in made["scores"]:
-                    made["scores"][f"{forced} {seed}"] = scored(workspace, effects, seed, given.steps)
+                    found, trained = scored(workspace, effects, seed, given.steps, made.get("downscale"))
+                    made["scores"][f"{forced} {seed}"] = found
+                    made.setdefault("downscale", trained)
                     record.write_text(json.dumps(made, indent=1))
         raw = [made["scores"][f" {seed}"]["raw"] for seed in given.seeds]
         print(f"| {name} | nothing | {mean(raw):.2f} dB | | |")
