@@ -57,10 +57,11 @@ def normalise(
     middle = spatial_median(sfm.centres)
     _check_extent(sfm, middle)
     upright = sfm.in_frame(rotation, middle)
-    contradicted = 0.0 if upright.opaque is None else beyond_alpha(upright, layout)
+    given = None if roi is None else Region(rotation @ (np.array(roi[:3]) - middle), roi[3])
+    contradicted = 0.0 if upright.opaque is None else beyond_alpha(upright, layout, given)
     if contradicted >= GOES_ON:
         upright = replace(upright, opaque=None)
-    region = find_region(upright, layout) if roi is None else Region(rotation @ (np.array(roi[:3]) - middle), roi[3])
+    region = given or find_region(upright, layout)
     if not region.half >= LEAST_HALF:
         raise ValueError(f"it is {region.half:.2g} units large, and {LEAST_HALF:g} is the least")
     scale = REGION_HALF / region.half

@@ -76,11 +76,13 @@ def find_region(scene: Reconstruction, layout: Layout) -> Region:
     return _grown(cube, scene)
 
 
-def beyond_alpha(scene: Reconstruction, layout: Layout) -> float:
+def beyond_alpha(scene: Reconstruction, layout: Layout, given: Region | None = None) -> float:
     """The share of observations that contradict photos with alpha, by which there is no more than the cube: their
-    points lie beyond it even when it is grown. 0 without observations."""
+    points lie beyond the one ``given``, or beyond the one found, even when it is grown. 0 without observations."""
     if not len(scene.point):
         return 0.0
+    if given is not None:
+        return share_beyond(scene, given.centre, given.half)
     cube = _ungrown(scene, layout)
     return share_beyond(scene, cube.centre, GROWTH * cube.half)
 

@@ -145,7 +145,7 @@ def geometric_evidence(
 
     from nerf.evidence.background import background_evidence, untracked_share
     from nerf.evidence.poses import common_residuals, pose_evidence
-    from nerf.evidence.rolling_shutter import motion_to_next, rolling_shutter_evidence
+    from nerf.evidence.rolling_shutter import across_rows, motion_to_next, rolling_shutter_evidence
 
     views = scene.of_split("train")
     with clock.runs_for(*GEOMETRIC):
@@ -162,8 +162,8 @@ def geometric_evidence(
     def rolling_shutter() -> "Evidence":
         motion = np.full((len(views), 2), np.nan)
         if _is_video(ingest, [one.file for one in views]):
-            motion = motion_to_next(xy * usual[view, None], point, view, len(views))
-        return rolling_shutter_evidence(residual, xy[:, 1] / size[view, 1], motion, view)
+            motion = motion_to_next(xy * usual[view, None], point, view, np.array(scene.indices_of("train")))
+        return rolling_shutter_evidence(residual, across_rows(xy, size[view]), motion, view)
 
     return clock.timed(
         {

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from stages.mesh_views import ShadowMap
 
 NEEDS = ("ingest", "normalise", "train")
-VERSION = 7
+VERSION = 8
 RESUMES = False
 LINKS = ("mesh.glb", "mesh.ply", "mesh.obj")
 UNKEYED = ("seconds",)  # it decides the resolution, and that enters the key
@@ -190,17 +190,14 @@ def _density(config: Config, model: "RadianceModel", box: "np.ndarray", device: 
 def _level(
     config: Config, lattice: "Lattice", model: "RadianceModel", maps: "list[ShadowMap]", progress: Progress
 ) -> "Level":
-    """The level asked for, or the one chosen from a fixed share of the maps' rays."""
-    from nerf.rays import join_rays
+    """The level asked for, or the one chosen from some of the maps' rays."""
     from stages.mesh_level import Level, check_range, choose_level
-    from stages.mesh_views import used_rays
+    from stages.mesh_views import drawn_rays
 
     check_range(lattice, config.level)
     if config.level is not None:
         return Level(config.level, "as asked", None, True)
-    every = join_rays(used_rays(one) for one in maps)
-    stride = max(1, len(every.near) // LEVEL_RAYS)
-    level = choose_level(lattice, model, every.each(lambda part: part[::stride]))
+    level = choose_level(lattice, model, drawn_rays(maps, LEVEL_RAYS))
     progress.note(f"surface at density {level.level:.3g}: {level.reason}")
     return level
 

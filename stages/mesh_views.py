@@ -89,6 +89,20 @@ def used_rays(shadow: ShadowMap) -> "Rays":
     return flat.each(lambda part: part[used])
 
 
+def drawn_rays(maps: list[ShadowMap], most: int) -> "Rays":
+    """``most`` of the maps' rays, or all where there are fewer, each as likely as any other: every k-th would be those
+    of a single column of each photo wherever k is a multiple of the maps' width."""
+    import torch
+
+    from nerf.randomness import generator
+    from nerf.rays import join_rays
+
+    every = join_rays(used_rays(one) for one in maps)
+    order = torch.randperm(len(every.near), generator=generator("cpu", 0))
+    chosen = order[:most].sort().values.to(every.near.device)
+    return every.each(lambda part: part[chosen])
+
+
 def look(vertices: np.ndarray, normals: np.ndarray, maps: Sequence[ShadowMap], voxel: float) -> Sight:
     """Look at every vertex from every photo; ``voxel`` is the lattice's spacing in scene units."""
     parts = [

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from stages.sparse_model import SparseModel
 
 NEEDS = ("ingest", "sfm")
-VERSION = 9
+VERSION = 10
 RESUMES = False
 LINKS = ("transforms.json", "scene.json")
 
@@ -77,9 +77,10 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
             f"Add training photos, or {'change the given split' if official else 'raise --normalise.test-every'}.",
         )
     if has_alpha and not found.bounded:
+        where = "what the photos' alpha leaves" if config.roi is None else "the region given"
         progress.note(
-            f"{found.beyond_alpha:.1%} of what is tracked lies beyond what the photos' alpha leaves: the scene goes on "
-            "there, and transparent parts are ignored, as masked ones are"
+            f"{found.beyond_alpha:.1%} of what is tracked lies beyond {where}: the scene goes on there, and "
+            "transparent parts are ignored, as masked ones are"
         )
     scene = _scene(sfm, photos, [model.images[i].camera for i in order], model.cameras, found, split)
     write_json(folder / "scene.json", scene.to_json())

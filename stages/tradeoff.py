@@ -76,7 +76,7 @@ class Trial(NamedTuple):
 
 def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
     """Measure how fast this machine trains each kind of field and reads photos; choose photo sizes and windows."""
-    from stages.tradeoff_speeds import measured_speeds, measured_reading, study_sizes
+    from stages.tradeoff_speeds import measured_reading, measured_speeds, study_sizes
     from stages.tradeoff_trial import WINDOW
 
     scene = _scene_with_test_photos(inputs)

@@ -240,6 +240,15 @@ def test_alpha_is_no_background_where_the_scene_goes_on_beyond_what_it_leaves() 
     np.testing.assert_array_equal(found.far, opaque.far)
 
 
+def test_alpha_is_no_background_where_the_region_asked_for_holds_a_part_of_what_it_leaves() -> None:
+    scene = opaque_where(seen_by(ring(), ball()), ball(4000))
+    part, whole = (normalise(scene, (0.0, 0.0, height, half)) for height, half in ((0.8, 0.35), (0.0, 1.1)))
+    assert whole.bounded and whole.beyond_alpha == 0
+    assert not part.bounded and part.beyond_alpha > 0.5
+    unbounded = normalise(dataclasses.replace(scene, opaque=None), (0.0, 0.0, 0.8, 0.35))
+    np.testing.assert_array_equal(part.far, unbounded.far)
+
+
 def test_a_photo_of_a_part_and_one_that_is_mistaken_carve_nothing_away() -> None:
     thing = ball(4000)
     scene = opaque_where(seen_by(np.concatenate([ring(40), ring(2, radius=1.6)]), thing), thing)  # two see a part

@@ -16,10 +16,13 @@ from tests.stages.photo_scene import pose_towards_origin
 VIEWS, POINTS = 10, 120
 
 
-def geometric(folder: Path, width: int, shift: float, readout: float = 0.0) -> dict[str, Evidence]:
-    """Frames of a video, 3:4, whose points are off by ``shift`` of the width, each frame in another direction, and by
-    the motion that a readout of this part of a frame makes; poses are stated to be uncertain by half a thousandth."""
-    height, focal = width * 3 // 4, 1.1 * width
+def geometric(
+    folder: Path, width: int, shift: float, readout: float = 0.0, turned: bool = False
+) -> dict[str, Evidence]:
+    """Frames of a video, 3:4, or 4:3 of a camera that was ``turned``, whose points are off by ``shift`` of the width,
+    each frame in another direction, and by the motion that a readout of this part of a frame makes; poses are stated to
+    be uncertain by half a thousandth."""
+    height, focal = width * 4 // 3 if turned else width * 3 // 4, 1.1 * width
     draw = np.random.default_rng(0)
     xyz = draw.uniform(-0.7, 0.7, (POINTS, 3))
     places, views, photos = [], [], []
@@ -36,7 +39,8 @@ def geometric(folder: Path, width: int, shift: float, readout: float = 0.0) -> d
     xy = np.array(places)
     motion = np.median(np.diff(xy, axis=0), axis=1)
     motion = np.concatenate([motion, motion[-1:]])[:, None]
-    rows = readout * (xy[..., 1:] / height - 0.5) * motion
+    row = xy[..., :1] / width if turned else xy[..., 1:] / height
+    rows = readout * (row - 0.5) * motion
     angle = draw.uniform(0, 2 * np.pi, VIEWS)
     xy = xy + shift * width * np.stack([np.cos(angle), np.sin(angle)], 1)[:, None] + rows
     points = {
@@ -81,6 +85,7 @@ def test_rows_are_late_by_pixels_of_a_photo_of_a_thousand(tmp_path: Path) -> Non
     assert small.called_for is large.called_for is True and small.unit == "px at 1000"
     assert large.statistic == pytest.approx(small.statistic, rel=0.05)
     assert large.words.startswith("rows take ") and " between frames, at 1000 pixels " in large.words
+    assert geometric(tmp_path / "upright", 800, 0.0, 0.5, turned=True)["rolling_shutter"].called_for is True
     # eleven thousandths of the width are motion enough, however small the photo is: here they are 1.8 of its pixels
     assert geometric(tmp_path / "icon", 160, 0.0, 0.5)["rolling_shutter"].called_for is True
 

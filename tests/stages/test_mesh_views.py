@@ -12,7 +12,7 @@ from nerf.lattice import Lattice
 from nerf.scene import Camera, Scene, Similarity, View
 from stages import mesh_views
 from stages.files import write_png
-from stages.mesh_views import look, shadow_maps, used_rays
+from stages.mesh_views import drawn_rays, look, shadow_maps, used_rays
 
 RADIUS = 0.5
 CORNER = torch.full((3,), 0.9)
@@ -126,3 +126,15 @@ def test_what_a_mask_ignores_is_neither_covered_nor_asked_where_light_stops(ball
     assert (sight.covered[local[:, 0] < -0.05] == 0).all() and (sight.covered[local[:, 0] > 0.05] == 1).all()
     (whole,) = shadow_maps(ball, scene, tmp_path, scene.views, lambda done: None)
     assert len(used_rays(maps[0]).near) == pytest.approx(len(used_rays(whole).near) / 2, rel=0.05)
+
+
+def test_rays_are_drawn_from_all_columns_of_the_photos(ball):
+    scene = scene_of((2.5, 0, 0))
+    (one,) = maps = shadow_maps(ball, scene, Path(), scene.views, lambda done: None)
+    rows, columns = one.reach.shape
+    drawn = drawn_rays(maps, rows)  # as many as every ray of one column would be
+    assert len(drawn.near) == rows and torch.equal(drawn.directions, drawn_rays(maps, rows).directions)
+    of_column = one.rays.directions.flatten(0, 1)
+    number = [int((of_column - ray).norm(dim=-1).argmin()) % columns for ray in drawn.directions]
+    assert len(set(number)) > columns / 4
+    assert len(drawn_rays(maps, 10**6).near) == rows * columns

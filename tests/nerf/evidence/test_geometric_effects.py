@@ -8,7 +8,7 @@ import pytest
 from nerf.evidence.background import background_evidence, untracked_share
 from nerf.evidence.blur import blur_evidence, relative_gradients
 from nerf.evidence.poses import common_residuals, pose_evidence
-from nerf.evidence.rolling_shutter import motion_to_next, rolling_shutter_evidence
+from nerf.evidence.rolling_shutter import across_rows, motion_to_next, rolling_shutter_evidence
 from nerf.evidence.scale import scale_evidence
 from nerf.evidence.tracks import TrackColours
 from tests.nerf.evidence.photographed_points import photographed_points
@@ -151,9 +151,16 @@ def test_the_motion_of_a_video() -> None:
     place = np.random.default_rng(0).uniform(0, 100, (20, 2))
     xy = np.concatenate([place, place + np.array([3, -1]), place[:5]])
     point = np.concatenate([np.arange(20), np.arange(20), np.arange(5)])
-    motion = motion_to_next(xy, point, np.repeat([0, 1, 2], [20, 20, 5]), 3)
+    view = np.repeat([0, 1, 2], [20, 20, 5])
+    motion = motion_to_next(xy, point, view, np.arange(3))
     np.testing.assert_allclose(motion[0], [3, -1])
     assert np.isnan(motion[1:]).all()
+    assert np.isnan(motion_to_next(xy, point, view, np.array([0, 2, 3]))).all()  # a frame between them was left out
+
+
+def test_rows_follow_each_other_along_the_shorter_side() -> None:
+    xy, size = np.array([[3.0, 1.0], [3.0, 1.0]]), np.array([[4.0, 2.0], [4.0, 8.0]])
+    np.testing.assert_allclose(across_rows(xy, size), [0.5, 0.75])
 
 
 def tensors(seed: int, views: int = 20) -> np.ndarray:
