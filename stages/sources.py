@@ -129,6 +129,14 @@ def unused_masks(source: Source) -> Path | None:
     return next((folder for folder in folders if wanted & {file.stem for file in folder.glob("*.png")}), None)
 
 
+def photos_beside(source: Source, photos: Path) -> int:
+    """How many photos lie in the folder PHOTOS itself where those of its ``images`` folder are taken."""
+    if source.kind not in ("photos", "colmap") or source.root != photos.absolute() / "images":
+        return 0
+    named = (file for file in photos.glob("*") if file.suffix.lower() in _IMAGES and not file.name.startswith("."))
+    return sum(file.is_file() for file in named)
+
+
 def list_photos(root: Path) -> tuple[Path, ...]:
     """All files below ``root`` that may be photos, sorted by relative name; where there are none but a single video,
     that.
@@ -140,7 +148,7 @@ def list_photos(root: Path) -> tuple[Path, ...]:
     found = _files_below(root, _is_photo_folder)
     if not found:
         raise StageError(f"{root} is empty", "there is no file in it", _FOLDER_HINT)
-    photos = [file for file in found if file.suffix.lower() not in _NOT_PHOTOS and not _is_video(file)]
+    photos = [file for file in found if _may_be_photo(file)]
     videos = [file for file in found if _is_video(file)]
     if not photos and len(videos) == 1:
         return (videos[0],)
@@ -241,7 +249,8 @@ def _check_given(photos: Path, cameras: Path | None) -> None:
 
 def _photo_root(folder: Path) -> Path:
     images = folder / "images"
-    return images if images.is_dir() else folder
+    holds_photos = images.is_dir() and any(map(_may_be_photo, _walk(images, _is_photo_folder)))
+    return images if holds_photos else folder
 
 
 def _is_photo_folder(folder: Path) -> bool:
@@ -311,6 +320,10 @@ def _model_files(folder: Path) -> tuple[Path, ...]:
         if all(part.is_file() for part in parts):
             return parts
     return ()
+
+
+def _may_be_photo(file: Path) -> bool:
+    return file.suffix.lower() not in _NOT_PHOTOS and not _is_video(file)
 
 
 def _is_video(file: Path) -> bool:

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from stages.contract import StageError
-from stages.sources import Source, camera_files, find_source
+from stages.sources import Source, camera_files, find_source, photos_beside
 
 
 def touch(folder: Path, *names: str) -> Path:
@@ -61,6 +61,18 @@ def test_images_inside_is_the_root_and_transforms_beside_it_is_not_used(tmp_path
     transforms(tmp_path / "transforms.json", "images/a.jpg")
     source = find_source(tmp_path)
     assert (source.kind, source.root, names(source)) == ("photos", tmp_path / "images", ["a.jpg"])
+
+
+def test_images_inside_without_photos_is_not_the_root(tmp_path: Path) -> None:
+    touch(tmp_path, "a.jpg", "images/.hidden.jpg", "images/notes.txt")
+    source = find_source(tmp_path)
+    assert (source.root, names(source), photos_beside(source, tmp_path)) == (tmp_path, ["a.jpg"], 0)
+
+
+def test_photos_beside_images_are_counted_those_of_other_folders_are_not(tmp_path: Path) -> None:
+    touch(tmp_path, "images/a.jpg", "images_4/a.jpg", "b.JPG", ".c.jpg", "database.db", "unknown")
+    assert photos_beside(find_source(tmp_path), tmp_path) == 1
+    assert photos_beside(find_source(tmp_path / "images"), tmp_path / "images") == 0
 
 
 def test_a_transforms_file_names_its_photos(tmp_path: Path) -> None:
