@@ -41,9 +41,10 @@ class Source:
     is the video; otherwise ``cameras`` is the transforms file, the folder of transforms_train.json, or the folder of
     one COLMAP model. ``files`` are the files to decode, in order of their names relative to ``root``; some may turn
     out to be no images, and files named by a transforms file may be missing. ``frames`` maps each file_path of a
-    transforms file, as it is written there, to the name of its photo. ``masks`` are all files in folders named masks,
-    each after the name, relative to ``root``, that it would have without such a folder in it. ``set_aside`` are files
-    in a folder of photos that belong to one of them by their names, as a depth map does, and that photo, by name.
+    transforms file, as it is written there, to the name of its photo. ``masks`` are the files that a transforms file
+    names as masks, each after its photo's name and .png, and then all files in folders named masks, each after the
+    name, relative to ``root``, that it would have without such a folder in it. ``set_aside`` are files in a folder of
+    photos that belong to one of them by their names, as a depth map does, and that photo, by name.
     """
 
     kind: SourceKind
@@ -70,7 +71,7 @@ def find_source(photos: Path, cameras: Path | None = None) -> Source:
         _check_given(photos, cameras)
         source = _source(photos, cameras)
         if source.kind != "video":
-            return replace(source, masks=_list_masks(source.root, source.files))
+            return replace(source, masks=source.masks + _list_masks(source.root, source.files))
         if cameras is not None:
             raise _cameras_of_video(source.files[0])
         return source
@@ -197,28 +198,29 @@ def _list_masks(root: Path, files: tuple[Path, ...]) -> tuple[tuple[str, Path], 
     return tuple(found)
 
 
-def _frame_file(names: tuple[str, ...], folders: tuple[Path, ...]) -> Path:
-    """The photo that the first of ``names`` stands for in the first of ``folders`` that has it; a missing extension is
-    completed, and where there is no such file a name is tried as Windows means it, with backslashes between folders.
+def _frame_file(names: tuple[str, ...], folders: tuple[Path, ...], what: str = "photo") -> Path:
+    """The photo, or mask, that the first of ``names`` stands for in the first of ``folders`` that has it; a missing
+    extension is completed, and where there is no such file a name is tried as Windows means it, with backslashes
+    between folders.
 
-    A photo that is nowhere is returned as if it were in the first folder, and refused when it is to be decoded.
+    One that is nowhere is returned as if it were in the first folder, and refused when it is to be decoded.
     """
     of_windows = tuple(name.replace("\\", "/") for name in names if "\\" in name)
     for name, folder, extension in product(names + of_windows, folders, _EXTENSIONS_TRIED):
-        file = _inside(folder, name + extension)
+        file = _inside(folder, name + extension, what)
         if file.is_file():
             return file
-    return _inside(folders[0], names[-1])
+    return _inside(folders[0], names[-1], what)
 
 
-def _inside(folder: Path, file_path: str) -> Path:
+def _inside(folder: Path, file_path: str, what: str) -> Path:
     file = folder / os.path.normpath(file_path)
     absolute = Path(file_path).is_absolute()
     if absolute or "\0" in file_path or not file.resolve().is_relative_to(folder.resolve()):
         raise StageError(
-            f"refused the photo {file_path[:MOST_LETTERS]!r}",
+            f"refused the {what} {file_path[:MOST_LETTERS]!r}",
             "its path is absolute" if absolute else f"it leads out of the folder {folder}",
-            "A transforms file may name photos inside its own folder only.",
+            f"A transforms file may name {what}s inside its own folder only.",
         )
     return file
 
@@ -264,7 +266,10 @@ def _from_transforms(kind: SourceKind, root: Path, cameras: Path) -> Source:
     frames = [frame for _, content in splits for frame in content["frames"]]
     files = {frame["file_path"]: _frame_file(photo_names(frame), folders) for frame in frames}
     in_order = _sorted_inside(root, set(files.values()))
-    return Source(kind, root, cameras, in_order, {path: _name(root, file) for path, file in files.items()})
+    photos = {path: _name(root, file) for path, file in files.items()}
+    named = {photos[frame["file_path"]]: mask for frame in frames if (mask := frame.get("mask_path"))}
+    masks = tuple((f"{photo}.png", _frame_file((mask,), folders, "mask")) for photo, mask in named.items())
+    return Source(kind, root, cameras, in_order, photos, masks)
 
 
 def camera_files(folder: Path) -> tuple[Path, ...]:

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from stages.contract import StageError
+from stages.masks import pair_masks
 from stages.sources import Source, camera_files, find_source, photos_beside
 
 
@@ -259,6 +260,36 @@ def test_masks_may_lie_beside_an_images_folder(tmp_path: Path, given: str) -> No
     assert [name for name, _ in find_source(tmp_path / given).masks] == ["a.png", "sub/b.png"]
     cameras = transforms(tmp_path / "transforms.json", "images/a.jpg")
     assert {"a.png", "sub/b.png"} <= {name for name, _ in find_source(cameras).masks}
+
+
+@pytest.mark.parametrize("given", [".", "images"])
+def test_a_transforms_file_may_name_masks_which_go_before_others(tmp_path: Path, given: str) -> None:
+    touch(tmp_path, "images/a.jpg", "images/b.jpg", "masks/all.png", "masks/a.png")
+    masks = {"images/a.jpg": "masks/all.png", "images/b.jpg": "./masks/all", "gone.jpg": "gone.png", "free.jpg": None}
+    frames = [{"file_path": name, "mask_path": mask, "transform_matrix": []} for name, mask in masks.items()]
+    cameras = tmp_path / "transforms.json"
+    cameras.write_text(json.dumps({"frames": frames}))
+    source = find_source(cameras) if given == "." else find_source(tmp_path / given, cameras)
+    paired, strays = pair_masks(names(source), source.masks)
+    assert {name.removeprefix("images/"): mask for name, mask in paired.items()} == {
+        "a.jpg": tmp_path / "masks/all.png", "b.jpg": tmp_path / "masks/all.png", "gone.jpg": source.root / "gone.png",
+    }  # fmt: skip
+    assert strays == [tmp_path / "masks/a.png"]
+
+
+@pytest.mark.parametrize(
+    ("mask", "words"),
+    [
+        ("../m.png", "refused the mask '../m.png': it leads out of the folder"),
+        ("/m.png", "refused the mask '/m.png': its path is absolute"),
+        (3, "the mask_path of frame 0 is no name of a file"),
+        ("x" * 300, "no file can have the name of frame 0"),
+    ],
+)
+def test_masks_may_not_leave_their_folder(mask: object, words: str, tmp_path: Path) -> None:
+    frame = {"file_path": "a.jpg", "mask_path": mask, "transform_matrix": []}
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": [frame]}))
+    assert words in str(refusal(tmp_path / "transforms.json"))
 
 
 @pytest.mark.parametrize("folder", ["images_4", "input", "photos"])
