@@ -98,10 +98,12 @@ def _source(photos: Path, cameras: Path | None) -> Source:
     files = list_photos(root)
     if _is_video(files[0]):
         return Source("video", root, None, files)
+    if cameras is not None and not _model_files(cameras := _cameras_in(cameras)):
+        return _from_transforms("transforms" if cameras.is_file() else "blender", root, cameras)
     set_aside = twins([_name(root, file) for file in files])
     files = tuple(file for file in files if _name(root, file) not in set_aside)
     if cameras is not None:
-        return Source("colmap", root, _colmap_model(cameras), files, set_aside=set_aside)
+        return Source("colmap", root, cameras, files, set_aside=set_aside)
     return Source("photos", root, None, files, set_aside=set_aside)
 
 
@@ -247,6 +249,14 @@ def _check_given(photos: Path, cameras: Path | None) -> None:
         raise StageError(
             "two sources of cameras", f"{photos.name} and --cameras {cameras}", "Give the photo folder with --cameras."
         )
+    if cameras is not None and cameras.is_file() and (suffix := cameras.suffix.lower()) != ".json":
+        of_colmap = suffix in (".bin", ".txt")
+        raise StageError(
+            f"cannot use the cameras {cameras.name}",
+            "it is no transforms file, whose name ends in .json",
+            f"Give the folder of the COLMAP model: --cameras {cameras.parent}" if of_colmap else
+            "Give a transforms file or the folder of a COLMAP model: cameras in other forms are not read.",
+        )  # fmt: skip
 
 
 def _photo_root(folder: Path) -> Path:
@@ -299,16 +309,35 @@ def _sorted_inside(root: Path, files: set[Path]) -> tuple[Path, ...]:
     return tuple(sorted(files, key=lambda file: file.relative_to(root).as_posix()))
 
 
-def _colmap_model(folder: Path) -> Path:
-    """The one COLMAP model in ``folder``: itself, or below it or its ``sparse`` folder."""
+def _cameras_in(folder: Path) -> Path:
+    """The one COLMAP model in ``folder``; where there is none the transforms.json, or the folder itself if it has a
+    transforms_train.json."""
+    found = [file for name in ("transforms.json", TRAIN) if (file := folder / name).is_file()]
+    if not found or _colmap_models(folder):
+        return _colmap_model(folder)
+    if len(found) > 1:
+        raise StageError(
+            f"two sources of cameras in {folder}", " and ".join(file.name for file in found),
+            f"Give one of them: --cameras {found[0]}",
+        )  # fmt: skip
+    return folder if found[0].name == TRAIN else found[0]
+
+
+def _colmap_models(folder: Path) -> list[Path]:
+    """All COLMAP models in ``folder``: itself, and below it and its ``sparse`` folder."""
     places = [folder, folder / "sparse"]
     places += [child for place in places if place.is_dir() for child in sorted(place.iterdir())]
-    models = sorted({place for place in places if _model_files(place)})
+    return sorted({place for place in places if _model_files(place)})
+
+
+def _colmap_model(folder: Path) -> Path:
+    """The one COLMAP model in ``folder``. Raises StageError where there is none, or several."""
+    models = _colmap_models(folder)
     if not models:
         raise StageError(
             f"no COLMAP model in {folder}",
-            "there is no cameras, images and points3D with .bin or .txt",
-            "Give the model's own folder, for example sparse/0.",
+            "there is no cameras, images and points3D with .bin or .txt, nor a transforms.json",
+            "Give the model's own folder, for example sparse/0, or a transforms file.",
         )
     if len(models) > 1:
         names = ", ".join(str(model.relative_to(folder)) for model in models)

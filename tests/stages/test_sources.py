@@ -225,6 +225,25 @@ def test_words_for_cameras_that_cannot_be_used(tmp_path: Path) -> None:
     assert refusal(tmp_path / "photos", tmp_path / "no").hint == "Check --cameras."
     assert refusal(tmp_path / "photos", tmp_path / "photos").what == f"no COLMAP model in {tmp_path}/photos"
     assert refusal(cameras, cameras).what == "two sources of cameras"
+    touch(tmp_path, "images.bin", "cameras.txt", "cams.csv")
+    for name in ("images.bin", "cameras.txt"):
+        hint = f"Give the folder of the COLMAP model: --cameras {tmp_path}"
+        assert refusal(tmp_path / "photos", tmp_path / name).hint == hint
+    assert refusal(tmp_path / "photos", tmp_path / "cams.csv").hint.endswith("cameras in other forms are not read.")
+
+
+@pytest.mark.parametrize(("name", "kind"), [("transforms.json", "transforms"), ("transforms_train.json", "blender")])
+def test_cameras_may_be_the_folder_of_a_transforms_file(tmp_path: Path, name: str, kind: str) -> None:
+    touch(tmp_path, "ds/images/a.jpg", "ds/images/b.jpg")
+    given = transforms(tmp_path / "ds" / name, "images/a.jpg")
+    source = find_source(tmp_path / "ds", tmp_path / "ds")
+    assert (source.kind, source.cameras) == (kind, given if kind == "transforms" else tmp_path / "ds")
+    assert names(source) == ["a.jpg"]
+    for other in ("transforms.json", "transforms_train.json"):
+        transforms(tmp_path / "ds" / other, "images/a.jpg")
+    assert refusal(tmp_path / "ds", tmp_path / "ds").what == f"two sources of cameras in {tmp_path}/ds"
+    touch(tmp_path / "ds/sparse/0", *COLMAP)
+    assert find_source(tmp_path / "ds", tmp_path / "ds").cameras == tmp_path / "ds/sparse/0"
 
 
 @pytest.mark.parametrize("given", ["holiday/clip.MP4", "holiday"])
