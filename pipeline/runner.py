@@ -1,5 +1,6 @@
 """Runs stages: finds what is already there, plans what was left open, runs the rest, finishes it durably."""
 
+import os
 import shutil
 import time
 from collections.abc import Mapping, Sequence
@@ -327,7 +328,8 @@ class Runner:
         source = find_source(config.photos, config.cameras)
         self.display.update("reading the video" if source.kind == "video" else f"reading {len(source.files)} photos")
         files = self.index.of_files(source.root, (*source.files, *(mask for _, mask in source.masks)))
-        self.photos = digest({"kind": source.kind, "frames": source.frames, "files": files})
+        masks = [(name, os.path.relpath(mask, source.root)) for name, mask in source.masks]
+        self.photos = digest({"kind": source.kind, "frames": source.frames, "masks": masks, "files": files})
         self.state["photos_digest"] = self.photos
         return self.photos
 

@@ -132,7 +132,7 @@ class _Taken:
 def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> StageResult:
     """Decode the photos of ``config`` into ``folder``. Raises StageError if fewer than two can be used."""
     source = find_source(config.photos, config.cameras)
-    say_unused(source, progress)
+    say_unused(source, config.photos, progress)
     with _writing(folder):
         (folder / "images").mkdir(parents=True, exist_ok=True)
         waiting = folder / "waiting"

@@ -3,11 +3,12 @@
 import os
 import shlex
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 from stages.contract import Progress, StageError, listed
 from stages.photos import Photo, Refusal
 from stages.sharpness import BLURRED
-from stages.sources import Source, unused_cameras, unused_masks
+from stages.sources import Source, photos_beside, unused_cameras, unused_masks
 from stages.twins import is_mask
 
 MAX_NOTES = 10
@@ -43,8 +44,13 @@ def say_everything(refused: Sequence[Refusal], notes: Sequence[str], progress: P
         progress.note(note)
 
 
-def say_unused(source: Source, progress: Progress) -> None:
-    """What lies with the photos and could be used, and how."""
+def say_unused(source: Source, photos: Path, progress: Progress) -> None:
+    """What lies with the photos, which were found in ``photos``, and could be used, and how."""
+    if beside := photos_beside(source, photos):
+        folder = shown(str(photos))
+        lie, them = ("1 photo lies", "is") if beside == 1 else (f"{beside} photos lie", "are")
+        how = f"to use all, move what lies beside into images/; to use only that, move images/ out of {folder}"
+        progress.note(f"{lie} in {folder} beside images/ and {them} not used: {how}")
     if (cameras := unused_cameras(source)) is not None:
         place, option = shown(str(cameras)), shown(f"--cameras {shlex.quote(str(cameras))}")
         progress.note(f"cameras lie in {place} and are not used: {option} would use them")

@@ -61,13 +61,14 @@ def face_crosses(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def vertex_normals(surface: Surface) -> np.ndarray:
-    """Unit outward normals (n, 3), averaged over a vertex's faces by area; zero for a vertex without area."""
+    """Unit outward normals (n, 3), averaged over a vertex's faces by area; +z where these have no area or cancel."""
     cross = np.repeat(face_crosses(*surface), 3, axis=0)
     corner = surface.faces.reshape(-1)
     count = len(surface.vertices)
     normals = np.stack([np.bincount(corner, cross[:, axis], count) for axis in range(3)], axis=1)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
-    return np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
+    anywhere = np.tile([0.0, 0.0, 1.0], (count, 1))  # glTF allows no other length than one
+    return np.divide(normals, length, out=anywhere, where=length > 0)
 
 
 def face_areas(surface: Surface) -> np.ndarray:
@@ -100,13 +101,25 @@ def keep_faces(surface: Surface, keep: np.ndarray) -> tuple[Surface, np.ndarray]
 
 
 def decimate(surface: Surface, max_faces: int) -> Surface:
-    """Collapse edges until ``max_faces`` remain (quadrics, Garland and Heckbert 1997); open borders stay put."""
+    """Collapse edges until ``max_faces`` remain (quadrics, Garland and Heckbert 1997); open borders stay put, and what
+    folds onto itself goes."""
     from fast_simplification import simplify
 
     if len(surface.faces) <= max_faces:
         return surface
     vertices, faces, *_ = simplify(surface.vertices, surface.faces, target_count=max_faces, preserve_border=True)
-    return Surface(vertices.astype(np.float64), faces.astype(np.int32))
+    return keep_faces(Surface(vertices.astype(np.float64), faces.astype(np.int32)), ~_cancel(faces))[0]
+
+
+def _cancel(faces: np.ndarray) -> np.ndarray:
+    """Which faces are back to back with a copy of themselves, or have a vertex twice, (m,) bool.
+
+    Nothing opens without them. Slivers between three vertices are kept, without area, too: they join their neighbours.
+    """
+    a, b, c = faces.astype(np.int64).T
+    winding = np.sign(b - a) * np.sign(c - b) * np.sign(c - a)
+    which = np.unique(np.sort(faces, axis=1), axis=0, return_inverse=True)[1].reshape(-1)
+    return (np.bincount(which, winding) == 0)[which]
 
 
 def is_watertight(surface: Surface) -> bool:

@@ -41,9 +41,10 @@ class Source:
     is the video; otherwise ``cameras`` is the transforms file, the folder of transforms_train.json, or the folder of
     one COLMAP model. ``files`` are the files to decode, in order of their names relative to ``root``; some may turn
     out to be no images, and files named by a transforms file may be missing. ``frames`` maps each file_path of a
-    transforms file, as it is written there, to the name of its photo. ``masks`` are all files in folders named masks,
-    each after the name, relative to ``root``, that it would have without such a folder in it. ``set_aside`` are files
-    in a folder of photos that belong to one of them by their names, as a depth map does, and that photo, by name.
+    transforms file, as it is written there, to the name of its photo. ``masks`` are the files that a transforms file
+    names as masks, each after its photo's name and .png, and then all files in folders named masks, each after the
+    name, relative to ``root``, that it would have without such a folder in it. ``set_aside`` are files in a folder of
+    photos that belong to one of them by their names, as a depth map does, and that photo, by name.
     """
 
     kind: SourceKind
@@ -70,7 +71,7 @@ def find_source(photos: Path, cameras: Path | None = None) -> Source:
         _check_given(photos, cameras)
         source = _source(photos, cameras)
         if source.kind != "video":
-            return replace(source, masks=_list_masks(source.root, source.files))
+            return replace(source, masks=source.masks + _list_masks(source.root, source.files))
         if cameras is not None:
             raise _cameras_of_video(source.files[0])
         return source
@@ -97,10 +98,12 @@ def _source(photos: Path, cameras: Path | None) -> Source:
     files = list_photos(root)
     if _is_video(files[0]):
         return Source("video", root, None, files)
+    if cameras is not None and not _model_files(cameras := _cameras_in(cameras)):
+        return _from_transforms("transforms" if cameras.is_file() else "blender", root, cameras)
     set_aside = twins([_name(root, file) for file in files])
     files = tuple(file for file in files if _name(root, file) not in set_aside)
     if cameras is not None:
-        return Source("colmap", root, _colmap_model(cameras), files, set_aside=set_aside)
+        return Source("colmap", root, cameras, files, set_aside=set_aside)
     return Source("photos", root, None, files, set_aside=set_aside)
 
 
@@ -129,6 +132,14 @@ def unused_masks(source: Source) -> Path | None:
     return next((folder for folder in folders if wanted & {file.stem for file in folder.glob("*.png")}), None)
 
 
+def photos_beside(source: Source, photos: Path) -> int:
+    """How many photos lie in the folder PHOTOS itself where those of its ``images`` folder are taken."""
+    if source.kind not in ("photos", "colmap") or source.root != photos.absolute() / "images":
+        return 0
+    named = (file for file in photos.glob("*") if file.suffix.lower() in _IMAGES and not file.name.startswith("."))
+    return sum(file.is_file() for file in named)
+
+
 def list_photos(root: Path) -> tuple[Path, ...]:
     """All files below ``root`` that may be photos, sorted by relative name; where there are none but a single video,
     that.
@@ -140,7 +151,7 @@ def list_photos(root: Path) -> tuple[Path, ...]:
     found = _files_below(root, _is_photo_folder)
     if not found:
         raise StageError(f"{root} is empty", "there is no file in it", _FOLDER_HINT)
-    photos = [file for file in found if file.suffix.lower() not in _NOT_PHOTOS and not _is_video(file)]
+    photos = [file for file in found if _may_be_photo(file)]
     videos = [file for file in found if _is_video(file)]
     if not photos and len(videos) == 1:
         return (videos[0],)
@@ -189,28 +200,29 @@ def _list_masks(root: Path, files: tuple[Path, ...]) -> tuple[tuple[str, Path], 
     return tuple(found)
 
 
-def _frame_file(names: tuple[str, ...], folders: tuple[Path, ...]) -> Path:
-    """The photo that the first of ``names`` stands for in the first of ``folders`` that has it; a missing extension is
-    completed, and where there is no such file a name is tried as Windows means it, with backslashes between folders.
+def _frame_file(names: tuple[str, ...], folders: tuple[Path, ...], what: str = "photo") -> Path:
+    """The photo, or mask, that the first of ``names`` stands for in the first of ``folders`` that has it; a missing
+    extension is completed, and where there is no such file a name is tried as Windows means it, with backslashes
+    between folders.
 
-    A photo that is nowhere is returned as if it were in the first folder, and refused when it is to be decoded.
+    One that is nowhere is returned as if it were in the first folder, and refused when it is to be decoded.
     """
     of_windows = tuple(name.replace("\\", "/") for name in names if "\\" in name)
     for name, folder, extension in product(names + of_windows, folders, _EXTENSIONS_TRIED):
-        file = _inside(folder, name + extension)
+        file = _inside(folder, name + extension, what)
         if file.is_file():
             return file
-    return _inside(folders[0], names[-1])
+    return _inside(folders[0], names[-1], what)
 
 
-def _inside(folder: Path, file_path: str) -> Path:
+def _inside(folder: Path, file_path: str, what: str) -> Path:
     file = folder / os.path.normpath(file_path)
     absolute = Path(file_path).is_absolute()
     if absolute or "\0" in file_path or not file.resolve().is_relative_to(folder.resolve()):
         raise StageError(
-            f"refused the photo {file_path[:MOST_LETTERS]!r}",
+            f"refused the {what} {file_path[:MOST_LETTERS]!r}",
             "its path is absolute" if absolute else f"it leads out of the folder {folder}",
-            "A transforms file may name photos inside its own folder only.",
+            f"A transforms file may name {what}s inside its own folder only.",
         )
     return file
 
@@ -237,11 +249,20 @@ def _check_given(photos: Path, cameras: Path | None) -> None:
         raise StageError(
             "two sources of cameras", f"{photos.name} and --cameras {cameras}", "Give the photo folder with --cameras."
         )
+    if cameras is not None and cameras.is_file() and (suffix := cameras.suffix.lower()) != ".json":
+        of_colmap = suffix in (".bin", ".txt")
+        raise StageError(
+            f"cannot use the cameras {cameras.name}",
+            "it is no transforms file, whose name ends in .json",
+            f"Give the folder of the COLMAP model: --cameras {cameras.parent}" if of_colmap else
+            "Give a transforms file or the folder of a COLMAP model: cameras in other forms are not read.",
+        )  # fmt: skip
 
 
 def _photo_root(folder: Path) -> Path:
     images = folder / "images"
-    return images if images.is_dir() else folder
+    holds_photos = images.is_dir() and any(map(_may_be_photo, _walk(images, _is_photo_folder)))
+    return images if holds_photos else folder
 
 
 def _is_photo_folder(folder: Path) -> bool:
@@ -255,7 +276,10 @@ def _from_transforms(kind: SourceKind, root: Path, cameras: Path) -> Source:
     frames = [frame for _, content in splits for frame in content["frames"]]
     files = {frame["file_path"]: _frame_file(photo_names(frame), folders) for frame in frames}
     in_order = _sorted_inside(root, set(files.values()))
-    return Source(kind, root, cameras, in_order, {path: _name(root, file) for path, file in files.items()})
+    photos = {path: _name(root, file) for path, file in files.items()}
+    named = {photos[frame["file_path"]]: mask for frame in frames if (mask := frame.get("mask_path"))}
+    masks = tuple((f"{photo}.png", _frame_file((mask,), folders, "mask")) for photo, mask in named.items())
+    return Source(kind, root, cameras, in_order, photos, masks)
 
 
 def camera_files(folder: Path) -> tuple[Path, ...]:
@@ -285,16 +309,35 @@ def _sorted_inside(root: Path, files: set[Path]) -> tuple[Path, ...]:
     return tuple(sorted(files, key=lambda file: file.relative_to(root).as_posix()))
 
 
-def _colmap_model(folder: Path) -> Path:
-    """The one COLMAP model in ``folder``: itself, or below it or its ``sparse`` folder."""
+def _cameras_in(folder: Path) -> Path:
+    """The one COLMAP model in ``folder``; where there is none the transforms.json, or the folder itself if it has a
+    transforms_train.json."""
+    found = [file for name in ("transforms.json", TRAIN) if (file := folder / name).is_file()]
+    if not found or _colmap_models(folder):
+        return _colmap_model(folder)
+    if len(found) > 1:
+        raise StageError(
+            f"two sources of cameras in {folder}", " and ".join(file.name for file in found),
+            f"Give one of them: --cameras {found[0]}",
+        )  # fmt: skip
+    return folder if found[0].name == TRAIN else found[0]
+
+
+def _colmap_models(folder: Path) -> list[Path]:
+    """All COLMAP models in ``folder``: itself, and below it and its ``sparse`` folder."""
     places = [folder, folder / "sparse"]
     places += [child for place in places if place.is_dir() for child in sorted(place.iterdir())]
-    models = sorted({place for place in places if _model_files(place)})
+    return sorted({place for place in places if _model_files(place)})
+
+
+def _colmap_model(folder: Path) -> Path:
+    """The one COLMAP model in ``folder``. Raises StageError where there is none, or several."""
+    models = _colmap_models(folder)
     if not models:
         raise StageError(
             f"no COLMAP model in {folder}",
-            "there is no cameras, images and points3D with .bin or .txt",
-            "Give the model's own folder, for example sparse/0.",
+            "there is no cameras, images and points3D with .bin or .txt, nor a transforms.json",
+            "Give the model's own folder, for example sparse/0, or a transforms file.",
         )
     if len(models) > 1:
         names = ", ".join(str(model.relative_to(folder)) for model in models)
@@ -311,6 +354,10 @@ def _model_files(folder: Path) -> tuple[Path, ...]:
         if all(part.is_file() for part in parts):
             return parts
     return ()
+
+
+def _may_be_photo(file: Path) -> bool:
+    return file.suffix.lower() not in _NOT_PHOTOS and not _is_video(file)
 
 
 def _is_video(file: Path) -> bool:

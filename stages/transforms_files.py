@@ -37,7 +37,10 @@ def _check_frames(frames: list[Any], what: str) -> None:
     for index, frame in enumerate(frames):
         if not (isinstance(frame, dict) and isinstance(frame.get("file_path"), str) and "transform_matrix" in frame):
             raise StageError(what, f"frame {index} lacks file_path or transform_matrix", _HINT)
-        if wrong := next((name for name in photo_names(frame) if not _is_name(name)), None):
+        mask = frame.get("mask_path") or ""
+        if not isinstance(mask, str):
+            raise StageError(what, f"the mask_path of frame {index} is no name of a file", _HINT)
+        if wrong := next((name for name in (*photo_names(frame), mask) if not _is_name(name)), None):
             why = f"no file can have the name of frame {index}, {ascii(wrong)[:MOST_LETTERS]}"
             raise StageError(what, why, _HINT)
 

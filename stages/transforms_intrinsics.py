@@ -24,9 +24,10 @@ NO_PANORAMAS = "panoramas are not supported"
 
 
 def read_intrinsics(values: Mapping[str, Any], width: int, height: int, focal: float = 0.0) -> Camera:
-    """The camera of a frame from ``w``, ``h``, ``fl_x``, ``fl_y`` or ``camera_angle_x``, ``camera_angle_y``, ``cx``,
-    ``cy``, ``k1`` …, ``p1``, ``p2``, ``sx1``, ``sy1`` or ``distortion_params``, and ``camera_model``; ``width``,
-    ``height`` (pixels) and ``focal`` (in longer sides of the picture) stand where the file has none.
+    """The camera of a frame from ``w``, ``h``, ``fl_x``, ``fl_y`` or ``camera_angle_x``, ``camera_angle_y`` (radians)
+    or ``x_fov``, ``y_fov`` (degrees), ``cx``, ``cy``, ``k1`` …, ``p1``, ``p2``, ``sx1``, ``sy1`` or
+    ``distortion_params``, and ``camera_model``; a focal length across one side serves for both. ``width``, ``height``
+    (pixels) and ``focal`` (in longer sides of the picture; 0 for unknown) stand where the file has none.
 
     Raises ValueError, saying what is wrong, for numbers that are not finite, for what no lens or crop could have, and
     for lenses that are not known here.
@@ -40,8 +41,11 @@ def read_intrinsics(values: Mapping[str, Any], width: int, height: int, focal: f
     w, h = number("w", width), number("h", height)
     if not all(1 <= side <= LARGEST_SIDE and side.is_integer() for side in (w, h)):
         raise ValueError(f"its w and h are {w:g} and {h:g}")
-    fx = number("fl_x", _focal_of(values.get("camera_angle_x"), w) or focal * max(w, h))
-    fy = number("fl_y", _focal_of(values.get("camera_angle_y"), h) or fx)
+    along = _focal_length(values, "x", w), _focal_length(values, "y", h)
+    given = [one for one in along if one is not None] or [focal * max(w, h)] * (focal > 0)
+    if not given:
+        raise ValueError("no focal length in it: neither fl_x nor camera_angle_x (between 0 and π)")
+    fx, fy = (given[0] if one is None else one for one in along)
     pinhole = (fx, fy, number("cx", w / 2), number("cy", h / 2))
     k = [number(f"k{i}", 0.0) for i in range(1, 7)]
     p, s = [number("p1", 0.0), number("p2", 0.0)], [number("sx1", 0.0), number("sy1", 0.0)]
@@ -112,12 +116,15 @@ def _distortion(k: list[float], p: list[float], s: list[float], declared: str) -
     return "PINHOLE", []
 
 
-def _focal_of(angle: Any, size: float) -> float:
-    """Focal length in pixels of a full viewing angle in radians across ``size`` pixels; 0 without an angle."""
-    if angle is None:
-        return 0.0
-    angle = _finite(angle, "viewing angle")
-    return 0.5 * size / math.tan(0.5 * angle) if 0 < angle < math.pi else 0.0
+def _focal_length(values: Mapping[str, Any], axis: str, size: float) -> float | None:
+    """Focal length in pixels along "x" or "y", where the picture has ``size`` pixels; None without one. Of a full
+    viewing angle that is in radians or, as instant-ngp's ``x_fov``, in degrees."""
+    if (name := f"fl_{axis}") in values:
+        return _finite(values[name], name)
+    for name, unit in ((f"camera_angle_{axis}", 1.0), (f"{axis}_fov", math.radians(1))):
+        if values.get(name) is not None and 0 < (angle := _finite(values[name], name) * unit) < math.pi:
+            return 0.5 * size / math.tan(0.5 * angle)
+    return None
 
 
 def _finite(value: Any, name: str) -> float:

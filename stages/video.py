@@ -12,12 +12,16 @@ from stages.contract import StageError
 if TYPE_CHECKING:
     import numpy as np
 
-# RGB becomes BT.709, the matrix browsers assume for video, and is labelled so.
+# RGB becomes BT.709, the matrix browsers assume for video, and is labelled so; on the frames, because the encoder takes
+# primaries and transfer from there, whatever -color_primaries and -color_trc say.
+_COLOUR = (
+    "scale=in_range=full:out_range=tv:out_color_matrix=bt709:flags=accurate_rnd+full_chroma_int,"
+    "setparams=color_primaries=bt709:color_trc=iec61966-2-1"
+)
 # One thread, because x264 cuts frames by thread count; bitexact, because containers else carry versions and dates.
-_OUTPUT = """
+_OUTPUT = f"""
     -an -vcodec libx264 -pix_fmt yuv420p -crf 18 -preset medium -threads 1 -x264-params threads=1:lookahead-threads=1
-    -vf scale=in_range=full:out_range=tv:out_color_matrix=bt709:flags=accurate_rnd+full_chroma_int
-    -colorspace bt709 -color_primaries bt709 -color_trc iec61966-2-1 -color_range tv
+    -vf {_COLOUR}
     -movflags +faststart -fflags +bitexact -flags:v +bitexact -map_metadata -1
 """.split()
 

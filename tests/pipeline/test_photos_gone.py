@@ -1,5 +1,7 @@
-"""Photos that were ingested and are gone, and photos that cannot be used any more: what was finished stays."""
+"""Photos that were ingested and are gone, and photos that cannot be used any more: what was finished stays. And masks
+that change places."""
 
+import json
 from pathlib import Path
 
 import pytest
@@ -55,3 +57,13 @@ def test_what_was_finished_stays_in_output_where_the_photos_cannot_be_used(photo
     with pytest.raises(StageFailed, match="no photos in"):
         run(photos.parent)
     assert links(tmp_path) == before
+
+
+def test_masks_that_change_places_are_ingested_anew(photos: Path):
+    def ran_with(*masks: str) -> bool:
+        frames = [{"file_path": "0.png", "transform_matrix": []}, {"file_path": "1.png", "transform_matrix": []}]
+        named = [{**frame, "mask_path": mask} for frame, mask in zip(frames, masks, strict=True)]
+        (photos / "transforms.json").write_text(json.dumps({"frames": named}))
+        return run(photos / "transforms.json")
+
+    assert [ran_with("a.png", "b.png"), ran_with("a.png", "b.png"), ran_with("b.png", "a.png")] == [True, False, True]

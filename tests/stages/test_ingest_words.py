@@ -61,6 +61,14 @@ def test_masks_beside_a_folder_of_photos_are_used_and_strays_said_once(tmp_path:
     assert sum("masks/stray.png is no photo's mask" in note for note in progress.notes) == 1
 
 
+def test_photos_beside_an_images_folder_are_said(tmp_path: Path, progress: Any) -> None:
+    put(tmp_path / "in/images", "a.jpg", "b.jpg")
+    put(tmp_path / "in", "c.jpg", "d.jpg")
+    ingest.run(Config(photos=tmp_path / "in"), {}, tmp_path / "out", progress)
+    how = f"to use all, move what lies beside into images/; to use only that, move images/ out of {tmp_path}/in"
+    assert progress.notes == [f"2 photos lie in {tmp_path}/in beside images/ and are not used: {how}"]
+
+
 def test_where_it_fails_all_refusals_are_said_by_reason(tmp_path: Path, progress: Any) -> None:
     folder = put(tmp_path / "in", "a.jpg")
     put(folder / "masks", "stray.png")

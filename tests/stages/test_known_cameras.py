@@ -104,6 +104,10 @@ def test_axes_turn_from_opengl_to_opencv_and_centres_stay(read) -> None:
         ({"fl_x": 50}, ("PINHOLE", (50, 50, 30, 20))),
         ({"camera_angle_x": math.pi / 2}, ("PINHOLE", (30, 30, 30, 20))),
         ({"camera_angle_x": math.pi / 2, "camera_angle_y": 2 * math.atan(0.5)}, ("PINHOLE", (30, 40, 30, 20))),
+        ({"fl_y": 50}, ("PINHOLE", (50, 50, 30, 20))),
+        ({"camera_angle_y": 2 * math.atan(0.5)}, ("PINHOLE", (40, 40, 30, 20))),
+        ({"y_fov": 90}, ("PINHOLE", (20, 20, 30, 20))),
+        ({"x_fov": 90.0, "fl_y": 31}, ("PINHOLE", (30, 31, 30, 20))),
         (LENS | {"camera_angle_x": 3.0}, ("PINHOLE", (50, 52, 31, 19))),
         (LENS | {"w": 2 * W, "h": 2 * H}, ("PINHOLE", (25, 26, 15.5, 9.5))),
     ],
@@ -173,8 +177,8 @@ def test_what_is_no_camera_is_refused_by_name(read, changes: dict[str, Any], mes
 
 
 def test_no_focal_length_at_all_is_refused(read) -> None:
-    with pytest.raises(StageError, match=r"camera of frame './0': a focal length of 0 × 0 pixels is not one"):
-        read([frame(0)])
+    with pytest.raises(StageError, match=r"camera of frame './0': no focal length in it: neither fl_x nor camera_ang"):
+        read([frame(0, camera_angle_x=40)])
 
 
 def test_a_rotation_with_rounding_is_made_orthonormal(read) -> None:

@@ -136,11 +136,22 @@ def test_components_are_numbered_by_area():
     np.testing.assert_array_equal(large.faces, TETRAHEDRON.faces)
 
 
-def test_normals_of_a_cornered_mesh_and_of_lost_vertices():
-    lost = TETRAHEDRON._replace(vertices=np.concatenate([TETRAHEDRON.vertices, [[9.0, 9, 9]]]))
-    normals = vertex_normals(lost)
+def test_normals_have_unit_length_also_where_faces_cancel_or_are_lost():
+    more = np.concatenate([TETRAHEDRON.vertices, [[9.0, 9, 9], [1, 1, 1]]])
+    normals = vertex_normals(Surface(more, np.concatenate([TETRAHEDRON.faces, [[1, 2, 5], [2, 1, 5]]])))
     np.testing.assert_allclose(normals[0], -np.ones(3) / np.sqrt(3))
-    assert (normals[4] == 0).all()
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1)
+
+
+def test_what_decimation_folds_onto_itself_goes_and_nothing_opens(monkeypatch):
+    folded = np.array([[1, 2, 4], [4, 2, 1], [3, 3, 0]], np.int32)  # in one edge of the tetrahedron, and in another
+    vertices = np.concatenate([TETRAHEDRON.vertices, [[1.0, 1, 1], TETRAHEDRON.vertices[0]]])
+    slivers = np.array([[5, 2, 1], [0, 2, 5], [0, 5, 1], *TETRAHEDRON.faces[1:]], np.int32)  # 0 and 5 are in one place
+    for faces in (TETRAHEDRON.faces, slivers):
+        given = vertices, np.concatenate([folded, faces])
+        monkeypatch.setattr("fast_simplification.simplify", lambda *_, given=given, **__: given)
+        fewer = decimate(Surface(*given), 5)
+        assert len(fewer.faces) == len(faces) and is_watertight(fewer)
 
 
 def test_decimation_keeps_the_shape_closed():

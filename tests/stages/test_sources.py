@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 from stages.contract import StageError
-from stages.sources import Source, camera_files, find_source
+from stages.masks import pair_masks
+from stages.sources import Source, camera_files, find_source, photos_beside
 
 
 def touch(folder: Path, *names: str) -> Path:
@@ -61,6 +62,18 @@ def test_images_inside_is_the_root_and_transforms_beside_it_is_not_used(tmp_path
     transforms(tmp_path / "transforms.json", "images/a.jpg")
     source = find_source(tmp_path)
     assert (source.kind, source.root, names(source)) == ("photos", tmp_path / "images", ["a.jpg"])
+
+
+def test_images_inside_without_photos_is_not_the_root(tmp_path: Path) -> None:
+    touch(tmp_path, "a.jpg", "images/.hidden.jpg", "images/notes.txt")
+    source = find_source(tmp_path)
+    assert (source.root, names(source), photos_beside(source, tmp_path)) == (tmp_path, ["a.jpg"], 0)
+
+
+def test_photos_beside_images_are_counted_those_of_other_folders_are_not(tmp_path: Path) -> None:
+    touch(tmp_path, "images/a.jpg", "images_4/a.jpg", "b.JPG", ".c.jpg", "database.db", "unknown")
+    assert photos_beside(find_source(tmp_path), tmp_path) == 1
+    assert photos_beside(find_source(tmp_path / "images"), tmp_path / "images") == 0
 
 
 def test_a_transforms_file_names_its_photos(tmp_path: Path) -> None:
@@ -212,6 +225,25 @@ def test_words_for_cameras_that_cannot_be_used(tmp_path: Path) -> None:
     assert refusal(tmp_path / "photos", tmp_path / "no").hint == "Check --cameras."
     assert refusal(tmp_path / "photos", tmp_path / "photos").what == f"no COLMAP model in {tmp_path}/photos"
     assert refusal(cameras, cameras).what == "two sources of cameras"
+    touch(tmp_path, "images.bin", "cameras.txt", "cams.csv")
+    for name in ("images.bin", "cameras.txt"):
+        hint = f"Give the folder of the COLMAP model: --cameras {tmp_path}"
+        assert refusal(tmp_path / "photos", tmp_path / name).hint == hint
+    assert refusal(tmp_path / "photos", tmp_path / "cams.csv").hint.endswith("cameras in other forms are not read.")
+
+
+@pytest.mark.parametrize(("name", "kind"), [("transforms.json", "transforms"), ("transforms_train.json", "blender")])
+def test_cameras_may_be_the_folder_of_a_transforms_file(tmp_path: Path, name: str, kind: str) -> None:
+    touch(tmp_path, "ds/images/a.jpg", "ds/images/b.jpg")
+    given = transforms(tmp_path / "ds" / name, "images/a.jpg")
+    source = find_source(tmp_path / "ds", tmp_path / "ds")
+    assert (source.kind, source.cameras) == (kind, given if kind == "transforms" else tmp_path / "ds")
+    assert names(source) == ["a.jpg"]
+    for other in ("transforms.json", "transforms_train.json"):
+        transforms(tmp_path / "ds" / other, "images/a.jpg")
+    assert refusal(tmp_path / "ds", tmp_path / "ds").what == f"two sources of cameras in {tmp_path}/ds"
+    touch(tmp_path / "ds/sparse/0", *COLMAP)
+    assert find_source(tmp_path / "ds", tmp_path / "ds").cameras == tmp_path / "ds/sparse/0"
 
 
 @pytest.mark.parametrize("given", ["holiday/clip.MP4", "holiday"])
@@ -247,6 +279,36 @@ def test_masks_may_lie_beside_an_images_folder(tmp_path: Path, given: str) -> No
     assert [name for name, _ in find_source(tmp_path / given).masks] == ["a.png", "sub/b.png"]
     cameras = transforms(tmp_path / "transforms.json", "images/a.jpg")
     assert {"a.png", "sub/b.png"} <= {name for name, _ in find_source(cameras).masks}
+
+
+@pytest.mark.parametrize("given", [".", "images"])
+def test_a_transforms_file_may_name_masks_which_go_before_others(tmp_path: Path, given: str) -> None:
+    touch(tmp_path, "images/a.jpg", "images/b.jpg", "masks/all.png", "masks/a.png")
+    masks = {"images/a.jpg": "masks/all.png", "images/b.jpg": "./masks/all", "gone.jpg": "gone.png", "free.jpg": None}
+    frames = [{"file_path": name, "mask_path": mask, "transform_matrix": []} for name, mask in masks.items()]
+    cameras = tmp_path / "transforms.json"
+    cameras.write_text(json.dumps({"frames": frames}))
+    source = find_source(cameras) if given == "." else find_source(tmp_path / given, cameras)
+    paired, strays = pair_masks(names(source), source.masks)
+    assert {name.removeprefix("images/"): mask for name, mask in paired.items()} == {
+        "a.jpg": tmp_path / "masks/all.png", "b.jpg": tmp_path / "masks/all.png", "gone.jpg": source.root / "gone.png",
+    }  # fmt: skip
+    assert strays == [tmp_path / "masks/a.png"]
+
+
+@pytest.mark.parametrize(
+    ("mask", "words"),
+    [
+        ("../m.png", "refused the mask '../m.png': it leads out of the folder"),
+        ("/m.png", "refused the mask '/m.png': its path is absolute"),
+        (3, "the mask_path of frame 0 is no name of a file"),
+        ("x" * 300, "no file can have the name of frame 0"),
+    ],
+)
+def test_masks_may_not_leave_their_folder(mask: object, words: str, tmp_path: Path) -> None:
+    frame = {"file_path": "a.jpg", "mask_path": mask, "transform_matrix": []}
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": [frame]}))
+    assert words in str(refusal(tmp_path / "transforms.json"))
 
 
 @pytest.mark.parametrize("folder", ["images_4", "input", "photos"])

@@ -1,5 +1,7 @@
+import subprocess
 from pathlib import Path
 
+import imageio_ffmpeg
 import numpy as np
 import pytest
 
@@ -27,6 +29,12 @@ def test_frames_come_back_in_order_with_their_colours(tmp_path: Path) -> None:
     assert frames.shape == (6, 48, 64, 3)
     assert fps == 24
     assert np.abs(frames.astype(int) - np.stack(plain_frames())).max() <= 4
+
+
+def test_its_colours_are_labelled(tmp_path: Path) -> None:
+    asked = [imageio_ffmpeg.get_ffmpeg_exe(), "-i", str(write(tmp_path / "a.mp4", plain_frames()))]
+    words = subprocess.run(asked, capture_output=True, text=True).stderr
+    assert "yuv420p(tv, bt709/bt709/iec61966-2-1" in words
 
 
 def test_detail_survives_and_is_not_turned_over(tmp_path: Path) -> None:
