@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     import numpy as np
 
 NEEDS: tuple[str, ...] = ()
-VERSION = 8
+VERSION = 9
 RESUMES = False
 NOTES = "notes.json"
 LINKS = ("photos.json", NOTES, "images", "masks")
