@@ -75,6 +75,8 @@ def run_command(words: Sequence[str]) -> int:
         return 0
     debug, as_json = "--debug" in words, "--json" in words
     signal.signal(signal.SIGTERM, _on_sigterm)
+    if hasattr(signal, "SIGHUP"):  # a run outlives its terminal, and so does what it starts
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         return _command(words[0])(words[1:])
     except UsageError as error:
