@@ -26,14 +26,14 @@ from pipeline.runner import Runner
 from pipeline.settings import (
     Settings,
     UsageError,
+    check_same_photos,
     check_workspace,
-    default_workspace,
     read_toml,
     settings_from,
     with_effects,
     with_source,
 )
-from pipeline.workspace import RUN_FILE, Workspace
+from pipeline.workspace import RUN_FILE, Workspace, default_workspace
 from stages.amounts import duration
 from stages.contract import StageError
 
@@ -149,6 +149,8 @@ def command_run(words: Sequence[str]) -> int:
         given = words_of.parse(words_of.RunArguments, "run", words, from_file)
     root, cameras = given.output or default_workspace(given.photos), given.cameras
     check_workspace(root, given.photos)
+    if given.output is None:
+        check_same_photos(Workspace(root), given.photos)
     if given.more is not None:
         recorded = _recorded_settings(Workspace.existing(root))
         given = words_of.parse(words_of.RunArguments, "run", words, recorded)

@@ -28,6 +28,22 @@ COPIES = ".copies"  # names of what in output/ is no link but a copy, one a line
 _KEY = re.compile(rf"[0-9a-f]{{{KEY_LENGTH}}}(\.|$)")
 
 
+def photo_set(photos: Path) -> Path:
+    """What PHOTOS are called after: a transforms.json or an images/ folder after its parent."""
+    base = Path(os.path.abspath(photos))  # resolves "..", keeps the names of links
+    return base.parent if base.suffix.lower() == ".json" or base.name == "images" else base
+
+
+def default_workspace(photos: Path) -> Path:
+    """``photos.nerf`` in the current folder; for a video ``clip.nerf``."""
+    base = photo_set(photos)
+    if base.is_file():
+        base = base.with_suffix("")
+    if base.name == "":
+        raise StageError("no workspace name", f"{photos} has no name to derive it from", "Give one with -o.")
+    return Path.cwd() / f"{base.name}.nerf"
+
+
 class _RunFile(BaseModel):
     """run.json: of each stage its options, what was chosen for it by what was asked, and its key."""
 
