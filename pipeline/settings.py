@@ -106,7 +106,8 @@ def with_effects(settings: Settings, choices: Sequence[str]) -> Settings:
 
 def with_source(settings: Settings, photos: Path, cameras: Path | None) -> Settings:
     """The settings with PHOTOS (and known cameras, if any) filled in. Raises StageError where PHOTOS is unusable,
-    UsageError where the photo to render like is none of them: better now than after the training."""
+    UsageError where the photo to render like is none of them or the cameras to render are not there: better now than
+    after the training."""
     from stages.sources import find_source
 
     source = find_source(photos, cameras)
@@ -114,6 +115,8 @@ def with_source(settings: Settings, photos: Path, cameras: Path | None) -> Setti
     if like is not None and source.kind != "video" and like not in names:
         near = difflib.get_close_matches(like, names, n=3)
         raise UsageError(f"--like {like}: no photo has that name" + (f"; perhaps {', '.join(near)}" if near else ""))
+    if (rendered := settings.render.cameras) is not None and not rendered.is_file():
+        raise UsageError(f"--render.cameras {rendered}: there is no such file")
     given = None if cameras is None else cameras.absolute()
     imported = None if source.cameras is None else source.cameras.absolute()
     return settings.model_copy(
