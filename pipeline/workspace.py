@@ -82,9 +82,8 @@ class Workspace:
             (self.root / ".lock.pid").write_text(f"{os.getpid()}\n")
         except Timeout:
             why = f"process {self._holder()} holds its lock"
-            raise StageError(
-                f"{self.root} is in use", why, "Wait for it to end, or give another one with -o."
-            ) from None
+            hint = "Wait for it to end; `run` and `demo` can be given another one with -o."
+            raise StageError(f"{self.root} is in use", why, hint) from None
         except OSError as error:
             self._lock.release()
             raise self._cannot_write(error) from error
@@ -103,6 +102,18 @@ class Workspace:
             return (self.root / ".lock.pid").read_text().strip() or "unknown"
         except OSError:
             return "unknown"
+
+    def at_work(self) -> str | None:
+        """The process that works in it; None where none does, or who asks may not write there and cannot tell."""
+        if not (self.root / ".lock.pid").exists():  # a killed process leaves it, so the lock decides
+            return None
+        try:
+            with self._lock.acquire(timeout=0):
+                return None
+        except Timeout:
+            return self._holder()
+        except OSError:
+            return None
 
     def folder(self, stage: str, key: str) -> Path:
         """Where the finished result of ``stage`` under ``key`` lies."""

@@ -5,12 +5,15 @@ import os
 import shutil
 import stat
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from PIL import Image
 
 from pipeline.cli import run_command
 from pipeline.manifests import Manifest, describe_outputs, outputs_digest
+from pipeline.status import status_of
 from pipeline.workspace import Workspace
 from stages.contract import StageError
 from stages.files import make_durable
@@ -80,6 +83,27 @@ def test_a_workspace_that_was_copied_without_its_links_is_one(tmp_path: Path):
     with Workspace(again) as workspace:
         workspace.link_outputs(result(again, 2), names)
     assert (again / "output/images").is_symlink() and (again / "output/mesh.ply").read_text() == "mesh 2"
+
+
+def test_a_stage_at_work_is_not_called_interrupted(tmp_path: Path):
+    runner: Any = SimpleNamespace(state={"keys": {}}, resolve=lambda *_, **__: SimpleNamespace(key=KEY))
+    asked = Workspace(tmp_path)
+    asked.partial("mesh", KEY).mkdir(parents=True)
+    with Workspace(tmp_path):
+        at_work = status_of(asked, runner, "mesh")
+    assert (at_work.state, at_work.text) == ("partial", f"process {os.getpid()} is at work in this workspace")
+    assert status_of(asked, runner, "mesh").text == "interrupted; `pipeline resume` takes it up again"
+
+
+def test_a_killed_process_is_not_at_work(tmp_path: Path):
+    asked = Workspace(tmp_path)
+    assert asked.at_work() is None
+    with Workspace(tmp_path):
+        assert asked.at_work() == str(os.getpid())
+    (tmp_path / ".lock.pid").write_text("1\n")
+    assert asked.at_work() is None
+    with Workspace(tmp_path):  # the question did not take the lock
+        pass
 
 
 def test_clean_takes_only_what_is_named_by_a_key(tmp_path: Path):
