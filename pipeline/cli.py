@@ -18,7 +18,7 @@ from pathlib import Path
 
 from pipeline import arguments as words_of
 from pipeline import chain, forecast, machine, status
-from pipeline.display import Display, SilentDisplay, Unread, choose_display
+from pipeline.display import Display, SilentDisplay, Unread, choose_display, open_closed_streams
 from pipeline.durations import seconds_from
 from pipeline.failures import StageFailed
 from pipeline.more import with_more
@@ -51,6 +51,7 @@ def main() -> None:
     """Entry point of ``pipeline``. That nobody reads its words to the end (`pipeline … | head`) is no error; nor are
     letters that the terminal does not have."""
     code: int | str | None = 0
+    open_closed_streams()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, get_args
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from pipeline.workspace import RUN_FILE, Workspace, default_workspace, photo_set
-from stages.contract import StageError, bounded
+from stages.contract import bounded
 from stages.effects import Config as EffectsConfig
 from stages.evaluate import Config as EvaluateConfig
 from stages.ingest import Config as IngestConfig

@@ -101,6 +101,22 @@ def test_the_end_of_its_terminal_does_not_end_a_run():
     assert process.wait(timeout=20) == 0
 
 
+@pytest.mark.skipif(os.name == "nt", reason="a shell of another kind")
+@pytest.mark.parametrize("closed", [">&-", "2>&-", "<&- >&- 2>&-"])
+def test_streams_that_were_closed_are_no_error(closed: str, tmp_path: Path):
+    for words, code in (["--version", 0], [f"status {tmp_path}", 3]):
+        command = f"{sys.executable} -m pipeline {words} {closed}"
+        ended = subprocess.run(command, shell=True, capture_output=True, text=True)
+        assert ended.returncode == code and "Traceback" not in ended.stderr
+
+
+def test_updates_before_the_first_stage_have_no_line(capsys: pytest.CaptureFixture[str]):
+    for as_json in (False, True):
+        with choose_display(as_json) as display:
+            display.update("reading 3 photos")
+    assert capsys.readouterr().out == ""
+
+
 def test_events_are_lines_of_json(capsys: pytest.CaptureFixture[str]):
     with choose_display(as_json=True) as display:
         say_everything(display)

@@ -1,5 +1,5 @@
-"""Options from a file, effects by name on the command line, and workspaces that would lie among the photos or are those of
-other photos."""
+"""Options from a file, effects by name on the command line, and workspaces that would lie among the photos or are
+those of other photos."""
 
 from pathlib import Path
 
