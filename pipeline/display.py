@@ -82,7 +82,7 @@ def open_closed_streams() -> None:
         if getattr(sys, name) is None:
             number = os.open(os.devnull, os.O_RDWR)  # the lowest that is free: that of the stream
             os.set_inheritable(number, True)
-            setattr(sys, name, open(number, "r" if name == "stdin" else "w"))
+            setattr(sys, name, os.fdopen(number, "r" if name == "stdin" else "w"))
 
 
 class SilentDisplay:

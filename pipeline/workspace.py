@@ -67,7 +67,10 @@ class Workspace:
         """A workspace that was made before; raises StageError with words if ``root`` is not one, or has links in it."""
         if not (root / RUN_FILE).is_file():
             why = "there is no run.json in it" if root.is_dir() else "there is no such folder"
-            raise StageError(f"{root} is not a workspace", why, "Start one with: pipeline run PHOTOS")
+            hint = "Start one with: pipeline run PHOTOS"
+            if photo_set(root).name and root.exists() and ((named := default_workspace(root)) / RUN_FILE).is_file():
+                hint = f"The workspace that is called after it is {named.name}."
+            raise StageError(f"{root} is not a workspace", why, hint)
         _refuse_links(root)
         return cls(root)
 
@@ -275,14 +278,23 @@ class Workspace:
 
     def stale_folders(self, keys: dict[str, str], stages: list[str]) -> list[Path]:
         """Stage folders that run.json does not use: other keys, abandoned partials, damaged ones. It uses the training
-        that the recorded one goes on from."""
+        that the recorded one goes on from, and a partial of the key until that is finished."""
         current = {self.folder(stage, key) for stage, key in keys.items()}
-        current |= {self.partial(stage, key) for stage, key in keys.items()}
+        current |= {self.partial(stage, key) for stage, key in keys.items() if not _is_whole(self.folder(stage, key))}
         after = self.read_run()["options"].get("train", {}).get("after")
         if isinstance(after, str):
             current.add(self.folder("train", after))
         found = (p for stage in stages if (self.root / stage).is_dir() for p in (self.root / stage).iterdir())
         return sorted(p for p in found if p.is_dir() and _KEY.match(p.name) and p not in current)  # others are not ours
+
+
+def _is_whole(folder: Path) -> bool:
+    """Whether a finished result lies there, by its sizes."""
+    try:
+        manifests.check_outputs(folder, manifests.read(folder))
+        return True
+    except (FileNotFoundError, BadManifest):
+        return False
 
 
 def _refuse_links(root: Path) -> None:

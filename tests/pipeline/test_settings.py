@@ -100,3 +100,14 @@ def test_a_workspace_nobody_named_is_not_taken_over_by_other_photos(
     assert [run("scan2/photos", "-o", "photos.nerf"), run("scan2/photos")] == [0, 0]
     (tmp_path / "scan2").rename(tmp_path / "moved")
     assert run("moved/photos") == 0
+
+
+def test_photos_given_one_by_one_are_told_from_wrong_options(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.chdir(tmp_path)
+    for name in ("a.jpg", "b.jpg", "c.jpg"):
+        (tmp_path / name).touch()
+    assert run_command(["run", "a.jpg", "b.jpg", "c.jpg", "--train.steps", "5"]) == 2
+    said = capsys.readouterr().err
+    assert said == "pipeline: b.jpg is one file too many; give the folder that holds the photos\n"

@@ -113,6 +113,28 @@ def test_clean_takes_only_what_is_named_by_a_key(tmp_path: Path):
     assert [path.name for path in stale] == [KEY, f"{KEY}.bad", f"{KEY}.partial"]
 
 
+def test_clean_takes_an_abandoned_second_attempt_at_what_is_finished(tmp_path: Path):
+    workspace = Workspace(tmp_path)
+    workspace.partial("mesh", KEY).mkdir(parents=True)
+    assert workspace.stale_folders({"mesh": KEY}, ["mesh"]) == []
+    outputs = describe_outputs(tmp_path, ())
+    made = Manifest("mesh", 1, KEY, {}, {}, outputs, outputs_digest(outputs), {}, {}, "", 1.0, "now")
+    workspace.finish(workspace.partial("mesh", KEY), workspace.folder("mesh", KEY), made)
+    workspace.partial("mesh", KEY).mkdir()
+    assert workspace.stale_folders({"mesh": KEY}, ["mesh"]) == [workspace.partial("mesh", KEY)]
+
+
+def test_photos_in_place_of_their_workspace_are_told_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.chdir(tmp_path)
+    for folder in ("photos", "photos.nerf"):
+        (tmp_path / folder).mkdir()
+    (tmp_path / "photos.nerf/run.json").write_text("{}")
+    assert run_command(["status", "photos/"]) == 3
+    assert "try: The workspace that is called after it is photos.nerf." in capsys.readouterr().err
+
+
 def test_files_are_synced_where_that_takes_the_right_to_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     fcntl = pytest.importorskip("fcntl", reason="the system itself asks for that right")
 
