@@ -3,7 +3,7 @@
 import io
 import re
 from collections.abc import Sequence
-from contextlib import redirect_stderr
+from contextlib import redirect_stderr, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -181,7 +181,16 @@ def parse(kind: type[T], command: str, words: Sequence[str], settings: Settings 
     except SystemExit as ending:
         if ending.code in (None, 0):
             raise
+        if "photos" in positional and (surplus := _surplus_file(kind, words, default)):
+            raise UsageError(f"{surplus} is one file too many; give the folder that holds the photos") from ending
         raise UsageError(f"{_what_is_wrong(ending, said.getvalue())} (pipeline {command} --help)") from ending
+
+
+def _surplus_file(kind: type, words: Sequence[str], default: Any) -> str | None:
+    """The first word that is none of the options but an existing file, as a shell gives them for ``*.jpg``."""
+    with suppress(SystemExit), redirect_stderr(io.StringIO()):
+        _, unknown = tyro.cli(kind, args=list(words), default=default, return_unknown_args=True)
+        return next((word for word in unknown if Path(word).is_file()), None)
 
 
 def _without_replaced(recorded: TrainConfig, words: Sequence[str]) -> TrainConfig:

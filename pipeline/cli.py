@@ -18,7 +18,7 @@ from pathlib import Path
 
 from pipeline import arguments as words_of
 from pipeline import chain, forecast, machine, status
-from pipeline.display import Display, SilentDisplay, Unread, choose_display
+from pipeline.display import Display, SilentDisplay, Unread, choose_display, open_closed_streams
 from pipeline.durations import seconds_from
 from pipeline.failures import StageFailed
 from pipeline.more import with_more
@@ -26,14 +26,14 @@ from pipeline.runner import Runner
 from pipeline.settings import (
     Settings,
     UsageError,
+    check_same_photos,
     check_workspace,
-    default_workspace,
     read_toml,
     settings_from,
     with_effects,
     with_source,
 )
-from pipeline.workspace import RUN_FILE, Workspace
+from pipeline.workspace import RUN_FILE, Workspace, default_workspace
 from stages.amounts import duration
 from stages.contract import StageError
 
@@ -51,6 +51,7 @@ def main() -> None:
     """Entry point of ``pipeline``. That nobody reads its words to the end (`pipeline … | head`) is no error; nor are
     letters that the terminal does not have."""
     code: int | str | None = 0
+    open_closed_streams()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
@@ -75,6 +76,8 @@ def run_command(words: Sequence[str]) -> int:
         return 0
     debug, as_json = "--debug" in words, "--json" in words
     signal.signal(signal.SIGTERM, _on_sigterm)
+    if hasattr(signal, "SIGHUP"):  # a run outlives its terminal, and so does what it starts
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         return _command(words[0])(words[1:])
     except UsageError as error:
@@ -147,6 +150,8 @@ def command_run(words: Sequence[str]) -> int:
         given = words_of.parse(words_of.RunArguments, "run", words, from_file)
     root, cameras = given.output or default_workspace(given.photos), given.cameras
     check_workspace(root, given.photos)
+    if given.output is None:
+        check_same_photos(Workspace(root), given.photos)
     if given.more is not None:
         recorded = _recorded_settings(Workspace.existing(root))
         given = words_of.parse(words_of.RunArguments, "run", words, recorded)

@@ -18,7 +18,8 @@ HEARTBEAT_SECONDS = 10.0  # plain output: one line at most this often, so that a
 
 
 class Display(Protocol):
-    """How the runner speaks. ``update`` and ``note`` may be called from any thread."""
+    """How the runner speaks. ``update`` and ``note`` may be called from any thread; an update before the first stage
+    has no line of its own."""
 
     def headline(self, text: str) -> None: ...
 
@@ -74,6 +75,16 @@ class Unread:
                 os.dup2(nowhere.fileno(), self._stream.fileno())
 
 
+def open_closed_streams() -> None:
+    """Let standard streams that were closed (``>&-``) lead nowhere; else whatever file is opened next is in their
+    place."""
+    for name in ("stdin", "stdout", "stderr"):
+        if getattr(sys, name) is None:
+            number = os.open(os.devnull, os.O_RDWR)  # the lowest that is free: that of the stream
+            os.set_inheritable(number, True)
+            setattr(sys, name, os.fdopen(number, "r" if name == "stdin" else "w"))
+
+
 class SilentDisplay:
     """Says nothing; for reading a workspace and for calls from Python."""
 
@@ -119,7 +130,7 @@ class PlainDisplay:
 
     def update(self, message: str, done: float | None = None) -> None:
         now = time.monotonic()
-        if now - self._last >= HEARTBEAT_SECONDS:
+        if self._stage and now - self._last >= HEARTBEAT_SECONDS:
             self._last = now
             share = "" if done is None else f" {100 * done:.0f} %"
             self._say(f"{self._stage:<10} …{share} {message}")
@@ -157,7 +168,7 @@ class JsonDisplay:
 
     def update(self, message: str, done: float | None = None) -> None:
         now = time.monotonic()
-        if now - self._last >= JSON_SECONDS:
+        if self._stage and now - self._last >= JSON_SECONDS:
             self._last = now
             self._event("progress", stage=self._stage, message=message, done=done)
 

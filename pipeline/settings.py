@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, get_args
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from pipeline.workspace import RUN_FILE
-from stages.contract import StageError, bounded
+from pipeline.workspace import RUN_FILE, Workspace, default_workspace, photo_set
+from stages.contract import bounded
 from stages.effects import Config as EffectsConfig
 from stages.evaluate import Config as EvaluateConfig
 from stages.ingest import Config as IngestConfig
@@ -106,7 +106,8 @@ def with_effects(settings: Settings, choices: Sequence[str]) -> Settings:
 
 def with_source(settings: Settings, photos: Path, cameras: Path | None) -> Settings:
     """The settings with PHOTOS (and known cameras, if any) filled in. Raises StageError where PHOTOS is unusable,
-    UsageError where the photo to render like is none of them: better now than after the training."""
+    UsageError where the photo to render like is none of them or the cameras to render are not there: better now than
+    after the training."""
     from stages.sources import find_source
 
     source = find_source(photos, cameras)
@@ -114,6 +115,8 @@ def with_source(settings: Settings, photos: Path, cameras: Path | None) -> Setti
     if like is not None and source.kind != "video" and like not in names:
         near = difflib.get_close_matches(like, names, n=3)
         raise UsageError(f"--like {like}: no photo has that name" + (f"; perhaps {', '.join(near)}" if near else ""))
+    if (rendered := settings.render.cameras) is not None and not rendered.is_file():
+        raise UsageError(f"--render.cameras {rendered}: there is no such file")
     given = None if cameras is None else cameras.absolute()
     imported = None if source.cameras is None else source.cameras.absolute()
     return settings.model_copy(
@@ -132,14 +135,16 @@ def check_workspace(root: Path, photos: Path) -> None:
         raise UsageError(f"-o {root}: that is a folder of photos; {better}")
 
 
-def default_workspace(photos: Path) -> Path:
-    """``photos.nerf`` in the current folder; for a transforms.json or an images/ folder, named after its parent, for a
-    video ``clip.nerf``."""
-    base = Path(os.path.abspath(photos))  # resolves "..", keeps the names of links
-    if base.suffix.lower() == ".json" or base.name == "images":
-        base = base.parent
-    elif base.is_file():
-        base = base.with_suffix("")
-    if base.name == "":
-        raise StageError("no workspace name", f"{photos} has no name to derive it from", "Give one with -o.")
-    return Path.cwd() / f"{base.name}.nerf"
+def check_same_photos(workspace: Workspace, photos: Path) -> None:
+    """Raises UsageError where a workspace that nobody named was made from another set of photos that is still there:
+    its results would make way for those of PHOTOS. Where the old one is gone, it was moved or renamed."""
+    from stages.sources import is_gone
+
+    recorded = workspace.read_run()["options"].get("ingest", {}).get("photos")
+    if not isinstance(recorded, str) or is_gone(Path(recorded)) or is_gone(photos):
+        return
+    before, now = photo_set(Path(recorded)), photo_set(photos)
+    if os.path.realpath(before) != os.path.realpath(now):
+        name = workspace.root.name
+        ways = f"-o another.nerf keeps them apart, -o {name} goes on in this one with the new photos"
+        raise UsageError(f"{name} was made from {before}, not from {now}; {ways}")

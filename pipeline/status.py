@@ -56,6 +56,8 @@ def status_of(workspace: Workspace, runner: Runner, stage: str, deep: bool = Fal
     except BadManifest as problem:
         return StageStatus(stage, "damaged", f"{problem}; `pipeline resume --verify` makes it again")
     if workspace.partial(stage, job.key).exists():
+        if process := workspace.at_work():
+            return StageStatus(stage, "partial", f"process {process} is at work in this workspace")
         command = stage if stage in ON_REQUEST else "resume"
         return StageStatus(stage, "partial", f"interrupted; `pipeline {command}` takes it up again")
     if last is not None:

@@ -28,6 +28,22 @@ COPIES = ".copies"  # names of what in output/ is no link but a copy, one a line
 _KEY = re.compile(rf"[0-9a-f]{{{KEY_LENGTH}}}(\.|$)")
 
 
+def photo_set(photos: Path) -> Path:
+    """What PHOTOS are called after: a transforms.json or an images/ folder after its parent."""
+    base = Path(os.path.abspath(photos))  # resolves "..", keeps the names of links
+    return base.parent if base.suffix.lower() == ".json" or base.name == "images" else base
+
+
+def default_workspace(photos: Path) -> Path:
+    """``photos.nerf`` in the current folder; for a video ``clip.nerf``."""
+    base = photo_set(photos)
+    if base.is_file():
+        base = base.with_suffix("")
+    if base.name == "":
+        raise StageError("no workspace name", f"{photos} has no name to derive it from", "Give one with -o.")
+    return Path.cwd() / f"{base.name}.nerf"
+
+
 class _RunFile(BaseModel):
     """run.json: of each stage its options, what was chosen for it by what was asked, and its key."""
 
@@ -51,7 +67,10 @@ class Workspace:
         """A workspace that was made before; raises StageError with words if ``root`` is not one, or has links in it."""
         if not (root / RUN_FILE).is_file():
             why = "there is no run.json in it" if root.is_dir() else "there is no such folder"
-            raise StageError(f"{root} is not a workspace", why, "Start one with: pipeline run PHOTOS")
+            hint = "Start one with: pipeline run PHOTOS"
+            if photo_set(root).name and root.exists() and ((named := default_workspace(root)) / RUN_FILE).is_file():
+                hint = f"The workspace that is called after it is {named.name}."
+            raise StageError(f"{root} is not a workspace", why, hint)
         _refuse_links(root)
         return cls(root)
 
@@ -66,9 +85,8 @@ class Workspace:
             (self.root / ".lock.pid").write_text(f"{os.getpid()}\n")
         except Timeout:
             why = f"process {self._holder()} holds its lock"
-            raise StageError(
-                f"{self.root} is in use", why, "Wait for it to end, or give another one with -o."
-            ) from None
+            hint = "Wait for it to end; `run` and `demo` can be given another one with -o."
+            raise StageError(f"{self.root} is in use", why, hint) from None
         except OSError as error:
             self._lock.release()
             raise self._cannot_write(error) from error
@@ -87,6 +105,18 @@ class Workspace:
             return (self.root / ".lock.pid").read_text().strip() or "unknown"
         except OSError:
             return "unknown"
+
+    def at_work(self) -> str | None:
+        """The process that works in it; None where none does, or who asks may not write there and cannot tell."""
+        if not (self.root / ".lock.pid").exists():  # a killed process leaves it, so the lock decides
+            return None
+        try:
+            with self._lock.acquire(timeout=0):
+                return None
+        except Timeout:
+            return self._holder()
+        except OSError:
+            return None
 
     def folder(self, stage: str, key: str) -> Path:
         """Where the finished result of ``stage`` under ``key`` lies."""
@@ -248,14 +278,23 @@ class Workspace:
 
     def stale_folders(self, keys: dict[str, str], stages: list[str]) -> list[Path]:
         """Stage folders that run.json does not use: other keys, abandoned partials, damaged ones. It uses the training
-        that the recorded one goes on from."""
+        that the recorded one goes on from, and a partial of the key until that is finished."""
         current = {self.folder(stage, key) for stage, key in keys.items()}
-        current |= {self.partial(stage, key) for stage, key in keys.items()}
+        current |= {self.partial(stage, key) for stage, key in keys.items() if not _is_whole(self.folder(stage, key))}
         after = self.read_run()["options"].get("train", {}).get("after")
         if isinstance(after, str):
             current.add(self.folder("train", after))
         found = (p for stage in stages if (self.root / stage).is_dir() for p in (self.root / stage).iterdir())
         return sorted(p for p in found if p.is_dir() and _KEY.match(p.name) and p not in current)  # others are not ours
+
+
+def _is_whole(folder: Path) -> bool:
+    """Whether a finished result lies there, by its sizes."""
+    try:
+        manifests.check_outputs(folder, manifests.read(folder))
+        return True
+    except (FileNotFoundError, BadManifest):
+        return False
 
 
 def _refuse_links(root: Path) -> None:

@@ -43,7 +43,7 @@ def load_backend(name: BackendName, device: str, progress: Progress | None = Non
     """The kernels, compiled for this machine; the first time takes some seconds, of which ``progress`` tells.
 
     Raises:
-        StageError: if Warp's kernels are asked for and do not run on ``device``.
+        StageError: if Warp's kernels are asked for and do not run on ``device``, or cannot be kept on its disk.
     """
     if name == "torch":
         from nerf.kernels import reference
@@ -55,7 +55,10 @@ def load_backend(name: BackendName, device: str, progress: Progress | None = Non
 
     if progress:
         progress.update("compiling kernels, once on each machine")
-    kernels.compile_kernels(device)
+    try:
+        kernels.compile_kernels(device)
+    except OSError as error:
+        raise StageError("cannot use the Warp kernels", _not_kept(error), "Or use --train.backend torch.") from error
     return kernels
 
 
@@ -65,8 +68,15 @@ def why_not_warp(device: str) -> str | None:
         with _without_native_stderr():
             from nerf.kernels import warp as kernels
     except (ImportError, OSError) as error:
+        if isinstance(error, OSError) and error.filename is not None:  # a library that does not load names none
+            return _not_kept(error)
         return f"warp-lang does not load here: {error}"
     return kernels.why_not(device)
+
+
+def _not_kept(error: OSError) -> str:
+    """Without a home that can be written to, compiled kernels have no place."""
+    return f"compiled kernels cannot be kept here ({error}); the variable WARP_CACHE_PATH can name another folder"
 
 
 @contextlib.contextmanager

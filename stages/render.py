@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from stages.amounts import duration, short_count
 from stages.contract import Inputs, Progress, StageConfig, StageError, StageResult
@@ -64,6 +64,12 @@ class Config(StageConfig):
         description="name of a photo to render as it was exposed, where photos differ; none: neutral",
     )
     save_frames: bool = Field(default=False, description="keep every frame as PNG in frames/")
+
+    @field_validator("cameras")
+    @classmethod
+    def _absolute(cls, cameras: Path | None) -> Path | None:
+        """Later commands may be given in another folder."""
+        return cameras and cameras.absolute()
 
 
 def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:

@@ -13,7 +13,8 @@ import pytest
 from PIL import Image
 
 from pipeline.cli import run_command
-from pipeline.settings import Settings, default_workspace
+from pipeline.settings import Settings
+from pipeline.workspace import default_workspace
 
 
 def test_help_names_every_command_and_stage(capsys: pytest.CaptureFixture[str]):

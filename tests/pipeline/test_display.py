@@ -2,6 +2,7 @@
 
 import json
 import os
+import subprocess
 import sys
 import threading
 from pathlib import Path
@@ -61,6 +62,59 @@ def test_a_run_goes_on_when_its_terminal_is_closed(monkeypatch: pytest.MonkeyPat
         terminal.flush()
         monkeypatch.undo()
     assert faults == []
+
+
+AT_WORK = """
+import os
+from pipeline import cli
+def at_work(words):
+    os.write(1, b"at work")
+    try:
+        os.read(0, 1)  # until the terminal is closed
+    except OSError:
+        pass
+    return os.system("kill -HUP $$")  # nor does it end what a stage started
+cli.command_doctor = at_work
+os._exit(cli.run_command(["doctor"]))
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "openpty"), reason="terminals of another kind")
+def test_the_end_of_its_terminal_does_not_end_a_run():
+    import fcntl
+    import termios
+
+    master, slave = os.openpty()
+    process = subprocess.Popen(
+        [sys.executable, "-c", AT_WORK],
+        stdin=slave,
+        stdout=slave,
+        stderr=slave,
+        start_new_session=True,
+        preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),  # the terminal that this session belongs to
+    )
+    os.close(slave)
+    shown = b""
+    while b"at work" not in shown:
+        shown += os.read(master, 4096)
+    os.close(master)
+    assert process.wait(timeout=20) == 0
+
+
+@pytest.mark.skipif(os.name == "nt", reason="a shell of another kind")
+@pytest.mark.parametrize("closed", [">&-", "2>&-", "<&- >&- 2>&-"])
+def test_streams_that_were_closed_are_no_error(closed: str, tmp_path: Path):
+    for words, code in (["--version", 0], [f"status {tmp_path}", 3]):
+        command = f"{sys.executable} -m pipeline {words} {closed}"
+        ended = subprocess.run(command, shell=True, capture_output=True, text=True)
+        assert ended.returncode == code and "Traceback" not in ended.stderr
+
+
+def test_updates_before_the_first_stage_have_no_line(capsys: pytest.CaptureFixture[str]):
+    for as_json in (False, True):
+        with choose_display(as_json) as display:
+            display.update("reading 3 photos")
+    assert capsys.readouterr().out == ""
 
 
 def test_events_are_lines_of_json(capsys: pytest.CaptureFixture[str]):

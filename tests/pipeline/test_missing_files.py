@@ -1,10 +1,13 @@
 """A file that a setting names is gone: the stage whose setting it is says so, and no other one minds."""
 
+import json
 from pathlib import Path
 from typing import Any
 
 import pytest
+from PIL import Image
 
+from pipeline.cli import run_command
 from pipeline.display import SilentDisplay
 from pipeline.failures import StageFailed
 from pipeline.runner import Runner
@@ -38,3 +41,22 @@ def test_without_the_photos_and_their_digest_no_report_is_made_up(
     monkeypatch.setattr(Runner, "_photos_digest", lambda _: (_ for _ in ()).throw(StageError("cannot read", "", "")))
     with pytest.raises(StageFailed, match="report: cannot read"):
         go(Machine(), 300.0, resume=True, alone=True, stages=("report",))
+
+
+@pytest.mark.parametrize("words", [["--render.cameras", "my.json"], ["--config", "options.toml"]], ids=["flag", "file"])
+def test_cameras_to_render_have_to_be_there_and_are_found_from_everywhere(
+    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "photos").mkdir()
+    for k in range(3):
+        Image.effect_noise((64, 48), 30 + k).save(tmp_path / f"photos/{k}.png")
+    (tmp_path / "options.toml").write_text("render.cameras = 'my.json'")
+    monkeypatch.chdir(tmp_path)
+    command = ["run", "photos", "--until", "ingest", *words]
+    assert run_command(command) == 2
+    assert f"--render.cameras {tmp_path}/my.json: there is no such file" in capsys.readouterr().err
+    assert not (tmp_path / "photos.nerf").exists()
+    (tmp_path / "my.json").write_text("{}")
+    assert run_command(command) == 0
+    run = json.loads((tmp_path / "photos.nerf/run.json").read_text())
+    assert run["options"]["render"]["cameras"] == str(tmp_path / "my.json")

@@ -1,4 +1,5 @@
-"""Options from a file, effects by name on the command line, and workspaces that would lie among the photos."""
+"""Options from a file, effects by name on the command line, and workspaces that would lie among the photos or are
+those of other photos."""
 
 from pathlib import Path
 
@@ -71,3 +72,42 @@ def test_a_workspace_beside_its_photos_is_one(tmp_path: Path, capsys: pytest.Cap
     assert [run_command(words), run_command(words)] == [0, 0]
     assert run_command(["run", str(tmp_path / "set"), "-o", str(tmp_path / "set")]) == 10
     assert "is a workspace" in capsys.readouterr().err
+
+
+def test_a_workspace_nobody_named_is_not_taken_over_by_other_photos(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    for k, scan in enumerate(("scan1", "scan2")):
+        (tmp_path / scan / "photos/images").mkdir(parents=True)
+        for n in range(3):
+            Image.effect_noise((64, 48), 30 + 9 * k + n).save(tmp_path / f"{scan}/photos/images/{n}.png")
+    (tmp_path / "link").symlink_to("scan1")
+    monkeypatch.chdir(tmp_path)
+
+    def run(photos: str, *words: str) -> int:
+        return run_command(["run", photos, "--until", "ingest", *words])
+
+    same = ["scan1/photos", "scan1/photos/images", "link/photos", str(tmp_path / "scan1/../scan1/photos/")]
+    assert [run(photos) for photos in same] == [0, 0, 0, 0]
+    assert run("nowhere/photos") == 10, "that is what is wrong with it"
+    before = (tmp_path / "photos.nerf/run.json").read_bytes()
+    capsys.readouterr()
+    assert run("scan2/photos") == 2
+    said = capsys.readouterr().err
+    assert f"photos.nerf was made from {tmp_path}/scan1/photos, not from {tmp_path}/scan2/photos; " in said
+    assert "-o another.nerf keeps them apart, -o photos.nerf goes on in this one" in said
+    assert (tmp_path / "photos.nerf/run.json").read_bytes() == before
+    assert [run("scan2/photos", "-o", "photos.nerf"), run("scan2/photos")] == [0, 0]
+    (tmp_path / "scan2").rename(tmp_path / "moved")
+    assert run("moved/photos") == 0
+
+
+def test_photos_given_one_by_one_are_told_from_wrong_options(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.chdir(tmp_path)
+    for name in ("a.jpg", "b.jpg", "c.jpg"):
+        (tmp_path / name).touch()
+    assert run_command(["run", "a.jpg", "b.jpg", "c.jpg", "--train.steps", "5"]) == 2
+    said = capsys.readouterr().err
+    assert said == "pipeline: b.jpg is one file too many; give the folder that holds the photos\n"

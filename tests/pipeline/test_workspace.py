@@ -5,12 +5,15 @@ import os
 import shutil
 import stat
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from PIL import Image
 
 from pipeline.cli import run_command
 from pipeline.manifests import Manifest, describe_outputs, outputs_digest
+from pipeline.status import status_of
 from pipeline.workspace import Workspace
 from stages.contract import StageError
 from stages.files import make_durable
@@ -82,11 +85,54 @@ def test_a_workspace_that_was_copied_without_its_links_is_one(tmp_path: Path):
     assert (again / "output/images").is_symlink() and (again / "output/mesh.ply").read_text() == "mesh 2"
 
 
+def test_a_stage_at_work_is_not_called_interrupted(tmp_path: Path):
+    runner: Any = SimpleNamespace(state={"keys": {}}, resolve=lambda *_, **__: SimpleNamespace(key=KEY))
+    asked = Workspace(tmp_path)
+    asked.partial("mesh", KEY).mkdir(parents=True)
+    with Workspace(tmp_path):
+        at_work = status_of(asked, runner, "mesh")
+    assert (at_work.state, at_work.text) == ("partial", f"process {os.getpid()} is at work in this workspace")
+    assert status_of(asked, runner, "mesh").text == "interrupted; `pipeline resume` takes it up again"
+
+
+def test_a_killed_process_is_not_at_work(tmp_path: Path):
+    asked = Workspace(tmp_path)
+    assert asked.at_work() is None
+    with Workspace(tmp_path):
+        assert asked.at_work() == str(os.getpid())
+    (tmp_path / ".lock.pid").write_text("1\n")
+    assert asked.at_work() is None
+    with Workspace(tmp_path):  # the question did not take the lock
+        pass
+
+
 def test_clean_takes_only_what_is_named_by_a_key(tmp_path: Path):
     for name in ("train/images", f"train/{KEY}", f"train/{KEY}.partial", f"train/{KEY}.bad"):
         (tmp_path / name).mkdir(parents=True)
     stale = Workspace(tmp_path).stale_folders({}, ["train"])
     assert [path.name for path in stale] == [KEY, f"{KEY}.bad", f"{KEY}.partial"]
+
+
+def test_clean_takes_an_abandoned_second_attempt_at_what_is_finished(tmp_path: Path):
+    workspace = Workspace(tmp_path)
+    workspace.partial("mesh", KEY).mkdir(parents=True)
+    assert workspace.stale_folders({"mesh": KEY}, ["mesh"]) == []
+    outputs = describe_outputs(tmp_path, ())
+    made = Manifest("mesh", 1, KEY, {}, {}, outputs, outputs_digest(outputs), {}, {}, "", 1.0, "now")
+    workspace.finish(workspace.partial("mesh", KEY), workspace.folder("mesh", KEY), made)
+    workspace.partial("mesh", KEY).mkdir()
+    assert workspace.stale_folders({"mesh": KEY}, ["mesh"]) == [workspace.partial("mesh", KEY)]
+
+
+def test_photos_in_place_of_their_workspace_are_told_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.chdir(tmp_path)
+    for folder in ("photos", "photos.nerf"):
+        (tmp_path / folder).mkdir()
+    (tmp_path / "photos.nerf/run.json").write_text("{}")
+    assert run_command(["status", "photos/"]) == 3
+    assert "try: The workspace that is called after it is photos.nerf." in capsys.readouterr().err
 
 
 def test_files_are_synced_where_that_takes_the_right_to_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -1,4 +1,6 @@
 import contextlib
+import errno
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -50,6 +52,22 @@ def test_otherwise_torch_is_chosen_and_the_reason_said(useless: None, progress) 
 def test_a_warp_that_does_not_load_is_no_failure(missing: None, progress) -> None:
     assert chosen_backend("cpu", progress) == "torch"
     assert progress.notes[0].startswith(NOTE + "warp-lang does not load here: import of nerf.kernels.warp halted")
+
+
+def test_where_kernels_cannot_be_kept_the_way_out_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "file").touch()
+    environment = {**os.environ, "WARP_CACHE_PATH": str(tmp_path / "file")}
+    code = "from stages.backend import chosen_backend as c, why_not_warp as w; print(c('cpu'), w('cpu'))"
+    answer = subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=environment, capture_output=True, text=True)
+    assert answer.stdout.startswith("torch compiled kernels cannot be kept here ([Errno "), answer.stderr
+    assert answer.stdout.endswith("; the variable WARP_CACHE_PATH can name another folder\n")
+
+    def full(device: str) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device", "/home/.cache")
+
+    monkeypatch.setattr(warp, "compile_kernels", full)
+    with pytest.raises(StageError, match=r"cannot be kept here .* WARP_CACHE_PATH .* --train.backend torch"):
+        load_backend("warp", "cpu")
 
 
 def test_why_not_says_what_is_wrong_with_a_gpu_alone(monkeypatch: pytest.MonkeyPatch) -> None:
