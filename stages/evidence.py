@@ -74,7 +74,7 @@ def scene_evidence(
     from nerf.evidence.exposure import exposure_evidence, fit_exposure, tone_evidence
     from nerf.evidence.media import media_evidence
     from nerf.evidence.scale import scale_evidence
-    from nerf.evidence.transients import transients_evidence
+    from nerf.evidence.transients import odd_photos, transients_evidence
     from nerf.evidence.view_dependence import view_dependence_evidence
     from nerf.evidence.vignetting import vignetting_evidence
     from stages.track_colours import look_at_photos
@@ -84,13 +84,14 @@ def scene_evidence(
         looked = look_at_photos(ingest, scene, points, progress)
         progress.update("fitting the photos' exposures")
         fit, tracks = fit_exposure(looked.tracks), looked.tracks
+        odd = odd_photos(tracks, fit, looked.expected)
     of = clock.timed(
         {
-            "exposure": lambda: exposure_evidence(fit, told_exposures(ingest, scene)),
+            "exposure": lambda: exposure_evidence(fit, told_exposures(ingest, scene), odd.much),
             "tone": lambda: tone_evidence(fit),
             "view_dependence": lambda: view_dependence_evidence(tracks, fit),
             "vignetting": lambda: vignetting_evidence(tracks, fit),
-            "transients": lambda: transients_evidence(tracks, fit, looked.expected),
+            "transients": lambda: transients_evidence(odd, fit),
             "scale": lambda: scale_evidence(tracks),
             "participating_media": lambda: media_evidence(tracks, fit),
             "blur": lambda: blur_evidence(looked.gradients),

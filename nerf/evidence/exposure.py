@@ -148,18 +148,24 @@ def _contrast(
     return slope, error, float(np.sqrt(np.median((size / total)[known])))
 
 
-def exposure_evidence(fit: ExposureFit, told: Float[np.ndarray, "views"] | None = None) -> Evidence:
+def exposure_evidence(
+    fit: ExposureFit,
+    told: Float[np.ndarray, "views"] | None = None,
+    odd: Bool[np.ndarray, "views"] | None = None,
+) -> Evidence:
     """Whether photos differ in exposure (or white balance): the deviation of gains over photos and channels, EV.
 
     The noise, that of one usual gain, is beside it; what all gains have is taken off in quadrature, so that noise alone
     is no difference. Photos whose noise is an effect itself do not count, for a few would hide the others' gains, or
-    pass for a difference. ``told`` is what the camera wrote of each photo's exposure (EV up to a constant, NaN where
-    nothing): a cross-check, which decides nothing because programs that develop photos change exposures and leave what
-    was written.
+    pass for a difference; nor do ``odd`` ones, in which something stands before many of their points
+    (nerf/evidence/transients.py) and draws their gains. ``told`` is what the camera wrote of each photo's exposure (EV
+    up to a constant, NaN where nothing): a cross-check, which decides nothing because programs that develop photos
+    change exposures and leave what was written.
     """
     if not fit.known.any():
         return unknown("EV", THRESHOLD_EV, fit.unknown_because, None)
-    counted = _well_measured(fit.known, fit.error.max(axis=1) / EV)
+    plain = fit.known if odd is None else _or_all(fit.known & ~odd, fit.known)
+    counted = _or_all(plain & (fit.error.max(axis=1) < THRESHOLD_EV * EV), plain)
     gain, error = fit.log_gain[counted] / EV, fit.error[counted] / EV
     noise = float(np.median(error))
     spread = float(np.sqrt(max(np.mean((gain - gain.mean(axis=0)) ** 2) - np.mean(error**2), 0.0)))
@@ -167,16 +173,16 @@ def exposure_evidence(fit: ExposureFit, told: Float[np.ndarray, "views"] | None 
     ratio = f"{span / noise:.0f} × their noise" if noise > 0 else "without noise"
     alone = int(np.count_nonzero(~fit.known))
     left_out = f"; {alone} photos share hardly any points with the others" if alone else ""
-    unsure = int(np.count_nonzero(fit.known & ~counted))
+    strange, unsure = int(np.count_nonzero(fit.known & ~plain)), int(np.count_nonzero(plain & ~counted))
+    left_out += f"; without {strange} photo{'s' * (strange > 1)} with something in the way" if strange else ""
     left_out += f"; {unsure} photos do not count, their gains are not known to {THRESHOLD_EV:.1g} EV" if unsure else ""
     checked = "" if told is None else _beside_told(gain.mean(axis=1), told[counted])
     return judged(spread, noise, THRESHOLD_EV, "EV", f"gains span {span:.2g} EV, {ratio}{left_out}{checked}")
 
 
-def _well_measured(known: Bool[np.ndarray, "views"], error_ev: Float[np.ndarray, "views"]) -> Bool[np.ndarray, "views"]:
-    """The photos whose noise is below the threshold; all that are known where fewer than two are."""
-    well = known & (error_ev < THRESHOLD_EV)
-    return well if np.count_nonzero(well) > 1 else known
+def _or_all(some: Bool[np.ndarray, "views"], every: Bool[np.ndarray, "views"]) -> Bool[np.ndarray, "views"]:
+    """Some of the photos; all where fewer than two are left."""
+    return some if np.count_nonzero(some) > 1 else every
 
 
 def _beside_told(gain: Float[np.ndarray, "known"], told: Float[np.ndarray, "known"]) -> str:
@@ -196,7 +202,7 @@ def tone_evidence(fit: ExposureFit) -> Evidence:
     if not known.any() or fit.brightness_spread == 0:
         return unknown("EV", THRESHOLD_EV, fit.unknown_because, False)
     scale = fit.brightness_spread / EV
-    counted = _well_measured(known, fit.contrast_error * scale)
+    counted = _or_all(known & (fit.contrast_error * scale < THRESHOLD_EV), known)
     contrast, error = fit.contrast[counted] * scale, fit.contrast_error[counted] * scale
     noise = float(np.median(error))
     spread = float(np.sqrt(max(np.mean(contrast**2) - np.mean(error**2), 0.0)))

@@ -5,6 +5,8 @@ a highlight or a false match. A passer-by shows where points are *expected*: pho
 see them, this one should, and has another colour there. Both are looked at, with the same rule.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -26,30 +28,50 @@ NEAR_DEG, NEAR_RATIO = 10.0, 1.3  # photos so close to each other hide the same 
 NEAR_APART = float(np.sqrt(1 + NEAR_RATIO**2 - 2 * NEAR_RATIO * np.cos(np.radians(NEAR_DEG))))
 
 
-def transients_evidence(tracks: TrackColours, fit: ExposureFit, expected: TrackColours | None) -> Evidence:
-    """The share of all points that photos show in another colour beyond what is usual for a photo, of those photos only
-    where it is much more than in the others (robust z). ``expected``: where photos should show points that they
-    have no observation of, its ``point`` numbered like that of ``tracks``."""
-    if not fit.known.any():
-        return unknown("share", THRESHOLD, fit.unknown_because, False)
+class Odd(NamedTuple):
+    """Of each photo (views,): the share of its points that it shows in another colour ``beyond`` what is usual for a
+    photo; that share's ``variance``; whether it is ``much`` more than in the others (robust z). ``seen``: whether
+    enough points are looked at in it; the rest is 0 where not."""
+
+    beyond: Float[np.ndarray, "views"]
+    variance: Float[np.ndarray, "views"]
+    much: Bool[np.ndarray, "views"]
+    seen: Bool[np.ndarray, "views"]
+
+
+def odd_photos(tracks: TrackColours, fit: ExposureFit, expected: TrackColours | None) -> Odd:
+    """Which photos show points in another colour than the others do. ``expected``: where photos should show points that
+    they have no observation of, its ``point`` numbered like that of ``tracks``. Of fewer than three none is odd."""
     looked = tracks if expected is None else _together(tracks, expected)
     known = fit.known[looked.view] & np.isin(looked.point, tracks.point[fit.used])
     looked = looked.only(known)
     outlier = _differs(looked, _usual_light(tracks, fit), fit)
-    seen = np.bincount(looked.view, minlength=looked.views)
-    enough = seen >= FEWEST_POINTS
-    if np.count_nonzero(enough) < 3:
+    points = np.bincount(looked.view, minlength=looked.views)
+    seen, none = points >= FEWEST_POINTS, np.zeros(looked.views)
+    if np.count_nonzero(seen) < 3:
+        return Odd(none, none, none > 0, none > 0)
+    points = np.where(seen, points, 1)
+    share = np.bincount(looked.view, outlier, looked.views) / points
+    usual = float(np.median(share[seen]))
+    deviation = OF_GAUSSIAN * float(np.median(np.abs(share - usual)[seen]))
+    count_noise = np.sqrt(np.maximum(usual * (1 - usual), 1 / points) / points)
+    beyond, variance = np.where(seen, share - usual, 0.0), np.where(seen, deviation**2 + count_noise**2, 0.0)
+    return Odd(beyond, variance, (beyond > SURE * np.sqrt(variance)) & (beyond > LEAST_EXCESS), seen)
+
+
+def transients_evidence(odd: Odd, fit: ExposureFit) -> Evidence:
+    """The share of all points that photos show in another colour beyond what is usual for a photo, of those photos only
+    where it is much more than in the others."""
+    if not fit.known.any():
+        return unknown("share", THRESHOLD, fit.unknown_because, False)
+    photos = int(np.count_nonzero(odd.seen))
+    if not photos:
         return unknown("share", THRESHOLD, "too few photos with enough points", False)
-    share = np.bincount(looked.view, outlier, looked.views)[enough] / seen[enough]
-    usual = float(np.median(share))
-    deviation = OF_GAUSSIAN * float(np.median(np.abs(share - usual)))
-    count_noise = np.sqrt(np.maximum(usual * (1 - usual), 1 / seen[enough]) / seen[enough])
-    excess = share - usual
-    odd = (excess > SURE * np.hypot(deviation, count_noise)) & (excess > LEAST_EXCESS)
-    found = float(np.sum(excess[odd]) / len(excess))
-    of_one = deviation**2 + count_noise**2  # where no photo is odd, one could have been overlooked
-    noise = float(np.sqrt(np.sum(of_one[odd]) if odd.any() else np.mean(of_one))) / len(excess)
-    words = f"{odd.sum()} of {len(odd)} photos show {found:.1%} of all points in another colour than the others"
+    found = float(np.sum(odd.beyond[odd.much]) / photos)
+    # where no photo is odd, one could have been overlooked
+    variance = np.sum(odd.variance[odd.much]) if odd.much.any() else np.mean(odd.variance[odd.seen])
+    noise = float(np.sqrt(variance)) / photos
+    words = f"{odd.much.sum()} of {photos} photos show {found:.1%} of all points in another colour than the others"
     return judged(found, noise, THRESHOLD, "share", words)
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from nerf.evidence import media, transients, view_dependence, vignetting
+from nerf.evidence.evidence import Evidence
 from nerf.evidence.exposure import EV, fit_exposure
 from nerf.evidence.tracks import TrackColours
 from nerf.srgb import linear_light
@@ -108,10 +109,15 @@ def passed_by(seed: int, share: float, photos: int = 2) -> tuple[TrackColours, T
     return seen.only(~expected), seen.only(expected)
 
 
+def passers_by(tracks: TrackColours, expected: TrackColours | None) -> Evidence:
+    fit = fit_exposure(tracks)
+    return transients.transients_evidence(transients.odd_photos(tracks, fit, expected), fit)
+
+
 def test_a_passer_by_in_few_photos_is_seen() -> None:
     for seed in SEEDS:
         tracks, expected = passed_by(seed, share=0.6)
-        found = transients.transients_evidence(tracks, fit_exposure(tracks), expected)
+        found = passers_by(tracks, expected)
         assert found.called_for is True, found
         assert found.words.startswith("2 of 14 photos show ")
 
@@ -119,7 +125,7 @@ def test_a_passer_by_in_few_photos_is_seen() -> None:
 def test_what_all_photos_have_is_no_passer_by() -> None:
     for seed in SEEDS:
         tracks, expected = passed_by(seed, share=0.0)
-        found = transients.transients_evidence(tracks, fit_exposure(tracks), expected)
+        found = passers_by(tracks, expected)
         assert found.called_for is False, found
 
 
@@ -176,8 +182,8 @@ def test_without_tracks_nothing_is_known() -> None:
     for found, decided in (
         (vignetting.vignetting_evidence(none, fit), False),
         (view_dependence.view_dependence_evidence(none, fit), None),
-        (transients.transients_evidence(none, fit, none), False),
-        (transients.transients_evidence(none, fit, None), False),
+        (passers_by(none, none), False),
+        (passers_by(none, None), False),
         (media.media_evidence(none, fit), False),
     ):
         assert found.called_for is decided and found.words.endswith(": nothing known")

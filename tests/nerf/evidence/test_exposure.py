@@ -56,6 +56,16 @@ def test_the_order_of_observations_and_the_names_of_points_change_nothing() -> N
     np.testing.assert_allclose(fit_exposure(renamed).log_gain, fit_exposure(tracks).log_gain, atol=1e-9)
 
 
+def test_photos_in_which_something_stands_before_the_points_do_not_count() -> None:
+    gain = np.zeros((12, 3))
+    gain[:3] = 0.5 * EV
+    fit, odd = fit_exposure(photographed_points(5, log_gain=gain)), np.arange(12) < 3
+    assert exposure_evidence(fit).called_for is True
+    found = exposure_evidence(fit, None, odd)
+    assert found.called_for is False and "; without 3 photos with something in the way" in found.words
+    assert exposure_evidence(fit, None, np.ones(12, bool)).statistic == exposure_evidence(fit).statistic
+
+
 @pytest.mark.parametrize("outliers", [0.0, 0.05])
 @pytest.mark.parametrize("noise", [0.003, 0.03])
 def test_equal_exposures_are_not_called_for(noise: float, outliers: float) -> None:
