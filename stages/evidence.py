@@ -97,11 +97,21 @@ def scene_evidence(
             "blur": lambda: blur_evidence(looked.gradients),
         }
     )
+    of["exposure"] = unless_pixels_differ(of["exposure"], of["scale"])
     of |= geometric_evidence(ingest, scene, points, uncertainty_px, clock)
     # What is trained begins with the gains: logarithms that differ in their last digits from processor to processor
     # must not make another field.
     gains = np.round(fit.log_gain, GAIN_DIGITS) + 0.0  # no -0
     return SceneEvidence(of, fit._replace(log_gain=gains), clock.seconds)
+
+
+def unless_pixels_differ(exposure: "Evidence", scale: "Evidence") -> "Evidence":
+    """What is told of exposure, left to a pilot where ``scale`` is seen: coarse pixels average what fine ones tell
+    apart, by which the gains of photos from very different distances differ, too (docs/numbers.md, "Effects")."""
+    if not (exposure.called_for and scale.called_for):
+        return exposure
+    words = f"{exposure.words}; photos from such different distances differ in that, too"
+    return exposure._replace(called_for=None, words=words)
 
 
 def told_exposures(ingest: Path, scene: "Scene") -> "np.ndarray":

@@ -9,7 +9,7 @@ import pytest
 
 from nerf.evidence.evidence import Evidence
 from nerf.scene import Camera, Scene, Similarity, View
-from stages.evidence import Clock, geometric_evidence, lens_evidence
+from stages.evidence import Clock, geometric_evidence, lens_evidence, unless_pixels_differ
 from stages.photos import Photo, write_photos
 from tests.stages.photo_scene import pose_towards_origin
 
@@ -88,6 +88,18 @@ def test_rows_are_late_by_pixels_of_a_photo_of_a_thousand(tmp_path: Path) -> Non
     assert geometric(tmp_path / "upright", 800, 0.0, 0.5, turned=True)["rolling_shutter"].called_for is True
     # eleven thousandths of the width are motion enough, however small the photo is: here they are 1.8 of its pixels
     assert geometric(tmp_path / "icon", 160, 0.0, 0.5)["rolling_shutter"].called_for is True
+
+
+@pytest.mark.parametrize("seen", [True, False])
+@pytest.mark.parametrize("called_for", [True, None, False])
+def test_gains_of_photos_from_very_different_distances_are_left_to_a_pilot(called_for: bool | None, seen: bool) -> None:
+    exposure = Evidence(0.2, "EV", 0.1, 0.01, called_for, "gains span 0.4 EV")
+    scale = Evidence(5.0 if seen else 2.0, "×", 4.0, 0.01, seen, "pixels differ")
+    found = unless_pixels_differ(exposure, scale)
+    if called_for and seen:
+        assert found.called_for is None and found.words.startswith("gains span 0.4 EV; photos from such different")
+    else:
+        assert found == exposure
 
 
 def candidate(group: int, model: str, error: float | None, chosen: bool = False) -> dict[str, Any]:
