@@ -8,7 +8,6 @@ import io
 import json
 import os
 import shutil
-import signal
 import sys
 import time
 import traceback
@@ -33,6 +32,7 @@ from pipeline.settings import (
     with_effects,
     with_source,
 )
+from pipeline.signals import Terminated, heed_signals
 from pipeline.workspace import RUN_FILE, Workspace, default_workspace
 from stages.amounts import duration
 from stages.contract import StageError
@@ -41,10 +41,6 @@ EXIT_DEFECT, EXIT_USAGE, EXIT_WORKSPACE, EXIT_INTERRUPT, EXIT_TERMINATED = 1, 2,
 
 GO_ON = "Finished stages are kept; `pipeline resume WORKSPACE` goes on."
 REPORT_IT = "Finished stages are kept. Please report it with the output of the same command and --debug."
-
-
-class Terminated(BaseException):
-    """SIGTERM arrived."""
 
 
 def main() -> None:
@@ -75,9 +71,7 @@ def run_command(words: Sequence[str]) -> int:
         print(machine.versions(("pipeline-nerf",))["pipeline-nerf"])
         return 0
     debug, as_json = "--debug" in words, "--json" in words
-    signal.signal(signal.SIGTERM, _on_sigterm)
-    if hasattr(signal, "SIGHUP"):  # a run outlives its terminal, and so does what it starts
-        signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    heed_signals()
     try:
         return _command(words[0])(words[1:])
     except UsageError as error:
@@ -106,10 +100,6 @@ def run_command(words: Sequence[str]) -> int:
         what = f"a defect of this program, not of your photos: {type(error).__name__}: {error}"
         _say(what, "it should not happen", REPORT_IT, as_json)
         return EXIT_DEFECT
-
-
-def _on_sigterm(*_: object) -> None:
-    raise Terminated
 
 
 def _say(what: str, why: str, hint: str, as_json: bool) -> None:

@@ -1,7 +1,6 @@
 """Faults by the dozen: what the tests of this folder do a few times and ``python -m tests.drills`` many times."""
 
 import random
-import re
 import shutil
 import signal
 from collections import Counter
@@ -13,8 +12,6 @@ from pipeline.chain import STAGES
 from tests.drills.drill import Prepare, Program, copy_workspace, results, run_words
 
 EXIT_CODES = {signal.SIGINT: 130, signal.SIGTERM: 143}
-# Python's own words where one of several interrupts meets the very end of an import: that one is lost, no other.
-IN_IMPORT = re.compile(r"(?sm)Exception ignored in: <function _get_module_lock.*?^KeyboardInterrupt: \n")
 
 
 @dataclass
@@ -122,7 +119,7 @@ def unclean(program: Program, number: signal.Signals, workspace: Path) -> list[s
     faults = []
     if program.wait() != EXIT_CODES[number]:
         faults.append(f"exit code {program.wait()}")
-    if complaints := IN_IMPORT.sub("", program.complaints):
+    if complaints := program.complaints:
         faults.append(f"it complained: {complaints}")
     if (last := program.events()[-1]) | {"why": "", "hint": ""} != {
         "event": "error", "stage": None, "what": "stopped", "why": "", "hint": ""

@@ -1,0 +1,48 @@
+"""How a command is stopped from outside: Ctrl-C raises KeyboardInterrupt, SIGTERM :class:`Terminated`, and neither gets
+lost; a terminal that is closed stops nothing."""
+
+import signal
+import sys
+import threading
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from types import FrameType
+
+LATER = 0.05  # seconds
+
+
+class Terminated(BaseException):
+    """SIGTERM arrived."""
+
+
+def heed_signals() -> None:
+    """From now on, for the whole process."""
+    signal.signal(signal.SIGTERM, _terminate)
+    if hasattr(signal, "SIGHUP"):  # a run outlives its terminal, and so does what it starts
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    sys.unraisablehook = _send_again
+
+
+def _terminate(number: int, frame: "FrameType | None") -> None:
+    raise Terminated
+
+
+def _send_again(ignored: "sys.UnraisableHookArgs") -> None:
+    """Python has places where it ignores whatever is raised, the end of an import or a finaliser, and a signal may
+    arrive in one. It is sent once more, when such a place has been left."""
+    number = {KeyboardInterrupt: signal.SIGINT, Terminated: signal.SIGTERM}.get(ignored.exc_type)
+    if number is None:
+        sys.__unraisablehook__(ignored)
+        return
+    again = threading.Timer(LATER, _send, (number,))
+    again.daemon = True
+    again.start()
+
+
+def _send(number: signal.Signals) -> None:
+    main = threading.main_thread().ident
+    if hasattr(signal, "pthread_kill") and main is not None:
+        signal.pthread_kill(main, number)  # wakes it, too, where it waits
+    else:
+        signal.raise_signal(number)

@@ -1,0 +1,47 @@
+"""Signals that arrive where Python ignores what is raised."""
+
+import signal
+import subprocess
+import sys
+
+import pytest
+
+STRUCK_IN_A_FINALISER = """
+import signal, sys, time
+from pipeline.signals import Terminated, heed_signals
+
+heed_signals()
+
+class Place:
+    def __del__(self):
+        signal.raise_signal(signal.Signals(int(sys.argv[1])))
+
+try:
+    Place()
+    time.sleep(20)
+except (KeyboardInterrupt, Terminated) as ending:
+    print(type(ending).__name__)
+"""
+
+
+@pytest.mark.parametrize(("number", "name"), [(signal.SIGINT, "KeyboardInterrupt"), (signal.SIGTERM, "Terminated")])
+def test_a_signal_that_python_ignores_arrives_all_the_same(number: signal.Signals, name: str) -> None:
+    command = [sys.executable, "-c", STRUCK_IN_A_FINALISER, str(int(number))]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=15, check=True)
+    assert (ended.stdout, ended.stderr) == (f"{name}\n", "")
+
+
+def test_other_exceptions_that_python_ignores_are_told_as_ever() -> None:
+    program = """
+from pipeline.signals import heed_signals
+
+heed_signals()
+
+class Place:
+    def __del__(self):
+        raise ValueError("lost")
+
+Place()
+"""
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=15, check=True)
+    assert "Exception ignored in" in ended.stderr and "ValueError: lost" in ended.stderr
