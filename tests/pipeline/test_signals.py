@@ -10,6 +10,7 @@ STRUCK_IN_A_FINALISER = """
 import signal, sys, time
 from pipeline.signals import Terminated, heed_signals
 
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs begin with SIGINT ignored
 heed_signals()
 
 class Place:
