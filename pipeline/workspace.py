@@ -170,12 +170,8 @@ class Workspace:
 
     def complete(self, partial: Path, folder: Path, key: str) -> Manifest | None:
         """Finish a partial folder that was killed after its manifest was written; None where there is none."""
-        try:
-            manifest = manifests.read(partial)
-            manifests.check_outputs(partial, manifest)
-        except (FileNotFoundError, BadManifest):
-            return None
-        if manifest.key != key:
+        manifest = _whole(partial)
+        if manifest is None or manifest.key != key:
             return None
         self.finish(partial, folder, manifest)
         return manifest
@@ -280,7 +276,7 @@ class Workspace:
         """Stage folders that run.json does not use: other keys, abandoned partials, damaged ones. It uses the training
         that the recorded one goes on from, and a partial of the key until that is finished."""
         current = {self.folder(stage, key) for stage, key in keys.items()}
-        current |= {self.partial(stage, key) for stage, key in keys.items() if not _is_whole(self.folder(stage, key))}
+        current |= {self.partial(stage, key) for stage, key in keys.items() if _whole(self.folder(stage, key)) is None}
         after = self.read_run()["options"].get("train", {}).get("after")
         if isinstance(after, str):
             current.add(self.folder("train", after))
@@ -288,13 +284,14 @@ class Workspace:
         return sorted(p for p in found if p.is_dir() and _KEY.match(p.name) and p not in current)  # others are not ours
 
 
-def _is_whole(folder: Path) -> bool:
-    """Whether a finished result lies there, by its sizes."""
+def _whole(folder: Path) -> Manifest | None:
+    """The manifest of a result that is whole, by its sizes; None where there is none."""
     try:
-        manifests.check_outputs(folder, manifests.read(folder))
-        return True
+        manifest = manifests.read(folder)
+        manifests.check_outputs(folder, manifest)
     except (FileNotFoundError, BadManifest):
-        return False
+        return None
+    return manifest
 
 
 def _refuse_links(root: Path) -> None:
