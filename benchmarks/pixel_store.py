@@ -27,7 +27,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from nerf.randomness import generator
+from nerf.pixel_order import PixelOrder
 from nerf.ray_bank import RayBank
 from nerf.scene import Camera, Scene, Similarity, View
 from stages import pixel_store
@@ -93,9 +93,11 @@ def milliseconds(work: Callable[[], object], repeats: int) -> str:
 
 def draw(bank: RayBank, where: str, repeats: int = REPEATS) -> None:
     """Time batches of rays."""
-    random = generator("cpu", 0)
+    order = PixelOrder(bank.drawable, 0, bank.device)
     for count in BATCHES:
-        print(f"{count} rays, {where:<16}{milliseconds(lambda n=count: bank.sample(n, random), repeats)}")
+        places = itertools.count(step=count)
+        taken = milliseconds(lambda n=count, p=places: bank.lookup(bank.nth(order.take(next(p), n))), repeats)
+        print(f"{count} rays, {where:<16}{taken}")
 
 
 def train(ingest: Path, scene: Scene, downscale: float) -> str:

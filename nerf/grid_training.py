@@ -19,6 +19,7 @@ from nerf.kernels import BOX
 from nerf.metrics import psnr
 from nerf.model import Rendering
 from nerf.parallel import in_order
+from nerf.pixel_order import PixelOrder
 from nerf.randomness import generator
 from nerf.ray_bank import RayBank
 from nerf.rays import Rays
@@ -155,6 +156,8 @@ class GridTrainer:
             tuple(tensor[first:end] for tensor in tables) for first, end in pairwise(model.layout.first_rows)
         ]
         self.samples_per_ray = torch.tensor(FIRST_SAMPLES_PER_RAY, dtype=torch.float64)
+        self.order = PixelOrder(self.bank.drawable, settings.seed, bank.device)
+        self.drawn = torch.tensor(0)  # pixels of that order so far; steps differ in how many they take
 
     def _usable(self) -> Bool[Tensor, "cache"] | None:
         """Known only where points tell where foregrounds begin, in folded space: a box is carved beforehand."""
@@ -173,19 +176,20 @@ class GridTrainer:
             self.cache.refresh(step, generator(device, self.settings.seed, step, self.settings.chunks))
         samples = sum(len(each.points) for each in parts)
         rays *= self.settings.chunks
+        self.drawn += self._of_photos(rays, share)
         self.samples_per_ray.mul_(MEMORY).add_((1 - MEMORY) * samples / rays)
         return StepResult(loss, psnr(error), rays, samples, sum(each.densities for each in parts))
 
     def state(self) -> dict[str, Tensor]:
         """Weights and cache bits as ``model.<name>``, what is learnt of photos as ``photo.<name>``, Adam's moments as
-        ``mean.<name>`` and ``square.<name>``, the cache's thickness, the mean number of samples per ray, and the
-        field's settings, to know it by."""
+        ``mean.<name>`` and ``square.<name>``, the cache's thickness, the mean number of samples per ray, how
+        many pixels were drawn, and the field's settings, to know it by."""
         return (
             {f"model.{name}": tensor for name, tensor in self.model.state_dict().items()}
             | {f"photo.{name}": tensor for name, tensor in self.photo_parameters.items()}
             | {f"mean.{name}": tensor for name, tensor in self.mean.items()}
             | {f"square.{name}": tensor for name, tensor in self.square.items()}
-            | {"thickness": self.cache.thickness, "samples_per_ray": self.samples_per_ray}
+            | {"thickness": self.cache.thickness, "samples_per_ray": self.samples_per_ray, "drawn": self.drawn}
             | {"settings": torch.tensor(astuple(self.model.settings), dtype=torch.float64)}
         )
 
@@ -209,8 +213,9 @@ class GridTrainer:
         device = self.bank.device
         random = generator(device, self.settings.seed, step, chunk)
         # Shared out over the chunks, which are small where cores are many and the field is young.
-        to_points = (chunk + 1) * count // GUIDED_EVERY - chunk * count // GUIDED_EVERY if self._is_guided(share) else 0
-        pixel, distance = self.bank.draw(count - to_points, random), torch.zeros(count, device=device)
+        first, end = self._of_photos(chunk * count, share), self._of_photos((chunk + 1) * count, share)
+        pixel = self.bank.nth(self.order.take(int(self.drawn) + first, end - first))
+        to_points, distance = count - len(pixel), torch.zeros(count, device=device)
         if to_points:
             of_points, distance[-to_points:] = self.bank.draw_known(to_points, random)
             pixel = torch.cat([pixel, of_points])
@@ -222,6 +227,10 @@ class GridTrainer:
         target = colour if alpha is None else torch.lerp(background, colour, alpha[:, None])
         jitter, offset = torch.rand(2, count, generator=random, device=device)
         return GridBatch(rays, target, background, jitter, offset, view, distance)
+
+    def _of_photos(self, rays: int, share: float) -> int:
+        """How many of so many rays run through pixels of all the photos; the others run to sparse points."""
+        return rays - rays // GUIDED_EVERY if self._is_guided(share) else rays
 
     def _is_guided(self, share: float) -> bool:
         return self.bank.known is not None and self.settings.depth_loss * depth_factor(share) > 0

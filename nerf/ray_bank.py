@@ -93,7 +93,7 @@ class RayBank(NamedTuple):
         return len(self.pixels) if self.runs is None else int(self.runs[0, -1])
 
     def without(self, ignored: Sequence[Bool[Tensor, "_ _"] | None]) -> "RayBank":
-        """This bank with pixels that :meth:`sample` never draws: per view, (height, width) True where the photo is to
+        """This bank with pixels that :meth:`draw` never gives: per view, (height, width) True where the photo is to
         be ignored, None where all of it is used. Raises ValueError if no pixel is left."""
         if not any(mask is not None and mask.any() for mask in ignored):
             return self
@@ -154,14 +154,13 @@ class RayBank(NamedTuple):
         bearing = torch.addcmul(torch.addcmul(patch[:3], patch[3:6], u), patch[6:], v)
         return bearing / bearing.square().sum(0).sqrt_()
 
-    def sample(self, count: int, generator: torch.Generator) -> Drawn:
-        """:meth:`lookup` of ``count`` pixels drawn uniformly from those that may be, with replacement."""
-        return self.lookup(self.draw(count, generator))
-
     def draw(self, count: int, generator: torch.Generator) -> Int[Tensor, "rays"]:
         """``count`` pixels drawn uniformly from those that may be, with replacement."""
-        drawn = torch.randint(self.drawable, (count,), generator=generator, device=self.device)
-        return drawn if self.runs is None else _in_runs(self.runs, drawn)
+        return self.nth(torch.randint(self.drawable, (count,), generator=generator, device=self.device))
+
+    def nth(self, number: Int[Tensor, "rays"]) -> Int[Tensor, "rays"]:
+        """The pixels that have these numbers, from 0 on, among those that may be drawn."""
+        return number if self.runs is None else _in_runs(self.runs, number)
 
     def draw_known(self, count: int, generator: torch.Generator) -> tuple[Int[Tensor, "rays"], Float[Tensor, "rays"]]:
         """``count`` of the pixels whose distance is known, drawn uniformly with replacement, and their distances."""
@@ -170,7 +169,7 @@ class RayBank(NamedTuple):
         return self.known.index_select(0, drawn), self.distance.index_select(0, drawn)
 
     def may_be_drawn(self, pixel: Int[Tensor, "*rays"]) -> Bool[Tensor, "*rays"]:
-        """Whether :meth:`sample` may draw these pixels."""
+        """Whether :meth:`draw` may give these pixels."""
         if self.runs is None:
             return torch.ones_like(pixel, dtype=torch.bool)
         run = torch.searchsorted(self.runs[1].contiguous(), pixel.flatten(), right=True).sub_(1).clamp_(min=0)

@@ -17,6 +17,7 @@ from nerf.metrics import psnr
 from nerf.model import RadianceModel, Rendering
 from nerf.paper import PaperNerf
 from nerf.parallel import in_order
+from nerf.pixel_order import PixelOrder
 from nerf.randomness import generator
 from nerf.ray_bank import RayBank
 from nerf.rays import Rays
@@ -150,6 +151,7 @@ class PaperTrainer:
         self.model = model
         self.bank = bank
         self.settings = settings
+        self.order = PixelOrder(bank.drawable, settings.seed, bank.device)
         self.photo_rays, self.photo_colours = photo_rays, photo_colours
         self.photo_parts = [each for each in (photo_rays, photo_colours) if each.parameters]
         self.photo_parameters = {**photo_rays.parameters, **photo_colours.parameters}
@@ -164,7 +166,7 @@ class PaperTrainer:
     def step(self, step: int, share: float, rate_scale: float = 1.0) -> StepResult:
         """One batch, one update. Raises NonFinite before the update, leaving model and optimiser as they were."""
         with part("batch"):
-            batch = self._batch(generator(self.bank.device, self.settings.seed, step))
+            batch = self._batch(step)
         device = self.bank.device
         starts = range(0, self.settings.batch_rays, CHUNK_RAYS.get(device.type, self.settings.batch_rays))
         parts = list(in_order(partial(self._part, batch, step), starts, device))
@@ -242,8 +244,10 @@ class PaperTrainer:
     def _backward_work(self, rays: int) -> Work:
         return Work(products=self.model.fine.products_backward * self.model.settings.queries_per_ray * rays)
 
-    def _batch(self, random: torch.Generator) -> Batch:
-        rays, colour, alpha, view = self.bank.sample(self.settings.batch_rays, random)
+    def _batch(self, step: int) -> Batch:
+        random = generator(self.bank.device, self.settings.seed, step)
+        count = self.settings.batch_rays
+        rays, colour, alpha, view = self.bank.lookup(self.bank.nth(self.order.take(step * count, count)))
         if self.settings.background == "random":
             background = torch.rand(3, generator=random, device=self.bank.device)
         else:

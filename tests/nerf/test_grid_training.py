@@ -216,7 +216,7 @@ def test_a_density_cache_of_an_unbounded_scene_has_finite_steps_everywhere() -> 
 
 def unequal_bank() -> RayBank:
     """The disc on black from one place twice, the second time at half the light."""
-    bank = small_bank()
+    bank = small_bank(40)
     half = len(bank.pixels) // 2
     colour = bank.pixels[:half, :3].where(bank.pixels[:half, 3:] > 0, 0)
     darker = (255 * expose(colour / 255, torch.full((3,), -math.log(2)))).round().byte()

@@ -44,7 +44,7 @@ def test_the_fourth_channel_is_alpha() -> None:
 def test_samples_are_uniform_over_pixels_whatever_the_sizes_of_the_photos() -> None:
     bank, *_ = scattered()
     count = 38_000  # a thousand for each of the 38 pixels
-    near = bank.sample(count, generator("cpu", 0))[0].near
+    near = bank.lookup(bank.draw(count, generator("cpu", 0))).rays.near
     for view, (height, width) in enumerate(SIZES):
         expected = count * height * width / 38
         assert abs((near == view + 1).sum() - expected) < 4 * expected**0.5
@@ -52,9 +52,8 @@ def test_samples_are_uniform_over_pixels_whatever_the_sizes_of_the_photos() -> N
 
 def test_samples_depend_on_the_generator_alone() -> None:
     bank, *_ = scattered()
-    first, second, other = (bank.sample(20, generator("cpu", seed)) for seed in (1, 1, 2))
-    assert torch.equal(first[0].directions, second[0].directions)
-    assert not torch.equal(first[0].directions, other[0].directions)
+    first, second, other = (bank.draw(20, generator("cpu", seed)) for seed in (1, 1, 2))
+    assert torch.equal(first, second) and not torch.equal(first, other)
 
 
 def test_a_photo_with_fewer_pixels_than_its_camera_has_bearings_is_refused() -> None:
@@ -140,18 +139,18 @@ def test_ignored_pixels_are_never_drawn_and_the_others_alike() -> None:
     ignored[1:, 1:4] = True
     masked = bank.without([ignored, torch.ones(SIZES[1], dtype=torch.bool), None])
     used = torch.cat([photos[0][~ignored], photos[2].flatten(0, 1)]).float() / 255
-    drawn = masked.sample(24_000, generator("cpu", 0))[1]  # a thousand for each of the 24 pixels
+    drawn = masked.lookup(masked.draw(24_000, generator("cpu", 0))).colour  # a thousand for each of the 24 pixels
     counts = (drawn[:, None] == used).all(-1).sum(0)
     assert len(used) == 24 and counts.sum() == 24_000
+    assert torch.equal(masked.lookup(masked.nth(torch.arange(24))).colour, used)
     assert (counts - 1000).abs().max() < 4 * 1000**0.5
 
 
 def test_without_masks_the_same_pixels_are_drawn_as_ever() -> None:
     bank, *_ = scattered()
     pixel = torch.randint(38, (20,), generator=generator("cpu", 3))
-    expected, drawn = bank.lookup(pixel), bank.without([None] * 3).sample(20, generator("cpu", 3))
-    assert torch.equal(drawn[0].directions, expected[0].directions) and torch.equal(drawn[1], expected[1])
-    assert bank.to("cpu").runs is None
+    assert torch.equal(bank.without([None] * 3).draw(20, generator("cpu", 3)), pixel)
+    assert torch.equal(bank.nth(pixel), pixel) and bank.to("cpu").runs is None
 
 
 def test_known_distances_are_drawn_with_their_pixels_as_often_as_each_other() -> None:

@@ -55,7 +55,7 @@ ELSEWHERE = {
 }
 NO_FORMULA = {
     "nerf/scene.py", "nerf/model.py", "nerf/parallel.py", "nerf/randomness.py", "nerf/kernels/reference.py",
-    "nerf/stopwatch.py", "nerf/machine_rates.py",
+    "nerf/stopwatch.py", "nerf/machine_rates.py", "nerf/pixel_order.py",
 }  # fmt: skip
 # Measured as the rows of the functions they repeat, or measuring themselves.
 REPEATED = ("nerf/kernels/warp/", "nerf/numerics/")

@@ -12,6 +12,8 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from nerf.parallel import workers
+
 wp.config.log_level = wp.LOG_ERROR  # a machine without a GPU is no news, nor is each module compiled
 # Else every kernel on x86, with tiles or without, notes in one static pointer where its stack is: threads race for it
 # (seen to crash in debug mode). None means: on the stack only where a register of the thread holds that pointer.
@@ -44,7 +46,7 @@ def why_not(device: str) -> str | None:
 def compile_kernels(device: str) -> None:
     """Have all kernels ready on ``device``: seconds the first time, afterwards they come from the user's cache."""
     with _recording:
-        wp.load_module(PACKAGE, device, recursive=True, max_workers=torch.get_num_threads())
+        wp.load_module(PACKAGE, device, recursive=True, max_workers=workers())
 
 
 class _Array(NamedTuple):

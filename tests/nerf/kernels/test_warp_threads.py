@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 import torch
+import warp as wp
 from torch import Tensor
 
 from nerf.grid_field import GridField, GridSettings
@@ -19,6 +20,7 @@ from nerf.grid_training import GridTrainer, GridTrainerSettings
 from nerf.kernels import Lattice, grid_layout, warp
 from nerf.kernels.cache import occupied
 from nerf.model import Rendering
+from nerf.parallel import take_over_cores
 from nerf.randomness import generator
 from nerf.ray_bank import RayBank, build_ray_bank
 from nerf.rays import Rays
@@ -42,6 +44,17 @@ def use_cores(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[int], None]
 
     yield use
     torch.set_num_threads(before)
+
+
+def test_kernels_are_compiled_on_all_cores_when_torch_has_given_them_up(
+    use_cores: Callable[[int], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[int] = []
+    monkeypatch.setattr(wp, "load_module", lambda *_, max_workers, **__: asked.append(max_workers))
+    use_cores(3)
+    take_over_cores()
+    warp.compile_kernels("cpu")
+    assert torch.get_num_threads() == 1 and asked == [3]
 
 
 def noise_bank() -> RayBank:

@@ -1,0 +1,40 @@
+"""The order of the pixels: each once an epoch, evenly, and whatever the order of asking."""
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from nerf.pixel_order import STRATUM, PixelOrder
+
+
+@pytest.mark.parametrize("count", [STRATUM, 12 * STRATUM, 701 * STRATUM])
+def test_every_epoch_has_every_number_once_in_another_order(count: int) -> None:
+    epochs = PixelOrder(count, 3, "cpu").take(0, 3 * count).view(3, count)
+    assert all(torch.equal(epoch.sort().values, torch.arange(count)) for epoch in epochs)
+    assert not torch.equal(epochs[0], epochs[1]) and not torch.equal(epochs[1], epochs[2])
+
+
+@given(count=st.integers(1, 5 * STRATUM))
+def test_of_other_counts_an_epoch_has_some_numbers_twice_at_most(count: int) -> None:
+    epoch = -(-count // STRATUM) * STRATUM
+    often = PixelOrder(count, 0, "cpu").take(0, epoch).bincount(minlength=count)
+    assert len(often) == count and often.sum() == epoch
+    assert often.max() - often.min() <= 1
+
+
+@given(data=st.data(), count=st.sampled_from([7, 3 * STRATUM, 20 * STRATUM + 5]))
+def test_a_place_has_its_number_however_it_is_asked_for(data: st.DataObject, count: int) -> None:
+    first = data.draw(st.integers(0, 5 * count))
+    takes = data.draw(st.lists(st.integers(0, 2 * count), min_size=1, max_size=4))
+    whole, order = PixelOrder(count, 1, "cpu").take(first, sum(takes)), PixelOrder(count, 1, "cpu")
+    starts = torch.tensor([first, *takes[:-1]]).cumsum(0).tolist()
+    parts = [order.take(start, each) for start, each in reversed(list(zip(starts, takes, strict=True)))]
+    assert torch.equal(torch.cat(parts[::-1]), whole)
+
+
+def test_a_round_takes_one_of_every_stratum_and_seeds_differ() -> None:
+    first, other = (PixelOrder(1000 * STRATUM, seed, "cpu").take(0, 1000) for seed in (0, 1))
+    assert torch.equal((first // STRATUM).sort().values, torch.arange(1000))
+    assert not torch.equal(first, other)
+    assert (first % STRATUM).bincount(minlength=STRATUM).max() < 20, "each stands somewhere else in its stratum"
