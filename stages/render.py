@@ -12,7 +12,7 @@ from stages.amounts import duration, short_count
 from stages.contract import Inputs, Progress, StageConfig, StageError, StageResult
 from stages.files import read_json, read_scene, write_json, write_png
 from stages.render_path import CameraPath, PathKind, fitted_path, path_from_file, path_rays, usual_path
-from stages.render_plan import LEAST_WIDTH
+from stages.render_plan import LEAST_WIDTH, even_width
 from stages.spread import spread
 
 if TYPE_CHECKING:
@@ -70,6 +70,12 @@ class Config(StageConfig):
     def _absolute(cls, cameras: Path | None) -> Path | None:
         """Later commands may be given in another folder."""
         return cameras and cameras.absolute()
+
+    @field_validator("width")
+    @classmethod
+    def _even(cls, width: int | None) -> int | None:
+        """Videos have no odd sides."""
+        return width and even_width(width)
 
 
 def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:

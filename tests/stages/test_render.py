@@ -120,6 +120,15 @@ def test_frames_are_kept_and_depth_left_out_on_request(inputs, progress) -> None
     assert [file.name for file in sorted((inputs["render"] / "frames").iterdir())] == [f"{i:05d}.png" for i in range(3)]
 
 
+def test_odd_widths_are_rounded_whatever_else_is_given(inputs, progress, tmp_path: Path) -> None:
+    write_json(tmp_path / "t.json", transforms(scene_with(ring(5))))
+    for given in ({}, {"frames": 3}, {"cameras": tmp_path / "t.json"}):
+        assert render.plan(render.Config.model_validate({"width": 41, **given}), inputs, progress).width == 40
+    assert render.Config(width=17).width == 16 and render.Config(width=640).width == 640
+    run(inputs, progress, frames=3, width=41)
+    assert read_video(inputs["render"] / "video.mp4")[0].shape == (3, 30, 40, 3)
+
+
 def test_plan_answers_every_open_question(inputs, progress) -> None:
     config = render.plan(render.Config(), inputs, progress)
     assert (config.path, config.frames, config.width, config.fps) == ("orbit", 6, 140, 2)
