@@ -3,6 +3,7 @@
 import difflib
 import time
 from collections.abc import Iterator
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -228,17 +229,21 @@ def _write(renderings: "Iterator[Rendering]", path: CameraPath, config: Config, 
         (folder / "frames").mkdir()
     waiting = folder / "inverse_depth.tmp"
     # Written and not mapped: on a full disk a write raises OSError, where a mapping would kill the process.
-    with waiting.open("wb") as depths, video_writer(folder / "video.mp4", width, height, config.fps) as add:
+    with (
+        waiting.open("wb") if config.depth else nullcontext() as depths,
+        video_writer(folder / "video.mp4", width, height, config.fps) as add,
+    ):
         for index, rendering in enumerate(renderings):
             frame = (rendering.colour.clamp(0, 1) * 255).round().byte().numpy()
             add(frame)
-            depths.write((1 / rendering.depth.numpy()).astype(np.float16).data)
+            if depths is not None:
+                depths.write((1 / rendering.depth.numpy()).astype(np.float16).data)
             if config.save_frames:
                 write_png(folder / "frames" / f"{index:05d}.png", frame)
     if config.depth:
         inverse = np.memmap(waiting, np.float16, "r", shape=(len(path.cameras), height, width))
         _write_depth(inverse, folder / "depth.mp4", config.fps)
-    waiting.unlink()
+        waiting.unlink()
     return ["video.mp4"] + ["depth.mp4"] * config.depth + ["frames"] * config.save_frames
 
 

@@ -1,5 +1,7 @@
 import json
 import weakref
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -118,6 +120,21 @@ def test_frames_are_kept_and_depth_left_out_on_request(inputs, progress) -> None
     outputs = run(inputs, progress, frames=3, width=40, depth=False, save_frames=True).outputs
     assert set(outputs) == {"video.mp4", "path.json", "frames"}
     assert [file.name for file in sorted((inputs["render"] / "frames").iterdir())] == [f"{i:05d}.png" for i in range(3)]
+
+
+@pytest.mark.parametrize("depth", [True, False])
+def test_depth_waits_on_the_disk_only_where_it_is_shown(inputs, progress, monkeypatch, depth: bool) -> None:
+    """It is 0.5 GB of 120 frames of 1920×1080."""
+
+    @contextmanager
+    def writer(path: Path, *_: int) -> Iterator[Callable[[np.ndarray], None]]:
+        yield lambda frame: waiting.append((path.parent / "inverse_depth.tmp").exists())
+
+    waiting = list[bool]()
+    monkeypatch.setattr("stages.video.video_writer", writer)
+    run(inputs, progress, frames=3, width=40, depth=depth)
+    assert waiting == (6 * [True] if depth else 3 * [False])
+    assert not (inputs["render"] / "inverse_depth.tmp").exists()
 
 
 def test_odd_widths_are_rounded_whatever_else_is_given(inputs, progress, tmp_path: Path) -> None:
