@@ -61,10 +61,12 @@ def training_bank(ingest: Path, scene: "Scene", split: "Split", downscale: float
     import torch
 
     from nerf.ray_bank import Placement, ray_bank
+    from stages.photos import loaders
     from stages.pixel_store import fill
 
     views, store = scene.of_split(split), _store(ingest, scene, split, downscale)
-    fill(store, lambda index: _decoded_pixels(ingest, scene, views[index], downscale), progress)
+    at_once = loaders(ingest / view.file for view in views)
+    fill(store, lambda index: _decoded_pixels(ingest, scene, views[index], downscale), at_once, progress)
     used = sorted({view.camera for view in views})
 
     def bearings(index: int) -> "Tensor":

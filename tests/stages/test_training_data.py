@@ -1,3 +1,4 @@
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -146,6 +147,24 @@ def test_where_photos_are_stored_is_found_out_once_for_each_split(
     for view in scene.views:
         reader.pixels(view, WHITE)
     assert sorted(asked) == ["test", "train"]
+
+
+@pytest.mark.parametrize("downscale", [1.0, 8.0])
+@pytest.mark.parametrize("has_alpha", [True, False])  # of the scene: where it has none, that of photos is dropped
+def test_how_many_photos_are_decoded_at_a_time_follows_from_what_their_files_hold(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, progress: SilentProgress, has_alpha: bool, downscale: float
+) -> None:
+    def pool(workers: int) -> ThreadPoolExecutor:
+        asked.append(workers)
+        return ThreadPoolExecutor(workers)
+
+    asked = list[int]()
+    inputs, scene = photographed(tmp_path, channels=4)
+    monkeypatch.setattr("stages.photos.processors", lambda: 16)
+    monkeypatch.setattr("stages.photos.DECODING_BYTES", 2 * 80 * WIDTH * HEIGHT)
+    monkeypatch.setattr("stages.pixel_store.ThreadPoolExecutor", pool)
+    training_bank(inputs["ingest"], replace(scene, has_alpha=has_alpha), "train", downscale, progress)
+    assert asked == [2]
 
 
 LENSES = {
