@@ -1,3 +1,4 @@
+import weakref
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +14,7 @@ from nerf.ray_bank import Placement, ray_bank
 from nerf.scene import Camera
 from stages.contract import StageError
 from stages.files import write_png, write_tensors
+from stages.masks import load_mask
 from stages.pixel_store import PixelStore, pixel_store
 from stages.training_data import (
     MOST_PATCHES,
@@ -211,6 +213,26 @@ def test_a_reduced_pixel_is_used_where_all_it_covers_is(
     bank = training_bank(inputs["ingest"], scene, "train", downscale, progress)
     assert (bank.drawable, len(bank.pixels)) == (6 * height * columns, 6 * height * width)
     assert progress.notes[-1] == f"masks leave {columns / width:.0%} of the pixels of the train photos"
+
+
+def test_masks_are_loaded_a_few_at_a_time_and_dropped(
+    tmp_path: Path, progress: SilentProgress, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """500 of 12 megapixels would be 6 GB."""
+
+    def load(*asked: Any) -> np.ndarray:
+        loaded.append(weakref.ref(mask := load_mask(*asked)))
+        alive.append(sum(each() is not None for each in loaded))
+        return mask
+
+    loaded, alive = list[weakref.ref[np.ndarray]](), list[int]()
+    inputs, scene = photographed(tmp_path, views=16, mask=half_mask())
+    monkeypatch.setattr("stages.masks.load_mask", load)
+    monkeypatch.setattr("stages.photos.loaders", lambda files: 2)
+    bank = training_bank(inputs["ingest"], scene, "train", 1.0, progress)
+    assert len(loaded) == 12 and 1 <= max(alive) <= 4
+    drawable = bank.may_be_drawn(torch.arange(len(bank.pixels))).view(12, HEIGHT, WIDTH)
+    assert torch.equal(drawable, torch.from_numpy(half_mask() > 0).expand(12, -1, -1))
 
 
 def test_without_masks_nothing_is_kept_of_them(tmp_path: Path, progress: SilentProgress) -> None:
