@@ -132,9 +132,10 @@ def load_pixels(path: Path, width: int, height: int) -> "np.ndarray":
     """
     import cv2
     import numpy as np
-    from PIL import Image
 
-    with Image.open(path) as image:
+    from stages.decoding import pillow
+
+    with pillow().open(path) as image:
         pixels = np.asarray(image)
     if (pixels.shape[1], pixels.shape[0]) == (width, height):
         return pixels
@@ -156,7 +157,7 @@ def loaders(files: Iterable[Path]) -> int:
 
 def _loading_bytes(file: Path) -> int:
     """Memory that :func:`load_pixels` takes, by the file's header."""
-    from PIL import Image
+    from stages.decoding import pillow
 
-    with Image.open(file) as image:
+    with pillow().open(file) as image:
         return BYTES_PER_PIXEL[len(image.getbands())] * image.width * image.height

@@ -10,6 +10,8 @@ from PIL import Image
 
 from stages import photos as module
 from stages.contract import StageError
+from stages.decoding import pillow
+from stages.masks import load_mask
 from stages.photos import Photo, Refusal, load_pixels, loaders, opaque_box, read_frame_names, read_photos, write_photos
 from tests.png_files import png
 
@@ -89,6 +91,19 @@ def test_large_photos_are_loaded_by_fewer_threads(
     (tmp_path / "large.png").write_bytes(png(*size, b"", alpha=alpha))
     (tmp_path / "small.png").write_bytes(png(1, 1, b""))
     assert loaders([tmp_path / "large.png", tmp_path / "small.png"]) == expected
+
+
+def test_what_ingest_accepted_is_no_bomb_to_a_process_that_decodes_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Pillow refuses more than 179 megapixels, ingest more than 250."""
+    photo, mask = stored(tmp_path, random_pixels(9, 7, 3)), tmp_path / "mask.png"
+    Image.fromarray(random_pixels(9, 7, 1)[..., 0]).save(mask)
+    for read in (lambda: load_pixels(photo, 7, 9), lambda: loaders([photo]), lambda: load_mask(mask, 7, 9)):
+        monkeypatch.setattr("PIL.Image.MAX_IMAGE_PIXELS", 10)
+        pillow.cache_clear()  # as if nothing had been decoded
+        read()
+    pillow.cache_clear()  # the limit comes back
 
 
 def photo(**changes: object) -> Photo:
