@@ -11,7 +11,7 @@ Where photos have masks, the pixels that may be drawn are kept as *runs* of neig
 row; without masks there are none, and nothing to look up.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -92,12 +92,13 @@ class RayBank(NamedTuple):
         """How many pixels may be drawn."""
         return len(self.pixels) if self.runs is None else int(self.runs[0, -1])
 
-    def without(self, ignored: Sequence[Bool[Tensor, "_ _"] | None]) -> "RayBank":
+    def without(self, ignored: Iterable[Bool[Tensor, "_ _"] | None]) -> "RayBank":
         """This bank with pixels that :meth:`draw` never gives: per view, (height, width) True where the photo is to
-        be ignored, None where all of it is used. Raises ValueError if no pixel is left."""
-        if not any(mask is not None and mask.any() for mask in ignored):
-            return self
+        be ignored, None where all of it is used. Taken one by one, for together they may not fit into memory. Raises
+        ValueError if no pixel is left."""
         runs = _runs(ignored, self.first_pixel)
+        if runs[0, -1] == len(self.pixels):
+            return self
         if not runs[0, -1]:
             raise ValueError("the masks ignore every pixel")
         return self._replace(runs=runs.to(self.device))
@@ -245,7 +246,7 @@ def build_ray_bank(
 
 
 def _runs(
-    ignored: Sequence[Bool[Tensor, "_ _"] | None], first_pixel: Int[Tensor, "views_and_end"]
+    ignored: Iterable[Bool[Tensor, "_ _"] | None], first_pixel: Int[Tensor, "views_and_end"]
 ) -> Int[Tensor, "2 runs_and_end"]:
     """Runs of pixels that are not ignored, as :class:`RayBank` has them. No run is longer than a view."""
     firsts, lengths = [], []

@@ -95,7 +95,7 @@ def decode(path: Path) -> Decoded:
 
 
 @cache
-def _pillow() -> ModuleType:
+def pillow() -> ModuleType:
     """Pillow, able to read HEIC, with its own pixel limit replaced by ours."""
     import logging
     import warnings
@@ -114,10 +114,10 @@ def _pillow() -> ModuleType:
 
 def _open(path: Path) -> "Image.Image":
     """The image with its header read, of a size we accept."""
-    pillow = _pillow()
+    library = pillow()
     try:
-        image = pillow.open(path, formats=_FORMATS)
-    except pillow.UnidentifiedImageError as error:
+        image = library.open(path, formats=_FORMATS)
+    except library.UnidentifiedImageError as error:
         raise DecodeError(_unrecognised(path)) from error
     except FileNotFoundError as error:
         raise DecodeError("there is no such file") from error
@@ -268,12 +268,12 @@ def _quantised(image: "Image.Image") -> "Image.Image":
     limit = 1.0 if image.mode == "F" else 65535.0
     if not (values.min() >= 0 and values.max() <= limit):
         raise DecodeError(f"pixel values from {values.min()} to {values.max()}; export it with 8 or 16 bits")
-    return _pillow().fromarray(np.rint(values * (255 / limit)).astype(np.uint8))
+    return pillow().fromarray(np.rint(values * (255 / limit)).astype(np.uint8))
 
 
 def upright(image: "Image.Image", orientation: int) -> "Image.Image":
     """Undo an EXIF orientation (EXIF 2.32, tag 0x0112)."""
-    turns = _pillow().Transpose
+    turns = pillow().Transpose
     turn = {
         2: turns.FLIP_LEFT_RIGHT,
         3: turns.ROTATE_180,

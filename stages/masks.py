@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from stages.decoding import DecodeError, decode, upright
+from stages.decoding import DecodeError, decode, pillow, upright
 from stages.files import write_png
 
 if TYPE_CHECKING:
@@ -96,9 +96,8 @@ def load_mask(path: Path, width: int, height: int) -> "np.ndarray":
     one is to be used."""
     import cv2
     import numpy as np
-    from PIL import Image
 
-    with Image.open(path) as image:
+    with pillow().open(path) as image:
         ignored = (np.asarray(image) == 0).astype(np.float32)
     if ignored.shape != (height, width):
         ignored = cv2.resize(ignored, (width, height), interpolation=cv2.INTER_AREA)
@@ -111,16 +110,15 @@ def write_feature_masks(ingest: Path, photos: "Sequence[Photo]", folder: Path) -
     Returns whether any photo has such a mask; without, nothing is written.
     """
     import numpy as np
-    from PIL import Image
 
     masked = [photo for photo in photos if photo.mask or photo.has_alpha]
     for photo in masked:
         allowed = np.full((photo.height, photo.width), 255, np.uint8)
         if photo.mask:
-            with Image.open(ingest / photo.mask) as mask:
+            with pillow().open(ingest / photo.mask) as mask:
                 allowed = np.asarray(mask)
         if photo.has_alpha:
-            with Image.open(ingest / photo.file) as image:
+            with pillow().open(ingest / photo.file) as image:
                 allowed = np.where(np.asarray(image.getchannel("A")) > 0, allowed, np.uint8(0))
         write_png(folder / f"{photo.image_name}.png", allowed)
     return bool(masked)

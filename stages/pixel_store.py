@@ -3,8 +3,8 @@
 It lies beside the folder of ingest as ``<folder>.pixels/``, outside of every manifest and digest. A store is found by
 what it was made from (names, sizes and times of the files, the size asked for), is written once under a lock, and
 appears whole under its name or not at all. A CRC-32 of each photo's pixels stands at its end: what has changed on the
-disk since is found before it is used, and made again. Photos are decoded on all cores, each written to its place and
-dropped.
+disk since is found before it is used, and made again. Photos are decoded several at a time, each written to its place
+and dropped.
 
 What a mapped file costs: as much memory as there is to spare, given back when others need it. Random reads are as
 fast as from plain memory once the file has been read; where it is larger than memory, each pixel that is not there
@@ -27,7 +27,6 @@ from typing import TYPE_CHECKING, BinaryIO, NamedTuple
 
 from stages.amounts import bytes_in_words
 from stages.contract import Progress, StageError
-from stages.device import processors
 from stages.live_line import live_line
 
 if TYPE_CHECKING:
@@ -35,8 +34,6 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 VERSION = 3  # raised when the same photos would give other pixels
-DECODING_BYTES = 1 << 30  # how much memory may go into photos that are being decoded at a time
-BYTES_PER_PIXEL = {3: 16, 4: 64}  # that decoding and shrinking a photo takes, by channels
 CHECKSUM_BYTES = 4
 FITS = 0.8  # share of the free memory up to which a store is read ahead as a whole
 
@@ -143,8 +140,9 @@ def pixel_store(ingest: Path, name: str, photos: Sequence[StoredPhoto], channels
     return PixelStore(ingest.with_name(f"{ingest.name}.pixels") / f"{name}-{key}", tuple(photos), channels)
 
 
-def fill(store: PixelStore, load: Load, progress: Progress) -> None:
-    """Write the pixels of all photos, unless they are there and sound; waits where another process is at it.
+def fill(store: PixelStore, load: Load, workers: int, progress: Progress) -> None:
+    """Write the pixels of all photos, ``workers`` of them at a time, unless they are there and sound; waits where
+    another process is at it.
 
     Raises:
         StageError: if the disk has no room for them.
@@ -155,7 +153,7 @@ def fill(store: PixelStore, load: Load, progress: Progress) -> None:
     store.path.parent.mkdir(exist_ok=True)
     with _only_one(store, progress):
         if not store.is_whole:  # nobody else was faster
-            _write(store, load, progress)
+            _write(store, load, workers, progress)
 
 
 def _is_sound(store: PixelStore, progress: Progress) -> bool:
@@ -186,7 +184,7 @@ def _only_one(store: PixelStore, progress: Progress) -> Iterator[None]:
         lock.release()
 
 
-def _write(store: PixelStore, load: Load, progress: Progress) -> None:
+def _write(store: PixelStore, load: Load, workers: int, progress: Progress) -> None:
     if store.path.exists():
         found = f"{store.path.stat().st_size:,} bytes and not {store.size:,}"
         progress.note(f"the pixel store {store.path.name} has {found}: making it again")
@@ -199,7 +197,7 @@ def _write(store: PixelStore, load: Load, progress: Progress) -> None:
     try:
         with partial.open("wb") as stream, live_line(progress, describe):
             _check_room(store)
-            for _ in _write_photos(store, load, stream):
+            for _ in _write_photos(store, load, workers, stream):
                 written += 1
             stream.flush()
             os.fsync(stream.fileno())
@@ -208,7 +206,7 @@ def _write(store: PixelStore, load: Load, progress: Progress) -> None:
         partial.unlink(missing_ok=True)
 
 
-def _write_photos(store: PixelStore, load: Load, stream: BinaryIO) -> Iterator[None]:
+def _write_photos(store: PixelStore, load: Load, workers: int, stream: BinaryIO) -> Iterator[None]:
     """Every photo at its place. At a time there are as many in memory as there are workers."""
     writing, starts = threading.Lock(), store.starts
 
@@ -223,19 +221,12 @@ def _write_photos(store: PixelStore, load: Load, stream: BinaryIO) -> Iterator[N
             stream.seek(starts[-1] + CHECKSUM_BYTES * index)
             stream.write(checksum(pixels.data))
 
-    pool = ThreadPoolExecutor(_workers(store))
+    pool = ThreadPoolExecutor(workers)
     try:
         for future in [pool.submit(write, index) for index in range(len(store.photos))]:
             yield future.result()
     finally:
         pool.shutdown(cancel_futures=True)
-
-
-def _workers(store: PixelStore) -> int:
-    """How many photos to decode at a time: one per core, fewer where they are too large for that."""
-    largest = max(photo.width * photo.height for photo in store.photos)
-    affordable = DECODING_BYTES // (BYTES_PER_PIXEL[store.channels] * largest)
-    return max(1, min(processors(), affordable))
 
 
 def _check_room(store: PixelStore) -> None:

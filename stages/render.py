@@ -3,6 +3,7 @@
 import difflib
 import time
 from collections.abc import Iterator
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +13,7 @@ from stages.amounts import duration, short_count
 from stages.contract import Inputs, Progress, StageConfig, StageError, StageResult
 from stages.files import read_json, read_scene, write_json, write_png
 from stages.render_path import CameraPath, PathKind, fitted_path, path_from_file, path_rays, usual_path
-from stages.render_plan import LEAST_WIDTH
+from stages.render_plan import LEAST_WIDTH, even_width
 from stages.spread import spread
 
 if TYPE_CHECKING:
@@ -70,6 +71,12 @@ class Config(StageConfig):
     def _absolute(cls, cameras: Path | None) -> Path | None:
         """Later commands may be given in another folder."""
         return cameras and cameras.absolute()
+
+    @field_validator("width")
+    @classmethod
+    def _even(cls, width: int | None) -> int | None:
+        """Videos have no odd sides."""
+        return width and even_width(width)
 
 
 def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
@@ -222,17 +229,21 @@ def _write(renderings: "Iterator[Rendering]", path: CameraPath, config: Config, 
         (folder / "frames").mkdir()
     waiting = folder / "inverse_depth.tmp"
     # Written and not mapped: on a full disk a write raises OSError, where a mapping would kill the process.
-    with waiting.open("wb") as depths, video_writer(folder / "video.mp4", width, height, config.fps) as add:
+    with (
+        waiting.open("wb") if config.depth else nullcontext() as depths,
+        video_writer(folder / "video.mp4", width, height, config.fps) as add,
+    ):
         for index, rendering in enumerate(renderings):
             frame = (rendering.colour.clamp(0, 1) * 255).round().byte().numpy()
             add(frame)
-            depths.write((1 / rendering.depth.numpy()).astype(np.float16).data)
+            if depths is not None:
+                depths.write((1 / rendering.depth.numpy()).astype(np.float16).data)
             if config.save_frames:
                 write_png(folder / "frames" / f"{index:05d}.png", frame)
     if config.depth:
         inverse = np.memmap(waiting, np.float16, "r", shape=(len(path.cameras), height, width))
         _write_depth(inverse, folder / "depth.mp4", config.fps)
-    waiting.unlink()
+        waiting.unlink()
     return ["video.mp4"] + ["depth.mp4"] * config.depth + ["frames"] * config.save_frames
 
 

@@ -13,7 +13,8 @@ FULL_RATE, USUAL_SECONDS = 30, 4.0
 
 
 def affordable(rays: float, camera: "Camera", longest: float, frames: int | None, width: int | None) -> tuple[int, int]:
-    """(frames, width), each as given or chosen so that all frames together have at most ``rays`` pixels.
+    """(frames, width), each as given or chosen so that all frames together have at most ``rays`` pixels;
+    a width that is given has to be even.
 
     A still has to show something before it is worth moving, and a size that shows it is enough until the motion is
     smooth. So growing ``rays`` are spent on: 6 frames up to a long side of 200, 24 frames at that, a side of 480,
@@ -27,16 +28,17 @@ def affordable(rays: float, camera: "Camera", longest: float, frames: int | None
 
     if width is not None:
         frames = frames or count(width * long_side / camera.width, LEAST_FRAMES, MOST_FRAMES)
-        return frames, _even(width)
+        return frames, width
     if frames is None:
         frames = count(min(USUAL_SIDE, longest), FEWEST_FRAMES, MOST_FRAMES)
         if squares < frames * min(SMALL_SIDE, longest) ** 2:
             frames = count(min(SMALL_SIDE, longest), LEAST_FRAMES, FEWEST_FRAMES)
     side = min(max(math.sqrt(squares / frames), LEAST_SIDE), longest)
-    return frames, _even(side * camera.width / long_side)
+    return frames, even_width(side * camera.width / long_side)
 
 
-def _even(width: float) -> int:
+def even_width(width: float) -> int:
+    """The largest even number of pixels that ``width`` has room for, LEAST_WIDTH at least."""
     return max(LEAST_WIDTH, 2 * int(width / 2))
 
 

@@ -76,7 +76,9 @@ class Config(StageConfig):
     field: Literal["grid", "paper"] | None = Field(
         default=None, description="grid: minutes without a GPU; paper: the published networks; none: grid"
     )
-    steps: int | None = Field(default=None, ge=1, description="train so many steps, with the same result every time")
+    steps: int | None = Field(
+        default=None, ge=1, description="train so many steps; on a CPU with the same result every time"
+    )
     preset: Literal["draft", "standard", "high", "paper"] | None = Field(
         default=None,
         description="draft, standard, high: train for half a minute, three, fifteen, in sizes to match; "

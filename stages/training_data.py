@@ -1,7 +1,8 @@
 """Photos and cameras as training and comparison read them, at any reduction in size."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -61,10 +62,12 @@ def training_bank(ingest: Path, scene: "Scene", split: "Split", downscale: float
     import torch
 
     from nerf.ray_bank import Placement, ray_bank
+    from stages.photos import loaders
     from stages.pixel_store import fill
 
     views, store = scene.of_split(split), _store(ingest, scene, split, downscale)
-    fill(store, lambda index: _decoded_pixels(ingest, scene, views[index], downscale), progress)
+    at_once = loaders(ingest / view.file for view in views)
+    fill(store, lambda index: _decoded_pixels(ingest, scene, views[index], downscale), at_once, progress)
     used = sorted({view.camera for view in views})
 
     def bearings(index: int) -> "Tensor":
@@ -84,7 +87,8 @@ def training_bank(ingest: Path, scene: "Scene", split: "Split", downscale: float
     )
     if not any(view.mask for view in views):
         return bank
-    return _masked(bank, [view_mask(ingest, scene, view, downscale) for view in views], split, progress)
+    masks = _ignored(views, lambda view: view_mask(ingest, scene, view, downscale), at_once)
+    return _masked(bank, masks, split, progress)
 
 
 def guided_bank(inputs: Inputs, scene: "Scene", downscale: float, progress: Progress) -> "RayBank":
@@ -109,9 +113,20 @@ def guided_bank(inputs: Inputs, scene: "Scene", downscale: float, progress: Prog
     )
 
 
-def _masked(bank: "RayBank", used: "Sequence[Tensor | None]", split: "Split", progress: Progress) -> "RayBank":
+def _ignored(
+    views: "Sequence[View]", load: "Callable[[View], Tensor | None]", at_once: int
+) -> "Iterator[Tensor | None]":
+    """Per view, (H, W) True where its mask ignores the photo; None without a mask. In memory are those being loaded
+    and the one before: all masks of many large photos would take more than training does."""
+    with ThreadPoolExecutor(at_once) as pool:
+        for first in range(0, len(views), at_once):
+            for used in pool.map(load, views[first : first + at_once]):
+                yield None if used is None else used.logical_not_()
+
+
+def _masked(bank: "RayBank", ignored: "Iterable[Tensor | None]", split: "Split", progress: Progress) -> "RayBank":
     try:
-        bank = bank.without([None if mask is None else ~mask for mask in used])
+        bank = bank.without(ignored)
     except ValueError as error:
         why = f"{error} of the {split} photos at this size"
         raise StageError(NOTHING_LEFT, why, "Give a smaller --train.downscale.") from error

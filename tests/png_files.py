@@ -6,13 +6,13 @@ import zlib
 import numpy as np
 
 
-def png(width: int, height: int, data: bytes, bits: int = 8) -> bytes:
-    """A file of colour; ``data`` are the pixels, deflated."""
+def png(width: int, height: int, data: bytes, bits: int = 8, alpha: bool = False) -> bytes:
+    """A file of colour, and of alpha if asked; ``data`` are the pixels, deflated."""
 
     def chunk(kind: bytes, content: bytes) -> bytes:
         return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
 
-    header = struct.pack(">IIBBBBB", width, height, bits, 2, 0, 0, 0)
+    header = struct.pack(">IIBBBBB", width, height, bits, 6 if alpha else 2, 0, 0, 0)
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
 
 

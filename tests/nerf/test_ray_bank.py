@@ -1,3 +1,5 @@
+import weakref
+
 import pytest
 import torch
 from hypothesis import given
@@ -144,6 +146,22 @@ def test_ignored_pixels_are_never_drawn_and_the_others_alike() -> None:
     assert len(used) == 24 and counts.sum() == 24_000
     assert torch.equal(masked.lookup(masked.nth(torch.arange(24))).colour, used)
     assert (counts - 1000).abs().max() < 4 * 1000**0.5
+
+
+def test_masks_are_taken_one_by_one_and_dropped() -> None:
+    bank, *_ = scattered()
+    shown, alive = list[weakref.ref[Tensor]](), list[int]()
+
+    def mask(size: tuple[int, int]) -> Tensor:
+        alive.append(sum(each() is not None for each in shown))
+        ignored = torch.zeros(size, dtype=torch.bool)
+        ignored[1, 1:] = True
+        shown.append(weakref.ref(ignored))
+        return ignored
+
+    masked, expected = bank.without(map(mask, SIZES)), bank.without([mask(size) for size in SIZES])
+    assert alive[:3] == [0, 1, 1], "the one before is held until the next is there"
+    assert masked.runs is not None and expected.runs is not None and torch.equal(masked.runs, expected.runs)
 
 
 def test_without_masks_the_same_pixels_are_drawn_as_ever() -> None:

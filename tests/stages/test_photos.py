@@ -8,8 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
+from stages import photos as module
 from stages.contract import StageError
-from stages.photos import Photo, Refusal, load_pixels, opaque_box, read_frame_names, read_photos, write_photos
+from stages.decoding import pillow
+from stages.masks import load_mask
+from stages.photos import Photo, Refusal, load_pixels, loaders, opaque_box, read_frame_names, read_photos, write_photos
+from tests.png_files import png
 
 
 def stored(folder: Path, pixels: np.ndarray) -> Path:
@@ -68,6 +72,38 @@ def test_the_colour_of_transparent_pixels_does_not_leak(tmp_path: Path) -> None:
     assert np.array_equal(loaded[:, 2:], np.zeros((2, 2, 4)))
     half = load_pixels(stored(tmp_path, pixels), 1, 1)
     assert half.tolist() == [[[255, 0, 0, 128]]]
+
+
+@pytest.mark.parametrize(
+    ("size", "alpha", "cores", "expected"),
+    [
+        ((400, 400), True, 2, 2),
+        ((4000, 3000), False, 2, 2),
+        ((4000, 3000), False, 64, 5),
+        ((4000, 3000), True, 64, 1),
+        ((9000, 8000), True, 8, 1),
+    ],
+)
+def test_large_photos_are_loaded_by_fewer_threads(
+    tmp_path: Path, size: tuple[int, int], alpha: bool, cores: int, expected: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "processors", lambda: cores)
+    (tmp_path / "large.png").write_bytes(png(*size, b"", alpha=alpha))
+    (tmp_path / "small.png").write_bytes(png(1, 1, b""))
+    assert loaders([tmp_path / "large.png", tmp_path / "small.png"]) == expected
+
+
+def test_what_ingest_accepted_is_no_bomb_to_a_process_that_decodes_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Pillow refuses more than 179 megapixels, ingest more than 250."""
+    photo, mask = stored(tmp_path, random_pixels(9, 7, 3)), tmp_path / "mask.png"
+    Image.fromarray(random_pixels(9, 7, 1)[..., 0]).save(mask)
+    for read in (lambda: load_pixels(photo, 7, 9), lambda: loaders([photo]), lambda: load_mask(mask, 7, 9)):
+        monkeypatch.setattr("PIL.Image.MAX_IMAGE_PIXELS", 10)
+        pillow.cache_clear()  # as if nothing had been decoded
+        read()
+    pillow.cache_clear()  # the limit comes back
 
 
 def photo(**changes: object) -> Photo:

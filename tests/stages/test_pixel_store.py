@@ -17,7 +17,7 @@ from filelock import FileLock
 from pipeline.workspace import Workspace
 from stages import pixel_store as module
 from stages.contract import StageError
-from stages.pixel_store import PixelStore, StoredPhoto, checksum, fill, pixel_store
+from stages.pixel_store import Load, PixelStore, StoredPhoto, checksum, pixel_store
 from tests.conftest import SilentProgress
 
 SIZES = [(5, 3), (4, 2), (7, 6), (5, 3)]  # (width, height)
@@ -31,6 +31,11 @@ def store_of(folder: Path, channels: int = 3, name: str = "train") -> PixelStore
         if not (ingest / photo.file).exists():
             (ingest / photo.file).write_text("only its size and time matter here")
     return pixel_store(ingest, name, photos, channels)
+
+
+def fill(store: PixelStore, load: Load, progress: SilentProgress) -> None:
+    """With two workers."""
+    module.fill(store, load, 2, progress)
 
 
 def painted(index: int, channels: int = 3) -> np.ndarray:
@@ -107,14 +112,11 @@ def test_a_damaged_store_is_made_again_and_said(tmp_path: Path, progress: Silent
     assert progress.notes == [f"the pixel store {store.path.name} has {size:,} bytes and not 256: making it again"]
 
 
-def test_photos_are_decoded_a_few_at_a_time_and_dropped(
-    tmp_path: Path, progress: SilentProgress, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_photos_are_decoded_a_few_at_a_time_and_dropped(tmp_path: Path, progress: SilentProgress) -> None:
     ingest = tmp_path / "ingest"
     ingest.mkdir()
     (ingest / "a").touch()
     store = pixel_store(ingest, "train", [StoredPhoto("a", 8, 8)] * 40, 3)
-    monkeypatch.setattr(module, "processors", lambda: 2)
     counting, alive, most = threading.Lock(), weakref.WeakSet(), 0
 
     class Pixels(np.ndarray):
@@ -131,24 +133,6 @@ def test_photos_are_decoded_a_few_at_a_time_and_dropped(
     fill(store, load, progress)
     assert 1 <= most <= 2
     assert kept(store, 39).min() == kept(store, 39).max() == 39
-
-
-@pytest.mark.parametrize(
-    ("width", "height", "channels", "cores", "expected"),
-    [
-        (400, 400, 4, 2, 2),
-        (4000, 3000, 3, 2, 2),
-        (4000, 3000, 3, 64, 5),
-        (4000, 3000, 4, 64, 1),
-        (20000, 10000, 4, 8, 1),
-    ],
-)
-def test_large_photos_are_decoded_by_fewer_workers(
-    width: int, height: int, channels: int, cores: int, expected: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(module, "processors", lambda: cores)
-    store = PixelStore(Path(), (StoredPhoto("a", width, height), StoredPhoto("b", 1, 1)), channels)
-    assert module._workers(store) == expected
 
 
 def test_a_failure_leaves_nothing_behind(tmp_path: Path, progress: SilentProgress) -> None:

@@ -1,5 +1,7 @@
 import json
 import weakref
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -118,6 +120,30 @@ def test_frames_are_kept_and_depth_left_out_on_request(inputs, progress) -> None
     outputs = run(inputs, progress, frames=3, width=40, depth=False, save_frames=True).outputs
     assert set(outputs) == {"video.mp4", "path.json", "frames"}
     assert [file.name for file in sorted((inputs["render"] / "frames").iterdir())] == [f"{i:05d}.png" for i in range(3)]
+
+
+@pytest.mark.parametrize("depth", [True, False])
+def test_depth_waits_on_the_disk_only_where_it_is_shown(inputs, progress, monkeypatch, depth: bool) -> None:
+    """It is 0.5 GB of 120 frames of 1920×1080."""
+
+    @contextmanager
+    def writer(path: Path, *_: int) -> Iterator[Callable[[np.ndarray], None]]:
+        yield lambda frame: waiting.append((path.parent / "inverse_depth.tmp").exists())
+
+    waiting = list[bool]()
+    monkeypatch.setattr("stages.video.video_writer", writer)
+    run(inputs, progress, frames=3, width=40, depth=depth)
+    assert waiting == (6 * [True] if depth else 3 * [False])
+    assert not (inputs["render"] / "inverse_depth.tmp").exists()
+
+
+def test_odd_widths_are_rounded_whatever_else_is_given(inputs, progress, tmp_path: Path) -> None:
+    write_json(tmp_path / "t.json", transforms(scene_with(ring(5))))
+    for given in ({}, {"frames": 3}, {"cameras": tmp_path / "t.json"}):
+        assert render.plan(render.Config.model_validate({"width": 41, **given}), inputs, progress).width == 40
+    assert render.Config(width=17).width == 16 and render.Config(width=640).width == 640
+    run(inputs, progress, frames=3, width=41)
+    assert read_video(inputs["render"] / "video.mp4")[0].shape == (3, 30, 40, 3)
 
 
 def test_plan_answers_every_open_question(inputs, progress) -> None:

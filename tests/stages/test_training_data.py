@@ -1,3 +1,5 @@
+import weakref
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,6 +14,7 @@ from nerf.ray_bank import Placement, ray_bank
 from nerf.scene import Camera
 from stages.contract import StageError
 from stages.files import write_png, write_tensors
+from stages.masks import load_mask
 from stages.pixel_store import PixelStore, pixel_store
 from stages.training_data import (
     MOST_PATCHES,
@@ -148,6 +151,24 @@ def test_where_photos_are_stored_is_found_out_once_for_each_split(
     assert sorted(asked) == ["test", "train"]
 
 
+@pytest.mark.parametrize("downscale", [1.0, 8.0])
+@pytest.mark.parametrize("has_alpha", [True, False])  # of the scene: where it has none, that of photos is dropped
+def test_how_many_photos_are_decoded_at_a_time_follows_from_what_their_files_hold(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, progress: SilentProgress, has_alpha: bool, downscale: float
+) -> None:
+    def pool(workers: int) -> ThreadPoolExecutor:
+        asked.append(workers)
+        return ThreadPoolExecutor(workers)
+
+    asked = list[int]()
+    inputs, scene = photographed(tmp_path, channels=4)
+    monkeypatch.setattr("stages.photos.processors", lambda: 16)
+    monkeypatch.setattr("stages.photos.DECODING_BYTES", 2 * 80 * WIDTH * HEIGHT)
+    monkeypatch.setattr("stages.pixel_store.ThreadPoolExecutor", pool)
+    training_bank(inputs["ingest"], replace(scene, has_alpha=has_alpha), "train", downscale, progress)
+    assert asked == [2]
+
+
 LENSES = {
     "none": Camera("PINHOLE", 4000, 3000, (3000.0, 3000.0, 2010.0, 1490.0)),
     "phone": Camera("SIMPLE_RADIAL", 4000, 3000, (3000.0, 2000.0, 1500.0, 0.1)),
@@ -192,6 +213,26 @@ def test_a_reduced_pixel_is_used_where_all_it_covers_is(
     bank = training_bank(inputs["ingest"], scene, "train", downscale, progress)
     assert (bank.drawable, len(bank.pixels)) == (6 * height * columns, 6 * height * width)
     assert progress.notes[-1] == f"masks leave {columns / width:.0%} of the pixels of the train photos"
+
+
+def test_masks_are_loaded_a_few_at_a_time_and_dropped(
+    tmp_path: Path, progress: SilentProgress, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """500 of 12 megapixels would be 6 GB."""
+
+    def load(*asked: Any) -> np.ndarray:
+        loaded.append(weakref.ref(mask := load_mask(*asked)))
+        alive.append(sum(each() is not None for each in loaded))
+        return mask
+
+    loaded, alive = list[weakref.ref[np.ndarray]](), list[int]()
+    inputs, scene = photographed(tmp_path, views=16, mask=half_mask())
+    monkeypatch.setattr("stages.masks.load_mask", load)
+    monkeypatch.setattr("stages.photos.loaders", lambda files: 2)
+    bank = training_bank(inputs["ingest"], scene, "train", 1.0, progress)
+    assert len(loaded) == 12 and 1 <= max(alive) <= 4
+    drawable = bank.may_be_drawn(torch.arange(len(bank.pixels))).view(12, HEIGHT, WIDTH)
+    assert torch.equal(drawable, torch.from_numpy(half_mask() > 0).expand(12, -1, -1))
 
 
 def test_without_masks_nothing_is_kept_of_them(tmp_path: Path, progress: SilentProgress) -> None:
