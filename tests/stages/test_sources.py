@@ -155,6 +155,21 @@ def test_an_export_of_ours_finds_the_photos_by_their_own_names(tmp_path: Path) -
     assert (source.files, source.frames) == ((photos / "ä.jpg",), {"images/a-1.jpg": "ä.jpg"})
 
 
+@pytest.mark.parametrize("linked", [True, False])
+def test_a_photo_that_was_removed_is_one_that_is_not_there_for_an_export_of_ours(tmp_path: Path, linked: bool) -> None:
+    touch(tmp_path, "photos/a.jpg", "kept/a.jpg", "kept/b.jpg", "output/x")
+    if linked:
+        (tmp_path / "output/images").symlink_to(tmp_path / "kept")
+    else:
+        shutil.copytree(tmp_path / "kept", tmp_path / "output/images")
+    frames = [{"file_path": f"images/{name}", "photo": name, "transform_matrix": []} for name in ("a.jpg", "b.jpg")]
+    cameras = tmp_path / "output/transforms.json"
+    cameras.write_text(json.dumps({"frames": frames}))
+    source = find_source(tmp_path / "photos", cameras)
+    assert names(source) == list(source.frames.values()) == ["a.jpg", "b.jpg"]
+    assert [file.is_file() for file in source.files] == [True, False]
+
+
 def test_a_transforms_file_that_was_written_on_windows(tmp_path: Path) -> None:
     touch(tmp_path, "train/0001.png", "train\\0002.png", "train/0002.png")
     written = ["train\\0001", ".\\train\\0002.png", "train\\0002", "gone\\0.png"]
