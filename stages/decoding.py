@@ -120,7 +120,8 @@ def _open(path: Path) -> "Image.Image":
     except pillow.UnidentifiedImageError as error:
         raise DecodeError(_unrecognised(path)) from error
     except FileNotFoundError as error:
-        raise DecodeError("there is no such file") from error
+        gone = "a link to a file that is not there" if path.is_symlink() else "there is no such file"
+        raise DecodeError(gone) from error
     except Exception as error:  # on damaged files Pillow's parsers raise whatever they run into
         if isinstance(error, OSError) and error.errno is not None:  # not Pillow's but the system's
             raise DecodeError(f"cannot be read: {error.strerror}") from error

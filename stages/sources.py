@@ -31,6 +31,7 @@ _IMAGES = (".jpg", ".jpeg", ".png", ".heic", ".heif", ".tif", ".tiff", ".webp", 
 _HAS_BESIDE = re.compile(r"images(_\d+)?|input|photos")  # folders of photos beside which their masks may lie
 _EXTENSIONS_TRIED = ("", ".png", ".jpg", ".jpeg")
 _FOLDER_HINT = "Give the folder that holds the photos: pipeline run FOLDER"
+_LINKS_HINT = "Fetch them (git annex get, dvc pull), or connect the drive that they lie on."
 
 
 @dataclass(frozen=True)
@@ -151,6 +152,8 @@ def list_photos(root: Path) -> tuple[Path, ...]:
     found = _files_below(root, _is_photo_folder)
     if not found:
         raise StageError(f"{root} is empty", "there is no file in it", _FOLDER_HINT)
+    if not any(map(Path.is_file, found)):
+        raise StageError(f"no photos in {root}", f"its {len(found)} files are links to what is not there", _LINKS_HINT)
     photos = [file for file in found if _may_be_photo(file)]
     videos = [file for file in found if _is_video(file)]
     if not photos and len(videos) == 1:
@@ -161,9 +164,10 @@ def list_photos(root: Path) -> tuple[Path, ...]:
 
 
 def is_gone(photos: Path) -> bool:
-    """Whether nothing is left of PHOTOS, or only a folder without files: a drive that is not there leaves one, too."""
+    """Whether nothing is left of PHOTOS, or only a folder without files: a drive that is not there leaves one, too, or
+    links to what was on it."""
     try:
-        empty = photos.is_dir() and next(_walk(_photo_root(photos), _is_photo_folder), None) is None
+        empty = photos.is_dir() and not any(map(Path.is_file, _walk(_photo_root(photos), _is_photo_folder)))
         return empty or not photos.exists()
     except OSError:  # said by find_source
         return False
@@ -181,7 +185,9 @@ def _walk(root: Path, enters: Callable[[Path], bool]) -> Iterator[Path]:
     for folder, subfolders, names in os.walk(root, onerror=fail):
         here = Path(folder)
         subfolders[:] = [s for s in subfolders if enters(here / s)]
-        yield from (here / name for name in names if not name.startswith(".") and (here / name).is_file())
+        files = (here / name for name in names if not name.startswith("."))
+        # Links that lead nowhere, as of photos in git-annex that were not fetched, are left to be refused by name.
+        yield from (file for file in files if file.is_file() or (file.is_symlink() and not file.exists()))
 
 
 def _list_masks(root: Path, files: tuple[Path, ...]) -> tuple[tuple[str, Path], ...]:

@@ -223,6 +223,8 @@ def test_what_is_no_image_is_named(tmp_path: Path) -> None:
         (tmp_path / name).write_bytes(data)
         assert reason(tmp_path / name) == expected
     assert reason(tmp_path / "nowhere.jpg") == "there is no such file"
+    (tmp_path / "link.jpg").symlink_to("nowhere.jpg")
+    assert reason(tmp_path / "link.jpg") == "a link to a file that is not there"
     assert reason(tmp_path / "a.NEF") == "camera raw files are not read; export JPEG, PNG or TIFF"
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from stages.contract import StageError
 from stages.masks import pair_masks
-from stages.sources import Source, camera_files, find_source, photos_beside
+from stages.sources import Source, camera_files, find_source, is_gone, photos_beside
 
 
 def touch(folder: Path, *names: str) -> Path:
@@ -342,6 +342,16 @@ def test_a_folder_without_read_permission(tmp_path: Path) -> None:
         assert refusal(tmp_path).why == "permission denied"
     finally:
         (tmp_path / "a").chmod(0o755)
+
+
+def test_links_that_lead_nowhere_are_left_to_be_refused_by_name(tmp_path: Path) -> None:
+    touch(tmp_path, "a.jpg")
+    (tmp_path / "b.jpg").symlink_to("annex/b")
+    assert names(find_source(tmp_path)) == ["a.jpg", "b.jpg"] and not is_gone(tmp_path)
+    (tmp_path / "a.jpg").unlink()
+    error = refusal(tmp_path)
+    assert (error.what, error.why) == (f"no photos in {tmp_path}", "its 1 files are links to what is not there")
+    assert is_gone(tmp_path)
 
 
 def test_a_folder_that_goes_while_it_is_listed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
