@@ -84,8 +84,6 @@ class Decoded:
 
 def decode(path: Path) -> Decoded:
     """Decode one image file. Raises DecodeError with the reason if that cannot be done."""
-    if path.suffix.lower() in _RAW:
-        raise DecodeError("camera raw files are not read; export JPEG, PNG or TIFF")
     with _open(path) as image:
         stored_plainly, lossy = _is_plain(image), _is_lossy(image, path)
         # Pillow turns TIFFs while it loads them, and forgets how.
@@ -114,6 +112,8 @@ def _pillow() -> ModuleType:
 
 def _open(path: Path) -> "Image.Image":
     """The image with its header read, of a size we accept."""
+    if path.suffix.lower() in _RAW:
+        raise DecodeError("camera raw files are not read; export JPEG, PNG or TIFF")
     pillow = _pillow()
     try:
         image = pillow.open(path, formats=_FORMATS)
@@ -136,7 +136,7 @@ def _open(path: Path) -> "Image.Image":
 
 
 def pixel_count(path: Path) -> int:
-    """How many pixels a file says that it has; 0 for one that is refused by its header."""
+    """How many pixels a file says that it has; 0 for one that is refused by its name or header."""
     try:
         with _open(path) as image:
             return image.width * image.height

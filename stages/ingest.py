@@ -236,10 +236,10 @@ def _workers(files: Sequence[Path]) -> int:
     from stages.decoding import pixel_count
     from stages.memory import at_once, check_memory
 
-    largest = max(map(pixel_count, files), default=0)
+    largest, name = max(((pixel_count(file), file.name) for file in files), default=(0, ""))
     needed = _BYTES_PER_PIXEL * max(1, largest)
-    megapixels = f"decoding a photo of {largest / 1e6:.0f} megapixels takes"
-    check_memory(needed, "the photos", megapixels, "Close other programs, or make the photos smaller.")
+    why = f"decoding {shown(name)}, which has {largest / 1e6:.0f} megapixels, takes"
+    check_memory(needed, "the photos", why, "Close other programs, make that photo smaller, or leave it out.")
     return at_once(min(processors(), _MAX_WORKERS), needed)
 
 

@@ -83,3 +83,15 @@ def test_where_it_fails_all_refusals_are_said_by_reason(tmp_path: Path, progress
         "refused y.jpg: identical to a.jpg",
         "masks/stray.png is no photo's mask, which are called NAME.png",
     ]
+
+
+def test_a_photo_that_memory_is_short_of_is_named_and_none_that_is_refused_by_its_ending(
+    tmp_path: Path, progress: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = put(tmp_path / "in", "a.jpg", "b.jpg")
+    Image.new("RGB", (500, 400)).save(folder / "raw.dng", "TIFF")
+    monkeypatch.setattr("stages.memory.available_bytes", lambda: 2**20)
+    ingest.run(Config(photos=folder), {}, tmp_path / "out", progress)
+    Image.new("RGB", (400, 300)).save(folder / "large.jpg")
+    with pytest.raises(StageError, match=r"^not enough memory for the photos: decoding large\.jpg, which has"):
+        ingest.run(Config(photos=folder), {}, tmp_path / "again", progress)
