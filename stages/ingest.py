@@ -26,6 +26,7 @@ from stages.ingest_words import (
     all_plain,
     all_the_same,
     facts,
+    nearly_black,
     say,
     say_everything,
     say_findings,
@@ -112,6 +113,7 @@ class _Taken:
     focal_source: str | None = None
     opaque_share: float | None = None  # that a mask beside ``waiting`` leaves; None without alpha
     one_colour: str | None = None
+    brightest: int = 255  # of all channels
     place: Place = _NO_PLACE
     exposure_ev: float | None = None
     time_s: float | None = None
@@ -145,6 +147,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
             taken, duplicates = _without_duplicates(taken)
             refused = sorted(refused + duplicates, key=lambda refusal: refusal.name)
         notes += [f"{shown(t.name)}: {note}" for t in taken for note in t.notes]
+        notes += nearly_black([photo.brightest for photo in taken])
         try:
             same = _checked(source, taken, refused, progress)
         except StageError:
@@ -270,6 +273,7 @@ def _take(file: Path, name: str, mask: Path | None, waiting: Path) -> _Taken | R
         focal_source=decoded.focal_source,
         opaque_share=_take_opaque(pixels, taken_mask, waiting),
         one_colour=one_colour(pixels),
+        brightest=int(pixels[..., :3].max()),
         place=decoded.place,
         exposure_ev=decoded.exposure_ev,
         mask=taken_mask,
