@@ -39,7 +39,10 @@ class DecodeError(Exception):
 
 
 class CameraKey(NamedTuple):
-    """Photos for which all of this agrees share intrinsics. Orientation counts: it moves the principal point."""
+    """Photos for which all of this agrees share intrinsics. Orientation counts: it moves the principal point.
+
+    ``focal_px`` is for pixels of ``width`` × ``height``, None where EXIF tells none or an absurd one.
+    """
 
     make: str
     model: str
@@ -61,7 +64,7 @@ class Place(NamedTuple):
 
 @dataclass(frozen=True)
 class Decoded:
-    """One image, upright, sRGB. ``focal_px`` is for these pixels, None where EXIF tells none or an absurd one.
+    """One image, upright, sRGB.
 
     ``suffix`` is ".jpg" or ".png" if the file's own bytes already say exactly this to any program (8-bit RGB or
     RGBA, sRGB, upright, one frame), so that they can be copied; otherwise None. ``stored`` is what kind of values it
@@ -70,7 +73,6 @@ class Decoded:
     """
 
     pixels: "np.ndarray"  # (h, w, 3 or 4) uint8
-    focal_px: float | None
     focal_source: str | None
     camera_key: CameraKey
     place: Place
@@ -184,7 +186,6 @@ def _convert(image: "Image.Image", stored_plainly: bool, lossy: bool, turned: in
     copy = stored_plainly and is_srgb and orientation == 1 and not opaque
     return Decoded(
         pixels=pixels,
-        focal_px=focal_px,
         focal_source=focal_source,
         camera_key=_camera_key(tags, pixels.shape[1], pixels.shape[0], turned or orientation, focal_px),
         place=place_from_exif(tags),

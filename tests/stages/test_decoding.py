@@ -28,7 +28,7 @@ def test_plain_files_keep_their_pixels_and_may_be_copied(tmp_path: Path) -> None
     pixels = smooth()
     png = decode(saved(tmp_path / "a.png", Image.fromarray(pixels)))
     assert np.array_equal(png.pixels, pixels)
-    assert (png.suffix, png.notes, png.focal_px) == (".png", (), None)
+    assert (png.suffix, png.notes, png.camera_key.focal_px) == (".png", (), None)
     jpeg = decode(saved(tmp_path / "a.jpg", Image.fromarray(pixels), quality=95))
     assert jpeg.suffix == ".jpg"
     assert 0 < np.abs(jpeg.pixels.astype(int) - pixels).mean() < 3
