@@ -39,7 +39,10 @@ class DecodeError(Exception):
 
 
 class CameraKey(NamedTuple):
-    """Photos for which all of this agrees share intrinsics. Orientation counts: it moves the principal point."""
+    """Photos for which all of this agrees share intrinsics. Orientation counts: it moves the principal point.
+
+    ``focal_px`` is for pixels of ``width`` × ``height``, None where EXIF tells none or an absurd one.
+    """
 
     make: str
     model: str
@@ -61,7 +64,7 @@ class Place(NamedTuple):
 
 @dataclass(frozen=True)
 class Decoded:
-    """One image, upright, sRGB. ``focal_px`` is for these pixels, None where EXIF tells none or an absurd one.
+    """One image, upright, sRGB.
 
     ``suffix`` is ".jpg" or ".png" if the file's own bytes already say exactly this to any program (8-bit RGB or
     RGBA, sRGB, upright, one frame), so that they can be copied; otherwise None. ``stored`` is what kind of values it
@@ -70,7 +73,6 @@ class Decoded:
     """
 
     pixels: "np.ndarray"  # (h, w, 3 or 4) uint8
-    focal_px: float | None
     focal_source: str | None
     camera_key: CameraKey
     place: Place
@@ -84,8 +86,6 @@ class Decoded:
 
 def decode(path: Path) -> Decoded:
     """Decode one image file. Raises DecodeError with the reason if that cannot be done."""
-    if path.suffix.lower() in _RAW:
-        raise DecodeError("camera raw files are not read; export JPEG, PNG or TIFF")
     with _open(path) as image:
         stored_plainly, lossy = _is_plain(image), _is_lossy(image, path)
         # Pillow turns TIFFs while it loads them, and forgets how.
@@ -114,13 +114,16 @@ def pillow() -> ModuleType:
 
 def _open(path: Path) -> "Image.Image":
     """The image with its header read, of a size we accept."""
+    if path.suffix.lower() in _RAW:
+        raise DecodeError("camera raw files are not read; export JPEG, PNG or TIFF")
     library = pillow()
     try:
         image = library.open(path, formats=_FORMATS)
     except library.UnidentifiedImageError as error:
         raise DecodeError(_unrecognised(path)) from error
     except FileNotFoundError as error:
-        raise DecodeError("there is no such file") from error
+        gone = "a link to a file that is not there" if path.is_symlink() else "there is no such file"
+        raise DecodeError(gone) from error
     except Exception as error:  # on damaged files Pillow's parsers raise whatever they run into
         if isinstance(error, OSError) and error.errno is not None:  # not Pillow's but the system's
             raise DecodeError(f"cannot be read: {error.strerror}") from error
@@ -135,7 +138,7 @@ def _open(path: Path) -> "Image.Image":
 
 
 def pixel_count(path: Path) -> int:
-    """How many pixels a file says that it has; 0 for one that is refused by its header."""
+    """How many pixels a file says that it has; 0 for one that is refused by its name or header."""
     try:
         with _open(path) as image:
             return image.width * image.height
@@ -183,7 +186,6 @@ def _convert(image: "Image.Image", stored_plainly: bool, lossy: bool, turned: in
     copy = stored_plainly and is_srgb and orientation == 1 and not opaque
     return Decoded(
         pixels=pixels,
-        focal_px=focal_px,
         focal_source=focal_source,
         camera_key=_camera_key(tags, pixels.shape[1], pixels.shape[0], turned or orientation, focal_px),
         place=place_from_exif(tags),

@@ -26,6 +26,7 @@ from stages.ingest_words import (
     all_plain,
     all_the_same,
     facts,
+    nearly_black,
     say,
     say_everything,
     say_findings,
@@ -112,6 +113,7 @@ class _Taken:
     focal_source: str | None = None
     opaque_share: float | None = None  # that a mask beside ``waiting`` leaves; None without alpha
     one_colour: str | None = None
+    brightest: int = 255  # of all channels
     place: Place = _NO_PLACE
     exposure_ev: float | None = None
     time_s: float | None = None
@@ -145,6 +147,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
             taken, duplicates = _without_duplicates(taken)
             refused = sorted(refused + duplicates, key=lambda refusal: refusal.name)
         notes += [f"{shown(t.name)}: {note}" for t in taken for note in t.notes]
+        notes += nearly_black([photo.brightest for photo in taken])
         try:
             same = _checked(source, taken, refused, progress)
         except StageError:
@@ -236,10 +239,10 @@ def _workers(files: Sequence[Path]) -> int:
     from stages.decoding import pixel_count
     from stages.memory import at_once, check_memory
 
-    largest = max(map(pixel_count, files), default=0)
+    largest, name = max(((pixel_count(file), file.name) for file in files), default=(0, ""))
     needed = _BYTES_PER_PIXEL * max(1, largest)
-    megapixels = f"decoding a photo of {largest / 1e6:.0f} megapixels takes"
-    check_memory(needed, "the photos", megapixels, "Close other programs, or make the photos smaller.")
+    why = f"decoding {shown(name)}, which has {largest / 1e6:.0f} megapixels, takes"
+    check_memory(needed, "the photos", why, "Close other programs, make that photo smaller, or leave it out.")
     return at_once(min(processors(), _MAX_WORKERS), needed)
 
 
@@ -270,6 +273,7 @@ def _take(file: Path, name: str, mask: Path | None, waiting: Path) -> _Taken | R
         focal_source=decoded.focal_source,
         opaque_share=_take_opaque(pixels, taken_mask, waiting),
         one_colour=one_colour(pixels),
+        brightest=int(pixels[..., :3].max()),
         place=decoded.place,
         exposure_ev=decoded.exposure_ev,
         mask=taken_mask,

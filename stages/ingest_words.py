@@ -12,6 +12,7 @@ from stages.sources import Source, photos_beside, unused_cameras, unused_masks
 from stages.twins import is_mask
 
 MAX_NOTES = 10
+NEARLY_BLACK = 16  # of 255: the most that 12 bits make in a file of 16
 HINT = "Take 20 to 100 overlapping photos of one scene from different places and put them into one folder."
 
 
@@ -79,6 +80,15 @@ def set_aside_by_values(files: Sequence[str]) -> list[str]:
     count = "1 file is" if len(files) == 1 else f"{len(files)} files are"
     named = listed([shown(name) for name in files], 3)
     return [f"{count} set aside as depth maps, being grey of 16 bits or of floats among photos in colour: {named}"]
+
+
+def nearly_black(brightest: Sequence[int]) -> list[str]:
+    """A note where no photo is brighter than its values make it that have 12 bits or fewer in files of 16;
+    ``brightest`` has the largest of each photo, of 255."""
+    if (most := max(brightest, default=255)) > NEARLY_BLACK:
+        return []
+    how = "values of 10 or 12 bits in files of 16 have to be scaled up first, those of 12 by 16"
+    return [f"all photos are nearly black, at most {most} of 255: {how}"]
 
 
 def say_findings(photos: Sequence[Photo], progress: Progress) -> None:

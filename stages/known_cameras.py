@@ -8,7 +8,7 @@ their files store them are turned upright as ingest turned the photos.
 import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -190,7 +190,7 @@ def _wrong(what: str, why: str) -> StageError:
 
 
 def _from_colmap(folder: Path, photos: Sequence[Photo]) -> KnownCameras:
-    given = read_model(folder)
+    given = _with_slashes(read_model(folder), photos)
     photo_of = _by_name([image.file for image in given.images], photos)
     kept = sorted(photo_of, key=lambda i: photo_of[i].image_name)
     if not kept:
@@ -217,6 +217,14 @@ def _from_colmap(folder: Path, photos: Sequence[Photo]) -> KnownCameras:
     if behind:
         notes.append(f"{behind} observations of points behind their cameras are left out")
     return KnownCameras(model, None, notes)
+
+
+def _with_slashes(model: SparseModel, photos: Sequence[Photo]) -> SparseModel:
+    """``model`` with the names of its images as Windows means them, backslashes between folders, but for those that
+    are a photo's own."""
+    own = {photo.name for photo in photos}
+    images = [replace(i, file=i.file if i.file in own else i.file.replace("\\", "/")) for i in model.images]
+    return replace(model, images=images)
 
 
 def _is_of_upright_photos(folder: Path, given: SparseModel, photo_of: Mapping[int, Photo]) -> bool:

@@ -1,7 +1,7 @@
 """How far to search features and which pairs of photos to match, decided beforehand by what that costs on this machine.
 
-The cost is measured on a few of the photos, in a child process (COLMAP may abort): ``python -m stages.matching_plan``
-reads a job from stdin as one line of JSON and answers with a :class:`Cost`.
+The cost is measured on a few of the photos, in a child process (COLMAP may abort): ``python -P -m
+stages.matching_plan`` reads a job from stdin as one line of JSON and answers with a :class:`Cost`.
 """
 
 import json
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from stages.sfm import Matcher
 
 FEWEST_MEASURED = 4
-CHILD = ["-m", "stages.matching_plan"]
+CHILD = ["-P", "-m", "stages.matching_plan"]
 WAYS = {
     "sequential": "neighbours in time, {} each",
     "spatial": "neighbours by place and looks, {} each",

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 PHASES = {"features": (0.0, 0.35), "matching": (0.35, 0.5), "mapping": (0.85, 0.15)}
 FIRST_ATTEMPT, REFINING = 0.7, 0.95  # where they end and begin in the whole
 FULL_DISK = 1 << 22  # bytes: less than the smallest of COLMAP's files that may have found no room
-CHILD = ["-m", "stages.sfm_child"]
+CHILD = ["-P", "-m", "stages.sfm_child"]  # -P: nothing that lies in the current folder is taken for a module
 
 
 def run_child(

@@ -10,7 +10,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from stages.contract import StageError
 from stages.transforms_files import HELD_OUT, MOST_LETTERS, TRAIN, photo_names, read_splits
@@ -31,6 +31,7 @@ _IMAGES = (".jpg", ".jpeg", ".png", ".heic", ".heif", ".tif", ".tiff", ".webp", 
 _HAS_BESIDE = re.compile(r"images(_\d+)?|input|photos")  # folders of photos beside which their masks may lie
 _EXTENSIONS_TRIED = ("", ".png", ".jpg", ".jpeg")
 _FOLDER_HINT = "Give the folder that holds the photos: pipeline run FOLDER"
+_LINKS_HINT = "Fetch them (git annex get, dvc pull), or connect the drive that they lie on."
 
 
 @dataclass(frozen=True)
@@ -151,6 +152,8 @@ def list_photos(root: Path) -> tuple[Path, ...]:
     found = _files_below(root, _is_photo_folder)
     if not found:
         raise StageError(f"{root} is empty", "there is no file in it", _FOLDER_HINT)
+    if not any(map(Path.is_file, found)):
+        raise StageError(f"no photos in {root}", f"its {len(found)} files are links to what is not there", _LINKS_HINT)
     photos = [file for file in found if _may_be_photo(file)]
     videos = [file for file in found if _is_video(file)]
     if not photos and len(videos) == 1:
@@ -161,9 +164,10 @@ def list_photos(root: Path) -> tuple[Path, ...]:
 
 
 def is_gone(photos: Path) -> bool:
-    """Whether nothing is left of PHOTOS, or only a folder without files: a drive that is not there leaves one, too."""
+    """Whether nothing is left of PHOTOS, or only a folder without files: a drive that is not there leaves one, too, or
+    links to what was on it."""
     try:
-        empty = photos.is_dir() and next(_walk(_photo_root(photos), _is_photo_folder), None) is None
+        empty = photos.is_dir() and not any(map(Path.is_file, _walk(_photo_root(photos), _is_photo_folder)))
         return empty or not photos.exists()
     except OSError:  # said by find_source
         return False
@@ -181,7 +185,9 @@ def _walk(root: Path, enters: Callable[[Path], bool]) -> Iterator[Path]:
     for folder, subfolders, names in os.walk(root, onerror=fail):
         here = Path(folder)
         subfolders[:] = [s for s in subfolders if enters(here / s)]
-        yield from (here / name for name in names if not name.startswith(".") and (here / name).is_file())
+        files = (here / name for name in names if not name.startswith("."))
+        # Links that lead nowhere, as of photos in git-annex that were not fetched, are left to be refused by name.
+        yield from (file for file in files if file.is_file() or (file.is_symlink() and not file.exists()))
 
 
 def _list_masks(root: Path, files: tuple[Path, ...]) -> tuple[tuple[str, Path], ...]:
@@ -200,19 +206,27 @@ def _list_masks(root: Path, files: tuple[Path, ...]) -> tuple[tuple[str, Path], 
     return tuple(found)
 
 
-def _frame_file(names: tuple[str, ...], folders: tuple[Path, ...], what: str = "photo") -> Path:
-    """The photo, or mask, that the first of ``names`` stands for in the first of ``folders`` that has it; a missing
-    extension is completed, and where there is no such file a name is tried as Windows means it, with backslashes
-    between folders.
+def _photo_file(frame: dict[str, Any], folders: tuple[Path, ...]) -> Path:
+    """The photo of a frame: in a file of ours by its own name first, then by ``file_path``."""
+    name, *copies = photo_names(frame)
+    file = _frame_file(name, folders)
+    # Not beside the cameras: there lie ingest's copies, none of PHOTOS, which stand in for no photo that was removed.
+    found = (_frame_file(copy, folders[:2]) for copy in copies)
+    return file if file.is_file() else next(filter(Path.is_file, found), file)
+
+
+def _frame_file(name: str, folders: tuple[Path, ...], what: str = "photo") -> Path:
+    """The photo, or mask, that ``name`` stands for in the first of ``folders`` that has it; a missing extension is
+    completed, and where there is no such file a name is tried as Windows means it, with backslashes between folders.
 
     One that is nowhere is returned as if it were in the first folder, and refused when it is to be decoded.
     """
-    of_windows = tuple(name.replace("\\", "/") for name in names if "\\" in name)
-    for name, folder, extension in product(names + of_windows, folders, _EXTENSIONS_TRIED):
-        file = _inside(folder, name + extension, what)
+    spellings = dict.fromkeys((name, name.replace("\\", "/")))
+    for spelling, folder, extension in product(spellings, folders, _EXTENSIONS_TRIED):
+        file = _inside(folder, spelling + extension, what)
         if file.is_file():
             return file
-    return _inside(folders[0], names[-1], what)
+    return _inside(folders[0], name, what)
 
 
 def _inside(folder: Path, file_path: str, what: str) -> Path:
@@ -274,11 +288,11 @@ def _from_transforms(kind: SourceKind, root: Path, cameras: Path) -> Source:
     folders = (root,) if place == root else (root, root.parent, place)
     splits, _ = read_splits(cameras)
     frames = [frame for _, content in splits for frame in content["frames"]]
-    files = {frame["file_path"]: _frame_file(photo_names(frame), folders) for frame in frames}
+    files = {frame["file_path"]: _photo_file(frame, folders) for frame in frames}
     in_order = _sorted_inside(root, set(files.values()))
     photos = {path: _name(root, file) for path, file in files.items()}
     named = {photos[frame["file_path"]]: mask for frame in frames if (mask := frame.get("mask_path"))}
-    masks = tuple((f"{photo}.png", _frame_file((mask,), folders, "mask")) for photo, mask in named.items())
+    masks = tuple((f"{photo}.png", _frame_file(mask, folders, "mask")) for photo, mask in named.items())
     return Source(kind, root, cameras, in_order, photos, masks)
 
 

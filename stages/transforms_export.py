@@ -34,14 +34,17 @@ _NEAREST = {
 
 
 def transforms(scene: Scene) -> dict[str, Any]:
-    """The content of transforms.json. Intrinsics stand once if all photos share them, else in every frame.
+    """The content of transforms.json. Intrinsics stand once if all photos share them, else in every frame; a model that
+    all have stands at the top, too: nerfstudio reads ``camera_model`` nowhere else.
 
     ``file_path`` is the decoded photo, ``photo`` its own name. ``scale`` and ``offset`` place the region of interest in
     instant-ngp's unit cube. A camera model that the format lacks is written as the nearest one, with a ``note``.
     Raises ValueError for a model without any counterpart.
     """
     cameras = [intrinsics(camera) for camera in scene.cameras]
-    shared = len({view.camera for view in scene.views}) == 1
+    used = {view.camera for view in scene.views}
+    models = {cameras[camera]["camera_model"] for camera in used}
+    shared = len(used) == 1
     sfm_from_scene = scene.scene_from_sfm.inverse()
     frames = []
     for view in scene.views:
@@ -49,7 +52,8 @@ def transforms(scene: Scene) -> dict[str, Any]:
         pose = opengl_matrix(sfm_from_scene.pose(view.scene_from_camera))
         frames.append(own | {"file_path": view.file, "photo": view.name, "transform_matrix": pose})
     scale = scene.scene_from_sfm.scale / 2  # of instant-ngp: [-1, 1] to [0, 1]
-    return (cameras[scene.views[0].camera] if shared else {}) | {
+    common = {"camera_model": models.pop()} if len(models) == 1 else {}
+    return (cameras[scene.views[0].camera] if shared else common) | {
         "frames": frames,
         "scale": scale,
         "offset": (0.5 - scale * sfm_from_scene.points(np.zeros(3))).tolist(),
@@ -80,4 +84,5 @@ def intrinsics(camera: Camera) -> dict[str, Any]:
         values |= {"fl_x": focal, "fl_y": focal}
     if camera.model in _NEAREST:
         values["note"] = f"approximation: {camera.model} with parameters {list(camera.params)} has no counterpart here"
-    return {"camera_model": model, "w": camera.width, "h": camera.height} | values
+    fisheye = {"is_fisheye": True} if model == "OPENCV_FISHEYE" else {}  # instant-ngp reads no camera_model
+    return {"camera_model": model, **fisheye, "w": camera.width, "h": camera.height} | values

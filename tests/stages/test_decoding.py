@@ -28,7 +28,7 @@ def test_plain_files_keep_their_pixels_and_may_be_copied(tmp_path: Path) -> None
     pixels = smooth()
     png = decode(saved(tmp_path / "a.png", Image.fromarray(pixels)))
     assert np.array_equal(png.pixels, pixels)
-    assert (png.suffix, png.notes, png.focal_px) == (".png", (), None)
+    assert (png.suffix, png.notes, png.camera_key.focal_px) == (".png", (), None)
     jpeg = decode(saved(tmp_path / "a.jpg", Image.fromarray(pixels), quality=95))
     assert jpeg.suffix == ".jpg"
     assert 0 < np.abs(jpeg.pixels.astype(int) - pixels).mean() < 3
@@ -223,6 +223,8 @@ def test_what_is_no_image_is_named(tmp_path: Path) -> None:
         (tmp_path / name).write_bytes(data)
         assert reason(tmp_path / name) == expected
     assert reason(tmp_path / "nowhere.jpg") == "there is no such file"
+    (tmp_path / "link.jpg").symlink_to("nowhere.jpg")
+    assert reason(tmp_path / "link.jpg") == "a link to a file that is not there"
     assert reason(tmp_path / "a.NEF") == "camera raw files are not read; export JPEG, PNG or TIFF"
 
 

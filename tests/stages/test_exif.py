@@ -87,7 +87,7 @@ def test_exif_reaches_the_camera_key(tmp_path: Path) -> None:
     tags["FocalLength"] = 9.0
     zoomed = decode(saved(tmp_path / "b.jpg", Image.fromarray(smooth()), exif=exif_with(**tags)))
     assert wide.camera_key[:6] == ("Maker", "M1", "", WIDTH, HEIGHT, 1)
-    assert wide.focal_px == pytest.approx(28 / 43.27 * np.hypot(WIDTH, HEIGHT))
+    assert wide.camera_key.focal_px == pytest.approx(28 / 43.27 * np.hypot(WIDTH, HEIGHT))
     assert wide.camera_key != zoomed.camera_key
 
 
@@ -157,6 +157,6 @@ def test_focal_prior_agrees_with_colmap(shared_data: Path, scene: str) -> None:
 
     photo = min((shared_data / scene / "images").iterdir())
     camera = pycolmap.infer_camera_from_image(photo)
-    focal = decode(photo).focal_px
+    focal = decode(photo).camera_key.focal_px
     assert (focal is not None) == camera.has_prior_focal_length
     assert focal is None or focal == pytest.approx(camera.params[0], rel=1e-6)

@@ -83,3 +83,25 @@ def test_where_it_fails_all_refusals_are_said_by_reason(tmp_path: Path, progress
         "refused y.jpg: identical to a.jpg",
         "masks/stray.png is no photo's mask, which are called NAME.png",
     ]
+
+
+def test_a_photo_that_memory_is_short_of_is_named_and_none_that_is_refused_by_its_ending(
+    tmp_path: Path, progress: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = put(tmp_path / "in", "a.jpg", "b.jpg")
+    Image.new("RGB", (500, 400)).save(folder / "raw.dng", "TIFF")
+    monkeypatch.setattr("stages.memory.available_bytes", lambda: 2**20)
+    ingest.run(Config(photos=folder), {}, tmp_path / "out", progress)
+    Image.new("RGB", (400, 300)).save(folder / "large.jpg")
+    with pytest.raises(StageError, match=r"^not enough memory for the photos: decoding large\.jpg, which has"):
+        ingest.run(Config(photos=folder), {}, tmp_path / "again", progress)
+
+
+@pytest.mark.parametrize(("most", "dark"), [(4095, True), (16383, False)])
+def test_twelve_bits_in_files_of_sixteen_are_said(tmp_path: Path, progress: Any, most: int, dark: bool) -> None:
+    for index in range(2):
+        grey = np.random.default_rng(index).integers(0, most, (24, 32), np.uint16, endpoint=True)
+        Image.fromarray(grey).save(tmp_path / f"{index}.png")
+    ingest.run(Config(photos=tmp_path), {}, tmp_path / "out", progress)
+    how = "values of 10 or 12 bits in files of 16 have to be scaled up first, those of 12 by 16"
+    assert progress.notes == [f"all photos are nearly black, at most 16 of 255: {how}"] * dark

@@ -308,6 +308,14 @@ def test_a_colmap_model_is_matched_by_name_and_keeps_its_points(tmp_path: Path) 
     assert [entry["observations"] for entry in known.account(PHOTOS)] == [2, 2, 0]
 
 
+def test_a_colmap_model_that_was_written_on_windows(tmp_path: Path) -> None:
+    colmap_model(tmp_path, ["left\\ä0.png", "right\\ä0.png", "right\\ä1.png"])
+    photos = [photo(0, folder="left/"), photo(0, folder="right/"), photo(1, folder="right\\")]
+    known = read_known_cameras(tmp_path, photos, {})
+    assert [image.file for image in known.model.images] == ["left/a0.png", "right/a0.png", "right\\a1.png"]
+    assert known.notes == []
+
+
 def test_a_colmap_model_of_larger_photos_is_scaled(tmp_path: Path) -> None:
     colmap_model(tmp_path, ["ä0.png", "ä1.png"])
     known = read_known_cameras(tmp_path, [photo(0, W // 2, H // 2), photo(1)], {})

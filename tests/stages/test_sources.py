@@ -11,7 +11,7 @@ import pytest
 
 from stages.contract import StageError
 from stages.masks import pair_masks
-from stages.sources import Source, camera_files, find_source, photos_beside
+from stages.sources import Source, camera_files, find_source, is_gone, photos_beside
 
 
 def touch(folder: Path, *names: str) -> Path:
@@ -153,6 +153,21 @@ def test_an_export_of_ours_finds_the_photos_by_their_own_names(tmp_path: Path) -
     cameras.write_text(json.dumps({"frames": [frame]}))
     source = find_source(photos, cameras)
     assert (source.files, source.frames) == ((photos / "ä.jpg",), {"images/a-1.jpg": "ä.jpg"})
+
+
+@pytest.mark.parametrize("linked", [True, False])
+def test_a_photo_that_was_removed_is_one_that_is_not_there_for_an_export_of_ours(tmp_path: Path, linked: bool) -> None:
+    touch(tmp_path, "photos/a.jpg", "kept/a.jpg", "kept/b.jpg", "output/x")
+    if linked:
+        (tmp_path / "output/images").symlink_to(tmp_path / "kept")
+    else:
+        shutil.copytree(tmp_path / "kept", tmp_path / "output/images")
+    frames = [{"file_path": f"images/{name}", "photo": name, "transform_matrix": []} for name in ("a.jpg", "b.jpg")]
+    cameras = tmp_path / "output/transforms.json"
+    cameras.write_text(json.dumps({"frames": frames}))
+    source = find_source(tmp_path / "photos", cameras)
+    assert names(source) == list(source.frames.values()) == ["a.jpg", "b.jpg"]
+    assert [file.is_file() for file in source.files] == [True, False]
 
 
 def test_a_transforms_file_that_was_written_on_windows(tmp_path: Path) -> None:
@@ -327,6 +342,16 @@ def test_a_folder_without_read_permission(tmp_path: Path) -> None:
         assert refusal(tmp_path).why == "permission denied"
     finally:
         (tmp_path / "a").chmod(0o755)
+
+
+def test_links_that_lead_nowhere_are_left_to_be_refused_by_name(tmp_path: Path) -> None:
+    touch(tmp_path, "a.jpg")
+    (tmp_path / "b.jpg").symlink_to("annex/b")
+    assert names(find_source(tmp_path)) == ["a.jpg", "b.jpg"] and not is_gone(tmp_path)
+    (tmp_path / "a.jpg").unlink()
+    error = refusal(tmp_path)
+    assert (error.what, error.why) == (f"no photos in {tmp_path}", "its 1 files are links to what is not there")
+    assert is_gone(tmp_path)
 
 
 def test_a_folder_that_goes_while_it_is_listed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

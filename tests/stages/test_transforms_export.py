@@ -61,6 +61,18 @@ def test_different_cameras_stand_in_their_frames() -> None:
     assert [content["frames"][1][key] for key in ("k1", "k2", "p1", "p2")] == [0.1, -0.02, 0.003, 0.004]
 
 
+def test_fisheyes_are_declared_where_other_programs_look() -> None:
+    """instant-ngp asks for ``is_fisheye`` beside the terms, nerfstudio for one ``camera_model`` at the top."""
+    fisheyes = tuple(Camera("OPENCV_FISHEYE", 8, 6, (f, 6.0, 4.0, 3.0, 0.1, 0.0, 0.0, 0.0)) for f in (5.0, 5.5))
+    content = transforms(scene_of(fisheyes, ring(4)))
+    assert content["camera_model"] == "OPENCV_FISHEYE" and "fl_x" not in content
+    assert all(frame["is_fisheye"] is True and "k1" in frame for frame in content["frames"])
+    assert transforms(scene_of(fisheyes[:1], ring(4)))["is_fisheye"] is True
+    mixed = transforms(scene_of((fisheyes[0], PINHOLE), ring(4)))
+    assert "camera_model" not in mixed
+    assert ["is_fisheye" in frame for frame in mixed["frames"]] == [True, False, True, False]
+
+
 def test_region_of_interest_lies_in_the_unit_cube_of_instant_ngp() -> None:
     content = transforms(scene_of((PINHOLE,), ring(4)))
     centre = SCENE_FROM_SFM.inverse().points(np.zeros(3))
