@@ -196,13 +196,9 @@ def _surplus_file(kind: type, words: Sequence[str], default: Any) -> str | None:
 def _without_replaced(recorded: TrainConfig, words: Sequence[str]) -> TrainConfig:
     """The recorded options of training without the budgets that the one given in ``words`` stands in place of."""
     given = {option for option in ("steps", "seconds", "preset") if _is_given(words, option)}
-    replaced: dict[str, None] = {}
-    for option, other in (("steps", "seconds"), ("seconds", "steps")):
-        if option in given and other not in given:
-            replaced[other] = None
-    if given:  # a new training does not go on from another
-        replaced |= dict.fromkeys(("after", "more_steps", "more_seconds"))
-    return recorded.model_copy(update=replaced)
+    # A preset is a budget, too, unless one is counted; and a new training does not go on from another.
+    others = {"steps", "seconds", "after", "more_steps", "more_seconds"} - given
+    return recorded.model_copy(update=dict.fromkeys(others)) if given else recorded
 
 
 def _what_is_wrong(ending: SystemExit, box: str) -> str:
