@@ -14,6 +14,7 @@ deviation is uncertain by 1 / √(2n) of itself. But only alike ones may be pool
 """
 
 import math
+import os
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -218,7 +219,14 @@ def command(point: Point, workspace: str) -> str:
     field = {"field": "paper"} if field_of(point.variant) == "paper" else {}
     given = {"seconds": max(1, round(point.train_seconds)), "downscale": point.downscale} | field
     flags = [_flag(name, value) for name, value in {**given, **VARIANTS[point.variant].options}.items()]
-    return " ".join(["pipeline train", shlex.quote(workspace), *flags])
+    return " ".join(["pipeline train", _quoted(workspace), *flags])
+
+
+def _quoted(name: str) -> str:
+    """As a shell takes it; the bytes of a name that is not Unicode, which no text holds, as in ``$'caf\\xe9'``."""
+    escaped = name.replace("\\", r"\\").replace("'", r"\'")
+    text = os.fsencode(escaped).decode("utf-8", "backslashreplace")
+    return shlex.quote(name) if text == escaped else f"$'{text}'"
 
 
 def _flag(name: str, value: Any) -> str:

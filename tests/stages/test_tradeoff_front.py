@@ -125,6 +125,12 @@ def test_the_command_of_a_setting_asks_for_what_it_was(variant: str) -> None:
     )
 
 
+def test_the_command_names_a_workspace_whose_name_is_not_unicode() -> None:
+    words = command(point(48.6, 29.0), "caf\udce9's.nerf")
+    assert words.startswith(r"pipeline train $'caf\xe9\'s.nerf' --train.")
+    words.encode()
+
+
 # Settings of the study of fox in docs/numbers.md: seconds, dB, deviation over two seeds.
 FOX_GRID = [(2.1, 14.09, 0.86), (3.8, 15.99, 1.69), (6.6, 18.61, 1.73), (10.8, 21.67, 0.51), (18.3, 24.83, 0.22)]
 FOX_GRID += [(30.4, 27.72, 0.03), (48.9, 29.26, 0.05)]
