@@ -308,9 +308,11 @@ def _whole(folder: Path) -> Manifest | None:
 
 
 def _refuse_links(root: Path) -> None:
-    """What is written and removed below ``root`` must lie there: only what ``output/`` holds may be links."""
-    for path in (path for folder in (root, *root.iterdir()) if folder.is_dir() for path in folder.iterdir()):
-        if path.is_symlink() and path.parent != root / "output":
+    """What is written and removed below ``root`` must lie there: only what ``output/`` holds may be links, and what
+    folders of others hold, which need not even be readable (``lost+found`` of a disk)."""
+    ours = (root, *map(root.joinpath, STAGES))
+    for path in (path for folder in ours if folder.is_dir() for path in folder.iterdir()):
+        if path.is_symlink():
             raise StageError(
                 f"{path} is a link",
                 "results are written and removed there, and a link may lead anywhere",

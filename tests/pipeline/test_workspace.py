@@ -4,6 +4,7 @@ import errno
 import os
 import shutil
 import stat
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -98,6 +99,22 @@ def test_what_is_shown_already_is_not_copied_again(tmp_path: Path, monkeypatch: 
         workspace.unlink_outputs(("images",))
     workspace.link_outputs(first, ("images",))
     assert (tmp_path / "output/images/a.png").is_file(), "half of a copy shows nothing"
+
+
+def test_folders_of_others_are_not_looked_into(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "lost+found").mkdir()
+    iterdir = Path.iterdir
+
+    def locked(folder: Path) -> Iterator[Path]:
+        """As for whoever is no administrator."""
+        if folder.name == "lost+found":
+            raise PermissionError(errno.EACCES, "Permission denied")
+        return iterdir(folder)
+
+    monkeypatch.setattr(Path, "iterdir", locked)
+    with Workspace(tmp_path) as workspace:
+        workspace.write_run(workspace.read_run())
+    assert Workspace.existing(tmp_path)
 
 
 def test_a_workspace_that_was_copied_without_its_links_is_one(tmp_path: Path):
