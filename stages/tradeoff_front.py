@@ -214,9 +214,9 @@ def _placed(own: Point, point: Point, front: Sequence[Point]) -> str:
 
 
 def command(point: Point, workspace: str) -> str:
-    """What trains the setting of ``point`` for as long in a workspace. The sizes of its field are given, for those that
-    would be chosen follow from a timing."""
-    field = {"field": "paper"} if field_of(point.variant) == "paper" else {}
+    """What trains the setting of ``point`` for as long in a workspace. Field and preset are given, for it may remember
+    others, and the field's sizes, for those that would be chosen follow from a timing."""
+    field = {"field": field_of(point.variant), "preset": "standard"}
     given = {"seconds": max(1, round(point.train_seconds)), "downscale": point.downscale} | field
     flags = [_flag(name, value) for name, value in {**given, **VARIANTS[point.variant].options}.items()]
     return " ".join(["pipeline train", _quoted(workspace), *flags])

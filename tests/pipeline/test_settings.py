@@ -63,6 +63,18 @@ def test_the_budget_given_replaces_the_one_remembered(words: list[str], budget: 
     assert (train.after is None) == bool(words), "a new training does not go on from another"
 
 
+@pytest.mark.parametrize(
+    ("remembered", "words", "left"),
+    [
+        ({"preset": "paper", "width": 64, "seed": 3}, ["--train.field", "grid"], {"field": "grid", "seed": 3}),
+        ({"levels": 3, "preset": "draft"}, ["--train.field=paper"], {"field": "paper", "preset": "draft"}),
+    ],
+)
+def test_the_field_given_takes_back_the_options_of_the_other(remembered: dict, words: list[str], left: dict):
+    asked = parse(StageArguments, "train", ["w", *words], Settings(train=TrainConfig(**remembered)))
+    assert asked.settings.train == TrainConfig(**left)
+
+
 def test_a_file_may_begin_with_the_byte_order_mark_of_windows(tmp_path: Path):
     (tmp_path / "a.toml").write_bytes(b"\xef\xbb\xbf[train]\r\nsteps = 3\r\n")
     assert read_toml(tmp_path / "a.toml") == {"train": {"steps": 3}}
