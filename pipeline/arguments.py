@@ -5,6 +5,7 @@ import re
 from collections.abc import Sequence
 from contextlib import redirect_stderr, suppress
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -12,6 +13,7 @@ import tyro
 from pydantic import ValidationError
 
 from pipeline.settings import Settings, UsageError, wrong_options
+from stages.train import GRID_ONLY, PAPER_ONLY
 from stages.train import Config as TrainConfig
 
 T = TypeVar("T")
@@ -194,15 +196,18 @@ def _surplus_file(kind: type, words: Sequence[str], default: Any) -> str | None:
 
 
 def _without_replaced(recorded: TrainConfig, words: Sequence[str]) -> TrainConfig:
-    """The recorded options of training without the budgets that the one given in ``words`` stands in place of."""
-    given = {option for option in ("steps", "seconds", "preset") if _is_given(words, option)}
-    replaced: dict[str, None] = {}
-    for option, other in (("steps", "seconds"), ("seconds", "steps")):
-        if option in given and other not in given:
-            replaced[other] = None
-    if given:  # a new training does not go on from another
-        replaced |= dict.fromkeys(("after", "more_steps", "more_seconds"))
-    return recorded.model_copy(update=replaced)
+    """The recorded options of training without what those in ``words`` stand in place of: the budgets beside the one
+    given, and all that belongs to the other field than the one given."""
+    replaced = set[str]()
+    if given := {option for option in ("steps", "seconds", "preset") if _given(words, option) is not None}:
+        # A preset is a budget, too, unless one is counted; and a new training does not go on from another.
+        replaced |= {"steps", "seconds", "after", "more_steps", "more_seconds"} - given
+    wanted = _given(words, "field")
+    if wanted == "paper":
+        replaced |= {*GRID_ONLY}
+    elif wanted == "grid":
+        replaced |= {*PAPER_ONLY, *(["preset"] if recorded.preset == "paper" else [])}
+    return recorded.model_copy(update={name: TrainConfig.model_fields[name].default for name in replaced})
 
 
 def _what_is_wrong(ending: SystemExit, box: str) -> str:
@@ -221,8 +226,13 @@ def _what_is_wrong(ending: SystemExit, box: str) -> str:
     return words + (f"; perhaps {', '.join(re.findall(r'--[a-z0-9.-]+', similar))}" if similar else "")
 
 
-def _is_given(words: Sequence[str], option: str) -> bool:
-    return any(word.split("=")[0] == f"--train.{option}" for word in words)
+def _given(words: Sequence[str], option: str) -> str | None:
+    """What ``words`` give for an option of training; None where they do not name it."""
+    for word, following in pairwise([*words, ""]):
+        name, equals, value = word.partition("=")
+        if name == f"--train.{option}":
+            return value if equals else following
+    return None
 
 
 def overview(stages: Sequence[str]) -> str:

@@ -134,6 +134,9 @@ def _command(name: str) -> Callable[[Sequence[str]], int]:
 def command_run(words: Sequence[str]) -> int:
     """``pipeline run PHOTOS``: the whole chain, or a part of it."""
     given = words_of.parse(words_of.RunArguments, "run", words)
+    if given.more is not None and given.config is not None:
+        what = f"--more goes on with the recorded options, not with those of --config {given.config}"
+        raise UsageError(f"{what}; leave --config out, and give what is to change as flags")
     file = {} if given.config is None else read_toml(given.config)
     if given.config is not None:  # the file's values become the defaults that flags override
         from_file = settings_from(file, f"--config {given.config}")

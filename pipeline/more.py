@@ -20,7 +20,7 @@ def with_more(settings: Settings, workspace: Workspace, text: str) -> Settings:
     Raises UsageError for what is no duration or for a second budget, StageError where nothing is finished.
     """
     train = settings.train
-    budgets = {"steps": train.steps, "seconds": train.seconds}
+    budgets = {"steps": train.steps, "seconds": train.seconds, "preset": train.preset}
     recorded = workspace.read_run()
     for name, value in budgets.items():
         if value is not None and value != recorded["options"]["train"][name]:

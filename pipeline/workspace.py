@@ -9,7 +9,7 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -24,7 +24,7 @@ from stages.files import first_fault, sync_file, sync_folder, write_durably
 
 RUN_FILE = "run.json"
 RUN_VERSION = 1
-COPIES = ".copies"  # names of what in output/ is no link but a copy, one a line
+COPIES = ".copies"  # what in output/ is no link but a copy, one a line: its name, a tab, what of the workspace it shows
 _KEY = re.compile(rf"[0-9a-f]{{{KEY_LENGTH}}}(\.|$)")
 
 
@@ -212,7 +212,7 @@ class Workspace:
             raise self._cannot_write(error) from error
 
     def link_outputs(self, folder: Path, names: tuple[str, ...]) -> None:
-        """Point ``output/<name>`` at the files of a finished folder; copies where links are not allowed.
+        """Point ``output/<name>`` at the files of a finished folder; copies, made once, where links are not allowed.
 
         Raises StageError where something else lies there.
         """
@@ -220,19 +220,25 @@ class Workspace:
         self._refuse_strangers(names)
         for name in names:
             source, shown = folder / name, self._shown(name)
-            if not source.exists():
+            if source.exists():
+                self._show(source, shown)
+            else:
                 _remove(shown)
-                continue
-            temporary = shown.with_name(f".{shown.name}.tmp")
-            _remove(temporary)
-            try:
-                temporary.symlink_to(os.path.relpath(source, shown.parent), target_is_directory=source.is_dir())
-            except OSError:  # Windows without the privilege, or a file system without links
-                shutil.copytree(source, temporary) if source.is_dir() else shutil.copy2(source, temporary)
-                self._note_copies([*self._copies(), shown.name])
-            if shown.is_dir() and not shown.is_symlink():
-                _remove(shown)
-            temporary.replace(shown)
+
+    def _show(self, source: Path, shown: Path) -> None:
+        temporary, copy_of = shown.with_name(f".{shown.name}.tmp"), None
+        _remove(temporary)
+        try:
+            temporary.symlink_to(os.path.relpath(source, shown.parent), target_is_directory=source.is_dir())
+        except OSError:  # Windows without the privilege, or a file system without links
+            copy_of = source.relative_to(self.root).as_posix()
+            if shown.exists() and self._copies().get(shown.name) == copy_of:
+                return
+            shutil.copytree(source, temporary) if source.is_dir() else shutil.copy2(source, temporary)
+        if copy_of is not None or shown.name in self._copies():
+            _remove(shown)  # before the note: no kill leaves one result under the name of another
+        self._note_copies({shown.name: copy_of})
+        temporary.replace(shown)
 
     def unlink_outputs(self, names: tuple[str, ...]) -> None:
         """Take ``output/<name>`` away, so that nothing there looks more current than it is."""
@@ -244,12 +250,19 @@ class Workspace:
         """Where an output or record is shown."""
         return self.root / "output" / Path(name).name
 
-    def _copies(self) -> list[str]:
+    def _copies(self) -> dict[str, str]:
+        """What each copy in ``output/`` shows, by its name, relative to the workspace; "" where that is not known."""
         copies = self.root / COPIES
-        return copies.read_text("utf-8", "replace").splitlines() if copies.exists() else []
+        lines = copies.read_text("utf-8", "replace").splitlines() if copies.exists() else []
+        return {name: source for name, _, source in (line.partition("\t") for line in lines)}
 
-    def _note_copies(self, names: Iterable[str]) -> None:
-        write_durably(self.root / COPIES, "\n".join(sorted(set(names))).encode())
+    def _note_copies(self, sources: Mapping[str, str | None]) -> None:
+        """What these copies show; None for what is no copy any more."""
+        before = self._copies()
+        now = {name: source for name, source in {**before, **sources}.items() if source is not None}
+        if now != before:
+            lines = (f"{name}\t{source}" for name, source in sorted(now.items()))
+            write_durably(self.root / COPIES, "\n".join(lines).encode())
 
     def _adopt_copies(self, names: Iterable[str]) -> None:
         """Where no result in ``output/`` is a link and none is noted as a copy, the workspace was zipped or copied in a
@@ -257,7 +270,7 @@ class Workspace:
         results = [shown for shown in map(self._shown, names) if shown.exists()]
         lost = results and not any(shown.is_symlink() for shown in results) and not self._copies()
         if lost and (self.root / RUN_FILE).exists():
-            self._note_copies(shown.name for shown in results)
+            self._note_copies({shown.name: "" for shown in results})
 
     def _is_ours(self, shown: Path) -> bool:
         return shown.is_symlink() or shown.name in self._copies()
@@ -295,9 +308,11 @@ def _whole(folder: Path) -> Manifest | None:
 
 
 def _refuse_links(root: Path) -> None:
-    """What is written and removed below ``root`` must lie there: only what ``output/`` holds may be links."""
-    for path in (path for folder in (root, *root.iterdir()) if folder.is_dir() for path in folder.iterdir()):
-        if path.is_symlink() and path.parent != root / "output":
+    """What is written and removed below ``root`` must lie there: only what ``output/`` holds may be links, and what
+    folders of others hold, which need not even be readable (``lost+found`` of a disk)."""
+    ours = (root, *map(root.joinpath, STAGES))
+    for path in (path for folder in ours if folder.is_dir() for path in folder.iterdir()):
+        if path.is_symlink():
             raise StageError(
                 f"{path} is a link",
                 "results are written and removed there, and a link may lead anywhere",
@@ -306,7 +321,12 @@ def _refuse_links(root: Path) -> None:
 
 
 def _remove(path: Path) -> None:
+    """A folder vanishes at one go: what a kill leaves of it has another name, and goes the next time."""
+    gone = path.with_name(f".{path.name}.gone")
+    if gone.is_dir():
+        shutil.rmtree(gone)
     if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path)
+        path.rename(gone)
+        shutil.rmtree(gone)
     else:
         path.unlink(missing_ok=True)

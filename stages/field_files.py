@@ -51,13 +51,13 @@ def load_field(
     """
     from pydantic import ValidationError
     from safetensors import SafetensorError
-    from safetensors.torch import load_file
+    from safetensors.torch import load
 
     info = read_json(folder / "field.json")
     try:
         weights = folder / "field.safetensors"
         model = _untrained(info, weights.stat().st_size, device, progress)
-        model.load_state_dict(load_file(weights))
+        model.load_state_dict(load(weights.read_bytes()))  # load_file takes paths in Unicode alone
         neutral = _neutral(info)
     except ValidationError as error:
         raise StageError("cannot read the trained field", first_fault(error), "Run stage train again.") from error

@@ -108,10 +108,10 @@ def write_tensors(path: Path, tensors: "dict[str, np.ndarray]") -> None:
 def read_tensors(path: Path) -> "dict[str, np.ndarray]":
     """Read arrays written by :func:`write_tensors`. Raises StageError where the file is missing or damaged."""
     from safetensors import SafetensorError
-    from safetensors.numpy import load_file
+    from safetensors.numpy import load
 
     try:
-        return load_file(path)
+        return load(path.read_bytes())  # load_file takes paths in Unicode alone
     except (OSError, KeyError, ValueError, SafetensorError) as error:
         raise damaged(path.name, str(error)) from error
 

@@ -79,7 +79,8 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     summary["budget"] = config.budget and config.budget.model_dump()
     write_json(folder / "summary.json", summary)
     progress.update("writing the page")
-    (folder / "report.html").write_text(page(results, summary, config), "utf-8")
+    text = page(results, summary, config)
+    (folder / "report.html").write_text(text, "utf-8", "backslashreplace")  # names of folders need not be Unicode
     return StageResult(("report.html", "summary.json"), summary["verdict"], facts={"verdict": summary["verdict"]})
 
 

@@ -14,6 +14,7 @@ deviation is uncertain by 1 / √(2n) of itself. But only alike ones may be pool
 """
 
 import math
+import os
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -213,12 +214,19 @@ def _placed(own: Point, point: Point, front: Sequence[Point]) -> str:
 
 
 def command(point: Point, workspace: str) -> str:
-    """What trains the setting of ``point`` for as long in a workspace. The sizes of its field are given, for those that
-    would be chosen follow from a timing."""
-    field = {"field": "paper"} if field_of(point.variant) == "paper" else {}
+    """What trains the setting of ``point`` for as long in a workspace. Field and preset are given, for it may remember
+    others, and the field's sizes, for those that would be chosen follow from a timing."""
+    field = {"field": field_of(point.variant), "preset": "standard"}
     given = {"seconds": max(1, round(point.train_seconds)), "downscale": point.downscale} | field
     flags = [_flag(name, value) for name, value in {**given, **VARIANTS[point.variant].options}.items()]
-    return " ".join(["pipeline train", shlex.quote(workspace), *flags])
+    return " ".join(["pipeline train", _quoted(workspace), *flags])
+
+
+def _quoted(name: str) -> str:
+    """As a shell takes it; the bytes of a name that is not Unicode, which no text holds, as in ``$'caf\\xe9'``."""
+    escaped = name.replace("\\", r"\\").replace("'", r"\'")
+    text = os.fsencode(escaped).decode("utf-8", "backslashreplace")
+    return shlex.quote(name) if text == escaped else f"$'{text}'"
 
 
 def _flag(name: str, value: Any) -> str:

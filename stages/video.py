@@ -37,7 +37,8 @@ def video_writer(path: Path, width: int, height: int, fps: int) -> "Iterator[Cal
     import imageio_ffmpeg
 
     source = f"-f rawvideo -vcodec rawvideo -pix_fmt rgb24 -s {width}x{height} -r {fps} -i -".split()
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-v", "error", *source, *_OUTPUT, str(path)]
+    place = f"file:{path}"  # what stands before a colon would be a protocol
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-v", "error", *source, *_OUTPUT, place]
     with tempfile.TemporaryFile() as words:
         encoder = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=words)
         assert encoder.stdin is not None

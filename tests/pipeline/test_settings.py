@@ -6,9 +6,11 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
+from pipeline.arguments import StageArguments, parse
 from pipeline.cli import run_command
 from pipeline.settings import Settings, UsageError, read_toml, with_effects
 from stages.effects import Config
+from stages.train import Config as TrainConfig
 
 EFFECTS = "exposure, view_dependence, background, pose_refinement"
 
@@ -43,6 +45,34 @@ def test_wrong_effects_are_named_with_those_that_there_are(choice: str, words: s
     with pytest.raises(UsageError) as error:
         with_effects(Settings(), [choice])
     assert str(error.value) == words
+
+
+@pytest.mark.parametrize(
+    ("words", "budget"),
+    [
+        ([], ("high", None, 600)),
+        (["--train.steps", "9"], ("high", 9, None)),
+        (["--train.preset=draft"], ("draft", None, None)),
+        (["--train.preset", "draft", "--train.seconds", "9"], ("draft", None, 9)),
+    ],
+)
+def test_the_budget_given_replaces_the_one_remembered(words: list[str], budget: tuple[str, int | None, float | None]):
+    remembered = Settings(train=TrainConfig(preset="high", seconds=600, after="0/0", more_steps=5))
+    train = parse(StageArguments, "train", ["w", *words], remembered).settings.train
+    assert (train.preset, train.steps, train.seconds) == budget
+    assert (train.after is None) == bool(words), "a new training does not go on from another"
+
+
+@pytest.mark.parametrize(
+    ("remembered", "words", "left"),
+    [
+        ({"preset": "paper", "width": 64, "seed": 3}, ["--train.field", "grid"], {"field": "grid", "seed": 3}),
+        ({"levels": 3, "preset": "draft"}, ["--train.field=paper"], {"field": "paper", "preset": "draft"}),
+    ],
+)
+def test_the_field_given_takes_back_the_options_of_the_other(remembered: dict, words: list[str], left: dict):
+    asked = parse(StageArguments, "train", ["w", *words], Settings(train=TrainConfig(**remembered)))
+    assert asked.settings.train == TrainConfig(**left)
 
 
 def test_a_file_may_begin_with_the_byte_order_mark_of_windows(tmp_path: Path):

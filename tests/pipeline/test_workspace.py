@@ -4,6 +4,7 @@ import errno
 import os
 import shutil
 import stat
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,7 +15,7 @@ from PIL import Image
 from pipeline.cli import run_command
 from pipeline.manifests import Manifest, describe_outputs, outputs_digest
 from pipeline.status import status_of
-from pipeline.workspace import Workspace
+from pipeline.workspace import COPIES, Workspace
 from stages.contract import StageError
 from stages.files import make_durable
 
@@ -55,10 +56,11 @@ def test_what_others_put_into_output_stays(tmp_path: Path):
     assert (tmp_path / "output/mesh.ply").read_text() == "of another program"
 
 
-def test_copies_make_way_where_links_are_not_allowed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    def not_allowed(*_: object, **__: object) -> None:
-        raise OSError(22, "A required privilege is not held by the client")
+def not_allowed(*_: object, **__: object) -> None:
+    raise OSError(22, "A required privilege is not held by the client")
 
+
+def test_copies_make_way_where_links_are_not_allowed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(Path, "symlink_to", not_allowed)
     names, output = ("images", "mesh.ply"), tmp_path / "output"
     for number in (1, 2):
@@ -69,8 +71,50 @@ def test_copies_make_way_where_links_are_not_allowed(tmp_path: Path, monkeypatch
     monkeypatch.undo()
     workspace.link_outputs(result(tmp_path, 3), names[:1])
     assert (output / "images").is_symlink() and not (output / "mesh.ply").is_symlink()
+    assert (tmp_path / COPIES).read_text() == "mesh.ply\tmesh/0000000000000002/mesh.ply"
     workspace.unlink_outputs(names)
     assert not any(output.iterdir())
+
+
+def test_what_is_shown_already_is_not_copied_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(Path, "symlink_to", not_allowed)
+    copytree, copied = shutil.copytree, list[Path]()
+
+    def noted(source: Path, place: Path) -> None:
+        copied.append(source)
+        copytree(source, place)
+
+    monkeypatch.setattr(shutil, "copytree", noted)
+    first, second, workspace = result(tmp_path, 1), result(tmp_path, 2), Workspace(tmp_path)
+    for folder in (first, second, second, first):
+        workspace.link_outputs(folder, ("images",))
+    assert copied == [first / "images", second / "images", first / "images"]
+
+    def killed(folder: Path) -> None:
+        (folder / "a.png").unlink()
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(shutil, "rmtree", killed)
+        workspace.unlink_outputs(("images",))
+    workspace.link_outputs(first, ("images",))
+    assert (tmp_path / "output/images/a.png").is_file(), "half of a copy shows nothing"
+
+
+def test_folders_of_others_are_not_looked_into(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "lost+found").mkdir()
+    iterdir = Path.iterdir
+
+    def locked(folder: Path) -> Iterator[Path]:
+        """As for whoever is no administrator."""
+        if folder.name == "lost+found":
+            raise PermissionError(errno.EACCES, "Permission denied")
+        return iterdir(folder)
+
+    monkeypatch.setattr(Path, "iterdir", locked)
+    with Workspace(tmp_path) as workspace:
+        workspace.write_run(workspace.read_run())
+    assert Workspace.existing(tmp_path)
 
 
 def test_a_workspace_that_was_copied_without_its_links_is_one(tmp_path: Path):

@@ -1,6 +1,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -11,7 +12,7 @@ from nerf.rays import Rays
 from stages.backend import BackendName, backend_name, chosen_backend, load_backend
 from stages.contract import StageError
 from stages.field_files import load_field, save_field
-from stages.files import read_json, write_json
+from stages.files import read_json, read_tensors, write_json, write_tensors
 
 SMALL = PaperSettings(depth=2, width=8, samples_coarse=4, samples_fine=4, contracted=True, spacing="log")
 GRID = GridSettings(levels=2, log2_rows=8, coarsest=4, finest=16, contracted=True, cache_cells=8)
@@ -36,6 +37,15 @@ def test_a_field_comes_back_the_same(kind: str, tmp_path: Path) -> None:
     assert {key: info[key] for key in INFO} == INFO
     assert info["kind"] == ("paper" if kind == "paper" else "grid")
     assert info["settings"]["contracted"] is True
+
+
+def test_files_are_read_from_folders_whose_names_are_not_unicode(tmp_path: Path) -> None:
+    folder = tmp_path / "caf\udce9"
+    folder.mkdir()
+    save_field(folder, KINDS["paper"], INFO)
+    assert load_field(folder)[1]["steps"] == 7
+    write_tensors(folder / "points.safetensors", {"none": np.zeros((0, 3))})
+    assert read_tensors(folder / "points.safetensors")["none"].shape == (0, 3)
 
 
 @pytest.mark.parametrize("kind", KINDS)

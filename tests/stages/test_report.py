@@ -104,6 +104,13 @@ def test_names_of_photos_are_escaped(inputs: dict[str, Path], tmp_path: Path, pr
     assert "blurred &lt;b&gt;.jpg" in html and "notes &amp; sums.jpg" in html
 
 
+def test_the_name_of_a_workspace_need_not_be_unicode(tmp_path: Path, progress: Any):
+    made = make_workspace(tmp_path)
+    root = (tmp_path / "fox.nerf").rename(tmp_path / "caf\udce9.nerf")
+    html, _ = written({stage: root / stage / folder.name for stage, folder in made.items()}, tmp_path / "out", progress)
+    assert "<title>caf\\udce9.nerf" in html
+
+
 def test_page_is_the_same_twice_and_gives_no_folder_away(inputs: dict[str, Path], tmp_path: Path, progress: Any):
     html, _ = written(inputs, tmp_path / "out", progress)
     assert html == written(inputs, tmp_path / "again", progress)[0]

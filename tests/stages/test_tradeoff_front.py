@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.arguments import StageArguments, parse
-from pipeline.settings import with_effects
-from stages.tradeoff_arms import OWN, VARIANTS, Arm, field_of
+from pipeline.settings import Settings, with_effects
+from stages.tradeoff_arms import OWN, PUBLISHED, REDUCED, VARIANTS, Arm, field_of
 from stages.tradeoff_front import (
     WORTH_DB,
     Point,
@@ -120,9 +120,23 @@ def test_the_command_of_a_setting_asks_for_what_it_was(variant: str) -> None:
     view_dependence = with_effects(given.settings, given.effect).effects.view_dependence
     assert view_dependence == {None: "auto", True: "on", False: "off"}[asked.view_dependence]
     assert given.settings.train.kind == asked.kind
-    assert given.settings.train == asked.model_copy(
-        update={"view_dependence": None, "field": given.settings.train.field}
-    )
+    usual = {"view_dependence": None, "preset": asked.preset or "standard"}
+    assert given.settings.train == asked.model_copy(update=usual)
+
+
+@pytest.mark.parametrize("remembered", [{"preset": "paper", "width": 64}, {"field": "grid", "levels": 3, "steps": 9}])
+@pytest.mark.parametrize("variant", ["grid", REDUCED, PUBLISHED])
+def test_the_command_is_taken_whatever_field_a_workspace_remembers(variant: str, remembered: dict[str, Any]) -> None:
+    words = shlex.split(command(point(48.6, 29.0, variant=variant), "fox.nerf"))[2:]
+    train = parse(StageArguments, "train", words, Settings(train=Config(**remembered))).settings.train
+    assert (train.kind, train.steps, train.seconds) == (field_of(variant), None, 49)
+    assert train.preset == VARIANTS[variant].options.get("preset", "standard")
+
+
+def test_the_command_names_a_workspace_whose_name_is_not_unicode() -> None:
+    words = command(point(48.6, 29.0), "caf\udce9's.nerf")
+    assert words.startswith(r"pipeline train $'caf\xe9\'s.nerf' --train.")
+    words.encode()
 
 
 # Settings of the study of fox in docs/numbers.md: seconds, dB, deviation over two seeds.

@@ -65,3 +65,9 @@ def test_an_exception_between_frames_stops_the_encoder(tmp_path: Path) -> None:
     with pytest.raises(KeyError), video_writer(tmp_path / "a.mp4", 64, 48, 30) as add:
         add(plain_frames()[0])
         raise KeyError
+
+
+def test_a_folder_may_have_a_colon_in_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("scan:1").mkdir()
+    assert write(Path("scan:1/a.mp4"), plain_frames()).stat().st_size > 0
