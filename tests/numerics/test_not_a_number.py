@@ -79,10 +79,17 @@ def test_weights_and_gradients_that_are_not_numbers_stay(backend: Backend) -> No
     assert backend.depth_loss(SAMPLES, weights, opacity, far, distance, lattice)[0].isnan()
     of_weights, of_opacity = backend.depth_loss_backward(SAMPLES, far, distance, lattice, torch.full((2,), math.nan))
     assert of_weights[0].isnan() and of_opacity[0].isnan()
-    parameter, gradient, mean, square = torch.zeros(16), torch.ones(16), torch.zeros(16), torch.zeros(16)
-    gradient[5] = math.nan
+
+
+@BACKENDS
+@pytest.mark.parametrize("others", [0.0, 1.0])
+def test_a_gradient_that_is_not_a_number_moves_its_parameter(backend: Backend, others: float) -> None:
+    """Of sixteen, taken together, and of those left over; where all others are zero, nothing else tells of it."""
+    parameter, gradient, mean, square = torch.zeros(40), torch.full((40,), others), torch.zeros(40), torch.zeros(40)
+    gradient[[5, 37]] = math.nan
     backend.adam(parameter, gradient, mean, square, 0.1, 1)
-    assert parameter.isnan().nonzero().tolist() == [[5]]
+    assert parameter.isnan().nonzero().flatten().tolist() == [5, 37] and not gradient.any()
+    assert mean.isnan().nonzero().flatten().tolist() == [5, 37]
 
 
 def test_a_gradient_too_large_for_adam_has_no_finite_norm() -> None:
