@@ -61,6 +61,17 @@ def test_a_cell_of_no_known_thickness_is_looked_into(backend: Backend) -> None:
 
 
 @BACKENDS
+def test_a_cell_where_a_value_is_not_a_number_has_none(backend: Backend) -> None:
+    """Before and behind other values of its cell, and whatever the cell is told afterwards."""
+    thickness, along_z = torch.full((64,), 0.5), torch.tensor([0, 1, 1, 2, 2, 3])
+    values = torch.tensor([2.0, 2.0, math.nan, math.nan, 2.0, 3.0])
+    points = torch.nn.functional.pad((along_z[:, None] + 0.5) / 4, (2, 0))
+    backend.raise_cache(4, thickness, points, values)
+    backend.raise_cache(4, thickness, points, torch.full((6,), 2.5))
+    torch.testing.assert_close(thickness[:5], torch.tensor([2.5, math.nan, math.nan, 3.0, 0.5]), equal_nan=True)
+
+
+@BACKENDS
 @pytest.mark.parametrize("resolution", [3, 16])
 def test_a_point_that_is_not_a_number_has_such_features(backend: Backend, resolution: int) -> None:
     """And is no index error: with an odd number of rows a side, it was one."""
