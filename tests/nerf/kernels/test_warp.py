@@ -294,11 +294,11 @@ GOOD = torch.zeros(8, 3)
 @pytest.mark.parametrize(
     ("points", "message"),
     [
-        (GOOD.double(), r"points must be contiguous torch.float32 in entries of 3; it is \(8, 3\) torch.float64"),
-        (GOOD.int(), r"points must be contiguous torch.float32 in entries of 3; it is \(8, 3\) torch.int32"),
+        (GOOD.double(), r"points must be contiguous torch.float32 in .* 3 on cpu; it is \(8, 3\) torch.float64"),
+        (GOOD.int(), r"points must be contiguous torch.float32 in entries of 3 on cpu; it is \(8, 3\) torch.int32"),
         (torch.zeros(3, 8).T, r"points must be contiguous .*; it is \(8, 3\) torch.float32, not contiguous"),
         (torch.zeros(8, 4)[:, :3], r"points must be contiguous .*; it is \(8, 3\) torch.float32, not contiguous"),
-        (torch.zeros(8), r"points must be .* in entries of 3; it is \(8,\) torch.float32, contiguous"),
+        (torch.zeros(8), r"points must be .* in entries of 3 on cpu; it is \(8,\) torch.float32, contiguous"),
     ],
 )
 def test_what_a_kernel_cannot_read_is_refused_by_name(points: Tensor, message: str) -> None:
@@ -311,16 +311,25 @@ def test_what_a_kernel_cannot_read_is_refused_by_name(points: Tensor, message: s
         launch(KERNEL, 8, 4, *arguments)
 
 
-@pytest.mark.gpu
 def test_tensors_in_two_memories_are_refused() -> None:
+    """A tensor of no memory stands for one of another GPU: whether it is on a GPU at all tells neither."""
+    with pytest.raises(TypeError, match=r"_raise: points must be .* on cpu; it is .*, contiguous, on meta"):
+        launch(KERNEL, 8, 4, torch.zeros(64), GOOD.to("meta"), torch.zeros(8))
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("other", ["cpu", "cuda:1"])
+def test_tensors_on_a_gpu_and_elsewhere_are_refused(other: str) -> None:
     skip_without("cuda")
-    with pytest.raises(TypeError, match=r"_raise: points must be .*, contiguous, on cpu"):
-        launch(KERNEL, 8, 4, torch.zeros(64, device="cuda"), GOOD, torch.zeros(8, device="cuda"))
+    if other == "cuda:1" and torch.cuda.device_count() < 2:
+        pytest.skip("no second GPU")
+    with pytest.raises(TypeError, match=f"_raise: points must be .* on cuda:0; it is .*, contiguous, on {other}"):
+        launch(KERNEL, 8, 4, torch.zeros(64, device="cuda:0"), GOOD.to(other), torch.zeros(8, device="cuda:0"))
 
 
 def test_numbers_and_tensors_are_not_confused() -> None:
     thickness, values = torch.zeros(64), torch.zeros(8)
     with pytest.raises(TypeError, match=r"_raise: cells must be a number; it is \(8,\) torch.float32"):
         on_a_new_thread(lambda: launch(KERNEL, 8, values, thickness, GOOD, values))
-    with pytest.raises(TypeError, match=r"_raise: values must be contiguous torch.float32 in entries of 1; it is 2.0"):
+    with pytest.raises(TypeError, match=r"_raise: values must be contiguous .* in entries of 1 on cpu; it is 2.0"):
         on_a_new_thread(lambda: launch(KERNEL, 8, 4, thickness, GOOD, 2.0))
