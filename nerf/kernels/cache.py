@@ -21,7 +21,10 @@ def raise_cache(
     points: Float[Tensor, "points 3"],
     values: Float[Tensor, "points"],
 ) -> None:
-    """In place: every cell with a point becomes the largest of itself and its points' values, however many."""
+    """In place: every cell with a point becomes the largest of itself and its points' values, however many.
+
+    It is NaN from then on if one of these is: what is broken stays in sight (:func:`occupied_bits`).
+    """
     thickness.scatter_reduce_(0, cell_numbers(cells, points).long(), values, "amax")
 
 

@@ -4,8 +4,9 @@ With the optical depth tau_i = sigma_i dt_i of sample i, T_i = exp(-sum_{j<i} ta
 T_{i+1} the one behind it, and w_i = T_i (1 - exp(-tau_i)) its weight; U = exp(-sum tau_j) is the light that nothing
 stops.
 
-Sums over a ray are differences of running sums over all packed samples, taken in float64. So that a dense ray does
-not drown the others, tau is limited to OPAQUE before it is summed: exp(-OPAQUE) is zero even in float64, so the limit
+Sums over a ray are differences of running sums over all packed samples, taken in float64, as long as these are numbers
+up to OPAQUE. Otherwise, which takes longer, rays are summed apart: what is no number on one of them, or huge, changes
+nothing on another. tau is limited to OPAQUE before it is summed: exp(-OPAQUE) is zero even in float64, so the limit
 changes nothing.
 """
 
@@ -110,7 +111,7 @@ def distortion(samples: Samples, weights: Float[Tensor, "samples"], lattice: Lat
     """
     m, lengths = _measure(samples, lattice)
     w = weights.double()
-    before, moment_before = _sums_before(samples, torch.stack([w, w * m], -1)).unbind(-1)
+    before, moment_before = _sums_before(samples, torch.stack([w, w * m]))
     return _ray_sums(samples, 2 * w * (m * before - moment_before) + w.square() * lengths / 3).to(weights.dtype)
 
 
@@ -120,9 +121,9 @@ def distortion_backward(
     """Gradient of the weights: 2 sum_j w_j |m_i - m_j| + 2/3 w_i l_i."""
     m, lengths = _measure(samples, lattice)
     w = weights.double()
-    both = torch.stack([w, w * m], -1)
-    before, moment_before = _sums_before(samples, both).unbind(-1)
-    behind, moment_behind = _sums_behind(samples, both).unbind(-1)
+    both = torch.stack([w, w * m])
+    before, moment_before = _sums_before(samples, both)
+    behind, moment_behind = _sums_behind(samples, both)
     apart = m * (before - behind) - moment_before + moment_behind
     return grad.index_select(0, samples.ray) * (2 * apart + 2 / 3 * w * lengths).to(weights.dtype)
 
@@ -147,26 +148,48 @@ def _stopping(samples: Samples, sigma: Float[Tensor, "samples"]) -> _Stopping:
 
 
 def _ray_sums(samples: Samples, values: Float[Tensor, "samples *channels"]) -> Float[Tensor, "rays *channels"]:
-    at_starts = _running(values).index_select(0, samples.starts)
-    return (at_starts[1:] - at_starts[:-1]).to(values.dtype)
+    zero = values.new_zeros(len(samples.starts) - 1, *values.shape[1:], dtype=torch.float64)
+    return zero.index_add(0, samples.ray.long(), values.double()).to(values.dtype)
 
 
-def _sums_before(samples: Samples, values: Float[Tensor, "samples *channels"]) -> Float[Tensor, "samples *channels"]:
+def _sums_before(samples: Samples, values: Float[Tensor, "*channels samples"]) -> Float[Tensor, "*channels samples"]:
     """For each sample, the sum over those before it on its ray."""
+    if not _may_share_a_sum(values):
+        return _sums_ray_by_ray(samples, samples.ray, values)
     running = _running(values)
     first = samples.starts.index_select(0, samples.ray)
-    return (running[:-1] - running.index_select(0, first)).to(values.dtype)
+    return (running[..., :-1] - running.index_select(-1, first)).to(values.dtype)
 
 
-def _sums_behind(samples: Samples, values: Float[Tensor, "samples *channels"]) -> Float[Tensor, "samples *channels"]:
+def _sums_behind(samples: Samples, values: Float[Tensor, "*channels samples"]) -> Float[Tensor, "*channels samples"]:
     """For each sample, the sum over those behind it on its ray."""
+    if not _may_share_a_sum(values):
+        return _sums_ray_by_ray(samples, samples.ray.flip(0), values.flip(-1)).flip(-1)
     running = _running(values)
     end = samples.starts[1:].index_select(0, samples.ray)
-    return (running.index_select(0, end) - running[1:]).to(values.dtype)
+    return (running.index_select(-1, end) - running[..., 1:]).to(values.dtype)
 
 
-def _running(values: Float[Tensor, "samples *channels"]) -> Float[Tensor, "samples+1 *channels"]:
-    return torch.cat([values.new_zeros(1, *values.shape[1:]), values]).double().cumsum(0)
+def _running(values: Float[Tensor, "*channels samples"]) -> Float[Tensor, "*channels samples+1"]:
+    return torch.nn.functional.pad(values, (1, 0)).double().cumsum(-1)
+
+
+def _may_share_a_sum(values: Float[Tensor, "*channels samples"]) -> bool:
+    """Whether all are numbers, and none so large that the others' digits are lost beside it."""
+    return not values.numel() or float(values.detach().abs().max()) <= OPAQUE
+
+
+def _sums_ray_by_ray(
+    samples: Samples, ray: Int32[Tensor, "samples"], values: Float[Tensor, "*channels samples"]
+) -> Float[Tensor, "*channels samples"]:
+    """Over the last sample of the same ray, the last 2, 4, ..., until that is all (Hillis and Steele 1986)."""
+    longest, reach = int(samples.starts.diff().max()), 1
+    last = torch.where(ray[1:] == ray[:-1], values.double()[..., :-1], 0)
+    sums = torch.nn.functional.pad(last, (1, 0))
+    while reach < longest - 1:
+        sums[..., reach:].add_(torch.where(ray[reach:] == ray[:-reach], sums[..., :-reach], 0))
+        reach *= 2
+    return sums.to(values.dtype)
 
 
 def _measure(samples: Samples, lattice: Lattice) -> tuple[Float[Tensor, "samples"], Float[Tensor, "samples"]]:

@@ -151,7 +151,8 @@ COMPOSITED: dict[str, Any] = {
 PACKED: dict[str, Any] = COMPOSITED | {
     "where": "nerf/kernels/packed_compositing.py: composite, composite_backward",
     "hazard": "as above; differences of running sums over all rays; T g − Σ w g − U G cancels",
-    "answer": "sums in float64 of τ limited to 800, where exp is 0 even there; Warp sums along one ray",
+    "answer": "sums in float64 of τ limited to 800, where exp is 0 even there; what is larger or no number is summed "
+    "ray by ray, which Warp always does",
 }
 
 CASES = [

@@ -61,6 +61,17 @@ def test_a_cell_of_no_known_thickness_is_looked_into(backend: Backend) -> None:
 
 
 @BACKENDS
+def test_a_cell_where_a_value_is_not_a_number_has_none(backend: Backend) -> None:
+    """Before and behind other values of its cell, and whatever the cell is told afterwards."""
+    thickness, along_z = torch.full((64,), 0.5), torch.tensor([0, 1, 1, 2, 2, 3])
+    values = torch.tensor([2.0, 2.0, math.nan, math.nan, 2.0, 3.0])
+    points = torch.nn.functional.pad((along_z[:, None] + 0.5) / 4, (2, 0))
+    backend.raise_cache(4, thickness, points, values)
+    backend.raise_cache(4, thickness, points, torch.full((6,), 2.5))
+    torch.testing.assert_close(thickness[:5], torch.tensor([2.5, math.nan, math.nan, 3.0, 0.5]), equal_nan=True)
+
+
+@BACKENDS
 @pytest.mark.parametrize("resolution", [3, 16])
 def test_a_point_that_is_not_a_number_has_such_features(backend: Backend, resolution: int) -> None:
     """And is no index error: with an odd number of rows a side, it was one."""
@@ -79,10 +90,17 @@ def test_weights_and_gradients_that_are_not_numbers_stay(backend: Backend) -> No
     assert backend.depth_loss(SAMPLES, weights, opacity, far, distance, lattice)[0].isnan()
     of_weights, of_opacity = backend.depth_loss_backward(SAMPLES, far, distance, lattice, torch.full((2,), math.nan))
     assert of_weights[0].isnan() and of_opacity[0].isnan()
-    parameter, gradient, mean, square = torch.zeros(16), torch.ones(16), torch.zeros(16), torch.zeros(16)
-    gradient[5] = math.nan
+
+
+@BACKENDS
+@pytest.mark.parametrize("others", [0.0, 1.0])
+def test_a_gradient_that_is_not_a_number_moves_its_parameter(backend: Backend, others: float) -> None:
+    """Of sixteen, taken together, and of those left over; where all others are zero, nothing else tells of it."""
+    parameter, gradient, mean, square = torch.zeros(40), torch.full((40,), others), torch.zeros(40), torch.zeros(40)
+    gradient[[5, 37]] = math.nan
     backend.adam(parameter, gradient, mean, square, 0.1, 1)
-    assert parameter.isnan().nonzero().tolist() == [[5]]
+    assert parameter.isnan().nonzero().flatten().tolist() == [5, 37] and not gradient.any()
+    assert mean.isnan().nonzero().flatten().tolist() == [5, 37]
 
 
 def test_a_gradient_too_large_for_adam_has_no_finite_norm() -> None:

@@ -36,7 +36,10 @@ def adam(
 
 @wp.func
 def _live(gradient: vec16):
-    """1 where the gradient is not exactly zero, else 0; twice, as once does not take the smallest numbers up to 1."""
+    """1 where the gradient is not exactly zero, also where it is no number, which wp.min takes for missing; else 0.
+
+    Twice, as once does not take the smallest numbers up to 1.
+    """
     one = vec16(1.0)
     return wp.min(wp.min(wp.abs(gradient) * 3.0e38, one) * 3.0e38, one)
 
@@ -74,9 +77,9 @@ def _adam16(
 ):
     i = wp.tid()
     g = gradient[i]
-    if wp.max(wp.abs(g)) == 0.0:
-        return
     live = _live(g)
+    if wp.max(live) == 0.0:  # of the gradients themselves it would pass over what is not a number
+        return
     m = mean[i] + _MEAN_SHARE * wp.cw_mul(live, g - mean[i])
     v = square[i] + _SQUARE_SHARE * wp.cw_mul(live, wp.cw_mul(g, g) - square[i])
     root = _roots(wp.max(correction * v, vec16(_LEAST_SQUARE)))

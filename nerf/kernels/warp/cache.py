@@ -21,6 +21,7 @@ def raise_cache(
 ) -> None:
     """As in nerf.kernels.cache."""
     launch(_raise, len(points), cells, thickness, points, values)
+    launch(_spoil, len(points), cells, thickness, points, values)
 
 
 def occupied_bits(thickness: Float[Tensor, "cache"], threshold: float) -> Int64[Tensor, "bricks"]:
@@ -50,8 +51,19 @@ def cell_of(cells: int, point: wp.vec3):
 
 @wp.kernel
 def _raise(cells: int, thickness: wp.array[float], points: wp.array[wp.vec3], values: wp.array[float]):
+    """To the largest number; a maximum of Warp's takes NaN for missing, so a cell that holds one is let be."""
     i = wp.tid()
-    wp.atomic_max(thickness, cell_of(cells, points[i]), values[i])
+    cell = cell_of(cells, points[i])
+    if thickness[cell] < values[i]:
+        wp.atomic_max(thickness, cell, values[i])
+
+
+@wp.kernel
+def _spoil(cells: int, thickness: wp.array[float], points: wp.array[wp.vec3], values: wp.array[float]):
+    """Where a value is no number, nor is the cell's. A launch by itself: on a GPU a maximum might undo it."""
+    i = wp.tid()
+    if wp.isnan(values[i]):
+        thickness[cell_of(cells, points[i])] = values[i]
 
 
 @wp.kernel

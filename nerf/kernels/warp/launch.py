@@ -86,18 +86,18 @@ def launch(kernel: wp.Kernel, count: int, *arguments: Argument) -> None:
     ready = recorded.launch
     for place, (array, argument) in enumerate(zip(recorded.arrays, arguments, strict=True), 1):
         if isinstance(argument, Tensor):
-            elsewhere = argument.is_cuda is not on_gpu
+            elsewhere = argument.device != device
             if array is None or elsewhere or argument.dtype is not array.dtype or not argument.is_contiguous():
-                raise TypeError(_unreadable(kernel, place, array, argument))
+                raise TypeError(_unreadable(kernel, place, array, device, argument))
             entries, rest = divmod(argument.numel(), array.numbers)
             if rest:
-                raise TypeError(_unreadable(kernel, place, array, argument))
+                raise TypeError(_unreadable(kernel, place, array, device, argument))
             entry = ready.params[place]
             entry.data, entry.shape[0] = argument.data_ptr(), entries
         elif array is None:
             ready.params[place].value = argument
         else:
-            raise TypeError(_unreadable(kernel, place, array, argument))
+            raise TypeError(_unreadable(kernel, place, array, device, argument))
     ready.set_dim(count)
     ready.launch(wp.stream_from_torch(device) if on_gpu else None)
 
@@ -118,11 +118,11 @@ def _array(entry: Any) -> _Array:
     return _Array(TORCH_TYPES[number], wp.types.type_size_in_bytes(entry) // wp.types.type_size_in_bytes(number))
 
 
-def _unreadable(kernel: wp.Kernel, place: int, array: _Array | None, argument: Argument) -> str:
+def _unreadable(kernel: wp.Kernel, place: int, array: _Array | None, device: torch.device, argument: Argument) -> str:
     name = kernel.adj.args[place - 1].label
-    wanted = "a number" if array is None else f"contiguous {array.dtype} in entries of {array.numbers}"
+    wanted = "a number" if array is None else f"contiguous {array.dtype} in entries of {array.numbers} on {device}"
     found = str(argument)
     if isinstance(argument, Tensor):
         layout = "contiguous" if argument.is_contiguous() else "not contiguous"
-        found = f"{tuple(argument.shape)} {argument.dtype}, {layout}, on {argument.device.type}"
+        found = f"{tuple(argument.shape)} {argument.dtype}, {layout}, on {argument.device}"
     return f"{kernel.key}: {name} must be {wanted}; it is {found}"

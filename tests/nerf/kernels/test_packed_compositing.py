@@ -210,14 +210,18 @@ def test_distortion_is_the_double_sum(lattice: Lattice) -> None:
     torch.testing.assert_close(distortion(samples, weights, lattice).tolist(), wanted, rtol=1e-12, atol=1e-13)
 
 
+@pytest.mark.parametrize("scale", [1.0, 1e6])
 @pytest.mark.parametrize("lattice", [EVEN, GROWING])
-def test_the_gradient_of_the_distortion_is_autograds(lattice: Lattice) -> None:
+def test_the_gradient_of_the_distortion_is_autograds(lattice: Lattice, scale: float) -> None:
+    """Also of weights so large that rays are summed apart."""
     samples = packed()
-    weights = composite(samples, *field(samples), *surroundings())[1].requires_grad_()
+    weights = (scale * composite(samples, *field(samples), *surroundings())[1]).requires_grad_()
     grad = torch.arange(1.0, 7.0, dtype=torch.float64)
     wanted = torch.autograd.grad(distortion(samples, weights, lattice), weights, grad)[0]
     given = distortion_backward(samples, weights.detach(), lattice, grad)
-    torch.testing.assert_close(given, wanted, rtol=0, atol=1e-13)
+    torch.testing.assert_close(given, wanted, rtol=0, atol=scale * 1e-13)
+    small = distortion_backward(samples, weights.detach() / scale, lattice, grad)
+    torch.testing.assert_close(given / scale, small, rtol=0, atol=1e-13)
 
 
 def test_no_samples_show_the_background() -> None:

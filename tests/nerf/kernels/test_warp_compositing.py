@@ -8,13 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from nerf.kernels import Lattice, reference, warp
+from nerf.kernels import Backend, Lattice, reference, warp
 from nerf.model import Rendering
 from tests.nerf.kernels.warp_agreement import (
     COUNTS,
     LATTICES,
     TOLERANCE,
     agree,
+    assert_each_close,
     doubled,
     normal,
     packed,
@@ -100,6 +101,26 @@ def test_waves_of_4096_samples(device: str, varied: bool) -> None:
         assert ((nears[1] > 4) & (nears[1] < 9)).all() and relative_error(*nears) < TOLERANCE
 
 
+@pytest.mark.parametrize("varied", [False, True])
+def test_what_is_done_to_each_of_4096_samples(device: str, varied: bool) -> None:
+    n = 4096 * 3
+    each = uniform(device, 22, n) + 0.5 if varied else torch.ones(n, device=device)
+    samples = packed(device, [4096] * 3, 0.001 * each)
+    rays = random_rays(device, 32).each(lambda part: part[-3:])
+    for contracted in (False, True):
+        agree("sample_points", rays, samples, contracted, tolerance=1e-6)
+    for thin in (0.0, 0.01):
+        kept, _ = agree("visible_samples", samples, each, 0.2, thin, uniform(device, 33, 3), tolerance=1e-6)
+        assert kept.starts.diff().min() > (100 if thin else 1000) and len(kept.t) < n / 2
+    hidden, of_ray = normal(device, 27, n, 64), normal(device, 29, 3, 64)
+    given, wanted = hidden.clone(), hidden.clone()
+    warp.add_ray_relu(samples, given, of_ray)
+    reference.add_ray_relu(samples, wanted, of_ray)
+    assert torch.equal(given, wanted)
+    waves, _ = agree("pack_waves", [samples, packed(device, [4096, 0, 1])])
+    assert waves.starts.diff().tolist() == [8192, 4096, 4097]
+
+
 THICKNESS = st.one_of(st.floats(0, 1e30), st.floats(0, 30), st.sampled_from([0.0, 1e-30, 800.0, 1e30]))
 
 
@@ -139,6 +160,31 @@ def test_an_opaque_sample_has_exactly_no_gradient_and_hides_the_rest(device: str
     grad_sigma, grad_colour = warp.composite_backward(samples, sigma, colour, background, far, *gradients(device, 1, 4))
     assert grad_sigma[0] != 0 and grad_sigma[1:].tolist() == [0, 0, 0]
     assert grad_colour[[0, 2, 3]].abs().max() == 0
+
+
+@pytest.mark.parametrize("wrong", [math.nan, math.inf, 1e20])
+@pytest.mark.parametrize("backend", [reference, warp], ids=["reference", "warp"])
+def test_what_is_wrong_on_one_ray_changes_nothing_on_others(device: str, backend: Backend, wrong: float) -> None:
+    """In value and gradient, of the rays before it and behind it."""
+    samples, (background, far) = packed(device, [20, 30, 40]), seen(device, 3, 90)[1:]
+    elsewhere, grads, on_spread = samples.ray != 1, gradients(device, 3, 90)[0], normal(device, 26, 3)
+
+    def on_others(value: float) -> list[Tensor]:
+        colour, given, sigma, weights = seen(device, 3, 90)[0], *(uniform(device, seed, 90) for seed in (20, 21, 25))
+        for place, part in ((22, colour), (23, given), (24, weights), (25, sigma)):
+            part[place] = value
+        inputs = samples, sigma, colour, background, far
+        rendering, light = backend.composite(*inputs)
+        of_samples = light, *backend.composite_backward(*inputs, grads, given)
+        spread = backend.distortion(samples, weights, GROWING)
+        pull = backend.distortion_backward(samples, weights, GROWING, on_spread)
+        kept, index = backend.visible_samples(samples, sigma, 1e-3, 0.05, on_spread.abs().clamp(max=0.9))
+        visible = [part[kept.ray != 1] for part in (index, kept.t, kept.dt)]
+        of_rays = [part[[0, 2]] for part in (*rendering, spread)]
+        return [*(part[elsewhere] for part in (*of_samples, pull)), *of_rays, *visible]
+
+    for one, right in zip(on_others(wrong), on_others(0.5), strict=True):
+        assert relative_error(one.float(), right) < 1e-6 and right.any()
 
 
 @pytest.mark.parametrize("threshold", [0.0, 1e-3, 0.1, 1.0])
@@ -204,4 +250,7 @@ def test_depth_loss_and_its_gradient(device: str, lattice: Lattice) -> None:
     distance[::3] = 0  # no point is known
     loss = agree("depth_loss", samples, weights, opacity, far, distance, lattice)
     assert (loss[::3] == 0).all() and (loss[1::3] > 0).all()
-    agree("depth_loss_backward", samples, far, distance, lattice, normal(device, 31, rays))
+    arguments = samples, far, distance, lattice, normal(device, 31, rays)
+    given, wanted = warp.depth_loss_backward(*arguments), reference.depth_loss_backward(*doubled(arguments))
+    for one, right in zip(given, wanted, strict=True):
+        assert_each_close(one, right, 0.0)

@@ -13,7 +13,7 @@ assert nerf.kernels.warp.adam  # the package defines all kernels when it is impo
 # With their kernels.
 MODULES = {
     "adam": 2,
-    "cache": 2,
+    "cache": 3,
     "compositing": 6,
     "directions": 1,
     "encoding": 3,

@@ -84,6 +84,14 @@ def test_marching_stops_at_the_cap(device: str, most: int, lattice: Lattice) -> 
     assert samples.starts.diff().max() == most
 
 
+@pytest.mark.parametrize("lattice", [BOUNDED._replace(step=2e-4), FOLDED._replace(step=5e-4, cone=1e-3)], ids=LATTICES)
+@pytest.mark.parametrize("kind", ["random", "full"])
+def test_marching_of_4096_samples(device: str, kind: str, lattice: Lattice) -> None:
+    lattice, where = lattice._replace(most_samples=4096), occupied_of(device, kind, 32)
+    samples = assert_same_march(where, lattice, random_rays(device, 32), uniform(device, 8, 32))
+    assert kind == "random" or samples.starts.diff().max() == 4096
+
+
 def test_marching_from_far_away_in_folded_space(device: str) -> None:
     rays = random_rays(device, 320, far=1e7)
     origins = rays.origins * torch.logspace(0, 6, 320)[:, None]

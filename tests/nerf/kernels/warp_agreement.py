@@ -2,7 +2,8 @@
 
 They are compared with the reference in float64 on the same float32 inputs. ``relative_error`` is the largest
 difference over the largest wanted number, of the whole tensor unless said otherwise: single entries may be
-differences of large numbers, of which no float32 program has more digits.
+differences of large numbers, of which no float32 program has more digits. Where they are not,
+``assert_each_close``.
 """
 
 from typing import Any
@@ -47,6 +48,13 @@ def relative_error(found: Tensor, wanted: Tensor) -> float:
     largest = float(wanted.abs().max())
     difference = float((found.double() - wanted.double()).abs().max())
     return difference / largest if largest else difference
+
+
+def assert_each_close(found: Tensor, wanted: Tensor, floor: float) -> None:
+    """Entry by entry, where each is computed by itself: TOLERANCE of it or, where it is a small difference of larger
+    numbers or too small for all digits of float32, ``floor``."""
+    assert found.dtype == torch.float32 and found.isfinite().all()
+    torch.testing.assert_close(found.double(), wanted, rtol=TOLERANCE, atol=floor)
 
 
 def tensors_in(result: Any) -> list[Tensor]:
