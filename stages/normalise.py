@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from stages.sparse_model import SparseModel
 
 NEEDS = ("ingest", "sfm")
-VERSION = 10
+VERSION = 11
 RESUMES = False
 LINKS = ("transforms.json", "scene.json")
 

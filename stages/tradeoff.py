@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 NEEDS = ("ingest", "normalise", "effects")
 OPTIONAL = ("train",)
-VERSION = 7
+VERSION = 8
 RESUMES = True
 LINKS = ("tradeoff.svg", "tradeoff.png", "tradeoff.md", "tradeoff.json", "ablation.png")
 
