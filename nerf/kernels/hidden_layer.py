@@ -19,7 +19,8 @@ def add_ray_relu_backward(
 ) -> Float[Tensor, "rays width"]:
     """The gradient of ``of_ray``; in place, ``grad`` becomes that of the sum. ``hidden`` is what came out."""
     relu_backward(hidden, grad)
-    return grad.new_zeros(len(samples.starts) - 1, grad.shape[1]).index_add_(0, samples.ray, grad)
+    ray = samples.ray.long()  # by 32-bit numbers torch adds rows several times slower
+    return grad.new_zeros(len(samples.starts) - 1, grad.shape[1]).index_add_(0, ray, grad)
 
 
 def relu_backward(hidden: Float[Tensor, "samples width"], grad: Float[Tensor, "samples width"]) -> None:
