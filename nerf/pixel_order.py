@@ -4,6 +4,8 @@ Drawn with replacement, n pixels would after n draws have left out a share of 1/
 met more often than others for a while.
 """
 
+from typing import NamedTuple
+
 import torch
 from jaxtyping import Int
 from torch import Tensor
@@ -14,41 +16,54 @@ STRATUM = 256  # neighbours of which a round takes one; a power of two
 EPOCHS = 1 << 40  # a counter of random numbers that no step of training has
 
 
-class PixelOrder:
-    """An endless sequence of the numbers below ``count``, a function of ``seed`` and the place in it alone.
+class _Epoch(NamedTuple):
+    """``within``: the permutation p; ``order``: of the strata; ``offset``: o of each stratum; ``shift``: of all."""
 
-    It runs in *epochs*, and they in *rounds*: a round takes one number of each *stratum* of neighbours, the strata in
-    random order. Within a stratum of s numbers, round r takes the number p(r) XOR o, with a permutation p of 0 to s - 1
-    for the epoch and a random o for the stratum: in s rounds each number once. So an epoch takes a table with an entry
-    per stratum, not per pixel. Where ``count`` is no multiple of the stratum, numbers from 0 on fill the last one up,
-    and come once more than others in an epoch.
+    number: int
+    within: Int[Tensor, "stratum"]
+    order: Int[Tensor, "strata"]
+    offset: Int[Tensor, "strata"]
+    shift: Int[Tensor, "1"]
+
+
+class PixelOrder:
+    """An endless sequence of the numbers below ``count``; which one stands in a place depends on ``seed`` and the kind
+    of device alone.
+
+    It runs in *epochs*, and they in *rounds*: a round takes one number of each *stratum* of s neighbours, the strata in
+    an order of the epoch's. Of its stratum, round r takes the number p(r) XOR o, with a permutation p of 0 to s - 1 and
+    an o for the stratum: in s rounds each number once. All of that is random, anew for every epoch, and takes a table
+    with an entry per stratum, not per pixel.
+
+    Where ``count`` is no multiple of s, the last stratum is filled up with numbers of the first, which come once more
+    than others in this epoch; where the first begins is random, so that these are others in each.
     """
 
     def __init__(self, count: int, seed: int, device: torch.device | str) -> None:
         self.count, self.seed, self.device = count, seed, torch.device(device)
         self.strata = -(-count // STRATUM)
-        self._tables: tuple[int, Tensor, Tensor, Tensor] | None = None
+        self._last: _Epoch | None = None
 
     def take(self, first: int, count: int) -> Int[Tensor, "count"]:
         """Those in the places from ``first`` on."""
-        period = self.strata * STRATUM
-        place = torch.arange(first, first + count, device=self.device)
-        epochs = range(first // period, (first + count - 1) // period + 1)
-        of_epochs = [self._of_epoch(epoch, place[place // period == epoch] % period) for epoch in epochs]
-        return torch.cat(of_epochs) if of_epochs else place
+        period, end = self.strata * STRATUM, first + count
+        epochs = range(first // period, max(first, end - 1) // period + 1)
+        return torch.cat([self._part(e, max(first - e * period, 0), min(end - e * period, period)) for e in epochs])
 
-    def _of_epoch(self, epoch: int, place: Int[Tensor, "places"]) -> Int[Tensor, "places"]:
-        within, order, offset = self._table(epoch)
+    def _part(self, epoch: int, first: int, end: int) -> Int[Tensor, "places"]:
+        _, within, order, offset, shift = self._epoch(epoch)
+        place = torch.arange(first, end, device=self.device)
         stratum = order[place % self.strata]
-        return (stratum * STRATUM + (within[place // self.strata] ^ offset[stratum])) % self.count
+        return (stratum * STRATUM + (within[place // self.strata] ^ offset[stratum]) + shift) % self.count
 
-    def _table(self, epoch: int) -> tuple[Tensor, Tensor, Tensor]:
-        """The epoch's permutation p, its order of the strata, and the strata's offsets o; the last epoch's are kept."""
-        kept = self._tables  # read once: another thread may put another epoch's in its place
-        if kept is None or kept[0] != epoch:
-            random = generator(self.device, self.seed, EPOCHS, epoch)
+    def _epoch(self, number: int) -> _Epoch:
+        """The last one is kept, as the next batch is most often of the same."""
+        epoch = self._last  # read once: another thread may put another in its place
+        if epoch is None or epoch.number != number:
+            random = generator(self.device, self.seed, EPOCHS, number)
             within = torch.randperm(STRATUM, generator=random, device=self.device)
             order = torch.randperm(self.strata, generator=random, device=self.device)
             offset = torch.randint(STRATUM, (self.strata,), generator=random, device=self.device)
-            self._tables = kept = (epoch, within, order, offset)
-        return kept[1:]
+            shift = torch.randint(self.count, (1,), generator=random, device=self.device)
+            self._last = epoch = _Epoch(number, within, order, offset, shift)
+        return epoch

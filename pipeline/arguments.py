@@ -199,7 +199,7 @@ def _without_replaced(recorded: TrainConfig, words: Sequence[str]) -> TrainConfi
     """The recorded options of training without what those in ``words`` stand in place of: the budgets beside the one
     given, and all that belongs to the other field than the one given."""
     replaced = set[str]()
-    if given := {option for option in ("steps", "seconds", "preset") if _given(words, option) is not None}:
+    if given := {option for option in ("steps", "seconds", "preset") if _given(words, option) not in (None, "None")}:
         # A preset is a budget, too, unless one is counted; and a new training does not go on from another.
         replaced |= {"steps", "seconds", "after", "more_steps", "more_seconds"} - given
     wanted = _given(words, "field")

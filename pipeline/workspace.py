@@ -223,7 +223,7 @@ class Workspace:
             if source.exists():
                 self._show(source, shown)
             else:
-                _remove(shown)
+                self._take_away(shown)
 
     def _show(self, source: Path, shown: Path) -> None:
         temporary, copy_of = shown.with_name(f".{shown.name}.tmp"), None
@@ -244,7 +244,11 @@ class Workspace:
         """Take ``output/<name>`` away, so that nothing there looks more current than it is."""
         for shown in map(self._shown, names):
             if self._is_ours(shown):
-                _remove(shown)
+                self._take_away(shown)
+
+    def _take_away(self, shown: Path) -> None:
+        _remove(shown)
+        self._note_copies({shown.name: None})  # what comes to lie there is the user's own
 
     def _shown(self, name: str) -> Path:
         """Where an output or record is shown."""

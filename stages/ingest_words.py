@@ -87,7 +87,7 @@ def nearly_black(brightest: Sequence[int]) -> list[str]:
     ``brightest`` has the largest of each photo, of 255."""
     if (most := max(brightest, default=255)) > NEARLY_BLACK:
         return []
-    how = "values of 10 or 12 bits in files of 16 have to be scaled up first, those of 12 by 16"
+    how = "if their values are of 10 or 12 bits in files of 16, scale them up first, those of 12 by 16"
     return [f"all photos are nearly black, at most {most} of 255: {how}"]
 
 

@@ -152,20 +152,18 @@ def list_photos(root: Path) -> tuple[Path, ...]:
     found = _files_below(root, _is_photo_folder)
     if not found:
         raise StageError(f"{root} is empty", "there is no file in it", _FOLDER_HINT)
-    if not any(map(Path.is_file, found)):
-        raise StageError(f"no photos in {root}", f"its {len(found)} files are links to what is not there", _LINKS_HINT)
     photos = [file for file in found if _may_be_photo(file)]
     videos = [file for file in found if _is_video(file)]
-    if not photos and len(videos) == 1:
-        return (videos[0],)
-    if not photos:
+    lost = sum(not file.is_file() for file in found)
+    if lost and not any(map(Path.is_file, photos + videos)):
+        raise StageError(f"no photos in {root}", f"{lost} of its files are links to what is not there", _LINKS_HINT)
+    if not photos and len(videos) != 1:
         raise _no_photos(root, found, videos)
-    return tuple(photos)
+    return tuple(photos or videos)
 
 
 def is_gone(photos: Path) -> bool:
-    """Whether nothing is left of PHOTOS, or only a folder without files: a drive that is not there leaves one, too, or
-    links to what was on it."""
+    """Whether nothing is left of PHOTOS: a drive that is not there leaves an empty folder, or links to what it held."""
     try:
         empty = photos.is_dir() and not any(map(Path.is_file, _walk(_photo_root(photos), _is_photo_folder)))
         return empty or not photos.exists()
@@ -186,8 +184,12 @@ def _walk(root: Path, enters: Callable[[Path], bool]) -> Iterator[Path]:
         here = Path(folder)
         subfolders[:] = [s for s in subfolders if enters(here / s)]
         files = (here / name for name in names if not name.startswith("."))
-        # Links that lead nowhere, as of photos in git-annex that were not fetched, are left to be refused by name.
-        yield from (file for file in files if file.is_file() or (file.is_symlink() and not file.exists()))
+        yield from (file for file in files if file.is_file() or _is_lost(file))
+
+
+def _is_lost(file: Path) -> bool:
+    """A link to a photo or video that is not there is refused by name. Other links may have led to folders."""
+    return file.suffix.lower() in _IMAGES + _VIDEOS and file.is_symlink() and not file.exists()
 
 
 def _list_masks(root: Path, files: tuple[Path, ...]) -> tuple[tuple[str, Path], ...]:

@@ -1,5 +1,7 @@
-"""Effects per photo in a step of a grid field: those that are off change no bit, those that run away are refused."""
+"""What a step of a grid field takes of the photos: pixels, each once, and effects, which change no bit where they are
+off and are refused where they run away."""
 
+from dataclasses import replace
 from functools import partial
 
 import pytest
@@ -11,6 +13,7 @@ from nerf.grid_field import GridField
 from nerf.grid_training import GridTrainer, _Part
 from nerf.kernels import reference
 from nerf.model import Rendering
+from nerf.ray_bank import RayBank
 from nerf.robust_loss import robust_error
 from nerf.training import RAYS, NonFinite
 from tests.nerf.test_grid_training import FIELD, TRAINER, copied, same, small_bank, trainer
@@ -51,3 +54,17 @@ def test_turns_that_run_away_are_refused_and_change_nothing(runaway: float) -> N
         run.step(1, 0.1)
     for name, tensor in run.state().items():
         torch.testing.assert_close(tensor, before[name], rtol=0, atol=0, equal_nan=True)
+
+
+def test_steps_draw_every_pixel_once_before_any_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever the number of rays, of chunks, and of rays to sparse points, which end half-way."""
+    bank, drawn = small_bank(16).with_distances(torch.tensor([136, 392]), torch.tensor([3.0, 2.5])), list[Tensor]()
+    assert bank.known is not None and bank.drawable == 512
+    monkeypatch.setattr(RayBank, "nth", lambda _, numbers: drawn.append(numbers) or numbers)
+    settings = replace(TRAINER, chunks=3, depth_loss=0.1)
+    run, rays = GridTrainer(GridField(FIELD, 0, reference), bank, settings), set[int]()
+    for step in range(40):
+        rays.add(run.step(step, min(1.0, step / 20)).rays)
+    often = torch.cat(drawn).bincount(minlength=512)
+    assert len(rays) > 5 and often.sum() == run.drawn > 1024
+    assert often.max() - often.min() <= 1

@@ -16,14 +16,19 @@ def test_every_epoch_has_every_number_once_in_another_order(count: int) -> None:
 
 
 @given(count=st.integers(1, 5 * STRATUM))
-def test_of_other_counts_an_epoch_has_some_numbers_twice_at_most(count: int) -> None:
+def test_of_other_counts_an_epoch_has_some_numbers_once_more(count: int) -> None:
     epoch = -(-count // STRATUM) * STRATUM
     often = PixelOrder(count, 0, "cpu").take(0, epoch).bincount(minlength=count)
     assert len(often) == count and often.sum() == epoch
     assert often.max() - often.min() <= 1
 
 
-@given(data=st.data(), count=st.sampled_from([7, 3 * STRATUM, 20 * STRATUM + 5]))
+def test_over_many_epochs_all_numbers_come_as_often() -> None:
+    often = PixelOrder(288, 0, "cpu").take(0, 400 * 512).bincount(minlength=288)
+    assert abs(often / (400 * 512 / 288) - 1).max() < 0.1
+
+
+@given(data=st.data(), count=st.sampled_from([300, 3 * STRATUM, 20 * STRATUM + 5]))
 def test_a_place_has_its_number_however_it_is_asked_for(data: st.DataObject, count: int) -> None:
     first = data.draw(st.integers(0, 5 * count))
     takes = data.draw(st.lists(st.integers(0, 2 * count), min_size=1, max_size=4))
@@ -35,6 +40,7 @@ def test_a_place_has_its_number_however_it_is_asked_for(data: st.DataObject, cou
 
 def test_a_round_takes_one_of_every_stratum_and_seeds_differ() -> None:
     first, other = (PixelOrder(1000 * STRATUM, seed, "cpu").take(0, 1000) for seed in (0, 1))
-    assert torch.equal((first // STRATUM).sort().values, torch.arange(1000))
+    apart = first.sort().values.diff()  # strata do not begin at 0
+    assert apart.max() < 2 * STRATUM and 254 < apart.float().mean() < 258
     assert not torch.equal(first, other)
     assert (first % STRATUM).bincount(minlength=STRATUM).max() < 20, "each stands somewhere else in its stratum"

@@ -140,6 +140,15 @@ def test_a_random_background_is_new_in_every_step_and_shines_through_alpha() -> 
     assert all(((b >= 0) & (b < 1)).all() for b in seen)
 
 
+def test_steps_draw_every_pixel_once_before_any_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    run, drawn = trainer(bank=small_bank(size=16)), list[Tensor]()
+    monkeypatch.setattr(RayBank, "nth", lambda _, numbers: drawn.append(numbers) or numbers)
+    for step in range(12):
+        run.step(step, 0.0)
+    often = torch.cat(drawn).bincount(minlength=512)
+    assert often.sum() == 12 * TRAINER.batch_rays and often.max() - often.min() <= 1
+
+
 def test_over_is_linear_between_background_and_colour() -> None:
     colour, background = torch.tensor([[0.2, 0.4, 0.6]]), torch.tensor([1.0, 0.0, 0.5])
     assert torch.equal(over(colour, None, background), colour)

@@ -74,6 +74,11 @@ def test_copies_make_way_where_links_are_not_allowed(tmp_path: Path, monkeypatch
     assert (tmp_path / COPIES).read_text() == "mesh.ply\tmesh/0000000000000002/mesh.ply"
     workspace.unlink_outputs(names)
     assert not any(output.iterdir())
+    (output / "mesh.ply").write_text("the user's own")
+    workspace.unlink_outputs(names)
+    with pytest.raises(StageError, match="is none of this program's results"):
+        workspace.link_outputs(result(tmp_path, 4), names)
+    assert (output / "mesh.ply").read_text() == "the user's own"
 
 
 def test_what_is_shown_already_is_not_copied_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

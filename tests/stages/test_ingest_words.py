@@ -103,5 +103,5 @@ def test_twelve_bits_in_files_of_sixteen_are_said(tmp_path: Path, progress: Any,
         grey = np.random.default_rng(index).integers(0, most, (24, 32), np.uint16, endpoint=True)
         Image.fromarray(grey).save(tmp_path / f"{index}.png")
     ingest.run(Config(photos=tmp_path), {}, tmp_path / "out", progress)
-    how = "values of 10 or 12 bits in files of 16 have to be scaled up first, those of 12 by 16"
+    how = "if their values are of 10 or 12 bits in files of 16, scale them up first, those of 12 by 16"
     assert progress.notes == [f"all photos are nearly black, at most 16 of 255: {how}"] * dark

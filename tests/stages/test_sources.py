@@ -350,8 +350,17 @@ def test_links_that_lead_nowhere_are_left_to_be_refused_by_name(tmp_path: Path) 
     assert names(find_source(tmp_path)) == ["a.jpg", "b.jpg"] and not is_gone(tmp_path)
     (tmp_path / "a.jpg").unlink()
     error = refusal(tmp_path)
-    assert (error.what, error.why) == (f"no photos in {tmp_path}", "its 1 files are links to what is not there")
+    assert (error.what, error.why) == (f"no photos in {tmp_path}", "1 of its files are links to what is not there")
     assert is_gone(tmp_path)
+    touch(tmp_path, "notes.txt")
+    (tmp_path / "b.jpg").rename(tmp_path / "b.mp4")
+    assert refusal(tmp_path).why == "1 of its files are links to what is not there"
+
+
+def test_a_linked_folder_that_is_gone_is_passed_over_as_it_was_before(tmp_path: Path) -> None:
+    touch(tmp_path, "a.jpg")
+    (tmp_path / "archive").symlink_to("drive")
+    assert names(find_source(tmp_path)) == ["a.jpg"]
 
 
 def test_a_folder_that_goes_while_it_is_listed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
