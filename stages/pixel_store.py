@@ -140,9 +140,9 @@ def pixel_store(ingest: Path, name: str, photos: Sequence[StoredPhoto], channels
     return PixelStore(ingest.with_name(f"{ingest.name}.pixels") / f"{name}-{key}", tuple(photos), channels)
 
 
-def fill(store: PixelStore, load: Load, workers: int, progress: Progress) -> None:
-    """Write the pixels of all photos, ``workers`` of them at a time, unless they are there and sound; waits where
-    another process is at it.
+def fill(store: PixelStore, load: Load, workers: Callable[[], int], progress: Progress) -> None:
+    """Write the pixels of all photos, as many at a time as ``workers`` answers, unless they are there and sound;
+    waits where another process is at it.
 
     Raises:
         StageError: if the disk has no room for them.
@@ -153,7 +153,7 @@ def fill(store: PixelStore, load: Load, workers: int, progress: Progress) -> Non
     store.path.parent.mkdir(exist_ok=True)
     with _only_one(store, progress):
         if not store.is_whole:  # nobody else was faster
-            _write(store, load, workers, progress)
+            _write(store, load, workers(), progress)
 
 
 def _is_sound(store: PixelStore, progress: Progress) -> bool:

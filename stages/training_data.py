@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -66,7 +66,7 @@ def training_bank(ingest: Path, scene: "Scene", split: "Split", downscale: float
     from stages.pixel_store import fill
 
     views, store = scene.of_split(split), _store(ingest, scene, split, downscale)
-    at_once = loaders(ingest / view.file for view in views)
+    at_once = cache(lambda: loaders(ingest / view.file for view in views))  # opens every file
     fill(store, lambda index: _decoded_pixels(ingest, scene, views[index], downscale), at_once, progress)
     used = sorted({view.camera for view in views})
 
@@ -87,7 +87,7 @@ def training_bank(ingest: Path, scene: "Scene", split: "Split", downscale: float
     )
     if not any(view.mask for view in views):
         return bank
-    masks = _ignored(views, lambda view: view_mask(ingest, scene, view, downscale), at_once)
+    masks = _ignored(views, lambda view: view_mask(ingest, scene, view, downscale), at_once())
     return _masked(bank, masks, split, progress)
 
 

@@ -35,7 +35,7 @@ def store_of(folder: Path, channels: int = 3, name: str = "train") -> PixelStore
 
 def fill(store: PixelStore, load: Load, progress: SilentProgress) -> None:
     """With two workers."""
-    module.fill(store, load, 2, progress)
+    module.fill(store, load, lambda: 2, progress)
 
 
 def painted(index: int, channels: int = 3) -> np.ndarray:

@@ -235,6 +235,15 @@ def test_masks_are_loaded_a_few_at_a_time_and_dropped(
     assert torch.equal(drawable, torch.from_numpy(half_mask() > 0).expand(12, -1, -1))
 
 
+def test_no_photo_is_opened_where_the_pixels_are_there(
+    tmp_path: Path, progress: SilentProgress, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    inputs, scene = photographed(tmp_path)
+    pixels = training_bank(inputs["ingest"], scene, "train", 1.0, progress).pixels
+    monkeypatch.setattr("PIL.Image.open", None)
+    assert torch.equal(training_bank(inputs["ingest"], scene, "train", 1.0, progress).pixels, pixels)
+
+
 def test_without_masks_nothing_is_kept_of_them(tmp_path: Path, progress: SilentProgress) -> None:
     inputs, scene = photographed(tmp_path)
     assert view_mask(inputs["ingest"], scene, scene.views[0], 1.0) is None

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from nerf.kernels import Backend, Lattice, reference, warp
+from nerf.kernels import Backend, Lattice, Samples, reference, warp
 from nerf.model import Rendering
 from tests.nerf.kernels.warp_agreement import (
     COUNTS,
@@ -47,16 +47,21 @@ def test_compositing_and_its_gradients(device: str, scale: float) -> None:
     agree("composite_backward", *inputs, *gradients(device, len(COUNTS), n))
 
 
+def three_long_rays(device: str, varied: bool) -> tuple[Samples, Tensor]:
+    """Rays of 4,096 samples, and a number for each that its interval is proportional to: 1, or 0.5 to 1.5."""
+    n = 4096 * 3
+    each = uniform(device, 22, n) + 0.5 if varied else torch.ones(n, device=device)
+    return packed(device, [4096] * 3, 0.001 * each), each
+
+
 @pytest.mark.parametrize("density", [0.01, 1.0, 4.0, 30.0])
 @pytest.mark.parametrize("varied", [False, True])
 def test_rays_of_4096_samples(device: str, varied: bool, density: float) -> None:
     """Equal ones, too: there the roundings of a sum all go the same way."""
-    n = 4096 * 3
-    each = uniform(device, 22, n) + 0.5 if varied else torch.ones(n, device=device)
-    samples = packed(device, [4096] * 3, 0.001 * each)
-    inputs = samples, density * each, *seen(device, 3, n)
+    samples, each = three_long_rays(device, varied)
+    inputs = samples, density * each, *seen(device, 3, len(each))
     _, weights = agree("composite", *inputs, tolerance=1e-6)
-    agree("composite_backward", *inputs, *gradients(device, 3, n), tolerance=1e-6)
+    agree("composite_backward", *inputs, *gradients(device, 3, len(each)), tolerance=1e-6)
     for lattice in (EVEN, GROWING):
         agree("distortion", samples, weights, lattice, tolerance=1e-6)
         agree("distortion_backward", samples, weights, lattice, normal(device, 23, 3), tolerance=1e-6)
@@ -64,9 +69,7 @@ def test_rays_of_4096_samples(device: str, varied: bool, density: float) -> None
 
 @pytest.mark.parametrize("varied", [False, True])
 def test_other_sums_along_rays_of_4096_samples(device: str, varied: bool) -> None:
-    n = 4096 * 3
-    each = uniform(device, 22, n) + 0.5 if varied else torch.ones(n, device=device)
-    samples = packed(device, [4096] * 3, 0.001 * each)
+    samples, each = three_long_rays(device, varied)
     rays = random_rays(device, 32).each(lambda part: part[-3:])
     for contracted in (False, True):
         grad = 0.1 * each[:, None].repeat(1, 3)
@@ -84,9 +87,7 @@ def test_other_sums_along_rays_of_4096_samples(device: str, varied: bool) -> Non
 
 @pytest.mark.parametrize("varied", [False, True])
 def test_waves_of_4096_samples(device: str, varied: bool) -> None:
-    n = 4096 * 3
-    each = uniform(device, 22, n) + 0.5 if varied else torch.ones(n, device=device)
-    samples, jitter = packed(device, [4096] * 3, 0.001 * each), uniform(device, 33, 3)
+    (samples, each), jitter = three_long_rays(device, varied), uniform(device, 33, 3)
     far, light_left = torch.full((3,), 9.0, device=device), 0.2
     for lattice in (EVEN._replace(most_samples=4096), GROWING._replace(most_samples=4096)):
         depths, nears = [], []
@@ -103,16 +104,14 @@ def test_waves_of_4096_samples(device: str, varied: bool) -> None:
 
 @pytest.mark.parametrize("varied", [False, True])
 def test_what_is_done_to_each_of_4096_samples(device: str, varied: bool) -> None:
-    n = 4096 * 3
-    each = uniform(device, 22, n) + 0.5 if varied else torch.ones(n, device=device)
-    samples = packed(device, [4096] * 3, 0.001 * each)
+    samples, each = three_long_rays(device, varied)
     rays = random_rays(device, 32).each(lambda part: part[-3:])
     for contracted in (False, True):
         agree("sample_points", rays, samples, contracted, tolerance=1e-6)
     for thin in (0.0, 0.01):
         kept, _ = agree("visible_samples", samples, each, 0.2, thin, uniform(device, 33, 3), tolerance=1e-6)
-        assert kept.starts.diff().min() > (100 if thin else 1000) and len(kept.t) < n / 2
-    hidden, of_ray = normal(device, 27, n, 64), normal(device, 29, 3, 64)
+        assert kept.starts.diff().min() > (100 if thin else 1000) and len(kept.t) < len(each) / 2
+    hidden, of_ray = normal(device, 27, len(each), 64), normal(device, 29, 3, 64)
     given, wanted = hidden.clone(), hidden.clone()
     warp.add_ray_relu(samples, given, of_ray)
     reference.add_ray_relu(samples, wanted, of_ray)
