@@ -5,7 +5,7 @@ held fading meanwhile, and raised at once where training finds more.
 """
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from nerf.contraction import uncontract
@@ -19,6 +19,7 @@ YOUNG_STEPS = 256  # a young field changes everywhere: all cells are measured ea
 PARTS = 4  # later a part of them in turn
 THIN = 0.01  # a cell as thin as this, or as the mean cell, counts as empty
 CHUNK = 1 << 14  # points measured at once
+BLOCK_SIDE, BRICK_BLOCKS = 2, 8  # cells are measured in blocks of 2³: 8 of them in a brick
 
 
 class DensityCache:
@@ -28,6 +29,7 @@ class DensityCache:
     def __init__(self, field: GridField, usable: Bool[Tensor, "cache"] | None = None) -> None:
         self.field, self.unusable = field, None if usable is None else ~usable
         self.thickness = torch.zeros(field.settings.cache_cells**3, device=field.table.device)
+        self.corners, self.block_of_cell = _blocks(field)
         self.usable_count = len(self.thickness) if usable is None else max(1, int(usable.sum()))
         if usable is not None:
             field.occupy(field.backend.occupied_bits(usable.float(), 0.5))
@@ -53,25 +55,17 @@ class DensityCache:
         return float(rows.sum(-1).double().sum()) / self.usable_count
 
     def _measure_part(self, part: int, parts: int, random: torch.Generator) -> None:
-        """Measure every ``parts``-th brick, beginning with number ``part``: blocks of 2³ cells, at one point each."""
-        cells, device = self.field.settings.cache_cells, self.thickness.device
-        # A cell's number ends in the binary digits x₁x₀y₁y₀z₁z₀, so a block of 2³ cells is all values of x₀, y₀, z₀.
-        digits = (2, 2, 2, 2, 2, 2)
-        numbers = torch.arange(cells**3, device=device).view(-1, BRICK_CELLS)[part::parts].unflatten(1, digits)
-        first = numbers[:, :, 0, :, 0, :, 0]
-        measured = self._measure(self._points_in(first.flatten(), 2, random)).view(-1, 2, 1, 2, 1, 2, 1)
-        thickness = self.thickness.view(-1, BRICK_CELLS)[part::parts].unflatten(1, digits)
-        torch.maximum(thickness.mul_(FADE), measured, out=thickness)
-
-    def _points_in(self, cell: Tensor, side: int, random: torch.Generator) -> Float[Tensor, "points 3"]:
-        """A random point in each cube of ``side`` cells that begins at a cell."""
-        cells = self.field.settings.cache_cells
-        corners = self.field.backend.cell_corners(cells, cell)
-        return corners + side / cells * torch.rand(corners.shape, generator=random, device=corners.device)
+        """Measure every ``parts``-th brick, beginning with number ``part``: each block at a random point of it."""
+        corners = self.corners[part::parts].flatten(0, 1)
+        side = BLOCK_SIDE / self.field.settings.cache_cells
+        points = corners + side * torch.rand(corners.shape, generator=random, device=corners.device)
+        measured = torch.cat(list(in_order(self._measure, points.split(CHUNK), points.device)))
+        of_cells = measured.view(-1, BRICK_BLOCKS).index_select(1, self.block_of_cell)
+        thickness = self.thickness.view(-1, BRICK_CELLS)[part::parts]
+        torch.maximum(thickness.mul_(FADE), of_cells, out=thickness)
 
     def _measure(self, unit: Float[Tensor, "points 3"]) -> Float[Tensor, "points"]:
-        sigma = torch.cat(list(in_order(self.field.unit_density, unit.split(CHUNK), unit.device)))
-        return sigma * self._step_length(unit)
+        return self.field.unit_density(unit) * self._step_length(unit)
 
     def _step_length(self, unit: Float[Tensor, "points 3"]) -> Float[Tensor, "points"] | float:
         """The lattice's step at points, as seen from a camera near the origin.
@@ -84,3 +78,14 @@ class DensityCache:
         margin = 0.5 / lattice.cells
         within = 2 * CONTRACTED_BOX * (unit.clamp(margin, 1 - margin) - 0.5)
         return (lattice.cone * uncontract(within).norm(dim=-1)).clamp(min=lattice.step)
+
+
+def _blocks(field: GridField) -> tuple[Float[Tensor, "bricks blocks 3"], Int[Tensor, "cells"]]:
+    """The nearest corner of each brick's blocks, in unit coordinates, and the block that each cell of a brick is in."""
+    # A cell's number ends in the binary digits x₁x₀y₁y₀z₁z₀: a block is all values of x₀, y₀, z₀.
+    first = torch.arange(BRICK_CELLS).view(2, 2, 2, 2, 2, 2)[:, 0, :, 0, :, 0].flatten()
+    block = torch.arange(BRICK_BLOCKS).view(2, 1, 2, 1, 2, 1).expand(2, 2, 2, 2, 2, 2).flatten()
+    device, cells = field.table.device, field.settings.cache_cells
+    bricks = torch.arange(0, cells**3, BRICK_CELLS)[:, None]
+    corners = field.backend.cell_corners(cells, (bricks + first).flatten().to(device))
+    return corners.view(-1, BRICK_BLOCKS, 3), block.to(device)

@@ -43,7 +43,9 @@ GUIDED_EVERY = 8  # one ray in so many runs to a sparse point, where some are kn
 FIRST_SAMPLES_PER_RAY = 128.0
 # A ray is not free, though it may need no colour: no step has more rays than if each needed so many.
 LEAST_SAMPLES_PER_RAY = 2.0
-ADAM_BYTES = 4 * 7  # of an entry of the table: its gradient read and cleared, itself and its moments read and written
+TOUCHED = 0.33  # of the table's entries, by a batch (docs/numbers.md: Where a step's time goes)
+# Of an entry: its gradient read; if it is not zero, that cleared, the entry itself and its moments read and written.
+ADAM_BYTES = 4 * (1 + 7 * TOUCHED)
 MEMORY = 0.9  # how much of the mean of samples per ray remains after each step
 
 

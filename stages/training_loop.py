@@ -69,8 +69,7 @@ class TrainingRun:
         progress: Progress,
     ) -> None:
         self.make_trainer, self.probes, self.budget = make_trainer, probes, budget
-        self.folder, self.checkpoint_seconds = folder, checkpoint_seconds
-        self.log, self.progress = log, progress
+        self.folder, self.log, self.progress, self.checkpoint_seconds = folder, log, progress, checkpoint_seconds
         self.checkpoints, self.journal, self.spent = folder / "checkpoints", folder / "plan.json", folder / "spent.txt"
         self.pace, self.next_planning = Pace(), 0.0
         checkpoint = latest_checkpoint(self.checkpoints, progress.note, self._fits)
@@ -231,6 +230,8 @@ class TrainingRun:
 
     def _measure(self) -> None:
         """Add a point to the curve. Not training time, and without influence on what is trained."""
+        import kornia.metrics  # noqa: F401 # not before the first steps, nor at the cost of the first measurement
+
         from stages.unseen import look
 
         started = time.perf_counter()

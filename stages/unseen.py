@@ -53,7 +53,6 @@ def unseen_photos(
 ) -> Unseen | None:
     """Of the photos of a split; None where it has none, or where masks leave nothing of its test photos, which decide
     nothing: then ``progress`` is told. Always the same pixels."""
-    import kornia.metrics  # noqa: F401 # takes seconds, which would count as the cost of the first measurement
     import torch
 
     from nerf.probe import make_patches, make_probe

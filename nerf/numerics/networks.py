@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from nerf import grid_mlp, sky
-from nerf.grid_mlp import DIRECTION, GEOMETRY, HIDDEN, LARGEST_LOG_DENSITY, DensityPass, Weights
+from nerf.grid_mlp import DIRECTION, GEOMETRY, LARGEST_LOG_DENSITY, DensityPass, Weights
 from nerf.kernels import Backend, GridLayout, Samples, grid_layout
 from nerf.kernels.adam import LEAST_ROOT, MEAN_DECAY, SQUARE_DECAY
 from nerf.numerics import Bound, Case
@@ -125,9 +125,8 @@ def _sigma(_: Backend, logarithm: Tensor) -> Tensor:
 def _sigma_backward(backend: Backend, grad: Tensor, logarithm: Tensor) -> tuple[Tensor]:
     """Alone: of a network whose hidden layer is silent, and whose colours ask for nothing."""
     geometry = torch.nn.functional.pad(logarithm, (0, GEOMETRY - 1))
-    silent = torch.zeros(len(logarithm), HIDDEN).to(logarithm)
     features, sigma = torch.zeros(len(logarithm), FEATURES).to(logarithm), grid_mlp.sigma_of(geometry)
-    done = DensityPass(features, silent, geometry, sigma)
+    done = DensityPass(features, geometry, sigma)
     of_geometry = torch.zeros_like(geometry)
     grid_mlp.density_backward(_weights(logarithm), backend, done, grad[:, 0], of_geometry)
     return (of_geometry[:, :1],)

@@ -15,6 +15,7 @@ wp.set_module_options({"enable_backward": False})
 _PRIME_Y = wp.constant(wp.uint32(2654435761))
 _PRIME_Z = wp.constant(wp.uint32(805459861))
 FEATURES = 4  # of a vertex: a row of the table is one vec4
+_SOON = wp.constant(8)  # points from now whose rows are called for (docs/numbers.md)
 vec8 = wp.types.vector(length=8, dtype=wp.float32)
 vec8i = wp.types.vector(length=8, dtype=wp.int32)
 
@@ -113,6 +114,47 @@ def _corner_shares(u: float, v: float, w: float):
     return vec8(a * t, a * w, b * t, b * w, c * t, c * w, d * t, d * w)
 
 
+# In C++, as a vector of Warp's reaches the CPU's compiler in two halves, each with loads and sums of its own.
+@wp.func_native("""
+    float mean[4] = {0.0f};
+    for (int corner = 0; corner < 8; ++corner)
+        for (int k = 0; k < 4; ++k)
+            mean[k] += shares.c[corner] * table.data[rows.c[corner]].c[k];
+    for (int k = 0; k < 4; ++k)
+        features.data[place].c[k] = mean[k];
+""")
+def _interpolate(table: wp.array[wp.vec4], rows: vec8i, shares: vec8, features: wp.array[wp.vec4], place: int):
+    """features[place] = sum of shares times rows of the table."""
+
+
+# A processor waits for memory most of the time in these kernels, so it asks for what it needs a few points ahead. A GPU
+# has other threads to go on with.
+@wp.func_native("""
+#ifndef __CUDA_ARCH__
+    for (int corner = 0; corner < 8; ++corner)
+        __builtin_prefetch(table.data + rows.c[corner]);
+#endif
+""")
+def _call_for(table: wp.array[wp.vec4], rows: vec8i):
+    """Have rows of the table on their way to a CPU's caches."""
+
+
+@wp.func
+def _call_around(table: wp.array[wp.vec4], level: wp.vec4i, point: wp.vec3):
+    """For the rows around a point; tables without a hash are small and stay in the caches."""
+    if level[3] != 0:
+        scaled = float(level[0]) * point
+        x = _cell(scaled[0], level[0])
+        y = _cell(scaled[1], level[0])
+        _call_for(table, _corner_rows(level, x, y, _cell(scaled[2], level[0])))
+
+
+@wp.func
+def _soon(points: wp.array[wp.vec3], i: int):
+    """The point that comes some points after number i, or the last."""
+    return points[wp.min(i + _SOON, points.shape[0] - 1)]
+
+
 @wp.kernel
 def _encode(
     levels: wp.array[wp.vec4i],
@@ -123,18 +165,17 @@ def _encode(
 ):
     i = wp.tid()
     point = points[i]
+    coming = _soon(points, i)
     for index in range(count):
         level = levels[index]
+        _call_around(table, level, coming)
         scaled = float(level[0]) * point
         x = _cell(scaled[0], level[0])
         y = _cell(scaled[1], level[0])
         z = _cell(scaled[2], level[0])
         rows = _corner_rows(level, x, y, z)
         shares = _corner_shares(scaled[0] - float(x), scaled[1] - float(y), scaled[2] - float(z))
-        mean = shares[0] * table[rows[0]]
-        for corner in range(1, 8):
-            mean += shares[corner] * table[rows[corner]]
-        features[i * count + index] = mean
+        _interpolate(table, rows, shares, features, i * count + index)
 
 
 @wp.kernel
@@ -148,6 +189,7 @@ def _encode_backward_table(
 ):
     i = wp.tid()
     level = levels[index]
+    _call_around(grad_table, level, _soon(points, i))
     scaled = float(level[0]) * points[i]
     x = _cell(scaled[0], level[0])
     y = _cell(scaled[1], level[0])
@@ -170,8 +212,10 @@ def _encode_backward_points(
 ):
     i = wp.tid()
     total = wp.vec3(0.0, 0.0, 0.0)
+    coming = _soon(points, i)
     for index in range(count):
         level = levels[index]
+        _call_around(table, level, coming)
         scaled = float(level[0]) * points[i]
         x = _cell(scaled[0], level[0])
         y = _cell(scaled[1], level[0])
