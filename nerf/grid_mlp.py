@@ -19,7 +19,8 @@ HIDDEN = 64
 GEOMETRY = 16  # numbers that the density network hands to the colour network; the first is the logarithm of density
 DIRECTION = 16  # spherical harmonics, where colour depends on the direction
 LARGEST_LOG_DENSITY = 15.0
-# Samples whose hidden layers exist at a time, so that on a CPU they stay in its core's cache (docs/numbers.md).
+# Samples whose hidden layer of the density network exists at a time: as many as stay in a core's cache (docs/numbers.md:
+# Waiting for memory); on a GPU all.
 BLOCK = {"cpu": 1 << 12, "cuda": 1 << 22}
 
 
@@ -85,7 +86,8 @@ def no_directions_backward(
 
 
 def density_products(weights: Weights) -> int:
-    """Multiplications and additions of a sample's density; the way back has twice as many."""
+    """Multiplications and additions of a sample's density; the way back has twice as many, without those of the hidden
+    layer, which is computed again."""
     return 2 * (weights.density_hidden.numel() + weights.density_out.numel())
 
 

@@ -230,10 +230,9 @@ class TrainingRun:
 
     def _measure(self) -> None:
         """Add a point to the curve. Not training time, and without influence on what is trained."""
-        import kornia.metrics  # noqa: F401 # not before the first steps, nor at the cost of the first measurement
+        from stages.unseen import load_metrics, look
 
-        from stages.unseen import look
-
+        load_metrics()
         started = time.perf_counter()
         seen = look(self.trainer, self.probes.heldout) if self.probes.heldout else None
         # Right after a kill at the very end no step has told how well the batches go.

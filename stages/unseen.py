@@ -78,6 +78,12 @@ def unseen_photos(
     )
 
 
+def load_metrics() -> None:
+    """Import what :func:`look` computes with. It takes long: the first step should not wait for it, nor should the first
+    measurement be charged with it."""
+    import kornia.metrics  # noqa: F401
+
+
 def look(trainer: "FieldTrainer", unseen: Unseen) -> Look:
     """How the field does on photos that it has never seen, exposed as their neighbours let expect."""
     from nerf.probe import measure, pictures

@@ -106,9 +106,10 @@ def test_products_are_those_that_torch_counts(
     with FlopCounterMode(display=False) as counted:
         timed_step(of, FIRST_TIMED, timings)
     ours = sum(work[1] for work in timings["parts"].values())
-    # We leave out what is once per ray (directions) and the hidden layer that is computed twice, and torch counts a
-    # rectangle of unneeded gradients.
-    assert 0.7 * counted.get_total_flops() < ours <= counted.get_total_flops()
+    # We leave out what is once per ray (directions) and, of the grid field, a hidden layer computed again; and torch
+    # counts a rectangle of unneeded gradients.
+    least = 0.7 if kind == "torch" else 0.8
+    assert least * counted.get_total_flops() < ours <= counted.get_total_flops()
 
 
 def test_rows_are_eight_corners_of_each_grid_of_each_point() -> None:

@@ -15,7 +15,7 @@ wp.set_module_options({"enable_backward": False})
 _PRIME_Y = wp.constant(wp.uint32(2654435761))
 _PRIME_Z = wp.constant(wp.uint32(805459861))
 FEATURES = 4  # of a vertex: a row of the table is one vec4
-_SOON = wp.constant(8)  # points from now whose rows are called for (docs/numbers.md)
+_AHEAD = wp.constant(8)  # points for which rows are fetched before their turn (docs/numbers.md: Waiting for memory)
 vec8 = wp.types.vector(length=8, dtype=wp.float32)
 vec8i = wp.types.vector(length=8, dtype=wp.int32)
 
@@ -114,9 +114,12 @@ def _corner_shares(u: float, v: float, w: float):
     return vec8(a * t, a * w, b * t, b * w, c * t, c * w, d * t, d * w)
 
 
-# In C++, as a vector of Warp's reaches the CPU's compiler in two halves, each with loads and sums of its own.
+# In C++, since sums of share * row with wp.vec4 compile to two loads, products and sums per corner (Warp 1.19, x86).
 @wp.func_native("""
     float mean[4] = {0.0f};
+    assert(place >= 0 && place < features.shape[0]);
+    for (int corner = 0; corner < 8; ++corner)
+        assert(rows.c[corner] >= 0 && rows.c[corner] < table.shape[0]);
     for (int corner = 0; corner < 8; ++corner)
         for (int k = 0; k < 4; ++k)
             mean[k] += shares.c[corner] * table.data[rows.c[corner]].c[k];
@@ -127,7 +130,7 @@ def _interpolate(table: wp.array[wp.vec4], rows: vec8i, shares: vec8, features: 
     """features[place] = sum of shares times rows of the table."""
 
 
-# A processor waits for memory most of the time in these kernels, so it asks for what it needs a few points ahead. A GPU
+# A CPU's core spends most of these kernels waiting for memory, so it asks for the rows of later points beforehand. A GPU
 # has other threads to go on with.
 @wp.func_native("""
 #ifndef __CUDA_ARCH__
@@ -135,24 +138,24 @@ def _interpolate(table: wp.array[wp.vec4], rows: vec8i, shares: vec8, features: 
         __builtin_prefetch(table.data + rows.c[corner]);
 #endif
 """)
-def _call_for(table: wp.array[wp.vec4], rows: vec8i):
+def _prefetch(table: wp.array[wp.vec4], rows: vec8i):
     """Have rows of the table on their way to a CPU's caches."""
 
 
 @wp.func
-def _call_around(table: wp.array[wp.vec4], level: wp.vec4i, point: wp.vec3):
-    """For the rows around a point; tables without a hash are small and stay in the caches."""
+def _prefetch_around(table: wp.array[wp.vec4], level: wp.vec4i, point: wp.vec3):
+    """The rows around a point. Those of grids without a hash stand in order, mostly few: caches do without."""
     if level[3] != 0:
         scaled = float(level[0]) * point
         x = _cell(scaled[0], level[0])
         y = _cell(scaled[1], level[0])
-        _call_for(table, _corner_rows(level, x, y, _cell(scaled[2], level[0])))
+        _prefetch(table, _corner_rows(level, x, y, _cell(scaled[2], level[0])))
 
 
 @wp.func
-def _soon(points: wp.array[wp.vec3], i: int):
-    """The point that comes some points after number i, or the last."""
-    return points[wp.min(i + _SOON, points.shape[0] - 1)]
+def _ahead(points: wp.array[wp.vec3], i: int):
+    """The point whose rows are to be fetched at the turn of number i."""
+    return points[wp.min(i + _AHEAD, points.shape[0] - 1)]
 
 
 @wp.kernel
@@ -165,10 +168,10 @@ def _encode(
 ):
     i = wp.tid()
     point = points[i]
-    coming = _soon(points, i)
+    later = _ahead(points, i)
     for index in range(count):
         level = levels[index]
-        _call_around(table, level, coming)
+        _prefetch_around(table, level, later)
         scaled = float(level[0]) * point
         x = _cell(scaled[0], level[0])
         y = _cell(scaled[1], level[0])
@@ -189,7 +192,7 @@ def _encode_backward_table(
 ):
     i = wp.tid()
     level = levels[index]
-    _call_around(grad_table, level, _soon(points, i))
+    _prefetch_around(grad_table, level, _ahead(points, i))
     scaled = float(level[0]) * points[i]
     x = _cell(scaled[0], level[0])
     y = _cell(scaled[1], level[0])
@@ -212,10 +215,10 @@ def _encode_backward_points(
 ):
     i = wp.tid()
     total = wp.vec3(0.0, 0.0, 0.0)
-    coming = _soon(points, i)
+    later = _ahead(points, i)
     for index in range(count):
         level = levels[index]
-        _call_around(table, level, coming)
+        _prefetch_around(table, level, later)
         scaled = float(level[0]) * points[i]
         x = _cell(scaled[0], level[0])
         y = _cell(scaled[1], level[0])
