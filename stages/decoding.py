@@ -24,7 +24,7 @@ MIN_SIDE_PX = 16
 _FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP", "GIF", "PPM", "HEIF", "AVIF", "JPEG2000")
 _DEEP_GREY = ("I", "I;16", "I;16L", "I;16B", "F")
 _LOSSY = ("JPEG", "MPO", "HEIF", "AVIF")
-_RAW = (".dng", ".cr2", ".cr3", ".nef", ".nrw", ".arw", ".srf", ".raf", ".orf", ".rw2", ".pef", ".raw", ".iiq")
+RAW = (".dng", ".cr2", ".cr3", ".nef", ".nrw", ".arw", ".srf", ".raf", ".orf", ".rw2", ".pef", ".raw", ".iiq")
 # Focal lengths over the longer side: 157 to 6 degrees through a pinhole, what COLMAP accepts. Others are not believed,
 # neither of EXIF nor of a lens that was fitted.
 FOCAL_RANGE = (0.1, 10.0)
@@ -114,7 +114,7 @@ def pillow() -> ModuleType:
 
 def _open(path: Path) -> "Image.Image":
     """The image with its header read, of a size we accept."""
-    if path.suffix.lower() in _RAW:
+    if path.suffix.lower() in RAW:
         raise DecodeError("camera raw files are not read; export JPEG, PNG or TIFF")
     library = pillow()
     try:

@@ -5,7 +5,7 @@ Cheap: lists folders and reads at most the JSON of a transforms file, never an i
 
 import os
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import product
@@ -13,25 +13,14 @@ from pathlib import Path
 from typing import Any, Literal
 
 from stages.contract import StageError
+from stages.listing import FOLDER_HINT, IMAGES, files_below, is_video, list_photos, photo_root, walk_photos
 from stages.transforms_files import HELD_OUT, MOST_LETTERS, TRAIN, photo_names, read_splits
 from stages.twins import twins
 
 SourceKind = Literal["photos", "video", "transforms", "blender", "colmap"]
 
-# Everything else is tried: what counts as a photo is decided by decoding, not by the name.
-# fmt: off
-_NOT_PHOTOS = (
-    ".txt", ".json", ".jsonl", ".md", ".rst", ".csv", ".tsv", ".xml", ".html", ".pdf", ".log", ".ini", ".toml", ".yaml",
-    ".yml", ".py", ".sh", ".ipynb", ".zip", ".gz", ".tar", ".7z", ".npy", ".npz", ".pt", ".pth", ".pkl", ".bin", ".db",
-    ".ply", ".obj", ".mtl", ".glb", ".gltf", ".stl", ".las", ".laz", ".xmp", ".aae", ".thm", ".mp3", ".wav", ".m4a",
-)
-_VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".3gp", ".mts", ".m2ts", ".wmv", ".lrv")
-# fmt: on
-_IMAGES = (".jpg", ".jpeg", ".png", ".heic", ".heif", ".tif", ".tiff", ".webp", ".bmp", ".avif", ".gif")
 _HAS_BESIDE = re.compile(r"images(_\d+)?|input|photos")  # folders of photos beside which their masks may lie
 _EXTENSIONS_TRIED = ("", ".png", ".jpg", ".jpeg")
-_FOLDER_HINT = "Give the folder that holds the photos: pipeline run FOLDER"
-_LINKS_HINT = "Fetch them (git annex get, dvc pull), or connect the drive that they lie on."
 
 
 @dataclass(frozen=True)
@@ -87,17 +76,17 @@ def cannot_read(path: Path | str, error: OSError) -> StageError:
 
 
 def _source(photos: Path, cameras: Path | None) -> Source:
-    if photos.is_file() and _is_video(photos):
+    if photos.is_file() and is_video(photos):
         return Source("video", photos.parent, None, (photos,))
     if photos.is_file():
         return _from_transforms("transforms", photos.parent, photos)
-    root = _photo_root(photos)
+    root = photo_root(photos)
     if cameras is not None and cameras.is_file():
         return _from_transforms("transforms", root, cameras)
     if cameras is None and (photos / TRAIN).is_file():
         return _from_transforms("blender", photos, photos)
     files = list_photos(root)
-    if _is_video(files[0]):
+    if is_video(files[0]):
         return Source("video", root, None, files)
     if cameras is not None and not _model_files(cameras := _cameras_in(cameras)):
         return _from_transforms("transforms" if cameras.is_file() else "blender", root, cameras)
@@ -137,59 +126,17 @@ def photos_beside(source: Source, photos: Path) -> int:
     """How many photos lie in the folder PHOTOS itself where those of its ``images`` folder are taken."""
     if source.kind not in ("photos", "colmap") or source.root != photos.absolute() / "images":
         return 0
-    named = (file for file in photos.glob("*") if file.suffix.lower() in _IMAGES and not file.name.startswith("."))
+    named = (file for file in photos.glob("*") if file.suffix.lower() in IMAGES and not file.name.startswith("."))
     return sum(file.is_file() for file in named)
-
-
-def list_photos(root: Path) -> tuple[Path, ...]:
-    """All files below ``root`` that may be photos, sorted by relative name; where there are none but a single video,
-    that.
-
-    Skipped: hidden files, ``masks`` folders, workspaces of ours (folders with a run.json), and files whose
-    extension says that they are no images. Folders that are symbolic links are not followed.
-    Raises StageError if nothing remains and PermissionError for a folder that cannot be read.
-    """
-    found = _files_below(root, _is_photo_folder)
-    if not found:
-        raise StageError(f"{root} is empty", "there is no file in it", _FOLDER_HINT)
-    photos = [file for file in found if _may_be_photo(file)]
-    videos = [file for file in found if _is_video(file)]
-    lost = sum(not file.is_file() for file in found)
-    if lost and not any(map(Path.is_file, photos + videos)):
-        raise StageError(f"no photos in {root}", f"{lost} of its files are links to what is not there", _LINKS_HINT)
-    if not photos and len(videos) != 1:
-        raise _no_photos(root, found, videos)
-    return tuple(photos or videos)
 
 
 def is_gone(photos: Path) -> bool:
     """Whether nothing is left of PHOTOS: a drive that is not there leaves an empty folder, or links to what it held."""
     try:
-        empty = photos.is_dir() and not any(map(Path.is_file, _walk(_photo_root(photos), _is_photo_folder)))
+        empty = photos.is_dir() and not any(map(Path.is_file, walk_photos(photo_root(photos))))
         return empty or not photos.exists()
     except OSError:  # said by find_source
         return False
-
-
-def _files_below(root: Path, enters: Callable[[Path], bool]) -> list[Path]:
-    """The files below ``root`` that are not hidden, in folders that one ``enters``, sorted by relative name."""
-    return sorted(_walk(root, enters), key=lambda file: file.relative_to(root).as_posix())
-
-
-def _walk(root: Path, enters: Callable[[Path], bool]) -> Iterator[Path]:
-    def fail(error: OSError) -> None:
-        raise error
-
-    for folder, subfolders, names in os.walk(root, onerror=fail):
-        here = Path(folder)
-        subfolders[:] = [s for s in subfolders if enters(here / s)]
-        files = (here / name for name in names if not name.startswith("."))
-        yield from (file for file in files if file.is_file() or _is_lost(file))
-
-
-def _is_lost(file: Path) -> bool:
-    """A link to a photo or video that is not there is refused by name. Other links may have led to folders."""
-    return file.suffix.lower() in _IMAGES + _VIDEOS and file.is_symlink() and not file.exists()
 
 
 def _list_masks(root: Path, files: tuple[Path, ...]) -> tuple[tuple[str, Path], ...]:
@@ -203,7 +150,7 @@ def _list_masks(root: Path, files: tuple[Path, ...]) -> tuple[tuple[str, Path], 
     found = []
     for masks, stands_in in places:
         if masks.is_dir():
-            inside = _files_below(masks, lambda folder: not folder.name.startswith("."))
+            inside = files_below(masks, lambda folder: not folder.name.startswith("."))
             found += [(_name(masks, file, stands_in), file) for file in inside]
     return tuple(found)
 
@@ -253,13 +200,13 @@ def _check_given(photos: Path, cameras: Path | None) -> None:
             raise StageError(
                 f"{photos} is a workspace", "it holds results, not photos", f"Go on with it: pipeline resume {photos}"
             )
-    elif (suffix := photos.suffix.lower()) in _IMAGES:
+    elif (suffix := photos.suffix.lower()) in IMAGES:
         raise StageError(
-            f"{photos.name} is a single image", "a scene needs many photos from different places", _FOLDER_HINT
+            f"{photos.name} is a single image", "a scene needs many photos from different places", FOLDER_HINT
         )
-    elif suffix != ".json" and not _is_video(photos):
+    elif suffix != ".json" and not is_video(photos):
         raise StageError(
-            f"cannot use {photos.name}", "it is no folder of photos, video or transforms.json", _FOLDER_HINT
+            f"cannot use {photos.name}", "it is no folder of photos, video or transforms.json", FOLDER_HINT
         )
     elif cameras is not None and suffix == ".json":
         raise StageError(
@@ -273,16 +220,6 @@ def _check_given(photos: Path, cameras: Path | None) -> None:
             f"Give the folder of the COLMAP model: --cameras {cameras.parent}" if of_colmap else
             "Give a transforms file or the folder of a COLMAP model: cameras in other forms are not read.",
         )  # fmt: skip
-
-
-def _photo_root(folder: Path) -> Path:
-    images = folder / "images"
-    holds_photos = images.is_dir() and any(map(_may_be_photo, _walk(images, _is_photo_folder)))
-    return images if holds_photos else folder
-
-
-def _is_photo_folder(folder: Path) -> bool:
-    return not folder.name.startswith(".") and folder.name != "masks" and not (folder / "run.json").is_file()
 
 
 def _from_transforms(kind: SourceKind, root: Path, cameras: Path) -> Source:
@@ -372,28 +309,9 @@ def _model_files(folder: Path) -> tuple[Path, ...]:
     return ()
 
 
-def _may_be_photo(file: Path) -> bool:
-    return file.suffix.lower() not in _NOT_PHOTOS and not _is_video(file)
-
-
-def _is_video(file: Path) -> bool:
-    return file.suffix.lower() in _VIDEOS
-
-
 def _cameras_of_video(video: Path) -> StageError:
     return StageError(
         f"cannot use --cameras with {video.name}",
         "it is a video, and which of its frames become photos is decided here: no cameras can be known for them",
         "Leave --cameras out, or give the folder of the photos that the cameras belong to.",
     )
-
-
-def _no_photos(root: Path, found: list[Path], videos: list[Path]) -> StageError:
-    if videos:
-        names = ", ".join(video.relative_to(root).as_posix() for video in videos[:5])
-        return StageError(
-            f"{len(videos)} videos in {root}", f"{names}: which one is meant is not clear",
-            f"Give one of them: pipeline run {videos[0]}",
-        )  # fmt: skip
-    suffixes = ", ".join(sorted({file.suffix.lower() or file.name for file in found})[:5])
-    return StageError(f"no photos in {root}", f"its {len(found)} files are no images ({suffixes})", _FOLDER_HINT)

@@ -370,7 +370,7 @@ def test_a_folder_that_goes_while_it_is_listed(tmp_path: Path, monkeypatch: pyte
         shutil.rmtree(folder)
         return True
 
-    monkeypatch.setattr("stages.sources._is_photo_folder", enters)
+    monkeypatch.setattr("stages.listing._is_photo_folder", enters)
     assert refusal(tmp_path).what == f"cannot read {tmp_path / 'a'}"
 
 
