@@ -34,7 +34,7 @@ from stages.photos import Photo
 from stages.sources import account_of_ours
 from stages.sparse_model import SparseImage, SparseModel
 from stages.transforms_export import OPENGL_FROM_OPENCV
-from stages.transforms_files import MOST_LETTERS, TRAIN, pose_matrix, read_splits
+from stages.transforms_files import MOST_LETTERS, TRAIN, none_among_the_photos, pose_matrix, read_splits
 from stages.transforms_intrinsics import flaw_of, read_intrinsics
 
 ORTHONORMAL_WITHIN = 1e-3  # largest entry of RᵀR − 1 that is rounding; beyond it a matrix means something else
@@ -95,7 +95,7 @@ def _from_transforms(cameras: Path, photos: Sequence[Photo], frames: Mapping[str
     by_name = {photo.name: photo for photo in photos}
     posed: dict[str, _Posed] = {}
     absent, test_files, approximate = [], [], 0
-    splits, notes = read_splits(cameras)
+    splits, notes = read_splits(cameras, lambda frame: frames.get(frame["file_path"]) in by_name)
     for where, content in splits:
         held_out = _held_out(content, where, notes)
         for frame in content["frames"]:
@@ -112,6 +112,8 @@ def _from_transforms(cameras: Path, photos: Sequence[Photo], frames: Mapping[str
             approximate += str(values.get("note", "")).startswith(APPROXIMATION)
             if PurePosixPath(name) in held_out:
                 test_files.append(file)
+        if held_out and not test_files:
+            notes.append(none_among_the_photos(len(held_out), where))
     if approximate:
         notes.append(f"the lenses of {approximate} frames are approximations, as their notes in the file say")
     unposed = [photo.name for photo in photos if photo.image_name not in posed]

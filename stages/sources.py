@@ -225,7 +225,7 @@ def _check_given(photos: Path, cameras: Path | None) -> None:
 def _from_transforms(kind: SourceKind, root: Path, cameras: Path) -> Source:
     place = cameras.parent if cameras.is_file() else cameras
     folders = (root,) if place == root else (root, root.parent, place)
-    splits, _ = read_splits(cameras)
+    splits, _ = read_splits(cameras, lambda frame: _photo_file(frame, folders).is_file())
     frames = [frame for _, content in splits for frame in content["frames"]]
     files = {frame["file_path"]: _photo_file(frame, folders) for frame in frames}
     in_order = _sorted_inside(root, set(files.values()))

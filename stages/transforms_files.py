@@ -1,7 +1,7 @@
 """Transforms files: what stands in them, and which of their frames are held out."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
@@ -45,14 +45,16 @@ def _check_frames(frames: list[Any], what: str) -> None:
             raise StageError(what, why, _HINT)
 
 
-def read_splits(cameras: Path) -> tuple[list[tuple[str, dict[str, Any]]], list[str]]:
+def read_splits(
+    cameras: Path, has_photo: Callable[[dict[str, Any]], bool]
+) -> tuple[list[tuple[str, dict[str, Any]]], list[str]]:
     """All frames of a transforms file or of a Blender-style folder: (where they stand, content of such a file), those
     held out last, with all of them as ``test_filenames``; and notes.
 
     Held out are the frames of transforms_test.json, else those of transforms_val.json, or the ``test_frames`` of a
     single file. Some loaders cannot do without such a file, so it may be empty, or repeat the frames to train on: these
-    are left out of it, and where that leaves none it is as if there were no file. Raises StageError as
-    :func:`read_transforms` does.
+    are left out of it, and where that leaves none that ``has_photo`` it is as if there were no file. Raises StageError
+    as :func:`read_transforms` does.
     """
     if cameras.is_file():
         train, content = cameras.name, read_transforms(cameras)
@@ -67,12 +69,19 @@ def read_splits(cameras: Path) -> tuple[list[tuple[str, dict[str, Any]]], list[s
         own = [frame for frame in other["frames"] if not _is_copy(frame, trained_on)]
         if repeated := len(other["frames"]) - len(own):
             notes.append(f"{where} repeats {repeated} frames of {train}: they stay photos to train on")
-        if own:
+        if own and not any(map(has_photo, own)):
+            notes.append(none_among_the_photos(len(own), where))
+        elif own:
             if where == HELD_OUT[1]:
                 notes.append(f"the test photos are those of {where}: {HELD_OUT[0]} gives none")
             names = [frame["file_path"] for frame in own]
             return [(train, content), (where, other | {"frames": own, "test_filenames": names})], notes
     return [(train, content)], notes
+
+
+def none_among_the_photos(count: int, where: str) -> str:
+    """The note on test photos that are not there, or that ingest refused."""
+    return f"none of the {count} test photos of {where} is among the photos"
 
 
 def _is_copy(frame: dict[str, Any], trained_on: Mapping[PurePosixPath, Any]) -> bool:

@@ -240,6 +240,12 @@ def test_test_photos_without_a_frame_are_named(read) -> None:
     assert known.notes == ["1 test photos of transforms.json have no frame: ./7"]
 
 
+def test_test_photos_that_are_not_there_are_said(read) -> None:
+    known = read([frame(i) for i in (0, 1, 7)], **LENS, test_filenames=["7"])
+    assert known.test_files is None
+    assert known.notes[-1] == "none of the 1 test photos of transforms.json is among the photos"
+
+
 @pytest.mark.parametrize(
     ("split", "why"),
     [

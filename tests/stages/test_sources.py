@@ -94,6 +94,8 @@ def test_blender_scenes_keep_train_and_test(tmp_path: Path) -> None:
     assert (source.kind, source.root, source.cameras) == ("blender", tmp_path, tmp_path)
     assert source.frames == {"./train/r_0": "train/r_0.png", "./test/r_0": "test/r_0.png"}
     assert names(source) == ["test/r_0.png", "train/r_0.png"]
+    (tmp_path / "test/r_0.png").unlink()
+    assert names(find_source(tmp_path)) == ["train/r_0.png", "val/r_0.png"]
     (tmp_path / "transforms_test.json").unlink()
     assert names(find_source(tmp_path)) == ["train/r_0.png", "val/r_0.png"]
 

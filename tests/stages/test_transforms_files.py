@@ -24,6 +24,7 @@ def frame(name: str, place: float) -> dict[str, Any]:
 TRAIN = [frame("train/0", 0), frame("train/1", 1)]
 TEST, VAL = [frame("test/0", 2)], [frame("val/0", 3)]
 COPY = [frame("./train/0", 0), frame("train/1", 1)]
+GONE = [frame("test/7", 7)]
 
 
 def known(folder: Path, **splits: list[dict[str, Any]]) -> KnownCameras:
@@ -38,6 +39,7 @@ NAMES = {f["file_path"]: f"{f['file_path']}.png".removeprefix("./") for f in (*T
 PHOTOS = [Photo(name, f"images/{name}", 6, 4, 0, None, None, False, 1.0) for name in sorted(set(NAMES.values()))]
 REPEATS = "transforms_test.json repeats 2 frames of transforms_train.json: they stay photos to train on"
 FROM_VAL = "the test photos are those of transforms_val.json: transforms_test.json gives none"
+NOT_THERE = "none of the 1 test photos of transforms_test.json is among the photos"
 
 
 @pytest.mark.parametrize(
@@ -51,6 +53,9 @@ FROM_VAL = "the test photos are those of transforms_val.json: transforms_test.js
         ({"test": [], "val": VAL}, ["val/0.png"], [FROM_VAL]),
         ({"val": VAL}, ["val/0.png"], [FROM_VAL]),
         ({"test": [], "val": []}, None, []),
+        ({"test": GONE, "val": VAL}, ["val/0.png"], [NOT_THERE, FROM_VAL]),
+        ({"test": GONE + TEST, "val": VAL}, ["test/0.png"], []),
+        ({"test": COPY + GONE}, None, [REPEATS, NOT_THERE]),
     ],
 )
 def test_the_test_photos_of_blender_folders(
@@ -58,7 +63,7 @@ def test_the_test_photos_of_blender_folders(
 ) -> None:
     found = known(tmp_path, train=TRAIN, **splits)
     assert found.test_files == test_files
-    assert [note for note in found.notes if "have no camera" not in note] == notes
+    assert [note for note in found.notes if "have no" not in note] == notes
     assert {"train/0.png", "train/1.png"} <= {image.file for image in found.model.images}
 
 
