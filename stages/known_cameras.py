@@ -6,8 +6,9 @@ their files store them are turned upright as ingest turned the photos.
 """
 
 import os
+import unicodedata
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -242,12 +243,13 @@ def _is_of_upright_photos(folder: Path, given: SparseModel, photo_of: Mapping[in
 
 
 def _by_name(names: Sequence[str], photos: Sequence[Photo]) -> dict[int, Photo]:
-    """Photo by index of its image: of the same name, else of the name that ingest gave it, else of the same end, else
-    of the same name but for its ending."""
+    """Photo by index of its image: of the same name, else of the name that ingest gave it, else of a name whose
+    accents are composed in another way, else of the same end, else of the same name but for its ending."""
     found: dict[int, Photo] = {}
     taken: set[str] = set()
     by_own, by_given = {photo.name: photo for photo in photos}, {photo.image_name: photo for photo in photos}
-    for photo_of in (by_own, by_given, _by_end(names, photos), _by_path(names, photos)):
+    tiers = (by_own, by_given, _by_key(names, photos, _composed), _by_end(names, photos))
+    for photo_of in (*tiers, _by_key(names, photos, _without_ending)):
         for index, name in enumerate(names):
             photo = photo_of.get(name)
             if photo is not None and index not in found and photo.name not in taken:
@@ -261,37 +263,43 @@ def _by_end(names: Sequence[str], photos: Sequence[Photo]) -> dict[str, Photo]:
     or photo is called ``0.jpg`` in any folder."""
     by_last: dict[str, list[Photo]] = {}
     for photo in photos:
-        by_last.setdefault(PurePosixPath(photo.name).name, []).append(photo)
-    images = Counter(PurePosixPath(name).name for name in names)
+        by_last.setdefault(_last(photo.name), []).append(photo)
+    images = Counter(map(_last, names))
     found: dict[str, Photo] = {}
     for name in names:
-        last = PurePosixPath(name).name
+        last = _last(name)
         same = by_last.get(last, [])
         if images[last] == len(same) == 1:
-            image, photo = f"/{name}", f"/{same[0].name}"
+            image, photo = f"/{_composed(name)}", f"/{_composed(same[0].name)}"
             if image.endswith(photo) or photo.endswith(image):
                 found[name] = same[0]
     return found
 
 
-def _by_path(names: Sequence[str], photos: Sequence[Photo]) -> dict[str, Photo]:
-    """Photo by name of its image where these are ``left/0.png`` and ``left/0.jpg``, say, and no other image or photo is
-    called ``left/0`` with any ending."""
-    images = Counter(map(_without_ending, names))
-    own = Counter(_without_ending(photo.name) for photo in photos)
-    by_path = {path: photo for photo in photos if own[path := _without_ending(photo.name)] == 1}
-    paths = {name: path for name in names if images[path := _without_ending(name)] == 1}
-    return {name: by_path[path] for name, path in paths.items() if path in by_path}
+def _by_key(names: Sequence[str], photos: Sequence[Photo], key: Callable[[str], str]) -> dict[str, Photo]:
+    """Photo by name of its image where both names have the same key, and no other image or photo has it."""
+    images = Counter(map(key, names))
+    own = Counter(key(photo.name) for photo in photos)
+    by_key = {key_of: photo for photo in photos if own[key_of := key(photo.name)] == 1}
+    return {name: by_key[key_of] for name in names if images[key_of := key(name)] == 1 and key_of in by_key}
 
 
 def _other_ending(name: str, photo: Photo) -> str | None:
-    """A photo and its image in words, where :func:`_by_path` brought them together."""
-    same = name == photo.image_name or PurePosixPath(name).name == PurePosixPath(photo.name).name
+    """A photo and its image in words, where their endings differ."""
+    same = name == photo.image_name or _last(name) == _last(photo.name)
     return None if same else f"{photo.name} ({name})"
 
 
+def _composed(name: str) -> str:
+    return unicodedata.normalize("NFC", name)
+
+
+def _last(name: str) -> str:
+    return PurePosixPath(_composed(name)).name
+
+
 def _without_ending(name: str) -> str:
-    return os.path.splitext(name)[0]
+    return os.path.splitext(_composed(name))[0]
 
 
 # --- both

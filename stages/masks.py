@@ -1,6 +1,7 @@
 """Masks: which parts of a photo are to be ignored. Black ignores, in the user's files as in ours."""
 
 import os
+import unicodedata
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,17 +31,26 @@ def pair_masks(names: Sequence[str], masks: Sequence[tuple[str, Path]]) -> tuple
     """The mask file of each photo that has one, by the photo's name, and the files that are no photo's mask, each
     once though it may stand for several names.
 
-    A photo's mask is called after it, with its ending or without, and ends in .png.
+    A photo's mask is called after it, with its ending or without, and ends in .png. Its accents may be composed in
+    another way, where no other mask is called so.
     """
     by_name: dict[str, Path] = {}
+    composed: dict[str, set[Path]] = {}
     for name, file in masks:
         if name.lower().endswith(".png"):
-            by_name.setdefault(name[: -len(".png")], file)
+            of = name[: -len(".png")]
+            by_name.setdefault(of, file)
+            composed.setdefault(unicodedata.normalize("NFC", of), set()).add(file)
+
+    def mask_of(name: str) -> Path | None:
+        alike = composed.get(unicodedata.normalize("NFC", name), set())
+        return by_name.get(name, next(iter(alike)) if len(alike) == 1 else None)
+
     found: dict[str, Path] = {}
     for name in names:
         inside = name.removeprefix("images/")  # beside an images/ folder that a transforms file names
         wanted = (name, os.path.splitext(name)[0], inside, os.path.splitext(inside)[0])
-        if file := next((by_name[one] for one in wanted if one in by_name), None):
+        if file := next(filter(None, map(mask_of, wanted)), None):
             found[name] = file
     used = set(found.values())
     return found, list(dict.fromkeys(file for _, file in masks if file not in used))

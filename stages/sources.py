@@ -8,19 +8,18 @@ import re
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from itertools import product
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from stages.contract import StageError
+from stages.frame_files import FrameFiles
 from stages.listing import FOLDER_HINT, IMAGES, files_below, is_video, list_photos, photo_root, walk_photos
-from stages.transforms_files import HELD_OUT, MOST_LETTERS, TRAIN, photo_names, read_splits
+from stages.transforms_files import HELD_OUT, TRAIN, read_splits
 from stages.twins import twins
 
 SourceKind = Literal["photos", "video", "transforms", "blender", "colmap"]
 
 _HAS_BESIDE = re.compile(r"images(_\d+)?|input|photos")  # folders of photos beside which their masks may lie
-_EXTENSIONS_TRIED = ("", ".png", ".jpg", ".jpeg")
 
 
 @dataclass(frozen=True)
@@ -155,41 +154,6 @@ def _list_masks(root: Path, files: tuple[Path, ...]) -> tuple[tuple[str, Path], 
     return tuple(found)
 
 
-def _photo_file(frame: dict[str, Any], folders: tuple[Path, ...]) -> Path:
-    """The photo of a frame: in a file of ours by its own name first, then by ``file_path``."""
-    name, *copies = photo_names(frame)
-    file = _frame_file(name, folders)
-    # Not beside the cameras: there lie ingest's copies, none of PHOTOS, which stand in for no photo that was removed.
-    found = (_frame_file(copy, folders[:2]) for copy in copies)
-    return file if file.is_file() else next(filter(Path.is_file, found), file)
-
-
-def _frame_file(name: str, folders: tuple[Path, ...], what: str = "photo") -> Path:
-    """The photo, or mask, that ``name`` stands for in the first of ``folders`` that has it; a missing extension is
-    completed, and where there is no such file a name is tried as Windows means it, with backslashes between folders.
-
-    One that is nowhere is returned as if it were in the first folder, and refused when it is to be decoded.
-    """
-    spellings = dict.fromkeys((name, name.replace("\\", "/")))
-    for spelling, folder, extension in product(spellings, folders, _EXTENSIONS_TRIED):
-        file = _inside(folder, spelling + extension, what)
-        if file.is_file():
-            return file
-    return _inside(folders[0], name, what)
-
-
-def _inside(folder: Path, file_path: str, what: str) -> Path:
-    file = folder / os.path.normpath(file_path)
-    absolute = Path(file_path).is_absolute()
-    if absolute or "\0" in file_path or not file.resolve().is_relative_to(folder.resolve()):
-        raise StageError(
-            f"refused the {what} {file_path[:MOST_LETTERS]!r}",
-            "its path is absolute" if absolute else f"it leads out of the folder {folder}",
-            f"A transforms file may name {what}s inside its own folder only.",
-        )
-    return file
-
-
 def _check_given(photos: Path, cameras: Path | None) -> None:
     if not photos.exists():
         raise StageError(f"{photos} does not exist", "no file or folder has this name", "Check the spelling.")
@@ -224,14 +188,14 @@ def _check_given(photos: Path, cameras: Path | None) -> None:
 
 def _from_transforms(kind: SourceKind, root: Path, cameras: Path) -> Source:
     place = cameras.parent if cameras.is_file() else cameras
-    folders = (root,) if place == root else (root, root.parent, place)
-    splits, _ = read_splits(cameras, lambda frame: _photo_file(frame, folders).is_file())
+    find = FrameFiles((root,) if place == root else (root, root.parent, place))
+    splits, _ = read_splits(cameras, lambda frame: find.photo(frame).is_file())
     frames = [frame for _, content in splits for frame in content["frames"]]
-    files = {frame["file_path"]: _photo_file(frame, folders) for frame in frames}
+    files = {frame["file_path"]: find.photo(frame) for frame in frames}
     in_order = _sorted_inside(root, set(files.values()))
     photos = {path: _name(root, file) for path, file in files.items()}
     named = {photos[frame["file_path"]]: mask for frame in frames if (mask := frame.get("mask_path"))}
-    masks = tuple((f"{photo}.png", _frame_file(mask, folders, "mask")) for photo, mask in named.items())
+    masks = tuple((f"{photo}.png", find.mask(mask)) for photo, mask in named.items())
     return Source(kind, root, cameras, in_order, photos, masks)
 
 

@@ -360,6 +360,8 @@ def test_a_name_that_two_photos_share_matches_neither(tmp_path: Path) -> None:
         (["b/0.jpg", "1.jpg"], ["0.png", "b/1.png"], {}),  # of another folder as well
         (["0.jpg", "1.jpg", "1.jpeg"], ["0.png", "0.tif", "1.png"], {}),
         (["0.jpg", "0.png"], ["0.png"], {1: "0.png"}),
+        (["a\u0308.png", "b/o\u0308.jpg"], ["\u00e4.png", "\u00f6.jpg"], {0: "\u00e4.png", 1: "\u00f6.jpg"}),
+        (["c/a\u0308.jpg", "c/a\u0308.png"], ["c/\u00e4.jpg", "c/\u00e4.png"], {0: "c/\u00e4.jpg", 1: "c/\u00e4.png"}),
     ],
 )
 def test_images_have_the_photos_of_their_names(images: list[str], own: list[str], matches: dict[int, str]) -> None:

@@ -1,5 +1,6 @@
 """Which file is whose mask, how it is made to fit, and what COLMAP and training get of it."""
 
+import unicodedata
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +44,15 @@ def test_masks_are_called_after_their_photos() -> None:
     found, strays = pair_masks(names, [(file, Path("masks", file)) for file in files])
     assert found == {name: Path("masks", file) for name, file in zip(names, files[:6], strict=False)}
     assert strays == [Path("masks/x.png"), Path("masks/g.jpg"), Path("masks/g.tif")]
+
+
+def test_accents_of_masks_may_be_composed_in_another_way() -> None:
+    apart = unicodedata.normalize("NFD", "ä")
+    files = [("ä.png", Path("1")), (f"{apart}ö.jpg.png", Path("2")), (f"{apart}.png", Path("3"))]
+    assert pair_masks([f"{apart}ö.jpg"], files)[0] == {f"{apart}ö.jpg": Path("2")}
+    assert pair_masks(["äö.jpg"], files) == ({"äö.jpg": Path("2")}, [Path("1"), Path("3")])
+    assert pair_masks(["ä.jpg", f"{apart}.jpg"], files)[0] == {"ä.jpg": Path("1"), f"{apart}.jpg": Path("3")}
+    assert pair_masks(["\u00c5.jpg"], [("\u212b.png", Path("1")), ("A\u030a.png", Path("2"))])[0] == {}
 
 
 def test_of_two_masks_of_one_photo_one_is_a_stray() -> None:
