@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from stages.contract import Progress, StageError, listed
+from stages.masks import STILL_BACKGROUND_HINT
 from stages.photos import Photo, Refusal
 from stages.sharpness import BLURRED
 from stages.sources import Source, photos_beside, unused_cameras, unused_masks
@@ -141,7 +142,7 @@ def too_few(source: Source, names: Sequence[str], refused: Sequence[Refusal]) ->
 def all_the_same(photos: int) -> StageError:
     """The error for photos that all show nearly the same picture."""
     why = "the camera stood still between them, so they tell nothing of depth"
-    return StageError(f"all {photos} photos are nearly the same picture", why, HINT)
+    return StageError(f"all {photos} photos are nearly the same picture", why, f"{HINT} {STILL_BACKGROUND_HINT}")
 
 
 def all_plain(colours: Sequence[tuple[str, str]]) -> StageError:

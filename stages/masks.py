@@ -16,6 +16,10 @@ if TYPE_CHECKING:
     from stages.photos import Photo
 
 USE_FROM = 128  # of 255: from here on a pixel counts as used
+STILL_BACKGROUND_HINT = (
+    "If it was the thing that turned, before a still background, mask the background (masks/NAME.png, black is "
+    "ignored) or use a plain backdrop."
+)
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Int
 
 from stages.contract import StageError
 from stages.degeneracy import count_turns, epipoles_inside, expands
+from stages.masks import STILL_BACKGROUND_HINT
 from stages.sfm_attempts import FEWEST_MATCHES
 
 if TYPE_CHECKING:
@@ -224,7 +225,7 @@ def why_no_model(photos: "Sequence[Photo]", matches: Matches, registered: int, p
         return StageError(
             what,
             f"the photos are all the same view ({verified} of {pairs} pairs differ by less than a pixel)",
-            "Move the camera between photos.",
+            f"Move the camera between photos. {STILL_BACKGROUND_HINT}",
         )
     if error := _no_depth(what, photos, matches):
         return error

@@ -14,6 +14,7 @@ from stages import ingest
 from stages.contract import StageError
 from stages.files import read_json
 from stages.ingest import Config
+from stages.masks import STILL_BACKGROUND_HINT
 from stages.photos import load_pixels, read_frame_names, read_photos
 from tests.blots import blots, cut_out
 
@@ -213,6 +214,7 @@ def test_photos_that_are_all_nearly_the_same_are_no_scene(tmp_path: Path, progre
         "all 3 photos are nearly the same picture",
         "the camera stood still between them, so they tell nothing of depth",
     )
+    assert error.hint.endswith(f"into one folder. {STILL_BACKGROUND_HINT}")
 
 
 def test_with_given_cameras_all_photos_are_used(tmp_path: Path, progress: Any) -> None:

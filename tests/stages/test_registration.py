@@ -185,6 +185,7 @@ def test_why_no_scene_can_be_made(found: Matches, registered: int, why: str) -> 
     assert error.what == "the cameras of 5 photos could not be found"
     assert error.why == why
     assert error.hint.endswith(".")
+    assert ("mask the background" in error.hint) == ("the same view" in why)
 
 
 @pytest.fixture

@@ -49,6 +49,10 @@ def test_turning_on_the_spot_is_refused(tmp_path: Path, progress) -> None:
 def test_identical_photos_are_refused(tmp_path: Path, progress) -> None:
     error = refusal({f"{i}.png": blots(0, 240, 180) for i in range(3)}, tmp_path, progress)
     assert error.why == "the photos are all the same view (3 of 3 pairs differ by less than a pixel)"
+    assert error.hint == (
+        "Move the camera between photos. If it was the thing that turned, before a still background, mask the "
+        "background (masks/NAME.png, black is ignored) or use a plain backdrop."
+    )
 
 
 def test_blank_photos_are_refused(tmp_path: Path, progress) -> None:
