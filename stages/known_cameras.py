@@ -7,7 +7,7 @@ their files store them are turned upright as ingest turned the photos.
 
 import os
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -77,6 +77,17 @@ class _Posed:
     turns: int  # quarter turns clockwise that made the camera upright
 
 
+@dataclass(frozen=True)
+class _Framed:
+    photo: Photo
+    frame: Mapping[str, Any]
+    values: Mapping[str, Any]  # of the frame, and of its file where the frame has none
+
+    @property
+    def name(self) -> str:
+        return self.frame["file_path"]
+
+
 def read_known_cameras(cameras: Path, photos: Sequence[Photo], frames: Mapping[str, str]) -> KnownCameras:
     """Read ``cameras`` and match them to ``photos``. ``frames`` maps a transforms file's file_path to a photo's name.
 
@@ -93,7 +104,7 @@ def read_known_cameras(cameras: Path, photos: Sequence[Photo], frames: Mapping[s
 
 def _from_transforms(cameras: Path, photos: Sequence[Photo], frames: Mapping[str, str]) -> KnownCameras:
     by_name = {photo.name: photo for photo in photos}
-    posed: dict[str, _Posed] = {}
+    framed: dict[str, _Framed] = {}
     absent, test_files, approximate = [], [], 0
     splits, notes = read_splits(cameras)
     for where, content in splits:
@@ -105,20 +116,22 @@ def _from_transforms(cameras: Path, photos: Sequence[Photo], frames: Mapping[str
                 absent.append(name)
                 continue
             file = photo.image_name
-            if file in posed:
+            if file in framed:
                 raise StageError(f"two frames for the photo {photo.name}", f"one is {name!r}", TRANSFORMS_HINT)
             values = {**content, **frame}
-            posed[file] = _posed(photo, frame, values)
+            framed[file] = _Framed(photo, frame, values)
             approximate += str(values.get("note", "")).startswith(APPROXIMATION)
             if PurePosixPath(name) in held_out:
                 test_files.append(file)
     if approximate:
         notes.append(f"the lenses of {approximate} frames are approximations, as their notes in the file say")
-    unposed = [photo.name for photo in photos if photo.image_name not in posed]
+    upright = _are_of_upright_photos(framed.values())
+    posed = [_posed(framed[file], upright) for file in sorted(framed)]
+    unposed = [photo.name for photo in photos if photo.image_name not in framed]
     return KnownCameras(
-        model=_without_points([posed[file] for file in sorted(posed)], splits[0][0]),
+        model=_without_points(posed, splits[0][0]),
         test_files=sorted(test_files) if test_files else None,
-        notes=_notes(absent, unposed, [one.turns for one in posed.values()]) + notes,
+        notes=_notes(absent, unposed, [one.turns for one in posed]) + notes,
     )
 
 
@@ -137,18 +150,32 @@ def _held_out(content: Mapping[str, Any], source: str, notes: list[str]) -> set[
     return set(map(PurePosixPath, names))
 
 
-def _posed(photo: Photo, frame: Mapping[str, Any], values: Mapping[str, Any]) -> _Posed:
-    """One frame, whose intrinsics are among ``values``, as the camera of the upright photo."""
-    name = frame["file_path"]
-    # A frame of our own export names the photo beside the decoded, upright picture that its camera is of.
-    upright = isinstance(frame.get("photo"), str)
+def _are_of_upright_photos(framed: Iterable[_Framed]) -> bool:
+    """Whether the cameras are of photos that were turned upright first, as their shapes alone do not tell of half turns
+    and squares: a frame names the photo beside the decoded, upright picture that its camera is of, as in our own
+    exports, or fits a photo only when that is upright."""
+    return any(
+        isinstance(one.frame.get("photo"), str) or fits_only_upright(_given_camera(one, upright=False), one.photo)
+        for one in framed
+    )
+
+
+def _given_camera(framed: _Framed, upright: bool) -> Camera:
+    """The camera of a frame as it stands there, in the size of the photo, ``upright`` or as stored, where it has none
+    of its own."""
+    photo = framed.photo
     size = (photo.width, photo.height) if upright else stored_size(photo)
     try:
-        camera = read_intrinsics(values, *size)
+        return read_intrinsics(framed.values, *size)
     except ValueError as error:
-        raise _wrong(f"the camera of frame {name!r}", str(error)) from error
+        raise _wrong(f"the camera of frame {framed.name!r}", str(error)) from error
+
+
+def _posed(framed: _Framed, upright: bool) -> _Posed:
+    """One frame as the camera of the upright photo."""
+    photo, name, camera = framed.photo, framed.name, _given_camera(framed, upright)
     turns = _turns(photo, camera, name, upright)
-    pose = turned_pose(_pose(frame["transform_matrix"], name), turns)
+    pose = turned_pose(_pose(framed.frame["transform_matrix"], name), turns)
     return _Posed(photo, _at_size_of(photo, turned_camera(camera, turns), name), pose, turns)
 
 
