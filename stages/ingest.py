@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     import numpy as np
 
 NEEDS: tuple[str, ...] = ()
-VERSION = 9
+VERSION = 10
 RESUMES = False
 NOTES = "notes.json"
 LINKS = ("photos.json", NOTES, "images", "masks")
