@@ -30,6 +30,7 @@ from pipeline.settings import (
     read_toml,
     settings_from,
     with_effects,
+    with_lasting_cameras,
     with_source,
 )
 from pipeline.signals import Terminated, heed_signals
@@ -222,6 +223,7 @@ def _run_stages(
     new_budget: tuple[float | None, float] | None = None,
 ) -> int:
     """``new_budget``: seconds for the whole command (None: no limit), and those spent before; None: as recorded."""
+    settings = with_lasting_cameras(settings)
     with Workspace(root) as workspace:
         runner = Runner(workspace, settings, display)
         if new_budget is not None:
