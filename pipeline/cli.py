@@ -166,7 +166,8 @@ def command_run(words: Sequence[str]) -> int:
         except StageError as error:
             display.failed("ingest", error)
             return chain.EXIT_CODES["ingest"]
-        return _run_stages(root, settings, stages, given.common, display, force, new_budget=(budget, 0.0))
+        new_budget = None if given.more is not None else (budget, 0.0)
+        return _run_stages(root, settings, stages, given.common, display, force, new_budget=new_budget)
 
 
 def _keeping_studies(settings: Settings, root: Path, words: Sequence[str], file: Collection[str] = ()) -> Settings:

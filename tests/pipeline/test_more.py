@@ -124,3 +124,18 @@ def test_a_training_of_another_version_is_not_gone_on_with(trained, capsys: pyte
     said = capsys.readouterr().err
     assert "is of another version of this program" in said and "without --more" in said
     assert all(path.is_file() for path in before), "the finished training stays whole"
+
+
+def test_the_budget_that_the_workspace_was_made_with_stays(tmp_path: Path):
+    """What stages were planned by it would be planned anew, and training could not go on with another plan."""
+    photos, workspace = write_blender_scene(tmp_path / "photos", train=6, test=2, size=24), str(tmp_path / "w")
+    words = ["run", str(photos), "-o", workspace, "--until", "train"]
+    few = [*SMALL, "--train.seconds", "0.5", "--effect", "view_dependence=off", "--effect", "exposure=off"]
+    assert run_command([*words, *few, "--budget", "2m"]) == 0
+    before = run_of(workspace)
+    assert run_command([*words, "--more", "4steps"]) == 0
+    after = run_of(workspace)
+    assert after["budget"]["seconds"] == before["budget"]["seconds"] == 120
+    assert after["keys"]["train"] != before["keys"]["train"]
+    for stage in ("sfm", "effects"):
+        assert after["plans"][stage] == before["plans"][stage]
