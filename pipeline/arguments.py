@@ -46,7 +46,7 @@ class Common:
     debug: bool = False
     """Show the traceback of an error."""
     replan: bool = False
-    """Forget the settings chosen automatically before and choose them again."""
+    """Choose again what was chosen automatically before: for every stage of a run, or the one that is named."""
     verify: bool = False
     """Read every file of finished results and compare it with its sha256; what is damaged is made again."""
 
