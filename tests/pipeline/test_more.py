@@ -51,6 +51,10 @@ def test_more_has_a_folder_of_its_own_and_a_chain_of_them(trained, monkeypatch: 
         assert steps_of(str(moved)) == 20, "nothing to do, wherever the workspace lies"
         assert run_command(["train", str(moved), "--more", "5steps"]) == 0
         assert steps_of(str(moved)) == 25
+        folders = [moved / "train" / first.name, moved / "train" / second.name, result(str(moved))]
+        stages = [json.loads((folder / "manifest.json").read_text()) for folder in folders]
+        took = [stage["seconds"] for stage in stages]
+        assert [stage["facts"]["earlier_seconds"] for stage in stages] == pytest.approx([0, took[0], took[0] + took[1]])
         assert run_command(["train", str(moved), "--train.steps", "12"]) == 0
         assert result(str(moved)) == moved / "train" / first.name, "a budget of its own takes back the first"
     finally:
