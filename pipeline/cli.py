@@ -173,7 +173,7 @@ def command_run(words: Sequence[str]) -> int:
 def _keeping_studies(settings: Settings, root: Path, words: Sequence[str], file: Collection[str] = ()) -> Settings:
     """The settings with the recorded options of the stages ON_REQUEST but those that the command's ``words`` or tables
     of the ``file`` of --config name: a run that does not ask for them leaves what they found where it is."""
-    named = {*file, *(word.removeprefix("--").split(".")[0] for word in words)}
+    named = {*file, *(stage for stage in chain.ON_REQUEST if any(word.startswith(f"--{stage}.") for word in words))}
     if not os.path.isfile(root / RUN_FILE):
         return settings
     options = Workspace(root).read_run()["options"]
