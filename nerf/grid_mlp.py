@@ -19,8 +19,8 @@ HIDDEN = 64
 GEOMETRY = 16  # numbers that the density network hands to the colour network; the first is the logarithm of density
 DIRECTION = 16  # spherical harmonics, where colour depends on the direction
 LARGEST_LOG_DENSITY = 15.0
-# Samples whose hidden layer of the density network exists at a time: as many as stay in a core's cache (docs/numbers.md:
-# Waiting for memory); on a GPU all.
+# Samples whose hidden layer of the density network exists at a time: as many as stay in a core's cache
+# (docs/numbers.md: Waiting for memory); on a GPU all.
 BLOCK = {"cpu": 1 << 12, "cuda": 1 << 22}
 
 

@@ -43,8 +43,8 @@ GUIDED_EVERY = 8  # one ray in so many runs to a sparse point, where some are kn
 FIRST_SAMPLES_PER_RAY = 128.0
 # A ray is not free, though it may need no colour: no step has more rays than if each needed so many.
 LEAST_SAMPLES_PER_RAY = 2.0
-# Of the table's entries, how many have a gradient in a step: of 5 grids of 2^18 rows with 33 to 49 k colours 0.29 to 0.36
-# (docs/numbers.md: Where a step's time goes); larger steps reach more.
+# Of the table's entries, how many have a gradient in a step: of 5 grids of 2^18 rows with 33 to 49 k colours 0.29 to
+# 0.36 (docs/numbers.md: Where a step's time goes); larger steps reach more.
 TOUCHED = 0.33
 # Of an entry: its gradient read; if there is one, that cleared, the entry itself and its moments read and written.
 ADAM_BYTES = 4 * (1 + 7 * TOUCHED)

@@ -13,6 +13,7 @@ import tyro
 from pydantic import ValidationError
 
 from pipeline.settings import Settings, UsageError, wrong_options
+from stages.render import Config as RenderConfig
 from stages.train import GRID_ONLY, PAPER_ONLY
 from stages.train import Config as TrainConfig
 
@@ -46,7 +47,7 @@ class Common:
     debug: bool = False
     """Show the traceback of an error."""
     replan: bool = False
-    """Forget the settings chosen automatically before and choose them again."""
+    """Choose again what was chosen automatically before: for every stage of a run, or the one that is named."""
     verify: bool = False
     """Read every file of finished results and compare it with its sha256; what is damaged is made again."""
 
@@ -171,7 +172,8 @@ def parse(kind: type[T], command: str, words: Sequence[str], settings: Settings 
     Raises UsageError with every wrong word in a sentence of its own, SystemExit(0) after ``--help``.
     """
     if settings is not None:
-        settings = settings.model_copy(update={"train": _without_replaced(settings.train, words)})
+        left = {"train": _without_replaced(settings.train, words), "render": _one_path(settings.render, command, words)}
+        settings = settings.model_copy(update=left)
     positional = {name: tyro.MISSING for name in ("photos", "workspace", "stage") if name in kind.__annotations__}
     default: Any = kind(**positional)
     if settings is not None:
@@ -199,15 +201,25 @@ def _without_replaced(recorded: TrainConfig, words: Sequence[str]) -> TrainConfi
     """The recorded options of training without what those in ``words`` stand in place of: the budgets beside the one
     given, and all that belongs to the other field than the one given."""
     replaced = set[str]()
-    if given := {option for option in ("steps", "seconds", "preset") if _given(words, option) not in (None, "None")}:
+    if given := {option for option in ("steps", "seconds", "preset") if _gives(words, f"--train.{option}")}:
         # A preset is a budget, too, unless one is counted; and a new training does not go on from another.
         replaced |= {"steps", "seconds", "after", "more_steps", "more_seconds"} - given
-    wanted = _given(words, "field")
+    wanted = _given(words, "--train.field")
     if wanted == "paper":
         replaced |= {*GRID_ONLY}
     elif wanted == "grid":
         replaced |= {*PAPER_ONLY, *(["preset"] if recorded.preset == "paper" else [])}
     return recorded.model_copy(update={name: TrainConfig.model_fields[name].default for name in replaced})
+
+
+def _one_path(recorded: RenderConfig, command: str, words: Sequence[str]) -> RenderConfig:
+    """The recorded options of rendering without what those in ``words`` stand in place of: a path and its length, or
+    cameras from a file."""
+    own = ("--cameras",) if command == "render" else ()  # of a run they are those of the photos
+    replaced = {"path": None, "frames": None} if _gives(words, "--render.cameras", *own) else {}
+    if _gives(words, "--render.path", "--render.frames"):
+        replaced["cameras"] = None
+    return recorded.model_copy(update=replaced)
 
 
 def _what_is_wrong(ending: SystemExit, box: str) -> str:
@@ -226,11 +238,16 @@ def _what_is_wrong(ending: SystemExit, box: str) -> str:
     return words + (f"; perhaps {', '.join(re.findall(r'--[a-z0-9.-]+', similar))}" if similar else "")
 
 
+def _gives(words: Sequence[str], *options: str) -> bool:
+    """Whether ``words`` give a value for one of the options, None being the way to leave it open."""
+    return any(_given(words, option) not in (None, "None") for option in options)
+
+
 def _given(words: Sequence[str], option: str) -> str | None:
-    """What ``words`` give for an option of training; None where they do not name it."""
+    """What ``words`` give for an option, spelt as there; None where they do not name it."""
     for word, following in pairwise([*words, ""]):
         name, equals, value = word.partition("=")
-        if name == f"--train.{option}":
+        if name == option:
             return value if equals else following
     return None
 

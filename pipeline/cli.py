@@ -30,6 +30,7 @@ from pipeline.settings import (
     read_toml,
     settings_from,
     with_effects,
+    with_lasting_cameras,
     with_source,
 )
 from pipeline.signals import Terminated, heed_signals
@@ -165,13 +166,14 @@ def command_run(words: Sequence[str]) -> int:
         except StageError as error:
             display.failed("ingest", error)
             return chain.EXIT_CODES["ingest"]
-        return _run_stages(root, settings, stages, given.common, display, force, new_budget=(budget, 0.0))
+        new_budget = None if given.more is not None else (budget, 0.0)
+        return _run_stages(root, settings, stages, given.common, display, force, new_budget=new_budget)
 
 
 def _keeping_studies(settings: Settings, root: Path, words: Sequence[str], file: Collection[str] = ()) -> Settings:
     """The settings with the recorded options of the stages ON_REQUEST but those that the command's ``words`` or tables
     of the ``file`` of --config name: a run that does not ask for them leaves what they found where it is."""
-    named = {*file, *(word.removeprefix("--").split(".")[0] for word in words)}
+    named = {*file, *(stage for stage in chain.ON_REQUEST if any(word.startswith(f"--{stage}.") for word in words))}
     if not os.path.isfile(root / RUN_FILE):
         return settings
     options = Workspace(root).read_run()["options"]
@@ -218,10 +220,12 @@ def _run_stages(
     common: words_of.Common,
     display: Display,
     force: frozenset[str] = frozenset(),
-    remember: bool = True,
+    alone: str | None = None,
     new_budget: tuple[float | None, float] | None = None,
 ) -> int:
-    """``new_budget``: seconds for the whole command (None: no limit), and those spent before; None: as recorded."""
+    """``alone``: the one stage that the command is for, whose stages are no run to repeat; None for a run.
+    ``new_budget``: seconds for the whole command (None: no limit), and those spent before; None: as recorded."""
+    settings = with_lasting_cameras(settings)
     with Workspace(root) as workspace:
         runner = Runner(workspace, settings, display)
         if new_budget is not None:
@@ -229,13 +233,14 @@ def _run_stages(
         foretold = forecast.foretell(runner, stages, force, forecast.photos_of(settings))
         display.headline(" · ".join([machine.headline(root), *foretold.words]))
         try:
-            given = {"force": force, "replan": common.replan, "remember": remember, "verify": common.verify}
+            replan = (stages if alone is None else (alone,)) if common.replan else ()
+            given = {"force": force, "replan": replan, "remember": alone is None, "verify": common.verify}
             ran = runner.run(stages, times=foretold.times, **given)
         except StageFailed as failure:
             display.failed(failure.stage, failure.error)
             raise
         words = _closing_words(workspace, ran)
-        if ran and remember and runner.budget:
+        if ran and alone is None and runner.budget:
             words = f"{duration(runner.budget.spent)} of {duration(runner.budget.total)} spent {words}"
         display.finished(words, _outputs(workspace))
     return 0
@@ -275,7 +280,7 @@ def command_stage(stage: str, words: Sequence[str]) -> int:
         stages = [*stages, "report"]
     with choose_display(given.common.json) as display:
         force = frozenset({stage}) if given.force else frozenset[str]()
-        return _run_stages(given.workspace, settings, stages, given.common, display, force, remember=False)
+        return _run_stages(given.workspace, settings, stages, given.common, display, force, alone=stage)
 
 
 def _study_for(settings: Settings, budget: str, stage: str) -> Settings:

@@ -3,7 +3,7 @@
 import os
 import shutil
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -85,25 +85,25 @@ class Runner:
         stages: Sequence[str],
         *,
         force: frozenset[str] = frozenset(),
-        replan: bool = False,
+        replan: Collection[str] = (),
         remember: bool = True,
         times: Mapping[str, float | None] | None = None,
         verify: bool = False,
     ) -> bool:
         """Bring ``stages`` (in chain order) up to date; True if anything ran. Raises StageFailed.
 
-        ``force`` names stages that run again even where a finished result exists; ``replan`` forgets what was
-        chosen for the user before; ``remember`` makes ``stages`` what `pipeline resume` repeats; ``times`` are the
-        seconds that stages are expected to take (pipeline/forecast.py), for a budget and the report; ``verify`` reads
-        every file of a finished result before it counts as finished.
+        ``force`` names stages that run again even where a finished result exists; ``replan`` those of which is
+        forgotten what was chosen for the user before; ``remember`` makes ``stages`` what `pipeline resume` repeats;
+        ``times`` are the seconds that stages are expected to take (pipeline/forecast.py), for a budget and the report;
+        ``verify`` reads every file of a finished result before it counts as finished.
         """
         self.verify, self.force, self.stages, self.times = verify, force, list(stages), times or {}
         if self.budget:
             self.budget.recover(self.workspace.root)
             if self.budget.over and not remember:
                 self.apart = Budget.new(self.budget.total, self._options_digest())
-        if replan:
-            self.state["plans"] = {}
+        for stage in replan:
+            self.state["plans"].pop(stage, None)
         if remember:
             self.state["stages"] = list(stages)
         self.workspace.write_run(self.state)

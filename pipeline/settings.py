@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, get_args
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from pipeline.workspace import RUN_FILE, Workspace, default_workspace, photo_set
+from pipeline.workspace import RUN_FILE, Workspace, default_workspace, lasting, photo_set
 from stages.contract import bounded
 from stages.effects import Config as EffectsConfig
 from stages.evaluate import Config as EvaluateConfig
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
 
 MOST_WRONG, MOST_LETTERS = 10, 100  # options in one error, and letters of a name or value in it
+WORDS_ALONE = {("ingest", "photos"): "PHOTOS", ("ingest", "cameras"): "--cameras", ("sfm", "cameras"): "--cameras"}
 
 
 class UsageError(Exception):
@@ -50,13 +51,18 @@ class Settings(BaseModel):
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """The options in a TOML file: tables named by stage, the same keys as the flags."""
+    """The options in a TOML file: tables named by stage, the same keys as the flags. Raises UsageError for a file that
+    is none, and where photos and cameras stand in it, which are the command's own words."""
     try:
-        return tomllib.loads(path.read_text("utf-8-sig"))  # -sig: Windows writes a byte order mark
+        values = tomllib.loads(path.read_text("utf-8-sig"))  # -sig: Windows writes a byte order mark
     except OSError as error:
         raise UsageError(f"--config {path}: {error.strerror}") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise UsageError(f"--config {path} is not TOML: {error}") from error
+    for (stage, option), word in WORDS_ALONE.items():
+        if isinstance(table := values.get(stage), dict) and option in table:
+            raise UsageError(f"--config {path}: {stage}.{option} is no option of a file; give {word} instead")
+    return values
 
 
 def settings_from(values: Mapping[str, Any], origin: str) -> Settings:
@@ -119,12 +125,22 @@ def with_source(settings: Settings, photos: Path, cameras: Path | None) -> Setti
         raise UsageError(f"--render.cameras {rendered}: there is no such file")
     given = None if cameras is None else cameras.absolute()
     imported = None if source.cameras is None else source.cameras.absolute()
+    if given is not None and imported is not None and lasting(imported) != imported:
+        given = imported  # of a whole output/ that was given, in which there may be none the next time
     return settings.model_copy(
         update={
             "ingest": settings.ingest.model_copy(update={"photos": photos.absolute(), "cameras": given}),
             "sfm": settings.sfm.model_copy(update={"cameras": imported}),
         }
     )
+
+
+def with_lasting_cameras(settings: Settings) -> Settings:
+    """The settings with cameras that a workspace shows in its ``output/`` named where they stay (:func:`lasting`): a
+    stage that reads them may be the one whose results are taken out of there before it begins."""
+    options = {stage: getattr(settings, stage) for stage in ("ingest", "sfm", "render")}
+    given = {stage: o.model_copy(update={"cameras": lasting(o.cameras)}) for stage, o in options.items() if o.cameras}
+    return settings.model_copy(update=given)
 
 
 def check_workspace(root: Path, photos: Path) -> None:

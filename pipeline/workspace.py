@@ -254,6 +254,14 @@ class Workspace:
         """Where an output or record is shown."""
         return self.root / "output" / Path(name).name
 
+    def _source_of(self, shown: Path) -> Path:
+        """What a name in ``output/`` shows; the name itself where that is not known, or a file of the user's own."""
+        if shown.is_symlink():
+            up, *inside = Path(os.readlink(shown)).parts
+            return self.root.joinpath(*inside) if up == ".." else shown
+        copied = self._copies().get(shown.name)
+        return self.root / copied if copied else shown
+
     def _copies(self) -> dict[str, str]:
         """What each copy in ``output/`` shows, by its name, relative to the workspace; "" where that is not known."""
         copies = self.root / COPIES
@@ -291,14 +299,30 @@ class Workspace:
 
     def stale_folders(self, keys: dict[str, str], stages: list[str]) -> list[Path]:
         """Stage folders that run.json does not use: other keys, abandoned partials, damaged ones. It uses the training
-        that the recorded one goes on from, and a partial of the key until that is finished."""
+        that the recorded one goes on from, what the options name as cameras, and a partial of the key until that is
+        finished."""
         current = {self.folder(stage, key) for stage, key in keys.items()}
         current |= {self.partial(stage, key) for stage, key in keys.items() if _whole(self.folder(stage, key)) is None}
-        after = self.read_run()["options"].get("train", {}).get("after")
+        options = self.read_run()["options"]
+        named = (stage.get("cameras") for stage in options.values())
+        cameras = [Path(os.path.realpath(path)) for path in named if isinstance(path, str)]
+        after = options.get("train", {}).get("after")
         if isinstance(after, str):
             current.add(self.folder("train", after))
         found = (p for stage in stages if (self.root / stage).is_dir() for p in (self.root / stage).iterdir())
-        return sorted(p for p in found if p.is_dir() and _KEY.match(p.name) and p not in current)  # others are not ours
+        ours = (p for p in found if p.is_dir() and _KEY.match(p.name) and p not in current)  # others are not ours
+        return sorted(p for p in ours if not any(path.is_relative_to(os.path.realpath(p)) for path in cameras))
+
+
+def lasting(path: Path) -> Path:
+    """``path``, absolute; where a workspace shows it in ``output/``, which the next run takes it out of, the file or
+    folder of the finished stage itself."""
+    path = path.absolute()
+    for shown in (path, *path.parents):
+        root = shown.parent.parent
+        if shown.parent.name == "output" and (root / RUN_FILE).is_file():
+            return Workspace(root)._source_of(shown) / path.relative_to(shown)
+    return path
 
 
 def _whole(folder: Path) -> Manifest | None:

@@ -146,6 +146,16 @@ def pixel_count(path: Path) -> int:
         return 0
 
 
+def upright_size(path: Path) -> tuple[tuple[int, int], int]:
+    """Width and height by an image's header once it is upright, and the EXIF orientation undone for that. Raises
+    DecodeError."""
+    with _open(path) as image:
+        # In a PNG without EXIF before its pixels Pillow would decode these to look behind them.
+        orientation = 1 if image.format == "PNG" and "exif" not in image.info else _exif(image, [])[1]
+        turned = orientation >= 5 and image.format != "TIFF"  # Pillow gives a TIFF's size upright
+        return ((image.height, image.width) if turned else image.size), orientation
+
+
 def _load(image: "Image.Image") -> None:
     """Decode the pixels."""
     try:

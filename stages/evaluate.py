@@ -45,6 +45,8 @@ READING = 0.25  # seconds for each photo of the set where it is read at another 
 BESIDE_DRAWING = 0.05  # seconds for each photo of the set, to read it: the mean image is one of them all
 DRAWINGS_TO_FIT = 3  # of a photo scored at a fitted pose: the raw one, one to fit by and the fitted one
 TRIED_PHOTOS = 4  # to see how fast the field draws them
+# Why nothing is measured, by whether there are test photos at all.
+UNMEASURED = {False: "no photo was kept for testing", True: "masks leave nothing of the test photos looked at"}
 NO_LPIPS = "LPIPS is not computed: no package in use ships its weights and nothing is downloaded"
 
 
@@ -304,7 +306,7 @@ def verdict(metrics: dict[str, Any]) -> str:
     """
     psnr, similarity, nearest, mean = (metrics[key] for key in ("psnr", "ssim", "psnr_nearest_view", "psnr_mean_image"))
     if psnr is None:
-        return "Not measured: no photo was kept for testing."
+        return f"Not measured: {UNMEASURED[metrics['photos_test'] > 0]}."
     size = "" if metrics["width_share"] == 1 else f" at {metrics['width_share']:.0%} of their width"
     figures = f"{psnr:.1f} dB on unseen photos{size}" + ("" if similarity is None else f", SSIM {similarity:.2f}")
     gain = f"{psnr - nearest:.1f} dB better than the nearest photo"
@@ -333,7 +335,7 @@ def _overall(images: list[dict[str, Any]], test_photos: int, downscale: float, n
         values = [image[key] for image in images if image[key] is not None]
         metrics[f"{key}_interval"] = mean_interval(values)
     if not images:
-        notes = [*notes, "no photo was kept for testing, so nothing is measured"]
+        notes = [*notes, f"{UNMEASURED[test_photos > 0]}, so nothing is measured"]
     elif len(images) < FEWEST_FOR_INTERVAL:
         notes = [*notes, f"no interval: {_photos(len(images))} cannot show how much the figures vary"]
     if small := sum(image["psnr_right"] is None for image in images):
@@ -353,7 +355,7 @@ def _overall(images: list[dict[str, Any]], test_photos: int, downscale: float, n
 def _line(metrics: dict[str, Any]) -> str:
     """21.4 ± 0.4 dB, SSIM 0.61 · nearest photo 14.2 dB, mean image 12.9 dB · 7 photos at 50 % width."""
     if metrics["psnr"] is None:
-        return "no test photos, nothing measured"
+        return f"nothing measured: {UNMEASURED[metrics['photos_test'] > 0]}"
     interval = metrics["psnr_interval"]
     deviation = f" ± {(interval[1] - interval[0]) / 2:.1f}" if interval else ""
     similarity = "" if metrics["ssim"] is None else f", SSIM {metrics['ssim']:.2f}"

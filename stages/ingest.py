@@ -37,9 +37,10 @@ from stages.ingest_words import (
     set_aside_by_values,
     shown,
     summary,
+    taken_as_upright,
     too_few,
 )
-from stages.masks import pair_masks, read_mask
+from stages.masks import are_of_stored_pixels, pair_masks, read_mask
 from stages.near_duplicates import near_duplicates, small, thumbnail
 from stages.panoramas import cutting_advice
 from stages.photos import OPAQUE_FROM, Box, Photo, Refusal, opaque_box, write_photos
@@ -52,7 +53,7 @@ if TYPE_CHECKING:
     import numpy as np
 
 NEEDS: tuple[str, ...] = ()
-VERSION = 9
+VERSION = 10
 RESUMES = False
 NOTES = "notes.json"
 LINKS = ("photos.json", NOTES, "images", "masks")
@@ -91,13 +92,14 @@ class Config(StageConfig):
 @dataclass(frozen=True)
 class _TakenMask:
     """A mask that waits in ``waiting``, the share of pixels that it ignores, itself made as small as the photo's
-    thumbnail, and what was done to make it fit."""
+    thumbnail, and what became of it to make it fit (stages/masks.py: Mask)."""
 
     waiting: Path
     ignored: float
     thumbnail: "np.ndarray"
     turned: bool
     resized: bool
+    ambiguous: bool
 
 
 @dataclass(frozen=True)
@@ -194,9 +196,12 @@ def _take_all(
     masks, strays = pair_masks([source.name(file) for file in source.files], source.masks)
     notes = set_aside(source.set_aside)
     notes += [f"{shown(f'masks/{file.name}')} is no photo's mask, which are called NAME.png" for file in strays]
-    outcomes = _decode_all(source, masks, waiting, progress)
-    refused = [outcome for outcome in outcomes if isinstance(outcome, Refusal)]
-    return [outcome for outcome in outcomes if isinstance(outcome, _Taken)], refused, notes
+    stored = are_of_stored_pixels((file, masks[name]) for file in source.files if (name := source.name(file)) in masks)
+    outcomes = _decode_all(source, masks, bool(stored), waiting, progress)
+    taken = [outcome for outcome in outcomes if isinstance(outcome, _Taken)]
+    if stored is None:
+        notes += taken_as_upright([photo.name for photo in taken if photo.mask and photo.mask.ambiguous])
+    return taken, [outcome for outcome in outcomes if isinstance(outcome, Refusal)], notes
 
 
 def _take_video(video: Path, most: int, waiting: Path, progress: Progress) -> list[_Taken]:
@@ -213,13 +218,16 @@ def _take_video(video: Path, most: int, waiting: Path, progress: Progress) -> li
     ]
 
 
-def _decode_all(source: Source, masks: Mapping[str, Path], waiting: Path, progress: Progress) -> list[_Taken | Refusal]:
-    """The outcome of every file, in the order of ``source.files`` whatever order they finish in."""
+def _decode_all(
+    source: Source, masks: Mapping[str, Path], stored: bool, waiting: Path, progress: Progress
+) -> list[_Taken | Refusal]:
+    """The outcome of every file, in the order of ``source.files`` whatever order they finish in. ``stored`` is as
+    :func:`read_mask` has it."""
     pool = ThreadPoolExecutor(_workers(source.files))
     names = [source.name(file) for file in source.files]
     try:
         futures: list[Future[_Taken | Refusal]] = [
-            pool.submit(_take, file, name, masks.get(name), waiting / f"{index:06d}")
+            pool.submit(_take, file, name, masks.get(name), stored, waiting / f"{index:06d}")
             for index, (file, name) in enumerate(zip(source.files, names, strict=True))
         ]
         pending = set(futures)
@@ -246,11 +254,11 @@ def _workers(files: Sequence[Path]) -> int:
     return at_once(min(processors(), _MAX_WORKERS), needed)
 
 
-def _take(file: Path, name: str, mask: Path | None, waiting: Path) -> _Taken | Refusal:
+def _take(file: Path, name: str, mask: Path | None, stored: bool, waiting: Path) -> _Taken | Refusal:
     """Decode one file and leave its pixels in ``waiting``. Raises OSError only where writing fails."""
     try:
         decoded = decode(file)
-        taken_mask = mask and _take_mask(mask, decoded.camera_key, waiting.with_suffix(".mask"))
+        taken_mask = mask and _take_mask(mask, decoded.camera_key, stored, waiting.with_suffix(".mask"))
     except DecodeError as error:
         return Refusal(name, str(error))
     if decoded.panorama:
@@ -284,14 +292,14 @@ def _take(file: Path, name: str, mask: Path | None, waiting: Path) -> _Taken | R
     )
 
 
-def _take_mask(file: Path, photo: CameraKey, waiting: Path) -> _TakenMask | None:
+def _take_mask(file: Path, photo: CameraKey, stored: bool, waiting: Path) -> _TakenMask | None:
     """The mask, left in ``waiting``; None where it ignores nothing. Raises DecodeError where it cannot be used."""
-    mask = read_mask(file, photo.width, photo.height, photo.orientation)
+    mask = read_mask(file, photo.width, photo.height, photo.orientation, stored)
     ignored = float((mask.pixels == 0).mean())
     if not ignored:
         return None
     write_png(waiting, mask.pixels)
-    return _TakenMask(waiting, ignored, small(mask.pixels), mask.turned, mask.resized)
+    return _TakenMask(waiting, ignored, small(mask.pixels), mask.turned, mask.resized, mask.ambiguous)
 
 
 def _take_opaque(pixels: "np.ndarray", mask: _TakenMask | None, waiting: Path) -> float | None:

@@ -118,6 +118,14 @@ def say_masks(ignored: Sequence[float], turned: int, resized: int, photos: int, 
     progress.note(f"masks of {len(ignored)} of {photos} photos ignore {share:.0%} of them{turned_words}{resized_words}")
 
 
+def taken_as_upright(names: Sequence[str]) -> list[str]:
+    """A note on photos that EXIF turned and whose masks fit them turned or not."""
+    if not names:
+        return []
+    which = f"masks of {len(names)} photos fit upright and as stored alike (EXIF orientation)"
+    return [f"{which}, and are taken as upright: look at masks/ of {_few([shown(name) for name in names])}"]
+
+
 def _photos_are(count: int) -> str:
     return "1 photo is" if count == 1 else f"{count} photos are"
 

@@ -8,49 +8,40 @@ their files store them are turned upright as ingest turned the photos.
 import os
 import unicodedata
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from nerf.scene import Camera
-from stages.colmap.cameras import camera_rays, rescaled
 from stages.colmap.model_files import FARTHEST
 from stages.colmap.models import read_model
 from stages.contract import StageError
-from stages.orientation import (
-    QUARTER_TURNS,
-    fits_only_upright,
-    is_of_stored_pixels,
-    pixel_map,
-    same_shape,
-    stored_size,
-    turned_camera,
-    turned_pose,
-)
+from stages.orientation import fits_only_upright, pixel_map, stored_size
 from stages.photos import Photo
+from stages.posed_photos import HINT, PosedPhoto, distinct, posed_photo, unusable, without_rays
 from stages.sources import account_of_ours
-from stages.sparse_model import SparseImage, SparseModel
+from stages.sparse_model import SparseModel
 from stages.transforms_export import OPENGL_FROM_OPENCV
 from stages.transforms_files import MOST_LETTERS, TRAIN, none_among_the_photos, pose_matrix, read_splits
-from stages.transforms_intrinsics import flaw_of, read_intrinsics
+from stages.transforms_intrinsics import read_intrinsics
 
 ORTHONORMAL_WITHIN = 1e-3  # largest entry of RᵀR − 1 that is rounding; beyond it a matrix means something else
 LARGEST_ENTRY = 1e6  # of a matrix that is looked at more closely: products of three of them are numbers
 MOST_NAMES = 5
-TRANSFORMS_HINT = "Correct the file, or leave the cameras out to have them found from the photos."
 APPROXIMATION = "approximation"  # how the note begins of a lens that is not the one it stands for
-LENS_SAMPLES = 8  # pixels along each side at which a lens must have an inverse; normalise looks at more
 
 
 @dataclass(frozen=True)
 class KnownCameras:
-    """``test_files`` is an official split, as files relative to ingest's ``images/``; ``notes`` are for the user."""
+    """``left_out``: why photos are that have a camera; ``test_files``: an official split; both by files relative to
+    ingest's ``images/``. ``notes`` are for the user."""
 
     model: SparseModel
+    left_out: dict[str, str]
     test_files: list[str] | None
     notes: list[str]
 
@@ -58,11 +49,12 @@ class KnownCameras:
         """What became of each photo, for registration.json."""
         seen = np.bincount(self.model.view, minlength=len(self.model.images)).tolist()
         observations = {image.file: count for image, count in zip(self.model.images, seen, strict=True)}
+        reasons = self.left_out | dict.fromkeys(observations)
         return [
             {
                 "file": file,
                 "registered": file in observations,
-                "reason": None if file in observations else "the given cameras have none for it",
+                "reason": reasons.get(file, "the given cameras have none for it"),
                 "keypoints": observations.get(file, 0),
                 "observations": observations.get(file, 0),
             }
@@ -70,12 +62,10 @@ class KnownCameras:
         ]
 
 
-@dataclass(frozen=True)
-class _Posed:
+class _Framed(NamedTuple):
     photo: Photo
-    camera: Camera  # of the upright photo
-    world_from_camera: Float[np.ndarray, "3 4"]
-    turns: int  # quarter turns clockwise that made the camera upright
+    frame: Mapping[str, Any]
+    values: Mapping[str, Any]  # of the frame, and of its file where the frame has none
 
 
 def read_known_cameras(cameras: Path, photos: Sequence[Photo], frames: Mapping[str, str]) -> KnownCameras:
@@ -94,7 +84,7 @@ def read_known_cameras(cameras: Path, photos: Sequence[Photo], frames: Mapping[s
 
 def _from_transforms(cameras: Path, photos: Sequence[Photo], frames: Mapping[str, str]) -> KnownCameras:
     by_name = {photo.name: photo for photo in photos}
-    posed: dict[str, _Posed] = {}
+    framed: dict[str, _Framed] = {}
     absent, test_files, approximate = [], [], 0
     splits, notes = read_splits(cameras, lambda frame: frames.get(frame["file_path"]) in by_name)
     for where, content in splits:
@@ -106,10 +96,10 @@ def _from_transforms(cameras: Path, photos: Sequence[Photo], frames: Mapping[str
                 absent.append(name)
                 continue
             file = photo.image_name
-            if file in posed:
-                raise StageError(f"two frames for the photo {photo.name}", f"one is {name!r}", TRANSFORMS_HINT)
+            if file in framed:
+                raise StageError(f"two frames for the photo {photo.name}", f"one is {name!r}", HINT)
             values = {**content, **frame}
-            posed[file] = _posed(photo, frame, values)
+            framed[file] = _Framed(photo, frame, values)
             approximate += str(values.get("note", "")).startswith(APPROXIMATION)
             if PurePosixPath(name) in held_out:
                 test_files.append(file)
@@ -117,11 +107,16 @@ def _from_transforms(cameras: Path, photos: Sequence[Photo], frames: Mapping[str
             notes.append(none_among_the_photos(len(held_out), where))
     if approximate:
         notes.append(f"the lenses of {approximate} frames are approximations, as their notes in the file say")
-    unposed = [photo.name for photo in photos if photo.image_name not in posed]
+    upright = _are_of_upright_photos(framed.values())
+    posed = [_from_frame(framed[file], upright) for file in sorted(framed)]
+    left_out = without_rays(posed)
+    kept = [one for one in posed if one.file not in left_out]
+    unposed = [photo.name for photo in photos if photo.image_name not in framed]
     return KnownCameras(
-        model=_without_points([posed[file] for file in sorted(posed)], splits[0][0]),
-        test_files=sorted(test_files) if test_files else None,
-        notes=_notes(absent, unposed, [one.turns for one in posed.values()]) + notes,
+        model=_without_points(kept, splits[0][0]),
+        left_out=left_out,
+        test_files=sorted(set(test_files) - left_out.keys()) or None,
+        notes=_notes(absent, unposed, posed, left_out) + notes,
     )
 
 
@@ -130,35 +125,47 @@ def _held_out(content: Mapping[str, Any], source: str, notes: list[str]) -> set[
     no frame has, a note is left. Raises StageError where none has a frame."""
     names = content.get("test_filenames") or content.get("val_filenames") or []
     if not (isinstance(names, list) and all(isinstance(name, str) for name in names)):
-        raise _wrong(f"the test photos of {source}", "test_filenames (or val_filenames) is no list of names")
+        raise unusable(f"the test photos of {source}", "test_filenames (or val_filenames) is no list of names")
     of_frames = {PurePosixPath(frame["file_path"]) for frame in content["frames"]}
     strange = [name[:MOST_LETTERS] for name in names if PurePosixPath(name) not in of_frames]
     if strange and len(strange) == len(names):
-        raise _wrong(f"the test photos of {source}", f"none of them is the file_path of a frame: {_few(strange)}")
+        raise unusable(f"the test photos of {source}", f"none of them is the file_path of a frame: {_few(strange)}")
     if strange:
         notes.append(f"{len(strange)} test photos of {source} have no frame: {_few(strange)}")
     return set(map(PurePosixPath, names))
 
 
-def _posed(photo: Photo, frame: Mapping[str, Any], values: Mapping[str, Any]) -> _Posed:
-    """One frame, whose intrinsics are among ``values``, as the camera of the upright photo."""
-    name = frame["file_path"]
-    # A frame of our own export names the photo beside the decoded, upright picture that its camera is of.
-    upright = isinstance(frame.get("photo"), str)
+def _are_of_upright_photos(framed: Iterable[_Framed]) -> bool:
+    """Whether the cameras are of photos that were turned upright first, as their shapes alone do not tell of half turns
+    and squares: a frame names the photo beside the decoded, upright picture that its camera is of, as in our own
+    exports, or fits a photo only when that is upright."""
+    return any(
+        isinstance(one.frame.get("photo"), str) or fits_only_upright(_given_camera(one, upright=False), one.photo)
+        for one in framed
+    )
+
+
+def _given_camera(framed: _Framed, upright: bool) -> Camera:
+    """The camera of a frame as it stands there, in the size of the photo, ``upright`` or as stored, where it has none
+    of its own."""
+    photo = framed.photo
     size = (photo.width, photo.height) if upright else stored_size(photo)
     try:
-        camera = read_intrinsics(values, *size)
+        return read_intrinsics(framed.values, *size)
     except ValueError as error:
-        raise _wrong(f"the camera of frame {name!r}", str(error)) from error
-    turns = _turns(photo, camera, name, upright)
-    pose = turned_pose(_pose(frame["transform_matrix"], name), turns)
-    return _Posed(photo, _at_size_of(photo, turned_camera(camera, turns), name), pose, turns)
+        raise unusable(f"the camera of frame {framed.frame['file_path']!r}", str(error)) from error
 
 
-def _without_points(posed: Sequence[_Posed], source: str) -> SparseModel:
+def _from_frame(framed: _Framed, upright: bool) -> PosedPhoto:
+    name = framed.frame["file_path"]
+    pose = _pose(framed.frame["transform_matrix"], name)
+    return posed_photo(framed.photo, name, _given_camera(framed, upright), pose, upright)
+
+
+def _without_points(posed: Sequence[PosedPhoto], source: str) -> SparseModel:
     if not posed:
         raise _nothing_matches(source)
-    return SparseModel.without_points(*_distinct(posed))
+    return SparseModel.without_points(*distinct(posed))
 
 
 def _pose(matrix: Any, name: str) -> Float[np.ndarray, "3 4"]:
@@ -166,27 +173,23 @@ def _pose(matrix: Any, name: str) -> Float[np.ndarray, "3 4"]:
     try:
         pose = pose_matrix(matrix)
     except ValueError as error:
-        raise _wrong(f"frame {name!r}", str(error)) from error
+        raise unusable(f"frame {name!r}", str(error)) from error
     if (place := np.abs(pose[:, 3]).max()) > FARTHEST:
         why = f"its place is {place:.3g} units from the origin, and the most is {FARTHEST:g}"
-        raise _wrong(f"the transform_matrix of frame {name!r}", why)
+        raise unusable(f"the transform_matrix of frame {name!r}", why)
     rotation = pose[:, :3]
     if not np.abs(rotation).max() <= LARGEST_ENTRY:
-        raise _wrong(
+        raise unusable(
             f"the transform_matrix of frame {name!r}", f"it is no rotation: {np.abs(rotation).max():.3g} is in it"
         )
     if (determinant := np.linalg.det(rotation)) < 0:
-        raise _wrong(f"the transform_matrix of frame {name!r}", "it mirrors (its determinant is negative)")
+        raise unusable(f"the transform_matrix of frame {name!r}", "it mirrors (its determinant is negative)")
     off = np.abs(rotation.T @ rotation - np.eye(3)).max()
     if not off <= ORTHONORMAL_WITHIN:
         why = f"it is no rotation: RᵀR is off by {off:.2g}, and it scales by {np.cbrt(determinant):.4g}"
-        raise _wrong(f"the transform_matrix of frame {name!r}", why)
+        raise unusable(f"the transform_matrix of frame {name!r}", why)
     u, _, vt = np.linalg.svd(rotation)
     return np.concatenate([u @ vt @ OPENGL_FROM_OPENCV, pose[:, 3:]], axis=1)
-
-
-def _wrong(what: str, why: str) -> StageError:
-    return StageError(f"cannot use {what}", why, TRANSFORMS_HINT)
 
 
 # --- COLMAP models
@@ -195,31 +198,32 @@ def _wrong(what: str, why: str) -> StageError:
 def _from_colmap(folder: Path, photos: Sequence[Photo]) -> KnownCameras:
     given = _with_slashes(read_model(folder), photos)
     photo_of = _by_name([image.file for image in given.images], photos)
-    kept = sorted(photo_of, key=lambda i: photo_of[i].image_name)
-    if not kept:
+    if not photo_of:
         raise _nothing_matches(folder.name)
-    posed, pixel_maps = [], []
-    all_upright = _is_of_upright_photos(folder, given, photo_of)
-    for i in kept:
-        image, photo = given.images[i], photo_of[i]
-        camera = given.cameras[image.camera]
-        turns = _turns(photo, camera, image.file, all_upright)
-        upright = _at_size_of(photo, turned_camera(camera, turns), image.file)
-        posed.append(_Posed(photo, upright, turned_pose(image.sfm_from_camera, turns), turns))
-        pixel_maps.append(pixel_map(camera, turns, photo.width, photo.height))
-    cameras, images = _distinct(posed)
-    model, behind = given.restricted(kept, pixel_maps, cameras, images).without_points_behind()
-    taken = {image.file for image in images}
+    upright = _is_of_upright_photos(folder, given, photo_of)
+    posed = {}
+    for i in sorted(photo_of, key=lambda i: photo_of[i].image_name):
+        image = given.images[i]
+        posed[i] = posed_photo(photo_of[i], image.file, given.cameras[image.camera], image.sfm_from_camera, upright)
+    left_out = without_rays(posed.values())
+    kept = {i: one for i, one in posed.items() if one.file not in left_out}
+    pixel_maps = [
+        pixel_map(given.cameras[given.images[i].camera], one.turns, one.photo.width, one.photo.height)
+        for i, one in kept.items()
+    ]
+    cameras, images = distinct(kept.values())
+    model, behind = given.restricted(list(kept), pixel_maps, cameras, images).without_points_behind()
     notes = _notes(
         [image.file for i, image in enumerate(given.images) if i not in photo_of],
-        [photo.name for photo in photos if photo.image_name not in taken],
-        [one.turns for one in posed],
+        {photo.name for photo in photos} - {photo.name for photo in photo_of.values()},
+        posed.values(),
+        left_out,
     )
-    if others := [pair for i in kept if (pair := _other_ending(given.images[i].file, photo_of[i]))]:
+    if others := [pair for one in kept.values() if (pair := _other_ending(one.name, one.photo))]:
         notes.append(f"{len(others)} photos have the cameras of files with another ending: {_few(others)}")
     if behind:
         notes.append(f"{behind} observations of points behind their cameras are left out")
-    return KnownCameras(model, None, notes)
+    return KnownCameras(model, left_out, None, notes)
 
 
 def _with_slashes(model: SparseModel, photos: Sequence[Photo]) -> SparseModel:
@@ -305,42 +309,6 @@ def _without_ending(name: str) -> str:
 # --- both
 
 
-def _distinct(posed: Sequence[_Posed]) -> tuple[list[Camera], list[SparseImage]]:
-    """Each camera once, and the images that have them."""
-    cameras = list(dict.fromkeys(p.camera for p in posed))
-    return cameras, [SparseImage(p.photo.image_name, cameras.index(p.camera), p.world_from_camera) for p in posed]
-
-
-def _turns(photo: Photo, camera: Camera, name: str, upright: bool) -> int:
-    """How many quarter turns clockwise make a given camera one of the upright photo. Raises StageError for a lens that
-    is none, and where the photo was mirrored, which no camera can be."""
-    if flaw := flaw_of(camera):
-        raise _wrong(f"the camera of {name!r}", flaw)
-    camera_rays(camera, LENS_SAMPLES, LENS_SAMPLES)
-    if not is_of_stored_pixels(camera, photo, upright):
-        return 0
-    if photo.orientation not in QUARTER_TURNS:
-        raise StageError(
-            f"cannot use the camera of {name!r}",
-            f"the EXIF orientation {photo.orientation} of {photo.name} mirrors the photo, and no camera sees mirrored",
-            "Leave the cameras out, or make them for photos that are saved upright, without an EXIF orientation.",
-        )
-    return QUARTER_TURNS[photo.orientation]
-
-
-def _at_size_of(photo: Photo, camera: Camera, name: str) -> Camera:
-    """``camera`` rescaled where the photo has another size. Raises StageError where it has another shape, too."""
-    size = (photo.width, photo.height)
-    if (camera.width, camera.height) == size:
-        return camera
-    if not same_shape(camera, size):
-        raise _wrong(
-            f"the camera of {name!r}",
-            f"it is for {camera.width}×{camera.height} pixels, the photo has {photo.width}×{photo.height}",
-        )
-    return rescaled(camera, *size)
-
-
 def _nothing_matches(source: str) -> StageError:
     return StageError(
         f"no camera in {source} belongs to a photo",
@@ -349,12 +317,19 @@ def _nothing_matches(source: str) -> StageError:
     )
 
 
-def _notes(absent: Sequence[str], unposed: Sequence[str], turns: Sequence[int]) -> list[str]:
+def _notes(
+    absent: Collection[str], unposed: Collection[str], posed: Collection[PosedPhoto], left_out: Collection[str]
+) -> list[str]:
     notes = []
-    for names, what in ((absent, "cameras have no photo"), (unposed, "photos have no camera and are left out")):
+    bent = [one.photo.name for one in posed if one.file in left_out]
+    for names, what in (
+        (absent, "cameras have no photo"),
+        (unposed, "photos have no camera and are left out"),
+        (bent, "photos have a camera without a ray for some of their pixels and are left out"),
+    ):
         if names:
             notes.append(f"{len(names)} {what}: {_few(sorted(names))}")
-    if turned := sum(map(bool, turns)):
+    if turned := sum(one.turns > 0 and one.file not in left_out for one in posed):
         notes.append(f"{turned} cameras are turned upright like their photos (EXIF orientation)")
     return notes
 

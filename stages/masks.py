@@ -2,12 +2,12 @@
 
 import os
 import unicodedata
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from stages.decoding import DecodeError, decode, pillow, upright
+from stages.decoding import DecodeError, decode, pillow, upright, upright_size
 from stages.files import write_png
 
 if TYPE_CHECKING:
@@ -24,11 +24,15 @@ STILL_BACKGROUND_HINT = (
 
 @dataclass(frozen=True)
 class Mask:
-    """A mask as large as its photo: ``pixels`` (h, w) uint8, 255 use, 0 ignore; what was done to make it fit."""
+    """A mask as large as its photo: ``pixels`` (h, w) uint8, 255 use, 0 ignore; what was done to make it fit.
+
+    ``ambiguous``: its shape does not tell whether it is of the upright photo or of what its file stores.
+    """
 
     pixels: "np.ndarray"
     turned: bool
     resized: bool
+    ambiguous: bool
 
 
 def pair_masks(names: Sequence[str], masks: Sequence[tuple[str, Path]]) -> tuple[dict[str, Path], list[Path]]:
@@ -60,36 +64,60 @@ def pair_masks(names: Sequence[str], masks: Sequence[tuple[str, Path]]) -> tuple
     return found, list(dict.fromkeys(file for _, file in masks if file not in used))
 
 
-def read_mask(file: Path, width: int, height: int, orientation: int) -> Mask:
+def are_of_stored_pixels(pairs: Iterable[tuple[Path, Path]]) -> bool | None:
+    """Whether masks are of photos as their files store them, by the headers of all pairs of a photo and its mask: True
+    where some fit no upright photo, False where some fit no other; None where none or both are so."""
+    told: set[bool] = set()
+    for photo, mask in pairs:
+        try:
+            (size, orientation), (found, _) = upright_size(photo), upright_size(mask)
+        except DecodeError:  # said where it is decoded
+            continue
+        fits, fits_stored = _same_shape(found, size), _same_shape(found, _stored(size, orientation))
+        if fits != fits_stored:
+            told.add(fits_stored)
+    return told.pop() if len(told) == 1 else None
+
+
+def read_mask(file: Path, width: int, height: int, orientation: int, stored: bool = False) -> Mask:
     """The mask of an upright photo of this size, whose file had this EXIF orientation.
 
-    A mask of the shape of the file as it was stored is turned like the photo. One of the same shape and another size is
-    resized to the nearest pixels. Raises DecodeError, words to follow the name of the photo, where it cannot be used.
+    A mask of the shape of the file as it was stored is turned like the photo; where it has the upright photo's as well
+    only if the set's masks are known to be of ``stored`` pixels, and it has no EXIF orientation of its own. One of the
+    same shape and another size is resized to the nearest pixels. Raises DecodeError, words to follow the name of the
+    photo, where it cannot be used.
     """
     import cv2
     import numpy as np
 
     try:
-        decoded = decode(file).pixels
+        decoded = decode(file)
     except DecodeError as error:
         raise DecodeError(f"its mask {file.name} cannot be used: {error}") from error
-    light = decoded[..., :3].max(axis=2)
-    if decoded.shape[2] == 4:
-        light = np.rint(light * (decoded[..., 3] / 255.0)).astype(np.uint8)
+    light = decoded.pixels[..., :3].max(axis=2)
+    if decoded.pixels.shape[2] == 4:
+        light = np.rint(light * (decoded.pixels[..., 3] / 255.0)).astype(np.uint8)
     pixels = np.where(light >= USE_FROM, np.uint8(255), np.uint8(0))
     size, found = (width, height), (pixels.shape[1], pixels.shape[0])
-    turned = orientation >= 5 and not _same_shape(found, size) and _same_shape(found, (height, width))
-    if turned:
-        pixels = _turned(pixels, orientation)
-    elif not _same_shape(found, size):
+    fits, fits_stored = _same_shape(found, size), _same_shape(found, _stored(size, orientation))
+    if not (fits or fits_stored):
         shapes = f"{found[0]}×{found[1]} and the photo {width}×{height}"
         raise DecodeError(f"its mask {file.name} does not fit: it is {shapes}")
+    ambiguous = fits and fits_stored and orientation != 1 and decoded.camera_key.orientation == 1
+    turned = stored if ambiguous else not fits
+    if turned:
+        pixels = _turned(pixels, orientation)
     resized = (pixels.shape[1], pixels.shape[0]) != size
     if resized:
         pixels = cv2.resize(pixels, size, interpolation=cv2.INTER_NEAREST)
     if not pixels.any():
         raise DecodeError(f"its mask {file.name} ignores all of it (its brightest value is {light.max()} of 255)")
-    return Mask(pixels, turned, resized)
+    return Mask(pixels, turned, resized, ambiguous)
+
+
+def _stored(size: tuple[int, int], orientation: int) -> tuple[int, int]:
+    """Width and height, in its file, of a photo that has this size upright."""
+    return (size[1], size[0]) if orientation >= 5 else size
 
 
 def _same_shape(found: tuple[int, int], wanted: tuple[int, int]) -> bool:

@@ -1,7 +1,11 @@
 """Stage normalise: the calibrated scene in our own frame, the split, and the export for other programs."""
 
 import math
+import os
+import re
+from collections import Counter
 from collections.abc import Sequence
+from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +25,7 @@ if TYPE_CHECKING:
     from stages.sparse_model import SparseModel
 
 NEEDS = ("ingest", "sfm")
-VERSION = 11
+VERSION = 12
 RESUMES = False
 LINKS = ("transforms.json", "scene.json")
 
@@ -178,11 +182,30 @@ def _within(rays: "np.ndarray", box: "Box | None") -> "np.ndarray":
 
 
 def _split(photos: "list[Photo]", test_every: int, official: list[str] | None) -> "list[Split]":
-    """An official split as it came; else the first photo by name and every ``test_every``-th after it (as LLFF)."""
-    held_out = {photo.file for photo in photos[::test_every]}
-    if official is not None:
+    """An official split as it came; else the first photo by name and every ``test_every``-th after it (as LLFF), of
+    rigs not the same view each time."""
+    if official is None:
+        held_out = {photos[i].file for i in _every([photo.name for photo in photos], test_every)}
+    else:
         held_out = {f"images/{file}" for file in official}
     return ["test" if photo.file in held_out else "train" for photo in photos]
+
+
+def _every(names: "Sequence[str]", step: int) -> list[int]:
+    """Every ``step``-th index of sorted names, from the first.
+
+    Where most names lie in blocks of one size that are alike but for their last numbers, as of a rig or of views cut
+    out of panoramas, and ``step`` would come upon some of the views only, each index is one further from the last.
+    """
+    blocks = [len(list(block)) for _, block in groupby(names, _without_last_number)]
+    size, count = Counter(blocks).most_common(1)[0]
+    in_step = 2 * count > len(blocks) > 1 and math.gcd(size, step) > 1
+    found = (step * i + in_step * (i % step) for i in range(math.ceil(len(names) / step)))
+    return [i for i in found if i < len(names)]
+
+
+def _without_last_number(name: str) -> str:
+    return re.sub(r"\d+(?=\D*$)", "", os.path.splitext(name)[0])
 
 
 def _scene(

@@ -108,13 +108,14 @@ def read_results(inputs: Inputs) -> Results:
 def summarise(results: Results) -> dict[str, Any]:
     """The content of summary.json; null for what no stage has told."""
     manifests, registration, metrics = results.manifests, results.registration or {}, results.metrics or {}
+    train = manifests["train"]["facts"] if "train" in manifests else {}
     mesh = manifests["mesh"]["facts"] if "mesh" in manifests else None
     return {
         "photos": len(results.photos["photos"]) if results.photos else None,
         **{key: registration.get(key) for key in ("registered", "camera_model", "reprojection_px")},
         "field": results.field["kind"] if results.field else None,
-        "train_seconds": manifests["train"]["facts"]["train_seconds"] if "train" in manifests else None,
-        "total_seconds": round(sum(manifest["seconds"] for manifest in manifests.values()), 3),
+        "train_seconds": train.get("train_seconds"),
+        "total_seconds": round(train.get("earlier_seconds", 0.0) + sum(m["seconds"] for m in manifests.values()), 3),
         "stage_seconds": {stage: manifest["seconds"] for stage, manifest in manifests.items()},
         "expected_seconds": _expected(manifests),
         "training_parts": results.parts,

@@ -276,11 +276,13 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     from stages.curve import write_curve
     from stages.effect_decisions import learnt_of_photos
     from stages.field_files import save_field
+    from stages.train_more import earlier_seconds
     from stages.training_parts import write_parts
     from stages.training_precision import say_if_inexact
     from stages.training_setup import field_background, prepare
 
     config, scene = plan(config, inputs, progress), read_scene(inputs["normalise"])
+    earlier = earlier_seconds(config, inputs)
     if config.target_psnr is not None:
         scene = _with_photos_aside(config, scene, progress)
     training = prepare(config, scene, inputs, folder, progress)
@@ -297,7 +299,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     device = training.probes.train.colours.device
     with products_at(config.matmul):
         parts = write_parts(folder, training.state.timings, training.trainer.model, device)
-    return _result(config, training, folder, parts, progress)
+    return _result(config, training, folder, parts, earlier, progress)
 
 
 def _with_photos_aside(config: Config, scene: "Scene", progress: Progress) -> "Scene":
@@ -311,7 +313,10 @@ def _with_photos_aside(config: Config, scene: "Scene", progress: Progress) -> "S
     return scene
 
 
-def _result(config: Config, training: "TrainingRun", folder: Path, parts: list[str], progress: Progress) -> StageResult:
+def _result(
+    config: Config, training: "TrainingRun", folder: Path, parts: list[str], earlier: float, progress: Progress
+) -> StageResult:
+    """``earlier``: seconds of the trainings that this one went on from."""
     from stages.checkpoints import checkpoint_files
     from stages.curve import coming_doubling, doubling_words, target_words
     from stages.training_precision import precision_facts
@@ -327,6 +332,7 @@ def _result(config: Config, training: "TrainingRun", folder: Path, parts: list[s
         "field": config.field,
         "steps": state.step,
         "train_seconds": round(state.seconds, 3),
+        "earlier_seconds": round(earlier, 3),
         "rays_per_second": round(state.rays / state.seconds, 1),
         "samples_per_second": round(state.samples / state.seconds, 1),
         "train_psnr": last["train_psnr"],

@@ -100,6 +100,15 @@ def _same_inputs(digests: dict[str, str], inputs: Inputs) -> None:
         raise StageError("training cannot go on", why, ANEW)
 
 
+def earlier_seconds(config: "Config", inputs: Inputs) -> float:
+    """What the trainings that ``config`` goes on from took as stages, each with all that comes before and after its
+    steps; 0 where it begins anew."""
+    if config.after is None:
+        return 0.0
+    manifest = read_json(earlier_training(config.after, inputs) / "manifest.json")
+    return manifest["seconds"] + manifest["facts"].get("earlier_seconds", 0.0)
+
+
 def budget_of(config: "Config", inputs: Inputs) -> "TrainingBudget":
     """How long to train, and from where on."""
     from stages.training_state import TrainingBudget

@@ -79,8 +79,8 @@ def unseen_photos(
 
 
 def load_metrics() -> None:
-    """Import what :func:`look` computes with. It takes long: the first step should not wait for it, nor should the first
-    measurement be charged with it."""
+    """Import what :func:`look` computes with. It takes long: the first step should not wait for it, nor should the
+    first measurement be charged with it."""
     import kornia.metrics  # noqa: F401
 
 

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     import pycolmap
 
 ROUND_TRIP_PX = 0.01  # a bearing that does not project back to its pixel is a false root of the distortion
+CHECKED_PIXELS = (33, 25)  # across and down, the very corners among them: there lenses bend most
 
 
 def camera_rays(camera: Camera, width: int, height: int) -> Float[np.ndarray, "height width 3"]:
@@ -26,19 +27,37 @@ def camera_rays(camera: Camera, width: int, height: int) -> Float[np.ndarray, "h
     lost = 0
     for row in range(height):
         pixels = np.stack([x, np.full(width, (row + 0.5) * (camera.height / height))], axis=1)
-        bearings = np.asarray(model.cam_ray_from_img(pixels))
-        miss = np.abs(np.asarray(model.img_from_cam(bearings)) - pixels).max(axis=1)
-        lost += int(np.count_nonzero(~(miss < ROUND_TRIP_PX)))  # NaN counts as lost
-        rays[row] = bearings
+        rays[row], missing = _bearings(model, pixels)
+        lost += missing
     if lost:
-        crop = "crop photos and cameras to the square inside the lens's circle"
-        other = crop if is_fisheye(camera.model) else "choose a simpler --sfm.camera-model"
-        raise StageError(
-            f"the {camera.model} camera has no ray for {lost / (width * height):.1%} of its pixels",
-            f"{why_no_ray(camera.model)} there (parameters {', '.join(f'{p:.5g}' for p in camera.params)})",
-            f"Check the distortion of the given cameras, or {other}.",
-        )
+        raise no_ray(camera, lost / (width * height))
     return rays
+
+
+def share_without_ray(model: "pycolmap.Camera") -> float:
+    """Of a camera's pixels, seen at CHECKED_PIXELS of them, the share for which the camera model has no inverse."""
+    sides = zip((model.width, model.height), CHECKED_PIXELS, strict=True)
+    x, y = (np.linspace(0.5, length - 0.5, count) for length, count in sides)
+    pixels = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    return _bearings(model, pixels)[1] / len(pixels)
+
+
+def _bearings(model: "pycolmap.Camera", pixels: Float[np.ndarray, "n 2"]) -> tuple[Float[np.ndarray, "n 3"], int]:
+    """Unit bearing vectors of pixels, and how many of these they are not those of."""
+    bearings = np.asarray(model.cam_ray_from_img(pixels))
+    miss = np.abs(np.asarray(model.img_from_cam(bearings)) - pixels).max(axis=1)
+    return bearings, int(np.count_nonzero(~(miss < ROUND_TRIP_PX)))  # NaN counts as lost
+
+
+def no_ray(camera: Camera, share: float, of: str = "") -> StageError:
+    """The error for a camera, ``of`` this photo where that is known, without a ray for this share of its pixels."""
+    crop = "crop photos and cameras to the square inside the lens's circle"
+    other = crop if is_fisheye(camera.model) else "choose a simpler --sfm.camera-model"
+    return StageError(
+        f"the {camera.model} camera{f' of {of!r}' * bool(of)} has no ray for {100 * share:.3g}% of its pixels",
+        f"{why_no_ray(camera.model)} there (parameters {', '.join(f'{p:.5g}' for p in camera.params)})",
+        f"Check the distortion of the given cameras, or {other}.",
+    )
 
 
 def why_no_ray(model: str) -> str:

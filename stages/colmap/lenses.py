@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from stages.colmap.cameras import ROUND_TRIP_PX, is_fisheye, why_no_ray
+from stages.colmap.cameras import is_fisheye, share_without_ray, why_no_ray
 from stages.colmap.observations import observations, points_in_camera
 from stages.decoding import FOCAL_RANGE
 
@@ -22,7 +22,6 @@ MODELS = (
     "OPENCV_FISHEYE",
 )
 FIT_POINTS = 300
-CHECKED_PIXELS = (33, 25)  # across and down, corners included
 FARTHEST_PRINCIPAL_POINT = 0.1  # of the image, from its centre: lenses are centred to a percent or two
 
 
@@ -110,10 +109,7 @@ def flaw(camera: "pycolmap.Camera") -> str | None:
     off = float(np.abs(params[list(camera.principal_point_idxs())] / size - 0.5).max())
     if off > FARTHEST_PRINCIPAL_POINT:
         return f"its principal point is {off:.0%} of the image off the centre"
-    x, y = (np.linspace(0.5, length - 0.5, count) for length, count in zip(size, CHECKED_PIXELS, strict=True))
-    pixels = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    again = np.asarray(camera.img_from_cam(np.asarray(camera.cam_ray_from_img(pixels))))
-    lost = 1 - np.count_nonzero(np.abs(again - pixels).max(axis=1) < ROUND_TRIP_PX) / len(pixels)  # NaN is lost
+    lost = share_without_ray(camera)
     return f"{why_no_ray(camera.model_name)} at {lost:.1%} of the pixels" if lost else None
 
 

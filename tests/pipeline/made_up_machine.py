@@ -197,7 +197,7 @@ def runs_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Go:
     Image.new("RGB", (4, 4)).save(photos / "0.png")
 
     def run(
-        machine: Machine, total: float | None, resume=False, stages=CHAIN, replan=False, alone=False, **options
+        machine: Machine, total: float | None, resume=False, stages=CHAIN, replan=(), alone=False, **options
     ) -> Outcome:
         clock = SimpleNamespace(monotonic=lambda: machine.now)
         monkeypatch.setattr("pipeline.runner.STAGES", chain(machine))

@@ -259,7 +259,7 @@ def test_replan_shares_out_anew(go: Go) -> None:
     machine = Machine()
     first = go(machine, 200.0)
     machine.slowness = 0.5
-    again = go(machine, 200.0, replan=True)
+    again = go(machine, 200.0, replan=CHAIN)
     assert spent(again)["train"] > 1.1 * spent(first)["train"]  # the cameras are there already
     assert again.took == pytest.approx(200, rel=0.1)
 

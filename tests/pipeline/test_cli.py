@@ -79,6 +79,9 @@ def test_usage_errors(tmp_path: Path, capsys: pytest.CaptureFixture[str], words:
         ("[train]\nstepz = 3", ": there is no option train.stepz\n"),
         ('[train]\nsteps = "many"', ": train.steps many must be a valid integer"),
         ("[train", "is not TOML"),
+        ("ingest.photos = 'a'", "options.toml: ingest.photos is no option of a file; give PHOTOS instead\n"),
+        ("[sfm]\ncameras = 'sparse'", "options.toml: sfm.cameras is no option of a file; give --cameras instead\n"),
+        ("[ingest]\ncameras = 'sparse'", ": ingest.cameras is no option of a file; give --cameras instead\n"),
     ],
 )
 def test_a_config_file_is_validated(tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, message: str):

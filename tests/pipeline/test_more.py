@@ -51,6 +51,10 @@ def test_more_has_a_folder_of_its_own_and_a_chain_of_them(trained, monkeypatch: 
         assert steps_of(str(moved)) == 20, "nothing to do, wherever the workspace lies"
         assert run_command(["train", str(moved), "--more", "5steps"]) == 0
         assert steps_of(str(moved)) == 25
+        folders = [moved / "train" / first.name, moved / "train" / second.name, result(str(moved))]
+        stages = [json.loads((folder / "manifest.json").read_text()) for folder in folders]
+        took = [stage["seconds"] for stage in stages]
+        assert [stage["facts"]["earlier_seconds"] for stage in stages] == pytest.approx([0, took[0], took[0] + took[1]])
         assert run_command(["train", str(moved), "--train.steps", "12"]) == 0
         assert result(str(moved)) == moved / "train" / first.name, "a budget of its own takes back the first"
     finally:
@@ -124,3 +128,18 @@ def test_a_training_of_another_version_is_not_gone_on_with(trained, capsys: pyte
     said = capsys.readouterr().err
     assert "is of another version of this program" in said and "without --more" in said
     assert all(path.is_file() for path in before), "the finished training stays whole"
+
+
+def test_the_budget_that_the_workspace_was_made_with_stays(tmp_path: Path):
+    """What stages were planned by it would be planned anew, and training could not go on with another plan."""
+    photos, workspace = write_blender_scene(tmp_path / "photos", train=6, test=2, size=24), str(tmp_path / "w")
+    words = ["run", str(photos), "-o", workspace, "--until", "train"]
+    few = [*SMALL, "--train.seconds", "0.5", "--effect", "view_dependence=off", "--effect", "exposure=off"]
+    assert run_command([*words, *few, "--budget", "2m"]) == 0
+    before = run_of(workspace)
+    assert run_command([*words, "--more", "4steps"]) == 0
+    after = run_of(workspace)
+    assert after["budget"]["seconds"] == before["budget"]["seconds"] == 120
+    assert after["keys"]["train"] != before["keys"]["train"]
+    for stage in ("sfm", "effects"):
+        assert after["plans"][stage] == before["plans"][stage]

@@ -1,5 +1,6 @@
 """What of a plan stands, and what is taken as it is given now."""
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -7,6 +8,7 @@ from typing import Any
 import pytest
 from PIL import Image
 
+from pipeline.cli import run_command
 from pipeline.display import SilentDisplay
 from pipeline.failures import StageFailed
 from pipeline.runner import Runner
@@ -25,11 +27,12 @@ def bring(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Bring:
     (tmp_path / "photos").mkdir()
     Image.new("RGB", (4, 4)).save(tmp_path / "photos/0.png")
 
-    def go(**sfm: Any) -> None:
+    def go(replan: tuple[str, ...] = (), **sfm: Any) -> None:
         calls.clear()
         settings = FakeSettings.model_validate({"ingest": {"photos": tmp_path / "photos"}, "sfm": sfm})
         with Workspace(tmp_path / "w.nerf") as workspace:
-            Runner(workspace, settings, SilentDisplay()).run(("ingest", "sfm"))  # type: ignore[arg-type]
+            runner = Runner(workspace, settings, SilentDisplay())  # type: ignore[arg-type]
+            runner.run(("ingest", "sfm"), replan=replan)
 
     return go
 
@@ -53,3 +56,26 @@ def test_seconds_that_a_budget_gave_stand_after_a_kill(tmp_path: Path, monkeypat
     go(machine, 300.0, resume=True)
     (result,) = (tmp_path / "w.nerf/sfm").glob("*/result.json")
     assert read_json(result)["config"]["seconds"] == 150.0
+
+
+def test_only_the_plans_of_the_stages_named_are_made_anew(bring: Bring, tmp_path: Path) -> None:
+    bring()
+    with Workspace(tmp_path / "w.nerf") as workspace:
+        run = workspace.read_run()
+        workspace.write_run(run | {"plans": run["plans"] | {"train": {"asked": {"steps": 3}}}})
+    bring(replan=("sfm",))
+    assert calls == ["plan sfm"]
+    assert Workspace(tmp_path / "w.nerf").read_run()["plans"] == run["plans"] | {"train": {"asked": {"steps": 3}}}
+
+
+def test_a_run_plans_its_stages_anew_and_one_stage_alone_itself(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[tuple[str, ...]] = []
+    monkeypatch.setattr("pipeline.runner.Runner.run", lambda *_, replan, **__: seen.append(tuple(replan)) or False)
+    monkeypatch.chdir(tmp_path)
+    run = {"version": 1, "options": {}, "plans": {}, "keys": {}, "stages": ["ingest", "sfm"]}
+    (tmp_path / "run.json").write_text(json.dumps(run))
+    for command in ("resume", "render", "tradeoff"):
+        assert run_command([command, ".", "--replan"]) == run_command([command, "."]) == 0
+    assert seen == [("ingest", "sfm"), (), ("render",), (), ("tradeoff",), ()]

@@ -43,7 +43,7 @@ def photos(tmp_path: Path) -> Path:
 def bring(tmp_path: Path, photos: Path) -> Bring:
     """Run the fake chain with options like sfm={"offset": 1}; says whether anything ran, and clears ``calls``."""
 
-    def go(root: Path = tmp_path / "w.nerf", stages=ALL, force=(), replan=False, verify=False, **options: dict) -> bool:
+    def go(root: Path = tmp_path / "w.nerf", stages=ALL, force=(), replan=(), verify=False, **options: dict) -> bool:
         calls.clear()
         options["ingest"] = {"photos": photos} | options.get("ingest", {})
         settings = FakeSettings.model_validate(options)
@@ -139,7 +139,7 @@ def test_a_plan_stands_until_the_options_change_or_replan(bring: Bring, tmp_path
     assert plan["offset"] == 5
     bring(train={"steps": 9})
     assert "plan sfm" not in calls
-    bring(replan=True)
+    bring(replan=ALL)
     assert calls == ["plan sfm"]  # the same answer: the same key, nothing runs
 
 

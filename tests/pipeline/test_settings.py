@@ -6,10 +6,11 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from pipeline.arguments import StageArguments, parse
+from pipeline.arguments import RunArguments, StageArguments, parse
 from pipeline.cli import run_command
 from pipeline.settings import Settings, UsageError, read_toml, with_effects
 from stages.effects import Config
+from stages.render import Config as RenderConfig
 from stages.train import Config as TrainConfig
 
 EFFECTS = "exposure, view_dependence, background, pose_refinement"
@@ -74,6 +75,27 @@ def test_the_budget_given_replaces_the_one_remembered(words: list[str], budget: 
 def test_the_field_given_takes_back_the_options_of_the_other(remembered: dict, words: list[str], left: dict):
     asked = parse(StageArguments, "train", ["w", *words], Settings(train=TrainConfig(**remembered)))
     assert asked.settings.train == TrainConfig(**left)
+
+
+@pytest.mark.parametrize(
+    ("remembered", "words", "left"),
+    [
+        ({"path": "spiral", "frames": 40, "width": 640}, ["--cameras", "my.json"], {"width": 640}),
+        ({"path": "spiral", "frames": 40}, ["--render.cameras=my.json"], {"cameras": Path("my.json")}),
+        ({"cameras": Path("my.json"), "fps": 25}, ["--render.path", "spiral"], {"path": "spiral", "fps": 25}),
+        ({"cameras": Path("my.json")}, ["--render.frames", "40"], {"frames": 40}),
+        ({"path": "spiral", "frames": 40}, ["--render.cameras", "None"], {"path": "spiral", "frames": 40}),
+        ({"path": "spiral"}, ["--render.frames", "40"], {"path": "spiral", "frames": 40}),
+    ],
+)
+def test_a_path_or_cameras_given_take_the_place_of_what_is_remembered(remembered: dict, words: list[str], left: dict):
+    asked = parse(StageArguments, "render", ["w", *words], Settings(render=RenderConfig(**remembered)))
+    assert asked.settings.render == RenderConfig(**left)
+
+
+def test_known_cameras_of_the_photos_leave_a_path_to_render():
+    in_file = Settings(render=RenderConfig(path="spiral"))
+    assert parse(RunArguments, "run", ["photos", "--cameras", "my.json"], in_file).settings == in_file
 
 
 def test_a_file_may_begin_with_the_byte_order_mark_of_windows(tmp_path: Path):

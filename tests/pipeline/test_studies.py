@@ -43,6 +43,23 @@ def test_a_run_leaves_a_study_as_it_was_asked_for(tmp_path: Path, monkeypatch: p
     assert seen == [1200, *[1800] * 7]
 
 
+@pytest.mark.parametrize("words", [["--until", "tradeoff"], ["-o", "tradeoff"], ["-o", "tradeoff.nerf"]], ids=" ".join)
+def test_the_name_of_a_study_is_no_option_of_it(words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    seen: list[float] = []
+    monkeypatch.setattr(
+        "pipeline.cli._run_stages", lambda root, settings, *_, **__: seen.append(settings.tradeoff.seconds)
+    )
+    monkeypatch.chdir(tmp_path)
+    run = {"version": 1, "options": {"tradeoff": {"seconds": 1200}}, "plans": {}, "keys": {}}
+    Path("photos").mkdir()
+    for workspace in ("photos.nerf", "tradeoff", "tradeoff.nerf"):
+        Path(workspace).mkdir()
+        Path(workspace, "run.json").write_text(json.dumps(run))
+    Image.new("RGB", (40, 30)).save("photos/a.jpg")
+    run_command(["run", "photos", *words])
+    assert seen == [1200]
+
+
 def test_the_budget_of_a_study_belongs_to_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     (tmp_path / "run.json").write_text('{"version": 1, "options": {}, "plans": {}, "keys": {}}')
     assert run_command(["mesh", str(tmp_path), "--budget", "30m"]) == 2

@@ -255,6 +255,16 @@ def test_a_photo_of_which_masks_leave_nothing_at_this_size_is_not_scored(make: M
     assert line.endswith("· 3 of 4 photos at 50% width")
 
 
+def test_masks_that_leave_nothing_of_any_test_photo_are_named(make: Make, tmp_path: Path, progress: Any):
+    metrics, line = _run(masked(make(), np.ones((HEIGHT, WIDTH), bool)), tmp_path / "out", progress)
+    why = "masks leave nothing of the test photos looked at"
+    assert metrics["verdict"] == f"Not measured: {why}." and line == f"nothing measured: {why}"
+    assert metrics["notes"][:2] == [
+        "masks leave nothing to compare of 4 photos at this size",
+        f"{why}, so nothing is measured",
+    ]
+
+
 def test_a_slow_field_is_scored_on_fewer_photos_and_says_so(make: Make, tmp_path: Path, progress: Any):
     metrics, line = _run(make(speed=5 * WIDTH * HEIGHT), tmp_path / "out", progress)
     words = "3 of 4 test photos are scored, evenly spread"
@@ -310,7 +320,7 @@ def test_without_test_photos_nothing_is_measured_and_nothing_fails(make: Make, t
     assert all(metrics[key] is None for key in (*evaluate.FIGURES, "psnr_interval", "ssim_interval"))
     assert metrics["images"] == [] and metrics["verdict"] == "Not measured: no photo was kept for testing."
     assert metrics["notes"][0] == "no photo was kept for testing, so nothing is measured"
-    assert line == "no test photos, nothing measured"
+    assert line == "nothing measured: no photo was kept for testing"
     assert (tmp_path / "out/renders").is_dir()
 
 

@@ -14,6 +14,7 @@ from stages.decoding import (
     exposure_from_exif,
     focal_from_exif,
     place_from_exif,
+    upright_size,
 )
 from tests.stages.photo_files import HEIGHT, WIDTH, exif_with, saved, smooth
 
@@ -40,6 +41,7 @@ def test_every_exif_orientation_is_baked(
     assert np.array_equal(decoded.pixels, upright)
     assert decoded.suffix == (".png" if (suffix, orientation) == ("png", 1) else None)
     assert decoded.camera_key[:6] == ("Maker", "", "", WIDTH, HEIGHT, orientation)
+    assert upright_size(path) == ((WIDTH, HEIGHT), orientation)
 
 
 @pytest.mark.parametrize("orientation", [0, 9, 65535])

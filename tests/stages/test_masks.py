@@ -11,10 +11,11 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from stages import ingest
-from stages.decoding import DecodeError
+from stages.decoding import DecodeError, upright
 from stages.files import write_png
-from stages.masks import load_mask, pair_masks, read_mask, write_feature_masks
+from stages.masks import are_of_stored_pixels, load_mask, pair_masks, read_mask, write_feature_masks
 from stages.photos import Photo, read_photos
+from tests.stages.photo_files import exif_with
 from tests.stages.test_ingest import mask_for, picture, put
 
 WIDTH, HEIGHT = 48, 32
@@ -85,16 +86,57 @@ def test_half_bright_is_used_and_transparent_ignored(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_a_mask_of_the_stored_shape_is_turned_like_the_photo(orientation: int, tmp_path: Path) -> None:
-    upright = ignoring(20, 10)
+    mask = ignoring(20, 10)
     stored = {
-        5: upright.T,
-        6: upright.T[::-1],
-        7: upright.T[::-1, ::-1],
-        8: upright.T[:, ::-1],
-    }.get(orientation, upright)
+        5: mask.T,
+        6: mask.T[::-1],
+        7: mask.T[::-1, ::-1],
+        8: mask.T[:, ::-1],
+    }.get(orientation, mask)
     found = read_mask(saved(tmp_path, np.ascontiguousarray(stored)), WIDTH, HEIGHT, orientation)
-    assert np.array_equal(found.pixels, upright)
+    assert np.array_equal(found.pixels, mask)
     assert found.turned == (orientation >= 5)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_where_its_shape_does_not_tell_a_mask_is_as_others_of_its_set(orientation: int, tmp_path: Path) -> None:
+    square = ignoring(20, 10, WIDTH, WIDTH)
+    found = read_mask(saved(tmp_path, square), WIDTH, WIDTH, orientation, stored=True)
+    assert np.array_equal(found.pixels, np.asarray(upright(Image.fromarray(square), orientation)))
+    assert found.turned == found.ambiguous == (orientation != 1)
+    Image.fromarray(square).save(tmp_path / "own.png", exif=exif_with(orientation))
+    own = read_mask(tmp_path / "own.png", WIDTH, WIDTH, orientation, stored=True)
+    assert np.array_equal(own.pixels, found.pixels) and not (own.turned or own.ambiguous)
+
+
+@pytest.mark.parametrize(
+    ("orientation", "size", "turned", "noted"),
+    [(6, (32, 24), True, False), (6, (24, 32), False, False), (4, (32, 24), False, True)],
+)
+def test_masks_of_half_turned_photos_are_as_the_shapes_of_others_tell(
+    orientation: int, size: tuple[int, int], turned: bool, noted: bool, tmp_path: Path, progress: Any
+) -> None:
+    folder = tmp_path / "in"
+    mask_for(folder, "masks/0.png", 8)
+    mask_for(folder, "masks/1.png", 8, size)
+    for index, one in enumerate((3, orientation)):
+        picture(index).save(folder / f"{index}.jpg", exif=exif_with(one))
+    ingest.run(ingest.Config(photos=folder), {}, tmp_path / "out", progress)
+    mask = np.asarray(Image.open(tmp_path / "out" / str(read_photos(tmp_path / "out")[0].mask)))
+    assert np.array_equal(mask[0] == 0, np.arange(32) >= 24 if turned else np.arange(32) < 8)
+    fit = "masks of 2 photos fit upright and as stored alike (EXIF orientation), and are taken as upright"
+    assert (f"{fit}: look at masks/ of 0.jpg, 1.jpg" in progress.notes) == noted
+
+
+def test_masks_of_both_kinds_tell_nothing_of_others(tmp_path: Path) -> None:
+    photos = [tmp_path / f"{index}.jpg" for index in range(3)]
+    for file in photos:
+        picture(0).save(file, exif=exif_with(6))
+    flat = saved(tmp_path, ignoring(5, 5, 32, 24), "flat.png")
+    high = saved(tmp_path, ignoring(5, 5, 24, 32), "high.png")
+    assert are_of_stored_pixels([(photos[0], flat), (photos[1], tmp_path / "none.png")]) is True
+    assert are_of_stored_pixels([(photos[0], high), (photos[2], high)]) is False
+    assert are_of_stored_pixels([(photos[0], high), (photos[2], flat)]) is None
 
 
 @pytest.mark.parametrize(("factor", "turned"), [(0.5, False), (2, False), (2, True)])

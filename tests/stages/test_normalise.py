@@ -192,6 +192,30 @@ def test_every_eighth_photo_is_held_out_beginning_with_the_first(inputs, progres
     assert [i for i, view in enumerate(views) if view.split == "test"] == held_out
 
 
+def rig(standpoints: int, views: int) -> list[str]:
+    return [f"{i:04d}_{view}.jpg" for i in range(standpoints) for view in range(views)]
+
+
+@pytest.mark.parametrize(
+    ("names", "held_out"),
+    [
+        ([f"frame_{i:05d}.png" for i in range(20)], [0, 8, 16]),
+        ([f"{letter}.png" for letter in "abcdefghij"], [0, 8]),
+        ([f"{day}_{i}.jpg" for day, count in (("a", 5), ("b", 12), ("c", 7)) for i in range(count)], [0, 8, 16]),
+        (rig(7, 3), [0, 8, 16]),
+        (rig(10, 8), [0, 9, 18, 27, 36, 45, 54, 63, 64, 73]),
+        (rig(10, 8)[:70] + rig(10, 8)[71:], [0, 9, 18, 27, 36, 45, 54, 63, 64, 73]),  # one found no place
+        (rig(3, 16), [0, 9, 18, 27, 36, 45]),
+        (rig(8, 4)[:30], [0, 9, 18, 27]),
+        (rig(2, 8)[:9], [0, 8]),  # of the second standpoint one is left
+    ],
+)
+def test_of_a_rig_not_the_same_view_is_held_out_each_time(names: list[str], held_out: list[int]) -> None:
+    photos = [Photo(name, f"images/{i}.png", 400, 400, 0, None, None, False, 1.0) for i, name in enumerate(names)]
+    split = normalise._split(photos, 8, None)
+    assert [i for i, part in enumerate(split) if part == "test"] == held_out
+
+
 def test_an_official_split_is_kept(inputs, progress) -> None:
     folders = inputs(9, test_files=["02.png", "05.png"])
     run(folders, progress, test_every=3)

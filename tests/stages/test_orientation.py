@@ -150,13 +150,21 @@ def test_our_own_model_is_of_upright_photos_and_comes_back(
 
 
 @pytest.mark.parametrize("alone", [True, False])
-def test_one_camera_that_only_fits_upright_tells_it_of_all(alone: bool, tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", ["colmap", "transforms"])
+def test_one_camera_that_only_fits_upright_tells_it_of_all(kind: str, alone: bool, tmp_path: Path) -> None:
     turned = dataclasses.replace(turned_photo(3), file="images/p.jpg")
     photos = [turned] if alone else [turned, dataclasses.replace(turned_photo(6, "q.jpg"), file="images/q.jpg")]
-    cameras = [dataclasses.replace(OPENCV, width=photo.width, height=photo.height) for photo in photos]
-    images = [SparseImage(photo.name, i, pose) for i, (photo, pose) in enumerate(zip(photos, ring(5), strict=False))]
-    write_model(tmp_path, SparseModel.without_points(cameras, images))
-    known = read_known_cameras(tmp_path, photos, {})
+    names, given = [photo.name for photo in photos], tmp_path
+    if kind == "transforms":
+        given = tmp_path / "given.json"
+        sizes = [{"w": photo.width, "h": photo.height} for photo in photos]
+        frames = [frame | size for frame, size in zip(frames_of(names), sizes, strict=True)]
+        given.write_text(json.dumps({**LENS, "frames": frames}))
+    else:
+        cameras = [dataclasses.replace(OPENCV, width=photo.width, height=photo.height) for photo in photos]
+        images = [SparseImage(name, i, pose) for i, (name, pose) in enumerate(zip(names, ring(5), strict=False))]
+        write_model(tmp_path, SparseModel.without_points(cameras, images))
+    known = read_known_cameras(given, photos, {name: name for name in names})
     turns = ["1 cameras are turned upright like their photos (EXIF orientation)"]
     assert known.notes == (turns if alone else [])
 

@@ -36,6 +36,18 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return make_workspace(tmp_path_factory.mktemp("report"))
 
 
+def test_training_that_another_one_went_on_from_counts_in_all(tmp_path: Path, progress: Any):
+    inputs = make_workspace(tmp_path)
+    manifest = read_json(inputs["train"] / "manifest.json")
+    more = {"facts": manifest["facts"] | {"train_seconds": 483.3, "earlier_seconds": 310.5}}
+    before = written(inputs, tmp_path / "before", progress)[1]["total_seconds"]
+    write_json(inputs["train"] / "manifest.json", manifest | more)
+    html, summary = written(inputs, tmp_path / "out", progress)
+    assert summary["total_seconds"] == pytest.approx(before + 310.5) and summary["total_seconds"] > 483.3
+    assert summary["stage_seconds"]["train"] == 181.7
+    assert "in all 10 min" in html
+
+
 def test_summary_has_exactly_the_promised_keys(inputs: dict[str, Path], tmp_path: Path, progress: Any):
     _, summary = written(inputs, tmp_path / "out", progress)
     assert summary == {

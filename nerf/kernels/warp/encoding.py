@@ -130,8 +130,8 @@ def _interpolate(table: wp.array[wp.vec4], rows: vec8i, shares: vec8, features: 
     """features[place] = sum of shares times rows of the table."""
 
 
-# A CPU's core spends most of these kernels waiting for memory, so it asks for the rows of later points beforehand. A GPU
-# has other threads to go on with.
+# A CPU's core spends most of these kernels waiting for memory, so it asks for the rows of later points beforehand. A
+# GPU has other threads to go on with.
 @wp.func_native("""
 #ifndef __CUDA_ARCH__
     for (int corner = 0; corner < 8; ++corner)

@@ -1,0 +1,102 @@
+"""Results of a workspace that are given back to it as cameras: they are read, and kept, where they stay."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from pipeline.cli import run_command
+from pipeline.settings import Settings
+from pipeline.workspace import COPIES, Workspace, lasting
+
+SHOWN = {"render": "path.json", "sfm": "sparse", "normalise": "transforms.json"}
+KEY = "0123456789abcdef"
+
+
+@pytest.fixture
+def workspace(tmp_path: Path) -> Path:
+    """One that shows cameras of three finished stages."""
+    root = tmp_path / "w.nerf"
+    for stage in SHOWN:
+        (root / stage / KEY).mkdir(parents=True)
+    (root / "render" / KEY / "path.json").touch()
+    frame = {"file_path": "0.png", "transform_matrix": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}
+    (root / "normalise" / KEY / "transforms.json").write_text(json.dumps({"fl_x": 5, "frames": [frame]}))
+    (root / "sfm" / KEY / "sparse").mkdir()
+    for part in ("cameras", "images", "points3D"):
+        (root / "sfm" / KEY / f"sparse/{part}.bin").touch()
+    with Workspace(root) as held:
+        held.write_run(held.read_run())
+        for stage, name in SHOWN.items():
+            held.link_outputs(root / stage / KEY, (name,))
+    return root
+
+
+@pytest.fixture
+def photos(tmp_path: Path) -> Path:
+    (tmp_path / "photos").mkdir()
+    Image.new("RGB", (4, 4)).save(tmp_path / "photos/0.png")
+    return tmp_path / "photos"
+
+
+@pytest.fixture
+def seen(monkeypatch: pytest.MonkeyPatch) -> list[Settings]:
+    """The settings of each run, of which no stage runs."""
+    found: list[Settings] = []
+    monkeypatch.setattr("pipeline.runner.Runner.run", lambda self, *_, **__: found.append(self.settings) or False)
+    return found
+
+
+def test_cameras_of_a_video_are_read_where_they_stay(
+    workspace: Path, seen: list[Settings], monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.chdir(workspace)
+    shown, stays = workspace / "output/path.json", workspace / "render" / KEY / "path.json"
+    for words in (["--cameras", str(shown)], ["--render.cameras", str(shown)]):
+        assert run_command(["render", str(workspace), *words]) == 0
+    assert [settings.render.cameras for settings in seen] == [stays, stays]
+
+
+@pytest.mark.parametrize(
+    ("given", "stays"),
+    [
+        ("output/sparse", f"sfm/{KEY}/sparse"),
+        ("output", f"sfm/{KEY}/sparse"),
+        ("output/transforms.json", f"normalise/{KEY}/transforms.json"),
+    ],
+)
+def test_cameras_of_photos_are_read_where_they_stay(
+    given: str, stays: str, workspace: Path, photos: Path, seen: list[Settings], monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.chdir(workspace)
+    assert run_command(["run", str(photos), "-o", str(workspace), "--cameras", given]) == 0
+    assert [(settings.ingest.cameras, settings.sfm.cameras) for settings in seen] == [(workspace / stays,) * 2]
+
+
+def test_links_of_the_user_s_own_are_recorded_as_given(workspace: Path, photos: Path, tmp_path: Path, seen: list):
+    (tmp_path / "mine.json").symlink_to(workspace / "normalise" / KEY / "transforms.json")
+    (tmp_path / "link").symlink_to(photos)
+    words = ["run", str(tmp_path / "link"), "-o", str(workspace), "--cameras", str(tmp_path / "mine.json")]
+    assert run_command(words) == 0
+    assert seen[0].sfm.cameras == tmp_path / "mine.json" and seen[0].ingest.photos == tmp_path / "link"
+
+
+def test_where_links_are_not_allowed_a_copy_stands_for_what_it_shows(workspace: Path):
+    shown, stays = workspace / "output/path.json", workspace / "render" / KEY / "path.json"
+    shown.unlink()
+    shutil.copy(stays, shown)
+    assert lasting(shown) == shown, "of which result it is a copy is not known"
+    (workspace / COPIES).write_text(f"path.json\trender/{KEY}/path.json\n")
+    assert lasting(shown) == stays
+
+
+def test_clean_keeps_what_the_options_name(workspace: Path):
+    for stays in (True, False):
+        with Workspace(workspace) as held:
+            cameras = str(workspace / "output/../render" / KEY / "path.json") if stays else None
+            held.write_run(held.read_run() | {"options": {"render": {"cameras": cameras}}})
+        assert run_command(["clean", str(workspace)]) == 0
+        assert (workspace / "render" / KEY / "path.json").exists() == stays
+        assert not (workspace / "sfm" / KEY).exists()

@@ -1,0 +1,75 @@
+"""Given cameras whose lens folds in the corners of the photo: few are left out by name, most end the import."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from nerf.scene import Camera
+from stages.colmap.cameras import camera_rays
+from stages.colmap.models import write_model
+from stages.contract import StageError
+from stages.known_cameras import KnownCameras, read_known_cameras
+from stages.photos import Photo
+from stages.sparse_model import SparseImage, SparseModel
+from tests.camera_layouts import ring
+
+W, H = 600, 400
+BENT = -0.2939  # as k1: no ray for the outermost pixels of the corners, the outer 1.4 % of the diagonals
+LENS = (500.0, 500.0, W / 2, H / 2)
+WHY = "its distortion cannot be undone at 0.485% of the pixels"
+
+
+def photos(count: int) -> list[Photo]:
+    return [Photo(f"{i}.jpg", f"images/{i}.jpg", W, H, 0, None, None, False, 1.0) for i in range(count)]
+
+
+def from_transforms(folder: Path, bent: list[int], count: int) -> KnownCameras:
+    frames: list[dict[str, Any]] = []
+    for i, pose in enumerate(ring(count)):
+        matrix = np.vstack([pose, [0, 0, 0, 1]]) @ np.diag([1.0, -1, -1, 1])
+        frames.append({"file_path": f"{i}.jpg", "transform_matrix": matrix.tolist(), "k1": BENT * (i in bent)})
+    content = {"fl_x": LENS[0], "test_filenames": ["0.jpg", "1.jpg"], "frames": frames}
+    (folder / "given.json").write_text(json.dumps(content))
+    return read_known_cameras(folder / "given.json", photos(count), {f"{i}.jpg": f"{i}.jpg" for i in range(count)})
+
+
+def from_colmap(folder: Path, bent: list[int], count: int) -> KnownCameras:
+    """Every camera sees the one point, at (i, i)."""
+    cameras = [Camera("PINHOLE", W, H, LENS), Camera("OPENCV", W, H, (*LENS, BENT, 0.0, 0.0, 0.0))]
+    images = [SparseImage(f"{i}.jpg", int(i in bent), pose) for i, pose in enumerate(ring(count))]
+    point = {"xyz": np.zeros((1, 3)), "rgb": np.zeros((1, 3), np.uint8), "error_px": np.zeros(1)}
+    index = np.arange(count)
+    seen = {"view": index, "point": 0 * index, "xy": np.stack([index, index], axis=1).astype(float)}
+    write_model(folder, SparseModel(cameras=cameras, images=images, **point, **seen))
+    return read_known_cameras(folder, photos(count), {})
+
+
+def test_a_fold_in_the_very_corner_is_missed_by_coarse_looks() -> None:
+    assert camera_rays(Camera("OPENCV", W, H, (*LENS, BENT, 0.0, 0.0, 0.0)), 32, 32).shape == (32, 32, 3)
+
+
+@pytest.mark.parametrize("read", [from_transforms, from_colmap])
+def test_photos_whose_lens_folds_in_the_corners_are_left_out(read: Any, tmp_path: Path) -> None:
+    known = read(tmp_path, [1], 5)
+    assert [image.file for image in known.model.images] == ["0.jpg", "2.jpg", "3.jpg", "4.jpg"]
+    assert [camera.model for camera in known.model.cameras] == ["PINHOLE"]
+    assert known.notes == [
+        "1 photos have a camera without a ray for some of their pixels and are left out: 1.jpg",
+    ]
+    account = known.account(photos(5))
+    assert [entry["registered"] for entry in account] == [True, False, True, True, True]
+    assert [entry["reason"] for entry in account] == [None, f"its given camera cannot be used: {WHY}", None, None, None]
+    if read is from_transforms:
+        assert known.test_files == ["0.jpg"]
+    else:
+        np.testing.assert_array_equal(known.model.view, np.arange(4))
+        np.testing.assert_array_equal(known.model.xy[:, 0], [0, 2, 3, 4])
+
+
+@pytest.mark.parametrize("read", [from_transforms, from_colmap])
+def test_where_half_of_the_lenses_fold_the_first_is_named(read: Any, tmp_path: Path) -> None:
+    with pytest.raises(StageError, match=r"the OPENCV camera of '2\.jpg' has no ray for 0\.485% of its pixels"):
+        read(tmp_path, [2, 3], 4)
