@@ -225,7 +225,7 @@ def _run_stages(
 ) -> int:
     """``alone``: the one stage that the command is for, whose stages are no run to repeat; None for a run.
     ``new_budget``: seconds for the whole command (None: no limit), and those spent before; None: as recorded."""
-    settings = with_lasting_cameras(settings)
+    settings = with_lasting_cameras(settings, root)
     with Workspace(root) as workspace:
         runner = Runner(workspace, settings, display)
         if new_budget is not None:

@@ -125,8 +125,6 @@ def with_source(settings: Settings, photos: Path, cameras: Path | None) -> Setti
         raise UsageError(f"--render.cameras {rendered}: there is no such file")
     given = None if cameras is None else cameras.absolute()
     imported = None if source.cameras is None else source.cameras.absolute()
-    if given is not None and imported is not None and lasting(imported) != imported:
-        given = imported  # of a whole output/ that was given, in which there may be none the next time
     return settings.model_copy(
         update={
             "ingest": settings.ingest.model_copy(update={"photos": photos.absolute(), "cameras": given}),
@@ -135,12 +133,17 @@ def with_source(settings: Settings, photos: Path, cameras: Path | None) -> Setti
     )
 
 
-def with_lasting_cameras(settings: Settings) -> Settings:
-    """The settings with cameras that a workspace shows in its ``output/`` named where they stay (:func:`lasting`): a
+def with_lasting_cameras(settings: Settings, root: Path) -> Settings:
+    """The settings with cameras that the workspace shows in its ``output/`` named where they stay (:func:`lasting`): a
     stage that reads them may be the one whose results are taken out of there before it begins."""
-    options = {stage: getattr(settings, stage) for stage in ("ingest", "sfm", "render")}
-    given = {stage: o.model_copy(update={"cameras": lasting(o.cameras)}) for stage, o in options.items() if o.cameras}
-    return settings.model_copy(update=given)
+    changed: dict[str, BaseModel] = {}
+    if (cameras := settings.render.cameras) is not None:
+        changed["render"] = settings.render.model_copy(update={"cameras": lasting(cameras, root)})
+    if (cameras := settings.sfm.cameras) is not None and (stays := lasting(cameras, root)) != cameras:
+        changed["sfm"] = settings.sfm.model_copy(update={"cameras": stays})
+        # Also where the whole output/ was given, in which there may be none the next time.
+        changed["ingest"] = settings.ingest.model_copy(update={"cameras": stays})
+    return settings.model_copy(update=changed)
 
 
 def check_workspace(root: Path, photos: Path) -> None:

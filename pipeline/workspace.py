@@ -314,13 +314,12 @@ class Workspace:
         return sorted(p for p in ours if not any(path.is_relative_to(os.path.realpath(p)) for path in cameras))
 
 
-def lasting(path: Path) -> Path:
-    """``path``, absolute; where a workspace shows it in ``output/``, which the next run takes it out of, the file or
-    folder of the finished stage itself."""
-    path = path.absolute()
+def lasting(path: Path, root: Path) -> Path:
+    """``path``, absolute; where the workspace at ``root`` shows it in ``output/``, which the next run takes it out of,
+    the file or folder of the finished stage itself. What other workspaces show is theirs to keep."""
+    path, output = path.absolute(), os.path.realpath(root / "output")
     for shown in (path, *path.parents):
-        root = shown.parent.parent
-        if shown.parent.name == "output" and (root / RUN_FILE).is_file():
+        if os.path.realpath(shown.parent) == output and (root / RUN_FILE).is_file():
             return Workspace(root)._source_of(shown) / path.relative_to(shown)
     return path
 

@@ -112,10 +112,13 @@ def _from_transforms(cameras: Path, photos: Sequence[Photo], frames: Mapping[str
     left_out = without_rays(posed)
     kept = [one for one in posed if one.file not in left_out]
     unposed = [photo.name for photo in photos if photo.image_name not in framed]
+    kept_tests = sorted(set(test_files) - left_out.keys())
+    if test_files and not kept_tests:
+        notes.append("all official test photos are among those left out, so others are held out")
     return KnownCameras(
         model=_without_points(kept, splits[0][0]),
         left_out=left_out,
-        test_files=sorted(set(test_files) - left_out.keys()) or None,
+        test_files=kept_tests or None,
         notes=_notes(absent, unposed, posed, left_out) + notes,
     )
 

@@ -20,17 +20,18 @@ _VIDEOS = (
     ".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".3gp", ".mts", ".m2ts", ".wmv", *_PREVIEWS,
 )
 IMAGES = (
-    ".jpg", ".jpeg", ".jpe", ".jfif", ".mpo", ".png", ".heic", ".heif", ".tif", ".tiff", ".webp", ".bmp", ".avif",
-    ".gif", ".jp2", ".j2k", ".ppm", ".pgm", ".pnm",
+    ".jpg", ".jpeg", ".jpe", ".jfif", ".mpo", ".insp", ".png", ".heic", ".heif", ".hif", ".tif", ".tiff", ".webp",
+    ".bmp", ".avif", ".gif", ".jp2", ".j2k", ".ppm", ".pgm", ".pnm",
 )
 # fmt: on
+MOST_PASSED_OVER = 2  # files beside a video, too few to be a set of photos
 FOLDER_HINT = "Give the folder that holds the photos: pipeline run FOLDER"
 _LINKS_HINT = "Fetch them (git annex get, dvc pull), or connect the drive that they lie on."
 
 
 def list_photos(root: Path) -> tuple[Path, ...]:
     """All files below ``root`` that may be photos, sorted by relative name; the video where there is a single one and
-    no file is an image by its ending.
+    beside it no more than MOST_PASSED_OVER of these, none an image by its ending.
 
     Skipped: hidden files, ``masks`` folders, workspaces of ours (folders with a run.json), and files whose
     extension says that they are no images. Folders that are symbolic links are not followed.
@@ -40,8 +41,9 @@ def list_photos(root: Path) -> tuple[Path, ...]:
     if not found:
         raise StageError(f"{root} is empty", "there is no file in it", FOLDER_HINT)
     photos, videos = [file for file in found if _may_be_photo(file)], _videos(found)
-    if len(videos) == 1 and not any(file.suffix.lower() in IMAGES + RAW for file in photos):
-        photos = []  # a README, say: none that must not be passed over for a video
+    unknown = not any(file.suffix.lower() in IMAGES + RAW for file in photos)
+    if len(videos) == 1 and unknown and len(photos) <= MOST_PASSED_OVER:
+        photos = []  # a README, say; more of them may be photos of whatever ending
     lost = sum(not file.is_file() for file in found)
     if lost and not any(map(Path.is_file, photos + videos)):
         raise StageError(f"no photos in {root}", f"{lost} of its files are links to what is not there", _LINKS_HINT)

@@ -75,6 +75,12 @@ def test_cameras_of_photos_are_read_where_they_stay(
     assert [(settings.ingest.cameras, settings.sfm.cameras) for settings in seen] == [(workspace / stays,) * 2]
 
 
+def test_cameras_of_another_workspace_are_recorded_as_shown(workspace: Path, photos: Path, tmp_path: Path, seen: list):
+    shown = workspace / "output/transforms.json"
+    assert run_command(["run", str(photos), "-o", str(tmp_path / "other.nerf"), "--cameras", str(shown)]) == 0
+    assert seen[0].ingest.cameras == seen[0].sfm.cameras == shown
+
+
 def test_links_of_the_user_s_own_are_recorded_as_given(workspace: Path, photos: Path, tmp_path: Path, seen: list):
     (tmp_path / "mine.json").symlink_to(workspace / "normalise" / KEY / "transforms.json")
     (tmp_path / "link").symlink_to(photos)
@@ -87,9 +93,9 @@ def test_where_links_are_not_allowed_a_copy_stands_for_what_it_shows(workspace: 
     shown, stays = workspace / "output/path.json", workspace / "render" / KEY / "path.json"
     shown.unlink()
     shutil.copy(stays, shown)
-    assert lasting(shown) == shown, "of which result it is a copy is not known"
+    assert lasting(shown, workspace) == shown, "of which result it is a copy is not known"
     (workspace / COPIES).write_text(f"path.json\trender/{KEY}/path.json\n")
-    assert lasting(shown) == stays
+    assert lasting(shown, workspace) == stays
 
 
 def test_clean_keeps_what_the_options_name(workspace: Path):

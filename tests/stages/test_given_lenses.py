@@ -69,6 +69,12 @@ def test_photos_whose_lens_folds_in_the_corners_are_left_out(read: Any, tmp_path
         np.testing.assert_array_equal(known.model.xy[:, 0], [0, 2, 3, 4])
 
 
+def test_that_no_test_photo_is_left_is_said(tmp_path: Path) -> None:
+    known = from_transforms(tmp_path, [0, 1], 5)
+    assert known.test_files is None
+    assert known.notes[-1] == "all official test photos are among those left out, so others are held out"
+
+
 @pytest.mark.parametrize("read", [from_transforms, from_colmap])
 def test_where_half_of_the_lenses_fold_the_first_is_named(read: Any, tmp_path: Path) -> None:
     with pytest.raises(StageError, match=r"the OPENCV camera of '2\.jpg' has no ray for 0\.485% of its pixels"):
