@@ -34,6 +34,7 @@ LARGEST = {"levels": 64, "features": 256, "log2_rows": 30, "finest": 2**20, "cac
 }
 DRAWN_CLOSER = 1.5  # samples of a drawn ray for one in training (docs/numbers.md: Samples along a ray)
 THIN = 1e-2  # optical thickness below which a sample of training stands for others like it (docs/numbers.md)
+QUANTUM = 1 / 512  # share of a ray's light that a picture may show in a neighbouring sample's colour (docs/numbers.md)
 CORNERS = 8  # of a cell: rows that a point reads of each grid
 
 
@@ -131,7 +132,7 @@ class GridField(nn.Module):
     Nothing here needs autograd: parameters are buffers, and gradients are computed by :meth:`backward`.
     """
 
-    chunk_rays = 8192
+    chunk_rays = 16384
 
     table: Tensor
     bits: Tensor
@@ -198,9 +199,8 @@ class GridField(nn.Module):
         unit, sampled = self._located(points)
         density = self._density_pass(unit.clamp(0, 1))
         of_rays = grid_mlp.ray_hidden(self.weights, self.of_directions(directions.reshape(-1, 3).contiguous()))
-        each = torch.arange(len(unit) + 1, dtype=torch.int32, device=unit.device)  # a ray of its own for every point
-        alone = Samples(each, each[:-1], unit[:, 0], unit[:, 0])
-        colour = grid_mlp.colour_forward(self.weights, self.backend, alone, density.geometry, of_rays).colour
+        each = torch.arange(len(unit), dtype=torch.int32, device=unit.device)  # a ray of its own for every point
+        colour = grid_mlp.colour_of(self.weights, each, density.geometry, of_rays)
         return torch.where(sampled, density.sigma, 0).view(points.shape[:-1]), colour.view(points.shape)
 
     def _located(self, points: Float[Tensor, "*points 3"]) -> tuple[Float[Tensor, "n 3"], Bool[Tensor, "n"]]:
@@ -216,24 +216,24 @@ class GridField(nn.Module):
         """Render without randomness: samples stand in the middle of their intervals.
 
         From front to back in waves of a few samples per ray, so that little is computed behind what stops a ray's
-        light: colour = sum over waves of T c, where T is the light that the waves before have let through.
+        light, and of each wave only the colours that stand for all (``nerf.kernels.drawing``). What is stopped behind
+        the last of them on a ray, less than a quantum, has the colour of the rest.
         """
-        rays = rays.each(Tensor.contiguous)
-        seen, light = rays.far.new_zeros(len(rays.far), 4), torch.ones_like(rays.far)
+        rays, backend = rays.each(Tensor.contiguous), self.backend
+        seen, shown = rays.far.new_zeros(len(rays.far), 4), torch.zeros_like(rays.far)
+        depth = torch.zeros_like(rays.far, dtype=torch.float64)
         of_rays = grid_mlp.ray_hidden(self.weights, self.of_directions(rays.directions))
         for wave in self._waves(rays, torch.full_like(rays.near, 0.5), self.drawn_lattice):
-            alone = self._composited(wave, of_rays)
-            seen += light[:, None] * torch.cat([alone.colour, alone.depth[:, None]], -1)
-            light *= 1 - alone.opacity
+            with part("composite"):
+                drawn = backend.drawn_samples(wave.samples, wave.density.sigma, QUANTUM, depth, shown)
+                geometry = wave.density.geometry.index_select(0, drawn.rows)
+            colour = grid_mlp.colour_of(self.weights, drawn.samples.ray, geometry, of_rays)
+            with part("composite"):
+                backend.add_drawn(drawn, colour, seen)
+        light, opacity = (each.to(seen.dtype) for each in (torch.exp(-depth), -torch.expm1(-depth)))
+        seen *= torch.where(shown == 0, 1, opacity / shown)[:, None]
         behind = self._behind(rays, background)
-        return Rendering(seen[:, :3] + light[:, None] * behind, seen[:, 3] + light * rays.far, 1 - light)
-
-    def _composited(self, wave: Wave, of_rays: Float[Tensor, "rays hidden"]) -> Rendering:
-        """What a wave's samples alone let the rays see, before nothing, which is nowhere."""
-        nowhere, black = of_rays.new_zeros(len(of_rays)), of_rays.new_zeros(len(of_rays), 3)
-        geometry = wave.density.geometry
-        colour = grid_mlp.colour_forward(self.weights, self.backend, wave.samples, geometry, of_rays).colour
-        return self.backend.composite(wave.samples, wave.density.sigma, colour, black, nowhere)[0]
+        return Rendering(seen[:, :3] + light[:, None] * behind, seen[:, 3] + light * rays.far, opacity)
 
     def forward(
         self,

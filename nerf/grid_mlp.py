@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int32
 from torch import Tensor
 
 from nerf.kernels import Backend, Samples
@@ -139,6 +139,21 @@ def colour_forward(
         hidden = geometry @ weights.colour_hidden[:GEOMETRY]
         backend.add_ray_relu(samples, hidden, of_rays)
         return ColourPass(geometry, hidden, (hidden @ weights.colour_out.T).sigmoid_())
+
+
+def colour_of(
+    weights: Weights,
+    ray: Int32[Tensor, "samples"],
+    geometry: Float[Tensor, "samples geometry"],
+    of_rays: Float[Tensor, "rays hidden"],
+) -> Float[Tensor, "samples 3"]:
+    """What :func:`colour_forward` says, for samples of rays ``ray``, where no way back is needed: nothing is kept."""
+    with part("mlp", Work(products=colour_products(weights) * len(geometry))):
+        logits = geometry.new_empty(len(geometry), 3)
+        for rows in _blocks(geometry):
+            hidden = of_rays.index_select(0, ray[rows]).addmm_(geometry[rows], weights.colour_hidden[:GEOMETRY])
+            torch.mm(hidden.relu_(), weights.colour_out.T, out=logits[rows])
+        return logits.sigmoid_()
 
 
 def colour_backward(

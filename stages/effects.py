@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from stages.pilots import Pilot, PilotScene
 
 NEEDS = ("ingest", "sfm", "normalise")
-VERSION = 11
+VERSION = 12
 RESUMES = False
 LINKS = ("effects.json",)
 UNKEYED = ("seconds",)  # it decides how many pilots, and that enters the key

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from stages.training_data import PhotoReader
 
 NEEDS = ("ingest", "normalise", "train")
-VERSION = 11
+VERSION = 12
 RESUMES = False
 LINKS = ("metrics.json", "renders", "errors")
 UNKEYED = ("seconds",)  # it decides how many photos, and that enters the key

@@ -123,6 +123,14 @@ class Samples(NamedTuple):
     dt: Float[Tensor, "samples"]
 
 
+class Drawn(NamedTuple):
+    """Samples whose colours stand for all (``nerf.kernels.drawing``): packed, their rows among all, their weights."""
+
+    samples: Samples
+    rows: Int32[Tensor, "kept"]
+    weights: Float[Tensor, "kept"]
+
+
 @runtime_checkable
 class Backend(Protocol):
     """The functions of a backend module; their docstrings are in ``nerf.kernels.reference``."""
@@ -214,6 +222,17 @@ class Backend(Protocol):
         grad: Rendering,
         grad_weights: Float[Tensor, "samples"],
     ) -> tuple[Float[Tensor, "samples"], Float[Tensor, "samples 3"]]: ...
+
+    def drawn_samples(
+        self,
+        samples: Samples,
+        sigma: Float[Tensor, "samples"],
+        quantum: float,
+        depth: Float64[Tensor, "rays"],
+        shown: Float[Tensor, "rays"],
+    ) -> Drawn: ...
+
+    def add_drawn(self, drawn: Drawn, colour: Float[Tensor, "kept 3"], seen: Float[Tensor, "rays 4"]) -> None: ...
 
     def distortion(
         self, samples: Samples, weights: Float[Tensor, "samples"], lattice: Lattice

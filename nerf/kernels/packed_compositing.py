@@ -41,7 +41,7 @@ def visible_samples(
     """
     chance = _chance(sigma * samples.dt, thin)
     of_thin = torch.where(chance < 1, chance, 0).double()
-    before = _sums_before(samples, of_thin) + offset.double().index_select(0, samples.ray)
+    before = sums_before(samples, of_thin) + offset.double().index_select(0, samples.ray)
     kept = ~(chance < 1) | ((before + of_thin).floor() > before.floor())
     index = (kept & (_stopping(samples, sigma).before >= threshold)).nonzero()[:, 0]
     starts = torch.searchsorted(index, samples.starts.long(), out_int32=True)
@@ -111,7 +111,7 @@ def distortion(samples: Samples, weights: Float[Tensor, "samples"], lattice: Lat
     """
     m, lengths = _measure(samples, lattice)
     w = weights.double()
-    before, moment_before = _sums_before(samples, torch.stack([w, w * m]))
+    before, moment_before = sums_before(samples, torch.stack([w, w * m]))
     return _ray_sums(samples, 2 * w * (m * before - moment_before) + w.square() * lengths / 3).to(weights.dtype)
 
 
@@ -122,7 +122,7 @@ def distortion_backward(
     m, lengths = _measure(samples, lattice)
     w = weights.double()
     both = torch.stack([w, w * m])
-    before, moment_before = _sums_before(samples, both)
+    before, moment_before = sums_before(samples, both)
     behind, moment_behind = _sums_behind(samples, both)
     apart = m * (before - behind) - moment_before + moment_behind
     return grad.index_select(0, samples.ray) * (2 * apart + 2 / 3 * w * lengths).to(weights.dtype)
@@ -140,7 +140,7 @@ class _Stopping(NamedTuple):
 
 def _stopping(samples: Samples, sigma: Float[Tensor, "samples"]) -> _Stopping:
     tau = (sigma * samples.dt).clamp(max=OPAQUE)
-    depth_before, depth = _sums_before(samples, tau), _ray_sums(samples, tau)
+    depth_before, depth = sums_before(samples, tau), _ray_sums(samples, tau)
     before = torch.exp(-depth_before)
     return _Stopping(
         before, torch.exp(-depth_before - tau), before * -torch.expm1(-tau), torch.exp(-depth), -torch.expm1(-depth)
@@ -152,7 +152,7 @@ def _ray_sums(samples: Samples, values: Float[Tensor, "samples *channels"]) -> F
     return zero.index_add(0, samples.ray.long(), values.double()).to(values.dtype)
 
 
-def _sums_before(samples: Samples, values: Float[Tensor, "*channels samples"]) -> Float[Tensor, "*channels samples"]:
+def sums_before(samples: Samples, values: Float[Tensor, "*channels samples"]) -> Float[Tensor, "*channels samples"]:
     """For each sample, the sum over those before it on its ray."""
     if not _may_share_a_sum(values):
         return _sums_ray_by_ray(samples, samples.ray, values)

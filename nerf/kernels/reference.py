@@ -6,6 +6,7 @@ Also a backend of its own (:class:`nerf.kernels.Backend`), for machines where no
 from nerf.kernels.adam import adam
 from nerf.kernels.cache import cell_corners, occupied_bits, raise_cache
 from nerf.kernels.directions import spherical_harmonics, spherical_harmonics_backward
+from nerf.kernels.drawing import add_drawn, drawn_samples
 from nerf.kernels.grid_encoding import encode, encode_backward_points, encode_backward_table
 from nerf.kernels.hidden_layer import add_ray_relu, add_ray_relu_backward, relu_backward
 from nerf.kernels.marching import march, sample_points, sample_points_backward
@@ -21,6 +22,7 @@ from nerf.kernels.waves import end_wave, pack_waves
 
 __all__ = [
     "adam",
+    "add_drawn",
     "add_ray_relu",
     "add_ray_relu_backward",
     "cell_corners",
@@ -30,6 +32,7 @@ __all__ = [
     "depth_loss_backward",
     "distortion",
     "distortion_backward",
+    "drawn_samples",
     "encode",
     "encode_backward_points",
     "encode_backward_table",

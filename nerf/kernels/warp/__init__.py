@@ -15,6 +15,7 @@ from nerf.kernels.warp.compositing import (
     visible_samples,
 )
 from nerf.kernels.warp.directions import spherical_harmonics, spherical_harmonics_backward
+from nerf.kernels.warp.drawing import add_drawn, drawn_samples
 from nerf.kernels.warp.encoding import encode, encode_backward_points, encode_backward_table
 from nerf.kernels.warp.launch import compile_kernels, why_not
 from nerf.kernels.warp.layers import add_ray_relu, add_ray_relu_backward, relu_backward
@@ -24,6 +25,7 @@ from nerf.kernels.warp.waves import end_wave, pack_waves
 
 __all__ = [
     "adam",
+    "add_drawn",
     "add_ray_relu",
     "add_ray_relu_backward",
     "cell_corners",
@@ -34,6 +36,7 @@ __all__ = [
     "depth_loss_backward",
     "distortion",
     "distortion_backward",
+    "drawn_samples",
     "encode",
     "encode_backward_points",
     "encode_backward_table",

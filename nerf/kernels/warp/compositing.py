@@ -99,7 +99,7 @@ def thickness(sigma: float, length: float):
 
 
 @wp.func
-def _stopped(tau: float):
+def stopped(tau: float):
     """1 - exp(-tau); by its series where the difference would lose digits."""
     if tau < 0.1:
         return tau * (1.0 - tau / 2.0 * (1.0 - tau / 3.0 * (1.0 - tau / 4.0 * (1.0 - tau / 5.0))))
@@ -199,7 +199,7 @@ def _composite(
     sum_depth = wp.float64(0.0)
     for i in range(starts[ray], starts[ray + 1]):
         more = thickness(sigma[i], lengths[i])
-        weight = wp.exp(-float(tau)) * _stopped(more)
+        weight = wp.exp(-float(tau)) * stopped(more)
         tau += wp.float64(more)
         weights[i] = weight
         sum_colour += wp.vec3d(weight * colour[i])
@@ -207,7 +207,7 @@ def _composite(
     unstopped = wp.exp(-float(tau))
     seen[ray] = wp.vec3(sum_colour) + unstopped * background[ray]
     depth[ray] = float(sum_depth) + unstopped * far[ray]
-    opacity[ray] = _stopped(float(tau))
+    opacity[ray] = stopped(float(tau))
 
 
 @wp.kernel
@@ -241,7 +241,7 @@ def _composite_backward(
         i = end - 1 - step
         more = thickness(sigma[i], lengths[i])
         before = wp.exp(-grad_sigma[i])
-        weight = before * _stopped(more)
+        weight = before * stopped(more)
         g = grad_weights[i] + wp.dot(on_seen, colour[i]) + on_depth * distances[i]
         grad_sigma[i] = lengths[i] * (before * wp.exp(-more) * g - float(behind))
         grad_colour[i] = weight * on_seen

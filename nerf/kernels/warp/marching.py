@@ -17,6 +17,7 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 _BOX = wp.constant(BOX)
 _HALF = wp.constant(CONTRACTED_BOX)
+_LARGEST = wp.constant(1.0e30)
 
 
 def march(occupied: Occupied, lattice: Lattice, rays: Rays, jitter: Float[Tensor, "rays"]) -> Samples:
@@ -114,16 +115,15 @@ def _slab(origin: float, direction: float):
 
 
 @wp.func
-def _axis_exit(low: float, high: float, position: float, speed: float):
-    """How far along the ray it leaves the interval from ``low`` to ``high`` on one axis."""
-    if speed == 0.0:
-        return wp.inf
-    return (wp.where(speed > 0.0, high, low) - position) / speed
+def _inverse(contracted: int, speed: float):
+    """Of how fast a unit coordinate moves along the ray where coordinates are linear; finite where it stands still."""
+    inverse = wp.where(contracted != 0, 2.0 * _HALF, 2.0 * _BOX) / speed
+    return wp.where(wp.abs(inverse) < _LARGEST, inverse, _LARGEST)
 
 
 @wp.func
 def _free_distance(
-    contracted: int, cells: int, x: int, y: int, z: int, clear: int, u: wp.vec3, point: wp.vec3, d: wp.vec3
+    contracted: int, cells: int, x: int, y: int, z: int, clear: int, u: wp.vec3, point: wp.vec3, inverse: wp.vec3
 ):
     """How far along the ray it stays, but for rounding at a face, within the cube of ``2 clear - 1`` bricks per side
     around cell (x, y, z), which holds its point (unit: u).
@@ -137,7 +137,6 @@ def _free_distance(
     around = 4.0 * float(clear - 1)
     low = (wp.vec3(float(x & ~3), float(y & ~3), float(z & ~3)) - wp.vec3(around)) * width
     high = low + wp.vec3((2.0 * around + 4.0) * width)
-    v = d / (2.0 * _BOX)
     folded = float(0.0)
     if contracted != 0:
         r = wp.max(wp.abs(point))
@@ -145,12 +144,10 @@ def _free_distance(
         folded = wp.max(0.75 * m, m * r / (4.0 + m))
         if r >= 1.0:
             return folded
-        v = d / (2.0 * _HALF)
         low = wp.max(low, wp.vec3(0.25))  # [-1, 1] of [-2, 2]
         high = wp.min(high, wp.vec3(0.75))
-    on_x = _axis_exit(low[0], high[0], u[0], v[0])
-    on_y = _axis_exit(low[1], high[1], u[1], v[1])
-    return wp.max(folded, wp.min(wp.min(on_x, on_y), _axis_exit(low[2], high[2], u[2], v[2])))
+    exits = wp.max(wp.cw_mul(low - u, inverse), wp.cw_mul(high - u, inverse))
+    return wp.max(folded, wp.min(exits))
 
 
 @wp.kernel
@@ -177,6 +174,9 @@ def _march(
     d = directions[ray]
     near = nears[ray]
     far = fars[ray]
+    counts[ray] = 0
+    if near >= far:  # its light is used up
+        return
     if contracted == 0:
         on_x = _slab(o[0], d[0])
         on_y = _slab(o[1], d[1])
@@ -188,6 +188,7 @@ def _march(
     count = int(0)
     k = int(0)
     scale = float(cells)
+    inverse = wp.vec3(_inverse(contracted, d[0]), _inverse(contracted, d[1]), _inverse(contracted, d[2]))
     while float(k) < last and count < most:
         s = first + jitter[ray] + float(k)
         t = lattice_distance(step, cone, s)
@@ -202,7 +203,7 @@ def _march(
         word = bits[number >> 6]
         if word == wp.int64(0):
             clear = wp.max(1, int(clearance[number >> 6]))
-            free = _free_distance(contracted, cells, x, y, z, clear, u, point, d)
+            free = _free_distance(contracted, cells, x, y, z, clear, u, point, inverse)
             # Rounded down by a thousandth of a step: a step too few is looked at again, one too many is lost.
             steps = lattice_coordinate(step, cone, t + free) - s - 0.001
             k += wp.max(1, int(wp.min(steps, 1.0e6)) + 1)

@@ -13,7 +13,7 @@ import pytest
 ROOT = Path(__file__).parents[3]
 TESTS = [
     f"tests/nerf/kernels/test_{name}.py"
-    for name in ("warp", "warp_marching", "warp_compositing", "warp_threads", "waves")
+    for name in ("warp", "warp_marching", "warp_compositing", "warp_threads", "waves", "drawing")
 ]
 TESTED = f"import pytest; raise SystemExit(pytest.main({TESTS} + ['-k', 'not first_use', '-p', 'no:cacheprovider']))"
 BEYOND = """

@@ -16,6 +16,7 @@ MODULES = {
     "cache": 3,
     "compositing": 6,
     "directions": 1,
+    "drawing": 3,
     "encoding": 3,
     "layers": 3,
     "marching": 4,

@@ -157,6 +157,9 @@ def everything(seed: int) -> list[Tensor]:
     depth, near = torch.zeros(count, dtype=torch.float64), rays.near.clone()
     warp.end_wave(lattice, samples, sigma, 0.1, known - 1, rays.far, depth, near)
     waves, order = warp.pack_waves([samples, front])
+    drawn_depth, shown, seen = torch.zeros_like(depth), torch.zeros(count), torch.zeros(count, 4)
+    drawn = warp.drawn_samples(samples, sigma, 0.1, drawn_depth, shown)
+    warp.add_drawn(drawn, colour.index_select(0, drawn.rows), seen)
     harmonics = warp.spherical_harmonics(directions)
     grad_directions = warp.spherical_harmonics_backward(directions, harmonics)
     hidden = torch.randn(len(samples.t), 64, generator=random)
@@ -171,6 +174,7 @@ def everything(seed: int) -> list[Tensor]:
     return [
         *(bits, *samples, points, features, grad_table, grad_points, *grad_rays, *front, kept, *rendering, weights),
         *(*grad_field, spread, grad_weights, apart, *grad_apart, depth, near, *waves, order),
+        *(*drawn.samples, drawn.rows, drawn.weights, drawn_depth, shown, seen),
         *(harmonics, grad_directions, hidden, grad_hidden, grad_rectified, of_ray, *adam, thickness),
     ]
 
