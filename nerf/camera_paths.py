@@ -14,6 +14,9 @@ from nerf.region import look_at_point
 FULL_CIRCLE_GAP_DEG = 60.0  # cameras with no wider gap in azimuth surround the object
 SMOOTHING_DEG = 20.0  # standard deviation over azimuth within which an orbit averages the cameras' radius and height
 STEEPEST = 0.15  # least horizontal distance of an orbit to its axis, in distances to the target (81 degrees)
+ORBIT_REACH = (
+    1 / 3
+)  # of the distance to the target: half of a ring that has a camera every 60 degrees is within a quarter
 SPIRAL_SHARE = 0.7  # quantile of the cameras' offsets that the spiral reaches
 ROUNDING = 1e-9  # of tour lengths of about 10: reversing a stretch gains more, or the search would run in circles
 ALONG = 0.1  # sine of the angle, 6 degrees, within which a view is along a direction
@@ -47,6 +50,30 @@ def orbit(cameras: Float[np.ndarray, "n 3 4"], frames: int) -> Poses:
     radius = np.maximum(radius, STEEPEST * np.hypot(radius, height))
     around = np.stack([radius * np.cos(path), radius * np.sin(path), height], axis=1)
     return look_at(target + around, target)
+
+
+def suits_orbit(cameras: Float[np.ndarray, "n 3 4"]) -> bool:
+    """Whether an orbit stays near the cameras, at least for half of its way within a third of the distance to what it
+    looks at. Between photos from close by and others from far away it would lead where nobody stood."""
+    path = orbit(cameras, SMOOTH_FRAMES)
+    target = closest_point_to_lines(cameras[:, :, 3], cameras[:, :, 2])
+    apart = np.linalg.norm(path[:, None, :, 3] - cameras[:, :, 3], axis=2).min(axis=1)
+    return bool(np.median(apart / np.linalg.norm(path[:, :, 3] - target, axis=1)) <= ORBIT_REACH)
+
+
+def zoomed(
+    cameras: Float[np.ndarray, "n 3 4"], focals: Float[np.ndarray, "n"], path: Poses
+) -> Float[np.ndarray, "frames"]:
+    """Focal lengths along a path: where the cameras near a frame show little of the scene, by a longer lens, a wider
+    view would show what nobody saw.
+
+    The geometric mean of the cameras' ``focals``, weighted by 1 / (d² + s²) for their distance d from the frame and the
+    cameras' median distance s from their middle, so that lenses that were changed on the spot make no zoom waver.
+    """
+    spread = np.median(np.linalg.norm(cameras[:, :, 3] - spatial_median(cameras[:, :, 3]), axis=1))
+    apart = np.linalg.norm(path[:, None, :, 3] - cameras[:, :, 3], axis=2) / (spread if spread > 0 else 1.0)
+    weight = 1 / (apart**2 + 1)
+    return np.exp(weight @ np.log(focals) / weight.sum(axis=1))
 
 
 def _arc(azimuths: Float[np.ndarray, "n"]) -> tuple[float, float]:

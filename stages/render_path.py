@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 PathKind = Literal["orbit", "spiral", "interpolated"]
 LARGEST_SIDE = 2**15  # pixels: four times as many as any screen has
 LEAST_FOCAL = 0.5  # in widths: a pinhole wider than 90 degrees stretches its corners
+ONE_LENS = 1.1  # between the longest and the shortest focal length of photos that are shown with one
 
 
 @dataclass(frozen=True)
@@ -62,11 +63,11 @@ def path_rays(path: CameraPath, scene: "Scene") -> "Iterator[Rays]":
 
 
 def usual_path(scene: "Scene") -> PathKind:
-    """Around an object an orbit, if it is known about which axis; before a scene a spiral, if the photos look where
-    it looks; else along the photos."""
-    from nerf.camera_paths import suits_spiral
+    """Around an object an orbit, if it is known about which axis and stays near the photos; before a scene a spiral, if
+    the photos look where it looks; else along the photos."""
+    from nerf.camera_paths import suits_orbit, suits_spiral
 
-    if scene.layout == "around" and scene.up_known:
+    if scene.layout == "around" and scene.up_known and suits_orbit(_poses(scene)):
         return "orbit"
     return "spiral" if scene.layout == "forward" and suits_spiral(_poses(scene)) else "interpolated"
 
@@ -79,10 +80,13 @@ def _poses(scene: "Scene") -> "np.ndarray":
 
 
 def fitted_path(scene: "Scene", kind: PathKind, frames: int) -> CameraPath:
-    """A path among the training photos, through an undistorted camera of median focal length."""
+    """A path among the training photos, through an undistorted camera of median focal length or, where theirs differ,
+    of one that goes along with them."""
+    import numpy as np
+
     from nerf import camera_paths
 
-    path = {
+    path_of = {
         "orbit": camera_paths.orbit,
         "spiral": camera_paths.spiral,
         "interpolated": camera_paths.interpolated,
@@ -90,7 +94,28 @@ def fitted_path(scene: "Scene", kind: PathKind, frames: int) -> CameraPath:
     poses = _poses(scene)
     if kind == "interpolated" and scene.layout == "forward":
         poses = camera_paths.levelled(poses)
-    return CameraPath((median_camera(scene),) * frames, path(poses, frames))
+    path, camera, relative = path_of(poses, frames), median_camera(scene), _relative_focals(scene)
+    if np.ptp(np.log(relative)) <= math.log(ONE_LENS):
+        return CameraPath((camera,) * frames, path)
+    return CameraPath(
+        tuple(_pinhole(camera.width, camera.height, x) for x in camera_paths.zoomed(poses, relative, path)), path
+    )
+
+
+def _relative_focals(scene: "Scene") -> "np.ndarray":
+    """Of the training photos, in longest sides."""
+    import numpy as np
+
+    cameras = [scene.cameras[view.camera] for view in scene.of_split("train")]
+    return np.array([camera.params[0] / max(camera.width, camera.height) for camera in cameras])
+
+
+def _pinhole(width: int, height: int, relative: float) -> "Camera":
+    """With a focal length in longest sides, at most 90 degrees wide."""
+    from nerf.scene import Camera
+
+    focal = max(float(relative) * max(width, height), LEAST_FOCAL * width)
+    return Camera("PINHOLE", width, height, (focal, focal, width / 2, height / 2))
 
 
 def median_camera(scene: "Scene") -> "Camera":
@@ -100,17 +125,13 @@ def median_camera(scene: "Scene") -> "Camera":
     """
     import numpy as np
 
-    from nerf.scene import Camera
-
     cameras = [scene.cameras[view.camera] for view in scene.of_split("train")]
     counts = Counter((camera.width, camera.height) for camera in cameras)
     most = max(counts.values())
     usual = [size for size, count in counts.items() if count == most]
     shape, area = (sorted(each)[len(usual) // 2] for each in ([w / h for w, h in usual], [w * h for w, h in usual]))
     width, height = round(math.sqrt(area * shape)), round(math.sqrt(area / shape))
-    relative = float(np.median([c.params[0] / max(c.width, c.height) for c in cameras]))
-    focal = max(relative * max(width, height), LEAST_FOCAL * width)
-    return Camera("PINHOLE", width, height, (focal, focal, width / 2, height / 2))
+    return _pinhole(width, height, float(np.median(_relative_focals(scene))))
 
 
 def path_from_file(scene: "Scene", file: Path) -> CameraPath:

@@ -11,7 +11,9 @@ from nerf.camera_paths import (
     nearest_rotations,
     orbit,
     spiral,
+    suits_orbit,
     suits_spiral,
+    zoomed,
 )
 from tests.camera_layouts import ring, room, survey, wall
 
@@ -131,6 +133,24 @@ def test_a_spiral_suits_photos_that_look_where_it_looks(cameras: np.ndarray, sui
     asked = spiral(cameras, 48) if suits else interpolated(cameras, 48)
     off = np.degrees(np.arccos(np.clip(asked[:, :, 2] @ cameras[:, :, 2].T, -1, 1))).min(axis=1)
     assert off.max() < 15  # from the direction of some photo
+
+
+def test_an_orbit_suits_rings_and_domes_but_not_photos_from_near_and_far() -> None:
+    dome = np.concatenate([ring(12, radius=r, height=h) for r, h in ((2.4, 0.3), (2.0, 1.4), (1.0, 2.2))])
+    near, far = ring(3, radius=1.5, arc_deg=40.0), ring(4, radius=7.5, arc_deg=20.0)
+    assert suits_orbit(ring(6)) and suits_orbit(dome) and suits_orbit(ring(9, arc_deg=100.0))
+    assert not suits_orbit(np.concatenate([near, far]))
+
+
+def test_a_path_zooms_with_the_photos_and_not_where_lenses_were_changed_on_the_spot() -> None:
+    cameras = np.concatenate([ring(4, radius=1.0, arc_deg=10.0), ring(4, radius=9.0, arc_deg=10.0)])
+    focals = np.repeat([0.5, 4.0], 4)
+    focal = zoomed(cameras, focals, interpolated(cameras, 40))
+    assert focal.max() > 2.5 and focal.min() < 0.8 and np.abs(np.diff(np.log(focal))).max() < 0.2
+    around = ring(24)
+    steady = zoomed(around, np.tile([0.5, 4.0], 12), orbit(around, 240))
+    assert np.ptp(np.log(steady)) < 0.05
+    np.testing.assert_allclose(zoomed(around, np.full(24, 1.3), orbit(around, 5)), 1.3)
 
 
 def test_a_video_of_flights_to_and_fro_does_not_flip_with_them() -> None:

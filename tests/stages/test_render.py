@@ -184,7 +184,7 @@ def test_nothing_is_timed_where_nothing_is_open(inputs, progress) -> None:
 @pytest.mark.parametrize(
     ("poses", "layout", "up_known", "path"),
     [
-        (wall(), "around", True, "orbit"),
+        (ring(), "around", True, "orbit"),
         (ring(), "around", False, "interpolated"),  # about which axis?
         (wall(), "forward", False, "spiral"),
         (wall(columns=40), "forward", True, "interpolated"),  # 12 wide, from 4 away

@@ -1,0 +1,31 @@
+"""Paths for photos that were taken from near and far, with lenses to match."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from stages.render_path import fitted_path, median_camera, usual_path
+from tests.camera_layouts import ring
+from tests.stages.test_render import CAMERA, scene_with
+
+
+def test_photos_from_near_and_far_are_shown_along_their_own_places_and_lenses() -> None:
+    test, near, far = ring(1), ring(3, radius=1.5, arc_deg=40.0), ring(4, radius=7.5, arc_deg=20.0)
+    scene = scene_with(np.concatenate([test, near, far]))
+    lenses = CAMERA, replace(CAMERA, params=(600.0, 600.0, *CAMERA.params[2:]))
+    views = tuple(replace(view, camera=int(index > 3)) for index, view in enumerate(scene.views))
+    scene = replace(scene, cameras=lenses, views=views)
+    assert usual_path(scene) == "interpolated" and usual_path(scene_with(ring(7))) == "orbit"
+    path = fitted_path(scene, "interpolated", 24)
+    focals = np.array([camera.params[0] for camera in path.cameras])
+    away = np.linalg.norm(path.poses[:, :, 3], axis=1)
+    assert focals[away.argmin()] < 220 and focals[away.argmax()] > 450
+    assert {(camera.width, camera.height, camera.params[2:]) for camera in path.cameras} == {(160, 120, (80.0, 60.0))}
+
+
+def test_photos_of_nearly_one_focal_length_are_shown_with_their_median() -> None:
+    scene = scene_with(ring(7))
+    cameras = tuple(replace(CAMERA, params=(f, f, *CAMERA.params[2:])) for f in (145.0, 150.0, 155.0))
+    views = tuple(replace(view, camera=index % 3) for index, view in enumerate(scene.views))
+    scene = replace(scene, cameras=cameras, views=views)
+    assert set(fitted_path(scene, "orbit", 9).cameras) == {median_camera(scene)}
