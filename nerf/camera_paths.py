@@ -14,9 +14,7 @@ from nerf.region import look_at_point
 FULL_CIRCLE_GAP_DEG = 60.0  # cameras with no wider gap in azimuth surround the object
 SMOOTHING_DEG = 20.0  # standard deviation over azimuth within which an orbit averages the cameras' radius and height
 STEEPEST = 0.15  # least horizontal distance of an orbit to its axis, in distances to the target (81 degrees)
-ORBIT_REACH = (
-    1 / 3
-)  # of the distance to the target: half of a ring that has a camera every 60 degrees is within a quarter
+CLEAR_SHARE = CLEAR_REACH = 0.9  # of a path, and of what its cameras have free before them
 SPIRAL_SHARE = 0.7  # quantile of the cameras' offsets that the spiral reaches
 ROUNDING = 1e-9  # of tour lengths of about 10: reversing a stretch gains more, or the search would run in circles
 ALONG = 0.1  # sine of the angle, 6 degrees, within which a view is along a direction
@@ -52,13 +50,12 @@ def orbit(cameras: Float[np.ndarray, "n 3 4"], frames: int) -> Poses:
     return look_at(target + around, target)
 
 
-def suits_orbit(cameras: Float[np.ndarray, "n 3 4"]) -> bool:
-    """Whether an orbit stays near the cameras, at least for half of its way within a third of the distance to what it
-    looks at. Between photos from close by and others from far away it would lead where nobody stood."""
-    path = orbit(cameras, SMOOTH_FRAMES)
-    target = closest_point_to_lines(cameras[:, :, 3], cameras[:, :, 2])
-    apart = np.linalg.norm(path[:, None, :, 3] - cameras[:, :, 3], axis=2).min(axis=1)
-    return bool(np.median(apart / np.linalg.norm(path[:, :, 3] - target, axis=1)) <= ORBIT_REACH)
+def keeps_clear(path: Poses, cameras: Float[np.ndarray, "n 3 4"], near: Float[np.ndarray, "n"]) -> bool:
+    """Whether a path stays where space is known to be free: nine tenths of it less far from some camera than that one
+    has nothing before it, nine tenths of its ``near``. Where cameras stood close by and far away, or along a line, a
+    path fitted to all of them leads through places where nobody stood, and what stands there."""
+    apart = np.linalg.norm(path[:, None, :, 3] - cameras[:, :, 3], axis=2) / near
+    return bool(np.quantile(apart.min(axis=1), CLEAR_SHARE) <= CLEAR_REACH)
 
 
 def zoomed(

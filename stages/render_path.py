@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 PathKind = Literal["orbit", "spiral", "interpolated"]
 LARGEST_SIDE = 2**15  # pixels: four times as many as any screen has
 LEAST_FOCAL = 0.5  # in widths: a pinhole wider than 90 degrees stretches its corners
+TRIED_FRAMES = 120  # of a path that may be unsuited
 ONE_LENS = 1.1  # between the longest and the shortest focal length of photos that are shown with one
 
 
@@ -63,13 +64,25 @@ def path_rays(path: CameraPath, scene: "Scene") -> "Iterator[Rays]":
 
 
 def usual_path(scene: "Scene") -> PathKind:
-    """Around an object an orbit, if it is known about which axis and stays near the photos; before a scene a spiral, if
-    the photos look where it looks; else along the photos."""
-    from nerf.camera_paths import suits_orbit, suits_spiral
+    """Around an object an orbit, if it is known about which axis; before a scene a spiral, if the photos look where it
+    looks; along the photos elsewhere, and where an orbit or a spiral would lead through what they do not show to be
+    free."""
+    import numpy as np
 
-    if scene.layout == "around" and scene.up_known and suits_orbit(_poses(scene)):
+    from nerf import camera_paths
+
+    poses = _poses(scene)
+    near = np.array([view.near for view in scene.of_split("train")])
+
+    def clear(path: "np.ndarray") -> bool:
+        return camera_paths.keeps_clear(path, poses, near)
+
+    if scene.layout == "around" and scene.up_known and clear(camera_paths.orbit(poses, TRIED_FRAMES)):
         return "orbit"
-    return "spiral" if scene.layout == "forward" and suits_spiral(_poses(scene)) else "interpolated"
+    spiral = scene.layout == "forward" and camera_paths.suits_spiral(poses)
+    if spiral and clear(camera_paths.spiral(poses, TRIED_FRAMES)):
+        return "spiral"
+    return "interpolated"
 
 
 def _poses(scene: "Scene") -> "np.ndarray":
@@ -97,9 +110,8 @@ def fitted_path(scene: "Scene", kind: PathKind, frames: int) -> CameraPath:
     path, camera, relative = path_of(poses, frames), median_camera(scene), _relative_focals(scene)
     if np.ptp(np.log(relative)) <= math.log(ONE_LENS):
         return CameraPath((camera,) * frames, path)
-    return CameraPath(
-        tuple(_pinhole(camera.width, camera.height, x) for x in camera_paths.zoomed(poses, relative, path)), path
-    )
+    focals = camera_paths.zoomed(poses, relative, path)
+    return CameraPath(tuple(_pinhole(camera.width, camera.height, focal) for focal in focals), path)
 
 
 def _relative_focals(scene: "Scene") -> "np.ndarray":

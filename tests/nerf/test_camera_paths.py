@@ -6,12 +6,12 @@ from hypothesis import strategies as st
 from nerf.camera_paths import (
     average_pose,
     interpolated,
+    keeps_clear,
     levelled,
     look_at,
     nearest_rotations,
     orbit,
     spiral,
-    suits_orbit,
     suits_spiral,
     zoomed,
 )
@@ -135,11 +135,25 @@ def test_a_spiral_suits_photos_that_look_where_it_looks(cameras: np.ndarray, sui
     assert off.max() < 15  # from the direction of some photo
 
 
-def test_an_orbit_suits_rings_and_domes_but_not_photos_from_near_and_far() -> None:
+def test_orbits_of_rings_and_domes_keep_clear_but_not_those_of_photos_from_near_and_far() -> None:
+    """Of an object of radius 1; far away something else stands before the photos, too."""
+
+    def clear(cameras: np.ndarray) -> bool:
+        near = np.minimum(np.linalg.norm(cameras[:, :, 3], axis=1) - 1, 2.0)
+        return keeps_clear(orbit(cameras, 120), cameras, near)
+
     dome = np.concatenate([ring(12, radius=r, height=h) for r, h in ((2.4, 0.3), (2.0, 1.4), (1.0, 2.2))])
-    near, far = ring(3, radius=1.5, arc_deg=40.0), ring(4, radius=7.5, arc_deg=20.0)
-    assert suits_orbit(ring(6)) and suits_orbit(dome) and suits_orbit(ring(9, arc_deg=100.0))
-    assert not suits_orbit(np.concatenate([near, far]))
+    near, far = ring(3, radius=1.5, height=0.3, arc_deg=40.0), ring(4, radius=7.5, height=0.3, arc_deg=20.0)
+    assert clear(ring(8)) and clear(dome) and clear(ring(9, arc_deg=100.0))
+    assert not clear(np.concatenate([near, far]))
+
+
+def test_a_spiral_beside_a_walk_does_not_keep_clear() -> None:
+    step = np.linspace(-1, 1, 11)
+    walk = facing(np.stack([step, step - 3, 0 * step], axis=1), np.tile([0.0, 1.0, 0.0], (11, 1)))
+    near = np.full(11, 0.3)
+    assert not keeps_clear(spiral(walk, 120), walk, near) and keeps_clear(interpolated(walk, 120), walk, near)
+    assert keeps_clear(spiral(wall(), 120), wall(), np.full(24, 0.3))
 
 
 def test_a_path_zooms_with_the_photos_and_not_where_lenses_were_changed_on_the_spot() -> None:

@@ -13,9 +13,11 @@ def test_photos_from_near_and_far_are_shown_along_their_own_places_and_lenses() 
     test, near, far = ring(1), ring(3, radius=1.5, arc_deg=40.0), ring(4, radius=7.5, arc_deg=20.0)
     scene = scene_with(np.concatenate([test, near, far]))
     lenses = CAMERA, replace(CAMERA, params=(600.0, 600.0, *CAMERA.params[2:]))
-    views = tuple(replace(view, camera=int(index > 3)) for index, view in enumerate(scene.views))
+    views = tuple(
+        replace(view, camera=int(index > 3), near=2.0 if index > 3 else 0.6) for index, view in enumerate(scene.views)
+    )
     scene = replace(scene, cameras=lenses, views=views)
-    assert usual_path(scene) == "interpolated" and usual_path(scene_with(ring(7))) == "orbit"
+    assert usual_path(scene) == "interpolated" and usual_path(scene_with(ring(24))) == "orbit"
     path = fitted_path(scene, "interpolated", 24)
     focals = np.array([camera.params[0] for camera in path.cameras])
     away = np.linalg.norm(path.poses[:, :, 3], axis=1)
