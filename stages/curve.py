@@ -51,17 +51,19 @@ def doubling_words(points: Sequence[dict[str, Any]], coming: "Gain | None") -> s
     last = last_doubling(curve)
     if last is None:
         return None
-    words = f"the last doubling of training time, to {duration(curve[-1][0])}, bought {last:+.1f} dB on held-out photos"
+    words = (
+        f"the last doubling of training time, to {duration(curve[-1][0])}, bought {last:+z.1f} dB on held-out photos"
+    )
     if coming is None:
         return words
     words += " (less over a run of half the time, which would have ended above this curve)"
     again = f"as long again at these sizes ({more_option(points)})"
-    return f"{words}; {again} is predicted to buy {coming.db:+.1f} dB (± {coming.half_width:.1f})"
+    return f"{words}; {again} is predicted to buy {coming.db:+z.1f} dB (± {coming.half_width:.1f})"
 
 
 def next_words(points: Sequence[dict[str, Any]], coming: "Gain | None") -> str | None:
     """:func:`doubling_words` for a line that has no room."""
-    gain = coming and f"{coming.db:+.1f} ± {coming.half_width:.1f} dB"
+    gain = coming and f"{coming.db:+z.1f} ± {coming.half_width:.1f} dB"
     return gain and f"as long again ({more_option(points)}) is predicted to buy {gain}"
 
 

@@ -23,6 +23,11 @@ def test_in_a_line_it_is_said_of_what() -> None:
     assert next_words(POINTS, None) is None
 
 
+def test_what_bought_nothing_has_no_minus() -> None:
+    points = [{"seconds": 10.0 * 2**k, "heldout_psnr": 20.0 - 0.01 * k} for k in range(5)]
+    assert "bought +0.0 dB" in (doubling_words(points, None) or "")
+
+
 @pytest.mark.parametrize(
     ("before", "after", "words"),
     [(0.5, 0.61, "rose from 0.50 to 0.61"), (0.61, 0.5, "fell from 0.61 to 0.50"), (0.846, 0.853, "stayed at 0.85")],

@@ -40,9 +40,12 @@ def test_the_order_of_three_pictures_is_told_where_they_are(inputs: dict[str, Pa
 def test_where_not_all_test_photos_are_scored_not_all_are_shown(tmp_path: Path, progress: Any):
     inputs = make_workspace(tmp_path)
     path = inputs["evaluate"] / "metrics.json"
-    write_json(path, json.loads(path.read_text("utf-8")) | {"photos_test": 9})
+    metrics = json.loads(path.read_text("utf-8")) | {"photos_test": 9}
+    write_json(path, metrics)
     html, _ = written(inputs, tmp_path / "out", progress)
-    assert "All 6 test photos that are scored" in html
+    assert "All 6 test photos that are scored" in html and "<p>6 of 9 test photos</p>" in html
+    write_json(path, metrics | {"images": metrics["images"][:1], "photos_scored": 1})
+    assert "<p>1 of 9 test photos</p>" in written(inputs, tmp_path / "one", progress)[0]
 
 
 def test_files_beside_the_page_are_named(tmp_path: Path, progress: Any):
@@ -57,6 +60,22 @@ def test_files_beside_the_page_are_named(tmp_path: Path, progress: Any):
     for fact in ("0.25 units of the files", "3.5 square units of the files", "40 per scene unit"):
         assert f"<td>{fact}</td>" in html
     assert "given away with it" not in written(inputs, tmp_path / "small", progress)[0]
+
+
+def test_long_names_of_photos_are_broken_and_do_not_widen_the_page(
+    inputs: dict[str, Path], tmp_path: Path, progress: Any
+):
+    html, _ = written(inputs, tmp_path / "out", progress)
+    assert ".names td { overflow-wrap: anywhere; }" in html
+    for head in ("<th>photo</th><th>why</th>", "<th>file</th><th>why</th>"):
+        assert f'<table class="names">\n<thead><tr>{head}' in html
+
+
+def test_the_curve_s_photos_are_those_above_where_there_are_any(inputs: dict[str, Path], tmp_path: Path, progress: Any):
+    words = "Held-out photos are the test photos above"
+    assert words in written(inputs, tmp_path / "out", progress)[0]
+    unmeasured = {stage: folder for stage, folder in inputs.items() if stage != "evaluate"}
+    assert words not in written(unmeasured, tmp_path / "unmeasured", progress)[0]
 
 
 def test_paper_shows_what_it_can(inputs: dict[str, Path], tmp_path: Path, progress: Any):
