@@ -78,6 +78,13 @@ def test_the_curve_s_photos_are_those_above_where_there_are_any(inputs: dict[str
     assert words not in written(unmeasured, tmp_path / "unmeasured", progress)[0]
 
 
+def test_every_picture_has_words_for_who_cannot_see_it(inputs: dict[str, Path], tmp_path: Path, progress: Any):
+    html, _ = written(inputs, tmp_path / "out", progress)
+    pictures, plots = re.findall(r"<(?:img|video)[^>]*>", html), re.findall(r"<[^>]*>\s*<svg", html)
+    assert len(pictures) > 10 and all(re.search(r' (alt|aria-label)="[^"]', tag) for tag in pictures)
+    assert len(plots) == 3 and all('role="img" aria-label="' in tag for tag in plots)
+
+
 def test_paper_shows_what_it_can(inputs: dict[str, Path], tmp_path: Path, progress: Any):
     html, _ = written(inputs, tmp_path / "out", progress)
     style = re.search(r"@media print \{.*?\n\}", html, re.DOTALL)
