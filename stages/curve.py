@@ -51,21 +51,24 @@ def doubling_words(points: Sequence[dict[str, Any]], coming: "Gain | None") -> s
     last = last_doubling(curve)
     if last is None:
         return None
-    words = f"the last doubling of training time, to {duration(curve[-1][0])}, bought {last:+.1f} dB on held-out photos"
+    words = (
+        f"the last doubling of training time, to {duration(curve[-1][0])}, bought {last:+z.1f} dB on held-out photos"
+    )
     if coming is None:
         return words
     words += " (less over a run of half the time, which would have ended above this curve)"
-    again = f"as long again at these sizes ({_more(points)})"
-    return f"{words}; {again} is predicted to buy {coming.db:+.1f} dB (± {coming.half_width:.1f})"
+    again = f"as long again at these sizes ({more_option(points)})"
+    return f"{words}; {again} is predicted to buy {coming.db:+z.1f} dB (± {coming.half_width:.1f})"
 
 
 def next_words(points: Sequence[dict[str, Any]], coming: "Gain | None") -> str | None:
     """:func:`doubling_words` for a line that has no room."""
-    gain = coming and f"{coming.db:+.1f} ± {coming.half_width:.1f} dB"
-    return gain and f"as long again ({_more(points)}) is predicted to buy {gain}"
+    gain = coming and f"{coming.db:+z.1f} ± {coming.half_width:.1f} dB"
+    return gain and f"as long again ({more_option(points)}) is predicted to buy {gain}"
 
 
-def _more(points: Sequence[dict[str, Any]]) -> str:
+def more_option(points: Sequence[dict[str, Any]]) -> str:
+    """``--more 3m``: as long again."""
     return f"--more {duration_option(points[-1]['seconds'])}"
 
 
@@ -98,7 +101,10 @@ def ssim_words(points: Sequence[dict[str, Any]]) -> str | None:
         return None
     from nerf.learning_curve import quality_at
 
-    return f"SSIM rose from {quality_at(known, known[-1][0] / 2):.2f} to {known[-1][1]:.2f} in that doubling"
+    before, after = quality_at(known, known[-1][0] / 2), known[-1][1]
+    if f"{before:.2f}" == f"{after:.2f}":
+        return f"SSIM stayed at {after:.2f} in that doubling"
+    return f"SSIM {'rose' if after > before else 'fell'} from {before:.2f} to {after:.2f} in that doubling"
 
 
 def sparkline(points: Sequence[dict[str, Any]]) -> str:

@@ -97,9 +97,10 @@ def choose_level(lattice: "Lattice", model: "RadianceModel", rays: "Rays") -> Le
         near = range(0, LEVELS, stride) if not misses else (best - stride, best + stride)
         misses |= {index: miss(index) for index in near if 0 <= index < LEVELS and index not in misses}
         best = min(misses, key=misses.__getitem__)
+    tried = " to ".join(f"{level:.2g}" if level < 10 else f"{level:.0f}" for level in (candidates[0], candidates[-1]))
     reason = (
         f"its surface lies closest to where {len(stop)} rays of the photos lose half of their light, "
-        f"{misses[best]:.2f} voxels away on average (tried {candidates[0]:.2g} to {candidates[-1]:.2g})"
+        f"{misses[best]:.2f} voxels away on average (tried {tried})"
     )
     return Level(candidates[best], reason, misses[best], misses[best] < CLIP_VOXELS / 2)
 

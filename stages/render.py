@@ -181,7 +181,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     facts = _facts(config, path) | ({} if exposure is None else {"exposure": exposure})
     line = f"{facts['path']}, {facts['frames']} frames {facts['width']}×{facts['height']}"
     line += "" if exposure is None else f" · {exposure}"
-    return StageResult(outputs, f"{line} · {frames_per_second:.2g} frames/s", ("speed.json",), facts)
+    return StageResult(outputs, f"{line} · drawn at {frames_per_second:.2g} frames/s", ("speed.json",), facts)
 
 
 def _check_memory(path: CameraPath) -> None:

@@ -137,6 +137,7 @@ def page(results: Results, summary: dict[str, Any], config: Config) -> str:
 
     from stages.report_effects import effects_table
     from stages.report_parts import parts_bar
+    from stages.tradeoff_front import quoted
 
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent),
@@ -145,7 +146,8 @@ def page(results: Results, summary: dict[str, Any], config: Config) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"duration": duration, "short": short_count, "thousands": "{:,}".format, "value": _value}
+    words = {"duration": duration, "short": short_count, "thousands": "{:,}".format, "value": _value, "quoted": quoted}
+    environment.filters |= words
     return environment.get_template("report.html.j2").render(
         workspace=_workspace(results.inputs),
         summary=summary,
@@ -168,6 +170,7 @@ def page(results: Results, summary: dict[str, Any], config: Config) -> str:
         study=_study(results),
         cameras=_cameras(results),
         mesh_preview=_mesh_preview(results.inputs),
+        mesh_files=[name for name in results.manifests.get("mesh", {}).get("outputs", ()) if name != "preview.png"],
         longest=max((manifest["seconds"] for manifest in results.manifests.values()), default=0) or 1,
         machine=results.manifests.get("train", next(iter(results.manifests.values()), {})).get("machine", {}),
     )
@@ -277,7 +280,7 @@ def _curve(results: Results) -> dict[str, Any] | None:
     """The training curve, and what it says of the time, in sentences."""
     from markupsafe import Markup
 
-    from stages.curve import coming_doubling, doubling_words, knee_words, ssim_words
+    from stages.curve import coming_doubling, doubling_words, knee_words, more_option, ssim_words
     from stages.report_plots import curve_svg
 
     if results.curve is None:
@@ -291,7 +294,8 @@ def _curve(results: Results) -> dict[str, Any] | None:
     words = [doubling_words(points, coming), knee_words(points), ssim_words(points)]
     threads = results.curve["threads"]
     where = "a GPU" if results.curve["device"] == "cuda" else f"{threads} processor core{'' if threads == 1 else 's'}"
-    return {"svg": Markup(svg), "words": [f"{word[0].upper()}{word[1:]}." for word in words if word], "where": where}
+    sentences = [f"{word[0].upper()}{word[1:]}." for word in words if word]
+    return {"svg": Markup(svg), "words": sentences, "where": where, "more": more_option(points)}
 
 
 def _study(results: Results) -> dict[str, Any] | None:

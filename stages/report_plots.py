@@ -40,14 +40,15 @@ def curve_svg(
             seen = [(row["seconds"], row[key]) for row in rows if row[key] is not None]
             if seen:
                 axes.plot(*zip(*seen, strict=True), color=colour, lw=2, marker="o", ms=3, label=label)
-        _draw_baselines(axes, {name: psnr for name, psnr in baselines.items() if psnr is not None})
         if coming is not None:
             _draw_prediction(axes, rows, coming)
         last = rows[-1]["seconds"] * (1 if coming is None else 2)
         _draw_knee(axes, heldout_curve(rows))
+        # Last, for they fix the limits, beyond which nothing is seen.
+        _draw_baselines(axes, {name: psnr for name, psnr in baselines.items() if psnr is not None})
         _doubling_axis(axes, rows[0]["seconds"], rows[-1]["seconds"], last)
         axes.set(xlabel="training time", ylabel="PSNR (dB)")
-        axes.legend(frameon=False, loc="lower left", bbox_to_anchor=(0, 1), ncols=3, borderaxespad=0)
+        axes.legend(frameon=False, loc="lower left", bbox_to_anchor=(0, 1), ncols=4, borderaxespad=0)
         return svg_element(figure)
 
 
@@ -59,15 +60,11 @@ def _draw_prediction(axes: "Axes", rows: Sequence[dict[str, Any]], coming: "Gain
 
 
 def _draw_knee(axes: "Axes", curve: Sequence[tuple[float, float]]) -> None:
-    from nerf.learning_curve import KNEE_DB, knee, quality_at
+    from nerf.learning_curve import knee, quality_at
 
-    if (seconds := knee(curve)) is None:
-        return
-    psnr, late = quality_at(curve, seconds), seconds**2 > curve[0][0] * curve[-1][0]
-    axes.plot(seconds, psnr, "o", mfc="none", mec=ORANGE, ms=11, mew=2)
-    words = f"knee, {duration(seconds)}: twice the time bought < {KNEE_DB:g} dB"
-    place = {"textcoords": "offset points", "ha": "right" if late else "left", "va": "top", "size": 9.5}
-    axes.annotate(words, (seconds, psnr), (10, -16), **place)
+    if (seconds := knee(curve)) is not None:
+        ring = {"color": "none", "mec": ORANGE, "ms": 11, "mew": 2}
+        axes.plot(seconds, quality_at(curve, seconds), "o", label=f"knee, {duration(seconds)}", **ring)
 
 
 def _draw_baselines(axes: "Axes", baselines: dict[str, float]) -> None:
@@ -136,7 +133,8 @@ def _doubling_axis(axes: "Axes", first: float, last: float, end: float) -> None:
     ticks = [end, *ticks] if end > last else ticks
     axes.set_xscale("log", base=2)
     axes.set_xlim(min(first, ticks[-1]), end * 1.04)
-    axes.set_xticks(ticks, [duration(tick) for tick in ticks])
+    # On two lines, for neighbours would run into each other: "2 min" over "31 s".
+    axes.set_xticks(ticks, [re.sub("(?<=[a-z]) ", "\n", duration(tick)) for tick in ticks])
     axes.set_xticks([], minor=True)
     axes.axvspan(last / 2, last, color=BLUE, alpha=0.08, lw=0)
     axes.grid(color=INK, alpha=0.15, lw=0.8)

@@ -219,10 +219,10 @@ def command(point: Point, workspace: str) -> str:
     field = {"field": field_of(point.variant), "preset": "standard"}
     given = {"seconds": max(1, round(point.train_seconds)), "downscale": point.downscale} | field
     flags = [_flag(name, value) for name, value in {**given, **VARIANTS[point.variant].options}.items()]
-    return " ".join(["pipeline train", _quoted(workspace), *flags])
+    return " ".join(["pipeline train", quoted(workspace), *flags])
 
 
-def _quoted(name: str) -> str:
+def quoted(name: str) -> str:
     """As a shell takes it; the bytes of a name that is not Unicode, which no text holds, as in ``$'caf\\xe9'``."""
     escaped = name.replace("\\", r"\\").replace("'", r"\'")
     text = os.fsencode(escaped).decode("utf-8", "backslashreplace")

@@ -1,7 +1,9 @@
 """What a curve says in words."""
 
+import pytest
+
 from nerf.learning_curve import Gain
-from stages.curve import doubling_words, next_words
+from stages.curve import doubling_words, next_words, ssim_words
 
 POINTS = [{"seconds": 10.0 * 2**k, "heldout_psnr": 20.0 + k} for k in range(5)]
 
@@ -19,3 +21,17 @@ def test_in_a_line_it_is_said_of_what() -> None:
     said = "as long again (--more 160s) is predicted to buy +0.7 ± 0.4 dB"
     assert next_words(POINTS, Gain(0.71, 0.37)) == said
     assert next_words(POINTS, None) is None
+
+
+def test_what_bought_nothing_has_no_minus() -> None:
+    points = [{"seconds": 10.0 * 2**k, "heldout_psnr": 20.0 - 0.01 * k} for k in range(5)]
+    assert "bought +0.0 dB" in (doubling_words(points, None) or "")
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "words"),
+    [(0.5, 0.61, "rose from 0.50 to 0.61"), (0.61, 0.5, "fell from 0.61 to 0.50"), (0.846, 0.853, "stayed at 0.85")],
+)
+def test_ssim_rises_falls_or_stays(before: float, after: float, words: str):
+    points = [{"seconds": 10.0 * (k + 1), "heldout_ssim": ssim} for k, ssim in enumerate((before, after))]
+    assert ssim_words(points) == f"SSIM {words} in that doubling"

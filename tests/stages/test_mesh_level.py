@@ -58,6 +58,7 @@ def test_the_surface_lies_where_light_stops_whatever_the_density(rays, inside):
     lattice = lattice_of(model)
     chosen = choose_level(lattice, model, rays)
     assert chosen.clear and chosen.miss_voxels is not None and 0 < chosen.miss_voxels < 0.35
+    assert "e+" not in chosen.reason
     radii = np.linalg.norm(extract(lattice, chosen.level).vertices, axis=1)
     assert abs(radii.mean() - 0.55) < VOXEL
     assert "rays of the photos lose half of their light" in chosen.reason

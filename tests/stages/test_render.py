@@ -95,7 +95,7 @@ def test_video_and_depth_show_the_field_from_the_path(inputs, progress) -> None:
     assert {int(c.argmax()) for c in centre} == {0, 1}  # seen from both of its sides
     assert (depth[:, 30, 40, 0].astype(int) > depth[:, 30, 40, 2] + 50).all()  # near is red
     assert (depth[:, 3, 3, 0] < 100).all()  # far is not
-    assert result.line.startswith("orbit, 8 frames 80×60 · ")
+    assert result.line.startswith("orbit, 8 frames 80×60 · drawn at ")
     assert set(result.outputs) == {"video.mp4", "depth.mp4", "path.json"}
     assert result.records == ("speed.json",)
     assert sorted(file.name for file in inputs["render"].iterdir()) == sorted([*result.outputs, *result.records])
