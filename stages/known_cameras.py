@@ -86,9 +86,10 @@ def _from_transforms(cameras: Path, photos: Sequence[Photo], frames: Mapping[str
     by_name = {photo.name: photo for photo in photos}
     framed: dict[str, _Framed] = {}
     absent, test_files, approximate = [], [], 0
+    unused: dict[str, Photo] = {}  # by file
     splits, notes = read_splits(cameras, lambda frame: frames.get(frame["file_path"]) in by_name)
     for where, content in splits:
-        held_out = _held_out(content, where, notes)
+        held_out, in_no_split = _split(content, where, notes)
         for frame in content["frames"]:
             name = frame["file_path"]
             photo = by_name.get(frames.get(name, ""))
@@ -96,6 +97,9 @@ def _from_transforms(cameras: Path, photos: Sequence[Photo], frames: Mapping[str
                 absent.append(name)
                 continue
             file = photo.image_name
+            if PurePosixPath(name) in in_no_split:
+                unused[file] = photo
+                continue
             if file in framed:
                 raise StageError(f"two frames for the photo {photo.name}", f"one is {name!r}", HINT)
             values = {**content, **frame}
@@ -111,30 +115,48 @@ def _from_transforms(cameras: Path, photos: Sequence[Photo], frames: Mapping[str
     posed = [_from_frame(framed[file], upright) for file in sorted(framed)]
     left_out = without_rays(posed)
     kept = [one for one in posed if one.file not in left_out]
-    unposed = [photo.name for photo in photos if photo.image_name not in framed]
+    unposed = [photo.name for photo in photos if photo.image_name not in framed.keys() | unused.keys()]
     kept_tests = sorted(set(test_files) - left_out.keys())
     if test_files and not kept_tests:
         notes.append("all official test photos are among those left out, so others are held out")
+    if unused:
+        names = _few(sorted(photo.name for photo in unused.values()))
+        notes.append(f"{len(unused)} photos are neither to train nor to test on and are left out: {names}")
     return KnownCameras(
         model=_without_points(kept, splits[0][0]),
-        left_out=left_out,
+        left_out=left_out | dict.fromkeys(unused, "the transforms file has it neither to train nor to test on"),
         test_files=kept_tests or None,
         notes=_notes(absent, unposed, posed, left_out) + notes,
     )
 
 
-def _held_out(content: Mapping[str, Any], source: str, notes: list[str]) -> set[PurePosixPath]:
-    """The official test photos by file_path: nerfstudio's ``test_filenames``, else its ``val_filenames``. Of names that
-    no frame has, a note is left. Raises StageError where none has a frame."""
-    names = content.get("test_filenames") or content.get("val_filenames") or []
+def _split(content: Mapping[str, Any], source: str, notes: list[str]) -> tuple[set[PurePosixPath], set[PurePosixPath]]:
+    """The official test photos by file_path, nerfstudio's ``test_filenames``, else its ``val_filenames``, less those
+    that its ``train_filenames`` have as well; and the frames that are in no split, where there are such. What is
+    repeated is noted."""
+    train = _listed(content, "train_filenames", source, notes)
+    of_frames = {PurePosixPath(frame["file_path"]) for frame in content["frames"]}
+    for key in ("test_filenames", "val_filenames"):
+        names = _listed(content, key, source, notes)
+        if repeated := len(names & train):
+            notes.append(f"{key} of {source} repeats {repeated} photos to train on: they stay that")
+        if own := names - train:
+            return own, of_frames - train - own if train else set()
+    return set(), of_frames - train if train else set()
+
+
+def _listed(content: Mapping[str, Any], key: str, source: str, notes: list[str]) -> set[PurePosixPath]:
+    """The photos in a list of a transforms file, by file_path. Of names that no frame has, a note is left. Raises
+    StageError where none has a frame."""
+    names = content.get(key) or []
     if not (isinstance(names, list) and all(isinstance(name, str) for name in names)):
-        raise unusable(f"the test photos of {source}", "test_filenames (or val_filenames) is no list of names")
+        raise unusable(f"the {key} of {source}", "it is no list of names")
     of_frames = {PurePosixPath(frame["file_path"]) for frame in content["frames"]}
     strange = [name[:MOST_LETTERS] for name in names if PurePosixPath(name) not in of_frames]
     if strange and len(strange) == len(names):
-        raise unusable(f"the test photos of {source}", f"none of them is the file_path of a frame: {_few(strange)}")
+        raise unusable(f"the {key} of {source}", f"none of them is the file_path of a frame: {_few(strange)}")
     if strange:
-        notes.append(f"{len(strange)} test photos of {source} have no frame: {_few(strange)}")
+        notes.append(f"{len(strange)} photos in {key} of {source} have no frame: {_few(strange)}")
     return set(map(PurePosixPath, names))
 
 
