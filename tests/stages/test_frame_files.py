@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from stages.sources import find_source
+from stages.sources import find_source, unused_masks
 from tests.stages.test_sources import names, refusal, touch, transforms
 
 
@@ -71,6 +71,18 @@ def test_masks_of_transforms_files_are_found_in_another_spelling(tmp_path: Path)
     frame = {"file_path": "a.jpg", "mask_path": "masks/a.png", "transform_matrix": []}
     (tmp_path / "transforms.json").write_text(json.dumps({"frames": [frame]}))
     assert find_source(tmp_path / "transforms.json").masks[0] == ("a.jpg.png", tmp_path / "masks/a.PNG")
+
+
+def test_masks_that_our_own_export_names_are_copies_of_those_of_the_photos(tmp_path: Path) -> None:
+    touch(tmp_path, "set/a.jpg", "w.nerf/output/masks/a.jpg.png")
+    frame = {"file_path": "images/a.jpg", "photo": "a.jpg", "mask_path": "masks/a.jpg.png", "transform_matrix": []}
+    cameras = tmp_path / "w.nerf/output/transforms.json"
+    cameras.write_text(json.dumps({"frames": [frame]}))
+    without = find_source(tmp_path / "set", cameras)
+    assert without.masks == () and unused_masks(without) == cameras.parent / "masks"
+    touch(tmp_path, "set/masks/a.png")
+    found = find_source(tmp_path / "set", cameras)
+    assert found.masks == (("a.png", tmp_path / "set/masks/a.png"),) and unused_masks(found) is None
 
 
 def test_each_folder_is_listed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
