@@ -1,6 +1,7 @@
 """The photos and masks that a transforms file names: where they lie, and how their names may be spelt there."""
 
 import os
+import re
 import unicodedata
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -28,13 +29,22 @@ class FrameFiles:
     def photo(self, frame: dict[str, Any]) -> Path:
         """The photo of a frame: in a file of ours by its own name first, then by ``file_path``.
 
-        One that is nowhere is returned as if it were in the first folder, and refused when it is to be decoded.
+        Where the first folder is a reduction of the one that it names, as ``images_4`` of ``images/0.png``, its smaller
+        copy. One that is nowhere is returned as if it were in the first folder, and refused when it is to be decoded.
         """
         name, *copies = photo_names(frame)
+        if (reduced := self._reduced(name)) is not None and reduced.is_file():
+            return reduced
         file = self._file(name, self.folders, "photo")
         # Not beside the cameras: there lie ingest's copies, none of PHOTOS, which stand in for no photo removed.
         found = (self._file(copy, self.folders[:2], "photo") for copy in copies)
         return file if file.is_file() else next(filter(Path.is_file, found), file)
+
+    def _reduced(self, name: str) -> Path | None:
+        """Where the smaller copy of a photo would be in the first folder; None where that is no folder of such."""
+        folder, _, inside = os.path.normpath(name.replace("\\", "/")).partition("/")
+        is_reduction = re.fullmatch(rf"{re.escape(folder)}_\d+", self.folders[0].name)
+        return self._file(inside, self.folders[:1], "photo") if is_reduction else None
 
     def mask(self, name: str) -> Path:
         """The mask of this name, found as photos are."""

@@ -85,6 +85,14 @@ def test_masks_that_our_own_export_names_are_copies_of_those_of_the_photos(tmp_p
     assert found.masks == (("a.png", tmp_path / "set/masks/a.png"),) and unused_masks(found) is None
 
 
+def test_a_folder_of_reduced_photos_stands_in_for_the_one_that_is_named(tmp_path: Path) -> None:
+    touch(tmp_path, "images/a.jpg", "images/left/b.JPG", "images_4/a.jpg", "images_4/left/b.jpg", "other_4/a.jpg")
+    cameras = transforms(tmp_path / "transforms.json", "images/a.jpg", "./images/left/b.JPG")
+    assert names(find_source(tmp_path / "images_4", cameras)) == ["a.jpg", "left/b.jpg"]
+    assert "is not among the photos" in str(refusal(tmp_path / "other_4", cameras)), "another folder is no reduction"
+    assert names(find_source(tmp_path / "images", cameras)) == ["a.jpg", "left/b.JPG"]
+
+
 def test_each_folder_is_listed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     written = [f"train/{index}" for index in range(9)]
     touch(tmp_path, *(f"{name}.PNG" for name in written))
