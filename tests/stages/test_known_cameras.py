@@ -197,7 +197,7 @@ def test_frames_without_photo_and_photos_without_frame_are_named(read) -> None:
 
 
 def test_no_frame_with_a_photo_is_an_error(read) -> None:
-    with pytest.raises(StageError, match=r"no camera in transforms.json belongs to a photo"):
+    with pytest.raises(StageError, match=r"no camera in transforms.json belongs to a photo: it is of \./8, \./9, and"):
         read([frame(8), frame(9)], **LENS)
 
 
@@ -312,6 +312,10 @@ def test_a_name_that_two_photos_share_matches_neither(tmp_path: Path) -> None:
         (["cam0/0.jpg", "0.jpg"], ["cam0/0.jpg", "cam1/0.jpg"], {0: "cam0/0.jpg"}),
         (["set/cam0/0.jpg", "1.jpg"], ["cam0/0.jpg", "b/1.jpg"], {0: "cam0/0.jpg", 1: "b/1.jpg"}),
         (["xcam0/0.jpg"], ["cam0/0.jpg"], {}),
+        (["i/l/0.jpg", "i/r/0.jpg"], ["l/0.jpg", "r/0.jpg"], {0: "l/0.jpg", 1: "r/0.jpg"}),  # all in a folder more
+        (["i/l/0.jpg", "i/l/1.jpg"], ["l/0.jpg", "r/0.jpg", "0.jpg"], {0: "l/0.jpg"}),
+        (["l/0.jpg", "r/0.jpg"], ["i/l/0.jpg", "i/r/0.jpg"], {0: "i/l/0.jpg", 1: "i/r/0.jpg"}),
+        (["l/0.jpg", "l/1.jpg"], ["r/0.jpg", "r/1.jpg"], {}),
         (["ä.jpg", "a.png"], ["ä.jpg"], {0: "ä.jpg"}),  # a model with both of its names
         (["b/a.png"], ["b/ä.jpg"], {0: "b/ä.jpg"}),
         (["0.jpg", "b/1.JPG", "2"], ["0.png", "b/1.jpg", "2.png"], {0: "0.png", 1: "b/1.jpg", 2: "2.png"}),
