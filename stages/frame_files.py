@@ -55,14 +55,14 @@ class FrameFiles:
         tried as Windows means it, with backslashes between folders, and then in other spellings."""
         spellings = dict.fromkeys((name, name.replace("\\", "/")))
         for spelling, folder, extension in product(spellings, folders, _EXTENSIONS_TRIED):
-            file = _inside(folder, spelling + extension, what)
+            file = _inside(folder, self.folders[0], spelling + extension, what)
             if file.is_file():
                 return file
         for spelling, folder in product(spellings, folders):
             alike = self._alike(folder, spelling)
-            if alike is not None and (file := _inside(folder, alike, what)).is_file():
+            if alike is not None and (file := _inside(folder, self.folders[0], alike, what)).is_file():
                 return file
-        return _inside(folders[0], name, what)
+        return _inside(folders[0], self.folders[0], name, what)
 
     def _alike(self, folder: Path, name: str) -> str | None:
         """What is in ``folder`` by another spelling of ``name``, relative to it: with the letters of its endings small
@@ -94,13 +94,17 @@ def _spellings_of(entry: str) -> Iterator[_Spelling]:
         yield stem, None
 
 
-def _inside(folder: Path, file_path: str, what: str) -> Path:
+def _inside(folder: Path, root: Path, file_path: str, what: str) -> Path:
+    """The file of this name in ``folder``. Raises StageError where it leads out of there, but for a link to ``root``,
+    which the user gave."""
     file = folder / os.path.normpath(file_path)
-    absolute = Path(file_path).is_absolute()
-    if absolute or "\0" in file_path or not file.resolve().is_relative_to(folder.resolve()):
+    absolute, is_name = Path(file_path).is_absolute(), "\0" not in file_path
+    if absolute or not is_name or not any(file.resolve().is_relative_to(place.resolve()) for place in (folder, root)):
+        linked = is_name and what == "photo" and not absolute and ".." not in file.relative_to(folder).parts
         raise StageError(
             f"refused the {what} {file_path[:MOST_LETTERS]!r}",
             "its path is absolute" if absolute else f"it leads out of the folder {folder}",
+            "Give the photo folder apart, if it is a link: pipeline run PHOTOS --cameras FILE." if linked else
             f"A transforms file may name {what}s inside its own folder only.",
-        )
+        )  # fmt: skip
     return file

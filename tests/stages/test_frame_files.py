@@ -66,6 +66,17 @@ def test_another_spelling_leads_out_of_the_folder_no_more_than_the_name(tmp_path
     assert error.what == "refused the photo 'a.JPG'"
 
 
+def test_a_linked_folder_of_photos_may_be_given_apart_from_its_cameras(tmp_path: Path) -> None:
+    touch(tmp_path, "disk/images/a.jpg", "secret.jpg", "set/notes")
+    (tmp_path / "set/images").symlink_to(tmp_path / "disk/images")
+    cameras = transforms(tmp_path / "set/transforms.json", "images/a.jpg")
+    assert "pipeline run PHOTOS --cameras FILE" in refusal(cameras).hint
+    for photos in ("set/images", "set"):
+        assert names(find_source(tmp_path / photos, cameras)) == ["a.jpg"]
+    (tmp_path / "disk/images/b.jpg").symlink_to(tmp_path / "secret.jpg")
+    assert refusal(tmp_path / "set", transforms(cameras, "images/b.jpg")).what == "refused the photo 'images/b.jpg'"
+
+
 def test_masks_of_transforms_files_are_found_in_another_spelling(tmp_path: Path) -> None:
     touch(tmp_path, "a.jpg", "masks/a.PNG")
     frame = {"file_path": "a.jpg", "mask_path": "masks/a.png", "transform_matrix": []}
