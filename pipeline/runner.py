@@ -78,7 +78,8 @@ class Runner:
 
     def _options_digest(self) -> str:
         """Of what a budget is kept for: a study has its own time."""
-        return digest({stage: options for stage, options in self.state["options"].items() if stage not in ON_REQUEST})
+        recorded = self.workspace.portable(self.state["options"])
+        return digest({stage: options for stage, options in recorded.items() if stage not in ON_REQUEST})
 
     def run(
         self,

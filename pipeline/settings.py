@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, get_args
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from pipeline.workspace import RUN_FILE, Workspace, default_workspace, lasting, photo_set
+from pipeline.workspace import RUN_FILE, Workspace, default_workspace, is_result, lasting, photo_set
 from stages.contract import bounded
 from stages.effects import Config as EffectsConfig
 from stages.evaluate import Config as EvaluateConfig
@@ -147,11 +147,15 @@ def with_lasting_cameras(settings: Settings, root: Path) -> Settings:
 
 
 def check_workspace(root: Path, photos: Path) -> None:
-    """Raises UsageError where the workspace would lie right among the photos: what a run writes is none of them."""
+    """Raises UsageError where the workspace would lie right among the photos: what a run writes is none of them; and
+    where the photos are a result of it, which a run takes out of its ``output/`` before it reads them."""
     places = [place for place in (photos, photos / "images") if not (place / RUN_FILE).is_file()]
     if photos.is_dir() and os.path.realpath(root) in map(os.path.realpath, places):
         better = f"leave -o out, which writes to {default_workspace(photos)}, or name another"
         raise UsageError(f"-o {root}: that is a folder of photos; {better}")
+    if is_result(photos, root):
+        what = f"{photos} is a result of that workspace, and makes way for those of the new run"
+        raise UsageError(f"-o {root}: {what}; give another folder with -o")
 
 
 def check_same_photos(workspace: Workspace, photos: Path) -> None:

@@ -9,7 +9,7 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -25,6 +25,7 @@ from stages.files import first_fault, sync_file, sync_folder, write_durably
 RUN_FILE = "run.json"
 RUN_VERSION = 1
 COPIES = ".copies"  # what in output/ is no link but a copy, one a line: its name, a tab, what of the workspace it shows
+_PATHS = ("photos", "cameras")  # options of stages that are paths
 _KEY = re.compile(rf"[0-9a-f]{{{KEY_LENGTH}}}(\.|$)")
 
 
@@ -186,13 +187,13 @@ class Workspace:
                 path.unlink()
 
     def read_run(self) -> dict[str, Any]:
-        """run.json, or an empty run for a new workspace."""
+        """run.json, or an empty run for a new workspace. Paths in its options are absolute."""
         try:
             value = json.loads((self.root / RUN_FILE).read_text("utf-8"))
             value = manifests.unsealed(value) if manifests.SEAL in value else value
             if value["version"] == RUN_VERSION:
                 _RunFile.model_validate(value, strict=True)
-                return value
+                return value | {"options": _with_paths(value["options"], lambda path: str(self.root.absolute() / path))}
             reason = f"it has version {value['version']}, this program reads {RUN_VERSION}"
         except FileNotFoundError:
             return {"version": RUN_VERSION, "options": {}, "plans": {}, "keys": {}}
@@ -205,11 +206,22 @@ class Workspace:
 
     def write_run(self, run: dict[str, Any]) -> None:
         """Write run.json durably. Raises StageError if it cannot be written."""
+        run = run | {"options": self.portable(run["options"])}
         text = json.dumps(manifests.sealed(run), indent=1, sort_keys=True, allow_nan=False)
         try:
             write_durably(self.root / RUN_FILE, (text + "\n").encode())
         except OSError as error:
             raise self._cannot_write(error) from error
+
+    def portable(self, options: Mapping[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+        """Options by stage, with paths that lie in the workspace relative to it: they go with it where it is moved."""
+        return _with_paths(options, self._relative)
+
+    def _relative(self, path: str) -> str:
+        for real in (os.path.abspath, os.path.realpath):
+            if (place := Path(real(path))).is_relative_to(root := real(self.root)):
+                return place.relative_to(root).as_posix()
+        return path
 
     def link_outputs(self, folder: Path, names: tuple[str, ...]) -> None:
         """Point ``output/<name>`` at the files of a finished folder; copies, made once, where links are not allowed.
@@ -320,8 +332,22 @@ def lasting(path: Path, root: Path) -> Path:
     path, output = path.absolute(), os.path.realpath(root / "output")
     for shown in (path, *path.parents):
         if os.path.realpath(shown.parent) == output and (root / RUN_FILE).is_file():
-            return Workspace(root)._source_of(shown) / path.relative_to(shown)
+            return Workspace(root.absolute())._source_of(shown) / path.relative_to(shown)
     return path
+
+
+def is_result(path: Path, root: Path) -> bool:
+    """Whether ``path`` lies in a result of the workspace at ``root``, shown in its ``output/`` or where it stays."""
+    inside = Path(os.path.relpath(os.path.realpath(lasting(path, root)), os.path.realpath(root))).parts
+    return len(inside) > 1 and inside[0] in STAGES and _KEY.match(inside[1]) is not None
+
+
+def _with_paths(options: Mapping[str, dict[str, Any]], change: Callable[[str], str]) -> dict[str, dict[str, Any]]:
+    """Options by stage, with their paths changed."""
+    return {
+        stage: values | {name: change(path) for name in _PATHS if isinstance(path := values.get(name), str)}
+        for stage, values in options.items()
+    }
 
 
 def _whole(folder: Path) -> Manifest | None:

@@ -1,6 +1,7 @@
 """The photos and masks that a transforms file names: where they lie, and how their names may be spelt there."""
 
 import os
+import re
 import unicodedata
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -28,13 +29,22 @@ class FrameFiles:
     def photo(self, frame: dict[str, Any]) -> Path:
         """The photo of a frame: in a file of ours by its own name first, then by ``file_path``.
 
-        One that is nowhere is returned as if it were in the first folder, and refused when it is to be decoded.
+        Where the first folder is a reduction of the one that it names, as ``images_4`` of ``images/0.png``, its smaller
+        copy. One that is nowhere is returned as if it were in the first folder, and refused when it is to be decoded.
         """
         name, *copies = photo_names(frame)
+        if (reduced := self._reduced(name)) is not None and reduced.is_file():
+            return reduced
         file = self._file(name, self.folders, "photo")
         # Not beside the cameras: there lie ingest's copies, none of PHOTOS, which stand in for no photo removed.
         found = (self._file(copy, self.folders[:2], "photo") for copy in copies)
         return file if file.is_file() else next(filter(Path.is_file, found), file)
+
+    def _reduced(self, name: str) -> Path | None:
+        """Where the smaller copy of a photo would be in the first folder; None where that is no folder of such."""
+        folder, _, inside = os.path.normpath(name.replace("\\", "/")).partition("/")
+        is_reduction = re.fullmatch(rf"{re.escape(folder)}_\d+", self.folders[0].name)
+        return self._file(inside, self.folders[:1], "photo") if is_reduction else None
 
     def mask(self, name: str) -> Path:
         """The mask of this name, found as photos are."""
@@ -45,14 +55,14 @@ class FrameFiles:
         tried as Windows means it, with backslashes between folders, and then in other spellings."""
         spellings = dict.fromkeys((name, name.replace("\\", "/")))
         for spelling, folder, extension in product(spellings, folders, _EXTENSIONS_TRIED):
-            file = _inside(folder, spelling + extension, what)
+            file = _inside(folder, self.folders[0], spelling + extension, what)
             if file.is_file():
                 return file
         for spelling, folder in product(spellings, folders):
             alike = self._alike(folder, spelling)
-            if alike is not None and (file := _inside(folder, alike, what)).is_file():
+            if alike is not None and (file := _inside(folder, self.folders[0], alike, what)).is_file():
                 return file
-        return _inside(folders[0], name, what)
+        return _inside(folders[0], self.folders[0], name, what)
 
     def _alike(self, folder: Path, name: str) -> str | None:
         """What is in ``folder`` by another spelling of ``name``, relative to it: with the letters of its endings small
@@ -84,13 +94,17 @@ def _spellings_of(entry: str) -> Iterator[_Spelling]:
         yield stem, None
 
 
-def _inside(folder: Path, file_path: str, what: str) -> Path:
+def _inside(folder: Path, root: Path, file_path: str, what: str) -> Path:
+    """The file of this name in ``folder``. Raises StageError where it leads out of there, but for a link to ``root``,
+    which the user gave."""
     file = folder / os.path.normpath(file_path)
-    absolute = Path(file_path).is_absolute()
-    if absolute or "\0" in file_path or not file.resolve().is_relative_to(folder.resolve()):
+    absolute, is_name = Path(file_path).is_absolute(), "\0" not in file_path
+    if absolute or not is_name or not any(file.resolve().is_relative_to(place.resolve()) for place in (folder, root)):
+        linked = is_name and what == "photo" and not absolute and ".." not in file.relative_to(folder).parts
         raise StageError(
             f"refused the {what} {file_path[:MOST_LETTERS]!r}",
             "its path is absolute" if absolute else f"it leads out of the folder {folder}",
+            "Give the photo folder apart, if it is a link: pipeline run PHOTOS --cameras FILE." if linked else
             f"A transforms file may name {what}s inside its own folder only.",
-        )
+        )  # fmt: skip
     return file

@@ -56,7 +56,7 @@ NEEDS: tuple[str, ...] = ()
 VERSION = 10
 RESUMES = False
 NOTES = "notes.json"
-LINKS = ("photos.json", NOTES, "images", "masks")
+LINKS = ("photos.json", NOTES, "images", "masks", "opaque")
 # What it decides here, which files are photos and which frames they are, is in the digest that stands for ``photos``.
 UNKEYED = ("cameras",)
 

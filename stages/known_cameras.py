@@ -10,6 +10,7 @@ import unicodedata
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import takewhile
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
@@ -31,7 +32,7 @@ from stages.transforms_intrinsics import read_intrinsics
 
 ORTHONORMAL_WITHIN = 1e-3  # largest entry of RᵀR − 1 that is rounding; beyond it a matrix means something else
 LARGEST_ENTRY = 1e6  # of a matrix that is looked at more closely: products of three of them are numbers
-MOST_NAMES = 5
+MOST_NAMES, FEW_NAMES = 5, 2
 APPROXIMATION = "approximation"  # how the note begins of a lens that is not the one it stands for
 
 
@@ -86,9 +87,10 @@ def _from_transforms(cameras: Path, photos: Sequence[Photo], frames: Mapping[str
     by_name = {photo.name: photo for photo in photos}
     framed: dict[str, _Framed] = {}
     absent, test_files, approximate = [], [], 0
+    unused: dict[str, Photo] = {}  # by file
     splits, notes = read_splits(cameras, lambda frame: frames.get(frame["file_path"]) in by_name)
     for where, content in splits:
-        held_out = _held_out(content, where, notes)
+        held_out, in_no_split = _split(content, where, notes)
         for frame in content["frames"]:
             name = frame["file_path"]
             photo = by_name.get(frames.get(name, ""))
@@ -96,6 +98,9 @@ def _from_transforms(cameras: Path, photos: Sequence[Photo], frames: Mapping[str
                 absent.append(name)
                 continue
             file = photo.image_name
+            if PurePosixPath(name) in in_no_split:
+                unused[file] = photo
+                continue
             if file in framed:
                 raise StageError(f"two frames for the photo {photo.name}", f"one is {name!r}", HINT)
             values = {**content, **frame}
@@ -107,34 +112,54 @@ def _from_transforms(cameras: Path, photos: Sequence[Photo], frames: Mapping[str
             notes.append(none_among_the_photos(len(held_out), where))
     if approximate:
         notes.append(f"the lenses of {approximate} frames are approximations, as their notes in the file say")
+    if not framed:
+        raise _nothing_matches(splits[0][0], absent, photos)
     upright = _are_of_upright_photos(framed.values())
     posed = [_from_frame(framed[file], upright) for file in sorted(framed)]
     left_out = without_rays(posed)
     kept = [one for one in posed if one.file not in left_out]
-    unposed = [photo.name for photo in photos if photo.image_name not in framed]
+    unposed = [photo.name for photo in photos if photo.image_name not in framed.keys() | unused.keys()]
     kept_tests = sorted(set(test_files) - left_out.keys())
     if test_files and not kept_tests:
         notes.append("all official test photos are among those left out, so others are held out")
+    if unused:
+        names = _few(sorted(photo.name for photo in unused.values()))
+        notes.append(f"{len(unused)} photos are neither to train nor to test on and are left out: {names}")
     return KnownCameras(
-        model=_without_points(kept, splits[0][0]),
-        left_out=left_out,
+        model=SparseModel.without_points(*distinct(kept)),
+        left_out=left_out | dict.fromkeys(unused, "the transforms file has it neither to train nor to test on"),
         test_files=kept_tests or None,
         notes=_notes(absent, unposed, posed, left_out) + notes,
     )
 
 
-def _held_out(content: Mapping[str, Any], source: str, notes: list[str]) -> set[PurePosixPath]:
-    """The official test photos by file_path: nerfstudio's ``test_filenames``, else its ``val_filenames``. Of names that
-    no frame has, a note is left. Raises StageError where none has a frame."""
-    names = content.get("test_filenames") or content.get("val_filenames") or []
+def _split(content: Mapping[str, Any], source: str, notes: list[str]) -> tuple[set[PurePosixPath], set[PurePosixPath]]:
+    """The official test photos by file_path, nerfstudio's ``test_filenames``, else its ``val_filenames``, less those
+    that its ``train_filenames`` have as well; and the frames that are in no split, where there are such. What is
+    repeated is noted."""
+    train = _listed(content, "train_filenames", source, notes)
+    of_frames = {PurePosixPath(frame["file_path"]) for frame in content["frames"]}
+    for key in ("test_filenames", "val_filenames"):
+        names = _listed(content, key, source, notes)
+        if repeated := len(names & train):
+            notes.append(f"{key} of {source} repeats {repeated} photos to train on: they stay that")
+        if own := names - train:
+            return own, of_frames - train - own if train else set()
+    return set(), of_frames - train if train else set()
+
+
+def _listed(content: Mapping[str, Any], key: str, source: str, notes: list[str]) -> set[PurePosixPath]:
+    """The photos in a list of a transforms file, by file_path. Of names that no frame has, a note is left. Raises
+    StageError where none has a frame."""
+    names = content.get(key) or []
     if not (isinstance(names, list) and all(isinstance(name, str) for name in names)):
-        raise unusable(f"the test photos of {source}", "test_filenames (or val_filenames) is no list of names")
+        raise unusable(f"the {key} of {source}", "it is no list of names")
     of_frames = {PurePosixPath(frame["file_path"]) for frame in content["frames"]}
     strange = [name[:MOST_LETTERS] for name in names if PurePosixPath(name) not in of_frames]
     if strange and len(strange) == len(names):
-        raise unusable(f"the test photos of {source}", f"none of them is the file_path of a frame: {_few(strange)}")
+        raise unusable(f"the {key} of {source}", f"none of them is the file_path of a frame: {_few(strange)}")
     if strange:
-        notes.append(f"{len(strange)} test photos of {source} have no frame: {_few(strange)}")
+        notes.append(f"{len(strange)} photos in {key} of {source} have no frame: {_few(strange)}")
     return set(map(PurePosixPath, names))
 
 
@@ -163,12 +188,6 @@ def _from_frame(framed: _Framed, upright: bool) -> PosedPhoto:
     name = framed.frame["file_path"]
     pose = _pose(framed.frame["transform_matrix"], name)
     return posed_photo(framed.photo, name, _given_camera(framed, upright), pose, upright)
-
-
-def _without_points(posed: Sequence[PosedPhoto], source: str) -> SparseModel:
-    if not posed:
-        raise _nothing_matches(source)
-    return SparseModel.without_points(*distinct(posed))
 
 
 def _pose(matrix: Any, name: str) -> Float[np.ndarray, "3 4"]:
@@ -202,7 +221,7 @@ def _from_colmap(folder: Path, photos: Sequence[Photo]) -> KnownCameras:
     given = _with_slashes(read_model(folder), photos)
     photo_of = _by_name([image.file for image in given.images], photos)
     if not photo_of:
-        raise _nothing_matches(folder.name)
+        raise _nothing_matches(folder.name, [image.file for image in given.images], photos)
     upright = _is_of_upright_photos(folder, given, photo_of)
     posed = {}
     for i in sorted(photo_of, key=lambda i: photo_of[i].image_name):
@@ -251,11 +270,12 @@ def _is_of_upright_photos(folder: Path, given: SparseModel, photo_of: Mapping[in
 
 def _by_name(names: Sequence[str], photos: Sequence[Photo]) -> dict[int, Photo]:
     """Photo by index of its image: of the same name, else of the name that ingest gave it, else of a name whose
-    accents are composed in another way, else of the same end, else of the same name but for its ending."""
+    accents are composed in another way, else of the same name below a folder that all have, else of the same end, else
+    of the same name but for its ending."""
     found: dict[int, Photo] = {}
     taken: set[str] = set()
     by_own, by_given = {photo.name: photo for photo in photos}, {photo.image_name: photo for photo in photos}
-    tiers = (by_own, by_given, _by_key(names, photos, _composed), _by_end(names, photos))
+    tiers = (by_own, by_given, _by_key(names, photos, _composed), _by_folder(names, photos), _by_end(names, photos))
     for photo_of in (*tiers, _by_key(names, photos, _without_ending)):
         for index, name in enumerate(names):
             photo = photo_of.get(name)
@@ -263,6 +283,32 @@ def _by_name(names: Sequence[str], photos: Sequence[Photo]) -> dict[int, Photo]:
                 found[index] = photo
                 taken.add(photo.name)
     return found
+
+
+def _by_folder(names: Sequence[str], photos: Sequence[Photo]) -> dict[str, Photo]:
+    """Photo by name of its image where all images, or else all photos, lie in a folder more: ``images/left/0.jpg`` is
+    ``left/0.jpg``. Of several such folders as few as have a match are left out."""
+    own = [photo.name for photo in photos]
+    of_images = ((_without_folders(names, count), own) for count in range(1, _shared_folders(names) + 1))
+    of_photos = ((names, _without_folders(own, count)) for count in range(1, _shared_folders(own) + 1))
+    for images, called in (*of_images, *of_photos):
+        by_name = dict(zip(map(_composed, called), photos, strict=True))
+        found = {
+            n: by_name[key] for n, image in zip(names, images, strict=True) if (key := _composed(image)) in by_name
+        }
+        if found:
+            return found
+    return {}
+
+
+def _shared_folders(names: Sequence[str]) -> int:
+    """How many folders all the names begin with."""
+    folders = (PurePosixPath(_composed(name)).parent.parts for name in names)
+    return len(list(takewhile(lambda parts: len(set(parts)) == 1, zip(*folders, strict=False))))
+
+
+def _without_folders(names: Sequence[str], count: int) -> list[str]:
+    return [str(PurePosixPath(*PurePosixPath(name).parts[count:])) for name in names]
 
 
 def _by_end(names: Sequence[str], photos: Sequence[Photo]) -> dict[str, Photo]:
@@ -312,10 +358,11 @@ def _without_ending(name: str) -> str:
 # --- both
 
 
-def _nothing_matches(source: str) -> StageError:
+def _nothing_matches(source: str, names: Sequence[str], photos: Sequence[Photo]) -> StageError:
+    here = _few([photo.name for photo in photos], FEW_NAMES)
     return StageError(
         f"no camera in {source} belongs to a photo",
-        "none of the names in it is the name of a photo",
+        f"it is of {_few(names, FEW_NAMES)}, and the photos are {here}",
         "Give the folder of the very photos that the cameras were made for.",
     )
 
@@ -337,5 +384,5 @@ def _notes(
     return notes
 
 
-def _few(names: Sequence[str]) -> str:
-    return ", ".join(names[:MOST_NAMES]) + (", …" if len(names) > MOST_NAMES else "")
+def _few(names: Sequence[str], most: int = MOST_NAMES) -> str:
+    return ", ".join(names[:most]) + (", …" if len(names) > most else "")

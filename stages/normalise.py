@@ -90,6 +90,9 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     write_json(folder / "scene.json", scene.to_json())
     write_tensors(folder / "points.safetensors", _points(model, sfm, found))
     write_json(folder / "transforms.json", transforms(scene))
+    if (without := sum(view.mask is None for view in scene.views)) and any(photo.mask for photo in photos):
+        them = f"{without} of {len(scene.views)} photos have none"
+        progress.note(f"transforms.json names no masks: nerfstudio takes one for each photo or none, and {them}")
     return StageResult(
         outputs=("scene.json", "points.safetensors", "transforms.json"),
         line=_line(found),

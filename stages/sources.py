@@ -14,7 +14,8 @@ from typing import Literal
 from stages.contract import StageError
 from stages.frame_files import FrameFiles
 from stages.listing import FOLDER_HINT, IMAGES, files_below, is_video, list_photos, photo_root, walk_photos
-from stages.transforms_files import HELD_OUT, TRAIN, read_splits
+from stages.masks import pair_masks
+from stages.transforms_files import HELD_OUT, TRAIN, photo_names, read_splits
 from stages.twins import twins
 
 SourceKind = Literal["photos", "video", "transforms", "blender", "colmap"]
@@ -113,12 +114,18 @@ def unused_cameras(source: Source) -> Path | None:
 
 
 def unused_masks(source: Source) -> Path | None:
-    """A folder beside photos that have no masks, in which there would be some if it were their ``masks`` folder."""
+    """A folder beside photos that have no masks, or beside the file of their cameras, in which there would be some if
+    it were their ``masks`` folder."""
     if source.masks:
         return None
-    wanted = {stem for file in source.files for stem in (file.stem, file.name)}
-    folders = (source.root.parent / name for name in ("masks", "mask"))
-    return next((folder for folder in folders if wanted & {file.stem for file in folder.glob("*.png")}), None)
+    names = [source.name(file) for file in source.files]
+    folders = [source.root.parent / name for name in ("masks", "mask")]
+    folders += [source.cameras.parent / "masks"] if source.cameras else []
+    for folder in filter(Path.is_dir, folders):
+        inside = files_below(folder, lambda _: True)
+        if pair_masks(names, [(_name(folder, file), file) for file in inside])[0]:
+            return folder
+    return None
 
 
 def photos_beside(source: Source, photos: Path) -> int:
@@ -194,7 +201,9 @@ def _from_transforms(kind: SourceKind, root: Path, cameras: Path) -> Source:
     files = {frame["file_path"]: find.photo(frame) for frame in frames}
     in_order = _sorted_inside(root, set(files.values()))
     photos = {path: _name(root, file) for path, file in files.items()}
-    named = {photos[frame["file_path"]]: mask for frame in frames if (mask := frame.get("mask_path"))}
+    # In a file of ours they are of ingest's copies: those that lie with the photos count.
+    foreign = [frame for frame in frames if len(photo_names(frame)) == 1]
+    named = {photos[frame["file_path"]]: mask for frame in foreign if (mask := frame.get("mask_path"))}
     masks = tuple((f"{photo}.png", find.mask(mask)) for photo, mask in named.items())
     return Source(kind, root, cameras, in_order, photos, masks)
 

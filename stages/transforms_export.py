@@ -37,19 +37,22 @@ def transforms(scene: Scene) -> dict[str, Any]:
     """The content of transforms.json. Intrinsics stand once if all photos share them, else in every frame; a model that
     all have stands at the top, too: nerfstudio reads ``camera_model`` nowhere else.
 
-    ``file_path`` is the decoded photo, ``photo`` its own name. ``scale`` and ``offset`` place the region of interest in
-    instant-ngp's unit cube. A camera model that the format lacks is written as the nearest one, with a ``note``.
+    ``file_path`` is the decoded photo, ``photo`` its own name, ``mask_path`` its mask, if every photo has one, as
+    nerfstudio wants it. ``scale`` and ``offset`` place the region of interest in instant-ngp's unit cube. A camera
+    model that the format lacks is written as the nearest one, with a ``note``.
     Raises ValueError for a model without any counterpart.
     """
     cameras = [intrinsics(camera) for camera in scene.cameras]
     used = {view.camera for view in scene.views}
     models = {cameras[camera]["camera_model"] for camera in used}
     shared = len(used) == 1
+    all_masked = all(view.mask for view in scene.views)
     sfm_from_scene = scene.scene_from_sfm.inverse()
     frames = []
     for view in scene.views:
-        own = {} if shared else cameras[view.camera]
+        own = {} if shared else dict(cameras[view.camera])
         pose = opengl_matrix(sfm_from_scene.pose(view.scene_from_camera))
+        own |= {"mask_path": view.mask} if all_masked else {}
         frames.append(own | {"file_path": view.file, "photo": view.name, "transform_matrix": pose})
     scale = scene.scene_from_sfm.scale / 2  # of instant-ngp: [-1, 1] to [0, 1]
     common = {"camera_model": models.pop()} if len(models) == 1 else {}

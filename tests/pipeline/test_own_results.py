@@ -8,8 +8,11 @@ import pytest
 from PIL import Image
 
 from pipeline.cli import run_command
+from pipeline.display import SilentDisplay
+from pipeline.runner import Runner
 from pipeline.settings import Settings
-from pipeline.workspace import COPIES, Workspace, lasting
+from pipeline.workspace import COPIES, Workspace, is_result, lasting
+from stages.sfm import Config as SfmConfig
 
 SHOWN = {"render": "path.json", "sfm": "sparse", "normalise": "transforms.json"}
 KEY = "0123456789abcdef"
@@ -71,7 +74,7 @@ def test_cameras_of_photos_are_read_where_they_stay(
     given: str, stays: str, workspace: Path, photos: Path, seen: list[Settings], monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.chdir(workspace)
-    assert run_command(["run", str(photos), "-o", str(workspace), "--cameras", given]) == 0
+    assert run_command(["run", str(photos), "-o", ".", "--cameras", given]) == 0
     assert [(settings.ingest.cameras, settings.sfm.cameras) for settings in seen] == [(workspace / stays,) * 2]
 
 
@@ -106,3 +109,40 @@ def test_clean_keeps_what_the_options_name(workspace: Path):
         assert run_command(["clean", str(workspace)]) == 0
         assert (workspace / "render" / KEY / "path.json").exists() == stays
         assert not (workspace / "sfm" / KEY).exists()
+
+
+def test_what_the_options_name_inside_goes_with_a_moved_workspace(workspace: Path, tmp_path: Path):
+    (workspace / "mine").mkdir()
+    inside, outside = workspace / "sfm" / KEY / "sparse", str(tmp_path / "set/transforms.json")
+    options = {"ingest": {"photos": str(workspace / "mine")}, "sfm": {"cameras": str(inside)}}
+    with Workspace(workspace) as held:
+        held.write_run(held.read_run() | {"options": options | {"render": {"cameras": outside}}})
+    moved = workspace.rename(tmp_path / "moved.nerf")
+    (tmp_path / "link").symlink_to(moved)
+    for root in (moved, tmp_path / "link"):
+        options = Workspace(root).read_run()["options"]
+        assert options["ingest"]["photos"] == str(root / "mine"), "also where no result lies"
+        assert options["sfm"]["cameras"] == str(root / "sfm" / KEY / "sparse")
+        assert options["render"]["cameras"] == outside
+    assert run_command(["clean", str(moved)]) == 0
+    assert (moved / "sfm" / KEY / "sparse/images.bin").exists() and not (moved / "normalise" / KEY).exists()
+
+
+def test_a_budget_is_of_the_same_options_in_a_moved_workspace(tmp_path: Path):
+    def of_options(root: Path) -> str:
+        settings = Settings(sfm=SfmConfig(cameras=root / "sfm" / KEY / "sparse"))
+        return Runner(Workspace(root), settings, SilentDisplay())._options_digest()
+
+    assert of_options(tmp_path / "w.nerf") == of_options(tmp_path / "moved.nerf")
+
+
+def test_a_result_is_no_photo_set_of_its_own_workspace(workspace: Path, photos: Path, capsys: pytest.CaptureFixture):
+    shutil.copytree(photos, workspace / "ingest" / KEY / "images")
+    with Workspace(workspace) as held:
+        held.link_outputs(workspace / "ingest" / KEY, ("images",))
+    for place in ("output/images", f"ingest/{KEY}/images"):
+        assert run_command(["run", str(workspace / place), "-o", str(workspace)]) == 2
+        assert "is a result of that workspace" in capsys.readouterr().err
+    assert (workspace / "output/images/0.png").is_file()
+    shutil.copytree(photos, workspace / "mine")
+    assert not is_result(workspace / "mine", workspace) and not is_result(photos, workspace)

@@ -328,7 +328,7 @@ def test_a_full_disk_under_the_books_is_the_workspaces_fault(tmp_path: Path, mon
     with Workspace(tmp_path / "w.nerf") as workspace:
         monkeypatch.setattr("pipeline.workspace.write_durably", full)
         with pytest.raises(StageError, match="No space left on device"):
-            workspace.write_run({})
+            workspace.write_run(workspace.read_run())
     monkeypatch.setattr(Path, "write_text", full)
     with pytest.raises(StageError, match="No space left on device"), Workspace(tmp_path / "other.nerf"):
         pass

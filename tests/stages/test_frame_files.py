@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from stages.sources import find_source
+from stages.sources import find_source, unused_masks
 from tests.stages.test_sources import names, refusal, touch, transforms
 
 
@@ -66,11 +66,42 @@ def test_another_spelling_leads_out_of_the_folder_no_more_than_the_name(tmp_path
     assert error.what == "refused the photo 'a.JPG'"
 
 
+def test_a_linked_folder_of_photos_may_be_given_apart_from_its_cameras(tmp_path: Path) -> None:
+    touch(tmp_path, "disk/images/a.jpg", "secret.jpg", "set/notes")
+    (tmp_path / "set/images").symlink_to(tmp_path / "disk/images")
+    cameras = transforms(tmp_path / "set/transforms.json", "images/a.jpg")
+    assert "pipeline run PHOTOS --cameras FILE" in refusal(cameras).hint
+    for photos in ("set/images", "set"):
+        assert names(find_source(tmp_path / photos, cameras)) == ["a.jpg"]
+    (tmp_path / "disk/images/b.jpg").symlink_to(tmp_path / "secret.jpg")
+    assert refusal(tmp_path / "set", transforms(cameras, "images/b.jpg")).what == "refused the photo 'images/b.jpg'"
+
+
 def test_masks_of_transforms_files_are_found_in_another_spelling(tmp_path: Path) -> None:
     touch(tmp_path, "a.jpg", "masks/a.PNG")
     frame = {"file_path": "a.jpg", "mask_path": "masks/a.png", "transform_matrix": []}
     (tmp_path / "transforms.json").write_text(json.dumps({"frames": [frame]}))
     assert find_source(tmp_path / "transforms.json").masks[0] == ("a.jpg.png", tmp_path / "masks/a.PNG")
+
+
+def test_masks_that_our_own_export_names_are_copies_of_those_of_the_photos(tmp_path: Path) -> None:
+    touch(tmp_path, "set/a.jpg", "w.nerf/output/masks/a.jpg.png")
+    frame = {"file_path": "images/a.jpg", "photo": "a.jpg", "mask_path": "masks/a.jpg.png", "transform_matrix": []}
+    cameras = tmp_path / "w.nerf/output/transforms.json"
+    cameras.write_text(json.dumps({"frames": [frame]}))
+    without = find_source(tmp_path / "set", cameras)
+    assert without.masks == () and unused_masks(without) == cameras.parent / "masks"
+    touch(tmp_path, "set/masks/a.png")
+    found = find_source(tmp_path / "set", cameras)
+    assert found.masks == (("a.png", tmp_path / "set/masks/a.png"),) and unused_masks(found) is None
+
+
+def test_a_folder_of_reduced_photos_stands_in_for_the_one_that_is_named(tmp_path: Path) -> None:
+    touch(tmp_path, "images/a.jpg", "images/left/b.JPG", "images_4/a.jpg", "images_4/left/b.jpg", "other_4/a.jpg")
+    cameras = transforms(tmp_path / "transforms.json", "images/a.jpg", "./images/left/b.JPG")
+    assert names(find_source(tmp_path / "images_4", cameras)) == ["a.jpg", "left/b.jpg"]
+    assert "is not among the photos" in str(refusal(tmp_path / "other_4", cameras)), "another folder is no reduction"
+    assert names(find_source(tmp_path / "images", cameras)) == ["a.jpg", "left/b.JPG"]
 
 
 def test_each_folder_is_listed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

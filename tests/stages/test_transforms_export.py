@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -51,6 +52,15 @@ def test_names_split_and_shared_intrinsics() -> None:
     assert (content["fl_x"], content["fl_y"], content["cx"], content["cy"]) == PINHOLE.params
     assert (content["w"], content["h"], content["camera_model"]) == (640, 480, "OPENCV")
     assert set(content["frames"][0]) == {"file_path", "photo", "transform_matrix"}
+
+
+@pytest.mark.parametrize("without", [0, 1, 4])
+def test_masks_are_named_where_every_photo_has_one(without: int) -> None:
+    scene = scene_of((PINHOLE, PINHOLE), ring(4))
+    views = [replace(view, mask=f"masks/{i}.png" if i >= without else None) for i, view in enumerate(scene.views)]
+    frames = transforms(replace(scene, views=tuple(views)))["frames"]
+    expected = [None if without else f"masks/{i}.png" for i in range(4)]
+    assert [frame.get("mask_path") for frame in frames] == expected
 
 
 def test_different_cameras_stand_in_their_frames() -> None:

@@ -1,6 +1,7 @@
 """What only belongs to a photo is set aside by its name, and no photo is."""
 
 import shutil
+import unicodedata
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from stages import ingest
 from stages.decoding import Stored
 from stages.ingest import Config
 from stages.photos import read_photos
-from stages.sources import find_source
+from stages.sources import find_source, unused_masks
 from stages.twins import depth_maps, is_mask, twins
 from tests.stages.test_sources import touch
 
@@ -219,3 +220,13 @@ def test_cameras_that_would_not_be_accepted_are_not_named(other: str, tmp_path: 
         ingest.run(Config(photos=tmp_path / "in"), {}, tmp_path / "out", progress)
         assert progress.notes == []
         shutil.rmtree(tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("photo", "mask"),
+    [("ä.jpg", unicodedata.normalize("NFD", "ä.png")), ("a.jpg", "a.PNG"), ("left/a.jpg", "left/a.jpg.png")],
+)
+def test_masks_that_are_not_used_are_seen_by_the_names_that_would_do(photo: str, mask: str, tmp_path: Path) -> None:
+    touch(tmp_path, f"frames/{photo}", f"masks/{mask}", "masks/another.png")
+    assert unused_masks(find_source(tmp_path / "frames")) == tmp_path / "masks"
+    assert not unused_masks(find_source(touch(tmp_path, "other/b.jpg") / "other"))
