@@ -39,6 +39,7 @@ LEAST_MOTION = 0.01
 # nothing is known to be shared.
 FOLLOWED_SHARE, LOST = 1 / 3, 1.0
 FEWEST_FRAMES = 3  # as sfm needs
+COUNTED_TOO_MANY = 2  # frames that a whole video's container may count and not hold
 # Widths over heights of pixels: what is stored for tape has 8/11 to 2; others are not believed, 0 is not known.
 PIXEL_ASPECTS = (0.25, 4.0)
 JPEG_QUALITY = 95  # far closer to the frame than the video is to what the camera saw
@@ -143,7 +144,7 @@ def _measure(video: Path, progress: Progress) -> list[Frame]:
                 progress.update(f"looked at {len(frames)} frames of {video.name}", share)
     if not frames:
         raise _undecodable(video, "not one frame of it can be decoded")
-    if len(frames) < 0.98 * announced:  # a container may count a frame or two too many
+    if announced - len(frames) > max(COUNTED_TOO_MANY, 0.02 * announced):
         progress.note(f"only {len(frames)} of {announced} frames of {video.name} can be decoded: is the file whole?")
     return frames
 

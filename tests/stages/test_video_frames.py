@@ -240,3 +240,17 @@ def test_a_video_whose_end_is_missing_is_said(tmp_path: Path, progress: Any) -> 
     words = progress.notes[0].split()
     assert " ".join(words[:2]) == "only" + f" {words[1]}" and 10 < int(words[1]) < 40
     assert progress.notes[0].endswith("of 40 frames of a.mp4 can be decoded: is the file whole?")
+
+
+def test_a_short_video_may_count_a_frame_too_many(tmp_path: Path, progress: Any, monkeypatch: Any) -> None:
+    def counted(capture: Any, what: int) -> float:
+        return get(capture, what) + (what == cv2.CAP_PROP_FRAME_COUNT)
+
+    get = cv2.VideoCapture.get
+
+    class Counting(cv2.VideoCapture):
+        get = counted
+
+    monkeypatch.setattr(cv2, "VideoCapture", Counting)
+    taken(clip(tmp_path / "a.mp4", panned(*np.arange(30) / 40)), tmp_path / "out", progress)
+    assert not any("can be decoded" in note for note in progress.notes)
