@@ -115,10 +115,24 @@ def _slab(origin: float, direction: float):
 
 
 @wp.func
-def _inverse(contracted: int, speed: float):
-    """Of how fast a unit coordinate moves along the ray where coordinates are linear; finite where it stands still."""
-    inverse = wp.where(contracted != 0, 2.0 * _HALF, 2.0 * _BOX) / speed
-    return wp.where(wp.abs(inverse) < _LARGEST, inverse, _LARGEST)
+def _box(origin: wp.vec3, direction: wp.vec3):
+    """Where a ray enters the box of a bounded scene, and where it leaves it."""
+    on_x = _slab(origin[0], direction[0])
+    on_y = _slab(origin[1], direction[1])
+    on_z = _slab(origin[2], direction[2])
+    return wp.vec2(wp.max(wp.max(on_x[0], on_y[0]), on_z[0]), wp.min(wp.min(on_x[1], on_y[1]), on_z[1]))
+
+
+@wp.func
+def _inverse(contracted: int, direction: wp.vec3):
+    """Of how fast unit coordinates move along the ray where they are linear; finite where one stands still."""
+    inverse = wp.cw_div(wp.vec3(wp.where(contracted != 0, 2.0 * _HALF, 2.0 * _BOX)), direction)
+    return wp.vec3(_finite(inverse[0]), _finite(inverse[1]), _finite(inverse[2]))
+
+
+@wp.func
+def _finite(number: float):
+    return wp.where(wp.abs(number) < _LARGEST, number, _LARGEST)
 
 
 @wp.func
@@ -178,17 +192,15 @@ def _march(
     if near >= far:  # its light is used up
         return
     if contracted == 0:
-        on_x = _slab(o[0], d[0])
-        on_y = _slab(o[1], d[1])
-        on_z = _slab(o[2], d[2])
-        near = wp.max(near, wp.max(wp.max(on_x[0], on_y[0]), on_z[0]))
-        far = wp.max(near, wp.min(far, wp.min(wp.min(on_x[1], on_y[1]), on_z[1])))
+        within = _box(o, d)
+        near = wp.max(near, within[0])
+        far = wp.max(near, wp.min(far, within[1]))
     first = lattice_coordinate(step, cone, near)
     last = lattice_coordinate(step, cone, far) - first
     count = int(0)
     k = int(0)
     scale = float(cells)
-    inverse = wp.vec3(_inverse(contracted, d[0]), _inverse(contracted, d[1]), _inverse(contracted, d[2]))
+    inverse = _inverse(contracted, d)
     while float(k) < last and count < most:
         s = first + jitter[ray] + float(k)
         t = lattice_distance(step, cone, s)
