@@ -185,16 +185,16 @@ def _reason(
     features, (seen, agreeing) = int(matches.keypoints[index]), support
     if not features:
         return "no features found in it: blurred, dark or without texture"
+    few = f" (only {features} features found in it)" if features < FEW_FEATURES else ""
     mine = (matches.pairs == index).any(axis=1)
     if not mine.any():
-        few = f" (only {features} features found in it)" if features < FEW_FEATURES else ""
         return f"it shares no view with any other photo{few}"
     if others := [model for model in models[1:] if names[index] in model]:
         return f"it belongs to another group of {len(others[0])} photos that does not connect to this one"
     partners = matches.pairs[mine].sum(axis=1) - index
     in_model = np.array([names[partner] in models[0] for partner in partners])
     if not in_model.any():
-        return f"it shares views only with photos that are not registered either ({len(partners)} of them)"
+        return f"it shares views only with photos that are not registered either ({len(partners)} of them){few}"
     if seen >= FEWEST_MATCHES and agreeing >= FEWEST_MATCHES:
         return f"its position is not sure: {agreeing} of its {seen} features that are points of the model agree on one"
     if seen >= FEWEST_MATCHES:
@@ -206,7 +206,7 @@ def _reason(
     if matches.flat[mine][in_model].all():
         turned = f"all {int(in_model.sum())} of its pairs with registered photos"
         return f"{turned} differ by a turn of the camera alone, or show one flat surface"
-    return f"too few of its features are points of the model: {seen}, {FEWEST_MATCHES} are needed"
+    return f"too few of its features are points of the model: {seen}, {FEWEST_MATCHES} are needed{few}"
 
 
 def why_no_model(photos: "Sequence[Photo]", matches: Matches, registered: int, points: int) -> StageError:

@@ -39,9 +39,9 @@ def view_dependence_evidence(tracks: TrackColours, fit: ExposureFit) -> Evidence
     cosine = np.clip(np.sum(towards[first] * towards[second], axis=1), -1, 1)
     angle = np.degrees(np.arccos(cosine))
     low, high = np.quantile(angle, [1 / 3, 2 / 3]) if len(angle) else (0.0, 0.0)
-    spread = float(high - low)
-    if len(angle) and spread < LEAST_SPREAD_DEG:
-        return unknown(unit, THRESHOLD, f"points are seen from directions {spread:.1f}° apart", None)
+    if len(angle) and high - low < LEAST_SPREAD_DEG:
+        why = f"points are seen from directions {low:.1f}° to {high:.1f}° apart, too alike to compare"
+        return unknown(unit, THRESHOLD, why, None)
     wide = angle >= high
     chosen = wide | (angle <= low)
     if min(wide.sum(), (chosen & ~wide).sum()) < FEWEST_PAIRS:

@@ -80,7 +80,7 @@ def choose(mapped: "pycolmap.Reconstruction", seed: int, models: Sequence[str] =
         lens = chosen.lens if chosen else Lens(mapped.camera(group[0]).model_name, False)
         choice.lenses |= dict.fromkeys(group, lens)
         choice.table += [row | {"group": index, "photos": photos} for row in rows]
-        whose = f"{photos} photos: " if len(verdicts) > 1 else ""
+        whose = f"{photos} photo{'s' * (photos != 1)}: " if len(verdicts) > 1 else ""
         given = " as given" if len(models) == 1 else ""
         choice.notes.append(f"{whose}camera model {lens.model}{given}, principal point {lens.place}: {why}")
     return choice
@@ -96,6 +96,8 @@ def _verdict(
     held_out = hold_out(sample, seed, most)
     if len(held_out.xy) < FEWEST_HELD_OUT:
         why = f"only {len(held_out.xy)} points are seen in three photos, too few to compare camera models"
+        if photos < 3:  # however many points there are
+            why = "camera models are compared by points that three photos of a camera see"
         return Verdict(cameras, photos, None, [], why)
     trials = list(_trials(sample, held_out, models, noise))
     cells = _cells(held_out, mapped)

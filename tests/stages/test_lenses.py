@@ -78,6 +78,14 @@ def test_with_too_few_points_nothing_is_compared() -> None:
     assert choice.notes[0].endswith("points are seen in three photos, too few to compare camera models")
 
 
+def test_a_single_photo_of_another_camera_is_no_lack_of_points() -> None:
+    model = mapped(photographed(PINHOLE, BARREL, points=250))
+    for image_id in sorted(i for i in model.reg_image_ids() if model.image(i).camera_id == 2)[1:]:
+        model.deregister_frame(model.image(image_id).frame_id)
+    words = "camera models are compared by points that three photos of a camera see"
+    assert choose(model, 0).notes[1] == f"1 photo: camera model SIMPLE_RADIAL, principal point centred: {words}"
+
+
 def test_of_a_given_model_only_the_principal_point_is_chosen() -> None:
     choice = choose(mapped(photographed(PINHOLE, points=150)), 0, ("OPENCV",))
     assert [(row["model"], row["free_parameters"]) for row in choice.table] == [("OPENCV", 6), ("OPENCV", 8)]

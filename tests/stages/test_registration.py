@@ -146,6 +146,13 @@ def test_a_photo_may_have_next_to_nothing_to_match(keypoints: int, why: str) -> 
     assert reasons(matches((0, 1), keypoints=keypoints), [["a.jpg", "b.jpg"]])["e"] == why
 
 
+def test_few_features_are_named_where_they_match_something_too() -> None:
+    few = " (only 20 features found in it)"
+    told = reasons(matches((0, 1), (1, 2), (3, 4), keypoints=20), [["a.jpg", "b.jpg"]])
+    assert told["c"] == f"too few of its features are points of the model: 0, 30 are needed{few}"
+    assert told["d"] == f"it shares views only with photos that are not registered either (1 of them){few}"
+
+
 @pytest.mark.parametrize(
     ("found", "registered", "why"),
     [

@@ -90,7 +90,9 @@ def test_one_direction_says_nothing_of_view_dependence() -> None:
     tracks = photographed_points(0)
     tracks = replace(tracks, towards=np.tile([0.0, 0.0, 1.0], (len(tracks), 1)))
     found = view_dependence.view_dependence_evidence(tracks, fit_exposure(tracks))
-    assert found.called_for is None and found.words == "points are seen from directions 0.0° apart: nothing known"
+    assert found.called_for is None and found.words == (
+        "points are seen from directions 0.0° to 0.0° apart, too alike to compare: nothing known"
+    )
 
 
 def passed_by(seed: int, share: float, photos: int = 2) -> tuple[TrackColours, TrackColours]:
