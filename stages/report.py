@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from nerf.scene import Scene
 
 NEEDS = ("ingest", "sfm", "normalise", "effects", "train", "evaluate", "render", "mesh", "tradeoff")
-VERSION = 5
+VERSION = 6
 RESUMES = False
 LINKS = ("report.html", "summary.json")
 

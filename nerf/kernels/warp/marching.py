@@ -131,16 +131,26 @@ def _inverse(contracted: int, direction: wp.vec3):
 
 
 @wp.func
+def _cell(cells: int, u: wp.vec3):
+    """Which holds a point, or is the nearest to it."""
+    scaled = float(cells) * u
+    last = cells - 1
+    return wp.vec3i(
+        wp.clamp(int(scaled[0]), 0, last), wp.clamp(int(scaled[1]), 0, last), wp.clamp(int(scaled[2]), 0, last)
+    )
+
+
+@wp.func
 def _finite(number: float):
     return wp.where(wp.abs(number) < _LARGEST, number, _LARGEST)
 
 
 @wp.func
 def _free_distance(
-    contracted: int, cells: int, x: int, y: int, z: int, clear: int, u: wp.vec3, point: wp.vec3, inverse: wp.vec3
+    contracted: int, cells: int, cell: wp.vec3i, clear: int, u: wp.vec3, point: wp.vec3, inverse: wp.vec3
 ):
     """How far along the ray it stays, but for rounding at a face, within the cube of ``2 clear - 1`` bricks per side
-    around cell (x, y, z), which holds its point (unit: u).
+    around a cell, which holds its point (unit: u).
 
     Where unit coordinates are linear, up to where it leaves these bricks or that region. Where space is folded, r being
     the largest component of the point, coordinates in [-2, 2] move at most 4/3 times as fast as the point, and at most
@@ -149,7 +159,7 @@ def _free_distance(
     """
     width = 1.0 / float(cells)
     around = 4.0 * float(clear - 1)
-    low = (wp.vec3(float(x & ~3), float(y & ~3), float(z & ~3)) - wp.vec3(around)) * width
+    low = (wp.vec3(float(cell[0] & ~3), float(cell[1] & ~3), float(cell[2] & ~3)) - wp.vec3(around)) * width
     high = low + wp.vec3((2.0 * around + 4.0) * width)
     folded = float(0.0)
     if contracted != 0:
@@ -199,7 +209,6 @@ def _march(
     last = lattice_coordinate(step, cone, far) - first
     count = int(0)
     k = int(0)
-    scale = float(cells)
     inverse = _inverse(contracted, d)
     while float(k) < last and count < most:
         s = first + jitter[ray] + float(k)
@@ -208,14 +217,12 @@ def _march(
             break
         point = o + t * d
         u = _unit(contracted, point)
-        x = wp.clamp(int(scale * u[0]), 0, cells - 1)
-        y = wp.clamp(int(scale * u[1]), 0, cells - 1)
-        z = wp.clamp(int(scale * u[2]), 0, cells - 1)
-        number = cell_number(cells, x, y, z)
+        cell = _cell(cells, u)
+        number = cell_number(cells, cell[0], cell[1], cell[2])
         word = bits[number >> 6]
         if word == wp.int64(0):
             clear = wp.max(1, int(clearance[number >> 6]))
-            free = _free_distance(contracted, cells, x, y, z, clear, u, point, inverse)
+            free = _free_distance(contracted, cells, cell, clear, u, point, inverse)
             # Rounded down by a thousandth of a step: a step too few is looked at again, one too many is lost.
             steps = lattice_coordinate(step, cone, t + free) - s - 0.001
             k += wp.max(1, int(wp.min(steps, 1.0e6)) + 1)
