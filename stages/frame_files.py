@@ -85,12 +85,15 @@ def _spellings_of(entry: str) -> Iterator[_Spelling]:
 
 
 def _inside(folder: Path, file_path: str, what: str) -> Path:
-    file = folder / os.path.normpath(file_path)
-    absolute = Path(file_path).is_absolute()
+    normal = os.path.normpath(file_path)
+    file, absolute = folder / normal, Path(file_path).is_absolute()
     if absolute or "\0" in file_path or not file.resolve().is_relative_to(folder.resolve()):
+        hint = f"A transforms file may name {what}s inside its own folder only."
+        if file.is_file() and not absolute and PurePosixPath(normal).parts[0] != "..":
+            hint += " A link leads out: if it is yours, give a copy with the files themselves (cp -rL)."
         raise StageError(
             f"refused the {what} {file_path[:MOST_LETTERS]!r}",
             "its path is absolute" if absolute else f"it leads out of the folder {folder}",
-            f"A transforms file may name {what}s inside its own folder only.",
+            hint,
         )
     return file

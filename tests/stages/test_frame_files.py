@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import unicodedata
 from pathlib import Path
 
@@ -64,6 +65,17 @@ def test_another_spelling_leads_out_of_the_folder_no_more_than_the_name(tmp_path
     (tmp_path / "set/a.JPG").symlink_to(tmp_path / "secret.jpg")
     error = refusal(transforms(tmp_path / "set/transforms.json", "a.jpg"))
     assert error.what == "refused the photo 'a.JPG'"
+
+
+def test_a_set_of_links_is_refused_with_the_way_on(tmp_path: Path) -> None:
+    """As `output/` of a workspace is one: its images/ is a link."""
+    touch(tmp_path, "kept/a.jpg")
+    (tmp_path / "output").mkdir()
+    (tmp_path / "output/images").symlink_to("../kept")
+    error = refusal(transforms(tmp_path / "output/transforms.json", "images/a.jpg"))
+    assert error.why == f"it leads out of the folder {tmp_path / 'output'}" and "(cp -rL)" in error.hint
+    shutil.copytree(tmp_path / "output", tmp_path / "copy")
+    assert names(find_source(tmp_path / "copy/transforms.json")) == ["images/a.jpg"]
 
 
 def test_masks_of_transforms_files_are_found_in_another_spelling(tmp_path: Path) -> None:

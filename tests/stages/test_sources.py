@@ -189,7 +189,7 @@ def test_frames_may_not_leave_their_folder(tmp_path: Path, file_path: str) -> No
     (tmp_path / "scene/link").symlink_to(tmp_path)
     error = refusal(transforms(tmp_path / "scene/transforms.json", "images/a.jpg", file_path))
     assert error.what == f"refused the photo {file_path!r}"
-    assert error.hint == "A transforms file may name photos inside its own folder only."
+    assert error.hint.startswith("A transforms file may name photos inside its own folder only.")
 
 
 @pytest.mark.parametrize(
