@@ -25,6 +25,7 @@ from pipeline.runner import Runner
 from pipeline.settings import (
     Settings,
     UsageError,
+    check_fitted_poses,
     check_same_photos,
     check_workspace,
     read_toml,
@@ -225,6 +226,8 @@ def _run_stages(
 ) -> int:
     """``alone``: the one stage that the command is for, whose stages are no run to repeat; None for a run.
     ``new_budget``: seconds for the whole command (None: no limit), and those spent before; None: as recorded."""
+    if "evaluate" in stages:
+        check_fitted_poses(settings)
     settings = with_lasting_cameras(settings, root)
     with Workspace(root) as workspace:
         runner = Runner(workspace, settings, display)
@@ -240,7 +243,7 @@ def _run_stages(
             display.failed(failure.stage, failure.error)
             raise
         words = _closing_words(workspace, ran)
-        if ran and alone is None and runner.budget:
+        if runner.charged and alone is None and runner.budget:
             words = f"{duration(runner.budget.spent)} of {duration(runner.budget.total)} spent {words}"
         display.finished(words, _outputs(workspace))
     return 0

@@ -40,6 +40,7 @@ class Runner:
         self.planning: dict[str, float] = {}  # seconds that it took, where it was done by this program
         self.apart: dict[str, Any] | None = None  # the account of a stage alone, after a whole run that has its own
         self.works_on: str | None = None
+        self.charged = False  # whether any work of this program has cost time of the budget
         self.started: dict[str, float] = {}  # when each stage did, later by what an input cost that was made again
         self.photos: str | None = None  # their digest: they are listed once
         self.checked: set[str] = set()  # stages whose files were written or read anew by this program
@@ -282,7 +283,7 @@ class Runner:
             return
         if stage == "report" and self.budget.over:  # it shows that account, and would be out of date with another
             return
-        self.works_on = stage
+        self.works_on, self.charged = stage, True
         self.budget.continue_as(self._options_digest(), self._photos_digest())
         (self.workspace.root / ALIVE).unlink(missing_ok=True)
         self.budget.begin(stage)

@@ -42,7 +42,9 @@ def status_of(workspace: Workspace, runner: Runner, stage: str, deep: bool = Fal
     try:
         job = runner.resolve(stage, may_plan=False)
     except NotReady as waiting:
-        reason = "" if waiting.upstream == stage else f"waits for {waiting.upstream}"
+        reason = f"waits for {waiting.upstream}"
+        if waiting.upstream == stage:
+            reason = _why_unplanned(runner, stage, last) if last else ""
         return StageStatus(stage, "stale" if last else "never", reason)
     except StageError as error:
         return StageStatus(stage, "stale" if last else "never", f"{error.what}: {error.why}")
@@ -65,6 +67,17 @@ def status_of(workspace: Workspace, runner: Runner, stage: str, deep: bool = Fal
     return StageStatus(stage, "never", "")
 
 
+def _why_unplanned(runner: Runner, stage: str, last: Manifest) -> str:
+    """Why a stage whose inputs are there has not the result it needs, while its open options are not chosen yet."""
+    inputs = {name: runner.done[name].outputs_digest for name in STAGES[stage].NEEDS}
+    return "; ".join(_other_inputs(inputs, last)) or "what its options leave open is chosen anew"
+
+
+def _other_inputs(now: dict[str, str], last: Manifest) -> list[str]:
+    changed = (name for name in sorted({*now, *last.inputs}) if now.get(name) != last.inputs.get(name))
+    return [f"{name} gives another result" for name in changed]
+
+
 def differences(job: Job, last: Manifest) -> list[str]:
     """Which part of the key changed between the last result and now."""
     found = []
@@ -75,9 +88,7 @@ def differences(job: Job, last: Manifest) -> list[str]:
         before, after = last.config.get(name), now.get(name)
         if before != after:
             found.append(f"{job.stage}.{name}: {before} → {after}")
-    for name in sorted({*job.inputs, *last.inputs}):
-        if job.inputs.get(name) != last.inputs.get(name):
-            found.append(f"{name} gives another result")
+    found += _other_inputs(job.inputs, last)
     if not found and last.key != job.key:
         found.append("the content of a file that its settings name changed")
     return found

@@ -50,9 +50,11 @@ def _bearings(model: "pycolmap.Camera", pixels: Float[np.ndarray, "n 2"]) -> tup
 
 
 def no_ray(camera: Camera, share: float, of: str = "") -> StageError:
-    """The error for a camera, ``of`` this photo where that is known, without a ray for this share of its pixels."""
+    """The error for a camera, given as that ``of`` this photo or of unknown origin, without a ray for this share of its
+    pixels."""
     crop = "crop photos and cameras to the square inside the lens's circle"
-    other = crop if is_fisheye(camera.model) else "choose a simpler --sfm.camera-model"
+    simpler = "give the photos without cameras" if of else "choose a simpler --sfm.camera-model"
+    other = crop if is_fisheye(camera.model) else simpler
     return StageError(
         f"the {camera.model} camera{f' of {of!r}' * bool(of)} has no ray for {100 * share:.3g}% of its pixels",
         f"{why_no_ray(camera.model)} there (parameters {', '.join(f'{p:.5g}' for p in camera.params)})",

@@ -130,14 +130,16 @@ def test_a_training_of_another_version_is_not_gone_on_with(trained, capsys: pyte
     assert all(path.is_file() for path in before), "the finished training stays whole"
 
 
-def test_the_budget_that_the_workspace_was_made_with_stays(tmp_path: Path):
+def test_the_budget_that_the_workspace_was_made_with_stays(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     """What stages were planned by it would be planned anew, and training could not go on with another plan."""
     photos, workspace = write_blender_scene(tmp_path / "photos", train=6, test=2, size=24), str(tmp_path / "w")
     words = ["run", str(photos), "-o", workspace, "--until", "train"]
     few = [*SMALL, "--train.seconds", "0.5", "--effect", "view_dependence=off", "--effect", "exposure=off"]
     assert run_command([*words, *few, "--budget", "2m"]) == 0
     before = run_of(workspace)
+    assert " of 2 min spent →" in capsys.readouterr().out
     assert run_command([*words, "--more", "4steps"]) == 0
+    assert "spent" not in capsys.readouterr().out, "none of it was: that would be what the first run took"
     after = run_of(workspace)
     assert after["budget"]["seconds"] == before["budget"]["seconds"] == 120
     assert after["keys"]["train"] != before["keys"]["train"]

@@ -12,6 +12,7 @@ from pipeline.cli import run_command
 from pipeline.display import SilentDisplay
 from pipeline.failures import StageFailed
 from pipeline.runner import Runner
+from pipeline.status import status_of
 from pipeline.workspace import Workspace
 from stages.files import read_json
 from tests.pipeline import fake_stages, made_up_machine
@@ -66,6 +67,24 @@ def test_only_the_plans_of_the_stages_named_are_made_anew(bring: Bring, tmp_path
     bring(replan=("sfm",))
     assert calls == ["plan sfm"]
     assert Workspace(tmp_path / "w.nerf").read_run()["plans"] == run["plans"] | {"train": {"asked": {"steps": 3}}}
+
+
+def test_status_says_why_a_stage_is_stale_whose_plan_is_still_to_be_made(
+    bring: Bring, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pipeline.status.STAGES", fake_stages.STAGES)
+    bring()
+    for number, sfm, why in (
+        (1, {"fail": True}, "what its options leave open is chosen anew"),
+        (50, {}, "ingest gives"),
+    ):
+        given = {"ingest": {"photos": tmp_path / "photos", "number": number}, "sfm": sfm}
+        workspace, settings = Workspace(tmp_path / "w.nerf"), FakeSettings.model_validate(given)
+        with workspace:
+            Runner(workspace, settings, SilentDisplay()).run(("ingest",))  # type: ignore[arg-type]
+        runner = Runner(workspace, settings, SilentDisplay())  # type: ignore[arg-type]
+        found = status_of(workspace, runner, "sfm")
+        assert found.state == "stale" and found.text.startswith(why)
 
 
 def test_a_run_plans_its_stages_anew_and_one_stage_alone_itself(

@@ -164,3 +164,14 @@ def test_photos_given_one_by_one_are_told_from_wrong_options(
     assert run_command(["run", "a.jpg", "b.jpg", "c.jpg", "--train.steps", "5"]) == 2
     said = capsys.readouterr().err
     assert said == "pipeline: b.jpg is one file too many; give the folder that holds the photos\n"
+
+
+def test_poses_that_no_field_will_fit_are_refused_before_any_work(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    (tmp_path / "photos").mkdir()
+    Image.new("RGB", (40, 30)).save(tmp_path / "photos/a.jpg")
+    words = ["run", str(tmp_path / "photos"), "-o", str(tmp_path / "w"), "--evaluate.fit-poses", "on"]
+    for asks_for_paper in (["--train.field", "paper"], ["--train.preset", "paper"], ["--train.width", "64"]):
+        assert run_command([*words, *asks_for_paper]) == 2
+        assert "give --evaluate.fit-poses auto" in capsys.readouterr().err
+    assert not (tmp_path / "w").exists()
+    assert run_command([*words, "--train.width", "64", "--until", "ingest"]) == 10, "a single photo: that is said first"

@@ -77,5 +77,7 @@ def test_that_no_test_photo_is_left_is_said(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("read", [from_transforms, from_colmap])
 def test_where_half_of_the_lenses_fold_the_first_is_named(read: Any, tmp_path: Path) -> None:
-    with pytest.raises(StageError, match=r"the OPENCV camera of '2\.jpg' has no ray for 0\.485% of its pixels"):
+    words = r"the OPENCV camera of '2\.jpg' has no ray for 0\.485% of its pixels"
+    with pytest.raises(StageError, match=words) as raised:
         read(tmp_path, [2, 3], 4)
+    assert raised.value.hint == "Check the distortion of the given cameras, or give the photos without cameras."
