@@ -1,6 +1,16 @@
-"""``python -m pipeline``: the same as the ``pipeline`` command."""
+"""The command ``pipeline``, and ``python -m pipeline``."""
 
-from pipeline.cli import main
+import sys
+
+
+def main() -> None:
+    """Entry point. Ctrl-C while Python reads the program, half a second or so, ends it as it does later on."""
+    try:
+        from pipeline import cli
+    except KeyboardInterrupt:
+        sys.exit(130)
+    cli.main()
+
 
 if __name__ == "__main__":
     main()

@@ -46,8 +46,8 @@ REPORT_IT = "Finished stages are kept. Please report it with the output of the s
 
 
 def main() -> None:
-    """Entry point of ``pipeline``. That nobody reads its words to the end (`pipeline … | head`) is no error; nor are
-    letters that the terminal does not have."""
+    """One command line, from ``sys.argv``. That nobody reads its words to the end (`pipeline … | head`) is no error;
+    nor are letters that the terminal does not have."""
     code: int | str | None = 0
     open_closed_streams()
     for stream in (sys.stdout, sys.stderr):

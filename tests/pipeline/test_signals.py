@@ -3,6 +3,8 @@
 import signal
 import subprocess
 import sys
+import tomllib
+from pathlib import Path
 
 import pytest
 
@@ -46,3 +48,22 @@ Place()
 """
     ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=15, check=True)
     assert "Exception ignored in" in ended.stderr and "ValueError: lost" in ended.stderr
+
+
+def test_ctrl_c_before_the_program_is_read_shows_no_traceback() -> None:
+    """The command's own entry point reads next to nothing, so that it is there in time."""
+    program = """
+import runpy, sys
+
+class Struck:
+    def find_spec(self, name, *_):
+        if name == "pipeline.cli":
+            raise KeyboardInterrupt
+
+sys.meta_path.insert(0, Struck())
+runpy.run_module("pipeline", run_name="__main__")
+"""
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=15)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (130, "", "")
+    project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text("utf-8"))["project"]
+    assert project["scripts"] == {"pipeline": "pipeline.__main__:main"}
