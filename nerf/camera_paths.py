@@ -13,7 +13,7 @@ from nerf.region import look_at_point
 
 FULL_CIRCLE_GAP_DEG = 60.0  # cameras with no wider gap in azimuth surround the object
 SMOOTHING_DEG = 20.0  # standard deviation over azimuth within which an orbit averages the cameras' radius and height
-STEEPEST = 0.15  # least horizontal distance of an orbit to its axis, in distances to the target (81 degrees)
+STEEPEST = 0.15  # least horizontal distance of an orbit to its axis and to what it looks at, in distances (81 degrees)
 CLEAR_SHARE = CLEAR_REACH = 0.9  # of a path, and of what its cameras have free before them
 SPIRAL_SHARE = 0.7  # quantile of the cameras' offsets that the spiral reaches
 ROUNDING = 1e-9  # of tour lengths of about 10: reversing a stretch gains more, or the search would run in circles
@@ -30,7 +30,8 @@ Poses = Float[np.ndarray, "frames 3 4"]
 
 
 def orbit(cameras: Float[np.ndarray, "n 3 4"], frames: int) -> Poses:
-    """Around the point all cameras look at, at the height and distance that the cameras near each azimuth have.
+    """Around the point all cameras look at, at the height and distance that the cameras near each azimuth have, and
+    looking where these look: what sticks out towards them is not cut off.
 
     Cameras on an arc (with a gap of more than 60 degrees) give a swing to and fro within that arc.
     """
@@ -44,10 +45,14 @@ def orbit(cameras: Float[np.ndarray, "n 3 4"], frames: int) -> Poses:
         path = start + 2 * np.pi * phase
     else:
         path = start + width * (1 - np.cos(2 * np.pi * phase)) / 2
-    radius, height = _ring(azimuths, offsets, path)
+    weight = _nearness(azimuths, path)
+    radius, height = weight @ np.linalg.norm(offsets[:, :2], axis=1), weight @ offsets[:, 2]
     radius = np.maximum(radius, STEEPEST * np.hypot(radius, height))
     around = np.stack([radius * np.cos(path), radius * np.sin(path), height], axis=1)
-    return look_at(target + around, target)
+    ahead = np.sum(-offsets * cameras[:, :, 2], axis=1, keepdims=True)
+    seen = weight @ (offsets + ahead * cameras[:, :, 2])  # of lines of sight, where they are nearest to the target
+    level = np.linalg.norm((seen - around)[:, :2], axis=1) / np.linalg.norm(seen - around, axis=1)
+    return look_at(target + around, target + (seen if level.min() >= STEEPEST else 0 * seen))
 
 
 def keeps_clear(path: Poses, cameras: Float[np.ndarray, "n 3 4"], near: Float[np.ndarray, "n"]) -> bool:
@@ -81,18 +86,15 @@ def _arc(azimuths: Float[np.ndarray, "n"]) -> tuple[float, float]:
     return float(ordered[(widest + 1) % len(ordered)]), float(2 * np.pi - gaps[widest])
 
 
-def _ring(
-    azimuths: Float[np.ndarray, "n"], offsets: Float[np.ndarray, "n 3"], path: Float[np.ndarray, "frames"]
-) -> tuple[Float[np.ndarray, "frames"], Float[np.ndarray, "frames"]]:
-    """The cameras' horizontal distance and height along the path: averages weighted by nearness in azimuth.
+def _nearness(azimuths: Float[np.ndarray, "n"], path: Float[np.ndarray, "frames"]) -> Float[np.ndarray, "frames n"]:
+    """Of the cameras to each frame in azimuth: weights whose sum is 1.
 
-    The weights exp(k (cos difference - 1)) (von Mises) are periodic and never vanish, so that no azimuth is empty.
+    exp(k (cos difference - 1)) (von Mises) is periodic and never vanishes, so that no azimuth is empty.
     """
     concentration = 1 / np.radians(SMOOTHING_DEG) ** 2
     closeness = concentration * (np.cos(path[:, None] - azimuths) - 1)
     weight = np.exp(closeness - closeness.max(axis=1, keepdims=True))
-    weight = weight / weight.sum(axis=1, keepdims=True)
-    return weight @ np.linalg.norm(offsets[:, :2], axis=1), weight @ offsets[:, 2]
+    return weight / weight.sum(axis=1, keepdims=True)
 
 
 def spiral(cameras: Float[np.ndarray, "n 3 4"], frames: int) -> Poses:
@@ -261,10 +263,11 @@ def _uncrossed(tour: np.ndarray, cost: Float[np.ndarray, "n n"]) -> np.ndarray |
 
 def look_at(
     centres: Float[np.ndarray, "frames 3"],
-    target: Float[np.ndarray, "3"],
+    target: Float[np.ndarray, "*each 3"],
     up: Float[np.ndarray, "3"] = UP,
 ) -> Poses:
-    """Poses at ``centres`` that look at ``target`` and keep the horizon level. No view may be along ``up``."""
+    """Poses at ``centres`` that look at ``target``, one for all or for each, and keep the horizon level. No view may be
+    along ``up``."""
     z = _unit(target - centres)
     x = _unit(np.cross(z, up))
     return np.stack([x, np.cross(z, x), z, centres], axis=2)

@@ -80,6 +80,16 @@ def test_orbit_stands_where_the_cameras_stood_and_looks_where_they_looked() -> N
     assert (poses[:, 2, 1] < 0).all()  # image y points down
 
 
+def test_orbit_looks_where_the_cameras_near_each_frame_look() -> None:
+    """At either end of a long thing, from both sides."""
+    centres = ring(48)[:, :, 3]
+    cameras = np.concatenate([look_at(c[None], np.array([c[0] / 4, 0.0, 0.0])) for c in centres])
+    poses = orbit(cameras, 96)
+    nearest = np.linalg.norm(poses[:, None, :, 3] - centres, axis=2).argmin(axis=1)
+    off = np.degrees(np.arccos(np.clip(np.sum(poses[:, :, 2] * cameras[nearest, :, 2], axis=1), -1, 1)))
+    assert off.max() < 6 and off.mean() < 3  # 11 and 6 where all look at one point
+
+
 def test_orbit_of_an_arc_stays_within_the_arc_and_reaches_its_ends() -> None:
     centres = orbit(ring(arc_deg=100.0), 60)[:, :, 3]
     from_middle = np.degrees(np.arctan2(centres[:, 0], -centres[:, 1]))
