@@ -31,7 +31,7 @@ Poses = Float[np.ndarray, "frames 3 4"]
 
 def orbit(cameras: Float[np.ndarray, "n 3 4"], frames: int) -> Poses:
     """Around the point all cameras look at, at the height and distance that the cameras near each azimuth have, and
-    looking where these look: what sticks out towards them is not cut off.
+    looking where these look.
 
     Cameras on an arc (with a gap of more than 60 degrees) give a swing to and fro within that arc.
     """
