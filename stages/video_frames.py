@@ -144,9 +144,14 @@ def _measure(video: Path, progress: Progress) -> list[Frame]:
                 progress.update(f"looked at {len(frames)} frames of {video.name}", share)
     if not frames:
         raise _undecodable(video, "not one frame of it can be decoded")
-    if announced - len(frames) > max(COUNTED_TOO_MANY, 0.02 * announced):
+    if lacks_frames(len(frames), announced):
         progress.note(f"only {len(frames)} of {announced} frames of {video.name} can be decoded: is the file whole?")
     return frames
+
+
+def lacks_frames(decoded: int, announced: int) -> bool:
+    """Whether a video is not whole, of which so many frames could be decoded and its container announces so many."""
+    return announced - decoded > max(COUNTED_TOO_MANY, 0.02 * announced)
 
 
 class _Motion:
