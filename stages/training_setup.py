@@ -33,8 +33,9 @@ LEAST_PHOTOS = 3
 COARSEST = {"bounded": 16, "contracted": 8}
 # Samples along a ray (docs/numbers.md).
 MOST_STEPS = 576  # bounded scenes: steps along the diagonal of the box
-STEPS_PER_CELL = 3  # folded space: steps in one of the finest cells
-MOST_STEPPED_CELLS = 1024  # folded space: of finer grids, steps are as long as with so many cells along an axis
+# Folded space: steps in one of the finest cells, where there are 512 along an axis or fewer, and where there are 1024 to
+# 2048. Cells so fine gain more by more rays than by closer samples (docs/numbers.md: Finer cells).
+STEPS_PER_CELL, STEPS_PER_FINE_CELL = 3, 1.5
 EVEN_UNTIL = 0.25  # folded space: scene units from the camera up to which steps are even; beyond, they grow
 # Folded space: at the shortest steps so many samples reach to a distance of 23; --train.ray-samples may ask for more.
 MOST_SAMPLES = 1024
@@ -174,14 +175,14 @@ def has_sky(config: "Config", scene: "Scene") -> bool:
 
 def grid_settings(config: "Config", sky: bool) -> "GridSettings":
     """Sizes of the grid field. Samples stand as close as the finest cells can tell them apart: in folded space a third
-    of a cell near the camera, growing with the distance, as pixels do; in a box a cell, or MOST_STEPS in all."""
+    to two thirds of a cell near the camera, growing with the distance, as pixels do; in a box a cell, or MOST_STEPS in
+    all."""
     from nerf.grid_field import GridSettings
     from nerf.kernels import CONTRACTED_BOX
 
     assert config.levels and config.log2_rows and config.finest, "plan() chooses them"
     assert config.contracted is not None and config.view_dependence is not None, "plan() takes them from stage effects"
-    cells = min(config.finest, MOST_STEPPED_CELLS)
-    shortest = 2 * CONTRACTED_BOX / (STEPS_PER_CELL * cells * config.ray_samples)
+    shortest = 2 * CONTRACTED_BOX / (_steps_across(config.finest) * config.ray_samples)
     return GridSettings(
         levels=config.levels,
         log2_rows=config.log2_rows,
@@ -195,6 +196,12 @@ def grid_settings(config: "Config", sky: bool) -> "GridSettings":
         view_dependence=config.view_dependence,
         sky=sky,
     )
+
+
+def _steps_across(finest: int) -> float:
+    """The shortest steps that fit along an axis of folded space whose finest cells are so many."""
+    coarse, fine = min(finest, 512), min(finest, 2048)
+    return max(STEPS_PER_CELL * coarse, STEPS_PER_FINE_CELL * fine)
 
 
 def grid_trainer_settings(config: "Config", scene: "Scene", seed: int) -> "GridTrainerSettings":

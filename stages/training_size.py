@@ -31,7 +31,7 @@ SAMPLES_PER_RAY = {"bounded": 3, "contracted": 10}
 (docs/numbers.md)."""
 GRID_SIZES = {
     "bounded": ((50e6, 5, 18, 512), (0, 4, 17, 256)),
-    "contracted": ((200e6, 6, 18, 1024), (60e6, 5, 18, 512), (0, 5, 17, 512)),
+    "contracted": ((30e6, 6, 18, 1024), (0, 5, 17, 512)),
 }
 """(computed colours from which on it pays, levels, log2 of rows, most cells along an axis), the largest first."""
 # The same on a GPU, which reads a large table as fast as a small one.
@@ -157,8 +157,9 @@ def timed_settings(config: "Config", device: str) -> "Config":
     if config.field == "paper":
         assert config.batch_rays is not None
         return config.model_copy(update={"batch_rays": min(config.batch_rays, MOST_TIMED_RAYS[device] * cores())})
-    sizes = {"levels": config.levels or 5, "log2_rows": config.log2_rows or 18, "finest": config.finest or 512}
-    return config.model_copy(update=sizes)
+    _, levels, log2_rows, finest = GRID_SIZES[config.space][0]  # which most budgets get
+    sizes = {"levels": levels, "log2_rows": log2_rows, "finest": finest}
+    return config.model_copy(update={name: value for name, value in sizes.items() if getattr(config, name) is None})
 
 
 def rays_per_step(config: "Config") -> float:

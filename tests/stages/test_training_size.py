@@ -137,7 +137,10 @@ def test_grids_grow_with_rays_and_pixels(scene: Scene, rays: float, factor: floa
     assert 128 <= field.finest <= 1024
     # Two neighbouring samples lie in the same or in neighbouring cells of the finest grid, near the cameras at least.
     cells_per_step = field.lattice.step * field.finest / (4 if folded else 1.8)
-    assert cells_per_step == pytest.approx(1 / 3 if folded else max(1, math.sqrt(3) * field.finest / 576), rel=0.01)
+    in_folded_space = 1 / 3 if field.finest <= 512 else 2 / 3
+    assert cells_per_step == pytest.approx(
+        in_folded_space if folded else max(1, math.sqrt(3) * field.finest / 576), rel=0.01
+    )
 
 
 @pytest.mark.parametrize(("folded", "most"), [(True, 2048), (False, 1024)])
@@ -172,13 +175,13 @@ def test_every_core_has_a_part_of_the_same_size_up_to_the_largest_step(folded: b
     assert parts[2].learning_rate == LARGE_STEP_RATE >= (parts[1].learning_rate or 1)
 
 
-def test_samples_follow_cells_of_a_1024th_at_most() -> None:
-    steps = [
-        grid_settings(Config(contracted=True, view_dependence=True, levels=1, log2_rows=8, finest=finest), sky=False)
-        for finest in (512, 1024, 2048)
-    ]
-    assert steps[0].shortest_step == 2 * steps[1].shortest_step == 2 * steps[2].shortest_step
-    assert steps[1].cone == steps[2].cone
+def test_samples_follow_cells_up_to_a_512th_and_from_a_1024th_to_a_2048th() -> None:
+    folded = Config(contracted=True, view_dependence=True, levels=1, log2_rows=8)
+    sizes = {finest: folded.model_copy(update={"finest": finest}) for finest in (256, 512, 700, 1024, 2048, 4096)}
+    fields = {finest: grid_settings(config, sky=False) for finest, config in sizes.items()}
+    steps = [field.shortest_step for field in fields.values()]
+    assert steps == [4 / 768, 4 / 1536, 4 / 1536, 4 / 1536, 4 / 3072, 4 / 3072]
+    assert all(field.cone == field.shortest_step / 0.25 for field in fields.values())
 
 
 @pytest.mark.parametrize("contracted", [False, True])
@@ -208,9 +211,9 @@ def test_the_reason_for_sizes_is_the_budget() -> None:
 
 
 FOLDED = GRID.model_copy(update={"contracted": True, "downscale": 1.0})
-LARGEST, MIDDLE, SMALLEST = (
+LARGEST, SMALLEST = (
     {"levels": levels, "log2_rows": log2_rows, "finest": finest}
-    for levels, log2_rows, finest in ((6, 18, 1024), (5, 18, 512), (5, 17, 512))
+    for levels, log2_rows, finest in ((6, 18, 1024), (5, 17, 512))
 )
 NEEDED = field_bytes(FOLDED.model_copy(update=LARGEST), 1)
 
@@ -219,7 +222,7 @@ NEEDED = field_bytes(FOLDED.model_copy(update=LARGEST), 1)
     "free, own, chosen",
     [
         (2 * NEEDED, {}, LARGEST),
-        (2 * NEEDED - 1, {}, MIDDLE),
+        (2 * NEEDED - 1, {}, SMALLEST),
         (0.0, {}, SMALLEST),
         (2 * NEEDED, {"log2_rows": 20}, SMALLEST),
     ],
