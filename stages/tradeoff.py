@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 NEEDS = ("ingest", "normalise", "effects")
 OPTIONAL = ("train",)
-VERSION = 10
+VERSION = 11
 RESUMES = True
 LINKS = ("tradeoff.svg", "tradeoff.png", "tradeoff.md", "tradeoff.json", "ablation.png")
 

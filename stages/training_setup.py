@@ -33,8 +33,8 @@ LEAST_PHOTOS = 3
 COARSEST = {"bounded": 16, "contracted": 8}
 # Samples along a ray (docs/numbers.md).
 MOST_STEPS = 576  # bounded scenes: steps along the diagonal of the box
-# Folded space: steps in one of the finest cells, where there are 512 along an axis or fewer, and where there are 1024 to
-# 2048. Cells so fine gain more by more rays than by closer samples (docs/numbers.md: Finer cells).
+# Folded space: steps in one of the finest cells, where there are 512 along an axis or fewer; and where there are 1024
+# to 2048, which gain more by more rays than by closer samples (docs/numbers.md: Finer cells).
 STEPS_PER_CELL, STEPS_PER_FINE_CELL = 3, 1.5
 EVEN_UNTIL = 0.25  # folded space: scene units from the camera up to which steps are even; beyond, they grow
 # Folded space: at the shortest steps so many samples reach to a distance of 23; --train.ray-samples may ask for more.
