@@ -78,17 +78,20 @@ def _planes(scene: Reconstruction, edges: Float[np.ndarray, "3"]) -> Iterator[Wi
     The upper ``edges`` say which side of a plane is up, and that it is no wall. Where these cancel (a ring of photos
     turned on their side, flights to and fro over the ground), standpoints share a floor and photos look down.
     """
-    standpoints = (_unit(scene.centres - spatial_median(scene.centres)), "level standpoints")
+    count = len(scene.centres)
+    # As of any fit, in which a plane's place and two angles are free: three standpoints always share one.
+    certainty = np.sqrt(max(count - 3, 0) / count)
+    standpoints = (_unit(scene.centres - spatial_median(scene.centres)), "level standpoints", certainty)
     if np.linalg.norm(scene.ups.mean(axis=0)) >= LEAST_EDGES:
         upwards, least = edges, np.cos(np.radians(MOST_PITCH_DEG))
-        sets = ((scene.rights, "level horizons"), standpoints)
+        sets = ((scene.rights, "level horizons", 1.0), standpoints)
     else:
         upwards, least, sets = -scene.axes.mean(axis=0), LEAST_LOOK, (standpoints,)
-    for vectors, source in sets:
+    for vectors, source, certainty in sets:
         flatness, normal = _avoided_direction(vectors)
         agreement = float(normal @ upwards)
-        if flatness < MOST_FLATNESS and abs(agreement) > least:
-            yield Witness(flatness, np.sign(agreement) * normal, source)
+        if flatness < certainty * MOST_FLATNESS and abs(agreement) > least:
+            yield Witness(flatness / certainty, np.sign(agreement) * normal, source)
 
 
 def _unit(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:

@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     from nerf.stopwatch import Work
 
 SECONDS = 0.3  # for each rate
-TABLES = {"2¹⁷": 1 << 17, "2²⁰": 1 << 20}  # rows: of one grid, of all five of a large field
+TABLES = {"2¹⁷": 1 << 17, "2²⁰": 1 << 20}  # rows: of one grid, of all of a large field
 # Of a ray while the grid field trains: densities asked for, beside the colours of stages/training_size.py. Over a run
 # lego_400, fox, banana and fountain_p11 ask for 2.3 to 2.9 for each colour (docs/numbers.md).
 DENSITIES = {"bounded": 7, "contracted": 24}

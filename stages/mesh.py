@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from stages.mesh_views import ShadowMap
 
 NEEDS = ("ingest", "normalise", "train")
-VERSION = 10
+VERSION = 11
 RESUMES = False
 LINKS = ("mesh.glb", "mesh.ply", "mesh.obj")
 UNKEYED = ("seconds",)  # it decides the resolution, and that enters the key

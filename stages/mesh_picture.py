@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from nerf.camera_paths import levelled
 from stages.mesh_shading import Viewpoint, framing, look, shade
 
 if TYPE_CHECKING:
@@ -48,7 +49,7 @@ def viewpoints(vertices: np.ndarray, scene: "Scene") -> tuple[Viewpoint, Viewpoi
     if scene.layout == "inside":
         focal_px = WIDTH / 2 / np.tan(np.radians(ROOM_FIELD_OF_VIEW) / 2)
         return Viewpoint(poses[first], focal_px, WIDTH, HEIGHT), Viewpoint(poses[second], focal_px, WIDTH, HEIGHT)
-    one, other = poses[first], poses[second]
+    one, other = levelled(poses[[first, second]])
     return _framed(vertices, -one[:, 2], -one[:, 1]), _framed(vertices, -other[:, 2], -other[:, 1])
 
 

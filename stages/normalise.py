@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from stages.sparse_model import SparseModel
 
 NEEDS = ("ingest", "sfm")
-VERSION = 13
+VERSION = 14
 RESUMES = False
 LINKS = ("transforms.json", "scene.json")
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from stages.drawing import Allowance, Painter
 
 NEEDS = ("normalise", "train")
-VERSION = 11
+VERSION = 12
 RESUMES = False
 LINKS = ("video.mp4", "depth.mp4", "path.json")
 UNKEYED = ("seconds",)  # it decides how many frames and how large, and these enter the key

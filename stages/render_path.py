@@ -86,10 +86,13 @@ def usual_path(scene: "Scene") -> PathKind:
 
 
 def _poses(scene: "Scene") -> "np.ndarray":
-    """Of the training photos, (n, 3, 4)."""
+    """Of the training photos, (n, 3, 4); set upright where they face one way: some held sideways would tilt a path."""
     import numpy as np
 
-    return np.stack([view.scene_from_camera for view in scene.of_split("train")])
+    from nerf.camera_paths import levelled
+
+    poses = np.stack([view.scene_from_camera for view in scene.of_split("train")])
+    return levelled(poses) if scene.layout == "forward" else poses
 
 
 def fitted_path(scene: "Scene", kind: PathKind, frames: int) -> CameraPath:
@@ -105,8 +108,6 @@ def fitted_path(scene: "Scene", kind: PathKind, frames: int) -> CameraPath:
         "interpolated": camera_paths.interpolated,
     }[kind]
     poses = _poses(scene)
-    if kind == "interpolated" and scene.layout == "forward":
-        poses = camera_paths.levelled(poses)
     path, camera, relative = path_of(poses, frames), median_camera(scene), _relative_focals(scene)
     if np.ptp(np.log(relative)) <= math.log(ONE_LENS):
         return CameraPath((camera,) * frames, path)

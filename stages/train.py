@@ -124,7 +124,7 @@ class Config(StageConfig):
     finest: int | None = Field(default=None, ge=16, le=4096, description="grid: cells along an axis of the finest grid")
     batch_samples: int | None = Field(default=None, ge=256, description="grid: colours computed in a step")
     ray_samples: float = Field(
-        default=1.0, gt=0, description="grid: samples along a ray, times what suits its finest cells"
+        default=1.0, gt=0, le=16, description="grid: samples along a ray, times what suits its finest cells"
     )
 
     batch_rays: int | None = Field(default=None, ge=1, description="paper: rays in a step; none: by the preset")

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from nerf.camera_paths import nearest_rotations
+from nerf.camera_paths import look_at, nearest_rotations
 from nerf.reconstruction import angles_deg
 from nerf.up_vector import find_up, up_by_places
 from tests.camera_layouts import ball, ring, seen_by, survey, wall
@@ -37,6 +37,15 @@ def test_level_standpoints_decide_when_horizons_are_crooked() -> None:
     up = find_up(seen_by(poses, ball()))
     assert up.source == "level standpoints"
     assert angles_deg(up.direction, UP) < 1e-5
+
+
+@pytest.mark.parametrize("third", [(0.0, -3.0, 2.1), (0.0, -2.8, 0.7)], ids=["overhead", "crouching"])
+def test_three_standpoints_always_share_a_plane_and_so_tell_nothing(third: tuple[float, float, float]) -> None:
+    centres = np.array([(-1.8, -2.2, 1.5), (1.8, -2.2, 1.5), third])
+    poses = rolled(look_at(centres, np.array([0.0, 0.0, 0.8])), np.array([2.0, -1.5, 1.0]))
+    up = find_up(seen_by(poses, ball()))
+    assert (up.known, up.source) == (True, "level horizons")
+    assert angles_deg(up.direction, UP) < 5
 
 
 def test_cameras_that_all_face_a_wall_take_up_from_their_upper_edges_and_not_from_their_plane() -> None:

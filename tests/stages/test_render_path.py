@@ -1,11 +1,11 @@
-"""Paths for photos that were taken from near and far, with lenses to match."""
+"""Paths for photos that were taken from near and far, with lenses to match, or that were held sideways."""
 
 from dataclasses import replace
 
 import numpy as np
 
 from stages.render_path import fitted_path, median_camera, usual_path
-from tests.camera_layouts import ring
+from tests.camera_layouts import ring, wall
 from tests.stages.test_render import CAMERA, scene_with
 
 
@@ -31,3 +31,12 @@ def test_photos_of_nearly_one_focal_length_are_shown_with_their_median() -> None
     views = tuple(replace(view, camera=index % 3) for index, view in enumerate(scene.views))
     scene = replace(scene, cameras=cameras, views=views)
     assert set(fitted_path(scene, "orbit", 9).cameras) == {median_camera(scene)}
+
+
+def test_a_few_photos_held_sideways_do_not_tilt_a_spiral() -> None:
+    poses = wall()
+    poses[:5, :, :2] = np.stack([poses[:5, :, 1], -poses[:5, :, 0]], axis=2)
+    scene = scene_with(poses, "forward")
+    assert usual_path(scene) == "spiral"
+    path = fitted_path(scene, "spiral", 30).poses
+    assert (np.abs(path[:, 2, 0]) < 1e-9).all() and (path[:, 2, 1] < -0.9).all()
