@@ -80,8 +80,8 @@ def _planes(scene: Reconstruction, edges: Float[np.ndarray, "3"]) -> Iterator[Wi
     """
     count = len(scene.centres)
     # As of any fit, in which a plane's place and two angles are free: three standpoints always share one.
-    certainty = np.sqrt(max(count - 3, 0) / count)
-    standpoints = (_unit(scene.centres - spatial_median(scene.centres)), "level standpoints", certainty)
+    of_fit = np.sqrt(max(count - 3, 0) / count)
+    standpoints = (_unit(scene.centres - spatial_median(scene.centres)), "level standpoints", of_fit)
     if np.linalg.norm(scene.ups.mean(axis=0)) >= LEAST_EDGES:
         upwards, least = edges, np.cos(np.radians(MOST_PITCH_DEG))
         sets = ((scene.rights, "level horizons", 1.0), standpoints)

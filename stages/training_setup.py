@@ -33,9 +33,9 @@ LEAST_PHOTOS = 3
 COARSEST = {"bounded": 16, "contracted": 8}
 # Samples along a ray (docs/numbers.md).
 MOST_STEPS = 576  # bounded scenes: steps along the diagonal of the box
-# Folded space: steps in one of the finest cells, where there are 512 along an axis or fewer; and where there are 1024
-# to 2048, which gain more by more rays than by closer samples (docs/numbers.md: Finer cells).
-STEPS_PER_CELL, STEPS_PER_FINE_CELL = 3, 1.5
+# Folded space: steps in one of the finest cells, by how many of these along an axis it counts for at most. Finer cells
+# gain more by more rays than by closer samples (docs/numbers.md: Finer cells).
+STEPS_PER_CELL = {512: 3, 2048: 1.5}
 EVEN_UNTIL = 0.25  # folded space: scene units from the camera up to which steps are even; beyond, they grow
 # Folded space: at the shortest steps so many samples reach to a distance of 23; --train.ray-samples may ask for more.
 MOST_SAMPLES = 1024
@@ -200,8 +200,7 @@ def grid_settings(config: "Config", sky: bool) -> "GridSettings":
 
 def _steps_across(finest: int) -> float:
     """The shortest steps that fit along an axis of folded space whose finest cells are so many."""
-    coarse, fine = min(finest, 512), min(finest, 2048)
-    return max(STEPS_PER_CELL * coarse, STEPS_PER_FINE_CELL * fine)
+    return max(per_cell * min(finest, most) for most, per_cell in STEPS_PER_CELL.items())
 
 
 def grid_trainer_settings(config: "Config", scene: "Scene", seed: int) -> "GridTrainerSettings":
