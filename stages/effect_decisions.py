@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from statistics import fmean
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from stages.files import read_dataclass, write_json
 
@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from nerf.scene import Scene, View
     from nerf.training import FieldTrainer
 
+Space = Literal["bounded", "contracted"]
+
 
 @dataclass(frozen=True)
 class Decisions:
@@ -27,6 +29,11 @@ class Decisions:
     unbounded: bool = False
     pose_refinement: bool = False
     exposure: dict[str, list[float]] | None = None
+
+    @property
+    def space(self) -> Space:
+        """What the field lies in: the box, or all of space, folded."""
+        return "contracted" if self.unbounded else "bounded"
 
     def log_gain(self, views: "Sequence[View]") -> "torch.Tensor":
         """The gains of some training photos, (views, 3)."""

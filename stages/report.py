@@ -302,7 +302,7 @@ def _study(results: Results) -> dict[str, Any] | None:
     """The study of cost and quality: recommendation, plot, table, and the ablation's pictures where there are any."""
     from markupsafe import Markup
 
-    from stages.tradeoff import COLUMNS, cells, drawing_words, meanings
+    from stages.tradeoff import COLUMNS, cells, drawing_words
     from stages.tradeoff_plot import plot_svg
 
     if results.study is None:
@@ -312,7 +312,6 @@ def _study(results: Results) -> dict[str, Any] | None:
     return results.study | {
         "svg": Markup(plot_svg(results.study)),
         "columns": COLUMNS,
-        "fields": meanings(results.study["points"]),
         "drawing": drawing_words(results.study["points"]),
         "rows": [{"cells": cells(row), "front": row["front"]} for row in results.study["points"]],
         "own_is_older": own and train and own["train"] != train.resolve().name,

@@ -16,9 +16,9 @@ from tyro.conf import Suppress
 
 from stages.amounts import duration
 from stages.contract import Inputs, Progress, StageConfig, StageError, StageResult
+from stages.effect_decisions import Space, read_decisions
 from stages.files import read_scene, write_json
 from stages.tradeoff_arms import (
-    MEANINGS,
     OWN,
     THINNED,
     VARIANTS,
@@ -28,6 +28,7 @@ from stages.tradeoff_arms import (
     Speed,
     drawn_per_second,
     in_words,
+    meanings,
     resolution_words,
 )
 
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
 
 NEEDS = ("ingest", "normalise", "effects")
 OPTIONAL = ("train",)
-VERSION = 11
+VERSION = 12
 RESUMES = True
 LINKS = ("tradeoff.svg", "tradeoff.png", "tradeoff.md", "tradeoff.json", "ablation.png")
 
@@ -60,6 +61,7 @@ class Config(StageConfig):
     speeds: Annotated[dict[str, tuple[float, float]] | None, Suppress] = Field(
         default=None, description="steps and rays a second of training, by variant"
     )
+    space: Annotated[Space | None, Suppress] = Field(default=None, description="that the scene lies in")
     sizes: Annotated[tuple[float, ...] | None, Suppress] = Field(default=None, description="photo sizes trained at")
     windows: Annotated[int | None, Suppress] = Field(default=None, description="of the held-out photos, scored on")
     reading: Annotated[tuple[float, float], Suppress] = Field(
@@ -89,6 +91,7 @@ def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
     reading = measured_reading(scene, inputs["ingest"], windows)
     chosen = {
         "speeds": {name: (round(speed.steps, 4), round(speed.rays, 2)) for name, speed in speeds.items()},
+        "space": read_decisions(inputs["effects"]).space,
         "sizes": sizes,
         "windows": windows,
         "reading": (round(reading.photos, 5), round(reading.windows, 5)),
@@ -139,10 +142,10 @@ def selection_of(config: Config) -> Selection:
     from stages.tradeoff_arms import SMALL_SIDE, select
     from stages.tradeoff_trial import SHOWN, WINDOW
 
-    assert config.speeds and config.sizes and config.windows, "plan() chooses them"
+    assert config.speeds and config.space and config.sizes and config.windows, "plan() chooses them"
     speeds = {name: Speed(*speed) for name, speed in config.speeds.items()}
     rays, reading = config.windows * WINDOW**2 + SHOWN * SMALL_SIDE**2, Reading(*config.reading)
-    return select(config.seconds, config.seeds, config.sizes, speeds, rays, reading)
+    return select(config.seconds, config.seeds, config.space, config.sizes, speeds, rays, reading)
 
 
 def promise(selection: Selection, arms: Path) -> str:
@@ -247,6 +250,7 @@ def _written(
     from stages.tradeoff_front import command, points_of, recommend, table
     from stages.tradeoff_plot import write_plot
 
+    assert config.space, "plan() reads it"
     points = points_of(trials, own.point if own else None)
     recommendation = recommend(points)
     chosen = recommendation.point
@@ -255,11 +259,12 @@ def _written(
     study = {
         "headline": recommendation.headline,
         "recommendation": recommendation.words,
-        "command": command(chosen, workspace),
+        "command": command(chosen, config.space, workspace),
         "recommended": points.index(chosen) + 1,
         "still_rising": recommendation.still_rising,
         "scored": _scored_on(config, exam, thinned),
         "points": table(points),
+        "fields": meanings({point.variant for point in points}, config.space),
         "own": own and {"train": own.key, "every": own.every},
         "ablation": worth_words(trials, config.downscale or 1.0),
         "arms": [{**trial.arm._asdict(), **trial.figures} for trial in trials],
@@ -306,7 +311,7 @@ def markdown(study: dict[str, Any]) -> str:
     for row in study["points"]:
         shown = [f"**{cell}**" if row["front"] else cell for cell in cells(row)]
         lines.append("| " + " | ".join(shown) + " |")
-    lines += ["", drawing_words(study["points"]), "", f"Fields: {meanings(study['points'])}."]
+    lines += ["", drawing_words(study["points"]), "", f"Fields: {study['fields']}."]
     if study["ablation"]:
         lines += ["", study["ablation"]]
     if study["left_out"]:
@@ -319,12 +324,6 @@ def drawing_words(rows: Sequence[dict[str, Any]]) -> str:
     row = next(row for row in rows if row["cheapest_drawn"])
     least = f"number {row['number']} is drawn in the least time, {row['frame_seconds']:.2f} s a frame"
     return f"The front is of training time and quality only. Of its points {least} (◂)."
-
-
-def meanings(rows: Sequence[dict[str, Any]]) -> str:
-    """What the fields of these points are, in words."""
-    named = {row["variant"] for row in rows}
-    return "; ".join(f"{variant}: {meaning}" for variant, meaning in MEANINGS.items() if variant in named)
 
 
 def cells(row: dict[str, Any]) -> list[str]:

@@ -5,8 +5,11 @@ of training times takes ``LONGEST`` of the study's time, each further one ``RUNG
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any, Literal, NamedTuple
+
+from stages.effect_decisions import Space
+from stages.training_size import GRID_SIZES
 
 LONGEST = 1 / 20
 RUNG = 1.7
@@ -26,27 +29,27 @@ SPENT_ELSEWHERE = 0.03  # of the study's time: measuring speeds before it, drawi
 class Variant(NamedTuple):
     """A field as stage train is asked for it. ``family`` groups variants in the plot; ``speed`` names the variant whose
     number of steps this one takes, so that the two differ in nothing else, and ``cost`` is what a ray of this one takes
-    beside a ray of that; with less than ``fewest`` steps it is not trained."""
+    beside a ray of that; with less than ``fewest`` steps it is not trained. ``grids``: see :func:`grid_sizes`."""
 
     family: str
     options: Mapping[str, Any]
     speed: str
     cost: float = 1.0
     fewest: int = FEWEST_STEPS
+    grids: Literal["small", "usual", "large"] | None = None
 
 
 REDUCED, PUBLISHED, FEWER_RAYS = "paper, reduced", "paper, published", "paper, published, 64 rays a step"
 OWN = "this workspace's field"  # no variant that a study trains: it is there, and is scored like the others
 WHOLE: Mapping[str, Any] = {"view_dependence": True, "batch_rays": 256}
 """The reduced method with all its parts. Half the rays that stage train would give it, for twice the steps."""
-FIVE: Mapping[str, Any] = {"levels": 5, "log2_rows": 18, "finest": 512}
 FULL: Mapping[str, Any] = {"view_dependence": True, "preset": "paper"}
 VARIANTS: dict[str, Variant] = {
-    "small grid": Variant("grid", {"levels": 4, "log2_rows": 17, "finest": 256}, "small grid"),
-    "grid": Variant("grid", FIVE, "grid"),
-    "large grid": Variant("grid", {"levels": 6, "log2_rows": 19, "finest": 1024}, "large grid"),
-    "grid, half the samples": Variant("grid samples", {**FIVE, "ray_samples": 0.5}, "grid"),
-    "grid, twice the samples": Variant("grid samples", {**FIVE, "ray_samples": 2.0}, "grid"),
+    "small grid": Variant("grid", {}, "small grid", grids="small"),
+    "grid": Variant("grid", {}, "grid", grids="usual"),
+    "large grid": Variant("grid", {}, "large grid", grids="large"),
+    "grid, half the samples": Variant("grid samples", {"ray_samples": 0.5}, "grid", grids="usual"),
+    "grid, twice the samples": Variant("grid samples", {"ray_samples": 2.0}, "grid", grids="usual"),
     REDUCED: Variant("paper", WHOLE, REDUCED),
     "paper, half the samples": Variant("paper", {**WHOLE, "samples_coarse": 16, "samples_fine": 16}, REDUCED, 0.5),
     "paper, twice the samples": Variant("paper", {**WHOLE, "samples_coarse": 64, "samples_fine": 64}, REDUCED, 2.0),
@@ -56,12 +59,13 @@ VARIANTS: dict[str, Variant] = {
     PUBLISHED: Variant("published", FULL, PUBLISHED, fewest=300),
     FEWER_RAYS: Variant("published", {**FULL, "batch_rays": 64}, FEWER_RAYS),
 }
+OF_GRIDS = "{levels} grids of features, the finest of {finest:,}³ cells"
 MEANINGS = {
-    "small grid": "4 grids of features, the finest of 256³ cells",
-    "grid": "5 grids of features, the finest of 512³ cells",
-    "large grid": "6 grids of features, the finest of 1,024³ cells",
-    "grid, half the samples": "the same 5 grids, looked at in half as many places along a ray",
-    "grid, twice the samples": "the same 5 grids, looked at in twice as many places along a ray",
+    "small grid": OF_GRIDS,
+    "grid": OF_GRIDS,
+    "large grid": OF_GRIDS,
+    "grid, half the samples": "the same {levels} grids, looked at in half as many places along a ray",
+    "grid, twice the samples": "the same {levels} grids, looked at in twice as many places along a ray",
     REDUCED: "the paper's two networks made small: 4 layers of 64, 32 + 32 samples along a ray, 256 rays a step",
     "paper, half the samples": "two such networks with 16 + 16 samples along a ray, for as many steps",
     "paper, twice the samples": "two such networks with 64 + 64 samples along a ray, for as many steps",
@@ -72,7 +76,7 @@ MEANINGS = {
     FEWER_RAYS: "the same, 8 layers of 256, 64 + 128 samples along a ray, but 64 rays a step instead of 1,024",
     OWN: "what the workspace had when the study was made, with the seconds of its own training",
 }
-"""What the variants are, for whoever reads a table of them."""
+"""What the variants are, for whoever reads a table of them, with places for the sizes of grids: :func:`meanings`."""
 ABLATIONS = tuple(name for name, variant in VARIANTS.items() if variant.family == "ablation")
 TIMED = tuple(dict.fromkeys(variant.speed for variant in VARIANTS.values()))
 
@@ -110,10 +114,11 @@ AT_ONCE = Reading()
 
 
 class Arm(NamedTuple):
-    """One training of a study. ``seconds`` is what it is expected to take in all; of ``every`` so many pixels of the
-    windows, along both axes, it is scored on one."""
+    """One training of a study, in a scene that lies in such a ``space``. ``seconds`` is what it is expected to take in
+    all; of ``every`` so many pixels of the windows, along both axes, it is scored on one."""
 
     variant: str
+    space: Space
     downscale: float
     steps: int
     seed: int
@@ -134,9 +139,8 @@ class Arm(NamedTuple):
     @property
     def options(self) -> dict[str, Any]:
         """What stage train is asked for."""
-        variant = VARIANTS[self.variant]
         given = {"steps": self.steps, "downscale": self.downscale, "seed": self.seed}
-        return {"field": field_of(self.variant), **variant.options, **given}
+        return options_of(self.variant, self.space) | given
 
 
 class Selection(NamedTuple):
@@ -167,6 +171,27 @@ def field_of(variant: str) -> Literal["grid", "paper"]:
     return "grid" if VARIANTS[variant].family.startswith("grid") else "paper"
 
 
+def grid_sizes(grids: Literal["small", "usual", "large"], space: Space) -> dict[str, int]:
+    """Sizes of a grid field: as stage train chooses them on a CPU for long runs (``usual``) and for short ones, and
+    larger still, by one grid, twice the rows and twice the cells along an axis."""
+    (_, levels, log2_rows, finest), (_, *small) = GRID_SIZES[space]
+    of = {"small": small, "usual": (levels, log2_rows, finest), "large": (levels + 1, log2_rows + 1, 2 * finest)}
+    return dict(zip(("levels", "log2_rows", "finest"), of[grids], strict=True))
+
+
+def options_of(variant: str, space: Space) -> dict[str, Any]:
+    """The field of a variant as stage train is asked for it in such a space."""
+    _, options, *_, grids = VARIANTS[variant]
+    return {"field": field_of(variant), **options, **(grid_sizes(grids, space) if grids else {})}
+
+
+def meanings(variants: Collection[str], space: Space) -> str:
+    """What these variants are, in words."""
+    shown = {name: meaning for name, meaning in MEANINGS.items() if name in variants}
+    sizes = {name: {} if name == OWN else options_of(name, space) for name in shown}
+    return "; ".join(f"{name}: {meaning.format(**sizes[name])}" for name, meaning in shown.items())
+
+
 def wanted(seeds: int) -> Iterator[tuple[str, int, int, int]]:
     """(variant, photo size, rung, seed) of all arms, the most informative first: the grid's ladder, the ablation and a
     smaller grid; second seeds of the ladder's ends and of the ablation; samples; the published networks; second
@@ -188,6 +213,7 @@ def wanted(seeds: int) -> Iterator[tuple[str, int, int, int]]:
 def select(
     seconds: float,
     seeds: int,
+    space: Space,
     downscales: Sequence[float],
     speeds: Mapping[str, Speed],
     drawn_rays: float,
@@ -203,7 +229,7 @@ def select(
     left, arms, left_out = seconds * (1 - SPENT_ELSEWHERE) - reading.windows, dict[str, Arm](), dict[str, Arm]()
     for variant, size, rung, seed in wanted(seeds):
         downscale = downscales[-1 if size == SMALL else min(size, max(0, len(downscales) - 2))]
-        arm = _arm(variant, downscale, rung, seed, seconds, speeds, drawn_rays)
+        arm = _arm(variant, space, downscale, rung, seed, seconds, speeds, drawn_rays)
         if arm.name in arms or (variant == FEWER_RAYS and any(a.variant == PUBLISHED for a in arms.values())):
             continue
         if all(arm.downscale != other.downscale for other in arms.values()):
@@ -218,6 +244,7 @@ def select(
 
 def _arm(
     variant: str,
+    space: Space,
     downscale: float,
     rung: int,
     seed: int,
@@ -230,7 +257,7 @@ def _arm(
     drawn = drawn_per_second(variant, speed)
     every = scored_every(drawn_rays / drawn, seconds)
     training = OVERHEAD * VARIANTS[variant].cost * steps / speed.steps
-    return Arm(variant, downscale, steps, seed, training + (PROBED_RAYS + drawn_rays / every**2) / drawn, every)
+    return Arm(variant, space, downscale, steps, seed, training + (PROBED_RAYS + drawn_rays / every**2) / drawn, every)
 
 
 def scored_every(drawing: float, seconds: float) -> int:

@@ -22,7 +22,8 @@ from statistics import mean, stdev
 from typing import Any, Literal
 
 from stages.amounts import duration
-from stages.tradeoff_arms import OWN, VARIANTS, Arm, field_of, resolution_words
+from stages.effect_decisions import Space
+from stages.tradeoff_arms import OWN, Arm, field_of, options_of, resolution_words
 
 WORTH_DB = 0.5  # a doubling of the time that buys less is not worth it; 0.5 dB is what one sees side by side
 LEAST_FREEDOM = 3
@@ -213,12 +214,11 @@ def _placed(own: Point, point: Point, front: Sequence[Point]) -> str:
     return f"{what} gains {gain:.1f} dB over the one recommended {times}{near}"
 
 
-def command(point: Point, workspace: str) -> str:
+def command(point: Point, space: Space, workspace: str) -> str:
     """What trains the setting of ``point`` for as long in a workspace. Field and preset are given, for it may remember
     others, and the field's sizes, for those that would be chosen follow from a timing."""
-    field = {"field": field_of(point.variant), "preset": "standard"}
-    given = {"seconds": max(1, round(point.train_seconds)), "downscale": point.downscale} | field
-    flags = [_flag(name, value) for name, value in {**given, **VARIANTS[point.variant].options}.items()]
+    given = {"seconds": max(1, round(point.train_seconds)), "downscale": point.downscale, "preset": "standard"}
+    flags = [_flag(name, value) for name, value in (given | options_of(point.variant, space)).items()]
     return " ".join(["pipeline train", quoted(workspace), *flags])
 
 

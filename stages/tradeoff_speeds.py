@@ -7,6 +7,7 @@ from statistics import median
 from typing import TYPE_CHECKING
 
 from stages.contract import Inputs, Progress
+from stages.effect_decisions import Space
 from stages.tradeoff_arms import (
     LONGEST,
     REDUCED,
@@ -14,7 +15,7 @@ from stages.tradeoff_arms import (
     VARIANTS,
     Reading,
     Speed,
-    field_of,
+    options_of,
     photo_sizes,
 )
 
@@ -45,9 +46,9 @@ def measured_speeds(scene: "Scene", inputs: Inputs, seconds: float, progress: Pr
     decisions, speeds = read_decisions(inputs["effects"]), dict[str, Speed]()
     for number, name in enumerate(TIMED):
         progress.update(f"trying how fast this machine trains: {name}", number / len(TIMED))
-        config = _planned(name, inputs, progress)
+        config = _planned(name, decisions.space, inputs, progress)
         if VARIANTS[name].family == "published":
-            rays = speeds[REDUCED].rays * _work(_planned(REDUCED, inputs, progress)) / _work(config)
+            rays = speeds[REDUCED].rays * _work(_planned(REDUCED, decisions.space, inputs, progress)) / _work(config)
             if LONGEST * seconds * rays < VARIANTS[name].fewest * rays_per_step(config):
                 speeds[name] = Speed(rays / rays_per_step(config), rays)
                 continue
@@ -56,11 +57,11 @@ def measured_speeds(scene: "Scene", inputs: Inputs, seconds: float, progress: Pr
     return speeds
 
 
-def _planned(name: str, inputs: Inputs, progress: Progress) -> "TrainConfig":
+def _planned(name: str, space: Space, inputs: Inputs, progress: Progress) -> "TrainConfig":
     """What stage train makes of a variant; nothing is left for it to choose by time."""
     from stages import train
 
-    asked = train.Config(field=field_of(name), steps=1, downscale=1.0, **VARIANTS[name].options)  # type: ignore[arg-type]
+    asked = train.Config(steps=1, downscale=1.0, **options_of(name, space))  # type: ignore[arg-type]
     return train.plan(asked, inputs, _Quiet(progress))
 
 

@@ -8,7 +8,7 @@ from tyro.conf import Suppress, arg
 
 from stages.amounts import short_count
 from stages.contract import Inputs, Progress, StageConfig, StageResult
-from stages.effect_decisions import read_decisions
+from stages.effect_decisions import Space, read_decisions
 from stages.files import read_scene
 from stages.photos import read_photos
 
@@ -180,7 +180,7 @@ class Config(StageConfig):
         return self.field or ("paper" if self.preset == "paper" or self._given(PAPER_ONLY) else "grid")
 
     @property
-    def space(self) -> Literal["bounded", "contracted"]:
+    def space(self) -> Space:
         """Which of the measured constants count."""
         return "contracted" if self.contracted else "bounded"
 

@@ -220,6 +220,7 @@ def test_page_shows_the_study_and_leaves_its_time_out(tmp_path: Path, progress: 
     ]
     points = sorted(points, key=lambda p: p.train_seconds)
     study = {"headline": "", "recommendation": recommend(points).words, "recommended": 3, "points": table(points)}
+    study |= {"fields": "grid: 5 grids of features"}
     study |= {"command": "pipeline train fox.nerf --train.seconds 20", "ablation": "Against the complete one: −2 dB."}
     study |= {"own": None, "scored": "6 windows of 2 held-out photos", "left_out": ["paper, published: 5 steps"]}
     write_json(inputs["tradeoff"] / "tradeoff.json", study)
@@ -232,7 +233,7 @@ def test_page_shows_the_study_and_leaves_its_time_out(tmp_path: Path, progress: 
     assert "reduced, a part left out" in text, "the plot's legend"
     assert "Train it: <code>pipeline train fox.nerf --train.seconds 20</code>" in text
     assert "number 1 is drawn in the least time, 1.00 s a frame" in text
-    assert "Fields: grid: 5 grids of features, the finest of 512³ cells; no view dependence: two such" in text
+    assert "Fields: grid: 5 grids of features." in text
     assert "What each part of the method is worth" not in text, "no picture, no title"
     assert "the star" not in text and "before the present one" not in text
     assert summary == summary_before, "the study's time is none of the run's"

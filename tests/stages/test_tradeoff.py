@@ -25,7 +25,14 @@ TINY_GRID: dict[str, Any] = {"levels": 2, "log2_rows": 10, "finest": 32, "batch_
 TINY_PAPER = {"depth": 2, "width": 16, "samples_coarse": 8, "samples_fine": 8, "batch_rays": 64}
 SPEEDS: dict[str, Any] = dict.fromkeys(tradeoff_arms.TIMED, (200.0, 1e7))
 SPEEDS |= dict.fromkeys((PUBLISHED, FEWER_RAYS), (0.1, 10.0))
-CONFIG: dict[str, Any] = {"seconds": 14.0, "seeds": 2, "downscale": 1.0, "sizes": (1.0,), "windows": 3}
+CONFIG: dict[str, Any] = {
+    "seconds": 14.0,
+    "seeds": 2,
+    "space": "bounded",
+    "downscale": 1.0,
+    "sizes": (1.0,),
+    "windows": 3,
+}
 
 
 @pytest.fixture(autouse=True)
@@ -34,7 +41,7 @@ def tiny_fields(monkeypatch: pytest.MonkeyPatch) -> None:
     for name, variant in VARIANTS.items():
         sizes: Mapping[str, Any] = TINY_GRID if variant.family.startswith("grid") else TINY_PAPER
         kept = {key: value for key, value in variant.options.items() if key not in (*TINY_GRID, "preset")}
-        monkeypatch.setitem(VARIANTS, name, variant._replace(options=kept | sizes))
+        monkeypatch.setitem(VARIANTS, name, variant._replace(options=kept | sizes, grids=None))
     monkeypatch.setattr(tradeoff_arms, "OVERHEAD", 1.0)
     monkeypatch.setattr(tradeoff_arms, "SPENT_ELSEWHERE", 0.6)
     monkeypatch.setattr(tradeoff, "LATE", 1e3)
@@ -76,7 +83,7 @@ def test_a_study_from_arms_to_recommendation_and_the_same_after_a_kill(
     assert study["ablation"].startswith("Against the complete reduced method, seed by seed, of 2 seeds")
     text = (tmp_path / "whole" / "tradeoff.md").read_text()
     assert study["ablation"] in text and "is drawn in the least time" in text
-    assert f"Train it: `{study['command']}`" in text and "grid: 5 grids of features" in text
+    assert f"Train it: `{study['command']}`" in text and f"Fields: {study['fields']}." in text and "grid: " in study["fields"]
 
     count, begun = len(study["arms"]), []
     whole = tradeoff_trial.score

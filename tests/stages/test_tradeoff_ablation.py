@@ -13,7 +13,7 @@ LEFT_OUT = "no positional encoding"
 
 
 def trial(variant: str, seed: int, psnr: float | None, steps: int = 1000) -> tuple[Arm, Mapping[str, Any]]:
-    return Arm(variant, 4.0, steps, seed, 0.0), {"psnr": psnr, "failed": None if psnr else "it diverged"}
+    return Arm(variant, "bounded", 4.0, steps, seed, 0.0), {"psnr": psnr, "failed": None if psnr else "it diverged"}
 
 
 def test_differences_are_taken_seed_by_seed() -> None:

@@ -2,6 +2,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from stages.effect_decisions import Space
 from stages.tradeoff_arms import (
     ABLATIONS,
     FEWER_RAYS,
@@ -20,6 +21,8 @@ from stages.tradeoff_arms import (
     Reading,
     Selection,
     Speed,
+    meanings,
+    options_of,
     photo_sizes,
     resolution_words,
     round_to_two_digits,
@@ -27,27 +30,44 @@ from stages.tradeoff_arms import (
     wanted,
 )
 from stages.train import PAPER_SIZES, Config
+from stages.training_size import GRID_SIZES
 
 FAST = {name: Speed(100.0, 1e6) for name in TIMED}
 SIZES = (1.0, 2.0, 4.0, 8.0)
+SPACES = pytest.mark.parametrize("space", ["bounded", "contracted"])
 # Two cores without a GPU: steps and rays a second, as in the studies of docs/numbers.md; the published networks' steps
 # by their arithmetic.
 CORES = {"small grid": Speed(32.0, 200e3), "grid": Speed(27.0, 170e3), "large grid": Speed(21.0, 130e3)}
 CORES |= {REDUCED: Speed(27.0, 6.9e3), PUBLISHED: Speed(0.066, 68.0), FEWER_RAYS: Speed(1.06, 68.0)}
 
 
-def test_every_variant_is_one_that_stage_train_takes() -> None:
-    for arm in select(1e4, 1, SIZES, FAST, 1000).arms:
+@SPACES
+def test_every_variant_is_one_that_stage_train_takes(space: Space) -> None:
+    for arm in select(1e4, 1, space, SIZES, FAST, 1000).arms:
         assert Config(**arm.options).kind == ("grid" if "grid" in arm.variant else "paper")
 
 
-def test_every_variant_is_explained_with_its_sizes() -> None:
+@SPACES
+def test_a_study_has_the_grids_that_training_chooses_for_long_and_for_short_runs(space: Space) -> None:
+    def sizes(variant: str) -> tuple[int, ...]:
+        return tuple(options_of(variant, space)[name] for name in ("levels", "log2_rows", "finest"))
+
+    chosen = [tuple(entry[1:]) for entry in GRID_SIZES[space]]
+    assert [sizes("grid"), sizes("small grid")] == chosen
+    assert sizes("grid, half the samples") == sizes("grid, twice the samples") == sizes("grid")
+    assert all(larger > usual for larger, usual in zip(sizes("large grid"), sizes("grid"), strict=True))
+
+
+@SPACES
+def test_every_variant_is_explained_with_its_sizes(space: Space) -> None:
     assert set(MEANINGS) == {*VARIANTS, OWN}
     for name, variant in VARIANTS.items():
+        said = meanings([name], space)
         if variant.family.startswith("grid"):
-            assert f"{variant.options['levels']} grids" in MEANINGS[name]
+            assert f"{options_of(name, space)['levels']} grids" in said
         if variant.family == "grid":
-            assert f"{variant.options['finest']:,}³ cells" in MEANINGS[name]
+            assert f"{options_of(name, space)['finest']:,}³ cells" in said
+    assert meanings([OWN, "grid"], space) == f"{meanings(['grid'], space)}; {OWN}: {MEANINGS[OWN]}"
     networks = {REDUCED: "small", PUBLISHED: "published", FEWER_RAYS: "published"}
     for name, preset in networks.items():
         sizes = {**PAPER_SIZES[preset], **VARIANTS[name].options}
@@ -57,7 +77,7 @@ def test_every_variant_is_explained_with_its_sizes() -> None:
 
 def test_with_time_enough_nothing_is_left_out_and_each_arm_is_there_once() -> None:
     plenty = {name: Speed(1e4, 1e8) for name in TIMED}
-    arms, left_out = select(1e4, 1, SIZES, plenty, 0)
+    arms, left_out = select(1e4, 1, "bounded", SIZES, plenty, 0)
     assert not left_out
     assert {arm.variant for arm in arms} == set(VARIANTS) - {FEWER_RAYS}, "nobody needs fewer rays a step"
     assert len({arm.name for arm in arms}) == len(arms) > 3 * RUNGS
@@ -68,7 +88,7 @@ def test_with_time_enough_nothing_is_left_out_and_each_arm_is_there_once() -> No
 @given(st.floats(10, 1e5), st.integers(1, 4), st.floats(0.01, 1e3), st.floats(0, 1e5))
 def test_a_plan_keeps_to_its_time(seconds: float, seeds: int, steps: float, drawn: float) -> None:
     speeds = {name: Speed(steps, 100 * steps) for name in TIMED}
-    selection = select(seconds, seeds, SIZES, speeds, drawn)
+    selection = select(seconds, seeds, "bounded", SIZES, speeds, drawn)
     assert selection.seconds <= seconds
     for arm in selection.arms:
         assert arm.steps >= FEWEST_STEPS and arm.seconds <= MOST_SHARE * seconds
@@ -80,7 +100,7 @@ def test_a_plan_keeps_to_its_time(seconds: float, seeds: int, steps: float, draw
 
 def planned(seconds: float, sizes: tuple[float, ...], reading: float, drawn: float = 16 * 64**2 + 5e4) -> Selection:
     """A study on two cores."""
-    return select(seconds, 3, sizes, CORES, drawn, Reading(reading, reading))
+    return select(seconds, 3, "bounded", sizes, CORES, drawn, Reading(reading, reading))
 
 
 @pytest.mark.parametrize(
@@ -123,23 +143,23 @@ def test_a_slowly_drawn_field_is_scored_on_fewer_pixels_and_still_takes_no_sixth
 
 def test_where_there_is_time_for_it_the_published_networks_have_their_rays() -> None:
     gpu = CORES | {PUBLISHED: Speed(20.0, 20e3), FEWER_RAYS: Speed(60.0, 4e3)}
-    variants = {arm.variant for arm in select(1320.0, 3, SIZES, gpu, 1e5).arms}
+    variants = {arm.variant for arm in select(1320.0, 3, "bounded", SIZES, gpu, 1e5).arms}
     assert PUBLISHED in variants and FEWER_RAYS not in variants
 
 
 def test_the_first_training_at_a_size_reads_the_photos_and_the_study_those_of_its_windows() -> None:
-    arms = select(600, 1, SIZES, FAST, 1000).arms
-    told = select(600, 1, SIZES, FAST, 1000, Reading(photos=5.0, windows=7.0)).arms
+    arms = select(600, 1, "bounded", SIZES, FAST, 1000).arms
+    told = select(600, 1, "bounded", SIZES, FAST, 1000, Reading(photos=5.0, windows=7.0)).arms
     more = {arm.name: arm.seconds for arm in told}
     slower = [arm.downscale for arm in arms if arm.name in more and more[arm.name] == pytest.approx(arm.seconds + 5)]
     assert sorted(slower) == list(SIZES)
-    free = select(600, 1, SIZES, FAST, 1000).seconds
+    free = select(600, 1, "bounded", SIZES, FAST, 1000).seconds
     assert sum(more.values()) <= min(free + 20, 600 - 7)
-    assert not select(600, 1, SIZES, FAST, 1000, Reading(photos=600.0)).arms
+    assert not select(600, 1, "bounded", SIZES, FAST, 1000, Reading(photos=600.0)).arms
 
 
 def test_the_method_and_its_ablations_take_the_same_steps() -> None:
-    arms = select(1e4, 1, SIZES, FAST, 1000).arms
+    arms = select(1e4, 1, "bounded", SIZES, FAST, 1000).arms
     of = {name: {(a.downscale, a.steps) for a in arms if a.variant == name} for name in VARIANTS}
     for name in ABLATIONS:
         assert of[name] and of[name] <= of[REDUCED]
@@ -148,7 +168,7 @@ def test_the_method_and_its_ablations_take_the_same_steps() -> None:
 
 def test_what_is_too_slow_is_named() -> None:
     speeds = FAST | {PUBLISHED: Speed(0.01, 10.0)}
-    selection = select(1800, 1, SIZES, speeds, 1000)
+    selection = select(1800, 1, "bounded", SIZES, speeds, 1000)
     assert PUBLISHED not in {arm.variant for arm in selection.arms}
     assert "paper, published at 1/8 of the resolution: 1 steps (fewer than 300)" in selection.left_out
 
@@ -177,7 +197,7 @@ def test_photo_sizes_are_distinct_and_not_tiny(
 
 
 def test_half_and_twice_the_samples_take_as_many_steps_and_their_part_of_the_time() -> None:
-    arms = {arm.variant: arm for arm in select(1e4, 1, SIZES, FAST, 0).arms}
+    arms = {arm.variant: arm for arm in select(1e4, 1, "bounded", SIZES, FAST, 0).arms}
     half, twice = arms["paper, half the samples"], arms["paper, twice the samples"]
     assert half.steps == twice.steps
     assert twice.seconds == pytest.approx(4 * half.seconds, rel=0.01)

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from pipeline.arguments import StageArguments, parse
 from pipeline.settings import Settings, with_effects
+from stages.effect_decisions import Space
 from stages.tradeoff_arms import OWN, PUBLISHED, REDUCED, VARIANTS, Arm, field_of
 from stages.tradeoff_front import (
     WORTH_DB,
@@ -111,12 +112,13 @@ def test_a_gain_within_the_spread_is_called_that() -> None:
     assert "within the spread" not in recommend([*points[:2], point(40, 25.9)]).words
 
 
+@pytest.mark.parametrize("space", ["bounded", "contracted"])
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_the_command_of_a_setting_asks_for_what_it_was(variant: str) -> None:
-    words = shlex.split(command(point(48.6, 29.0, variant=variant, downscale=4.0), "my fox.nerf"))
+def test_the_command_of_a_setting_asks_for_what_it_was(variant: str, space: Space) -> None:
+    words = shlex.split(command(point(48.6, 29.0, variant=variant, downscale=4.0), space, "my fox.nerf"))
     assert words[:3] == ["pipeline", "train", "my fox.nerf"]
     given = parse(StageArguments, "train", words[2:])
-    asked = Config(**Arm(variant, 4.0, 1, 0, 0.0).options).model_copy(update={"steps": None, "seconds": 49.0})
+    asked = Config(**Arm(variant, space, 4.0, 1, 0, 0.0).options).model_copy(update={"steps": None, "seconds": 49.0})
     view_dependence = with_effects(given.settings, given.effect).effects.view_dependence
     assert view_dependence == {None: "auto", True: "on", False: "off"}[asked.view_dependence]
     assert given.settings.train.kind == asked.kind
@@ -127,14 +129,14 @@ def test_the_command_of_a_setting_asks_for_what_it_was(variant: str) -> None:
 @pytest.mark.parametrize("remembered", [{"preset": "paper", "width": 64}, {"field": "grid", "levels": 3, "steps": 9}])
 @pytest.mark.parametrize("variant", ["grid", REDUCED, PUBLISHED])
 def test_the_command_is_taken_whatever_field_a_workspace_remembers(variant: str, remembered: dict[str, Any]) -> None:
-    words = shlex.split(command(point(48.6, 29.0, variant=variant), "fox.nerf"))[2:]
+    words = shlex.split(command(point(48.6, 29.0, variant=variant), "contracted", "fox.nerf"))[2:]
     train = parse(StageArguments, "train", words, Settings(train=Config(**remembered))).settings.train
     assert (train.kind, train.steps, train.seconds) == (field_of(variant), None, 49)
     assert train.preset == VARIANTS[variant].options.get("preset", "standard")
 
 
 def test_the_command_names_a_workspace_whose_name_is_not_unicode() -> None:
-    words = command(point(48.6, 29.0), "caf\udce9's.nerf")
+    words = command(point(48.6, 29.0), "bounded", "caf\udce9's.nerf")
     assert words.startswith(r"pipeline train $'caf\xe9\'s.nerf' --train.")
     words.encode()
 
@@ -182,13 +184,15 @@ def test_seeds_of_a_setting_make_one_point() -> None:
     figures = {"failed": None, "frame_seconds": 1.0, "peak_memory_mb": 5, "model_mb": 1.0}
     trials = [
         (
-            Arm("grid", 2.0, 100, seed, 0.0),
+            Arm("grid", "bounded", 2.0, 100, seed, 0.0),
             {**figures, "psnr": 20.0 + seed, "ssim": 0.8 + 0.01 * seed, "train_seconds": 10.0 + seed},
         )
         for seed in range(3)
     ]
-    trials += [(Arm("grid", 4.0, 100, 0, 0.0), {**figures, "psnr": 18.0, "train_seconds": 4.0, "ssim": None})]
-    trials += [(Arm("small grid", 4.0, 100, 0, 0.0), {"failed": "it diverged"})]
+    trials += [
+        (Arm("grid", "bounded", 4.0, 100, 0, 0.0), {**figures, "psnr": 18.0, "train_seconds": 4.0, "ssim": None})
+    ]
+    trials += [(Arm("small grid", "bounded", 4.0, 100, 0, 0.0), {"failed": "it diverged"})]
     alone, three = points_of(trials)
     assert (three.psnr, three.deviation, three.seeds, three.train_seconds) == (21.0, 1.0, 3, 11.0)
     assert (three.ssim, three.ssim_deviation) == (pytest.approx(0.81), pytest.approx(0.01))

@@ -13,7 +13,7 @@ from stages.tradeoff_arms import Arm
 from stages.tradeoff_trial import ENOUGH, OWN_FAULTS, Exam, figures_file, kept, make_exam, run_arm
 from tests.stages.photo_scene import HEIGHT, WIDTH, photographed
 
-ARM = Arm("grid", 1.0, 100, 0, 1.0)
+ARM = Arm("grid", "bounded", 1.0, 100, 0, 1.0)
 NO_EXAM: Any = None
 
 
