@@ -1,6 +1,6 @@
 """The stages in the order they run, and how they depend on each other."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from types import ModuleType
 
 from stages import effects, evaluate, ingest, mesh, normalise, render, report, sfm, tradeoff, train
@@ -55,3 +55,9 @@ def up_to(stage: str) -> list[str]:
 def usual() -> list[str]:
     """The stages that a run has unless it is told otherwise."""
     return up_to(list(STAGES)[-1])
+
+
+def command_that_makes(stage: str, recorded: Sequence[str] | None) -> str:
+    """Which command brings ``stage`` up to date in a workspace whose last run had the ``recorded`` stages: that run
+    again, or the stage's own."""
+    return "resume" if stage in (recorded or usual()) else stage

@@ -41,7 +41,7 @@ from stages.contract import StageError
 
 EXIT_DEFECT, EXIT_USAGE, EXIT_WORKSPACE, EXIT_INTERRUPT, EXIT_TERMINATED = 1, 2, 3, 130, 143
 
-GO_ON = "Finished stages are kept; `pipeline resume WORKSPACE` goes on."
+GO_ON = "Finished stages are kept; the same command goes on."
 REPORT_IT = "Finished stages are kept. Please report it with the output of the same command and --debug."
 
 
@@ -233,10 +233,11 @@ def _run_stages(
         runner = Runner(workspace, settings, display)
         if new_budget is not None:
             runner.set_budget(*new_budget)
-        foretold = forecast.foretell(runner, stages, force, forecast.photos_of(settings))
+        replan = (stages if alone is None else (alone,)) if common.replan else ()
+        anew = force | (runner.state["plans"].keys() & replan)
+        foretold = forecast.foretell(runner, stages, anew, forecast.photos_of(settings))
         display.headline(" · ".join([machine.headline(root), *foretold.words]))
         try:
-            replan = (stages if alone is None else (alone,)) if common.replan else ()
             given = {"force": force, "replan": replan, "remember": alone is None, "verify": common.verify}
             ran = runner.run(stages, times=foretold.times, **given)
         except StageFailed as failure:

@@ -162,12 +162,19 @@ class Forecast(NamedTuple):
     times: Mapping[str, float | None]
 
 
-def foretell(runner: "Runner", stages: Sequence[str], force: frozenset[str], photos: Photos | None) -> Forecast:
-    """How long a run of ``stages`` takes: in words, where anything has to run and it can be told, and by stage."""
-    if photos is None:
+def foretell(runner: "Runner", stages: Sequence[str], anew: frozenset[str], photos: Photos | None) -> Forecast:
+    """How long a run of ``stages`` takes, ``anew`` those of them that run though they have a result: in words, where
+    anything has to run and it can be told, and by stage. Nothing where the photos or a file that a setting names cannot
+    be read: the stage that reads it says so."""
+    try:
+        return _foretold(runner, stages, anew, photos) if photos else Forecast([], {})
+    except StageError:
         return Forecast([], {})
+
+
+def _foretold(runner: "Runner", stages: Sequence[str], anew: frozenset[str], photos: Photos) -> Forecast:
     train, times, reading = runner.settings.train, expected(runner.settings, photos), photos.reading(processors())
-    left = [name for name in stages if name in force or runner.found(name) is None]
+    left = [name for name in stages if name in anew or runner.found(name) is None]
     trains = "train" in left
     apart = [name for name in left if has_its_own_time(name, runner.settings)]
     budget = None if apart and set(left) <= {*apart, "report"} else runner.budget

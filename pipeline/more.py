@@ -3,6 +3,7 @@
 import re
 from typing import Any
 
+from pipeline.chain import command_that_makes
 from pipeline.durations import seconds_from
 from pipeline.manifests import BadManifest, Manifest
 from pipeline.settings import Settings, UsageError
@@ -29,8 +30,8 @@ def with_more(settings: Settings, workspace: Workspace, text: str) -> Settings:
     finished = None if key is None else _finished(workspace, key)
     after = training_name(finished.key, finished.outputs_digest) if finished else train.after
     if after is None:
-        why = "no training is finished there"
-        raise StageError(f"{workspace.root} cannot go on", why, f"First: pipeline resume {workspace.root}")
+        why, command = "no training is finished there", command_that_makes("train", recorded.get("stages"))
+        raise StageError(f"{workspace.root} cannot go on", why, f"First: pipeline {command} {workspace.root}")
     return settings.model_copy(update={"train": train.model_copy(update={"after": after, **_budget(text)})})
 
 
@@ -46,5 +47,6 @@ def _finished(workspace: Workspace, key: str) -> Manifest | None:
     try:
         return workspace.finished("train", key)
     except BadManifest as problem:
-        hint = f"It was set aside; pipeline resume {workspace.root} trains again."
+        command = command_that_makes("train", workspace.read_run().get("stages"))
+        hint = f"It was set aside; pipeline {command} {workspace.root} trains again."
         raise StageError(f"{workspace.root} cannot go on", str(problem), hint) from problem

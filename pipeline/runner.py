@@ -10,7 +10,7 @@ from typing import Any
 
 from pipeline import machine, manifests
 from pipeline.budget import ALIVE, Budget, has_its_own_time, reading_of, takes_what_it_is_given
-from pipeline.chain import ON_REQUEST, STAGES, needed_for
+from pipeline.chain import ON_REQUEST, STAGES, command_that_makes, needed_for
 from pipeline.display import Display
 from pipeline.failures import StageFailed, worded
 from pipeline.forecast import pilots_seconds, reckoned_with
@@ -197,7 +197,8 @@ class Runner:
                     self.display.note(f"set aside as .bad and made again: {problem}")
                 else:
                     del folders[name]
-                    again = f"`pipeline resume --verify` makes it again ({problem})"
+                    command = command_that_makes(name, self.state.get("stages"))
+                    again = f"`pipeline {command} --verify` makes it again ({problem})"
                     self.display.note(f"{name} is damaged: left out; {again}")
         if damaged:
             raise DamagedInputs

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from pipeline import manifests
-from pipeline.chain import ON_REQUEST, STAGES
+from pipeline.chain import STAGES, command_that_makes
 from pipeline.job import Job, NotReady
 from pipeline.manifests import BadManifest, Manifest
 from pipeline.runner import Runner
@@ -48,7 +48,7 @@ def status_of(workspace: Workspace, runner: Runner, stage: str, deep: bool = Fal
         return StageStatus(stage, "stale" if last else "never", reason)
     except StageError as error:
         return StageStatus(stage, "stale" if last else "never", f"{error.what}: {error.why}")
-    folder = workspace.folder(stage, job.key)
+    folder, command = workspace.folder(stage, job.key), command_that_makes(stage, runner.state.get("stages"))
     try:
         manifest = manifests.read(folder)
         manifests.check_outputs(folder, manifest, deep)
@@ -56,11 +56,10 @@ def status_of(workspace: Workspace, runner: Runner, stage: str, deep: bool = Fal
     except FileNotFoundError:
         pass
     except BadManifest as problem:
-        return StageStatus(stage, "damaged", f"{problem}; `pipeline resume --verify` makes it again")
+        return StageStatus(stage, "damaged", f"{problem}; `pipeline {command} --verify` makes it again")
     if workspace.partial(stage, job.key).exists():
         if process := workspace.at_work():
             return StageStatus(stage, "partial", f"process {process} is at work in this workspace")
-        command = stage if stage in ON_REQUEST else "resume"
         return StageStatus(stage, "partial", f"interrupted; `pipeline {command}` takes it up again")
     if last is not None:
         return StageStatus(stage, "stale", "; ".join(differences(job, last)) or "run again")

@@ -26,15 +26,17 @@ def mean_photo(photos: "Iterable[Tensor]", used: "Iterable[Tensor | None]") -> M
     """Average (H, W, 3) photos, each of equal weight whatever its size. Raises ValueError for no photos.
 
     ``used`` says of each photo which pixels count, (H, W) bool, None all of them. Where no photo has a pixel that
-    counts, the mean image has the mean colour.
+    counts, the mean image has the mean colour; that is of all pixels where none counts anywhere.
     """
     import torch
 
-    total, weight, colours = torch.zeros(()), torch.zeros(()), torch.zeros(3, dtype=torch.float64)
-    sizes, count = set(), 0
+    total, weight = torch.zeros(()), torch.zeros(())
+    colours, of_all = torch.zeros(2, 3, dtype=torch.float64)
+    sizes, number, count = set(), 0, 0
     for photo, mask in zip(photos, used, strict=True):
         sizes.add(photo.shape)
-        exact = photo.double()
+        exact, number = photo.double(), number + 1
+        of_all += exact.mean((0, 1))
         if mask is not None and not mask.any():
             continue
         colours += exact.mean((0, 1)) if mask is None else exact[mask].mean(0)
@@ -42,8 +44,10 @@ def mean_photo(photos: "Iterable[Tensor]", used: "Iterable[Tensor | None]") -> M
             total = total + (exact if mask is None else exact * mask[..., None])
             weight = weight + (1 if mask is None else mask[..., None])
         count += 1
-    if not count:
+    if not number:
         raise ValueError("the mean of no photos")
+    if not count:
+        return MeanPhoto(None, (of_all / number).float())
     colour = colours / count
     image = torch.where(weight > 0, total / weight.clamp(min=1), colour).float() if len(sizes) == 1 else None
     return MeanPhoto(image, colour.float())

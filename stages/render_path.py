@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 PathKind = Literal["orbit", "spiral", "interpolated"]
 LARGEST_SIDE = 2**15  # pixels: four times as many as any screen has
 LEAST_FOCAL = 0.5  # in widths: a pinhole wider than 90 degrees stretches its corners
+ONE_PLACE = 1e-6  # scene units
 TRIED_FRAMES = 120  # of a path that may be unsuited
 ONE_LENS = 1.1  # between the longest and the shortest focal length of photos that are shown with one
 
@@ -97,7 +98,7 @@ def _poses(scene: "Scene") -> "np.ndarray":
 
 def fitted_path(scene: "Scene", kind: PathKind, frames: int) -> CameraPath:
     """A path among the training photos, through an undistorted camera of median focal length or, where theirs differ,
-    of one that goes along with them."""
+    of one that goes along with them. Raises StageError for an orbit around photos from one place."""
     import numpy as np
 
     from nerf import camera_paths
@@ -108,6 +109,9 @@ def fitted_path(scene: "Scene", kind: PathKind, frames: int) -> CameraPath:
         "interpolated": camera_paths.interpolated,
     }[kind]
     poses = _poses(scene)
+    if kind == "orbit" and np.ptp(poses[:, :, 3], axis=0).max() < ONE_PLACE:
+        hint = "Leave --render.path out, or give interpolated."
+        raise StageError("there is no orbit to fly", "all photos were taken from one place", hint)
     path, camera, relative = path_of(poses, frames), median_camera(scene), _relative_focals(scene)
     if np.ptp(np.log(relative)) <= math.log(ONE_LENS):
         return CameraPath((camera,) * frames, path)

@@ -13,8 +13,10 @@ import pytest
 from PIL import Image
 
 from pipeline.cli import run_command
+from pipeline.runner import Runner
 from pipeline.settings import Settings
 from pipeline.workspace import default_workspace
+from stages.contract import StageError
 
 
 def test_help_names_every_command_and_stage(capsys: pytest.CaptureFixture[str]):
@@ -303,6 +305,22 @@ def test_photos_that_cannot_be_used_any_more_fail_their_own_stage(tmp_path: Path
         photo.rename(photo.with_suffix(".txt"))
     assert run_command(["resume", str(tmp_path / "w.nerf")]) == 10
     assert f"no photos in {tmp_path / 'photos'}" in capsys.readouterr().err
+
+
+def test_a_photo_that_cannot_be_read_any_more_fails_the_stage_that_reads_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    (tmp_path / "photos").mkdir()
+    for k in range(3):
+        Image.effect_noise((64, 48), 30 + k).convert("RGB").save(tmp_path / f"photos/{k}.png")
+    assert run_on(tmp_path / "photos", capsys, "--until", "ingest")[0] == 0
+
+    def unreadable(_: Runner) -> str:
+        raise StageError("cannot read 1.png", "Permission denied", "Check its permissions.")
+
+    monkeypatch.setattr(Runner, "_photos_digest", unreadable)
+    assert run_command(["resume", str(tmp_path / "w.nerf")]) == 10
+    assert "cannot read 1.png" in capsys.readouterr().err
 
 
 def test_status_of_no_workspace(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 from PIL import Image
 
+from pipeline import forecast
 from pipeline.cli import run_command
 from pipeline.display import SilentDisplay
 from pipeline.failures import StageFailed
@@ -98,3 +99,15 @@ def test_a_run_plans_its_stages_anew_and_one_stage_alone_itself(
     for command in ("resume", "render", "tradeoff"):
         assert run_command([command, ".", "--replan"]) == run_command([command, "."]) == 0
     assert seen == [("ingest", "sfm"), (), ("render",), (), ("tradeoff",), ()]
+
+
+def test_what_is_planned_anew_is_foretold(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    anew: list[frozenset[str]] = []
+    monkeypatch.setattr("pipeline.runner.Runner.run", lambda *_, **__: False)
+    monkeypatch.setattr(forecast, "foretell", lambda *given: anew.append(given[2]) or forecast.Forecast([], {}))
+    monkeypatch.chdir(tmp_path)
+    run = {"version": 1, "options": {}, "plans": {"train": {"asked": {}}}, "keys": {}, "stages": ["ingest", "train"]}
+    (tmp_path / "run.json").write_text(json.dumps(run))
+    for words in (["resume", "."], ["resume", ".", "--replan"], ["ingest", ".", "--replan", "--force"]):
+        assert run_command(words) == 0
+    assert anew == [set(), {"train"}, {"ingest"}], "what has no plan does not run for that"

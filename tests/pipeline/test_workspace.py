@@ -144,6 +144,29 @@ def test_a_stage_at_work_is_not_called_interrupted(tmp_path: Path):
     assert status_of(asked, runner, "mesh").text == "interrupted; `pipeline resume` takes it up again"
 
 
+@pytest.mark.parametrize(
+    "stage, recorded, command",
+    [
+        ("mesh", None, "resume"),
+        ("mesh", ["ingest", "sfm", "normalise", "effects", "train", "mesh"], "resume"),
+        ("mesh", ["ingest", "sfm"], "mesh"),
+        ("tradeoff", None, "tradeoff"),
+    ],
+)
+def test_the_command_named_is_one_that_makes_the_stage(
+    tmp_path: Path, stage: str, recorded: list[str] | None, command: str
+):
+    job = SimpleNamespace(key=KEY)
+    runner: Any = SimpleNamespace(state={"keys": {}, "stages": recorded}, resolve=lambda *_, **__: job)
+    workspace = Workspace(tmp_path)
+    workspace.partial(stage, KEY).mkdir(parents=True)
+    assert status_of(workspace, runner, stage).text == f"interrupted; `pipeline {command}` takes it up again"
+    workspace.folder(stage, KEY).mkdir(parents=True)
+    (workspace.folder(stage, KEY) / "manifest.json").write_text("{")
+    damaged = status_of(workspace, runner, stage)
+    assert damaged.state == "damaged" and damaged.text.endswith(f"`pipeline {command} --verify` makes it again")
+
+
 def test_a_killed_process_is_not_at_work(tmp_path: Path):
     asked = Workspace(tmp_path)
     assert asked.at_work() is None

@@ -51,8 +51,14 @@ def test_a_mean_of_masked_photos_is_of_what_they_are_used_for():
 def test_a_photo_that_is_masked_away_does_not_count():
     photos, nothing = [torch.full((2, 2, 3), 0.3), torch.ones(2, 2, 3)], torch.zeros(2, 2, dtype=torch.bool)
     assert torch.allclose(mean_photo(photos, [None, nothing]).shown_at(2, 2), photos[0])
+
+
+def test_where_masks_leave_nothing_of_any_photo_the_mean_colour_is_that_of_all():
+    nothing = torch.zeros(2, 2, dtype=torch.bool)
+    mean = mean_photo([torch.full((2, 2, 3), 0.3), torch.ones(2, 2, 3)], [nothing, nothing])
+    assert torch.allclose(mean.shown_at(2, 2), torch.full((2, 2, 3), 0.65))
     with pytest.raises(ValueError, match="the mean of no photos"):
-        mean_photo(photos, [nothing, nothing])
+        mean_photo([], [])
 
 
 def test_a_test_photo_of_another_size_gets_the_mean_colour():

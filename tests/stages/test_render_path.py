@@ -3,7 +3,9 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
+from stages.contract import StageError
 from stages.render_path import fitted_path, median_camera, usual_path
 from tests.camera_layouts import ring, wall
 from tests.stages.test_render import CAMERA, scene_with
@@ -40,3 +42,11 @@ def test_a_few_photos_held_sideways_do_not_tilt_a_spiral() -> None:
     assert usual_path(scene) == "spiral"
     path = fitted_path(scene, "spiral", 30).poses
     assert (np.abs(path[:, 2, 0]) < 1e-9).all() and (path[:, 2, 1] < -0.9).all()
+
+
+def test_photos_from_one_place_have_no_orbit_but_a_path() -> None:
+    poses = ring(6)
+    poses[:, :, 3] = 0.25
+    with pytest.raises(StageError, match="one place"):
+        fitted_path(scene_with(poses), "orbit", 9)
+    assert np.isfinite(fitted_path(scene_with(poses), "interpolated", 9).poses).all()

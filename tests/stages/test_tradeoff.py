@@ -83,7 +83,11 @@ def test_a_study_from_arms_to_recommendation_and_the_same_after_a_kill(
     assert study["ablation"].startswith("Against the complete reduced method, seed by seed, of 2 seeds")
     text = (tmp_path / "whole" / "tradeoff.md").read_text()
     assert study["ablation"] in text and "is drawn in the least time" in text
-    assert f"Train it: `{study['command']}`" in text and f"Fields: {study['fields']}." in text and "grid: " in study["fields"]
+    assert (
+        f"Train it: `{study['command']}`" in text
+        and f"Fields: {study['fields']}." in text
+        and "grid: " in study["fields"]
+    )
 
     count, begun = len(study["arms"]), []
     whole = tradeoff_trial.score
