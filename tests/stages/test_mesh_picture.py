@@ -1,5 +1,7 @@
 """The report's picture of a mesh: from where it is taken."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -47,6 +49,18 @@ def test_what_faces_one_way_is_shown_from_where_the_cameras_stand():
     assert shows_all(one) and shows_all(other)
     np.testing.assert_allclose(one.from_camera[:, 2], [0, 1, 0], atol=1e-12)
     assert other.from_camera[0, 2] < 0  # the camera on the right looks to the left
+
+
+def test_a_photo_that_was_held_sideways_shows_the_mesh_upright():
+    scene = scene_of("forward", [(-1, -3, 0), (0, -3, 0), (1.5, -3, 0)])
+    upright = viewpoints(CUBE, scene)
+    turns = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
+    views = tuple(
+        replace(view, scene_from_camera=np.c_[view.scene_from_camera[:, :3] @ turns, view.scene_from_camera[:, 3]])
+        for view in scene.views
+    )
+    for seen, before in zip(viewpoints(CUBE, replace(scene, views=views)), upright, strict=True):
+        assert np.allclose(seen.from_camera, before.from_camera)
 
 
 def test_a_room_is_shown_from_inside():
