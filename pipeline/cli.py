@@ -34,14 +34,13 @@ from pipeline.settings import (
     with_lasting_cameras,
     with_source,
 )
-from pipeline.signals import Terminated, heed_signals
+from pipeline.signals import Terminated, go_on, heed_signals
 from pipeline.workspace import RUN_FILE, Workspace, default_workspace
 from stages.amounts import duration
 from stages.contract import StageError
 
 EXIT_DEFECT, EXIT_USAGE, EXIT_WORKSPACE, EXIT_INTERRUPT, EXIT_TERMINATED = 1, 2, 3, 130, 143
 
-GO_ON = "Finished stages are kept; the same command goes on."
 REPORT_IT = "Finished stages are kept. Please report it with the output of the same command and --debug."
 
 
@@ -89,10 +88,10 @@ def run_command(words: Sequence[str]) -> int:
         _say(error.what, error.why, error.hint, as_json)
         return EXIT_WORKSPACE
     except KeyboardInterrupt:
-        _say("stopped", "Ctrl-C", GO_ON, as_json)
+        _say("stopped", "Ctrl-C", go_on(words), as_json)
         return EXIT_INTERRUPT
     except Terminated:
-        _say("stopped", "SIGTERM", GO_ON, as_json)
+        _say("stopped", "SIGTERM", go_on(words), as_json)
         return EXIT_TERMINATED
     except BrokenPipeError:
         raise

@@ -163,9 +163,9 @@ class Forecast(NamedTuple):
 
 
 def foretell(runner: "Runner", stages: Sequence[str], anew: frozenset[str], photos: Photos | None) -> Forecast:
-    """How long a run of ``stages`` takes, ``anew`` those of them that run though they have a result: in words, where
-    anything has to run and it can be told, and by stage. Nothing where the photos or a file that a setting names cannot
-    be read: the stage that reads it says so."""
+    """How long a run of ``stages`` takes, ``anew`` those of them that may run though they have a result: in words,
+    where anything may have to run and it can be told, and by stage. Nothing where the photos or a file that a setting
+    names cannot be read: the stage that reads it says so."""
     try:
         return _foretold(runner, stages, anew, photos) if photos else Forecast([], {})
     except StageError:

@@ -73,9 +73,10 @@ class Runner:
 
     def found(self, stage: str) -> Manifest | None:
         """The finished result of ``stage`` for these options, as far as can be told beforehand; None without one."""
-        found = self._upstream(stage, "report") if self.state["keys"] else None
-        self.done.clear()  # what runs now may make it outdated
-        return found
+        try:
+            return self._upstream(stage, "report") if self.state["keys"] else None
+        finally:
+            self.done.clear()  # what runs now may make it outdated
 
     def _options_digest(self) -> str:
         """Of what a budget is kept for: a study has its own time."""
@@ -198,7 +199,7 @@ class Runner:
                 else:
                     del folders[name]
                     command = command_that_makes(name, self.state.get("stages"))
-                    again = f"`pipeline {command} --verify` makes it again ({problem})"
+                    again = f"`pipeline {command} {self.workspace.root} --verify` makes it again ({problem})"
                     self.display.note(f"{name} is damaged: left out; {again}")
         if damaged:
             raise DamagedInputs

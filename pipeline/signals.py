@@ -4,6 +4,7 @@ lost; a terminal that is closed stops nothing."""
 import signal
 import sys
 import threading
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -22,6 +23,18 @@ def heed_signals() -> None:
     if hasattr(signal, "SIGHUP"):  # a run outlives its terminal, and so does what it starts
         signal.signal(signal.SIGHUP, signal.SIG_IGN)
     sys.unraisablehook = _send_again
+
+
+def go_on(words: Sequence[str]) -> str:
+    """What takes up again the work of a command line that was stopped."""
+    way = "the same command goes on"
+    if words[0] in ("run", "resume"):  # what was asked for is recorded before any stage begins
+        way = "`pipeline resume WORKSPACE` goes on"
+    elif "--force" in words:
+        way = "the same command begins anew"
+    elif "--replan" in words:
+        way = "the same command without --replan goes on"
+    return f"Finished stages are kept; {way}."
 
 
 def _terminate(number: int, frame: "FrameType | None") -> None:

@@ -56,11 +56,13 @@ def status_of(workspace: Workspace, runner: Runner, stage: str, deep: bool = Fal
     except FileNotFoundError:
         pass
     except BadManifest as problem:
-        return StageStatus(stage, "damaged", f"{problem}; `pipeline {command} --verify` makes it again")
+        return StageStatus(
+            stage, "damaged", f"{problem}; `pipeline {command} {workspace.root} --verify` makes it again"
+        )
     if workspace.partial(stage, job.key).exists():
         if process := workspace.at_work():
             return StageStatus(stage, "partial", f"process {process} is at work in this workspace")
-        return StageStatus(stage, "partial", f"interrupted; `pipeline {command}` takes it up again")
+        return StageStatus(stage, "partial", f"interrupted; `pipeline {command} {workspace.root}` takes it up again")
     if last is not None:
         return StageStatus(stage, "stale", "; ".join(differences(job, last)) or "run again")
     return StageStatus(stage, "never", "")

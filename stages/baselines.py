@@ -32,23 +32,24 @@ def mean_photo(photos: "Iterable[Tensor]", used: "Iterable[Tensor | None]") -> M
 
     total, weight = torch.zeros(()), torch.zeros(())
     colours, of_all = torch.zeros(2, 3, dtype=torch.float64)
-    sizes, number, count = set(), 0, 0
+    sizes, seen, counted = set(), 0, 0
     for photo, mask in zip(photos, used, strict=True):
         sizes.add(photo.shape)
-        exact, number = photo.double(), number + 1
-        of_all += exact.mean((0, 1))
+        exact, seen = photo.double(), seen + 1
+        colour = exact.mean((0, 1))
+        of_all += colour
         if mask is not None and not mask.any():
             continue
-        colours += exact.mean((0, 1)) if mask is None else exact[mask].mean(0)
+        colours += colour if mask is None else exact[mask].mean(0)
         if len(sizes) == 1:
             total = total + (exact if mask is None else exact * mask[..., None])
             weight = weight + (1 if mask is None else mask[..., None])
-        count += 1
-    if not number:
+        counted += 1
+    if not seen:
         raise ValueError("the mean of no photos")
-    if not count:
-        return MeanPhoto(None, (of_all / number).float())
-    colour = colours / count
+    if not counted:
+        return MeanPhoto(None, (of_all / seen).float())
+    colour = colours / counted
     image = torch.where(weight > 0, total / weight.clamp(min=1), colour).float() if len(sizes) == 1 else None
     return MeanPhoto(image, colour.float())
 

@@ -110,7 +110,7 @@ def fitted_path(scene: "Scene", kind: PathKind, frames: int) -> CameraPath:
     }[kind]
     poses = _poses(scene)
     if kind == "orbit" and np.ptp(poses[:, :, 3], axis=0).max() < ONE_PLACE:
-        hint = "Leave --render.path out, or give interpolated."
+        hint = "Give --render.path interpolated, or None to have one chosen."
         raise StageError("there is no orbit to fly", "all photos were taken from one place", hint)
     path, camera, relative = path_of(poses, frames), median_camera(scene), _relative_focals(scene)
     if np.ptp(np.log(relative)) <= math.log(ONE_LENS):

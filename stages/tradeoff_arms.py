@@ -25,6 +25,8 @@ DRAWING = {"grid": 0.7, "paper": 3.0}
 """Rays drawn a second over rays trained, about: drawing does less, but a grid field of few steps is fog all over."""
 SPENT_ELSEWHERE = 0.03  # of the study's time: measuring speeds before it, drawing plots after it
 
+Grids = Literal["small", "usual", "large"]
+
 
 class Variant(NamedTuple):
     """A field as stage train is asked for it. ``family`` groups variants in the plot; ``speed`` names the variant whose
@@ -36,7 +38,7 @@ class Variant(NamedTuple):
     speed: str
     cost: float = 1.0
     fewest: int = FEWEST_STEPS
-    grids: Literal["small", "usual", "large"] | None = None
+    grids: Grids | None = None
 
 
 REDUCED, PUBLISHED, FEWER_RAYS = "paper, reduced", "paper, published", "paper, published, 64 rays a step"
@@ -171,9 +173,9 @@ def field_of(variant: str) -> Literal["grid", "paper"]:
     return "grid" if VARIANTS[variant].family.startswith("grid") else "paper"
 
 
-def grid_sizes(grids: Literal["small", "usual", "large"], space: Space) -> dict[str, int]:
-    """Sizes of a grid field: as stage train chooses them on a CPU for long runs (``usual``) and for short ones, and
-    larger still, by one grid, twice the rows and twice the cells along an axis."""
+def grid_sizes(grids: Grids, space: Space) -> dict[str, int]:
+    """Sizes of a grid field: those that stage train has on a CPU for long runs (``usual``) and for short ones, whatever
+    the size of the photos, and larger still, by one grid, twice the rows and twice the cells along an axis."""
     (_, levels, log2_rows, finest), (_, *small) = GRID_SIZES[space]
     of = {"small": small, "usual": (levels, log2_rows, finest), "large": (levels + 1, log2_rows + 1, 2 * finest)}
     return dict(zip(("levels", "log2_rows", "finest"), of[grids], strict=True))
@@ -181,7 +183,7 @@ def grid_sizes(grids: Literal["small", "usual", "large"], space: Space) -> dict[
 
 def options_of(variant: str, space: Space) -> dict[str, Any]:
     """The field of a variant as stage train is asked for it in such a space."""
-    _, options, *_, grids = VARIANTS[variant]
+    options, grids = VARIANTS[variant].options, VARIANTS[variant].grids
     return {"field": field_of(variant), **options, **(grid_sizes(grids, space) if grids else {})}
 
 

@@ -108,7 +108,8 @@ def test_more_of_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert "is not a workspace" in capsys.readouterr().err
     assert run_command(["run", str(photos), "-o", str(tmp_path / "w"), "--until", "ingest"]) == 0
     assert run_command(["run", str(photos), "-o", str(tmp_path / "w"), "--more", "10m"]) == 3
-    assert "no training is finished there" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "no training is finished there" in said and f"First: pipeline train {tmp_path / 'w'}" in said
 
 
 def test_more_belongs_to_training(trained, capsys: pytest.CaptureFixture[str]):

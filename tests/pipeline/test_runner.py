@@ -204,7 +204,7 @@ def test_a_damaged_input_that_is_only_read_where_it_is_there_is_left_out_and_lef
     assert seen == [{"ingest"}] and calls == ["train"]
     assert [p.name for p in folder.parent.iterdir()] == [folder.name], "nobody would make it again"
     (note,) = notes
-    assert note.startswith("sfm is damaged: left out; `pipeline sfm --verify` makes it again (")
+    assert note.startswith(f"sfm is damaged: left out; `pipeline sfm {tmp_path / 'w.nerf'} --verify` makes it again (")
     bring(stages=("ingest", "sfm", "train"), verify=True, force={"train"})
     assert "sfm" in calls and seen[1:] == [{"ingest", "sfm"}]
 

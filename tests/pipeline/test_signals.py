@@ -1,4 +1,4 @@
-"""Signals that arrive where Python ignores what is raised."""
+"""Signals that arrive where Python ignores what is raised, and what is said of them."""
 
 import signal
 import subprocess
@@ -7,6 +7,8 @@ import tomllib
 from pathlib import Path
 
 import pytest
+
+from pipeline.cli import run_command
 
 STRUCK_IN_A_FINALISER = """
 import signal, sys, time
@@ -67,3 +69,25 @@ runpy.run_module("pipeline", run_name="__main__")
     assert (ended.returncode, ended.stdout, ended.stderr) == (130, "", "")
     project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text("utf-8"))["project"]
     assert project["scripts"] == {"pipeline": "pipeline.__main__:main"}
+
+
+@pytest.mark.parametrize(
+    "words, way",
+    [
+        ("run photos --from train", "`pipeline resume WORKSPACE` goes on"),
+        ("resume w", "`pipeline resume WORKSPACE` goes on"),
+        ("tradeoff w --budget 30m", "the same command goes on"),
+        ("demo", "the same command goes on"),
+        ("train w --force", "the same command begins anew"),
+        ("train w --replan", "the same command without --replan goes on"),
+    ],
+)
+def test_what_was_stopped_is_told_how_to_go_on(
+    words: str, way: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    def interrupted(_: str):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("pipeline.cli._command", interrupted)
+    assert run_command(words.split()) == 130
+    assert f"Finished stages are kept; {way}.\n" in capsys.readouterr().err

@@ -141,7 +141,7 @@ def test_a_stage_at_work_is_not_called_interrupted(tmp_path: Path):
     with Workspace(tmp_path):
         at_work = status_of(asked, runner, "mesh")
     assert (at_work.state, at_work.text) == ("partial", f"process {os.getpid()} is at work in this workspace")
-    assert status_of(asked, runner, "mesh").text == "interrupted; `pipeline resume` takes it up again"
+    assert status_of(asked, runner, "mesh").text == f"interrupted; `pipeline resume {tmp_path}` takes it up again"
 
 
 @pytest.mark.parametrize(
@@ -160,11 +160,13 @@ def test_the_command_named_is_one_that_makes_the_stage(
     runner: Any = SimpleNamespace(state={"keys": {}, "stages": recorded}, resolve=lambda *_, **__: job)
     workspace = Workspace(tmp_path)
     workspace.partial(stage, KEY).mkdir(parents=True)
-    assert status_of(workspace, runner, stage).text == f"interrupted; `pipeline {command}` takes it up again"
+    assert status_of(workspace, runner, stage).text == f"interrupted; `pipeline {command} {tmp_path}` takes it up again"
     workspace.folder(stage, KEY).mkdir(parents=True)
     (workspace.folder(stage, KEY) / "manifest.json").write_text("{")
     damaged = status_of(workspace, runner, stage)
-    assert damaged.state == "damaged" and damaged.text.endswith(f"`pipeline {command} --verify` makes it again")
+    assert damaged.state == "damaged" and damaged.text.endswith(
+        f"`pipeline {command} {tmp_path} --verify` makes it again"
+    )
 
 
 def test_a_killed_process_is_not_at_work(tmp_path: Path):

@@ -15,9 +15,10 @@ from PIL import Image
 from nerf.scene import Camera
 from stages import stopwatch, tradeoff, tradeoff_arms, tradeoff_own, tradeoff_trial, train
 from stages.contract import StageError
+from stages.effect_decisions import Decisions, write_decisions
 from stages.files import read_json, read_scene, write_json
 from stages.tradeoff import Config
-from stages.tradeoff_arms import FEWER_RAYS, OWN, PUBLISHED, VARIANTS, Arm
+from stages.tradeoff_arms import FEWER_RAYS, OWN, PUBLISHED, VARIANTS, Arm, Speed
 from stages.tradeoff_own import own_field
 from tests.stages.photo_scene import photographed
 
@@ -83,11 +84,8 @@ def test_a_study_from_arms_to_recommendation_and_the_same_after_a_kill(
     assert study["ablation"].startswith("Against the complete reduced method, seed by seed, of 2 seeds")
     text = (tmp_path / "whole" / "tradeoff.md").read_text()
     assert study["ablation"] in text and "is drawn in the least time" in text
-    assert (
-        f"Train it: `{study['command']}`" in text
-        and f"Fields: {study['fields']}." in text
-        and "grid: " in study["fields"]
-    )
+    assert f"Train it: `{study['command']}`" in text and f"Fields: {study['fields']}." in text
+    assert "grid: 2 grids of features, the finest of 32³ cells; " in study["fields"]
 
     count, begun = len(study["arms"]), []
     whole = tradeoff_trial.score
@@ -113,6 +111,22 @@ def test_what_is_planned_is_what_is_run(tmp_path: Path, photos: dict[str, Path],
     assert planned.speeds and set(planned.speeds) == set(tradeoff_arms.TIMED)
     assert all(steps > 0 and rays > steps for steps, rays in planned.speeds.values())
     assert planned.sizes == (1.0, 1.0) and planned.downscale == 1.0
+
+
+@pytest.mark.parametrize("unbounded, space", [(False, "bounded"), (True, "contracted")])
+def test_a_study_is_of_the_space_that_the_scene_lies_in(
+    tmp_path: Path,
+    photos: dict[str, Path],
+    progress: Any,
+    monkeypatch: pytest.MonkeyPatch,
+    unbounded: bool,
+    space: str,
+) -> None:
+    speeds = {name: Speed(*speed) for name, speed in SPEEDS.items()}
+    monkeypatch.setattr("stages.tradeoff_speeds.measured_speeds", lambda *_: speeds)
+    write_decisions(tmp_path, Decisions(unbounded=unbounded))
+    planned = tradeoff.plan(Config(seconds=60.0), photos | {"effects": tmp_path}, progress)
+    assert {planned.space} == {arm.space for arm in tradeoff.selection_of(planned).arms} == {space}
     assert planned.windows and 6 <= planned.windows <= 32
     photos_take, windows_take = planned.reading
     assert 0 < photos_take < 5 and 0 < windows_take < 5

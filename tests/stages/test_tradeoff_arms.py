@@ -48,10 +48,12 @@ def test_every_variant_is_one_that_stage_train_takes(space: Space) -> None:
 
 
 @SPACES
-def test_a_study_has_the_grids_that_training_chooses_for_long_and_for_short_runs(space: Space) -> None:
+def test_a_study_has_the_sizes_of_grids_that_training_has_for_long_and_for_short_runs(space: Space) -> None:
     def sizes(variant: str) -> tuple[int, ...]:
         return tuple(options_of(variant, space)[name] for name in ("levels", "log2_rows", "finest"))
 
+    usual = [arm for arm in select(1e4, 1, space, SIZES, FAST, 1000).arms if arm.variant == "grid"]
+    assert {arm.options["finest"] for arm in usual} == {512 if space == "bounded" else 1024}
     chosen = [tuple(entry[1:]) for entry in GRID_SIZES[space]]
     assert [sizes("grid"), sizes("small grid")] == chosen
     assert sizes("grid, half the samples") == sizes("grid, twice the samples") == sizes("grid")
