@@ -1,6 +1,7 @@
 """The stages in the order they run, and how they depend on each other."""
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from types import ModuleType
 
 from stages import effects, evaluate, ingest, mesh, normalise, render, report, sfm, tradeoff, train
@@ -57,7 +58,7 @@ def usual() -> list[str]:
     return up_to(list(STAGES)[-1])
 
 
-def command_that_makes(stage: str, recorded: Sequence[str] | None) -> str:
-    """Which command brings ``stage`` up to date in a workspace whose last run had the ``recorded`` stages: that run
-    again, or the stage's own."""
-    return "resume" if stage in (recorded or usual()) else stage
+def command_that_makes(stage: str, recorded: Sequence[str] | None, root: Path) -> str:
+    """The command that brings ``stage`` up to date in the workspace ``root``, whose last run had the ``recorded``
+    stages: that run again, or the stage's own."""
+    return f"pipeline {'resume' if stage in (recorded or usual()) else stage} {root}"

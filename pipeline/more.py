@@ -27,11 +27,11 @@ def with_more(settings: Settings, workspace: Workspace, text: str) -> Settings:
         if value is not None and value != recorded["options"]["train"][name]:
             raise UsageError(f"--more and --train.{name} are two budgets; give one")
     key = recorded["keys"].get("train")
-    finished = None if key is None else _finished(workspace, key)
+    command = command_that_makes("train", recorded.get("stages"), workspace.root)
+    finished = None if key is None else _finished(workspace, key, command)
     after = training_name(finished.key, finished.outputs_digest) if finished else train.after
     if after is None:
-        why, command = "no training is finished there", command_that_makes("train", recorded.get("stages"))
-        raise StageError(f"{workspace.root} cannot go on", why, f"First: pipeline {command} {workspace.root}")
+        raise StageError(f"{workspace.root} cannot go on", "no training is finished there", f"First: {command}")
     return settings.model_copy(update={"train": train.model_copy(update={"after": after, **_budget(text)})})
 
 
@@ -43,10 +43,9 @@ def _budget(text: str) -> dict[str, Any]:
     return {"more_steps": None, "more_seconds": seconds_from(text)}
 
 
-def _finished(workspace: Workspace, key: str) -> Manifest | None:
+def _finished(workspace: Workspace, key: str, command: str) -> Manifest | None:
     try:
         return workspace.finished("train", key)
     except BadManifest as problem:
-        command = command_that_makes("train", workspace.read_run().get("stages"))
-        hint = f"It was set aside; pipeline {command} {workspace.root} trains again."
+        hint = f"It was set aside; {command} trains again."
         raise StageError(f"{workspace.root} cannot go on", str(problem), hint) from problem

@@ -198,8 +198,8 @@ class Runner:
                     self.display.note(f"set aside as .bad and made again: {problem}")
                 else:
                     del folders[name]
-                    command = command_that_makes(name, self.state.get("stages"))
-                    again = f"`pipeline {command} {self.workspace.root} --verify` makes it again ({problem})"
+                    command = command_that_makes(name, self.state.get("stages"), self.workspace.root)
+                    again = f"`{command} --verify` makes it again ({problem})"
                     self.display.note(f"{name} is damaged: left out; {again}")
         if damaged:
             raise DamagedInputs

@@ -48,7 +48,8 @@ def status_of(workspace: Workspace, runner: Runner, stage: str, deep: bool = Fal
         return StageStatus(stage, "stale" if last else "never", reason)
     except StageError as error:
         return StageStatus(stage, "stale" if last else "never", f"{error.what}: {error.why}")
-    folder, command = workspace.folder(stage, job.key), command_that_makes(stage, runner.state.get("stages"))
+    folder = workspace.folder(stage, job.key)
+    command = command_that_makes(stage, runner.state.get("stages"), workspace.root)
     try:
         manifest = manifests.read(folder)
         manifests.check_outputs(folder, manifest, deep)
@@ -56,13 +57,11 @@ def status_of(workspace: Workspace, runner: Runner, stage: str, deep: bool = Fal
     except FileNotFoundError:
         pass
     except BadManifest as problem:
-        return StageStatus(
-            stage, "damaged", f"{problem}; `pipeline {command} {workspace.root} --verify` makes it again"
-        )
+        return StageStatus(stage, "damaged", f"{problem}; `{command} --verify` makes it again")
     if workspace.partial(stage, job.key).exists():
         if process := workspace.at_work():
             return StageStatus(stage, "partial", f"process {process} is at work in this workspace")
-        return StageStatus(stage, "partial", f"interrupted; `pipeline {command} {workspace.root}` takes it up again")
+        return StageStatus(stage, "partial", f"interrupted; `{command}` takes it up again")
     if last is not None:
         return StageStatus(stage, "stale", "; ".join(differences(job, last)) or "run again")
     return StageStatus(stage, "never", "")
