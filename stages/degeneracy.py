@@ -18,6 +18,7 @@ LIKE_A_ROTATION = 0.02
 # Between two models of the same photos poses differ by less than a degree and a hundredth of the scene where both are
 # right (docs/numbers.md); what repeats puts a photo another facade, or window, farther.
 SAME_ANGLE_DEG, SAME_PLACE = 5.0, 0.05
+PROPOSALS = 500
 RADIAL_DEG, MOSTLY = 15.0, 0.8
 FOCAL_LENGTHS = np.geomspace(0.3, 6, 61)  # over the longer side: from 118 to 10 degrees
 
@@ -111,7 +112,8 @@ def elsewhere(
 ) -> Bool[np.ndarray, "photos"]:
     """Which photos of two models, by their poses (from the camera), stand elsewhere in the second than in the first.
 
-    Compared is after the similarity between the models on which most photos agree; every two photos propose one.
+    Compared is after the similarity between the models on which most photos agree; every two photos propose one, or of
+    many photos as many pairs as PROPOSALS, from all over the list.
     ``extent``: how far apart the first model's cameras stand (root mean square). None of fewer than three photos.
     """
     best = np.zeros(len(first), bool)
@@ -119,7 +121,8 @@ def elsewhere(
     if len(first) < 3:
         return nowhere_else
     between = first[:, :, :3] @ second[:, :, :3].transpose(0, 2, 1)
-    for pair in combinations(range(len(first)), 2):
+    pairs = list(combinations(range(len(first)), 2))
+    for pair in pairs[:: -(-len(pairs) // PROPOSALS)]:
         chosen = list(pair)
         u, _, vt = np.linalg.svd(between[chosen].sum(axis=0))
         rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt

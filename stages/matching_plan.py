@@ -1,4 +1,4 @@
-"""How far to search features and which pairs of photos to match, decided beforehand by what that costs on this machine.
+"""How far to search features and which pairs of photos to match, decided beforehand.
 
 The cost is measured on a few of the photos, in a child process (COLMAP may abort): ``python -P -m
 stages.matching_plan`` reads a job from stdin as one line of JSON and answers with a :class:`Cost`.
@@ -29,19 +29,16 @@ if TYPE_CHECKING:
 FEWEST_MEASURED = 4
 CHILD = ["-P", "-m", "stages.matching_plan"]
 WAYS = {
-    "sequential": "neighbours in time, {} each",
-    "spatial": "neighbours by place and looks, {} each",
-    "retrieval": "retrieval of {} neighbours each",
+    "sequential": "neighbours in time, up to {} each",
+    "spatial": "neighbours by GPS position and similarity, up to {} each",
+    "retrieval": "neighbours by similarity and order, up to {} each",
 }
 
 
-# The accuracy in docs/numbers.md is that of the first tier: sets of ordinary size are always searched so, and none
-# farther, since that costs a multiple and moves no camera of a well-sized photo; where photos find no place there is an
-# attempt for it. Larger sets, whose photos have partners enough, give way where features and matches, made once for all
-# trainings to come, would take longer than three of them. A step down has half the pixels or the same, and a quarter of
-# the products of matching. Below 1131 pixels photos would have to be doubled to yield enough, which saves nothing.
-ORDINARY = 100  # photos
-BEARABLE_SECONDS = 540.0
+# The accuracy in docs/numbers.md is that of the first tier. Sets of any size are searched so: features left out cost
+# more in cameras than they save in seconds. Only where a time is given that would not be enough, they give way: a step
+# down has half the pixels or the same, and a quarter of the products of matching. Below 1131 pixels photos would have
+# to be doubled to yield enough, which saves nothing.
 SEARCHING = 0.55  # of the seconds given to structure from motion: mapping and adjusting take the rest
 DENSEST = (0.5, 0.08)  # seconds of a photo and of a pair, two cores, of photos with the most features (fountain_p11)
 WORTH_IT = 0.7  # of the time: small photos, or such with few features, gain nothing by a step down, and are spared it
@@ -102,45 +99,34 @@ def chosen(
     progress: Progress,
     seconds_given: float | None,
 ) -> Chosen:
-    """What is left open, chosen by what the photos take on this machine; said where anything was measured for it.
-
-    First the pairs, then how far features are searched, so that sets of ordinary size are always searched in full.
-    Nothing is measured where it could change nothing. With ``seconds_given`` to all of structure from motion, sets of
-    ordinary size give way, too, where features and matches would take more than their part of it.
+    """What is left open: the pairs by how many photos there are, and features in full, unless ``seconds_given`` to all
+    of structure from motion would not be enough for them. Then some photos are timed on this machine, which is said.
     """
-    from stages.pairing import can_save, choose, expected_pairs, places_of
+    from stages.pairing import choose, expected_pairs, places_of
 
     count, tiers = len(photos), tiers_of(left_open)
-    pairs_open = left_open.matcher is None and can_save(count, neighbours)
-    bearable = BEARABLE_SECONDS if seconds_given is None else min(BEARABLE_SECONDS, SEARCHING * seconds_given)
-    if count <= ORDINARY and (seconds_given is None or _at_most(count) <= bearable):
-        tiers = tiers[:1]
-    if not pairs_open and len(tiers) == 1:
-        return Chosen(*tiers[0], left_open.matcher or "exhaustive")
-    progress.update("measuring what features and matches of a few photos take")
-    full = _measured(photos, images, tiers[0])
-    matcher = left_open.matcher or choose(count, neighbours, full.per_pair, places_of(photos))
+    matcher = left_open.matcher or choose(count, neighbours, places_of(photos))
     pairs = expected_pairs(matcher, count, neighbours)
-    if matcher != left_open.matcher and matcher != "exhaustive":
+    if matcher != "exhaustive":
         everything = expected_pairs("exhaustive", count, neighbours)
-        progress.note(
-            f"{count} photos have {everything:,} pairs, about {rough_duration(everything * full.per_pair)}: "
-            f"{WAYS[matcher].format(neighbours)}, about {rough_duration(pairs * full.per_pair)}"
-        )
-    tier, seconds = tiers[0], full.of(count, pairs)
+        progress.note(f"{count} photos have {everything:,} pairs: {WAYS[matcher].format(neighbours)}, about {pairs:,}")
+    if seconds_given is None or len(tiers) == 1 or _at_most(count, pairs) <= SEARCHING * seconds_given:
+        return Chosen(*tiers[0], matcher)
+    progress.update("measuring what features and matches of a few photos take")
+    tier, full = tiers[0], _measured(photos, images, tiers[0], matcher).of(count, pairs)
+    seconds = full
     for less in tiers[1:]:
-        if seconds <= bearable:
+        if seconds <= SEARCHING * seconds_given:
             break
-        if (shorter := _measured(photos, images, less).of(count, pairs)) <= WORTH_IT * seconds:
+        if (shorter := _measured(photos, images, less, matcher).of(count, pairs)) <= WORTH_IT * seconds:
             tier, seconds = less, shorter
-    progress.note(_search_in_words(count, tiers[0], tier, full.of(count, pairs), seconds))
+    progress.note(_search_in_words(count, tiers[0], tier, full, seconds))
     return Chosen(*tier, matcher)
 
 
-def _at_most(count: int) -> float:
-    """Seconds that features and all pairs of ``count`` photos take at most, before any is measured."""
-
-    return Cost(*DENSEST).of(count, count * (count - 1) // 2) * max(1.0, 2 / processors())
+def _at_most(count: int, pairs: int) -> float:
+    """Seconds that features and pairs take at most, before any is measured."""
+    return Cost(*DENSEST).of(count, pairs) * max(1.0, 2 / processors())
 
 
 def tiers_of(left_open: Open) -> list[Tier]:
@@ -162,10 +148,11 @@ def _in_words(tier: Tier) -> str:
     return f"{tier.max_image_size} pixels for {tier.max_features} features"
 
 
-def _measured(photos: "Sequence[Photo]", images: Path, tier: Tier) -> Cost:
+def _measured(photos: "Sequence[Photo]", images: Path, tier: Tier, matcher: "Matcher") -> Cost:
     """Measured in a child process, all cores at work. Raises StageError where it does not end well."""
     some = [asdict(photo) for photo in _sample(photos, processors())]
-    job = json.dumps({"images": str(images.absolute()), "photos": some, **tier._asdict()})
+    indexed = matcher != "exhaustive"
+    job = json.dumps({"images": str(images.absolute()), "photos": some, "indexed": indexed, **tier._asdict()})
     answer = subprocess.run(
         [sys.executable, *CHILD], input=job.encode(), capture_output=True, env=environment(), start_new_session=True
     )
@@ -200,10 +187,17 @@ def main() -> None:
     os.write(channel, json.dumps(measure(**job)._asdict()).encode())
 
 
-def measure(images: str, photos: list[dict[str, Any]], max_image_size: int, max_features: int) -> Cost:
+def measure(images: str, photos: list[dict[str, Any]], max_image_size: int, max_features: int, indexed: bool) -> Cost:
     """What these photos take."""
     from stages.colmap.mapping import MAPPING_MODEL
-    from stages.colmap.matching import STRICT_RATIO, Search, extract_features, fill_database, match_pairs
+    from stages.colmap.matching import (
+        STRICT_RATIO,
+        Search,
+        extract_features,
+        fill_database,
+        match_pairs,
+        read_vocabulary,
+    )
     from stages.pairing import exhaustive
     from stages.photos import Photo
 
@@ -215,7 +209,8 @@ def measure(images: str, photos: list[dict[str, Any]], max_image_size: int, max_
         started = time.monotonic()
         extract_features(database, Path(images), some, Search(max_image_size, max_features))
         extracted = time.monotonic()
-        match_pairs(database, pairs, 0, STRICT_RATIO)
+        words = read_vocabulary(database, len(some), 0) if indexed else None
+        match_pairs(database, pairs, 0, STRICT_RATIO, words=words)
         return Cost((extracted - started) / len(some), (time.monotonic() - extracted) / len(pairs))
 
 

@@ -1,4 +1,4 @@
-"""Which pairs of photos are matched, and which way of choosing them is worth its time.
+"""Which pairs of photos are matched to begin with; match_graph.py says which follow.
 
 Photos are numbered from 0. Pairs are rows (first, second) with first < second, in order, none of them twice.
 """
@@ -16,10 +16,10 @@ if TYPE_CHECKING:
 Pairs = Int[np.ndarray, "pairs 2"]
 Likeness = Float[np.ndarray, "photos photos"]
 
-# Matching every pair misses nothing, so it is what is done unless it takes longer than this and something else less
-# than half as long. It is as long as a standard training takes.
-PATIENCE_SECONDS = 180.0
-MUTUAL = 0.5  # of a photo's nearest, about so many have it among their own
+# Matching every pair misses nothing, but most pairs of many photos show nothing in common. On sets of up to so many it
+# is done, exactly; on larger ones the match graph is grown (match_graph.py).
+MAX_EXHAUSTIVE = 50
+MUTUAL = 0.9  # of a photo's partners, about so many count it among their own
 LOOPS = 5  # in a sequence one of so many partners is looked for at other times
 GPS_ERROR_M = 10.0  # twice the 4.9 m that phones reach under open sky (gps.gov, GPS accuracy)
 EARTH_AXES_M = (6_378_137.0, 6_356_752.314)  # WGS 84
@@ -123,17 +123,18 @@ def closeness(position_m: Float[np.ndarray, "n 3"]) -> Likeness:
     return -np.sqrt(sum((axis[:, None] - axis[None]) ** 2 for axis in position_m.T))
 
 
-def pairs_of(
+def start_pairs(
     matcher: "Matcher", neighbours: int, count: int, places: Places, similarity: Callable[[], Likeness]
 ) -> Pairs:
-    """The pairs to match. ``similarity`` is asked for only where it is needed.
+    """The pairs that matching begins with. ``similarity`` is asked for only where it is needed.
 
-    Without times ``sequential`` goes by the order of the photos; ``spatial`` needs positions.
+    Without times ``sequential`` goes by the order of the photos; ``spatial`` needs positions; ``retrieval`` begins
+    with the most similar photos alone, since the match graph is grown from what verification says of them.
     """
     if matcher == "exhaustive":
         return exhaustive(count)
     if matcher == "retrieval":
-        return union(nearest(similarity(), neighbours), spanning_tree(similarity()))
+        return union(nearest(similarity(), max(2, neighbours // 4)), spanning_tree(similarity()))
     if matcher == "spatial":
         assert places.position_m is not None
         return spatial(places.position_m, similarity(), neighbours)
@@ -166,15 +167,9 @@ def expected_pairs(matcher: "Matcher", count: int, neighbours: int) -> int:
     return everything if matcher == "exhaustive" else min(everything, round(count * neighbours * (1 - MUTUAL / 2)))
 
 
-def can_save(count: int, neighbours: int) -> bool:
-    """Whether choosing pairs could at least halve the time, however long a pair takes."""
-    return 2 * expected_pairs("retrieval", count, neighbours) < expected_pairs("exhaustive", count, neighbours)
-
-
-def choose(count: int, neighbours: int, seconds_per_pair: float, places: Places) -> "Matcher":
-    """Every pair where that is bearable or choosing saves little; else by time, place or looks."""
-    everything = seconds_per_pair * expected_pairs("exhaustive", count, neighbours)
-    if everything <= PATIENCE_SECONDS or not can_save(count, neighbours):
+def choose(count: int, neighbours: int, places: Places) -> "Matcher":
+    """Every pair of a set of ordinary size; else by time, place or looks."""
+    if count <= MAX_EXHAUSTIVE:
         return "exhaustive"
     if places.time_s is not None:
         return "sequential"

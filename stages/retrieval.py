@@ -18,16 +18,20 @@ Descriptors = UInt8[np.ndarray, "features 128"]
 Words = Float[np.ndarray, "words 128"]
 
 
-def photo_similarity(
-    descriptors: Callable[[int], Descriptors], count: int, seed: int
-) -> Float[np.ndarray, "photos photos"]:
-    """Cosines between the photos' VLAD vectors (float32), a function of the descriptors and the seed.
+def vocabulary(descriptors: Callable[[int], Descriptors], count: int, seed: int) -> Words:
+    """Visual words of these photos' own features, whole numbers; a function of the descriptors and the seed.
 
-    ``descriptors`` gives those of one photo; they are asked for twice, one photo at a time, so memory holds few.
+    ``descriptors`` gives those of one photo; they are asked for one photo at a time, so memory holds few.
     """
     random = np.random.default_rng(seed)
     sample = np.concatenate([_sampled(descriptors(photo), SAMPLE // count + 1, random) for photo in range(count)])
-    words = visual_words(sample.astype(np.float32), random)
+    return np.rint(visual_words(sample.astype(np.float32), random))
+
+
+def photo_similarity(
+    descriptors: Callable[[int], Descriptors], count: int, words: Words
+) -> Float[np.ndarray, "photos photos"]:
+    """Cosines between the photos' VLAD vectors (float32)."""
     vectors = np.stack([vlad(descriptors(photo).astype(np.float32), words) for photo in range(count)])
     return vectors @ vectors.T
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from stages.photos import Photo
 
 NEEDS = ("ingest",)
-VERSION = 11
+VERSION = 12
 RESUMES = True
 LINKS = ("sparse", "registration.json")
 # Both may decide that an attempt is not made, which is said, in the stage's line as well. A run with another limit is
@@ -49,13 +49,13 @@ class Config(StageConfig):
         default=None,
         ge=100,
         description="Longer side in pixels at which features are searched; larger photos are reduced for it; "
-        "None: 1600, and of large sets as much as is bearable here.",
+        "None: 1600, and less where --sfm.seconds or a budget leaves too little time.",
     )
     max_features: int | None = Field(
         default=None,
         ge=100,
         description="Features per photo, the largest ones first; matching takes time with its square; None: "
-        "4096, and of large sets as many as is bearable here.",
+        "4096, and fewer where --sfm.seconds or a budget leaves too little time.",
     )
     camera_model: CameraModel | None = Field(
         default=None,
@@ -69,8 +69,9 @@ class Config(StageConfig):
     )
     matcher: Matcher | None = Field(
         default=None,
-        description="Which pairs of photos are matched: all, neighbours in time or place, or those that look "
-        "alike; None: by cost.",
+        description="Which pairs of photos matching begins with: all, neighbours in time or place, or those that "
+        "look alike; all but the first go on where verified pairs point; None: all of up to 50 photos, else by what is "
+        "known of them.",
     )
     neighbours: int = Field(default=30, ge=1, description="Partners of each photo, where not all pairs are matched.")
     attempts: int = Field(
@@ -151,7 +152,12 @@ def _import(cameras: Path, photos: "list[Photo]", ingest: Path, folder: Path, pr
         source="import",
         attempts=[],
         repeated_structure=None,
-        images=[image | {"uncertainty_px": None} for image in known.account(photos)],
+        match_graph=None,
+        check=None,
+        second_opinion=None,
+        images=[
+            image | {"uncertainty_px": None, "agreement": None, "transfer_px": None} for image in known.account(photos)
+        ],
         reprojection_px=float(errors.mean()) if len(errors) else None,
         points=len(known.model.xyz),
         camera_model="/".join(sorted({camera.model for camera in known.model.cameras})),
@@ -203,13 +209,21 @@ def _reconstruct(
     if found["conflict"]:
         progress.note(repeated_structure(models, found["conflict"]))
     _say_who_is_missing(photos, images, progress)
-    spread = found["uncertainty_px"]
+    spread, judged = found["uncertainty_px"], found["check"].pop("images")
+    unknown = {"agreement": None, "transfer_px": None}
+    images = with_left_out(images, everything)
     result = _result(
         folder,
         source="sfm",
         attempts=found["attempts"],
         repeated_structure=found["conflict"],
-        images=[image | {"uncertainty_px": spread.get(image["file"])} for image in with_left_out(images, everything)],
+        match_graph=found["match_graph"],
+        check=found["check"],
+        second_opinion=found["second_opinion"],
+        images=[
+            image | {"uncertainty_px": spread.get(image["file"])} | judged.get(image["file"], unknown)
+            for image in images
+        ],
         reprojection_px=found["reprojection_px"],
         points=points,
         camera_model=found["camera_model"],

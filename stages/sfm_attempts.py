@@ -68,8 +68,8 @@ ATTEMPTS = (
 @dataclass(frozen=True)
 class Tried:
     """What came of an attempt: the file name of its database, the files in each sub-model, best first, and of the best
-    one its points, its mean error, and where another one contradicts it (``Conflict``, as a dict). ``seconds`` are
-    those of each phase."""
+    one its points, its mean error, where another one contradicts it (``conflict``), by file why photos were excluded
+    from it, and how a ``second_opinion`` compares. ``seconds`` are those of each phase."""
 
     name: str
     database: str
@@ -78,6 +78,9 @@ class Tried:
     reprojection_px: float | None = None
     conflict: dict[str, Any] | None = None
     seconds: dict[str, float] = field(default_factory=dict)
+    match_graph: dict[str, Any] | None = None
+    excluded: dict[str, str] = field(default_factory=dict)
+    second_opinion: dict[str, Any] | None = None
 
     @property
     def rank(self) -> tuple[int, int, float]:

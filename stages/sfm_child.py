@@ -19,8 +19,11 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from stages import sfm_global
 from stages.amounts import rough_duration
-from stages.colmap.diagnosis import find_conflict, links, supports
+from stages.colmap.diagnosis import compare_models, find_conflict, links, supports
 from stages.colmap.mapping import MAPPING_MODEL, incremental_options, map_globally, map_incrementally
 from stages.colmap.matching import (
     LOOSE_RATIO,
@@ -33,14 +36,42 @@ from stages.colmap.matching import (
     hold_open,
     look_alike,
     match_pairs,
+    matched_pairs,
+    read_vocabulary,
+    verified_matches,
 )
 from stages.colmap.models import load_native, write_native
 from stages.colmap.refinement import finish
+from stages.colmap.repair import Checked, check_model, deregister, reasons, register_again
+from stages.colmap.thinning import thin_matches
 from stages.files import make_durable
+from stages.geometry_check import weak_links
 from stages.masks import write_feature_masks
-from stages.pairing import Likeness, Pairs, pairs_of, places_of, second_look
+from stages.match_graph import (
+    MIN_INLIERS,
+    MIN_YIELD,
+    ORDER_OVERLAP,
+    ROUNDS,
+    in_order,
+    inlier_matrix,
+    natural_order,
+    next_pairs,
+    order_tells,
+)
+from stages.pairing import (
+    MAX_EXHAUSTIVE,
+    Likeness,
+    Pairs,
+    exhaustive,
+    expected_pairs,
+    places_of,
+    second_look,
+    start_pairs,
+    union,
+)
 from stages.photos import Photo
 from stages.registration import FEWEST_POINTS, FEWEST_REGISTERED
+from stages.retrieval import Words
 from stages.sfm import Matcher
 from stages.sfm_attempts import (
     ATTEMPTS,
@@ -48,6 +79,7 @@ from stages.sfm_attempts import (
     GIVEN_UP,
     NO_TIME,
     Attempt,
+    Effort,
     Journal,
     Situation,
     Tried,
@@ -87,7 +119,7 @@ class Job:
 def main() -> None:
     """Read the job from stdin, do it, say the result."""
     job = Job(**json.loads(sys.stdin.buffer.readline()))
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    threading.Thread(target=end_with_parent, daemon=True).start()
     channel = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)  # nothing else may write on the channel
 
@@ -101,7 +133,8 @@ def main() -> None:
         raise
 
 
-def _end_with_parent() -> None:
+def end_with_parent() -> None:
+    """End this process when stdin does: the parent is gone."""
     while os.read(0, 1):
         pass
     os._exit(1)
@@ -120,6 +153,8 @@ class _Work:
         self.clock, self.started = Clock(self.journal.folder / CLOCK), time.monotonic()
         self.attempt = ATTEMPTS[0].name
         self.seconds: dict[str, float] = {}  # of this attempt's phases
+        # Where pairs were chosen there are matches in plenty: mapping works on the best of them.
+        self.thinned = len(self.photos) > MAX_EXHAUSTIVE
 
     def begin(self, phase: str, **more: Any) -> None:
         """Say that a phase begins. Of an interrupted run features and matches are kept, while mapping starts again."""
@@ -140,13 +175,14 @@ class _Work:
         return self.started + limits[limit] - time.monotonic(), limit
 
     @cached_property
-    def similarity(self) -> Likeness:
-        return look_alike(self.database, len(self.photos), self.job.seed)
+    def words(self) -> Words:
+        """The vocabulary of the photos' features, as the first attempt found them."""
+        return read_vocabulary(self.database, len(self.photos), self.job.seed)
 
     @cached_property
-    def pairs(self) -> Pairs:
-        job = self.job
-        return pairs_of(job.matcher, job.neighbours, len(self.files), places_of(self.photos), lambda: self.similarity)
+    def similarity(self) -> Likeness:
+        """How much any two photos look alike."""
+        return look_alike(self.database, len(self.photos), self.words)
 
     def missing(self) -> list[int]:
         """The photos that have no place in the best model so far."""
@@ -191,10 +227,13 @@ def reconstruct(job: Job, say: Say) -> dict[str, Any]:
     say(phase="refining")
     database = work.latest()
     mapped = load_native(work.journal.model(best.name))  # from disk also where it is at hand: then resuming is no other
-    finished = finish(mapped, database, job.seed, job.camera_model, job.camera_params is not None)
+    known = job.camera_params is not None
+    finished = finish(mapped, database, job.seed, job.camera_model, known, work.thinned)
     for note in finished.notes:
         say(note=note)
     model = finished.model
+    checked, left_out = _last_check(model, database, work)
+    left_out = best.excluded | finished.left_out | left_out
     registered = [model.image(i) for i in sorted(model.reg_image_ids())]
     sparse = Path(job.folder, "sparse")
     write_native(sparse, model)
@@ -204,14 +243,44 @@ def reconstruct(job: Job, say: Say) -> dict[str, Any]:
         "models": [_files(model), *best.groups[1:]],
         "observations": {image.name: image.num_points3D for image in registered},
         "uncertainty_px": finished.uncertainty_px,
-        "left_out": finished.left_out,
+        "left_out": {name: why for name, why in left_out.items() if name not in _files(model)},
         "points": model.num_points3D(),
         "reprojection_px": model.compute_mean_reprojection_error(),
         "camera_model": "/".join(sorted({model.camera(image.camera_id).model_name for image in registered})),
         "camera_models": finished.camera_models,
         "conflict": best.conflict,
         "supports": supports(model, database, job.seed),
+        "match_graph": best.match_graph,
+        "check": checked,
+        "second_opinion": best.second_opinion,
     }
+
+
+def _last_check(model: Any, database: Path, work: _Work) -> tuple[dict[str, Any], dict[str, str]]:
+    """What the check says of the finished model, for registration.json, and by name why photos that fail leave it."""
+    checked = check_model(model, database, work.job.seed)
+    failed, left_out = checked.failed(), {}
+    if 0 < 2 * len(failed) < len(checked.ids):
+        left_out = reasons(model, checked)
+        deregister(model, failed)
+        checked = check_model(model, database, work.job.seed)
+    names, check = [model.image(i).name for i in checked.ids], checked.check
+    votes = check.votes_for + check.votes_against
+    return {
+        "pairs": int(check.agrees.sum() + check.contradicts.sum()),
+        "agreeing": int(check.agrees.sum()),
+        "error_px": check.usual_px,
+        "tolerance_px": check.tolerance_px,
+        "doubtful": [name for name, passed in zip(names, check.passed, strict=True) if not passed],
+        "weak_links": [
+            {"photos": [names[i] for i in link.photos], "pairs": link.pairs, "matches": link.matches}
+            for link in weak_links(checked.matches, check)
+        ],
+        "images": {
+            name: {"agreement": agree / of if of else None, "transfer_px": float(px) if np.isfinite(px) else None}
+            for name, agree, of, px in zip(names, check.votes_for, votes, check.photo_error_px, strict=True)
+        },
+    }, left_out
 
 
 def _try_all(work: _Work) -> None:
@@ -265,9 +334,9 @@ def _make(attempt: Attempt, missing: list[int], work: _Work) -> None:
     """Make an attempt and note what came of it."""
     work.say(attempt=attempt.name)
     work.attempt, work.seconds = attempt.name, {}
-    database = _matched(attempt, missing, work)
-    models = _mapped(attempt, database, work)
-    tried = Tried(attempt.name, database.name, seconds=work.seconds)
+    database, match_graph = _matched(attempt, missing, work)
+    models, excluded, opinion = _mapped(attempt, database, work)
+    tried = Tried(attempt.name, database.name, seconds=work.seconds, match_graph=match_graph)
     if models:
         folder = work.journal.model(attempt.name)
         write_native(folder, models[0])
@@ -278,22 +347,26 @@ def _make(attempt: Attempt, missing: list[int], work: _Work) -> None:
             points=models[0].num_points3D(),
             reprojection_px=models[0].compute_mean_reprojection_error(),
             conflict=find_conflict(models),
+            excluded=excluded,
+            second_opinion=opinion,
         )
     work.journal.add(tried)
 
 
-def _matched(attempt: Attempt, missing: list[int], work: _Work) -> Path:
-    """The database with the matches that the attempt works on."""
-    job, database = work.job, work.database
+def _matched(attempt: Attempt, missing: list[int], work: _Work) -> tuple[Path, dict[str, Any] | None]:
+    """The database with the matches that the attempt works on, and what is known of their graph where it was grown."""
+    job, database, graph = work.job, work.database, None
     if attempt.matches == "same":
-        return work.latest()
+        best = work.usable()
+        return work.latest(), best.match_graph if best else None
     if attempt.matches == "strict":
         _find_features(database, Search(job.max_image_size, job.max_features), work)
-        _match(database, work.pairs, STRICT_RATIO, work)
+        graph = _match_all(database, work)
     elif attempt.matches == "loose":
         database = work.beside("loose")
+        before = matched_pairs(work.latest())
         copy_without_matches_of({work.files[number] for number in missing}, work.latest(), database)
-        _match(database, second_look(work.pairs, missing, job.neighbours, lambda: work.similarity), LOOSE_RATIO, work)
+        _match(database, second_look(before, missing, job.neighbours, lambda: work.similarity), LOOSE_RATIO, work)
     elif attempt.matches == "fisheye":
         latest, database = work.latest(), work.beside("fisheye")
         copy_as_fisheye(latest, database, job.seed)
@@ -301,8 +374,8 @@ def _matched(attempt: Attempt, missing: list[int], work: _Work) -> Path:
         database = work.beside("rich")
         twice = Search(2 * job.max_image_size, 2 * job.max_features, doubled_up_to=job.max_image_size)
         _find_features(database, twice, work)
-        _match(database, work.pairs, STRICT_RATIO, work)
-    return database
+        graph = _match_all(database, work)
+    return database, graph
 
 
 def _find_features(database: Path, search: Search, work: _Work) -> None:
@@ -316,33 +389,127 @@ def _find_features(database: Path, search: Search, work: _Work) -> None:
     work.end("features")
 
 
+def _match_all(database: Path, work: _Work) -> dict[str, Any] | None:
+    """Match every pair, or grow the match graph: round by round, where verification says that it pays.
+
+    Returns how many pairs were tried and verified, and whether the order of names or times helped to choose them.
+    """
+    job, count, places = work.job, len(work.photos), places_of(work.photos)
+    if job.matcher == "exhaustive":
+        _match(database, exhaustive(count), STRICT_RATIO, work)
+        return None
+    names = [photo.name for photo in work.photos]
+    order = natural_order(names) if places.time_s is None else np.argsort(places.time_s, kind="stable")
+    pairs = union(
+        start_pairs(job.matcher, job.neighbours, count, places, lambda: work.similarity), in_order(order, 1, 2)
+    )
+
+    def tried() -> np.ndarray:
+        _match(database, pairs, STRICT_RATIO, work)
+        return inlier_matrix(count, pairs, verified_matches(database, pairs))
+
+    inliers = tried()
+    if tells := order_tells(order, inliers):
+        pairs = union(pairs, in_order(order, 3, ORDER_OVERLAP))
+        inliers = tried()
+    for _ in range(ROUNDS):
+        more = next_pairs(inliers, work.similarity, job.neighbours)
+        if not len(more):
+            break
+        pairs = union(pairs, more)
+        inliers = tried()
+        if (inliers[more[:, 0], more[:, 1]] >= MIN_INLIERS).mean() < MIN_YIELD:
+            break
+    verified = int((verified_matches(database, pairs) >= MIN_INLIERS).sum())
+    helped = "photos next to each other by name or time are among them" if tells else "their order says nothing"
+    work.say(note=f"{verified:,} of {len(pairs):,} tried pairs of photos verified; {helped}")
+    return {"tried": len(pairs), "verified": verified, "order": tells}
+
+
 def _match(database: Path, pairs: Pairs, max_ratio: float, work: _Work) -> None:
     def expect(left: int, seconds: float) -> None:
-        count = len(work.photos)
-        every = "all " if left == count * (count - 1) // 2 else ""
-        work.say(note=f"matching {every}{left:,} pairs of photos: about {rough_duration(seconds)}")
+        if work.job.matcher == "exhaustive":
+            work.say(note=f"matching {left:,} pairs of photos: about {rough_duration(seconds)}")
 
-    work.begin("matching", database=str(database), pairs=len(pairs))
-    match_pairs(database, pairs, work.job.seed, max_ratio, expect)
+    expected = expected_pairs(work.job.matcher, len(work.photos), work.job.neighbours)
+    work.begin("matching", database=str(database), pairs=max(len(pairs), expected))
+    exact = work.job.matcher == "exhaustive" or max_ratio != STRICT_RATIO
+    match_pairs(database, pairs, work.job.seed, max_ratio, expect, None if exact else work.words)
     work.end("matching")
 
 
-def _mapped(attempt: Attempt, database: Path, work: _Work) -> list[Any]:
-    """All sub-models that come of these matches, best first."""
+def _mapped(attempt: Attempt, database: Path, work: _Work) -> tuple[list[Any], dict[str, str], dict[str, Any] | None]:
+    """All sub-models that come of these matches, best first; of the best one only photos whose poses stand, by name why
+    others were excluded, and how a second opinion compares."""
     work.begin("mapping", done=0)
-    models = Path(work.job.folder, "models")
     seed, lens_is_known = work.job.seed, work.job.camera_params is not None
+    models, matches = Path(work.job.folder, "models"), database
+    if work.thinned:
+        matches = work.beside("thinned")
+        thin_matches(database, matches)
+    opinion = _second_opinion(attempt, database, work)
+    effort = attempt.effort or Effort()
+    options = incremental_options(seed, effort, lens_is_known, work.thinned)
     if attempt.effort is None:
-        found = map_globally(database, work.images, models, seed, lens_is_known)
+        found = map_globally(matches, work.images, models, seed, lens_is_known)
     else:
         placed = count(1)
-        options = incremental_options(seed, attempt.effort, lens_is_known)
         found = map_incrementally(
-            database, work.images, models, options, lambda: work.say(phase="mapping", done=next(placed))
+            matches, work.images, models, options, lambda: work.say(phase="mapping", done=next(placed))
         )
     shutil.rmtree(models)
+    compared, excluded = None, {}
+    if found:
+        other, compared = _compared(found[0], opinion)
+        found[0], excluded = _standing(found[0], other, database, matches, options, work)
     work.end("mapping")
-    return found
+    return found, excluded, compared
+
+
+def _second_opinion(attempt: Attempt, database: Path, work: _Work) -> "sfm_global.Started | None":
+    """Global mapping begun beside the first attempt; None where it would say nothing."""
+    if attempt.name != ATTEMPTS[0].name or len(work.photos) < sfm_global.MIN_PHOTOS:
+        return None
+    matches, known = work.beside("global"), work.job.camera_params is not None
+    thin_matches(database, matches, sfm_global.TRACKS_PER_PHOTO)
+    return sfm_global.start(matches, work.images, work.journal.folder / "global", work.job.seed, known)
+
+
+def _compared(model: Any, opinion: "sfm_global.Started | None") -> tuple[Any, dict[str, Any] | None]:
+    """The model of the second opinion, None without one, and how far both agree."""
+    if opinion is None:
+        return None, None
+    if failure := sfm_global.failure(opinion):
+        return None, {"failed": failure}
+    other = load_native(opinion.folder)
+    return other, compare_models(model, other) | {"failed": None}
+
+
+def _standing(
+    model: Any, other: Any, database: Path, matches: Path, options: Any, work: _Work
+) -> tuple[Any, dict[str, str]]:
+    """The model with only photos whose poses stand, and by name why others are excluded.
+
+    Photos that fail are freed and registered again, in the model of the second opinion where more photos pass in it.
+    """
+    best = model, check_model(model, database, work.job.seed)
+    if not (failed := best[1].failed()):
+        return model, {}
+    what = "contradict their verified matches" if best[1].check.misplaced.any() else "are not linked to the others"
+    work.say(note=f"{len(failed)} of {len(best[1].ids)} registered photos {what}: registering them again")
+    if other is not None:
+        best = max(best, (other, check_model(other, database, work.job.seed)), key=_passing)
+    if best[1].failed():
+        again = register_again(*best, matches, work.images, Path(work.job.folder, "again"), options)
+        best = max(best, (again, check_model(again, database, work.job.seed)), key=_passing)
+    model, checked = best
+    why = reasons(model, checked)
+    deregister(model, checked.failed())
+    return model, why
+
+
+def _passing(candidate: tuple[Any, Checked]) -> int:
+    return int(candidate[1].check.passed.sum())
 
 
 def _files(model: Any) -> list[str]:

@@ -2,11 +2,13 @@
 
 from collections import Counter
 from collections.abc import Container, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from nerf.alignment import align
 from stages.degeneracy import elsewhere
 from stages.registration import FLAT_CONFIGS
 from stages.sfm_attempts import FEWEST_MATCHES
@@ -69,6 +71,31 @@ def find_conflict(models: "Sequence[pycolmap.Reconstruction]") -> dict[str, Any]
         if apart.sum() >= max(FEWEST_ELSEWHERE, SHARE_ELSEWHERE * len(shared)):
             return {"group": group, "shared": len(shared), "elsewhere": int(apart.sum())}
     return None
+
+
+def compare_models(model: "pycolmap.Reconstruction", other: "pycolmap.Reconstruction") -> dict[str, Any]:
+    """How far two models of the same photos agree, after the similarity on which most of them do.
+
+    ``photos`` is how many both have, ``agree`` how many of them stand the same in both, ``elsewhere`` the files of those
+    that do not; ``centre`` and ``degrees`` are mean differences of the former, in shares of the first one's extent.
+    """
+    first, second = _poses(model), _poses(other)
+    shared = sorted(first.keys() & second.keys())
+    facts: dict[str, Any] = {"photos": len(shared), "agree": 0, "elsewhere": [], "centre": None, "degrees": None}
+    if len(shared) < 3:
+        return facts
+    here, there = (np.array([of[name] for name in shared]) for of in (first, second))
+    extent = float(np.linalg.norm(np.ptp(here[:, :, 3], axis=0)))
+    apart = elsewhere(here, there, extent)
+    facts |= {"agree": int((~apart).sum()), "elsewhere": [name for name, far in zip(shared, apart, strict=True) if far]}
+    with suppress(ValueError):  # all in one line: nothing to align by
+        first_from_second = align(there[~apart][:, :, 3], here[~apart][:, :, 3])
+        moved = np.array([first_from_second.pose(pose) for pose in there[~apart]])
+        off = np.linalg.norm(moved[:, :, 3] - here[~apart][:, :, 3], axis=1)
+        cosine = (np.einsum("nij,nij->n", moved[:, :, :3], here[~apart][:, :, :3]) - 1) / 2
+        turned = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+        facts |= {"centre": float(off.mean() / extent), "degrees": float(turned.mean())}
+    return facts
 
 
 def _poses(model: "pycolmap.Reconstruction") -> dict[str, np.ndarray]:

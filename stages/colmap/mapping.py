@@ -11,6 +11,8 @@ if TYPE_CHECKING:
 
 MAPPING_MODEL = "SIMPLE_RADIAL"  # one focal length and one distortion term hold with few matches
 SMALLEST_MODEL = 3
+# COLMAP's own are 1.1 and 5, for all observations; the final adjustment comes after mapping in any case.
+GROWTH_BETWEEN_ADJUSTMENTS, ADJUSTMENTS_AT_A_TIME = 1.3, 2
 
 
 def map_incrementally(
@@ -18,21 +20,35 @@ def map_incrementally(
     images: Path,
     models: Path,
     options: "pycolmap.IncrementalPipelineOptions",
-    on_image: Callable[[], None],
+    on_image: Callable[[], None] = lambda: None,
+    begin: Path | None = None,
 ) -> "list[pycolmap.Reconstruction]":
-    """All sub-models, best first: most registered photos, then most points. ``on_image`` is called per photo."""
+    """All sub-models, best first: most registered photos, then most points. ``on_image`` is called per photo. It goes
+    on from the model in the folder ``begin``, where one is given."""
     import pycolmap
 
     models.mkdir(parents=True, exist_ok=True)
     found = pycolmap.incremental_mapping(
-        database, images, models, options, initial_image_pair_callback=on_image, next_image_callback=on_image
+        database,
+        images,
+        models,
+        options,
+        input_path=begin or "",
+        initial_image_pair_callback=on_image,
+        next_image_callback=on_image,
     )
     return sorted(found.values(), key=_rank, reverse=True)
 
 
-def incremental_options(seed: int, effort: Effort, lens_is_known: bool) -> "pycolmap.IncrementalPipelineOptions":
-    """What mapping asks of photos; a known lens is kept as it is."""
+def incremental_options(
+    seed: int, effort: Effort, lens_is_known: bool, thinned: bool
+) -> "pycolmap.IncrementalPipelineOptions":
+    """What mapping asks of photos; a known lens is kept as it is. Of ``thinned`` matches, those of many photos, all
+    cameras are adjusted together less often: long tracks hold them in the meantime."""
     options = pipeline_options(seed + effort.seed)
+    if thinned:
+        options.ba_global_frames_ratio = options.ba_global_points_ratio = GROWTH_BETWEEN_ADJUSTMENTS
+        options.ba_global_max_refinements = ADJUSTMENTS_AT_A_TIME
     options.mapper.init_min_num_inliers = effort.matches
     options.mapper.init_min_tri_angle = effort.angle_deg
     options.mapper.init_max_forward_motion = effort.forward_motion

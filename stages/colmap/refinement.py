@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 # borders of wide photos, that is where it shows what it is worth.
 MANY_MORE = 1.1
 SIMPLEST = MODELS[0]
+CLOSING_STEPS = (4, 4)  # of the adjustment of all observations, before and after those that fit no more are dropped
 
 
 @dataclass(frozen=True)
@@ -33,27 +34,34 @@ class Finished:
 
 
 def finish(
-    mapped: "pycolmap.Reconstruction", database: Path, seed: int, camera_model: str | None, lens_is_known: bool
+    mapped: "pycolmap.Reconstruction",
+    database: Path,
+    seed: int,
+    camera_model: str | None,
+    lens_is_known: bool,
+    thinned: bool,
 ) -> Finished:
     """Choose the camera model by held-out observations, unless it is given, and adjust everything with it.
 
     Of a given model it is only chosen whether its principal point is refined; a known lens is kept as it is. Where
     many more observations fit the chosen lens than mapping's, the choice is made again with them. No camera of the
-    model is absurd in the end, unless those of most photos are.
+    model is absurd in the end, unless those of most photos are. Of a model of ``thinned`` matches (thinning.py) the
+    tracks that it has are adjusted first; then all matches come back.
     """
     import pycolmap
 
     if lens_is_known:
         choice = Choice(noise_px(mapped, observations(mapped)), notes=["the camera is kept as given"])
         model = pycolmap.Reconstruction(mapped)
-        _adjust(model, database, seed, set(model.cameras), adjustment_options(False, choice.noise_px))
+        adjust = _adjust_thinned if thinned else _adjust
+        adjust(model, database, seed, set(model.cameras), adjustment_options(False, choice.noise_px))
         return _finished(model, choice, {})
     models = (camera_model,) if camera_model else MODELS
     choice = choose(mapped, seed, models)
-    model = _adjusted(mapped, database, seed, choice)
-    if model.compute_num_observations() > MANY_MORE * mapped.compute_num_observations():
+    model = _adjusted(mapped, database, seed, choice, thinned)
+    if not thinned and model.compute_num_observations() > MANY_MORE * mapped.compute_num_observations():
         choice = choose(model, seed, models)
-        model = _adjusted(model, database, seed, choice)
+        model = _adjusted(model, database, seed, choice, thinned)
     _simplify_absurd(model, database, seed, choice)
     return _finished(model, choice, _leave_out(model, flaws(model)))
 
@@ -103,19 +111,61 @@ def _finished(model: "pycolmap.Reconstruction", choice: Choice, left_out: dict[s
 
 
 def _adjusted(
-    before: "pycolmap.Reconstruction", database: Path, seed: int, choice: Choice
+    before: "pycolmap.Reconstruction", database: Path, seed: int, choice: Choice, thinned: bool
 ) -> "pycolmap.Reconstruction":
     import pycolmap
 
+    adjust = _adjust_thinned if thinned else _adjust
     model = pycolmap.Reconstruction(before)
     equip(model, {camera_id: lens.model for camera_id, lens in choice.lenses.items()})
     centred = {camera_id for camera_id, lens in choice.lenses.items() if not lens.principal_point}
     # Whether to refine principal points holds for all cameras at once: those that keep theirs are adjusted before.
     if centred:
-        _adjust(model, database, seed, set(), adjustment_options(False, choice.noise_px))
+        adjust(model, database, seed, set(), adjustment_options(False, choice.noise_px))
     if centred != choice.lenses.keys():
-        _adjust(model, database, seed, centred, adjustment_options(True, choice.noise_px))
+        adjust(model, database, seed, centred, adjustment_options(True, choice.noise_px))
     return model
+
+
+def _adjust_thinned(
+    model: "pycolmap.Reconstruction",
+    database: Path,
+    seed: int,
+    constant_cameras: set[int],
+    adjustment: "pycolmap.BundleAdjustmentOptions",
+) -> None:
+    """Adjust cameras, poses and the tracks there are until little changes; then bring back all matches, and adjust all
+    of it in a few steps: the long tracks have put everything in its place by then."""
+    adjust_tracks(model, constant_cameras, adjustment)
+    mapper, options = _mapper(model, database, seed, constant_cameras)
+    for image_id in sorted(model.reg_image_ids()):
+        mapper.triangulate_image(options.triangulation, image_id)
+    for steps in CLOSING_STEPS:
+        mapper.complete_and_merge_tracks(options.triangulation)
+        mapper.filter_points(options.mapper)
+        adjust_tracks(model, constant_cameras, adjustment, steps)
+    mapper.filter_points(options.mapper)
+    mapper.end_reconstruction(discard=False)
+    model.update_point_3d_errors()
+
+
+def adjust_tracks(
+    model: "pycolmap.Reconstruction",
+    constant_cameras: set[int],
+    adjustment: "pycolmap.BundleAdjustmentOptions",
+    steps: int = 100,
+) -> None:
+    """Adjust cameras, poses and points to the observations that the model has."""
+    import pycolmap
+
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in sorted(model.reg_image_ids()):
+        config.add_image(image_id)
+    for camera_id in constant_cameras:
+        config.set_constant_cam_intrinsics(camera_id)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    adjustment.ceres.solver_options.max_num_iterations = steps
+    pycolmap.create_default_bundle_adjuster(adjustment, config, model).solve()
 
 
 def _adjust(
@@ -126,6 +176,22 @@ def _adjust(
     adjustment: "pycolmap.BundleAdjustmentOptions",
 ) -> None:
     """Complete, merge and filter tracks and adjust everything together, until little changes."""
+    mapper, options = _mapper(model, database, seed, constant_cameras)
+    mapper.iterative_global_refinement(
+        options.ba_global_max_refinements,
+        options.ba_global_max_refinement_change,
+        options.mapper,
+        adjustment,
+        options.triangulation,
+    )
+    mapper.end_reconstruction(discard=False)
+    model.update_point_3d_errors()
+
+
+def _mapper(
+    model: "pycolmap.Reconstruction", database: Path, seed: int, constant_cameras: set[int]
+) -> "tuple[pycolmap.IncrementalMapper, pycolmap.IncrementalPipelineOptions]":
+    """A mapper that works on the model with all matches of the database, and its options."""
     import pycolmap
 
     options = pipeline_options(seed)
@@ -138,12 +204,4 @@ def _adjust(
         cached.model, cached.params = camera.model, camera.params
     mapper = pycolmap.IncrementalMapper(cache)
     mapper.begin_reconstruction(model)
-    mapper.iterative_global_refinement(
-        options.ba_global_max_refinements,
-        options.ba_global_max_refinement_change,
-        options.mapper,
-        adjustment,
-        options.triangulation,
-    )
-    mapper.end_reconstruction(discard=False)
-    model.update_point_3d_errors()
+    return mapper, options

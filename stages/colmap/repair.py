@@ -1,0 +1,106 @@
+"""Photos whose poses the matches contradict: freed, registered again, left out if that does not help.
+
+Call it in a child process. What contradicts a pose is decided in stages/geometry_check.py.
+"""
+
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from stages.colmap.correspondences import read_pair_matches
+from stages.colmap.mapping import map_incrementally
+from stages.colmap.matching import unfinished_copy
+from stages.geometry_check import PairMatches, PoseCheck, check_poses
+
+if TYPE_CHECKING:
+    import pycolmap
+
+
+class Checked(NamedTuple):
+    """What the verified matches of a database say of a model's poses; photos in order of ``ids``."""
+
+    ids: list[int]
+    matches: PairMatches
+    check: PoseCheck
+
+    def failed(self) -> list[int]:
+        """The image ids of photos whose poses do not stand."""
+        return [image_id for image_id, passed in zip(self.ids, self.check.passed, strict=True) if not passed]
+
+
+def check_model(model: "pycolmap.Reconstruction", database: Path, seed: int) -> Checked:
+    """Check every registered photo by all verified matches, those that mapping did not use or rejected as well."""
+    import pycolmap
+
+    with pycolmap.Database.open(database) as db:
+        ids, matches = read_pair_matches(db, model, seed)
+    poses = np.array([model.image(i).cam_from_world().inverse().matrix() for i in ids]).reshape(-1, 3, 4)
+    return Checked(ids, matches, check_poses(matches, poses))
+
+
+def reasons(model: "pycolmap.Reconstruction", checked: Checked) -> dict[str, str]:
+    """By name, why each photo that failed cannot stay."""
+    check, found = checked.check, {}
+    groups = int(check.misplaced.sum())
+    for image_id, misplaced, unlinked, agree, against in zip(
+        checked.ids, check.misplaced, check.unlinked, check.votes_for, check.votes_against, strict=True
+    ):
+        if misplaced:
+            matches = f"{against:,.0f} of its {agree + against:,.0f} verified matches with other photos"
+            together = f", as for {groups - 1} more" if groups > 1 else ""
+            found[model.image(image_id).name] = f"its place is contradicted by {matches}{together}"
+        elif unlinked:
+            found[model.image(image_id).name] = "no verified match supports its place among the other photos"
+    return found
+
+
+def deregister(model: "pycolmap.Reconstruction", image_ids: Sequence[int]) -> None:
+    """Free photos of their poses; what only they saw goes with them."""
+    for image_id in image_ids:
+        model.deregister_frame(model.image(image_id).frame_id)
+    model.update_point_3d_errors()
+
+
+def register_again(
+    model: "pycolmap.Reconstruction",
+    checked: Checked,
+    database: Path,
+    images: Path,
+    scratch: Path,
+    options: "pycolmap.IncrementalPipelineOptions",
+) -> "pycolmap.Reconstruction":
+    """The model with the photos that failed freed and, where possible, registered anew.
+
+    Pairs of photos that stand and contradict their poses are mistakes of matching: mapping goes on without them.
+    """
+    from stages.colmap.models import load_native, write_native
+
+    begin, models = scratch / "begin", scratch / "models"
+    shutil.rmtree(scratch, ignore_errors=True)
+    failed = checked.failed()
+    write_native(begin, model)
+    freed = load_native(begin)
+    deregister(freed, failed)
+    write_native(begin, freed)
+    clean = scratch / "clean.db"
+    copy_without_mistakes(checked, database, clean)
+    found = map_incrementally(clean, images, models, options, begin=begin)
+    best = max(found, key=lambda one: (one.num_reg_images(), one.num_points3D()), default=freed)
+    shutil.rmtree(scratch, ignore_errors=True)
+    return best if best.num_reg_images() >= freed.num_reg_images() else freed
+
+
+def copy_without_mistakes(checked: Checked, database: Path, copy: Path) -> None:
+    """Copy the database without the verified pairs of standing photos that contradict their poses."""
+    import pycolmap
+
+    unfinished = unfinished_copy(database, copy)
+    passed = checked.check.passed
+    mistakes = checked.matches.pairs[checked.check.contradicts & passed[checked.matches.pairs].all(axis=1)]
+    with pycolmap.Database.open(unfinished) as db, pycolmap.DatabaseTransaction(db):
+        for first, second in mistakes.tolist():
+            db.delete_two_view_geometry(checked.ids[first], checked.ids[second])
+    unfinished.replace(copy)

@@ -1,0 +1,263 @@
+"""Whether camera poses agree with what pairs of photos say of each other: no pose, point or track of a model is trusted.
+
+Every verified match (keypoint a of photo i, keypoint b of photo j) is a test. Photo i's other matches give the inverse
+depth of a, without j; with it the poses predict where j sees the point. The distance to b, in pixels, is the *transfer
+error*. It notices a wrong rotation, a wrong place and a wrong scale, also along a straight row of photos, where every
+epipolar line stays right (Hartley and Zisserman 2004, ch. 9 and 12: epipolar geometry, triangulation).
+
+Pairs vote with their matches, for or against; photos and groups are judged by the votes across the cut between them and
+the rest. So a group that was moved as a whole, whose members agree among themselves, is found as well as one photo.
+
+All arrays are numpy float64. A *match* is directed here: every undirected one counts once each way.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from stages.match_graph import connected, weak_cuts
+
+MEDIAN_VARIANCE = np.pi / 2  # of a median, over that of a mean
+# A pair agrees with the poses where half of its matches lie nearer to their predictions than this: so many times the
+# usual distance, which is noise, and never less than a fraction of a pixel nor more than verification lets through.
+TOLERANCE, MIN_TOLERANCE_PX, MAX_TOLERANCE_PX = 3.0, 0.6, 4.0
+ROUNDS = 3  # of acquittal
+MIN_BUNDLE = 60  # agreeing matches across: twice what mapping asks of a single photo
+MIN_MATCHES = 8  # of a pair, for its median to mean something
+
+
+class PairMatches(NamedTuple):
+    """Verified matches of posed photos, numbered from 0; match k belongs to ``pairs[pair[k]]`` and joins two keypoints.
+
+    Keypoints are numbered through all photos: ``photo`` says whose each is, ``bearing`` is its unit ray in the camera's
+    frame (right for every camera model). ``focal_px`` turns angles into pixels, one per photo. ``weight`` is how many
+    verified matches a pair has in all; those listed may be a sample.
+    """
+
+    pairs: Int[np.ndarray, "pairs 2"]
+    weight: Float[np.ndarray, "pairs"]
+    pair: Int[np.ndarray, "matches"]
+    keypoint: Int[np.ndarray, "matches 2"]
+    photo: Int[np.ndarray, "keypoints"]
+    bearing: Float[np.ndarray, "keypoints 3"]
+    focal_px: Float[np.ndarray, "photos"]
+
+
+def transfer_errors_px(
+    matches: PairMatches,
+    world_from_camera: Float[np.ndarray, "photos 3 4"],
+    trusted: Bool[np.ndarray, "pairs"] | None = None,
+) -> tuple[Float[np.ndarray, "2*matches"], Bool[np.ndarray, "2*matches"]]:
+    """How far each match is from where the poses predict it, in pixels of the photo that sees it; the matches from first
+    to second photo, then those from second to first. Depths come from the ``trusted`` pairs, from all without it.
+
+    Also which of them are predicted to a point, by a depth that others tell.
+
+    The part along the epipolar line counts in units of what it would be if the depth were known: a depth that other
+    pairs measured over a short baseline predicts little over a long one. Where nothing else tells the depth, only the
+    distance to the epipolar line counts, and how far behind the camera the point would be.
+    """
+    source, target = (np.concatenate([matches.keypoint[:, a], matches.keypoint[:, 1 - a]]) for a in (0, 1))
+    rotation, centre = world_from_camera[:, :, :3], world_from_camera[:, :, 3]
+    ray = np.einsum("kij,kj->ki", rotation[matches.photo], matches.bearing)
+    here, there = ray[source], ray[target]
+    baseline = centre[matches.photo[target]] - centre[matches.photo[source]]
+    ahead = np.einsum("ki,ki->k", baseline, here)
+    sideways = ahead[:, None] * here - baseline  # the point moves that way, seen from the target, as it comes nearer
+    base = np.linalg.norm(sideways, axis=1)
+    sideways = np.divide(sideways, base[:, None], out=np.zeros_like(sideways), where=base[:, None] > 0)
+    seen_ahead, seen_sideways = np.einsum("ki,ki->k", there, here), np.einsum("ki,ki->k", there, sideways)
+    across = np.einsum("ki,ki->k", there, np.cross(here, sideways))
+    across = np.where(base > 0, across, np.linalg.norm(np.cross(here, there), axis=1))
+    slope = np.divide(seen_sideways, seen_ahead, out=np.full_like(base, np.inf), where=seen_ahead > 0)
+    scale = base + np.where(np.isfinite(slope), slope, 0) * ahead
+    inverse_depth = np.divide(slope, scale, out=np.full_like(base, np.inf), where=(scale > 0) & np.isfinite(slope))
+    evidence = base**2 if trusted is None else base**2 * np.tile(trusted[matches.pair], 2)
+    others, weight = _median_of_others(np.maximum(inverse_depth, 0), evidence, source)
+    known = weight > 0
+    others = np.where(known, others, np.maximum(inverse_depth, 0))
+    others = np.where(np.isfinite(others), others, 0)
+    predicted = np.arctan2(others * base, 1 - others * ahead)
+    along = np.arctan2(seen_sideways, seen_ahead) - predicted
+    spread = np.sqrt(1 + np.divide(MEDIAN_VARIANCE * base**2, weight, out=np.zeros_like(base), where=known))
+    angle = np.hypot(np.arcsin(np.clip(across, -1, 1)), along / spread)
+    return matches.focal_px[matches.photo[target]] * angle, known
+
+
+def _median_of_others(
+    value: Float[np.ndarray, "n"], weight: Float[np.ndarray, "n"], group: Int[np.ndarray, "n"]
+) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+    """Of each entry the weighted median of the other entries of its group, and their weight together (0: none)."""
+    order = np.lexsort((value, group))
+    value, weight, group = value[order], weight[order], group[order]
+    begins = np.flatnonzero(np.r_[True, group[1:] != group[:-1]])
+    ends = np.r_[begins[1:], len(group)]
+    total = np.cumsum(weight)
+    first, last = np.repeat(begins, ends - begins), np.repeat(ends, ends - begins) - 1
+    before = total[first] - weight[first]
+    others = np.maximum(total[last] - before - weight, 0)
+    place = np.arange(len(group))
+    # Without the entry itself, sums from its place on are smaller by its weight.
+    half = before + others / 2
+    median = np.searchsorted(total, half)
+    after = np.maximum(np.searchsorted(total, half + weight), place + 1)
+    median = np.clip(np.where(median < place, median, after), first, last)
+    median = np.where((median == place), np.where(place > first, place - 1, np.minimum(place + 1, last)), median)
+    found = np.where(last > first, value[median], np.nan)
+    others = np.where(last > first, others, 0)
+    out, out_weight = np.empty_like(value), np.empty_like(weight)
+    out[order], out_weight[order] = found, others
+    return out, out_weight
+
+
+# --- votes
+
+
+class PoseCheck(NamedTuple):
+    """What verified pairs say of poses. ``pair_error_px``: each pair's median transfer error, NaN of too few matches;
+    a pair ``agrees`` if it is within ``tolerance_px``. ``misplaced``: photos that more matches contradict than support,
+    alone or as a group; ``unlinked``: photos or groups that no pair links to the rest, so that nothing supports where
+    they are. ``votes_for`` and ``votes_against`` are matches of each photo with those that are neither,
+    ``photo_error_px`` the median over its pairs with them, by matches (NaN without). ``usual_px`` is that of all pairs.
+    """
+
+    pair_error_px: Float[np.ndarray, "pairs"]
+    photo_error_px: Float[np.ndarray, "photos"]
+    usual_px: float
+    tolerance_px: float
+    agrees: Bool[np.ndarray, "pairs"]
+    contradicts: Bool[np.ndarray, "pairs"]
+    misplaced: Bool[np.ndarray, "photos"]
+    unlinked: Bool[np.ndarray, "photos"]
+    votes_for: Float[np.ndarray, "photos"]
+    votes_against: Float[np.ndarray, "photos"]
+
+    @property
+    def passed(self) -> Bool[np.ndarray, "photos"]:
+        """The photos whose poses stand."""
+        return ~(self.misplaced | self.unlinked)
+
+
+def check_poses(matches: PairMatches, world_from_camera: Float[np.ndarray, "photos 3 4"]) -> PoseCheck:
+    """Judge photos and groups by the votes of the pairs between them and the rest.
+
+    Groups to judge are the parts that come off the graph of agreeing pairs at its weakest places: who was moved as a
+    whole agrees within, and next to nothing across. A part is misplaced if more matches across contradict than agree.
+    """
+    count = len(world_from_camera)
+    error = pair_medians(matches, *transfer_errors_px(matches, world_from_camera))
+    told = np.isfinite(error)
+    usual = float(np.median(np.repeat(error[told], matches.weight[told].astype(int)))) if told.any() else 0.0
+    tolerance = float(np.clip(TOLERANCE * usual, MIN_TOLERANCE_PX, MAX_TOLERANCE_PX))
+    support, against = _votes(matches, error, tolerance, count)
+    misplaced = _outvoted(support, against)
+    # Depths that a misplaced group measured wrong speak against good photos beside it: these are heard once more.
+    for _ in range(ROUNDS if misplaced.any() else 0):
+        trusted = ~misplaced[matches.pairs].any(axis=1)
+        error = pair_medians(matches, *transfer_errors_px(matches, world_from_camera, trusted))
+        support, against = _votes(matches, error, tolerance, count)
+        acquitted = misplaced & ((support - against)[:, ~misplaced].sum(axis=1) > 0)
+        if not acquitted.any():
+            break
+        misplaced &= ~acquitted
+    unlinked = ~misplaced & (connected(np.where(misplaced[:, None] | misplaced[None], 0, support) > 0) > 0)
+    standing = ~(misplaced | unlinked)
+    return PoseCheck(
+        pair_error_px=error,
+        photo_error_px=_photo_medians(matches, np.where(standing[matches.pairs].all(axis=1), error, np.nan), count),
+        usual_px=usual,
+        tolerance_px=tolerance,
+        agrees=error <= tolerance,
+        contradicts=error > tolerance,
+        misplaced=misplaced,
+        unlinked=unlinked,
+        votes_for=support[:, standing].sum(axis=1),
+        votes_against=against[:, standing].sum(axis=1),
+    )
+
+
+def _photo_medians(
+    matches: PairMatches, error_px: Float[np.ndarray, "pairs"], count: int
+) -> Float[np.ndarray, "photos"]:
+    """Of each photo the median error over its pairs, each counting by its matches; NaN where it has none."""
+    photo, error = matches.pairs.T.reshape(-1), np.tile(error_px, 2)
+    told = np.isfinite(error)
+    photo, error, weight = photo[told], error[told], np.tile(matches.weight, 2)[told]
+    found = np.full(count, np.nan)
+    for number in np.unique(photo).tolist():
+        mine = np.flatnonzero(photo == number)
+        mine = mine[np.argsort(error[mine], kind="stable")]
+        total = np.cumsum(weight[mine])
+        found[number] = error[mine[np.searchsorted(total, total[-1] / 2)]]
+    return found
+
+
+class WeakLink(NamedTuple):
+    """Photos that few matches hold to the rest."""
+
+    photos: list[int]
+    pairs: int
+    matches: int
+
+
+def weak_links(matches: PairMatches, check: PoseCheck) -> list[WeakLink]:
+    """Groups that a single pair, or fewer than MIN_BUNDLE agreeing matches hold to the rest: the smallest ones."""
+    support, _ = _votes(matches, check.pair_error_px, check.tolerance_px, len(check.misplaced))
+    cuts, found = weak_cuts(support), []
+    taken = np.zeros(len(check.misplaced), bool)
+    for number in np.argsort(cuts.side.sum(axis=1), kind="stable").tolist():
+        side, pairs, weight = cuts.side[number], int(cuts.edges[number]), float(cuts.weight[number])
+        if (pairs == 1 or weight < MIN_BUNDLE) and not (side & taken).any():
+            taken |= side
+            found.append(WeakLink(np.flatnonzero(side).tolist(), pairs, int(weight)))
+    return found
+
+
+def _outvoted(
+    support: Float[np.ndarray, "photos photos"], against: Float[np.ndarray, "photos photos"]
+) -> Bool[np.ndarray, "photos"]:
+    """Photos on the smaller side of a cut across which more matches contradict than agree; the clearest cut first, for
+    photos beside a misplaced group would be outvoted by it."""
+    sides = np.concatenate([weak_cuts(support).side, np.eye(len(support), dtype=bool)]).astype(float)
+    excess = against - support
+    standing = np.ones(len(support))
+    while True:
+        part = sides * standing
+        rest = standing - part
+        margin = np.einsum("ci,ci->c", part @ excess, rest)
+        margin[part.sum(axis=1) > rest.sum(axis=1)] = 0
+        clearest = int(np.argmax(margin))
+        if margin[clearest] <= 0:
+            break
+        standing = rest[clearest]
+    return standing == 0
+
+
+def pair_medians(
+    matches: PairMatches, error_px: Float[np.ndarray, "2*matches"], known: Bool[np.ndarray, "2*matches"]
+) -> Float[np.ndarray, "pairs"]:
+    """The median transfer error of each pair, both ways, of matches ``known`` to a point where these are enough; NaN of
+    fewer than MIN_MATCHES matches."""
+    pair = np.tile(matches.pair, 2)
+    enough = np.bincount(pair[known], minlength=len(matches.pairs)) >= MIN_MATCHES
+    counted = known | ~enough[pair]
+    pair, error_px = pair[counted], error_px[counted]
+    order = np.lexsort((error_px, pair))
+    bounds = np.searchsorted(pair[order], np.arange(len(matches.pairs) + 1))
+    middle = np.minimum((bounds[:-1] + bounds[1:]) // 2, max(0, len(order) - 1))
+    found = error_px[order][middle] if len(order) else np.full(len(middle), np.nan)
+    return np.where(np.diff(bounds) >= MIN_MATCHES, found, np.nan)
+
+
+def _votes(
+    matches: PairMatches, error_px: Float[np.ndarray, "pairs"], tolerance_px: float, count: int
+) -> tuple[Float[np.ndarray, "photos photos"], Float[np.ndarray, "photos photos"]]:
+    """The symmetric matrices of matches whose pairs agree with the poses, and of those whose pairs contradict them."""
+    both = []
+    for chosen in (error_px <= tolerance_px, error_px > tolerance_px):
+        votes = np.zeros((count, count))
+        first, second = matches.pairs[chosen].T
+        votes[first, second] = votes[second, first] = matches.weight[chosen]
+        both.append(votes)
+    return both[0], both[1]
