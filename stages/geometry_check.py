@@ -1,4 +1,4 @@
-"""Whether camera poses agree with what pairs of photos say of each other: no pose, point or track of a model is trusted.
+"""Whether camera poses agree with what pairs of photos say of each other: no pose or point of a model is trusted.
 
 Every verified match (keypoint a of photo i, keypoint b of photo j) is a test. Photo i's other matches give the inverse
 depth of a, without j; with it the poses predict where j sees the point. The distance to b, in pixels, is the *transfer
@@ -22,7 +22,7 @@ MEDIAN_VARIANCE = np.pi / 2  # of a median, over that of a mean
 # A pair agrees with the poses where half of its matches lie nearer to their predictions than this: so many times the
 # usual distance, which is noise, and never less than a fraction of a pixel nor more than verification lets through.
 TOLERANCE, MIN_TOLERANCE_PX, MAX_TOLERANCE_PX = 3.0, 0.6, 4.0
-ROUNDS = 3  # of acquittal
+ROUNDS = 12  # of acquittal, which goes from neighbour to neighbour
 MIN_BUNDLE = 60  # agreeing matches across: twice what mapping asks of a single photo
 MIN_MATCHES = 8  # of a pair, for its median to mean something
 
@@ -49,8 +49,8 @@ def transfer_errors_px(
     world_from_camera: Float[np.ndarray, "photos 3 4"],
     trusted: Bool[np.ndarray, "pairs"] | None = None,
 ) -> tuple[Float[np.ndarray, "2*matches"], Bool[np.ndarray, "2*matches"]]:
-    """How far each match is from where the poses predict it, in pixels of the photo that sees it; the matches from first
-    to second photo, then those from second to first. Depths come from the ``trusted`` pairs, from all without it.
+    """How far each match is from where the poses predict it, in pixels of the photo that sees it; the matches from
+    first to second photo, then those from second to first. Depths come from ``trusted`` pairs, from all without it.
 
     Also which of them are predicted to a point, by a depth that others tell.
 

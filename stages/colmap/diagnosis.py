@@ -76,8 +76,8 @@ def find_conflict(models: "Sequence[pycolmap.Reconstruction]") -> dict[str, Any]
 def compare_models(model: "pycolmap.Reconstruction", other: "pycolmap.Reconstruction") -> dict[str, Any]:
     """How far two models of the same photos agree, after the similarity on which most of them do.
 
-    ``photos`` is how many both have, ``agree`` how many of them stand the same in both, ``elsewhere`` the files of those
-    that do not; ``centre`` and ``degrees`` are mean differences of the former, in shares of the first one's extent.
+    ``photos`` is how many both have, ``agree`` how many of them stand the same in both, ``elsewhere`` the files of
+    those that do not; ``centre`` and ``degrees`` are mean differences of the former, in shares of the first one's extent.
     """
     first, second = _poses(model), _poses(other)
     shared = sorted(first.keys() & second.keys())

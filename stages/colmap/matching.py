@@ -9,7 +9,7 @@ from contextlib import suppress
 from functools import lru_cache, partial
 from itertools import combinations, product
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -206,7 +206,7 @@ def _spread(pairs: list[tuple[int, int]]) -> list[tuple[int, int]]:
 class _Photo(NamedTuple):
     camera: "pycolmap.Camera"
     places: np.ndarray  # (keypoints, 2), pixels
-    features: "np.ndarray | IndexedFeatures"  # descriptors, (keypoints, 128) bytes, or the same by a vocabulary
+    features: Any  # descriptors, (keypoints, 128) bytes, or IndexedFeatures of them
 
 
 def _read_photo(db: "pycolmap.Database", photo: int, words: Words | None = None) -> _Photo:
@@ -259,10 +259,8 @@ def _match(
     first: _Photo, second: _Photo, max_ratio: float, options: "pycolmap.TwoViewGeometryOptions"
 ) -> "tuple[np.ndarray, pycolmap.TwoViewGeometry]":
     """Matches, and the geometry of two views with those that it explains: none where they are too few."""
-    if isinstance(first.features, IndexedFeatures):
-        matches = match_indexed(first.features, second.features, max_ratio)
-    else:
-        matches = match_descriptors(first.features, second.features, max_ratio)
+    match = match_indexed if isinstance(first.features, IndexedFeatures) else match_descriptors
+    matches = match(first.features, second.features, max_ratio)
     return matches, _verified(first, second, matches, options)
 
 

@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from stages.feature_matching import BLOCK, FARTHEST, match_descriptors
+from stages.feature_matching import BLOCK, FARTHEST, PROBES, index_features, match_descriptors, match_indexed
+from stages.retrieval import visual_words
 
 
 def random_descriptors(count: int, seed: int) -> np.ndarray:
@@ -84,3 +85,41 @@ def test_the_largest_bytes_are_told_apart_exactly() -> None:
 def test_no_features_no_matches(first: int, second: int) -> None:
     found = match_descriptors(random_descriptors(5, 0)[:first], random_descriptors(5, 1)[:second], 0.8)
     assert found.shape == (0, 2)
+
+
+# --- by a vocabulary
+
+
+def indexed(first: np.ndarray, second: np.ndarray, words: np.ndarray, max_ratio: float = 0.8) -> list[list[int]]:
+    return match_indexed(index_features(first, words), index_features(second, words), max_ratio).tolist()
+
+
+def words_of(descriptors: np.ndarray) -> np.ndarray:
+    return np.rint(visual_words(descriptors.astype(np.float32), np.random.default_rng(0)))
+
+
+def test_with_no_more_cells_than_are_probed_indexed_matches_are_exact() -> None:
+    first, second = views(300, noise=18.0)
+    words = words_of(first)[:PROBES]
+    assert indexed(first, second, words) == match_descriptors(first, second, 0.8).tolist()
+
+
+def test_indexed_matches_are_nearly_all_and_hardly_any_others() -> None:
+    first, second = views(2000, noise=8.0)
+    exact = {*map(tuple, match_descriptors(first, second, 0.8).tolist())}
+    found = {*map(tuple, indexed(first, second, words_of(np.concatenate([first, second]))))}
+    assert 0.95 * len(exact) < len(exact & found) <= len(exact) and len(exact) > 900
+    assert len(found - exact) < 0.02 * len(exact)
+
+
+def test_indexed_matches_do_not_depend_on_which_photo_comes_first() -> None:
+    first, second = views(800, noise=8.0)
+    words = words_of(np.concatenate([first, second]))
+    assert indexed(first, second, words) == sorted([i, j] for j, i in indexed(second, first, words))
+
+
+@pytest.mark.parametrize("counts", [(0, 5), (5, 0), (0, 0), (1, 1)])
+def test_photos_with_hardly_any_features_are_indexed_too(counts: tuple[int, int]) -> None:
+    words = words_of(random_descriptors(300, 7))
+    first, second = (random_descriptors(count, 3) for count in counts)
+    assert indexed(first, second, words) == ([[0, 0]] if min(counts) else [])

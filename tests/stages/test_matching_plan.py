@@ -22,7 +22,6 @@ from stages.photos import Photo
 from tests.synthetic_photos import SyntheticPhotos
 
 ALL_OPEN = Open(None, None, None)
-FULL = Open(1600, 4096, None)
 
 
 def photos(count: int) -> list[Photo]:
@@ -33,7 +32,7 @@ def costing(monkeypatch: pytest.MonkeyPatch, *seconds: tuple[float, float]) -> l
     """Let tiers cost so much, one after the other; the answer grows by what is measured."""
     asked: list[Tier] = []
 
-    def measured(_: list[Photo], __: Path, tier: Tier) -> Cost:
+    def measured(_: list[Photo], __: Path, tier: Tier, ___: str) -> Cost:
         asked.append(tier)
         return Cost(*seconds[len(asked) - 1])
 
@@ -41,125 +40,55 @@ def costing(monkeypatch: pytest.MonkeyPatch, *seconds: tuple[float, float]) -> l
     return asked
 
 
-SEARCHED = "400 photos searched at 1600 pixels for 4096 features and matched: about "
-
-
 @pytest.mark.parametrize(
-    ("seconds", "matcher", "notes"),
+    ("places", "matcher"),
     [
-        (
-            0.034,
-            "retrieval",
-            [
-                "400 photos have 79,800 pairs, about 45 min: retrieval of 30 neighbours each, about 5 min",
-                SEARCHED + "5 min",
-            ],
-        ),
-        (
-            1.0,
-            "retrieval",
-            [
-                "400 photos have 79,800 pairs, about 22 h 10 min: retrieval of 30 neighbours each, about 2 h 30 min",
-                SEARCHED + "2 h 30 min",
-            ],
-        ),
-        (0.002, "exhaustive", [SEARCHED + "3 min"]),
+        (Places(), "retrieval"),
+        (Places(time_s=np.arange(400.0)), "sequential"),
+        (Places(position_m=9.0 * np.indices((400, 3))[0]), "spatial"),
     ],
 )
-def test_the_choice_of_pairs_follows_the_measurement_and_is_said(
-    seconds: float, matcher: str, notes: list[str], progress, monkeypatch: pytest.MonkeyPatch
+def test_pairs_of_many_photos_are_chosen_by_what_is_known(
+    places: Places, matcher: str, progress, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    costing(monkeypatch, (0.05, seconds))
-    assert chosen(FULL, photos(400), Path(), 30, progress, None) == Chosen(1600, 4096, matcher)  # type: ignore[arg-type]
-    assert progress.notes == notes
-
-
-@pytest.mark.parametrize(
-    ("places", "words"),
-    [
-        (Places(time_s=np.arange(400.0)), "neighbours in time, 30 each, about 5 min"),
-        (Places(position_m=9.0 * np.indices((400, 3))[0]), "neighbours by place and looks, 30 each, about 5 min"),
-    ],
-)
-def test_other_choices_have_other_words(places: Places, words: str, progress, monkeypatch: pytest.MonkeyPatch) -> None:
-    costing(monkeypatch, (0.05, 0.034))
+    asked = costing(monkeypatch)
     monkeypatch.setattr(pairing, "places_of", lambda _: places)
-    chosen(FULL, photos(400), Path(), 30, progress, None)
-    assert progress.notes[0] == f"400 photos have 79,800 pairs, about 45 min: {words}"
+    assert chosen(ALL_OPEN, photos(400), Path(), 30, progress, None) == (1600, 4096, matcher)
+    assert not asked and len(progress.notes) == 1
 
 
 @pytest.mark.parametrize(
-    ("count", "costs", "tier", "note"),
+    ("costs", "tier"),
     [
-        (
-            400,
-            [(0.36, 0.034)],
-            Tier(1600, 4096),
-            "400 photos searched at 1600 pixels for 4096 features and matched: about 8 min",
-        ),
-        (
-            1000,
-            [(0.36, 0.034), (0.18, 0.009)],
-            Tier(1131, 2048),
-            "1000 photos searched at 1600 pixels for 4096 features and matched take about 19 min: "
-            "at 1131 pixels for 2048 features instead, about 6 min",
-        ),
-        (
-            5000,
-            [(0.36, 0.034), (0.18, 0.009), (0.12, 0.002)],
-            Tier(1131, 1024),
-            "5000 photos searched at 1600 pixels for 4096 features and matched take about 1 h 34 min: "
-            "at 1131 pixels for 1024 features instead, about 14 min",
-        ),
-        (  # with few features a step down saves too little, and two steps enough
-            1000,
-            [(0.36, 0.046), (0.36, 0.044), (0.36, 0.009)],
-            Tier(1131, 1024),
-            "1000 photos searched at 1600 pixels for 4096 features and matched take about 23 min: "
-            "at 1131 pixels for 1024 features instead, about 9 min",
-        ),
-        (
-            1000,
-            [(0.53, 0.046), (0.70, 0.044), (0.70, 0.033)],
-            Tier(1600, 4096),
-            "1000 photos searched at 1600 pixels for 4096 features and matched: about 26 min",
-        ),
+        ([(0.36, 0.034)], Tier(1600, 4096)),
+        ([(0.72, 0.068), (0.18, 0.009)], Tier(1131, 2048)),
+        ([(0.72, 0.068), (0.54, 0.05), (0.12, 0.002)], Tier(1131, 1024)),
+        ([(0.72, 0.068), (0.70, 0.067), (0.70, 0.066)], Tier(1600, 4096)),  # a step down saves too little
     ],
 )
-def test_large_sets_are_searched_as_far_as_is_bearable(
-    count: int,
-    costs: list[tuple[float, float]],
-    tier: Tier,
-    note: str,
-    progress,
-    monkeypatch: pytest.MonkeyPatch,
+def test_features_give_way_only_to_a_time_that_is_given(
+    costs: list[tuple[float, float]], tier: Tier, progress, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked = costing(monkeypatch, *costs)
-    assert chosen(ALL_OPEN, photos(count), Path(), 30, progress, None) == Chosen(*tier, "retrieval")
-    assert progress.notes[1:] == [note]
+    assert chosen(ALL_OPEN, photos(400), Path(), 30, progress, 900.0) == Chosen(*tier, "retrieval")
     assert asked == list(TIERS[: len(costs)])
+    assert chosen(ALL_OPEN, photos(400), Path(), 30, progress, None) == Chosen(1600, 4096, "retrieval")
 
 
 def test_what_is_given_stays_in_every_tier(progress, monkeypatch: pytest.MonkeyPatch) -> None:
     assert tiers_of(Open(None, 8192, None)) == [Tier(1600, 8192), Tier(1131, 8192)]
     assert tiers_of(Open(2400, None, None)) == [Tier(2400, 4096), Tier(2400, 2048), Tier(2400, 1024)]
     asked = costing(monkeypatch, (0.36, 0.034), (0.18, 0.009))
-    every_pair = chosen(Open(None, None, "exhaustive"), photos(200), Path(), 30, progress, None)
+    every_pair = chosen(Open(None, None, "exhaustive"), photos(200), Path(), 30, progress, 900.0)
     assert every_pair == Chosen(1131, 2048, "exhaustive") and len(asked) == 2
     assert len(progress.notes) == 1
 
 
-@pytest.mark.parametrize("count", [3, 91, 100])
-def test_sets_of_ordinary_size_are_searched_in_full(count: int, progress, monkeypatch: pytest.MonkeyPatch) -> None:
-    costing(monkeypatch, (100.0, 100.0))
-    assert chosen(ALL_OPEN, photos(count), Path(), 30, progress, None)[:2] == (1600, 4096)
-
-
-def test_nothing_is_measured_where_it_could_change_nothing(progress, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_is_measured_without_a_time(progress, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(matching_plan, "CHILD", ["-c", "raise SystemExit('measured')"])
-    assert chosen(ALL_OPEN, photos(60), Path(), 30, progress, None) == Chosen(1600, 4096, "exhaustive")
+    assert chosen(ALL_OPEN, photos(50), Path(), 30, progress, None) == Chosen(1600, 4096, "exhaustive")
     with pytest.raises(StageError) as caught:
-        chosen(ALL_OPEN, photos(400), Path(), 30, progress, None)
+        chosen(ALL_OPEN, photos(400), Path(), 30, progress, 60.0)
     assert (caught.value.what, caught.value.why) == ("could not measure what features and matches take", "measured")
     assert caught.value.hint == (
         "Say how, and nothing is measured: --sfm.matcher exhaustive --sfm.max-image-size 1600 --sfm.max-features 4096."
@@ -181,9 +110,10 @@ def test_measured_are_neighbours_from_all_over_the_set_enough_for_all_cores() ->
     assert numbers(3, 64) == [0, 1, 2]
 
 
-def test_features_and_pairs_take_time(synthetic_photos: SyntheticPhotos) -> None:
+@pytest.mark.parametrize("indexed", [False, True])
+def test_features_and_pairs_take_time(synthetic_photos: SyntheticPhotos, indexed: bool) -> None:
     entries = [{**vars(photo), "file": f"images/photo_{i:03d}.jpg"} for i, photo in enumerate(photos(3))]
-    cost = measure(str(synthetic_photos.folder), entries, 1600, 500)
+    cost = measure(str(synthetic_photos.folder), entries, 1600, 500, indexed)
     assert 0 < cost.per_photo < 60 and 0 < cost.per_pair < 60
     assert cost.of(10, 45) == 10 * cost.per_photo + 45 * cost.per_pair
 

@@ -6,19 +6,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stages.pairing import (
-    PATIENCE_SECONDS,
+    MAX_EXHAUSTIVE,
     Places,
-    can_save,
     cartesian,
     choose,
     closeness,
     exhaustive,
-    expected_pairs,
     nearest,
-    pairs_of,
     second_look,
     sequential,
     spanning_tree,
+    start_pairs,
     union,
 )
 
@@ -62,17 +60,17 @@ def test_exhaustive_is_every_pair_once(count: int) -> None:
     pairs = exhaustive(count)
     assert is_proper(pairs)
     assert len(pairs) == count * (count - 1) // 2
-    np.testing.assert_array_equal(pairs_of("exhaustive", 3, count, Places(), unused), pairs)
+    np.testing.assert_array_equal(start_pairs("exhaustive", 3, count, Places(), unused), pairs)
 
 
 @given(st.integers(2, 40), st.integers(1, 50), st.integers(0, 5))
-def test_everyone_gets_the_neighbours_asked_for_and_all_hang_together(count: int, neighbours: int, seed: int) -> None:
+def test_retrieval_begins_with_the_most_similar_and_all_hang_together(count: int, neighbours: int, seed: int) -> None:
     alike = similarity(count, seed)
-    pairs = pairs_of("retrieval", neighbours, count, Places(), lambda: alike)
+    pairs = start_pairs("retrieval", neighbours, count, Places(), lambda: alike)
     assert is_proper(pairs)
     assert groups(pairs, count) == 1
     for photo, found in enumerate(partners(pairs, count)):
-        best = sorted(set(range(count)) - {photo}, key=lambda other: -alike[photo, other])[:neighbours]
+        best = sorted(set(range(count)) - {photo}, key=lambda other: -alike[photo, other])[: max(2, neighbours // 4)]
         assert found >= set(best)
 
 
@@ -81,7 +79,7 @@ def test_two_groups_that_look_like_themselves_only_are_joined_by_their_likest_pa
     alike[:3, :3] = alike[3:, 3:] = 0.9
     alike[1, 5] = alike[5, 1] = 0.1
     assert groups(nearest(alike, 2), 6) == 2
-    assert [1, 5] in pairs_of("retrieval", 2, 6, Places(), lambda: alike).tolist()
+    assert [1, 5] in start_pairs("retrieval", 2, 6, Places(), lambda: alike).tolist()
 
 
 @given(st.integers(1, 12), st.integers(0, 9))
@@ -116,7 +114,7 @@ def test_a_video_that_returns_is_closed_by_what_looks_alike() -> None:
     times[shuffled] = np.arange(60) / 30
     frame = np.argsort(shuffled)
     alike = around[np.ix_(frame, frame)]
-    pairs = pairs_of("sequential", 10, 60, Places(time_s=times), lambda: alike)
+    pairs = start_pairs("sequential", 10, 60, Places(time_s=times), lambda: alike)
     found = {frozenset(pair) for pair in pairs.tolist()}
     assert frozenset((int(shuffled[0]), int(shuffled[59]))) in found
     assert all(frozenset((int(a), int(b))) in found for a, b in pairwise(shuffled))
@@ -124,7 +122,7 @@ def test_a_video_that_returns_is_closed_by_what_looks_alike() -> None:
 
 
 def test_without_times_a_sequence_goes_by_name() -> None:
-    pairs = pairs_of("sequential", 5, 12, Places(), lambda: similarity(12)).tolist()
+    pairs = start_pairs("sequential", 5, 12, Places(), lambda: similarity(12)).tolist()
     assert all([i, i + 1] in pairs for i in range(11))
 
 
@@ -154,7 +152,7 @@ def test_nearest_places_are_those_next_door() -> None:
     walk = union(np.stack([steps[:-1], steps[1:]], axis=1), np.array([[0, 2], [17, 19]]))
     assert nearest(closeness(places), 2).tolist() == walk.tolist()
     alike = similarity(20)
-    pairs = pairs_of("spatial", 4, 20, Places(position_m=places), lambda: alike)
+    pairs = start_pairs("spatial", 4, 20, Places(position_m=places), lambda: alike)
     assert is_proper(pairs) and groups(pairs, 20) == 1
     assert {*map(tuple, walk.tolist())} < {*map(tuple, pairs.tolist())}
     assert min(map(len, partners(pairs, 20))) >= 4
@@ -166,15 +164,15 @@ def test_where_positions_tell_nothing_looks_choose_half_of_the_partners(error_m:
     angle = 2 * np.pi * np.arange(120) / 120
     alike = np.cos(angle[:, None] - angle[None])
     places = np.random.default_rng(0).normal(0, error_m, (120, 3))
-    found = partners(pairs_of("spatial", 30, 120, Places(position_m=places), lambda: alike), 120)
+    found = partners(start_pairs("spatial", 30, 120, Places(position_m=places), lambda: alike), 120)
     likest = partners(nearest(alike, 14), 120)
     assert all(mine <= theirs for mine, theirs in zip(likest, found, strict=True))
-    assert sum(map(len, found)) <= 2 * expected_pairs("spatial", 120, 30) * 1.2
+    assert sum(map(len, found)) <= 2 * 120 * 30
 
 
 def test_a_second_look_takes_as_many_pairs_again_for_the_missing() -> None:
     alike = similarity(40)
-    pairs = pairs_of("retrieval", 4, 40, Places(), lambda: alike)
+    pairs = nearest(alike, 4)
     again = second_look(pairs, [3, 17], 4, lambda: alike)
     assert {*map(tuple, pairs.tolist())} < {*map(tuple, again.tolist())}
     assert all(3 in pair or 17 in pair for pair in {*map(tuple, again.tolist())} - {*map(tuple, pairs.tolist())})
@@ -184,26 +182,14 @@ def test_a_second_look_takes_as_many_pairs_again_for_the_missing() -> None:
     np.testing.assert_array_equal(second_look(exhaustive(9), [2], 4, unused), exhaustive(9))
 
 
-@given(st.integers(3, 2000), st.floats(1e-4, 1), st.floats(1, 100))
-def test_what_is_worth_choosing_stays_so_where_a_pair_costs_more(count: int, seconds: float, times: float) -> None:
-    cheap, dear = (choose(count, 30, cost, Places()) for cost in (seconds, times * seconds))
-    assert (cheap, dear) in {("exhaustive", "exhaustive"), ("exhaustive", "retrieval"), ("retrieval", "retrieval")}
-    if dear == "retrieval":
-        assert can_save(count, 30)
-        assert expected_pairs("exhaustive", count, 30) * times * seconds > PATIENCE_SECONDS
-
-
-def test_small_sets_are_matched_whole_whatever_it_costs() -> None:
-    assert choose(60, 30, 1e6, Places()) == "exhaustive"
-    assert not can_save(91, 30)
-    assert can_save(92, 30)
+def test_pairs_are_chosen_of_sets_above_ordinary_size() -> None:
+    assert choose(MAX_EXHAUSTIVE, 30, Places()) == "exhaustive"
+    assert choose(MAX_EXHAUSTIVE + 1, 30, Places()) == "retrieval"
 
 
 def test_time_and_place_are_used_where_they_are_known() -> None:
     along = np.arange(200.0)
     street = np.stack([5 * along, 0 * along, 0 * along], axis=1)
-    assert choose(200, 30, 1.0, Places(time_s=along, position_m=street)) == "sequential"
-    assert choose(200, 30, 1.0, Places(position_m=street)) == "spatial"
-    assert choose(200, 30, 1.0, Places(position_m=street / 100)) == "retrieval", (
-        "GPS does not tell photos in a room apart"
-    )
+    assert choose(200, 30, Places(time_s=along, position_m=street)) == "sequential"
+    assert choose(200, 30, Places(position_m=street)) == "spatial"
+    assert choose(200, 30, Places(position_m=street / 100)) == "retrieval", "GPS does not tell photos in a room apart"

@@ -1,6 +1,8 @@
+from collections.abc import Callable
+
 import numpy as np
 
-from stages.retrieval import photo_similarity, visual_words, vlad
+from stages.retrieval import photo_similarity, visual_words, vlad, vocabulary
 from tests.stages.test_feature_matching import random_descriptors
 
 
@@ -16,9 +18,13 @@ def walk(photos: int, features: int = 60, step: int = 20) -> list[np.ndarray]:
     ]
 
 
+def similarity(descriptors: Callable[[int], np.ndarray], count: int, seed: int = 0) -> np.ndarray:
+    return photo_similarity(descriptors, count, vocabulary(descriptors, count, seed))
+
+
 def test_photos_that_share_features_look_alike_in_the_order_of_how_much_they_share() -> None:
     photos = walk(30)
-    alike = photo_similarity(photos.__getitem__, 30, seed=0)
+    alike = similarity(photos.__getitem__, 30)
     ranked = np.argsort(-np.where(np.eye(30, dtype=bool), -np.inf, alike), axis=1)
     for photo in range(2, 28):
         assert set(ranked[photo, :2]) == {photo - 1, photo + 1}
@@ -26,7 +32,7 @@ def test_photos_that_share_features_look_alike_in_the_order_of_how_much_they_sha
 
 
 def test_similarity_is_a_cosine() -> None:
-    alike = photo_similarity(walk(8).__getitem__, 8, seed=0)
+    alike = similarity(walk(8).__getitem__, 8)
     np.testing.assert_allclose(np.diag(alike), 1, atol=1e-5)
     np.testing.assert_array_equal(alike, alike.T)
     assert alike.min() >= -1.0001
@@ -34,7 +40,7 @@ def test_similarity_is_a_cosine() -> None:
 
 def test_it_is_a_function_of_features_and_seed() -> None:
     photos = walk(8)
-    once, again, other = (photo_similarity(photos.__getitem__, 8, seed) for seed in (3, 3, 4))
+    once, again, other = (similarity(photos.__getitem__, 8, seed) for seed in (3, 3, 4))
     np.testing.assert_array_equal(once, again)
     assert (once != other).any()
 
@@ -61,8 +67,8 @@ def test_words_are_centres_of_what_is_nearest_to_them() -> None:
 
 def test_photos_without_features_look_like_nothing() -> None:
     photos = [*walk(3), np.zeros((0, 128), np.uint8)]
-    alike = photo_similarity(photos.__getitem__, 4, seed=0)
+    alike = similarity(photos.__getitem__, 4)
     assert np.isfinite(alike).all()
     assert (alike[3] == 0).all()
-    nothing = photo_similarity(lambda photo: np.zeros((0, 128), np.uint8), 3, seed=0)
+    nothing = similarity(lambda photo: np.zeros((0, 128), np.uint8), 3)
     np.testing.assert_array_equal(nothing, np.zeros((3, 3)))
