@@ -6,7 +6,7 @@ library that multiplies, nor on the machine.
 
 :func:`match_descriptors` compares every feature with every other. :func:`match_indexed` compares those that fall into
 the same cells of a common vocabulary: an inverted file (Jégou et al. 2011, "Product quantization for nearest neighbor
-search", section 4), which finds 99 % of the matches in a fifth of the time (docs/stages/sfm.md).
+search", section 4), which finds 98 % of the matches in a fifth of the time (docs/stages/sfm.md).
 """
 
 from dataclasses import dataclass

@@ -200,6 +200,7 @@ def measure(images: str, photos: list[dict[str, Any]], max_image_size: int, max_
     )
     from stages.pairing import exhaustive
     from stages.photos import Photo
+    from stages.retrieval import CELLS
 
     some = [Photo(**photo) for photo in photos]
     pairs = exhaustive(len(some))
@@ -209,7 +210,7 @@ def measure(images: str, photos: list[dict[str, Any]], max_image_size: int, max_
         started = time.monotonic()
         extract_features(database, Path(images), some, Search(max_image_size, max_features))
         extracted = time.monotonic()
-        words = read_vocabulary(database, len(some), 0) if indexed else None
+        words = read_vocabulary(database, len(some), 0, CELLS) if indexed else None
         match_pairs(database, pairs, 0, STRICT_RATIO, words=words)
         return Cost((extracted - started) / len(some), (time.monotonic() - extracted) / len(pairs))
 

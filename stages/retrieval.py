@@ -10,7 +10,8 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-WORDS = 128
+WORDS = 128  # of a photo's VLAD vector
+CELLS = 32  # of the inverted file that features are matched by: fewer and larger products than with more of them
 ROUNDS = 10
 SAMPLE = 50_000  # features that the words are made from
 
@@ -18,14 +19,14 @@ Descriptors = UInt8[np.ndarray, "features 128"]
 Words = Float[np.ndarray, "words 128"]
 
 
-def vocabulary(descriptors: Callable[[int], Descriptors], count: int, seed: int) -> Words:
+def vocabulary(descriptors: Callable[[int], Descriptors], count: int, seed: int, words: int = WORDS) -> Words:
     """Visual words of these photos' own features, whole numbers; a function of the descriptors and the seed.
 
     ``descriptors`` gives those of one photo; they are asked for one photo at a time, so memory holds few.
     """
     random = np.random.default_rng(seed)
     sample = np.concatenate([_sampled(descriptors(photo), SAMPLE // count + 1, random) for photo in range(count)])
-    return np.rint(visual_words(sample.astype(np.float32), random))
+    return np.rint(visual_words(sample.astype(np.float32), random, words))
 
 
 def photo_similarity(
@@ -42,9 +43,9 @@ def _sampled(descriptors: Descriptors, most: int, random: np.random.Generator) -
     return descriptors[np.sort(random.choice(len(descriptors), most, replace=False))]
 
 
-def visual_words(features: Float[np.ndarray, "features 128"], random: np.random.Generator) -> Words:
-    """Centres of the features by k-means (Lloyd); fewer than WORDS where there are fewer features."""
-    words = features[random.permutation(len(features))[:WORDS]]
+def visual_words(features: Float[np.ndarray, "features 128"], random: np.random.Generator, count: int = WORDS) -> Words:
+    """Centres of the features by k-means (Lloyd); fewer than ``count`` where there are fewer features."""
+    words = features[random.permutation(len(features))[:count]]
     for _ in range(ROUNDS if len(words) else 0):
         sums, counts = _summed(features, _nearest_word(features, words), len(words))
         used = counts > 0  # a word that lost its features stays where it is

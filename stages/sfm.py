@@ -16,6 +16,7 @@ from stages.sfm_process import run_child
 
 if TYPE_CHECKING:
     from stages.photos import Photo
+    from stages.sparse_model import SparseModel
 
 NEEDS = ("ingest",)
 VERSION = 12
@@ -147,16 +148,19 @@ def _import(cameras: Path, photos: "list[Photo]", ingest: Path, folder: Path, pr
             f"{lost} of {len(errors)} points are seen where their cameras cannot see anything",
             "Check the distortion of the cameras, or leave them out to have them found from the photos.",
         )
+    check = _check_given(known.model, photos, ingest, folder, progress)
+    judged = check.pop("images", {}) if check else {}
+    unknown = {"agreement": None, "transfer_px": None}
     return _result(
         folder,
         source="import",
         attempts=[],
         repeated_structure=None,
         match_graph=None,
-        check=None,
+        check=check,
         second_opinion=None,
         images=[
-            image | {"uncertainty_px": None, "agreement": None, "transfer_px": None} for image in known.account(photos)
+            image | {"uncertainty_px": None} | judged.get(image["file"], unknown) for image in known.account(photos)
         ],
         reprojection_px=float(errors.mean()) if len(errors) else None,
         points=len(known.model.xyz),
@@ -165,6 +169,32 @@ def _import(cameras: Path, photos: "list[Photo]", ingest: Path, folder: Path, pr
         georeference=None,
         test_files=known.test_files,
     )
+
+
+def _check_given(
+    model: "SparseModel", photos: "list[Photo]", ingest: Path, folder: Path, progress: Progress
+) -> dict[str, Any] | None:
+    """What verified matches of neighbouring photos say of given cameras; None, said, where they say nothing."""
+    from stages.sfm_check import check_given_cameras
+
+    progress.update("comparing the cameras with what neighbouring photos show")
+    posed = {image.file for image in model.images}
+    check = check_given_cameras([photo for photo in photos if photo.image_name in posed], ingest / "images", folder)
+    if why := check.get("failed"):
+        progress.note(f"the given cameras could not be checked: {why}")
+        return None
+    if 2 * check["agreeing"] < check["pairs"]:
+        progress.note(
+            f"the given cameras contradict their photos: {check['agreeing']} of {check['pairs']} verified pairs agree "
+            "with them. Check that poses are world from camera and which way their axes point, or leave out --cameras"
+        )
+    elif check["doubtful"]:
+        names = {photo.image_name: photo.name for photo in photos}
+        who = listed([names[file] for file in check["doubtful"]], MOST_NAMES)
+        progress.note(
+            f"{len(check['doubtful'])} of {len(posed)} given cameras contradict what their photos show: {who}"
+        )
+    return check
 
 
 # --- structure-from-motion
@@ -373,7 +403,7 @@ def _result(folder: Path, source: str, images: list[dict[str, Any]], **facts: An
     points = f" · {facts['points']:,} points".replace(",", " ") if facts["points"] else ""
     return StageResult(
         outputs=("sparse", "registration.json"),
-        records=("sfm.log",) if source == "sfm" else (),
+        records=("sfm.log",),
         line=f"{registered}/{len(images)} {what}{error} · {facts['camera_model']}{points}",
         facts=counts | {name: fact for name, fact in facts.items() if name != "test_files"},
     )

@@ -42,10 +42,9 @@ from stages.colmap.matching import (
 )
 from stages.colmap.models import load_native, write_native
 from stages.colmap.refinement import finish
-from stages.colmap.repair import Checked, check_model, deregister, reasons, register_again
+from stages.colmap.repair import Checked, check_model, deregister, facts, reasons, register_again
 from stages.colmap.thinning import thin_matches
 from stages.files import make_durable
-from stages.geometry_check import weak_links
 from stages.masks import write_feature_masks
 from stages.match_graph import (
     MIN_INLIERS,
@@ -71,7 +70,7 @@ from stages.pairing import (
 )
 from stages.photos import Photo
 from stages.registration import FEWEST_POINTS, FEWEST_REGISTERED
-from stages.retrieval import Words
+from stages.retrieval import CELLS, Words
 from stages.sfm import Matcher
 from stages.sfm_attempts import (
     ATTEMPTS,
@@ -176,13 +175,13 @@ class _Work:
 
     @cached_property
     def words(self) -> Words:
-        """The vocabulary of the photos' features, as the first attempt found them."""
-        return read_vocabulary(self.database, len(self.photos), self.job.seed)
+        """The vocabulary that features are matched by, of those that the first attempt found."""
+        return read_vocabulary(self.database, len(self.photos), self.job.seed, CELLS)
 
     @cached_property
     def similarity(self) -> Likeness:
         """How much any two photos look alike."""
-        return look_alike(self.database, len(self.photos), self.words)
+        return look_alike(self.database, len(self.photos), self.job.seed)
 
     def missing(self) -> list[int]:
         """The photos that have no place in the best model so far."""
@@ -264,23 +263,7 @@ def _last_check(model: Any, database: Path, work: _Work) -> tuple[dict[str, Any]
         left_out = reasons(model, checked)
         deregister(model, failed)
         checked = check_model(model, database, work.job.seed)
-    names, check = [model.image(i).name for i in checked.ids], checked.check
-    votes = check.votes_for + check.votes_against
-    return {
-        "pairs": int(check.agrees.sum() + check.contradicts.sum()),
-        "agreeing": int(check.agrees.sum()),
-        "error_px": check.usual_px,
-        "tolerance_px": check.tolerance_px,
-        "doubtful": [name for name, passed in zip(names, check.passed, strict=True) if not passed],
-        "weak_links": [
-            {"photos": [names[i] for i in link.photos], "pairs": link.pairs, "matches": link.matches}
-            for link in weak_links(checked.matches, check)
-        ],
-        "images": {
-            name: {"agreement": agree / of if of else None, "transfer_px": float(px) if np.isfinite(px) else None}
-            for name, agree, of, px in zip(names, check.votes_for, votes, check.photo_error_px, strict=True)
-        },
-    }, left_out
+    return facts(model, checked), left_out
 
 
 def _try_all(work: _Work) -> None:

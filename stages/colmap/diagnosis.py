@@ -77,7 +77,8 @@ def compare_models(model: "pycolmap.Reconstruction", other: "pycolmap.Reconstruc
     """How far two models of the same photos agree, after the similarity on which most of them do.
 
     ``photos`` is how many both have, ``agree`` how many of them stand the same in both, ``elsewhere`` the files of
-    those that do not; ``centre`` and ``degrees`` are mean differences of the former, in shares of the first one's extent.
+    those that do not; ``centre`` and ``degrees`` are mean differences of the former, centres as shares of the extent of
+    the first model's cameras.
     """
     first, second = _poses(model), _poses(other)
     shared = sorted(first.keys() & second.keys())

@@ -17,7 +17,7 @@ from stages.device import processors
 from stages.feature_matching import IndexedFeatures, index_features, match_descriptors, match_indexed
 from stages.memory import at_once
 from stages.pairing import Likeness, Pairs
-from stages.retrieval import Words, photo_similarity, vocabulary
+from stages.retrieval import WORDS, Words, photo_similarity, vocabulary
 
 if TYPE_CHECKING:
     import pycolmap
@@ -173,9 +173,9 @@ def match_pairs(
     """Match and verify these pairs of photos (numbered from 0) where that has not been done yet.
 
     ``max_ratio`` is Lowe's: the best match must be nearer than this share of the second best. With ``words``, a
-    vocabulary of these photos, features are compared by them, which takes a fifth of the time and misses one match in
-    a hundred. ``on_expected`` is told how many pairs there are to match and how long it will take, once a first block,
-    spread over all, is done.
+    vocabulary of these photos, features are compared by them, which takes a fifth of the time and misses two matches
+    in a hundred. ``on_expected`` is told how many pairs there are to match and how long it will take, once a first
+    block, spread over all, is done.
     """
     import pycolmap
 
@@ -216,18 +216,19 @@ def _read_photo(db: "pycolmap.Database", photo: int, words: Words | None = None)
     return _Photo(camera, keypoints[:, :2], descriptors if words is None else index_features(descriptors, words))
 
 
-def read_vocabulary(database: Path, count: int, seed: int) -> Words:
-    """The visual words of these photos' features."""
+def read_vocabulary(database: Path, count: int, seed: int, words: int) -> Words:
+    """So many visual words of these photos' features."""
     import pycolmap
 
     with pycolmap.Database.open(database) as db:
-        return vocabulary(partial(read_descriptors, db), count, seed)
+        return vocabulary(partial(read_descriptors, db), count, seed, words)
 
 
-def look_alike(database: Path, count: int, words: Words) -> Likeness:
+def look_alike(database: Path, count: int, seed: int) -> Likeness:
     """How much any two photos look alike, by their features."""
     import pycolmap
 
+    words = read_vocabulary(database, count, seed, WORDS)
     with pycolmap.Database.open(database) as db:
         return photo_similarity(partial(read_descriptors, db), count, words)
 
@@ -259,7 +260,7 @@ def _match(
     first: _Photo, second: _Photo, max_ratio: float, options: "pycolmap.TwoViewGeometryOptions"
 ) -> "tuple[np.ndarray, pycolmap.TwoViewGeometry]":
     """Matches, and the geometry of two views with those that it explains: none where they are too few."""
-    match = match_indexed if isinstance(first.features, IndexedFeatures) else match_descriptors
+    match: Any = match_indexed if isinstance(first.features, IndexedFeatures) else match_descriptors
     matches = match(first.features, second.features, max_ratio)
     return matches, _verified(first, second, matches, options)
 

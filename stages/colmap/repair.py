@@ -6,14 +6,14 @@ Call it in a child process. What contradicts a pose is decided in stages/geometr
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from stages.colmap.correspondences import read_pair_matches
 from stages.colmap.mapping import map_incrementally
 from stages.colmap.matching import unfinished_copy
-from stages.geometry_check import PairMatches, PoseCheck, check_poses
+from stages.geometry_check import PairMatches, PoseCheck, check_poses, weak_links
 
 if TYPE_CHECKING:
     import pycolmap
@@ -55,6 +55,27 @@ def reasons(model: "pycolmap.Reconstruction", checked: Checked) -> dict[str, str
         elif unlinked:
             found[model.image(image_id).name] = "no verified match supports its place among the other photos"
     return found
+
+
+def facts(model: "pycolmap.Reconstruction", checked: Checked) -> dict[str, Any]:
+    """What registration.json says of a check, as plain JSON; of each photo under "images", by name."""
+    names, check = [model.image(i).name for i in checked.ids], checked.check
+    votes = check.votes_for + check.votes_against
+    return {
+        "pairs": int(check.agrees.sum() + check.contradicts.sum()),
+        "agreeing": int(check.agrees.sum()),
+        "error_px": check.usual_px,
+        "tolerance_px": check.tolerance_px,
+        "doubtful": [name for name, misplaced in zip(names, check.misplaced, strict=True) if misplaced],
+        "weak_links": [
+            {"photos": [names[i] for i in link.photos], "pairs": link.pairs, "matches": link.matches}
+            for link in weak_links(checked.matches, check)
+        ],
+        "images": {
+            name: {"agreement": agree / of if of else None, "transfer_px": float(px) if np.isfinite(px) else None}
+            for name, agree, of, px in zip(names, check.votes_for, votes, check.photo_error_px, strict=True)
+        },
+    }
 
 
 def deregister(model: "pycolmap.Reconstruction", image_ids: Sequence[int]) -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from stages.colmap import matching
 from stages.colmap.diagnosis import links
-from stages.colmap.matching import fill_database, hold_open, look_alike, match_pairs, read_vocabulary
+from stages.colmap.matching import fill_database, hold_open, look_alike, match_pairs
 from stages.pairing import exhaustive
 from stages.photos import Photo
 from tests.stages.test_feature_matching import random_descriptors
@@ -123,7 +123,7 @@ def test_the_first_block_is_spread_over_all_pairs() -> None:
 
 
 def test_photos_of_the_same_points_look_alike(database: Path) -> None:
-    alike = look_alike(database, COUNT, read_vocabulary(database, COUNT, seed=0))
+    alike = look_alike(database, COUNT, seed=0)
     assert alike.shape == (COUNT, COUNT)
     assert alike[:-1, -1].max() < alike[:-1, :-1].min()
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from stages.feature_matching import BLOCK, FARTHEST, PROBES, index_features, match_descriptors, match_indexed
-from stages.retrieval import visual_words
+from stages.retrieval import CELLS, visual_words
 
 
 def random_descriptors(count: int, seed: int) -> np.ndarray:
@@ -95,7 +95,7 @@ def indexed(first: np.ndarray, second: np.ndarray, words: np.ndarray, max_ratio:
 
 
 def words_of(descriptors: np.ndarray) -> np.ndarray:
-    return np.rint(visual_words(descriptors.astype(np.float32), np.random.default_rng(0)))
+    return np.rint(visual_words(descriptors.astype(np.float32), np.random.default_rng(0), CELLS))
 
 
 def test_with_no_more_cells_than_are_probed_indexed_matches_are_exact() -> None:

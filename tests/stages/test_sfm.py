@@ -154,7 +154,7 @@ def test_strangers_are_left_out_and_named_and_alpha_and_mixed_sizes_work(
     assert result.line.startswith("8/9 registered, ")
     notes = [re.sub(r"about .*", "…", note) for note in progress.notes if not note.startswith("camera model ")]
     assert notes == [
-        "matching all 36 pairs of photos: …",
+        "matching 36 pairs of photos: …",
         "1 of 9 photos has no place yet: matching them again, less strictly",
         "matching 8 pairs of photos: …",
         "passed over, for 1 of 9 photos missing is not worth starting over: verifying and mapping again, as if through "
