@@ -22,6 +22,7 @@ MEDIAN_VARIANCE = np.pi / 2  # of a median, over that of a mean
 # A pair agrees with the poses where half of its matches lie nearer to their predictions than this: so many times the
 # usual distance, which is noise, and never less than a fraction of a pixel nor more than verification lets through.
 TOLERANCE, MIN_TOLERANCE_PX, MAX_TOLERANCE_PX = 3.0, 0.6, 4.0
+CLOSEST = 1e-3  # of its distance to the other photo: nearer a point cannot be to a photo that sees it
 ROUNDS = 12  # of acquittal, which goes from neighbour to neighbour
 MIN_BUNDLE = 60  # agreeing matches across: twice what mapping asks of a single photo
 MIN_MATCHES = 8  # of a pair, for its median to mean something
@@ -54,8 +55,9 @@ def transfer_errors_px(
 
     Also which of them are predicted to a point, by a depth that others tell.
 
-    The part along the epipolar line counts in units of what it would be if the depth were known: a depth that other
-    pairs measured over a short baseline predicts little over a long one. Where nothing else tells the depth, only the
+    Errors count in units of what noise would make of them were the point as far from both photos and its depth known:
+    a ray transferred to a photo nearer by is vaguer there, and a depth that other pairs measured over a short baseline
+    predicts little over a long one. Where nothing else tells the depth, only the
     distance to the epipolar line counts, and how far behind the camera the point would be.
     """
     source, target = (np.concatenate([matches.keypoint[:, a], matches.keypoint[:, 1 - a]]) for a in (0, 1))
@@ -70,19 +72,31 @@ def transfer_errors_px(
     seen_ahead, seen_sideways = np.einsum("ki,ki->k", there, here), np.einsum("ki,ki->k", there, sideways)
     across = np.einsum("ki,ki->k", there, np.cross(here, sideways))
     across = np.where(base > 0, across, np.linalg.norm(np.cross(here, there), axis=1))
-    slope = np.divide(seen_sideways, seen_ahead, out=np.full_like(base, np.inf), where=seen_ahead > 0)
-    scale = base + np.where(np.isfinite(slope), slope, 0) * ahead
-    inverse_depth = np.divide(slope, scale, out=np.full_like(base, np.inf), where=(scale > 0) & np.isfinite(slope))
-    evidence = base**2 if trusted is None else base**2 * np.tile(trusted[matches.pair], 2)
-    others, weight = _median_of_others(np.maximum(inverse_depth, 0), evidence, source)
+    scale = base * seen_ahead + seen_sideways * ahead  # not positive where the rays do not meet before the cameras
+    meets = scale > 0
+    inverse_depth = np.maximum(np.divide(seen_sideways, scale, out=np.zeros_like(base), where=meets), 0)
+    evidence = np.where(meets, _sensitivity(inverse_depth, base, ahead)[1], 0.0) ** 2
+    if trusted is not None:
+        evidence *= np.tile(trusted[matches.pair], 2)
+    others, weight = _median_of_others(inverse_depth, evidence, source)
     known = weight > 0
-    others = np.where(known, others, np.maximum(inverse_depth, 0))
-    others = np.where(np.isfinite(others), others, 0)
-    predicted = np.arctan2(others * base, 1 - others * ahead)
-    along = np.arctan2(seen_sideways, seen_ahead) - predicted
-    spread = np.sqrt(1 + np.divide(MEDIAN_VARIANCE * base**2, weight, out=np.zeros_like(base), where=known))
-    angle = np.hypot(np.arcsin(np.clip(across, -1, 1)), along / spread)
+    others = np.where(known, others, inverse_depth)
+    along = np.arctan2(seen_sideways, seen_ahead) - np.arctan2(others * base, 1 - others * ahead)
+    nearness, slope = _sensitivity(others, base, ahead)
+    noise = (1 + nearness**2) / 2  # of the ray that is transferred and of the one it is compared with; 1 at equal depth
+    depth_noise = np.divide(MEDIAN_VARIANCE * slope**2, weight, out=np.zeros_like(base), where=known)
+    angle = np.hypot(np.arcsin(np.clip(across, -1, 1)) / np.sqrt(noise), along / np.sqrt(noise + depth_noise))
     return matches.focal_px[matches.photo[target]] * angle, known
+
+
+def _sensitivity(
+    inverse_depth: Float[np.ndarray, "n"], base: Float[np.ndarray, "n"], ahead: Float[np.ndarray, "n"]
+) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+    """How many times nearer a point is to the target than to the source, and by how much its direction there changes
+    with its inverse depth."""
+    squared = (1 - inverse_depth * ahead) ** 2 + (inverse_depth * base) ** 2
+    squared = np.maximum(squared, CLOSEST**2)
+    return 1 / np.sqrt(squared), base / squared
 
 
 def _median_of_others(

@@ -198,6 +198,8 @@ def test_nearly_the_same_pictures_are_not_matched_and_masks_keep_features_away(
         "reason": f"nearly the same picture as {photos[0].name}: it adds no baseline",
         "keypoints": 0,
         "observations": 0,
+        "agreement": None,
+        "transfer_px": None,
         "uncertainty_px": None,
     }
     place = {image.file: index for index, image in enumerate(model.images)}
@@ -381,5 +383,18 @@ def test_photos_that_look_alike_are_enough(inputs: dict[str, Path], tmp_path: Pa
     config = sfm.Config(max_features=1000, matcher="retrieval", neighbours=3)
     result = sfm.run(config, inputs, tmp_path, progress)
     assert result.line.startswith("12/12 registered")
-    said = re.fullmatch(r"matching (\d+) pairs of photos: about \d+ s", progress.notes[0])
-    assert said and 12 * 3 / 2 <= int(said[1]) < 12 * 11 / 2
+    graph = read_json(tmp_path / "registration.json")["match_graph"]
+    assert 12 * 3 / 2 <= graph["verified"] <= graph["tried"] < 12 * 11 / 2
+    assert graph["order"]
+
+
+def test_every_photo_is_checked_and_a_second_opinion_agrees(reconstructed: Path) -> None:
+    account = read_json(reconstructed / "registration.json")
+    check, opinion = account["check"], account["second_opinion"]
+    assert check["doubtful"] == [] and check["weak_links"] == []
+    assert 0.9 * check["pairs"] < check["agreeing"] <= check["pairs"] <= 12 * 11 / 2
+    assert 0 < check["error_px"] < check["tolerance_px"] < 4
+    assert min(image["agreement"] for image in account["images"]) > 0.9
+    assert 0 < max(image["transfer_px"] for image in account["images"]) < check["tolerance_px"]
+    assert (opinion["photos"], opinion["agree"], opinion["elsewhere"], opinion["failed"]) == (12, 12, [], None)
+    assert 0 < opinion["centre"] < 0.02

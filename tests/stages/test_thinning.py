@@ -1,0 +1,54 @@
+import numpy as np
+
+from stages.colmap.correspondences import Correspondences
+from stages.colmap.thinning import best_tracks
+
+PHOTOS, KEYPOINTS = 4, 6
+
+
+def matched(*tracks: list[tuple[int, int]]) -> Correspondences:
+    """Photos of six keypoints each; a track lists (photo, keypoint), each matched with the next one."""
+    rows = [(first, second) for track in tracks for first, second in zip(track, track[1:], strict=False)]
+    numbers = np.array([[photo * KEYPOINTS + keypoint for photo, keypoint in row] for row in rows]).reshape(-1, 2)
+    pair = np.zeros(len(rows), int)
+    return Correspondences(np.array([[1, 2]]), pair, numbers, KEYPOINTS * np.arange(PHOTOS + 1))
+
+
+def kept(correspondences: Correspondences, cells: np.ndarray, tracks: int) -> set[tuple[int, int]]:
+    chosen = np.flatnonzero(best_tracks(correspondences, cells, tracks))
+    return {(int(k) // KEYPOINTS, int(k) % KEYPOINTS) for k in chosen}
+
+
+ONE_CELL = np.zeros(PHOTOS * KEYPOINTS, int)
+LONG = [(0, 0), (1, 0), (2, 0), (3, 0)]
+SHORT = [(0, 1), (1, 1)]
+MIDDLE = [(0, 2), (1, 2), (2, 2)]
+
+
+def test_the_longest_tracks_of_each_photo_are_kept() -> None:
+    tracks = matched(LONG, SHORT, MIDDLE)
+    assert kept(tracks, ONE_CELL, 1) == set(LONG)
+    assert kept(tracks, ONE_CELL, 2) == {*LONG, *MIDDLE}
+    assert kept(tracks, ONE_CELL, 3) == {*LONG, *MIDDLE, *SHORT}
+
+
+def test_a_photo_with_few_tracks_keeps_all_of_them() -> None:
+    lonely = [(3, 5), (2, 5)]
+    assert kept(matched(MIDDLE, SHORT, lonely), ONE_CELL, 1) == {*MIDDLE, *lonely}
+
+
+def test_every_part_of_a_photo_gives_tracks_in_turn() -> None:
+    cells = ONE_CELL.copy()
+    cells[[1, KEYPOINTS + 1]] = 7  # the short track lies elsewhere in its photos
+    assert kept(matched(LONG, SHORT, MIDDLE), cells, 2) == {*LONG, *SHORT, *MIDDLE}
+    assert kept(matched(LONG, SHORT, [(0, 2), (1, 2), (3, 2)]), cells, 1) == set(LONG)
+
+
+def test_a_track_that_sees_a_photo_twice_comes_last() -> None:
+    twice = [(0, 3), (1, 3), (2, 3), (3, 3), (0, 4)]
+    assert kept(matched(twice, MIDDLE), ONE_CELL, 1) == {*MIDDLE, *twice}  # all that photo 3 has
+    assert kept(matched(twice, MIDDLE, [(3, 1), (2, 1)]), ONE_CELL, 1) == {*MIDDLE, (3, 1), (2, 1)}
+
+
+def test_nothing_matched_keeps_nothing() -> None:
+    assert kept(matched(), ONE_CELL, 5) == set()
