@@ -70,7 +70,8 @@ def best_tracks(matches: Correspondences, cells: Int[np.ndarray, "keypoints"], t
     photo = np.repeat(np.arange(photos), np.diff(matches.begins))
     sees = np.unique(track.astype(np.int64) * photos + photo) // photos
     size, length = np.bincount(track), np.bincount(sees, minlength=int(track.max(initial=-1)) + 1)
-    length = np.where(size == length, length, np.minimum(length, 1))[track]
+    length = np.where(size == length, length, 1)  # with mistakes: behind all others
+    length = np.where(size > 1, length, 0)[track]  # never matched: last of all
     in_cell = _rank(photo * CELLS**2 + cells, -length)
     best = (_rank(photo, in_cell, -length) < tracks) & (size[track] > 1)
     keep = np.zeros(len(size), bool)

@@ -1,3 +1,5 @@
+from itertools import pairwise
+
 import numpy as np
 
 from stages.colmap.correspondences import Correspondences
@@ -8,7 +10,7 @@ PHOTOS, KEYPOINTS = 4, 6
 
 def matched(*tracks: list[tuple[int, int]]) -> Correspondences:
     """Photos of six keypoints each; a track lists (photo, keypoint), each matched with the next one."""
-    rows = [(first, second) for track in tracks for first, second in zip(track, track[1:], strict=False)]
+    rows = [(first, second) for track in tracks for first, second in pairwise(track)]
     numbers = np.array([[photo * KEYPOINTS + keypoint for photo, keypoint in row] for row in rows]).reshape(-1, 2)
     pair = np.zeros(len(rows), int)
     return Correspondences(np.array([[1, 2]]), pair, numbers, KEYPOINTS * np.arange(PHOTOS + 1))
