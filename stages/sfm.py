@@ -16,7 +16,6 @@ from stages.sfm_process import run_child
 
 if TYPE_CHECKING:
     from stages.photos import Photo
-    from stages.sparse_model import SparseModel
 
 NEEDS = ("ingest",)
 VERSION = 12
@@ -30,6 +29,17 @@ UNKEYED = ("max_seconds", "seconds")
 CameraModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE"]
 Matcher = Literal["exhaustive", "sequential", "spatial", "retrieval"]
 MOST_NAMES = 5
+# Of what the child process says, what registration.json takes as it is.
+FACTS = (
+    "attempts",
+    "reprojection_px",
+    "points",
+    "camera_model",
+    "camera_models",
+    "match_graph",
+    "check",
+    "second_opinion",
+)
 
 
 class Config(StageConfig):
@@ -114,7 +124,11 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     photos, matched = _photos(inputs["ingest"])
     folder.mkdir(parents=True, exist_ok=True)
     if config.cameras is not None:
-        return _import(config.cameras, photos, inputs["ingest"], folder, progress)
+        from stages.sfm_import import import_cameras
+
+        return _result(
+            folder, source="import", **import_cameras(config.cameras, photos, inputs["ingest"], folder, progress)
+        )
     return _reconstruct(plan(config, inputs, progress), photos, matched, inputs["ingest"], folder, progress)
 
 
@@ -124,77 +138,6 @@ def _photos(ingest: Path) -> "tuple[list[Photo], list[Photo]]":
 
     everything = sorted(read_photos(ingest), key=lambda photo: photo.file)
     return everything, [photo for photo in everything if not photo.near_duplicate_of]
-
-
-# --- known cameras
-
-
-def _import(cameras: Path, photos: "list[Photo]", ingest: Path, folder: Path, progress: Progress) -> StageResult:
-    import numpy as np
-
-    from stages.colmap.models import read_model, write_model
-    from stages.known_cameras import read_known_cameras
-    from stages.photos import read_frame_names
-
-    progress.update(f"reading the cameras of {cameras.name}")
-    known = read_known_cameras(cameras, photos, read_frame_names(ingest))
-    for note in known.notes:
-        progress.note(note)
-    write_model(folder / "sparse", known.model)
-    errors = read_model(folder / "sparse").error_px  # computed anew: what the given model says of them may be anything
-    if lost := int((~np.isfinite(errors)).sum()):
-        raise StageError(
-            f"the cameras of {cameras.name} do not fit its points",
-            f"{lost} of {len(errors)} points are seen where their cameras cannot see anything",
-            "Check the distortion of the cameras, or leave them out to have them found from the photos.",
-        )
-    check = _check_given(known.model, photos, ingest, folder, progress)
-    judged = check.pop("images", {}) if check else {}
-    unknown = {"agreement": None, "transfer_px": None}
-    return _result(
-        folder,
-        source="import",
-        attempts=[],
-        repeated_structure=None,
-        match_graph=None,
-        check=check,
-        second_opinion=None,
-        images=[
-            image | {"uncertainty_px": None} | judged.get(image["file"], unknown) for image in known.account(photos)
-        ],
-        reprojection_px=float(errors.mean()) if len(errors) else None,
-        points=len(known.model.xyz),
-        camera_model="/".join(sorted({camera.model for camera in known.model.cameras})),
-        camera_models=[],
-        georeference=None,
-        test_files=known.test_files,
-    )
-
-
-def _check_given(
-    model: "SparseModel", photos: "list[Photo]", ingest: Path, folder: Path, progress: Progress
-) -> dict[str, Any] | None:
-    """What verified matches of neighbouring photos say of given cameras; None, said, where they say nothing."""
-    from stages.sfm_check import check_given_cameras
-
-    progress.update("comparing the cameras with what neighbouring photos show")
-    posed = {image.file for image in model.images}
-    check = check_given_cameras([photo for photo in photos if photo.image_name in posed], ingest / "images", folder)
-    if why := check.get("failed"):
-        progress.note(f"the given cameras could not be checked: {why}")
-        return None
-    if 2 * check["agreeing"] < check["pairs"]:
-        progress.note(
-            f"the given cameras contradict their photos: {check['agreeing']} of {check['pairs']} verified pairs agree "
-            "with them. Check that poses are world from camera and which way their axes point, or leave out --cameras"
-        )
-    elif check["doubtful"]:
-        names = {photo.image_name: photo.name for photo in photos}
-        who = listed([names[file] for file in check["doubtful"]], MOST_NAMES)
-        progress.note(
-            f"{len(check['doubtful'])} of {len(posed)} given cameras contradict what their photos show: {who}"
-        )
-    return check
 
 
 # --- structure-from-motion
@@ -239,31 +182,27 @@ def _reconstruct(
     if found["conflict"]:
         progress.note(repeated_structure(models, found["conflict"]))
     _say_who_is_missing(photos, images, progress)
-    spread, judged = found["uncertainty_px"], found["check"].pop("images")
-    unknown = {"agreement": None, "transfer_px": None}
-    images = with_left_out(images, everything)
     result = _result(
         folder,
         source="sfm",
-        attempts=found["attempts"],
         repeated_structure=found["conflict"],
-        match_graph=found["match_graph"],
-        check=found["check"],
-        second_opinion=found["second_opinion"],
-        images=[
-            image | {"uncertainty_px": spread.get(image["file"])} | judged.get(image["file"], unknown)
-            for image in images
-        ],
-        reprojection_px=found["reprojection_px"],
-        points=points,
-        camera_model=found["camera_model"],
-        camera_models=found["camera_models"],
+        images=_with_figures(with_left_out(images, everything), found),
         georeference=_georeference(folder, photos, progress),
         test_files=None,
+        **{name: found[name] for name in FACTS},
     )
     _forget(folder)
     all_placed = all(image["registered"] for image in images)
     return result if all_placed else replace(result, line=result.line + _for_want_of_time(found["attempts"]))
+
+
+def _with_figures(images: list[dict[str, Any]], found: dict[str, Any]) -> list[dict[str, Any]]:
+    """The account of each image with how well its pose is known, and how its matches agree with it."""
+    spread, judged = found["uncertainty_px"], found["check"].pop("images")
+    unknown = {"agreement": None, "transfer_px": None}
+    return [
+        image | {"uncertainty_px": spread.get(image["file"])} | judged.get(image["file"], unknown) for image in images
+    ]
 
 
 def _georeference(folder: Path, photos: "Sequence[Photo]", progress: Progress) -> dict[str, Any] | None:

@@ -14,12 +14,13 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from jaxtyping import Float
+
+from stages.pairing import Pairs, closeness, nearest
 from stages.sfm_process import environment
 
 if TYPE_CHECKING:
-    import pycolmap
-
-    from stages.pairing import Pairs
     from stages.photos import Photo
 
 CHILD = ["-P", "-m", "stages.sfm_check"]
@@ -72,7 +73,7 @@ def check(photos: list[dict[str, Any]], images: str, folder: str) -> dict[str, A
         verified_matches,
     )
     from stages.colmap.models import load_native
-    from stages.colmap.repair import check_model, facts
+    from stages.colmap.repair import camera_poses, check_model, facts
     from stages.masks import write_feature_masks
     from stages.match_graph import MIN_INLIERS
     from stages.photos import Photo
@@ -86,7 +87,7 @@ def check(photos: list[dict[str, Any]], images: str, folder: str) -> dict[str, A
     if write_feature_masks(Path(images).parent, some, masks):
         search = search._replace(masks=masks)
     extract_features(database, Path(images), some, search)
-    pairs = neighbours_by_pose(model)
+    pairs = neighbours_by_pose(camera_poses(model))
     match_pairs(database, pairs, 0, STRICT_RATIO)
     verified = int((verified_matches(database, pairs) >= MIN_INLIERS).sum())
     checked = check_model(model, database, 0) if verified >= MIN_PAIRS else None
@@ -96,17 +97,14 @@ def check(photos: list[dict[str, Any]], images: str, folder: str) -> dict[str, A
     return facts(model, checked)
 
 
-def neighbours_by_pose(model: "pycolmap.Reconstruction") -> "Pairs":
-    """Each photo with those that stand nearest and look the same way most nearly, numbered in order of image id."""
-    import numpy as np
-
-    from stages.pairing import closeness, nearest
-
-    poses = np.array([model.image(i).cam_from_world().inverse().matrix() for i in sorted(model.reg_image_ids())])
-    distance = -closeness(poses[:, :, 3])
-    usual = np.median(np.sort(distance, axis=1)[:, min(1, len(poses) - 1)])
-    turn = np.degrees(np.arccos(np.clip(poses[:, :, 2] @ poses[:, :, 2].T, -1, 1)))
-    return nearest(-(distance / max(usual, 1e-12 * distance.max(), 1e-300) + turn / TURN_DEG), PARTNERS)
+def neighbours_by_pose(world_from_camera: Float[np.ndarray, "photos 3 4"]) -> Pairs:
+    """Each photo with those that stand nearest and look the same way most nearly."""
+    centres, axes = world_from_camera[:, :, 3], world_from_camera[:, :, 2]
+    distance = -closeness(centres)
+    usual = np.median(np.sort(distance, axis=1)[:, min(1, len(centres) - 1)])
+    turn = np.degrees(np.arccos(np.clip(axes @ axes.T, -1, 1)))
+    apart = distance / usual if usual > 0 else distance
+    return nearest(-(apart + turn / TURN_DEG), PARTNERS)
 
 
 if __name__ == "__main__":

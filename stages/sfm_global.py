@@ -9,11 +9,15 @@ import json
 import shutil
 import subprocess
 import sys
+import threading
 from pathlib import Path
 from typing import NamedTuple
 
+from stages.colmap.mapping import map_globally
+from stages.colmap.models import write_native
 from stages.files import make_durable
 from stages.sfm_process import environment
+from stages.sfm_work import end_with_parent
 
 TRACKS_PER_PHOTO = 200  # of the best: enough for poses that are compared, not kept
 MIN_PHOTOS = 10  # of fewer there is no telling which of two opinions is right
@@ -48,12 +52,6 @@ def failure(started: Started) -> str | None:
 
 def main() -> None:
     """Read the job from stdin, do it."""
-    import threading
-
-    from stages.colmap.mapping import map_globally
-    from stages.colmap.models import write_native
-    from stages.sfm_child import end_with_parent
-
     job = json.loads(sys.stdin.buffer.readline())
     threading.Thread(target=end_with_parent, daemon=True).start()
     folder = Path(job["folder"])

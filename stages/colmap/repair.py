@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from stages.colmap.correspondences import read_pair_matches
 from stages.colmap.mapping import map_incrementally
@@ -37,8 +38,13 @@ def check_model(model: "pycolmap.Reconstruction", database: Path, seed: int) -> 
 
     with pycolmap.Database.open(database) as db:
         ids, matches = read_pair_matches(db, model, seed)
-    poses = np.array([model.image(i).cam_from_world().inverse().matrix() for i in ids]).reshape(-1, 3, 4)
-    return Checked(ids, matches, check_poses(matches, poses))
+    return Checked(ids, matches, check_poses(matches, camera_poses(model)))
+
+
+def camera_poses(model: "pycolmap.Reconstruction") -> Float[np.ndarray, "photos 3 4"]:
+    """World from camera of every registered photo, in order of image id."""
+    poses = [model.image(i).cam_from_world().inverse().matrix() for i in sorted(model.reg_image_ids())]
+    return np.array(poses).reshape(-1, 3, 4)
 
 
 def reasons(model: "pycolmap.Reconstruction", checked: Checked) -> dict[str, str]:

@@ -1,0 +1,89 @@
+"""From matches to a model in which every pose stands, and a second opinion. Runs in the child process of stage sfm."""
+
+import shutil
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+from stages import sfm_global
+from stages.colmap.diagnosis import compare_models
+from stages.colmap.mapping import incremental_options, map_globally, map_incrementally
+from stages.colmap.models import load_native
+from stages.colmap.repair import Checked, check_model, deregister, reasons, register_again
+from stages.colmap.thinning import thin_matches
+from stages.sfm_attempts import ATTEMPTS, Attempt, Effort
+from stages.sfm_work import Work
+
+
+def mapped(attempt: Attempt, database: Path, work: Work) -> tuple[list[Any], dict[str, str], dict[str, Any] | None]:
+    """All sub-models that come of these matches, best first; of the best one only photos whose poses stand, by name why
+    others were excluded, and how a second opinion compares."""
+    work.begin("mapping", done=0)
+    seed, lens_is_known = work.job.seed, work.job.camera_params is not None
+    models, matches = Path(work.job.folder, "models"), database
+    if work.thinned:
+        matches = work.beside("thinned")
+        thin_matches(database, matches)
+    opinion = _second_opinion(attempt, database, work)
+    effort = attempt.effort or Effort()
+    options = incremental_options(seed, effort, lens_is_known, work.thinned)
+    if attempt.effort is None:
+        found = map_globally(matches, work.images, models, seed, lens_is_known)
+    else:
+        placed = count(1)
+        found = map_incrementally(
+            matches, work.images, models, options, lambda: work.say(phase="mapping", done=next(placed))
+        )
+    shutil.rmtree(models)
+    compared, excluded = None, {}
+    if found:
+        other, compared = _compared(found[0], opinion)
+        found[0], excluded = _standing(found[0], other, database, matches, options, work)
+    work.end("mapping")
+    return found, excluded, compared
+
+
+def _second_opinion(attempt: Attempt, database: Path, work: Work) -> "sfm_global.Started | None":
+    """Global mapping begun beside the first attempt; None where it would say nothing."""
+    if attempt.name != ATTEMPTS[0].name or len(work.photos) < sfm_global.MIN_PHOTOS:
+        return None
+    matches, known = work.beside("global"), work.job.camera_params is not None
+    thin_matches(database, matches, sfm_global.TRACKS_PER_PHOTO)
+    return sfm_global.start(matches, work.images, work.journal.folder / "global", work.job.seed, known)
+
+
+def _compared(model: Any, opinion: "sfm_global.Started | None") -> tuple[Any, dict[str, Any] | None]:
+    """The model of the second opinion, None without one, and how far both agree."""
+    if opinion is None:
+        return None, None
+    if failure := sfm_global.failure(opinion):
+        return None, {"failed": failure}
+    other = load_native(opinion.folder)
+    return other, compare_models(model, other) | {"failed": None}
+
+
+def _standing(
+    model: Any, other: Any, database: Path, matches: Path, options: Any, work: Work
+) -> tuple[Any, dict[str, str]]:
+    """The model with only photos whose poses stand, and by name why others are excluded.
+
+    Photos that fail are freed and registered again, in the model of the second opinion where more photos pass in it.
+    """
+    best = model, check_model(model, database, work.job.seed)
+    if not (failed := best[1].failed()):
+        return model, {}
+    what = "contradict their verified matches" if best[1].check.misplaced.any() else "are not linked to the others"
+    work.say(note=f"{len(failed)} of {len(best[1].ids)} registered photos {what}: registering them again")
+    if other is not None:
+        best = max(best, (other, check_model(other, database, work.job.seed)), key=_passing)
+    if best[1].failed():
+        again = register_again(*best, matches, work.images, Path(work.job.folder, "again"), options)
+        best = max(best, (again, check_model(again, database, work.job.seed)), key=_passing)
+    model, checked = best
+    why = reasons(model, checked)
+    deregister(model, checked.failed())
+    return model, why
+
+
+def _passing(candidate: tuple[Any, Checked]) -> int:
+    return int(candidate[1].check.passed.sum())
