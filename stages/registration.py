@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from stages.contract import StageError
+from stages.contract import StageError, listed
 from stages.degeneracy import count_turns, epipoles_inside, expands
 from stages.masks import STILL_BACKGROUND_HINT
 from stages.sfm_attempts import FEWEST_MATCHES
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 FEWEST_REGISTERED = 3  # one to hold out, two to learn from; two views alone fit many wrong scenes
 FEWEST_POINTS = 100
 FEW_FEATURES = 50
+MOST_NAMES = 5
 SAME_VIEW_PX = 1.0
 FLAT_CONFIGS = (4, 5, 6)  # colmap TwoViewGeometry: PLANAR, PANORAMIC, PLANAR_OR_PANORAMIC
 PAIR_BASE = 2**31 - 1  # pair_id = PAIR_BASE * first image id + second image id
@@ -126,7 +127,7 @@ def account(
     models: Sequence[Sequence[str]],
     observations: Mapping[str, int],
     supports: Mapping[str, tuple[int, int]],
-    conflict: Mapping[str, int] | None,
+    conflict: Mapping[str, Any] | None,
     left_out: Mapping[str, str],
 ) -> list[dict[str, Any]]:
     """What became of each photo, for registration.json. ``models`` are the names in each sub-model, best first;
@@ -151,19 +152,21 @@ def account(
     return entries
 
 
-def _contradiction(models: Sequence[Sequence[str]], conflict: Mapping[str, int]) -> str:
+def _contradiction(models: Sequence[Sequence[str]], conflict: Mapping[str, Any]) -> str:
     shares = f"shares {conflict['shared']} with this one and puts {conflict['elsewhere']} of them elsewhere"
     return (
         f"it belongs to a group of {len(models[conflict['group']])} photos that {shares}: something looks alike there"
     )
 
 
-def repeated_structure(models: Sequence[Sequence[str]], conflict: Mapping[str, int]) -> str:
-    """What is said of two groups of photos that contradict each other, and what to do."""
-    sizes = f"two groups of {len(models[0])} and {len(models[conflict['group']])} photos"
-    where = f"share {conflict['shared']} and disagree about where {conflict['elsewhere']} of them were taken"
-    advice = "take photos that lead from one such part to the other, or mask what repeats"
-    return f"repeated structure: {sizes} {where}. Parts of the scene look alike: {advice}"
+def repeated_structure(conflict: Mapping[str, Any], name_of: Mapping[str, str]) -> str:
+    """What is said of a group of photos that contradicts the others, by the users' own names, and what to do."""
+    others, moved = ([name_of[file] for file in conflict[key]] for key in ("others", "photos"))
+    return (
+        f"repeated structure: {listed(others, MOST_NAMES)} fit only if {listed(moved, MOST_NAMES)} were taken "
+        "elsewhere, so they are left out. Parts of the scene look alike there: take photos that lead from one such part to the "
+        "other, or mask what repeats"
+    )
 
 
 def with_left_out(entries: Sequence[dict[str, Any]], photos: "Sequence[Photo]") -> list[dict[str, Any]]:

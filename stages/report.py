@@ -15,6 +15,7 @@ from tyro.conf import Suppress
 from stages.amounts import duration, short_count
 from stages.contract import Inputs, Progress, StageConfig, StageResult
 from stages.files import read_json, read_scene, read_tensors, write_json
+from stages.report_cameras import camera_report
 from stages.training_parts import PARTS_FILE
 
 if TYPE_CHECKING:
@@ -24,11 +25,12 @@ if TYPE_CHECKING:
     from nerf.scene import Scene
 
 NEEDS = ("ingest", "sfm", "normalise", "effects", "train", "evaluate", "render", "mesh", "tradeoff")
-VERSION = 6
+VERSION = 7
 RESUMES = False
 LINKS = ("report.html", "summary.json")
 
 WIDTH_LARGE, WIDTH_SMALL = 900, 420  # pixels of a picture in the page
+THUMBNAIL_PX = 160
 MOST_SMALL = 12  # further test photos shown, besides the best, the median and the worst
 
 
@@ -110,9 +112,12 @@ def summarise(results: Results) -> dict[str, Any]:
     manifests, registration, metrics = results.manifests, results.registration or {}, results.metrics or {}
     train = manifests["train"]["facts"] if "train" in manifests else {}
     mesh = manifests["mesh"]["facts"] if "mesh" in manifests else None
+    cameras = camera_report(results.registration)
     return {
         "photos": len(results.photos["photos"]) if results.photos else None,
         **{key: registration.get(key) for key in ("registered", "camera_model", "reprojection_px")},
+        "cameras_verdict": cameras.verdict,
+        "cameras_doubtful": cameras.doubtful,
         "field": results.field["kind"] if results.field else None,
         "train_seconds": train.get("train_seconds"),
         "total_seconds": round(train.get("earlier_seconds", 0.0) + sum(m["seconds"] for m in manifests.values()), 3),
@@ -159,6 +164,7 @@ def page(results: Results, summary: dict[str, Any], config: Config) -> str:
         settings=_settings(results.manifests),
         refused=results.photos["refused"] if results.photos else [],
         missing=_missing(results),
+        camera_groups=_camera_groups(results),
         lenses=_lenses(results),
         attempts=_attempts(results),
         uncertainty=_uncertainty(results),
@@ -205,6 +211,35 @@ def _missing(results: Results) -> list[dict[str, str]]:
         for image in results.registration["images"]
         if not image["registered"]
     ]
+
+
+def _camera_groups(results: Results) -> list[dict[str, Any]]:
+    """The photos that the verdict on the cameras speaks of: a title, names and pictures, how many more there are."""
+    if results.photos is None:
+        return []
+    names = {photo["file"]: photo["name"] for photo in results.photos["photos"]}
+    return [
+        {
+            "title": group.title,
+            "more": group.more,
+            "photos": [
+                {"name": names[f"images/{file}"], "picture": _thumbnail(results.inputs["ingest"] / "images" / file)}
+                for file in group.files
+            ],
+        }
+        for group in camera_report(results.registration).groups
+    ]
+
+
+def _thumbnail(path: Path) -> str | None:
+    """A small picture of a photo, None where it is not there."""
+    from PIL import Image
+
+    if not path.exists():
+        return None
+    with Image.open(path) as picture:
+        picture.thumbnail((THUMBNAIL_PX, THUMBNAIL_PX))
+        return _jpeg_uri(picture.convert("RGB"))
 
 
 def _lenses(results: Results) -> dict[str, Any]:

@@ -93,6 +93,8 @@ def _layout_svg(name: str, scene: "Scene", plane: tuple[int, int], xyz: "np.ndar
     from matplotlib.collections import LineCollection
     from matplotlib.patches import Rectangle
 
+    from stages.match_graph import natural_order
+
     centres = np.array([view.scene_from_camera[:, 3] for view in scene.views])[:, plane]
     low, high = np.minimum(centres.min(0), -REGION_HALF), np.maximum(centres.max(0), REGION_HALF)
     middle, half = (low + high) / 2, (high - low) / 2 + 0.06 * (high - low).max()
@@ -105,6 +107,9 @@ def _layout_svg(name: str, scene: "Scene", plane: tuple[int, int], xyz: "np.ndar
                 (-REGION_HALF, -REGION_HALF), 2 * REGION_HALF, 2 * REGION_HALF, fill=False, ec=INK, ls="--", alpha=0.6
             )
         )
+        # A jump between photos that follow each other by name is seen at once.
+        row = natural_order([view.name for view in scene.views])
+        axes.plot(*centres[row].T, color=GREY, lw=0.5, alpha=0.7, zorder=2)
         for split, colour in SPLIT_COLOURS.items():
             outlines = [_outline(scene, view, 0.1 * half.max())[:, plane] for view in scene.of_split(split)]
             axes.add_collection(LineCollection(outlines, colors=colour, lw=0.9, zorder=3))

@@ -180,7 +180,7 @@ def _reconstruct(
         names, matches, models, found["observations"], found["supports"], found["conflict"], found["left_out"]
     )
     if found["conflict"]:
-        progress.note(repeated_structure(models, found["conflict"]))
+        progress.note(repeated_structure(found["conflict"], {photo.image_name: photo.name for photo in photos}))
     _say_who_is_missing(photos, images, progress)
     result = _result(
         folder,

@@ -55,7 +55,9 @@ def links(database: Path, placed: Container[str]) -> Links:
 def find_conflict(models: "Sequence[pycolmap.Reconstruction]") -> dict[str, Any] | None:
     """The largest sub-model that shares photos with the best one (the first) and puts some of them elsewhere.
 
-    ``group`` is its number, ``shared`` how many photos both have, ``elsewhere`` how many of them it puts elsewhere.
+    ``group`` is its number, ``shared`` how many photos both have, ``elsewhere`` how many of them it puts elsewhere;
+    these are the ``photos``, and ``others`` those that it alone has. Where there are none of the latter nothing is lost
+    by it: the poses of the best model have passed the check, and the group has nothing to add.
     """
     if len(models) < 2:
         return None
@@ -69,7 +71,10 @@ def find_conflict(models: "Sequence[pycolmap.Reconstruction]") -> dict[str, Any]
         here, there = (np.array([of[name] for name in shared]) for of in (best, poses))
         apart = elsewhere(here, there, extent)
         if apart.sum() >= max(FEWEST_ELSEWHERE, SHARE_ELSEWHERE * len(shared)):
-            return {"group": group, "shared": len(shared), "elsewhere": int(apart.sum())}
+            others = sorted(poses.keys() - best.keys())
+            moved = [name for name, far in zip(shared, apart, strict=True) if far]
+            found = {"group": group, "shared": len(shared), "elsewhere": len(moved), "photos": moved, "others": others}
+            return found if others else None
     return None
 
 

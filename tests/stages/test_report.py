@@ -55,6 +55,8 @@ def test_summary_has_exactly_the_promised_keys(inputs: dict[str, Path], tmp_path
         "registered": 24,
         "camera_model": "OPENCV",
         "reprojection_px": 0.61,
+        "cameras_verdict": None,
+        "cameras_doubtful": False,
         "field": "paper",
         "train_seconds": 183.3,
         "total_seconds": pytest.approx(58.2 + 181.7 + 60.1 + 4 * 2.5),
