@@ -21,7 +21,10 @@ from stages.match_graph import connected, weak_cuts
 MEDIAN_VARIANCE = np.pi / 2  # of a median, over that of a mean
 # A pair agrees with the poses where half of its matches lie nearer to their predictions than this: so many times the
 # usual distance, which is noise, and never less than a fraction of a pixel nor more than verification lets through.
+# It contradicts them where they lie CLEARLY farther off: a photo that few points hold may be off a little.
 TOLERANCE, MIN_TOLERANCE_PX, MAX_TOLERANCE_PX = 3.0, 0.6, 4.0
+CLEARLY = 2.0
+MIN_WITNESS = 30  # matches of a pair that may contradict: verification lets chance pass with half as many
 CLOSEST = 1e-3  # of its distance to the other photo: nearer a point cannot be to a photo that sees it
 ROUNDS = 12  # of acquittal, which goes from neighbour to neighbour
 MIN_BUNDLE = 60  # agreeing matches across: twice what mapping asks of a single photo
@@ -129,11 +132,13 @@ def _median_of_others(
 
 
 class PoseCheck(NamedTuple):
-    """What verified pairs say of poses. ``pair_error_px``: each pair's median transfer error, NaN of too few matches;
-    a pair ``agrees`` if it is within ``tolerance_px``. ``misplaced``: photos that more matches contradict than support,
-    alone or as a group; ``unlinked``: photos or groups that no pair links to the rest, so that nothing supports where
-    they are. ``votes_for`` and ``votes_against`` are matches of each photo with those that are neither,
-    ``photo_error_px`` the median over its pairs with them, by matches (NaN without). ``usual_px`` is that of all pairs.
+    """What verified pairs say of poses.
+
+    ``pair_error_px`` is each pair's median transfer error, NaN of too few matches, and ``usual_px`` that of all. A pair
+    ``agrees`` if it is within ``tolerance_px``, and ``contradicts`` if it is clearly beyond. ``misplaced`` are photos
+    that more matches contradict than support, alone or as a group; ``unlinked`` are photos or groups that no pair links
+    to the rest, so that nothing supports where they are. ``votes_for`` and ``votes_against`` are matches of each photo
+    with those that are neither, ``photo_error_px`` the median over its pairs with them (NaN without).
     """
 
     pair_error_px: Float[np.ndarray, "pairs"]
@@ -175,7 +180,8 @@ def check_poses(matches: PairMatches, world_from_camera: Float[np.ndarray, "phot
         if not acquitted.any():
             break
         misplaced &= ~acquitted
-    unlinked = ~misplaced & (connected(np.where(misplaced[:, None] | misplaced[None], 0, support) > 0) > 0)
+    held = _matrix(matches, error <= CLEARLY * tolerance, count)
+    unlinked = ~misplaced & (connected(np.where(misplaced[:, None] | misplaced[None], 0, held) > 0) > 0)
     standing = ~(misplaced | unlinked)
     return PoseCheck(
         pair_error_px=error,
@@ -183,7 +189,7 @@ def check_poses(matches: PairMatches, world_from_camera: Float[np.ndarray, "phot
         usual_px=usual,
         tolerance_px=tolerance,
         agrees=error <= tolerance,
-        contradicts=error > tolerance,
+        contradicts=_contradicts(matches, error, tolerance),
         misplaced=misplaced,
         unlinked=unlinked,
         votes_for=support[:, standing].sum(axis=1),
@@ -268,10 +274,18 @@ def _votes(
     matches: PairMatches, error_px: Float[np.ndarray, "pairs"], tolerance_px: float, count: int
 ) -> tuple[Float[np.ndarray, "photos photos"], Float[np.ndarray, "photos photos"]]:
     """The symmetric matrices of matches whose pairs agree with the poses, and of those whose pairs contradict them."""
-    both = []
-    for chosen in (error_px <= tolerance_px, error_px > tolerance_px):
-        votes = np.zeros((count, count))
-        first, second = matches.pairs[chosen].T
-        votes[first, second] = votes[second, first] = matches.weight[chosen]
-        both.append(votes)
-    return both[0], both[1]
+    agree, against = error_px <= tolerance_px, _contradicts(matches, error_px, tolerance_px)
+    return _matrix(matches, agree, count), _matrix(matches, against, count)
+
+
+def _contradicts(
+    matches: PairMatches, error_px: Float[np.ndarray, "pairs"], tolerance_px: float
+) -> Bool[np.ndarray, "pairs"]:
+    return (error_px > CLEARLY * tolerance_px) & (matches.weight >= MIN_WITNESS)
+
+
+def _matrix(matches: PairMatches, chosen: Bool[np.ndarray, "pairs"], count: int) -> Float[np.ndarray, "photos photos"]:
+    votes = np.zeros((count, count))
+    first, second = matches.pairs[chosen].T
+    votes[first, second] = votes[second, first] = matches.weight[chosen]
+    return votes

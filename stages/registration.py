@@ -164,8 +164,8 @@ def repeated_structure(conflict: Mapping[str, Any], name_of: Mapping[str, str]) 
     others, moved = ([name_of[file] for file in conflict[key]] for key in ("others", "photos"))
     return (
         f"repeated structure: {listed(others, MOST_NAMES)} fit only if {listed(moved, MOST_NAMES)} were taken "
-        "elsewhere, so they are left out. Parts of the scene look alike there: take photos that lead from one such part to the "
-        "other, or mask what repeats"
+        "elsewhere, so they are left out. Parts of the scene look alike there: take photos that lead from one such "
+        "part to the other, or mask what repeats"
     )
 
 
