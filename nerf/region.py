@@ -19,7 +19,7 @@ CONVERGENT_DEG = 30.0  # four fifths of the axes within this of the direction to
 LEAST_WIDTH = 0.5  # of what the photos see at the focus; textured spots may be small, the object around them is not
 FORWARD_REACH = 3.0  # the farthest depth the cube takes in, in median depths; beyond, detail is below a pixel's
 INSIDE_REACH = 2.0  # likewise around a camera that looks outward
-FAR_CAMERA = 5.0  # a camera so many times as far from the cameras' middle as is usual does not count
+FAR_CAMERA = 5.0  # a camera so many times as far from the cameras' middle as is usual does not count, nor what it sees
 CORE, WHOLE = 0.95, 0.999  # shares of the observations that the cube should hold, and that are the whole scene
 CARVED = 48  # points along an edge of the cube that is carved
 MOST_CARVING = 200  # photos that carve it; more tell no more
@@ -127,7 +127,7 @@ def _around(scene: Reconstruction) -> Region:
     width = distance * float(np.median(_half_widths(scene)))
     if not len(scene.point):
         return Region(centre, width)
-    half = float(np.quantile(_reach(scene, centre), CORE))
+    half = float(np.quantile(_reach(scene, centre)[_near_by(scene)[scene.view]], CORE))
     return Region(centre, min(max(half, LEAST_WIDTH * width), distance))
 
 
@@ -168,7 +168,7 @@ def _forward(scene: Reconstruction) -> Region:
 def _depth_extent(scene: Reconstruction) -> tuple[float, float]:
     """The depths between which photos that face one way show something."""
     if len(scene.point):
-        depths = scene.distances()
+        depths = scene.distances()[_near_by(scene)[scene.view]]
         near, far = np.quantile(depths, [1 - CORE, CORE])
         return float(near), float(min(far, FORWARD_REACH * np.median(depths)))
     spread = float(np.median(np.linalg.norm(scene.centres - spatial_median(scene.centres), axis=1)))
@@ -186,7 +186,8 @@ def _inside(scene: Reconstruction) -> Region:
     if not len(scene.point):
         return Region(middle, 3 * float(np.quantile(spread, 0.9)))
     reach = INSIDE_REACH * np.median(scene.distances())
-    points = np.quantile(scene.points[scene.point], [(1 - CORE) / 2, (1 + CORE) / 2], axis=0)
+    seen = scene.points[scene.point[_near_by(scene)[scene.view]]]
+    points = np.quantile(seen, [(1 - CORE) / 2, (1 + CORE) / 2], axis=0)
     low = np.minimum(low, np.maximum(points[0], low - reach))
     high = np.maximum(high, np.minimum(points[1], high + reach))
     return Region((low + high) / 2, float((high - low).max() / 2))

@@ -192,6 +192,7 @@ def measure(images: str, photos: list[dict[str, Any]], max_image_size: int, max_
     from stages.colmap.mapping import MAPPING_MODEL
     from stages.colmap.matching import (
         STRICT_RATIO,
+        Features,
         Search,
         extract_features,
         fill_database,
@@ -211,7 +212,7 @@ def measure(images: str, photos: list[dict[str, Any]], max_image_size: int, max_
         extract_features(database, Path(images), some, Search(max_image_size, max_features))
         extracted = time.monotonic()
         words = read_vocabulary(database, len(some), 0, CELLS) if indexed else None
-        match_pairs(database, pairs, 0, STRICT_RATIO, words=words)
+        match_pairs(database, pairs, 0, STRICT_RATIO, features=Features(words))
         return Cost((extracted - started) / len(some), (time.monotonic() - extracted) / len(pairs))
 
 

@@ -15,7 +15,7 @@ from tyro.conf import Suppress
 from stages.amounts import duration, short_count
 from stages.contract import Inputs, Progress, StageConfig, StageResult
 from stages.files import read_json, read_scene, read_tensors, write_json
-from stages.report_cameras import camera_report
+from stages.report_cameras import attempts, camera_models, camera_report, missing, uncertainty
 from stages.training_parts import PARTS_FILE
 
 if TYPE_CHECKING:
@@ -153,6 +153,7 @@ def page(results: Results, summary: dict[str, Any], config: Config) -> str:
     )
     words = {"duration": duration, "short": short_count, "thousands": "{:,}".format, "value": _value, "quoted": quoted}
     environment.filters |= words
+    names = {photo["file"]: photo["name"] for photo in results.photos["photos"]} if results.photos else {}
     return environment.get_template("report.html.j2").render(
         workspace=_workspace(results.inputs),
         summary=summary,
@@ -163,11 +164,11 @@ def page(results: Results, summary: dict[str, Any], config: Config) -> str:
         expected={} if config.budget else summary["expected_seconds"],
         settings=_settings(results.manifests),
         refused=results.photos["refused"] if results.photos else [],
-        missing=_missing(results),
-        camera_groups=_camera_groups(results),
-        lenses=_lenses(results),
-        attempts=_attempts(results),
-        uncertainty=_uncertainty(results),
+        missing=missing(results.registration, names),
+        camera_groups=_camera_groups(results, names),
+        lenses=camera_models(results.registration),
+        attempts=attempts(results.registration),
+        uncertainty=uncertainty(results.registration, names),
         video=_video(results.inputs, config.video_limit_mb),
         compared=_compared(results),
         curve=_curve(results),
@@ -201,23 +202,9 @@ def _workspace(inputs: Inputs) -> str:
     return next((folder.resolve().parents[1].name for folder in inputs.values()), "")
 
 
-def _missing(results: Results) -> list[dict[str, str]]:
-    """The photos without a known camera, by their own names, and why."""
-    if results.registration is None or results.photos is None:
-        return []
-    names = {photo["file"]: photo["name"] for photo in results.photos["photos"]}
-    return [
-        {"name": names[f"images/{image['file']}"], "reason": image["reason"] or "no reason is known"}
-        for image in results.registration["images"]
-        if not image["registered"]
-    ]
-
-
-def _camera_groups(results: Results) -> list[dict[str, Any]]:
+def _camera_groups(results: Results, names: Mapping[str, str]) -> list[dict[str, Any]]:
     """The photos that the verdict on the cameras speaks of: a title, names and pictures, how many more there are."""
-    if results.photos is None:
-        return []
-    names = {photo["file"]: photo["name"] for photo in results.photos["photos"]}
+    groups = camera_report(results.registration).groups if names else []
     return [
         {
             "title": group.title,
@@ -227,7 +214,7 @@ def _camera_groups(results: Results) -> list[dict[str, Any]]:
                 for file in group.files
             ],
         }
-        for group in camera_report(results.registration).groups
+        for group in groups
     ]
 
 
@@ -240,50 +227,6 @@ def _thumbnail(path: Path) -> str | None:
     with Image.open(path) as picture:
         picture.thumbnail((THUMBNAIL_PX, THUMBNAIL_PX))
         return _jpeg_uri(picture.convert("RGB"))
-
-
-def _lenses(results: Results) -> dict[str, Any]:
-    """The comparison of camera models in stage sfm."""
-    from stages.colmap.held_out import NOISE_MULTIPLES
-
-    rows = (results.registration or {}).get("camera_models", [])
-    chosen = [f"{row['model']}, principal point {row['principal_point']}" for row in rows if row["chosen"]]
-    return {
-        "rows": rows,
-        "several": len({row["group"] for row in rows}) > 1,
-        "multiples": f"{NOISE_MULTIPLES:g}",
-        "summary": f"Camera model: {'; '.join(dict.fromkeys(chosen)) or 'no candidate would do'}",
-    }
-
-
-def _attempts(results: Results) -> list[dict[str, Any]]:
-    """What stage sfm tried and what became of it in words (``outcome``); empty where the first attempt did it all."""
-    rows = (results.registration or {}).get("attempts", [])
-    kept = next((row for row in rows if row["kept"]), None)
-    return [row | {"outcome": _outcome(row, kept)} for row in rows] if len(rows) > 1 else []
-
-
-def _outcome(row: dict[str, Any], kept: dict[str, Any] | None) -> str:
-    if row["kept"] or row["passed"] is not None:
-        return "kept" if row["kept"] else f"not made: {row['passed']}"
-    if not row["registered"] or kept is None:
-        return "no model"
-    for fact, words in (("registered", "fewer photos"), ("points", "fewer points")):
-        if row[fact] != kept[fact]:
-            return words
-    return "a larger error" if row["reprojection_px"] > kept["reprojection_px"] else "no better"
-
-
-def _uncertainty(results: Results) -> dict[str, Any] | None:
-    """How well poses are known, of the median and the worst photo."""
-    if results.registration is None or results.photos is None:
-        return None
-    names = {photo["file"]: photo["name"] for photo in results.photos["photos"]}
-    known = [(i["uncertainty_px"], i["file"]) for i in results.registration["images"] if i.get("uncertainty_px")]
-    if not known:
-        return None
-    most, file = max(known)
-    return {"median": sorted(known)[len(known) // 2][0], "most": most, "worst": names[f"images/{file}"]}
 
 
 def _video(inputs: Inputs, limit_mb: float) -> str | None:

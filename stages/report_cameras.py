@@ -96,3 +96,60 @@ def _agreement(check: Mapping[str, Any], opinion: Mapping[str, Any] | None) -> s
 
 def _group(title: str, files: Sequence[str]) -> PhotoGroup:
     return PhotoGroup(title, list(files[:MAX_SHOWN]), max(0, len(files) - MAX_SHOWN))
+
+
+# --- how they were found
+
+
+def missing(registration: Mapping[str, Any] | None, name_of: Mapping[str, str]) -> list[dict[str, str]]:
+    """The photos without a known camera, by their own names, and why."""
+    if registration is None or not name_of:
+        return []
+    return [
+        {"name": name_of[f"images/{image['file']}"], "reason": image["reason"] or "no reason is known"}
+        for image in registration["images"]
+        if not image["registered"]
+    ]
+
+
+def camera_models(registration: Mapping[str, Any] | None) -> dict[str, Any]:
+    """The comparison of camera models in stage sfm."""
+    from stages.colmap.held_out import NOISE_MULTIPLES
+
+    rows = (registration or {}).get("camera_models", [])
+    chosen = [f"{row['model']}, principal point {row['principal_point']}" for row in rows if row["chosen"]]
+    return {
+        "rows": rows,
+        "several": len({row["group"] for row in rows}) > 1,
+        "multiples": f"{NOISE_MULTIPLES:g}",
+        "summary": f"Camera model: {'; '.join(dict.fromkeys(chosen)) or 'no candidate would do'}",
+    }
+
+
+def attempts(registration: Mapping[str, Any] | None) -> list[dict[str, Any]]:
+    """What stage sfm tried and what became of it in words (``outcome``); empty where the first attempt did it all."""
+    rows = (registration or {}).get("attempts", [])
+    kept = next((row for row in rows if row["kept"]), None)
+    return [row | {"outcome": _outcome(row, kept)} for row in rows] if len(rows) > 1 else []
+
+
+def _outcome(row: dict[str, Any], kept: dict[str, Any] | None) -> str:
+    if row["kept"] or row["passed"] is not None:
+        return "kept" if row["kept"] else f"not made: {row['passed']}"
+    if not row["registered"] or kept is None:
+        return "no model"
+    for fact, words in (("registered", "fewer photos"), ("points", "fewer points")):
+        if row[fact] != kept[fact]:
+            return words
+    return "a larger error" if row["reprojection_px"] > kept["reprojection_px"] else "no better"
+
+
+def uncertainty(registration: Mapping[str, Any] | None, name_of: Mapping[str, str]) -> dict[str, Any] | None:
+    """How well poses are known, of the median and the worst photo."""
+    if registration is None or not name_of:
+        return None
+    known = [(i["uncertainty_px"], i["file"]) for i in registration["images"] if i.get("uncertainty_px")]
+    if not known:
+        return None
+    most, file = max(known)
+    return {"median": sorted(known)[len(known) // 2][0], "most": most, "worst": name_of[f"images/{file}"]}

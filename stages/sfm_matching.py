@@ -118,5 +118,5 @@ def _match(database: Path, pairs: Pairs, max_ratio: float, work: Work) -> None:
     expected = expected_pairs(work.job.matcher, len(work.photos), work.job.neighbours)
     work.begin("matching", database=str(database), pairs=max(len(pairs), expected))
     exact = work.job.matcher == "exhaustive" or max_ratio != STRICT_RATIO
-    match_pairs(database, pairs, work.job.seed, max_ratio, expect, None if exact else work.words)
+    match_pairs(database, pairs, work.job.seed, max_ratio, expect, None if exact else work.features(database))
     work.end("matching")

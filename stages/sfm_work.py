@@ -9,11 +9,11 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from stages.colmap.matching import hold_open, look_alike, read_vocabulary
+from stages.colmap.matching import Features, hold_open, look_alike, read_vocabulary
 from stages.pairing import MAX_EXHAUSTIVE, Likeness
 from stages.photos import Photo
 from stages.registration import FEWEST_POINTS, FEWEST_REGISTERED
-from stages.retrieval import CELLS, Words
+from stages.retrieval import CELLS
 from stages.sfm import Matcher
 from stages.sfm_attempts import ATTEMPTS, GIVEN, GIVEN_UP, Journal, Tried
 from stages.sfm_clock import NAME as CLOCK
@@ -58,6 +58,7 @@ class Work:
         self.clock, self.started = Clock(self.journal.folder / CLOCK), time.monotonic()
         self.attempt = ATTEMPTS[0].name
         self.seconds: dict[str, float] = {}  # of this attempt's phases
+        self._features: tuple[Path, Features] | None = None
         # Where pairs were chosen there are matches in plenty: mapping works on the best of them.
         self.thinned = len(self.photos) > MAX_EXHAUSTIVE
 
@@ -79,10 +80,12 @@ class Work:
         limit = min(limits, key=limits.__getitem__)
         return self.started + limits[limit] - time.monotonic(), limit
 
-    @cached_property
-    def words(self) -> Words:
-        """The vocabulary that features are matched by, of those that the first attempt found."""
-        return read_vocabulary(self.database, len(self.photos), self.job.seed, CELLS)
+    def features(self, database: Path) -> Features:
+        """How the features of a database are compared where pairs are chosen; kept from one round to the next."""
+        if self._features is None or self._features[0] != database:
+            words = read_vocabulary(self.database, len(self.photos), self.job.seed, CELLS)
+            self._features = database, Features(words)
+        return self._features[1]
 
     @cached_property
     def similarity(self) -> Likeness:

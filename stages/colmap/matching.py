@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Container, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from functools import lru_cache, partial
+from functools import partial
 from itertools import combinations, product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -168,31 +168,36 @@ def match_pairs(
     seed: int,
     max_ratio: float,
     on_expected: Callable[[int, float], None] = lambda left, seconds: None,
-    words: Words | None = None,
+    features: "Features | None" = None,
 ) -> None:
     """Match and verify these pairs of photos (numbered from 0) where that has not been done yet.
 
-    ``max_ratio`` is Lowe's: the best match must be nearer than this share of the second best. With ``words``, a
-    vocabulary of these photos, features are compared by them, which takes a fifth of the time and misses two matches
-    in a hundred. ``on_expected`` is told how many pairs there are to match and how long it will take, once a first
-    block, spread over all, is done.
+    ``max_ratio`` is Lowe's: the best match must be nearer than this share of the second best. ``features`` says how
+    features are compared, exactly without it, and keeps those that were read for further calls. ``on_expected`` is
+    told how many pairs there are to match and how long it will take, once a first block, spread over all, is done.
     """
     import pycolmap
 
     options = _verification(seed)
     with pycolmap.Database.open(database) as db, ThreadPoolExecutor(processors()) as pool:
         todo = _spread([(i, j) for i, j in pairs.tolist() if not db.exists_two_view_geometry(i + 1, j + 1)])
-        photo = lru_cache(CACHED_PHOTOS)(partial(_read_photo, db, words=words))
-        for begin in range(0, len(todo), BLOCK_SIZE):
-            block = todo[begin : begin + BLOCK_SIZE]
-            started = time.monotonic()
-            work = [pool.submit(_match, photo(i), photo(j), max_ratio, options) for i, j in block]
+        photo = partial((features or Features()).read, db)
+        blocks = [todo[begin : begin + BLOCK_SIZE] for begin in range(0, len(todo), BLOCK_SIZE)]
+        started, work = time.monotonic(), []
+        for number in range(len(blocks) + 1):
+            ahead = [
+                pool.submit(_match, photo(i), photo(j), max_ratio, options)
+                for i, j in (blocks[number] if number < len(blocks) else [])
+            ]  # at work while those before are written
             with pycolmap.DatabaseTransaction(db):
-                for (i, j), (matches, geometry) in zip(block, (each.result() for each in work), strict=True):
+                for (i, j), (matches, geometry) in zip(
+                    blocks[number - 1] if number else [], (each.result() for each in work), strict=True
+                ):
                     db.write_matches(i + 1, j + 1, matches)
                     db.write_two_view_geometry(i + 1, j + 1, geometry)
-            if not begin:
-                on_expected(len(todo), (time.monotonic() - started) * len(todo) / len(block))
+            work = ahead
+            if number == 1:
+                on_expected(len(todo), (time.monotonic() - started) * len(todo) / len(blocks[0]))
 
 
 def _spread(pairs: list[tuple[int, int]]) -> list[tuple[int, int]]:
@@ -209,11 +214,27 @@ class _Photo(NamedTuple):
     features: Any  # descriptors, (keypoints, 128) bytes, or IndexedFeatures of them
 
 
-def _read_photo(db: "pycolmap.Database", photo: int, words: Words | None = None) -> _Photo:
-    camera = db.read_camera(db.read_image(photo + 1).camera_id)
-    keypoints = np.array(db.read_keypoints(photo + 1), float).reshape(-1, 6)
-    descriptors = read_descriptors(db, photo)
-    return _Photo(camera, keypoints[:, :2], descriptors if words is None else index_features(descriptors, words))
+class Features:
+    """Photos' features as they are compared: exactly, or with ``words`` by an inverted file, which takes a fifth of the
+    time and misses two matches in a hundred. The latest CACHED_PHOTOS are kept."""
+
+    def __init__(self, words: Words | None = None) -> None:
+        self._words = words
+        self._photos: dict[int, _Photo] = {}
+
+    def read(self, db: "pycolmap.Database", photo: int) -> _Photo:
+        """Those of the photo with this number."""
+        if (found := self._photos.pop(photo, None)) is None:
+            camera = db.read_camera(db.read_image(photo + 1).camera_id)
+            keypoints = np.array(db.read_keypoints(photo + 1), float).reshape(-1, 6)
+            features: Any = read_descriptors(db, photo)
+            if self._words is not None:
+                features = index_features(features, self._words)
+            found = _Photo(camera, keypoints[:, :2], features)
+        self._photos[photo] = found  # the latest last
+        if len(self._photos) > CACHED_PHOTOS:
+            del self._photos[next(iter(self._photos))]
+        return found
 
 
 def read_vocabulary(database: Path, count: int, seed: int, words: int) -> Words:
@@ -315,7 +336,7 @@ def copy_as_fisheye(database: Path, copy: Path, seed: int) -> None:
             lens = pycolmap.Camera.create_from_model_name(camera.camera_id, FISHEYE_MODEL, focal_px, *size)
             lens.has_prior_focal_length = True
             db.update_camera(lens)
-        photo = lru_cache(CACHED_PHOTOS)(partial(_read_photo, db))
+        photo = partial(Features().read, db)
         for pair_id, matches in zip(*db.read_all_matches(), strict=True):
             first, second = pycolmap.pair_id_to_image_pair(pair_id)
             geometry = _verified(photo(first - 1), photo(second - 1), np.asarray(matches, np.uint32), options)
