@@ -52,7 +52,8 @@ def incremental_options(
     options.mapper.init_min_num_inliers = effort.matches
     options.mapper.init_min_tri_angle = effort.angle_deg
     options.mapper.init_max_forward_motion = effort.forward_motion
-    options.structure_less_registration_fallback = effort.without_structure
+    # Thinned photos have points enough; those that lack them have false matches, on which this takes minutes.
+    options.structure_less_registration_fallback = effort.without_structure and not thinned
     options.mapper.abs_pose_min_num_inliers = FEWEST_MATCHES
     if lens_is_known:
         options.ba_refine_focal_length = options.ba_refine_extra_params = False

@@ -1,0 +1,143 @@
+"""How many deliberately moved photos the check of poses finds, and how many good ones it blames.
+
+    python -m benchmarks.geometry_check WORKSPACE [--moved 200] [--out FILE.json]
+
+WORKSPACE has a finished stage sfm whose cameras are right. Its photos are matched anew (the database is not kept), and
+groups of 1 to 20 neighbours in the order of names are turned by 2 to 30 degrees or shifted by 5 to 500 % of the usual
+step, until so many photos were moved. What moves points by less than twice the tolerance in the photo is below the
+noise and counted apart.
+"""
+
+import argparse
+import json
+import platform
+import subprocess
+import tempfile
+from collections.abc import Sequence
+from datetime import date
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stages.colmap.mapping import MAPPING_MODEL
+from stages.colmap.matching import (
+    STRICT_RATIO,
+    Features,
+    Search,
+    extract_features,
+    fill_database,
+    look_alike,
+    match_pairs,
+    read_vocabulary,
+)
+from stages.colmap.models import load_native
+from stages.colmap.repair import Checked, camera_poses, check_model
+from stages.geometry_check import CLEARLY, check_poses
+from stages.match_graph import in_order, natural_order
+from stages.pairing import nearest, union
+from stages.photos import read_photos
+from stages.retrieval import CELLS
+
+SIZES = (1, 1, 1, 2, 3, 5, 10, 20)
+
+
+class Move(NamedTuple):
+    """A group that was moved: how, how many photos, by how many pixels at the usual depth, how many were found, and how
+    many others were blamed."""
+
+    kind: str
+    photos: int
+    pixels: float
+    found: int
+    blamed: int
+
+
+def main() -> None:
+    """Move, check, count."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("workspace", type=Path)
+    parser.add_argument("--moved", type=int, default=200)
+    parser.add_argument("--out", type=Path)
+    asked = parser.parse_args()
+    ingest, sfm = (next((asked.workspace / stage).glob("*[0-9a-f]")) for stage in ("ingest", "sfm"))
+    checked, poses, depth, names = right_model(ingest, sfm / "sparse")
+    print(f"{len(names)} photos, {len(checked.matches.pairs)} pairs, tolerance {checked.check.tolerance_px:.2f} px; ")
+    print(f"unmoved: {int((~checked.check.passed).sum())} blamed")
+    moves = [*moved(checked, poses, depth, natural_order(names), asked.moved)]
+    floor = CLEARLY * checked.check.tolerance_px
+    above = [move for move in moves if move.pixels >= floor]
+    photos, found = sum(move.photos for move in above), sum(move.found for move in above)
+    others = sum(len(names) - move.photos for move in moves)
+    facts = {
+        "command": f"python -m benchmarks.geometry_check {asked.workspace.name} --moved {asked.moved}",
+        "date": str(date.today()),
+        "machine": platform.processor() or platform.machine(),
+        "commit": subprocess.run(
+            ["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=True
+        ).stdout.strip(),
+        "photos": len(names),
+        "noise_floor_px": floor,
+        "moved_above_noise": photos,
+        "found": found / max(1, photos),
+        "moved_below_noise": sum(move.photos for move in moves) - photos,
+        "blamed": sum(move.blamed for move in moves) / others,
+        "moves": [move._asdict() for move in moves],
+    }
+    print({name: value for name, value in facts.items() if name != "moves"})
+    if asked.out:
+        asked.out.write_text(json.dumps(facts, indent=1) + "\n")
+
+
+def right_model(ingest: Path, sparse: Path) -> tuple[Checked, np.ndarray, float, list[str]]:
+    """The check of the model as it is, poses, usual depth of points and names of its photos."""
+    model = load_native(sparse)
+    registered = {model.image(i).name for i in model.reg_image_ids()}
+    photos = sorted((p for p in read_photos(ingest) if not p.near_duplicate_of), key=lambda photo: photo.file)
+    assert {photo.image_name for photo in photos} == registered, "all photos have to be registered"
+    with tempfile.TemporaryDirectory() as scratch:
+        database = Path(scratch, "matches.db")
+        fill_database(database, photos, MAPPING_MODEL)
+        extract_features(database, ingest / "images", photos, Search(1600, 4096))
+        order = natural_order([photo.name for photo in photos])
+        pairs = union(in_order(order, 1, 5), nearest(look_alike(database, len(photos), 0), 10))
+        features = Features(read_vocabulary(database, len(photos), 0, CELLS))
+        match_pairs(database, pairs, 0, STRICT_RATIO, features=features)
+        checked = check_model(model, database, 0)
+    poses = camera_poses(model)
+    points = np.array([model.point3D(i).xyz for i in sorted(model.point3D_ids())[::20]])
+    depth = float(np.median(np.linalg.norm(points[:, None] - poses[None, :, :, 3], axis=2)))
+    return checked, poses, depth, [photo.name for photo in photos]
+
+
+def moved(checked: Checked, poses: np.ndarray, depth: float, order: np.ndarray, count: int) -> "Sequence[Move]":
+    """Groups moved one after the other, until so many photos were."""
+    random, moves = np.random.default_rng(0), []
+    step = float(np.median(np.linalg.norm(np.diff(poses[order, :, 3], axis=0), axis=1)))
+    focal = float(np.median(checked.matches.focal_px))
+    while sum(move.photos for move in moves) < count:
+        size = min(int(random.choice(SIZES)), len(poses) // 4)
+        begin = int(random.integers(len(poses) - size + 1))
+        group = order[begin : begin + size]
+        axis = random.normal(size=3)
+        axis /= np.linalg.norm(axis)
+        wrong = poses.copy()
+        if random.random() < 0.5:
+            kind, degrees = "turn", float(np.exp(random.uniform(np.log(2), np.log(30))))
+            turn, middle = Rotation.from_rotvec(np.radians(degrees) * axis).as_matrix(), poses[group, :, 3].mean(axis=0)
+            wrong[group, :, :3] = turn @ wrong[group, :, :3]
+            wrong[group, :, 3] = (wrong[group, :, 3] - middle) @ turn.T + middle
+            pixels = float(np.radians(degrees) * focal)
+        else:
+            kind, steps = "shift", float(np.exp(random.uniform(np.log(0.05), np.log(5))))
+            wrong[group, :, 3] += steps * step * axis
+            pixels = steps * step / depth * focal
+        failed = ~check_poses(checked.matches, wrong).passed
+        found = int(failed[group].sum())
+        moves.append(Move(kind, size, pixels, found, int(failed.sum()) - found))
+    return moves
+
+
+if __name__ == "__main__":
+    main()
