@@ -5,10 +5,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from stages.colmap.models import read_model, write_model
 from stages.contract import Progress, StageError, listed
-from stages.known_cameras import read_known_cameras
+from stages.known_cameras import KnownCameras, read_known_cameras
 from stages.photos import Photo, read_frame_names
 from stages.sfm_check import check_given_cameras
 from stages.sparse_model import SparseModel
@@ -23,18 +24,7 @@ def import_cameras(
 
     Raises StageError where they cannot be used.
     """
-    progress.update(f"reading the cameras of {cameras.name}")
-    known = read_known_cameras(cameras, photos, read_frame_names(ingest))
-    for note in known.notes:
-        progress.note(note)
-    write_model(folder / "sparse", known.model)
-    errors = read_model(folder / "sparse").error_px  # computed anew: what the given model says of them may be anything
-    if lost := int((~np.isfinite(errors)).sum()):
-        raise StageError(
-            f"the cameras of {cameras.name} do not fit its points",
-            f"{lost} of {len(errors)} points are seen where their cameras cannot see anything",
-            "Check the distortion of the cameras, or leave them out to have them found from the photos.",
-        )
+    known, errors = write_known_model(cameras, photos, ingest, folder, progress)
     check = _check_given(known.model, photos, ingest, folder, progress)
     judged = check.pop("images", {}) if check else {}
     unknown = {"agreement": None, "transfer_px": None}
@@ -54,6 +44,25 @@ def import_cameras(
         "georeference": None,
         "test_files": known.test_files,
     }
+
+
+def write_known_model(
+    cameras: Path, photos: Sequence[Photo], ingest: Path, folder: Path, progress: Progress
+) -> tuple[KnownCameras, Float[np.ndarray, "points"]]:
+    """Read the cameras and write ``sparse/``; also the reprojection errors of its points, in pixels."""
+    progress.update(f"reading the cameras of {cameras.name}")
+    known = read_known_cameras(cameras, photos, read_frame_names(ingest))
+    for note in known.notes:
+        progress.note(note)
+    write_model(folder / "sparse", known.model)
+    errors = read_model(folder / "sparse").error_px  # computed anew: what the given model says of them may be anything
+    if lost := int((~np.isfinite(errors)).sum()):
+        raise StageError(
+            f"the cameras of {cameras.name} do not fit its points",
+            f"{lost} of {len(errors)} points are seen where their cameras cannot see anything",
+            "Check the distortion of the cameras, or leave them out to have them found from the photos.",
+        )
+    return known, errors
 
 
 def _check_given(

@@ -39,7 +39,7 @@ def finish(
     seed: int,
     camera_model: str | None,
     lens_is_known: bool,
-    thinned: bool,
+    thinned: bool = False,
 ) -> Finished:
     """Choose the camera model by held-out observations, unless it is given, and adjust everything with it.
 

@@ -58,9 +58,9 @@ def _import_cameras(cameras: Path, photos: list, folder: Path) -> None:
     from nerf.normalisation import normalise
     from stages.colmap.models import read_model
     from stages.normalise import _reconstruction
-    from stages.sfm import _import
+    from stages.sfm_import import write_known_model
 
-    assert _import(cameras, photos, folder, folder / "sfm", Quiet()).outputs
+    write_known_model(cameras, photos, folder, folder / "sfm", Quiet())
     model = read_model(folder / "sfm" / "sparse")
     try:
         found = normalise(_reconstruction(model, list(range(len(model.images))), None), None)

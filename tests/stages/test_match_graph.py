@@ -98,7 +98,7 @@ def test_weak_cuts_find_groups_that_hang_by_a_thread() -> None:
     weight[6, 9] = weight[9, 6] = 5
     np.fill_diagonal(weight, 0)
     cuts = weak_cuts(weight)
-    by_side = {tuple(np.flatnonzero(side)): (edges, total) for side, edges, total in zip(*cuts, strict=True)}
+    by_side = {tuple(np.flatnonzero(side).tolist()): (edges, total) for side, edges, total in zip(*cuts, strict=True)}
     assert by_side[(8, 9, 10)] == (2, 45)
     assert by_side[(11,)] == (0, 0)
     assert all(2 * side.sum() <= 11 for side in cuts.side)

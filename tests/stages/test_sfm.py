@@ -301,8 +301,8 @@ def test_an_attempt_that_ended_the_program_is_left_out(
     folders = with_a_stranger(inputs, tmp_path / "ingest")
     crash = (
         "import sys, stages.sfm_child as c, os\n"
-        "first = c._matched\n"
-        f"c._matched = lambda a, m, w: {end} if a.name == 'looser matching' else first(a, m, w)\n"
+        "first = c.matched\n"
+        f"c.matched = lambda a, m, w: {end} if a.name == 'looser matching' else first(a, m, w)\n"
         "c.main()"
     )
     with monkeypatch.context() as patched:
@@ -324,11 +324,11 @@ def test_an_attempt_for_which_no_time_is_left_is_not_begun(
 ) -> None:
     slow = (
         "import stages.sfm_child as c\n"
-        "end = c._Work.end\n"
+        "end = c.Work.end\n"
         "def slowly(work, phase):\n"
         "    end(work, phase)\n"
         "    work.seconds[phase] += 100\n"
-        "c._Work.end = slowly\n"
+        "c.Work.end = slowly\n"
         "c.main()"
     )
     monkeypatch.setattr(sfm_process, "CHILD", ["-c", slow])

@@ -12,8 +12,8 @@ from PIL import Image
 from stages import sfm, sfm_clock, sfm_process
 from stages.contract import StageError
 from stages.sfm_attempts import GIVEN, GIVEN_UP, NO_TIME, OUT_OF_TIME, left_out_for_time
-from stages.sfm_child import Job, _Work
 from stages.sfm_clock import Clock
+from stages.sfm_work import Job, Work
 from tests.stages.sfm_inputs import SMALL, ingested
 from tests.synthetic_photos import SyntheticPhotos
 
@@ -51,11 +51,11 @@ def test_a_phase_goes_on_counting_unless_it_begins_anew(tmp_path: Path, wait: Ca
     assert (again.total, again.earlier) == (145, 111)
 
 
-def work(folder: Path, seconds: float | None, max_seconds: float) -> _Work:
+def work(folder: Path, seconds: float | None, max_seconds: float) -> Work:
     search = {"max_image_size": 800, "max_features": 500, "matcher": "exhaustive", "neighbours": 3, "attempts": 7}
     given = {"seed": 0, "camera_model": None, "camera_params": None, "seconds": seconds, "max_seconds": max_seconds}
     paths = {"folder": str(folder), "images": str(folder), "database": str(folder / "x.db")}
-    return _Work(Job(**paths, photos=[], **search, **given), lambda **message: None)
+    return Work(Job(**paths, photos=[], **search, **given), lambda **message: None)
 
 
 @pytest.mark.parametrize(
@@ -89,15 +89,15 @@ def test_a_run_that_goes_on_knows_what_the_one_before_it_took(
     pictures = sorted(synthetic_photos.folder.iterdir())[:6]
     folders = ingested(tmp_path / "ingest", {file.name: np.asarray(Image.open(file)) for file in pictures})
     killed = (
-        "import os, time, stages.sfm_child as c, stages.sfm_clock as clock\n"
+        "import os, time, stages.sfm_child as c, stages.sfm_clock as clock, stages.sfm_matching as matching\n"
         "clock.BEAT = 0.1\n"
-        "c.match_pairs = lambda *_: (time.sleep(3), os.kill(os.getpid(), 9))\n"
+        "matching.match_pairs = lambda *_: (time.sleep(3), os.kill(os.getpid(), 9))\n"
         "c.main()"
     )
     told = (
-        "import stages.sfm_child as c\n"
-        "add = c.Journal.add\n"
-        "c.Journal.add = lambda journal, tried: (print(tried.seconds, file=c.sys.stderr), add(journal, tried))\n"
+        "import stages.sfm_child as c, stages.sfm_attempts as a\n"
+        "add = a.Journal.add\n"
+        "a.Journal.add = lambda journal, tried: (print(tried.seconds, file=c.sys.stderr), add(journal, tried))\n"
         "c.main()"
     )
     with monkeypatch.context() as patched:
