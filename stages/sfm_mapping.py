@@ -35,10 +35,15 @@ def mapped(attempt: Attempt, database: Path, work: Work) -> tuple[list[Any], dic
             matches, work.images, models, options, lambda: work.say(phase="mapping", done=next(placed))
         )
     shutil.rmtree(models)
-    compared, excluded = None, {}
+    excluded: dict[str, str] = {}
+    failure = sfm_global.failure(opinion) if opinion else None
+    other = load_native(opinion.folder) if opinion and not failure else None
+    compared = None if opinion is None else {"failed": failure}
     if found:
-        other, compared = _compared(found[0], opinion)
-        found[0], excluded = _standing(found[0], other, database, matches, options, work)
+        before = found[0]
+        found[0], excluded = _standing(before, other, database, matches, options, work)
+        if other is not None:  # where it was taken itself, it is compared with the one that it replaced
+            compared = compare_models(before if found[0] is other else found[0], other) | {"failed": None}
     work.end("mapping")
     return found, excluded, compared
 
@@ -50,16 +55,6 @@ def _second_opinion(attempt: Attempt, database: Path, work: Work) -> "sfm_global
     matches, known = work.beside("global"), work.job.camera_params is not None
     thin_matches(database, matches, sfm_global.TRACKS_PER_PHOTO)
     return sfm_global.start(matches, work.images, work.journal.folder / "global", work.job.seed, known)
-
-
-def _compared(model: Any, opinion: "sfm_global.Started | None") -> tuple[Any, dict[str, Any] | None]:
-    """The model of the second opinion, None without one, and how far both agree."""
-    if opinion is None:
-        return None, None
-    if failure := sfm_global.failure(opinion):
-        return None, {"failed": failure}
-    other = load_native(opinion.folder)
-    return other, compare_models(model, other) | {"failed": None}
 
 
 def _standing(
