@@ -152,6 +152,6 @@ def natural_order(names: Sequence[str]) -> Int[np.ndarray, "photos"]:
 
     def key(name: str) -> list[tuple[int, int, str]]:
         parts = re.split(r"(\d+)", name.casefold())
-        return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in parts]
+        return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts]
 
     return np.array(sorted(range(len(names)), key=lambda i: (key(names[i]), names[i])), int)

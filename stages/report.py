@@ -15,7 +15,16 @@ from tyro.conf import Suppress
 from stages.amounts import duration, short_count
 from stages.contract import Inputs, Progress, StageConfig, StageResult
 from stages.files import read_json, read_scene, read_tensors, write_json
-from stages.report_cameras import attempts, camera_models, camera_report, missing, uncertainty
+from stages.report_cameras import (
+    CameraReport,
+    attempts,
+    camera_models,
+    camera_report,
+    doubtful_files,
+    missing,
+    order_tells,
+    uncertainty,
+)
 from stages.training_parts import PARTS_FILE
 
 if TYPE_CHECKING:
@@ -25,7 +34,7 @@ if TYPE_CHECKING:
     from nerf.scene import Scene
 
 NEEDS = ("ingest", "sfm", "normalise", "effects", "train", "evaluate", "render", "mesh", "tradeoff")
-VERSION = 7
+VERSION = 8
 RESUMES = False
 LINKS = ("report.html", "summary.json")
 
@@ -83,7 +92,9 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     progress.update("writing the page")
     text = page(results, summary, config)
     (folder / "report.html").write_text(text, "utf-8", "backslashreplace")  # names of folders need not be Unicode
-    return StageResult(("report.html", "summary.json"), summary["verdict"], facts={"verdict": summary["verdict"]})
+    doubt = "The cameras are doubtful. " if summary["cameras_doubtful"] else ""
+    line = f"{doubt}{summary['verdict']}"
+    return StageResult(("report.html", "summary.json"), line, facts={"verdict": line})
 
 
 def read_results(inputs: Inputs) -> Results:
@@ -112,12 +123,12 @@ def summarise(results: Results) -> dict[str, Any]:
     manifests, registration, metrics = results.manifests, results.registration or {}, results.metrics or {}
     train = manifests["train"]["facts"] if "train" in manifests else {}
     mesh = manifests["mesh"]["facts"] if "mesh" in manifests else None
-    cameras = camera_report(results.registration)
+    cameras = _camera_report(results)
     return {
         "photos": len(results.photos["photos"]) if results.photos else None,
         **{key: registration.get(key) for key in ("registered", "camera_model", "reprojection_px")},
         "cameras_verdict": cameras.verdict,
-        "cameras_doubtful": cameras.doubtful,
+        "cameras_doubtful": cameras.doubt is not None,
         "field": results.field["kind"] if results.field else None,
         "train_seconds": train.get("train_seconds"),
         "total_seconds": round(train.get("earlier_seconds", 0.0) + sum(m["seconds"] for m in manifests.values()), 3),
@@ -128,6 +139,10 @@ def summarise(results: Results) -> dict[str, Any]:
         "mesh": mesh and {key: mesh[key] for key in ("vertices", "faces", "watertight")},
         "verdict": metrics.get("verdict", "Not measured: stage evaluate has not run."),
     }
+
+
+def _camera_report(results: Results) -> CameraReport:
+    return camera_report(results.registration, results.manifests["sfm"]["config"] if results.registration else {})
 
 
 def _expected(manifests: Mapping[str, dict[str, Any]]) -> dict[str, float]:
@@ -175,6 +190,7 @@ def page(results: Results, summary: dict[str, Any], config: Config) -> str:
         parts=parts_bar(results.parts),
         effects=effects_table(results.effects),
         study=_study(results),
+        camera_report=_camera_report(results),
         cameras=_cameras(results),
         mesh_preview=_mesh_preview(results.inputs),
         mesh_files=[name for name in results.manifests.get("mesh", {}).get("outputs", ()) if name != "preview.png"],
@@ -204,7 +220,7 @@ def _workspace(inputs: Inputs) -> str:
 
 def _camera_groups(results: Results, names: Mapping[str, str]) -> list[dict[str, Any]]:
     """The photos that the verdict on the cameras speaks of: a title, names and pictures, how many more there are."""
-    groups = camera_report(results.registration).groups if names else []
+    groups = _camera_report(results).groups if names else []
     return [
         {
             "title": group.title,
@@ -220,13 +236,16 @@ def _camera_groups(results: Results, names: Mapping[str, str]) -> list[dict[str,
 
 def _thumbnail(path: Path) -> str | None:
     """A small picture of a photo, None where it is not there."""
+    import numpy as np
     from PIL import Image
+
+    from stages.decoding import pillow
 
     if not path.exists():
         return None
-    with Image.open(path) as picture:
+    with pillow().open(path) as picture:
         picture.thumbnail((THUMBNAIL_PX, THUMBNAIL_PX))
-        return _jpeg_uri(picture.convert("RGB"))
+        return _jpeg_uri(Image.fromarray(_opaque(np.asarray(picture), 255)))
 
 
 def _video(inputs: Inputs, limit_mb: float) -> str | None:
@@ -242,16 +261,24 @@ def _mesh_preview(inputs: Inputs) -> str | None:
     return _data_uri(preview.read_bytes(), "image/png") if preview and preview.exists() else None
 
 
-def _cameras(results: Results) -> dict[str, Any]:
-    """The camera layout as SVG by the name of the view."""
+def _cameras(results: Results) -> dict[str, Any] | None:
+    """The layout of cameras that passed: ``svgs`` by the name of the view, and what a reader has to know of them."""
     from markupsafe import Markup
 
-    from stages.report_plots import camera_svgs
+    from stages.report_plots import ORDER_COLOURS, camera_svgs
 
     if results.scene is None:
-        return {}
-    points = read_tensors(results.inputs["normalise"] / "points.safetensors")
-    return {name: Markup(svg) for name, svg in camera_svgs(results.scene, points["xyz"], points["rgb"]).items()}
+        return None
+    doubtful = {f"images/{file}" for file in doubtful_files(results.registration)} if results.registration else set()
+    drawn = [view for view in results.scene.views if view.file not in doubtful] or list(results.scene.views)
+    points, joined = read_tensors(results.inputs["normalise"] / "points.safetensors"), order_tells(results.registration)
+    svgs = camera_svgs(results.scene, drawn, points["xyz"], points["rgb"], joined)
+    return {
+        "svgs": {name: Markup(svg) for name, svg in svgs.items()},
+        "joined": joined,
+        "colours": ORDER_COLOURS,
+        "undrawn": len(results.scene.views) - len(drawn),
+    }
 
 
 def _curve(results: Results) -> dict[str, Any] | None:

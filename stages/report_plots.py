@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import PurePosixPath
 from typing import TYPE_CHECKING, Any
 
 from nerf import REGION_HALF
@@ -15,10 +16,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from nerf.learning_curve import Gain
-    from nerf.scene import Scene, Split, View
+    from nerf.scene import Scene, View
 
 BLUE, ORANGE, GREY = "#3b82f6", "#f2711c", "#8a8f98"
-SPLIT_COLOURS: "dict[Split, str]" = {"train": BLUE, "test": ORANGE}
+ORDER_COLOURS = (BLUE, "#9b5de5", "#e0457b", ORANGE, "#e0a800")  # from first to last, legible on light and dark pages
 INK = "#010203"  # drawn with this and then replaced by the page's own text colour
 MOST_POINTS = 20_000
 ROOM_BELOW = 0.08  # of the curve's height, so that the name of the lowest line stands clear of the times
@@ -78,26 +79,40 @@ def _draw_baselines(axes: "Axes", baselines: dict[str, float]) -> None:
     axes.set_ylim(low - ROOM_BELOW * (high - low), high)
 
 
-def camera_svgs(scene: "Scene", xyz: "np.ndarray", rgb: "np.ndarray") -> dict[str, str]:
-    """The cameras, the sparse points (n, 3) in their colours and the region of interest, by the name of the view.
+def camera_svgs(
+    scene: "Scene", views: "Sequence[View]", xyz: "np.ndarray", rgb: "np.ndarray", joined: bool
+) -> dict[str, str]:
+    """Some ``views`` of the scene, coloured in the order of their names and ``joined`` in it or not, the sparse points
+    (n, 3) in their colours and the region of interest, by the name of the projection.
 
     Orthographic projections along z and along y: from above and from the side where the scene knows its up.
     """
-    names = ("from above", "from the side") if scene.up_known else ("along z", "along y")
-    return {name: _layout_svg(name, scene, (0, axis), xyz, rgb) for name, axis in zip(names, (1, 2), strict=True)}
-
-
-def _layout_svg(name: str, scene: "Scene", plane: tuple[int, int], xyz: "np.ndarray", rgb: "np.ndarray") -> str:
-    """One projection, on the two given axes of the scene. Points beyond the cameras and the box are cut off."""
-    import numpy as np
-    from matplotlib.collections import LineCollection
-    from matplotlib.patches import Rectangle
-
     from stages.match_graph import natural_order
 
-    centres = np.array([view.scene_from_camera[:, 3] for view in scene.views])[:, plane]
+    ordered = [views[i] for i in natural_order([view.name for view in views])]
+    names = ("from above", "from the side") if scene.up_known else ("along z", "along y")
+    return {
+        name: _layout_svg(name, scene, ordered, (0, axis), (xyz, rgb), joined)
+        for name, axis in zip(names, (1, 2), strict=True)
+    }
+
+
+def _layout_svg(
+    name: str,
+    scene: "Scene",
+    views: "Sequence[View]",
+    plane: tuple[int, int],
+    points: "tuple[np.ndarray, np.ndarray]",
+    joined: bool,
+) -> str:
+    """One projection, on the two given axes of the scene. Points beyond the cameras and the box are cut off."""
+    import numpy as np
+    from matplotlib.patches import Rectangle
+
+    centres = np.array([view.scene_from_camera[:, 3] for view in views])[:, plane]
     low, high = np.minimum(centres.min(0), -REGION_HALF), np.maximum(centres.max(0), REGION_HALF)
     middle, half = (low + high) / 2, (high - low) / 2 + 0.06 * (high - low).max()
+    xyz, rgb = points
     shown = np.linspace(0, len(xyz) - 1, min(len(xyz), MOST_POINTS)).astype(int)
     with drawing((5, min(8.0, max(1.6, 5 * half[1] / half[0]))), name) as figure:
         axes = figure.add_subplot(aspect="equal")
@@ -107,15 +122,31 @@ def _layout_svg(name: str, scene: "Scene", plane: tuple[int, int], xyz: "np.ndar
                 (-REGION_HALF, -REGION_HALF), 2 * REGION_HALF, 2 * REGION_HALF, fill=False, ec=INK, ls="--", alpha=0.6
             )
         )
-        # A jump between photos that follow each other by name is seen at once.
-        row = natural_order([view.name for view in scene.views])
-        axes.plot(*centres[row].T, color=GREY, lw=0.5, alpha=0.7, zorder=2)
-        for split, colour in SPLIT_COLOURS.items():
-            outlines = [_outline(scene, view, 0.1 * half.max())[:, plane] for view in scene.of_split(split)]
-            axes.add_collection(LineCollection(outlines, colors=colour, lw=0.9, zorder=3))
+        _draw_cameras(axes, scene, views, plane, 0.1 * half.max(), joined)
         axes.set(xlim=middle[0] + half[0] * np.array([-1, 1]), ylim=middle[1] + half[1] * np.array([-1, 1]))
         axes.set_axis_off()
         return svg_element(figure)
+
+
+def _draw_cameras(
+    axes: "Axes", scene: "Scene", views: "Sequence[View]", plane: tuple[int, int], depth: float, joined: bool
+) -> None:
+    """Outlines coloured from the first view to the last, test photos with a dot, and thin lines from each view to the
+    next in the same folder: a jump between photos that follow each other is seen at once."""
+    import numpy as np
+    from matplotlib.collections import LineCollection
+    from matplotlib.colors import LinearSegmentedColormap
+
+    colours = LinearSegmentedColormap.from_list("order", ORDER_COLOURS)(np.linspace(0, 1, len(views)))
+    centres = np.array([view.scene_from_camera[:, 3] for view in views])[:, plane]
+    folders = [PurePosixPath(view.name).parent for view in views]
+    steps = [i for i in range(1, len(views)) if joined and folders[i - 1] == folders[i]]
+    lines = [centres[i - 1 : i + 1] for i in steps]
+    axes.add_collection(LineCollection(lines, colors=colours[steps], lw=1, alpha=0.8, zorder=2))
+    outlines = [_outline(scene, view, depth)[:, plane] for view in views]
+    axes.add_collection(LineCollection(outlines, colors=colours, lw=0.9, zorder=3))
+    test = [i for i, view in enumerate(views) if view.split == "test"]
+    axes.scatter(*centres[test].T, c=colours[test], s=20, lw=0, zorder=4)
 
 
 def _outline(scene: "Scene", view: "View", depth: float) -> "np.ndarray":

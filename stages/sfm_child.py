@@ -80,6 +80,9 @@ def reconstruct(job: Job, say: Say) -> dict[str, Any]:
         say(note=note)
     model = finished.model
     checked, left_out = _last_check(model, database, work)
+    checked["doubtful"] = sorted({*checked["doubtful"], *best.excluded, *left_out} - {*_files(model)})
+    if work.thinned:  # points that mapping did not have are black until then
+        model.extract_colors_for_all_images(work.images)
     left_out = best.excluded | finished.left_out | left_out
     registered = [model.image(i) for i in sorted(model.reg_image_ids())]
     sparse = Path(job.folder, "sparse")

@@ -215,7 +215,7 @@ def test_where_the_chosen_lens_lets_many_more_observations_in_it_is_chosen_again
     few, many = photographed(PINHOLE, photos=6, points=60), photographed(PINHOLE, photos=6, points=70)
     asked = []
 
-    def adjusted(before: object, database: Path, seed: int, choice: Choice) -> object:
+    def adjusted(before: object, database: Path, seed: int, choice: Choice, thinned: bool) -> object:
         asked.append(before)
         return many
 

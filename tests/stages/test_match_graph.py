@@ -91,6 +91,10 @@ def test_numbers_in_names_count_as_numbers() -> None:
     ]
 
 
+def test_digits_that_are_no_decimals_are_letters() -> None:
+    assert natural_order(["5²3.jpg", "5²20.jpg"]).tolist() == [0, 1]
+
+
 def test_weak_cuts_find_groups_that_hang_by_a_thread() -> None:
     weight = np.zeros((12, 12))
     weight[:8, :8] = weight[8:11, 8:11] = 100

@@ -3,16 +3,21 @@
 import math
 import re
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.colors import to_rgba
 
 from nerf.learning_curve import Gain
 from nerf.scene import Camera, Scene, Similarity, View
 from stages import report_plots
 from stages.curve import coming_doubling
-from stages.report_plots import _outline, camera_svgs, curve_svg
+from stages.report_plots import ORDER_COLOURS, _outline, camera_svgs, curve_svg
 
 
 def _scene(count: int = 9) -> Scene:
@@ -45,7 +50,7 @@ def test_plots_are_well_formed_and_the_same_twice():
     rgb = np.random.default_rng(1).integers(0, 255, (500, 3))
     for draw in (
         lambda: curve_svg(_curve(), {"nearest photo": 14.2}),
-        lambda: "".join(camera_svgs(_scene(), xyz, rgb).values()),
+        lambda: "".join(camera_svgs(_scene(), _scene().views, xyz, rgb, True).values()),
     ):
         svg = draw()
         assert svg == draw() and svg is not None
@@ -55,7 +60,7 @@ def test_plots_are_well_formed_and_the_same_twice():
 
 
 def test_plots_of_one_page_share_no_identifier():
-    cameras = camera_svgs(_scene(), np.zeros((1, 3)), np.zeros((1, 3), np.uint8))
+    cameras = camera_svgs(_scene(), _scene().views, np.zeros((1, 3)), np.zeros((1, 3), np.uint8), True)
     ids = [re.findall(r'id="([^"]+)"', svg) for svg in (curve_svg(_curve(), {}) or "", *cameras.values())]
     assert all(ids)
     together = [name for plot in ids for name in plot]
@@ -98,8 +103,36 @@ def test_cameras_plot_says_which_way_is_up_only_where_it_is_known():
     scene = _scene()
     blind = Scene(scene.cameras, scene.views, scene.scene_from_sfm, True, False, "around", False)
     points = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
-    assert list(camera_svgs(scene, *points)) == ["from above", "from the side"]
-    assert list(camera_svgs(blind, *points)) == ["along z", "along y"]
+    assert list(camera_svgs(scene, scene.views, *points, True)) == ["from above", "from the side"]
+    assert list(camera_svgs(blind, scene.views, *points, True)) == ["along z", "along y"]
+
+
+def _drawn(views: Sequence[View], joined: bool, monkeypatch: pytest.MonkeyPatch) -> Axes:
+    """What is drawn of the views from above."""
+    drawn: list[Axes] = []
+    monkeypatch.setattr(report_plots, "svg_element", lambda figure: str(drawn.append(figure.axes[0])))
+    camera_svgs(_scene(), views, np.zeros((0, 3)), np.zeros((0, 3), np.uint8), joined)
+    return drawn[0]
+
+
+def test_each_camera_is_joined_to_the_next_by_name_and_has_the_colour_of_its_place(monkeypatch: pytest.MonkeyPatch):
+    by_number = [replace(view, name=f"IMG_{8 + i}.jpg") for i, view in enumerate(_scene().views)]  # 8, 9, 10, …
+    centres = np.array([view.scene_from_camera[:2, 3] for view in by_number])
+    _, joins, outlines, test = _drawn(by_number[::-1], True, monkeypatch).collections
+    assert isinstance(joins, LineCollection) and isinstance(outlines, LineCollection)
+    assert np.allclose(joins.get_segments(), np.stack([centres[:-1], centres[1:]], axis=1))
+    assert np.allclose([line[0] for line in outlines.get_segments()], centres)
+    ends = [to_rgba(ORDER_COLOURS[0]), to_rgba(ORDER_COLOURS[-1])]
+    assert np.allclose(np.asarray(outlines.get_colors())[[0, -1]], ends)
+    assert np.allclose(np.asarray(test.get_offsets()), centres[[0, 8]]), "test photos have a dot"
+
+
+def test_no_line_leads_from_folder_to_folder_nor_where_names_tell_no_order(monkeypatch: pytest.MonkeyPatch):
+    views = [replace(view, name=f"{'ab'[i // 5]}/{i}.jpg") for i, view in enumerate(_scene().views)]
+    for joined, count in ((True, 7), (False, 0)):
+        joins, outlines = _drawn(views, joined, monkeypatch).collections[1:3]
+        assert isinstance(joins, LineCollection) and isinstance(outlines, LineCollection)
+        assert (len(joins.get_segments()), len(outlines.get_segments())) == (count, 9)
 
 
 def test_a_camera_outline_starts_at_its_centre_and_opens_by_its_field_of_view():
