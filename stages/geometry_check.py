@@ -234,6 +234,33 @@ def weak_links(matches: PairMatches, check: PoseCheck) -> list[WeakLink]:
     return found
 
 
+def cut_off(
+    row: Int[np.ndarray, "photos"], matches: PairMatches, check: PoseCheck, reach: int
+) -> Bool[np.ndarray, "photos"]:
+    """Standing photos that the rest of the ``row``, in which photos were taken, leads to only through misplaced ones.
+
+    Where parts of a scene look alike, photos of one part can stand in the other: they agree there with what they see,
+    and those between the parts, which know better, are outvoted. Matches lead along the row through these, and none of
+    a photo up to ``reach`` places before them agrees with one behind: so the row falls apart, and its longest piece
+    alone can be relied on.
+    """
+    count = len(check.misplaced)
+    verified, agrees = _matrix(matches, matches.weight >= MIN_WITNESS, count) > 0, _matrix(matches, check.agrees, count)
+    leads = np.r_[True, verified[row[:-1], row[1:]]]  # to each place from the one before
+    places = np.flatnonzero(check.passed[row])
+    piece = np.zeros(len(places), int)
+    for number in range(1, len(places)):
+        before, after = places[number - 1], places[number]
+        crossing = np.ix_(row[places[max(0, number - reach) : number]], row[places[number : number + reach]])
+        led_through = after > before + 1 and check.misplaced[row[before + 1 : after]].all()
+        broken = led_through and leads[before + 1 : after + 1].all() and not agrees[crossing].any()
+        piece[number] = piece[number - 1] + broken
+    found = np.zeros(count, bool)
+    if len(places):
+        found[row[places[piece != np.bincount(piece).argmax()]]] = True
+    return found
+
+
 def _outvoted(
     support: Float[np.ndarray, "photos photos"], against: Float[np.ndarray, "photos photos"]
 ) -> Bool[np.ndarray, "photos"]:

@@ -9,9 +9,10 @@ from stages import sfm_global
 from stages.colmap.diagnosis import compare_models
 from stages.colmap.mapping import incremental_options, map_globally, map_incrementally
 from stages.colmap.models import load_native
-from stages.colmap.repair import Checked, check_model, deregister, reasons, register_again
+from stages.colmap.repair import Checked, check_model, deregister, drop_cut_off, reasons, register_again
 from stages.colmap.thinning import thin_matches
 from stages.sfm_attempts import ATTEMPTS, Attempt, Effort
+from stages.sfm_matching import row_of
 from stages.sfm_work import Work
 
 
@@ -77,6 +78,8 @@ def _standing(
     model, checked = best
     why = reasons(model, checked)
     deregister(model, checked.failed())
+    if (row := row_of(database, work)) is not None:
+        why |= drop_cut_off(model, checked, (row + 1).tolist())
     return model, why
 
 

@@ -82,8 +82,7 @@ def _match_all(database: Path, work: Work) -> dict[str, Any] | None:
     if job.matcher == "exhaustive":
         _match(database, exhaustive(count), STRICT_RATIO, work)
         return None
-    names = [photo.name for photo in work.photos]
-    order = natural_order(names) if places.time_s is None else np.argsort(places.time_s, kind="stable")
+    order = _order(work)
     pairs = union(
         start_pairs(job.matcher, job.neighbours, count, places, lambda: work.similarity), in_order(order, 1, 2)
     )
@@ -108,6 +107,18 @@ def _match_all(database: Path, work: Work) -> dict[str, Any] | None:
     helped = "photos next to each other by name or time are among them" if tells else "their order says nothing"
     work.say(note=f"{verified:,} of {len(pairs):,} tried pairs of photos verified; {helped}")
     return {"tried": len(pairs), "verified": verified, "order": tells}
+
+
+def _order(work: Work) -> np.ndarray:
+    """The photos in order of time, where it is known, else of their names."""
+    time_s = places_of(work.photos).time_s
+    return natural_order([photo.name for photo in work.photos]) if time_s is None else np.argsort(time_s, kind="stable")
+
+
+def row_of(database: Path, work: Work) -> np.ndarray | None:
+    """The photos in the order in which they were taken one after the other, None where names and times do not tell."""
+    pairs, order = matched_pairs(database), _order(work)
+    return order if order_tells(order, inlier_matrix(len(order), pairs, verified_matches(database, pairs))) else None
 
 
 def _match(database: Path, pairs: Pairs, max_ratio: float, work: Work) -> None:

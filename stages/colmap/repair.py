@@ -14,7 +14,8 @@ from jaxtyping import Float
 from stages.colmap.correspondences import read_pair_matches
 from stages.colmap.mapping import map_incrementally
 from stages.colmap.matching import unfinished_copy
-from stages.geometry_check import PairMatches, PoseCheck, check_poses, weak_links
+from stages.geometry_check import PairMatches, PoseCheck, check_poses, cut_off, weak_links
+from stages.match_graph import ORDER_OVERLAP
 
 if TYPE_CHECKING:
     import pycolmap
@@ -61,6 +62,17 @@ def reasons(model: "pycolmap.Reconstruction", checked: Checked) -> dict[str, str
         elif unlinked:
             found[model.image(image_id).name] = "no verified match supports its place among the other photos"
     return found
+
+
+def drop_cut_off(model: "pycolmap.Reconstruction", checked: Checked, row: Sequence[int]) -> dict[str, str]:
+    """Take out photos that the ``row`` (image ids) leads to only through misplaced ones: by name why."""
+    place = {image_id: number for number, image_id in enumerate(checked.ids)}
+    order = np.array([place[image_id] for image_id in row if image_id in place], int)
+    lost = cut_off(order, checked.matches, checked.check, ORDER_OVERLAP)
+    ids = [image_id for image_id, cut in zip(checked.ids, lost, strict=True) if cut]
+    why = "its place is contradicted by photos between it and the others: parts of the scene look alike"
+    deregister(model, ids)
+    return {model.image(image_id).name: why for image_id in ids}
 
 
 def facts(model: "pycolmap.Reconstruction", checked: Checked) -> dict[str, Any]:

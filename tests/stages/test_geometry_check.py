@@ -6,6 +6,7 @@ from stages.geometry_check import (
     PairMatches,
     _median_of_others,
     check_poses,
+    cut_off,
     pair_medians,
     transfer_errors_px,
     weak_links,
@@ -132,6 +133,25 @@ def test_a_single_pair_across_is_a_weak_link() -> None:
     check = check_poses(matches, poses)
     (link,) = weak_links(matches, check)
     assert check.passed.all() and link.photos == list(range(7)) and link.pairs == 1
+
+
+@pytest.mark.parametrize(
+    ("middle", "led_through", "lost"),
+    [
+        (range(10, 16), True, range(10)),
+        (range(10, 13), True, range(0)),  # matches reach over these
+        (range(10, 16), False, range(0)),  # a new row may begin there
+    ],
+)
+def test_a_row_falls_apart_where_photos_in_its_midst_stand_elsewhere(
+    middle: range, led_through: bool, lost: range
+) -> None:
+    matches, poses = walk()
+    if not led_through:
+        matches = restricted(matches, ~((matches.pairs[:, 0] <= 12) & (matches.pairs[:, 1] > 12)))
+    check = check_poses(matches, moved(poses, list(middle), 0.0, (0, 0, -5)))
+    linked = check._replace(misplaced=np.isin(np.arange(30), middle), unlinked=np.zeros(30, bool))  # as by a false loop
+    assert np.flatnonzero(cut_off(np.arange(30), matches, linked, 5)).tolist() == list(lost)
 
 
 def restricted(matches: PairMatches, kept: np.ndarray) -> PairMatches:
