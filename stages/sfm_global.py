@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 from stages.colmap.mapping import map_globally
 from stages.colmap.models import write_native
+from stages.colmap.thinning import thin_matches
 from stages.files import make_durable
 from stages.sfm_process import environment
 from stages.sfm_work import end_with_parent
@@ -31,10 +32,12 @@ class Started(NamedTuple):
     folder: Path
 
 
-def start(database: Path, images: Path, folder: Path, seed: int, lens_is_known: bool) -> Started:
-    """Begin; the caller waits with :func:`failure`. It ends with this process."""
+def start(database: Path, thinned: Path, images: Path, folder: Path, seed: int, lens_is_known: bool) -> Started:
+    """Begin with the best matches of ``database``, copied to ``thinned``; the caller waits with :func:`failure`. It ends
+    with this process."""
     shutil.rmtree(folder, ignore_errors=True)
-    job = {"database": str(database), "images": str(images), "folder": str(folder), "seed": seed}
+    paths = {"database": database, "thinned": thinned, "images": images, "folder": folder}
+    job = {name: str(path) for name, path in paths.items()} | {"seed": seed}
     process = subprocess.Popen([sys.executable, *CHILD], stdin=subprocess.PIPE, stdout=2, env=environment())
     assert process.stdin
     process.stdin.write(json.dumps(job | {"lens_is_known": lens_is_known}).encode() + b"\n")
@@ -56,7 +59,9 @@ def main() -> None:
     threading.Thread(target=end_with_parent, daemon=True).start()
     folder = Path(job["folder"])
     scratch = folder.with_name(f"{folder.name}.scratch")
-    models = map_globally(Path(job["database"]), Path(job["images"]), scratch, job["seed"], job["lens_is_known"])
+    thinned = Path(job["thinned"])
+    thin_matches(Path(job["database"]), thinned, TRACKS_PER_PHOTO)
+    models = map_globally(thinned, Path(job["images"]), scratch, job["seed"], job["lens_is_known"])
     shutil.rmtree(scratch, ignore_errors=True)
     if models:
         unfinished = folder.with_name(f"{folder.name}.unfinished")

@@ -22,10 +22,10 @@ def mapped(attempt: Attempt, database: Path, work: Work) -> tuple[list[Any], dic
     work.begin("mapping", done=0)
     seed, lens_is_known = work.job.seed, work.job.camera_params is not None
     models, matches = Path(work.job.folder, "models"), database
+    opinion = _second_opinion(attempt, database, work)
     if work.thinned:
         matches = work.beside("thinned")
         thin_matches(database, matches)
-    opinion = _second_opinion(attempt, database, work)
     effort = attempt.effort or Effort()
     options = incremental_options(seed, effort, lens_is_known, work.thinned)
     if attempt.effort is None:
@@ -53,9 +53,8 @@ def _second_opinion(attempt: Attempt, database: Path, work: Work) -> "sfm_global
     """Global mapping begun beside the first attempt; None where it would say nothing."""
     if attempt.name != ATTEMPTS[0].name or len(work.photos) < sfm_global.MIN_PHOTOS:
         return None
-    matches, known = work.beside("global"), work.job.camera_params is not None
-    thin_matches(database, matches, sfm_global.TRACKS_PER_PHOTO)
-    return sfm_global.start(matches, work.images, work.journal.folder / "global", work.job.seed, known)
+    known, folder = work.job.camera_params is not None, work.journal.folder / "global"
+    return sfm_global.start(database, work.beside("global"), work.images, folder, work.job.seed, known)
 
 
 def _standing(

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 # borders of wide photos, that is where it shows what it is worth.
 MANY_MORE = 1.1
 SIMPLEST = MODELS[0]
-CLOSING_STEPS = (4, 4)  # of the adjustment of all observations, before and after those that fit no more are dropped
+CLOSING_STEPS = (3, 3)  # of the adjustment of all observations, before and after those that fit no more are dropped
 
 
 @dataclass(frozen=True)

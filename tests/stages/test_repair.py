@@ -122,14 +122,18 @@ def test_mapping_of_thinned_matches_finds_the_same_cameras(tmp_path: Path) -> No
 def test_global_mapping_runs_beside_and_agrees(made: Made, tmp_path: Path) -> None:
     import pycolmap
 
-    started = sfm_global.start(made.database, tmp_path, tmp_path / "global", 0, lens_is_known=False)
+    started = sfm_global.start(
+        made.database, tmp_path / "thinned.db", tmp_path, tmp_path / "global", 0, lens_is_known=False
+    )
     assert sfm_global.failure(started) is None
     compared = compare_models(made.model, pycolmap.Reconstruction(tmp_path / "global"))
     assert compared["agree"] == PHOTOS and compared["centre"] < 0.02 and compared["elsewhere"] == []
 
 
 def test_what_global_mapping_dies_of_is_told(tmp_path: Path) -> None:
-    started = sfm_global.start(tmp_path / "missing.db", tmp_path, tmp_path / "global", 0, lens_is_known=False)
+    started = sfm_global.start(
+        tmp_path / "missing.db", tmp_path / "thinned.db", tmp_path, tmp_path / "global", 0, lens_is_known=False
+    )
     assert "code" in (sfm_global.failure(started) or "")
 
 
