@@ -131,9 +131,9 @@ def test_global_mapping_runs_beside_and_agrees(made: Made, tmp_path: Path) -> No
 
 
 def test_what_global_mapping_dies_of_is_told(tmp_path: Path) -> None:
-    started = sfm_global.start(
-        tmp_path / "missing.db", tmp_path / "thinned.db", tmp_path, tmp_path / "global", 0, lens_is_known=False
-    )
+    damaged = tmp_path / "damaged.db"
+    damaged.write_bytes(b"no database" * 100)
+    started = sfm_global.start(damaged, tmp_path / "thinned.db", tmp_path, tmp_path / "global", 0, lens_is_known=False)
     assert "code" in (sfm_global.failure(started) or "")
 
 
