@@ -237,7 +237,7 @@ def weak_links(matches: PairMatches, check: PoseCheck) -> list[WeakLink]:
 def cut_off(
     row: Int[np.ndarray, "photos"], matches: PairMatches, check: PoseCheck, reach: int
 ) -> Bool[np.ndarray, "photos"]:
-    """Standing photos that the rest of the ``row``, in which photos were taken, leads to only through misplaced ones.
+    """Standing photos that the rest of the ``row``, in which photos were taken, leads to only through photos that fail.
 
     Where parts of a scene look alike, photos of one part can stand in the other: they agree there with what they see,
     and those between the parts, which know better, are outvoted. Matches lead along the row through these, and none of
@@ -252,8 +252,8 @@ def cut_off(
     for number in range(1, len(places)):
         before, after = places[number - 1], places[number]
         crossing = np.ix_(row[places[max(0, number - reach) : number]], row[places[number : number + reach]])
-        led_through = after > before + 1 and check.misplaced[row[before + 1 : after]].all()
-        broken = led_through and leads[before + 1 : after + 1].all() and not agrees[crossing].any()
+        led_through = after > before + 1 and leads[before + 1 : after + 1].all()
+        broken = led_through and not agrees[crossing].any()
         piece[number] = piece[number - 1] + broken
     found = np.zeros(count, bool)
     if len(places):

@@ -33,8 +33,10 @@ class Started(NamedTuple):
 
 
 def start(database: Path, thinned: Path, images: Path, folder: Path, seed: int, lens_is_known: bool) -> Started:
-    """Begin with the best matches of ``database``, copied to ``thinned``; the caller waits with :func:`failure`. It ends
-    with this process."""
+    """Begin with the best matches of ``database``, copied to ``thinned``; the caller waits with :func:`failure`.
+
+    It ends with this process.
+    """
     shutil.rmtree(folder, ignore_errors=True)
     paths = {"database": database, "thinned": thinned, "images": images, "folder": folder}
     job = {name: str(path) for name, path in paths.items()} | {"seed": seed}

@@ -316,7 +316,7 @@ def copy_without_matches_of(names: Container[str], database: Path, copy: Path) -
             if first.name in names or second.name in names:
                 db.delete_matches(first.image_id, second.image_id)
                 db.delete_two_view_geometry(first.image_id, second.image_id)
-    unfinished.replace(copy)
+    finish_copy(unfinished, copy)
 
 
 def copy_as_fisheye(database: Path, copy: Path, seed: int) -> None:
@@ -342,7 +342,7 @@ def copy_as_fisheye(database: Path, copy: Path, seed: int) -> None:
             geometry = _verified(photo(first - 1), photo(second - 1), np.asarray(matches, np.uint32), options)
             db.delete_two_view_geometry(first, second)
             db.write_two_view_geometry(first, second, geometry)
-    unfinished.replace(copy)
+    finish_copy(unfinished, copy)
 
 
 def unfinished_copy(database: Path, copy: Path) -> Path:
@@ -353,3 +353,14 @@ def unfinished_copy(database: Path, copy: Path) -> Path:
         if (source := database.with_name(database.name + part)).exists():
             shutil.copyfile(source, unfinished.with_name(unfinished.name + part))
     return unfinished
+
+
+def finish_copy(unfinished: Path, copy: Path) -> None:
+    """Put a finished copy in its place.
+
+    The write-ahead log of an earlier copy, which a process that was killed leaves behind, would be read as if it were
+    the new one's.
+    """
+    for part in ("-wal", "-shm"):
+        copy.with_name(copy.name + part).unlink(missing_ok=True)
+    unfinished.replace(copy)

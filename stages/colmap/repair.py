@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from stages.colmap.correspondences import read_pair_matches
 from stages.colmap.mapping import map_incrementally
-from stages.colmap.matching import unfinished_copy
+from stages.colmap.matching import finish_copy, unfinished_copy
 from stages.geometry_check import PairMatches, PoseCheck, check_poses, cut_off, weak_links
 from stages.match_graph import ORDER_OVERLAP
 
@@ -65,7 +65,7 @@ def reasons(model: "pycolmap.Reconstruction", checked: Checked) -> dict[str, str
 
 
 def drop_cut_off(model: "pycolmap.Reconstruction", checked: Checked, row: Sequence[int]) -> dict[str, str]:
-    """Take out photos that the ``row`` (image ids) leads to only through misplaced ones: by name why."""
+    """Take out photos that the ``row`` (image ids) leads to only through photos that fail: by name why."""
     place = {image_id: number for number, image_id in enumerate(checked.ids)}
     order = np.array([place[image_id] for image_id in row if image_id in place], int)
     lost = cut_off(order, checked.matches, checked.check, ORDER_OVERLAP)
@@ -142,4 +142,4 @@ def copy_without_mistakes(checked: Checked, database: Path, copy: Path) -> None:
     with pycolmap.Database.open(unfinished) as db, pycolmap.DatabaseTransaction(db):
         for first, second in mistakes.tolist():
             db.delete_two_view_geometry(checked.ids[first], checked.ids[second])
-    unfinished.replace(copy)
+    finish_copy(unfinished, copy)

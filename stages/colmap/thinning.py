@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from stages.colmap.correspondences import Correspondences, read_correspondences
-from stages.colmap.matching import unfinished_copy
+from stages.colmap.matching import finish_copy, unfinished_copy
 
 if TYPE_CHECKING:
     import pycolmap
@@ -44,7 +44,7 @@ def thin_matches(database: Path, copy: Path, tracks: int = TRACKS_PER_PHOTO) -> 
             geometry.inlier_matches = np.asarray(geometry.inlier_matches)[kept[mine]].astype(np.uint32)
             db.delete_two_view_geometry(first, second)
             db.write_two_view_geometry(first, second, geometry)
-    unfinished.replace(copy)
+    finish_copy(unfinished, copy)
 
 
 def _cells(db: "pycolmap.Database", photos: int) -> Int[np.ndarray, "keypoints"]:

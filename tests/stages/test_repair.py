@@ -1,5 +1,7 @@
 """Matches and models that COLMAP makes up itself, with known poses: a check, repairs, thinned matches, two opinions."""
 
+import sqlite3
+from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -117,6 +119,21 @@ def test_mapping_of_thinned_matches_finds_the_same_cameras(tmp_path: Path) -> No
     compared = compare_models(made.model, model)
     assert compared["agree"] == PHOTOS and 0 < compared["centre"] < 0.01
     assert check_model(model, made.database, 0).check.passed.all()
+
+
+def test_the_log_of_a_copy_whose_process_was_killed_is_not_taken_for_the_next_ones(made: Made, tmp_path: Path) -> None:
+    copy, log = tmp_path / "thinned.db", tmp_path / "thinned.db-wal"
+    thin_matches(made.database, copy)
+    with closing(sqlite3.connect(copy)) as killed:
+        killed.execute("pragma journal_mode=wal")
+        killed.execute("create table left_behind as select * from matches")
+        killed.commit()
+        left = log.read_bytes()
+    log.write_bytes(left)
+    thin_matches(made.database, copy)
+    with closing(sqlite3.connect(copy)) as database:
+        assert database.execute("pragma integrity_check").fetchall() == [("ok",)]
+        assert not database.execute("select name from sqlite_master where name = 'left_behind'").fetchall()
 
 
 def test_global_mapping_runs_beside_and_agrees(made: Made, tmp_path: Path) -> None:
