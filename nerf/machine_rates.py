@@ -97,9 +97,11 @@ def _best_on_every_core(make: Callable[[], Callable[[], object]], device: torch.
     def best(_: int) -> float:
         work, until, found = make(), time.perf_counter() + seconds, list[float]()
         while len(found) < FEWEST_RUNS or time.perf_counter() < until:
-            started = clock.now()
-            work()
-            found.append(clock.now() - started)
+            started, runs, spent = clock.now(), 0, 0.0
+            while spent <= 0:  # clocks of a thread's time move in steps that may be longer than a run
+                work()
+                runs, spent = runs + 1, clock.now() - started
+            found.append(spent / runs)
         return min(found)
 
     each = list(in_order(best, range(_cores(device)), device))

@@ -261,6 +261,19 @@ def cut_off(
     return found
 
 
+def row_breaks(row: Int[np.ndarray, "photos"], matches: PairMatches, check: PoseCheck) -> list[tuple[int, int]]:
+    """Standing photos next to each other in the ``row``, in which photos were taken, whose own matches contradict where
+    they stand to each other.
+
+    Of right poses next to none: photos taken one after the other see the same. A row that goes on elsewhere, at a place
+    that looks alike, has one.
+    """
+    standing = row[check.passed[row]]
+    against = _matrix(matches, check.contradicts, len(check.misplaced)) > 0
+    steps = zip(standing[:-1].tolist(), standing[1:].tolist(), strict=True)
+    return [(first, second) for first, second in steps if against[first, second]]
+
+
 def _outvoted(
     support: Float[np.ndarray, "photos photos"], against: Float[np.ndarray, "photos photos"]
 ) -> Bool[np.ndarray, "photos"]:

@@ -77,6 +77,8 @@ def _doubts_of_check(registration: Mapping[str, Any]) -> list[str]:
         return found
     if check["agreeing"] < MIN_AGREEING * check["pairs"]:
         found.append(f"only {check['agreeing']:,} of {check['pairs']:,} verified image pairs agree with them")
+    if len(breaks := check.get("row_breaks", [])) > MAX_DOUBTFUL * photos:
+        found.append(f"{len(breaks)} times the matches of two photos taken one after the other contradict their poses")
     links = _weak_links(registration)
     weak = {file for link in links for file in link["photos"]}
     # A lone photo at the edge of many does no harm; of a group the place and size beside the rest are not sure.
@@ -149,6 +151,8 @@ def _groups(registration: Mapping[str, Any]) -> list[PhotoGroup]:
     lost = "" if registration["source"] == "import" else "Excluded: "
     groups = [(f"{lost}verified matches contradict their poses", doubtful_files(registration))]
     groups += _weak_groups(_weak_links(registration))
+    breaks = (registration.get("check") or {}).get("row_breaks", [])
+    groups.append(("The next photo by name or time contradicts where these stand", [step[0] for step in breaks]))
     groups.append(("Placed elsewhere by global mapping", opinion["elsewhere"] if _disagrees(opinion) else []))
     groups.append(("Excluded because parts of the scene look alike: these fit only …", repeated.get("others", [])))
     groups.append(("… if these were taken elsewhere", repeated.get("photos", [])))

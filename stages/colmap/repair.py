@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from stages.colmap.correspondences import read_pair_matches
 from stages.colmap.mapping import map_incrementally
 from stages.colmap.matching import finish_copy, unfinished_copy
-from stages.geometry_check import PairMatches, PoseCheck, check_poses, cut_off, weak_links
+from stages.geometry_check import PairMatches, PoseCheck, check_poses, cut_off, row_breaks, weak_links
 from stages.match_graph import ORDER_OVERLAP
 
 if TYPE_CHECKING:
@@ -66,13 +66,23 @@ def reasons(model: "pycolmap.Reconstruction", checked: Checked) -> dict[str, str
 
 def drop_cut_off(model: "pycolmap.Reconstruction", checked: Checked, row: Sequence[int]) -> dict[str, str]:
     """Take out photos that the ``row`` (image ids) leads to only through photos that fail: by name why."""
-    place = {image_id: number for number, image_id in enumerate(checked.ids)}
-    order = np.array([place[image_id] for image_id in row if image_id in place], int)
-    lost = cut_off(order, checked.matches, checked.check, ORDER_OVERLAP)
+    lost = cut_off(_places(checked, row), checked.matches, checked.check, ORDER_OVERLAP)
     ids = [image_id for image_id, cut in zip(checked.ids, lost, strict=True) if cut]
     why = "its place is contradicted by photos between it and the others: parts of the scene look alike"
     deregister(model, ids)
     return {model.image(image_id).name: why for image_id in ids}
+
+
+def broken_steps(model: "pycolmap.Reconstruction", checked: Checked, row: Sequence[int]) -> list[list[str]]:
+    """Names of photos next to each other in the ``row`` (image ids) whose own matches contradict their poses."""
+    steps = row_breaks(_places(checked, row), checked.matches, checked.check)
+    return [[model.image(checked.ids[photo]).name for photo in step] for step in steps]
+
+
+def _places(checked: Checked, row: Sequence[int]) -> Int[np.ndarray, "photos"]:
+    """The row in numbers of the check."""
+    place = {image_id: number for number, image_id in enumerate(checked.ids)}
+    return np.array([place[image_id] for image_id in row if image_id in place], int)
 
 
 def facts(model: "pycolmap.Reconstruction", checked: Checked) -> dict[str, Any]:

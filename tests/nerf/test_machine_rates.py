@@ -1,9 +1,11 @@
+import time
+
 import pytest
 import torch
 
 from nerf import machine_rates
 from nerf.machine_rates import Rates, measure_rates
-from nerf.stopwatch import Work
+from nerf.stopwatch import Stopwatch, Work
 
 CPU = torch.device("cpu")
 
@@ -17,6 +19,13 @@ def test_rates_are_those_of_a_computer_and_no_random_state_changes(monkeypatch: 
     assert torch.equal(before, torch.get_rng_state())
     for rate in rates:
         assert 1e6 < rate < 1e14
+
+
+def test_a_clock_that_moves_in_long_steps_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(machine_rates, "GATHERED", 1 << 12)
+    rate = machine_rates.measure_gather(CPU, 1 << 10, 0.2)
+    monkeypatch.setattr(Stopwatch, "now", lambda _: time.thread_time() // 0.016 * 0.016)  # as on Windows
+    assert 1 / 4 < machine_rates.measure_gather(CPU, 1 << 10, 0.2) / rate < 4
 
 
 @pytest.mark.parametrize("cores", [1, 2, 16, 256])

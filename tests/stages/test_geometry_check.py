@@ -8,6 +8,7 @@ from stages.geometry_check import (
     check_poses,
     cut_off,
     pair_medians,
+    row_breaks,
     transfer_errors_px,
     weak_links,
 )
@@ -152,6 +153,16 @@ def test_a_row_falls_apart_where_photos_in_its_midst_stand_elsewhere(
     check = check_poses(matches, moved(poses, list(middle), 0.0, (0, 0, -5)))
     linked = check._replace(misplaced=np.isin(np.arange(30), middle), unlinked=np.zeros(30, bool))  # as by a false loop
     assert np.flatnonzero(cut_off(np.arange(30), matches, linked, 5)).tolist() == list(lost)
+
+
+def test_a_step_of_the_row_that_its_own_matches_contradict_is_a_break() -> None:
+    matches, poses = walk()
+    row = np.arange(30)
+    assert row_breaks(row, matches, check_poses(matches, poses)) == []
+    elsewhere = moved(poses, list(range(12)), 0.0, (0, 0, -5))
+    trusting = check_poses(matches, elsewhere)._replace(misplaced=np.zeros(30, bool), unlinked=np.zeros(30, bool))
+    assert row_breaks(row, matches, trusting) == [(11, 12)]
+    assert row_breaks(row[::2], matches, trusting) == [(10, 12)]
 
 
 def restricted(matches: PairMatches, kept: np.ndarray) -> PairMatches:
