@@ -28,16 +28,16 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Float
-from PIL import Image
 from torch import Tensor
 
 from benchmarks.repeating_places import SETS, Poses
 from nerf.alignment import align
+from nerf.pose_distance import rotation_angles
 from nerf.scene import Camera, Similarity
 from nerf.synthetic import Solid, photograph
 from stages.colmap.cameras import camera_rays
 from stages.colmap.models import read_model
-from stages.files import read_json, write_json
+from stages.files import read_json, write_jpeg, write_json
 from stages.photos import read_photos
 
 LENS = Camera("SIMPLE_RADIAL", 480, 360, (400.0, 240.0, 180.0, -0.04))
@@ -56,13 +56,13 @@ def in_view(solids: tuple[Solid, ...], pose: Tensor, widest: float, margin: floa
     return tuple(solid for solid in solids if beyond(solid) < solid.shape.reach + margin)
 
 
-def draw(name: str, folder: Path, count: int, shuffle: bool, only: range | None = None) -> None:
-    """Write the photos that are not there yet (``only``: of these places in the walk) and truth.json beside them."""
+def draw(name: str, folder: Path, count: int, shuffle: bool) -> None:
+    """Write the photos that are not there yet, and truth.json beside them."""
     place, random = SETS[name], np.random.default_rng(0)
     poses = place.poses(count, random)
     numbers = random.permutation(count) if shuffle else np.arange(count)
     files = [f"{number:04d}.jpg" for number in numbers]
-    lens = {"model": LENS.model, "width": LENS.width, "height": LENS.height, "params": list(LENS.params)}
+    lens = vars(LENS) | {"params": list(LENS.params)}
     truth = {"camera": lens, "world_from_camera": dict(zip(files, poses.tolist(), strict=True))}
     folder.mkdir(parents=True, exist_ok=True)
     beside = folder.parent / "truth.json"
@@ -72,16 +72,16 @@ def draw(name: str, folder: Path, count: int, shuffle: bool, only: range | None 
     scene, directions = place.scene(count), torch.from_numpy(camera_rays(LENS, LENS.width, LENS.height))
     widest = math.acos(float(directions[..., 2].min()))
     begin, drawn = time.perf_counter(), 0
-    for index in only or range(count):
-        file = folder / files[index]
+    for file_name, world_from_camera in zip(files, poses, strict=True):
+        file = folder / file_name
         if file.exists():
             continue
-        pose = torch.from_numpy(poses[index]).float()
+        pose = torch.from_numpy(world_from_camera).float()
         seen = scene._replace(solids=in_view(scene.solids, pose, widest, place.shading))
         with torch.inference_mode():
             image = photograph(seen, directions, pose, 1)
         part = folder.parent / f"{file.name}.part"
-        Image.fromarray((255 * image).round().byte().numpy()).save(part, "JPEG", quality=QUALITY, subsampling=0)
+        write_jpeg(part, (255 * image).round().byte().numpy(), QUALITY)
         part.replace(file)  # whole or not at all: what is there counts as drawn
         drawn += 1
         if drawn % 20 == 0:
@@ -107,10 +107,8 @@ class Errors(NamedTuple):
 def errors(world_from_sfm: Similarity, found: Poses, true: Poses, size: float) -> Errors:
     """Of every camera after a similarity."""
     share = np.linalg.norm(world_from_sfm.points(found[:, :, 3]) - true[:, :, 3], axis=1) / size
-    relative = np.swapaxes(true[:, :, :3], 1, 2) @ world_from_sfm.rotation @ found[:, :, :3]
-    # By the difference from the identity: the arc cosine of the trace loses half its digits at small angles.
-    half_sine = np.linalg.norm(relative - np.eye(3), axis=(1, 2)) / math.sqrt(8)
-    return Errors(share, np.rad2deg(2 * np.arcsin(half_sine.clip(max=1))))
+    turn = rotation_angles(world_from_sfm.rotation @ found[:, :, :3], true[:, :, :3])
+    return Errors(share, np.rad2deg(turn))
 
 
 def fit(found: Poses, true: Poses, scale: float, arm: float) -> Similarity:

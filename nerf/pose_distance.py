@@ -13,9 +13,16 @@ def pose_distances(pose: Float[np.ndarray, "3 4"], others: Float[np.ndarray, "n 
     counts, roll included.
     """
     moved = np.linalg.norm(others[:, :, 3] - pose[:, 3], axis=1)
+    return moved + rotation_angles(others[:, :, :3], pose[:, :3])
+
+
+def rotation_angles(
+    rotations: Float[np.ndarray, "n 3 3"], others: Float[np.ndarray, "*n 3 3"]
+) -> Float[np.ndarray, "n"]:
+    """Between each rotation and its other one, or the only other one, in radians."""
     # The chord ||R_a - R_b||_F = 2 sqrt(2) sin(angle / 2) keeps its precision at small angles, unlike arccos(trace).
-    chord = np.linalg.norm(others[:, :, :3] - pose[:, :3], axis=(1, 2))
-    return moved + 2 * np.arcsin(np.minimum(chord / np.sqrt(8), 1.0))
+    chord = np.linalg.norm(rotations - others, axis=(1, 2))
+    return 2 * np.arcsin(np.minimum(chord / np.sqrt(8), 1.0))
 
 
 def neighbour_weights(

@@ -77,7 +77,7 @@ def _doubts_of_check(registration: Mapping[str, Any]) -> list[str]:
         return found
     if check["agreeing"] < MIN_AGREEING * check["pairs"]:
         found.append(f"only {check['agreeing']:,} of {check['pairs']:,} verified image pairs agree with them")
-    if len(breaks := check.get("row_breaks", [])) > MAX_DOUBTFUL * photos:
+    if len(breaks := _row_breaks(registration)) > MAX_DOUBTFUL * photos:
         found.append(f"{len(breaks)} times the matches of two photos taken one after the other contradict their poses")
     links = _weak_links(registration)
     weak = {file for link in links for file in link["photos"]}
@@ -91,6 +91,11 @@ def _weak_links(registration: Mapping[str, Any]) -> list[Mapping[str, Any]]:
     """Groups that few matches hold to the rest; none of given cameras, whose poses do not rest on matches."""
     check = registration.get("check")
     return check["weak_links"] if check and registration["source"] != "import" else []
+
+
+def _row_breaks(registration: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Photos next to each other by name or time whose matches contradict their poses."""
+    return (registration.get("check") or {}).get("row_breaks", [])  # workspaces of before lack it
 
 
 def _doubts_of_opinion(opinion: Mapping[str, Any] | None) -> list[str]:
@@ -151,8 +156,8 @@ def _groups(registration: Mapping[str, Any]) -> list[PhotoGroup]:
     lost = "" if registration["source"] == "import" else "Excluded: "
     groups = [(f"{lost}verified matches contradict their poses", doubtful_files(registration))]
     groups += _weak_groups(_weak_links(registration))
-    breaks = (registration.get("check") or {}).get("row_breaks", [])
-    groups.append(("The next photo by name or time contradicts where these stand", [step[0] for step in breaks]))
+    breaks = [first for first, _ in _row_breaks(registration)]
+    groups.append(("The next photo by name or time contradicts where these stand", breaks))
     groups.append(("Placed elsewhere by global mapping", opinion["elsewhere"] if _disagrees(opinion) else []))
     groups.append(("Excluded because parts of the scene look alike: these fit only …", repeated.get("others", [])))
     groups.append(("… if these were taken elsewhere", repeated.get("photos", [])))

@@ -17,7 +17,7 @@ from stages.amounts import rough_duration
 from stages.colmap.diagnosis import find_conflict, links, supports
 from stages.colmap.models import load_native, write_native
 from stages.colmap.refinement import finish
-from stages.colmap.repair import broken_steps, check_model, deregister, facts, reasons
+from stages.colmap.repair import check_model, deregister, facts, reasons
 from stages.files import make_durable
 from stages.sfm_attempts import (
     ATTEMPTS,
@@ -114,9 +114,7 @@ def _last_check(model: Any, database: Path, work: Work) -> tuple[dict[str, Any],
         left_out = reasons(model, checked)
         deregister(model, failed)
         checked = check_model(model, database, work.job.seed)
-    row = row_of(database, work)
-    breaks = [] if row is None else broken_steps(model, checked, (row + 1).tolist())
-    return facts(model, checked) | {"row_breaks": breaks}, left_out
+    return facts(model, checked, row_of(database, work)), left_out
 
 
 def _try_all(work: Work) -> None:

@@ -77,9 +77,7 @@ def _standing(
     model, checked = best
     why = reasons(model, checked)
     deregister(model, checked.failed())
-    if (row := row_of(database, work)) is not None:
-        why |= drop_cut_off(model, checked, (row + 1).tolist())
-    return model, why
+    return model, why | drop_cut_off(model, checked, row_of(database, work))
 
 
 def _passing(candidate: tuple[Any, Checked]) -> int:

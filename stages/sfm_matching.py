@@ -115,10 +115,11 @@ def _order(work: Work) -> np.ndarray:
     return natural_order([photo.name for photo in work.photos]) if time_s is None else np.argsort(time_s, kind="stable")
 
 
-def row_of(database: Path, work: Work) -> np.ndarray | None:
-    """The photos in the order in which they were taken one after the other, None where names and times do not tell."""
+def row_of(database: Path, work: Work) -> list[int]:
+    """The photos, by image id, in the order in which they were taken; none where names and times do not tell it."""
     pairs, order = matched_pairs(database), _order(work)
-    return order if order_tells(order, inlier_matrix(len(order), pairs, verified_matches(database, pairs))) else None
+    inliers = inlier_matrix(len(order), pairs, verified_matches(database, pairs))
+    return (order + 1).tolist() if order_tells(order, inliers) else []
 
 
 def _match(database: Path, pairs: Pairs, max_ratio: float, work: Work) -> None:

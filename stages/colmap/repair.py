@@ -65,18 +65,13 @@ def reasons(model: "pycolmap.Reconstruction", checked: Checked) -> dict[str, str
 
 
 def drop_cut_off(model: "pycolmap.Reconstruction", checked: Checked, row: Sequence[int]) -> dict[str, str]:
-    """Take out photos that the ``row`` (image ids) leads to only through photos that fail: by name why."""
+    """Take out photos that the ``row`` (image ids, none where it is not known) leads to only through photos that fail:
+    by name why."""
     lost = cut_off(_places(checked, row), checked.matches, checked.check, ORDER_OVERLAP)
     ids = [image_id for image_id, cut in zip(checked.ids, lost, strict=True) if cut]
     why = "its place is contradicted by photos between it and the others: parts of the scene look alike"
     deregister(model, ids)
     return {model.image(image_id).name: why for image_id in ids}
-
-
-def broken_steps(model: "pycolmap.Reconstruction", checked: Checked, row: Sequence[int]) -> list[list[str]]:
-    """Names of photos next to each other in the ``row`` (image ids) whose own matches contradict their poses."""
-    steps = row_breaks(_places(checked, row), checked.matches, checked.check)
-    return [[model.image(checked.ids[photo]).name for photo in step] for step in steps]
 
 
 def _places(checked: Checked, row: Sequence[int]) -> Int[np.ndarray, "photos"]:
@@ -85,8 +80,11 @@ def _places(checked: Checked, row: Sequence[int]) -> Int[np.ndarray, "photos"]:
     return np.array([place[image_id] for image_id in row if image_id in place], int)
 
 
-def facts(model: "pycolmap.Reconstruction", checked: Checked) -> dict[str, Any]:
-    """What registration.json says of a check, as plain JSON; of each photo under "images", by name."""
+def facts(model: "pycolmap.Reconstruction", checked: Checked, row: Sequence[int] = ()) -> dict[str, Any]:
+    """What registration.json says of a check, as plain JSON; of each photo under "images", by name.
+
+    ``row``: image ids in the order in which photos were taken, where that is known.
+    """
     names, check = [model.image(i).name for i in checked.ids], checked.check
     votes = check.votes_for + check.votes_against
     return {
@@ -99,6 +97,7 @@ def facts(model: "pycolmap.Reconstruction", checked: Checked) -> dict[str, Any]:
             {"photos": [names[i] for i in link.photos], "pairs": link.pairs, "matches": link.matches}
             for link in weak_links(checked.matches, check)
         ],
+        "row_breaks": [[names[i] for i in step] for step in row_breaks(_places(checked, row), checked.matches, check)],
         "images": {
             name: {"agreement": agree / of if of else None, "transfer_px": float(px) if np.isfinite(px) else None}
             for name, agree, of, px in zip(names, check.votes_for, votes, check.photo_error_px, strict=True)
