@@ -1,6 +1,6 @@
 """Large synthetic photo sets of places that repeat themselves, with exactly known cameras; and a score against them.
 
-    python -m benchmarks.large_sets draw {rings,corridor,facades} FOLDER [--photos N] [--shuffle]
+    python -m benchmarks.large_sets draw {rings,corridor,corridor_in_step,facades} FOLDER [--photos N] [--shuffle]
     python -m benchmarks.large_sets score TRUTH_JSON SPARSE_FOLDER INGEST_FOLDER
 
 ``draw`` writes photos of 480 × 360 into FOLDER and the true cameras beside it, into truth.json: so each set needs a
@@ -11,6 +11,8 @@ Names follow the walk; with ``--shuffle`` they are in random order and say nothi
   things, in a room with the same wallpaper on two walls, plain ones with pictures, and two equal cupboards.
 * ``corridor``: 300 photos of a walk along a corridor of equal doors, lamps and floor tiles, and back; pictures hang and
   boxes stand here and there. Looks swing from wall to wall, and are the mirror image on the way back.
+* ``corridor_in_step``: the same, but a swing takes as long as four doors, so that photos a swing apart show the same;
+  and looks swing so far that the right pairs alone do not hold it together. It is to be named, not solved.
 * ``facades``: 120 photos around a building whose two long sides are the same but for a few signs and flower boxes. The
   two short sides are unlike each other.
 

@@ -196,7 +196,7 @@ def ring_walk(count: int, random: np.random.Generator) -> Poses:
 
 STEP = 0.2  # scene units from photo to photo in the corridor
 AISLE = 1.5  # half the corridor's width
-SWING, SWING_LENGTH = math.radians(75), 6.0  # of the looks to either wall, and scene units from one to the next on it
+DOOR_PERIOD = 1.5
 
 
 def corridor(count: int) -> SyntheticScene:
@@ -204,12 +204,12 @@ def corridor(count: int) -> SyntheticScene:
     random, noise = np.random.default_rng(2), make_noise(2)
     end = STEP * count / 2
     half, middle = end / 2 + 1.6, end / 2
-    side = Box((half, 0.05, 1.2)), partial(doors, noise, 1.5)
+    side = Box((half, 0.05, 1.2)), partial(doors, noise, DOOR_PERIOD)
     solids = [
         placed(*side, (middle, AISLE + 0.05, 0)),
         placed(*side, (middle, -AISLE - 0.05, 0), 180),
         placed(Box((half, AISLE, 0.05)), partial(tiles, noise, 0.5, FOREVER), (middle, 0, -1.25)),
-        placed(Box((half, AISLE, 0.05)), partial(lamps, 3.0), (middle, 0, 1.25)),
+        placed(Box((half, AISLE, 0.05)), partial(lamps, 2 * DOOR_PERIOD), (middle, 0, 1.25)),
     ]
     for x, turn_deg in ((middle - half, 90.0), (middle + half, -90.0)):
         solids.append(placed(Box((AISLE, 0.05, 1.2)), partial(plain, (0.60, 0.56, 0.48)), (x, 0, 0), turn_deg))
@@ -226,14 +226,14 @@ def corridor(count: int) -> SyntheticScene:
     return SyntheticScene(tuple(solids), noise)
 
 
-def corridor_walk(count: int, random: np.random.Generator) -> Poses:
-    """There on one side and back on the other. A look that swings by SWING to either side of the way ahead meets the
-    same places of the same walls both times, once from either side."""
+def corridor_walk(swing_deg: float, swing_length: float, count: int, random: np.random.Generator) -> Poses:
+    """There on one side and back on the other. Looks swing by ``swing_deg`` to either side of the way ahead, once in
+    ``swing_length`` scene units, and meet the same places of the same walls both times, once from either side."""
     there = (count + 1) // 2
     place = np.concatenate([np.arange(there), np.arange(count - there)[::-1]])
     ahead = np.where(np.arange(count) < there, 1.0, -1.0)
     x = STEP * place
-    angle = SWING * np.cos(2 * np.pi * (x - STEP * there) / SWING_LENGTH)
+    angle = math.radians(swing_deg) * np.cos(2 * np.pi * (x - STEP * there) / swing_length)
     centres = np.stack([x, -0.25 * ahead, 0.15 + 0.1 * ahead], axis=1)
     look = np.stack([ahead * np.cos(angle), np.sin(angle), np.full(count, -0.08)], axis=1)
     return hand_held(centres, centres + 2 * look, random, 0.06)
@@ -291,6 +291,7 @@ class PhotoSet(NamedTuple):
 
 SETS = {
     "rings": PhotoSet(table_room, ring_walk, 300, 3.0),
-    "corridor": PhotoSet(corridor, corridor_walk, 300, 0.3),
+    "corridor": PhotoSet(corridor, partial(corridor_walk, 40, 7.3), 300, 0.3),
+    "corridor_in_step": PhotoSet(corridor, partial(corridor_walk, 75, 4 * DOOR_PERIOD), 300, 0.3),
     "facades": PhotoSet(building, building_walk, 120, 3.0),
 }

@@ -1,10 +1,9 @@
-"""Decoding one image file of any kind into upright 8-bit sRGB, and what EXIF tells of its camera and place.
+"""Decoding one image file of any kind into upright 8-bit sRGB.
 
 Files come from anywhere: formats are a fixed list, sizes are checked before pixels are decoded, and whatever goes
 wrong becomes a :class:`DecodeError` with a reason a user understands.
 """
 
-import math
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -12,6 +11,15 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from stages.colour_profiles import to_srgb
+from stages.exif import (
+    Place,
+    clock_from_exif,
+    exposure_from_exif,
+    focal_from_exif,
+    place_from_exif,
+    positive,
+    read_exif,
+)
 from stages.panoramas import is_panorama
 
 if TYPE_CHECKING:
@@ -25,10 +33,6 @@ _FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP", "GIF", "PPM", "HEIF", "AVIF", 
 _DEEP_GREY = ("I", "I;16", "I;16L", "I;16B", "F")
 _LOSSY = ("JPEG", "MPO", "HEIF", "AVIF")
 RAW = (".dng", ".cr2", ".cr3", ".nef", ".nrw", ".arw", ".srf", ".raf", ".orf", ".rw2", ".pef", ".raw", ".iiq")
-# Focal lengths over the longer side: 157 to 6 degrees through a pinhole, what COLMAP accepts. Others are not believed,
-# neither of EXIF nor of a lens that was fitted.
-FOCAL_RANGE = (0.1, 10.0)
-_ALTITUDES_M = (-500.0, 20_000.0)  # of shores and aircraft: beyond, a receiver has not found its place
 
 
 Stored = Literal["colour", "grey", "deep grey"]  # the last of 16 bits or of floats
@@ -54,14 +58,6 @@ class CameraKey(NamedTuple):
     focal_px: float | None
 
 
-class Place(NamedTuple):
-    """Where EXIF says that a photo was taken: degrees, north and east positive, and metres above the sea."""
-
-    latitude: float | None = None
-    longitude: float | None = None
-    altitude_m: float | None = None
-
-
 @dataclass(frozen=True)
 class Decoded:
     """One image, upright, sRGB.
@@ -69,7 +65,7 @@ class Decoded:
     ``suffix`` is ".jpg" or ".png" if the file's own bytes already say exactly this to any program (8-bit RGB or
     RGBA, sRGB, upright, one frame), so that they can be copied; otherwise None. ``stored`` is what kind of values it
     has. ``lossy`` is a file that was compressed with losses. ``notes`` tell what was assumed, ``exposure_ev`` is what
-    :func:`exposure_from_exif` tells.
+    :func:`exposure_from_exif` tells, ``clock_s`` what :func:`clock_from_exif` does.
     """
 
     pixels: "np.ndarray"  # (h, w, 3 or 4) uint8
@@ -77,6 +73,7 @@ class Decoded:
     camera_key: CameraKey
     place: Place
     exposure_ev: float | None
+    clock_s: float | None
     suffix: str | None
     stored: Stored
     lossy: bool
@@ -89,7 +86,7 @@ def decode(path: Path) -> Decoded:
     with _open(path) as image:
         stored_plainly, lossy = _is_plain(image), _is_lossy(image, path)
         # Pillow turns TIFFs while it loads them, and forgets how.
-        turned = _exif(image, [])[1] if image.format == "TIFF" else None
+        turned = read_exif(image, [])[1] if image.format == "TIFF" else None
         _load(image)
         return _convert(image, stored_plainly, lossy, turned)
 
@@ -151,7 +148,7 @@ def upright_size(path: Path) -> tuple[tuple[int, int], int]:
     DecodeError."""
     with _open(path) as image:
         # In a PNG without EXIF before its pixels Pillow would decode these to look behind them.
-        orientation = 1 if image.format == "PNG" and "exif" not in image.info else _exif(image, [])[1]
+        orientation = 1 if image.format == "PNG" and "exif" not in image.info else read_exif(image, [])[1]
         turned = orientation >= 5 and image.format != "TIFF"  # Pillow gives a TIFF's size upright
         return ((image.height, image.width) if turned else image.size), orientation
 
@@ -185,7 +182,7 @@ def _convert(image: "Image.Image", stored_plainly: bool, lossy: bool, turned: in
     import numpy as np
 
     notes: list[str] = []
-    tags, orientation = _exif(image, notes)
+    tags, orientation = read_exif(image, notes)
     converted, is_srgb = to_srgb(_to_eight_bit(image), image.info.get("icc_profile"), notes)
     pixels = np.asarray(converted if turned else upright(converted, orientation))
     opaque = pixels.shape[2] == 4 and bool((pixels[..., 3] == 255).all())
@@ -200,6 +197,7 @@ def _convert(image: "Image.Image", stored_plainly: bool, lossy: bool, turned: in
         camera_key=_camera_key(tags, pixels.shape[1], pixels.shape[0], turned or orientation, focal_px),
         place=place_from_exif(tags),
         exposure_ev=exposure_from_exif(tags),
+        clock_s=clock_from_exif(tags),
         suffix=(".png" if image.format == "PNG" else ".jpg") if copy else None,
         stored=_stored(image.mode),
         lossy=lossy,
@@ -298,100 +296,6 @@ def upright(image: "Image.Image", orientation: int) -> "Image.Image":
     return image if turn is None else image.transpose(turn)
 
 
-def _exif(image: "Image.Image", notes: list[str]) -> tuple[dict[str, Any], int]:
-    """EXIF tags by name, and the orientation (1 where absent or invalid)."""
-    from PIL import ExifTags
-
-    try:
-        exif = image.getexif()
-        tags = {**exif, **exif.get_ifd(ExifTags.IFD.Exif)}
-        place = exif.get_ifd(ExifTags.IFD.GPSInfo)
-    except Exception:  # as in _open; the pixels are good
-        notes.append("its EXIF cannot be read")
-        return {}, 1
-    named = {ExifTags.TAGS.get(tag, str(tag)): value for tag, value in tags.items()}
-    named |= {ExifTags.GPSTAGS.get(tag, str(tag)): value for tag, value in place.items()}
-    orientation = named.get("Orientation")
-    return named, orientation if isinstance(orientation, int) and 1 <= orientation <= 8 else 1
-
-
-def focal_from_exif(tags: dict[str, Any], width: int, height: int) -> tuple[float | None, str | None]:
-    """Focal length in pixels of an image of this size from EXIF, and the tag it came from; None if not told.
-
-    The 35 mm equivalent is by the diagonal, as CIPA DCG-001 defines it and COLMAP reads it:
-    f_px = f_35 · diagonal_px / 43.27. Otherwise FocalLength with the focal plane resolution, which counts pixels
-    as the camera wrote them, so it is scaled to the present width (COLMAP does not). If the recorded pixel
-    dimensions have another aspect the image was cropped and neither says anything.
-    """
-    longer, shorter = max(width, height), min(width, height)
-    recorded = _positive(tags.get("ExifImageWidth")), _positive(tags.get("ExifImageHeight"))
-    camera_longer = longer
-    if recorded[0] and recorded[1]:
-        camera_longer = max(recorded[0], recorded[1])
-        if abs(min(recorded[0], recorded[1]) / camera_longer * longer / shorter - 1) > 0.02:
-            return None, None
-    focal, source = None, None
-    focal_mm, resolution = _positive(tags.get("FocalLength")), _positive(tags.get("FocalPlaneXResolution"))
-    unit_mm = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}.get(tags.get("FocalPlaneResolutionUnit", 2))
-    if focal_35 := _positive(tags.get("FocalLengthIn35mmFilm")):
-        focal, source = focal_35 / 43.27 * math.hypot(width, height), "FocalLengthIn35mmFilm"
-    elif focal_mm and resolution and unit_mm:
-        focal, source = focal_mm * resolution / unit_mm * longer / camera_longer, "FocalPlaneXResolution"
-    if focal is None or not FOCAL_RANGE[0] <= focal / longer <= FOCAL_RANGE[1]:
-        return None, None
-    return focal, source
-
-
-def exposure_from_exif(tags: dict[str, Any]) -> float | None:
-    """How many stops brighter a photo shows a scene than one of 1 s, f/1 and ISO 1 would: log2(t S / N²), of exposure
-    time t, sensitivity S and f-number N (EXIF 2.32, tags 0x829A, 0x8827, 0x829D); None where one is missing or 0."""
-    sensitivity = tags.get("ISOSpeedRatings")
-    sensitivity = sensitivity[0] if isinstance(sensitivity, tuple | list) and sensitivity else sensitivity
-    time, speed, stop = (_positive(value) for value in (tags.get("ExposureTime"), sensitivity, tags.get("FNumber")))
-    return math.log2(time) + math.log2(speed) - 2 * math.log2(stop) if time and speed and stop else None
-
-
-def place_from_exif(tags: dict[str, Any]) -> Place:
-    """Latitude, longitude and altitude (EXIF 2.32, GPS tags 1 to 6); nothing where they are incomplete, out of range,
-    or both 0, which is what a receiver writes that has not found its place."""
-    latitude = _degrees(tags.get("GPSLatitude"), tags.get("GPSLatitudeRef"), "NS")
-    longitude = _degrees(tags.get("GPSLongitude"), tags.get("GPSLongitudeRef"), "EW")
-    if latitude is None or longitude is None or abs(latitude) > 90 or abs(longitude) > 180:
-        return Place()
-    if latitude == longitude == 0:
-        return Place()
-    altitude = _number(tags.get("GPSAltitude"))
-    below_sea = tags.get("GPSAltitudeRef") in (1, b"\x01")
-    if altitude is not None:
-        altitude = -altitude if below_sea else altitude
-        altitude = altitude if _ALTITUDES_M[0] <= altitude <= _ALTITUDES_M[1] else None
-    return Place(latitude, longitude, altitude)
-
-
-def _degrees(value: Any, direction: Any, positive_negative: str) -> float | None:
-    """(degrees, minutes, seconds) and a letter as signed degrees."""
-    parts = [_number(part) for part in value] if isinstance(value, tuple | list) else []
-    sign = {positive_negative[0]: 1, positive_negative[1]: -1}.get(str(direction).strip("\0 ").upper())
-    if len(parts) != 3 or None in parts or sign is None:
-        return None
-    degrees, minutes, seconds = (part for part in parts if part is not None)
-    return sign * (degrees + minutes / 60 + seconds / 3600)
-
-
-def _number(value: Any) -> float | None:
-    """``value`` as a finite float; None for anything else that EXIF may hold."""
-    try:
-        number = float(value)
-    except (TypeError, ValueError, ZeroDivisionError):
-        return None
-    return number if math.isfinite(number) else None
-
-
-def _positive(value: Any) -> float | None:
-    number = _number(value)
-    return number if number is not None and number > 0 else None
-
-
 def _camera_key(tags: dict[str, Any], width: int, height: int, orientation: int, focal_px: float | None) -> CameraKey:
     make, model, lens = (str(tags.get(tag, "")).strip("\0 ") for tag in ("Make", "Model", "LensModel"))
-    return CameraKey(make, model, lens, width, height, orientation, _positive(tags.get("FocalLength")), focal_px)
+    return CameraKey(make, model, lens, width, height, orientation, positive(tags.get("FocalLength")), focal_px)

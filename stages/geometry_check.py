@@ -29,6 +29,8 @@ CLOSEST = 1e-3  # of its distance to the other photo: nearer a point cannot be t
 ROUNDS = 12  # of acquittal, which goes from neighbour to neighbour
 MIN_BUNDLE = 60  # agreeing matches across: twice what mapping asks of a single photo
 MIN_MATCHES = 8  # of a pair, for its median to mean something
+MAX_TORN = 0.05  # share of the steps of a row that may be broken by pairs with MIN_STEP of a usual step's matches
+MIN_STEP = 0.5
 
 
 class PairMatches(NamedTuple):
@@ -237,23 +239,25 @@ def weak_links(matches: PairMatches, check: PoseCheck) -> list[WeakLink]:
 def cut_off(
     row: Int[np.ndarray, "photos"], matches: PairMatches, check: PoseCheck, reach: int
 ) -> Bool[np.ndarray, "photos"]:
-    """Standing photos that the rest of the ``row``, in which photos were taken, leads to only through photos that fail.
+    """Standing photos off the longest piece of the ``row``, in which photos were taken, where the row falls apart.
 
     Where parts of a scene look alike, photos of one part can stand in the other: they agree there with what they see,
     and those between the parts, which know better, are outvoted. Matches lead along the row through these, and none of
-    a photo up to ``reach`` places before them agrees with one behind: so the row falls apart, and its longest piece
-    alone can be relied on.
+    a photo up to ``reach`` places before them agrees with one behind: there the row falls apart, and its longest piece
+    alone can be relied on. So it does at every break where it is torn: many parts stand in one another then.
     """
     count = len(check.misplaced)
     verified, agrees = _matrix(matches, matches.weight >= MIN_WITNESS, count) > 0, _matrix(matches, check.agrees, count)
     leads = np.r_[True, verified[row[:-1], row[1:]]]  # to each place from the one before
     places = np.flatnonzero(check.passed[row])
+    torn = is_torn(row, matches, check)
+    breaks = _steps(row, matches, check, check.contradicts) > 0
     piece = np.zeros(len(places), int)
     for number in range(1, len(places)):
         before, after = places[number - 1], places[number]
         crossing = np.ix_(row[places[max(0, number - reach) : number]], row[places[number : number + reach]])
         led_through = after > before + 1 and leads[before + 1 : after + 1].all()
-        broken = led_through and not agrees[crossing].any()
+        broken = (led_through and not agrees[crossing].any()) or (torn and breaks[number - 1])
         piece[number] = piece[number - 1] + broken
     found = np.zeros(count, bool)
     if len(places):
@@ -269,9 +273,26 @@ def row_breaks(row: Int[np.ndarray, "photos"], matches: PairMatches, check: Pose
     that looks alike, has one.
     """
     standing = row[check.passed[row]]
-    against = _matrix(matches, check.contradicts, len(check.misplaced)) > 0
-    steps = zip(standing[:-1].tolist(), standing[1:].tolist(), strict=True)
-    return [(first, second) for first, second in steps if against[first, second]]
+    steps = np.flatnonzero(_steps(row, matches, check, check.contradicts))
+    return [(int(standing[step]), int(standing[step + 1])) for step in steps]
+
+
+def is_torn(row: Int[np.ndarray, "photos"], matches: PairMatches, check: PoseCheck) -> bool:
+    """Whether more than MAX_TORN of the steps of the row are broken by pairs about as strong as those of whole steps:
+    by photos that see the same, and not by a place that looks alike, where the row went on elsewhere."""
+    whole, broken = (_steps(row, matches, check, pairs) for pairs in (check.agrees, check.contradicts))
+    if not whole.any():
+        return False
+    strong = broken >= MIN_STEP * np.median(whole[whole > 0])
+    return bool(strong.sum() > MAX_TORN * len(strong))
+
+
+def _steps(
+    row: Int[np.ndarray, "photos"], matches: PairMatches, check: PoseCheck, chosen: Bool[np.ndarray, "pairs"]
+) -> Float[np.ndarray, "steps"]:
+    """The matches of each step of the row from one standing photo to the next, 0 where its pair is not ``chosen``."""
+    standing = row[check.passed[row]]
+    return _matrix(matches, chosen, len(check.misplaced))[standing[:-1], standing[1:]]
 
 
 def _outvoted(

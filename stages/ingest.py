@@ -19,8 +19,9 @@ from pydantic import Field
 
 from stages.ascii_names import ascii_files
 from stages.contract import Inputs, OptionalSourcePath, Progress, SourcePath, StageConfig, StageError, StageResult
-from stages.decoding import CameraKey, DecodeError, Place, Stored, decode
+from stages.decoding import CameraKey, DecodeError, Stored, decode
 from stages.device import processors
+from stages.exif import Place
 from stages.files import write_jpeg, write_json, write_png
 from stages.ingest_words import (
     all_plain,
@@ -53,7 +54,7 @@ if TYPE_CHECKING:
     import numpy as np
 
 NEEDS: tuple[str, ...] = ()
-VERSION = 10
+VERSION = 11
 RESUMES = False
 NOTES = "notes.json"
 LINKS = ("photos.json", NOTES, "images", "masks", "opaque")
@@ -118,6 +119,7 @@ class _Taken:
     brightest: int = 255  # of all channels
     place: Place = _NO_PLACE
     exposure_ev: float | None = None
+    clock_s: float | None = None
     time_s: float | None = None
     mask: _TakenMask | None = None
     digest: bytes = b""  # of size and pixels
@@ -284,6 +286,7 @@ def _take(file: Path, name: str, mask: Path | None, stored: bool, waiting: Path)
         brightest=int(pixels[..., :3].max()),
         place=decoded.place,
         exposure_ev=decoded.exposure_ev,
+        clock_s=decoded.clock_s,
         mask=taken_mask,
         digest=hashlib.blake2b(str(pixels.shape).encode() + pixels.data, digest_size=16).digest(),
         thumbnail=thumbnail(pixels, taken_mask.thumbnail if taken_mask else None),
@@ -386,6 +389,7 @@ def _store(taken: Sequence[_Taken], same: Mapping[str, str], folder: Path) -> li
                 time_s=photo.time_s,
                 **photo.place._asdict(),
                 exposure_ev=photo.exposure_ev,
+                clock_s=photo.clock_s,
                 orientation=photo.camera_key.orientation,
             )
         )

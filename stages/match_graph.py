@@ -8,12 +8,15 @@ across the graph's weakest places, until every photo has been tried with enough 
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from stages.pairing import Likeness, Pairs, spanning_tree, union
+
+if TYPE_CHECKING:
+    from stages.photos import Photo
 
 UNTESTED = -1
 MIN_INLIERS = 30  # verified matches from which on a pair links two photos; mapping asks a photo for as many
@@ -155,3 +158,14 @@ def natural_order(names: Sequence[str]) -> Int[np.ndarray, "photos"]:
         return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts]
 
     return np.array(sorted(range(len(names)), key=lambda i: (key(names[i]), names[i])), int)
+
+
+def possible_orders(photos: "Sequence[Photo]") -> list[np.ndarray]:
+    """The orders in which the photos may have been taken: of their times, where all are known, and of their names,
+    where that is another."""
+    by_name = natural_order([photo.name for photo in photos])
+    clock_s = [photo.clock_s if photo.time_s is None else photo.time_s for photo in photos]
+    if None in clock_s:
+        return [by_name]
+    by_time = by_name[np.argsort(np.array(clock_s, float)[by_name], kind="stable")]  # within a second by name
+    return [by_time] if np.array_equal(by_time, by_name) else [by_time, by_name]

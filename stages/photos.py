@@ -32,10 +32,10 @@ class Photo:
     ``mask`` is a grey PNG of the photo's size, 255 where it is to be used and 0 where it is to be ignored; None: all of
     it is used. ``near_duplicate_of`` is the name of the photo that is nearly the same picture, which is used in its
     place. ``time_s`` is when a frame of a video was taken, in seconds from its beginning, None for photos. The place
-    is EXIF's, in degrees (north and east positive) and metres above the sea, None where it tells none; so is
-    ``exposure_ev``, in stops (stages/decoding.py: exposure_from_exif). ``opaque`` holds all that is more than half
-    opaque, None without alpha. ``has_alpha``: not nearly all of it is; ``opaque_mask`` is a mask that ignores the rest
-    beside what ``mask`` does. ``used_share`` and ``opaque_share`` are what the two masks leave of the pixels.
+    is EXIF's, in degrees (north and east positive) and metres above the sea, None where it tells none; so are
+    ``exposure_ev``, in stops, and ``clock_s``, when it was taken (stages/exif.py). ``opaque`` holds all that is more
+    than half opaque, None without alpha. ``has_alpha``: not nearly all of it is; ``opaque_mask`` is a mask that ignores
+    the rest beside what ``mask`` does. ``used_share`` and ``opaque_share`` are what the two masks leave of the pixels.
     ``orientation`` is EXIF's, which was undone in the pixels.
     """
 
@@ -56,6 +56,7 @@ class Photo:
     longitude: float | None = None
     altitude_m: float | None = None
     exposure_ev: float | None = None
+    clock_s: float | None = None
     opaque: Box | None = None
     opaque_mask: str | None = None  # "opaque/….png", relative to ingest's folder
     opaque_share: float = 1.0

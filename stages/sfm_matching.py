@@ -28,9 +28,9 @@ from stages.match_graph import (
     ROUNDS,
     in_order,
     inlier_matrix,
-    natural_order,
     next_pairs,
     order_tells,
+    possible_orders,
 )
 from stages.pairing import Pairs, exhaustive, expected_pairs, places_of, second_look, start_pairs, union
 from stages.sfm_attempts import Attempt
@@ -82,9 +82,10 @@ def _match_all(database: Path, work: Work) -> dict[str, Any] | None:
     if job.matcher == "exhaustive":
         _match(database, exhaustive(count), STRICT_RATIO, work)
         return None
-    order = _order(work)
+    orders = possible_orders(work.photos)
     pairs = union(
-        start_pairs(job.matcher, job.neighbours, count, places, lambda: work.similarity), in_order(order, 1, 2)
+        start_pairs(job.matcher, job.neighbours, count, places, lambda: work.similarity),
+        *(in_order(order, 1, 2) for order in orders),
     )
 
     def tried() -> np.ndarray:
@@ -92,8 +93,8 @@ def _match_all(database: Path, work: Work) -> dict[str, Any] | None:
         return inlier_matrix(count, pairs, verified_matches(database, pairs))
 
     inliers = tried()
-    if tells := order_tells(order, inliers):
-        pairs = union(pairs, in_order(order, 3, ORDER_OVERLAP))
+    if telling := [order for order in orders if order_tells(order, inliers)]:
+        pairs = union(pairs, *(in_order(order, 3, ORDER_OVERLAP) for order in telling))
         inliers = tried()
     for _ in range(ROUNDS):
         more = next_pairs(inliers, work.similarity, job.neighbours)
@@ -104,22 +105,16 @@ def _match_all(database: Path, work: Work) -> dict[str, Any] | None:
         if (inliers[more[:, 0], more[:, 1]] >= MIN_INLIERS).mean() < MIN_YIELD:
             break
     verified = int((verified_matches(database, pairs) >= MIN_INLIERS).sum())
-    helped = "photos next to each other by name or time are among them" if tells else "their order says nothing"
+    helped = "photos next to each other by name or time are among them" if telling else "their order says nothing"
     work.say(note=f"{verified:,} of {len(pairs):,} tried pairs of photos verified; {helped}")
-    return {"tried": len(pairs), "verified": verified, "order": tells}
-
-
-def _order(work: Work) -> np.ndarray:
-    """The photos in order of time, where it is known, else of their names."""
-    time_s = places_of(work.photos).time_s
-    return natural_order([photo.name for photo in work.photos]) if time_s is None else np.argsort(time_s, kind="stable")
+    return {"tried": len(pairs), "verified": verified, "order": bool(telling)}
 
 
 def row_of(database: Path, work: Work) -> list[int]:
-    """The photos, by image id, in the order in which they were taken; none where names and times do not tell it."""
-    pairs, order = matched_pairs(database), _order(work)
-    inliers = inlier_matrix(len(order), pairs, verified_matches(database, pairs))
-    return (order + 1).tolist() if order_tells(order, inliers) else []
+    """The photos, by image id, in the order in which they were taken; none where neither times nor names tell it."""
+    pairs, orders = matched_pairs(database), possible_orders(work.photos)
+    inliers = inlier_matrix(len(work.photos), pairs, verified_matches(database, pairs))
+    return next(((order + 1).tolist() for order in orders if order_tells(order, inliers)), [])
 
 
 def _match(database: Path, pairs: Pairs, max_ratio: float, work: Work) -> None:

@@ -15,7 +15,7 @@ NERF_MAY_USE = {"torch", "numpy", "jaxtyping"}
 KERNELS = "nerf/kernels/warp/"  # alone may use Warp, whose kernels name all their arrays
 FILES = [path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
 AROUND = [path for folder in ("tests", "benchmarks") for path in sorted((ROOT / folder).rglob("*.py"))]
-MAX_FILE_LINES, MAX_FUNCTION_LINES, MAX_ARGUMENTS, MAX_MEDIAN_FUNCTION_LINES = 400, 60, 8, 20
+MAX_FUNCTION_LINES, MAX_ARGUMENTS, MAX_MEDIAN_FUNCTION_LINES = 60, 8, 20
 MAX_KERNEL_ARGUMENTS = 16
 ALLOWED_BASES = {"Module", "Function", "Exception", "BaseException", "Enum", "IntEnum", "NamedTuple", "Protocol"} | {
     "BaseModel",
@@ -75,8 +75,7 @@ def test_only_one_room_speaks_to_pycolmap():
 
 
 @pytest.mark.parametrize("path", [*FILES, *AROUND], ids=name_of)
-def test_modules_are_short_and_named_after_a_subject(path: Path):
-    assert len(path.read_text("utf-8").splitlines()) <= MAX_FILE_LINES
+def test_modules_are_named_after_a_subject(path: Path):
     assert path.name not in ("utils.py", "util.py", "helpers.py", "misc.py", "common.py")
 
 

@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from stages.colmap.cameras import is_fisheye, share_without_ray, why_no_ray
 from stages.colmap.observations import observations, points_in_camera
-from stages.decoding import FOCAL_RANGE
+from stages.exif import FOCAL_RANGE
 
 if TYPE_CHECKING:
     import pycolmap

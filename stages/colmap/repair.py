@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from stages.colmap.correspondences import read_pair_matches
 from stages.colmap.mapping import map_incrementally
 from stages.colmap.matching import finish_copy, unfinished_copy
-from stages.geometry_check import PairMatches, PoseCheck, check_poses, cut_off, row_breaks, weak_links
+from stages.geometry_check import PairMatches, PoseCheck, check_poses, cut_off, is_torn, row_breaks, weak_links
 from stages.match_graph import ORDER_OVERLAP
 
 if TYPE_CHECKING:
@@ -65,12 +65,15 @@ def reasons(model: "pycolmap.Reconstruction", checked: Checked) -> dict[str, str
 
 
 def drop_cut_off(model: "pycolmap.Reconstruction", checked: Checked, row: Sequence[int]) -> dict[str, str]:
-    """Take out photos that the ``row`` (image ids, none where it is not known) leads to only through photos that fail:
-    by name why."""
-    lost = cut_off(_places(checked, row), checked.matches, checked.check, ORDER_OVERLAP)
+    """Take out photos that stand off the longest piece of a ``row`` (image ids, none where it is not known) that falls
+    apart: by name why."""
+    places, neighbours = _places(checked, row), "photos between it and the others"
+    if is_torn(places, checked.matches, checked.check):
+        neighbours = "photos taken just before or after"
+    lost = cut_off(places, checked.matches, checked.check, ORDER_OVERLAP)
     ids = [image_id for image_id, cut in zip(checked.ids, lost, strict=True) if cut]
-    why = "its place is contradicted by photos between it and the others: parts of the scene look alike"
     deregister(model, ids)
+    why = f"its place is contradicted by {neighbours}: parts of the scene look alike"
     return {model.image(image_id).name: why for image_id in ids}
 
 

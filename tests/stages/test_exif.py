@@ -1,6 +1,7 @@
 """What EXIF says of a photo: which way is up, its focal length, its camera, how and where it was taken."""
 
 import math
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -8,14 +9,8 @@ import numpy as np
 import pytest
 from PIL import ExifTags, Image
 
-from stages.decoding import (
-    Place,
-    decode,
-    exposure_from_exif,
-    focal_from_exif,
-    place_from_exif,
-    upright_size,
-)
+from stages.decoding import decode, upright_size
+from stages.exif import Place, clock_from_exif, exposure_from_exif, focal_from_exif, place_from_exif
 from tests.stages.photo_files import HEIGHT, WIDTH, exif_with, saved, smooth
 
 
@@ -162,3 +157,19 @@ def test_focal_prior_agrees_with_colmap(shared_data: Path, scene: str) -> None:
     focal = decode(photo).camera_key.focal_px
     assert (focal is not None) == camera.has_prior_focal_length
     assert focal is None or focal == pytest.approx(camera.params[0], rel=1e-6)
+
+
+def test_when_a_photo_was_taken(tmp_path: Path) -> None:
+    tags: dict[str, Any] = {"DateTimeOriginal": "2024:02:29 23:59:58", "SubsecTimeOriginal": "75"}
+    told = decode(saved(tmp_path / "a.jpg", Image.fromarray(smooth()), exif=exif_with(**tags))).clock_s
+    assert told == pytest.approx(datetime(2024, 2, 29, 23, 59, 58, 750_000, UTC).timestamp(), abs=1e-3)
+    later = clock_from_exif({"DateTimeOriginal": "2024:03:01 00:00:00"})
+    assert told is not None and later is not None and later - told == pytest.approx(1.25, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    "told", [None, "", "0000:00:00 00:00:00", "    :  :     :  :  ", "2024:13:01 00:00:00", 7, b"x"]
+)
+def test_a_clock_that_was_never_set_tells_nothing(told: object) -> None:
+    assert clock_from_exif({"DateTimeOriginal": told}) is None
+    assert clock_from_exif({}) is None

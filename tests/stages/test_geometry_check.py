@@ -3,6 +3,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stages.geometry_check import (
+    MIN_WITNESS,
     PairMatches,
     _median_of_others,
     check_poses,
@@ -163,6 +164,24 @@ def test_a_step_of_the_row_that_its_own_matches_contradict_is_a_break() -> None:
     trusting = check_poses(matches, elsewhere)._replace(misplaced=np.zeros(30, bool), unlinked=np.zeros(30, bool))
     assert row_breaks(row, matches, trusting) == [(11, 12)]
     assert row_breaks(row[::2], matches, trusting) == [(10, 12)]
+
+
+@pytest.mark.parametrize(
+    ("kept_of_breaks", "lost"),
+    [
+        (1.0, [*range(8), *range(20, 30)]),
+        (0.4, []),  # pairs weaker than those of whole steps: the row may have gone on at a place that looks alike
+    ],
+)
+def test_of_a_torn_row_only_the_longest_piece_stands(kept_of_breaks: float, lost: list[int]) -> None:
+    matches, poses = walk()
+    row, breaks = np.arange(30), [[7, 8], [19, 20]]
+    weight = np.where([pair in breaks for pair in matches.pairs.tolist()], kept_of_breaks, 1.0) * matches.weight
+    matches = matches._replace(weight=np.maximum(weight, MIN_WITNESS))
+    folded = moved(moved(poses, list(range(8)), 0.0, (0, 0, -5)), list(range(20, 30)), 0.0, (0, 0, 5))
+    trusting = check_poses(matches, folded)._replace(misplaced=np.zeros(30, bool), unlinked=np.zeros(30, bool))
+    assert row_breaks(row, matches, trusting) == [(7, 8), (19, 20)]
+    assert np.flatnonzero(cut_off(row, matches, trusting, 5)).tolist() == lost
 
 
 def restricted(matches: PairMatches, kept: np.ndarray) -> PairMatches:

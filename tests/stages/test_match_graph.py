@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -11,9 +13,11 @@ from stages.match_graph import (
     neighbour_overlap,
     next_pairs,
     order_tells,
+    possible_orders,
     weak_cuts,
 )
 from stages.pairing import Pairs, nearest, spanning_tree, union
+from stages.photos import Photo
 
 
 def walk(count: int, reach: int) -> np.ndarray:
@@ -112,3 +116,21 @@ def test_the_largest_component_is_number_0() -> None:
     edges = np.zeros((6, 6), bool)
     edges[0, 1] = edges[2, 3] = edges[3, 4] = True
     assert connected(edges).tolist() == [1, 1, 0, 0, 0, 2]
+
+
+@pytest.mark.parametrize(
+    ("clocks", "orders"),
+    [
+        ([None, 3.0, 1.0], [[0, 1, 2]]),  # one does not tell
+        ([5.0, 5.0, 6.0], [[0, 1, 2]]),  # within a second by name, and so the same order
+        ([2.0, 3.0, 1.0], [[2, 0, 1], [0, 1, 2]]),
+    ],
+)
+def test_photos_may_follow_each_other_by_clock_or_by_name(clocks: list[float | None], orders: list[list[int]]) -> None:
+    photos = [
+        Photo(f"{number}.jpg", f"images/{number}.jpg", 8, 8, 0, None, None, False, 1.0, clock_s=clock)
+        for number, clock in enumerate(clocks)
+    ]
+    assert [order.tolist() for order in possible_orders(photos)] == orders
+    frames = [replace(photo, time_s=float(number), clock_s=None) for number, photo in enumerate(photos)]
+    assert [order.tolist() for order in possible_orders(frames)] == [[0, 1, 2]]
