@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from stages.photos import Photo
 
 NEEDS = ("ingest",)
-VERSION = 13
+VERSION = 14
 RESUMES = True
 LINKS = ("sparse", "registration.json")
 # Both may decide that an attempt is not made, which is said, in the stage's line as well. A run with another limit is

@@ -50,12 +50,13 @@ class Attempt(NamedTuple):
 
     name: str
     words: str
-    matches: Literal["strict", "loose", "same", "fisheye", "rich"]
+    matches: Literal["strict", "row", "loose", "same", "fisheye", "rich"]
     effort: Effort | None
 
 
 ATTEMPTS = (
     Attempt("first", "", "strict", Effort(without_structure=True)),
+    Attempt("in order", "mapping by matches of photos taken one after the other alone", "row", Effort()),
     Attempt("fisheye", "verifying and mapping again, as if through a fisheye lens", "fisheye", Effort()),
     Attempt("looser matching", "matching them again, less strictly", "loose", Effort()),
     Attempt("weaker start", "mapping again, asking less of the first pair", "same", WEAK_START),
@@ -69,7 +70,8 @@ ATTEMPTS = (
 class Tried:
     """What came of an attempt: the file name of its database, the files in each sub-model, best first, and of the best
     one its points, its mean error, where another one contradicts it (``conflict``), by file why photos were excluded
-    from it, and how a ``second_opinion`` compares. ``seconds`` are those of each phase."""
+    from it, whether the row of photos fell apart in it (``folded``), and how a ``second_opinion`` compares. ``seconds``
+    are those of each phase."""
 
     name: str
     database: str
@@ -80,6 +82,7 @@ class Tried:
     seconds: dict[str, float] = field(default_factory=dict)
     match_graph: dict[str, Any] | None = None
     excluded: dict[str, str] = field(default_factory=dict)
+    folded: bool = False
     second_opinion: dict[str, Any] | None = None
 
     @property
@@ -162,7 +165,7 @@ def expected_seconds(attempt: Attempt, tried: Sequence[Tried], missing: float, c
     if attempt.matches == "rich":
         return 4 * (first["features"] + first["matching"]) + 2 * mapping
     # A missing photo's pairs are matched again, or where pairs were chosen as many as the first time.
-    again = {"same": 0.0, "fisheye": 1.0, "loose": 1.0 if chosen_pairs else 1 - (1 - missing) ** 2}
+    again = {"same": 0.0, "row": 0.0, "fisheye": 1.0, "loose": 1.0 if chosen_pairs else 1 - (1 - missing) ** 2}
     return again[attempt.matches] * first["matching"] + mapping
 
 
@@ -174,7 +177,8 @@ def time_against(expected: float, tried: Sequence[Tried], left: float) -> bool:
 class Situation(NamedTuple):
     """What the attempts so far have left: ``missing`` of ``photos`` have no place, and ``alone`` of these none in any
     other sub-model either; ``linked``: their matches with photos that have a place, or if none has any with each other,
-    are enough for one; ``flat``: there is no model, and a plane or a turn explains next to all pairs."""
+    are enough for one; ``flat``: there is no model, and a plane or a turn explains next to all pairs; ``folded``: the
+    row of photos fell apart in a model."""
 
     missing: int
     alone: int
@@ -182,12 +186,15 @@ class Situation(NamedTuple):
     linked: bool
     flat: bool
     lens_is_given: bool
+    folded: bool = False
 
 
 def reason_against(attempt: Attempt, now: Situation) -> str | None:
     """Why an attempt cannot help or is not worth its time, None if it should be made."""
     if now.flat and attempt.matches != "loose":
         return "the photos tell nothing of depth"
+    if now.folded and attempt.matches != "row":
+        return "parts of the scene look alike, which these do not mend"
     if attempt.matches == "same" and not now.linked:
         return "the missing photos share too little with the others"
     if attempt.matches == "fisheye" and now.lens_is_given:

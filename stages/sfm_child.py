@@ -124,6 +124,8 @@ def _try_all(work: Work) -> None:
         journal.passed.pop(attempt.name, None)  # of an interrupted run that had less time
         if attempt not in ATTEMPTS[: work.job.attempts] or not (missing := work.missing()):
             continue
+        if attempt.matches == "row" and not _folded(work):
+            continue
         if attempt.name == ATTEMPTS[0].name:
             _make(attempt, missing, work)
         elif why := _no_use(attempt, missing, work):
@@ -145,8 +147,14 @@ def _no_use(attempt: Attempt, missing: list[int], work: Work) -> str | None:
     linked, flat = links(work.latest(), set(groups[0]))
     alone = {work.files[number] for number in missing}.difference(*groups)
     count, lens_is_given = len(work.photos), work.job.camera_model is not None
-    now = Situation(len(missing), len(alone), count, linked, flat and len(missing) == count, lens_is_given)
+    flat &= len(missing) == count
+    now = Situation(len(missing), len(alone), count, linked, flat, lens_is_given, _folded(work))
     return reason_against(attempt, now)
+
+
+def _folded(work: Work) -> bool:
+    """Whether the row of photos fell apart in the model of an attempt."""
+    return any(tried.folded for tried in work.journal.tried)
 
 
 def _no_way(attempt: Attempt, missing: list[int], work: Work) -> str | None:
@@ -169,7 +177,7 @@ def _make(attempt: Attempt, missing: list[int], work: Work) -> None:
     work.say(attempt=attempt.name)
     work.attempt, work.seconds = attempt.name, {}
     database, match_graph = matched(attempt, missing, work)
-    models, excluded, opinion = mapped(attempt, database, work)
+    models, standing, opinion = mapped(attempt, database, work)
     tried = Tried(attempt.name, database.name, seconds=work.seconds, match_graph=match_graph)
     if models:
         folder = work.journal.model(attempt.name)
@@ -181,7 +189,8 @@ def _make(attempt: Attempt, missing: list[int], work: Work) -> None:
             points=models[0].num_points3D(),
             reprojection_px=models[0].compute_mean_reprojection_error(),
             conflict=find_conflict(models),
-            excluded=excluded,
+            excluded=standing.excluded,
+            folded=standing.folded,
             second_opinion=opinion,
         )
     work.journal.add(tried)

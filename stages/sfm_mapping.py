@@ -3,22 +3,40 @@
 import shutil
 from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from stages import sfm_global
 from stages.colmap.diagnosis import compare_models
 from stages.colmap.mapping import incremental_options, map_globally, map_incrementally
 from stages.colmap.models import load_native
-from stages.colmap.repair import Checked, check_model, deregister, drop_cut_off, reasons, register_again
+from stages.colmap.repair import (
+    Checked,
+    agreeing_pairs,
+    check_model,
+    deregister,
+    drop_cut_off,
+    reasons,
+    register_again,
+    tears,
+)
 from stages.colmap.thinning import thin_matches
 from stages.sfm_attempts import ATTEMPTS, Attempt, Effort
-from stages.sfm_matching import row_of
+from stages.sfm_matching import copy_row, row_of
 from stages.sfm_work import Work
 
 
-def mapped(attempt: Attempt, database: Path, work: Work) -> tuple[list[Any], dict[str, str], dict[str, Any] | None]:
-    """All sub-models that come of these matches, best first; of the best one only photos whose poses stand, by name why
-    others were excluded, and how a second opinion compares."""
+class Standing(NamedTuple):
+    """The model with only photos whose poses stand, by name why others are excluded, and whether they are since the row
+    in which photos were taken falls apart."""
+
+    model: Any
+    excluded: dict[str, str]
+    folded: bool
+
+
+def mapped(attempt: Attempt, database: Path, work: Work) -> tuple[list[Any], Standing, dict[str, Any] | None]:
+    """All sub-models that come of these matches, best first; what stands of the best one, which is its place there; and
+    how a second opinion compares."""
     work.begin("mapping", done=0)
     seed, lens_is_known = work.job.seed, work.job.camera_params is not None
     models, matches = Path(work.job.folder, "models"), database
@@ -36,17 +54,20 @@ def mapped(attempt: Attempt, database: Path, work: Work) -> tuple[list[Any], dic
             matches, work.images, models, options, lambda: work.say(phase="mapping", done=next(placed))
         )
     shutil.rmtree(models)
-    excluded: dict[str, str] = {}
+    standing = Standing(None, {}, False)
     failure = sfm_global.failure(opinion) if opinion else None
     other = load_native(opinion.folder) if opinion and not failure else None
     compared = None if opinion is None else {"failed": failure}
     if found:
         before = found[0]
-        found[0], excluded = _standing(before, other, database, matches, options, work)
+        if attempt.matches == "row":
+            copy_row(database, work, agreeing_pairs(check_model(before, work.database, seed)))
+        standing = _standing(before, other, database, matches, options, work)
+        found[0] = standing.model
         if other is not None:  # where it was taken itself, it is compared with the one that it replaced
             compared = compare_models(before if found[0] is other else found[0], other) | {"failed": None}
     work.end("mapping")
-    return found, excluded, compared
+    return found, standing, compared
 
 
 def _second_opinion(attempt: Attempt, database: Path, work: Work) -> "sfm_global.Started | None":
@@ -57,27 +78,23 @@ def _second_opinion(attempt: Attempt, database: Path, work: Work) -> "sfm_global
     return sfm_global.start(database, work.beside("global"), work.images, folder, work.job.seed, known)
 
 
-def _standing(
-    model: Any, other: Any, database: Path, matches: Path, options: Any, work: Work
-) -> tuple[Any, dict[str, str]]:
-    """The model with only photos whose poses stand, and by name why others are excluded.
-
-    Photos that fail are freed and registered again, in the model of the second opinion where more photos pass in it.
-    """
-    best = model, check_model(model, database, work.job.seed)
-    if not (failed := best[1].failed()):
-        return model, {}
-    what = "contradict their verified matches" if best[1].check.misplaced.any() else "are not linked to the others"
-    work.say(note=f"{len(failed)} of {len(best[1].ids)} registered photos {what}: registering them again")
-    if other is not None:
-        best = max(best, (other, check_model(other, database, work.job.seed)), key=_passing)
-    if best[1].failed():
-        again = register_again(*best, matches, work.images, Path(work.job.folder, "again"), options)
-        best = max(best, (again, check_model(again, database, work.job.seed)), key=_passing)
+def _standing(model: Any, other: Any, database: Path, matches: Path, options: Any, work: Work) -> Standing:
+    """What stands of the model. Photos that fail are freed and registered again, in the model of the second opinion
+    where more photos pass in it."""
+    best, row = (model, check_model(model, database, work.job.seed)), row_of(database, work)
+    if (failed := best[1].failed()) and not tears(best[1], row):
+        what = "contradict their verified matches" if best[1].check.misplaced.any() else "are not linked to the others"
+        work.say(note=f"{len(failed)} of {len(best[1].ids)} registered photos {what}: registering them again")
+        if other is not None:
+            best = max(best, (other, check_model(other, database, work.job.seed)), key=_passing)
+        if best[1].failed():
+            again = register_again(*best, matches, work.images, Path(work.job.folder, "again"), options)
+            best = max(best, (again, check_model(again, database, work.job.seed)), key=_passing)
     model, checked = best
     why = reasons(model, checked)
     deregister(model, checked.failed())
-    return model, why | drop_cut_off(model, checked, row_of(database, work))
+    cut_off = drop_cut_off(model, checked, row)
+    return Standing(model, why | cut_off, bool(cut_off))
 
 
 def _passing(candidate: tuple[Any, Checked]) -> int:

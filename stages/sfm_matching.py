@@ -1,6 +1,8 @@
 """From photos to the matches that an attempt maps by. Runs in the child process of stage sfm."""
 
 import shutil
+from collections.abc import Container
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,7 @@ from stages.colmap.matching import (
     Search,
     copy_as_fisheye,
     copy_without_matches_of,
+    copy_without_pairs,
     extract_features,
     fill_database,
     match_pairs,
@@ -51,6 +54,9 @@ def matched(attempt: Attempt, missing: list[int], work: Work) -> tuple[Path, dic
         before = matched_pairs(work.latest())
         copy_without_matches_of({work.files[number] for number in missing}, work.latest(), database)
         _match(database, second_look(before, missing, job.neighbours, lambda: work.similarity), LOOSE_RATIO, work)
+    elif attempt.matches == "row":
+        database = work.beside("row")
+        copy_row(database, work)
     elif attempt.matches == "fisheye":
         latest, database = work.latest(), work.beside("fisheye")
         copy_as_fisheye(latest, database, job.seed)
@@ -115,6 +121,18 @@ def row_of(database: Path, work: Work) -> list[int]:
     pairs, orders = matched_pairs(database), possible_orders(work.photos)
     inliers = inlier_matrix(len(work.photos), pairs, verified_matches(database, pairs))
     return next(((order + 1).tolist() for order in orders if order_tells(order, inliers)), [])
+
+
+def copy_row(copy: Path, work: Work, besides: Container[tuple[int, int]] = ()) -> None:
+    """Copy the first database with the matches of photos taken one after the other, and of the pairs ``besides`` (image
+    ids, the lower first), alone.
+
+    Where a place repeats itself, photos taken one after the other are the only ones that are sure to show the same:
+    they share more of it than of its likeness (docs/experiments/match_graph.md).
+    """
+    steps = {tuple(sorted(step)) for step in pairwise(row_of(work.database, work))}
+    tried = [(first, second) for first, second in np.sort(matched_pairs(work.database) + 1, axis=1).tolist()]
+    copy_without_pairs(work.database, copy, [pair for pair in tried if pair not in steps and pair not in besides])
 
 
 def _match(database: Path, pairs: Pairs, max_ratio: float, work: Work) -> None:

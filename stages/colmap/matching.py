@@ -3,7 +3,7 @@
 import math
 import shutil
 import time
-from collections.abc import Callable, Container, Sequence
+from collections.abc import Callable, Container, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from functools import partial
@@ -316,6 +316,17 @@ def copy_without_matches_of(names: Container[str], database: Path, copy: Path) -
             if first.name in names or second.name in names:
                 db.delete_matches(first.image_id, second.image_id)
                 db.delete_two_view_geometry(first.image_id, second.image_id)
+    finish_copy(unfinished, copy)
+
+
+def copy_without_pairs(database: Path, copy: Path, pairs: Iterable[Sequence[int]]) -> None:
+    """Copy the database less what was verified of these pairs of image ids."""
+    import pycolmap
+
+    unfinished = unfinished_copy(database, copy)
+    with pycolmap.Database.open(unfinished) as db, pycolmap.DatabaseTransaction(db):
+        for first, second in pairs:
+            db.delete_two_view_geometry(first, second)
     finish_copy(unfinished, copy)
 
 

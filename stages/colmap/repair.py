@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 
 from stages.colmap.correspondences import read_pair_matches
 from stages.colmap.mapping import map_incrementally
-from stages.colmap.matching import finish_copy, unfinished_copy
+from stages.colmap.matching import copy_without_pairs
 from stages.geometry_check import PairMatches, PoseCheck, check_poses, cut_off, is_torn, row_breaks, weak_links
 from stages.match_graph import ORDER_OVERLAP
 
@@ -64,13 +64,22 @@ def reasons(model: "pycolmap.Reconstruction", checked: Checked) -> dict[str, str
     return found
 
 
+def tears(checked: Checked, row: Sequence[int]) -> bool:
+    """Whether the poses tear the ``row`` (image ids) apart: no photo by itself is at fault then."""
+    return is_torn(_places(checked, row), checked.matches, checked.check)
+
+
+def agreeing_pairs(checked: Checked) -> set[tuple[int, int]]:
+    """The verified pairs of image ids that agree with the poses."""
+    pairs = np.array(checked.ids)[checked.matches.pairs[checked.check.agrees]]
+    return {(first, second) for first, second in np.sort(pairs, axis=1).tolist()}
+
+
 def drop_cut_off(model: "pycolmap.Reconstruction", checked: Checked, row: Sequence[int]) -> dict[str, str]:
     """Take out photos that stand off the longest piece of a ``row`` (image ids, none where it is not known) that falls
     apart: by name why."""
-    places, neighbours = _places(checked, row), "photos between it and the others"
-    if is_torn(places, checked.matches, checked.check):
-        neighbours = "photos taken just before or after"
-    lost = cut_off(places, checked.matches, checked.check, ORDER_OVERLAP)
+    neighbours = "photos taken just before or after" if tears(checked, row) else "photos between it and the others"
+    lost = cut_off(_places(checked, row), checked.matches, checked.check, ORDER_OVERLAP)
     ids = [image_id for image_id, cut in zip(checked.ids, lost, strict=True) if cut]
     deregister(model, ids)
     why = f"its place is contradicted by {neighbours}: parts of the scene look alike"
@@ -136,22 +145,10 @@ def register_again(
     freed = load_native(begin)
     deregister(freed, failed)
     write_native(begin, freed)
-    clean = scratch / "clean.db"
-    copy_without_mistakes(checked, database, clean)
+    clean, passed = scratch / "clean.db", checked.check.passed
+    mistakes = checked.matches.pairs[checked.check.contradicts & passed[checked.matches.pairs].all(axis=1)]
+    copy_without_pairs(database, clean, np.array(checked.ids)[mistakes].tolist())
     found = map_incrementally(clean, images, models, options, begin=begin)
     best = max(found, key=lambda one: (one.num_reg_images(), one.num_points3D()), default=freed)
     shutil.rmtree(scratch, ignore_errors=True)
     return best if best.num_reg_images() >= freed.num_reg_images() else freed
-
-
-def copy_without_mistakes(checked: Checked, database: Path, copy: Path) -> None:
-    """Copy the database without the verified pairs of standing photos that contradict their poses."""
-    import pycolmap
-
-    unfinished = unfinished_copy(database, copy)
-    passed = checked.check.passed
-    mistakes = checked.matches.pairs[checked.check.contradicts & passed[checked.matches.pairs].all(axis=1)]
-    with pycolmap.Database.open(unfinished) as db, pycolmap.DatabaseTransaction(db):
-        for first, second in mistakes.tolist():
-            db.delete_two_view_geometry(checked.ids[first], checked.ids[second])
-    finish_copy(unfinished, copy)

@@ -2,7 +2,9 @@
 
 import sqlite3
 from contextlib import closing
+from itertools import combinations
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,9 +13,11 @@ import pytest
 from stages import sfm_global
 from stages.colmap.diagnosis import compare_models
 from stages.colmap.mapping import incremental_options, map_incrementally
-from stages.colmap.repair import check_model, deregister, facts, reasons, register_again
+from stages.colmap.repair import agreeing_pairs, check_model, deregister, facts, reasons, register_again
 from stages.colmap.thinning import thin_matches
+from stages.photos import Photo
 from stages.sfm_attempts import Effort
+from stages.sfm_matching import copy_row
 
 PHOTOS = 16
 
@@ -63,10 +67,7 @@ def test_true_poses_pass(made: Made) -> None:
 
 
 def test_a_turned_photo_is_named_and_registered_again(made: Made, tmp_path: Path) -> None:
-    import pycolmap
-
-    wrong = pycolmap.Reconstruction(made.model)
-    turn(wrong, 5, degrees=3.0)
+    wrong = turned_alone(made, 5)
     checked = check_model(wrong, made.database, 0)
     assert checked.failed() == [5]
     assert list(reasons(wrong, checked)) == [wrong.image(5).name]
@@ -119,6 +120,36 @@ def test_mapping_of_thinned_matches_finds_the_same_cameras(tmp_path: Path) -> No
     compared = compare_models(made.model, model)
     assert compared["agree"] == PHOTOS and 0 < compared["centre"] < 0.01
     assert check_model(model, made.database, 0).check.passed.all()
+
+
+def test_of_a_row_only_steps_and_pairs_that_agree_are_mapped(made: Made, tmp_path: Path) -> None:
+    wrong = turned_alone(made, 5)
+    agreeing = agreeing_pairs(check_model(wrong, made.database, 0))
+    assert agreeing == {pair for pair in combinations(range(1, PHOTOS + 1), 2) if 5 not in pair}
+    photos = [Photo(f"{i:02}.jpg", f"images/{i:02}.jpg", 8, 8, 0, None, None, False, 1.0) for i in range(PHOTOS)]
+    work: Any = SimpleNamespace(database=made.database, photos=photos)
+    steps = {(i, i + 1) for i in range(1, PHOTOS)}
+    copy_row(tmp_path / "row.db", work)
+    assert verified_pairs(tmp_path / "row.db") == steps
+    copy_row(tmp_path / "row.db", work, agreeing)
+    assert verified_pairs(tmp_path / "row.db") == steps | agreeing
+
+
+def turned_alone(made: Made, image_id: int) -> Any:
+    """The true model but for one photo that is turned."""
+    import pycolmap
+
+    wrong = pycolmap.Reconstruction(made.model)
+    turn(wrong, image_id, degrees=3.0)
+    return wrong
+
+
+def verified_pairs(database: Path) -> set[tuple[int, int]]:
+    import pycolmap
+
+    with pycolmap.Database.open(database) as db:
+        ids, _ = db.read_two_view_geometries()
+    return {pycolmap.pair_id_to_image_pair(pair_id) for pair_id in ids}
 
 
 def test_the_log_of_a_copy_whose_process_was_killed_is_not_taken_for_the_next_ones(made: Made, tmp_path: Path) -> None:

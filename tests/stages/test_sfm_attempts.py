@@ -132,6 +132,9 @@ APART = "the missing photos fit together among themselves and share too little w
         ("more features", {"missing": 1, "photos": 8}, "1 of 8 photos missing is not worth starting over"),
         ("more features", {"missing": 2, "photos": 8}, None),
         ("more features", {"missing": 50, "flat": True}, "the photos tell nothing of depth"),
+        ("in order", {"missing": 40, "folded": True}, None),
+        ("in order", {"missing": 4, "folded": True}, "4 of 50 photos missing is not worth starting over"),
+        ("fisheye", {"missing": 40, "folded": True}, "parts of the scene look alike, which these do not mend"),
     ],
 )
 def test_an_attempt_that_cannot_help_is_not_made(name: str, change: dict[str, Any], why: str | None) -> None:
