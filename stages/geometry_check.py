@@ -168,9 +168,7 @@ def check_poses(matches: PairMatches, world_from_camera: Float[np.ndarray, "phot
     """
     count = len(world_from_camera)
     error = pair_medians(matches, *transfer_errors_px(matches, world_from_camera))
-    told = np.isfinite(error)
-    usual = float(np.median(np.repeat(error[told], matches.weight[told].astype(int)))) if told.any() else 0.0
-    tolerance = float(np.clip(TOLERANCE * usual, MIN_TOLERANCE_PX, MAX_TOLERANCE_PX))
+    usual, tolerance = _usual_px(error, matches.weight)
     support, against = _votes(matches, error, tolerance, count)
     misplaced = _outvoted(support, against)
     # Depths that a misplaced group measured wrong speak against good photos beside it: these are heard once more.
@@ -197,6 +195,25 @@ def check_poses(matches: PairMatches, world_from_camera: Float[np.ndarray, "phot
         votes_for=support[:, standing].sum(axis=1),
         votes_against=against[:, standing].sum(axis=1),
     )
+
+
+def _usual_px(error_px: Float[np.ndarray, "pairs"], weight: Float[np.ndarray, "pairs"]) -> tuple[float, float]:
+    """The median error of matches, and up to which one a pair agrees."""
+    told = np.isfinite(error_px)
+    usual = float(np.median(np.repeat(error_px[told], weight[told].astype(int)))) if told.any() else 0.0
+    return usual, float(np.clip(TOLERANCE * usual, MIN_TOLERANCE_PX, MAX_TOLERANCE_PX))
+
+
+def agreeing(
+    matches: PairMatches, world_from_camera: Float[np.ndarray, "photos 3 4"], trusted: Bool[np.ndarray, "pairs"]
+) -> Bool[np.ndarray, "pairs"]:
+    """The pairs that agree with poses which ``trusted`` ones made, by the depths that these alone tell: where most pairs
+    are mistaken, :func:`check_poses` would believe them."""
+    error, known = transfer_errors_px(matches, world_from_camera, trusted)
+    told = np.bincount(np.tile(matches.pair, 2)[known], minlength=len(matches.pairs)) >= MIN_MATCHES
+    error = np.where(told, pair_medians(matches, error, known), np.nan)
+    _, tolerance = _usual_px(error[trusted], matches.weight[trusted])
+    return error <= tolerance
 
 
 def _photo_medians(

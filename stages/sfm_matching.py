@@ -56,7 +56,7 @@ def matched(attempt: Attempt, missing: list[int], work: Work) -> tuple[Path, dic
         _match(database, second_look(before, missing, job.neighbours, lambda: work.similarity), LOOSE_RATIO, work)
     elif attempt.matches == "row":
         database = work.beside("row")
-        copy_row(database, work)
+        copy_only(steps_of_row(work), database, work)
     elif attempt.matches == "fisheye":
         latest, database = work.latest(), work.beside("fisheye")
         copy_as_fisheye(latest, database, job.seed)
@@ -123,16 +123,19 @@ def row_of(database: Path, work: Work) -> list[int]:
     return next(((order + 1).tolist() for order in orders if order_tells(order, inliers)), [])
 
 
-def copy_row(copy: Path, work: Work, besides: Container[tuple[int, int]] = ()) -> None:
-    """Copy the first database with the matches of photos taken one after the other, and of the pairs ``besides`` (image
-    ids, the lower first), alone.
+def steps_of_row(work: Work) -> set[tuple[int, int]]:
+    """The pairs of photos taken one after the other (image ids, the lower first).
 
-    Where a place repeats itself, photos taken one after the other are the only ones that are sure to show the same:
-    they share more of it than of its likeness (docs/experiments/match_graph.md).
+    Where a place repeats itself they are the only ones that are sure to show the same: they share more of it than of
+    its likeness (docs/experiments/match_graph.md).
     """
-    steps = {tuple(sorted(step)) for step in pairwise(row_of(work.database, work))}
+    return {(min(step), max(step)) for step in pairwise(row_of(work.database, work))}
+
+
+def copy_only(pairs: Container[tuple[int, int]], copy: Path, work: Work) -> None:
+    """Copy the first database with what was verified of these ``pairs`` alone."""
     tried = [(first, second) for first, second in np.sort(matched_pairs(work.database) + 1, axis=1).tolist()]
-    copy_without_pairs(work.database, copy, [pair for pair in tried if pair not in steps and pair not in besides])
+    copy_without_pairs(work.database, copy, [pair for pair in tried if pair not in pairs])
 
 
 def _match(database: Path, pairs: Pairs, max_ratio: float, work: Work) -> None:

@@ -4,7 +4,7 @@ Call it in a child process. What contradicts a pose is decided in stages/geometr
 """
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -14,7 +14,16 @@ from jaxtyping import Float, Int
 from stages.colmap.correspondences import read_pair_matches
 from stages.colmap.mapping import map_incrementally
 from stages.colmap.matching import copy_without_pairs
-from stages.geometry_check import PairMatches, PoseCheck, check_poses, cut_off, is_torn, row_breaks, weak_links
+from stages.geometry_check import (
+    PairMatches,
+    PoseCheck,
+    agreeing,
+    check_poses,
+    cut_off,
+    is_torn,
+    row_breaks,
+    weak_links,
+)
 from stages.match_graph import ORDER_OVERLAP
 
 if TYPE_CHECKING:
@@ -69,10 +78,17 @@ def tears(checked: Checked, row: Sequence[int]) -> bool:
     return is_torn(_places(checked, row), checked.matches, checked.check)
 
 
-def agreeing_pairs(checked: Checked) -> set[tuple[int, int]]:
-    """The verified pairs of image ids that agree with the poses."""
-    pairs = np.array(checked.ids)[checked.matches.pairs[checked.check.agrees]]
-    return {(first, second) for first, second in np.sort(pairs, axis=1).tolist()}
+def agreeing_pairs(
+    model: "pycolmap.Reconstruction", database: Path, trusted: Container[tuple[int, int]], seed: int
+) -> set[tuple[int, int]]:
+    """The verified pairs of image ids, the lower first, that agree with a model which the ``trusted`` ones made."""
+    import pycolmap
+
+    with pycolmap.Database.open(database) as db:
+        ids, matches = read_pair_matches(db, model, seed)
+    pairs = [(first, second) for first, second in np.sort(np.array(ids)[matches.pairs], axis=1).tolist()]
+    agree = agreeing(matches, camera_poses(model), np.array([pair in trusted for pair in pairs]))
+    return {pair for pair, agrees in zip(pairs, agree.tolist(), strict=True) if agrees}
 
 
 def drop_cut_off(model: "pycolmap.Reconstruction", checked: Checked, row: Sequence[int]) -> dict[str, str]:
