@@ -207,8 +207,10 @@ def _usual_px(error_px: Float[np.ndarray, "pairs"], weight: Float[np.ndarray, "p
 def agreeing(
     matches: PairMatches, world_from_camera: Float[np.ndarray, "photos 3 4"], trusted: Bool[np.ndarray, "pairs"]
 ) -> Bool[np.ndarray, "pairs"]:
-    """The pairs that agree with poses which ``trusted`` ones made, by the depths that these alone tell: where most pairs
-    are mistaken, :func:`check_poses` would believe them."""
+    """The pairs that agree with poses which ``trusted`` ones made, by the depths that these alone tell.
+
+    :func:`check_poses` would believe the mistaken ones where they are most of all.
+    """
     error, known = transfer_errors_px(matches, world_from_camera, trusted)
     told = np.bincount(np.tile(matches.pair, 2)[known], minlength=len(matches.pairs)) >= MIN_MATCHES
     error = np.where(told, pair_medians(matches, error, known), np.nan)
