@@ -204,18 +204,21 @@ def _usual_px(error_px: Float[np.ndarray, "pairs"], weight: Float[np.ndarray, "p
     return usual, float(np.clip(TOLERANCE * usual, MIN_TOLERANCE_PX, MAX_TOLERANCE_PX))
 
 
-def agreeing(
+def believed(
     matches: PairMatches, world_from_camera: Float[np.ndarray, "photos 3 4"], trusted: Bool[np.ndarray, "pairs"]
-) -> Bool[np.ndarray, "pairs"]:
-    """The pairs that agree with poses which ``trusted`` ones made, by the depths that these alone tell.
+) -> Bool[np.ndarray, "matches"]:
+    """The matches to believe beside poses that ``trusted`` pairs made, by the depths that these alone tell: where most
+    pairs are mistaken, :func:`check_poses` would believe them.
 
-    :func:`check_poses` would believe the mistaken ones where they are most of all.
+    Those of trusted pairs that are not clearly off, and of others those that agree, if they are MIN_WITNESS.
     """
-    error, known = transfer_errors_px(matches, world_from_camera, trusted)
-    told = np.bincount(np.tile(matches.pair, 2)[known], minlength=len(matches.pairs)) >= MIN_MATCHES
-    error = np.where(told, pair_medians(matches, error, known), np.nan)
-    _, tolerance = _usual_px(error[trusted], matches.weight[trusted])
-    return error <= tolerance
+    error, known = (part.reshape(2, -1) for part in transfer_errors_px(matches, world_from_camera, trusted))
+    pair_error = pair_medians(matches, error.reshape(-1), known.reshape(-1))
+    _, tolerance = _usual_px(pair_error[trusted], matches.weight[trusted])
+    off = (known & (error > CLEARLY * tolerance)).any(axis=0)
+    agrees = (known & (error <= tolerance)).any(axis=0) & ~off
+    enough = np.bincount(matches.pair[agrees], minlength=len(matches.pairs)) >= MIN_WITNESS
+    return np.where(trusted[matches.pair], ~off, agrees & enough[matches.pair])
 
 
 def _photo_medians(

@@ -11,8 +11,8 @@ from stages.colmap.mapping import incremental_options, map_globally, map_increme
 from stages.colmap.models import load_native
 from stages.colmap.repair import (
     Checked,
-    agreeing_pairs,
     check_model,
+    copy_believed,
     deregister,
     drop_cut_off,
     reasons,
@@ -21,7 +21,7 @@ from stages.colmap.repair import (
 )
 from stages.colmap.thinning import thin_matches
 from stages.sfm_attempts import ATTEMPTS, Attempt, Effort
-from stages.sfm_matching import copy_only, row_of, steps_of_row
+from stages.sfm_matching import row_of, steps_of_row
 from stages.sfm_work import Work
 
 
@@ -61,8 +61,7 @@ def mapped(attempt: Attempt, database: Path, work: Work) -> tuple[list[Any], Sta
     if found:
         before = found[0]
         if attempt.matches == "row":
-            steps = steps_of_row(work)
-            copy_only(steps | agreeing_pairs(before, work.database, steps, seed), database, work)
+            copy_believed(before, work.database, database, steps_of_row(work))
         standing = _standing(before, other, database, matches, options, work)
         found[0] = standing.model
         if other is not None:  # where it was taken itself, it is compared with the one that it replaced

@@ -1,7 +1,6 @@
 """From photos to the matches that an attempt maps by. Runs in the child process of stage sfm."""
 
 import shutil
-from collections.abc import Container
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -56,7 +55,8 @@ def matched(attempt: Attempt, missing: list[int], work: Work) -> tuple[Path, dic
         _match(database, second_look(before, missing, job.neighbours, lambda: work.similarity), LOOSE_RATIO, work)
     elif attempt.matches == "row":
         database = work.beside("row")
-        copy_only(steps_of_row(work), database, work)
+        tried, steps = np.sort(matched_pairs(work.database) + 1, axis=1).tolist(), steps_of_row(work)
+        copy_without_pairs(work.database, database, [pair for pair in tried if tuple(pair) not in steps])
     elif attempt.matches == "fisheye":
         latest, database = work.latest(), work.beside("fisheye")
         copy_as_fisheye(latest, database, job.seed)
@@ -130,12 +130,6 @@ def steps_of_row(work: Work) -> set[tuple[int, int]]:
     its likeness (docs/experiments/match_graph.md).
     """
     return {(min(step), max(step)) for step in pairwise(row_of(work.database, work))}
-
-
-def copy_only(pairs: Container[tuple[int, int]], copy: Path, work: Work) -> None:
-    """Copy the first database with what was verified of these ``pairs`` alone."""
-    tried = [(first, second) for first, second in np.sort(matched_pairs(work.database) + 1, axis=1).tolist()]
-    copy_without_pairs(work.database, copy, [pair for pair in tried if pair not in pairs])
 
 
 def _match(database: Path, pairs: Pairs, max_ratio: float, work: Work) -> None:

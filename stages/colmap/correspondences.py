@@ -39,9 +39,13 @@ def read_correspondences(db: "pycolmap.Database", geometries: "dict[int, pycolma
 
 
 def read_pair_matches(
-    db: "pycolmap.Database", model: "pycolmap.Reconstruction", seed: int
+    db: "pycolmap.Database",
+    model: "pycolmap.Reconstruction",
+    seed: int,
+    most: int | None = MAX_MATCHES_CHECKED,
 ) -> tuple[list[int], PairMatches]:
-    """The image ids of the model's photos, and the verified matches between them for a check of their poses."""
+    """The image ids of the model's photos, and the verified matches between them for a check of their poses; ``most``
+    of each pair, None: all, in their order."""
     import pycolmap
 
     ids = sorted(model.reg_image_ids())
@@ -55,8 +59,8 @@ def read_pair_matches(
             continue
         pairs.append((number[first], number[second]))
         weights.append(len(inliers))
-        if len(inliers) > MAX_MATCHES_CHECKED:
-            inliers = inliers[random.choice(len(inliers), MAX_MATCHES_CHECKED, replace=False)]
+        if most and len(inliers) > most:
+            inliers = inliers[random.choice(len(inliers), most, replace=False)]
         keypoints.append(inliers)
     bearings = [_bearings(db, model, image_id) for image_id in ids]
     begins = np.concatenate([[0], np.cumsum([len(some) for some in bearings])]).astype(int)

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Bool
 
 from stages.device import processors
 from stages.feature_matching import IndexedFeatures, index_features, match_descriptors, match_indexed
@@ -328,6 +329,16 @@ def copy_without_pairs(database: Path, copy: Path, pairs: Iterable[Sequence[int]
         for first, second in pairs:
             db.delete_two_view_geometry(first, second)
     finish_copy(unfinished, copy)
+
+
+def keep_inliers(
+    db: "pycolmap.Database", pair: tuple[int, int], geometry: "pycolmap.TwoViewGeometry", keep: Bool[np.ndarray, "n"]
+) -> None:
+    """Leave only some of the verified matches of a pair of image ids, which it is deleted without."""
+    db.delete_two_view_geometry(*pair)
+    if keep.any():
+        geometry.inlier_matches = np.asarray(geometry.inlier_matches)[keep].astype(np.uint32)
+        db.write_two_view_geometry(*pair, geometry)
 
 
 def copy_as_fisheye(database: Path, copy: Path, seed: int) -> None:

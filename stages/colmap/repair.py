@@ -13,11 +13,11 @@ from jaxtyping import Float, Int
 
 from stages.colmap.correspondences import read_pair_matches
 from stages.colmap.mapping import map_incrementally
-from stages.colmap.matching import copy_without_pairs
+from stages.colmap.matching import copy_without_pairs, finish_copy, keep_inliers, unfinished_copy
 from stages.geometry_check import (
     PairMatches,
     PoseCheck,
-    agreeing,
+    believed,
     check_poses,
     cut_off,
     is_torn,
@@ -78,17 +78,26 @@ def tears(checked: Checked, row: Sequence[int]) -> bool:
     return is_torn(_places(checked, row), checked.matches, checked.check)
 
 
-def agreeing_pairs(
-    model: "pycolmap.Reconstruction", database: Path, trusted: Container[tuple[int, int]], seed: int
-) -> set[tuple[int, int]]:
-    """The verified pairs of image ids, the lower first, that agree with a model which the ``trusted`` ones made."""
+def copy_believed(
+    model: "pycolmap.Reconstruction", database: Path, copy: Path, trusted: Container[tuple[int, int]]
+) -> None:
+    """Copy the database with the verified matches alone that are believed beside a model which those of ``trusted``
+    pairs (image ids, the lower first) made."""
     import pycolmap
 
-    with pycolmap.Database.open(database) as db:
-        ids, matches = read_pair_matches(db, model, seed)
-    pairs = [(first, second) for first, second in np.sort(np.array(ids)[matches.pairs], axis=1).tolist()]
-    agree = agreeing(matches, camera_poses(model), np.array([pair in trusted for pair in pairs]))
-    return {pair for pair, agrees in zip(pairs, agree.tolist(), strict=True) if agrees}
+    unfinished = unfinished_copy(database, copy)
+    with pycolmap.Database.open(unfinished) as db, pycolmap.DatabaseTransaction(db):
+        ids, matches = read_pair_matches(db, model, 0, most=None)
+        pairs = np.sort(np.array(ids)[matches.pairs], axis=1).tolist()
+        kept = believed(matches, camera_poses(model), np.array([(i, j) in trusted for i, j in pairs], bool))
+        bounds = np.searchsorted(matches.pair, np.arange(len(pairs) + 1))
+        mine = {(i, j): kept[bounds[k] : bounds[k + 1]] for k, (i, j) in enumerate(pairs)}
+        for pair_id, geometry in zip(*db.read_two_view_geometries(), strict=True):
+            first, second = pycolmap.pair_id_to_image_pair(pair_id)
+            keep = mine.get((first, second), np.zeros(0, bool))
+            if (first, second) not in trusted or len(keep):
+                keep_inliers(db, (first, second), geometry, keep)
+    finish_copy(unfinished, copy)
 
 
 def drop_cut_off(model: "pycolmap.Reconstruction", checked: Checked, row: Sequence[int]) -> dict[str, str]:

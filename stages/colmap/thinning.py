@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from stages.colmap.correspondences import Correspondences, read_correspondences
-from stages.colmap.matching import finish_copy, unfinished_copy
+from stages.colmap.matching import finish_copy, keep_inliers, unfinished_copy
 
 if TYPE_CHECKING:
     import pycolmap
@@ -40,10 +40,7 @@ def thin_matches(database: Path, copy: Path, tracks: int = TRACKS_PER_PHOTO) -> 
     with pycolmap.Database.open(unfinished) as db, pycolmap.DatabaseTransaction(db):
         for number, (first, second) in enumerate(matches.pairs.tolist()):
             geometry = geometries[pycolmap.image_pair_to_pair_id(first, second)]
-            mine = slice(bounds[number], bounds[number + 1])
-            geometry.inlier_matches = np.asarray(geometry.inlier_matches)[kept[mine]].astype(np.uint32)
-            db.delete_two_view_geometry(first, second)
-            db.write_two_view_geometry(first, second, geometry)
+            keep_inliers(db, (first, second), geometry, kept[bounds[number] : bounds[number + 1]])
     finish_copy(unfinished, copy)
 
 

@@ -13,11 +13,11 @@ import pytest
 from stages import sfm_global
 from stages.colmap.diagnosis import compare_models
 from stages.colmap.mapping import incremental_options, map_incrementally
-from stages.colmap.repair import agreeing_pairs, check_model, deregister, facts, reasons, register_again
+from stages.colmap.repair import check_model, copy_believed, deregister, facts, reasons, register_again
 from stages.colmap.thinning import thin_matches
 from stages.photos import Photo
 from stages.sfm_attempts import Effort
-from stages.sfm_matching import copy_only, steps_of_row
+from stages.sfm_matching import steps_of_row
 
 PHOTOS = 16
 
@@ -122,17 +122,17 @@ def test_mapping_of_thinned_matches_finds_the_same_cameras(tmp_path: Path) -> No
     assert check_model(model, made.database, 0).check.passed.all()
 
 
-def test_of_a_row_only_steps_and_pairs_that_agree_are_mapped(made: Made, tmp_path: Path) -> None:
+def test_beside_trusted_pairs_those_are_believed_that_agree(made: Made, tmp_path: Path) -> None:
     wrong = turned_alone(made, 5)
     photos = [Photo(f"{i:02}.jpg", f"images/{i:02}.jpg", 8, 8, 0, None, None, False, 1.0) for i in range(PHOTOS)]
     work: Any = SimpleNamespace(database=made.database, photos=photos)
     steps = steps_of_row(work)
     assert steps == {(i, i + 1) for i in range(1, PHOTOS)}
-    trusted = {(first, second) for first, second in steps if 5 not in (first, second)} | {(4, 6)}
-    agreeing = agreeing_pairs(wrong, made.database, trusted, 0)
-    assert agreeing == {pair for pair in combinations(range(1, PHOTOS + 1), 2) if 5 not in pair}
-    copy_only(steps | agreeing, tmp_path / "row.db", work)
-    assert verified_pairs(tmp_path / "row.db") == steps | agreeing
+    copy = tmp_path / "row.db"
+    copy_believed(wrong, made.database, copy, {step for step in steps if 5 not in step} | {(4, 6)})
+    assert verified_pairs(copy) == {pair for pair in combinations(range(1, PHOTOS + 1), 2) if 5 not in pair}
+    copy_believed(wrong, made.database, copy, steps)  # trusted matches stay unless they are clearly off
+    assert verified_pairs(copy) & {(4, 5), (5, 6)} == set()
 
 
 def turned_alone(made: Made, image_id: int) -> Any:
