@@ -29,8 +29,8 @@ CLOSEST = 1e-3  # of its distance to the other photo: nearer a point cannot be t
 ROUNDS = 12  # of acquittal, which goes from neighbour to neighbour
 MIN_BUNDLE = 60  # agreeing matches across: twice what mapping asks of a single photo
 MIN_MATCHES = 8  # of a pair, for its median to mean something
-MAX_TORN = 0.05  # share of the steps of a row that may be broken by pairs with MIN_STEP of a usual step's matches
-MIN_STEP = 0.5
+# So many steps of a row, and such a share of them, may be broken by pairs with MIN_STEP of a usual step's matches.
+MAX_BREAKS, MAX_TORN, MIN_STEP = 2, 0.05, 0.5
 
 
 class PairMatches(NamedTuple):
@@ -300,13 +300,13 @@ def row_breaks(row: Int[np.ndarray, "photos"], matches: PairMatches, check: Pose
 
 
 def is_torn(row: Int[np.ndarray, "photos"], matches: PairMatches, check: PoseCheck) -> bool:
-    """Whether more than MAX_TORN of the steps of the row are broken by pairs about as strong as those of whole steps:
-    by photos that see the same, and not by a place that looks alike, where the row went on elsewhere."""
+    """Whether more than MAX_TORN of the steps of the row, and MAX_BREAKS, are broken by pairs about as strong as those
+    of whole steps: by photos that see the same, not by a place that looks alike, where the row went on elsewhere."""
     whole, broken = (_steps(row, matches, check, pairs) for pairs in (check.agrees, check.contradicts))
     if not whole.any():
         return False
     strong = broken >= MIN_STEP * np.median(whole[whole > 0])
-    return bool(strong.sum() > MAX_TORN * len(strong))
+    return bool(strong.sum() > max(MAX_BREAKS, MAX_TORN * len(strong)))
 
 
 def _steps(

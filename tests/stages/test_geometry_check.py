@@ -1,3 +1,5 @@
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -167,20 +169,24 @@ def test_a_step_of_the_row_that_its_own_matches_contradict_is_a_break() -> None:
 
 
 @pytest.mark.parametrize(
-    ("kept_of_breaks", "lost"),
+    ("breaks", "kept_of_breaks", "lost"),
     [
-        (1.0, [*range(8), *range(20, 30)]),
-        (0.4, []),  # pairs weaker than those of whole steps: the row may have gone on at a place that looks alike
+        ([[5, 6], [7, 8], [19, 20]], 1.0, [*range(8), *range(20, 30)]),
+        ([[5, 6], [7, 8], [19, 20]], 0.4, []),  # weaker than whole steps: the row may have gone on at another place
+        ([[7, 8], [19, 20]], 1.0, []),  # no more than two such places
     ],
 )
-def test_of_a_torn_row_only_the_longest_piece_stands(kept_of_breaks: float, lost: list[int]) -> None:
+def test_of_a_torn_row_only_the_longest_piece_stands(
+    breaks: list[list[int]], kept_of_breaks: float, lost: list[int]
+) -> None:
     matches, poses = walk()
-    row, breaks = np.arange(30), [[7, 8], [19, 20]]
+    row, ends = np.arange(30), [0, *(second for _, second in breaks), 30]
     weight = np.where([pair in breaks for pair in matches.pairs.tolist()], kept_of_breaks, 1.0) * matches.weight
     matches = matches._replace(weight=np.maximum(weight, MIN_WITNESS))
-    folded = moved(moved(poses, list(range(8)), 0.0, (0, 0, -5)), list(range(20, 30)), 0.0, (0, 0, 5))
-    trusting = check_poses(matches, folded)._replace(misplaced=np.zeros(30, bool), unlinked=np.zeros(30, bool))
-    assert row_breaks(row, matches, trusting) == [(7, 8), (19, 20)]
+    for number, (first, after) in enumerate(pairwise(ends)):
+        poses = moved(poses, list(range(first, after)), 0.0, (0, 0, -5.0 * number))
+    trusting = check_poses(matches, poses)._replace(misplaced=np.zeros(30, bool), unlinked=np.zeros(30, bool))
+    assert row_breaks(row, matches, trusting) == [tuple(step) for step in breaks]
     assert np.flatnonzero(cut_off(row, matches, trusting, 5)).tolist() == lost
 
 
