@@ -19,22 +19,22 @@ from typing import Any, NamedTuple
 
 import torch
 
-from nerf import grid_training
-from nerf.grid_field import GridField
-from nerf.grid_training import GridTrainer
-from nerf.probe import Probe, make_probe, measure
-from nerf.ray_bank import RayBank
-from nerf.scene import Scene
-from nerf.schedule import plan_of
-from nerf.training import FieldTrainer
-from stages.backend import chosen_backend, load_backend
-from stages.device import compute_device
-from stages.effect_decisions import Decisions, photo_parts, read_decisions, told_by_neighbours
-from stages.files import read_json, read_scene
+from nerf.fields.hash_grid import GridField
+from nerf.geometry.scene import Scene
+from nerf.training import hash_grid_trainer as grid_training
+from nerf.training.hash_grid_trainer import GridTrainer
+from nerf.training.ray_dataset import RayBank
+from nerf.training.schedule import plan_of
+from nerf.training.trainer import FieldTrainer
+from nerf.training.validation_probe import Probe, make_probe, measure
+from stages.effects.decisions import Decisions, photo_parts, read_decisions, told_by_neighbours
+from stages.hardware.backend import chosen_backend, load_backend
+from stages.hardware.device import compute_device
+from stages.io.files import read_json, read_scene
 from stages.train import Config, with_habits
-from stages.training_data import guided_bank, training_bank
-from stages.training_setup import field_background, make_trainer
-from stages.training_size import chosen_downscale, grid_size, rays_per_step
+from stages.train.data import guided_bank, training_bank
+from stages.train.setup import field_background, make_trainer
+from stages.train.size import chosen_downscale, grid_size, rays_per_step
 
 BUDGETS = (125, 250, 500, 1000, 2000)
 ONCE = 1000  # steps that draw every pixel of the training photos once: it is their number that gives the photos' size

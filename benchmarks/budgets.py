@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from pipeline.durations import seconds_from
+from pipeline.cli.durations import seconds_from
 
 SETS = ("fox", "fountain_p11", "fern", "banana", "demo")
 BUDGETS = ("2m", "5m", "15m")

@@ -18,13 +18,13 @@ from typing import Any
 from benchmarks.grid_parts import loaded
 from benchmarks.nerfacto import pipeline
 from nerf.effects import AS_GIVEN, AS_RENDERED
-from nerf.product_precision import products_at
-from nerf.ray_bank import RayBank
-from nerf.scene import Scene
-from nerf.training import FieldTrainer
-from stages.effect_decisions import Decisions, photo_parts
+from nerf.geometry.scene import Scene
+from nerf.runtime.matmul_precision import products_at
+from nerf.training.ray_dataset import RayBank
+from nerf.training.trainer import FieldTrainer
+from stages.effects.decisions import Decisions, photo_parts
 from stages.train import Config
-from stages.training_setup import make_trainer
+from stages.train.setup import make_trainer
 
 WARM_STEPS = 300
 SHARE = 0.1  # of the run: the learning rate is still whole

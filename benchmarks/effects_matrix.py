@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from stages import effects
-from stages.effect_decisions import Decisions, read_decisions
-from stages.files import read_scene
-from stages.pilots import pilot_scene, run_pilot
+from stages.effects.decisions import Decisions, read_decisions
+from stages.effects.pilots import pilot_scene, run_pilot
+from stages.io.files import read_scene
 from tests.effect_scenes import Effects, effect_scene
 from tests.synthetic_photos import Quiet
 

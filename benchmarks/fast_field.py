@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from benchmarks.nerfacto import HERE, pipeline, stage_folder
-from stages.files import read_json, read_scene
+from stages.io.files import read_json, read_scene
 
 EVERY_PHOTO = 10**6
 HEAD = (
@@ -70,8 +70,8 @@ def frame_seconds(workspace: Path, width: int) -> tuple[float, str]:
     """How long a held-out view takes to draw at a width, and its size; the best of two."""
     import numpy as np
 
-    from stages.drawing import load_painter
-    from stages.render_path import CameraPath, path_rays
+    from stages.render.path import CameraPath, path_rays
+    from stages.render.renderer import load_painter
 
     scene = read_scene(stage_folder(workspace, "scene.json"))
     view = scene.of_split("test")[0]

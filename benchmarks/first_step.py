@@ -20,17 +20,17 @@ from pathlib import Path
 
 from benchmarks.nerfacto import HERE, pipeline
 from benchmarks.pixel_store import Spoken
-from nerf.scene import Camera
+from nerf.geometry.scene import Camera
 from pipeline.demo import demo_truth, write_photos
-from stages.files import write_json
-from stages.transforms_export import intrinsics, opengl_matrix
+from stages.io.files import write_json
+from stages.io.transforms_export import intrinsics, opengl_matrix
 
 LENS, PHOTOS = Camera("PINHOLE", 120, 90, (125.0, 125.0, 60.0, 45.0)), 100
 SIZES = ("--train.steps", "1000", "--train.levels", "5", "--train.log2-rows", "18", "--train.finest", "512")
 UNTIL_FIRST_STEP = """
 import os, time
-from pipeline.cli import main
-from stages import training_loop
+from pipeline.cli.commands import main
+from stages.train import loop as training_loop
 
 def first(take, *_):
     take()

@@ -21,7 +21,7 @@ from statistics import mean, stdev
 from typing import Any
 
 from benchmarks.nerfacto import pipeline, stage_folder
-from stages.files import read_json
+from stages.io.files import read_json
 
 EFFECTS = ("exposure", "view_dependence", "background", "pose_refinement")
 FIGURES = {"raw": "psnr", "fitted": "psnr_fitted_right", "posed": "psnr_posed_right"}

@@ -79,7 +79,7 @@ def attack(name: str, seconds: float, seed: int) -> dict[str, Any]:
     from hypothesis import HealthCheck, Phase, given, settings
     from hypothesis import seed as seeded
 
-    from stages.colmap import load
+    from stages.sfm.colmap import load
     from tests.fuzz.loaders import LOADERS, SECONDS, attempt
 
     load()

@@ -21,8 +21,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stages.colmap.mapping import MAPPING_MODEL
-from stages.colmap.matching import (
+from stages.io.photos import read_photos
+from stages.sfm.colmap.mapping import MAPPING_MODEL
+from stages.sfm.colmap.matching import (
     STRICT_RATIO,
     Features,
     Search,
@@ -32,13 +33,12 @@ from stages.colmap.matching import (
     match_pairs,
     read_vocabulary,
 )
-from stages.colmap.models import load_native
-from stages.colmap.repair import Checked, camera_poses, check_model
-from stages.geometry_check import CLEARLY, check_poses
-from stages.match_graph import in_order, natural_order
-from stages.pairing import nearest, union
-from stages.photos import read_photos
-from stages.retrieval import CELLS
+from stages.sfm.colmap.models import load_native
+from stages.sfm.colmap.repair import Checked, camera_poses, check_model
+from stages.sfm.geometry_check import CLEARLY, check_poses
+from stages.sfm.pairs.image_retrieval import CELLS
+from stages.sfm.pairs.match_graph import in_order, natural_order
+from stages.sfm.pairs.pair_selection import nearest, union
 
 SIZES = (1, 1, 1, 2, 3, 5, 10, 20)
 

@@ -13,16 +13,16 @@ import numpy as np
 import torch
 from PIL import Image
 
-from nerf.grid_field import GridField, GridSettings
-from nerf.grid_training import GridTrainer, GridTrainerSettings
-from nerf.kernels import reference
+from nerf.fields.hash_grid import GridField, GridSettings
+from nerf.geometry.rays import Rays
+from nerf.kernels import torch as reference
 from nerf.kernels import warp as fast
-from nerf.metrics import mean_squared_error, psnr
-from nerf.parallel import take_over_cores, workers
-from nerf.ray_bank import RayBank, build_ray_bank
-from nerf.rays import Rays
-from nerf.rendering import render_image
-from nerf.training import over
+from nerf.rendering.images import render_image
+from nerf.runtime.parallel import take_over_cores, workers
+from nerf.training.hash_grid_trainer import GridTrainer, GridTrainerSettings
+from nerf.training.metrics import mean_squared_error, psnr
+from nerf.training.ray_dataset import RayBank, build_ray_bank
+from nerf.training.trainer import over
 
 SCENE_PER_BLENDER = 0.75  # takes the objects of the NeRF-synthetic set into [-0.9, 0.9]^3
 WHITE = torch.ones(3)

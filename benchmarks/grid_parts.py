@@ -4,7 +4,7 @@
 
 The steps are those of `pipeline train WORKSPACE --train.seconds S --train.downscale D`: photos, cameras and effects are
 those of the workspace, sizes, colours in a step and its parts what stage train chooses here. The same account as every
-run keeps (stages/training_parts.py), of more steps one after another; samples are points whose colour was computed.
+run keeps (stages/train/profile.py), of more steps one after another; samples are points whose colour was computed.
 """
 
 import argparse
@@ -16,17 +16,17 @@ import torch
 
 from benchmarks.nerfacto import pipeline, stage_folder
 from benchmarks.pixel_store import Spoken
-from nerf.product_precision import products_at
-from nerf.ray_bank import RayBank
-from nerf.scene import Scene
-from nerf.training import FieldTrainer
-from stages.device import compute_device, cores
-from stages.effect_decisions import Decisions, photo_parts, read_decisions
-from stages.files import read_scene
+from nerf.geometry.scene import Scene
+from nerf.runtime.matmul_precision import products_at
+from nerf.training.ray_dataset import RayBank
+from nerf.training.trainer import FieldTrainer
+from stages.effects.decisions import Decisions, photo_parts, read_decisions
+from stages.hardware.device import compute_device, cores
+from stages.io.files import read_scene
 from stages.train import Config, plan
-from stages.training_data import guided_bank
-from stages.training_parts import FIRST_TIMED, observed, parts_table, rates_for
-from stages.training_setup import make_trainer
+from stages.train.data import guided_bank
+from stages.train.profile import FIRST_TIMED, observed, parts_table, rates_for
+from stages.train.setup import make_trainer
 
 LINKED = {"ingest": "photos.json", "normalise": "scene.json", "effects": "effects.json"}
 WARM_STEPS, TIMED_STEPS = 300, 60

@@ -33,14 +33,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from benchmarks.repeating_places import SETS, Poses
-from nerf.alignment import align
-from nerf.pose_distance import rotation_angles
-from nerf.scene import Camera, Similarity
-from nerf.synthetic import Solid, photograph
-from stages.colmap.cameras import camera_rays
-from stages.colmap.models import read_model
-from stages.files import read_json, write_jpeg, write_json
-from stages.photos import read_photos
+from nerf.geometry.alignment import align
+from nerf.geometry.pose_distance import rotation_angles
+from nerf.geometry.scene import Camera, Similarity
+from nerf.synthetic.scenes import Solid, photograph
+from stages.io.files import read_json, write_jpeg, write_json
+from stages.io.photos import read_photos
+from stages.sfm.colmap.cameras import camera_rays
+from stages.sfm.colmap.models import read_model
 
 LENS = Camera("SIMPLE_RADIAL", 480, 360, (400.0, 240.0, 180.0, -0.04))
 QUALITY = 95  # of the JPEG files

@@ -5,8 +5,8 @@
 WORKSPACE has a finished stage ingest. All pairs of the first N photos by name are matched and verified: the truth.
 Then each way is asked for pairs: VLAD by 128 words, the largest 512 features of each photo matched directly, COLMAP's
 vocabulary tree (pycolmap.VisualIndex, made of the photos' own features), the order of names, and the match graph grown
-from VLAD (stages/match_graph.py), with names in order and shuffled. Printed, and written as JSON: pairs, recall of the
-best 20 partners of each photo by verified matches, and the share of pairs that verify.
+from VLAD (stages/sfm/pairs/match_graph.py), with names in order and shuffled. Printed, and written as JSON: pairs,
+recall of the best 20 partners of each photo by verified matches, and the share of pairs that verify.
 """
 
 import argparse
@@ -20,8 +20,9 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from stages.colmap.mapping import MAPPING_MODEL
-from stages.colmap.matching import (
+from stages.io.photos import read_photos
+from stages.sfm.colmap.mapping import MAPPING_MODEL
+from stages.sfm.colmap.matching import (
     STRICT_RATIO,
     Features,
     Search,
@@ -33,11 +34,18 @@ from stages.colmap.matching import (
     read_vocabulary,
     verified_matches,
 )
-from stages.feature_matching import match_descriptors
-from stages.match_graph import MIN_INLIERS, ORDER_OVERLAP, ROUNDS, in_order, inlier_matrix, next_pairs, order_tells
-from stages.pairing import Likeness, Pairs, exhaustive, nearest, spanning_tree, union
-from stages.photos import read_photos
-from stages.retrieval import CELLS
+from stages.sfm.pairs.feature_matching import match_descriptors
+from stages.sfm.pairs.image_retrieval import CELLS
+from stages.sfm.pairs.match_graph import (
+    MIN_INLIERS,
+    ORDER_OVERLAP,
+    ROUNDS,
+    in_order,
+    inlier_matrix,
+    next_pairs,
+    order_tells,
+)
+from stages.sfm.pairs.pair_selection import Likeness, Pairs, exhaustive, nearest, spanning_tree, union
 
 BEST = 20  # partners of a photo that count
 LARGEST = 512  # features of a photo

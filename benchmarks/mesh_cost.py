@@ -19,18 +19,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from nerf import REGION_HALF
-from pipeline.truth import Truth, compare_with_truth
-from pipeline.workspace import Workspace
+from pipeline.demo.truth import Truth, compare_with_truth
+from pipeline.engine.workspace import Workspace
 from stages.contract import Inputs
-from stages.device import compute_device
-from stages.field_files import load_field
-from stages.files import read_scene, read_tensors
+from stages.hardware.device import compute_device
+from stages.io.field_files import load_field
+from stages.io.files import read_scene, read_tensors
 from stages.mesh import Config, reconstruct, write_mesh
-from stages.mesh_samples import sample_surface
+from stages.mesh.samples import sample_surface
 
 if TYPE_CHECKING:
-    from nerf.scene import Scene
-    from stages.mesh_files import ColouredMesh
+    from nerf.geometry.scene import Scene
+    from stages.mesh.files import ColouredMesh
 
 SAMPLES = 200_000  # of the mesh
 

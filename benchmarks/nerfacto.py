@@ -67,12 +67,12 @@ def train_ours(workspace: Path, downscale: float, seconds: float) -> Point:
 
 def score_ours(workspace: Path) -> float:
     """Mean PSNR over the held-out photos at the trained size, as stage evaluate scores them."""
-    from nerf.metrics import mean_squared_error, psnr
-    from stages.drawing import load_painter
-    from stages.effect_decisions import expected_gains
-    from stages.files import read_json, read_scene
-    from stages.training_data import PhotoReader, view_rays
-    from stages.training_setup import WHITE
+    from nerf.training.metrics import mean_squared_error, psnr
+    from stages.effects.decisions import expected_gains
+    from stages.io.files import read_json, read_scene
+    from stages.render.renderer import load_painter
+    from stages.train.data import PhotoReader, view_rays
+    from stages.train.setup import WHITE
 
     scene, train = read_scene(stage_folder(workspace, "scene.json")), stage_folder(workspace, "curve.json")
     painter, info = load_painter(train), read_json(train / "field.json")
@@ -92,9 +92,9 @@ def export(workspace: Path, downscale: float, target: Path) -> tuple[int, int]:
     import numpy as np
     from PIL import Image
 
-    from stages.files import read_json, read_scene, write_json
-    from stages.training_data import PhotoReader, scaled_size
-    from stages.training_setup import WHITE
+    from stages.io.files import read_json, read_scene, write_json
+    from stages.train.data import PhotoReader, scaled_size
+    from stages.train.setup import WHITE
 
     ingest, normalise = stage_folder(workspace, "photos.json"), stage_folder(workspace, "scene.json")
     scene = read_scene(normalise)

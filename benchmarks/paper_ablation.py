@@ -15,11 +15,11 @@ from typing import Any
 
 from PIL import Image
 
-from pipeline.display import PlainDisplay
-from pipeline.runner import Runner
-from pipeline.settings import Settings, settings_from, with_source
-from pipeline.workspace import Workspace
-from stages.files import read_json
+from pipeline.cli.display import PlainDisplay
+from pipeline.cli.settings import Settings, settings_from, with_source
+from pipeline.engine.runner import Runner
+from pipeline.engine.workspace import Workspace
+from stages.io.files import read_json
 
 VARIANTS: dict[str, dict[str, dict[str, Any]]] = {
     "complete": {},

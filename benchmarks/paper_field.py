@@ -21,12 +21,12 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from nerf.compositing import composite
-from nerf.encoding import positional_encoding
-from nerf.paper import PaperNerf, PaperSettings
-from nerf.randomness import generator
-from nerf.rays import Rays, points_on
-from nerf.sampling import midpoint_edges, sample_pdf, stratified
+from nerf.fields.positional_encoding import positional_encoding
+from nerf.fields.vanilla import PaperNerf, PaperSettings
+from nerf.geometry.rays import Rays, points_on
+from nerf.rendering.sampling import midpoint_edges, sample_pdf, stratified
+from nerf.rendering.volume_rendering import composite
+from nerf.runtime.randomness import generator
 
 PRESETS = {
     "small": PaperSettings(depth=4, width=64, samples_coarse=32, samples_fine=32),

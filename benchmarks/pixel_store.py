@@ -27,17 +27,17 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from nerf.pixel_order import PixelOrder
-from nerf.ray_bank import RayBank
-from nerf.scene import Camera, Scene, Similarity, View
-from stages import pixel_store
-from stages.backend import chosen_backend
-from stages.device import compute_device
-from stages.memory import available_bytes
+from nerf.geometry.scene import Camera, Scene, Similarity, View
+from nerf.training.pixel_sampler import PixelOrder
+from nerf.training.ray_dataset import RayBank
+from stages.hardware.backend import chosen_backend
+from stages.hardware.device import compute_device
+from stages.hardware.memory import available_bytes
+from stages.io import pixel_store
 from stages.train import Config, with_habits
-from stages.training_data import training_bank
-from stages.training_setup import make_trainer
-from stages.training_size import grid_size
+from stages.train.data import training_bank
+from stages.train.setup import make_trainer
+from stages.train.size import grid_size
 
 WIDTH, HEIGHT = 4000, 3000
 DIFFERENT = 4  # photos that are painted; the others are copies

@@ -4,7 +4,7 @@ python -m benchmarks.prediction runs.json
 
 Every case is a run of T steps and one of 2 T with the same seed: from the curve of the first alone it is predicted by
 how much the second ends higher, and the constants of the prediction are those of the other sets only. At the end: what
-nerf/learning_curve.py holds, and how curves compare across budgets and schedules.
+nerf/training/learning_curve.py holds, and how curves compare across budgets and schedules.
 """
 
 import argparse
@@ -17,8 +17,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from nerf.grid_training import CONSTANT_SHARE
-from nerf.learning_curve import FEWEST_STEPS, Curve, last_doubling
+from nerf.training.hash_grid_trainer import CONSTANT_SHARE
+from nerf.training.learning_curve import FEWEST_STEPS, Curve, last_doubling
 
 SHARE = 0.8  # of the truths that an interval is to hold
 LEAST = 0.1  # dB: by as much two seeds differ

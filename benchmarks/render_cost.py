@@ -15,17 +15,17 @@ from pathlib import Path
 import torch
 
 from nerf.effects.exposure import ExposedModel
-from nerf.grid_field import GridField
-from nerf.metrics import mean_squared_error, psnr
-from nerf.model import RadianceModel
-from nerf.paper import PaperNerf
-from pipeline.workspace import Workspace
-from stages.drawing import Painter, load_painter
-from stages.effect_decisions import expected_gains
-from stages.files import read_json, read_scene
-from stages.spread import spread
-from stages.tradeoff_arms import resolution_words
-from stages.training_data import PhotoReader, view_rays
+from nerf.fields.hash_grid import GridField
+from nerf.fields.interface import RadianceModel
+from nerf.fields.vanilla import PaperNerf
+from nerf.training.metrics import mean_squared_error, psnr
+from pipeline.engine.workspace import Workspace
+from stages.effects.decisions import expected_gains
+from stages.io.files import read_json, read_scene
+from stages.render.renderer import Painter, load_painter
+from stages.render.spread import spread
+from stages.tradeoff.runs import resolution_words
+from stages.train.data import PhotoReader, view_rays
 
 
 def with_samples(model: RadianceModel, factor: float) -> RadianceModel:

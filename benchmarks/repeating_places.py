@@ -10,11 +10,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf import solid_texture
-from nerf.camera_paths import look_at
-from nerf.shapes import Box, Frustum, Shape, Sphere, Torus
-from nerf.solid_texture import Colour, Noise, make_noise, mix, speckled
-from nerf.synthetic import Solid, SyntheticScene
+from nerf.geometry.camera_paths import look_at
+from nerf.synthetic import textures as solid_texture
+from nerf.synthetic.scenes import Solid, SyntheticScene
+from nerf.synthetic.shapes import Box, Frustum, Shape, Sphere, Torus
+from nerf.synthetic.textures import Colour, Noise, make_noise, mix, speckled
 
 FOREVER = 1e6  # scene units: a period that no scene reaches the end of
 SOFT = 0.012  # scene units over which painted edges pass from one colour to the other

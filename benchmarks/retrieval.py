@@ -26,16 +26,16 @@ import torch
 from PIL import Image
 
 from benchmarks.sfm_speed import Timed
-from nerf import solid_texture
-from nerf.alignment import align
-from nerf.camera_paths import look_at
-from nerf.scene import Camera
-from nerf.shapes import Box
-from nerf.solid_texture import make_noise
-from nerf.synthetic import Solid, SyntheticScene, photograph
+from nerf.geometry.alignment import align
+from nerf.geometry.camera_paths import look_at
+from nerf.geometry.scene import Camera
+from nerf.synthetic import textures as solid_texture
+from nerf.synthetic.scenes import Solid, SyntheticScene, photograph
+from nerf.synthetic.shapes import Box
+from nerf.synthetic.textures import make_noise
 from stages import ingest, sfm
-from stages.colmap.cameras import camera_rays
-from stages.colmap.models import read_model
+from stages.sfm.colmap.cameras import camera_rays
+from stages.sfm.colmap.models import read_model
 
 LENS = Camera("SIMPLE_RADIAL", 320, 240, (300.0, 160.0, 120.0, -0.05))
 STEP = 0.25  # scene units between photos

@@ -30,12 +30,12 @@ from pathlib import Path
 
 import numpy as np
 
-from nerf.alignment import align
+from nerf.geometry.alignment import align
 from stages import ingest, sfm
-from stages.colmap.models import read_model
-from stages.known_cameras import read_known_cameras
-from stages.photos import Photo, read_photos
-from stages.sparse_model import SparseModel
+from stages.io.photos import Photo, read_photos
+from stages.io.sparse_model import SparseModel
+from stages.sfm.colmap.models import read_model
+from stages.sfm.imported.known_cameras import read_known_cameras
 
 
 class Quiet:

@@ -28,13 +28,20 @@ import pycolmap
 
 from benchmarks.sfm_accuracy import Quiet
 from stages import ingest
-from stages.colmap.mapping import MAPPING_MODEL
-from stages.colmap.matching import STRICT_RATIO, Search, extract_features, fill_database, match_pairs, read_descriptors
-from stages.device import processors
-from stages.feature_matching import match_descriptors
-from stages.matching_plan import TIERS
-from stages.pairing import exhaustive
-from stages.photos import Photo, read_photos
+from stages.hardware.device import processors
+from stages.io.photos import Photo, read_photos
+from stages.sfm.colmap.mapping import MAPPING_MODEL
+from stages.sfm.colmap.matching import (
+    STRICT_RATIO,
+    Search,
+    extract_features,
+    fill_database,
+    match_pairs,
+    read_descriptors,
+)
+from stages.sfm.pairs.feature_matching import match_descriptors
+from stages.sfm.pairs.matching_plan import TIERS
+from stages.sfm.pairs.pair_selection import exhaustive
 
 SCALES, SIGMA = 3, 1.6  # of an octave; of the first picture
 

@@ -25,8 +25,8 @@ import pycolmap
 
 from benchmarks.sfm_accuracy import errors
 from stages import ingest, sfm
-from stages.colmap.models import read_model
-from stages.sparse_model import SparseModel
+from stages.io.sparse_model import SparseModel
+from stages.sfm.colmap.models import read_model
 
 
 class Timed:

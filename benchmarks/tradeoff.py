@@ -10,13 +10,13 @@ Run it on an idle machine. Interrupted, the same command goes on where it stoppe
 import argparse
 from pathlib import Path
 
-from pipeline import machine
-from pipeline.chain import needed_for
-from pipeline.display import PlainDisplay
-from pipeline.durations import seconds_from
-from pipeline.runner import Runner
-from pipeline.settings import Settings, with_source
-from pipeline.workspace import Workspace
+from pipeline.cli.display import PlainDisplay
+from pipeline.cli.durations import seconds_from
+from pipeline.cli.settings import Settings, with_source
+from pipeline.doctor import machine
+from pipeline.engine.runner import Runner
+from pipeline.engine.stage_list import needed_for
+from pipeline.engine.workspace import Workspace
 from stages.tradeoff import Config
 
 DOCS = Path(__file__).parents[1] / "docs"

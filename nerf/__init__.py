@@ -9,10 +9,10 @@ Conventions (docs/CONVENTIONS.md has the reasons):
 * A ray is (origin, unit direction, near, far); ``t`` is metric distance along the unit direction.
 * ``t`` are interval end points, shape (..., N+1); ``weights`` are per interval, shape (..., N).
 * Colour is float in [0, 1], sRGB-encoded, channels last.
-* Randomness is a function of (seed, step, chunk), see ``nerf.randomness``, and which pixels are drawn one of
-  (seed, how many were drawn before), see ``nerf.pixel_order``; never of call order or threads.
+* Randomness is a function of (seed, step, chunk), see ``nerf.runtime.randomness``, and which pixels are drawn one of
+  (seed, how many were drawn before), see ``nerf.training.pixel_sampler``; never of call order or threads.
 * How far each formula is from the truth in float32, and what it does at its limits: docs/NUMERICS.md, measured from
-  the cases in ``nerf.numerics``. A new formula gets a case there.
+  the cases in ``pipeline.doctor.numerics``. A new formula gets a case there.
 * Shapes are jaxtyping annotations, checked by beartype in the tests. For that reason no module here may use
   ``from __future__ import annotations``.
 """

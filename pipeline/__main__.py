@@ -6,7 +6,7 @@ import sys
 def main() -> None:
     """Entry point. Ctrl-C while Python reads the program, half a second or so, ends it as it does later on."""
     try:
-        from pipeline import cli
+        from pipeline.cli import commands as cli
     except KeyboardInterrupt:
         sys.exit(130)
     cli.main()

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from nerf.camera_paths import look_at
-from nerf.reconstruction import Reconstruction
+from nerf.geometry.camera_paths import look_at
+from nerf.geometry.reconstruction import Reconstruction
 
 FIELD_OF_VIEW_TAN = 0.5
 

@@ -48,8 +48,8 @@ class SilentProgress:
 
 @pytest.fixture(autouse=True)
 def cores_are_free(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whatever took over the cores in another test (nerf/parallel.py)."""
-    monkeypatch.setattr("nerf.parallel._taken", None)
+    """Whatever took over the cores in another test (nerf/runtime/parallel.py)."""
+    monkeypatch.setattr("nerf.runtime.parallel._taken", None)
 
 
 @pytest.fixture

@@ -10,14 +10,14 @@ import torch
 from PIL import Image
 
 from nerf.effects.exposure import expose
-from nerf.effects.rotations import rotation_from_vector
-from nerf.normalisation import normalise
-from nerf.rays import Rays
-from nerf.reconstruction import Reconstruction
-from nerf.scene import Camera, Scene, View
-from nerf.synthetic import SyntheticScene, photograph, ring_of_cameras, still_life
-from stages.files import write_json, write_tensors
-from stages.photos import Photo, write_photos
+from nerf.geometry.normalisation import normalise
+from nerf.geometry.rays import Rays
+from nerf.geometry.reconstruction import Reconstruction
+from nerf.geometry.rotations import rotation_from_vector
+from nerf.geometry.scene import Camera, Scene, View
+from nerf.synthetic.scenes import SyntheticScene, photograph, ring_of_cameras, still_life
+from stages.io.files import write_json, write_tensors
+from stages.io.photos import Photo, write_photos
 from tests.camera_layouts import opaque_everywhere
 from tests.small_scenes import pinhole_directions
 

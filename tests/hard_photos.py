@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from nerf.scene import Camera
+from nerf.geometry.scene import Camera
 
 if TYPE_CHECKING:
     import torch
 
-    from nerf.synthetic import SyntheticScene
+    from nerf.synthetic.scenes import SyntheticScene
 
 WIDTH, HEIGHT = 320, 240
 LENS = Camera("OPENCV", WIDTH, HEIGHT, (334.0, 333.0, 160.8, 119.5, -0.085, 0.032, 0.0011, -0.0008))
@@ -77,7 +77,7 @@ def shoot(folder: Path, shots: Sequence[Shot], develop: Callable[[Picture, int],
 def _picture(camera: Camera, pose: bytes, scene: int) -> Picture:
     import torch
 
-    from nerf.synthetic import photograph
+    from nerf.synthetic.scenes import photograph
 
     with torch.inference_mode():
         world_from_camera = torch.tensor(np.frombuffer(pose).reshape(3, 4), dtype=torch.float32)
@@ -88,15 +88,15 @@ def _picture(camera: Camera, pose: bytes, scene: int) -> Picture:
 def _bearings(camera: Camera) -> "torch.Tensor":
     import torch
 
-    from stages.colmap.cameras import camera_rays
+    from stages.sfm.colmap.cameras import camera_rays
 
     return torch.from_numpy(camera_rays(camera, 2 * camera.width, 2 * camera.height))
 
 
 @cache
 def _scene(number: int) -> "SyntheticScene":
-    from nerf.shapes import Frustum
-    from nerf.synthetic import still_life
+    from nerf.synthetic.scenes import still_life
+    from nerf.synthetic.shapes import Frustum
 
     if number != PLANE:
         return still_life(number)
@@ -106,7 +106,7 @@ def _scene(number: int) -> "SyntheticScene":
 
 def walk(count: int, of: int = 36, start: int = 0) -> Poses:
     """``count`` of ``of`` poses on a walk around the still life, from number ``start`` on."""
-    from nerf.synthetic import ring_of_cameras
+    from nerf.synthetic.scenes import ring_of_cameras
 
     return ring_of_cameras(of)[start : start + count]
 
@@ -125,7 +125,7 @@ def along(poses: Poses, camera: Camera = LENS, scene: int = 0, prefix: str = "ph
 
 def on_the_spot(count: int = 12) -> Poses:
     """One place, and the camera turned to look here and there on the table."""
-    from nerf.camera_paths import look_at
+    from nerf.geometry.camera_paths import look_at
 
     centre = np.array([2.6, 0.0, 1.6])
     angles = np.linspace(0, 2 * np.pi, count, endpoint=False)

@@ -7,8 +7,8 @@ import numpy as np
 import torch
 from PIL import Image
 
-from nerf.rays import rays_of_view
-from nerf.synthetic import ring_of_cameras, still_life
+from nerf.geometry.rays import rays_of_view
+from nerf.synthetic.scenes import ring_of_cameras, still_life
 
 SIZE, FOCAL_PX = 40, 52.0
 OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0])

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from tyro.conf import Suppress
 
-from pipeline.chain import STAGES
+from pipeline.engine.stage_list import STAGES
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -128,7 +128,7 @@ def test_the_checks_can_fail():
     assert "photos" not in options_of("ingest") and "cameras" not in options_of("sfm")
     assert "cameras" in options_of("render") and "no-depth" in flags_of("render")
     assert "steppes" not in flags_of("train")
-    assert MODULE.findall("| `nerf/rays.py` | rays |\nnerf/model.py") == ["nerf/rays.py"]
+    assert MODULE.findall("| `nerf/geometry/rays.py` | rays |\nnerf/model.py") == ["nerf/geometry/rays.py"]
     headings = "# A `b`, c_d\n```\n# e\n```\n## See [f](g)\n## A b c_d\n"
     assert list(anchors(headings)) == ["a-b-c_d", "see-f", "a-b-c_d-1"]
     assert prose("Words\n```\ncode\n```\n| table |\n<!-- studies -->\nx\n<!-- end of studies -->\n") == ["Words", ""]

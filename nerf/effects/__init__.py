@@ -1,9 +1,9 @@
 """What stands between a radiance field and a photo of it, each part switched on only where a scene calls for it.
 
-The trainers (nerf/grid_training.py, nerf/training.py) know two places: where a photo's rays run (:class:`PhotoRays`)
-and what the photo makes of the colours they meet (:class:`PhotoColours`). In each stands one part; the neutral ones,
-:class:`AsGiven` and :class:`AsRendered`, have no parameters and compute nothing, so that an effect that is off costs
-nothing and changes no bit.
+The trainers (nerf/training/hash_grid_trainer.py, nerf/training/trainer.py) know two places: where a photo's rays run
+(:class:`PhotoRays`) and what the photo makes of the colours they meet (:class:`PhotoColours`). In each stands one part;
+the neutral ones, :class:`AsGiven` and :class:`AsRendered`, have no parameters and compute nothing, so that an effect
+that is off costs nothing and changes no bit.
 
 Parameters have a row per view of the ray bank and are updated in place by the trainer. ``forward`` is plain torch,
 which autograd may differentiate (the paper field's trainer does so); ``backward`` is its derivative by hand (the grid
@@ -17,8 +17,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerf.model import Rendering
-from nerf.rays import Rays
+from nerf.fields.interface import Rendering
+from nerf.geometry.rays import Rays
 
 
 class Seen(NamedTuple):
@@ -80,7 +80,7 @@ class PhotoColours(Protocol):
 
     def of_unseen(self, weights: Float[Tensor, "unseen views"]) -> "PhotoColours":
         """What photos that took no part are expected to make of colours, from what ``weights`` says of their neighbours
-        among those that did (nerf/pose_distance.py)."""
+        among those that did (nerf/geometry/pose_distance.py)."""
         ...
 
     def residual(self, seen: Seen, target: Float[Tensor, "rays 3"]) -> Float[Tensor, "rays 3"]:

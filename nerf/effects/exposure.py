@@ -1,8 +1,8 @@
 """Exposure: photos of one scene taken at different gains, one per channel (which is white balance, too).
 
 A gain acts on light, photos are sRGB: what a photo of log gain g shows of a colour c is s(exp(g) s⁻¹(c)), where s is
-the transfer curve of sRGB (nerf/srgb.py). Gains are natural logarithms, so they add up: expose(expose(c, a), b) is
-expose(c, a + b), and g = log 2 is one stop (EV).
+the transfer curve of sRGB (nerf/rendering/srgb.py). Gains are natural logarithms, so they add up: expose(expose(c, a),
+b) is expose(c, a + b), and g = log 2 is one stop (EV).
 
 From power to power no light has to be computed: s(exp(g) s⁻¹(c)) = k (c + 0.055) - 0.055 with k = exp(g / 2.4), which
 is c + (k - 1) (c + 0.055). That keeps colours as large as 1e30 finite, and c exactly what it is where g is 0.
@@ -14,9 +14,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerf.model import RadianceModel, Rendering
-from nerf.rays import Rays
-from nerf.srgb import KNEE, OFFSET, POWER, SLOPE, linear_to_srgb, srgb_to_linear
+from nerf.fields.interface import RadianceModel, Rendering
+from nerf.geometry.rays import Rays
+from nerf.rendering.srgb import KNEE, OFFSET, POWER, SLOPE, linear_to_srgb, srgb_to_linear
 
 LARGEST = 16.0  # of a log gain, either way: 23 stops, beyond what any camera spans
 

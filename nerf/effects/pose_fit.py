@@ -7,10 +7,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf.effects import AS_RENDERED, PhotoColours, Seen
-from nerf.effects.poses import LARGEST_UNIT, RefinedPoses
-from nerf.grid_field import GridField
-from nerf.randomness import generator
-from nerf.rays import Rays
+from nerf.effects.pose_refinement import LARGEST_UNIT, RefinedPoses
+from nerf.fields.hash_grid import GridField
+from nerf.geometry.rays import Rays
+from nerf.runtime.randomness import generator
 
 STEPS = 40
 RAYS = 256  # looked at in a step

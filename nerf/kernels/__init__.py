@@ -1,6 +1,6 @@
 """The hot loops of the grid field: arrays in, arrays out, written more than once and tested against each other.
 
-A backend is a module with the functions of :class:`Backend`. ``nerf.kernels.reference`` is the specification: plain
+A backend is a module with the functions of :class:`Backend`. ``nerf.kernels.torch`` is the specification: plain
 torch, any device, float32 or float64. The contract:
 
 * Tensors are contiguous, all on one device. Values are float32 (the reference takes float64 as well), optical depths
@@ -12,7 +12,7 @@ torch, any device, float32 or float64. The contract:
 * Samples are *packed*: those of ray r are the entries starts[r] ... starts[r + 1] - 1, front to back. A ray may have
   none.
 * Points given to a grid or to the density cache are in *unit coordinates*: [0, 1]^3 is the cube [-0.9, 0.9]^3 of a
-  bounded scene, or all of space folded into [-2, 2]^3 (nerf/contraction.py).
+  bounded scene, or all of space folded into [-2, 2]^3 (nerf/geometry/contraction.py).
 * No function draws random numbers; no function fails on zero rays or zero samples.
 """
 
@@ -24,8 +24,8 @@ from jaxtyping import Float, Float64, Int, Int32, Int64, UInt8
 from torch import Tensor
 
 from nerf import REGION_HALF
-from nerf.model import Rendering
-from nerf.rays import Rays
+from nerf.fields.interface import Rendering
+from nerf.geometry.rays import Rays
 
 BOX = REGION_HALF  # half the side of the cube that a bounded scene fills
 ALIGNED_ROWS = 4  # of four features: a cache line, and a whole number of vectors for Adam
@@ -108,7 +108,8 @@ class Lattice(NamedTuple):
 
 class Occupied(NamedTuple):
     """Where the density cache says that there may be something, and how far around each brick it says that there is
-    nothing (``nerf.kernels.cache``): what is known to be empty may be skipped, and no more follows from it."""
+    nothing (``nerf.kernels.torch.occupancy``): what is known to be empty may be skipped, and no more follows from
+    it."""
 
     bits: Int64[Tensor, "bricks"]
     clearance: UInt8[Tensor, "bricks"]
@@ -124,7 +125,8 @@ class Samples(NamedTuple):
 
 
 class Drawn(NamedTuple):
-    """Samples whose colours stand for all (``nerf.kernels.drawing``): packed, their rows among all, their weights."""
+    """Samples whose colours stand for all (``nerf.kernels.torch.colour_sampling``): packed, their rows among all, their
+    weights."""
 
     samples: Samples
     rows: Int32[Tensor, "kept"]
@@ -133,7 +135,7 @@ class Drawn(NamedTuple):
 
 @runtime_checkable
 class Backend(Protocol):
-    """The functions of a backend module; their docstrings are in ``nerf.kernels.reference``."""
+    """The functions of a backend module; their docstrings are in ``nerf.kernels.torch``."""
 
     def march(self, occupied: Occupied, lattice: Lattice, rays: Rays, jitter: Float[Tensor, "rays"]) -> Samples: ...
 

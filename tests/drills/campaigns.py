@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from pipeline.chain import STAGES
+from pipeline.engine.stage_list import STAGES
 from tests.drills.drill import Prepare, Program, copy_workspace, results, run_words
 
 EXIT_CODES = {signal.SIGINT: 130, signal.SIGTERM: 143}

@@ -123,7 +123,7 @@ def _live(words: list[str], files: Path, mark: str, prepare: Prepare) -> None:
     os.environ[MARK] = mark
     signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    from pipeline.cli import run_command
+    from pipeline.cli.commands import run_command
 
     if prepare is not None:
         prepare()
@@ -144,7 +144,7 @@ def finished_folders(workspace: Path) -> dict[str, Path]:
 
 def results(workspace: Path) -> dict[str, str]:
     """Stage → digest of its outputs, the files read anew. The report shows how long everything took: it is left out."""
-    from pipeline import manifests
+    from pipeline.engine import manifests
 
     found = {}
     for stage, folder in finished_folders(workspace).items():

@@ -9,8 +9,8 @@ import torch
 import trimesh  # noqa: F401
 import warp  # noqa: F401
 
-import pipeline.cli  # noqa: F401
-from stages.colmap import load
+import pipeline.cli.commands  # noqa: F401
+from stages.sfm.colmap import load
 
 load()
 torch.set_num_threads(torch.get_num_threads())

@@ -57,7 +57,7 @@ def test_a_clock_that_jumps(chain: Chain, tmp_path: Path, jump: float, reads: in
 
 
 def test_photos_exchanged_under_their_old_size_and_date(chain: Chain, tmp_path: Path):
-    from pipeline.keys import ContentIndex
+    from pipeline.engine.keys import ContentIndex
 
     shutil.copytree(chain.photos, tmp_path / "photos")
     photo = tmp_path / "photos/train/r_0.png"

@@ -38,8 +38,8 @@ def status(workspace: Path, *more: str) -> tuple[int, str]:
 
 def test_a_flipped_bit_in_any_file_is_found(chain: Chain, tmp_path: Path):
     # Every file of every stage in turn, manifests and records included.
-    from pipeline import manifests
-    from pipeline.manifests import BadManifest
+    from pipeline.engine import manifests
+    from pipeline.engine.manifests import BadManifest
 
     workspace = copy_workspace(chain.workspace, tmp_path / "w.nerf")
     count = 0

@@ -12,19 +12,20 @@ import torch
 from PIL import Image
 from safetensors.torch import load_file
 
-from nerf.effects.exposures import Exposures
-from nerf.effects.poses import RefinedPoses
-from nerf.grid_training import GridTrainer
-from nerf.probe import make_probe, measure
-from nerf.ray_bank import RayBank
-from nerf.training import PaperTrainer
-from stages import train, training_loop
+from nerf.effects.exposure_model import Exposures
+from nerf.effects.pose_refinement import RefinedPoses
+from nerf.training.hash_grid_trainer import GridTrainer
+from nerf.training.ray_dataset import RayBank
+from nerf.training.trainer import PaperTrainer
+from nerf.training.validation_probe import make_probe, measure
+from stages import train
 from stages.contract import StageError, StageResult
-from stages.decoding import DecodeError, decode
-from stages.examination import symptom_of
-from stages.field_files import load_field
-from stages.files import read_scene
-from stages.training_data import training_bank
+from stages.ingest.decoding import DecodeError, decode
+from stages.io.field_files import load_field
+from stages.io.files import read_scene
+from stages.train import loop as training_loop
+from stages.train.data import training_bank
+from stages.train.health_check import symptom_of
 from tests.stages.photo_scene import photographed
 
 KINDS: dict[str, dict[str, Any]] = {
@@ -47,9 +48,9 @@ NAMED = ("training diverged", "the field does not learn")
 @pytest.fixture(autouse=True)
 def short_warm_up(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(training_loop, "WARM_UP_STEPS", WARM_UP)
-    monkeypatch.setattr("stages.training_parts.write_parts", lambda *_: [])
-    monkeypatch.setattr("stages.unseen.PROBE_RAYS", 256)
-    monkeypatch.setattr("nerf.density_cache.EVERY", 32)  # measuring it is most of what so small a field costs
+    monkeypatch.setattr("stages.train.profile.write_parts", lambda *_: [])
+    monkeypatch.setattr("stages.train.validation_images.PROBE_RAYS", 256)
+    monkeypatch.setattr("nerf.fields.occupancy_grid.EVERY", 32)  # measuring it is most of what so small a field costs
 
 
 @pytest.fixture
@@ -232,7 +233,7 @@ def test_no_number_is_a_symptom(inputs: dict[str, Path], progress: Any) -> None:
 
 
 def train_loop_trainer(inputs: dict[str, Path], bank: RayBank) -> GridTrainer:
-    from stages.training_setup import make_trainer
+    from stages.train.setup import make_trainer
 
     settings: dict[str, Any] = {"downscale": 1.0, "steps": 1, "chunks": 1} | GRID | KINDS["torch"]
     asked = train.Config(**settings)
@@ -311,4 +312,4 @@ def with_photo_parts(monkeypatch: pytest.MonkeyPatch, what: str) -> None:
             else (AS_GIVEN, Exposures(torch.zeros(len(views), 3)))
         )
 
-    monkeypatch.setattr("stages.effect_decisions.photo_parts", parts)
+    monkeypatch.setattr("stages.effects.decisions.photo_parts", parts)

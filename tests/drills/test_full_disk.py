@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from pipeline import chain as stages_of
+from pipeline.engine import stage_list as stages_of
 from tests.drills.campaigns import Chain
 from tests.drills.drill import MARK, Program, finished_folders, results
 from tests.synthetic_photos import SyntheticPhotos

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipeline.chain import usual
+from pipeline.engine.stage_list import usual
 from tests.drills.campaigns import Chain
 from tests.drills.drill import Program, copy_workspace, results
 from tests.synthetic_photos import SyntheticPhotos

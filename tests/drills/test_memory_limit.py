@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.chain import EXIT_CODES
+from pipeline.engine.stage_list import EXIT_CODES
 from tests.drills.campaigns import Chain
 from tests.drills.drill import Program, copy_workspace, results
 

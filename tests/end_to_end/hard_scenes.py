@@ -13,9 +13,9 @@ import torch
 from jaxtyping import Float
 from PIL import Image
 
-from nerf.rays import rays_of_view
-from nerf.synthetic import ring_of_cameras, still_life
-from pipeline.cli import run_command
+from nerf.geometry.rays import rays_of_view
+from nerf.synthetic.scenes import ring_of_cameras, still_life
+from pipeline.cli.commands import run_command
 from tests.small_scenes import OPENGL_FROM_OPENCV, pinhole_directions
 
 SIZE, FOCAL_PX = 40, 52.0

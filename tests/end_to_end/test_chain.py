@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from pipeline.cli import run_command
+from pipeline.cli.commands import run_command
 from tests.small_scenes import write_blender_scene
 from tests.video_files import read_video
 

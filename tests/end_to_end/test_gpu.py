@@ -5,13 +5,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from nerf.metrics import mean_squared_error, psnr
-from nerf.rays import Rays, rays_of_view
-from nerf.rendering import render_image
-from nerf.synthetic import ring_of_cameras
-from pipeline.cli import run_command
-from stages.field_files import load_field
-from stages.files import read_json
+from nerf.geometry.rays import Rays, rays_of_view
+from nerf.rendering.images import render_image
+from nerf.synthetic.scenes import ring_of_cameras
+from nerf.training.metrics import mean_squared_error, psnr
+from pipeline.cli.commands import run_command
+from stages.io.field_files import load_field
+from stages.io.files import read_json
 from tests.devices import skip_without
 from tests.small_scenes import pinhole_directions, write_blender_scene
 

@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nerf.alignment import align
+from nerf.geometry.alignment import align
 from stages import ingest, sfm
-from stages.colmap.models import read_model
 from stages.contract import StageError
-from stages.files import read_json
+from stages.io.files import read_json
+from stages.sfm.colmap.models import read_model
 from tests.hard_photos import (
     BARREL,
     FISHEYE,

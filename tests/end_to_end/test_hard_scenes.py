@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from nerf.camera_paths import look_at
+from nerf.geometry.camera_paths import look_at
 from tests.end_to_end.hard_scenes import RING, Poses, moved, over_white, run, write_set
 
 UTM = (448_262.5, 5_411_932.25, 273.0)

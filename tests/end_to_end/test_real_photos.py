@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.cli import run_command
+from pipeline.cli.commands import run_command
 
 
 @pytest.mark.slow

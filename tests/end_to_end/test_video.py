@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipeline.cli import run_command
-from stages.files import read_json
-from stages.video import video_writer
+from pipeline.cli.commands import run_command
+from stages.io.files import read_json
+from stages.io.video import video_writer
 from tests.synthetic_photos import SyntheticPhotos
 
 

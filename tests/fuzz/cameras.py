@@ -17,7 +17,7 @@ from tests.synthetic_photos import Quiet
 @cache
 def transforms() -> dict[str, Any]:
     """A valid transforms file of four photos."""
-    from nerf.synthetic import ring_of_cameras
+    from nerf.synthetic.scenes import ring_of_cameras
 
     frames = [
         {
@@ -31,7 +31,7 @@ def transforms() -> dict[str, Any]:
 
 
 def photos_of(frames: dict[str, str]) -> list:
-    from stages.photos import Photo
+    from stages.io.photos import Photo
 
     return [
         Photo(name, f"images/{i}.png", W, H, 0, None, None, False, 1.0)
@@ -41,8 +41,8 @@ def photos_of(frames: dict[str, str]) -> list:
 
 def _load_cameras(given: Path, folder: Path) -> None:
     """From what is given to the finished stages ingest (photos.json) and sfm, less the photos."""
-    from stages.photos import write_photos
-    from stages.sources import find_source
+    from stages.ingest.sources import find_source
+    from stages.io.photos import write_photos
 
     source = find_source(given)
     assert all(file.is_relative_to(source.root) for file in source.files)
@@ -55,10 +55,10 @@ def _load_cameras(given: Path, folder: Path) -> None:
 
 def _import_cameras(cameras: Path, photos: list, folder: Path) -> None:
     """The end of stage sfm with given cameras, and the scene frame of them: finite, whatever they were."""
-    from nerf.normalisation import normalise
-    from stages.colmap.models import read_model
+    from nerf.geometry.normalisation import normalise
     from stages.normalise import _reconstruction
-    from stages.sfm_import import write_known_model
+    from stages.sfm.colmap.models import read_model
+    from stages.sfm.imported.poses import write_known_model
 
     write_known_model(cameras, photos, folder, folder / "sfm", Quiet())
     model = read_model(folder / "sfm" / "sparse")
@@ -81,8 +81,8 @@ def try_transforms(folder: Path) -> None:
 @cache
 def scene() -> Any:
     """A valid scene.json."""
-    from nerf.scene import Camera, Scene, Similarity, View
-    from nerf.synthetic import ring_of_cameras
+    from nerf.geometry.scene import Camera, Scene, Similarity, View
+    from nerf.synthetic.scenes import ring_of_cameras
 
     views = tuple(
         View(f"{i}.png", f"images/{i}.png", 0, pose, 0.1, 9.0, "train", None)
@@ -93,7 +93,7 @@ def scene() -> Any:
 
 
 def try_path(folder: Path) -> None:
-    from stages.render_path import path_from_file, path_rays
+    from stages.render.path import path_from_file, path_rays
 
     path = path_from_file(scene(), folder / "path.json").resized(8)
     rays = next(path_rays(path, scene()))
@@ -105,11 +105,11 @@ def colmap_models() -> dict[str, dict[str, bytes]]:
     """A valid COLMAP model as binary and as text files."""
     import pycolmap
 
-    from nerf.scene import Camera
-    from nerf.synthetic import ring_of_cameras
-    from stages.colmap.cameras import project
-    from stages.colmap.models import write_model
-    from stages.sparse_model import SparseImage, SparseModel
+    from nerf.geometry.scene import Camera
+    from nerf.synthetic.scenes import ring_of_cameras
+    from stages.io.sparse_model import SparseImage, SparseModel
+    from stages.sfm.colmap.cameras import project
+    from stages.sfm.colmap.models import write_model
 
     camera, points = Camera("OPENCV", W, H, (30.0, 31.0, 12.0, 10.0, 0.01, 0.0, 0.0, 0.0)), np.eye(3) / 4
     poses = ring_of_cameras(3)
@@ -128,7 +128,7 @@ def colmap_models() -> dict[str, dict[str, bytes]]:
 
 
 def try_colmap(folder: Path) -> None:
-    from stages.photos import write_photos
+    from stages.io.photos import write_photos
 
     photos = photos_of({f"p{i}.png": f"p{i}.png" for i in range(3)})
     (folder / "out").mkdir()

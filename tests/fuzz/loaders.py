@@ -12,10 +12,10 @@ from typing import NamedTuple
 
 from hypothesis import strategies as st
 
-from pipeline.manifests import BadManifest
-from pipeline.settings import UsageError
+from pipeline.cli.settings import UsageError
+from pipeline.engine.manifests import BadManifest
 from stages.contract import StageError
-from stages.decoding import DecodeError
+from stages.ingest.decoding import DecodeError
 from tests.fuzz import cameras, pictures, workspaces
 from tests.fuzz.inputs import damaged, json_files, one_of, single
 

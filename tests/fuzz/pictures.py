@@ -68,9 +68,9 @@ def any_picture() -> st.SearchStrategy[bytes]:
 
 
 def try_photo(folder: Path) -> None:
-    from stages.decoding import decode
-    from stages.near_duplicates import thumbnail
-    from stages.sharpness import one_colour, sharpness
+    from stages.ingest.decoding import decode
+    from stages.ingest.near_duplicates import thumbnail
+    from stages.ingest.sharpness import one_colour, sharpness
 
     decoded = decode(folder / "a.png")
     assert decoded.pixels.dtype == np.uint8 and decoded.pixels.shape[2] in (3, 4)
@@ -79,7 +79,7 @@ def try_photo(folder: Path) -> None:
 
 
 def try_mask(folder: Path) -> None:
-    from stages.masks import read_mask
+    from stages.ingest.masks import read_mask
 
     mask = read_mask(folder / "a.png", H, W, 6).pixels
     assert mask.shape == (W, H) and set(np.unique(mask)) <= {0, 255}
@@ -88,7 +88,7 @@ def try_mask(folder: Path) -> None:
 @cache
 def clip() -> bytes:
     """A short video whose picture moves."""
-    from stages.video import video_writer
+    from stages.io.video import video_writer
 
     noise = np.random.default_rng(0).integers(0, 256, (48, 160, 3), np.uint8).repeat(2, 0).repeat(2, 1)
     with tempfile.TemporaryDirectory() as folder:
@@ -100,7 +100,7 @@ def clip() -> bytes:
 
 
 def try_video(folder: Path) -> None:
-    from stages.video_frames import take_frames
+    from stages.ingest.video_frames import take_frames
 
     (folder / "out").mkdir()
     assert len(take_frames(folder / "a.mp4", 5, folder / "out", Quiet())) >= 3

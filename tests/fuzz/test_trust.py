@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipeline.cli import run_command
-from pipeline.manifests import BadManifest, Manifest, check_outputs, outputs_digest, read, sealed
-from pipeline.workspace import Workspace
+from pipeline.cli.commands import run_command
+from pipeline.engine.manifests import BadManifest, Manifest, check_outputs, outputs_digest, read, sealed
+from pipeline.engine.workspace import Workspace
 from stages.contract import StageError
-from stages.photos import Photo, read_photos, write_photos
-from stages.sources import find_source
+from stages.ingest.sources import find_source
+from stages.io.photos import Photo, read_photos, write_photos
 from tests.end_to_end.hard_scenes import RING, run, write_set
 
 ROOT = Path(__file__).parents[2]

@@ -29,14 +29,14 @@ formats = ["ply", "glb"]
 
 
 def try_toml(folder: Path) -> None:
-    from pipeline.settings import read_toml, settings_from
+    from pipeline.cli.settings import read_toml, settings_from
 
     settings_from(read_toml(folder / "a.toml"), "--config a.toml")
 
 
 def try_run(folder: Path) -> None:
-    from pipeline import status
-    from pipeline.cli import _reader
+    from pipeline.cli.commands import _reader
+    from pipeline.engine import status
 
     with contextlib.chdir(folder):  # where relative paths in it lead
         status.all_statuses(*_reader(folder), deep=False)
@@ -45,7 +45,7 @@ def try_run(folder: Path) -> None:
 @cache
 def run_file() -> dict[str, Any]:
     """A valid run.json."""
-    from pipeline.settings import Settings
+    from pipeline.cli.settings import Settings
 
     options = Settings().model_dump(mode="json")
     keys = dict.fromkeys(options, "0" * 64)
@@ -63,7 +63,7 @@ def manifest() -> dict[str, Any]:
     """A valid manifest.json of one output."""
     from dataclasses import asdict
 
-    from pipeline.manifests import Manifest, outputs_digest
+    from pipeline.engine.manifests import Manifest, outputs_digest
 
     outputs = {"a.json": {"size": 2, "sha256": hashlib.sha256(b"{}").hexdigest()}}
     digest = outputs_digest(outputs)
@@ -72,7 +72,7 @@ def manifest() -> dict[str, Any]:
 
 def with_seal(text: bytes) -> bytes:
     """An object with the seal that it would have: what is behind the seal is to be read, too."""
-    from pipeline.manifests import sealed
+    from pipeline.engine.manifests import sealed
 
     try:
         value = json.loads(text)
@@ -82,13 +82,13 @@ def with_seal(text: bytes) -> bytes:
 
 
 def try_manifest(folder: Path) -> None:
-    from pipeline import manifests
+    from pipeline.engine import manifests
 
     manifests.check_outputs(folder, manifests.read(folder), deep=True)
 
 
 def try_photos(folder: Path) -> None:
-    from stages.photos import read_frame_names, read_photos
+    from stages.io.photos import read_frame_names, read_photos
 
     for photo in read_photos(folder):
         assert not Path(photo.file).is_absolute() and ".." not in Path(photo.file).parts
@@ -98,7 +98,7 @@ def try_photos(folder: Path) -> None:
 @cache
 def photos_file() -> bytes:
     """A valid photos.json."""
-    from stages.photos import write_photos
+    from stages.io.photos import write_photos
 
     with tempfile.TemporaryDirectory() as folder:
         write_photos(Path(folder), photos_of({"a": "p0.png", "b": "p1.png"}), [], {"a": "p0.png"})
@@ -106,13 +106,13 @@ def photos_file() -> bytes:
 
 
 def try_scene(folder: Path) -> None:
-    from stages.files import read_scene
+    from stages.io.files import read_scene
 
     read_scene(folder)
 
 
 def try_points(folder: Path) -> None:
-    from stages.files import read_tensors
+    from stages.io.files import read_tensors
 
     read_tensors(folder / "points.safetensors")
 
@@ -128,8 +128,8 @@ def points() -> bytes:
 @cache
 def field() -> dict[str, bytes]:
     """A valid, tiny trained field."""
-    from nerf.paper import PaperNerf, PaperSettings
-    from stages.field_files import save_field
+    from nerf.fields.vanilla import PaperNerf, PaperSettings
+    from stages.io.field_files import save_field
 
     model = PaperNerf(PaperSettings(depth=2, width=8, position_frequencies=2, direction_frequencies=1), seed=0)
     exposure = {"neutral": [0.0, 0.0, 0.0], "photos": {"p0.png": [0.1, 0.0, 0.0]}}
@@ -146,7 +146,7 @@ def fields() -> st.SearchStrategy[dict[str, bytes]]:
 
 
 def try_field(folder: Path) -> None:
-    from stages.field_files import load_field
+    from stages.io.field_files import load_field
 
     load_field(folder)
 
@@ -156,7 +156,7 @@ def checkpoint() -> dict[str, bytes]:
     """A valid checkpoint."""
     import torch
 
-    from stages.checkpoints import Checkpoint, save_checkpoint
+    from stages.train.checkpoints import Checkpoint, save_checkpoint
 
     with tempfile.TemporaryDirectory() as folder:
         save_checkpoint(Path(folder), Checkpoint(7, {"w": torch.zeros(3)}, {"lr": 0.1}))
@@ -164,7 +164,7 @@ def checkpoint() -> dict[str, bytes]:
 
 
 def try_checkpoint(folder: Path) -> None:
-    from stages.checkpoints import latest_checkpoint
+    from stages.train.checkpoints import latest_checkpoint
 
     if latest_checkpoint(folder, lambda _: None) is None:
         raise StageError("no checkpoint", "the only one is damaged", "-")

@@ -3,9 +3,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nerf.alignment import align
-from nerf.camera_paths import nearest_rotations
-from nerf.scene import Similarity
+from nerf.geometry.alignment import align
+from nerf.geometry.camera_paths import nearest_rotations
+from nerf.geometry.scene import Similarity
 
 
 @given(seed=st.integers(0, 2**32 - 1), count=st.integers(3, 12), scale=st.floats(1e-3, 1e3), far=st.floats(0, 100))

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nerf.camera_paths import (
+from nerf.geometry.camera_paths import (
     average_pose,
     interpolated,
     keeps_clear,

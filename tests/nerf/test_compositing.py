@@ -5,7 +5,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nerf.compositing import composite, volume_weights
+from nerf.rendering.volume_rendering import composite, volume_weights
 from tests.reference import paper_loop
 
 BLACK = torch.zeros(3, dtype=torch.float64)

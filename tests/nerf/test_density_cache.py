@@ -4,10 +4,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerf.density_cache import YOUNG_STEPS, DensityCache
-from nerf.grid_field import GridField, GridSettings
-from nerf.kernels import reference
-from nerf.kernels.cache import BRICK_CELLS, cell_corners
+from nerf.fields.hash_grid import GridField, GridSettings
+from nerf.fields.occupancy_grid import YOUNG_STEPS, DensityCache
+from nerf.kernels import torch as reference
+from nerf.kernels.torch.occupancy import BRICK_CELLS, cell_corners
 
 CELLS = 16
 NUMBERS = torch.arange(CELLS**3)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from nerf.depth_range import LEAST_NEAR, range_between_views
+from nerf.geometry.near_far import LEAST_NEAR, range_between_views
 
 PHOTOS = np.array([[0.0, 0, -2.5], [0.5, 0, -2.5], [-0.5, 0, -2.5], [0, 0, 9.0]])
 NEAR, FAR = np.array([1.0, 1.1, 1.2, 0.1]), np.array([20.0, 30.0, 25.0, 90.0])

@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from nerf.encoding import positional_encoding
+from nerf.fields.positional_encoding import positional_encoding
 from tests.reference.paper_loop import encode
 
 

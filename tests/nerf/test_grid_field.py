@@ -5,13 +5,15 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerf import grid_mlp, sky
-from nerf.grid_field import THIN, GridField, GridSettings
-from nerf.kernels import Backend, GridLayout, Lattice, Samples, reference, warp
-from nerf.kernels.cache import occupied
-from nerf.model import RadianceModel, Rendering
-from nerf.rays import Rays
-from nerf.waves import HIDDEN_BEHIND
+from nerf.fields import background as sky
+from nerf.fields import mlp as grid_mlp
+from nerf.fields.hash_grid import THIN, GridField, GridSettings
+from nerf.fields.interface import RadianceModel, Rendering
+from nerf.geometry.rays import Rays
+from nerf.kernels import Backend, GridLayout, Lattice, Samples, warp
+from nerf.kernels import torch as reference
+from nerf.kernels.torch.occupancy import occupied
+from nerf.rendering.early_termination import HIDDEN_BEHIND
 
 SMALL = GridSettings(levels=2, log2_rows=9, coarsest=3, finest=9, steps=24, cache_cells=8)
 FOLDED = replace(SMALL, contracted=True, shortest_step=0.1, cone=0.2)
@@ -80,7 +82,7 @@ def encoded_by_autograd(layout: GridLayout, table: Tensor, points: Tensor) -> Te
 
 @pytest.mark.parametrize("settings", [SMALL, FOLDED, OUTDOORS, DIFFUSE])
 def test_all_gradients_are_those_of_autograd(settings: GridSettings, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nerf.grid_field.THIN", 0.0)
+    monkeypatch.setattr("nerf.fields.hash_grid.THIN", 0.0)
     monkeypatch.setattr(grid_mlp, "BLOCK", {"cpu": 7})  # so that there are several, the last one short
     model, given = field(settings), rays()
     jitter = torch.rand(6, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
@@ -278,7 +280,7 @@ def in_one_pass(
 
 def in_short_waves(monkeypatch: pytest.MonkeyPatch, whole: int, shortest: int, longest: int) -> None:
     for name, length in {"WAVE": {"cpu": whole}, "SHORTEST_WAVE": shortest, "LONGEST_WAVE": longest}.items():
-        monkeypatch.setattr(f"nerf.waves.{name}", length)
+        monkeypatch.setattr(f"nerf.rendering.early_termination.{name}", length)
 
 
 @pytest.mark.parametrize("settings", [SMALL, FOLDED])
@@ -373,7 +375,7 @@ def test_thin_samples_that_stand_for_others_keep_picture_and_gradients(
         return len(done.points), [*done.rendering, *gradients.weights]
 
     with monkeypatch.context() as patch:
-        patch.setattr("nerf.grid_field.THIN", 0.0)
+        patch.setattr("nerf.fields.hash_grid.THIN", 0.0)
         every, wanted = seen_and_gradients(0.0)
     counts, found = zip(*(seen_and_gradients((draw + 0.5) / draws) for draw in range(draws)), strict=True)
     assert max(counts) < 0.9 * every

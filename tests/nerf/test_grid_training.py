@@ -7,16 +7,16 @@ from torch import Tensor
 
 from nerf.effects import AS_GIVEN, AS_RENDERED
 from nerf.effects.exposure import expose
-from nerf.effects.exposures import Exposures
-from nerf.effects.poses import RefinedPoses
-from nerf.grid_field import GridField, GridSettings
-from nerf.grid_training import GridBatch, GridTrainer, GridTrainerSettings, depth_factor, rate_factor
-from nerf.kernels import reference
-from nerf.probe import make_probe, measure
-from nerf.ray_bank import RayBank, build_ray_bank
-from nerf.rays import Rays
-from nerf.sky import sky_colour
-from nerf.training import FieldTrainer, NonFinite
+from nerf.effects.exposure_model import Exposures
+from nerf.effects.pose_refinement import RefinedPoses
+from nerf.fields.background import sky_colour
+from nerf.fields.hash_grid import GridField, GridSettings
+from nerf.geometry.rays import Rays
+from nerf.kernels import torch as reference
+from nerf.training.hash_grid_trainer import GridBatch, GridTrainer, GridTrainerSettings, depth_factor, rate_factor
+from nerf.training.ray_dataset import RayBank, build_ray_bank
+from nerf.training.trainer import FieldTrainer, NonFinite
+from nerf.training.validation_probe import make_probe, measure
 
 FIELD = GridSettings(levels=2, log2_rows=10, coarsest=4, finest=16, steps=32, cache_cells=16)
 BACKGROUND = (0.2, 0.9, 0.5)

@@ -8,14 +8,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerf.effects.poses import RefinedPoses
-from nerf.grid_field import GridField
-from nerf.grid_training import GridTrainer, _Part
-from nerf.kernels import reference
-from nerf.model import Rendering
-from nerf.ray_bank import RayBank
-from nerf.robust_loss import robust_error
-from nerf.training import RAYS, NonFinite
+from nerf.effects.pose_refinement import RefinedPoses
+from nerf.fields.hash_grid import GridField
+from nerf.fields.interface import Rendering
+from nerf.kernels import torch as reference
+from nerf.training.hash_grid_trainer import GridTrainer, _Part
+from nerf.training.losses import robust_error
+from nerf.training.ray_dataset import RayBank
+from nerf.training.trainer import RAYS, NonFinite
 from tests.nerf.test_grid_training import FIELD, TRAINER, copied, same, small_bank, trainer
 
 

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from nerf.lattice import (
+from nerf.fields.density_grid import (
     Lattice,
     along,
     density_lattice,
@@ -17,7 +17,7 @@ from nerf.lattice import (
     stopping_distance,
     trilinear,
 )
-from nerf.rays import Rays, clip_to_box
+from nerf.geometry.rays import Rays, clip_to_box
 
 LOW, HIGH = torch.tensor([-0.9, -0.9, -0.9]), torch.tensor([0.9, 0.9, 0.9])
 

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nerf.learning_curve import FEWEST_STEPS, KNEE_DB, knee, last_doubling, next_doubling, quality_at
+from nerf.training.learning_curve import FEWEST_STEPS, KNEE_DB, knee, last_doubling, next_doubling, quality_at
 
 LATEST = 8.0
 

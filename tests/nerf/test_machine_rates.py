@@ -3,9 +3,9 @@ import time
 import pytest
 import torch
 
-from nerf import machine_rates
-from nerf.machine_rates import Rates, measure_rates
-from nerf.stopwatch import Stopwatch, Work
+from nerf.runtime import machine_rates
+from nerf.runtime.machine_rates import Rates, measure_rates
+from nerf.runtime.profiler import Stopwatch, Work
 
 CPU = torch.device("cpu")
 

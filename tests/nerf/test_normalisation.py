@@ -5,12 +5,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nerf.camera_paths import nearest_rotations
-from nerf.depth_range import LEAST_NEAR
-from nerf.normalisation import Normalisation, normalise
-from nerf.reconstruction import Reconstruction, angles_deg, extent
-from nerf.region import find_layout
-from nerf.up_vector import Witness
+from nerf.geometry.camera_paths import nearest_rotations
+from nerf.geometry.near_far import LEAST_NEAR
+from nerf.geometry.normalisation import Normalisation, normalise
+from nerf.geometry.reconstruction import Reconstruction, angles_deg, extent
+from nerf.geometry.region_of_interest import find_layout
+from nerf.geometry.up_vector import Witness
 from tests.camera_layouts import (
     ball,
     ground,

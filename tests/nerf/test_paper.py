@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from nerf.model import Rendering
-from nerf.paper import BOX, SOFTPLUS_SHIFT, PaperNerf, PaperSettings
-from nerf.randomness import generator
-from nerf.rays import Rays
+from nerf.fields.interface import Rendering
+from nerf.fields.vanilla import BOX, SOFTPLUS_SHIFT, PaperNerf, PaperSettings
+from nerf.geometry.rays import Rays
+from nerf.runtime.randomness import generator
 from tests.reference import paper_loop
 
 SMALL = PaperSettings(

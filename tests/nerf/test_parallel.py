@@ -5,7 +5,7 @@ import threading
 import pytest
 import torch
 
-from nerf.parallel import in_order, take_over_cores, workers
+from nerf.runtime.parallel import in_order, take_over_cores, workers
 
 CPU = torch.device("cpu")
 

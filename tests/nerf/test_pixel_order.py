@@ -5,7 +5,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nerf.pixel_order import STRATUM, PixelOrder
+from nerf.training.pixel_sampler import STRATUM, PixelOrder
 
 
 @pytest.mark.parametrize("count", [STRATUM, 12 * STRATUM, 701 * STRATUM])

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from nerf.pose_distance import NEIGHBOURS, neighbour_weights, pose_distances
+from nerf.geometry.pose_distance import NEIGHBOURS, neighbour_weights, pose_distances
 
 
 def poses(*x: float) -> np.ndarray:

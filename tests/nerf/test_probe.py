@@ -3,11 +3,11 @@ import math
 import pytest
 import torch
 
-from nerf.metrics import PSNR_LIMIT
-from nerf.model import Rendering
-from nerf.probe import make_patches, make_probe, measure, pictures
-from nerf.ray_bank import RayBank, build_ray_bank
-from nerf.rays import Rays
+from nerf.fields.interface import Rendering
+from nerf.geometry.rays import Rays
+from nerf.training.metrics import PSNR_LIMIT
+from nerf.training.ray_dataset import RayBank, build_ray_bank
+from nerf.training.validation_probe import make_patches, make_probe, measure, pictures
 
 
 class Painted:

@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from nerf import product_precision
-from nerf.product_precision import MOST_ERROR, Medium, error_of, medium_products, products_at
+from nerf.runtime import matmul_precision as product_precision
+from nerf.runtime.matmul_precision import MOST_ERROR, Medium, error_of, medium_products, products_at
 
 CPU = torch.device("cpu")
 

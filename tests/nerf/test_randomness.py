@@ -2,7 +2,7 @@ import itertools
 
 import torch
 
-from nerf.randomness import generator
+from nerf.runtime.randomness import generator
 
 
 def draw(*numbers: int) -> list[float]:

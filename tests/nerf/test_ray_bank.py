@@ -6,9 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from nerf.randomness import generator
-from nerf.ray_bank import Placement, RayBank, _in_runs, build_ray_bank, ray_bank
-from nerf.rays import rays_of_view
+from nerf.geometry.rays import rays_of_view
+from nerf.runtime.randomness import generator
+from nerf.training.ray_dataset import Placement, RayBank, _in_runs, build_ray_bank, ray_bank
 
 SIZES = [(3, 5), (4, 2), (3, 5)]  # (height, width) of each view
 CAMERAS = [0, 1, 0]

@@ -5,7 +5,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nerf.rays import Rays, clip_to_box, join_rays, points_on, rays_of_view
+from nerf.geometry.rays import Rays, clip_to_box, join_rays, points_on, rays_of_view
 from tests.reference import paper_loop
 
 

@@ -2,8 +2,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nerf.camera_paths import nearest_rotations
-from nerf.reconstruction import closest_point_to_lines, spatial_median
+from nerf.geometry.camera_paths import nearest_rotations
+from nerf.geometry.reconstruction import closest_point_to_lines, spatial_median
 
 random = np.random.default_rng(0)
 

@@ -5,9 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from nerf.camera_paths import look_at
-from nerf.normalisation import normalise
-from nerf.reconstruction import Reconstruction, angles_deg
+from nerf.geometry.camera_paths import look_at
+from nerf.geometry.normalisation import normalise
+from nerf.geometry.reconstruction import Reconstruction, angles_deg
 from tests.nerf.test_normalisation import region_half
 
 

@@ -1,10 +1,10 @@
 import pytest
 import torch
 
-from nerf.model import Rendering
-from nerf.paper import PaperNerf, PaperSettings
-from nerf.rays import Rays
-from nerf.rendering import render_image
+from nerf.fields.interface import Rendering
+from nerf.fields.vanilla import PaperNerf, PaperSettings
+from nerf.geometry.rays import Rays
+from nerf.rendering.images import render_image
 
 
 class Gradient:

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from nerf.robust_loss import LARGEST_PULL, robust_error
+from nerf.training.losses import LARGEST_PULL, robust_error
 
 
 def test_small_errors_are_squared_and_large_ones_pull_no_harder() -> None:

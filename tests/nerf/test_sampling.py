@@ -5,8 +5,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nerf.randomness import generator
-from nerf.sampling import Spacing, invert_cdf, midpoint_edges, sample_pdf, stratified
+from nerf.rendering.sampling import Spacing, invert_cdf, midpoint_edges, sample_pdf, stratified
+from nerf.runtime.randomness import generator
 from tests.reference import paper_loop
 
 

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nerf.scene import Camera, Scene, Similarity, View
+from nerf.geometry.scene import Camera, Scene, Similarity, View
 
 
 def turned(angle: float, scale: float, translation: list[float]) -> Similarity:

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nerf.schedule import CLOSING_SHARE, StepPlan, learning_rate, plan_of, replanned, steps_that_fit
+from nerf.training.schedule import CLOSING_SHARE, StepPlan, learning_rate, plan_of, replanned, steps_that_fit
 
 
 @st.composite

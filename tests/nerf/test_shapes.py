@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from nerf.shapes import Box, Frustum, Sphere, Torus
+from nerf.synthetic.shapes import Box, Frustum, Sphere, Torus
 
 SHAPES = {
     "sphere": (Sphere(0.7), 4 / 3 * math.pi * 0.7**3),

@@ -1,8 +1,8 @@
 import pytest
 import torch
 
-from nerf import solid_texture
-from nerf.solid_texture import LATTICE, make_noise
+from nerf.synthetic import textures as solid_texture
+from nerf.synthetic.textures import LATTICE, make_noise
 
 TEXTURES = ("mosaic", "marble", "wrapping", "banded", "foliage", "doughnut", "peel")
 

@@ -6,8 +6,8 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 import torch
 
-from nerf.parallel import in_order
-from nerf.stopwatch import REST, UNTIMED, Spent, Stopwatch, Work, part, running
+from nerf.runtime.parallel import in_order
+from nerf.runtime.profiler import REST, UNTIMED, Spent, Stopwatch, Work, part, running
 
 CPU = torch.device("cpu")
 

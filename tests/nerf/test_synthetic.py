@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from nerf.rays import Rays, rays_of_view
-from nerf.synthetic import SyntheticScene, photograph, ring_of_cameras, still_life
+from nerf.geometry.rays import Rays, rays_of_view
+from nerf.synthetic.scenes import SyntheticScene, photograph, ring_of_cameras, still_life
 
 
 @pytest.fixture(scope="module")

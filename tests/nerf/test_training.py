@@ -5,13 +5,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerf.effects.exposures import Exposures
-from nerf.effects.poses import RefinedPoses
-from nerf.paper import PaperNerf, PaperSettings
-from nerf.probe import make_probe, measure
-from nerf.ray_bank import RayBank, build_ray_bank
-from nerf.rays import Rays
-from nerf.training import NonFinite, PaperTrainer, TrainerSettings, over
+from nerf.effects.exposure_model import Exposures
+from nerf.effects.pose_refinement import RefinedPoses
+from nerf.fields.vanilla import PaperNerf, PaperSettings
+from nerf.geometry.rays import Rays
+from nerf.training.ray_dataset import RayBank, build_ray_bank
+from nerf.training.trainer import NonFinite, PaperTrainer, TrainerSettings, over
+from nerf.training.validation_probe import make_probe, measure
 
 FIELD = PaperSettings(
     depth=2, width=16, skip=9, position_frequencies=3, direction_frequencies=1, samples_coarse=8, samples_fine=8

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from nerf.camera_paths import look_at, nearest_rotations
-from nerf.reconstruction import angles_deg
-from nerf.up_vector import find_up, up_by_places
+from nerf.geometry.camera_paths import look_at, nearest_rotations
+from nerf.geometry.reconstruction import angles_deg
+from nerf.geometry.up_vector import find_up, up_by_places
 from tests.camera_layouts import ball, ring, seen_by, survey, wall
 
 UP = np.array([0.0, 0.0, 1.0])

@@ -7,16 +7,17 @@ from typing import Any
 import pytest
 import torch
 
-from nerf import visibility
-from nerf.contraction import uncontract
-from nerf.depth_range import NEAR_MARGIN
-from nerf.grid_field import GridField, GridSettings
-from nerf.grid_training import GridTrainer, GridTrainerSettings
-from nerf.kernels import CONTRACTED_BOX, reference
-from nerf.kernels.cache import cell_corners, cell_numbers, grown, is_occupied
-from nerf.kernels.marching import unit_coordinates
-from nerf.ray_bank import RayBank, build_ray_bank
-from nerf.visibility import usable_cells
+from nerf.fields import frustum_mask as visibility
+from nerf.fields.frustum_mask import usable_cells
+from nerf.fields.hash_grid import GridField, GridSettings
+from nerf.geometry.contraction import uncontract
+from nerf.geometry.near_far import NEAR_MARGIN
+from nerf.kernels import CONTRACTED_BOX
+from nerf.kernels import torch as reference
+from nerf.kernels.torch.marching import unit_coordinates
+from nerf.kernels.torch.occupancy import cell_corners, cell_numbers, grown, is_occupied
+from nerf.training.hash_grid_trainer import GridTrainer, GridTrainerSettings
+from nerf.training.ray_dataset import RayBank, build_ray_bank
 
 SIZE, HALF = 12, 0.5  # pixels of a photo, and half its width at a distance of one
 NEAR, FAR = 1.0, 40.0

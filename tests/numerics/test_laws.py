@@ -9,17 +9,18 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from nerf.compositing import composite, volume_weights
-from nerf.contraction import contract, uncontract
-from nerf.encoding import positional_encoding
-from nerf.kernels import BOX, Backend, Lattice, Samples, grid_layout, reference, warp
-from nerf.kernels.cache import cell_numbers, occupied
-from nerf.lattice import Lattice as DensityLattice
-from nerf.rays import Rays, clip_to_box
-from nerf.sampling import invert_cdf
+from nerf.fields.density_grid import Lattice as DensityLattice
+from nerf.fields.positional_encoding import positional_encoding
+from nerf.geometry.contraction import contract, uncontract
+from nerf.geometry.rays import Rays, clip_to_box
+from nerf.kernels import BOX, Backend, Lattice, Samples, grid_layout, warp
+from nerf.kernels import torch as reference
+from nerf.kernels.torch.occupancy import cell_numbers, occupied
+from nerf.rendering.sampling import invert_cdf
+from nerf.rendering.volume_rendering import composite, volume_weights
 from stages.contract import StageError
-from stages.image_metrics import ssim
-from stages.mesh_surface import extract, is_watertight
+from stages.evaluate.image_metrics import ssim
+from stages.mesh.surface import extract, is_watertight
 
 BACKENDS = pytest.mark.parametrize("backend", [reference, warp], ids=["torch", "warp"])
 DENSITY = st.one_of(st.just(0.0), st.floats(-45, 30).map(lambda e: 10.0**e), st.floats(0, 100))

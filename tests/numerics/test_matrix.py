@@ -1,4 +1,5 @@
-"""Every case of nerf/numerics within its bounds, its gradient that of differences, and docs/NUMERICS.md the result."""
+"""Every case of pipeline/doctor/numerics within its bounds, its gradient that of differences, and docs/NUMERICS.md the
+result."""
 
 import ast
 import functools
@@ -10,9 +11,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerf.kernels import Backend, reference, warp
-from nerf.numerics import Bound, Case, Measured, cotangent, error, measure
-from nerf.numerics.matrix import CASES, Row, figure, limit
+from nerf.kernels import Backend, warp
+from nerf.kernels import torch as reference
+from pipeline.doctor.numerics import Bound, Case, Measured, cotangent, error, measure
+from pipeline.doctor.numerics.matrix import CASES, Row, figure, limit
 from tests.devices import skip_without
 from tests.numerics.document import DOCUMENT, ELSEWHERE, NO_FORMULA, REPEATED, STATISTICS, document
 

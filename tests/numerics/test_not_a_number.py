@@ -5,8 +5,9 @@ import math
 import pytest
 import torch
 
-from nerf.kernels import Backend, Lattice, Samples, grid_layout, reference, warp
-from nerf.model import Rendering
+from nerf.fields.interface import Rendering
+from nerf.kernels import Backend, Lattice, Samples, grid_layout, warp
+from nerf.kernels import torch as reference
 
 BACKENDS = pytest.mark.parametrize("backend", [reference, warp], ids=["torch", "warp"])
 SAMPLES = Samples(

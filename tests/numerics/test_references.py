@@ -1,4 +1,5 @@
-"""The references of nerf/numerics against 50 digits: formulas as they stand in the papers, one number at a time."""
+"""The references of pipeline/doctor/numerics against 50 digits: formulas as they stand in the papers, one number at a
+time."""
 
 from collections.abc import Callable
 
@@ -7,14 +8,14 @@ import torch
 from mpmath import mp, mpf
 from torch import Tensor
 
+from nerf.fields.vanilla import SOFTPLUS_SHIFT
 from nerf.kernels import Lattice
-from nerf.kernels.adam import LEAST_ROOT
-from nerf.numerics import Case, error
-from nerf.numerics.losses import GROWING
-from nerf.numerics.matrix import CASES
-from nerf.numerics.networks import COUNT
-from nerf.numerics.space import FOLDED, OCTAVES
-from nerf.paper import SOFTPLUS_SHIFT
+from nerf.kernels.torch.adam import LEAST_ROOT
+from pipeline.doctor.numerics import Case, error
+from pipeline.doctor.numerics.losses import GROWING
+from pipeline.doctor.numerics.matrix import CASES
+from pipeline.doctor.numerics.networks import COUNT
+from pipeline.doctor.numerics.space import FOLDED, OCTAVES
 
 mp.dps = 50
 Row = list[mpf]

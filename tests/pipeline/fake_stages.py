@@ -7,7 +7,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from stages.contract import Progress, StageConfig, StageError, StageResult
-from stages.files import read_json, write_json
+from stages.io.files import read_json, write_json
 
 calls: list[str] = []
 

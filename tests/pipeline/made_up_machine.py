@@ -10,14 +10,14 @@ import pytest
 from PIL import Image
 from pydantic import BaseModel
 
-from pipeline.budget import SHARES, Budget, reading_seconds
-from pipeline.display import SilentDisplay
-from pipeline.runner import Runner
-from pipeline.workspace import RUN_FILE, Workspace
+from pipeline.cli.display import SilentDisplay
+from pipeline.engine.runner import Runner
+from pipeline.engine.workspace import RUN_FILE, Workspace
+from pipeline.schedule.budget import SHARES, Budget, reading_seconds
 from stages.contract import StageConfig, StageError, StageResult
-from stages.device import processors
-from stages.files import write_durably, write_json
-from stages.photos import Photo, write_photos
+from stages.hardware.device import processors
+from stages.io.files import write_durably, write_json
+from stages.io.photos import Photo, write_photos
 
 CHAIN = ("ingest", "sfm", "normalise", "effects", "train", "evaluate", "render", "mesh", "report")
 NEEDS: dict[str, tuple[str, ...]] = {
@@ -79,7 +79,7 @@ class Machine:
 
     @contextmanager
     def periodically(self, seconds: float, act: Callable[[], object]) -> Iterator[None]:
-        """stages/periodically.py, by this machine's clock."""
+        """stages/io/periodically.py, by this machine's clock."""
         self.beats[act] = seconds, self.now + seconds
         try:
             yield
@@ -87,7 +87,7 @@ class Machine:
             del self.beats[act]
 
     def write_durably(self, path: Path, content: bytes) -> None:
-        """stages/files.py, for those who note how long they worked: a killed program does so no more."""
+        """stages/io/files.py, for those who note how long they worked: a killed program does so no more."""
         if self.dead:
             raise OSError
         write_durably(path, content)
@@ -200,12 +200,12 @@ def runs_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Go:
         machine: Machine, total: float | None, resume=False, stages=CHAIN, replan=(), alone=False, **options
     ) -> Outcome:
         clock = SimpleNamespace(monotonic=lambda: machine.now)
-        monkeypatch.setattr("pipeline.runner.STAGES", chain(machine))
-        monkeypatch.setattr("pipeline.runner.time", clock)
-        monkeypatch.setattr("stages.stopwatch.time", clock)
-        monkeypatch.setattr("stages.colmap.load", lambda: None)
-        monkeypatch.setattr("stages.stopwatch.periodically", machine.periodically)
-        monkeypatch.setattr("stages.stopwatch.write_durably", machine.write_durably)
+        monkeypatch.setattr("pipeline.engine.runner.STAGES", chain(machine))
+        monkeypatch.setattr("pipeline.engine.runner.time", clock)
+        monkeypatch.setattr("stages.io.stopwatch.time", clock)
+        monkeypatch.setattr("stages.sfm.colmap.load", lambda: None)
+        monkeypatch.setattr("stages.io.stopwatch.periodically", machine.periodically)
+        monkeypatch.setattr("stages.io.stopwatch.write_durably", machine.write_durably)
         settings = Options.model_validate({"ingest": {"photos": photos}} | options)
         machine.root, machine.dead = tmp_path / "w.nerf", False
         with Workspace(machine.root) as workspace:

@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 from PIL import Image
 
-from pipeline.budget import LEAST_SECONDS, Budget, allotted, least_total, reading_seconds, training_seconds
-from pipeline.failures import StageFailed
-from stages.device import processors
-from stages.files import read_json
+from pipeline.cli.failures import StageFailed
+from pipeline.schedule.budget import LEAST_SECONDS, Budget, allotted, least_total, reading_seconds, training_seconds
+from stages.hardware.device import processors
+from stages.io.files import read_json
 from tests.pipeline.made_up_machine import EXPECTED, MUST, Go, Killed, Machine, runs_on, spent
 
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.budget import (
+from pipeline.schedule.budget import (
     BESIDE_PILOTS,
     LEAST_SECONDS,
     MOST_SECONDS,
@@ -20,9 +20,9 @@ from pipeline.budget import (
     least_total,
     training_seconds,
 )
-from pipeline.forecast import without_budget
-from stages.files import read_json
-from stages.stopwatch import BEAT
+from pipeline.schedule.forecast import without_budget
+from stages.io.files import read_json
+from stages.io.stopwatch import BEAT
 from stages.train import Config as TrainConfig
 from tests.pipeline.made_up_machine import CHAIN, EXPECTED, Go, Killed, Machine, runs_on, spent
 

@@ -12,10 +12,10 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from pipeline.cli import run_command
-from pipeline.runner import Runner
-from pipeline.settings import Settings
-from pipeline.workspace import default_workspace
+from pipeline.cli.commands import run_command
+from pipeline.cli.settings import Settings
+from pipeline.engine.runner import Runner
+from pipeline.engine.workspace import default_workspace
 from stages.contract import StageError
 
 
@@ -94,7 +94,9 @@ def test_a_config_file_is_validated(tmp_path: Path, capsys: pytest.CaptureFixtur
 
 def test_like_is_an_option_of_render_whichever_way_it_is_spelt(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     seen: list[str | None] = []
-    monkeypatch.setattr("pipeline.cli._run_stages", lambda root, settings, *_, **__: seen.append(settings.render.like))
+    monkeypatch.setattr(
+        "pipeline.cli.commands._run_stages", lambda root, settings, *_, **__: seen.append(settings.render.like)
+    )
     (tmp_path / "photos").mkdir()
     Image.new("RGB", (40, 30)).save(tmp_path / "photos/a.jpg")
     for words in (["--like", "a.jpg"], ["--render.like", "a.jpg"], []):
@@ -105,7 +107,7 @@ def test_like_is_an_option_of_render_whichever_way_it_is_spelt(tmp_path: Path, m
 def test_a_target_is_an_option_of_train_whichever_way_it_is_spelt(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     seen: list[float | None] = []
     monkeypatch.setattr(
-        "pipeline.cli._run_stages", lambda root, settings, *_, **__: seen.append(settings.train.target_psnr)
+        "pipeline.cli.commands._run_stages", lambda root, settings, *_, **__: seen.append(settings.train.target_psnr)
     )
     (tmp_path / "photos").mkdir()
     (tmp_path / "w").mkdir()
@@ -133,7 +135,9 @@ def test_a_photo_to_render_like_has_to_be_there(tmp_path: Path, capsys: pytest.C
 
 def test_like_belongs_to_render(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):
     seen: list[str | None] = []
-    monkeypatch.setattr("pipeline.cli._run_stages", lambda root, settings, *_, **__: seen.append(settings.render.like))
+    monkeypatch.setattr(
+        "pipeline.cli.commands._run_stages", lambda root, settings, *_, **__: seen.append(settings.render.like)
+    )
     (tmp_path / "run.json").write_text(json.dumps({"version": 1, "options": {}, "plans": {}, "keys": {}}))
     assert run_command(["mesh", str(tmp_path), "--like", "a.jpg"]) == 2
     assert "--like belongs to `pipeline render` and `pipeline run`, not to mesh" in capsys.readouterr().err
@@ -374,7 +378,7 @@ def test_a_budget_and_more_are_two_budgets(
     def with_after(settings: Settings, *_: object) -> Settings:
         return settings.model_copy(update={"train": settings.train.model_copy(update={"after": "0" * 16})})
 
-    monkeypatch.setattr("pipeline.cli.with_more", with_after)
+    monkeypatch.setattr("pipeline.cli.commands.with_more", with_after)
     (tmp_path / "w").mkdir()
     (tmp_path / "w/run.json").write_text('{"version": 1, "options": {}, "plans": {}, "keys": {}}')
     words = ["run", str(tmp_path), "-o", str(tmp_path / "w"), "--more", "10m", "--budget", "5m"]

@@ -6,15 +6,15 @@ import pytest
 import torch
 from PIL import Image
 
-from nerf.rays import rays_of_view
-from nerf.scene import Camera
-from nerf.synthetic import still_life
+from nerf.geometry.rays import rays_of_view
+from nerf.geometry.scene import Camera
+from nerf.synthetic.scenes import still_life
 from pipeline import demo
-from pipeline.cli import command_demo, run_command
-from pipeline.settings import Settings
-from pipeline.truth import Truth
-from stages.colmap.cameras import camera_rays
+from pipeline.cli.commands import command_demo, run_command
+from pipeline.cli.settings import Settings
+from pipeline.demo.truth import Truth
 from stages.contract import StageError
+from stages.sfm.colmap.cameras import camera_rays
 from tests.synthetic_photos import SyntheticPhotos
 
 TINY = Camera("OPENCV", 48, 36, (50.0, 50.0, 24.0, 18.0, -0.08, 0.03, 0.001, -0.001))
@@ -98,9 +98,9 @@ def test_the_demo_leaves_a_study_as_it_was_asked_for(tmp_path: Path, monkeypatch
     workspace.mkdir()
     run = {"version": 1, "options": {"tradeoff": {"seconds": 1200}}, "plans": {}, "keys": {}}
     (workspace / "run.json").write_text(json.dumps(run))
-    monkeypatch.setattr("pipeline.cli._run_stages", run_stages)
+    monkeypatch.setattr("pipeline.cli.commands._run_stages", run_stages)
     monkeypatch.setattr("pipeline.demo.photograph", lambda photos, display: ("made", 0.0))
-    monkeypatch.setattr("pipeline.cli.with_source", lambda settings, *_: settings)
+    monkeypatch.setattr("pipeline.cli.commands.with_source", lambda settings, *_: settings)
     monkeypatch.setattr("pipeline.demo.truth_lines", lambda *_: ["compared"])
     assert command_demo(["-o", str(tmp_path)]) == 1
     assert seen == [1200]

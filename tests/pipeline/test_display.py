@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.cli import run_command
-from pipeline.display import Display, PlainDisplay, choose_display, end_line
+from pipeline.cli.commands import run_command
+from pipeline.cli.display import Display, PlainDisplay, choose_display, end_line
 from stages.contract import StageError
 
 
@@ -66,7 +66,7 @@ def test_a_run_goes_on_when_its_terminal_is_closed(monkeypatch: pytest.MonkeyPat
 
 AT_WORK = """
 import os
-from pipeline import cli
+from pipeline.cli import commands as cli
 def at_work(words):
     os.write(1, b"at work")
     try:

@@ -10,10 +10,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipeline import forecast, manifests
-from pipeline.budget import BESIDE_PILOTS, Budget
-from pipeline.chain import usual
-from pipeline.forecast import (
+from pipeline.cli.settings import Settings
+from pipeline.engine import manifests
+from pipeline.engine.manifests import Manifest
+from pipeline.engine.stage_list import usual
+from pipeline.schedule import forecast
+from pipeline.schedule.budget import BESIDE_PILOTS, Budget
+from pipeline.schedule.forecast import (
     Photos,
     expected,
     photos_of,
@@ -22,11 +25,9 @@ from pipeline.forecast import (
     sfm_seconds,
     without_budget,
 )
-from pipeline.manifests import Manifest
-from pipeline.settings import Settings
 from stages.effects import Config as EffectsConfig
+from stages.io.video import video_writer
 from stages.train import Config as TrainConfig
-from stages.video import video_writer
 from tests.png_files import png
 
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.keys import ContentIndex, canonical_json, config_for_key, digest, stage_key
+from pipeline.engine.keys import ContentIndex, canonical_json, config_for_key, digest, stage_key
 from stages.contract import StageConfig, StageError
 
 json_values = st.recursive(

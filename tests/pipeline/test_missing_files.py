@@ -7,11 +7,11 @@ from typing import Any
 import pytest
 from PIL import Image
 
-from pipeline.cli import run_command
-from pipeline.display import SilentDisplay
-from pipeline.failures import StageFailed
-from pipeline.runner import Runner
-from pipeline.workspace import Workspace
+from pipeline.cli.commands import run_command
+from pipeline.cli.display import SilentDisplay
+from pipeline.cli.failures import StageFailed
+from pipeline.engine.runner import Runner
+from pipeline.engine.workspace import Workspace
 from stages.contract import StageError
 from tests.pipeline.made_up_machine import Machine, Options, runs_on
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.cli import run_command
+from pipeline.cli.commands import run_command
 from tests.small_scenes import write_blender_scene
 
 SMALL = "--train.levels 2 --train.log2-rows 8 --train.finest 16 --train.batch-samples 512 --train.chunks 1".split()
@@ -62,7 +62,7 @@ def test_more_has_a_folder_of_its_own_and_a_chain_of_them(trained, monkeypatch: 
 
 
 def test_an_interrupted_more_is_taken_up_by_the_same_words(trained, monkeypatch: pytest.MonkeyPatch):
-    from nerf.grid_training import GridTrainer
+    from nerf.training.hash_grid_trainer import GridTrainer
 
     photos, workspace = trained
     words = ["run", photos, "-o", workspace, "--until", "train", "--more", "9steps"]
@@ -123,7 +123,7 @@ def test_a_training_of_another_version_is_not_gone_on_with(trained, capsys: pyte
 
     photos, workspace = trained
     before = sorted(path for path in result(workspace).rglob("*") if path.is_file())
-    monkeypatch.setattr("nerf.grid_training.GridTrainer.load_state", refuse)
+    monkeypatch.setattr("nerf.training.hash_grid_trainer.GridTrainer.load_state", refuse)
     words = ["--more", "6steps", "--train.learning-rate", "0.02"]  # the workspace remembers the rate of another test
     assert run_command(["run", photos, "-o", workspace, "--until", "train", *words]) == 14
     said = capsys.readouterr().err

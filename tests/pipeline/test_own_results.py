@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from pipeline.cli import run_command
-from pipeline.display import SilentDisplay
-from pipeline.runner import Runner
-from pipeline.settings import Settings
-from pipeline.workspace import COPIES, Workspace, is_result, lasting
+from pipeline.cli.commands import run_command
+from pipeline.cli.display import SilentDisplay
+from pipeline.cli.settings import Settings
+from pipeline.engine.runner import Runner
+from pipeline.engine.workspace import COPIES, Workspace, is_result, lasting
 from stages.sfm import Config as SfmConfig
 
 SHOWN = {"render": "path.json", "sfm": "sparse", "normalise": "transforms.json"}
@@ -48,7 +48,9 @@ def photos(tmp_path: Path) -> Path:
 def seen(monkeypatch: pytest.MonkeyPatch) -> list[Settings]:
     """The settings of each run, of which no stage runs."""
     found: list[Settings] = []
-    monkeypatch.setattr("pipeline.runner.Runner.run", lambda self, *_, **__: found.append(self.settings) or False)
+    monkeypatch.setattr(
+        "pipeline.engine.runner.Runner.run", lambda self, *_, **__: found.append(self.settings) or False
+    )
     return found
 
 

@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from pipeline.display import SilentDisplay
-from pipeline.failures import StageFailed
-from pipeline.runner import Runner
-from pipeline.workspace import Workspace
+from pipeline.cli.display import SilentDisplay
+from pipeline.cli.failures import StageFailed
+from pipeline.engine.runner import Runner
+from pipeline.engine.workspace import Workspace
 from tests.pipeline import fake_stages
 from tests.pipeline.fake_stages import FakeSettings
 
@@ -18,7 +18,7 @@ from tests.pipeline.fake_stages import FakeSettings
 @pytest.fixture
 def photos(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Photos that the chain of fake stages was run on."""
-    monkeypatch.setattr("pipeline.runner.STAGES", fake_stages.STAGES)
+    monkeypatch.setattr("pipeline.engine.runner.STAGES", fake_stages.STAGES)
     folder = tmp_path / "photos/images"
     folder.mkdir(parents=True)
     Image.new("RGB", (4, 4)).save(folder / "0.png")

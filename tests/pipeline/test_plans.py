@@ -8,14 +8,14 @@ from typing import Any
 import pytest
 from PIL import Image
 
-from pipeline import forecast
-from pipeline.cli import run_command
-from pipeline.display import SilentDisplay
-from pipeline.failures import StageFailed
-from pipeline.runner import Runner
-from pipeline.status import status_of
-from pipeline.workspace import Workspace
-from stages.files import read_json
+from pipeline.cli.commands import run_command
+from pipeline.cli.display import SilentDisplay
+from pipeline.cli.failures import StageFailed
+from pipeline.engine.runner import Runner
+from pipeline.engine.status import status_of
+from pipeline.engine.workspace import Workspace
+from pipeline.schedule import forecast
+from stages.io.files import read_json
 from tests.pipeline import fake_stages, made_up_machine
 from tests.pipeline.fake_stages import FakeSettings, calls
 
@@ -25,7 +25,7 @@ Bring = Callable[..., None]
 @pytest.fixture
 def bring(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Bring:
     """Runs stages ingest and sfm of the fake chain with options of sfm."""
-    monkeypatch.setattr("pipeline.runner.STAGES", fake_stages.STAGES)
+    monkeypatch.setattr("pipeline.engine.runner.STAGES", fake_stages.STAGES)
     (tmp_path / "photos").mkdir()
     Image.new("RGB", (4, 4)).save(tmp_path / "photos/0.png")
 
@@ -73,7 +73,7 @@ def test_only_the_plans_of_the_stages_named_are_made_anew(bring: Bring, tmp_path
 def test_status_says_why_a_stage_is_stale_whose_plan_is_still_to_be_made(
     bring: Bring, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pipeline.status.STAGES", fake_stages.STAGES)
+    monkeypatch.setattr("pipeline.engine.status.STAGES", fake_stages.STAGES)
     bring()
     for number, sfm, why in (
         (1, {"fail": True}, "what its options leave open is chosen anew"),
@@ -92,7 +92,9 @@ def test_a_run_plans_its_stages_anew_and_one_stage_alone_itself(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seen: list[tuple[str, ...]] = []
-    monkeypatch.setattr("pipeline.runner.Runner.run", lambda *_, replan, **__: seen.append(tuple(replan)) or False)
+    monkeypatch.setattr(
+        "pipeline.engine.runner.Runner.run", lambda *_, replan, **__: seen.append(tuple(replan)) or False
+    )
     monkeypatch.chdir(tmp_path)
     run = {"version": 1, "options": {}, "plans": {}, "keys": {}, "stages": ["ingest", "sfm"]}
     (tmp_path / "run.json").write_text(json.dumps(run))
@@ -103,7 +105,7 @@ def test_a_run_plans_its_stages_anew_and_one_stage_alone_itself(
 
 def test_what_is_planned_anew_is_foretold(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     anew: list[frozenset[str]] = []
-    monkeypatch.setattr("pipeline.runner.Runner.run", lambda *_, **__: False)
+    monkeypatch.setattr("pipeline.engine.runner.Runner.run", lambda *_, **__: False)
     monkeypatch.setattr(forecast, "foretell", lambda *given: anew.append(given[2]) or forecast.Forecast([], {}))
     monkeypatch.chdir(tmp_path)
     run = {"version": 1, "options": {}, "plans": {"train": {"asked": {}}}, "keys": {}, "stages": ["ingest", "train"]}

@@ -8,14 +8,14 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from pipeline import status
-from pipeline.display import SilentDisplay
-from pipeline.failures import StageFailed
-from pipeline.job import NotReady
-from pipeline.runner import Runner
-from pipeline.workspace import Workspace
-from stages import sources
+from pipeline.cli.display import SilentDisplay
+from pipeline.cli.failures import StageFailed
+from pipeline.engine import status
+from pipeline.engine.job import NotReady
+from pipeline.engine.runner import Runner
+from pipeline.engine.workspace import Workspace
 from stages.contract import StageError
+from stages.ingest import sources
 from tests.pipeline import fake_stages
 from tests.pipeline.fake_stages import FakeSettings, calls
 
@@ -26,7 +26,7 @@ Bring = Callable[..., bool]
 @pytest.fixture(autouse=True)
 def fake_chain(monkeypatch: pytest.MonkeyPatch):
     for module in ("runner", "status"):
-        monkeypatch.setattr(f"pipeline.{module}.STAGES", fake_stages.STAGES)
+        monkeypatch.setattr(f"pipeline.engine.{module}.STAGES", fake_stages.STAGES)
     calls.clear()
 
 
@@ -326,7 +326,7 @@ def test_a_full_disk_under_the_books_is_the_workspaces_fault(tmp_path: Path, mon
         raise OSError(28, "No space left on device")
 
     with Workspace(tmp_path / "w.nerf") as workspace:
-        monkeypatch.setattr("pipeline.workspace.write_durably", full)
+        monkeypatch.setattr("pipeline.engine.workspace.write_durably", full)
         with pytest.raises(StageError, match="No space left on device"):
             workspace.write_run(workspace.read_run())
     monkeypatch.setattr(Path, "write_text", full)

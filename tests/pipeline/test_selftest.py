@@ -4,9 +4,11 @@ from importlib.metadata import version
 
 import pytest
 
-from nerf.numerics import matrix
-from nerf.numerics.matrix import CASES
-from pipeline import cli, doctor, machine, selftest
+from pipeline import doctor
+from pipeline.cli import commands as cli
+from pipeline.doctor import machine, selftest
+from pipeline.doctor.numerics import matrix
+from pipeline.doctor.numerics.matrix import CASES
 
 
 def test_every_formula_has_a_line_for_each_backend(capsys: pytest.CaptureFixture[str]) -> None:
@@ -20,7 +22,7 @@ def test_every_formula_has_a_line_for_each_backend(capsys: pytest.CaptureFixture
 
 
 def test_without_warp_torch_alone_is_measured(monkeypatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr("stages.backend.why_not_warp", lambda device: "it is not there")
+    monkeypatch.setattr("stages.hardware.backend.why_not_warp", lambda device: "it is not there")
     monkeypatch.setattr(matrix, "CASES", [case for case in CASES if case.kernels][:1])
     assert selftest.numerical_matrix("cpu") == []
     assert " torch " in (out := capsys.readouterr().out) and " warp " not in out
@@ -33,7 +35,10 @@ def test_what_is_off_is_said_and_the_program_ends_with_one(monkeypatch, capsys: 
     monkeypatch.setattr(doctor, "self_test", lambda device: [])
     assert cli.run_command(["doctor", "--selftest"]) == 1
     out = capsys.readouterr().out
-    assert f"problem: self-test: {case.formula} (nerf/contraction.py: contract) is off by more than its limit" in out
+    assert (
+        f"problem: self-test: {case.formula} (nerf/geometry/contraction.py: contract) is off by more than its limit"
+        in out
+    )
     assert "\n  FAILED " in out and "2 formulas, 1 within their limits" in out
 
 

@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from pipeline.arguments import RunArguments, StageArguments, parse
-from pipeline.cli import run_command
-from pipeline.settings import Settings, UsageError, read_toml, with_effects
+from pipeline.cli.arguments import RunArguments, StageArguments, parse
+from pipeline.cli.commands import run_command
+from pipeline.cli.settings import Settings, UsageError, read_toml, with_effects
 from stages.effects import Config
 from stages.render import Config as RenderConfig
 from stages.train import Config as TrainConfig

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.cli import run_command
+from pipeline.cli.commands import run_command
 
 STRUCK_IN_A_FINALISER = """
 import signal, sys, time
-from pipeline.signals import Terminated, heed_signals
+from pipeline.cli.signals import Terminated, heed_signals
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs begin with SIGINT ignored
 heed_signals()
@@ -38,7 +38,7 @@ def test_a_signal_that_python_ignores_arrives_all_the_same(number: signal.Signal
 
 def test_other_exceptions_that_python_ignores_are_told_as_ever() -> None:
     program = """
-from pipeline.signals import heed_signals
+from pipeline.cli.signals import heed_signals
 
 heed_signals()
 
@@ -59,7 +59,7 @@ import runpy, sys
 
 class Struck:
     def find_spec(self, name, *_):
-        if name == "pipeline.cli":
+        if name == "pipeline.cli.commands":
             raise KeyboardInterrupt
 
 sys.meta_path.insert(0, Struck())
@@ -88,6 +88,6 @@ def test_what_was_stopped_is_told_how_to_go_on(
     def interrupted(_: str):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("pipeline.cli._command", interrupted)
+    monkeypatch.setattr("pipeline.cli.commands._command", interrupted)
     assert run_command(words.split()) == 130
     assert f"Finished stages are kept; {way}.\n" in capsys.readouterr().err

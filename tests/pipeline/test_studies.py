@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from pipeline import chain
-from pipeline.cli import run_command
-from pipeline.settings import Settings
+from pipeline.cli.commands import run_command
+from pipeline.cli.settings import Settings
+from pipeline.engine import stage_list as chain
 
 
 def test_a_study_is_asked_for_by_its_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -17,7 +17,7 @@ def test_a_study_is_asked_for_by_its_time(tmp_path: Path, monkeypatch: pytest.Mo
     def remember(_root: Path, settings: Settings, stages: list[str], *_: object, **__: object) -> None:
         seen.append((settings, stages))
 
-    monkeypatch.setattr("pipeline.cli._run_stages", remember)
+    monkeypatch.setattr("pipeline.cli.commands._run_stages", remember)
     (tmp_path / "run.json").write_text('{"version": 1, "options": {}, "plans": {}, "keys": {}}')
     run_command(["tradeoff", str(tmp_path), "--budget", "30m"])
     run_command(["tradeoff", str(tmp_path), "--tradeoff.seconds", "60"])
@@ -28,7 +28,7 @@ def test_a_study_is_asked_for_by_its_time(tmp_path: Path, monkeypatch: pytest.Mo
 def test_a_run_leaves_a_study_as_it_was_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     seen: list[float] = []
     monkeypatch.setattr(
-        "pipeline.cli._run_stages", lambda root, settings, *_, **__: seen.append(settings.tradeoff.seconds)
+        "pipeline.cli.commands._run_stages", lambda root, settings, *_, **__: seen.append(settings.tradeoff.seconds)
     )
     photos, workspace, file = tmp_path / "photos", tmp_path / "w", tmp_path / "options.toml"
     photos.mkdir()
@@ -47,7 +47,7 @@ def test_a_run_leaves_a_study_as_it_was_asked_for(tmp_path: Path, monkeypatch: p
 def test_the_name_of_a_study_is_no_option_of_it(words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     seen: list[float] = []
     monkeypatch.setattr(
-        "pipeline.cli._run_stages", lambda root, settings, *_, **__: seen.append(settings.tradeoff.seconds)
+        "pipeline.cli.commands._run_stages", lambda root, settings, *_, **__: seen.append(settings.tradeoff.seconds)
     )
     monkeypatch.chdir(tmp_path)
     run = {"version": 1, "options": {"tradeoff": {"seconds": 1200}}, "plans": {}, "keys": {}}

@@ -8,11 +8,11 @@ import trimesh
 from scipy.spatial.transform import Rotation
 from skimage.measure import marching_cubes
 
-from nerf.scene import Camera, Scene, Similarity, View
-from nerf.synthetic import ring_of_cameras, still_life
-from pipeline.truth import Truth, compare_with_truth, seen
+from nerf.geometry.scene import Camera, Scene, Similarity, View
+from nerf.synthetic.scenes import ring_of_cameras, still_life
+from pipeline.demo.truth import Truth, compare_with_truth, seen
 from stages.contract import StageError
-from stages.transforms_export import transforms
+from stages.io.transforms_export import transforms
 
 LENS = Camera("OPENCV", 480, 360, (500.0, 502.0, 240.0, 180.0, 0.0, 0.0, 0.0, 0.0))
 SFM_FROM_TRUTH = Similarity(3.7, Rotation.from_euler("xyz", [0.4, -1.1, 2.0]).as_matrix(), np.array([5.0, -2.0, 9.0]))

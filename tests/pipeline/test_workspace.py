@@ -12,12 +12,12 @@ from typing import Any
 import pytest
 from PIL import Image
 
-from pipeline.cli import run_command
-from pipeline.manifests import Manifest, describe_outputs, outputs_digest
-from pipeline.status import status_of
-from pipeline.workspace import COPIES, Workspace
+from pipeline.cli.commands import run_command
+from pipeline.engine.manifests import Manifest, describe_outputs, outputs_digest
+from pipeline.engine.status import status_of
+from pipeline.engine.workspace import COPIES, Workspace
 from stages.contract import StageError
-from stages.files import make_durable
+from stages.io.files import make_durable
 
 KEY = "0123456789abcdef"
 

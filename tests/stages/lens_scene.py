@@ -4,11 +4,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from nerf.scene import Camera
-from stages.colmap.cameras import native
-from stages.colmap.held_out import adjustment_options
-from stages.colmap.lenses import equip
-from stages.colmap.observations import observations, points_in_camera, residuals
+from nerf.geometry.scene import Camera
+from stages.sfm.colmap.cameras import native
+from stages.sfm.colmap.held_out import adjustment_options
+from stages.sfm.colmap.lenses import equip
+from stages.sfm.colmap.observations import observations, points_in_camera, residuals
 
 if TYPE_CHECKING:
     import pycolmap

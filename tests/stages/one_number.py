@@ -9,14 +9,14 @@ import torch
 from torch import Tensor
 
 from nerf.effects import AS_GIVEN, AS_RENDERED
-from nerf.model import Rendering
-from nerf.probe import Patches, Probe
-from nerf.rays import Rays
-from nerf.training import StepResult
-from stages.training_log import TrainingLog
-from stages.training_loop import TrainingRun
-from stages.training_state import Probes, TrainingBudget
-from stages.unseen import Target, Unseen
+from nerf.fields.interface import Rendering
+from nerf.geometry.rays import Rays
+from nerf.training.trainer import StepResult
+from nerf.training.validation_probe import Patches, Probe
+from stages.train.log import TrainingLog
+from stages.train.loop import TrainingRun
+from stages.train.state import Probes, TrainingBudget
+from stages.train.validation_images import Target, Unseen
 
 
 class Killed(BaseException):

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import numpy as np
 
-from nerf.scene import Camera, Scene, Similarity, View
-from stages.effect_decisions import Decisions, write_decisions
-from stages.files import write_json, write_png, write_tensors
+from nerf.geometry.scene import Camera, Scene, Similarity, View
+from stages.effects.decisions import Decisions, write_decisions
+from stages.io.files import write_json, write_png, write_tensors
 
 WIDTH, HEIGHT, FOCAL = 24, 16, 20.0
 RADIUS = 0.6  # of the ball

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from nerf.scene import Camera, Scene, Similarity, View
+from nerf.geometry.scene import Camera, Scene, Similarity, View
 from stages import report
-from stages.files import write_json, write_tensors
+from stages.io.files import write_json, write_tensors
 
 NASTY = "<script>alert(1)</script>.jpg"
 FACTS = {

@@ -6,7 +6,7 @@ import numpy as np
 from PIL import Image
 
 from stages import sfm
-from stages.photos import Photo, write_photos
+from stages.io.photos import Photo, write_photos
 
 SMALL = sfm.Config(max_features=1000)
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stages.ascii_names import ascii_files
+from stages.io.ascii_names import ascii_files
 
 
 def test_names_that_are_safe_are_kept_and_others_tell_what_they_were() -> None:

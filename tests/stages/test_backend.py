@@ -10,11 +10,12 @@ from typing import Any
 import pytest
 
 import nerf.kernels
-from nerf.kernels import reference, warp
+from nerf.kernels import torch as reference
+from nerf.kernels import warp
 from stages import evaluate, mesh, render, train
-from stages.backend import chosen_backend, load_backend
 from stages.contract import StageConfig, StageError
-from stages.field_files import load_field
+from stages.hardware.backend import chosen_backend, load_backend
+from stages.io.field_files import load_field
 from stages.train import Config
 from tests.stages.photo_scene import photographed
 
@@ -57,7 +58,7 @@ def test_a_warp_that_does_not_load_is_no_failure(missing: None, progress) -> Non
 def test_where_kernels_cannot_be_kept_the_way_out_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").touch()
     environment = {**os.environ, "WARP_CACHE_PATH": str(tmp_path / "file")}
-    code = "from stages.backend import chosen_backend as c, why_not_warp as w; print(c('cpu'), w('cpu'))"
+    code = "from stages.hardware.backend import chosen_backend as c, why_not_warp as w; print(c('cpu'), w('cpu'))"
     answer = subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=environment, capture_output=True, text=True)
     assert answer.stdout.startswith("torch compiled kernels cannot be kept here ([Errno "), answer.stderr
     assert answer.stdout.endswith("; the variable WARP_CACHE_PATH can name another folder\n")
@@ -100,7 +101,8 @@ def test_warp_asked_for_by_name_is_not_replaced_silently(
 
 def test_loading_warp_says_nothing_and_leaves_stderr_open() -> None:
     code = (
-        "import sys; from stages.backend import chosen_backend as c; print(c('cpu')); print('heard', file=sys.stderr)"
+        "import sys; from stages.hardware.backend import chosen_backend as c; "
+        "print(c('cpu')); print('heard', file=sys.stderr)"
     )
     answer = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert (answer.returncode, answer.stdout, answer.stderr) == (0, "warp\n", "heard\n")

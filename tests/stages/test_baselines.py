@@ -8,8 +8,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nerf.scene import View
-from stages.baselines import mean_photo, nearest_view, resized
+from nerf.geometry.scene import View
+from stages.evaluate.baselines import mean_photo, nearest_view, resized
 
 
 def _view(name: str, centre: tuple[float, float, float] = (0, 0, 0), angle: float = 0, roll: float = 0) -> View:

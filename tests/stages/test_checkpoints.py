@@ -4,8 +4,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from stages.checkpoints import Checkpoint, latest_checkpoint, save_checkpoint
-from stages.files import write_durably
+from stages.io.files import write_durably
+from stages.train.checkpoints import Checkpoint, latest_checkpoint, save_checkpoint
 
 
 def checkpoint(step: int) -> Checkpoint:

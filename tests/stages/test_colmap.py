@@ -5,14 +5,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from nerf.scene import Camera
-from nerf.synthetic import ring_of_cameras
-from stages.colmap.cameras import camera_rays, is_valid, native, project, rescaled
-from stages.colmap.diagnosis import find_conflict
-from stages.colmap.lenses import flaw
-from stages.colmap.models import load_native, read_model, write_model
+from nerf.geometry.scene import Camera
+from nerf.synthetic.scenes import ring_of_cameras
 from stages.contract import StageError
-from stages.sparse_model import SparseImage, SparseModel
+from stages.io.sparse_model import SparseImage, SparseModel
+from stages.sfm.colmap.cameras import camera_rays, is_valid, native, project, rescaled
+from stages.sfm.colmap.diagnosis import find_conflict
+from stages.sfm.colmap.lenses import flaw
+from stages.sfm.colmap.models import load_native, read_model, write_model
 
 W, H = 60, 40
 

@@ -8,11 +8,11 @@ import numpy as np
 import pycolmap
 import pytest
 
-from stages.colmap import matching
-from stages.colmap.diagnosis import links
-from stages.colmap.matching import fill_database, hold_open, look_alike, match_pairs
-from stages.pairing import exhaustive
-from stages.photos import Photo
+from stages.io.photos import Photo
+from stages.sfm.colmap import matching
+from stages.sfm.colmap.diagnosis import links
+from stages.sfm.colmap.matching import fill_database, hold_open, look_alike, match_pairs
+from stages.sfm.pairs.pair_selection import exhaustive
 from tests.stages.test_feature_matching import random_descriptors
 
 COUNT = 6
@@ -151,7 +151,7 @@ def test_few_matches_with_each_of_several_photos_join_as_well(database: Path) ->
 READER = """
 import sys
 from pathlib import Path
-from stages.registration import count_done
+from stages.sfm.registration import count_done
 print("ready", flush=True)
 while True:
     count_done(Path(sys.argv[1]))

@@ -2,8 +2,8 @@
 
 import pytest
 
-from nerf.learning_curve import Gain
-from stages.curve import doubling_words, next_words, ssim_words
+from nerf.training.learning_curve import Gain
+from stages.train.curve import doubling_words, next_words, ssim_words
 
 POINTS = [{"seconds": 10.0 * 2**k, "heldout_psnr": 20.0 + k} for k in range(5)]
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageCms
 
-from stages.decoding import (
+from stages.ingest.decoding import (
     MAX_PIXELS,
     DecodeError,
     decode,

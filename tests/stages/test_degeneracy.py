@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from nerf.synthetic import ring_of_cameras
-from stages.degeneracy import (
+from nerf.synthetic.scenes import ring_of_cameras
+from stages.sfm.degeneracy import (
     LIKE_A_ROTATION,
     count_turns,
     departure_from_rotation,

@@ -6,10 +6,10 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from nerf.model import Rendering
-from nerf.rays import Rays
-from stages.drawing import Allowance, Painter, trained_seconds
-from stages.files import write_json
+from nerf.fields.interface import Rendering
+from nerf.geometry.rays import Rays
+from stages.io.files import write_json
+from stages.render.renderer import Allowance, Painter, trained_seconds
 
 
 class Slow:
@@ -52,7 +52,7 @@ def test_a_picture_has_every_ray_in_its_place() -> None:
 @pytest.mark.parametrize("seconds_per_ray", [1e-5, 1e-4])
 def test_the_speed_found_is_the_fields(seconds_per_ray: float, monkeypatch: pytest.MonkeyPatch) -> None:
     field = Slow(seconds_per_ray)
-    monkeypatch.setattr("stages.drawing.time", SimpleNamespace(perf_counter=lambda: field.now))
+    monkeypatch.setattr("stages.render.renderer.time", SimpleNamespace(perf_counter=lambda: field.now))
     speed = Painter(field, torch.zeros(3)).rays_per_second(square, 100, 0.02)
     assert speed == pytest.approx(1 / seconds_per_ray)
 

@@ -6,17 +6,18 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from nerf.evidence.evidence import Evidence
-from nerf.evidence.exposure import ExposureFit, fit_exposure
-from nerf.evidence.tracks import TrackColours
-from nerf.training import NonFinite
-from pipeline import manifests
-from pipeline.keys import stage_key
-from stages import effects, evidence, pilots, train
-from stages.effect_decisions import Decisions, read_decisions, write_decisions
-from stages.evidence import SceneEvidence
-from stages.files import write_json
-from stages.pilots import Pilot
+from nerf.effects.statistics.exposure import ExposureFit, fit_exposure
+from nerf.effects.statistics.statistic import Evidence
+from nerf.effects.statistics.tracks import TrackColours
+from nerf.training.trainer import NonFinite
+from pipeline.engine import manifests
+from pipeline.engine.keys import stage_key
+from stages import effects, train
+from stages.effects import evidence, pilots
+from stages.effects.decisions import Decisions, read_decisions, write_decisions
+from stages.effects.evidence import SceneEvidence
+from stages.effects.pilots import Pilot
+from stages.io.files import write_json
 from tests.effect_scenes import Effects, effect_scene
 from tests.stages.photo_scene import photographed
 from tests.synthetic_photos import Quiet

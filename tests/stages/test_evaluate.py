@@ -15,13 +15,13 @@ from PIL import Image
 from torch import Tensor
 
 from nerf.effects.exposure import expose
-from nerf.model import Rendering
-from nerf.rays import Rays
-from nerf.scene import Camera, Scene, Similarity, View
+from nerf.fields.interface import Rendering
+from nerf.geometry.rays import Rays
+from nerf.geometry.scene import Camera, Scene, Similarity, View
 from stages import evaluate
 from stages.contract import StageError
 from stages.evaluate import affordable
-from stages.files import write_json, write_png
+from stages.io.files import write_json, write_png
 
 WIDTH, HEIGHT, FOCAL = 32, 24, 30.0
 WAVES = np.array([[5.0, 2.0, 3.0], [-4.0, 6.0, 1.0], [2.0, -3.0, 7.0]])
@@ -98,9 +98,9 @@ def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Make:
         info = {"kind": "sky", "downscale": downscale, "background": [0.0, 0.0, 0.0]}
         write_json(inputs["train"] / "field.json", info)
         write_json(inputs["train"] / "curve.json", {"points": [{"seconds": 2.0}]})
-        monkeypatch.setattr("stages.drawing.Painter.rays_per_second", lambda *_: speed)
-        monkeypatch.setattr("stages.device.compute_device", lambda: "cpu")
-        monkeypatch.setattr("stages.field_files.load_field", lambda *_: (field or SkyField(), info))
+        monkeypatch.setattr("stages.render.renderer.Painter.rays_per_second", lambda *_: speed)
+        monkeypatch.setattr("stages.hardware.device.compute_device", lambda: "cpu")
+        monkeypatch.setattr("stages.io.field_files.load_field", lambda *_: (field or SkyField(), info))
         return inputs
 
     return build
@@ -285,7 +285,7 @@ def test_photos_asked_for_are_scored_whatever_they_take(make: Make, tmp_path: Pa
 
 def test_a_photo_too_large_for_the_time_is_scored_smaller(make: Make, progress: Any, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(evaluate, "LEAST_SIDE", 4)
-    monkeypatch.setattr("stages.drawing.Allowance.left", lambda _: 2.0)
+    monkeypatch.setattr("stages.render.renderer.Allowance.left", lambda _: 2.0)
     inputs = make(speed=WIDTH * HEIGHT // 32)  # a photo takes 32 seconds
 
     def downscale(**asked: Any) -> float | None:

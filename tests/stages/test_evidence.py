@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from nerf.evidence.evidence import Evidence
-from nerf.scene import Camera, Scene, Similarity, View
-from stages.evidence import Clock, geometric_evidence, lens_evidence, unless_pixels_differ
-from stages.photos import Photo, write_photos
+from nerf.effects.statistics.statistic import Evidence
+from nerf.geometry.scene import Camera, Scene, Similarity, View
+from stages.effects.evidence import Clock, geometric_evidence, lens_evidence, unless_pixels_differ
+from stages.io.photos import Photo, write_photos
 from tests.stages.photo_scene import pose_towards_origin
 
 VIEWS, POINTS = 10, 120
@@ -56,7 +56,7 @@ def geometric(
 
 def test_what_serves_several_effects_is_shared_out_among_them(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [0.0]
-    monkeypatch.setattr("stages.evidence.time", SimpleNamespace(perf_counter=lambda: now[0]))
+    monkeypatch.setattr("stages.effects.evidence.time", SimpleNamespace(perf_counter=lambda: now[0]))
 
     def works(seconds: float, said: Any = None) -> Any:
         now[0] += seconds

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from PIL import ExifTags, Image
 
-from stages.decoding import decode, upright_size
-from stages.exif import Place, clock_from_exif, exposure_from_exif, focal_from_exif, place_from_exif
+from stages.ingest.decoding import decode, upright_size
+from stages.ingest.exif import Place, clock_from_exif, exposure_from_exif, focal_from_exif, place_from_exif
 from tests.stages.photo_files import HEIGHT, WIDTH, exif_with, saved, smooth
 
 

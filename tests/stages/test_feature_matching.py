@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from stages.feature_matching import BLOCK, FARTHEST, PROBES, index_features, match_descriptors, match_indexed
-from stages.retrieval import CELLS, visual_words
+from stages.sfm.pairs.feature_matching import BLOCK, FARTHEST, PROBES, index_features, match_descriptors, match_indexed
+from stages.sfm.pairs.image_retrieval import CELLS, visual_words
 
 
 def random_descriptors(count: int, seed: int) -> np.ndarray:

@@ -6,13 +6,13 @@ import pytest
 import torch
 
 from nerf.effects.exposure import ExposedModel
-from nerf.grid_field import GridField, GridSettings
-from nerf.paper import PaperNerf, PaperSettings
-from nerf.rays import Rays
-from stages.backend import BackendName, backend_name, chosen_backend, load_backend
+from nerf.fields.hash_grid import GridField, GridSettings
+from nerf.fields.vanilla import PaperNerf, PaperSettings
+from nerf.geometry.rays import Rays
 from stages.contract import StageError
-from stages.field_files import load_field, save_field
-from stages.files import read_json, read_tensors, write_json, write_tensors
+from stages.hardware.backend import BackendName, backend_name, chosen_backend, load_backend
+from stages.io.field_files import load_field, save_field
+from stages.io.files import read_json, read_tensors, write_json, write_tensors
 
 SMALL = PaperSettings(depth=2, width=8, samples_coarse=4, samples_fine=4, contracted=True, spacing="log")
 GRID = GridSettings(levels=2, log2_rows=8, coarsest=4, finest=16, contracted=True, cache_cells=8)
@@ -138,7 +138,7 @@ def test_a_field_keeps_to_torch_if_that_trained_it(trained_with: BackendName, tm
 
 def test_a_field_of_warp_is_read_without_it_and_the_reason_said(tmp_path: Path, progress, monkeypatch) -> None:
     save_field(tmp_path, GridField(GRID, 5, load_backend("warp", "cpu")), INFO)
-    monkeypatch.setattr("stages.backend.why_not_warp", lambda device: "it is not there")
+    monkeypatch.setattr("stages.hardware.backend.why_not_warp", lambda device: "it is not there")
     loaded, _ = load_field(tmp_path, "cpu", progress)
     assert isinstance(loaded, GridField)
     assert backend_name(loaded.backend) == "torch"

@@ -8,17 +8,17 @@ import pytest
 import torch
 
 from nerf.effects.exposure import ExposedModel
-from nerf.effects.poses import RefinedPoses
-from nerf.grid_field import GridField, GridSettings
-from nerf.model import Rendering
-from nerf.rays import Rays
+from nerf.effects.pose_refinement import RefinedPoses
+from nerf.fields.hash_grid import GridField, GridSettings
+from nerf.fields.interface import Rendering
+from nerf.geometry.rays import Rays
 from stages import evaluate
-from stages.backend import chosen_backend, load_backend
-from stages.drawing import Painter
-from stages.effect_decisions import Decisions, learnt_of_photos, photo_parts
+from stages.effects.decisions import Decisions, learnt_of_photos, photo_parts
 from stages.evaluate import Examiner
-from stages.right_halves import from_fitted_pose, right_half_psnr
-from stages.training_data import PhotoReader, training_bank, view_rays
+from stages.evaluate.half_images import from_fitted_pose, right_half_psnr
+from stages.hardware.backend import chosen_backend, load_backend
+from stages.render.renderer import Painter
+from stages.train.data import PhotoReader, training_bank, view_rays
 from tests.stages.photo_scene import photographed
 from tests.synthetic_photos import Quiet
 
@@ -36,7 +36,7 @@ def test_poses_are_fitted_to_the_field_as_it_is_and_scored_as_the_photo_was_expo
         given.append((model, rendering.colour))
         return rays._replace(near=rays.near + 0.5)  # seen from elsewhere
 
-    monkeypatch.setattr("stages.right_halves.from_fitted_pose", fit)
+    monkeypatch.setattr("stages.evaluate.half_images.from_fitted_pose", fit)
     neutral = Painter(ExposedModel(field, torch.full((3,), 0.3)), torch.zeros(3))
     examiner = Examiner(scene, inputs["ingest"], tmp_path, neutral, {view.name: gain}, True, 1.0)
     (scored,) = examiner.score([view], Quiet())

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from stages.sources import find_source, unused_masks
+from stages.ingest.sources import find_source, unused_masks
 from tests.stages.test_sources import names, refusal, touch, transforms
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stages.geometry_check import (
+from stages.sfm.geometry_check import (
     MIN_WITNESS,
     PairMatches,
     _median_of_others,

@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from nerf.scene import Camera
-from stages.colmap.cameras import camera_rays
-from stages.colmap.models import write_model
+from nerf.geometry.scene import Camera
 from stages.contract import StageError
-from stages.known_cameras import KnownCameras, read_known_cameras
-from stages.photos import Photo
-from stages.sparse_model import SparseImage, SparseModel
+from stages.io.photos import Photo
+from stages.io.sparse_model import SparseImage, SparseModel
+from stages.sfm.colmap.cameras import camera_rays
+from stages.sfm.colmap.models import write_model
+from stages.sfm.imported.known_cameras import KnownCameras, read_known_cameras
 from tests.camera_layouts import ring
 
 W, H = 600, 400

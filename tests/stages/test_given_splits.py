@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from stages.contract import StageError
-from stages.known_cameras import KnownCameras, read_known_cameras
+from stages.sfm.imported.known_cameras import KnownCameras, read_known_cameras
 from tests.stages.test_known_cameras import LENS, NAMES, PHOTOS, frame
 
 

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from skimage.metrics import structural_similarity
 
-from stages.image_metrics import ERROR_SCALE, error_map, mean_interval, ssim
+from stages.evaluate.image_metrics import ERROR_SCALE, error_map, mean_interval, ssim
 
 
 def _picture(seed: int, height: int = 40, width: int = 52) -> torch.Tensor:

@@ -12,10 +12,10 @@ from PIL import Image
 
 from stages import ingest
 from stages.contract import StageError
-from stages.files import read_json
 from stages.ingest import Config
-from stages.masks import STILL_BACKGROUND_HINT
-from stages.photos import load_pixels, read_frame_names, read_photos
+from stages.ingest.masks import STILL_BACKGROUND_HINT
+from stages.io.files import read_json
+from stages.io.photos import load_pixels, read_frame_names, read_photos
 from tests.blots import blots, cut_out
 
 
@@ -275,7 +275,7 @@ def test_a_photo_whose_mask_cannot_be_used_is_refused(tmp_path: Path, progress: 
 
 
 def test_a_video_becomes_photos_with_times(tmp_path: Path, progress: Any) -> None:
-    from stages.video import video_writer
+    from stages.io.video import video_writer
 
     wall = blots(0, 500, 200)
     with video_writer(tmp_path / "my clip.mp4", 160, 120, 10) as write:

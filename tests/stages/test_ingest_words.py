@@ -9,9 +9,9 @@ from PIL import Image
 
 from stages import ingest
 from stages.contract import StageError
-from stages.files import read_json
 from stages.ingest import Config
-from stages.photos import read_photos
+from stages.io.files import read_json
+from stages.io.photos import read_photos
 
 
 def put(folder: Path, *names: str) -> Path:
@@ -90,7 +90,7 @@ def test_a_photo_that_memory_is_short_of_is_named_and_none_that_is_refused_by_it
 ) -> None:
     folder = put(tmp_path / "in", "a.jpg", "b.jpg")
     Image.new("RGB", (500, 400)).save(folder / "raw.dng", "TIFF")
-    monkeypatch.setattr("stages.memory.available_bytes", lambda: 2**20)
+    monkeypatch.setattr("stages.hardware.memory.available_bytes", lambda: 2**20)
     ingest.run(Config(photos=folder), {}, tmp_path / "out", progress)
     Image.new("RGB", (400, 300)).save(folder / "large.jpg")
     with pytest.raises(StageError, match=r"^not enough memory for the photos: decoding large\.jpg, which has"):

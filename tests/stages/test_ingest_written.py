@@ -10,9 +10,9 @@ import pytest
 from PIL import Image
 
 from stages import ingest
-from stages.decoding import decode
 from stages.ingest import Config
-from stages.photos import Photo, read_photos
+from stages.ingest.decoding import decode
+from stages.io.photos import Photo, read_photos
 from tests.blots import blots
 from tests.stages.photo_files import exif_with
 

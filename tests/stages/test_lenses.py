@@ -5,12 +5,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from nerf.scene import Camera
-from stages.colmap import lenses, refinement
-from stages.colmap.cameras import native
-from stages.colmap.held_out import Choice, choose, hold_out, paired
-from stages.colmap.lenses import MODELS, Lens, equip, flaw
-from stages.colmap.observations import noise_px, observations, residuals
+from nerf.geometry.scene import Camera
+from stages.sfm.colmap import lenses, refinement
+from stages.sfm.colmap.cameras import native
+from stages.sfm.colmap.held_out import Choice, choose, hold_out, paired
+from stages.sfm.colmap.lenses import MODELS, Lens, equip, flaw
+from stages.sfm.colmap.observations import noise_px, observations, residuals
 from tests.stages.lens_scene import HEIGHT, WIDTH, adjust, lens, mapped, photographed
 
 if TYPE_CHECKING:

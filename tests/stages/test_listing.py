@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from stages.contract import StageError
-from stages.sources import find_source
+from stages.ingest.sources import find_source
 from tests.stages.test_sources import names, touch
 
 

@@ -2,11 +2,11 @@ import time
 
 import pytest
 
-from stages.live_line import live_line
+from stages.io.live_line import live_line
 
 
 def test_it_speaks_while_the_block_is_busy_and_once_more_at_the_end(progress, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("stages.live_line.PERIOD_SECONDS", 0.01)
+    monkeypatch.setattr("stages.io.live_line.PERIOD_SECONDS", 0.01)
     with live_line(progress, lambda: ("working", 0.5)):
         deadline = time.monotonic() + 5
         while not progress.updates and time.monotonic() < deadline:

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from stages import ingest
-from stages.decoding import DecodeError, upright
-from stages.files import write_png
-from stages.masks import are_of_stored_pixels, load_mask, pair_masks, read_mask, write_feature_masks
-from stages.photos import Photo, read_photos
+from stages.ingest.decoding import DecodeError, upright
+from stages.ingest.masks import are_of_stored_pixels, load_mask, pair_masks, read_mask, write_feature_masks
+from stages.io.files import write_png
+from stages.io.photos import Photo, read_photos
 from tests.stages.photo_files import exif_with
 from tests.stages.test_ingest import mask_for, picture, put
 
@@ -151,7 +151,7 @@ def test_a_mask_of_another_size_is_resized(factor: float, turned: bool, tmp_path
 @example(6000, 4000, 1600 / 6000)
 @given(st.integers(100, 6000), st.integers(100, 6000), st.floats(0.1, 2))
 def test_any_reduction_rounded_to_pixels_keeps_its_shape(width: int, height: int, scale: float) -> None:
-    from stages.masks import _same_shape
+    from stages.ingest.masks import _same_shape
 
     reduced = max(1, round(width * scale)), max(1, round(height * scale))
     assert _same_shape(reduced, (width, height)) and _same_shape((width, height), reduced)

@@ -3,7 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stages.match_graph import (
+from stages.io.photos import Photo
+from stages.sfm.pairs.match_graph import (
     MIN_INLIERS,
     UNTESTED,
     connected,
@@ -16,8 +17,7 @@ from stages.match_graph import (
     possible_orders,
     weak_cuts,
 )
-from stages.pairing import Pairs, nearest, spanning_tree, union
-from stages.photos import Photo
+from stages.sfm.pairs.pair_selection import Pairs, nearest, spanning_tree, union
 
 
 def walk(count: int, reach: int) -> np.ndarray:

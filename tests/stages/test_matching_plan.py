@@ -3,9 +3,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stages import matching_plan, pairing, sfm
+from stages import sfm
 from stages.contract import StageError
-from stages.matching_plan import (
+from stages.io.photos import Photo
+from stages.sfm.pairs import matching_plan
+from stages.sfm.pairs import pair_selection as pairing
+from stages.sfm.pairs.matching_plan import (
     TIERS,
     Chosen,
     Cost,
@@ -17,8 +20,7 @@ from stages.matching_plan import (
     measure,
     tiers_of,
 )
-from stages.pairing import Places
-from stages.photos import Photo
+from stages.sfm.pairs.pair_selection import Places
 from tests.synthetic_photos import SyntheticPhotos
 
 ALL_OPEN = Open(None, None, None)

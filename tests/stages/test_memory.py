@@ -6,11 +6,11 @@ from pathlib import Path
 import psutil
 import pytest
 
-from stages import memory
-from stages.colmap.matching import BYTES_PER_SEARCHED_PIXEL, Search, feature_bytes
 from stages.contract import StageError
-from stages.memory import at_once, available_bytes, available_on, check_memory, rooms_in_groups
-from stages.photos import Photo
+from stages.hardware import memory
+from stages.hardware.memory import at_once, available_bytes, available_on, check_memory, rooms_in_groups
+from stages.io.photos import Photo
+from stages.sfm.colmap.matching import BYTES_PER_SEARCHED_PIXEL, Search, feature_bytes
 
 
 @pytest.fixture

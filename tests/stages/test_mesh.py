@@ -11,11 +11,14 @@ import torch
 import trimesh
 from trimesh.visual import ColorVisuals
 
-from nerf.camera_paths import look_at
-from nerf.scene import Camera, Scene, Similarity, View
-from stages import field_files, mesh, mesh_picture, mesh_views
+from nerf.geometry.camera_paths import look_at
+from nerf.geometry.scene import Camera, Scene, Similarity, View
+from stages import mesh
 from stages.contract import StageError
-from stages.files import write_json, write_tensors
+from stages.io import field_files
+from stages.io.files import write_json, write_tensors
+from stages.mesh import picture as mesh_picture
+from stages.mesh import visibility as mesh_views
 
 RADIUS = 0.4
 TURN = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])

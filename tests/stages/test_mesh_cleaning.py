@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from stages.contract import StageError
-from stages.mesh_cleaning import FEWEST_POINTS, HIDDEN_STEPS, REACH, clean, openness
-from stages.mesh_surface import Surface
-from stages.mesh_views import Sight
+from stages.mesh.cleaning import FEWEST_POINTS, HIDDEN_STEPS, REACH, clean, openness
+from stages.mesh.surface import Surface
+from stages.mesh.visibility import Sight
 
 CORNERS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
 FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32)

@@ -8,7 +8,7 @@ import pytest
 import trimesh
 from trimesh.visual import ColorVisuals
 
-from stages.mesh_files import Z_UP_TO_Y_UP, ColouredMesh, write_glb, write_obj, write_ply
+from stages.mesh.files import Z_UP_TO_Y_UP, ColouredMesh, write_glb, write_obj, write_ply
 
 VERTICES = np.array([[0.1, 0, 0], [1, 0.2, 0], [0, 1, 0.3], [0.4, 0, 1]])
 FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32)

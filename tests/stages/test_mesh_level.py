@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from nerf.lattice import Lattice, density_lattice
-from nerf.rays import Rays
+from nerf.fields.density_grid import Lattice, density_lattice
+from nerf.geometry.rays import Rays
 from stages.contract import StageError
-from stages.mesh_level import check_range, choose_level
-from stages.mesh_surface import extract
+from stages.mesh.iso_level import check_range, choose_level
+from stages.mesh.surface import extract
 
 CORNER = torch.full((3,), 0.9)
 RAYS = 256

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nerf.camera_paths import look_at
-from nerf.scene import Camera, Scene, Similarity, View
-from stages import mesh_picture
-from stages.mesh_files import ColouredMesh
-from stages.mesh_picture import ELEVATION, picture, viewpoints
+from nerf.geometry.camera_paths import look_at
+from nerf.geometry.scene import Camera, Scene, Similarity, View
+from stages.mesh import picture as mesh_picture
+from stages.mesh.files import ColouredMesh
+from stages.mesh.picture import ELEVATION, picture, viewpoints
 
 CUBE = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 UP = np.array([0, 0, 1.0])

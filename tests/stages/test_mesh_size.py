@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from nerf import REGION_HALF
-from stages.mesh_size import (
+from stages.mesh.size import (
     FEWEST_POINTS,
     MARGIN,
     ONCE,
@@ -50,7 +50,7 @@ def test_a_longer_training_gets_a_finer_lattice():
 
 def test_the_yardstick_is_the_best_of_a_few(monkeypatch: pytest.MonkeyPatch):
     ticks = iter([0.0, 5.0, 10.0, 12.0, 20.0, 29.0])
-    monkeypatch.setattr("stages.mesh_size.time", SimpleNamespace(perf_counter=lambda: next(ticks)))
+    monkeypatch.setattr("stages.mesh.size.time", SimpleNamespace(perf_counter=lambda: next(ticks)))
     assert yardstick() == 2.0
 
 

@@ -7,8 +7,8 @@ import pytest
 import torch
 from skimage.measure import marching_cubes
 
-from nerf.lattice import Lattice, occupancy
-from stages.mesh_surface import (
+from nerf.fields.density_grid import Lattice, occupancy
+from stages.mesh.surface import (
     Surface,
     border_vertices,
     components,

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from nerf.camera_paths import look_at
-from nerf.lattice import Lattice
-from nerf.scene import Camera, Scene, Similarity, View
-from stages import mesh_views
-from stages.files import write_png
-from stages.mesh_views import drawn_rays, look, shadow_maps, used_rays
+from nerf.fields.density_grid import Lattice
+from nerf.geometry.camera_paths import look_at
+from nerf.geometry.scene import Camera, Scene, Similarity, View
+from stages.io.files import write_png
+from stages.mesh import visibility as mesh_views
+from stages.mesh.visibility import drawn_rays, look, shadow_maps, used_rays
 
 RADIUS = 0.5
 CORNER = torch.full((3,), 0.9)

@@ -8,9 +8,9 @@ import numpy as np
 import pycolmap
 import pytest
 
-from stages.colmap.model_files import CAMERA_MODELS, read_model_files
-from stages.colmap.models import read_model, world_from_camera
 from stages.contract import StageError
+from stages.sfm.colmap.model_files import CAMERA_MODELS, read_model_files
+from stages.sfm.colmap.models import read_model, world_from_camera
 from tests.fuzz.cameras import colmap_models
 
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from stages.near_duplicates import near_duplicates, small, thumbnail
-from stages.sharpness import sharpness
+from stages.ingest.near_duplicates import near_duplicates, small, thumbnail
+from stages.ingest.sharpness import sharpness
 from tests.blots import blots, cut_out
 
 WIDTH, HEIGHT = 400, 300

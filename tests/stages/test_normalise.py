@@ -6,12 +6,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from nerf.camera_paths import nearest_rotations
-from nerf.scene import Camera
+from nerf.geometry.camera_paths import nearest_rotations
+from nerf.geometry.scene import Camera
 from stages import normalise
 from stages.contract import StageError
-from stages.files import read_json, read_scene, read_tensors
-from stages.photos import Box, Photo, read_photos, write_photos
+from stages.io.files import read_json, read_scene, read_tensors
+from stages.io.photos import Box, Photo, read_photos, write_photos
 from tests.camera_layouts import ball, ring, seen_by
 
 CAMERA = Camera("PINHOLE", 400, 400, (400.0, 400.0, 200.0, 200.0))
@@ -65,7 +65,7 @@ def inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
             point=scene.point,
             xy=np.zeros((len(scene.view), 2)),
         )
-        monkeypatch.setattr("stages.colmap.models.read_model", lambda sparse: model)
+        monkeypatch.setattr("stages.sfm.colmap.models.read_model", lambda sparse: model)
         return folders
 
     return build

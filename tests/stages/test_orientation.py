@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from nerf.scene import Camera
+from nerf.geometry.scene import Camera
 from stages import ingest, normalise, sfm
-from stages.colmap.cameras import camera_rays, project
-from stages.colmap.model_files import PARAMETERS
-from stages.colmap.models import read_model, write_model
 from stages.contract import StageError
-from stages.decoding import upright
-from stages.known_cameras import KnownCameras, read_known_cameras
-from stages.orientation import QUARTER_TURNS, pixel_map, turned_camera, turned_pose
-from stages.photos import Photo, load_pixels, read_photos
-from stages.sparse_model import SparseImage, SparseModel
+from stages.ingest.decoding import upright
+from stages.io.photos import Photo, load_pixels, read_photos
+from stages.io.sparse_model import SparseImage, SparseModel
+from stages.sfm.colmap.cameras import camera_rays, project
+from stages.sfm.colmap.model_files import PARAMETERS
+from stages.sfm.colmap.models import read_model, write_model
+from stages.sfm.imported.known_cameras import KnownCameras, read_known_cameras
+from stages.sfm.imported.orientation import QUARTER_TURNS, pixel_map, turned_camera, turned_pose
 from tests.camera_layouts import ring
 from tests.stages.photo_files import exif_with
 

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stages.pairing import (
+from stages.sfm.pairs.pair_selection import (
     MAX_EXHAUSTIVE,
     Places,
     cartesian,

@@ -10,10 +10,10 @@ from PIL import Image
 from stages import ingest
 from stages.contract import StageError
 from stages.ingest import Config
-from stages.panoramas import is_panorama
-from stages.photos import read_photos
-from stages.video import video_writer
-from stages.video_frames import take_frames
+from stages.ingest.panoramas import is_panorama
+from stages.ingest.video_frames import take_frames
+from stages.io.photos import read_photos
+from stages.io.video import video_writer
 from tests.blots import blots
 
 ATTRIBUTE = '<rdf:Description GPano:ProjectionType="equirectangular" GPano:FullPanoWidthPixels="4000"/>'

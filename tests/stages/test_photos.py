@@ -8,11 +8,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from stages import photos as module
 from stages.contract import StageError
-from stages.decoding import pillow
-from stages.masks import load_mask
-from stages.photos import Photo, Refusal, load_pixels, loaders, opaque_box, read_frame_names, read_photos, write_photos
+from stages.ingest.decoding import pillow
+from stages.ingest.masks import load_mask
+from stages.io import photos as module
+from stages.io.photos import (
+    Photo,
+    Refusal,
+    load_pixels,
+    loaders,
+    opaque_box,
+    read_frame_names,
+    read_photos,
+    write_photos,
+)
 from tests.png_files import png
 
 

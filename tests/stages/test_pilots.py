@@ -9,12 +9,12 @@ import torch
 
 from nerf.effects.exposure import expose
 from nerf.effects.pose_fit import fit_pose
-from nerf.effects.poses import RefinedPoses
-from nerf.rendering import render_image
-from stages import pilots
-from stages.effect_decisions import Decisions, expected_gains, told_by_neighbours
-from stages.files import read_scene
-from stages.pilots import Pilot, PilotScene, pilot_scene, run_pilot
+from nerf.effects.pose_refinement import RefinedPoses
+from nerf.rendering.images import render_image
+from stages.effects import pilots
+from stages.effects.decisions import Decisions, expected_gains, told_by_neighbours
+from stages.effects.pilots import Pilot, PilotScene, pilot_scene, run_pilot
+from stages.io.files import read_scene
 from tests.effect_scenes import Effects, effect_scene
 from tests.stages.photo_scene import HEIGHT, WIDTH, photographed
 from tests.synthetic_photos import Quiet
@@ -82,10 +82,10 @@ def test_a_pilot_is_foretold_by_its_steps_and_the_poses_that_it_fits_on_the_cpu(
     inputs: dict[str, Path], monkeypatch: pytest.MonkeyPatch, device: str, fit: float
 ) -> None:
     on = {"cpu": fit, "cuda": 0.02}  # seconds of a step
-    monkeypatch.setattr("stages.device.compute_device", lambda: device)
-    monkeypatch.setattr("stages.device.cores", lambda: 16)
-    monkeypatch.setattr("stages.backend.chosen_backend", lambda _device: "torch")
-    monkeypatch.setattr("stages.training_size.seconds_per_step", lambda *given: on[given[-1]])
+    monkeypatch.setattr("stages.hardware.device.compute_device", lambda: device)
+    monkeypatch.setattr("stages.hardware.device.cores", lambda: 16)
+    monkeypatch.setattr("stages.hardware.backend.chosen_backend", lambda _device: "torch")
+    monkeypatch.setattr("stages.train.size.seconds_per_step", lambda *given: on[given[-1]])
     scene = read_scene(inputs["normalise"])
     without, fitting = pilots.expected_seconds(scene, 100)
     assert without == pytest.approx(1.3 * 6 * 100 * 0.02)
@@ -172,7 +172,7 @@ def test_the_scenes_photos_are_as_bright_as_they_say(tmp_path: Path) -> None:
     """The helper itself: an exposure effect changes photos by gains within its range, and nothing else does."""
     plain = effect_scene(tmp_path / "plain", Effects(), views=3)
     exposed = effect_scene(tmp_path / "exposed", Effects(exposure_ev=1.0), views=3)
-    from stages.photos import load_pixels
+    from stages.io.photos import load_pixels
 
     for name in ("000.png", "001.png", "002.png"):
         a, b = (torch.tensor(load_pixels(i["ingest"] / "images" / name, 240, 180)) / 255 for i in (plain, exposed))

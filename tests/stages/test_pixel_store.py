@@ -14,10 +14,10 @@ import pytest
 import torch
 from filelock import FileLock
 
-from pipeline.workspace import Workspace
-from stages import pixel_store as module
+from pipeline.engine.workspace import Workspace
 from stages.contract import StageError
-from stages.pixel_store import Load, PixelStore, StoredPhoto, checksum, pixel_store
+from stages.io import pixel_store as module
+from stages.io.pixel_store import Load, PixelStore, StoredPhoto, checksum, pixel_store
 from tests.conftest import SilentProgress
 
 SIZES = [(5, 3), (4, 2), (7, 6), (5, 3)]  # (width, height)

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stages.photos import Photo
-from stages.registration import (
+from stages.io.photos import Photo
+from stages.sfm.registration import (
     Matches,
     account,
     count_done,

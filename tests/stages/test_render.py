@@ -11,14 +11,14 @@ import torch
 from PIL import Image
 
 from nerf.effects.exposure import ExposedModel
-from nerf.model import Rendering
-from nerf.region import Layout
-from nerf.scene import Camera, Scene, Similarity, View
+from nerf.fields.interface import Rendering
+from nerf.geometry.region_of_interest import Layout
+from nerf.geometry.scene import Camera, Scene, Similarity, View
 from stages import render
 from stages.contract import StageError
-from stages.files import read_json, write_json
-from stages.render_path import CameraPath, fitted_path, median_camera, path_from_file, path_rays, resized
-from stages.transforms_export import transforms
+from stages.io.files import read_json, write_json
+from stages.io.transforms_export import transforms
+from stages.render.path import CameraPath, fitted_path, median_camera, path_from_file, path_rays, resized
 from tests.camera_layouts import ring, wall
 from tests.video_files import read_video
 
@@ -69,8 +69,8 @@ def inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Path]:
     info = {"background": [0.0, 0.0, 1.0], "downscale": 1.0, "rays": 100_000}
     write_json(folders["train"] / "field.json", info)
     write_json(folders["train"] / "curve.json", {"points": [{"step": 9, "seconds": 10.0}]})
-    monkeypatch.setattr("stages.drawing.Painter.rays_per_second", lambda self, sample, largest, seconds: 30_000)
-    monkeypatch.setattr("stages.field_files.load_field", lambda *_: (Ball(), info))
+    monkeypatch.setattr("stages.render.renderer.Painter.rays_per_second", lambda self, sample, largest, seconds: 30_000)
+    monkeypatch.setattr("stages.io.field_files.load_field", lambda *_: (Ball(), info))
     return folders
 
 
@@ -131,7 +131,7 @@ def test_depth_waits_on_the_disk_only_where_it_is_shown(inputs, progress, monkey
         yield lambda frame: waiting.append((path.parent / "inverse_depth.tmp").exists())
 
     waiting = list[bool]()
-    monkeypatch.setattr("stages.video.video_writer", writer)
+    monkeypatch.setattr("stages.io.video.video_writer", writer)
     run(inputs, progress, frames=3, width=40, depth=depth)
     assert waiting == (6 * [True] if depth else 3 * [False])
     assert not (inputs["render"] / "inverse_depth.tmp").exists()
@@ -224,7 +224,7 @@ def test_bearings_are_made_frame_by_frame_and_kept_while_the_lens_is_the_same(mo
         made.append((camera.params[0], weakref.ref(rays := np.zeros((height, width, 3), np.float32))))
         return rays
 
-    monkeypatch.setattr("stages.colmap.cameras.camera_rays", camera_rays)
+    monkeypatch.setattr("stages.sfm.colmap.cameras.camera_rays", camera_rays)
     lenses = [replace(CAMERA, params=(focal, *CAMERA.params[1:])) for focal in (150.0, 150.0, 151.0, 152.0)]
     frames = path_rays(CameraPath(tuple(lenses), ring(4)), scene_with(ring(5)))
     asked = []
@@ -338,7 +338,7 @@ def with_exposure(inputs, monkeypatch) -> None:
     info = read_json(inputs["train"] / "field.json") | {"exposure": {"neutral": [0.0] * 3, "photos": photos}}
     write_json(inputs["train"] / "field.json", info)
     shown = ExposedModel(GreyBall(), torch.zeros(3))
-    monkeypatch.setattr("stages.field_files.load_field", lambda *_: (shown, info))
+    monkeypatch.setattr("stages.io.field_files.load_field", lambda *_: (shown, info))
 
 
 class GreyBall(Ball):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stages.contract import StageError
-from stages.render_path import fitted_path, median_camera, usual_path
+from stages.render.path import fitted_path, median_camera, usual_path
 from tests.camera_layouts import ring, wall
 from tests.stages.test_render import CAMERA, scene_with
 

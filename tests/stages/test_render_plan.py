@@ -2,10 +2,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nerf.scene import Camera
+from nerf.geometry.scene import Camera
 from stages import render
-from stages.render_path import even_height
-from stages.render_plan import affordable, chosen_fps, longest_side
+from stages.render.path import even_height
+from stages.render.plan import affordable, chosen_fps, longest_side
 
 LANDSCAPE = Camera("PINHOLE", 1600, 1000, (1500.0, 1500.0, 800.0, 500.0))
 PORTRAIT = Camera("PINHOLE", 1000, 1600, (1500.0, 1500.0, 500.0, 800.0))

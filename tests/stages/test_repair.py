@@ -10,14 +10,14 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from stages import sfm_global
-from stages.colmap.diagnosis import compare_models
-from stages.colmap.mapping import incremental_options, map_incrementally
-from stages.colmap.repair import check_model, copy_believed, deregister, facts, reasons, register_again
-from stages.colmap.thinning import thin_matches
-from stages.photos import Photo
-from stages.sfm_attempts import Effort
-from stages.sfm_matching import steps_of_row
+from stages.io.photos import Photo
+from stages.sfm import global_mapping as sfm_global
+from stages.sfm.colmap.diagnosis import compare_models
+from stages.sfm.colmap.mapping import incremental_options, map_incrementally
+from stages.sfm.colmap.repair import check_model, copy_believed, deregister, facts, reasons, register_again
+from stages.sfm.colmap.thinning import thin_matches
+from stages.sfm.matching import steps_of_row
+from stages.sfm.retry_strategies import Effort
 
 PHOTOS = 16
 

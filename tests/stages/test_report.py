@@ -12,8 +12,8 @@ from PIL import Image
 
 from stages import report
 from stages.contract import StageError
-from stages.files import read_json, write_json
-from stages.tradeoff_front import recommend, table
+from stages.io.files import read_json, write_json
+from stages.tradeoff.pareto_front import recommend, table
 from tests.stages.report_workspace import LINES, PARTS, make_workspace, written
 from tests.stages.test_tradeoff_front import point
 

@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from stages import report
-from stages.files import write_json
-from stages.report_cameras import MAX_SHOWN, camera_report, doubtful_files, order_tells
+from stages.io.files import write_json
+from stages.report.cameras import MAX_SHOWN, camera_report, doubtful_files, order_tells
 from tests.stages.report_workspace import make_workspace, written
 
 PHOTOS = 60
@@ -176,7 +176,7 @@ def test_photos_whose_given_poses_are_contradicted_are_not_drawn(
     inputs: dict[str, Path], tmp_path: Path, progress: Any, monkeypatch: pytest.MonkeyPatch
 ):
     drawn: list[int] = []
-    monkeypatch.setattr("stages.report_plots.camera_svgs", lambda _, views, *__: str(drawn.append(len(views))) and {})
+    monkeypatch.setattr("stages.report.plots.camera_svgs", lambda _, views, *__: str(drawn.append(len(views))) and {})
     change(inputs, source="import", check=check(doubtful=png(range(5))))
     assert "Left out of the plot: 5 photos" in written(inputs, tmp_path / "out", progress)[0]
     change(inputs, check=check(doubtful=png(range(24))))

@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from stages.files import write_json
+from stages.io.files import write_json
 from tests.stages.report_workspace import make_workspace, written
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from stages.files import write_json
+from stages.io.files import write_json
 from tests.stages.report_workspace import make_workspace, written
 
 

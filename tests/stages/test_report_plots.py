@@ -13,11 +13,11 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import to_rgba
 
-from nerf.learning_curve import Gain
-from nerf.scene import Camera, Scene, Similarity, View
-from stages import report_plots
-from stages.curve import coming_doubling
-from stages.report_plots import ORDER_COLOURS, _outline, camera_svgs, curve_svg
+from nerf.geometry.scene import Camera, Scene, Similarity, View
+from nerf.training.learning_curve import Gain
+from stages.report import plots as report_plots
+from stages.report.plots import ORDER_COLOURS, _outline, camera_svgs, curve_svg
+from stages.train.curve import coming_doubling
 
 
 def _scene(count: int = 9) -> Scene:

@@ -2,7 +2,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from stages.retrieval import photo_similarity, visual_words, vlad, vocabulary
+from stages.sfm.pairs.image_retrieval import photo_similarity, visual_words, vlad, vocabulary
 from tests.stages.test_feature_matching import random_descriptors
 
 

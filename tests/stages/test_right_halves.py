@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from nerf.effects.exposure import expose
-from nerf.model import Rendering
-from stages.right_halves import FEWEST_PIXELS, right_half_psnr, viewing_distance
+from nerf.fields.interface import Rendering
+from stages.evaluate.half_images import FEWEST_PIXELS, right_half_psnr, viewing_distance
 
 BLACK = torch.zeros(3)
 

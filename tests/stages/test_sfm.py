@@ -14,14 +14,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from nerf.alignment import align
-from stages import ingest, sfm, sfm_process
-from stages.colmap.models import read_model
+from nerf.geometry.alignment import align
+from stages import ingest, sfm
 from stages.contract import StageError
-from stages.files import read_json, write_png
-from stages.photos import read_photos, write_photos
-from stages.registration import count_done
-from stages.sfm_attempts import ATTEMPTS, Journal, Tried
+from stages.io.files import read_json, write_png
+from stages.io.photos import read_photos, write_photos
+from stages.sfm import process as sfm_process
+from stages.sfm.colmap.models import read_model
+from stages.sfm.registration import count_done
+from stages.sfm.retry_strategies import ATTEMPTS, Journal, Tried
 from tests.blots import blots
 from tests.small_scenes import write_blender_scene
 from tests.stages.sfm_inputs import SMALL, ingested
@@ -254,7 +255,7 @@ def test_the_camera_of_one_photo_that_comes_out_absurd_does_not_end_the_run(
     images["photo_003.jpg"] = np.ascontiguousarray(images["photo_003.jpg"][:, 10:230])  # another size, another camera
     absurd = "camera.width == 220" if always else "camera.width == 220 and camera.model_name != 'SIMPLE_PINHOLE'"
     child = (
-        "import stages.colmap.lenses as lenses, stages.sfm_child as c\n"
+        "import stages.sfm.colmap.lenses as lenses, stages.sfm.worker as c\n"
         f"lenses.flaw = lambda camera: 'it is absurd' if {absurd} else None\n"
         "c.main()"
     )
@@ -300,7 +301,7 @@ def test_an_attempt_that_ended_the_program_is_left_out(
 ) -> None:
     folders = with_a_stranger(inputs, tmp_path / "ingest")
     crash = (
-        "import sys, stages.sfm_child as c, os\n"
+        "import sys, stages.sfm.worker as c, os\n"
         "first = c.matched\n"
         f"c.matched = lambda a, m, w: {end} if a.name == 'looser matching' else first(a, m, w)\n"
         "c.main()"
@@ -323,7 +324,7 @@ def test_an_attempt_for_which_no_time_is_left_is_not_begun(
     inputs: dict[str, Path], tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     slow = (
-        "import stages.sfm_child as c\n"
+        "import stages.sfm.worker as c\n"
         "end = c.Work.end\n"
         "def slowly(work, phase):\n"
         "    end(work, phase)\n"

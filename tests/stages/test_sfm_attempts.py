@@ -3,7 +3,7 @@ from typing import Any
 
 import pytest
 
-from stages.sfm_attempts import (
+from stages.sfm.retry_strategies import (
     ATTEMPTS,
     Journal,
     Situation,

@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from stages import sfm, sfm_clock, sfm_process
+from stages import sfm
 from stages.contract import StageError
-from stages.sfm_attempts import GIVEN, GIVEN_UP, NO_TIME, OUT_OF_TIME, left_out_for_time
-from stages.sfm_clock import Clock
-from stages.sfm_work import Job, Work
+from stages.sfm import clock as sfm_clock
+from stages.sfm import process as sfm_process
+from stages.sfm.clock import Clock
+from stages.sfm.retry_strategies import GIVEN, GIVEN_UP, NO_TIME, OUT_OF_TIME, left_out_for_time
+from stages.sfm.work import Job, Work
 from tests.stages.sfm_inputs import SMALL, ingested
 from tests.synthetic_photos import SyntheticPhotos
 
@@ -89,13 +91,13 @@ def test_a_run_that_goes_on_knows_what_the_one_before_it_took(
     pictures = sorted(synthetic_photos.folder.iterdir())[:6]
     folders = ingested(tmp_path / "ingest", {file.name: np.asarray(Image.open(file)) for file in pictures})
     killed = (
-        "import os, time, stages.sfm_child as c, stages.sfm_clock as clock, stages.sfm_matching as matching\n"
+        "import os, time, stages.sfm.worker as c, stages.sfm.clock as clock, stages.sfm.matching as matching\n"
         "clock.BEAT = 0.1\n"
         "matching.match_pairs = lambda *_: (time.sleep(3), os.kill(os.getpid(), 9))\n"
         "c.main()"
     )
     told = (
-        "import stages.sfm_child as c, stages.sfm_attempts as a\n"
+        "import stages.sfm.worker as c, stages.sfm.retry_strategies as a\n"
         "add = a.Journal.add\n"
         "a.Journal.add = lambda journal, tried: (print(tried.seconds, file=c.sys.stderr), add(journal, tried))\n"
         "c.main()"

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from stages import matching_plan, sfm_process
+from stages.sfm import process as sfm_process
+from stages.sfm.pairs import matching_plan
 
 
 @pytest.mark.parametrize("child", [sfm_process.CHILD, matching_plan.CHILD])

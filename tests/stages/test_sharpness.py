@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from stages.sharpness import BLURRED, WIDTH, relative_sharpness, sharpness
+from stages.ingest.sharpness import BLURRED, WIDTH, relative_sharpness, sharpness
 from tests.blots import blots
 
 

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from stages.contract import StageError
-from stages.masks import pair_masks
-from stages.sources import Source, camera_files, find_source, is_gone, photos_beside
+from stages.ingest.masks import pair_masks
+from stages.ingest.sources import Source, camera_files, find_source, is_gone, photos_beside
 
 
 def touch(folder: Path, *names: str) -> Path:
@@ -39,7 +39,8 @@ def refusal(photos: Path, cameras: Path | None = None) -> StageError:
 
 
 def test_importing_is_cheap() -> None:
-    code = "import sys, stages.sources; print(sorted({'numpy', 'PIL', 'cv2', 'torch', 'pycolmap'} & set(sys.modules)))"
+    heavy = "{'numpy', 'PIL', 'cv2', 'torch', 'pycolmap'}"
+    code = f"import sys, stages.ingest.sources; print(sorted({heavy} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 
@@ -374,7 +375,7 @@ def test_a_folder_that_goes_while_it_is_listed(tmp_path: Path, monkeypatch: pyte
         shutil.rmtree(folder)
         return True
 
-    monkeypatch.setattr("stages.listing._is_photo_folder", enters)
+    monkeypatch.setattr("stages.ingest.listing._is_photo_folder", enters)
     assert refusal(tmp_path).what == f"cannot read {tmp_path / 'a'}"
 
 

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from stages import stopwatch
-from stages.files import read_json
-from stages.stopwatch import keep, kept
+from stages.io import stopwatch
+from stages.io.files import read_json
+from stages.io.stopwatch import keep, kept
 
 
 def test_the_seconds_of_earlier_attempts_count(tmp_path: Path) -> None:

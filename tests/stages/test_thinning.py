@@ -2,8 +2,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from stages.colmap.correspondences import Correspondences
-from stages.colmap.thinning import best_tracks
+from stages.sfm.colmap.correspondences import Correspondences
+from stages.sfm.colmap.thinning import best_tracks
 
 PHOTOS, KEYPOINTS = 4, 6
 

@@ -7,15 +7,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-import stages.track_colours
-from nerf.evidence import transients
-from nerf.evidence.exposure import EV, fit_exposure
-from nerf.scene import Camera, Scene, View
-from stages.colmap.cameras import focal_and_centre
-from stages.evidence import scene_evidence, training_residuals
-from stages.files import write_png
-from stages.photos import Photo, write_photos
-from stages.track_colours import (
+import stages.effects.track_colours
+from nerf.effects.statistics import transients
+from nerf.effects.statistics.exposure import EV, fit_exposure
+from nerf.geometry.scene import Camera, Scene, View
+from stages.effects.evidence import scene_evidence, training_residuals
+from stages.effects.track_colours import (
     BRIGHTEST,
     CLIPPED_SHARE,
     DARKEST,
@@ -25,6 +22,9 @@ from stages.track_colours import (
     look_at_photos,
     training_tracks,
 )
+from stages.io.files import write_png
+from stages.io.photos import Photo, write_photos
+from stages.sfm.colmap.cameras import focal_and_centre
 from tests.conftest import SilentProgress
 from tests.stages.photo_scene import pose_towards_origin
 
@@ -82,7 +82,7 @@ def photographed_points(
 
 
 def _scene(views: list[View]) -> Scene:
-    from nerf.scene import Similarity
+    from nerf.geometry.scene import Similarity
 
     return Scene((CAMERA,), tuple(views), Similarity(1.0, np.eye(3), np.zeros(3)), False, False, "around", True)
 
@@ -205,7 +205,7 @@ def test_fewer_observations_are_whole_tracks(tmp_path: Path, progress: SilentPro
 
 
 def test_near_photos_have_larger_windows(tmp_path: Path, progress: SilentProgress) -> None:
-    from stages.track_colours import _windows
+    from stages.effects.track_colours import _windows
 
     scene, points = photographed_points(tmp_path)
     tracks = training_tracks(scene, points, MOST)[0]
@@ -251,7 +251,7 @@ def test_only_photos_nearby_are_asked_what_should_be_seen(monkeypatch: pytest.Mo
     near = pairs()
     monkeypatch.setattr(transients, "NEAR_APART", 100.0)
     assert pairs() == near and len(near) > 1000
-    monkeypatch.setattr(stages.track_colours, "MOST_LOOKED_AT", 300 * count)
+    monkeypatch.setattr(stages.effects.track_colours, "MOST_LOOKED_AT", 300 * count)
     some = pairs()
     # whole points are drawn, other ones for every photo
     assert some < near and 0.05 < len(some) / len(near) < 0.3

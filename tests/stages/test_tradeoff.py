@@ -12,14 +12,18 @@ import pytest
 import torch
 from PIL import Image
 
-from nerf.scene import Camera
-from stages import stopwatch, tradeoff, tradeoff_arms, tradeoff_own, tradeoff_trial, train
+from nerf.geometry.scene import Camera
+from stages import tradeoff, train
 from stages.contract import StageError
-from stages.effect_decisions import Decisions, write_decisions
-from stages.files import read_json, read_scene, write_json
+from stages.effects.decisions import Decisions, write_decisions
+from stages.io import stopwatch
+from stages.io.files import read_json, read_scene, write_json
 from stages.tradeoff import Config
-from stages.tradeoff_arms import FEWER_RAYS, OWN, PUBLISHED, VARIANTS, Arm, Speed
-from stages.tradeoff_own import own_field
+from stages.tradeoff import own_field as tradeoff_own
+from stages.tradeoff import runs as tradeoff_arms
+from stages.tradeoff import trial as tradeoff_trial
+from stages.tradeoff.own_field import own_field
+from stages.tradeoff.runs import FEWER_RAYS, OWN, PUBLISHED, VARIANTS, Arm, Speed
 from tests.stages.photo_scene import photographed
 
 TINY_GRID: dict[str, Any] = {"levels": 2, "log2_rows": 10, "finest": 32, "batch_samples": 1024}
@@ -123,7 +127,7 @@ def test_a_study_is_of_the_space_that_the_scene_lies_in(
     space: str,
 ) -> None:
     speeds = {name: Speed(*speed) for name, speed in SPEEDS.items()}
-    monkeypatch.setattr("stages.tradeoff_speeds.measured_speeds", lambda *_: speeds)
+    monkeypatch.setattr("stages.tradeoff.speeds.measured_speeds", lambda *_: speeds)
     write_decisions(tmp_path, Decisions(unbounded=unbounded))
     planned = tradeoff.plan(Config(seconds=60.0), photos | {"effects": tmp_path}, progress)
     assert {planned.space} == {arm.space for arm in tradeoff.selection_of(planned).arms} == {space}
@@ -314,7 +318,7 @@ def test_want_of_memory_ends_the_study_which_goes_on_with_that_training(
 
 
 def test_what_counts_as_an_arms_own_fault_is_what_training_says() -> None:
-    said = "".join((Path(train.__file__).parent / f"training_{name}.py").read_text() for name in ("loop", "data"))
+    said = "".join((Path(train.__file__).parent / f"{name}.py").read_text() for name in ("loop", "data"))
     assert all(f'"{what}"' in said for what in tradeoff_trial.OWN_FAULTS)
 
 
@@ -334,8 +338,8 @@ def test_too_little_time_is_said_with_numbers(tmp_path: Path, photos: dict[str, 
 
 
 def test_windows_are_parts_of_the_photos(photos: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> None:
-    from stages.training_data import PhotoReader, view_rays
-    from stages.training_setup import WHITE
+    from stages.train.data import PhotoReader, view_rays
+    from stages.train.setup import WHITE
 
     monkeypatch.setattr(tradeoff_trial, "WINDOW", 8)
     scene = read_scene(photos["normalise"])

@@ -5,9 +5,9 @@ from typing import Any
 import pytest
 from PIL import Image
 
-from stages.tradeoff_ablation import worth, worth_words
-from stages.tradeoff_arms import REDUCED, Arm
-from stages.tradeoff_plot import Row, write_sheet
+from stages.tradeoff.ablation import worth, worth_words
+from stages.tradeoff.plot import Row, write_sheet
+from stages.tradeoff.runs import REDUCED, Arm
 
 LEFT_OUT = "no positional encoding"
 

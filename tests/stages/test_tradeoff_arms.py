@@ -2,8 +2,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stages.effect_decisions import Space
-from stages.tradeoff_arms import (
+from stages.effects.decisions import Space
+from stages.tradeoff.runs import (
     ABLATIONS,
     FEWER_RAYS,
     FEWEST_STEPS,
@@ -30,7 +30,7 @@ from stages.tradeoff_arms import (
     wanted,
 )
 from stages.train import PAPER_SIZES, Config
-from stages.training_size import GRID_SIZES
+from stages.train.size import GRID_SIZES
 
 FAST = {name: Speed(100.0, 1e6) for name in TIMED}
 SIZES = (1.0, 2.0, 4.0, 8.0)

@@ -7,11 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.arguments import StageArguments, parse
-from pipeline.settings import Settings, with_effects
-from stages.effect_decisions import Space
-from stages.tradeoff_arms import OWN, PUBLISHED, REDUCED, VARIANTS, Arm, field_of
-from stages.tradeoff_front import (
+from pipeline.cli.arguments import StageArguments, parse
+from pipeline.cli.settings import Settings, with_effects
+from stages.effects.decisions import Space
+from stages.tradeoff.pareto_front import (
     WORTH_DB,
     Point,
     command,
@@ -22,6 +21,7 @@ from stages.tradeoff_front import (
     spread_at,
     table,
 )
+from stages.tradeoff.runs import OWN, PUBLISHED, REDUCED, VARIANTS, Arm, field_of
 from stages.train import Config
 
 

@@ -1,6 +1,6 @@
 """Numbers beside the points of a study's plot."""
 
-from stages.tradeoff_plot import NUMBER, Label, side_by_side
+from stages.tradeoff.plot import NUMBER, Label, side_by_side
 
 
 def test_numbers_of_points_that_lie_together_stand_side_by_side() -> None:

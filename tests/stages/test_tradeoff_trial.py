@@ -6,11 +6,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from stages import tradeoff_trial, train
+from stages import train
 from stages.contract import StageError
-from stages.files import read_json
-from stages.tradeoff_arms import Arm
-from stages.tradeoff_trial import ENOUGH, OWN_FAULTS, Exam, figures_file, kept, make_exam, run_arm
+from stages.io.files import read_json
+from stages.tradeoff import trial as tradeoff_trial
+from stages.tradeoff.runs import Arm
+from stages.tradeoff.trial import ENOUGH, OWN_FAULTS, Exam, figures_file, kept, make_exam, run_arm
 from tests.stages.photo_scene import HEIGHT, WIDTH, photographed
 
 ARM = Arm("grid", "bounded", 1.0, 100, 0, 1.0)

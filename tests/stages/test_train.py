@@ -8,17 +8,17 @@ import pytest
 import torch
 from pydantic import ValidationError
 
-from nerf.grid_training import GridTrainer
-from nerf.training import PaperTrainer
+from nerf.training.hash_grid_trainer import GridTrainer
+from nerf.training.trainer import PaperTrainer
 from stages import train
 from stages.contract import Progress, StageError
-from stages.device import cores
-from stages.field_files import load_field
-from stages.files import read_json
-from stages.photos import Photo, write_photos
+from stages.hardware.device import cores
+from stages.io.field_files import load_field
+from stages.io.files import read_json
+from stages.io.photos import Photo, write_photos
 from stages.train import Config
-from stages.training_setup import prepare
-from stages.unseen import unseen_photos, with_validation
+from stages.train.setup import prepare
+from stages.train.validation_images import unseen_photos, with_validation
 from tests.stages.photo_scene import HEIGHT, WIDTH, photographed
 
 TINY: dict[str, Any] = {
@@ -142,8 +142,8 @@ def test_a_grid_field_that_stays_empty_is_given_up_by_name(
     tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     inputs, _ = photographed(tmp_path, channels=4)
-    monkeypatch.setattr("stages.training_loop.WARM_UP_STEPS", 3)
-    monkeypatch.setattr("nerf.grid_mlp.sigma_of", lambda geometry: 0 * geometry[:, 0])
+    monkeypatch.setattr("stages.train.loop.WARM_UP_STEPS", 3)
+    monkeypatch.setattr("nerf.fields.mlp.sigma_of", lambda geometry: 0 * geometry[:, 0])
     with pytest.raises(StageError, match=r"the field does not learn: after 3 steps it is empty .* 3 different seeds"):
         trained(tmp_path / "train", inputs, progress, field="grid", steps=20)
 
@@ -224,7 +224,7 @@ def test_every_option_is_shared_or_of_one_field() -> None:
 def test_plan_answers_everything_for_the_grid_field(
     bounded: bool, tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("stages.training_size.TIMED_SECONDS", 0.01)
+    monkeypatch.setattr("stages.train.size.TIMED_SECONDS", 0.01)
     inputs, _ = photographed(tmp_path, bounded=bounded)
     planned = train.plan(Config(), inputs, progress)
     assert (planned.field, planned.seconds, planned.contracted) == ("grid", 180, not bounded)
@@ -239,7 +239,7 @@ def test_plan_answers_everything_for_the_grid_field(
 def test_what_masks_ignore_does_not_count_for_the_size_of_the_photos(
     tmp_path: Path, progress: Progress, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("stages.training_size.LEAST_LONG_SIDE", 2)
+    monkeypatch.setattr("stages.train.size.LEAST_LONG_SIDE", 2)
     mask = np.zeros((HEIGHT, WIDTH), np.uint8)
     mask[: HEIGHT // 4] = 255
     sizes: dict[str, Any] = {"levels": 2, "log2_rows": 8, "finest": 16, "batch_samples": 256, "steps": 2}
@@ -259,7 +259,7 @@ def test_what_masks_ignore_does_not_count_for_the_size_of_the_photos(
 def test_plan_answers_everything_for_the_paper_field(
     tmp_path: Path, progress: Progress, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("stages.training_size.TIMED_SECONDS", 0.01)
+    monkeypatch.setattr("stages.train.size.TIMED_SECONDS", 0.01)
     inputs, _ = photographed(tmp_path)
     planned = train.plan(Config(batch_rays=8), inputs, progress)
     assert (planned.field, planned.background, planned.levels) == ("paper", "white", None)

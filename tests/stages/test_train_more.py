@@ -6,11 +6,11 @@ from typing import Any
 
 import pytest
 
-from nerf.scene import Camera, Scene
+from nerf.geometry.scene import Camera, Scene
 from stages import train
-from stages.files import read_json, write_json
+from stages.io.files import read_json, write_json
 from stages.train import Config
-from stages.train_more import larger_photos_words, training_name
+from stages.train.more import larger_photos_words, training_name
 from tests.stages.photo_scene import photographed
 
 DIGEST = "d" * 64

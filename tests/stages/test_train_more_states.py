@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from stages.checkpoints import Checkpoint, latest_checkpoint, save_checkpoint
 from stages.contract import StageError
-from stages.training_state import TrainingBudget
+from stages.train.checkpoints import Checkpoint, latest_checkpoint, save_checkpoint
+from stages.train.state import TrainingBudget
 from tests.stages.one_number import run_in
 
 

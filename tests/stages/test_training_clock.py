@@ -8,10 +8,10 @@ from types import SimpleNamespace
 
 import pytest
 
-from stages import training_loop
-from stages.checkpoints import latest_checkpoint
-from stages.training_loop import TrainingRun
-from stages.training_state import Pace, TrainingBudget, checkpoint_interval
+from stages.train import loop as training_loop
+from stages.train.checkpoints import latest_checkpoint
+from stages.train.loop import TrainingRun
+from stages.train.state import Pace, TrainingBudget, checkpoint_interval
 from tests.stages.one_number import Killed, OneNumber, killed_at, number_of, run_in, slow
 
 

@@ -10,13 +10,13 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nerf.ray_bank import Placement, ray_bank
-from nerf.scene import Camera
+from nerf.geometry.scene import Camera
+from nerf.training.ray_dataset import Placement, ray_bank
 from stages.contract import StageError
-from stages.files import write_png, write_tensors
-from stages.masks import load_mask
-from stages.pixel_store import PixelStore, pixel_store
-from stages.training_data import (
+from stages.ingest.masks import load_mask
+from stages.io.files import write_png, write_tensors
+from stages.io.pixel_store import PixelStore, pixel_store
+from stages.train.data import (
     MOST_PATCHES,
     PhotoReader,
     camera_directions,
@@ -27,7 +27,7 @@ from stages.training_data import (
     view_mask,
     view_rays,
 )
-from stages.training_setup import WHITE
+from stages.train.setup import WHITE
 from tests.conftest import SilentProgress
 from tests.stages.photo_scene import CAMERA, FOCAL, HEIGHT, RADIUS, WIDTH, ball_photo, photographed, seen_points
 
@@ -130,7 +130,7 @@ def test_evaluation_reads_the_pixels_that_training_stored(
     decoded = [reader.pixels(view, WHITE) for view in (trained, unseen)]
     for split in ("train", "test"):
         training_bank(ingest, scene, split, 2.0, progress)
-    monkeypatch.setattr("stages.photos.load_pixels", None)
+    monkeypatch.setattr("stages.io.photos.load_pixels", None)
     for view, pixels in zip((trained, unseen), decoded, strict=True):
         assert torch.equal(reader.pixels(view, WHITE), pixels)
 
@@ -144,7 +144,7 @@ def test_where_photos_are_stored_is_found_out_once_for_each_split(
 
     inputs, scene = photographed(tmp_path)
     asked = list[str]()
-    monkeypatch.setattr("stages.pixel_store.pixel_store", found_out)
+    monkeypatch.setattr("stages.io.pixel_store.pixel_store", found_out)
     reader = PhotoReader(inputs["ingest"], scene, 1.0)
     for view in scene.views:
         reader.pixels(view, WHITE)
@@ -162,9 +162,9 @@ def test_how_many_photos_are_decoded_at_a_time_follows_from_what_their_files_hol
 
     asked = list[int]()
     inputs, scene = photographed(tmp_path, channels=4)
-    monkeypatch.setattr("stages.photos.processors", lambda: 16)
-    monkeypatch.setattr("stages.photos.DECODING_BYTES", 2 * 80 * WIDTH * HEIGHT)
-    monkeypatch.setattr("stages.pixel_store.ThreadPoolExecutor", pool)
+    monkeypatch.setattr("stages.io.photos.processors", lambda: 16)
+    monkeypatch.setattr("stages.io.photos.DECODING_BYTES", 2 * 80 * WIDTH * HEIGHT)
+    monkeypatch.setattr("stages.io.pixel_store.ThreadPoolExecutor", pool)
     training_bank(inputs["ingest"], replace(scene, has_alpha=has_alpha), "train", downscale, progress)
     assert asked == [2]
 
@@ -227,8 +227,8 @@ def test_masks_are_loaded_a_few_at_a_time_and_dropped(
 
     loaded, alive = list[weakref.ref[np.ndarray]](), list[int]()
     inputs, scene = photographed(tmp_path, views=16, mask=half_mask())
-    monkeypatch.setattr("stages.masks.load_mask", load)
-    monkeypatch.setattr("stages.photos.loaders", lambda files: 2)
+    monkeypatch.setattr("stages.ingest.masks.load_mask", load)
+    monkeypatch.setattr("stages.io.photos.loaders", lambda files: 2)
     bank = training_bank(inputs["ingest"], scene, "train", 1.0, progress)
     assert len(loaded) == 12 and 1 <= max(alive) <= 4
     drawable = bank.may_be_drawn(torch.arange(len(bank.pixels))).view(12, HEIGHT, WIDTH)

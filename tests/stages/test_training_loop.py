@@ -8,13 +8,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from nerf.training import NonFinite, StepResult
-from stages import training_loop
-from stages.checkpoints import latest_checkpoint
+from nerf.training.trainer import NonFinite, StepResult
 from stages.contract import StageError
-from stages.training_loop import TrainingRun
-from stages.training_state import TrainingBudget
-from stages.unseen import Target
+from stages.train import loop as training_loop
+from stages.train.checkpoints import latest_checkpoint
+from stages.train.loop import TrainingRun
+from stages.train.state import TrainingBudget
+from stages.train.validation_images import Target
 from tests.stages.one_number import Killed, OneNumber, events, killed_at, number_of, probe, quiet, run_in, unseen
 
 

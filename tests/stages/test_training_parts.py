@@ -8,18 +8,18 @@ import pytest
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
-from nerf.grid_field import GridField, GridSettings
-from nerf.grid_training import GridTrainer, GridTrainerSettings
-from nerf.kernels import reference
-from nerf.machine_rates import Rates
-from nerf.paper import PaperNerf, PaperSettings
-from nerf.ray_bank import RayBank, build_ray_bank
-from nerf.synthetic import ring_of_cameras
-from nerf.training import PaperTrainer, StepResult, TrainerSettings
-from stages.backend import load_backend
-from stages.files import read_json
-from stages.report_parts import PARTS, parts_bar
-from stages.training_parts import FIRST_TIMED, TIMED_EVERY, observed, parts_table, rates_for, write_parts
+from nerf.fields.hash_grid import GridField, GridSettings
+from nerf.fields.vanilla import PaperNerf, PaperSettings
+from nerf.kernels import torch as reference
+from nerf.runtime.machine_rates import Rates
+from nerf.synthetic.scenes import ring_of_cameras
+from nerf.training.hash_grid_trainer import GridTrainer, GridTrainerSettings
+from nerf.training.ray_dataset import RayBank, build_ray_bank
+from nerf.training.trainer import PaperTrainer, StepResult, TrainerSettings
+from stages.hardware.backend import load_backend
+from stages.io.files import read_json
+from stages.report.profile import PARTS, parts_bar
+from stages.train.profile import FIRST_TIMED, TIMED_EVERY, observed, parts_table, rates_for, write_parts
 from tests.small_scenes import pinhole_directions
 
 CPU = torch.device("cpu")
@@ -54,8 +54,8 @@ def timed_step(of: GridTrainer | PaperTrainer, step: int, timings: dict[str, Any
 def test_a_run_has_the_same_bits_with_every_step_timed_and_with_none(
     kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("stages.training_parts.TIMED_EVERY", 1)
-    monkeypatch.setattr("stages.training_parts.FIRST_TIMED", 0)
+    monkeypatch.setattr("stages.train.profile.TIMED_EVERY", 1)
+    monkeypatch.setattr("stages.train.profile.FIRST_TIMED", 0)
     timed, plain, timings = trainer(kind), trainer(kind), {}
     for step in range(20):  # the density cache is measured in the sixteenth
         assert timed_step(timed, step, timings) == plain.step(step, 0.1, 1.0)
@@ -66,8 +66,8 @@ def test_a_run_has_the_same_bits_with_every_step_timed_and_with_none(
 
 @pytest.mark.parametrize("kind", ["torch", "warp", "paper"])
 def test_shares_sum_to_one_and_every_part_is_there(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("stages.training_parts.TIMED_EVERY", 1)
-    monkeypatch.setattr("stages.training_parts.FIRST_TIMED", 0)
+    monkeypatch.setattr("stages.train.profile.TIMED_EVERY", 1)
+    monkeypatch.setattr("stages.train.profile.FIRST_TIMED", 0)
     of, timings = trainer(kind), {}
     results = [timed_step(of, step, timings) for step in range(5)]
     table = parts_table(timings, RATES)
@@ -102,7 +102,7 @@ def test_products_are_those_that_torch_counts(
     for name, value in changed.items():
         monkeypatch.setitem(PAPER, name, value)
     of, timings = trainer(kind), {}
-    monkeypatch.setattr("nerf.parallel.workers", lambda: 1)  # the counter sees the thread that it is opened in
+    monkeypatch.setattr("nerf.runtime.parallel.workers", lambda: 1)  # the counter sees the thread that it is opened in
     with FlopCounterMode(display=False) as counted:
         timed_step(of, FIRST_TIMED, timings)
     ours = sum(work[1] for work in timings["parts"].values())
@@ -164,7 +164,7 @@ def test_the_page_has_a_row_per_part_and_nothing_where_nothing_was_timed() -> No
 
 
 def test_the_file_is_written_where_a_step_was_timed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("stages.training_parts.rates_for", lambda *_: RATES)
+    monkeypatch.setattr("stages.train.profile.rates_for", lambda *_: RATES)
     of, timings = trainer("paper"), {}
     assert write_parts(tmp_path, timings, of.model, CPU) == []
     timed_step(of, FIRST_TIMED, timings)
@@ -175,7 +175,7 @@ def test_the_file_is_written_where_a_step_was_timed(tmp_path: Path, monkeypatch:
 @pytest.mark.parametrize("kind", ["torch", "paper"])
 def test_rates_are_measured_at_the_sizes_of_the_field(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
-    monkeypatch.setattr("nerf.machine_rates.measure_rates", lambda *arguments: asked.append(arguments) or RATES)
+    monkeypatch.setattr("nerf.runtime.machine_rates.measure_rates", lambda *arguments: asked.append(arguments) or RATES)
     model = trainer(kind).model
     assert rates_for(model, CPU) == RATES
     rows = model.layout.rows if isinstance(model, GridField) else 1

@@ -6,13 +6,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nerf.grid_field import GridSettings
-from nerf.scene import Camera, Scene
-from stages.effect_decisions import Decisions
+from nerf.fields.hash_grid import GridSettings
+from nerf.geometry.scene import Camera, Scene
+from stages.effects.decisions import Decisions
 from stages.train import LARGE_STEP_RATE, LARGEST_STEP, PART_SAMPLES, Config, with_habits
-from stages.training_data import scaled_size
-from stages.training_setup import field_bytes, grid_settings, has_sky
-from stages.training_size import (
+from stages.train.data import scaled_size
+from stages.train.setup import field_bytes, grid_settings, has_sky
+from stages.train.size import (
     LEAST_LONG_SIDE,
     MOST_PHOTOS,
     MOST_PIXELS,
@@ -111,7 +111,7 @@ PAPER = Config(
 
 @pytest.mark.parametrize("config", [GRID, PAPER], ids=["grid", "paper"])
 def test_the_speed_is_measured_on_this_machine(config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("stages.training_size.TIMED_SECONDS", 0.05)
+    monkeypatch.setattr("stages.train.size.TIMED_SECONDS", 0.05)
     _, scene = photographed(tmp_path, channels=4)
     assert 10 < rays_per_second(config, scene, Decisions()) < 1e7
 
@@ -150,9 +150,9 @@ def test_a_gpu_has_larger_fields_and_takes_larger_steps(
     config = Config(field="grid", contracted=folded, view_dependence=True, downscale=1.0, chunks=2)
     large = of_size(scene, 4000, 3000)
     on_cpu = grid_size(with_habits(config), large, 1e9), with_habits(config)
-    monkeypatch.setattr("stages.training_size.compute_device", lambda: "cuda")
-    monkeypatch.setattr("stages.device.compute_device", lambda: "cuda")
-    monkeypatch.setattr("stages.training_size.available_on", {"cuda": 80e9}.get)
+    monkeypatch.setattr("stages.train.size.compute_device", lambda: "cuda")
+    monkeypatch.setattr("stages.hardware.device.compute_device", lambda: "cuda")
+    monkeypatch.setattr("stages.train.size.available_on", {"cuda": 80e9}.get)
     on_gpu = grid_size(with_habits(config), large, 1e9), with_habits(config)
     assert on_gpu[0] == {"levels": 8, "log2_rows": 20, "finest": most}
     assert on_gpu[0]["finest"] > on_cpu[0]["finest"] and on_gpu[0]["log2_rows"] > on_cpu[0]["log2_rows"]
@@ -230,7 +230,7 @@ NEEDED = field_bytes(FOLDED.model_copy(update=LARGEST), 1)
 def test_grids_take_half_of_the_free_memory_at_most(
     scene: Scene, free: float, own: dict[str, int], chosen: dict[str, int], monkeypatch: pytest.MonkeyPatch, progress
 ) -> None:
-    monkeypatch.setattr("stages.training_size.available_on", {"cpu": free}.get)
+    monkeypatch.setattr("stages.train.size.available_on", {"cpu": free}.get)
     config = FOLDED.model_copy(update=own)
     assert grid_size(config, of_size(scene, 4000, 3000), 1e9, progress) == chosen
     said = "5 grids of up to 2^{log2_rows} rows: 6 grids of up to 2^18 rows, which the budget could fill, take "
@@ -250,8 +250,8 @@ def test_grids_take_half_of_the_free_memory_at_most(
 def test_the_pixels_take_half_of_a_gpus_free_memory_at_most(
     scene: Scene, device: str, free: float, has_alpha: bool, downscale: float, monkeypatch: pytest.MonkeyPatch, progress
 ) -> None:
-    monkeypatch.setattr("stages.training_size.compute_device", lambda: device)
-    monkeypatch.setattr("stages.training_size.available_on", {"cuda": free}.get)
+    monkeypatch.setattr("stages.train.size.compute_device", lambda: device)
+    monkeypatch.setattr("stages.train.size.available_on", {"cuda": free}.get)
     large = replace(of_size(scene, 2000, 1000), has_alpha=has_alpha)  # six photos, 36 MB without alpha
     assert chosen_downscale(large, 12e6, progress=progress) == downscale
     said = f"photos at 1/{downscale:g} of their size: at 1/1, which the budget could make use of, their pixels take "

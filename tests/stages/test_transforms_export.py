@@ -4,10 +4,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nerf.scene import Camera, Scene, Similarity, View
-from stages.colmap.model_files import PARAMETERS
-from stages.transforms_export import intrinsics, transforms
-from stages.transforms_intrinsics import read_intrinsics
+from nerf.geometry.scene import Camera, Scene, Similarity, View
+from stages.io.transforms_export import intrinsics, transforms
+from stages.io.transforms_intrinsics import read_intrinsics
+from stages.sfm.colmap.model_files import PARAMETERS
 from tests.camera_layouts import ring
 
 TURN = np.array([[0.0, -1.0, 0.0], [0.6, 0.0, -0.8], [0.8, 0.0, 0.6]])

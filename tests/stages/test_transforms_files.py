@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from stages.contract import StageError
-from stages.known_cameras import KnownCameras, read_known_cameras
-from stages.photos import Photo
-from stages.transforms_files import read_transforms
+from stages.io.photos import Photo
+from stages.io.transforms_files import read_transforms
+from stages.sfm.imported.known_cameras import KnownCameras, read_known_cameras
 
 LENS = {"camera_angle_x": 0.7}
 

@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from stages import ingest
-from stages.decoding import Stored
 from stages.ingest import Config
-from stages.photos import read_photos
-from stages.sources import find_source, unused_masks
-from stages.twins import depth_maps, is_mask, twins
+from stages.ingest.auxiliary_files import depth_maps, is_mask, twins
+from stages.ingest.decoding import Stored
+from stages.ingest.sources import find_source, unused_masks
+from stages.io.photos import read_photos
 from tests.stages.test_sources import touch
 
 

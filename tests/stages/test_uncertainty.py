@@ -5,11 +5,11 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from stages.colmap import uncertainty
-from stages.colmap.held_out import Choice
-from stages.colmap.observations import LEAST_NOISE_PX, noise_px, observations
-from stages.colmap.refinement import _finished
-from stages.colmap.uncertainty import _error_px, pose_uncertainty_px
+from stages.sfm.colmap import uncertainty
+from stages.sfm.colmap.held_out import Choice
+from stages.sfm.colmap.observations import LEAST_NOISE_PX, noise_px, observations
+from stages.sfm.colmap.refinement import _finished
+from stages.sfm.colmap.uncertainty import _error_px, pose_uncertainty_px
 from tests.stages.lens_scene import adjust, lens, photographed
 
 CAMERA = lens("SIMPLE_RADIAL", 800, 450, 300, -0.1)

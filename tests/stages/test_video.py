@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stages.contract import StageError
-from stages.video import video_writer
+from stages.io.video import video_writer
 from tests.video_files import read_video
 
 COLOURS = [(200, 30, 30), (30, 200, 30), (30, 30, 200), (128, 128, 128), (255, 255, 255), (0, 0, 0)]

@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from stages.contract import StageError
-from stages.video import video_writer
-from stages.video_frames import (
+from stages.ingest.video_frames import (
     LONG_STEP,
     LOST,
     PLENTY,
@@ -25,6 +24,7 @@ from stages.video_frames import (
     lacks_frames,
     take_frames,
 )
+from stages.io.video import video_writer
 from tests.blots import blots, cut_out
 
 WIDTH, HEIGHT, FPS = 160, 120, 10
@@ -95,7 +95,7 @@ def test_large_frames_are_shrunk_once(tmp_path: Path, progress: Any, monkeypatch
     with video_writer(tmp_path / "a.mp4", 1200, 64, FPS) as write:
         for step in range(4):
             write(cut_out(wall, 100 * step, 10, 1200, 64))
-    monkeypatch.setattr("stages.video_frames.sharpness", lambda picture: float(sizes.append(picture.shape) or 0))
+    monkeypatch.setattr("stages.ingest.video_frames.sharpness", lambda picture: float(sizes.append(picture.shape) or 0))
     assert len(taken(tmp_path / "a.mp4", tmp_path / "out", progress)) == 4
     assert sizes == [(53, 1000)] * 4
 

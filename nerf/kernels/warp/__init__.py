@@ -6,7 +6,7 @@ no fixed order.
 """
 
 from nerf.kernels.warp.adam import adam
-from nerf.kernels.warp.cache import cell_corners, occupied_bits, raise_cache
+from nerf.kernels.warp.colour_sampling import add_drawn, drawn_samples
 from nerf.kernels.warp.compositing import (
     composite,
     composite_backward,
@@ -14,14 +14,14 @@ from nerf.kernels.warp.compositing import (
     distortion_backward,
     visible_samples,
 )
-from nerf.kernels.warp.directions import spherical_harmonics, spherical_harmonics_backward
-from nerf.kernels.warp.drawing import add_drawn, drawn_samples
+from nerf.kernels.warp.early_termination import end_wave, pack_waves
 from nerf.kernels.warp.encoding import encode, encode_backward_points, encode_backward_table
+from nerf.kernels.warp.hidden_layer import add_ray_relu, add_ray_relu_backward, relu_backward
 from nerf.kernels.warp.launch import compile_kernels, why_not
-from nerf.kernels.warp.layers import add_ray_relu, add_ray_relu_backward, relu_backward
 from nerf.kernels.warp.marching import march, sample_points, sample_points_backward
+from nerf.kernels.warp.occupancy import cell_corners, occupied_bits, raise_cache
 from nerf.kernels.warp.sparse_depth import depth_loss, depth_loss_backward
-from nerf.kernels.warp.waves import end_wave, pack_waves
+from nerf.kernels.warp.spherical_harmonics import spherical_harmonics, spherical_harmonics_backward
 
 __all__ = [
     "adam",

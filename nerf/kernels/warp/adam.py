@@ -1,10 +1,10 @@
-"""Adam for gradients that are zero almost everywhere (``nerf.kernels.adam``)."""
+"""Adam for gradients that are zero almost everywhere (``nerf.kernels.torch.adam``)."""
 
 import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf.kernels.adam import LEAST_ROOT, MEAN_DECAY, SQUARE_DECAY
+from nerf.kernels.torch.adam import LEAST_ROOT, MEAN_DECAY, SQUARE_DECAY
 from nerf.kernels.warp.launch import launch, vec16
 
 wp.set_module_options({"enable_backward": False})
@@ -23,7 +23,7 @@ def adam(
     rate: float,
     count: int,
 ) -> None:
-    """As in nerf.kernels.adam."""
+    """As in nerf.kernels.torch.adam."""
     mean_share, square_share = 1 - MEAN_DECAY**count, 1 - SQUARE_DECAY**count
     scales, tensors = (rate / mean_share, 1 / square_share), (parameter, gradient, mean, square)
     whole, rest = divmod(parameter.numel(), _LANES)

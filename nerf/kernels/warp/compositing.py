@@ -1,4 +1,4 @@
-"""Volume rendering of packed samples (``nerf.kernels.packed_compositing``): a ray is one thread's loop.
+"""Volume rendering of packed samples (``nerf.kernels.torch.compositing``): a ray is one thread's loop.
 
 Sums run along one ray, in float64 as the reference's do: in float32 a run of 4096 equal numbers is off by 1e-5 or more,
 as each addition rounds the same way.
@@ -9,10 +9,10 @@ import warp as wp
 from jaxtyping import Float, Int32
 from torch import Tensor
 
+from nerf.fields.interface import Rendering
 from nerf.kernels import Lattice, Samples
-from nerf.kernels.packed_compositing import LEAST_CHANCE, OPAQUE
+from nerf.kernels.torch.compositing import LEAST_CHANCE, OPAQUE
 from nerf.kernels.warp.launch import launch
-from nerf.model import Rendering
 
 wp.set_module_options({"enable_backward": False})
 
@@ -24,7 +24,7 @@ _SERIES_BELOW = wp.constant(0.2)  # the first term that artanh's series leaves o
 def visible_samples(
     samples: Samples, sigma: Float[Tensor, "samples"], threshold: float, thin: float, offset: Float[Tensor, "rays"]
 ) -> tuple[Samples, Int32[Tensor, "kept"]]:
-    """As in nerf.kernels.packed_compositing."""
+    """As in nerf.kernels.torch.compositing."""
     rays, device = len(samples.starts) - 1, sigma.device
     counts = torch.empty(rays, dtype=torch.int32, device=device)
     launch(_count_visible, rays, samples.starts, samples.dt, sigma, threshold, thin, offset, counts)
@@ -44,7 +44,7 @@ def composite(
     background: Float[Tensor, "rays 3"],
     far: Float[Tensor, "rays"],
 ) -> tuple[Rendering, Float[Tensor, "samples"]]:
-    """As in nerf.kernels.packed_compositing."""
+    """As in nerf.kernels.torch.compositing."""
     rendering = Rendering(torch.empty_like(background), torch.empty_like(far), torch.empty_like(far))
     weights = torch.empty_like(sigma)
     packed = samples.starts, samples.t, samples.dt, sigma, colour
@@ -61,7 +61,7 @@ def composite_backward(
     grad: Rendering,
     grad_weights: Float[Tensor, "samples"],
 ) -> tuple[Float[Tensor, "samples"], Float[Tensor, "samples 3"]]:
-    """As in nerf.kernels.packed_compositing."""
+    """As in nerf.kernels.torch.compositing."""
     grad_sigma, grad_colour = torch.empty_like(sigma), torch.empty_like(colour)
     packed = samples.starts, samples.t, samples.dt, sigma, colour
     arguments = *packed, background, far, *grad, grad_weights, grad_sigma, grad_colour
@@ -70,7 +70,7 @@ def composite_backward(
 
 
 def distortion(samples: Samples, weights: Float[Tensor, "samples"], lattice: Lattice) -> Float[Tensor, "rays"]:
-    """As in nerf.kernels.packed_compositing."""
+    """As in nerf.kernels.torch.compositing."""
     spread = weights.new_empty(len(samples.starts) - 1)
     launch(_distortion, len(spread), grows_from(lattice), samples.starts, samples.t, samples.dt, weights, spread)
     return spread
@@ -79,7 +79,7 @@ def distortion(samples: Samples, weights: Float[Tensor, "samples"], lattice: Lat
 def distortion_backward(
     samples: Samples, weights: Float[Tensor, "samples"], lattice: Lattice, grad: Float[Tensor, "rays"]
 ) -> Float[Tensor, "samples"]:
-    """As in nerf.kernels.packed_compositing."""
+    """As in nerf.kernels.torch.compositing."""
     grad_weights = torch.empty_like(weights)
     packed = samples.starts, samples.t, samples.dt, weights
     launch(_distortion_backward, len(grad), grows_from(lattice), *packed, grad, grad_weights)

@@ -1,4 +1,4 @@
-"""Multi-resolution feature grids (``nerf.kernels.grid_encoding``), for grids of four features."""
+"""Multi-resolution feature grids (``nerf.kernels.torch.encoding``), for grids of four features."""
 
 import functools
 
@@ -23,7 +23,7 @@ vec8i = wp.types.vector(length=8, dtype=wp.int32)
 def encode(
     layout: GridLayout, table: Float[Tensor, "rows features"], points: Float[Tensor, "points 3"]
 ) -> Float[Tensor, "points width"]:
-    """As in nerf.kernels.grid_encoding."""
+    """As in nerf.kernels.torch.encoding."""
     features = points.new_empty(len(points), layout.width)
     levels = _levels(layout, points.device)
     launch(_encode, len(points), levels, len(layout.resolutions), table, points, features)
@@ -37,7 +37,7 @@ def encode_backward_table(
     grad_features: Float[Tensor, "points width"],
     grad_table: Float[Tensor, "rows features"],
 ) -> None:
-    """As in nerf.kernels.grid_encoding. Points are added in their order on the CPU, in any order on a GPU."""
+    """As in nerf.kernels.torch.encoding. Points are added in their order on the CPU, in any order on a GPU."""
     levels = _levels(layout, points.device)
     launch(
         _encode_backward_table, len(points), levels, len(layout.resolutions), level, points, grad_features, grad_table
@@ -50,7 +50,7 @@ def encode_backward_points(
     points: Float[Tensor, "points 3"],
     grad_features: Float[Tensor, "points width"],
 ) -> Float[Tensor, "points 3"]:
-    """As in nerf.kernels.grid_encoding."""
+    """As in nerf.kernels.torch.encoding."""
     grad_points = torch.empty_like(points)
     levels = _levels(layout, points.device)
     arguments = levels, len(layout.resolutions), table, points, grad_features, grad_points

@@ -12,7 +12,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from nerf.parallel import workers
+from nerf.runtime.parallel import workers
 
 wp.config.log_level = wp.LOG_ERROR  # a machine without a GPU is no news, nor is each module compiled
 # Else every kernel on x86, with tiles or without, notes in one static pointer where its stack is: threads race for it

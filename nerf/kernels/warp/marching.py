@@ -1,4 +1,4 @@
-"""Samples along rays (``nerf.kernels.marching``): where the density cache is empty, whole
+"""Samples along rays (``nerf.kernels.torch.marching``): where the density cache is empty, whole
 neighbourhoods of bricks are skipped."""
 
 import threading
@@ -8,10 +8,10 @@ import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
+from nerf.geometry.rays import Rays
 from nerf.kernels import BOX, CONTRACTED_BOX, Lattice, Occupied, Samples
-from nerf.kernels.warp.cache import cell_number
 from nerf.kernels.warp.launch import launch
-from nerf.rays import Rays
+from nerf.kernels.warp.occupancy import cell_number
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -21,7 +21,7 @@ _LARGEST = wp.constant(1.0e30)
 
 
 def march(occupied: Occupied, lattice: Lattice, rays: Rays, jitter: Float[Tensor, "rays"]) -> Samples:
-    """As in nerf.kernels.marching."""
+    """As in nerf.kernels.torch.marching."""
     count, device = len(jitter), jitter.device
     found = _scratch(count * lattice.most_samples, device)
     counts = torch.empty(count, dtype=torch.int32, device=device)
@@ -38,7 +38,7 @@ def march(occupied: Occupied, lattice: Lattice, rays: Rays, jitter: Float[Tensor
 
 
 def sample_points(rays: Rays, samples: Samples, contracted: bool) -> Float[Tensor, "samples 3"]:
-    """As in nerf.kernels.marching."""
+    """As in nerf.kernels.torch.marching."""
     points = samples.t.new_empty(len(samples.t), 3)
     launch(_sample_points, len(points), int(contracted), rays.origins, rays.directions, samples.ray, samples.t, points)
     return points
@@ -47,7 +47,7 @@ def sample_points(rays: Rays, samples: Samples, contracted: bool) -> Float[Tenso
 def sample_points_backward(
     rays: Rays, samples: Samples, contracted: bool, grad_points: Float[Tensor, "samples 3"]
 ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays 3"]]:
-    """As in nerf.kernels.marching."""
+    """As in nerf.kernels.torch.marching."""
     grad_origins, grad_directions = torch.empty_like(rays.origins), torch.empty_like(rays.directions)
     packed = samples.starts, samples.t, grad_points
     arguments = int(contracted), rays.origins, rays.directions, *packed, grad_origins, grad_directions
@@ -87,7 +87,7 @@ def lattice_coordinate(step: float, cone: float, t: float):
 
 @wp.func
 def _contract(point: wp.vec3):
-    """nerf.contraction.contract: the largest component r > 1 becomes 2 - 1/r, the others in proportion."""
+    """nerf.geometry.contraction.contract: the largest component r > 1 becomes 2 - 1/r, the others in proportion."""
     r = wp.max(wp.max(wp.abs(point[0]), wp.abs(point[1])), wp.abs(point[2]))
     if r <= 1.0:
         return point

@@ -16,9 +16,9 @@ from nerf.effects.exposure import (
     fit_log_gain,
     own_light,
 )
-from nerf.model import RadianceModel, Rendering
-from nerf.rays import Rays
-from nerf.srgb import KNEE, linear_to_srgb, srgb_to_linear
+from nerf.fields.interface import RadianceModel, Rendering
+from nerf.geometry.rays import Rays
+from nerf.rendering.srgb import KNEE, linear_to_srgb, srgb_to_linear
 
 EXTREMES = [0.0, 1e-30, 1e-8, 0.04, KNEE, 0.0405, 0.5, 1.0, 2.0, 1e4, 1e12, 1e20, 1e30]
 gains = st.floats(-3, 3)

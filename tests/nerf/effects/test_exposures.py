@@ -5,9 +5,9 @@ import torch
 
 from nerf.effects import AS_GIVEN, AS_RENDERED, PhotoColours, PhotoRays, Seen
 from nerf.effects.exposure import expose
-from nerf.effects.exposures import Exposures
-from nerf.effects.poses import RefinedPoses
-from nerf.model import Rendering
+from nerf.effects.exposure_model import Exposures
+from nerf.effects.pose_refinement import RefinedPoses
+from nerf.fields.interface import Rendering
 
 VIEW = torch.tensor([0, 2, 2, 1])
 GAINS = torch.tensor([[0.5, 0.0, -0.2], [0.0, 0.3, 0.1], [-0.4, 0.1, 0.2]], dtype=torch.float64)

@@ -4,9 +4,9 @@ import torch
 from torch import Tensor
 
 from nerf.effects.pose_fit import fit_pose
-from nerf.grid_field import GridField, GridGradients, GridPass, GridSettings
-from nerf.kernels import reference
-from nerf.rays import Rays
+from nerf.fields.hash_grid import GridField, GridGradients, GridPass, GridSettings
+from nerf.geometry.rays import Rays
+from nerf.kernels import torch as reference
 
 SMALLER = 1 / 16  # a power of two: numbers that differ by it have the same digits
 FIELD = GridSettings(levels=2, log2_rows=10, coarsest=4, finest=16, steps=32, cache_cells=16)

@@ -4,9 +4,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerf.effects.poses import RATE, RefinedPoses
-from nerf.kernels import reference
-from nerf.rays import Rays
+from nerf.effects.pose_refinement import RATE, RefinedPoses
+from nerf.geometry.rays import Rays
+from nerf.kernels import torch as reference
 
 
 def rays(count: int = 6) -> Rays:

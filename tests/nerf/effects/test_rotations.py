@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from nerf.effects.rotations import SERIES_BELOW, cross_matrix, rotation_from_vector
+from nerf.geometry.rotations import SERIES_BELOW, cross_matrix, rotation_from_vector
 
 ANGLES = (
     0.0,

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from nerf.evidence.tracks import TrackColours
+from nerf.effects.statistics.tracks import TrackColours
 
 
 def encoded(light: np.ndarray) -> np.ndarray:

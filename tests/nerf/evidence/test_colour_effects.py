@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nerf.evidence import media, transients, view_dependence, vignetting
-from nerf.evidence.evidence import Evidence
-from nerf.evidence.exposure import EV, fit_exposure
-from nerf.evidence.tracks import TrackColours
-from nerf.srgb import linear_light
+from nerf.effects.statistics import media, transients, view_dependence, vignetting
+from nerf.effects.statistics.exposure import EV, fit_exposure
+from nerf.effects.statistics.statistic import Evidence
+from nerf.effects.statistics.tracks import TrackColours
+from nerf.rendering.srgb import linear_light
 from tests.nerf.evidence.photographed_points import encoded, photographed_points
 
 SEEDS = range(20)

@@ -2,7 +2,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nerf.evidence.evidence import HARM, decide, judged, unknown
+from nerf.effects.statistics.statistic import HARM, decide, judged, unknown
 
 INFINITE = float("inf")
 

@@ -3,8 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nerf.evidence.exposure import EV, THRESHOLD_EV, exposure_evidence, fit_exposure, tone_evidence
-from nerf.evidence.tracks import TrackColours
+from nerf.effects.statistics.exposure import EV, THRESHOLD_EV, exposure_evidence, fit_exposure, tone_evidence
+from nerf.effects.statistics.tracks import TrackColours
 from tests.nerf.evidence.photographed_points import photographed_points
 
 SEEDS = range(20)

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nerf.evidence.background import background_evidence, untracked_share
-from nerf.evidence.blur import blur_evidence, relative_gradients
-from nerf.evidence.poses import common_residuals, pose_evidence
-from nerf.evidence.rolling_shutter import across_rows, motion_to_next, rolling_shutter_evidence
-from nerf.evidence.scale import scale_evidence
-from nerf.evidence.tracks import TrackColours
+from nerf.effects.statistics.background import background_evidence, untracked_share
+from nerf.effects.statistics.blur import blur_evidence, relative_gradients
+from nerf.effects.statistics.poses import common_residuals, pose_evidence
+from nerf.effects.statistics.rolling_shutter import across_rows, motion_to_next, rolling_shutter_evidence
+from nerf.effects.statistics.scale import scale_evidence
+from nerf.effects.statistics.tracks import TrackColours
 from tests.nerf.evidence.photographed_points import photographed_points
 
 SEEDS = range(20)

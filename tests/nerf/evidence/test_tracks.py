@@ -2,7 +2,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nerf.evidence.tracks import MOST_IN_TRACK, TrackColours, log_light, log_noise, usable
+from nerf.effects.statistics.tracks import MOST_IN_TRACK, TrackColours, log_light, log_noise, usable
 from tests.nerf.evidence.photographed_points import photographed_points
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nerf.evidence.two_way import TwoWay, inverted, solved, two_way
+from nerf.effects.statistics.additive_model import TwoWay, inverted, solved, two_way
 
 
 def drawn(seed: int, views: int = 7, points: int = 40) -> tuple[TwoWay, np.ndarray]:
@@ -122,7 +122,7 @@ import hashlib
 
 import numpy as np
 
-from nerf.evidence.exposure import fit_exposure
+from nerf.effects.statistics.exposure import fit_exposure
 from tests.nerf.evidence.photographed_points import photographed_points
 
 tracks = photographed_points(0, views=160, points=1200, per_point=6, log_gain=np.random.default_rng(0).normal(size=160))

@@ -1,6 +1,6 @@
 import torch
 
-from nerf.kernels.reference import adam
+from nerf.kernels.torch import adam
 
 
 def test_busy_entries_follow_torchs_adam() -> None:

@@ -1,7 +1,7 @@
 import torch
 
-from nerf.kernels.cache import MOST_CLEAR, cell_numbers, occupied
-from nerf.kernels.reference import cell_corners, occupied_bits, raise_cache
+from nerf.kernels.torch import cell_corners, occupied_bits, raise_cache
+from nerf.kernels.torch.occupancy import MOST_CLEAR, cell_numbers, occupied
 
 
 def test_every_cell_has_one_number_and_bricks_are_words() -> None:

@@ -1,6 +1,6 @@
 import torch
 
-from nerf.kernels.reference import spherical_harmonics, spherical_harmonics_backward
+from nerf.kernels.torch import spherical_harmonics, spherical_harmonics_backward
 
 
 def unit_vectors(count: int) -> torch.Tensor:

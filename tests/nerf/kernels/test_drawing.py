@@ -7,7 +7,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerf.kernels import Backend, Drawn, Samples, reference, warp
+from nerf.kernels import Backend, Drawn, Samples, warp
+from nerf.kernels import torch as reference
 from tests.devices import DEVICES, skip_without
 from tests.nerf.kernels.warp_agreement import COUNTS, normal, packed, uniform
 

@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from nerf.kernels import GridLayout, grid_layout
-from nerf.kernels.reference import encode, encode_backward_points, encode_backward_table
+from nerf.kernels.torch import encode, encode_backward_points, encode_backward_table
 
 LAYOUT = grid_layout(levels=3, coarsest=3, finest=9, log2_rows=7, features=2)
 

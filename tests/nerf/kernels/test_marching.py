@@ -3,12 +3,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerf.contraction import contract
+from nerf.geometry.contraction import contract
+from nerf.geometry.rays import Rays, clip_to_box
 from nerf.kernels import BOX, Lattice
-from nerf.kernels.cache import occupied
-from nerf.kernels.marching import lattice_coordinate, lattice_distance
-from nerf.kernels.reference import march, occupied_bits, sample_points, sample_points_backward
-from nerf.rays import Rays, clip_to_box
+from nerf.kernels.torch import march, occupied_bits, sample_points, sample_points_backward
+from nerf.kernels.torch.marching import lattice_coordinate, lattice_distance
+from nerf.kernels.torch.occupancy import occupied
 
 BOUNDED = Lattice(step=0.05, cone=0.0, contracted=False, cells=8, most_samples=1000)
 FOLDED = Lattice(step=0.05, cone=0.1, contracted=True, cells=8, most_samples=1000)

@@ -6,11 +6,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from nerf import compositing
+from nerf.fields.interface import Rendering
 from nerf.kernels import Lattice, Samples
-from nerf.kernels.packed_compositing import LEAST_CHANCE
-from nerf.kernels.reference import composite, composite_backward, distortion, distortion_backward, visible_samples
-from nerf.model import Rendering
+from nerf.kernels.torch import composite, composite_backward, distortion, distortion_backward, visible_samples
+from nerf.kernels.torch.compositing import LEAST_CHANCE
+from nerf.rendering import volume_rendering as compositing
 
 COUNTS = (3, 0, 7, 1, 0, 12)
 EVEN, GROWING = Lattice(0.05, 0.0, False, 8, 100), Lattice(0.05, 0.2, True, 8, 100)

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from nerf.kernels import Lattice, Samples
-from nerf.kernels.sparse_depth import depth_loss, depth_loss_backward
+from nerf.kernels.torch.sparse_depth import depth_loss, depth_loss_backward
 
 EVEN, GROWING = Lattice(0.25, 0.0, False, 8, 100), Lattice(0.25, 0.1, True, 8, 100)  # the second grows from 2.5 on
 T = torch.tensor([1.0, 2.0, 4.0, 8.0], dtype=torch.float64)

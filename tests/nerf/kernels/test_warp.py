@@ -13,8 +13,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerf.kernels import Backend, grid_layout, reference, warp
-from nerf.kernels.warp import cache
+from nerf.kernels import Backend, grid_layout, warp
+from nerf.kernels import torch as reference
+from nerf.kernels.warp import occupancy as cache
 from nerf.kernels.warp.launch import launch
 from tests.devices import skip_without
 from tests.nerf.kernels.warp_agreement import (

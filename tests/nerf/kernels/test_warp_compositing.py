@@ -8,8 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from nerf.kernels import Backend, Lattice, Samples, reference, warp
-from nerf.model import Rendering
+from nerf.fields.interface import Rendering
+from nerf.kernels import Backend, Lattice, Samples, warp
+from nerf.kernels import torch as reference
 from tests.nerf.kernels.warp_agreement import (
     COUNTS,
     LATTICES,

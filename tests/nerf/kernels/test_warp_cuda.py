@@ -13,15 +13,15 @@ assert nerf.kernels.warp.adam  # the package defines all kernels when it is impo
 # With their kernels.
 MODULES = {
     "adam": 2,
-    "cache": 3,
+    "colour_sampling": 3,
     "compositing": 6,
-    "directions": 1,
-    "drawing": 3,
+    "early_termination": 2,
     "encoding": 3,
-    "layers": 3,
+    "hidden_layer": 3,
     "marching": 4,
+    "occupancy": 3,
     "sparse_depth": 2,
-    "waves": 2,
+    "spherical_harmonics": 1,
 }
 
 

@@ -4,11 +4,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerf.contraction import uncontract
-from nerf.kernels import BOX, Lattice, Occupied, Samples, reference, warp
-from nerf.kernels.cache import cell_corners, cell_numbers, occupied
-from nerf.kernels.marching import lattice_coordinate, unit_coordinates
-from nerf.rays import Rays, clip_to_box
+from nerf.geometry.contraction import uncontract
+from nerf.geometry.rays import Rays, clip_to_box
+from nerf.kernels import BOX, Lattice, Occupied, Samples, warp
+from nerf.kernels import torch as reference
+from nerf.kernels.torch.marching import lattice_coordinate, unit_coordinates
+from nerf.kernels.torch.occupancy import cell_corners, cell_numbers, occupied
 from tests.nerf.kernels.warp_agreement import (
     BOUNDED,
     FOLDED,

@@ -15,15 +15,15 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from nerf.grid_field import GridField, GridSettings
-from nerf.grid_training import GridTrainer, GridTrainerSettings
+from nerf.fields.hash_grid import GridField, GridSettings
+from nerf.fields.interface import Rendering
+from nerf.geometry.rays import Rays
 from nerf.kernels import Lattice, grid_layout, warp
-from nerf.kernels.cache import occupied
-from nerf.model import Rendering
-from nerf.parallel import take_over_cores
-from nerf.randomness import generator
-from nerf.ray_bank import RayBank, build_ray_bank
-from nerf.rays import Rays
+from nerf.kernels.torch.occupancy import occupied
+from nerf.runtime.parallel import take_over_cores
+from nerf.runtime.randomness import generator
+from nerf.training.hash_grid_trainer import GridTrainer, GridTrainerSettings
+from nerf.training.ray_dataset import RayBank, build_ray_bank
 
 ROOT = Path(__file__).parents[3]
 
@@ -39,7 +39,7 @@ def use_cores(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[int], None]
     before = torch.get_num_threads()
 
     def use(count: int) -> None:
-        monkeypatch.setattr("nerf.parallel._taken", None)
+        monkeypatch.setattr("nerf.runtime.parallel._taken", None)
         torch.set_num_threads(count)
 
     yield use
@@ -104,7 +104,7 @@ def run_briefly(trainer: GridTrainer, start: dict[str, Tensor]) -> dict[str, Ten
 def test_a_training_run_has_the_same_bits_again_and_again_on_any_number_of_threads(
     field: GridSettings, use_cores: Callable[[int], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("nerf.density_cache.CHUNK", 128)  # so that even this small cache is measured in several
+    monkeypatch.setattr("nerf.fields.occupancy_grid.CHUNK", 128)  # so that even this small cache is measured in several
     trainer, used = small_trainer(field), set[int]()
     guided = [int((trainer._batch(0, 0.0, chunk, trainer._rays_per_chunk()).distance > 0).sum()) for chunk in range(4)]
     assert sum(guided) == 2 and trainer._rays_per_chunk() == 4

@@ -7,8 +7,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerf.kernels import Backend, Lattice, Samples, reference, warp
-from nerf.kernels.marching import lattice_coordinate
+from nerf.kernels import Backend, Lattice, Samples, warp
+from nerf.kernels import torch as reference
+from nerf.kernels.torch.marching import lattice_coordinate
 from tests.devices import DEVICES, skip_without
 
 BACKENDS = pytest.mark.parametrize("backend", [reference, warp], ids=["reference", "warp"])

@@ -11,9 +11,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nerf.kernels import BOX, Lattice, Occupied, Samples, reference, warp
-from nerf.kernels.cache import occupied
-from nerf.rays import Rays
+from nerf.geometry.rays import Rays
+from nerf.kernels import BOX, Lattice, Occupied, Samples, warp
+from nerf.kernels import torch as reference
+from nerf.kernels.torch.occupancy import occupied
 
 TOLERANCE = 1e-5
 BOUNDED = Lattice(2 * BOX * 3**0.5 / 256, 0.0, False, 32, 1024)

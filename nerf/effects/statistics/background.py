@@ -1,0 +1,44 @@
+"""Whether photos show anything beyond the region of interest, and how much of them is beside all points."""
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from nerf import REGION_HALF
+from nerf.effects.statistics.statistic import Evidence, unknown
+
+NEVER = float("inf")  # the threshold of what no share decides, and its noise: only alpha does
+CELLS = 16  # along each side of a photo
+
+
+def background_evidence(
+    position: Float[np.ndarray, "points 3"], point: Int[np.ndarray, "k"], has_alpha: bool, untracked: float
+) -> Evidence:
+    """Photos with alpha say themselves what is there; without it the background is always called for, since sky and
+    plain walls have no points: that none lies beyond the region proves nothing.
+
+    The share of observations whose point does, and ``untracked``, are shown and decide nothing, so threshold and noise
+    are infinite."""
+    if has_alpha:
+        return Evidence(0.0, "share", NEVER, NEVER, False, "the photos' alpha says what is background")
+    seen = np.bincount(point, minlength=len(position)).astype(float)
+    if not seen.any():
+        return unknown("share", NEVER, "no tracks", True)
+    beyond = np.abs(position).max(axis=1) > REGION_HALF
+    share = float(np.average(beyond, weights=seen))
+    words = (
+        f"only alpha could tell that nothing lies beyond the region: {share:.1%} of what is tracked does, and "
+        f"{untracked:.0%} of the photos' area has no track near"
+    )
+    return Evidence(share, "share", NEVER, NEVER, True, words)
+
+
+def untracked_share(place: Float[np.ndarray, "k 2"], view: Int[np.ndarray, "k"], views: int) -> float:
+    """The share of the photos' area with no observation near: of CELLS × CELLS cells, those without one in them or in
+    their eight neighbours. ``place``: x / width and y / height. 1 without observations."""
+    cell = np.clip((place * CELLS).astype(int), 0, CELLS - 1)
+    near = np.zeros((views, CELLS + 2, CELLS + 2), bool)
+    for down in range(3):
+        for across in range(3):
+            near[view, cell[:, 1] + down, cell[:, 0] + across] = True
+    inside = near[:, 1:-1, 1:-1]
+    return float(1 - inside.mean()) if inside.size else 1.0

@@ -1,0 +1,2 @@
+"""Radiance fields: their interface, the vanilla NeRF, the hash grid with its networks, background and occupancy
+grid."""

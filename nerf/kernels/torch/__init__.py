@@ -1,0 +1,50 @@
+"""The specification of the grid field's hot loops: plain torch, readable, on any device, in float32 or float64.
+
+Also a backend of its own (:class:`nerf.kernels.Backend`), for machines where no other runs.
+"""
+
+from nerf.kernels.torch.adam import adam
+from nerf.kernels.torch.colour_sampling import add_drawn, drawn_samples
+from nerf.kernels.torch.compositing import (
+    composite,
+    composite_backward,
+    distortion,
+    distortion_backward,
+    visible_samples,
+)
+from nerf.kernels.torch.early_termination import end_wave, pack_waves
+from nerf.kernels.torch.encoding import encode, encode_backward_points, encode_backward_table
+from nerf.kernels.torch.hidden_layer import add_ray_relu, add_ray_relu_backward, relu_backward
+from nerf.kernels.torch.marching import march, sample_points, sample_points_backward
+from nerf.kernels.torch.occupancy import cell_corners, occupied_bits, raise_cache
+from nerf.kernels.torch.sparse_depth import depth_loss, depth_loss_backward
+from nerf.kernels.torch.spherical_harmonics import spherical_harmonics, spherical_harmonics_backward
+
+__all__ = [
+    "adam",
+    "add_drawn",
+    "add_ray_relu",
+    "add_ray_relu_backward",
+    "cell_corners",
+    "composite",
+    "composite_backward",
+    "depth_loss",
+    "depth_loss_backward",
+    "distortion",
+    "distortion_backward",
+    "drawn_samples",
+    "encode",
+    "encode_backward_points",
+    "encode_backward_table",
+    "end_wave",
+    "march",
+    "occupied_bits",
+    "pack_waves",
+    "raise_cache",
+    "relu_backward",
+    "sample_points",
+    "sample_points_backward",
+    "spherical_harmonics",
+    "spherical_harmonics_backward",
+    "visible_samples",
+]

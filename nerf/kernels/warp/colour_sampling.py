@@ -1,0 +1,121 @@
+"""What rays see of samples that are only drawn (``nerf.kernels.torch.colour_sampling``): a ray is one thread's loop."""
+
+import torch
+import warp as wp
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from nerf.kernels import Drawn, Samples
+from nerf.kernels.warp.compositing import stopped, thickness
+from nerf.kernels.warp.launch import launch
+
+wp.set_module_options({"enable_backward": False})
+
+
+def drawn_samples(
+    samples: Samples,
+    sigma: Float[Tensor, "samples"],
+    quantum: float,
+    depth: Float64[Tensor, "rays"],
+    shown: Float[Tensor, "rays"],
+) -> Drawn:
+    """As in nerf.kernels.torch.colour_sampling."""
+    rays, device = len(depth), sigma.device
+    counts = torch.empty(rays, dtype=torch.int32, device=device)
+    found, found_weights = torch.empty_like(samples.ray), torch.empty_like(sigma)
+    packed = samples.starts, samples.dt, sigma
+    launch(_find, rays, *packed, 1 / quantum, depth, shown, counts, found, found_weights)
+    starts = torch.nn.functional.pad(counts.cumsum(0, dtype=torch.int32), (1, 0))
+    total = int(starts[-1])
+    index, ray = (torch.empty(total, dtype=torch.int32, device=device) for _ in range(2))
+    t, dt, weights = (torch.empty(total, device=device) for _ in range(3))
+    kept = samples.starts, starts, samples.t, samples.dt, found, found_weights
+    launch(_keep, rays, *kept, index, ray, t, dt, weights)
+    return Drawn(Samples(starts, ray, t, dt), index, weights)
+
+
+def add_drawn(drawn: Drawn, colour: Float[Tensor, "kept 3"], seen: Float[Tensor, "rays 4"]) -> None:
+    """As in nerf.kernels.torch.colour_sampling."""
+    launch(_add, len(seen), drawn.samples.starts, drawn.samples.t, drawn.weights, colour, seen)
+
+
+@wp.kernel
+def _find(
+    starts: wp.array[int],
+    lengths: wp.array[float],
+    sigma: wp.array[float],
+    per_quantum: float,
+    depth: wp.array[wp.float64],
+    shown: wp.array[float],
+    counts: wp.array[int],
+    found: wp.array[int],
+    weights: wp.array[float],
+):
+    ray = wp.tid()
+    start = starts[ray]
+    end = starts[ray + 1]
+    counts[ray] = 0
+    if start == end:
+        return
+    tau = depth[ray]
+    already = shown[ray]
+    quanta = wp.floor(stopped(float(tau)) * per_quantum + 0.5)
+    place = int(start)
+    for i in range(start, end):
+        tau += wp.float64(thickness(sigma[i], lengths[i]))
+        here = stopped(float(tau))
+        now = wp.floor(here * per_quantum + 0.5)
+        # Written in any case, as a branch that is taken half of the time costs more.
+        found[place] = i
+        weights[place] = here - already
+        keep = now > quanta
+        already = wp.where(keep, here, already)
+        place += int(keep)
+        quanta = now
+    depth[ray] = tau
+    shown[ray] = already
+    counts[ray] = place - start
+
+
+@wp.kernel
+def _keep(
+    starts: wp.array[int],
+    kept_starts: wp.array[int],
+    distances: wp.array[float],
+    lengths: wp.array[float],
+    found: wp.array[int],
+    weights: wp.array[float],
+    index: wp.array[int],
+    rays: wp.array[int],
+    kept_distances: wp.array[float],
+    kept_lengths: wp.array[float],
+    kept_weights: wp.array[float],
+):
+    ray = wp.tid()
+    start = starts[ray]
+    first = kept_starts[ray]
+    for place in range(first, kept_starts[ray + 1]):
+        i = found[start + place - first]
+        index[place] = i
+        rays[place] = ray
+        kept_distances[place] = distances[i]
+        kept_lengths[place] = lengths[i]
+        kept_weights[place] = weights[start + place - first]
+
+
+@wp.kernel
+def _add(
+    starts: wp.array[int],
+    distances: wp.array[float],
+    weights: wp.array[float],
+    colour: wp.array[wp.vec3],
+    seen: wp.array[wp.vec4],
+):
+    ray = wp.tid()
+    sum_colour = wp.vec3d()
+    sum_distance = wp.float64(0.0)
+    for i in range(starts[ray], starts[ray + 1]):
+        sum_colour += wp.vec3d(weights[i] * colour[i])
+        sum_distance += wp.float64(weights[i] * distances[i])
+    more = wp.vec3(sum_colour)
+    seen[ray] += wp.vec4(more[0], more[1], more[2], float(sum_distance))

@@ -1,0 +1,95 @@
+"""Between two waves of samples (``nerf.kernels.torch.early_termination``): a ray is one thread's loop."""
+
+from collections.abc import Sequence
+
+import torch
+import warp as wp
+from jaxtyping import Float, Float64, Int32
+from torch import Tensor
+
+from nerf.kernels import Lattice, Samples
+from nerf.kernels.warp.compositing import thickness
+from nerf.kernels.warp.launch import launch
+from nerf.kernels.warp.marching import lattice_coordinate, lattice_distance
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+
+def end_wave(
+    lattice: Lattice,
+    samples: Samples,
+    sigma: Float[Tensor, "samples"],
+    threshold: float,
+    jitter: Float[Tensor, "rays"],
+    far: Float[Tensor, "rays"],
+    depth: Float64[Tensor, "rays"],
+    near: Float[Tensor, "rays"],
+) -> None:
+    """As in nerf.kernels.torch.early_termination."""
+    sizes, packed = lattice[:2], (samples.starts, samples.t, samples.dt)
+    launch(_end_wave, len(far), *sizes, lattice.most_samples, *packed, sigma, threshold, jitter, far, depth, near)
+
+
+def pack_waves(waves: Sequence[Samples]) -> tuple[Samples, Int32[Tensor, "samples"]]:
+    """As in nerf.kernels.torch.early_termination."""
+    starts, rays = sum(wave.starts for wave in waves[1:]) + waves[0].starts, len(waves[0].starts) - 1
+    total, device, before = sum(len(wave.t) for wave in waves), starts.device, 0
+    order, ray = (torch.empty(total, dtype=torch.int32, device=device) for _ in range(2))
+    t, dt = (torch.empty(total, device=device) for _ in range(2))
+    placed = starts[:-1].clone()
+    for wave in waves:
+        launch(_place_wave, rays, wave.starts, wave.t, wave.dt, before, placed, order, ray, t, dt)
+        before += len(wave.t)
+    return Samples(starts, ray, t, dt), order
+
+
+@wp.kernel
+def _end_wave(
+    step: float,
+    cone: float,
+    most: int,
+    starts: wp.array[int],
+    distances: wp.array[float],
+    lengths: wp.array[float],
+    sigma: wp.array[float],
+    threshold: float,
+    jitter: wp.array[float],
+    far: wp.array[float],
+    depth: wp.array[wp.float64],
+    near: wp.array[float],
+):
+    ray = wp.tid()
+    start = starts[ray]
+    end = starts[ray + 1]
+    tau = depth[ray]
+    for i in range(start, end):
+        tau += wp.float64(thickness(sigma[i], lengths[i]))
+    depth[ray] = tau
+    onward = far[ray]
+    if end - start == most and wp.exp(-float(tau)) >= threshold:
+        s = lattice_coordinate(step, cone, distances[end - 1]) + (1.0 - jitter[ray])
+        onward = wp.min(onward, lattice_distance(step, cone, s))
+    near[ray] = onward
+
+
+@wp.kernel
+def _place_wave(
+    starts: wp.array[int],
+    distances: wp.array[float],
+    lengths: wp.array[float],
+    before: int,
+    placed: wp.array[int],
+    order: wp.array[int],
+    rays: wp.array[int],
+    all_distances: wp.array[float],
+    all_lengths: wp.array[float],
+):
+    ray = wp.tid()
+    place = placed[ray]
+    for i in range(starts[ray], starts[ray + 1]):
+        order[place] = before + i
+        rays[place] = ray
+        all_distances[place] = distances[i]
+        all_lengths[place] = lengths[i]
+        place += 1
+    placed[ray] = place

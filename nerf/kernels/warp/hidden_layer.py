@@ -1,0 +1,98 @@
+"""The hidden layer of the colour network, whose input is part the sample's and part its ray's
+(``nerf.kernels.torch.hidden_layer``)."""
+
+import warp as wp
+from jaxtyping import Float
+from torch import Tensor
+
+from nerf.kernels import Samples
+from nerf.kernels.warp.launch import launch, vec16
+
+wp.set_module_options({"enable_backward": False})
+
+_HIDDEN = 64
+# Samples whose gradients are summed by themselves before they join their ray's: of n numbers one after the other, in
+# float32, up to n half ulps are lost, here 64 + 64 for a ray of 4096. Sums in float64 take twice the vectors.
+_TOGETHER = wp.constant(64)
+
+
+def add_ray_relu(samples: Samples, hidden: Float[Tensor, "samples 64"], of_ray: Float[Tensor, "rays 64"]) -> None:
+    """As in nerf.kernels.torch.hidden_layer."""
+    launch(_add_ray_relu, len(of_ray), samples.starts, of_ray, hidden)
+
+
+def add_ray_relu_backward(
+    samples: Samples, hidden: Float[Tensor, "samples 64"], grad: Float[Tensor, "samples 64"]
+) -> Float[Tensor, "rays 64"]:
+    """As in nerf.kernels.torch.hidden_layer."""
+    of_ray = grad.new_empty(len(samples.starts) - 1, _HIDDEN)
+    launch(_add_ray_relu_backward, len(of_ray), samples.starts, hidden, grad, of_ray)
+    return of_ray
+
+
+def relu_backward(hidden: Float[Tensor, "samples 64"], grad: Float[Tensor, "samples 64"]) -> None:
+    """As in nerf.kernels.torch.hidden_layer."""
+    launch(_relu_backward, 4 * len(hidden), hidden, grad)
+
+
+@wp.func
+def _rectified(x: vec16):
+    """max(x, 0), and NaN where x is not a number: wp.max alone takes NaN for missing. 0 x changes no finite number."""
+    return wp.max(x, vec16(0.0)) + 0.0 * x
+
+
+@wp.func
+def _where_positive(hidden: vec16, grad: vec16):
+    """The gradient where the layer let it through: hidden is zero or, twice multiplied, surely 1 or more."""
+    one = vec16(1.0)
+    return wp.cw_mul(grad, wp.min(wp.min(3.0e38 * hidden, one) * 3.0e38, one))
+
+
+@wp.kernel
+def _add_ray_relu(starts: wp.array[int], of_ray: wp.array[vec16], hidden: wp.array[vec16]):
+    ray = wp.tid()
+    a = of_ray[4 * ray]
+    b = of_ray[4 * ray + 1]
+    c = of_ray[4 * ray + 2]
+    d = of_ray[4 * ray + 3]
+    for i in range(starts[ray], starts[ray + 1]):
+        hidden[4 * i] = _rectified(hidden[4 * i] + a)
+        hidden[4 * i + 1] = _rectified(hidden[4 * i + 1] + b)
+        hidden[4 * i + 2] = _rectified(hidden[4 * i + 2] + c)
+        hidden[4 * i + 3] = _rectified(hidden[4 * i + 3] + d)
+
+
+@wp.kernel
+def _add_ray_relu_backward(
+    starts: wp.array[int], hidden: wp.array[vec16], grad: wp.array[vec16], of_ray: wp.array[vec16]
+):
+    ray = wp.tid()
+    end = starts[ray + 1]
+    of_ray[4 * ray] = vec16(0.0)
+    of_ray[4 * ray + 1] = vec16(0.0)
+    of_ray[4 * ray + 2] = vec16(0.0)
+    of_ray[4 * ray + 3] = vec16(0.0)
+    for first in range(starts[ray], end, _TOGETHER):
+        a = vec16(0.0)
+        b = vec16(0.0)
+        c = vec16(0.0)
+        d = vec16(0.0)
+        for i in range(first, wp.min(first + _TOGETHER, end)):
+            grad[4 * i] = _where_positive(hidden[4 * i], grad[4 * i])
+            grad[4 * i + 1] = _where_positive(hidden[4 * i + 1], grad[4 * i + 1])
+            grad[4 * i + 2] = _where_positive(hidden[4 * i + 2], grad[4 * i + 2])
+            grad[4 * i + 3] = _where_positive(hidden[4 * i + 3], grad[4 * i + 3])
+            a += grad[4 * i]
+            b += grad[4 * i + 1]
+            c += grad[4 * i + 2]
+            d += grad[4 * i + 3]
+        of_ray[4 * ray] = of_ray[4 * ray] + a
+        of_ray[4 * ray + 1] = of_ray[4 * ray + 1] + b
+        of_ray[4 * ray + 2] = of_ray[4 * ray + 2] + c
+        of_ray[4 * ray + 3] = of_ray[4 * ray + 3] + d
+
+
+@wp.kernel
+def _relu_backward(hidden: wp.array[vec16], grad: wp.array[vec16]):
+    i = wp.tid()
+    grad[i] = _where_positive(hidden[i], grad[i])

@@ -1,0 +1,1 @@
+"""From samples along rays to pictures: sampling, volume rendering, early termination, sRGB."""

@@ -1,0 +1,97 @@
+"""Float32 matrix products at torch's precision "medium", where that is measured to be faster and about as exact.
+
+What "medium" means depends on processor and torch: the same arithmetic by another library, bfloat16 or TF32 inside (on
+a Xeon with tiles twice as fast and off by 2e-3; docs/numbers.md), or nothing at all. So it is tried and never assumed.
+"""
+
+import functools
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Literal, NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerf.runtime.machine_rates import FEWEST_RUNS, PRODUCT_ROWS
+
+Precision = Literal["highest", "medium"]
+
+USUAL_WIDTH = 64  # of the networks; of wider ones fewer rows make as much work
+FEWEST_ROWS = 256
+TRIED_SECONDS = 0.06  # for both precisions together
+LEAST_SPEEDUP, MOST_ERROR = 1.3, 1e-4
+
+
+class Medium(NamedTuple):
+    """Products at "medium": how many times faster than at "highest" they are, and how far off (:func:`error_of`)."""
+
+    speedup: float
+    error: float
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether nobody would see the difference in training."""
+        return self.error <= MOST_ERROR
+
+    @property
+    def pays(self) -> bool:
+        """Whether training should use it: clearly faster, and about as exact."""
+        return self.is_exact and self.speedup >= LEAST_SPEEDUP
+
+
+@contextmanager
+def products_at(precision: Precision | None) -> Iterator[None]:
+    """Compute the whole process's float32 products at ``precision``, afterwards as before. None changes nothing."""
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision(precision or before)
+    try:
+        yield
+    finally:
+        torch.set_float32_matmul_precision(before)
+
+
+@functools.cache
+def medium_products(device: torch.device, width: int) -> Medium:
+    """Of products (n, width) x (width, width), the fastest of several at each precision in turn; once in a process, in
+    a tenth of a second. Changes no random state."""
+    random = torch.Generator(device).manual_seed(0)
+    rows = max(FEWEST_ROWS, min(PRODUCT_ROWS, PRODUCT_ROWS * USUAL_WIDTH**2 // width**2))
+    a, b = (torch.randn(count, width, generator=random, device=device) for count in (rows, width))
+    with products_at("medium"):
+        error = error_of(a @ b, a, b)
+    seconds = _fastest(a, b)
+    return Medium(seconds["highest"] / seconds["medium"], error)
+
+
+def error_of(found: Float[Tensor, "rows n"], a: Float[Tensor, "rows m"], b: Float[Tensor, "m n"]) -> float:
+    """‖found - a b‖ / ‖a b‖, the product in float64."""
+    exact = a.double() @ b.double()
+    return float((found - exact).norm() / exact.norm())
+
+
+def _fastest(a: Tensor, b: Tensor) -> dict[Precision, float]:
+    """Seconds of the fastest product at each precision."""
+    seconds: dict[Precision, float] = {"highest": float("inf"), "medium": float("inf")}
+    until, runs = time.perf_counter() + TRIED_SECONDS, 0
+    while runs < FEWEST_RUNS or time.perf_counter() < until:
+        runs += 1
+        for precision, least in seconds.items():
+            with products_at(precision):
+                seconds[precision] = min(least, seconds_of_product(a, b))
+    return seconds
+
+
+def seconds_of_product(a: Tensor, b: Tensor) -> float:
+    """What one takes at the precision that torch is set to."""
+    _wait_for(a.device)
+    started = time.perf_counter()
+    torch.mm(a, b)
+    _wait_for(a.device)
+    return time.perf_counter() - started
+
+
+def _wait_for(device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)

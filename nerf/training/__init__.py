@@ -1,0 +1,1 @@
+"""One trainer per field; the rays and pixels it is given; losses, schedules, metrics."""

@@ -1,0 +1,363 @@
+"""One optimisation step of a grid field, behind the same interface as the paper's (nerf/training/trainer.py)."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import astuple, dataclass
+from functools import partial
+from itertools import pairwise
+from typing import Literal, NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from nerf.effects import AS_GIVEN, AS_RENDERED, PhotoColours, PhotoRays, Seen
+from nerf.fields import mlp as grid_mlp
+from nerf.fields.background import PRIOR as SKY_PRIOR
+from nerf.fields.background import RATE as SKY_RATE
+from nerf.fields.frustum_mask import usable_cells
+from nerf.fields.hash_grid import CORNERS, GridField, GridPass
+from nerf.fields.interface import Rendering
+from nerf.fields.mlp import Weights
+from nerf.fields.occupancy_grid import DensityCache
+from nerf.geometry.rays import Rays
+from nerf.kernels import BOX
+from nerf.runtime.parallel import in_order
+from nerf.runtime.profiler import Work, part
+from nerf.runtime.randomness import generator
+from nerf.training.losses import robust_error
+from nerf.training.metrics import psnr
+from nerf.training.pixel_sampler import PixelOrder
+from nerf.training.ray_dataset import RayBank
+from nerf.training.trainer import RAYS, NonFinite, StepResult, all_finite
+
+WARM_UP_STEPS = 20
+# Of the run, before the rate begins to fall. A fall over most of the run costs short runs up to 2 dB and gains long
+# ones nothing (docs/numbers.md); and what is measured before it does not depend on how long the run will be.
+CONSTANT_SHARE = 0.75
+FINAL_RATE = 0.05  # of the rate at first
+# The distortion loss begins weak: it draws fog together wherever that stands, and far things that only smooth colours
+# tell apart (the sky) would be drawn close behind the scene before their place is known (docs/numbers.md).
+FIRST_DISTORTION = 0.25  # of its weight
+FULL_DISTORTION_SHARE = 0.3  # of the run
+GUIDED_EVERY = 8  # one ray in so many runs to a sparse point, where some are known
+FIRST_SAMPLES_PER_RAY = 128.0
+# A ray is not free, though it may need no colour: no step has more rays than if each needed so many.
+LEAST_SAMPLES_PER_RAY = 2.0
+# Of the table's entries, how many have a gradient in a step: of 5 grids of 2^18 rows with 33 to 49 k colours 0.29 to
+# 0.36 (docs/numbers.md: Where a step's time goes); larger steps reach more.
+TOUCHED = 0.33
+# Of an entry: its gradient read; if there is one, that cleared, the entry itself and its moments read and written.
+ADAM_BYTES = 4 * (1 + 7 * TOUCHED)
+MEMORY = 0.9  # how much of the mean of samples per ray remains after each step
+
+
+@dataclass(frozen=True)
+class GridTrainerSettings:
+    """How to train. ``samples``: colours to compute in a step; its rays are as many as are expected to need them.
+    ``chunks``: equal parts of a step, each computed on a core; results depend on their number, not on that of the
+    cores. ``background`` is what lies behind a scene without a sky: a colour, or another random one for each ray (only
+    for photos with alpha, where it shows the field which space is empty). ``distortion``: full weight of the distortion
+    loss, for scenes without a known background. ``depth_loss``: its weight at first, at the pixels whose distance the
+    bank knows. ``least_photos``: that must look into a cell of folded space for something to stand before their
+    foregrounds (nerf/fields/frustum_mask.py), or all but one where they are few."""
+
+    seed: int
+    background: tuple[float, float, float] | Literal["random"]
+    samples: int = 1 << 14
+    chunks: int = 1
+    rate: float = 2e-2
+    distortion: float = 0.0
+    depth_loss: float = 0.0
+    least_photos: int = 1
+
+
+class GridBatch(NamedTuple):
+    """Rays with the colour each should see over its background, where its samples stand in their intervals and which of
+    its thin ones are kept (both in [0, 1)), whose view it belongs to, and how far away is the sparse point that it runs
+    to; 0: to none."""
+
+    rays: Rays
+    target: Float[Tensor, "rays 3"]
+    background: Float[Tensor, "rays 3"]
+    jitter: Float[Tensor, "rays"]
+    offset: Float[Tensor, "rays"]
+    view: Int[Tensor, "rays"]
+    distance: Float[Tensor, "rays"]
+
+
+class Loss(NamedTuple):
+    """A chunk's share of the loss, of the mean squared error in it, and the gradients of rendering, weights and of
+    what the photos make of colours."""
+
+    value: Tensor
+    squared_error: Tensor
+    grad: Rendering
+    grad_weights: Float[Tensor, "samples"]
+    grad_photos: dict[str, Tensor]
+
+
+class _Part(NamedTuple):
+    """What one chunk of a batch contributes to it: loss, gradients and their norm, the thickness of cells it met, and
+    how many densities it asked for."""
+
+    batch: GridBatch
+    loss: Tensor
+    squared_error: Tensor
+    weights: Weights
+    features: Float[Tensor, "samples width"]
+    points: Float[Tensor, "samples 3"]
+    sky: dict[str, Tensor]
+    photos: dict[str, Tensor]
+    norm: Tensor
+    thickness: Float[Tensor, "samples"]
+    densities: int
+
+
+def rate_factor(step: int, share: float) -> float:
+    """The learning rate over its base: a linear warm-up, then constant, then falling exponentially."""
+    fallen = max(0.0, share - CONSTANT_SHARE) / (1 - CONSTANT_SHARE)
+    return min(1.0, (step + 1) / WARM_UP_STEPS) * FINAL_RATE**fallen
+
+
+def distortion_factor(share: float) -> float:
+    """The weight of the distortion loss over its full one: from a quarter it grows with the share of the run."""
+    return min(1.0, max(FIRST_DISTORTION, share / FULL_DISTORTION_SHARE))
+
+
+def depth_factor(share: float) -> float:
+    """The weight of the depth loss over its first one: it falls to nothing over the run. Shape is decided early, and
+    once it is about right photos know it better than points do."""
+    return 1 - share
+
+
+class GridTrainer:
+    """Trains a grid field on the robust error of colours by Adam, and keeps its density cache. ``photo_rays`` and
+    ``photo_colours`` stand between the field and each photo (nerf/effects)."""
+
+    def __init__(
+        self,
+        model: GridField,
+        bank: RayBank,
+        settings: GridTrainerSettings,
+        photo_rays: PhotoRays = AS_GIVEN,
+        photo_colours: PhotoColours = AS_RENDERED,
+    ) -> None:
+        self.model, self.settings = model, settings
+        # Nothing beyond the box of a bounded scene is drawn: a point there would pull the light to its walls.
+        self.bank = bank if model.settings.contracted else bank.known_within(BOX)
+        self.photo_rays, self.photo_colours = photo_rays, photo_colours
+        self.cache = DensityCache(model, self._usable())
+        self.photo_parts = [each for each in (photo_rays, photo_colours) if each.parameters]
+        self.photo_parameters = {**photo_rays.parameters, **photo_colours.parameters}
+        of_networks = model.weights._asdict()
+        self.sky = {"sky": model.sky} if model.settings.sky else {}
+        self.parameters = {"table": model.table, **of_networks, **self.sky, **self.photo_parameters}
+        self.mean = {name: torch.zeros_like(tensor) for name, tensor in self.parameters.items()}
+        self.square = {name: torch.zeros_like(tensor) for name, tensor in self.parameters.items()}
+        self.grad_table = torch.zeros_like(model.table)
+        tables = model.table, self.grad_table, self.mean["table"], self.square["table"]
+        self.levels = [
+            tuple(tensor[first:end] for tensor in tables) for first, end in pairwise(model.layout.first_rows)
+        ]
+        self.samples_per_ray = torch.tensor(FIRST_SAMPLES_PER_RAY, dtype=torch.float64)
+        self.order = PixelOrder(self.bank.drawable, settings.seed, bank.device)
+        self.drawn = torch.tensor(0)  # pixels of that order so far; steps differ in how many they take
+
+    def _usable(self) -> Bool[Tensor, "cache"] | None:
+        """Known only where points tell where foregrounds begin, in folded space: a box is carved beforehand."""
+        least, lattice = min(self.settings.least_photos, len(self.bank.near) - 1), self.model.lattice
+        if least <= 1 or self.bank.known is None or not lattice.contracted:
+            return None
+        return usable_cells(self.bank, least, lattice.cells)
+
+    def step(self, step: int, share: float, rate_scale: float = 1.0) -> StepResult:
+        """One batch, one update. Raises NonFinite before the update, leaving model and optimiser as they were."""
+        device, rays = self.bank.device, self._rays_per_chunk()
+        parts = list(in_order(partial(self._part, step, share, rays), range(self.settings.chunks), device))
+        loss, error = self._finite(step, parts)
+        self._update(parts, rate_scale * rate_factor(step, share), step + 1)
+        with part("cache"):
+            self.cache.refresh(step, generator(device, self.settings.seed, step, self.settings.chunks))
+        samples = sum(len(each.points) for each in parts)
+        rays *= self.settings.chunks
+        self.drawn += self._of_photos(rays, share)
+        self.samples_per_ray.mul_(MEMORY).add_((1 - MEMORY) * samples / rays)
+        return StepResult(loss, psnr(error), rays, samples, sum(each.densities for each in parts))
+
+    def state(self) -> dict[str, Tensor]:
+        """Weights and cache bits as ``model.<name>``, what is learnt of photos as ``photo.<name>``, Adam's moments as
+        ``mean.<name>`` and ``square.<name>``, the cache's thickness, the mean number of samples per ray, how
+        many pixels were drawn, and the field's settings, to know it by."""
+        return (
+            {f"model.{name}": tensor for name, tensor in self.model.state_dict().items()}
+            | {f"photo.{name}": tensor for name, tensor in self.photo_parameters.items()}
+            | {f"mean.{name}": tensor for name, tensor in self.mean.items()}
+            | {f"square.{name}": tensor for name, tensor in self.square.items()}
+            | {"thickness": self.cache.thickness, "samples_per_ray": self.samples_per_ray, "drawn": self.drawn}
+            | {"settings": torch.tensor(astuple(self.model.settings), dtype=torch.float64)}
+        )
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        """Go back to what :meth:`state` gave. Raises RuntimeError for the state of another field, also where its
+        tables have the same shapes."""
+        mine = self.state()
+        different = [name for name in sorted(mine.keys() | state.keys()) if _shape(mine, name) != _shape(state, name)]
+        if not different and not torch.equal(mine["settings"], state["settings"].to(mine["settings"].device)):
+            different = ["settings"]
+        if different:
+            raise RuntimeError(f"this state belongs to another field: {', '.join(different)} differ")
+        for name, tensor in mine.items():
+            tensor.copy_(state[name])
+
+    def _rays_per_chunk(self) -> int:
+        wanted = int(self.settings.samples / max(LEAST_SAMPLES_PER_RAY, float(self.samples_per_ray)))
+        return max(1, wanted // self.settings.chunks)
+
+    def _batch(self, step: int, share: float, chunk: int, count: int) -> GridBatch:
+        device = self.bank.device
+        random = generator(device, self.settings.seed, step, chunk)
+        # Shared out over the chunks, which are small where cores are many and the field is young.
+        first, end = self._of_photos(chunk * count, share), self._of_photos((chunk + 1) * count, share)
+        pixel = self.bank.nth(self.order.take(int(self.drawn) + first, end - first))
+        to_points, distance = count - len(pixel), torch.zeros(count, device=device)
+        if to_points:
+            of_points, distance[-to_points:] = self.bank.draw_known(to_points, random)
+            pixel = torch.cat([pixel, of_points])
+        rays, colour, alpha, view = self.bank.lookup(pixel)
+        if self.settings.background == "random":
+            background = torch.rand(count, 3, generator=random, device=device)
+        else:
+            background = torch.tensor(self.settings.background, device=device).repeat(count, 1)
+        target = colour if alpha is None else torch.lerp(background, colour, alpha[:, None])
+        jitter, offset = torch.rand(2, count, generator=random, device=device)
+        return GridBatch(rays, target, background, jitter, offset, view, distance)
+
+    def _of_photos(self, rays: int, share: float) -> int:
+        """How many of so many rays run through pixels of all the photos; the others run to sparse points."""
+        return rays - rays // GUIDED_EVERY if self._is_guided(share) else rays
+
+    def _is_guided(self, share: float) -> bool:
+        return self.bank.known is not None and self.settings.depth_loss * depth_factor(share) > 0
+
+    def _part(self, step: int, share: float, rays: int, chunk: int) -> _Part:
+        """What a chunk of so many rays adds to loss and gradients."""
+        with part("batch"):
+            batch = self._batch(step, share, chunk, rays)
+            seen_along = self.photo_rays.forward(batch.rays, batch.view)
+            if not all_finite(seen_along):
+                raise NonFinite(RAYS, step, _whole([batch]))
+        done = self.model.forward(seen_along, batch.jitter, batch.offset, batch.background)
+        with part("composite"):
+            loss = self._loss(rays * self.settings.chunks, share, done, batch)
+        with part("backward", self._backward_work(done)):
+            gradients = self.model.backward(done, loss.grad, loss.grad_weights)
+            grad_rays = partial(self.model.rays_backward, done, gradients)
+            photos = loss.grad_photos | self.photo_rays.backward(batch.rays, batch.view, grad_rays)
+            sky = {name: self.model.sky_backward(done, gradients) for name in self.sky}
+        weights, features, *_ = gradients
+        norm = torch.nn.utils.get_total_norm([*weights, features, *sky.values(), *photos.values()])
+        of_loss = loss.value, loss.squared_error
+        return _Part(batch, *of_loss, weights, features, done.points, sky, photos, norm, done.thickness, done.marched)
+
+    def _backward_work(self, done: GridPass) -> Work:
+        weights = self.model.weights
+        products = 2 * (grid_mlp.density_products(weights) + grid_mlp.colour_products(weights)) * len(done.points)
+        to_points = CORNERS * len(self.model.layout.resolutions) * len(done.points) if self.photo_rays.parameters else 0
+        return Work(products, to_points)
+
+    def _loss(self, rays: int, share: float, done: GridPass, batch: GridBatch) -> Loss:
+        seen = Seen(done.rendering, batch.background, batch.view)
+        error = self.photo_colours.residual(seen, batch.target)
+        robust, pull = robust_error(error)
+        grad, photos = self.photo_colours.backward(seen, pull * (2 / (3 * rays)))
+        value, grad_weights = robust.sum() / (3 * rays), torch.zeros_like(done.weights)
+        backend, lattice = self.model.backend, self.model.lattice
+        if self.settings.distortion:
+            each = torch.full_like(batch.distance, self.settings.distortion * distortion_factor(share) / rays)
+            value = value + (each * backend.distortion(done.samples, done.weights, lattice)).sum()
+            grad_weights = backend.distortion_backward(done.samples, done.weights, lattice, each)
+        if self._is_guided(share):
+            each = torch.full_like(batch.distance, self.settings.depth_loss * depth_factor(share) / rays)
+            places = done.rays.far, batch.distance, lattice
+            apart = backend.depth_loss(done.samples, done.weights, done.rendering.opacity, *places)
+            value = value + (each * apart).sum()
+            of_weights, of_opacity = backend.depth_loss_backward(done.samples, *places, each)
+            grad_weights, grad = grad_weights + of_weights, grad._replace(opacity=grad.opacity + of_opacity)
+        return Loss(value, error.square().sum() / (3 * rays), grad, grad_weights, photos)
+
+    def _finite(self, step: int, parts: Sequence[_Part]) -> tuple[float, float]:
+        """Loss and squared error as numbers, once they and all gradients are known to be finite.
+
+        The table's gradient is a sum of the features' gradients with weights up to 1: finite if their norm is.
+        """
+        each = zip(*((chunk.loss, chunk.squared_error, chunk.norm) for chunk in parts), strict=True)
+        # One wait for the GPU, not three.
+        loss_now, error_now, norm_now = torch.stack([torch.stack(values).sum() for values in each]).tolist()
+        for quantity, value in {"loss": loss_now, "gradient": norm_now}.items():
+            if not abs(value) < float("inf"):
+                raise NonFinite(quantity, step, _whole([chunk.batch for chunk in parts]))
+        return loss_now, error_now
+
+    def _update(self, parts: Sequence[_Part], factor: float, count: int) -> None:
+        """Of the table's levels, which share no rows, of the networks, of what is learnt of photos and of the cache:
+        each work for a core. ``factor``: of all learning rates."""
+        finest_first = range(len(self.model.layout.resolutions) - 1, -1, -1)  # no core waits long for the last
+        rate = self.settings.rate * factor
+        work = [partial(self._update_level, level, parts, rate, count) for level in finest_first]
+        of_networks = [chunk.weights._asdict() for chunk in parts]
+        work.append(partial(self._update_small, Weights._fields, of_networks, rate, count))
+        of_sky = [*(chunk.sky for chunk in parts), self._sky_prior(parts)]
+        work.append(partial(self._update_small, self.sky, of_sky, SKY_RATE * rate, count))
+        work.append(partial(self._raise_cache, parts))
+        for of_photos in self.photo_parts:
+            work.append(partial(self._update_photos, of_photos, parts, of_photos.rate * factor, count))
+        for _ in in_order(lambda update: update(), work, self.bank.device):
+            pass
+
+    def _sky_prior(self, parts: Sequence[_Part]) -> dict[str, Tensor]:
+        """The prior's gradient of the sky, where rays of this batch ran to it: what none runs to stays as it is."""
+        rays = sum(len(chunk.batch.jitter) for chunk in parts)
+        touched = {name: torch.stack([chunk.sky[name] for chunk in parts]).sum(0) != 0 for name in self.sky}
+        return {name: SKY_PRIOR / rays * sky * touched[name] for name, sky in self.sky.items()}
+
+    def _update_level(self, level: int, parts: Sequence[_Part], rate: float, count: int) -> None:
+        layout, backend = self.model.layout, self.model.backend
+        with part("scatter", Work(rows=CORNERS * sum(len(each.points) for each in parts))):
+            for each in parts:
+                backend.encode_backward_table(layout, level, each.points, each.features, self.grad_table)
+        table, grad, mean, square = self.levels[level]
+        with part("optimiser", Work(bytes=ADAM_BYTES * table.numel())):
+            backend.adam(table, grad, mean, square, rate, count)
+
+    def _update_small(
+        self, names: Iterable[str], of_parts: Sequence[dict[str, Tensor]], rate: float, count: int
+    ) -> None:
+        """Of parameters that are small beside the table."""
+        with part("optimiser"):
+            for name in names:
+                gradient = torch.stack([each[name] for each in of_parts]).sum(0)
+                parameter, mean, square = self.parameters[name], self.mean[name], self.square[name]
+                self.model.backend.adam(parameter, gradient, mean, square, rate, count)
+
+    def _update_photos(
+        self, of_photos: PhotoRays | PhotoColours, parts: Sequence[_Part], rate: float, count: int
+    ) -> None:
+        self._update_small(of_photos.parameters, [chunk.photos for chunk in parts], rate, count)
+        of_photos.settle()
+
+    def _raise_cache(self, parts: Sequence[_Part]) -> None:
+        with part("cache"):
+            for each in parts:
+                self.cache.raise_to(each.points, each.thickness)
+
+
+def _whole(batches: Sequence[GridBatch]) -> dict[str, Tensor]:
+    """A batch by the names of its tensors, its chunks put together again."""
+    rays = zip(*(batch.rays for batch in batches), strict=True)
+    rest = zip(*(batch[1:] for batch in batches), strict=True)
+    names = (*Rays._fields, *GridBatch._fields[1:])
+    return {name: torch.cat(chunks) for name, chunks in zip(names, (*rays, *rest), strict=True)}
+
+
+def _shape(state: dict[str, Tensor], name: str) -> torch.Size | None:
+    return state[name].shape if name in state else None

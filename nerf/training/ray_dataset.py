@@ -1,0 +1,288 @@
+"""All pixels of a set of photos, and what it takes to turn any of them into a ray.
+
+Photos may differ in size and camera. They are laid end to end: a *pixel* index counts through all of them, row by
+row. The pixels stay uint8 and may be a file mapped into memory, so that there may be more of them than memory holds.
+
+A camera is a mosaic of *patches*, each small enough for its bearings to be linear in the pixel (the model of a pinhole
+camera: exact without distortion). One look-up then gives the ray of a pixel, and a camera takes the same small memory
+whatever the size of its photos: a set where every photo has a camera of its own stays small.
+
+Where photos have masks, the pixels that may be drawn are kept as *runs* of neighbours, of which a photo has a few in a
+row; without masks there are none, and nothing to look up.
+"""
+
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int, UInt8
+from torch import Tensor
+
+from nerf.geometry.rays import Rays
+
+# Bearings are brought to the plane z = 1, where those of a camera without distortion are linear in the pixel. Beyond 60
+# degrees from the axis, where that plane is too far away, they keep a bounded length.
+LEAST_FORWARD = 0.5
+
+
+class Drawn(NamedTuple):
+    """Pixels with the rays through them: colour and alpha in [0, 1] (None without such a channel), and whose view."""
+
+    rays: Rays
+    colour: Float[Tensor, "rays 3"]
+    alpha: Float[Tensor, "rays"] | None
+    view: Int[Tensor, "rays"]
+
+
+class RayBank(NamedTuple):
+    """Photos as one table of pixels; make it with :func:`ray_bank` or :func:`build_ray_bank`.
+
+    View v owns the pixels [first_pixel[v], first_pixel[v + 1]); ``pixels`` have 3 channels, or 4 with a straight (not
+    premultiplied) alpha. What a look-up needs of a view stands in two tables with a column per view:
+
+    * ``layout``: its first pixel, its width, its camera's first patch, patches in a row;
+    * ``geometry``: the rotation scene_from_camera row by row, the centre, near, far, patches per pixel along x and y.
+
+    ``patches`` has a column per patch: the bearing in its middle, and how it changes along x and y over one patch.
+
+    ``runs`` has a column per run of pixels that may be drawn: how many of them lie before it, and its first pixel. A
+    last column has the number of all of them. None: every pixel may be drawn.
+
+    ``known`` are pixels that show a sparse point, ``distance`` how far along their rays (scene units) it lies. None: of
+    no pixel is that known.
+    """
+
+    pixels: UInt8[Tensor, "pixels channels"]
+    first_pixel: Int[Tensor, "views_and_end"]
+    layout: Int[Tensor, "4 views"]
+    geometry: Float[Tensor, "16 views"]
+    patches: Float[Tensor, "9 patches"]
+    runs: Int[Tensor, "2 runs_and_end"] | None = None
+    known: Int[Tensor, "known"] | None = None
+    distance: Float[Tensor, "known"] | None = None
+
+    @property
+    def device(self) -> torch.device:
+        """Where the tables are."""
+        return self.pixels.device
+
+    @property
+    def near(self) -> Float[Tensor, "views"]:
+        """Per view, where rays begin."""
+        return self.geometry[12]
+
+    @property
+    def viewing_distance(self) -> Float[Tensor, "views"] | None:
+        """Per view, the median of how far away its known pixels show something (scene units): of all that are known
+        where it has none; None where nothing is known."""
+        if self.known is None or self.distance is None:
+            return None
+        view = torch.searchsorted(self.first_pixel, self.known, right=True).sub_(1)
+        counts = torch.bincount(view, minlength=len(self.near)).tolist()
+        of_all, of_views = self.distance.median(), self.distance[view.argsort(stable=True)].split(counts)
+        return torch.stack([each.median() if len(each) else of_all for each in of_views])
+
+    def to(self, device: torch.device | str) -> "RayBank":
+        """This bank with its tables on ``device``."""
+        moved = {name: table.to(device) for name, table in self._asdict().items() if table is not None}
+        return self._replace(**moved)
+
+    @property
+    def drawable(self) -> int:
+        """How many pixels may be drawn."""
+        return len(self.pixels) if self.runs is None else int(self.runs[0, -1])
+
+    def without(self, ignored: Iterable[Bool[Tensor, "_ _"] | None]) -> "RayBank":
+        """This bank with pixels that :meth:`draw` never gives: per view, (height, width) True where the photo is to
+        be ignored, None where all of it is used. Taken one by one, for together they may not fit into memory. Raises
+        ValueError if no pixel is left."""
+        runs = _runs(ignored, self.first_pixel)
+        if runs[0, -1] == len(self.pixels):
+            return self
+        if not runs[0, -1]:
+            raise ValueError("the masks ignore every pixel")
+        return self._replace(runs=runs.to(self.device))
+
+    def with_distances(self, pixel: Int[Tensor, "known"], distance: Float[Tensor, "known"]) -> "RayBank":
+        """This bank, which knows how far away is what these pixels show (scene units, along the ray).
+
+        Left out are pixels that may not be drawn (so give the masks first), those that are not wholly opaque, whose
+        light ends in part elsewhere, and distances that are not between near and far of their views: no sample stands
+        there, and what does would be pulled to the end of the ray."""
+        near, far = self.geometry[12:].index_select(1, torch.searchsorted(self.first_pixel, pixel, right=True) - 1)[:2]
+        kept = self.may_be_drawn(pixel) & (near < distance) & (distance < far)
+        if self.pixels.shape[1] == 4:
+            kept &= self.pixels.index_select(0, pixel)[:, 3] == 255
+        return self._knowing(pixel[kept], distance[kept].float())
+
+    def known_within(self, half: float) -> "RayBank":
+        """This bank without the known distances that end outside of the cube from -``half`` to ``half``."""
+        if self.known is None or self.distance is None:
+            return self
+        rays, _ = self.rays(self.known)
+        inside = ((rays.origins + self.distance[:, None] * rays.directions).abs() <= half).all(-1)
+        return self._knowing(self.known[inside], self.distance[inside])
+
+    def _knowing(self, pixel: Int[Tensor, "known"], distance: Float[Tensor, "known"]) -> "RayBank":
+        known = len(pixel) > 0
+        return self._replace(known=pixel if known else None, distance=distance if known else None)
+
+    def lookup(self, pixel: Int[Tensor, "rays"]) -> Drawn:
+        """Given pixels, and the rays through them."""
+        rays, view = self.rays(pixel)
+        values = self.pixels.index_select(0, pixel).float().div_(255)
+        return Drawn(rays, values[:, :3], values[:, 3] if values.shape[1] == 4 else None, view)
+
+    def rays(self, pixel: Int[Tensor, "rays"]) -> tuple[Rays, Int[Tensor, "rays"]]:
+        """The rays through pixels, and whose views they are; the photos, which may be on disk, are not read."""
+        view = torch.searchsorted(self.first_pixel, pixel, right=True).sub_(1)
+        geometry = self.geometry.index_select(1, view)
+        bearing = self._bearing(pixel, self.layout.index_select(1, view), geometry[14:])
+        directions = (geometry[:9].view(3, 3, -1) * bearing).sum(1)
+        return Rays(geometry[9:12].T.contiguous(), directions.T.contiguous(), geometry[12], geometry[13]), view
+
+    def _bearing(
+        self, pixel: Int[Tensor, "rays"], layout: Int[Tensor, "4 rays"], per_pixel: Float[Tensor, "2 rays"]
+    ) -> Float[Tensor, "3 rays"]:
+        """Unit bearings in the camera frame: of the patch, b + u db/du + v db/dv, with (u, v) from its middle."""
+        first_pixel, width, first_patch, across = layout
+        within = pixel - first_pixel
+        row = within // width
+        x, y = (within - row * width + 0.5) * per_pixel[0], (row + 0.5) * per_pixel[1]  # in patches
+        column, line = x.long(), y.long()
+        u, v = x.sub_(column).sub_(0.5), y.sub_(line).sub_(0.5)
+        patch = self.patches.index_select(1, first_patch + line * across + column)
+        bearing = torch.addcmul(torch.addcmul(patch[:3], patch[3:6], u), patch[6:], v)
+        return bearing / bearing.square().sum(0).sqrt_()
+
+    def draw(self, count: int, generator: torch.Generator) -> Int[Tensor, "rays"]:
+        """``count`` pixels drawn uniformly from those that may be, with replacement."""
+        return self.nth(torch.randint(self.drawable, (count,), generator=generator, device=self.device))
+
+    def nth(self, number: Int[Tensor, "rays"]) -> Int[Tensor, "rays"]:
+        """The pixels that have these numbers, from 0 on, among those that may be drawn."""
+        return number if self.runs is None else _in_runs(self.runs, number)
+
+    def draw_known(self, count: int, generator: torch.Generator) -> tuple[Int[Tensor, "rays"], Float[Tensor, "rays"]]:
+        """``count`` of the pixels whose distance is known, drawn uniformly with replacement, and their distances."""
+        assert self.known is not None and self.distance is not None, "a bank that knows none is not asked"
+        drawn = torch.randint(len(self.known), (count,), generator=generator, device=self.device)
+        return self.known.index_select(0, drawn), self.distance.index_select(0, drawn)
+
+    def may_be_drawn(self, pixel: Int[Tensor, "*rays"]) -> Bool[Tensor, "*rays"]:
+        """Whether :meth:`draw` may give these pixels."""
+        if self.runs is None:
+            return torch.ones_like(pixel, dtype=torch.bool)
+        run = torch.searchsorted(self.runs[1].contiguous(), pixel.flatten(), right=True).sub_(1).clamp_(min=0)
+        into = pixel.flatten() - self.runs[1, run]
+        return ((into >= 0) & (into < self.runs[0].diff()[run])).view(pixel.shape)
+
+
+class Placement(NamedTuple):
+    """How the views stand: scene_from_camera, and distances along the unit ray."""
+
+    poses: Float[Tensor, "views 3 4"]
+    near: Float[Tensor, "views"]
+    far: Float[Tensor, "views"]
+
+
+def ray_bank(
+    pixels: UInt8[Tensor, "pixels channels"],
+    sizes: Sequence[tuple[int, int]],
+    camera_of: Sequence[int],
+    camera_bearings: Sequence[Float[Tensor, "_ _ 3"]],
+    placement: Placement,
+) -> RayBank:
+    """The bank of photos that are laid end to end already.
+
+    Args:
+        pixels: all photos, row by row, with 3 or with 4 channels; taken as it is, without a copy.
+        sizes: per view, (height, width) of its photo in pixels.
+        camera_of: per view, the index of its camera in ``camera_bearings``.
+        camera_bearings: per camera, (rows, columns, 3) bearing vectors (camera frame) in the middles of the equal
+            patches into which they divide the picture. As many as pixels give each pixel its own; fewer are enough
+            where distortion is smooth.
+        placement: of every view.
+
+    Raises:
+        ValueError: if there are no photos, one has fewer pixels along a side than its camera has bearings, or
+            ``pixels`` has another length than all photos together.
+    """
+    if not sizes:
+        raise ValueError("a ray bank needs at least one photo")
+    grids = [(bearings.shape[0], bearings.shape[1]) for bearings in camera_bearings]
+    for view, (size, camera) in enumerate(zip(sizes, camera_of, strict=True)):
+        if size[0] < grids[camera][0] or size[1] < grids[camera][1]:
+            raise ValueError(f"photo {view} has size {size}, its camera {camera} {grids[camera]} bearings")
+    first_pixel = _starts([height * width for height, width in sizes])
+    if len(pixels) != first_pixel[-1]:
+        raise ValueError(f"there are {len(pixels)} pixels, the photos have {first_pixel[-1]}")
+    first_patch = _starts([rows * columns for rows, columns in grids])
+    cameras = torch.tensor(camera_of)
+    grid, size = torch.tensor(grids)[cameras], torch.tensor(sizes)
+    poses, near, far = placement
+    rotations, centres = poses[:, :, :3].reshape(-1, 9), poses[:, :, 3]
+    return RayBank(
+        pixels=pixels,
+        first_pixel=first_pixel,
+        layout=torch.stack([first_pixel[:-1], size[:, 1], first_patch[cameras], grid[:, 1]]),
+        geometry=torch.cat([rotations, centres, near[:, None], far[:, None], (grid / size).flip(1)], 1).T.contiguous(),
+        patches=torch.cat([_patches(bearings) for bearings in camera_bearings], 1),
+    )
+
+
+def build_ray_bank(
+    photos: Sequence[UInt8[Tensor, "_ _ channels"]],
+    camera_of: Sequence[int],
+    camera_bearings: Sequence[Float[Tensor, "_ _ 3"]],
+    poses: Float[Tensor, "views 3 4"],
+    near: Float[Tensor, "views"],
+    far: Float[Tensor, "views"],
+) -> RayBank:
+    """:func:`ray_bank` of photos in memory, (height, width, channels) each, which it copies."""
+    pixels = [photo.flatten(0, 1) for photo in photos] or [torch.zeros(0, 3, dtype=torch.uint8)]
+    sizes = [(photo.shape[0], photo.shape[1]) for photo in photos]
+    return ray_bank(torch.cat(pixels), sizes, camera_of, camera_bearings, Placement(poses, near, far))
+
+
+def _runs(
+    ignored: Iterable[Bool[Tensor, "_ _"] | None], first_pixel: Int[Tensor, "views_and_end"]
+) -> Int[Tensor, "2 runs_and_end"]:
+    """Runs of pixels that are not ignored, as :class:`RayBank` has them. No run is longer than a view."""
+    firsts, lengths = [], []
+    for mask, start, end in zip(ignored, first_pixel[:-1], first_pixel[1:], strict=True):
+        if mask is None:
+            firsts.append(start[None])
+            lengths.append((end - start)[None])
+            continue
+        used = torch.nn.functional.pad((~mask).flatten().to(torch.int8), (1, 1))
+        change = used.diff()
+        begins, ends = (change == 1).nonzero()[:, 0], (change == -1).nonzero()[:, 0]
+        firsts.append(start + begins)
+        lengths.append(ends - begins)
+    before = _starts(torch.cat(lengths).tolist())
+    return torch.stack([before, torch.cat([*firsts, first_pixel[-1:]])])
+
+
+def _in_runs(runs: Int[Tensor, "2 runs_and_end"], drawn: Int[Tensor, "rays"]) -> Int[Tensor, "rays"]:
+    """The pixels that are the ``drawn``-th ones, counted from 0, of those in runs."""
+    before, first = runs.index_select(1, torch.searchsorted(runs[0].contiguous(), drawn, right=True).sub_(1))
+    return first + drawn - before
+
+
+def _patches(bearings: Float[Tensor, "rows columns 3"]) -> Float[Tensor, "9 patches"]:
+    """Bearings on the plane z = 1, with their slopes along x and y per patch (central differences)."""
+    flat = bearings / bearings[..., 2:].clamp(min=LEAST_FORWARD)
+    return torch.cat([flat, _slope(flat, 1), _slope(flat, 0)], -1).flatten(0, 1).T.contiguous()
+
+
+def _slope(values: Float[Tensor, "rows columns 3"], axis: int) -> Float[Tensor, "rows columns 3"]:
+    count = values.shape[axis]
+    if count == 1:
+        return torch.zeros_like(values)
+    return torch.gradient(values, dim=axis, edge_order=min(2, count - 1))[0]
+
+
+def _starts(counts: list[int]) -> Int[Tensor, "counts_and_end"]:
+    """Where each of several runs of ``counts`` items begins, and at last where the last one ends."""
+    return torch.cat([torch.zeros(1, dtype=torch.int64), torch.tensor(counts, dtype=torch.int64).cumsum(0)])

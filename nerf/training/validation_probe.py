@@ -1,0 +1,111 @@
+"""Fixed pixels on which a field in training is measured now and then: single ones, which tell PSNR, and small whole
+patches of the photos, which can be compared in structure."""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from nerf.effects import AS_GIVEN, AS_RENDERED, PhotoColours, PhotoRays, Seen
+from nerf.fields.interface import RadianceModel, Rendering
+from nerf.geometry.rays import Rays
+from nerf.rendering.images import render_image
+from nerf.runtime.randomness import generator
+from nerf.training.metrics import mean_squared_error, psnr
+from nerf.training.ray_dataset import RayBank
+from nerf.training.trainer import over
+
+
+class Probe(NamedTuple):
+    """Rays, what they should see, the background both are shown over, and the views that the rays belong to."""
+
+    rays: Rays
+    colours: Float[Tensor, "rays 3"]
+    background: Float[Tensor, "3"]
+    view: Int[Tensor, "rays"]
+
+    @property
+    def flat_psnr(self) -> float:
+        """What the best single colour scores (dB): a field that is no better has learned nothing of the scene."""
+        mean = self.colours.mean(0).expand_as(self.colours)
+        return psnr(mean_squared_error(mean, self.colours))
+
+
+class ProbeResult(NamedTuple):
+    """PSNR in dB and mean opacity of a field on a probe."""
+
+    psnr: float
+    opacity: float
+
+
+class Patches(NamedTuple):
+    """Squares of photos: ``probe`` has their pixels one patch after the other, row by row; ``used`` says which of them
+    count."""
+
+    probe: Probe
+    used: Bool[Tensor, "patches side side"]
+
+
+def make_probe(bank: RayBank, count: int, background: Float[Tensor, "3"], seed: int) -> Probe:
+    """Draw ``count`` pixels of ``bank``, always the same for the same seed."""
+    return _probe_of(bank, bank.draw(count, generator(bank.device, seed)), background)
+
+
+def make_patches(bank: RayBank, count: int, side: int, background: Float[Tensor, "3"], seed: int) -> Patches:
+    """``count`` squares around drawn pixels of ``bank``, moved to lie inside their photos; always the same for the same
+    seed. Their side is ``side`` pixels, less where a photo is smaller."""
+    first, width = bank.layout[:2]
+    height = bank.first_pixel.diff() // width
+    side = min(side, int(width.min()), int(height.min()))
+    pixel = bank.draw(count, generator(bank.device, seed, 1))
+    view = torch.searchsorted(bank.first_pixel, pixel, right=True) - 1
+    first, width, height = (table.index_select(0, view) for table in (first, width, height))
+    within = pixel - first
+    top = (within // width - side // 2).clamp(min=0).minimum(height - side)
+    left = (within % width - side // 2).clamp(min=0).minimum(width - side)
+    steps = torch.arange(side, device=bank.device)
+    corner = first + top * width + left
+    pixels = corner[:, None, None] + steps[:, None] * width[:, None, None] + steps
+    return Patches(_probe_of(bank, pixels.flatten(), background), bank.may_be_drawn(pixels))
+
+
+def _probe_of(bank: RayBank, pixels: Int[Tensor, "rays"], background: Float[Tensor, "3"]) -> Probe:
+    rays, colour, alpha, view = bank.lookup(pixels)
+    return Probe(rays, over(colour, alpha, background), background, view)
+
+
+@torch.no_grad()
+def measure(
+    model: RadianceModel,
+    probe: Probe,
+    photo_colours: PhotoColours = AS_RENDERED,
+    photo_rays: PhotoRays = AS_GIVEN,
+) -> ProbeResult:
+    """Render the probe and compare it with the photos, as ``photo_rays`` and ``photo_colours`` have them.
+
+    Raises ValueError where what it shows is no finite number.
+    """
+    shown, opacity = _shown(model, probe, photo_colours, photo_rays)
+    return ProbeResult(psnr(mean_squared_error(shown, probe.colours)), float(opacity.mean()))
+
+
+@torch.no_grad()
+def pictures(
+    model: RadianceModel, patches: Patches, photo_colours: PhotoColours = AS_RENDERED
+) -> tuple[Float[Tensor, "patches side side 3"], Float[Tensor, "patches side side 3"]]:
+    """What the field shows of the patches, in [0, 1], and what the photos show."""
+    shown, _ = _shown(model, patches.probe, photo_colours, AS_GIVEN)
+    shape = (*patches.used.shape, 3)
+    return shown.view(shape), patches.probe.colours.view(shape)
+
+
+def _shown(
+    model: RadianceModel, probe: Probe, photo_colours: PhotoColours, photo_rays: PhotoRays
+) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"]]:
+    """What the field shows in the photos' place, in [0, 1] as they are, and its opacity. What is no finite number stays
+    that."""
+    one_row = photo_rays.forward(probe.rays, probe.view).each(lambda part: part[None])
+    seen = Rendering(*(part[0] for part in render_image(model, one_row, probe.background)))
+    shown = probe.colours + photo_colours.residual(Seen(seen, probe.background, probe.view), probe.colours)
+    return torch.where(shown.isfinite(), shown.clamp(0, 1), shown), seen.opacity

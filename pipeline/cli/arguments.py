@@ -1,0 +1,269 @@
+"""The words of the command line: one dataclass per command, read by tyro; dotted flags come from the stage configs."""
+
+import io
+import re
+from collections.abc import Sequence
+from contextlib import redirect_stderr, suppress
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import tyro
+from pydantic import ValidationError
+
+from pipeline.cli.settings import Settings, UsageError, wrong_options
+from stages.render import Config as RenderConfig
+from stages.train import GRID_ONLY, PAPER_ONLY
+from stages.train import Config as TrainConfig
+
+T = TypeVar("T")
+
+Effects = Annotated[
+    tyro.conf.UseAppendAction[tuple[str, ...]],
+    tyro.conf.arg(metavar="NAME=on|off|auto", help="Force an effect on or off, or let the photos decide; repeatable."),
+]
+More = Annotated[
+    str | None,
+    tyro.conf.arg(
+        metavar="10m",
+        help="Go on from the finished training for so much longer (90s, 10m, 1h30m, or 500steps), with the recorded "
+        "options; what it gave so far is kept.",
+    ),
+]
+
+BudgetOption = Annotated[
+    str | None,
+    tyro.conf.arg(metavar="DURATION", help="Wall time for the whole command, like 90s, 10m or 1h30m."),
+]
+
+
+@dataclass
+class Common:
+    """Options of every command that runs stages."""
+
+    json: bool = False
+    """One JSON object a line instead of text."""
+    debug: bool = False
+    """Show the traceback of an error."""
+    replan: bool = False
+    """Choose again what was chosen automatically before: for every stage of a run, or the one that is named."""
+    verify: bool = False
+    """Read every file of finished results and compare it with its sha256; what is damaged is made again."""
+
+
+@dataclass
+class RunArguments:
+    """Photos in; cameras, radiance field, figures, video, mesh and report out."""
+
+    photos: tyro.conf.Positional[Path]
+    """A folder of photos, a video, a transforms.json, or a folder with transforms_train.json."""
+    settings: Annotated[Settings, tyro.conf.arg(name="")] = field(default_factory=Settings)
+    common: Annotated[Common, tyro.conf.arg(name="")] = field(default_factory=Common)
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """The workspace (default: <photos>.nerf in the current folder)."""
+    cameras: Path | None = None
+    """Known cameras for these photos: a transforms.json or a COLMAP model folder."""
+    like: str | None = None
+    """Render the video as this photo was exposed (its name; where the effect exposure is on)."""
+    effect: Effects = ()
+    budget: BudgetOption = None
+    until: str | None = None
+    """The last stage to run."""
+    more: More = None
+    from_: Annotated[str | None, tyro.conf.arg(name="from")] = None
+    """Run this stage and all after it again even if they are cached."""
+    config: Path | None = None
+    """A TOML file with options, tables named by stage; flags win over it."""
+
+
+@dataclass
+class StageArguments:
+    """Bring one stage of a workspace up to date, with the recorded options plus the flags given."""
+
+    workspace: tyro.conf.Positional[Path]
+    """The workspace folder."""
+    settings: Annotated[Settings, tyro.conf.arg(name="")] = field(default_factory=Settings)
+    common: Annotated[Common, tyro.conf.arg(name="")] = field(default_factory=Common)
+    cameras: Path | None = None
+    """render only: a file with the cameras to render, like output/transforms.json."""
+    like: str | None = None
+    """render only: render the video as this photo was exposed (its name)."""
+    effect: Effects = ()
+    budget: str | None = None
+    """tradeoff only: how long the study may take, as in 30m."""
+    more: More = None
+    force: bool = False
+    """Run it again even if it is cached."""
+
+
+@dataclass
+class ResumeArguments:
+    """Repeat the recorded run: what is finished is kept, what was interrupted goes on."""
+
+    workspace: tyro.conf.Positional[Path]
+    common: Annotated[Common, tyro.conf.arg(name="")] = field(default_factory=Common)
+
+
+@dataclass
+class StatusArguments:
+    """Each stage: cached, stale, partial or never, with its one-line summary."""
+
+    workspace: tyro.conf.Positional[Path]
+    json: bool = False
+    """One JSON array instead of text."""
+    verify: bool = False
+    """Read every file of finished results and compare it with its sha256; exit code 1 if one is damaged."""
+
+
+@dataclass
+class ExplainArguments:
+    """Say whether a stage would run, and which part of its key changed."""
+
+    stage: tyro.conf.Positional[str]
+    workspace: tyro.conf.Positional[Path]
+
+
+@dataclass
+class CleanArguments:
+    """Remove results that the recorded options do not use."""
+
+    workspace: tyro.conf.Positional[Path]
+    dry_run: bool = False
+    """Only list them."""
+
+
+@dataclass
+class DoctorArguments:
+    """Versions, device, threads, free disk and a five-second numerical self-test."""
+
+    selftest: bool = False
+    """Measure every formula of docs/NUMERICS.md on this machine's device as well, in under a minute."""
+    bench: bool = False
+    """Measure matrix products, random reads and copying as well, and say what training can reach here at most; 5 s."""
+
+
+@dataclass
+class DemoArguments:
+    """Photograph a synthetic scene, run everything on the photos and compare with the truth."""
+
+    settings: Annotated[Settings, tyro.conf.arg(name="")] = field(default_factory=Settings)
+    common: Annotated[Common, tyro.conf.arg(name="")] = field(default_factory=Common)
+    effect: Effects = ()
+    budget: BudgetOption = None
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("demo")
+    """Where photos and workspace go."""
+
+
+COMMANDS: dict[str, type] = {
+    "run": RunArguments,
+    "resume": ResumeArguments,
+    "status": StatusArguments,
+    "explain": ExplainArguments,
+    "clean": CleanArguments,
+    "doctor": DoctorArguments,
+    "demo": DemoArguments,
+}
+
+
+def parse(kind: type[T], command: str, words: Sequence[str], settings: Settings | None = None) -> T:
+    """Parse ``words``; stage options not named in them keep their value in ``settings``.
+
+    Raises UsageError with every wrong word in a sentence of its own, SystemExit(0) after ``--help``.
+    """
+    if settings is not None:
+        left = {"train": _without_replaced(settings.train, words), "render": _one_path(settings.render, command, words)}
+        settings = settings.model_copy(update=left)
+    positional = {name: tyro.MISSING for name in ("photos", "workspace", "stage") if name in kind.__annotations__}
+    default: Any = kind(**positional)
+    if settings is not None:
+        default = replace(default, settings=settings)
+    said = io.StringIO()
+    try:
+        with redirect_stderr(said):
+            return tyro.cli(kind, prog=f"pipeline {command}", args=list(words), default=default)
+    except SystemExit as ending:
+        if ending.code in (None, 0):
+            raise
+        if "photos" in positional and (surplus := _surplus_file(kind, words, default)):
+            raise UsageError(f"{surplus} is one file too many; give the folder that holds the photos") from ending
+        raise UsageError(f"{_what_is_wrong(ending, said.getvalue())} (pipeline {command} --help)") from ending
+
+
+def _surplus_file(kind: type, words: Sequence[str], default: Any) -> str | None:
+    """The first word that is none of the options but an existing file, as a shell gives them for ``*.jpg``."""
+    with suppress(SystemExit), redirect_stderr(io.StringIO()):
+        _, unknown = tyro.cli(kind, args=list(words), default=default, return_unknown_args=True)
+        return next((word for word in unknown if Path(word).is_file()), None)
+
+
+def _without_replaced(recorded: TrainConfig, words: Sequence[str]) -> TrainConfig:
+    """The recorded options of training without what those in ``words`` stand in place of: the budgets beside the one
+    given, and all that belongs to the other field than the one given."""
+    replaced = set[str]()
+    if given := {option for option in ("steps", "seconds", "preset") if _gives(words, f"--train.{option}")}:
+        # A preset is a budget, too, unless one is counted; and a new training does not go on from another.
+        replaced |= {"steps", "seconds", "after", "more_steps", "more_seconds"} - given
+    wanted = _given(words, "--train.field")
+    if wanted == "paper":
+        replaced |= {*GRID_ONLY}
+    elif wanted == "grid":
+        replaced |= {*PAPER_ONLY, *(["preset"] if recorded.preset == "paper" else [])}
+    return recorded.model_copy(update={name: TrainConfig.model_fields[name].default for name in replaced})
+
+
+def _one_path(recorded: RenderConfig, command: str, words: Sequence[str]) -> RenderConfig:
+    """The recorded options of rendering without what those in ``words`` stand in place of: a path and its length, or
+    cameras from a file."""
+    own = ("--cameras",) if command == "render" else ()  # of a run they are those of the photos
+    replaced = {"path": None, "frames": None} if _gives(words, "--render.cameras", *own) else {}
+    if _gives(words, "--render.path", "--render.frames"):
+        replaced["cameras"] = None
+    return recorded.model_copy(update=replaced)
+
+
+def _what_is_wrong(ending: SystemExit, box: str) -> str:
+    """The problem in one line: pydantic's findings where an option was refused, else what tyro put into its box."""
+    fault = ending.__context__
+    if fault is not None and isinstance(refused := fault.__cause__ or fault.__context__, ValidationError):
+        return wrong_options(refused, "--" + str(fault.args[1]).removeprefix("settings."))
+    # Drawn with lines where the terminal has them, else indented by two; the title is neither.
+    lines = [line.strip(" │") for line in box.splitlines() if line.startswith(("│", "  "))]
+    words = " ".join(line for line in lines if line.strip("─-"))
+    for end in ("Got errors:", "Argument helptext:", "For full helptext"):
+        words = words.split(end)[0]
+    words, _, similar = words.partition("Perhaps you meant:")
+    words = re.sub(r"no type matching (.+) could be instantiated from \[(.*)\]", r"\2 does not fit \1", words)
+    words = " ".join(words.split()).removeprefix("Error parsing ").rstrip(".")
+    return words + (f"; perhaps {', '.join(re.findall(r'--[a-z0-9.-]+', similar))}" if similar else "")
+
+
+def _gives(words: Sequence[str], *options: str) -> bool:
+    """Whether ``words`` give a value for one of the options, None being the way to leave it open."""
+    return any(_given(words, option) not in (None, "None") for option in options)
+
+
+def _given(words: Sequence[str], option: str) -> str | None:
+    """What ``words`` give for an option, spelt as there; None where they do not name it."""
+    for word, following in pairwise([*words, ""]):
+        name, equals, value = word.partition("=")
+        if name == option:
+            return value if equals else following
+    return None
+
+
+def overview(stages: Sequence[str]) -> str:
+    """The text of ``pipeline --help``."""
+    commands = [(name, (kind.__doc__ or "").strip()) for name, kind in COMMANDS.items()]
+    lines = [f"  {name:<10} {text}" for name, text in commands]
+    return "\n".join(
+        [
+            "usage: pipeline COMMAND … (pipeline COMMAND --help says more)",
+            "",
+            "  pipeline run photos/       from photos to cameras, radiance field, video, mesh and report",
+            "",
+            *lines,
+            "",
+            f"One stage of a workspace, with its options: pipeline STAGE WORKSPACE ({', '.join(stages)})",
+        ]
+    )

@@ -1,0 +1,393 @@
+"""The command line: finds the command, runs it, turns every ending into words and an exit code.
+
+Exit codes: 0 done; 2 usage; 3 the workspace; 10 to 19 the stage that failed (pipeline/engine/stage_list.py); 130
+Ctrl-C; 143 SIGTERM; 1 a defect of this program.
+"""
+
+import io
+import json
+import os
+import shutil
+import sys
+import time
+import traceback
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+from pipeline.cli import arguments as words_of
+from pipeline.cli.display import Display, SilentDisplay, Unread, choose_display, open_closed_streams
+from pipeline.cli.durations import seconds_from
+from pipeline.cli.failures import StageFailed
+from pipeline.cli.settings import (
+    Settings,
+    UsageError,
+    check_fitted_poses,
+    check_same_photos,
+    check_workspace,
+    read_toml,
+    settings_from,
+    with_effects,
+    with_lasting_cameras,
+    with_source,
+)
+from pipeline.cli.signals import Terminated, go_on, heed_signals
+from pipeline.doctor import machine
+from pipeline.engine import stage_list as chain
+from pipeline.engine import status
+from pipeline.engine.more import with_more
+from pipeline.engine.runner import Runner
+from pipeline.engine.workspace import RUN_FILE, Workspace, default_workspace
+from pipeline.schedule import forecast
+from stages.contract import StageError
+from stages.io.amounts import duration
+
+EXIT_DEFECT, EXIT_USAGE, EXIT_WORKSPACE, EXIT_INTERRUPT, EXIT_TERMINATED = 1, 2, 3, 130, 143
+
+REPORT_IT = "Finished stages are kept. Please report it with the output of the same command and --debug."
+
+
+def main() -> None:
+    """One command line, from ``sys.argv``. That nobody reads its words to the end (`pipeline … | head`) is no error;
+    nor are letters that the terminal does not have."""
+    code: int | str | None = 0
+    open_closed_streams()
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+    try:
+        try:
+            code = run_command(sys.argv[1:])
+        except SystemExit as ending:  # of a help text
+            code = ending.code
+        sys.stdout.flush()
+    except BrokenPipeError:
+        Unread(sys.stdout).leave()
+    sys.exit(code)
+
+
+def run_command(words: Sequence[str]) -> int:
+    """Run one command line and return its exit code; errors are said on the way."""
+    if not words or words[0] in ("-h", "--help"):
+        print(words_of.overview(list(chain.STAGES)))
+        return 0 if words else EXIT_USAGE
+    if words[0] == "--version":
+        print(machine.versions(("pipeline-nerf",))["pipeline-nerf"])
+        return 0
+    debug, as_json = "--debug" in words, "--json" in words
+    heed_signals()
+    try:
+        return _command(words[0])(words[1:])
+    except UsageError as error:
+        _say(str(error), "", "", as_json)
+        return EXIT_USAGE
+    except StageFailed as failure:
+        if debug:
+            traceback.print_exc()
+        return chain.EXIT_CODES[failure.stage]
+    except StageError as error:
+        if debug:
+            traceback.print_exc()
+        _say(error.what, error.why, error.hint, as_json)
+        return EXIT_WORKSPACE
+    except KeyboardInterrupt:
+        _say("stopped", "Ctrl-C", go_on(words), as_json)
+        return EXIT_INTERRUPT
+    except Terminated:
+        _say("stopped", "SIGTERM", go_on(words), as_json)
+        return EXIT_TERMINATED
+    except BrokenPipeError:
+        raise
+    except Exception as error:
+        if debug:
+            traceback.print_exc()
+        what = f"a defect of this program, not of your photos: {type(error).__name__}: {error}"
+        _say(what, "it should not happen", REPORT_IT, as_json)
+        return EXIT_DEFECT
+
+
+def _say(what: str, why: str, hint: str, as_json: bool) -> None:
+    """What ended the program outside of any stage, in words, or as an event like that of a stage that failed."""
+    if as_json:
+        event = {"event": "error", "stage": None, "what": what, "why": why, "hint": hint}
+        print(json.dumps(event), flush=True)
+        return
+    reason = f"\n  why: {why}\n  try: {hint}" if why else ""
+    errors = Unread(sys.stderr)  # where nobody reads along, the exit code still tells
+    print(f"pipeline: {what}{reason}", file=errors)
+    errors.leave()
+
+
+def _command(name: str) -> Callable[[Sequence[str]], int]:
+    commands: dict[str, Callable[[Sequence[str]], int]] = {
+        "run": command_run,
+        "resume": command_resume,
+        "status": command_status,
+        "explain": command_explain,
+        "clean": command_clean,
+        "doctor": command_doctor,
+        "demo": command_demo,
+    }
+    if name in commands:
+        return commands[name]
+    if name in chain.STAGES:
+        return lambda words: command_stage(name, words)
+    raise UsageError(f"no command {name!r}; there are: {', '.join([*commands, *chain.STAGES])}")
+
+
+def command_run(words: Sequence[str]) -> int:
+    """``pipeline run PHOTOS``: the whole chain, or a part of it."""
+    given = words_of.parse(words_of.RunArguments, "run", words)
+    if given.more is not None and given.config is not None:
+        what = f"--more goes on with the recorded options, not with those of --config {given.config}"
+        raise UsageError(f"{what}; leave --config out, and give what is to change as flags")
+    file = {} if given.config is None else read_toml(given.config)
+    if given.config is not None:  # the file's values become the defaults that flags override
+        from_file = settings_from(file, f"--config {given.config}")
+        given = words_of.parse(words_of.RunArguments, "run", words, from_file)
+    root, cameras = given.output or default_workspace(given.photos), given.cameras
+    check_workspace(root, given.photos)
+    if given.output is None:
+        check_same_photos(Workspace(root), given.photos)
+    if given.more is not None:
+        recorded = _recorded_settings(Workspace.existing(root))
+        given = words_of.parse(words_of.RunArguments, "run", words, recorded)
+        cameras = cameras or recorded.ingest.cameras
+    asked = _like(with_effects(_more(given, root), given.effect), given.like)
+    asked = _keeping_studies(asked, root, words, file)
+    stages = chain.up_to(_known_stage(given.until or list(chain.STAGES)[-1], "--until"))
+    force = frozenset[str]()
+    if given.from_ is not None:
+        force = frozenset(stages[stages.index(_known_stage(given.from_, "--from", stages)) :])
+    budget = _budget(given.budget, asked)
+    if budget is not None and (studies := [stage for stage in stages if stage in chain.ON_REQUEST]):
+        later = f"`pipeline {studies[0]} {root} --budget 30m`"
+        raise UsageError(f"--budget and --until {studies[0]}: a study has a budget of its own; run first, then {later}")
+    with choose_display(given.common.json) as display:
+        try:
+            settings = with_source(asked, given.photos, cameras)
+        except StageError as error:
+            display.failed("ingest", error)
+            return chain.EXIT_CODES["ingest"]
+        new_budget = None if given.more is not None else (budget, 0.0)
+        return _run_stages(root, settings, stages, given.common, display, force, new_budget=new_budget)
+
+
+def _keeping_studies(settings: Settings, root: Path, words: Sequence[str], file: Collection[str] = ()) -> Settings:
+    """The settings with the recorded options of the stages ON_REQUEST but those that the command's ``words`` or tables
+    of the ``file`` of --config name: a run that does not ask for them leaves what they found where it is."""
+    named = {*file, *(stage for stage in chain.ON_REQUEST if any(word.startswith(f"--{stage}.") for word in words))}
+    if not os.path.isfile(root / RUN_FILE):
+        return settings
+    options = Workspace(root).read_run()["options"]
+    recorded = {stage: options[stage] for stage in chain.ON_REQUEST if stage in options and stage not in named}
+    try:
+        kept = settings_from(recorded, f"options recorded in {root}")
+    except UsageError:  # of another version of this program, which finds nothing by them anyway
+        return settings
+    return settings.model_copy(update={stage: getattr(kept, stage) for stage in recorded})
+
+
+def _budget(text: str | None, settings: Settings) -> float | None:
+    """The seconds of ``--budget``. Raises UsageError beside steps, which take as long as they take, and ``--more``."""
+    if text is not None and settings.train.after is not None:
+        raise UsageError("--budget and --more are two budgets; give one")
+    if text is not None and settings.train.steps is not None:
+        what = f"--budget {text} and --train.steps {settings.train.steps}: so many steps take as long as they take"
+        raise UsageError(f"{what}; leave out one, or give --train.seconds")
+    return None if text is None else seconds_from(text)
+
+
+def _more(given: words_of.RunArguments | words_of.StageArguments, root: Path) -> Settings:
+    """The settings given, with ``--more``."""
+    return given.settings if given.more is None else with_more(given.settings, Workspace.existing(root), given.more)
+
+
+def _like(settings: Settings, photo: str | None) -> Settings:
+    """The settings with ``--like PHOTO``."""
+    if photo is None:
+        return settings
+    return settings.model_copy(update={"render": settings.render.model_copy(update={"like": photo})})
+
+
+def _known_stage(name: str, flag: str, among: Sequence[str] = tuple(chain.STAGES)) -> str:
+    if name not in among:
+        raise UsageError(f"{flag} {name}: not one of {', '.join(among)}")
+    return name
+
+
+def _run_stages(
+    root: Path,
+    settings: Settings,
+    stages: Sequence[str],
+    common: words_of.Common,
+    display: Display,
+    force: frozenset[str] = frozenset(),
+    alone: str | None = None,
+    new_budget: tuple[float | None, float] | None = None,
+) -> int:
+    """``alone``: the one stage that the command is for, whose stages are no run to repeat; None for a run.
+    ``new_budget``: seconds for the whole command (None: no limit), and those spent before; None: as recorded."""
+    if "evaluate" in stages:
+        check_fitted_poses(settings)
+    settings = with_lasting_cameras(settings, root)
+    with Workspace(root) as workspace:
+        runner = Runner(workspace, settings, display)
+        if new_budget is not None:
+            runner.set_budget(*new_budget)
+        replan = (stages if alone is None else (alone,)) if common.replan else ()
+        anew = force | (runner.state["plans"].keys() & replan)
+        foretold = forecast.foretell(runner, stages, anew, forecast.photos_of(settings))
+        display.headline(" · ".join([machine.headline(root), *foretold.words]))
+        try:
+            given = {"force": force, "replan": replan, "remember": alone is None, "verify": common.verify}
+            ran = runner.run(stages, times=foretold.times, **given)
+        except StageFailed as failure:
+            display.failed(failure.stage, failure.error)
+            raise
+        words = _closing_words(workspace, ran)
+        if runner.charged and alone is None and runner.budget:
+            words = f"{duration(runner.budget.spent)} of {duration(runner.budget.total)} spent {words}"
+        display.finished(words, _outputs(workspace))
+    return 0
+
+
+def _outputs(workspace: Workspace) -> dict[str, Path]:
+    folder = workspace.root / "output"
+    return {path.name: path for path in sorted(folder.iterdir())} if folder.is_dir() else {}
+
+
+def _closing_words(workspace: Workspace, ran: bool) -> str:
+    found = _outputs(workspace)
+    named = [str(found[name]) for name in ("report.html", "mesh.glb", "video.mp4") if name in found]
+    words = "" if ran else "nothing to do: everything is up to date "
+    return words + ("→ " + "  ".join(named) if named else f"→ {workspace.root}")
+
+
+def command_stage(stage: str, words: Sequence[str]) -> int:
+    """``pipeline STAGE WORKSPACE``: bring one stage, what it needs, and the report if there is one, up to date."""
+    given = words_of.parse(words_of.StageArguments, stage, words)
+    workspace = Workspace.existing(given.workspace)
+    recorded = _recorded_settings(workspace)
+    given = words_of.parse(words_of.StageArguments, stage, words, recorded)
+    for flag in ("cameras", "like"):
+        if getattr(given, flag) is not None and stage != "render":
+            raise UsageError(f"--{flag} belongs to `pipeline render` and `pipeline run`, not to {stage}")
+    if given.more is not None and stage != "train":
+        raise UsageError(f"--more belongs to `pipeline train` and `pipeline run`, not to {stage}")
+    settings = _like(with_effects(_more(given, given.workspace), given.effect), given.like)
+    if given.budget is not None:
+        settings = _study_for(settings, given.budget, stage)
+    if given.cameras is not None:
+        update = {"cameras": given.cameras.absolute()}
+        settings = settings.model_copy(update={"render": settings.render.model_copy(update=update)})
+    stages = chain.needed_for(stage)
+    if stage != "report" and "report" in workspace.read_run()["keys"]:
+        stages = [*stages, "report"]
+    with choose_display(given.common.json) as display:
+        force = frozenset({stage}) if given.force else frozenset[str]()
+        return _run_stages(given.workspace, settings, stages, given.common, display, force, alone=stage)
+
+
+def _study_for(settings: Settings, budget: str, stage: str) -> Settings:
+    """The settings with `pipeline tradeoff --budget`."""
+    if stage != "tradeoff":
+        raise UsageError(f"--budget belongs to `pipeline tradeoff`, not to {stage}")
+    update = {"seconds": seconds_from(budget)}
+    return settings.model_copy(update={"tradeoff": settings.tradeoff.model_copy(update=update)})
+
+
+def _recorded_settings(workspace: Workspace) -> Settings:
+    """The options in run.json. Raises StageError where this version of the program has others."""
+    try:
+        return settings_from(workspace.read_run()["options"], "recorded there")
+    except UsageError as error:
+        why = f"{error}; another version of this program wrote it"
+        hint = f"Give the photos again: pipeline run PHOTOS -o {workspace.root}. What still fits is kept."
+        raise StageError(f"cannot use the options of {workspace.root}", why, hint) from error
+
+
+def command_resume(words: Sequence[str]) -> int:
+    """``pipeline resume WORKSPACE``: repeat the recorded run."""
+    given = words_of.parse(words_of.ResumeArguments, "resume", words)
+    workspace = Workspace.existing(given.workspace)
+    stages = workspace.read_run().get("stages") or chain.usual()
+    with choose_display(given.common.json) as display:
+        return _run_stages(given.workspace, _recorded_settings(workspace), stages, given.common, display)
+
+
+def _reader(root: Path) -> tuple[Workspace, Runner]:
+    workspace = Workspace.existing(root)
+    return workspace, Runner(workspace, _recorded_settings(workspace), SilentDisplay())
+
+
+def command_status(words: Sequence[str]) -> int:
+    """``pipeline status WORKSPACE``."""
+    given = words_of.parse(words_of.StatusArguments, "status", words)
+    statuses = status.all_statuses(*_reader(given.workspace), given.verify)
+    code = EXIT_DEFECT if given.verify and any(s.state == "damaged" for s in statuses) else 0
+    if given.json:
+        print(json.dumps([asdict(s) for s in statuses]))
+        return code
+    for s in statuses:
+        print(f"{s.stage:<10} {s.state:<8} {s.text}".rstrip())
+    return code
+
+
+def command_explain(words: Sequence[str]) -> int:
+    """``pipeline explain STAGE WORKSPACE``."""
+    given = words_of.parse(words_of.ExplainArguments, "explain", words)
+    stage = _known_stage(given.stage, "explain")
+    print("\n".join(status.explain(*_reader(given.workspace), stage)))
+    return 0
+
+
+def command_clean(words: Sequence[str]) -> int:
+    """``pipeline clean WORKSPACE``: remove results that the recorded options do not use."""
+    given = words_of.parse(words_of.CleanArguments, "clean", words)
+    with Workspace.existing(given.workspace) as workspace:
+        stale = workspace.stale_folders(workspace.read_run()["keys"], list(chain.STAGES))
+        freed = sum(p.stat().st_size for folder in stale for p in folder.rglob("*") if p.is_file())
+        for folder in stale:
+            print(f"{'would remove' if given.dry_run else 'removed'} {folder}")
+            if not given.dry_run:
+                shutil.rmtree(folder)
+    print(f"{freed / 2**20:.1f} MB in {len(stale)} folders")
+    return 0
+
+
+def command_doctor(words: Sequence[str]) -> int:
+    """``pipeline doctor``: versions, device, threads, free disk, a numerical self-test."""
+    given = words_of.parse(words_of.DoctorArguments, "doctor", words)
+    from pipeline.doctor import examine
+
+    return examine(Path(os.curdir), given.selftest, given.bench)
+
+
+def command_demo(words: Sequence[str]) -> int:
+    """``pipeline demo``: photograph a synthetic scene, run everything, compare with the truth."""
+    from pipeline import demo
+
+    given = words_of.parse(words_of.DemoArguments, "demo", words)
+    if given.budget is None:
+        given = words_of.parse(words_of.DemoArguments, "demo", words, demo.default_settings())
+    budget = _budget(given.budget, given.settings)
+    asked = with_effects(given.settings, given.effect)
+    photos, root = given.output / "photos", given.output / "demo.nerf"
+    asked = _keeping_studies(asked, root, words)
+    with choose_display(given.common.json) as display:
+        display.begin("photos")
+        line, seconds = demo.photograph(photos, display)
+        display.end("photos", line, seconds, cached=seconds == 0)
+        settings = with_source(asked, photos, None)
+        budgeted = (budget, seconds)
+        code = _run_stages(root, settings, chain.usual(), given.common, display, new_budget=budgeted)
+        started = time.monotonic()
+        display.begin("truth")
+        *notes, last = demo.truth_lines(root / "output", photos)
+        for text in notes:
+            display.note(text)
+        display.end("truth", last, time.monotonic() - started, cached=False)
+        report = root / "output" / "report.html"
+        display.finished(f"→ the report: {report}", {"report.html": report})
+    return code

@@ -1,0 +1,180 @@
+"""All options of a run: one pydantic model per stage, filled from defaults, a TOML file and flags, in that order."""
+
+import difflib
+import os
+import tomllib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, get_args
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from pipeline.engine.workspace import RUN_FILE, Workspace, default_workspace, is_result, lasting, photo_set
+from stages.contract import bounded
+from stages.effects import Config as EffectsConfig
+from stages.evaluate import Config as EvaluateConfig
+from stages.ingest import Config as IngestConfig
+from stages.mesh import Config as MeshConfig
+from stages.normalise import Config as NormaliseConfig
+from stages.render import Config as RenderConfig
+from stages.report import Config as ReportConfig
+from stages.sfm import Config as SfmConfig
+from stages.tradeoff import Config as TradeoffConfig
+from stages.train import Config as TrainConfig
+
+if TYPE_CHECKING:
+    from pydantic_core import ErrorDetails
+
+MOST_WRONG, MOST_LETTERS = 10, 100  # options in one error, and letters of a name or value in it
+WORDS_ALONE = {("ingest", "photos"): "PHOTOS", ("ingest", "cameras"): "--cameras", ("sfm", "cameras"): "--cameras"}
+
+
+class UsageError(Exception):
+    """A command line or config file that makes no sense; shown in one line, exit code 2."""
+
+
+class Settings(BaseModel):
+    """The options of every stage, as the user gave them: None still means "choose for me"."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    ingest: IngestConfig = IngestConfig()
+    sfm: SfmConfig = SfmConfig()
+    normalise: NormaliseConfig = NormaliseConfig()
+    effects: EffectsConfig = EffectsConfig()
+    train: TrainConfig = TrainConfig()
+    evaluate: EvaluateConfig = EvaluateConfig()
+    render: RenderConfig = RenderConfig()
+    mesh: MeshConfig = MeshConfig()
+    tradeoff: TradeoffConfig = TradeoffConfig()
+    report: ReportConfig = ReportConfig()
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """The options in a TOML file: tables named by stage, the same keys as the flags. Raises UsageError for a file that
+    is none, and where photos and cameras stand in it, which are the command's own words."""
+    try:
+        values = tomllib.loads(path.read_text("utf-8-sig"))  # -sig: Windows writes a byte order mark
+    except OSError as error:
+        raise UsageError(f"--config {path}: {error.strerror}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise UsageError(f"--config {path} is not TOML: {error}") from error
+    for (stage, option), word in WORDS_ALONE.items():
+        if isinstance(table := values.get(stage), dict) and option in table:
+            raise UsageError(f"--config {path}: {stage}.{option} is no option of a file; give {word} instead")
+    return values
+
+
+def settings_from(values: Mapping[str, Any], origin: str) -> Settings:
+    """Validate ``values`` (stage → option → value). Raises UsageError naming every wrong key and its origin."""
+    try:
+        return Settings.model_validate(values)
+    except ValidationError as error:
+        raise UsageError(f"{origin}: {wrong_options(error)}") from error
+
+
+def wrong_options(error: ValidationError, *parents: str) -> str:
+    """Every wrong option below ``parents`` with what it must be: ``train.steps 0 must be at least 1; …``."""
+    wrong = [_wrong_option(bounded(".".join([*parents, *map(str, e["loc"])]), MOST_LETTERS), e) for e in error.errors()]
+    more = f"; and {len(wrong) - MOST_WRONG} more" if len(wrong) > MOST_WRONG else ""
+    return "; ".join(wrong[:MOST_WRONG]) + more
+
+
+def _wrong_option(name: str, problem: "ErrorDetails") -> str:
+    name = name.replace("_", "-") if name.startswith("--") else name
+    if problem["type"] == "extra_forbidden":
+        return f"there is no option {name}"
+    if problem["type"] == "value_error":
+        return f"{name}: {problem['msg'].removeprefix('Value error, ')}"
+    must = problem["msg"].removeprefix("Input should ")
+    for long, short in (("greater than or equal to", "at least"), ("less than or equal to", "at most")):
+        must = must.replace(long, short)
+    return f"{name} {bounded(str(problem['input']), MOST_LETTERS)} must {must}"
+
+
+def with_effects(settings: Settings, choices: Sequence[str]) -> Settings:
+    """The settings of all stages with each ``NAME=on|off|auto`` as the option NAME of stage effects; the last one wins.
+
+    Raises UsageError for another name or value, with those that there are.
+    """
+    fields = EffectsConfig.model_fields.items()
+    names = [name for name, field in fields if {"on", "off", "auto"} <= set(get_args(field.annotation))]
+    chosen = {}
+    for choice in choices:
+        name, _, value = choice.partition("=")
+        if name.replace("-", "_") not in names:
+            raise UsageError(f"--effect {choice}: no effect {name!r}; there are: {', '.join(names)}")
+        if value not in ("on", "off", "auto"):
+            raise UsageError(f"--effect {choice}: {name} can be on, off or auto, as in --effect {name}=on")
+        chosen[name.replace("-", "_")] = value
+    return settings.model_copy(update={"effects": settings.effects.model_copy(update=chosen)})
+
+
+def with_source(settings: Settings, photos: Path, cameras: Path | None) -> Settings:
+    """The settings with PHOTOS (and known cameras, if any) filled in. Raises StageError where PHOTOS is unusable,
+    UsageError where the photo to render like is none of them or the cameras to render are not there: better now than
+    after the training."""
+    from stages.ingest.sources import find_source
+
+    source = find_source(photos, cameras)
+    names, like = [source.name(file) for file in source.files], settings.render.like
+    if like is not None and source.kind != "video" and like not in names:
+        near = difflib.get_close_matches(like, names, n=3)
+        raise UsageError(f"--like {like}: no photo has that name" + (f"; perhaps {', '.join(near)}" if near else ""))
+    if (rendered := settings.render.cameras) is not None and not rendered.is_file():
+        raise UsageError(f"--render.cameras {rendered}: there is no such file")
+    given = None if cameras is None else cameras.absolute()
+    imported = None if source.cameras is None else source.cameras.absolute()
+    return settings.model_copy(
+        update={
+            "ingest": settings.ingest.model_copy(update={"photos": photos.absolute(), "cameras": given}),
+            "sfm": settings.sfm.model_copy(update={"cameras": imported}),
+        }
+    )
+
+
+def check_fitted_poses(settings: Settings) -> None:
+    """Raises UsageError where stage evaluate would refuse to fit poses: better now than after the training."""
+    if settings.evaluate.fit_poses == "on" and settings.train.kind == "paper":
+        what = "--evaluate.fit-poses on is for the grid field, and the options of training ask for the paper field"
+        raise UsageError(f"{what}; give --evaluate.fit-poses auto")
+
+
+def with_lasting_cameras(settings: Settings, root: Path) -> Settings:
+    """The settings with cameras that the workspace shows in its ``output/`` named where they stay (:func:`lasting`): a
+    stage that reads them may be the one whose results are taken out of there before it begins."""
+    changed: dict[str, BaseModel] = {}
+    if (cameras := settings.render.cameras) is not None:
+        changed["render"] = settings.render.model_copy(update={"cameras": lasting(cameras, root)})
+    if (cameras := settings.sfm.cameras) is not None and (stays := lasting(cameras, root)) != cameras:
+        changed["sfm"] = settings.sfm.model_copy(update={"cameras": stays})
+        # Also where the whole output/ was given, in which there may be none the next time.
+        changed["ingest"] = settings.ingest.model_copy(update={"cameras": stays})
+    return settings.model_copy(update=changed)
+
+
+def check_workspace(root: Path, photos: Path) -> None:
+    """Raises UsageError where the workspace would lie right among the photos: what a run writes is none of them; and
+    where the photos are a result of it, which a run takes out of its ``output/`` before it reads them."""
+    places = [place for place in (photos, photos / "images") if not (place / RUN_FILE).is_file()]
+    if photos.is_dir() and os.path.realpath(root) in map(os.path.realpath, places):
+        better = f"leave -o out, which writes to {default_workspace(photos)}, or name another"
+        raise UsageError(f"-o {root}: that is a folder of photos; {better}")
+    if is_result(photos, root):
+        what = f"{photos} is a result of that workspace, and makes way for those of the new run"
+        raise UsageError(f"-o {root}: {what}; give another folder with -o")
+
+
+def check_same_photos(workspace: Workspace, photos: Path) -> None:
+    """Raises UsageError where a workspace that nobody named was made from another set of photos that is still there:
+    its results would make way for those of PHOTOS. Where the old one is gone, it was moved or renamed."""
+    from stages.ingest.sources import is_gone
+
+    recorded = workspace.read_run()["options"].get("ingest", {}).get("photos")
+    if not isinstance(recorded, str) or is_gone(Path(recorded)) or is_gone(photos):
+        return
+    before, now = photo_set(Path(recorded)), photo_set(photos)
+    if os.path.realpath(before) != os.path.realpath(now):
+        name = workspace.root.name
+        ways = f"-o another.nerf keeps them apart, -o {name} goes on in this one with the new photos"
+        raise UsageError(f"{name} was made from {before}, not from {now}; {ways}")

@@ -1,0 +1,94 @@
+"""``pipeline doctor --bench``: what this machine can do, and how fast training could be with nothing else to do."""
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import torch
+
+    from nerf.runtime.profiler import Work
+
+SECONDS = 0.3  # for each rate
+TABLES = {"2¹⁷": 1 << 17, "2²⁰": 1 << 20}  # rows: of one grid, of all of a large field
+# Of a ray while the grid field trains: densities asked for, beside the colours of stages/train/size.py. Over a run
+# lego_400, fox, banana and fountain_p11 ask for 2.3 to 2.9 for each colour (docs/numbers.md).
+DENSITIES = {"bounded": 7, "contracted": 24}
+WHERE = {"bounded": "around an object", "contracted": "in unbounded space"}
+PAPER_RAYS = {"paper field as published": (8, 256, 64, 128), "paper field 4 × 64": (4, 64, 32, 32)}
+
+
+def bench_lines(device: "torch.device") -> list[str]:
+    """Measure, and the table in lines."""
+    from nerf.runtime.machine_rates import copied_bytes, measure_copy, measure_gather, measure_products
+    from stages.hardware.device import compute_device, cores
+    from stages.io.amounts import bytes_in_words
+
+    compute_device()
+    count = cores()
+    products = {width: measure_products(device, width, SECONDS) for width in (64, 256)}
+    reads = {name: measure_gather(device, rows, SECONDS) for name, rows in TABLES.items()}
+    copied = measure_copy(device, SECONDS)
+    words = f"{count} cores at once" if device.type == "cpu" else "the GPU"
+    lines = [f"rates of {words}, float32" + (", per core and in all" if count > 1 else "")]
+    for width, rate in products.items():
+        lines.append(_line(f"matrix products (8192, {width}) × ({width}, {width})", rate / 1e9, count, "GFLOP/s"))
+    for name, rate in reads.items():
+        lines.append(_line(f"random reads of 16 bytes, table of {name} rows", rate / 1e6, count, "million/s"))
+    size = bytes_in_words(copied_bytes(device))
+    lines.append(_line(f"memory, copying {size} (read and written)", copied / 1e9, count, "GB/s"))
+    return [*lines, *_meaning(products, reads["2²⁰"], copied, count)]
+
+
+def _line(name: str, rate: float, count: int, unit: str) -> str:
+    return (
+        f"  {name:<48} {rate:>8.1f} {rate * count:>8.1f} {unit}" if count > 1 else f"  {name:<48} {rate:>8.1f} {unit}"
+    )
+
+
+def _meaning(products: dict[int, float], reads: float, copied: float, count: int) -> list[str]:
+    """What training can reach here at most: the work of a ray that nothing can save, at these rates."""
+    from nerf.runtime.machine_rates import Rates
+    from nerf.runtime.profiler import Work
+    from stages.io.amounts import short_count
+    from stages.train.size import SAMPLES_PER_RAY
+
+    lines = ["at these rates, with nothing else to do and no core waiting, training would reach"]
+    for space, densities in DENSITIES.items():
+        work = grid_work(space == "contracted", densities)
+        most = count / Rates(products[64], reads, copied).seconds(work)
+        text = f"grid field {WHERE[space]} ({SAMPLES_PER_RAY[space]} colours, {densities} densities a ray)"
+        lines.append(f"  {short_count(most):>8} rays/s  {text}")
+    for name, sizes in PAPER_RAYS.items():
+        most = count / Rates(products[sizes[1]], reads, copied).seconds(Work(products=paper_products(*sizes)))
+        lines.append(f"  {short_count(most):>8} rays/s  {name}")
+    return lines
+
+
+def grid_work(contracted: bool, densities: float) -> "Work":
+    """Of a ray in training, its share of the optimiser's included: a large field, in the steps that stage train takes
+    on this machine."""
+    from nerf.fields import mlp as grid_mlp
+    from nerf.fields.hash_grid import CORNERS, GridField
+    from nerf.kernels import torch as reference
+    from nerf.runtime.profiler import Work
+    from nerf.training.hash_grid_trainer import ADAM_BYTES
+    from stages.hardware.device import compute_device
+    from stages.train import Config, with_habits
+    from stages.train.setup import grid_settings
+    from stages.train.size import SAMPLES_PER_RAY, rays_per_step, timed_settings
+
+    asked = Config(field="grid", contracted=contracted, view_dependence=True)
+    config = timed_settings(with_habits(asked), compute_device())
+    model = GridField(grid_settings(config, sky=False), 0, reference)
+    density, colour = grid_mlp.density_products(model.weights), grid_mlp.colour_products(model.weights)
+    colours = SAMPLES_PER_RAY[config.space]
+    rows = CORNERS * model.settings.levels * (densities + colours)
+    adam = ADAM_BYTES * model.table.numel() / rays_per_step(config)
+    return Work(densities * density + colours * (colour + 2 * (density + colour)), rows, adam)
+
+
+def paper_products(depth: int, width: int, coarse: int, fine: int) -> int:
+    """Multiplications and additions of a ray of the paper's field in training."""
+    from nerf.fields.vanilla import PaperNerf, PaperSettings
+
+    model = PaperNerf(PaperSettings(depth=depth, width=width, samples_coarse=coarse, samples_fine=fine), 0)
+    return model.settings.queries_per_ray * (model.fine.products + model.fine.products_backward)

@@ -1,0 +1,386 @@
+"""Cases of the fields themselves: feature grids, directions, networks, activations, the optimiser."""
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from nerf.fields import background as sky
+from nerf.fields import mlp as grid_mlp
+from nerf.fields.mlp import DIRECTION, GEOMETRY, LARGEST_LOG_DENSITY, DensityPass, Weights
+from nerf.fields.vanilla import SOFTPLUS_SHIFT, shifted_softplus
+from nerf.kernels import Backend, GridLayout, Samples, grid_layout
+from nerf.kernels.torch.adam import LEAST_ROOT, MEAN_DECAY, SQUARE_DECAY
+from pipeline.doctor.numerics import Bound, Case
+from pipeline.doctor.numerics.space import decades, directions, uniform
+
+LAYOUT = grid_layout(levels=4, coarsest=6, finest=384, log2_rows=12, features=4)
+FEATURES = 20
+RATE, COUNT = 0.01, 3
+
+
+def _table(like: Tensor) -> Tensor:
+    return uniform(7, -1, 1, LAYOUT.rows, LAYOUT.features).to(like)
+
+
+def _weights(like: Tensor) -> Weights:
+    drawn = grid_mlp.initial_weights(FEATURES, DIRECTION, torch.Generator().manual_seed(8))
+    return Weights(*(part.to(like) for part in drawn))
+
+
+def _borders() -> tuple[Tensor]:
+    """Vertices and faces of cells of every level, their neighbours in float32, the corners of the unit cube."""
+    resolutions = torch.tensor(LAYOUT.resolutions)
+    cell = (uniform(9, 0, 1, 64, len(resolutions)) * resolutions).floor()
+    faces = (cell / resolutions).flatten()
+    triples = torch.stack([faces, faces.roll(1), uniform(10, 0, 1, len(faces))], -1)
+    up, down = torch.nextafter(triples, torch.tensor(1.0)), torch.nextafter(triples, torch.tensor(0.0))
+    corners = torch.tensor([[0.0, 0, 0], [1, 1, 1], [0, 1, 1e-45], [1e-38, 1, 0.5]])
+    return (torch.cat([triples, up, down, corners]),)
+
+
+def _dyadic(points: Tensor) -> Tensor:
+    """Multiples of 2^-13: float32 is exact in saying which cell is theirs, so that gradients can be compared."""
+    return (points * 8192).round() / 8192
+
+
+def _encode(backend: Backend, points: Tensor) -> Tensor:
+    return backend.encode(LAYOUT, _table(points), points)
+
+
+def _encode_points_backward(backend: Backend, grad: Tensor, points: Tensor) -> tuple[Tensor]:
+    return (backend.encode_backward_points(LAYOUT, _table(points), points, grad),)
+
+
+def _trilinear(table: Tensor, points: Tensor, layout: GridLayout = LAYOUT) -> Tensor:
+    """Level by level and corner by corner, as the layout's docstring has it."""
+    levels = []
+    for level, resolution in enumerate(layout.resolutions):
+        scaled = points * resolution
+        cell = scaled.detach().floor().clamp(0, resolution - 1)
+        mean: Any = 0
+        for corner in torch.cartesian_prod(*[torch.arange(2, device=points.device)] * 3):
+            share = torch.where(corner == 1, scaled - cell, 1 - (scaled - cell))
+            mean = (
+                mean + (share[:, :1] * share[:, 1:2] * share[:, 2:]) * table[_row(layout, level, cell.long() + corner)]
+            )
+        levels.append(mean)
+    return torch.cat(levels, -1)
+
+
+def _row(layout: GridLayout, level: int, vertex: Tensor) -> Tensor:
+    x, y, z = vertex.unbind(-1)
+    if layout.hashed(level):
+        number = (x ^ (y * 2654435761) ^ (z * 805459861)) % layout.level_rows(level)
+    else:
+        side = layout.resolutions[level] + 1
+        number = (x * side + y) * side + z
+    return layout.first_rows[level] + number
+
+
+def _table_points(like: Tensor) -> Tensor:
+    return torch.cat([_dyadic(uniform(11, 0, 1, 2000, 3)), torch.full((200, 3), 0.5)]).to(like)
+
+
+def _encode_table(backend: Backend, table: Tensor) -> Tensor:
+    """A row for each of the table, as cases have them: the first points' features."""
+    return backend.encode(LAYOUT, table, _table_points(table))
+
+
+def _encode_table_backward(backend: Backend, grad: Tensor, table: Tensor) -> tuple[Tensor]:
+    total = torch.zeros_like(table)
+    for level in range(len(LAYOUT.resolutions)):
+        backend.encode_backward_table(LAYOUT, level, _table_points(table), grad, total)
+    return (total,)
+
+
+def _harmonics(d: Tensor) -> Tensor:
+    """By degree and order from associated Legendre polynomials in z and (x + iy)^m (Sloan 2008)."""
+    x, y, z = d.unbind(-1)
+    real, imaginary = [torch.ones_like(x)], [torch.zeros_like(x)]
+    for _ in range(3):
+        r, i = real[-1], imaginary[-1]
+        real.append(x * r - y * i)
+        imaginary.append(x * i + y * r)
+    legendre = {(0, 0): torch.ones_like(z), (1, 0): z, (1, 1): -torch.ones_like(z)}
+    legendre |= {(2, 0): (3 * z * z - 1) / 2, (2, 1): -3 * z, (2, 2): 3 * torch.ones_like(z)}
+    legendre |= {(3, 0): (5 * z**3 - 3 * z) / 2, (3, 1): -1.5 * (5 * z * z - 1), (3, 2): 15 * z}
+    legendre[3, 3] = -15 * torch.ones_like(z)
+    parts = []
+    for degree in range(4):
+        for order in range(-degree, degree + 1):
+            m = abs(order)
+            scale = math.sqrt(
+                (2 * degree + 1) / (4 * math.pi) * math.factorial(degree - m) / math.factorial(degree + m)
+            )
+            around = imaginary[m] if order < 0 else real[m]
+            parts.append((scale * math.sqrt(2) if m else scale) * legendre[degree, m] * around)
+    return torch.stack(parts, -1)
+
+
+def _sigma(_: Backend, logarithm: Tensor) -> Tensor:
+    return grid_mlp.sigma_of(logarithm)[:, None]
+
+
+def _sigma_backward(backend: Backend, grad: Tensor, logarithm: Tensor) -> tuple[Tensor]:
+    """Alone: of a network whose hidden layer is silent, and whose colours ask for nothing."""
+    geometry = torch.nn.functional.pad(logarithm, (0, GEOMETRY - 1))
+    features, sigma = torch.zeros(len(logarithm), FEATURES).to(logarithm), grid_mlp.sigma_of(geometry)
+    done = DensityPass(features, geometry, sigma)
+    of_geometry = torch.zeros_like(geometry)
+    grid_mlp.density_backward(_weights(logarithm), backend, done, grad[:, 0], of_geometry)
+    return (of_geometry[:, :1],)
+
+
+def _density(_: Backend, features: Tensor) -> Tensor:
+    return grid_mlp.density_forward(_weights(features), features).geometry
+
+
+def _density_backward(backend: Backend, grad: Tensor, features: Tensor) -> tuple[Tensor]:
+    weights = _weights(features)
+    done = grid_mlp.density_forward(weights, features)
+    none = torch.zeros_like(features[:, 0])
+    return (grid_mlp.density_backward(weights, backend, done, none, grad.clone()).features,)
+
+
+def _density_plainly(features: Tensor) -> Tensor:
+    weights = _weights(features)
+    return torch.relu(features @ weights.density_hidden) @ weights.density_out.T
+
+
+def _each(like: Tensor) -> Samples:
+    """A ray of its own for every sample."""
+    each = torch.arange(len(like) + 1, dtype=torch.int32, device=like.device)
+    return Samples(each, each[:-1], like[:, 0].contiguous(), like[:, 0].contiguous())
+
+
+def _colour(backend: Backend, geometry: Tensor, harmonics: Tensor) -> Tensor:
+    weights = _weights(geometry)
+    of_rays = grid_mlp.ray_hidden(weights, harmonics)
+    return grid_mlp.colour_forward(weights, backend, _each(geometry), geometry, of_rays).colour
+
+
+def _colour_backward(backend: Backend, grad: Tensor, geometry: Tensor, harmonics: Tensor) -> tuple[Tensor, Tensor]:
+    weights, samples = _weights(geometry), _each(geometry)
+    done = grid_mlp.colour_forward(weights, backend, samples, geometry, grid_mlp.ray_hidden(weights, harmonics))
+    gradients = grid_mlp.colour_backward(weights, backend, samples, done, harmonics, grad)
+    return gradients.geometry, gradients.harmonics
+
+
+def _colour_plainly(geometry: Tensor, harmonics: Tensor) -> Tensor:
+    weights = _weights(geometry)
+    hidden = torch.relu(torch.cat([geometry, harmonics], -1) @ weights.colour_hidden)
+    return torch.sigmoid(hidden @ weights.colour_out.T)
+
+
+def _sky_directions(like: Tensor) -> Tensor:
+    return torch.nn.functional.normalize(_dyadic(directions(12, 512))).to(like)
+
+
+def _sky(backend: Backend, table: Tensor) -> Tensor:
+    return sky.sky_colour(backend, table, _sky_directions(table))
+
+
+def _sky_backward(backend: Backend, grad: Tensor, table: Tensor) -> tuple[Tensor]:
+    directions = _sky_directions(table)
+    return (sky.sky_backward(backend, directions, sky.sky_colour(backend, table, directions), grad),)
+
+
+def _sky_plainly(table: Tensor) -> Tensor:
+    on_sphere = (_sky_directions(torch.zeros(1)).to(table) + 1) / 2
+    return torch.sigmoid(_trilinear(table, on_sphere, sky.LAYOUT).view(len(on_sphere), -1, 4).sum(1))[:, :3]
+
+
+def _adam(backend: Backend, gradient: Tensor, mean: Tensor, square: Tensor) -> Tensor:
+    """How far an entry moves, in rates."""
+    entry = torch.zeros_like(gradient)
+    backend.adam(entry, gradient.clone(), mean.clone(), square.clone(), RATE, COUNT)
+    return entry / RATE
+
+
+def _adam_plainly(gradient: Tensor, mean: Tensor, square: Tensor) -> Tensor:
+    m = MEAN_DECAY * mean + (1 - MEAN_DECAY) * gradient
+    v = SQUARE_DECAY * square + (1 - SQUARE_DECAY) * gradient.square()
+    root = (v / (1 - SQUARE_DECAY**COUNT)).sqrt().clamp(min=LEAST_ROOT)
+    return torch.where(gradient != 0, -m / (1 - MEAN_DECAY**COUNT) / root, 0)
+
+
+def _hard_gradients() -> tuple[Tensor, Tensor, Tensor]:
+    """From denormal to the largest whose square float32 holds, with and without a past."""
+    sizes = torch.tensor([0.0, -0.0, 1e-45, -1e-38, 1e-30, 1e-20, -1e-15, 1e-12, 1e-8, 1.0, -1e8, 1e15, 1e18])
+    gradient = torch.cat([sizes, sizes])[:, None]
+    past = torch.cat([torch.zeros_like(sizes), torch.full_like(sizes, 1e-3)])[:, None]
+    return gradient, past, past.square()
+
+
+LOGARITHMS = torch.tensor([[-1e30], [-200.0], [-88.0], [-1e-45], [0.0], [14.999], [15.0], [15.000001], [88.0], [1e30]])
+SKY_SIZES = torch.tensor([0, 1e-38, 1.0, 30.0, 1.0]).repeat(sky.LAYOUT.rows)[: sky.LAYOUT.rows, None]
+
+CASES = [
+    Case(
+        formula="features of points: trilinear means of grid vertices",
+        where="nerf/kernels/torch/encoding.py: encode",
+        domain="unit coordinates within ±1e6",
+        hazard="x R − cell cancels: R ulp(x) of a cell's width, 2e-5 at R = 384; a border point has two cells",
+        answer="continuous, so either cell gives the same; a point beyond the border has the nearest",
+        tried="[0, 1]³; vertices and faces of all levels and their neighbours in float32, corners, 1e-45",
+        typical=lambda: (uniform(1, 0, 1, 512, 3),),
+        extreme=_borders,
+        function=_encode,
+        reference=lambda points: _trilinear(_table(points), points),
+        value=Bound(2e-4, "one"),
+        kernels=True,
+    ),
+    Case(
+        formula="its gradient with respect to points",
+        where="nerf/kernels/torch/encoding.py: encode_backward_points",
+        domain="unit coordinates",
+        hazard="jumps where a point changes its cell: there it is one side's",
+        answer="the side of the cell that the value is taken from",
+        tried="multiples of 2⁻¹³ in [0, 1]³, whose cells are beyond doubt; corners",
+        typical=lambda: (_dyadic(uniform(2, 0, 1, 512, 3)),),
+        extreme=lambda: (torch.tensor([[0.0, 0, 0], [1, 1, 1], [0, 1, 0.5]]),),
+        function=_encode,
+        reference=lambda points: _trilinear(_table(points), points),
+        backward=_encode_points_backward,
+        value=Bound(5e-7, "one"),
+        gradient=Bound(5e-6, "row"),
+        differentiable=1,
+        kernels=True,
+    ),
+    Case(
+        formula="its gradient with respect to the table",
+        where="nerf/kernels/torch/encoding.py: encode_backward_table",
+        domain="finite",
+        hazard="float32 sums of many points' gradients in one row",
+        answer="added in the order of the points; a row served by 200 points is off by 200 half ulps at most",
+        tried="2000 points of [0, 1]³ and one point 200 times",
+        typical=lambda: (_table(torch.zeros(1)),),
+        extreme=lambda: (torch.zeros(0, LAYOUT.features),),
+        function=_encode_table,
+        reference=lambda table: _trilinear(table, _table_points(table)),
+        backward=_encode_table_backward,
+        value=Bound(1e-6, "one"),
+        gradient=Bound(5e-6, "row"),
+        differentiable=1,
+        kernels=True,
+    ),
+    Case(
+        formula="the sky: sigmoid of what its table has on the unit sphere",
+        where="nerf/fields/background.py: sky_colour, sky_backward",
+        domain="finite features",
+        hazard="levels cancel: a logit is off by half an ulp of the largest feature; 1 − c is 0 beyond 17",
+        answer="accepted, as for the colour network: where features are that large, the colour is saturated",
+        tried="features of size 1, 0, 1e-38 and 30 in 512 directions",
+        typical=lambda: (uniform(13, -1, 1, sky.LAYOUT.rows, 4) * SKY_SIZES,),
+        extreme=lambda: (torch.zeros(0, 4),),
+        function=_sky,
+        reference=_sky_plainly,
+        backward=_sky_backward,
+        value=Bound(5e-6, "one"),
+        gradient=Bound(5e-6, "one"),
+        differentiable=1,
+        kernels=True,
+    ),
+    Case(
+        formula="spherical harmonics up to degree 3",
+        where="nerf/kernels/torch/spherical_harmonics.py: spherical_harmonics, spherical_harmonics_backward",
+        domain="unit vectors; their gradient is that of free vectors",
+        hazard="5 z² − 1 and its like cancel near their zeros",
+        answer="errors are shares of the largest, not of a value near zero",
+        tried="directions; the axes, components of 1e-45 and 1e-20",
+        typical=lambda: (directions(1, 512),),
+        extreme=lambda: (torch.tensor([[1.0, 0, 0], [0, -1, -0.0], [0, 1e-45, 1], [1e-20, 0, -1]]),),
+        function=lambda backend, d: backend.spherical_harmonics(d),
+        reference=_harmonics,
+        backward=lambda backend, grad, d: (backend.spherical_harmonics_backward(d, grad),),
+        value=Bound(5e-7, "one"),
+        gradient=Bound(3e-6, "row"),
+        differentiable=1,
+        kernels=True,
+    ),
+    Case(
+        formula="density exp(min(x, 15))",
+        where="nerf/fields/mlp.py: sigma_of, density_backward",
+        domain="all finite x",
+        hazard="exp overflows beyond 88, and its gradient with it",
+        answer="x is limited to 15, where 0.001 units already stop all light but e⁻³⁰⁰⁰; beyond the gradient is 0",
+        tried="|x| < 15; −1e30, −200, −88, ±0, around 15, 88, 1e30",
+        typical=lambda: (uniform(1, -15, 15, 512, 1),),
+        extreme=lambda: (LOGARITHMS,),
+        function=_sigma,
+        reference=lambda x: torch.exp(torch.where(x <= LARGEST_LOG_DENSITY, x, LARGEST_LOG_DENSITY)),
+        backward=_sigma_backward,
+        value=Bound(3e-7, "itself"),
+        gradient=Bound(5e-7, "itself"),
+        differentiable=1,
+        kernels=True,
+    ),
+    Case(
+        formula="density log(1 + exp(x + shift)) of the paper's field",
+        where="nerf/fields/vanilla.py: shifted_softplus",
+        domain="all finite x",
+        hazard="exp overflows beyond 88; 1 + exp(x) loses x < −16",
+        answer="log1p; x itself beyond 40; relative precision down to denormal densities",
+        tried="|x| < 15; −1e30, −200, −88, ±0, 15, 88, 1e30",
+        typical=lambda: (uniform(1, -15, 15, 512, 1),),
+        extreme=lambda: (LOGARITHMS,),
+        function=lambda _, x: shifted_softplus(x),
+        reference=lambda x: torch.logaddexp(x + SOFTPLUS_SHIFT, torch.zeros_like(x)),
+        value=Bound(5e-6, "itself"),
+        gradient=Bound(5e-6, "itself"),
+        differentiable=1,
+    ),
+    Case(
+        formula="density network: rectified products",
+        where="nerf/fields/mlp.py: density_forward, density_backward",
+        domain="features up to 1e30",
+        hazard="sums of 64 products cancel; relu has two slopes at 0",
+        answer="float32 products whatever else; errors are shares of the largest output",
+        tried="features of size 1, 1e-4, 1e-38, 0, 1e30",
+        typical=lambda: (uniform(1, -1, 1, 256, FEATURES),),
+        extreme=lambda: (uniform(2, -1, 1, 5, FEATURES) * torch.tensor([[1e-4], [1e-38], [0], [1e30], [1e10]]),),
+        function=_density,
+        reference=_density_plainly,
+        backward=_density_backward,
+        value=Bound(2e-6, "row"),
+        gradient=Bound(2e-6, "row"),
+        differentiable=1,
+        kernels=True,
+    ),
+    Case(
+        formula="colour network, sigmoid, c (1 − c)",
+        where="nerf/fields/mlp.py: colour_forward, colour_backward",
+        domain="geometry up to 1e30",
+        hazard="1 − c is 0 in float32 for logits beyond 17: a saturated colour has no gradient",
+        answer="accepted: the true one is below 6e-8; finite for every logit",
+        tried="geometry of size 1, 0, 1e-38, 1e3, 1e30; harmonics of size 1",
+        typical=lambda: (uniform(1, -1, 1, 256, GEOMETRY), uniform(2, -1, 1, 256, DIRECTION)),
+        extreme=lambda: (
+            uniform(3, -1, 1, 4, GEOMETRY) * torch.tensor([[0], [1e-38], [1e3], [1e30]]),
+            uniform(4, -1, 1, 4, DIRECTION),
+        ),
+        function=_colour,
+        reference=_colour_plainly,
+        backward=_colour_backward,
+        value=Bound(5e-7, "one"),
+        gradient=Bound(5e-7, "one"),
+        differentiable=2,
+        kernels=True,
+    ),
+    Case(
+        formula="Adam without motion where the gradient is 0",
+        where="nerf/kernels/torch/adam.py: adam",
+        domain="|g| < 1.8e19: beyond, g² overflows, and the norm of all gradients with it: the step is refused",
+        hazard="g² underflows below 1e-19; m / √v is 0/0 for an entry never touched",
+        answer="√v is at least 1e-15, not increased by it; 0 stays exactly where it is",
+        tried="g over 20 decades; ±0, 1e-45, 1e-38, 1e-30 … 1e18, with and without a past",
+        typical=lambda: (decades(1, -10, 10, 64, 1), uniform(2, -1, 1, 64, 1), uniform(3, 0, 1, 64, 1)),
+        extreme=_hard_gradients,
+        function=_adam,
+        reference=_adam_plainly,
+        value=Bound(1e-6, "one"),
+        kernels=True,
+    ),
+]

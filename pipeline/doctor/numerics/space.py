@@ -1,0 +1,310 @@
+"""Cases of where things are: encoding, contraction, points on rays, boxes, the lattice of samples."""
+
+import torch
+from torch import Tensor
+
+from nerf.fields.positional_encoding import positional_encoding
+from nerf.geometry.contraction import contract, uncontract
+from nerf.geometry.rays import Rays, clip_to_box, points_on
+from nerf.kernels import BOX, CONTRACTED_BOX, Backend, Lattice, Samples
+from nerf.kernels.torch.marching import lattice_coordinate, lattice_distance
+from pipeline.doctor.numerics import Bound, Case
+
+OCTAVES = 16
+FOLDED = Lattice(step=0.002, cone=0.008, contracted=True, cells=128, most_samples=1024)
+PER_RAY = 4
+
+
+def uniform(seed: int, low: float | int, high: float | int, *shape: int) -> Tensor:
+    """Float32 numbers between ``low`` and ``high``, the same for the same seed."""
+    return low + (high - low) * torch.rand(shape, generator=torch.Generator().manual_seed(seed))
+
+
+def decades(seed: int, low: float | int, high: float | int, *shape: int) -> Tensor:
+    """Positive float32 numbers whose decimal logarithms are uniform between ``low`` and ``high``."""
+    return 10 ** uniform(seed, low, high, *shape)
+
+
+def directions(seed: int, count: int) -> Tensor:
+    """Unit vectors."""
+    return torch.nn.functional.normalize(uniform(seed, -1, 1, count, 3), dim=-1)
+
+
+def _encoded(x: Tensor) -> Tensor:
+    angles = torch.pi * torch.fmod(x[..., None] * 2.0 ** torch.arange(OCTAVES, device=x.device), 2).flatten(-2)
+    return torch.cat([angles.sin(), angles.cos()], -1)
+
+
+def _folded(x: Tensor) -> Tensor:
+    r = x.abs().amax(-1, keepdim=True)
+    return torch.where(r > 1, (2 - 1 / r.clamp(min=1)) * x / r.clamp(min=1), x)
+
+
+def _unfolded(y: Tensor) -> Tensor:
+    m = y.abs().amax(-1, keepdim=True)
+    return torch.where(m > 1, y / (m.clamp(min=1) * (2 - m)), y)
+
+
+def _samples(t: Tensor) -> Samples:
+    """As many samples on every ray as ``t`` has columns."""
+    rays, count = t.shape
+    starts = torch.arange(0, rays * count + 1, count, dtype=torch.int32, device=t.device)
+    ray = torch.arange(rays, device=t.device).repeat_interleave(count).int()
+    return Samples(starts, ray, t.reshape(-1).contiguous(), torch.ones_like(t).reshape(-1))
+
+
+def _rays(origins: Tensor, towards: Tensor) -> Rays:
+    none = torch.zeros_like(origins[:, 0])
+    return Rays(origins.contiguous(), towards.contiguous(), none, none)
+
+
+def _unit_points(contracted: bool):
+    def function(backend: Backend, origins: Tensor, towards: Tensor, t: Tensor) -> Tensor:
+        return backend.sample_points(_rays(origins, towards), _samples(t), contracted).view(len(t), -1)
+
+    def reference(origins: Tensor, towards: Tensor, t: Tensor) -> Tensor:
+        points = origins[:, None] + t[..., None] * towards[:, None]
+        half = CONTRACTED_BOX if contracted else BOX
+        return (((_folded(points) if contracted else points) + half) / (2 * half)).flatten(1)
+
+    def backward(backend: Backend, grad: Tensor, origins: Tensor, towards: Tensor, t: Tensor) -> tuple[Tensor, ...]:
+        rays, samples = _rays(origins, towards), _samples(t)
+        return backend.sample_points_backward(rays, samples, contracted, grad.reshape(-1, 3).contiguous())
+
+    return {"function": function, "reference": reference, "backward": backward, "differentiable": 2, "kernels": True}
+
+
+def _slabs(origins: Tensor, towards: Tensor, ends: Tensor, half: float) -> tuple[Tensor, Tensor, Tensor]:
+    """(near, far, hit) of the cube, axis by axis; an axis along which a ray does not move decides all or nothing."""
+    still, within = towards == 0, origins.abs() <= half
+    speed = torch.where(still, 1, towards)
+    first, second = (-half - origins) / speed, (half - origins) / speed
+    everywhere = torch.where(within, torch.inf, -torch.inf)
+    enter = torch.where(still, -everywhere, torch.minimum(first, second)).amax(-1).maximum(ends[:, 0])
+    leave = torch.where(still, everywhere, torch.maximum(first, second)).amin(-1).minimum(ends[:, 1])
+    return enter, leave, enter < leave
+
+
+def _clipped(origins: Tensor, towards: Tensor, ends: Tensor) -> Tensor:
+    near, far, hit = _slabs(origins, towards, ends, BOX)
+    return torch.stack([torch.where(hit, near, ends[:, 1]), torch.where(hit, far, ends[:, 1])], -1)
+
+
+def _box_rays() -> tuple[Tensor, Tensor, Tensor]:
+    return uniform(1, -2, 2, 512, 3), directions(2, 512), torch.tensor([[0.05, 30.0]]).repeat(512, 1)
+
+
+def _hard_box_rays() -> tuple[Tensor, Tensor, Tensor]:
+    """Along axes (zeros of both signs, denormal and barely normal components), from inside, missing, from far away."""
+    towards = torch.tensor([[1.0, 0, 0], [0, -0.0, -1], [1, 1e-45, -1e-38], [0.6, 0.8, 0], [-1e-30, 0, 1]])
+    origins = torch.tensor([[0.1, 0.2, -0.3], [-3, 0.2, 0.4], [0.5, 5, 0], [-1e6, 0.1, 0.2], [0.3, -0.2, -1000]])
+    ends = torch.tensor([[0.05, 30.0], [0, 1e30], [1e-30, 0.1]])
+    rows = torch.cartesian_prod(torch.arange(5), torch.arange(5), torch.arange(3)).T
+    return origins[rows[0]], towards[rows[1]], ends[rows[2]]
+
+
+def _on_rays(origins: Tensor, towards: Tensor, t: Tensor) -> Tensor:
+    return (origins[:, None] + t[..., None] * towards[:, None]).flatten(1)
+
+
+def _points_on(_: Backend, origins: Tensor, towards: Tensor, t: Tensor) -> Tensor:
+    return points_on(_rays(origins, towards), t).flatten(1)
+
+
+def _distance(s: Tensor) -> Tensor:
+    beyond = FOLDED.cone * s > 1
+    grown = FOLDED.linear_until * torch.exp(torch.where(beyond, FOLDED.cone * s - 1, 0))
+    return torch.where(beyond, grown, FOLDED.step * s)
+
+
+def _coordinate(t: Tensor) -> Tensor:
+    relative = t / FOLDED.linear_until
+    return torch.where(relative > 1, 1 + torch.log(relative.clamp(min=1)), relative) / FOLDED.cone
+
+
+def _interval(s: Tensor) -> Tensor:
+    ends = _distance(torch.stack([s, s + 1], -1))
+    return torch.cat([ends, ends[..., 1:] - ends[..., :1]], -1)
+
+
+def _intervals(_: Backend, s: Tensor) -> Tensor:
+    start, end = lattice_distance(FOLDED, s), lattice_distance(FOLDED, s + 1)
+    return torch.stack([start, end, end - start], -1)
+
+
+def _spread_rays() -> tuple[Tensor, Tensor, Tensor]:
+    return uniform(1, -3, 3, 256, 3), directions(2, 256), uniform(3, 0, 30, 256, PER_RAY)
+
+
+def _far_rays() -> tuple[Tensor, Tensor, Tensor]:
+    """Samples from 1e-30 to 1e30 away, in the corners, on the faces and in the middle of the unit cube."""
+    t = decades(4, -30, 30, 64, PER_RAY)
+    t[:8] = torch.tensor([0.0, 1.0, 1e-45, 2.0])
+    towards = directions(5, 64)
+    towards[:4] = torch.tensor([[1.0, 0, 0], [0, -1, 0], [0, 0, 1], [1, 0, 0]])
+    return torch.zeros(64, 3), towards, t
+
+
+CASES = [
+    Case(
+        formula="γ(x) = sin, cos of 2ᵏπx, k < 16",
+        where="nerf/fields/positional_encoding.py: positional_encoding",
+        domain="|x| ≤ 1e30",
+        hazard="float32 of 2⁹πx is off by 1e-4 for |x| < 1, by all of it beyond 1e4",
+        answer="2ᵏx is reduced to half a turn, exactly in binary, before it is multiplied by π",
+        tried="|x| < 0.9; 0, 1e-45, 1e-38, ±1/2, ±1, up to 1e3, 1e6, 1e30",
+        typical=lambda: (uniform(1, -0.9, 0.9, 512, 3),),
+        extreme=lambda: (
+            torch.cat(
+                [
+                    torch.tensor([[0.0, -0.0, 1e-45], [1e-38, 0.5, -0.5], [1.0, -1.0, 1e30], [-1e30, 3e-5, 1e10]]),
+                    uniform(2, -1e3, 1e3, 128, 3),
+                    uniform(3, -1e6, 1e6, 128, 3),
+                ]
+            ),
+        ),
+        function=lambda _, x: positional_encoding(x, OCTAVES),
+        reference=_encoded,
+        value=Bound(1e-6, "one"),
+        gradient=Bound(5e-6, "row"),
+        differentiable=1,
+    ),
+    Case(
+        formula="contraction (2 − 1/r) x/r",
+        where="nerf/geometry/contraction.py: contract",
+        domain="all finite x",
+        hazard="r² overflows beyond 1e19; the slope jumps where r = max abs x_i has ties",
+        answer="x/r and 1/r only, r ≥ 1; the identity for r ≤ 1, with a continuous slope at 1",
+        tried="|x| < 3; 0, 1e-45, 1 and its neighbours, ties, 1e19, 1e30, 3e38",
+        typical=lambda: (uniform(1, -3, 3, 512, 3),),
+        extreme=lambda: (
+            torch.tensor(
+                [
+                    [0.0, -0.0, 1e-45],
+                    [1.0, 1.0, -1.0],
+                    [0.99999994, 0.5, 0.0],
+                    [1.0000001, 0.5, 0.0],
+                    [2.0, -2.0, 2.0],
+                    [1e19, 1.0, -1e10],
+                    [1e30, 1e30, 0.0],
+                    [3e38, -1.0, 1e-38],
+                ]
+            ),
+        ),
+        function=lambda _, x: contract(x),
+        reference=_folded,
+        value=Bound(5e-7, "itself"),
+        gradient=Bound(2e-6, "row"),
+        differentiable=1,
+    ),
+    Case(
+        formula="its inverse y / (m (2 − m))",
+        where="nerf/geometry/contraction.py: uncontract",
+        domain="max abs y_i < 2",
+        hazard="2 − m cancels; infinite at 2",
+        answer="2 − m of two float32 numbers is exact (Sterbenz); callers stay half a cell within the faces",
+        tried="|y| < 1.9; 0, 1 and its neighbours, the last number below 2",
+        typical=lambda: (uniform(1, -1.9, 1.9, 512, 3),),
+        extreme=lambda: (
+            torch.tensor([[0.0, 1e-45, -0.0], [1.0, -1.0, 0.5], [1.0000001, 0.1, 0.0], [1.9999999, 1.0, -1e-30]]),
+        ),
+        function=lambda _, y: uncontract(y),
+        reference=_unfolded,
+        value=Bound(5e-7, "itself"),
+        gradient=Bound(5e-6, "row"),
+        differentiable=1,
+    ),
+    Case(
+        formula="o + t d",
+        where="nerf/geometry/rays.py: points_on",
+        domain="finite",
+        hazard="cancels where o and t d are long and their sum is short: a camera 1e6 units off sees 0.06 units coarse",
+        answer="the scene frame has its region in ±0.9, wherever sfm had it; paper fields take rays in float64",
+        tried="|o| < 3, t < 30; t from 0 and 1e-45 to 1e30",
+        typical=_spread_rays,
+        extreme=_far_rays,
+        function=_points_on,
+        reference=_on_rays,
+        value=Bound(5e-7, "row"),
+        gradient=Bound(1e-6, "row"),
+        differentiable=2,
+    ),
+    Case(
+        formula="unit coordinates of samples, bounded",
+        where="nerf/kernels/torch/marching.py: sample_points, sample_points_backward",
+        domain="points of a ray clipped to the box",
+        hazard="o + t d cancels as above",
+        answer="errors of a float32 point; gradients are sums over a ray's samples, in order, by Warp in float64",
+        tried="|o| < 3, t < 30; t from 0 to 1e-45 … 2",
+        typical=_spread_rays,
+        extreme=lambda: tuple(part[:8] for part in _far_rays()),
+        value=Bound(1e-6, "row"),
+        gradient=Bound(2e-6, "row"),
+        **_unit_points(False),
+    ),
+    Case(
+        formula="unit coordinates of samples, all of space",
+        where="nerf/kernels/torch/marching.py: sample_points, sample_points_backward",
+        domain="all finite points",
+        hazard="r³ overflows beyond 1e12 in the gradient −2 (r − 1)/r³",
+        answer="written in x/r and 1/r",
+        tried="|o| < 3, t < 30; t from 0 and 1e-45 to 1e30",
+        typical=_spread_rays,
+        extreme=_far_rays,
+        value=Bound(5e-7, "one"),
+        gradient=Bound(5e-6, "row"),
+        **_unit_points(True),
+    ),
+    Case(
+        formula="ray–box interval by slabs",
+        where="nerf/geometry/rays.py: clip_to_box",
+        domain="finite rays that do not run within a face",
+        hazard="0/0 for a ray within a face, (±h − o)/0 along an axis",
+        answer="a component of 0 becomes the smallest normal number; a ray within a face may count either way, finite",
+        tried="|o| < 2; along axes (±0, 1e-45, 1e-38), from inside, from 1000 and 1e6 away, misses, far = 1e30",
+        typical=_box_rays,
+        extreme=_hard_box_rays,
+        function=lambda _, o, d, e: torch.stack(clip_to_box(Rays(o, d, *e.unbind(-1)), -BOX, BOX)[2:], -1),
+        reference=_clipped,
+        value=Bound(2e-6, "row"),
+    ),
+    Case(
+        formula="t(s) = step s, then step/cone exp(cone s − 1)",
+        where="nerf/kernels/torch/marching.py: lattice_distance",
+        domain="t ≤ 1e30",
+        hazard="exp overflows for s beyond 89/cone",
+        answer="the exponent's own rounding, cone s ulp/2, stays: 1e-6 at t = 1000; infinite t is beyond any far",
+        tried="s from 0, 1e-45 to 9000 (t = 1e30)",
+        typical=lambda: (uniform(1, 0, 1500, 512, 1),),
+        extreme=lambda: (torch.tensor([[0.0], [1e-45], [1e-30], [125.0], [125.00001], [8000.0], [9000.0]]),),
+        function=lambda _, s: lattice_distance(FOLDED, s),
+        reference=_distance,
+        value=Bound(5e-6, "itself"),
+    ),
+    Case(
+        formula="s(t), its inverse",
+        where="nerf/kernels/torch/marching.py: lattice_coordinate",
+        domain="0 ≤ t ≤ 1e37",
+        hazard="log of 0; t/t₁ overflows beyond 3e38 t₁",
+        answer="the logarithm is taken of max(1, t/t₁)",
+        tried="t from 0, 1e-45 to 1e37",
+        typical=lambda: (decades(1, -3, 3, 512, 1),),
+        extreme=lambda: (torch.tensor([[0.0], [1e-45], [1e-30], [0.25], [0.25000003], [1e30], [1e37]]),),
+        function=lambda _, t: lattice_coordinate(FOLDED, t),
+        reference=_coordinate,
+        value=Bound(1e-6, "itself"),
+    ),
+    Case(
+        formula="dt = t(s + 1) − t(s)",
+        where="nerf/kernels/torch/marching.py: march",
+        domain="s ≤ 1200 (t ≤ 1200)",
+        hazard="a difference of distances: cancels",
+        answer="its error is a share of t, not of dt = 0.008 t: 1e-4 of an interval at most, in length, not in place",
+        tried="s from 0 to 1200",
+        typical=lambda: (uniform(1, 0, 1200, 512),),
+        extreme=lambda: (torch.tensor([0.0, 124.0, 124.5, 125.0, 1200.0]),),
+        function=_intervals,
+        reference=_interval,
+        value=Bound(5e-6, "row"),
+    ),
+]

@@ -1,0 +1,391 @@
+"""Runs stages: finds what is already there, plans what was left open, runs the rest, finishes it durably."""
+
+import os
+import shutil
+import time
+from collections.abc import Collection, Mapping, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from pipeline.cli.display import Display
+from pipeline.cli.failures import StageFailed, worded
+from pipeline.cli.settings import Settings
+from pipeline.doctor import machine
+from pipeline.engine import manifests
+from pipeline.engine.job import DamagedInputs, Job, NotReady
+from pipeline.engine.keys import ContentIndex, config_for_key, digest, stage_key
+from pipeline.engine.manifests import BadManifest, Manifest
+from pipeline.engine.stage_list import ON_REQUEST, STAGES, command_that_makes, needed_for
+from pipeline.engine.workspace import Workspace
+from pipeline.schedule.budget import ALIVE, Budget, has_its_own_time, reading_of, takes_what_it_is_given
+from pipeline.schedule.forecast import pilots_seconds, reckoned_with
+from stages.contract import StageConfig, StageError
+from stages.io.stopwatch import counted, keep, kept
+
+ATTEMPTS = "attempts.json"  # in a partial folder: seconds of all attempts at the stage, planning included
+
+
+class Runner:
+    """Brings stages of one workspace up to date. The workspace's lock must be held by whoever calls ``run``."""
+
+    def __init__(self, workspace: Workspace, settings: Settings, display: Display) -> None:
+        self.workspace, self.settings, self.display = workspace, settings, display
+        self.force: frozenset[str] = frozenset()
+        self.state = workspace.read_run()
+        self.state["options"] = settings.model_dump(mode="json")
+        self.index = ContentIndex(workspace.root / ".content.json")
+        self.done: dict[str, Manifest] = {}
+        self.stages: list[str] = []
+        self.times: Mapping[str, float | None] = {}
+        self.planning: dict[str, float] = {}  # seconds that it took, where it was done by this program
+        self.apart: dict[str, Any] | None = None  # the account of a stage alone, after a whole run that has its own
+        self.works_on: str | None = None
+        self.charged = False  # whether any work of this program has cost time of the budget
+        self.started: dict[str, float] = {}  # when each stage did, later by what an input cost that was made again
+        self.photos: str | None = None  # their digest: they are listed once
+        self.checked: set[str] = set()  # stages whose files were written or read anew by this program
+        self.at_work = ""
+        self.verify = False
+
+    @property
+    def budget(self) -> Budget | None:
+        """The time that the run may take in all, where there is a limit."""
+        state = self.apart or self.state.get("budget")
+        return Budget(state) if state else None
+
+    def set_budget(self, total: float | None, before: float) -> None:
+        """Make ``total`` seconds the budget of this workspace, None for no limit. The same as before goes on.
+
+        ``before``: seconds spent already on what the photos were made in.
+        """
+        if total is None:
+            self.state.pop("budget", None)
+        elif self.budget is None or self.budget.total != total:
+            self.state["budget"] = Budget.new(total, self._options_digest())
+            if before:
+                Budget(self.state["budget"]).end("photos", before)
+
+    def time_left(self, budget: Budget) -> float:
+        """Seconds of the budget that this run has: all, unless it goes on with an interrupted one."""
+        budget.recover(self.workspace.root)
+        goes_on = budget.spent and budget.is_of(self._options_digest(), self._photos_digest())
+        return budget.left if goes_on else budget.total
+
+    def found(self, stage: str) -> Manifest | None:
+        """The finished result of ``stage`` for these options, as far as can be told beforehand; None without one."""
+        try:
+            return self._upstream(stage, "report") if self.state["keys"] else None
+        finally:
+            self.done.clear()  # what runs now may make it outdated
+
+    def _options_digest(self) -> str:
+        """Of what a budget is kept for: a study has its own time."""
+        recorded = self.workspace.portable(self.state["options"])
+        return digest({stage: options for stage, options in recorded.items() if stage not in ON_REQUEST})
+
+    def run(
+        self,
+        stages: Sequence[str],
+        *,
+        force: frozenset[str] = frozenset(),
+        replan: Collection[str] = (),
+        remember: bool = True,
+        times: Mapping[str, float | None] | None = None,
+        verify: bool = False,
+    ) -> bool:
+        """Bring ``stages`` (in chain order) up to date; True if anything ran. Raises StageFailed.
+
+        ``force`` names stages that run again even where a finished result exists; ``replan`` those of which is
+        forgotten what was chosen for the user before; ``remember`` makes ``stages`` what `pipeline resume` repeats;
+        ``times`` are the seconds that stages are expected to take (pipeline/schedule/forecast.py), for a budget and the
+        report; ``verify`` reads every file of a finished result before it counts as finished.
+        """
+        self.verify, self.force, self.stages, self.times = verify, force, list(stages), times or {}
+        if self.budget:
+            self.budget.recover(self.workspace.root)
+            if self.budget.over and not remember:
+                self.apart = Budget.new(self.budget.total, self._options_digest())
+        for stage in replan:
+            self.state["plans"].pop(stage, None)
+        if remember:
+            self.state["stages"] = list(stages)
+        self.workspace.write_run(self.state)
+        try:
+            ran = [self._bring_up_to_date(stage) for stage in stages]
+        except Exception as problem:
+            self._unlink_outdated()
+            if isinstance(problem, StageFailed):
+                self._close_account(remember)
+            raise
+        except BaseException:  # a signal: whoever sent it does not wait for photos to be read
+            self._unlink_after(self.at_work)
+            raise
+        self._unlink_outdated()
+        self._close_account(remember)
+        return any(ran)
+
+    def _close_account(self, whole_run: bool) -> None:
+        """A run that ended by itself, well or not, is over; one stage of an interrupted run does not end it."""
+        if self.budget and whole_run:
+            self.budget.close()
+            self.workspace.write_run(self.state)
+
+    def _unlink_outdated(self) -> None:
+        """Take out of ``output/`` what belongs to other settings than the current ones."""
+        for stage, module in STAGES.items():
+            try:
+                self._upstream(stage, "output")
+            except NotReady:
+                self.workspace.unlink_outputs(module.LINKS)
+            except StageError:  # photos or a file that a setting names cannot be read: said where that stage runs
+                continue
+
+    def _unlink_after(self, stage: str) -> None:
+        """Take out of ``output/`` what rests on ``stage``, which was at work; nothing where none was."""
+        for later, module in STAGES.items():
+            if stage and (later == "report" or stage in needed_for(later, STAGES)):
+                self.workspace.unlink_outputs(module.LINKS)
+
+    def _bring_up_to_date(self, stage: str) -> bool:
+        self.started[stage] = time.monotonic()
+        self.display.begin(stage)
+        try:
+            with worded(stage):
+                job, manifest, ran = self._found_or_made(stage)
+                self.workspace.link_outputs(self.workspace.folder(stage, job.key), job.module.LINKS)
+                self.workspace.write_run(self.state)
+                self.index.save()
+        finally:
+            self._end_work(stage)
+        self.done[stage] = manifest
+        self.display.end(stage, manifest.line, time.monotonic() - self.started[stage], cached=not ran)
+        return ran
+
+    def _found_or_made(self, stage: str) -> tuple[Job, Manifest, bool]:
+        """The stage's job and result, and whether it had to run for it."""
+        try:
+            job = self.resolve(stage)
+            self.state["keys"][stage] = job.key
+            manifest = None if stage in self.force else self.find_finished(job)
+            if manifest is not None:
+                return job, manifest, False
+            self._check_inputs(stage, job.folders)
+        except DamagedInputs:
+            self._make_inputs_again(stage)
+            return self._found_or_made(stage)
+        self.workspace.unlink_outputs(job.module.LINKS)
+        return job, self._execute(job), True
+
+    def _check_inputs(self, stage: str, folders: dict[str, Path]) -> None:
+        """Compare all that ``stage`` is to read with its sha256. Raises DamagedInputs after setting the bad aside.
+        What it reads only where that is there stays in place and leaves ``folders``: nobody makes that again here.
+
+        Once per program and stage: what this program wrote itself was hashed when it was written.
+        """
+        damaged = False
+        for name in [name for name in folders if name not in self.checked]:
+            self.display.update(f"checking the files of {name}")
+            needed = name in STAGES[stage].NEEDS
+            try:
+                if needed:
+                    self.workspace.finished(name, self.done[name].key, deep=True)
+                else:
+                    manifests.check_outputs(folders[name], self.done[name], deep=True)
+                self.checked.add(name)
+            except BadManifest as problem:
+                damaged = damaged or needed
+                if needed:
+                    self.display.note(f"set aside as .bad and made again: {problem}")
+                else:
+                    del folders[name]
+                    command = command_that_makes(name, self.state.get("stages"), self.workspace.root)
+                    again = f"`{command} --verify` makes it again ({problem})"
+                    self.display.note(f"{name} is damaged: left out; {again}")
+        if damaged:
+            raise DamagedInputs
+
+    def _make_inputs_again(self, stage: str) -> None:
+        """Bring everything below ``stage`` up to date once more; what lies above the damage may change with it."""
+        needed = {name for above in STAGES[stage].NEEDS if above in self.done for name in needed_for(above, STAGES)}
+        clock = time.monotonic()
+        self.done.clear()
+        self.photos = None  # perhaps hours after they were listed
+        for name in STAGES:
+            if name in needed:
+                self._bring_up_to_date(name)
+        self.started[stage] += time.monotonic() - clock  # each has its own account
+        self.display.begin(stage)
+
+    def resolve(self, stage: str, *, may_plan: bool = True) -> Job:
+        """Everything that decides ``stage``'s key.
+
+        Raises NotReady where an upstream result is missing, or where settings are left open and may not be planned.
+        """
+        module = STAGES[stage]
+        upstream = {name: m for name in module.NEEDS if (m := self._upstream(name, stage)) is not None}
+        beside = {name: m for name in getattr(module, "OPTIONAL", ()) if (m := self._upstream(name, "report"))}
+        folders = {name: self.workspace.folder(name, m.key) for name, m in (upstream | beside).items()}
+        # The report shows timings and logs too, so it depends on whole manifests and not only on outputs.
+        if stage == "report":
+            inputs = {name: manifests.file_sha256(folders[name] / manifests.NAME) for name in upstream}
+        else:
+            inputs = {name: m.outputs_digest for name, m in upstream.items()}
+        config = self._planned(stage, inputs, folders, may_plan)
+        key_config = self._config_for_key(stage, config)
+        key = stage_key(stage, module.VERSION, key_config, inputs)
+        return Job(stage, module, config, key_config, inputs, folders, key)
+
+    def _upstream(self, name: str, stage: str) -> Manifest | None:
+        """The current result of ``name``. Only "report" does without: it takes what is there, as OPTIONAL does."""
+        if name not in self.done:
+            try:
+                key = self.resolve(name, may_plan=False).key
+                self.done[name] = manifests.read(self.workspace.folder(name, key))
+            except (NotReady, FileNotFoundError, BadManifest):
+                if stage != "report":
+                    raise NotReady(name) from None
+            except StageError:  # a file that a setting names is gone: the stage says so where it runs
+                rest_on_it = any(name in module.NEEDS for later, module in STAGES.items() if later != "report")
+                if stage != "report" or rest_on_it:
+                    raise
+        return self.done.get(name)
+
+    def _planned(self, stage: str, inputs: dict[str, str], folders: dict[str, Path], may_plan: bool) -> StageConfig:
+        """The stage's config with every "choose for me" answered: from run.json, or by the stage's plan()."""
+        module, options = STAGES[stage], getattr(self.settings, stage)
+        if stage == "report" and (account := self.state.get("budget")):
+            return module.Config.model_validate(options.model_dump() | {"budget": Budget(account).account()})
+        if not hasattr(module, "plan"):
+            return options
+        options_for_key = self._config_for_key(stage, options)
+        time_given = reckoned_with(stage, self.settings, self.budget)
+        asked = digest({"version": module.VERSION, "options": options_for_key, "inputs": inputs} | time_given)
+        plans = self.state["plans"].setdefault(stage, {})
+        if asked in plans:
+            # Taken as given now: paths, for the plan was made for equal content, wherever that lay then, and what is
+            # part of no key. But seconds stay: where they are open, a budget gave the plan its own.
+            now = {name for name, value in options if isinstance(value, Path)}
+            now |= {*getattr(module, "UNKEYED", ())} - {"seconds"}
+            return module.Config.model_validate(plans[asked] | options.model_dump(include=now))
+        if not may_plan:
+            raise NotReady(stage)
+        self._check_inputs(stage, folders)
+        self._begin_work(stage)
+        clock = time.monotonic()
+        with counted(self.workspace.root / ALIVE):
+            config = module.plan(self._with_time(stage, options), folders, self.display)
+        self.planning[stage] = time.monotonic() - clock
+        plans[asked] = config.model_dump(mode="json")
+        self.workspace.write_run(self.state)
+        return config
+
+    def _begin_work(self, stage: str) -> None:
+        """From here on ``stage`` costs time of the budget, which nothing does that was found finished."""
+        if self.budget is None or self.works_on == stage or has_its_own_time(stage, self.settings):
+            return
+        if stage == "report" and self.budget.over:  # it shows that account, and would be out of date with another
+            return
+        self.works_on, self.charged = stage, True
+        self.budget.continue_as(self._options_digest(), self._photos_digest())
+        (self.workspace.root / ALIVE).unlink(missing_ok=True)
+        self.budget.begin(stage)
+        if (seconds := self.times.get(stage)) is not None:
+            self.budget.promise(stage, seconds)
+        self.workspace.write_run(self.state)
+
+    def _end_work(self, stage: str) -> None:
+        """Note what ``stage`` cost, where it did."""
+        if self.budget and self.works_on == stage:
+            self.budget.end(stage, time.monotonic() - self.started[stage])
+            self.works_on = None
+            self.workspace.write_run(self.state)
+
+    def _with_time(self, stage: str, options: StageConfig) -> StageConfig:
+        """``options`` with the seconds that the budget leaves for the stage, where these are open; without a budget
+        only pilots have a limit."""
+        if not takes_what_it_is_given(options) or (self.budget is None and stage != "effects"):
+            return options
+        reading = reading_of(self.workspace.folder("ingest", self.done["ingest"].key))
+        if self.budget is None:
+            return options.model_copy(update={"seconds": pilots_seconds(self.settings, self.times, reading)})
+        # An input that has to be made again is none of the stages that were asked for.
+        order = list(STAGES)
+        after = (name for name in self.stages if order.index(name) > order.index(stage))
+        to_come = {name: self.times.get(name) for name in after if not has_its_own_time(name, self.settings)}
+        if stage == "train" and (why := self.budget.shortage(to_come, reading)):
+            self.display.note(f"the budget cannot be kept: {why}")
+        return options.model_copy(update={"seconds": self.budget.give(stage, to_come, reading)})
+
+    def _config_for_key(self, stage: str, config: StageConfig) -> dict[str, Any]:
+        replaced = {"photos": self._photos_digest()} if stage == "ingest" else {}
+        return config_for_key(config, self.index, replaced, getattr(STAGES[stage], "UNKEYED", ()))
+
+    def _photos_digest(self) -> str:
+        """Digest of the photos' names and bytes; the last known one where the photos are gone but were ingested."""
+        from stages.ingest.sources import find_source, is_gone
+
+        if self.photos is not None:
+            return self.photos
+        config = self.settings.ingest
+        if (known := self.state.get("photos_digest")) and is_gone(config.photos):
+            return known
+        source = find_source(config.photos, config.cameras)
+        self.display.update("reading the video" if source.kind == "video" else f"reading {len(source.files)} photos")
+        files = self.index.of_files(source.root, (*source.files, *(mask for _, mask in source.masks)))
+        masks = [(name, os.path.relpath(mask, source.root)) for name, mask in source.masks]
+        self.photos = digest({"kind": source.kind, "frames": source.frames, "masks": masks, "files": files})
+        self.state["photos_digest"] = self.photos
+        return self.photos
+
+    def find_finished(self, job: Job) -> Manifest | None:
+        """The finished result for this job, if there is one; a damaged one is set aside and said aloud."""
+        try:
+            manifest = self.workspace.finished(job.stage, job.key, deep=self.verify)
+            if manifest is not None and self.verify:
+                self.checked.add(job.stage)
+            return manifest
+        except BadManifest as problem:
+            self.display.note(f"set aside as .bad and made again: {problem}")
+            return None
+
+    def _execute(self, job: Job) -> Manifest:
+        from stages.sfm.colmap import load
+
+        partial, folder = self.workspace.partial(job.stage, job.key), self.workspace.folder(job.stage, job.key)
+        if job.stage not in self.force and (manifest := self.workspace.complete(partial, folder, job.key)):
+            return manifest
+        self._begin_work(job.stage)
+        before = kept(partial / ATTEMPTS) + self.planning.pop(job.stage, 0.0)
+        if partial.exists() and not (job.module.RESUMES and job.stage not in self.force):
+            shutil.rmtree(partial)
+        partial.mkdir(parents=True, exist_ok=True)
+        keep(partial / ATTEMPTS, before)
+        self.workspace.write_run(self.state)
+        load()  # which changes how signals are handled; once it is over, they are ours again
+        started = datetime.now(UTC)
+        self.at_work = job.stage
+        with counted(self.workspace.root / ALIVE), counted(partial / ATTEMPTS) as spent:
+            result = job.module.run(job.config, job.folders, partial, self.display)
+        outputs = manifests.describe_outputs(partial, result.outputs)
+        manifest = Manifest(
+            stage=job.stage,
+            version=job.module.VERSION,
+            key=job.key,
+            config=job.config.model_dump(mode="json"),
+            inputs=job.inputs,
+            outputs=outputs,
+            outputs_digest=manifests.outputs_digest(outputs),
+            records=manifests.describe_outputs(partial, result.records),
+            facts=result.facts,
+            line=result.line,
+            seconds=round(spent(), 3),
+            expected=None if (expected := self.times.get(job.stage)) is None else round(expected, 1),
+            started=started.isoformat(timespec="seconds"),
+            machine=machine.facts(),
+        )
+        self.workspace.finish(partial, folder, manifest)
+        self.checked.add(job.stage)
+        self.force -= {job.stage}
+        self.at_work = ""
+        return manifest

@@ -1,0 +1,120 @@
+"""What is cached, stale, half done or never run, and why a stage would run; reads only, runs nothing."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from pipeline.engine import manifests
+from pipeline.engine.job import Job, NotReady
+from pipeline.engine.manifests import BadManifest, Manifest
+from pipeline.engine.runner import Runner
+from pipeline.engine.stage_list import STAGES, command_that_makes
+from pipeline.engine.workspace import Workspace
+from stages.contract import KEY_LENGTH, StageError
+
+
+@dataclass(frozen=True)
+class StageStatus:
+    """``state``: cached / stale / damaged / partial / never; ``text``: its summary or the reason."""
+
+    stage: str
+    state: str
+    text: str
+
+
+def last_result(workspace: Workspace, runner: Runner, stage: str) -> Manifest | None:
+    """The result run.json points to, or else the newest finished one of any key."""
+    known = runner.state["keys"].get(stage)
+    folders = [workspace.folder(stage, known)] if known else []
+    if (workspace.root / stage).is_dir():
+        others = (p for p in (workspace.root / stage).iterdir() if len(p.name) == KEY_LENGTH)
+        folders += sorted(others, key=lambda p: p.stat().st_mtime, reverse=True)
+    for folder in folders:
+        try:
+            return manifests.read(folder)
+        except (FileNotFoundError, BadManifest):
+            continue
+    return None
+
+
+def status_of(workspace: Workspace, runner: Runner, stage: str, deep: bool = False) -> StageStatus:
+    """How ``stage`` stands for the recorded options; ``deep``: its files are read and compared with their sha256."""
+    last = last_result(workspace, runner, stage)
+    try:
+        job = runner.resolve(stage, may_plan=False)
+    except NotReady as waiting:
+        reason = f"waits for {waiting.upstream}"
+        if waiting.upstream == stage:
+            reason = _why_unplanned(runner, stage, last) if last else ""
+        return StageStatus(stage, "stale" if last else "never", reason)
+    except StageError as error:
+        return StageStatus(stage, "stale" if last else "never", f"{error.what}: {error.why}")
+    folder = workspace.folder(stage, job.key)
+    command = command_that_makes(stage, runner.state.get("stages"), workspace.root)
+    try:
+        manifest = manifests.read(folder)
+        manifests.check_outputs(folder, manifest, deep)
+        return StageStatus(stage, "cached", manifest.line)
+    except FileNotFoundError:
+        pass
+    except BadManifest as problem:
+        return StageStatus(stage, "damaged", f"{problem}; `{command} --verify` makes it again")
+    if workspace.partial(stage, job.key).exists():
+        if process := workspace.at_work():
+            return StageStatus(stage, "partial", f"process {process} is at work in this workspace")
+        return StageStatus(stage, "partial", f"interrupted; `{command}` takes it up again")
+    if last is not None:
+        return StageStatus(stage, "stale", "; ".join(differences(job, last)) or "run again")
+    return StageStatus(stage, "never", "")
+
+
+def _why_unplanned(runner: Runner, stage: str, last: Manifest) -> str:
+    """Why a stage whose inputs are there has not the result it needs, while its open options are not chosen yet."""
+    inputs = {name: runner.done[name].outputs_digest for name in STAGES[stage].NEEDS}
+    return "; ".join(_other_inputs(inputs, last)) or "what its options leave open is chosen anew"
+
+
+def _other_inputs(now: dict[str, str], last: Manifest) -> list[str]:
+    changed = (name for name in sorted({*now, *last.inputs}) if now.get(name) != last.inputs.get(name))
+    return [f"{name} gives another result" for name in changed]
+
+
+def differences(job: Job, last: Manifest) -> list[str]:
+    """Which part of the key changed between the last result and now."""
+    found = []
+    if last.version != job.module.VERSION:
+        found.append(f"the stage itself changed (version {last.version} → {job.module.VERSION})")
+    now: dict[str, Any] = job.config.model_dump(mode="json")
+    for name in sorted({*now, *last.config} - set(getattr(job.module, "UNKEYED", ()))):
+        before, after = last.config.get(name), now.get(name)
+        if before != after:
+            found.append(f"{job.stage}.{name}: {before} → {after}")
+    found += _other_inputs(job.inputs, last)
+    if not found and last.key != job.key:
+        found.append("the content of a file that its settings name changed")
+    return found
+
+
+def explain(workspace: Workspace, runner: Runner, stage: str) -> list[str]:
+    """Lines that say whether ``stage`` would run, and which part of its key makes it."""
+    status = status_of(workspace, runner, stage)
+    lines = [f"{stage}: {status.state}" + (f" · {status.text}" if status.text else "")]
+    try:
+        job = runner.resolve(stage, may_plan=False)
+    except (NotReady, StageError):
+        return lines
+    last = last_result(workspace, runner, stage)
+    if status.state == "cached":
+        lines.append("It would not run: its key has a finished result.")
+    elif last is None:
+        lines.append("It would run: it has never finished in this workspace.")
+    else:
+        lines += ["It would run because:", *(f"  {reason}" for reason in differences(job, last))]
+    lines.append(f"key {job.key[:KEY_LENGTH]} = version {job.module.VERSION}")
+    lines += [f"  config {name} = {value}" for name, value in sorted(job.key_config.items())]
+    lines += [f"  input  {name} = {value[:KEY_LENGTH]}" for name, value in sorted(job.inputs.items())]
+    return lines
+
+
+def all_statuses(workspace: Workspace, runner: Runner, deep: bool) -> list[StageStatus]:
+    """Every stage of the chain, in order."""
+    return [status_of(workspace, runner, stage, deep) for stage in STAGES]

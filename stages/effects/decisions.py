@@ -1,0 +1,134 @@
+"""What stage effects decided, as the stages after it read it: ``decisions.json``."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from statistics import fmean
+from typing import TYPE_CHECKING, Any, Literal
+
+from stages.io.files import read_dataclass, write_json
+
+if TYPE_CHECKING:
+    import torch
+
+    from nerf.effects import PhotoColours, PhotoRays
+    from nerf.geometry.scene import Scene, View
+    from nerf.training.ray_dataset import RayBank
+    from nerf.training.trainer import FieldTrainer
+
+Space = Literal["bounded", "contracted"]
+
+
+@dataclass(frozen=True)
+class Decisions:
+    """Which effects are modelled. ``exposure``: natural logarithm of the gain per channel in linear light, by the name
+    of each training photo; None: all photos have one exposure."""
+
+    view_dependence: bool = True
+    unbounded: bool = False
+    pose_refinement: bool = False
+    exposure: dict[str, list[float]] | None = None
+
+    @property
+    def space(self) -> Space:
+        """What the field lies in: the box, or all of space, folded."""
+        return "contracted" if self.unbounded else "bounded"
+
+    def log_gain(self, views: "Sequence[View]") -> "torch.Tensor":
+        """The gains of some training photos, (views, 3)."""
+        import torch
+
+        assert self.exposure is not None
+        return torch.tensor([self.exposure[view.name] for view in views])
+
+
+def write_decisions(folder: Path, decisions: Decisions) -> None:
+    """Write decisions.json."""
+    write_json(folder / "decisions.json", asdict(decisions))
+
+
+def read_decisions(folder: Path) -> Decisions:
+    """Read decisions.json. Raises StageError where it is missing or damaged."""
+    return read_dataclass(folder / "decisions.json", Decisions)
+
+
+def photo_parts(decisions: Decisions, views: "Sequence[View]", bank: "RayBank") -> "tuple[PhotoRays, PhotoColours]":
+    """What stands between the field and the photos ``views`` of ``bank``, in their order."""
+    import numpy as np
+    import torch
+
+    from nerf.effects import AS_GIVEN, AS_RENDERED
+    from nerf.effects.exposure_model import Exposures
+    from nerf.effects.pose_refinement import RefinedPoses
+
+    rays = AS_GIVEN
+    if decisions.pose_refinement:
+        centres = np.stack([view.scene_from_camera[:, 3] for view in views])
+        placed = torch.tensor(centres, dtype=torch.float32, device=bank.device)
+        rays = RefinedPoses(placed, bank.viewing_distance)
+    gains = None if decisions.exposure is None else decisions.log_gain(views).to(bank.device)
+    colours = AS_RENDERED if gains is None else Exposures.of_tracks(gains)
+    return rays, colours
+
+
+def told_by_neighbours(scene: "Scene", unseen: "Sequence[View]") -> "torch.Tensor":
+    """(unseen, training photos): how much each training photo tells of each photo that took no part in training."""
+    import numpy as np
+    import torch
+
+    from nerf.geometry.pose_distance import neighbour_weights
+
+    poses, known = (np.stack([v.scene_from_camera for v in views]) for views in (unseen, scene.of_split("train")))
+    return torch.from_numpy(neighbour_weights(poses, known)).float()
+
+
+def expected_gains(field: dict[str, Any], scene: "Scene", unseen: "Sequence[View]") -> "dict[str, torch.Tensor]":
+    """By the name of a photo that took no part in training, the log gains (3,) that its neighbours let expect, from the
+    content of field.json; empty where exposure is not modelled."""
+    import torch
+
+    if field.get("exposure") is None or not unseen:
+        return {}
+    photos = field["exposure"]["photos"]  # of all training photos but those that were set aside for a target
+    scene = replace(scene, views=tuple(view for view in scene.views if view.name in photos))
+    known = torch.tensor([photos[view.name] for view in scene.of_split("train")])
+    gains = told_by_neighbours(scene, unseen) @ known
+    return dict(zip((view.name for view in unseen), gains, strict=True))
+
+
+def neutral_in_words(field: dict[str, Any]) -> str | None:
+    """At which exposure a field with this field.json is shown, in stops (EV) above the photo with the least one, the
+    three channels on the mean; None where exposure is not modelled."""
+    if field.get("exposure") is None:
+        return None
+    neutral = fmean(field["exposure"]["neutral"])
+    least = min((fmean(gains) for gains in field["exposure"]["photos"].values()), default=neutral)
+    stops = round((neutral - least) / math.log(2), 2) + 0.0  # no -0
+    return f"neutral exposure, {stops:+.2f} EV over the least exposed photo"
+
+
+def learnt_of_photos(trainer: "FieldTrainer", views: "Sequence[View]") -> dict[str, Any]:
+    """What training learnt of each photo, for field.json: nothing where no effect is on.
+
+    ``exposure``: ``neutral``, at which the field is shown, and the gain of each photo, as natural logarithms in linear
+    light. ``poses``: each photo's rotation vector (radians) and shift (scene units), added to its calibrated pose.
+    """
+    import torch
+
+    from nerf.effects.exposure_model import Exposures
+    from nerf.effects.pose_refinement import RefinedPoses
+
+    learnt: dict[str, Any] = {}
+    names = [view.name for view in views]
+    if isinstance(trainer.photo_colours, Exposures):
+        gains = trainer.photo_colours.log_gain.tolist()
+        learnt["exposure"] = {"neutral": trainer.photo_colours.neutral.tolist(), "photos": _by(names, gains)}
+    if isinstance(trainer.photo_rays, RefinedPoses):
+        corrections = torch.cat([trainer.photo_rays.turn, trainer.photo_rays.shift], dim=1)
+        learnt["poses"] = _by(names, corrections.tolist())
+    return learnt
+
+
+def _by(names: list[str], rows: list[list[float]]) -> dict[str, list[float]]:
+    return dict(zip(names, rows, strict=True))

@@ -1,0 +1,203 @@
+"""Short paired trainings that tell what an effect is worth, on photos kept back from the training photos.
+
+Both arms have the same seed, rays and number of steps and differ in nothing but the effect. The photos kept back have
+an exposure (and, where an arm refines poses, a pose) of their own, which neither arm knows: both are fitted to the left
+half of such a photo and judged on its right half.
+"""
+
+import time
+from statistics import mean, median
+from typing import TYPE_CHECKING, NamedTuple
+
+from stages.contract import Inputs, Progress, StageError
+from stages.effects.decisions import Decisions, photo_parts
+from stages.evaluate.image_metrics import FEWEST_FOR_INTERVAL, mean_interval
+from stages.train.setup import BLACK
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from nerf.fields.hash_grid import GridField
+    from nerf.geometry.rays import Rays
+    from nerf.geometry.scene import Scene
+    from nerf.training.ray_dataset import RayBank
+    from stages.train import Config as TrainConfig
+
+LONG_SIDE = 200  # pixels of the photos in a pilot
+MOST_KEPT = 4  # of the training photos, to judge by; with fewer than FEWEST_FOR_INTERVAL their own noise is not known
+SEEDS = 3
+BATCH_SAMPLES = 1 << 13  # half the usual: a pilot has to be short, and is judged early
+CHUNKS = 4  # fixed, so that a pilot ends the same whatever the machine
+BESIDE_TRAINING = 0.3  # of the time of the trainings: reading photos, the warm-up, scoring
+# Of a pilot's training, on one core, that take as long as fitting the pose of a photo kept back and drawing it again:
+# 7 in the scenes of tests/effect_scenes.py where alpha ends space, 20 to 26 where nothing does.
+STEPS_PER_FIT = 25
+LEAST_GAIN_DB = 0.1  # a gain must exceed its noise, and this, which nobody sees
+
+
+class Pilot(NamedTuple):
+    """What switching an effect on gained on the photos kept back, in dB: the mean, and half of its 95 % interval, over
+    seeds or over photos, whichever is wider. ``cost`` is the share by which it made training slower."""
+
+    gain_db: float
+    noise_db: float
+    cost: float
+
+    @property
+    def pays(self) -> bool:
+        """Whether the gain is more than its noise."""
+        return self.gain_db > max(self.noise_db, LEAST_GAIN_DB)
+
+    @property
+    def hurts(self) -> bool:
+        """Whether leaving it out would gain as clearly."""
+        return -self.gain_db > max(self.noise_db, LEAST_GAIN_DB)
+
+
+class _Photo(NamedTuple):
+    """A photo kept back: (height, width) rays, colours and which pixels count."""
+
+    rays: "Rays"
+    colours: "Tensor"
+    used: "Tensor | None"
+
+
+class PilotScene(NamedTuple):
+    """What every pilot of a scene shares; make it with :func:`pilot_scene`."""
+
+    scene: "Scene"
+    bank: "RayBank"
+    kept: "tuple[_Photo, ...]"
+
+
+def pilot_scene(inputs: Inputs, scene: "Scene", progress: Progress) -> PilotScene | str:
+    """Small photos to train on and to judge by, both from the training photos; or why there can be no pilot."""
+    from stages.evaluate.half_images import enough
+    from stages.hardware.device import compute_device
+    from stages.train.data import NOTHING_LEFT, PhotoReader, guided_bank, view_mask, view_rays
+    from stages.train.validation_images import set_aside
+
+    split = set_aside(scene, MOST_KEPT, FEWEST_FOR_INTERVAL)
+    if split is None:
+        return "too few training photos"
+    cameras = [scene.cameras[view.camera] for view in scene.views]
+    downscale = max(1.0, median(max(camera.width, camera.height) for camera in cameras) / LONG_SIDE)
+    size = f"1/{downscale:.3g} of their size"
+    try:
+        bank = guided_bank(inputs, split, downscale, progress).to(compute_device())
+    except StageError as error:
+        if error.what != NOTHING_LEFT:
+            raise
+        # Larger photos may show enough of a thin thing.
+        return f"masks leave nothing of the training photos at {size}"
+    reader = PhotoReader(inputs["ingest"], split, downscale)
+    photos = [
+        _Photo(
+            view_rays(split, view, downscale),
+            reader.pixels(view, BLACK),
+            view_mask(inputs["ingest"], split, view, downscale),
+        )
+        for view in split.of_split("validation")
+    ]
+    kept = tuple(photo for photo in photos if enough(photo.colours, photo.used))
+    if len(kept) < FEWEST_FOR_INTERVAL:
+        return f"too few training photos show enough at {size}"
+    return PilotScene(split, bank, kept)
+
+
+def fits_poses(off: Decisions, on: Decisions) -> bool:
+    """Whether a pilot of these two arms finds out where photos kept back were taken from: where neither refines poses,
+    they are taken as right."""
+    return off.pose_refinement or on.pose_refinement
+
+
+def expected_seconds(scene: "Scene", steps: int) -> tuple[float, float]:
+    """What a pilot takes here: its trainings, by a few steps of a fresh field, and what goes on beside them; and what a
+    pilot takes that fits poses, too."""
+    from stages.hardware.device import compute_device, cores
+    from stages.train.size import seconds_per_step
+
+    arm, device = Decisions(unbounded=not scene.has_alpha), compute_device()
+    per_step = seconds_per_step(_config(arm, steps, device), scene, arm, device)
+    trainings = (1 + BESIDE_TRAINING) * 2 * SEEDS * steps * per_step
+    on_cpu = per_step if device == "cpu" else seconds_per_step(_config(arm, steps, "cpu"), scene, arm, "cpu")
+    return trainings, trainings + 2 * SEEDS * MOST_KEPT * STEPS_PER_FIT * on_cpu * min(CHUNKS, cores())
+
+
+def run_pilot(trial: PilotScene, off: Decisions, on: Decisions, steps: int, seed: int, progress: Progress) -> Pilot:
+    """Train both arms for each seed and compare. Raises NonFinite where an arm diverges."""
+    gains: list[list[float]] = []
+    arms, seconds = {"off": off, "on": on}, {"off": 0.0, "on": 0.0}
+    poses = fits_poses(off, on)
+    _trained(trial, off, 1, seed)  # pays for kernels and memory
+    for number in range(SEEDS):
+        scores: dict[str, list[float]] = {}
+        for name in ("off", "on") if number % 2 else ("on", "off"):
+            done = (2 * number + len(scores)) / (2 * SEEDS)
+            progress.update(f"pilot training {2 * number + len(scores) + 1} of {2 * SEEDS}", done)
+            trained = time.perf_counter()
+            field = _trained(trial, arms[name], steps, seed + number)
+            seconds[name] += time.perf_counter() - trained
+            scores[name] = [_score(field, photo, poses, seed) for photo in trial.kept]
+        gains.append([with_it - without for with_it, without in zip(scores["on"], scores["off"], strict=True)])
+    return Pilot(mean(map(mean, gains)), _noise(gains), seconds["on"] / seconds["off"] - 1)
+
+
+def _noise(gains: list[list[float]]) -> float:
+    """Half of the mean gain's 95 % interval by Student's t, which knows how few they are: the seeds' own, or the
+    photos' where that is more."""
+    of_seeds = [mean(of_seed) for of_seed in gains]
+    of_photos = [mean(of_photo) for of_photo in zip(*gains, strict=True)]
+    intervals = [interval for each in (of_seeds, of_photos) if (interval := mean_interval(each)) is not None]
+    return max((high - low) / 2 for low, high in intervals)
+
+
+def _trained(trial: PilotScene, arm: Decisions, steps: int, seed: int) -> "GridField":
+    """A grid field after ``steps`` steps under the decisions of one arm."""
+    from nerf.fields.hash_grid import GridField
+    from stages.train.setup import make_trainer
+
+    parts = photo_parts(arm, trial.scene.of_split("train"), trial.bank)
+    trainer = make_trainer(_config(arm, steps, trial.bank.device.type), trial.scene, trial.bank, seed, parts)
+    for step in range(steps):
+        trainer.step(step, step / steps, 1.0)
+    assert isinstance(trainer.model, GridField)
+    return trainer.model.to("cpu")
+
+
+def _config(arm: Decisions, steps: int, device: str) -> "TrainConfig":
+    """A small grid field with what stage train would choose."""
+    from stages.hardware.backend import chosen_backend
+    from stages.train import Config, with_habits
+
+    return with_habits(
+        Config(
+            field="grid",
+            steps=steps,
+            contracted=arm.unbounded,
+            view_dependence=arm.view_dependence,
+            backend=chosen_backend(device),
+            chunks=CHUNKS,
+            levels=4,
+            log2_rows=17,
+            finest=256,
+            batch_samples=BATCH_SAMPLES,
+        )
+    )
+
+
+def _score(field: "GridField", photo: _Photo, poses: bool, seed: int) -> float:
+    """PSNR (dB) on the right half of a photo whose exposure (and pose) is fitted on its left half."""
+    import torch
+
+    from nerf.rendering.images import render_image
+    from stages.evaluate.half_images import from_fitted_pose, right_half_psnr
+
+    black = torch.zeros(3)
+    picture = render_image(field, photo.rays, black)
+    if poses:
+        rays = from_fitted_pose(field, photo.rays, picture, black, photo.colours, photo.used, seed)
+        picture = render_image(field, rays, black)
+    _, fitted = right_half_psnr(picture, black, photo.colours, photo.used)
+    assert fitted is not None, "pilot_scene keeps no photo that has too few pixels"
+    return fitted

@@ -1,0 +1,1 @@
+"""The machine: CPU or GPU, memory, the backend of the kernels."""

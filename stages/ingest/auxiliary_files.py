@@ -1,0 +1,88 @@
+"""Files that are no photos but belong to one: masks, depth maps, normals, masked copies. Told by their names, and
+depth maps by their values, too."""
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import PurePosixPath
+
+from stages.ingest.decoding import Stored
+
+# a_mask.png and a.depth_2.tif belong to a.jpg; mask/a.png and depth_maps/a.png to image/a.jpg, or to a.jpg beside them.
+_ENDING = re.compile(r"(.+)[ ._-](masks?|masked|depth|depthmap|normals?|alpha|matte)([ ._-]?\d+)?", re.IGNORECASE)
+_FOLDER = re.compile(r"(masks?|masked|depths?)(maps?)?($|[._-]|\d)|normals([._-]?maps?)?$", re.IGNORECASE)
+# Folders of such names may be of photos, too: normal/ beside wide/ and tele/, label/ beside front/. But no map survives
+# compression with losses, and few photos are stored without.
+_PERHAPS = re.compile(
+    r"normal([._-]?maps?)?$|(conf(idence)?|semantics?|segmentations?|instances?|labels?)([._-]?maps?)?($|[._-])",
+    re.IGNORECASE,
+)
+_COLOUR = re.compile(r"(.+)[ ._-](colou?r|rgb|image)", re.IGNORECASE)  # a.color.jpg beside a.depth.png
+_MASK = re.compile(r"(.+[ ._-])?masks?([ ._-]?\d+)?", re.IGNORECASE)
+
+# Of a depth map there is a photo, but for a few that were lost; of photos in grey there need not be any in colour.
+_COLOURED = 0.9
+
+_Place = tuple[PurePosixPath, str]  # a folder, and what a photo in it is called
+
+
+def twins(names: Sequence[str]) -> dict[str, str]:
+    """{file: the photo that it belongs to}, all named relative to the photo folder."""
+    files = [PurePosixPath(name) for name in names]
+    photos: dict[_Place, PurePosixPath] = {}
+    for file in files:
+        photos.setdefault((file.parent, _plain(file.stem)), file)
+    beside: dict[PurePosixPath, list[PurePosixPath]] = {}
+    for folder in sorted({folder for file in files for folder in file.parents if not _is_of_maps(folder, file)}):
+        beside.setdefault(folder.parent, []).append(folder)
+    found = {}
+    for file in files:
+        places = _places(file, beside)
+        if photo := next((photos[place] for place in places if photos.get(place, file) != file), None):
+            found[str(file)] = str(photo)
+    return found
+
+
+def depth_maps(stored: Mapping[str, Stored]) -> set[str]:
+    """Which files are depth maps by their values, whatever they are called: those in deep grey, where there are about
+    as many in colour. ``stored`` is how each file stores its values, by its name."""
+    deep = {name for name, kind in stored.items() if kind == "deep grey"}
+    colour = sum(kind == "colour" for kind in stored.values())
+    return deep if colour >= _COLOURED * len(deep) else set()
+
+
+def is_mask(name: str) -> bool:
+    """Whether such a file is by its name a mask, rather than a depth map, say, or a masked copy."""
+    file = PurePosixPath(name)
+    return any(_MASK.fullmatch(part) for part in (*file.parts[:-1], file.stem))
+
+
+def _is_of_maps(folder: PurePosixPath, file: PurePosixPath) -> bool:
+    """Whether a folder is by its name one of maps, as far as a file in it can tell."""
+    return bool(_FOLDER.match(folder.name) or (_PERHAPS.match(folder.name) and not _is_jpeg(file)))
+
+
+def _is_jpeg(file: PurePosixPath) -> bool:
+    return file.suffix.lower() in (".jpg", ".jpeg", ".heic", ".heif")
+
+
+def _places(file: PurePosixPath, beside: Mapping[PurePosixPath, Sequence[PurePosixPath]]) -> Iterator[_Place]:
+    """Where the photo may lie that a file belongs to. ``beside``: the folders of photos in each folder."""
+    ending = _ENDING.fullmatch(file.stem)
+    if ending and ending[2].lower() == "normal" and _is_jpeg(file):
+        ending = None
+    stems = [_plain(ending[1])] if ending else []
+    yield from ((file.parent, stem) for stem in stems)
+    stems.append(_plain(file.stem))
+    for holder in file.parents:
+        if _is_of_maps(holder, file):
+            inside = file.parent.relative_to(holder)
+            folders = (*beside.get(holder.parent, ()), holder.parent)
+            yield from ((folder / inside, stem) for folder in folders for stem in stems)
+
+
+def _plain(stem: str) -> str:
+    """A name without what says that it is the photo; a number without leading zeros, which a mask's has fewer of in
+    some sets."""
+    colour = _COLOUR.fullmatch(stem)
+    stem = colour[1] if colour else stem
+    return stem.lstrip("0") or "0" if stem.isdecimal() else stem

@@ -1,0 +1,301 @@
+"""Decoding one image file of any kind into upright 8-bit sRGB.
+
+Files come from anywhere: formats are a fixed list, sizes are checked before pixels are decoded, and whatever goes
+wrong becomes a :class:`DecodeError` with a reason a user understands.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+from stages.ingest.colour_profiles import to_srgb
+from stages.ingest.exif import (
+    Place,
+    clock_from_exif,
+    exposure_from_exif,
+    focal_from_exif,
+    place_from_exif,
+    positive,
+    read_exif,
+)
+from stages.ingest.panoramas import is_panorama
+
+if TYPE_CHECKING:
+    import numpy as np
+    from PIL import Image
+
+MAX_PIXELS = 250_000_000
+MIN_SIDE_PX = 16
+# EPS and its like run interpreters; RAW files would be read as their thumbnails.
+_FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP", "GIF", "PPM", "HEIF", "AVIF", "JPEG2000")
+_DEEP_GREY = ("I", "I;16", "I;16L", "I;16B", "F")
+_LOSSY = ("JPEG", "MPO", "HEIF", "AVIF")
+RAW = (".dng", ".cr2", ".cr3", ".nef", ".nrw", ".arw", ".srf", ".raf", ".orf", ".rw2", ".pef", ".raw", ".iiq")
+
+
+Stored = Literal["colour", "grey", "deep grey"]  # the last of 16 bits or of floats
+
+
+class DecodeError(Exception):
+    """A file that cannot become a photo; the text is the reason, to be shown after its name."""
+
+
+class CameraKey(NamedTuple):
+    """Photos for which all of this agrees share intrinsics. Orientation counts: it moves the principal point.
+
+    ``focal_px`` is for pixels of ``width`` × ``height``, None where EXIF tells none or an absurd one.
+    """
+
+    make: str
+    model: str
+    lens: str
+    width: int
+    height: int
+    orientation: int
+    focal_mm: float | None
+    focal_px: float | None
+
+
+@dataclass(frozen=True)
+class Decoded:
+    """One image, upright, sRGB.
+
+    ``suffix`` is ".jpg" or ".png" if the file's own bytes already say exactly this to any program (8-bit RGB or
+    RGBA, sRGB, upright, one frame), so that they can be copied; otherwise None. ``stored`` is what kind of values it
+    has. ``lossy`` is a file that was compressed with losses. ``notes`` tell what was assumed, ``exposure_ev`` is what
+    :func:`exposure_from_exif` tells, ``clock_s`` what :func:`clock_from_exif` does.
+    """
+
+    pixels: "np.ndarray"  # (h, w, 3 or 4) uint8
+    focal_source: str | None
+    camera_key: CameraKey
+    place: Place
+    exposure_ev: float | None
+    clock_s: float | None
+    suffix: str | None
+    stored: Stored
+    lossy: bool
+    panorama: bool
+    notes: tuple[str, ...]
+
+
+def decode(path: Path) -> Decoded:
+    """Decode one image file. Raises DecodeError with the reason if that cannot be done."""
+    with _open(path) as image:
+        stored_plainly, lossy = _is_plain(image), _is_lossy(image, path)
+        # Pillow turns TIFFs while it loads them, and forgets how.
+        turned = read_exif(image, [])[1] if image.format == "TIFF" else None
+        _load(image)
+        return _convert(image, stored_plainly, lossy, turned)
+
+
+@cache
+def pillow() -> ModuleType:
+    """Pillow, able to read HEIC, with its own pixel limit replaced by ours."""
+    import logging
+    import warnings
+
+    import pillow_heif
+    from PIL import Image
+
+    pillow_heif.register_heif_opener()
+    Image.MAX_IMAGE_PIXELS = None
+    # What is wrong with a file we say ourselves.
+    warnings.filterwarnings("ignore", category=UserWarning, module=r"PIL\.")
+    logging.getLogger("PIL").setLevel(logging.CRITICAL)
+    Image.init()
+    return Image
+
+
+def _open(path: Path) -> "Image.Image":
+    """The image with its header read, of a size we accept."""
+    if path.suffix.lower() in RAW:
+        raise DecodeError("camera raw files are not read; export JPEG, PNG or TIFF")
+    library = pillow()
+    try:
+        image = library.open(path, formats=_FORMATS)
+    except library.UnidentifiedImageError as error:
+        raise DecodeError(_unrecognised(path)) from error
+    except FileNotFoundError as error:
+        gone = "a link to a file that is not there" if path.is_symlink() else "there is no such file"
+        raise DecodeError(gone) from error
+    except Exception as error:  # on damaged files Pillow's parsers raise whatever they run into
+        if isinstance(error, OSError) and error.errno is not None:  # not Pillow's but the system's
+            raise DecodeError(f"cannot be read: {error.strerror}") from error
+        raise DecodeError(f"damaged: its header cannot be read ({error})") from error
+    width, height = image.size
+    if width * height > MAX_PIXELS:
+        megapixels = width * height / 1e6
+        raise DecodeError(f"{width}×{height} is {megapixels:.0f} megapixels; the limit is {MAX_PIXELS / 1e6:.0f}")
+    if min(width, height) < MIN_SIDE_PX:
+        raise DecodeError(f"{width}×{height} is too small; at least {MIN_SIDE_PX} pixels a side")
+    return image
+
+
+def pixel_count(path: Path) -> int:
+    """How many pixels a file says that it has; 0 for one that is refused by its name or header."""
+    try:
+        with _open(path) as image:
+            return image.width * image.height
+    except DecodeError:
+        return 0
+
+
+def upright_size(path: Path) -> tuple[tuple[int, int], int]:
+    """Width and height by an image's header once it is upright, and the EXIF orientation undone for that. Raises
+    DecodeError."""
+    with _open(path) as image:
+        # In a PNG without EXIF before its pixels Pillow would decode these to look behind them.
+        orientation = 1 if image.format == "PNG" and "exif" not in image.info else read_exif(image, [])[1]
+        turned = orientation >= 5 and image.format != "TIFF"  # Pillow gives a TIFF's size upright
+        return ((image.height, image.width) if turned else image.size), orientation
+
+
+def _load(image: "Image.Image") -> None:
+    """Decode the pixels."""
+    try:
+        image.load()
+    except MemoryError as error:
+        raise DecodeError("does not fit into memory") from error
+    except OSError as error:
+        raise DecodeError(_what_is_missing(image, error)) from error
+    except Exception as error:  # as in _open
+        raise DecodeError(f"damaged: {error}") from error
+
+
+def _unrecognised(path: Path) -> str:
+    with path.open("rb") as file:
+        head = file.read(256)
+    if not head:
+        return "the file is empty"
+    if head.startswith((b"\xff\xd8", b"\x89PNG")):
+        return "damaged: its header cannot be read"
+    if all(byte in b"\t\r\n" or 32 <= byte < 127 for byte in head):
+        return "not an image: it is text"
+    return "not an image of a known format"
+
+
+def _convert(image: "Image.Image", stored_plainly: bool, lossy: bool, turned: int | None) -> Decoded:
+    """The loaded image as upright sRGB; ``turned`` is the EXIF orientation where it has been undone already."""
+    import numpy as np
+
+    notes: list[str] = []
+    tags, orientation = read_exif(image, notes)
+    converted, is_srgb = to_srgb(_to_eight_bit(image), image.info.get("icc_profile"), notes)
+    pixels = np.asarray(converted if turned else upright(converted, orientation))
+    opaque = pixels.shape[2] == 4 and bool((pixels[..., 3] == 255).all())
+    pixels = np.ascontiguousarray(pixels[..., :3] if opaque else pixels)
+    focal_px, focal_source = focal_from_exif(tags, *image.size)
+    if (frames := _frame_count(image)) > 1:
+        notes.append(f"first of {frames} frames")
+    copy = stored_plainly and is_srgb and orientation == 1 and not opaque
+    return Decoded(
+        pixels=pixels,
+        focal_source=focal_source,
+        camera_key=_camera_key(tags, pixels.shape[1], pixels.shape[0], turned or orientation, focal_px),
+        place=place_from_exif(tags),
+        exposure_ev=exposure_from_exif(tags),
+        clock_s=clock_from_exif(tags),
+        suffix=(".png" if image.format == "PNG" else ".jpg") if copy else None,
+        stored=_stored(image.mode),
+        lossy=lossy,
+        panorama=is_panorama(pixels, image.info.get("xmp")),
+        notes=tuple(notes),
+    )
+
+
+def _is_plain(image: "Image.Image") -> bool:
+    """Whether the file stores 8-bit RGB (or PNG RGBA) and nothing else. To be asked before its pixels are loaded."""
+    if image.format in ("JPEG", "MPO"):  # the further frames of phones' MPO files are previews and gain maps
+        return image.mode == "RGB"
+    if image.format != "PNG" or getattr(image, "n_frames", 1) > 1 or "transparency" in image.info:
+        return False
+    return image.tile[0].args in ("RGB", "RGBA")  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def _stored(mode: str) -> Stored:
+    if mode in _DEEP_GREY:
+        return "deep grey"
+    return "grey" if mode in ("1", "L", "LA") else "colour"
+
+
+def _is_lossy(image: "Image.Image", path: Path) -> bool:
+    if image.format == "WEBP":
+        with path.open("rb") as file:
+            return file.read(16).endswith(b"VP8 ")
+    return image.format in _LOSSY
+
+
+def _frame_count(image: "Image.Image") -> int:
+    """How many pictures the file shows. Asked last: counting the pages of a damaged TIFF spoils the image object."""
+    if image.format in ("MPO", "HEIF"):  # previews, depth and gain maps
+        return 1
+    try:
+        return getattr(image, "n_frames", 1)
+    except Exception:  # as in _open; the first page was read
+        return 1
+
+
+def _what_is_missing(image: Any, error: OSError) -> str:
+    """Words for an image whose pixels end early; rows that were not decoded have stayed zero."""
+    import numpy as np
+
+    word = "truncated" if "truncated" in str(error) else "damaged"
+    if image.format not in ("JPEG", "MPO", "PNG"):
+        return f"{word}: {error}"
+    image.tile = []  # what is there is all there is: do not try again
+    try:
+        rows = np.asarray(image).reshape(image.height, -1).any(axis=1)
+    except OSError:  # the decoder refused before there were any pixels
+        return f"{word}: {error}"
+    missing = 1 - (np.flatnonzero(rows)[-1] + 1) / image.height if rows.any() else 1.0
+    return f"{word}: {100 * missing:.0f} % of the picture is missing" if missing >= 0.005 else f"{word}: {error}"
+
+
+def _to_eight_bit(image: "Image.Image") -> "Image.Image":
+    """``image`` in mode L, LA, RGB, RGBA or CMYK."""
+    if image.mode in _DEEP_GREY:
+        return _quantised(image)
+    if image.has_transparency_data:
+        return image if image.mode in ("LA", "RGBA") else image.convert("RGBA")
+    if image.mode in ("L", "RGB", "CMYK"):
+        return image
+    try:
+        return image.convert("L" if image.mode == "1" else "RGB")
+    except ValueError as error:
+        raise DecodeError(f"its pixel format {image.mode} is not read; export JPEG, PNG or TIFF") from error
+
+
+def _quantised(image: "Image.Image") -> "Image.Image":
+    """Grey of 16 bits, or of floats in [0, 1], as 8 bits."""
+    import numpy as np
+
+    values = np.asarray(image)
+    if wrong := int(values.size - np.isfinite(values).sum()):
+        raise DecodeError(f"{wrong:,} of its {values.size:,} pixels are no numbers (NaN or infinite)")
+    limit = 1.0 if image.mode == "F" else 65535.0
+    if not (values.min() >= 0 and values.max() <= limit):
+        raise DecodeError(f"pixel values from {values.min()} to {values.max()}; export it with 8 or 16 bits")
+    return pillow().fromarray(np.rint(values * (255 / limit)).astype(np.uint8))
+
+
+def upright(image: "Image.Image", orientation: int) -> "Image.Image":
+    """Undo an EXIF orientation (EXIF 2.32, tag 0x0112)."""
+    turns = pillow().Transpose
+    turn = {
+        2: turns.FLIP_LEFT_RIGHT,
+        3: turns.ROTATE_180,
+        4: turns.FLIP_TOP_BOTTOM,
+        5: turns.TRANSPOSE,
+        6: turns.ROTATE_270,
+        7: turns.TRANSVERSE,
+        8: turns.ROTATE_90,
+    }.get(orientation)
+    return image if turn is None else image.transpose(turn)
+
+
+def _camera_key(tags: dict[str, Any], width: int, height: int, orientation: int, focal_px: float | None) -> CameraKey:
+    make, model, lens = (str(tags.get(tag, "")).strip("\0 ") for tag in ("Make", "Model", "LensModel"))
+    return CameraKey(make, model, lens, width, height, orientation, positive(tags.get("FocalLength")), focal_px)

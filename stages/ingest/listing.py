@@ -1,0 +1,115 @@
+"""Which files below a folder may be photos, or the one video there. Told by their names: no file is opened."""
+
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from stages.contract import StageError
+from stages.ingest.decoding import RAW
+
+# Everything else is tried: what counts as a photo is decided by decoding, not by the name.
+# fmt: off
+_NOT_PHOTOS = (
+    ".txt", ".json", ".jsonl", ".md", ".rst", ".csv", ".tsv", ".xml", ".html", ".pdf", ".log", ".ini", ".toml", ".yaml",
+    ".yml", ".py", ".sh", ".ipynb", ".zip", ".gz", ".tar", ".7z", ".npy", ".npz", ".pt", ".pth", ".pkl", ".bin", ".db",
+    ".ply", ".obj", ".mtl", ".glb", ".gltf", ".stl", ".las", ".laz", ".xmp", ".aae", ".thm", ".mp3", ".wav", ".m4a",
+    ".srt", ".vtt", ".gpx", ".kml", ".mrk", ".nav", ".obs",
+)
+_PREVIEWS = (".lrv", ".lrf")  # small copies that cameras and drones write beside each video
+_VIDEOS = (
+    ".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".3gp", ".mts", ".m2ts", ".wmv", *_PREVIEWS,
+)
+IMAGES = (
+    ".jpg", ".jpeg", ".jpe", ".jfif", ".mpo", ".insp", ".png", ".heic", ".heif", ".hif", ".tif", ".tiff", ".webp",
+    ".bmp", ".avif", ".gif", ".jp2", ".j2k", ".ppm", ".pgm", ".pnm",
+)
+# fmt: on
+MOST_PASSED_OVER = 2  # files beside a video, too few to be a set of photos
+FOLDER_HINT = "Give the folder that holds the photos: pipeline run FOLDER"
+_LINKS_HINT = "Fetch them (git annex get, dvc pull), or connect the drive that they lie on."
+
+
+def list_photos(root: Path) -> tuple[Path, ...]:
+    """All files below ``root`` that may be photos, sorted by relative name; the video where there is a single one and
+    beside it no more than MOST_PASSED_OVER of these, none an image by its ending.
+
+    Skipped: hidden files, ``masks`` folders, workspaces of ours (folders with a run.json), and files whose
+    extension says that they are no images. Folders that are symbolic links are not followed.
+    Raises StageError if nothing remains and PermissionError for a folder that cannot be read.
+    """
+    found = files_below(root, _is_photo_folder)
+    if not found:
+        raise StageError(f"{root} is empty", "there is no file in it", FOLDER_HINT)
+    photos, videos = [file for file in found if _may_be_photo(file)], _videos(found)
+    unknown = not any(file.suffix.lower() in IMAGES + RAW for file in photos)
+    if len(videos) == 1 and unknown and len(photos) <= MOST_PASSED_OVER:
+        photos = []  # a README, say; more of them may be photos of whatever ending
+    lost = sum(not file.is_file() for file in found)
+    if lost and not any(map(Path.is_file, photos + videos)):
+        raise StageError(f"no photos in {root}", f"{lost} of its files are links to what is not there", _LINKS_HINT)
+    if not photos and len(videos) != 1:
+        raise _no_photos(root, found, videos)
+    return tuple(photos or videos)
+
+
+def photo_root(folder: Path) -> Path:
+    """The folder of the photos of a folder that was given: its ``images`` if that holds any, else itself."""
+    images = folder / "images"
+    holds_photos = images.is_dir() and any(map(_may_be_photo, walk_photos(images)))
+    return images if holds_photos else folder
+
+
+def walk_photos(root: Path) -> Iterator[Path]:
+    """The files below ``root``, photos or not, in any order, but for hidden ones, masks and workspaces of ours."""
+    return _walk(root, _is_photo_folder)
+
+
+def files_below(root: Path, enters: Callable[[Path], bool]) -> list[Path]:
+    """The files below ``root`` that are not hidden, in folders that one ``enters``, sorted by relative name."""
+    return sorted(_walk(root, enters), key=lambda file: file.relative_to(root).as_posix())
+
+
+def _walk(root: Path, enters: Callable[[Path], bool]) -> Iterator[Path]:
+    def fail(error: OSError) -> None:
+        raise error
+
+    for folder, subfolders, names in os.walk(root, onerror=fail):
+        here = Path(folder)
+        subfolders[:] = [s for s in subfolders if enters(here / s)]
+        files = (here / name for name in names if not name.startswith("."))
+        yield from (file for file in files if file.is_file() or _is_lost(file))
+
+
+def _is_lost(file: Path) -> bool:
+    """A link to a photo or video that is not there is refused by name. Other links may have led to folders."""
+    return file.suffix.lower() in IMAGES + _VIDEOS and file.is_symlink() and not file.exists()
+
+
+def _is_photo_folder(folder: Path) -> bool:
+    return not folder.name.startswith(".") and folder.name != "masks" and not (folder / "run.json").is_file()
+
+
+def _may_be_photo(file: Path) -> bool:
+    return file.suffix.lower() not in _NOT_PHOTOS and not is_video(file)
+
+
+def is_video(file: Path) -> bool:
+    """Whether a file is a video by its ending."""
+    return file.suffix.lower() in _VIDEOS
+
+
+def _videos(found: list[Path]) -> list[Path]:
+    """The videos; previews of videos only where there is nothing else."""
+    videos = [file for file in found if is_video(file)]
+    return [file for file in videos if file.suffix.lower() not in _PREVIEWS] or videos
+
+
+def _no_photos(root: Path, found: list[Path], videos: list[Path]) -> StageError:
+    if videos:
+        names = ", ".join(video.relative_to(root).as_posix() for video in videos[:5])
+        return StageError(
+            f"{len(videos)} videos in {root}", f"{names}: which one is meant is not clear",
+            f"Give one of them: pipeline run {videos[0]}",
+        )  # fmt: skip
+    suffixes = ", ".join(sorted({file.suffix.lower() or file.name for file in found})[:5])
+    return StageError(f"no photos in {root}", f"its {len(found)} files are no images ({suffixes})", FOLDER_HINT)

@@ -1,0 +1,166 @@
+"""Masks: which parts of a photo are to be ignored. Black ignores, in the user's files as in ours."""
+
+import os
+import unicodedata
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from stages.ingest.decoding import DecodeError, decode, pillow, upright, upright_size
+from stages.io.files import write_png
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from stages.io.photos import Photo
+
+USE_FROM = 128  # of 255: from here on a pixel counts as used
+STILL_BACKGROUND_HINT = (
+    "If it was the thing that turned, before a still background, mask the background (masks/NAME.png, black is "
+    "ignored) or use a plain backdrop."
+)
+
+
+@dataclass(frozen=True)
+class Mask:
+    """A mask as large as its photo: ``pixels`` (h, w) uint8, 255 use, 0 ignore; what was done to make it fit.
+
+    ``ambiguous``: its shape does not tell whether it is of the upright photo or of what its file stores.
+    """
+
+    pixels: "np.ndarray"
+    turned: bool
+    resized: bool
+    ambiguous: bool
+
+
+def pair_masks(names: Sequence[str], masks: Sequence[tuple[str, Path]]) -> tuple[dict[str, Path], list[Path]]:
+    """The mask file of each photo that has one, by the photo's name, and the files that are no photo's mask, each
+    once though it may stand for several names.
+
+    A photo's mask is called after it, with its ending or without, and ends in .png. Its accents may be composed in
+    another way, where no other mask is called so.
+    """
+    by_name: dict[str, Path] = {}
+    composed: dict[str, set[Path]] = {}
+    for name, file in masks:
+        if name.lower().endswith(".png"):
+            of = name[: -len(".png")]
+            by_name.setdefault(of, file)
+            composed.setdefault(unicodedata.normalize("NFC", of), set()).add(file)
+
+    def mask_of(name: str) -> Path | None:
+        alike = composed.get(unicodedata.normalize("NFC", name), set())
+        return by_name.get(name, next(iter(alike)) if len(alike) == 1 else None)
+
+    found: dict[str, Path] = {}
+    for name in names:
+        inside = name.removeprefix("images/")  # beside an images/ folder that a transforms file names
+        wanted = (name, os.path.splitext(name)[0], inside, os.path.splitext(inside)[0])
+        if file := next(filter(None, map(mask_of, wanted)), None):
+            found[name] = file
+    used = set(found.values())
+    return found, list(dict.fromkeys(file for _, file in masks if file not in used))
+
+
+def are_of_stored_pixels(pairs: Iterable[tuple[Path, Path]]) -> bool | None:
+    """Whether masks are of photos as their files store them, by the headers of all pairs of a photo and its mask: True
+    where some fit no upright photo, False where some fit no other; None where none or both are so."""
+    told: set[bool] = set()
+    for photo, mask in pairs:
+        try:
+            (size, orientation), (found, _) = upright_size(photo), upright_size(mask)
+        except DecodeError:  # said where it is decoded
+            continue
+        fits, fits_stored = _same_shape(found, size), _same_shape(found, _stored(size, orientation))
+        if fits != fits_stored:
+            told.add(fits_stored)
+    return told.pop() if len(told) == 1 else None
+
+
+def read_mask(file: Path, width: int, height: int, orientation: int, stored: bool = False) -> Mask:
+    """The mask of an upright photo of this size, whose file had this EXIF orientation.
+
+    A mask of the shape of the file as it was stored is turned like the photo; where it has the upright photo's as well
+    only if the set's masks are known to be of ``stored`` pixels, and it has no EXIF orientation of its own. One of the
+    same shape and another size is resized to the nearest pixels. Raises DecodeError, words to follow the name of the
+    photo, where it cannot be used.
+    """
+    import cv2
+    import numpy as np
+
+    try:
+        decoded = decode(file)
+    except DecodeError as error:
+        raise DecodeError(f"its mask {file.name} cannot be used: {error}") from error
+    light = decoded.pixels[..., :3].max(axis=2)
+    if decoded.pixels.shape[2] == 4:
+        light = np.rint(light * (decoded.pixels[..., 3] / 255.0)).astype(np.uint8)
+    pixels = np.where(light >= USE_FROM, np.uint8(255), np.uint8(0))
+    size, found = (width, height), (pixels.shape[1], pixels.shape[0])
+    fits, fits_stored = _same_shape(found, size), _same_shape(found, _stored(size, orientation))
+    if not (fits or fits_stored):
+        shapes = f"{found[0]}×{found[1]} and the photo {width}×{height}"
+        raise DecodeError(f"its mask {file.name} does not fit: it is {shapes}")
+    ambiguous = fits and fits_stored and orientation != 1 and decoded.camera_key.orientation == 1
+    turned = stored if ambiguous else not fits
+    if turned:
+        pixels = _turned(pixels, orientation)
+    resized = (pixels.shape[1], pixels.shape[0]) != size
+    if resized:
+        pixels = cv2.resize(pixels, size, interpolation=cv2.INTER_NEAREST)
+    if not pixels.any():
+        raise DecodeError(f"its mask {file.name} ignores all of it (its brightest value is {light.max()} of 255)")
+    return Mask(pixels, turned, resized, ambiguous)
+
+
+def _stored(size: tuple[int, int], orientation: int) -> tuple[int, int]:
+    """Width and height, in its file, of a photo that has this size upright."""
+    return (size[1], size[0]) if orientation >= 5 else size
+
+
+def _same_shape(found: tuple[int, int], wanted: tuple[int, int]) -> bool:
+    """Whether a size is another one in a smaller or larger copy, rounded to whole pixels: both sides of the smaller one
+    may be off by half a pixel, each of which counts as often as the larger one is wide or high."""
+    return abs(found[0] * wanted[1] - found[1] * wanted[0]) <= max(*found, *wanted)
+
+
+def _turned(pixels: "np.ndarray", orientation: int) -> "np.ndarray":
+    import numpy as np
+    from PIL import Image
+
+    return np.ascontiguousarray(upright(Image.fromarray(pixels), orientation))
+
+
+def load_mask(path: Path, width: int, height: int) -> "np.ndarray":
+    """A mask that ingest wrote as (height, width) bool at a photo's reduced size, True where every pixel that goes into
+    one is to be used."""
+    import cv2
+    import numpy as np
+
+    with pillow().open(path) as image:
+        ignored = (np.asarray(image) == 0).astype(np.float32)
+    if ignored.shape != (height, width):
+        ignored = cv2.resize(ignored, (width, height), interpolation=cv2.INTER_AREA)
+    return ignored == 0
+
+
+def write_feature_masks(ingest: Path, photos: "Sequence[Photo]", folder: Path) -> bool:
+    """Write for COLMAP, as ``folder/<image name>.png``, where features may lie: neither ignored nor transparent.
+
+    Returns whether any photo has such a mask; without, nothing is written.
+    """
+    import numpy as np
+
+    masked = [photo for photo in photos if photo.mask or photo.has_alpha]
+    for photo in masked:
+        allowed = np.full((photo.height, photo.width), 255, np.uint8)
+        if photo.mask:
+            with pillow().open(ingest / photo.mask) as mask:
+                allowed = np.asarray(mask)
+        if photo.has_alpha:
+            with pillow().open(ingest / photo.file) as image:
+                allowed = np.where(np.asarray(image.getchannel("A")) > 0, allowed, np.uint8(0))
+        write_png(folder / f"{photo.image_name}.png", allowed)
+    return bool(masked)

@@ -1,0 +1,290 @@
+"""What PHOTOS may be: a folder of photos, a video, or photos whose cameras are already known.
+
+Cheap: lists folders and reads at most the JSON of a transforms file, never an image.
+"""
+
+import os
+import re
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal
+
+from stages.contract import StageError
+from stages.ingest.auxiliary_files import twins
+from stages.ingest.frame_files import FrameFiles
+from stages.ingest.listing import FOLDER_HINT, IMAGES, files_below, is_video, list_photos, photo_root, walk_photos
+from stages.ingest.masks import pair_masks
+from stages.io.transforms_files import HELD_OUT, TRAIN, photo_names, read_splits
+
+SourceKind = Literal["photos", "video", "transforms", "blender", "colmap"]
+
+_HAS_BESIDE = re.compile(r"images(_\d+)?|input|photos")  # folders of photos beside which their masks may lie
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where photos, and perhaps cameras, come from.
+
+    ``kind`` "photos" goes through structure-from-motion and has no ``cameras``, and so does "video", whose one file
+    is the video; otherwise ``cameras`` is the transforms file, the folder of transforms_train.json, or the folder of
+    one COLMAP model. ``files`` are the files to decode, in order of their names relative to ``root``; some may turn
+    out to be no images, and files named by a transforms file may be missing. ``frames`` maps each file_path of a
+    transforms file, as it is written there, to the name of its photo. ``masks`` are the files that a transforms file
+    names as masks, each after its photo's name and .png, and then all files in folders named masks, each after the
+    name, relative to ``root``, that it would have without such a folder in it. ``set_aside`` are files in a folder of
+    photos that belong to one of them by their names, as a depth map does, and that photo, by name.
+    """
+
+    kind: SourceKind
+    root: Path
+    cameras: Path | None
+    files: tuple[Path, ...]
+    frames: Mapping[str, str] = field(default_factory=dict)
+    masks: tuple[tuple[str, Path], ...] = ()
+    set_aside: Mapping[str, str] = field(default_factory=dict)
+
+    def name(self, file: Path) -> str:
+        """The name of one of ``files``: relative to ``root``, with forward slashes, always encodable as UTF-8."""
+        return _name(self.root, file)
+
+
+def _name(root: Path, file: Path, below: Path = Path()) -> str:
+    return os.fsencode((below / file.relative_to(root)).as_posix()).decode("utf-8", "backslashreplace")
+
+
+def find_source(photos: Path, cameras: Path | None = None) -> Source:
+    """Decide what PHOTOS is. Raises StageError where there is nothing to work on or the choice is not clear."""
+    photos, cameras = photos.absolute(), cameras and cameras.absolute()
+    try:
+        _check_given(photos, cameras)
+        source = _source(photos, cameras)
+        if source.kind != "video":
+            return replace(source, masks=source.masks + _list_masks(source.root, source.files))
+        if cameras is not None:
+            raise _cameras_of_video(source.files[0])
+        return source
+    except OSError as error:
+        raise cannot_read(error.filename or photos, error) from error
+
+
+def cannot_read(path: Path | str, error: OSError) -> StageError:
+    """The error for a file or folder of the user's that cannot be read, or has gone since it was listed."""
+    hint = "Check that it is still there and may be read (chmod -R u+rX), then run again."
+    return StageError(f"cannot read {path}", (error.strerror or str(error)).lower(), hint)
+
+
+def _source(photos: Path, cameras: Path | None) -> Source:
+    if photos.is_file() and is_video(photos):
+        return Source("video", photos.parent, None, (photos,))
+    if photos.is_file():
+        return _from_transforms("transforms", photos.parent, photos)
+    root = photo_root(photos)
+    if cameras is not None and cameras.is_file():
+        return _from_transforms("transforms", root, cameras)
+    if cameras is None and (photos / TRAIN).is_file():
+        return _from_transforms("blender", photos, photos)
+    files = list_photos(root)
+    if is_video(files[0]):
+        return Source("video", root, None, files)
+    if cameras is not None and not _model_files(cameras := _cameras_in(cameras)):
+        return _from_transforms("transforms" if cameras.is_file() else "blender", root, cameras)
+    set_aside = twins([_name(root, file) for file in files])
+    files = tuple(file for file in files if _name(root, file) not in set_aside)
+    if cameras is not None:
+        return Source("colmap", root, cameras, files, set_aside=set_aside)
+    return Source("photos", root, None, files, set_aside=set_aside)
+
+
+def unused_cameras(source: Source) -> Path | None:
+    """What lies with photos that were given without cameras and could be given as their cameras: the one COLMAP model
+    in a ``sparse`` folder, or a transforms.json that names some of them."""
+    if source.kind != "photos":
+        return None
+    places = (source.root.parent, source.root) if source.root.name == "images" else (source.root,)
+    for place in places:
+        with suppress(StageError, OSError):
+            return _colmap_model(place / "sparse")
+    for file in (place / "transforms.json" for place in places):
+        with suppress(StageError, OSError):
+            if set(_from_transforms("transforms", source.root, file).files) & set(source.files):
+                return file
+    return None
+
+
+def unused_masks(source: Source) -> Path | None:
+    """A folder beside photos that have no masks, or beside the file of their cameras, in which there would be some if
+    it were their ``masks`` folder."""
+    if source.masks:
+        return None
+    names = [source.name(file) for file in source.files]
+    folders = [source.root.parent / name for name in ("masks", "mask")]
+    folders += [source.cameras.parent / "masks"] if source.cameras else []
+    for folder in filter(Path.is_dir, folders):
+        inside = files_below(folder, lambda _: True)
+        if pair_masks(names, [(_name(folder, file), file) for file in inside])[0]:
+            return folder
+    return None
+
+
+def photos_beside(source: Source, photos: Path) -> int:
+    """How many photos lie in the folder PHOTOS itself where those of its ``images`` folder are taken."""
+    if source.kind not in ("photos", "colmap") or source.root != photos.absolute() / "images":
+        return 0
+    named = (file for file in photos.glob("*") if file.suffix.lower() in IMAGES and not file.name.startswith("."))
+    return sum(file.is_file() for file in named)
+
+
+def is_gone(photos: Path) -> bool:
+    """Whether nothing is left of PHOTOS: a drive that is not there leaves an empty folder, or links to what it held."""
+    try:
+        empty = photos.is_dir() and not any(map(Path.is_file, walk_photos(photo_root(photos))))
+        return empty or not photos.exists()
+    except OSError:  # said by find_source
+        return False
+
+
+def _list_masks(root: Path, files: tuple[Path, ...]) -> tuple[tuple[str, Path], ...]:
+    """What lies in a ``masks`` folder in ``root`` or in any folder of photos below it, or beside one of these that is
+    called as folders of nothing but photos are. See :class:`Source`."""
+    holders = sorted({holder for file in files for holder in file.parents if holder.is_relative_to(root)} | {root})
+    places = [(holder / "masks", holder.relative_to(root)) for holder in holders]
+    places += [
+        (holder.parent / "masks", holder.relative_to(root)) for holder in holders if _HAS_BESIDE.fullmatch(holder.name)
+    ]
+    found = []
+    for masks, stands_in in places:
+        if masks.is_dir():
+            inside = files_below(masks, lambda folder: not folder.name.startswith("."))
+            found += [(_name(masks, file, stands_in), file) for file in inside]
+    return tuple(found)
+
+
+def _check_given(photos: Path, cameras: Path | None) -> None:
+    if not photos.exists():
+        raise StageError(f"{photos} does not exist", "no file or folder has this name", "Check the spelling.")
+    if cameras is not None and not cameras.exists():
+        raise StageError(f"{cameras} does not exist", "no file or folder has this name", "Check --cameras.")
+    if photos.is_dir():
+        if (photos / "run.json").is_file():
+            raise StageError(
+                f"{photos} is a workspace", "it holds results, not photos", f"Go on with it: pipeline resume {photos}"
+            )
+    elif (suffix := photos.suffix.lower()) in IMAGES:
+        raise StageError(
+            f"{photos.name} is a single image", "a scene needs many photos from different places", FOLDER_HINT
+        )
+    elif suffix != ".json" and not is_video(photos):
+        raise StageError(
+            f"cannot use {photos.name}", "it is no folder of photos, video or transforms.json", FOLDER_HINT
+        )
+    elif cameras is not None and suffix == ".json":
+        raise StageError(
+            "two sources of cameras", f"{photos.name} and --cameras {cameras}", "Give the photo folder with --cameras."
+        )
+    if cameras is not None and cameras.is_file() and (suffix := cameras.suffix.lower()) != ".json":
+        of_colmap = suffix in (".bin", ".txt")
+        raise StageError(
+            f"cannot use the cameras {cameras.name}",
+            "it is no transforms file, whose name ends in .json",
+            f"Give the folder of the COLMAP model: --cameras {cameras.parent}" if of_colmap else
+            "Give a transforms file or the folder of a COLMAP model: cameras in other forms are not read.",
+        )  # fmt: skip
+
+
+def _from_transforms(kind: SourceKind, root: Path, cameras: Path) -> Source:
+    place = cameras.parent if cameras.is_file() else cameras
+    find = FrameFiles((root,) if place == root else (root, root.parent, place))
+    splits, _ = read_splits(cameras, lambda frame: find.photo(frame).is_file())
+    frames = [frame for _, content in splits for frame in content["frames"]]
+    files = {frame["file_path"]: find.photo(frame) for frame in frames}
+    in_order = _sorted_inside(root, set(files.values()))
+    photos = {path: _name(root, file) for path, file in files.items()}
+    # In a file of ours they are of ingest's copies: those that lie with the photos count.
+    foreign = [frame for frame in frames if len(photo_names(frame)) == 1]
+    named = {photos[frame["file_path"]]: mask for frame in foreign if (mask := frame.get("mask_path"))}
+    masks = tuple((f"{photo}.png", find.mask(mask)) for photo, mask in named.items())
+    return Source(kind, root, cameras, in_order, photos, masks)
+
+
+def camera_files(folder: Path) -> tuple[Path, ...]:
+    """The files in which known cameras may stand, of all that lie in a folder: those of a Blender-style scene, else
+    those of a COLMAP model, binary ones before text, with the account of one of ours; none where it holds neither."""
+    if (folder / TRAIN).is_file():
+        return tuple(path for name in (TRAIN, *HELD_OUT) if (path := folder / name).is_file())
+    account = account_of_ours(folder)
+    return (*_model_files(folder), *(() if account is None else (account,)))
+
+
+def account_of_ours(model: Path) -> Path | None:
+    """The registration.json beside a COLMAP model that stage sfm wrote, in its own folder or in ``output/``; None
+    without."""
+    account = model.parent / "registration.json"
+    return account if model.name == "sparse" and account.is_file() else None
+
+
+def _sorted_inside(root: Path, files: set[Path]) -> tuple[Path, ...]:
+    outside = [file for file in files if not file.is_relative_to(root)]
+    if outside:
+        raise StageError(
+            f"{min(outside)} is not among the photos",
+            f"the transforms file names it, but it lies outside {root}",
+            "Give the folder that holds all photos of the transforms file.",
+        )
+    return tuple(sorted(files, key=lambda file: file.relative_to(root).as_posix()))
+
+
+def _cameras_in(folder: Path) -> Path:
+    """The one COLMAP model in ``folder``; where there is none the transforms.json, or the folder itself if it has a
+    transforms_train.json."""
+    found = [file for name in ("transforms.json", TRAIN) if (file := folder / name).is_file()]
+    if not found or _colmap_models(folder):
+        return _colmap_model(folder)
+    if len(found) > 1:
+        raise StageError(
+            f"two sources of cameras in {folder}", " and ".join(file.name for file in found),
+            f"Give one of them: --cameras {found[0]}",
+        )  # fmt: skip
+    return folder if found[0].name == TRAIN else found[0]
+
+
+def _colmap_models(folder: Path) -> list[Path]:
+    """All COLMAP models in ``folder``: itself, and below it and its ``sparse`` folder."""
+    places = [folder, folder / "sparse"]
+    places += [child for place in places if place.is_dir() for child in sorted(place.iterdir())]
+    return sorted({place for place in places if _model_files(place)})
+
+
+def _colmap_model(folder: Path) -> Path:
+    """The one COLMAP model in ``folder``. Raises StageError where there is none, or several."""
+    models = _colmap_models(folder)
+    if not models:
+        raise StageError(
+            f"no COLMAP model in {folder}",
+            "there is no cameras, images and points3D with .bin or .txt, nor a transforms.json",
+            "Give the model's own folder, for example sparse/0, or a transforms file.",
+        )
+    if len(models) > 1:
+        names = ", ".join(str(model.relative_to(folder)) for model in models)
+        raise StageError(
+            f"{len(models)} COLMAP models in {folder}", f"{names}: which one is meant is not clear",
+            f"Give one of them: --cameras {models[0]}",
+        )  # fmt: skip
+    return models[0]
+
+
+def _model_files(folder: Path) -> tuple[Path, ...]:
+    for extension in (".bin", ".txt"):
+        parts = tuple(folder / f"{part}{extension}" for part in ("cameras", "images", "points3D"))
+        if all(part.is_file() for part in parts):
+            return parts
+    return ()
+
+
+def _cameras_of_video(video: Path) -> StageError:
+    return StageError(
+        f"cannot use --cameras with {video.name}",
+        "it is a video, and which of its frames become photos is decided here: no cameras can be known for them",
+        "Leave --cameras out, or give the folder of the photos that the cameras belong to.",
+    )

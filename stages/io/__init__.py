@@ -1,0 +1,1 @@
+"""Files that more than one stage reads or writes, and how amounts and progress are told."""

@@ -1,0 +1,132 @@
+"""A trained field on disk: ``field.safetensors`` (weights) and ``field.json`` (what they belong to)."""
+
+import json
+import math
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, get_args
+
+from stages.contract import Progress, StageError
+from stages.hardware.backend import BackendName, backend_name, backend_of_field, load_backend
+from stages.io.files import first_fault, read_json, write_json
+
+if TYPE_CHECKING:
+    from nerf.fields.hash_grid import GridField
+    from nerf.fields.interface import RadianceModel
+    from nerf.fields.vanilla import PaperNerf
+
+
+def save_field(folder: Path, model: "RadianceModel", info: dict[str, Any]) -> None:
+    """Write a field; ``info`` says what it was trained on: background, downscale, steps, rays. What computes a grid
+    field is written, too.
+
+    Raises:
+        TypeError: for a kind of field that has no file format.
+    """
+    from safetensors.torch import save
+
+    from nerf.fields.hash_grid import GridField
+    from nerf.fields.vanilla import PaperNerf
+
+    if not isinstance(model, PaperNerf | GridField):
+        raise TypeError(f"no file format for a {type(model).__name__}")
+    kind = {"kind": "paper"}
+    if isinstance(model, GridField):
+        kind = {"kind": "grid", "backend": backend_name(model.backend)}
+    weights = {name: tensor.detach().cpu().contiguous() for name, tensor in model.state_dict().items()}
+    (folder / "field.safetensors").write_bytes(save(weights))
+    write_json(folder / "field.json", {**kind, "settings": asdict(model.settings), **info})
+
+
+def load_field(
+    folder: Path, device: str = "cpu", progress: Progress | None = None
+) -> "tuple[RadianceModel, dict[str, Any]]":
+    """The field in ``folder``, ready to render, and the content of its field.json.
+
+    One that models exposure comes at its neutral one, wrapped in an ExposedModel. ``progress`` is told why a grid field
+    is computed by torch's kernels: they trained it, or Warp's do not run on ``device``.
+
+    Raises:
+        StageError: if the files are missing or damaged, or another version of the program wrote them.
+    """
+    from pydantic import ValidationError
+    from safetensors import SafetensorError
+    from safetensors.torch import load
+
+    info = read_json(folder / "field.json")
+    try:
+        weights = folder / "field.safetensors"
+        model = _untrained(info, weights.stat().st_size, device, progress)
+        model.load_state_dict(load(weights.read_bytes()))  # load_file takes paths in Unicode alone
+        neutral = _neutral(info)
+    except ValidationError as error:
+        raise StageError("cannot read the trained field", first_fault(error), "Run stage train again.") from error
+    except (
+        OSError,
+        KeyError,
+        TypeError,
+        AttributeError,
+        ValueError,
+        OverflowError,
+        RuntimeError,
+        SafetensorError,
+    ) as error:
+        why = " ".join(str(error).split())  # torch lists mismatches over several lines
+        raise StageError("cannot read the trained field", why, "Run stage train again.") from error
+    model = model.to(device).requires_grad_(False)
+    return model if neutral is None else _exposed(model, neutral, device), info
+
+
+def _neutral(info: dict[str, Any]) -> list[float] | None:
+    """The neutral log gains, None where exposure is not modelled. Raises ValueError for what are no gains."""
+    if info.get("exposure") is None:
+        return None
+    for name, log_gain in {"neutral": info["exposure"]["neutral"], **info["exposure"]["photos"]}.items():
+        if len(log_gain) != 3 or not all(math.isfinite(value) for value in log_gain):
+            raise ValueError(f"the exposure of {name} is {log_gain}; it must be three numbers")
+    return info["exposure"]["neutral"]
+
+
+def _exposed(model: "RadianceModel", log_gain: list[float], device: str) -> "RadianceModel":
+    import torch
+
+    from nerf.effects.exposure import ExposedModel
+
+    return ExposedModel(model, torch.tensor(log_gain, dtype=torch.float32, device=device))
+
+
+def _untrained(info: dict[str, Any], stored: int, device: str, progress: Progress | None) -> "PaperNerf | GridField":
+    """The field that ``info`` describes; ``stored`` is the size of its weights in bytes, which it must not exceed.
+    Raises ValueError, before anything is allocated."""
+    from pydantic import TypeAdapter
+
+    from nerf.fields.hash_grid import GridField, GridSettings
+    from nerf.fields.vanilla import PaperNerf, PaperSettings
+
+    kind, settings = info["kind"], info["settings"]
+    if kind not in ("grid", "paper"):
+        raise ValueError(f"a field of kind {kind!r} is unknown to this version")
+    text = json.dumps(settings)
+    if kind == "grid":
+        grid = GridSettings(**settings)  # which refuses unknown names; their types are checked next
+        TypeAdapter(GridSettings).validate_json(text, strict=True)
+        _check_size(grid.layout.rows * grid.features, stored)
+        return GridField(grid, 0, load_backend(backend_of_field(_trained_with(info), device, progress), device))
+    paper = PaperSettings(**settings)
+    TypeAdapter(PaperSettings).validate_json(text, strict=True)
+    _check_size(paper.depth * paper.width**2, stored)
+    return PaperNerf(paper, seed=0)
+
+
+def _trained_with(info: dict[str, Any]) -> BackendName:
+    """Raises ValueError where that is not said, or no backend."""
+    if "backend" not in info:
+        raise ValueError("an earlier version of this program wrote it, which did not say with which kernels it trained")
+    if info["backend"] not in get_args(BackendName):
+        raise ValueError(f"kernels called {info['backend']!r} are unknown to this version")
+    return info["backend"]
+
+
+def _check_size(numbers: int, stored: int) -> None:
+    if 4 * numbers > stored:
+        raise ValueError(f"its settings ask for {4 * numbers} bytes of weights and more, and {stored} are there")

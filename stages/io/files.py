@@ -1,0 +1,144 @@
+"""Files: JSON, safetensors, PNG and JPEG, written so that equal content is equal bytes; durably where it matters."""
+
+import json
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from stages.contract import StageError, bounded
+
+if TYPE_CHECKING:
+    import numpy as np
+    from pydantic import ValidationError
+
+    from nerf.geometry.scene import Scene
+
+T = TypeVar("T")
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write ``value`` with sorted keys and round-trip floats. Raises ValueError on NaN or infinity."""
+    path.write_text(_as_json(value), "utf-8")
+
+
+def write_json_durably(path: Path, value: Any) -> None:
+    """:func:`write_json`, after a kill, a power cut or on a full disk whole or not at all."""
+    write_durably(path, _as_json(value).encode())
+
+
+def _as_json(value: Any) -> str:
+    return json.dumps(value, sort_keys=True, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+
+
+def read_json(path: Path) -> Any:
+    """Read a JSON file that one of our stages wrote. Raises StageError where it is missing or damaged."""
+    try:
+        return json.loads(path.read_text("utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise damaged(path.name, str(error)) from error
+
+
+def damaged(name: str, why: str) -> StageError:
+    """The error for a file that one of our stages wrote and that is not any more as it was."""
+    return StageError(f"cannot read {name}", why, "Delete its folder and run again.")
+
+
+def read_dataclass(path: Path, kind: type[T]) -> T:
+    """Read a JSON file that one of our stages wrote as this dataclass, every field of its own type.
+
+    Raises StageError where it is missing or damaged.
+    """
+    from pydantic import TypeAdapter, ValidationError
+
+    try:
+        return TypeAdapter(kind).validate_json(path.read_bytes(), strict=True)
+    except OSError as error:
+        raise damaged(path.name, str(error)) from error
+    except ValidationError as error:
+        raise damaged(path.name, first_fault(error)) from error
+
+
+def first_fault(error: "ValidationError") -> str:
+    """Where the first fault is and what, in one line."""
+    fault = error.errors()[0]
+    return bounded(f"{'.'.join(map(str, fault['loc'])) or 'it'}: {fault['msg']}")
+
+
+def write_durably(path: Path, content: bytes) -> None:
+    """Write a file so that after a kill or power cut it is either the old one or the new one, on the disk."""
+    temporary = path.with_name(path.name + ".tmp")
+    with temporary.open("wb") as stream:
+        stream.write(content)
+        stream.flush()
+        os.fsync(stream.fileno())
+    temporary.replace(path)
+    sync_folder(path.parent)
+
+
+def make_durable(folder: Path) -> None:
+    """Have every file of a folder, and the folder, on the disk."""
+    for path in folder.iterdir():
+        sync_file(path)
+    sync_folder(folder)
+
+
+def sync_file(path: Path) -> None:
+    """Have what a file holds on the disk."""
+    with path.open("r+b") as stream:  # Windows syncs only what may be written to
+        os.fsync(stream.fileno())
+
+
+def sync_folder(folder: Path) -> None:
+    """Make renames in ``folder`` durable, where the system can (not on Windows)."""
+    if os.name == "posix":
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+
+def write_tensors(path: Path, tensors: "dict[str, np.ndarray]") -> None:
+    """Write arrays as safetensors without metadata."""
+    from safetensors.numpy import save
+
+    path.write_bytes(save(tensors))  # save_file words a full disk as an error of its own kind
+
+
+def read_tensors(path: Path) -> "dict[str, np.ndarray]":
+    """Read arrays written by :func:`write_tensors`. Raises StageError where the file is missing or damaged."""
+    from safetensors import SafetensorError
+    from safetensors.numpy import load
+
+    try:
+        return load(path.read_bytes())  # load_file takes paths in Unicode alone
+    except (OSError, KeyError, ValueError, SafetensorError) as error:
+        raise damaged(path.name, str(error)) from error
+
+
+def write_png(path: Path, pixels: "np.ndarray") -> None:
+    """Write (height, width, 3 or 4) or grey (height, width) uint8, folders included; packed fast, for pictures hardly
+    shrink any further."""
+    from PIL import Image
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(pixels).save(path, format="PNG", compress_level=1)
+
+
+def write_jpeg(path: Path, pixels: "np.ndarray", quality: int) -> None:
+    """Write (height, width, 3) uint8, colours at full size: averaged over 2 × 2 pixels they would lose more than all
+    the rest."""
+    from PIL import Image
+
+    Image.fromarray(pixels).save(path, format="JPEG", quality=quality, subsampling=0)
+
+
+def read_scene(folder: Path) -> "Scene":
+    """The scene that stage normalise left in ``folder``. Raises StageError where it is missing or damaged."""
+    from nerf.geometry.scene import Scene
+
+    value = read_json(folder / "scene.json")
+    try:
+        return Scene.from_json(value)
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        raise damaged("scene.json", f"{type(error).__name__}: {error}") from error

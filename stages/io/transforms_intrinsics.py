@@ -1,0 +1,134 @@
+"""Cameras of transforms files: nerfstudio's, instant-ngp's and Blender's names for intrinsics as COLMAP's models."""
+
+import math
+import sys
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from nerf.geometry.scene import Camera
+from stages.sfm.colmap.cameras import focal_lengths_and_centre
+from stages.sfm.colmap.model_files import LARGEST_SIDE
+
+# Focal lengths in widths of the picture: from 179° across to 20 seconds of arc, a telescope's.
+FOCAL_RATIOS = (0.005, 10_000.0)
+FARTHEST_CENTRE = 100.0  # in widths: where the principal point of the last corner cut out of a large picture may lie
+MOST_LETTERS = 40  # of a value, in an error
+FISHEYE, PRISM, RATIONAL, PANORAMA = "OPENCV_FISHEYE", "THIN_PRISM_FISHEYE", "FULL_OPENCV", "EQUIRECTANGULAR"
+PERSPECTIVES = ("", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", RATIONAL)
+FISHEYES = ("SIMPLE_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", FISHEYE, PRISM)
+OTHER_LENSES = ("ftheta_p0", "latlong")  # keys that declare them to instant-ngp
+NERFSTUDIOS = ("k1", "k2", "k3", "k4", "p1", "p2")  # distortion_params, in nerfstudio's order
+NO_PANORAMAS = "panoramas are not supported"
+
+
+def read_intrinsics(values: Mapping[str, Any], width: int, height: int, focal: float = 0.0) -> Camera:
+    """The camera of a frame from ``w``, ``h``, ``fl_x``, ``fl_y`` or ``camera_angle_x``, ``camera_angle_y`` (radians)
+    or ``x_fov``, ``y_fov`` (degrees), ``cx``, ``cy``, ``k1`` …, ``p1``, ``p2``, ``sx1``, ``sy1`` or
+    ``distortion_params``, and ``camera_model``; a focal length across one side serves for both. ``width``, ``height``
+    (pixels) and ``focal`` (in longer sides of the picture; 0 for unknown) stand where the file has none.
+
+    Raises ValueError, saying what is wrong, for numbers that are not finite, for what no lens or crop could have, and
+    for lenses that are not known here.
+    """
+    declared = _declared(values)
+    values = _with_named_terms(values)
+
+    def number(key: str, default: float) -> float:
+        return _finite(values.get(key, default), key)
+
+    w, h = number("w", width), number("h", height)
+    if not all(1 <= side <= LARGEST_SIDE and side.is_integer() for side in (w, h)):
+        raise ValueError(f"its w and h are {w:g} and {h:g}")
+    along = _focal_length(values, "x", w), _focal_length(values, "y", h)
+    given = [one for one in along if one is not None] or [focal * max(w, h)] * (focal > 0)
+    if not given:
+        raise ValueError("no focal length in it: neither fl_x nor camera_angle_x (between 0 and π)")
+    fx, fy = (given[0] if one is None else one for one in along)
+    pinhole = (fx, fy, number("cx", w / 2), number("cy", h / 2))
+    k = [number(f"k{i}", 0.0) for i in range(1, 7)]
+    p, s = [number("p1", 0.0), number("p2", 0.0)], [number("sx1", 0.0), number("sy1", 0.0)]
+    model, distortion = _distortion(k, p, s, declared)
+    camera = Camera(model, int(w), int(h), (*pinhole, *distortion))
+    if flaw := flaw_of(camera):
+        raise ValueError(flaw)
+    return camera
+
+
+def flaw_of(camera: Camera) -> str | None:
+    """What is wrong with intrinsics that no lens and no crop could have."""
+    if camera.model == PANORAMA:
+        return NO_PANORAMAS
+    if not np.isfinite(camera.params).all():
+        return f"its parameters are not finite: {', '.join(f'{value:.5g}' for value in camera.params)}"
+    focal, centre = focal_lengths_and_centre(camera)
+    longer = max(camera.width, camera.height)
+    if not all(FOCAL_RATIOS[0] <= value / longer <= FOCAL_RATIOS[1] for value in focal):
+        pixels = " × ".join(f"{value:.5g}" for value in focal)
+        return f"a focal length of {pixels} pixels is not one for a picture of {camera.width}×{camera.height}"
+    if max(map(abs, centre), default=0.0) > FARTHEST_CENTRE * longer:
+        place = ", ".join(f"{value:.5g}" for value in centre)
+        return f"its principal point ({place}) is far outside of its {camera.width}×{camera.height} pixels"
+    return None
+
+
+def _with_named_terms(values: Mapping[str, Any]) -> Mapping[str, Any]:
+    """``values`` with ``distortion_params`` under the names of its terms."""
+    if "distortion_params" not in values:
+        return values
+    terms = values["distortion_params"]
+    if not (isinstance(terms, list) and len(terms) == len(NERFSTUDIOS)):
+        raise ValueError(
+            f"its distortion_params are not six numbers, {', '.join(NERFSTUDIOS)} as nerfstudio orders them"
+        )
+    return {**values, **dict(zip(NERFSTUDIOS, terms, strict=True))}
+
+
+def _declared(values: Mapping[str, Any]) -> str:
+    """The lens that the values declare, "" without; one of PERSPECTIVES or FISHEYES."""
+    declared = values.get("camera_model") or ""
+    if declared == PANORAMA:
+        raise ValueError(NO_PANORAMAS)
+    if declared not in PERSPECTIVES + FISHEYES:
+        known = ", ".join((*PERSPECTIVES[1:], *FISHEYES))
+        raise ValueError(f"its camera_model is {repr(declared)[:MOST_LETTERS]}, which is none of {known}")
+    if other := next((key for key in OTHER_LENSES if values.get(key, False) is not False), None):
+        raise ValueError(f"it has {other}: lenses of that kind are not supported")
+    return FISHEYE if values.get("is_fisheye") and declared not in FISHEYES else declared
+
+
+def _distortion(k: list[float], p: list[float], s: list[float], declared: str) -> tuple[str, list[float]]:
+    """COLMAP's model for these terms and its parameters after fx, fy, cx, cy."""
+    if declared in FISHEYES:
+        if any(k[4:]):
+            raise ValueError("it has a k5 or k6, and is a fisheye")
+        return (PRISM, [k[0], k[1], *p, k[2], k[3], *s]) if any(p) or any(s) else (FISHEYE, k[:4])
+    if any(s):
+        raise ValueError(f"it has sx1 or sy1, and its camera_model is not {PRISM}")
+    if any(k[3:]) and declared != RATIONAL:
+        # In such files k4 multiplies r⁸, which no model of COLMAP has; FULL_OPENCV's k4 is a denominator's r².
+        raise ValueError("it has a k4, and its camera_model is not FULL_OPENCV")
+    if any(k[2:]):
+        return RATIONAL, [k[0], k[1], *p, *k[2:]]
+    if any(k) or any(p):
+        return "OPENCV", [k[0], k[1], *p]
+    return "PINHOLE", []
+
+
+def _focal_length(values: Mapping[str, Any], axis: str, size: float) -> float | None:
+    """Focal length in pixels along "x" or "y", where the picture has ``size`` pixels; None without one. Of a full
+    viewing angle that is in radians or, as instant-ngp's ``x_fov``, in degrees."""
+    if (name := f"fl_{axis}") in values:
+        return _finite(values[name], name)
+    for name, unit in ((f"camera_angle_{axis}", 1.0), (f"{axis}_fov", math.radians(1))):
+        if values.get(name) is not None and 0 < (angle := _finite(values[name], name) * unit) < math.pi:
+            return 0.5 * size / math.tan(0.5 * angle)
+    return None
+
+
+def _finite(value: Any, name: str) -> float:
+    number = value if isinstance(value, int | float) and not isinstance(value, bool) else math.nan
+    if not abs(number) <= sys.float_info.max:
+        raise ValueError(f"its {name} is {repr(value)[:MOST_LETTERS]}, not a finite number")
+    return float(number)

@@ -1,0 +1,206 @@
+"""The report's plots as inline SVG: text and axes take the page's colour, and equal data is equal bytes."""
+
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import PurePosixPath
+from typing import TYPE_CHECKING, Any
+
+from nerf import REGION_HALF
+from stages.io.amounts import duration
+from stages.train.curve import heldout_curve
+
+if TYPE_CHECKING:
+    import numpy as np
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from nerf.geometry.scene import Scene, View
+    from nerf.training.learning_curve import Gain
+
+BLUE, ORANGE, GREY = "#3b82f6", "#f2711c", "#8a8f98"
+ORDER_COLOURS = (BLUE, "#9b5de5", "#e0457b", ORANGE, "#e0a800")  # from first to last, legible on light and dark pages
+INK = "#010203"  # drawn with this and then replaced by the page's own text colour
+MOST_POINTS = 20_000
+ROOM_BELOW = 0.08  # of the curve's height, so that the name of the lowest line stands clear of the times
+
+
+def curve_svg(
+    points: Sequence[dict[str, Any]], baselines: dict[str, float | None], coming: "Gain | None" = None
+) -> str | None:
+    """PSNR against training seconds, one grid line per doubling of the time, with the knee and what is ``coming``, what
+    the next doubling is predicted to buy; None for fewer than two points. ``baselines`` are drawn as horizontal lines
+    under their names.
+    """
+    rows = [row for row in points if row["seconds"] > 0]
+    if len(rows) < 2:
+        return None
+    with drawing((8.2, 3.4), "curve") as figure:
+        axes = figure.add_subplot()
+        for key, label, colour in (("train_psnr", "training rays", GREY), ("heldout_psnr", "held-out photos", BLUE)):
+            seen = [(row["seconds"], row[key]) for row in rows if row[key] is not None]
+            if seen:
+                axes.plot(*zip(*seen, strict=True), color=colour, lw=2, marker="o", ms=3, label=label)
+        if coming is not None:
+            _draw_prediction(axes, rows, coming)
+        last = rows[-1]["seconds"] * (1 if coming is None else 2)
+        _draw_knee(axes, heldout_curve(rows))
+        # Last, for they fix the limits, beyond which nothing is seen.
+        _draw_baselines(axes, {name: psnr for name, psnr in baselines.items() if psnr is not None})
+        _doubling_axis(axes, rows[0]["seconds"], rows[-1]["seconds"], last)
+        axes.set(xlabel="training time", ylabel="PSNR (dB)")
+        axes.legend(frameon=False, loc="lower left", bbox_to_anchor=(0, 1), ncols=4, borderaxespad=0)
+        return svg_element(figure)
+
+
+def _draw_prediction(axes: "Axes", rows: Sequence[dict[str, Any]], coming: "Gain") -> None:
+    """A dotted line on to twice the time, with its interval."""
+    (seconds, psnr), style = heldout_curve(rows)[-1], {"color": BLUE, "lw": 1.5, "ls": (0, (1, 1.5))}
+    axes.plot([seconds, 2 * seconds], [psnr, psnr + coming.db], label="predicted", **style)
+    axes.errorbar(2 * seconds, psnr + coming.db, coming.half_width, color=BLUE, capsize=4, lw=1.5)
+
+
+def _draw_knee(axes: "Axes", curve: Sequence[tuple[float, float]]) -> None:
+    from nerf.training.learning_curve import knee, quality_at
+
+    if (seconds := knee(curve)) is not None:
+        ring = {"color": "none", "mec": ORANGE, "ms": 11, "mew": 2}
+        axes.plot(seconds, quality_at(curve, seconds), "o", label=f"knee, {duration(seconds)}", **ring)
+
+
+def _draw_baselines(axes: "Axes", baselines: dict[str, float]) -> None:
+    """Horizontal lines named beside the plot, the highest above its line and the others below, so as not to collide."""
+    for name, psnr in baselines.items():
+        above = psnr == max(baselines.values())
+        axes.axhline(psnr, color=ORANGE, lw=1, ls=(0, (4, 3)))
+        place = {"transform": axes.get_yaxis_transform(), "va": "bottom" if above else "top", "size": 9.5}
+        axes.text(1.01, psnr, f"{name}\n{psnr:.1f} dB", linespacing=1.1, **place)
+    low, high = axes.get_ylim()
+    axes.set_ylim(low - ROOM_BELOW * (high - low), high)
+
+
+def camera_svgs(
+    scene: "Scene", views: "Sequence[View]", xyz: "np.ndarray", rgb: "np.ndarray", joined: bool
+) -> dict[str, str]:
+    """Some ``views`` of the scene, coloured in the order of their names and ``joined`` in it or not, the sparse points
+    (n, 3) in their colours and the region of interest, by the name of the projection.
+
+    Orthographic projections along z and along y: from above and from the side where the scene knows its up.
+    """
+    from stages.sfm.pairs.match_graph import natural_order
+
+    ordered = [views[i] for i in natural_order([view.name for view in views])]
+    names = ("from above", "from the side") if scene.up_known else ("along z", "along y")
+    return {
+        name: _layout_svg(name, scene, ordered, (0, axis), (xyz, rgb), joined)
+        for name, axis in zip(names, (1, 2), strict=True)
+    }
+
+
+def _layout_svg(
+    name: str,
+    scene: "Scene",
+    views: "Sequence[View]",
+    plane: tuple[int, int],
+    points: "tuple[np.ndarray, np.ndarray]",
+    joined: bool,
+) -> str:
+    """One projection, on the two given axes of the scene. Points beyond the cameras and the box are cut off."""
+    import numpy as np
+    from matplotlib.patches import Rectangle
+
+    centres = np.array([view.scene_from_camera[:, 3] for view in views])[:, plane]
+    low, high = np.minimum(centres.min(0), -REGION_HALF), np.maximum(centres.max(0), REGION_HALF)
+    middle, half = (low + high) / 2, (high - low) / 2 + 0.06 * (high - low).max()
+    xyz, rgb = points
+    shown = np.linspace(0, len(xyz) - 1, min(len(xyz), MOST_POINTS)).astype(int)
+    with drawing((5, min(8.0, max(1.6, 5 * half[1] / half[0]))), name) as figure:
+        axes = figure.add_subplot(aspect="equal")
+        axes.scatter(*xyz[shown][:, plane].T, c=rgb[shown] / 255, s=2, lw=0, alpha=0.7, rasterized=True)
+        axes.add_patch(
+            Rectangle(
+                (-REGION_HALF, -REGION_HALF), 2 * REGION_HALF, 2 * REGION_HALF, fill=False, ec=INK, ls="--", alpha=0.6
+            )
+        )
+        _draw_cameras(axes, scene, views, plane, 0.1 * half.max(), joined)
+        axes.set(xlim=middle[0] + half[0] * np.array([-1, 1]), ylim=middle[1] + half[1] * np.array([-1, 1]))
+        axes.set_axis_off()
+        return svg_element(figure)
+
+
+def _draw_cameras(
+    axes: "Axes", scene: "Scene", views: "Sequence[View]", plane: tuple[int, int], depth: float, joined: bool
+) -> None:
+    """Outlines coloured from the first view to the last, test photos with a dot, and thin lines from each view to the
+    next in the same folder: a jump between photos that follow each other is seen at once."""
+    import numpy as np
+    from matplotlib.collections import LineCollection
+    from matplotlib.colors import LinearSegmentedColormap
+
+    colours = LinearSegmentedColormap.from_list("order", ORDER_COLOURS)(np.linspace(0, 1, len(views)))
+    centres = np.array([view.scene_from_camera[:, 3] for view in views])[:, plane]
+    folders = [PurePosixPath(view.name).parent for view in views]
+    steps = [i for i in range(1, len(views)) if joined and folders[i - 1] == folders[i]]
+    lines = [centres[i - 1 : i + 1] for i in steps]
+    axes.add_collection(LineCollection(lines, colors=colours[steps], lw=1, alpha=0.8, zorder=2))
+    outlines = [_outline(scene, view, depth)[:, plane] for view in views]
+    axes.add_collection(LineCollection(outlines, colors=colours, lw=0.9, zorder=3))
+    test = [i for i, view in enumerate(views) if view.split == "test"]
+    axes.scatter(*centres[test].T, c=colours[test], s=20, lw=0, zorder=4)
+
+
+def _outline(scene: "Scene", view: "View", depth: float) -> "np.ndarray":
+    """The pyramid from the camera's centre to its image at ``depth``, as one line through all edges: (11, 3)."""
+    import numpy as np
+
+    camera = scene.cameras[view.camera]
+    # COLMAP lists the focal length first in every camera model.
+    x, y = (np.array([camera.width, camera.height]) / 2 / camera.params[0]) * depth
+    corners = np.array([[-x, -y, depth], [x, -y, depth], [x, y, depth], [-x, y, depth], [0, 0, 0]])
+    stroke = corners[[4, 0, 1, 4, 2, 1, 2, 3, 4, 3, 0]]
+    return stroke @ view.scene_from_camera[:, :3].T + view.scene_from_camera[:, 3]
+
+
+def _doubling_axis(axes: "Axes", first: float, last: float, end: float) -> None:
+    """A logarithmic time axis to ``end`` with ticks there, at ``last`` and at its halves, and the last half shaded."""
+    import math
+
+    ticks = [last / 2**k for k in range(max(1, min(8, math.ceil(math.log2(last / first)) + 1)))]
+    ticks = [end, *ticks] if end > last else ticks
+    axes.set_xscale("log", base=2)
+    axes.set_xlim(min(first, ticks[-1]), end * 1.04)
+    # On two lines, for neighbours would run into each other: "2 min" over "31 s".
+    axes.set_xticks(ticks, [re.sub("(?<=[a-z]) ", "\n", duration(tick)) for tick in ticks])
+    axes.set_xticks([], minor=True)
+    axes.axvspan(last / 2, last, color=BLUE, alpha=0.08, lw=0)
+    axes.grid(color=INK, alpha=0.15, lw=0.8)
+
+
+@contextmanager
+def drawing(size: tuple[float, float], salt: str) -> "Iterator[Figure]":
+    """A figure to draw on, without pyplot's global state, whose identifiers depend on ``salt`` alone."""
+    from matplotlib import rc_context
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    style: dict[Any, Any] = {"svg.hashsalt": salt, "svg.fonttype": "none", "font.size": 10.5}
+    style |= {f"axes.spines.{side}": False for side in ("top", "right")}
+    style |= dict.fromkeys(("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color"), INK)
+    with rc_context(style):
+        figure = Figure(figsize=size, layout="constrained")
+        FigureCanvasAgg(figure)
+        yield figure
+
+
+def svg_element(figure: "Figure") -> str:
+    """The figure as an element to be put into a page, transparent, scaling with its column."""
+    import io
+
+    buffer = io.StringIO()
+    figure.savefig(buffer, format="svg", transparent=True, dpi=160, metadata={"Date": None, "Creator": None})
+    text = buffer.getvalue()
+    text = text[text.index("<svg") :].replace(INK, "currentColor")
+    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
+    # Matplotlib numbers its groups afresh in every figure; nothing refers to them and a page may hold each id once.
+    text = re.sub(r' id="[\w.]+_\d+"', "", text)
+    return re.sub(r'<svg ([^>]*?)width="[^"]*"', r"<svg \1", re.sub(r'(<svg [^>]*?)height="[^"]*"', r"\1", text))

@@ -1,0 +1,125 @@
+"""Camera models: pixels to rays and back, for every model that COLMAP knows."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float
+
+from nerf.geometry.scene import Camera
+from stages.contract import StageError
+
+if TYPE_CHECKING:
+    import pycolmap
+
+ROUND_TRIP_PX = 0.01  # a bearing that does not project back to its pixel is a false root of the distortion
+CHECKED_PIXELS = (33, 25)  # across and down, the very corners among them: there lenses bend most
+
+
+def camera_rays(camera: Camera, width: int, height: int) -> Float[np.ndarray, "height width 3"]:
+    """Unit bearing vectors (float32) of the pixel centres of ``camera``'s image resized to width × height.
+
+    Raises StageError where the camera model has no inverse at some pixels.
+    """
+    model = native(camera)
+    # Centres are mapped to the camera's own pixels: Camera.rescale would average the two scales of one focal length.
+    x = (np.arange(width) + 0.5) * (camera.width / width)
+    rays = np.empty((height, width, 3), np.float32)
+    lost = 0
+    for row in range(height):
+        pixels = np.stack([x, np.full(width, (row + 0.5) * (camera.height / height))], axis=1)
+        rays[row], missing = _bearings(model, pixels)
+        lost += missing
+    if lost:
+        raise no_ray(camera, lost / (width * height))
+    return rays
+
+
+def share_without_ray(model: "pycolmap.Camera") -> float:
+    """Of a camera's pixels, seen at CHECKED_PIXELS of them, the share for which the camera model has no inverse."""
+    sides = zip((model.width, model.height), CHECKED_PIXELS, strict=True)
+    x, y = (np.linspace(0.5, length - 0.5, count) for length, count in sides)
+    pixels = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    return _bearings(model, pixels)[1] / len(pixels)
+
+
+def _bearings(model: "pycolmap.Camera", pixels: Float[np.ndarray, "n 2"]) -> tuple[Float[np.ndarray, "n 3"], int]:
+    """Unit bearing vectors of pixels, and how many of these they are not those of."""
+    bearings = np.asarray(model.cam_ray_from_img(pixels))
+    miss = np.abs(np.asarray(model.img_from_cam(bearings)) - pixels).max(axis=1)
+    return bearings, int(np.count_nonzero(~(miss < ROUND_TRIP_PX)))  # NaN counts as lost
+
+
+def no_ray(camera: Camera, share: float, of: str = "") -> StageError:
+    """The error for a camera, given as that ``of`` this photo or of unknown origin, without a ray for this share of its
+    pixels."""
+    crop = "crop photos and cameras to the square inside the lens's circle"
+    simpler = "give the photos without cameras" if of else "choose a simpler --sfm.camera-model"
+    other = crop if is_fisheye(camera.model) else simpler
+    return StageError(
+        f"the {camera.model} camera{f' of {of!r}' * bool(of)} has no ray for {100 * share:.3g}% of its pixels",
+        f"{why_no_ray(camera.model)} there (parameters {', '.join(f'{p:.5g}' for p in camera.params)})",
+        f"Check the distortion of the given cameras, or {other}.",
+    )
+
+
+def why_no_ray(model: str) -> str:
+    """What may be the matter where a camera of this model has no ray: COLMAP's fisheyes end at 90° from the axis, and
+    the bearings that they give further out are of other pixels."""
+    return f"{'it looks beyond 90° from its axis or ' if is_fisheye(model) else ''}its distortion cannot be undone"
+
+
+def is_fisheye(model: str) -> bool:
+    """Whether a camera model is one of angles, which may be made for very wide lenses."""
+    return model.endswith("FISHEYE")
+
+
+def project(camera: Camera, points_camera: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
+    """Pixel coordinates of points in the camera's frame; NaN for points behind the camera."""
+    return np.asarray(native(camera).img_from_cam(np.asarray(points_camera, np.float64)))
+
+
+def rescaled(camera: Camera, width: int, height: int) -> Camera:
+    """The camera of the same image resized to width × height pixels."""
+    model = native(camera)
+    model.rescale(width, height)
+    return plain(model)
+
+
+def is_valid(camera: Camera) -> bool:
+    """Whether all parameters are finite and all focal lengths positive."""
+    focal, _ = focal_lengths_and_centre(camera)
+    return bool(np.isfinite(camera.params).all()) and all(f > 0 for f in focal)
+
+
+def focal_lengths_and_centre(camera: Camera) -> tuple[list[float], list[float]]:
+    """The parameters that are focal lengths, one or two, and the principal point's; a panorama has neither."""
+    model = native(camera)
+    focal, centre = model.focal_length_idxs(), model.principal_point_idxs()
+    return [camera.params[i] for i in focal], [camera.params[i] for i in centre]
+
+
+def native(camera: Camera, camera_id: int = 1) -> "pycolmap.Camera":
+    """The same camera for COLMAP. Raises ValueError where the model takes another number of parameters."""
+    import pycolmap
+
+    model = pycolmap.Camera(
+        camera_id=camera_id,
+        model=camera.model,
+        width=camera.width,
+        height=camera.height,
+        params=list(camera.params),
+    )
+    if not model.verify_params():
+        raise ValueError(f"{camera.model} takes {model.params_info}, got {len(camera.params)} numbers")
+    return model
+
+
+def plain(camera: "pycolmap.Camera") -> Camera:
+    """The inverse of :func:`native`."""
+    return Camera(camera.model_name, camera.width, camera.height, tuple(float(p) for p in camera.params))
+
+
+def focal_and_centre(camera: Camera) -> tuple[float, tuple[float, float]]:
+    """The mean focal length and the principal point, in pixels."""
+    model = native(camera)
+    return float(model.mean_focal_length()), (float(model.principal_point_x), float(model.principal_point_y))

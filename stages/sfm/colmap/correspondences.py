@@ -1,0 +1,83 @@
+"""The verified matches of a database as arrays. Call it in a child process."""
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from jaxtyping import Int
+
+from stages.sfm.geometry_check import PairMatches
+
+if TYPE_CHECKING:
+    import pycolmap
+
+MAX_MATCHES_CHECKED = 200  # of a pair, drawn by the seed: their median is known to a tenth of their spread
+
+
+class Correspondences(NamedTuple):
+    """Verified matches of a database, keypoints numbered through all photos; match k belongs to ``pairs[pair[k]]``."""
+
+    pairs: Int[np.ndarray, "pairs 2"]  # image ids
+    pair: Int[np.ndarray, "matches"]
+    keypoint: Int[np.ndarray, "matches 2"]
+    begins: Int[np.ndarray, "photos+1"]  # where each photo's keypoints begin
+
+
+def read_correspondences(db: "pycolmap.Database", geometries: "dict[int, pycolmap.TwoViewGeometry]") -> Correspondences:
+    """All verified matches, in order of ``geometries`` (by pair id)."""
+    import pycolmap
+
+    counts = [db.num_keypoints_for_image(i + 1) for i in range(db.num_images())]
+    begins = np.concatenate([[0], np.cumsum(counts)]).astype(int)
+    pairs = np.array([pycolmap.pair_id_to_image_pair(pair_id) for pair_id in geometries], int).reshape(-1, 2)
+    inliers = [np.asarray(geometry.inlier_matches, int).reshape(-1, 2) for geometry in geometries.values()]
+    return Correspondences(
+        pairs,
+        np.repeat(np.arange(len(pairs)), [len(some) for some in inliers]),
+        np.concatenate([np.zeros((0, 2), int), *(s + begins[p - 1] for s, p in zip(inliers, pairs, strict=True))]),
+        begins,
+    )
+
+
+def read_pair_matches(
+    db: "pycolmap.Database",
+    model: "pycolmap.Reconstruction",
+    seed: int,
+    most: int | None = MAX_MATCHES_CHECKED,
+) -> tuple[list[int], PairMatches]:
+    """The image ids of the model's photos, and the verified matches between them for a check of their poses; ``most``
+    of each pair, None: all, in their order."""
+    import pycolmap
+
+    ids = sorted(model.reg_image_ids())
+    number = {image_id: place for place, image_id in enumerate(ids)}
+    random = np.random.default_rng(seed)
+    pairs, weights, keypoints = [], [], []
+    for pair_id, geometry in zip(*db.read_two_view_geometries(), strict=True):
+        first, second = pycolmap.pair_id_to_image_pair(pair_id)
+        inliers = np.asarray(geometry.inlier_matches, int).reshape(-1, 2)
+        if not (len(inliers) and first in number and second in number):
+            continue
+        pairs.append((number[first], number[second]))
+        weights.append(len(inliers))
+        if most and len(inliers) > most:
+            inliers = inliers[random.choice(len(inliers), most, replace=False)]
+        keypoints.append(inliers)
+    bearings = [_bearings(db, model, image_id) for image_id in ids]
+    begins = np.concatenate([[0], np.cumsum([len(some) for some in bearings])]).astype(int)
+    rows = [some + begins[list(pair)] for some, pair in zip(keypoints, pairs, strict=True)]
+    return ids, PairMatches(
+        pairs=np.array(pairs, int).reshape(-1, 2),
+        weight=np.array(weights, float),
+        pair=np.repeat(np.arange(len(pairs)), [len(some) for some in keypoints]),
+        keypoint=np.concatenate([np.zeros((0, 2), int), *rows]),
+        photo=np.repeat(np.arange(len(ids)), np.diff(begins)),
+        bearing=np.concatenate([np.zeros((0, 3)), *bearings]),
+        focal_px=np.array([model.camera(model.image(i).camera_id).mean_focal_length() for i in ids]),
+    )
+
+
+def _bearings(db: "pycolmap.Database", model: "pycolmap.Reconstruction", image_id: int) -> np.ndarray:
+    """Unit rays of a photo's keypoints in its camera's frame; along the axis where the lens has none."""
+    xy = np.array(db.read_keypoints(image_id), float).reshape(-1, 6)[:, :2]
+    rays = np.asarray(model.camera(model.image(image_id).camera_id).cam_ray_from_img(xy), float).reshape(-1, 3)
+    return np.where(np.isfinite(rays).all(axis=1, keepdims=True), rays, [0.0, 0.0, 1.0])

@@ -1,0 +1,264 @@
+"""Which camera model the photos call for, by the error of observations that were held out. Call it in a child process.
+
+Every candidate lens adjusts cameras, poses and points to most observations and then foretells the others. The
+simplest one wins that foretells them no worse than the best by more than the noise of the comparison. A lens that is
+too simple bends the poses; one that is too rich fits noise, and bends them too.
+"""
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from stages.sfm.colmap.lenses import MODELS, Lens, equip, flaws
+from stages.sfm.colmap.observations import Observations, noise_px, observations, residuals
+
+if TYPE_CHECKING:
+    import pycolmap
+
+# Points for the comparison are drawn until they have so many observations: 14 candidates then take seconds.
+MOST_OBSERVATIONS = 20_000
+MOST_PER_PHOTO = 100  # where there are hundreds of photos it takes more: a pose alone has 6 unknowns
+FEWEST_HELD_OUT = 50  # the spread of so many is known to a tenth, 1/√(2 · 50); fewer are no evidence
+CAP_PX = 4.0  # what is farther off is a mismatch, as for COLMAP's own filter, and counts as this
+CELLS = 4  # neighbours in a photo err alike, so the noise is that of the means of 4 × 4 parts of each photo
+MOST_ITERATIONS = 50
+FEW_ABSURD = 0.2  # of the photos may have absurd cameras: these are put right in the end, and decide for no others
+NOISE_MULTIPLES = 3.0  # with a dozen rivals two standard errors are often exceeded by chance, three hardly ever
+
+
+class Trial(NamedTuple):
+    """How a candidate did."""
+
+    lens: Lens
+    error_px: Float[np.ndarray, "n"]  # of each held-out observation
+    noise_px: float  # of the observations it was adjusted to
+    flaw: str | None  # of one of its cameras, where more than a few photos have such
+
+
+class Verdict(NamedTuple):
+    """What came of the comparison for some cameras: the trial whose lens they take, None if there is none."""
+
+    cameras: list[int]
+    photos: int
+    chosen: Trial | None
+    rows: list[dict[str, Any]]
+    why: str
+
+
+@dataclass
+class Choice:
+    """The lens of every camera that has photos, by its id, and why: a table's rows and sentences."""
+
+    noise_px: float
+    lenses: dict[int, Lens] = field(default_factory=dict)
+    table: list[dict[str, Any]] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+
+def choose(mapped: "pycolmap.Reconstruction", seed: int, models: Sequence[str] = MODELS) -> Choice:
+    """The lens of every camera, of these models.
+
+    A camera is judged by its own photos alone where they share enough points, and the others all together, each
+    candidate being tried by all of them. Cameras that come out alike so are judged once more, together, since more
+    observations tell finer differences. Where evidence is too little, cameras stay as mapping had them.
+    """
+    cameras = sorted({mapped.image(i).camera_id for i in mapped.reg_image_ids()})
+    noise = noise_px(mapped, observations(mapped))
+    verdicts = [_verdict(mapped, group, seed, models, noise) for group in _groups(mapped, cameras)]
+    judged = [verdict for verdict in verdicts if verdict.chosen]
+    if len(judged) > 1 and len({verdict.chosen.lens for verdict in judged if verdict.chosen}) == 1:
+        alike = sorted(camera for verdict in judged for camera in verdict.cameras)
+        rest = [verdict for verdict in verdicts if not verdict.chosen]
+        verdicts = [_verdict(mapped, alike, seed, models, noise), *rest]
+    largest = max((v for v in verdicts if v.chosen), key=lambda v: v.photos, default=None)
+    choice = Choice(largest.chosen.noise_px if largest and largest.chosen else noise)
+    for index, (group, photos, chosen, rows, why) in enumerate(verdicts):
+        lens = chosen.lens if chosen else Lens(mapped.camera(group[0]).model_name, False)
+        choice.lenses |= dict.fromkeys(group, lens)
+        choice.table += [row | {"group": index, "photos": photos} for row in rows]
+        whose = f"{photos} photo{'s' * (photos != 1)}: " if len(verdicts) > 1 else ""
+        given = " as given" if len(models) == 1 else ""
+        choice.notes.append(f"{whose}camera model {lens.model}{given}, principal point {lens.place}: {why}")
+    return choice
+
+
+def _verdict(
+    mapped: "pycolmap.Reconstruction", cameras: list[int], seed: int, models: Sequence[str], noise: float
+) -> Verdict:
+    """Let every candidate foretell what these cameras saw."""
+    sample = _part(mapped, cameras)
+    photos = sample.num_reg_images()
+    most = max(MOST_OBSERVATIONS * photos // mapped.num_reg_images(), MOST_PER_PHOTO * photos)
+    held_out = hold_out(sample, seed, most)
+    if len(held_out.xy) < FEWEST_HELD_OUT:
+        why = f"only {len(held_out.xy)} points are seen in three photos, too few to compare camera models"
+        if photos < 3:  # however many points there are
+            why = "camera models are compared by points that three photos of a camera see"
+        return Verdict(cameras, photos, None, [], why)
+    trials = list(_trials(sample, held_out, models, noise))
+    cells = _cells(held_out, mapped)
+    chosen, rows = _judge(trials, cells)
+    return Verdict(cameras, photos, chosen, rows, _reason(chosen, trials, cells))
+
+
+def _groups(mapped: "pycolmap.Reconstruction", cameras: list[int]) -> list[list[int]]:
+    """Cameras that are judged together: each one whose photos share enough points alone, then all others."""
+    if len(cameras) == 1:
+        return [cameras]
+    camera_of = {i: mapped.image(i).camera_id for i in mapped.reg_image_ids()}
+    shared: Counter[int] = Counter()
+    for point_id in mapped.point3D_ids():
+        views = Counter(camera_of[element.image_id] for element in mapped.point3D(point_id).track.elements)
+        shared.update(camera for camera, count in views.items() if count >= 3)
+    alone = [camera for camera in cameras if shared[camera] >= FEWEST_HELD_OUT]
+    others = [camera for camera in cameras if camera not in alone]
+    return [[camera] for camera in alone] + ([others] if others else [])
+
+
+def _part(mapped: "pycolmap.Reconstruction", cameras: list[int]) -> "pycolmap.Reconstruction":
+    """The photos of these cameras and the points that two of them see."""
+    import pycolmap
+
+    part = pycolmap.Reconstruction(mapped)
+    for image_id in sorted(part.reg_image_ids()):
+        if part.image(image_id).camera_id not in cameras:
+            part.deregister_frame(part.image(image_id).frame_id)
+    return part
+
+
+def hold_out(model: "pycolmap.Reconstruction", seed: int, most: int) -> Observations:
+    """Reduce a model to points drawn until they have so many observations; take one of each with three or more away.
+
+    Which one is drawn too, so they come from all photos. Two are left, and so every point keeps its place.
+    """
+    random = np.random.default_rng(seed)
+    drawn, count = [], 0
+    for point_id in random.permutation(np.array(sorted(model.point3D_ids()), np.int64)).tolist():
+        if count < most:
+            drawn.append(point_id)
+            count += model.point3D(point_id).track.length()
+        else:
+            model.delete_point3D(point_id)
+    taken = []
+    for point_id in sorted(drawn):
+        track = sorted((e.image_id, e.point2D_idx) for e in model.point3D(point_id).track.elements)
+        if len(track) >= 3:
+            image_id, keypoint = track[random.integers(len(track))]
+            taken.append((image_id, point_id, model.image(image_id).point2D(keypoint).xy))
+            model.delete_observation(image_id, keypoint)
+    taken.sort(key=lambda one: one[:2])
+    return Observations(
+        np.array([one[0] for one in taken], np.int64),
+        np.array([one[1] for one in taken], np.int64),
+        np.array([one[2] for one in taken], float).reshape(-1, 2),
+    )
+
+
+def _cells(seen: Observations, model: "pycolmap.Reconstruction") -> Int[np.ndarray, "n"]:
+    """In which part of which photo an observation lies."""
+    size = {i: (c.width, c.height) for i in model.reg_image_ids() for c in [model.camera(model.image(i).camera_id)]}
+    part = seen.xy / np.array([size[i] for i in seen.image.tolist()], float).reshape(-1, 2)
+    column, row = np.clip((CELLS * part).astype(np.int64), 0, CELLS - 1).T
+    return (seen.image * CELLS + row) * CELLS + column
+
+
+def _trials(
+    sample: "pycolmap.Reconstruction", held_out: Observations, models: Sequence[str], noise: float
+) -> Iterator[Trial]:
+    """Every candidate adjusted to the sample; with a refined principal point it goes on from where it was centred."""
+    import pycolmap
+
+    trained = observations(sample)
+    cameras = sorted({sample.image(i).camera_id for i in sample.reg_image_ids()})
+    _adjust(sample, False, noise)  # most of the way is the same for all candidates
+    for name in models:
+        model = pycolmap.Reconstruction(sample)
+        equip(model, dict.fromkeys(cameras, name))
+        for principal_point in (False, True):
+            _adjust(model, principal_point, noise)
+            length = np.linalg.norm(residuals(model, held_out), axis=1)
+            error = np.where(length < CAP_PX, length, CAP_PX)  # a point behind the camera (NaN) counts as far off
+            absurd = list(flaws(model).values())
+            why = absurd[0] if len(absurd) > FEW_ABSURD * model.num_reg_images() else None
+            yield Trial(Lens(name, principal_point), error, noise_px(model, trained), why)
+
+
+def _adjust(model: "pycolmap.Reconstruction", principal_point: bool, noise: float) -> None:
+    import pycolmap
+
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in sorted(model.reg_image_ids()):
+        config.add_image(image_id)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    options = adjustment_options(principal_point, noise)
+    options.ceres.solver_options.max_num_iterations = MOST_ITERATIONS
+    pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+
+
+def adjustment_options(principal_point: bool, noise: float) -> "pycolmap.BundleAdjustmentOptions":
+    """Of comparison and final adjustment alike.
+
+    Residuals r count by soft-L1, 2s²(√(1 + (r/s)²) − 1), with s the ``noise`` of the observations: beyond it they pull
+    with a force that grows no more, so that the mismatches that remain do not bend the cameras. Were the noise
+    Gaussian, this would cost 7 % of its efficiency (Huber 1981, section 7.6: E[ψ']² / E[ψ²] in two dimensions).
+    """
+    import pycolmap
+
+    options = pycolmap.BundleAdjustmentOptions(refine_principal_point=principal_point, print_summary=False)
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
+    options.ceres.loss_function_scale = noise
+    options.ceres.solver_options.function_tolerance = 1e-6
+    options.ceres.solver_options.num_threads = 1
+    return options
+
+
+def _judge(trials: list[Trial], cells: Int[np.ndarray, "n"]) -> tuple[Trial | None, list[dict[str, Any]]]:
+    """The trial whose lens to take, None if all are absurd, and the table."""
+    chosen, excess = None, {}
+    if sound := [trial for trial in trials if not trial.flaw]:
+        best = min(sound, key=lambda trial: trial.error_px.mean())
+        excess = {trial.lens: paired(trial.error_px - best.error_px, cells) for trial in sound}
+        able = [trial for trial in sound if excess[trial.lens][0] <= NOISE_MULTIPLES * excess[trial.lens][1]]
+        chosen = min(able, key=lambda trial: (trial.lens.complexity, trial.error_px.mean()))
+    rows = []
+    for trial in trials:
+        worse, noise = excess.get(trial.lens, (None, None))
+        rows.append(
+            {
+                "model": trial.lens.model,
+                "principal_point": trial.lens.place,
+                "free_parameters": trial.lens.free_parameters,
+                "held_out_px": None if trial.flaw else float(trial.error_px.mean()),
+                "worse_px": worse,
+                "noise_px": noise,
+                "chosen": trial is chosen,
+                "reason": trial.flaw,
+            }
+        )
+    return chosen, rows
+
+
+def paired(difference: Float[np.ndarray, "n"], cells: Int[np.ndarray, "n"]) -> tuple[float, float]:
+    """The mean of differences, and its standard error where those of one cell may err alike."""
+    mean = float(difference.mean())
+    _, cell = np.unique(cells, return_inverse=True)
+    sums = np.bincount(cell, difference - mean)
+    return mean, float(np.sqrt((sums**2).sum() * len(sums) / max(len(sums) - 1, 1)) / len(difference))
+
+
+def _reason(chosen: Trial | None, trials: list[Trial], cells: Int[np.ndarray, "n"]) -> str:
+    if chosen is None:
+        return "every candidate comes out absurd, so it stays as mapping had it"
+    error = f"held-out error {chosen.error_px.mean():.2f} px"
+    simpler = [trial for trial in trials if not trial.flaw and trial.lens.complexity < chosen.lens.complexity]
+    if not simpler:
+        return f"{error}, and no richer one is better by more than the noise"
+    rival = min(simpler, key=lambda trial: trial.error_px.mean())
+    worse, noise = paired(rival.error_px - chosen.error_px, cells)
+    return (
+        f"{error}, {rival.lens.model} ({rival.lens.place}) as the best simpler one {worse:.3f} ± {noise:.3f} px worse"
+    )

@@ -1,0 +1,120 @@
+"""Camera models: the candidates, how a mapped camera becomes one of them, and when one is absurd."""
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from stages.ingest.exif import FOCAL_RANGE
+from stages.sfm.colmap.cameras import is_fisheye, share_without_ray, why_no_ray
+from stages.sfm.colmap.observations import observations, points_in_camera
+
+if TYPE_CHECKING:
+    import pycolmap
+
+MODELS = (
+    "SIMPLE_PINHOLE",
+    "SIMPLE_RADIAL",
+    "RADIAL",
+    "OPENCV",
+    "SIMPLE_RADIAL_FISHEYE",
+    "RADIAL_FISHEYE",
+    "OPENCV_FISHEYE",
+)
+FIT_POINTS = 300
+FARTHEST_PRINCIPAL_POINT = 0.1  # of the image, from its centre: lenses are centred to a percent or two
+
+
+class Lens(NamedTuple):
+    """A candidate: a camera model, and whether the principal point is refined or stays in the centre."""
+
+    model: str
+    principal_point: bool
+
+    @property
+    def free_parameters(self) -> int:
+        """How many numbers of the camera are refined."""
+        import pycolmap
+
+        parameters = pycolmap.Camera.create_from_model_name(1, self.model, 1.0, 2, 2).params
+        return len(parameters) - 2 * (not self.principal_point)
+
+    @property
+    def complexity(self) -> tuple[bool, int]:
+        """The simpler of two lenses has the smaller one.
+
+        Ordinary lenses are made to draw straight lines straight, and at their angles a fisheye's series describes
+        much the same rays. So a fisheye model counts as less simple than all others, however few its numbers.
+        """
+        return is_fisheye(self.model), self.free_parameters
+
+    @property
+    def place(self) -> str:
+        """What becomes of the principal point, in a word."""
+        return "refined" if self.principal_point else "centred"
+
+
+def equip(model: "pycolmap.Reconstruction", lenses: dict[int, str]) -> None:
+    """Give cameras (by id) the models named and centred principal points, to draw their points where they were drawn.
+
+    Cameras without points stay as they are.
+    """
+    seen = observations(model)
+    points: dict[int, list[np.ndarray]] = {}
+    for image_id, (_, mine) in points_in_camera(model, seen).items():
+        points.setdefault(model.image(image_id).camera_id, []).append(mine)
+    for camera_id, name in lenses.items():
+        camera = model.camera(camera_id)
+        middle = [camera.width / 2, camera.height / 2]
+        centred = [camera.params[i] for i in camera.principal_point_idxs()] == middle
+        if camera_id in points and not (camera.model_name == name and centred):
+            mine = np.concatenate(points[camera_id])
+            new = _fitted(camera, name, mine[:: -(-len(mine) // FIT_POINTS)])
+            camera.model, camera.params = new.model, list(new.params)
+
+
+def _fitted(camera: "pycolmap.Camera", name: str, points: Float[np.ndarray, "n 3"]) -> "pycolmap.Camera":
+    """The centred camera of a model that projects points in the camera's frame most nearly as this one does."""
+    import pycolmap
+    from scipy.optimize import least_squares
+
+    target = np.asarray(camera.img_from_cam(points))
+    points, target = points[np.isfinite(target[:, 0])], target[np.isfinite(target[:, 0])]
+    new = pycolmap.Camera.create_from_model_name(
+        camera.camera_id, name, camera.mean_focal_length(), camera.width, camera.height
+    )
+    params = np.array(new.params)  # with the principal point in the centre
+    centre, focal = list(new.principal_point_idxs()), list(new.focal_length_idxs())
+    free = np.setdiff1d(np.arange(len(params)), centre)
+    unit = np.where(np.isin(free, focal), camera.mean_focal_length(), 1.0)
+
+    def misses(x: np.ndarray) -> np.ndarray:
+        params[free] = x * unit
+        new.params = params.tolist()
+        return (np.asarray(new.img_from_cam(points)) - target).ravel()
+
+    misses(least_squares(misses, params[free] / unit).x)
+    return new
+
+
+def flaw(camera: "pycolmap.Camera") -> str | None:
+    """What makes an adjusted camera absurd, or None."""
+    size = np.array([camera.width, camera.height])
+    params = np.array(camera.params)
+    if not np.isfinite(params).all():
+        return "its parameters are not finite"
+    focal = params[list(camera.focal_length_idxs())] / size.max()
+    if focal.min() < FOCAL_RANGE[0] or focal.max() > FOCAL_RANGE[1]:
+        return f"its focal length is {focal.min():.2g} to {focal.max():.2g} times the longer side"
+    off = float(np.abs(params[list(camera.principal_point_idxs())] / size - 0.5).max())
+    if off > FARTHEST_PRINCIPAL_POINT:
+        return f"its principal point is {off:.0%} of the image off the centre"
+    lost = share_without_ray(camera)
+    return f"{why_no_ray(camera.model_name)} at {lost:.1%} of the pixels" if lost else None
+
+
+def flaws(model: "pycolmap.Reconstruction") -> dict[int, str]:
+    """The registered photos whose camera is absurd, by image id, and what makes it so."""
+    camera_of = {i: model.image(i).camera_id for i in sorted(model.reg_image_ids())}
+    found = {camera_id: flaw(model.camera(camera_id)) for camera_id in set(camera_of.values())}
+    return {i: why for i, camera_id in camera_of.items() if (why := found[camera_id])}

@@ -1,0 +1,388 @@
+"""Features and matches: everything that fills COLMAP's database. Call it in a child process."""
+
+import math
+import shutil
+import time
+from collections.abc import Callable, Container, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from functools import partial
+from itertools import combinations, product
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool
+
+from stages.hardware.device import processors
+from stages.hardware.memory import at_once
+from stages.sfm.pairs.feature_matching import IndexedFeatures, index_features, match_descriptors, match_indexed
+from stages.sfm.pairs.image_retrieval import WORDS, Words, photo_similarity, vocabulary
+from stages.sfm.pairs.pair_selection import Likeness, Pairs
+
+if TYPE_CHECKING:
+    import pycolmap
+
+    from stages.io.photos import Photo
+
+FOCAL_GUESS = 1.2  # focal length over the longer side where EXIF is silent: 45 degrees, a phone's wide lens
+# Lowe's ratio: 0.8 is SIFT's own. 0.9 lets in many mismatches, most of which verification throws out again, and
+# finds views that lie farther apart; only photos that otherwise stay without a place are matched like that.
+STRICT_RATIO = 0.8
+LOOSE_RATIO = 0.9
+BLOCK_SIZE = 32  # pairs of photos that are committed at once (progress, resuming)
+FISHEYE_MODEL = "SIMPLE_RADIAL_FISHEYE"
+FISHEYE_ANGLE_DEG = 150.0
+BYTES_PER_SEARCHED_PIXEL = 100  # 77 to 86 measured on photos of 1024 to 3200 pixels
+OPENINGS, PAUSE_SECONDS = 50, 0.1  # a reader holds the lock for milliseconds
+CACHED_PHOTOS = 256  # whose features are held in memory, about half a megabyte each
+
+
+def hold_open(database: Path) -> "pycolmap.Database":
+    """A connection to keep for as long as another process reads along.
+
+    Whoever opens the database first or closes it last has to be alone in it, and COLMAP does not wait for that: it
+    fails. With this connection there no other one is the first or the last. Raises RuntimeError where it cannot be
+    opened for seconds.
+    """
+    import pycolmap
+
+    for _ in range(OPENINGS - 1):
+        with suppress(RuntimeError):
+            return pycolmap.Database.open(database)
+        time.sleep(PAUSE_SECONDS)
+    return pycolmap.Database.open(database)
+
+
+def fill_database(
+    database: Path, photos: "Sequence[Photo]", camera_model: str, camera_params: Sequence[float] | None = None
+) -> None:
+    """Enter photos (in order of ``file``) and one camera per camera group, all or nothing.
+
+    Known ``camera_params`` are those of one camera for all photos.
+    """
+    import pycolmap
+
+    with pycolmap.Database.open(database) as db, pycolmap.DatabaseTransaction(db):
+        if db.num_images():
+            return
+        camera_ids: dict[int, int] = {}
+        for image_id, photo in enumerate(photos, start=1):
+            group = 0 if camera_params else photo.camera_group
+            if group not in camera_ids:
+                camera_ids[group] = len(camera_ids) + 1
+                _enter_camera(db, _first_guess(photo, camera_model, camera_params, camera_ids[group]))
+            camera_id = camera_ids[group]
+            image = pycolmap.Image(name=photo.image_name, camera_id=camera_id, image_id=image_id)
+            db.write_image(image, use_image_id=True)
+            frame = pycolmap.Frame(frame_id=image_id, rig_id=camera_id)
+            frame.add_data_id(image.data_id)
+            db.write_frame(frame, use_frame_id=True)
+
+
+def _first_guess(photo: "Photo", model: str, params: Sequence[float] | None, camera_id: int) -> "pycolmap.Camera":
+    """The camera of a photo: as it is known, by EXIF's focal length, or by a guess."""
+    import pycolmap
+
+    size = photo.width, photo.height
+    if params is not None:
+        camera = pycolmap.Camera(camera_id=camera_id, model=model, width=size[0], height=size[1], params=list(params))
+        camera.has_prior_focal_length = True
+        return camera
+    fisheye = model.endswith("FISHEYE")
+    guess = fisheye_focal_px(*size) if fisheye else FOCAL_GUESS * max(size)
+    camera = pycolmap.Camera.create_from_model_name(camera_id, model, photo.focal_px or guess, *size)
+    # Two views through a fisheye have no fundamental matrix to do without a focal length: the guess has to serve.
+    camera.has_prior_focal_length = fisheye or photo.focal_px is not None
+    return camera
+
+
+def fisheye_focal_px(width: int, height: int) -> float:
+    """Of an equidistant lens, r = f θ, with FISHEYE_ANGLE_DEG from corner to corner."""
+    return math.hypot(width, height) / math.radians(FISHEYE_ANGLE_DEG)
+
+
+def _enter_camera(db: "pycolmap.Database", camera: "pycolmap.Camera") -> None:
+    import pycolmap
+
+    db.write_camera(camera, use_camera_id=True)
+    rig = pycolmap.Rig(rig_id=camera.camera_id)
+    rig.add_ref_sensor(camera.sensor_id)
+    db.write_rig(rig, use_rig_id=True)
+
+
+class Search(NamedTuple):
+    """How far features are searched: the longer side in pixels that photos are reduced to, the most features of each,
+    the folder of masks, and up to which longer side photos are doubled first: smaller ones yield too few features."""
+
+    max_image_size: int
+    max_features: int
+    masks: Path | None = None
+    doubled_up_to: int = 1024
+
+
+def feature_bytes(photos: "Sequence[Photo]", search: Search) -> float:
+    """Memory that searching the largest of the photos takes, by its pixels as they are searched."""
+
+    def searched(photo: "Photo") -> float:
+        longer = max(photo.width, photo.height)
+        scale = min(1.0, search.max_image_size / longer) * (2 if longer <= search.doubled_up_to else 1)
+        return photo.width * photo.height * scale**2
+
+    return BYTES_PER_SEARCHED_PIXEL * max(map(searched, photos))
+
+
+def extract_features(database: Path, images: Path, photos: "Sequence[Photo]", search: Search) -> None:
+    """SIFT keypoints and descriptors of every photo that has none yet, where ``masks/<image name>.png`` is not black,
+    or anywhere where that is not there.
+
+    Photos are searched from their own size down. Doubling them first, as is COLMAP's habit, costs 4.5 times as
+    much and moves no camera of a well-sized photo (benchmarks/sfm_accuracy.py), so only small ones are doubled.
+    """
+    import pycolmap
+
+    options = pycolmap.FeatureExtractionOptions()
+    options.max_image_size = search.max_image_size
+    options.sift.max_num_features = search.max_features
+    options.num_threads = at_once(processors(), feature_bytes(photos, search))
+    every = [photo.image_name for photo in photos]
+    small = {p.image_name for p in photos if max(p.width, p.height) <= search.doubled_up_to}
+    masks = search.masks
+    masked = {name for name in every if masks and (masks / f"{name}.png").is_file()}
+    # A photo without a mask has to go without a folder of masks: one that is not there is an error to COLMAP.
+    for is_small, is_masked in product((True, False), (False, True)):
+        names = [name for name in every if (name in small, name in masked) == (is_small, is_masked)]
+        if not names:
+            continue
+        options.sift.first_octave = -1 if is_small else 0
+        reader = pycolmap.ImageReaderOptions()
+        if is_masked and masks:
+            reader.mask_path = masks
+        pycolmap.extract_features(
+            database, images, names, reader_options=reader, extraction_options=options, device=pycolmap.Device.cpu
+        )
+
+
+def match_pairs(
+    database: Path,
+    pairs: Pairs,
+    seed: int,
+    max_ratio: float,
+    on_expected: Callable[[int, float], None] = lambda left, seconds: None,
+    features: "Features | None" = None,
+) -> None:
+    """Match and verify these pairs of photos (numbered from 0) where that has not been done yet.
+
+    ``max_ratio`` is Lowe's: the best match must be nearer than this share of the second best. ``features`` says how
+    features are compared, exactly without it, and keeps those that were read for further calls. ``on_expected`` is
+    told how many pairs there are to match and how long it will take, once a first block, spread over all, is done.
+    """
+    import pycolmap
+
+    options = _verification(seed)
+    with pycolmap.Database.open(database) as db, ThreadPoolExecutor(processors()) as pool:
+        todo = _spread([(i, j) for i, j in pairs.tolist() if not db.exists_two_view_geometry(i + 1, j + 1)])
+        photo = partial((features or Features()).read, db)
+        blocks = [todo[begin : begin + BLOCK_SIZE] for begin in range(0, len(todo), BLOCK_SIZE)]
+        started, work = time.monotonic(), []
+        for number in range(len(blocks) + 1):
+            ahead = [
+                pool.submit(_match, photo(i), photo(j), max_ratio, options)
+                for i, j in (blocks[number] if number < len(blocks) else [])
+            ]  # at work while those before are written
+            with pycolmap.DatabaseTransaction(db):
+                for (i, j), (matches, geometry) in zip(
+                    blocks[number - 1] if number else [], (each.result() for each in work), strict=True
+                ):
+                    db.write_matches(i + 1, j + 1, matches)
+                    db.write_two_view_geometry(i + 1, j + 1, geometry)
+            work = ahead
+            if number == 1:
+                on_expected(len(todo), (time.monotonic() - started) * len(todo) / len(blocks[0]))
+
+
+def _spread(pairs: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    """The same pairs, a block from all over them first: what it costs then holds for the rest."""
+    step = max(1, len(pairs) // BLOCK_SIZE)
+    first = pairs[::step][:BLOCK_SIZE]
+    chosen = set(first)
+    return first + [pair for pair in pairs if pair not in chosen]
+
+
+class _Photo(NamedTuple):
+    camera: "pycolmap.Camera"
+    places: np.ndarray  # (keypoints, 2), pixels
+    features: Any  # descriptors, (keypoints, 128) bytes, or IndexedFeatures of them
+
+
+class Features:
+    """Photos' features as they are compared: exactly, or with ``words`` by an inverted file, which takes a fifth of the
+    time and misses two matches in a hundred. The latest CACHED_PHOTOS are kept."""
+
+    def __init__(self, words: Words | None = None) -> None:
+        self._words = words
+        self._photos: dict[int, _Photo] = {}
+
+    def read(self, db: "pycolmap.Database", photo: int) -> _Photo:
+        """Those of the photo with this number."""
+        if (found := self._photos.pop(photo, None)) is None:
+            camera = db.read_camera(db.read_image(photo + 1).camera_id)
+            keypoints = np.array(db.read_keypoints(photo + 1), float).reshape(-1, 6)
+            features: Any = read_descriptors(db, photo)
+            if self._words is not None:
+                features = index_features(features, self._words)
+            found = _Photo(camera, keypoints[:, :2], features)
+        self._photos[photo] = found  # the latest last
+        if len(self._photos) > CACHED_PHOTOS:
+            del self._photos[next(iter(self._photos))]
+        return found
+
+
+def read_vocabulary(database: Path, count: int, seed: int, words: int) -> Words:
+    """So many visual words of these photos' features."""
+    import pycolmap
+
+    with pycolmap.Database.open(database) as db:
+        return vocabulary(partial(read_descriptors, db), count, seed, words)
+
+
+def look_alike(database: Path, count: int, seed: int) -> Likeness:
+    """How much any two photos look alike, by their features."""
+    import pycolmap
+
+    words = read_vocabulary(database, count, seed, WORDS)
+    with pycolmap.Database.open(database) as db:
+        return photo_similarity(partial(read_descriptors, db), count, words)
+
+
+def verified_matches(database: Path, pairs: Pairs) -> np.ndarray:
+    """How many verified matches each of these pairs has; 0 where it was not matched or failed."""
+    import pycolmap
+
+    with pycolmap.Database.open(database) as db:
+        found = dict(zip(*db.read_two_view_geometry_num_inliers(), strict=True))
+    return np.array([found.get(pycolmap.image_pair_to_pair_id(i + 1, j + 1), 0) for i, j in pairs.tolist()], int)
+
+
+def matched_pairs(database: Path) -> Pairs:
+    """All pairs of photos that were matched so far, verified or not."""
+    import pycolmap
+
+    with pycolmap.Database.open(database) as db:
+        ids, _ = db.read_all_matches()
+    return np.array([pycolmap.pair_id_to_image_pair(pair) for pair in ids], int).reshape(-1, 2) - 1
+
+
+def read_descriptors(db: "pycolmap.Database", photo: int) -> np.ndarray:
+    """Of the photo with this number, (keypoints, 128) bytes."""
+    return np.array(db.read_descriptors(photo + 1).data, np.uint8).reshape(-1, 128)
+
+
+def _match(
+    first: _Photo, second: _Photo, max_ratio: float, options: "pycolmap.TwoViewGeometryOptions"
+) -> "tuple[np.ndarray, pycolmap.TwoViewGeometry]":
+    """Matches, and the geometry of two views with those that it explains: none where they are too few."""
+    match: Any = match_indexed if isinstance(first.features, IndexedFeatures) else match_descriptors
+    matches = match(first.features, second.features, max_ratio)
+    return matches, _verified(first, second, matches, options)
+
+
+def _verification(seed: int) -> "pycolmap.TwoViewGeometryOptions":
+    import pycolmap
+
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.random_seed = seed
+    return options
+
+
+def _verified(
+    first: _Photo, second: _Photo, matches: np.ndarray, options: "pycolmap.TwoViewGeometryOptions"
+) -> "pycolmap.TwoViewGeometry":
+    import pycolmap
+
+    views = first.camera, first.places, second.camera, second.places
+    return pycolmap.estimate_two_view_geometry(*views, matches, options)
+
+
+def copy_without_matches_of(names: Container[str], database: Path, copy: Path) -> None:
+    """Copy the database, less every pair with one of these photos; nothing where the copy is there already."""
+    import pycolmap
+
+    if copy.exists():
+        return
+    unfinished = unfinished_copy(database, copy)
+    with pycolmap.Database.open(unfinished) as db, pycolmap.DatabaseTransaction(db):
+        images = sorted(db.read_all_images(), key=lambda image: image.image_id)
+        for first, second in combinations(images, 2):
+            if first.name in names or second.name in names:
+                db.delete_matches(first.image_id, second.image_id)
+                db.delete_two_view_geometry(first.image_id, second.image_id)
+    finish_copy(unfinished, copy)
+
+
+def copy_without_pairs(database: Path, copy: Path, pairs: Iterable[Sequence[int]]) -> None:
+    """Copy the database less what was verified of these pairs of image ids."""
+    import pycolmap
+
+    unfinished = unfinished_copy(database, copy)
+    with pycolmap.Database.open(unfinished) as db, pycolmap.DatabaseTransaction(db):
+        for first, second in pairs:
+            db.delete_two_view_geometry(first, second)
+    finish_copy(unfinished, copy)
+
+
+def keep_inliers(
+    db: "pycolmap.Database", pair: tuple[int, int], geometry: "pycolmap.TwoViewGeometry", keep: Bool[np.ndarray, "n"]
+) -> None:
+    """Leave only some of the verified matches of a pair of image ids, which it is deleted without."""
+    db.delete_two_view_geometry(*pair)
+    if keep.any():
+        geometry.inlier_matches = np.asarray(geometry.inlier_matches)[keep].astype(np.uint32)
+        db.write_two_view_geometry(*pair, geometry)
+
+
+def copy_as_fisheye(database: Path, copy: Path, seed: int) -> None:
+    """Copy the database, its cameras become fisheye lenses and its matches verified anew; nothing where it is there.
+
+    Without EXIF the focal length is :func:`fisheye_focal_px`, and counts as known.
+    """
+    import pycolmap
+
+    if copy.exists():
+        return
+    unfinished, options = unfinished_copy(database, copy), _verification(seed)
+    with pycolmap.Database.open(unfinished) as db, pycolmap.DatabaseTransaction(db):
+        for camera in db.read_all_cameras():
+            size = camera.width, camera.height
+            focal_px = camera.mean_focal_length() if camera.has_prior_focal_length else fisheye_focal_px(*size)
+            lens = pycolmap.Camera.create_from_model_name(camera.camera_id, FISHEYE_MODEL, focal_px, *size)
+            lens.has_prior_focal_length = True
+            db.update_camera(lens)
+        photo = partial(Features().read, db)
+        for pair_id, matches in zip(*db.read_all_matches(), strict=True):
+            first, second = pycolmap.pair_id_to_image_pair(pair_id)
+            geometry = _verified(photo(first - 1), photo(second - 1), np.asarray(matches, np.uint32), options)
+            db.delete_two_view_geometry(first, second)
+            db.write_two_view_geometry(first, second, geometry)
+    finish_copy(unfinished, copy)
+
+
+def unfinished_copy(database: Path, copy: Path) -> Path:
+    """Copy a database beside ``copy``, to be renamed to it once it is what it should be."""
+    unfinished = copy.with_suffix(".unfinished")
+    for part in ("", "-wal"):  # as long as anybody reads along, the latest pages stay in the write-ahead log
+        unfinished.with_name(unfinished.name + part).unlink(missing_ok=True)
+        if (source := database.with_name(database.name + part)).exists():
+            shutil.copyfile(source, unfinished.with_name(unfinished.name + part))
+    return unfinished
+
+
+def finish_copy(unfinished: Path, copy: Path) -> None:
+    """Put a finished copy in its place.
+
+    The write-ahead log of an earlier copy, which a process that was killed leaves behind, would be read as if it were
+    the new one's.
+    """
+    for part in ("-wal", "-shm"):
+        copy.with_name(copy.name + part).unlink(missing_ok=True)
+    unfinished.replace(copy)

@@ -1,0 +1,234 @@
+"""The files of a COLMAP model, binary or text, read without COLMAP.
+
+COLMAP's own reader believes what it reads: a count that was damaged makes it allocate until the machine is full, loop
+without end, or abort the process. https://colmap.github.io/format.html. Only cameras, images and points3D are read:
+what rigs and frames say of poses is in images, too, and tracks are what images say of their points.
+"""
+
+import struct
+from collections.abc import Iterator
+from itertools import zip_longest
+from pathlib import Path
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from nerf.geometry.scene import Camera
+
+# By COLMAP's number: the name and how many parameters it has.
+CAMERA_MODELS = {
+    0: ("SIMPLE_PINHOLE", 3),
+    1: ("PINHOLE", 4),
+    2: ("SIMPLE_RADIAL", 4),
+    3: ("RADIAL", 5),
+    4: ("OPENCV", 8),
+    5: ("OPENCV_FISHEYE", 8),
+    6: ("FULL_OPENCV", 12),
+    7: ("FOV", 5),
+    8: ("SIMPLE_RADIAL_FISHEYE", 4),
+    9: ("RADIAL_FISHEYE", 5),
+    10: ("THIN_PRISM_FISHEYE", 12),
+    11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+    12: ("SIMPLE_DIVISION", 4),
+    13: ("DIVISION", 5),
+    14: ("SIMPLE_FISHEYE", 3),
+    15: ("FISHEYE", 4),
+    16: ("EUCM", 6),
+    17: ("EQUIRECTANGULAR", 2),
+}
+PARAMETERS = dict(CAMERA_MODELS.values())
+LARGEST_SIDE = 2**31 - 1
+FARTHEST = 1e30  # of anything, in its units: squares and products of three such numbers are numbers, too
+NO_POINT = -1
+
+Entry = TypeVar("Entry")
+
+
+class FileImage(NamedTuple):
+    """An image as it is in the file: ``pose`` is (qw, qx, qy, qz, tx, ty, tz) of camera_from_world, ``points`` the id
+    of each of its keypoints' point, NO_POINT where it has none."""
+
+    name: str
+    camera: int
+    pose: Float[np.ndarray, "7"]
+    xy: Float[np.ndarray, "k 2"]
+    points: Int[np.ndarray, "k"]
+
+
+class FilePoint(NamedTuple):
+    """A point as it is in the file."""
+
+    xyz: tuple[float, ...]
+    rgb: tuple[int, ...]
+    error_px: float
+
+
+class ModelFiles(NamedTuple):
+    """What the files hold, by id."""
+
+    cameras: dict[int, Camera]
+    images: dict[int, FileImage]
+    points: dict[int, FilePoint]
+
+
+def read_model_files(folder: Path) -> ModelFiles:
+    """The model in ``folder``, checked to be one: places somewhere, every id there once, every image with a camera and
+    points that exist. Raises OSError, and ValueError or OverflowError with the reason."""
+    binary = (folder / "cameras.bin").is_file()
+    readers = (
+        {"cameras": _binary_cameras, "images": _binary_images, "points3D": _binary_points}
+        if binary
+        else {"cameras": _text_cameras, "images": _text_images, "points3D": _text_points}
+    )
+    parts = []
+    for part, reader in readers.items():
+        path = folder / f"{part}{'.bin' if binary else '.txt'}"
+        try:
+            parts.append(_by_id(reader(path)))
+        except (struct.error, ValueError, OverflowError) as error:
+            raise ValueError(f"{path.name} is damaged: {error}") from error
+    model = ModelFiles(*parts)
+    _check(model)
+    return model
+
+
+def _by_id(entries: Iterator[tuple[int, Entry]]) -> dict[int, Entry]:
+    found: dict[int, Entry] = {}
+    for number, entry in entries:
+        if number in found:
+            raise ValueError(f"the id {number} is there twice")
+        found[number] = entry
+    return found
+
+
+def _check(model: ModelFiles) -> None:
+    for number, camera in model.cameras.items():
+        if not (1 <= camera.width <= LARGEST_SIDE and 1 <= camera.height <= LARGEST_SIDE):
+            raise ValueError(f"camera {number} has {camera.width:.6g}×{camera.height:.6g} pixels")
+    ids = np.array(sorted(model.points), np.int64)
+    for image in model.images.values():
+        if image.camera not in model.cameras:
+            raise ValueError(f"image {image.name} is of camera {image.camera}, which is not there")
+        if not (np.isfinite(image.pose).all() and image.pose[:4].any() and np.abs(image.pose[4:]).max() <= FARTHEST):
+            raise ValueError(f"image {image.name} has no pose: {', '.join(f'{v:.6g}' for v in image.pose)}")
+        seen = image.points != NO_POINT
+        if not (np.abs(image.xy[seen]) <= FARTHEST).all():
+            raise ValueError(f"image {image.name} has keypoints that are nowhere")
+        if (unknown := ~np.isin(image.points, ids) & seen).any():
+            raise ValueError(f"image {image.name} sees point {image.points[unknown][0]}, which is not there")
+    for number, point in model.points.items():
+        if not (np.abs(point.xyz) <= FARTHEST).all():
+            raise ValueError(f"point {number} is nowhere: {', '.join(f'{v:.6g}' for v in point.xyz)}")
+
+
+def _camera(name: str, width: int, height: int, params: tuple[float, ...]) -> Camera:
+    if name not in PARAMETERS:
+        raise ValueError(f"there is no camera model {name[:40]!r}")
+    if len(params) != PARAMETERS[name]:
+        raise ValueError(f"a {name} camera has {PARAMETERS[name]} parameters, not {len(params)}")
+    return Camera(name, width, height, params)
+
+
+# --- binary: little endian, a count and so many entries
+
+
+class _Bytes:
+    """A file's bytes, taken from the front; asking for more than are left raises ValueError."""
+
+    def __init__(self, path: Path) -> None:
+        self.data, self.place = path.read_bytes(), 0
+
+    def take(self, form: str) -> tuple:
+        """The next numbers of this struct format."""
+        values = struct.unpack_from(f"<{form}", self.data, self.place)
+        self.place += struct.calcsize(f"<{form}")
+        return values
+
+    def skip(self, count: int, size: int) -> memoryview:
+        """The next ``count`` entries of ``size`` bytes."""
+        end = self.place + count * size
+        if end > len(self.data):
+            raise ValueError(f"it announces {count} entries after byte {self.place} and ends at {len(self.data)}")
+        part = memoryview(self.data)[self.place : end]
+        self.place = end
+        return part
+
+    def text(self) -> str:
+        """Up to the next zero byte."""
+        end = self.data.index(b"\0", self.place)
+        name = self.data[self.place : end].decode("utf-8", "backslashreplace")
+        self.place = end + 1
+        return name
+
+
+def _binary_cameras(path: Path) -> Iterator[tuple[int, Camera]]:
+    file = _Bytes(path)
+    for _ in range(*file.take("Q")):
+        number, model, width, height = file.take("IiQQ")
+        if model not in CAMERA_MODELS:
+            raise ValueError(f"there is no camera model {model}")
+        name, count = CAMERA_MODELS[model]
+        yield number, _camera(name, width, height, file.take(f"{count}d"))
+
+
+def _binary_images(path: Path) -> Iterator[tuple[int, FileImage]]:
+    file = _Bytes(path)
+    keypoint = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
+    for _ in range(*file.take("Q")):
+        number, *pose, camera = file.take("I7dI")
+        name = file.text()
+        seen = np.frombuffer(file.skip(file.take("Q")[0], keypoint.itemsize), keypoint)
+        yield number, FileImage(name, camera, np.array(pose), seen["xy"], seen["point"])
+
+
+def _binary_points(path: Path) -> Iterator[tuple[int, FilePoint]]:
+    file = _Bytes(path)
+    for _ in range(*file.take("Q")):
+        number, x, y, z, r, g, b, error, track = file.take("q3d3BdQ")
+        file.skip(track, 8)
+        yield number, FilePoint((x, y, z), (r, g, b), error)
+
+
+# --- text: a line per entry, two per image
+
+
+def _lines(path: Path) -> list[str]:
+    return [line for line in path.read_text("utf-8-sig", "backslashreplace").split("\n") if not line.startswith("#")]
+
+
+def _fields(line: str, least: int) -> list[str]:
+    fields = line.split()
+    if len(fields) < least:
+        raise ValueError(f"a line has {len(fields)} fields where {least} belong: {line[:60]!r}")
+    return fields
+
+
+def _text_cameras(path: Path) -> Iterator[tuple[int, Camera]]:
+    for line in filter(str.strip, _lines(path)):
+        number, model, width, height, *params = _fields(line, 4)
+        yield int(number), _camera(model, int(width), int(height), tuple(map(float, params)))
+
+
+def _text_images(path: Path) -> Iterator[tuple[int, FileImage]]:
+    lines = iter(_lines(path))
+    for line in lines:
+        if not line.strip():
+            continue
+        number, *pose, camera, name = [*_fields(line, 10)[:9], line.split(maxsplit=9)[9].strip()]
+        seen = next(lines, "").split()
+        triples = list(zip_longest(*[iter(seen)] * 3))
+        if triples and None in triples[-1]:
+            raise ValueError(f"the keypoints of {name} are no triples")
+        xy = np.array([[float(x), float(y)] for x, y, _ in triples]).reshape(-1, 2)
+        points = np.array([int(point) for _, _, point in triples], np.int64)
+        yield int(number), FileImage(name, int(camera), np.array(pose, float), xy, points)
+
+
+def _text_points(path: Path) -> Iterator[tuple[int, FilePoint]]:
+    for line in filter(str.strip, _lines(path)):
+        number, *xyz_rgb, error = _fields(line, 8)[:8]
+        rgb = tuple(int(value) for value in xyz_rgb[3:])
+        if not all(0 <= value <= 255 for value in rgb):
+            raise ValueError(f"point {number} has the colour {rgb}")
+        yield int(number), FilePoint(tuple(map(float, xyz_rgb[:3])), rgb, float(error))

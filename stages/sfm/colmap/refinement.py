@@ -1,0 +1,207 @@
+"""The final adjustment of cameras and points. Call it in a child process."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from stages.sfm.colmap.held_out import Choice, adjustment_options, choose
+from stages.sfm.colmap.lenses import MODELS, equip, flaws
+from stages.sfm.colmap.mapping import pipeline_options
+from stages.sfm.colmap.observations import noise_px, observations
+from stages.sfm.colmap.uncertainty import pose_uncertainty_px
+
+if TYPE_CHECKING:
+    import pycolmap
+
+# The first choice can only go by what mapping's lens let in. Where another one lets in a tenth more, mostly from the
+# borders of wide photos, that is where it shows what it is worth.
+MANY_MORE = 1.1
+SIMPLEST = MODELS[0]
+CLOSING_STEPS = (3, 3)  # of the adjustment of all observations, before and after those that fit no more are dropped
+
+
+@dataclass(frozen=True)
+class Finished:
+    """The model after the final adjustment and what there is to say about it."""
+
+    model: "pycolmap.Reconstruction"
+    camera_models: list[dict[str, Any]]  # the comparison, a row per candidate (registration.json)
+    notes: list[str]
+    uncertainty_px: dict[str, float]  # by the image's name
+    left_out: dict[str, str]  # by the image's name, why its camera cannot be used: it has no place any more
+
+
+def finish(
+    mapped: "pycolmap.Reconstruction",
+    database: Path,
+    seed: int,
+    camera_model: str | None,
+    lens_is_known: bool,
+    thinned: bool = False,
+) -> Finished:
+    """Choose the camera model by held-out observations, unless it is given, and adjust everything with it.
+
+    Of a given model it is only chosen whether its principal point is refined; a known lens is kept as it is. Where
+    many more observations fit the chosen lens than mapping's, the choice is made again with them. No camera of the
+    model is absurd in the end, unless those of most photos are. Of a model of ``thinned`` matches (thinning.py) the
+    tracks that it has are adjusted first; then all matches come back.
+    """
+    import pycolmap
+
+    if lens_is_known:
+        choice = Choice(noise_px(mapped, observations(mapped)), notes=["the camera is kept as given"])
+        model = pycolmap.Reconstruction(mapped)
+        adjust = _adjust_thinned if thinned else _adjust
+        adjust(model, database, seed, set(model.cameras), adjustment_options(False, choice.noise_px))
+        return _finished(model, choice, {})
+    models = (camera_model,) if camera_model else MODELS
+    choice = choose(mapped, seed, models)
+    model = _adjusted(mapped, database, seed, choice, thinned)
+    if not thinned and model.compute_num_observations() > MANY_MORE * mapped.compute_num_observations():
+        choice = choose(model, seed, models)
+        model = _adjusted(model, database, seed, choice, thinned)
+    _simplify_absurd(model, database, seed, choice)
+    return _finished(model, choice, _leave_out(model, flaws(model)))
+
+
+def _simplify_absurd(model: "pycolmap.Reconstruction", database: Path, seed: int, choice: Choice) -> None:
+    """Make pinholes of absurd cameras, fisheyes excepted, and adjust everything but the other cameras.
+
+    They are mostly those of few photos, that show too little to be judged by, or were judged by what others show.
+    """
+    absurd = {i: why for i, why in flaws(model).items() if not _camera(model, i).model_name.endswith("FISHEYE")}
+    if not absurd:
+        return
+    cameras = {_camera(model, image_id).camera_id for image_id in absurd}
+    equip(model, dict.fromkeys(cameras, SIMPLEST))
+    _adjust(model, database, seed, set(model.cameras) - cameras, adjustment_options(False, choice.noise_px))
+    photos = f"{len(absurd)} photo{'s' * (len(absurd) != 1)}"
+    choice.notes.append(f"{photos}: the camera came out absurd ({next(iter(absurd.values()))}): {SIMPLEST} instead")
+
+
+def _camera(model: "pycolmap.Reconstruction", image_id: int) -> "pycolmap.Camera":
+    return model.camera(model.image(image_id).camera_id)
+
+
+def _leave_out(model: "pycolmap.Reconstruction", absurd: dict[int, str]) -> dict[str, str]:
+    """Take these photos out of the model: by name why. None where they are most of all: what is left is no scene."""
+    if not absurd or 2 * len(absurd) >= model.num_reg_images():
+        return {}
+    reasons = {model.image(image_id).name: f"its camera came out absurd: {why}" for image_id, why in absurd.items()}
+    for image_id in absurd:
+        model.deregister_frame(model.image(image_id).frame_id)
+    model.tear_down()  # their cameras go too
+    model.update_point_3d_errors()
+    return reasons
+
+
+def _finished(model: "pycolmap.Reconstruction", choice: Choice, left_out: dict[str, str]) -> Finished:
+    notes, uncertainty = choice.notes, {}
+    untold = "how well the poses are known cannot be told"
+    try:
+        uncertainty = pose_uncertainty_px(model, choice.noise_px)
+    except np.linalg.LinAlgError:
+        notes = [*notes, f"{untold}: the points leave some of them free to move"]
+    except MemoryError as error:
+        notes = [*notes, f"{untold}: {str(error) or 'memory ran out'}"]
+    by_name = {model.image(i).name: px for i, px in uncertainty.items()}
+    return Finished(model, choice.table, notes, by_name, left_out)
+
+
+def _adjusted(
+    before: "pycolmap.Reconstruction", database: Path, seed: int, choice: Choice, thinned: bool
+) -> "pycolmap.Reconstruction":
+    import pycolmap
+
+    adjust = _adjust_thinned if thinned else _adjust
+    model = pycolmap.Reconstruction(before)
+    equip(model, {camera_id: lens.model for camera_id, lens in choice.lenses.items()})
+    centred = {camera_id for camera_id, lens in choice.lenses.items() if not lens.principal_point}
+    # Whether to refine principal points holds for all cameras at once: those that keep theirs are adjusted before.
+    if centred:
+        adjust(model, database, seed, set(), adjustment_options(False, choice.noise_px))
+    if centred != choice.lenses.keys():
+        adjust(model, database, seed, centred, adjustment_options(True, choice.noise_px))
+    return model
+
+
+def _adjust_thinned(
+    model: "pycolmap.Reconstruction",
+    database: Path,
+    seed: int,
+    constant_cameras: set[int],
+    adjustment: "pycolmap.BundleAdjustmentOptions",
+) -> None:
+    """Adjust cameras, poses and the tracks there are until little changes; then bring back all matches, and adjust all
+    of it in a few steps: the long tracks have put everything in its place by then."""
+    adjust_tracks(model, constant_cameras, adjustment)
+    mapper, options = _mapper(model, database, seed, constant_cameras)
+    for image_id in sorted(model.reg_image_ids()):
+        mapper.triangulate_image(options.triangulation, image_id)
+    for steps in CLOSING_STEPS:
+        mapper.complete_and_merge_tracks(options.triangulation)
+        mapper.filter_points(options.mapper)
+        adjust_tracks(model, constant_cameras, adjustment, steps)
+    mapper.filter_points(options.mapper)
+    mapper.end_reconstruction(discard=False)
+    model.update_point_3d_errors()
+
+
+def adjust_tracks(
+    model: "pycolmap.Reconstruction",
+    constant_cameras: set[int],
+    adjustment: "pycolmap.BundleAdjustmentOptions",
+    steps: int = 100,
+) -> None:
+    """Adjust cameras, poses and points to the observations that the model has."""
+    import pycolmap
+
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in sorted(model.reg_image_ids()):
+        config.add_image(image_id)
+    for camera_id in constant_cameras:
+        config.set_constant_cam_intrinsics(camera_id)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    adjustment.ceres.solver_options.max_num_iterations = steps
+    pycolmap.create_default_bundle_adjuster(adjustment, config, model).solve()
+
+
+def _adjust(
+    model: "pycolmap.Reconstruction",
+    database: Path,
+    seed: int,
+    constant_cameras: set[int],
+    adjustment: "pycolmap.BundleAdjustmentOptions",
+) -> None:
+    """Complete, merge and filter tracks and adjust everything together, until little changes."""
+    mapper, options = _mapper(model, database, seed, constant_cameras)
+    mapper.iterative_global_refinement(
+        options.ba_global_max_refinements,
+        options.ba_global_max_refinement_change,
+        options.mapper,
+        adjustment,
+        options.triangulation,
+    )
+    mapper.end_reconstruction(discard=False)
+    model.update_point_3d_errors()
+
+
+def _mapper(
+    model: "pycolmap.Reconstruction", database: Path, seed: int, constant_cameras: set[int]
+) -> "tuple[pycolmap.IncrementalMapper, pycolmap.IncrementalPipelineOptions]":
+    """A mapper that works on the model with all matches of the database, and its options."""
+    import pycolmap
+
+    options = pipeline_options(seed)
+    options.mapper.constant_cameras = constant_cameras
+    with pycolmap.Database.open(database) as db:
+        wanted = pycolmap.DatabaseCacheOptions(min_num_matches=options.min_num_matches)
+        cache = pycolmap.DatabaseCache.create(db, wanted)
+    for camera in model.cameras.values():  # the database still has the model that mapping began with
+        cached = cache.camera(camera.camera_id)
+        cached.model, cached.params = camera.model, camera.params
+    mapper = pycolmap.IncrementalMapper(cache)
+    mapper.begin_reconstruction(model)
+    return mapper, options

@@ -1,0 +1,179 @@
+"""Photos whose poses the matches contradict: freed, registered again, left out if that does not help.
+
+Call it in a child process. What contradicts a pose is decided in stages/sfm/geometry_check.py.
+"""
+
+import shutil
+from collections.abc import Container, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from stages.sfm.colmap.correspondences import read_pair_matches
+from stages.sfm.colmap.mapping import map_incrementally
+from stages.sfm.colmap.matching import copy_without_pairs, finish_copy, keep_inliers, unfinished_copy
+from stages.sfm.geometry_check import (
+    PairMatches,
+    PoseCheck,
+    believed,
+    check_poses,
+    cut_off,
+    is_torn,
+    row_breaks,
+    weak_links,
+)
+from stages.sfm.pairs.match_graph import ORDER_OVERLAP
+
+if TYPE_CHECKING:
+    import pycolmap
+
+
+class Checked(NamedTuple):
+    """What the verified matches of a database say of a model's poses; photos in order of ``ids``."""
+
+    ids: list[int]
+    matches: PairMatches
+    check: PoseCheck
+
+    def failed(self) -> list[int]:
+        """The image ids of photos whose poses do not stand."""
+        return [image_id for image_id, passed in zip(self.ids, self.check.passed, strict=True) if not passed]
+
+
+def check_model(model: "pycolmap.Reconstruction", database: Path, seed: int) -> Checked:
+    """Check every registered photo by all verified matches, those that mapping did not use or rejected as well."""
+    import pycolmap
+
+    with pycolmap.Database.open(database) as db:
+        ids, matches = read_pair_matches(db, model, seed)
+    return Checked(ids, matches, check_poses(matches, camera_poses(model)))
+
+
+def camera_poses(model: "pycolmap.Reconstruction") -> Float[np.ndarray, "photos 3 4"]:
+    """World from camera of every registered photo, in order of image id."""
+    poses = [model.image(i).cam_from_world().inverse().matrix() for i in sorted(model.reg_image_ids())]
+    return np.array(poses).reshape(-1, 3, 4)
+
+
+def reasons(model: "pycolmap.Reconstruction", checked: Checked) -> dict[str, str]:
+    """By name, why each photo that failed cannot stay."""
+    check, found = checked.check, {}
+    groups = int(check.misplaced.sum())
+    for image_id, misplaced, unlinked, agree, against in zip(
+        checked.ids, check.misplaced, check.unlinked, check.votes_for, check.votes_against, strict=True
+    ):
+        if misplaced:
+            matches = f"{against:,.0f} of its {agree + against:,.0f} verified matches with other photos"
+            together = f", as for {groups - 1} more" if groups > 1 else ""
+            found[model.image(image_id).name] = f"its place is contradicted by {matches}{together}"
+        elif unlinked:
+            found[model.image(image_id).name] = "no verified match supports its place among the other photos"
+    return found
+
+
+def tears(checked: Checked, row: Sequence[int]) -> bool:
+    """Whether the poses tear the ``row`` (image ids) apart: no photo by itself is at fault then."""
+    return is_torn(_places(checked, row), checked.matches, checked.check)
+
+
+def copy_believed(
+    model: "pycolmap.Reconstruction", database: Path, copy: Path, trusted: Container[tuple[int, int]]
+) -> None:
+    """Copy the database with the verified matches alone that are believed beside a model which those of ``trusted``
+    pairs (image ids, the lower first) made."""
+    import pycolmap
+
+    unfinished = unfinished_copy(database, copy)
+    with pycolmap.Database.open(unfinished) as db, pycolmap.DatabaseTransaction(db):
+        ids, matches = read_pair_matches(db, model, 0, most=None)
+        pairs = np.sort(np.array(ids)[matches.pairs], axis=1).tolist()
+        kept = believed(matches, camera_poses(model), np.array([(i, j) in trusted for i, j in pairs], bool))
+        bounds = np.searchsorted(matches.pair, np.arange(len(pairs) + 1))
+        mine = {(i, j): kept[bounds[k] : bounds[k + 1]] for k, (i, j) in enumerate(pairs)}
+        for pair_id, geometry in zip(*db.read_two_view_geometries(), strict=True):
+            first, second = pycolmap.pair_id_to_image_pair(pair_id)
+            keep = mine.get((first, second), np.zeros(0, bool))
+            if (first, second) not in trusted or len(keep):
+                keep_inliers(db, (first, second), geometry, keep)
+    finish_copy(unfinished, copy)
+
+
+def drop_cut_off(model: "pycolmap.Reconstruction", checked: Checked, row: Sequence[int]) -> dict[str, str]:
+    """Take out photos that stand off the longest piece of a ``row`` (image ids, none where it is not known) that falls
+    apart: by name why."""
+    neighbours = "photos taken just before or after" if tears(checked, row) else "photos between it and the others"
+    lost = cut_off(_places(checked, row), checked.matches, checked.check, ORDER_OVERLAP)
+    ids = [image_id for image_id, cut in zip(checked.ids, lost, strict=True) if cut]
+    deregister(model, ids)
+    why = f"its place is contradicted by {neighbours}: parts of the scene look alike"
+    return {model.image(image_id).name: why for image_id in ids}
+
+
+def _places(checked: Checked, row: Sequence[int]) -> Int[np.ndarray, "photos"]:
+    """The row in numbers of the check."""
+    place = {image_id: number for number, image_id in enumerate(checked.ids)}
+    return np.array([place[image_id] for image_id in row if image_id in place], int)
+
+
+def facts(model: "pycolmap.Reconstruction", checked: Checked, row: Sequence[int] = ()) -> dict[str, Any]:
+    """What registration.json says of a check, as plain JSON; of each photo under "images", by name.
+
+    ``row``: image ids in the order in which photos were taken, where that is known.
+    """
+    names, check = [model.image(i).name for i in checked.ids], checked.check
+    votes = check.votes_for + check.votes_against
+    return {
+        "pairs": int(check.agrees.sum() + check.contradicts.sum()),
+        "agreeing": int(check.agrees.sum()),
+        "error_px": check.usual_px,
+        "tolerance_px": check.tolerance_px,
+        "doubtful": [name for name, misplaced in zip(names, check.misplaced, strict=True) if misplaced],
+        "weak_links": [
+            {"photos": [names[i] for i in link.photos], "pairs": link.pairs, "matches": link.matches}
+            for link in weak_links(checked.matches, check)
+        ],
+        "row_breaks": [[names[i] for i in step] for step in row_breaks(_places(checked, row), checked.matches, check)],
+        "images": {
+            name: {"agreement": agree / of if of else None, "transfer_px": float(px) if np.isfinite(px) else None}
+            for name, agree, of, px in zip(names, check.votes_for, votes, check.photo_error_px, strict=True)
+        },
+    }
+
+
+def deregister(model: "pycolmap.Reconstruction", image_ids: Sequence[int]) -> None:
+    """Free photos of their poses; what only they saw goes with them."""
+    for image_id in image_ids:
+        model.deregister_frame(model.image(image_id).frame_id)
+    model.update_point_3d_errors()
+
+
+def register_again(
+    model: "pycolmap.Reconstruction",
+    checked: Checked,
+    database: Path,
+    images: Path,
+    scratch: Path,
+    options: "pycolmap.IncrementalPipelineOptions",
+) -> "pycolmap.Reconstruction":
+    """The model with the photos that failed freed and, where possible, registered anew.
+
+    Pairs of photos that stand and contradict their poses are mistakes of matching: mapping goes on without them.
+    """
+    from stages.sfm.colmap.models import load_native, write_native
+
+    begin, models = scratch / "begin", scratch / "models"
+    shutil.rmtree(scratch, ignore_errors=True)
+    failed = checked.failed()
+    write_native(begin, model)
+    freed = load_native(begin)
+    deregister(freed, failed)
+    write_native(begin, freed)
+    clean, passed = scratch / "clean.db", checked.check.passed
+    mistakes = checked.matches.pairs[checked.check.contradicts & passed[checked.matches.pairs].all(axis=1)]
+    copy_without_pairs(database, clean, np.array(checked.ids)[mistakes].tolist())
+    found = map_incrementally(clean, images, models, options, begin=begin)
+    best = max(found, key=lambda one: (one.num_reg_images(), one.num_points3D()), default=freed)
+    shutil.rmtree(scratch, ignore_errors=True)
+    return best if best.num_reg_images() >= freed.num_reg_images() else freed

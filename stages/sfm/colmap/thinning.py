@@ -1,0 +1,102 @@
+"""Fewer matches for mapping: the longest tracks of each photo, spread over it. Call it in a child process.
+
+Bundle adjustment takes time with the observations, and hundreds of photos have far more than their poses need. Long
+tracks tie many photos together; where structure repeats, chance matches make short ones. Mapping works on these, and
+the final adjustment brings back all matches (stages/sfm/colmap/refinement.py).
+"""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from stages.sfm.colmap.correspondences import Correspondences, read_correspondences
+from stages.sfm.colmap.matching import finish_copy, keep_inliers, unfinished_copy
+
+if TYPE_CHECKING:
+    import pycolmap
+
+TRACKS_PER_PHOTO = 500  # of mapping: 1,000 take 1.7 times as long and move no camera by more (docs/stages/sfm.md)
+CELLS = 4  # of 4 × 4 parts of a photo each gives tracks in turn: those of one corner would leave the rest loose
+
+
+def thin_matches(database: Path, copy: Path, tracks: int = TRACKS_PER_PHOTO) -> None:
+    """Copy the database with the verified matches of each photo's best ``tracks`` tracks alone.
+
+    Focal lengths that nothing tells are calibrated by all pairs together in the copy: mapping that begins with a guess
+    that is a fifth off can take minutes to leave it, or end with a lens that draws everything wrong.
+    """
+    import pycolmap
+
+    unfinished = unfinished_copy(database, copy)
+    with pycolmap.Database.open(unfinished) as db:
+        geometries = dict(zip(*db.read_two_view_geometries(), strict=True))
+        matches = read_correspondences(db, geometries)
+        cells = _cells(db, len(matches.begins) - 1)
+    calibrate_focal_lengths(unfinished)
+    kept = best_tracks(matches, cells, tracks)[matches.keypoint[:, 0]]
+    bounds = np.searchsorted(matches.pair, np.arange(len(matches.pairs) + 1))
+    with pycolmap.Database.open(unfinished) as db, pycolmap.DatabaseTransaction(db):
+        for number, (first, second) in enumerate(matches.pairs.tolist()):
+            geometry = geometries[pycolmap.image_pair_to_pair_id(first, second)]
+            keep_inliers(db, (first, second), geometry, kept[bounds[number] : bounds[number + 1]])
+    finish_copy(unfinished, copy)
+
+
+def _cells(db: "pycolmap.Database", photos: int) -> Int[np.ndarray, "keypoints"]:
+    """In which part of its photo each keypoint lies."""
+    found = [np.zeros(0, int)]
+    for photo in range(photos):
+        camera = db.read_camera(db.read_image(photo + 1).camera_id)
+        xy: Float[np.ndarray, "n 2"] = np.array(db.read_keypoints(photo + 1), float).reshape(-1, 6)[:, :2]
+        column, row = np.clip(CELLS * xy / (camera.width, camera.height), 0, CELLS - 1).astype(int).T
+        found.append(row * CELLS + column)
+    return np.concatenate(found)
+
+
+def best_tracks(matches: Correspondences, cells: Int[np.ndarray, "keypoints"], tracks: int) -> Bool[np.ndarray, "k"]:
+    """Which keypoints belong to one of the ``tracks`` best tracks of any photo: the longest in each of its cells, then
+    the second longest, and so on. A track that sees a photo twice has mistakes in it and comes after all others."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    count, photos = int(matches.begins[-1]), len(matches.begins) - 1
+    edges = (np.ones(len(matches.keypoint), bool), tuple(matches.keypoint.T))
+    _, track = connected_components(coo_matrix(edges, shape=(count, count)), directed=False)
+    photo = np.repeat(np.arange(photos), np.diff(matches.begins))
+    sees = np.unique(track.astype(np.int64) * photos + photo) // photos
+    size, length = np.bincount(track), np.bincount(sees, minlength=int(track.max(initial=-1)) + 1)
+    length = np.where(size == length, length, 1)  # with mistakes: behind all others
+    length = np.where(size > 1, length, 0)[track]  # never matched: last of all
+    in_cell = _rank(photo * CELLS**2 + cells, -length)
+    best = (_rank(photo, in_cell, -length) < tracks) & (size[track] > 1)
+    keep = np.zeros(len(size), bool)
+    keep[track[best]] = True
+    return keep[track]
+
+
+def _rank(group: Int[np.ndarray, "n"], *keys: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
+    """The place of each entry within its group, by these keys; ties by place in the list."""
+    order = np.lexsort((*reversed(keys), group))
+    begins = np.searchsorted(group[order], group[order])
+    rank = np.empty(len(group), int)
+    rank[order] = np.arange(len(group)) - begins
+    return rank
+
+
+def calibrate_focal_lengths(database: Path) -> None:
+    """Where no focal length is known: those under which most fundamental matrices are essential ones (Sweeney et al.
+    2015, "Optimizing the viewing graph for structure-from-motion"). Nothing changes where the pairs do not tell."""
+    import pycolmap
+
+    with pycolmap.Database.open(database) as db:
+        before = db.read_all_cameras()
+    if any(camera.has_prior_focal_length for camera in before):
+        return
+    options = pycolmap.ViewGraphCalibrationOptions(random_seed=0, reestimate_relative_pose=False)
+    if pycolmap.calibrate_view_graph(database, options):
+        return
+    with pycolmap.Database.open(database) as db, pycolmap.DatabaseTransaction(db):
+        for camera in before:
+            db.update_camera(camera)

@@ -1,0 +1,76 @@
+"""A second opinion: global mapping (GLOMAP, Pan et al. 2024) of the same matches, in a process of its own.
+
+It places all photos at once, incremental mapping one after the other, so they go wrong in different ways. It works on
+fewer tracks, on a core that incremental mapping leaves free. ``python -P -m stages.sfm.global_mapping`` reads a job
+from stdin as one line of JSON, and writes the best model into its folder.
+"""
+
+import json
+import shutil
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from typing import NamedTuple
+
+from stages.io.files import make_durable
+from stages.sfm.colmap.mapping import map_globally
+from stages.sfm.colmap.models import write_native
+from stages.sfm.colmap.thinning import thin_matches
+from stages.sfm.process import environment
+from stages.sfm.work import end_with_parent
+
+TRACKS_PER_PHOTO = 200  # of the best: enough for poses that are compared, not kept
+MIN_PHOTOS = 10  # of fewer there is no telling which of two opinions is right
+CHILD = ["-P", "-m", "stages.sfm.global_mapping"]
+
+
+class Started(NamedTuple):
+    """Global mapping at work; its model comes into ``folder``."""
+
+    process: "subprocess.Popen[bytes]"
+    folder: Path
+
+
+def start(database: Path, thinned: Path, images: Path, folder: Path, seed: int, lens_is_known: bool) -> Started:
+    """Begin with the best matches of ``database``, copied to ``thinned``; the caller waits with :func:`failure`.
+
+    It ends with this process.
+    """
+    shutil.rmtree(folder, ignore_errors=True)
+    paths = {"database": database, "thinned": thinned, "images": images, "folder": folder}
+    job = {name: str(path) for name, path in paths.items()} | {"seed": seed}
+    process = subprocess.Popen([sys.executable, *CHILD], stdin=subprocess.PIPE, stdout=2, env=environment())
+    assert process.stdin
+    process.stdin.write(json.dumps(job | {"lens_is_known": lens_is_known}).encode() + b"\n")
+    process.stdin.flush()  # and left open: its end tells the process that this one is gone
+    return Started(process, folder)
+
+
+def failure(started: Started) -> str | None:
+    """Wait until it is done: why there is no model, None if there is one."""
+    code = started.process.wait()
+    if code == 0 and started.folder.exists():
+        return None
+    return f"global mapping ended with code {code}" if code else "global mapping found no model"
+
+
+def main() -> None:
+    """Read the job from stdin, do it."""
+    job = json.loads(sys.stdin.buffer.readline())
+    threading.Thread(target=end_with_parent, daemon=True).start()
+    folder = Path(job["folder"])
+    scratch = folder.with_name(f"{folder.name}.scratch")
+    thinned = Path(job["thinned"])
+    thin_matches(Path(job["database"]), thinned, TRACKS_PER_PHOTO)
+    models = map_globally(thinned, Path(job["images"]), scratch, job["seed"], job["lens_is_known"])
+    shutil.rmtree(scratch, ignore_errors=True)
+    if models:
+        unfinished = folder.with_name(f"{folder.name}.unfinished")
+        write_native(unfinished, models[0])
+        make_durable(unfinished)
+        unfinished.rename(folder)
+
+
+if __name__ == "__main__":
+    main()

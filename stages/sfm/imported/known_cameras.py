@@ -1,0 +1,388 @@
+"""Cameras that are known already: transforms.json, Blender's transforms_train/test.json, or a COLMAP model.
+
+Poses in transforms files are world_from_camera with OpenGL axes (x right, y up, z backward); they are turned to
+OpenCV axes here and nowhere else. Photos are told apart by their own names, as ingest noted them. Cameras of photos as
+their files store them are turned upright as ingest turned the photos.
+"""
+
+import os
+import unicodedata
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import takewhile
+from pathlib import Path, PurePosixPath
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from nerf.geometry.scene import Camera
+from stages.contract import StageError
+from stages.ingest.sources import account_of_ours
+from stages.io.photos import Photo
+from stages.io.sparse_model import SparseModel
+from stages.io.transforms_export import OPENGL_FROM_OPENCV
+from stages.io.transforms_files import MOST_LETTERS, TRAIN, none_among_the_photos, pose_matrix, read_splits
+from stages.io.transforms_intrinsics import read_intrinsics
+from stages.sfm.colmap.model_files import FARTHEST
+from stages.sfm.colmap.models import read_model
+from stages.sfm.imported.orientation import fits_only_upright, pixel_map, stored_size
+from stages.sfm.imported.posed_photos import HINT, PosedPhoto, distinct, posed_photo, unusable, without_rays
+
+ORTHONORMAL_WITHIN = 1e-3  # largest entry of RᵀR − 1 that is rounding; beyond it a matrix means something else
+LARGEST_ENTRY = 1e6  # of a matrix that is looked at more closely: products of three of them are numbers
+MOST_NAMES, FEW_NAMES = 5, 2
+APPROXIMATION = "approximation"  # how the note begins of a lens that is not the one it stands for
+
+
+@dataclass(frozen=True)
+class KnownCameras:
+    """``left_out``: why photos are that have a camera; ``test_files``: an official split; both by files relative to
+    ingest's ``images/``. ``notes`` are for the user."""
+
+    model: SparseModel
+    left_out: dict[str, str]
+    test_files: list[str] | None
+    notes: list[str]
+
+    def account(self, photos: Sequence[Photo]) -> list[dict[str, Any]]:
+        """What became of each photo, for registration.json."""
+        seen = np.bincount(self.model.view, minlength=len(self.model.images)).tolist()
+        observations = {image.file: count for image, count in zip(self.model.images, seen, strict=True)}
+        reasons = self.left_out | dict.fromkeys(observations)
+        return [
+            {
+                "file": file,
+                "registered": file in observations,
+                "reason": reasons.get(file, "the given cameras have none for it"),
+                "keypoints": observations.get(file, 0),
+                "observations": observations.get(file, 0),
+            }
+            for file in (photo.image_name for photo in photos)
+        ]
+
+
+class _Framed(NamedTuple):
+    photo: Photo
+    frame: Mapping[str, Any]
+    values: Mapping[str, Any]  # of the frame, and of its file where the frame has none
+
+
+def read_known_cameras(cameras: Path, photos: Sequence[Photo], frames: Mapping[str, str]) -> KnownCameras:
+    """Read ``cameras`` and match them to ``photos``. ``frames`` maps a transforms file's file_path to a photo's name.
+
+    Raises StageError, naming the frame, for anything that is no camera: numbers that are not finite, a focal length
+    that is not positive, a rotation that is scaled or mirrored; and where no frame has a photo.
+    """
+    if cameras.is_file() or (cameras / TRAIN).is_file():
+        return _from_transforms(cameras, photos, frames)
+    return _from_colmap(cameras, photos)
+
+
+# --- transforms files
+
+
+def _from_transforms(cameras: Path, photos: Sequence[Photo], frames: Mapping[str, str]) -> KnownCameras:
+    by_name = {photo.name: photo for photo in photos}
+    framed: dict[str, _Framed] = {}
+    absent, test_files, approximate = [], [], 0
+    unused: dict[str, Photo] = {}  # by file
+    splits, notes = read_splits(cameras, lambda frame: frames.get(frame["file_path"]) in by_name)
+    for where, content in splits:
+        held_out, in_no_split = _split(content, where, notes)
+        for frame in content["frames"]:
+            name = frame["file_path"]
+            photo = by_name.get(frames.get(name, ""))
+            if photo is None:
+                absent.append(name)
+                continue
+            file = photo.image_name
+            if PurePosixPath(name) in in_no_split:
+                unused[file] = photo
+                continue
+            if file in framed:
+                raise StageError(f"two frames for the photo {photo.name}", f"one is {name!r}", HINT)
+            values = {**content, **frame}
+            framed[file] = _Framed(photo, frame, values)
+            approximate += str(values.get("note", "")).startswith(APPROXIMATION)
+            if PurePosixPath(name) in held_out:
+                test_files.append(file)
+        if held_out and not test_files:
+            notes.append(none_among_the_photos(len(held_out), where))
+    if approximate:
+        notes.append(f"the lenses of {approximate} frames are approximations, as their notes in the file say")
+    if not framed:
+        raise _nothing_matches(splits[0][0], absent, photos)
+    upright = _are_of_upright_photos(framed.values())
+    posed = [_from_frame(framed[file], upright) for file in sorted(framed)]
+    left_out = without_rays(posed)
+    kept = [one for one in posed if one.file not in left_out]
+    unposed = [photo.name for photo in photos if photo.image_name not in framed.keys() | unused.keys()]
+    kept_tests = sorted(set(test_files) - left_out.keys())
+    if test_files and not kept_tests:
+        notes.append("all official test photos are among those left out, so others are held out")
+    if unused:
+        names = _few(sorted(photo.name for photo in unused.values()))
+        notes.append(f"{len(unused)} photos are neither to train nor to test on and are left out: {names}")
+    return KnownCameras(
+        model=SparseModel.without_points(*distinct(kept)),
+        left_out=left_out | dict.fromkeys(unused, "the transforms file has it neither to train nor to test on"),
+        test_files=kept_tests or None,
+        notes=_notes(absent, unposed, posed, left_out) + notes,
+    )
+
+
+def _split(content: Mapping[str, Any], source: str, notes: list[str]) -> tuple[set[PurePosixPath], set[PurePosixPath]]:
+    """The official test photos by file_path, nerfstudio's ``test_filenames``, else its ``val_filenames``, less those
+    that its ``train_filenames`` have as well; and the frames that are in no split, where there are such. What is
+    repeated is noted."""
+    train = _listed(content, "train_filenames", source, notes)
+    of_frames = {PurePosixPath(frame["file_path"]) for frame in content["frames"]}
+    for key in ("test_filenames", "val_filenames"):
+        names = _listed(content, key, source, notes)
+        if repeated := len(names & train):
+            notes.append(f"{key} of {source} repeats {repeated} photos to train on: they stay that")
+        if own := names - train:
+            return own, of_frames - train - own if train else set()
+    return set(), of_frames - train if train else set()
+
+
+def _listed(content: Mapping[str, Any], key: str, source: str, notes: list[str]) -> set[PurePosixPath]:
+    """The photos in a list of a transforms file, by file_path. Of names that no frame has, a note is left. Raises
+    StageError where none has a frame."""
+    names = content.get(key) or []
+    if not (isinstance(names, list) and all(isinstance(name, str) for name in names)):
+        raise unusable(f"the {key} of {source}", "it is no list of names")
+    of_frames = {PurePosixPath(frame["file_path"]) for frame in content["frames"]}
+    strange = [name[:MOST_LETTERS] for name in names if PurePosixPath(name) not in of_frames]
+    if strange and len(strange) == len(names):
+        raise unusable(f"the {key} of {source}", f"none of them is the file_path of a frame: {_few(strange)}")
+    if strange:
+        notes.append(f"{len(strange)} photos in {key} of {source} have no frame: {_few(strange)}")
+    return set(map(PurePosixPath, names))
+
+
+def _are_of_upright_photos(framed: Iterable[_Framed]) -> bool:
+    """Whether the cameras are of photos that were turned upright first, as their shapes alone do not tell of half turns
+    and squares: a frame names the photo beside the decoded, upright picture that its camera is of, as in our own
+    exports, or fits a photo only when that is upright."""
+    return any(
+        isinstance(one.frame.get("photo"), str) or fits_only_upright(_given_camera(one, upright=False), one.photo)
+        for one in framed
+    )
+
+
+def _given_camera(framed: _Framed, upright: bool) -> Camera:
+    """The camera of a frame as it stands there, in the size of the photo, ``upright`` or as stored, where it has none
+    of its own."""
+    photo = framed.photo
+    size = (photo.width, photo.height) if upright else stored_size(photo)
+    try:
+        return read_intrinsics(framed.values, *size)
+    except ValueError as error:
+        raise unusable(f"the camera of frame {framed.frame['file_path']!r}", str(error)) from error
+
+
+def _from_frame(framed: _Framed, upright: bool) -> PosedPhoto:
+    name = framed.frame["file_path"]
+    pose = _pose(framed.frame["transform_matrix"], name)
+    return posed_photo(framed.photo, name, _given_camera(framed, upright), pose, upright)
+
+
+def _pose(matrix: Any, name: str) -> Float[np.ndarray, "3 4"]:
+    """world_from_camera with OpenCV axes, from a matrix as written in a transforms file."""
+    try:
+        pose = pose_matrix(matrix)
+    except ValueError as error:
+        raise unusable(f"frame {name!r}", str(error)) from error
+    if (place := np.abs(pose[:, 3]).max()) > FARTHEST:
+        why = f"its place is {place:.3g} units from the origin, and the most is {FARTHEST:g}"
+        raise unusable(f"the transform_matrix of frame {name!r}", why)
+    rotation = pose[:, :3]
+    if not np.abs(rotation).max() <= LARGEST_ENTRY:
+        raise unusable(
+            f"the transform_matrix of frame {name!r}", f"it is no rotation: {np.abs(rotation).max():.3g} is in it"
+        )
+    if (determinant := np.linalg.det(rotation)) < 0:
+        raise unusable(f"the transform_matrix of frame {name!r}", "it mirrors (its determinant is negative)")
+    off = np.abs(rotation.T @ rotation - np.eye(3)).max()
+    if not off <= ORTHONORMAL_WITHIN:
+        why = f"it is no rotation: RᵀR is off by {off:.2g}, and it scales by {np.cbrt(determinant):.4g}"
+        raise unusable(f"the transform_matrix of frame {name!r}", why)
+    u, _, vt = np.linalg.svd(rotation)
+    return np.concatenate([u @ vt @ OPENGL_FROM_OPENCV, pose[:, 3:]], axis=1)
+
+
+# --- COLMAP models
+
+
+def _from_colmap(folder: Path, photos: Sequence[Photo]) -> KnownCameras:
+    given = _with_slashes(read_model(folder), photos)
+    photo_of = _by_name([image.file for image in given.images], photos)
+    if not photo_of:
+        raise _nothing_matches(folder.name, [image.file for image in given.images], photos)
+    upright = _is_of_upright_photos(folder, given, photo_of)
+    posed = {}
+    for i in sorted(photo_of, key=lambda i: photo_of[i].image_name):
+        image = given.images[i]
+        posed[i] = posed_photo(photo_of[i], image.file, given.cameras[image.camera], image.sfm_from_camera, upright)
+    left_out = without_rays(posed.values())
+    kept = {i: one for i, one in posed.items() if one.file not in left_out}
+    pixel_maps = [
+        pixel_map(given.cameras[given.images[i].camera], one.turns, one.photo.width, one.photo.height)
+        for i, one in kept.items()
+    ]
+    cameras, images = distinct(kept.values())
+    model, behind = given.restricted(list(kept), pixel_maps, cameras, images).without_points_behind()
+    notes = _notes(
+        [image.file for i, image in enumerate(given.images) if i not in photo_of],
+        {photo.name for photo in photos} - {photo.name for photo in photo_of.values()},
+        posed.values(),
+        left_out,
+    )
+    if others := [pair for one in kept.values() if (pair := _other_ending(one.name, one.photo))]:
+        notes.append(f"{len(others)} photos have the cameras of files with another ending: {_few(others)}")
+    if behind:
+        notes.append(f"{behind} observations of points behind their cameras are left out")
+    return KnownCameras(model, left_out, None, notes)
+
+
+def _with_slashes(model: SparseModel, photos: Sequence[Photo]) -> SparseModel:
+    """``model`` with the names of its images as Windows means them, backslashes between folders, but for those that
+    are a photo's own."""
+    own = {photo.name for photo in photos}
+    images = [replace(i, file=i.file if i.file in own else i.file.replace("\\", "/")) for i in model.images]
+    return replace(model, images=images)
+
+
+def _is_of_upright_photos(folder: Path, given: SparseModel, photo_of: Mapping[int, Photo]) -> bool:
+    """Whether a model is of photos that were turned upright first, as its shapes alone do not tell of half turns and
+    squares: it is one of ours, or of the pictures that ingest wrote, or fits a photo only when that is upright."""
+    pairs = [(given.images[i], photo) for i, photo in photo_of.items()]
+    has_names_of_ingest = all(image.file == photo.image_name for image, photo in pairs)
+    return (
+        account_of_ours(folder) is not None
+        or (has_names_of_ingest and any(photo.image_name != photo.name for _, photo in pairs))
+        or any(fits_only_upright(given.cameras[image.camera], photo) for image, photo in pairs)
+    )
+
+
+def _by_name(names: Sequence[str], photos: Sequence[Photo]) -> dict[int, Photo]:
+    """Photo by index of its image: of the same name, else of the name that ingest gave it, else of a name whose
+    accents are composed in another way, else of the same name below a folder that all have, else of the same end, else
+    of the same name but for its ending."""
+    found: dict[int, Photo] = {}
+    taken: set[str] = set()
+    by_own, by_given = {photo.name: photo for photo in photos}, {photo.image_name: photo for photo in photos}
+    tiers = (by_own, by_given, _by_key(names, photos, _composed), _by_folder(names, photos), _by_end(names, photos))
+    for photo_of in (*tiers, _by_key(names, photos, _without_ending)):
+        for index, name in enumerate(names):
+            photo = photo_of.get(name)
+            if photo is not None and index not in found and photo.name not in taken:
+                found[index] = photo
+                taken.add(photo.name)
+    return found
+
+
+def _by_folder(names: Sequence[str], photos: Sequence[Photo]) -> dict[str, Photo]:
+    """Photo by name of its image where all images, or else all photos, lie in a folder more: ``images/left/0.jpg`` is
+    ``left/0.jpg``. Of several such folders as few as have a match are left out."""
+    own = [photo.name for photo in photos]
+    of_images = ((_without_folders(names, count), own) for count in range(1, _shared_folders(names) + 1))
+    of_photos = ((names, _without_folders(own, count)) for count in range(1, _shared_folders(own) + 1))
+    for images, called in (*of_images, *of_photos):
+        by_name = dict(zip(map(_composed, called), photos, strict=True))
+        found = {
+            n: by_name[key] for n, image in zip(names, images, strict=True) if (key := _composed(image)) in by_name
+        }
+        if found:
+            return found
+    return {}
+
+
+def _shared_folders(names: Sequence[str]) -> int:
+    """How many folders all the names begin with."""
+    folders = (PurePosixPath(_composed(name)).parent.parts for name in names)
+    return len(list(takewhile(lambda parts: len(set(parts)) == 1, zip(*folders, strict=False))))
+
+
+def _without_folders(names: Sequence[str], count: int) -> list[str]:
+    return [str(PurePosixPath(*PurePosixPath(name).parts[count:])) for name in names]
+
+
+def _by_end(names: Sequence[str], photos: Sequence[Photo]) -> dict[str, Photo]:
+    """Photo by name of its image where one is called ``0.jpg``, say, and the other ``left/0.jpg``, and no other image
+    or photo is called ``0.jpg`` in any folder."""
+    by_last: dict[str, list[Photo]] = {}
+    for photo in photos:
+        by_last.setdefault(_last(photo.name), []).append(photo)
+    images = Counter(map(_last, names))
+    found: dict[str, Photo] = {}
+    for name in names:
+        last = _last(name)
+        same = by_last.get(last, [])
+        if images[last] == len(same) == 1:
+            image, photo = f"/{_composed(name)}", f"/{_composed(same[0].name)}"
+            if image.endswith(photo) or photo.endswith(image):
+                found[name] = same[0]
+    return found
+
+
+def _by_key(names: Sequence[str], photos: Sequence[Photo], key: Callable[[str], str]) -> dict[str, Photo]:
+    """Photo by name of its image where both names have the same key, and no other image or photo has it."""
+    images = Counter(map(key, names))
+    own = Counter(key(photo.name) for photo in photos)
+    by_key = {key_of: photo for photo in photos if own[key_of := key(photo.name)] == 1}
+    return {name: by_key[key_of] for name in names if images[key_of := key(name)] == 1 and key_of in by_key}
+
+
+def _other_ending(name: str, photo: Photo) -> str | None:
+    """A photo and its image in words, where their endings differ."""
+    same = name == photo.image_name or _last(name) == _last(photo.name)
+    return None if same else f"{photo.name} ({name})"
+
+
+def _composed(name: str) -> str:
+    return unicodedata.normalize("NFC", name)
+
+
+def _last(name: str) -> str:
+    return PurePosixPath(_composed(name)).name
+
+
+def _without_ending(name: str) -> str:
+    return os.path.splitext(_composed(name))[0]
+
+
+# --- both
+
+
+def _nothing_matches(source: str, names: Sequence[str], photos: Sequence[Photo]) -> StageError:
+    here = _few([photo.name for photo in photos], FEW_NAMES)
+    return StageError(
+        f"no camera in {source} belongs to a photo",
+        f"it is of {_few(names, FEW_NAMES)}, and the photos are {here}",
+        "Give the folder of the very photos that the cameras were made for.",
+    )
+
+
+def _notes(
+    absent: Collection[str], unposed: Collection[str], posed: Collection[PosedPhoto], left_out: Collection[str]
+) -> list[str]:
+    notes = []
+    bent = [one.photo.name for one in posed if one.file in left_out]
+    for names, what in (
+        (absent, "cameras have no photo"),
+        (unposed, "photos have no camera and are left out"),
+        (bent, "photos have a camera without a ray for some of their pixels and are left out"),
+    ):
+        if names:
+            notes.append(f"{len(names)} {what}: {_few(sorted(names))}")
+    if turned := sum(one.turns > 0 and one.file not in left_out for one in posed):
+        notes.append(f"{turned} cameras are turned upright like their photos (EXIF orientation)")
+    return notes
+
+
+def _few(names: Sequence[str], most: int = MOST_NAMES) -> str:
+    return ", ".join(names[:most]) + (", …" if len(names) > most else "")

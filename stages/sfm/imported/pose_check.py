@@ -1,0 +1,112 @@
+"""Whether cameras that were given fit their photos, in a child process: COLMAP may abort.
+
+Features of reduced photos are matched between neighbours by pose, which the check of stages/sfm/geometry_check.py
+judges. ``python -P -m stages.sfm.imported.pose_check`` reads a job from stdin as one line of JSON and answers with
+another.
+"""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float
+
+from stages.sfm.pairs.pair_selection import Pairs, closeness, nearest
+from stages.sfm.process import environment
+
+if TYPE_CHECKING:
+    from stages.io.photos import Photo
+
+CHILD = ["-P", "-m", "stages.sfm.imported.pose_check"]
+MAX_IMAGE_SIZE, MAX_FEATURES = 1000, 2000  # enough to tell a step of a few pixels, in seconds for hundreds of photos
+PARTNERS = 6  # of each photo
+TURN_DEG = 30.0  # two photos whose axes differ by so much count as far apart as two whose centres are usual neighbours
+MIN_PAIRS = 3  # verified pairs, for there to be any evidence
+
+
+def check_given_cameras(photos: "Sequence[Photo]", images: Path, folder: Path) -> dict[str, Any]:
+    """Check the model in ``folder/sparse``, whose images are these photos in order of ``file``.
+
+    Returns what :func:`stages.sfm.colmap.repair.facts` says, or {"failed": why} where nothing could be compared. The
+    model stays as it is.
+    """
+    job = {"photos": [asdict(photo) for photo in photos], "images": str(images.absolute()), "folder": str(folder)}
+    with (folder / "sfm.log").open("ab") as log:
+        answer = subprocess.run(
+            [sys.executable, *CHILD],
+            input=json.dumps(job).encode() + b"\n",
+            stdout=subprocess.PIPE,
+            stderr=log,
+            env=environment(),
+        )
+    if answer.returncode:
+        return {"failed": f"the check ended with code {answer.returncode}"}
+    return json.loads(answer.stdout)
+
+
+# --- in the child
+
+
+def main() -> None:
+    """Read the job from stdin, do it, print the answer."""
+    job = json.loads(sys.stdin.buffer.readline())
+    channel = os.dup(1)
+    os.dup2(2, 1)  # nothing else may print there
+    os.write(channel, json.dumps(check(**job)).encode())
+
+
+def check(photos: list[dict[str, Any]], images: str, folder: str) -> dict[str, Any]:
+    """Match neighbours by pose and let their matches judge the poses."""
+    from stages.ingest.masks import write_feature_masks
+    from stages.io.photos import Photo
+    from stages.sfm.colmap.mapping import MAPPING_MODEL
+    from stages.sfm.colmap.matching import (
+        STRICT_RATIO,
+        Search,
+        extract_features,
+        fill_database,
+        match_pairs,
+        verified_matches,
+    )
+    from stages.sfm.colmap.models import load_native
+    from stages.sfm.colmap.repair import camera_poses, check_model, facts
+    from stages.sfm.pairs.match_graph import MIN_INLIERS
+
+    some, scratch = [Photo(**photo) for photo in photos], Path(folder, "check")
+    scratch.mkdir(exist_ok=True)
+    database, masks = scratch / "check.db", scratch / "masks"
+    model = load_native(Path(folder, "sparse"))
+    fill_database(database, some, MAPPING_MODEL)
+    search = Search(MAX_IMAGE_SIZE, MAX_FEATURES, doubled_up_to=MAX_IMAGE_SIZE // 2)
+    if write_feature_masks(Path(images).parent, some, masks):
+        search = search._replace(masks=masks)
+    extract_features(database, Path(images), some, search)
+    pairs = neighbours_by_pose(camera_poses(model))
+    match_pairs(database, pairs, 0, STRICT_RATIO)
+    verified = int((verified_matches(database, pairs) >= MIN_INLIERS).sum())
+    checked = check_model(model, database, 0) if verified >= MIN_PAIRS else None
+    shutil.rmtree(scratch)
+    if checked is None:
+        return {"failed": f"only {verified} pairs of neighbouring photos share enough features"}
+    return facts(model, checked)
+
+
+def neighbours_by_pose(world_from_camera: Float[np.ndarray, "photos 3 4"]) -> Pairs:
+    """Each photo with those that stand nearest and look the same way most nearly."""
+    centres, axes = world_from_camera[:, :, 3], world_from_camera[:, :, 2]
+    distance = -closeness(centres)
+    usual = np.median(np.sort(distance, axis=1)[:, min(1, len(centres) - 1)])
+    turn = np.degrees(np.arccos(np.clip(axes @ axes.T, -1, 1)))
+    apart = distance / usual if usual > 0 else distance
+    return nearest(-(apart + turn / TURN_DEG), PARTNERS)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,97 @@
+"""Given cameras as those of upright photos: turned with them, of their size, with a ray for every pixel."""
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from nerf.geometry.scene import Camera
+from stages.contract import StageError
+from stages.io.photos import Photo
+from stages.io.sparse_model import SparseImage
+from stages.io.transforms_intrinsics import flaw_of
+from stages.sfm.colmap.cameras import native, no_ray, rescaled, share_without_ray, why_no_ray
+from stages.sfm.imported.orientation import QUARTER_TURNS, is_of_stored_pixels, same_shape, turned_camera, turned_pose
+
+HINT = "Correct the file, or leave the cameras out to have them found from the photos."
+
+
+@dataclass(frozen=True)
+class PosedPhoto:
+    """A photo and its camera; ``name`` is its own in the file or model that the camera comes from."""
+
+    photo: Photo
+    name: str
+    camera: Camera  # of the upright photo
+    world_from_camera: Float[np.ndarray, "3 4"]
+    turns: int  # quarter turns clockwise that made the camera upright
+
+    @property
+    def file(self) -> str:
+        """The photo's, relative to ingest's ``images/``."""
+        return self.photo.image_name
+
+
+def posed_photo(
+    photo: Photo, name: str, camera: Camera, world_from_camera: Float[np.ndarray, "3 4"], upright: bool
+) -> PosedPhoto:
+    """A camera, given under ``name``, as one of the upright photo; ``upright`` is as :func:`is_of_stored_pixels` has
+    it. Raises StageError, with the name, for a lens that is none and for another shape than the photo's."""
+    turns = _turns(photo, camera, name, upright)
+    camera = _at_size_of(photo, turned_camera(camera, turns), name)
+    return PosedPhoto(photo, name, camera, turned_pose(world_from_camera, turns), turns)
+
+
+def _turns(photo: Photo, camera: Camera, name: str, upright: bool) -> int:
+    """How many quarter turns clockwise make a given camera one of the upright photo. Raises StageError for a lens that
+    is none, and where the photo was mirrored, which no camera can be."""
+    if flaw := flaw_of(camera):
+        raise unusable(f"the camera of {name!r}", flaw)
+    if not is_of_stored_pixels(camera, photo, upright):
+        return 0
+    if photo.orientation not in QUARTER_TURNS:
+        raise StageError(
+            f"cannot use the camera of {name!r}",
+            f"the EXIF orientation {photo.orientation} of {photo.name} mirrors the photo, and no camera sees mirrored",
+            "Leave the cameras out, or make them for photos that are saved upright, without an EXIF orientation.",
+        )
+    return QUARTER_TURNS[photo.orientation]
+
+
+def _at_size_of(photo: Photo, camera: Camera, name: str) -> Camera:
+    """``camera`` rescaled where the photo has another size. Raises StageError where it has another shape, too."""
+    size = (photo.width, photo.height)
+    if (camera.width, camera.height) == size:
+        return camera
+    if not same_shape(camera, size):
+        raise unusable(
+            f"the camera of {name!r}",
+            f"it is for {camera.width}×{camera.height} pixels, the photo has {photo.width}×{photo.height}",
+        )
+    return rescaled(camera, *size)
+
+
+def without_rays(posed: Collection[PosedPhoto]) -> dict[str, str]:
+    """Which photos have a lens without a ray for some of their pixels, by file, and what is to be said of it. Raises
+    StageError, with a name, where half of them have: without these there is no scene."""
+    lost = {camera: share_without_ray(native(camera)) for camera in {one.camera for one in posed}}
+    bent = [one for one in posed if lost[one.camera]]
+    if bent and 2 * len(bent) >= len(posed):
+        raise no_ray(bent[0].camera, lost[bent[0].camera], of=bent[0].name)
+    why = "its given camera cannot be used"
+    return {
+        one.file: f"{why}: {why_no_ray(one.camera.model)} at {100 * lost[one.camera]:.3g}% of the pixels"
+        for one in bent
+    }
+
+
+def distinct(posed: Collection[PosedPhoto]) -> tuple[list[Camera], list[SparseImage]]:
+    """Each camera once, and the images that have them."""
+    cameras = list(dict.fromkeys(p.camera for p in posed))
+    return cameras, [SparseImage(p.file, cameras.index(p.camera), p.world_from_camera) for p in posed]
+
+
+def unusable(what: str, why: str) -> StageError:
+    """The error for what stands in a file of cameras."""
+    return StageError(f"cannot use {what}", why, HINT)

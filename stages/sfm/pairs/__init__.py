@@ -1,0 +1,1 @@
+"""Which pairs of photos to match, and which of their features look alike."""

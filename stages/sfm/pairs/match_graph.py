@@ -1,0 +1,171 @@
+"""The match graph: photos, and between them the pairs that were matched and verified. Which pairs to try next.
+
+Verification is the only judge of a pair. It starts with neighbours in order and photos that look alike, and goes on to
+where verified pairs point: to photos whose verified neighbours are the same, to photos with few verified pairs, and
+across the graph's weakest places, until every photo has been tried with enough others.
+
+``inliers`` is symmetric: the verified matches of each pair, 0 where a pair failed, UNTESTED where it was not tried.
+"""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from stages.sfm.pairs.pair_selection import Likeness, Pairs, spanning_tree, union
+
+if TYPE_CHECKING:
+    from stages.io.photos import Photo
+
+UNTESTED = -1
+MIN_INLIERS = 30  # verified matches from which on a pair links two photos; mapping asks a photo for as many
+SATURATED = 400  # verified matches; a pair with more says no more about which photos look at the same things
+ORDER_OVERLAP = 5  # photos before and after each in the order of names or time that are tried with it
+PER_ROUND = 4  # untested partners of each photo that are tried in a round
+MIN_OVERLAP = 0.05  # cosine of two photos' verified neighbours, from which on it is worth trying the pair
+MIN_YIELD = 0.25  # share of a round's pairs that must turn out as links for another round
+ROUNDS = 8
+WEAK_CUT = 3  # links between two parts of the graph that are as good as none: tried pairs across are added
+
+
+def inlier_matrix(count: int, pairs: Pairs, inliers: Int[np.ndarray, "pairs"]) -> Int[np.ndarray, "photos photos"]:
+    """The symmetric matrix of the graph."""
+    matrix = np.full((count, count), UNTESTED)
+    matrix[pairs[:, 0], pairs[:, 1]] = matrix[pairs[:, 1], pairs[:, 0]] = inliers
+    return matrix
+
+
+def in_order(order: Int[np.ndarray, "photos"], first: int, last: int) -> Pairs:
+    """Photos that are ``first`` to ``last`` steps apart in ``order``."""
+    steps = range(first, min(last, len(order) - 1) + 1)
+    return union(*(np.stack([order[:-step], order[step:]], axis=1) for step in steps))
+
+
+def order_tells(order: Int[np.ndarray, "photos"], inliers: Int[np.ndarray, "photos photos"]) -> bool:
+    """Whether photos next to each other in ``order`` share as many verified matches as those that look most alike.
+
+    In a shuffled set they share what any two photos do, and there is no use in trying more of them.
+    """
+    beside = inliers[order[:-1], order[1:]]
+    tested = np.where(inliers < 0, 0, inliers)
+    tested[order[:-1], order[1:]] = tested[order[1:], order[:-1]] = 0
+    return bool(np.median(beside) >= np.median(tested.max(axis=1)) / 2) if len(order) > 1 else False
+
+
+def next_pairs(inliers: Int[np.ndarray, "photos photos"], similarity: Likeness, neighbours: int) -> Pairs:
+    """Untested pairs for the next round, none where the graph is saturated.
+
+    Two photos with the same verified neighbours see the same things. Photos with few links ask by similarity as well,
+    and so do the parts on either side of a weak place.
+    """
+    tested = (inliers >= 0).sum(axis=1)
+    room = np.clip(neighbours - tested, 0, PER_ROUND)
+    overlap = np.where(inliers == UNTESTED, neighbour_overlap(inliers), -np.inf)
+    np.fill_diagonal(overlap, -np.inf)
+    by_overlap = _best_partners(np.where(overlap >= MIN_OVERLAP, overlap, -np.inf), room)
+    links = (inliers >= MIN_INLIERS).sum(axis=1)
+    lonely = np.where(links < PER_ROUND, PER_ROUND, 0)
+    untested = np.where(inliers == UNTESTED, similarity.astype(float), -np.inf)
+    np.fill_diagonal(untested, -np.inf)
+    return union(by_overlap, _best_partners(untested, lonely), across_weak_cuts(inliers, untested))
+
+
+def neighbour_overlap(inliers: Int[np.ndarray, "photos photos"]) -> Float[np.ndarray, "photos photos"]:
+    """The cosine between any two photos' rows of verified matches, saturated, each photo its own best neighbour."""
+    weight = np.sqrt(np.clip(np.where(inliers >= MIN_INLIERS, inliers, 0), 0, SATURATED).astype(float))
+    np.fill_diagonal(weight, np.sqrt(SATURATED))
+    length = np.linalg.norm(weight, axis=1)
+    return weight @ weight.T / (length[:, None] * length[None])
+
+
+def _best_partners(score: Float[np.ndarray, "photos photos"], each: Int[np.ndarray, "photos"]) -> Pairs:
+    """Of each photo its best partners, as many as it may have; none whose score is minus infinity."""
+    order = np.argsort(-score, axis=1, kind="stable")
+    rank = np.arange(len(score))[None] < each[:, None]
+    chosen = rank & np.isfinite(np.take_along_axis(score, order, axis=1))
+    first, place = np.nonzero(chosen)
+    return union(np.stack([first, order[first, place]], axis=1))
+
+
+# --- weak places
+
+
+class Cuts(NamedTuple):
+    """Parts of a graph and what holds each to the rest: how many edges, and their weight together."""
+
+    side: Bool[np.ndarray, "cuts photos"]  # the smaller one
+    edges: Int[np.ndarray, "cuts"]
+    weight: Float[np.ndarray, "cuts"]
+
+
+def weak_cuts(weight: Float[np.ndarray, "photos photos"]) -> Cuts:
+    """For each edge of the maximum spanning forest: the part that would come off without it and others beside it.
+
+    ``weight`` is symmetric, 0 where there is no edge. Groups that hardly connect to the rest are among these parts,
+    since within a group edges are heavier than across (single linkage). Parts that are not connected at all come as
+    cuts without edges.
+    """
+    from scipy.sparse import csr_matrix
+    from scipy.sparse.csgraph import breadth_first_order
+
+    component = connected(weight > 0)
+    parts = [component == number for number in range(1, int(component.max(initial=0)) + 1)]
+    ends = spanning_tree(np.where(weight > 0, weight, -1.0))
+    ends = ends[weight[ends[:, 0], ends[:, 1]] > 0]
+    tree = csr_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=weight.shape)
+    below = np.eye(len(weight), dtype=bool)
+    for number in range(int(component.max(initial=-1)) + 1):
+        whole = component == number
+        order, parent = breadth_first_order(tree, int(np.argmax(whole)), directed=False)
+        for photo in order[:0:-1]:
+            below[parent[photo]] |= below[photo]
+        parts += [below[i] if 2 * below[i].sum() <= whole.sum() else whole & ~below[i] for i in order[1:]]
+    side = np.array(parts, bool).reshape(-1, len(weight))
+    edges, across = (
+        np.einsum("ci,ci->c", side.astype(float) @ of, (~side).astype(float)) for of in (1.0 * (weight > 0), weight)
+    )
+    return Cuts(side, np.rint(edges).astype(int), across)
+
+
+def connected(edges: Bool[np.ndarray, "photos photos"]) -> Int[np.ndarray, "photos"]:
+    """The number of each photo's connected component, the largest being 0."""
+    from scipy.sparse import csr_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    _, label = connected_components(csr_matrix(edges), directed=False)
+    by_size = np.argsort(-np.bincount(label), kind="stable")
+    return np.argsort(by_size, kind="stable")[label]
+
+
+def across_weak_cuts(inliers: Int[np.ndarray, "photos photos"], untested: Float[np.ndarray, "photos photos"]) -> Pairs:
+    """The most similar untested pairs across the graph's weak places, a few for each photo on the smaller side."""
+    found = [np.zeros((0, 2), int)]
+    cuts = weak_cuts(np.where(inliers >= MIN_INLIERS, inliers, 0).astype(float))
+    for side in cuts.side[cuts.edges <= WEAK_CUT]:
+        across = np.where(side[:, None] & ~side[None], untested, -np.inf)
+        each = np.where(side, PER_ROUND, 0)
+        found.append(_best_partners(across, each))
+    return union(*found)
+
+
+def natural_order(names: Sequence[str]) -> Int[np.ndarray, "photos"]:
+    """The order of names in which numbers count as numbers: a2 comes before a10."""
+    import re
+
+    def key(name: str) -> list[tuple[int, int, str]]:
+        parts = re.split(r"(\d+)", name.casefold())
+        return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts]
+
+    return np.array(sorted(range(len(names)), key=lambda i: (key(names[i]), names[i])), int)
+
+
+def possible_orders(photos: "Sequence[Photo]") -> list[np.ndarray]:
+    """The orders in which the photos may have been taken: of their times, where all are known, and of their names,
+    where that is another."""
+    by_name = natural_order([photo.name for photo in photos])
+    clock_s = [photo.clock_s if photo.time_s is None else photo.time_s for photo in photos]
+    if None in clock_s:
+        return [by_name]
+    by_time = by_name[np.argsort(np.array(clock_s, float)[by_name], kind="stable")]  # within a second by name
+    return [by_time] if np.array_equal(by_time, by_name) else [by_time, by_name]

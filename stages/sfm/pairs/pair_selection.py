@@ -1,0 +1,184 @@
+"""Which pairs of photos are matched to begin with; match_graph.py says which follow.
+
+Photos are numbered from 0. Pairs are rows (first, second) with first < second, in order, none of them twice.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+if TYPE_CHECKING:
+    from stages.io.photos import Photo
+    from stages.sfm import Matcher
+
+Pairs = Int[np.ndarray, "pairs 2"]
+Likeness = Float[np.ndarray, "photos photos"]
+
+# Matching every pair misses nothing, but most pairs of many photos show nothing in common. On sets of up to so many it
+# is done, exactly; on larger ones the match graph is grown (match_graph.py).
+MAX_EXHAUSTIVE = 50
+MUTUAL = 0.9  # of a photo's partners, about so many count it among their own
+LOOPS = 5  # in a sequence one of so many partners is looked for at other times
+GPS_ERROR_M = 10.0  # twice the 4.9 m that phones reach under open sky (gps.gov, GPS accuracy)
+EARTH_AXES_M = (6_378_137.0, 6_356_752.314)  # WGS 84
+
+
+class Places(NamedTuple):
+    """When and where the photos were taken, as far as it is known.
+
+    ``time_s``: seconds in the one video that all photos come from. ``position_m``: Cartesian, metres.
+    """
+
+    time_s: Float[np.ndarray, "photos"] | None = None
+    position_m: Float[np.ndarray, "photos 3"] | None = None
+
+
+def places_of(photos: "Sequence[Photo]") -> Places:
+    """When and where the photos were taken, as far as all of them tell."""
+    times = [photo.time_s for photo in photos]
+    places = [(photo.latitude, photo.longitude) for photo in photos]
+    altitudes = [photo.altitude_m for photo in photos]
+    time_s = None if None in times else np.array(times, float)
+    position_m = None
+    if all(None not in place for place in places):
+        latitude, longitude = np.array(places, float).T
+        position_m = cartesian(latitude, longitude, None if None in altitudes else np.array(altitudes, float))
+    return Places(time_s, position_m)
+
+
+# --- the ways of choosing
+
+
+def exhaustive(count: int) -> Pairs:
+    """Every photo with every other."""
+    return np.stack(np.triu_indices(count, 1), axis=1)
+
+
+def sequential(order: Int[np.ndarray, "photos"], overlap: int) -> Pairs:
+    """Photos up to ``overlap`` steps apart in ``order``, and those 2, 4, 8, … steps apart."""
+    count = len(order)
+    powers = {2**i for i in range(count.bit_length())}
+    steps = [step for step in sorted(powers | set(range(1, overlap + 1))) if step < count]
+    return union(*(np.stack([order[:-step], order[step:]], axis=1) for step in steps))
+
+
+def nearest(similarity: Likeness, neighbours: int) -> Pairs:
+    """Each photo with its ``neighbours`` most similar; ties go to the lower number."""
+    count = len(similarity)
+    others = np.where(np.eye(count, dtype=bool), -np.inf, similarity)
+    partners = np.argsort(-others, axis=1, kind="stable")[:, : min(neighbours, count - 1)]
+    return union(np.stack([np.repeat(np.arange(count), partners.shape[1]), partners.reshape(-1)], axis=1))
+
+
+def spanning_tree(similarity: Likeness) -> Pairs:
+    """The pairs of largest similarity that connect all photos (Prim 1957)."""
+    count = len(similarity)
+    best, parent = similarity[0].astype(float), np.zeros(count, int)
+    best[0] = -np.inf
+    outside = np.arange(count) > 0
+    pairs = []
+    for _ in range(count - 1):
+        likest = int(np.argmax(np.where(outside, best, -np.inf)))
+        pairs.append((parent[likest], likest))
+        outside[likest] = False
+        closer = outside & (similarity[likest] > best)
+        best[closer], parent[closer] = similarity[likest, closer], likest
+    return union(np.array(pairs, int).reshape(-1, 2))
+
+
+def spatial(position_m: Float[np.ndarray, "photos 3"], similarity: Likeness, neighbours: int) -> Pairs:
+    """Each photo with its ``neighbours``: half of them nearest by place, the others its most similar among the rest.
+
+    Positions may be off by more than photos are apart, or the same for dozens of them: looks make up for that.
+    """
+    near = nearest(closeness(position_m), neighbours // 2)
+    rest = similarity.astype(float)
+    rest[tuple(near.T)] = rest[tuple(near.T[::-1])] = -np.inf
+    return union(near, nearest(rest, neighbours - neighbours // 2), spanning_tree(similarity))
+
+
+def union(*pairs: Int[np.ndarray, "n 2"]) -> Pairs:
+    """Each pair that is in any of them once, whichever way round it was written."""
+    together = np.sort(np.concatenate([np.zeros((0, 2), int), *pairs]), axis=1)
+    return np.unique(together[together[:, 0] != together[:, 1]], axis=0)
+
+
+def cartesian(
+    latitude: Float[np.ndarray, "n"], longitude: Float[np.ndarray, "n"], altitude: Float[np.ndarray, "n"] | None
+) -> Float[np.ndarray, "n 3"]:
+    """Metres from the centre of the Earth (WGS 84), from degrees and metres: no seam at the date line or a pole."""
+    phi, lam = np.radians(latitude), np.radians(longitude)
+    height = np.zeros_like(phi) if altitude is None else altitude
+    long_axis, short_axis = EARTH_AXES_M
+    flat = (short_axis / long_axis) ** 2
+    normal = long_axis / np.sqrt(np.cos(phi) ** 2 + flat * np.sin(phi) ** 2)
+    around = (normal + height) * np.cos(phi)
+    return np.stack([around * np.cos(lam), around * np.sin(lam), (flat * normal + height) * np.sin(phi)], axis=1)
+
+
+def closeness(position_m: Float[np.ndarray, "n 3"]) -> Likeness:
+    """Minus the distance between any two positions, in metres."""
+    return -np.sqrt(sum((axis[:, None] - axis[None]) ** 2 for axis in position_m.T))
+
+
+def start_pairs(
+    matcher: "Matcher", neighbours: int, count: int, places: Places, similarity: Callable[[], Likeness]
+) -> Pairs:
+    """The pairs that matching begins with. ``similarity`` is asked for only where it is needed.
+
+    Without times ``sequential`` goes by the order of the photos; ``spatial`` needs positions; ``retrieval`` begins
+    with the most similar photos alone, since the match graph is grown from what verification says of them.
+    """
+    if matcher == "exhaustive":
+        return exhaustive(count)
+    if matcher == "retrieval":
+        return union(nearest(similarity(), max(2, neighbours // 4)), spanning_tree(similarity()))
+    if matcher == "spatial":
+        assert places.position_m is not None
+        return spatial(places.position_m, similarity(), neighbours)
+    order = np.arange(count) if places.time_s is None else np.argsort(places.time_s, kind="stable")
+    loops = max(1, neighbours // LOOPS)
+    overlap = max(1, (neighbours - loops) // 2)
+    when = np.argsort(order)
+    apart = np.abs(when[:, None] - when[None]) > overlap
+    return union(sequential(order, overlap), nearest(np.where(apart, similarity(), -np.inf), loops))
+
+
+def second_look(pairs: Pairs, missing: Sequence[int], neighbours: int, similarity: Callable[[], Likeness]) -> Pairs:
+    """The pairs again, and more for photos that found no place: as many as were matched already, at most all.
+
+    They go to each missing photo's most similar ones, and are at least twice as many as it had.
+    """
+    count, each = int(pairs.max(initial=0)) + 1, max(2 * neighbours, len(pairs) // max(1, len(missing)))
+    if len(pairs) == count * (count - 1) // 2:
+        return pairs
+    order = np.argsort(-similarity()[list(missing)], axis=1, kind="stable")[:, : each + 1]  # itself is one of them
+    return union(pairs, np.stack([np.repeat(missing, order.shape[1]), order.reshape(-1)], axis=1))
+
+
+# --- the choice among them
+
+
+def expected_pairs(matcher: "Matcher", count: int, neighbours: int) -> int:
+    """About how many pairs there will be."""
+    everything = count * (count - 1) // 2
+    return everything if matcher == "exhaustive" else min(everything, round(count * neighbours * (1 - MUTUAL / 2)))
+
+
+def choose(count: int, neighbours: int, places: Places) -> "Matcher":
+    """Every pair of a set of ordinary size; else by time, place or looks."""
+    if count <= MAX_EXHAUSTIVE:
+        return "exhaustive"
+    if places.time_s is not None:
+        return "sequential"
+    if places.position_m is not None and _is_spread_out(places.position_m, neighbours):
+        return "spatial"
+    return "retrieval"
+
+
+def _is_spread_out(position_m: Float[np.ndarray, "photos 3"], neighbours: int) -> bool:
+    """Whether neighbourhoods are larger than the error of positions, as far as these can tell: indoors it is larger."""
+    farthest = np.sort(-closeness(position_m), axis=1)[:, min(neighbours, len(position_m) - 1)]
+    return bool(np.median(farthest) > GPS_ERROR_M)

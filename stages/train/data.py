@@ -1,0 +1,204 @@
+"""Photos and cameras as training and comparison read them, at any reduction in size."""
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache, lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from stages.contract import Inputs, Progress, StageError
+from stages.io.files import read_tensors
+
+if TYPE_CHECKING:
+    import numpy as np
+    from torch import Tensor
+
+    from nerf.geometry.rays import Rays
+    from nerf.geometry.scene import Camera, Scene, Split, View
+    from nerf.training.ray_dataset import RayBank
+    from stages.io.pixel_store import PixelStore
+
+# Along the longer side of a picture. At 1000 pixels the bearings are then off by at most 0.002 of them for a phone's
+# lens, 0.02 for an action camera's, 0.05 for a fisheye's, and a camera takes 1 MB; twice as many: a quarter, and 4 MB.
+MOST_PATCHES = 192
+NOTHING_LEFT = "nothing is left to train on"  # what happened, of the StageError where masks leave no pixel at a size
+
+
+def scaled_size(camera: "Camera", downscale: float) -> tuple[int, int]:
+    """(width, height) of a camera's photos made ``downscale`` times smaller, rounded half up, at least one pixel."""
+    return max(1, int(camera.width / downscale + 0.5)), max(1, int(camera.height / downscale + 0.5))
+
+
+@lru_cache(maxsize=1)
+def camera_directions(camera: "Camera", downscale: float) -> "Tensor":
+    """The unit bearing vectors (H, W, 3) of a camera's pixel centres at a reduced size; not to be written to.
+
+    The last answer is kept: photos of one camera mostly follow each other.
+    """
+    import torch
+
+    from stages.sfm.colmap.cameras import camera_rays
+
+    return torch.from_numpy(camera_rays(camera, *scaled_size(camera, downscale)))
+
+
+def patch_bearings(camera: "Camera", downscale: float) -> "Tensor":
+    """Bearing vectors (rows, columns, 3) of a camera in the middles of the patches that stand for its pixels in a ray
+    bank, MOST_PATCHES along the longer side or one per pixel."""
+    import torch
+
+    from stages.sfm.colmap.cameras import camera_rays
+
+    width, height = scaled_size(camera, downscale)
+    shrink = max(1.0, max(width, height) / MOST_PATCHES)
+    return torch.from_numpy(camera_rays(camera, math.ceil(width / shrink), math.ceil(height / shrink)))
+
+
+def training_bank(ingest: Path, scene: "Scene", split: "Split", downscale: float, progress: Progress) -> "RayBank":
+    """All pixels and rays of one split, on the CPU; the pixels are mapped from the pixel store, which is made if need
+    be. What masks ignore is never drawn. Raises StageError, NOTHING_LEFT, where they leave nothing."""
+    import numpy as np
+    import torch
+
+    from nerf.training.ray_dataset import Placement, ray_bank
+    from stages.io.photos import loaders
+    from stages.io.pixel_store import fill
+
+    views, store = scene.of_split(split), _store(ingest, scene, split, downscale)
+    at_once = cache(lambda: loaders(ingest / view.file for view in views))  # opens every file
+    fill(store, lambda index: _decoded_pixels(ingest, scene, views[index], downscale), at_once, progress)
+    used = sorted({view.camera for view in views})
+
+    def bearings(index: int) -> "Tensor":
+        progress.update(f"rays of camera {index + 1} of {len(used)}", index / len(used))
+        return patch_bearings(scene.cameras[used[index]], downscale)
+
+    bank = ray_bank(
+        pixels=store.table(progress),
+        sizes=[(photo.height, photo.width) for photo in store.photos],
+        camera_of=[used.index(view.camera) for view in views],
+        camera_bearings=[bearings(index) for index in range(len(used))],
+        placement=Placement(
+            poses=torch.tensor(np.stack([view.scene_from_camera for view in views]), dtype=torch.float32),
+            near=torch.tensor([view.near for view in views]),
+            far=torch.tensor([view.far for view in views]),
+        ),
+    )
+    if not any(view.mask for view in views):
+        return bank
+    masks = _ignored(views, lambda view: view_mask(ingest, scene, view, downscale), at_once())
+    return _masked(bank, masks, split, progress)
+
+
+def guided_bank(inputs: Inputs, scene: "Scene", downscale: float, progress: Progress) -> "RayBank":
+    """:func:`training_bank` of the training photos, which knows how far away are the sparse points that they show.
+
+    Of normalise's points only those that two training photos saw at least, where these saw them."""
+    import numpy as np
+    import torch
+
+    from stages.effects.track_colours import training_tracks
+
+    bank = training_bank(inputs["ingest"], scene, "train", downscale, progress)
+    points = read_tensors(inputs["normalise"] / "points.safetensors")
+    tracks, xy = training_tracks(scene, points, most=len(points["view"]))
+    cameras = [scene.cameras[view.camera] for view in scene.of_split("train")]
+    full = np.array([(camera.width, camera.height) for camera in cameras]).reshape(-1, 2)[tracks.view]
+    size = np.array([scaled_size(camera, downscale) for camera in cameras]).reshape(-1, 2)[tracks.view]
+    column, row = np.clip(np.floor(xy * size / full), 0, size - 1).astype(int).T
+    within = torch.from_numpy(row * size[:, 0] + column)
+    return bank.with_distances(
+        bank.first_pixel[torch.from_numpy(tracks.view)] + within, torch.from_numpy(tracks.distance)
+    )
+
+
+def _ignored(
+    views: "Sequence[View]", load: "Callable[[View], Tensor | None]", at_once: int
+) -> "Iterator[Tensor | None]":
+    """Per view, (H, W) True where its mask ignores the photo; None without a mask. In memory are those being loaded
+    and the one before: all masks of many large photos would take more than training does."""
+    with ThreadPoolExecutor(at_once) as pool:
+        for first in range(0, len(views), at_once):
+            for used in pool.map(load, views[first : first + at_once]):
+                yield None if used is None else used.logical_not_()
+
+
+def _masked(bank: "RayBank", ignored: "Iterable[Tensor | None]", split: "Split", progress: Progress) -> "RayBank":
+    try:
+        bank = bank.without(ignored)
+    except ValueError as error:
+        why = f"{error} of the {split} photos at this size"
+        raise StageError(NOTHING_LEFT, why, "Give a smaller --train.downscale.") from error
+    progress.note(f"masks leave {bank.drawable / len(bank.pixels):.0%} of the pixels of the {split} photos")
+    return bank
+
+
+def view_mask(ingest: Path, scene: "Scene", view: "View", downscale: float) -> "Tensor | None":
+    """Which pixels of a view are to be used, (H, W) bool; None: all of them."""
+    import torch
+
+    from stages.ingest.masks import load_mask
+
+    if view.mask is None:
+        return None
+    return torch.from_numpy(load_mask(ingest / view.mask, *scaled_size(scene.cameras[view.camera], downscale)))
+
+
+def view_rays(scene: "Scene", view: "View", downscale: float) -> "Rays":
+    """One ray per pixel of a view, (H, W), on the CPU."""
+    import torch
+
+    from nerf.geometry.rays import rays_of_view
+
+    pose = torch.tensor(view.scene_from_camera, dtype=torch.float32)
+    return rays_of_view(camera_directions(scene.cameras[view.camera], downscale), pose, view.near, view.far)
+
+
+class PhotoReader:
+    """The photos of a scene at 1/``downscale`` of their size, one by one. To be held while many are read: where those
+    of a split are stored is told by a look at every one of them, once."""
+
+    def __init__(self, ingest: Path, scene: "Scene", downscale: float) -> None:
+        self.ingest, self.scene, self.downscale = ingest, scene, downscale
+        self._stores: dict[Split, tuple[PixelStore, dict[str, int]]] = {}
+
+    def pixels(self, view: "View", background: Sequence[float]) -> "Tensor":
+        """The photo of a view as (H, W, 3) float32 in [0, 1], over ``background`` where it has alpha."""
+        import torch
+
+        from nerf.training.trainer import over
+
+        pixels = torch.tensor(self._pixels(view)).float() / 255
+        alpha = pixels[..., 3] if self.scene.has_alpha else None
+        return over(pixels[..., :3], alpha, torch.tensor(background, dtype=torch.float32))
+
+    def _pixels(self, view: "View") -> "np.ndarray":
+        """The photo of a view as uint8, out of the pixel store where that is there."""
+        if view.split not in self._stores:
+            store = _store(self.ingest, self.scene, view.split, self.downscale)
+            self._stores[view.split] = store, {photo.file: index for index, photo in enumerate(store.photos)}
+        store, places = self._stores[view.split]
+        stored = store.photo(places[view.file]) if store.is_whole else None
+        return _decoded_pixels(self.ingest, self.scene, view, self.downscale) if stored is None else stored
+
+
+def _store(ingest: Path, scene: "Scene", split: "Split", downscale: float) -> "PixelStore":
+    """Where the pixels of one split at this size are kept, whether or not they are there yet."""
+    from stages.io.pixel_store import StoredPhoto, pixel_store
+
+    views = scene.of_split(split)
+    photos = [StoredPhoto(view.file, *scaled_size(scene.cameras[view.camera], downscale)) for view in views]
+    return pixel_store(ingest, split, photos, 4 if scene.has_alpha else 3)
+
+
+def _decoded_pixels(ingest: Path, scene: "Scene", view: "View", downscale: float) -> "np.ndarray":
+    """The photo of a view as uint8: (H, W, 4) in a scene with alpha, else (H, W, 3) as it is below its alpha."""
+    import numpy as np
+
+    from stages.io.photos import load_pixels
+
+    pixels = load_pixels(ingest / view.file, *scaled_size(scene.cameras[view.camera], downscale))
+    if scene.has_alpha and pixels.shape[2] == 3:  # a photo without transparent parts covers every pixel
+        return np.concatenate([pixels, np.full_like(pixels[..., :1], 255)], axis=2)
+    return pixels if scene.has_alpha else np.ascontiguousarray(pixels[..., :3])

@@ -1,0 +1,56 @@
+"""At which of torch's precisions a training computes its matrix products: "medium" where it is measured to pay.
+
+A run in seconds may choose by a measurement, as it does its sizes: the choice is kept and enters the key. A run counted
+in steps promises the same bytes every time, which no measurement does: it takes "highest" unless told otherwise.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+from stages.contract import Progress
+from stages.hardware.device import compute_device
+
+if TYPE_CHECKING:
+    from nerf.runtime.matmul_precision import Medium, Precision
+    from stages.train import Config
+
+
+def chosen_precision(config: "Config", progress: Progress) -> "Precision":
+    """For the products of a training whose field and sizes of networks are known; "medium" is said."""
+    if config.steps is not None:
+        return "highest"
+    medium = _medium(config)
+    if not medium.pays:
+        return "highest"
+    progress.note(
+        f"matrix products at torch's precision medium: {medium.speedup:.1f} times faster here, "
+        f"off by {medium.error:.0e}"
+    )
+    return "medium"
+
+
+def say_if_inexact(config: "Config", progress: Progress) -> None:
+    """Where a precision that was asked for, or chosen on another machine, means less here."""
+    if config.matmul == "medium" and not (medium := _medium(config)).is_exact:
+        progress.note(f"matrix products are off by {medium.error:.0e} here; --train.matmul highest computes exact ones")
+
+
+def precision_facts(config: "Config") -> dict[str, Any]:
+    """For the manifest: the precision, and what "medium" is on this machine."""
+    medium = _medium(config)
+    return {
+        "matmul": config.matmul,
+        "medium_matmul_speedup": round(medium.speedup, 2),
+        "medium_matmul_error": float(f"{medium.error:.1e}"),
+    }
+
+
+def _medium(config: "Config") -> "Medium":
+    """Measured at the width of the field's networks."""
+    import torch
+
+    from nerf.fields.mlp import HIDDEN
+    from nerf.runtime.matmul_precision import medium_products
+
+    width = HIDDEN if config.kind == "grid" else config.width
+    assert width, "plan() chooses it"
+    return medium_products(torch.device(compute_device()), width)
