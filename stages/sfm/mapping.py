@@ -5,7 +5,7 @@ from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from stages.sfm import global_mapping as sfm_global
+from stages.sfm import global_mapping
 from stages.sfm.colmap.diagnosis import compare_models
 from stages.sfm.colmap.mapping import incremental_options, map_globally, map_incrementally
 from stages.sfm.colmap.models import load_native
@@ -55,7 +55,7 @@ def mapped(attempt: Attempt, database: Path, work: Work) -> tuple[list[Any], Sta
         )
     shutil.rmtree(models)
     standing = Standing(None, {}, False)
-    failure = sfm_global.failure(opinion) if opinion else None
+    failure = global_mapping.failure(opinion) if opinion else None
     other = load_native(opinion.folder) if opinion and not failure else None
     compared = None if opinion is None else {"failed": failure}
     if found:
@@ -70,12 +70,12 @@ def mapped(attempt: Attempt, database: Path, work: Work) -> tuple[list[Any], Sta
     return found, standing, compared
 
 
-def _second_opinion(attempt: Attempt, database: Path, work: Work) -> "sfm_global.Started | None":
+def _second_opinion(attempt: Attempt, database: Path, work: Work) -> "global_mapping.Started | None":
     """Global mapping begun beside the first attempt; None where it would say nothing."""
-    if attempt.name != ATTEMPTS[0].name or len(work.photos) < sfm_global.MIN_PHOTOS:
+    if attempt.name != ATTEMPTS[0].name or len(work.photos) < global_mapping.MIN_PHOTOS:
         return None
     known, folder = work.job.camera_params is not None, work.journal.folder / "global"
-    return sfm_global.start(database, work.beside("global"), work.images, folder, work.job.seed, known)
+    return global_mapping.start(database, work.beside("global"), work.images, folder, work.job.seed, known)
 
 
 def _standing(model: Any, other: Any, database: Path, matches: Path, options: Any, work: Work) -> Standing:

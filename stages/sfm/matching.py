@@ -63,7 +63,7 @@ def matched(attempt: Attempt, missing: list[int], work: Work) -> tuple[Path, dic
         _match(database, second_look(before, missing, job.neighbours, lambda: work.similarity), LOOSE_RATIO, work)
     elif attempt.matches == "row":
         database = work.beside("row")
-        tried, steps = np.sort(matched_pairs(work.database) + 1, axis=1).tolist(), steps_of_row(work)
+        tried, steps = (matched_pairs(work.database) + 1).tolist(), steps_of_row(work)
         copy_without_pairs(work.database, database, [pair for pair in tried if tuple(pair) not in steps])
     elif attempt.matches == "fisheye":
         latest, database = work.latest(), work.beside("fisheye")

@@ -9,29 +9,23 @@ DOCUMENT = Path(__file__).parents[2] / "docs" / "NUMERICS.md"
 
 # What has no row. A module of nerf/ stands in a row, here, or fails a test.
 ELSEWHERE = {
-    "nerf/kernels/torch/hidden_layer.py": "max(x + y, 0) and its mask, bit for bit: "
-    "tests/nerf/kernels/test_warp.py; NaN "
-    "stays NaN: tests/numerics/test_not_a_number.py",
-    "nerf/kernels/torch/occupancy.py": "comparisons and bits, exact: tests/nerf/kernels/test_cache.py; a cell that "
-    "is no number "
-    "counts as occupied",
+    "nerf/kernels/torch/hidden_layer.py": "max(x + y, 0) and its mask, bit for bit: tests/nerf/kernels/test_warp.py; "
+    "NaN stays NaN: tests/numerics/test_not_a_number.py",
+    "nerf/kernels/torch/occupancy.py": "comparisons and bits, exact: tests/nerf/kernels/test_cache.py; a cell that is "
+    "no number counts as occupied",
     "nerf/kernels/torch/early_termination.py": "sums of optical depth in float64, the lattice's step as marching "
-    "takes it: "
-    "tests/nerf/kernels/test_waves.py",
+    "takes it: tests/nerf/kernels/test_waves.py",
     "nerf/kernels/torch/colour_sampling.py": "1 − exp(−x) as in compositing, of optical depth summed in float64; "
-    "differences of it "
-    "are off by 1e-7, and what is no number is left out and reaches the light behind it: "
+    "differences of it are off by 1e-7, and what is no number is left out and reaches the light behind it: "
     "tests/nerf/kernels/test_drawing.py",
     "nerf/rendering/early_termination.py": "cuts rays where the light is below 1e-3: tests/nerf/test_grid_field.py",
     "nerf/fields/hash_grid.py": "puts rows together: tests/nerf/test_grid_field.py",
-    "nerf/fields/occupancy_grid.py": "σ times the lattice's step; the outermost cells, which reach to infinity, "
-    "count half a "
-    "cell within: tests/nerf/test_grid_training.py",
-    "nerf/fields/frustum_mask.py": "angles and distances of the middles of cells; the cells around them count as well: "
-    "tests/nerf/test_visibility.py",
-    "nerf/training/ray_dataset.py": "bearings linear within a patch, of length 1/2 or more before they are divided "
-    "by it: "
-    "tests/nerf/test_ray_bank.py",
+    "nerf/fields/occupancy_grid.py": "σ times the lattice's step; the outermost cells, which reach to infinity, count "
+    "half a cell within: tests/nerf/test_grid_training.py",
+    "nerf/fields/frustum_mask.py": "angles and distances of the middles of cells; the cells around them count as "
+    "well: tests/nerf/test_visibility.py",
+    "nerf/training/ray_dataset.py": "bearings linear within a patch, of length 1/2 or more before they are divided by "
+    "it: tests/nerf/test_ray_bank.py",
     "nerf/rendering/srgb.py": "the standard's own curve, its inverse, from nothing to 1e30: tests/nerf/test_srgb.py",
     "nerf/effects/exposure.py": "powers taken between powers, without light in between; value, gradient, extremes: "
     "tests/nerf/effects/test_exposure.py",

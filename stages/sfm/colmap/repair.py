@@ -88,7 +88,7 @@ def copy_believed(
     unfinished = unfinished_copy(database, copy)
     with pycolmap.Database.open(unfinished) as db, pycolmap.DatabaseTransaction(db):
         ids, matches = read_pair_matches(db, model, 0, most=None)
-        pairs = np.sort(np.array(ids)[matches.pairs], axis=1).tolist()
+        pairs = np.array(ids)[matches.pairs].tolist()  # the lower id first, as COLMAP numbers pairs
         kept = believed(matches, camera_poses(model), np.array([(i, j) in trusted for i, j in pairs], bool))
         bounds = np.searchsorted(matches.pair, np.arange(len(pairs) + 1))
         mine = {(i, j): kept[bounds[k] : bounds[k + 1]] for k, (i, j) in enumerate(pairs)}
