@@ -1,0 +1,61 @@
+"""Retired words stay out of code, command line, report and documents; CHANGELOG alone may name them.
+
+Each entry is a regular expression and the field's standard term that stands in its place.
+"""
+
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+KINDS = (".py", ".md", ".toml", ".j2")
+EXEMPT = ("CHANGELOG.md", "tests/test_vocabulary.py")
+
+SCENE_FIELDS_RENDERING: dict[str, str] = {}
+
+EFFECTS: dict[str, str] = {}
+
+SFM_AND_INGEST: dict[str, str] = {}
+
+TRAINING: dict[str, str] = {}
+
+MESH_AND_TRADEOFF: dict[str, str] = {}
+
+PIPELINE: dict[str, str] = {}
+
+RETIRED = SCENE_FIELDS_RENDERING | EFFECTS | SFM_AND_INGEST | TRAINING | MESH_AND_TRADEOFF | PIPELINE
+
+
+def texts() -> dict[str, str]:
+    """Path and text of every file that we write."""
+    listing = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    names = [name for name in listing.splitlines() if name.endswith(KINDS) and name not in EXEMPT]
+    return {name: (ROOT / name).read_text("utf-8") for name in names if (ROOT / name).exists()}
+
+
+@pytest.fixture(scope="module")
+def sources() -> dict[str, str]:
+    return texts()
+
+
+def offenders(pattern: str, sources: dict[str, str]) -> list[str]:
+    """``file:line: text`` of each line, and ``file`` of each path, in which the pattern is found."""
+    found = [name for name in sources if re.search(pattern, name)]
+    for name, text in sources.items():
+        for number, line in enumerate(text.splitlines(), 1):
+            if re.search(pattern, line):
+                found.append(f"{name}:{number}: {line.strip()}")
+    return found
+
+
+def test_no_retired_word_is_left(sources: dict[str, str]):
+    assert len(sources) > 100
+    left = {f"{old} -> {new}": places for old, new in RETIRED.items() if (places := offenders(old, sources))}
+    assert not left, "\n".join(f"{words}\n  " + "\n  ".join(places[:20]) for words, places in left.items())
+
+
+def test_a_retired_word_would_be_found():
+    assert offenders(r"\bwaves\b", {"a.py": "x = 1\nfor waves in rays:\n"}) == ["a.py:2: for waves in rays:"]
+    assert offenders(r"ray_bank", {"tests/test_ray_bank.py": ""}) == ["tests/test_ray_bank.py"]
