@@ -4,14 +4,14 @@ Each entry is a regular expression and the field's standard term that stands in 
 """
 
 import re
-import subprocess
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parents[1]
 KINDS = (".py", ".md", ".toml", ".j2")
-EXEMPT = ("CHANGELOG.md", "tests/test_vocabulary.py")
+FOLDERS = ("nerf", "stages", "pipeline", "tests", "benchmarks", "docs")
+EXEMPT = "tests/test_vocabulary.py"
 
 SCENE_FIELDS_RENDERING: dict[str, str] = {}
 
@@ -30,9 +30,10 @@ RETIRED = SCENE_FIELDS_RENDERING | EFFECTS | SFM_AND_INGEST | TRAINING | MESH_AN
 
 def texts() -> dict[str, str]:
     """Path and text of every file that we write."""
-    listing = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
-    names = [name for name in listing.splitlines() if name.endswith(KINDS) and name not in EXEMPT]
-    return {name: (ROOT / name).read_text("utf-8") for name in names if (ROOT / name).exists()}
+    paths = [ROOT / "README.md", ROOT / "pyproject.toml"]
+    paths += [path for folder in FOLDERS for path in sorted((ROOT / folder).rglob("*")) if path.suffix in KINDS]
+    names = {path.relative_to(ROOT).as_posix(): path for path in paths}
+    return {name: path.read_text("utf-8") for name, path in names.items() if name != EXEMPT}
 
 
 @pytest.fixture(scope="module")
