@@ -171,7 +171,7 @@ def reconstruct(
 def _density(config: Config, model: "RadianceModel", box: "np.ndarray", device: str, progress: Progress) -> "Lattice":
     import torch
 
-    from nerf.fields.density_grid import density_lattice
+    from nerf.fields.density_grid import sample_density_grid
     from stages.hardware.memory import available_bytes, check_memory
 
     assert config.resolution is not None
@@ -184,7 +184,7 @@ def _density(config: Config, model: "RadianceModel", box: "np.ndarray", device: 
     def report(done: float) -> None:
         progress.update(f"density at {config.resolution}³ points", 0.6 * done)
 
-    return density_lattice(model, points_along(box, config.resolution), low, high, CHUNK, report)
+    return sample_density_grid(model, points_along(box, config.resolution), low, high, CHUNK, report)
 
 
 def _level(

@@ -102,20 +102,20 @@ def seconds_per_density(train: Path, box: "np.ndarray", chunk: int) -> float:
     """Measured: larger lattices of the field in ``train`` over a box until one takes long enough to tell."""
     import torch
 
-    from nerf.fields.density_grid import density_lattice
+    from nerf.fields.density_grid import sample_density_grid
     from stages.hardware.device import compute_device
     from stages.io.field_files import load_field
 
     device = compute_device()
     model, _ = load_field(train, device)
     low, high = torch.tensor(box, dtype=torch.float32, device=device)
-    density_lattice(model, TIMED_EDGES[0], low, high, chunk)  # the first pays for memory and kernels
+    sample_density_grid(model, TIMED_EDGES[0], low, high, chunk)  # the first pays for memory and kernels
     seconds = per_point = 0.0
     for edge in TIMED_EDGES:
         if seconds >= TIMED_SECONDS:
             break
         began = time.perf_counter()
-        count = density_lattice(model, points_along(box, edge), low, high, chunk).values.cpu().numel()
+        count = sample_density_grid(model, points_along(box, edge), low, high, chunk).values.cpu().numel()
         seconds = time.perf_counter() - began
         per_point = seconds / count
     return per_point

@@ -55,7 +55,7 @@ def shadow_maps(
     the folder of stage ``ingest``."""
     from scipy.ndimage import maximum_filter
 
-    from nerf.fields.density_grid import stopping_distance
+    from nerf.fields.density_grid import median_depth
     from stages.train.data import view_mask, view_rays
 
     maps = []
@@ -65,7 +65,7 @@ def shadow_maps(
         downscale = max((pixels * len(views) / RAYS) ** 0.5, max(camera.width, camera.height) / LONGEST, 1.0)
         rays = view_rays(scene, view, downscale)
         rays = rays.each(lambda part: part.to(lattice.low.device))
-        stop = stopping_distance(lattice, rays, max(lattice.values.shape)).cpu().numpy()
+        stop = median_depth(lattice, rays, max(lattice.values.shape)).cpu().numpy()
         widest = float((rays.directions.cpu().double().numpy() @ view.scene_from_camera[:, 2]).min())
         mask = view_mask(ingest, scene, view, max(1.0, max(camera.width, camera.height) / LONGEST_MASK))
         used = None if mask is None else mask.numpy()
