@@ -92,7 +92,9 @@ def main() -> None:
     train = read_bank(given.folder, "train", given.downscale, 1)
     test = read_bank(given.folder, "test", given.downscale, given.test_every)
     model = HashGridField(settings, given.seed, fast if given.backend == "warp" else reference)
-    trainer = HashGridTrainer(model, train, HashGridTrainerSettings(given.seed, "random", given.samples, chunks=workers()))
+    trainer = HashGridTrainer(
+        model, train, HashGridTrainerSettings(given.seed, "random", given.samples, chunks=workers())
+    )
     print(f"{settings}\n{model.layout.rows:,} rows")
     clock = time.process_time if given.processor_time else time.perf_counter
     seconds, step, rays, due = 0.0, 0, 0, 5.0

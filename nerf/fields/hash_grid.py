@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
 
 from nerf.fields import mlp as grid_mlp
-from nerf.fields.background import directions_backward, initial_background, background_backward, background_colour
+from nerf.fields.background import background_backward, background_colour, directions_backward, initial_background
 from nerf.fields.interface import Rendering
 from nerf.fields.mlp import ColourPass, DensityPass, Weights
 from nerf.geometry.rays import Rays
@@ -161,7 +161,9 @@ class HashGridField(nn.Module):
             self.register_buffer(name, weight)
         if settings.sky:
             self.register_buffer("sky", initial_background())
-        self.register_buffer("bits", torch.full((settings.occupancy_resolution**3 // 64,), -1))  # every cell may hold something
+        self.register_buffer(
+            "bits", torch.full((settings.occupancy_resolution**3 // 64,), -1)
+        )  # every cell may hold something
         self.register_buffer("clearance", torch.zeros(settings.occupancy_resolution**3 // 64, dtype=torch.uint8))
 
     def on_cpu(self) -> "HashGridField":
@@ -266,7 +268,9 @@ class HashGridField(nn.Module):
         of_samples = samples, points, thickness, density
         return HashGridPass(rays, background, len(order), *of_samples, harmonics, colour, rendering, weights)
 
-    def backward(self, done: HashGridPass, grad: Rendering, grad_weights: Float[Tensor, "samples"]) -> HashGridGradients:
+    def backward(
+        self, done: HashGridPass, grad: Rendering, grad_weights: Float[Tensor, "samples"]
+    ) -> HashGridGradients:
         """Gradients of a loss, given those of the rendering and of the samples' weights."""
         backend, density, colour = self.backend, done.density, done.colour
         grad_sigma, grad_colour = backend.composite_backward(

@@ -234,7 +234,9 @@ class Backend(Protocol):
         shown: Float[Tensor, "rays"],
     ) -> Drawn: ...
 
-    def accumulate_colours(self, drawn: Drawn, colour: Float[Tensor, "kept 3"], seen: Float[Tensor, "rays 4"]) -> None: ...
+    def accumulate_colours(
+        self, drawn: Drawn, colour: Float[Tensor, "kept 3"], seen: Float[Tensor, "rays 4"]
+    ) -> None: ...
 
     def distortion(
         self, samples: Samples, weights: Float[Tensor, "samples"], lattice: Lattice

@@ -56,7 +56,9 @@ def march_with_early_termination(
         density = density_at(points)
         yield Wave(samples, points, density)
         with part("march"):
-            backend.finish_round(of_wave, samples, density.sigma, EARLY_STOP_TRANSMITTANCE, jitter, rays.far, depth, near)
+            backend.finish_round(
+                of_wave, samples, density.sigma, EARLY_STOP_TRANSMITTANCE, jitter, rays.far, depth, near
+            )
             taken, going_on = taken + of_wave.most_samples, int((near < rays.far).sum())
 
 

@@ -95,7 +95,9 @@ def _exposed(model: "RadianceModel", log_gain: list[float], device: str) -> "Rad
     return ExposedModel(model, torch.tensor(log_gain, dtype=torch.float32, device=device))
 
 
-def _untrained(info: dict[str, Any], stored: int, device: str, progress: Progress | None) -> "VanillaNerf | HashGridField":
+def _untrained(
+    info: dict[str, Any], stored: int, device: str, progress: Progress | None
+) -> "VanillaNerf | HashGridField":
     """The field that ``info`` describes; ``stored`` is the size of its weights in bytes, which it must not exceed.
     Raises ValueError, before anything is allocated."""
     from pydantic import TypeAdapter

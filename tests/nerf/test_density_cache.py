@@ -15,7 +15,9 @@ NUMBERS = torch.arange(CELLS**3)
 
 def cache_of_a_slope(axis: int, monkeypatch: pytest.MonkeyPatch) -> OccupancyGrid:
     """Of a field in which a step is as thick as its point is far along an axis, in cells."""
-    model = HashGridField(HashGridSettings(levels=1, log2_rows=6, coarsest=2, finest=2, occupancy_resolution=CELLS), 0, reference)
+    model = HashGridField(
+        HashGridSettings(levels=1, log2_rows=6, coarsest=2, finest=2, occupancy_resolution=CELLS), 0, reference
+    )
 
     def slope(unit: Tensor) -> Tensor:
         return CELLS * unit[:, axis] / model.lattice.step

@@ -299,7 +299,9 @@ def test_waves_through_thin_fog_see_what_a_single_pass_sees(
 
 
 @pytest.mark.parametrize("settings", [SMALL, FOLDED])
-def test_waves_end_soon_behind_what_stops_the_light(settings: HashGridSettings, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_waves_end_soon_behind_what_stops_the_light(
+    settings: HashGridSettings, monkeypatch: pytest.MonkeyPatch
+) -> None:
     in_short_waves(monkeypatch, 80, 2, 64)
     model, given, background = dense_field(settings), rays(40), torch.tensor([0.2, 0.4, 0.6], dtype=torch.float64)
     marched, front, whole = in_one_pass(model, model.drawn_lattice, given, torch.full_like(given.near, 0.5), background)
@@ -325,7 +327,10 @@ def test_what_is_empty_follows_from_what_is_occupied() -> None:
 def test_waves_of_compiled_kernels_see_what_a_single_pass_of_them_sees(
     settings: HashGridSettings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    model, given = HashGridField(replace(settings, occupancy_resolution=32), 0, warp), rays(300).each(lambda part: part.float())
+    model, given = (
+        HashGridField(replace(settings, occupancy_resolution=32), 0, warp),
+        rays(300).each(lambda part: part.float()),
+    )
     model.table.mul_(3e4)
     few = torch.randint(len(model.bits), (40,), generator=torch.Generator().manual_seed(5))
     model.occupy(torch.zeros_like(model.bits).index_fill_(0, few, -1))

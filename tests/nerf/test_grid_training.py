@@ -13,7 +13,13 @@ from nerf.fields.background import background_colour
 from nerf.fields.hash_grid import HashGridField, HashGridSettings
 from nerf.geometry.rays import Rays
 from nerf.kernels import torch as reference
-from nerf.training.hash_grid_trainer import HashGridBatch, HashGridTrainer, HashGridTrainerSettings, depth_factor, lr_multiplier
+from nerf.training.hash_grid_trainer import (
+    HashGridBatch,
+    HashGridTrainer,
+    HashGridTrainerSettings,
+    depth_factor,
+    lr_multiplier,
+)
 from nerf.training.ray_dataset import RayDataset, build_ray_bank
 from nerf.training.trainer import FieldTrainer, NonFinite
 from nerf.training.validation_probe import make_probe, measure
@@ -240,7 +246,9 @@ def test_the_gradient_of_poses_is_that_of_the_loss(seed: int) -> None:
     """As far as differences tell: of other fields, samples that come to lie in another cell weigh more in them."""
     poses = RefinedPoses(torch.eye(3)[:2])
     poses.turn += torch.tensor([[0.02, 0.01, -0.01], [0.0, -0.02, 0.03]])
-    run = HashGridTrainer(HashGridField(FIELD, seed, reference), small_bank(), replace(TRAINER, background=BACKGROUND), poses)
+    run = HashGridTrainer(
+        HashGridField(FIELD, seed, reference), small_bank(), replace(TRAINER, background=BACKGROUND), poses
+    )
     for step in range(60):
         run.step(step, 0.84)  # at a third of the rate
     by_hand = run._part(7, 0.5, 128, 0).photos
@@ -294,7 +302,9 @@ def test_the_sky_becomes_what_is_seen_in_its_direction() -> None:
     colours = torch.tensor([[30, 60, 230], [240, 200, 30]], dtype=torch.uint8)
     bank = bank._replace(pixels=colours.repeat_interleave(len(bank.pixels) // 2, 0))
     outdoors = replace(FIELD, contracted=True, shortest_step=0.05, cone=0.1, sky=True)
-    run = HashGridTrainer(HashGridField(outdoors, 0, reference), bank, replace(TRAINER, background=(0.0, 0.0, 0.0), rate=1e-2))
+    run = HashGridTrainer(
+        HashGridField(outdoors, 0, reference), bank, replace(TRAINER, background=(0.0, 0.0, 0.0), rate=1e-2)
+    )
     for step in range(20):
         run.step(step, step / 20)
     ahead = torch.tensor([[0.0, 0, 1], [0, 0, -1], [0, 0.1, 1]])
@@ -373,7 +383,9 @@ def test_without_a_weight_known_distances_change_nothing() -> None:
 def test_the_sky_where_it_is_always_hidden_falls_back_to_grey(monkeypatch: pytest.MonkeyPatch) -> None:
     """Light of a millionth reaches it now and then; Adam alone would follow that anywhere."""
     outdoors = replace(FIELD, contracted=True, shortest_step=0.05, cone=0.1, sky=True)
-    run = HashGridTrainer(HashGridField(outdoors, 0, reference), small_bank(), replace(TRAINER, background=(0.0, 0.0, 0.0)))
+    run = HashGridTrainer(
+        HashGridField(outdoors, 0, reference), small_bank(), replace(TRAINER, background=(0.0, 0.0, 0.0))
+    )
     run.model.sky.fill_(3.0)
     noise = torch.Generator().manual_seed(0)
 

@@ -8,13 +8,13 @@ import torch
 from nerf.fields.density_grid import (
     Lattice,
     along,
-    sample_density_grid,
     first_crossing,
+    median_depth,
     occupancy,
     optical_depth,
     ray_distances,
+    sample_density_grid,
     smoothed,
-    median_depth,
     trilinear,
 )
 from nerf.geometry.rays import Rays, clip_to_box

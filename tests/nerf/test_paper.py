@@ -61,7 +61,9 @@ def middle_jitter(settings: VanillaSettings) -> tuple[np.ndarray, np.ndarray]:
     return np.full(first, 0.5), np.full(settings.samples_fine, 0.5)
 
 
-def slow(weights: paper_loop.Weights, settings: VanillaSettings, rays: Rays, jitters: list | None = None) -> list[tuple]:
+def slow(
+    weights: paper_loop.Weights, settings: VanillaSettings, rays: Rays, jitters: list | None = None
+) -> list[tuple]:
     """(coarse, fine) of every ray by the slow loop."""
     results = []
     for i in range(len(rays.near)):

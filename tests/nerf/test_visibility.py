@@ -21,7 +21,9 @@ from nerf.training.ray_dataset import RayDataset, build_ray_bank
 
 SIZE, HALF = 12, 0.5  # pixels of a photo, and half its width at a distance of one
 NEAR, FAR = 1.0, 40.0
-FIELD = HashGridSettings(levels=2, log2_rows=10, coarsest=4, finest=16, steps=32, occupancy_resolution=16, contracted=True)
+FIELD = HashGridSettings(
+    levels=2, log2_rows=10, coarsest=4, finest=16, steps=32, occupancy_resolution=16, contracted=True
+)
 TRAINER = HashGridTrainerSettings(seed=3, background=(0.0, 0.0, 0.0), samples=1024, least_photos=3)
 
 

@@ -15,7 +15,7 @@ from nerf.runtime.machine_rates import Rates
 from nerf.synthetic.scenes import ring_of_cameras
 from nerf.training.hash_grid_trainer import HashGridTrainer, HashGridTrainerSettings
 from nerf.training.ray_dataset import RayDataset, build_ray_bank
-from nerf.training.trainer import VanillaTrainer, StepResult, VanillaTrainerSettings
+from nerf.training.trainer import StepResult, VanillaTrainer, VanillaTrainerSettings
 from stages.hardware.backend import load_backend
 from stages.io.files import read_json
 from stages.report.profile import PARTS, parts_bar
@@ -43,7 +43,9 @@ def trainer(kind: str) -> HashGridTrainer | VanillaTrainer:
         return VanillaTrainer(VanillaNerf(VanillaSettings(**PAPER), 0), bank(), VanillaTrainerSettings(32, 0, "random"))
     backend = load_backend("warp" if kind == "warp" else "torch", "cpu")
     settings = HashGridTrainerSettings(0, "random", samples=512, chunks=2, distortion=1e-3)
-    return HashGridTrainer(HashGridField(HashGridSettings(2, 4, 10, 8, 16, occupancy_resolution=16), 0, backend), bank(), settings)
+    return HashGridTrainer(
+        HashGridField(HashGridSettings(2, 4, 10, 8, 16, occupancy_resolution=16), 0, backend), bank(), settings
+    )
 
 
 def timed_step(of: HashGridTrainer | VanillaTrainer, step: int, timings: dict[str, Any]) -> StepResult:

@@ -33,11 +33,11 @@ def visible_samples(
     everything. ``sigma`` must be the density that will be composited: older ones (the cache's) would hide a surface
     from the very gradient that is to move it.
 
-    Of those thinner than ``thin`` each is kept with the chance p = max(tau / thin, MIN_KEEP_PROBABILITY), and its interval is
-    made 1 / p times as long: it stands for others like it, so that sums of tau f over a ray keep their expectation, and
-    so do gradients of densities. Chances are added up along the ray, beginning with ``offset``, a random number in
-    [0, 1), and a sample is kept where the sum reaches a whole number (systematic sampling; Carpenter et al. 1999), so
-    that thin fog is sampled evenly. ``thin`` 0 keeps all.
+    Of those thinner than ``thin`` each is kept with probability p = max(tau / thin, MIN_KEEP_PROBABILITY), and its
+    interval is made 1 / p times as long: it stands for others like it, so that sums of tau f over a ray keep their
+    expectation, and so do gradients of densities. Probabilities are added up along the ray, beginning with ``offset``,
+    a random number in [0, 1), and a sample is kept where the sum reaches a whole number (systematic sampling;
+    Carpenter et al. 1999), so that thin fog is sampled evenly. ``thin`` 0 keeps all.
     """
     chance = _chance(sigma * samples.dt, thin)
     of_thin = torch.where(chance < 1, chance, 0).double()

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from nerf.kernels import Lattice, Samples
 from nerf.kernels.torch.compositing import OPAQUE
-from nerf.kernels.torch.marching import t_to_s, s_to_t
+from nerf.kernels.torch.marching import s_to_t, t_to_s
 
 
 def finish_round(

@@ -25,9 +25,9 @@ def depth_loss(
     """sum_i w_i |m(t_i) - m(d)| + U |m(far) - m(d)| of each ray, where U = 1 - opacity is the light that nothing stops
     and d the ``distance`` of its point; 0 for rays whose d is 0, of which none is known.
 
-    Positions m are measured as in the distortion loss (nerf/kernels/torch/marching.py: normalised_distance), so that where
-    steps grow a tenth too far costs the same at any distance. In float64: logarithms of nearly the same distance
-    cancel.
+    Positions m are measured as in the distortion loss (nerf/kernels/torch/marching.py: normalised_distance), so that
+    where steps grow a tenth too far costs the same at any distance. In float64: logarithms of nearly the same
+    distance cancel.
     """
     of_samples, of_rest = _apart(samples, far, distance, lattice)
     rest = (1 - opacity) * of_rest

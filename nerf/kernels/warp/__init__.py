@@ -24,8 +24,8 @@ from nerf.kernels.warp.sparse_depth import depth_loss, depth_loss_backward
 from nerf.kernels.warp.spherical_harmonics import spherical_harmonics, spherical_harmonics_backward
 
 __all__ = [
-    "adam",
     "accumulate_colours",
+    "adam",
     "add_ray_relu",
     "add_ray_relu_backward",
     "cell_corners",
@@ -36,7 +36,6 @@ __all__ = [
     "depth_loss_backward",
     "distortion",
     "distortion_backward",
-    "select_colour_samples",
     "encode",
     "encode_backward_points",
     "encode_backward_table",
@@ -44,10 +43,11 @@ __all__ = [
     "march",
     "occupancy_bits",
     "pack_rounds",
-    "scatter_max",
     "relu_backward",
     "sample_points",
     "sample_points_backward",
+    "scatter_max",
+    "select_colour_samples",
     "spherical_harmonics",
     "spherical_harmonics_backward",
     "visible_samples",

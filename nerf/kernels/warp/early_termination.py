@@ -10,7 +10,7 @@ from torch import Tensor
 from nerf.kernels import Lattice, Samples
 from nerf.kernels.warp.compositing import thickness
 from nerf.kernels.warp.launch import launch
-from nerf.kernels.warp.marching import t_to_s, s_to_t
+from nerf.kernels.warp.marching import s_to_t, t_to_s
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 

@@ -7,7 +7,7 @@ from nerf.fields.positional_encoding import positional_encoding
 from nerf.geometry.contraction import contract, uncontract
 from nerf.geometry.rays import Rays, clip_to_box, points_on
 from nerf.kernels import BOX, CONTRACTED_BOX, Backend, Lattice, Samples
-from nerf.kernels.torch.marching import t_to_s, s_to_t
+from nerf.kernels.torch.marching import s_to_t, t_to_s
 from pipeline.doctor.numerics import Bound, Case
 
 OCTAVES = 16

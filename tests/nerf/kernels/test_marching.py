@@ -7,7 +7,7 @@ from nerf.geometry.contraction import contract
 from nerf.geometry.rays import Rays, clip_to_box
 from nerf.kernels import BOX, Lattice
 from nerf.kernels.torch import march, occupancy_bits, sample_points, sample_points_backward
-from nerf.kernels.torch.marching import t_to_s, s_to_t
+from nerf.kernels.torch.marching import s_to_t, t_to_s
 from nerf.kernels.torch.occupancy import occupied
 
 BOUNDED = Lattice(step=0.05, cone=0.0, contracted=False, cells=8, most_samples=1000)
