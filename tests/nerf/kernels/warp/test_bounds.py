@@ -12,8 +12,8 @@ import pytest
 
 ROOT = Path(__file__).parents[4]
 TESTS = [
-    f"tests/nerf/kernels/test_{name}.py"
-    for name in ("warp", "warp_marching", "warp_compositing", "warp_threads", "waves", "drawing")
+    *(f"tests/nerf/kernels/warp/test_{name}.py" for name in ("warp", "marching", "compositing", "threads")),
+    *(f"tests/nerf/kernels/test_{name}.py" for name in ("early_termination", "colour_sampling")),
 ]
 TESTED = f"import pytest; raise SystemExit(pytest.main({TESTS} + ['-k', 'not first_use', '-p', 'no:cacheprovider']))"
 BEYOND = """
