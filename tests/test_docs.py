@@ -95,7 +95,7 @@ def test_every_file_of_figures_says_where_they_come_from():
 def test_the_example_in_python_gives_stages_what_they_need():
     calls = calls_of_run((ROOT / "docs" / "PYTHON.md").read_text("utf-8"))
     assert len(calls) > 5
-    assert calls == [(stage, STAGES[stage].NEEDS) for stage, _ in calls]
+    assert calls == [(stage, STAGES[stage].INPUTS) for stage, _ in calls]
 
 
 def test_the_pages_are_linked():
