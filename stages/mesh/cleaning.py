@@ -14,12 +14,12 @@ if TYPE_CHECKING:
     from stages.mesh.visibility import Sight
 
 # Of the photos that look at a vertex. What is there is seen by about half of them, nine vertices in ten by a quarter;
-# what only shows itself past the edge of something else is seen by less (docs/numbers.md).
+# what only shows itself past the edge of something else is seen by less (docs/experiments/mesh.md).
 SEEN_OF_LOOKING = 0.2
 HIDDEN_STEPS = 10  # from vertex to vertex, by which a face may be away from what photos see: creases and gaps close
 SEEN_SHARE = 0.1  # of a component's area; an inner cavity has none, the seen side of an object about half
 # Of a component's area, near a sparse point. Of the demo's table 41 % lies within 0.03 of one, 57 % within 0.05; of
-# sheets of sky below it nothing within 0.3 (docs/numbers.md).
+# sheets of sky below it nothing within 0.3 (docs/experiments/mesh.md).
 LOCATED_SHARE = 0.1
 REACH, REACH_IN_SPACINGS = 0.1, 3.0  # scene units; of the distance from a sparse point to the next, if that is more
 FEWEST_POINTS = 50  # near the surface; fewer tell nothing of what is far from them

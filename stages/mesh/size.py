@@ -27,11 +27,12 @@ TIMED_EDGES, TIMED_SECONDS = (32, 64, 96), 0.3
 # What takes time besides the densities, in multiples of the time that the surface of a ball takes (:func:`yardstick`).
 # ONCE: what any mesh takes (visibility, level, colours, picture, files). PER_POINT: what each lattice point adds
 # (marching cubes, cleaning, decimation). Measured on an idle machine, where a ball takes 0.024 s: fox, fountain_p11 and
-# herzjesu_p8 at 64 to 192 points per edge took 2.6 to 3 s and 0.8 to 1.1 µs a point (docs/numbers.md).
+# herzjesu_p8 at 64 to 192 points per edge took 2.6 to 3 s and 0.8 to 1.1 µs a point (docs/experiments/mesh.md).
 ONCE, PER_POINT = 150.0, 4.5e-5
 # A colour reads the grids as often as this many densities, once for each of its samples. It takes 3 to 4 times as
-# long as these, for the second network and because colours are not shared out among the cores (docs/numbers.md); that
-# is in ONCE. Surfaces have 3 to 5 vertices for each point of a side of the lattice, and decimation leaves 150,000.
+# long as these, for the second network and because colours are not shared out among the cores
+# (docs/experiments/mesh.md); that is in ONCE. Surfaces have 3 to 5 vertices for each point of a side of the lattice,
+# and decimation leaves 150,000.
 COLOURED, VERTICES_PER_FACE, MOST_VERTICES = 8, 5, 150_000
 BALL_EDGE, BALL_TIMES = 96, 3
 # Of PER_POINT, and of the memory. Measured: a plain's lattice in a box with 3.5 times the surface took 1.2 times the

@@ -15,7 +15,8 @@ if TYPE_CHECKING:
 
 
 # Passes of nerf.fields.density_grid.smoothed: a Gaussian of a lattice point's distance. The field's finest cells are
-# about as small, and what differs between two of them is noise that a lattice would pick at random (docs/numbers.md).
+# about as small, and what differs between two of them is noise that a lattice would pick at random
+# (docs/experiments/mesh.md).
 SMOOTHING = 2
 
 
