@@ -1,4 +1,4 @@
-"""What a mesh costs: seconds and distance to what is known of the surface, against the lattice's resolution.
+"""What a mesh costs: seconds and distance to what is known of the surface, against the grid's resolution.
 
     pipeline run PHOTOS --until train --train.steps 1500
     python -m benchmarks.mesh_cost PHOTOS.nerf
@@ -90,7 +90,7 @@ def main() -> None:
     folders = {stage: workspace.folder(stage, keys[stage]) for stage in ("ingest", "normalise", "train")}
     truth = Truth.read(given.truth) if given.truth else None
     names = "mesh to truth (%) | truth to mesh (%)" if truth else "median point to mesh (%) | nine in ten within (%)"
-    print(f"| lattice | faces | s | {names} |\n|---|---|---|---|---|")
+    print(f"| grid | faces | s | {names} |\n|---|---|---|---|---|")
     for resolution in given.resolutions:
         print(row(folders, resolution, truth), flush=True)
 

@@ -11,9 +11,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from nerf.effects import AS_GIVEN, AS_RENDERED, PhotoColours, PhotoRays, Seen
-from nerf.fields import mlp as grid_mlp
-from nerf.fields.background import PRIOR as SKY_PRIOR
-from nerf.fields.background import RATE as SKY_RATE
+from nerf.fields import mlp
+from nerf.fields.background import BACKGROUND_LR_SCALE, BACKGROUND_PRIOR
 from nerf.fields.frustum_mask import compute_frustum_mask
 from nerf.fields.hash_grid import CORNERS, HashGridField, HashGridPass
 from nerf.fields.interface import Rendering
@@ -108,7 +107,7 @@ class _Part(NamedTuple):
     weights: Weights
     features: Float[Tensor, "samples width"]
     points: Float[Tensor, "samples 3"]
-    sky: dict[str, Tensor]
+    background: dict[str, Tensor]
     photos: dict[str, Tensor]
     norm: Tensor
     thickness: Float[Tensor, "samples"]
@@ -148,16 +147,16 @@ class HashGridTrainer:
         # Nothing beyond the box of a bounded scene is drawn: a point there would pull the light to its walls.
         self.bank = bank if model.settings.contracted else bank.known_within(BOX)
         self.photo_rays, self.photo_colours = photo_rays, photo_colours
-        self.cache = OccupancyGrid(model, self._usable())
+        self.occupancy_grid = OccupancyGrid(model, self._usable())
         self.photo_parts = [each for each in (photo_rays, photo_colours) if each.parameters]
         self.photo_parameters = {**photo_rays.parameters, **photo_colours.parameters}
         of_networks = model.weights._asdict()
-        self.sky = {"sky": model.sky} if model.settings.sky else {}
-        self.parameters = {"table": model.table, **of_networks, **self.sky, **self.photo_parameters}
-        self.mean = {name: torch.zeros_like(tensor) for name, tensor in self.parameters.items()}
-        self.square = {name: torch.zeros_like(tensor) for name, tensor in self.parameters.items()}
+        self.background = {"background_table": model.background_table} if model.settings.background_model else {}
+        self.parameters = {"table": model.table, **of_networks, **self.background, **self.photo_parameters}
+        self.exp_avg = {name: torch.zeros_like(tensor) for name, tensor in self.parameters.items()}
+        self.exp_avg_sq = {name: torch.zeros_like(tensor) for name, tensor in self.parameters.items()}
         self.grad_table = torch.zeros_like(model.table)
-        tables = model.table, self.grad_table, self.mean["table"], self.square["table"]
+        tables = model.table, self.grad_table, self.exp_avg["table"], self.exp_avg_sq["table"]
         self.levels = [
             tuple(tensor[first:end] for tensor in tables) for first, end in pairwise(model.layout.first_rows)
         ]
@@ -165,12 +164,12 @@ class HashGridTrainer:
         self.order = PixelSampler(self.bank.drawable, settings.seed, bank.device)
         self.drawn = torch.tensor(0)  # pixels of that order so far; steps differ in how many they take
 
-    def _usable(self) -> Bool[Tensor, "cache"] | None:
+    def _usable(self) -> Bool[Tensor, "cells"] | None:
         """Known only where points tell where foregrounds begin, in folded space: a box is carved beforehand."""
-        least, lattice = min(self.settings.least_photos, len(self.bank.near) - 1), self.model.lattice
-        if least <= 1 or self.bank.known is None or not lattice.contracted:
+        least, stepping = min(self.settings.least_photos, len(self.bank.near) - 1), self.model.stepping
+        if least <= 1 or self.bank.known is None or not stepping.contracted:
             return None
-        return compute_frustum_mask(self.bank, least, lattice.cells)
+        return compute_frustum_mask(self.bank, least, stepping.occupancy_resolution)
 
     def step(self, step: int, share: float, rate_scale: float = 1.0) -> StepResult:
         """One batch, one update. Raises NonFinite before the update, leaving model and optimiser as they were."""
@@ -179,7 +178,7 @@ class HashGridTrainer:
         loss, error = self._finite(step, parts)
         self._update(parts, rate_scale * lr_multiplier(step, share), step + 1)
         with part("cache"):
-            self.cache.refresh(step, generator(device, self.settings.seed, step, self.settings.chunks))
+            self.occupancy_grid.update(step, generator(device, self.settings.seed, step, self.settings.chunks))
         samples = sum(len(each.points) for each in parts)
         rays *= self.settings.chunks
         self.drawn += self._of_photos(rays, share)
@@ -187,15 +186,19 @@ class HashGridTrainer:
         return StepResult(loss, psnr(error), rays, samples, sum(each.densities for each in parts))
 
     def state(self) -> dict[str, Tensor]:
-        """Weights and cache bits as ``model.<name>``, what is learnt of photos as ``photo.<name>``, Adam's moments as
-        ``mean.<name>`` and ``square.<name>``, the cache's thickness, the mean number of samples per ray, how
-        many pixels were drawn, and the field's settings, to know it by."""
+        """Weights and occupancy bits as ``model.<name>``, per-image parameters as ``photo.<name>``, Adam's moments as
+        ``exp_avg.<name>`` and ``exp_avg_sq.<name>``, the optical thickness of the occupancy grid's cells, the mean
+        number of samples per ray, how many pixels were sampled, and the field's settings, to know it by."""
         return (
             {f"model.{name}": tensor for name, tensor in self.model.state_dict().items()}
             | {f"photo.{name}": tensor for name, tensor in self.photo_parameters.items()}
-            | {f"mean.{name}": tensor for name, tensor in self.mean.items()}
-            | {f"square.{name}": tensor for name, tensor in self.square.items()}
-            | {"thickness": self.cache.thickness, "samples_per_ray": self.samples_per_ray, "drawn": self.drawn}
+            | {f"exp_avg.{name}": tensor for name, tensor in self.exp_avg.items()}
+            | {f"exp_avg_sq.{name}": tensor for name, tensor in self.exp_avg_sq.items()}
+            | {
+                "optical_thickness": self.occupancy_grid.optical_thickness,
+                "samples_per_ray": self.samples_per_ray,
+                "drawn": self.drawn,
+            }
             | {"settings": torch.tensor(astuple(self.model.settings), dtype=torch.float64)}
         )
 
@@ -255,15 +258,17 @@ class HashGridTrainer:
             gradients = self.model.backward(done, loss.grad, loss.grad_weights)
             grad_rays = partial(self.model.rays_backward, done, gradients)
             photos = loss.grad_photos | self.photo_rays.backward(batch.rays, batch.view, grad_rays)
-            sky = {name: self.model.background_backward(done, gradients) for name in self.sky}
+            background = {name: self.model.background_backward(done, gradients) for name in self.background}
         weights, features, *_ = gradients
-        norm = torch.nn.utils.get_total_norm([*weights, features, *sky.values(), *photos.values()])
+        norm = torch.nn.utils.get_total_norm([*weights, features, *background.values(), *photos.values()])
         of_loss = loss.value, loss.squared_error
-        return _Part(batch, *of_loss, weights, features, done.points, sky, photos, norm, done.thickness, done.marched)
+        return _Part(
+            batch, *of_loss, weights, features, done.points, background, photos, norm, done.thickness, done.marched
+        )
 
     def _backward_work(self, done: HashGridPass) -> Work:
         weights = self.model.weights
-        products = 2 * (grid_mlp.density_products(weights) + grid_mlp.colour_products(weights)) * len(done.points)
+        products = 2 * (mlp.density_products(weights) + mlp.colour_products(weights)) * len(done.points)
         to_points = CORNERS * len(self.model.layout.resolutions) * len(done.points) if self.photo_rays.parameters else 0
         return Work(products, to_points)
 
@@ -273,14 +278,14 @@ class HashGridTrainer:
         robust, pull = huber_loss(error)
         grad, photos = self.photo_colours.backward(seen, pull * (2 / (3 * rays)))
         value, grad_weights = robust.sum() / (3 * rays), torch.zeros_like(done.weights)
-        backend, lattice = self.model.backend, self.model.lattice
+        backend, stepping = self.model.backend, self.model.stepping
         if self.settings.distortion:
             each = torch.full_like(batch.distance, self.settings.distortion * distortion_factor(share) / rays)
-            value = value + (each * backend.distortion(done.samples, done.weights, lattice)).sum()
-            grad_weights = backend.distortion_backward(done.samples, done.weights, lattice, each)
+            value = value + (each * backend.distortion(done.samples, done.weights, stepping)).sum()
+            grad_weights = backend.distortion_backward(done.samples, done.weights, stepping, each)
         if self._is_guided(share):
             each = torch.full_like(batch.distance, self.settings.depth_loss * depth_factor(share) / rays)
-            places = done.rays.far, batch.distance, lattice
+            places = done.rays.far, batch.distance, stepping
             apart = backend.depth_loss(done.samples, done.weights, done.rendering.opacity, *places)
             value = value + (each * apart).sum()
             of_weights, of_opacity = backend.depth_loss_backward(done.samples, *places, each)
@@ -300,57 +305,61 @@ class HashGridTrainer:
                 raise NonFinite(quantity, step, _whole([chunk.batch for chunk in parts]))
         return loss_now, error_now
 
-    def _update(self, parts: Sequence[_Part], factor: float, count: int) -> None:
+    def _update(self, parts: Sequence[_Part], factor: float, adam_step: int) -> None:
         """Of the table's levels, which share no rows, of the networks, of what is learnt of photos and of the cache:
         each work for a core. ``factor``: of all learning rates."""
         finest_first = range(len(self.model.layout.resolutions) - 1, -1, -1)  # no core waits long for the last
-        rate = self.settings.rate * factor
-        work = [partial(self._update_level, level, parts, rate, count) for level in finest_first]
+        learning_rate = self.settings.rate * factor
+        work = [partial(self._update_level, level, parts, learning_rate, adam_step) for level in finest_first]
         of_networks = [chunk.weights._asdict() for chunk in parts]
-        work.append(partial(self._update_small, Weights._fields, of_networks, rate, count))
-        of_sky = [*(chunk.sky for chunk in parts), self._sky_prior(parts)]
-        work.append(partial(self._update_small, self.sky, of_sky, SKY_RATE * rate, count))
-        work.append(partial(self._raise_cache, parts))
+        work.append(partial(self._update_small, Weights._fields, of_networks, learning_rate, adam_step))
+        of_background = [*(chunk.background for chunk in parts), self._background_prior(parts)]
+        work.append(
+            partial(self._update_small, self.background, of_background, BACKGROUND_LR_SCALE * learning_rate, adam_step)
+        )
+        work.append(partial(self._raise_occupancy, parts))
         for of_photos in self.photo_parts:
-            work.append(partial(self._update_photos, of_photos, parts, of_photos.rate * factor, count))
+            work.append(partial(self._update_photos, of_photos, parts, of_photos.rate * factor, adam_step))
         for _ in in_order(lambda update: update(), work, self.bank.device):
             pass
 
-    def _sky_prior(self, parts: Sequence[_Part]) -> dict[str, Tensor]:
+    def _background_prior(self, parts: Sequence[_Part]) -> dict[str, Tensor]:
         """The prior's gradient of the sky, where rays of this batch ran to it: what none runs to stays as it is."""
         rays = sum(len(chunk.batch.jitter) for chunk in parts)
-        touched = {name: torch.stack([chunk.sky[name] for chunk in parts]).sum(0) != 0 for name in self.sky}
-        return {name: SKY_PRIOR / rays * sky * touched[name] for name, sky in self.sky.items()}
+        touched = {
+            name: torch.stack([chunk.background[name] for chunk in parts]).sum(0) != 0 for name in self.background
+        }
+        return {name: BACKGROUND_PRIOR / rays * table * touched[name] for name, table in self.background.items()}
 
-    def _update_level(self, level: int, parts: Sequence[_Part], rate: float, count: int) -> None:
+    def _update_level(self, level: int, parts: Sequence[_Part], learning_rate: float, adam_step: int) -> None:
         layout, backend = self.model.layout, self.model.backend
         with part("scatter", Work(rows=CORNERS * sum(len(each.points) for each in parts))):
             for each in parts:
                 backend.encode_backward_table(layout, level, each.points, each.features, self.grad_table)
-        table, grad, mean, square = self.levels[level]
+        table, grad, exp_avg, exp_avg_sq = self.levels[level]
         with part("optimiser", Work(bytes=ADAM_BYTES * table.numel())):
-            backend.adam(table, grad, mean, square, rate, count)
+            backend.adam(table, grad, exp_avg, exp_avg_sq, learning_rate, adam_step)
 
     def _update_small(
-        self, names: Iterable[str], of_parts: Sequence[dict[str, Tensor]], rate: float, count: int
+        self, names: Iterable[str], of_parts: Sequence[dict[str, Tensor]], learning_rate: float, adam_step: int
     ) -> None:
         """Of parameters that are small beside the table."""
         with part("optimiser"):
             for name in names:
                 gradient = torch.stack([each[name] for each in of_parts]).sum(0)
-                parameter, mean, square = self.parameters[name], self.mean[name], self.square[name]
-                self.model.backend.adam(parameter, gradient, mean, square, rate, count)
+                parameter, exp_avg, exp_avg_sq = self.parameters[name], self.exp_avg[name], self.exp_avg_sq[name]
+                self.model.backend.adam(parameter, gradient, exp_avg, exp_avg_sq, learning_rate, adam_step)
 
     def _update_photos(
-        self, of_photos: PhotoRays | PhotoColours, parts: Sequence[_Part], rate: float, count: int
+        self, of_photos: PhotoRays | PhotoColours, parts: Sequence[_Part], learning_rate: float, adam_step: int
     ) -> None:
-        self._update_small(of_photos.parameters, [chunk.photos for chunk in parts], rate, count)
+        self._update_small(of_photos.parameters, [chunk.photos for chunk in parts], learning_rate, adam_step)
         of_photos.settle()
 
-    def _raise_cache(self, parts: Sequence[_Part]) -> None:
+    def _raise_occupancy(self, parts: Sequence[_Part]) -> None:
         with part("cache"):
             for each in parts:
-                self.cache.raise_to(each.points, each.thickness)
+                self.occupancy_grid.raise_to(each.points, each.thickness)
 
 
 def _whole(batches: Sequence[HashGridBatch]) -> dict[str, Tensor]:

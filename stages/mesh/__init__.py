@@ -1,6 +1,6 @@
 """Stage mesh: the field's density becomes a coloured triangle mesh.
 
-density lattice over the region of interest → marching cubes at the density where the photos' rays stop → only
+density grid over the region of interest → marching cubes at the density where the photos' rays stop → only
 what the photos cover, see and locate → decimation → colours from the field, seen as the photos saw it → PLY, OBJ, GLB.
 A surface that leaves the region of interest ends there, open: closing it would invent geometry.
 """
@@ -15,8 +15,8 @@ from stages.contract import Inputs, Progress, StageConfig, StageResult
 from stages.io.files import read_json, read_scene, read_tensors, write_png
 from stages.mesh.size import (
     affordable_resolution,
+    density_grid_box,
     flatness,
-    lattice_box,
     point_cost,
     points_along,
     resolution_in,
@@ -27,7 +27,7 @@ from stages.mesh.size import (
 if TYPE_CHECKING:
     import numpy as np
 
-    from nerf.fields.density_grid import Lattice
+    from nerf.fields.density_grid import DensityGrid
     from nerf.fields.interface import RadianceModel
     from nerf.geometry.scene import Scene
     from stages.mesh.cleaning import Cleaned
@@ -43,7 +43,7 @@ NOT_HASHED = ("seconds",)  # it decides the resolution, and that enters the key
 
 CHUNK = 1 << 16
 LEVEL_RAYS = 1024
-COLOUR_SAMPLES = 8  # through the two lattice cells about a vertex
+COLOUR_SAMPLES = 8  # through the two grid cells about a vertex
 BYTES_PER_POINT = 20  # density, occupancy, its averages and marching cubes; 16 measured at 208³
 
 Format = Literal["glb", "ply", "obj"]
@@ -57,7 +57,7 @@ class Config(StageConfig):
         default=None,
         ge=16,
         le=1024,
-        description="lattice points per edge of a cube, as many in all in a flat box; none: from the training",
+        description="grid points per edge of a cube, as many in all in a flat box; none: from the training",
     )
     seconds: float | None = Field(
         default=None, gt=0, description="that the stage may take; none: about a tenth of the training"
@@ -92,7 +92,7 @@ def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
     if config.seconds is not None:
         progress.update("trying how fast the field tells its density")
         began = time.perf_counter()
-        box = lattice_box(read_scene(inputs["normalise"]).layout, _sparse_points(inputs["normalise"]))
+        box = density_grid_box(read_scene(inputs["normalise"]).layout, _sparse_points(inputs["normalise"]))
         speeds = seconds_per_density(inputs["train"], box, CHUNK), yardstick()
         resolution = resolution_in(config.seconds - (time.perf_counter() - began), *speeds, flatness(box))
         return config.model_copy(update={"resolution": resolution})
@@ -148,14 +148,14 @@ def reconstruct(
     from stages.mesh.surface import decimate, extract, vertex_normals
     from stages.mesh.visibility import look, shadow_maps
 
-    box = lattice_box(scene.layout, points)
-    lattice = _density(config, model, box, device, progress)
-    voxel = float(lattice.spacing().max())
+    box = density_grid_box(scene.layout, points)
+    grid = _density(config, model, box, device, progress)
+    voxel = float(grid.spacing().max())
     views = scene.of_split("train")
-    maps = shadow_maps(lattice, scene, ingest, views, lambda done: progress.update("visibility", 0.6 + 0.2 * done))
-    level = _level(config, lattice, model, maps, progress)
+    maps = shadow_maps(grid, scene, ingest, views, lambda done: progress.update("visibility", 0.6 + 0.2 * done))
+    level = _level(config, grid, model, maps, progress)
     progress.update("marching cubes", 0.8)
-    raw = extract(lattice, level.level)
+    raw = extract(grid, level.level)
     sight = look(raw.vertices, vertex_normals(raw), maps, voxel)
     progress.update("cleaning", 0.85)
     cleaned = clean(raw, sight, points, config.keep, min(config.min_views, len(views)), config.min_component)
@@ -168,7 +168,9 @@ def reconstruct(
     return Extracted(mesh, level, cleaned, openness(surface, box, voxel), voxel)
 
 
-def _density(config: Config, model: "RadianceModel", box: "np.ndarray", device: str, progress: Progress) -> "Lattice":
+def _density(
+    config: Config, model: "RadianceModel", box: "np.ndarray", device: str, progress: Progress
+) -> "DensityGrid":
     import torch
 
     from nerf.fields.density_grid import sample_density_grid
@@ -178,7 +180,7 @@ def _density(config: Config, model: "RadianceModel", box: "np.ndarray", device: 
     needed = BYTES_PER_POINT * point_cost(flatness(box))
     fits = int((available_bytes() / needed) ** (1 / 3)) // 16 * 16
     hint = f"Try --mesh.resolution {fits}." if fits >= 16 else "Close other programs."
-    check_memory(needed * config.resolution**3, "the mesh", f"a lattice of {config.resolution}³ points needs", hint)
+    check_memory(needed * config.resolution**3, "the mesh", f"a grid of {config.resolution}³ points needs", hint)
     low, high = torch.tensor(box, dtype=torch.float32, device=device)
 
     def report(done: float) -> None:
@@ -188,16 +190,16 @@ def _density(config: Config, model: "RadianceModel", box: "np.ndarray", device: 
 
 
 def _level(
-    config: Config, lattice: "Lattice", model: "RadianceModel", maps: "list[ShadowMap]", progress: Progress
+    config: Config, grid: "DensityGrid", model: "RadianceModel", maps: "list[ShadowMap]", progress: Progress
 ) -> "Level":
     """The level asked for, or the one chosen from some of the maps' rays."""
     from stages.mesh.iso_level import Level, check_range, choose_level
     from stages.mesh.visibility import drawn_rays
 
-    check_range(lattice, config.level)
+    check_range(grid, config.level)
     if config.level is not None:
         return Level(config.level, "as asked", None, True)
-    level = choose_level(lattice, model, drawn_rays(maps, LEVEL_RAYS))
+    level = choose_level(grid, model, drawn_rays(maps, LEVEL_RAYS))
     progress.note(f"surface at density {level.level:.3g}: {level.reason}")
     return level
 
@@ -205,10 +207,10 @@ def _level(
 def _colours(
     model: "RadianceModel", vertices: "np.ndarray", directions: "np.ndarray", voxel: float, device: str
 ) -> "np.ndarray":
-    """sRGB bytes (n, 3) of what is seen along ``directions`` (n, 3) from a lattice cell before each vertex of the raw
+    """sRGB bytes (n, 3) of what is seen along ``directions`` (n, 3) from a grid cell before each vertex of the raw
     surface to one behind it.
 
-    A field's colour means something where the field is dense, and a vertex is as far from there as the lattice is
+    A field's colour means something where the field is dense, and a vertex is as far from there as the grid is
     coarse. Only the light that is stopped there counts; where nothing stops any, the last sample does.
     """
     import torch

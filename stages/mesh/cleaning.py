@@ -142,7 +142,7 @@ def _have(label: np.ndarray, area: np.ndarray, marked: np.ndarray, share: float)
 
 
 def openness(surface: Surface, box: np.ndarray, voxel: float) -> str:
-    """Where the surface ends: "watertight", or "open" and the places, for a lattice over a box (2, 3)."""
+    """Where the surface ends: "watertight", or "open" and the places, for a grid over a box (2, 3)."""
     if is_watertight(surface):
         return "watertight"
     border = border_vertices(surface)

@@ -16,13 +16,13 @@ from stages.contract import StageError
 if TYPE_CHECKING:
     import torch
 
-    from nerf.fields.density_grid import Lattice
+    from nerf.fields.density_grid import DensityGrid
     from nerf.fields.interface import RadianceModel
     from nerf.geometry.rays import Rays
 
 CLIP_VOXELS = 4.0
 MARGIN = 1e-5
-SAMPLES_PER_EDGE = 4  # along a ray, per lattice point of an edge: at least two samples per voxel
+SAMPLES_PER_EDGE = 4  # along a ray, per grid point of an edge: at least two samples per voxel
 RAYS_AT_A_TIME = 128
 LEVELS = 17  # over three decades: neighbours differ by a factor of 1.5
 STRIDES = (4, 2, 1)  # of the levels: every fourth is tried, then those next to the best, closer and closer
@@ -42,19 +42,19 @@ class Level(NamedTuple):
     clear: bool
 
 
-def check_range(lattice: "Lattice", level: float | None) -> None:
-    """Refuse lattices in which no surface can be: non-finite, empty or constant, or a given level out of range."""
+def check_range(grid: "DensityGrid", level: float | None) -> None:
+    """Refuse grids in which no surface can be: non-finite, empty or constant, or a given level out of range."""
     import torch
 
-    broken = int((~torch.isfinite(lattice.values)).sum())
+    broken = int((~torch.isfinite(grid.values)).sum())
     if broken:
         raise StageError(
             "the density is not finite",
-            f"{broken} of {lattice.values.numel()} lattice points are NaN or infinite",
+            f"{broken} of {grid.values.numel()} grid points are NaN or infinite",
             "Train again: the field is broken.",
         )
-    low, high = float(lattice.values.min()), float(lattice.values.max())
-    through = 1 - float(torch.exp(-high * (lattice.high - lattice.low).norm()))
+    low, high = float(grid.values.min()), float(grid.values.max())
+    through = 1 - float(torch.exp(-high * (grid.high - grid.low).norm()))
     if through < 0.01:
         why = f"its density is at most {high:.3g} per scene unit, which stops {through:.1%} of a ray across the box"
         raise StageError("the field is empty", why, "Train for longer (--train.steps or --train.seconds).")
@@ -67,29 +67,29 @@ def check_range(lattice: "Lattice", level: float | None) -> None:
         raise StageError(f"no surface at density {level:g}", why, hint)
 
 
-def choose_level(lattice: "Lattice", model: "RadianceModel", rays: "Rays") -> Level:
-    """The density whose surface in ``lattice`` lies closest to where ``rays`` lose half of their light in ``model``."""
+def choose_level(grid: "DensityGrid", model: "RadianceModel", rays: "Rays") -> Level:
+    """The density whose surface in ``grid`` lies closest to where ``rays`` lose half of their light in ``model``."""
     import torch
 
     from nerf.fields.density_grid import along, first_crossing, ray_distances
     from nerf.geometry.rays import clip_to_box
     from stages.mesh.surface import solidity
 
-    inside = clip_to_box(rays, lattice.low, lattice.high)
+    inside = clip_to_box(rays, grid.low, grid.high)
     inside = inside.each(lambda part: part[inside.far > inside.near])
-    t = ray_distances(inside, SAMPLES_PER_EDGE * max(lattice.values.shape))
+    t = ray_distances(inside, SAMPLES_PER_EDGE * max(grid.values.shape))
     stop, peak = _stops(model, inside, t)
     stopped = torch.isfinite(stop)
     if int(stopped.sum()) < MIN_STOPPED * len(stop) or not stopped.any():
-        return _thickest_fog(lattice, float(stopped.float().mean()) if len(stop) else 0.0)
-    low, high = float(lattice.values.min()), float(lattice.values.max())
+        return _thickest_fog(grid, float(stopped.float().mean()) if len(stop) else 0.0)
+    low, high = float(grid.values.min()), float(grid.values.max())
     peaks = peak[stopped].median() * torch.logspace(-2.5, 0.5, LEVELS, device=peak.device)
     # Inside the range by a part of its own ends: the highest density is an outlier, often of millions.
     candidates = peaks.clamp((1 + MARGIN) * low, (1 - MARGIN) * high).tolist()
-    voxel = float(lattice.spacing().max())
+    voxel = float(grid.spacing().max())
 
     def miss(index: int) -> float:
-        surface = first_crossing(along(solidity(lattice, candidates[index]), inside, t), t, 0.5)
+        surface = first_crossing(along(solidity(grid, candidates[index]), inside, t), t, 0.5)
         return _miss(surface, stop, voxel)
 
     misses, best = {}, 0
@@ -108,7 +108,7 @@ def choose_level(lattice: "Lattice", model: "RadianceModel", rays: "Rays") -> Le
 def _stops(model: "RadianceModel", rays: "Rays", t: "torch.Tensor") -> "tuple[torch.Tensor, torch.Tensor]":
     """Where each ray has lost half of its light (infinite: nowhere), and the largest density met until there.
 
-    The field itself is asked, not the lattice: between two lattice points a wall thinner than a voxel looks like a
+    The field itself is asked, not the grid: between two grid points a wall thinner than a voxel looks like a
     ramp that stops light a voxel too early. Midpoint rule, so that a jump between samples is off by nothing on average.
     """
     import torch
@@ -135,12 +135,12 @@ def _miss(surface: "torch.Tensor", stop: "torch.Tensor", voxel: float) -> float:
     return float((distance / voxel).clamp(max=CLIP_VOXELS).mean())
 
 
-def _thickest_fog(lattice: "Lattice", share: float) -> Level:
+def _thickest_fog(grid: "DensityGrid", share: float) -> Level:
     """Otsu's threshold (1979) on the logarithm of the density, for fields that hardly stop any light."""
     import numpy as np
     from skimage.filters import threshold_otsu
 
-    values = lattice.values.cpu().numpy()
+    values = grid.values.cpu().numpy()
     level = float(np.exp(threshold_otsu(np.log(values[values > 1e-3 * values.max()]))))
     reason = (
         f"only {share:.1%} of the photos' rays lose half of their light in the box, so the field is still fog; "

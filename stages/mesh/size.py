@@ -1,6 +1,6 @@
-"""Where a mesh's lattice lies, and how fine it can be in the time there is.
+"""Where a mesh's grid lies, and how fine it can be in the time there is.
 
-A box is (2, 3): its lowest and its highest corner, in the scene frame. ``resolution`` is the number of lattice points
+A box is (2, 3): its lowest and its highest corner, in the scene frame. ``resolution`` is the number of grid points
 per edge of a cube; a flat box has about as many points in all, and cubic voxels, smaller ones.
 """
 
@@ -21,21 +21,21 @@ if TYPE_CHECKING:
 # either side, in sides of the cube, and the few points beyond OUTERMOST, some of them false, say nothing.
 FEWEST_POINTS, SPANNED, MARGIN, OUTERMOST = 500, 0.5, 0.05, 0.001
 
-POINTS_PER_RAY = 20  # lattice points per ray trained: about a tenth of what training cost
+POINTS_PER_RAY = 20  # grid points per ray trained: about a tenth of what training cost
 LEAST_RESOLUTION, MOST_RESOLUTION = 64, 256
 TIMED_EDGES, TIMED_SECONDS = (32, 64, 96), 0.3
 # What takes time besides the densities, in multiples of the time that the surface of a ball takes (:func:`yardstick`).
-# ONCE: what any mesh takes (visibility, level, colours, picture, files). PER_POINT: what each lattice point adds
+# ONCE: what any mesh takes (visibility, level, colours, picture, files). PER_POINT: what each grid point adds
 # (marching cubes, cleaning, decimation). Measured on an idle machine, where a ball takes 0.024 s: fox, fountain_p11 and
 # herzjesu_p8 at 64 to 192 points per edge took 2.6 to 3 s and 0.8 to 1.1 µs a point (docs/experiments/mesh.md).
 ONCE, PER_POINT = 150.0, 4.5e-5
 # A colour reads the grids as often as this many densities, once for each of its samples. It takes 3 to 4 times as
 # long as these, for the second network and because colours are not shared out among the cores
-# (docs/experiments/mesh.md); that is in ONCE. Surfaces have 3 to 5 vertices for each point of a side of the lattice,
+# (docs/experiments/mesh.md); that is in ONCE. Surfaces have 3 to 5 vertices for each point of a side of the grid,
 # and decimation leaves 150,000.
 COLOURED, VERTICES_PER_FACE, MOST_VERTICES = 8, 5, 150_000
 BALL_EDGE, BALL_TIMES = 96, 3
-# Of PER_POINT, and of the memory. Measured: a plain's lattice in a box with 3.5 times the surface took 1.2 times the
+# Of PER_POINT, and of the memory. Measured: a plain's grid in a box with 3.5 times the surface took 1.2 times the
 # seconds and 1.5 times the memory. Surfaces of photos are twice as large.
 SURFACE_SHARE = 1 / 3
 
@@ -46,8 +46,8 @@ def affordable_resolution(rays: int) -> int:
     return min(MOST_RESOLUTION, max(96, round(edge / 16) * 16))
 
 
-def lattice_box(layout: "Layout", points: "np.ndarray") -> "np.ndarray":
-    """The box for the lattice: the region of interest, or where the scene is flat (ground from the air, a façade, the
+def density_grid_box(layout: "Layout", points: "np.ndarray") -> "np.ndarray":
+    """The box for the grid: the region of interest, or where the scene is flat (ground from the air, a façade, the
     floor of a house) the slice of it that sparse ``points`` (n, 3) lie in.
 
     Not where photos were taken around an object: that may be bare at its top, and points on what it stands on do not
@@ -68,7 +68,7 @@ def lattice_box(layout: "Layout", points: "np.ndarray") -> "np.ndarray":
 
 
 def points_along(box: "np.ndarray", resolution: int) -> int:
-    """Lattice points along the longest edge of a box."""
+    """Grid points along the longest edge of a box."""
     sides = (box[1] - box[0]).tolist()
     return round((resolution - 1) * max(sides) / math.prod(sides) ** (1 / 3)) + 1
 
@@ -80,7 +80,7 @@ def flatness(box: "np.ndarray") -> float:
 
 
 def point_cost(flatness: float) -> float:
-    """What a lattice point takes besides its density, in those of a cube: a part of it is its share in the surface."""
+    """What a grid point takes besides its density, in those of a cube: a part of it is its share in the surface."""
     return 1 + SURFACE_SHARE * (flatness - 1)
 
 
@@ -100,7 +100,7 @@ def seconds_of(resolution: int, per_density: float, per_ball: float, flatness: f
 
 
 def seconds_per_density(train: Path, box: "np.ndarray", chunk: int) -> float:
-    """Measured: larger lattices of the field in ``train`` over a box until one takes long enough to tell."""
+    """Measured: larger grids of the field in ``train`` over a box until one takes long enough to tell."""
     import torch
 
     from nerf.fields.density_grid import sample_density_grid
@@ -123,18 +123,18 @@ def seconds_per_density(train: Path, box: "np.ndarray", chunk: int) -> float:
 
 
 def yardstick() -> float:
-    """Seconds for the surface of a ball on a lattice of BALL_EDGE³, the best of a few: how fast this machine is at what
+    """Seconds for the surface of a ball on a grid of BALL_EDGE³, the best of a few: how fast this machine is at what
     is no field."""
     import torch
 
-    from nerf.fields.density_grid import Lattice
+    from nerf.fields.density_grid import DensityGrid
     from stages.mesh.surface import extract, vertex_normals
 
     line = torch.linspace(-1, 1, BALL_EDGE)
     radius = torch.stack(torch.meshgrid(line, line, line, indexing="ij")).norm(dim=0)
-    lattice, times = Lattice((4 * (0.6 - radius)).exp(), -torch.ones(3), torch.ones(3)), []
+    grid, times = DensityGrid((4 * (0.6 - radius)).exp(), -torch.ones(3), torch.ones(3)), []
     for _ in range(BALL_TIMES):
         began = time.perf_counter()
-        vertex_normals(extract(lattice, 1.0))
+        vertex_normals(extract(grid, 1.0))
         times.append(time.perf_counter() - began)
     return min(times)

@@ -11,11 +11,11 @@ import numpy as np
 from stages.contract import StageError
 
 if TYPE_CHECKING:
-    from nerf.fields.density_grid import Lattice
+    from nerf.fields.density_grid import DensityGrid
 
 
-# Passes of nerf.fields.density_grid.smoothed: a Gaussian of a lattice point's distance. The field's finest cells are
-# about as small, and what differs between two of them is noise that a lattice would pick at random
+# Passes of nerf.fields.density_grid.smoothed: a Gaussian of a grid point's distance. The field's finest cells are
+# about as small, and what differs between two of them is noise that a grid would pick at random
 # (docs/experiments/mesh.md).
 SMOOTHING = 2
 
@@ -27,31 +27,31 @@ class Surface(NamedTuple):
     faces: np.ndarray
 
 
-def solidity(lattice: "Lattice", level: float) -> "Lattice":
-    """What passes 1/2 at the surface of density ``level``: the occupancy, less what is finer than the lattice."""
+def solidity(grid: "DensityGrid", level: float) -> "DensityGrid":
+    """What passes 1/2 at the surface of density ``level``: the occupancy, less what is finer than the grid."""
     from nerf.fields.density_grid import occupancy, smoothed
 
-    return smoothed(occupancy(lattice, level), SMOOTHING)
+    return smoothed(occupancy(grid, level), SMOOTHING)
 
 
-def extract(lattice: "Lattice", level: float) -> Surface:
+def extract(grid: "DensityGrid", level: float) -> Surface:
     """The surface where density passes ``level`` (marching cubes, Lewiner et al. 2003); open where the box cuts it.
 
-    Raises StageError where nothing is as solid as that, or all is: of sheets of one lattice point and rods of two
+    Raises StageError where nothing is as solid as that, or all is: of sheets of one grid point and rods of two
     smoothing leaves nothing.
     """
     from skimage.measure import marching_cubes
 
-    values = solidity(lattice, level).values.cpu().numpy()
+    values = solidity(grid, level).values.cpu().numpy()
     if not values.min() < 0.5 < values.max():
         raise StageError(
             f"no surface at density {level:.3g}",
-            f"between neighbours of the lattice it averages {values.min():.0%} to {values.max():.0%} of solid: what is "
-            "there is too thin for the lattice, or fills the box",
+            f"between neighbours of the grid it averages {values.min():.0%} to {values.max():.0%} of solid: what is "
+            "there is too thin for the grid, or fills the box",
             "Give a higher --mesh.resolution or another --mesh.level.",
         )
     index, faces, _, _ = marching_cubes(values, 0.5, gradient_direction="ascent")
-    vertices = lattice.low.cpu().double().numpy() + index * lattice.spacing().cpu().double().numpy()
+    vertices = grid.low.cpu().double().numpy() + index * grid.spacing().cpu().double().numpy()
     return Surface(vertices, faces.astype(np.int32))
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 if TYPE_CHECKING:
-    from nerf.fields.density_grid import Lattice
+    from nerf.fields.density_grid import DensityGrid
     from nerf.geometry.rays import Rays
     from nerf.geometry.scene import Camera, Scene, View
 
@@ -49,7 +49,7 @@ class ShadowMap(NamedTuple):
 
 
 def shadow_maps(
-    lattice: "Lattice", scene: "Scene", ingest: Path, views: Sequence["View"], on_view: Callable[[float], None]
+    grid: "DensityGrid", scene: "Scene", ingest: Path, views: Sequence["View"], on_view: Callable[[float], None]
 ) -> list[ShadowMap]:
     """One map per photo; together about ``RAYS`` rays, each with a sample per voxel of the longest edge. Masks lie in
     the folder of stage ``ingest``."""
@@ -64,8 +64,8 @@ def shadow_maps(
         pixels = camera.width * camera.height
         downscale = max((pixels * len(views) / RAYS) ** 0.5, max(camera.width, camera.height) / LONGEST, 1.0)
         rays = view_rays(scene, view, downscale)
-        rays = rays.each(lambda part: part.to(lattice.low.device))
-        stop = median_depth(lattice, rays, max(lattice.values.shape)).cpu().numpy()
+        rays = rays.each(lambda part: part.to(grid.low.device))
+        stop = median_depth(grid, rays, max(grid.values.shape)).cpu().numpy()
         widest = float((rays.directions.cpu().double().numpy() @ view.scene_from_camera[:, 2]).min())
         mask = view_mask(ingest, scene, view, max(1.0, max(camera.width, camera.height) / LONGEST_MASK))
         used = None if mask is None else mask.numpy()
@@ -104,7 +104,7 @@ def drawn_rays(maps: list[ShadowMap], most: int) -> "Rays":
 
 
 def look(vertices: np.ndarray, normals: np.ndarray, maps: Sequence[ShadowMap], voxel: float) -> Sight:
-    """Look at every vertex from every photo; ``voxel`` is the lattice's spacing in scene units."""
+    """Look at every vertex from every photo; ``voxel`` is the grid's spacing in scene units."""
     parts = [
         _look(vertices[start : start + BLOCK], normals[start : start + BLOCK], maps, voxel)
         for start in range(0, len(vertices), BLOCK)

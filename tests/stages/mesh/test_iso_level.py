@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from nerf.fields.density_grid import Lattice, sample_density_grid
+from nerf.fields.density_grid import DensityGrid, sample_density_grid
 from nerf.geometry.rays import Rays
 from stages.contract import StageError
 from stages.mesh.iso_level import check_range, choose_level
@@ -48,18 +48,18 @@ def rays():
     return Rays(origins, directions, torch.full((RAYS,), 0.5), torch.full((RAYS,), 6.0))
 
 
-def lattice_of(model):
+def density_grid_of(model):
     return sample_density_grid(model, POINTS, -CORNER, CORNER)
 
 
 @pytest.mark.parametrize("inside", [60.0, 1e3, 1e5])
 def test_the_surface_lies_where_light_stops_whatever_the_density(rays, inside):
     model = Solid(ball, inside)
-    lattice = lattice_of(model)
-    chosen = choose_level(lattice, model, rays)
+    grid = density_grid_of(model)
+    chosen = choose_level(grid, model, rays)
     assert chosen.clear and chosen.miss_voxels is not None and 0 < chosen.miss_voxels < 0.35
     assert "e+" not in chosen.reason
-    radii = np.linalg.norm(extract(lattice, chosen.level).vertices, axis=1)
+    radii = np.linalg.norm(extract(grid, chosen.level).vertices, axis=1)
     assert abs(radii.mean() - 0.55) < VOXEL
     assert "rays of the photos lose half of their light" in chosen.reason
 
@@ -68,17 +68,17 @@ def test_the_level_scales_with_density_and_inversely_with_length(rays):
     """Light knows only density times length: a field twice the size with half the density has half the level."""
     model = Solid(ball, 100.0, softness=0.02)
     large = Solid(lambda p: 2 * ball(p / 2), 50.0, softness=0.04)
-    lattice = lattice_of(model)
+    grid = density_grid_of(model)
     far_rays = Rays(rays.origins * 2, rays.directions, rays.near * 2, rays.far * 2)
-    level = choose_level(lattice, model, rays).level
-    half = choose_level(Lattice(lattice.values / 2, -2 * CORNER, 2 * CORNER), large, far_rays).level
+    level = choose_level(grid, model, rays).level
+    half = choose_level(DensityGrid(grid.values / 2, -2 * CORNER, 2 * CORNER), large, far_rays).level
     assert half == pytest.approx(level / 2, rel=1e-3)
 
 
 def test_haze_around_a_solid_is_not_its_surface(rays):
     model = Solid(ball, 500.0, outside=0.15)
-    lattice = lattice_of(model)
-    surface = extract(lattice, choose_level(lattice, model, rays).level)
+    grid = density_grid_of(model)
+    surface = extract(grid, choose_level(grid, model, rays).level)
     assert abs(np.linalg.norm(surface.vertices, axis=1).mean() - 0.55) < VOXEL
 
 
@@ -93,13 +93,13 @@ def test_density_before_near_has_no_say(rays):
     )
     rays = rays.each(lambda part: part[(rays.near > 0) & (rays.near < 4)])
     bare, hung = Solid(ball, 500.0), Solid(curtained, 500.0)
-    without, behind = choose_level(lattice_of(bare), bare, rays), choose_level(lattice_of(hung), hung, rays)
+    without, behind = choose_level(density_grid_of(bare), bare, rays), choose_level(density_grid_of(hung), hung, rays)
     assert 1 / 2.4 < behind.level / without.level < 2.4  # two steps of the search at most
 
 
 def test_fog_is_split_into_thick_and_thin_and_called_fog(rays):
     model = Solid(ball, 0.02, softness=0.1, outside=0.002)
-    chosen = choose_level(lattice_of(model), model, rays)
+    chosen = choose_level(density_grid_of(model), model, rays)
     assert chosen.miss_voxels is None and not chosen.clear
     assert 0.002 < chosen.level < 0.022
     assert chosen.reason.startswith("only 0.0% of the photos' rays") and "still fog" in chosen.reason
@@ -108,7 +108,7 @@ def test_fog_is_split_into_thick_and_thin_and_called_fog(rays):
 def test_rays_that_all_miss_the_box_leave_fog(rays):
     model = Solid(ball, 500.0)
     away = rays._replace(directions=-rays.directions)
-    assert choose_level(lattice_of(model), model, away).miss_voxels is None
+    assert choose_level(density_grid_of(model), model, away).miss_voxels is None
 
 
 @pytest.mark.parametrize(
@@ -116,17 +116,17 @@ def test_rays_that_all_miss_the_box_leave_fog(rays):
     [
         (torch.zeros(4, 4, 4), None, "the field is empty: its density is at most 0 per scene unit, which stops 0.0%"),
         (torch.full((4, 4, 4), 9.0), None, "the field has no surface: its density is 9 to 9 per scene unit"),
-        (torch.full((4, 4, 4), torch.nan), None, "the density is not finite: 64 of 64 lattice points are NaN"),
+        (torch.full((4, 4, 4), torch.nan), None, "the density is not finite: 64 of 64 grid points are NaN"),
         (torch.linspace(1, 9, 64).reshape(4, 4, 4), 20.0, "no surface at density 20: density runs from 1 to 9 per"),
         (torch.linspace(1, 9, 64).reshape(4, 4, 4), 0.5, "no surface at density 0.5: density runs from 1 to 9 per"),
     ],
 )
-def test_lattices_without_a_surface_are_refused_in_words(values, level, message):
+def test_grids_without_a_surface_are_refused_in_words(values, level, message):
     with pytest.raises(StageError) as error:
-        check_range(Lattice(values, -CORNER, CORNER), level)
+        check_range(DensityGrid(values, -CORNER, CORNER), level)
     assert str(error.value).startswith(message)
     assert error.value.hint.startswith("Give --mesh.level" if level else "Train")
 
 
 def test_a_level_in_range_passes():
-    check_range(Lattice(torch.linspace(1, 9, 64).reshape(4, 4, 4), -CORNER, CORNER), 5.0)
+    check_range(DensityGrid(torch.linspace(1, 9, 64).reshape(4, 4, 4), -CORNER, CORNER), 5.0)

@@ -1,4 +1,4 @@
-"""How fine a lattice fits into the time there is."""
+"""How fine a grid fits into the time there is."""
 
 from types import SimpleNamespace
 
@@ -13,8 +13,8 @@ from stages.mesh.size import (
     MARGIN,
     ONCE,
     affordable_resolution,
+    density_grid_box,
     flatness,
-    lattice_box,
     points_along,
     resolution_in,
     seconds_of,
@@ -44,7 +44,7 @@ def test_the_resolution_chosen_fits_and_the_next_would_not(seconds: float, per_d
     assert seconds_of(edge, 2 * per_density, per_ball) > seconds_of(edge, per_density, per_ball) > ONCE * per_ball
 
 
-def test_a_longer_training_gets_a_finer_lattice():
+def test_a_longer_training_gets_a_finer_grid():
     assert [affordable_resolution(rays) for rays in (0, 10**5, 3 * 10**5, 10**9)] == [96, 128, 176, 256]
 
 
@@ -56,9 +56,9 @@ def test_the_yardstick_is_the_best_of_a_few(monkeypatch: pytest.MonkeyPatch):
 
 @pytest.mark.parametrize(("points", "flat"), [(GROUND, 2), (FACADE, 1)])
 @pytest.mark.parametrize("layout", ["forward", "inside"])
-def test_the_lattice_of_a_flat_scene_spans_the_slice_that_its_points_lie_in(points, flat, layout):
+def test_the_grid_of_a_flat_scene_spans_the_slice_that_its_points_lie_in(points, flat, layout):
     stray = np.array([[0.1, 0.1, 0.85], [0.5, 0.85, 0.1], [0.0, 0.0, 30.0]])
-    box = lattice_box(layout, np.concatenate([points, stray]))
+    box = density_grid_box(layout, np.concatenate([points, stray]))
     ends = np.quantile(points[:, flat], [0, 1]) + np.array([-1, 1]) * 2 * REGION_HALF * MARGIN
     np.testing.assert_allclose(box[:, flat], ends, atol=0.02)
     rest = [axis for axis in range(3) if axis != flat]
@@ -76,14 +76,14 @@ def test_the_lattice_of_a_flat_scene_spans_the_slice_that_its_points_lie_in(poin
         (GROUND + np.array([0, 0, 5]), "inside"),
     ],
 )
-def test_the_lattice_spans_the_region_where_points_do_not_tell_that_it_is_flat(points, layout):
-    np.testing.assert_array_equal(lattice_box(layout, points), CUBE)
+def test_the_grid_spans_the_region_where_points_do_not_tell_that_it_is_flat(points, layout):
+    np.testing.assert_array_equal(density_grid_box(layout, points), CUBE)
 
 
 @pytest.mark.parametrize("resolution", [16, 48, 77, 256])
 def test_a_flat_box_has_as_many_points_and_smaller_voxels(resolution):
     assert points_along(CUBE, resolution) == resolution and flatness(CUBE) == pytest.approx(1)
-    box = lattice_box("forward", GROUND)
+    box = density_grid_box("forward", GROUND)
     along = points_along(box, resolution)
     per_edge = (box[1] - box[0]) / 1.8 * (along - 1) + 1
     assert along > 1.3 * resolution
