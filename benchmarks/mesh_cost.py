@@ -26,7 +26,7 @@ from stages.hardware.device import compute_device
 from stages.io.field_files import load_field
 from stages.io.files import read_scene, read_tensors
 from stages.mesh import Config, reconstruct, write_mesh
-from stages.mesh.samples import sample_surface
+from stages.mesh.surface import sample_surface
 
 if TYPE_CHECKING:
     from nerf.geometry.scene import Scene

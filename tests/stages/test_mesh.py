@@ -17,8 +17,8 @@ from stages import mesh
 from stages.contract import StageError
 from stages.io import field_files
 from stages.io.files import write_json, write_tensors
-from stages.mesh import picture as mesh_picture
-from stages.mesh import visibility as mesh_views
+from stages.mesh import preview as mesh_preview
+from stages.mesh import visibility as mesh_visibility
 
 RADIUS = 0.4
 TURN = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
@@ -28,10 +28,10 @@ NO_POINTS = np.zeros((0, 3), np.float32)
 
 
 SMALL = (
-    (mesh_picture, "WIDTH", 60),
-    (mesh_picture, "HEIGHT", 50),
-    (mesh_views, "LONGEST", 32),
-    (mesh, "LEVEL_RAYS", 256),
+    (mesh_preview, "WIDTH", 60),
+    (mesh_preview, "HEIGHT", 50),
+    (mesh_visibility, "MAX_MAP_SIDE", 32),
+    (mesh, "ISO_LEVEL_RAYS", 256),
 )
 
 
@@ -170,9 +170,9 @@ def test_the_facts_are_those_of_the_files(run_mesh):
     assert facts["watertight"] is True and facts["ends"] == "watertight"
     assert facts["surface_area"] == pytest.approx(loaded.area, rel=1e-5)
     assert facts["voxel"] == pytest.approx(VOXEL / 0.25)
-    assert (facts["components_kept"], facts["components_dropped"], facts["faces_uncovered"]) == (1, 0, 0)
+    assert (facts["components_kept"], facts["components_dropped"], facts["faces_outside_photos"]) == (1, 0, 0)
     assert (facts["resolution"], facts["frame"]) == (48, "sfm")
-    assert 0 < facts["level"] < 300 and 0 < facts["level_miss_voxels"] < 0.5
+    assert 0 < facts["level"] < 300 and 0 < facts["surface_error_voxels"] < 0.5
 
 
 def test_colours_at_a_neutral_exposure_say_at_which(run_mesh):
@@ -304,8 +304,8 @@ def test_a_lattice_beyond_memory_is_refused_with_one_that_fits(run_mesh, monkeyp
 
 def test_the_resolution_that_fits_into_seconds_is_that_of_the_box(run_mesh, monkeypatch):
     asked = []
-    monkeypatch.setattr(mesh, "yardstick", lambda: 0.02)
-    monkeypatch.setattr(mesh, "seconds_per_density", lambda train, box, chunk: asked.append(box) or 2e-7)
+    monkeypatch.setattr(mesh, "reference_seconds", lambda: 0.02)
+    monkeypatch.setattr(mesh, "density_query_seconds", lambda train, box, chunk: asked.append(box) or 2e-7)
     points = np.random.default_rng(0).uniform([-0.9, -0.9, -0.25], [0.9, 0.9, -0.15], (1000, 3)).astype(np.float32)
     for layout in ("around", "inside"):
         scene = replace(scene_around(), layout=layout)
@@ -317,14 +317,14 @@ def test_the_resolution_that_fits_into_seconds_is_that_of_the_box(run_mesh, monk
 
 def test_fog_becomes_a_mesh_that_says_it_is_fog(run_mesh, progress):
     result, _ = run_mesh(Solid(ball, inside=0.3))
-    assert result.facts["faces"] > 100 and result.facts["level_miss_voxels"] is None
+    assert result.facts["faces"] > 100 and result.facts["surface_error_voxels"] is None
     assert result.line.endswith("; the field has no clear surface yet, train for longer")
     assert any("still fog" in note for note in progress.notes)
 
 
 def test_the_level_asked_for_is_taken(run_mesh):
     result, _ = run_mesh(Solid(ball), level=150.0)
-    assert (result.facts["level"], result.facts["level_reason"]) == (150.0, "as asked")
+    assert (result.facts["level"], result.facts["iso_level_reason"]) == (150.0, "as asked")
 
 
 @pytest.mark.parametrize(

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from stages.contract import StageError
-from stages.mesh.cleaning import FEWEST_POINTS, HIDDEN_STEPS, REACH, clean, openness
+from stages.mesh.cleaning import MIN_POINTS, DILATION_STEPS, SUPPORT_RADIUS, clean, boundary
 from stages.mesh.surface import Surface
-from stages.mesh.visibility import Sight
+from stages.mesh.visibility import Visibility
 
 CORNERS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
 FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32)
@@ -21,15 +21,15 @@ def tetrahedra(*sizes):
 def sight(covered, seen):
     """Four vertices per component, all with the same counts."""
     covered, seen = np.repeat(covered, 4), np.repeat(seen, 4)
-    return Sight(covered, seen, np.zeros((len(seen), 3)))
+    return Visibility(covered, seen, np.zeros((len(seen), 3)))
 
 
 NO_POINTS = np.zeros((0, 3))
 
 
-def points_at(*corners, count=2 * FEWEST_POINTS):
+def points_at(*corners, count=2 * MIN_POINTS):
     """A dense cloud of points around each of some places."""
-    cloud = np.random.default_rng(0).normal(scale=REACH / 10, size=(count, 3))
+    cloud = np.random.default_rng(0).normal(scale=SUPPORT_RADIUS / 10, size=(count, 3))
     return np.concatenate([cloud + corner for corner in corners])
 
 
@@ -63,7 +63,7 @@ def test_what_is_far_from_every_sparse_point_goes_and_does_not_set_the_scale():
     assert cleaned.surface.vertices[:, 0].max() == 3.0
 
 
-@pytest.mark.parametrize("count", [0, 1, FEWEST_POINTS - 1])
+@pytest.mark.parametrize("count", [0, 1, MIN_POINTS - 1])
 def test_few_points_tell_nothing(count):
     surface = tetrahedra(2.0, 1.0)
     points = points_at(surface.vertices[4], count=count)
@@ -80,7 +80,7 @@ def test_a_bare_wall_is_not_dropped_for_a_speck_on_it():
     edges, strip = long_strip()
     speck = np.array([[200.0, 0, 0], [201, 0, 0], [200, 1, 0]])
     wall = Surface(np.concatenate([edges, speck]), np.vstack([strip, [202, 203, 204]]).astype(np.int32))
-    view = Sight(np.full(205, 5), np.full(205, 5), np.zeros((205, 3)))
+    view = Visibility(np.full(205, 5), np.full(205, 5), np.zeros((205, 3)))
     on_the_wall, on_the_speck = points_at(wall.vertices[0]), points_at(speck[0])
     both = np.concatenate([on_the_wall, on_the_speck[: len(on_the_speck) // 2]])
     assert clean(wall, view, both, "visible", 2, 0.0).kept == 2
@@ -99,15 +99,15 @@ def test_what_is_hidden_and_far_from_every_sparse_point_is_cut_off():
     """A strip of which photos see the first fifth, with points there: the rest hangs on it, a little of it stays."""
     strip = Surface(*long_strip())
     x = strip.vertices[:, 0]
-    view = Sight(np.full(202, 5), np.where(x <= 20, 5, 1), np.zeros((202, 3)))
+    view = Visibility(np.full(202, 5), np.where(x <= 20, 5, 1), np.zeros((202, 3)))
     here, face = points_at(strip.vertices[0]), points_at(*strip.vertices[[180, 182, 181]])
     cleaned = clean(strip, view, here, "visible", 2, 0.0)
-    assert cleaned.surface.vertices[:, 0].max() == 20 + HIDDEN_STEPS
-    assert cleaned.hidden == 2 * (80 - HIDDEN_STEPS)
+    assert cleaned.surface.vertices[:, 0].max() == 20 + DILATION_STEPS
+    assert cleaned.hidden == 2 * (80 - DILATION_STEPS)
     assert clean(strip, view, np.concatenate([here, face]), "visible", 2, 0.0).hidden == cleaned.hidden - 1
-    past_an_edge = Sight(np.full(202, 50), np.where(x <= 20, 25, 9), np.zeros((202, 3)))
+    past_an_edge = Visibility(np.full(202, 50), np.where(x <= 20, 25, 9), np.zeros((202, 3)))
     assert clean(strip, past_an_edge, here, "visible", 2, 0.0).hidden == cleaned.hidden
-    assert clean(strip, view, here[: FEWEST_POINTS - 1], "visible", 2, 0.0).hidden == 0
+    assert clean(strip, view, here[: MIN_POINTS - 1], "visible", 2, 0.0).hidden == 0
     assert clean(strip, view, here, "all", 2, 0.0).hidden == 0
 
 
@@ -115,7 +115,7 @@ def test_where_all_that_is_covered_would_be_hidden_nothing_is_cut_for_it():
     """The points lie on an end of the strip that too few photos cover."""
     strip = Surface(*long_strip())
     covered = strip.vertices[:, 0] > 50
-    view = Sight(np.where(covered, 5, 1), np.where(covered, 1, 0), np.zeros((202, 3)))
+    view = Visibility(np.where(covered, 5, 1), np.where(covered, 1, 0), np.zeros((202, 3)))
     with pytest.raises(StageError, match="no part of the surface is seen by the photos"):
         clean(strip, view, points_at(*strip.vertices[:3]), "visible", 2, 0.0)
 
@@ -156,4 +156,4 @@ def sheet(low, high):
     ],
 )
 def test_the_end_of_a_surface_is_named(surface, words):
-    assert openness(surface, np.array([[-0.9] * 3, [0.9] * 3]), 0.02) == words
+    assert boundary(surface, np.array([[-0.9] * 3, [0.9] * 3]), 0.02) == words

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stages.mesh.samples import sample_surface
+from stages.mesh.surface import sample_surface
 
 SQUARE = np.array([[0.0, 0, 0], [2, 0, 0], [2, 1, 0], [0, 1, 0]])
 TWO_TRIANGLES = np.array([[0, 1, 2], [0, 2, 3]])

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stages.mesh.shading import SUPERSAMPLING, Viewpoint, framing, look, shade
+from stages.mesh.rasteriser import SUPERSAMPLING, Viewpoint, framing, look, shade
 
 FORWARD = np.eye(3, 4)  # at the origin, looking along +z
 CAMERA = Viewpoint(FORWARD, 50.0, 64, 48)

@@ -11,8 +11,8 @@ from nerf.fields.density_grid import Lattice
 from nerf.geometry.camera_paths import look_at
 from nerf.geometry.scene import Camera, Scene, Similarity, View
 from stages.io.files import write_png
-from stages.mesh import visibility as mesh_views
-from stages.mesh.visibility import drawn_rays, look, shadow_maps, used_rays
+from stages.mesh import visibility as mesh_visibility
+from stages.mesh.visibility import sample_rays, look, shadow_maps, unmasked_rays
 
 RADIUS = 0.5
 CORNER = torch.full((3,), 0.9)
@@ -103,7 +103,7 @@ def test_lens_polynomials_that_fold_back_do_not_cover_what_the_photo_cannot_show
 
 
 def test_many_photos_share_the_rays(ball, monkeypatch):
-    monkeypatch.setattr(mesh_views, "RAYS", 1000)
+    monkeypatch.setattr(mesh_visibility, "NUM_RAYS", 1000)
     told = []
     for count, shape in ((1, (27, 37)), (10, (9, 12))):
         scene = scene_of(*[(2.5, 0, 0)] * count)
@@ -125,16 +125,16 @@ def test_what_a_mask_ignores_is_neither_covered_nor_asked_where_light_stops(ball
     sight = look(vertices, normals, maps, VOXEL)
     assert (sight.covered[local[:, 0] < -0.05] == 0).all() and (sight.covered[local[:, 0] > 0.05] == 1).all()
     (whole,) = shadow_maps(ball, scene, tmp_path, scene.views, lambda done: None)
-    assert len(used_rays(maps[0]).near) == pytest.approx(len(used_rays(whole).near) / 2, rel=0.05)
+    assert len(unmasked_rays(maps[0]).near) == pytest.approx(len(unmasked_rays(whole).near) / 2, rel=0.05)
 
 
 def test_rays_are_drawn_from_all_columns_of_the_photos(ball):
     scene = scene_of((2.5, 0, 0))
     (one,) = maps = shadow_maps(ball, scene, Path(), scene.views, lambda done: None)
     rows, columns = one.reach.shape
-    drawn = drawn_rays(maps, rows)  # as many as every ray of one column would be
-    assert len(drawn.near) == rows and torch.equal(drawn.directions, drawn_rays(maps, rows).directions)
+    drawn = sample_rays(maps, rows)  # as many as every ray of one column would be
+    assert len(drawn.near) == rows and torch.equal(drawn.directions, sample_rays(maps, rows).directions)
     of_column = one.rays.directions.flatten(0, 1)
     number = [int((of_column - ray).norm(dim=-1).argmin()) % columns for ray in drawn.directions]
     assert len(set(number)) > columns / 4
-    assert len(drawn_rays(maps, 10**6).near) == rows * columns
+    assert len(sample_rays(maps, 10**6).near) == rows * columns
