@@ -12,11 +12,11 @@ from pydantic import Field
 
 from stages.contract import Inputs, Progress, StageConfig, StageResult
 
-NEEDS = ("ingest", "normalise", "train")
+INPUTS = ("ingest", "normalise", "train")
 VERSION = 12
 RESUMES = False
-LINKS = ("mesh.glb", "mesh.ply", "mesh.obj")
-UNKEYED = ("seconds",)  # it decides the resolution, and that enters the key
+PUBLISHED = ("mesh.glb", "mesh.ply", "mesh.obj")
+NOT_HASHED = ("seconds",)  # it decides the resolution, and that enters the key
 
 Format = Literal["glb", "ply", "obj"]
 Keep = Literal["visible", "largest", "all"]

@@ -67,7 +67,9 @@ def obj_bytes(mesh: ColouredMesh) -> bytes:
     """Wavefront OBJ with colours after the coordinates, as MeshLab, Blender and CloudCompare read them."""
     decimals = int(np.clip(np.ceil(7 - np.log10(_size(mesh.vertices))), MIN_DECIMALS, MAX_DECIMALS))
     coloured = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=mesh.colours, process=False)
-    return export_obj(coloured, include_normals=False, digits=decimals, header=None).encode("ascii")
+    return export_obj(coloured, include_normals=False, digits=decimals, header="vertex colours are sRGB").encode(
+        "ascii"
+    )
 
 
 def glb_bytes(mesh: ColouredMesh, upright_from_mesh: np.ndarray) -> bytes:

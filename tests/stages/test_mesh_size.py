@@ -9,16 +9,16 @@ from hypothesis import strategies as st
 
 from nerf import REGION_HALF
 from stages.mesh.resolution import (
-    MIN_POINTS,
+    FIXED_COST,
     MARGIN,
-    ONCE,
-    resolution_from_training,
-    slab_factor,
+    MIN_POINTS,
+    expected_seconds,
     grid_box,
     points_per_edge,
-    resolution_within,
-    expected_seconds,
     reference_seconds,
+    resolution_from_training,
+    resolution_within,
+    slab_factor,
 )
 
 CUBE = np.array([[-REGION_HALF] * 3, [REGION_HALF] * 3])
@@ -41,7 +41,11 @@ def test_the_resolution_chosen_fits_and_the_next_would_not(seconds: float, per_d
     edge = resolution_within(seconds, per_density, per_ball)
     assert expected_seconds(edge, per_density, per_ball) <= seconds or edge == 64
     assert expected_seconds(edge + 16, per_density, per_ball) > seconds or edge == 256
-    assert expected_seconds(edge, 2 * per_density, per_ball) > expected_seconds(edge, per_density, per_ball) > ONCE * per_ball
+    assert (
+        expected_seconds(edge, 2 * per_density, per_ball)
+        > expected_seconds(edge, per_density, per_ball)
+        > FIXED_COST * per_ball
+    )
 
 
 def test_a_longer_training_gets_a_finer_lattice():
