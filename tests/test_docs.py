@@ -1,5 +1,6 @@
 """The documentation agrees with the code: links, options, the example in Python, the table of rooms."""
 
+import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -7,18 +8,19 @@ from pathlib import Path
 import pytest
 from tyro.conf import Suppress
 
+from benchmarks import results
 from pipeline.engine.stage_list import STAGES
 
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 CHANGELOG = ROOT / "CHANGELOG.md"
-GENERATED = ROOT / "docs" / "NUMERICS.md"
+GENERATED = {ROOT / "docs" / "NUMERICS.md", ROOT / "docs" / "results.md"}
 MAX_PROSE = 128
+MAX_RESULTS = 250
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 OPTION = re.compile(rf"--({'|'.join(STAGES)})\.([a-z][a-z0-9_-]*)")
 CALL = re.compile(r"(?m)^(?:\w+ = )?run\((\w+), \1\.Config\(.*?\)(?:, \[(.*)\])?\)$")
 CODE = re.compile(r"(?ms)^```(\w*)$\n(.*?)^```$\n")
-STUDIES = re.compile(r"(?s)<!-- studies -->.*<!-- end of studies -->")
 MODULE = re.compile(r"(?m)^\| `((?:nerf|stages|pipeline)/[\w/]+\.py)` \|")
 
 
@@ -53,9 +55,8 @@ def anchors(text: str) -> Iterator[str]:
 
 
 def prose(text: str) -> list[str]:
-    """Lines that are no code, no table, no picture and not written by a program."""
-    lines = STUDIES.sub("", CODE.sub("", text)).splitlines()
-    return [line for line in lines if not line.lstrip().startswith(("|", "!["))]
+    """Lines that are no code, no table and no picture."""
+    return [line for line in CODE.sub("", text).splitlines() if not line.lstrip().startswith(("|", "!["))]
 
 
 def calls_of_run(text: str) -> list[tuple[str, tuple[str, ...]]]:
@@ -74,9 +75,21 @@ def test_links_lead_somewhere(page: Path):
         assert not anchor or anchor in anchors(other.read_text("utf-8")), target
 
 
-@pytest.mark.parametrize("page", [page for page in [*PAGES, CHANGELOG] if page != GENERATED], ids=name_of)
+@pytest.mark.parametrize("page", [page for page in [*PAGES, CHANGELOG] if page not in GENERATED], ids=name_of)
 def test_prose_is_wrapped(page: Path):
     assert not [line for line in prose(page.read_text("utf-8")) if len(line) > MAX_PROSE]
+
+
+def test_results_are_what_the_json_files_give():
+    assert results.PAGE.read_text("utf-8") == results.page(), "python -m benchmarks.results"
+    assert len(results.page().splitlines()) <= MAX_RESULTS
+
+
+def test_every_file_of_figures_says_where_they_come_from():
+    records = {path.name: json.loads(path.read_text("utf-8")) for path in results.RESULTS.glob("*.json")}
+    assert len(records) > 20
+    wanted = {"command", "date", "machine", "commit", "figures"}
+    assert not [name for name, record in records.items() if not (wanted <= record.keys() and record["figures"])]
 
 
 def test_the_example_in_python_gives_stages_what_they_need():
@@ -131,7 +144,7 @@ def test_the_checks_can_fail():
     assert MODULE.findall("| `nerf/geometry/rays.py` | rays |\nnerf/model.py") == ["nerf/geometry/rays.py"]
     headings = "# A `b`, c_d\n```\n# e\n```\n## See [f](g)\n## A b c_d\n"
     assert list(anchors(headings)) == ["a-b-c_d", "see-f", "a-b-c_d-1"]
-    assert prose("Words\n```\ncode\n```\n| table |\n<!-- studies -->\nx\n<!-- end of studies -->\n") == ["Words", ""]
+    assert prose("Words\n```\ncode\n```\n| table |\n![picture](a.png)\n") == ["Words"]
     assert calls_of_run('run(a, inputs)\nrun(a, a.Config())\nc = run(b, b.Config(d=(1, 2)), ["a", "e"])\n') == [
         ("a", ()),
         ("b", ("a", "e")),

@@ -17,7 +17,7 @@ from nerf.kernels import Backend, grid_layout
 # Of the last, one cell is 7° wide: skies and far hills, not what has parallax. Three features are a colour; the kernels
 # read four.
 LAYOUT = grid_layout(levels=2, coarsest=4, finest=16, log2_rows=13, features=4)
-# Of the field's. The sky must be found before fog near the cameras takes its place (docs/numbers.md).
+# Of the field's. The sky must be found before fog near the cameras takes its place (docs/experiments/learning_rate.md).
 RATE = 10.0
 # Pulls what rays run to towards grey, as hard as so much of a ray's light pulls towards the photo. What is hidden gets
 # less light than that, which Adam, whose steps are as long for faint gradients, would follow to black and white.

@@ -32,9 +32,11 @@ LARGEST = {"levels": 64, "features": 256, "log2_rows": 30, "finest": 2**20, "cac
     "steps": 10**6,
     "most_samples": 10**6,
 }
-DRAWN_CLOSER = 1.5  # samples of a drawn ray for one in training (docs/numbers.md: Samples along a ray)
-THIN = 1e-2  # optical thickness below which a sample of training stands for others like it (docs/numbers.md)
-QUANTUM = 1 / 512  # share of a ray's light that a picture may show in a neighbouring sample's colour (docs/numbers.md)
+DRAWN_CLOSER = 1.5  # samples of a drawn ray for one in training (docs/experiments/ray_samples.md)
+# Optical thickness below which a sample of training stands for others like it (docs/experiments/ray_samples.md).
+THIN = 1e-2
+# Share of a ray's light that a picture may show in a neighbouring sample's colour (docs/experiments/colour_samples.md).
+QUANTUM = 1 / 512
 CORNERS = 8  # of a cell: rows that a point reads of each grid
 
 

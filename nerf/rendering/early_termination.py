@@ -17,8 +17,8 @@ from nerf.kernels import Backend, Lattice, Occupied, Samples
 from nerf.runtime.profiler import part
 
 HIDDEN_BEHIND = 1e-3  # transmittance below which the rest of a ray is left out
-# Samples whose densities are computed at once, in all, and per ray (docs/numbers.md). A GPU waits for the host after
-# each wave, and works on a million samples as long as on a few.
+# Samples whose densities are computed at once, in all, and per ray (docs/experiments/early_termination.md). A GPU waits
+# for the host after each wave, and works on a million samples as long as on a few.
 WAVE = {"cpu": 1 << 14, "cuda": 1 << 20}
 SHORTEST_WAVE, LONGEST_WAVE = 6, 64
 

@@ -1,7 +1,8 @@
 """Float32 matrix products at torch's precision "medium", where that is measured to be faster and about as exact.
 
 What "medium" means depends on processor and torch: the same arithmetic by another library, bfloat16 or TF32 inside (on
-a Xeon with tiles twice as fast and off by 2e-3; docs/numbers.md), or nothing at all. So it is tried and never assumed.
+a Xeon with tiles twice as fast and off by 2e-3; docs/experiments/reduced_precision.md), or nothing at all. So it is
+tried and never assumed.
 """
 
 import functools

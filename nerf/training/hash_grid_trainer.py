@@ -32,11 +32,13 @@ from nerf.training.trainer import RAYS, NonFinite, StepResult, all_finite
 
 WARM_UP_STEPS = 20
 # Of the run, before the rate begins to fall. A fall over most of the run costs short runs up to 2 dB and gains long
-# ones nothing (docs/numbers.md); and what is measured before it does not depend on how long the run will be.
+# ones nothing (docs/experiments/learning_rate.md); and what is measured before it does not depend on how long the run
+# will be.
 CONSTANT_SHARE = 0.75
 FINAL_RATE = 0.05  # of the rate at first
 # The distortion loss begins weak: it draws fog together wherever that stands, and far things that only smooth colours
-# tell apart (the sky) would be drawn close behind the scene before their place is known (docs/numbers.md).
+# tell apart (the sky) would be drawn close behind the scene before their place is known
+# (docs/experiments/learning_rate.md).
 FIRST_DISTORTION = 0.25  # of its weight
 FULL_DISTORTION_SHARE = 0.3  # of the run
 GUIDED_EVERY = 8  # one ray in so many runs to a sparse point, where some are known
@@ -44,7 +46,7 @@ FIRST_SAMPLES_PER_RAY = 128.0
 # A ray is not free, though it may need no colour: no step has more rays than if each needed so many.
 LEAST_SAMPLES_PER_RAY = 2.0
 # Of the table's entries, how many have a gradient in a step: of 5 grids of 2^18 rows with 33 to 49 k colours 0.29 to
-# 0.36 (docs/numbers.md: Where a step's time goes); larger steps reach more.
+# 0.36 (docs/experiments/step_time.md); larger steps reach more.
 TOUCHED = 0.33
 # Of an entry: its gradient read; if there is one, that cleared, the entry itself and its moments read and written.
 ADAM_BYTES = 4 * (1 + 7 * TOUCHED)

@@ -5,7 +5,7 @@ from torch import Tensor
 
 LARGEST_PULL = 0.1
 """Of the peak: from this error on colours are pulled no harder, and the loss grows linearly. Of 0.05, 0.1, 0.2 and none
-the best on most sets (docs/numbers.md); instant-ngp's, too."""
+the best on most sets (docs/experiments/colour_loss.md); instant-ngp's, too."""
 
 
 def robust_error(

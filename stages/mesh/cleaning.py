@@ -13,12 +13,12 @@ if TYPE_CHECKING:
     from stages.mesh import Keep
 
 # Of the photos whose frustums hold a vertex. A true surface is visible in about half of them, nine vertices in ten in a
-# quarter; what only shows past the edge of something else is visible in fewer (docs/numbers.md).
+# quarter; what only shows past the edge of something else is visible in fewer (docs/experiments/mesh.md).
 MIN_VISIBLE_FRACTION = 0.2
 DILATION_STEPS = 10  # edges from a visible vertex within which faces are kept: creases and gaps close
 MIN_VISIBLE_AREA = 0.1  # of a component's; an inner cavity has none, the visible side of an object about half
 # Of a component's area, near a sparse point. Of the demo's table 41 % lies within 0.03 of one, 57 % within 0.05; of
-# sheets of sky below it nothing within 0.3 (docs/numbers.md).
+# sheets of sky below it nothing within 0.3 (docs/experiments/mesh.md).
 MIN_SUPPORTED_AREA = 0.1
 # How near is near: in scene units, or in median distances from a sparse point to the next, whichever is more.
 SUPPORT_RADIUS, SUPPORT_RADIUS_SPACINGS = 0.1, 3.0

@@ -34,11 +34,13 @@ TIMED_EDGES, MIN_TIMED_SECONDS = (32, 64, 96), 0.3
 # What takes time besides density queries, in multiples of the reference timing (the surface of a ball). FIXED_COST:
 # what any mesh takes (visibility, iso-level, colours, picture, files). COST_PER_POINT: what each grid point adds
 # (marching cubes, cleaning, decimation). Measured on an idle machine with a reference timing of 0.024 s: fox,
-# fountain_p11 and herzjesu_p8 at 64 to 192 points per edge took 2.6 to 3 s and 0.8 to 1.1 µs a point (docs/numbers.md).
+# fountain_p11 and herzjesu_p8 at 64 to 192 points per edge took 2.6 to 3 s and 0.8 to 1.1 µs a point
+# (docs/experiments/mesh.md).
 FIXED_COST, COST_PER_POINT = 150.0, 4.5e-5
 # A colour reads the grids as often as this many density queries, once for each of its samples. It takes 3 to 4 times as
-# long as these, for the second network and because colours are not shared out among the cores (docs/numbers.md); that
-# is in FIXED_COST. Surfaces have 3 to 5 vertices per grid point of a side, and decimation leaves 150,000.
+# long as these, for the second network and because colours are not shared out among the cores
+# (docs/experiments/mesh.md); that is in FIXED_COST.
+# Surfaces have 3 to 5 vertices per grid point of a side, and decimation leaves 150,000.
 QUERIES_PER_COLOUR, VERTICES_PER_FACE, MAX_VERTICES = 8, 5, 150_000
 REFERENCE_EDGE, REFERENCE_REPEATS = 96, 3
 # Of COST_PER_POINT, and of the memory. Measured: a plain's grid in a box with 3.5 times the surface took 1.2 times the

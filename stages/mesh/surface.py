@@ -16,7 +16,7 @@ from nerf.fields.density_grid import Lattice, occupancy, smoothed
 from stages.contract import StageError
 
 # Passes of nerf.fields.density_grid.smoothed: a Gaussian of one grid spacing. The field's finest cells are about as
-# small, and what differs between two of them is noise that a grid would pick at random (docs/numbers.md).
+# small, and what differs between two of them is noise that a grid would pick at random (docs/experiments/mesh.md).
 SMOOTHING_PASSES = 2
 
 

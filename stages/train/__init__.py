@@ -53,10 +53,10 @@ PAPER_SIZES = {
 GRID_RATES = {"bounded": 2e-2, "contracted": 1e-2}
 MOST_PARTS = 64  # of a step
 # Colours that each part of a step computes, so each core: half of what a part takes does not depend on how many they
-# are, and fewer cost as long. In a box more of them go with its closer samples (docs/numbers.md).
+# are, and fewer cost as long. In a box more of them go with its closer samples (docs/experiments/colour_samples.md).
 PART_SAMPLES = {"bounded": 3 << 13, "contracted": 1 << 14}
 # The largest step, which a GPU takes as fast as a small one. Its gradients are sure enough for the larger rate
-# (docs/numbers.md).
+# (docs/experiments/colour_samples.md).
 LARGEST_STEP, LARGE_STEP_RATE = 1 << 18, 2e-2
 
 GRID_ONLY = ("backend", "chunks", "levels", "log2_rows", "finest", "batch_samples", "ray_samples")

@@ -23,18 +23,20 @@ if TYPE_CHECKING:
 
 FINAL_RATE = 0.1  # of the paper field's learning rate at the start
 # Weight of the distortion loss (Barron et al. 2022, who take 1e-2) in folded space, against fog and matter close before
-# the cameras; fog also costs most of the time (docs/numbers.md). A box around an object needs none.
+# the cameras; fog also costs most of the time (docs/experiments/distortion_loss.md). A box around an object needs none.
 DISTORTION = 2e-3
-# Weight at first of the loss at sparse points (docs/numbers.md; Deng et al. 2022 take 0.1, too, of another loss).
+# Weight at first of the loss at sparse points (docs/experiments/sparse_depth.md; Deng et al. 2022 take 0.1, too, of
+# another loss).
 DEPTH_LOSS = 0.1
-# Photos that must look into a cell for something to stand before their foregrounds (docs/numbers.md).
+# Photos that must look into a cell for something to stand before their foregrounds (docs/experiments/few_photos.md).
 LEAST_PHOTOS = 3
-# Cells along an axis of the coarsest grid: fewer where they have to fill all of folded space (docs/numbers.md).
+# Cells along an axis of the coarsest grid: fewer where they have to fill all of folded space
+# (docs/experiments/few_photos.md).
 COARSEST = {"bounded": 16, "contracted": 8}
-# Samples along a ray (docs/numbers.md).
+# Samples along a ray (docs/experiments/ray_samples.md).
 MOST_STEPS = 576  # bounded scenes: steps along the diagonal of the box
 # Folded space: steps in one of the finest cells, by how many of these along an axis it counts for at most. Finer cells
-# gain more by more rays than by closer samples (docs/numbers.md: Finer cells).
+# gain more by more rays than by closer samples (docs/experiments/cell_sizes.md).
 STEPS_PER_CELL = {512: 3, 2048: 1.5}
 EVEN_UNTIL = 0.25  # folded space: scene units from the camera up to which steps are even; beyond, they grow
 # Folded space: at the shortest steps so many samples reach to a distance of 23; --train.ray-samples may ask for more.

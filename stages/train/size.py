@@ -21,14 +21,14 @@ if TYPE_CHECKING:
 
 LEAST_LONG_SIDE = 150  # pixels: below this a photo shows too little to judge anything by
 MOST_PIXELS = 400e6  # of many photos, which are held in memory: 1.2 GB
-MOST_PHOTOS = 48  # of 240 photos of one scene, 0.2 rays a pixel are best (docs/numbers.md)
+MOST_PHOTOS = 48  # of 240 photos of one scene, 0.2 rays a pixel are best (docs/experiments/many_photos.md)
 TIMED_SECONDS = 1.0
 MOST_TIMED_RAYS = {"cpu": 256, "cuda": 1 << 20}
 """For each core: one chunk of a batch. More keep a CPU no busier and make the published model's steps long; a GPU needs
 many."""
 SAMPLES_PER_RAY = {"bounded": 3, "contracted": 10}
 """Colours that the grid field computes for a ray, over a run: measured on lego_400 and five photo sets
-(docs/numbers.md)."""
+(docs/results.md)."""
 GRID_SIZES = {
     "bounded": ((50e6, 5, 18, 512), (0, 4, 17, 256)),
     "contracted": ((30e6, 6, 18, 1024), (0, 5, 17, 512)),
