@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from scipy.spatial import KDTree
 
-from nerf.fields.density_grid import Lattice, density_lattice
+from nerf.fields.density_grid import Lattice, sample_density_grid
 from nerf.fields.interface import RadianceModel
 from nerf.geometry.scene import Scene
 from nerf.rendering.volume_rendering import composite
@@ -100,7 +100,7 @@ def _density_grid(config: "Config", source: Source, box: np.ndarray, progress: P
     def report(done: float) -> None:
         progress.update(f"density at {config.resolution}³ points", 0.6 * done)
 
-    return density_lattice(source.model, points_per_edge(box, config.resolution), low, high, CHUNK, report)
+    return sample_density_grid(source.model, points_per_edge(box, config.resolution), low, high, CHUNK, report)
 
 
 def _iso_level(

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from nerf import REGION_HALF
-from nerf.fields.density_grid import Lattice, density_lattice
+from nerf.fields.density_grid import Lattice, sample_density_grid
 from nerf.geometry.region_of_interest import Layout
 from stages.contract import Inputs, Progress
 from stages.hardware.device import compute_device
@@ -123,13 +123,13 @@ def density_query_seconds(train: Path, box: np.ndarray) -> float:
     device = compute_device()
     model, _ = load_field(train, device)
     low, high = torch.tensor(box, dtype=torch.float32, device=device)
-    density_lattice(model, TIMED_EDGES[0], low, high, CHUNK)  # the first pays for memory and kernels
+    sample_density_grid(model, TIMED_EDGES[0], low, high, CHUNK)  # the first pays for memory and kernels
     seconds = per_point = 0.0
     for edge in TIMED_EDGES:
         if seconds >= MIN_TIMED_SECONDS:
             break
         began = time.perf_counter()
-        count = density_lattice(model, points_per_edge(box, edge), low, high, CHUNK).values.cpu().numel()
+        count = sample_density_grid(model, points_per_edge(box, edge), low, high, CHUNK).values.cpu().numel()
         seconds = time.perf_counter() - began
         per_point = seconds / count
     return per_point

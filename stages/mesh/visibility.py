@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from scipy.ndimage import maximum_filter
 
-from nerf.fields.density_grid import Lattice, stopping_distance
+from nerf.fields.density_grid import Lattice, median_depth
 from nerf.geometry.rays import Rays, join_rays
 from nerf.geometry.scene import Camera, Scene, View
 from nerf.runtime.randomness import generator
@@ -65,7 +65,7 @@ def shadow_maps(
         downscale = max((pixels * len(views) / NUM_RAYS) ** 0.5, max(camera.width, camera.height) / MAX_MAP_SIDE, 1.0)
         rays = view_rays(scene, view, downscale)
         rays = rays.each(lambda part: part.to(grid.low.device))
-        depth = stopping_distance(grid, rays, max(grid.values.shape)).cpu().numpy()
+        depth = median_depth(grid, rays, max(grid.values.shape)).cpu().numpy()
         min_cosine = float((rays.directions.cpu().double().numpy() @ view.scene_from_camera[:, 2]).min())
         mask = view_mask(ingest, scene, view, max(1.0, max(camera.width, camera.height) / MAX_MASK_SIDE))
         depth = maximum_filter(depth, size=3, mode="nearest")

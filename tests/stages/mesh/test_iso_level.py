@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from nerf.fields.density_grid import Lattice, density_lattice
+from nerf.fields.density_grid import Lattice, sample_density_grid
 from nerf.geometry.rays import Rays
 from stages.contract import StageError
 from stages.mesh.iso_level import check_range, choose_iso_level
@@ -49,7 +49,7 @@ def rays():
 
 
 def lattice_of(model):
-    return density_lattice(model, POINTS, -CORNER, CORNER)
+    return sample_density_grid(model, POINTS, -CORNER, CORNER)
 
 
 @pytest.mark.parametrize("inside", [60.0, 1e3, 1e5])
