@@ -30,8 +30,8 @@ from PIL import Image
 
 from benchmarks.record import Record, add_out
 from nerf.geometry.scene import Camera, Scene, Similarity, View
-from nerf.training.pixel_sampler import PixelOrder
-from nerf.training.ray_dataset import RayBank
+from nerf.training.pixel_sampler import PixelSampler
+from nerf.training.ray_dataset import RayDataset
 from stages.hardware.backend import chosen_backend
 from stages.hardware.device import compute_device
 from stages.hardware.memory import available_bytes
@@ -93,9 +93,9 @@ def milliseconds(work: Callable[[], object], repeats: int) -> dict[str, float]:
     return {"median_ms": round(statistics.median(taken), 2), "lowest_ms": round(min(taken), 2)}
 
 
-def draw(bank: RayBank, where: str, record: Record, repeats: int = REPEATS) -> None:
+def draw(bank: RayDataset, where: str, record: Record, repeats: int = REPEATS) -> None:
     """Time batches of rays."""
-    order = PixelOrder(bank.drawable, 0, bank.device)
+    order = PixelSampler(bank.drawable, 0, bank.device)
     for count in BATCHES:
         places = itertools.count(step=count)
         taken = milliseconds(lambda n=count, p=places: bank.lookup(bank.nth(order.take(next(p), n))), repeats)
@@ -138,7 +138,7 @@ def measure(ingest: Path, photos: int, downscale: float, record: Record) -> None
     scene = paint(ingest, photos)
     print(f"{photos} photos of {WIDTH} x {HEIGHT}, each with its own camera, at 1/{downscale:g}")
 
-    def opened(what: str) -> RayBank:
+    def opened(what: str) -> RayDataset:
         started = time.perf_counter()
         bank = training_bank(ingest, scene, "train", downscale, Spoken())
         taken = round(1e3 * (time.perf_counter() - started))
@@ -156,7 +156,7 @@ def measure(ingest: Path, photos: int, downscale: float, record: Record) -> None
     draw(opened("opening the store from the disk"), "from the disk", record, 5)
 
 
-def warm(bank: RayBank, record: Record) -> None:
+def warm(bank: RayDataset, record: Record) -> None:
     """Batches from a store that memory holds, and from a copy in plain memory."""
     draw(bank, "first ones", record, 5)
     bank.pixels.view(-1)[:: mmap.PAGESIZE].sum()

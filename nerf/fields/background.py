@@ -24,12 +24,12 @@ RATE = 10.0
 PRIOR = 1e-5
 
 
-def initial_sky() -> Float[Tensor, "rows 4"]:
+def initial_background() -> Float[Tensor, "rows 4"]:
     """Grey in every direction."""
     return torch.zeros(LAYOUT.rows, LAYOUT.features)
 
 
-def sky_colour(
+def background_colour(
     backend: Backend, sky: Float[Tensor, "rows 4"], directions: Float[Tensor, "rays 3"]
 ) -> Float[Tensor, "rays 3"]:
     """The colour seen in each direction (unit vectors)."""
@@ -37,7 +37,7 @@ def sky_colour(
     return features.view(-1, len(LAYOUT.resolutions), LAYOUT.features).sum(1)[:, :3].sigmoid()
 
 
-def sky_backward(
+def background_backward(
     backend: Backend,
     directions: Float[Tensor, "rays 3"],
     colour: Float[Tensor, "rays 3"],

@@ -43,7 +43,7 @@ class Medium(NamedTuple):
 
 
 @contextmanager
-def products_at(precision: Precision | None) -> Iterator[None]:
+def use_matmul_precision(precision: Precision | None) -> Iterator[None]:
     """Compute the whole process's float32 products at ``precision``, afterwards as before. None changes nothing."""
     before = torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision(precision or before)
@@ -54,13 +54,13 @@ def products_at(precision: Precision | None) -> Iterator[None]:
 
 
 @functools.cache
-def medium_products(device: torch.device, width: int) -> Medium:
+def medium_matmul(device: torch.device, width: int) -> Medium:
     """Of products (n, width) x (width, width), the fastest of several at each precision in turn; once in a process, in
     a tenth of a second. Changes no random state."""
     random = torch.Generator(device).manual_seed(0)
     rows = max(FEWEST_ROWS, min(PRODUCT_ROWS, PRODUCT_ROWS * USUAL_WIDTH**2 // width**2))
     a, b = (torch.randn(count, width, generator=random, device=device) for count in (rows, width))
-    with products_at("medium"):
+    with use_matmul_precision("medium"):
         error = error_of(a @ b, a, b)
     seconds = _fastest(a, b)
     return Medium(seconds["highest"] / seconds["medium"], error)
@@ -79,7 +79,7 @@ def _fastest(a: Tensor, b: Tensor) -> dict[Precision, float]:
     while runs < FEWEST_RUNS or time.perf_counter() < until:
         runs += 1
         for precision, least in seconds.items():
-            with products_at(precision):
+            with use_matmul_precision(precision):
                 seconds[precision] = min(least, seconds_of_product(a, b))
     return seconds
 
