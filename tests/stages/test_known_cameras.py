@@ -123,6 +123,51 @@ def test_a_frames_own_intrinsics_win(read) -> None:
     assert [image.camera for image in model.images] == [0, 1, 0]
 
 
+ANGLE = 2 * math.atan(0.25)  # of a focal length of 120 across W pixels, of 80 across H
+
+
+@pytest.mark.parametrize(
+    ("own", "expected"),
+    [
+        ({"camera_angle_x": ANGLE}, ("OPENCV", (120, 120, 31, 19, 0.1, 0, 0, 0))),
+        ({"camera_angle_y": ANGLE}, ("OPENCV", (80, 80, 31, 19, 0.1, 0, 0, 0))),
+        ({"camera_angle_x": ANGLE, "camera_angle_y": ANGLE}, ("OPENCV", (120, 80, 31, 19, 0.1, 0, 0, 0))),
+        ({"x_fov": math.degrees(ANGLE)}, ("OPENCV", (120, 120, 31, 19, 0.1, 0, 0, 0))),
+        ({"fl_x": 70.0}, ("OPENCV", (70, 70, 31, 19, 0.1, 0, 0, 0))),
+        ({"fl_x": 70.0, "fl_y": None}, ("OPENCV", (70, 70, 31, 19, 0.1, 0, 0, 0))),
+        ({"fl_x": None}, ("OPENCV", (50, 52, 31, 19, 0.1, 0, 0, 0))),
+        ({"cx": 33.0}, ("OPENCV", (50, 52, 33, 20, 0.1, 0, 0, 0))),
+        ({"p1": 0.01}, ("OPENCV", (50, 52, 31, 19, 0, 0, 0.01, 0))),
+        ({"k1": 0.0}, ("PINHOLE", (50, 52, 31, 19))),
+        ({"distortion_params": [0, 0.2, 0, 0, 0, 0]}, ("OPENCV", (50, 52, 31, 19, 0, 0.2, 0, 0))),
+        ({"camera_model": "OPENCV_FISHEYE"}, ("OPENCV_FISHEYE", (50, 52, 31, 19, 0, 0, 0, 0))),
+        ({"camera_model": "OPENCV"}, ("OPENCV", (50, 52, 31, 19, 0.1, 0, 0, 0))),
+    ],
+)
+def test_a_frame_has_each_group_of_intrinsics_whole(read, own: dict[str, Any], expected: tuple[str, tuple]) -> None:
+    known = read([frame(0), frame(1, **own), frame(2)], k1=0.1, camera_model="OPENCV", **LENS)
+    camera = known.model.cameras[known.model.images[1].camera]
+    assert (camera.model, camera.width, camera.height) == (expected[0], W, H)
+    assert camera.params == pytest.approx(expected[1])
+    assert known.notes == []
+
+
+@pytest.mark.parametrize(
+    ("own", "shared", "named"),
+    [
+        ({"fl_x": 70.0, "camera_angle_x": ANGLE}, {}, ["./1", "fl_x", "70", "camera_angle_x", "120"]),
+        ({}, {"x_fov": math.degrees(ANGLE)}, ["all frames", "fl_x", "50", "x_fov", "120"]),
+        ({"k1": 0.2, "distortion_params": [0.1, 0, 0, 0, 0, 0]}, {}, ["./1", "k1", "distortion_params"]),
+        ({}, {"camera_model": "PINHOLE", "is_fisheye": True}, ["all frames", "PINHOLE", "is_fisheye"]),
+    ],
+)
+def test_contradictory_intrinsics_are_named(
+    read, own: dict[str, Any], shared: dict[str, Any], named: list[str]
+) -> None:
+    (note,) = read([frame(0), frame(1, **own), frame(2)], **LENS, **shared).notes
+    assert all(part in note for part in named)
+
+
 def _with(row: int, column: int, value: float) -> list[list[float]]:
     pose = matrix(1).tolist()
     pose[row][column] = value
@@ -140,12 +185,12 @@ def _with(row: int, column: int, value: float) -> list[list[float]]:
         ({"transform_matrix": (matrix(1) @ np.diag([-1, 1, 1, 1])).tolist()}, r"frame './1': it mirrors"),
         ({"transform_matrix": (matrix(1) @ np.diag([2, 2, 2, 1])).tolist()}, r"no rotation: .* it scales by 2\."),
         ({"transform_matrix": np.zeros((4, 4)).tolist()}, r"no rotation: RᵀR is off by 1, and it scales by 0\."),
-        ({"fl_x": 0}, r"camera of frame './1': a focal length of 0 × 52 pixels is not one for a picture of 60×40"),
-        ({"fl_x": -50}, r"camera of frame './1': a focal length of -50 × 52 pixels is not one"),
-        ({"fl_x": 1e308}, r"camera of frame './1': a focal length of 1e\+308 × 52 pixels is not one"),
-        ({"fl_x": 1e-300}, r"camera of frame './1': a focal length of 1e-300 × 52 pixels is not one"),
+        ({"fl_x": 0}, r"camera of frame './1': a focal length of 0 × 0 pixels is not one for a picture of 60×40"),
+        ({"fl_x": -50}, r"camera of frame './1': a focal length of -50 × -50 pixels is not one"),
+        ({"fl_x": 1e308}, r"camera of frame './1': a focal length of 1e\+308 × 1e\+308 pixels is not one"),
+        ({"fl_x": 1e-300}, r"camera of frame './1': a focal length of 1e-300 × 1e-300 pixels is not one"),
         ({"fl_x": 10**400}, r"camera of frame './1': its fl_x is 10{39}, not a finite number"),
-        ({"cx": -1e300}, r"camera of frame './1': its principal point \(-1e\+300, 19\) is far outside of its 60×40"),
+        ({"cx": -1e300}, r"camera of frame './1': its principal point \(-1e\+300, 20\) is far outside of its 60×40"),
         ({"w": 10**30, "h": 10**30}, r"camera of frame './1': its w and h are 1e\+30 and 1e\+30"),
         ({"transform_matrix": _with(0, 3, 1e300)}, r"frame './1': its place is 1e\+300 units from the origin"),
         ({"transform_matrix": _with(0, 0, 1e308)}, r"frame './1': it is no rotation: 1e\+308 is in it"),

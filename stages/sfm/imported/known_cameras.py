@@ -24,7 +24,7 @@ from stages.io.photos import Photo
 from stages.io.sparse_model import SparseModel
 from stages.io.transforms_export import OPENGL_FROM_OPENCV
 from stages.io.transforms_files import MOST_LETTERS, TRAIN, none_among_the_photos, pose_matrix, read_splits
-from stages.io.transforms_intrinsics import read_intrinsics
+from stages.io.transforms_intrinsics import contradictions, intrinsics_of, read_intrinsics
 from stages.sfm.colmap.model_files import FARTHEST
 from stages.sfm.colmap.models import read_model
 from stages.sfm.imported.orientation import fits_only_upright, pixel_map, stored_size
@@ -66,7 +66,7 @@ class KnownCameras:
 class _Framed(NamedTuple):
     photo: Photo
     frame: Mapping[str, Any]
-    values: Mapping[str, Any]  # of the frame, and of its file where the frame has none
+    values: Mapping[str, Any]  # of the frame, and of its file what the frame has none of
 
 
 def read_known_cameras(cameras: Path, photos: Sequence[Photo], frames: Mapping[str, str]) -> KnownCameras:
@@ -103,7 +103,7 @@ def _from_transforms(cameras: Path, photos: Sequence[Photo], frames: Mapping[str
                 continue
             if file in framed:
                 raise StageError(f"two frames for the photo {photo.name}", f"one is {name!r}", HINT)
-            values = {**content, **frame}
+            values = intrinsics_of(frame, content)
             framed[file] = _Framed(photo, frame, values)
             approximate += str(values.get("note", "")).startswith(APPROXIMATION)
             if PurePosixPath(name) in held_out:
@@ -114,6 +114,7 @@ def _from_transforms(cameras: Path, photos: Sequence[Photo], frames: Mapping[str
         notes.append(f"the lenses of {approximate} frames are approximations, as their notes in the file say")
     if not framed:
         raise _nothing_matches(splits[0][0], absent, photos)
+    notes += _contradictions([content for _, content in splits], framed)
     upright = _are_of_upright_photos(framed.values())
     posed = [_from_frame(framed[file], upright) for file in sorted(framed)]
     left_out = without_rays(posed)
@@ -161,6 +162,22 @@ def _listed(content: Mapping[str, Any], key: str, source: str, notes: list[str])
     if strange:
         notes.append(f"{len(strange)} photos in {key} of {source} have no frame: {_few(strange)}")
     return set(map(PurePosixPath, names))
+
+
+def _contradictions(files: Sequence[Mapping[str, Any]], framed: Mapping[str, _Framed]) -> list[str]:
+    """Notes on what files and frames say of a camera twice and not alike."""
+    size = next((one.photo.width, one.photo.height) for one in framed.values())
+    notes = [f"of all frames: {what}" for content in files for what in contradictions(content, *size)]
+    of_frames = {
+        one.frame["file_path"]: what
+        for one in framed.values()
+        if (what := contradictions(one.frame, *(one.values.get(s) or o for s, o in zip("wh", size, strict=True))))
+    }
+    if of_frames:
+        name, what = next(iter(of_frames.items()))
+        more = f" ({len(of_frames) - 1} more frames likewise)" if len(of_frames) > 1 else ""
+        notes.append(f"frame {name!r}: {'; '.join(what)}{more}")
+    return notes
 
 
 def _are_of_upright_photos(framed: Iterable[_Framed]) -> bool:
