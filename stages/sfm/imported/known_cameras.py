@@ -30,8 +30,11 @@ from stages.sfm.colmap.models import read_model
 from stages.sfm.imported.orientation import fits_only_upright, pixel_map, stored_size
 from stages.sfm.imported.posed_photos import HINT, PosedPhoto, distinct, posed_photo, unusable, without_rays
 
-ORTHONORMAL_WITHIN = 1e-3  # largest entry of RᵀR − 1 that is rounding; beyond it a matrix means something else
-LARGEST_ENTRY = 1e6  # of a matrix that is looked at more closely: products of three of them are numbers
+# The root mean square stretch of a matrix beside its scale, as an angle, is about what its rotation is off by where the
+# numbers were rounded: 0.02° of three decimals, 0.2° of two. Beyond this a matrix is no rotation.
+MAX_STRETCH_DEG, NOTED_STRETCH_DEG = 0.05, 0.005
+SCALED_WITHIN = 1e-3  # of 1: what rounding makes of a rotation's scale
+MAX_ENTRY = 1e6  # of a matrix that is looked at more closely: products of three of them are numbers
 MOST_NAMES, FEW_NAMES = 5, 2
 APPROXIMATION = "approximation"  # how the note begins of a lens that is not the one it stands for
 
@@ -116,7 +119,8 @@ def _from_transforms(cameras: Path, photos: Sequence[Photo], frames: Mapping[str
         raise _nothing_matches(splits[0][0], absent, photos)
     notes += _contradictions([content for _, content in splits], framed)
     upright = _are_of_upright_photos(framed.values())
-    posed = [_from_frame(framed[file], upright) for file in sorted(framed)]
+    posed, rotations = zip(*(_from_frame(framed[file], upright) for file in sorted(framed)), strict=True)
+    notes += _rounded_or_scaled({one.name: rotation for one, rotation in zip(posed, rotations, strict=True)})
     left_out = without_rays(posed)
     kept = [one for one in posed if one.file not in left_out]
     unposed = [photo.name for photo in photos if photo.image_name not in framed.keys() | unused.keys()]
@@ -201,13 +205,21 @@ def _given_camera(framed: _Framed, upright: bool) -> Camera:
         raise unusable(f"the camera of frame {framed.frame['file_path']!r}", str(error)) from error
 
 
-def _from_frame(framed: _Framed, upright: bool) -> PosedPhoto:
+class _Rotation(NamedTuple):
+    """The rotation nearest to a matrix, by which it ``scales``, and the ``stretch_deg`` that is left."""
+
+    matrix: Float[np.ndarray, "3 3"]
+    scale: float
+    stretch_deg: float
+
+
+def _from_frame(framed: _Framed, upright: bool) -> tuple[PosedPhoto, _Rotation]:
     name = framed.frame["file_path"]
-    pose = _pose(framed.frame["transform_matrix"], name)
-    return posed_photo(framed.photo, name, _given_camera(framed, upright), pose, upright)
+    pose, rotation = _pose(framed.frame["transform_matrix"], name)
+    return posed_photo(framed.photo, name, _given_camera(framed, upright), pose, upright), rotation
 
 
-def _pose(matrix: Any, name: str) -> Float[np.ndarray, "3 4"]:
+def _pose(matrix: Any, name: str) -> tuple[Float[np.ndarray, "3 4"], _Rotation]:
     """world_from_camera with OpenCV axes, from a matrix as written in a transforms file."""
     try:
         pose = pose_matrix(matrix)
@@ -216,19 +228,37 @@ def _pose(matrix: Any, name: str) -> Float[np.ndarray, "3 4"]:
     if (place := np.abs(pose[:, 3]).max()) > FARTHEST:
         why = f"its place is {place:.3g} units from the origin, and the most is {FARTHEST:g}"
         raise unusable(f"the transform_matrix of frame {name!r}", why)
-    rotation = pose[:, :3]
-    if not np.abs(rotation).max() <= LARGEST_ENTRY:
-        raise unusable(
-            f"the transform_matrix of frame {name!r}", f"it is no rotation: {np.abs(rotation).max():.3g} is in it"
-        )
-    if (determinant := np.linalg.det(rotation)) < 0:
+    if not (largest := np.abs(pose[:, :3]).max()) <= MAX_ENTRY:
+        raise unusable(f"the transform_matrix of frame {name!r}", f"it is no rotation: {largest:.3g} is in it")
+    if np.linalg.det(pose[:, :3]) < 0:
         raise unusable(f"the transform_matrix of frame {name!r}", "it mirrors (its determinant is negative)")
-    off = np.abs(rotation.T @ rotation - np.eye(3)).max()
-    if not off <= ORTHONORMAL_WITHIN:
-        why = f"it is no rotation: RᵀR is off by {off:.2g}, and it scales by {np.cbrt(determinant):.4g}"
+    rotation = _nearest_rotation(pose[:, :3])
+    if not rotation.stretch_deg <= MAX_STRETCH_DEG:
+        why = (
+            f"it is no rotation: its axes are off by {rotation.stretch_deg:.2g}°, and it scales by {rotation.scale:.4g}"
+        )
         raise unusable(f"the transform_matrix of frame {name!r}", why)
-    u, _, vt = np.linalg.svd(rotation)
-    return np.concatenate([u @ vt @ OPENGL_FROM_OPENCV, pose[:, 3:]], axis=1)
+    return np.concatenate([rotation.matrix @ OPENGL_FROM_OPENCV, pose[:, 3:]], axis=1), rotation
+
+
+def _nearest_rotation(matrix: Float[np.ndarray, "3 3"]) -> _Rotation:
+    """By singular values (Schönemann 1966); infinitely stretched where one of them is 0."""
+    u, stretch, vt = np.linalg.svd(matrix)
+    scale = float(np.cbrt(stretch.prod()))
+    off = np.degrees(np.sqrt(np.mean((stretch / scale - 1) ** 2))) if scale > 0 else np.inf
+    return _Rotation(u @ vt, scale, float(off))
+
+
+def _rounded_or_scaled(rotations: Mapping[str, _Rotation]) -> list[str]:
+    """Notes on matrices, by their frames' names, that are not rotations as they stand."""
+    notes = []
+    if rounded := {name: r.stretch_deg for name, r in rotations.items() if r.stretch_deg > NOTED_STRETCH_DEG}:
+        off = f"off by up to {max(rounded.values()):.2g}°"
+        notes.append(f"the rotations of {len(rounded)} frames are rounded, {off}: {_few(list(rounded))}")
+    if scaled := {name: r.scale for name, r in rotations.items() if abs(r.scale - 1) > SCALED_WITHIN}:
+        by = " to ".join(f"{scale:.4g}" for scale in sorted({min(scaled.values()), max(scaled.values())}))
+        notes.append(f"the matrices of {len(scaled)} frames scale by {by}, which is left out: {_few(list(scaled))}")
+    return notes
 
 
 # --- COLMAP models
