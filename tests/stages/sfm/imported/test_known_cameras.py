@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from nerf.geometry.scene import Camera
 from stages.contract import StageError
@@ -183,8 +184,16 @@ def _with(row: int, column: int, value: float) -> list[list[float]]:
         ({"transform_matrix": [[1, 0], ["x"]]}, r"frame './1': its transform_matrix is not a matrix of numbers"),
         ({"transform_matrix": 7}, r"frame './1': its transform_matrix is not 4 × 4"),
         ({"transform_matrix": (matrix(1) @ np.diag([-1, 1, 1, 1])).tolist()}, r"frame './1': it mirrors"),
-        ({"transform_matrix": (matrix(1) @ np.diag([2, 2, 2, 1])).tolist()}, r"no rotation: .* it scales by 2\."),
-        ({"transform_matrix": np.zeros((4, 4)).tolist()}, r"no rotation: RᵀR is off by 1, and it scales by 0\."),
+        (
+            {"transform_matrix": (matrix(1) @ np.diag([2, 2, 3, 1])).tolist()},
+            r"its axes are off by 12°, and it scales by",
+        ),
+        ({"transform_matrix": matrix(1).round(2).tolist()}, r"no rotation: its axes are off by 0\.\d+°"),
+        ({"transform_matrix": np.zeros((4, 4)).tolist()}, r"its axes are off by inf°, and it scales by 0\."),
+        (
+            {"transform_matrix": matrix(1).T.tolist()},
+            r"the last row .* is 1, 2, -1, 1 and not 0, 0, 0, 1: it may be trans",
+        ),
         ({"fl_x": 0}, r"camera of frame './1': a focal length of 0 × 0 pixels is not one for a picture of 60×40"),
         ({"fl_x": -50}, r"camera of frame './1': a focal length of -50 × -50 pixels is not one"),
         ({"fl_x": 1e308}, r"camera of frame './1': a focal length of 1e\+308 × 1e\+308 pixels is not one"),
@@ -225,13 +234,37 @@ def test_no_focal_length_at_all_is_refused(read) -> None:
         read([frame(0, camera_angle_x=40)])
 
 
-def test_a_rotation_with_rounding_is_made_orthonormal(read) -> None:
-    rounded = matrix(1)
-    rounded[:3, :3] = np.round(rounded[:3, :3], 4)
-    (image,) = read([frame(1, transform_matrix=rounded.tolist())], **LENS).model.images
-    turned = image.sfm_from_camera[:, :3]
-    np.testing.assert_allclose(turned.T @ turned, np.eye(3), atol=1e-12)
-    assert 0 < np.abs(turned @ OPENGL_FROM_OPENCV - matrix(1)[:3, :3]).max() < 1e-4
+def test_rounded_rotations_are_projected_and_named(read) -> None:
+    tilted = matrix(1)
+    tilted[:3, :3] = Rotation.from_euler("xyz", (0.4, -0.7, 1.1)).as_matrix()
+    exact = read([frame(0), frame(1, transform_matrix=tilted.tolist()), frame(2)], **LENS)
+    rounded = read([frame(0), frame(1, transform_matrix=tilted.round(3).tolist()), frame(2)], **LENS)
+    for a, b in zip(exact.model.images, rounded.model.images, strict=True):
+        rotation = b.sfm_from_camera[:, :3]
+        np.testing.assert_allclose(rotation.T @ rotation, np.eye(3), atol=1e-12)
+        np.testing.assert_allclose(rotation, a.sfm_from_camera[:, :3], atol=np.radians(0.05))
+    assert exact.notes == []
+    (note,) = rounded.notes
+    assert "1 frames" in note and "./1" in note
+
+
+@pytest.mark.parametrize("scale", [1.05, 0.1, 1000.0])
+@pytest.mark.parametrize("frames", [[1], [0, 1, 2]])
+def test_the_scale_of_a_matrix_is_left_out_and_named(read, scale: float, frames: list[int]) -> None:
+    by = np.diag([scale, scale, scale, 1])
+    given = [frame(i, transform_matrix=(matrix(i) @ (by if i in frames else np.eye(4))).tolist()) for i in range(3)]
+    known, plain = read(given, **LENS), read([frame(i) for i in range(3)], **LENS)
+    for scaled, image in zip(known.model.images, plain.model.images, strict=True):
+        np.testing.assert_allclose(scaled.sfm_from_camera, image.sfm_from_camera, atol=1e-12)
+    (note,) = known.notes
+    assert f"{len(frames)} frames" in note and f"{scale:g}" in note
+
+
+def test_a_matrix_may_be_a_flat_list_of_its_rows(read) -> None:
+    flat = read([frame(i, transform_matrix=matrix(i).ravel().tolist()) for i in range(3)], **LENS)
+    plain = read([frame(i) for i in range(3)], **LENS)
+    for one, other in zip(flat.model.images, plain.model.images, strict=True):
+        np.testing.assert_array_equal(one.sfm_from_camera, other.sfm_from_camera)
 
 
 def test_frames_without_photo_and_photos_without_frame_are_named(read) -> None:
