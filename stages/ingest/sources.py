@@ -9,9 +9,9 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
-from stages.contract import StageError
+from stages.contract import StageError, listed
 from stages.ingest.auxiliary_files import twins
 from stages.ingest.frame_files import FrameFiles
 from stages.ingest.listing import FOLDER_HINT, IMAGES, files_below, is_video, list_photos, photo_root, walk_photos
@@ -20,6 +20,7 @@ from stages.io.transforms_files import HELD_OUT, TRAIN, photo_names, read_splits
 
 SourceKind = Literal["photos", "video", "transforms", "blender", "colmap"]
 
+FEW_NAMES = 2
 _HAS_BESIDE = re.compile(r"images(_\d+)?|input|photos")  # folders of photos beside which their masks may lie
 
 
@@ -196,9 +197,13 @@ def _check_given(photos: Path, cameras: Path | None) -> None:
 def _from_transforms(kind: SourceKind, root: Path, cameras: Path) -> Source:
     place = cameras.parent if cameras.is_file() else cameras
     find = FrameFiles((root,) if place == root else (root, root.parent, place))
-    splits, _ = read_splits(cameras, lambda frame: find.photo(frame).is_file())
-    frames = [frame for _, content in splits for frame in content["frames"]]
+    frames = _frames(cameras, find)
+    if not any(find.photo(frame).is_file() for frame in frames):
+        find = replace(find, of_other_folders=True)
+        frames = _frames(cameras, find)
     files = {frame["file_path"]: find.photo(frame) for frame in frames}
+    if not any(map(Path.is_file, files.values())):
+        raise _none_of_its_photos(cameras, root, list(files))
     in_order = _sorted_inside(root, set(files.values()))
     photos = {path: _name(root, file) for path, file in files.items()}
     # In a file of ours they are of ingest's copies: those that lie with the photos count.
@@ -206,6 +211,22 @@ def _from_transforms(kind: SourceKind, root: Path, cameras: Path) -> Source:
     named = {photos[frame["file_path"]]: mask for frame in foreign if (mask := frame.get("mask_path"))}
     masks = tuple((f"{photo}.png", find.mask(mask)) for photo, mask in named.items())
     return Source(kind, root, cameras, in_order, photos, masks)
+
+
+def _frames(cameras: Path, find: FrameFiles) -> list[dict[str, Any]]:
+    splits, _ = read_splits(cameras, lambda frame: find.photo(frame).is_file())
+    return [frame for _, content in splits for frame in content["frames"]]
+
+
+def _none_of_its_photos(cameras: Path, root: Path, names: list[str]) -> StageError:
+    """The error for a transforms file of which nothing is among the photos at hand."""
+    here = sorted(file.relative_to(root).as_posix() for file in walk_photos(root) if file.suffix.lower() in IMAGES)
+    there = f"{root} has {listed(here, FEW_NAMES)}" if here else f"there are no photos in {root}"
+    return StageError(
+        f"none of the {len(names)} photos of {cameras.name} is there",
+        f"it names {listed(names, FEW_NAMES)}, and {there}",
+        f"Give the folder with its photos: pipeline run PHOTOS --cameras {cameras}",
+    )
 
 
 def camera_files(folder: Path) -> tuple[Path, ...]:

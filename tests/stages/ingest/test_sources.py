@@ -327,7 +327,7 @@ def test_a_transforms_file_may_name_masks_which_go_before_others(tmp_path: Path,
 )
 def test_masks_may_not_leave_their_folder(mask: object, words: str, tmp_path: Path) -> None:
     frame = {"file_path": "a.jpg", "mask_path": mask, "transform_matrix": []}
-    (tmp_path / "transforms.json").write_text(json.dumps({"frames": [frame]}))
+    (touch(tmp_path, "a.jpg") / "transforms.json").write_text(json.dumps({"frames": [frame]}))
     assert words in str(refusal(tmp_path / "transforms.json"))
 
 
