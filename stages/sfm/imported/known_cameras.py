@@ -89,7 +89,7 @@ def read_known_cameras(cameras: Path, photos: Sequence[Photo], frames: Mapping[s
 def _from_transforms(cameras: Path, photos: Sequence[Photo], frames: Mapping[str, str]) -> KnownCameras:
     by_name = {photo.name: photo for photo in photos}
     framed: dict[str, _Framed] = {}
-    absent, test_files, approximate = [], [], 0
+    absent, repeated, test_files, approximate = [], [], [], 0
     unused: dict[str, Photo] = {}  # by file
     splits, notes = read_splits(cameras, lambda frame: frames.get(frame["file_path"]) in by_name)
     for where, content in splits:
@@ -104,15 +104,20 @@ def _from_transforms(cameras: Path, photos: Sequence[Photo], frames: Mapping[str
             if PurePosixPath(name) in in_no_split:
                 unused[file] = photo
                 continue
-            if file in framed:
-                raise StageError(f"two frames for the photo {photo.name}", f"one is {name!r}", HINT)
             values = intrinsics_of(frame, content)
+            if file in framed:
+                if (values | {"file_path": name}) != (framed[file].values | {"file_path": name}):
+                    raise _two_frames(photo.name, framed[file].frame["file_path"], name)
+                repeated.append(name)
+                continue
             framed[file] = _Framed(photo, frame, values)
             approximate += str(values.get("note", "")).startswith(APPROXIMATION)
             if PurePosixPath(name) in held_out:
                 test_files.append(file)
         if held_out and not test_files:
             notes.append(none_among_the_photos(len(held_out), where))
+    if repeated:
+        notes.append(f"{len(repeated)} frames are listed twice, alike: {_few(repeated)}")
     if approximate:
         notes.append(f"the lenses of {approximate} frames are approximations, as their notes in the file say")
     if not framed:
@@ -136,6 +141,11 @@ def _from_transforms(cameras: Path, photos: Sequence[Photo], frames: Mapping[str
         test_files=kept_tests or None,
         notes=_notes(absent, unposed, posed, left_out) + notes,
     )
+
+
+def _two_frames(photo: str, first: str, second: str) -> StageError:
+    which = f"{first!r} is listed twice" if first == second else f"they are {first!r} and {second!r}"
+    return StageError(f"two frames for the photo {photo} differ", which, HINT)
 
 
 def _split(content: Mapping[str, Any], source: str, notes: list[str]) -> tuple[set[PurePosixPath], set[PurePosixPath]]:
@@ -290,6 +300,8 @@ def _from_colmap(folder: Path, photos: Sequence[Photo]) -> KnownCameras:
     )
     if others := [pair for one in kept.values() if (pair := _other_ending(one.name, one.photo))]:
         notes.append(f"{len(others)} photos have the cameras of files with another ending: {_few(others)}")
+    if not len(given.xyz):
+        notes.append("the model has no points: near and far are taken from where its cameras stand and look")
     if behind:
         notes.append(f"{behind} observations of points behind their cameras are left out")
     return KnownCameras(model, left_out, None, notes)

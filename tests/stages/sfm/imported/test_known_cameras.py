@@ -280,8 +280,15 @@ def test_no_frame_with_a_photo_is_an_error(read) -> None:
 
 
 def test_a_photo_has_one_frame(read) -> None:
-    with pytest.raises(StageError, match=r"two frames for the photo ä1.png: one is './1'"):
-        read([frame(1), frame(1)], **LENS)
+    for second in (frame(1, fl_x=51.0), frame(1, transform_matrix=matrix(2).tolist())):
+        with pytest.raises(StageError, match=r"two frames for the photo ä1.png differ: './1' is listed twice"):
+            read([frame(1), second], **LENS)
+
+
+def test_frames_that_are_listed_twice_alike_count_once(read) -> None:
+    known = read([frame(0), frame(1), frame(1), frame(2)], **LENS)
+    assert [image.file for image in known.model.images] == ["a0.png", "a1.png", "a2.png"]
+    assert known.notes == ["1 frames are listed twice, alike: ./1"]
 
 
 @pytest.mark.parametrize("with_test", [True, False])
