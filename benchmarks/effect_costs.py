@@ -19,8 +19,8 @@ from benchmarks.grid_parts import loaded
 from benchmarks.nerfacto import pipeline
 from nerf.effects import AS_GIVEN, AS_RENDERED
 from nerf.geometry.scene import Scene
-from nerf.runtime.matmul_precision import products_at
-from nerf.training.ray_dataset import RayBank
+from nerf.runtime.matmul_precision import use_matmul_precision
+from nerf.training.ray_dataset import RayDataset
 from nerf.training.trainer import FieldTrainer
 from stages.effects.decisions import Decisions, photo_parts
 from stages.train import Config
@@ -52,7 +52,7 @@ class Timed:
 
 
 def arms(
-    config: Config, scene: Scene, bank: RayBank, decided: Decisions, neutral: tuple[Timed, Timed]
+    config: Config, scene: Scene, bank: RayDataset, decided: Decisions, neutral: tuple[Timed, Timed]
 ) -> dict[str, FieldTrainer]:
     """A trainer for each choice; ``neutral`` stand in the first one."""
     views = scene.of_split("train")
@@ -88,7 +88,7 @@ def main() -> None:
     neutral = Timed(AS_GIVEN), Timed(AS_RENDERED)
     trainers = arms(config, scene, bank, decided, neutral)
     seconds: dict[str, list[float]] = {name: [] for name in trainers}
-    with products_at(config.matmul):
+    with use_matmul_precision(config.matmul):
         for each in trainers.values():
             for step in range(WARM_STEPS):
                 each.step(step, SHARE, 1.0)
