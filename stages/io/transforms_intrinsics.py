@@ -53,9 +53,10 @@ def contradictions(values: Mapping[str, Any], width: int, height: int) -> list[s
             focal = _focal_lengths(values, axis, float(size))
         except (TypeError, ValueError):
             continue
-        taken = next(iter(focal), None)
-        for name in [name for name in focal if abs(focal[name] - focal[taken]) > SAME_WITHIN * abs(focal[taken])]:
-            found.append(f"{taken} is {focal[taken]:.5g} pixels and {name} says {focal[name]:.5g}: {taken} is taken")
+        (taken, pixels), *others = focal.items() or [("", 0.0)]
+        for name, other in others:
+            if abs(other - pixels) > SAME_WITHIN * abs(pixels):
+                found.append(f"{taken} is {pixels:.5g} pixels and {name} says {other:.5g}: {taken} is taken")
     terms = values.get("distortion_params")
     if isinstance(terms, list) and len(terms) == len(NERFSTUDIOS):
         other = [name for name, term in zip(NERFSTUDIOS, terms, strict=True) if values.get(name, term) != term]

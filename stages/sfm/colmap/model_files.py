@@ -81,15 +81,17 @@ def read_model_files(folder: Path) -> ModelFiles:
         if binary
         else {"cameras": _text_cameras, "images": _text_images, "points3D": _text_points}
     )
+    files = {part: folder / f"{part}{'.bin' if binary else '.txt'}" for part in readers}
+    if without_points := not files["points3D"].is_file():
+        readers["points3D"] = lambda _: iter(())
     parts = []
-    for part, reader in readers.items():
-        path = folder / f"{part}{'.bin' if binary else '.txt'}"
+    for part, path in files.items():
         try:
-            parts.append(_by_id(reader(path)) if path.is_file() or part != "points3D" else {})
+            parts.append(_by_id(readers[part](path)))
         except (struct.error, ValueError, OverflowError) as error:
             raise ValueError(f"{path.name} is damaged: {error}") from error
     model = ModelFiles(*parts)
-    if not path.is_file():  # what images see are then points that nobody knows
+    if without_points:  # what images see are then points that nobody knows
         images = {i: image._replace(points=np.full_like(image.points, NO_POINT)) for i, image in model.images.items()}
         model = model._replace(images=images)
     _check(model)

@@ -106,7 +106,7 @@ def _from_transforms(cameras: Path, photos: Sequence[Photo], frames: Mapping[str
                 continue
             values = intrinsics_of(frame, content)
             if file in framed:
-                if (values | {"file_path": name}) != (framed[file].values | {"file_path": name}):
+                if {**values, "file_path": ""} != {**framed[file].values, "file_path": ""}:
                     raise _two_frames(photo.name, framed[file].frame["file_path"], name)
                 repeated.append(name)
                 continue
