@@ -93,9 +93,9 @@ def _averaged(values: Float[Tensor, "n _ _"]) -> Float[Tensor, "n _ _"]:
 def trilinear(grid: DensityGrid, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points"]:
     """Interpolate inside the box; the value is zero beyond it."""
     scaled = 2 * (points - grid.low) / (grid.high - grid.low) - 1
-    grid = scaled.flip(-1).reshape(1, 1, 1, -1, 3)  # grid_sample's x runs along the last axis
+    locations = scaled.flip(-1).reshape(1, 1, 1, -1, 3)  # grid_sample's x runs along the last axis
     volume = grid.values[None, None]
-    sampled = torch.nn.functional.grid_sample(volume, grid, padding_mode="zeros", align_corners=True)
+    sampled = torch.nn.functional.grid_sample(volume, locations, padding_mode="zeros", align_corners=True)
     return sampled.reshape(points.shape[:-1])
 
 

@@ -9,6 +9,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from nerf.fields.density_grid import DensityGrid
 from nerf.fields.positional_encoding import positional_encoding
 from nerf.geometry.contraction import contract, uncontract
 from nerf.geometry.rays import Rays, clip_to_box
@@ -190,7 +191,7 @@ def test_a_grid_without_a_surface_is_refused(density: float) -> None:
     """Empty, full, constant: no level lies strictly inside."""
     corner = torch.ones(3)
     with pytest.raises(StageError, match="no surface at density 7"):
-        extract_surface(DensityLattice(torch.full((6, 6, 6), density), -corner, corner), 7.0)
+        extract_surface(DensityGrid(torch.full((6, 6, 6), density), -corner, corner), 7.0)
 
 
 @pytest.mark.parametrize("density", [1e4, 1e30])
@@ -199,10 +200,10 @@ def test_a_block_of_full_vertices_is_a_closed_surface_and_a_single_one_is_too_th
 ) -> None:
     values = torch.zeros(7, 7, 7)
     values[2:5, 2:5, 2:5] = density
-    surface = extract_surface(DensityLattice(values, -torch.ones(3), torch.ones(3)), 7.0)
+    surface = extract_surface(DensityGrid(values, -torch.ones(3), torch.ones(3)), 7.0)
     assert is_watertight(surface) and np.isfinite(surface.vertices).all()
     assert 1 / 3 < np.abs(surface.vertices).max() < 2 / 3
     alone = torch.zeros(7, 7, 7)
     alone[3, 3, 3] = density
     with pytest.raises(StageError, match="too thin for the grid"):
-        extract_surface(DensityLattice(alone, -torch.ones(3), torch.ones(3)), 7.0)
+        extract_surface(DensityGrid(alone, -torch.ones(3), torch.ones(3)), 7.0)

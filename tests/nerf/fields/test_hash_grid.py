@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from nerf.fields import mlp
+from nerf.fields.background import BACKGROUND_LAYOUT, background_colour
 from nerf.fields.hash_grid import THINNING_THRESHOLD, HashGridField, HashGridSettings
 from nerf.fields.interface import RadianceModel, Rendering
 from nerf.geometry.rays import Rays
@@ -86,7 +87,7 @@ def encoded_by_autograd(layout: GridLayout, table: Tensor, points: Tensor) -> Te
 @pytest.mark.parametrize("settings", [SMALL, FOLDED, OUTDOORS, DIFFUSE])
 def test_all_gradients_are_those_of_autograd(settings: HashGridSettings, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("nerf.fields.hash_grid.THINNING_THRESHOLD", 0.0)
-    monkeypatch.setattr(grid_mlp, "BLOCK", {"cpu": 7})  # so that there are several, the last one short
+    monkeypatch.setattr(mlp, "BLOCK", {"cpu": 7})  # so that there are several, the last one short
     model, given = field(settings), rays()
     jitter = torch.rand(6, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
     background = torch.rand(6, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
@@ -256,7 +257,7 @@ def test_parameters_depend_on_the_seed_alone() -> None:
     ("wrong", "message"),
     [
         ({"num_levels": 0}, "levels is 0; it must be at least 1"),
-        ({"base_res": 10}, "finest is 9; it must be at least 10"),
+        ({"base_res": 10}, "max_res is 9; it must be at least 10"),
         ({"occupancy_resolution": 10}, "occupancy_resolution is 10; it must be a multiple of 4"),
         ({"cone_angle": 0.0}, r"min_step_size \(0.002\) and cone_angle \(0.0\) must be positive"),
     ],

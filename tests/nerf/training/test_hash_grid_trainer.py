@@ -176,8 +176,8 @@ def test_the_distortion_loss_is_added_and_has_its_gradient() -> None:
     one, other = plain.step(0, 1.0), with_it.step(0, 1.0)
     assert one.psnr == other.psnr
     assert one.loss < other.loss < one.loss + 5
-    assert torch.equal(plain.mean["colour_out"], with_it.mean["colour_out"])
-    assert not torch.equal(plain.mean["density_out"], with_it.mean["density_out"])
+    assert torch.equal(plain.exp_avg["colour_out"], with_it.exp_avg["colour_out"])
+    assert not torch.equal(plain.exp_avg["density_out"], with_it.exp_avg["density_out"])
 
 
 def test_the_distortion_loss_begins_weak() -> None:
@@ -206,7 +206,7 @@ def test_the_rate_warms_up_stays_and_falls() -> None:
 
 def test_a_state_of_another_architecture_is_refused() -> None:
     other = trainer(field=replace(FIELD, num_levels=1))
-    with pytest.raises(RuntimeError, match=r"another field: mean\.density_hidden, mean\.table"):
+    with pytest.raises(RuntimeError, match=r"another field: exp_avg\.density_hidden, exp_avg\.table"):
         trainer().load_state(other.state())
 
 
@@ -218,7 +218,7 @@ def test_a_state_of_equal_shapes_but_other_settings_is_refused() -> None:
 
 def test_a_density_cache_of_an_unbounded_scene_has_finite_steps_everywhere() -> None:
     model = HashGridField(replace(FIELD, contracted=True), 0, reference)
-    cache = HashGridTrainer(model, small_bank(), TRAINER).cache
+    cache = HashGridTrainer(model, small_bank(), TRAINER).occupancy_grid
     cache.update(15, torch.Generator().manual_seed(1))
     assert cache.optical_thickness.isfinite().all()
     assert cache.optical_thickness.max() > 20 * cache.optical_thickness.min() > 0

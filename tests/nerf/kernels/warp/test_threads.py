@@ -106,7 +106,7 @@ def run_briefly(trainer: HashGridTrainer, start: dict[str, Tensor]) -> dict[str,
 def test_a_training_run_has_the_same_bits_again_and_again_on_any_number_of_threads(
     field: HashGridSettings, use_cores: Callable[[int], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("nerf.fields.occupancy_grid.CHUNK", 128)  # so that even this small cache is measured in several
+    monkeypatch.setattr("nerf.fields.occupancy_grid.CHUNK_POINTS", 128)  # several chunks even here
     trainer, used = small_trainer(field), set[int]()
     guided = [int((trainer._batch(0, 0.0, chunk, trainer._rays_per_chunk()).distance > 0).sum()) for chunk in range(4)]
     assert sum(guided) == 2 and trainer._rays_per_chunk() == 4
@@ -116,7 +116,13 @@ def test_a_training_run_has_the_same_bits_again_and_again_on_any_number_of_threa
     use_cores(1)
     wanted = copied(run_briefly(trainer, start))
     changed = {name for name in wanted if not torch.equal(wanted[name], start[name])}
-    assert {"model.table", "model.occupancy_bits", "thickness", "exp_avg.table", "exp_avg_sq.colour_out"} <= changed
+    assert {
+        "model.table",
+        "model.occupancy_bits",
+        "optical_thickness",
+        "exp_avg.table",
+        "exp_avg_sq.colour_out",
+    } <= changed
     assert ("model.background_table" in changed) == field.background_model
     for repeat in range(200):
         use_cores(count := (1, 2, 4)[repeat % 3])
