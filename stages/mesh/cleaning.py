@@ -51,7 +51,9 @@ def clean(
     covered = np.all(sight.covered[surface.faces] >= min_views, axis=1) | (keep != "visible")
     if not covered.any():
         why = f"none of its {len(surface.faces)} faces lies in {min_views} photos between near and far"
-        raise StageError("no part of the surface is covered by the photos", why, "Try --mesh.keep all.")
+        raise StageError(
+            "mesh.nothing-covered", "no part of the surface is covered by the photos", why, "Try --mesh.keep all."
+        )
     surface, old = keep_faces(surface, covered)
     hidden = 0
     if keep == "visible":
@@ -68,7 +70,12 @@ def clean(
         good = np.arange(count) < (1 if keep == "largest" else count)
     if not good.any():
         why = f"in none of its {count} components is a tenth of the area seen by {min_views} photos"
-        raise StageError("no part of the surface is seen by the photos", why, "Try --mesh.keep all or --mesh.level.")
+        raise StageError(
+            "mesh.nothing-seen",
+            "no part of the surface is seen by the photos",
+            why,
+            "Try --mesh.keep all or --mesh.level.",
+        )
     surface, left = keep_faces(surface, good[label])
     return Cleaned(surface, old[left], int(good.sum()), int((~good).sum()), int((~covered).sum()), hidden)
 

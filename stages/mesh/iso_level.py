@@ -49,6 +49,7 @@ def check_range(lattice: "Lattice", level: float | None) -> None:
     broken = int((~torch.isfinite(lattice.values)).sum())
     if broken:
         raise StageError(
+            "mesh.density-not-finite",
             "the density is not finite",
             f"{broken} of {lattice.values.numel()} lattice points are NaN or infinite",
             "Train again: the field is broken.",
@@ -57,14 +58,21 @@ def check_range(lattice: "Lattice", level: float | None) -> None:
     through = 1 - float(torch.exp(-high * (lattice.high - lattice.low).norm()))
     if through < 0.01:
         why = f"its density is at most {high:.3g} per scene unit, which stops {through:.1%} of a ray across the box"
-        raise StageError("the field is empty", why, "Train for longer (--train.steps or --train.seconds).")
+        raise StageError(
+            "mesh.empty-field", "the field is empty", why, "Train for longer (--train.steps or --train.seconds)."
+        )
     if high - low < 1e-3 * high:
         why = f"its density is {low:.3g} to {high:.3g} per scene unit, the same everywhere"
-        raise StageError("the field has no surface", why, "Train for longer (--train.steps or --train.seconds).")
+        raise StageError(
+            "mesh.uniform-field",
+            "the field has no surface",
+            why,
+            "Train for longer (--train.steps or --train.seconds).",
+        )
     if level is not None and not low < level < high:
         why = f"density runs from {low:.3g} to {high:.3g} per scene unit"
         hint = "Give --mesh.level a value in between, or leave it out to have one chosen."
-        raise StageError(f"no surface at density {level:g}", why, hint)
+        raise StageError("mesh.level-out-of-range", f"no surface at density {level:g}", why, hint)
 
 
 def choose_level(lattice: "Lattice", model: "RadianceModel", rays: "Rays") -> Level:

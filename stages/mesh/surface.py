@@ -45,6 +45,7 @@ def extract(lattice: "Lattice", level: float) -> Surface:
     values = solidity(lattice, level).values.cpu().numpy()
     if not values.min() < 0.5 < values.max():
         raise StageError(
+            "mesh.too-thin",
             f"no surface at density {level:.3g}",
             f"between neighbours of the lattice it averages {values.min():.0%} to {values.max():.0%} of solid: what is "
             "there is too thin for the lattice, or fills the box",

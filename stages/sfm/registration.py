@@ -218,14 +218,16 @@ def why_no_model(photos: "Sequence[Photo]", matches: Matches, registered: int, p
     what = f"the cameras of {len(photos)} photos could not be found"
     if np.median(matches.keypoints) < FEW_FEATURES:
         return StageError(
+            "sfm.few-features",
             what,
             f"half of the photos show fewer than {FEW_FEATURES} features",
             "Take sharper, better lit photos, or put something with texture into the scene.",
         )
     if not verified:
-        return StageError(what, f"0 of {pairs} pairs of photos share a view", OVERLAP_HINT)
+        return StageError("sfm.no-overlap", what, f"0 of {pairs} pairs of photos share a view", OVERLAP_HINT)
     if np.median(matches.shift_px) < SAME_VIEW_PX:
         return StageError(
+            "sfm.same-view",
             what,
             f"the photos are all the same view ({verified} of {pairs} pairs differ by less than a pixel)",
             f"Move the camera between photos. {STILL_BACKGROUND_HINT}",
@@ -235,7 +237,7 @@ def why_no_model(photos: "Sequence[Photo]", matches: Matches, registered: int, p
     why = f"{verified} of {pairs} pairs of photos share a view, but no two of them tell the depth of the scene"
     if registered:
         why = f"only {registered} photos and {points} points fit together; {verified} of {pairs} pairs share a view"
-    return StageError(what, why, OVERLAP_HINT)
+    return StageError("sfm.no-model", what, why, OVERLAP_HINT)
 
 
 def _no_depth(what: str, photos: "Sequence[Photo]", matches: Matches) -> StageError | None:
@@ -245,12 +247,14 @@ def _no_depth(what: str, photos: "Sequence[Photo]", matches: Matches) -> StageEr
     turns = count_turns(matches.homography[matches.flat], sizes[matches.pairs[matches.flat]])
     if flat > count / 2 and turns > flat / 2:
         return StageError(
+            "sfm.pure-rotation",
             what,
             f"the camera turned on the spot: {turns} of {count} matching pairs differ by a rotation alone",
             "Move sideways between photos, by a tenth of the distance to the scene, instead of turning on the spot.",
         )
     if ahead > count / 2:
         return StageError(
+            "sfm.forward-motion",
             what,
             f"the camera moved straight ahead: in {ahead} of {count} matching pairs it goes towards something in the "
             "picture, which leaves too little parallax",
@@ -258,6 +262,7 @@ def _no_depth(what: str, photos: "Sequence[Photo]", matches: Matches) -> StageEr
         )
     if flat > count / 2:
         return StageError(
+            "sfm.planar-scene",
             what,
             f"the photos show one flat surface: a plane alone explains {flat} of {count} matching pairs",
             "Take in something that stands out from the surface, and photograph it from the side as well.",

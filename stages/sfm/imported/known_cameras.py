@@ -102,7 +102,7 @@ def _from_transforms(cameras: Path, photos: Sequence[Photo], frames: Mapping[str
                 unused[file] = photo
                 continue
             if file in framed:
-                raise StageError(f"two frames for the photo {photo.name}", f"one is {name!r}", HINT)
+                raise StageError("sfm.two-frames", f"two frames for the photo {photo.name}", f"one is {name!r}", HINT)
             values = {**content, **frame}
             framed[file] = _Framed(photo, frame, values)
             approximate += str(values.get("note", "")).startswith(APPROXIMATION)
@@ -153,11 +153,15 @@ def _listed(content: Mapping[str, Any], key: str, source: str, notes: list[str])
     StageError where none has a frame."""
     names = content.get(key) or []
     if not (isinstance(names, list) and all(isinstance(name, str) for name in names)):
-        raise unusable(f"the {key} of {source}", "it is no list of names")
+        raise unusable("sfm.split-no-list", f"the {key} of {source}", "it is no list of names")
     of_frames = {PurePosixPath(frame["file_path"]) for frame in content["frames"]}
     strange = [name[:MOST_LETTERS] for name in names if PurePosixPath(name) not in of_frames]
     if strange and len(strange) == len(names):
-        raise unusable(f"the {key} of {source}", f"none of them is the file_path of a frame: {_few(strange)}")
+        raise unusable(
+            "sfm.split-of-no-frame",
+            f"the {key} of {source}",
+            f"none of them is the file_path of a frame: {_few(strange)}",
+        )
     if strange:
         notes.append(f"{len(strange)} photos in {key} of {source} have no frame: {_few(strange)}")
     return set(map(PurePosixPath, names))
@@ -181,7 +185,9 @@ def _given_camera(framed: _Framed, upright: bool) -> Camera:
     try:
         return read_intrinsics(framed.values, *size)
     except ValueError as error:
-        raise unusable(f"the camera of frame {framed.frame['file_path']!r}", str(error)) from error
+        raise unusable(
+            "sfm.frame-intrinsics", f"the camera of frame {framed.frame['file_path']!r}", str(error)
+        ) from error
 
 
 def _from_frame(framed: _Framed, upright: bool) -> PosedPhoto:
@@ -195,21 +201,25 @@ def _pose(matrix: Any, name: str) -> Float[np.ndarray, "3 4"]:
     try:
         pose = pose_matrix(matrix)
     except ValueError as error:
-        raise unusable(f"frame {name!r}", str(error)) from error
+        raise unusable("sfm.frame-pose", f"frame {name!r}", str(error)) from error
     if (place := np.abs(pose[:, 3]).max()) > FARTHEST:
         why = f"its place is {place:.3g} units from the origin, and the most is {FARTHEST:g}"
-        raise unusable(f"the transform_matrix of frame {name!r}", why)
+        raise unusable("sfm.pose-far-away", f"the transform_matrix of frame {name!r}", why)
     rotation = pose[:, :3]
     if not np.abs(rotation).max() <= LARGEST_ENTRY:
         raise unusable(
-            f"the transform_matrix of frame {name!r}", f"it is no rotation: {np.abs(rotation).max():.3g} is in it"
+            "sfm.pose-large-entry",
+            f"the transform_matrix of frame {name!r}",
+            f"it is no rotation: {np.abs(rotation).max():.3g} is in it",
         )
     if (determinant := np.linalg.det(rotation)) < 0:
-        raise unusable(f"the transform_matrix of frame {name!r}", "it mirrors (its determinant is negative)")
+        raise unusable(
+            "sfm.pose-mirrors", f"the transform_matrix of frame {name!r}", "it mirrors (its determinant is negative)"
+        )
     off = np.abs(rotation.T @ rotation - np.eye(3)).max()
     if not off <= ORTHONORMAL_WITHIN:
         why = f"it is no rotation: RᵀR is off by {off:.2g}, and it scales by {np.cbrt(determinant):.4g}"
-        raise unusable(f"the transform_matrix of frame {name!r}", why)
+        raise unusable("sfm.pose-no-rotation", f"the transform_matrix of frame {name!r}", why)
     u, _, vt = np.linalg.svd(rotation)
     return np.concatenate([u @ vt @ OPENGL_FROM_OPENCV, pose[:, 3:]], axis=1)
 
@@ -361,6 +371,7 @@ def _without_ending(name: str) -> str:
 def _nothing_matches(source: str, names: Sequence[str], photos: Sequence[Photo]) -> StageError:
     here = _few([photo.name for photo in photos], FEW_NAMES)
     return StageError(
+        "sfm.no-camera-matches",
         f"no camera in {source} belongs to a photo",
         f"it is of {_few(names, FEW_NAMES)}, and the photos are {here}",
         "Give the folder of the very photos that the cameras were made for.",
