@@ -5,7 +5,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from pipeline.cli.failures import StageFailed
+from pipeline.engine.failures import StageFailed
 from stages.contract import StageError
 
 

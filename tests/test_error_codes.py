@@ -1,4 +1,4 @@
-"""Every error that a user can act on has a code of its own, which begins with the stage or package it comes from."""
+"""Every error that a user can act on has a code of its own, which begins with the stage or package that it comes from."""
 
 import ast
 import re
@@ -43,7 +43,8 @@ def text_of(code: ast.expr, module: Module) -> str:
 
 
 def wrong_codes(module: Module) -> Iterator[str]:
-    _, package = module.name.split("/")[:2]
+    folder, package, *_ = module.name.split("/")
+    package = package if folder == "stages" else folder
     for code in codes(module):
         text = text_of(code, module)
         if not CODE.fullmatch(text) or text.split(".")[0] != package:

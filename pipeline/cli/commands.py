@@ -79,7 +79,7 @@ def run_command(words: Sequence[str]) -> int:
     try:
         return _command(words[0])(words[1:])
     except UsageError as error:
-        _say("cli.usage", str(error), "", "", as_json)
+        _say("pipeline.usage", str(error), "", "", as_json)
         return EXIT_USAGE
     except StageFailed as failure:
         if debug:
@@ -91,10 +91,10 @@ def run_command(words: Sequence[str]) -> int:
         _say(error.code, error.what, error.why, error.hint, as_json)
         return EXIT_WORKSPACE
     except KeyboardInterrupt:
-        _say("cli.interrupted", "stopped", "Ctrl-C", go_on(words), as_json)
+        _say("pipeline.interrupted", "stopped", "Ctrl-C", go_on(words), as_json)
         return EXIT_INTERRUPT
     except Terminated:
-        _say("cli.terminated", "stopped", "SIGTERM", go_on(words), as_json)
+        _say("pipeline.terminated", "stopped", "SIGTERM", go_on(words), as_json)
         return EXIT_TERMINATED
     except BrokenPipeError:
         raise
@@ -102,7 +102,7 @@ def run_command(words: Sequence[str]) -> int:
         if debug:
             traceback.print_exc()
         what = f"a defect of this program, not of your photos: {type(error).__name__}: {error}"
-        _say("cli.defect", what, "it should not happen", REPORT_IT, as_json)
+        _say("pipeline.defect", what, "it should not happen", REPORT_IT, as_json)
         return EXIT_DEFECT
 
 
@@ -305,7 +305,9 @@ def _recorded_settings(workspace: Workspace) -> Settings:
     except UsageError as error:
         why = f"{error}; another version of this program wrote it"
         hint = f"Give the photos again: pipeline run PHOTOS -o {workspace.root}. What still fits is kept."
-        raise StageError("cli.recorded-options", f"cannot use the options of {workspace.root}", why, hint) from error
+        raise StageError(
+            "pipeline.recorded-options", f"cannot use the options of {workspace.root}", why, hint
+        ) from error
 
 
 def command_resume(words: Sequence[str]) -> int:

@@ -33,7 +33,7 @@ def with_more(settings: Settings, workspace: Workspace, text: str) -> Settings:
     after = training_name(finished.key, finished.outputs_digest) if finished else train.after
     if after is None:
         raise StageError(
-            "engine.nothing-to-continue",
+            "pipeline.nothing-to-continue",
             f"{workspace.root} cannot go on",
             "no training is finished there",
             f"First: {command}",
@@ -54,4 +54,4 @@ def _finished(workspace: Workspace, key: str, command: str) -> Manifest | None:
         return workspace.finished("train", key)
     except BadManifest as problem:
         hint = f"It was set aside; {command} trains again."
-        raise StageError("engine.training-damaged", f"{workspace.root} cannot go on", str(problem), hint) from problem
+        raise StageError("pipeline.training-damaged", f"{workspace.root} cannot go on", str(problem), hint) from problem
