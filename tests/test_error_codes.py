@@ -1,4 +1,4 @@
-"""Every error that a user can act on has a code of its own, which begins with the stage or package that it comes from."""
+"""Every error that a user can act on has a code of its own, which begins with its stage or package."""
 
 import ast
 import re

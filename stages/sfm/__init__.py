@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from stages.io.photos import Photo
 
 INPUTS = ("ingest",)
-VERSION = 14
+VERSION = 15
 RESUMES = True
 PUBLISHED = ("sparse", "registration.json")
 # Both may decide that an attempt is not made, which is said, in the stage's line as well. A run with another limit is
