@@ -19,10 +19,10 @@ from stages import ingest, sfm
 from stages.contract import StageError
 from stages.io.files import read_json, write_png
 from stages.io.photos import read_photos, write_photos
-from stages.sfm import process as sfm_process
+from stages.sfm import worker_process
 from stages.sfm.colmap.models import read_model
 from stages.sfm.registration import count_done
-from stages.sfm.retry_strategies import ATTEMPTS, Journal, Tried
+from stages.sfm.retry_strategies import STRATEGIES, Outcome, StrategyLog
 from tests.blots import blots
 from tests.small_scenes import write_blender_scene
 from tests.stages.sfm_inputs import SMALL, ingested
@@ -114,7 +114,7 @@ def test_a_killed_run_takes_its_child_along_and_goes_on_to_the_same_bytes(
     parent.wait()
     wait_for(lambda: is_gone(child))
     sfm.run(SMALL, inputs, tmp_path, progress)
-    assert progress.notes[0].startswith("going on with the features of 12 photos and ")
+    assert progress.notes[0].startswith("resuming with the features of 12 photos and ")
     assert contents(tmp_path) == contents(reconstructed)
 
 
@@ -130,16 +130,16 @@ def test_a_damaged_database_is_made_anew(
 @pytest.mark.parametrize(
     ("child", "message"),
     [
-        ("import os; os.abort()", r"was ended by SIGABRT while finding features: COLMAP failed inside \(it left no"),
+        ("import os; os.abort()", r"was ended by SIGABRT while extracting features: COLMAP failed inside \(it left no"),
         ("import os; os.kill(os.getpid(), 9)", "was ended by SIGKILL .*: most often the machine ran out of memory"),
-        ("raise ValueError('no such thing')", "failed while finding features: ValueError: no such thing"),
-        ("import time; time.sleep(60)", "was given up while finding features: it took longer than 0.5 s"),
+        ("raise ValueError('no such thing')", "failed while extracting features: ValueError: no such thing"),
+        ("import time; time.sleep(60)", "was given up while extracting features: it took longer than 0.5 s"),
     ],
 )
 def test_however_the_child_ends_it_is_an_error_with_words(
     child: str, message: str, inputs: dict[str, Path], tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sfm_process, "CHILD", ["-c", child])
+    monkeypatch.setattr(worker_process, "COMMAND", ["-c", child])
     with pytest.raises(StageError, match=message):
         sfm.run(sfm.Config(max_seconds=0.5 if "sleep" in child else 60), inputs, tmp_path, progress)
     assert (tmp_path / "sfm.log").exists()
@@ -156,22 +156,22 @@ def test_strangers_are_left_out_and_named_and_alpha_and_mixed_sizes_work(
     notes = [re.sub(r"about .*", "…", note) for note in progress.notes if not note.startswith("camera model ")]
     assert notes == [
         "matching 36 pairs of photos: …",
-        "1 of 9 photos has no place yet: matching them again, less strictly",
+        "1 of 9 photos is not registered yet: matching them again with a relaxed ratio test",
         "matching 8 pairs of photos: …",
-        "passed over, for 1 of 9 photos missing is not worth starting over: verifying and mapping again, as if through "
-        "a fisheye lens; searching twice as many features at twice the size",
-        "passed over, for the missing photos share too little with the others: mapping again, asking less of the first "
-        "pair; mapping again, with another seed; mapping again, all photos at once",
-        "1 of 9 photos found no place and are left out:",
+        "skipped, because 1 of 9 photos missing is not worth starting over: verifying and mapping again with a fisheye "
+        "camera model; extracting twice as many features at twice the size",
+        "skipped, because the missing photos share too few matches with the others: mapping again from a weaker "
+        "initial pair; mapping again with another seed; mapping again with global mapping",
+        "1 of 9 photos could not be registered and are left out:",
         "  stranger.png: it shares no view with any other photo",
     ]
     account = read_json(tmp_path / "sfm/registration.json")
     assert [image["file"] for image in account["images"] if not image["registered"]] == ["stranger.png"]
-    tried = {row["attempt"]: row["passed"] for row in account["attempts"]}
-    assert list(tried) == [attempt.name for attempt in ATTEMPTS if attempt.matches != "row"]
-    assert [name for name, passed in tried.items() if passed is None] == ["first", "looser matching"]
+    tried = {row["strategy"]: row["skipped"] for row in account["strategies"]}
+    assert list(tried) == [strategy.name for strategy in STRATEGIES if strategy.matches != "consecutive"]
+    assert [name for name, skipped in tried.items() if skipped is None] == ["default", "relaxed ratio test"]
     assert tried["fisheye"] == "1 of 9 photos missing is not worth starting over"
-    assert [row["attempt"] for row in account["attempts"] if row["kept"]] == ["first"]
+    assert [row["strategy"] for row in account["strategies"] if row["kept"]] == ["default"]
     assert account["repeated_structure"] is None
 
 
@@ -259,7 +259,7 @@ def test_the_camera_of_one_photo_that_comes_out_absurd_does_not_end_the_run(
         f"lenses.flaw = lambda camera: 'it is absurd' if {absurd} else None\n"
         "c.main()"
     )
-    monkeypatch.setattr(sfm_process, "CHILD", ["-c", child])
+    monkeypatch.setattr(worker_process, "COMMAND", ["-c", child])
     sfm.run(SMALL, ingested(tmp_path / "ingest", images), tmp_path / "sfm", progress)
     assert "1 photo: the camera came out absurd (it is absurd): SIMPLE_PINHOLE instead" in progress.notes
     account, model = read_json(tmp_path / "sfm/registration.json"), read_model(tmp_path / "sfm/sparse")
@@ -307,7 +307,7 @@ def test_an_attempt_that_ended_the_program_is_left_out(
         "c.main()"
     )
     with monkeypatch.context() as patched:
-        patched.setattr(sfm_process, "CHILD", ["-c", crash])
+        patched.setattr(worker_process, "COMMAND", ["-c", crash])
         with pytest.raises(StageError, match=message):
             sfm.run(SMALL, folders, tmp_path / "sfm", progress)
     progress.notes.clear()
@@ -332,7 +332,7 @@ def test_an_attempt_for_which_no_time_is_left_is_not_begun(
         "c.Work.end = slowly\n"
         "c.main()"
     )
-    monkeypatch.setattr(sfm_process, "CHILD", ["-c", slow])
+    monkeypatch.setattr(worker_process, "COMMAND", ["-c", slow])
     config = SMALL.model_copy(update={"max_seconds": 240.0})
     result = sfm.run(config, with_a_stranger(inputs, tmp_path / "ingest"), tmp_path / "sfm", progress)
     assert result.line.startswith("6/7 registered, ")
@@ -351,7 +351,7 @@ def test_an_attempt_for_which_no_time_is_left_is_not_begun(
 def test_attempts_whose_matches_are_gone_are_forgotten(
     inputs: dict[str, Path], reconstructed: Path, tmp_path: Path, progress
 ) -> None:
-    Journal(tmp_path / "attempts").add(Tried("first", "matches-0.db", [["photo_000.jpg"] * 12], 500, 0.1))
+    StrategyLog(tmp_path / "attempts").add(Outcome("first", "matches-0.db", [["photo_000.jpg"] * 12], 500, 0.1))
     sfm.run(SMALL, inputs, tmp_path, progress)
     assert contents(tmp_path) == contents(reconstructed)
 

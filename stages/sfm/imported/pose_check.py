@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from stages.sfm.pairs.pair_selection import Pairs, closeness, nearest
-from stages.sfm.process import environment
+from stages.sfm.worker_process import environment
 
 if TYPE_CHECKING:
     from stages.io.photos import Photo

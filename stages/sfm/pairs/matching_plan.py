@@ -19,7 +19,7 @@ from stages.contract import Progress, StageError
 from stages.hardware.device import processors
 from stages.io.amounts import rough_duration
 from stages.render.spread import spread
-from stages.sfm.process import environment
+from stages.sfm.worker_process import environment
 
 if TYPE_CHECKING:
     from stages.io.photos import Photo
