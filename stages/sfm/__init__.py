@@ -8,14 +8,14 @@ from pydantic import Field
 from stages.contract import Inputs, OptionalSourcePath, Progress, StageConfig, StageResult
 from stages.io.files import write_json
 
-NEEDS = ("ingest",)
+INPUTS = ("ingest",)
 VERSION = 15
 RESUMES = True
-LINKS = ("sparse", "registration.json")
+PUBLISHED = ("sparse", "registration.json")
 # Both may decide that a retry strategy is skipped, which is said, in the stage's line as well. A run with another limit
 # is to resume from the matches that one before it kept, so its key has to be the same. The quality of feature
 # extraction, which ``seconds`` decides as well, enters the key by options of its own.
-UNKEYED = ("max_seconds", "seconds")
+NOT_HASHED = ("max_seconds", "seconds")
 
 CameraModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE"]
 Matcher = Literal["exhaustive", "sequential", "spatial", "retrieval"]

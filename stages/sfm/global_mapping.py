@@ -22,7 +22,7 @@ from stages.sfm.worker_process import environment
 
 TRACKS_PER_PHOTO = 200  # of the best: enough for poses that are compared, not kept
 MIN_PHOTOS = 10  # of fewer there is no telling which of two models is right
-CHILD = ["-P", "-m", "stages.sfm.global_mapping"]
+COMMAND = ["-P", "-m", "stages.sfm.global_mapping"]
 
 
 class Started(NamedTuple):
@@ -40,7 +40,7 @@ def start(database: Path, thinned: Path, images: Path, folder: Path, seed: int, 
     shutil.rmtree(folder, ignore_errors=True)
     paths = {"database": database, "thinned": thinned, "images": images, "folder": folder}
     job = {name: str(path) for name, path in paths.items()} | {"seed": seed}
-    process = subprocess.Popen([sys.executable, *CHILD], stdin=subprocess.PIPE, stdout=2, env=environment())
+    process = subprocess.Popen([sys.executable, *COMMAND], stdin=subprocess.PIPE, stdout=2, env=environment())
     assert process.stdin
     process.stdin.write(json.dumps(job | {"camera_is_known": camera_is_known}).encode() + b"\n")
     process.stdin.flush()  # and left open: its end tells the process that this one is gone

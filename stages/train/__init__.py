@@ -16,11 +16,11 @@ if TYPE_CHECKING:
     from nerf.geometry.scene import Scene
     from stages.train.loop import TrainingRun
 
-NEEDS = ("ingest", "normalise", "effects")
+INPUTS = ("ingest", "normalise", "effects")
 VERSION = 23
 RESUMES = True
-LINKS = ("curve.json",)
-UNKEYED = ("checkpoint_seconds", "tensorboard")
+PUBLISHED = ("curve.json",)
+NOT_HASHED = ("checkpoint_seconds", "tensorboard")
 
 # Of training, where neither seconds nor steps are given.
 SECONDS = {"draft": 30.0, "standard": 180.0, "high": 900.0, "paper": 3600.0}

@@ -1,0 +1,199 @@
+"""COLMAP's synthetic matches and models, with known poses: check, repair, thinned matches, global mapping."""
+
+import sqlite3
+from contextlib import closing
+from itertools import combinations
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+from stages.io.photos import Photo
+from stages.sfm import global_mapping
+from stages.sfm.colmap.diagnosis import compare_models
+from stages.sfm.colmap.mapping import incremental_options, map_incrementally
+from stages.sfm.colmap.repair import check_model, copy_consistent_matches, deregister, facts, reasons, register_again
+from stages.sfm.colmap.thinning import thin_matches
+from stages.sfm.matching import consecutive_pairs
+from stages.sfm.retry_strategies import MappingOptions
+
+PHOTOS = 16
+
+
+class Made(NamedTuple):
+    database: Path
+    model: Any
+
+
+@pytest.fixture
+def made(tmp_path: Path) -> Made:
+    """Photos around 400 points, all matched with each other, half a pixel of noise; a model with the true poses."""
+    return make(tmp_path)
+
+
+def make(folder: Path, points: int = 400) -> Made:
+    import pycolmap
+
+    pycolmap.set_random_seed(0)
+    options = pycolmap.SyntheticDatasetOptions(
+        num_rigs=1, num_frames_per_rig=PHOTOS, num_points3D=points, num_points2D_without_point3D=20
+    )
+    database = folder / "made.db"
+    with pycolmap.Database.open(database) as db:
+        model = pycolmap.synthesize_dataset(options, db)
+        pycolmap.synthesize_noise(pycolmap.SyntheticNoiseOptions(point2D_stddev=0.5), model, db)
+    return Made(database, model)
+
+
+def turn(model: Any, image_id: int, degrees: float) -> None:
+    """Turn a registered photo where it stands."""
+    import pycolmap
+
+    image = model.image(image_id)
+    turned = pycolmap.Rigid3d(pycolmap.Rotation3d(np.radians([0.0, degrees, 0.0])), np.zeros(3))
+    frame = model.frame(image.frame_id)
+    frame.rig_from_world = turned * frame.rig_from_world
+
+
+def test_true_poses_pass(made: Made) -> None:
+    checked = check_model(made.model, made.database, 0)
+    assert checked.check.passed.all() and not checked.failed() and not reasons(made.model, checked)
+    said = facts(made.model, checked)
+    assert said["doubtful"] == [] and said["pairs"] == said["agreeing"] == PHOTOS * (PHOTOS - 1) / 2
+    assert 0.3 < said["error_px"] < 1.5
+    assert {image["agreement"] for image in said["images"].values()} == {1.0}
+
+
+def test_a_turned_photo_is_named_and_registered_again(made: Made, tmp_path: Path) -> None:
+    wrong = turned_alone(made, 5)
+    checked = check_model(wrong, made.database, 0)
+    assert checked.failed() == [5]
+    assert list(reasons(wrong, checked)) == [wrong.image(5).name]
+    options = incremental_options(0, MappingOptions(), camera_is_known=False, thinned=False)
+    again = register_again(wrong, checked, made.database, tmp_path, tmp_path / "again", options)
+    assert again.num_reg_images() == PHOTOS
+    assert check_model(again, made.database, 0).check.passed.all()
+    compared = compare_models(made.model, again)
+    assert compared["agree"] == PHOTOS and compared["degrees"] < 0.2
+    assert not (tmp_path / "again").exists()
+
+
+def test_a_photo_whose_matches_are_all_wrong_is_excluded_with_a_reason(made: Made) -> None:
+    """Ten in a hundred photos with injected matches: here photo 5 has keypoints of others' points."""
+    import pycolmap
+
+    random = np.random.default_rng(0)
+    with pycolmap.Database.open(made.database) as db, pycolmap.DatabaseTransaction(db):
+        for pair_id, geometry in zip(*db.read_two_view_geometries(), strict=True):
+            pair = pycolmap.pair_id_to_image_pair(pair_id)
+            if 5 in pair:
+                matches = np.array(geometry.inlier_matches)
+                matches[:, 1] = random.permutation(matches[:, 1])
+                geometry.inlier_matches = matches
+                db.delete_two_view_geometry(*pair)
+                db.write_two_view_geometry(*pair, geometry)
+    checked = check_model(made.model, made.database, 0)
+    assert checked.failed() == [5]
+    (reason,) = reasons(made.model, checked).values()
+    assert "contradicted" in reason
+    deregister(made.model, checked.failed())
+    assert made.model.num_reg_images() == PHOTOS - 1
+    assert check_model(made.model, made.database, 0).check.passed.all()
+
+
+def test_mapping_of_thinned_matches_finds_the_same_cameras(tmp_path: Path) -> None:
+    import pycolmap
+
+    made = make(tmp_path, points=1000)
+    thinned = tmp_path / "thinned.db"
+    thin_matches(made.database, thinned, tracks=30)
+    with pycolmap.Database.open(made.database) as db, pycolmap.Database.open(thinned) as few:
+        before, after = db.num_inlier_matches(), few.num_inlier_matches()
+        (guess,), (calibrated,) = db.read_all_cameras(), few.read_all_cameras()
+    assert 0 < after < 0.6 * before
+    assert calibrated.has_prior_focal_length and not guess.has_prior_focal_length
+    assert abs(calibrated.mean_focal_length() / 1280 - 1) < 0.1
+    options = incremental_options(0, MappingOptions(), camera_is_known=False, thinned=True)
+    (model,) = map_incrementally(thinned, tmp_path, tmp_path / "models", options)
+    compared = compare_models(made.model, model)
+    assert compared["agree"] == PHOTOS and 0 < compared["centre"] < 0.01
+    assert check_model(model, made.database, 0).check.passed.all()
+
+
+def test_matches_consistent_with_trusted_pairs_are_kept(made: Made, tmp_path: Path) -> None:
+    wrong = turned_alone(made, 5)
+    photos = [Photo(f"{i:02}.jpg", f"images/{i:02}.jpg", 8, 8, 0, None, None, False, 1.0) for i in range(PHOTOS)]
+    state: Any = SimpleNamespace(database=made.database, photos=photos)
+    steps = consecutive_pairs(state)
+    assert steps == {(i, i + 1) for i in range(1, PHOTOS)}
+    copy = tmp_path / "consecutive.db"
+    copy_consistent_matches(wrong, made.database, copy, {step for step in steps if 5 not in step} | {(4, 6)})
+    assert verified_pairs(copy) == {pair for pair in combinations(range(1, PHOTOS + 1), 2) if 5 not in pair}
+    copy_consistent_matches(wrong, made.database, copy, steps)  # trusted matches stay unless they are clearly off
+    assert verified_pairs(copy) & {(4, 5), (5, 6)} == set()
+
+
+def turned_alone(made: Made, image_id: int) -> Any:
+    """The true model but for one photo that is turned."""
+    import pycolmap
+
+    wrong = pycolmap.Reconstruction(made.model)
+    turn(wrong, image_id, degrees=3.0)
+    return wrong
+
+
+def verified_pairs(database: Path) -> set[tuple[int, int]]:
+    import pycolmap
+
+    with pycolmap.Database.open(database) as db:
+        ids, _ = db.read_two_view_geometries()
+    return {pycolmap.pair_id_to_image_pair(pair_id) for pair_id in ids}
+
+
+def test_the_log_of_a_copy_whose_process_was_killed_is_not_taken_for_the_next_ones(made: Made, tmp_path: Path) -> None:
+    copy, log = tmp_path / "thinned.db", tmp_path / "thinned.db-wal"
+    thin_matches(made.database, copy)
+    with closing(sqlite3.connect(copy)) as killed:
+        killed.execute("pragma journal_mode=wal")
+        killed.execute("create table left_behind as select * from matches")
+        killed.commit()
+        left = log.read_bytes()
+    log.write_bytes(left)
+    thin_matches(made.database, copy)
+    with closing(sqlite3.connect(copy)) as database:
+        assert database.execute("pragma integrity_check").fetchall() == [("ok",)]
+        assert not database.execute("select name from sqlite_master where name = 'left_behind'").fetchall()
+
+
+def test_global_mapping_runs_beside_and_agrees(made: Made, tmp_path: Path) -> None:
+    import pycolmap
+
+    started = global_mapping.start(
+        made.database, tmp_path / "thinned.db", tmp_path, tmp_path / "global", 0, camera_is_known=False
+    )
+    assert global_mapping.failure(started) is None
+    compared = compare_models(made.model, pycolmap.Reconstruction(tmp_path / "global"))
+    assert compared["agree"] == PHOTOS and compared["centre"] < 0.02 and compared["different"] == []
+
+
+def test_what_global_mapping_dies_of_is_told(tmp_path: Path) -> None:
+    damaged = tmp_path / "damaged.db"
+    damaged.write_bytes(b"no database" * 100)
+    started = global_mapping.start(
+        damaged, tmp_path / "thinned.db", tmp_path, tmp_path / "global", 0, camera_is_known=False
+    )
+    assert "code" in (global_mapping.failure(started) or "")
+
+
+def test_models_that_disagree_name_images_with_different_poses(made: Made) -> None:
+    import pycolmap
+
+    other = pycolmap.Reconstruction(made.model)
+    for image_id in (3, 9):
+        turn(other, image_id, degrees=40.0)
+    names = [made.model.image(i).name for i in (3, 9)]
+    compared = compare_models(made.model, other)
+    assert (compared["photos"], compared["agree"]) == (PHOTOS, PHOTOS - 2)
+    assert sorted(compared["different"]) == sorted(names)

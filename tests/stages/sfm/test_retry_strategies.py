@@ -1,0 +1,149 @@
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from stages.sfm.retry_strategies import (
+    STRATEGIES,
+    Outcome,
+    Situation,
+    StrategyLog,
+    abandon,
+    exceeds_time,
+    expected_seconds,
+    reason_against,
+)
+
+BY_NAME = {strategy.name: strategy for strategy in STRATEGIES}
+
+
+def test_the_list_begins_with_the_default_and_names_are_unique() -> None:
+    assert STRATEGIES[0].matches == "strict" and not STRATEGIES[0].description
+    assert len(BY_NAME) == len(STRATEGIES)
+    assert all(strategy.description for strategy in STRATEGIES[1:])
+
+
+def test_more_photos_beat_more_points_beat_less_error() -> None:
+    groups = [["a", "b", "c"], ["d"]]
+    ranked = [
+        Outcome("none", "x.db"),
+        Outcome("few", "x.db", [["a", "b"]], 900, 0.1),
+        Outcome("inexact", "x.db", groups, 500, 0.9),
+        Outcome("exact", "x.db", groups, 500, 0.3),
+        Outcome("more", "x.db", groups, 501, 2.0),
+    ]
+    ranks = [outcome.rank for outcome in ranked]
+    assert ranks == sorted(set(ranks))
+
+
+def test_the_log_is_read_back_and_knows_the_best(tmp_path: Path) -> None:
+    log = StrategyLog(tmp_path / "strategies")
+    assert log.best() is None and log.left() == STRATEGIES
+    one, other = Outcome("default", "x.db", [["a", "b"]], 50, 0.5), Outcome("other seed", "x.db", [["a", "b"]], 50, 0.5)
+    for outcome in (one, Outcome("weaker initial pair", "x.db"), other):
+        log.add(outcome)
+    again = StrategyLog(tmp_path / "strategies")
+    assert again.outcomes == log.outcomes and again.best() == one  # of equals the first
+    assert [strategy.name for strategy in again.left()] == ["global mapping", "more features"]
+    assert again.model("other seed") == tmp_path / "strategies" / "other-seed"
+
+
+def test_the_report_lists_tried_and_skipped_strategies(tmp_path: Path) -> None:
+    log = StrategyLog(tmp_path / "strategies")
+    log.add(Outcome("default", "x.db", [["a", "b"]], 50, 0.5))
+    log.skipped["fisheye"] = "the camera model is given"
+    log.add(Outcome("relaxed ratio test", "x.db", [["a", "b", "c"]], 60, 0.4))
+    log.skipped["weaker initial pair"] = "not noted: nothing was tried after it"
+    again = StrategyLog(tmp_path / "strategies")
+    assert again.skipped == {"fisheye": "the camera model is given"}
+    none = {"registered": None, "points": None, "reprojection_px": None}
+    assert again.report() == [
+        {"strategy": "default", "registered": 2, "points": 50, "reprojection_px": 0.5, "kept": False, "skipped": None},
+        {"strategy": "fisheye", **none, "kept": False, "skipped": "the camera model is given"},
+        {"strategy": "relaxed ratio test", "registered": 3, "points": 60, "reprojection_px": 0.4}
+        | {"kept": True, "skipped": None},
+    ]
+
+
+TIMED = [
+    Outcome("default", "x.db", seconds={"features": 10.0, "matching": 40.0, "mapping": 20.0}),
+    Outcome("other seed", "x.db", seconds={"mapping": 30.0}),
+]
+
+
+@pytest.mark.parametrize(
+    ("name", "chosen_pairs", "seconds"),
+    [
+        ("fisheye", False, 40 + 30),
+        ("relaxed ratio test", False, 0.75 * 40 + 30),  # of all pairs, three quarters have one of half of the photos
+        ("relaxed ratio test", True, 40 + 30),
+        ("weaker initial pair", False, 30),
+        ("global mapping", True, 30),
+        ("more features", False, 4 * (10 + 40) + 2 * 30),
+    ],
+)
+def test_earlier_strategies_predict_the_seconds_of_the_next(name: str, chosen_pairs: bool, seconds: float) -> None:
+    assert expected_seconds(BY_NAME[name], TIMED, 0.5, chosen_pairs) == pytest.approx(seconds)
+
+
+def test_a_strategy_must_leave_time_for_the_final_bundle_adjustment() -> None:
+    assert exceeds_time(50.0, TIMED, 50.0 + 2 * 30 - 1)
+    assert not exceeds_time(50.0, TIMED, 50.0 + 2 * 30 + 1)
+
+
+def test_strategies_that_ended_the_worker_are_remembered(tmp_path: Path) -> None:
+    for name in ("global mapping", "fisheye", "fisheye"):
+        abandon(tmp_path / "strategies", name, "ran out of time" if name == "fisheye" else "ended the program")
+    abandoned = StrategyLog(tmp_path / "strategies").abandoned
+    assert abandoned == {"global mapping": "ended the program", "fisheye": "ran out of time"}
+
+
+PLAIN = Situation(missing=5, alone=5, images=50, linked=True, planar=False, camera_model_is_given=False)
+TOO_LITTLE = "the missing photos share too few matches with the others"
+APART = "the missing photos form models of their own and share too few matches with the others"
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "why"),
+    [
+        ("relaxed ratio test", {"linked": False, "planar": True}, None),
+        ("weaker initial pair", {}, None),
+        ("weaker initial pair", {"linked": False, "missing": 40}, TOO_LITTLE),
+        ("weaker initial pair", {"missing": 4}, "4 of 50 photos missing is not worth starting over"),
+        ("other seed", {"missing": 9, "images": 300}, "9 of 300 photos missing is not worth starting over"),
+        ("global mapping", {"missing": 9, "images": 300}, "9 of 300 photos missing is not worth starting over"),
+        ("relaxed ratio test", {"missing": 9, "images": 300}, None),
+        ("other seed", {"missing": 1, "images": 8}, None),
+        ("weaker initial pair", {"planar": True}, "the photos tell nothing of depth"),
+        ("global mapping", {"linked": False}, TOO_LITTLE),
+        ("relaxed ratio test", {"missing": 150, "alone": 0, "images": 300, "linked": False}, None),
+        ("fisheye", {"missing": 150, "alone": 3, "images": 300, "linked": False}, APART),
+        ("more features", {"missing": 150, "alone": 3, "images": 300, "linked": False}, APART),
+        ("more features", {"missing": 150, "alone": 30, "images": 300, "linked": False}, None),
+        ("more features", {"missing": 150, "alone": 3, "images": 300}, None),
+        ("fisheye", {"missing": 40}, None),
+        ("fisheye", {"missing": 40, "camera_model_is_given": True}, "the camera model is given"),
+        ("fisheye", {"missing": 4}, "4 of 50 photos missing is not worth starting over"),
+        ("weaker initial pair", {"missing": 1, "images": 51}, "1 of 51 photos missing is not worth mapping again"),
+        ("relaxed ratio test", {"missing": 5, "images": 300}, "5 of 300 photos missing is not worth mapping again"),
+        ("relaxed ratio test", {"missing": 6, "images": 300}, None),
+        ("more features", {"linked": False, "camera_model_is_given": True}, None),
+        ("more features", {"missing": 4}, "4 of 50 photos missing is not worth starting over"),
+        ("more features", {"missing": 1, "images": 8}, "1 of 8 photos missing is not worth starting over"),
+        ("more features", {"missing": 2, "images": 8}, None),
+        ("more features", {"missing": 50, "planar": True}, "the photos tell nothing of depth"),
+        ("consecutive pairs", {"missing": 40, "sequence_broken": True}, None),
+        (
+            "consecutive pairs",
+            {"missing": 4, "sequence_broken": True},
+            "4 of 50 photos missing is not worth starting over",
+        ),
+        (
+            "fisheye",
+            {"missing": 40, "sequence_broken": True},
+            "the scene has repeated structure, which these do not mend",
+        ),
+    ],
+)
+def test_a_strategy_that_cannot_help_is_skipped(name: str, change: dict[str, Any], why: str | None) -> None:
+    assert reason_against(BY_NAME[name], PLAIN._replace(**change)) == why
