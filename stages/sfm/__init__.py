@@ -33,7 +33,7 @@ class Config(StageConfig):
         default=0,
         ge=0,
         lt=2**31,
-        description="Seed of matching and mapping (docs/numbers.md says how far runs repeat).",
+        description="Seed of matching and mapping (docs/experiments/camera_models.md says how far runs repeat).",
     )
     max_image_size: int | None = Field(
         default=None,

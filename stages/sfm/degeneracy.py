@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 # photos of 300 pixels, a tenth of it.
 MAX_ROTATION_DEPARTURE = 0.02
 # Between two models of the same photos poses differ by less than a degree and a hundredth of the scene where both are
-# right (docs/numbers.md); repeated structure moves a photo by a facade, or a window.
+# right (docs/experiments/match_graph.md); repeated structure moves a photo by a facade, or a window.
 MAX_ANGLE_DEG, MAX_OFFSET = 5.0, 0.05
 MAX_PROPOSALS = 500
 MAX_RADIAL_DEG, MIN_RADIAL_FRACTION = 15.0, 0.8

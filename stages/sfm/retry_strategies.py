@@ -17,7 +17,8 @@ from stages.io.files import write_durably
 MIN_MISSING_TO_START_OVER = 0.1  # of all; for features and fisheye two at least, since one may well be a stranger
 # Nor is mapping again, minutes of many images, worth a blurred one among them: the others show what it shows.
 MIN_MISSING_TO_RETRY = 0.02
-# Camera model selection and final bundle adjustment take 0.8 to 1.6 times as long as mapping (docs/numbers.md).
+# Camera model selection and final bundle adjustment take 0.8 to 1.6 times as long as mapping
+# (docs/experiments/camera_models.md).
 FINAL_ADJUSTMENT_FACTOR = 2.0
 NO_TIME, OUT_OF_TIME = "too little was left of", "ran out of time"
 MAX_SECONDS_LIMIT, TIME_GIVEN = "--sfm.max-seconds", "the time it is given (--budget or --sfm.seconds)"

@@ -8,13 +8,13 @@ import torch
 from nerf.fields.density_grid import (
     Lattice,
     along,
-    density_lattice,
     first_crossing,
+    median_depth,
     occupancy,
     optical_depth,
     ray_distances,
+    sample_density_grid,
     smoothed,
-    stopping_distance,
     trilinear,
 )
 from nerf.geometry.rays import Rays, clip_to_box
@@ -51,7 +51,7 @@ def make_rays(origins, directions, near=0.0, far=10.0):
 
 
 def test_values_lie_at_the_vertices_and_the_corners_on_the_box():
-    lattice = density_lattice(Field(linear), 7, LOW, HIGH)
+    lattice = sample_density_grid(Field(linear), 7, LOW, HIGH)
     assert lattice.values.shape == (7, 7, 7)
     index = torch.tensor([[0, 0, 0], [6, 6, 6], [1, 4, 2]])
     points = LOW + index * lattice.spacing()
@@ -60,28 +60,28 @@ def test_values_lie_at_the_vertices_and_the_corners_on_the_box():
 
 
 def test_a_long_box_has_nearly_cubic_voxels():
-    lattice = density_lattice(Field(linear), 41, LOW, torch.tensor([0.9, 0.0, -0.75]))
+    lattice = sample_density_grid(Field(linear), 41, LOW, torch.tensor([0.9, 0.0, -0.75]))
     assert lattice.values.shape == (41, 21, 4)
     assert float(lattice.spacing().max() / lattice.spacing().min()) < 1.2
 
 
 def test_the_chunk_size_changes_nothing_and_progress_is_told():
     told = []
-    whole = density_lattice(Field(linear), 9, LOW, HIGH)
-    parts = density_lattice(Field(linear), 9, LOW, HIGH, chunk=100, on_chunk=told.append)
+    whole = sample_density_grid(Field(linear), 9, LOW, HIGH)
+    parts = sample_density_grid(Field(linear), 9, LOW, HIGH, chunk=100, on_chunk=told.append)
     assert torch.equal(whole.values, parts.values)
     assert len(told) == 8 and told == sorted(told) and told[-1] == 1.0
 
 
 def test_no_gradient_is_recorded():
     weight = torch.tensor(2.0, requires_grad=True)
-    assert not density_lattice(Field(lambda p: weight * p[..., 0]), 3, LOW, HIGH).values.requires_grad
+    assert not sample_density_grid(Field(lambda p: weight * p[..., 0]), 3, LOW, HIGH).values.requires_grad
 
 
 @pytest.mark.parametrize(("resolution", "high"), [(1, HIGH), (8, LOW), (8, torch.tensor([0.9, -0.9, 0.9]))])
 def test_boxes_and_resolutions_without_a_voxel_are_refused(resolution, high):
     with pytest.raises(ValueError, match="a lattice needs a box and two vertices per edge"):
-        density_lattice(Field(linear), resolution, LOW, high)
+        sample_density_grid(Field(linear), resolution, LOW, high)
 
 
 def test_interpolation_is_exact_for_trilinear_functions_and_zero_outside():
@@ -89,7 +89,7 @@ def test_interpolation_is_exact_for_trilinear_functions_and_zero_outside():
         return (1 + p[..., 0]) * (2 - p[..., 1]) * (3 + p[..., 2])
 
     box = torch.tensor([1.0, 1.0, 1.0])
-    lattice = density_lattice(Field(product), 5, -box, box)
+    lattice = sample_density_grid(Field(product), 5, -box, box)
     points = torch.rand(500, 3, generator=torch.Generator().manual_seed(0)) * 2 - 1
     torch.testing.assert_close(trilinear(lattice, points), product(points), atol=2e-5, rtol=1e-5)
     assert (trilinear(lattice, points + torch.tensor([5.0, 0, 0])) == 0).all()
@@ -119,11 +119,11 @@ def test_light_stops_half_a_transmittance_behind_the_wall(density, near):
     rays = make_rays([[-3.0, 0.1, 0.2]], [[1.0, 0, 0]], near=near)
     expected = max(near, 2.1) + math.log(2) / density
     expected = expected if expected < 3.9 else math.inf
-    assert float(stopping_distance(lattice, rays, 200)) == pytest.approx(expected, rel=1e-4)
+    assert float(median_depth(lattice, rays, 200)) == pytest.approx(expected, rel=1e-4)
 
 
 def test_what_rays_meet_is_what_lies_there():
-    lattice = density_lattice(Field(linear), 9, LOW, HIGH)
+    lattice = sample_density_grid(Field(linear), 9, LOW, HIGH)
     rays = clip_to_box(make_rays([[-2.0, 0.3, 0.1]], [[1.0, -0.1, 0.2]]), LOW, HIGH)
     t = ray_distances(rays, 12)
     points = rays.origins[:, None] + t[..., None] * rays.directions[:, None]

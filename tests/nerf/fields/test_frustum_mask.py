@@ -8,24 +8,26 @@ import pytest
 import torch
 
 from nerf.fields import frustum_mask as visibility
-from nerf.fields.frustum_mask import usable_cells
-from nerf.fields.hash_grid import GridField, GridSettings
+from nerf.fields.frustum_mask import compute_frustum_mask
+from nerf.fields.hash_grid import HashGridField, HashGridSettings
 from nerf.geometry.contraction import uncontract
 from nerf.geometry.near_far import NEAR_MARGIN
 from nerf.kernels import CONTRACTED_BOX
 from nerf.kernels import torch as reference
 from nerf.kernels.torch.marching import unit_coordinates
 from nerf.kernels.torch.occupancy import cell_corners, cell_numbers, grown, is_occupied
-from nerf.training.hash_grid_trainer import GridTrainer, GridTrainerSettings
-from nerf.training.ray_dataset import RayBank, build_ray_bank
+from nerf.training.hash_grid_trainer import HashGridTrainer, HashGridTrainerSettings
+from nerf.training.ray_dataset import RayDataset, build_ray_bank
 
 SIZE, HALF = 12, 0.5  # pixels of a photo, and half its width at a distance of one
 NEAR, FAR = 1.0, 40.0
-FIELD = GridSettings(levels=2, log2_rows=10, coarsest=4, finest=16, steps=32, cache_cells=16, contracted=True)
-TRAINER = GridTrainerSettings(seed=3, background=(0.0, 0.0, 0.0), samples=1024, least_photos=3)
+FIELD = HashGridSettings(
+    levels=2, log2_rows=10, coarsest=4, finest=16, steps=32, occupancy_resolution=16, contracted=True
+)
+TRAINER = HashGridTrainerSettings(seed=3, background=(0.0, 0.0, 0.0), samples=1024, least_photos=3)
 
 
-def bank(count: int = 4, half: float = HALF) -> RayBank:
+def bank(count: int = 4, half: float = HALF) -> RayDataset:
     """Photos from 2.5 units away, a fifth of the circle apart, that all look at the origin."""
     grid = 2 * half * ((torch.arange(SIZE) + 0.5) / SIZE - 0.5)
     y, x = torch.meshgrid(grid, grid, indexing="ij")
@@ -41,7 +43,7 @@ def bank(count: int = 4, half: float = HALF) -> RayBank:
     return build_ray_bank([photo] * count, [0] * count, [bearings], torch.stack(poses), near, far)
 
 
-def knowing(views: RayBank) -> RayBank:
+def knowing(views: RayDataset) -> RayDataset:
     """With a sparse point: the rule holds where some are known."""
     return views.with_distances(torch.tensor([5]), torch.tensor([2.5]))
 
@@ -52,7 +54,7 @@ def middles(cells: int) -> torch.Tensor:
     return uncontract(2 * CONTRACTED_BOX * (unit - 0.5))
 
 
-def projected(views: RayBank, points: torch.Tensor, near: float, half: float) -> torch.Tensor:
+def projected(views: RayDataset, points: torch.Tensor, near: float, half: float) -> torch.Tensor:
     """How many photos have the points in their picture, between ``near`` and far."""
     photos = torch.zeros(len(points), dtype=torch.int32)
     for geometry in views.geometry.T:
@@ -67,7 +69,7 @@ def projected(views: RayBank, points: torch.Tensor, near: float, half: float) ->
 @pytest.mark.parametrize("least", [1, 2, 3, 4])
 def test_a_cell_is_usable_where_enough_photos_look_or_one_from_its_foreground_on(half: float, least: int) -> None:
     views = bank(half=half)
-    usable, points = usable_cells(views, least, 64), middles(64)
+    usable, points = compute_frustum_mask(views, least, 64), middles(64)
     photos = projected(views, points, NEAR, half)
     wanted = (photos >= least) | (projected(views, points, NEAR / NEAR_MARGIN, half) > 0)
     assert usable[wanted].all(), "none is overlooked, however wide the lens"
@@ -87,7 +89,7 @@ def test_photos_that_look_together_find_what_each_finds_after_the_other(monkeypa
         for count, together in ((1, 1), (2, 2), (2, 16)):
             torch.set_num_threads(count)
             monkeypatch.setattr(visibility, "TOGETHER", together)
-            found.append(usable_cells(bank(5, 0.15), 3, 64))
+            found.append(compute_frustum_mask(bank(5, 0.15), 3, 64))
     finally:
         torch.set_num_threads(threads)
     assert 0 < found[0].float().mean() < 1
@@ -104,27 +106,27 @@ def test_all_trainers_of_a_bank_ask_once(monkeypatch: pytest.MonkeyPatch) -> Non
     own = visibility._looked_at
     monkeypatch.setattr(visibility, "_looked_at", looked_at)
     views = knowing(bank())
-    fields = [GridField(FIELD, seed, reference) for seed in (0, 1)]
+    fields = [HashGridField(FIELD, seed, reference) for seed in (0, 1)]
     for field in fields:
-        GridTrainer(field, views, TRAINER)
+        HashGridTrainer(field, views, TRAINER)
     assert asked == [0, 1, 2, 3] and torch.equal(fields[0].bits, fields[1].bits)
-    usable_cells(bank(), 3, 16)
-    usable_cells(views, 2, 16)
+    compute_frustum_mask(bank(), 3, 16)
+    compute_frustum_mask(views, 2, 16)
     assert len(asked) == 12, "another bank, and another question"
 
 
 def test_what_one_photo_sees_alone_before_its_foreground_is_left_empty() -> None:
     along = torch.tensor([[2.5 - t, 0.0, 0.0] for t in (-3.0, 0.4, 1.2, 1.7, 2.5, 20.0)])
-    usable = usable_cells(bank(2), 2, 64)
+    usable = compute_frustum_mask(bank(2), 2, 64)
     numbers = cell_numbers(64, unit_coordinates(along, True)).long()
     assert usable[numbers].tolist() == [False, False, False, True, True, True]
 
 
 def test_nothing_is_ever_sampled_elsewhere_nor_found_there() -> None:
-    field = GridField(FIELD, 0, reference)
+    field = HashGridField(FIELD, 0, reference)
     views = knowing(bank(4, 0.15))
-    trainer = GridTrainer(field, views, TRAINER)
-    usable = usable_cells(views, 3, 16)
+    trainer = HashGridTrainer(field, views, TRAINER)
+    usable = compute_frustum_mask(views, 3, 16)
     assert 0.02 < usable.float().mean() < 0.98
     numbers = torch.arange(16**3, dtype=torch.int32)
     for step in range(40):
@@ -140,7 +142,7 @@ def test_nothing_is_ever_sampled_elsewhere_nor_found_there() -> None:
     [(knowing(bank(2)), True, 3), (bank(), True, 3), (knowing(bank()), False, 3), (knowing(bank()), True, 1)],
     ids=["two photos", "no points", "a box", "one is enough"],
 )
-def test_where_the_rule_says_nothing_all_of_space_is_used(views: RayBank, contracted: bool, least: int) -> None:
-    field = GridField(replace(FIELD, contracted=contracted), 0, reference)
-    GridTrainer(field, views, replace(TRAINER, least_photos=least))
+def test_where_the_rule_says_nothing_all_of_space_is_used(views: RayDataset, contracted: bool, least: int) -> None:
+    field = HashGridField(replace(FIELD, contracted=contracted), 0, reference)
+    HashGridTrainer(field, views, replace(TRAINER, least_photos=least))
     assert (field.bits == -1).all()

@@ -7,24 +7,24 @@ from torch import Tensor
 
 from nerf.fields import background as sky
 from nerf.fields import mlp as grid_mlp
-from nerf.fields.hash_grid import THIN, GridField, GridSettings
+from nerf.fields.hash_grid import THIN, HashGridField, HashGridSettings
 from nerf.fields.interface import RadianceModel, Rendering
 from nerf.geometry.rays import Rays
 from nerf.kernels import Backend, GridLayout, Lattice, Samples, warp
 from nerf.kernels import torch as reference
 from nerf.kernels.torch.occupancy import occupied
-from nerf.rendering.early_termination import HIDDEN_BEHIND
+from nerf.rendering.early_termination import EARLY_STOP_TRANSMITTANCE
 
-SMALL = GridSettings(levels=2, log2_rows=9, coarsest=3, finest=9, steps=24, cache_cells=8)
+SMALL = HashGridSettings(levels=2, log2_rows=9, coarsest=3, finest=9, steps=24, occupancy_resolution=8)
 FOLDED = replace(SMALL, contracted=True, shortest_step=0.1, cone=0.2)
 OUTDOORS = replace(FOLDED, sky=True)
 DIFFUSE = replace(SMALL, view_dependence=False)
 BACKENDS = pytest.mark.parametrize("backend", [reference, warp], ids=["reference", "warp"])
 
 
-def field(settings: GridSettings = SMALL, seed: int = 1) -> GridField:
+def field(settings: HashGridSettings = SMALL, seed: int = 1) -> HashGridField:
     """A field in float64 whose features are large enough to matter."""
-    model = GridField(settings, seed, reference).double()
+    model = HashGridField(settings, seed, reference).double()
     model.table.mul_(2e4)
     if settings.sky:
         model.sky.normal_(generator=torch.Generator().manual_seed(5))
@@ -41,7 +41,7 @@ def rays(count: int = 6) -> Rays:
     return Rays(origins, towards / towards.norm(dim=-1, keepdim=True), *ends)
 
 
-def seen_by_autograd(model: GridField, given: Rays, jitter: Tensor, background: Tensor) -> Tensor:
+def seen_by_autograd(model: HashGridField, given: Rays, jitter: Tensor, background: Tensor) -> Tensor:
     """The loss sum(colour * k) + sum(depth) written with plain torch, differentiable in parameters and rays."""
     settings = model.settings
     samples = reference.march(occupied(model.bits), model.lattice, given.each(lambda part: part.detach()), jitter)
@@ -81,7 +81,7 @@ def encoded_by_autograd(layout: GridLayout, table: Tensor, points: Tensor) -> Te
 
 
 @pytest.mark.parametrize("settings", [SMALL, FOLDED, OUTDOORS, DIFFUSE])
-def test_all_gradients_are_those_of_autograd(settings: GridSettings, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_all_gradients_are_those_of_autograd(settings: HashGridSettings, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("nerf.fields.hash_grid.THIN", 0.0)
     monkeypatch.setattr(grid_mlp, "BLOCK", {"cpu": 7})  # so that there are several, the last one short
     model, given = field(settings), rays()
@@ -97,7 +97,7 @@ def test_all_gradients_are_those_of_autograd(settings: GridSettings, monkeypatch
         reference.encode_backward_table(model.layout, level, done.points, gradients.features, grad_table)
     of_rays = model.rays_backward(done, gradients)
 
-    of_sky = [model.sky_backward(done, gradients)] if settings.sky else []
+    of_sky = [model.background_backward(done, gradients)] if settings.sky else []
 
     skies = [model.sky] if settings.sky else []
     parameters = [model.table, *model.weights, *skies, given.origins, given.directions]
@@ -128,7 +128,7 @@ def test_it_is_a_radiance_model_of_the_scene_frame() -> None:
     again, colour = model.density_and_colour(points, towards.expand_as(points))
     torch.testing.assert_close(again, density)
     assert colour.shape == points.shape and ((colour > 0) & (colour < 1)).all()
-    compiled = GridField(SMALL, 0, warp)
+    compiled = HashGridField(SMALL, 0, warp)
     assert compiled.density_and_colour(points.float(), towards.float().expand_as(points))[1].shape == points.shape
     assert (field(FOLDED).density(1e6 * points) > 0).all()
 
@@ -170,7 +170,7 @@ def test_closed_cells_are_not_seen() -> None:
 
 @pytest.mark.parametrize("settings", [SMALL, FOLDED])
 def test_the_density_beside_a_colour_is_the_density_zero_in_closed_cells_and_beyond_the_box(
-    settings: GridSettings,
+    settings: HashGridSettings,
 ) -> None:
     model = field(settings)
     model.bits[::2] = 0
@@ -186,33 +186,33 @@ def test_what_nothing_stops_ends_in_the_sky_whatever_the_background() -> None:
     model.occupy(torch.zeros_like(model.bits))
     seen = [model.render(given, torch.full((3,), shade, dtype=torch.float64)).colour for shade in (0.0, 1.0)]
     assert torch.equal(*seen) and seen[0].std(0).min() > 0.01
-    torch.testing.assert_close(seen[0], sky.sky_colour(reference, model.sky, given.directions))
+    torch.testing.assert_close(seen[0], sky.background_colour(reference, model.sky, given.directions))
     there_too = Rays(1000 + given.origins, *given[1:])
     assert torch.equal(model.render(there_too, torch.zeros(3, dtype=torch.float64)).colour, seen[0])
 
 
 def test_a_new_sky_is_grey_all_around() -> None:
-    model = GridField(OUTDOORS, 1, reference)
-    assert (sky.sky_colour(reference, model.sky, torch.nn.functional.normalize(torch.randn(99, 3))) == 0.5).all()
+    model = HashGridField(OUTDOORS, 1, reference)
+    assert (sky.background_colour(reference, model.sky, torch.nn.functional.normalize(torch.randn(99, 3))) == 0.5).all()
 
 
 @BACKENDS
 def test_a_new_sky_is_a_grey_background_bit_for_bit(backend: Backend) -> None:
-    with_sky, without = GridField(OUTDOORS, 1, backend), GridField(FOLDED, 1, backend)
+    with_sky, without = HashGridField(OUTDOORS, 1, backend), HashGridField(FOLDED, 1, backend)
     assert_same_field(with_sky, without)
     assert with_sky.state_dict().keys() - without.state_dict().keys() == {"sky"}
 
 
 @BACKENDS
 def test_view_dependence_without_weight_is_a_diffuse_field_bit_for_bit(backend: Backend) -> None:
-    dependent, diffuse = GridField(SMALL, 1, backend), GridField(DIFFUSE, 1, backend)
+    dependent, diffuse = HashGridField(SMALL, 1, backend), HashGridField(DIFFUSE, 1, backend)
     dependent.colour_hidden[grid_mlp.GEOMETRY :] = 0
     weights = dependent.state_dict()
     diffuse.load_state_dict(weights | {"colour_hidden": weights["colour_hidden"][: grid_mlp.GEOMETRY]})
     assert_same_field(dependent, diffuse)
 
 
-def assert_same_field(one: GridField, other: GridField) -> None:
+def assert_same_field(one: HashGridField, other: HashGridField) -> None:
     """What two fields let rays see before grey, drawn and in training, and what both have of gradients."""
     given, grey = rays(40).each(lambda part: part.float()), torch.full((3,), 0.5)
     for model in (one, other):
@@ -230,7 +230,7 @@ def assert_same_field(one: GridField, other: GridField) -> None:
 
 
 def test_parameters_depend_on_the_seed_alone() -> None:
-    one, same, other = (GridField(SMALL, seed, reference).state_dict() for seed in (1, 1, 2))
+    one, same, other = (HashGridField(SMALL, seed, reference).state_dict() for seed in (1, 1, 2))
     assert all(torch.equal(one[name], same[name]) for name in one)
     assert not torch.equal(one["table"], other["table"])
     assert set(one) == {"table", "bits", "clearance", "density_hidden", "density_out", "colour_hidden", "colour_out"}
@@ -242,7 +242,7 @@ def test_parameters_depend_on_the_seed_alone() -> None:
     [
         ({"levels": 0}, "levels is 0; it must be at least 1"),
         ({"coarsest": 10}, "finest is 9; it must be at least 10"),
-        ({"cache_cells": 10}, "cache_cells is 10; it must be a multiple of 4"),
+        ({"occupancy_resolution": 10}, "occupancy_resolution is 10; it must be a multiple of 4"),
         ({"cone": 0.0}, r"shortest_step \(0.002\) and cone \(0.0\) must be positive"),
     ],
 )
@@ -251,7 +251,7 @@ def test_impossible_sizes_are_refused(wrong: dict, message: str) -> None:
         replace(SMALL, **wrong)
 
 
-def in_waves(model: GridField, given: Rays, background: Tensor) -> tuple[Rendering, int]:
+def in_waves(model: HashGridField, given: Rays, background: Tensor) -> tuple[Rendering, int]:
     """The rendering, and of how many samples the density was asked for it."""
     asked, encode = [0], reference.encode
 
@@ -265,12 +265,12 @@ def in_waves(model: GridField, given: Rays, background: Tensor) -> tuple[Renderi
 
 
 def in_one_pass(
-    model: GridField, lattice: Lattice, given: Rays, jitter: Tensor, background: Tensor, thin: float = 0.0
+    model: HashGridField, lattice: Lattice, given: Rays, jitter: Tensor, background: Tensor, thin: float = 0.0
 ) -> tuple[int, Samples, Rendering]:
     """How many samples of a lattice stand in occupied cells, those that can be seen, and what rays see; no waves."""
     samples = reference.march(occupied(model.bits), lattice, given, jitter)
     density = model._density_pass(reference.sample_points(given, samples, model.settings.contracted))
-    front, seen = reference.visible_samples(samples, density.sigma, HIDDEN_BEHIND, thin, jitter)
+    front, seen = reference.visible_samples(samples, density.sigma, EARLY_STOP_TRANSMITTANCE, thin, jitter)
     of_rays = grid_mlp.ray_hidden(model.weights, reference.spherical_harmonics(given.directions))
     colour = grid_mlp.colour_forward(model.weights, reference, front, density.geometry[seen], of_rays).colour
     behind = background.repeat(len(jitter), 1)
@@ -286,7 +286,7 @@ def in_short_waves(monkeypatch: pytest.MonkeyPatch, whole: int, shortest: int, l
 @pytest.mark.parametrize("settings", [SMALL, FOLDED])
 @pytest.mark.parametrize("lengths", [(1, 1, 1), (60, 2, 5), (1 << 15, 8, 64)])
 def test_waves_through_thin_fog_see_what_a_single_pass_sees(
-    settings: GridSettings, lengths: tuple[int, int, int], monkeypatch: pytest.MonkeyPatch
+    settings: HashGridSettings, lengths: tuple[int, int, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     in_short_waves(monkeypatch, *lengths)
     model, given, background = field(settings), rays(40), torch.tensor([0.2, 0.4, 0.6], dtype=torch.float64)
@@ -299,20 +299,22 @@ def test_waves_through_thin_fog_see_what_a_single_pass_sees(
 
 
 @pytest.mark.parametrize("settings", [SMALL, FOLDED])
-def test_waves_end_soon_behind_what_stops_the_light(settings: GridSettings, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_waves_end_soon_behind_what_stops_the_light(
+    settings: HashGridSettings, monkeypatch: pytest.MonkeyPatch
+) -> None:
     in_short_waves(monkeypatch, 80, 2, 64)
     model, given, background = dense_field(settings), rays(40), torch.tensor([0.2, 0.4, 0.6], dtype=torch.float64)
     marched, front, whole = in_one_pass(model, model.drawn_lattice, given, torch.full_like(given.near, 0.5), background)
     waves, asked = in_waves(model, given, background)
     assert len(front.t) < asked < 0.7 * marched
     assert whole.opacity.min() > 0.99
-    left = HIDDEN_BEHIND * torch.tensor([1.0, 5.0, 1.0])  # of a ray's colour, depth and opacity
+    left = EARLY_STOP_TRANSMITTANCE * torch.tensor([1.0, 5.0, 1.0])  # of a ray's colour, depth and opacity
     for one, other, most in zip(waves, whole, left, strict=True):
         assert 0 < (one - other).abs().max() < most
 
 
 def test_what_is_empty_follows_from_what_is_occupied() -> None:
-    model = field(replace(SMALL, cache_cells=32))
+    model = field(replace(SMALL, occupancy_resolution=32))
     for cell in (5, 17):
         bits = torch.zeros_like(model.bits)
         bits[cell] = 1
@@ -323,9 +325,12 @@ def test_what_is_empty_follows_from_what_is_occupied() -> None:
 
 @pytest.mark.parametrize("settings", [SMALL, FOLDED])
 def test_waves_of_compiled_kernels_see_what_a_single_pass_of_them_sees(
-    settings: GridSettings, monkeypatch: pytest.MonkeyPatch
+    settings: HashGridSettings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    model, given = GridField(replace(settings, cache_cells=32), 0, warp), rays(300).each(lambda part: part.float())
+    model, given = (
+        HashGridField(replace(settings, occupancy_resolution=32), 0, warp),
+        rays(300).each(lambda part: part.float()),
+    )
     model.table.mul_(3e4)
     few = torch.randint(len(model.bits), (40,), generator=torch.Generator().manual_seed(5))
     model.occupy(torch.zeros_like(model.bits).index_fill_(0, few, -1))
@@ -342,7 +347,7 @@ def test_waves_of_compiled_kernels_see_what_a_single_pass_of_them_sees(
 @pytest.mark.parametrize("lengths", [(1, 1, 1), (80, 2, 64)])
 @pytest.mark.parametrize("dense", [False, True])
 def test_training_keeps_the_samples_of_a_single_pass_whatever_the_waves(
-    settings: GridSettings, lengths: tuple[int, int, int], dense: bool, monkeypatch: pytest.MonkeyPatch
+    settings: HashGridSettings, lengths: tuple[int, int, int], dense: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     in_short_waves(monkeypatch, *lengths)
     model, given = (dense_field if dense else field)(settings), rays(40)
@@ -359,7 +364,7 @@ def test_training_keeps_the_samples_of_a_single_pass_whatever_the_waves(
 
 @pytest.mark.parametrize("settings", [replace(SMALL, steps=500), replace(FOLDED, shortest_step=0.005, cone=0.01)])
 def test_thin_samples_that_stand_for_others_keep_picture_and_gradients(
-    settings: GridSettings, monkeypatch: pytest.MonkeyPatch
+    settings: HashGridSettings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """On average over the offsets, but for what second order in a thin sample's thickness makes of it."""
     model, given, draws = field(settings), rays(40), 64
@@ -392,7 +397,7 @@ def test_a_ray_ends_after_the_most_samples_it_may_have(monkeypatch: pytest.Monke
     assert done.marched == 7 * 40 and done.samples.starts.diff().max() <= 7
 
 
-def dense_field(settings: GridSettings) -> GridField:
+def dense_field(settings: HashGridSettings) -> HashGridField:
     model = field(settings)
     model.density_out[0] = model.density_out[0].abs() * 4
     return model

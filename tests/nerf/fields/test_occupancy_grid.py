@@ -4,8 +4,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerf.fields.hash_grid import GridField, GridSettings
-from nerf.fields.occupancy_grid import YOUNG_STEPS, DensityCache
+from nerf.fields.hash_grid import HashGridField, HashGridSettings
+from nerf.fields.occupancy_grid import YOUNG_STEPS, OccupancyGrid
 from nerf.kernels import torch as reference
 from nerf.kernels.torch.occupancy import BRICK_CELLS, cell_corners
 
@@ -13,15 +13,17 @@ CELLS = 16
 NUMBERS = torch.arange(CELLS**3)
 
 
-def cache_of_a_slope(axis: int, monkeypatch: pytest.MonkeyPatch) -> DensityCache:
+def cache_of_a_slope(axis: int, monkeypatch: pytest.MonkeyPatch) -> OccupancyGrid:
     """Of a field in which a step is as thick as its point is far along an axis, in cells."""
-    model = GridField(GridSettings(levels=1, log2_rows=6, coarsest=2, finest=2, cache_cells=CELLS), 0, reference)
+    model = HashGridField(
+        HashGridSettings(levels=1, log2_rows=6, coarsest=2, finest=2, occupancy_resolution=CELLS), 0, reference
+    )
 
     def slope(unit: Tensor) -> Tensor:
         return CELLS * unit[:, axis] / model.lattice.step
 
     monkeypatch.setattr(model, "unit_density", slope)
-    return DensityCache(model)
+    return OccupancyGrid(model)
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])

@@ -8,12 +8,12 @@ import pytest
 import torch
 
 from nerf.fields.interface import Rendering
-from nerf.fields.vanilla import BOX, SOFTPLUS_SHIFT, PaperNerf, PaperSettings
+from nerf.fields.vanilla import BOX, SOFTPLUS_SHIFT, VanillaNerf, VanillaSettings
 from nerf.geometry.rays import Rays
 from nerf.runtime.randomness import generator
 from tests.reference import paper_loop
 
-SMALL = PaperSettings(
+SMALL = VanillaSettings(
     depth=3, width=6, skip=0, position_frequencies=3, direction_frequencies=2, samples_coarse=4, samples_fine=5
 )
 VARIANTS = {
@@ -39,9 +39,9 @@ def rays_at(target_spread: float, count: int, dtype: torch.dtype = torch.float64
     return Rays(*(part.to(dtype) for part in (origins, directions, near, far)))
 
 
-def model_of(settings: PaperSettings, seed: int = 0) -> PaperNerf:
+def model_of(settings: VanillaSettings, seed: int = 0) -> VanillaNerf:
     """A float64 model with random biases as well, and a little denser than a fresh one, so that rays saturate."""
-    model = PaperNerf(settings, seed).double()
+    model = VanillaNerf(settings, seed).double()
     random = torch.Generator().manual_seed(seed)
     with torch.no_grad():
         for name, parameter in model.named_parameters():
@@ -52,16 +52,18 @@ def model_of(settings: PaperSettings, seed: int = 0) -> PaperNerf:
     return model
 
 
-def weights_of(model: PaperNerf) -> paper_loop.Weights:
+def weights_of(model: VanillaNerf) -> paper_loop.Weights:
     return {name: value.double().numpy() for name, value in model.state_dict().items()}
 
 
-def middle_jitter(settings: PaperSettings) -> tuple[np.ndarray, np.ndarray]:
+def middle_jitter(settings: VanillaSettings) -> tuple[np.ndarray, np.ndarray]:
     first = settings.samples_coarse if settings.hierarchical else settings.queries_per_ray
     return np.full(first, 0.5), np.full(settings.samples_fine, 0.5)
 
 
-def slow(weights: paper_loop.Weights, settings: PaperSettings, rays: Rays, jitters: list | None = None) -> list[tuple]:
+def slow(
+    weights: paper_loop.Weights, settings: VanillaSettings, rays: Rays, jitters: list | None = None
+) -> list[tuple]:
     """(coarse, fine) of every ray by the slow loop."""
     results = []
     for i in range(len(rays.near)):
@@ -113,14 +115,14 @@ def test_random_samples_agree_with_the_slow_loop() -> None:
 @pytest.mark.parametrize("contracted", [False, True])
 @pytest.mark.parametrize(
     "settings",
-    [PaperSettings(width=16), PaperSettings(depth=4, width=64, samples_coarse=32, samples_fine=32)],
+    [VanillaSettings(width=16), VanillaSettings(depth=4, width=64, samples_coarse=32, samples_fine=32)],
     ids=["narrow", "shallow"],
 )
 def test_float32_agrees_with_the_slow_loop_at_the_published_frequencies(
-    settings: PaperSettings, contracted: bool, seed: int
+    settings: VanillaSettings, contracted: bool, seed: int
 ) -> None:
     settings = dataclasses.replace(settings, contracted=contracted)
-    model, rays = PaperNerf(settings, seed), rays_at(0.8 + 0.1 * seed, 2, torch.float32)
+    model, rays = VanillaNerf(settings, seed), rays_at(0.8 + 0.1 * seed, 2, torch.float32)
     with torch.no_grad():
         renderings = model.render_training(rays, BACKGROUND.float(), None)
     assert renderings[1].colour.dtype == torch.float32
@@ -128,7 +130,7 @@ def test_float32_agrees_with_the_slow_loop_at_the_published_frequencies(
     assert 0 < difference(renderings, expected) < 1e-5
 
 
-def loss_gradients(model: PaperNerf, rays: Rays) -> dict[str, np.ndarray]:
+def loss_gradients(model: VanillaNerf, rays: Rays) -> dict[str, np.ndarray]:
     model.zero_grad()
     coarse, fine = model.render_training(rays, BACKGROUND.to(rays.near.dtype), None)
     loss = sum((r.colour**2).sum() + 0.1 * r.depth.sum() + r.opacity.sum() for r in (coarse, fine))
@@ -137,7 +139,7 @@ def loss_gradients(model: PaperNerf, rays: Rays) -> dict[str, np.ndarray]:
     return {name: p.grad.double().numpy() for name, p in model.named_parameters() if p.grad is not None}
 
 
-def complex_step_gradients(model: PaperNerf, settings: PaperSettings, rays: Rays) -> dict[str, np.ndarray]:
+def complex_step_gradients(model: VanillaNerf, settings: VanillaSettings, rays: Rays) -> dict[str, np.ndarray]:
     weights: Any = {name: value.astype(complex) for name, value in weights_of(model).items()}
     gradients = {name: np.zeros(value.shape) for name, value in weights.items()}
     for name, value in weights.items():
@@ -170,7 +172,7 @@ def test_gradients_of_every_weight_agree_with_the_slow_loop(variant: str, sizes:
 
 def test_published_sizes() -> None:
     """The published code has 595 844 weights; three layers of it also take the 3 identity terms gamma lacks here."""
-    sizes = {name: tuple(value.shape) for name, value in PaperNerf(PaperSettings(), 0).fine.named_parameters()}
+    sizes = {name: tuple(value.shape) for name, value in VanillaNerf(VanillaSettings(), 0).fine.named_parameters()}
     assert sizes["trunk.0.weight"] == (256, 60) and sizes["trunk.5.weight"] == (256, 316)
     assert all(sizes[f"trunk.{i}.weight"] == (256, 256) for i in (1, 2, 3, 4, 6, 7))
     assert sizes["colour_hidden.weight"] == (128, 280) and sizes["colour_head.weight"] == (3, 128)
@@ -178,11 +180,11 @@ def test_published_sizes() -> None:
 
 
 def test_queries_per_ray_are_the_published_ones() -> None:
-    assert PaperSettings().queries_per_ray == 64 + 192
+    assert VanillaSettings().queries_per_ray == 64 + 192
 
 
 def test_without_hierarchical_sampling_there_is_one_network_and_one_rendering() -> None:
-    model = PaperNerf(dataclasses.replace(SMALL, hierarchical=False), 0)
+    model = VanillaNerf(dataclasses.replace(SMALL, hierarchical=False), 0)
     assert not any(name.startswith("coarse") for name, _ in model.named_parameters())
     coarse, fine = model.render_training(rays_at(0.5, 3, torch.float32), torch.ones(3), None)
     assert coarse is fine
@@ -190,7 +192,7 @@ def test_without_hierarchical_sampling_there_is_one_network_and_one_rendering() 
 
 def test_without_view_dependence_colour_ignores_direction_and_has_no_weights_for_it() -> None:
     points, d = torch.rand(4, 3) - 0.5, torch.nn.functional.normalize(torch.randn(2, 4, 3), dim=-1)
-    seeing, blind = PaperNerf(SMALL, 0), PaperNerf(dataclasses.replace(SMALL, view_dependence=False), 0)
+    seeing, blind = VanillaNerf(SMALL, 0), VanillaNerf(dataclasses.replace(SMALL, view_dependence=False), 0)
     one, other = (seeing.density_and_colour(points, towards)[1] for towards in d)
     assert not torch.allclose(one, other)
     one, other = (blind.density_and_colour(points, towards)[1] for towards in d)
@@ -200,19 +202,19 @@ def test_without_view_dependence_colour_ignores_direction_and_has_no_weights_for
 
 def test_opposite_directions_along_an_axis_are_told_apart() -> None:
     up = torch.tensor([[0.0, 0.0, 1.0]])
-    model, point = PaperNerf(SMALL, 0), torch.zeros(1, 3)
+    model, point = VanillaNerf(SMALL, 0), torch.zeros(1, 3)
     one, other = (model.density_and_colour(point, towards)[1] for towards in (up, -up))
     assert not torch.allclose(one, other, atol=1e-4)
 
 
 def test_no_points_are_no_trouble() -> None:
-    model, none = PaperNerf(SMALL, 0), torch.zeros(0, 3)
+    model, none = VanillaNerf(SMALL, 0), torch.zeros(0, 3)
     assert model.density(none).shape == (0,)
     assert [each.shape for each in model.density_and_colour(none, none)] == [(0,), (0, 3)]
 
 
 def test_density_is_independent_of_direction_and_zero_outside_the_box() -> None:
-    model = PaperNerf(SMALL, 0)
+    model = VanillaNerf(SMALL, 0)
     points = torch.tensor([[0.3, -0.2, 0.1], [0.0, BOX + 1e-3, 0.0], [2.3, -0.2, 0.1], [1e30, 0.0, 0.0]])
     sigma = model.density(points)
     assert sigma[0] > 0 and sigma[1:].tolist() == [0, 0, 0]
@@ -220,7 +222,7 @@ def test_density_is_independent_of_direction_and_zero_outside_the_box() -> None:
 
 
 def test_a_contracted_field_fills_all_of_space() -> None:
-    model = PaperNerf(dataclasses.replace(SMALL, contracted=True, spacing="log"), 0)
+    model = VanillaNerf(dataclasses.replace(SMALL, contracted=True, spacing="log"), 0)
     sigma = model.density(torch.tensor([[0.3, 0.1, 0.1], [2.3, 0.1, 0.1], [1e4, 0.0, 0.0], [1e30, 0.0, 0.0]]))
     assert torch.isfinite(sigma).all() and (sigma > 0).all()
     assert sigma[0] != sigma[1]
@@ -228,15 +230,15 @@ def test_a_contracted_field_fills_all_of_space() -> None:
 
 @pytest.mark.parametrize("contracted", [False, True])
 def test_a_fresh_field_is_neither_empty_nor_opaque(contracted: bool) -> None:
-    settings = PaperSettings(depth=4, width=64, samples_coarse=16, samples_fine=16, contracted=contracted)
+    settings = VanillaSettings(depth=4, width=64, samples_coarse=16, samples_fine=16, contracted=contracted)
     for seed in range(3):
-        opacity = PaperNerf(settings, seed).render(rays_at(0.5, 64, torch.float32), torch.ones(3)).opacity
+        opacity = VanillaNerf(settings, seed).render(rays_at(0.5, 64, torch.float32), torch.ones(3)).opacity
         assert 0.05 < opacity.mean() < 0.95
 
 
 def test_weights_are_a_function_of_the_seed_alone() -> None:
     before = torch.get_rng_state()
-    first, again, other = (PaperNerf(SMALL, seed).state_dict() for seed in (1, 1, 2))
+    first, again, other = (VanillaNerf(SMALL, seed).state_dict() for seed in (1, 1, 2))
     assert torch.equal(torch.get_rng_state(), before)
     assert all(torch.equal(first[name], again[name]) for name in first)
     assert not torch.equal(first["fine.trunk.0.weight"], other["fine.trunk.0.weight"])
@@ -244,7 +246,7 @@ def test_weights_are_a_function_of_the_seed_alone() -> None:
 
 
 def test_rays_may_have_any_leading_shape() -> None:
-    model, rays = PaperNerf(SMALL, 0), rays_at(0.8, 6, torch.float32)
+    model, rays = VanillaNerf(SMALL, 0), rays_at(0.8, 6, torch.float32)
     grid = rays.each(lambda part: part.reshape(2, 3, *part.shape[1:]))
     torch.testing.assert_close(
         model.render(grid, torch.ones(3)).colour.reshape(6, 3), model.render(rays, torch.ones(3)).colour
@@ -252,7 +254,7 @@ def test_rays_may_have_any_leading_shape() -> None:
 
 
 def test_a_ray_that_misses_the_box_shows_the_background_at_far_and_has_no_gradient() -> None:
-    model = PaperNerf(SMALL, 0)
+    model = VanillaNerf(SMALL, 0)
     missing = Rays(torch.tensor([[5.0, 5.0, 0]]), torch.tensor([[0.0, 0, 1]]), torch.tensor([1.0]), torch.tensor([4.0]))
     coarse, fine = model.render_training(missing, torch.tensor([[0.1, 0.2, 0.3]]), generator("cpu", 0))
     for rendering in (coarse, fine):
@@ -265,7 +267,7 @@ def test_a_ray_that_misses_the_box_shows_the_background_at_far_and_has_no_gradie
 @pytest.mark.parametrize("activation", ["softplus", "relu"])
 @pytest.mark.parametrize("size", [-1e30, 1e30])
 def test_extreme_densities_are_finite_in_value_and_gradient(activation: Any, size: float) -> None:
-    model = PaperNerf(dataclasses.replace(SMALL, density_activation=activation), 0)
+    model = VanillaNerf(dataclasses.replace(SMALL, density_activation=activation), 0)
     for mlp in (model.coarse, model.fine):
         assert mlp is not None
         torch.nn.init.constant_(mlp.density_head.bias, size)
@@ -277,14 +279,14 @@ def test_extreme_densities_are_finite_in_value_and_gradient(activation: Any, siz
 
 @pytest.mark.parametrize("net", ["coarse", "fine"])
 def test_a_weight_that_is_not_a_number_is_not_hidden(net: str) -> None:
-    model = PaperNerf(SMALL, 0)
+    model = VanillaNerf(SMALL, 0)
     torch.nn.init.constant_(model.get_parameter(f"{net}.density_head.bias"), math.nan)
     assert model.render(rays_at(0.5, 4, torch.float32), torch.ones(3)).colour.isnan().all()
 
 
 def test_settings_survive_json() -> None:
     settings = dataclasses.replace(SMALL, contracted=True, spacing="log", density_activation="relu")
-    assert PaperSettings(**json.loads(json.dumps(dataclasses.asdict(settings)))) == settings
+    assert VanillaSettings(**json.loads(json.dumps(dataclasses.asdict(settings)))) == settings
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from nerf.geometry.near_far import LEAST_NEAR, range_between_views
+from nerf.geometry.near_far import LEAST_NEAR, near_and_far_between_views
 
 PHOTOS = np.array([[0.0, 0, -2.5], [0.5, 0, -2.5], [-0.5, 0, -2.5], [0, 0, 9.0]])
 NEAR, FAR = np.array([1.0, 1.1, 1.2, 0.1]), np.array([20.0, 30.0, 25.0, 90.0])
@@ -12,7 +12,7 @@ NEAR, FAR = np.array([1.0, 1.1, 1.2, 0.1]), np.array([20.0, 30.0, 25.0, 90.0])
 def ranges(centre: tuple[float, float, float], bounded: bool = False) -> tuple[float, float]:
     """Of one camera that looks along z."""
     pose = np.concatenate([np.eye(3), np.array(centre)[:, None]], axis=1)
-    near, far = range_between_views(pose[None], PHOTOS, NEAR, FAR, bounded)
+    near, far = near_and_far_between_views(pose[None], PHOTOS, NEAR, FAR, bounded)
     return float(near[0]), float(far[0])
 
 
@@ -33,7 +33,7 @@ def test_what_photos_have_before_them_is_nearer_from_further_ahead() -> None:
 def test_where_photos_see_nearer_than_usual_so_do_cameras_between_them() -> None:
     """As above the ground in a survey that is long beside its height."""
     pose = np.concatenate([np.eye(3), PHOTOS[0][:, None]], axis=1)[None]
-    near, _ = range_between_views(pose, PHOTOS, 0.01 * NEAR, FAR, bounded=False)
+    near, _ = near_and_far_between_views(pose, PHOTOS, 0.01 * NEAR, FAR, bounded=False)
     assert near[0] == pytest.approx(0.01 * NEAR[0])
 
 

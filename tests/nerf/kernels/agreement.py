@@ -97,7 +97,7 @@ def occupied_of(device: str, kind: str, cells: int) -> Occupied:
     thickness = uniform(device, 7, cells**3)
     if kind == "bricks":  # three bricks of ten, all of their cells
         return occupied(-(thickness.view(-1, 64)[:, 0] < 0.3).long())
-    return occupied(reference.occupied_bits(thickness, {"random": 0.5, "sparse": 0.97}[kind]))
+    return occupied(reference.occupancy_bits(thickness, {"random": 0.5, "sparse": 0.97}[kind]))
 
 
 def packed(device: str, counts: list[int], lengths: Tensor | None = None) -> Samples:

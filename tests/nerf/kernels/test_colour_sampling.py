@@ -31,7 +31,7 @@ def drawn_of(
     count = len(samples.starts) - 1
     depth = torch.zeros(count, dtype=torch.float64) if depth is None else depth.clone()
     shown = torch.zeros(count) if shown is None else shown.clone()
-    return backend.drawn_samples(samples, sigma, QUANTUM, depth, shown), depth, shown
+    return backend.select_colour_samples(samples, sigma, QUANTUM, depth, shown), depth, shown
 
 
 def cut(samples: Samples, sigma: Tensor, first: int) -> Iterator[tuple[Samples, Tensor]]:
@@ -95,13 +95,13 @@ def test_a_picture_is_off_by_a_quantum_at_most(backend: Backend, device: str) ->
     wanted, weights = reference.composite(samples, sigma, colour, torch.zeros(50, 3), far)
     drawn, depth, shown = drawn_of(backend, samples, sigma)
     seen = torch.zeros(50, 4)
-    backend.add_drawn(drawn, colour.index_select(0, drawn.rows), seen)
+    backend.accumulate_colours(drawn, colour.index_select(0, drawn.rows), seen)
     assert len(drawn.rows) < 0.6 * float((weights > 0).sum())
     assert float((seen[:, :3] - wanted.colour).abs().max()) < QUANTUM
     assert float((seen[:, 3] - wanted.depth).abs().max()) < QUANTUM * float(samples.t.max())
     assert ((-torch.expm1(-depth) - shown).abs() <= QUANTUM).all()
     again = seen.clone()
-    backend.add_drawn(drawn, colour.index_select(0, drawn.rows), again)
+    backend.accumulate_colours(drawn, colour.index_select(0, drawn.rows), again)
     torch.testing.assert_close(again, 2 * seen)
 
 
@@ -131,5 +131,5 @@ def test_no_rays_and_no_samples(backend: Backend, device: str, rays: int) -> Non
     drawn, depth, shown = drawn_of(backend, packed(device, [0] * rays), torch.zeros(0))
     assert len(drawn.rows) == 0 and drawn.samples.starts.tolist() == [0] * (rays + 1)
     seen = torch.ones(rays, 4)
-    backend.add_drawn(drawn, torch.zeros(0, 3), seen)
+    backend.accumulate_colours(drawn, torch.zeros(0, 3), seen)
     assert not depth.any() and not shown.any() and (seen == 1).all()

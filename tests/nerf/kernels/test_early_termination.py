@@ -9,7 +9,7 @@ from torch import Tensor
 
 from nerf.kernels import Backend, Lattice, Samples, warp
 from nerf.kernels import torch as reference
-from nerf.kernels.torch.marching import lattice_coordinate
+from nerf.kernels.torch.marching import t_to_s
 from tests.devices import DEVICES, skip_without
 
 BACKENDS = pytest.mark.parametrize("backend", [reference, warp], ids=["reference", "warp"])
@@ -43,7 +43,7 @@ def ended(
     """Depth and near after a wave that began with a depth of 0.5 on all rays."""
     count = len(samples.starts) - 1
     depth, near = torch.full((count,), 0.5, dtype=torch.float64), torch.full((count,), 0.2)
-    backend.end_wave(lattice, samples, sigma, threshold, jitters(count), torch.full((count,), 9.0), depth, near)
+    backend.finish_round(lattice, samples, sigma, threshold, jitters(count), torch.full((count,), 9.0), depth, near)
     return depth, near
 
 
@@ -67,7 +67,7 @@ def test_rays_with_light_go_on_behind_their_last_sample(backend: Backend, lattic
             assert near[ray] == 9
             continue
         assert near[ray] < 9
-        steps = lattice_coordinate(lattice, near[ray]) - lattice_coordinate(lattice, samples.t[mine][-1])
+        steps = t_to_s(lattice, near[ray]) - t_to_s(lattice, samples.t[mine][-1])
         assert float(steps) == pytest.approx(1 - float(jitters(len(COUNTS))[ray]), abs=1e-4)
     assert (near < 9).sum() == 3
 
@@ -77,7 +77,7 @@ def test_the_light_decides_as_it_does_for_visible_samples(backend: Backend) -> N
     """A ray goes on exactly if a sample behind its last one would be visible."""
     samples, sigma = wave_of((4,) * 200), random_numbers(800, 3)
     depth, near = torch.zeros(200, dtype=torch.float64), torch.zeros(200)
-    backend.end_wave(BOUNDED, samples, sigma, 0.8, jitters(200), torch.full((200,), 9.0), depth, near)
+    backend.finish_round(BOUNDED, samples, sigma, 0.8, jitters(200), torch.full((200,), 9.0), depth, near)
     more = wave_of((5,) * 200)
     longer = more._replace(dt=with_fifth(samples.dt))
     front, _ = backend.visible_samples(longer, with_fifth(sigma), 0.8, 0.0, jitters(200))
@@ -108,7 +108,7 @@ def test_extreme_densities(backend: Backend, sigma: float) -> None:
 @BACKENDS
 def test_waves_are_packed_ray_by_ray_in_their_order(backend: Backend) -> None:
     waves = [wave_of(COUNTS, 1), wave_of((0, 4, 0, 0, 2, 0, 0, 1), 2), wave_of((0, 1, 0, 0, 0, 0, 0, 0), 3)]
-    samples, order = backend.pack_waves(waves)
+    samples, order = backend.pack_rounds(waves)
     t = torch.cat([wave.t for wave in waves])
     before, wanted = 0, [list[int]() for _ in COUNTS]
     for wave in waves:
@@ -126,7 +126,7 @@ def test_waves_are_packed_ray_by_ray_in_their_order(backend: Backend) -> None:
 def test_one_wave_stays_as_it_is_and_none_of_its_rays_need_have_samples(backend: Backend) -> None:
     for counts in (COUNTS, (0, 0)):
         wave = wave_of(counts)
-        samples, order = backend.pack_waves([wave])
+        samples, order = backend.pack_rounds([wave])
         assert all(torch.equal(one, other) for one, other in zip(samples, wave, strict=True))
         assert order.tolist() == list(range(sum(counts)))
     depth, near = ended(backend, FOLDED, wave_of((0, 0)), torch.zeros(0), 0.1)

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from nerf.fields.interface import Rendering
-from nerf.fields.vanilla import PaperNerf, PaperSettings
+from nerf.fields.vanilla import VanillaNerf, VanillaSettings
 from nerf.geometry.rays import Rays
 from nerf.rendering.images import render_image
 
@@ -44,7 +44,7 @@ def test_every_pixel_is_in_its_place(chunk: int | None) -> None:
 
 
 def test_chunks_change_the_paper_field_by_rounding_only() -> None:
-    model = PaperNerf(PaperSettings(depth=2, width=8, samples_coarse=4, samples_fine=4), 0)
+    model = VanillaNerf(VanillaSettings(depth=2, width=8, samples_coarse=4, samples_fine=4), 0)
     rays = grid(4, 5)._replace(near=torch.zeros(4, 5), far=torch.ones(4, 5))
     whole, cut = (render_image(model, rays, torch.ones(3), chunk) for chunk in (100, 3))
     assert whole.opacity.max() > 0.05

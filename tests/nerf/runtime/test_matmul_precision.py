@@ -6,14 +6,14 @@ import pytest
 import torch
 
 from nerf.runtime import matmul_precision as product_precision
-from nerf.runtime.matmul_precision import MOST_ERROR, Medium, error_of, medium_products, products_at
+from nerf.runtime.matmul_precision import MOST_ERROR, Medium, error_of, medium_matmul, use_matmul_precision
 
 CPU = torch.device("cpu")
 
 
 @pytest.fixture(autouse=True)
 def nothing_is_known() -> None:
-    medium_products.cache_clear()
+    medium_matmul.cache_clear()
 
 
 def rounded(values: torch.Tensor, bits: int) -> torch.Tensor:
@@ -30,11 +30,11 @@ def test_it_pays_where_it_is_faster_and_about_as_exact(speedup: float, error: fl
 
 
 def test_the_setting_is_put_back_whatever_happens() -> None:
-    with pytest.raises(KeyError), products_at("medium"):
+    with pytest.raises(KeyError), use_matmul_precision("medium"):
         assert torch.get_float32_matmul_precision() == "medium"
-        with products_at("highest"):
+        with use_matmul_precision("highest"):
             assert torch.get_float32_matmul_precision() == "highest"
-        with products_at(None):
+        with use_matmul_precision(None):
             assert torch.get_float32_matmul_precision() == "medium"
         raise KeyError
     assert torch.get_float32_matmul_precision() == "highest"
@@ -50,23 +50,23 @@ def test_the_fastest_of_several_counts(seconds: dict[str, float], speedup: float
 
     monkeypatch.setattr(product_precision, "TRIED_SECONDS", 0.0)
     monkeypatch.setattr(product_precision, "seconds_of_product", made_up)
-    found = medium_products(CPU, 64)
+    found = medium_matmul(CPU, 64)
     assert found.speedup == speedup and 0 <= found.error < 0.1
     assert asked == [("highest", 8192, 64, 64, 64), ("medium", 8192, 64, 64, 64)] * 3
-    assert medium_products(CPU, 64) is found and len(asked) == 6, "once is enough"
+    assert medium_matmul(CPU, 64) is found and len(asked) == 6, "once is enough"
 
 
 @pytest.mark.parametrize("width, rows", [(2, 8192), (64, 8192), (128, 2048), (256, 512), (1024, 256)])
 def test_networks_of_any_width_are_as_much_work(width: int, rows: int, monkeypatch) -> None:
     tried = []
     monkeypatch.setattr(product_precision, "_fastest", lambda a, b: tried.append(a) or {"highest": 1.0, "medium": 1.0})
-    medium_products(CPU, width)
+    medium_matmul(CPU, width)
     assert tried[0].shape == (rows, width)
 
 
 def test_it_is_measured_here_without_touching_random_state() -> None:
     state = torch.get_rng_state()
-    found = medium_products(CPU, 64)
+    found = medium_matmul(CPU, 64)
     assert 0.01 < found.speedup < 100 and 0 <= found.error < 0.1
     assert torch.equal(torch.get_rng_state(), state)
     assert torch.get_float32_matmul_precision() == "highest"

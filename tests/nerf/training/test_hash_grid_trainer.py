@@ -9,21 +9,27 @@ from nerf.effects import AS_GIVEN, AS_RENDERED
 from nerf.effects.exposure import expose
 from nerf.effects.exposure_model import Exposures
 from nerf.effects.pose_refinement import RefinedPoses
-from nerf.fields.background import sky_colour
-from nerf.fields.hash_grid import GridField, GridSettings
+from nerf.fields.background import background_colour
+from nerf.fields.hash_grid import HashGridField, HashGridSettings
 from nerf.geometry.rays import Rays
 from nerf.kernels import torch as reference
-from nerf.training.hash_grid_trainer import GridBatch, GridTrainer, GridTrainerSettings, depth_factor, rate_factor
-from nerf.training.ray_dataset import RayBank, build_ray_bank
+from nerf.training.hash_grid_trainer import (
+    HashGridBatch,
+    HashGridTrainer,
+    HashGridTrainerSettings,
+    depth_factor,
+    lr_multiplier,
+)
+from nerf.training.ray_dataset import RayDataset, build_ray_bank
 from nerf.training.trainer import FieldTrainer, NonFinite
 from nerf.training.validation_probe import make_probe, measure
 
-FIELD = GridSettings(levels=2, log2_rows=10, coarsest=4, finest=16, steps=32, cache_cells=16)
+FIELD = HashGridSettings(levels=2, log2_rows=10, coarsest=4, finest=16, steps=32, occupancy_resolution=16)
 BACKGROUND = (0.2, 0.9, 0.5)
-TRAINER = GridTrainerSettings(seed=3, background="random", samples=1024)
+TRAINER = HashGridTrainerSettings(seed=3, background="random", samples=1024)
 
 
-def small_bank(size: int = 12) -> RayBank:
+def small_bank(size: int = 12) -> RayDataset:
     """Two opposite views of a red disc on nothing, from 3 units away."""
     grid = (torch.arange(size) + 0.5) / size - 0.5
     y, x = torch.meshgrid(grid, grid, indexing="ij")
@@ -37,8 +43,8 @@ def small_bank(size: int = 12) -> RayBank:
     return build_ray_bank([photo.to(torch.uint8)] * 2, [0, 0], [bearings], torch.stack([front, back]), near, far)
 
 
-def trainer(settings: GridTrainerSettings = TRAINER, field: GridSettings = FIELD) -> GridTrainer:
-    return GridTrainer(GridField(field, 0, reference), small_bank(), settings)
+def trainer(settings: HashGridTrainerSettings = TRAINER, field: HashGridSettings = FIELD) -> HashGridTrainer:
+    return HashGridTrainer(HashGridField(field, 0, reference), small_bank(), settings)
 
 
 def copied(state: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -93,7 +99,7 @@ def test_the_gradient_of_a_batch_is_the_sum_over_its_chunks() -> None:
     parts = [run._part(0, 0.25, rays, chunk) for chunk in range(4)]
     assert sum(int((part.batch.distance > 0).sum()) for part in parts) == 4 * rays // 8
     assert rays > 10 and not torch.equal(parts[0].batch.target, parts[1].batch.target)
-    whole = GridBatch(
+    whole = HashGridBatch(
         Rays(*(torch.cat(part) for part in zip(*(part.batch.rays for part in parts), strict=True))),
         *(torch.cat(part) for part in zip(*(part.batch[1:] for part in parts), strict=True)),
     )
@@ -121,7 +127,7 @@ def test_empty_space_is_closed_and_the_object_stays_open() -> None:
     for step in range(96):
         run.step(step, 0.5)
     words = torch.stack([(run.model.bits >> bit) & 1 for bit in range(64)], -1)
-    opened = words.sum() / FIELD.cache_cells**3
+    opened = words.sum() / FIELD.occupancy_resolution**3
     assert 0.02 < opened < 0.7
     rays, _, alpha, _ = run.bank.lookup(torch.arange(len(run.bank.pixels)))
     opacity = run.model.render(rays, torch.ones(3)).opacity
@@ -188,10 +194,10 @@ def test_unbounded_scenes_train_too() -> None:
 
 
 def test_the_rate_warms_up_stays_and_falls() -> None:
-    assert rate_factor(0, 0.0) == pytest.approx(0.05)
-    assert rate_factor(19, 0.1) == rate_factor(500, 0.75) == 1
-    assert rate_factor(500, 0.875) == pytest.approx(0.05**0.5)
-    assert rate_factor(500, 1.0) == pytest.approx(0.05)
+    assert lr_multiplier(0, 0.0) == pytest.approx(0.05)
+    assert lr_multiplier(19, 0.1) == lr_multiplier(500, 0.75) == 1
+    assert lr_multiplier(500, 0.875) == pytest.approx(0.05**0.5)
+    assert lr_multiplier(500, 1.0) == pytest.approx(0.05)
 
 
 def test_a_state_of_another_architecture_is_refused() -> None:
@@ -207,14 +213,14 @@ def test_a_state_of_equal_shapes_but_other_settings_is_refused() -> None:
 
 
 def test_a_density_cache_of_an_unbounded_scene_has_finite_steps_everywhere() -> None:
-    model = GridField(replace(FIELD, contracted=True), 0, reference)
-    cache = GridTrainer(model, small_bank(), TRAINER).cache
+    model = HashGridField(replace(FIELD, contracted=True), 0, reference)
+    cache = HashGridTrainer(model, small_bank(), TRAINER).cache
     cache.refresh(15, torch.Generator().manual_seed(1))
     assert cache.thickness.isfinite().all()
     assert cache.thickness.max() > 20 * cache.thickness.min() > 0
 
 
-def unequal_bank() -> RayBank:
+def unequal_bank() -> RayDataset:
     """The disc on black from one place twice, the second time at half the light."""
     bank = small_bank(40)
     half = len(bank.pixels) // 2
@@ -228,7 +234,7 @@ def test_exposures_are_learnt_where_they_are_modelled() -> None:
     settings, errors = replace(TRAINER, background=(0.0, 0.0, 0.0), seed=0), []  # of some seeds all becomes black
     exposures = Exposures(torch.zeros(2, 3))
     for colours in (AS_RENDERED, exposures):
-        run = GridTrainer(GridField(FIELD, 0, reference), unequal_bank(), settings, AS_GIVEN, colours)
+        run = HashGridTrainer(HashGridField(FIELD, 0, reference), unequal_bank(), settings, AS_GIVEN, colours)
         errors.append([run.step(step, step / 300).psnr for step in range(300)][-1])
     red = exposures.log_gain[:, 0]
     assert 0.15 < float(red[0] - red[1]) < 0.8 and exposures.log_gain.mean(0).abs().max() < 1e-6
@@ -240,7 +246,9 @@ def test_the_gradient_of_poses_is_that_of_the_loss(seed: int) -> None:
     """As far as differences tell: of other fields, samples that come to lie in another cell weigh more in them."""
     poses = RefinedPoses(torch.eye(3)[:2])
     poses.turn += torch.tensor([[0.02, 0.01, -0.01], [0.0, -0.02, 0.03]])
-    run = GridTrainer(GridField(FIELD, seed, reference), small_bank(), replace(TRAINER, background=BACKGROUND), poses)
+    run = HashGridTrainer(
+        HashGridField(FIELD, seed, reference), small_bank(), replace(TRAINER, background=BACKGROUND), poses
+    )
     for step in range(60):
         run.step(step, 0.84)  # at a third of the rate
     by_hand = run._part(7, 0.5, 128, 0).photos
@@ -261,9 +269,9 @@ def test_the_gradient_of_poses_is_that_of_the_loss(seed: int) -> None:
 
 
 def test_what_is_learnt_of_photos_is_part_of_the_state() -> None:
-    def fresh() -> GridTrainer:
+    def fresh() -> HashGridTrainer:
         parts = RefinedPoses(torch.eye(3)[:2]), Exposures(torch.tensor([[0.0, 0, 0], [0.5, 0.5, 0.5]]))
-        return GridTrainer(GridField(FIELD, 0, reference), small_bank(), TRAINER, *parts)
+        return HashGridTrainer(HashGridField(FIELD, 0, reference), small_bank(), TRAINER, *parts)
 
     whole, first, second = fresh(), fresh(), fresh()
     for step in range(20):
@@ -280,7 +288,7 @@ def test_what_is_learnt_of_photos_is_part_of_the_state() -> None:
 
 
 def test_without_view_dependence_a_point_has_one_colour() -> None:
-    run = GridTrainer(GridField(replace(FIELD, view_dependence=False), 0, reference), small_bank(), TRAINER)
+    run = HashGridTrainer(HashGridField(replace(FIELD, view_dependence=False), 0, reference), small_bank(), TRAINER)
     psnr = [run.step(step, step / 60).psnr for step in range(60)]
     points, directions = torch.rand(50, 3) - 0.5, torch.nn.functional.normalize(torch.randn(2, 50, 3), dim=-1)
     one, other = (run.model.density_and_colour(points, towards)[1] for towards in directions)
@@ -294,11 +302,13 @@ def test_the_sky_becomes_what_is_seen_in_its_direction() -> None:
     colours = torch.tensor([[30, 60, 230], [240, 200, 30]], dtype=torch.uint8)
     bank = bank._replace(pixels=colours.repeat_interleave(len(bank.pixels) // 2, 0))
     outdoors = replace(FIELD, contracted=True, shortest_step=0.05, cone=0.1, sky=True)
-    run = GridTrainer(GridField(outdoors, 0, reference), bank, replace(TRAINER, background=(0.0, 0.0, 0.0), rate=1e-2))
+    run = HashGridTrainer(
+        HashGridField(outdoors, 0, reference), bank, replace(TRAINER, background=(0.0, 0.0, 0.0), rate=1e-2)
+    )
     for step in range(20):
         run.step(step, step / 20)
     ahead = torch.tensor([[0.0, 0, 1], [0, 0, -1], [0, 0.1, 1]])
-    seen = sky_colour(reference, run.model.sky, ahead / ahead.norm(dim=-1, keepdim=True))
+    seen = background_colour(reference, run.model.sky, ahead / ahead.norm(dim=-1, keepdim=True))
     assert torch.equal(seen > 0.5, colours[[0, 1, 0]] > 127)
     assert (seen - 0.5).abs().min() > 0.05
     assert {"model.sky", "mean.sky", "square.sky"} <= run.state().keys()
@@ -313,7 +323,7 @@ def test_known_distances_decide_a_shape_that_colours_leave_open() -> None:
     settings = replace(TRAINER, background=(0.0, 0.0, 0.0), depth_loss=0.1)
     centre, depth = grey.lookup(torch.tensor([78])).rays, {}
     for name, photos in {"open": grey, "guided": guided}.items():
-        run = GridTrainer(GridField(FIELD, 0, reference), photos, settings)
+        run = HashGridTrainer(HashGridField(FIELD, 0, reference), photos, settings)
         for step in range(120):
             run.step(step, step / 120)
         depth[name] = float(run.model.render(centre, torch.zeros(3)).depth)
@@ -359,7 +369,7 @@ def test_points_beyond_the_box_of_a_bounded_scene_are_no_guide() -> None:
     bank = small_bank().with_distances(torch.tensor([78, 78]), torch.tensor([3.0, 4.5]))
     outdoors = replace(FIELD, contracted=True, shortest_step=0.05, cone=0.1)
     for field, distances in {FIELD: [3.0], outdoors: [3.0, 4.5]}.items():
-        kept = GridTrainer(GridField(field, 0, reference), bank, TRAINER).bank.distance
+        kept = HashGridTrainer(HashGridField(field, 0, reference), bank, TRAINER).bank.distance
         assert kept is not None and kept.tolist() == distances
 
 
@@ -373,7 +383,9 @@ def test_without_a_weight_known_distances_change_nothing() -> None:
 def test_the_sky_where_it_is_always_hidden_falls_back_to_grey(monkeypatch: pytest.MonkeyPatch) -> None:
     """Light of a millionth reaches it now and then; Adam alone would follow that anywhere."""
     outdoors = replace(FIELD, contracted=True, shortest_step=0.05, cone=0.1, sky=True)
-    run = GridTrainer(GridField(outdoors, 0, reference), small_bank(), replace(TRAINER, background=(0.0, 0.0, 0.0)))
+    run = HashGridTrainer(
+        HashGridField(outdoors, 0, reference), small_bank(), replace(TRAINER, background=(0.0, 0.0, 0.0))
+    )
     run.model.sky.fill_(3.0)
     noise = torch.Generator().manual_seed(0)
 
@@ -382,7 +394,7 @@ def test_the_sky_where_it_is_always_hidden_falls_back_to_grey(monkeypatch: pytes
         light[:100] = 0
         return light
 
-    monkeypatch.setattr(run.model, "sky_backward", faint)
+    monkeypatch.setattr(run.model, "background_backward", faint)
     for step in range(120):
         run.step(step, 0.0)
     assert run.model.sky[100:].abs().mean() < 0.5

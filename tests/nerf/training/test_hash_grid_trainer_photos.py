@@ -9,22 +9,22 @@ import torch
 from torch import Tensor
 
 from nerf.effects.pose_refinement import RefinedPoses
-from nerf.fields.hash_grid import GridField
+from nerf.fields.hash_grid import HashGridField
 from nerf.fields.interface import Rendering
 from nerf.kernels import torch as reference
-from nerf.training.hash_grid_trainer import GridTrainer, _Part
-from nerf.training.losses import robust_error
-from nerf.training.ray_dataset import RayBank
+from nerf.training.hash_grid_trainer import HashGridTrainer, _Part
+from nerf.training.losses import huber_loss
+from nerf.training.ray_dataset import RayDataset
 from nerf.training.trainer import RAYS, NonFinite
 from tests.nerf.training.test_hash_grid_trainer import FIELD, TRAINER, copied, same, small_bank, trainer
 
 
-def part_without_effects(run: GridTrainer, step: int, share: float, rays: int, chunk: int) -> _Part:
+def part_without_effects(run: HashGridTrainer, step: int, share: float, rays: int, chunk: int) -> _Part:
     """What a chunk adds to loss and gradients, written as if no photo had rays or colours of its own."""
     batch = run._batch(step, share, chunk, rays)
     done = run.model.forward(batch.rays, batch.jitter, batch.offset, batch.background)
     error = done.rendering.colour - batch.target
-    robust, pull = robust_error(error)
+    robust, pull = huber_loss(error)
     none = torch.zeros(rays)
     grad = Rendering(pull * (2 / (3 * rays)), none, none)
     gradients = run.model.backward(done, grad, torch.zeros_like(done.weights))
@@ -46,7 +46,7 @@ def test_effects_that_are_off_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> 
 @pytest.mark.parametrize("runaway", [1e30, float("nan")])
 def test_turns_that_run_away_are_refused_and_change_nothing(runaway: float) -> None:
     poses = RefinedPoses(torch.eye(3)[:2])
-    run = GridTrainer(GridField(FIELD, 0, reference), small_bank(), TRAINER, poses)
+    run = HashGridTrainer(HashGridField(FIELD, 0, reference), small_bank(), TRAINER, poses)
     run.step(0, 0.0)
     poses.turn[:, 1] = runaway
     before = copied(run.state())
@@ -60,9 +60,9 @@ def test_steps_draw_every_pixel_once_before_any_again(monkeypatch: pytest.Monkey
     """Whatever the number of rays, of chunks, and of rays to sparse points, which end half-way."""
     bank, drawn = small_bank(16).with_distances(torch.tensor([136, 392]), torch.tensor([3.0, 2.5])), list[Tensor]()
     assert bank.known is not None and bank.drawable == 512
-    monkeypatch.setattr(RayBank, "nth", lambda _, numbers: drawn.append(numbers) or numbers)
+    monkeypatch.setattr(RayDataset, "nth", lambda _, numbers: drawn.append(numbers) or numbers)
     settings = replace(TRAINER, chunks=3, depth_loss=0.1)
-    run, rays = GridTrainer(GridField(FIELD, 0, reference), bank, settings), set[int]()
+    run, rays = HashGridTrainer(HashGridField(FIELD, 0, reference), bank, settings), set[int]()
     for step in range(40):
         rays.add(run.step(step, min(1.0, step / 20)).rays)
     often = torch.cat(drawn).bincount(minlength=512)

@@ -8,13 +8,13 @@ from torch import Tensor
 
 from nerf.geometry.rays import rays_of_view
 from nerf.runtime.randomness import generator
-from nerf.training.ray_dataset import Placement, RayBank, _in_runs, build_ray_bank, ray_bank
+from nerf.training.ray_dataset import Placement, RayDataset, _in_runs, build_ray_bank, ray_bank
 
 SIZES = [(3, 5), (4, 2), (3, 5)]  # (height, width) of each view
 CAMERAS = [0, 1, 0]
 
 
-def scattered(channels: int = 3) -> tuple[RayBank, list[Tensor], list[Tensor], Tensor]:
+def scattered(channels: int = 3) -> tuple[RayDataset, list[Tensor], list[Tensor], Tensor]:
     random = generator("cpu", 11)
     photos = [torch.randint(256, (h, w, channels), generator=random, dtype=torch.uint8) for h, w in SIZES]
     bearings = [torch.randn(h, w, 3, generator=random) for h, w in SIZES[:2]]

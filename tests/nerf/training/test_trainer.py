@@ -7,19 +7,19 @@ from torch import Tensor
 
 from nerf.effects.exposure_model import Exposures
 from nerf.effects.pose_refinement import RefinedPoses
-from nerf.fields.vanilla import PaperNerf, PaperSettings
+from nerf.fields.vanilla import VanillaNerf, VanillaSettings
 from nerf.geometry.rays import Rays
-from nerf.training.ray_dataset import RayBank, build_ray_bank
-from nerf.training.trainer import NonFinite, PaperTrainer, TrainerSettings, over
+from nerf.training.ray_dataset import RayDataset, build_ray_bank
+from nerf.training.trainer import NonFinite, VanillaTrainer, VanillaTrainerSettings, over
 from nerf.training.validation_probe import make_probe, measure
 
-FIELD = PaperSettings(
+FIELD = VanillaSettings(
     depth=2, width=16, skip=9, position_frequencies=3, direction_frequencies=1, samples_coarse=8, samples_fine=8
 )
-TRAINER = TrainerSettings(batch_rays=64, seed=3, background=(1.0, 1.0, 1.0), rate_start=5e-3, rate_end=5e-4)
+TRAINER = VanillaTrainerSettings(batch_rays=64, seed=3, background=(1.0, 1.0, 1.0), rate_start=5e-3, rate_end=5e-4)
 
 
-def small_bank(channels: int = 3, size: int = 12) -> RayBank:
+def small_bank(channels: int = 3, size: int = 12) -> RayDataset:
     """Two opposite views of a red disc on white (or on nothing, with alpha), from 3 units away."""
     grid = (torch.arange(size) + 0.5) / size - 0.5
     y, x = torch.meshgrid(grid, grid, indexing="ij")
@@ -35,8 +35,8 @@ def small_bank(channels: int = 3, size: int = 12) -> RayBank:
     return build_ray_bank([photo.to(torch.uint8)] * 2, [0, 0], [bearings], torch.stack([front, back]), near, far)
 
 
-def trainer(settings: TrainerSettings = TRAINER, bank: RayBank | None = None) -> PaperTrainer:
-    return PaperTrainer(PaperNerf(FIELD, seed=0), bank or small_bank(), settings)
+def trainer(settings: VanillaTrainerSettings = TRAINER, bank: RayDataset | None = None) -> VanillaTrainer:
+    return VanillaTrainer(VanillaNerf(FIELD, seed=0), bank or small_bank(), settings)
 
 
 def same(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:
@@ -87,7 +87,7 @@ def test_training_beats_a_flat_colour() -> None:
 def test_the_loss_is_the_sum_of_both_renderings_mean_squared_errors() -> None:
     run = trainer()
     nothing = replace(FIELD, hierarchical=False)
-    alone = PaperTrainer(PaperNerf(nothing, seed=0), small_bank(), TRAINER).step(0, 0.0)
+    alone = VanillaTrainer(VanillaNerf(nothing, seed=0), small_bank(), TRAINER).step(0, 0.0)
     both = run.step(0, 0.0)
     assert alone.loss == pytest.approx(10 ** (-alone.psnr / 10), rel=1e-5)
     assert both.loss > 1.2 * 10 ** (-both.psnr / 10)
@@ -142,7 +142,7 @@ def test_a_random_background_is_new_in_every_step_and_shines_through_alpha() -> 
 
 def test_steps_draw_every_pixel_once_before_any_again(monkeypatch: pytest.MonkeyPatch) -> None:
     run, drawn = trainer(bank=small_bank(size=16)), list[Tensor]()
-    monkeypatch.setattr(RayBank, "nth", lambda _, numbers: drawn.append(numbers) or numbers)
+    monkeypatch.setattr(RayDataset, "nth", lambda _, numbers: drawn.append(numbers) or numbers)
     for step in range(12):
         run.step(step, 0.0)
     often = torch.cat(drawn).bincount(minlength=512)
@@ -158,15 +158,15 @@ def test_over_is_linear_between_background_and_colour() -> None:
 
 
 def test_a_state_of_another_architecture_is_refused() -> None:
-    other = PaperTrainer(PaperNerf(replace(FIELD, width=8), seed=0), small_bank(), TRAINER)
+    other = VanillaTrainer(VanillaNerf(replace(FIELD, width=8), seed=0), small_bank(), TRAINER)
     with pytest.raises(RuntimeError, match="this state belongs to another field: settings differ"):
         trainer().load_state(other.state())
 
 
 def test_what_is_learnt_of_photos_is_trained_and_resumed() -> None:
-    def fresh() -> PaperTrainer:
+    def fresh() -> VanillaTrainer:
         parts = RefinedPoses(torch.eye(3)[:2]), Exposures(torch.tensor([[0.0, 0, 0], [0.5, 0.5, 0.5]]))
-        return PaperTrainer(PaperNerf(FIELD, seed=0), small_bank(), TRAINER, *parts)
+        return VanillaTrainer(VanillaNerf(FIELD, seed=0), small_bank(), TRAINER, *parts)
 
     whole, first, second = fresh(), fresh(), fresh()
     begun = {name: part.detach().clone() for name, part in whole.photo_parameters.items()}

@@ -6,7 +6,7 @@ import torch
 from nerf.fields.interface import Rendering
 from nerf.geometry.rays import Rays
 from nerf.training.metrics import PSNR_LIMIT
-from nerf.training.ray_dataset import RayBank, build_ray_bank
+from nerf.training.ray_dataset import RayDataset, build_ray_bank
 from nerf.training.validation_probe import make_patches, make_probe, measure, pictures
 
 
@@ -26,7 +26,7 @@ class Painted:
         return Rendering(grey, rays.far, torch.full_like(rays.far, 0.5))
 
 
-def painted_bank() -> RayBank:
+def painted_bank() -> RayDataset:
     values = torch.arange(256)
     directions = torch.stack([values / 255, values * 0.0, values * 0.0 + 1], -1)[None]
     photo = values.to(torch.uint8)[None, :, None].expand(1, 256, 3)
@@ -50,7 +50,7 @@ def test_a_probe_is_always_the_same() -> None:
     assert not torch.equal(first, other)
 
 
-def two_photos(grey: float = 0.0) -> RayBank:
+def two_photos(grey: float = 0.0) -> RayDataset:
     """Photos of 20 x 30 and 13 x 17 pixels whose colours tell view, row and column; Painted paints them ``grey``."""
     photos, directions = [], []
     for view, (height, width) in enumerate(((20, 30), (13, 17))):

@@ -62,20 +62,20 @@ def test_more_has_a_folder_of_its_own_and_a_chain_of_them(trained, monkeypatch: 
 
 
 def test_an_interrupted_more_is_taken_up_by_the_same_words(trained, monkeypatch: pytest.MonkeyPatch):
-    from nerf.training.hash_grid_trainer import GridTrainer
+    from nerf.training.hash_grid_trainer import HashGridTrainer
 
     photos, workspace = trained
     words = ["run", photos, "-o", workspace, "--until", "train", "--more", "9steps"]
     assert run_command(["train", workspace, "--train.steps", "12"]) == 0
-    first, step = result(workspace), GridTrainer.step
+    first, step = result(workspace), HashGridTrainer.step
 
-    def interrupted(self: GridTrainer, number: int, *rest: float):
+    def interrupted(self: HashGridTrainer, number: int, *rest: float):
         if number == 15:
             raise KeyboardInterrupt
         return step(self, number, *rest)
 
     with monkeypatch.context() as patch:
-        patch.setattr(GridTrainer, "step", interrupted)
+        patch.setattr(HashGridTrainer, "step", interrupted)
         assert run_command([*words, "--train.checkpoint-seconds", "1e-9"]) == 130
     assert run_command(["clean", workspace]) == 0
     assert (first / "field.safetensors").is_file(), "the training goes on from it"
@@ -123,7 +123,7 @@ def test_a_training_of_another_version_is_not_gone_on_with(trained, capsys: pyte
 
     photos, workspace = trained
     before = sorted(path for path in result(workspace).rglob("*") if path.is_file())
-    monkeypatch.setattr("nerf.training.hash_grid_trainer.GridTrainer.load_state", refuse)
+    monkeypatch.setattr("nerf.training.hash_grid_trainer.HashGridTrainer.load_state", refuse)
     words = ["--more", "6steps", "--train.learning-rate", "0.02"]  # the workspace remembers the rate of another test
     assert run_command(["run", photos, "-o", workspace, "--until", "train", *words]) == 14
     said = capsys.readouterr().err

@@ -9,7 +9,7 @@ import torch
 
 from nerf.effects.exposure import ExposedModel
 from nerf.effects.pose_refinement import RefinedPoses
-from nerf.fields.hash_grid import GridField, GridSettings
+from nerf.fields.hash_grid import HashGridField, HashGridSettings
 from nerf.fields.interface import Rendering
 from nerf.geometry.rays import Rays
 from stages import evaluate
@@ -28,11 +28,13 @@ def test_poses_are_fitted_to_the_field_as_it_is_and_scored_as_the_photo_was_expo
 ) -> None:
     inputs, scene = photographed(tmp_path)
     kernels = load_backend(chosen_backend("cpu"), "cpu")
-    field = GridField(GridSettings(levels=2, log2_rows=8, coarsest=4, finest=16, cache_cells=8), 5, kernels)
+    field = HashGridField(
+        HashGridSettings(levels=2, log2_rows=8, coarsest=4, finest=16, occupancy_resolution=8), 5, kernels
+    )
     plain, gain = Painter(field, torch.zeros(3)), torch.full((3,), 0.7)
     view, given = scene.of_split("test")[0], []
 
-    def fit(model: GridField, rays: Rays, rendering: Rendering, *_: object) -> Rays:
+    def fit(model: HashGridField, rays: Rays, rendering: Rendering, *_: object) -> Rays:
         given.append((model, rendering.colour))
         return rays._replace(near=rays.near + 0.5)  # seen from elsewhere
 

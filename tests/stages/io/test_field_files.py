@@ -6,20 +6,20 @@ import pytest
 import torch
 
 from nerf.effects.exposure import ExposedModel
-from nerf.fields.hash_grid import GridField, GridSettings
-from nerf.fields.vanilla import PaperNerf, PaperSettings
+from nerf.fields.hash_grid import HashGridField, HashGridSettings
+from nerf.fields.vanilla import VanillaNerf, VanillaSettings
 from nerf.geometry.rays import Rays
 from stages.contract import StageError
 from stages.hardware.backend import BackendName, backend_name, chosen_backend, load_backend
 from stages.io.field_files import load_field, save_field
 from stages.io.files import read_json, read_tensors, write_json, write_tensors
 
-SMALL = PaperSettings(depth=2, width=8, samples_coarse=4, samples_fine=4, contracted=True, spacing="log")
-GRID = GridSettings(levels=2, log2_rows=8, coarsest=4, finest=16, contracted=True, cache_cells=8)
+SMALL = VanillaSettings(depth=2, width=8, samples_coarse=4, samples_fine=4, contracted=True, spacing="log")
+GRID = HashGridSettings(levels=2, log2_rows=8, coarsest=4, finest=16, contracted=True, occupancy_resolution=8)
 KERNELS = load_backend(chosen_backend("cpu"), "cpu")
-OUTDOORS = GridField(replace(GRID, sky=True), 5, KERNELS)
+OUTDOORS = HashGridField(replace(GRID, sky=True), 5, KERNELS)
 OUTDOORS.sky.normal_(generator=torch.Generator().manual_seed(6))
-KINDS = {"paper": PaperNerf(SMALL, seed=5), "grid": GridField(GRID, 5, KERNELS), "sky": OUTDOORS}
+KINDS = {"paper": VanillaNerf(SMALL, seed=5), "grid": HashGridField(GRID, 5, KERNELS), "sky": OUTDOORS}
 BY_TORCH = "the grid field is computed by torch alone, as it was trained"
 INFO = {"background": [1.0, 1.0, 1.0], "downscale": 2.5, "steps": 7, "rays": 700}
 
@@ -66,7 +66,7 @@ def test_a_loaded_field_asks_for_no_gradients(kind: str, tmp_path: Path) -> None
 
 @pytest.mark.parametrize("harm", ["cut weights", "no weights", "another kind", "another size", "unknown setting"])
 def test_a_damaged_field_is_refused_in_words(harm: str, tmp_path: Path) -> None:
-    save_field(tmp_path, PaperNerf(SMALL, seed=5), INFO)
+    save_field(tmp_path, VanillaNerf(SMALL, seed=5), INFO)
     weights, info = tmp_path / "field.safetensors", read_json(tmp_path / "field.json")
     if harm == "cut weights":
         weights.write_bytes(weights.read_bytes()[:-9])
@@ -108,7 +108,7 @@ def test_a_field_with_exposure_is_shown_at_the_neutral_one(kind: str, tmp_path: 
 def test_a_field_without_exposure_is_the_field_itself(tmp_path: Path) -> None:
     save_field(tmp_path, KINDS["paper"], INFO)
     loaded, _ = load_field(tmp_path)
-    assert isinstance(loaded, PaperNerf)
+    assert isinstance(loaded, VanillaNerf)
 
 
 @pytest.mark.parametrize(
@@ -129,18 +129,18 @@ def test_damaged_exposure_is_refused_in_words(harm: dict[str, object], tmp_path:
 
 @pytest.mark.parametrize("trained_with", ["warp", "torch"])
 def test_a_field_keeps_to_torch_if_that_trained_it(trained_with: BackendName, tmp_path: Path, progress) -> None:
-    save_field(tmp_path, GridField(GRID, 5, load_backend(trained_with, "cpu")), INFO)
+    save_field(tmp_path, HashGridField(GRID, 5, load_backend(trained_with, "cpu")), INFO)
     loaded, info = load_field(tmp_path, "cpu", progress)
-    assert isinstance(loaded, GridField)
+    assert isinstance(loaded, HashGridField)
     assert backend_name(loaded.backend) == info["backend"] == trained_with
     assert [note.split(":")[0] for note in progress.notes] == [BY_TORCH] * (trained_with == "torch")
 
 
 def test_a_field_of_warp_is_read_without_it_and_the_reason_said(tmp_path: Path, progress, monkeypatch) -> None:
-    save_field(tmp_path, GridField(GRID, 5, load_backend("warp", "cpu")), INFO)
+    save_field(tmp_path, HashGridField(GRID, 5, load_backend("warp", "cpu")), INFO)
     monkeypatch.setattr("stages.hardware.backend.why_not_warp", lambda device: "it is not there")
     loaded, _ = load_field(tmp_path, "cpu", progress)
-    assert isinstance(loaded, GridField)
+    assert isinstance(loaded, HashGridField)
     assert backend_name(loaded.backend) == "torch"
     assert progress.notes == ["the grid field is computed by torch alone, several times slower: it is not there"]
 

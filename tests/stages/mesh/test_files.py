@@ -2,13 +2,15 @@
 
 import json
 import struct
+from typing import get_args
 
 import numpy as np
 import pytest
 import trimesh
 from trimesh.visual import ColorVisuals
 
-from stages.mesh.files import Z_UP_TO_Y_UP, ColouredMesh, write_glb, write_obj, write_ply
+from stages.mesh import Format
+from stages.mesh.files import WRITERS, Z_UP_TO_Y_UP, ColouredMesh, glb_bytes, obj_bytes, ply_bytes
 
 VERTICES = np.array([[0.1, 0, 0], [1, 0.2, 0], [0, 1, 0.3], [0.4, 0, 1]])
 FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32)
@@ -53,7 +55,7 @@ def tolerance(mesh):
 
 
 def test_ply_is_read_back_as_it_was(tmp_path, mesh):
-    write_ply(tmp_path / "mesh.ply", mesh)
+    (tmp_path / "mesh.ply").write_bytes(ply_bytes(mesh))
     loaded = trimesh.load_mesh(tmp_path / "mesh.ply", process=False)
     np.testing.assert_allclose(loaded.vertices, mesh.vertices, rtol=0, atol=tolerance(mesh))
     np.testing.assert_array_equal(loaded.faces, FACES)
@@ -65,7 +67,7 @@ def test_ply_is_read_back_as_it_was(tmp_path, mesh):
 
 
 def test_obj_is_read_back_as_it_was(tmp_path, mesh):
-    write_obj(tmp_path / "mesh.obj", mesh)
+    (tmp_path / "mesh.obj").write_bytes(obj_bytes(mesh))
     loaded = trimesh.load_mesh(tmp_path / "mesh.obj", process=False)
     np.testing.assert_allclose(loaded.vertices, mesh.vertices, rtol=0, atol=tolerance(mesh))
     np.testing.assert_array_equal(loaded.faces, FACES)
@@ -74,7 +76,7 @@ def test_obj_is_read_back_as_it_was(tmp_path, mesh):
 
 def test_glb_is_read_back_and_stands_upright(tmp_path, mesh):
     upright = Z_UP_TO_Y_UP @ QUARTER_TURN
-    write_glb(tmp_path / "mesh.glb", mesh, upright)
+    (tmp_path / "mesh.glb").write_bytes(glb_bytes(mesh, upright))
     loaded = upright_mesh(tmp_path / "mesh.glb")
     np.testing.assert_allclose(loaded.vertices, mesh.vertices @ upright.T, rtol=0, atol=tolerance(mesh))
     np.testing.assert_array_equal(loaded.faces, FACES)
@@ -88,18 +90,19 @@ def test_up_becomes_plus_y():
 def test_glb_holds_the_coordinates_themselves_unless_float_is_too_coarse(tmp_path):
     near, far = (ColouredMesh(VERTICES + offset, FACES, NORMALS, COLOURS) for offset in (0, FAR))
     for mesh, translated in ((near, False), (far, True)):
-        write_glb(tmp_path / "mesh.glb", mesh, np.eye(3))
+        (tmp_path / "mesh.glb").write_bytes(glb_bytes(mesh, np.eye(3)))
         document, binary = gltf_of(tmp_path / "mesh.glb")
-        root, child = document["nodes"]
-        assert "matrix" in root and ("translation" in child) == translated
-        stored = np.frombuffer(binary, "<f4", 12).reshape(4, 3) + np.array(child.get("translation", np.zeros(3)))
-        np.testing.assert_allclose(stored, mesh.vertices, rtol=0, atol=1e-6)
-        accessor = document["accessors"][0]
+        offset = np.array(document["nodes"][0].get("matrix", np.eye(4).reshape(-1)))[12:15]
+        assert offset.any() == translated
+        accessor = document["accessors"][document["meshes"][0]["primitives"][0]["attributes"]["POSITION"]]
+        start = document["bufferViews"][accessor["bufferView"]]["byteOffset"]
+        stored = np.frombuffer(binary, "<f4", 12, start).reshape(4, 3)
+        np.testing.assert_allclose(stored + offset, mesh.vertices, rtol=0, atol=1e-6)
         np.testing.assert_allclose(np.array(accessor["max"]) - accessor["min"], np.ptp(VERTICES, axis=0), atol=1e-6)
 
 
 def test_glb_colours_are_linear_light_and_unlit(tmp_path):
-    write_glb(tmp_path / "mesh.glb", ColouredMesh(VERTICES, FACES, NORMALS, COLOURS), np.eye(3))
+    (tmp_path / "mesh.glb").write_bytes(glb_bytes(ColouredMesh(VERTICES, FACES, NORMALS, COLOURS), np.eye(3)))
     document, binary = gltf_of(tmp_path / "mesh.glb")
     assert document["extensionsUsed"] == ["KHR_materials_unlit"]
     assert "KHR_materials_unlit" in document["materials"][0]["extensions"]
@@ -111,10 +114,10 @@ def test_glb_colours_are_linear_light_and_unlit(tmp_path):
     np.testing.assert_array_equal(np.rint(255 * encoded[:, :3]), COLOURS)
 
 
-def test_equal_meshes_are_equal_bytes(tmp_path, mesh):
-    for name in ("first", "second"):
-        write_ply(tmp_path / f"{name}.ply", mesh)
-        write_obj(tmp_path / f"{name}.obj", mesh)
-        write_glb(tmp_path / f"{name}.glb", mesh, np.eye(3))
-    for kind in ("ply", "obj", "glb"):
-        assert (tmp_path / f"first.{kind}").read_bytes() == (tmp_path / f"second.{kind}").read_bytes()
+@pytest.mark.parametrize("extension", WRITERS)
+def test_equal_meshes_are_equal_bytes(mesh, extension):
+    assert WRITERS[extension](mesh, np.eye(3)) == WRITERS[extension](mesh, np.eye(3))
+
+
+def test_every_format_offered_has_a_writer():
+    assert set(get_args(Format)) == set(WRITERS)

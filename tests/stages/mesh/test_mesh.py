@@ -15,10 +15,11 @@ from nerf.geometry.camera_paths import look_at
 from nerf.geometry.scene import Camera, Scene, Similarity, View
 from stages import mesh
 from stages.contract import StageError
-from stages.io import field_files
 from stages.io.files import write_json, write_tensors
-from stages.mesh import picture as mesh_picture
-from stages.mesh import visibility as mesh_views
+from stages.mesh import extraction, resolution
+from stages.mesh import preview as mesh_preview
+from stages.mesh import visibility as mesh_visibility
+from stages.mesh.extraction import vertex_colours
 
 RADIUS = 0.4
 TURN = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
@@ -28,10 +29,10 @@ NO_POINTS = np.zeros((0, 3), np.float32)
 
 
 SMALL = (
-    (mesh_picture, "WIDTH", 60),
-    (mesh_picture, "HEIGHT", 50),
-    (mesh_views, "LONGEST", 32),
-    (mesh, "LEVEL_RAYS", 256),
+    (mesh_preview, "WIDTH", 60),
+    (mesh_preview, "HEIGHT", 50),
+    (mesh_visibility, "MAX_MAP_SIDE", 32),
+    (extraction, "ISO_LEVEL_RAYS", 256),
 )
 
 
@@ -101,7 +102,7 @@ def run_mesh(tmp_path, progress, monkeypatch):
         write_tensors(inputs["normalise"] / "points.safetensors", {"xyz": points})
         info = {"rays": 1000} | (learnt or {})
         write_json(inputs["train"] / "field.json", info)
-        monkeypatch.setattr(field_files, "load_field", lambda *_: (model, info))
+        monkeypatch.setattr(extraction, "load_field", lambda *_: (model, info))
         config = mesh.Config.model_validate({"resolution": 48} | settings)
         return mesh.run(config, inputs, tmp_path / folder, progress), tmp_path / folder
 
@@ -157,7 +158,7 @@ class Sheet:
 def test_a_sheet_that_lets_light_through_has_its_own_colour():
     vertices, along_z = np.array([[0.0, 0, 0], [0.3, 0, 5.0]]), np.tile([0.0, 0, 1], (2, 1))
     sheet: Any = Sheet()
-    colours = mesh._colours(sheet, vertices, along_z, VOXEL, "cpu")
+    colours = vertex_colours(sheet, vertices, along_z, VOXEL, "cpu")
     assert colours.tolist() == [[255, 0, 0], [255, 255, 255]], "the second vertex has nothing about it"
 
 
@@ -167,12 +168,12 @@ def test_the_facts_are_those_of_the_files(run_mesh):
     facts = result.facts
     assert json.loads(json.dumps(facts, allow_nan=False)) == facts
     assert (facts["vertices"], facts["faces"]) == (len(loaded.vertices), len(loaded.faces))
-    assert facts["watertight"] is True and facts["ends"] == "watertight"
+    assert facts["watertight"] is True and facts["boundary"] == "watertight"
     assert facts["surface_area"] == pytest.approx(loaded.area, rel=1e-5)
     assert facts["voxel"] == pytest.approx(VOXEL / 0.25)
-    assert (facts["components_kept"], facts["components_dropped"], facts["faces_uncovered"]) == (1, 0, 0)
+    assert (facts["components_kept"], facts["components_dropped"], facts["faces_outside_photos"]) == (1, 0, 0)
     assert (facts["resolution"], facts["frame"]) == (48, "sfm")
-    assert 0 < facts["level"] < 300 and 0 < facts["level_miss_voxels"] < 0.5
+    assert 0 < facts["iso_level"] < 300 and 0 < facts["surface_error_voxels"] < 0.5
 
 
 def test_colours_at_a_neutral_exposure_say_at_which(run_mesh):
@@ -248,7 +249,7 @@ def test_a_part_that_no_sparse_point_locates_is_dropped(run_mesh):
 def test_a_plain_ends_at_the_box_or_where_the_photos_end(run_mesh):
     result, folder = run_mesh(Solid(plain))
     assert result.facts["watertight"] is False
-    assert "open at the box" in result.line
+    assert "open at the edge of the region" in result.line
     loaded = trimesh.load_mesh(folder / "mesh.ply", process=False)
     in_scene = SCENE_FROM_SFM.points(np.asarray(loaded.vertices))
     assert np.abs(in_scene[:, 2] + 0.2).max() < VOXEL  # nothing was invented below to close it
@@ -265,7 +266,7 @@ def test_flat_scenes_have_smaller_voxels(run_mesh):
     cube, _ = run_mesh(Solid(plain), scene=scene, frame="scene")
     result, folder = run_mesh(Solid(plain), folder="flat", scene=scene, points=points, frame="scene")
     assert cube.facts["voxel"] == pytest.approx(VOXEL) and 0.4 * VOXEL < result.facts["voxel"] < 0.6 * VOXEL
-    assert (result.facts["resolution"], result.facts["ends"]) == (48, cube.facts["ends"])
+    assert (result.facts["resolution"], result.facts["boundary"]) == (48, cube.facts["boundary"])
     assert result.facts["surface_area"] == pytest.approx(cube.facts["surface_area"], rel=0.02)
     heights = np.asarray(trimesh.load_mesh(folder / "mesh.ply", process=False).vertices)[:, 2]
     assert np.abs(heights + 0.2).max() < 0.5 * VOXEL
@@ -282,7 +283,7 @@ def test_decimation_leaves_as_many_faces_as_asked_for(run_mesh):
     [
         (Solid(ball, inside=0.0), {}, "the field is empty"),
         (Solid(lambda p: torch.full_like(p[..., 0], -9.0)), {}, "the field has no surface"),
-        (Solid(ball), {"level": 1e6}, "no surface at density 1e+06"),
+        (Solid(ball), {"iso_level": 1e6}, "no surface at density 1e+06"),
     ],
 )
 def test_fields_without_a_surface_write_nothing(run_mesh, tmp_path, model, settings, what):
@@ -304,8 +305,8 @@ def test_a_lattice_beyond_memory_is_refused_with_one_that_fits(run_mesh, monkeyp
 
 def test_the_resolution_that_fits_into_seconds_is_that_of_the_box(run_mesh, monkeypatch):
     asked = []
-    monkeypatch.setattr(mesh, "yardstick", lambda: 0.02)
-    monkeypatch.setattr(mesh, "seconds_per_density", lambda train, box, chunk: asked.append(box) or 2e-7)
+    monkeypatch.setattr(resolution, "reference_seconds", lambda: 0.02)
+    monkeypatch.setattr(resolution, "density_query_seconds", lambda train, box: asked.append(box) or 2e-7)
     points = np.random.default_rng(0).uniform([-0.9, -0.9, -0.25], [0.9, 0.9, -0.15], (1000, 3)).astype(np.float32)
     for layout in ("around", "inside"):
         scene = replace(scene_around(), layout=layout)
@@ -317,14 +318,14 @@ def test_the_resolution_that_fits_into_seconds_is_that_of_the_box(run_mesh, monk
 
 def test_fog_becomes_a_mesh_that_says_it_is_fog(run_mesh, progress):
     result, _ = run_mesh(Solid(ball, inside=0.3))
-    assert result.facts["faces"] > 100 and result.facts["level_miss_voxels"] is None
+    assert result.facts["faces"] > 100 and result.facts["surface_error_voxels"] is None
     assert result.line.endswith("; the field has no clear surface yet, train for longer")
     assert any("still fog" in note for note in progress.notes)
 
 
 def test_the_level_asked_for_is_taken(run_mesh):
-    result, _ = run_mesh(Solid(ball), level=150.0)
-    assert (result.facts["level"], result.facts["level_reason"]) == (150.0, "as asked")
+    result, _ = run_mesh(Solid(ball), iso_level=150.0)
+    assert (result.facts["iso_level"], result.facts["iso_level_reason"]) == (150.0, "given")
 
 
 @pytest.mark.parametrize(

@@ -13,15 +13,18 @@ from stages.mesh.surface import (
     border_vertices,
     components,
     decimate,
-    extract,
+    extract_surface,
     face_areas,
     is_watertight,
     keep_faces,
+    sample_surface,
     vertex_normals,
 )
 
 LEVEL = 20.0
 SHARPNESS = 0.02
+SQUARE = np.array([[0.0, 0, 0], [2, 0, 0], [2, 1, 0], [0, 1, 0]])
+TWO_TRIANGLES = np.array([[0, 1, 2], [0, 2, 3]])
 TETRAHEDRON = Surface(
     np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]),
     np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32),
@@ -68,7 +71,7 @@ def unsmoothed(lattice):
     ],
 )
 def test_area_volume_and_topology_are_those_of_the_solid(distance, area, content, characteristic):
-    surface = extract(lattice_of(distance), LEVEL)
+    surface = extract_surface(lattice_of(distance), LEVEL)
     assert is_watertight(surface) and len(border_vertices(surface)) == 0
     assert euler(surface) == characteristic
     assert 0 < abs(float(face_areas(surface).sum()) / area - 1) < 0.015
@@ -81,13 +84,13 @@ def test_area_volume_and_topology_are_those_of_the_solid(distance, area, content
 def test_noise_from_one_lattice_point_to_the_next_is_not_drawn():
     clean, random = lattice_of(ball), torch.Generator().manual_seed(0)
     noisy = clean._replace(values=clean.values * torch.exp(torch.randn(clean.values.shape, generator=random)))
-    off = ball(torch.from_numpy(extract(noisy, LEVEL).vertices)) / (1.8 / 63)
+    off = ball(torch.from_numpy(extract_surface(noisy, LEVEL).vertices)) / (1.8 / 63)
     raw = ball(torch.from_numpy(unsmoothed(noisy))) / (1.8 / 63)
     assert 0 < float(off.std()) < 0.4 * float(raw.std())
 
 
 def test_normals_point_to_lower_density():
-    surface = extract(lattice_of(ball), LEVEL)
+    surface = extract_surface(lattice_of(ball), LEVEL)
     outward = surface.vertices / np.linalg.norm(surface.vertices, axis=1, keepdims=True)
     assert 0.99 < float((vertex_normals(surface) * outward).sum(axis=1).min()) <= 1
 
@@ -95,20 +98,20 @@ def test_normals_point_to_lower_density():
 def test_a_density_of_thirty_decades_makes_the_same_surface():
     lattice = lattice_of(ball)
     extreme = lattice._replace(values=torch.where(lattice.values > 10 * LEVEL, 1e30, lattice.values))
-    assert np.isfinite(extract(extreme, LEVEL).vertices).all()
-    assert volume(extract(extreme, LEVEL)) == pytest.approx(volume(extract(lattice, LEVEL)), rel=0.01)
+    assert np.isfinite(extract_surface(extreme, LEVEL).vertices).all()
+    assert volume(extract_surface(extreme, LEVEL)) == pytest.approx(volume(extract_surface(lattice, LEVEL)), rel=0.01)
 
 
 def test_a_step_is_put_halfway_between_full_and_empty():
     values = torch.zeros(12, 12, 12)
     values[:6] = 1e6
     corner = torch.full((3,), 1.1)
-    surface = extract(Lattice(values, -corner, corner), LEVEL)
+    surface = extract_surface(Lattice(values, -corner, corner), LEVEL)
     np.testing.assert_allclose(surface.vertices[:, 0], 0, atol=1e-6)  # between vertices at -0.1 and 0.1
 
 
 def test_what_the_box_cuts_stays_open_there():
-    surface = extract(lattice_of(lambda p: p[..., 2] + 0.31), LEVEL)
+    surface = extract_surface(lattice_of(lambda p: p[..., 2] + 0.31), LEVEL)
     assert not is_watertight(surface)
     border = border_vertices(surface)
     assert len(border) == 2 * 4 * 63
@@ -155,7 +158,7 @@ def test_what_decimation_folds_onto_itself_goes_and_nothing_opens(monkeypatch):
 
 
 def test_decimation_keeps_the_shape_closed():
-    surface = extract(lattice_of(torus), LEVEL)
+    surface = extract_surface(lattice_of(torus), LEVEL)
     fewer = decimate(surface, len(surface.faces) // 4)
     assert 0.2 < len(fewer.faces) / len(surface.faces) <= 0.25
     assert is_watertight(fewer) and euler(fewer) == 0
@@ -164,8 +167,34 @@ def test_decimation_keeps_the_shape_closed():
 
 
 def test_decimation_leaves_borders_where_they_are():
-    surface = extract(lattice_of(lambda p: p[..., 2] + 0.2 * p[..., 0].cos()), LEVEL)
+    surface = extract_surface(lattice_of(lambda p: p[..., 2] + 0.2 * p[..., 0].cos()), LEVEL)
     fewer = decimate(surface, len(surface.faces) // 3)
     assert len(fewer.faces) < len(surface.faces) / 2
     before, after = (np.unique(border_vertices(s).round(9), axis=0) for s in (surface, fewer))
     np.testing.assert_array_equal(before, after)
+
+
+def test_samples_lie_on_the_surface_and_are_uniform_by_area():
+    points = sample_surface(SQUARE, TWO_TRIANGLES, 20000, seed=1)
+    assert points.shape == (20000, 3) and (points[:, 2] == 0).all()
+    counts, _, _ = np.histogram2d(points[:, 0], points[:, 1], bins=[8, 4], range=[[0, 2], [0, 1]])
+    assert counts.sum() == 20000
+    assert 0 < np.abs(counts - 625).max() < 5 * 25  # five standard deviations of a Poisson count
+
+
+def test_large_and_small_triangles_get_their_share():
+    vertices = np.concatenate([SQUARE, SQUARE * 0.1 + [0, 0, 5]])
+    faces = np.concatenate([TWO_TRIANGLES, TWO_TRIANGLES + 4])
+    points = sample_surface(vertices, faces, 10100, seed=0)
+    assert abs((points[:, 2] > 1).sum() - 100) <= 1  # stratified: exact but for the stratum on the border
+
+
+def test_the_seed_decides_the_samples():
+    first, again, other = (sample_surface(SQUARE, TWO_TRIANGLES, 10, seed) for seed in (3, 3, 4))
+    assert np.array_equal(first, again) and not np.array_equal(first, other)
+
+
+@pytest.mark.parametrize("faces", [np.zeros((0, 3), int), np.array([[0, 1, 1]])])
+def test_a_mesh_without_area_is_refused(faces):
+    with pytest.raises(ValueError, match="without area"):
+        sample_surface(SQUARE, faces, 10, 0)

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from nerf.runtime.matmul_precision import Medium
-from nerf.training.hash_grid_trainer import GridTrainer
+from nerf.training.hash_grid_trainer import HashGridTrainer
 from stages import train
 from stages.effects.decisions import Decisions
 from stages.train import Config
@@ -30,7 +30,7 @@ def here(monkeypatch: pytest.MonkeyPatch):
             widths.append(width)
             return medium
 
-        monkeypatch.setattr("nerf.runtime.matmul_precision.medium_products", measured)
+        monkeypatch.setattr("nerf.runtime.matmul_precision.medium_matmul", measured)
         return widths
 
     return is_
@@ -39,13 +39,13 @@ def here(monkeypatch: pytest.MonkeyPatch):
 @pytest.fixture
 def trained_at(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """At which precision steps were taken."""
-    step, seen = GridTrainer.step, list[str]()
+    step, seen = HashGridTrainer.step, list[str]()
 
-    def watched(self: GridTrainer, *given: Any):
+    def watched(self: HashGridTrainer, *given: Any):
         seen.append(torch.get_float32_matmul_precision())
         return step(self, *given)
 
-    monkeypatch.setattr(GridTrainer, "step", watched)
+    monkeypatch.setattr(HashGridTrainer, "step", watched)
     return seen
 
 

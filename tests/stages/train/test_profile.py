@@ -8,14 +8,14 @@ import pytest
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
-from nerf.fields.hash_grid import GridField, GridSettings
-from nerf.fields.vanilla import PaperNerf, PaperSettings
+from nerf.fields.hash_grid import HashGridField, HashGridSettings
+from nerf.fields.vanilla import VanillaNerf, VanillaSettings
 from nerf.kernels import torch as reference
 from nerf.runtime.machine_rates import Rates
 from nerf.synthetic.scenes import ring_of_cameras
-from nerf.training.hash_grid_trainer import GridTrainer, GridTrainerSettings
-from nerf.training.ray_dataset import RayBank, build_ray_bank
-from nerf.training.trainer import PaperTrainer, StepResult, TrainerSettings
+from nerf.training.hash_grid_trainer import HashGridTrainer, HashGridTrainerSettings
+from nerf.training.ray_dataset import RayDataset, build_ray_bank
+from nerf.training.trainer import StepResult, VanillaTrainer, VanillaTrainerSettings
 from stages.hardware.backend import load_backend
 from stages.io.files import read_json
 from stages.report.profile import PARTS, parts_bar
@@ -30,7 +30,7 @@ PAPER: dict[str, Any] = {"depth": 3, "width": 16, "skip": 1, "samples_coarse": 8
 COUNTED: dict[str, Any] = {"steps": 1, "rays": 8, "samples": 80, "densities": 200, "seconds": 1.0, "core_seconds": 1.0}
 
 
-def bank() -> RayBank:
+def bank() -> RayDataset:
     random = torch.Generator().manual_seed(0)
     photos = [torch.randint(256, (12, 12, 4), generator=random, dtype=torch.uint8) for _ in range(3)]
     poses = torch.stack([torch.tensor(pose, dtype=torch.float32) for pose in ring_of_cameras(3)])
@@ -38,15 +38,17 @@ def bank() -> RayBank:
     return build_ray_bank(photos, [0, 0, 0], [pinhole_directions(12, 12, 14.0)], poses, near, far)
 
 
-def trainer(kind: str) -> GridTrainer | PaperTrainer:
+def trainer(kind: str) -> HashGridTrainer | VanillaTrainer:
     if kind == "paper":
-        return PaperTrainer(PaperNerf(PaperSettings(**PAPER), 0), bank(), TrainerSettings(32, 0, "random"))
+        return VanillaTrainer(VanillaNerf(VanillaSettings(**PAPER), 0), bank(), VanillaTrainerSettings(32, 0, "random"))
     backend = load_backend("warp" if kind == "warp" else "torch", "cpu")
-    settings = GridTrainerSettings(0, "random", samples=512, chunks=2, distortion=1e-3)
-    return GridTrainer(GridField(GridSettings(2, 4, 10, 8, 16, cache_cells=16), 0, backend), bank(), settings)
+    settings = HashGridTrainerSettings(0, "random", samples=512, chunks=2, distortion=1e-3)
+    return HashGridTrainer(
+        HashGridField(HashGridSettings(2, 4, 10, 8, 16, occupancy_resolution=16), 0, backend), bank(), settings
+    )
 
 
-def timed_step(of: GridTrainer | PaperTrainer, step: int, timings: dict[str, Any]) -> StepResult:
+def timed_step(of: HashGridTrainer | VanillaTrainer, step: int, timings: dict[str, Any]) -> StepResult:
     return observed(partial(of.step, step, 0.1, 1.0), step, timings, CPU)
 
 
@@ -114,7 +116,7 @@ def test_products_are_those_that_torch_counts(
 
 def test_rows_are_eight_corners_of_each_grid_of_each_point() -> None:
     of = trainer("torch")
-    assert isinstance(of, GridTrainer)
+    assert isinstance(of, HashGridTrainer)
     points, encode, timings = [0], reference.encode, {}
 
     class Counting:
@@ -178,5 +180,5 @@ def test_rates_are_measured_at_the_sizes_of_the_field(kind: str, monkeypatch: py
     monkeypatch.setattr("nerf.runtime.machine_rates.measure_rates", lambda *arguments: asked.append(arguments) or RATES)
     model = trainer(kind).model
     assert rates_for(model, CPU) == RATES
-    rows = model.layout.rows if isinstance(model, GridField) else 1
+    rows = model.layout.rows if isinstance(model, HashGridField) else 1
     assert asked[0][1:3] == ((64, rows) if kind == "torch" else (16, 1))

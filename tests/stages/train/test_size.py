@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nerf.fields.hash_grid import GridSettings
+from nerf.fields.hash_grid import HashGridSettings
 from nerf.geometry.scene import Camera, Scene
 from stages.effects.decisions import Decisions
 from stages.train import LARGE_STEP_RATE, LARGEST_STEP, PART_SAMPLES, Config, with_habits
@@ -133,7 +133,7 @@ def test_grids_grow_with_rays_and_pixels(scene: Scene, rays: float, factor: floa
     small, more_rays, fewer_pixels = chosen(rays, down), chosen(rays * factor, down), chosen(rays, down * factor)
     assert all(more_rays[name] >= small[name] >= fewer_pixels[name] for name in small)
     field = grid_settings(config.model_copy(update=small), sky=False)
-    assert isinstance(field, GridSettings)
+    assert isinstance(field, HashGridSettings)
     assert 128 <= field.finest <= 1024
     # Two neighbouring samples lie in the same or in neighbouring cells of the finest grid, near the cameras at least.
     cells_per_step = field.lattice.step * field.finest / (4 if folded else 1.8)

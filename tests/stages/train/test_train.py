@@ -8,8 +8,8 @@ import pytest
 import torch
 from pydantic import ValidationError
 
-from nerf.training.hash_grid_trainer import GridTrainer
-from nerf.training.trainer import PaperTrainer
+from nerf.training.hash_grid_trainer import HashGridTrainer
+from nerf.training.trainer import VanillaTrainer
 from stages import train
 from stages.contract import Progress, StageError
 from stages.hardware.device import cores
@@ -32,7 +32,7 @@ TINY: dict[str, Any] = {
     "learning_rate": 5e-3,
 }
 TINY_GRID: dict[str, Any] = {"levels": 2, "log2_rows": 10, "finest": 32, "batch_samples": 1024, "downscale": 1.0}
-TRAINERS = {"grid": GridTrainer, "paper": PaperTrainer}
+TRAINERS = {"grid": HashGridTrainer, "paper": VanillaTrainer}
 OUTPUTS = ("field.safetensors", "field.json")
 
 
@@ -122,15 +122,15 @@ def test_forty_steps_are_twenty_a_kill_and_twenty_more(
 
 def test_a_grid_field_that_diverges_is_rolled_back(tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch) -> None:
     inputs, _ = photographed(tmp_path, channels=4)
-    step, broken = GridTrainer.step, []
+    step, broken = HashGridTrainer.step, []
 
-    def poisoned(self: GridTrainer, number: int, *rest: float):
+    def poisoned(self: HashGridTrainer, number: int, *rest: float):
         if number == 30 and not broken:
             broken.append(number)
             self.model.colour_out[0, 0] = float("nan")
         return step(self, number, *rest)
 
-    monkeypatch.setattr(GridTrainer, "step", poisoned)
+    monkeypatch.setattr(HashGridTrainer, "step", poisoned)
     result = trained(tmp_path / "train", inputs, progress, field="grid", steps=60)
     assert result.facts["rollbacks"] == 1
     assert "nonfinite_30.safetensors" in result.records

@@ -9,7 +9,7 @@ from torch import Tensor
 from nerf.fields.interface import Rendering
 from nerf.kernels import Lattice, Samples
 from nerf.kernels.torch import composite, composite_backward, distortion, distortion_backward, visible_samples
-from nerf.kernels.torch.compositing import LEAST_CHANCE
+from nerf.kernels.torch.compositing import MIN_KEEP_PROBABILITY
 from nerf.rendering import volume_rendering as compositing
 
 COUNTS = (3, 0, 7, 1, 0, 12)
@@ -160,7 +160,7 @@ def test_thin_samples_are_kept_where_their_chances_add_up_to_whole_numbers() -> 
         light, chances = 1.0, offset
         for i in range(int(samples.starts[ray]), int(samples.starts[ray + 1])):
             tau = sigma[i].item() * samples.dt[i].item()
-            chance = min(max(tau / thin, LEAST_CHANCE), 1.0)
+            chance = min(max(tau / thin, MIN_KEEP_PROBABILITY), 1.0)
             before, chances = math.floor(chances), chances + (chance if chance < 1 else 0)
             if light >= 0.1 and (chance == 1 or math.floor(chances) > before):
                 wanted.append(i)
@@ -186,7 +186,7 @@ def test_over_all_offsets_each_length_is_what_it_was(thin: float) -> None:
         least = min(least, len(index))
     tau = sigma * samples.dt
     assert torch.equal((total / samples.dt > 0), torch.arange(200) <= 150)
-    torch.testing.assert_close(total[:151], samples.dt[:151], rtol=1.01 / draws / LEAST_CHANCE, atol=0)
+    torch.testing.assert_close(total[:151], samples.dt[:151], rtol=1.01 / draws / MIN_KEEP_PROBABILITY, atol=0)
     thick = (tau >= thin)[:150]
     assert (tau[:150] >= thin).sum() < least < 151
     assert (total[:150][thick] / samples.dt[:150][thick] - 1).abs().max() < 1e-12

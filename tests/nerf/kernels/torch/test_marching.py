@@ -6,8 +6,8 @@ from torch import Tensor
 from nerf.geometry.contraction import contract
 from nerf.geometry.rays import Rays, clip_to_box
 from nerf.kernels import BOX, Lattice
-from nerf.kernels.torch import march, occupied_bits, sample_points, sample_points_backward
-from nerf.kernels.torch.marching import lattice_coordinate, lattice_distance
+from nerf.kernels.torch import march, occupancy_bits, sample_points, sample_points_backward
+from nerf.kernels.torch.marching import s_to_t, t_to_s
 from nerf.kernels.torch.occupancy import occupied
 
 BOUNDED = Lattice(step=0.05, cone=0.0, contracted=False, cells=8, most_samples=1000)
@@ -56,7 +56,7 @@ def test_the_lattice_is_the_solution_of_its_equation() -> None:
 @pytest.mark.parametrize("lattice", [BOUNDED, FOLDED])
 def test_distance_and_coordinate_undo_each_other(lattice: Lattice) -> None:
     t = torch.logspace(-6, 3, 50, dtype=torch.float64)
-    torch.testing.assert_close(lattice_distance(lattice, lattice_coordinate(lattice, t)), t)
+    torch.testing.assert_close(s_to_t(lattice, t_to_s(lattice, t)), t)
 
 
 @pytest.mark.parametrize("lattice", [BOUNDED, FOLDED])
@@ -73,7 +73,7 @@ def test_samples_of_an_empty_cell_are_skipped_and_the_others_stay_where_they_are
     rays = random_rays(400)
     jitter = jitter_of(rays)
     thickness = torch.rand(512, generator=torch.Generator().manual_seed(5))
-    some = march(occupied(occupied_bits(thickness, 0.7)), BOUNDED, rays, jitter)
+    some = march(occupied(occupancy_bits(thickness, 0.7)), BOUNDED, rays, jitter)
     every = march(FULL, BOUNDED, rays, jitter)
     points = sample_points(rays, every, False)
     x, y, z = (8 * points).long().clamp(0, 7).unbind(-1)

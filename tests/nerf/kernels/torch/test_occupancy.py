@@ -1,6 +1,6 @@
 import torch
 
-from nerf.kernels.torch import cell_corners, occupied_bits, raise_cache
+from nerf.kernels.torch import cell_corners, occupancy_bits, scatter_max
 from nerf.kernels.torch.occupancy import MOST_CLEAR, cell_numbers, occupied
 
 
@@ -22,19 +22,19 @@ def test_points_outside_belong_to_the_nearest_cell() -> None:
 def test_cells_rise_to_the_largest_value() -> None:
     thickness = torch.full((64,), 1.0)
     points = torch.tensor([[0.1, 0.1, 0.1], [0.1, 0.1, 0.1], [0.1, 0.1, 0.1], [0.9, 0.9, 0.9]])
-    raise_cache(4, thickness, points, torch.tensor([0.1, 2.0, 0.3, 0.2]))
+    scatter_max(4, thickness, points, torch.tensor([0.1, 2.0, 0.3, 0.2]))
     assert thickness[0] == 2
     assert (thickness[1:] == 1).all()
 
 
 def test_bits_say_which_cells_exceed_the_threshold() -> None:
     thickness = torch.rand(512, generator=torch.Generator().manual_seed(1))
-    bits = occupied_bits(thickness, 0.4)
+    bits = occupancy_bits(thickness, 0.4)
     assert bits.shape == (8,) and bits.dtype == torch.int64
     unpacked = [(word >> bit) & 1 == 1 for word in bits.tolist() for bit in range(64)]
     assert unpacked == (thickness > 0.4).tolist()
-    assert occupied_bits(torch.full((64,), 2.0), 1.0).tolist() == [-1]
-    assert occupied_bits(torch.full((64,), 1.0), 1.0).tolist() == [0]
+    assert occupancy_bits(torch.full((64,), 2.0), 1.0).tolist() == [-1]
+    assert occupancy_bits(torch.full((64,), 1.0), 1.0).tolist() == [0]
 
 
 def test_clearance_is_the_distance_to_the_nearest_occupied_brick() -> None:

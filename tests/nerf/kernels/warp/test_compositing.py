@@ -96,7 +96,7 @@ def test_waves_of_4096_samples(device: str, varied: bool) -> None:
             depth, near = torch.full((3,), 0.1, dtype=torch.float64, device=device), torch.zeros(3, dtype=kind)
             arguments = samples, 0.3 * each, light_left, jitter, far
             arguments = arguments if backend is warp else doubled(arguments)
-            backend.end_wave(lattice, *arguments, depth, near)
+            backend.finish_round(lattice, *arguments, depth, near)
             depths.append(depth)
             nears.append(near)
         assert (depths[0] > 1).all() and float((depths[0] / depths[1] - 1).abs().max()) < 1e-6
@@ -117,7 +117,7 @@ def test_what_is_done_to_each_of_4096_samples(device: str, varied: bool) -> None
     warp.add_ray_relu(samples, given, of_ray)
     reference.add_ray_relu(samples, wanted, of_ray)
     assert torch.equal(given, wanted)
-    waves, _ = agree("pack_waves", [samples, packed(device, [4096, 0, 1])])
+    waves, _ = agree("pack_rounds", [samples, packed(device, [4096, 0, 1])])
     assert waves.starts.diff().tolist() == [8192, 4096, 4097]
 
 

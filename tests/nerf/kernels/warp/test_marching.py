@@ -8,7 +8,7 @@ from nerf.geometry.contraction import uncontract
 from nerf.geometry.rays import Rays, clip_to_box
 from nerf.kernels import BOX, Lattice, Occupied, Samples, warp
 from nerf.kernels import torch as reference
-from nerf.kernels.torch.marching import lattice_coordinate, unit_coordinates
+from nerf.kernels.torch.marching import t_to_s, unit_coordinates
 from nerf.kernels.torch.occupancy import cell_corners, cell_numbers, occupied
 from tests.nerf.kernels.agreement import (
     BOUNDED,
@@ -30,7 +30,7 @@ def places(lattice: Lattice, rays: Rays, jitter: Tensor, samples: Samples) -> Te
     """Ray and number k on the lattice of each sample, as one integer."""
     near = rays.near if lattice.contracted else clip_to_box(rays, -BOX, BOX).near
     ray = samples.ray.long()
-    k = lattice_coordinate(lattice, samples.t) - (lattice_coordinate(lattice, near) + jitter)[ray]
+    k = t_to_s(lattice, samples.t) - (t_to_s(lattice, near) + jitter)[ray]
     assert not len(k) or (k - k.round()).abs().max() < 0.3
     return (ray << 24) + k.round().long()
 

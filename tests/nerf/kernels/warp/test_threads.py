@@ -15,15 +15,15 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from nerf.fields.hash_grid import GridField, GridSettings
+from nerf.fields.hash_grid import HashGridField, HashGridSettings
 from nerf.fields.interface import Rendering
 from nerf.geometry.rays import Rays
 from nerf.kernels import Lattice, grid_layout, warp
 from nerf.kernels.torch.occupancy import occupied
 from nerf.runtime.parallel import take_over_cores
 from nerf.runtime.randomness import generator
-from nerf.training.hash_grid_trainer import GridTrainer, GridTrainerSettings
-from nerf.training.ray_dataset import RayBank, build_ray_bank
+from nerf.training.hash_grid_trainer import HashGridTrainer, HashGridTrainerSettings
+from nerf.training.ray_dataset import RayDataset, build_ray_bank
 
 ROOT = Path(__file__).parents[4]
 
@@ -57,7 +57,7 @@ def test_kernels_are_compiled_on_all_cores_when_torch_has_given_them_up(
     assert torch.get_num_threads() == 1 and asked == [3]
 
 
-def noise_bank() -> RayBank:
+def noise_bank() -> RayDataset:
     """Two opposite views of coloured noise, opaque and transparent, from 3 units away."""
     grid = (torch.arange(12) + 0.5) / 12 - 0.5
     y, x = torch.meshgrid(grid, grid, indexing="ij")
@@ -70,18 +70,18 @@ def noise_bank() -> RayBank:
     return build_ray_bank([photo] * 2, [0, 0], [bearings], torch.stack([front, back]), near, far)
 
 
-BOUNDED = GridSettings(levels=3, log2_rows=8, coarsest=4, finest=16, steps=32, cache_cells=8)
+BOUNDED = HashGridSettings(levels=3, log2_rows=8, coarsest=4, finest=16, steps=32, occupancy_resolution=8)
 OUTDOORS = replace(BOUNDED, contracted=True, shortest_step=0.1, cone=0.1, sky=True)
 
 
-def small_trainer(field: GridSettings) -> GridTrainer:
+def small_trainer(field: HashGridSettings) -> HashGridTrainer:
     """A step has sixteen rays, two of which run to points whose distance is known."""
     background = (0.0, 0.0, 0.0) if field.sky else "random"
-    settings = GridTrainerSettings(3, background, samples=512, chunks=4, distortion=1e-3, depth_loss=0.1)
-    model = GridField(field, 0, warp)
-    model.occupy(warp.occupied_bits(torch.rand(512, generator=torch.Generator().manual_seed(2)), 0.3))
+    settings = HashGridTrainerSettings(3, background, samples=512, chunks=4, distortion=1e-3, depth_loss=0.1)
+    model = HashGridField(field, 0, warp)
+    model.occupy(warp.occupancy_bits(torch.rand(512, generator=torch.Generator().manual_seed(2)), 0.3))
     opaque = (noise_bank().pixels[:, 3] == 255).nonzero()[:, 0]
-    trainer = GridTrainer(
+    trainer = HashGridTrainer(
         model, noise_bank().with_distances(opaque, torch.full_like(opaque, 3.0, dtype=torch.float32)), settings
     )
     trainer.samples_per_ray.fill_(32)
@@ -92,7 +92,7 @@ def copied(state: dict[str, Tensor]) -> dict[str, Tensor]:
     return {name: tensor.clone() for name, tensor in state.items()}
 
 
-def run_briefly(trainer: GridTrainer, start: dict[str, Tensor]) -> dict[str, Tensor]:
+def run_briefly(trainer: HashGridTrainer, start: dict[str, Tensor]) -> dict[str, Tensor]:
     """A step and a refresh of the density cache, from the same beginning each time."""
     trainer.load_state(start)
     trainer.step(0, 0.0)
@@ -102,7 +102,7 @@ def run_briefly(trainer: GridTrainer, start: dict[str, Tensor]) -> dict[str, Ten
 
 @pytest.mark.parametrize("field", [BOUNDED, OUTDOORS], ids=["bounded", "outdoors"])
 def test_a_training_run_has_the_same_bits_again_and_again_on_any_number_of_threads(
-    field: GridSettings, use_cores: Callable[[int], None], monkeypatch: pytest.MonkeyPatch
+    field: HashGridSettings, use_cores: Callable[[int], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("nerf.fields.occupancy_grid.CHUNK", 128)  # so that even this small cache is measured in several
     trainer, used = small_trainer(field), set[int]()
@@ -133,7 +133,7 @@ def everything(seed: int) -> list[Tensor]:
     rays = Rays(
         0.3 * torch.randn(count, 3, generator=random), directions, *torch.tensor([[0.05], [4.0]]).repeat(1, count)
     )
-    bits = warp.occupied_bits(torch.rand(512, generator=random), 0.4)
+    bits = warp.occupancy_bits(torch.rand(512, generator=random), 0.4)
     samples = warp.march(occupied(bits), lattice, rays, torch.rand(count, generator=random))
     points = warp.sample_points(rays, samples, lattice.contracted)
     table = torch.randn(layout.rows, 4, generator=random)
@@ -155,11 +155,11 @@ def everything(seed: int) -> list[Tensor]:
     apart = warp.depth_loss(samples, weights, rendering.opacity, rays.far, known, lattice)
     grad_apart = warp.depth_loss_backward(samples, rays.far, known, lattice, apart)
     depth, near = torch.zeros(count, dtype=torch.float64), rays.near.clone()
-    warp.end_wave(lattice, samples, sigma, 0.1, known - 1, rays.far, depth, near)
-    waves, order = warp.pack_waves([samples, front])
+    warp.finish_round(lattice, samples, sigma, 0.1, known - 1, rays.far, depth, near)
+    waves, order = warp.pack_rounds([samples, front])
     drawn_depth, shown, seen = torch.zeros_like(depth), torch.zeros(count), torch.zeros(count, 4)
-    drawn = warp.drawn_samples(samples, sigma, 0.1, drawn_depth, shown)
-    warp.add_drawn(drawn, colour.index_select(0, drawn.rows), seen)
+    drawn = warp.select_colour_samples(samples, sigma, 0.1, drawn_depth, shown)
+    warp.accumulate_colours(drawn, colour.index_select(0, drawn.rows), seen)
     harmonics = warp.spherical_harmonics(directions)
     grad_directions = warp.spherical_harmonics_backward(directions, harmonics)
     hidden = torch.randn(len(samples.t), 64, generator=random)
@@ -170,7 +170,7 @@ def everything(seed: int) -> list[Tensor]:
     adam = [torch.randn(layout.rows, 4, generator=random), grad_table.clone(), grad_table.clone(), grad_table.abs()]
     warp.adam(adam[0], adam[1], adam[2], adam[3], 1e-2, 3)
     thickness = torch.rand(512, generator=random)
-    warp.raise_cache(8, thickness, points, sigma)
+    warp.scatter_max(8, thickness, points, sigma)
     return [
         *(bits, *samples, points, features, grad_table, grad_points, *grad_rays, *front, kept, *rendering, weights),
         *(*grad_field, spread, grad_weights, apart, *grad_apart, depth, near, *waves, order),
@@ -207,7 +207,7 @@ def encode():
     return warp.encode(layout, torch.ones(layout.rows, 4), torch.full((5, 3), 0.3)).sum().item()
 
 def occupied():
-    return warp.occupied_bits(torch.arange(64.0), 62.5).item()
+    return warp.occupancy_bits(torch.arange(64.0), 62.5).item()
 
 def first_use(number):
     jobs = [encode, occupied]

@@ -225,17 +225,17 @@ def test_the_cache_is_the_reference_s_bit_for_bit(device: str, cells: int) -> No
     given = uniform(device, 37, cells**3)
     wanted, before = given.clone(), given.clone()
     points, values = grid_points(device), uniform(device, 38, 3001)
-    warp.raise_cache(cells, given, points, values)
-    reference.raise_cache(cells, wanted, points, values)
+    warp.scatter_max(cells, given, points, values)
+    reference.scatter_max(cells, wanted, points, values)
     assert torch.equal(given, wanted)
     assert (given > before).float().mean() > 0.01 and not (given < before).any()
-    assert torch.equal(warp.occupied_bits(given, 0.5), reference.occupied_bits(given, 0.5))
+    assert torch.equal(warp.occupancy_bits(given, 0.5), reference.occupancy_bits(given, 0.5))
 
 
 def test_a_cell_at_the_threshold_is_empty(device: str) -> None:
     thickness = torch.full((64,), 0.01, device=device)
     thickness[63] = 0.0100001
-    assert warp.occupied_bits(thickness, 0.01).tolist() == [-(1 << 63)]
+    assert warp.occupancy_bits(thickness, 0.01).tolist() == [-(1 << 63)]
 
 
 # What holds for all
@@ -280,9 +280,9 @@ def test_no_rays_and_no_samples_are_fine_even_at_first(device: str, rays: int) -
         warp.encode_backward_table(layout, 0, none, features, table)
         agree("visible_samples", samples, empty, 0.5, 0.1, few.near)
         agree("spherical_harmonics", few.directions)
-        agree("pack_waves", [samples, samples])
+        agree("pack_rounds", [samples, samples])
         depth, near = torch.zeros(rays, dtype=torch.float64, device=device), few.near.clone()
-        warp.end_wave(FOLDED, samples, empty, 0.5, few.near, few.far, depth, near)
+        warp.finish_round(FOLDED, samples, empty, 0.5, few.near, few.far, depth, near)
         assert torch.equal(near, few.far) and not depth.any()
         inputs = samples, empty, none, few.directions, few.far
         rendering, _ = agree("composite", *inputs)
@@ -292,7 +292,7 @@ def test_no_rays_and_no_samples_are_fine_even_at_first(device: str, rays: int) -
         warp.add_ray_relu(samples, hidden, torch.ones(rays, 64, device=device))
         assert not warp.add_ray_relu_backward(samples, hidden, hidden).any()
         warp.relu_backward(hidden, hidden)
-        warp.raise_cache(4, torch.ones(64, device=device), none, empty)
+        warp.scatter_max(4, torch.ones(64, device=device), none, empty)
 
     on_a_new_thread(everything)
 

@@ -7,9 +7,9 @@ import pytest
 
 from nerf.geometry.camera_paths import look_at
 from nerf.geometry.scene import Camera, Scene, Similarity, View
-from stages.mesh import picture as mesh_picture
+from stages.mesh import preview as mesh_preview
 from stages.mesh.files import ColouredMesh
-from stages.mesh.picture import ELEVATION, picture, viewpoints
+from stages.mesh.preview import ELEVATION, preview, viewpoints
 
 CUBE = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 UP = np.array([0, 0, 1.0])
@@ -72,11 +72,11 @@ def test_a_room_is_shown_from_inside():
 
 @pytest.mark.parametrize("centre", [(0.01, 0, 3), (2, 0, 1)])
 def test_the_picture_has_two_rows_of_colour_and_clay(monkeypatch, centre):
-    monkeypatch.setattr(mesh_picture, "WIDTH", 40)
-    monkeypatch.setattr(mesh_picture, "HEIGHT", 30)
+    monkeypatch.setattr(mesh_preview, "WIDTH", 40)
+    monkeypatch.setattr(mesh_preview, "HEIGHT", 30)
     faces = np.array([[0, 2, 4], [2, 6, 4], [1, 5, 3], [3, 5, 7]], np.int32)
     red = np.tile(np.array([220, 20, 20], np.uint8), (8, 1))
-    image = picture(ColouredMesh(CUBE, faces, CUBE, red), scene_of("around", [centre])).astype(int)
+    image = preview(ColouredMesh(CUBE, faces, CUBE, red), scene_of("around", [centre])).astype(int)
     assert image.shape == (60, 80, 3)
     redness = image[..., 0] - image[..., 1]
     assert (redness[:, :40] > 60).any() and redness[:, 40:].max() < 20

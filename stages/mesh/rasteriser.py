@@ -8,16 +8,16 @@ from typing import NamedTuple
 import numpy as np
 
 from nerf.geometry.camera_paths import look_at
-from stages.mesh.surface import face_crosses
+from stages.mesh.surface import face_area_vectors
 
 SUPERSAMPLING = 2
 FIELD_OF_VIEW = 35.0  # degrees
-BLOCK = 1 << 17  # triangle-pixel pairs tested at a time: what fits into a processor's cache
-KEY_LIGHT, HEADLIGHT, SKY = 0.45, 0.30, 0.30  # shares of the shading; together a little over 1 where all agree
+CHUNK = 1 << 17  # triangle-pixel pairs tested at a time: what fits into a processor's cache
+KEY_LIGHT, HEADLIGHT, AMBIENT = 0.45, 0.30, 0.30  # fractions of the shading; together a little over 1
 TOWARDS_LIGHT = np.array([-0.5, -0.75, -0.45]) / np.linalg.norm([0.5, 0.75, 0.45])  # camera axes: upper left, behind
 CLAY = np.array([205, 200, 192], np.uint8)
 BACKFACE = np.array([96, 84, 92], np.float32)  # the inside of an open surface must not pass for its outside
-SKY_TOP, SKY_BOTTOM = np.array([250.0, 251, 253]), np.array([222.0, 226, 232])
+BACKGROUND_TOP, BACKGROUND_BOTTOM = np.array([250.0, 251, 253]), np.array([222.0, 226, 232])
 
 
 class Viewpoint(NamedTuple):
@@ -29,21 +29,21 @@ class Viewpoint(NamedTuple):
     height: int
 
 
-class Seen(NamedTuple):
+class Fragments(NamedTuple):
     """What a viewpoint sees, per subpixel on the mesh: the part of a picture worth doing once for several colours.
 
-    ``pixel`` is its flat index, ``face`` the face in front, ``share`` (n, 3) what each corner has of it, in
-    perspective, ``light`` how bright it is, and ``away`` whether the face's back is seen.
+    ``pixel`` is its flat index, ``face`` the face in front, ``barycentric`` (n, 3) its perspective-correct weights,
+    ``light`` how bright it is, and ``backfacing`` whether the back of the face is seen.
     """
 
     pixel: np.ndarray
     face: np.ndarray
-    share: np.ndarray
+    barycentric: np.ndarray
     light: np.ndarray
-    away: np.ndarray
+    backfacing: np.ndarray
 
 
-def look(vertices: np.ndarray, faces: np.ndarray, camera: Viewpoint) -> Seen:
+def rasterise(vertices: np.ndarray, faces: np.ndarray, camera: Viewpoint) -> Fragments:
     """The faces in front, and the light on them. Faces that reach behind the camera are left out."""
     camera = _supersampled(camera)
     points = _in_camera(vertices, camera)
@@ -54,11 +54,13 @@ def look(vertices: np.ndarray, faces: np.ndarray, camera: Viewpoint) -> Seen:
     winner = _nearest_faces(pixels, depth, faces[usable], camera)
     pixel = np.flatnonzero(winner >= 0)
     face = usable[winner[pixel]]
-    return Seen(pixel, face, *_lit(points, faces, face, pixel, camera))
+    return Fragments(pixel, face, *_lit(points, faces, face, pixel, camera))
 
 
-def shade(seen: Seen, faces: np.ndarray, colours: np.ndarray | None, camera: Viewpoint, shading: float) -> np.ndarray:
-    """Colour what :func:`look` saw of a mesh and average the subpixels, to (height, width, 3) uint8.
+def shade(
+    fragments: Fragments, faces: np.ndarray, colours: np.ndarray | None, camera: Viewpoint, shading: float
+) -> np.ndarray:
+    """Colour the fragments of a mesh and average the subpixels, to (height, width, 3) uint8.
 
     ``colours`` are one uint8 triple per vertex, or None for plain clay; ``shading`` blends from the colours as they
     are (0) to fully lit (1).
@@ -67,10 +69,12 @@ def shade(seen: Seen, faces: np.ndarray, colours: np.ndarray | None, camera: Vie
     if colours is None:
         colour = CLAY.astype(np.float32)
     else:
-        colour = (seen.share[:, :, None] * colours[faces[seen.face]]).sum(axis=1)
-    light = seen.light[:, None]
+        colour = (fragments.barycentric[:, :, None] * colours[faces[fragments.face]]).sum(axis=1)
+    light = fragments.light[:, None]
     lit = colour * (1 - shading + shading * light)
-    image[seen.pixel] = np.clip(np.where(seen.away[:, None], 0.5 * lit + 0.5 * BACKFACE * light, lit), 0, 255)
+    image[fragments.pixel] = np.clip(
+        np.where(fragments.backfacing[:, None], 0.5 * lit + 0.5 * BACKFACE * light, lit), 0, 255
+    )
     tiled = image.reshape(camera.height, SUPERSAMPLING, camera.width, SUPERSAMPLING, 3)
     return np.rint(tiled.mean(axis=(1, 3))).astype(np.uint8)
 
@@ -97,15 +101,15 @@ def _nearest_faces(pixels: np.ndarray, depth: np.ndarray, faces: np.ndarray, cam
     winner = np.full(camera.width * camera.height, -1)
     todo = np.flatnonzero(pairs)
     ends = np.cumsum(pairs[todo])
-    for block in np.split(todo, np.searchsorted(ends, np.arange(BLOCK, ends[-1], BLOCK)) if len(ends) else []):
+    for block in np.split(todo, np.searchsorted(ends, np.arange(CHUNK, ends[-1], CHUNK)) if len(ends) else []):
         face = np.repeat(block, pairs[block])
         within = np.arange(len(face)) - np.repeat(np.cumsum(pairs[block]) - pairs[block], pairs[block])
         row, column = np.divmod(within, extent[face, 0])
         x, y = first[face, 0] + column, first[face, 1] + row
-        share = _barycentric(corners[face], np.stack([x, y], axis=1) + 0.5)
-        inside = (share >= 0).all(axis=1)
+        barycentric = _barycentric(corners[face], np.stack([x, y], axis=1) + 0.5)
+        inside = (barycentric >= 0).all(axis=1)
         face, pixel = face[inside], y[inside] * camera.width + x[inside]
-        nearness = (share[inside] * inverse_depth[face]).sum(axis=1)
+        nearness = (barycentric[inside] * inverse_depth[face]).sum(axis=1)
         order = np.argsort(nearness, kind="stable")  # of equal pixels the last, nearest, assignment stands
         pixel, face, nearness = pixel[order], face[order], nearness[order]
         front = nearness > best[pixel]
@@ -128,37 +132,37 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def _lit(
     points: np.ndarray, faces: np.ndarray, face: np.ndarray, pixel: np.ndarray, camera: Viewpoint
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The shares, light and backs of :class:`Seen`, float32; ``points`` are in camera coordinates.
+    """Barycentric weights, light and backfacing of :class:`Fragments`, float32; ``points`` are in camera coordinates.
 
     What belongs to a face is computed once for it, in float64: a small one's cross products nearly cancel.
     """
     a, b, c = points[faces].swapaxes(0, 1)
     opposite = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1).astype(np.float32)
-    normals = face_crosses(points, faces)
+    normals = face_area_vectors(points, faces)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     normals = np.divide(normals, length, out=normals, where=length > 0).astype(np.float32)[face]
     row, column = np.divmod(pixel, camera.width)
     ray = np.stack([column + 0.5 - camera.width / 2, row + 0.5 - camera.height / 2], axis=1) / camera.focal_px
     ray = np.concatenate([ray, np.ones((len(ray), 1))], axis=1).astype(np.float32)
-    share = np.einsum("nkj,nj->nk", opposite[face], ray)
-    share /= share.sum(axis=1, keepdims=True)
+    barycentric = np.einsum("nkj,nj->nk", opposite[face], ray)
+    barycentric /= barycentric.sum(axis=1, keepdims=True)
     towards = np.einsum("nj,nj->n", normals, ray)
-    away = towards > 0
-    normals[away] *= -1
+    backfacing = towards > 0
+    normals[backfacing] *= -1
     light = KEY_LIGHT * np.clip(normals @ TOWARDS_LIGHT.astype(np.float32), 0, 1)
     light += HEADLIGHT * np.abs(towards) / np.linalg.norm(ray, axis=1)
-    light += SKY * (0.5 - 0.5 * normals[:, 1]) + 0.15
-    return share, light, away
+    light += AMBIENT * (0.5 - 0.5 * normals[:, 1]) + 0.15
+    return barycentric, light, backfacing
 
 
 def _background(camera: Viewpoint) -> np.ndarray:
     """A light vertical gradient, flat (pixels, 3)."""
-    share = np.linspace(0, 1, camera.height)[:, None]
-    rows = (1 - share) * SKY_TOP + share * SKY_BOTTOM
+    height = np.linspace(0, 1, camera.height)[:, None]
+    rows = (1 - height) * BACKGROUND_TOP + height * BACKGROUND_BOTTOM
     return np.repeat(rows.astype(np.float32), camera.width, axis=0)
 
 
-def framing(vertices: np.ndarray, towards: np.ndarray, up: np.ndarray, width: int, height: int) -> Viewpoint:
+def frame_mesh(vertices: np.ndarray, towards: np.ndarray, up: np.ndarray, width: int, height: int) -> Viewpoint:
     """A camera that shows all of ``vertices`` from direction ``towards`` (from the mesh to the camera)."""
     towards = towards / np.linalg.norm(towards)
     focal_px = min(width, height) / 2 / np.tan(np.radians(FIELD_OF_VIEW) / 2)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stages.mesh.shading import SUPERSAMPLING, Viewpoint, framing, look, shade
+from stages.mesh.rasteriser import SUPERSAMPLING, Viewpoint, frame_mesh, rasterise, shade
 
 FORWARD = np.eye(3, 4)  # at the origin, looking along +z
 CAMERA = Viewpoint(FORWARD, 50.0, 64, 48)
@@ -16,7 +16,7 @@ def plain(colour, count=4):
 
 
 def preview(vertices, faces, colours, camera, shading=1.0):
-    return shade(look(vertices, faces, camera), faces, colours, camera, shading)
+    return shade(rasterise(vertices, faces, camera), faces, colours, camera, shading)
 
 
 def shown(image, colour):
@@ -100,7 +100,7 @@ def test_nothing_to_see_is_the_background(vertices):
 @pytest.mark.parametrize("towards", [(1.0, 0, 0.2), (-1, 2, 3), (0, 1, -0.5)])
 def test_framing_shows_everything_and_fills_the_picture(towards):
     vertices = np.random.default_rng(0).normal(size=(500, 3)) * [1, 2, 0.3] + [10, -4, 2]
-    camera = framing(vertices, np.array(towards), np.array([0, 0, 1.0]), 200, 150)
+    camera = frame_mesh(vertices, np.array(towards), np.array([0, 0, 1.0]), 200, 150)
     points = (vertices - camera.from_camera[:, 3]) @ camera.from_camera[:, :3]
     assert (points[:, 2] > 0).all()
     reach = np.abs(points[:, :2] / points[:, 2:]) * camera.focal_px / [100, 75]
