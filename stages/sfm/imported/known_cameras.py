@@ -1,8 +1,8 @@
 """Cameras that are known already: transforms.json, Blender's transforms_train/test.json, or a COLMAP model.
 
-Poses in transforms files are world_from_camera with OpenGL axes (x right, y up, z backward); they are turned to
-OpenCV axes here and nowhere else. Photos are told apart by their own names, as ingest noted them. Cameras of photos as
-their files store them are turned upright as ingest turned the photos.
+Poses in transforms files are world_from_camera with OpenGL axes (x right, y up, z backward); they are turned to OpenCV
+axes here and nowhere else. Photos are told apart by their own names, as ingest noted them. Cameras of photos as their
+files store them are turned upright as ingest turned the photos.
 """
 
 import os
