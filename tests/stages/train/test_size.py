@@ -190,7 +190,7 @@ def test_ray_samples_multiply_the_samples_along_a_ray(contracted: bool, factor: 
     sizes = {"levels": 4, "log2_rows": 16, "finest": 512, "contracted": contracted}
     usual = grid_settings(GRID.model_copy(update=sizes), sky=False)
     asked = grid_settings(GRID.model_copy(update=sizes | {"ray_samples": factor}), sky=False)
-    assert asked.steps == pytest.approx(factor * usual.steps, abs=0.5)
+    assert asked.diagonal_steps == pytest.approx(factor * usual.diagonal_steps, abs=0.5)
     assert asked.cone_angle == pytest.approx(usual.cone_angle / factor)
     assert asked.stepping.step_size == pytest.approx(usual.stepping.step_size / factor, rel=0.01)
     reach = [each.max_samples_per_ray * each.stepping.step_size for each in (usual, asked)]
