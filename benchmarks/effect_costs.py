@@ -19,8 +19,8 @@ from benchmarks.grid_parts import loaded
 from benchmarks.nerfacto import pipeline
 from nerf.effects import NO_EFFECTS
 from nerf.geometry.scene import Scene
-from nerf.runtime.matmul_precision import products_at
-from nerf.training.ray_dataset import RayBank
+from nerf.runtime.matmul_precision import use_matmul_precision
+from nerf.training.ray_dataset import RayDataset
 from nerf.training.trainer import FieldTrainer
 from stages.effects.decisions import Decisions, image_effects
 from stages.train import Config
@@ -51,7 +51,9 @@ class Timed:
         return timed
 
 
-def arms(config: Config, scene: Scene, bank: RayBank, decided: Decisions, identity: Timed) -> dict[str, FieldTrainer]:
+def arms(
+    config: Config, scene: Scene, bank: RayDataset, decided: Decisions, identity: Timed
+) -> dict[str, FieldTrainer]:
     """A trainer for each choice; ``identity`` stands in the first one."""
     views = scene.of_split("train")
     none = replace(decided, view_dependence=True, pose_refinement=False, exposure=None)
@@ -86,7 +88,7 @@ def main() -> None:
     identity = Timed(NO_EFFECTS)
     trainers = arms(config, scene, bank, decided, identity)
     seconds: dict[str, list[float]] = {name: [] for name in trainers}
-    with products_at(config.matmul):
+    with use_matmul_precision(config.matmul):
         for each in trainers.values():
             for step in range(WARM_STEPS):
                 each.step(step, SHARE, 1.0)

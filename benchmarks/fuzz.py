@@ -123,7 +123,7 @@ def _in_words(fault: Exception) -> str:
 
 
 def print_table(table: dict[str, dict[str, Any]]) -> None:
-    """As it stands in docs/numbers.md."""
+    """As it stands in docs/results.md."""
     print("| loader | tried | refused in words | faults | seconds |\n|---|---|---|---|---|")
     for name, row in table.items():
         print(f"| {name} | {row['tried']} | {row['refused']} | {len(row['faults'])} | {row['seconds']:.0f} |")

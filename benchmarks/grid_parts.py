@@ -17,8 +17,8 @@ import torch
 from benchmarks.nerfacto import pipeline, stage_folder
 from benchmarks.pixel_store import Spoken
 from nerf.geometry.scene import Scene
-from nerf.runtime.matmul_precision import products_at
-from nerf.training.ray_dataset import RayBank
+from nerf.runtime.matmul_precision import use_matmul_precision
+from nerf.training.ray_dataset import RayDataset
 from nerf.training.trainer import FieldTrainer
 from stages.effects.decisions import Decisions, image_effects, read_decisions
 from stages.hardware.device import compute_device, cores
@@ -48,7 +48,7 @@ def main() -> None:
     config, trainer = prepared(workspace, Config(seconds=given.seconds, downscale=given.downscale))
     timings: dict[str, Any] = {}
     device = torch.device(compute_device())
-    with products_at(config.matmul):
+    with use_matmul_precision(config.matmul):
         for step in range(WARM_STEPS):
             trainer.step(step, SHARE, 1.0)
         for step in range(WARM_STEPS, WARM_STEPS + TIMED_STEPS):
@@ -65,7 +65,7 @@ def prepared(workspace: Path, asked: Config) -> tuple[Config, FieldTrainer]:
     )
 
 
-def loaded(workspace: Path, asked: Config) -> tuple[Config, Scene, RayBank, Decisions]:
+def loaded(workspace: Path, asked: Config) -> tuple[Config, Scene, RayDataset, Decisions]:
     """What a fresh field is made of: the settings that stage train chose, which are printed, and its inputs."""
     inputs = {stage: stage_folder(workspace, output) for stage, output in LINKED.items()}
     scene, config = read_scene(inputs["normalise"]), plan(asked, inputs, Spoken())

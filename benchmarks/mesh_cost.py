@@ -1,4 +1,4 @@
-"""What a mesh costs: seconds and distance to what is known of the surface, against the lattice's resolution.
+"""What a mesh costs: seconds and distance to what is known of the surface, against the grid's resolution.
 
     pipeline run PHOTOS --until train --train.steps 1500
     python -m benchmarks.mesh_cost PHOTOS.nerf
@@ -22,11 +22,9 @@ from nerf import REGION_HALF
 from pipeline.demo.truth import Truth, compare_with_truth
 from pipeline.engine.workspace import Workspace
 from stages.contract import Inputs
-from stages.hardware.device import compute_device
-from stages.io.field_files import load_field
-from stages.io.files import read_scene, read_tensors
-from stages.mesh import Config, reconstruct, write_mesh
-from stages.mesh.samples import sample_surface
+from stages.mesh import Config
+from stages.mesh.extraction import extract_mesh, load, write_mesh
+from stages.mesh.surface import sample_surface
 
 if TYPE_CHECKING:
     from nerf.geometry.scene import Scene
@@ -67,14 +65,14 @@ def to_points(mesh: "ColouredMesh", points: np.ndarray) -> str:
 
 def row(folders: Inputs, resolution: int, truth: Truth | None) -> str:
     """One resolution's row of the table."""
-    scene, device = read_scene(folders["normalise"]), compute_device()
-    model, _ = load_field(folders["train"], device)
-    normalise = folders["normalise"]
-    points = read_tensors(normalise / "points.safetensors")["xyz"].astype(float)
+    source = load(folders, Quiet())
     started = time.perf_counter()
-    made = reconstruct(Config(resolution=resolution), model, scene, folders["ingest"], points, device, Quiet())
+    made = extract_mesh(Config(resolution=resolution), source, Quiet())
     seconds = time.perf_counter() - started
-    known = to_points(made.mesh, points) if truth is None else to_truth(made.mesh, scene, normalise, truth)
+    if truth is None:
+        known = to_points(made.mesh, source.points)
+    else:
+        known = to_truth(made.mesh, source.scene, folders["normalise"], truth)
     return f"| {resolution}³ | {len(made.mesh.faces):,} | {seconds:.1f} | {known} |"
 
 
@@ -90,7 +88,7 @@ def main() -> None:
     folders = {stage: workspace.folder(stage, keys[stage]) for stage in ("ingest", "normalise", "train")}
     truth = Truth.read(given.truth) if given.truth else None
     names = "mesh to truth (%) | truth to mesh (%)" if truth else "median point to mesh (%) | nine in ten within (%)"
-    print(f"| lattice | faces | s | {names} |\n|---|---|---|---|---|")
+    print(f"| grid | faces | s | {names} |\n|---|---|---|---|---|")
     for resolution in given.resolutions:
         print(row(folders, resolution, truth), flush=True)
 

@@ -22,15 +22,15 @@ import torch
 from torch import Tensor
 
 from nerf.fields.positional_encoding import positional_encoding
-from nerf.fields.vanilla import PaperNerf, PaperSettings
+from nerf.fields.vanilla import VanillaNerf, VanillaSettings
 from nerf.geometry.rays import Rays, points_on
 from nerf.rendering.sampling import midpoint_edges, sample_pdf, stratified
 from nerf.rendering.volume_rendering import composite
 from nerf.runtime.randomness import generator
 
 PRESETS = {
-    "small": PaperSettings(depth=4, width=64, samples_coarse=32, samples_fine=32),
-    "paper": PaperSettings(),
+    "small": VanillaSettings(depth=4, width=64, samples_coarse=32, samples_fine=32),
+    "paper": VanillaSettings(),
 }
 BACKGROUND = torch.ones(3)
 
@@ -55,7 +55,7 @@ def random_rays(count: int) -> Rays:
     return Rays(origins, directions, torch.full((count,), 2.0), torch.full((count,), 4.0))
 
 
-def products(model: PaperNerf, rays: int, backward: bool) -> Callable[[], None]:
+def products(model: VanillaNerf, rays: int, backward: bool) -> Callable[[], None]:
     """The bare matrix products of both networks, into memory that is already there."""
     settings = model.settings
     triples: list[tuple[Tensor, Tensor, Tensor]] = []
@@ -80,17 +80,17 @@ def products(model: PaperNerf, rays: int, backward: bool) -> Callable[[], None]:
     return work
 
 
-def forward(model: PaperNerf, rays: Rays) -> None:
+def forward(model: VanillaNerf, rays: Rays) -> None:
     with torch.no_grad():
         model.render_training(rays, BACKGROUND, generator("cpu", 0))
 
 
-def forward_and_backward(model: PaperNerf, rays: Rays) -> None:
+def forward_and_backward(model: VanillaNerf, rays: Rays) -> None:
     coarse, fine = model.render_training(rays, BACKGROUND, generator("cpu", 0))
     (coarse.colour.square().sum() + fine.colour.square().sum()).backward()
 
 
-def print_rates(model: PaperNerf, batches: tuple[int, ...]) -> None:
+def print_rates(model: VanillaNerf, batches: tuple[int, ...]) -> None:
     print("rays at a time   render rays/s   forward+backward rays/s")
     for count in batches:
         rays = random_rays(count)
@@ -98,7 +98,7 @@ def print_rates(model: PaperNerf, batches: tuple[int, ...]) -> None:
         print(f"{count:14d}   {count / render:13.0f}   {count / train:23.0f}")
 
 
-def print_parts(model: PaperNerf, count: int) -> None:
+def print_parts(model: VanillaNerf, count: int) -> None:
     """Time of each part alone on inputs of its size, as a share of training's forward pass."""
     settings, rays, random = model.settings, random_rays(count), generator("cpu", 1)
     assert model.coarse is not None
@@ -125,7 +125,7 @@ def print_parts(model: PaperNerf, count: int) -> None:
         print(f"  {name:32s} {100 * part / whole:5.1f} %")
 
 
-def print_floor(model: PaperNerf, count: int) -> None:
+def print_floor(model: VanillaNerf, count: int) -> None:
     """The share of the time that the matrix products alone would take."""
     rays = random_rays(count)
     for run in (forward, forward_and_backward):
@@ -139,7 +139,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
-    model = PaperNerf(PRESETS[options.preset], seed=0)
+    model = VanillaNerf(PRESETS[options.preset], seed=0)
     print(f"{options.preset}, {options.threads} threads, torch {torch.__version__}")
     print_rates(model, (128, 256, 1024, 4096) if options.preset == "small" else (16, 64, 256))
     count = 256 if options.preset == "small" else 32

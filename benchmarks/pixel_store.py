@@ -28,8 +28,8 @@ import numpy as np
 from PIL import Image
 
 from nerf.geometry.scene import Camera, Scene, Similarity, View
-from nerf.training.pixel_sampler import PixelOrder
-from nerf.training.ray_dataset import RayBank
+from nerf.training.pixel_sampler import PixelSampler
+from nerf.training.ray_dataset import RayDataset
 from stages.hardware.backend import chosen_backend
 from stages.hardware.device import compute_device
 from stages.hardware.memory import available_bytes
@@ -91,9 +91,9 @@ def milliseconds(work: Callable[[], object], repeats: int) -> str:
     return f"{statistics.median(taken):8.2f} ms (lowest {min(taken):.2f})"
 
 
-def draw(bank: RayBank, where: str, repeats: int = REPEATS) -> None:
+def draw(bank: RayDataset, where: str, repeats: int = REPEATS) -> None:
     """Time batches of rays."""
-    order = PixelOrder(bank.drawable, 0, bank.device)
+    order = PixelSampler(bank.drawable, 0, bank.device)
     for count in BATCHES:
         places = itertools.count(step=count)
         taken = milliseconds(lambda n=count, p=places: bank.lookup(bank.nth(order.take(next(p), n))), repeats)
@@ -135,7 +135,7 @@ def measure(ingest: Path, photos: int, downscale: float) -> None:
     scene = paint(ingest, photos)
     print(f"{photos} photos of {WIDTH} x {HEIGHT}, each with its own camera, at 1/{downscale:g}; {memory()}")
 
-    def opened() -> RayBank:
+    def opened() -> RayDataset:
         started = time.perf_counter()
         bank = training_bank(ingest, scene, "train", downscale, Spoken())
         print(f"opened in {time.perf_counter() - started:.1f} s; {memory()}")
@@ -152,7 +152,7 @@ def measure(ingest: Path, photos: int, downscale: float) -> None:
     draw(opened(), "from the disk", 5)
 
 
-def warm(bank: RayBank) -> None:
+def warm(bank: RayDataset) -> None:
     """Batches from a store that memory holds, and from a copy in plain memory."""
     draw(bank, "first ones", 5)
     bank.pixels.view(-1)[:: mmap.PAGESIZE].sum()

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from nerf.training.hash_grid_trainer import CONSTANT_SHARE
+from nerf.training.hash_grid_trainer import LR_HOLD_FRACTION
 from nerf.training.learning_curve import FEWEST_STEPS, Curve, last_doubling
 
 SHARE = 0.8  # of the truths that an interval is to hold
@@ -61,7 +61,7 @@ def final(run: Run) -> float:
 
 def in_use(run: Run) -> bool:
     """Whether a run was made in one piece, under the schedule that is in use."""
-    return run["schedule"] == "whole" and run["constant"] == CONSTANT_SHARE
+    return run["schedule"] == "whole" and run["constant"] == LR_HOLD_FRACTION
 
 
 def cases_of(runs: list[Run]) -> list[Case]:

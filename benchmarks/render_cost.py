@@ -15,9 +15,9 @@ from pathlib import Path
 import torch
 
 from nerf.effects.appearance import AppearanceModel
-from nerf.fields.hash_grid import GridField
+from nerf.fields.hash_grid import HashGridField
 from nerf.fields.interface import RadianceModel
-from nerf.fields.vanilla import PaperNerf
+from nerf.fields.vanilla import VanillaNerf
 from nerf.training.metrics import mean_squared_error, psnr
 from pipeline.engine.workspace import Workspace
 from stages.effects.decisions import expected_gains
@@ -32,16 +32,16 @@ def with_samples(model: RadianceModel, factor: float) -> RadianceModel:
     """The same field with so many times the samples along each ray."""
     if isinstance(model, AppearanceModel):
         return AppearanceModel(with_samples(model.model, factor), model.effects)
-    if isinstance(model, GridField):
+    if isinstance(model, HashGridField):
         given = model.settings
         finer = {"shortest_step": given.shortest_step / factor, "cone": given.cone / factor}
         settings = replace(given, steps=max(1, round(given.steps * factor)), **finer)
-        changed: GridField | PaperNerf = GridField(settings, 0, model.backend)
+        changed: HashGridField | VanillaNerf = HashGridField(settings, 0, model.backend)
     else:
-        assert isinstance(model, PaperNerf)
+        assert isinstance(model, VanillaNerf)
         given = model.settings
         coarse, fine = (max(2, round(count * factor)) for count in (given.samples_coarse, given.samples_fine))
-        changed = PaperNerf(replace(given, samples_coarse=coarse, samples_fine=fine), seed=0)
+        changed = VanillaNerf(replace(given, samples_coarse=coarse, samples_fine=fine), seed=0)
     changed.load_state_dict(model.state_dict())
     return changed.to(next(iter(model.state_dict().values())).device).requires_grad_(False)
 
@@ -50,10 +50,10 @@ def samples_of(model: RadianceModel) -> str:
     """How the samples of a field are laid, in its own terms."""
     if isinstance(model, AppearanceModel):
         return samples_of(model.model)
-    if isinstance(model, GridField):
+    if isinstance(model, HashGridField):
         step, bounded = model.drawn_lattice.step, f"{model.settings.steps} along the box's diagonal"
         return f"steps from {step:.4f}" if model.settings.contracted else bounded
-    assert isinstance(model, PaperNerf)
+    assert isinstance(model, VanillaNerf)
     return f"{model.settings.samples_coarse} + {model.settings.samples_fine}"
 
 

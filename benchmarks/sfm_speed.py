@@ -9,7 +9,7 @@ more where the machine does other work; what was registered, the mean reprojecti
 ``reference_cameras.json`` has measured cameras, the mean distance of the camera centres after the similarity that fits
 them best and the mean angle between the rotations.
 
-Figures are in docs/numbers.md.
+Figures are in docs/results.md.
 """
 
 import argparse

@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from nerf.effects import NO_EFFECTS, ImageEffects, RayGradients, RenderedRays, TrainingImages
-from nerf.fields.hash_grid import GridField
+from nerf.fields.hash_grid import HashGridField
 from nerf.geometry.rays import Rays
 from nerf.geometry.rotations import rotation_from_vector
 from nerf.runtime.randomness import generator
@@ -111,7 +111,7 @@ def _gauge(centres: Float[Tensor, "views 3"], unit: Float[Tensor, "views 1"]) ->
 
 
 def fit_pose(
-    model: GridField,
+    model: HashGridField,
     rays: Rays,
     target: Float[Tensor, "pixels 3"],
     background: Float[Tensor, "3"],
@@ -141,7 +141,7 @@ def fit_pose(
 
 
 def _pose_gradients(
-    model: GridField,
+    model: HashGridField,
     pose: PoseRefinement,
     effects: ImageEffects,
     pixels: tuple[Rays, Float[Tensor, "pixels 3"], Float[Tensor, "3"]],

@@ -14,14 +14,14 @@ from torch import Tensor
 
 from nerf.effects import NO_EFFECTS, ImageEffects, RenderedRays
 from nerf.fields.interface import RadianceModel, Rendering
-from nerf.fields.vanilla import PaperNerf
+from nerf.fields.vanilla import VanillaNerf
 from nerf.geometry.rays import Rays
 from nerf.runtime.parallel import in_order
 from nerf.runtime.profiler import Work, part
 from nerf.runtime.randomness import generator
 from nerf.training.metrics import psnr
-from nerf.training.pixel_sampler import PixelOrder
-from nerf.training.ray_dataset import RayBank
+from nerf.training.pixel_sampler import PixelSampler
+from nerf.training.ray_dataset import RayDataset
 from nerf.training.schedule import learning_rate
 
 # Rays per chunk of a batch, each on its own core; elsewhere a batch is one chunk. Their gradients are added in order,
@@ -89,7 +89,7 @@ def all_finite(rays: Rays) -> bool:
 
 
 @dataclass(frozen=True)
-class TrainerSettings:
+class VanillaTrainerSettings:
     """How to train. ``background`` is what lies behind the scene: a colour, or another random one each step
     (only for photos with alpha, where it shows the field which space is empty)."""
 
@@ -130,22 +130,22 @@ class _Part(NamedTuple):
     gradients: tuple[Tensor, ...]
 
 
-class PaperTrainer:
+class VanillaTrainer:
     """Trains coarse and fine network together on |C_c - C|² + |C_f - C|² (Mildenhall et al. 2020, eq. 6) by Adam
     with the published constants; the loss is the mean over rays and channels. ``effects`` stand
     between the field and each image (nerf/effects)."""
 
     def __init__(
         self,
-        model: PaperNerf,
-        bank: RayBank,
-        settings: TrainerSettings,
+        model: VanillaNerf,
+        bank: RayDataset,
+        settings: VanillaTrainerSettings,
         effects: ImageEffects = NO_EFFECTS,
     ) -> None:
         self.model = model
         self.bank = bank
         self.settings = settings
-        self.order = PixelOrder(bank.drawable, settings.seed, bank.device)
+        self.order = PixelSampler(bank.drawable, settings.seed, bank.device)
         self.effects = effects
         networks = [p for p in model.parameters() if p.requires_grad]
         groups = [{"params": networks, "of_start": 1.0}]

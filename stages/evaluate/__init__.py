@@ -29,11 +29,11 @@ if TYPE_CHECKING:
     from stages.render.renderer import Painter
     from stages.train.data import PhotoReader
 
-NEEDS = ("ingest", "normalise", "train")
+INPUTS = ("ingest", "normalise", "train")
 VERSION = 12
 RESUMES = False
-LINKS = ("metrics.json", "renders", "errors")
-UNKEYED = ("seconds",)  # it decides how many photos, and that enters the key
+PUBLISHED = ("metrics.json", "renders", "errors")
+NOT_HASHED = ("seconds",)  # it decides how many photos, and that enters the key
 
 BACKGROUNDS = {"white": WHITE, "black": BLACK}
 RIGHT_HALVES = ("psnr_right", "psnr_fitted_right", "psnr_posed_right")
@@ -234,13 +234,13 @@ class Examiner:
     def _from_fitted_pose(self, view: "View", truth: "Tensor", used: "Tensor | None") -> "Rendering":
         """The view from where its left half says that it was taken."""
         from nerf.effects.appearance import AppearanceModel
-        from nerf.fields.hash_grid import GridField
+        from nerf.fields.hash_grid import HashGridField
         from stages.evaluate.half_images import from_fitted_pose
         from stages.train.data import view_rays
 
         model = self.painter.model
         field = model.model if isinstance(model, AppearanceModel) else model
-        assert isinstance(field, GridField), "only with a grid field does evaluate fit poses"
+        assert isinstance(field, HashGridField), "only with a grid field does evaluate fit poses"
         rays = view_rays(self.scene, view, self.downscale)
         as_it_is = replace(self.painter, model=field).draw(rays)
         moved = from_fitted_pose(field.on_cpu(), rays, as_it_is, self.painter.background.cpu(), truth, used)

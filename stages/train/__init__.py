@@ -16,11 +16,11 @@ if TYPE_CHECKING:
     from nerf.geometry.scene import Scene
     from stages.train.loop import TrainingRun
 
-NEEDS = ("ingest", "normalise", "effects")
+INPUTS = ("ingest", "normalise", "effects")
 VERSION = 23
 RESUMES = True
-LINKS = ("curve.json",)
-UNKEYED = ("checkpoint_seconds", "tensorboard")
+PUBLISHED = ("curve.json",)
+NOT_HASHED = ("checkpoint_seconds", "tensorboard")
 
 # Of training, where neither seconds nor steps are given.
 SECONDS = {"draft": 30.0, "standard": 180.0, "high": 900.0, "paper": 3600.0}
@@ -53,10 +53,10 @@ PAPER_SIZES = {
 GRID_RATES = {"bounded": 2e-2, "contracted": 1e-2}
 MOST_PARTS = 64  # of a step
 # Colours that each part of a step computes, so each core: half of what a part takes does not depend on how many they
-# are, and fewer cost as long. In a box more of them go with its closer samples (docs/numbers.md).
+# are, and fewer cost as long. In a box more of them go with its closer samples (docs/experiments/colour_samples.md).
 PART_SAMPLES = {"bounded": 3 << 13, "contracted": 1 << 14}
 # The largest step, which a GPU takes as fast as a small one. Its gradients are sure enough for the larger rate
-# (docs/numbers.md).
+# (docs/experiments/colour_samples.md).
 LARGEST_STEP, LARGE_STEP_RATE = 1 << 18, 2e-2
 
 GRID_ONLY = ("backend", "chunks", "levels", "log2_rows", "finest", "batch_samples", "ray_samples")
@@ -272,7 +272,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     Raises:
         StageError: if training diverges or the field does not learn, every remedy of ours having failed.
     """
-    from nerf.runtime.matmul_precision import products_at
+    from nerf.runtime.matmul_precision import use_matmul_precision
     from stages.effects.decisions import learnt_of_photos
     from stages.io.field_files import save_field
     from stages.train.curve import write_curve
@@ -287,7 +287,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
         scene = _with_photos_aside(config, scene, progress)
     training = prepare(config, scene, inputs, folder, progress)
     say_if_inexact(config, progress)
-    with products_at(config.matmul):
+    with use_matmul_precision(config.matmul):
         training.train()
     info = {"downscale": config.downscale, "steps": training.state.step, "rays": training.state.rays}
     info["background"] = list(field_background(config, scene))
@@ -297,7 +297,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     write_curve(folder, config.kind, config.downscale, training.plan.is_whole, training.state.curve)
     progress.update("measuring what this machine can do")
     device = training.probes.train.colours.device
-    with products_at(config.matmul):
+    with use_matmul_precision(config.matmul):
         parts = write_parts(folder, training.state.timings, training.trainer.model, device)
     return _result(config, training, folder, parts, earlier, progress)
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from nerf.geometry.rays import Rays
     from nerf.geometry.scene import Camera, Scene, Split, View
-    from nerf.training.ray_dataset import RayBank
+    from nerf.training.ray_dataset import RayDataset
     from stages.io.pixel_store import PixelStore
 
 # Along the longer side of a picture. At 1000 pixels the bearings are then off by at most 0.002 of them for a phone's
@@ -55,7 +55,7 @@ def patch_bearings(camera: "Camera", downscale: float) -> "Tensor":
     return torch.from_numpy(camera_rays(camera, math.ceil(width / shrink), math.ceil(height / shrink)))
 
 
-def training_bank(ingest: Path, scene: "Scene", split: "Split", downscale: float, progress: Progress) -> "RayBank":
+def training_bank(ingest: Path, scene: "Scene", split: "Split", downscale: float, progress: Progress) -> "RayDataset":
     """All pixels and rays of one split, on the CPU; the pixels are mapped from the pixel store, which is made if need
     be. What masks ignore is never drawn. Raises StageError, NOTHING_LEFT, where they leave nothing."""
     import numpy as np
@@ -91,7 +91,7 @@ def training_bank(ingest: Path, scene: "Scene", split: "Split", downscale: float
     return _masked(bank, masks, split, progress)
 
 
-def guided_bank(inputs: Inputs, scene: "Scene", downscale: float, progress: Progress) -> "RayBank":
+def guided_bank(inputs: Inputs, scene: "Scene", downscale: float, progress: Progress) -> "RayDataset":
     """:func:`training_bank` of the training photos, which knows how far away are the sparse points that they show.
 
     Of normalise's points only those that two training photos saw at least, where these saw them."""
@@ -124,7 +124,7 @@ def _ignored(
                 yield None if used is None else used.logical_not_()
 
 
-def _masked(bank: "RayBank", ignored: "Iterable[Tensor | None]", split: "Split", progress: Progress) -> "RayBank":
+def _masked(bank: "RayDataset", ignored: "Iterable[Tensor | None]", split: "Split", progress: Progress) -> "RayDataset":
     try:
         bank = bank.without(ignored)
     except ValueError as error:

@@ -49,8 +49,8 @@ def _medium(config: "Config") -> "Medium":
     import torch
 
     from nerf.fields.mlp import HIDDEN
-    from nerf.runtime.matmul_precision import medium_products
+    from nerf.runtime.matmul_precision import medium_matmul
 
     width = HIDDEN if config.kind == "grid" else config.width
     assert width, "plan() chooses it"
-    return medium_products(torch.device(compute_device()), width)
+    return medium_matmul(torch.device(compute_device()), width)

@@ -47,13 +47,13 @@ def observed(
 
 def rates_for(model: "RadianceModel", device: "torch.device") -> "Rates":
     """This machine's rates at the sizes of a field. A field without a table reads nothing at random."""
-    from nerf.fields.hash_grid import GridField
+    from nerf.fields.hash_grid import HashGridField
     from nerf.fields.mlp import HIDDEN
-    from nerf.fields.vanilla import PaperNerf
+    from nerf.fields.vanilla import VanillaNerf
     from nerf.runtime.machine_rates import measure_rates
 
-    rows = model.layout.rows if isinstance(model, GridField) else 1
-    width = model.settings.width if isinstance(model, PaperNerf) else HIDDEN
+    rows = model.layout.rows if isinstance(model, HashGridField) else 1
+    width = model.settings.width if isinstance(model, VanillaNerf) else HIDDEN
     return measure_rates(device, width, rows, RATES_SECONDS)
 
 

@@ -11,30 +11,32 @@ from stages.io.amounts import short_count
 
 if TYPE_CHECKING:
     from nerf.effects import ImageEffects
-    from nerf.fields.hash_grid import GridSettings
-    from nerf.fields.vanilla import PaperSettings
+    from nerf.fields.hash_grid import HashGridSettings
+    from nerf.fields.vanilla import VanillaSettings
     from nerf.geometry.scene import Scene
-    from nerf.training.hash_grid_trainer import GridTrainerSettings
-    from nerf.training.ray_dataset import RayBank
-    from nerf.training.trainer import FieldTrainer, TrainerSettings
+    from nerf.training.hash_grid_trainer import HashGridTrainerSettings
+    from nerf.training.ray_dataset import RayDataset
+    from nerf.training.trainer import FieldTrainer, VanillaTrainerSettings
     from stages.train import Config
     from stages.train.loop import TrainingRun
     from stages.train.state import TrainingBudget
 
-FINAL_RATE = 0.1  # of the paper field's learning rate at the start
+LR_FINAL_FRACTION = 0.1  # of the paper field's learning rate at the start
 # Weight of the distortion loss (Barron et al. 2022, who take 1e-2) in folded space, against fog and matter close before
-# the cameras; fog also costs most of the time (docs/numbers.md). A box around an object needs none.
+# the cameras; fog also costs most of the time (docs/experiments/distortion_loss.md). A box around an object needs none.
 DISTORTION = 2e-3
-# Weight at first of the loss at sparse points (docs/numbers.md; Deng et al. 2022 take 0.1, too, of another loss).
+# Weight at first of the loss at sparse points (docs/experiments/sparse_depth.md; Deng et al. 2022 take 0.1, too, of
+# another loss).
 DEPTH_LOSS = 0.1
-# Photos that must look into a cell for something to stand before their foregrounds (docs/numbers.md).
+# Photos that must look into a cell for something to stand before their foregrounds (docs/experiments/few_photos.md).
 LEAST_PHOTOS = 3
-# Cells along an axis of the coarsest grid: fewer where they have to fill all of folded space (docs/numbers.md).
+# Cells along an axis of the coarsest grid: fewer where they have to fill all of folded space
+# (docs/experiments/few_photos.md).
 COARSEST = {"bounded": 16, "contracted": 8}
-# Samples along a ray (docs/numbers.md).
+# Samples along a ray (docs/experiments/ray_samples.md).
 MOST_STEPS = 576  # bounded scenes: steps along the diagonal of the box
 # Folded space: steps in one of the finest cells, by how many of these along an axis it counts for at most. Finer cells
-# gain more by more rays than by closer samples (docs/numbers.md: Finer cells).
+# gain more by more rays than by closer samples (docs/experiments/cell_sizes.md).
 STEPS_PER_CELL = {512: 3, 2048: 1.5}
 EVEN_UNTIL = 0.25  # folded space: scene units from the camera up to which steps are even; beyond, they grow
 # Folded space: at the shortest steps so many samples reach to a distance of 23; --train.ray-samples may ask for more.
@@ -122,7 +124,7 @@ def check_field_fits(config: "Config") -> None:
 def make_trainer(
     config: "Config",
     scene: "Scene",
-    bank: "RayBank",
+    bank: "RayDataset",
     seed: int,
     effects: "ImageEffects | None" = None,
 ) -> "FieldTrainer":
@@ -132,22 +134,22 @@ def make_trainer(
 
     effects = effects or NO_EFFECTS
     if config.field == "grid":
-        from nerf.fields.hash_grid import GridField
-        from nerf.training.hash_grid_trainer import GridTrainer
+        from nerf.fields.hash_grid import HashGridField
+        from nerf.training.hash_grid_trainer import HashGridTrainer
         from stages.hardware.backend import load_backend
 
         assert config.backend, "plan() chooses it"
         backend = load_backend(config.backend, bank.device.type)
-        model = GridField(grid_settings(config, has_sky(config, scene)), seed, backend).to(bank.device)
-        return GridTrainer(model, bank, grid_trainer_settings(config, scene, seed), effects)
-    from nerf.fields.vanilla import PaperNerf
-    from nerf.training.trainer import PaperTrainer
+        model = HashGridField(grid_settings(config, has_sky(config, scene)), seed, backend).to(bank.device)
+        return HashGridTrainer(model, bank, grid_trainer_settings(config, scene, seed), effects)
+    from nerf.fields.vanilla import VanillaNerf
+    from nerf.training.trainer import VanillaTrainer
 
-    published = PaperNerf(paper_settings(config), seed).to(bank.device)
-    return PaperTrainer(published, bank, paper_trainer_settings(config, scene, seed), effects)
+    published = VanillaNerf(paper_settings(config), seed).to(bank.device)
+    return VanillaTrainer(published, bank, paper_trainer_settings(config, scene, seed), effects)
 
 
-def _say_sizes(config: "Config", budget: "TrainingBudget", bank: "RayBank", progress: Progress) -> None:
+def _say_sizes(config: "Config", budget: "TrainingBudget", bank: "RayDataset", progress: Progress) -> None:
     much = f"{budget.seconds:g} s" if budget.steps is None else f"{budget.steps:,} steps"
     another = "" if budget.after is None else "another "
     photos = f"{len(bank.near)} photos at 1/{config.downscale:g} of their size"
@@ -173,17 +175,17 @@ def has_sky(config: "Config", scene: "Scene") -> bool:
     return bool(config.contracted) and not scene.has_alpha
 
 
-def grid_settings(config: "Config", sky: bool) -> "GridSettings":
+def grid_settings(config: "Config", sky: bool) -> "HashGridSettings":
     """Sizes of the grid field. Samples stand as close as the finest cells can tell them apart: in folded space a third
     to two thirds of a cell near the camera, growing with the distance, as pixels do; in a box a cell, or MOST_STEPS in
     all."""
-    from nerf.fields.hash_grid import GridSettings
+    from nerf.fields.hash_grid import HashGridSettings
     from nerf.kernels import CONTRACTED_BOX
 
     assert config.levels and config.log2_rows and config.finest, "plan() chooses them"
     assert config.contracted is not None and config.view_dependence is not None, "plan() takes them from stage effects"
     shortest = 2 * CONTRACTED_BOX / (_steps_across(config.finest) * config.ray_samples)
-    return GridSettings(
+    return HashGridSettings(
         levels=config.levels,
         log2_rows=config.log2_rows,
         coarsest=min(COARSEST[config.space], config.finest),
@@ -203,12 +205,12 @@ def _steps_across(finest: int) -> float:
     return max(per_cell * min(finest, most) for most, per_cell in STEPS_PER_CELL.items())
 
 
-def grid_trainer_settings(config: "Config", scene: "Scene", seed: int) -> "GridTrainerSettings":
+def grid_trainer_settings(config: "Config", scene: "Scene", seed: int) -> "HashGridTrainerSettings":
     """How the grid field is trained."""
-    from nerf.training.hash_grid_trainer import GridTrainerSettings
+    from nerf.training.hash_grid_trainer import HashGridTrainerSettings
 
     assert config.batch_samples and config.chunks and config.learning_rate, "plan() chooses them"
-    return GridTrainerSettings(
+    return HashGridTrainerSettings(
         seed=seed,
         background=_trained_over(config, scene),
         samples=config.batch_samples,
@@ -220,20 +222,20 @@ def grid_trainer_settings(config: "Config", scene: "Scene", seed: int) -> "GridT
     )
 
 
-def paper_settings(config: "Config") -> "PaperSettings":
+def paper_settings(config: "Config") -> "VanillaSettings":
     """Sizes and ablations of the paper field."""
-    from nerf.fields.vanilla import PaperSettings
+    from nerf.fields.vanilla import VanillaSettings
 
-    return PaperSettings(**{part.name: getattr(config, part.name) for part in fields(PaperSettings)})
+    return VanillaSettings(**{part.name: getattr(config, part.name) for part in fields(VanillaSettings)})
 
 
-def paper_trainer_settings(config: "Config", scene: "Scene", seed: int) -> "TrainerSettings":
+def paper_trainer_settings(config: "Config", scene: "Scene", seed: int) -> "VanillaTrainerSettings":
     """How the paper field is trained."""
-    from nerf.training.trainer import TrainerSettings
+    from nerf.training.trainer import VanillaTrainerSettings
 
     assert config.batch_rays is not None and config.learning_rate is not None, "plan() chooses them"
-    rates = (config.learning_rate, config.learning_rate * FINAL_RATE)
-    return TrainerSettings(config.batch_rays, seed, _trained_over(config, scene), *rates)
+    rates = (config.learning_rate, config.learning_rate * LR_FINAL_FRACTION)
+    return VanillaTrainerSettings(config.batch_rays, seed, _trained_over(config, scene), *rates)
 
 
 def _trained_over(config: "Config", scene: "Scene") -> tuple[float, float, float] | Literal["random"]:

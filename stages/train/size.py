@@ -15,20 +15,20 @@ from stages.train.setup import field_bytes, make_trainer
 
 if TYPE_CHECKING:
     from nerf.geometry.scene import Scene
-    from nerf.training.ray_dataset import RayBank
+    from nerf.training.ray_dataset import RayDataset
     from stages.effects.decisions import Decisions
     from stages.train import Config
 
 LEAST_LONG_SIDE = 150  # pixels: below this a photo shows too little to judge anything by
 MOST_PIXELS = 400e6  # of many photos, which are held in memory: 1.2 GB
-MOST_PHOTOS = 48  # of 240 photos of one scene, 0.2 rays a pixel are best (docs/numbers.md)
+MOST_PHOTOS = 48  # of 240 photos of one scene, 0.2 rays a pixel are best (docs/experiments/many_photos.md)
 TIMED_SECONDS = 1.0
 MOST_TIMED_RAYS = {"cpu": 256, "cuda": 1 << 20}
 """For each core: one chunk of a batch. More keep a CPU no busier and make the published model's steps long; a GPU needs
 many."""
 SAMPLES_PER_RAY = {"bounded": 3, "contracted": 10}
 """Colours that the grid field computes for a ray, over a run: measured on lego_400 and five photo sets
-(docs/numbers.md)."""
+(docs/results.md)."""
 GRID_SIZES = {
     "bounded": ((50e6, 5, 18, 512), (0, 4, 17, 256)),
     "contracted": ((30e6, 6, 18, 1024), (0, 5, 17, 512)),
@@ -138,12 +138,12 @@ def rays_per_second(config: "Config", scene: "Scene", decisions: "Decisions") ->
 
 def seconds_per_step(config: "Config", scene: "Scene", decisions: "Decisions", device: str) -> float:
     """Measured: steps of a fresh field of known sizes, with its effects, on a grey picture, for about a second."""
-    from nerf.runtime.matmul_precision import products_at
+    from nerf.runtime.matmul_precision import use_matmul_precision
 
     bank = _grey_bank(scene).to(device)
     effects = image_effects(decisions, scene.of_split("train")[:1], bank)
     trainer = make_trainer(config, scene, bank, seed=0, effects=effects)
-    with products_at(config.matmul):
+    with use_matmul_precision(config.matmul):
         trainer.step(0, 0.0, 1.0)  # the first step pays for memory and kernels
         started, steps = time.perf_counter(), 0
         while steps == 0 or time.perf_counter() - started < TIMED_SECONDS:
@@ -171,7 +171,7 @@ def rays_per_step(config: "Config") -> float:
     return config.batch_samples / SAMPLES_PER_RAY[config.space]
 
 
-def _grey_bank(scene: "Scene") -> "RayBank":
+def _grey_bank(scene: "Scene") -> "RayDataset":
     """The rays of the first training view, of a picture that is grey all over."""
     import torch
 
