@@ -204,8 +204,8 @@ class VanillaTrainer:
             return _Part(loss.detach(), fine_error.detach(), torch.autograd.grad(loss, self.parameters))
 
     def state(self) -> dict[str, Tensor]:
-        """Weights as ``model.<name>``, per-image parameters as ``image.<effect>.<name>``, Adam's moments and step counts
-        as ``adam.<parameter>.<name>``, and the field's settings, to know it by."""
+        """Weights as ``model.<name>``, per-image parameters as ``image.<effect>.<name>``, Adam's moments and step
+        counts as ``adam.<parameter>.<name>``, and the field's settings, to know it by."""
         tensors = {"settings": torch.frombuffer(bytearray(repr(self.model.settings).encode()), dtype=torch.uint8)}
         tensors |= {f"model.{name}": tensor for name, tensor in self.model.state_dict().items()}
         tensors |= {f"image.{name}": tensor.detach() for name, tensor in self.effects.parameters.items()}
