@@ -35,7 +35,8 @@ MIN_SPREAD = 1 / 255  # no residual spreads less than a step of the photos
 
 
 class ExposureModel:
-    """A :class:`nerf.effects.ColourEffect`. ``log_gain``: natural logarithms of gains in linear light, a row per view."""
+    """A :class:`nerf.effects.ColourEffect`. ``log_gain``: natural logarithms of gains in linear light, a row per
+    view."""
 
     name = "exposure"
     learning_rate = LEARNING_RATE
