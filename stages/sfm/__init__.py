@@ -1,128 +1,104 @@
-"""Stage sfm: where every photo was taken from, by structure-from-motion or from cameras that are known already."""
+"""Stage sfm: the camera poses and intrinsics of all photos, by structure-from-motion or imported."""
 
-import shutil
-from collections.abc import Sequence
-from dataclasses import replace
-from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from pydantic import Field
 
-from stages.contract import Inputs, OptionalSourcePath, Progress, StageConfig, StageError, StageResult, listed
+from stages.contract import Inputs, OptionalSourcePath, Progress, StageConfig, StageResult
 from stages.io.files import write_json
-from stages.sfm.process import run_child
-from stages.sfm.retry_strategies import ATTEMPTS, JOURNAL, left_out_for_time, read_kept
-
-if TYPE_CHECKING:
-    from stages.io.photos import Photo
 
 INPUTS = ("ingest",)
-VERSION = 14
+VERSION = 15
 RESUMES = True
 PUBLISHED = ("sparse", "registration.json")
-# Both may decide that an attempt is not made, which is said, in the stage's line as well. A run with another limit is
-# to go on from the matches that one before it kept, so its key has to be the same. How far features are searched, which
-# ``seconds`` decides as well, enters the key by options of its own.
+# Both may decide that a retry strategy is skipped, which is said, in the stage's line as well. A run with another limit
+# is to resume from the matches that one before it kept, so its key has to be the same. The quality of feature
+# extraction, which ``seconds`` decides as well, enters the key by options of its own.
 NOT_HASHED = ("max_seconds", "seconds")
 
 CameraModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE"]
 Matcher = Literal["exhaustive", "sequential", "spatial", "retrieval"]
-MOST_NAMES = 5
-# Of what the child process says, what registration.json takes as it is.
-FACTS = (
-    "attempts",
-    "reprojection_px",
-    "points",
-    "camera_model",
-    "camera_models",
-    "match_graph",
-    "check",
-    "second_opinion",
-)
+MAX_STRATEGIES = 8  # the default of ``max_strategies``, which is all of them
 
 
 class Config(StageConfig):
-    """How cameras are found."""
+    """How the cameras are found."""
 
     cameras: OptionalSourcePath = Field(
         default=None,
-        description="Known cameras: a transforms.json, a folder with transforms_train.json, or a COLMAP model.",
+        description="Poses to import: a transforms.json, a folder with transforms_train.json, or a COLMAP model.",
     )
     seed: int = Field(
         default=0,
         ge=0,
         lt=2**31,
-        description="Of every random choice in matching and mapping; docs/experiments/camera_models.md says "
-        "how far runs were seen to repeat.",
+        description="Seed of matching and mapping (docs/experiments/camera_models.md says how far runs repeat).",
     )
     max_image_size: int | None = Field(
         default=None,
         ge=100,
-        description="Longer side in pixels at which features are searched; larger photos are reduced for it; "
-        "None: 1600, and less where --sfm.seconds or a budget leaves too little time.",
+        description="Longer side in pixels at which features are extracted; larger photos are downscaled "
+        "(default: 1600, less where --sfm.seconds or a budget leaves too little time).",
     )
     max_features: int | None = Field(
         default=None,
         ge=100,
-        description="Features per photo, the largest ones first; matching takes time with its square; None: "
-        "4096, and fewer where --sfm.seconds or a budget leaves too little time.",
+        description="Features per photo, the largest first; matching time grows with its square "
+        "(default: 4096, fewer where --sfm.seconds or a budget leaves too little time).",
     )
     camera_model: CameraModel | None = Field(
         default=None,
-        description="COLMAP's camera model; None: SIMPLE_RADIAL while mapping, and then the simplest one that "
-        "held-out observations do not speak against.",
+        description="COLMAP's camera model (default: SIMPLE_RADIAL while mapping, then the simplest one that "
+        "held-out observations support).",
     )
     camera_params: tuple[float, ...] | None = Field(
         default=None,
-        description="The numbers of --sfm.camera-model where they are known, in COLMAP's order, for photos of "
-        "this size; kept.",
+        description="Known parameters of --sfm.camera-model in COLMAP's order, for photos of this size; they are "
+        "not refined.",
     )
     matcher: Matcher | None = Field(
         default=None,
-        description="Which pairs of photos matching begins with: all, neighbours in time or place, or those that "
-        "look alike; all but the first go on where verified pairs point; None: all of up to 50 photos, else by what is "
-        "known of them.",
+        description="How image pairs are selected: all, by time, by GPS position, or by image retrieval; all but "
+        "exhaustive then follow the verified pairs (default: exhaustive up to 50 photos, else by what EXIF tells).",
     )
     neighbours: int = Field(default=30, ge=1, description="Partners of each photo, where not all pairs are matched.")
-    attempts: int = Field(
-        default=len(ATTEMPTS),
+    max_strategies: int = Field(
+        default=MAX_STRATEGIES,
         ge=1,
-        le=len(ATTEMPTS),
-        description="How many ways to find the cameras are tried while photos have no place; 1: only the first.",
+        le=MAX_STRATEGIES,
+        description="How many retry strategies may be tried while photos are unregistered; 1: only the default one.",
     )
     seconds: float | None = Field(
         default=None,
         gt=0,
-        description="That it may take, if it can be: features are searched less far where they would take "
-        "longer, and further attempts that would not fit are not begun. It is not given up for "
-        "it; None: as long as is bearable.",
+        description="Time to aim for: extraction quality is lowered where it would take longer, and retry strategies "
+        "that would not fit are skipped; structure-from-motion is not aborted for it (default: no limit).",
     )
     max_seconds: float = Field(
         default=4 * 3600.0,
         gt=0,
-        description="When structure-from-motion is given up; what was matched until then is kept for the next "
-        "try. Attempts that would not fit are not begun.",
+        description="Structure-from-motion is aborted after this time; its matches are kept for the next run. Retry "
+        "strategies that would not fit are skipped.",
     )
 
 
 def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
     """The config with features and pairs chosen, by what they take on this machine for some of the photos."""
-    from stages.sfm.pairs.matching_plan import Open, chosen
-
-    left_open = Open(config.max_image_size, config.max_features, config.matcher)
-    if config.cameras is not None or None not in left_open:
+    if config.cameras is not None or None not in (config.max_image_size, config.max_features, config.matcher):
         return config
-    _, photos = _photos(inputs["ingest"])
-    images = inputs["ingest"] / "images"
-    answer = chosen(left_open, photos, images, config.neighbours, progress, config.seconds)
-    return config.model_copy(update=answer._asdict())
+    from stages.sfm import reconstruction
+
+    return reconstruction.choose_options(config, inputs["ingest"], progress)
 
 
 def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> StageResult:
     """Write ``sparse/`` and registration.json. Raises StageError where no usable model comes out."""
-    photos, matched = _photos(inputs["ingest"])
+    from stages.sfm import reconstruction
+
+    config = plan(config, inputs, progress)
     folder.mkdir(parents=True, exist_ok=True)
+<<<<<<< HEAD
     if config.cameras is not None:
         from stages.sfm.imported.poses import import_cameras
 
@@ -238,7 +214,12 @@ def _check_count(photos: "Sequence[Photo]", ingested: int) -> None:
         why = f"it takes at least {FEWEST_REGISTERED} photos that overlap"
         if same := ingested - len(photos):
             why += f", and {same} are nearly the same picture as one of these"
-        raise StageError(f"cannot find cameras from {len(photos)} photo{'s' * (len(photos) != 1)}", why, OVERLAP_HINT)
+        raise StageError(
+            "sfm.few-photos",
+            f"cannot find cameras from {len(photos)} photo{'s' * (len(photos) != 1)}",
+            why,
+            OVERLAP_HINT,
+        )
 
 
 def _check_memory(config: Config, photos: "Sequence[Photo]") -> None:
@@ -262,17 +243,24 @@ def _check_camera(config: Config, photos: "Sequence[Photo]") -> None:
     what = "cannot use --sfm.camera-params"
     hint = "Give COLMAP's numbers for these photos: --sfm.camera-model SIMPLE_RADIAL --sfm.camera-params F CX CY K."
     if config.camera_model is None:
-        raise StageError(what, "the model that they are the parameters of is not given", hint)
+        raise StageError(
+            "sfm.parameters-without-model", what, "the model that they are the parameters of is not given", hint
+        )
     sizes = sorted({(photo.width, photo.height) for photo in photos})
     if len(sizes) > 1:
         listed = ", ".join(f"{width}×{height}" for width, height in sizes[:3])
-        raise StageError(what, f"the photos have {len(sizes)} sizes ({listed}) and so several cameras", hint)
+        raise StageError(
+            "sfm.parameters-of-several-cameras",
+            what,
+            f"the photos have {len(sizes)} sizes ({listed}) and so several cameras",
+            hint,
+        )
     try:
         valid = is_valid(Camera(config.camera_model, *sizes[0], config.camera_params))
     except ValueError as error:
-        raise StageError(what, str(error), hint) from error
+        raise StageError("sfm.parameter-count", what, str(error), hint) from error
     if not valid:
-        raise StageError(what, "a focal length is not positive", hint)
+        raise StageError("sfm.focal-not-positive", what, "a focal length is not positive", hint)
 
 
 def _database(folder: Path, names: Sequence[str], progress: Progress) -> Path:
@@ -340,9 +328,23 @@ def _result(folder: Path, source: str, images: list[dict[str, Any]], **facts: An
     error = "" if facts["reprojection_px"] is None else f", {facts['reprojection_px']:.2f} px"
     what = "registered" if source == "sfm" else "cameras known"
     points = f" · {facts['points']:,} points".replace(",", " ") if facts["points"] else ""
+=======
+    registration, skipped = reconstruction.find_cameras(config, inputs["ingest"], folder, progress)
+    write_json(folder / "registration.json", registration)
+>>>>>>> main
     return StageResult(
         outputs=("sparse", "registration.json"),
         records=("sfm.log",),
-        line=f"{registered}/{len(images)} {what}{error} · {facts['camera_model']}{points}",
-        facts=counts | {name: fact for name, fact in facts.items() if name != "test_files"},
+        line=_line(registration) + skipped,
+        facts={name: fact for name, fact in registration.items() if name not in ("images", "test_files")},
     )
+
+
+def _line(registration: dict[str, Any]) -> str:
+    """The stage's line."""
+    what = "registered" if registration["source"] == "sfm" else "poses imported"
+    error, points = registration["reprojection_px"], registration["points"]
+    line = f"{registration['registered']}/{registration['photos']} {what}"
+    line += "" if error is None else f", {error:.2f} px"
+    line += f" · {registration['camera_model']}"
+    return line + (f" · {points:,} points".replace(",", " ") if points else "")
