@@ -220,13 +220,8 @@ def why_no_model(photos: "Sequence[Photo]", matches: Matches, registered: int, p
             "Take sharper, better lit photos, or put something with texture into the scene.",
         )
     if not verified:
-<<<<<<< HEAD
         return StageError("sfm.no-overlap", what, f"0 of {pairs} pairs of photos share a view", OVERLAP_HINT)
-    if np.median(matches.shift_px) < SAME_VIEW_PX:
-=======
-        return StageError(what, f"0 of {pairs} pairs of photos share a view", OVERLAP_HINT)
     if np.median(matches.shift_px) < MAX_SAME_VIEW_PX:
->>>>>>> main
         return StageError(
             "sfm.same-view",
             what,
