@@ -54,13 +54,16 @@ MEMORY = 0.9  # how much of the mean of samples per ray remains after each step
 
 @dataclass(frozen=True)
 class HashGridTrainerSettings:
-    """How to train. ``samples``: colours to compute in a step; its rays are as many as are expected to need them.
-    ``chunks``: equal parts of a step, each computed on a core; results depend on their number, not on that of the
-    cores. ``background`` is what lies behind a scene without a background model: a colour, or another random one for each ray (only
-    for photos with alpha, where it shows the field which space is empty). ``distortion``: full weight of the distortion
-    loss, for scenes without a known background. ``depth_loss``: its weight at first, at the pixels whose distance the
-    bank knows. ``least_photos``: that must look into a cell of folded space for something to stand before their
-    foregrounds (nerf/fields/frustum_mask.py), or all but one where they are few."""
+    """How to train.
+
+    ``samples``: colours to evaluate in a step; its rays are as many as are expected to need them. ``chunks``: equal
+    micro-batches of a step, each computed on a core; results depend on their number, not on that of the cores.
+    ``background`` is what lies behind a scene without a background model: a colour, or another random one for each ray
+    (only for photos with alpha, where it shows the field which space is empty). ``distortion``: full weight of the
+    distortion loss, for scenes without a known background. ``depth_loss``: initial weight of the sparse depth loss, at
+    the pixels whose distance the dataset knows. ``least_photos``: that must see a cell of contracted space for something
+    to stand before their foregrounds (nerf/fields/frustum_mask.py), or all but one where they are few.
+    """
 
     seed: int
     background: tuple[float, float, float] | Literal["random"]
@@ -98,8 +101,8 @@ class Loss(NamedTuple):
 
 
 class _Part(NamedTuple):
-    """What one chunk of a batch contributes to it: loss, gradients and their norm, the optical thickness of its samples, and
-    how many densities it asked for."""
+    """What one micro-batch contributes: loss, gradients and their norm, the optical thickness of its samples, and how
+    many densities it evaluated."""
 
     batch: HashGridBatch
     loss: Tensor
