@@ -61,8 +61,8 @@ class HashGridTrainerSettings:
     ``background`` is what lies behind a scene without a background model: a colour, or another random one for each ray
     (only for photos with alpha, where it shows the field which space is empty). ``distortion``: full weight of the
     distortion loss, for scenes without a known background. ``depth_loss``: initial weight of the sparse depth loss, at
-    the pixels whose distance the dataset knows. ``least_photos``: that must see a cell of contracted space for something
-    to stand before their foregrounds (nerf/fields/frustum_mask.py), or all but one where they are few.
+    the pixels whose distance the dataset knows. ``least_photos``: that must see a cell of contracted space for
+    something to stand before their foregrounds (nerf/fields/frustum_mask.py), or all but one where they are few.
     """
 
     seed: int
