@@ -27,6 +27,8 @@ PUBLISHED = ("sparse", "registration.json")
 NOT_HASHED = ("max_seconds", "seconds")
 
 CameraModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE"]
+Direction = Literal["world-from-camera", "camera-from-world"]
+CameraAxes = Literal["opencv", "opengl"]
 Matcher = Literal["exhaustive", "sequential", "spatial", "retrieval"]
 MOST_NAMES = 5
 # Of what the child process says, what registration.json takes as it is.
@@ -48,6 +50,16 @@ class Config(StageConfig):
     cameras: OptionalSourcePath = Field(
         default=None,
         description="Known cameras: a transforms.json, a folder with transforms_train.json, or a COLMAP model.",
+    )
+    pose_direction: Direction | None = Field(
+        default=None,
+        description="What the matrices of known cameras are; None: world-from-camera in transforms files, "
+        "camera-from-world in COLMAP models.",
+    )
+    camera_axes: CameraAxes | None = Field(
+        default=None,
+        description="Where the axes of known cameras point: opencv (x right, y down, z forward) or opengl (x right, "
+        "y up, z back); None: opengl in transforms files, opencv in COLMAP models.",
     )
     seed: int = Field(
         default=0,
@@ -124,10 +136,14 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     photos, matched = _photos(inputs["ingest"])
     folder.mkdir(parents=True, exist_ok=True)
     if config.cameras is not None:
+        from stages.sfm.imported.conventions import PoseConvention
         from stages.sfm.imported.poses import import_cameras
 
+        convention = PoseConvention(config.pose_direction, config.camera_axes)
         return _result(
-            folder, source="import", **import_cameras(config.cameras, photos, inputs["ingest"], folder, progress)
+            folder,
+            source="import",
+            **import_cameras(config.cameras, convention, photos, inputs["ingest"], folder, progress),
         )
     return _reconstruct(plan(config, inputs, progress), photos, matched, inputs["ingest"], folder, progress)
 
