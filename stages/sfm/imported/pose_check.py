@@ -19,12 +19,12 @@ import numpy as np
 from jaxtyping import Float
 
 from stages.sfm.pairs.pair_selection import Pairs, closeness, nearest, union
-from stages.sfm.process import environment
+from stages.sfm.worker_process import environment
 
 if TYPE_CHECKING:
     from stages.io.photos import Photo
 
-CHILD = ["-P", "-m", "stages.sfm.imported.pose_check"]
+COMMAND = ["-P", "-m", "stages.sfm.imported.pose_check"]
 MAX_IMAGE_SIZE, MAX_FEATURES = 1000, 2000  # enough to tell a step of a few pixels, in seconds for hundreds of photos
 PARTNERS = 6  # of each photo
 NEXT = 2  # places before and after it, in the order of names
@@ -42,7 +42,7 @@ def check_given_cameras(photos: "Sequence[Photo]", images: Path, folder: Path) -
     job = {"photos": [asdict(photo) for photo in photos], "images": str(images.absolute()), "folder": str(folder)}
     with (folder / "sfm.log").open("ab") as log:
         answer = subprocess.run(
-            [sys.executable, *CHILD],
+            [sys.executable, *COMMAND],
             input=json.dumps(job).encode() + b"\n",
             stdout=subprocess.PIPE,
             stderr=log,
@@ -80,7 +80,7 @@ def check(photos: list[dict[str, Any]], images: str, folder: str) -> dict[str, A
     from stages.sfm.colmap.models import load_native
     from stages.sfm.colmap.repair import camera_poses, check_model, facts
     from stages.sfm.imported.conventions import best_fit
-    from stages.sfm.pairs.match_graph import MIN_INLIERS, in_order, natural_order
+    from stages.sfm.pairs.match_graph import MIN_INLIERS, natural_order, pairs_apart
 
     some, scratch = [Photo(**photo) for photo in photos], Path(folder, "check")
     scratch.mkdir(exist_ok=True)
@@ -93,7 +93,7 @@ def check(photos: list[dict[str, Any]], images: str, folder: str) -> dict[str, A
     extract_features(database, Path(images), some, search)
     poses = camera_poses(model)
     by_name = natural_order([photo.name for photo in some])  # where poses are wrong, so are their neighbours
-    pairs = union(neighbours_by_pose(poses), in_order(by_name, 1, NEXT))
+    pairs = union(neighbours_by_pose(poses), pairs_apart(by_name, 1, NEXT))
     match_pairs(database, pairs, 0, STRICT_RATIO)
     verified = int((verified_matches(database, pairs) >= MIN_INLIERS).sum())
     checked = check_model(model, database, 0) if verified >= MIN_PAIRS else None
