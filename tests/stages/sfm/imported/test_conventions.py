@@ -40,7 +40,7 @@ def ring() -> tuple[PairMatches, np.ndarray]:
         pair=np.repeat(np.arange(len(pairs)), 60),
         keypoint=(60 * pairs[:, None] + np.arange(60)[None, :, None]).reshape(-1, 2),
         photo=np.repeat(np.arange(PHOTOS), 60),
-        bearing=(rays / np.linalg.norm(rays, axis=2, keepdims=True)).reshape(-1, 3),
+        ray_direction=(rays / np.linalg.norm(rays, axis=2, keepdims=True)).reshape(-1, 3),
         focal_px=np.full(PHOTOS, FOCAL_PX),
     )
     return matches, poses
