@@ -9,18 +9,15 @@ noise and counted apart.
 """
 
 import argparse
-import json
-import platform
-import subprocess
 import tempfile
 from collections.abc import Sequence
-from datetime import date
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from benchmarks.record import Record, add_out
 from stages.io.photos import read_photos
 from stages.sfm.colmap.mapping import MAPPING_MODEL
 from stages.sfm.colmap.matching import (
@@ -35,9 +32,9 @@ from stages.sfm.colmap.matching import (
 )
 from stages.sfm.colmap.models import load_native
 from stages.sfm.colmap.repair import Checked, camera_poses, check_model
-from stages.sfm.geometry_check import CLEARLY, check_poses
+from stages.sfm.geometry_check import CONTRADICTION_FACTOR, check_poses
 from stages.sfm.pairs.image_retrieval import CELLS
-from stages.sfm.pairs.match_graph import in_order, natural_order
+from stages.sfm.pairs.match_graph import natural_order, pairs_apart
 from stages.sfm.pairs.pair_selection import nearest, union
 
 SIZES = (1, 1, 1, 2, 3, 5, 10, 20)
@@ -59,35 +56,25 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("workspace", type=Path)
     parser.add_argument("--moved", type=int, default=200)
-    parser.add_argument("--out", type=Path)
+    add_out(parser)
     asked = parser.parse_args()
     ingest, sfm = (next((asked.workspace / stage).glob("*[0-9a-f]")) for stage in ("ingest", "sfm"))
     checked, poses, depth, names = right_model(ingest, sfm / "sparse")
     print(f"{len(names)} photos, {len(checked.matches.pairs)} pairs, tolerance {checked.check.tolerance_px:.2f} px; ")
     print(f"unmoved: {int((~checked.check.passed).sum())} blamed")
     moves = [*moved(checked, poses, depth, natural_order(names), asked.moved)]
-    floor = CLEARLY * checked.check.tolerance_px
+    floor = CONTRADICTION_FACTOR * checked.check.tolerance_px
     above = [move for move in moves if move.pixels >= floor]
     photos, found = sum(move.photos for move in above), sum(move.found for move in above)
     others = sum(len(names) - move.photos for move in moves)
-    facts = {
-        "command": f"python -m benchmarks.geometry_check {asked.workspace.name} --moved {asked.moved}",
-        "date": str(date.today()),
-        "machine": platform.processor() or platform.machine(),
-        "commit": subprocess.run(
-            ["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=True
-        ).stdout.strip(),
-        "photos": len(names),
-        "noise_floor_px": floor,
-        "moved_above_noise": photos,
-        "found": found / max(1, photos),
-        "moved_below_noise": sum(move.photos for move in moves) - photos,
-        "blamed": sum(move.blamed for move in moves) / others,
-        "moves": [move._asdict() for move in moves],
-    }
-    print({name: value for name, value in facts.items() if name != "moves"})
-    if asked.out:
-        asked.out.write_text(json.dumps(facts, indent=1) + "\n")
+    Record(asked.out).add(
+        photos=len(names),
+        noise_floor_px=round(floor, 2),
+        moved_above_noise=photos,
+        found_share=round(found / max(1, photos), 3),
+        moved_below_noise=sum(move.photos for move in moves) - photos,
+        blamed_share=round(sum(move.blamed for move in moves) / others, 4),
+    )
 
 
 def right_model(ingest: Path, sparse: Path) -> tuple[Checked, np.ndarray, float, list[str]]:
@@ -101,7 +88,7 @@ def right_model(ingest: Path, sparse: Path) -> tuple[Checked, np.ndarray, float,
         fill_database(database, photos, MAPPING_MODEL)
         extract_features(database, ingest / "images", photos, Search(1600, 4096))
         order = natural_order([photo.name for photo in photos])
-        pairs = union(in_order(order, 1, 5), nearest(look_alike(database, len(photos), 0), 10))
+        pairs = union(pairs_apart(order, 1, 5), nearest(look_alike(database, len(photos), 0), 10))
         features = Features(read_vocabulary(database, len(photos), 0, CELLS))
         match_pairs(database, pairs, 0, STRICT_RATIO, features=features)
         checked = check_model(model, database, 0)

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from PIL import Image
 
+from benchmarks.record import Record, add_out
 from nerf.fields.hash_grid import HashGridField, HashGridSettings
 from nerf.geometry.rays import Rays
 from nerf.kernels import torch as reference
@@ -85,7 +86,9 @@ def main() -> None:
     parser.add_argument("--test-every", type=int, default=5)
     parser.add_argument("--picture", type=Path, default=None)
     parser.add_argument("--processor-time", action="store_true", help="count this, not the clock: on a busy machine")
+    add_out(parser)
     given = parser.parse_args()
+    record = Record(given.out)
     print(f"{torch.get_num_threads()} threads")
     take_over_cores()
     settings = HashGridSettings(given.levels, 4, given.log2_rows, 16, given.finest, steps=given.steps)
@@ -105,12 +108,9 @@ def main() -> None:
         step, rays = step + 1, rays + result.rays
         if seconds >= min(due, given.seconds):
             quality, pictures = heldout(model, test)
-            speed = f"{step / seconds:.1f} steps/s  {rays / seconds:,.0f} rays/s"
-            per_ray = float(trainer.samples_per_ray)
-            print(
-                f"{seconds:6.1f} s  held out {quality:.2f} dB  train {result.psnr:.2f}  {speed}  {per_ray:.1f}/ray",
-                flush=True,
-            )
+            per_ray = round(float(trainer.samples_per_ray), 1)
+            speed = {"steps": step, "rays_per_second": rays / seconds, "samples_per_ray": per_ray}
+            record.add(seconds=round(seconds, 1), psnr=quality, train_psnr=round(result.psnr, 2), **speed)
             due *= 2
             if given.picture:
                 both = (255 * torch.cat(pictures, 1).clamp(0, 1)).round().to(torch.uint8)

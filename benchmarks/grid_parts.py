@@ -16,6 +16,7 @@ import torch
 
 from benchmarks.nerfacto import pipeline, stage_folder
 from benchmarks.pixel_store import Spoken
+from benchmarks.record import Record, add_out
 from nerf.geometry.scene import Scene
 from nerf.runtime.matmul_precision import use_matmul_precision
 from nerf.training.ray_dataset import RayDataset
@@ -40,6 +41,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, help="of training that sizes are for; none: the standard preset's")
     parser.add_argument("--downscale", type=float, help="photo width / trained width; none: as the seconds allow")
     parser.add_argument("--cores", type=int, help="none: all")
+    add_out(parser)
     given = parser.parse_args()
     workspace = given.workspace.absolute()
     pipeline("run", given.photos.absolute(), "-o", workspace, "--until", "effects")
@@ -53,7 +55,17 @@ def main() -> None:
             trainer.step(step, SHARE, 1.0)
         for step in range(WARM_STEPS, WARM_STEPS + TIMED_STEPS):
             observed(partial(trainer.step, step, SHARE, 1.0), FIRST_TIMED, timings, device)
-        report(parts_table(timings, rates_for(trainer.model, device)))
+        table = parts_table(timings, rates_for(trainer.model, device))
+    report(table)
+    Record(given.out).add(
+        set=given.photos.name,
+        downscale=config.downscale,
+        seconds=given.seconds,
+        colours_per_step=config.batch_samples,
+        step_ms=round(1e3 * table["seconds"] / TIMED_STEPS, 1),
+        at_machine_rates_percent=round(100 * table["floor_share"]),
+        **{f"{row['part']}_percent": round(100 * row["share"]) for row in table["parts"]},
+    )
 
 
 def prepared(workspace: Path, asked: Config) -> tuple[Config, FieldTrainer]:

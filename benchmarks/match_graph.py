@@ -10,16 +10,13 @@ recall of the best 20 partners of each photo by verified matches, and the share 
 """
 
 import argparse
-import json
-import platform
-import subprocess
 import tempfile
-from datetime import date
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 
+from benchmarks.record import Record, add_out
 from stages.io.photos import read_photos
 from stages.sfm.colmap.mapping import MAPPING_MODEL
 from stages.sfm.colmap.matching import (
@@ -37,15 +34,15 @@ from stages.sfm.colmap.matching import (
 from stages.sfm.pairs.feature_matching import match_descriptors
 from stages.sfm.pairs.image_retrieval import CELLS
 from stages.sfm.pairs.match_graph import (
+    MAX_GROWTH_ROUNDS,
     MIN_INLIERS,
     ORDER_OVERLAP,
-    ROUNDS,
-    in_order,
     inlier_matrix,
     next_pairs,
-    order_tells,
+    order_is_informative,
+    pairs_apart,
 )
-from stages.sfm.pairs.pair_selection import Likeness, Pairs, exhaustive, nearest, spanning_tree, union
+from stages.sfm.pairs.pair_selection import Pairs, SimilarityMatrix, exhaustive, nearest, spanning_tree, union
 
 BEST = 20  # partners of a photo that count
 LARGEST = 512  # features of a photo
@@ -58,7 +55,7 @@ def main() -> None:
     parser.add_argument("workspace", type=Path)
     parser.add_argument("--photos", type=int, default=60)
     parser.add_argument("--neighbours", type=int, default=30)
-    parser.add_argument("--out", type=Path)
+    add_out(parser)
     asked = parser.parse_args()
     ingest = next((asked.workspace / "ingest").iterdir())
     photos = sorted((p for p in read_photos(ingest) if not p.near_duplicate_of), key=lambda p: p.file)[: asked.photos]
@@ -75,18 +72,13 @@ def main() -> None:
             "VLAD": nearest(vlad, asked.neighbours),
             f"{LARGEST} largest features": nearest(largest_features(database, count), asked.neighbours),
             "vocabulary tree": vocabulary_tree(database, count, asked.neighbours),
-            "order of names": in_order(np.arange(count), 1, asked.neighbours // 2),
+            "order of names": pairs_apart(np.arange(count), 1, asked.neighbours // 2),
             "grown": grown(np.arange(count), truth, vlad, asked.neighbours),
             "grown, names shuffled": grown(np.random.default_rng(0).permutation(count), truth, vlad, asked.neighbours),
         }
-    rows = [{"way": name, **scores(pairs, truth)} for name, pairs in ways.items()]
-    for row in rows:
-        print(f"{row['way']:24s} {row['pairs']:6d} pairs  recall {row['recall']:.3f}  verified {row['verified']:.3f}")
-    if asked.out:
-        commit = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=True).stdout.strip()
-        facts = {"command": f"python -m benchmarks.match_graph {asked.workspace.name} --photos {count}"}
-        facts |= {"date": str(date.today()), "machine": platform.processor() or platform.machine(), "commit": commit}
-        asked.out.write_text(json.dumps(facts | {"photos": count, "ways": rows}, indent=1) + "\n")
+    record = Record(asked.out)
+    for name, pairs in ways.items():
+        record.add(way=name, photos=count, **scores(pairs, truth))
 
 
 def scores(pairs: Pairs, truth: np.ndarray) -> dict[str, float | int]:
@@ -97,24 +89,25 @@ def scores(pairs: Pairs, truth: np.ndarray) -> dict[str, float | int]:
     links = np.take_along_axis(truth, best, axis=1) >= MIN_INLIERS
     found = np.take_along_axis(chosen, best, axis=1) & links
     recall = float((found.sum(axis=1) / np.maximum(links.sum(axis=1), 1)).mean())
-    return {"pairs": len(pairs), "recall": recall, "verified": float((truth[tuple(pairs.T)] >= MIN_INLIERS).mean())}
+    verified = float((truth[tuple(pairs.T)] >= MIN_INLIERS).mean())
+    return {"pairs": len(pairs), "recall": round(recall, 3), "verified": round(verified, 3)}
 
 
-def grown(order: np.ndarray, truth: np.ndarray, similarity: Likeness, neighbours: int) -> Pairs:
+def grown(order: np.ndarray, truth: np.ndarray, similarity: SimilarityMatrix, neighbours: int) -> Pairs:
     """The pairs of a match graph grown as stage sfm does, each answered from the truth."""
 
     def tried(pairs: Pairs) -> np.ndarray:
         return inlier_matrix(len(truth), pairs, truth[tuple(pairs.T)])
 
-    pairs = union(in_order(order, 1, 2), nearest(similarity, neighbours // 4), spanning_tree(similarity))
-    if order_tells(order, tried(pairs)):
-        pairs = union(pairs, in_order(order, 3, ORDER_OVERLAP))
-    for _ in range(ROUNDS):
+    pairs = union(pairs_apart(order, 1, 2), nearest(similarity, neighbours // 4), spanning_tree(similarity))
+    if order_is_informative(order, tried(pairs)):
+        pairs = union(pairs, pairs_apart(order, 3, ORDER_OVERLAP))
+    for _ in range(MAX_GROWTH_ROUNDS):
         pairs = union(pairs, next_pairs(tried(pairs), similarity, neighbours))
     return pairs
 
 
-def largest_features(database: Path, count: int) -> Likeness:
+def largest_features(database: Path, count: int) -> SimilarityMatrix:
     """How many of the photos' largest features match (Wu 2013, "Towards linear-time incremental structure from
     motion", section 3: preemptive matching)."""
     with pycolmap.Database.open(database) as db:

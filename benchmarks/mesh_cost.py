@@ -14,10 +14,11 @@ import shutil
 import tempfile
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from benchmarks.record import Record, add_out
 from nerf import REGION_HALF
 from pipeline.demo.truth import Truth, compare_with_truth
 from pipeline.engine.workspace import Workspace
@@ -43,27 +44,27 @@ class Quiet:
         """Nothing."""
 
 
-def to_truth(mesh: "ColouredMesh", scene: "Scene", normalise: Path, truth: Truth) -> str:
+def to_truth(mesh: "ColouredMesh", scene: "Scene", normalise: Path, truth: Truth) -> dict[str, float]:
     """Mesh to truth, and truth to mesh, in percent of the scene's size."""
     with tempfile.TemporaryDirectory() as folder:
         shutil.copy(normalise / "transforms.json", folder)
         write_mesh(Config(formats=("ply",)), mesh, scene, Path(folder))
         error = compare_with_truth(Path(folder), truth).mesh
     assert error is not None, "the mesh has just been written"
-    return f"{error.accuracy:.2f} | {error.completeness:.2f}"
+    return {"mesh_to_truth_percent": error.accuracy, "truth_to_mesh_percent": error.completeness}
 
 
-def to_points(mesh: "ColouredMesh", points: np.ndarray) -> str:
+def to_points(mesh: "ColouredMesh", points: np.ndarray) -> dict[str, float]:
     """From the sparse points in the region to the mesh: median, and nine in ten, in percent of the region's size."""
     from scipy.spatial import KDTree
 
     inside = points[np.abs(points).max(1) < REGION_HALF]
     distance = KDTree(sample_surface(mesh.vertices, mesh.faces, SAMPLES, seed=0)).query(inside)[0]
     median, most = np.percentile(distance, [50, 90]) * 100 / (2 * REGION_HALF)
-    return f"{median:.2f} | {most:.2f}"
+    return {"point_to_mesh_percent": median, "nine_in_ten_percent": most}
 
 
-def row(folders: Inputs, resolution: int, truth: Truth | None) -> str:
+def figures(folders: Inputs, resolution: int, truth: Truth | None) -> dict[str, Any]:
     """One resolution's row of the table."""
     source = load(folders, Quiet())
     started = time.perf_counter()
@@ -73,7 +74,8 @@ def row(folders: Inputs, resolution: int, truth: Truth | None) -> str:
         known = to_points(made.mesh, source.points)
     else:
         known = to_truth(made.mesh, source.scene, folders["normalise"], truth)
-    return f"| {resolution}³ | {len(made.mesh.faces):,} | {seconds:.1f} | {known} |"
+    rounded = {name: round(value, 2) for name, value in known.items()}
+    return {"resolution": resolution, "faces": len(made.mesh.faces), "seconds": round(seconds, 1), **rounded}
 
 
 def main() -> None:
@@ -82,15 +84,15 @@ def main() -> None:
     parser.add_argument("workspace", type=Path)
     parser.add_argument("--resolutions", type=int, nargs="+", default=[48, 64, 96, 128, 192, 256])
     parser.add_argument("--truth", type=Path, default=None)
+    add_out(parser)
     given = parser.parse_args()
     workspace = Workspace.existing(given.workspace)
     keys = workspace.read_run()["keys"]
     folders = {stage: workspace.folder(stage, keys[stage]) for stage in ("ingest", "normalise", "train")}
     truth = Truth.read(given.truth) if given.truth else None
-    names = "mesh to truth (%) | truth to mesh (%)" if truth else "median point to mesh (%) | nine in ten within (%)"
-    print(f"| grid | faces | s | {names} |\n|---|---|---|---|---|")
+    record = Record(given.out)
     for resolution in given.resolutions:
-        print(row(folders, resolution, truth), flush=True)
+        record.add(set=given.workspace.stem, **figures(folders, resolution, truth))
 
 
 if __name__ == "__main__":

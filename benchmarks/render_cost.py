@@ -14,6 +14,7 @@ from pathlib import Path
 
 import torch
 
+from benchmarks.record import Record, add_out
 from nerf.effects.exposure import ExposedModel
 from nerf.fields.hash_grid import HashGridField
 from nerf.fields.interface import RadianceModel
@@ -82,12 +83,13 @@ def main() -> None:
     parser.add_argument("--factors", type=float, nargs="+", default=[0.25, 0.5, 1.0, 2.0])
     parser.add_argument("--downscales", type=float, nargs="+", default=[4.0, 2.0, 1.0])
     parser.add_argument("--photos", type=int, default=2)
+    add_out(parser)
     given = parser.parse_args()
+    record = Record(given.out)
     workspace = Workspace.existing(given.workspace)
     keys = workspace.read_run()["keys"]
     folders = {stage: workspace.folder(stage, keys[stage]) for stage in ("ingest", "normalise", "train")}
     painter = load_painter(folders["train"])
-    print("| samples | resolution | a frame (s) | PSNR (dB) |\n|---|---|---|---|")
     for downscale in given.downscales:
         for factor in given.factors:
             other = replace(painter, model=with_samples(painter.model, factor))
@@ -95,7 +97,7 @@ def main() -> None:
             with torch.no_grad():
                 seconds, score = measured(other, folders, downscale, given.photos)
             words = f"× {factor:g} ({samples_of(other.model)})"
-            print(f"| {words} | {resolution_name(downscale)} | {seconds:.2f} | {score:.2f} |", flush=True)
+            record.add(samples=words, resolution=resolution_name(downscale), frame_seconds=seconds, psnr=score)
 
 
 if __name__ == "__main__":

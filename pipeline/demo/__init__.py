@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nerf.geometry.scene import Camera
-from pipeline.cli.settings import Settings
 from pipeline.demo.truth import Truth, compare_with_truth
+from pipeline.engine.settings import Settings
 from stages.contract import Progress, StageError
 from stages.train import Config as TrainConfig
 
@@ -129,4 +129,9 @@ def _refuse_strangers(folder: Path, truth: Truth) -> None:
 
 
 def _cannot_write(folder: Path, why: str, better: str) -> StageError:
-    return StageError(f"cannot write the demo's photos to {folder}", why, f"Give {better}: pipeline demo -o FOLDER")
+    return StageError(
+        "pipeline.demo-not-written",
+        f"cannot write the demo's photos to {folder}",
+        why,
+        f"Give {better}: pipeline demo -o FOLDER",
+    )

@@ -74,7 +74,7 @@ def pilot_scene(inputs: Inputs, scene: "Scene", progress: Progress) -> PilotScen
     """Small photos to train on and to judge by, both from the training photos; or why there can be no pilot."""
     from stages.evaluate.half_images import enough
     from stages.hardware.device import compute_device
-    from stages.train.data import NOTHING_LEFT, PhotoReader, guided_bank, view_mask, view_rays
+    from stages.train.data import ALL_MASKED, PhotoReader, guided_bank, view_mask, view_rays
     from stages.train.validation_images import set_aside
 
     split = set_aside(scene, MOST_KEPT, FEWEST_FOR_INTERVAL)
@@ -86,7 +86,7 @@ def pilot_scene(inputs: Inputs, scene: "Scene", progress: Progress) -> PilotScen
     try:
         bank = guided_bank(inputs, split, downscale, progress).to(compute_device())
     except StageError as error:
-        if error.what != NOTHING_LEFT:
+        if error.code != ALL_MASKED:
             raise
         # Larger photos may show enough of a thin thing.
         return f"masks leave nothing of the training photos at {size}"

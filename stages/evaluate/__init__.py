@@ -283,7 +283,9 @@ def fits_poses(config: Config, field: dict[str, Any]) -> bool:
     fittable = field["kind"] == "grid"
     if config.fit_poses == "on" and not fittable:
         why = f"this is a {field['kind']} field, and only a grid field tells the gradients of its rays"
-        raise StageError("cannot fit poses of test photos", why, "Give --evaluate.fit-poses auto.")
+        raise StageError(
+            "evaluate.no-pose-fit", "cannot fit poses of test photos", why, "Give --evaluate.fit-poses auto."
+        )
     return fittable and (config.fit_poses == "on" or (config.fit_poses == "auto" and "poses" in field))
 
 

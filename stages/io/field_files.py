@@ -60,7 +60,9 @@ def load_field(
         model.load_state_dict(load(weights.read_bytes()))  # load_file takes paths in Unicode alone
         neutral = _neutral(info)
     except ValidationError as error:
-        raise StageError("cannot read the trained field", first_fault(error), "Run stage train again.") from error
+        raise StageError(
+            "io.field-settings", "cannot read the trained field", first_fault(error), "Run stage train again."
+        ) from error
     except (
         OSError,
         KeyError,
@@ -72,7 +74,7 @@ def load_field(
         SafetensorError,
     ) as error:
         why = " ".join(str(error).split())  # torch lists mismatches over several lines
-        raise StageError("cannot read the trained field", why, "Run stage train again.") from error
+        raise StageError("io.field-weights", "cannot read the trained field", why, "Run stage train again.") from error
     model = model.to(device).requires_grad_(False)
     return model if neutral is None else _exposed(model, neutral, device), info
 

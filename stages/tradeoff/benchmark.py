@@ -28,11 +28,11 @@ from stages.contract import Inputs, Progress, StageError
 from stages.effects.decisions import expected_gains
 from stages.evaluate.image_metrics import ssim
 from stages.io.files import read_json, sync_file, write_json_durably, write_png
-from stages.io.periodically import periodically
+from stages.io.stopwatch import periodically
 from stages.render.renderer import TIMED_SECONDS, load_painter
 from stages.render.spread import spread
 from stages.tradeoff.schedule import SCORING_STRIDE, SMALL_SIDE, WORKSPACE_FIELD, Run, scoring_stride
-from stages.train.data import NOTHING_LEFT, PhotoReader, scaled_size, view_mask, view_rays
+from stages.train.data import ALL_MASKED, PhotoReader, scaled_size, view_mask, view_rays
 from stages.train.setup import BLACK, WHITE
 
 CROP_SIZE = 64  # pixels along an edge
@@ -42,8 +42,8 @@ R2_STEPS = (0.7548776662466927, 0.5698402909980532)
 MIN_UNMASKED = 0.25  # of a crop's pixels
 MAX_POSITIONS = 256  # in a photo, tried for a crop with MIN_UNMASKED
 MEMORY_INTERVAL_SECONDS = 0.05
-RUN_FAILURES = ("training diverged", "the field does not learn", NOTHING_LEFT)
-"""What stage train says where the run itself is at fault: it would say so again."""
+RUN_FAILURES = ("train.diverged", "train.collapsed", ALL_MASKED)
+"""The errors of stage train where the run itself is at fault: it would fail again."""
 
 Colour = tuple[float, float, float]
 
@@ -119,7 +119,8 @@ def _check_masks(crops: tuple[Crop, ...]) -> None:
     scored = slice(None, None, SCORING_STRIDE)
     if not any(crop.mask is None or crop.mask[scored, scored].any() for crop in crops):
         why = "masks leave next to nothing of the held-out photos at this size"
-        raise StageError("nothing to score a study by", why, "Lower --normalise.test-every, or ignore less.")
+        hint = "Lower --normalise.test-every, or ignore less."
+        raise StageError("tradeoff.no-pixels-to-score", "nothing to score a study by", why, hint)
 
 
 # --- one run
@@ -141,10 +142,10 @@ def train_and_score(run: Run, benchmark: Benchmark, inputs: Inputs, folder: Path
         try:
             result = train.run(train.Config(**run.options), inputs, work, progress)
         except StageError as error:
-            if error.what not in RUN_FAILURES:
+            if error.code not in RUN_FAILURES:
                 what = f"the study stopped at {run.label}: {error.what}"
                 hint = "Close other programs or free disk space; the same command then goes on with this training."
-                raise StageError(what, error.why, hint) from error
+                raise StageError("tradeoff.stopped", what, error.why, hint) from error
             figures["failed"] = f"{error.what}: {error.why}"
         else:
             figures |= {name: result.facts[name] for name in ("train_seconds", "restarts")}

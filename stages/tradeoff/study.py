@@ -100,7 +100,8 @@ def _scene_with_test_photos(inputs: Inputs) -> Scene:
     scene = read_scene(inputs["normalise"])
     if not scene.of_split("test"):
         why = "no photo of this scene was kept for testing"
-        raise StageError("nothing to score a study by", why, "Lower --normalise.test-every, or add photos.")
+        hint = "Lower --normalise.test-every, or add photos."
+        raise StageError("tradeoff.no-test-photos", "nothing to score a study by", why, hint)
     return scene
 
 
@@ -175,7 +176,7 @@ def run_study(config: "Config", inputs: Inputs, folder: Path, progress: Progress
     if len(failed) == len(results):
         why = "; ".join(dict.fromkeys(str(figures["failed"]) for _, figures in results))
         why = why or f"{duration(config.seconds)} are too short here even for {schedule.left_out[0]}"
-        raise StageError("the study has no result", why, "Give it more time, as in --budget 30m.")
+        raise StageError("tradeoff.no-result", "the study has no result", why, "Give it more time, as in --budget 30m.")
     return Outcome(results, (*schedule.left_out, *list_runs(late), *failed), existing, benchmark)
 
 

@@ -45,7 +45,7 @@ def try_run(folder: Path) -> None:
 @cache
 def run_file() -> dict[str, Any]:
     """A valid run.json."""
-    from pipeline.cli.settings import Settings
+    from pipeline.engine.settings import Settings
 
     options = Settings().model_dump(mode="json")
     keys = dict.fromkeys(options, "0" * 64)
@@ -167,4 +167,4 @@ def try_checkpoint(folder: Path) -> None:
     from stages.train.checkpoints import latest_checkpoint
 
     if latest_checkpoint(folder, lambda _: None) is None:
-        raise StageError("no checkpoint", "the only one is damaged", "-")
+        raise StageError("train.no-state", "no checkpoint", "the only one is damaged", "-")

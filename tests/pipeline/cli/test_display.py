@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 from pipeline.cli.commands import run_command
-from pipeline.cli.display import Display, PlainDisplay, choose_display, end_line
+from pipeline.cli.display import PlainDisplay, choose_display, end_line
+from pipeline.engine.display import Display
 from stages.contract import StageError
 
 
@@ -21,7 +22,7 @@ def say_everything(display: Display) -> None:
         display.update("step 1", 0.5)
         display.note("a note " * 2000)  # more than a buffer holds
         display.end(stage, "it is done", 1.0, cached=False)
-    display.failed("train", StageError("what", "why", "what to try"))
+    display.failed("train", StageError("train.code", "what", "why", "what to try"))
     display.finished("at last", {})
 
 

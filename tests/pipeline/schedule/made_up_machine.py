@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 from pydantic import BaseModel
 
-from pipeline.cli.display import SilentDisplay
+from pipeline.engine.display import SilentDisplay
 from pipeline.engine.runner import Runner
 from pipeline.engine.workspace import RUN_FILE, Workspace
 from pipeline.schedule.budget import SHARES, Budget, reading_seconds
@@ -142,7 +142,7 @@ def chain(machine: Machine) -> dict[str, SimpleNamespace]:
             else:
                 machine.work(MUST[name])
             if name == machine.refuses:
-                raise StageError("it cannot be done", "nothing overlaps", "Add photos.")
+                raise StageError("sfm.fake", "it cannot be done", "nothing overlaps", "Add photos.")
             if name == "ingest":
                 photo = Photo(
                     "0.png", "images/0.png", round(1000 * machine.megapixels), 1000, 0, None, None, False, 1.0

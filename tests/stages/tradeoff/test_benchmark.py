@@ -29,7 +29,7 @@ NO_BENCHMARK: Any = None
 @pytest.fixture
 def diverging(monkeypatch: pytest.MonkeyPatch) -> None:
     def diverges(*_: object) -> None:
-        raise StageError(RUN_FAILURES[0], "it was told to", "Do not tell it to.")
+        raise StageError(RUN_FAILURES[0], "training diverged", "it was told to", "Do not tell it to.")
 
     monkeypatch.setattr(train, "run", diverges)
 
@@ -41,7 +41,7 @@ def test_figures_that_cannot_be_read_are_found_anew(content: bytes, tmp_path: Pa
     file.write_bytes(content)
     assert read_figures(file) is None
     figures = train_and_score(RUN, NO_BENCHMARK, {}, tmp_path, progress)
-    assert figures["failed"] == f"{RUN_FAILURES[0]}: it was told to"
+    assert figures["failed"] == "training diverged: it was told to"
     assert read_figures(file) == read_json(file) == figures
 
 

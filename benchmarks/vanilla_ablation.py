@@ -1,6 +1,6 @@
 """The method's own ablation (Mildenhall et al. 2020, table 2) at reduced width: what each of its parts is worth.
 
-    python -m benchmarks.paper_ablation ../shared/data/lego_400 --workspace /tmp/ablation.nerf
+    python -m benchmarks.vanilla_ablation ../shared/data/lego_400 --workspace /tmp/ablation.nerf
 
 Trains the complete method, and the method without view dependence, without positional encoding and without
 hierarchical sampling, for the same number of steps with several seeds, in one workspace: interrupted, it goes on where
@@ -15,9 +15,11 @@ from typing import Any
 
 from PIL import Image
 
+from benchmarks.record import Record, add_out
 from pipeline.cli.display import PlainDisplay
-from pipeline.cli.settings import Settings, settings_from, with_source
+from pipeline.cli.settings import settings_from, with_source
 from pipeline.engine.runner import Runner
+from pipeline.engine.settings import Settings
 from pipeline.engine.workspace import Workspace
 from stages.io.files import read_json
 
@@ -32,7 +34,7 @@ STAGES = ("ingest", "sfm", "normalise", "effects", "train", "evaluate")
 
 
 def settings_of(photos: Path, variant: str, seed: int, steps: int, downscale: float) -> Settings:
-    """The reduced paper field (4 layers of 64, 32 + 32 samples) in one variant."""
+    """The reduced vanilla NeRF (4 layers of 64, 32 + 32 samples) in one variant."""
     train = {"field": "paper", "steps": steps, "seed": seed, "downscale": downscale}
     chosen = VARIANTS[variant]
     values = {"train": train | chosen.get("train", {}), "effects": AS_PUBLISHED | chosen.get("effects", {})}
@@ -48,21 +50,20 @@ def score(root: Path, settings: Settings) -> tuple[dict, Path]:
     return read_json(folder / "metrics.json"), folder
 
 
-def table(found: dict[str, list[dict]]) -> str:
+def table(found: dict[str, list[dict]], out: Path | None) -> None:
     """A row per variant: PSNR, SSIM and the paired difference to the complete method, each mean ± deviation."""
-    lines = ["| variant | PSNR (dB) | SSIM | difference (dB) |", "|---|---|---|---|"]
+    record = Record(out)
     for variant, metrics in found.items():
         psnr = [m["psnr"] for m in metrics]
         difference = [m["psnr"] - c["psnr"] for m, c in zip(metrics, found["complete"], strict=True)]
         ssim = statistics.mean(m["ssim"] for m in metrics)
-        lines.append(f"| {variant} | {spread(psnr)} | {ssim:.3f} | {spread(difference)} |")
-    return "\n".join(lines)
+        record.add(variant=variant, psnr=spread(psnr), ssim=ssim, difference_db=spread(difference))
 
 
-def spread(values: list[float]) -> str:
-    """mean ± standard deviation over the seeds."""
+def spread(values: list[float]) -> list[float]:
+    """Mean and standard deviation over the seeds."""
     deviation = statistics.stdev(values) if len(values) > 1 else 0.0
-    return f"{statistics.mean(values):.2f} ± {deviation:.2f}"
+    return [round(statistics.mean(values), 2), round(deviation, 2)]
 
 
 def sheet(folders: dict[str, Path], file: Path) -> None:
@@ -88,6 +89,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=1000)
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--downscale", type=float, default=4.0)
+    add_out(parser)
     given = parser.parse_args()
     found: dict[str, list[dict]] = {variant: [] for variant in VARIANTS}
     folders: dict[str, Path] = {}
@@ -97,7 +99,7 @@ def main() -> None:
             settings = settings_of(given.photos, variant, seed, given.steps, given.downscale)
             metrics, folders[variant] = score(given.workspace, settings)
             found[variant].append(metrics)
-        print(table(found), flush=True)
+        table(found, given.out)
     sheet(folders, given.workspace.with_suffix(".png"))
 
 

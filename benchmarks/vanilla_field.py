@@ -1,6 +1,6 @@
 """How fast the paper's field is, where its time goes, and how near it comes to its matrix products alone.
 
-    python benchmarks/paper_field.py [--preset small|paper] [--threads N]
+    python -m benchmarks.vanilla_field [--preset small|published] [--threads N]
 
 Run it on an idle machine: torch's threads wait for each other, so one busy core slows all of them.
 
@@ -21,6 +21,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
+from benchmarks.record import Record, add_out
 from nerf.fields.positional_encoding import positional_encoding
 from nerf.fields.vanilla import VanillaNerf, VanillaSettings
 from nerf.geometry.rays import Rays, points_on
@@ -30,7 +31,7 @@ from nerf.runtime.randomness import generator
 
 PRESETS = {
     "small": VanillaSettings(depth=4, width=64, samples_coarse=32, samples_fine=32),
-    "paper": VanillaSettings(),
+    "published": VanillaSettings(),
 }
 BACKGROUND = torch.ones(3)
 
@@ -90,12 +91,11 @@ def forward_and_backward(model: VanillaNerf, rays: Rays) -> None:
     (coarse.colour.square().sum() + fine.colour.square().sum()).backward()
 
 
-def print_rates(model: VanillaNerf, batches: tuple[int, ...]) -> None:
-    print("rays at a time   render rays/s   forward+backward rays/s")
+def print_rates(model: VanillaNerf, batches: tuple[int, ...], record: Record) -> None:
     for count in batches:
         rays = random_rays(count)
         render, train = seconds(partial(model.render, rays, BACKGROUND), partial(forward_and_backward, model, rays))
-        print(f"{count:14d}   {count / render:13.0f}   {count / train:23.0f}")
+        record.add(rays_at_a_time=count, render_rays_per_second=round(count / render), rays_per_second=count / train)
 
 
 def print_parts(model: VanillaNerf, count: int) -> None:
@@ -137,11 +137,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--preset", choices=PRESETS, default="small")
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
+    add_out(parser)
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
     model = VanillaNerf(PRESETS[options.preset], seed=0)
     print(f"{options.preset}, {options.threads} threads, torch {torch.__version__}")
-    print_rates(model, (128, 256, 1024, 4096) if options.preset == "small" else (16, 64, 256))
+    print_rates(model, (128, 256, 1024, 4096) if options.preset == "small" else (16, 64, 256), Record(options.out))
     count = 256 if options.preset == "small" else 32
     print_parts(model, count)
     print_floor(model, count)
