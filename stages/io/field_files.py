@@ -43,8 +43,8 @@ def load_field(
 ) -> "tuple[RadianceModel, dict[str, Any]]":
     """The field in ``folder``, ready to render, and the content of its field.json.
 
-    One that models exposure comes at its neutral one, wrapped in an ExposedModel. ``progress`` is told why a grid field
-    is computed by torch's kernels: they trained it, or Warp's do not run on ``device``.
+    One that models exposure comes at its reference exposure, in an AppearanceModel. ``progress`` is told why a grid
+    field is computed by torch's kernels: they trained it, or Warp's do not run on ``device``.
 
     Raises:
         StageError: if the files are missing or damaged, or another version of the program wrote them.
@@ -92,9 +92,10 @@ def _neutral(info: dict[str, Any]) -> list[float] | None:
 def _exposed(model: "RadianceModel", log_gain: list[float], device: str) -> "RadianceModel":
     import torch
 
-    from nerf.effects.exposure import ExposedModel
+    from nerf.effects.appearance import AppearanceModel
+    from nerf.effects.exposure import ExposureModel
 
-    return ExposedModel(model, torch.tensor(log_gain, dtype=torch.float32, device=device))
+    return AppearanceModel(model, (ExposureModel(torch.tensor([log_gain], dtype=torch.float32, device=device)),))
 
 
 def _untrained(
