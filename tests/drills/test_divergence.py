@@ -17,8 +17,8 @@ from nerf.effects.exposure import ExposureModel
 from nerf.effects.pose_refinement import PoseRefinement
 from nerf.training.hash_grid_trainer import HashGridTrainer
 from nerf.training.ray_dataset import RayDataset
-from nerf.training.trainer import VanillaTrainer
 from nerf.training.validation_probe import make_probe, measure
+from nerf.training.vanilla_trainer import VanillaTrainer
 from stages import train
 from stages.contract import StageError, StageResult
 from stages.ingest.decoding import DecodeError, decode

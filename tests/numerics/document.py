@@ -44,8 +44,8 @@ ELSEWHERE = {
     "nerf/rendering/images.py": "cuts pictures into chunks: tests/nerf/rendering/test_images.py",
     "nerf/training/validation_probe.py": "mean colour, PSNR, patches of pixels: "
     "tests/nerf/training/test_validation_probe.py",
-    "nerf/training/trainer.py": "sums of chunks; refuses what is not finite before the update: "
-    "tests/nerf/training/test_trainer.py",
+    "nerf/training/vanilla_trainer.py": "sums of chunks; refuses what is not finite before the update: "
+    "tests/nerf/training/test_vanilla_trainer.py",
     "nerf/training/hash_grid_trainer.py": "likewise: tests/nerf/training/test_hash_grid_trainer.py",
     "nerf/runtime/matmul_precision.py": "lets products be off by 1e-4 beside float64, where that is faster: "
     "tests/nerf/runtime/test_matmul_precision.py",

@@ -11,8 +11,9 @@ from nerf.effects.pose_refinement import PoseRefinement
 from nerf.fields.vanilla import VanillaNerf, VanillaSettings
 from nerf.geometry.rays import Rays
 from nerf.training.ray_dataset import RayDataset, ray_dataset_from_images
-from nerf.training.trainer import NonFinite, VanillaTrainer, VanillaTrainerSettings, over
+from nerf.training.trainer import NonFinite, over
 from nerf.training.validation_probe import make_probe, measure
+from nerf.training.vanilla_trainer import VanillaTrainer, VanillaTrainerSettings
 
 FIELD = VanillaSettings(
     depth=2, width=16, skip=9, position_frequencies=3, direction_frequencies=1, samples_coarse=8, samples_fine=8
