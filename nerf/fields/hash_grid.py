@@ -46,7 +46,7 @@ CORNERS = 8  # of a cell: rows that a point reads of each grid
 
 @dataclass(frozen=True)
 class HashGridSettings:
-    """Sizes of a grid field. Raises ValueError on impossible ones.
+    """Sizes of a hash-grid field. Raises ValueError on impossible ones.
 
     ``diagonal_steps``: steps along the diagonal of a bounded scene's box. ``min_step_size`` (scene units) and
     ``cone_angle`` (step per distance) replace it where space is ``contracted``. Without ``view_dependence`` a point has

@@ -1,4 +1,4 @@
-"""One optimisation step of a grid field, behind the same interface as the paper's (nerf/training/trainer.py)."""
+"""One optimisation step of a hash-grid field, behind the same interface as the paper's (nerf/training/trainer.py)."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import astuple, dataclass
@@ -135,7 +135,7 @@ def depth_loss_multiplier(progress: float) -> float:
 
 
 class HashGridTrainer:
-    """Trains a grid field on the Huber loss of colours by Adam, and updates its occupancy grid. ``effects`` stand
+    """Trains a hash-grid field on the Huber loss of colours by Adam, and updates its occupancy grid. ``effects`` stand
     between the field and each image (nerf/effects)."""
 
     def __init__(
@@ -164,7 +164,7 @@ class HashGridTrainer:
         self.drawn = torch.tensor(0)  # pixels of that order so far; steps differ in how many they take
 
     def _usable(self) -> Bool[Tensor, "cells"] | None:
-        """Known only where points tell where foregrounds begin, in folded space: a box is carved beforehand."""
+        """Known only where points tell where foregrounds begin, in contracted space: a box is carved beforehand."""
         least, stepping = min(self.settings.least_photos, len(self.dataset.near) - 1), self.model.stepping
         if least <= 1 or self.dataset.known is None or not stepping.contracted:
             return None

@@ -9,7 +9,7 @@ if TYPE_CHECKING:
 
 SECONDS = 0.3  # for each rate
 TABLES = {"2¹⁷": 1 << 17, "2²⁰": 1 << 20}  # rows: of one grid, of all of a large field
-# Of a ray while the grid field trains: densities asked for, beside the colours of stages/train/size.py. Over a run
+# Of a ray while the hash-grid field trains: densities asked for, beside the colours of stages/train/size.py. Over a run
 # lego_400, fox, banana and fountain_p11 ask for 2.3 to 2.9 for each colour (docs/experiments/ray_samples.md).
 DENSITIES = {"bounded": 7, "contracted": 24}
 WHERE = {"bounded": "around an object", "contracted": "in unbounded space"}
@@ -54,7 +54,7 @@ def _meaning(products: dict[int, float], reads: float, copied: float, count: int
     for space, densities in DENSITIES.items():
         work = grid_work(space == "contracted", densities)
         most = count / Rates(products[64], reads, copied).seconds(work)
-        text = f"grid field {WHERE[space]} ({SAMPLES_PER_RAY[space]} colours, {densities} densities a ray)"
+        text = f"hash-grid field {WHERE[space]} ({SAMPLES_PER_RAY[space]} colours, {densities} densities a ray)"
         lines.append(f"  {short_count(most):>8} rays/s  {text}")
     for name, sizes in PAPER_RAYS.items():
         most = count / Rates(products[sizes[1]], reads, copied).seconds(WorkCounts(matmul_flops=paper_products(*sizes)))

@@ -65,6 +65,7 @@ def parts_table(timings: dict[str, Any], rates: "Rates") -> dict[str, Any]:
     part's work takes at ``rates``; null for parts whose work is not of that kind. ``floor_share`` is of what was
     computed.
     """
+    from nerf.runtime.profiler import WorkCounts
 
     spent = {name: (seconds, rates.seconds(WorkCounts(*work))) for name, (seconds, *work) in timings["parts"].items()}
     busy, floor = (sum(column) for column in zip(*spent.values(), strict=True))

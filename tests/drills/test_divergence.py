@@ -133,9 +133,9 @@ def test_weights_that_the_last_update_broke_are_never_kept(
     assert weights_are_finite(tmp_path / "train")
 
 
-# Of the dataset: near and far, the cameras' places, their rotations; and how bearings change from pixel to pixel.
+# Of the dataset: near and far, the cameras' places, their rotations; and how ray directions change from pixel to pixel.
 ROWS = {"near": ("geometry", 12), "far": ("geometry", 13), "centres": ("geometry", 9), "rotations": ("geometry", 4)}
-ROWS["bearings"] = ("patches", 1)
+ROWS["ray_directions"] = ("patches", 1)
 
 
 @pytest.mark.parametrize("poison", [float("nan"), float("inf")])

@@ -27,8 +27,8 @@ ELSEWHERE = {
     "half a cell within: tests/nerf/training/test_hash_grid_trainer.py",
     "nerf/fields/frustum_mask.py": "angles and distances of the middles of cells; the cells around them count as "
     "well: tests/nerf/fields/test_frustum_mask.py",
-    "nerf/training/ray_dataset.py": "bearings linear within a patch, of length 1/2 or more before they are divided by "
-    "it: tests/nerf/training/test_ray_dataset.py",
+    "nerf/training/ray_dataset.py": "ray directions linear within a patch, of length 1/2 or more before they are "
+    "divided by it: tests/nerf/training/test_ray_dataset.py",
     "nerf/rendering/srgb.py": "the standard's own curve, its inverse, from nothing to 1e30: "
     "tests/nerf/rendering/test_srgb.py",
     "nerf/effects/exposure.py": "powers taken between powers, without light in between; value, gradient, extremes: "

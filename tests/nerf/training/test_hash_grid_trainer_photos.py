@@ -1,5 +1,5 @@
-"""What a step of a grid field takes of the photos: pixels, each once, and effects, which change no bit where they are
-off and are refused where they run away."""
+"""What a step of a hash-grid field takes of the photos: pixels, each once, and effects, which change no bit where
+they are off and are refused where they run away."""
 
 from dataclasses import replace
 from functools import partial

@@ -25,8 +25,8 @@ def small_dataset(channels: int = 3, size: int = 12) -> RayDataset:
     """Two opposite views of a red disc on white (or on nothing, with alpha), from 3 units away."""
     grid = (torch.arange(size) + 0.5) / size - 0.5
     y, x = torch.meshgrid(grid, grid, indexing="ij")
-    bearings = torch.stack([x, y, torch.ones_like(x)], -1)
-    bearings = bearings / bearings.norm(dim=-1, keepdim=True)
+    ray_directions = torch.stack([x, y, torch.ones_like(x)], -1)
+    ray_directions = ray_directions / ray_directions.norm(dim=-1, keepdim=True)
     inside = (x**2 + y**2 < 0.06)[..., None]
     photo = torch.where(inside, torch.tensor([200, 20, 20]), 255)
     if channels == 4:
@@ -35,7 +35,7 @@ def small_dataset(channels: int = 3, size: int = 12) -> RayDataset:
     back = torch.tensor([[-1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 3]])
     near, far = torch.full((2,), 2.0), torch.full((2,), 4.0)
     return ray_dataset_from_images(
-        [photo.to(torch.uint8)] * 2, [0, 0], [bearings], torch.stack([front, back]), near, far
+        [photo.to(torch.uint8)] * 2, [0, 0], [ray_directions], torch.stack([front, back]), near, far
     )
 
 
