@@ -159,9 +159,9 @@ def _free_distance(
     around a cell, which holds its point (unit: u).
 
     Where unit coordinates are linear, up to where it leaves these bricks or that region. Where space is contracted, r
-    being the largest component of the point, coordinates in [-2, 2] move at most 4/3 times as fast as the point, and at most
-    4/(r - a) times within a distance a of it; so within a distance m of the nearest face (in the largest component) it
-    stays for max(3/4 m, m r / (4 + m)).
+    being the largest component of the point, coordinates in [-2, 2] move at most 4/3 times as fast as the point, and
+    at most 4/(r - a) times within a distance a of it; so within a distance m of the nearest face (in the largest
+    component) it stays for max(3/4 m, m r / (4 + m)).
     """
     width = 1.0 / float(cells)
     around = 4.0 * float(clear - 1)
