@@ -12,6 +12,7 @@ from stages.io.files import read_json
 from stages.tradeoff import trial as tradeoff_trial
 from stages.tradeoff.runs import Arm
 from stages.tradeoff.trial import ENOUGH, OWN_FAULTS, Exam, figures_file, kept, make_exam, run_arm
+from tests.refusals import refused
 from tests.stages.photo_scene import HEIGHT, WIDTH, photographed
 
 ARM = Arm("grid", "bounded", 1.0, 100, 0, 1.0)
@@ -76,6 +77,6 @@ def test_where_masks_leave_too_little_the_best_places_are_taken(
 
 
 def test_masks_that_leave_nothing_are_said(tmp_path: Path) -> None:
-    with pytest.raises(StageError, match="nothing to score a study by") as caught:
+    with refused("tradeoff.no-pixels-to-score") as caught:
         masked_exam(tmp_path, (slice(0, 0), slice(0, 0)))
     assert "masks leave next to nothing" in caught.value.why
