@@ -10,7 +10,7 @@ from statistics import mean, median
 from typing import TYPE_CHECKING, NamedTuple
 
 from stages.contract import Inputs, Progress, StageError
-from stages.effects.decisions import Decisions, photo_parts
+from stages.effects.decisions import Decisions, image_effects
 from stages.evaluate.image_metrics import FEWEST_FOR_INTERVAL, mean_interval
 from stages.train.setup import BLACK
 
@@ -157,8 +157,8 @@ def _trained(trial: PilotScene, arm: Decisions, steps: int, seed: int) -> "HashG
     from nerf.fields.hash_grid import HashGridField
     from stages.train.setup import make_trainer
 
-    parts = photo_parts(arm, trial.scene.of_split("train"), trial.bank)
-    trainer = make_trainer(_config(arm, steps, trial.bank.device.type), trial.scene, trial.bank, seed, parts)
+    effects = image_effects(arm, trial.scene.of_split("train"), trial.bank)
+    trainer = make_trainer(_config(arm, steps, trial.bank.device.type), trial.scene, trial.bank, seed, effects)
     for step in range(steps):
         trainer.step(step, step / steps, 1.0)
     assert isinstance(trainer.model, HashGridField)

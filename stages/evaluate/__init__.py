@@ -233,13 +233,13 @@ class Examiner:
 
     def _from_fitted_pose(self, view: "View", truth: "Tensor", used: "Tensor | None") -> "Rendering":
         """The view from where its left half says that it was taken."""
-        from nerf.effects.exposure import ExposedModel
+        from nerf.effects.appearance import AppearanceModel
         from nerf.fields.hash_grid import HashGridField
         from stages.evaluate.half_images import from_fitted_pose
         from stages.train.data import view_rays
 
         model = self.painter.model
-        field = model.model if isinstance(model, ExposedModel) else model
+        field = model.model if isinstance(model, AppearanceModel) else model
         assert isinstance(field, HashGridField), "only with a grid field does evaluate fit poses"
         rays = view_rays(self.scene, view, self.downscale)
         as_it_is = replace(self.painter, model=field).draw(rays)

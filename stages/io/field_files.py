@@ -43,8 +43,8 @@ def load_field(
 ) -> "tuple[RadianceModel, dict[str, Any]]":
     """The field in ``folder``, ready to render, and the content of its field.json.
 
-    One that models exposure comes at its neutral one, wrapped in an ExposedModel. ``progress`` is told why a grid field
-    is computed by torch's kernels: they trained it, or Warp's do not run on ``device``.
+    One that models exposure comes at its reference exposure, in an AppearanceModel. ``progress`` is told why a grid
+    field is computed by torch's kernels: they trained it, or Warp's do not run on ``device``.
 
     Raises:
         StageError: if the files are missing or damaged, or another version of the program wrote them.
@@ -92,9 +92,10 @@ def _neutral(info: dict[str, Any]) -> list[float] | None:
 def _exposed(model: "RadianceModel", log_gain: list[float], device: str) -> "RadianceModel":
     import torch
 
-    from nerf.effects.exposure import ExposedModel
+    from nerf.effects.appearance import AppearanceModel
+    from nerf.effects.exposure import ExposureModel
 
-    return ExposedModel(model, torch.tensor(log_gain, dtype=torch.float32, device=device))
+    return AppearanceModel(model, (ExposureModel(torch.tensor([log_gain], dtype=torch.float32, device=device)),))
 
 
 def _untrained(
@@ -114,7 +115,7 @@ def _untrained(
     if kind == "grid":
         grid = HashGridSettings(**settings)  # which refuses unknown names; their types are checked next
         TypeAdapter(HashGridSettings).validate_json(text, strict=True)
-        _check_size(grid.layout.rows * grid.features, stored)
+        _check_size(grid.layout.rows * grid.features_per_level, stored)
         return HashGridField(grid, 0, load_backend(backend_of_field(_trained_with(info), device, progress), device))
     paper = VanillaSettings(**settings)
     TypeAdapter(VanillaSettings).validate_json(text, strict=True)

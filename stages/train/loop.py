@@ -379,7 +379,7 @@ class TrainingRun:
     def _on_training_photos(self) -> "ProbeResult":
         from nerf.training.validation_probe import measure
 
-        return measure(self.trainer.model, self.probes.train, self.trainer.photo_colours, self.trainer.photo_rays)
+        return measure(self.trainer.model, self.probes.train, self.trainer.effects)
 
     def _restart(self, symptom: str) -> None:
         """Begin anew with another seed; give up by name after the second."""

@@ -88,7 +88,7 @@ def look(trainer: "FieldTrainer", unseen: Unseen) -> Look:
     """How the field does on photos that it has never seen, exposed as their neighbours let expect."""
     from nerf.training.validation_probe import measure, pictures
 
-    as_expected = trainer.photo_colours.of_unseen(unseen.neighbours)
+    as_expected = trainer.effects.of_held_out(unseen.neighbours)
     psnr = measure(trainer.model, unseen.probe, as_expected).psnr
     rows = zip(*pictures(trainer.model, unseen.patches, as_expected), unseen.patches.used, strict=True)
     known = [value for row in rows if (value := ssim(*(part.cpu() for part in row))) is not None]
