@@ -87,7 +87,7 @@ def wording(module: Module) -> Iterator[tuple[str, list[str]]]:
     def texts(call: ast.Call, parts: list[ast.expr]) -> list[str]:
         inside = [scope for scope in scopes if call in ast.walk(scope)]
         names = constants | {name: values for scope in inside for name, values in assigned(scope).items()}
-        return [text for part in parts for text in sentences(part, names)]
+        return list(dict.fromkeys(text for part in parts for text in sentences(part, names)))
 
     for call in made(module.tree):
         yield code_of(call, module), texts(call, call.args[1:])
