@@ -226,7 +226,7 @@ def test_page_shows_the_study_and_leaves_its_time_out(tmp_path: Path, progress: 
     study |= {"command": "pipeline train fox.nerf --train.seconds 20", "ablation": "Against the complete one: −2 dB."}
     study |= {
         "workspace_field": None,
-        "scored": "6 windows of 2 held-out photos",
+        "scored": "6 crops of 2 held-out photos",
         "left_out": ["paper, published: 5 steps"],
     }
     write_json(inputs["tradeoff"] / "tradeoff.json", study)
