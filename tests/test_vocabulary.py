@@ -21,7 +21,7 @@ SCENE_FIELDS_RENDERING: dict[str, str] = {
     r"\bMOST_CLEAR\b|\bclearance\b": "empty-space distance",
     r"\bLattice\b|\blattice_(distance|coordinate|measure)\b": "RayStepping, s_to_t, t_to_s, normalised_distance",
     r"density.lattice": "density grid",
-    r"\b(end_wave|pack_waves|front_to_back|in_waves)\b|\bwaves of samples\b": "marching rounds, march_with_early_termination",
+    r"\b(end_wave|pack_waves|front_to_back)\b|\bwaves of samples\b": "marching rounds, march_with_early_termination",
     r"HIDDEN_BEHIND": "EARLY_STOP_TRANSMITTANCE",
     r"quantum of light|\bQUANTUM\b|\b(drawn_samples|add_drawn)\b": "opacity-quantised colour sampling",
     r"LEAST_CHANCE": "MIN_KEEP_PROBABILITY",
