@@ -23,8 +23,8 @@ from nerf.training.metrics import mean_squared_error, psnr
 from pipeline.engine.workspace import Workspace
 from stages.effects.decisions import expected_gains
 from stages.io.files import read_json, read_scene
+from stages.io.photos import spread
 from stages.render.renderer import Painter, load_painter
-from stages.render.spread import spread
 from stages.tradeoff.runs import resolution_words
 from stages.train.data import PhotoReader, view_rays
 

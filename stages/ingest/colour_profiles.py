@@ -1,19 +1,16 @@
 """Colours of any ICC profile into sRGB."""
 
-from typing import TYPE_CHECKING, Any
+import io
+from typing import Any
 
-if TYPE_CHECKING:
-    from PIL import Image
+import numpy as np
+from PIL import Image, ImageCms
 
 _SRGB_TOLERANCE = 2  # of 255: profiles closer than this to sRGB are sRGB written by another hand
 
 
-def to_srgb(image: "Image.Image", profile: bytes | None, notes: list[str]) -> "tuple[Image.Image, bool]":
+def to_srgb(image: Image.Image, profile: bytes | None, notes: list[str]) -> tuple[Image.Image, bool]:
     """``image`` as RGB or RGBA in sRGB, and whether its values already were sRGB."""
-    import io
-
-    from PIL import ImageCms
-
     mode = "RGBA" if image.mode in ("LA", "RGBA") else "RGB"
     if not profile:
         return image.convert(mode), True
@@ -32,9 +29,6 @@ def to_srgb(image: "Image.Image", profile: bytes | None, notes: list[str]) -> "t
 
 
 def _is_identity(transform: Any, mode: str) -> bool:
-    import numpy as np
-    from PIL import Image, ImageCms
-
     levels = np.arange(0, 256, 15, dtype=np.uint8)
     cube = np.stack(np.meshgrid(levels, levels, levels), axis=-1).reshape(len(levels), -1, 3)
     before = Image.fromarray(cube).convert(mode)

@@ -11,7 +11,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from stages.io.files import write_durably
-from stages.io.periodically import periodically
+from stages.io.live_line import periodically
 
 BEAT = 5.0  # seconds between what is kept: whatever ends the program takes no more than these with it
 

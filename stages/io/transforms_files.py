@@ -3,17 +3,16 @@
 import json
 from collections.abc import Callable, Mapping
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
 
 from stages.contract import StageError
 
-if TYPE_CHECKING:
-    import numpy as np
-    from jaxtyping import Float
-
 TRAIN, HELD_OUT = "transforms_train.json", ("transforms_test.json", "transforms_val.json")  # of a Blender-style folder
-LONGEST_PATH, LONGEST_NAME = 2000, 250  # bytes, with room for an extension
-MOST_LETTERS = 60  # of a name, in an error
+MAX_PATH_BYTES, MAX_NAME_BYTES = 2000, 250  # bytes, with room for an extension
+MAX_LETTERS = 60  # of a name, in an error
 ROUNDED = 1e-3  # what rounding may make of a 0
 _HINT = "Give a transforms.json as nerfstudio, instant-ngp or the NeRF-synthetic scenes write it."
 
@@ -42,7 +41,7 @@ def _check_frames(frames: list[Any], what: str) -> None:
         if not isinstance(mask, str):
             raise StageError(what, f"the mask_path of frame {index} is no name of a file", _HINT)
         if wrong := next((name for name in (*photo_names(frame), mask) if not _is_name(name)), None):
-            why = f"no file can have the name of frame {index}, {ascii(wrong)[:MOST_LETTERS]}"
+            why = f"no file can have the name of frame {index}, {ascii(wrong)[:MAX_LETTERS]}"
             raise StageError(what, why, _HINT)
 
 
@@ -81,7 +80,7 @@ def read_splits(
 
 
 def none_among_the_photos(count: int, where: str) -> str:
-    """The note on test photos that are not there, or that ingest refused."""
+    """The note on test photos that are not there, or that ingest rejected."""
     return f"none of the {count} test photos of {where} is among the photos"
 
 
@@ -104,11 +103,9 @@ def _test_frames(file: str, content: dict[str, Any]) -> tuple[str, dict[str, Any
     return where, content | {"frames": frames}
 
 
-def pose_matrix(matrix: Any) -> "Float[np.ndarray, '3 4']":
+def pose_matrix(matrix: Any) -> Float[np.ndarray, "3 4"]:
     """The first three rows of a frame's ``transform_matrix``, which may be a flat list of its rows. Raises ValueError
     for what is no matrix of that shape."""
-    import numpy as np
-
     try:
         pose = np.array(matrix, np.float64)
     except (TypeError, ValueError, OverflowError) as error:
@@ -135,4 +132,4 @@ def _is_name(file_path: str) -> bool:
         parts = file_path.encode().split(b"/")
     except UnicodeEncodeError:
         return False
-    return sum(map(len, parts)) <= LONGEST_PATH and max(map(len, parts)) <= LONGEST_NAME
+    return sum(map(len, parts)) <= MAX_PATH_BYTES and max(map(len, parts)) <= MAX_NAME_BYTES

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 from pydantic import Field
 from tyro.conf import Suppress
 
+from stages.amounts import duration, short_count
 from stages.contract import Inputs, Progress, StageConfig, StageResult
-from stages.io.amounts import duration, short_count
 from stages.io.files import read_json, read_scene, read_tensors, write_json
 from stages.report.cameras import (
     CameraReport,
@@ -178,7 +178,7 @@ def page(results: Results, summary: dict[str, Any], config: Config) -> str:
         budget=config.budget,
         expected={} if config.budget else summary["expected_seconds"],
         settings=_settings(results.manifests),
-        refused=results.photos["refused"] if results.photos else [],
+        rejected=results.photos["rejected"] if results.photos else [],
         missing=missing(results.registration, names),
         camera_groups=_camera_groups(results, names),
         lenses=camera_models(results.registration),
@@ -239,7 +239,7 @@ def _thumbnail(path: Path) -> str | None:
     import numpy as np
     from PIL import Image
 
-    from stages.ingest.decoding import pillow
+    from stages.io.pixels import pillow
 
     if not path.exists():
         return None
@@ -347,7 +347,7 @@ def _pictures(results: Results, image: dict[str, Any], width: int) -> dict[str, 
     """One test photo's figures with its photo, render and error map as data URIs, all of one size."""
     from PIL import Image
 
-    from stages.io.photos import load_pixels
+    from stages.io.pixels import load_pixels
 
     assert results.scene is not None
     view = next(view for view in results.scene.views if view.name == image["name"])

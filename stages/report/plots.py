@@ -7,7 +7,7 @@ from pathlib import PurePosixPath
 from typing import TYPE_CHECKING, Any
 
 from nerf import REGION_HALF
-from stages.io.amounts import duration
+from stages.amounts import duration
 from stages.train.curve import heldout_curve
 
 if TYPE_CHECKING:

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 from pydantic import Field
 from tyro.conf import Suppress
 
+from stages.amounts import duration
 from stages.contract import Inputs, Progress, StageConfig, StageError, StageResult
 from stages.effects.decisions import Space, read_decisions
-from stages.io.amounts import duration
 from stages.io.files import read_scene, write_json
 from stages.tradeoff.runs import (
     OWN,

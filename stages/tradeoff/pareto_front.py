@@ -21,8 +21,8 @@ from dataclasses import asdict, dataclass, replace
 from statistics import mean, stdev
 from typing import Any, Literal
 
+from stages.amounts import duration
 from stages.effects.decisions import Space
-from stages.io.amounts import duration
 from stages.tradeoff.runs import OWN, Arm, field_of, options_of, resolution_words
 
 WORTH_DB = 0.5  # a doubling of the time that buys less is not worth it; 0.5 dB is what one sees side by side

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from stages.io.amounts import duration
+from stages.amounts import duration
 from stages.report.plots import INK, drawing, svg_element
 from stages.tradeoff.runs import OWN, family_of, resolution_words
 

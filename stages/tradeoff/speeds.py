@@ -74,7 +74,7 @@ def _work(config: "TrainConfig") -> float:
 def measured_reading(scene: "Scene", ingest: Path, windows: int) -> Reading:
     """What the photos take by the time that one of them takes: all on all cores, those of the windows one by one."""
     from stages.hardware.device import processors
-    from stages.io.photos import load_pixels
+    from stages.io.pixels import load_pixels
     from stages.train.data import scaled_size
 
     def pixels(views: "Sequence[View]") -> int:

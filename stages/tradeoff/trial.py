@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from stages.contract import Inputs, Progress, StageError
 from stages.io.files import read_json, sync_file, write_json_durably
-from stages.io.periodically import periodically
+from stages.io.live_line import periodically
 from stages.tradeoff.runs import SMALL_SIDE, THINNED, Arm
 from stages.train.data import NOTHING_LEFT
 
@@ -68,7 +68,7 @@ class Exam:
 def make_exam(ingest: Path, scene: "Scene", downscale: float, count: int, small: float) -> Exam:
     """``count`` windows spread over the held-out photos at 1/``downscale`` of their size, and SHOWN of these photos at
     1/``small``, large ones still smaller: of at most SMALL_SIDE pixels, which the study has time to draw."""
-    from stages.render.spread import spread
+    from stages.io.photos import spread
     from stages.train.data import scaled_size
     from stages.train.setup import BLACK, WHITE
 

@@ -79,8 +79,8 @@ def test_where_it_fails_all_refusals_are_said_by_reason(tmp_path: Path, progress
         ingest.run(Config(photos=folder), {}, tmp_path / "out", progress)
     names = ", ".join(f"x{index:02d}.jpg" for index in range(12))
     assert progress.notes == [
-        f"refused {names}: not an image: it is text",
-        "refused y.jpg: identical to a.jpg",
+        f"rejected {names}: not an image: it is text",
+        "rejected y.jpg: identical to a.jpg",
         "masks/stray.png is no photo's mask, which are called NAME.png",
     ]
 

@@ -11,10 +11,10 @@ from stages.contract import Progress, StageError, listed
 from stages.io.photos import Photo, read_frame_names
 from stages.io.sparse_model import SparseModel
 from stages.sfm.colmap.models import read_model, write_model
-from stages.sfm.imported.known_cameras import KnownCameras, read_known_cameras
 from stages.sfm.imported.pose_check import check_given_cameras
+from stages.sfm.imported.pose_files import KnownCameras, read_known_cameras
 
-MOST_NAMES = 5
+MAX_NAMES = 5
 
 
 def import_cameras(
@@ -82,7 +82,7 @@ def _check_given(
         )
     elif check["doubtful"]:
         names = {photo.image_name: photo.name for photo in photos}
-        who = listed([names[file] for file in check["doubtful"]], MOST_NAMES)
+        who = listed([names[file] for file in check["doubtful"]], MAX_NAMES)
         progress.note(
             f"{len(check['doubtful'])} of {len(posed)} given cameras contradict what their photos show: {who}"
         )

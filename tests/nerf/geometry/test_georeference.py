@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from nerf.geometry.camera_paths import nearest_rotations
+from nerf.geometry.georeference import ONE_LINE, Georeference, east_north_up, georeference
 from nerf.geometry.scene import Similarity
-from stages.normalise.georeference import ONE_LINE, Georeference, east_north_up, georeference
 
 HERE = (47.3769, 8.5417, 408.0)
 METRES_PER_DEGREE = 111_178.0  # northwards at 47 degrees
