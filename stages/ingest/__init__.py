@@ -42,11 +42,11 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     from stages.ingest import conversion
 
     source = find_source(config.photos, config.cameras)
-    conversion.note_unused(source, config.photos, progress)
+    conversion.messages.note_unused(source, config.photos, progress)
     with conversion.writing(folder):
         converted = conversion.convert(source, config.frames, folder, progress)
-        conversion.note_rejected(converted.rejected, progress)
-        conversion.note_first(converted.notes, NOTES, progress)
+        conversion.messages.note_rejected(converted.rejected, progress)
+        conversion.messages.note_first(converted.notes, NOTES, progress)
         photos = conversion.store(converted, folder)
         write_photos(folder, photos, converted.rejected, source.frames)
         if converted.notes:
@@ -56,6 +56,6 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     return StageResult(
         outputs=("images", "photos.json", *["masks"] * has_masks, *["opaque"] * has_alpha),
         records=(NOTES,) if converted.notes else (),
-        line=conversion.summary(source, photos, converted.rejected),
-        facts=conversion.facts(source, photos, converted.rejected),
+        line=conversion.messages.summary(source, photos, converted.rejected),
+        facts=conversion.messages.facts(source, photos, converted.rejected),
     )

@@ -26,7 +26,7 @@ from stages.ingest.auxiliary_files import Stored, depth_maps, pair_masks
 from stages.ingest.decoding import CameraKey, DecodeError, decode, pixel_count
 from stages.ingest.exif import GpsPosition
 from stages.ingest.masks import are_of_stored_pixels, read_mask
-from stages.ingest.messages import facts, note_first, note_rejected, note_unused, shown, summary
+from stages.ingest.messages import shown
 from stages.ingest.near_duplicates import near_duplicates, small, thumbnail
 from stages.ingest.panoramas import cutting_advice
 from stages.ingest.sharpness import one_colour, relative_sharpness, sharpness
@@ -36,18 +36,6 @@ from stages.io.ascii_names import ascii_files
 from stages.io.files import write_jpeg, write_png
 from stages.io.photos import Box, Photo, Rejection
 from stages.io.pixels import OPAQUE_FROM, opaque_box
-
-__all__ = [
-    "convert",
-    "facts",
-    "note_findings",
-    "note_first",
-    "note_rejected",
-    "note_unused",
-    "store",
-    "summary",
-    "writing",
-]
 
 _MAX_WORKERS = 8  # each holds a few copies of one photo, up to 250 megapixels
 _BYTES_PER_PIXEL = 24  # of a photo while it is decoded, turned, packed and looked at; 22 measured for 16 bits
@@ -150,6 +138,7 @@ def writing(folder: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise StageError(
+            "ingest.cannot-write",
             f"cannot write the photos to {folder}",
             error.strerror or str(error),
             "Make room there, or choose another workspace with -o.",

@@ -4,15 +4,15 @@ Files come from anywhere: formats are a fixed list, sizes are checked before pix
 wrong becomes a :class:`DecodeError` with a reason a user understands.
 """
 
+import io
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageCms
 
 from stages.ingest.auxiliary_files import Stored
-from stages.ingest.colour_profiles import to_srgb
 from stages.ingest.exif import (
     GpsPosition,
     clock_from_exif,
@@ -27,6 +27,7 @@ from stages.ingest.panoramas import is_panorama
 from stages.io.pixels import pillow
 
 MAX_PIXELS = 250_000_000
+_SRGB_TOLERANCE = 2  # of 255: profiles closer than this to sRGB are sRGB written by another hand
 MIN_SIDE_PX = 16
 # EPS and its like run interpreters; RAW_EXTENSIONS files would be read as their thumbnails.
 _FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP", "GIF", "PPM", "HEIF", "AVIF", "JPEG2000")
@@ -159,7 +160,7 @@ def _convert(image: Image.Image, stored_plainly: bool, lossy: bool, turned: int 
     """The loaded image as upright sRGB; ``turned`` is the EXIF orientation where it has been undone already."""
     notes: list[str] = []
     tags, orientation = read_exif(image, notes)
-    converted, is_srgb = to_srgb(_to_eight_bit(image), image.info.get("icc_profile"), notes)
+    converted, is_srgb = _to_srgb(_to_eight_bit(image), image.info.get("icc_profile"), notes)
     pixels = np.asarray(converted if turned else upright(converted, orientation))
     opaque = pixels.shape[2] == 4 and bool((pixels[..., 3] == 255).all())
     pixels = np.ascontiguousarray(pixels[..., :3] if opaque else pixels)
@@ -251,6 +252,33 @@ def _quantised(image: Image.Image) -> Image.Image:
     if not (values.min() >= 0 and values.max() <= limit):
         raise DecodeError(f"pixel values from {values.min()} to {values.max()}; export it with 8 or 16 bits")
     return pillow().fromarray(np.rint(values * (255 / limit)).astype(np.uint8))
+
+
+def _to_srgb(image: Image.Image, profile: bytes | None, notes: list[str]) -> tuple[Image.Image, bool]:
+    """``image`` as RGB or RGBA in sRGB, and whether its values already were sRGB."""
+    mode = "RGBA" if image.mode in ("LA", "RGBA") else "RGB"
+    if not profile:
+        return image.convert(mode), True
+    source = image.convert("RGBA") if image.mode == "LA" else image
+    try:
+        transform = ImageCms.buildTransform(
+            ImageCms.ImageCmsProfile(io.BytesIO(profile)), ImageCms.createProfile("sRGB"), source.mode, mode
+        )
+        if source.mode == mode and _is_identity(transform, mode):
+            return source, True
+        converted = ImageCms.applyTransform(source, transform) or source  # None only for in-place work
+    except (ImageCms.PyCMSError, OSError, ValueError) as error:
+        notes.append(f"colour profile ignored ({error})")
+        return image.convert(mode), False
+    return converted, False
+
+
+def _is_identity(transform: Any, mode: str) -> bool:
+    levels = np.arange(0, 256, 15, dtype=np.uint8)
+    cube = np.stack(np.meshgrid(levels, levels, levels), axis=-1).reshape(len(levels), -1, 3)
+    before = Image.fromarray(cube).convert(mode)
+    after = ImageCms.applyTransform(before, transform)
+    return int(np.abs(np.asarray(before, int) - np.asarray(after, int)).max()) <= _SRGB_TOLERANCE
 
 
 def upright(image: Image.Image, orientation: int) -> Image.Image:

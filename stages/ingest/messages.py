@@ -140,19 +140,39 @@ def too_few(source: Source, names: Sequence[str], rejected: Sequence[Rejection])
     """The error for one photo or none, ``names``, and what the rejections show."""
     if not names:
         first = f"{shown(rejected[0].name)}: {rejected[0].reason}"
-        return StageError(f"none of the {len(rejected)} files in {source.root} is a usable photo", first, HINT)
+        return StageError(
+            "ingest.no-usable-photo",
+            f"none of the {len(rejected)} files in {source.root} is a usable photo",
+            first,
+            HINT,
+        )
     only = shown(names[0])
     if rejected and all(rejection.reason.startswith("identical to ") for rejection in rejected):
-        return StageError(f"all {len(rejected) + 1} photos are identical", f"they have the pixels of {only}", HINT)
+        return StageError(
+            "ingest.identical-photos",
+            f"all {len(rejected) + 1} photos are identical",
+            f"they have the pixels of {only}",
+            HINT,
+        )
     if rejected:
-        return StageError(f"only one photo can be used, {only}", f"{len(rejected)} other files were rejected", HINT)
-    return StageError("there is only one photo", f"{only}; a scene needs at least two", HINT)
+        return StageError(
+            "ingest.one-usable-photo",
+            f"only one photo can be used, {only}",
+            f"{len(rejected)} other files were rejected",
+            HINT,
+        )
+    return StageError("ingest.one-photo", "there is only one photo", f"{only}; a scene needs at least two", HINT)
 
 
 def all_the_same(photos: int) -> StageError:
     """The error for photos that all show nearly the same picture."""
     why = "the camera did not move between them, so they show no depth"
-    return StageError(f"all {photos} photos are nearly the same picture", why, f"{HINT} {STILL_BACKGROUND_HINT}")
+    return StageError(
+        "ingest.same-picture",
+        f"all {photos} photos are nearly the same picture",
+        why,
+        f"{HINT} {STILL_BACKGROUND_HINT}",
+    )
 
 
 def all_plain(colours: Sequence[tuple[str, str]]) -> StageError:
@@ -160,7 +180,7 @@ def all_plain(colours: Sequence[tuple[str, str]]) -> StageError:
     name, colour = colours[0]
     why = f"{shown(name)} is {colour} everywhere, so there is nothing that could be found or learnt"
     hint = "Look at the photos: a cap on the lens, an exposure far off, or an export that failed."
-    return StageError(f"all {len(colours)} photos show one single colour", why, hint)
+    return StageError("ingest.plain-photos", f"all {len(colours)} photos show one single colour", why, hint)
 
 
 def summary(source: Source, photos: Sequence[Photo], rejected: Sequence[Rejection]) -> str:

@@ -10,7 +10,7 @@ from stages.contract import Inputs, Progress
 from stages.hardware.device import compute_device
 
 if TYPE_CHECKING:
-    from nerf.effects import PhotoColours, PhotoRays
+    from nerf.effects import ImageEffects
     from nerf.fields.hash_grid import HashGridSettings
     from nerf.fields.vanilla import VanillaSettings
     from nerf.geometry.scene import Scene
@@ -52,7 +52,7 @@ def prepare(config: "Config", scene: "Scene", inputs: Inputs, folder: Path, prog
     import torch
 
     from nerf.training.validation_probe import make_probe
-    from stages.effects.decisions import photo_parts, read_decisions
+    from stages.effects.decisions import image_effects, read_decisions
     from stages.train.data import guided_bank
     from stages.train.log import TrainingLog
     from stages.train.loop import TrainingRun
@@ -80,7 +80,7 @@ def prepare(config: "Config", scene: "Scene", inputs: Inputs, folder: Path, prog
     _say_sizes(config, budget, bank, progress)
     decisions, views = read_decisions(inputs["effects"]), scene.of_split("train")
     return TrainingRun(
-        lambda attempt: make_trainer(config, scene, bank, config.seed + attempt, photo_parts(decisions, views, bank)),
+        lambda attempt: make_trainer(config, scene, bank, config.seed + attempt, image_effects(decisions, views, bank)),
         probes,
         budget,
         folder,
@@ -126,13 +126,13 @@ def make_trainer(
     scene: "Scene",
     bank: "RayDataset",
     seed: int,
-    photo_parts: "tuple[PhotoRays, PhotoColours] | None" = None,
+    effects: "ImageEffects | None" = None,
 ) -> "FieldTrainer":
-    """A fresh field of the kind that ``config`` asks for, with its trainer, where ``bank`` is. ``photo_parts`` stand
-    between it and the photos; None: nothing does."""
-    from nerf.effects import AS_GIVEN, AS_RENDERED
+    """A fresh field of the kind that ``config`` asks for, with its trainer, where ``bank`` is. ``effects`` stand
+    between it and the photos; None: none does."""
+    from nerf.effects import NO_EFFECTS
 
-    photo_parts = photo_parts or (AS_GIVEN, AS_RENDERED)
+    effects = effects or NO_EFFECTS
     if config.field == "grid":
         from nerf.fields.hash_grid import HashGridField
         from nerf.training.hash_grid_trainer import HashGridTrainer
@@ -141,12 +141,12 @@ def make_trainer(
         assert config.backend, "plan() chooses it"
         backend = load_backend(config.backend, bank.device.type)
         model = HashGridField(grid_settings(config, has_sky(config, scene)), seed, backend).to(bank.device)
-        return HashGridTrainer(model, bank, grid_trainer_settings(config, scene, seed), *photo_parts)
+        return HashGridTrainer(model, bank, grid_trainer_settings(config, scene, seed), effects)
     from nerf.fields.vanilla import VanillaNerf
     from nerf.training.trainer import VanillaTrainer
 
     published = VanillaNerf(paper_settings(config), seed).to(bank.device)
-    return VanillaTrainer(published, bank, paper_trainer_settings(config, scene, seed), *photo_parts)
+    return VanillaTrainer(published, bank, paper_trainer_settings(config, scene, seed), effects)
 
 
 def _say_sizes(config: "Config", budget: "TrainingBudget", bank: "RayDataset", progress: Progress) -> None:

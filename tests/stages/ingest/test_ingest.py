@@ -213,7 +213,7 @@ def test_photos_that_are_all_nearly_the_same_are_no_scene(tmp_path: Path, progre
     error = failure(shifted(tmp_path / "in", 0, 1, 2), tmp_path / "out", progress)
     assert (error.what, error.why) == (
         "all 3 photos are nearly the same picture",
-        "the camera stood still between them, so they tell nothing of depth",
+        "the camera did not move between them, so they show no depth",
     )
     assert error.hint.endswith(f"into one folder. {STILL_BACKGROUND_HINT}")
 
@@ -383,7 +383,7 @@ def test_a_full_disk_is_said_in_words(tmp_path: Path, progress: Any, monkeypatch
     [
         ("sceaux_castle", "11 photos 1416×1064, one camera, EXIF focal 1433 px"),
         ("room_no_overlap", "8 photos in 2 sizes, 2 cameras, no EXIF focal"),
-        ("lego_400", "125 photos 400×400 with alpha, cameras given"),
+        ("lego_400", "125 photos 400×400 with alpha, poses imported"),
     ],
 )
 def test_real_sets(shared_data: Path, tmp_path: Path, progress: Any, scene: str, line: str) -> None:

@@ -65,7 +65,7 @@ def test_photos_beside_an_images_folder_are_said(tmp_path: Path, progress: Any) 
     put(tmp_path / "in/images", "a.jpg", "b.jpg")
     put(tmp_path / "in", "c.jpg", "d.jpg")
     ingest.run(Config(photos=tmp_path / "in"), {}, tmp_path / "out", progress)
-    how = f"to use all, move what lies beside into images/; to use only that, move images/ out of {tmp_path}/in"
+    how = f"to use all, move them into images/; to use only them, move images/ out of {tmp_path}/in"
     assert progress.notes == [f"2 photos lie in {tmp_path}/in beside images/ and are not used: {how}"]
 
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from stages.contract import StageError
-from stages.io import photos as module
+from stages.io import pixels
 from stages.io.photos import Photo, Rejection, read_frame_names, read_photos, write_photos
 from stages.io.pixels import load_mask, load_pixels, loaders, opaque_box, pillow
 from tests.png_files import png
@@ -86,7 +86,7 @@ def test_the_colour_of_transparent_pixels_does_not_leak(tmp_path: Path) -> None:
 def test_large_photos_are_loaded_by_fewer_threads(
     tmp_path: Path, size: tuple[int, int], alpha: bool, cores: int, expected: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "processors", lambda: cores)
+    monkeypatch.setattr(pixels, "processors", lambda: cores)
     (tmp_path / "large.png").write_bytes(png(*size, b"", alpha=alpha))
     (tmp_path / "small.png").write_bytes(png(1, 1, b""))
     assert loaders([tmp_path / "large.png", tmp_path / "small.png"]) == expected
