@@ -1,30 +1,12 @@
-"""Work beside a block of code: something repeated, or a live line that keeps moving while a long step computes."""
+"""A live line that keeps moving while a long step computes."""
 
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from stages.contract import Progress
+from stages.io.stopwatch import periodically
 
 PERIOD_SECONDS = 0.5
-
-
-@contextmanager
-def periodically(seconds: float, act: Callable[[], object]) -> Iterator[None]:
-    """Call ``act`` every ``seconds`` as long as the block runs, and not once after it; from another thread."""
-    over = threading.Event()
-
-    def repeat() -> None:
-        while not over.wait(seconds):
-            act()
-
-    thread = threading.Thread(target=repeat, daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        over.set()
-        thread.join()
 
 
 @contextmanager

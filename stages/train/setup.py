@@ -95,7 +95,9 @@ def field_bytes(config: "Config", workers: int) -> float:
     if config.field == "grid":
         settings = grid_settings(config, sky=False)  # which is small beside the rest
         assert config.batch_samples
-        return TABLE_COPIES * 4 * settings.features * settings.layout.rows + SAMPLE_BYTES * config.batch_samples
+        return (
+            TABLE_COPIES * 4 * settings.features_per_level * settings.layout.rows + SAMPLE_BYTES * config.batch_samples
+        )
     from nerf.training.trainer import CHUNK_RAYS
 
     sizes = paper_settings(config)
@@ -163,11 +165,15 @@ def _say_sizes(config: "Config", budget: "TrainingBudget", bank: "RayDataset", p
 
 def _step_words(config: "Config") -> str:
     """Of the grid field: how a step is divided and what computes it, and where samples stand along a ray."""
-    lattice = grid_settings(config, sky=False).lattice
-    growing = f", from {lattice.linear_until:g} on every {lattice.cone:.1%} of the distance" if lattice.cone else ""
+    stepping = grid_settings(config, sky=False).stepping
+    growing = (
+        f", from {stepping.linear_until:g} on every {stepping.cone_angle:.1%} of the distance"
+        if stepping.cone_angle
+        else ""
+    )
     parts = f"{config.chunks} part{'' if config.chunks == 1 else 's'}"
     step = f"{config.batch_samples:,} colours a step in {parts}, by {config.backend}"
-    return f"{step} · samples every {lattice.step:.2g} scene units{growing}"
+    return f"{step} · samples every {stepping.step_size:.2g} scene units{growing}"
 
 
 def has_sky(config: "Config", scene: "Scene") -> bool:
@@ -186,17 +192,17 @@ def grid_settings(config: "Config", sky: bool) -> "HashGridSettings":
     assert config.contracted is not None and config.view_dependence is not None, "plan() takes them from stage effects"
     shortest = 2 * CONTRACTED_BOX / (_steps_across(config.finest) * config.ray_samples)
     return HashGridSettings(
-        levels=config.levels,
-        log2_rows=config.log2_rows,
-        coarsest=min(COARSEST[config.space], config.finest),
-        finest=config.finest,
+        num_levels=config.levels,
+        log2_hashmap_size=config.log2_rows,
+        base_res=min(COARSEST[config.space], config.finest),
+        max_res=config.finest,
         contracted=config.contracted,
-        steps=max(1, round(config.ray_samples * min(math.sqrt(3) * config.finest, MOST_STEPS))),
-        shortest_step=shortest,
-        cone=shortest / EVEN_UNTIL,
-        most_samples=math.ceil(MOST_SAMPLES * max(1.0, config.ray_samples)),
+        diagonal_steps=max(1, round(config.ray_samples * min(math.sqrt(3) * config.finest, MOST_STEPS))),
+        min_step_size=shortest,
+        cone_angle=shortest / EVEN_UNTIL,
+        max_samples_per_ray=math.ceil(MOST_SAMPLES * max(1.0, config.ray_samples)),
         view_dependence=config.view_dependence,
-        sky=sky,
+        background_model=sky,
     )
 
 

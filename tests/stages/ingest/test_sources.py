@@ -283,8 +283,8 @@ def test_a_video_or_a_folder_with_nothing_else(tmp_path: Path, given: str) -> No
     with pytest.raises(StageError) as error:
         find_source(tmp_path / given, transforms(tmp_path / "t.json", "a.jpg").parent)
     assert str(error.value) == (
-        "cannot use --cameras with clip.MP4: it is a video, and which of its frames become photos is decided by ingest: "
-        "no poses can be imported for them. "
+        "cannot use --cameras with clip.MP4: it is a video, and which of its frames become photos is "
+        "decided by ingest: no poses can be imported for them. "
         "Leave --cameras out, or give the folder of the photos that the cameras belong to."
     )
 
