@@ -115,7 +115,7 @@ def test_where_a_photo_was_taken(tmp_path: Path, suffix: str) -> None:
     exif.get_ifd(ExifTags.IFD.GPSInfo).update(numbers)
     big = Image.fromarray(smooth(96, 64))
     decode(saved(tmp_path / "warm.png", big))  # registers HEIC
-    place = decode(saved(tmp_path / f"a.{suffix}", big, exif=exif)).place
+    place = decode(saved(tmp_path / f"a.{suffix}", big, exif=exif)).gps
     assert place.latitude == pytest.approx(-(33 + 51 / 60 + 24.5 / 3600), abs=1e-6)
     assert place.longitude == pytest.approx(151 + 12 / 60 + 54 / 3600, abs=1e-6)
     assert place.altitude_m == pytest.approx(-4.25)
