@@ -7,12 +7,12 @@ from jaxtyping import Float
 from nerf.geometry.scene import Camera
 from stages.contract import StageError
 
-ROUND_TRIP_PX = 0.01  # a bearing that does not project back to its pixel is a false root of the distortion
+ROUND_TRIP_PX = 0.01  # a ray direction that does not project back to its pixel is a false root of the distortion
 CHECKED_PIXELS = (33, 25)  # across and down, the very corners among them: there lenses bend most
 
 
 def camera_rays(camera: Camera, width: int, height: int) -> Float[np.ndarray, "height width 3"]:
-    """Unit bearing vectors (float32) of the pixel centres of ``camera``'s image resized to width × height.
+    """Unit ray directions (float32) of the pixel centres of ``camera``'s image resized to width × height.
 
     Raises StageError where the camera model has no inverse at some pixels.
     """
@@ -23,7 +23,7 @@ def camera_rays(camera: Camera, width: int, height: int) -> Float[np.ndarray, "h
     lost = 0
     for row in range(height):
         pixels = np.stack([x, np.full(width, (row + 0.5) * (camera.height / height))], axis=1)
-        rays[row], missing = _bearings(model, pixels)
+        rays[row], missing = _ray_directions(model, pixels)
         lost += missing
     if lost:
         raise no_ray(camera, lost / (width * height))
@@ -35,14 +35,14 @@ def share_without_ray(model: pycolmap.Camera) -> float:
     sides = zip((model.width, model.height), CHECKED_PIXELS, strict=True)
     x, y = (np.linspace(0.5, length - 0.5, count) for length, count in sides)
     pixels = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    return _bearings(model, pixels)[1] / len(pixels)
+    return _ray_directions(model, pixels)[1] / len(pixels)
 
 
-def _bearings(model: pycolmap.Camera, pixels: Float[np.ndarray, "n 2"]) -> tuple[Float[np.ndarray, "n 3"], int]:
-    """Unit bearing vectors of pixels, and how many of these they are not those of."""
-    bearings = np.asarray(model.cam_ray_from_img(pixels))
-    miss = np.abs(np.asarray(model.img_from_cam(bearings)) - pixels).max(axis=1)
-    return bearings, int(np.count_nonzero(~(miss < ROUND_TRIP_PX)))  # NaN counts as lost
+def _ray_directions(model: pycolmap.Camera, pixels: Float[np.ndarray, "n 2"]) -> tuple[Float[np.ndarray, "n 3"], int]:
+    """Unit ray directions of pixels, and how many of these they are not those of."""
+    ray_directions = np.asarray(model.cam_ray_from_img(pixels))
+    miss = np.abs(np.asarray(model.img_from_cam(ray_directions)) - pixels).max(axis=1)
+    return ray_directions, int(np.count_nonzero(~(miss < ROUND_TRIP_PX)))  # NaN counts as lost
 
 
 def no_ray(camera: Camera, share: float, of: str = "") -> StageError:
@@ -61,7 +61,7 @@ def no_ray(camera: Camera, share: float, of: str = "") -> StageError:
 
 def why_no_ray(model: str) -> str:
     """What may be the matter where a camera of this model has no ray: COLMAP's fisheyes end at 90° from the axis, and
-    the bearings that they give further out are of other pixels."""
+    the ray directions that they give further out are of other pixels."""
     return f"{'it looks beyond 90° from its axis or ' if is_fisheye(model) else ''}its distortion cannot be undone"
 
 
