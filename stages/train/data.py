@@ -43,7 +43,7 @@ def camera_directions(camera: "Camera", downscale: float) -> "Tensor":
     return torch.from_numpy(camera_rays(camera, *scaled_size(camera, downscale)))
 
 
-def patch_bearings(camera: "Camera", downscale: float) -> "Tensor":
+def patch_directions(camera: "Camera", downscale: float) -> "Tensor":
     """Bearing vectors (rows, columns, 3) of a camera in the middles of the patches that stand for its pixels in a ray
     dataset, MOST_PATCHES along the longer side or one per pixel."""
     import torch
@@ -74,7 +74,7 @@ def training_dataset(
 
     def directions(index: int) -> "Tensor":
         progress.update(f"rays of camera {index + 1} of {len(used)}", index / len(used))
-        return patch_bearings(scene.cameras[used[index]], downscale)
+        return patch_directions(scene.cameras[used[index]], downscale)
 
     dataset = make_ray_dataset(
         pixels=store.table(progress),
