@@ -64,8 +64,8 @@ def training_dataset(
     import torch
 
     from nerf.training.ray_dataset import PosedViews, make_ray_dataset
-    from stages.io.photos import loaders
     from stages.io.pixel_store import fill
+    from stages.io.pixels import loaders
 
     views, store = scene.of_split(split), _store(ingest, scene, split, downscale)
     at_once = cache(lambda: loaders(ingest / view.file for view in views))  # opens every file
@@ -142,7 +142,7 @@ def view_mask(ingest: Path, scene: "Scene", view: "View", downscale: float) -> "
     """Which pixels of a view are to be used, (H, W) bool; None: all of them."""
     import torch
 
-    from stages.ingest.masks import load_mask
+    from stages.io.pixels import load_mask
 
     if view.mask is None:
         return None
@@ -200,7 +200,7 @@ def _decoded_pixels(ingest: Path, scene: "Scene", view: "View", downscale: float
     """The photo of a view as uint8: (H, W, 4) in a scene with alpha, else (H, W, 3) as it is below its alpha."""
     import numpy as np
 
-    from stages.io.photos import load_pixels
+    from stages.io.pixels import load_pixels
 
     pixels = load_pixels(ingest / view.file, *scaled_size(scene.cameras[view.camera], downscale))
     if scene.has_alpha and pixels.shape[2] == 3:  # a photo without transparent parts covers every pixel
