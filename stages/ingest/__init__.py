@@ -10,7 +10,7 @@ from stages.io.files import write_json
 from stages.io.photos import write_photos
 
 INPUTS: tuple[str, ...] = ()
-VERSION = 12
+VERSION = 13
 RESUMES = False
 NOTES = "notes.json"
 PUBLISHED = ("photos.json", NOTES, "images", "masks", "opaque")

@@ -8,6 +8,7 @@ from pathlib import Path
 from stages.contract import Progress, StageError, listed
 from stages.ingest.auxiliary_files import is_mask
 from stages.ingest.masks import STILL_BACKGROUND_HINT
+from stages.ingest.near_duplicates import Brackets
 from stages.ingest.sharpness import BLURRED
 from stages.ingest.sources import Source, photos_beside, unused_cameras, unused_masks
 from stages.io.photos import Photo, Rejection
@@ -83,6 +84,15 @@ def excluded_by_values(files: Sequence[str]) -> list[str]:
     count = "1 file is" if len(files) == 1 else f"{len(files)} files are"
     named = listed([shown(name) for name in files], 3)
     return [f"{count} excluded as depth maps, being grey of 16 bits or of floats among photos in colour: {named}"]
+
+
+def bracketed(brackets: Brackets) -> str:
+    """The note on places that were photographed with several exposures each."""
+    last = brackets.exposures - 1
+    names = {0: "darkest", last: "brightest", last / 2: "middle one"}
+    which = names.get(brackets.position, f"number {brackets.position + 1} from the darkest")
+    each = f"{brackets.places} places were photographed with {brackets.exposures} exposures each"
+    return f"{each}: the {which} of each is kept, where least is clipped or too dark"
 
 
 def nearly_black(brightest: Sequence[int]) -> list[str]:
