@@ -57,14 +57,14 @@ def pair_masks(names: Sequence[str], masks: Sequence[tuple[str, Path]]) -> tuple
     """The mask file of each photo that has one, by the photo's name, and the files that are no photo's mask, each
     once though it may stand for several names.
 
-    A photo's mask is called after it, with its ending or without, and ends in .png. Its accents may be composed in
-    another way, where no other mask is called so.
+    A photo's mask is called after it, with its ending or without, and ends as images do, in .png rather than in another
+    way. Its accents may be composed in another way, where no other mask is called so.
     """
     by_name: dict[str, Path] = {}
     composed: dict[str, set[Path]] = {}
-    for name, file in masks:
-        if name.lower().endswith(".png"):
-            of = name[: -len(".png")]
+    for name, file in sorted(masks, key=lambda mask: not mask[0].lower().endswith(".png")):
+        of, ending = os.path.splitext(name)
+        if ending.lower() in IMAGES:
             by_name.setdefault(of, file)
             composed.setdefault(unicodedata.normalize("NFC", of), set()).add(file)
 
