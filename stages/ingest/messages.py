@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from stages.contract import Progress, StageError, listed
-from stages.ingest.auxiliary_files import is_mask
+from stages.ingest.auxiliary_files import instant_ngp_masks, is_mask
 from stages.ingest.masks import STILL_BACKGROUND_HINT
 from stages.ingest.near_duplicates import Brackets
 from stages.ingest.sharpness import BLURRED
@@ -66,11 +66,14 @@ def note_unused(source: Source, photos: Path, progress: Progress) -> None:
 
 def excluded(files: Mapping[str, str]) -> list[str]:
     """Notes on files that are not taken for photos, {file: the photo that it belongs to}."""
+    used = instant_ngp_masks(files).values()
+    notes = [f"{len(used)} masks of instant-ngp's ({shown(min(used))}, …) are used: white is ignored"] if used else []
+    files = {name: photo for name, photo in files.items() if name not in used}
     if not files:
-        return []
+        return notes
     named = [f"{shown(name)} (of {shown(photo)})" for name, photo in sorted(files.items())]
     count = "1 file is" if len(files) == 1 else f"{len(files)} files are"
-    notes = [f"{count} excluded, named as a mask, depth map or other copy of a photo: {listed(named, 3)}"]
+    notes += [f"{count} excluded, named as a mask, depth map or other copy of a photo: {listed(named, 3)}"]
     if mask := next((name for name in sorted(files) if is_mask(name)), None):
         place = f"masks/{os.path.splitext(files[mask])[0]}.png"
         notes.append(f"to be used as a mask, whose black is ignored, {shown(mask)} would have to be {shown(place)}")

@@ -12,7 +12,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
 from stages.contract import StageError, listed
-from stages.ingest.auxiliary_files import auxiliary_files, pair_masks
+from stages.ingest.auxiliary_files import IGNORED, auxiliary_files, instant_ngp_masks, pair_masks
 from stages.ingest.frame_files import FrameFiles
 from stages.ingest.listing import FOLDER_HINT, IMAGES, files_below, is_video, list_photos, photo_root, walk_photos
 from stages.io.transforms_files import HELD_OUT, TRAIN, photo_names, read_splits
@@ -63,7 +63,7 @@ def find_source(photos: Path, cameras: Path | None = None) -> Source:
         _check_given(photos, cameras)
         source = _source(photos, cameras)
         if source.kind != "video":
-            return replace(source, masks=source.masks + _list_masks(source.root, source.files))
+            return replace(source, masks=source.masks + _list_masks(source.root, source.files) + _beside(source))
         if cameras is not None:
             raise _cameras_of_video(source.files[0])
         return source
@@ -166,6 +166,15 @@ def _list_masks(root: Path, files: tuple[Path, ...]) -> tuple[tuple[str, Path], 
             inside = files_below(masks, lambda folder: not folder.name.startswith("."))
             found += [(_name(masks, file, stands_in), file) for file in inside]
     return tuple(found)
+
+
+def _beside(source: Source) -> tuple[tuple[str, Path], ...]:
+    """Masks of instant-ngp's that lie beside their photos, after the names that they would have in a masks folder."""
+    if source.kind in ("transforms", "blender"):
+        own = {source.name(file): file.with_name(f"{IGNORED}{file.stem}.png") for file in source.files}
+        return tuple((f"{photo}.png", mask) for photo, mask in own.items() if mask.is_file())
+    found = instant_ngp_masks(source.excluded)
+    return tuple((f"{photo}.png", source.root / mask) for photo, mask in found.items())
 
 
 def _check_given(photos: Path, cameras: Path | None) -> None:
