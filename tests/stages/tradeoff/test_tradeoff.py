@@ -128,7 +128,7 @@ def test_a_study_is_of_the_space_that_the_scene_lies_in(
 ) -> None:
     speeds = {name: Speed(*speed) for name, speed in SPEEDS.items()}
     monkeypatch.setattr("stages.tradeoff.speeds.measured_speeds", lambda *_: speeds)
-    write_decisions(tmp_path, Decisions(unbounded=unbounded))
+    write_decisions(tmp_path, Decisions({"background": {}} if unbounded else {}))
     planned = tradeoff.plan(Config(seconds=60.0), photos | {"effects": tmp_path}, progress)
     assert {planned.space} == {arm.space for arm in tradeoff.selection_of(planned).arms} == {space}
     assert planned.windows and 6 <= planned.windows <= 32
