@@ -52,8 +52,8 @@ def read_decisions(folder: Path) -> Decisions:
     return read_dataclass(folder / "decisions.json", Decisions)
 
 
-def image_effects(decisions: Decisions, views: "Sequence[View]", bank: "RayDataset") -> "ImageEffects":
-    """What stands between the field and the photos ``views`` of ``bank``, in their order."""
+def image_effects(decisions: Decisions, views: "Sequence[View]", dataset: "RayDataset") -> "ImageEffects":
+    """What stands between the field and the photos ``views`` of ``dataset``, in their order."""
     import numpy as np
     import torch
 
@@ -64,11 +64,11 @@ def image_effects(decisions: Decisions, views: "Sequence[View]", bank: "RayDatas
     if not any(parts.rays or parts.colours for _, parts in modelled):
         return NO_EFFECTS
     poses = np.stack([view.scene_from_camera for view in views])
-    images = TrainingImages(torch.tensor(poses, dtype=torch.float32, device=bank.device), bank.viewing_distance)
+    images = TrainingImages(torch.tensor(poses, dtype=torch.float32, device=dataset.device), dataset.viewing_distance)
     for name, parts in modelled:
         measured = None
         if rows := decisions.on[name]:
-            measured = torch.tensor([rows[view.name] for view in views], device=bank.device)
+            measured = torch.tensor([rows[view.name] for view in views], device=dataset.device)
         if parts.rays:
             rays.append(parts.rays(images, measured))
         if parts.colours:

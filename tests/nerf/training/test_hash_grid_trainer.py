@@ -16,19 +16,21 @@ from nerf.training.hash_grid_trainer import (
     HashGridBatch,
     HashGridTrainer,
     HashGridTrainerSettings,
-    depth_factor,
+    depth_loss_multiplier,
     lr_multiplier,
 )
-from nerf.training.ray_dataset import RayDataset, build_ray_bank
+from nerf.training.ray_dataset import RayDataset, ray_dataset_from_images
 from nerf.training.trainer import FieldTrainer, NonFinite
 from nerf.training.validation_probe import make_probe, measure
 
-FIELD = HashGridSettings(levels=2, log2_rows=10, coarsest=4, finest=16, steps=32, occupancy_resolution=16)
+FIELD = HashGridSettings(
+    num_levels=2, log2_hashmap_size=10, base_res=4, max_res=16, diagonal_steps=32, occupancy_resolution=16
+)
 BACKGROUND = (0.2, 0.9, 0.5)
 TRAINER = HashGridTrainerSettings(seed=3, background="random", samples=1024)
 
 
-def small_bank(size: int = 12) -> RayDataset:
+def small_dataset(size: int = 12) -> RayDataset:
     """Two opposite views of a red disc on nothing, from 3 units away."""
     grid = (torch.arange(size) + 0.5) / size - 0.5
     y, x = torch.meshgrid(grid, grid, indexing="ij")
@@ -39,11 +41,13 @@ def small_bank(size: int = 12) -> RayDataset:
     front = torch.tensor([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, -3]])
     back = torch.tensor([[-1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 3]])
     near, far = torch.full((2,), 1.0), torch.full((2,), 5.0)
-    return build_ray_bank([photo.to(torch.uint8)] * 2, [0, 0], [bearings], torch.stack([front, back]), near, far)
+    return ray_dataset_from_images(
+        [photo.to(torch.uint8)] * 2, [0, 0], [bearings], torch.stack([front, back]), near, far
+    )
 
 
 def trainer(settings: HashGridTrainerSettings = TRAINER, field: HashGridSettings = FIELD) -> HashGridTrainer:
-    return HashGridTrainer(HashGridField(field, 0, reference), small_bank(), settings)
+    return HashGridTrainer(HashGridField(field, 0, reference), small_dataset(), settings)
 
 
 def copied(state: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -56,12 +60,12 @@ def same(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:
 
 def test_it_trains_behind_the_common_interface() -> None:
     run: FieldTrainer = trainer()
-    probe = make_probe(small_bank(), 288, torch.ones(3), seed=5)
+    probe = make_probe(small_dataset(), 288, torch.ones(3), seed=5)
     before = measure(run.model, probe).psnr
     for step in range(80):
         run.step(step, step / 80, 1.0)
     after = measure(run.model, probe).psnr
-    assert before < probe.flat_psnr < probe.flat_psnr + 5 < after < 60
+    assert before < probe.mean_colour_psnr < probe.mean_colour_psnr + 5 < after < 60
 
 
 def test_a_resumed_run_is_the_uninterrupted_one_bit_for_bit() -> None:
@@ -82,7 +86,7 @@ def test_results_do_not_depend_on_the_number_of_threads() -> None:
     try:
         for count in (1, 2, 3):
             torch.set_num_threads(count)
-            run = trainer(settings, replace(FIELD, levels=3, finest=64, log2_rows=16))
+            run = trainer(settings, replace(FIELD, num_levels=3, max_res=64, log2_hashmap_size=16))
             for step in range(20):  # the density cache is refreshed once
                 run.step(step, step / 20)
             states.append(copied(run.state()))
@@ -93,7 +97,7 @@ def test_results_do_not_depend_on_the_number_of_threads() -> None:
 
 def test_the_gradient_of_a_batch_is_the_sum_over_its_chunks() -> None:
     run = trainer(replace(TRAINER, samples=1 << 14, distortion=0.1, depth_loss=0.2, chunks=4))
-    run.bank = run.bank.with_distances(torch.tensor([78, 222]), torch.tensor([3.0, 2.5]))
+    run.dataset = run.dataset.with_sparse_depths(torch.tensor([78, 222]), torch.tensor([3.0, 2.5]))
     rays = run._rays_per_chunk()
     parts = [run._part(0, 0.25, rays, chunk) for chunk in range(4)]
     assert sum(int((part.batch.distance > 0).sum()) for part in parts) == 4 * rays // 8
@@ -115,20 +119,20 @@ def test_rays_adapt_to_the_samples_they_need() -> None:
     run = trainer()
     results = [run.step(step, 0.5) for step in range(100)]
     assert results[0].rays == 1024 // 128
-    assert results[0].rays < results[0].samples <= results[0].densities <= results[0].rays * FIELD.lattice.most_samples
+    assert results[0].rays < results[0].samples <= results[0].densities <= results[0].rays * FIELD.stepping.max_samples
     needed = results[-1].rays * float(run.samples_per_ray)
     assert 0.7 * 1024 < needed < 1.4 * 1024
     assert results[-1].rays > 5 * results[0].rays
 
 
 def test_empty_space_is_closed_and_the_object_stays_open() -> None:
-    run = trainer(field=replace(FIELD, steps=200))
+    run = trainer(field=replace(FIELD, diagonal_steps=200))
     for step in range(96):
         run.step(step, 0.5)
-    words = torch.stack([(run.model.bits >> bit) & 1 for bit in range(64)], -1)
+    words = torch.stack([(run.model.occupancy_bits >> bit) & 1 for bit in range(64)], -1)
     opened = words.sum() / FIELD.occupancy_resolution**3
     assert 0.02 < opened < 0.7
-    rays, _, alpha, _ = run.bank.lookup(torch.arange(len(run.bank.pixels)))
+    rays, _, alpha, _ = run.dataset.lookup(torch.arange(len(run.dataset.pixels)))
     opacity = run.model.render(rays, torch.ones(3)).opacity
     assert opacity[alpha == 1].mean() > 0.7
     assert opacity[alpha == 0].mean() < 0.1
@@ -145,7 +149,9 @@ def test_a_non_finite_step_changes_nothing_and_shows_its_batch(
     else:
         backward = run.model.backward
         monkeypatch.setattr(
-            run.model, "backward", lambda *a: backward(*a)._replace(features=torch.full((1, FIELD.levels * 4), broken))
+            run.model,
+            "backward",
+            lambda *a: backward(*a)._replace(features=torch.full((1, FIELD.num_levels * 4), broken)),
         )
     before = copied(run.state())
     with pytest.raises(NonFinite, match=f"the {quantity} of step 1 is not finite") as caught:
@@ -171,8 +177,8 @@ def test_the_distortion_loss_is_added_and_has_its_gradient() -> None:
     one, other = plain.step(0, 1.0), with_it.step(0, 1.0)
     assert one.psnr == other.psnr
     assert one.loss < other.loss < one.loss + 5
-    assert torch.equal(plain.mean["colour_out"], with_it.mean["colour_out"])
-    assert not torch.equal(plain.mean["density_out"], with_it.mean["density_out"])
+    assert torch.equal(plain.exp_avg["colour_out"], with_it.exp_avg["colour_out"])
+    assert not torch.equal(plain.exp_avg["density_out"], with_it.exp_avg["density_out"])
 
 
 def test_the_distortion_loss_begins_weak() -> None:
@@ -185,7 +191,7 @@ def test_the_distortion_loss_begins_weak() -> None:
 def test_unbounded_scenes_train_too() -> None:
     run = trainer(
         replace(TRAINER, background=(0.0, 0.0, 0.0), distortion=1e-3),
-        replace(FIELD, contracted=True, shortest_step=0.05, cone=0.1),
+        replace(FIELD, contracted=True, min_step_size=0.05, cone_angle=0.1),
     )
     results = [run.step(step, step / 60) for step in range(60)]
     first, last = (sum(r.psnr for r in part) / 10 for part in (results[:10], results[-10:]))
@@ -200,40 +206,40 @@ def test_the_rate_warms_up_stays_and_falls() -> None:
 
 
 def test_a_state_of_another_architecture_is_refused() -> None:
-    other = trainer(field=replace(FIELD, levels=1))
-    with pytest.raises(RuntimeError, match=r"another field: mean\.density_hidden, mean\.table"):
+    other = trainer(field=replace(FIELD, num_levels=1))
+    with pytest.raises(RuntimeError, match=r"another field: exp_avg\.density_hidden, exp_avg\.table"):
         trainer().load_state(other.state())
 
 
 def test_a_state_of_equal_shapes_but_other_settings_is_refused() -> None:
-    other = trainer(field=replace(FIELD, steps=33))
+    other = trainer(field=replace(FIELD, diagonal_steps=33))
     with pytest.raises(RuntimeError, match="another field: settings differ"):
         trainer().load_state(other.state())
 
 
 def test_a_density_cache_of_an_unbounded_scene_has_finite_steps_everywhere() -> None:
     model = HashGridField(replace(FIELD, contracted=True), 0, reference)
-    cache = HashGridTrainer(model, small_bank(), TRAINER).cache
-    cache.refresh(15, torch.Generator().manual_seed(1))
-    assert cache.thickness.isfinite().all()
-    assert cache.thickness.max() > 20 * cache.thickness.min() > 0
+    cache = HashGridTrainer(model, small_dataset(), TRAINER).occupancy_grid
+    cache.update(15, torch.Generator().manual_seed(1))
+    assert cache.optical_thickness.isfinite().all()
+    assert cache.optical_thickness.max() > 20 * cache.optical_thickness.min() > 0
 
 
-def unequal_bank() -> RayDataset:
+def unequal_dataset() -> RayDataset:
     """The disc on black from one place twice, the second time at half the light."""
-    bank = small_bank(40)
-    half = len(bank.pixels) // 2
-    colour = bank.pixels[:half, :3].where(bank.pixels[:half, 3:] > 0, 0)
+    dataset = small_dataset(40)
+    half = len(dataset.pixels) // 2
+    colour = dataset.pixels[:half, :3].where(dataset.pixels[:half, 3:] > 0, 0)
     darker = (255 * expose(colour / 255, torch.full((3,), -math.log(2)))).round().byte()
-    geometry = bank.geometry[:, :1].repeat(1, 2)
-    return bank._replace(pixels=torch.cat([colour, darker]), geometry=geometry)
+    geometry = dataset.geometry[:, :1].repeat(1, 2)
+    return dataset._replace(pixels=torch.cat([colour, darker]), geometry=geometry)
 
 
 def test_exposures_are_learnt_where_they_are_modelled() -> None:
     settings, errors = replace(TRAINER, background=(0.0, 0.0, 0.0), seed=0), []  # of some seeds all becomes black
     exposures = ExposureModel(torch.zeros(2, 3))
     for effects in (NO_EFFECTS, ImageEffects(colours=(exposures,))):
-        run = HashGridTrainer(HashGridField(FIELD, 0, reference), unequal_bank(), settings, effects)
+        run = HashGridTrainer(HashGridField(FIELD, 0, reference), unequal_dataset(), settings, effects)
         errors.append([run.step(step, step / 300).psnr for step in range(300)][-1])
     red = exposures.log_gain[:, 0]
     assert 0.15 < float(red[0] - red[1]) < 0.8 and exposures.log_gain.mean(0).abs().max() < 1e-6
@@ -245,7 +251,7 @@ def test_the_gradient_of_poses_is_that_of_the_loss(seed: int) -> None:
     """As far as differences tell: of other fields, samples that come to lie in another cell weigh more in them."""
     poses, settings = PoseRefinement(torch.eye(3)[:2]), replace(TRAINER, background=BACKGROUND)
     poses.turn += torch.tensor([[0.02, 0.01, -0.01], [0.0, -0.02, 0.03]])
-    run = HashGridTrainer(HashGridField(FIELD, seed, reference), small_bank(), settings, ImageEffects((poses,)))
+    run = HashGridTrainer(HashGridField(FIELD, seed, reference), small_dataset(), settings, ImageEffects((poses,)))
     for step in range(60):
         run.step(step, 0.84)  # at a third of the rate
     by_hand = run._part(7, 0.5, 128, 0).effects
@@ -271,7 +277,7 @@ def test_per_image_parameters_are_part_of_the_state() -> None:
     def fresh() -> HashGridTrainer:
         exposures = ExposureModel(torch.tensor([[0.0, 0, 0], [0.5, 0.5, 0.5]]))
         effects = ImageEffects((PoseRefinement(torch.eye(3)[:2]),), (exposures,))
-        return HashGridTrainer(HashGridField(FIELD, 0, reference), small_bank(), TRAINER, effects)
+        return HashGridTrainer(HashGridField(FIELD, 0, reference), small_dataset(), TRAINER, effects)
 
     whole, first, second = fresh(), fresh(), fresh()
     for step in range(20):
@@ -289,7 +295,7 @@ def test_per_image_parameters_are_part_of_the_state() -> None:
 
 
 def test_without_view_dependence_a_point_has_one_colour() -> None:
-    run = HashGridTrainer(HashGridField(replace(FIELD, view_dependence=False), 0, reference), small_bank(), TRAINER)
+    run = HashGridTrainer(HashGridField(replace(FIELD, view_dependence=False), 0, reference), small_dataset(), TRAINER)
     psnr = [run.step(step, step / 60).psnr for step in range(60)]
     points, directions = torch.rand(50, 3) - 0.5, torch.nn.functional.normalize(torch.randn(2, 50, 3), dim=-1)
     one, other = (run.model.density_and_colour(points, towards)[1] for towards in directions)
@@ -299,28 +305,28 @@ def test_without_view_dependence_a_point_has_one_colour() -> None:
 
 def test_the_sky_becomes_what_is_seen_in_its_direction() -> None:
     """Two opposite views, one of blue and one of yellow: even through the first fog that shows at once."""
-    bank = small_bank()
+    dataset = small_dataset()
     colours = torch.tensor([[30, 60, 230], [240, 200, 30]], dtype=torch.uint8)
-    bank = bank._replace(pixels=colours.repeat_interleave(len(bank.pixels) // 2, 0))
-    outdoors = replace(FIELD, contracted=True, shortest_step=0.05, cone=0.1, sky=True)
+    dataset = dataset._replace(pixels=colours.repeat_interleave(len(dataset.pixels) // 2, 0))
+    outdoors = replace(FIELD, contracted=True, min_step_size=0.05, cone_angle=0.1, background_model=True)
     run = HashGridTrainer(
-        HashGridField(outdoors, 0, reference), bank, replace(TRAINER, background=(0.0, 0.0, 0.0), rate=1e-2)
+        HashGridField(outdoors, 0, reference), dataset, replace(TRAINER, background=(0.0, 0.0, 0.0), rate=1e-2)
     )
     for step in range(20):
         run.step(step, step / 20)
     ahead = torch.tensor([[0.0, 0, 1], [0, 0, -1], [0, 0.1, 1]])
-    seen = background_colour(reference, run.model.sky, ahead / ahead.norm(dim=-1, keepdim=True))
+    seen = background_colour(reference, run.model.background_table, ahead / ahead.norm(dim=-1, keepdim=True))
     assert torch.equal(seen > 0.5, colours[[0, 1, 0]] > 127)
     assert (seen - 0.5).abs().min() > 0.05
-    assert {"model.sky", "mean.sky", "square.sky"} <= run.state().keys()
+    assert {"model.background_table", "exp_avg.background_table", "exp_avg_sq.background_table"} <= run.state().keys()
     assert not any("sky" in name for name in trainer().state())
 
 
 def test_known_distances_decide_a_shape_that_colours_leave_open() -> None:
     """Photos of one colour fit any depth; the centre of one is known to be 3 units away."""
-    bank = small_bank()
-    grey = bank._replace(pixels=torch.full_like(bank.pixels[:, :3], 128))
-    guided = grey.with_distances(torch.tensor([78]), torch.tensor([3.0]))
+    dataset = small_dataset()
+    grey = dataset._replace(pixels=torch.full_like(dataset.pixels[:, :3], 128))
+    guided = grey.with_sparse_depths(torch.tensor([78]), torch.tensor([3.0]))
     settings = replace(TRAINER, background=(0.0, 0.0, 0.0), depth_loss=0.1)
     centre, depth = grey.lookup(torch.tensor([78])).rays, {}
     for name, photos in {"open": grey, "guided": guided}.items():
@@ -334,8 +340,8 @@ def test_known_distances_decide_a_shape_that_colours_leave_open() -> None:
 def test_points_guide_a_run_less_and_less() -> None:
     settings = replace(TRAINER, depth_loss=0.1)
     plain, guided = trainer(settings), trainer(settings)
-    guided.bank = guided.bank.with_distances(torch.tensor([78, 222]), torch.tensor([3.0, 2.5]))
-    assert depth_factor(0.0) == 1 and depth_factor(0.25) == 0.75 and depth_factor(1.0) == 0
+    guided.dataset = guided.dataset.with_sparse_depths(torch.tensor([78, 222]), torch.tensor([3.0, 2.5]))
+    assert depth_loss_multiplier(0.0) == 1 and depth_loss_multiplier(0.25) == 0.75 and depth_loss_multiplier(1.0) == 0
     assert plain.step(0, 1.0) == guided.step(0, 1.0)
     assert same(plain.state(), guided.state())
     plain.step(1, 0.9)
@@ -345,7 +351,7 @@ def test_points_guide_a_run_less_and_less() -> None:
 
 def test_the_depth_loss_fades_in_value_and_gradient() -> None:
     run = trainer(replace(TRAINER, depth_loss=0.1))
-    run.bank = run.bank.with_distances(torch.tensor([78]), torch.tensor([3.0]))
+    run.dataset = run.dataset.with_sparse_depths(torch.tensor([78]), torch.tensor([3.0]))
     batch = run._batch(0, 0.0, 0, 64)
     done = run.model.forward(batch.rays, batch.jitter, batch.offset, batch.background)
     early, late, over = (run._loss(64, share, done, batch) for share in (0.25, 0.75, 1.0))
@@ -360,43 +366,43 @@ def test_the_depth_loss_fades_in_value_and_gradient() -> None:
 
 def test_however_many_the_chunks_an_eighth_of_the_rays_run_to_points() -> None:
     run = trainer(replace(TRAINER, depth_loss=0.1))
-    run.bank = run.bank.with_distances(torch.tensor([78]), torch.tensor([3.0]))
+    run.dataset = run.dataset.with_sparse_depths(torch.tensor([78]), torch.tensor([3.0]))
     for count in (1, 3, 5, 8, 21):
         to_points = [int((run._batch(0, 0.1, chunk, count).distance > 0).sum()) for chunk in range(32)]
         assert sum(to_points) == 32 * count // 8 and max(to_points) - min(to_points) <= 1
 
 
 def test_points_beyond_the_box_of_a_bounded_scene_are_no_guide() -> None:
-    bank = small_bank().with_distances(torch.tensor([78, 78]), torch.tensor([3.0, 4.5]))
-    outdoors = replace(FIELD, contracted=True, shortest_step=0.05, cone=0.1)
+    dataset = small_dataset().with_sparse_depths(torch.tensor([78, 78]), torch.tensor([3.0, 4.5]))
+    outdoors = replace(FIELD, contracted=True, min_step_size=0.05, cone_angle=0.1)
     for field, distances in {FIELD: [3.0], outdoors: [3.0, 4.5]}.items():
-        kept = HashGridTrainer(HashGridField(field, 0, reference), bank, TRAINER).bank.distance
+        kept = HashGridTrainer(HashGridField(field, 0, reference), dataset, TRAINER).dataset.distance
         assert kept is not None and kept.tolist() == distances
 
 
 def test_without_a_weight_known_distances_change_nothing() -> None:
     plain, other = trainer(), trainer()
-    other.bank = other.bank.with_distances(torch.tensor([78, 222]), torch.tensor([3.0, 2.5]))
+    other.dataset = other.dataset.with_sparse_depths(torch.tensor([78, 222]), torch.tensor([3.0, 2.5]))
     assert [plain.step(step, 0.1) for step in range(3)] == [other.step(step, 0.1) for step in range(3)]
     assert same(plain.state(), other.state())
 
 
 def test_the_sky_where_it_is_always_hidden_falls_back_to_grey(monkeypatch: pytest.MonkeyPatch) -> None:
     """Light of a millionth reaches it now and then; Adam alone would follow that anywhere."""
-    outdoors = replace(FIELD, contracted=True, shortest_step=0.05, cone=0.1, sky=True)
+    outdoors = replace(FIELD, contracted=True, min_step_size=0.05, cone_angle=0.1, background_model=True)
     run = HashGridTrainer(
-        HashGridField(outdoors, 0, reference), small_bank(), replace(TRAINER, background=(0.0, 0.0, 0.0))
+        HashGridField(outdoors, 0, reference), small_dataset(), replace(TRAINER, background=(0.0, 0.0, 0.0))
     )
-    run.model.sky.fill_(3.0)
+    run.model.background_table.fill_(3.0)
     noise = torch.Generator().manual_seed(0)
 
     def faint(*_: object) -> Tensor:
-        light = 1e-10 * torch.randn(run.model.sky.shape, generator=noise)
+        light = 1e-10 * torch.randn(run.model.background_table.shape, generator=noise)
         light[:100] = 0
         return light
 
     monkeypatch.setattr(run.model, "background_backward", faint)
     for step in range(120):
         run.step(step, 0.0)
-    assert run.model.sky[100:].abs().mean() < 0.5
-    assert torch.equal(run.model.sky[:100], torch.full((100, 4), 3.0)), "no ray of any batch ran there"
+    assert run.model.background_table[100:].abs().mean() < 0.5
+    assert torch.equal(run.model.background_table[:100], torch.full((100, 4), 3.0)), "no ray of any batch ran there"
