@@ -9,19 +9,20 @@ import pytest
 import torch
 
 from nerf.effects.exposure import ExposureModel
+from nerf.fields.hash_grid import HashGridField
+from nerf.kernels import torch as reference
+from nerf.training.hash_grid_trainer import HashGridTrainer
 from pipeline.cli.settings import Settings, with_effects
 from stages import effects
 from stages.effects.decisions import image_effects, read_decisions
 from stages.effects.effect_list import EFFECTS, Effect, EffectParts
-from stages.hardware.backend import chosen_backend
 from stages.io.files import read_scene
 from stages.report.effects import effects_table
-from stages.train import Config, with_habits
-from stages.train.data import guided_bank
-from stages.train.setup import make_trainer
+from stages.train.data import guided_dataset
 from tests.effect_scenes import Effects, effect_scene
 from tests.nerf.effects import falloff
 from tests.nerf.effects.falloff import FalloffModel
+from tests.nerf.training.test_hash_grid_trainer import FIELD, TRAINER
 from tests.synthetic_photos import Quiet
 
 ENTRY = Effect("falloff", "light falls off", lambda: EffectParts(falloff.statistic, colours=FalloffModel.initial))
@@ -46,16 +47,13 @@ def test_an_effect_is_its_own_file_and_one_entry_of_the_list(tmp_path: Path) -> 
     assert "falloff" in [row["name"] for row in rows["rows"]]
 
     scene = read_scene(inputs["normalise"])
-    views, bank = scene.of_split("train"), guided_bank(inputs, scene, 4.0, Quiet())
-    made = image_effects(read_decisions(out), views, bank)
+    views, dataset = scene.of_split("train"), guided_dataset(inputs, scene, 4.0, Quiet())
+    made = image_effects(read_decisions(out), views, dataset)
     assert [type(effect) for effect in made.colours] == [ExposureModel, FalloffModel] and not made.rays
-    small = {"levels": 2, "log2_rows": 10, "finest": 32, "batch_samples": 1024, "chunks": 1}
-    chosen = Config(field="grid", steps=5, contracted=False, view_dependence=True, **small)
-    chosen = with_habits(chosen.model_copy(update={"backend": chosen_backend("cpu")}))
-    trainer = make_trainer(chosen, scene, bank, 0, made)
+    trainer = HashGridTrainer(HashGridField(FIELD, 0, reference), dataset, TRAINER, made)
     before = {name: part.clone() for name, part in made.parameters.items()}
     for step in range(5):
-        trainer.step(step, step / 5, 1.0)
+        trainer.step(step, step / 5)
     moved = {name for name, part in made.parameters.items() if not torch.equal(part, before[name])}
     assert moved == {"exposure.log_gain", "falloff.slope"} <= {name.removeprefix("image.") for name in trainer.state()}
     held_out = trainer.effects.of_held_out(torch.full((1, len(views)), 1 / len(views)))
