@@ -6,9 +6,9 @@ from typing import Annotated, Literal
 from pydantic import Field, field_validator
 from tyro.conf import Suppress
 
+from stages.amounts import duration
 from stages.contract import Inputs, Progress, StageConfig, StageResult
 from stages.effects.effect_list import EFFECTS
-from stages.io.amounts import duration
 from stages.io.files import read_json, read_scene
 
 INPUTS = ("ingest", "sfm", "normalise")

@@ -53,9 +53,7 @@ def camera_report(registration: Mapping[str, Any] | None, config: Mapping[str, A
 
 def doubtful_files(registration: Mapping[str, Any]) -> list[str]:
     """The photos whose matches contradict their poses: they lost them, unless these were given."""
-    found = [image["file"] for image in registration["images"] if "contradicted by" in (image["reason"] or "")]
-    check = registration.get("check") or {"doubtful": []}
-    return found + [file for file in check["doubtful"] if file not in found]
+    return list((registration.get("check") or {"doubtful": []})["doubtful"])
 
 
 def order_is_informative(registration: Mapping[str, Any] | None) -> bool:
@@ -199,7 +197,7 @@ def missing(registration: Mapping[str, Any] | None, name_of: Mapping[str, str]) 
 
 def camera_models(registration: Mapping[str, Any] | None) -> dict[str, Any]:
     """The comparison of camera models in stage sfm."""
-    from stages.sfm.colmap.held_out import NOISE_MULTIPLES
+    from stages.sfm.colmap.camera_model_selection import NOISE_MULTIPLES
 
     rows = (registration or {}).get("camera_models", [])
     chosen = [f"{row['model']}, principal point {row['principal_point']}" for row in rows if row["chosen"]]

@@ -1,23 +1,21 @@
 """How well each photo's pose is known, in its own pixels. Call it in a child process."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+import pycolmap
 from jaxtyping import Float
+from scipy.linalg import cho_factor, cho_solve
+from scipy.sparse import bsr_matrix
 
+from stages.amounts import bytes_in_words
 from stages.hardware.memory import available_bytes
-from stages.io.amounts import bytes_in_words
 from stages.sfm.colmap.observations import Observations, observations, points_in_camera, residuals
-
-if TYPE_CHECKING:
-    import pycolmap
 
 FEWEST_OBSERVATIONS = 6  # of a photo: 12 equations for 6 unknowns; with fewer its pose is not known
 MATRICES = 6  # of 6 n × 6 n float64 for n photos, that are there at once at most
 STEP = 1e-5  # of finite differences, as a share of the distance: rounding and curvature are both far below a percent
 
 
-def pose_uncertainty_px(model: "pycolmap.Reconstruction", noise: float) -> dict[int, float]:
+def pose_uncertainty_px(model: pycolmap.Reconstruction, noise: float) -> dict[int, float]:
     """By image id: how far, root mean square over the points a photo sees, its pose may have moved them, in pixels.
 
     It is the covariance of the bundle adjustment at its minimum (points and poses unknown, cameras as they are),
@@ -51,7 +49,7 @@ def pose_uncertainty_px(model: "pycolmap.Reconstruction", noise: float) -> dict[
 
 
 def _jacobians(
-    model: "pycolmap.Reconstruction", seen: Observations
+    model: pycolmap.Reconstruction, seen: Observations
 ) -> tuple[Float[np.ndarray, "n 2 6"], Float[np.ndarray, "n 2 3"]]:
     """Of each observation's projection, by its photo's turn (radians) and shift in the camera's frame and by its point.
 
@@ -61,20 +59,20 @@ def _jacobians(
     for image_id, (mine, points) in points_in_camera(model, seen).items():
         camera, pose = model.camera(model.image(image_id).camera_id), model.image(image_id).cam_from_world().matrix()
         step = STEP * np.linalg.norm(points, axis=1)
-        bearing = np.empty((len(points), 2, 3))
+        ray_direction = np.empty((len(points), 2, 3))
         for axis, unit in enumerate(np.eye(3)):
             ahead, behind = (np.asarray(camera.img_from_cam(points + s * step[:, None] * unit)) for s in (1, -1))
-            bearing[:, :, axis] = (ahead - behind) / (2 * step[:, None])
+            ray_direction[:, :, axis] = (ahead - behind) / (2 * step[:, None])
         # J (φ × y) = Σ φ_a J (e_a × y) with y = R x
         turned = np.cross(np.eye(3)[None], (points - pose[:, 3])[:, None])
-        to_pose[mine, :, :3] = np.einsum("nij,naj->nia", bearing, turned)
-        to_pose[mine, :, 3:] = bearing
-        to_point[mine] = bearing @ pose[:, :3]
+        to_pose[mine, :, :3] = np.einsum("nij,naj->nia", ray_direction, turned)
+        to_pose[mine, :, 3:] = ray_direction
+        to_point[mine] = ray_direction @ pose[:, :3]
     return to_pose, to_point
 
 
 def _whitened_covariance(
-    model: "pycolmap.Reconstruction",
+    model: pycolmap.Reconstruction,
     seen: Observations,
     ids: np.ndarray,
     to_pose: Float[np.ndarray, "n 2 6"],
@@ -86,9 +84,6 @@ def _whitened_covariance(
     are its null space, and the pseudo-inverse is (S + Q Qᵀ)⁻¹ − Q Qᵀ. Its trace over one photo is the sum of squared
     pixels by which its points move.
     """
-    from scipy.linalg import cho_factor, cho_solve
-    from scipy.sparse import bsr_matrix
-
     place, point = np.searchsorted(ids, seen.image), np.unique(seen.point, return_inverse=True)[1]
     pose_roots = np.linalg.cholesky(_sums(np.einsum("nki,nkj->nij", to_pose, to_pose), place))
     point_roots = np.linalg.cholesky(_sums(np.einsum("nki,nkj->nij", to_point, to_point), point))
