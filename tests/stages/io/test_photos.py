@@ -10,7 +10,6 @@ from PIL import Image
 
 from stages.ingest.decoding import pillow
 from stages.ingest.masks import load_mask
-from stages.io import photos as module
 from stages.io.photos import (
     Photo,
     Refusal,
@@ -96,7 +95,7 @@ def test_the_colour_of_transparent_pixels_does_not_leak(tmp_path: Path) -> None:
 def test_large_photos_are_loaded_by_fewer_threads(
     tmp_path: Path, size: tuple[int, int], alpha: bool, cores: int, expected: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "processors", lambda: cores)
+    monkeypatch.setattr("stages.io.photos.processors", lambda: cores)
     (tmp_path / "large.png").write_bytes(png(*size, b"", alpha=alpha))
     (tmp_path / "small.png").write_bytes(png(1, 1, b""))
     assert loaders([tmp_path / "large.png", tmp_path / "small.png"]) == expected

@@ -6,8 +6,7 @@ import pytest
 from stages import sfm
 from stages.contract import StageError
 from stages.io.photos import Photo
-from stages.sfm.pairs import matching_plan
-from stages.sfm.pairs import pair_selection as pairing
+from stages.sfm.pairs import matching_plan, pair_selection
 from stages.sfm.pairs.matching_plan import (
     TIERS,
     Chosen,
@@ -54,7 +53,7 @@ def test_pairs_of_many_photos_are_chosen_by_what_is_known(
     places: Places, matcher: str, progress, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked = costing(monkeypatch)
-    monkeypatch.setattr(pairing, "places_of", lambda _: places)
+    monkeypatch.setattr(pair_selection, "places_of", lambda _: places)
     assert chosen(ALL_OPEN, photos(400), Path(), 30, progress, None) == (1600, 4096, matcher)
     assert not asked and len(progress.notes) == 1
 
