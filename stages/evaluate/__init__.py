@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field
 
+from stages.amounts import duration, short_count
 from stages.contract import Inputs, Progress, StageConfig, StageError, StageResult
 from stages.evaluate.image_metrics import ERROR_SCALE, FEWEST_FOR_INTERVAL, error_map, mean_interval, ssim
-from stages.io.amounts import duration, short_count
 from stages.io.files import read_json, read_scene, write_json, write_png
-from stages.render.spread import spread
+from stages.io.photos import spread
 from stages.train.setup import BLACK, WHITE
 
 if TYPE_CHECKING:

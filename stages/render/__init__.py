@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import Field, field_validator
 
+from stages.amounts import duration, short_count
 from stages.contract import Inputs, Progress, StageConfig, StageError, StageResult
-from stages.io.amounts import duration, short_count
 from stages.io.files import read_json, read_scene, write_json, write_png
+from stages.io.photos import spread
 from stages.render.path import CameraPath, PathKind, fitted_path, path_from_file, path_rays, usual_path
 from stages.render.plan import LEAST_WIDTH, even_width
-from stages.render.spread import spread
 
 if TYPE_CHECKING:
     import numpy as np
