@@ -166,7 +166,7 @@ def test_page_shows_the_evidence_for_the_camera_model(tmp_path: Path, progress: 
         assert cells in html
     assert "–</td><td>its distortion cannot be undone at 2.0% of the pixels</td>" in html
     assert "pose of the median photo is known to 0.26 px" in html
-    assert "the least certain one's (IMG_0023.jpg) to 0.48 px" in html
+    assert "the least certain one (IMG_0023.jpg) to 0.48 px" in html
     path = inputs["sfm"] / "registration.json"
     registration = json.loads(path.read_text("utf-8"))
     unknown = [image | {"uncertainty_px": None} for image in registration["images"]]
@@ -321,9 +321,7 @@ def test_training_shows_where_its_time_went(inputs: dict[str, Path], tmp_path: P
     html, _ = written(inputs, tmp_path / "out", progress)
     assert "<h3>Where training spent its time</h3>" in html
     assert re.search(r"backward</td>.*?50\.0%.*?70%", html)
-    assert (
-        "take 60% of its time" in html and "The limit is then 7.2 k rays/s; these steps reached 3.9 k" in html
-    )
+    assert "take 60% of its time" in html and "The limit is then 7.2 k rays/s; these steps reached 3.9 k" in html
     assert "They computed 49 k samples/s: per ray 30.0 densities and 12.5 colours." in html
     widths = [float(width) for width in re.findall(r'<i style="width: ([\d.]+)%; background', html)]
     assert widths == [50, 30, 10, 10]
