@@ -17,10 +17,9 @@ from tyro.conf import Suppress
 from nerf.geometry.scene import Scene
 from stages.amounts import duration, short_count
 from stages.contract import Inputs
-from stages.ingest.decoding import pillow
 from stages.io.ascii_names import shell_quoted
 from stages.io.files import read_json, read_scene, read_tensors
-from stages.io.photos import load_pixels
+from stages.io.pixels import load_pixels, pillow
 from stages.report.cameras import (
     CameraReport,
     camera_models,
@@ -265,7 +264,7 @@ def _curve(results: Results) -> dict[str, Any] | None:
     if results.curve is None:
         return None
     points, metrics = results.curve["points"], results.metrics or {}
-    baselines = {"nearest photo": "psnr_nearest_view", "mean image": "psnr_mean_image"}
+    baselines = {"nearest training view": "psnr_nearest_view", "mean image": "psnr_mean_image"}
     coming = coming_doubling(results.curve["field"], results.curve["whole"], points)
     svg = curve_svg(points, {name: metrics.get(key) for name, key in baselines.items()}, coming)
     if svg is None:
