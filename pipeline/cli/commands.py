@@ -131,7 +131,7 @@ def _command(name: str) -> Callable[[Sequence[str]], int]:
         return commands[name]
     if name in stage_list.STAGES:
         return lambda words: command_stage(name, words)
-    raise UsageError(f"no command {name!r}; there are: {', '.join([*commands, *chain.STAGES])}")
+    raise UsageError(f"no command {name!r}; there are: {', '.join([*commands, *stage_list.STAGES])}")
 
 
 def command_run(words: Sequence[str]) -> int:
