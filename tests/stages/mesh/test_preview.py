@@ -7,7 +7,6 @@ import pytest
 
 from nerf.geometry.camera_paths import look_at
 from nerf.geometry.scene import Camera, Scene, Similarity, View
-from stages.mesh import preview as mesh_preview
 from stages.mesh.files import ColouredMesh
 from stages.mesh.preview import ELEVATION, preview, viewpoints
 
@@ -15,13 +14,13 @@ CUBE = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-
 UP = np.array([0, 0, 1.0])
 
 
-def scene_of(layout, centres, target=(0.0, 0, 0)):
+def scene_of(capture_type, centres, target=(0.0, 0, 0)):
     views = tuple(
         View(f"{i}", f"{i}", 0, look_at(np.array([c], float), np.array(target))[0], 0.1, 9.0, "train")
         for i, c in enumerate(centres)
     )
     camera = Camera("SIMPLE_PINHOLE", 40, 30, (40.0, 20.0, 15.0))
-    return Scene((camera,), views, Similarity(1.0, np.eye(3), np.zeros(3)), True, False, layout, True)
+    return Scene((camera,), views, Similarity(1.0, np.eye(3), np.zeros(3)), True, False, capture_type, True)
 
 
 def shows_all(camera):
@@ -72,8 +71,8 @@ def test_a_room_is_shown_from_inside():
 
 @pytest.mark.parametrize("centre", [(0.01, 0, 3), (2, 0, 1)])
 def test_the_picture_has_two_rows_of_colour_and_clay(monkeypatch, centre):
-    monkeypatch.setattr(mesh_preview, "WIDTH", 40)
-    monkeypatch.setattr(mesh_preview, "HEIGHT", 30)
+    monkeypatch.setattr("stages.mesh.preview.WIDTH", 40)
+    monkeypatch.setattr("stages.mesh.preview.HEIGHT", 30)
     faces = np.array([[0, 2, 4], [2, 6, 4], [1, 5, 3], [3, 5, 7]], np.int32)
     red = np.tile(np.array([220, 20, 20], np.uint8), (8, 1))
     image = preview(ColouredMesh(CUBE, faces, CUBE, red), scene_of("around", [centre])).astype(int)
