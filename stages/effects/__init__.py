@@ -2,6 +2,7 @@
 
 import math
 import time
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
@@ -9,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 from pydantic import Field
 from tyro.conf import Suppress
 
-from stages.contract import Inputs, Progress, StageConfig, StageResult
+from stages.contract import BudgetLeft, Inputs, Progress, StageConfig, StageResult, Workload
 from stages.effects.decisions import Decisions, write_decisions
 from stages.io.amounts import duration
 from stages.io.files import read_json, read_scene, read_tensors, write_json
@@ -21,9 +22,13 @@ if TYPE_CHECKING:
 
 INPUTS = ("ingest", "sfm", "normalise")
 VERSION = 12
+EXIT_CODE = 13
 RESUMES = False
 PUBLISHED = ("effects.json",)
 NOT_HASHED = ("seconds",)  # it decides how many pilots, and that enters the key
+# Of the run: what the stage may take, and of what is free no more than FREE_SHARE. Of that, beside reading the photos,
+# statistics take one or two seconds, timing a pilot as much.
+BUDGET_SHARE, FREE_SHARE, STATISTICS_SECONDS = 0.15, 0.25, 4.0
 
 Switch = Literal["auto", "on", "off"]
 ORDER = (
@@ -70,6 +75,24 @@ class Verdict(NamedTuple):
     reason: str
     pilot: "Pilot | None" = None
     seconds: float = 0.0
+
+
+def expected_seconds(config: Config, workload: Workload) -> float:
+    """Reading the photos, two or three seconds, and half a minute where a pilot has to decide."""
+    return 10.0 + workload.photos.reading_seconds(workload.cores)
+
+
+def budget_seconds(left: BudgetLeft) -> float:
+    """What pilots may take: BUDGET_SHARE of the run, less what the stage takes without any; and of what is free no more
+    than leaves a training that is worth it."""
+    share = min(BUDGET_SHARE * left.total, FREE_SHARE * left.free)
+    return max(0.0, share - STATISTICS_SECONDS - left.reading)
+
+
+def limiting_seconds(options: Mapping[str, Any]) -> float | None:
+    """Without a budget a training in seconds limits its pilots; a run that counts steps is to end the same on every
+    machine. What ``--more`` adds changes no pilot: the field that goes on stands on their decisions."""
+    return options["train"].planned_seconds
 
 
 def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:

@@ -17,7 +17,16 @@ from typing import TYPE_CHECKING
 
 from pydantic import Field
 
-from stages.contract import Inputs, OptionalSourcePath, Progress, SourcePath, StageConfig, StageError, StageResult
+from stages.contract import (
+    Inputs,
+    OptionalSourcePath,
+    Progress,
+    SourcePath,
+    StageConfig,
+    StageError,
+    StageResult,
+    Workload,
+)
 from stages.hardware.device import processors
 from stages.ingest.auxiliary_files import depth_maps
 from stages.ingest.decoding import CameraKey, DecodeError, Stored, decode
@@ -55,6 +64,7 @@ if TYPE_CHECKING:
 
 INPUTS: tuple[str, ...] = ()
 VERSION = 11
+EXIT_CODE = 10
 RESUMES = False
 NOTES = "notes.json"
 PUBLISHED = ("photos.json", NOTES, "images", "masks", "opaque")
@@ -133,6 +143,11 @@ class _Taken:
         that tells."""
         known = self.camera_key.make or self.camera_key.model or self.camera_key.lens
         return self.camera_key, "" if known else str(Path(self.name).parent)
+
+
+def expected_seconds(config: Config, workload: Workload) -> float:
+    """Every photo is decoded once."""
+    return 0.5 + workload.photos.reading_seconds(min(workload.cores, _MAX_WORKERS))
 
 
 def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> StageResult:

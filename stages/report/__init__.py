@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from pydantic import Field
 from tyro.conf import Suppress
 
-from stages.contract import Inputs, Progress, StageConfig, StageResult
+from stages.contract import READING_SECONDS, Inputs, Progress, StageConfig, StageResult, Workload
 from stages.io.amounts import duration, short_count
 from stages.io.files import read_json, read_scene, read_tensors, write_json
 from stages.report.cameras import (
@@ -35,7 +35,9 @@ if TYPE_CHECKING:
 
 INPUTS = ("ingest", "sfm", "normalise", "effects", "train", "evaluate", "render", "mesh", "tradeoff")
 VERSION = 8
+EXIT_CODE = 18
 RESUMES = False
+SUMMARY = True
 PUBLISHED = ("report.html", "summary.json")
 
 WIDTH_LARGE, WIDTH_SMALL = 900, 420  # pixels of a picture in the page
@@ -44,10 +46,10 @@ MOST_SMALL = 12  # further test photos shown, besides the best, the median and t
 
 
 class Account(StageConfig):
-    """What a budget of wall time promised and what was spent, in seconds, by stage; none of what was there already."""
+    """What a budget of wall time allocated and what was spent, in seconds, by stage; none of what was there already."""
 
     seconds: float
-    promised: dict[str, float]
+    allocated: dict[str, float]
     spent: dict[str, float]
 
 
@@ -80,6 +82,12 @@ class Results:
     parts: dict[str, Any] | None
     metrics: dict[str, Any] | None
     study: dict[str, Any] | None
+
+
+def expected_seconds(config: Config, workload: Workload) -> float:
+    """The page, and at most fifteen test photos beside their renders."""
+    test_photos = workload.photos.number / workload.options["normalise"].test_every
+    return 2.0 + READING_SECONDS * workload.photos.megapixels * min(15, test_photos)
 
 
 def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> StageResult:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 from pydantic import Field
 from tyro.conf import Suppress
 
-from stages.contract import Inputs, Progress, StageConfig, StageError, StageResult
+from stages.contract import Inputs, Progress, StageConfig, StageError, StageResult, Workload
 from stages.effects.decisions import Space, read_decisions
 from stages.io.amounts import duration
 from stages.io.files import read_scene, write_json
@@ -40,7 +40,9 @@ if TYPE_CHECKING:
 INPUTS = ("ingest", "normalise", "effects")
 OPTIONAL_INPUTS = ("train",)
 VERSION = 12
+EXIT_CODE = 19
 RESUMES = True
+ON_REQUEST = True
 PUBLISHED = ("tradeoff.svg", "tradeoff.png", "tradeoff.md", "tradeoff.json", "ablation.png")
 
 FEWEST_WINDOWS, MOST_WINDOWS = 6, 32
@@ -74,6 +76,11 @@ class Trial(NamedTuple):
 
     arm: Arm
     figures: dict[str, Any]
+
+
+def expected_seconds(config: Config, workload: Workload) -> float:
+    """Just what it is given."""
+    return config.seconds
 
 
 def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
@@ -115,7 +122,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
         StageError: without held-out photos, where not one arm could be scored, or where one could not be trained for
             want of memory or disk.
     """
-    from stages.io.stopwatch import counted
+    from stages.io.stopwatch import counting
     from stages.tradeoff.own_field import own_field
     from stages.tradeoff.trial import make_exam
 
@@ -124,7 +131,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     scene, selection = _scene_with_test_photos(inputs), selection_of(config)
     for line in (promise(selection, folder / "arms"), *plan_words(selection, config.seconds)):
         progress.note(line)
-    with counted(folder / "clock.json") as spent:
+    with counting(folder / "clock.json") as spent:
         exam = make_exam(inputs["ingest"], scene, config.downscale, config.windows, config.sizes[-1])
         trials, late = _run_all(config, selection, exam, inputs, folder, progress, spent)
         own = own_field(exam, inputs, folder / "arms", config.seconds, progress)
