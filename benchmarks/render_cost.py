@@ -15,7 +15,7 @@ from pathlib import Path
 import torch
 
 from benchmarks.record import Record, add_out
-from nerf.effects.exposure import ExposedModel
+from nerf.effects.appearance import AppearanceModel
 from nerf.fields.hash_grid import HashGridField
 from nerf.fields.interface import RadianceModel
 from nerf.fields.vanilla import VanillaNerf
@@ -31,11 +31,11 @@ from stages.train.data import PhotoReader, view_rays
 
 def with_samples(model: RadianceModel, factor: float) -> RadianceModel:
     """The same field with so many times the samples along each ray."""
-    if isinstance(model, ExposedModel):
-        return ExposedModel(with_samples(model.model, factor), model.log_gain)
+    if isinstance(model, AppearanceModel):
+        return AppearanceModel(with_samples(model.model, factor), model.effects)
     if isinstance(model, HashGridField):
         given = model.settings
-        finer = {"shortest_step": given.shortest_step / factor, "cone": given.cone / factor}
+        finer = {"min_step_size": given.min_step_size / factor, "cone_angle": given.cone_angle / factor}
         settings = replace(given, steps=max(1, round(given.steps * factor)), **finer)
         changed: HashGridField | VanillaNerf = HashGridField(settings, 0, model.backend)
     else:
@@ -49,10 +49,10 @@ def with_samples(model: RadianceModel, factor: float) -> RadianceModel:
 
 def samples_of(model: RadianceModel) -> str:
     """How the samples of a field are laid, in its own terms."""
-    if isinstance(model, ExposedModel):
+    if isinstance(model, AppearanceModel):
         return samples_of(model.model)
     if isinstance(model, HashGridField):
-        step, bounded = model.drawn_lattice.step, f"{model.settings.steps} along the box's diagonal"
+        step, bounded = model.render_stepping.step_size, f"{model.settings.diagonal_steps} along the box's diagonal"
         return f"steps from {step:.4f}" if model.settings.contracted else bounded
     assert isinstance(model, VanillaNerf)
     return f"{model.settings.samples_coarse} + {model.settings.samples_fine}"

@@ -10,10 +10,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from nerf.effects import AS_GIVEN, AS_RENDERED, PhotoColours, PhotoRays, Seen
-from nerf.fields import mlp as grid_mlp
-from nerf.fields.background import PRIOR as SKY_PRIOR
-from nerf.fields.background import RATE as SKY_RATE
+from nerf.effects import NO_EFFECTS, Effect, ImageEffects, RayGradients, RenderedRays, parameters_of
+from nerf.fields import mlp
+from nerf.fields.background import BACKGROUND_LR_SCALE, BACKGROUND_PRIOR
 from nerf.fields.frustum_mask import compute_frustum_mask
 from nerf.fields.hash_grid import CORNERS, HashGridField, HashGridPass
 from nerf.fields.interface import Rendering
@@ -55,13 +54,16 @@ MEMORY = 0.9  # how much of the mean of samples per ray remains after each step
 
 @dataclass(frozen=True)
 class HashGridTrainerSettings:
-    """How to train. ``samples``: colours to compute in a step; its rays are as many as are expected to need them.
-    ``chunks``: equal parts of a step, each computed on a core; results depend on their number, not on that of the
-    cores. ``background`` is what lies behind a scene without a sky: a colour, or another random one for each ray (only
-    for photos with alpha, where it shows the field which space is empty). ``distortion``: full weight of the distortion
-    loss, for scenes without a known background. ``depth_loss``: its weight at first, at the pixels whose distance the
-    bank knows. ``least_photos``: that must look into a cell of folded space for something to stand before their
-    foregrounds (nerf/fields/frustum_mask.py), or all but one where they are few."""
+    """How to train.
+
+    ``samples``: colours to evaluate in a step; its rays are as many as are expected to need them. ``chunks``: equal
+    micro-batches of a step, each computed on a core; results depend on their number, not on that of the cores.
+    ``background`` is what lies behind a scene without a background model: a colour, or another random one for each ray
+    (only for photos with alpha, where it shows the field which space is empty). ``distortion``: full weight of the
+    distortion loss, for scenes without a known background. ``depth_loss``: initial weight of the sparse depth loss, at
+    the pixels whose distance the dataset knows. ``least_photos``: that must see a cell of contracted space for
+    something to stand before their foregrounds (nerf/fields/frustum_mask.py), or all but one where they are few.
+    """
 
     seed: int
     background: tuple[float, float, float] | Literal["random"]
@@ -89,18 +91,18 @@ class HashGridBatch(NamedTuple):
 
 class Loss(NamedTuple):
     """A chunk's share of the loss, of the mean squared error in it, and the gradients of rendering, weights and of
-    what the photos make of colours."""
+    the colour effects' parameters."""
 
     value: Tensor
     squared_error: Tensor
     grad: Rendering
     grad_weights: Float[Tensor, "samples"]
-    grad_photos: dict[str, Tensor]
+    grad_effects: dict[str, Tensor]
 
 
 class _Part(NamedTuple):
-    """What one chunk of a batch contributes to it: loss, gradients and their norm, the thickness of cells it met, and
-    how many densities it asked for."""
+    """What one micro-batch contributes: loss, gradients and their norm, the optical thickness of its samples, and how
+    many densities it evaluated."""
 
     batch: HashGridBatch
     loss: Tensor
@@ -108,8 +110,8 @@ class _Part(NamedTuple):
     weights: Weights
     features: Float[Tensor, "samples width"]
     points: Float[Tensor, "samples 3"]
-    sky: dict[str, Tensor]
-    photos: dict[str, Tensor]
+    background: dict[str, Tensor]
+    effects: dict[str, Tensor]
     norm: Tensor
     thickness: Float[Tensor, "samples"]
     densities: int
@@ -133,31 +135,27 @@ def depth_factor(share: float) -> float:
 
 
 class HashGridTrainer:
-    """Trains a grid field on the robust error of colours by Adam, and keeps its density cache. ``photo_rays`` and
-    ``photo_colours`` stand between the field and each photo (nerf/effects)."""
+    """Trains a grid field on the Huber loss of colours by Adam, and updates its occupancy grid. ``effects`` stand
+    between the field and each image (nerf/effects)."""
 
     def __init__(
         self,
         model: HashGridField,
         bank: RayDataset,
         settings: HashGridTrainerSettings,
-        photo_rays: PhotoRays = AS_GIVEN,
-        photo_colours: PhotoColours = AS_RENDERED,
+        effects: ImageEffects = NO_EFFECTS,
     ) -> None:
-        self.model, self.settings = model, settings
+        self.model, self.settings, self.effects = model, settings, effects
         # Nothing beyond the box of a bounded scene is drawn: a point there would pull the light to its walls.
         self.bank = bank if model.settings.contracted else bank.known_within(BOX)
-        self.photo_rays, self.photo_colours = photo_rays, photo_colours
-        self.cache = OccupancyGrid(model, self._usable())
-        self.photo_parts = [each for each in (photo_rays, photo_colours) if each.parameters]
-        self.photo_parameters = {**photo_rays.parameters, **photo_colours.parameters}
+        self.occupancy_grid = OccupancyGrid(model, self._usable())
         of_networks = model.weights._asdict()
-        self.sky = {"sky": model.sky} if model.settings.sky else {}
-        self.parameters = {"table": model.table, **of_networks, **self.sky, **self.photo_parameters}
-        self.mean = {name: torch.zeros_like(tensor) for name, tensor in self.parameters.items()}
-        self.square = {name: torch.zeros_like(tensor) for name, tensor in self.parameters.items()}
+        self.background = {"background_table": model.background_table} if model.settings.background_model else {}
+        self.parameters = {"table": model.table, **of_networks, **self.background, **effects.parameters}
+        self.exp_avg = {name: torch.zeros_like(tensor) for name, tensor in self.parameters.items()}
+        self.exp_avg_sq = {name: torch.zeros_like(tensor) for name, tensor in self.parameters.items()}
         self.grad_table = torch.zeros_like(model.table)
-        tables = model.table, self.grad_table, self.mean["table"], self.square["table"]
+        tables = model.table, self.grad_table, self.exp_avg["table"], self.exp_avg_sq["table"]
         self.levels = [
             tuple(tensor[first:end] for tensor in tables) for first, end in pairwise(model.layout.first_rows)
         ]
@@ -165,12 +163,12 @@ class HashGridTrainer:
         self.order = PixelSampler(self.bank.drawable, settings.seed, bank.device)
         self.drawn = torch.tensor(0)  # pixels of that order so far; steps differ in how many they take
 
-    def _usable(self) -> Bool[Tensor, "cache"] | None:
+    def _usable(self) -> Bool[Tensor, "cells"] | None:
         """Known only where points tell where foregrounds begin, in folded space: a box is carved beforehand."""
-        least, lattice = min(self.settings.least_photos, len(self.bank.near) - 1), self.model.lattice
-        if least <= 1 or self.bank.known is None or not lattice.contracted:
+        least, stepping = min(self.settings.least_photos, len(self.bank.near) - 1), self.model.stepping
+        if least <= 1 or self.bank.known is None or not stepping.contracted:
             return None
-        return compute_frustum_mask(self.bank, least, lattice.cells)
+        return compute_frustum_mask(self.bank, least, stepping.occupancy_resolution)
 
     def step(self, step: int, share: float, rate_scale: float = 1.0) -> StepResult:
         """One batch, one update. Raises NonFinite before the update, leaving model and optimiser as they were."""
@@ -179,7 +177,7 @@ class HashGridTrainer:
         loss, error = self._finite(step, parts)
         self._update(parts, rate_scale * lr_multiplier(step, share), step + 1)
         with part("cache"):
-            self.cache.refresh(step, generator(device, self.settings.seed, step, self.settings.chunks))
+            self.occupancy_grid.update(step, generator(device, self.settings.seed, step, self.settings.chunks))
         samples = sum(len(each.points) for each in parts)
         rays *= self.settings.chunks
         self.drawn += self._of_photos(rays, share)
@@ -187,15 +185,16 @@ class HashGridTrainer:
         return StepResult(loss, psnr(error), rays, samples, sum(each.densities for each in parts))
 
     def state(self) -> dict[str, Tensor]:
-        """Weights and cache bits as ``model.<name>``, what is learnt of photos as ``photo.<name>``, Adam's moments as
-        ``mean.<name>`` and ``square.<name>``, the cache's thickness, the mean number of samples per ray, how
-        many pixels were drawn, and the field's settings, to know it by."""
+        """Weights and occupancy bits as ``model.<name>``, per-image parameters as ``image.<effect>.<name>``, Adam's
+        moments as ``exp_avg.<name>`` and ``exp_avg_sq.<name>``, the optical thickness of the occupancy grid's cells,
+        the mean number of samples per ray, how many pixels were sampled, and the field's settings, to know it by."""
         return (
             {f"model.{name}": tensor for name, tensor in self.model.state_dict().items()}
-            | {f"photo.{name}": tensor for name, tensor in self.photo_parameters.items()}
-            | {f"mean.{name}": tensor for name, tensor in self.mean.items()}
-            | {f"square.{name}": tensor for name, tensor in self.square.items()}
-            | {"thickness": self.cache.thickness, "samples_per_ray": self.samples_per_ray, "drawn": self.drawn}
+            | {f"image.{name}": tensor for name, tensor in self.effects.parameters.items()}
+            | {f"exp_avg.{name}": tensor for name, tensor in self.exp_avg.items()}
+            | {f"exp_avg_sq.{name}": tensor for name, tensor in self.exp_avg_sq.items()}
+            | {"optical_thickness": self.occupancy_grid.optical_thickness}
+            | {"samples_per_ray": self.samples_per_ray, "drawn": self.drawn}
             | {"settings": torch.tensor(astuple(self.model.settings), dtype=torch.float64)}
         )
 
@@ -245,7 +244,7 @@ class HashGridTrainer:
         """What a chunk of so many rays adds to loss and gradients."""
         with part("batch"):
             batch = self._batch(step, share, chunk, rays)
-            seen_along = self.photo_rays.forward(batch.rays, batch.view)
+            seen_along = self.effects.forward_rays(batch.rays, batch.view)
             if not all_finite(seen_along):
                 raise NonFinite(RAYS, step, _whole([batch]))
         done = self.model.forward(seen_along, batch.jitter, batch.offset, batch.background)
@@ -253,39 +252,42 @@ class HashGridTrainer:
             loss = self._loss(rays * self.settings.chunks, share, done, batch)
         with part("backward", self._backward_work(done)):
             gradients = self.model.backward(done, loss.grad, loss.grad_weights)
-            grad_rays = partial(self.model.rays_backward, done, gradients)
-            photos = loss.grad_photos | self.photo_rays.backward(batch.rays, batch.view, grad_rays)
-            sky = {name: self.model.background_backward(done, gradients) for name in self.sky}
+            effects = loss.grad_effects | self.effects.backward_rays(
+                batch.rays, batch.view, lambda: RayGradients(*self.model.rays_backward(done, gradients))
+            )
+            background = {name: self.model.background_backward(done, gradients) for name in self.background}
         weights, features, *_ = gradients
-        norm = torch.nn.utils.get_total_norm([*weights, features, *sky.values(), *photos.values()])
+        norm = torch.nn.utils.get_total_norm([*weights, features, *background.values(), *effects.values()])
         of_loss = loss.value, loss.squared_error
-        return _Part(batch, *of_loss, weights, features, done.points, sky, photos, norm, done.thickness, done.marched)
+        return _Part(
+            batch, *of_loss, weights, features, done.points, background, effects, norm, done.thickness, done.marched
+        )
 
     def _backward_work(self, done: HashGridPass) -> Work:
         weights = self.model.weights
-        products = 2 * (grid_mlp.density_products(weights) + grid_mlp.colour_products(weights)) * len(done.points)
-        to_points = CORNERS * len(self.model.layout.resolutions) * len(done.points) if self.photo_rays.parameters else 0
+        products = 2 * (mlp.density_products(weights) + mlp.colour_products(weights)) * len(done.points)
+        to_points = CORNERS * len(self.model.layout.resolutions) * len(done.points) if self.effects.rays else 0
         return Work(products, to_points)
 
     def _loss(self, rays: int, share: float, done: HashGridPass, batch: HashGridBatch) -> Loss:
-        seen = Seen(done.rendering, batch.background, batch.view)
-        error = self.photo_colours.residual(seen, batch.target)
+        seen = RenderedRays(done.rendering, batch.background, batch.rays, batch.view)
+        error = self.effects.residual(seen, batch.target)
         robust, pull = huber_loss(error)
-        grad, photos = self.photo_colours.backward(seen, pull * (2 / (3 * rays)))
+        grad, effects = self.effects.backward_residual(seen, pull * (2 / (3 * rays)))
         value, grad_weights = robust.sum() / (3 * rays), torch.zeros_like(done.weights)
-        backend, lattice = self.model.backend, self.model.lattice
+        backend, stepping = self.model.backend, self.model.stepping
         if self.settings.distortion:
             each = torch.full_like(batch.distance, self.settings.distortion * distortion_factor(share) / rays)
-            value = value + (each * backend.distortion(done.samples, done.weights, lattice)).sum()
-            grad_weights = backend.distortion_backward(done.samples, done.weights, lattice, each)
+            value = value + (each * backend.distortion(done.samples, done.weights, stepping)).sum()
+            grad_weights = backend.distortion_backward(done.samples, done.weights, stepping, each)
         if self._is_guided(share):
             each = torch.full_like(batch.distance, self.settings.depth_loss * depth_factor(share) / rays)
-            places = done.rays.far, batch.distance, lattice
+            places = done.rays.far, batch.distance, stepping
             apart = backend.depth_loss(done.samples, done.weights, done.rendering.opacity, *places)
             value = value + (each * apart).sum()
             of_weights, of_opacity = backend.depth_loss_backward(done.samples, *places, each)
             grad_weights, grad = grad_weights + of_weights, grad._replace(opacity=grad.opacity + of_opacity)
-        return Loss(value, error.square().sum() / (3 * rays), grad, grad_weights, photos)
+        return Loss(value, error.square().sum() / (3 * rays), grad, grad_weights, effects)
 
     def _finite(self, step: int, parts: Sequence[_Part]) -> tuple[float, float]:
         """Loss and squared error as numbers, once they and all gradients are known to be finite.
@@ -300,57 +302,59 @@ class HashGridTrainer:
                 raise NonFinite(quantity, step, _whole([chunk.batch for chunk in parts]))
         return loss_now, error_now
 
-    def _update(self, parts: Sequence[_Part], factor: float, count: int) -> None:
-        """Of the table's levels, which share no rows, of the networks, of what is learnt of photos and of the cache:
-        each work for a core. ``factor``: of all learning rates."""
+    def _update(self, parts: Sequence[_Part], factor: float, adam_step: int) -> None:
+        """Update the table's levels, which share no rows, the networks, the per-image parameters and the occupancy
+        grid, each on a core. ``factor`` scales all learning rates."""
         finest_first = range(len(self.model.layout.resolutions) - 1, -1, -1)  # no core waits long for the last
-        rate = self.settings.rate * factor
-        work = [partial(self._update_level, level, parts, rate, count) for level in finest_first]
+        learning_rate = self.settings.rate * factor
+        work = [partial(self._update_level, level, parts, learning_rate, adam_step) for level in finest_first]
         of_networks = [chunk.weights._asdict() for chunk in parts]
-        work.append(partial(self._update_small, Weights._fields, of_networks, rate, count))
-        of_sky = [*(chunk.sky for chunk in parts), self._sky_prior(parts)]
-        work.append(partial(self._update_small, self.sky, of_sky, SKY_RATE * rate, count))
-        work.append(partial(self._raise_cache, parts))
-        for of_photos in self.photo_parts:
-            work.append(partial(self._update_photos, of_photos, parts, of_photos.rate * factor, count))
+        work.append(partial(self._update_small, Weights._fields, of_networks, learning_rate, adam_step))
+        of_background = [*(chunk.background for chunk in parts), self._background_prior(parts)]
+        work.append(
+            partial(self._update_small, self.background, of_background, BACKGROUND_LR_SCALE * learning_rate, adam_step)
+        )
+        work.append(partial(self._raise_occupancy, parts))
+        for effect in self.effects.all:
+            work.append(partial(self._update_effect, effect, parts, effect.learning_rate * factor, adam_step))
         for _ in in_order(lambda update: update(), work, self.bank.device):
             pass
 
-    def _sky_prior(self, parts: Sequence[_Part]) -> dict[str, Tensor]:
-        """The prior's gradient of the sky, where rays of this batch ran to it: what none runs to stays as it is."""
+    def _background_prior(self, parts: Sequence[_Part]) -> dict[str, Tensor]:
+        """The prior's gradient of the background where rays of this batch reach it; elsewhere it stays as it is."""
         rays = sum(len(chunk.batch.jitter) for chunk in parts)
-        touched = {name: torch.stack([chunk.sky[name] for chunk in parts]).sum(0) != 0 for name in self.sky}
-        return {name: SKY_PRIOR / rays * sky * touched[name] for name, sky in self.sky.items()}
+        touched = {
+            name: torch.stack([chunk.background[name] for chunk in parts]).sum(0) != 0 for name in self.background
+        }
+        return {name: BACKGROUND_PRIOR / rays * table * touched[name] for name, table in self.background.items()}
 
-    def _update_level(self, level: int, parts: Sequence[_Part], rate: float, count: int) -> None:
+    def _update_level(self, level: int, parts: Sequence[_Part], learning_rate: float, adam_step: int) -> None:
         layout, backend = self.model.layout, self.model.backend
         with part("scatter", Work(rows=CORNERS * sum(len(each.points) for each in parts))):
             for each in parts:
                 backend.encode_backward_table(layout, level, each.points, each.features, self.grad_table)
-        table, grad, mean, square = self.levels[level]
+        table, grad, exp_avg, exp_avg_sq = self.levels[level]
         with part("optimiser", Work(bytes=ADAM_BYTES * table.numel())):
-            backend.adam(table, grad, mean, square, rate, count)
+            backend.adam(table, grad, exp_avg, exp_avg_sq, learning_rate, adam_step)
 
     def _update_small(
-        self, names: Iterable[str], of_parts: Sequence[dict[str, Tensor]], rate: float, count: int
+        self, names: Iterable[str], of_parts: Sequence[dict[str, Tensor]], learning_rate: float, adam_step: int
     ) -> None:
         """Of parameters that are small beside the table."""
         with part("optimiser"):
             for name in names:
                 gradient = torch.stack([each[name] for each in of_parts]).sum(0)
-                parameter, mean, square = self.parameters[name], self.mean[name], self.square[name]
-                self.model.backend.adam(parameter, gradient, mean, square, rate, count)
+                parameter, exp_avg, exp_avg_sq = self.parameters[name], self.exp_avg[name], self.exp_avg_sq[name]
+                self.model.backend.adam(parameter, gradient, exp_avg, exp_avg_sq, learning_rate, adam_step)
 
-    def _update_photos(
-        self, of_photos: PhotoRays | PhotoColours, parts: Sequence[_Part], rate: float, count: int
-    ) -> None:
-        self._update_small(of_photos.parameters, [chunk.photos for chunk in parts], rate, count)
-        of_photos.settle()
+    def _update_effect(self, effect: Effect, parts: Sequence[_Part], learning_rate: float, adam_step: int) -> None:
+        self._update_small(parameters_of(effect), [chunk.effects for chunk in parts], learning_rate, adam_step)
+        effect.fix_gauge()
 
-    def _raise_cache(self, parts: Sequence[_Part]) -> None:
+    def _raise_occupancy(self, parts: Sequence[_Part]) -> None:
         with part("cache"):
             for each in parts:
-                self.cache.raise_to(each.points, each.thickness)
+                self.occupancy_grid.raise_to(each.points, each.thickness)
 
 
 def _whole(batches: Sequence[HashGridBatch]) -> dict[str, Tensor]:

@@ -53,7 +53,7 @@ def read(root: Path) -> RunFile:
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         reason = f"it cannot be used ({error})"
     hint = f"Delete {root / NAME} and give the same `pipeline run` again: finished stages are kept."
-    raise StageError(f"cannot read {root / NAME}", reason, hint)
+    raise StageError("pipeline.run-file", f"cannot read {root / NAME}", reason, hint)
 
 
 def write(root: Path, run: RunFile) -> None:

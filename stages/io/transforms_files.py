@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 TRAIN, HELD_OUT = "transforms_train.json", ("transforms_test.json", "transforms_val.json")  # of a Blender-style folder
 LONGEST_PATH, LONGEST_NAME = 2000, 250  # bytes, with room for an extension
 MOST_LETTERS = 60  # of a name, in an error
+ROUNDED = 1e-3  # what rounding may make of a 0
 _HINT = "Give a transforms.json as nerfstudio, instant-ngp or the NeRF-synthetic scenes write it."
 
 
@@ -24,11 +25,13 @@ def read_transforms(transforms: Path, *, may_be_empty: bool = False) -> dict[str
     try:
         content = json.loads(transforms.read_text("utf-8-sig"))  # -sig: Windows writes a byte order mark
     except (ValueError, RecursionError) as error:
-        raise StageError(f"cannot read {transforms.name}", f"it is not JSON ({error})", _HINT) from error
+        raise StageError(
+            "io.transforms-not-json", f"cannot read {transforms.name}", f"it is not JSON ({error})", _HINT
+        ) from error
     if not isinstance(content, dict) or not isinstance(content.get("frames"), list):
-        raise StageError(what, "it has no list named 'frames'", _HINT)
+        raise StageError("io.transforms-without-frames", what, "it has no list named 'frames'", _HINT)
     if not (content["frames"] or may_be_empty):
-        raise StageError(what, "its list 'frames' is empty", _HINT)
+        raise StageError("io.transforms-empty", what, "its list 'frames' is empty", _HINT)
     _check_frames(content["frames"], what)
     return content
 
@@ -36,13 +39,17 @@ def read_transforms(transforms: Path, *, may_be_empty: bool = False) -> dict[str
 def _check_frames(frames: list[Any], what: str) -> None:
     for index, frame in enumerate(frames):
         if not (isinstance(frame, dict) and isinstance(frame.get("file_path"), str) and "transform_matrix" in frame):
-            raise StageError(what, f"frame {index} lacks file_path or transform_matrix", _HINT)
+            raise StageError(
+                "io.transforms-incomplete-frame", what, f"frame {index} lacks file_path or transform_matrix", _HINT
+            )
         mask = frame.get("mask_path") or ""
         if not isinstance(mask, str):
-            raise StageError(what, f"the mask_path of frame {index} is no name of a file", _HINT)
+            raise StageError(
+                "io.transforms-mask-path", what, f"the mask_path of frame {index} is no name of a file", _HINT
+            )
         if wrong := next((name for name in (*photo_names(frame), mask) if not _is_name(name)), None):
             why = f"no file can have the name of frame {index}, {ascii(wrong)[:MOST_LETTERS]}"
-            raise StageError(what, why, _HINT)
+            raise StageError("io.transforms-file-path", what, why, _HINT)
 
 
 def read_splits(
@@ -98,19 +105,25 @@ def _test_frames(file: str, content: dict[str, Any]) -> tuple[str, dict[str, Any
     """The frames that lie under ``test_frames``, as ScanNet++ has them, as a file of their own."""
     where, frames = f"test_frames of {file}", content["test_frames"]
     if not isinstance(frames, list):
-        raise StageError(f"cannot use {where}", "it is no list", _HINT)
+        raise StageError("io.transforms-split", f"cannot use {where}", "it is no list", _HINT)
     _check_frames(frames, f"cannot use {where}")
     return where, content | {"frames": frames}
 
 
 def pose_matrix(matrix: Any) -> "Float[np.ndarray, '3 4']":
-    """The first three rows of a frame's ``transform_matrix``. Raises ValueError for what is no matrix of that shape."""
+    """The first three rows of a frame's ``transform_matrix``, which may be a flat list of its rows. Raises ValueError
+    for what is no matrix of that shape."""
     import numpy as np
 
     try:
         pose = np.array(matrix, np.float64)
     except (TypeError, ValueError, OverflowError) as error:
         raise ValueError("its transform_matrix is not a matrix of numbers") from error
+    if pose.shape in ((12,), (16,)):
+        pose = pose.reshape(-1, 4)
+    if pose.shape == (4, 4) and (np.abs(pose[3, :3]) > ROUNDED).any():
+        row = ", ".join(f"{value:.4g}" for value in pose[3])
+        raise ValueError(f"the last row of its transform_matrix is {row} and not 0, 0, 0, 1: it may be transposed")
     if pose.shape not in ((3, 4), (4, 4)) or not np.isfinite(pose[:3]).all():
         raise ValueError("its transform_matrix is not 4 × 4 (or 3 × 4) finite numbers")
     return pose[:3]

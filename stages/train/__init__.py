@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from stages.train.loop import TrainingRun
 
 INPUTS = ("ingest", "normalise", "effects")
-VERSION = 23
+VERSION = 24
 EXIT_CODE = 14
 RESUMES = True
 PUBLISHED = ("curve.json",)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 # Along the longer side of a picture. At 1000 pixels the bearings are then off by at most 0.002 of them for a phone's
 # lens, 0.02 for an action camera's, 0.05 for a fisheye's, and a camera takes 1 MB; twice as many: a quarter, and 4 MB.
 MOST_PATCHES = 192
-NOTHING_LEFT = "nothing is left to train on"  # what happened, of the StageError where masks leave no pixel at a size
+ALL_MASKED = "train.all-masked"  # the error where masks leave no pixel at a size
 
 
 def scaled_size(camera: "Camera", downscale: float) -> tuple[int, int]:
@@ -57,7 +57,7 @@ def patch_bearings(camera: "Camera", downscale: float) -> "Tensor":
 
 def training_bank(ingest: Path, scene: "Scene", split: "Split", downscale: float, progress: Progress) -> "RayDataset":
     """All pixels and rays of one split, on the CPU; the pixels are mapped from the pixel store, which is made if need
-    be. What masks ignore is never drawn. Raises StageError, NOTHING_LEFT, where they leave nothing."""
+    be. What masks ignore is never drawn. Raises StageError, ALL_MASKED, where they leave nothing."""
     import numpy as np
     import torch
 
@@ -129,7 +129,7 @@ def _masked(bank: "RayDataset", ignored: "Iterable[Tensor | None]", split: "Spli
         bank = bank.without(ignored)
     except ValueError as error:
         why = f"{error} of the {split} photos at this size"
-        raise StageError(NOTHING_LEFT, why, "Give a smaller --train.downscale.") from error
+        raise StageError(ALL_MASKED, "nothing is left to train on", why, "Give a smaller --train.downscale.") from error
     progress.note(f"masks leave {bank.drawable / len(bank.pixels):.0%} of the pixels of the {split} photos")
     return bank
 

@@ -10,7 +10,7 @@ from stages.hardware.device import compute_device
 from stages.io.amounts import short_count
 
 if TYPE_CHECKING:
-    from nerf.effects import PhotoColours, PhotoRays
+    from nerf.effects import ImageEffects
     from nerf.fields.hash_grid import HashGridSettings
     from nerf.fields.vanilla import VanillaSettings
     from nerf.geometry.scene import Scene
@@ -52,7 +52,7 @@ def prepare(config: "Config", scene: "Scene", inputs: Inputs, folder: Path, prog
     import torch
 
     from nerf.training.validation_probe import make_probe
-    from stages.effects.decisions import photo_parts, read_decisions
+    from stages.effects.decisions import image_effects, read_decisions
     from stages.train.data import guided_bank
     from stages.train.log import TrainingLog
     from stages.train.loop import TrainingRun
@@ -80,7 +80,7 @@ def prepare(config: "Config", scene: "Scene", inputs: Inputs, folder: Path, prog
     _say_sizes(config, budget, bank, progress)
     decisions, views = read_decisions(inputs["effects"]), scene.of_split("train")
     return TrainingRun(
-        lambda attempt: make_trainer(config, scene, bank, config.seed + attempt, photo_parts(decisions, views, bank)),
+        lambda attempt: make_trainer(config, scene, bank, config.seed + attempt, image_effects(decisions, views, bank)),
         probes,
         budget,
         folder,
@@ -95,7 +95,9 @@ def field_bytes(config: "Config", workers: int) -> float:
     if config.field == "grid":
         settings = grid_settings(config, sky=False)  # which is small beside the rest
         assert config.batch_samples
-        return TABLE_COPIES * 4 * settings.features * settings.layout.rows + SAMPLE_BYTES * config.batch_samples
+        return (
+            TABLE_COPIES * 4 * settings.features_per_level * settings.layout.rows + SAMPLE_BYTES * config.batch_samples
+        )
     from nerf.training.trainer import CHUNK_RAYS
 
     sizes = paper_settings(config)
@@ -126,13 +128,13 @@ def make_trainer(
     scene: "Scene",
     bank: "RayDataset",
     seed: int,
-    photo_parts: "tuple[PhotoRays, PhotoColours] | None" = None,
+    effects: "ImageEffects | None" = None,
 ) -> "FieldTrainer":
-    """A fresh field of the kind that ``config`` asks for, with its trainer, where ``bank`` is. ``photo_parts`` stand
-    between it and the photos; None: nothing does."""
-    from nerf.effects import AS_GIVEN, AS_RENDERED
+    """A fresh field of the kind that ``config`` asks for, with its trainer, where ``bank`` is. ``effects`` stand
+    between it and the photos; None: none does."""
+    from nerf.effects import NO_EFFECTS
 
-    photo_parts = photo_parts or (AS_GIVEN, AS_RENDERED)
+    effects = effects or NO_EFFECTS
     if config.field == "grid":
         from nerf.fields.hash_grid import HashGridField
         from nerf.training.hash_grid_trainer import HashGridTrainer
@@ -141,12 +143,12 @@ def make_trainer(
         assert config.backend, "plan() chooses it"
         backend = load_backend(config.backend, bank.device.type)
         model = HashGridField(grid_settings(config, has_sky(config, scene)), seed, backend).to(bank.device)
-        return HashGridTrainer(model, bank, grid_trainer_settings(config, scene, seed), *photo_parts)
+        return HashGridTrainer(model, bank, grid_trainer_settings(config, scene, seed), effects)
     from nerf.fields.vanilla import VanillaNerf
     from nerf.training.trainer import VanillaTrainer
 
     published = VanillaNerf(paper_settings(config), seed).to(bank.device)
-    return VanillaTrainer(published, bank, paper_trainer_settings(config, scene, seed), *photo_parts)
+    return VanillaTrainer(published, bank, paper_trainer_settings(config, scene, seed), effects)
 
 
 def _say_sizes(config: "Config", budget: "TrainingBudget", bank: "RayDataset", progress: Progress) -> None:
@@ -163,11 +165,15 @@ def _say_sizes(config: "Config", budget: "TrainingBudget", bank: "RayDataset", p
 
 def _step_words(config: "Config") -> str:
     """Of the grid field: how a step is divided and what computes it, and where samples stand along a ray."""
-    lattice = grid_settings(config, sky=False).lattice
-    growing = f", from {lattice.linear_until:g} on every {lattice.cone:.1%} of the distance" if lattice.cone else ""
+    stepping = grid_settings(config, sky=False).stepping
+    growing = (
+        f", from {stepping.linear_until:g} on every {stepping.cone_angle:.1%} of the distance"
+        if stepping.cone_angle
+        else ""
+    )
     parts = f"{config.chunks} part{'' if config.chunks == 1 else 's'}"
     step = f"{config.batch_samples:,} colours a step in {parts}, by {config.backend}"
-    return f"{step} · samples every {lattice.step:.2g} scene units{growing}"
+    return f"{step} · samples every {stepping.step_size:.2g} scene units{growing}"
 
 
 def has_sky(config: "Config", scene: "Scene") -> bool:
@@ -186,17 +192,17 @@ def grid_settings(config: "Config", sky: bool) -> "HashGridSettings":
     assert config.contracted is not None and config.view_dependence is not None, "plan() takes them from stage effects"
     shortest = 2 * CONTRACTED_BOX / (_steps_across(config.finest) * config.ray_samples)
     return HashGridSettings(
-        levels=config.levels,
-        log2_rows=config.log2_rows,
-        coarsest=min(COARSEST[config.space], config.finest),
-        finest=config.finest,
+        num_levels=config.levels,
+        log2_hashmap_size=config.log2_rows,
+        base_res=min(COARSEST[config.space], config.finest),
+        max_res=config.finest,
         contracted=config.contracted,
-        steps=max(1, round(config.ray_samples * min(math.sqrt(3) * config.finest, MOST_STEPS))),
-        shortest_step=shortest,
-        cone=shortest / EVEN_UNTIL,
-        most_samples=math.ceil(MOST_SAMPLES * max(1.0, config.ray_samples)),
+        diagonal_steps=max(1, round(config.ray_samples * min(math.sqrt(3) * config.finest, MOST_STEPS))),
+        min_step_size=shortest,
+        cone_angle=shortest / EVEN_UNTIL,
+        max_samples_per_ray=math.ceil(MOST_SAMPLES * max(1.0, config.ray_samples)),
         view_dependence=config.view_dependence,
-        sky=sky,
+        background_model=sky,
     )
 
 

@@ -7,7 +7,7 @@ from statistics import median
 from typing import TYPE_CHECKING
 
 from stages.contract import Progress
-from stages.effects.decisions import photo_parts
+from stages.effects.decisions import image_effects
 from stages.hardware.device import compute_device, cores
 from stages.hardware.memory import available_on
 from stages.io.amounts import bytes_in_words, short_count
@@ -141,8 +141,8 @@ def seconds_per_step(config: "Config", scene: "Scene", decisions: "Decisions", d
     from nerf.runtime.matmul_precision import use_matmul_precision
 
     bank = _grey_bank(scene).to(device)
-    parts = photo_parts(decisions, scene.of_split("train")[:1], bank)
-    trainer = make_trainer(config, scene, bank, seed=0, photo_parts=parts)
+    effects = image_effects(decisions, scene.of_split("train")[:1], bank)
+    trainer = make_trainer(config, scene, bank, seed=0, effects=effects)
     with use_matmul_precision(config.matmul):
         trainer.step(0, 0.0, 1.0)  # the first step pays for memory and kernels
         started, steps = time.perf_counter(), 0

@@ -57,7 +57,7 @@ def unseen_photos(
 
     from nerf.training.validation_probe import make_patches, make_probe
     from stages.effects.decisions import told_by_neighbours
-    from stages.train.data import NOTHING_LEFT, training_bank
+    from stages.train.data import ALL_MASKED, training_bank
     from stages.train.setup import field_background
 
     if not scene.of_split(split):
@@ -66,7 +66,7 @@ def unseen_photos(
     try:
         bank = training_bank(ingest, scene, split, config.downscale, progress).to(device)
     except StageError as error:
-        if split != "test" or error.what != NOTHING_LEFT:
+        if split != "test" or error.code != ALL_MASKED:
             raise
         progress.note(f"held-out quality is not measured while training: {error.why}")
         return None
@@ -88,7 +88,7 @@ def look(trainer: "FieldTrainer", unseen: Unseen) -> Look:
     """How the field does on photos that it has never seen, exposed as their neighbours let expect."""
     from nerf.training.validation_probe import measure, pictures
 
-    as_expected = trainer.photo_colours.of_unseen(unseen.neighbours)
+    as_expected = trainer.effects.of_held_out(unseen.neighbours)
     psnr = measure(trainer.model, unseen.probe, as_expected).psnr
     rows = zip(*pictures(trainer.model, unseen.patches, as_expected), unseen.patches.used, strict=True)
     known = [value for row in rows if (value := ssim(*(part.cpu() for part in row))) is not None]
@@ -104,7 +104,7 @@ def with_validation(scene: "Scene") -> "Scene":
     if split is None:
         count = len(scene.of_split("train"))
         why = f"photos to decide by have to be set aside, and of {count} training photos too few would be left"
-        raise StageError("no target can be trained to", why, "Leave out --target-psnr.")
+        raise StageError("train.few-photos-for-target", "no target can be trained to", why, "Leave out --target-psnr.")
     return split
 
 

@@ -15,7 +15,7 @@ ELSEWHERE = {
     "nerf/kernels/torch/occupancy.py": "comparisons and bits, exact: "
     "tests/nerf/kernels/torch/test_occupancy.py; a cell that is "
     "no number counts as occupied",
-    "nerf/kernels/torch/early_termination.py": "sums of optical depth in float64, the lattice's step as marching "
+    "nerf/kernels/torch/early_termination.py": "sums of optical depth in float64, the step size as marching "
     "takes it: tests/nerf/kernels/test_early_termination.py",
     "nerf/kernels/torch/colour_sampling.py": "1 − exp(−x) as in compositing, of optical depth summed in float64; "
     "differences of it are off by 1e-7, and what is no number is left out and reaches the light behind it: "
@@ -23,7 +23,7 @@ ELSEWHERE = {
     "nerf/rendering/early_termination.py": "cuts rays where the light is below 1e-3: "
     "tests/nerf/fields/test_hash_grid.py",
     "nerf/fields/hash_grid.py": "puts rows together: tests/nerf/fields/test_hash_grid.py",
-    "nerf/fields/occupancy_grid.py": "σ times the lattice's step; the outermost cells, which reach to infinity, count "
+    "nerf/fields/occupancy_grid.py": "σ times the step size; the outermost cells, which reach to infinity, count "
     "half a cell within: tests/nerf/training/test_hash_grid_trainer.py",
     "nerf/fields/frustum_mask.py": "angles and distances of the middles of cells; the cells around them count as "
     "well: tests/nerf/fields/test_frustum_mask.py",
@@ -33,13 +33,13 @@ ELSEWHERE = {
     "tests/nerf/rendering/test_srgb.py",
     "nerf/effects/exposure.py": "powers taken between powers, without light in between; value, gradient, extremes: "
     "tests/nerf/effects/test_exposure.py",
-    "nerf/effects/exposure_model.py": "gains of a photo's rays, from nothing to 1e30: "
-    "tests/nerf/effects/test_exposure_model.py",
+    "nerf/effects/__init__.py": "effects in order, by the chain rule: tests/nerf/effects/test_composition.py; "
+    "gains of a photo's rays, from nothing to 1e30: tests/nerf/effects/test_exposure_model.py",
+    "nerf/effects/appearance.py": "changes no bit where effects change nothing: tests/nerf/effects/test_exposure.py",
     "nerf/geometry/rotations.py": "its series below 0.1 radians, against the matrix exponential from 0 to beyond π: "
     "tests/nerf/geometry/test_rotations.py",
     "nerf/effects/pose_refinement.py": "turns and shifts of rays, up to 3.1 radians: "
-    "tests/nerf/effects/test_pose_refinement.py",
-    "nerf/effects/pose_fit.py": "a search: tests/stages/effects/test_pilots.py, tests/nerf/effects/test_pose_fit.py",
+    "tests/nerf/effects/test_pose_refinement.py; the fit of one is a search: tests/nerf/effects/test_pose_fit.py",
     "nerf/geometry/pose_distance.py": "float64, ratios of distances: tests/nerf/geometry/test_pose_distance.py",
     "nerf/rendering/images.py": "cuts pictures into chunks: tests/nerf/rendering/test_images.py",
     "nerf/training/validation_probe.py": "mean colour, PSNR, patches of pixels: "

@@ -29,11 +29,11 @@ def import_cameras(
     judged = check.pop("images", {}) if check else {}
     unknown = {"agreement": None, "transfer_px": None}
     return {
-        "attempts": [],
+        "strategies": [],
         "repeated_structure": None,
         "match_graph": None,
         "check": check,
-        "second_opinion": None,
+        "global_mapping": None,
         "images": [
             image | {"uncertainty_px": None} | judged.get(image["file"], unknown) for image in known.account(photos)
         ],
@@ -58,6 +58,7 @@ def write_known_model(
     errors = read_model(folder / "sparse").error_px  # computed anew: what the given model says of them may be anything
     if lost := int((~np.isfinite(errors)).sum()):
         raise StageError(
+            "sfm.points-do-not-fit",
             f"the cameras of {cameras.name} do not fit its points",
             f"{lost} of {len(errors)} points are seen where their cameras cannot see anything",
             "Check the distortion of the cameras, or leave them out to have them found from the photos.",

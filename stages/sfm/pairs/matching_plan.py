@@ -19,7 +19,7 @@ from stages.contract import Progress, StageError
 from stages.hardware.device import processors
 from stages.io.amounts import rough_duration
 from stages.render.spread import spread
-from stages.sfm.process import environment
+from stages.sfm.worker_process import environment
 
 if TYPE_CHECKING:
     from stages.io.photos import Photo
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from stages.sfm.pairs.pair_selection import Places
 
 FEWEST_MEASURED = 4
-CHILD = ["-P", "-m", "stages.sfm.pairs.matching_plan"]
+COMMAND = ["-P", "-m", "stages.sfm.pairs.matching_plan"]
 WAYS = {
     "sequential": "neighbours in time, up to {} each",
     "spatial": "neighbours by GPS position and similarity, up to {} each",
@@ -85,6 +85,7 @@ def check_matcher(matcher: "Matcher | None", places: "Places") -> None:
     """Raises StageError where a matcher was asked for that the photos do not allow."""
     if matcher == "spatial" and places.position_m is None:
         raise StageError(
+            "sfm.no-positions",
             "cannot choose pairs of photos by place",
             "not all photos tell by EXIF where they were taken",
             "Leave out --sfm.matcher, or try --sfm.matcher retrieval.",
@@ -154,14 +155,14 @@ def _measured(photos: "Sequence[Photo]", images: Path, tier: Tier, matcher: "Mat
     indexed = matcher != "exhaustive"
     job = json.dumps({"images": str(images.absolute()), "photos": some, "indexed": indexed, **tier._asdict()})
     answer = subprocess.run(
-        [sys.executable, *CHILD], input=job.encode(), capture_output=True, env=environment(), start_new_session=True
+        [sys.executable, *COMMAND], input=job.encode(), capture_output=True, env=environment(), start_new_session=True
     )
     if answer.returncode:
         lines = answer.stderr.decode("utf-8", "replace").strip().splitlines()
         why = lines[-1] if lines else f"COLMAP ended with {answer.returncode}"
         every = f"--sfm.matcher exhaustive --sfm.max-image-size {tier.max_image_size}"
         hint = f"Say how, and nothing is measured: {every} --sfm.max-features {tier.max_features}."
-        raise StageError("could not measure what features and matches take", why, hint)
+        raise StageError("sfm.not-measured", "could not measure what features and matches take", why, hint)
     return Cost(**json.loads(answer.stdout))
 
 

@@ -37,7 +37,7 @@ def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
 def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> StageResult:
     """Write count.json."""
     if not config.most:
-        raise StageError("nothing is counted", "0 is where it starts", "Give a larger --count.most.")
+        raise StageError("count.zero", "nothing is counted", "0 is where it starts", "Give a larger --count.most.")
     count = min(config.most, len(read_photos(inputs["ingest"])))
     write_json(folder / "count.json", count)
     return StageResult(("count.json",), f"{count} photos")

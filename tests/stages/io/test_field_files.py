@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 import torch
 
-from nerf.effects.exposure import ExposedModel
+from nerf.effects.appearance import AppearanceModel
+from nerf.effects.exposure import ExposureModel
 from nerf.fields.hash_grid import HashGridField, HashGridSettings
 from nerf.fields.vanilla import VanillaNerf, VanillaSettings
 from nerf.geometry.rays import Rays
@@ -15,10 +16,12 @@ from stages.io.field_files import load_field, save_field
 from stages.io.files import read_json, read_tensors, write_json, write_tensors
 
 SMALL = VanillaSettings(depth=2, width=8, samples_coarse=4, samples_fine=4, contracted=True, spacing="log")
-GRID = HashGridSettings(levels=2, log2_rows=8, coarsest=4, finest=16, contracted=True, occupancy_resolution=8)
+GRID = HashGridSettings(
+    num_levels=2, log2_hashmap_size=8, base_res=4, max_res=16, contracted=True, occupancy_resolution=8
+)
 KERNELS = load_backend(chosen_backend("cpu"), "cpu")
-OUTDOORS = HashGridField(replace(GRID, sky=True), 5, KERNELS)
-OUTDOORS.sky.normal_(generator=torch.Generator().manual_seed(6))
+OUTDOORS = HashGridField(replace(GRID, background_model=True), 5, KERNELS)
+OUTDOORS.background_table.normal_(generator=torch.Generator().manual_seed(6))
 KINDS = {"paper": VanillaNerf(SMALL, seed=5), "grid": HashGridField(GRID, 5, KERNELS), "sky": OUTDOORS}
 BY_TORCH = "the grid field is computed by torch alone, as it was trained"
 INFO = {"background": [1.0, 1.0, 1.0], "downscale": 2.5, "steps": 7, "rays": 700}
@@ -98,8 +101,9 @@ def test_a_field_with_exposure_is_shown_at_the_neutral_one(kind: str, tmp_path: 
     plain = KINDS[kind]
     save_field(tmp_path, plain, INFO | {"exposure": EXPOSURE})
     loaded, info = load_field(tmp_path)
-    assert info["exposure"] == EXPOSURE and isinstance(loaded, ExposedModel)
-    wanted = ExposedModel(plain, torch.tensor(EXPOSURE["neutral"])).render(RAYS, torch.ones(3)).colour
+    assert info["exposure"] == EXPOSURE and isinstance(loaded, AppearanceModel)
+    exposure = ExposureModel(torch.tensor([EXPOSURE["neutral"]]))
+    wanted = AppearanceModel(plain, (exposure,)).render(RAYS, torch.ones(3)).colour
     assert torch.equal(loaded.render(RAYS, torch.ones(3)).colour, wanted)
     assert (wanted[:, 1] == plain.render(RAYS, torch.ones(3)).colour[:, 1]).all()
     assert (wanted[:, 0] > plain.render(RAYS, torch.ones(3)).colour[:, 0]).all()
