@@ -22,10 +22,10 @@ from nerf.fields.vanilla import VanillaNerf
 from nerf.training.metrics import mean_squared_error, psnr
 from pipeline.engine.workspace import Workspace
 from stages.effects.decisions import expected_gains
+from stages.io.amounts import resolution_name
 from stages.io.files import read_json, read_scene
 from stages.render.renderer import Painter, load_painter
 from stages.render.spread import spread
-from stages.tradeoff.runs import resolution_words
 from stages.train.data import PhotoReader, view_rays
 
 
@@ -97,7 +97,7 @@ def main() -> None:
             with torch.no_grad():
                 seconds, score = measured(other, folders, downscale, given.photos)
             words = f"× {factor:g} ({samples_of(other.model)})"
-            record.add(samples=words, resolution=resolution_words(downscale), frame_seconds=seconds, psnr=score)
+            record.add(samples=words, resolution=resolution_name(downscale), frame_seconds=seconds, psnr=score)
 
 
 if __name__ == "__main__":

@@ -32,7 +32,7 @@ from stages.train.profile import observed
 from stages.train.state import Pace, Probes, RunState, TrainingBudget, checkpoint_interval, lost_seconds
 
 if TYPE_CHECKING:
-    from nerf.training.schedule import StepPlan
+    from nerf.training.schedule import StepSchedule
     from nerf.training.trainer import FieldTrainer, NonFinite
     from nerf.training.validation_probe import ProbeResult
     from stages.train.log import TrainingLog
@@ -104,13 +104,13 @@ class TrainingRun:
 
     def _begin(self, state: RunState) -> None:
         """Start from fresh weights; ``state`` carries over what earlier attempts cost."""
-        from nerf.training.schedule import plan_of
+        from nerf.training.schedule import schedule_of
 
         self.state = state
         self.trainer: FieldTrainer = self.make_trainer(state.restarts)
         self.lost = lost_seconds(self.spent, state)
         steps, self.clock_budget = self._limits()
-        self.plan: StepPlan = plan_of(steps or PROVISIONAL_STEPS)
+        self.plan: StepSchedule = schedule_of(steps or PROVISIONAL_STEPS)
         self._plan_measurement()
         self._write_journal()
         self._save()
@@ -171,12 +171,12 @@ class TrainingRun:
         self.progress.note(going_on_words(self.state.step, self.plan.total_steps, left))
 
     def _load(self, checkpoint: Checkpoint, journal: Path) -> None:
-        from nerf.training.schedule import Decision, StepPlan
+        from nerf.training.schedule import ScheduleRevision, StepSchedule
 
         self.state = RunState(**checkpoint.facts)
         self.trainer = self.make_trainer(self.state.restarts)
         self.trainer.load_state(checkpoint.tensors)
-        self.plan = StepPlan(tuple(Decision(*decision) for decision in read_json(journal)))
+        self.plan = StepSchedule(tuple(ScheduleRevision(*decision) for decision in read_json(journal)))
         self.lost = lost_seconds(self.spent, self.state)
         self._plan_measurement()
 

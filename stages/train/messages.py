@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from stages.io.amounts import short_count
 
 if TYPE_CHECKING:
-    from nerf.training.schedule import StepPlan
+    from nerf.training.schedule import StepSchedule
     from stages.train.state import Pace, RunState
 
 
@@ -35,7 +35,7 @@ def reached_before_words(target_psnr: float) -> str:
     return f"{target_psnr:g} dB are reached already: training goes on for all that was asked for"
 
 
-def steering_words(state: "RunState", target_psnr: float, plan: "StepPlan") -> str:
+def steering_words(state: "RunState", target_psnr: float, plan: "StepSchedule") -> str:
     """That the rate falls before the end, or goes back up, with a target in mind."""
     seen = f"{state.validation_psnr:.1f} of {target_psnr:g} dB on photos set aside after {state.step:,} steps"
     and_now = "annealing over" if plan.decisions[-1].reason == "target" else "going on for"

@@ -49,8 +49,8 @@ def _medium(config: "Config") -> "Medium":
     import torch
 
     from nerf.fields.mlp import HIDDEN
-    from nerf.runtime.matmul_precision import medium_matmul
+    from nerf.runtime.matmul_precision import measure_medium_matmul
 
     width = HIDDEN if config.kind == "grid" else config.width
     assert width, "plan() chooses it"
-    return medium_matmul(torch.device(compute_device()), width)
+    return measure_medium_matmul(torch.device(compute_device()), width)

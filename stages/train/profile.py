@@ -29,9 +29,9 @@ def observed(
     if step % TIMED_EVERY != FIRST_TIMED:
         return take()
     from nerf.runtime.parallel import workers
-    from nerf.runtime.profiler import Stopwatch, running
+    from nerf.runtime.profiler import Profiler, running
 
-    stopwatch, started = Stopwatch(device), time.perf_counter()
+    stopwatch, started = Profiler(device), time.perf_counter()
     with running(stopwatch):
         result = take()
     seconds = time.perf_counter() - started

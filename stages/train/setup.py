@@ -53,7 +53,7 @@ def prepare(config: "Config", scene: "Scene", inputs: Inputs, folder: Path, prog
 
     from nerf.training.validation_probe import make_probe
     from stages.effects.decisions import image_effects, read_decisions
-    from stages.train.data import guided_bank
+    from stages.train.data import guided_dataset
     from stages.train.log import TrainingLog
     from stages.train.loop import TrainingRun
     from stages.train.more import budget_of
@@ -65,11 +65,11 @@ def prepare(config: "Config", scene: "Scene", inputs: Inputs, folder: Path, prog
     if device == "cpu":
         check_field_fits(config)
     progress.update("reading the photos")
-    bank = guided_bank(inputs, scene, config.downscale, progress).to(device)
+    dataset = guided_dataset(inputs, scene, config.downscale, progress).to(device)
     shown_over = torch.tensor(field_background(config, scene), device=device)
 
     probes = Probes(
-        make_probe(bank, PROBE_RAYS, shown_over, PROBE_SEED),
+        make_probe(dataset, PROBE_RAYS, shown_over, PROBE_SEED),
         unseen_photos(config, inputs["ingest"], scene, "test", device, progress),
     )
     if config.target_psnr is not None:
@@ -77,10 +77,12 @@ def prepare(config: "Config", scene: "Scene", inputs: Inputs, folder: Path, prog
         assert aside is not None, "stage train sets some aside"
         probes = probes._replace(target=Target(config.target_psnr, aside))
     budget = budget_of(config, inputs)
-    _say_sizes(config, budget, bank, progress)
+    _say_sizes(config, budget, dataset, progress)
     decisions, views = read_decisions(inputs["effects"]), scene.of_split("train")
     return TrainingRun(
-        lambda attempt: make_trainer(config, scene, bank, config.seed + attempt, image_effects(decisions, views, bank)),
+        lambda attempt: make_trainer(
+            config, scene, dataset, config.seed + attempt, image_effects(decisions, views, dataset)
+        ),
         probes,
         budget,
         folder,
@@ -126,11 +128,11 @@ def check_field_fits(config: "Config") -> None:
 def make_trainer(
     config: "Config",
     scene: "Scene",
-    bank: "RayDataset",
+    dataset: "RayDataset",
     seed: int,
     effects: "ImageEffects | None" = None,
 ) -> "FieldTrainer":
-    """A fresh field of the kind that ``config`` asks for, with its trainer, where ``bank`` is. ``effects`` stand
+    """A fresh field of the kind that ``config`` asks for, with its trainer, where ``dataset`` is. ``effects`` stand
     between it and the photos; None: none does."""
     from nerf.effects import NO_EFFECTS
 
@@ -141,24 +143,26 @@ def make_trainer(
         from stages.hardware.backend import load_backend
 
         assert config.backend, "plan() chooses it"
-        backend = load_backend(config.backend, bank.device.type)
-        model = HashGridField(grid_settings(config, has_sky(config, scene)), seed, backend).to(bank.device)
-        return HashGridTrainer(model, bank, grid_trainer_settings(config, scene, seed), effects)
+        backend = load_backend(config.backend, dataset.device.type)
+        model = HashGridField(grid_settings(config, has_sky(config, scene)), seed, backend).to(dataset.device)
+        return HashGridTrainer(model, dataset, grid_trainer_settings(config, scene, seed), effects)
     from nerf.fields.vanilla import VanillaNerf
     from nerf.training.trainer import VanillaTrainer
 
-    published = VanillaNerf(paper_settings(config), seed).to(bank.device)
-    return VanillaTrainer(published, bank, paper_trainer_settings(config, scene, seed), effects)
+    published = VanillaNerf(paper_settings(config), seed).to(dataset.device)
+    return VanillaTrainer(published, dataset, paper_trainer_settings(config, scene, seed), effects)
 
 
-def _say_sizes(config: "Config", budget: "TrainingBudget", bank: "RayDataset", progress: Progress) -> None:
+def _say_sizes(config: "Config", budget: "TrainingBudget", dataset: "RayDataset", progress: Progress) -> None:
     much = f"{budget.seconds:g} s" if budget.steps is None else f"{budget.steps:,} steps"
     another = "" if budget.after is None else "another "
-    photos = f"{len(bank.near)} photos at 1/{config.downscale:g} of their size"
+    photos = f"{len(dataset.near)} photos at 1/{config.downscale:g} of their size"
     grid = config.field == "grid"
     grids = f"{config.levels} grids of up to 2^{config.log2_rows} rows, to {config.finest}³"
     sizes = grids if grid else f"{config.depth} × {config.width}"
-    progress.note(f"{config.field} field ({sizes}), {another}{much} · {photos}, {short_count(len(bank.pixels))} pixels")
+    progress.note(
+        f"{config.field} field ({sizes}), {another}{much} · {photos}, {short_count(len(dataset.pixels))} pixels"
+    )
     if grid:
         progress.note(_step_words(config))
 

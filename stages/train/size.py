@@ -140,9 +140,9 @@ def seconds_per_step(config: "Config", scene: "Scene", decisions: "Decisions", d
     """Measured: steps of a fresh field of known sizes, with its effects, on a grey picture, for about a second."""
     from nerf.runtime.matmul_precision import use_matmul_precision
 
-    bank = _grey_bank(scene).to(device)
-    effects = image_effects(decisions, scene.of_split("train")[:1], bank)
-    trainer = make_trainer(config, scene, bank, seed=0, effects=effects)
+    dataset = _grey_dataset(scene).to(device)
+    effects = image_effects(decisions, scene.of_split("train")[:1], dataset)
+    trainer = make_trainer(config, scene, dataset, seed=0, effects=effects)
     with use_matmul_precision(config.matmul):
         trainer.step(0, 0.0, 1.0)  # the first step pays for memory and kernels
         started, steps = time.perf_counter(), 0
@@ -171,11 +171,11 @@ def rays_per_step(config: "Config") -> float:
     return config.batch_samples / SAMPLES_PER_RAY[config.space]
 
 
-def _grey_bank(scene: "Scene") -> "RayDataset":
+def _grey_dataset(scene: "Scene") -> "RayDataset":
     """The rays of the first training view, of a picture that is grey all over."""
     import torch
 
-    from nerf.training.ray_dataset import build_ray_bank
+    from nerf.training.ray_dataset import ray_dataset_from_images
     from stages.train.data import camera_directions
 
     view = scene.of_split("train")[0]
@@ -183,4 +183,6 @@ def _grey_bank(scene: "Scene") -> "RayDataset":
     directions = camera_directions(camera, max(1.0, max(camera.width, camera.height) / LEAST_LONG_SIDE))
     grey = torch.full((*directions.shape[:2], 3), 128, dtype=torch.uint8)
     pose = torch.tensor(view.scene_from_camera, dtype=torch.float32)
-    return build_ray_bank([grey], [0], [directions], pose[None], torch.tensor([view.near]), torch.tensor([view.far]))
+    return ray_dataset_from_images(
+        [grey], [0], [directions], pose[None], torch.tensor([view.near]), torch.tensor([view.far])
+    )

@@ -57,14 +57,14 @@ def unseen_photos(
 
     from nerf.training.validation_probe import make_patches, make_probe
     from stages.effects.decisions import told_by_neighbours
-    from stages.train.data import ALL_MASKED, training_bank
+    from stages.train.data import ALL_MASKED, training_dataset
     from stages.train.setup import field_background
 
     if not scene.of_split(split):
         return None
     assert config.downscale is not None, "plan() chooses it"
     try:
-        bank = training_bank(ingest, scene, split, config.downscale, progress).to(device)
+        dataset = training_dataset(ingest, scene, split, config.downscale, progress).to(device)
     except StageError as error:
         if split != "test" or error.code != ALL_MASKED:
             raise
@@ -72,8 +72,8 @@ def unseen_photos(
         return None
     shown_over = torch.tensor(field_background(config, scene), device=device)
     return Unseen(
-        make_probe(bank, PROBE_RAYS, shown_over, PROBE_SEED),
-        make_patches(bank, PATCHES, PATCH_SIDE, shown_over, PROBE_SEED),
+        make_probe(dataset, PROBE_RAYS, shown_over, PROBE_SEED),
+        make_patches(dataset, PATCHES, PATCH_SIDE, shown_over, PROBE_SEED),
         told_by_neighbours(scene, scene.of_split(split)),
     )
 
