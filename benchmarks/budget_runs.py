@@ -121,7 +121,7 @@ def train_run(bench: Bench, seed: int, steps: int, schedule: str) -> dict[str, A
     plan = schedule_of(steps) if schedule == "whole" else schedule_of(steps // 2).extended(steps)
     points, pace, rays = [], 0.0, 0
     for step in range(steps):
-        result = trainer.step(step, plan.share(step))
+        result = trainer.step(step, plan.progress(step))
         pace += (result.psnr - pace) * max(1 / (step + 1), 0.02)
         rays += result.rays
         if (step + 1) % MEAN_EVERY == 0:

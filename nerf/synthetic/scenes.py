@@ -167,7 +167,7 @@ def photograph(
     world_from_camera: Float[Tensor, "3 4"],
     samples: int,
 ) -> Float[Tensor, "height width 3"]:
-    """What a camera sees; ``camera_directions`` hold samples x samples unit bearing vectors per pixel."""
+    """What a camera sees; ``camera_directions`` hold samples x samples unit ray directions per pixel."""
     rays = rays_of_view(camera_directions.reshape(-1, 3), world_from_camera, near=0.0, far=math.inf)
     chunks = zip(*(part.split(CHUNK) for part in rays), strict=True)
     colour = torch.cat([scene.trace(Rays(*chunk)).colour for chunk in chunks])

@@ -29,10 +29,10 @@ def observed(
     if step % TIMED_EVERY != FIRST_TIMED:
         return take()
     from nerf.runtime.parallel import workers
-    from nerf.runtime.profiler import Profiler, running
+    from nerf.runtime.profiler import Profiler, profiling
 
-    stopwatch, started = Profiler(device), time.perf_counter()
-    with running(stopwatch):
+    profiler, started = Profiler(device), time.perf_counter()
+    with profiling(profiler):
         result = take()
     seconds = time.perf_counter() - started
     cores = workers() if device.type == "cpu" else 1
@@ -40,7 +40,7 @@ def observed(
     for name, amount in (amounts | {"seconds": seconds, "core_seconds": cores * seconds}).items():
         timings[name] = timings.get(name, 0) + amount
     parts = timings.setdefault("parts", {})
-    for name, spent in stopwatch.parts.items():
+    for name, spent in profiler.spans.items():
         parts[name] = [a + b for a, b in zip(parts.get(name, [0.0] * 4), (spent.seconds, *spent.work), strict=True)]
     return result
 
@@ -65,9 +65,9 @@ def parts_table(timings: dict[str, Any], rates: "Rates") -> dict[str, Any]:
     part's work takes at ``rates``; null for parts whose work is not of that kind. ``floor_share`` is of what was
     computed.
     """
-    from nerf.runtime.profiler import Work
+    from nerf.runtime.profiler import WorkCounts
 
-    spent = {name: (seconds, rates.seconds(Work(*work))) for name, (seconds, *work) in timings["parts"].items()}
+    spent = {name: (seconds, rates.seconds(WorkCounts(*work))) for name, (seconds, *work) in timings["parts"].items()}
     busy, floor = (sum(column) for column in zip(*spent.values(), strict=True))
     whole = max(timings["core_seconds"], busy)
     spent[WAITING] = (whole - busy, 0.0)

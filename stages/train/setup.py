@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from nerf.geometry.scene import Scene
     from nerf.training.hash_grid_trainer import HashGridTrainerSettings
     from nerf.training.ray_dataset import RayDataset
-    from nerf.training.trainer import FieldTrainer, VanillaTrainerSettings
+    from nerf.training.trainer import FieldTrainer
+    from nerf.training.vanilla_trainer import VanillaTrainerSettings
     from stages.train import Config
     from stages.train.loop import TrainingRun
     from stages.train.state import TrainingBudget
@@ -100,7 +101,7 @@ def field_bytes(config: "Config", workers: int) -> float:
         return (
             TABLE_COPIES * 4 * settings.features_per_level * settings.layout.rows + SAMPLE_BYTES * config.batch_samples
         )
-    from nerf.training.trainer import CHUNK_RAYS
+    from nerf.training.vanilla_trainer import CHUNK_RAYS
 
     sizes = paper_settings(config)
     assert config.batch_rays
@@ -147,7 +148,7 @@ def make_trainer(
         model = HashGridField(grid_settings(config, has_sky(config, scene)), seed, backend).to(dataset.device)
         return HashGridTrainer(model, dataset, grid_trainer_settings(config, scene, seed), effects)
     from nerf.fields.vanilla import VanillaNerf
-    from nerf.training.trainer import VanillaTrainer
+    from nerf.training.vanilla_trainer import VanillaTrainer
 
     published = VanillaNerf(paper_settings(config), seed).to(dataset.device)
     return VanillaTrainer(published, dataset, paper_trainer_settings(config, scene, seed), effects)
@@ -241,7 +242,7 @@ def paper_settings(config: "Config") -> "VanillaSettings":
 
 def paper_trainer_settings(config: "Config", scene: "Scene", seed: int) -> "VanillaTrainerSettings":
     """How the paper field is trained."""
-    from nerf.training.trainer import VanillaTrainerSettings
+    from nerf.training.vanilla_trainer import VanillaTrainerSettings
 
     assert config.batch_rays is not None and config.learning_rate is not None, "plan() chooses them"
     rates = (config.learning_rate, config.learning_rate * LR_FINAL_FRACTION)

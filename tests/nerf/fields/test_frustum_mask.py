@@ -37,7 +37,7 @@ def dataset(count: int = 4, half: float = HALF) -> RayDataset:
     """Photos from 2.5 units away, a fifth of the circle apart, that all look at the origin."""
     grid = 2 * half * ((torch.arange(SIZE) + 0.5) / SIZE - 0.5)
     y, x = torch.meshgrid(grid, grid, indexing="ij")
-    bearings = torch.nn.functional.normalize(torch.stack([x, y, torch.ones_like(x)], -1), dim=-1)
+    ray_directions = torch.nn.functional.normalize(torch.stack([x, y, torch.ones_like(x)], -1), dim=-1)
     poses = []
     for angle in torch.arange(count) * (2 * math.pi / 5):
         forward = torch.stack([-angle.cos(), -angle.sin(), torch.zeros(())])
@@ -46,7 +46,7 @@ def dataset(count: int = 4, half: float = HALF) -> RayDataset:
         poses.append(torch.cat([rotation, -2.5 * forward[:, None]], 1))
     photo = torch.randint(0, 256, (SIZE, SIZE, 3), generator=torch.Generator().manual_seed(0)).to(torch.uint8)
     near, far = torch.full((count,), NEAR), torch.full((count,), FAR)
-    return ray_dataset_from_images([photo] * count, [0] * count, [bearings], torch.stack(poses), near, far)
+    return ray_dataset_from_images([photo] * count, [0] * count, [ray_directions], torch.stack(poses), near, far)
 
 
 def knowing(views: RayDataset) -> RayDataset:

@@ -15,7 +15,8 @@ from nerf.runtime.machine_rates import Rates
 from nerf.synthetic.scenes import ring_of_cameras
 from nerf.training.hash_grid_trainer import HashGridTrainer, HashGridTrainerSettings
 from nerf.training.ray_dataset import RayDataset, ray_dataset_from_images
-from nerf.training.trainer import StepResult, VanillaTrainer, VanillaTrainerSettings
+from nerf.training.trainer import StepResult
+from nerf.training.vanilla_trainer import VanillaTrainer, VanillaTrainerSettings
 from stages.hardware.backend import load_backend
 from stages.io.files import read_json
 from stages.report.profile import PARTS, parts_bar

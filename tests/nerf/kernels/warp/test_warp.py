@@ -216,7 +216,7 @@ def test_adam_on_slices_leaves_their_neighbours_alone(device: str) -> None:
         assert torch.equal(one[[0, *range(40, 43), 44]], old[[0, *range(40, 43), 44]])
 
 
-# The density cache
+# The occupancy grid
 
 
 @pytest.mark.parametrize("cells", [4, 32])
