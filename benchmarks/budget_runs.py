@@ -21,7 +21,7 @@ import torch
 
 from nerf.fields.hash_grid import HashGridField
 from nerf.geometry.scene import Scene
-from nerf.training import hash_grid_trainer as grid_training
+from nerf.training import hash_grid_trainer
 from nerf.training.hash_grid_trainer import HashGridTrainer
 from nerf.training.ray_dataset import RayDataset
 from nerf.training.schedule import schedule_of
@@ -143,7 +143,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, nargs="+", default=BUDGETS)
     parser.add_argument("--schedule", choices=SCHEDULES, default="whole")
     parser.add_argument(
-        "--constant", type=float, default=grid_training.LR_HOLD_FRACTION, help="share before the rate falls"
+        "--constant", type=float, default=hash_grid_trainer.LR_HOLD_FRACTION, help="share before the rate falls"
     )
     given = parser.parse_args()
     runs = json.loads(given.runs.read_text()) if given.runs.exists() else []
@@ -151,7 +151,7 @@ def main() -> None:
         bench = None
         for seed, steps in product(given.seeds, given.steps):
             run = {"set": workspace.stem, "seed": seed, "steps": steps, "schedule": given.schedule}
-            run["constant"] = grid_training.LR_HOLD_FRACTION = given.constant
+            run["constant"] = hash_grid_trainer.LR_HOLD_FRACTION = given.constant
             if any(run.items() <= made.items() for made in runs):
                 continue
             bench = bench or bench_of(workspace)

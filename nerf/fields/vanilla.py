@@ -27,7 +27,7 @@ from nerf.geometry.rays import Rays, clip_to_box, points_on
 from nerf.rendering.sampling import Spacing, midpoint_edges, sample_pdf, stratified
 from nerf.rendering.volume_rendering import composite, volume_weights
 from nerf.runtime.profiler import WorkCounts, span
-from nerf.runtime.randomness import generator as seeded_generator
+from nerf.runtime.randomness import generator
 
 BOX = 0.95  # between the region of interest, 0.9, and half the encoding's period, 1
 CONTRACTED_SCALE = 0.45  # takes the contracted cube of half size 2 to 0.9
@@ -161,8 +161,8 @@ class VanillaNerf(nn.Module):
     def __init__(self, settings: VanillaSettings, seed: int) -> None:
         super().__init__()
         self.settings = settings
-        self.coarse = VanillaMlp(settings, seeded_generator("cpu", seed, 0)) if settings.hierarchical else None
-        self.fine = VanillaMlp(settings, seeded_generator("cpu", seed, 1))
+        self.coarse = VanillaMlp(settings, generator("cpu", seed, 0)) if settings.hierarchical else None
+        self.fine = VanillaMlp(settings, generator("cpu", seed, 1))
 
     def density(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points"]:
         """Density per scene unit; zero outside the cube to which an uncontracted field is cut."""

@@ -395,7 +395,7 @@ class Runner:
             return None
 
     def _execute(self, job: Job) -> Manifest:
-        from stages.sfm.colmap import load
+        import stages.sfm.colmap  # noqa: F401 -- pycolmap changes how signals are handled: before ours are set
 
         partial, folder = self.workspace.partial(job.stage, job.key), self.workspace.folder(job.stage, job.key)
         if job.stage not in self.force and (manifest := self.workspace.complete(partial, folder, job.key)):
@@ -407,7 +407,6 @@ class Runner:
         partial.mkdir(parents=True, exist_ok=True)
         write_elapsed(partial / ATTEMPTS, before)
         self.workspace.write_run(self.run_file)
-        load()  # which changes how signals are handled; once it is over, they are ours again
         started = datetime.now(UTC)
         self.running = job.stage
         with counting(self.workspace.root / RUNNING), counting(partial / ATTEMPTS) as spent:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field
 
+from stages.amounts import duration, short_count
 from stages.contract import (
     Flexible,
     Inputs,
@@ -22,9 +23,8 @@ from stages.contract import (
     Workload,
 )
 from stages.evaluate.image_metrics import ERROR_SCALE, FEWEST_FOR_INTERVAL, error_map, mean_interval, ssim
-from stages.io.amounts import duration, short_count
 from stages.io.files import read_json, read_scene, write_json, write_png
-from stages.render.spread import spread
+from stages.io.photos import spread
 from stages.train import trained_seconds
 from stages.train.setup import BLACK, WHITE
 

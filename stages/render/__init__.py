@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import Field, field_validator
 
+from stages.amounts import duration, short_count
 from stages.contract import (
     Flexible,
     Inputs,
@@ -18,11 +19,10 @@ from stages.contract import (
     StageResult,
     Workload,
 )
-from stages.io.amounts import duration, short_count
 from stages.io.files import read_json, read_scene, write_json, write_png
+from stages.io.photos import spread
 from stages.render.path import CameraPath, PathKind, fitted_path, path_from_file, path_rays, usual_path
 from stages.render.plan import LEAST_WIDTH, even_width
-from stages.render.spread import spread
 from stages.train import trained_seconds
 
 if TYPE_CHECKING:

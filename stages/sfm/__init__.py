@@ -15,6 +15,7 @@ from stages.contract import (
     Workload,
 )
 from stages.io.files import write_json
+from stages.sfm.pairs import Matcher
 
 INPUTS = ("ingest",)
 VERSION = 15
@@ -29,7 +30,6 @@ NOT_HASHED = ("max_seconds", "seconds")
 CameraModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE"]
 Direction = Literal["world-from-camera", "camera-from-world"]
 CameraAxes = Literal["opencv", "opengl"]
-Matcher = Literal["exhaustive", "sequential", "spatial", "retrieval"]
 MAX_STRATEGIES = 8  # the default of ``max_strategies``, which is all of them
 BUDGET_SHARE = 0.5  # of a budget: what it may take before it extracts fewer features
 

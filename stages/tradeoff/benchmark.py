@@ -28,9 +28,9 @@ from stages.contract import Inputs, Progress, StageError
 from stages.effects.decisions import expected_gains
 from stages.evaluate.image_metrics import ssim
 from stages.io.files import read_json, sync_file, write_json_durably, write_png
+from stages.io.photos import spread
 from stages.io.stopwatch import periodically
 from stages.render.renderer import TIMED_SECONDS, load_painter
-from stages.render.spread import spread
 from stages.tradeoff.schedule import SCORING_STRIDE, SMALL_SIDE, WORKSPACE_FIELD, Run, scoring_stride
 from stages.train.data import ALL_MASKED, PhotoReader, scaled_size, view_mask, view_rays
 from stages.train.setup import BLACK, WHITE

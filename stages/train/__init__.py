@@ -6,9 +6,16 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import Field, model_validator
 from tyro.conf import Suppress, arg
 
-from stages.contract import Flexible, Inputs, Progress, StageConfig, StageResult, Workload
+from stages.amounts import short_count
+from stages.contract import (
+    Flexible,
+    Inputs,
+    Progress,
+    StageConfig,
+    StageResult,
+    Workload,
+)
 from stages.effects.decisions import Space, read_decisions
-from stages.io.amounts import short_count
 from stages.io.files import read_scene
 from stages.io.photos import read_photos
 

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stages.io.amounts import duration, duration_option
+from stages.amounts import duration, duration_option
 from stages.io.files import write_json
 
 if TYPE_CHECKING:

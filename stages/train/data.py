@@ -43,7 +43,7 @@ def camera_directions(camera: "Camera", downscale: float) -> "Tensor":
     return torch.from_numpy(camera_rays(camera, *scaled_size(camera, downscale)))
 
 
-def patch_bearings(camera: "Camera", downscale: float) -> "Tensor":
+def patch_directions(camera: "Camera", downscale: float) -> "Tensor":
     """Bearing vectors (rows, columns, 3) of a camera in the middles of the patches that stand for its pixels in a ray
     dataset, MOST_PATCHES along the longer side or one per pixel."""
     import torch
@@ -64,8 +64,8 @@ def training_dataset(
     import torch
 
     from nerf.training.ray_dataset import PosedViews, make_ray_dataset
-    from stages.io.photos import loaders
     from stages.io.pixel_store import fill
+    from stages.io.pixels import loaders
 
     views, store = scene.of_split(split), _store(ingest, scene, split, downscale)
     at_once = cache(lambda: loaders(ingest / view.file for view in views))  # opens every file
@@ -74,7 +74,7 @@ def training_dataset(
 
     def directions(index: int) -> "Tensor":
         progress.update(f"rays of camera {index + 1} of {len(used)}", index / len(used))
-        return patch_bearings(scene.cameras[used[index]], downscale)
+        return patch_directions(scene.cameras[used[index]], downscale)
 
     dataset = make_ray_dataset(
         pixels=store.table(progress),
@@ -142,7 +142,7 @@ def view_mask(ingest: Path, scene: "Scene", view: "View", downscale: float) -> "
     """Which pixels of a view are to be used, (H, W) bool; None: all of them."""
     import torch
 
-    from stages.ingest.masks import load_mask
+    from stages.io.pixels import load_mask
 
     if view.mask is None:
         return None
@@ -200,7 +200,7 @@ def _decoded_pixels(ingest: Path, scene: "Scene", view: "View", downscale: float
     """The photo of a view as uint8: (H, W, 4) in a scene with alpha, else (H, W, 3) as it is below its alpha."""
     import numpy as np
 
-    from stages.io.photos import load_pixels
+    from stages.io.pixels import load_pixels
 
     pixels = load_pixels(ingest / view.file, *scaled_size(scene.cameras[view.camera], downscale))
     if scene.has_alpha and pixels.shape[2] == 3:  # a photo without transparent parts covers every pixel

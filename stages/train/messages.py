@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from stages.io.amounts import short_count
+from stages.amounts import short_count
 
 if TYPE_CHECKING:
     from nerf.training.schedule import StepSchedule

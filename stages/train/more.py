@@ -8,8 +8,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from stages.amounts import duration
 from stages.contract import KEY_LENGTH, Inputs, StageError
-from stages.io.amounts import duration
 from stages.io.files import read_json
 
 if TYPE_CHECKING:

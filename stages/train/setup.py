@@ -5,9 +5,9 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from stages.amounts import short_count
 from stages.contract import Inputs, Progress
 from stages.hardware.device import compute_device
-from stages.io.amounts import short_count
 
 if TYPE_CHECKING:
     from nerf.effects import ImageEffects

@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from statistics import median
 from typing import TYPE_CHECKING
 
+from stages.amounts import bytes_in_words, short_count
 from stages.contract import Progress
 from stages.effects.decisions import image_effects
 from stages.hardware.device import compute_device, cores
 from stages.hardware.memory import available_on
-from stages.io.amounts import bytes_in_words, short_count
 from stages.train.setup import field_bytes, make_trainer
 
 if TYPE_CHECKING:

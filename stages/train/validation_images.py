@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from stages.contract import Progress, StageError
 from stages.evaluate.image_metrics import ssim
-from stages.render.spread import spread
+from stages.io.photos import spread
 
 if TYPE_CHECKING:
     from torch import Tensor

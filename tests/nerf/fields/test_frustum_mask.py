@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import torch
 
-from nerf.fields import frustum_mask as visibility
+from nerf.fields import frustum_mask
 from nerf.fields.frustum_mask import compute_frustum_mask
 from nerf.fields.hash_grid import HashGridField, HashGridSettings
 from nerf.geometry.contraction import uncontract
@@ -94,7 +94,7 @@ def test_photos_that_look_together_find_what_each_finds_after_the_other(monkeypa
     try:
         for count, together in ((1, 1), (2, 2), (2, 16)):
             torch.set_num_threads(count)
-            monkeypatch.setattr(visibility, "TOGETHER", together)
+            monkeypatch.setattr(frustum_mask, "TOGETHER", together)
             found.append(compute_frustum_mask(dataset(5, 0.15), 3, 64))
     finally:
         torch.set_num_threads(threads)
@@ -109,8 +109,8 @@ def test_all_trainers_of_a_bank_ask_once(monkeypatch: pytest.MonkeyPatch) -> Non
         asked.append(given[-1])
         return own(*given)
 
-    own = visibility._looked_at
-    monkeypatch.setattr(visibility, "_looked_at", looked_at)
+    own = frustum_mask._looked_at
+    monkeypatch.setattr(frustum_mask, "_looked_at", looked_at)
     views = knowing(dataset())
     fields = [HashGridField(FIELD, seed, reference) for seed in (0, 1)]
     for field in fields:

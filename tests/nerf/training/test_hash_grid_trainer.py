@@ -217,7 +217,7 @@ def test_a_state_of_equal_shapes_but_other_settings_is_refused() -> None:
         trainer().load_state(other.state())
 
 
-def test_a_density_cache_of_an_unbounded_scene_has_finite_steps_everywhere() -> None:
+def test_an_occupancy_grid_of_an_unbounded_scene_has_finite_steps_everywhere() -> None:
     model = HashGridField(replace(FIELD, contracted=True), 0, reference)
     cache = HashGridTrainer(model, small_dataset(), TRAINER).occupancy_grid
     cache.update(15, torch.Generator().manual_seed(1))

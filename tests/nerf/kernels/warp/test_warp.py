@@ -15,7 +15,7 @@ from torch import Tensor
 
 from nerf.kernels import Backend, grid_layout, warp
 from nerf.kernels import torch as reference
-from nerf.kernels.warp import occupancy as cache
+from nerf.kernels.warp import occupancy
 from nerf.kernels.warp.launch import launch
 from tests.devices import skip_without
 from tests.nerf.kernels.agreement import (
@@ -297,7 +297,7 @@ def test_no_rays_and_no_samples_are_fine_even_at_first(device: str, rays: int) -
     on_a_new_thread(everything)
 
 
-KERNEL: Any = cache._raise
+KERNEL: Any = occupancy._raise
 GOOD = torch.zeros(8, 3)
 
 
