@@ -231,7 +231,6 @@ def runs_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Go:
         monkeypatch.setattr("pipeline.engine.runner.STAGES", chain(machine))
         monkeypatch.setattr("pipeline.engine.runner.time", clock)
         monkeypatch.setattr("stages.io.stopwatch.time", clock)
-        monkeypatch.setattr("stages.sfm.colmap.load", lambda: None)
         monkeypatch.setattr("stages.io.stopwatch.periodically", machine.periodically)
         monkeypatch.setattr("stages.io.stopwatch.write_durably", machine.write_durably)
         settings = Options.model_validate({"ingest": {"photos": photos}} | options)
