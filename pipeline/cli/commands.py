@@ -15,7 +15,7 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from pipeline.cli import arguments as words_of
+from pipeline.cli import arguments
 from pipeline.cli.display import Unread, choose_display, open_closed_streams
 from pipeline.cli.durations import seconds_from
 from pipeline.cli.more import with_more
@@ -67,7 +67,7 @@ def main() -> None:
 def run_command(words: Sequence[str]) -> int:
     """Run one command line and return its exit code; errors are said on the way."""
     if not words or words[0] in ("-h", "--help"):
-        print(words_of.overview(list(stage_list.STAGES)))
+        print(arguments.overview(list(stage_list.STAGES)))
         return 0 if words else EXIT_USAGE
     if words[0] == "--version":
         print(machine.versions(("pipeline-nerf",))["pipeline-nerf"])
@@ -135,21 +135,21 @@ def _command(name: str) -> Callable[[Sequence[str]], int]:
 
 def command_run(words: Sequence[str]) -> int:
     """``pipeline run PHOTOS``: the whole chain, or a part of it."""
-    given = words_of.parse(words_of.RunArguments, "run", words)
+    given = arguments.parse(arguments.RunArguments, "run", words)
     if given.more is not None and given.config is not None:
         what = f"--more goes on with the recorded options, not with those of --config {given.config}"
         raise UsageError(f"{what}; leave --config out, and give what is to change as flags")
     file = {} if given.config is None else read_toml(given.config)
     if given.config is not None:  # the file's values become the defaults that flags override
         from_file = settings_from(file, f"--config {given.config}")
-        given = words_of.parse(words_of.RunArguments, "run", words, from_file)
+        given = arguments.parse(arguments.RunArguments, "run", words, from_file)
     root, cameras = given.output or default_workspace(given.photos), given.cameras
     check_workspace(root, given.photos)
     if given.output is None:
         check_same_photos(Workspace(root), given.photos)
     if given.more is not None:
         recorded = _recorded_settings(Workspace.existing(root))
-        given = words_of.parse(words_of.RunArguments, "run", words, recorded)
+        given = arguments.parse(arguments.RunArguments, "run", words, recorded)
         cameras = cameras or recorded.ingest.cameras
     asked = _matching_exposure(with_effects(_more(given, root), given.effect), given.match_exposure)
     asked = _keeping_studies(asked, root, words, file)
@@ -197,7 +197,7 @@ def _budget(text: str | None, settings: Settings) -> float | None:
     return None if text is None else seconds_from(text)
 
 
-def _more(given: words_of.RunArguments | words_of.StageArguments, root: Path) -> Settings:
+def _more(given: arguments.RunArguments | arguments.StageArguments, root: Path) -> Settings:
     """The settings given, with ``--more``."""
     return given.settings if given.more is None else with_more(given.settings, Workspace.existing(root), given.more)
 
@@ -219,7 +219,7 @@ def _run_stages(
     root: Path,
     settings: Settings,
     stages: Sequence[str],
-    common: words_of.Common,
+    common: arguments.Common,
     display: Display,
     force: frozenset[str] = frozenset(),
     alone: str | None = None,
@@ -265,10 +265,10 @@ def _closing_words(workspace: Workspace, ran: bool) -> str:
 
 def command_stage(stage: str, words: Sequence[str]) -> int:
     """``pipeline STAGE WORKSPACE``: bring one stage, what it needs, and the report if there is one, up to date."""
-    given = words_of.parse(words_of.StageArguments, stage, words)
+    given = arguments.parse(arguments.StageArguments, stage, words)
     workspace = Workspace.existing(given.workspace)
     recorded = _recorded_settings(workspace)
-    given = words_of.parse(words_of.StageArguments, stage, words, recorded)
+    given = arguments.parse(arguments.StageArguments, stage, words, recorded)
     for flag in ("cameras", "match_exposure"):
         if getattr(given, flag) is not None and stage != "render":
             option = flag.replace("_", "-")
@@ -311,7 +311,7 @@ def _recorded_settings(workspace: Workspace) -> Settings:
 
 def command_resume(words: Sequence[str]) -> int:
     """``pipeline resume WORKSPACE``: repeat the recorded run."""
-    given = words_of.parse(words_of.ResumeArguments, "resume", words)
+    given = arguments.parse(arguments.ResumeArguments, "resume", words)
     workspace = Workspace.existing(given.workspace)
     stages = workspace.read_run().stages or stage_list.usual()
     with choose_display(given.common.json) as display:
@@ -325,7 +325,7 @@ def _reader(root: Path) -> tuple[Workspace, Runner]:
 
 def command_status(words: Sequence[str]) -> int:
     """``pipeline status WORKSPACE``."""
-    given = words_of.parse(words_of.StatusArguments, "status", words)
+    given = arguments.parse(arguments.StatusArguments, "status", words)
     statuses = status.all_statuses(*_reader(given.workspace), given.verify)
     code = EXIT_DEFECT if given.verify and any(s.state == "damaged" for s in statuses) else 0
     if given.json:
@@ -338,7 +338,7 @@ def command_status(words: Sequence[str]) -> int:
 
 def command_explain(words: Sequence[str]) -> int:
     """``pipeline explain STAGE WORKSPACE``."""
-    given = words_of.parse(words_of.ExplainArguments, "explain", words)
+    given = arguments.parse(arguments.ExplainArguments, "explain", words)
     stage = _known_stage(given.stage, "explain")
     print("\n".join(status.explain(*_reader(given.workspace), stage)))
     return 0
@@ -346,7 +346,7 @@ def command_explain(words: Sequence[str]) -> int:
 
 def command_clean(words: Sequence[str]) -> int:
     """``pipeline clean WORKSPACE``: remove results that the recorded options do not use."""
-    given = words_of.parse(words_of.CleanArguments, "clean", words)
+    given = arguments.parse(arguments.CleanArguments, "clean", words)
     with Workspace.existing(given.workspace) as workspace:
         stale = workspace.stale_folders(workspace.read_run().keys, list(stage_list.STAGES))
         freed = sum(p.stat().st_size for folder in stale for p in folder.rglob("*") if p.is_file())
@@ -360,7 +360,7 @@ def command_clean(words: Sequence[str]) -> int:
 
 def command_doctor(words: Sequence[str]) -> int:
     """``pipeline doctor``: versions, device, threads, free disk, a numerical self-test."""
-    given = words_of.parse(words_of.DoctorArguments, "doctor", words)
+    given = arguments.parse(arguments.DoctorArguments, "doctor", words)
     from pipeline.doctor import examine
 
     return examine(Path(os.curdir), given.selftest, given.bench)
@@ -370,9 +370,9 @@ def command_demo(words: Sequence[str]) -> int:
     """``pipeline demo``: photograph a synthetic scene, run everything, compare with the truth."""
     from pipeline import demo
 
-    given = words_of.parse(words_of.DemoArguments, "demo", words)
+    given = arguments.parse(arguments.DemoArguments, "demo", words)
     if given.budget is None:
-        given = words_of.parse(words_of.DemoArguments, "demo", words, demo.default_settings())
+        given = arguments.parse(arguments.DemoArguments, "demo", words, demo.default_settings())
     budget = _budget(given.budget, given.settings)
     asked = with_effects(given.settings, given.effect)
     photos, root = given.output / "photos", given.output / "demo.nerf"

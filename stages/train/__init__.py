@@ -261,7 +261,9 @@ def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
     preset = config.preset or "standard"
     seconds = SECONDS[preset] if config.steps is None and config.seconds is None else config.seconds
     config = config.model_copy(update={"field": config.kind, "preset": preset, "seconds": seconds})
-    config = _filled(config, {"contracted": decisions.unbounded, "view_dependence": decisions.view_dependence})
+    config = _filled(
+        config, {"contracted": "background" in decisions.on, "view_dependence": "view_dependence" in decisions.on}
+    )
     config = with_habits(config)
     if config.kind == "grid":
         from stages.hardware.backend import chosen_backend, load_backend
