@@ -31,7 +31,7 @@ PARTS = {"steps_timed": 19, "seconds": 5.0, "core_seconds": 10.0, "floor_share":
     "rays": 19_456,
     "samples": 243_200,
     "densities": 583_680,
-    "rates": {"products": 80_123_456_789, "rows": 150_000_000, "bytes": 19_000_000_000},
+    "rates": {"matmul_flops": 80_123_456_789, "gathered_rows": 150_000_000, "streamed_bytes": 19_000_000_000},
     "parts": [
         {"part": "backward", "seconds": 5.0, "share": 0.5, "floor": 3.5},
         {"part": "mlp", "seconds": 3.0, "share": 0.3, "floor": 1.9},

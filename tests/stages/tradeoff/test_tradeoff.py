@@ -126,7 +126,7 @@ def test_a_study_is_of_the_space_that_the_scene_lies_in(
 ) -> None:
     speeds = {name: Speed(*speed) for name, speed in SPEEDS.items()}
     monkeypatch.setattr(study, "measure_speeds", lambda *_: speeds)
-    write_decisions(tmp_path, Decisions(unbounded=unbounded))
+    write_decisions(tmp_path, Decisions({"background": {}} if unbounded else {}))
     planned = tradeoff.plan(Config(seconds=60.0), photos | {"effects": tmp_path}, progress)
     assert {planned.space} == {run.space for run in study.schedule_of(planned).runs} == {space}
     assert planned.crops and 6 <= planned.crops <= 32
