@@ -87,7 +87,7 @@ def main() -> None:
     given = parser.parse_args()
     record = Record(given.out)
     workspace = Workspace.existing(given.workspace)
-    keys = workspace.read_run()["keys"]
+    keys = workspace.read_run().keys
     folders = {stage: workspace.folder(stage, keys[stage]) for stage in ("ingest", "normalise", "train")}
     painter = load_painter(folders["train"])
     for downscale in given.downscales:
