@@ -5,19 +5,19 @@ import os
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel, ValidationError
 
 from pipeline.engine.settings import Settings
 from pipeline.engine.workspace import RUN_FILE, Workspace, default_workspace, is_result, lasting, photo_set
 from stages.contract import bounded
-from stages.effects import Config as EffectsConfig
+from stages.effects.effect_list import EFFECTS
 
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
 
-MOST_WRONG, MOST_LETTERS = 10, 100  # options in one error, and letters of a name or value in it
+MAX_WRONG, MAX_LETTERS = 10, 100  # options in one error, and letters of a name or value in it
 WORDS_ALONE = {("ingest", "photos"): "PHOTOS", ("ingest", "cameras"): "--cameras", ("sfm", "cameras"): "--cameras"}
 
 
@@ -50,9 +50,9 @@ def settings_from(values: Mapping[str, Any], origin: str) -> Settings:
 
 def wrong_options(error: ValidationError, *parents: str) -> str:
     """Every wrong option below ``parents`` with what it must be: ``train.steps 0 must be at least 1; …``."""
-    wrong = [_wrong_option(bounded(".".join([*parents, *map(str, e["loc"])]), MOST_LETTERS), e) for e in error.errors()]
-    more = f"; and {len(wrong) - MOST_WRONG} more" if len(wrong) > MOST_WRONG else ""
-    return "; ".join(wrong[:MOST_WRONG]) + more
+    wrong = [_wrong_option(bounded(".".join([*parents, *map(str, e["loc"])]), MAX_LETTERS), e) for e in error.errors()]
+    more = f"; and {len(wrong) - MAX_WRONG} more" if len(wrong) > MAX_WRONG else ""
+    return "; ".join(wrong[:MAX_WRONG]) + more
 
 
 def _wrong_option(name: str, problem: "ErrorDetails") -> str:
@@ -64,25 +64,25 @@ def _wrong_option(name: str, problem: "ErrorDetails") -> str:
     must = problem["msg"].removeprefix("Input should ")
     for long, short in (("greater than or equal to", "at least"), ("less than or equal to", "at most")):
         must = must.replace(long, short)
-    return f"{name} {bounded(str(problem['input']), MOST_LETTERS)} must {must}"
+    return f"{name} {bounded(str(problem['input']), MAX_LETTERS)} must {must}"
 
 
 def with_effects(settings: Settings, choices: Sequence[str]) -> Settings:
-    """The settings of all stages with each ``NAME=on|off|auto`` as the option NAME of stage effects; the last one wins.
+    """The settings of all stages with each effect of ``NAME=on|off|auto`` forced, or not any more; the last one wins.
 
     Raises UsageError for another name or value, with those that there are.
     """
-    fields = EffectsConfig.model_fields.items()
-    names = [name for name, field in fields if {"on", "off", "auto"} <= set(get_args(field.annotation))]
-    chosen = {}
+    names = [effect.name for effect in EFFECTS]
+    force: dict[str, Any] = dict(settings.effects.force)
     for choice in choices:
         name, _, value = choice.partition("=")
         if name.replace("-", "_") not in names:
             raise UsageError(f"--effect {choice}: no effect {name!r}; there are: {', '.join(names)}")
         if value not in ("on", "off", "auto"):
             raise UsageError(f"--effect {choice}: {name} can be on, off or auto, as in --effect {name}=on")
-        chosen[name.replace("-", "_")] = value
-    return settings.model_copy(update={"effects": settings.effects.model_copy(update=chosen)})
+        force[name.replace("-", "_")] = value
+    force = {name: value for name, value in force.items() if value != "auto"}
+    return settings.model_copy(update={"effects": settings.effects.model_copy(update={"force": force})})
 
 
 def with_source(settings: Settings, photos: Path, cameras: Path | None) -> Settings:
@@ -147,7 +147,7 @@ def check_same_photos(workspace: Workspace, photos: Path) -> None:
     its results would make way for those of PHOTOS. Where the old one is gone, it was moved or renamed."""
     from stages.ingest.sources import is_gone
 
-    recorded = workspace.read_run()["options"].get("ingest", {}).get("photos")
+    recorded = workspace.read_run().options.get("ingest", {}).get("photos")
     if not isinstance(recorded, str) or is_gone(Path(recorded)) or is_gone(photos):
         return
     before, now = photo_set(Path(recorded)), photo_set(photos)

@@ -7,7 +7,14 @@ from pydantic import Field, model_validator
 from tyro.conf import Suppress, arg
 
 from stages.amounts import short_count
-from stages.contract import Inputs, Progress, StageConfig, StageResult
+from stages.contract import (
+    Flexible,
+    Inputs,
+    Progress,
+    StageConfig,
+    StageResult,
+    Workload,
+)
 from stages.effects.decisions import Space, read_decisions
 from stages.io.files import read_scene
 from stages.io.photos import read_photos
@@ -18,9 +25,25 @@ if TYPE_CHECKING:
 
 INPUTS = ("ingest", "normalise", "effects")
 VERSION = 24
+EXIT_CODE = 14
 RESUMES = True
 PUBLISHED = ("curve.json",)
 NOT_HASHED = ("checkpoint_seconds", "tensorboard")
+
+# Its own seconds count steps alone. Beside reading the photos, timing the first steps takes about STARTING_SECONDS,
+# validation and checkpoints 1.5 to 2 % (fox, fountain_p11 and sceaux_castle, three minutes each).
+STARTING_SECONDS, OVERHEAD = 4.0, 0.02
+
+
+def step_seconds(wall: float, reading: float) -> float:
+    """Seconds of training steps in a stage that takes ``wall`` seconds in all, at least half of these, and ``reading``
+    of them to read the photos."""
+    return max(wall / 2, (wall - STARTING_SECONDS - reading) / (1 + OVERHEAD))
+
+
+# A user waits for the field, so it gets most of what is left; figures, a video and a mesh are there to see it by. A
+# training of less than half a minute is worth none.
+FLEXIBLE = Flexible(share=0.68, min_seconds=30.0, max_share=1.0, reads_photos=True, work=step_seconds)
 
 # Of training, where neither seconds nor steps are given.
 SECONDS = {"draft": 30.0, "standard": 180.0, "high": 900.0, "paper": 3600.0}
@@ -175,6 +198,21 @@ class Config(StageConfig):
         return self
 
     @property
+    def time_is_open(self) -> bool:
+        """Whether neither seconds nor steps are given, nor those of ``--more``."""
+        return self.seconds is None and self.steps is None and self.after is None
+
+    @property
+    def exempt_from_budget(self) -> bool:
+        """A training that goes on (``--more``) has a time of its own."""
+        return self.after is not None
+
+    @property
+    def planned_seconds(self) -> float | None:
+        """Of a training from the beginning: those asked for, or the preset's; None where it counts steps."""
+        return None if self.steps is not None else self.seconds or SECONDS[self.preset or "standard"]
+
+    @property
     def kind(self) -> Literal["grid", "paper"]:
         """The field that these options ask for."""
         return self.field or ("paper" if self.preset == "paper" or self._given(PAPER_ONLY) else "grid")
@@ -188,6 +226,24 @@ class Config(StageConfig):
         """Which of these options differ from their defaults, with their values."""
         values = {name: getattr(self, name) for name in names}
         return [f"{n} ({value})" for n, value in values.items() if value != type(self).model_fields[n].default]
+
+
+def expected_seconds(config: Config, workload: Workload) -> float | None:
+    """The seconds of steps and what comes beside them; None where it counts steps, which nobody has timed yet."""
+    seconds = config.planned_seconds if config.after is None else config.more_seconds
+    return None if seconds is None else seconds + STARTING_SECONDS + workload.photos.reading_seconds(workload.cores)
+
+
+def trained_seconds(workload: Workload) -> float | None:
+    """Seconds of training steps behind the field that the later stages will meet, by which they give themselves time:
+    those of the finished training, or those to come. None where nobody can tell."""
+    if finished := workload.facts("train", None):
+        return finished["train_seconds"]
+    config: Config = workload.options["train"]
+    if config.after is None:
+        return config.planned_seconds
+    before = workload.facts("train", config.after)  # without it the stage says why it cannot go on
+    return before["train_seconds"] + config.more_seconds if before and config.more_seconds else None
 
 
 def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
@@ -205,7 +261,9 @@ def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:
     preset = config.preset or "standard"
     seconds = SECONDS[preset] if config.steps is None and config.seconds is None else config.seconds
     config = config.model_copy(update={"field": config.kind, "preset": preset, "seconds": seconds})
-    config = _filled(config, {"contracted": decisions.unbounded, "view_dependence": decisions.view_dependence})
+    config = _filled(
+        config, {"contracted": "background" in decisions.on, "view_dependence": "view_dependence" in decisions.on}
+    )
     config = with_habits(config)
     if config.kind == "grid":
         from stages.hardware.backend import chosen_backend, load_backend

@@ -8,7 +8,7 @@ import pytest
 from nerf.synthetic.scenes import ring_of_cameras
 from stages.ingest.sources import find_source
 from stages.sfm.imported.llff import read_llff
-from stages.sfm.imported.pose_files import read_known_cameras
+from stages.sfm.imported.pose_files import read_poses
 from tests.refusals import refused
 from tests.stages.sfm.imported.test_pose_files import H, W, photo
 
@@ -28,7 +28,7 @@ def rows_of(poses: np.ndarray, scale: float = 1.0) -> np.ndarray:
 @pytest.mark.parametrize("scale", [1.0, 4.0])
 def test_poses_and_focal_length_are_read(tmp_path: Path, scale: float) -> None:
     np.save(tmp_path / "poses_bounds.npy", rows_of(POSES, scale))
-    known = read_known_cameras(tmp_path / "poses_bounds.npy", PHOTOS, ROWS)
+    known = read_poses(tmp_path / "poses_bounds.npy", PHOTOS, ROWS)
     for image, pose in zip(known.model.images, POSES, strict=True):
         np.testing.assert_allclose(image.sfm_from_camera, pose, atol=1e-9)
     assert [camera.params for camera in known.model.cameras] == [(50, 50, W / 2, H / 2)]
@@ -46,7 +46,7 @@ def test_rows_belong_to_photos_in_order_of_their_names(tmp_path: Path) -> None:
 def test_a_row_too_few_is_refused(tmp_path: Path) -> None:
     np.save(tmp_path / "poses_bounds.npy", rows_of(POSES[:2]))
     with refused("sfm.llff-count"):
-        read_known_cameras(tmp_path / "poses_bounds.npy", PHOTOS, ROWS)
+        read_poses(tmp_path / "poses_bounds.npy", PHOTOS, ROWS)
 
 
 @pytest.mark.parametrize("content", ["text", "shape", "pickle", "nan", "size"])
@@ -60,7 +60,7 @@ def test_what_is_no_such_file_is_refused(tmp_path: Path, content: str) -> None:
         rows[1, {"nan": 3, "size": 4}.get(content, 0)] = {"nan": np.nan, "size": 40.5}.get(content, 1.0)
         np.save(path, rows[:, :15] if content == "shape" else rows)
     with refused("sfm.llff-unreadable"):
-        read_known_cameras(path, PHOTOS, ROWS)
+        read_poses(path, PHOTOS, ROWS)
 
 
 def test_the_fern_of_llff(shared_data: Path) -> None:
