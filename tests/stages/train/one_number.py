@@ -39,10 +39,10 @@ class OneNumber:
     def model(self) -> "OneNumber":
         return self
 
-    def step(self, step: int, share: float, lr_scale: float) -> StepResult:
+    def step(self, step: int, progress: float, lr_scale: float) -> StepResult:
         self.trouble(step, lr_scale)
-        self.history.append((step, share, lr_scale))
-        self.value = self.value * 0.9 + lr_scale * (1 - share) * torch.sin(torch.tensor(float(step)))
+        self.history.append((step, progress, lr_scale))
+        self.value = self.value * 0.9 + lr_scale * (1 - progress) * torch.sin(torch.tensor(float(step)))
         return StepResult(float(self.value), 20.0, rays=4, samples=12, densities=20)
 
     def state(self) -> dict[str, Tensor]:

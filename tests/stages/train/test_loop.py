@@ -177,7 +177,7 @@ def test_more_steps_begin_where_the_finished_run_ended_at_the_longer_run_s_rates
     before = {path: path.read_bytes() for path in first.rglob("*") if path.is_file()}
     longer = run_in(tmp_path / "more", progress, TrainingBudget(20, None, first))
     longer.train()
-    assert [(step, share) for step, share, _ in number_of(longer).history] == [
+    assert [(step, progress) for step, progress, _ in number_of(longer).history] == [
         (step, pytest.approx(step / 60)) for step in range(40, 60)
     ]
     assert (longer.state.step, longer.state.rays, longer.state.steps_before) == (60, 240, 40)
@@ -217,9 +217,9 @@ class Rising(OneNumber):
     def __init__(self) -> None:
         super().__init__(0, quiet)
 
-    def step(self, step: int, share: float, lr_scale: float) -> StepResult:
-        result = super().step(step, share, lr_scale)
-        db = 20 + math.log2((step + 1) / 500) + self.annealing * share
+    def step(self, step: int, progress: float, lr_scale: float) -> StepResult:
+        result = super().step(step, progress, lr_scale)
+        db = 20 + math.log2((step + 1) / 500) + self.annealing * progress
         self.shown = probe().colours + 10 ** (-db / 20)
         return result
 
@@ -270,10 +270,10 @@ def more_towards(folder: Path, progress, target: float, first: Path, make=Rising
 
 def test_a_target_that_was_reached_does_not_end_more_steps(tmp_path: Path, progress) -> None:
     class Mortal(Rising):
-        def step(self, step: int, share: float, lr_scale: float) -> StepResult:
+        def step(self, step: int, progress: float, lr_scale: float) -> StepResult:
             if step == 500:
                 raise Killed
-            return super().step(step, share, lr_scale)
+            return super().step(step, progress, lr_scale)
 
     first = towards(tmp_path / "first", progress, 20.0)
     with pytest.raises(Killed):
@@ -297,10 +297,10 @@ def test_more_steps_towards_a_higher_target_anneal_as_if_none_had_been(tmp_path:
 @pytest.mark.parametrize("at", [70, 225, 250])
 def test_a_run_to_a_target_in_two_pieces_is_the_same(at: int, tmp_path: Path, progress) -> None:
     class Mortal(Rising):
-        def step(self, step: int, share: float, lr_scale: float) -> StepResult:
+        def step(self, step: int, progress: float, lr_scale: float) -> StepResult:
             if step == at:
                 raise Killed
-            return super().step(step, share, lr_scale)
+            return super().step(step, progress, lr_scale)
 
     whole = towards(tmp_path / "whole", progress, 20.0)
     with pytest.raises(Killed):

@@ -29,7 +29,7 @@ TURNS = list(_right_handed())
 @pytest.fixture(scope="module")
 def ring() -> tuple[PairMatches, np.ndarray]:
     """A ring of cameras around points that all of them see, and their poses."""
-    random, poses = np.random.default_rng(0), np.stack(ring_of_cameras(PHOTOS))[:, :3]
+    random, poses = np.random.default_rng(0), ring_of_cameras(PHOTOS)[:, :3]
     points = random.uniform(-0.3, 0.3, (60, 3))
     rays = np.einsum("pji,pkj->pki", poses[:, :, :3], points[None] - poses[:, None, :, 3])
     rays = rays / rays[..., 2:] + np.pad(random.normal(0, 0.4 / FOCAL_PX, (PHOTOS, 60, 2)), ((0, 0), (0, 0), (0, 1)))

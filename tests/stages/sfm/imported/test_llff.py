@@ -12,7 +12,7 @@ from stages.sfm.imported.pose_files import read_poses
 from tests.refusals import refused
 from tests.stages.sfm.imported.test_pose_files import H, W, photo
 
-POSES = np.stack(ring_of_cameras(3))[:, :3]
+POSES = ring_of_cameras(3)[:, :3]
 PHOTOS = [photo(index) for index in range(3)]
 ROWS = {str(index): one.name for index, one in enumerate(PHOTOS)}
 
