@@ -17,6 +17,7 @@ import torch
 from benchmarks.nerfacto import pipeline, stage_folder
 from benchmarks.pixel_store import Spoken
 from nerf.geometry.scene import Scene
+from nerf.runtime.machine_rates import measure_rates
 from nerf.runtime.matmul_precision import products_at
 from nerf.training.ray_dataset import RayBank
 from nerf.training.trainer import FieldTrainer
@@ -25,8 +26,8 @@ from stages.hardware.device import compute_device, cores
 from stages.io.files import read_scene
 from stages.train import Config, plan
 from stages.train.data import guided_bank
-from stages.train.profile import FIRST_TIMED, observed, parts_table, rates_for
-from stages.train.setup import make_trainer
+from stages.train.fields import field_of, make_trainer
+from stages.train.profile import FIRST_TIMED, RATES_SECONDS, observed, parts_table
 
 LINKED = {"ingest": "photos.json", "normalise": "scene.json", "effects": "effects.json"}
 WARM_STEPS, TIMED_STEPS = 300, 60
@@ -53,7 +54,9 @@ def main() -> None:
             trainer.step(step, SHARE, 1.0)
         for step in range(WARM_STEPS, WARM_STEPS + TIMED_STEPS):
             observed(partial(trainer.step, step, SHARE, 1.0), FIRST_TIMED, timings, device)
-        report(parts_table(timings, rates_for(trainer.model, device)))
+        field = field_of(config)
+        rates = measure_rates(device, field.matmul_width(config), field.table_rows(config), RATES_SECONDS)
+        report(parts_table(timings, rates))
 
 
 def prepared(workspace: Path, asked: Config) -> tuple[Config, FieldTrainer]:

@@ -9,7 +9,7 @@ if TYPE_CHECKING:
 
 SECONDS = 0.3  # for each rate
 TABLES = {"2¹⁷": 1 << 17, "2²⁰": 1 << 20}  # rows: of one grid, of all of a large field
-# Of a ray while the grid field trains: densities asked for, beside the colours of stages/train/size.py. Over a run
+# Of a ray while the grid field trains: densities asked for, beside the colours of stages/train/hash_grid.py. Over a run
 # lego_400, fox, banana and fountain_p11 ask for 2.3 to 2.9 for each colour (docs/numbers.md).
 DENSITIES = {"bounded": 7, "contracted": 24}
 WHERE = {"bounded": "around an object", "contracted": "in unbounded space"}
@@ -49,7 +49,7 @@ def _meaning(products: dict[int, float], reads: float, copied: float, count: int
     from nerf.runtime.machine_rates import Rates
     from nerf.runtime.profiler import Work
     from stages.io.amounts import short_count
-    from stages.train.size import SAMPLES_PER_RAY
+    from stages.train.hash_grid import SAMPLES_PER_RAY
 
     lines = ["at these rates, with nothing else to do and no core waiting, training would reach"]
     for space, densities in DENSITIES.items():
@@ -72,13 +72,12 @@ def grid_work(contracted: bool, densities: float) -> "Work":
     from nerf.runtime.profiler import Work
     from nerf.training.hash_grid_trainer import ADAM_BYTES
     from stages.hardware.device import compute_device
-    from stages.train import Config, with_habits
-    from stages.train.setup import grid_settings
-    from stages.train.size import SAMPLES_PER_RAY, rays_per_step, timed_settings
+    from stages.train.config import Config
+    from stages.train.hash_grid import SAMPLES_PER_RAY, field_settings, rays_per_step, timed, with_defaults
 
     asked = Config(field="grid", contracted=contracted, view_dependence=True)
-    config = timed_settings(with_habits(asked), compute_device())
-    model = GridField(grid_settings(config, sky=False), 0, reference)
+    config = timed(with_defaults(asked), compute_device())
+    model = GridField(field_settings(config, sky=False), 0, reference)
     density, colour = grid_mlp.density_products(model.weights), grid_mlp.colour_products(model.weights)
     colours = SAMPLES_PER_RAY[config.space]
     rows = CORNERS * model.settings.levels * (densities + colours)

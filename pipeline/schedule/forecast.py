@@ -22,8 +22,8 @@ from pipeline.schedule.budget import (
 from stages.contract import StageError
 from stages.hardware.device import processors
 from stages.io.amounts import duration, rough_duration
-from stages.train import SECONDS
-from stages.train import Config as TrainConfig
+from stages.train.config import SECONDS
+from stages.train.config import Config as TrainConfig
 
 if TYPE_CHECKING:
     from pipeline.engine.runner import Runner

@@ -162,3 +162,8 @@ def _loading_bytes(file: Path) -> int:
 
     with pillow().open(file) as image:
         return BYTES_PER_PIXEL[len(image.getbands())] * image.width * image.height
+
+
+def evenly_spread(length: int, count: int) -> list[int]:
+    """``count`` indices in the middle of equal parts of a list of ``length``."""
+    return [(2 * i + 1) * length // (2 * count) for i in range(count)]

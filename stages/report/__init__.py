@@ -25,7 +25,6 @@ from stages.report.cameras import (
     order_tells,
     uncertainty,
 )
-from stages.train.profile import PARTS_FILE
 
 if TYPE_CHECKING:
     import numpy as np
@@ -112,7 +111,7 @@ def read_results(inputs: Inputs) -> Results:
         effects=of("effects", "effects.json"),
         field=of("train", "field.json"),
         curve=of("train", "curve.json"),
-        parts=of("train", PARTS_FILE) if "train" in inputs and (inputs["train"] / PARTS_FILE).exists() else None,
+        parts=of("train", "parts.json") if "train" in inputs and (inputs["train"] / "parts.json").exists() else None,
         metrics=of("evaluate", "metrics.json"),
         study=of("tradeoff", "tradeoff.json"),
     )

@@ -9,7 +9,6 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
 from stages.effects.decisions import Space
-from stages.train.size import GRID_SIZES
 
 LONGEST = 1 / 20
 RUNG = 1.7
@@ -176,7 +175,9 @@ def field_of(variant: str) -> Literal["grid", "paper"]:
 def grid_sizes(grids: Grids, space: Space) -> dict[str, int]:
     """Sizes of a grid field: those that stage train has on a CPU for long runs (``usual``) and for short ones, whatever
     the size of the photos, and larger still, by one grid, twice the rows and twice the cells along an axis."""
-    (_, levels, log2_rows, finest), (_, *small) = GRID_SIZES[space]
+    from stages.train.hash_grid import SIZES
+
+    (_, levels, log2_rows, finest), (_, *small) = SIZES[space]
     of = {"small": small, "usual": (levels, log2_rows, finest), "large": (levels + 1, log2_rows + 1, 2 * finest)}
     return dict(zip(("levels", "log2_rows", "finest"), of[grids], strict=True))
 

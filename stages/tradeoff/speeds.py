@@ -41,7 +41,8 @@ def measured_speeds(scene: "Scene", inputs: Inputs, seconds: float, progress: Pr
     may take longer than the whole timing. Their arithmetic beside the reduced ones' tells.
     """
     from stages.effects.decisions import read_decisions
-    from stages.train.size import rays_per_second, rays_per_step
+    from stages.train.fields import field_of
+    from stages.train.speed import rays_per_second
 
     decisions, speeds = read_decisions(inputs["effects"]), dict[str, Speed]()
     for number, name in enumerate(TIMED):
@@ -49,11 +50,11 @@ def measured_speeds(scene: "Scene", inputs: Inputs, seconds: float, progress: Pr
         config = _planned(name, decisions.space, inputs, progress)
         if VARIANTS[name].family == "published":
             rays = speeds[REDUCED].rays * _work(_planned(REDUCED, decisions.space, inputs, progress)) / _work(config)
-            if LONGEST * seconds * rays < VARIANTS[name].fewest * rays_per_step(config):
-                speeds[name] = Speed(rays / rays_per_step(config), rays)
+            if LONGEST * seconds * rays < VARIANTS[name].fewest * field_of(config).rays_per_step(config):
+                speeds[name] = Speed(rays / field_of(config).rays_per_step(config), rays)
                 continue
         rays = rays_per_second(config, scene, decisions)
-        speeds[name] = Speed(rays / rays_per_step(config), rays)
+        speeds[name] = Speed(rays / field_of(config).rays_per_step(config), rays)
     return speeds
 
 
@@ -91,7 +92,7 @@ def measured_reading(scene: "Scene", ingest: Path, windows: int) -> Reading:
 
 def study_sizes(scene: "Scene", speeds: Mapping[str, Speed], seconds: float) -> tuple[float, ...]:
     """The photo sizes of a study of ``seconds``, see :func:`photo_sizes`."""
-    from stages.train.size import chosen_downscale
+    from stages.train.planning import chosen_downscale
 
     smallest = chosen_downscale(scene, rays=1.0)  # as small as photos are ever made
     cameras = [scene.cameras[view.camera] for view in scene.of_split("train")]

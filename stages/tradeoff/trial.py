@@ -68,15 +68,15 @@ class Exam:
 def make_exam(ingest: Path, scene: "Scene", downscale: float, count: int, small: float) -> Exam:
     """``count`` windows spread over the held-out photos at 1/``downscale`` of their size, and SHOWN of these photos at
     1/``small``, large ones still smaller: of at most SMALL_SIDE pixels, which the study has time to draw."""
-    from stages.render.spread import spread
+    from stages.io.photos import evenly_spread
+    from stages.train.config import BLACK, WHITE
     from stages.train.data import scaled_size
-    from stages.train.setup import BLACK, WHITE
 
     test, background = scene.of_split("test"), WHITE if scene.has_alpha else BLACK
     whole = (_photo(ingest, scene, test[i % len(test)], downscale, background) for i in range(count))
     windows = tuple(photo.part(_place(photo, i, count)) for i, photo in enumerate(whole))
     _check_used(windows)
-    shown = [test[i] for i in spread(len(test), min(SHOWN, len(test)))]
+    shown = [test[i] for i in evenly_spread(len(test), min(SHOWN, len(test)))]
     sides = [max(camera.width, camera.height) for camera in (scene.cameras[view.camera] for view in shown)]
     sizes = [max(small, side / SMALL_SIDE) for side in sides]
     photos = tuple(_photo(ingest, scene, *each, background) for each in zip(shown, sizes, strict=True))

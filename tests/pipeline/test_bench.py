@@ -10,8 +10,7 @@ from nerf.training.hash_grid_trainer import ADAM_BYTES
 from pipeline import doctor
 from pipeline.cli import commands as cli
 from pipeline.doctor import bench
-from stages.train import PART_SAMPLES
-from stages.train.size import SAMPLES_PER_RAY
+from stages.train.hash_grid import PART_SAMPLES, SAMPLES_PER_RAY
 
 
 @pytest.fixture

@@ -16,6 +16,7 @@ from stages.contract import StageError
 from stages.ingest.masks import load_mask
 from stages.io.files import write_png, write_tensors
 from stages.io.pixel_store import PixelStore, pixel_store
+from stages.train.config import WHITE
 from stages.train.data import (
     MOST_PATCHES,
     PhotoReader,
@@ -27,7 +28,6 @@ from stages.train.data import (
     view_mask,
     view_rays,
 )
-from stages.train.setup import WHITE
 from tests.conftest import SilentProgress
 from tests.stages.photo_scene import CAMERA, FOCAL, HEIGHT, RADIUS, WIDTH, ball_photo, photographed, seen_points
 

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from stages.contract import Progress, StageError
 from stages.hardware.device import processors
 from stages.io.amounts import rough_duration
-from stages.render.spread import spread
+from stages.io.photos import evenly_spread
 from stages.sfm.process import environment
 
 if TYPE_CHECKING:
@@ -170,7 +170,7 @@ def _sample(photos: "Sequence[Photo]", cores: int) -> "list[Photo]":
 
     Neighbours in the list see much the same, those of different parts often nothing: both kinds of pairs are timed.
     """
-    first = spread(len(photos), max(FEWEST_MEASURED, cores) // 2)
+    first = evenly_spread(len(photos), max(FEWEST_MEASURED, cores) // 2)
     return [
         photos[index] for index in sorted({one for index in first for one in (index, index + 1)}) if index < len(photos)
     ]
