@@ -2,14 +2,14 @@
 
 A stage is a module of this package with
 
-* ``NEEDS: tuple[str, ...]``: the stages whose finished folders it reads;
-* optionally ``OPTIONAL: tuple[str, ...]``: stages whose finished folders it reads where they are there: they are no
-  part of its key and are not brought up to date for it, nor given to it where damaged, so no output may depend on
-  them;
+* ``INPUTS: tuple[str, ...]``: the stages whose finished folders it reads;
+* optionally ``OPTIONAL_INPUTS: tuple[str, ...]``: stages whose finished folders it reads where they are there: they
+  are no part of its key and are not brought up to date for it, nor given to it where damaged, so no output may depend
+  on them;
 * ``VERSION: int``: raised whenever the same config and inputs would give other outputs than before;
 * ``RESUMES: bool``: whether it can go on from its own half-written folder (otherwise it starts clean);
-* ``LINKS: tuple[str, ...]``: the outputs or records shown in ``<workspace>/output/``;
-* optionally ``UNKEYED: tuple[str, ...]``: options that cannot change the result and so do not enter the key;
+* ``PUBLISHED: tuple[str, ...]``: the outputs or records shown in ``<workspace>/output/``;
+* optionally ``NOT_HASHED: tuple[str, ...]``: options that cannot change the result and so do not enter the key;
 * ``Config``: its settings, a :class:`StageConfig`;
 * ``run(config, inputs, folder, progress) -> StageResult``: reads ``inputs[stage]`` (finished folders), writes
   into ``folder`` and nowhere else, raises :class:`StageError` for everything a user can act on;

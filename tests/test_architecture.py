@@ -162,7 +162,7 @@ def test_every_stage_keeps_the_contract():
         assert issubclass(module.Config, StageConfig)
         assert isinstance(module.VERSION, int)
         assert isinstance(module.RESUMES, bool)
-        assert set(module.NEEDS) <= set(seen), f"{name} needs a stage that comes after it"
+        assert set(module.INPUTS) <= set(seen), f"{name} needs a stage that comes after it"
         assert module.run.__doc__ and module.Config.__doc__ and module.__doc__
         seen.append(name)
 

@@ -82,7 +82,7 @@ def test_prose_is_wrapped(page: Path):
 def test_the_example_in_python_gives_stages_what_they_need():
     calls = calls_of_run((ROOT / "docs" / "PYTHON.md").read_text("utf-8"))
     assert len(calls) > 5
-    assert calls == [(stage, STAGES[stage].NEEDS) for stage, _ in calls]
+    assert calls == [(stage, STAGES[stage].INPUTS) for stage, _ in calls]
 
 
 def test_the_pages_are_linked():

@@ -64,7 +64,7 @@ class RunArguments:
     """The workspace (default: <photos>.nerf in the current folder)."""
     cameras: Path | None = None
     """Known cameras for these photos: a transforms.json or a COLMAP model folder."""
-    like: str | None = None
+    match_exposure: str | None = None
     """Render the video as this photo was exposed (its name; where the effect exposure is on)."""
     effect: Effects = ()
     budget: BudgetOption = None
@@ -87,7 +87,7 @@ class StageArguments:
     common: Annotated[Common, tyro.conf.arg(name="")] = field(default_factory=Common)
     cameras: Path | None = None
     """render only: a file with the cameras to render, like output/transforms.json."""
-    like: str | None = None
+    match_exposure: str | None = None
     """render only: render the video as this photo was exposed (its name)."""
     effect: Effects = ()
     budget: str | None = None

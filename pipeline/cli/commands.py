@@ -153,7 +153,7 @@ def command_run(words: Sequence[str]) -> int:
         recorded = _recorded_settings(Workspace.existing(root))
         given = words_of.parse(words_of.RunArguments, "run", words, recorded)
         cameras = cameras or recorded.ingest.cameras
-    asked = _like(with_effects(_more(given, root), given.effect), given.like)
+    asked = _matching_exposure(with_effects(_more(given, root), given.effect), given.match_exposure)
     asked = _keeping_studies(asked, root, words, file)
     stages = chain.up_to(_known_stage(given.until or list(chain.STAGES)[-1], "--until"))
     force = frozenset[str]()
@@ -203,11 +203,11 @@ def _more(given: words_of.RunArguments | words_of.StageArguments, root: Path) ->
     return given.settings if given.more is None else with_more(given.settings, Workspace.existing(root), given.more)
 
 
-def _like(settings: Settings, photo: str | None) -> Settings:
-    """The settings with ``--like PHOTO``."""
+def _matching_exposure(settings: Settings, photo: str | None) -> Settings:
+    """The settings with ``--match-exposure PHOTO``."""
     if photo is None:
         return settings
-    return settings.model_copy(update={"render": settings.render.model_copy(update={"like": photo})})
+    return settings.model_copy(update={"render": settings.render.model_copy(update={"match_exposure": photo})})
 
 
 def _known_stage(name: str, flag: str, among: Sequence[str] = tuple(chain.STAGES)) -> str:
@@ -270,12 +270,13 @@ def command_stage(stage: str, words: Sequence[str]) -> int:
     workspace = Workspace.existing(given.workspace)
     recorded = _recorded_settings(workspace)
     given = words_of.parse(words_of.StageArguments, stage, words, recorded)
-    for flag in ("cameras", "like"):
+    for flag in ("cameras", "match_exposure"):
         if getattr(given, flag) is not None and stage != "render":
-            raise UsageError(f"--{flag} belongs to `pipeline render` and `pipeline run`, not to {stage}")
+            option = flag.replace("_", "-")
+            raise UsageError(f"--{option} belongs to `pipeline render` and `pipeline run`, not to {stage}")
     if given.more is not None and stage != "train":
         raise UsageError(f"--more belongs to `pipeline train` and `pipeline run`, not to {stage}")
-    settings = _like(with_effects(_more(given, given.workspace), given.effect), given.like)
+    settings = _matching_exposure(with_effects(_more(given, given.workspace), given.effect), given.match_exposure)
     if given.budget is not None:
         settings = _study_for(settings, given.budget, stage)
     if given.cameras is not None:

@@ -117,10 +117,12 @@ def with_source(settings: Settings, photos: Path, cameras: Path | None) -> Setti
     from stages.ingest.sources import find_source
 
     source = find_source(photos, cameras)
-    names, like = [source.name(file) for file in source.files], settings.render.like
+    names, like = [source.name(file) for file in source.files], settings.render.match_exposure
     if like is not None and source.kind != "video" and like not in names:
         near = difflib.get_close_matches(like, names, n=3)
-        raise UsageError(f"--like {like}: no photo has that name" + (f"; perhaps {', '.join(near)}" if near else ""))
+        raise UsageError(
+            f"--match-exposure {like}: no photo has that name" + (f"; perhaps {', '.join(near)}" if near else "")
+        )
     if (rendered := settings.render.cameras) is not None and not rendered.is_file():
         raise UsageError(f"--render.cameras {rendered}: there is no such file")
     given = None if cameras is None else cameras.absolute()

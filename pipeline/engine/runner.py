@@ -137,7 +137,7 @@ class Runner:
             try:
                 self._upstream(stage, "output")
             except NotReady:
-                self.workspace.unlink_outputs(module.LINKS)
+                self.workspace.unlink_outputs(module.PUBLISHED)
             except StageError:  # photos or a file that a setting names cannot be read: said where that stage runs
                 continue
 
@@ -145,7 +145,7 @@ class Runner:
         """Take out of ``output/`` what rests on ``stage``, which was at work; nothing where none was."""
         for later, module in STAGES.items():
             if stage and (later == "report" or stage in needed_for(later, STAGES)):
-                self.workspace.unlink_outputs(module.LINKS)
+                self.workspace.unlink_outputs(module.PUBLISHED)
 
     def _bring_up_to_date(self, stage: str) -> bool:
         self.started[stage] = time.monotonic()
@@ -153,7 +153,7 @@ class Runner:
         try:
             with worded(stage):
                 job, manifest, ran = self._found_or_made(stage)
-                self.workspace.link_outputs(self.workspace.folder(stage, job.key), job.module.LINKS)
+                self.workspace.link_outputs(self.workspace.folder(stage, job.key), job.module.PUBLISHED)
                 self.workspace.write_run(self.state)
                 self.index.save()
         finally:
@@ -174,7 +174,7 @@ class Runner:
         except DamagedInputs:
             self._make_inputs_again(stage)
             return self._found_or_made(stage)
-        self.workspace.unlink_outputs(job.module.LINKS)
+        self.workspace.unlink_outputs(job.module.PUBLISHED)
         return job, self._execute(job), True
 
     def _check_inputs(self, stage: str, folders: dict[str, Path]) -> None:
@@ -186,7 +186,7 @@ class Runner:
         damaged = False
         for name in [name for name in folders if name not in self.checked]:
             self.display.update(f"checking the files of {name}")
-            needed = name in STAGES[stage].NEEDS
+            needed = name in STAGES[stage].INPUTS
             try:
                 if needed:
                     self.workspace.finished(name, self.done[name].key, deep=True)
@@ -207,7 +207,7 @@ class Runner:
 
     def _make_inputs_again(self, stage: str) -> None:
         """Bring everything below ``stage`` up to date once more; what lies above the damage may change with it."""
-        needed = {name for above in STAGES[stage].NEEDS if above in self.done for name in needed_for(above, STAGES)}
+        needed = {name for above in STAGES[stage].INPUTS if above in self.done for name in needed_for(above, STAGES)}
         clock = time.monotonic()
         self.done.clear()
         self.photos = None  # perhaps hours after they were listed
@@ -223,8 +223,8 @@ class Runner:
         Raises NotReady where an upstream result is missing, or where settings are left open and may not be planned.
         """
         module = STAGES[stage]
-        upstream = {name: m for name in module.NEEDS if (m := self._upstream(name, stage)) is not None}
-        beside = {name: m for name in getattr(module, "OPTIONAL", ()) if (m := self._upstream(name, "report"))}
+        upstream = {name: m for name in module.INPUTS if (m := self._upstream(name, stage)) is not None}
+        beside = {name: m for name in getattr(module, "OPTIONAL_INPUTS", ()) if (m := self._upstream(name, "report"))}
         folders = {name: self.workspace.folder(name, m.key) for name, m in (upstream | beside).items()}
         # The report shows timings and logs too, so it depends on whole manifests and not only on outputs.
         if stage == "report":
@@ -237,7 +237,7 @@ class Runner:
         return Job(stage, module, config, key_config, inputs, folders, key)
 
     def _upstream(self, name: str, stage: str) -> Manifest | None:
-        """The current result of ``name``. Only "report" does without: it takes what is there, as OPTIONAL does."""
+        """The current result of ``name``. Only "report" does without it, as with OPTIONAL_INPUTS."""
         if name not in self.done:
             try:
                 key = self.resolve(name, may_plan=False).key
@@ -246,7 +246,7 @@ class Runner:
                 if stage != "report":
                     raise NotReady(name) from None
             except StageError:  # a file that a setting names is gone: the stage says so where it runs
-                rest_on_it = any(name in module.NEEDS for later, module in STAGES.items() if later != "report")
+                rest_on_it = any(name in module.INPUTS for later, module in STAGES.items() if later != "report")
                 if stage != "report" or rest_on_it:
                     raise
         return self.done.get(name)
@@ -266,7 +266,7 @@ class Runner:
             # Taken as given now: paths, for the plan was made for equal content, wherever that lay then, and what is
             # part of no key. But seconds stay: where they are open, a budget gave the plan its own.
             now = {name for name, value in options if isinstance(value, Path)}
-            now |= {*getattr(module, "UNKEYED", ())} - {"seconds"}
+            now |= {*getattr(module, "NOT_HASHED", ())} - {"seconds"}
             return module.Config.model_validate(plans[asked] | options.model_dump(include=now))
         if not may_plan:
             raise NotReady(stage)
@@ -319,7 +319,7 @@ class Runner:
 
     def _config_for_key(self, stage: str, config: StageConfig) -> dict[str, Any]:
         replaced = {"photos": self._photos_digest()} if stage == "ingest" else {}
-        return config_for_key(config, self.index, replaced, getattr(STAGES[stage], "UNKEYED", ()))
+        return config_for_key(config, self.index, replaced, getattr(STAGES[stage], "NOT_HASHED", ()))
 
     def _photos_digest(self) -> str:
         """Digest of the photos' names and bytes; the last known one where the photos are gone but were ingested."""

@@ -43,7 +43,7 @@ def needed_for(stage: str, stages: Mapping[str, ModuleType] = STAGES) -> list[st
     wanted = {stage}
     for name in reversed(list(stages)):
         if name in wanted:
-            wanted.update(stages[name].NEEDS)
+            wanted.update(stages[name].INPUTS)
     return [name for name in stages if name in wanted]
 
 

@@ -69,7 +69,7 @@ def status_of(workspace: Workspace, runner: Runner, stage: str, deep: bool = Fal
 
 def _why_unplanned(runner: Runner, stage: str, last: Manifest) -> str:
     """Why a stage whose inputs are there has not the result it needs, while its open options are not chosen yet."""
-    inputs = {name: runner.done[name].outputs_digest for name in STAGES[stage].NEEDS}
+    inputs = {name: runner.done[name].outputs_digest for name in STAGES[stage].INPUTS}
     return "; ".join(_other_inputs(inputs, last)) or "what its options leave open is chosen anew"
 
 
@@ -84,7 +84,7 @@ def differences(job: Job, last: Manifest) -> list[str]:
     if last.version != job.module.VERSION:
         found.append(f"the stage itself changed (version {last.version} → {job.module.VERSION})")
     now: dict[str, Any] = job.config.model_dump(mode="json")
-    for name in sorted({*now, *last.config} - set(getattr(job.module, "UNKEYED", ()))):
+    for name in sorted({*now, *last.config} - set(getattr(job.module, "NOT_HASHED", ()))):
         before, after = last.config.get(name), now.get(name)
         if before != after:
             found.append(f"{job.stage}.{name}: {before} → {after}")

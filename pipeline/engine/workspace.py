@@ -79,7 +79,7 @@ class Workspace:
         try:
             self.root.mkdir(parents=True, exist_ok=True)
             _refuse_links(self.root)
-            names = [name for module in STAGES.values() for name in module.LINKS]
+            names = [name for module in STAGES.values() for name in module.PUBLISHED]
             self._adopt_copies(names)
             self._refuse_strangers(names)
             self._lock.acquire(timeout=0)

@@ -19,11 +19,11 @@ if TYPE_CHECKING:
     from nerf.geometry.scene import Scene
     from stages.effects.pilots import Pilot, PilotScene
 
-NEEDS = ("ingest", "sfm", "normalise")
+INPUTS = ("ingest", "sfm", "normalise")
 VERSION = 12
 RESUMES = False
-LINKS = ("effects.json",)
-UNKEYED = ("seconds",)  # it decides how many pilots, and that enters the key
+PUBLISHED = ("effects.json",)
+NOT_HASHED = ("seconds",)  # it decides how many pilots, and that enters the key
 
 Switch = Literal["auto", "on", "off"]
 ORDER = (

@@ -29,11 +29,11 @@ if TYPE_CHECKING:
     from stages.render.renderer import Painter
     from stages.train.data import PhotoReader
 
-NEEDS = ("ingest", "normalise", "train")
+INPUTS = ("ingest", "normalise", "train")
 VERSION = 12
 RESUMES = False
-LINKS = ("metrics.json", "renders", "errors")
-UNKEYED = ("seconds",)  # it decides how many photos, and that enters the key
+PUBLISHED = ("metrics.json", "renders", "errors")
+NOT_HASHED = ("seconds",)  # it decides how many photos, and that enters the key
 
 BACKGROUNDS = {"white": WHITE, "black": BLACK}
 RIGHT_HALVES = ("psnr_right", "psnr_fitted_right", "psnr_posed_right")

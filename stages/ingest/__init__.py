@@ -53,13 +53,13 @@ from stages.io.photos import OPAQUE_FROM, Box, Photo, Refusal, opaque_box, write
 if TYPE_CHECKING:
     import numpy as np
 
-NEEDS: tuple[str, ...] = ()
+INPUTS: tuple[str, ...] = ()
 VERSION = 11
 RESUMES = False
 NOTES = "notes.json"
-LINKS = ("photos.json", NOTES, "images", "masks", "opaque")
+PUBLISHED = ("photos.json", NOTES, "images", "masks", "opaque")
 # What it decides here, which files are photos and which frames they are, is in the digest that stands for ``photos``.
-UNKEYED = ("cameras",)
+NOT_HASHED = ("cameras",)
 
 _MAX_WORKERS = 8  # each holds a few copies of one photo, up to 250 megapixels
 _BYTES_PER_PIXEL = 24  # of a photo while it is decoded, turned, packed and looked at; 22 measured for 16 bits

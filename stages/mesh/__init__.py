@@ -35,11 +35,11 @@ if TYPE_CHECKING:
     from stages.mesh.iso_level import Level
     from stages.mesh.visibility import ShadowMap
 
-NEEDS = ("ingest", "normalise", "train")
+INPUTS = ("ingest", "normalise", "train")
 VERSION = 11
 RESUMES = False
-LINKS = ("mesh.glb", "mesh.ply", "mesh.obj")
-UNKEYED = ("seconds",)  # it decides the resolution, and that enters the key
+PUBLISHED = ("mesh.glb", "mesh.ply", "mesh.obj")
+NOT_HASHED = ("seconds",)  # it decides the resolution, and that enters the key
 
 CHUNK = 1 << 16
 LEVEL_RAYS = 1024

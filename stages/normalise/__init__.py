@@ -24,10 +24,10 @@ if TYPE_CHECKING:
     from stages.io.photos import Box, Photo
     from stages.io.sparse_model import SparseModel
 
-NEEDS = ("ingest", "sfm")
+INPUTS = ("ingest", "sfm")
 VERSION = 14
 RESUMES = False
-LINKS = ("transforms.json", "scene.json")
+PUBLISHED = ("transforms.json", "scene.json")
 
 FEWEST_TRAINING_VIEWS = 2
 FEWEST_VIEWS = 3  # one to hold out, two to train on

@@ -25,11 +25,11 @@ if TYPE_CHECKING:
     from nerf.geometry.scene import Scene
     from stages.render.renderer import Allowance, Painter
 
-NEEDS = ("normalise", "train")
-VERSION = 12
+INPUTS = ("normalise", "train")
+VERSION = 13
 RESUMES = False
-LINKS = ("video.mp4", "depth.mp4", "path.json")
-UNKEYED = ("seconds",)  # it decides how many frames and how large, and these enter the key
+PUBLISHED = ("video.mp4", "depth.mp4", "path.json")
+NOT_HASHED = ("seconds",)  # it decides how many frames and how large, and these enter the key
 
 STARTING_SECONDS = 1.0  # to load the field once more and to write what is not video
 TRIED_VIEWS = 4  # of the path, to see how fast the field draws them
@@ -60,7 +60,7 @@ class Config(StageConfig):
         description="seconds that the stage may take; none: drawing takes 30 % of the training's seconds",
     )
     depth: bool = Field(default=True, description="write depth.mp4 too")
-    like: str | None = Field(
+    match_exposure: str | None = Field(
         default=None,
         description="name of a photo to render as it was exposed, where photos differ; none: neutral",
     )
@@ -168,7 +168,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     assert config.width is not None and config.fps is not None
     scene = read_scene(inputs["normalise"])
     painter = load_painter(inputs["train"], progress=progress)
-    gain, exposure = _exposure(config.like, inputs["train"], scene, progress)
+    gain, exposure = _exposure(config.match_exposure, inputs["train"], scene, progress)
     painter = painter if gain is None else painter.at_gain(gain)
     path = _path(config, scene).resized(config.width)
     _check_memory(path)
@@ -279,7 +279,7 @@ def _path_json(path: CameraPath, scene: "Scene", fps: int) -> dict[str, Any]:
     return (intrinsics(path.cameras[0]) if shared else {}) | {"fps": fps, "frames": frames}
 
 
-def _exposure(like: str | None, train: Path, scene: "Scene", progress: Progress) -> "tuple[Tensor | None, str | None]":
+def _exposure(photo: str | None, train: Path, scene: "Scene", progress: Progress) -> "tuple[Tensor | None, str | None]":
     """The log gain (3,) of the video, None as the field comes, and this in words, None where the field has only one.
 
     Training is over when this is found out: a photo of which no exposure is known is no error, but what is taken
@@ -292,18 +292,18 @@ def _exposure(like: str | None, train: Path, scene: "Scene", progress: Progress)
     field = read_json(train / "field.json")
     neutral = neutral_in_words(field)
     if (known := field.get("exposure")) is None:
-        if like is not None:
-            progress.note(f"exposure is not modelled: all photos count as exposed alike, and the video like {like}")
+        if photo is not None:
+            progress.note(f"exposure is not modelled: all photos count as exposed alike, and the video like {photo}")
         return None, None
-    if like is None:
+    if photo is None:
         return None, neutral
-    if like in known["photos"]:
-        return torch.tensor(known["photos"][like]), f"exposed like {like}"
-    if unseen := [view for view in scene.views if view.name == like]:
-        progress.note(f"{like} was not trained on: its exposure is what the photos taken nearest by let expect")
-        return expected_gains(field, scene, unseen)[like], f"exposed as expected of {like}"
-    near = difflib.get_close_matches(like, known["photos"], n=3)
-    progress.note(f"no photo {like} has a camera: {neutral}" + (f"; perhaps {', '.join(near)}" if near else ""))
+    if photo in known["photos"]:
+        return torch.tensor(known["photos"][photo]), f"exposed like {photo}"
+    if unseen := [view for view in scene.views if view.name == photo]:
+        progress.note(f"{photo} was not trained on: its exposure is what the photos taken nearest by let expect")
+        return expected_gains(field, scene, unseen)[photo], f"exposed as expected of {photo}"
+    near = difflib.get_close_matches(photo, known["photos"], n=3)
+    progress.note(f"no photo {photo} has a camera: {neutral}" + (f"; perhaps {', '.join(near)}" if near else ""))
     return None, neutral
 
 

@@ -32,10 +32,10 @@ if TYPE_CHECKING:
 
     from nerf.geometry.scene import Scene
 
-NEEDS = ("ingest", "sfm", "normalise", "effects", "train", "evaluate", "render", "mesh", "tradeoff")
+INPUTS = ("ingest", "sfm", "normalise", "effects", "train", "evaluate", "render", "mesh", "tradeoff")
 VERSION = 8
 RESUMES = False
-LINKS = ("report.html", "summary.json")
+PUBLISHED = ("report.html", "summary.json")
 
 WIDTH_LARGE, WIDTH_SMALL = 900, 420  # pixels of a picture in the page
 THUMBNAIL_PX = 160
@@ -104,7 +104,7 @@ def read_results(inputs: Inputs) -> Results:
 
     return Results(
         inputs=inputs,
-        manifests={stage: of(stage, "manifest.json") for stage in NEEDS if stage in inputs and stage != "tradeoff"},
+        manifests={stage: of(stage, "manifest.json") for stage in INPUTS if stage in inputs and stage != "tradeoff"},
         photos=of("ingest", "photos.json"),
         registration=of("sfm", "registration.json"),
         scene=read_scene(inputs["normalise"]) if "normalise" in inputs else None,

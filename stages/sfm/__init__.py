@@ -17,14 +17,14 @@ from stages.sfm.retry_strategies import ATTEMPTS, JOURNAL, left_out_for_time, re
 if TYPE_CHECKING:
     from stages.io.photos import Photo
 
-NEEDS = ("ingest",)
+INPUTS = ("ingest",)
 VERSION = 14
 RESUMES = True
-LINKS = ("sparse", "registration.json")
+PUBLISHED = ("sparse", "registration.json")
 # Both may decide that an attempt is not made, which is said, in the stage's line as well. A run with another limit is
 # to go on from the matches that one before it kept, so its key has to be the same. How far features are searched, which
 # ``seconds`` decides as well, enters the key by options of its own.
-UNKEYED = ("max_seconds", "seconds")
+NOT_HASHED = ("max_seconds", "seconds")
 
 CameraModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE"]
 Matcher = Literal["exhaustive", "sequential", "spatial", "retrieval"]

@@ -37,11 +37,11 @@ if TYPE_CHECKING:
     from stages.tradeoff.own_field import Own
     from stages.tradeoff.trial import Exam
 
-NEEDS = ("ingest", "normalise", "effects")
-OPTIONAL = ("train",)
+INPUTS = ("ingest", "normalise", "effects")
+OPTIONAL_INPUTS = ("train",)
 VERSION = 12
 RESUMES = True
-LINKS = ("tradeoff.svg", "tradeoff.png", "tradeoff.md", "tradeoff.json", "ablation.png")
+PUBLISHED = ("tradeoff.svg", "tradeoff.png", "tradeoff.md", "tradeoff.json", "ablation.png")
 
 FEWEST_WINDOWS, MOST_WINDOWS = 6, 32
 SCORING_SHARE = 0.003  # of the study's time: for drawing all windows once, whatever the field; but the published one

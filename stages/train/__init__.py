@@ -5,11 +5,11 @@ from pathlib import Path
 from stages.contract import Inputs, Progress, StageResult
 from stages.train.config import Config
 
-NEEDS = ("ingest", "normalise", "effects")
+INPUTS = ("ingest", "normalise", "effects")
 VERSION = 23
 RESUMES = True
-LINKS = ("curve.json",)
-UNKEYED = ("checkpoint_seconds", "tensorboard")
+PUBLISHED = ("curve.json",)
+NOT_HASHED = ("checkpoint_seconds", "tensorboard")
 
 
 def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:

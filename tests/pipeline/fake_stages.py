@@ -65,14 +65,14 @@ def _run_train(config: TrainConfig, inputs: dict[str, Path], folder: Path, progr
 
 
 def _module(needs: tuple[str, ...], config: type[StageConfig], run: Any, **more: Any) -> SimpleNamespace:
-    defaults = {"VERSION": 1, "RESUMES": False, "LINKS": ()}
-    return SimpleNamespace(NEEDS=needs, Config=config, run=run, **(defaults | more))
+    defaults = {"VERSION": 1, "RESUMES": False, "PUBLISHED": ()}
+    return SimpleNamespace(INPUTS=needs, Config=config, run=run, **(defaults | more))
 
 
 STAGES = {
     "ingest": _module((), IngestConfig, _run_ingest),
-    "sfm": _module(("ingest",), SfmConfig, _run_sfm, plan=_plan_sfm, LINKS=("deep", "log.txt")),
-    "train": _module(("sfm",), TrainConfig, _run_train, RESUMES=True, LINKS=("result.json",)),
+    "sfm": _module(("ingest",), SfmConfig, _run_sfm, plan=_plan_sfm, PUBLISHED=("deep", "log.txt")),
+    "train": _module(("sfm",), TrainConfig, _run_train, RESUMES=True, PUBLISHED=("result.json",)),
 }
 
 

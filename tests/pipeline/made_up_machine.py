@@ -20,14 +20,14 @@ from stages.io.files import write_durably, write_json
 from stages.io.photos import Photo, write_photos
 
 CHAIN = ("ingest", "sfm", "normalise", "effects", "train", "evaluate", "render", "mesh", "report")
-NEEDS: dict[str, tuple[str, ...]] = {
+INPUTS: dict[str, tuple[str, ...]] = {
     "sfm": ("ingest",),
     "normalise": ("sfm",),
     "effects": ("normalise",),
     "train": ("effects",),
 }
-NEEDS |= {"evaluate": ("train",), "render": ("train",), "mesh": ("train",), "tradeoff": ("effects",)}
-NEEDS["report"] = ("train", "evaluate", "render", "mesh", "tradeoff")
+INPUTS |= {"evaluate": ("train",), "render": ("train",), "mesh": ("train",), "tradeoff": ("effects",)}
+INPUTS["report"] = ("train", "evaluate", "render", "mesh", "tradeoff")
 
 
 class Stage(StageConfig):
@@ -156,12 +156,12 @@ def chain(machine: Machine) -> dict[str, SimpleNamespace]:
         return work
 
     def stage(name: str) -> SimpleNamespace:
-        common = {"NEEDS": NEEDS.get(name, ()), "VERSION": 1, "RESUMES": name == "train", "LINKS": ()}
+        common = {"INPUTS": INPUTS.get(name, ()), "VERSION": 1, "RESUMES": name == "train", "PUBLISHED": ()}
         if name in ("ingest", "normalise", "report"):
             return SimpleNamespace(Config=Fixed, run=run(name), **common)
         unkeyed = () if name == "train" else ("seconds",)
         config = Training if name == "train" else Stage
-        return SimpleNamespace(Config=config, run=run(name), plan=plan(name), UNKEYED=unkeyed, **common)
+        return SimpleNamespace(Config=config, run=run(name), plan=plan(name), NOT_HASHED=unkeyed, **common)
 
     return {name: stage(name) for name in (*CHAIN[:-1], "tradeoff", "report")}
 

@@ -92,14 +92,17 @@ def test_a_config_file_is_validated(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert message in capsys.readouterr().err
 
 
-def test_like_is_an_option_of_render_whichever_way_it_is_spelt(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_match_exposure_is_an_option_of_render_whichever_way_it_is_spelt(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     seen: list[str | None] = []
     monkeypatch.setattr(
-        "pipeline.cli.commands._run_stages", lambda root, settings, *_, **__: seen.append(settings.render.like)
+        "pipeline.cli.commands._run_stages",
+        lambda root, settings, *_, **__: seen.append(settings.render.match_exposure),
     )
     (tmp_path / "photos").mkdir()
     Image.new("RGB", (40, 30)).save(tmp_path / "photos/a.jpg")
-    for words in (["--like", "a.jpg"], ["--render.like", "a.jpg"], []):
+    for words in (["--match-exposure", "a.jpg"], ["--render.match-exposure", "a.jpg"], []):
         run_command(["run", str(tmp_path / "photos"), *words])
     assert seen == ["a.jpg", "a.jpg", None]
 
@@ -128,20 +131,23 @@ def test_help_names_the_target_by_its_short_name(capsys: pytest.CaptureFixture[s
 
 def test_a_photo_to_render_like_has_to_be_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     Image.new("RGB", (40, 30)).save(tmp_path / "IMG_1.jpg")
-    assert run_command(["run", str(tmp_path), "-o", str(tmp_path / "w"), "--like", "IMG_1.jpeg"]) == 2
-    assert "--like IMG_1.jpeg: no photo has that name; perhaps IMG_1.jpg" in capsys.readouterr().err
+    assert run_command(["run", str(tmp_path), "-o", str(tmp_path / "w"), "--match-exposure", "IMG_1.jpeg"]) == 2
+    assert "--match-exposure IMG_1.jpeg: no photo has that name; perhaps IMG_1.jpg" in capsys.readouterr().err
     assert not (tmp_path / "w").exists()
 
 
-def test_like_belongs_to_render(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):
+def test_match_exposure_belongs_to_render(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
     seen: list[str | None] = []
     monkeypatch.setattr(
-        "pipeline.cli.commands._run_stages", lambda root, settings, *_, **__: seen.append(settings.render.like)
+        "pipeline.cli.commands._run_stages",
+        lambda root, settings, *_, **__: seen.append(settings.render.match_exposure),
     )
     (tmp_path / "run.json").write_text(json.dumps({"version": 1, "options": {}, "plans": {}, "keys": {}}))
-    assert run_command(["mesh", str(tmp_path), "--like", "a.jpg"]) == 2
-    assert "--like belongs to `pipeline render` and `pipeline run`, not to mesh" in capsys.readouterr().err
-    run_command(["render", str(tmp_path), "--like", "a.jpg"])
+    assert run_command(["mesh", str(tmp_path), "--match-exposure", "a.jpg"]) == 2
+    assert "--match-exposure belongs to `pipeline render` and `pipeline run`, not to mesh" in capsys.readouterr().err
+    run_command(["render", str(tmp_path), "--match-exposure", "a.jpg"])
     assert seen == ["a.jpg"]
 
 

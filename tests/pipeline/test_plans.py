@@ -43,7 +43,7 @@ def test_what_is_part_of_no_key_can_be_changed_after_it_was_planned(
     bring: Bring, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As a longer --sfm.max-seconds, once a shorter one was not enough."""
-    monkeypatch.setattr(fake_stages.STAGES["sfm"], "UNKEYED", ("fail",), raising=False)
+    monkeypatch.setattr(fake_stages.STAGES["sfm"], "NOT_HASHED", ("fail",), raising=False)
     with pytest.raises(StageFailed):
         bring(fail=True)
     bring(fail=False)

@@ -162,7 +162,7 @@ def test_a_kill_between_manifest_and_rename_loses_nothing(bring: Bring, tmp_path
 
 
 def test_options_that_cannot_change_the_result_do_not_run_it_again(bring: Bring, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(fake_stages.STAGES["train"], "UNKEYED", ("die_at",), raising=False)
+    monkeypatch.setattr(fake_stages.STAGES["train"], "NOT_HASHED", ("die_at",), raising=False)
     bring()
     bring(train={"die_at": 99})
     assert calls == []
@@ -173,8 +173,8 @@ def test_what_a_stage_reads_where_it_is_there_neither_runs_for_it_nor_makes_it_s
 ):
     train, seen = fake_stages.STAGES["train"], list[set[str]]()
     whole = train.run
-    monkeypatch.setattr(train, "NEEDS", ("ingest",))
-    monkeypatch.setattr(train, "OPTIONAL", ("sfm",), raising=False)
+    monkeypatch.setattr(train, "INPUTS", ("ingest",))
+    monkeypatch.setattr(train, "OPTIONAL_INPUTS", ("sfm",), raising=False)
     monkeypatch.setattr(
         train, "run", lambda config, inputs, *rest: seen.append({*inputs}) or whole(config, inputs, *rest)
     )
@@ -191,8 +191,8 @@ def test_a_damaged_input_that_is_only_read_where_it_is_there_is_left_out_and_lef
 ):
     train, seen, notes = fake_stages.STAGES["train"], list[set[str]](), list[str]()
     whole = train.run
-    monkeypatch.setattr(train, "NEEDS", ("ingest",))
-    monkeypatch.setattr(train, "OPTIONAL", ("sfm",), raising=False)
+    monkeypatch.setattr(train, "INPUTS", ("ingest",))
+    monkeypatch.setattr(train, "OPTIONAL_INPUTS", ("sfm",), raising=False)
     monkeypatch.setattr(
         train, "run", lambda config, inputs, *rest: seen.append({*inputs}) or whole(config, inputs, *rest)
     )

@@ -84,7 +84,7 @@ def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Make:
     def build(
         field: SkyField | None = None, *, tests: int = 4, speed: int = 10**9, downscale: float = 1, alpha: bool = False
     ) -> dict[str, Path]:
-        inputs = {stage: tmp_path / stage for stage in evaluate.NEEDS}
+        inputs = {stage: tmp_path / stage for stage in evaluate.INPUTS}
         for folder in inputs.values():
             folder.mkdir()
         (inputs["ingest"] / "images").mkdir()
@@ -228,7 +228,7 @@ def test_masks_count_in_the_scores_of_right_halves(make: Make, tmp_path: Path, p
 
 def make_again(folder: Path) -> dict[str, Path]:
     """The folders that were made before."""
-    return {stage: folder / stage for stage in evaluate.NEEDS}
+    return {stage: folder / stage for stage in evaluate.INPUTS}
 
 
 def test_what_masks_ignore_does_not_count(make: Make, tmp_path: Path, progress: Any):

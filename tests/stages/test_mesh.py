@@ -94,7 +94,7 @@ def run_mesh(tmp_path, progress, monkeypatch):
         monkeypatch.setattr(module, name, small)
 
     def run(model, folder="mesh", scene=None, points=NO_POINTS, learnt=None, **settings):
-        inputs = {name: tmp_path / name for name in mesh.NEEDS}
+        inputs = {name: tmp_path / name for name in mesh.INPUTS}
         for path in (*inputs.values(), tmp_path / folder):
             path.mkdir(exist_ok=True)
         write_json(inputs["normalise"] / "scene.json", (scene or scene_around()).to_json())

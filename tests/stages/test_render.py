@@ -355,7 +355,7 @@ def test_a_field_with_exposure_is_rendered_at_a_stated_one(
     inputs, progress, monkeypatch, like: str | None, level: float, words: str
 ) -> None:
     with_exposure(inputs, monkeypatch)
-    result = run(inputs, progress, frames=2, width=40, like=like, save_frames=True)
+    result = run(inputs, progress, frames=2, width=40, match_exposure=like, save_frames=True)
     assert result.facts["exposure"] == words and f" · {words} · " in result.line
     frame = np.asarray(Image.open(inputs["render"] / "frames/00000.png"))
     assert np.abs(frame[15, 20] / 255 - level).max() < 0.004
@@ -366,7 +366,7 @@ def test_a_field_without_exposure_says_nothing_of_it(inputs, progress) -> None:
     result = run(inputs, progress, frames=2, width=40)
     assert "exposure" not in result.facts and "expos" not in result.line
     progress.notes.clear()
-    assert "exposure" not in run(inputs, progress, frames=2, width=40, like="3.jpg").facts
+    assert "exposure" not in run(inputs, progress, frames=2, width=40, match_exposure="3.jpg").facts
     assert progress.notes == ["exposure is not modelled: all photos count as exposed alike, and the video like 3.jpg"]
 
 
@@ -381,7 +381,7 @@ def test_a_photo_without_exposure_of_its_own_is_no_error_after_the_training(
     inputs, progress, monkeypatch, like: str, level: float, exposure: str, note: str
 ) -> None:
     with_exposure(inputs, monkeypatch)
-    result = run(inputs, progress, frames=2, width=40, like=like, save_frames=True)
+    result = run(inputs, progress, frames=2, width=40, match_exposure=like, save_frames=True)
     assert result.facts["exposure"] == exposure and progress.notes[-1].startswith(note)
     frame = np.asarray(Image.open(inputs["render"] / "frames/00000.png"))
     assert np.abs(frame[15, 20] / 255 - level).max() < 0.004
