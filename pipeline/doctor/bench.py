@@ -9,8 +9,8 @@ if TYPE_CHECKING:
 
 SECONDS = 0.3  # for each rate
 TABLES = {"2¹⁷": 1 << 17, "2²⁰": 1 << 20}  # rows: of one grid, of all of a large field
-# Of a ray while the grid field trains: densities asked for, beside the colours of stages/train/hash_grid.py. Over a run
-# lego_400, fox, banana and fountain_p11 ask for 2.3 to 2.9 for each colour (docs/numbers.md).
+# Of a ray while the grid field trains: densities asked for, beside the colours of stages/train/fields/hash_grid.py. Over
+# a run lego_400, fox, banana and fountain_p11 ask for 2.3 to 2.9 for each colour (docs/numbers.md).
 DENSITIES = {"bounded": 7, "contracted": 24}
 WHERE = {"bounded": "around an object", "contracted": "in unbounded space"}
 PAPER_RAYS = {"paper field as published": (8, 256, 64, 128), "paper field 4 × 64": (4, 64, 32, 32)}
@@ -49,7 +49,7 @@ def _meaning(products: dict[int, float], reads: float, copied: float, count: int
     from nerf.runtime.machine_rates import Rates
     from nerf.runtime.profiler import Work
     from stages.io.amounts import short_count
-    from stages.train.hash_grid import SAMPLES_PER_RAY
+    from stages.train.fields.hash_grid import SAMPLES_PER_RAY
 
     lines = ["at these rates, with nothing else to do and no core waiting, training would reach"]
     for space, densities in DENSITIES.items():
@@ -73,7 +73,7 @@ def grid_work(contracted: bool, densities: float) -> "Work":
     from nerf.training.hash_grid_trainer import ADAM_BYTES
     from stages.hardware.device import compute_device
     from stages.train.config import Config
-    from stages.train.hash_grid import SAMPLES_PER_RAY, field_settings, rays_per_step, timed, with_defaults
+    from stages.train.fields.hash_grid import SAMPLES_PER_RAY, field_settings, rays_per_step, timed, with_defaults
 
     asked = Config(field="grid", contracted=contracted, view_dependence=True)
     config = timed(with_defaults(asked), compute_device())

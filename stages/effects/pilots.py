@@ -115,7 +115,7 @@ def expected_seconds(scene: "Scene", steps: int) -> tuple[float, float]:
     """What a pilot takes here: its trainings, by a few steps of a fresh field, and what goes on beside them; and what a
     pilot takes that fits poses, too."""
     from stages.hardware.device import compute_device, cores
-    from stages.train.speed import seconds_per_step
+    from stages.train.planning import seconds_per_step
 
     arm, device = Decisions(unbounded=not scene.has_alpha), compute_device()
     per_step = seconds_per_step(_config(arm, steps, device), scene, arm, device)

@@ -175,7 +175,7 @@ def field_of(variant: str) -> Literal["grid", "paper"]:
 def grid_sizes(grids: Grids, space: Space) -> dict[str, int]:
     """Sizes of a grid field: those that stage train has on a CPU for long runs (``usual``) and for short ones, whatever
     the size of the photos, and larger still, by one grid, twice the rows and twice the cells along an axis."""
-    from stages.train.hash_grid import SIZES
+    from stages.train.fields.hash_grid import SIZES
 
     (_, levels, log2_rows, finest), (_, *small) = SIZES[space]
     of = {"small": small, "usual": (levels, log2_rows, finest), "large": (levels + 1, log2_rows + 1, 2 * finest)}

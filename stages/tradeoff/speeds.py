@@ -42,7 +42,7 @@ def measured_speeds(scene: "Scene", inputs: Inputs, seconds: float, progress: Pr
     """
     from stages.effects.decisions import read_decisions
     from stages.train.fields import field_of
-    from stages.train.speed import rays_per_second
+    from stages.train.planning import rays_per_second
 
     decisions, speeds = read_decisions(inputs["effects"]), dict[str, Speed]()
     for number, name in enumerate(TIMED):

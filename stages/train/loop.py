@@ -31,10 +31,9 @@ from stages.io.files import read_json, write_durably
 from stages.io.live_line import live_line
 from stages.train.checkpoints import Checkpoint, latest_checkpoint, save_checkpoint
 from stages.train.health_check import Lost, is_suspicious, not_finite, symptom_of
-from stages.train.log import TrainingLog
 from stages.train.more import cannot_go_on
 from stages.train.profile import observed
-from stages.train.state import Pace, Probes, RunState, TrainingBudget, checkpoint_interval, lost_seconds
+from stages.train.state import Pace, Probes, RunState, TrainingBudget, TrainingLog, checkpoint_interval, lost_seconds
 from stages.train.validation_images import Target, load_metrics, look
 
 MOST_ROLLBACKS = 3

@@ -1,30 +1,35 @@
 """What the options of training leave open: field, budget, kernels, and sizes as large as the budget can make use of."""
 
 import math
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING
 
+import torch
+
+from nerf.runtime.matmul_precision import products_at
+from nerf.training.ray_dataset import RayBank, build_ray_bank
 from stages.contract import Inputs, Progress
-from stages.effects.decisions import Decisions, read_decisions
+from stages.effects.decisions import Decisions, photo_parts, read_decisions
 from stages.hardware.device import compute_device
 from stages.hardware.memory import available_on
 from stages.io.amounts import bytes_in_words, duration, short_count
 from stages.io.files import read_json, read_scene
 from stages.io.photos import read_photos
 from stages.train.config import SECONDS, Config
-from stages.train.data import MIN_LONG_SIDE
-from stages.train.fields import field_of
+from stages.train.data import MIN_LONG_SIDE, camera_directions
+from stages.train.fields import field_of, make_trainer
 from stages.train.more import continued, earlier_training
 from stages.train.precision import chosen_precision
-from stages.train.speed import rays_per_second
 
 if TYPE_CHECKING:
     from nerf.geometry.scene import Scene
 
 MAX_PIXELS = 400e6  # of many photos, which are held in memory: 1.2 GB
 MAX_PHOTOS = 48  # of 240 photos of one scene, 0.2 rays a pixel are best (docs/numbers.md)
+TIMED_SECONDS = 1.0
 MAX_MEMORY_SHARE = 0.5  # of what is free on a GPU: what the pixels may take of it
 MIN_NAMED_GAIN = 0.2  # of the photos' width: what larger photos have to have before they are worth a word
 
@@ -79,6 +84,37 @@ def rays_in_budget(config: Config, scene: "Scene", decisions: Decisions) -> floa
         return config.steps * field_of(config).rays_per_step(config)
     assert config.seconds is not None, "one of the two is given"
     return config.seconds * rays_per_second(config, scene, decisions)
+
+
+def rays_per_second(config: Config, scene: "Scene", decisions: Decisions) -> float:
+    """Measured training speed."""
+    device = compute_device()
+    config = field_of(config).timed(config, device)
+    return field_of(config).rays_per_step(config) / seconds_per_step(config, scene, decisions, device)
+
+
+def seconds_per_step(config: Config, scene: "Scene", decisions: Decisions, device: str) -> float:
+    """Measured: steps of a fresh field of known sizes, with its effects, on a grey picture, for about a second."""
+    bank = _grey_bank(scene).to(device)
+    parts = photo_parts(decisions, scene.of_split("train")[:1], bank)
+    trainer = make_trainer(config, scene, bank, seed=0, photo_parts=parts)
+    with products_at(config.matmul):
+        trainer.step(0, 0.0, 1.0)  # the first step pays for memory and kernels
+        started, steps = time.perf_counter(), 0
+        while steps == 0 or time.perf_counter() - started < TIMED_SECONDS:
+            steps += 1
+            trainer.step(steps, 0.0, 1.0)
+        return (time.perf_counter() - started) / steps
+
+
+def _grey_bank(scene: "Scene") -> RayBank:
+    """The rays of the first training view, of a picture that is grey all over."""
+    view = scene.of_split("train")[0]
+    camera = scene.cameras[view.camera]
+    directions = camera_directions(camera, max(1.0, max(camera.width, camera.height) / MIN_LONG_SIDE))
+    grey = torch.full((*directions.shape[:2], 3), 128, dtype=torch.uint8)
+    pose = torch.tensor(view.scene_from_camera, dtype=torch.float32)
+    return build_ray_bank([grey], [0], [directions], pose[None], torch.tensor([view.near]), torch.tensor([view.far]))
 
 
 def chosen_downscale(

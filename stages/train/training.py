@@ -28,12 +28,11 @@ from stages.train.curve import (
 )
 from stages.train.data import field_background, guided_bank
 from stages.train.fields import field_of, make_trainer
-from stages.train.log import TrainingLog
 from stages.train.loop import TrainingRun
 from stages.train.more import budget_of, earlier_seconds
 from stages.train.precision import precision_facts, say_if_inexact
 from stages.train.profile import write_parts
-from stages.train.state import Probes, TrainingBudget
+from stages.train.state import Probes, TrainingBudget, TrainingLog
 from stages.train.validation_images import PROBE_RAYS, PROBE_SEED, Target, unseen_photos, with_validation
 
 

@@ -30,8 +30,8 @@ from stages.tradeoff.runs import (
     wanted,
 )
 from stages.train import Config
-from stages.train.hash_grid import SIZES as GRID_SIZES
-from stages.train.vanilla import SIZES as PAPER_SIZES
+from stages.train.fields.hash_grid import SIZES as GRID_SIZES
+from stages.train.fields.vanilla import SIZES as PAPER_SIZES
 
 FAST = {name: Speed(100.0, 1e6) for name in TIMED}
 SIZES = (1.0, 2.0, 4.0, 8.0)

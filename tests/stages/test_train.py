@@ -18,7 +18,7 @@ from stages.io.files import read_json
 from stages.io.photos import Photo, write_photos
 from stages.train import Config
 from stages.train.config import GRID_ONLY, PAPER_ONLY
-from stages.train.hash_grid import LEARNING_RATES
+from stages.train.fields.hash_grid import LEARNING_RATES
 from stages.train.training import prepare
 from stages.train.validation_images import unseen_photos, with_validation
 from tests.stages.photo_scene import HEIGHT, WIDTH, photographed
@@ -226,7 +226,7 @@ def test_every_option_is_shared_or_of_one_field() -> None:
 def test_plan_answers_everything_for_the_grid_field(
     bounded: bool, tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("stages.train.speed.TIMED_SECONDS", 0.01)
+    monkeypatch.setattr("stages.train.planning.TIMED_SECONDS", 0.01)
     inputs, _ = photographed(tmp_path, bounded=bounded)
     planned = train.plan(Config(), inputs, progress)
     assert (planned.field, planned.seconds, planned.contracted) == ("grid", 180, not bounded)
@@ -261,7 +261,7 @@ def test_what_masks_ignore_does_not_count_for_the_size_of_the_photos(
 def test_plan_answers_everything_for_the_paper_field(
     tmp_path: Path, progress: Progress, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("stages.train.speed.TIMED_SECONDS", 0.01)
+    monkeypatch.setattr("stages.train.planning.TIMED_SECONDS", 0.01)
     inputs, _ = photographed(tmp_path)
     planned = train.plan(Config(batch_rays=8), inputs, progress)
     assert (planned.field, planned.background, planned.levels) == ("paper", "white", None)

@@ -18,7 +18,7 @@ from stages.io.files import write_png, write_tensors
 from stages.io.pixel_store import PixelStore, pixel_store
 from stages.train.config import WHITE
 from stages.train.data import (
-    MOST_PATCHES,
+    MAX_PATCHES,
     PhotoReader,
     camera_directions,
     guided_bank,
@@ -184,7 +184,7 @@ def test_patches_bend_no_ray(lens: str, limit_px: float) -> None:
     camera, downscale = LENSES[lens], 4.0
     width, height = scaled_size(camera, downscale)
     bearings = patch_bearings(camera, downscale)
-    assert max(bearings.shape[:2]) == MOST_PATCHES < width
+    assert max(bearings.shape[:2]) == MAX_PATCHES < width
     placed = Placement(torch.eye(3, 4)[None], torch.ones(1), torch.ones(1))
     bank = ray_bank(torch.zeros(width * height, 3, dtype=torch.uint8), [(height, width)], [0], [bearings], placed)
     found = bank.lookup(torch.arange(width * height))[0].directions

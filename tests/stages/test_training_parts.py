@@ -21,7 +21,7 @@ from stages.io.files import read_json
 from stages.report.profile import PARTS, parts_bar
 from stages.train import Config
 from stages.train.fields import field_of
-from stages.train.hash_grid import field_settings
+from stages.train.fields.hash_grid import field_settings
 from stages.train.profile import FIRST_TIMED, RATES_SECONDS, TIMED_EVERY, observed, parts_table, write_parts
 from tests.small_scenes import pinhole_directions
 

@@ -13,7 +13,7 @@ from stages.effects.decisions import Decisions
 from stages.train import Config
 from stages.train.data import MIN_LONG_SIDE, has_background_model, scaled_size
 from stages.train.fields import with_defaults
-from stages.train.hash_grid import (
+from stages.train.fields.hash_grid import (
     LARGE_STEP_LEARNING_RATE,
     MAX_STEP_SAMPLES,
     PART_SAMPLES,
@@ -21,8 +21,7 @@ from stages.train.hash_grid import (
     memory_bytes,
     with_sizes,
 )
-from stages.train.planning import MAX_PHOTOS, MAX_PIXELS, chosen_downscale, rays_in_budget
-from stages.train.speed import rays_per_second
+from stages.train.planning import MAX_PHOTOS, MAX_PIXELS, chosen_downscale, rays_in_budget, rays_per_second, reason
 from tests.stages.photo_scene import photographed
 
 
@@ -112,7 +111,7 @@ PAPER = Config(
 
 @pytest.mark.parametrize("config", [GRID, PAPER], ids=["grid", "paper"])
 def test_the_speed_is_measured_on_this_machine(config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("stages.train.speed.TIMED_SECONDS", 0.05)
+    monkeypatch.setattr("stages.train.planning.TIMED_SECONDS", 0.05)
     _, scene = photographed(tmp_path, channels=4)
     assert 10 < rays_per_second(config, scene, Decisions()) < 1e7
 
@@ -157,8 +156,8 @@ def test_a_gpu_has_larger_fields_and_takes_larger_steps(
     config = Config(field="grid", contracted=folded, view_dependence=True, downscale=1.0, chunks=2)
     large = of_size(scene, 4000, 3000)
     on_cpu = sizes_of(with_defaults(config), large, 1e9), with_defaults(config)
-    monkeypatch.setattr("stages.train.hash_grid.compute_device", lambda: "cuda")
-    monkeypatch.setattr("stages.train.hash_grid.available_on", {"cuda": 80e9}.get)
+    monkeypatch.setattr("stages.train.fields.hash_grid.compute_device", lambda: "cuda")
+    monkeypatch.setattr("stages.train.fields.hash_grid.available_on", {"cuda": 80e9}.get)
     on_gpu = sizes_of(with_defaults(config), large, 1e9), with_defaults(config)
     assert on_gpu[0] == {"levels": 8, "log2_rows": 20, "finest": most}
     assert on_gpu[0]["finest"] > on_cpu[0]["finest"] and on_gpu[0]["log2_rows"] > on_cpu[0]["log2_rows"]
@@ -211,8 +210,8 @@ def test_a_sky_is_where_space_has_no_end_and_no_alpha_tells(scene: Scene, contra
 
 
 def test_the_reason_for_sizes_is_the_budget() -> None:
-    reason = "100 steps draw about 1.0 M rays and compute 3.0 M colours: sizes left open are chosen for that"
-    assert reason(GRID, 1e6) == reason
+    said = "100 steps draw about 1.0 M rays and compute 3.0 M colours: sizes left open are chosen for that"
+    assert reason(GRID, 1e6) == said
     assert reason(PAPER, 950) == "10 s on this machine draw about 950 rays: sizes left open are chosen for that"
 
 
@@ -236,7 +235,7 @@ NEEDED = memory_bytes(FOLDED.model_copy(update=LARGEST), 1)
 def test_grids_take_half_of_the_free_memory_at_most(
     scene: Scene, free: float, own: dict[str, int], chosen: dict[str, int], monkeypatch: pytest.MonkeyPatch, progress
 ) -> None:
-    monkeypatch.setattr("stages.train.hash_grid.available_on", {"cpu": free}.get)
+    monkeypatch.setattr("stages.train.fields.hash_grid.available_on", {"cpu": free}.get)
     config = FOLDED.model_copy(update=own)
     assert sizes_of(config, of_size(scene, 4000, 3000), 1e9, progress) == chosen | own
     said = "5 grids of up to 2^{log2_rows} rows: 6 grids of up to 2^18 rows, which the budget could fill, take "

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Protocol
 from nerf.effects import AS_GIVEN, AS_RENDERED, PhotoColours, PhotoRays
 from nerf.training.trainer import FieldTrainer
 from stages.contract import Progress
-from stages.train import hash_grid, vanilla
 from stages.train.config import Config
+from stages.train.fields import hash_grid, vanilla
 
 if TYPE_CHECKING:
     from nerf.geometry.scene import Scene
