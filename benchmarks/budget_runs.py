@@ -19,11 +19,11 @@ from typing import Any, NamedTuple
 
 import torch
 
-from nerf.fields.hash_grid import GridField
+from nerf.fields.hash_grid import HashGridField
 from nerf.geometry.scene import Scene
 from nerf.training import hash_grid_trainer as grid_training
-from nerf.training.hash_grid_trainer import GridTrainer
-from nerf.training.ray_dataset import RayBank
+from nerf.training.hash_grid_trainer import HashGridTrainer
+from nerf.training.ray_dataset import RayDataset
 from nerf.training.schedule import plan_of
 from nerf.training.trainer import FieldTrainer
 from nerf.training.validation_probe import Probe, make_probe, measure
@@ -63,7 +63,7 @@ class Bench(NamedTuple):
     config: Config
     scene: Scene
     decisions: Decisions
-    bank: RayBank
+    bank: RayDataset
     probe: Probe
     neighbours: torch.Tensor
 
@@ -98,9 +98,9 @@ class RunningMean:
 
     def __init__(self, trainer: FieldTrainer, exponent: float) -> None:
         model = trainer.model
-        assert isinstance(model, GridField)
+        assert isinstance(model, HashGridField)
         self.of, self.exponent = model, exponent
-        self.model = GridField(model.settings, 0, model.backend)
+        self.model = HashGridField(model.settings, 0, model.backend)
 
     def add(self, step: int) -> None:
         new = 1 - max(0.0, 1 - MEAN_EVERY / step) ** (self.exponent + 1)
@@ -115,7 +115,7 @@ def train_run(bench: Bench, seed: int, steps: int, schedule: str) -> dict[str, A
     """One run, measured at geometric steps."""
     parts = photo_parts(bench.decisions, bench.scene.of_split("train"), bench.bank)
     trainer = make_trainer(bench.config, bench.scene, bench.bank, seed, parts)
-    assert isinstance(trainer, GridTrainer)
+    assert isinstance(trainer, HashGridTrainer)
     means = {name: RunningMean(trainer, exponent) for name, exponent in MEANS.items()}
     due = {round(steps / 2 ** (k / PER_DOUBLING)) for k in range(PER_DOUBLING * int(math.log2(steps / FIRST)) + 1)}
     plan = plan_of(steps) if schedule == "whole" else plan_of(steps // 2).extended(steps)
@@ -143,7 +143,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, nargs="+", default=BUDGETS)
     parser.add_argument("--schedule", choices=SCHEDULES, default="whole")
     parser.add_argument(
-        "--constant", type=float, default=grid_training.CONSTANT_SHARE, help="share before the rate falls"
+        "--constant", type=float, default=grid_training.LR_HOLD_FRACTION, help="share before the rate falls"
     )
     given = parser.parse_args()
     runs = json.loads(given.runs.read_text()) if given.runs.exists() else []
@@ -151,7 +151,7 @@ def main() -> None:
         bench = None
         for seed, steps in product(given.seeds, given.steps):
             run = {"set": workspace.stem, "seed": seed, "steps": steps, "schedule": given.schedule}
-            run["constant"] = grid_training.CONSTANT_SHARE = given.constant
+            run["constant"] = grid_training.LR_HOLD_FRACTION = given.constant
             if any(run.items() <= made.items() for made in runs):
                 continue
             bench = bench or bench_of(workspace)

@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from benchmarks.record import Record, add_out
 from pipeline.cli.durations import seconds_from
 
 SETS = ("fox", "fountain_p11", "fern", "banana", "demo")
@@ -31,24 +32,30 @@ def main() -> None:
     options.add_argument("--sets", nargs="+", default=SETS)
     options.add_argument("--budgets", nargs="+", default=BUDGETS)
     options.add_argument("--burner", action="store_true", help="every run a second time, beside a CPU burner")
+    add_out(options)
     given = options.parse_args()
-    print("| set | budget | beside | spent (s) | off (%) | train (s) | width trained at | dB at one size |")
-    print("|---|---|---|---|---|---|---|---|")
+    record = Record(given.out)
     for name in given.sets:
         for budget in given.budgets:
             for burning in (False, True) if given.burner else (False,):
-                print(_row(name, budget, burning, given.data, given.workspaces), flush=True)
+                record.add(**_figures(name, budget, burning, given.data, given.workspaces))
 
 
-def _row(name: str, budget: str, burning: bool, data: Path, workspaces: Path) -> str:
+def _figures(name: str, budget: str, burning: bool, data: Path, workspaces: Path) -> dict[str, Any]:
     folder = workspaces / f"{name}-{budget}{'-burner' if burning else ''}"
     promised, spent = seconds_from(budget), _spent(name, budget, burning, data, folder)
     root = folder / "demo.nerf" if name == "demo" else folder
     train, scored = _of(root, "train"), _score(root)
-    beside = "burner" if burning else "nothing"
-    off, seconds = 100 * (spent / promised - 1), train["facts"]["train_seconds"]
-    width = 1 / train["facts"]["downscale"]
-    return f"| {name} | {budget} | {beside} | {spent:.0f} | {off:+.1f} | {seconds:.0f} | {width:.0%} | {scored:.2f} |"
+    return {
+        "set": name,
+        "budget": budget,
+        "beside": "burner" if burning else "nothing",
+        "spent_seconds": round(spent),
+        "off_percent": round(100 * (spent / promised - 1), 1),
+        "train_seconds": round(train["facts"]["train_seconds"]),
+        "width_share": 1 / train["facts"]["downscale"],
+        "psnr": scored,
+    }
 
 
 def _spent(name: str, budget: str, burning: bool, data: Path, folder: Path) -> float:

@@ -2,7 +2,7 @@
 
     python -m benchmarks.effect_costs ../shared/data/fox --workspace /tmp/fox.nerf [--seconds 60] [--rounds 60]
 
-Trains the same field with every choice, a step of each in turn, and prints the median of each step's time over that of
+Trains the same field with every choice, a step of each in turn, and gives the median of each step's time over that of
 the step beside it in which no effect of photos is on (as many colours a step everywhere). "off": how much of that step
 passes in the parts that stand in place of effects which are off (nerf/effects), where one trainer that knows of no
 effects would only take the difference of two colours; so it is a bound from above.
@@ -17,10 +17,11 @@ from typing import Any
 
 from benchmarks.grid_parts import loaded
 from benchmarks.nerfacto import pipeline
+from benchmarks.record import Record, add_out
 from nerf.effects import AS_GIVEN, AS_RENDERED
 from nerf.geometry.scene import Scene
-from nerf.runtime.matmul_precision import products_at
-from nerf.training.ray_dataset import RayBank
+from nerf.runtime.matmul_precision import use_matmul_precision
+from nerf.training.ray_dataset import RayDataset
 from nerf.training.trainer import FieldTrainer
 from stages.effects.decisions import Decisions, photo_parts
 from stages.train import Config
@@ -52,7 +53,7 @@ class Timed:
 
 
 def arms(
-    config: Config, scene: Scene, bank: RayBank, decided: Decisions, neutral: tuple[Timed, Timed]
+    config: Config, scene: Scene, bank: RayDataset, decided: Decisions, neutral: tuple[Timed, Timed]
 ) -> dict[str, FieldTrainer]:
     """A trainer for each choice; ``neutral`` stand in the first one."""
     views = scene.of_split("train")
@@ -75,12 +76,13 @@ def arms(
 
 
 def main() -> None:
-    """Print a line for each choice."""
+    """Time every choice."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("photos", type=Path)
     parser.add_argument("--workspace", type=Path, required=True, help="made if it is not there")
     parser.add_argument("--seconds", type=float, default=60.0, help="of training that sizes are for")
     parser.add_argument("--rounds", type=int, default=60, help="steps of each choice that are timed")
+    add_out(parser)
     given = parser.parse_args()
     workspace = given.workspace.absolute()
     pipeline("run", given.photos.absolute(), "-o", workspace, "--until", "effects")
@@ -88,7 +90,7 @@ def main() -> None:
     neutral = Timed(AS_GIVEN), Timed(AS_RENDERED)
     trainers = arms(config, scene, bank, decided, neutral)
     seconds: dict[str, list[float]] = {name: [] for name in trainers}
-    with products_at(config.matmul):
+    with use_matmul_precision(config.matmul):
         for each in trainers.values():
             for step in range(WARM_STEPS):
                 each.step(step, SHARE, 1.0)
@@ -100,9 +102,10 @@ def main() -> None:
                 each.step(step, SHARE, 1.0)
                 seconds[name].append(time.perf_counter() - began)
     off = seconds.pop("off")
-    print(f"off: {sum(sum(part.seconds) for part in neutral) / sum(off):.3%} of {1e3 * median(off):.1f} ms a step")
-    for name, mine in seconds.items():
-        print(f"{name}: {median(a / b for a, b in zip(mine, off, strict=True)) - 1:+.1%}")
+    share = sum(sum(part.seconds) for part in neutral) / sum(off)
+    more = {name: median(a / b for a, b in zip(mine, off, strict=True)) - 1 for name, mine in seconds.items()}
+    percent = {f"{name.replace(' ', '_')}_percent": round(100 * value, 1) for name, value in more.items()}
+    Record(given.out).add(**percent, all_off_percent=round(100 * share, 2), step_ms=round(1e3 * median(off)))
 
 
 if __name__ == "__main__":

@@ -14,8 +14,9 @@ import json
 import tempfile
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+from benchmarks.record import Record, add_out
 from stages import effects
 from stages.effects.decisions import Decisions, read_decisions
 from stages.effects.pilots import pilot_scene, run_pilot
@@ -102,8 +103,8 @@ def gains(found: Outcome, wanted: Cell, steps: int) -> str:
     return "; ".join(parts)
 
 
-def row(name: str, seeds: int, steps: int) -> str:
-    """The line of the table."""
+def figures(name: str, seeds: int, steps: int) -> dict[str, Any]:
+    """The row of the table."""
     wanted, right, depends, seen, wrong, gain = CELLS[name], 0, 0, 0, [], ""
     for seed in range(seeds):
         with tempfile.TemporaryDirectory() as folder:
@@ -114,8 +115,15 @@ def row(name: str, seeds: int, steps: int) -> str:
             seen += all(found.table[flag]["on"] for flag in wanted.seen)
             if seed == 0:
                 gain = gains(found, wanted, steps)
-    flags = f"{seen}/{seeds}" if wanted.seen else ""
-    return f"| {name} | {right}/{seeds} | {flags} | {depends}/{seeds} | {gain} | {', '.join(wrong)} |"
+    return {
+        "photos": name,
+        "single": len(wanted.on - {"background"}) <= 1 and not (wanted.made.alpha and wanted.on),
+        "right": f"{right}/{seeds}",
+        "flagged": f"{seen}/{seeds}" if wanted.seen else None,
+        "gain": gain or None,
+        "view_dependence_on": f"{depends}/{seeds}",
+        "wrong": ", ".join(wrong) or None,
+    }
 
 
 def main() -> None:
@@ -124,10 +132,11 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--gain-steps", type=int, default=600)
     parser.add_argument("--only", nargs="*", default=list(CELLS))
+    add_out(parser)
     given = parser.parse_args()
-    print("| photos | right | seen | view dependence on | gain (dB) | wrong |\n" + 6 * "|---" + "|")
+    record = Record(given.out)
     for name in given.only:
-        print(row(name, given.seeds, given.gain_steps), flush=True)
+        record.add(**figures(name, given.seeds, given.gain_steps))
 
 
 if __name__ == "__main__":

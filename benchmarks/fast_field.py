@@ -17,12 +17,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from benchmarks.nerfacto import HERE, pipeline, stage_folder
+from benchmarks.record import Record, add_out
 from stages.io.files import read_json, read_scene
 
 EVERY_PHOTO = 10**6
-HEAD = (
-    "| set / downscale | s | grids | steps | rays/s | samples/s | PSNR (dB) | SSIM | frame | GB |\n" + 10 * "|---" + "|"
-)
 
 
 class Case(NamedTuple):
@@ -85,17 +83,24 @@ def frame_seconds(workspace: Path, width: int) -> tuple[float, str]:
     return min(seconds), "×".join(map(str, reversed(rays.near.shape)))
 
 
-def row(workspace: Path, case: Case, memory: float) -> str:
-    """The line of the table."""
+def figures(workspace: Path, case: Case, memory_gb: float) -> dict[str, Any]:
+    """The row of the table."""
     folder = stage_folder(workspace, "curve.json")
     facts: dict[str, Any] = read_json(folder / "manifest.json")["facts"]
     field, metrics = read_json(folder / "field.json")["settings"], read_json(workspace / "output" / "metrics.json")
     frame, size = frame_seconds(workspace, case.frame_width)
-    sizes = f"{field['levels']} × 2^{field['log2_rows']} to {field['finest']}"
-    quality = f"{metrics['psnr']:.2f} | {metrics['ssim']:.3f}"
-    speed = f"{facts['steps']:,} | {facts['rays_per_second']:,.0f} | {facts['samples_per_second']:,.0f}"
-    where = f"{case.name} / {case.downscale:g} | {case.seconds:g} | {sizes}"
-    return f"| {where} | {speed} | {quality} | {frame:.2f} s at {size} | {memory:.1f} |"
+    return {
+        "set": case.name,
+        "downscale": case.downscale,
+        "seconds": case.seconds,
+        "grids": f"{field['levels']} × 2^{field['log2_rows']} to {field['finest']}",
+        **{name: facts[name] for name in ("steps", "rays_per_second", "samples_per_second")},
+        "psnr": metrics["psnr"],
+        "ssim": metrics["ssim"],
+        "frame_seconds": frame,
+        "frame": size,
+        "memory_gb": round(memory_gb, 1),
+    }
 
 
 def chosen(only: list[str]) -> tuple[Case, ...]:
@@ -116,17 +121,17 @@ def main() -> None:
     parser.add_argument("data", type=Path)
     parser.add_argument("--workspaces", type=Path, required=True, help="folder for one workspace per set")
     parser.add_argument("--only", nargs="+", default=[], help="sets, or cases as set/downscale/seconds")
+    add_out(parser)
     given = parser.parse_args()
-    cases = chosen(given.only)
+    cases, record = chosen(given.only), Record(given.out)
     given.workspaces.mkdir(parents=True, exist_ok=True)
-    print(HEAD)
     for case in cases:
         if not (photos := (given.data / case.name).absolute()).is_dir():
             print(f"{case.name} is skipped: {photos} is not there", file=sys.stderr)
             continue
         workspace = (given.workspaces / f"{case.name}.nerf").absolute()
         pipeline("run", photos, "-o", workspace, "--until", "normalise")
-        print(row(workspace, case, train(workspace, case)), flush=True)
+        record.add(**figures(workspace, case, train(workspace, case)))
 
 
 if __name__ == "__main__":

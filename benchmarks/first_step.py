@@ -20,6 +20,7 @@ from pathlib import Path
 
 from benchmarks.nerfacto import HERE, pipeline
 from benchmarks.pixel_store import Spoken
+from benchmarks.record import Record, add_out
 from nerf.geometry.scene import Camera
 from pipeline.demo import demo_truth, write_photos
 from stages.io.files import write_json
@@ -71,14 +72,17 @@ def main() -> None:
     parser.add_argument("workspace", type=Path, nargs="?")
     parser.add_argument("--downscale", type=float, default=1.0)
     parser.add_argument("--repeats", type=int, default=3, help="with a warm cache")
+    add_out(parser)
     given = parser.parse_args()
+    record = Record(given.out)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         workspace, kernels = given.workspace or made(folder), folder / "kernels"
         copy = Path(shutil.copytree(workspace, folder / "copy.nerf", symlinks=True))
         for run in range(1 + given.repeats):
             seconds = first_step_seconds(copy, given.downscale, kernels)
-            print(f"{'warm' if run else 'cold'} cache of kernels: {seconds:.1f} s to the end of step 1", flush=True)
+            kernels_are = "compiled before" if run else "to compile"
+            record.add(set=workspace.stem, kernels=kernels_are, to_first_step=f"{seconds:.1f} s")
 
 
 if __name__ == "__main__":

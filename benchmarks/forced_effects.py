@@ -21,6 +21,7 @@ from statistics import mean, stdev
 from typing import Any
 
 from benchmarks.nerfacto import pipeline, stage_folder
+from benchmarks.record import Record, add_out
 from stages.io.files import read_json
 
 EFFECTS = ("exposure", "view_dependence", "background", "pose_refinement")
@@ -66,15 +67,15 @@ def gain(scores: Scores, forced: str, figure: str, seeds: list[int]) -> tuple[fl
     return mean(gains), 2 * stdev(gains) / math.sqrt(len(gains)) if len(gains) > 1 else math.inf
 
 
-def row(name: str, forced: str, on: bool, scores: Scores, seeds: list[int]) -> str:
-    """A line of the table."""
-    cells = []
+def cells(forced: str, on: bool, scores: Scores, seeds: list[int]) -> dict[str, str]:
+    """What the table says of one effect."""
+    told = {}
     for figure in FIGURES:
         found = gain(scores, forced, figure, seeds)
-        words = "" if found is None else f"{found[0]:+.2f} ± {found[1]:.2f}"
+        words = "" if found is None else f"{'off' if on else 'on'} {found[0]:+.2f} ± {found[1]:.2f}"
         wrong = found is not None and figure == JUDGED_BY.get(forced, "raw") and found[0] + found[1] < -TOLERATED
-        cells.append(f"**{words}**" if wrong else words)
-    return f"| {name} | {forced} {'off' if on else 'on'} | {' | '.join(cells)} |"
+        told[forced if figure == "raw" else f"{forced}_{figure}"] = f"**{words}**" if wrong else words
+    return told
 
 
 def main() -> None:
@@ -85,11 +86,12 @@ def main() -> None:
     parser.add_argument("--workspaces", type=Path, required=True)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--steps", type=int, default=800)
+    add_out(parser)
     given = parser.parse_args()
-    print(f"| set | forced | {' | '.join(FIGURES)} |\n|---|---|---|---|---|")
+    record = Record(given.out)
     for name in given.sets:
-        workspace, record = given.workspaces / f"{name}.nerf", given.workspaces / f"{name}.json"
-        made: dict[str, Any] = json.loads(record.read_text()) if record.exists() else {"scores": {}}
+        workspace, scores = given.workspaces / f"{name}.nerf", given.workspaces / f"{name}.json"
+        made: dict[str, Any] = json.loads(scores.read_text()) if scores.exists() else {"scores": {}}
         if "decided" not in made:
             made["decided"] = decided(given.data / name, workspace)
         for seed in given.seeds:
@@ -99,11 +101,12 @@ def main() -> None:
                     found, trained = scored(workspace, effects, seed, given.steps, made.get("downscale"))
                     made["scores"][f"{forced} {seed}"] = found
                     made.setdefault("downscale", trained)
-                    record.write_text(json.dumps(made, indent=1))
+                    scores.write_text(json.dumps(made, indent=1))
         raw = [made["scores"][f" {seed}"]["raw"] for seed in given.seeds]
-        print(f"| {name} | nothing | {mean(raw):.2f} dB | | |")
+        told = {"set": name, "decided_db": round(mean(raw), 2)}
         for effect, on in made["decided"].items():
-            print(row(name, effect, on, made["scores"], given.seeds), flush=True)
+            told |= cells(effect, on, made["scores"], given.seeds)
+        record.add(**told)
 
 
 if __name__ == "__main__":

@@ -19,6 +19,8 @@ import time
 from pathlib import Path
 from typing import Any
 
+from benchmarks.record import Record, add_out
+
 MEMORY = 3 << 30  # bytes of data that a child may have; torch and its like take one gigabyte of it
 ROUND_SECONDS = 60.0  # each loader in turn
 EXAMPLES = 100  # of one seed
@@ -32,6 +34,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--keep", type=Path, default=Path("fuzz"))
     parser.add_argument("--child", nargs=2, help=argparse.SUPPRESS)
+    add_out(parser)
     given = parser.parse_args()
     if given.child:
         print(json.dumps(attack(given.child[0], float(given.child[1]), given.seed)))
@@ -39,7 +42,7 @@ def main() -> int:
     from tests.fuzz.loaders import LOADERS
 
     table = run(given.only or list(LOADERS), 60 * given.minutes, given.seed, given.keep)
-    print_table(table)
+    print_table(table, given.seed, given.out)
     return int(any(row["faults"] for row in table.values()))
 
 
@@ -122,13 +125,14 @@ def _in_words(fault: Exception) -> str:
     return f"{type(fault).__name__}: {str(fault)[:300]} {notes[:1000]}"
 
 
-def print_table(table: dict[str, dict[str, Any]]) -> None:
-    """As it stands in docs/numbers.md."""
-    print("| loader | tried | refused in words | faults | seconds |\n|---|---|---|---|---|")
+def print_table(table: dict[str, dict[str, Any]], seed: int, out: Path | None) -> None:
+    """A row for each loader, and what all of them did, which is what is kept."""
+    loaders, total = Record(), {"tried": 0, "refused": 0, "faults": 0}
     for name, row in table.items():
-        print(f"| {name} | {row['tried']} | {row['refused']} | {len(row['faults'])} | {row['seconds']:.0f} |")
-    every = [sum(row[key] for row in table.values()) for key in ("tried", "refused", "seconds")]
-    print(f"| all | {every[0]} | {every[1]} | {sum(len(r['faults']) for r in table.values())} | {every[2]:.0f} |")
+        counts = {"tried": row["tried"], "refused": row["refused"], "faults": len(row["faults"])}
+        loaders.add(loader=name, **counts, seconds=round(row["seconds"]))
+        total = {key: total[key] + count for key, count in counts.items()}
+    Record(out).add(seeds=str(seed), **total)
 
 
 if __name__ == "__main__":

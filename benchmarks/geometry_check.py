@@ -9,18 +9,15 @@ noise and counted apart.
 """
 
 import argparse
-import json
-import platform
-import subprocess
 import tempfile
 from collections.abc import Sequence
-from datetime import date
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from benchmarks.record import Record, add_out
 from stages.io.photos import read_photos
 from stages.sfm.colmap.mapping import MAPPING_MODEL
 from stages.sfm.colmap.matching import (
@@ -59,7 +56,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("workspace", type=Path)
     parser.add_argument("--moved", type=int, default=200)
-    parser.add_argument("--out", type=Path)
+    add_out(parser)
     asked = parser.parse_args()
     ingest, sfm = (next((asked.workspace / stage).glob("*[0-9a-f]")) for stage in ("ingest", "sfm"))
     checked, poses, depth, names = right_model(ingest, sfm / "sparse")
@@ -70,24 +67,14 @@ def main() -> None:
     above = [move for move in moves if move.pixels >= floor]
     photos, found = sum(move.photos for move in above), sum(move.found for move in above)
     others = sum(len(names) - move.photos for move in moves)
-    facts = {
-        "command": f"python -m benchmarks.geometry_check {asked.workspace.name} --moved {asked.moved}",
-        "date": str(date.today()),
-        "machine": platform.processor() or platform.machine(),
-        "commit": subprocess.run(
-            ["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=True
-        ).stdout.strip(),
-        "photos": len(names),
-        "noise_floor_px": floor,
-        "moved_above_noise": photos,
-        "found": found / max(1, photos),
-        "moved_below_noise": sum(move.photos for move in moves) - photos,
-        "blamed": sum(move.blamed for move in moves) / others,
-        "moves": [move._asdict() for move in moves],
-    }
-    print({name: value for name, value in facts.items() if name != "moves"})
-    if asked.out:
-        asked.out.write_text(json.dumps(facts, indent=1) + "\n")
+    Record(asked.out).add(
+        photos=len(names),
+        noise_floor_px=round(floor, 2),
+        moved_above_noise=photos,
+        found_share=round(found / max(1, photos), 3),
+        moved_below_noise=sum(move.photos for move in moves) - photos,
+        blamed_share=round(sum(move.blamed for move in moves) / others, 4),
+    )
 
 
 def right_model(ingest: Path, sparse: Path) -> tuple[Checked, np.ndarray, float, list[str]]:

@@ -13,22 +13,23 @@ import numpy as np
 import torch
 from PIL import Image
 
-from nerf.fields.hash_grid import GridField, GridSettings
+from benchmarks.record import Record, add_out
+from nerf.fields.hash_grid import HashGridField, HashGridSettings
 from nerf.geometry.rays import Rays
 from nerf.kernels import torch as reference
 from nerf.kernels import warp as fast
 from nerf.rendering.images import render_image
 from nerf.runtime.parallel import take_over_cores, workers
-from nerf.training.hash_grid_trainer import GridTrainer, GridTrainerSettings
+from nerf.training.hash_grid_trainer import HashGridTrainer, HashGridTrainerSettings
 from nerf.training.metrics import mean_squared_error, psnr
-from nerf.training.ray_dataset import RayBank, build_ray_bank
+from nerf.training.ray_dataset import RayDataset, build_ray_bank
 from nerf.training.trainer import over
 
 SCENE_PER_BLENDER = 0.75  # takes the objects of the NeRF-synthetic set into [-0.9, 0.9]^3
 WHITE = torch.ones(3)
 
 
-def read_bank(folder: Path, split: str, downscale: int, every: int) -> RayBank:
+def read_bank(folder: Path, split: str, downscale: int, every: int) -> RayDataset:
     """All photos of a split, RGBA, made smaller by averaging premultiplied pixels."""
     cameras = json.loads((folder / f"transforms_{split}.json").read_text())
     photos, poses = [], []
@@ -55,7 +56,7 @@ def _smaller(pixels: np.ndarray, factor: int) -> np.ndarray:
     return np.round(255 * np.concatenate([colour, mean[..., 3:]], -1)).astype(np.uint8)
 
 
-def heldout(model: GridField, bank: RayBank) -> tuple[float, list[torch.Tensor]]:
+def heldout(model: HashGridField, bank: RayDataset) -> tuple[float, list[torch.Tensor]]:
     """Mean PSNR over the views, and [picture, truth] of the first."""
     values, first = [], []
     for view in range(len(bank.near)):
@@ -85,14 +86,18 @@ def main() -> None:
     parser.add_argument("--test-every", type=int, default=5)
     parser.add_argument("--picture", type=Path, default=None)
     parser.add_argument("--processor-time", action="store_true", help="count this, not the clock: on a busy machine")
+    add_out(parser)
     given = parser.parse_args()
+    record = Record(given.out)
     print(f"{torch.get_num_threads()} threads")
     take_over_cores()
-    settings = GridSettings(given.levels, 4, given.log2_rows, 16, given.finest, steps=given.steps)
+    settings = HashGridSettings(given.levels, 4, given.log2_rows, 16, given.finest, steps=given.steps)
     train = read_bank(given.folder, "train", given.downscale, 1)
     test = read_bank(given.folder, "test", given.downscale, given.test_every)
-    model = GridField(settings, given.seed, fast if given.backend == "warp" else reference)
-    trainer = GridTrainer(model, train, GridTrainerSettings(given.seed, "random", given.samples, chunks=workers()))
+    model = HashGridField(settings, given.seed, fast if given.backend == "warp" else reference)
+    trainer = HashGridTrainer(
+        model, train, HashGridTrainerSettings(given.seed, "random", given.samples, chunks=workers())
+    )
     print(f"{settings}\n{model.layout.rows:,} rows")
     clock = time.process_time if given.processor_time else time.perf_counter
     seconds, step, rays, due = 0.0, 0, 0, 5.0
@@ -103,12 +108,9 @@ def main() -> None:
         step, rays = step + 1, rays + result.rays
         if seconds >= min(due, given.seconds):
             quality, pictures = heldout(model, test)
-            speed = f"{step / seconds:.1f} steps/s  {rays / seconds:,.0f} rays/s"
-            per_ray = float(trainer.samples_per_ray)
-            print(
-                f"{seconds:6.1f} s  held out {quality:.2f} dB  train {result.psnr:.2f}  {speed}  {per_ray:.1f}/ray",
-                flush=True,
-            )
+            per_ray = round(float(trainer.samples_per_ray), 1)
+            speed = {"steps": step, "rays_per_second": rays / seconds, "samples_per_ray": per_ray}
+            record.add(seconds=round(seconds, 1), psnr=quality, train_psnr=round(result.psnr, 2), **speed)
             due *= 2
             if given.picture:
                 both = (255 * torch.cat(pictures, 1).clamp(0, 1)).round().to(torch.uint8)

@@ -16,10 +16,11 @@ import torch
 
 from benchmarks.nerfacto import pipeline, stage_folder
 from benchmarks.pixel_store import Spoken
+from benchmarks.record import Record, add_out
 from nerf.geometry.scene import Scene
 from nerf.runtime.machine_rates import measure_rates
-from nerf.runtime.matmul_precision import products_at
-from nerf.training.ray_dataset import RayBank
+from nerf.runtime.matmul_precision import use_matmul_precision
+from nerf.training.ray_dataset import RayDataset
 from nerf.training.trainer import FieldTrainer
 from stages.effects.decisions import Decisions, photo_parts, read_decisions
 from stages.hardware.device import compute_device, cores
@@ -41,6 +42,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, help="of training that sizes are for; none: the standard preset's")
     parser.add_argument("--downscale", type=float, help="photo width / trained width; none: as the seconds allow")
     parser.add_argument("--cores", type=int, help="none: all")
+    add_out(parser)
     given = parser.parse_args()
     workspace = given.workspace.absolute()
     pipeline("run", given.photos.absolute(), "-o", workspace, "--until", "effects")
@@ -49,14 +51,24 @@ def main() -> None:
     config, trainer = prepared(workspace, Config(seconds=given.seconds, downscale=given.downscale))
     timings: dict[str, Any] = {}
     device = torch.device(compute_device())
-    with products_at(config.matmul):
+    with use_matmul_precision(config.matmul):
         for step in range(WARM_STEPS):
             trainer.step(step, SHARE, 1.0)
         for step in range(WARM_STEPS, WARM_STEPS + TIMED_STEPS):
             observed(partial(trainer.step, step, SHARE, 1.0), FIRST_TIMED, timings, device)
         field = field_of(config)
         rates = measure_rates(device, field.matmul_width(config), field.table_rows(config), RATES_SECONDS)
-        report(parts_table(timings, rates))
+        table = parts_table(timings, rates)
+    report(table)
+    Record(given.out).add(
+        set=given.photos.name,
+        downscale=config.downscale,
+        seconds=given.seconds,
+        colours_per_step=config.batch_samples,
+        step_ms=round(1e3 * table["seconds"] / TIMED_STEPS, 1),
+        at_machine_rates_percent=round(100 * table["floor_share"]),
+        **{f"{row['part']}_percent": round(100 * row["share"]) for row in table["parts"]},
+    )
 
 
 def prepared(workspace: Path, asked: Config) -> tuple[Config, FieldTrainer]:
@@ -66,7 +78,7 @@ def prepared(workspace: Path, asked: Config) -> tuple[Config, FieldTrainer]:
     return config, make_trainer(config, scene, bank, config.seed, photo_parts(decisions, scene.of_split("train"), bank))
 
 
-def loaded(workspace: Path, asked: Config) -> tuple[Config, Scene, RayBank, Decisions]:
+def loaded(workspace: Path, asked: Config) -> tuple[Config, Scene, RayDataset, Decisions]:
     """What a fresh field is made of: the settings that stage train chose, which are printed, and its inputs."""
     inputs = {stage: stage_folder(workspace, output) for stage, output in LINKED.items()}
     scene, config = read_scene(inputs["normalise"]), plan(asked, inputs, Spoken())

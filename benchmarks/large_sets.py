@@ -32,6 +32,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from benchmarks.record import Record, add_out
 from benchmarks.repeating_places import SETS, Poses
 from nerf.geometry.alignment import align
 from nerf.geometry.pose_distance import rotation_angles
@@ -151,8 +152,8 @@ def robust_fit(found: Poses, true: Poses, size: float) -> Similarity:
     return best
 
 
-def score(truth_json: Path, sparse: Path, ingest_folder: Path) -> None:
-    """Print how many cameras are where they were, and which are farthest off."""
+def score(truth_json: Path, sparse: Path, ingest_folder: Path, record: Record) -> None:
+    """Record how many cameras are where they were, and which are farthest off."""
     truth = {name: np.array(pose) for name, pose in read_json(truth_json)["world_from_camera"].items()}
     names = {photo.image_name: photo.name for photo in read_photos(ingest_folder)}
     images = read_model(sparse).images
@@ -163,10 +164,18 @@ def score(truth_json: Path, sparse: Path, ingest_folder: Path) -> None:
     true, all_centres = np.stack([truth[name] for name in registered]), np.stack(list(truth.values()))[:, :, 3]
     size = float(np.linalg.norm(all_centres[:, None] - all_centres, axis=2).max())
     off = errors(robust_fit(found, true, size), found, true, size)
-    print(f"registered {len(images)} of {len(truth)}")
-    print(f"within {100 * CENTRE_SHARE:g} % of the size: {(off.share < CENTRE_SHARE).sum()}")
-    print(f"within {TURN_DEG:g} degree: {(off.turn_deg < TURN_DEG).sum()}; within both: {off.good.sum()}")
-    print(f"median error {100 * np.median(off.share):.4f} % of the size, {np.median(off.turn_deg):.4f} degrees")
+    record.add(
+        set=truth_json.parent.name,
+        attempt=None,
+        superseded=False,
+        photos=len(truth),
+        registered=len(images),
+        right=int(off.good.sum()),
+        median_share_of_size=round(float(np.median(off.share)), 6),
+        largest_share_of_size=round(float(off.share.max()), 6),
+        median_deg=round(float(np.median(off.turn_deg)), 4),
+        excluded=len(truth) - len(images),
+    )
     print(f"farthest off, of {len(images)}:")
     for index in np.argsort(-off.share)[:WORST]:
         print(f"  {registered[index]}  {100 * off.share[index]:9.4f} %  {off.turn_deg[index]:9.4f} degrees")
@@ -184,9 +193,10 @@ def main() -> None:
     scoring = commands.add_parser("score", help="compare a COLMAP model with the truth")
     for argument in ("truth_json", "sparse_folder", "ingest_folder"):
         scoring.add_argument(argument, type=Path)
+    add_out(scoring)
     arguments = parser.parse_args()
     if arguments.command == "score":
-        score(arguments.truth_json, arguments.sparse_folder, arguments.ingest_folder)
+        score(arguments.truth_json, arguments.sparse_folder, arguments.ingest_folder, Record(arguments.out))
     else:
         draw(arguments.name, arguments.folder, arguments.photos or SETS[arguments.name].photos, arguments.shuffle)
 

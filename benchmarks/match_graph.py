@@ -10,16 +10,13 @@ recall of the best 20 partners of each photo by verified matches, and the share 
 """
 
 import argparse
-import json
-import platform
-import subprocess
 import tempfile
-from datetime import date
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 
+from benchmarks.record import Record, add_out
 from stages.io.photos import read_photos
 from stages.sfm.colmap.mapping import MAPPING_MODEL
 from stages.sfm.colmap.matching import (
@@ -58,7 +55,7 @@ def main() -> None:
     parser.add_argument("workspace", type=Path)
     parser.add_argument("--photos", type=int, default=60)
     parser.add_argument("--neighbours", type=int, default=30)
-    parser.add_argument("--out", type=Path)
+    add_out(parser)
     asked = parser.parse_args()
     ingest = next((asked.workspace / "ingest").iterdir())
     photos = sorted((p for p in read_photos(ingest) if not p.near_duplicate_of), key=lambda p: p.file)[: asked.photos]
@@ -79,14 +76,9 @@ def main() -> None:
             "grown": grown(np.arange(count), truth, vlad, asked.neighbours),
             "grown, names shuffled": grown(np.random.default_rng(0).permutation(count), truth, vlad, asked.neighbours),
         }
-    rows = [{"way": name, **scores(pairs, truth)} for name, pairs in ways.items()]
-    for row in rows:
-        print(f"{row['way']:24s} {row['pairs']:6d} pairs  recall {row['recall']:.3f}  verified {row['verified']:.3f}")
-    if asked.out:
-        commit = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=True).stdout.strip()
-        facts = {"command": f"python -m benchmarks.match_graph {asked.workspace.name} --photos {count}"}
-        facts |= {"date": str(date.today()), "machine": platform.processor() or platform.machine(), "commit": commit}
-        asked.out.write_text(json.dumps(facts | {"photos": count, "ways": rows}, indent=1) + "\n")
+    record = Record(asked.out)
+    for name, pairs in ways.items():
+        record.add(way=name, photos=count, **scores(pairs, truth))
 
 
 def scores(pairs: Pairs, truth: np.ndarray) -> dict[str, float | int]:
@@ -97,7 +89,8 @@ def scores(pairs: Pairs, truth: np.ndarray) -> dict[str, float | int]:
     links = np.take_along_axis(truth, best, axis=1) >= MIN_INLIERS
     found = np.take_along_axis(chosen, best, axis=1) & links
     recall = float((found.sum(axis=1) / np.maximum(links.sum(axis=1), 1)).mean())
-    return {"pairs": len(pairs), "recall": recall, "verified": float((truth[tuple(pairs.T)] >= MIN_INLIERS).mean())}
+    verified = float((truth[tuple(pairs.T)] >= MIN_INLIERS).mean())
+    return {"pairs": len(pairs), "recall": round(recall, 3), "verified": round(verified, 3)}
 
 
 def grown(order: np.ndarray, truth: np.ndarray, similarity: Likeness, neighbours: int) -> Pairs:

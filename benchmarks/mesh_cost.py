@@ -1,4 +1,4 @@
-"""What a mesh costs: seconds and distance to what is known of the surface, against the lattice's resolution.
+"""What a mesh costs: seconds and distance to what is known of the surface, against the grid's resolution.
 
     pipeline run PHOTOS --until train --train.steps 1500
     python -m benchmarks.mesh_cost PHOTOS.nerf
@@ -14,19 +14,18 @@ import shutil
 import tempfile
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from benchmarks.record import Record, add_out
 from nerf import REGION_HALF
 from pipeline.demo.truth import Truth, compare_with_truth
 from pipeline.engine.workspace import Workspace
 from stages.contract import Inputs
-from stages.hardware.device import compute_device
-from stages.io.field_files import load_field
-from stages.io.files import read_scene, read_tensors
-from stages.mesh import Config, reconstruct, write_mesh
-from stages.mesh.samples import sample_surface
+from stages.mesh import Config
+from stages.mesh.extraction import extract_mesh, load, write_mesh
+from stages.mesh.surface import sample_surface
 
 if TYPE_CHECKING:
     from nerf.geometry.scene import Scene
@@ -45,37 +44,38 @@ class Quiet:
         """Nothing."""
 
 
-def to_truth(mesh: "ColouredMesh", scene: "Scene", normalise: Path, truth: Truth) -> str:
+def to_truth(mesh: "ColouredMesh", scene: "Scene", normalise: Path, truth: Truth) -> dict[str, float]:
     """Mesh to truth, and truth to mesh, in percent of the scene's size."""
     with tempfile.TemporaryDirectory() as folder:
         shutil.copy(normalise / "transforms.json", folder)
         write_mesh(Config(formats=("ply",)), mesh, scene, Path(folder))
         error = compare_with_truth(Path(folder), truth).mesh
     assert error is not None, "the mesh has just been written"
-    return f"{error.accuracy:.2f} | {error.completeness:.2f}"
+    return {"mesh_to_truth_percent": error.accuracy, "truth_to_mesh_percent": error.completeness}
 
 
-def to_points(mesh: "ColouredMesh", points: np.ndarray) -> str:
+def to_points(mesh: "ColouredMesh", points: np.ndarray) -> dict[str, float]:
     """From the sparse points in the region to the mesh: median, and nine in ten, in percent of the region's size."""
     from scipy.spatial import KDTree
 
     inside = points[np.abs(points).max(1) < REGION_HALF]
     distance = KDTree(sample_surface(mesh.vertices, mesh.faces, SAMPLES, seed=0)).query(inside)[0]
     median, most = np.percentile(distance, [50, 90]) * 100 / (2 * REGION_HALF)
-    return f"{median:.2f} | {most:.2f}"
+    return {"point_to_mesh_percent": median, "nine_in_ten_percent": most}
 
 
-def row(folders: Inputs, resolution: int, truth: Truth | None) -> str:
+def figures(folders: Inputs, resolution: int, truth: Truth | None) -> dict[str, Any]:
     """One resolution's row of the table."""
-    scene, device = read_scene(folders["normalise"]), compute_device()
-    model, _ = load_field(folders["train"], device)
-    normalise = folders["normalise"]
-    points = read_tensors(normalise / "points.safetensors")["xyz"].astype(float)
+    source = load(folders, Quiet())
     started = time.perf_counter()
-    made = reconstruct(Config(resolution=resolution), model, scene, folders["ingest"], points, device, Quiet())
+    made = extract_mesh(Config(resolution=resolution), source, Quiet())
     seconds = time.perf_counter() - started
-    known = to_points(made.mesh, points) if truth is None else to_truth(made.mesh, scene, normalise, truth)
-    return f"| {resolution}³ | {len(made.mesh.faces):,} | {seconds:.1f} | {known} |"
+    if truth is None:
+        known = to_points(made.mesh, source.points)
+    else:
+        known = to_truth(made.mesh, source.scene, folders["normalise"], truth)
+    rounded = {name: round(value, 2) for name, value in known.items()}
+    return {"resolution": resolution, "faces": len(made.mesh.faces), "seconds": round(seconds, 1), **rounded}
 
 
 def main() -> None:
@@ -84,15 +84,15 @@ def main() -> None:
     parser.add_argument("workspace", type=Path)
     parser.add_argument("--resolutions", type=int, nargs="+", default=[48, 64, 96, 128, 192, 256])
     parser.add_argument("--truth", type=Path, default=None)
+    add_out(parser)
     given = parser.parse_args()
     workspace = Workspace.existing(given.workspace)
     keys = workspace.read_run()["keys"]
     folders = {stage: workspace.folder(stage, keys[stage]) for stage in ("ingest", "normalise", "train")}
     truth = Truth.read(given.truth) if given.truth else None
-    names = "mesh to truth (%) | truth to mesh (%)" if truth else "median point to mesh (%) | nine in ten within (%)"
-    print(f"| lattice | faces | s | {names} |\n|---|---|---|---|---|")
+    record = Record(given.out)
     for resolution in given.resolutions:
-        print(row(folders, resolution, truth), flush=True)
+        record.add(set=given.workspace.stem, **figures(folders, resolution, truth))
 
 
 if __name__ == "__main__":

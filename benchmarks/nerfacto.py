@@ -31,8 +31,9 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from benchmarks.record import Record, add_out
+
 HERE = Path(__file__).parent
-HEAD = "| | training s | steps | rays/s | held-out PSNR (dB) |\n|---|---|---|---|---|"
 LINE_SECONDS = 20.0  # of nerfacto's training, between the lines that tell of it
 
 
@@ -215,10 +216,10 @@ def verdict(ours: list[Point], budgets: list[float], theirs: list[Point]) -> str
     return f"{goal}: not reached by ours within {budgets[-1]:g} s"
 
 
-def told(name: str, point: Point) -> Point:
-    """The point, after its line of the table has been printed."""
+def recorded(record: Record, method: str, point: Point) -> Point:
+    """The point, after it became a row of the table."""
     seconds, psnr, steps, rays = point
-    print(f"| {name} | {seconds:.1f} | {steps:,} | {rays / seconds:,.0f} | {psnr:.2f} |", flush=True)
+    record.add(method=method, train_seconds=round(seconds, 1), steps=steps, rays_per_second=rays / seconds, psnr=psnr)
     return point
 
 
@@ -233,19 +234,23 @@ def main() -> None:
     parser.add_argument("--downscale", type=float, default=2.4, help="photo width / trained width")
     parser.add_argument("--nerfacto-rays", type=int, default=4096, help="in a step")
     parser.add_argument("--camera-optimizer", action=argparse.BooleanOptionalAction, default=True, help="of nerfacto")
+    add_out(parser)
     given = parser.parse_args()
+    record = Record(given.out)
     workspace, budgets, python = given.workspace.absolute(), sorted(given.seconds), given.nerfstudio_python.absolute()
     pipeline("run", given.photos.absolute(), "-o", workspace, "--until", "normalise")
     folder = workspace.with_name(f"{workspace.name}.nerfacto")
     width, height = export(workspace, given.downscale, folder)
-    print(f"photos at {width} x {height}\n\n{HEAD}", flush=True)
-    ours = [told("ours", train_ours(workspace, given.downscale, seconds)) for seconds in budgets]
+    print(f"photos at {width} x {height}\n", flush=True)
+    ours = [recorded(record, "ours", train_ours(workspace, given.downscale, seconds)) for seconds in budgets]
     if lacking := lacks(python):
         print(f"\nnerfacto is skipped: {lacking}")
         return
     arguments = (str(folder), sorted(60 * m for m in given.minutes), given.nerfacto_rays, given.camera_optimizer)
-    theirs = [told("nerfacto", point) for point in train_nerfacto(python, *arguments)]
-    ours += [told("ours, again", train_ours(workspace, given.downscale, seconds)) for seconds in budgets]
+    theirs = [recorded(record, "nerfacto", point) for point in train_nerfacto(python, *arguments)]
+    ours += [
+        recorded(record, "ours, second run", train_ours(workspace, given.downscale, seconds)) for seconds in budgets
+    ]
     print(f"\n{verdict(ours, budgets, theirs)}")
 
 

@@ -23,13 +23,15 @@ from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
 
+from benchmarks.record import Record, add_out
 from nerf.geometry.scene import Camera, Scene, Similarity, View
-from nerf.training.pixel_sampler import PixelOrder
-from nerf.training.ray_dataset import RayBank
+from nerf.training.pixel_sampler import PixelSampler
+from nerf.training.ray_dataset import RayDataset
 from stages.hardware.backend import chosen_backend
 from stages.hardware.device import compute_device
 from stages.hardware.memory import available_bytes
@@ -72,34 +74,34 @@ def paint(folder: Path, photos: int) -> Scene:
     return Scene((camera,) * photos, tuple(views), frame, False, False, "inside", True)
 
 
-def memory() -> str:
-    """Peak of this process, and what it holds now, split into what is its own and what is mapped files."""
+def memory() -> dict[str, float]:
+    """Peak of this process, and what it holds now, split into what is its own and what is mapped files; in GB."""
     lines = Path("/proc/self/status").read_text().splitlines()
     now = {line.split(":")[0]: int(line.split()[1]) / 1e6 for line in lines if line.startswith("Rss")}
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
-    return f"peak {peak:.2f} GB · now own {now['RssAnon']:.2f} GB, file {now['RssFile']:.2f} GB"
+    return {"peak_gb": round(peak, 2), "own_gb": round(now["RssAnon"], 2), "file_gb": round(now["RssFile"], 2)}
 
 
-def milliseconds(work: Callable[[], object], repeats: int) -> str:
+def milliseconds(work: Callable[[], object], repeats: int) -> dict[str, float]:
     """Median and lowest duration."""
     taken = []
     for _ in range(repeats):
         started = time.perf_counter()
         work()
         taken.append(1e3 * (time.perf_counter() - started))
-    return f"{statistics.median(taken):8.2f} ms (lowest {min(taken):.2f})"
+    return {"median_ms": round(statistics.median(taken), 2), "lowest_ms": round(min(taken), 2)}
 
 
-def draw(bank: RayBank, where: str, repeats: int = REPEATS) -> None:
+def draw(bank: RayDataset, where: str, record: Record, repeats: int = REPEATS) -> None:
     """Time batches of rays."""
-    order = PixelOrder(bank.drawable, 0, bank.device)
+    order = PixelSampler(bank.drawable, 0, bank.device)
     for count in BATCHES:
         places = itertools.count(step=count)
         taken = milliseconds(lambda n=count, p=places: bank.lookup(bank.nth(order.take(next(p), n))), repeats)
-        print(f"{count} rays, {where:<16}{taken}")
+        record.add(what=f"{count} rays, {where}", **taken, **memory())
 
 
-def train(ingest: Path, scene: Scene, downscale: float) -> str:
+def train(ingest: Path, scene: Scene, downscale: float) -> dict[str, Any]:
     """The time of a step of training on a store that has been made, and the memory of the process that took it."""
     device = compute_device()
     asked = Config(field="grid", contracted=True, view_dependence=True, downscale=downscale)
@@ -109,7 +111,7 @@ def train(ingest: Path, scene: Scene, downscale: float) -> str:
     trainer, step = make_trainer(config, scene, bank, config.seed), itertools.count()
     taken = milliseconds(lambda: trainer.step(next(step), 0.0, 1.0), STEPS)
     sizes = f"{config.levels} grids of 2^{config.log2_rows} rows, {config.batch_samples:,} colours in a step"
-    return f"{STEPS} steps of training ({sizes}):{taken} each; {memory()}"
+    return {"what": f"a step of training: {sizes}", **taken, **memory()}
 
 
 def drop_from_memory(store: Path) -> None:
@@ -120,47 +122,48 @@ def drop_from_memory(store: Path) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--photos", type=int, default=6)
     parser.add_argument("--downscale", type=float, default=1.0)
     parser.add_argument("--folder", type=Path, default=None, help="where to work; default: a temporary folder")
+    add_out(parser)
     given = parser.parse_args()
     with tempfile.TemporaryDirectory(dir=given.folder) as folder:
-        measure(Path(folder) / "ingest", given.photos, given.downscale)
+        measure(Path(folder) / "ingest", given.photos, given.downscale, Record(given.out))
 
 
-def measure(ingest: Path, photos: int, downscale: float) -> None:
-    """Build, draw, print."""
+def measure(ingest: Path, photos: int, downscale: float, record: Record) -> None:
+    """Build, draw, record."""
     scene = paint(ingest, photos)
-    print(f"{photos} photos of {WIDTH} x {HEIGHT}, each with its own camera, at 1/{downscale:g}; {memory()}")
+    print(f"{photos} photos of {WIDTH} x {HEIGHT}, each with its own camera, at 1/{downscale:g}")
 
-    def opened() -> RayBank:
+    def opened(what: str) -> RayDataset:
         started = time.perf_counter()
         bank = training_bank(ingest, scene, "train", downscale, Spoken())
-        print(f"opened in {time.perf_counter() - started:.1f} s; {memory()}")
+        taken = round(1e3 * (time.perf_counter() - started))
+        record.add(what=f"{what} of {photos} photos", median_ms=taken, lowest_ms=taken, **memory())
         return bank
 
-    opened()
+    opened("making the store")
     (store,) = (path for path in ingest.with_name("ingest.pixels").iterdir() if not path.suffix)
-    print(f"the store was made: {store.stat().st_size / 1e9:.2f} GB")
+    print(f"the store: {store.stat().st_size / 1e9:.2f} GB")
     with ProcessPoolExecutor(1, get_context("spawn")) as alone:
-        print(alone.submit(train, ingest, scene, downscale).result())
-    warm(opened())
+        record.add(**alone.submit(train, ingest, scene, downscale).result())
+    warm(opened("opening the store"), record)
     drop_from_memory(store)
     pixel_store.FITS = 0.0  # as if memory were too small for it
-    draw(opened(), "from the disk", 5)
+    draw(opened("opening the store from the disk"), "from the disk", record, 5)
 
 
-def warm(bank: RayBank) -> None:
+def warm(bank: RayDataset, record: Record) -> None:
     """Batches from a store that memory holds, and from a copy in plain memory."""
-    draw(bank, "first ones", 5)
+    draw(bank, "first ones", record, 5)
     bank.pixels.view(-1)[:: mmap.PAGESIZE].sum()
-    draw(bank, "mapped")
-    print(memory())
+    draw(bank, "mapped", record)
     if bank.pixels.numel() > pixel_store.FITS * available_bytes():
         print("left out: the same from plain memory, which has no room for them")
     else:
-        draw(bank._replace(pixels=bank.pixels.clone()), "plain memory")
+        draw(bank._replace(pixels=bank.pixels.clone()), "plain memory", record)
 
 
 if __name__ == "__main__":

@@ -17,7 +17,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from nerf.training.hash_grid_trainer import CONSTANT_SHARE
+from benchmarks.record import Record, add_out
+from nerf.training.hash_grid_trainer import LR_HOLD_FRACTION
 from nerf.training.learning_curve import FEWEST_STEPS, Curve, last_doubling
 
 SHARE = 0.8  # of the truths that an interval is to hold
@@ -61,7 +62,7 @@ def final(run: Run) -> float:
 
 def in_use(run: Run) -> bool:
     """Whether a run was made in one piece, under the schedule that is in use."""
-    return run["schedule"] == "whole" and run["constant"] == CONSTANT_SHARE
+    return run["schedule"] == "whole" and run["constant"] == LR_HOLD_FRACTION
 
 
 def cases_of(runs: list[Run]) -> list[Case]:
@@ -112,12 +113,14 @@ def score(cases: list[Case], terms: Terms) -> list[tuple[Case, float, float]]:
     return rows
 
 
-def print_scores(cases: list[Case]) -> None:
+def print_scores(cases: list[Case], record: Record) -> None:
     for name, terms in MODELS.items():
         rows = score(cases, terms)
         covered = mean(abs(case.reached - guess) <= half for case, guess, half in rows)
         rms = mean((case.reached - guess) ** 2 for case, guess, _ in rows) ** 0.5
-        print(f"{name:<18} rms {rms:.2f} dB, covered {covered:.0%}, half width {mean(r[2] for r in rows):.2f}")
+        width = round(mean(row[2] for row in rows), 2)
+        holds = round(100 * covered)
+        record.add(prediction=name, rms_db=round(rms, 2), interval_holds_percent=holds, half_width_db=width)
     terms = MODELS[IN_USE]
     print("\n| case | last doubling | predicted | reached | |\n|---|---|---|---|---|")
     for case, guess, half in score(cases, terms):
@@ -153,8 +156,10 @@ def print_schedules(runs: list[Run]) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("runs", type=Path)
-    runs = json.loads(parser.parse_args().runs.read_text())
-    print_scores(cases_of(runs))
+    add_out(parser)
+    given = parser.parse_args()
+    runs = json.loads(given.runs.read_text())
+    print_scores(cases_of(runs), Record(given.out))
     print()
     print_schedules(runs)
 

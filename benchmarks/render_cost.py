@@ -14,10 +14,11 @@ from pathlib import Path
 
 import torch
 
+from benchmarks.record import Record, add_out
 from nerf.effects.exposure import ExposedModel
-from nerf.fields.hash_grid import GridField
+from nerf.fields.hash_grid import HashGridField
 from nerf.fields.interface import RadianceModel
-from nerf.fields.vanilla import PaperNerf
+from nerf.fields.vanilla import VanillaNerf
 from nerf.training.metrics import mean_squared_error, psnr
 from pipeline.engine.workspace import Workspace
 from stages.effects.decisions import expected_gains
@@ -32,16 +33,16 @@ def with_samples(model: RadianceModel, factor: float) -> RadianceModel:
     """The same field with so many times the samples along each ray."""
     if isinstance(model, ExposedModel):
         return ExposedModel(with_samples(model.model, factor), model.log_gain)
-    if isinstance(model, GridField):
+    if isinstance(model, HashGridField):
         given = model.settings
         finer = {"shortest_step": given.shortest_step / factor, "cone": given.cone / factor}
         settings = replace(given, steps=max(1, round(given.steps * factor)), **finer)
-        changed: GridField | PaperNerf = GridField(settings, 0, model.backend)
+        changed: HashGridField | VanillaNerf = HashGridField(settings, 0, model.backend)
     else:
-        assert isinstance(model, PaperNerf)
+        assert isinstance(model, VanillaNerf)
         given = model.settings
         coarse, fine = (max(2, round(count * factor)) for count in (given.samples_coarse, given.samples_fine))
-        changed = PaperNerf(replace(given, samples_coarse=coarse, samples_fine=fine), seed=0)
+        changed = VanillaNerf(replace(given, samples_coarse=coarse, samples_fine=fine), seed=0)
     changed.load_state_dict(model.state_dict())
     return changed.to(next(iter(model.state_dict().values())).device).requires_grad_(False)
 
@@ -50,10 +51,10 @@ def samples_of(model: RadianceModel) -> str:
     """How the samples of a field are laid, in its own terms."""
     if isinstance(model, ExposedModel):
         return samples_of(model.model)
-    if isinstance(model, GridField):
+    if isinstance(model, HashGridField):
         step, bounded = model.drawn_lattice.step, f"{model.settings.steps} along the box's diagonal"
         return f"steps from {step:.4f}" if model.settings.contracted else bounded
-    assert isinstance(model, PaperNerf)
+    assert isinstance(model, VanillaNerf)
     return f"{model.settings.samples_coarse} + {model.settings.samples_fine}"
 
 
@@ -82,12 +83,13 @@ def main() -> None:
     parser.add_argument("--factors", type=float, nargs="+", default=[0.25, 0.5, 1.0, 2.0])
     parser.add_argument("--downscales", type=float, nargs="+", default=[4.0, 2.0, 1.0])
     parser.add_argument("--photos", type=int, default=2)
+    add_out(parser)
     given = parser.parse_args()
+    record = Record(given.out)
     workspace = Workspace.existing(given.workspace)
     keys = workspace.read_run()["keys"]
     folders = {stage: workspace.folder(stage, keys[stage]) for stage in ("ingest", "normalise", "train")}
     painter = load_painter(folders["train"])
-    print("| samples | resolution | a frame (s) | PSNR (dB) |\n|---|---|---|---|")
     for downscale in given.downscales:
         for factor in given.factors:
             other = replace(painter, model=with_samples(painter.model, factor))
@@ -95,7 +97,7 @@ def main() -> None:
             with torch.no_grad():
                 seconds, score = measured(other, folders, downscale, given.photos)
             words = f"× {factor:g} ({samples_of(other.model)})"
-            print(f"| {words} | {resolution_words(downscale)} | {seconds:.2f} | {score:.2f} |", flush=True)
+            record.add(samples=words, resolution=resolution_words(downscale), frame_seconds=seconds, psnr=score)
 
 
 if __name__ == "__main__":

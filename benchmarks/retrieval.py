@@ -20,11 +20,13 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from PIL import Image
 
+from benchmarks.record import Record, add_out
 from benchmarks.sfm_speed import Timed
 from nerf.geometry.alignment import align
 from nerf.geometry.camera_paths import look_at
@@ -89,8 +91,8 @@ def draw(folder: Path, count: int, seed: int = 0) -> dict[str, np.ndarray]:
     return truth
 
 
-def measure(config: sfm.Config, folder: Path, truth: dict[str, np.ndarray]) -> None:
-    """Run stage sfm and print its line of the table."""
+def measure(config: sfm.Config, folder: Path, truth: dict[str, np.ndarray]) -> dict[str, Any]:
+    """Run stage sfm; its row of the table."""
     progress, sfm_folder = Timed(), folder / str(config.matcher)
     begin = time.perf_counter()
     result = sfm.run(config, {"ingest": folder / "ingest"}, sfm_folder, progress)
@@ -101,7 +103,15 @@ def measure(config: sfm.Config, folder: Path, truth: dict[str, np.ndarray]) -> N
     aligned = np.stack([align(found[:, :, 3], true).pose(pose) for pose in found])[:, :, 3]
     off = np.linalg.norm(aligned - true, axis=1).max() / np.ptp(true[:, 0])
     matching = sum(value for kind, value in progress.seconds.items() if kind.startswith("matched"))
-    print(f"{config.matcher:12s} {matching:9.0f} {seconds:6.0f}  {100 * off:6.2f} %  {result.line}", flush=True)
+    return {
+        "matcher": config.matcher,
+        "photos": len(truth),
+        "registered": len(model.images),
+        "centres_max_percent": round(100 * off, 2),
+        "matching_seconds": round(matching),
+        "seconds": round(seconds),
+        "found": result.line,
+    }
 
 
 def main() -> None:
@@ -112,16 +122,17 @@ def main() -> None:
     parser.add_argument("--neighbours", type=int, default=sfm.Config().neighbours)
     parser.add_argument("--max-features", type=int, default=sfm.Config().max_features)
     parser.add_argument("--folder", type=Path, help="where the photos are drawn, and kept")
+    add_out(parser)
     arguments = parser.parse_args()
+    record = Record(arguments.out)
     with tempfile.TemporaryDirectory() as scratch:
         photos, folder = (arguments.folder or Path(scratch)) / "photos", Path(scratch)
         truth = draw(photos, arguments.photos)
         (folder / "ingest").mkdir()
         ingest.run(ingest.Config(photos=photos), {}, folder / "ingest", Timed())
-        print(f"{'matcher':12s} {'matching':>9s} {'sfm s':>6s}  {'farthest':>8s}")
         for matcher in arguments.matchers:
             config = {"matcher": matcher, "neighbours": arguments.neighbours, "max_features": arguments.max_features}
-            measure(sfm.Config.model_validate(config), folder, truth)
+            record.add(**measure(sfm.Config.model_validate(config), folder, truth))
 
 
 if __name__ == "__main__":

@@ -27,9 +27,11 @@ import json
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from benchmarks.record import Record, add_out
 from nerf.geometry.alignment import align
 from stages import ingest, sfm
 from stages.io.photos import Photo, read_photos
@@ -79,8 +81,8 @@ def agreement(model: SparseModel, transforms: Path, photos: list[Photo]) -> tupl
     return 100 * distances / size, degrees
 
 
-def measure(data: Path, config: sfm.Config) -> None:
-    """Run ingest and sfm on one set and print its line of the table."""
+def measure(data: Path, config: sfm.Config) -> dict[str, Any]:
+    """Run ingest and sfm on one set; its row of the table."""
     transforms = data / "transforms.json"
     with tempfile.TemporaryDirectory() as scratch:
         folders = {name: Path(scratch, name) for name in ("ingest", "sfm")}
@@ -92,13 +94,18 @@ def measure(data: Path, config: sfm.Config) -> None:
         seconds = time.perf_counter() - begin
         model = read_model(folders["sfm"] / "sparse")
         if transforms.exists():
-            unit, (off, degrees) = "%", agreement(model, transforms, read_photos(folders["ingest"]))
+            unit, (off, degrees) = "percent", agreement(model, transforms, read_photos(folders["ingest"]))
         else:
             unit, (off, degrees) = "mm", errors(model, json.loads((data / "reference_cameras.json").read_text()))
-    print(
-        f"{data.name:14s} {off.mean():7.2f} {off.max():7.2f} {unit:2s} {degrees.mean():8.3f} {seconds:6.0f}  "
-        f"{result.line}"
-    )
+    return {
+        "set": data.name,
+        "registered": len(model.images),
+        f"centres_{unit}": off.mean(),
+        f"centres_max_{unit}": off.max(),
+        "rotations_deg": degrees.mean(),
+        "seconds": round(seconds),
+        "found": result.line,
+    }
 
 
 def main() -> None:
@@ -109,12 +116,13 @@ def main() -> None:
     parser.add_argument("--camera-model", default=None)
     parser.add_argument("--max-features", type=int, default=None)
     parser.add_argument("--max-image-size", type=int, default=None)
+    add_out(parser)
     arguments = parser.parse_args()
+    record = Record(arguments.out)
     given = {name: getattr(arguments, name) for name in ("camera_model", "max_features", "max_image_size")}
     config = sfm.Config(**given)
-    print(f"{'set':14s} {'mean':>7s} {'max':>7s}    {'mean deg':>8s} {'s':>6s}")
     for name in arguments.sets:
-        measure(arguments.data / name, config)
+        record.add(**measure(arguments.data / name, config))
 
 
 if __name__ == "__main__":

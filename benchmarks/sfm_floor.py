@@ -26,6 +26,7 @@ import cv2
 import numpy as np
 import pycolmap
 
+from benchmarks.record import Record, add_out
 from benchmarks.sfm_accuracy import Quiet
 from stages import ingest
 from stages.hardware.device import processors
@@ -87,8 +88,8 @@ def blurred(path: Path, photo: Photo, search: Search) -> None:
         octave = [octave[SCALES][::2, ::2]]
 
 
-def compare(photos: list[Photo], folder: Path, database: Path) -> None:
-    """Print the lines of the table."""
+def compare(photos: list[Photo], folder: Path, database: Path, record: Record) -> None:
+    """Record the rows of the table."""
     cores, search = processors(), Search(*TIERS[0])
     fill_database(database, photos, MAPPING_MODEL)
     finding = seconds(lambda: extract_features(database, folder / "images", photos, search), 1)
@@ -113,7 +114,8 @@ def compare(photos: list[Photo], folder: Path, database: Path) -> None:
         ("nearest neighbours of a pair", floor / len(pairs), matching / len(pairs)),
         ("pair, verified and written", floor / len(pairs), matching_all / len(pairs)),
     ):
-        print(f"{name:30s} floor {1000 * least:7.1f} ms, taken {1000 * taken:7.1f} ms, share {least / taken:.2f}")
+        milliseconds = {"floor_ms": round(1000 * least, 1), "taken_ms": round(1000 * taken, 1)}
+        record.add(work=name, **milliseconds, share=round(least / taken, 2))
 
 
 def main() -> None:
@@ -122,6 +124,7 @@ def main() -> None:
     parser.add_argument("data", type=Path)
     parser.add_argument("--set", default="fox")
     parser.add_argument("--photos", type=int, default=12)
+    add_out(parser)
     arguments = parser.parse_args()
     if os.environ.get("OPENBLAS_NUM_THREADS") != "1":  # as in the child in which the stage works
         parser.error("set OPENBLAS_NUM_THREADS=1: work is divided by pairs, not inside a product")
@@ -135,7 +138,10 @@ def main() -> None:
         )
         photos = sorted(read_photos(folder), key=lambda photo: photo.file)
         compare(
-            photos[:: max(1, len(photos) // arguments.photos)][: arguments.photos], folder, Path(scratch, "some.db")
+            photos[:: max(1, len(photos) // arguments.photos)][: arguments.photos],
+            folder,
+            Path(scratch, "some.db"),
+            Record(arguments.out),
         )
 
 

@@ -9,7 +9,6 @@ more where the machine does other work; what was registered, the mean reprojecti
 ``reference_cameras.json`` has measured cameras, the mean distance of the camera centres after the similarity that fits
 them best and the mean angle between the rotations.
 
-Figures are in docs/numbers.md.
 """
 
 import argparse
@@ -19,10 +18,12 @@ import re
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
 
+from benchmarks.record import Record, add_out
 from benchmarks.sfm_accuracy import errors
 from stages import ingest, sfm
 from stages.io.sparse_model import SparseModel
@@ -81,36 +82,30 @@ def ours(photos: Path, folder: Path) -> tuple[Path, dict[str, float], str]:
     return folders["sfm"] / "sparse", parts, progress.parts()
 
 
-def quality(model: SparseModel, reference: Path) -> str:
-    """Registered photos, points and errors in words."""
-    words = f"{len(model.images)} registered, {len(model.xyz)} points, {model.error_px.mean():.2f} px"
+def quality(model: SparseModel, reference: Path) -> dict[str, Any]:
+    """Registered photos, points and errors."""
+    found = {"registered": len(model.images), "points": len(model.xyz), "reprojection_px": model.error_px.mean()}
     if not reference.exists():
-        return words
+        return found | {"centres_mm": None, "rotations_deg": None}
     millimetres, degrees = errors(model, json.loads(reference.read_text()))
-    return f"{words}, centres {millimetres.mean():.2f} mm, rotations {np.mean(degrees):.3f}°"
+    return found | {"centres_mm": millimetres.mean(), "rotations_deg": np.mean(degrees)}
 
 
-def compare(data: Path) -> None:
-    """Run both on one set and print what came out."""
-    totals = []
-    for name in ("COLMAP's defaults", "ingest + sfm"):
+def compare(data: Path, record: Record) -> None:
+    """Run both on one set and record what came out."""
+    for name in ("COLMAP's defaults", "ingest and sfm"):
         spent = sum(os.times()[:4])
         with tempfile.TemporaryDirectory() as scratch:
-            if name == "ingest + sfm":
+            if name == "ingest and sfm":
                 sparse, parts, more = ours(data / "images", Path(scratch))
             else:
                 sparse, parts, more = *colmaps_defaults(data / "images", Path(scratch)), ""
-            words = quality(read_model(sparse), data / "reference_cameras.json")
-        totals.append(np.array([sum(parts.values()), sum(os.times()[:4]) - spent]))
-        line = ", ".join(f"{part} {seconds:.1f}" for part, seconds in parts.items())
-        print(
-            f"{data.name:14s} {name:18s} {totals[-1][0]:7.1f} s, processors {totals[-1][1]:.1f} s  ({line})  {words}",
-            flush=True,
-        )
+            found = quality(read_model(sparse), data / "reference_cameras.json")
+        seconds, cpu_seconds = round(sum(parts.values()), 1), round(sum(os.times()[:4]) - spent, 1)
+        line = ", ".join(f"{part} {each:.1f}" for part, each in parts.items())
+        record.add(set=data.name, program=name, seconds=seconds, cpu_seconds=cpu_seconds, **found, parts=line)
         if more:
             print(f"    {more}")
-    wall, processors = totals[1] / totals[0]
-    print(f"{data.name:14s} ratio {wall:.2f}, of processor time {processors:.2f}", flush=True)
 
 
 def main() -> None:
@@ -118,10 +113,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", type=Path)
     parser.add_argument("--sets", nargs="+", default=["fox", "fountain_p11"])
+    add_out(parser)
     arguments = parser.parse_args()
+    record = Record(arguments.out)
     pycolmap.logging.minloglevel = 2
     for name in arguments.sets:
-        compare(arguments.data / name)
+        compare(arguments.data / name, record)
 
 
 if __name__ == "__main__":

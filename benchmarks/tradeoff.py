@@ -1,26 +1,27 @@
-"""The studies in the documentation: runs `pipeline tradeoff` on photo sets and writes plots and tables into docs/.
+"""A study for the documentation: runs `pipeline tradeoff` on a photo set and records its points.
 
-    nice python -m benchmarks.tradeoff ../shared/data lego_400 fox --budget 30m --workspaces /tmp/studies
+    nice python -m benchmarks.tradeoff ../shared/data/fox --budget 30m --workspace /tmp/fox.nerf \
+        --out benchmarks/results/tradeoff_fox.json
 
-Writes docs/images/tradeoff_SET.png and ablation_SET.png, and recommendation and table of each set into docs/numbers.md,
-in place of what is between its two marks. Every set is trained as by default first: that field is a point, too.
-Run it on an idle machine. Interrupted, the same command goes on where it stopped.
+With ``--out`` its plots become docs/images/tradeoff_SET.png and ablation_SET.png. The set is trained as by default
+first: that field is a point, too. Run it on an idle machine. Interrupted, the same command goes on where it stopped.
 """
 
 import argparse
 from pathlib import Path
 
+from benchmarks.record import Record, add_out
 from pipeline.cli.display import PlainDisplay
 from pipeline.cli.durations import seconds_from
 from pipeline.cli.settings import Settings, with_source
-from pipeline.doctor import machine
 from pipeline.engine.runner import Runner
 from pipeline.engine.stage_list import needed_for
 from pipeline.engine.workspace import Workspace
+from stages.io.files import read_json
 from stages.tradeoff import Config
+from stages.tradeoff.runs import resolution_words
 
-DOCS = Path(__file__).parents[1] / "docs"
-FIRST_MARK, LAST_MARK = "<!-- studies -->\n", "<!-- end of studies -->"
+IMAGES = Path(__file__).parents[1] / "docs" / "images"
 
 
 def study(photos: Path, root: Path, seconds: float) -> Path:
@@ -32,39 +33,30 @@ def study(photos: Path, root: Path, seconds: float) -> Path:
         return workspace.folder("tradeoff", runner.done["tradeoff"].key)
 
 
-def documented(name: str, folder: Path) -> str:
-    """Copies a study's pictures into docs/images; its section of docs/numbers.md."""
-    lines = [
-        f"### A study of {name}",
-        "",
-        f"![quality against training time of {name}](images/tradeoff_{name}.png)",
-        "",
-    ]
-    (DOCS / "images" / f"tradeoff_{name}.png").write_bytes((folder / "tradeoff.png").read_bytes())
-    if (folder / "ablation.png").exists():
-        (DOCS / "images" / f"ablation_{name}.png").write_bytes((folder / "ablation.png").read_bytes())
-        lines += [f"![the method and its ablations on {name}](images/ablation_{name}.png)", ""]
-    return "\n".join([*lines, (folder / "tradeoff.md").read_text("utf-8")])
-
-
 def main() -> None:
-    """Study every set and write the page."""
+    """Study the set and record its points."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("data", type=Path, help="the folder of the sets")
-    parser.add_argument("sets", nargs="+")
+    parser.add_argument("photos", type=Path)
     parser.add_argument("--budget", default="30m")
-    parser.add_argument("--workspaces", type=Path, required=True)
+    parser.add_argument("--workspace", type=Path, required=True)
+    add_out(parser)
     given = parser.parse_args()
-    seconds = seconds_from(given.budget)
-    facts = machine.facts()
-    where = f"{facts['cores']} cores, {facts['gpu'] or 'no GPU'}, torch {facts['torch']}; {given.budget} each."
-    sections = [
-        documented(name, study(given.data / name, given.workspaces / f"{name}.nerf", seconds)) for name in given.sets
-    ]
-    page = DOCS / "numbers.md"
-    before, rest = page.read_text("utf-8").split(FIRST_MARK)
-    after = rest.split(LAST_MARK)[1]
-    page.write_text(before + FIRST_MARK + "\n".join([where, "", *sections]) + LAST_MARK + after, "utf-8")
+    folder, record = study(given.photos, given.workspace, seconds_from(given.budget)), Record(given.out)
+    for point in read_json(folder / "tradeoff.json")["points"]:
+        record.add(
+            field=point["variant"],
+            photos=resolution_words(point["downscale"]),
+            **{key: point[key] for key in ("steps", "train_seconds", "frame_seconds")},
+            memory=point["peak_memory_mb"] and f"{point['peak_memory_mb']:,.0f} MB",
+            model=f"{point['model_mb']:.1f} MB",
+            psnr=point["psnr"] if point["deviation"] is None else [point["psnr"], point["deviation"]],
+            ssim=point["ssim"] if point["ssim_deviation"] is None else [point["ssim"], point["ssim_deviation"]],
+            seeds=point["seeds"],
+            front=point["front"],
+        )
+    if given.out:
+        for plot in folder.glob("*.png"):
+            (IMAGES / f"{plot.stem}_{given.photos.name}.png").write_bytes(plot.read_bytes())
 
 
 if __name__ == "__main__":

@@ -1,24 +1,25 @@
-"""The documentation agrees with the code: links, options, the example in Python, the table of rooms."""
+"""The documentation agrees with the code: links, options, the example in Python, the table of modules."""
 
+import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
 
-import pytest
 from tyro.conf import Suppress
 
+from benchmarks import results
 from pipeline.engine.stage_list import STAGES
 
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 CHANGELOG = ROOT / "CHANGELOG.md"
-GENERATED = ROOT / "docs" / "NUMERICS.md"
+GENERATED = {ROOT / "docs" / "NUMERICS.md", ROOT / "docs" / "results.md"}
 MAX_PROSE = 128
+MAX_RESULTS = 250
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 OPTION = re.compile(rf"--({'|'.join(STAGES)})\.([a-z][a-z0-9_-]*)")
 CALL = re.compile(r"(?m)^(?:\w+ = )?run\((\w+), \1\.Config\(.*?\)(?:, \[(.*)\])?\)$")
 CODE = re.compile(r"(?ms)^```(\w*)$\n(.*?)^```$\n")
-STUDIES = re.compile(r"(?s)<!-- studies -->.*<!-- end of studies -->")
 MODULE = re.compile(r"(?m)^\| `((?:nerf|stages|pipeline)/[\w/]+\.py)` \|")
 
 
@@ -53,9 +54,8 @@ def anchors(text: str) -> Iterator[str]:
 
 
 def prose(text: str) -> list[str]:
-    """Lines that are no code, no table, no picture and not written by a program."""
-    lines = STUDIES.sub("", CODE.sub("", text)).splitlines()
-    return [line for line in lines if not line.lstrip().startswith(("|", "!["))]
+    """Lines that are no code, no table and no picture."""
+    return [line for line in CODE.sub("", text).splitlines() if not line.lstrip().startswith(("|", "!["))]
 
 
 def calls_of_run(text: str) -> list[tuple[str, tuple[str, ...]]]:
@@ -63,20 +63,51 @@ def calls_of_run(text: str) -> list[tuple[str, tuple[str, ...]]]:
     return [(stage, tuple(re.findall(r'"(\w+)"', names))) for stage, names in CALL.findall(text)]
 
 
-@pytest.mark.parametrize("page", [*PAGES, CHANGELOG], ids=name_of)
-def test_links_lead_somewhere(page: Path):
+def dead_links(page: Path) -> Iterator[str]:
+    """What a page points at and nobody finds."""
     for target in LINK.findall(page.read_text("utf-8")):
         if re.match(r"[a-z]+:", target):
             continue
         path, _, anchor = target.partition("#")
         other = page.parent / path if path else page
-        assert other.exists(), target
-        assert not anchor or anchor in anchors(other.read_text("utf-8")), target
+        if not other.exists() or (anchor and anchor not in anchors(other.read_text("utf-8"))):
+            yield f"{page.name}: {target}"
 
 
-@pytest.mark.parametrize("page", [page for page in [*PAGES, CHANGELOG] if page != GENERATED], ids=name_of)
-def test_prose_is_wrapped(page: Path):
-    assert not [line for line in prose(page.read_text("utf-8")) if len(line) > MAX_PROSE]
+def unlike_the_code(stage: str, page: str) -> Iterator[str]:
+    """Options whose default in the table is not the code's. One that is chosen (None) is described in words."""
+    for name, field in STAGES[stage].Config.model_fields.items():
+        if isinstance(field.default, bool) or not isinstance(field.default, int | float):
+            continue
+        option = f"--{stage}.{name.replace('_', '-')}"
+        row = re.search(rf"(?m)^\| `{option}` \| ([^|]+) \|", page)
+        if not row or float(row[1]) != field.default:
+            yield option
+
+
+def page_of(stage: str) -> str:
+    return (ROOT / "docs" / "stages" / f"{stage}.md").read_text("utf-8")
+
+
+def test_links_lead_somewhere():
+    assert [dead for page in [*PAGES, CHANGELOG] for dead in dead_links(page)] == []
+
+
+def test_prose_is_wrapped():
+    lines = {name_of(page): prose(page.read_text("utf-8")) for page in [*PAGES, CHANGELOG] if page not in GENERATED}
+    assert [f"{page}: {line}" for page in lines for line in lines[page] if len(line) > MAX_PROSE] == []
+
+
+def test_results_are_what_the_json_files_give():
+    assert results.PAGE.read_text("utf-8") == results.page(), "python -m benchmarks.results"
+    assert len(results.page().splitlines()) <= MAX_RESULTS
+
+
+def test_every_file_of_figures_says_where_they_come_from():
+    records = {path.name: json.loads(path.read_text("utf-8")) for path in results.RESULTS.glob("*.json")}
+    assert len(records) > 20
+    wanted = {"command", "date", "machine", "commit", "figures"}
+    assert not [name for name, record in records.items() if not (wanted <= record.keys() and record["figures"])]
 
 
 def test_the_example_in_python_gives_stages_what_they_need():
@@ -93,45 +124,43 @@ def test_the_pages_are_linked():
     assert not [name_of(page) for page in PAGES[1:] if page not in linked and page.parent not in folders]
 
 
-@pytest.mark.parametrize("page", PAGES, ids=name_of)
-def test_options_named_exist(page: Path):
-    wrong = [f"--{stage}.{option}" for stage, option in documented(page.read_text()) if option not in flags_of(stage)]
-    assert not wrong
+def test_options_named_exist():
+    named = [(page, stage, option) for page in PAGES for stage, option in sorted(documented(page.read_text("utf-8")))]
+    assert [
+        f"{name_of(page)}: --{stage}.{option}" for page, stage, option in named if option not in flags_of(stage)
+    ] == []
 
 
-@pytest.mark.parametrize("stage", STAGES)
-def test_every_option_is_on_its_stages_page(stage: str):
-    page = (ROOT / "docs" / "stages" / f"{stage}.md").read_text("utf-8")
-    assert options_of(stage) == {option for of, option in documented(page) if of == stage and option in options_of(of)}
+def test_every_option_is_on_its_stages_page():
+    named = {stage: {option for of, option in documented(page_of(stage)) if of == stage} for stage in STAGES}
+    missing = [f"--{stage}.{option}" for stage in STAGES for option in sorted(options_of(stage) - named[stage])]
+    assert missing == []
 
 
-@pytest.mark.parametrize("stage", STAGES)
-def test_defaults_in_the_tables_are_those_of_the_code(stage: str):
-    """Compared where the default is a number; one that is chosen (None) is described in words."""
-    page = (ROOT / "docs" / "stages" / f"{stage}.md").read_text("utf-8")
-    for name, field in STAGES[stage].Config.model_fields.items():
-        if isinstance(field.default, bool) or not isinstance(field.default, int | float):
-            continue
-        row = re.search(rf"(?m)^\| `--{stage}\.{name.replace('_', '-')}` \| ([^|]+) \|", page)
-        assert row and float(row[1]) == field.default, name
+def test_defaults_in_the_tables_are_those_of_the_code():
+    assert [option for stage in STAGES for option in unlike_the_code(stage, page_of(stage))] == []
 
 
-def test_the_table_of_rooms_is_complete():
-    rooms = MODULE.findall((ROOT / "docs" / "ARCHITECTURE.md").read_text("utf-8"))
+def test_the_table_of_modules_is_complete():
+    listed = MODULE.findall((ROOT / "docs" / "ARCHITECTURE.md").read_text("utf-8"))
     modules = [name_of(path) for package in ("nerf", "stages", "pipeline") for path in (ROOT / package).rglob("*.py")]
     assert len(modules) > 60
-    assert sorted(rooms) == sorted(modules)
+    assert sorted(listed) == sorted(modules)
 
 
-def test_the_checks_can_fail():
+def test_the_checks_can_fail(tmp_path: Path):
     assert documented("`--train.steps 500` and --mesh.max-faces") == {("train", "steps"), ("mesh", "max-faces")}
     assert "photos" not in options_of("ingest") and "cameras" not in options_of("sfm")
     assert "cameras" in options_of("render") and "no-depth" in flags_of("render")
     assert "steppes" not in flags_of("train")
+    assert list(unlike_the_code("train", page_of("train").replace("| 0 |", "| 1 |"))) == ["--train.seed"]
+    nowhere = tmp_path / "page.md"
+    nowhere.write_text("# Here\n[a](b.md) [b](#here) [c](#there) [d](https://example.org)\n", "utf-8")
+    assert [dead.split(": ")[1] for dead in dead_links(nowhere)] == ["b.md", "#there"]
     assert MODULE.findall("| `nerf/geometry/rays.py` | rays |\nnerf/model.py") == ["nerf/geometry/rays.py"]
     headings = "# A `b`, c_d\n```\n# e\n```\n## See [f](g)\n## A b c_d\n"
     assert list(anchors(headings)) == ["a-b-c_d", "see-f", "a-b-c_d-1"]
-    assert prose("Words\n```\ncode\n```\n| table |\n<!-- studies -->\nx\n<!-- end of studies -->\n") == ["Words", ""]
+    assert prose("Words\n```\ncode\n```\n| table |\n![picture](a.png)\n") == ["Words"]
     assert calls_of_run('run(a, inputs)\nrun(a, a.Config())\nc = run(b, b.Config(d=(1, 2)), ["a", "e"])\n') == [
         ("a", ()),
         ("b", ("a", "e")),

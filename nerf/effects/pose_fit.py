@@ -8,18 +8,18 @@ from torch import Tensor
 
 from nerf.effects import AS_RENDERED, PhotoColours, Seen
 from nerf.effects.pose_refinement import LARGEST_UNIT, RefinedPoses
-from nerf.fields.hash_grid import GridField
+from nerf.fields.hash_grid import HashGridField
 from nerf.geometry.rays import Rays
 from nerf.runtime.randomness import generator
 
 STEPS = 40
 RAYS = 256  # looked at in a step
 RATE = 3e-3  # radians and units of shift at first, falling exponentially to
-FINAL_RATE = 0.1  # of it
+LR_FINAL_FRACTION = 0.1  # of it
 
 
 def fit_pose(
-    model: GridField,
+    model: HashGridField,
     rays: Rays,
     target: Float[Tensor, "pixels 3"],
     background: Float[Tensor, "3"],
@@ -41,14 +41,14 @@ def fit_pose(
         places = torch.rand(2, len(pixel), generator=random, device=target.device)
         some = rays.each(itemgetter(pixel))
         gradients = _gradients(model, pose, photo_colours, (some, target[pixel], background), places)
-        rate = RATE * FINAL_RATE ** (step / (STEPS - 1))
+        rate = RATE * LR_FINAL_FRACTION ** (step / (STEPS - 1))
         for name, gradient in gradients.items():
             model.backend.adam(pose.parameters[name], gradient, mean[name], square[name], rate, step + 1)
     return pose
 
 
 def _gradients(
-    model: GridField,
+    model: HashGridField,
     pose: RefinedPoses,
     photo_colours: PhotoColours,
     pixels: tuple[Rays, Float[Tensor, "pixels 3"], Float[Tensor, "3"]],

@@ -17,19 +17,19 @@ from nerf.kernels import Backend, grid_layout
 # Of the last, one cell is 7° wide: skies and far hills, not what has parallax. Three features are a colour; the kernels
 # read four.
 LAYOUT = grid_layout(levels=2, coarsest=4, finest=16, log2_rows=13, features=4)
-# Of the field's. The sky must be found before fog near the cameras takes its place (docs/numbers.md).
+# Of the field's. The sky must be found before fog near the cameras takes its place (docs/experiments/learning_rate.md).
 RATE = 10.0
 # Pulls what rays run to towards grey, as hard as so much of a ray's light pulls towards the photo. What is hidden gets
 # less light than that, which Adam, whose steps are as long for faint gradients, would follow to black and white.
 PRIOR = 1e-5
 
 
-def initial_sky() -> Float[Tensor, "rows 4"]:
+def initial_background() -> Float[Tensor, "rows 4"]:
     """Grey in every direction."""
     return torch.zeros(LAYOUT.rows, LAYOUT.features)
 
 
-def sky_colour(
+def background_colour(
     backend: Backend, sky: Float[Tensor, "rows 4"], directions: Float[Tensor, "rays 3"]
 ) -> Float[Tensor, "rays 3"]:
     """The colour seen in each direction (unit vectors)."""
@@ -37,7 +37,7 @@ def sky_colour(
     return features.view(-1, len(LAYOUT.resolutions), LAYOUT.features).sum(1)[:, :3].sigmoid()
 
 
-def sky_backward(
+def background_backward(
     backend: Backend,
     directions: Float[Tensor, "rays 3"],
     colour: Float[Tensor, "rays 3"],

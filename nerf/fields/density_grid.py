@@ -29,7 +29,7 @@ class Lattice(NamedTuple):
         return (self.high - self.low) / (torch.tensor(self.values.shape, device=self.low.device) - 1)
 
 
-def density_lattice(
+def sample_density_grid(
     model: RadianceModel,
     resolution: int,
     low: Float[Tensor, "3"],
@@ -131,7 +131,7 @@ def first_crossing(
     return torch.where(above.any(-1, keepdim=True), t0 + (t1 - t0) * share, torch.inf).squeeze(-1)
 
 
-def stopping_distance(lattice: Lattice, rays: Rays, samples: int) -> Float[Tensor, "*rays"]:
+def median_depth(lattice: Lattice, rays: Rays, samples: int) -> Float[Tensor, "*rays"]:
     """Distance at which half of the light is lost to the density lattice: the median depth; infinite if never."""
     rays = clip_to_box(rays, lattice.low, lattice.high)
     t = ray_distances(rays, samples)

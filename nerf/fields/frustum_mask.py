@@ -19,7 +19,7 @@ from nerf.geometry.near_far import NEAR_MARGIN
 from nerf.kernels import CONTRACTED_BOX
 from nerf.kernels.torch.occupancy import cell_corners, grown
 from nerf.runtime.parallel import in_order
-from nerf.training.ray_dataset import RayBank
+from nerf.training.ray_dataset import RayDataset
 
 SIDE = 64  # coarse cells along an edge of the unit cube
 EDGE_PIXELS = 16  # along each side of a photo, from which its field of view is known
@@ -30,17 +30,17 @@ TOGETHER = 16  # photos that look at once, on all cores, at what is undecided; f
 _answers: MutableMapping[Tensor, dict[tuple[int, int], Tensor]] = WeakTensorKeyDictionary()
 
 
-def usable_cells(bank: RayBank, least: int, cells: int) -> Bool[Tensor, "cache"]:
+def compute_frustum_mask(bank: RayDataset, least: int, cells: int) -> Bool[Tensor, "cache"]:
     """Which of ``cells``³ cells of folded space, in the order of ``nerf.kernels.torch.occupancy``, may hold something:
     those whose middles ``least`` photos of ``bank`` look at, or one, from where its foreground begins; and a coarse
     cell around them. What hides them, and masks, count for nothing. Found once for a bank; not to be written to."""
     answers = _answers.setdefault(bank.geometry, {})
     if (least, cells) not in answers:
-        answers[least, cells] = _usable_cells(bank, least, cells)
+        answers[least, cells] = _compute_frustum_mask(bank, least, cells)
     return answers[least, cells]
 
 
-def _usable_cells(bank: RayBank, least: int, cells: int) -> Bool[Tensor, "cache"]:
+def _compute_frustum_mask(bank: RayDataset, least: int, cells: int) -> Bool[Tensor, "cache"]:
     side, views = min(SIDE, cells), range(len(bank.near))
     middles = _middles(side, bank.device)
     undecided = torch.arange(side**3, device=bank.device)
@@ -67,7 +67,7 @@ def _middles(side: int, device: torch.device) -> Float[Tensor, "3 cells"]:
 
 
 def _looked_at(
-    bank: RayBank, points: Float[Tensor, "3 points"], view: int
+    bank: RayDataset, points: Float[Tensor, "3 points"], view: int
 ) -> tuple[Bool[Tensor, "points"], Bool[Tensor, "points"]]:
     """Which points a photo may show between near and far, and which of these are no nearer than its foreground."""
     geometry = bank.geometry[:, view]
@@ -86,7 +86,7 @@ def _angles(vectors: Float[Tensor, "3 n"]) -> Float[Tensor, "2 n"]:
     return torch.atan2(vectors[:2], vectors[2:])
 
 
-def _spread_directions(bank: RayBank, view: int) -> Float[Tensor, "rays 3"]:
+def _spread_directions(bank: RayDataset, view: int) -> Float[Tensor, "rays 3"]:
     """Of EDGE_PIXELS² rays of a photo, those of its corners among them."""
     first, end = bank.first_pixel[view : view + 2].tolist()
     width = int(bank.layout[1, view])

@@ -15,31 +15,33 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
 
 from nerf.fields import mlp as grid_mlp
-from nerf.fields.background import directions_backward, initial_sky, sky_backward, sky_colour
+from nerf.fields.background import background_backward, background_colour, directions_backward, initial_background
 from nerf.fields.interface import Rendering
 from nerf.fields.mlp import ColourPass, DensityPass, Weights
 from nerf.geometry.rays import Rays
 from nerf.kernels import BOX, Backend, GridLayout, Lattice, Occupied, Samples, grid_layout
 from nerf.kernels.torch.marching import unit_coordinates
 from nerf.kernels.torch.occupancy import cell_numbers, is_occupied, occupied
-from nerf.rendering.early_termination import HIDDEN_BEHIND, Wave, front_to_back
+from nerf.rendering.early_termination import EARLY_STOP_TRANSMITTANCE, Wave, march_with_early_termination
 from nerf.runtime.profiler import Work, part
 from nerf.runtime.randomness import generator
 
 INITIAL_FEATURE = 1e-4
 # Far beyond any use: no loop over them is endless, and indices stay within 32 bits.
-LARGEST = {"levels": 64, "features": 256, "log2_rows": 30, "finest": 2**20, "cache_cells": 1024} | {
+LARGEST = {"levels": 64, "features": 256, "log2_rows": 30, "finest": 2**20, "occupancy_resolution": 1024} | {
     "steps": 10**6,
     "most_samples": 10**6,
 }
-DRAWN_CLOSER = 1.5  # samples of a drawn ray for one in training (docs/numbers.md: Samples along a ray)
-THIN = 1e-2  # optical thickness below which a sample of training stands for others like it (docs/numbers.md)
-QUANTUM = 1 / 512  # share of a ray's light that a picture may show in a neighbouring sample's colour (docs/numbers.md)
+DRAWN_CLOSER = 1.5  # samples of a drawn ray for one in training (docs/experiments/ray_samples.md)
+# Optical thickness below which a sample of training stands for others like it (docs/experiments/ray_samples.md).
+THIN = 1e-2
+# Share of a ray's light that a picture may show in a neighbouring sample's colour (docs/experiments/colour_samples.md).
+QUANTUM = 1 / 512
 CORNERS = 8  # of a cell: rows that a point reads of each grid
 
 
 @dataclass(frozen=True)
-class GridSettings:
+class HashGridSettings:
     """Sizes of a grid field. Raises ValueError on impossible ones.
 
     ``steps``: lattice steps along the diagonal of a bounded scene's box. ``shortest_step`` (scene units) and ``cone``
@@ -58,20 +60,20 @@ class GridSettings:
     shortest_step: float = 0.002
     cone: float = 0.008
     most_samples: int = 1024
-    cache_cells: int = 128
+    occupancy_resolution: int = 128
     view_dependence: bool = True
     sky: bool = False
 
     def __post_init__(self) -> None:
         at_least = {"levels": 1, "features": 1, "log2_rows": 1, "coarsest": 1, "steps": 1, "most_samples": 1}
-        for name, least in (at_least | {"finest": self.coarsest, "cache_cells": 4}).items():
+        for name, least in (at_least | {"finest": self.coarsest, "occupancy_resolution": 4}).items():
             if getattr(self, name) < least:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be at least {least}")
         for name, most in LARGEST.items():
             if getattr(self, name) > most:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be at most {most}")
-        if self.cache_cells % 4:
-            raise ValueError(f"cache_cells is {self.cache_cells}; it must be a multiple of 4")
+        if self.occupancy_resolution % 4:
+            raise ValueError(f"occupancy_resolution is {self.occupancy_resolution}; it must be a multiple of 4")
         if not (0 < self.shortest_step < math.inf and 0 < self.cone < math.inf):
             raise ValueError(f"shortest_step ({self.shortest_step}) and cone ({self.cone}) must be positive numbers")
 
@@ -84,9 +86,9 @@ class GridSettings:
     def lattice(self) -> Lattice:
         """Of the samples."""
         if self.contracted:
-            return Lattice(self.shortest_step, self.cone, True, self.cache_cells, self.most_samples)
+            return Lattice(self.shortest_step, self.cone, True, self.occupancy_resolution, self.most_samples)
         step = 2 * BOX * math.sqrt(3) / self.steps
-        return Lattice(step, 0.0, False, self.cache_cells, self.most_samples)
+        return Lattice(step, 0.0, False, self.occupancy_resolution, self.most_samples)
 
     @property
     def drawn_lattice(self) -> Lattice:
@@ -100,8 +102,8 @@ class GridSettings:
         return lattice._replace(step=step, cone=cone, most_samples=most)
 
 
-class GridPass(NamedTuple):
-    """What a rendering computed on its way, for :meth:`GridField.backward`; ``marched`` counts all densities asked,
+class HashGridPass(NamedTuple):
+    """What a rendering computed on its way, for :meth:`HashGridField.backward`; ``marched`` counts all densities asked,
     ``thickness`` is of the samples' own intervals, not of what they stand for."""
 
     rays: Rays
@@ -117,7 +119,7 @@ class GridPass(NamedTuple):
     weights: Float[Tensor, "samples"]
 
 
-class GridGradients(NamedTuple):
+class HashGridGradients(NamedTuple):
     """Of the networks and, by way of the samples' features, the rays' harmonics and the background, of whatever lies
     before them."""
 
@@ -127,7 +129,7 @@ class GridGradients(NamedTuple):
     background: Float[Tensor, "rays 3"]
 
 
-class GridField(nn.Module):
+class HashGridField(nn.Module):
     """A RadianceModel in the scene frame; its parameters are a function of ``settings`` and ``seed``.
 
     Nothing here needs autograd: parameters are buffers, and gradients are computed by :meth:`backward`.
@@ -144,7 +146,7 @@ class GridField(nn.Module):
     colour_out: Tensor
     sky: Tensor
 
-    def __init__(self, settings: GridSettings, seed: int, backend: Backend) -> None:
+    def __init__(self, settings: HashGridSettings, seed: int, backend: Backend) -> None:
         super().__init__()
         self.settings, self.backend = settings, backend
         self.layout, self.lattice, self.drawn_lattice = settings.layout, settings.lattice, settings.drawn_lattice
@@ -160,15 +162,17 @@ class GridField(nn.Module):
         for name, weight in grid_mlp.initial_weights(self.layout.width, direction, random)._asdict().items():
             self.register_buffer(name, weight)
         if settings.sky:
-            self.register_buffer("sky", initial_sky())
-        self.register_buffer("bits", torch.full((settings.cache_cells**3 // 64,), -1))  # every cell may hold something
-        self.register_buffer("clearance", torch.zeros(settings.cache_cells**3 // 64, dtype=torch.uint8))
+            self.register_buffer("sky", initial_background())
+        self.register_buffer(
+            "bits", torch.full((settings.occupancy_resolution**3 // 64,), -1)
+        )  # every cell may hold something
+        self.register_buffer("clearance", torch.zeros(settings.occupancy_resolution**3 // 64, dtype=torch.uint8))
 
-    def on_cpu(self) -> "GridField":
+    def on_cpu(self) -> "HashGridField":
         """This field, or on a GPU its like in the CPU's memory."""
         if self.table.device.type == "cpu":
             return self
-        like = GridField(self.settings, 0, self.backend)
+        like = HashGridField(self.settings, 0, self.backend)
         like.load_state_dict(self.state_dict())
         return like
 
@@ -207,7 +211,7 @@ class GridField(nn.Module):
     def _located(self, points: Float[Tensor, "*points 3"]) -> tuple[Float[Tensor, "n 3"], Bool[Tensor, "n"]]:
         """Unit coordinates of points, and which of them lie in cells that are sampled and in a bounded scene's box."""
         unit = unit_coordinates(points, self.settings.contracted).reshape(-1, 3)
-        sampled = is_occupied(self.bits, cell_numbers(self.settings.cache_cells, unit))
+        sampled = is_occupied(self.bits, cell_numbers(self.settings.occupancy_resolution, unit))
         if not self.settings.contracted:
             sampled &= (points.reshape(-1, 3).abs() <= BOX).all(-1)
         return unit, sampled
@@ -226,11 +230,11 @@ class GridField(nn.Module):
         of_rays = grid_mlp.ray_hidden(self.weights, self.of_directions(rays.directions))
         for wave in self._waves(rays, torch.full_like(rays.near, 0.5), self.drawn_lattice):
             with part("composite"):
-                drawn = backend.drawn_samples(wave.samples, wave.density.sigma, QUANTUM, depth, shown)
+                drawn = backend.select_colour_samples(wave.samples, wave.density.sigma, QUANTUM, depth, shown)
                 geometry = wave.density.geometry.index_select(0, drawn.rows)
             colour = grid_mlp.colour_of(self.weights, drawn.samples.ray, geometry, of_rays)
             with part("composite"):
-                backend.add_drawn(drawn, colour, seen)
+                backend.accumulate_colours(drawn, colour, seen)
         light, opacity = (each.to(seen.dtype) for each in (torch.exp(-depth), -torch.expm1(-depth)))
         seen *= torch.where(shown == 0, 1, opacity / shown)[:, None]
         behind = self._behind(rays, background)
@@ -242,16 +246,16 @@ class GridField(nn.Module):
         jitter: Float[Tensor, "rays"],
         offset: Float[Tensor, "rays"],
         background: Float[Tensor, "rays 3"],
-    ) -> GridPass:
+    ) -> HashGridPass:
         """Density of all samples in occupied cells; colour of those that can be seen, thin ones standing for others
         like them (``Backend.visible_samples``, which ``offset`` is for)."""
         backend, rays = self.backend, rays.each(Tensor.contiguous)
         background = self._behind(rays, background)
         waves = list(self._waves(rays, jitter, self.lattice))
         with part("march"):
-            marched, order = backend.pack_waves([wave.samples for wave in waves])
+            marched, order = backend.pack_rounds([wave.samples for wave in waves])
             sigma = torch.cat([wave.density.sigma for wave in waves]).index_select(0, order)
-            samples, seen = backend.visible_samples(marched, sigma, HIDDEN_BEHIND, THIN, offset)
+            samples, seen = backend.visible_samples(marched, sigma, EARLY_STOP_TRANSMITTANCE, THIN, offset)
             rows = order.index_select(0, seen)
             points = torch.cat([wave.points for wave in waves]).index_select(0, rows)
             of_waves = zip(*(wave.density for wave in waves), strict=True)
@@ -264,9 +268,11 @@ class GridField(nn.Module):
         with part("composite"):
             rendering, weights = backend.composite(samples, density.sigma, colour.colour, background, rays.far)
         of_samples = samples, points, thickness, density
-        return GridPass(rays, background, len(order), *of_samples, harmonics, colour, rendering, weights)
+        return HashGridPass(rays, background, len(order), *of_samples, harmonics, colour, rendering, weights)
 
-    def backward(self, done: GridPass, grad: Rendering, grad_weights: Float[Tensor, "samples"]) -> GridGradients:
+    def backward(
+        self, done: HashGridPass, grad: Rendering, grad_weights: Float[Tensor, "samples"]
+    ) -> HashGridGradients:
         """Gradients of a loss, given those of the rendering and of the samples' weights."""
         backend, density, colour = self.backend, done.density, done.colour
         grad_sigma, grad_colour = backend.composite_backward(
@@ -276,10 +282,10 @@ class GridField(nn.Module):
         of_density = grid_mlp.density_backward(self.weights, backend, density, grad_sigma, of_colour.geometry)
         weights = Weights(of_density.density_hidden, of_density.density_out, *of_colour[:2])
         of_background = (1 - done.rendering.opacity)[:, None] * grad.colour
-        return GridGradients(weights, of_density.features, of_colour.harmonics, of_background)
+        return HashGridGradients(weights, of_density.features, of_colour.harmonics, of_background)
 
     def rays_backward(
-        self, done: GridPass, gradients: GridGradients
+        self, done: HashGridPass, gradients: HashGridGradients
     ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays 3"]]:
         """Gradients of the rays' origins and directions, for refining poses."""
         backend, rays, samples = self.backend, done.rays, done.samples
@@ -294,15 +300,15 @@ class GridField(nn.Module):
             )
         return grad_origins, grad_directions
 
-    def sky_backward(self, done: GridPass, gradients: GridGradients) -> Float[Tensor, "rows 4"]:
+    def background_backward(self, done: HashGridPass, gradients: HashGridGradients) -> Float[Tensor, "rows 4"]:
         """Gradient of the sky, for a field that has one."""
-        return sky_backward(self.backend, done.rays.directions, done.background, gradients.background)
+        return background_backward(self.backend, done.rays.directions, done.background, gradients.background)
 
     def _behind(self, rays: Rays, background: Float[Tensor, "*#rays 3"]) -> Float[Tensor, "*#rays 3"]:
-        return sky_colour(self.backend, self.sky, rays.directions) if self.settings.sky else background
+        return background_colour(self.backend, self.sky, rays.directions) if self.settings.sky else background
 
     def _waves(self, rays: Rays, jitter: Float[Tensor, "rays"], lattice: Lattice) -> Iterator[Wave]:
-        return front_to_back(
+        return march_with_early_termination(
             self.backend, Occupied(self.bits, self.clearance), lattice, self._density_pass, rays, jitter
         )
 

@@ -24,7 +24,7 @@ class Rendering(NamedTuple):
 class RadianceModel(Protocol):
     """A trained field. Points are in the scene frame, densities per scene unit, colours in [0, 1].
 
-    ``chunk_rays``: how many a CPU core best renders at once (docs/numbers.md).
+    ``chunk_rays``: how many a CPU core best renders at once (docs/experiments/early_termination.md).
     """
 
     chunk_rays: int

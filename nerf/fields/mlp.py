@@ -20,7 +20,7 @@ GEOMETRY = 16  # numbers that the density network hands to the colour network; t
 DIRECTION = 16  # spherical harmonics, where colour depends on the direction
 LARGEST_LOG_DENSITY = 15.0
 # Samples whose hidden layer of the density network exists at a time: as many as stay in a core's cache
-# (docs/numbers.md: Waiting for memory); on a GPU all.
+# (docs/experiments/step_time.md); on a GPU all.
 BLOCK = {"cpu": 1 << 12, "cuda": 1 << 22}
 
 

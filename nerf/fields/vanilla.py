@@ -49,7 +49,7 @@ LARGEST = 10_000  # of any size of these networks: far beyond any use, and no lo
 
 
 @dataclass(frozen=True)
-class PaperSettings:
+class VanillaSettings:
     """Sizes and variants; the defaults are the published model. Raises ValueError on impossible values.
 
     ``skip``: index from 0 of the layer after which gamma(x) is concatenated (the published fifth layer has index 4);
@@ -89,10 +89,10 @@ class PaperSettings:
         return self.samples_coarse + (self.samples_coarse + self.samples_fine)
 
 
-class PaperMlp(nn.Module):
+class VanillaMlp(nn.Module):
     """F_theta: (position, direction) -> (density, colour), density independent of direction (figure 7)."""
 
-    def __init__(self, settings: PaperSettings, init: torch.Generator) -> None:
+    def __init__(self, settings: VanillaSettings, init: torch.Generator) -> None:
         super().__init__()
         self.settings = settings
         width = settings.width
@@ -153,16 +153,16 @@ class PaperMlp(nn.Module):
             return positional_encoding(x, frequencies, dtype) if self.settings.positional_encoding else x.to(dtype)
 
 
-class PaperNerf(nn.Module):
+class VanillaNerf(nn.Module):
     """A RadianceModel in the scene frame; weights are a function of ``settings`` and ``seed``."""
 
     chunk_rays = 512
 
-    def __init__(self, settings: PaperSettings, seed: int) -> None:
+    def __init__(self, settings: VanillaSettings, seed: int) -> None:
         super().__init__()
         self.settings = settings
-        self.coarse = PaperMlp(settings, seeded_generator("cpu", seed, 0)) if settings.hierarchical else None
-        self.fine = PaperMlp(settings, seeded_generator("cpu", seed, 1))
+        self.coarse = VanillaMlp(settings, seeded_generator("cpu", seed, 0)) if settings.hierarchical else None
+        self.fine = VanillaMlp(settings, seeded_generator("cpu", seed, 1))
 
     def density(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points"]:
         """Density per scene unit; zero outside the cube to which an uncontracted field is cut."""
@@ -230,7 +230,7 @@ class PaperNerf(nn.Module):
             return torch.sort(torch.cat([t, drawn], -1)).values
 
     def _seen(
-        self, mlp: PaperMlp, rays: Rays, t: Float[Tensor, "*rays ends"], background: Float[Tensor, "*#rays 3"]
+        self, mlp: VanillaMlp, rays: Rays, t: Float[Tensor, "*rays ends"], background: Float[Tensor, "*#rays 3"]
     ) -> tuple[Rendering, Float[Tensor, "*rays ends-1"]]:
         with part("sampling"):
             points = self._coordinates(points_on(rays, t[..., :-1]))

@@ -77,7 +77,7 @@ def _widened(
     return low, high
 
 
-def range_between_views(
+def near_and_far_between_views(
     poses: Float[np.ndarray, "frames 3 4"],
     view_centres: Float[np.ndarray, "n 3"],
     view_near: Float[np.ndarray, "n"],

@@ -182,7 +182,7 @@ class Backend(Protocol):
 
     def relu_backward(self, hidden: Float[Tensor, "samples 64"], grad: Float[Tensor, "samples 64"]) -> None: ...
 
-    def end_wave(
+    def finish_round(
         self,
         lattice: Lattice,
         samples: Samples,
@@ -194,7 +194,7 @@ class Backend(Protocol):
         near: Float[Tensor, "rays"],
     ) -> None: ...
 
-    def pack_waves(self, waves: Sequence[Samples]) -> tuple[Samples, Int32[Tensor, "samples"]]: ...
+    def pack_rounds(self, waves: Sequence[Samples]) -> tuple[Samples, Int32[Tensor, "samples"]]: ...
 
     def visible_samples(
         self,
@@ -225,7 +225,7 @@ class Backend(Protocol):
         grad_weights: Float[Tensor, "samples"],
     ) -> tuple[Float[Tensor, "samples"], Float[Tensor, "samples 3"]]: ...
 
-    def drawn_samples(
+    def select_colour_samples(
         self,
         samples: Samples,
         sigma: Float[Tensor, "samples"],
@@ -234,7 +234,9 @@ class Backend(Protocol):
         shown: Float[Tensor, "rays"],
     ) -> Drawn: ...
 
-    def add_drawn(self, drawn: Drawn, colour: Float[Tensor, "kept 3"], seen: Float[Tensor, "rays 4"]) -> None: ...
+    def accumulate_colours(
+        self, drawn: Drawn, colour: Float[Tensor, "kept 3"], seen: Float[Tensor, "rays 4"]
+    ) -> None: ...
 
     def distortion(
         self, samples: Samples, weights: Float[Tensor, "samples"], lattice: Lattice
@@ -273,7 +275,7 @@ class Backend(Protocol):
         count: int,
     ) -> None: ...
 
-    def raise_cache(
+    def scatter_max(
         self,
         cells: int,
         thickness: Float[Tensor, "cache"],
@@ -281,6 +283,6 @@ class Backend(Protocol):
         values: Float[Tensor, "points"],
     ) -> None: ...
 
-    def occupied_bits(self, thickness: Float[Tensor, "cache"], threshold: float) -> Int64[Tensor, "bricks"]: ...
+    def occupancy_bits(self, thickness: Float[Tensor, "cache"], threshold: float) -> Int64[Tensor, "bricks"]: ...
 
     def cell_corners(self, cells: int, numbers: Int[Tensor, "chosen"]) -> Float[Tensor, "chosen 3"]: ...

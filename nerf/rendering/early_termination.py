@@ -16,9 +16,9 @@ from nerf.geometry.rays import Rays
 from nerf.kernels import Backend, Lattice, Occupied, Samples
 from nerf.runtime.profiler import part
 
-HIDDEN_BEHIND = 1e-3  # transmittance below which the rest of a ray is left out
-# Samples whose densities are computed at once, in all, and per ray (docs/numbers.md). A GPU waits for the host after
-# each wave, and works on a million samples as long as on a few.
+EARLY_STOP_TRANSMITTANCE = 1e-3  # transmittance below which the rest of a ray is left out
+# Samples whose densities are computed at once, in all, and per ray (docs/experiments/early_termination.md). A GPU waits
+# for the host after each wave, and works on a million samples as long as on a few.
 WAVE = {"cpu": 1 << 14, "cuda": 1 << 20}
 SHORTEST_WAVE, LONGEST_WAVE = 6, 64
 
@@ -31,7 +31,7 @@ class Wave(NamedTuple):
     density: DensityPass
 
 
-def front_to_back(
+def march_with_early_termination(
     backend: Backend,
     occupied: Occupied,
     lattice: Lattice,
@@ -56,7 +56,9 @@ def front_to_back(
         density = density_at(points)
         yield Wave(samples, points, density)
         with part("march"):
-            backend.end_wave(of_wave, samples, density.sigma, HIDDEN_BEHIND, jitter, rays.far, depth, near)
+            backend.finish_round(
+                of_wave, samples, density.sigma, EARLY_STOP_TRANSMITTANCE, jitter, rays.far, depth, near
+            )
             taken, going_on = taken + of_wave.most_samples, int((near < rays.far).sum())
 
 

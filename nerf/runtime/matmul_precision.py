@@ -1,7 +1,8 @@
 """Float32 matrix products at torch's precision "medium", where that is measured to be faster and about as exact.
 
 What "medium" means depends on processor and torch: the same arithmetic by another library, bfloat16 or TF32 inside (on
-a Xeon with tiles twice as fast and off by 2e-3; docs/numbers.md), or nothing at all. So it is tried and never assumed.
+a Xeon with tiles twice as fast and off by 2e-3; docs/experiments/reduced_precision.md), or nothing at all. So it is
+tried and never assumed.
 """
 
 import functools
@@ -42,7 +43,7 @@ class Medium(NamedTuple):
 
 
 @contextmanager
-def products_at(precision: Precision | None) -> Iterator[None]:
+def use_matmul_precision(precision: Precision | None) -> Iterator[None]:
     """Compute the whole process's float32 products at ``precision``, afterwards as before. None changes nothing."""
     before = torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision(precision or before)
@@ -53,13 +54,13 @@ def products_at(precision: Precision | None) -> Iterator[None]:
 
 
 @functools.cache
-def medium_products(device: torch.device, width: int) -> Medium:
+def medium_matmul(device: torch.device, width: int) -> Medium:
     """Of products (n, width) x (width, width), the fastest of several at each precision in turn; once in a process, in
     a tenth of a second. Changes no random state."""
     random = torch.Generator(device).manual_seed(0)
     rows = max(FEWEST_ROWS, min(PRODUCT_ROWS, PRODUCT_ROWS * USUAL_WIDTH**2 // width**2))
     a, b = (torch.randn(count, width, generator=random, device=device) for count in (rows, width))
-    with products_at("medium"):
+    with use_matmul_precision("medium"):
         error = error_of(a @ b, a, b)
     seconds = _fastest(a, b)
     return Medium(seconds["highest"] / seconds["medium"], error)
@@ -78,7 +79,7 @@ def _fastest(a: Tensor, b: Tensor) -> dict[Precision, float]:
     while runs < FEWEST_RUNS or time.perf_counter() < until:
         runs += 1
         for precision, least in seconds.items():
-            with products_at(precision):
+            with use_matmul_precision(precision):
                 seconds[precision] = min(least, seconds_of_product(a, b))
     return seconds
 

@@ -1,8 +1,8 @@
 """One chunk of work per core, results in the order of the chunks.
 
 On a CPU, one Python thread per core with torch's own threads off beats torch's threads inside every operation: no
-barrier after each of them, and no collapse when other programs want the cores too (docs/numbers.md). Chunks are
-cut by the caller, never by the number of cores, so results do not depend on it.
+barrier after each of them, and no collapse when other programs want the cores too (docs/experiments/step_time.md).
+Chunks are cut by the caller, never by the number of cores, so results do not depend on it.
 """
 
 import functools

@@ -14,37 +14,39 @@ from nerf.effects import AS_GIVEN, AS_RENDERED, PhotoColours, PhotoRays, Seen
 from nerf.fields import mlp as grid_mlp
 from nerf.fields.background import PRIOR as SKY_PRIOR
 from nerf.fields.background import RATE as SKY_RATE
-from nerf.fields.frustum_mask import usable_cells
-from nerf.fields.hash_grid import CORNERS, GridField, GridPass
+from nerf.fields.frustum_mask import compute_frustum_mask
+from nerf.fields.hash_grid import CORNERS, HashGridField, HashGridPass
 from nerf.fields.interface import Rendering
 from nerf.fields.mlp import Weights
-from nerf.fields.occupancy_grid import DensityCache
+from nerf.fields.occupancy_grid import OccupancyGrid
 from nerf.geometry.rays import Rays
 from nerf.kernels import BOX
 from nerf.runtime.parallel import in_order
 from nerf.runtime.profiler import Work, part
 from nerf.runtime.randomness import generator
-from nerf.training.losses import robust_error
+from nerf.training.losses import huber_loss
 from nerf.training.metrics import psnr
-from nerf.training.pixel_sampler import PixelOrder
-from nerf.training.ray_dataset import RayBank
+from nerf.training.pixel_sampler import PixelSampler
+from nerf.training.ray_dataset import RayDataset
 from nerf.training.trainer import RAYS, NonFinite, StepResult, all_finite
 
 WARM_UP_STEPS = 20
 # Of the run, before the rate begins to fall. A fall over most of the run costs short runs up to 2 dB and gains long
-# ones nothing (docs/numbers.md); and what is measured before it does not depend on how long the run will be.
-CONSTANT_SHARE = 0.75
-FINAL_RATE = 0.05  # of the rate at first
+# ones nothing (docs/experiments/learning_rate.md); and what is measured before it does not depend on how long the run
+# will be.
+LR_HOLD_FRACTION = 0.75
+LR_FINAL_FRACTION = 0.05  # of the rate at first
 # The distortion loss begins weak: it draws fog together wherever that stands, and far things that only smooth colours
-# tell apart (the sky) would be drawn close behind the scene before their place is known (docs/numbers.md).
+# tell apart (the sky) would be drawn close behind the scene before their place is known
+# (docs/experiments/learning_rate.md).
 FIRST_DISTORTION = 0.25  # of its weight
 FULL_DISTORTION_SHARE = 0.3  # of the run
-GUIDED_EVERY = 8  # one ray in so many runs to a sparse point, where some are known
+DEPTH_RAY_INTERVAL = 8  # one ray in so many runs to a sparse point, where some are known
 FIRST_SAMPLES_PER_RAY = 128.0
 # A ray is not free, though it may need no colour: no step has more rays than if each needed so many.
 LEAST_SAMPLES_PER_RAY = 2.0
 # Of the table's entries, how many have a gradient in a step: of 5 grids of 2^18 rows with 33 to 49 k colours 0.29 to
-# 0.36 (docs/numbers.md: Where a step's time goes); larger steps reach more.
+# 0.36 (docs/experiments/step_time.md); larger steps reach more.
 TOUCHED = 0.33
 # Of an entry: its gradient read; if there is one, that cleared, the entry itself and its moments read and written.
 ADAM_BYTES = 4 * (1 + 7 * TOUCHED)
@@ -52,7 +54,7 @@ MEMORY = 0.9  # how much of the mean of samples per ray remains after each step
 
 
 @dataclass(frozen=True)
-class GridTrainerSettings:
+class HashGridTrainerSettings:
     """How to train. ``samples``: colours to compute in a step; its rays are as many as are expected to need them.
     ``chunks``: equal parts of a step, each computed on a core; results depend on their number, not on that of the
     cores. ``background`` is what lies behind a scene without a sky: a colour, or another random one for each ray (only
@@ -71,7 +73,7 @@ class GridTrainerSettings:
     least_photos: int = 1
 
 
-class GridBatch(NamedTuple):
+class HashGridBatch(NamedTuple):
     """Rays with the colour each should see over its background, where its samples stand in their intervals and which of
     its thin ones are kept (both in [0, 1)), whose view it belongs to, and how far away is the sparse point that it runs
     to; 0: to none."""
@@ -100,7 +102,7 @@ class _Part(NamedTuple):
     """What one chunk of a batch contributes to it: loss, gradients and their norm, the thickness of cells it met, and
     how many densities it asked for."""
 
-    batch: GridBatch
+    batch: HashGridBatch
     loss: Tensor
     squared_error: Tensor
     weights: Weights
@@ -113,10 +115,10 @@ class _Part(NamedTuple):
     densities: int
 
 
-def rate_factor(step: int, share: float) -> float:
+def lr_multiplier(step: int, share: float) -> float:
     """The learning rate over its base: a linear warm-up, then constant, then falling exponentially."""
-    fallen = max(0.0, share - CONSTANT_SHARE) / (1 - CONSTANT_SHARE)
-    return min(1.0, (step + 1) / WARM_UP_STEPS) * FINAL_RATE**fallen
+    fallen = max(0.0, share - LR_HOLD_FRACTION) / (1 - LR_HOLD_FRACTION)
+    return min(1.0, (step + 1) / WARM_UP_STEPS) * LR_FINAL_FRACTION**fallen
 
 
 def distortion_factor(share: float) -> float:
@@ -130,15 +132,15 @@ def depth_factor(share: float) -> float:
     return 1 - share
 
 
-class GridTrainer:
+class HashGridTrainer:
     """Trains a grid field on the robust error of colours by Adam, and keeps its density cache. ``photo_rays`` and
     ``photo_colours`` stand between the field and each photo (nerf/effects)."""
 
     def __init__(
         self,
-        model: GridField,
-        bank: RayBank,
-        settings: GridTrainerSettings,
+        model: HashGridField,
+        bank: RayDataset,
+        settings: HashGridTrainerSettings,
         photo_rays: PhotoRays = AS_GIVEN,
         photo_colours: PhotoColours = AS_RENDERED,
     ) -> None:
@@ -146,7 +148,7 @@ class GridTrainer:
         # Nothing beyond the box of a bounded scene is drawn: a point there would pull the light to its walls.
         self.bank = bank if model.settings.contracted else bank.known_within(BOX)
         self.photo_rays, self.photo_colours = photo_rays, photo_colours
-        self.cache = DensityCache(model, self._usable())
+        self.cache = OccupancyGrid(model, self._usable())
         self.photo_parts = [each for each in (photo_rays, photo_colours) if each.parameters]
         self.photo_parameters = {**photo_rays.parameters, **photo_colours.parameters}
         of_networks = model.weights._asdict()
@@ -160,7 +162,7 @@ class GridTrainer:
             tuple(tensor[first:end] for tensor in tables) for first, end in pairwise(model.layout.first_rows)
         ]
         self.samples_per_ray = torch.tensor(FIRST_SAMPLES_PER_RAY, dtype=torch.float64)
-        self.order = PixelOrder(self.bank.drawable, settings.seed, bank.device)
+        self.order = PixelSampler(self.bank.drawable, settings.seed, bank.device)
         self.drawn = torch.tensor(0)  # pixels of that order so far; steps differ in how many they take
 
     def _usable(self) -> Bool[Tensor, "cache"] | None:
@@ -168,14 +170,14 @@ class GridTrainer:
         least, lattice = min(self.settings.least_photos, len(self.bank.near) - 1), self.model.lattice
         if least <= 1 or self.bank.known is None or not lattice.contracted:
             return None
-        return usable_cells(self.bank, least, lattice.cells)
+        return compute_frustum_mask(self.bank, least, lattice.cells)
 
     def step(self, step: int, share: float, rate_scale: float = 1.0) -> StepResult:
         """One batch, one update. Raises NonFinite before the update, leaving model and optimiser as they were."""
         device, rays = self.bank.device, self._rays_per_chunk()
         parts = list(in_order(partial(self._part, step, share, rays), range(self.settings.chunks), device))
         loss, error = self._finite(step, parts)
-        self._update(parts, rate_scale * rate_factor(step, share), step + 1)
+        self._update(parts, rate_scale * lr_multiplier(step, share), step + 1)
         with part("cache"):
             self.cache.refresh(step, generator(device, self.settings.seed, step, self.settings.chunks))
         samples = sum(len(each.points) for each in parts)
@@ -213,7 +215,7 @@ class GridTrainer:
         wanted = int(self.settings.samples / max(LEAST_SAMPLES_PER_RAY, float(self.samples_per_ray)))
         return max(1, wanted // self.settings.chunks)
 
-    def _batch(self, step: int, share: float, chunk: int, count: int) -> GridBatch:
+    def _batch(self, step: int, share: float, chunk: int, count: int) -> HashGridBatch:
         device = self.bank.device
         random = generator(device, self.settings.seed, step, chunk)
         # Shared out over the chunks, which are small where cores are many and the field is young.
@@ -230,11 +232,11 @@ class GridTrainer:
             background = torch.tensor(self.settings.background, device=device).repeat(count, 1)
         target = colour if alpha is None else torch.lerp(background, colour, alpha[:, None])
         jitter, offset = torch.rand(2, count, generator=random, device=device)
-        return GridBatch(rays, target, background, jitter, offset, view, distance)
+        return HashGridBatch(rays, target, background, jitter, offset, view, distance)
 
     def _of_photos(self, rays: int, share: float) -> int:
         """How many of so many rays run through pixels of all the photos; the others run to sparse points."""
-        return rays - rays // GUIDED_EVERY if self._is_guided(share) else rays
+        return rays - rays // DEPTH_RAY_INTERVAL if self._is_guided(share) else rays
 
     def _is_guided(self, share: float) -> bool:
         return self.bank.known is not None and self.settings.depth_loss * depth_factor(share) > 0
@@ -253,22 +255,22 @@ class GridTrainer:
             gradients = self.model.backward(done, loss.grad, loss.grad_weights)
             grad_rays = partial(self.model.rays_backward, done, gradients)
             photos = loss.grad_photos | self.photo_rays.backward(batch.rays, batch.view, grad_rays)
-            sky = {name: self.model.sky_backward(done, gradients) for name in self.sky}
+            sky = {name: self.model.background_backward(done, gradients) for name in self.sky}
         weights, features, *_ = gradients
         norm = torch.nn.utils.get_total_norm([*weights, features, *sky.values(), *photos.values()])
         of_loss = loss.value, loss.squared_error
         return _Part(batch, *of_loss, weights, features, done.points, sky, photos, norm, done.thickness, done.marched)
 
-    def _backward_work(self, done: GridPass) -> Work:
+    def _backward_work(self, done: HashGridPass) -> Work:
         weights = self.model.weights
         products = 2 * (grid_mlp.density_products(weights) + grid_mlp.colour_products(weights)) * len(done.points)
         to_points = CORNERS * len(self.model.layout.resolutions) * len(done.points) if self.photo_rays.parameters else 0
         return Work(products, to_points)
 
-    def _loss(self, rays: int, share: float, done: GridPass, batch: GridBatch) -> Loss:
+    def _loss(self, rays: int, share: float, done: HashGridPass, batch: HashGridBatch) -> Loss:
         seen = Seen(done.rendering, batch.background, batch.view)
         error = self.photo_colours.residual(seen, batch.target)
-        robust, pull = robust_error(error)
+        robust, pull = huber_loss(error)
         grad, photos = self.photo_colours.backward(seen, pull * (2 / (3 * rays)))
         value, grad_weights = robust.sum() / (3 * rays), torch.zeros_like(done.weights)
         backend, lattice = self.model.backend, self.model.lattice
@@ -351,11 +353,11 @@ class GridTrainer:
                 self.cache.raise_to(each.points, each.thickness)
 
 
-def _whole(batches: Sequence[GridBatch]) -> dict[str, Tensor]:
+def _whole(batches: Sequence[HashGridBatch]) -> dict[str, Tensor]:
     """A batch by the names of its tensors, its chunks put together again."""
     rays = zip(*(batch.rays for batch in batches), strict=True)
     rest = zip(*(batch[1:] for batch in batches), strict=True)
-    names = (*Rays._fields, *GridBatch._fields[1:])
+    names = (*Rays._fields, *HashGridBatch._fields[1:])
     return {name: torch.cat(chunks) for name, chunks in zip(names, (*rays, *rest), strict=True)}
 
 

@@ -52,8 +52,9 @@ def knee(curve: Curve) -> float | None:
     return found
 
 
-# Least squares over 32 pairs of runs of T and 2 T steps of the grid field, eight sets (docs/numbers.md): what a run
-# gained from half of its time to its end, annealing included, against what a run of twice the time ends higher.
+# Least squares over 32 pairs of runs of T and 2 T steps of the grid field, eight sets
+# (docs/experiments/learning_curve.md): what a run gained from half of its time to its end, annealing included, against
+# what a run of twice the time ends higher.
 FEWEST_STEPS = 500  # a shorter run is still fog, and tells nothing of a longer one
 NEXT_OF_LAST = 0.71
 NEXT_HALF_WIDTH = 0.37  # dB: held four of five, each judged by the other sets

@@ -3,12 +3,12 @@
 from jaxtyping import Float
 from torch import Tensor
 
-LARGEST_PULL = 0.1
+HUBER_DELTA = 0.1
 """Of the peak: from this error on colours are pulled no harder, and the loss grows linearly. Of 0.05, 0.1, 0.2 and none
-the best on most sets (docs/numbers.md); instant-ngp's, too."""
+the best on most sets (docs/experiments/colour_loss.md); instant-ngp's, too."""
 
 
-def robust_error(
+def huber_loss(
     error: Float[Tensor, "*shape"],
 ) -> tuple[Float[Tensor, "*shape"], Float[Tensor, "*shape"]]:
     """Twice Huber's loss of each error, and half its derivative: e² and e up to the largest pull d, then 2 d |e| − d²
@@ -17,5 +17,5 @@ def robust_error(
     Adam divides by the root mean square of an entry's gradients, so that a few large errors, of an edge that is not
     there yet, of a passer-by or a highlight, would slow all small ones down.
     """
-    pull = error.clamp(-LARGEST_PULL, LARGEST_PULL)
+    pull = error.clamp(-HUBER_DELTA, HUBER_DELTA)
     return pull * (2 * error - pull), pull

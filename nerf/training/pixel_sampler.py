@@ -12,7 +12,7 @@ from torch import Tensor
 
 from nerf.runtime.randomness import generator
 
-STRATUM = 256  # neighbours of which a round takes one; a power of two
+BLOCK_SIZE = 256  # neighbours of which a round takes one; a power of two
 EPOCHS = 1 << 40  # a counter of random numbers that no step of training has
 
 
@@ -26,7 +26,7 @@ class _Epoch(NamedTuple):
     shift: Int[Tensor, "1"]
 
 
-class PixelOrder:
+class PixelSampler:
     """An endless sequence of the numbers below ``count``; which one stands in a place depends on ``seed`` and the kind
     of device alone.
 
@@ -41,12 +41,12 @@ class PixelOrder:
 
     def __init__(self, count: int, seed: int, device: torch.device | str) -> None:
         self.count, self.seed, self.device = count, seed, torch.device(device)
-        self.strata = -(-count // STRATUM)
+        self.strata = -(-count // BLOCK_SIZE)
         self._last: _Epoch | None = None
 
     def take(self, first: int, count: int) -> Int[Tensor, "count"]:
         """Those in the places from ``first`` on."""
-        period, end = self.strata * STRATUM, first + count
+        period, end = self.strata * BLOCK_SIZE, first + count
         epochs = range(first // period, max(first, end - 1) // period + 1)
         return torch.cat([self._part(e, max(first - e * period, 0), min(end - e * period, period)) for e in epochs])
 
@@ -54,16 +54,16 @@ class PixelOrder:
         _, within, order, offset, shift = self._epoch(epoch)
         place = torch.arange(first, end, device=self.device)
         stratum = order[place % self.strata]
-        return (stratum * STRATUM + (within[place // self.strata] ^ offset[stratum]) + shift) % self.count
+        return (stratum * BLOCK_SIZE + (within[place // self.strata] ^ offset[stratum]) + shift) % self.count
 
     def _epoch(self, number: int) -> _Epoch:
         """The last one is kept, as the next batch is most often of the same."""
         epoch = self._last  # read once: another thread may put another in its place
         if epoch is None or epoch.number != number:
             random = generator(self.device, self.seed, EPOCHS, number)
-            within = torch.randperm(STRATUM, generator=random, device=self.device)
+            within = torch.randperm(BLOCK_SIZE, generator=random, device=self.device)
             order = torch.randperm(self.strata, generator=random, device=self.device)
-            offset = torch.randint(STRATUM, (self.strata,), generator=random, device=self.device)
+            offset = torch.randint(BLOCK_SIZE, (self.strata,), generator=random, device=self.device)
             shift = torch.randint(self.count, (1,), generator=random, device=self.device)
             self._last = epoch = _Epoch(number, within, order, offset, shift)
         return epoch

@@ -34,7 +34,7 @@ class Drawn(NamedTuple):
     view: Int[Tensor, "rays"]
 
 
-class RayBank(NamedTuple):
+class RayDataset(NamedTuple):
     """Photos as one table of pixels; make it with :func:`ray_bank` or :func:`build_ray_bank`.
 
     View v owns the pixels [first_pixel[v], first_pixel[v + 1]); ``pixels`` have 3 channels, or 4 with a straight (not
@@ -82,7 +82,7 @@ class RayBank(NamedTuple):
         of_all, of_views = self.distance.median(), self.distance[view.argsort(stable=True)].split(counts)
         return torch.stack([each.median() if len(each) else of_all for each in of_views])
 
-    def to(self, device: torch.device | str) -> "RayBank":
+    def to(self, device: torch.device | str) -> "RayDataset":
         """This bank with its tables on ``device``."""
         moved = {name: table.to(device) for name, table in self._asdict().items() if table is not None}
         return self._replace(**moved)
@@ -92,7 +92,7 @@ class RayBank(NamedTuple):
         """How many pixels may be drawn."""
         return len(self.pixels) if self.runs is None else int(self.runs[0, -1])
 
-    def without(self, ignored: Iterable[Bool[Tensor, "_ _"] | None]) -> "RayBank":
+    def without(self, ignored: Iterable[Bool[Tensor, "_ _"] | None]) -> "RayDataset":
         """This bank with pixels that :meth:`draw` never gives: per view, (height, width) True where the photo is to
         be ignored, None where all of it is used. Taken one by one, for together they may not fit into memory. Raises
         ValueError if no pixel is left."""
@@ -103,7 +103,7 @@ class RayBank(NamedTuple):
             raise ValueError("the masks ignore every pixel")
         return self._replace(runs=runs.to(self.device))
 
-    def with_distances(self, pixel: Int[Tensor, "known"], distance: Float[Tensor, "known"]) -> "RayBank":
+    def with_distances(self, pixel: Int[Tensor, "known"], distance: Float[Tensor, "known"]) -> "RayDataset":
         """This bank, which knows how far away is what these pixels show (scene units, along the ray).
 
         Left out are pixels that may not be drawn (so give the masks first), those that are not wholly opaque, whose
@@ -115,7 +115,7 @@ class RayBank(NamedTuple):
             kept &= self.pixels.index_select(0, pixel)[:, 3] == 255
         return self._knowing(pixel[kept], distance[kept].float())
 
-    def known_within(self, half: float) -> "RayBank":
+    def known_within(self, half: float) -> "RayDataset":
         """This bank without the known distances that end outside of the cube from -``half`` to ``half``."""
         if self.known is None or self.distance is None:
             return self
@@ -123,7 +123,7 @@ class RayBank(NamedTuple):
         inside = ((rays.origins + self.distance[:, None] * rays.directions).abs() <= half).all(-1)
         return self._knowing(self.known[inside], self.distance[inside])
 
-    def _knowing(self, pixel: Int[Tensor, "known"], distance: Float[Tensor, "known"]) -> "RayBank":
+    def _knowing(self, pixel: Int[Tensor, "known"], distance: Float[Tensor, "known"]) -> "RayDataset":
         known = len(pixel) > 0
         return self._replace(known=pixel if known else None, distance=distance if known else None)
 
@@ -192,7 +192,7 @@ def ray_bank(
     camera_of: Sequence[int],
     camera_bearings: Sequence[Float[Tensor, "_ _ 3"]],
     placement: Placement,
-) -> RayBank:
+) -> RayDataset:
     """The bank of photos that are laid end to end already.
 
     Args:
@@ -222,7 +222,7 @@ def ray_bank(
     grid, size = torch.tensor(grids)[cameras], torch.tensor(sizes)
     poses, near, far = placement
     rotations, centres = poses[:, :, :3].reshape(-1, 9), poses[:, :, 3]
-    return RayBank(
+    return RayDataset(
         pixels=pixels,
         first_pixel=first_pixel,
         layout=torch.stack([first_pixel[:-1], size[:, 1], first_patch[cameras], grid[:, 1]]),
@@ -238,7 +238,7 @@ def build_ray_bank(
     poses: Float[Tensor, "views 3 4"],
     near: Float[Tensor, "views"],
     far: Float[Tensor, "views"],
-) -> RayBank:
+) -> RayDataset:
     """:func:`ray_bank` of photos in memory, (height, width, channels) each, which it copies."""
     pixels = [photo.flatten(0, 1) for photo in photos] or [torch.zeros(0, 3, dtype=torch.uint8)]
     sizes = [(photo.shape[0], photo.shape[1]) for photo in photos]
@@ -248,7 +248,7 @@ def build_ray_bank(
 def _runs(
     ignored: Iterable[Bool[Tensor, "_ _"] | None], first_pixel: Int[Tensor, "views_and_end"]
 ) -> Int[Tensor, "2 runs_and_end"]:
-    """Runs of pixels that are not ignored, as :class:`RayBank` has them. No run is longer than a view."""
+    """Runs of pixels that are not ignored, as :class:`RayDataset` has them. No run is longer than a view."""
     firsts, lengths = [], []
     for mask, start, end in zip(ignored, first_pixel[:-1], first_pixel[1:], strict=True):
         if mask is None:

@@ -14,14 +14,14 @@ from torch import Tensor
 
 from nerf.effects import AS_GIVEN, AS_RENDERED, PhotoColours, PhotoRays, Seen
 from nerf.fields.interface import RadianceModel, Rendering
-from nerf.fields.vanilla import PaperNerf
+from nerf.fields.vanilla import VanillaNerf
 from nerf.geometry.rays import Rays
 from nerf.runtime.parallel import in_order
 from nerf.runtime.profiler import Work, part
 from nerf.runtime.randomness import generator
 from nerf.training.metrics import psnr
-from nerf.training.pixel_sampler import PixelOrder
-from nerf.training.ray_dataset import RayBank
+from nerf.training.pixel_sampler import PixelSampler
+from nerf.training.ray_dataset import RayDataset
 from nerf.training.schedule import learning_rate
 
 # Rays per chunk of a batch, each on its own core; elsewhere a batch is one chunk. Their gradients are added in order,
@@ -94,7 +94,7 @@ def all_finite(rays: Rays) -> bool:
 
 
 @dataclass(frozen=True)
-class TrainerSettings:
+class VanillaTrainerSettings:
     """How to train. ``background`` is what lies behind the scene: a colour, or another random one each step
     (only for photos with alpha, where it shows the field which space is empty)."""
 
@@ -135,23 +135,23 @@ class _Part(NamedTuple):
     gradients: tuple[Tensor, ...]
 
 
-class PaperTrainer:
+class VanillaTrainer:
     """Trains coarse and fine network together on |C_c - C|² + |C_f - C|² (Mildenhall et al. 2020, eq. 6) by Adam
     with the published constants; the loss is the mean over rays and channels. ``photo_rays`` and ``photo_colours``
     stand between the field and each photo (nerf/effects)."""
 
     def __init__(
         self,
-        model: PaperNerf,
-        bank: RayBank,
-        settings: TrainerSettings,
+        model: VanillaNerf,
+        bank: RayDataset,
+        settings: VanillaTrainerSettings,
         photo_rays: PhotoRays = AS_GIVEN,
         photo_colours: PhotoColours = AS_RENDERED,
     ) -> None:
         self.model = model
         self.bank = bank
         self.settings = settings
-        self.order = PixelOrder(bank.drawable, settings.seed, bank.device)
+        self.order = PixelSampler(bank.drawable, settings.seed, bank.device)
         self.photo_rays, self.photo_colours = photo_rays, photo_colours
         self.photo_parts = [each for each in (photo_rays, photo_colours) if each.parameters]
         self.photo_parameters = {**photo_rays.parameters, **photo_colours.parameters}

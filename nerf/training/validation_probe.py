@@ -13,7 +13,7 @@ from nerf.geometry.rays import Rays
 from nerf.rendering.images import render_image
 from nerf.runtime.randomness import generator
 from nerf.training.metrics import mean_squared_error, psnr
-from nerf.training.ray_dataset import RayBank
+from nerf.training.ray_dataset import RayDataset
 from nerf.training.trainer import over
 
 
@@ -47,12 +47,12 @@ class Patches(NamedTuple):
     used: Bool[Tensor, "patches side side"]
 
 
-def make_probe(bank: RayBank, count: int, background: Float[Tensor, "3"], seed: int) -> Probe:
+def make_probe(bank: RayDataset, count: int, background: Float[Tensor, "3"], seed: int) -> Probe:
     """Draw ``count`` pixels of ``bank``, always the same for the same seed."""
     return _probe_of(bank, bank.draw(count, generator(bank.device, seed)), background)
 
 
-def make_patches(bank: RayBank, count: int, side: int, background: Float[Tensor, "3"], seed: int) -> Patches:
+def make_patches(bank: RayDataset, count: int, side: int, background: Float[Tensor, "3"], seed: int) -> Patches:
     """``count`` squares around drawn pixels of ``bank``, moved to lie inside their photos; always the same for the same
     seed. Their side is ``side`` pixels, less where a photo is smaller."""
     first, width = bank.layout[:2]
@@ -70,7 +70,7 @@ def make_patches(bank: RayBank, count: int, side: int, background: Float[Tensor,
     return Patches(_probe_of(bank, pixels.flatten(), background), bank.may_be_drawn(pixels))
 
 
-def _probe_of(bank: RayBank, pixels: Int[Tensor, "rays"], background: Float[Tensor, "3"]) -> Probe:
+def _probe_of(bank: RayDataset, pixels: Int[Tensor, "rays"], background: Float[Tensor, "3"]) -> Probe:
     rays, colour, alpha, view = bank.lookup(pixels)
     return Probe(rays, over(colour, alpha, background), background, view)
 

@@ -148,7 +148,7 @@ def _mesh_error(mesh: Path, truth_from_sfm: Similarity, truth: Truth, percent: f
     from scipy.spatial import KDTree
 
     from nerf.synthetic.scenes import still_life
-    from stages.mesh.samples import sample_surface
+    from stages.mesh.surface import sample_surface
 
     loaded = trimesh.load_mesh(mesh, process=False)
     vertices = truth_from_sfm.points(np.asarray(loaded.vertices, float))

@@ -9,8 +9,8 @@ if TYPE_CHECKING:
 
 SECONDS = 0.3  # for each rate
 TABLES = {"2¹⁷": 1 << 17, "2²⁰": 1 << 20}  # rows: of one grid, of all of a large field
-# Of a ray while the grid field trains: densities asked for, beside the colours of stages/train/fields/hash_grid.py. Over
-# a run lego_400, fox, banana and fountain_p11 ask for 2.3 to 2.9 for each colour (docs/numbers.md).
+# Of a ray while the grid field trains: densities asked for, beside the colours of stages/train/fields/hash_grid.py.
+# Over a run lego_400, fox, banana and fountain_p11 ask for 2.3 to 2.9 for each colour (docs/experiments/ray_samples.md).
 DENSITIES = {"bounded": 7, "contracted": 24}
 WHERE = {"bounded": "around an object", "contracted": "in unbounded space"}
 PAPER_RAYS = {"paper field as published": (8, 256, 64, 128), "paper field 4 × 64": (4, 64, 32, 32)}
@@ -67,7 +67,7 @@ def grid_work(contracted: bool, densities: float) -> "Work":
     """Of a ray in training, its share of the optimiser's included: a large field, in the steps that stage train takes
     on this machine."""
     from nerf.fields import mlp as grid_mlp
-    from nerf.fields.hash_grid import CORNERS, GridField
+    from nerf.fields.hash_grid import CORNERS, HashGridField
     from nerf.kernels import torch as reference
     from nerf.runtime.profiler import Work
     from nerf.training.hash_grid_trainer import ADAM_BYTES
@@ -77,7 +77,7 @@ def grid_work(contracted: bool, densities: float) -> "Work":
 
     asked = Config(field="grid", contracted=contracted, view_dependence=True)
     config = timed(with_defaults(asked), compute_device())
-    model = GridField(field_settings(config, sky=False), 0, reference)
+    model = HashGridField(field_settings(config, sky=False), 0, reference)
     density, colour = grid_mlp.density_products(model.weights), grid_mlp.colour_products(model.weights)
     colours = SAMPLES_PER_RAY[config.space]
     rows = CORNERS * model.settings.levels * (densities + colours)
@@ -87,7 +87,7 @@ def grid_work(contracted: bool, densities: float) -> "Work":
 
 def paper_products(depth: int, width: int, coarse: int, fine: int) -> int:
     """Multiplications and additions of a ray of the paper's field in training."""
-    from nerf.fields.vanilla import PaperNerf, PaperSettings
+    from nerf.fields.vanilla import VanillaNerf, VanillaSettings
 
-    model = PaperNerf(PaperSettings(depth=depth, width=width, samples_coarse=coarse, samples_fine=fine), 0)
+    model = VanillaNerf(VanillaSettings(depth=depth, width=width, samples_coarse=coarse, samples_fine=fine), 0)
     return model.settings.queries_per_ray * (model.fine.products + model.fine.products_backward)

@@ -78,11 +78,11 @@ def _check_learning(device: "torch.device") -> str:
     """Forward, backward and optimiser together: the loss must fall a hundredfold."""
     import torch
 
-    from nerf.fields.vanilla import PaperNerf, PaperSettings
+    from nerf.fields.vanilla import VanillaNerf, VanillaSettings
     from nerf.geometry.rays import Rays
 
-    settings = PaperSettings(depth=2, width=32, skip=1, samples_coarse=8, samples_fine=8)
-    model = PaperNerf(settings, seed=0).to(device)
+    settings = VanillaSettings(depth=2, width=32, skip=1, samples_coarse=8, samples_fine=8)
+    model = VanillaNerf(settings, seed=0).to(device)
     optimiser = torch.optim.Adam(model.parameters(), lr=1e-2)
     directions = torch.nn.functional.normalize(torch.randn(256, 3, device=device), dim=-1)
     ones = torch.ones(256, device=device)

@@ -27,7 +27,8 @@ MOST_SECONDS = {"evaluate": 60.0, "render": 300.0, "mesh": 60.0}
 SFM_SHARE = 0.5  # of the budget: what structure from motion may take before it searches fewer features
 EFFECTS_SHARE = 0.15  # of the run: what stage effects may take, and of what is left of a budget no more than
 EFFECTS_OF_LEFT = 0.25  # this: a pilot has to leave a training that is worth it
-# Of that, beside reading the photos: statistics take one or two seconds (docs/numbers.md), timing a pilot as much.
+# Of that, beside reading the photos: statistics take one or two seconds (docs/experiments/effects.md), timing a pilot
+# as much.
 BESIDE_PILOTS = 4.0
 LARGEST_SHARE = 0.35  # of the budget: what a stage other than train may take where all before it is there already
 # Training's own seconds count steps alone. Beside reading the photos, timing the first steps takes about STARTING,

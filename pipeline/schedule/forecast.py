@@ -63,7 +63,7 @@ def expected(settings: Settings, photos: Photos | None) -> dict[str, float | Non
     """Seconds by stage; None of those that take what a budget gives them, and of a training in steps, which nobody has
     timed yet. Nothing where the photos are gone.
 
-    Rates were measured on two cores, on fox, fountain_p11, fern, banana, herzjesu_p8 and the demo (docs/numbers.md):
+    Rates were measured on two cores, on fox, fountain_p11, fern, banana, herzjesu_p8 and the demo (docs/results.md):
     sfm took 0.6 to 1.8 times as long, and more where photos found no place at once.
     """
     if photos is None:

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     from nerf.effects import PhotoColours, PhotoRays
     from nerf.geometry.scene import Scene, View
-    from nerf.training.ray_dataset import RayBank
+    from nerf.training.ray_dataset import RayDataset
     from nerf.training.trainer import FieldTrainer
 
 Space = Literal["bounded", "contracted"]
@@ -53,7 +53,7 @@ def read_decisions(folder: Path) -> Decisions:
     return read_dataclass(folder / "decisions.json", Decisions)
 
 
-def photo_parts(decisions: Decisions, views: "Sequence[View]", bank: "RayBank") -> "tuple[PhotoRays, PhotoColours]":
+def photo_parts(decisions: Decisions, views: "Sequence[View]", bank: "RayDataset") -> "tuple[PhotoRays, PhotoColours]":
     """What stands between the field and the photos ``views`` of ``bank``, in their order."""
     import numpy as np
     import torch

@@ -107,7 +107,7 @@ def scene_evidence(
 
 def unless_pixels_differ(exposure: "Evidence", scale: "Evidence") -> "Evidence":
     """What is told of exposure, left to a pilot where ``scale`` is seen: coarse pixels average what fine ones tell
-    apart, by which the gains of photos from very different distances differ, too (docs/numbers.md, "Effects")."""
+    apart, by which the gains of photos from very different distances differ, too (docs/experiments/effects.md)."""
     if not (exposure.called_for and scale.called_for):
         return exposure
     words = f"{exposure.words}; photos from such different distances differ in that, too"

@@ -17,10 +17,10 @@ from stages.train.config import BLACK
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from nerf.fields.hash_grid import GridField
+    from nerf.fields.hash_grid import HashGridField
     from nerf.geometry.rays import Rays
     from nerf.geometry.scene import Scene
-    from nerf.training.ray_dataset import RayBank
+    from nerf.training.ray_dataset import RayDataset
     from stages.train.config import Config as TrainConfig
 
 LONG_SIDE = 200  # pixels of the photos in a pilot
@@ -66,7 +66,7 @@ class PilotScene(NamedTuple):
     """What every pilot of a scene shares; make it with :func:`pilot_scene`."""
 
     scene: "Scene"
-    bank: "RayBank"
+    bank: "RayDataset"
     kept: "tuple[_Photo, ...]"
 
 
@@ -152,16 +152,16 @@ def _noise(gains: list[list[float]]) -> float:
     return max((high - low) / 2 for low, high in intervals)
 
 
-def _trained(trial: PilotScene, arm: Decisions, steps: int, seed: int) -> "GridField":
+def _trained(trial: PilotScene, arm: Decisions, steps: int, seed: int) -> "HashGridField":
     """A grid field after ``steps`` steps under the decisions of one arm."""
-    from nerf.fields.hash_grid import GridField
+    from nerf.fields.hash_grid import HashGridField
     from stages.train.fields import make_trainer
 
     parts = photo_parts(arm, trial.scene.of_split("train"), trial.bank)
     trainer = make_trainer(_config(arm, steps, trial.bank.device.type), trial.scene, trial.bank, seed, parts)
     for step in range(steps):
         trainer.step(step, step / steps, 1.0)
-    assert isinstance(trainer.model, GridField)
+    assert isinstance(trainer.model, HashGridField)
     return trainer.model.to("cpu")
 
 
@@ -187,7 +187,7 @@ def _config(arm: Decisions, steps: int, device: str) -> "TrainConfig":
     )
 
 
-def _score(field: "GridField", photo: _Photo, poses: bool, seed: int) -> float:
+def _score(field: "HashGridField", photo: _Photo, poses: bool, seed: int) -> float:
     """PSNR (dB) on the right half of a photo whose exposure (and pose) is fitted on its left half."""
     import torch
 

@@ -234,13 +234,13 @@ class Examiner:
     def _from_fitted_pose(self, view: "View", truth: "Tensor", used: "Tensor | None") -> "Rendering":
         """The view from where its left half says that it was taken."""
         from nerf.effects.exposure import ExposedModel
-        from nerf.fields.hash_grid import GridField
+        from nerf.fields.hash_grid import HashGridField
         from stages.evaluate.half_images import from_fitted_pose
         from stages.train.data import view_rays
 
         model = self.painter.model
         field = model.model if isinstance(model, ExposedModel) else model
-        assert isinstance(field, GridField), "only with a grid field does evaluate fit poses"
+        assert isinstance(field, HashGridField), "only with a grid field does evaluate fit poses"
         rays = view_rays(self.scene, view, self.downscale)
         as_it_is = replace(self.painter, model=field).draw(rays)
         moved = from_fitted_pose(field.on_cpu(), rays, as_it_is, self.painter.background.cpu(), truth, used)

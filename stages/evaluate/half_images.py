@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from nerf.fields.hash_grid import GridField
+    from nerf.fields.hash_grid import HashGridField
     from nerf.fields.interface import Rendering
     from nerf.geometry.rays import Rays
 
@@ -40,7 +40,7 @@ def right_half_psnr(
 
 
 def from_fitted_pose(
-    field: "GridField",
+    field: "HashGridField",
     rays: "Rays",
     rendering: "Rendering",
     background: "Tensor",

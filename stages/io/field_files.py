@@ -11,9 +11,9 @@ from stages.hardware.backend import BackendName, backend_name, backend_of_field,
 from stages.io.files import first_fault, read_json, write_json
 
 if TYPE_CHECKING:
-    from nerf.fields.hash_grid import GridField
+    from nerf.fields.hash_grid import HashGridField
     from nerf.fields.interface import RadianceModel
-    from nerf.fields.vanilla import PaperNerf
+    from nerf.fields.vanilla import VanillaNerf
 
 
 def save_field(folder: Path, model: "RadianceModel", info: dict[str, Any]) -> None:
@@ -25,13 +25,13 @@ def save_field(folder: Path, model: "RadianceModel", info: dict[str, Any]) -> No
     """
     from safetensors.torch import save
 
-    from nerf.fields.hash_grid import GridField
-    from nerf.fields.vanilla import PaperNerf
+    from nerf.fields.hash_grid import HashGridField
+    from nerf.fields.vanilla import VanillaNerf
 
-    if not isinstance(model, PaperNerf | GridField):
+    if not isinstance(model, VanillaNerf | HashGridField):
         raise TypeError(f"no file format for a {type(model).__name__}")
     kind = {"kind": "paper"}
-    if isinstance(model, GridField):
+    if isinstance(model, HashGridField):
         kind = {"kind": "grid", "backend": backend_name(model.backend)}
     weights = {name: tensor.detach().cpu().contiguous() for name, tensor in model.state_dict().items()}
     (folder / "field.safetensors").write_bytes(save(weights))
@@ -95,27 +95,29 @@ def _exposed(model: "RadianceModel", log_gain: list[float], device: str) -> "Rad
     return ExposedModel(model, torch.tensor(log_gain, dtype=torch.float32, device=device))
 
 
-def _untrained(info: dict[str, Any], stored: int, device: str, progress: Progress | None) -> "PaperNerf | GridField":
+def _untrained(
+    info: dict[str, Any], stored: int, device: str, progress: Progress | None
+) -> "VanillaNerf | HashGridField":
     """The field that ``info`` describes; ``stored`` is the size of its weights in bytes, which it must not exceed.
     Raises ValueError, before anything is allocated."""
     from pydantic import TypeAdapter
 
-    from nerf.fields.hash_grid import GridField, GridSettings
-    from nerf.fields.vanilla import PaperNerf, PaperSettings
+    from nerf.fields.hash_grid import HashGridField, HashGridSettings
+    from nerf.fields.vanilla import VanillaNerf, VanillaSettings
 
     kind, settings = info["kind"], info["settings"]
     if kind not in ("grid", "paper"):
         raise ValueError(f"a field of kind {kind!r} is unknown to this version")
     text = json.dumps(settings)
     if kind == "grid":
-        grid = GridSettings(**settings)  # which refuses unknown names; their types are checked next
-        TypeAdapter(GridSettings).validate_json(text, strict=True)
+        grid = HashGridSettings(**settings)  # which refuses unknown names; their types are checked next
+        TypeAdapter(HashGridSettings).validate_json(text, strict=True)
         _check_size(grid.layout.rows * grid.features, stored)
-        return GridField(grid, 0, load_backend(backend_of_field(_trained_with(info), device, progress), device))
-    paper = PaperSettings(**settings)
-    TypeAdapter(PaperSettings).validate_json(text, strict=True)
+        return HashGridField(grid, 0, load_backend(backend_of_field(_trained_with(info), device, progress), device))
+    paper = VanillaSettings(**settings)
+    TypeAdapter(VanillaSettings).validate_json(text, strict=True)
     _check_size(paper.depth * paper.width**2, stored)
-    return PaperNerf(paper, seed=0)
+    return VanillaNerf(paper, seed=0)
 
 
 def _trained_with(info: dict[str, Any]) -> BackendName:

@@ -1,22 +1,23 @@
-"""Triangles: marching cubes, cleaning, decimation, and what is open.
+"""Triangles: marching cubes, areas, normals, components, decimation, open borders, samples.
 
 ``vertices`` are (n, 3) float64, ``faces`` (m, 3) int32 indices, counter-clockwise seen from outside, that is from
 the side of lower density.
 """
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from fast_simplification import simplify
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from skimage.measure import marching_cubes
 
+from nerf.fields.density_grid import Lattice, occupancy, smoothed
 from stages.contract import StageError
 
-if TYPE_CHECKING:
-    from nerf.fields.density_grid import Lattice
-
-
-# Passes of nerf.fields.density_grid.smoothed: a Gaussian of a lattice point's distance. The field's finest cells are
-# about as small, and what differs between two of them is noise that a lattice would pick at random (docs/numbers.md).
-SMOOTHING = 2
+# Passes of nerf.fields.density_grid.smoothed: a Gaussian of one grid spacing. The field's finest cells are about as
+# small, and what differs between two of them is noise that a grid would pick at random (docs/experiments/mesh.md).
+SMOOTHING_PASSES = 2
 
 
 class Surface(NamedTuple):
@@ -26,61 +27,54 @@ class Surface(NamedTuple):
     faces: np.ndarray
 
 
-def solidity(lattice: "Lattice", level: float) -> "Lattice":
-    """What passes 1/2 at the surface of density ``level``: the occupancy, less what is finer than the lattice."""
-    from nerf.fields.density_grid import occupancy, smoothed
-
-    return smoothed(occupancy(lattice, level), SMOOTHING)
+def smoothed_occupancy(grid: Lattice, iso_level: float) -> Lattice:
+    """The occupancy, 1/2 where the density is ``iso_level``, without what is finer than the grid."""
+    return smoothed(occupancy(grid, iso_level), SMOOTHING_PASSES)
 
 
-def extract(lattice: "Lattice", level: float) -> Surface:
-    """The surface where density passes ``level`` (marching cubes, Lewiner et al. 2003); open where the box cuts it.
+def extract_surface(grid: Lattice, iso_level: float) -> Surface:
+    """The surface at density ``iso_level`` (marching cubes, Lewiner et al. 2003); open where the box cuts it.
 
-    Raises StageError where nothing is as solid as that, or all is: of sheets of one lattice point and rods of two
-    smoothing leaves nothing.
+    Raises StageError where no point is that dense, or all are. Smoothing leaves nothing of sheets one grid point thick
+    and of rods two grid points thick.
     """
-    from skimage.measure import marching_cubes
-
-    values = solidity(lattice, level).values.cpu().numpy()
+    values = smoothed_occupancy(grid, iso_level).values.cpu().numpy()
     if not values.min() < 0.5 < values.max():
         raise StageError(
-            f"no surface at density {level:.3g}",
-            f"between neighbours of the lattice it averages {values.min():.0%} to {values.max():.0%} of solid: what is "
-            "there is too thin for the lattice, or fills the box",
-            "Give a higher --mesh.resolution or another --mesh.level.",
+            f"no surface at density {iso_level:.3g}",
+            f"the smoothed occupancy runs from {values.min():.0%} to {values.max():.0%} and does not pass 50%: the "
+            "scene is too thin for the grid, or fills the box",
+            "Give a higher --mesh.resolution or another --mesh.iso-level.",
         )
     index, faces, _, _ = marching_cubes(values, 0.5, gradient_direction="ascent")
-    vertices = lattice.low.cpu().double().numpy() + index * lattice.spacing().cpu().double().numpy()
+    vertices = grid.low.cpu().double().numpy() + index * grid.spacing().cpu().double().numpy()
     return Surface(vertices, faces.astype(np.int32))
 
 
-def face_crosses(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Of each face, the vector (m, 3) along its outward normal that is as long as twice its area."""
+def face_area_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Per face, its outward normal times twice its area, (m, 3)."""
     a, b, c = vertices[faces].swapaxes(0, 1)
     return np.cross(b - a, c - a)
 
 
 def vertex_normals(surface: Surface) -> np.ndarray:
     """Unit outward normals (n, 3), averaged over a vertex's faces by area; +z where these have no area or cancel."""
-    cross = np.repeat(face_crosses(*surface), 3, axis=0)
+    per_corner = np.repeat(face_area_vectors(*surface), 3, axis=0)
     corner = surface.faces.reshape(-1)
     count = len(surface.vertices)
-    normals = np.stack([np.bincount(corner, cross[:, axis], count) for axis in range(3)], axis=1)
+    normals = np.stack([np.bincount(corner, per_corner[:, axis], count) for axis in range(3)], axis=1)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
-    anywhere = np.tile([0.0, 0.0, 1.0], (count, 1))  # glTF allows no other length than one
-    return np.divide(normals, length, out=anywhere, where=length > 0)
+    fallback = np.tile([0.0, 0.0, 1.0], (count, 1))  # glTF allows no other length than one
+    return np.divide(normals, length, out=fallback, where=length > 0)
 
 
 def face_areas(surface: Surface) -> np.ndarray:
     """Area of each face."""
-    return np.linalg.norm(face_crosses(*surface), axis=1) / 2
+    return np.linalg.norm(face_area_vectors(*surface), axis=1) / 2
 
 
 def components(surface: Surface) -> np.ndarray:
-    """The number of the connected component of each face, 0 for the one of largest area, then downwards."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
+    """The connected component of each face, numbered by decreasing area from 0."""
     first, second = surface.faces[:, [0, 1]].T, surface.faces[:, [1, 2]].T
     start, end = np.concatenate([first, second], axis=1)
     size = len(surface.vertices)
@@ -101,20 +95,18 @@ def keep_faces(surface: Surface, keep: np.ndarray) -> tuple[Surface, np.ndarray]
 
 
 def decimate(surface: Surface, max_faces: int) -> Surface:
-    """Collapse edges until ``max_faces`` remain (quadrics, Garland and Heckbert 1997); open borders stay put, and what
-    folds onto itself goes."""
-    from fast_simplification import simplify
-
+    """Collapse edges until ``max_faces`` remain (quadrics, Garland and Heckbert 1997); open borders stay put, and faces
+    folded onto each other are removed."""
     if len(surface.faces) <= max_faces:
         return surface
     vertices, faces, *_ = simplify(surface.vertices, surface.faces, target_count=max_faces, preserve_border=True)
-    return keep_faces(Surface(vertices.astype(np.float64), faces.astype(np.int32)), ~_cancel(faces))[0]
+    return keep_faces(Surface(vertices.astype(np.float64), faces.astype(np.int32)), ~_folded_pairs(faces))[0]
 
 
-def _cancel(faces: np.ndarray) -> np.ndarray:
-    """Which faces are back to back with a copy of themselves, or have a vertex twice, (m,) bool.
+def _folded_pairs(faces: np.ndarray) -> np.ndarray:
+    """Faces that lie back to back with a copy of themselves, or have a vertex twice, (m,) bool.
 
-    Nothing opens without them. Slivers between three vertices are kept, without area, too: they join their neighbours.
+    Removing them opens nothing. Other faces without area are kept: they join their neighbours.
     """
     a, b, c = faces.astype(np.int64).T
     winding = np.sign(b - a) * np.sign(c - b) * np.sign(c - a)
@@ -141,3 +133,21 @@ def border_vertices(surface: Surface) -> np.ndarray:
 def _directed_edges(surface: Surface) -> tuple[np.ndarray, np.ndarray]:
     faces = surface.faces.astype(np.int64)
     return faces.reshape(-1), faces[:, [1, 2, 0]].reshape(-1)
+
+
+def sample_surface(vertices: np.ndarray, faces: np.ndarray, count: int, seed: int) -> np.ndarray:
+    """``count`` points (count, 3), uniform by area over the triangles (Osada et al. 2002, equation 1).
+
+    Stratified along the cumulated area, so that ``count`` points cover a mesh evenly. Raises ValueError for a mesh
+    without area.
+    """
+    vertices = vertices.astype(np.float64)
+    cumulated = np.cumsum(np.linalg.norm(face_area_vectors(vertices, faces), axis=-1))
+    if len(faces) == 0 or not cumulated[-1] > 0:
+        raise ValueError(f"cannot sample a mesh without area ({len(faces)} faces)")
+    random = np.random.default_rng(seed).random((3, count))
+    position = (np.arange(count) + random[0]) / count * cumulated[-1]
+    chosen = np.searchsorted(cumulated, position, side="right").clip(max=len(faces) - 1)
+    a, b, c = vertices[faces[chosen]].swapaxes(0, 1)
+    root, fraction = np.sqrt(random[1])[:, None], random[2][:, None]
+    return (1 - root) * a + root * (1 - fraction) * b + root * fraction * c

@@ -1,154 +1,147 @@
-"""What the training photos say about a surface: which vertices they cover, which they see, and from where.
+"""Which training photos see each vertex of a surface, and from where.
 
-A photo *covers* a vertex that lies inside its image where its mask ignores nothing, between its near and far; it *sees*
-the vertex when the vertex faces it and no more than half of the light is lost on the way. Losses are looked up in a
-shadow map (Williams 1978): one coarse map per photo of the distance at which its rays lose half of their light.
+A vertex lies *in the frustum* of a photo where it projects into its image, its mask ignores nothing there, and it is
+between near and far. It is *visible* when it also faces the camera and its ray loses no more than half of its
+transmittance on the way. That is looked up in a shadow map (Williams 1978): per photo a coarse grid of rays with the
+distance at which each loses half of its transmittance.
 """
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+import torch
+from scipy.ndimage import maximum_filter
 
-if TYPE_CHECKING:
-    from nerf.fields.density_grid import Lattice
-    from nerf.geometry.rays import Rays
-    from nerf.geometry.scene import Camera, Scene, View
+from nerf.fields.density_grid import Lattice, median_depth
+from nerf.geometry.rays import Rays, join_rays
+from nerf.geometry.scene import Camera, Scene, View
+from nerf.runtime.randomness import generator
+from stages.sfm.colmap.cameras import project
+from stages.train.data import view_mask, view_rays
 
-RAYS = 1 << 17  # over all photos: enough for the level and the maps, seconds on two cores
-LONGEST = 96
-LONGEST_MASK = 384  # a cell counts as ignored if any pixel in it is, and thin things must not go
-SLACK_VOXELS = 3.0  # the surface lies before the median depth, and the map is coarse
-EDGE_ON = 0.1  # cosine between viewing ray and normal below which a vertex is not seen but grazed
-ANGLE_SLACK = 0.02  # the outermost ray goes through a pixel's centre, the image ends half a cell further
-BLOCK = 1 << 15  # vertices at a time: what fits into a processor's cache
+NUM_RAYS = 1 << 17  # over all photos: enough for the iso-level and the maps, seconds on two cores
+MAX_MAP_SIDE = 96
+MAX_MASK_SIDE = 384  # a cell counts as ignored if any pixel in it is, and thin things must not go
+DEPTH_BIAS_VOXELS = 3.0  # the surface lies before the median depth, and the map is coarse
+MIN_COSINE = 0.1  # between viewing ray and normal; below it a vertex is grazed, not visible
+ANGLE_MARGIN = 0.02  # the outermost ray goes through a pixel's centre, the image ends half a cell further
+CHUNK = 1 << 15  # vertices at a time: what fits into a processor's cache
 
 
-class Sight(NamedTuple):
-    """Per vertex: how many photos cover it, how many see it, and the mean viewing direction (n, 3).
+class Visibility(NamedTuple):
+    """Per vertex: in how many photos' frustums it lies, in how many it is visible, and the mean viewing direction.
 
-    The direction is a unit vector from the cameras that see the vertex towards it, each weighted by how squarely
-    it looks at the surface; where none does, it is the inward normal.
+    ``direction`` (n, 3) is a unit vector from the cameras that see the vertex towards it, each weighted by the cosine
+    between ray and normal; where none sees it, it is the inward normal.
     """
 
-    covered: np.ndarray
-    seen: np.ndarray
+    in_frustum: np.ndarray
+    visible: np.ndarray
     direction: np.ndarray
 
 
 class ShadowMap(NamedTuple):
-    """A photo and the distance at which each of its coarse grid of rays (h, w) loses half of its light."""
+    """A photo and the distance at which each of its coarse grid of rays (h, w) loses half of its transmittance."""
 
-    view: "View"
-    camera: "Camera"
-    rays: "Rays"
-    reach: np.ndarray  # the farthest among a cell and its neighbours, so that silhouettes hide nothing behind them
-    widest: float  # cosine between the optical axis and the outermost ray
-    used: np.ndarray | None  # what the mask leaves of the photo, finer than the rays; None: all
+    view: View
+    camera: Camera
+    rays: Rays
+    depth: np.ndarray  # the largest of a cell and its neighbours, so that silhouettes hide nothing behind them
+    min_cosine: float  # between the optical axis and the outermost ray
+    mask: np.ndarray | None  # True where the photo counts, finer than the rays; None: everywhere
 
 
 def shadow_maps(
-    lattice: "Lattice", scene: "Scene", ingest: Path, views: Sequence["View"], on_view: Callable[[float], None]
+    grid: Lattice, scene: Scene, ingest: Path, views: Sequence[View], on_view: Callable[[float], None]
 ) -> list[ShadowMap]:
-    """One map per photo; together about ``RAYS`` rays, each with a sample per voxel of the longest edge. Masks lie in
-    the folder of stage ``ingest``."""
-    from scipy.ndimage import maximum_filter
-
-    from nerf.fields.density_grid import stopping_distance
-    from stages.train.data import view_mask, view_rays
-
+    """One map per photo; together about ``NUM_RAYS`` rays, each with a sample per voxel of the longest edge. Masks lie
+    in the folder of stage ``ingest``."""
     maps = []
     for number, view in enumerate(views):
         camera = scene.cameras[view.camera]
         pixels = camera.width * camera.height
-        downscale = max((pixels * len(views) / RAYS) ** 0.5, max(camera.width, camera.height) / LONGEST, 1.0)
+        downscale = max((pixels * len(views) / NUM_RAYS) ** 0.5, max(camera.width, camera.height) / MAX_MAP_SIDE, 1.0)
         rays = view_rays(scene, view, downscale)
-        rays = rays.each(lambda part: part.to(lattice.low.device))
-        stop = stopping_distance(lattice, rays, max(lattice.values.shape)).cpu().numpy()
-        widest = float((rays.directions.cpu().double().numpy() @ view.scene_from_camera[:, 2]).min())
-        mask = view_mask(ingest, scene, view, max(1.0, max(camera.width, camera.height) / LONGEST_MASK))
-        used = None if mask is None else mask.numpy()
-        maps.append(ShadowMap(view, camera, rays, maximum_filter(stop, size=3, mode="nearest"), widest, used))
+        rays = rays.each(lambda part: part.to(grid.low.device))
+        depth = median_depth(grid, rays, max(grid.values.shape)).cpu().numpy()
+        min_cosine = float((rays.directions.cpu().double().numpy() @ view.scene_from_camera[:, 2]).min())
+        mask = view_mask(ingest, scene, view, max(1.0, max(camera.width, camera.height) / MAX_MASK_SIDE))
+        depth = maximum_filter(depth, size=3, mode="nearest")
+        maps.append(ShadowMap(view, camera, rays, depth, min_cosine, None if mask is None else mask.numpy()))
         on_view((number + 1) / len(views))
     return maps
 
 
-def used_rays(shadow: ShadowMap) -> "Rays":
+def unmasked_rays(shadow_map: ShadowMap) -> Rays:
     """The rays of a map that its mask does not ignore, (n,)."""
-    import torch
-
-    flat = shadow.rays.each(lambda part: part.flatten(0, 1))
-    if shadow.used is None:
+    flat = shadow_map.rays.each(lambda part: part.flatten(0, 1))
+    if shadow_map.mask is None:
         return flat
     rows, columns = (  # of the mask, at the middles of the rays' cells
         (np.arange(cells) * 2 + 1) * pixels // (2 * cells)
-        for cells, pixels in zip(shadow.reach.shape, shadow.used.shape, strict=True)
+        for cells, pixels in zip(shadow_map.depth.shape, shadow_map.mask.shape, strict=True)
     )
-    used = torch.from_numpy(shadow.used[np.ix_(rows, columns)]).flatten().to(flat.near.device)
-    return flat.each(lambda part: part[used])
+    counts = torch.from_numpy(shadow_map.mask[np.ix_(rows, columns)]).flatten().to(flat.near.device)
+    return flat.each(lambda part: part[counts])
 
 
-def drawn_rays(maps: list[ShadowMap], most: int) -> "Rays":
-    """``most`` of the maps' rays, or all where there are fewer, each as likely as any other: every k-th would be those
-    of a single column of each photo wherever k is a multiple of the maps' width."""
-    import torch
-
-    from nerf.geometry.rays import join_rays
-    from nerf.runtime.randomness import generator
-
-    every = join_rays(used_rays(one) for one in maps)
-    order = torch.randperm(len(every.near), generator=generator("cpu", 0))
-    chosen = order[:most].sort().values.to(every.near.device)
-    return every.each(lambda part: part[chosen])
+def sample_rays(maps: list[ShadowMap], count: int) -> Rays:
+    """``count`` random rays of the maps, or all where there are fewer. Every k-th instead would come from a single
+    column of each photo wherever k is a multiple of the maps' width."""
+    rays = join_rays(unmasked_rays(shadow_map) for shadow_map in maps)
+    order = torch.randperm(len(rays.near), generator=generator("cpu", 0))
+    chosen = order[:count].sort().values.to(rays.near.device)
+    return rays.each(lambda part: part[chosen])
 
 
-def look(vertices: np.ndarray, normals: np.ndarray, maps: Sequence[ShadowMap], voxel: float) -> Sight:
-    """Look at every vertex from every photo; ``voxel`` is the lattice's spacing in scene units."""
-    parts = [
-        _look(vertices[start : start + BLOCK], normals[start : start + BLOCK], maps, voxel)
-        for start in range(0, len(vertices), BLOCK)
+def vertex_visibility(vertices: np.ndarray, normals: np.ndarray, maps: Sequence[ShadowMap], voxel: float) -> Visibility:
+    """The visibility of every vertex in all photos; ``voxel`` is the grid's spacing in scene units."""
+    chunks = [
+        _chunk_visibility(vertices[start : start + CHUNK], normals[start : start + CHUNK], maps, voxel)
+        for start in range(0, len(vertices), CHUNK)
     ]
-    return Sight(*map(np.concatenate, zip(*parts, strict=True)))
+    return Visibility(*map(np.concatenate, zip(*chunks, strict=True)))
 
 
-def _look(vertices: np.ndarray, normals: np.ndarray, maps: Sequence[ShadowMap], voxel: float) -> Sight:
-    covered = np.zeros(len(vertices), np.int32)
-    seen = np.zeros(len(vertices), np.int32)
-    towards = np.zeros_like(vertices)
-    for shadow in maps:
-        offset = vertices - shadow.view.scene_from_camera[:, 3]
+def _chunk_visibility(vertices: np.ndarray, normals: np.ndarray, maps: Sequence[ShadowMap], voxel: float) -> Visibility:
+    in_frustum = np.zeros(len(vertices), np.int32)
+    visible = np.zeros(len(vertices), np.int32)
+    total = np.zeros_like(vertices)
+    for shadow_map in maps:
+        offset = vertices - shadow_map.view.scene_from_camera[:, 3]
         distance = np.linalg.norm(offset, axis=1)
-        cell = _cells(offset, distance, shadow)
-        inside = np.flatnonzero((cell >= 0) & (distance >= shadow.view.near) & (distance <= shadow.view.far))
-        covered[inside] += 1
+        cell = _cells(offset, distance, shadow_map)
+        inside = np.flatnonzero((cell >= 0) & (distance >= shadow_map.view.near) & (distance <= shadow_map.view.far))
+        in_frustum[inside] += 1
         direction = offset[inside] / distance[inside, None]
-        facing = -(direction * normals[inside]).sum(axis=1)
-        reach = shadow.reach.reshape(-1)[cell[inside]] + SLACK_VOXELS * voxel
-        sees = (facing > EDGE_ON) & (distance[inside] <= reach)
-        seen[inside[sees]] += 1
-        towards[inside[sees]] += direction[sees] * facing[sees, None]
-    length = np.linalg.norm(towards, axis=1, keepdims=True)
-    direction = np.where(length > 0, towards / np.where(length > 0, length, 1), -normals)
-    return Sight(covered, seen, direction)
+        cosine = -(direction * normals[inside]).sum(axis=1)
+        max_distance = shadow_map.depth.reshape(-1)[cell[inside]] + DEPTH_BIAS_VOXELS * voxel
+        sees = (cosine > MIN_COSINE) & (distance[inside] <= max_distance)
+        visible[inside[sees]] += 1
+        total[inside[sees]] += direction[sees] * cosine[sees, None]
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    direction = np.where(length > 0, total / np.where(length > 0, length, 1), -normals)
+    return Visibility(in_frustum, visible, direction)
 
 
-def _cells(offset: np.ndarray, distance: np.ndarray, shadow: ShadowMap) -> np.ndarray:
+def _cells(offset: np.ndarray, distance: np.ndarray, shadow_map: ShadowMap) -> np.ndarray:
     """The flat index of each point's cell in the shadow map, -1 outside the image and where its mask ignores it.
 
-    Lens polynomials fold back far outside of the image; points at wider angles than any ray are therefore refused.
+    Distortion polynomials fold back far outside of the image; points at wider angles than any ray are therefore left
+    out.
     """
-    from stages.sfm.colmap.cameras import project
-
-    height, width = shadow.reach.shape
-    points = offset @ shadow.view.scene_from_camera[:, :3]
+    height, width = shadow_map.depth.shape
+    camera = shadow_map.camera
+    points = offset @ shadow_map.view.scene_from_camera[:, :3]
     cell = np.full(len(points), -1)
-    ahead = np.flatnonzero(points[:, 2] > max(shadow.widest - ANGLE_SLACK, 1e-6) * distance)
-    share = project(shadow.camera, points[ahead]) / [shadow.camera.width, shadow.camera.height]
-    shown = np.flatnonzero(((share >= 0) & (share < 1)).all(axis=1))
-    if shadow.used is not None:
-        column, row = (share[shown] * shadow.used.shape[::-1]).astype(np.int64).T
-        shown = shown[shadow.used[row, column]]
-    column, row = (share[shown] * [width, height]).astype(np.int64).T
-    cell[ahead[shown]] = row * width + column
+    ahead = np.flatnonzero(points[:, 2] > max(shadow_map.min_cosine - ANGLE_MARGIN, 1e-6) * distance)
+    position = project(camera, points[ahead]) / [camera.width, camera.height]  # [0, 1) in the image
+    inside = np.flatnonzero(((position >= 0) & (position < 1)).all(axis=1))
+    if shadow_map.mask is not None:
+        column, row = (position[inside] * shadow_map.mask.shape[::-1]).astype(np.int64).T
+        inside = inside[shadow_map.mask[row, column]]
+    column, row = (position[inside] * [width, height]).astype(np.int64).T
+    cell[ahead[inside]] = row * width + column
     return cell

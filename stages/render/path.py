@@ -44,12 +44,12 @@ def path_rays(path: CameraPath, scene: "Scene") -> "Iterator[Rays]":
     import numpy as np
     import torch
 
-    from nerf.geometry.near_far import range_between_views
+    from nerf.geometry.near_far import near_and_far_between_views
     from nerf.geometry.rays import rays_of_view
     from stages.sfm.colmap.cameras import camera_rays
 
     views = scene.of_split("train")
-    near, far = range_between_views(
+    near, far = near_and_far_between_views(
         path.poses,
         np.stack([view.scene_from_camera[:, 3] for view in views]),
         np.array([view.near for view in views]),

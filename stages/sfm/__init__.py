@@ -53,8 +53,8 @@ class Config(StageConfig):
         default=0,
         ge=0,
         lt=2**31,
-        description="Of every random choice in matching and mapping; docs/numbers.md says how far runs were "
-        "seen to repeat.",
+        description="Of every random choice in matching and mapping; docs/experiments/camera_models.md says "
+        "how far runs were seen to repeat.",
     )
     max_image_size: int | None = Field(
         default=None,

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 # photos of 300 pixels, a tenth of it.
 LIKE_A_ROTATION = 0.02
 # Between two models of the same photos poses differ by less than a degree and a hundredth of the scene where both are
-# right (docs/numbers.md); what repeats puts a photo another facade, or window, farther.
+# right (docs/experiments/match_graph.md); what repeats puts a photo another facade, or window, farther.
 SAME_ANGLE_DEG, SAME_PLACE = 5.0, 0.05
 PROPOSALS = 500
 RADIAL_DEG, MOSTLY = 15.0, 0.8

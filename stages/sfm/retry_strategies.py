@@ -17,7 +17,8 @@ from stages.io.files import write_durably
 WORTH_STARTING_OVER = 0.1  # of all; for features and the lens two at least, since one may well be a stranger
 # Nor is mapping again, minutes of many photos, for a blurred one among them: the others show what it shows.
 WORTH_ANOTHER = 0.02
-# The lens is chosen and everything adjusted in 0.8 to 1.6 times the time of mapping (docs/numbers.md).
+# The lens is chosen and everything adjusted in 0.8 to 1.6 times the time of mapping
+# (docs/experiments/camera_models.md).
 FINISHING = 2.0
 NO_TIME, OUT_OF_TIME = "too little was left of", "ran out of time"
 GIVEN_UP, GIVEN = "--sfm.max-seconds", "the time it is given (--budget or --sfm.seconds)"

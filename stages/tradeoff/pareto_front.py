@@ -10,7 +10,7 @@ study has time for, would else be the answer for every scene. It is placed besid
 field, as many as give ``LEAST_FREEDOM`` degrees of freedom, but, where nearer ones tell something, none that took more
 than ``ALIKE`` times as long or as short. One from two seeds alone is hardly known: of n degrees of freedom a standard
 deviation is uncertain by 1 / √(2n) of itself. But only alike ones may be pooled: after a hundred steps seeds differ by
-2 dB, after a thousand by 0.05 (fox, docs/numbers.md).
+2 dB, after a thousand by 0.05 (fox, docs/results.md).
 """
 
 import math

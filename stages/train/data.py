@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from nerf.geometry.rays import Rays, rays_of_view
-from nerf.training.ray_dataset import Placement, RayBank, ray_bank
+from nerf.training.ray_dataset import Placement, RayDataset, ray_bank
 from nerf.training.trainer import over
 from stages.contract import Inputs, Progress, StageError
 from stages.effects.track_colours import training_tracks
@@ -56,7 +56,7 @@ def patch_bearings(camera: "Camera", downscale: float) -> "Tensor":
     return torch.from_numpy(camera_rays(camera, math.ceil(width / shrink), math.ceil(height / shrink)))
 
 
-def training_bank(ingest: Path, scene: "Scene", split: "Split", downscale: float, progress: Progress) -> RayBank:
+def training_bank(ingest: Path, scene: "Scene", split: "Split", downscale: float, progress: Progress) -> RayDataset:
     """All pixels and rays of one split, on the CPU; the pixels are mapped from the pixel store, which is made if need
     be. What masks ignore is never drawn. Raises StageError, NOTHING_LEFT, where they leave nothing."""
     views, store = scene.of_split(split), _store(ingest, scene, split, downscale)
@@ -85,7 +85,7 @@ def training_bank(ingest: Path, scene: "Scene", split: "Split", downscale: float
     return _masked(bank, masks, split, progress)
 
 
-def guided_bank(inputs: Inputs, scene: "Scene", downscale: float, progress: Progress) -> RayBank:
+def guided_bank(inputs: Inputs, scene: "Scene", downscale: float, progress: Progress) -> RayDataset:
     """:func:`training_bank` of the training photos, which knows how far away are the sparse points that they show.
 
     Of normalise's points only those that two training photos saw at least, where these saw them."""
@@ -113,7 +113,7 @@ def _ignored(
                 yield None if used is None else used.logical_not_()
 
 
-def _masked(bank: RayBank, ignored: "Iterable[Tensor | None]", split: "Split", progress: Progress) -> RayBank:
+def _masked(bank: RayDataset, ignored: "Iterable[Tensor | None]", split: "Split", progress: Progress) -> RayDataset:
     try:
         bank = bank.without(ignored)
     except ValueError as error:

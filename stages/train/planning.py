@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from nerf.runtime.matmul_precision import products_at
-from nerf.training.ray_dataset import RayBank, build_ray_bank
+from nerf.runtime.matmul_precision import use_matmul_precision
+from nerf.training.ray_dataset import RayDataset, build_ray_bank
 from stages.contract import Inputs, Progress
 from stages.effects.decisions import Decisions, photo_parts, read_decisions
 from stages.hardware.device import compute_device
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from nerf.geometry.scene import Scene
 
 MAX_PIXELS = 400e6  # of many photos, which are held in memory: 1.2 GB
-MAX_PHOTOS = 48  # of 240 photos of one scene, 0.2 rays a pixel are best (docs/numbers.md)
+MAX_PHOTOS = 48  # of 240 photos of one scene, 0.2 rays a pixel are best (docs/experiments/many_photos.md)
 TIMED_SECONDS = 1.0
 MAX_MEMORY_SHARE = 0.5  # of what is free on a GPU: what the pixels may take of it
 MIN_NAMED_GAIN = 0.2  # of the photos' width: what larger photos have to have before they are worth a word
@@ -98,7 +98,7 @@ def seconds_per_step(config: Config, scene: "Scene", decisions: Decisions, devic
     bank = _grey_bank(scene).to(device)
     parts = photo_parts(decisions, scene.of_split("train")[:1], bank)
     trainer = make_trainer(config, scene, bank, seed=0, photo_parts=parts)
-    with products_at(config.matmul):
+    with use_matmul_precision(config.matmul):
         trainer.step(0, 0.0, 1.0)  # the first step pays for memory and kernels
         started, steps = time.perf_counter(), 0
         while steps == 0 or time.perf_counter() - started < TIMED_SECONDS:
@@ -107,7 +107,7 @@ def seconds_per_step(config: Config, scene: "Scene", decisions: Decisions, devic
         return (time.perf_counter() - started) / steps
 
 
-def _grey_bank(scene: "Scene") -> RayBank:
+def _grey_bank(scene: "Scene") -> RayDataset:
     """The rays of the first training view, of a picture that is grey all over."""
     view = scene.of_split("train")[0]
     camera = scene.cameras[view.camera]

@@ -6,8 +6,8 @@ from typing import NamedTuple
 import torch
 
 from nerf.geometry.scene import Scene
-from nerf.runtime.matmul_precision import products_at
-from nerf.training.ray_dataset import RayBank
+from nerf.runtime.matmul_precision import use_matmul_precision
+from nerf.training.ray_dataset import RayDataset
 from nerf.training.validation_probe import make_probe
 from stages.contract import Inputs, Progress, StageResult
 from stages.effects.decisions import learnt_of_photos, photo_parts, read_decisions
@@ -98,7 +98,7 @@ def prepare(config: Config, scene: Scene, inputs: Inputs, folder: Path, progress
     )
 
 
-def _say_sizes(config: Config, budget: TrainingBudget, bank: RayBank, progress: Progress) -> None:
+def _say_sizes(config: Config, budget: TrainingBudget, bank: RayDataset, progress: Progress) -> None:
     much = f"{budget.seconds:g} s" if budget.steps is None else f"{budget.steps:,} steps"
     another = "" if budget.after is None else "another "
     photos = f"{len(bank.near)} photos at 1/{config.downscale:g} of their size"
@@ -111,7 +111,7 @@ def _say_sizes(config: Config, budget: TrainingBudget, bank: RayBank, progress: 
 
 def compute(training: Training) -> None:
     """Take the steps of the budget, at the precision that was chosen."""
-    with products_at(training.config.matmul):
+    with use_matmul_precision(training.config.matmul):
         training.run.train()
 
 
@@ -125,7 +125,7 @@ def save(training: Training, folder: Path, progress: Progress) -> StageResult:
     save_field(folder, run.trainer.model, info)
     write_curve(folder, config.kind, config.downscale, run.plan.is_whole, run.state.curve)
     progress.update("measuring what this machine can do")
-    with products_at(config.matmul):
+    with use_matmul_precision(config.matmul):
         parts = write_parts(folder, run.state.timings, config, run.probes.train.colours.device)
     for words in _closing_notes(training):
         progress.note(words)

@@ -14,9 +14,9 @@ from safetensors.torch import load_file
 
 from nerf.effects.exposure_model import Exposures
 from nerf.effects.pose_refinement import RefinedPoses
-from nerf.training.hash_grid_trainer import GridTrainer
-from nerf.training.ray_dataset import RayBank
-from nerf.training.trainer import PaperTrainer
+from nerf.training.hash_grid_trainer import HashGridTrainer
+from nerf.training.ray_dataset import RayDataset
+from nerf.training.trainer import VanillaTrainer
 from nerf.training.validation_probe import make_probe, measure
 from stages import train
 from stages.contract import StageError, StageResult
@@ -147,7 +147,7 @@ def test_rays_that_are_no_numbers_end_training_by_name(
     progress: Any,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def poisoned(bank: RayBank) -> None:
+    def poisoned(bank: RayDataset) -> None:
         table, number = ROWS[row]
         getattr(bank, table)[number, ::2] = poison
 
@@ -232,14 +232,14 @@ def test_no_number_is_a_symptom(inputs: dict[str, Path], progress: Any) -> None:
     assert symptom is None or "no number" in symptom or "flat colour" in symptom
 
 
-def train_loop_trainer(inputs: dict[str, Path], bank: RayBank) -> GridTrainer:
+def train_loop_trainer(inputs: dict[str, Path], bank: RayDataset) -> HashGridTrainer:
     from stages.train.fields import make_trainer, with_defaults
 
     settings: dict[str, Any] = {"downscale": 1.0, "steps": 1, "chunks": 1} | GRID | KINDS["torch"]
     asked = train.Config(**settings)
     config = with_defaults(asked.model_copy(update={"contracted": False, "view_dependence": True}))
     trainer = make_trainer(config, read_scene(inputs["normalise"]), bank, 0)
-    assert isinstance(trainer, GridTrainer)
+    assert isinstance(trainer, HashGridTrainer)
     return trainer
 
 
@@ -266,7 +266,7 @@ def test_openexr_and_radiance_files_are_no_photos(tmp_path: Path, head: bytes) -
 def _forget(trainer: Any) -> None:
     """The weights of a field that is empty everywhere, all of them finite."""
     with torch.no_grad():
-        if isinstance(trainer, PaperTrainer):
+        if isinstance(trainer, VanillaTrainer):
             trainer.model.fine.density_head.weight.zero_()
             trainer.model.fine.density_head.bias.fill_(-100)
         else:
@@ -276,7 +276,7 @@ def _forget(trainer: Any) -> None:
 
 def spoil_at(step: int, spoil: Callable[[Any], None], monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
     """``spoil`` the trainer whenever it has taken so many steps."""
-    trainer = PaperTrainer if kind == "paper" else GridTrainer
+    trainer = VanillaTrainer if kind == "paper" else HashGridTrainer
     take = trainer.step
 
     def spoiled(self: Any, number: int, *rest: float):

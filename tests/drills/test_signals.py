@@ -10,7 +10,7 @@ from tests.drills.campaigns import Chain, kills, unclean
 from tests.drills.drill import Program
 from tests.synthetic_photos import SyntheticPhotos
 
-PATIENT = 10.0  # seconds; on a machine that does nothing else it takes a tenth of one (docs/numbers.md)
+PATIENT = 10.0  # seconds; on a machine that does nothing else it takes a tenth of one (docs/results.md)
 SOON = 0.05  # seconds after a stage has begun
 
 

@@ -128,10 +128,10 @@ def points() -> bytes:
 @cache
 def field() -> dict[str, bytes]:
     """A valid, tiny trained field."""
-    from nerf.fields.vanilla import PaperNerf, PaperSettings
+    from nerf.fields.vanilla import VanillaNerf, VanillaSettings
     from stages.io.field_files import save_field
 
-    model = PaperNerf(PaperSettings(depth=2, width=8, position_frequencies=2, direction_frequencies=1), seed=0)
+    model = VanillaNerf(VanillaSettings(depth=2, width=8, position_frequencies=2, direction_frequencies=1), seed=0)
     exposure = {"neutral": [0.0, 0.0, 0.0], "photos": {"p0.png": [0.1, 0.0, 0.0]}}
     info = {"background": [1, 1, 1], "downscale": 1.0, "steps": 5, "rays": 50, "exposure": exposure}
     with tempfile.TemporaryDirectory() as folder:

@@ -9,54 +9,63 @@ DOCUMENT = Path(__file__).parents[2] / "docs" / "NUMERICS.md"
 
 # What has no row. A module of nerf/ stands in a row, here, or fails a test.
 ELSEWHERE = {
-    "nerf/kernels/torch/hidden_layer.py": "max(x + y, 0) and its mask, bit for bit: tests/nerf/kernels/test_warp.py; "
+    "nerf/kernels/torch/hidden_layer.py": "max(x + y, 0) and its mask, bit for bit: "
+    "tests/nerf/kernels/warp/test_warp.py; "
     "NaN stays NaN: tests/numerics/test_not_a_number.py",
-    "nerf/kernels/torch/occupancy.py": "comparisons and bits, exact: tests/nerf/kernels/test_cache.py; a cell that is "
+    "nerf/kernels/torch/occupancy.py": "comparisons and bits, exact: "
+    "tests/nerf/kernels/torch/test_occupancy.py; a cell that is "
     "no number counts as occupied",
     "nerf/kernels/torch/early_termination.py": "sums of optical depth in float64, the lattice's step as marching "
-    "takes it: tests/nerf/kernels/test_waves.py",
+    "takes it: tests/nerf/kernels/test_early_termination.py",
     "nerf/kernels/torch/colour_sampling.py": "1 − exp(−x) as in compositing, of optical depth summed in float64; "
     "differences of it are off by 1e-7, and what is no number is left out and reaches the light behind it: "
-    "tests/nerf/kernels/test_drawing.py",
-    "nerf/rendering/early_termination.py": "cuts rays where the light is below 1e-3: tests/nerf/test_grid_field.py",
-    "nerf/fields/hash_grid.py": "puts rows together: tests/nerf/test_grid_field.py",
+    "tests/nerf/kernels/test_colour_sampling.py",
+    "nerf/rendering/early_termination.py": "cuts rays where the light is below 1e-3: "
+    "tests/nerf/fields/test_hash_grid.py",
+    "nerf/fields/hash_grid.py": "puts rows together: tests/nerf/fields/test_hash_grid.py",
     "nerf/fields/occupancy_grid.py": "σ times the lattice's step; the outermost cells, which reach to infinity, count "
-    "half a cell within: tests/nerf/test_grid_training.py",
+    "half a cell within: tests/nerf/training/test_hash_grid_trainer.py",
     "nerf/fields/frustum_mask.py": "angles and distances of the middles of cells; the cells around them count as "
-    "well: tests/nerf/test_visibility.py",
+    "well: tests/nerf/fields/test_frustum_mask.py",
     "nerf/training/ray_dataset.py": "bearings linear within a patch, of length 1/2 or more before they are divided by "
-    "it: tests/nerf/test_ray_bank.py",
-    "nerf/rendering/srgb.py": "the standard's own curve, its inverse, from nothing to 1e30: tests/nerf/test_srgb.py",
+    "it: tests/nerf/training/test_ray_dataset.py",
+    "nerf/rendering/srgb.py": "the standard's own curve, its inverse, from nothing to 1e30: "
+    "tests/nerf/rendering/test_srgb.py",
     "nerf/effects/exposure.py": "powers taken between powers, without light in between; value, gradient, extremes: "
     "tests/nerf/effects/test_exposure.py",
     "nerf/effects/exposure_model.py": "gains of a photo's rays, from nothing to 1e30: "
-    "tests/nerf/effects/test_exposures.py",
+    "tests/nerf/effects/test_exposure_model.py",
     "nerf/geometry/rotations.py": "its series below 0.1 radians, against the matrix exponential from 0 to beyond π: "
-    "tests/nerf/effects/test_rotations.py",
-    "nerf/effects/pose_refinement.py": "turns and shifts of rays, up to 3.1 radians: tests/nerf/effects/test_poses.py",
-    "nerf/effects/pose_fit.py": "a search: tests/stages/test_pilots.py, tests/nerf/effects/test_pose_fit.py",
-    "nerf/geometry/pose_distance.py": "float64, ratios of distances: tests/nerf/test_pose_distance.py",
-    "nerf/rendering/images.py": "cuts pictures into chunks: tests/nerf/test_rendering.py",
-    "nerf/training/validation_probe.py": "mean colour, PSNR, patches of pixels: tests/nerf/test_probe.py",
+    "tests/nerf/geometry/test_rotations.py",
+    "nerf/effects/pose_refinement.py": "turns and shifts of rays, up to 3.1 radians: "
+    "tests/nerf/effects/test_pose_refinement.py",
+    "nerf/effects/pose_fit.py": "a search: tests/stages/effects/test_pilots.py, tests/nerf/effects/test_pose_fit.py",
+    "nerf/geometry/pose_distance.py": "float64, ratios of distances: tests/nerf/geometry/test_pose_distance.py",
+    "nerf/rendering/images.py": "cuts pictures into chunks: tests/nerf/rendering/test_images.py",
+    "nerf/training/validation_probe.py": "mean colour, PSNR, patches of pixels: "
+    "tests/nerf/training/test_validation_probe.py",
     "nerf/training/trainer.py": "sums of chunks; refuses what is not finite before the update: "
-    "tests/nerf/test_training.py",
-    "nerf/training/hash_grid_trainer.py": "likewise: tests/nerf/test_grid_training.py",
+    "tests/nerf/training/test_trainer.py",
+    "nerf/training/hash_grid_trainer.py": "likewise: tests/nerf/training/test_hash_grid_trainer.py",
     "nerf/runtime/matmul_precision.py": "lets products be off by 1e-4 beside float64, where that is faster: "
-    "tests/nerf/test_product_precision.py",
-    "nerf/training/schedule.py": "rates within the range they are given, in float64: tests/nerf/test_schedule.py",
-    "nerf/training/learning_curve.py": "interpolation in log time, in float64: tests/nerf/test_learning_curve.py",
-    "nerf/geometry/reconstruction.py": "float64, relative to the cameras' middle: tests/nerf/test_reconstruction.py",
+    "tests/nerf/runtime/test_matmul_precision.py",
+    "nerf/training/schedule.py": "rates within the range they are given, in float64: "
+    "tests/nerf/training/test_schedule.py",
+    "nerf/training/learning_curve.py": "interpolation in log time, in float64: "
+    "tests/nerf/training/test_learning_curve.py",
+    "nerf/geometry/reconstruction.py": "float64, relative to the cameras' middle: "
+    "tests/nerf/geometry/test_reconstruction.py",
     "nerf/geometry/normalisation.py": "float64, the same for every similar reconstruction, 1e6 off the origin too: "
-    "tests/nerf/test_normalisation.py",
-    "nerf/geometry/region_of_interest.py": "float64: tests/nerf/test_normalisation.py",
-    "nerf/geometry/up_vector.py": "float64: tests/nerf/test_up_vector.py",
-    "nerf/geometry/near_far.py": "float64: tests/nerf/test_normalisation.py",
-    "nerf/geometry/alignment.py": "float64, refuses points on one line: tests/nerf/test_alignment.py",
-    "nerf/geometry/camera_paths.py": "float64: tests/nerf/test_camera_paths.py",
+    "tests/nerf/geometry/test_normalisation.py",
+    "nerf/geometry/region_of_interest.py": "float64: tests/nerf/geometry/test_normalisation.py",
+    "nerf/geometry/up_vector.py": "float64: tests/nerf/geometry/test_up_vector.py",
+    "nerf/geometry/near_far.py": "float64: tests/nerf/geometry/test_normalisation.py",
+    "nerf/geometry/alignment.py": "float64, refuses points on one line: tests/nerf/geometry/test_alignment.py",
+    "nerf/geometry/camera_paths.py": "float64: tests/nerf/geometry/test_camera_paths.py",
     "nerf/synthetic/shapes.py": "the synthetic scene, without gradient, against exact geometry: "
-    "tests/nerf/test_shapes.py",
-    "nerf/synthetic/textures.py": "the synthetic scene: tests/nerf/test_solid_texture.py",
-    "nerf/synthetic/scenes.py": "the synthetic scene: tests/nerf/test_synthetic.py",
+    "tests/nerf/synthetic/test_shapes.py",
+    "nerf/synthetic/textures.py": "the synthetic scene: tests/nerf/synthetic/test_textures.py",
+    "nerf/synthetic/scenes.py": "the synthetic scene: tests/nerf/synthetic/test_scenes.py",
 }
 NO_FORMULA = {
     "nerf/geometry/scene.py", "nerf/fields/interface.py", "nerf/runtime/parallel.py", "nerf/runtime/randomness.py",
@@ -64,7 +73,7 @@ NO_FORMULA = {
 }  # fmt: skip
 # Measured as the rows of the functions they repeat.
 REPEATED = ("nerf/kernels/warp/",)
-# Statistics in float64, each with its own noise: tests/nerf/evidence.
+# Statistics in float64, each with its own noise: tests/nerf/effects/statistics.
 STATISTICS = ("nerf/effects/statistics/",)
 
 HEAD = """# Numerics

@@ -4,8 +4,6 @@ import ast
 import re
 from pathlib import Path
 
-import pytest
-
 ROOT = Path(__file__).parents[2]
 SMALLEST, LARGEST = 1e-30, 1.000001e-5
 # (file, line without blanks): why it may stand without a name.
@@ -39,11 +37,9 @@ def _is_constant(statement: ast.Assign | ast.AnnAssign) -> bool:
     return all(isinstance(target, ast.Name) and NAME.match(target.id) for target in targets)
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda path: path.relative_to(ROOT).as_posix())
-def test_every_small_number_has_a_name_and_a_reason(path: Path) -> None:
-    name = path.relative_to(ROOT).as_posix()
-    left = [line for line in unexplained(path.read_text("utf-8")) if (name, line) not in ALLOWED]
-    assert not left, f"{name}: name these numbers and say why they are what they are"
+def test_every_small_number_has_a_name_and_a_reason() -> None:
+    left = {path.relative_to(ROOT).as_posix(): unexplained(path.read_text("utf-8")) for path in FILES}
+    assert [f"{name}: {line}" for name in left for line in left[name] if (name, line) not in ALLOWED] == []
 
 
 def test_what_is_allowed_is_there_and_has_a_reason() -> None:

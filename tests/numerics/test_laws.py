@@ -20,7 +20,7 @@ from nerf.rendering.sampling import invert_cdf
 from nerf.rendering.volume_rendering import composite, volume_weights
 from stages.contract import StageError
 from stages.evaluate.image_metrics import ssim
-from stages.mesh.surface import extract, is_watertight
+from stages.mesh.surface import extract_surface, is_watertight
 
 BACKENDS = pytest.mark.parametrize("backend", [reference, warp], ids=["torch", "warp"])
 DENSITY = st.one_of(st.just(0.0), st.floats(-45, 30).map(lambda e: 10.0**e), st.floats(0, 100))
@@ -191,7 +191,7 @@ def test_a_lattice_without_a_surface_is_refused(density: float) -> None:
     """Empty, full, constant: no level lies strictly inside."""
     corner = torch.ones(3)
     with pytest.raises(StageError, match="no surface at density 7"):
-        extract(DensityLattice(torch.full((6, 6, 6), density), -corner, corner), 7.0)
+        extract_surface(DensityLattice(torch.full((6, 6, 6), density), -corner, corner), 7.0)
 
 
 @pytest.mark.parametrize("density", [1e4, 1e30])
@@ -200,10 +200,10 @@ def test_a_block_of_full_vertices_is_a_closed_surface_and_a_single_one_is_too_th
 ) -> None:
     values = torch.zeros(7, 7, 7)
     values[2:5, 2:5, 2:5] = density
-    surface = extract(DensityLattice(values, -torch.ones(3), torch.ones(3)), 7.0)
+    surface = extract_surface(DensityLattice(values, -torch.ones(3), torch.ones(3)), 7.0)
     assert is_watertight(surface) and np.isfinite(surface.vertices).all()
     assert 1 / 3 < np.abs(surface.vertices).max() < 2 / 3
     alone = torch.zeros(7, 7, 7)
     alone[3, 3, 3] = density
-    with pytest.raises(StageError, match="too thin for the lattice"):
-        extract(DensityLattice(alone, -torch.ones(3), torch.ones(3)), 7.0)
+    with pytest.raises(StageError, match="too thin for the grid"):
+        extract_surface(DensityLattice(alone, -torch.ones(3), torch.ones(3)), 7.0)

@@ -58,7 +58,7 @@ def test_a_cell_of_no_known_thickness_is_looked_into(backend: Backend) -> None:
     """Skipped, a part of the field that is broken would look like empty space, and no loss would ever tell."""
     thickness = torch.zeros(128)
     thickness[3] = math.nan
-    assert backend.occupied_bits(thickness, 0.01).tolist() == [1 << 3, 0]
+    assert backend.occupancy_bits(thickness, 0.01).tolist() == [1 << 3, 0]
 
 
 @BACKENDS
@@ -67,8 +67,8 @@ def test_a_cell_where_a_value_is_not_a_number_has_none(backend: Backend) -> None
     thickness, along_z = torch.full((64,), 0.5), torch.tensor([0, 1, 1, 2, 2, 3])
     values = torch.tensor([2.0, 2.0, math.nan, math.nan, 2.0, 3.0])
     points = torch.nn.functional.pad((along_z[:, None] + 0.5) / 4, (2, 0))
-    backend.raise_cache(4, thickness, points, values)
-    backend.raise_cache(4, thickness, points, torch.full((6,), 2.5))
+    backend.scatter_max(4, thickness, points, values)
+    backend.scatter_max(4, thickness, points, torch.full((6,), 2.5))
     torch.testing.assert_close(thickness[:5], torch.tensor([2.5, math.nan, math.nan, 3.0, 0.5]), equal_nan=True)
 
 

@@ -4,7 +4,7 @@ Also a backend of its own (:class:`nerf.kernels.Backend`), for machines where no
 """
 
 from nerf.kernels.torch.adam import adam
-from nerf.kernels.torch.colour_sampling import add_drawn, drawn_samples
+from nerf.kernels.torch.colour_sampling import accumulate_colours, select_colour_samples
 from nerf.kernels.torch.compositing import (
     composite,
     composite_backward,
@@ -12,17 +12,17 @@ from nerf.kernels.torch.compositing import (
     distortion_backward,
     visible_samples,
 )
-from nerf.kernels.torch.early_termination import end_wave, pack_waves
+from nerf.kernels.torch.early_termination import finish_round, pack_rounds
 from nerf.kernels.torch.encoding import encode, encode_backward_points, encode_backward_table
 from nerf.kernels.torch.hidden_layer import add_ray_relu, add_ray_relu_backward, relu_backward
 from nerf.kernels.torch.marching import march, sample_points, sample_points_backward
-from nerf.kernels.torch.occupancy import cell_corners, occupied_bits, raise_cache
+from nerf.kernels.torch.occupancy import cell_corners, occupancy_bits, scatter_max
 from nerf.kernels.torch.sparse_depth import depth_loss, depth_loss_backward
 from nerf.kernels.torch.spherical_harmonics import spherical_harmonics, spherical_harmonics_backward
 
 __all__ = [
+    "accumulate_colours",
     "adam",
-    "add_drawn",
     "add_ray_relu",
     "add_ray_relu_backward",
     "cell_corners",
@@ -32,18 +32,18 @@ __all__ = [
     "depth_loss_backward",
     "distortion",
     "distortion_backward",
-    "drawn_samples",
     "encode",
     "encode_backward_points",
     "encode_backward_table",
-    "end_wave",
+    "finish_round",
     "march",
-    "occupied_bits",
-    "pack_waves",
-    "raise_cache",
+    "occupancy_bits",
+    "pack_rounds",
     "relu_backward",
     "sample_points",
     "sample_points_backward",
+    "scatter_max",
+    "select_colour_samples",
     "spherical_harmonics",
     "spherical_harmonics_backward",
     "visible_samples",

@@ -14,7 +14,7 @@ from nerf.kernels import Drawn, Samples
 from nerf.kernels.torch.compositing import OPAQUE, sums_before
 
 
-def drawn_samples(
+def select_colour_samples(
     samples: Samples,
     sigma: Float[Tensor, "samples"],
     quantum: float,
@@ -50,7 +50,7 @@ def _quanta(stopped: Float64[Tensor, "samples"], quantum: float) -> Float64[Tens
     return (stopped / quantum + 0.5).floor()
 
 
-def add_drawn(drawn: Drawn, colour: Float[Tensor, "kept 3"], seen: Float[Tensor, "rays 4"]) -> None:
+def accumulate_colours(drawn: Drawn, colour: Float[Tensor, "kept 3"], seen: Float[Tensor, "rays 4"]) -> None:
     """In place, ``seen`` grows by what the samples show, sum w c, and sum w t."""
     each = drawn.weights[:, None] * torch.cat([colour, drawn.samples.t[:, None]], -1)
     seen += torch.zeros_like(seen, dtype=torch.float64).index_add(0, drawn.samples.ray, each.double()).to(seen.dtype)

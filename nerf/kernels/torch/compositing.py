@@ -18,10 +18,10 @@ from torch import Tensor
 
 from nerf.fields.interface import Rendering
 from nerf.kernels import Lattice, Samples
-from nerf.kernels.torch.marching import lattice_measure
+from nerf.kernels.torch.marching import normalised_distance
 
 OPAQUE = 800.0
-LEAST_CHANCE = 1 / 16  # of a thin sample to be kept, so that no interval becomes more than 16 times as long
+MIN_KEEP_PROBABILITY = 1 / 16  # of a thin sample to be kept, so that no interval becomes more than 16 times as long
 
 
 def visible_samples(
@@ -33,11 +33,11 @@ def visible_samples(
     everything. ``sigma`` must be the density that will be composited: older ones (the cache's) would hide a surface
     from the very gradient that is to move it.
 
-    Of those thinner than ``thin`` each is kept with the chance p = max(tau / thin, LEAST_CHANCE), and its interval is
-    made 1 / p times as long: it stands for others like it, so that sums of tau f over a ray keep their expectation, and
-    so do gradients of densities. Chances are added up along the ray, beginning with ``offset``, a random number in
-    [0, 1), and a sample is kept where the sum reaches a whole number (systematic sampling; Carpenter et al. 1999), so
-    that thin fog is sampled evenly. ``thin`` 0 keeps all.
+    Of those thinner than ``thin`` each is kept with probability p = max(tau / thin, MIN_KEEP_PROBABILITY), and its
+    interval is made 1 / p times as long: it stands for others like it, so that sums of tau f over a ray keep their
+    expectation, and so do gradients of densities. Probabilities are added up along the ray, beginning with ``offset``,
+    a random number in [0, 1), and a sample is kept where the sum reaches a whole number (systematic sampling;
+    Carpenter et al. 1999), so that thin fog is sampled evenly. ``thin`` 0 keeps all.
     """
     chance = _chance(sigma * samples.dt, thin)
     of_thin = torch.where(chance < 1, chance, 0).double()
@@ -52,7 +52,7 @@ def visible_samples(
 
 def _chance(tau: Float[Tensor, "samples"], thin: float) -> Float[Tensor, "samples"]:
     """Of a sample to be kept; 1 for what is no number, that it may be noticed."""
-    return torch.where(tau < thin, (tau / thin).clamp(min=LEAST_CHANCE), 1)
+    return torch.where(tau < thin, (tau / thin).clamp(min=MIN_KEEP_PROBABILITY), 1)
 
 
 def composite(
@@ -196,4 +196,4 @@ def _measure(samples: Samples, lattice: Lattice) -> tuple[Float[Tensor, "samples
     """Positions and lengths in the measure of the lattice, float64."""
     t, dt = samples.t.double(), samples.dt.double()
     lengths = dt / (lattice.linear_until * (t / lattice.linear_until).clamp(min=1)) if lattice.cone else dt
-    return lattice_measure(lattice, t), lengths
+    return normalised_distance(lattice, t), lengths

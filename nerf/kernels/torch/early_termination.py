@@ -9,10 +9,10 @@ from torch import Tensor
 
 from nerf.kernels import Lattice, Samples
 from nerf.kernels.torch.compositing import OPAQUE
-from nerf.kernels.torch.marching import lattice_coordinate, lattice_distance
+from nerf.kernels.torch.marching import s_to_t, t_to_s
 
 
-def end_wave(
+def finish_round(
     lattice: Lattice,
     samples: Samples,
     sigma: Float[Tensor, "samples"],
@@ -32,12 +32,12 @@ def end_wave(
     goes_on = (samples.starts.diff() == lattice.most_samples) & (torch.exp(-depth.to(sigma.dtype)) >= threshold)
     ray = goes_on.nonzero()[:, 0]
     last = samples.t.index_select(0, samples.starts.index_select(0, ray + 1) - 1)
-    onward = lattice_distance(lattice, lattice_coordinate(lattice, last) + (1 - jitter.index_select(0, ray)))
+    onward = s_to_t(lattice, t_to_s(lattice, last) + (1 - jitter.index_select(0, ray)))
     near.copy_(far)
     near[ray] = torch.minimum(onward, far[ray])
 
 
-def pack_waves(waves: Sequence[Samples]) -> tuple[Samples, Int32[Tensor, "samples"]]:
+def pack_rounds(waves: Sequence[Samples]) -> tuple[Samples, Int32[Tensor, "samples"]]:
     """The samples of several waves of the same rays packed ray by ray, and where each is among the waves' samples one
     after the other."""
     counts = torch.stack([wave.starts.diff() for wave in waves])

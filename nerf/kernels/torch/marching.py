@@ -19,10 +19,10 @@ def march(occupied: Occupied, lattice: Lattice, rays: Rays, jitter: Float[Tensor
     """
     if not lattice.contracted:
         rays = clip_to_box(rays, -BOX, BOX)
-    first = lattice_coordinate(lattice, rays.near)
-    counts = torch.ceil(lattice_coordinate(lattice, rays.far) - first)
+    first = t_to_s(lattice, rays.near)
+    counts = torch.ceil(t_to_s(lattice, rays.far) - first)
     k = torch.arange(int(counts.max()) if len(counts) else 0, dtype=first.dtype, device=first.device)
-    t = lattice_distance(lattice, (first + jitter)[:, None] + k)
+    t = s_to_t(lattice, (first + jitter)[:, None] + k)
     wanted = (k < counts[:, None]) & (t < rays.far[:, None])
     # The same as points_on(rays, t), laid out axis by axis: torch is several times faster without a row of 3 innermost.
     points = (rays.origins.T[:, :, None] + t * rays.directions.T[:, :, None]).movedim(0, -1)
@@ -31,12 +31,12 @@ def march(occupied: Occupied, lattice: Lattice, rays: Rays, jitter: Float[Tensor
     if len(k) > lattice.most_samples:
         wanted &= wanted.cumsum(-1) <= lattice.most_samples
     ray, k_wanted = wanted.nonzero(as_tuple=True)
-    start, end = (lattice_distance(lattice, first[ray] + k_wanted + edge) for edge in (0, 1))
+    start, end = (s_to_t(lattice, first[ray] + k_wanted + edge) for edge in (0, 1))
     dt = torch.minimum(end, rays.far[ray]) - start
     return Samples(_starts_of(wanted.sum(-1)), ray.int(), t[wanted], dt)
 
 
-def lattice_distance(lattice: Lattice, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+def s_to_t(lattice: Lattice, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     """t(s) of :class:`nerf.kernels.Lattice`."""
     if not lattice.cone:
         return lattice.step * s
@@ -44,15 +44,15 @@ def lattice_distance(lattice: Lattice, s: Float[Tensor, "*batch"]) -> Float[Tens
     return torch.minimum(lattice.step * s, s.new_tensor(lattice.linear_until)) * torch.exp(beyond)
 
 
-def lattice_coordinate(lattice: Lattice, t: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-    """s(t), the inverse of :func:`lattice_distance`."""
+def t_to_s(lattice: Lattice, t: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """s(t), the inverse of :func:`s_to_t`."""
     if not lattice.cone:
         return t / lattice.step
     linear_until = lattice.linear_until
     return t.clamp(max=linear_until) / lattice.step + torch.log(t.clamp(min=linear_until) / linear_until) / lattice.cone
 
 
-def lattice_measure(lattice: Lattice, t: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+def normalised_distance(lattice: Lattice, t: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     """The measure m in which losses tell distances: dm = dt / max(t_1, t) where steps grow from t_1 on (beyond it m is
     log t + const), distances themselves if they do not."""
     if not lattice.cone:

@@ -15,7 +15,7 @@ BRICK_CELLS = 64
 MOST_CLEAR = 8  # bricks: a quarter of a cube of 128 cells, so that a ray crosses an empty one in a few hops
 
 
-def raise_cache(
+def scatter_max(
     cells: int,
     thickness: Float[Tensor, "cache"],
     points: Float[Tensor, "points 3"],
@@ -23,12 +23,12 @@ def raise_cache(
 ) -> None:
     """In place: every cell with a point becomes the largest of itself and its points' values, however many.
 
-    It is NaN from then on if one of these is: what is broken stays in sight (:func:`occupied_bits`).
+    It is NaN from then on if one of these is: what is broken stays in sight (:func:`occupancy_bits`).
     """
     thickness.scatter_reduce_(0, cell_numbers(cells, points).long(), values, "amax")
 
 
-def occupied_bits(thickness: Float[Tensor, "cache"], threshold: float) -> Int64[Tensor, "bricks"]:
+def occupancy_bits(thickness: Float[Tensor, "cache"], threshold: float) -> Int64[Tensor, "bricks"]:
     """A bit for each cell thicker than ``threshold``, and for each whose thickness is not a number: left out, a cell
     where the field is broken would look empty."""
     occupied = ~(thickness <= threshold).view(-1, BRICK_CELLS)

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf.kernels import Lattice, Samples
-from nerf.kernels.torch.marching import lattice_measure
+from nerf.kernels.torch.marching import normalised_distance
 
 
 def depth_loss(
@@ -25,9 +25,9 @@ def depth_loss(
     """sum_i w_i |m(t_i) - m(d)| + U |m(far) - m(d)| of each ray, where U = 1 - opacity is the light that nothing stops
     and d the ``distance`` of its point; 0 for rays whose d is 0, of which none is known.
 
-    Positions m are measured as in the distortion loss (nerf/kernels/torch/marching.py: lattice_measure), so that where
-    steps grow a tenth too far costs the same at any distance. In float64: logarithms of nearly the same distance
-    cancel.
+    Positions m are measured as in the distortion loss (nerf/kernels/torch/marching.py: normalised_distance), so that
+    where steps grow a tenth too far costs the same at any distance. In float64: logarithms of nearly the same
+    distance cancel.
     """
     of_samples, of_rest = _apart(samples, far, distance, lattice)
     rest = (1 - opacity) * of_rest
@@ -51,7 +51,7 @@ def _apart(
     samples: Samples, far: Float[Tensor, "rays"], distance: Float[Tensor, "rays"], lattice: Lattice
 ) -> tuple[Float[Tensor, "samples"], Float[Tensor, "rays"]]:
     """How far samples and the ends of rays are from their point, float64; 0 on rays without one."""
-    known, point = distance > 0, lattice_measure(lattice, distance.double())
-    of_samples = (lattice_measure(lattice, samples.t.double()) - point.index_select(0, samples.ray)).abs()
-    of_rest = (lattice_measure(lattice, far.double()) - point).abs()
+    known, point = distance > 0, normalised_distance(lattice, distance.double())
+    of_samples = (normalised_distance(lattice, samples.t.double()) - point.index_select(0, samples.ray)).abs()
+    of_rest = (normalised_distance(lattice, far.double()) - point).abs()
     return of_samples * known.index_select(0, samples.ray), of_rest * known

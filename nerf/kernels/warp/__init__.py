@@ -6,7 +6,7 @@ no fixed order.
 """
 
 from nerf.kernels.warp.adam import adam
-from nerf.kernels.warp.colour_sampling import add_drawn, drawn_samples
+from nerf.kernels.warp.colour_sampling import accumulate_colours, select_colour_samples
 from nerf.kernels.warp.compositing import (
     composite,
     composite_backward,
@@ -14,18 +14,18 @@ from nerf.kernels.warp.compositing import (
     distortion_backward,
     visible_samples,
 )
-from nerf.kernels.warp.early_termination import end_wave, pack_waves
+from nerf.kernels.warp.early_termination import finish_round, pack_rounds
 from nerf.kernels.warp.encoding import encode, encode_backward_points, encode_backward_table
 from nerf.kernels.warp.hidden_layer import add_ray_relu, add_ray_relu_backward, relu_backward
 from nerf.kernels.warp.launch import compile_kernels, why_not
 from nerf.kernels.warp.marching import march, sample_points, sample_points_backward
-from nerf.kernels.warp.occupancy import cell_corners, occupied_bits, raise_cache
+from nerf.kernels.warp.occupancy import cell_corners, occupancy_bits, scatter_max
 from nerf.kernels.warp.sparse_depth import depth_loss, depth_loss_backward
 from nerf.kernels.warp.spherical_harmonics import spherical_harmonics, spherical_harmonics_backward
 
 __all__ = [
+    "accumulate_colours",
     "adam",
-    "add_drawn",
     "add_ray_relu",
     "add_ray_relu_backward",
     "cell_corners",
@@ -36,18 +36,18 @@ __all__ = [
     "depth_loss_backward",
     "distortion",
     "distortion_backward",
-    "drawn_samples",
     "encode",
     "encode_backward_points",
     "encode_backward_table",
-    "end_wave",
+    "finish_round",
     "march",
-    "occupied_bits",
-    "pack_waves",
-    "raise_cache",
+    "occupancy_bits",
+    "pack_rounds",
     "relu_backward",
     "sample_points",
     "sample_points_backward",
+    "scatter_max",
+    "select_colour_samples",
     "spherical_harmonics",
     "spherical_harmonics_backward",
     "visible_samples",

@@ -12,7 +12,7 @@ from nerf.kernels.warp.launch import launch
 wp.set_module_options({"enable_backward": False})
 
 
-def drawn_samples(
+def select_colour_samples(
     samples: Samples,
     sigma: Float[Tensor, "samples"],
     quantum: float,
@@ -34,7 +34,7 @@ def drawn_samples(
     return Drawn(Samples(starts, ray, t, dt), index, weights)
 
 
-def add_drawn(drawn: Drawn, colour: Float[Tensor, "kept 3"], seen: Float[Tensor, "rays 4"]) -> None:
+def accumulate_colours(drawn: Drawn, colour: Float[Tensor, "kept 3"], seen: Float[Tensor, "rays 4"]) -> None:
     """As in nerf.kernels.torch.colour_sampling."""
     launch(_add, len(seen), drawn.samples.starts, drawn.samples.t, drawn.weights, colour, seen)
 

@@ -11,13 +11,13 @@ from torch import Tensor
 
 from nerf.fields.interface import Rendering
 from nerf.kernels import Lattice, Samples
-from nerf.kernels.torch.compositing import LEAST_CHANCE, OPAQUE
+from nerf.kernels.torch.compositing import MIN_KEEP_PROBABILITY, OPAQUE
 from nerf.kernels.warp.launch import launch
 
 wp.set_module_options({"enable_backward": False})
 
 _OPAQUE = wp.constant(OPAQUE)
-_LEAST_CHANCE = wp.constant(LEAST_CHANCE)
+_MIN_KEEP_PROBABILITY = wp.constant(MIN_KEEP_PROBABILITY)
 _SERIES_BELOW = wp.constant(0.2)  # the first term that artanh's series leaves out is then below 1e-8 of it
 
 
@@ -110,7 +110,7 @@ def stopped(tau: float):
 def _chance(tau: float, thin: float):
     """Of a sample to be kept; 1 for what is no number."""
     if tau < thin:
-        return wp.max(tau / thin, _LEAST_CHANCE)
+        return wp.max(tau / thin, _MIN_KEEP_PROBABILITY)
     return 1.0
 
 

@@ -10,12 +10,12 @@ from torch import Tensor
 from nerf.kernels import Lattice, Samples
 from nerf.kernels.warp.compositing import thickness
 from nerf.kernels.warp.launch import launch
-from nerf.kernels.warp.marching import lattice_coordinate, lattice_distance
+from nerf.kernels.warp.marching import s_to_t, t_to_s
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 
-def end_wave(
+def finish_round(
     lattice: Lattice,
     samples: Samples,
     sigma: Float[Tensor, "samples"],
@@ -27,10 +27,10 @@ def end_wave(
 ) -> None:
     """As in nerf.kernels.torch.early_termination."""
     sizes, packed = lattice[:2], (samples.starts, samples.t, samples.dt)
-    launch(_end_wave, len(far), *sizes, lattice.most_samples, *packed, sigma, threshold, jitter, far, depth, near)
+    launch(_finish_round, len(far), *sizes, lattice.most_samples, *packed, sigma, threshold, jitter, far, depth, near)
 
 
-def pack_waves(waves: Sequence[Samples]) -> tuple[Samples, Int32[Tensor, "samples"]]:
+def pack_rounds(waves: Sequence[Samples]) -> tuple[Samples, Int32[Tensor, "samples"]]:
     """As in nerf.kernels.torch.early_termination."""
     starts, rays = sum(wave.starts for wave in waves[1:]) + waves[0].starts, len(waves[0].starts) - 1
     total, device, before = sum(len(wave.t) for wave in waves), starts.device, 0
@@ -38,13 +38,13 @@ def pack_waves(waves: Sequence[Samples]) -> tuple[Samples, Int32[Tensor, "sample
     t, dt = (torch.empty(total, device=device) for _ in range(2))
     placed = starts[:-1].clone()
     for wave in waves:
-        launch(_place_wave, rays, wave.starts, wave.t, wave.dt, before, placed, order, ray, t, dt)
+        launch(_place_round, rays, wave.starts, wave.t, wave.dt, before, placed, order, ray, t, dt)
         before += len(wave.t)
     return Samples(starts, ray, t, dt), order
 
 
 @wp.kernel
-def _end_wave(
+def _finish_round(
     step: float,
     cone: float,
     most: int,
@@ -67,13 +67,13 @@ def _end_wave(
     depth[ray] = tau
     onward = far[ray]
     if end - start == most and wp.exp(-float(tau)) >= threshold:
-        s = lattice_coordinate(step, cone, distances[end - 1]) + (1.0 - jitter[ray])
-        onward = wp.min(onward, lattice_distance(step, cone, s))
+        s = t_to_s(step, cone, distances[end - 1]) + (1.0 - jitter[ray])
+        onward = wp.min(onward, s_to_t(step, cone, s))
     near[ray] = onward
 
 
 @wp.kernel
-def _place_wave(
+def _place_round(
     starts: wp.array[int],
     distances: wp.array[float],
     lengths: wp.array[float],

@@ -15,7 +15,7 @@ wp.set_module_options({"enable_backward": False})
 _PRIME_Y = wp.constant(wp.uint32(2654435761))
 _PRIME_Z = wp.constant(wp.uint32(805459861))
 FEATURES = 4  # of a vertex: a row of the table is one vec4
-_AHEAD = wp.constant(8)  # points for which rows are fetched before their turn (docs/numbers.md: Waiting for memory)
+_AHEAD = wp.constant(8)  # points for which rows are fetched before their turn (docs/experiments/step_time.md)
 vec8 = wp.types.vector(length=8, dtype=wp.float32)
 vec8i = wp.types.vector(length=8, dtype=wp.int32)
 

@@ -68,7 +68,7 @@ def _scratch(length: int, device: torch.device) -> Tensor:
 
 
 @wp.func
-def lattice_distance(step: float, cone: float, s: float):
+def s_to_t(step: float, cone: float, s: float):
     """t(s) of nerf.kernels.Lattice."""
     if cone == 0.0:
         return step * s
@@ -77,7 +77,7 @@ def lattice_distance(step: float, cone: float, s: float):
 
 
 @wp.func
-def lattice_coordinate(step: float, cone: float, t: float):
+def t_to_s(step: float, cone: float, t: float):
     """s(t), the inverse of t(s)."""
     if cone == 0.0:
         return t / step
@@ -205,14 +205,14 @@ def _march(
         within = _box(o, d)
         near = wp.max(near, within[0])
         far = wp.max(near, wp.min(far, within[1]))
-    first = lattice_coordinate(step, cone, near)
-    last = lattice_coordinate(step, cone, far) - first
+    first = t_to_s(step, cone, near)
+    last = t_to_s(step, cone, far) - first
     count = int(0)
     k = int(0)
     inverse = _inverse(contracted, d)
     while float(k) < last and count < most:
         s = first + jitter[ray] + float(k)
-        t = lattice_distance(step, cone, s)
+        t = s_to_t(step, cone, s)
         if t >= far:
             break
         point = o + t * d
@@ -224,7 +224,7 @@ def _march(
             clear = wp.max(1, int(clearance[number >> 6]))
             free = _free_distance(contracted, cells, cell, clear, u, point, inverse)
             # Rounded down by a thousandth of a step: a step too few is looked at again, one too many is lost.
-            steps = lattice_coordinate(step, cone, t + free) - s - 0.001
+            steps = t_to_s(step, cone, t + free) - s - 0.001
             k += wp.max(1, int(wp.min(steps, 1.0e6)) + 1)
         else:
             if ((word >> wp.int64(number & 63)) & wp.int64(1)) != wp.int64(0):
@@ -254,10 +254,10 @@ def _place(
     start = starts[ray]
     for i in range(start, starts[ray + 1]):
         k = float(found[ray * most + i - start])
-        here = lattice_distance(step, cone, firsts[ray] + k)
-        there = wp.min(lattice_distance(step, cone, firsts[ray] + k + 1.0), ends[ray])
+        here = s_to_t(step, cone, firsts[ray] + k)
+        there = wp.min(s_to_t(step, cone, firsts[ray] + k + 1.0), ends[ray])
         rays[i] = ray
-        distances[i] = lattice_distance(step, cone, firsts[ray] + jitter[ray] + k)
+        distances[i] = s_to_t(step, cone, firsts[ray] + jitter[ray] + k)
         lengths[i] = there - here
 
 

@@ -10,10 +10,10 @@ from nerf.kernels.warp.launch import launch
 
 wp.set_module_options({"enable_backward": False})
 
-__all__ = ["cell_corners", "occupied_bits", "raise_cache"]  # cell_corners runs once in 16 steps: torch will do
+__all__ = ["cell_corners", "occupancy_bits", "scatter_max"]  # cell_corners runs once in 16 steps: torch will do
 
 
-def raise_cache(
+def scatter_max(
     cells: int,
     thickness: Float[Tensor, "cache"],
     points: Float[Tensor, "points 3"],
@@ -24,10 +24,10 @@ def raise_cache(
     launch(_spoil, len(points), cells, thickness, points, values)
 
 
-def occupied_bits(thickness: Float[Tensor, "cache"], threshold: float) -> Int64[Tensor, "bricks"]:
+def occupancy_bits(thickness: Float[Tensor, "cache"], threshold: float) -> Int64[Tensor, "bricks"]:
     """As in nerf.kernels.torch.occupancy."""
     bits = thickness.new_empty(len(thickness) // BRICK_CELLS, dtype=torch.int64)
-    launch(_occupied_bits, len(bits), thickness, threshold, bits)
+    launch(_occupancy_bits, len(bits), thickness, threshold, bits)
     return bits
 
 
@@ -67,7 +67,7 @@ def _spoil(cells: int, thickness: wp.array[float], points: wp.array[wp.vec3], va
 
 
 @wp.kernel
-def _occupied_bits(thickness: wp.array[float], threshold: float, bits: wp.array[wp.int64]):
+def _occupancy_bits(thickness: wp.array[float], threshold: float, bits: wp.array[wp.int64]):
     brick = wp.tid()
     word = wp.int64(0)
     for cell in range(64):

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from nerf.kernels import Backend, Lattice, Samples
-from nerf.training.losses import LARGEST_PULL, robust_error
+from nerf.training.losses import HUBER_DELTA, huber_loss
 from nerf.training.metrics import PSNR_LIMIT, psnr
 from pipeline.doctor.numerics import Bound, Case
 from pipeline.doctor.numerics.light import N, light, packed
@@ -81,7 +81,7 @@ def _depth_loss_plainly(weights: Tensor) -> Tensor:
 
 def _huber(error: Tensor) -> Tensor:
     size = error.abs()
-    return torch.where(size <= LARGEST_PULL, size.square(), 2 * LARGEST_PULL * size - LARGEST_PULL**2)
+    return torch.where(size <= HUBER_DELTA, size.square(), 2 * HUBER_DELTA * size - HUBER_DELTA**2)
 
 
 def _psnrs(_: Backend, error: Tensor) -> Tensor:
@@ -134,16 +134,16 @@ CASES = [
     ),
     Case(
         formula="colour loss e², 2 d |e| − d² where |e| > d",
-        where="nerf/training/losses.py: robust_error",
+        where="nerf/training/losses.py: huber_loss",
         domain="any e; NaN and ∞ stay so",
         hazard="e² overflows beyond 1e19",
         answer="p (2 e − p) with the pull p = clamp(e, −d, d), half the gradient",
         tried="|e| from 1e-6 to 1; 0, ± d and their neighbours, ± 1e30",
         typical=lambda: (decades(1, -6, 0, 256, 1),),
         extreme=lambda: (torch.tensor([[0.0], [0.1], [-0.1], [0.1000001], [-0.0999999], [1e30], [-1e30]]),),
-        function=lambda _, error: robust_error(error)[0],
+        function=lambda _, error: huber_loss(error)[0],
         reference=_huber,
-        backward=lambda _, grad, error: (2 * grad * robust_error(error)[1],),
+        backward=lambda _, grad, error: (2 * grad * huber_loss(error)[1],),
         differentiable=1,
         value=Bound(5e-7, "itself"),
         gradient=Bound(5e-7, "itself"),

@@ -179,12 +179,12 @@ def _sky_directions(like: Tensor) -> Tensor:
 
 
 def _sky(backend: Backend, table: Tensor) -> Tensor:
-    return sky.sky_colour(backend, table, _sky_directions(table))
+    return sky.background_colour(backend, table, _sky_directions(table))
 
 
 def _sky_backward(backend: Backend, grad: Tensor, table: Tensor) -> tuple[Tensor]:
     directions = _sky_directions(table)
-    return (sky.sky_backward(backend, directions, sky.sky_colour(backend, table, directions), grad),)
+    return (sky.background_backward(backend, directions, sky.background_colour(backend, table, directions), grad),)
 
 
 def _sky_plainly(table: Tensor) -> Tensor:
@@ -268,7 +268,7 @@ CASES = [
     ),
     Case(
         formula="the sky: sigmoid of what its table has on the unit sphere",
-        where="nerf/fields/background.py: sky_colour, sky_backward",
+        where="nerf/fields/background.py: background_colour, background_backward",
         domain="finite features",
         hazard="levels cancel: a logit is off by half an ulp of the largest feature; 1 − c is 0 beyond 17",
         answer="accepted, as for the colour network: where features are that large, the colour is saturated",

@@ -7,7 +7,7 @@ from nerf.fields.positional_encoding import positional_encoding
 from nerf.geometry.contraction import contract, uncontract
 from nerf.geometry.rays import Rays, clip_to_box, points_on
 from nerf.kernels import BOX, CONTRACTED_BOX, Backend, Lattice, Samples
-from nerf.kernels.torch.marching import lattice_coordinate, lattice_distance
+from nerf.kernels.torch.marching import s_to_t, t_to_s
 from pipeline.doctor.numerics import Bound, Case
 
 OCTAVES = 16
@@ -128,7 +128,7 @@ def _interval(s: Tensor) -> Tensor:
 
 
 def _intervals(_: Backend, s: Tensor) -> Tensor:
-    start, end = lattice_distance(FOLDED, s), lattice_distance(FOLDED, s + 1)
+    start, end = s_to_t(FOLDED, s), s_to_t(FOLDED, s + 1)
     return torch.stack([start, end, end - start], -1)
 
 
@@ -270,27 +270,27 @@ CASES = [
     ),
     Case(
         formula="t(s) = step s, then step/cone exp(cone s − 1)",
-        where="nerf/kernels/torch/marching.py: lattice_distance",
+        where="nerf/kernels/torch/marching.py: s_to_t",
         domain="t ≤ 1e30",
         hazard="exp overflows for s beyond 89/cone",
         answer="the exponent's own rounding, cone s ulp/2, stays: 1e-6 at t = 1000; infinite t is beyond any far",
         tried="s from 0, 1e-45 to 9000 (t = 1e30)",
         typical=lambda: (uniform(1, 0, 1500, 512, 1),),
         extreme=lambda: (torch.tensor([[0.0], [1e-45], [1e-30], [125.0], [125.00001], [8000.0], [9000.0]]),),
-        function=lambda _, s: lattice_distance(FOLDED, s),
+        function=lambda _, s: s_to_t(FOLDED, s),
         reference=_distance,
         value=Bound(5e-6, "itself"),
     ),
     Case(
         formula="s(t), its inverse",
-        where="nerf/kernels/torch/marching.py: lattice_coordinate",
+        where="nerf/kernels/torch/marching.py: t_to_s",
         domain="0 ≤ t ≤ 1e37",
         hazard="log of 0; t/t₁ overflows beyond 3e38 t₁",
         answer="the logarithm is taken of max(1, t/t₁)",
         tried="t from 0, 1e-45 to 1e37",
         typical=lambda: (decades(1, -3, 3, 512, 1),),
         extreme=lambda: (torch.tensor([[0.0], [1e-45], [1e-30], [0.25], [0.25000003], [1e30], [1e37]]),),
-        function=lambda _, t: lattice_coordinate(FOLDED, t),
+        function=lambda _, t: t_to_s(FOLDED, t),
         reference=_coordinate,
         value=Bound(1e-6, "itself"),
     ),

@@ -35,7 +35,7 @@ WAYS = {
 }
 
 
-# The accuracy in docs/numbers.md is that of the first tier. Sets of any size are searched so: features left out cost
+# The accuracy in docs/results.md is that of the first tier. Sets of any size are searched so: features left out cost
 # more in cameras than they save in seconds. Only where a time is given that would not be enough, they give way: a step
 # down has half the pixels or the same, and a quarter of the products of matching. Below 1131 pixels photos would have
 # to be doubled to yield enough, which saves nothing.

@@ -10,7 +10,7 @@ from stages.train.fields import hash_grid, vanilla
 
 if TYPE_CHECKING:
     from nerf.geometry.scene import Scene
-    from nerf.training.ray_dataset import RayBank
+    from nerf.training.ray_dataset import RayDataset
 
 
 class Field(Protocol):
@@ -73,7 +73,7 @@ class Field(Protocol):
         self,
         config: Config,
         scene: "Scene",
-        bank: "RayBank",
+        bank: "RayDataset",
         seed: int,
         photo_rays: PhotoRays,
         photo_colours: PhotoColours,
@@ -98,7 +98,7 @@ def with_defaults(config: Config) -> Config:
 def make_trainer(
     config: Config,
     scene: "Scene",
-    bank: "RayBank",
+    bank: "RayDataset",
     seed: int,
     photo_parts: tuple[PhotoRays, PhotoColours] = (AS_GIVEN, AS_RENDERED),
 ) -> FieldTrainer:

@@ -4,10 +4,10 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from nerf.effects import PhotoColours, PhotoRays
-from nerf.fields.hash_grid import GridField, GridSettings
+from nerf.fields.hash_grid import HashGridField, HashGridSettings
 from nerf.fields.mlp import HIDDEN
 from nerf.kernels import BOX, CONTRACTED_BOX
-from nerf.training.hash_grid_trainer import GridTrainer, GridTrainerSettings
+from nerf.training.hash_grid_trainer import HashGridTrainer, HashGridTrainerSettings
 from stages.contract import Progress
 from stages.hardware.backend import chosen_backend, load_backend
 from stages.hardware.device import compute_device, cores
@@ -18,36 +18,39 @@ from stages.train.data import has_background_model, training_background
 
 if TYPE_CHECKING:
     from nerf.geometry.scene import Scene
-    from nerf.training.ray_dataset import RayBank
+    from nerf.training.ray_dataset import RayDataset
 
 # At first; both fall while training. In contracted space a cell is met from farther away, and rays are longer.
 LEARNING_RATES = {"bounded": 2e-2, "contracted": 1e-2}
 # Colours that each part of a step computes, so each core: half of what a part takes does not depend on how many they
-# are, and fewer cost as long. In a box more of them go with its closer samples (docs/numbers.md).
+# are, and fewer cost as long. In a box more of them go with its closer samples (docs/experiments/colour_samples.md).
 PART_SAMPLES = {"bounded": 3 << 13, "contracted": 1 << 14}
 # The largest step, which a GPU takes as fast as a small one. Its gradients are sure enough for the larger rate
-# (docs/numbers.md).
+# (docs/experiments/colour_samples.md).
 MAX_STEP_SAMPLES, LARGE_STEP_LEARNING_RATE = 1 << 18, 2e-2
 # Weight of the distortion loss (Barron et al. 2022, who take 1e-2) in contracted space, against fog and matter close
-# before the cameras; fog also costs most of the time (docs/numbers.md). A box around an object needs none.
+# before the cameras; fog also costs most of the time (docs/experiments/distortion_loss.md). A box around an object
+# needs none.
 DISTORTION = 2e-3
-# Weight at first of the loss at sparse points (docs/numbers.md; Deng et al. 2022 take 0.1, too, of another loss).
+# Weight at first of the loss at sparse points (docs/experiments/sparse_depth.md; Deng et al. 2022 take 0.1, too, of
+# another loss).
 DEPTH_LOSS = 0.1
-# Photos that must look into a cell for something to stand before their foregrounds (docs/numbers.md).
+# Photos that must look into a cell for something to stand before their foregrounds (docs/experiments/few_photos.md).
 MIN_PHOTOS = 3
-# Cells along an axis of the coarsest grid: fewer where they have to fill all of contracted space (docs/numbers.md).
+# Cells along an axis of the coarsest grid: fewer where they have to fill all of contracted space
+# (docs/experiments/few_photos.md).
 BASE_RES = {"bounded": 16, "contracted": 8}
-# Samples along a ray (docs/numbers.md).
+# Samples along a ray (docs/experiments/ray_samples.md).
 MAX_STEPS = 576  # bounded scenes: steps along the diagonal of the box
 # Contracted space: steps in one of the finest cells, by how many of these along an axis it counts for at most. Finer
-# cells gain more by more rays than by closer samples (docs/numbers.md: Finer cells).
+# cells gain more by more rays than by closer samples (docs/experiments/cell_sizes.md).
 STEPS_PER_CELL = {512: 3, 2048: 1.5}
 EVEN_UNTIL = 0.25  # contracted space: scene units from the camera up to which steps are even; beyond, they grow
 # Contracted space: at the shortest steps so many samples reach to a distance of 23; --train.ray-samples may ask for
 # more.
 MAX_SAMPLES = 1024
 SAMPLES_PER_RAY = {"bounded": 3, "contracted": 10}
-"""Colours computed for a ray, over a run: measured on lego_400 and five photo sets (docs/numbers.md)."""
+"""Colours computed for a ray, over a run: measured on lego_400 and five photo sets (docs/results.md)."""
 SIZES = {
     "bounded": ((50e6, 5, 18, 512), (0, 4, 17, 256)),
     "contracted": ((30e6, 6, 18, 1024), (0, 5, 17, 512)),
@@ -173,23 +176,23 @@ def step_in_words(config: Config) -> str:
 
 
 def make_trainer(
-    config: Config, scene: "Scene", bank: "RayBank", seed: int, photo_rays: PhotoRays, photo_colours: PhotoColours
-) -> GridTrainer:
+    config: Config, scene: "Scene", bank: "RayDataset", seed: int, photo_rays: PhotoRays, photo_colours: PhotoColours
+) -> HashGridTrainer:
     """A fresh field with its trainer, where ``bank`` is."""
     assert config.backend, "plan() chooses it"
     backend = load_backend(config.backend, bank.device.type)
-    model = GridField(field_settings(config, has_background_model(config, scene)), seed, backend).to(bank.device)
-    return GridTrainer(model, bank, _trainer_settings(config, scene, seed), photo_rays, photo_colours)
+    model = HashGridField(field_settings(config, has_background_model(config, scene)), seed, backend).to(bank.device)
+    return HashGridTrainer(model, bank, _trainer_settings(config, scene, seed), photo_rays, photo_colours)
 
 
-def field_settings(config: Config, sky: bool) -> GridSettings:
+def field_settings(config: Config, sky: bool) -> HashGridSettings:
     """Sizes of the field. Samples stand as close as the finest cells can tell them apart: in contracted space a third
     to two thirds of a cell near the camera, growing with the distance, as pixels do; in a box a cell, or MAX_STEPS in
     all."""
     assert config.levels and config.log2_rows and config.finest, "plan() chooses them"
     assert config.contracted is not None and config.view_dependence is not None, "plan() takes them from stage effects"
     shortest = 2 * CONTRACTED_BOX / (_steps_across(config.finest) * config.ray_samples)
-    return GridSettings(
+    return HashGridSettings(
         levels=config.levels,
         log2_rows=config.log2_rows,
         coarsest=min(BASE_RES[config.space], config.finest),
@@ -209,9 +212,9 @@ def _steps_across(max_res: int) -> float:
     return max(per_cell * min(max_res, most) for most, per_cell in STEPS_PER_CELL.items())
 
 
-def _trainer_settings(config: Config, scene: "Scene", seed: int) -> GridTrainerSettings:
+def _trainer_settings(config: Config, scene: "Scene", seed: int) -> HashGridTrainerSettings:
     assert config.batch_samples and config.chunks and config.learning_rate, "plan() chooses them"
-    return GridTrainerSettings(
+    return HashGridTrainerSettings(
         seed=seed,
         background=training_background(config, scene),
         samples=config.batch_samples,

@@ -4,8 +4,8 @@ from dataclasses import fields
 from typing import TYPE_CHECKING
 
 from nerf.effects import PhotoColours, PhotoRays
-from nerf.fields.vanilla import PaperNerf, PaperSettings
-from nerf.training.trainer import CHUNK_RAYS, PaperTrainer, TrainerSettings
+from nerf.fields.vanilla import VanillaNerf, VanillaSettings
+from nerf.training.trainer import CHUNK_RAYS, VanillaTrainer, VanillaTrainerSettings
 from stages.contract import Progress
 from stages.hardware.device import cores
 from stages.train.config import Config
@@ -13,7 +13,7 @@ from stages.train.data import training_background
 
 if TYPE_CHECKING:
     from nerf.geometry.scene import Scene
-    from nerf.training.ray_dataset import RayBank
+    from nerf.training.ray_dataset import RayDataset
 
 # The small networks have few steps and take large ones: after 300 of 512 rays on lego_400 at a quarter of its size a
 # start at 5e-4 gave 14.7 dB held out, 2e-3 17.4, 5e-3 19.1. The published ones are those of the released lego config.
@@ -121,16 +121,16 @@ def step_in_words(config: Config) -> str | None:
 
 
 def make_trainer(
-    config: Config, scene: "Scene", bank: "RayBank", seed: int, photo_rays: PhotoRays, photo_colours: PhotoColours
-) -> PaperTrainer:
+    config: Config, scene: "Scene", bank: "RayDataset", seed: int, photo_rays: PhotoRays, photo_colours: PhotoColours
+) -> VanillaTrainer:
     """A fresh field with its trainer, where ``bank`` is."""
     assert config.batch_rays is not None and config.learning_rate is not None, "plan() chooses them"
-    model = PaperNerf(field_settings(config), seed).to(bank.device)
+    model = VanillaNerf(field_settings(config), seed).to(bank.device)
     rates = (config.learning_rate, config.learning_rate * FINAL_LEARNING_RATE)
-    settings = TrainerSettings(config.batch_rays, seed, training_background(config, scene), *rates)
-    return PaperTrainer(model, bank, settings, photo_rays, photo_colours)
+    settings = VanillaTrainerSettings(config.batch_rays, seed, training_background(config, scene), *rates)
+    return VanillaTrainer(model, bank, settings, photo_rays, photo_colours)
 
 
-def field_settings(config: Config) -> PaperSettings:
+def field_settings(config: Config) -> VanillaSettings:
     """Sizes and ablations of the field."""
-    return PaperSettings(**{part.name: getattr(config, part.name) for part in fields(PaperSettings)})
+    return VanillaSettings(**{part.name: getattr(config, part.name) for part in fields(VanillaSettings)})

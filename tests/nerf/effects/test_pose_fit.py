@@ -1,25 +1,25 @@
-"""The pose of a photo, found in a field; that it is found at all is tested on photos (tests/stages/test_pilots.py)."""
+"""The pose of a photo, found in a field; that it is found on photos: tests/stages/effects/test_pilots.py."""
 
 import torch
 from torch import Tensor
 
 from nerf.effects.pose_fit import fit_pose
-from nerf.fields.hash_grid import GridField, GridGradients, GridPass, GridSettings
+from nerf.fields.hash_grid import HashGridField, HashGridGradients, HashGridPass, HashGridSettings
 from nerf.geometry.rays import Rays
 from nerf.kernels import torch as reference
 
 SMALLER = 1 / 16  # a power of two: numbers that differ by it have the same digits
-FIELD = GridSettings(levels=2, log2_rows=10, coarsest=4, finest=16, steps=32, cache_cells=16)
+FIELD = HashGridSettings(levels=2, log2_rows=10, coarsest=4, finest=16, steps=32, occupancy_resolution=16)
 
 
-class Small(GridField):
+class Small(HashGridField):
     """What the same field is in a scene that is smaller by SMALLER."""
 
-    def forward(self, rays: Rays, jitter: Tensor, offset: Tensor, background: Tensor) -> GridPass:
+    def forward(self, rays: Rays, jitter: Tensor, offset: Tensor, background: Tensor) -> HashGridPass:
         large = Rays(rays.origins / SMALLER, rays.directions, rays.near / SMALLER, rays.far / SMALLER)
         return super().forward(large, jitter, offset, background)
 
-    def rays_backward(self, done: GridPass, gradients: GridGradients) -> tuple[Tensor, Tensor]:
+    def rays_backward(self, done: HashGridPass, gradients: HashGridGradients) -> tuple[Tensor, Tensor]:
         origins, directions = super().rays_backward(done, gradients)
         return origins / SMALLER, directions
 
@@ -31,7 +31,7 @@ def test_the_pose_found_in_a_smaller_scene_is_the_same_but_smaller() -> None:
     near, far = torch.full((100,), 0.5), torch.full((100,), 3.0)
     target, black = torch.rand(100, 3, generator=random), torch.zeros(3)
     found = []
-    for field, scale in ((GridField(FIELD, 0, reference), 1.0), (Small(FIELD, 0, reference), SMALLER)):
+    for field, scale in ((HashGridField(FIELD, 0, reference), 1.0), (Small(FIELD, 0, reference), SMALLER)):
         field.table *= 3000  # something to be seen
         rays = Rays(scale * torch.tensor([0.0, 0, -1.5]).repeat(100, 1), directions, scale * near, scale * far)
         found.append(fit_pose(field, rays, target, black, distance=scale))

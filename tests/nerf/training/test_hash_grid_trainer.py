@@ -1,0 +1,401 @@
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from nerf.effects import AS_GIVEN, AS_RENDERED
+from nerf.effects.exposure import expose
+from nerf.effects.exposure_model import Exposures
+from nerf.effects.pose_refinement import RefinedPoses
+from nerf.fields.background import background_colour
+from nerf.fields.hash_grid import HashGridField, HashGridSettings
+from nerf.geometry.rays import Rays
+from nerf.kernels import torch as reference
+from nerf.training.hash_grid_trainer import (
+    HashGridBatch,
+    HashGridTrainer,
+    HashGridTrainerSettings,
+    depth_factor,
+    lr_multiplier,
+)
+from nerf.training.ray_dataset import RayDataset, build_ray_bank
+from nerf.training.trainer import FieldTrainer, NonFinite
+from nerf.training.validation_probe import make_probe, measure
+
+FIELD = HashGridSettings(levels=2, log2_rows=10, coarsest=4, finest=16, steps=32, occupancy_resolution=16)
+BACKGROUND = (0.2, 0.9, 0.5)
+TRAINER = HashGridTrainerSettings(seed=3, background="random", samples=1024)
+
+
+def small_bank(size: int = 12) -> RayDataset:
+    """Two opposite views of a red disc on nothing, from 3 units away."""
+    grid = (torch.arange(size) + 0.5) / size - 0.5
+    y, x = torch.meshgrid(grid, grid, indexing="ij")
+    bearings = torch.stack([x, y, torch.ones_like(x)], -1)
+    bearings = bearings / bearings.norm(dim=-1, keepdim=True)
+    inside = (x**2 + y**2 < 0.04)[..., None]
+    photo = torch.cat([torch.where(inside, torch.tensor([200, 20, 20]), 255), torch.where(inside, 255, 0)], -1)
+    front = torch.tensor([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, -3]])
+    back = torch.tensor([[-1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 3]])
+    near, far = torch.full((2,), 1.0), torch.full((2,), 5.0)
+    return build_ray_bank([photo.to(torch.uint8)] * 2, [0, 0], [bearings], torch.stack([front, back]), near, far)
+
+
+def trainer(settings: HashGridTrainerSettings = TRAINER, field: HashGridSettings = FIELD) -> HashGridTrainer:
+    return HashGridTrainer(HashGridField(field, 0, reference), small_bank(), settings)
+
+
+def copied(state: dict[str, Tensor]) -> dict[str, Tensor]:
+    return {name: tensor.clone() for name, tensor in state.items()}
+
+
+def same(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:
+    return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
+
+
+def test_it_trains_behind_the_common_interface() -> None:
+    run: FieldTrainer = trainer()
+    probe = make_probe(small_bank(), 288, torch.ones(3), seed=5)
+    before = measure(run.model, probe).psnr
+    for step in range(80):
+        run.step(step, step / 80, 1.0)
+    after = measure(run.model, probe).psnr
+    assert before < probe.flat_psnr < probe.flat_psnr + 5 < after < 60
+
+
+def test_a_resumed_run_is_the_uninterrupted_one_bit_for_bit() -> None:
+    whole, first = trainer(), trainer()
+    results = [whole.step(step, step / 40) for step in range(40)]
+    for step in range(20):
+        first.step(step, step / 40)
+    second = trainer()
+    second.load_state(copied(first.state()))
+    assert [second.step(step, step / 40) for step in range(20, 40)] == results[20:]
+    assert same(whole.state(), second.state())
+    assert len({result.rays for result in results}) > 5, "the number of rays is meant to adapt"
+
+
+def test_results_do_not_depend_on_the_number_of_threads() -> None:
+    settings = replace(TRAINER, samples=3 << 12)
+    threads, states = torch.get_num_threads(), []
+    try:
+        for count in (1, 2, 3):
+            torch.set_num_threads(count)
+            run = trainer(settings, replace(FIELD, levels=3, finest=64, log2_rows=16))
+            for step in range(20):  # the density cache is refreshed once
+                run.step(step, step / 20)
+            states.append(copied(run.state()))
+    finally:
+        torch.set_num_threads(threads)
+    assert same(states[0], states[1]) and same(states[0], states[2])
+
+
+def test_the_gradient_of_a_batch_is_the_sum_over_its_chunks() -> None:
+    run = trainer(replace(TRAINER, samples=1 << 14, distortion=0.1, depth_loss=0.2, chunks=4))
+    run.bank = run.bank.with_distances(torch.tensor([78, 222]), torch.tensor([3.0, 2.5]))
+    rays = run._rays_per_chunk()
+    parts = [run._part(0, 0.25, rays, chunk) for chunk in range(4)]
+    assert sum(int((part.batch.distance > 0).sum()) for part in parts) == 4 * rays // 8
+    assert rays > 10 and not torch.equal(parts[0].batch.target, parts[1].batch.target)
+    whole = HashGridBatch(
+        Rays(*(torch.cat(part) for part in zip(*(part.batch.rays for part in parts), strict=True))),
+        *(torch.cat(part) for part in zip(*(part.batch[1:] for part in parts), strict=True)),
+    )
+    done = run.model.forward(whole.rays, whole.jitter, whole.offset, whole.background)
+    loss = run._loss(4 * rays, 0.25, done, whole)
+    gradients = run.model.backward(done, loss.grad, loss.grad_weights)
+    summed = [torch.stack(of_parts).sum(0) for of_parts in zip(*(part.weights for part in parts), strict=True)]
+    torch.testing.assert_close(summed, list(gradients.weights), rtol=1e-4, atol=1e-9)
+    torch.testing.assert_close(torch.cat([part.features for part in parts]), gradients.features, rtol=1e-4, atol=1e-9)
+    torch.testing.assert_close(sum(part.loss for part in parts), loss.value)
+
+
+def test_rays_adapt_to_the_samples_they_need() -> None:
+    run = trainer()
+    results = [run.step(step, 0.5) for step in range(100)]
+    assert results[0].rays == 1024 // 128
+    assert results[0].rays < results[0].samples <= results[0].densities <= results[0].rays * FIELD.lattice.most_samples
+    needed = results[-1].rays * float(run.samples_per_ray)
+    assert 0.7 * 1024 < needed < 1.4 * 1024
+    assert results[-1].rays > 5 * results[0].rays
+
+
+def test_empty_space_is_closed_and_the_object_stays_open() -> None:
+    run = trainer(field=replace(FIELD, steps=200))
+    for step in range(96):
+        run.step(step, 0.5)
+    words = torch.stack([(run.model.bits >> bit) & 1 for bit in range(64)], -1)
+    opened = words.sum() / FIELD.occupancy_resolution**3
+    assert 0.02 < opened < 0.7
+    rays, _, alpha, _ = run.bank.lookup(torch.arange(len(run.bank.pixels)))
+    opacity = run.model.render(rays, torch.ones(3)).opacity
+    assert opacity[alpha == 1].mean() > 0.7
+    assert opacity[alpha == 0].mean() < 0.1
+
+
+@pytest.mark.parametrize(("broken", "quantity"), [(math.nan, "loss"), (math.inf, "gradient")])
+def test_a_non_finite_step_changes_nothing_and_shows_its_batch(
+    broken: float, quantity: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = trainer()
+    run.step(0, 0.0)
+    if quantity == "loss":
+        run.model.colour_out[0, 0] = broken
+    else:
+        backward = run.model.backward
+        monkeypatch.setattr(
+            run.model, "backward", lambda *a: backward(*a)._replace(features=torch.full((1, FIELD.levels * 4), broken))
+        )
+    before = copied(run.state())
+    with pytest.raises(NonFinite, match=f"the {quantity} of step 1 is not finite") as caught:
+        run.step(1, 0.5)
+    for name, tensor in run.state().items():
+        torch.testing.assert_close(tensor, before[name], rtol=0, atol=0, equal_nan=True)
+    assert set(caught.value.batch) == {*Rays._fields, "target", "background", "jitter", "offset", "view", "distance"}
+
+
+def test_the_rate_scale_scales_the_update() -> None:
+    whole, half = trainer(), trainer()
+    start = copied(whole.state())
+    whole.step(0, 0.0, 1.0)
+    half.step(0, 0.0, 0.5)
+    for name in ("model.table", "model.colour_out"):
+        moved, moved_half = whole.state()[name] - start[name], half.state()[name] - start[name]
+        assert moved.any()
+        torch.testing.assert_close(moved_half, moved / 2, atol=1e-7, rtol=1e-3)
+
+
+def test_the_distortion_loss_is_added_and_has_its_gradient() -> None:
+    plain, with_it = trainer(), trainer(replace(TRAINER, distortion=1.0))
+    one, other = plain.step(0, 1.0), with_it.step(0, 1.0)
+    assert one.psnr == other.psnr
+    assert one.loss < other.loss < one.loss + 5
+    assert torch.equal(plain.mean["colour_out"], with_it.mean["colour_out"])
+    assert not torch.equal(plain.mean["density_out"], with_it.mean["density_out"])
+
+
+def test_the_distortion_loss_begins_weak() -> None:
+    losses = [trainer(replace(TRAINER, distortion=1.0)).step(0, share).loss for share in (0.0, 0.05, 0.15, 0.3, 1.0)]
+    bare = trainer().step(0, 0.0).loss
+    added = [(loss - bare) / (losses[-1] - bare) for loss in losses]
+    assert added == pytest.approx([0.25, 0.25, 0.5, 1, 1], rel=1e-4)
+
+
+def test_unbounded_scenes_train_too() -> None:
+    run = trainer(
+        replace(TRAINER, background=(0.0, 0.0, 0.0), distortion=1e-3),
+        replace(FIELD, contracted=True, shortest_step=0.05, cone=0.1),
+    )
+    results = [run.step(step, step / 60) for step in range(60)]
+    first, last = (sum(r.psnr for r in part) / 10 for part in (results[:10], results[-10:]))
+    assert first + 3 < last < 60
+
+
+def test_the_rate_warms_up_stays_and_falls() -> None:
+    assert lr_multiplier(0, 0.0) == pytest.approx(0.05)
+    assert lr_multiplier(19, 0.1) == lr_multiplier(500, 0.75) == 1
+    assert lr_multiplier(500, 0.875) == pytest.approx(0.05**0.5)
+    assert lr_multiplier(500, 1.0) == pytest.approx(0.05)
+
+
+def test_a_state_of_another_architecture_is_refused() -> None:
+    other = trainer(field=replace(FIELD, levels=1))
+    with pytest.raises(RuntimeError, match=r"another field: mean\.density_hidden, mean\.table"):
+        trainer().load_state(other.state())
+
+
+def test_a_state_of_equal_shapes_but_other_settings_is_refused() -> None:
+    other = trainer(field=replace(FIELD, steps=33))
+    with pytest.raises(RuntimeError, match="another field: settings differ"):
+        trainer().load_state(other.state())
+
+
+def test_a_density_cache_of_an_unbounded_scene_has_finite_steps_everywhere() -> None:
+    model = HashGridField(replace(FIELD, contracted=True), 0, reference)
+    cache = HashGridTrainer(model, small_bank(), TRAINER).cache
+    cache.refresh(15, torch.Generator().manual_seed(1))
+    assert cache.thickness.isfinite().all()
+    assert cache.thickness.max() > 20 * cache.thickness.min() > 0
+
+
+def unequal_bank() -> RayDataset:
+    """The disc on black from one place twice, the second time at half the light."""
+    bank = small_bank(40)
+    half = len(bank.pixels) // 2
+    colour = bank.pixels[:half, :3].where(bank.pixels[:half, 3:] > 0, 0)
+    darker = (255 * expose(colour / 255, torch.full((3,), -math.log(2)))).round().byte()
+    geometry = bank.geometry[:, :1].repeat(1, 2)
+    return bank._replace(pixels=torch.cat([colour, darker]), geometry=geometry)
+
+
+def test_exposures_are_learnt_where_they_are_modelled() -> None:
+    settings, errors = replace(TRAINER, background=(0.0, 0.0, 0.0), seed=0), []  # of some seeds all becomes black
+    exposures = Exposures(torch.zeros(2, 3))
+    for colours in (AS_RENDERED, exposures):
+        run = HashGridTrainer(HashGridField(FIELD, 0, reference), unequal_bank(), settings, AS_GIVEN, colours)
+        errors.append([run.step(step, step / 300).psnr for step in range(300)][-1])
+    red = exposures.log_gain[:, 0]
+    assert 0.15 < float(red[0] - red[1]) < 0.8 and exposures.log_gain.mean(0).abs().max() < 1e-6
+    assert errors[1] > errors[0] + 1
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_the_gradient_of_poses_is_that_of_the_loss(seed: int) -> None:
+    """As far as differences tell: of other fields, samples that come to lie in another cell weigh more in them."""
+    poses = RefinedPoses(torch.eye(3)[:2])
+    poses.turn += torch.tensor([[0.02, 0.01, -0.01], [0.0, -0.02, 0.03]])
+    run = HashGridTrainer(
+        HashGridField(FIELD, seed, reference), small_bank(), replace(TRAINER, background=BACKGROUND), poses
+    )
+    for step in range(60):
+        run.step(step, 0.84)  # at a third of the rate
+    by_hand = run._part(7, 0.5, 128, 0).photos
+    assert set(by_hand) == {"turn", "offset"}
+
+    def difference(part: Tensor, view: int, axis: int) -> float:
+        losses = []
+        for sign in (1, -1):
+            part[view, axis] += sign * 2e-3
+            losses.append(float(run._part(7, 0.5, 128, 0).loss))
+            part[view, axis] -= sign * 2e-3
+        return (losses[0] - losses[1]) / 4e-3
+
+    for name, part in poses.parameters.items():
+        # across the line of sight: what a shift along it or a turn about it does is too little to measure like this
+        found = torch.tensor([[difference(part, view, axis) for axis in (0, 1)] for view in (0, 1)])
+        torch.testing.assert_close(by_hand[name][:, :2], found, rtol=0.2, atol=0.1 * float(found.abs().max()))
+
+
+def test_what_is_learnt_of_photos_is_part_of_the_state() -> None:
+    def fresh() -> HashGridTrainer:
+        parts = RefinedPoses(torch.eye(3)[:2]), Exposures(torch.tensor([[0.0, 0, 0], [0.5, 0.5, 0.5]]))
+        return HashGridTrainer(HashGridField(FIELD, 0, reference), small_bank(), TRAINER, *parts)
+
+    whole, first, second = fresh(), fresh(), fresh()
+    for step in range(20):
+        whole.step(step, step / 20)
+    for step in range(10):
+        first.step(step, step / 20)
+    second.load_state(copied(first.state()))
+    for step in range(10, 20):
+        second.step(step, step / 20)
+    assert same(whole.state(), second.state())
+    assert {"photo.turn", "photo.offset", "photo.log_gain", "mean.turn"} <= whole.state().keys()
+    with pytest.raises(RuntimeError, match="photo"):
+        trainer().load_state(whole.state())
+
+
+def test_without_view_dependence_a_point_has_one_colour() -> None:
+    run = HashGridTrainer(HashGridField(replace(FIELD, view_dependence=False), 0, reference), small_bank(), TRAINER)
+    psnr = [run.step(step, step / 60).psnr for step in range(60)]
+    points, directions = torch.rand(50, 3) - 0.5, torch.nn.functional.normalize(torch.randn(2, 50, 3), dim=-1)
+    one, other = (run.model.density_and_colour(points, towards)[1] for towards in directions)
+    assert torch.equal(one, other)
+    assert psnr[-1] > 12 and run.model.colour_hidden.shape[0] == 16
+
+
+def test_the_sky_becomes_what_is_seen_in_its_direction() -> None:
+    """Two opposite views, one of blue and one of yellow: even through the first fog that shows at once."""
+    bank = small_bank()
+    colours = torch.tensor([[30, 60, 230], [240, 200, 30]], dtype=torch.uint8)
+    bank = bank._replace(pixels=colours.repeat_interleave(len(bank.pixels) // 2, 0))
+    outdoors = replace(FIELD, contracted=True, shortest_step=0.05, cone=0.1, sky=True)
+    run = HashGridTrainer(
+        HashGridField(outdoors, 0, reference), bank, replace(TRAINER, background=(0.0, 0.0, 0.0), rate=1e-2)
+    )
+    for step in range(20):
+        run.step(step, step / 20)
+    ahead = torch.tensor([[0.0, 0, 1], [0, 0, -1], [0, 0.1, 1]])
+    seen = background_colour(reference, run.model.sky, ahead / ahead.norm(dim=-1, keepdim=True))
+    assert torch.equal(seen > 0.5, colours[[0, 1, 0]] > 127)
+    assert (seen - 0.5).abs().min() > 0.05
+    assert {"model.sky", "mean.sky", "square.sky"} <= run.state().keys()
+    assert not any("sky" in name for name in trainer().state())
+
+
+def test_known_distances_decide_a_shape_that_colours_leave_open() -> None:
+    """Photos of one colour fit any depth; the centre of one is known to be 3 units away."""
+    bank = small_bank()
+    grey = bank._replace(pixels=torch.full_like(bank.pixels[:, :3], 128))
+    guided = grey.with_distances(torch.tensor([78]), torch.tensor([3.0]))
+    settings = replace(TRAINER, background=(0.0, 0.0, 0.0), depth_loss=0.1)
+    centre, depth = grey.lookup(torch.tensor([78])).rays, {}
+    for name, photos in {"open": grey, "guided": guided}.items():
+        run = HashGridTrainer(HashGridField(FIELD, 0, reference), photos, settings)
+        for step in range(120):
+            run.step(step, step / 120)
+        depth[name] = float(run.model.render(centre, torch.zeros(3)).depth)
+    assert abs(depth["guided"] - 3) < 0.15 < abs(depth["open"] - 3) - 0.3
+
+
+def test_points_guide_a_run_less_and_less() -> None:
+    settings = replace(TRAINER, depth_loss=0.1)
+    plain, guided = trainer(settings), trainer(settings)
+    guided.bank = guided.bank.with_distances(torch.tensor([78, 222]), torch.tensor([3.0, 2.5]))
+    assert depth_factor(0.0) == 1 and depth_factor(0.25) == 0.75 and depth_factor(1.0) == 0
+    assert plain.step(0, 1.0) == guided.step(0, 1.0)
+    assert same(plain.state(), guided.state())
+    plain.step(1, 0.9)
+    guided.step(1, 0.9)
+    assert not same(plain.state(), guided.state())
+
+
+def test_the_depth_loss_fades_in_value_and_gradient() -> None:
+    run = trainer(replace(TRAINER, depth_loss=0.1))
+    run.bank = run.bank.with_distances(torch.tensor([78]), torch.tensor([3.0]))
+    batch = run._batch(0, 0.0, 0, 64)
+    done = run.model.forward(batch.rays, batch.jitter, batch.offset, batch.background)
+    early, late, over = (run._loss(64, share, done, batch) for share in (0.25, 0.75, 1.0))
+    of_depth = [float(loss.value - over.value) for loss in (early, late)]
+    assert of_depth[0] == pytest.approx(3 * of_depth[1]) and of_depth[1] > 0
+    pulls = [loss.grad_weights - over.grad_weights for loss in (early, late)]
+    torch.testing.assert_close(pulls[0], 3 * pulls[1])
+    pulls = [loss.grad.opacity - over.grad.opacity for loss in (early, late)]
+    torch.testing.assert_close(pulls[0], 3 * pulls[1])
+    assert pulls[0].any()
+
+
+def test_however_many_the_chunks_an_eighth_of_the_rays_run_to_points() -> None:
+    run = trainer(replace(TRAINER, depth_loss=0.1))
+    run.bank = run.bank.with_distances(torch.tensor([78]), torch.tensor([3.0]))
+    for count in (1, 3, 5, 8, 21):
+        to_points = [int((run._batch(0, 0.1, chunk, count).distance > 0).sum()) for chunk in range(32)]
+        assert sum(to_points) == 32 * count // 8 and max(to_points) - min(to_points) <= 1
+
+
+def test_points_beyond_the_box_of_a_bounded_scene_are_no_guide() -> None:
+    bank = small_bank().with_distances(torch.tensor([78, 78]), torch.tensor([3.0, 4.5]))
+    outdoors = replace(FIELD, contracted=True, shortest_step=0.05, cone=0.1)
+    for field, distances in {FIELD: [3.0], outdoors: [3.0, 4.5]}.items():
+        kept = HashGridTrainer(HashGridField(field, 0, reference), bank, TRAINER).bank.distance
+        assert kept is not None and kept.tolist() == distances
+
+
+def test_without_a_weight_known_distances_change_nothing() -> None:
+    plain, other = trainer(), trainer()
+    other.bank = other.bank.with_distances(torch.tensor([78, 222]), torch.tensor([3.0, 2.5]))
+    assert [plain.step(step, 0.1) for step in range(3)] == [other.step(step, 0.1) for step in range(3)]
+    assert same(plain.state(), other.state())
+
+
+def test_the_sky_where_it_is_always_hidden_falls_back_to_grey(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Light of a millionth reaches it now and then; Adam alone would follow that anywhere."""
+    outdoors = replace(FIELD, contracted=True, shortest_step=0.05, cone=0.1, sky=True)
+    run = HashGridTrainer(
+        HashGridField(outdoors, 0, reference), small_bank(), replace(TRAINER, background=(0.0, 0.0, 0.0))
+    )
+    run.model.sky.fill_(3.0)
+    noise = torch.Generator().manual_seed(0)
+
+    def faint(*_: object) -> Tensor:
+        light = 1e-10 * torch.randn(run.model.sky.shape, generator=noise)
+        light[:100] = 0
+        return light
+
+    monkeypatch.setattr(run.model, "background_backward", faint)
+    for step in range(120):
+        run.step(step, 0.0)
+    assert run.model.sky[100:].abs().mean() < 0.5
+    assert torch.equal(run.model.sky[:100], torch.full((100, 4), 3.0)), "no ray of any batch ran there"

@@ -1,0 +1,70 @@
+"""What a step of a grid field takes of the photos: pixels, each once, and effects, which change no bit where they are
+off and are refused where they run away."""
+
+from dataclasses import replace
+from functools import partial
+
+import pytest
+import torch
+from torch import Tensor
+
+from nerf.effects.pose_refinement import RefinedPoses
+from nerf.fields.hash_grid import HashGridField
+from nerf.fields.interface import Rendering
+from nerf.kernels import torch as reference
+from nerf.training.hash_grid_trainer import HashGridTrainer, _Part
+from nerf.training.losses import huber_loss
+from nerf.training.ray_dataset import RayDataset
+from nerf.training.trainer import RAYS, NonFinite
+from tests.nerf.training.test_hash_grid_trainer import FIELD, TRAINER, copied, same, small_bank, trainer
+
+
+def part_without_effects(run: HashGridTrainer, step: int, share: float, rays: int, chunk: int) -> _Part:
+    """What a chunk adds to loss and gradients, written as if no photo had rays or colours of its own."""
+    batch = run._batch(step, share, chunk, rays)
+    done = run.model.forward(batch.rays, batch.jitter, batch.offset, batch.background)
+    error = done.rendering.colour - batch.target
+    robust, pull = huber_loss(error)
+    none = torch.zeros(rays)
+    grad = Rendering(pull * (2 / (3 * rays)), none, none)
+    gradients = run.model.backward(done, grad, torch.zeros_like(done.weights))
+    norm = torch.nn.utils.get_total_norm([*gradients.weights, gradients.features])
+    losses = robust.sum() / (3 * rays), error.square().sum() / (3 * rays)
+    learnt = gradients.weights, gradients.features, done.points, dict[str, Tensor](), dict[str, Tensor]()
+    return _Part(batch, *losses, *learnt, norm, done.thickness, done.marched)
+
+
+def test_effects_that_are_off_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+    off, without = trainer(), trainer()
+    monkeypatch.setattr(without, "_part", partial(part_without_effects, without))
+    for step in range(30):
+        assert off.step(step, step / 30) == without.step(step, step / 30)
+    assert same(off.state(), without.state())
+    assert not same(off.state(), trainer().state())
+
+
+@pytest.mark.parametrize("runaway", [1e30, float("nan")])
+def test_turns_that_run_away_are_refused_and_change_nothing(runaway: float) -> None:
+    poses = RefinedPoses(torch.eye(3)[:2])
+    run = HashGridTrainer(HashGridField(FIELD, 0, reference), small_bank(), TRAINER, poses)
+    run.step(0, 0.0)
+    poses.turn[:, 1] = runaway
+    before = copied(run.state())
+    with pytest.raises(NonFinite, match=f"the {RAYS} of step 1 is not finite"):
+        run.step(1, 0.1)
+    for name, tensor in run.state().items():
+        torch.testing.assert_close(tensor, before[name], rtol=0, atol=0, equal_nan=True)
+
+
+def test_steps_draw_every_pixel_once_before_any_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever the number of rays, of chunks, and of rays to sparse points, which end half-way."""
+    bank, drawn = small_bank(16).with_distances(torch.tensor([136, 392]), torch.tensor([3.0, 2.5])), list[Tensor]()
+    assert bank.known is not None and bank.drawable == 512
+    monkeypatch.setattr(RayDataset, "nth", lambda _, numbers: drawn.append(numbers) or numbers)
+    settings = replace(TRAINER, chunks=3, depth_loss=0.1)
+    run, rays = HashGridTrainer(HashGridField(FIELD, 0, reference), bank, settings), set[int]()
+    for step in range(40):
+        rays.add(run.step(step, min(1.0, step / 20)).rays)
+    often = torch.cat(drawn).bincount(minlength=512)
+    assert len(rays) > 5 and often.sum() == run.drawn > 1024
+    assert often.max() - often.min() <= 1

@@ -1,0 +1,22 @@
+import pytest
+import torch
+
+from nerf.training.losses import HUBER_DELTA, huber_loss
+
+
+def test_small_errors_are_squared_and_large_ones_pull_no_harder() -> None:
+    loss, pull = huber_loss(torch.tensor([0.05, -0.05, 0.3, -0.3]))
+    torch.testing.assert_close(loss, torch.tensor([0.0025, 0.0025, 0.05, 0.05]))
+    torch.testing.assert_close(pull, torch.tensor([0.05, -0.05, HUBER_DELTA, -HUBER_DELTA]))
+
+
+def test_the_pull_is_half_the_derivative_on_both_sides_of_the_bend() -> None:
+    error = torch.linspace(-0.31, 0.3, 100, dtype=torch.float64, requires_grad=True)
+    size = error.abs()
+    torch.where(size < HUBER_DELTA, size**2, 2 * HUBER_DELTA * size - HUBER_DELTA**2).sum().backward()
+    torch.testing.assert_close(2 * huber_loss(error.detach())[1], error.grad)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_what_is_not_finite_stays_so(value: float) -> None:
+    assert not huber_loss(torch.tensor([value]))[0].isfinite()

@@ -1,0 +1,107 @@
+"""When test photos are scored at fitted poses, what is scored there, and that it is said."""
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+
+from nerf.effects.exposure import ExposedModel
+from nerf.effects.pose_refinement import RefinedPoses
+from nerf.fields.hash_grid import HashGridField, HashGridSettings
+from nerf.fields.interface import Rendering
+from nerf.geometry.rays import Rays
+from stages import evaluate
+from stages.effects.decisions import Decisions, learnt_of_photos, photo_parts
+from stages.evaluate import Examiner
+from stages.evaluate.half_images import from_fitted_pose, right_half_psnr
+from stages.hardware.backend import chosen_backend, load_backend
+from stages.render.renderer import Painter
+from stages.train.data import PhotoReader, training_bank, view_rays
+from tests.stages.photo_scene import photographed
+from tests.synthetic_photos import Quiet
+
+
+def test_poses_are_fitted_to_the_field_as_it_is_and_scored_as_the_photo_was_exposed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    inputs, scene = photographed(tmp_path)
+    kernels = load_backend(chosen_backend("cpu"), "cpu")
+    field = HashGridField(
+        HashGridSettings(levels=2, log2_rows=8, coarsest=4, finest=16, occupancy_resolution=8), 5, kernels
+    )
+    plain, gain = Painter(field, torch.zeros(3)), torch.full((3,), 0.7)
+    view, given = scene.of_split("test")[0], []
+
+    def fit(model: HashGridField, rays: Rays, rendering: Rendering, *_: object) -> Rays:
+        given.append((model, rendering.colour))
+        return rays._replace(near=rays.near + 0.5)  # seen from elsewhere
+
+    monkeypatch.setattr("stages.evaluate.half_images.from_fitted_pose", fit)
+    neutral = Painter(ExposedModel(field, torch.full((3,), 0.3)), torch.zeros(3))
+    examiner = Examiner(scene, inputs["ingest"], tmp_path, neutral, {view.name: gain}, True, 1.0)
+    (scored,) = examiner.score([view], Quiet())
+    rays = view_rays(scene, view, 1.0)
+    assert given[0][0] is field and torch.equal(given[0][1], plain.draw(rays).colour)
+    truth = PhotoReader(inputs["ingest"], scene, 1.0).pixels(view, (0.0,) * 3)
+    exposed = neutral.at_gain(gain)
+    right, fitted = right_half_psnr(exposed.draw(rays), torch.zeros(3), truth)
+    _, posed = right_half_psnr(exposed.draw(rays._replace(near=rays.near + 0.5)), torch.zeros(3), truth)
+    assert scored["psnr_right"] == pytest.approx(right) and scored["psnr_fitted_right"] == pytest.approx(fitted)
+    assert scored["psnr_posed_right"] == pytest.approx(posed)
+
+
+def test_refined_poses_are_learnt_in_units_of_what_photos_see_and_written_in_scene_units(tmp_path: Path) -> None:
+    inputs, scene = photographed(tmp_path)
+    views = scene.of_split("train")
+    bank = training_bank(inputs["ingest"], scene, "train", 1.0, Quiet())
+    near = bank._replace(known=bank.first_pixel[:-1] + 5, distance=torch.full((len(views),), 0.25))
+    rays, colours = photo_parts(Decisions(pose_refinement=True), views, near)
+    rays.parameters["offset"][1] = torch.tensor([1.0, 0.0, -2.0])
+    trainer: Any = SimpleNamespace(photo_rays=rays, photo_colours=colours)
+    learnt = learnt_of_photos(trainer, views)["poses"]
+    assert learnt[views[1].name] == [0.0, 0.0, 0.0, 0.25, 0.0, -0.5] and learnt[views[0].name] == [0.0] * 6
+
+
+def test_a_test_photos_pose_is_fitted_in_units_of_what_it_sees(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[float] = []
+
+    def fit(*given: Any) -> RefinedPoses:
+        asked.append(given[-1])
+        return RefinedPoses(torch.zeros(1, 3))
+
+    monkeypatch.setattr("nerf.effects.pose_fit.fit_pose", fit)
+    some, whole = torch.rand(8, 40, 3), torch.ones(8, 40)
+    rays = Rays(some, some, whole, whole)
+    field: Any = None
+    from_fitted_pose(field, rays, Rendering(some, 0.25 * whole, whole), torch.zeros(3), some, None)
+    assert asked == [0.25]
+
+
+@pytest.mark.parametrize(
+    ("asked", "refined", "fitted"),
+    [("auto", True, True), ("auto", False, False), ("on", False, True), ("off", True, False)],
+)
+def test_poses_are_fitted_where_training_refined_them_or_as_asked(asked: Any, refined: bool, fitted: bool) -> None:
+    field = {"kind": "grid"} | ({"poses": {"a.jpg": [0.0] * 6}} if refined else {})
+    assert evaluate.fits_poses(evaluate.Config(fit_poses=asked), field) is fitted
+
+
+@pytest.mark.parametrize(
+    ("scores", "words"),
+    [
+        ((20.0, 20.3, None), ""),
+        ((20.0, 20.6, None), " · right halves 20.0 dB, 20.6 dB with its exposure fitted on the left half"),
+        ((20.0, 20.3, 20.4), ""),
+        (
+            (20.0, 20.3, 24.0),
+            " · right halves 20.0 dB, 20.3 dB with its exposure fitted on the left half, 24.0 dB with its pose, too",
+        ),
+        ((None, None, None), ""),
+    ],
+)
+def test_the_line_names_what_was_fitted_where_that_makes_a_difference(
+    scores: tuple[float | None, ...], words: str
+) -> None:
+    assert evaluate._right_halves(dict(zip(evaluate.RIGHT_HALVES, scores, strict=True))) == words

@@ -1,0 +1,113 @@
+"""The files of transforms files where these spell their names in another way than the disk does."""
+
+import json
+import os
+import unicodedata
+from pathlib import Path
+
+import pytest
+
+from stages.ingest.sources import find_source, unused_masks
+from tests.stages.ingest.test_sources import names, refusal, touch, transforms
+
+
+def apart(name: str) -> str:
+    """With accents as letters of their own, as macOS writes them."""
+    return unicodedata.normalize("NFD", name)
+
+
+@pytest.mark.parametrize(
+    ("written", "there"),
+    [
+        ("./train/r_0", "train/r_0.PNG"),
+        ("./train/r_0", "train/r_0.JPG"),
+        ("train/r_0.5", "train/r_0.5.webp"),
+        ("train\\r_0", "train/r_0.tif"),
+        ("images/a.jpg", "images/a.JPG"),
+        ("images/a.JPG", "images/a.jpg"),
+        ("images/Küche_01.jpg", apart("images/Küche_01.jpg")),
+        (apart("images/Küche_01.jpg"), "images/Küche_01.jpg"),
+        ("Küche/01.jpg", apart("Küche/01.JPG")),
+        ("Küche/ä", apart("Küche/ä.png")),
+    ],
+)
+def test_a_photo_is_found_in_another_spelling(tmp_path: Path, written: str, there: str) -> None:
+    touch(tmp_path, there, "images/other.jpg", "train/r_0_depth.PNG")
+    source = find_source(transforms(tmp_path / "transforms.json", written))
+    assert source.files == (tmp_path / there,)
+    assert source.frames == {written: there}
+
+
+@pytest.mark.parametrize(
+    ("written", "there"),
+    [
+        ("r_0", ["r_0.webp", "r_0.TIF"]),
+        ("a.jpg", ["a.JPG", "a.Jpg"]),
+        ("a.jpg", ["A.jpg", "a.jpeg"]),
+        ("shot.A", ["shot.a.png"]),
+        ("ä/b.jpg", ["a/b.jpg"]),
+        ("a", ["a.txt"]),
+    ],
+)
+def test_nothing_is_guessed(tmp_path: Path, written: str, there: list[str]) -> None:
+    source = find_source(transforms(touch(tmp_path, *there) / "transforms.json", written))
+    assert names(source) == [written]
+
+
+def test_a_file_of_the_very_name_goes_first(tmp_path: Path) -> None:
+    touch(tmp_path, "a.JPG", "a.jpg", "b.JPG", "b.png")
+    assert names(find_source(transforms(tmp_path / "transforms.json", "a.jpg", "b"))) == ["a.jpg", "b.png"]
+
+
+def test_another_spelling_leads_out_of_the_folder_no_more_than_the_name(tmp_path: Path) -> None:
+    touch(tmp_path, "secret.jpg", "set/b.jpg")
+    (tmp_path / "set/a.JPG").symlink_to(tmp_path / "secret.jpg")
+    error = refusal(transforms(tmp_path / "set/transforms.json", "a.jpg"))
+    assert error.what == "refused the photo 'a.JPG'"
+
+
+def test_a_linked_folder_of_photos_may_be_given_apart_from_its_cameras(tmp_path: Path) -> None:
+    touch(tmp_path, "disk/images/a.jpg", "secret.jpg", "set/notes")
+    (tmp_path / "set/images").symlink_to(tmp_path / "disk/images")
+    cameras = transforms(tmp_path / "set/transforms.json", "images/a.jpg")
+    assert "pipeline run PHOTOS --cameras FILE" in refusal(cameras).hint
+    for photos in ("set/images", "set"):
+        assert names(find_source(tmp_path / photos, cameras)) == ["a.jpg"]
+    (tmp_path / "disk/images/b.jpg").symlink_to(tmp_path / "secret.jpg")
+    assert refusal(tmp_path / "set", transforms(cameras, "images/b.jpg")).what == "refused the photo 'images/b.jpg'"
+
+
+def test_masks_of_transforms_files_are_found_in_another_spelling(tmp_path: Path) -> None:
+    touch(tmp_path, "a.jpg", "masks/a.PNG")
+    frame = {"file_path": "a.jpg", "mask_path": "masks/a.png", "transform_matrix": []}
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": [frame]}))
+    assert find_source(tmp_path / "transforms.json").masks[0] == ("a.jpg.png", tmp_path / "masks/a.PNG")
+
+
+def test_masks_that_our_own_export_names_are_copies_of_those_of_the_photos(tmp_path: Path) -> None:
+    touch(tmp_path, "set/a.jpg", "w.nerf/output/masks/a.jpg.png")
+    frame = {"file_path": "images/a.jpg", "photo": "a.jpg", "mask_path": "masks/a.jpg.png", "transform_matrix": []}
+    cameras = tmp_path / "w.nerf/output/transforms.json"
+    cameras.write_text(json.dumps({"frames": [frame]}))
+    without = find_source(tmp_path / "set", cameras)
+    assert without.masks == () and unused_masks(without) == cameras.parent / "masks"
+    touch(tmp_path, "set/masks/a.png")
+    found = find_source(tmp_path / "set", cameras)
+    assert found.masks == (("a.png", tmp_path / "set/masks/a.png"),) and unused_masks(found) is None
+
+
+def test_a_folder_of_reduced_photos_stands_in_for_the_one_that_is_named(tmp_path: Path) -> None:
+    touch(tmp_path, "images/a.jpg", "images/left/b.JPG", "images_4/a.jpg", "images_4/left/b.jpg", "other_4/a.jpg")
+    cameras = transforms(tmp_path / "transforms.json", "images/a.jpg", "./images/left/b.JPG")
+    assert names(find_source(tmp_path / "images_4", cameras)) == ["a.jpg", "left/b.jpg"]
+    assert "is not among the photos" in str(refusal(tmp_path / "other_4", cameras)), "another folder is no reduction"
+    assert names(find_source(tmp_path / "images", cameras)) == ["a.jpg", "left/b.JPG"]
+
+
+def test_each_folder_is_listed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    written = [f"train/{index}" for index in range(9)]
+    touch(tmp_path, *(f"{name}.PNG" for name in written))
+    listed, real = [], os.listdir
+    monkeypatch.setattr(os, "listdir", lambda folder: listed.append(folder) or real(folder))
+    assert len(names(find_source(transforms(tmp_path / "transforms.json", *written, "gone")))) == 10
+    assert listed.count(tmp_path / "train") == 1 and listed.count(tmp_path) == 1

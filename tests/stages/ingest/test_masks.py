@@ -1,0 +1,224 @@
+"""Which file is whose mask, how it is made to fit, and what COLMAP and training get of it."""
+
+import unicodedata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+from PIL import Image
+
+from stages import ingest
+from stages.ingest.decoding import DecodeError, upright
+from stages.ingest.masks import are_of_stored_pixels, load_mask, pair_masks, read_mask, write_feature_masks
+from stages.io.files import write_png
+from stages.io.photos import Photo, read_photos
+from tests.stages.ingest.photo_files import exif_with
+from tests.stages.ingest.test_ingest import mask_for, picture, put
+
+WIDTH, HEIGHT = 48, 32
+
+
+def ignoring(x: int, y: int, width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
+    """Black right of x and below y."""
+    mask = np.full((height, width), 255, np.uint8)
+    mask[y:, x:] = 0
+    return mask
+
+
+def saved(folder: Path, pixels: np.ndarray, name: str = "m.png") -> Path:
+    Image.fromarray(pixels).save(folder / name)
+    return folder / name
+
+
+def reason(file: Path) -> str:
+    with pytest.raises(DecodeError) as error:
+        read_mask(file, WIDTH, HEIGHT, 1)
+    return str(error.value)
+
+
+def test_masks_are_called_after_their_photos() -> None:
+    names = ["a.jpg", "b.jpg", "left/a.jpg", "ö d.heic", "e.png", "images/f.jpg", "g.jpg"]
+    files = ["a.png", "b.jpg.PNG", "left/a.jpg.png", "ö d.png", "e.png", "f.png", "x.png", "g.jpg", "g.tif"]
+    found, strays = pair_masks(names, [(file, Path("masks", file)) for file in files])
+    assert found == {name: Path("masks", file) for name, file in zip(names, files[:6], strict=False)}
+    assert strays == [Path("masks/x.png"), Path("masks/g.jpg"), Path("masks/g.tif")]
+
+
+def test_accents_of_masks_may_be_composed_in_another_way() -> None:
+    apart = unicodedata.normalize("NFD", "ä")
+    files = [("ä.png", Path("1")), (f"{apart}ö.jpg.png", Path("2")), (f"{apart}.png", Path("3"))]
+    assert pair_masks([f"{apart}ö.jpg"], files)[0] == {f"{apart}ö.jpg": Path("2")}
+    assert pair_masks(["äö.jpg"], files) == ({"äö.jpg": Path("2")}, [Path("1"), Path("3")])
+    assert pair_masks(["ä.jpg", f"{apart}.jpg"], files)[0] == {"ä.jpg": Path("1"), f"{apart}.jpg": Path("3")}
+    assert pair_masks(["\u00c5.jpg"], [("\u212b.png", Path("1")), ("A\u030a.png", Path("2"))])[0] == {}
+
+
+def test_of_two_masks_of_one_photo_one_is_a_stray() -> None:
+    found, strays = pair_masks(["a.jpg"], [("a.jpg.png", Path("1")), ("a.png", Path("2")), ("a.png", Path("3"))])
+    assert (found, strays) == ({"a.jpg": Path("1")}, [Path("2"), Path("3")])
+
+
+@pytest.mark.parametrize("kind", ["1", "L", "RGB", "RGBA", "P", "16"])
+def test_black_is_ignored_whatever_the_kind_of_picture(kind: str, tmp_path: Path) -> None:
+    mask = ignoring(20, 10)
+    image = Image.fromarray(mask)
+    if kind == "16":
+        image = Image.fromarray(mask.astype(np.uint16) * 257)
+    elif kind != "L":
+        image = image.convert(kind)
+    image.save(tmp_path / "m.png")
+    found = read_mask(tmp_path / "m.png", WIDTH, HEIGHT, 1)
+    assert np.array_equal(found.pixels, mask)
+    assert (found.turned, found.resized) == (False, False)
+
+
+def test_half_bright_is_used_and_transparent_ignored(tmp_path: Path) -> None:
+    grey = np.full((HEIGHT, WIDTH, 4), 255, np.uint8)
+    grey[:, :10, :3], grey[:, 10:20, :3] = 127, 128
+    grey[:, 20:30, :3] = [0, 0, 200]  # a colour is not black
+    grey[:, 30:40, 3] = 0
+    found = read_mask(saved(tmp_path, grey), WIDTH, HEIGHT, 1).pixels
+    assert [int(value) for value in found[0, 5::10]] == [0, 255, 255, 0, 255]
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_a_mask_of_the_stored_shape_is_turned_like_the_photo(orientation: int, tmp_path: Path) -> None:
+    mask = ignoring(20, 10)
+    stored = {
+        5: mask.T,
+        6: mask.T[::-1],
+        7: mask.T[::-1, ::-1],
+        8: mask.T[:, ::-1],
+    }.get(orientation, mask)
+    found = read_mask(saved(tmp_path, np.ascontiguousarray(stored)), WIDTH, HEIGHT, orientation)
+    assert np.array_equal(found.pixels, mask)
+    assert found.turned == (orientation >= 5)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_where_its_shape_does_not_tell_a_mask_is_as_others_of_its_set(orientation: int, tmp_path: Path) -> None:
+    square = ignoring(20, 10, WIDTH, WIDTH)
+    found = read_mask(saved(tmp_path, square), WIDTH, WIDTH, orientation, stored=True)
+    assert np.array_equal(found.pixels, np.asarray(upright(Image.fromarray(square), orientation)))
+    assert found.turned == found.ambiguous == (orientation != 1)
+    Image.fromarray(square).save(tmp_path / "own.png", exif=exif_with(orientation))
+    own = read_mask(tmp_path / "own.png", WIDTH, WIDTH, orientation, stored=True)
+    assert np.array_equal(own.pixels, found.pixels) and not (own.turned or own.ambiguous)
+
+
+@pytest.mark.parametrize(
+    ("orientation", "size", "turned", "noted"),
+    [(6, (32, 24), True, False), (6, (24, 32), False, False), (4, (32, 24), False, True)],
+)
+def test_masks_of_half_turned_photos_are_as_the_shapes_of_others_tell(
+    orientation: int, size: tuple[int, int], turned: bool, noted: bool, tmp_path: Path, progress: Any
+) -> None:
+    folder = tmp_path / "in"
+    mask_for(folder, "masks/0.png", 8)
+    mask_for(folder, "masks/1.png", 8, size)
+    for index, one in enumerate((3, orientation)):
+        picture(index).save(folder / f"{index}.jpg", exif=exif_with(one))
+    ingest.run(ingest.Config(photos=folder), {}, tmp_path / "out", progress)
+    mask = np.asarray(Image.open(tmp_path / "out" / str(read_photos(tmp_path / "out")[0].mask)))
+    assert np.array_equal(mask[0] == 0, np.arange(32) >= 24 if turned else np.arange(32) < 8)
+    fit = "masks of 2 photos fit upright and as stored alike (EXIF orientation), and are taken as upright"
+    assert (f"{fit}: look at masks/ of 0.jpg, 1.jpg" in progress.notes) == noted
+
+
+def test_masks_of_both_kinds_tell_nothing_of_others(tmp_path: Path) -> None:
+    photos = [tmp_path / f"{index}.jpg" for index in range(3)]
+    for file in photos:
+        picture(0).save(file, exif=exif_with(6))
+    flat = saved(tmp_path, ignoring(5, 5, 32, 24), "flat.png")
+    high = saved(tmp_path, ignoring(5, 5, 24, 32), "high.png")
+    assert are_of_stored_pixels([(photos[0], flat), (photos[1], tmp_path / "none.png")]) is True
+    assert are_of_stored_pixels([(photos[0], high), (photos[2], high)]) is False
+    assert are_of_stored_pixels([(photos[0], high), (photos[2], flat)]) is None
+
+
+@pytest.mark.parametrize(("factor", "turned"), [(0.5, False), (2, False), (2, True)])
+def test_a_mask_of_another_size_is_resized(factor: float, turned: bool, tmp_path: Path) -> None:
+    mask = ignoring(int(20 * factor), int(10 * factor), int(WIDTH * factor), int(HEIGHT * factor))
+    file = saved(tmp_path, np.ascontiguousarray(np.rot90(mask)) if turned else mask)
+    found = read_mask(file, WIDTH, HEIGHT, 6 if turned else 1)
+    assert np.array_equal(found.pixels, ignoring(20, 10))
+    assert (found.turned, found.resized) == (turned, True)
+
+
+@example(6000, 4000, 1600 / 6000)
+@given(st.integers(100, 6000), st.integers(100, 6000), st.floats(0.1, 2))
+def test_any_reduction_rounded_to_pixels_keeps_its_shape(width: int, height: int, scale: float) -> None:
+    from stages.ingest.masks import _same_shape
+
+    reduced = max(1, round(width * scale)), max(1, round(height * scale))
+    assert _same_shape(reduced, (width, height)) and _same_shape((width, height), reduced)
+    assert not _same_shape((reduced[0] + width // 2 + 2, reduced[1]), (width, height)) or width > 50 * height
+
+
+def test_a_mask_that_cannot_be_used_is_a_reason_to_refuse_the_photo(tmp_path: Path) -> None:
+    assert reason(saved(tmp_path, ignoring(5, 5, 40, 40))) == (
+        "its mask m.png does not fit: it is 40×40 and the photo 48×32"
+    )
+    assert reason(saved(tmp_path, ignoring(5, 5, HEIGHT, WIDTH))).startswith("its mask m.png does not fit")
+    labels = np.minimum(ignoring(5, 5), 1)
+    assert reason(saved(tmp_path, labels)) == "its mask m.png ignores all of it (its brightest value is 1 of 255)"
+    (tmp_path / "t.png").write_text("text")
+    assert reason(tmp_path / "t.png") == "its mask t.png cannot be used: not an image: it is text"
+
+
+def photo(name: str, mask: str | None = None, has_alpha: bool = False) -> Photo:
+    return Photo(name, f"images/{name}", WIDTH, HEIGHT, 0, None, None, has_alpha, 1.0, mask=mask)
+
+
+def test_features_lie_where_nothing_is_ignored_or_transparent(tmp_path: Path) -> None:
+    rgba = np.full((HEIGHT, WIDTH, 4), 200, np.uint8)
+    rgba[:5, :, 3] = 0
+    rgba[5, :, 3] = 1
+    write_png(tmp_path / "images/s/a.png", rgba)
+    write_png(tmp_path / "images/c.png", rgba)
+    write_png(tmp_path / "masks/s/a.png.png", ignoring(20, 10))
+    write_png(tmp_path / "masks/b.jpg.png", ignoring(30, 20))
+    photos = [
+        photo("s/a.png", "masks/s/a.png.png", True),
+        photo("b.jpg", "masks/b.jpg.png"),
+        photo("c.png", None, True),
+    ]
+    assert write_feature_masks(tmp_path, [*photos, photo("d.jpg")], tmp_path / "out")
+    written = {file.relative_to(tmp_path / "out").as_posix() for file in (tmp_path / "out").rglob("*.png")}
+    assert written == {"s/a.png.png", "b.jpg.png", "c.png.png"}
+    both = ignoring(20, 10)
+    both[:5] = 0
+    assert np.array_equal(np.asarray(Image.open(tmp_path / "out/s/a.png.png")), both)
+    assert np.array_equal(np.asarray(Image.open(tmp_path / "out/b.jpg.png")), ignoring(30, 20))
+    assert not write_feature_masks(tmp_path, [photo("d.jpg")], tmp_path / "none")
+    assert not (tmp_path / "none").exists()
+
+
+def test_a_reduced_mask_uses_only_what_is_used_as_a_whole(tmp_path: Path) -> None:
+    file = saved(tmp_path, ignoring(21, 0))
+    assert np.array_equal(load_mask(file, WIDTH, HEIGHT), ignoring(21, 0) > 0)
+    assert np.array_equal(load_mask(file, 12, 8), np.broadcast_to(np.arange(12) < 5, (8, 12)))
+    assert np.array_equal(load_mask(file, 7, 3), np.broadcast_to(np.arange(7) < 3, (3, 7)))  # 3 / 7 of 48 is 20.6
+
+
+def test_what_alpha_and_mask_leave_is_a_mask_of_its_own(tmp_path: Path, progress: Any) -> None:
+    folder = put(tmp_path / "in", "a.jpg")
+    alpha = np.full((24, 32), 255, np.uint8)
+    alpha[:6], alpha[6] = 127, 128
+    for name in ("b.png", "c.png"):
+        Image.fromarray(np.dstack([np.asarray(picture(ord(name[0]))), alpha])).save(folder / name)
+    mask_for(folder, "masks/c.png", 8)
+    result = ingest.run(ingest.Config(photos=folder), {}, tmp_path / "out", progress)
+    assert result.outputs == ("images", "photos.json", "masks", "opaque")
+    photos = read_photos(tmp_path / "out")
+    assert [(photo.used_share, photo.opaque_share) for photo in photos] == [(1, 1), (1, 0.75), (0.75, 0.5625)]
+    for photo, columns in zip(photos[1:], (0, 8), strict=True):
+        file = f"opaque/{photo.name}.png"
+        assert photo.opaque_mask == file
+        opaque = np.asarray(Image.open(tmp_path / "out" / file))
+        wanted = np.where(alpha > 127, 255, 0)
+        wanted[:, :columns] = 0
+        assert np.array_equal(opaque, wanted)

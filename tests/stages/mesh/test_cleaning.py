@@ -1,0 +1,159 @@
+"""What is kept of a surface, and how its end is described."""
+
+import numpy as np
+import pytest
+
+from stages.contract import StageError
+from stages.mesh.cleaning import DILATION_STEPS, MIN_POINTS, SUPPORT_RADIUS, boundary, clean
+from stages.mesh.surface import Surface
+from stages.mesh.visibility import Visibility
+
+CORNERS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32)
+
+
+def tetrahedra(*sizes):
+    """Separate tetrahedra of the given edge lengths in a row."""
+    vertices = np.concatenate([CORNERS * size + [2 * i, 0, 0] for i, size in enumerate(sizes)])
+    return Surface(vertices, np.concatenate([FACES + 4 * i for i in range(len(sizes))]))
+
+
+def visibility_of(in_frustum, seen):
+    """Four vertices per component, all with the same counts."""
+    in_frustum, seen = np.repeat(in_frustum, 4), np.repeat(seen, 4)
+    return Visibility(in_frustum, seen, np.zeros((len(seen), 3)))
+
+
+NO_POINTS = np.zeros((0, 3))
+
+
+def points_at(*corners, count=2 * MIN_POINTS):
+    """A dense cloud of points around each of some places."""
+    cloud = np.random.default_rng(0).normal(scale=SUPPORT_RADIUS / 10, size=(count, 3))
+    return np.concatenate([cloud + corner for corner in corners])
+
+
+def long_strip():
+    """Vertices in pairs, 0 to 100 along x, and two faces between one pair and the next."""
+    steps = np.arange(101.0)
+    edges = np.stack([np.stack([steps, 0 * steps, 0 * steps], -1), np.stack([steps, 0 * steps + 1, 0 * steps], -1)], 1)
+    first = 2 * np.arange(100)[:, None]
+    faces = np.concatenate([first + np.array(corners) for corners in ([0, 2, 1], [1, 2, 3])])
+    return edges.reshape(-1, 3), faces.astype(np.int32)
+
+
+def test_visible_keeps_what_is_seen_and_large_enough():
+    surface = tetrahedra(1.0, 0.5, 0.05, 1.0)  # the third is a speck of 1/400 of the area, the last an unseen cavity
+    cleaned = clean(surface, visibility_of([5, 5, 5, 5], [3, 2, 5, 1]), NO_POINTS, "visible", 2, 0.01)
+    assert (cleaned.kept, cleaned.dropped, cleaned.outside) == (2, 2, 0)
+    np.testing.assert_array_equal(cleaned.surface.vertices, surface.vertices[:8])
+    assert cleaned.vertex.tolist() == list(range(8))
+
+
+def test_an_unseen_component_does_not_set_the_scale():
+    cleaned = clean(tetrahedra(100.0, 1.0), visibility_of([5, 5], [0, 5]), NO_POINTS, "visible", 2, 0.01)
+    assert (cleaned.kept, len(cleaned.surface.faces)) == (1, 4)
+
+
+def test_what_is_far_from_every_sparse_point_goes_and_does_not_set_the_scale():
+    view, both = visibility_of([5, 5], [5, 5]), tetrahedra(100.0, 1.0)
+    on_the_second = both.vertices[4]
+    cleaned = clean(both, view, points_at(on_the_second), "visible", 2, 0.01)
+    assert (cleaned.kept, cleaned.dropped, len(cleaned.surface.faces)) == (1, 1, 4)
+    assert cleaned.surface.vertices[:, 0].max() == 3.0
+
+
+@pytest.mark.parametrize("count", [0, 1, MIN_POINTS - 1])
+def test_few_points_tell_nothing(count):
+    surface = tetrahedra(2.0, 1.0)
+    points = points_at(surface.vertices[4], count=count)
+    assert clean(surface, visibility_of([5, 5], [5, 5]), points, "visible", 2, 0.01).kept == 2
+
+
+def test_points_far_from_all_of_the_surface_tell_nothing():
+    points = points_at(np.array([0.0, 50, 50]))
+    assert clean(tetrahedra(2.0, 1.0), visibility_of([5, 5], [5, 5]), points, "visible", 2, 0.01).kept == 2
+
+
+def test_a_bare_wall_is_not_dropped_for_a_speck_on_it():
+    """The wall has points in one corner alone: it stays if they are more than those on the speck."""
+    edges, strip = long_strip()
+    speck = np.array([[200.0, 0, 0], [201, 0, 0], [200, 1, 0]])
+    wall = Surface(np.concatenate([edges, speck]), np.vstack([strip, [202, 203, 204]]).astype(np.int32))
+    view = Visibility(np.full(205, 5), np.full(205, 5), np.zeros((205, 3)))
+    on_the_wall, on_the_speck = points_at(wall.vertices[0]), points_at(speck[0])
+    both = np.concatenate([on_the_wall, on_the_speck[: len(on_the_speck) // 2]])
+    assert clean(wall, view, both, "visible", 2, 0.0).kept == 2
+    both = np.concatenate([on_the_wall[: len(on_the_wall) // 2], on_the_speck])
+    assert clean(wall, view, both, "visible", 2, 0.0).kept == 1
+
+
+def test_faces_without_enough_photos_are_cut_before_components_are_counted():
+    view = visibility_of([5, 1], [5, 1])
+    assert clean(tetrahedra(1.0, 1.0), view, NO_POINTS, "visible", 2, 0.01)[2:] == (1, 0, 4, 0)
+    view.in_frustum[0] = 1  # three of the four faces of the first touch its first vertex
+    assert clean(tetrahedra(1.0, 1.0), view, NO_POINTS, "visible", 2, 0.01)[2:] == (1, 0, 7, 0)
+
+
+def test_what_is_hidden_and_far_from_every_sparse_point_is_cut_off():
+    """A strip of which photos see the first fifth, with points there: the rest hangs on it, a little of it stays."""
+    strip = Surface(*long_strip())
+    x = strip.vertices[:, 0]
+    view = Visibility(np.full(202, 5), np.where(x <= 20, 5, 1), np.zeros((202, 3)))
+    here, face = points_at(strip.vertices[0]), points_at(*strip.vertices[[180, 182, 181]])
+    cleaned = clean(strip, view, here, "visible", 2, 0.0)
+    assert cleaned.surface.vertices[:, 0].max() == 20 + DILATION_STEPS
+    assert cleaned.hidden == 2 * (80 - DILATION_STEPS)
+    assert clean(strip, view, np.concatenate([here, face]), "visible", 2, 0.0).hidden == cleaned.hidden - 1
+    past_an_edge = Visibility(np.full(202, 50), np.where(x <= 20, 25, 9), np.zeros((202, 3)))
+    assert clean(strip, past_an_edge, here, "visible", 2, 0.0).hidden == cleaned.hidden
+    assert clean(strip, view, here[: MIN_POINTS - 1], "visible", 2, 0.0).hidden == 0
+    assert clean(strip, view, here, "all", 2, 0.0).hidden == 0
+
+
+def test_nothing_counts_as_hidden_where_all_would():
+    """The points lie on an end of the strip that lies in too few frustums."""
+    strip = Surface(*long_strip())
+    in_frustum = strip.vertices[:, 0] > 50
+    view = Visibility(np.where(in_frustum, 5, 1), np.where(in_frustum, 1, 0), np.zeros((202, 3)))
+    with pytest.raises(StageError, match="no part of the surface is visible in the photos"):
+        clean(strip, view, points_at(*strip.vertices[:3]), "visible", 2, 0.0)
+
+
+@pytest.mark.parametrize(("keep", "kept"), [("largest", 1), ("all", 3)])
+def test_other_rules_ignore_the_photos(keep, kept):
+    cleaned = clean(tetrahedra(0.5, 1.0, 0.5), visibility_of([0, 0, 0], [0, 0, 0]), NO_POINTS, keep, 2, 0.01)
+    assert (cleaned.kept, cleaned.dropped) == (kept, 3 - kept)
+    assert np.ptp(cleaned.surface.vertices[:, 1]) == 1.0
+
+
+@pytest.mark.parametrize(
+    ("in_frustum", "message"),
+    [
+        (1, "no part of the surface lies in the photos: none of its 4 faces"),
+        (2, "no part of the surface is visible"),
+    ],
+)
+def test_nothing_left_is_an_error_that_helps(in_frustum, message):
+    with pytest.raises(StageError, match=message) as error:
+        clean(tetrahedra(1.0), visibility_of([in_frustum], [0]), NO_POINTS, "visible", 2, 0.01)
+    assert "--mesh.keep all" in error.value.hint
+
+
+def sheet(low, high):
+    corners = np.array([[low, low, 0], [high, low, 0], [high, high, 0], [low, high, 0.0]])
+    return Surface(corners, np.array([[0, 1, 2], [0, 2, 3]], np.int32))
+
+
+@pytest.mark.parametrize(
+    ("surface", "words"),
+    [
+        (tetrahedra(0.5), "watertight"),
+        (sheet(-0.9, 0.9), "open at the edge of the region"),
+        (sheet(-0.5, 0.5), "open where too few photos look"),
+        (sheet(-0.9, 0.5), "open at the edge of the region and where too few photos look"),
+        (tetrahedra(0.5)._replace(faces=np.concatenate([FACES, FACES])), "closed, but not a manifold"),
+    ],
+)
+def test_the_end_of_a_surface_is_named(surface, words):
+    assert boundary(surface, np.array([[-0.9] * 3, [0.9] * 3]), 0.02) == words

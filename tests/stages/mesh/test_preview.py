@@ -1,0 +1,82 @@
+"""The report's picture of a mesh: from where it is taken."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from nerf.geometry.camera_paths import look_at
+from nerf.geometry.scene import Camera, Scene, Similarity, View
+from stages.mesh import preview as mesh_preview
+from stages.mesh.files import ColouredMesh
+from stages.mesh.preview import ELEVATION, preview, viewpoints
+
+CUBE = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+UP = np.array([0, 0, 1.0])
+
+
+def scene_of(layout, centres, target=(0.0, 0, 0)):
+    views = tuple(
+        View(f"{i}", f"{i}", 0, look_at(np.array([c], float), np.array(target))[0], 0.1, 9.0, "train")
+        for i, c in enumerate(centres)
+    )
+    camera = Camera("SIMPLE_PINHOLE", 40, 30, (40.0, 20.0, 15.0))
+    return Scene((camera,), views, Similarity(1.0, np.eye(3), np.zeros(3)), True, False, layout, True)
+
+
+def shows_all(camera):
+    points = (CUBE - camera.from_camera[:, 3]) @ camera.from_camera[:, :3]
+    pixels = points[:, :2] / points[:, 2:] * camera.focal_px
+    return bool((points[:, 2] > 0).all() and (np.abs(pixels) < [camera.width / 2, camera.height / 2]).all())
+
+
+@pytest.mark.parametrize(("last", "turned"), [((-2, -0.5, 0.4), 180.0), ((0.5, -2.0, 0.2), -90.0)])
+def test_an_object_is_shown_from_a_photos_side_and_as_far_around_as_there_are_photos(last, turned):
+    scene = scene_of("around", [(-0.1, 0, 3), (2, 0.5, 1.1), last])
+    one, other = viewpoints(CUBE, scene)
+    assert shows_all(one) and shows_all(other)
+    side = -one.from_camera[:, 2]
+    np.testing.assert_allclose(side, np.array([2, 0.5, 1.1]) / np.linalg.norm([2, 0.5, 1.1]))
+    assert abs(np.degrees(np.arcsin(side[2])) - ELEVATION) < 5
+    turn = np.radians(turned)
+    around = [side[0] * np.cos(turn) - side[1] * np.sin(turn), side[0] * np.sin(turn) + side[1] * np.cos(turn)]
+    np.testing.assert_allclose(-other.from_camera[:, 2], [*around, side[2]], atol=1e-12)
+
+
+def test_what_faces_one_way_is_shown_from_where_the_cameras_stand():
+    scene = scene_of("forward", [(-1, -3, 0), (0, -3, 0), (1.5, -3, 0)])
+    one, other = viewpoints(CUBE, scene)
+    assert shows_all(one) and shows_all(other)
+    np.testing.assert_allclose(one.from_camera[:, 2], [0, 1, 0], atol=1e-12)
+    assert other.from_camera[0, 2] < 0  # the camera on the right looks to the left
+
+
+def test_a_photo_that_was_held_sideways_shows_the_mesh_upright():
+    scene = scene_of("forward", [(-1, -3, 0), (0, -3, 0), (1.5, -3, 0)])
+    upright = viewpoints(CUBE, scene)
+    turns = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
+    views = tuple(
+        replace(view, scene_from_camera=np.c_[view.scene_from_camera[:, :3] @ turns, view.scene_from_camera[:, 3]])
+        for view in scene.views
+    )
+    for seen, before in zip(viewpoints(CUBE, replace(scene, views=views)), upright, strict=True):
+        assert np.allclose(seen.from_camera, before.from_camera)
+
+
+def test_a_room_is_shown_from_inside():
+    scene = scene_of("inside", [(0, 0, 0), (0.3, 0, 0)], target=(0.0, 5, 0))
+    one, other = viewpoints(CUBE, scene)
+    np.testing.assert_allclose(one.from_camera[:, 3], [0, 0, 0])
+    np.testing.assert_allclose(other.from_camera[:, 3], [0.3, 0, 0])
+
+
+@pytest.mark.parametrize("centre", [(0.01, 0, 3), (2, 0, 1)])
+def test_the_picture_has_two_rows_of_colour_and_clay(monkeypatch, centre):
+    monkeypatch.setattr(mesh_preview, "WIDTH", 40)
+    monkeypatch.setattr(mesh_preview, "HEIGHT", 30)
+    faces = np.array([[0, 2, 4], [2, 6, 4], [1, 5, 3], [3, 5, 7]], np.int32)
+    red = np.tile(np.array([220, 20, 20], np.uint8), (8, 1))
+    image = preview(ColouredMesh(CUBE, faces, CUBE, red), scene_of("around", [centre])).astype(int)
+    assert image.shape == (60, 80, 3)
+    redness = image[..., 0] - image[..., 1]
+    assert (redness[:, :40] > 60).any() and redness[:, 40:].max() < 20

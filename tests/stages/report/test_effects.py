@@ -1,0 +1,108 @@
+"""The page on effects: what the photos call for, and how unseen photos are exposed and posed for each score."""
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+from stages.io.files import write_json
+from tests.stages.report.report_workspace import make_workspace, written
+
+
+def test_page_shows_both_scores_of_right_halves_with_what_they_mean(tmp_path: Path, progress: Any):
+    inputs = make_workspace(tmp_path)
+    html, _ = written(inputs, tmp_path / "out", progress)
+    assert "right half, exposure fitted on the left (dB)</th>" in html
+    assert '<td class="number">23.50</td><td class="number">28.25</td></tr>' in html
+    assert "Right halves of the photos alone: 21.0 dB, and 25.8 dB with the exposure of each photo fitted" in html
+    path = inputs["evaluate"] / "metrics.json"
+    metrics = json.loads(path.read_text("utf-8"))
+    unknown = {"psnr_right": None, "psnr_fitted_right": None}
+    write_json(path, metrics | unknown | {"images": [image | unknown for image in metrics["images"]]})
+    html, _ = written(inputs, tmp_path / "unknown", progress)
+    assert "Right halves" not in html and '<td class="number">–</td><td class="number">–</td></tr>' in html
+
+
+def test_page_says_how_unseen_photos_were_exposed(tmp_path: Path, progress: Any):
+    inputs = make_workspace(tmp_path)
+    assert "was drawn exposed" not in written(inputs, tmp_path / "out", progress)[0]
+    path = inputs["evaluate"] / "metrics.json"
+    metrics = json.loads(path.read_text("utf-8"))
+    write_json(path, metrics | {"exposure": "as the photos taken nearest by"})
+    html, _ = written(inputs, tmp_path / "exposed", progress)
+    assert "each was drawn exposed as the photos taken nearest by, four training photos, without a look at" in html
+
+
+def test_page_shows_what_fitted_poses_add_apart_from_fitted_exposures(tmp_path: Path, progress: Any):
+    inputs = make_workspace(tmp_path)
+    html, _ = written(inputs, tmp_path / "out", progress)
+    assert "pose fitted" not in html
+    path = inputs["evaluate"] / "metrics.json"
+    metrics = json.loads(path.read_text("utf-8"))
+    images = [image | {"psnr_posed_right": image["psnr_fitted_right"] + 2} for image in metrics["images"]]
+    write_json(path, metrics | {"psnr_posed_right": 27.8, "poses_fitted": True, "images": images})
+    html, _ = written(inputs, tmp_path / "posed", progress)
+    assert "right half, exposure and pose fitted on the left (dB)</th>" in html
+    assert '<td class="number">23.50</td><td class="number">28.25</td><td class="number">30.25</td></tr>' in html
+    assert "25.8 dB with the exposure of each photo fitted" in html and "pose fitted there, too: 27.8 dB" in html
+
+
+def effect(on: bool, reason: str, **figures: Any) -> dict[str, Any]:
+    """An entry of effects.json."""
+    nothing = dict.fromkeys(("statistic", "threshold", "noise", "pilot_gain_db", "pilot_noise_db", "cost"))
+    return nothing | {"on": on, "modelled": True, "unit": "", "seconds": 0.0, "reason": reason} | figures
+
+
+EFFECTS = {
+    "background": effect(False, "no pixel looks beyond the region"),
+    "exposure": effect(
+        True, "gains span 0.8 EV", statistic=0.8, threshold=0.05, noise=0.016, unit="EV", seconds=2.5, cost=0.04
+    ),
+    "view_dependence": effect(True, "it pays", pilot_gain_db=0.94, pilot_noise_db=0.21, seconds=0.02),
+    "blur": effect(True, "<i>smeared</i>", modelled=False, statistic=4.0, threshold=2.5, unit="px"),
+    "tone": effect(False, "none seen", modelled=False),
+}
+
+
+def test_page_shows_what_the_photos_call_for(tmp_path: Path, progress: Any):
+    inputs = make_workspace(tmp_path)
+    assert "Effects of these photos" not in written(inputs, tmp_path / "without", progress)[0]
+    inputs["effects"] = tmp_path / "fox.nerf" / "effects" / "0123456789abcdef"
+    inputs["effects"].mkdir(parents=True)
+    manifest = json.loads((inputs["train"] / "manifest.json").read_text("utf-8"))
+    write_json(inputs["effects"] / "manifest.json", manifest | {"stage": "effects", "config": {}, "facts": {}})
+    write_json(inputs["effects"] / "effects.json", EFFECTS)
+    html, _ = written(inputs, tmp_path / "out", progress)
+    section = html[html.index("Effects of these photos") : html.index("Where the cameras stood")]
+    cells = re.findall(r"<t[dh](?: [^>]*)?>(.*?)</t[dh]>", section)
+    rows = [cells[i : i + 9] for i in range(0, len(cells), 9)]
+    assert rows[0] == [
+        "effect",
+        "",
+        "why",
+        "statistic",
+        "threshold",
+        "noise",
+        "gain in pilot",
+        "costs when on",
+        "deciding took",
+    ]
+    assert rows[1:] == [
+        ["exposure", "<b>on</b>", "gains span 0.8 EV", "0.8 EV", "0.05 EV", "0.016 EV", "–", "+4% time", "2.5 s"],
+        ["view dependence", "<b>on</b>", "it pays", "–", "–", "–", "+0.9 ± 0.2 dB", "–", "&lt; 0.1 s"],
+        ["background", "off", "no pixel looks beyond the region", "–", "–", "–", "–", "–", "–"],
+    ]
+    flags = re.findall(r"<li>(.*?)</li>", section)
+    assert flags == [
+        "blur: &lt;i&gt;smeared&lt;/i&gt; (4 px, threshold 2.5 px). Hold the camera still, lock the focus, give more "
+        "light, and leave blurred photos out."
+    ]
+
+
+def test_without_flags_there_is_no_list_of_them(tmp_path: Path, progress: Any):
+    inputs = make_workspace(tmp_path) | {"effects": tmp_path / "effects"}
+    inputs["effects"].mkdir()
+    write_json(inputs["effects"] / "manifest.json", json.loads((inputs["mesh"] / "manifest.json").read_text("utf-8")))
+    write_json(inputs["effects"] / "effects.json", {"exposure": EFFECTS["exposure"]})
+    html, _ = written(inputs, tmp_path / "out", progress)
+    assert "Effects of these photos" in html and "not modelled" not in html

@@ -1,0 +1,92 @@
+"""The page as a reader meets it: words that explain the figures, commands that can be copied, paper, narrow screens."""
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from stages.io.files import write_json
+from tests.stages.report.report_workspace import make_workspace, written
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    return make_workspace(tmp_path_factory.mktemp("report"))
+
+
+@pytest.mark.parametrize(
+    ("name", "word"), [("Oma & <Co> #1.nerf", "'Oma &amp; &lt;Co&gt; #1.nerf'"), ("plain.nerf", "plain.nerf")]
+)
+def test_commands_can_be_copied_into_a_shell(name: str, word: str, tmp_path: Path, progress: Any):
+    made = make_workspace(tmp_path)
+    root = (tmp_path / "fox.nerf").rename(tmp_path / name)
+    html, _ = written({stage: root / stage / folder.name for stage, folder in made.items()}, tmp_path / "out", progress)
+    word = word.replace("'", "&#39;")
+    assert f"<code>pipeline train {word} --more 183s</code>" in html and f"<code>pipeline resume {word}</code>" in html
+    del made["train"]
+    html, _ = written({"ingest": root / "ingest" / made["ingest"].name}, tmp_path / "few", progress)
+    assert f"Go on from here: <code>pipeline resume {word}</code>" in html and "--more" not in html
+
+
+def test_the_order_of_three_pictures_is_told_where_they_are(inputs: dict[str, Path], tmp_path: Path, progress: Any):
+    html, _ = written(inputs, tmp_path / "out", progress)
+    story = ["6 dB more is half the error", "<b>render</b><b>photo</b>", "; drag to compare.", "left the photo, middle"]
+    places = [html.index(words) for words in (*story, '<span class="tag">best')]
+    assert places == sorted(places)
+
+
+def test_where_not_all_test_photos_are_scored_not_all_are_shown(tmp_path: Path, progress: Any):
+    inputs = make_workspace(tmp_path)
+    path = inputs["evaluate"] / "metrics.json"
+    metrics = json.loads(path.read_text("utf-8")) | {"photos_test": 9}
+    write_json(path, metrics)
+    html, _ = written(inputs, tmp_path / "out", progress)
+    assert "All 6 test photos that are scored" in html and "<p>6 of 9 test photos</p>" in html
+    write_json(path, metrics | {"images": metrics["images"][:1], "photos_scored": 1})
+    assert "<p>1 of 9 test photos</p>" in written(inputs, tmp_path / "one", progress)[0]
+
+
+def test_files_beside_the_page_are_named(tmp_path: Path, progress: Any):
+    inputs = make_workspace(tmp_path)
+    manifest = json.loads((inputs["mesh"] / "manifest.json").read_text("utf-8"))
+    manifest["outputs"] = {name: {} for name in ("mesh.glb", "mesh.ply", "preview.png")}
+    manifest["facts"] |= {"voxel": 0.25, "surface_area": 3.5, "level": 40.0}
+    write_json(inputs["mesh"] / "manifest.json", manifest)
+    html, _ = written(inputs, tmp_path / "out", progress, video_limit_mb=0.001)
+    assert "In <code>output/</code>: mesh.glb, mesh.ply." in html
+    assert '<a href="video.mp4">' in html and "to be given away with it" in html
+    for fact in ("0.25 units of the files", "3.5 square units of the files", "40 per scene unit"):
+        assert f"<td>{fact}</td>" in html
+    assert "given away with it" not in written(inputs, tmp_path / "small", progress)[0]
+
+
+def test_long_names_of_photos_are_broken_and_do_not_widen_the_page(
+    inputs: dict[str, Path], tmp_path: Path, progress: Any
+):
+    html, _ = written(inputs, tmp_path / "out", progress)
+    assert ".names td { overflow-wrap: anywhere; }" in html
+    for head in ("<th>photo</th><th>why</th>", "<th>file</th><th>why</th>"):
+        assert f'<table class="names">\n<thead><tr>{head}' in html
+
+
+def test_the_curve_s_photos_are_those_above_where_there_are_any(inputs: dict[str, Path], tmp_path: Path, progress: Any):
+    words = "Held-out photos are the test photos above"
+    assert words in written(inputs, tmp_path / "out", progress)[0]
+    unmeasured = {stage: folder for stage, folder in inputs.items() if stage != "evaluate"}
+    assert words not in written(unmeasured, tmp_path / "unmeasured", progress)[0]
+
+
+def test_every_picture_has_words_for_who_cannot_see_it(inputs: dict[str, Path], tmp_path: Path, progress: Any):
+    html, _ = written(inputs, tmp_path / "out", progress)
+    pictures, plots = re.findall(r"<(?:img|video)[^>]*>", html), re.findall(r"<[^>]*>\s*<svg", html)
+    assert len(pictures) > 10 and all(re.search(r' (alt|aria-label)="[^"]', tag) for tag in pictures)
+    assert len(plots) == 3 and all('role="img" aria-label="' in tag for tag in plots)
+
+
+def test_paper_shows_what_it_can(inputs: dict[str, Path], tmp_path: Path, progress: Any):
+    html, _ = written(inputs, tmp_path / "out", progress)
+    style = re.search(r"@media print \{.*?\n\}", html, re.DOTALL)
+    assert style is not None and ".film, .compare," in style[0] and "zoom" in style[0]
+    assert html.index('<section class="film">') < html.index("<h2>A new camera path")

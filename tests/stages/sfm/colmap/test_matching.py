@@ -1,0 +1,174 @@
+"""Matching into COLMAP's database, on features that a synthetic scene of points would have."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+
+from stages.io.photos import Photo
+from stages.sfm.colmap import matching
+from stages.sfm.colmap.diagnosis import links
+from stages.sfm.colmap.matching import fill_database, hold_open, look_alike, match_pairs
+from stages.sfm.pairs.pair_selection import exhaustive
+from tests.stages.sfm.pairs.test_feature_matching import random_descriptors
+
+COUNT = 6
+PAIRS = [(i, j) for i in range(COUNT) for j in range(i + 1, COUNT)]
+
+
+@pytest.fixture
+def database(tmp_path: Path) -> Path:
+    """Six photos by a camera that moves sideways along a cloud of points; the last one sees another cloud."""
+    path, random = tmp_path / "matches.db", np.random.default_rng(0)
+    photos = [Photo(f"{i}.png", f"images/{i}.png", 320, 240, 0, None, None, False, 1.0) for i in range(COUNT)]
+    fill_database(path, photos, "SIMPLE_RADIAL")
+    points = random.uniform((-3, -1, 3), (3, 1, 6), (400, 3))
+    alike = random_descriptors(400, 0)
+    with pycolmap.Database.open(path) as db:
+        for photo in range(COUNT):
+            seen = points - np.array([0.3 * photo - 0.75, 0, 0])
+            places = 300 * seen[:, :2] / seen[:, 2:] + (160, 120) + random.normal(scale=0.3, size=(400, 2))
+            inside = ((places > 0) & (places < (320, 240))).all(axis=1)
+            noisy = alike if photo < COUNT - 1 else random_descriptors(400, 1)
+            noisy = np.rint(noisy + random.normal(scale=8, size=(400, 128))).clip(0, 255).astype(np.uint8)
+            shapes = np.tile([1, 0, 0, 1], (int(inside.sum()), 1))
+            db.write_keypoints(photo + 1, np.hstack([places[inside], shapes]).astype(np.float32))
+            kind = pycolmap.FeatureExtractorType.SIFT
+            db.write_descriptors(photo + 1, pycolmap.FeatureDescriptors(data=noisy[inside], type=kind))
+    return path
+
+
+def copy_of(database: Path, name: str) -> Path:
+    copy = database.with_name(name)
+    for part in ("", "-wal", "-shm"):
+        if (source := database.with_name(database.name + part)).exists():
+            copy.with_name(copy.name + part).write_bytes(source.read_bytes())
+    return copy
+
+
+def found(database: Path) -> dict[tuple[int, int], tuple[bytes, bytes, int]]:
+    """Matches, verified matches and kind of geometry of every pair that was tried."""
+    result = {}
+    with pycolmap.Database.open(database) as db:
+        for i, j in PAIRS:
+            if db.exists_two_view_geometry(i + 1, j + 1):
+                geometry = db.read_two_view_geometry(i + 1, j + 1)
+                verified = geometry.inlier_matches.tobytes()
+                result[i, j] = db.read_matches(i + 1, j + 1).tobytes(), verified, int(geometry.config)
+    return result
+
+
+def test_a_list_of_pairs_gives_what_all_pairs_give(database: Path) -> None:
+    some = np.array([[0, 1], [1, 4], [2, 3], [0, 5]])
+    everything, listed = copy_of(database, "all.db"), copy_of(database, "some.db")
+    match_pairs(everything, exhaustive(COUNT), 0, 0.8)
+    match_pairs(listed, some, 0, 0.8)
+    every = found(everything)
+    assert list(every) == PAIRS
+    assert found(listed) == {pair: every[pair] for pair in map(tuple, some.tolist())}
+    verified = {pair: len(inliers) // 8 for pair, (_, inliers, _) in every.items()}
+    assert all(verified[i, i + 1] > 50 for i in range(COUNT - 2))
+    assert all(verified[i, COUNT - 1] == 0 for i in range(COUNT - 1)), "too few matches are no geometry"
+
+
+def test_verified_matches_are_those_of_colmaps_own_verification(database: Path) -> None:
+    match_pairs(database, exhaustive(COUNT), 0, 0.8)
+    ours = found(database)
+    with pycolmap.Database.open(database) as db:
+        for i, j in PAIRS:
+            db.delete_two_view_geometry(i + 1, j + 1)
+    listed = database.with_name("pairs.txt")
+    listed.write_text("".join(f"{i}.png {j}.png\n" for i, j in PAIRS))
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.random_seed = 0
+    pycolmap.verify_matches(database, listed, options)
+    theirs = found(database)
+    assert {pair: rest for pair, (_, *rest) in ours.items()} == {pair: rest for pair, (_, *rest) in theirs.items()}
+
+
+def test_the_number_of_cores_changes_nothing(database: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    results = []
+    for cores in (1, 4):
+        monkeypatch.setattr(matching, "processors", lambda cores=cores: cores)
+        copy = copy_of(database, f"{cores}.db")
+        match_pairs(copy, exhaustive(COUNT), 0, 0.8)
+        results.append(found(copy))
+    assert results[0] == results[1]
+
+
+def test_only_what_is_missing_is_matched(database: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = copy_of(database, "whole.db")
+    match_pairs(whole, exhaustive(COUNT), 0, 0.8)
+    match_pairs(database, exhaustive(COUNT)[::2], 0, 0.8)
+    told, tried, real = [], [], matching._match
+    monkeypatch.setattr(matching, "_match", lambda *args: tried.append(args) or real(*args))
+    match_pairs(database, exhaustive(COUNT), 0, 0.8, lambda pairs, seconds: told.append((pairs, seconds)))
+    assert len(tried) == 7  # 8 of 15 were there
+    assert [pairs for pairs, _ in told] == [7] and told[0][1] > 0
+    assert found(database) == found(whole)
+    match_pairs(database, exhaustive(COUNT), 0, 0.8, lambda pairs, seconds: told.append((pairs, seconds)))
+    assert len(tried) == 7 and len(told) == 1
+
+
+def test_the_first_block_is_spread_over_all_pairs() -> None:
+    pairs = [(i, j) for i in range(40) for j in range(i + 1, 40)]
+    order = matching._spread(pairs)
+    assert sorted(order) == pairs
+    firsts = [i for i, _ in order[: matching.BLOCK_SIZE]]
+    assert min(firsts) == 0 and max(firsts) > 30
+    assert matching._spread([]) == []
+
+
+def test_photos_of_the_same_points_look_alike(database: Path) -> None:
+    alike = look_alike(database, COUNT, seed=0)
+    assert alike.shape == (COUNT, COUNT)
+    assert alike[:-1, -1].max() < alike[:-1, :-1].min()
+
+
+def test_photos_without_a_place_are_joined_by_their_matches_with_those_that_have_one(database: Path) -> None:
+    match_pairs(database, exhaustive(COUNT), 0, 0.8)
+    names = [f"{i}.png" for i in range(COUNT)]
+    assert links(database, set(names[:-2])).join
+    assert not links(database, set(names[:-1])).join
+    assert not links(database, {names[-1]}).join, "five that share views with each other alone"
+    assert links(database, set()).join, "no place: any pair is one to begin with"
+
+
+def test_few_matches_with_each_of_several_photos_join_as_well(database: Path) -> None:
+    match_pairs(database, exhaustive(COUNT), 0, 0.8)
+    placed = {f"{i}.png" for i in range(COUNT - 1)}
+    for photo, expected in ((1, False), (2, True)):
+        with pycolmap.Database.open(database) as db:
+            db.delete_two_view_geometry(photo, COUNT)
+            few = pycolmap.TwoViewGeometry(inlier_matches=np.tile(np.arange(20, dtype=np.uint32)[:, None], 2), config=2)
+            db.write_two_view_geometry(photo, COUNT, few)
+        assert links(database, placed).join == expected
+
+
+READER = """
+import sys
+from pathlib import Path
+from stages.sfm.registration import count_done
+print("ready", flush=True)
+while True:
+    count_done(Path(sys.argv[1]))
+"""
+
+
+def test_a_database_that_is_held_open_can_be_opened_while_another_process_reads_along(database: Path) -> None:
+    reader = subprocess.Popen(
+        [sys.executable, "-c", READER, str(database)], stdout=subprocess.PIPE, cwd=Path(__file__).parents[4]
+    )
+    try:
+        assert reader.stdout and reader.stdout.readline() == b"ready\n"
+        held = hold_open(database)
+        for _ in range(500):  # without it one in ten or twenty fails
+            with pycolmap.Database.open(database) as db:
+                assert db.num_images() == COUNT
+        held.close()
+    finally:
+        reader.kill()
+        reader.wait()

@@ -1,0 +1,83 @@
+"""Which photos a transforms file holds out, and which it leaves out."""
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from stages.contract import StageError
+from stages.sfm.imported.known_cameras import KnownCameras, read_known_cameras
+from tests.stages.sfm.imported.test_known_cameras import LENS, NAMES, PHOTOS, frame
+
+
+@pytest.fixture
+def read(tmp_path: Path):
+    """Writes a transforms.json of these frames and values and reads it with PHOTOS."""
+
+    def write_and_read(frames: list[dict[str, Any]], **values: Any) -> KnownCameras:
+        path = tmp_path / "transforms.json"
+        path.write_text(json.dumps({**values, "frames": frames}))
+        return read_known_cameras(path, PHOTOS, NAMES)
+
+    return write_and_read
+
+
+@pytest.mark.parametrize(
+    ("split", "test_files"),
+    [
+        ({"train_filenames": ["0", "1"], "test_filenames": ["./2"], "val_filenames": ["./1"]}, ["a2.png"]),
+        ({"train_filenames": ["0"], "val_filenames": ["2", "./1"]}, ["a1.png", "a2.png"]),
+        ({"val_filenames": ["2", "./1"]}, ["a1.png", "a2.png"]),
+        ({"train_filenames": ["0", "1", "2"], "test_filenames": [], "val_filenames": []}, None),
+    ],
+)
+def test_the_split_of_a_transforms_file_is_kept(read, split: dict[str, Any], test_files: list[str] | None) -> None:
+    known = read([frame(i) for i in range(3)], **LENS, **split)
+    assert known.test_files == test_files
+    assert known.notes == []
+
+
+def test_photos_in_no_split_are_left_out_by_name(read) -> None:
+    known = read([frame(i) for i in range(3)], **LENS, train_filenames=["0"], test_filenames=["2"], val_filenames=["1"])
+    assert [image.file for image in known.model.images] == ["a0.png", "a2.png"]
+    assert known.test_files == ["a2.png"]
+    assert known.left_out == {"a1.png": "the transforms file has it neither to train nor to test on"}
+    assert known.notes == ["1 photos are neither to train nor to test on and are left out: ä1.png"]
+
+
+@pytest.mark.parametrize("key", ["test_filenames", "val_filenames"])
+def test_test_photos_that_are_trained_on_stay_that(read, key: str) -> None:
+    everything = ["0", "1", "2"]
+    known = read([frame(i) for i in range(3)], **LENS, **{"train_filenames": everything, key: everything})
+    assert len(known.model.images) == 3 and known.test_files is None
+    assert known.notes == [f"{key} of transforms.json repeats 3 photos to train on: they stay that"]
+
+
+def test_test_photos_without_a_frame_are_named(read) -> None:
+    known = read([frame(i) for i in range(3)], **LENS, test_filenames=["./2", "./7"])
+    assert known.test_files == ["a2.png"]
+    assert known.notes == ["1 photos in test_filenames of transforms.json have no frame: ./7"]
+
+
+def test_test_photos_that_are_not_there_are_said(read) -> None:
+    known = read([frame(i) for i in (0, 1, 7)], **LENS, test_filenames=["7"])
+    assert known.test_files is None
+    assert known.notes[-1] == "none of the 1 test photos of transforms.json is among the photos"
+
+
+@pytest.mark.parametrize(
+    ("split", "why"),
+    [
+        (["./7", "b/2" * 999], r"none of them is the file_path of a frame: \./7, (b/2){20}$"),
+        ("./2", "it is no list of names"),
+        ([2], "it is no list of names"),
+    ],
+)
+@pytest.mark.parametrize("key", ["train_filenames", "test_filenames", "val_filenames"])
+def test_a_split_that_cannot_be_kept_is_refused(read, split: Any, why: str, key: str) -> None:
+    with pytest.raises(StageError) as raised:
+        read([frame(i) for i in range(3)], **LENS, **{key: split})
+    assert raised.value.what == f"cannot use the {key} of transforms.json"
+    assert re.match(why, raised.value.why)

@@ -1,0 +1,100 @@
+"""Photos, and cameras given for them, of which stage sfm can make nothing are refused with the reason."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stages import sfm
+from stages.contract import StageError
+from tests.blots import blots
+from tests.stages.sfm.sfm_inputs import SMALL, ingested
+
+
+def turned(angle: float, panorama: np.ndarray, size: tuple[int, int] = (240, 180), focal: float = 250.0) -> np.ndarray:
+    """What a camera sees of a far picture after turning about its vertical axis."""
+    import cv2
+
+    cos, sin = np.cos(angle), np.sin(angle)
+    lens = np.array([[focal, 0, size[0] / 2], [0, focal, size[1] / 2], [0, 0, 1]])
+    far = np.array([[focal, 0, panorama.shape[1] / 2], [0, focal, panorama.shape[0] / 2], [0, 0, 1]])
+    homography = far @ np.array([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]]) @ np.linalg.inv(lens)
+    return cv2.warpPerspective(panorama, homography, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+
+
+def refusal(images: dict[str, np.ndarray], folder: Path, progress) -> StageError:
+    inputs = ingested(folder / "ingest", images)
+    with pytest.raises(StageError) as error:
+        sfm.run(SMALL, inputs, folder / "sfm", progress)
+    assert not (folder / "sfm" / "sparse").exists()
+    assert not (folder / "sfm" / "registration.json").exists()
+    return error.value
+
+
+def test_photos_without_overlap_are_refused(tmp_path: Path, progress) -> None:
+    error = refusal({f"{i}.png": blots(i, 240, 180) for i in range(4)}, tmp_path, progress)
+    assert str(error) == (
+        "the cameras of 4 photos could not be found: 0 of 6 pairs of photos share a view. "
+        "Take photos with 60–80 % overlap, so that everything is visible in at least three of them."
+    )
+
+
+def test_turning_on_the_spot_is_refused(tmp_path: Path, progress) -> None:
+    panorama = blots(0)
+    error = refusal({f"{i}.png": turned(0.12 * i - 0.3, panorama) for i in range(6)}, tmp_path, progress)
+    assert error.why == "the camera turned on the spot: 15 of 15 matching pairs differ by a rotation alone"
+    assert "Move sideways" in error.hint
+
+
+def test_identical_photos_are_refused(tmp_path: Path, progress) -> None:
+    error = refusal({f"{i}.png": blots(0, 240, 180) for i in range(3)}, tmp_path, progress)
+    assert error.why == "the photos are all the same view (3 of 3 pairs differ by less than a pixel)"
+    assert error.hint == (
+        "Move the camera between photos. If it was the thing that turned, before a still background, mask the "
+        "background (masks/NAME.png, black is ignored) or use a plain backdrop."
+    )
+
+
+def test_blank_photos_are_refused(tmp_path: Path, progress) -> None:
+    error = refusal({f"{i}.png": np.full((180, 240, 3), 90, np.uint8) for i in range(3)}, tmp_path, progress)
+    assert error.why == "half of the photos show fewer than 50 features"
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_too_few_photos_are_refused_at_once(count: int, tmp_path: Path, progress) -> None:
+    error = refusal({f"{i}.png": blots(i, 240, 180) for i in range(count)}, tmp_path, progress)
+    assert error.what == f"cannot find cameras from {count} photo{'s' * (count == 2)}"
+
+
+@pytest.mark.parametrize(
+    ("given", "sizes", "why"),
+    [
+        (
+            {"camera_params": (250.0, 120.0, 90.0)},
+            [(240, 180)],
+            "the model that they are the parameters of is not given",
+        ),
+        (
+            {"camera_model": "RADIAL", "camera_params": (250.0, 120.0, 90.0)},
+            [(240, 180)],
+            "RADIAL takes f, cx, cy, k1, k2, got 3 numbers",
+        ),
+        (
+            {"camera_model": "SIMPLE_PINHOLE", "camera_params": (-250.0, 120.0, 90.0)},
+            [(240, 180)],
+            "a focal length is not positive",
+        ),
+        (
+            {"camera_model": "SIMPLE_PINHOLE", "camera_params": (250.0, 120.0, 90.0)},
+            [(240, 180), (180, 240)],
+            "the photos have 2 sizes (180×240, 240×180) and so several cameras",
+        ),
+    ],
+)
+def test_intrinsics_that_cannot_be_those_of_the_photos_are_refused(
+    given: dict[str, object], sizes: list[tuple[int, int]], why: str, tmp_path: Path, progress
+) -> None:
+    images = {f"{i}.png": blots(i, *sizes[i % len(sizes)]) for i in range(3)}
+    with pytest.raises(StageError) as caught:
+        sfm.run(SMALL.model_copy(update=given), ingested(tmp_path / "ingest", images), tmp_path / "sfm", progress)
+    assert (caught.value.what, caught.value.why) == ("cannot use --sfm.camera-params", why)

@@ -1,0 +1,401 @@
+"""Cameras of a few small photos, what became of each, and runs that were cut short: all of stage sfm at work."""
+
+import re
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from nerf.geometry.alignment import align
+from stages import ingest, sfm
+from stages.contract import StageError
+from stages.io.files import read_json, write_png
+from stages.io.photos import read_photos, write_photos
+from stages.sfm import process as sfm_process
+from stages.sfm.colmap.models import read_model
+from stages.sfm.registration import count_done
+from stages.sfm.retry_strategies import ATTEMPTS, Journal, Tried
+from tests.blots import blots
+from tests.small_scenes import write_blender_scene
+from tests.stages.sfm.sfm_inputs import SMALL, ingested
+from tests.synthetic_photos import Quiet, SyntheticPhotos
+
+ROOT = Path(__file__).parents[3]
+
+
+@pytest.fixture(scope="module")
+def inputs(synthetic_photos: SyntheticPhotos, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """The synthetic photos after ingest."""
+    folder = tmp_path_factory.mktemp("ingest")
+    ingest.run(ingest.Config(photos=synthetic_photos.folder), {}, folder, Quiet())
+    return {"ingest": folder}
+
+
+@pytest.fixture(scope="module")
+def reconstructed(inputs: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a finished run on the synthetic photos."""
+    folder = tmp_path_factory.mktemp("sfm")
+    sfm.run(SMALL, inputs, folder, Quiet())
+    return folder
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    files = [*(folder / "sparse").iterdir(), folder / "registration.json"]
+    return {file.name: file.read_bytes() for file in files}
+
+
+def test_cameras_of_synthetic_photos_are_found(reconstructed: Path, synthetic_photos: SyntheticPhotos) -> None:
+    model, truth = read_model(reconstructed / "sparse"), synthetic_photos.truth.poses
+    assert [image.file for image in model.images] == sorted(truth)
+    true = np.stack([truth[image.file] for image in model.images])
+    found = np.stack([image.sfm_from_camera for image in model.images])
+    truth_from_sfm = align(found[:, :, 3], true[:, :, 3])
+    aligned = np.stack([truth_from_sfm.pose(pose) for pose in found])
+    assert 0 < np.linalg.norm(aligned[:, :, 3] - true[:, :, 3], axis=1).max() < 0.015  # 3 from the table
+    cosines = (np.einsum("nij,nij->n", aligned[:, :, :3], true[:, :, :3]) - 1) / 2
+    assert 0 < np.degrees(np.arccos(cosines)).max() < 1
+
+
+def test_the_account_says_what_became_of_each_photo(reconstructed: Path) -> None:
+    account, model = read_json(reconstructed / "registration.json"), read_model(reconstructed / "sparse")
+    assert (account["source"], account["photos"], account["registered"]) == ("sfm", 12, 12)
+    assert account["test_files"] is None
+    # So few points say next to nothing about distortion: which of the two it is differs between processors.
+    assert account["camera_model"] in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL")
+    (chosen,) = (row for row in account["camera_models"] if row["chosen"])
+    assert (chosen["model"], chosen["principal_point"], chosen["photos"]) == (account["camera_model"], "centred", 12)
+    assert 0 < chosen["held_out_px"] < 1
+    assert all(0 < image["uncertainty_px"] < 1 for image in account["images"])
+    assert account["points"] == len(model.xyz) > 100
+    assert account["reprojection_px"] == pytest.approx(model.error_px.mean())
+    assert [image["observations"] for image in account["images"]] == np.bincount(model.view).tolist()
+    assert all(image["keypoints"] > image["observations"] > 20 for image in account["images"])
+    assert sorted(path.name for path in reconstructed.iterdir()) == ["registration.json", "sfm.log", "sparse"]
+
+
+PROGRAM = """
+import sys
+from pathlib import Path
+from stages import sfm
+from tests.synthetic_photos import Quiet
+sfm.run(sfm.Config(max_features=1000), {"ingest": Path(sys.argv[1])}, Path(sys.argv[2]), Quiet())
+"""
+
+
+def wait_for(condition: Callable[[], object], seconds: float = 60) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "it did not happen in time"
+        time.sleep(0.01)
+
+
+def is_gone(pid: int) -> bool:
+    status = Path(f"/proc/{pid}/stat")
+    return not status.exists() or status.read_text().rpartition(")")[2].split()[0] == "Z"
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for the child in /proc")
+def test_a_killed_run_takes_its_child_along_and_goes_on_to_the_same_bytes(
+    inputs: dict[str, Path], reconstructed: Path, tmp_path: Path, progress
+) -> None:
+    parent = subprocess.Popen([sys.executable, "-c", PROGRAM, str(inputs["ingest"]), str(tmp_path)], cwd=ROOT)
+    children = Path(f"/proc/{parent.pid}/task/{parent.pid}/children")
+    wait_for(lambda: any(count_done(database)[1] for database in tmp_path.glob("matches-*.db")))
+    (child,) = map(int, children.read_text().split())
+    parent.kill()
+    parent.wait()
+    wait_for(lambda: is_gone(child))
+    sfm.run(SMALL, inputs, tmp_path, progress)
+    assert progress.notes[0].startswith("going on with the features of 12 photos and ")
+    assert contents(tmp_path) == contents(reconstructed)
+
+
+def test_a_damaged_database_is_made_anew(
+    inputs: dict[str, Path], reconstructed: Path, tmp_path: Path, progress
+) -> None:
+    (tmp_path / f"matches-{version('pycolmap')}.db").write_bytes(b"SQLite format 3\0 and then nothing of use")
+    sfm.run(SMALL, inputs, tmp_path, progress)
+    assert progress.notes[0] == "the matches of the interrupted run are damaged: starting over"
+    assert contents(tmp_path) == contents(reconstructed)
+
+
+@pytest.mark.parametrize(
+    ("child", "message"),
+    [
+        ("import os; os.abort()", r"was ended by SIGABRT while finding features: COLMAP failed inside \(it left no"),
+        ("import os; os.kill(os.getpid(), 9)", "was ended by SIGKILL .*: most often the machine ran out of memory"),
+        ("raise ValueError('no such thing')", "failed while finding features: ValueError: no such thing"),
+        ("import time; time.sleep(60)", "was given up while finding features: it took longer than 0.5 s"),
+    ],
+)
+def test_however_the_child_ends_it_is_an_error_with_words(
+    child: str, message: str, inputs: dict[str, Path], tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sfm_process, "CHILD", ["-c", child])
+    with pytest.raises(StageError, match=message):
+        sfm.run(sfm.Config(max_seconds=0.5 if "sleep" in child else 60), inputs, tmp_path, progress)
+    assert (tmp_path / "sfm.log").exists()
+
+
+def test_strangers_are_left_out_and_named_and_alpha_and_mixed_sizes_work(
+    inputs: dict[str, Path], tmp_path: Path, progress
+) -> None:
+    images = {path.name: np.asarray(Image.open(path)) for path in sorted((inputs["ingest"] / "images").iterdir())[:8]}
+    alpha = {f"{n}.png": np.dstack([i, np.full(i.shape[:2], 255, np.uint8)]) for n, i in list(images.items())[:6]}
+    plain = dict(list(images.items())[6:]) | {"stranger.png": blots(1, 300, 200)}
+    result = sfm.run(SMALL, ingested(tmp_path / "ingest", alpha | plain), tmp_path / "sfm", progress)
+    assert result.line.startswith("8/9 registered, ")
+    notes = [re.sub(r"about .*", "…", note) for note in progress.notes if not note.startswith("camera model ")]
+    assert notes == [
+        "matching 36 pairs of photos: …",
+        "1 of 9 photos has no place yet: matching them again, less strictly",
+        "matching 8 pairs of photos: …",
+        "passed over, for 1 of 9 photos missing is not worth starting over: verifying and mapping again, as if through "
+        "a fisheye lens; searching twice as many features at twice the size",
+        "passed over, for the missing photos share too little with the others: mapping again, asking less of the first "
+        "pair; mapping again, with another seed; mapping again, all photos at once",
+        "1 of 9 photos found no place and are left out:",
+        "  stranger.png: it shares no view with any other photo",
+    ]
+    account = read_json(tmp_path / "sfm/registration.json")
+    assert [image["file"] for image in account["images"] if not image["registered"]] == ["stranger.png"]
+    tried = {row["attempt"]: row["passed"] for row in account["attempts"]}
+    assert list(tried) == [attempt.name for attempt in ATTEMPTS if attempt.matches != "row"]
+    assert [name for name, passed in tried.items() if passed is None] == ["first", "looser matching"]
+    assert tried["fisheye"] == "1 of 9 photos missing is not worth starting over"
+    assert [row["attempt"] for row in account["attempts"] if row["kept"]] == ["first"]
+    assert account["repeated_structure"] is None
+
+
+def test_nearly_the_same_pictures_are_not_matched_and_masks_keep_features_away(
+    inputs: dict[str, Path], tmp_path: Path, progress
+) -> None:
+    images = {path.name: np.asarray(Image.open(path)) for path in sorted((inputs["ingest"] / "images").iterdir())[:9]}
+    ingested(tmp_path / "ingest", images)
+    photos = read_photos(tmp_path / "ingest")
+    photos[1] = replace(photos[1], near_duplicate_of=photos[0].name)
+    mask = np.full((180, 240), 255, np.uint8)
+    mask[:, :80] = 0
+    photos[5] = replace(photos[5], mask="masks/m.png")
+    write_png(tmp_path / "ingest/masks/m.png", mask)
+    write_photos(tmp_path / "ingest", photos, [], {})
+    result = sfm.run(SMALL, {"ingest": tmp_path / "ingest"}, tmp_path / "sfm", progress)
+    account = read_json(tmp_path / "sfm/registration.json")
+    model = read_model(tmp_path / "sfm/sparse")
+    assert result.line.startswith("8/9 registered, ")
+    assert (account["photos"], account["registered"]) == (9, 8)
+    assert [image["file"] for image in account["images"]] == list(images)
+    assert account["images"][1] == {
+        "file": photos[1].image_name,
+        "registered": False,
+        "reason": f"nearly the same picture as {photos[0].name}: it adds no baseline",
+        "keypoints": 0,
+        "observations": 0,
+        "agreement": None,
+        "transfer_px": None,
+        "uncertainty_px": None,
+    }
+    place = {image.file: index for index, image in enumerate(model.images)}
+    seen_at = model.xy[model.view == place[photos[5].image_name]]
+    others = model.xy[model.view == place[photos[4].image_name]]
+    assert len(seen_at) > 20 and seen_at[:, 0].min() > 79
+    assert (others[:, 0] < 79).sum() > 5
+    assert sorted(path.name for path in (tmp_path / "sfm").iterdir()) == ["registration.json", "sfm.log", "sparse"]
+
+
+def test_a_known_camera_is_kept(
+    inputs: dict[str, Path], synthetic_photos: SyntheticPhotos, tmp_path: Path, progress
+) -> None:
+    lens = synthetic_photos.truth.camera
+    config = SMALL.model_copy(update={"camera_model": lens.model, "camera_params": lens.params})
+    result = sfm.run(config, inputs, tmp_path, progress)
+    assert result.line.startswith("12/12 registered, ") and " · OPENCV · " in result.line
+    assert read_model(tmp_path / "sparse").cameras == [lens]
+    assert "the camera is kept as given" in progress.notes
+    assert read_json(tmp_path / "registration.json")["camera_models"] == []
+
+
+def test_photos_with_gps_tell_metres_and_directions(
+    inputs: dict[str, Path], synthetic_photos: SyntheticPhotos, tmp_path: Path, progress
+) -> None:
+    """The walk around the table, as if a unit were 40 m, at the equator, where degrees east and north are metres."""
+    ingest_folder = tmp_path / "ingest"
+    shutil.copytree(inputs["ingest"], ingest_folder)
+    centres = {name: 40 * pose[:, 3] for name, pose in synthetic_photos.truth.poses.items()}
+    photos = [
+        replace(photo, longitude=x / 111_319.49, latitude=y / 110_574.28, altitude_m=float(z))
+        for photo in read_photos(ingest_folder)
+        for x, y, z in [centres[photo.name]]
+    ]
+    write_photos(ingest_folder, photos, [], {})
+    sfm.run(SMALL, {"ingest": ingest_folder}, tmp_path / "sfm", progress)
+    found = read_json(tmp_path / "sfm/registration.json")["georeference"]
+    assert found["photos"] == 12 and 0 < found["error_m"] < 0.5
+    images = read_model(tmp_path / "sfm/sparse").images
+    matrix = np.array(found["enu_from_sfm"])
+    enu = np.array([matrix[:3, :3] @ image.sfm_from_camera[:, 3] + matrix[:3, 3] for image in images])
+    true = np.array([centres[image.file] for image in images])
+    np.testing.assert_allclose(enu - enu[0], true - true[0], atol=1.5)  # of walks of 120 m
+    assert any(note.startswith("GPS of 12 photos: one unit is ") for note in progress.notes)
+
+
+@pytest.mark.parametrize("always", [False, True], ids=["mended", "left out"])
+def test_the_camera_of_one_photo_that_comes_out_absurd_does_not_end_the_run(
+    always: bool, inputs: dict[str, Path], tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    images = {path.name: np.asarray(Image.open(path)) for path in sorted((inputs["ingest"] / "images").iterdir())[:8]}
+    images["photo_003.jpg"] = np.ascontiguousarray(images["photo_003.jpg"][:, 10:230])  # another size, another camera
+    absurd = "camera.width == 220" if always else "camera.width == 220 and camera.model_name != 'SIMPLE_PINHOLE'"
+    child = (
+        "import stages.sfm.colmap.lenses as lenses, stages.sfm.worker as c\n"
+        f"lenses.flaw = lambda camera: 'it is absurd' if {absurd} else None\n"
+        "c.main()"
+    )
+    monkeypatch.setattr(sfm_process, "CHILD", ["-c", child])
+    sfm.run(SMALL, ingested(tmp_path / "ingest", images), tmp_path / "sfm", progress)
+    assert "1 photo: the camera came out absurd (it is absurd): SIMPLE_PINHOLE instead" in progress.notes
+    account, model = read_json(tmp_path / "sfm/registration.json"), read_model(tmp_path / "sfm/sparse")
+    reasons = {image["file"]: image["reason"] for image in account["images"] if not image["registered"]}
+    assert reasons == ({"photo_003.jpg": "its camera came out absurd: it is absurd"} if always else {})
+    assert [camera.model for camera in model.cameras if camera.width == 220] == ([] if always else ["SIMPLE_PINHOLE"])
+    assert len(model.images) == account["registered"] == 8 - len(reasons)
+    assert [image["observations"] for image in account["images"] if image["registered"]] == (
+        np.bincount(model.view).tolist()
+    )
+
+
+def with_a_stranger(inputs: dict[str, Path], folder: Path) -> dict[str, Path]:
+    """Six photos and one of another scene: the first attempt leaves it without a place."""
+    images = {path.name: np.asarray(Image.open(path)) for path in sorted((inputs["ingest"] / "images").iterdir())[:6]}
+    return ingested(folder, images | {"stranger.png": blots(1, 300, 200)})
+
+
+@pytest.mark.parametrize(
+    ("end", "message", "became"),
+    [
+        ("os.abort()", "was ended by SIGABRT .*goes on without the attempt 'looser matching'", "ended the program"),
+        (
+            "os.kill(os.getpid(), 9)",
+            "was ended by SIGKILL .*ran out of memory. Run again: it goes on without",
+            "was killed, most often for want of memory",
+        ),
+        ("int('x')", "failed while mapping: ValueError.*Run again: it goes on without", "ended the program"),
+    ],
+)
+def test_an_attempt_that_ended_the_program_is_left_out(
+    end: str,
+    message: str,
+    became: str,
+    inputs: dict[str, Path],
+    tmp_path: Path,
+    progress,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    folders = with_a_stranger(inputs, tmp_path / "ingest")
+    crash = (
+        "import sys, stages.sfm.worker as c, os\n"
+        "first = c.matched\n"
+        f"c.matched = lambda a, m, w: {end} if a.name == 'looser matching' else first(a, m, w)\n"
+        "c.main()"
+    )
+    with monkeypatch.context() as patched:
+        patched.setattr(sfm_process, "CHILD", ["-c", crash])
+        with pytest.raises(StageError, match=message):
+            sfm.run(SMALL, folders, tmp_path / "sfm", progress)
+    progress.notes.clear()
+    result = sfm.run(SMALL, folders, tmp_path / "sfm", progress)
+    assert result.line.startswith("6/7 registered, ")
+    assert progress.notes[0].startswith("going on with the features of 7 photos and 21 matched pairs")
+    assert f"left out, for it {became} last time: matching them again, less strictly" in progress.notes
+    tried = {row["attempt"]: row["passed"] for row in read_json(tmp_path / "sfm/registration.json")["attempts"]}
+    assert tried["looser matching"] == f"it {became}"
+    assert not (tmp_path / "sfm/attempts").exists()
+
+
+def test_an_attempt_for_which_no_time_is_left_is_not_begun(
+    inputs: dict[str, Path], tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    slow = (
+        "import stages.sfm.worker as c\n"
+        "end = c.Work.end\n"
+        "def slowly(work, phase):\n"
+        "    end(work, phase)\n"
+        "    work.seconds[phase] += 100\n"
+        "c.Work.end = slowly\n"
+        "c.main()"
+    )
+    monkeypatch.setattr(sfm_process, "CHILD", ["-c", slow])
+    config = SMALL.model_copy(update={"max_seconds": 240.0})
+    result = sfm.run(config, with_a_stranger(inputs, tmp_path / "ingest"), tmp_path / "sfm", progress)
+    assert result.line.startswith("6/7 registered, ")
+    assert result.line.endswith(" · 1 way left out for time: sfm --force")
+    # All of the first time's 100 s of mapping, 1 - (6/7)² of those of matching; twice 100 s are for the adjustment.
+    said = (
+        "left out, for it would take about 2 min and the last adjustment, of --sfm.max-seconds 4 min are left: "
+        "matching them again, less strictly"
+    )
+    assert said in progress.notes
+    tried = {row["attempt"]: row["passed"] for row in read_json(tmp_path / "sfm/registration.json")["attempts"]}
+    assert tried["looser matching"] == "too little was left of --sfm.max-seconds"
+    assert tried["weaker start"] == "the missing photos share too little with the others"
+
+
+def test_attempts_whose_matches_are_gone_are_forgotten(
+    inputs: dict[str, Path], reconstructed: Path, tmp_path: Path, progress
+) -> None:
+    Journal(tmp_path / "attempts").add(Tried("first", "matches-0.db", [["photo_000.jpg"] * 12], 500, 0.1))
+    sfm.run(SMALL, inputs, tmp_path, progress)
+    assert contents(tmp_path) == contents(reconstructed)
+
+
+def test_the_screen_never_stands_still(inputs: dict[str, Path], tmp_path: Path, progress) -> None:
+    sfm.run(SMALL, inputs, tmp_path, progress)
+    shares = [done for _, done in progress.updates if done is not None]
+    assert shares == sorted(shares)
+    assert 0 <= shares[0] < shares[-1] <= 1
+    assert len(progress.updates) >= 3
+
+
+def test_known_cameras_go_through_without_points(tmp_path: Path, progress) -> None:
+    write_blender_scene(tmp_path / "blender", train=4, test=1)
+    config = ingest.Config(photos=tmp_path / "blender")
+    ingest.run(config, {}, tmp_path / "ingest", progress)
+    result = sfm.run(
+        sfm.Config(cameras=tmp_path / "blender"), {"ingest": tmp_path / "ingest"}, tmp_path / "sfm", progress
+    )
+    account = read_json(tmp_path / "sfm/registration.json")
+    assert result.line == "5/5 cameras known · PINHOLE"
+    assert (account["source"], account["reprojection_px"], account["points"]) == ("import", None, 0)
+    assert account["test_files"] == ["test/r_4.png"]
+    assert account["camera_models"] == []
+    assert {image["uncertainty_px"] for image in account["images"]} == {None}
+    assert read_model(tmp_path / "sfm/sparse").cameras[0].params[0] == pytest.approx(52.0)
+
+
+def test_photos_that_look_alike_are_enough(inputs: dict[str, Path], tmp_path: Path, progress) -> None:
+    config = sfm.Config(max_features=1000, matcher="retrieval", neighbours=3)
+    result = sfm.run(config, inputs, tmp_path, progress)
+    assert result.line.startswith("12/12 registered")
+    graph = read_json(tmp_path / "registration.json")["match_graph"]
+    assert 12 * 3 / 2 <= graph["verified"] <= graph["tried"] < 12 * 11 / 2
+    assert graph["order"]
+
+
+def test_every_photo_is_checked_and_a_second_opinion_agrees(reconstructed: Path) -> None:
+    account = read_json(reconstructed / "registration.json")
+    check, opinion = account["check"], account["second_opinion"]
+    assert check["doubtful"] == [] and check["weak_links"] == []
+    assert 0.9 * check["pairs"] < check["agreeing"] <= check["pairs"] <= 12 * 11 / 2
+    assert 0 < check["error_px"] < check["tolerance_px"] < 4
+    assert min(image["agreement"] for image in account["images"]) > 0.9
+    assert 0 < max(image["transfer_px"] for image in account["images"]) < check["tolerance_px"]
+    assert (opinion["photos"], opinion["agree"], opinion["elsewhere"], opinion["failed"]) == (12, 12, [], None)
+    assert 0 < opinion["centre"] < 0.02

@@ -1,0 +1,170 @@
+"""Runs that are given seconds: they use them, whatever single steps take."""
+
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from stages.train import loop as training_loop
+from stages.train.checkpoints import latest_checkpoint
+from stages.train.loop import TrainingRun
+from stages.train.state import Pace, TrainingBudget, checkpoint_interval
+from tests.stages.train.one_number import Killed, OneNumber, killed_at, number_of, run_in, slow
+
+
+def test_a_run_in_seconds_takes_about_that_long_and_its_share_ends_at_1(tmp_path: Path, progress) -> None:
+    run = run_in(tmp_path, progress, TrainingBudget(None, 0.3), make=lambda attempt: OneNumber(attempt, slow))
+    run.train()
+    assert 0.2 < run.state.seconds < 0.5
+    assert run.plan.share(run.state.step) == pytest.approx(1)
+    assert len(run.plan.decisions) >= 2
+    shares = [share for _, share, _ in number_of(run).history]
+    assert 0.8 < shares[-1] < 1
+
+
+def test_a_resumed_run_in_seconds_keeps_its_plan_and_its_clock(tmp_path: Path, progress) -> None:
+    with pytest.raises(Killed):
+        run_in(tmp_path, progress, TrainingBudget(None, 0.3), make=killed_at(30)).train()
+    journal = json.loads((tmp_path / "plan.json").read_text())
+    resumed = run_in(tmp_path, progress, TrainingBudget(None, 0.3), make=lambda attempt: OneNumber(attempt, slow))
+    resumed.train()
+    assert [list(decision) for decision in resumed.plan.decisions][: len(journal)] == journal
+    assert number_of(resumed).history[0][:2] == (30, resumed.plan.share(30))
+    assert 0.2 < resumed.state.seconds < 0.5
+    assert any(note.startswith("going on from step 30, with 0 s of training left") for note in progress.notes)
+
+
+def test_more_seconds_take_about_that_long(tmp_path: Path, progress) -> None:
+    def make(attempt: int) -> OneNumber:
+        return OneNumber(attempt, slow)
+
+    first = run_in(tmp_path / "first", progress, TrainingBudget(None, 0.2), make)
+    first.train()
+    more = run_in(tmp_path / "more", progress, TrainingBudget(None, 0.2, tmp_path / "first"), make)
+    assert more.plan.share(first.state.step) == pytest.approx(0.5, abs=0.05)
+    more.train()
+    assert 0.1 < more.state.seconds - first.state.seconds < 0.35
+
+
+def run_on_a_made_up_clock(
+    folder: Path,
+    progress,
+    monkeypatch: pytest.MonkeyPatch,
+    seconds: float,
+    takes: Callable[[int], float],
+    killed_after: float = math.inf,
+    checkpoint_seconds: float | None = None,
+) -> TrainingRun:
+    """``takes(step)`` seconds a step, and no time at all beside the steps."""
+    now = 0.0
+
+    def step_by_step(step: int, rate_scale: float) -> None:
+        nonlocal now
+        if now >= killed_after:
+            raise Killed
+        now += takes(step)
+
+    clock = SimpleNamespace(perf_counter=lambda: now, monotonic=lambda: now)
+    monkeypatch.setattr(training_loop, "time", clock)
+    budget = TrainingBudget(None, seconds)
+    run = run_in(folder, progress, budget, lambda _: OneNumber(0, step_by_step), checkpoint_seconds=checkpoint_seconds)
+    run.train()
+    return run
+
+
+@pytest.mark.parametrize(("checkpoint_seconds", "kept"), [(20.0, 20.0), (math.inf, 0.0), (None, 27.0)])
+@pytest.mark.parametrize("factor", [1.0, 10.0])
+def test_what_a_kill_loses_is_spent(
+    checkpoint_seconds: float | None,
+    kept: float,
+    factor: float,
+    tmp_path: Path,
+    progress,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    on_clock = (tmp_path, progress, monkeypatch, 60.0)
+    with pytest.raises(Killed):
+        run_on_a_made_up_clock(*on_clock, lambda _: 0.2, 29.0, checkpoint_seconds)
+    checkpoint = latest_checkpoint(tmp_path / "checkpoints", pytest.fail)
+    assert checkpoint is not None and kept <= checkpoint.facts["seconds"] < kept + 2
+    run = run_on_a_made_up_clock(*on_clock, lambda _: 0.2 * factor, checkpoint_seconds=checkpoint_seconds)
+    again = run.state.seconds - checkpoint.facts["seconds"]
+    assert 29 + again == pytest.approx(60, abs=2.5), "it is all spent, however slow the machine is now"
+    shares = [share for _, share, _ in number_of(run).history]
+    assert shares == sorted(shares) and 0.9 < shares[-1] <= 1
+    lost = [note for note in progress.notes if "after the last checkpoint are lost, and count as spent" in note]
+    assert len(lost) == (29 - checkpoint.facts["seconds"] > 1.6)
+
+
+def test_a_run_that_is_killed_again_and_again_has_half_of_its_time(
+    tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    on_clock = (tmp_path, progress, monkeypatch, 60.0, lambda _: 0.2)
+    for _ in range(9):
+        with pytest.raises(Killed):
+            run_on_a_made_up_clock(*on_clock, 10.0, math.inf)
+    assert run_on_a_made_up_clock(*on_clock).state.seconds == pytest.approx(30, abs=1.0)
+
+
+def test_killed_before_its_steps_could_be_counted(tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch) -> None:
+    on_clock = (tmp_path, progress, monkeypatch, 100.0, lambda _: 10.0)
+    with pytest.raises(Killed):
+        run_on_a_made_up_clock(*on_clock, 10.0, 5.0)
+    run = run_on_a_made_up_clock(*on_clock, 100_000.0, 5.0)
+    assert run.state.seconds == pytest.approx(100, abs=11) and number_of(run).history[0][0] == 1
+
+
+@pytest.mark.parametrize("content", ["", "0.5\0", "nan", "-3"])
+def test_what_was_spent_may_be_unreadable(
+    content: str, tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    on_clock = (tmp_path, progress, monkeypatch, 60.0, lambda _: 0.2)
+    with pytest.raises(Killed):
+        run_on_a_made_up_clock(*on_clock, 10.0)
+    (tmp_path / "spent.txt").write_text(content)
+    assert run_on_a_made_up_clock(*on_clock).state.seconds == pytest.approx(60, abs=0.7)
+
+
+def test_checkpoints_come_often_in_short_runs_and_seldom_where_they_are_slow() -> None:
+    short, long, steps = TrainingBudget(None, 40.0), TrainingBudget(None, 900.0), TrainingBudget(400, None)
+    assert checkpoint_interval(short, 0.0) == 2 and checkpoint_interval(short, 0.1) == pytest.approx(10)
+    assert checkpoint_interval(short, 2.0) == checkpoint_interval(long, 0.0) == checkpoint_interval(steps, 0.0) == 30
+
+
+@pytest.mark.parametrize(("slow_step", "lasts"), [(0, 1.0), (0, 10.0), (1, 5.0), (100, 20.0), (600, 3.0)])
+def test_one_step_that_lasts_long_does_not_end_a_run_early(
+    slow_step: int, lasts: float, tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = run_on_a_made_up_clock(
+        tmp_path, progress, monkeypatch, 60.0, lambda step: lasts if step == slow_step else 0.04
+    )
+    assert run.state.seconds == pytest.approx(60, abs=0.7)
+    assert run.state.step == pytest.approx(1 + (60 - lasts) / 0.04, rel=0.02)
+    seconds = 0.0
+    for step, share, _ in number_of(run).history:
+        seconds += lasts if step == slow_step else 0.04
+        if step not in range(slow_step, slow_step + 100):
+            assert share == pytest.approx(seconds / 60, abs=0.04)
+
+
+@pytest.mark.parametrize("factor", [0.1, 10.0])
+def test_a_machine_that_changes_its_speed_is_followed(
+    factor: float, tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = run_on_a_made_up_clock(
+        tmp_path, progress, monkeypatch, 60.0, lambda step: 0.04 if step < 500 else 0.04 * factor
+    )
+    assert run.state.seconds == pytest.approx(60, abs=1.0)
+    assert run.state.step == pytest.approx(500 + 40 / (0.04 * factor), rel=0.05)
+
+
+def test_the_pace_forgets_the_first_step_and_takes_little_of_a_stall() -> None:
+    pace = Pace()
+    pace.add(1.0, 4, 20.0)
+    assert pace.seconds_per_step == 1.0
+    for seconds in (0.04, 0.04, 0.04, 30.0):
+        pace.add(seconds, 4, 20.0)
+    assert pace.seconds_per_step == pytest.approx(0.06)

@@ -1,0 +1,105 @@
+"""Stage train computes its products at "medium" where that is measured to pay, and only while it trains."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from nerf.runtime.matmul_precision import Medium
+from nerf.training.hash_grid_trainer import HashGridTrainer
+from stages import train
+from stages.effects.decisions import Decisions
+from stages.train import Config
+from stages.train.planning import rays_per_second
+from stages.train.precision import chosen_precision
+from tests.stages.photo_scene import photographed
+
+TINY: dict[str, Any] = {"levels": 2, "log2_rows": 10, "finest": 32, "batch_samples": 1024, "downscale": 1.0}
+FAST, INEXACT, NOTHING = Medium(2.53, 1.2e-5), Medium(4.0, 3e-4), Medium(1.0, 2e-7)
+SAID = "matrix products at torch's precision medium: 2.5 times faster here, off by 1e-05"
+
+
+@pytest.fixture
+def here(monkeypatch: pytest.MonkeyPatch):
+    """Sets what "medium" is on this machine; the widths that it was asked for."""
+    widths: list[int] = []
+
+    def is_(medium: Medium) -> list[int]:
+        def measured(device: torch.device, width: int) -> Medium:
+            widths.append(width)
+            return medium
+
+        monkeypatch.setattr("nerf.runtime.matmul_precision.medium_matmul", measured)
+        return widths
+
+    return is_
+
+
+@pytest.fixture
+def trained_at(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """At which precision steps were taken."""
+    step, seen = HashGridTrainer.step, list[str]()
+
+    def watched(self: HashGridTrainer, *given: Any):
+        seen.append(torch.get_float32_matmul_precision())
+        return step(self, *given)
+
+    monkeypatch.setattr(HashGridTrainer, "step", watched)
+    return seen
+
+
+@pytest.mark.parametrize(
+    "medium, chosen, notes", [(FAST, "medium", [SAID]), (INEXACT, "highest", []), (NOTHING, "highest", [])]
+)
+def test_a_run_in_seconds_takes_what_pays(medium: Medium, chosen: str, notes: list[str], here, progress) -> None:
+    widths = here(medium)
+    assert chosen_precision(Config(seconds=5, field="grid"), progress) == chosen
+    assert chosen_precision(Config(seconds=5, field="paper", width=48), progress) == chosen
+    assert progress.notes == 2 * notes and widths == [64, 48]
+
+
+def test_a_run_in_steps_depends_on_no_measurement(here, progress) -> None:
+    widths = here(FAST)
+    assert chosen_precision(Config(steps=5, field="grid"), progress) == "highest"
+    assert widths == [] and progress.notes == []
+
+
+def test_planning_keeps_the_choice_and_what_was_asked_for(tmp_path: Path, here, progress) -> None:
+    inputs, _ = photographed(tmp_path)
+    here(FAST)
+    planned = train.plan(Config(**TINY, seconds=5), inputs, progress)
+    assert planned.matmul == "medium" and progress.notes == [SAID]
+    here(NOTHING)
+    assert train.plan(planned, inputs, progress) == planned
+    assert train.plan(Config(**TINY, steps=5, matmul="medium"), inputs, progress).matmul == "medium"
+    assert train.plan(Config(**TINY, seconds=5), inputs, progress).matmul == "highest"
+
+
+@pytest.mark.parametrize("matmul", ["medium", "highest"])
+def test_it_is_set_while_training_alone_and_recorded(matmul, tmp_path: Path, here, trained_at, progress) -> None:
+    inputs, _ = photographed(tmp_path)
+    here(FAST)
+    (tmp_path / "train").mkdir()
+    result = train.run(Config(**TINY, steps=2, matmul=matmul), inputs, tmp_path / "train", progress)
+    assert trained_at == [matmul] * 2 and torch.get_float32_matmul_precision() == "highest"
+    facts = {"matmul": matmul, "medium_matmul_speedup": 2.53, "medium_matmul_error": 1.2e-5}
+    assert facts.items() <= result.facts.items()
+
+
+def test_speed_is_measured_as_it_will_be_trained(tmp_path: Path, trained_at, progress, monkeypatch) -> None:
+    monkeypatch.setattr("stages.train.planning.TIMED_SECONDS", 0.0)
+    inputs, scene = photographed(tmp_path)
+    config = train.plan(Config(**TINY, steps=5, matmul="medium"), inputs, progress)
+    assert rays_per_second(config, scene, Decisions()) > 0
+    assert set(trained_at) == {"medium"} and torch.get_float32_matmul_precision() == "highest"
+
+
+def test_products_that_are_inexact_on_another_machine_are_said(tmp_path: Path, here, progress) -> None:
+    inputs, _ = photographed(tmp_path)
+    here(INEXACT)
+    for matmul in ("medium", "highest"):
+        (tmp_path / matmul).mkdir()
+        train.run(Config(**TINY, steps=1, matmul=matmul), inputs, tmp_path / matmul, progress)
+    said = [note for note in progress.notes if note.startswith("matrix products")]
+    assert said == ["matrix products are off by 3e-04 here; --train.matmul highest computes exact ones"]
