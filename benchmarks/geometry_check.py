@@ -32,9 +32,9 @@ from stages.sfm.colmap.matching import (
 )
 from stages.sfm.colmap.models import load_native
 from stages.sfm.colmap.repair import Checked, camera_poses, check_model
-from stages.sfm.geometry_check import CLEARLY, check_poses
+from stages.sfm.geometry_check import CONTRADICTION_FACTOR, check_poses
 from stages.sfm.pairs.image_retrieval import CELLS
-from stages.sfm.pairs.match_graph import in_order, natural_order
+from stages.sfm.pairs.match_graph import natural_order, pairs_apart
 from stages.sfm.pairs.pair_selection import nearest, union
 
 SIZES = (1, 1, 1, 2, 3, 5, 10, 20)
@@ -63,7 +63,7 @@ def main() -> None:
     print(f"{len(names)} photos, {len(checked.matches.pairs)} pairs, tolerance {checked.check.tolerance_px:.2f} px; ")
     print(f"unmoved: {int((~checked.check.passed).sum())} blamed")
     moves = [*moved(checked, poses, depth, natural_order(names), asked.moved)]
-    floor = CLEARLY * checked.check.tolerance_px
+    floor = CONTRADICTION_FACTOR * checked.check.tolerance_px
     above = [move for move in moves if move.pixels >= floor]
     photos, found = sum(move.photos for move in above), sum(move.found for move in above)
     others = sum(len(names) - move.photos for move in moves)
@@ -88,7 +88,7 @@ def right_model(ingest: Path, sparse: Path) -> tuple[Checked, np.ndarray, float,
         fill_database(database, photos, MAPPING_MODEL)
         extract_features(database, ingest / "images", photos, Search(1600, 4096))
         order = natural_order([photo.name for photo in photos])
-        pairs = union(in_order(order, 1, 5), nearest(look_alike(database, len(photos), 0), 10))
+        pairs = union(pairs_apart(order, 1, 5), nearest(look_alike(database, len(photos), 0), 10))
         features = Features(read_vocabulary(database, len(photos), 0, CELLS))
         match_pairs(database, pairs, 0, STRICT_RATIO, features=features)
         checked = check_model(model, database, 0)

@@ -34,15 +34,15 @@ from stages.sfm.colmap.matching import (
 from stages.sfm.pairs.feature_matching import match_descriptors
 from stages.sfm.pairs.image_retrieval import CELLS
 from stages.sfm.pairs.match_graph import (
+    MAX_GROWTH_ROUNDS,
     MIN_INLIERS,
     ORDER_OVERLAP,
-    ROUNDS,
-    in_order,
     inlier_matrix,
     next_pairs,
-    order_tells,
+    order_is_informative,
+    pairs_apart,
 )
-from stages.sfm.pairs.pair_selection import Likeness, Pairs, exhaustive, nearest, spanning_tree, union
+from stages.sfm.pairs.pair_selection import Pairs, SimilarityMatrix, exhaustive, nearest, spanning_tree, union
 
 BEST = 20  # partners of a photo that count
 LARGEST = 512  # features of a photo
@@ -72,7 +72,7 @@ def main() -> None:
             "VLAD": nearest(vlad, asked.neighbours),
             f"{LARGEST} largest features": nearest(largest_features(database, count), asked.neighbours),
             "vocabulary tree": vocabulary_tree(database, count, asked.neighbours),
-            "order of names": in_order(np.arange(count), 1, asked.neighbours // 2),
+            "order of names": pairs_apart(np.arange(count), 1, asked.neighbours // 2),
             "grown": grown(np.arange(count), truth, vlad, asked.neighbours),
             "grown, names shuffled": grown(np.random.default_rng(0).permutation(count), truth, vlad, asked.neighbours),
         }
@@ -93,21 +93,21 @@ def scores(pairs: Pairs, truth: np.ndarray) -> dict[str, float | int]:
     return {"pairs": len(pairs), "recall": round(recall, 3), "verified": round(verified, 3)}
 
 
-def grown(order: np.ndarray, truth: np.ndarray, similarity: Likeness, neighbours: int) -> Pairs:
+def grown(order: np.ndarray, truth: np.ndarray, similarity: SimilarityMatrix, neighbours: int) -> Pairs:
     """The pairs of a match graph grown as stage sfm does, each answered from the truth."""
 
     def tried(pairs: Pairs) -> np.ndarray:
         return inlier_matrix(len(truth), pairs, truth[tuple(pairs.T)])
 
-    pairs = union(in_order(order, 1, 2), nearest(similarity, neighbours // 4), spanning_tree(similarity))
-    if order_tells(order, tried(pairs)):
-        pairs = union(pairs, in_order(order, 3, ORDER_OVERLAP))
-    for _ in range(ROUNDS):
+    pairs = union(pairs_apart(order, 1, 2), nearest(similarity, neighbours // 4), spanning_tree(similarity))
+    if order_is_informative(order, tried(pairs)):
+        pairs = union(pairs, pairs_apart(order, 3, ORDER_OVERLAP))
+    for _ in range(MAX_GROWTH_ROUNDS):
         pairs = union(pairs, next_pairs(tried(pairs), similarity, neighbours))
     return pairs
 
 
-def largest_features(database: Path, count: int) -> Likeness:
+def largest_features(database: Path, count: int) -> SimilarityMatrix:
     """How many of the photos' largest features match (Wu 2013, "Towards linear-time incremental structure from
     motion", section 3: preemptive matching)."""
     with pycolmap.Database.open(database) as db:

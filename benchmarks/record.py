@@ -14,7 +14,7 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
-from pipeline.doctor import machine
+from pipeline.engine import machine
 
 Figures = Mapping[str, Any]
 

@@ -13,8 +13,9 @@ from pathlib import Path
 from benchmarks.record import Record, add_out
 from pipeline.cli.display import PlainDisplay
 from pipeline.cli.durations import seconds_from
-from pipeline.cli.settings import Settings, with_source
+from pipeline.cli.settings import with_source
 from pipeline.engine.runner import Runner
+from pipeline.engine.settings import Settings
 from pipeline.engine.stage_list import needed_for
 from pipeline.engine.workspace import Workspace
 from stages.io.files import read_json

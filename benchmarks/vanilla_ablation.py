@@ -17,8 +17,9 @@ from PIL import Image
 
 from benchmarks.record import Record, add_out
 from pipeline.cli.display import PlainDisplay
-from pipeline.cli.settings import Settings, settings_from, with_source
+from pipeline.cli.settings import settings_from, with_source
 from pipeline.engine.runner import Runner
+from pipeline.engine.settings import Settings
 from pipeline.engine.workspace import Workspace
 from stages.io.files import read_json
 

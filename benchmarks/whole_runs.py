@@ -34,21 +34,17 @@ def figures(name: str, root: Path, seconds: float) -> dict[str, Any]:
     """The row of a finished run."""
     keys = read_json(root / "run.json")["keys"]
     manifests = {stage: read_json(root / stage / key[:16] / "manifest.json") for stage, key in keys.items() if key}
-    sfm, train = manifests["sfm"]["facts"], manifests["train"]["facts"]
-    metrics = read_json(root / "output" / "metrics.json")
-    return {
-        "set": name,
-        "registered": f"{sfm['registered']}/{sfm['photos']}",
-        "camera_model": sfm["camera_model"],
-        "psnr": metrics["psnr"],
-        "above_nearest_db": round(metrics["psnr"] - metrics["psnr_nearest_view"], 1),
-        "ssim": metrics["ssim"],
-        "width_share": metrics["width_share"],
-        "whole_seconds": round(seconds),
-        **{f"{stage}_seconds": round(manifests[stage]["seconds"]) for stage in SECONDS if stage in manifests},
-        "steps": train["steps"],
-        "rays_per_second": train["rays_per_second"],
-    }
+    sfm = manifests["sfm"]["facts"]
+    found = {key: sfm[key] for key in ("camera_model", "reprojection_px", "points")}
+    row = {"set": name, "registered": f"{sfm['registered']}/{sfm['photos']}", **found, "whole_seconds": round(seconds)}
+    row |= {f"{stage}_seconds": round(manifests[stage]["seconds"]) for stage in SECONDS if stage in manifests}
+    if "train" in manifests:
+        row |= {key: manifests["train"]["facts"][key] for key in ("steps", "rays_per_second")}
+    if "evaluate" in manifests:
+        metrics = read_json(root / "output" / "metrics.json")
+        row |= {key: metrics[key] for key in ("psnr", "ssim", "width_share")}
+        row["above_nearest_db"] = round(metrics["psnr"] - metrics["psnr_nearest_view"], 1)
+    return row
 
 
 def main() -> None:

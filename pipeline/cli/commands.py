@@ -16,11 +16,10 @@ from dataclasses import asdict
 from pathlib import Path
 
 from pipeline.cli import arguments as words_of
-from pipeline.cli.display import Display, SilentDisplay, Unread, choose_display, open_closed_streams
+from pipeline.cli.display import Unread, choose_display, open_closed_streams
 from pipeline.cli.durations import seconds_from
-from pipeline.cli.failures import StageFailed
+from pipeline.cli.more import with_more
 from pipeline.cli.settings import (
-    Settings,
     UsageError,
     check_fitted_poses,
     check_same_photos,
@@ -32,11 +31,12 @@ from pipeline.cli.settings import (
     with_source,
 )
 from pipeline.cli.signals import Terminated, go_on, heed_signals
-from pipeline.doctor import machine
+from pipeline.engine import machine, status
 from pipeline.engine import stage_list as chain
-from pipeline.engine import status
-from pipeline.engine.more import with_more
+from pipeline.engine.display import Display, SilentDisplay
+from pipeline.engine.failures import StageFailed
 from pipeline.engine.runner import Runner
+from pipeline.engine.settings import Settings
 from pipeline.engine.workspace import RUN_FILE, Workspace, default_workspace
 from pipeline.schedule import forecast
 from stages.contract import StageError

@@ -8,32 +8,14 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
 from pathlib import Path
-from typing import Any, Protocol, TextIO
+from typing import Any, TextIO
 
+from pipeline.engine.display import Display
 from stages.contract import StageError
 from stages.io.amounts import duration
 
 JSON_SECONDS = 0.2  # JSON output: one progress event at most this often
 HEARTBEAT_SECONDS = 10.0  # plain output: one line at most this often, so that a log stays readable
-
-
-class Display(Protocol):
-    """How the runner speaks. ``update`` and ``note`` may be called from any thread; an update before the first stage
-    has no line of its own."""
-
-    def headline(self, text: str) -> None: ...
-
-    def begin(self, stage: str) -> None: ...
-
-    def update(self, message: str, done: float | None = None) -> None: ...
-
-    def note(self, message: str) -> None: ...
-
-    def end(self, stage: str, line: str, seconds: float, cached: bool) -> None: ...
-
-    def failed(self, stage: str, error: StageError) -> None: ...
-
-    def finished(self, message: str, outputs: dict[str, Path]) -> None: ...
 
 
 def end_line(stage: str, line: str, seconds: float, cached: bool) -> str:
@@ -83,31 +65,6 @@ def open_closed_streams() -> None:
             number = os.open(os.devnull, os.O_RDWR)  # the lowest that is free: that of the stream
             os.set_inheritable(number, True)
             setattr(sys, name, os.fdopen(number, "r" if name == "stdin" else "w"))
-
-
-class SilentDisplay:
-    """Says nothing; for reading a workspace and for calls from Python."""
-
-    def headline(self, text: str) -> None:
-        pass
-
-    def begin(self, stage: str) -> None:
-        pass
-
-    def update(self, message: str, done: float | None = None) -> None:
-        pass
-
-    def note(self, message: str) -> None:
-        pass
-
-    def end(self, stage: str, line: str, seconds: float, cached: bool) -> None:
-        pass
-
-    def failed(self, stage: str, error: StageError) -> None:
-        pass
-
-    def finished(self, message: str, outputs: dict[str, Path]) -> None:
-        pass
 
 
 class PlainDisplay:

@@ -1,4 +1,4 @@
-"""All options of a run: one pydantic model per stage, filled from defaults, a TOML file and flags, in that order."""
+"""The settings of a run, filled from a TOML file and the command line; what makes no sense is refused."""
 
 import difflib
 import os
@@ -7,20 +7,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ValidationError
 
+from pipeline.engine.settings import Settings
 from pipeline.engine.workspace import RUN_FILE, Workspace, default_workspace, is_result, lasting, photo_set
 from stages.contract import bounded
 from stages.effects import Config as EffectsConfig
-from stages.evaluate import Config as EvaluateConfig
-from stages.ingest import Config as IngestConfig
-from stages.mesh import Config as MeshConfig
-from stages.normalise import Config as NormaliseConfig
-from stages.render import Config as RenderConfig
-from stages.report import Config as ReportConfig
-from stages.sfm import Config as SfmConfig
-from stages.tradeoff import Config as TradeoffConfig
-from stages.train import Config as TrainConfig
 
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
@@ -31,23 +23,6 @@ WORDS_ALONE = {("ingest", "photos"): "PHOTOS", ("ingest", "cameras"): "--cameras
 
 class UsageError(Exception):
     """A command line or config file that makes no sense; shown in one line, exit code 2."""
-
-
-class Settings(BaseModel):
-    """The options of every stage, as the user gave them: None still means "choose for me"."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    ingest: IngestConfig = IngestConfig()
-    sfm: SfmConfig = SfmConfig()
-    normalise: NormaliseConfig = NormaliseConfig()
-    effects: EffectsConfig = EffectsConfig()
-    train: TrainConfig = TrainConfig()
-    evaluate: EvaluateConfig = EvaluateConfig()
-    render: RenderConfig = RenderConfig()
-    mesh: MeshConfig = MeshConfig()
-    tradeoff: TradeoffConfig = TradeoffConfig()
-    report: ReportConfig = ReportConfig()
 
 
 def read_toml(path: Path) -> dict[str, Any]:

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nerf.geometry.scene import Camera
-from pipeline.cli.settings import Settings
 from pipeline.demo.truth import Truth, compare_with_truth
+from pipeline.engine.settings import Settings
 from stages.contract import Progress, StageError
 from stages.train import Config as TrainConfig
 

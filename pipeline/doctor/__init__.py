@@ -5,9 +5,9 @@
 import platform
 from pathlib import Path
 
-from pipeline.doctor import machine
 from pipeline.doctor.bench import bench_lines
 from pipeline.doctor.selftest import numerical_matrix, self_test
+from pipeline.engine import machine
 from stages.hardware.backend import why_not_warp
 from stages.hardware.device import processors
 

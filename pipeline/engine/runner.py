@@ -8,14 +8,13 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from pipeline.cli.display import Display
-from pipeline.cli.failures import StageFailed, worded
-from pipeline.cli.settings import Settings
-from pipeline.doctor import machine
-from pipeline.engine import manifests
+from pipeline.engine import machine, manifests
+from pipeline.engine.display import Display
+from pipeline.engine.failures import StageFailed, worded
 from pipeline.engine.job import DamagedInputs, Job, NotReady
 from pipeline.engine.keys import ContentIndex, config_for_key, digest, stage_key
 from pipeline.engine.manifests import BadManifest, Manifest
+from pipeline.engine.settings import Settings
 from pipeline.engine.stage_list import ON_REQUEST, STAGES, command_that_makes, needed_for
 from pipeline.engine.workspace import Workspace
 from pipeline.schedule.budget import ALIVE, Budget, has_its_own_time, reading_of, takes_what_it_is_given

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pipeline.cli.settings import Settings
+from pipeline.engine.settings import Settings
 from pipeline.engine.stage_list import ON_REQUEST
 from stages.contract import StageConfig
 from stages.hardware.device import processors

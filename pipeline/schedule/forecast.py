@@ -4,9 +4,9 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
-from pipeline.cli.settings import Settings
 from pipeline.engine import manifests
 from pipeline.engine.manifests import BadManifest
+from pipeline.engine.settings import Settings
 from pipeline.engine.stage_list import ON_REQUEST
 from pipeline.schedule.budget import (
     READING,

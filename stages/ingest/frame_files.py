@@ -3,14 +3,14 @@
 import os
 import re
 import unicodedata
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from itertools import product
-from pathlib import Path, PurePosixPath
+from itertools import product, takewhile
+from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
 from stages.contract import StageError
-from stages.ingest.listing import IMAGES
+from stages.ingest.listing import IMAGES, walk_photos
 from stages.io.transforms_files import MOST_LETTERS, photo_names
 
 _EXTENSIONS_TRIED = ("", ".png", ".jpg", ".jpeg")
@@ -21,10 +21,15 @@ _Spelling = tuple[str, str | None]
 
 @dataclass(frozen=True)
 class FrameFiles:
-    """Finds files in the first of ``folders`` that has them. What lies in a folder is listed once at most."""
+    """Finds files in the first of ``folders`` that has them. What lies in a folder is listed once at most.
+
+    ``of_other_folders``: the names are of another machine or folder, and only their ends tell which files are meant.
+    """
 
     folders: tuple[Path, ...]
+    of_other_folders: bool = False
     _listed: dict[Path, dict[_Spelling, list[str]]] = field(default_factory=dict, init=False)
+    _by_last: dict[str, list[Path]] = field(default_factory=dict, init=False)
 
     def photo(self, frame: dict[str, Any]) -> Path:
         """The photo of a frame: in a file of ours by its own name first, then by ``file_path``.
@@ -52,17 +57,39 @@ class FrameFiles:
 
     def _file(self, name: str, folders: tuple[Path, ...], what: str) -> Path:
         """The file that ``name`` stands for. A missing extension is completed; where there is no such file a name is
-        tried as Windows means it, with backslashes between folders, and then in other spellings."""
-        spellings = dict.fromkeys((name, name.replace("\\", "/")))
-        for spelling, folder, extension in product(spellings, folders, _EXTENSIONS_TRIED):
-            file = _inside(folder, self.folders[0], spelling + extension, what)
-            if file.is_file():
-                return file
-        for spelling, folder in product(spellings, folders):
-            alike = self._alike(folder, spelling)
-            if alike is not None and (file := _inside(folder, self.folders[0], alike, what)).is_file():
-                return file
-        return _inside(folders[0], self.folders[0], name, what)
+        tried as Windows means it, with backslashes between folders, then in other spellings. One that leads out of the
+        folders is of another machine: its end tells which file is meant."""
+        relative = _relative(name, folders)
+        spellings = () if relative is None else dict.fromkeys((relative, relative.replace("\\", "/")))
+        try:
+            for spelling, folder, extension in product(spellings, folders, _EXTENSIONS_TRIED):
+                file = _inside(folder, self.folders[0], spelling + extension, what)
+                if file.is_file():
+                    return file
+            for spelling, folder in product(spellings, folders):
+                alike = self._alike(folder, spelling)
+                if alike is not None and (file := _inside(folder, self.folders[0], alike, what)).is_file():
+                    return file
+            if relative is not None and not self.of_other_folders:
+                return _inside(folders[0], self.folders[0], relative, what)
+        except StageError:
+            if (found := self._by_end(name)) is None:
+                raise
+            return found
+        return self._by_end(name) or _inside(folders[0], self.folders[0], relative or name, what)
+
+    def _by_end(self, name: str) -> Path | None:
+        """The file in the first folder whose path has the longest end in common with ``name``, whatever its letters'
+        case; None where there is no such file, or more than one."""
+        if not self._by_last:
+            for file in walk_photos(self.folders[0]):
+                for spelling in (file.name, file.stem) if file.suffix.lower() in IMAGES else (file.name,):
+                    self._by_last.setdefault(_folded(spelling), []).append(file)
+        *above, last = [_folded(part) for part in PurePosixPath(name.replace("\\", "/")).parts]
+        found = self._by_last.get(last, [])
+        alike = [_in_common(above, [_folded(part) for part in file.parent.parts]) for file in found]
+        best = [file for file, count in zip(found, alike, strict=True) if count == max(alike)]
+        return best[0] if len(best) == 1 and best[0].resolve().is_relative_to(self.folders[0].resolve()) else None
 
     def _alike(self, folder: Path, name: str) -> str | None:
         """What is in ``folder`` by another spelling of ``name``, relative to it: with the letters of its endings small
@@ -85,6 +112,24 @@ class FrameFiles:
         stem, ending = os.path.splitext(composed)
         entries = self._listed[folder]
         return entries.get((stem, ending.lower()), []) + entries.get((composed, None), [])
+
+
+def _relative(name: str, folders: tuple[Path, ...]) -> str | None:
+    """``name`` relative to the folder that it lies in if it is absolute; None where it lies in none of them."""
+    if not (PurePosixPath(name).is_absolute() or PureWindowsPath(name).is_absolute()):
+        return name
+    inside = (folder for folder in folders if PurePosixPath(name).is_relative_to(folder))
+    return next((str(PurePosixPath(name).relative_to(folder)) for folder in inside), None)
+
+
+def _folded(name: str) -> str:
+    return unicodedata.normalize("NFC", name).casefold()
+
+
+def _in_common(first: Sequence[str], second: Sequence[str]) -> int:
+    """How many parts at their ends are the same."""
+    pairs = zip(reversed(first), reversed(second), strict=False)
+    return len(list(takewhile(lambda pair: pair[0] == pair[1], pairs)))
 
 
 def _spellings_of(entry: str) -> Iterator[_Spelling]:

@@ -5,13 +5,13 @@ Cheap: lists folders and reads at most the JSON of a transforms file, never an i
 
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from pathlib import Path
-from typing import Literal
+from pathlib import Path, PurePosixPath
+from typing import Any, Literal
 
-from stages.contract import StageError
+from stages.contract import StageError, listed
 from stages.ingest.auxiliary_files import twins
 from stages.ingest.frame_files import FrameFiles
 from stages.ingest.listing import FOLDER_HINT, IMAGES, files_below, is_video, list_photos, photo_root, walk_photos
@@ -20,6 +20,7 @@ from stages.io.transforms_files import HELD_OUT, TRAIN, photo_names, read_splits
 
 SourceKind = Literal["photos", "video", "transforms", "blender", "colmap"]
 
+FEW_NAMES = 2
 _HAS_BESIDE = re.compile(r"images(_\d+)?|input|photos")  # folders of photos beside which their masks may lie
 
 
@@ -88,9 +89,10 @@ def _source(photos: Path, cameras: Path | None) -> Source:
     files = list_photos(root)
     if is_video(files[0]):
         return Source("video", root, None, files)
-    if cameras is not None and not _model_files(cameras := _cameras_in(cameras)):
+    names = [_name(root, file) for file in files]
+    if cameras is not None and not _model_files(cameras := _cameras_in(cameras, names)):
         return _from_transforms("transforms" if cameras.is_file() else "blender", root, cameras)
-    set_aside = twins([_name(root, file) for file in files])
+    set_aside = twins(names)
     files = tuple(file for file in files if _name(root, file) not in set_aside)
     if cameras is not None:
         return Source("colmap", root, cameras, files, set_aside=set_aside)
@@ -105,7 +107,7 @@ def unused_cameras(source: Source) -> Path | None:
     places = (source.root.parent, source.root) if source.root.name == "images" else (source.root,)
     for place in places:
         with suppress(StageError, OSError):
-            return _colmap_model(place / "sparse")
+            return _colmap_model(place / "sparse", [source.name(file) for file in source.files])
     for file in (place / "transforms.json" for place in places):
         with suppress(StageError, OSError):
             if set(_from_transforms("transforms", source.root, file).files) & set(source.files):
@@ -196,9 +198,13 @@ def _check_given(photos: Path, cameras: Path | None) -> None:
 def _from_transforms(kind: SourceKind, root: Path, cameras: Path) -> Source:
     place = cameras.parent if cameras.is_file() else cameras
     find = FrameFiles((root,) if place == root else (root, root.parent, place))
-    splits, _ = read_splits(cameras, lambda frame: find.photo(frame).is_file())
-    frames = [frame for _, content in splits for frame in content["frames"]]
+    frames = _frames(cameras, find)
+    if not any(find.photo(frame).is_file() for frame in frames):
+        find = replace(find, of_other_folders=True)
+        frames = _frames(cameras, find)
     files = {frame["file_path"]: find.photo(frame) for frame in frames}
+    if not any(map(Path.is_file, files.values())):
+        raise _none_of_its_photos(cameras, root, list(files))
     in_order = _sorted_inside(root, set(files.values()))
     photos = {path: _name(root, file) for path, file in files.items()}
     # In a file of ours they are of ingest's copies: those that lie with the photos count.
@@ -206,6 +212,22 @@ def _from_transforms(kind: SourceKind, root: Path, cameras: Path) -> Source:
     named = {photos[frame["file_path"]]: mask for frame in foreign if (mask := frame.get("mask_path"))}
     masks = tuple((f"{photo}.png", find.mask(mask)) for photo, mask in named.items())
     return Source(kind, root, cameras, in_order, photos, masks)
+
+
+def _frames(cameras: Path, find: FrameFiles) -> list[dict[str, Any]]:
+    splits, _ = read_splits(cameras, lambda frame: find.photo(frame).is_file())
+    return [frame for _, content in splits for frame in content["frames"]]
+
+
+def _none_of_its_photos(cameras: Path, root: Path, names: list[str]) -> StageError:
+    """The error for a transforms file of which nothing is among the photos at hand."""
+    here = sorted(file.relative_to(root).as_posix() for file in walk_photos(root) if file.suffix.lower() in IMAGES)
+    there = f"{root} has {listed(here, FEW_NAMES)}" if here else f"there are no photos in {root}"
+    return StageError(
+        f"none of the {len(names)} photos of {cameras.name} is there",
+        f"it names {listed(names, FEW_NAMES)}, and {there}",
+        f"Give the folder with its photos: pipeline run PHOTOS --cameras {cameras}",
+    )
 
 
 def camera_files(folder: Path) -> tuple[Path, ...]:
@@ -235,12 +257,12 @@ def _sorted_inside(root: Path, files: set[Path]) -> tuple[Path, ...]:
     return tuple(sorted(files, key=lambda file: file.relative_to(root).as_posix()))
 
 
-def _cameras_in(folder: Path) -> Path:
+def _cameras_in(folder: Path, photos: Sequence[str]) -> Path:
     """The one COLMAP model in ``folder``; where there is none the transforms.json, or the folder itself if it has a
     transforms_train.json."""
     found = [file for name in ("transforms.json", TRAIN) if (file := folder / name).is_file()]
     if not found or _colmap_models(folder):
-        return _colmap_model(folder)
+        return _colmap_model(folder, photos)
     if len(found) > 1:
         raise StageError(
             f"two sources of cameras in {folder}", " and ".join(file.name for file in found),
@@ -256,29 +278,41 @@ def _colmap_models(folder: Path) -> list[Path]:
     return sorted({place for place in places if _model_files(place)})
 
 
-def _colmap_model(folder: Path) -> Path:
-    """The one COLMAP model in ``folder``. Raises StageError where there is none, or several."""
+def _colmap_model(folder: Path, photos: Sequence[str]) -> Path:
+    """The one COLMAP model in ``folder``. Raises StageError where there is none, or several: then the one with the most
+    of these ``photos`` is recommended, for the largest of COLMAP's models need not be its first."""
     models = _colmap_models(folder)
     if not models:
         raise StageError(
             f"no COLMAP model in {folder}",
-            "there is no cameras, images and points3D with .bin or .txt, nor a transforms.json",
+            "there is no cameras and images with .bin or .txt, nor a transforms.json",
             "Give the model's own folder, for example sparse/0, or a transforms file.",
         )
     if len(models) > 1:
-        names = ", ".join(str(model.relative_to(folder)) for model in models)
+        counts = {model: _cameras_of(model, photos) for model in models}
+        each = ", ".join(f"{model.relative_to(folder)} with {counts[model]}" for model in models)
+        best = max(models, key=lambda model: counts[model])
         raise StageError(
-            f"{len(models)} COLMAP models in {folder}", f"{names}: which one is meant is not clear",
-            f"Give one of them: --cameras {models[0]}",
-        )  # fmt: skip
+            f"{len(models)} COLMAP models in {folder}",
+            f"cameras of the {len(photos)} photos are in {each}: which one is meant is not clear",
+            f"Give the one with most: --cameras {best}",
+        )
     return models[0]
+
+
+def _cameras_of(model: Path, photos: Sequence[str]) -> int:
+    """How many of the photos have a camera in a model, by the last parts of their names."""
+    from stages.sfm.colmap.model_files import image_names
+
+    own = {PurePosixPath(name).stem for name in photos}
+    return len(own & {PurePosixPath(name.replace("\\", "/")).stem for name in image_names(model)})
 
 
 def _model_files(folder: Path) -> tuple[Path, ...]:
     for extension in (".bin", ".txt"):
-        parts = tuple(folder / f"{part}{extension}" for part in ("cameras", "images", "points3D"))
-        if all(part.is_file() for part in parts):
-            return parts
+        cameras, images, points = (folder / f"{part}{extension}" for part in ("cameras", "images", "points3D"))
+        if cameras.is_file() and images.is_file():
+            return (cameras, images, points) if points.is_file() else (cameras, images)
     return ()
 
 

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 TRAIN, HELD_OUT = "transforms_train.json", ("transforms_test.json", "transforms_val.json")  # of a Blender-style folder
 LONGEST_PATH, LONGEST_NAME = 2000, 250  # bytes, with room for an extension
 MOST_LETTERS = 60  # of a name, in an error
+ROUNDED = 1e-3  # what rounding may make of a 0
 _HINT = "Give a transforms.json as nerfstudio, instant-ngp or the NeRF-synthetic scenes write it."
 
 
@@ -104,13 +105,19 @@ def _test_frames(file: str, content: dict[str, Any]) -> tuple[str, dict[str, Any
 
 
 def pose_matrix(matrix: Any) -> "Float[np.ndarray, '3 4']":
-    """The first three rows of a frame's ``transform_matrix``. Raises ValueError for what is no matrix of that shape."""
+    """The first three rows of a frame's ``transform_matrix``, which may be a flat list of its rows. Raises ValueError
+    for what is no matrix of that shape."""
     import numpy as np
 
     try:
         pose = np.array(matrix, np.float64)
     except (TypeError, ValueError, OverflowError) as error:
         raise ValueError("its transform_matrix is not a matrix of numbers") from error
+    if pose.shape in ((12,), (16,)):
+        pose = pose.reshape(-1, 4)
+    if pose.shape == (4, 4) and (np.abs(pose[3, :3]) > ROUNDED).any():
+        row = ", ".join(f"{value:.4g}" for value in pose[3])
+        raise ValueError(f"the last row of its transform_matrix is {row} and not 0, 0, 0, 1: it may be transposed")
     if pose.shape not in ((3, 4), (4, 4)) or not np.isfinite(pose[:3]).all():
         raise ValueError("its transform_matrix is not 4 × 4 (or 3 × 4) finite numbers")
     return pose[:3]

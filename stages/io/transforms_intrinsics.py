@@ -21,6 +21,49 @@ FISHEYES = ("SIMPLE_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEY
 OTHER_LENSES = ("ftheta_p0", "latlong")  # keys that declare them to instant-ngp
 NERFSTUDIOS = ("k1", "k2", "k3", "k4", "p1", "p2")  # distortion_params, in nerfstudio's order
 NO_PANORAMAS = "panoramas are not supported"
+# Keys that tell one thing together: a frame that has one of a group has the group, and the file's count no more.
+FOCAL = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov")
+CENTRE = ("cx", "cy")
+DISTORTION = ("distortion_params", "k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "sx1", "sy1")
+LENS = ("camera_model", "is_fisheye", *OTHER_LENSES)
+SAME_WITHIN = 0.01  # two focal lengths, relatively: files are rounded
+
+
+def intrinsics_of(frame: Mapping[str, Any], file: Mapping[str, Any]) -> dict[str, Any]:
+    """The values that hold for one frame of a transforms file: its own, and the file's of each group of intrinsics that
+    the frame does not have. A value that is null counts as absent.
+
+    A frame's ``camera_angle_x`` so overrules the ``fl_x`` of its file. Distortion belongs to a lens: where the frame
+    declares another one than the file, the file's terms are not the frame's.
+    """
+    own, shared = ({key: value for key, value in of.items() if value is not None} for of in (frame, file))
+    other_lens = any(key in own and own[key] != shared.get(key, False) for key in LENS)
+    for group in (FOCAL, CENTRE, DISTORTION, LENS):
+        if not own.keys().isdisjoint(group) or (group is DISTORTION and other_lens):
+            shared = {key: value for key, value in shared.items() if key not in group}
+    return shared | own
+
+
+def contradictions(values: Mapping[str, Any], width: int, height: int) -> list[str]:
+    """What a frame or a file says twice and not alike, and which is taken. Values that are no numbers are not compared:
+    :func:`read_intrinsics` refuses those that it reads."""
+    found = []
+    for axis, size in (("x", values.get("w") or width), ("y", values.get("h") or height)):
+        try:
+            focal = _focal_lengths(values, axis, float(size))
+        except (TypeError, ValueError):
+            continue
+        (taken, pixels), *others = focal.items() or [("", 0.0)]
+        for name, other in others:
+            if abs(other - pixels) > SAME_WITHIN * abs(pixels):
+                found.append(f"{taken} is {pixels:.5g} pixels and {name} says {other:.5g}: {taken} is taken")
+    terms = values.get("distortion_params")
+    if isinstance(terms, list) and len(terms) == len(NERFSTUDIOS):
+        other = [name for name, term in zip(NERFSTUDIOS, terms, strict=True) if values.get(name, term) != term]
+        found += [f"{', '.join(other)} and distortion_params differ: distortion_params is taken"] * bool(other)
+    if values.get("is_fisheye") and values.get("camera_model", FISHEYE) not in (*FISHEYES, "", None):
+        found.append(f"camera_model is {values['camera_model']} and is_fisheye is true: a fisheye is taken")
+    return found
 
 
 def read_intrinsics(values: Mapping[str, Any], width: int, height: int, focal: float = 0.0) -> Camera:
@@ -119,12 +162,18 @@ def _distortion(k: list[float], p: list[float], s: list[float], declared: str) -
 def _focal_length(values: Mapping[str, Any], axis: str, size: float) -> float | None:
     """Focal length in pixels along "x" or "y", where the picture has ``size`` pixels; None without one. Of a full
     viewing angle that is in radians or, as instant-ngp's ``x_fov``, in degrees."""
-    if (name := f"fl_{axis}") in values:
-        return _finite(values[name], name)
+    return next(iter(_focal_lengths(values, axis, size).values()), None)
+
+
+def _focal_lengths(values: Mapping[str, Any], axis: str, size: float) -> dict[str, float]:
+    """By the key that says so, the one that counts first."""
+    found = {}
+    if values.get(name := f"fl_{axis}") is not None:
+        found[name] = _finite(values[name], name)
     for name, unit in ((f"camera_angle_{axis}", 1.0), (f"{axis}_fov", math.radians(1))):
         if values.get(name) is not None and 0 < (angle := _finite(values[name], name) * unit) < math.pi:
-            return 0.5 * size / math.tan(0.5 * angle)
-    return None
+            found[name] = 0.5 * size / math.tan(0.5 * angle)
+    return found
 
 
 def _finite(value: Any, name: str) -> float:

@@ -161,7 +161,7 @@ def path_from_file(scene: "Scene", file: Path) -> CameraPath:
     import numpy as np
 
     from stages.io.transforms_files import read_transforms
-    from stages.io.transforms_intrinsics import read_intrinsics
+    from stages.io.transforms_intrinsics import intrinsics_of, read_intrinsics
 
     content = read_transforms(file)
     usual = median_camera(scene)
@@ -169,7 +169,7 @@ def path_from_file(scene: "Scene", file: Path) -> CameraPath:
     cameras, poses = [], []
     for index, frame in enumerate(content["frames"]):
         try:
-            cameras.append(read_intrinsics(content | frame, usual.width, usual.height, focal))
+            cameras.append(read_intrinsics(intrinsics_of(frame, content), usual.width, usual.height, focal))
             poses.append(_in_scene(frame["transform_matrix"], scene.scene_from_sfm))
         except (TypeError, ValueError, ArithmeticError) as error:
             hint = "Give numbers as output/transforms.json and output/path.json have them."

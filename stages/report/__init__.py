@@ -17,12 +17,12 @@ from stages.io.amounts import duration, short_count
 from stages.io.files import read_json, read_scene, read_tensors, write_json
 from stages.report.cameras import (
     CameraReport,
-    attempts,
     camera_models,
     camera_report,
     doubtful_files,
     missing,
-    order_tells,
+    order_is_informative,
+    strategies,
     uncertainty,
 )
 
@@ -181,7 +181,7 @@ def page(results: Results, summary: dict[str, Any], config: Config) -> str:
         missing=missing(results.registration, names),
         camera_groups=_camera_groups(results, names),
         lenses=camera_models(results.registration),
-        attempts=attempts(results.registration),
+        strategies=strategies(results.registration),
         uncertainty=uncertainty(results.registration, names),
         video=_video(results.inputs, config.video_limit_mb),
         compared=_compared(results),
@@ -270,7 +270,10 @@ def _cameras(results: Results) -> dict[str, Any] | None:
         return None
     doubtful = {f"images/{file}" for file in doubtful_files(results.registration)} if results.registration else set()
     drawn = [view for view in results.scene.views if view.file not in doubtful] or list(results.scene.views)
-    points, joined = read_tensors(results.inputs["normalise"] / "points.safetensors"), order_tells(results.registration)
+    points, joined = (
+        read_tensors(results.inputs["normalise"] / "points.safetensors"),
+        order_is_informative(results.registration),
+    )
     svgs = camera_svgs(results.scene, drawn, points["xyz"], points["rgb"], joined)
     return {
         "svgs": {name: Markup(svg) for name, svg in svgs.items()},

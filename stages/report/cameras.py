@@ -3,10 +3,10 @@
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, TypeGuard
 
-MAX_DOUBTFUL = 0.05  # share of the photos that were excluded, stand elsewhere in a second opinion, or are weakly linked
+MAX_DOUBTFUL = 0.05  # fraction of the photos that are excluded, differ from global mapping, or are weakly linked
 MIN_AGREEING = 0.5  # share of the verified pairs
 MAX_SHOWN = 8  # photos of a group
-LEAST_SAID = 0.0001  # share of the extent: 0.00% would be no figure
+MIN_SHOWN = 0.0001  # share of the extent: 0.00% would be no figure
 MAX_WEAK = 4  # weakly linked groups shown one by one
 BETTER_PHOTOS = "take photos that lead from one part to the other, or mask what repeats"
 CHECK_GIVEN = "Check the given poses, or leave out --cameras to have them found from the photos."
@@ -22,7 +22,7 @@ class PhotoGroup(NamedTuple):
 
 class CameraReport(NamedTuple):
     """``doubt`` says why the cameras are doubtful, null where they are not, and ``advice`` what that means and what to
-    try. ``figures`` say how far verified pairs and a second opinion agree, null where nothing was checked."""
+    try. ``figures`` say how far verified pairs and global mapping agree, null where nothing was checked."""
 
     doubt: str | None
     advice: str
@@ -38,13 +38,13 @@ class CameraReport(NamedTuple):
 def camera_report(registration: Mapping[str, Any] | None, config: Mapping[str, Any]) -> CameraReport:
     """What registration.json says of the cameras. ``config``: the settings of stage sfm that made it.
 
-    Workspaces of before the check, and given cameras, lack some of it, or all.
+    Imported poses lack some of it, or all.
     """
     if not registration:
         return CameraReport(None, "", None, [])
     reasons = [
         *_doubts_of_check(registration),
-        *_doubts_of_opinion(registration.get("second_opinion")),
+        *_doubts_of_global_mapping(registration.get("global_mapping")),
         *_doubts_of_structure(registration.get("repeated_structure")),
     ]
     doubt = f"The cameras are doubtful: {'; '.join(reasons)}." if reasons else None
@@ -58,7 +58,7 @@ def doubtful_files(registration: Mapping[str, Any]) -> list[str]:
     return found + [file for file in check["doubtful"] if file not in found]
 
 
-def order_tells(registration: Mapping[str, Any] | None) -> bool:
+def order_is_informative(registration: Mapping[str, Any] | None) -> bool:
     """Whether photos that follow each other by name were taken one after the other, as far as anybody knows."""
     graph = (registration or {}).get("match_graph")
     return graph is None or graph["order"]
@@ -77,48 +77,45 @@ def _doubts_of_check(registration: Mapping[str, Any]) -> list[str]:
         return found
     if check["agreeing"] < MIN_AGREEING * check["pairs"]:
         found.append(f"only {check['agreeing']:,} of {check['pairs']:,} verified image pairs agree with them")
-    if len(breaks := _row_breaks(registration)) > MAX_DOUBTFUL * photos:
+    if len(breaks := _sequence_breaks(registration)) > MAX_DOUBTFUL * photos:
         found.append(f"{len(breaks)} times the matches of two photos taken one after the other contradict their poses")
     links = _weak_links(registration)
     weak = {file for link in links for file in link["photos"]}
     # A lone photo at the edge of many does no harm; of a group the place and size beside the rest are not sure.
     if len(weak) > MAX_DOUBTFUL * photos or any(len(link["photos"]) > 1 for link in links):
-        found.append(f"few matches hold {_photos(len(weak))} to the rest")
+        found.append(f"few matches link {_photos(len(weak))} to the rest")
     return found
 
 
 def _weak_links(registration: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """Groups that few matches hold to the rest; none of given cameras, whose poses do not rest on matches."""
+    """Groups that few matches link to the rest; none of imported poses, which do not rest on matches."""
     check = registration.get("check")
     return check["weak_links"] if check and registration["source"] != "import" else []
 
 
-def _row_breaks(registration: Mapping[str, Any]) -> list[tuple[str, str]]:
+def _sequence_breaks(registration: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Photos next to each other by name or time whose matches contradict their poses."""
-    return (registration.get("check") or {}).get("row_breaks", [])  # workspaces of before lack it
+    return (registration.get("check") or {}).get("sequence_breaks", [])
 
 
-def _doubts_of_opinion(opinion: Mapping[str, Any] | None) -> list[str]:
-    if not _disagrees(opinion):
+def _doubts_of_global_mapping(comparison: Mapping[str, Any] | None) -> list[str]:
+    if not _disagrees(comparison):
         return []
-    return [f"global mapping places {len(opinion['elsewhere'])} of {opinion['photos']} photos elsewhere"]
+    return [f"global mapping places {len(comparison['different'])} of {comparison['photos']} photos differently"]
 
 
-def _disagrees(opinion: Mapping[str, Any] | None) -> TypeGuard[Mapping[str, Any]]:
-    if not opinion or opinion["failed"]:
+def _disagrees(comparison: Mapping[str, Any] | None) -> TypeGuard[Mapping[str, Any]]:
+    if not comparison or comparison["failed"]:
         return False
-    return len(opinion["elsewhere"]) > MAX_DOUBTFUL * opinion["photos"]
+    return len(comparison["different"]) > MAX_DOUBTFUL * comparison["photos"]
 
 
 def _doubts_of_structure(repeated: Mapping[str, Any] | None) -> list[str]:
     if not repeated:
         return []
-    if not repeated.get("others"):  # a workspace of before they were named
-        return ["parts of the scene look alike, and a group of photos contradicts the others"]
     others, moved = len(repeated["others"]), len(repeated["photos"])
     fits = "fits" if others == 1 else "fit"
-    were = "was" if moved == 1 else "were"
-    return [f"parts of the scene look alike: {_photos(others)} {fits} only if {moved} others {were} taken elsewhere"]
+    return [f"repeated structure: {_photos(others)} {fits} only if {moved} others have other poses"]
 
 
 def _photos(count: int) -> str:
@@ -138,29 +135,31 @@ def _advice(registration: Mapping[str, Any], config: Mapping[str, Any]) -> str:
 
 
 def _figures(registration: Mapping[str, Any]) -> str | None:
-    check, opinion = registration.get("check"), registration.get("second_opinion")
+    check, comparison = registration.get("check"), registration.get("global_mapping")
     said = []
     if check and check["pairs"]:
         pairs = f"{check['agreeing']:,} of {check['pairs']:,} verified image pairs"
-        said.append(f"the cameras agree with {pairs} (usual distance {check['error_px']:.2f} px)")
-    if opinion and not opinion["failed"] and opinion["centre"] is not None:
-        same = f"{opinion['agree']} of {opinion['photos']} photos the same"
-        extent = f"{max(opinion['centre'], LEAST_SAID):.2%} of the extent"
-        said.append(f"a second, global reconstruction places {same} (within {extent})")
+        said.append(f"the cameras agree with {pairs} (median error {check['error_px']:.2f} px)")
+    if comparison and not comparison["failed"] and comparison["centre"] is not None:
+        same = f"{comparison['agree']} of {comparison['photos']} photos the same pose"
+        extent = f"{max(comparison['centre'], MIN_SHOWN):.2%} of the extent"
+        said.append(f"global mapping gives {same} (within {extent})")
     sentence = "; ".join(said)
     return f"{sentence[0].upper()}{sentence[1:]}." if said else None
 
 
 def _groups(registration: Mapping[str, Any]) -> list[PhotoGroup]:
-    opinion, repeated = registration.get("second_opinion"), registration.get("repeated_structure") or {}
+    comparison, repeated = registration.get("global_mapping"), registration.get("repeated_structure") or {}
     lost = "" if registration["source"] == "import" else "Excluded: "
     groups = [(f"{lost}verified matches contradict their poses", doubtful_files(registration))]
     groups += _weak_groups(_weak_links(registration))
-    breaks = [first for first, _ in _row_breaks(registration)]
-    groups.append(("The next photo by name or time contradicts where these stand", breaks))
-    groups.append(("Placed elsewhere by global mapping", opinion["elsewhere"] if _disagrees(opinion) else []))
-    groups.append(("Excluded because parts of the scene look alike: these fit only …", repeated.get("others", [])))
-    groups.append(("… if these were taken elsewhere", repeated.get("photos", [])))
+    breaks = [first for first, _ in _sequence_breaks(registration)]
+    groups.append(("Their matches with the next photo by name or time contradict their poses", breaks))
+    groups.append(
+        ("Global mapping gives these different poses", comparison["different"] if _disagrees(comparison) else [])
+    )
+    groups.append(("Excluded for repeated structure: these fit only …", repeated.get("others", [])))
+    groups.append(("… if these have other poses", repeated.get("photos", [])))
     return [
         PhotoGroup(f"{title[0].upper()}{title[1:]}", list(files[:MAX_SHOWN]), max(0, len(files) - MAX_SHOWN))
         for title, files in groups
@@ -173,10 +172,11 @@ def _weak_groups(links: Sequence[Mapping[str, Any]]) -> list[tuple[str, list[str
     largest = sorted((link for link in links if len(link["photos"]) > 1), key=lambda link: -len(link["photos"]))
     shown = largest[:MAX_WEAK]
     groups = [
-        (f"Held to the rest by {link['matches']} matches of {_pairs(link['pairs'])}", link["photos"]) for link in shown
+        (f"Linked to the rest by {link['matches']} matches of {_pairs(link['pairs'])}", link["photos"])
+        for link in shown
     ]
     others = [file for link in links if link not in shown for file in link["photos"]]
-    return [*groups, ("Each held to the rest by few matches", others)]
+    return [*groups, ("Each linked to the rest by few matches", others)]
 
 
 def _pairs(count: int) -> str:
@@ -211,16 +211,16 @@ def camera_models(registration: Mapping[str, Any] | None) -> dict[str, Any]:
     }
 
 
-def attempts(registration: Mapping[str, Any] | None) -> list[dict[str, Any]]:
-    """What stage sfm tried and what became of it in words (``outcome``); empty where the first attempt did it all."""
-    rows = (registration or {}).get("attempts", [])
+def strategies(registration: Mapping[str, Any] | None) -> list[dict[str, Any]]:
+    """What stage sfm tried and its ``outcome`` in words; empty where the default strategy was enough."""
+    rows = (registration or {}).get("strategies", [])
     kept = next((row for row in rows if row["kept"]), None)
     return [row | {"outcome": _outcome(row, kept)} for row in rows] if len(rows) > 1 else []
 
 
 def _outcome(row: dict[str, Any], kept: dict[str, Any] | None) -> str:
-    if row["kept"] or row["passed"] is not None:
-        return "kept" if row["kept"] else f"not made: {row['passed']}"
+    if row["kept"] or row["skipped"] is not None:
+        return "kept" if row["kept"] else f"skipped: {row['skipped']}"
     if not row["registered"] or kept is None:
         return "no model"
     for fact, words in (("registered", "fewer photos"), ("points", "fewer points")):

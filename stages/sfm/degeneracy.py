@@ -1,10 +1,8 @@
-"""What is wrong with a set of photos when no depth, or two contradicting scenes, come of it.
+"""Degenerate sets of photos: pure rotation, a planar scene, forward motion, repeated structure.
 
-A turn of the camera on the spot, one flat surface, a camera that moves straight ahead, or parts that look alike.
-
-Two photos taken from one place, or of one plane, are related by a homography H (Hartley and Zisserman 2004, ch. 13).
-From one place it is H = K R K⁻¹, so with the right focal length K⁻¹ H K is a rotation; for a plane at distance d with
-normal n and a camera that moved by t it is R + t nᵀ/d, and no rotation.
+Two photos taken from one position, or of one plane, are related by a homography H (Hartley and Zisserman 2004, ch. 13).
+From one position it is H = K R K⁻¹, so with the right focal length K⁻¹ H K is a rotation; for a plane at distance d
+with normal n and a camera that moved by t it is R + t nᵀ/d, and no rotation.
 """
 
 from itertools import combinations
@@ -14,12 +12,12 @@ from jaxtyping import Bool, Float, Int
 
 # A step of 2 % of the distance to the plane makes K⁻¹ H K differ so much from a rotation; half a pixel of noise in
 # photos of 300 pixels, a tenth of it.
-LIKE_A_ROTATION = 0.02
+MAX_ROTATION_DEPARTURE = 0.02
 # Between two models of the same photos poses differ by less than a degree and a hundredth of the scene where both are
-# right (docs/experiments/match_graph.md); what repeats puts a photo another facade, or window, farther.
-SAME_ANGLE_DEG, SAME_PLACE = 5.0, 0.05
-PROPOSALS = 500
-RADIAL_DEG, MOSTLY = 15.0, 0.8
+# right (docs/experiments/match_graph.md); repeated structure moves a photo by a facade, or a window.
+MAX_ANGLE_DEG, MAX_OFFSET = 5.0, 0.05
+MAX_PROPOSALS = 500
+MAX_RADIAL_DEG, MIN_RADIAL_FRACTION = 15.0, 0.8
 FOCAL_LENGTHS = np.geomspace(0.3, 6, 61)  # over the longer side: from 118 to 10 degrees
 
 
@@ -49,19 +47,20 @@ def _calibration(size: Int[np.ndarray, "pairs 2"], focal: float) -> Float[np.nda
     return matrix
 
 
-def count_turns(homographies: Float[np.ndarray, "pairs 3 3"], sizes: Int[np.ndarray, "pairs 2 2"]) -> int:
-    """How many of the pairs are turns of the camera on the spot, with the one focal length that makes most of them so.
+def count_pure_rotations(homographies: Float[np.ndarray, "pairs 3 3"], sizes: Int[np.ndarray, "pairs 2 2"]) -> int:
+    """How many of the pairs are pure rotations, with the one focal length that makes most of them so.
 
-    One for all: with a focal length of its own, many a plane seen twice would pass for a turn.
+    One for all: with a focal length of its own, many a plane seen twice would pass for a rotation.
     """
     if not len(homographies):
         return 0
     return max(
-        int((departure_from_rotation(homographies, sizes, focal) < LIKE_A_ROTATION).sum()) for focal in FOCAL_LENGTHS
+        int((departure_from_rotation(homographies, sizes, focal) < MAX_ROTATION_DEPARTURE).sum())
+        for focal in FOCAL_LENGTHS
     )
 
 
-# --- moving straight ahead
+# --- forward motion
 
 
 def epipoles_inside(
@@ -81,11 +80,11 @@ def epipoles_inside(
     return inside
 
 
-def expands(
+def flow_is_radial(
     first: Float[np.ndarray, "matches 2"], second: Float[np.ndarray, "matches 2"], size: Int[np.ndarray, "2"]
 ) -> bool:
-    """Whether most matches move straight away from one point of the picture, or towards it: as it is when the camera
-    moves ahead and hardly turns. Told so where a homography explains the pair, and its epipole is not defined.
+    """Whether most matches move straight away from one point of the picture, or towards it, as in forward motion with
+    little rotation. For pairs that a homography explains, where the epipole is not defined.
 
     The point e is the one whose rays the offsets o at x cross least: min Σ (o × (x − e))² / |o|².
     """
@@ -100,29 +99,29 @@ def expands(
         return False
     rays = first[moving] - focus
     outwards = (rays * offsets[moving]).sum(axis=1)
-    radial = np.abs(outwards) > np.cos(np.radians(RADIAL_DEG)) * np.linalg.norm(rays, axis=1) * length[moving]
-    return max((radial & (outwards > 0)).mean(), (radial & (outwards < 0)).mean()) > MOSTLY
+    radial = np.abs(outwards) > np.cos(np.radians(MAX_RADIAL_DEG)) * np.linalg.norm(rays, axis=1) * length[moving]
+    return max((radial & (outwards > 0)).mean(), (radial & (outwards < 0)).mean()) > MIN_RADIAL_FRACTION
 
 
-# --- parts that look alike
+# --- repeated structure
 
 
-def elsewhere(
+def different_poses(
     first: Float[np.ndarray, "photos 3 4"], second: Float[np.ndarray, "photos 3 4"], extent: float
 ) -> Bool[np.ndarray, "photos"]:
-    """Which photos of two models, by their poses (from the camera), stand elsewhere in the second than in the first.
+    """Which photos have other poses (from the camera) in the second model than in the first.
 
-    Compared is after the similarity between the models on which most photos agree; every two photos propose one, or of
-    many photos as many pairs as PROPOSALS, from all over the list.
-    ``extent``: how far apart the first model's cameras stand (root mean square). None of fewer than three photos.
+    They are compared after the similarity between the models on which most photos agree; every two photos propose one,
+    or of many photos as many pairs as MAX_PROPOSALS, from all over the list. ``extent``: how far apart the first
+    model's cameras are (root mean square). None of fewer than three photos.
     """
     best = np.zeros(len(first), bool)
-    nowhere_else = best.copy()
+    none = best.copy()
     if len(first) < 3:
-        return nowhere_else
+        return none
     between = first[:, :, :3] @ second[:, :, :3].transpose(0, 2, 1)
     pairs = list(combinations(range(len(first)), 2))
-    for pair in pairs[:: -(-len(pairs) // PROPOSALS)]:
+    for pair in pairs[:: -(-len(pairs) // MAX_PROPOSALS)]:
         chosen = list(pair)
         u, _, vt = np.linalg.svd(between[chosen].sum(axis=0))
         rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
@@ -131,8 +130,8 @@ def elsewhere(
             continue
         moved = step / other_step * second[:, :, 3] @ rotation.T
         off = first[:, :, 3] - moved
-        far = np.linalg.norm(off - off[chosen].mean(axis=0), axis=1) > SAME_PLACE * extent
+        far = np.linalg.norm(off - off[chosen].mean(axis=0), axis=1) > MAX_OFFSET * extent
         cosine = (np.einsum("nij,ij->n", between, rotation) - 1) / 2
-        agreeing = ~far & (cosine > np.cos(np.radians(SAME_ANGLE_DEG)))
+        agreeing = ~far & (cosine > np.cos(np.radians(MAX_ANGLE_DEG)))
         best = max(best, agreeing, key=np.sum)
-    return ~best if best.any() else nowhere_else  # they all stand in one place: nothing to compare
+    return ~best if best.any() else none  # they all are in one position: nothing to compare

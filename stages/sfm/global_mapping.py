@@ -1,7 +1,7 @@
-"""A second opinion: global mapping (GLOMAP, Pan et al. 2024) of the same matches, in a process of its own.
+"""Global mapping (GLOMAP, Pan et al. 2024) of the same matches, to compare with, in a process of its own.
 
-It places all photos at once, incremental mapping one after the other, so they go wrong in different ways. It works on
-fewer tracks, on a core that incremental mapping leaves free. ``python -P -m stages.sfm.global_mapping`` reads a job
+It estimates all poses together, incremental mapping one after the other, so they go wrong in different ways. It works
+on fewer tracks, on a core that incremental mapping leaves free. ``python -P -m stages.sfm.global_mapping`` reads a job
 from stdin as one line of JSON, and writes the best model into its folder.
 """
 
@@ -17,22 +17,22 @@ from stages.io.files import make_durable
 from stages.sfm.colmap.mapping import map_globally
 from stages.sfm.colmap.models import write_native
 from stages.sfm.colmap.thinning import thin_matches
-from stages.sfm.process import environment
-from stages.sfm.work import end_with_parent
+from stages.sfm.job import end_with_parent
+from stages.sfm.worker_process import environment
 
 TRACKS_PER_PHOTO = 200  # of the best: enough for poses that are compared, not kept
-MIN_PHOTOS = 10  # of fewer there is no telling which of two opinions is right
-CHILD = ["-P", "-m", "stages.sfm.global_mapping"]
+MIN_PHOTOS = 10  # of fewer there is no telling which of two models is right
+COMMAND = ["-P", "-m", "stages.sfm.global_mapping"]
 
 
 class Started(NamedTuple):
-    """Global mapping at work; its model comes into ``folder``."""
+    """Global mapping that is running; its model comes into ``folder``."""
 
     process: "subprocess.Popen[bytes]"
     folder: Path
 
 
-def start(database: Path, thinned: Path, images: Path, folder: Path, seed: int, lens_is_known: bool) -> Started:
+def start(database: Path, thinned: Path, images: Path, folder: Path, seed: int, camera_is_known: bool) -> Started:
     """Begin with the best matches of ``database``, copied to ``thinned``; the caller waits with :func:`failure`.
 
     It ends with this process.
@@ -40,9 +40,9 @@ def start(database: Path, thinned: Path, images: Path, folder: Path, seed: int, 
     shutil.rmtree(folder, ignore_errors=True)
     paths = {"database": database, "thinned": thinned, "images": images, "folder": folder}
     job = {name: str(path) for name, path in paths.items()} | {"seed": seed}
-    process = subprocess.Popen([sys.executable, *CHILD], stdin=subprocess.PIPE, stdout=2, env=environment())
+    process = subprocess.Popen([sys.executable, *COMMAND], stdin=subprocess.PIPE, stdout=2, env=environment())
     assert process.stdin
-    process.stdin.write(json.dumps(job | {"lens_is_known": lens_is_known}).encode() + b"\n")
+    process.stdin.write(json.dumps(job | {"camera_is_known": camera_is_known}).encode() + b"\n")
     process.stdin.flush()  # and left open: its end tells the process that this one is gone
     return Started(process, folder)
 
@@ -63,7 +63,7 @@ def main() -> None:
     scratch = folder.with_name(f"{folder.name}.scratch")
     thinned = Path(job["thinned"])
     thin_matches(Path(job["database"]), thinned, TRACKS_PER_PHOTO)
-    models = map_globally(thinned, Path(job["images"]), scratch, job["seed"], job["lens_is_known"])
+    models = map_globally(thinned, Path(job["images"]), scratch, job["seed"], job["camera_is_known"])
     shutil.rmtree(scratch, ignore_errors=True)
     if models:
         unfinished = folder.with_name(f"{folder.name}.unfinished")

@@ -1,4 +1,4 @@
-"""From matches to a model in which every pose stands, and a second opinion. Runs in the child process of stage sfm."""
+"""From matches to a model whose poses pass the check, compared with global mapping. Runs in the worker process."""
 
 import shutil
 from itertools import count
@@ -12,89 +12,90 @@ from stages.sfm.colmap.models import load_native
 from stages.sfm.colmap.repair import (
     Checked,
     check_model,
-    copy_believed,
+    copy_consistent_matches,
     deregister,
-    drop_cut_off,
+    drop_outside_main_segment,
+    fragments_sequence,
     reasons,
     register_again,
-    tears,
 )
 from stages.sfm.colmap.thinning import thin_matches
-from stages.sfm.matching import row_of, steps_of_row
-from stages.sfm.retry_strategies import ATTEMPTS, Attempt, Effort
-from stages.sfm.work import Work
+from stages.sfm.job import JobState
+from stages.sfm.matching import capture_sequence, consecutive_pairs
+from stages.sfm.retry_strategies import STRATEGIES, MappingOptions, Strategy
 
 
-class Standing(NamedTuple):
-    """The model with only photos whose poses stand, by name why others are excluded, and whether they are since the row
-    in which photos were taken falls apart."""
+class CheckedModel(NamedTuple):
+    """The model with only the images that passed the check, by name why others are excluded, and whether the sequence
+    of photos was broken in it."""
 
     model: Any
     excluded: dict[str, str]
-    folded: bool
+    sequence_broken: bool
 
 
-def mapped(attempt: Attempt, database: Path, work: Work) -> tuple[list[Any], Standing, dict[str, Any] | None]:
-    """All sub-models that come of these matches, best first; what stands of the best one, which is its place there; and
-    how a second opinion compares."""
-    work.begin("mapping", done=0)
-    seed, lens_is_known = work.job.seed, work.job.camera_params is not None
-    models, matches = Path(work.job.folder, "models"), database
-    opinion = _second_opinion(attempt, database, work)
-    if work.thinned:
-        matches = work.beside("thinned")
+def run_mapping(
+    strategy: Strategy, database: Path, state: JobState
+) -> tuple[list[Any], CheckedModel, dict[str, Any] | None]:
+    """All sub-models of these matches, best first; the best one as checked, which also takes its place in the list;
+    and how global mapping compares."""
+    state.begin("mapping", done=0)
+    seed, camera_is_known = state.job.seed, state.job.camera_params is not None
+    models, matches = Path(state.job.folder, "models"), database
+    beside = _start_global_mapping(strategy, database, state)
+    if state.thinned:
+        matches = state.sibling("thinned")
         thin_matches(database, matches)
-    effort = attempt.effort or Effort()
-    options = incremental_options(seed, effort, lens_is_known, work.thinned)
-    if attempt.effort is None:
-        found = map_globally(matches, work.images, models, seed, lens_is_known)
+    options = incremental_options(seed, strategy.mapping or MappingOptions(), camera_is_known, state.thinned)
+    if strategy.mapping is None:
+        found = map_globally(matches, state.images, models, seed, camera_is_known)
     else:
-        placed = count(1)
+        registered = count(1)
         found = map_incrementally(
-            matches, work.images, models, options, lambda: work.say(phase="mapping", done=next(placed))
+            matches, state.images, models, options, lambda: state.send(phase="mapping", done=next(registered))
         )
     shutil.rmtree(models)
-    standing = Standing(None, {}, False)
-    failure = global_mapping.failure(opinion) if opinion else None
-    other = load_native(opinion.folder) if opinion and not failure else None
-    compared = None if opinion is None else {"failed": failure}
+    checked = CheckedModel(None, {}, False)
+    failure = global_mapping.failure(beside) if beside else None
+    other = load_native(beside.folder) if beside and not failure else None
+    compared = None if beside is None else {"failed": failure}
     if found:
         before = found[0]
-        if attempt.matches == "row":
-            copy_believed(before, work.database, database, steps_of_row(work))
-        standing = _standing(before, other, database, matches, options, work)
-        found[0] = standing.model
+        if strategy.matches == "consecutive":
+            copy_consistent_matches(before, state.database, database, consecutive_pairs(state))
+        checked = _checked(before, other, database, matches, options, state)
+        found[0] = checked.model
         if other is not None:  # where it was taken itself, it is compared with the one that it replaced
             compared = compare_models(before if found[0] is other else found[0], other) | {"failed": None}
-    work.end("mapping")
-    return found, standing, compared
+    state.end("mapping")
+    return found, checked, compared
 
 
-def _second_opinion(attempt: Attempt, database: Path, work: Work) -> "global_mapping.Started | None":
-    """Global mapping begun beside the first attempt; None where it would say nothing."""
-    if attempt.name != ATTEMPTS[0].name or len(work.photos) < global_mapping.MIN_PHOTOS:
+def _start_global_mapping(strategy: Strategy, database: Path, state: JobState) -> "global_mapping.Started | None":
+    """Global mapping begun beside the first strategy; None where it would tell nothing."""
+    if strategy.name != STRATEGIES[0].name or len(state.photos) < global_mapping.MIN_PHOTOS:
         return None
-    known, folder = work.job.camera_params is not None, work.journal.folder / "global"
-    return global_mapping.start(database, work.beside("global"), work.images, folder, work.job.seed, known)
+    known, folder = state.job.camera_params is not None, state.log.folder / "global"
+    return global_mapping.start(database, state.sibling("global"), state.images, folder, state.job.seed, known)
 
 
-def _standing(model: Any, other: Any, database: Path, matches: Path, options: Any, work: Work) -> Standing:
-    """What stands of the model. Photos that fail are freed and registered again, in the model of the second opinion
-    where more photos pass in it."""
-    best, row = (model, check_model(model, database, work.job.seed)), row_of(database, work)
-    if (failed := best[1].failed()) and not tears(best[1], row):
+def _checked(model: Any, other: Any, database: Path, matches: Path, options: Any, state: JobState) -> CheckedModel:
+    """The model without the images that fail the check. These are registered again first, in the model of global
+    mapping where more images pass in it."""
+    best, sequence = (model, check_model(model, database, state.job.seed)), capture_sequence(database, state)
+    if (failed := best[1].failed()) and not fragments_sequence(best[1], sequence):
         what = "contradict their verified matches" if best[1].check.misplaced.any() else "are not linked to the others"
-        work.say(note=f"{len(failed)} of {len(best[1].ids)} registered photos {what}: registering them again")
+        state.send(note=f"{len(failed)} of {len(best[1].ids)} registered photos {what}: registering them again")
         if other is not None:
-            best = max(best, (other, check_model(other, database, work.job.seed)), key=_passing)
+            best = max(best, (other, check_model(other, database, state.job.seed)), key=_passing)
         if best[1].failed():
-            again = register_again(*best, matches, work.images, Path(work.job.folder, "again"), options)
-            best = max(best, (again, check_model(again, database, work.job.seed)), key=_passing)
+            again = register_again(*best, matches, state.images, Path(state.job.folder, "again"), options)
+            best = max(best, (again, check_model(again, database, state.job.seed)), key=_passing)
     model, checked = best
     why = reasons(model, checked)
     deregister(model, checked.failed())
-    cut_off = drop_cut_off(model, checked, row)
-    return Standing(model, why | cut_off, bool(cut_off))
+    outside = drop_outside_main_segment(model, checked, sequence)
+    return CheckedModel(model, why | outside, bool(outside))
 
 
 def _passing(candidate: tuple[Any, Checked]) -> int:

@@ -1,4 +1,4 @@
-"""Which photos found their place, and why the others did not: read off COLMAP's database of features and matches.
+"""Which photos are registered, and why the others are not: read from COLMAP's database of features and matches.
 
 Plain SQLite, read-only, and never in a process that has the same database open through pycolmap: two copies of SQLite
 in one process undo each other's locks and damage the file (https://sqlite.org/howtocorrupt.html, section 2.2.1).
@@ -16,18 +16,18 @@ from jaxtyping import Bool, Float, Int
 
 from stages.contract import StageError, listed
 from stages.ingest.masks import STILL_BACKGROUND_HINT
-from stages.sfm.degeneracy import count_turns, epipoles_inside, expands
-from stages.sfm.retry_strategies import FEWEST_MATCHES
+from stages.sfm.degeneracy import count_pure_rotations, epipoles_inside, flow_is_radial
+from stages.sfm.retry_strategies import MIN_POSE_INLIERS
 
 if TYPE_CHECKING:
     from stages.io.photos import Photo
 
-FEWEST_REGISTERED = 3  # one to hold out, two to learn from; two views alone fit many wrong scenes
-FEWEST_POINTS = 100
-FEW_FEATURES = 50
-MOST_NAMES = 5
-SAME_VIEW_PX = 1.0
-FLAT_CONFIGS = (4, 5, 6)  # colmap TwoViewGeometry: PLANAR, PANORAMIC, PLANAR_OR_PANORAMIC
+MIN_REGISTERED = 3  # one to hold out, two to learn from; two views alone fit many wrong scenes
+MIN_MODEL_POINTS = 100
+MIN_FEATURES = 50
+MAX_NAMES = 5
+MAX_SAME_VIEW_PX = 1.0
+PLANAR_CONFIGS = (4, 5, 6)  # colmap TwoViewGeometry: PLANAR, PANORAMIC, PLANAR_OR_PANORAMIC
 PAIR_BASE = 2**31 - 1  # pair_id = PAIR_BASE * first image id + second image id
 OVERLAP_HINT = "Take photos with 60–80 % overlap, so that everything is visible in at least three of them."
 
@@ -36,17 +36,17 @@ OVERLAP_HINT = "Take photos with 60–80 % overlap, so that everything is visibl
 class Matches:
     """The verified among ``tried`` pairs of photos; photos are numbered from 0 in order of ``file``.
 
-    ``flat``: a plane or a rotation alone explains the pair, so it tells nothing of depth; ``homography`` is that map
-    (zero where there is none). ``ahead``: the camera moved towards something in the picture, or away from it.
-    ``shift_px``: median distance between matched keypoints.
+    ``planar``: a plane or a pure rotation explains the pair (COLMAP's PLANAR_OR_PANORAMIC), so it tells nothing of
+    depth; ``homography`` is that map (zero where there is none). ``forward``: forward motion, towards something in the
+    picture or away from it. ``shift_px``: median distance between matched keypoints.
     """
 
     keypoints: Int[np.ndarray, "photos"]
     tried: int
     pairs: Int[np.ndarray, "pairs 2"]
-    flat: Bool[np.ndarray, "pairs"]
+    planar: Bool[np.ndarray, "pairs"]
     homography: Float[np.ndarray, "pairs 3 3"]
-    ahead: Bool[np.ndarray, "pairs"]
+    forward: Bool[np.ndarray, "pairs"]
     shift_px: Float[np.ndarray, "pairs"]
 
 
@@ -92,27 +92,27 @@ def read_matches(database: Path) -> Matches:
             db.execute("SELECT width, height FROM images JOIN cameras USING (camera_id) ORDER BY image_id").fetchall(),
             int,
         ).reshape(-1, 2)
-        places = {
+        positions = {
             image_id - 1: np.frombuffer(data, np.float32).reshape(rows, cols)[:, :2]
             for image_id, rows, cols, data in db.execute("SELECT * FROM keypoints WHERE rows > 0")
         }
     pairs = np.array([divmod(pair_id, PAIR_BASE) for pair_id, *_ in verified], int).reshape(-1, 2) - 1
-    flat = np.array([config in FLAT_CONFIGS for _, _, config, *_ in verified], bool)
-    ahead = epipoles_inside(_matrices([blob for *_, blob in verified]), sizes[pairs])
+    planar = np.array([config in PLANAR_CONFIGS for _, _, config, *_ in verified], bool)
+    forward = epipoles_inside(_matrices([blob for *_, blob in verified]), sizes[pairs])
     shifts = []
     for number, ((first, second), (_, rows, _, data, *_)) in enumerate(zip(pairs, verified, strict=True)):
         matched = np.frombuffer(data, np.uint32).reshape(rows, 2)
-        here, there = places[first][matched[:, 0]], places[second][matched[:, 1]]
+        here, there = positions[first][matched[:, 0]], positions[second][matched[:, 1]]
         shifts.append(np.median(np.linalg.norm(there - here, axis=1)))
-        if flat[number]:
-            ahead[number] = expands(here, there, sizes[first])
+        if planar[number]:
+            forward[number] = flow_is_radial(here, there, sizes[first])
     return Matches(
         keypoints=np.array(keypoints, int).reshape(-1),
         tried=tried,
         pairs=pairs,
-        flat=flat,
+        planar=planar,
         homography=_matrices([blob for *_, blob, _ in verified]),
-        ahead=ahead,
+        forward=forward,
         shift_px=np.array(shifts, float),
     )
 
@@ -121,7 +121,7 @@ def _matrices(blobs: Sequence[bytes | None]) -> Float[np.ndarray, "n 3 3"]:
     return np.array([np.frombuffer(blob, float) if blob else np.zeros(9) for blob in blobs]).reshape(-1, 3, 3)
 
 
-def account(
+def image_rows(
     names: Sequence[str],
     matches: Matches,
     models: Sequence[Sequence[str]],
@@ -153,42 +153,40 @@ def account(
 
 
 def _contradiction(models: Sequence[Sequence[str]], conflict: Mapping[str, Any]) -> str:
-    shares = f"shares {conflict['shared']} with this one and puts {conflict['elsewhere']} of them elsewhere"
-    return (
-        f"it belongs to a group of {len(models[conflict['group']])} photos that {shares}: something looks alike there"
-    )
+    shares = f"shares {conflict['shared']} with this model and gives {conflict['different']} of them different poses"
+    return f"it belongs to a group of {len(models[conflict['group']])} photos that {shares}: repeated structure"
 
 
 def repeated_structure(conflict: Mapping[str, Any], name_of: Mapping[str, str]) -> str:
-    """What is said of a group of photos that contradicts the others, by the users' own names, and what to do."""
+    """The message about a group of photos that contradicts the others, by the users' own names, and what to do."""
     others, moved = ([name_of[file] for file in conflict[key]] for key in ("others", "photos"))
     return (
-        f"repeated structure: {listed(others, MOST_NAMES)} fit only if {listed(moved, MOST_NAMES)} were taken "
-        "elsewhere, so they are left out. Parts of the scene look alike there: take photos that lead from one such "
-        "part to the other, or mask what repeats"
+        f"repeated structure: {listed(others, MAX_NAMES)} fit only if {listed(moved, MAX_NAMES)} have other poses, so "
+        "they are left out. Take photos that lead from one of the similar parts of the scene to the other, or mask "
+        "what repeats"
     )
 
 
-def with_left_out(entries: Sequence[dict[str, Any]], photos: "Sequence[Photo]") -> list[dict[str, Any]]:
-    """The account of all ``photos`` in their order: what is known of those matched, and of those that ingest left out
-    that they are nearly the same picture as another one."""
+def with_near_duplicates(entries: Sequence[dict[str, Any]], photos: "Sequence[Photo]") -> list[dict[str, Any]]:
+    """The rows of all ``photos`` in their order: those of matched photos, and of near duplicates, which ingest excludes
+    from matching, as which photo."""
     known = {entry["file"]: entry for entry in entries}
-    everything = []
+    rows = []
     for photo in photos:
         reason = f"nearly the same picture as {photo.near_duplicate_of}: it adds no baseline"
-        left_out = {"file": photo.image_name, "registered": False, "reason": reason, "keypoints": 0, "observations": 0}
-        everything.append(known.get(photo.image_name, left_out))
-    return everything
+        duplicate = {"file": photo.image_name, "registered": False, "reason": reason, "keypoints": 0, "observations": 0}
+        rows.append(known.get(photo.image_name, duplicate))
+    return rows
 
 
 def _reason(
     index: int, names: Sequence[str], matches: Matches, models: Sequence[Sequence[str]], support: tuple[int, int]
 ) -> str:
-    """Why a photo has no place: the first link that is missing between its features and the model."""
+    """Why a photo is unregistered: the first link that is missing between its features and the model."""
     features, (seen, agreeing) = int(matches.keypoints[index]), support
     if not features:
         return "no features found in it: blurred, dark or without texture"
-    few = f" (only {features} features found in it)" if features < FEW_FEATURES else ""
+    few = f" (only {features} features found in it)" if features < MIN_FEATURES else ""
     mine = (matches.pairs == index).any(axis=1)
     if not mine.any():
         return f"it shares no view with any other photo{few}"
@@ -197,34 +195,32 @@ def _reason(
     partners = matches.pairs[mine].sum(axis=1) - index
     in_model = np.array([names[partner] in models[0] for partner in partners])
     if not in_model.any():
-        return f"it shares views only with photos that are not registered either ({len(partners)} of them){few}"
-    if seen >= FEWEST_MATCHES and agreeing >= FEWEST_MATCHES:
-        return f"its position is not sure: {agreeing} of its {seen} features that are points of the model agree on one"
-    if seen >= FEWEST_MATCHES:
-        agree = f"{agreeing} of {seen} agree on one position, {FEWEST_MATCHES} are needed"
+        return f"it shares views only with unregistered photos ({len(partners)} of them){few}"
+    if seen >= MIN_POSE_INLIERS and agreeing >= MIN_POSE_INLIERS:
+        return f"its pose is not sure: {agreeing} of its {seen} features that are points of the model agree on one"
+    if seen >= MIN_POSE_INLIERS:
+        agree = f"{agreeing} of {seen} agree on one pose, {MIN_POSE_INLIERS} are needed"
         return f"its matches contradict each other: {agree}"
-    if matches.ahead[mine][in_model].all():
-        steps = f"in all {int(in_model.sum())} of its pairs with registered photos"
-        return f"{steps} the camera moves straight towards something in the picture: too little parallax"
-    if matches.flat[mine][in_model].all():
-        turned = f"all {int(in_model.sum())} of its pairs with registered photos"
-        return f"{turned} differ by a turn of the camera alone, or show one flat surface"
-    return f"too few of its features are points of the model: {seen}, {FEWEST_MATCHES} are needed{few}"
+    if matches.forward[mine][in_model].all():
+        return f"forward motion in all {int(in_model.sum())} of its pairs with registered photos: too little parallax"
+    if matches.planar[mine][in_model].all():
+        return f"pure rotation or a planar scene in all {int(in_model.sum())} of its pairs with registered photos"
+    return f"too few of its features are points of the model: {seen}, {MIN_POSE_INLIERS} are needed{few}"
 
 
 def why_no_model(photos: "Sequence[Photo]", matches: Matches, registered: int, points: int) -> StageError:
-    """The error for a set of photos from which no scene can be made, by what its pairs tell."""
+    """The error for photos that give no model, with the cause that their pairs show."""
     pairs, verified = matches.tried, len(matches.pairs)
     what = f"the cameras of {len(photos)} photos could not be found"
-    if np.median(matches.keypoints) < FEW_FEATURES:
+    if np.median(matches.keypoints) < MIN_FEATURES:
         return StageError(
             what,
-            f"half of the photos show fewer than {FEW_FEATURES} features",
+            f"half of the photos show fewer than {MIN_FEATURES} features",
             "Take sharper, better lit photos, or put something with texture into the scene.",
         )
     if not verified:
         return StageError(what, f"0 of {pairs} pairs of photos share a view", OVERLAP_HINT)
-    if np.median(matches.shift_px) < SAME_VIEW_PX:
+    if np.median(matches.shift_px) < MAX_SAME_VIEW_PX:
         return StageError(
             what,
             f"the photos are all the same view ({verified} of {pairs} pairs differ by less than a pixel)",
@@ -232,34 +228,34 @@ def why_no_model(photos: "Sequence[Photo]", matches: Matches, registered: int, p
         )
     if error := _no_depth(what, photos, matches):
         return error
-    why = f"{verified} of {pairs} pairs of photos share a view, but no two of them tell the depth of the scene"
+    why = f"{verified} of {pairs} pairs of photos share a view, but none of them shows the depth of the scene"
     if registered:
         why = f"only {registered} photos and {points} points fit together; {verified} of {pairs} pairs share a view"
     return StageError(what, why, OVERLAP_HINT)
 
 
 def _no_depth(what: str, photos: "Sequence[Photo]", matches: Matches) -> StageError | None:
-    """The error where most pairs lack what tells depth, by the name of what they have instead."""
+    """The error where most pairs are degenerate, by kind."""
     sizes = np.array([(photo.width, photo.height) for photo in photos])
-    count, flat, ahead = len(matches.pairs), int(matches.flat.sum()), int(matches.ahead.sum())
-    turns = count_turns(matches.homography[matches.flat], sizes[matches.pairs[matches.flat]])
-    if flat > count / 2 and turns > flat / 2:
+    count, planar, forward = len(matches.pairs), int(matches.planar.sum()), int(matches.forward.sum())
+    rotations = count_pure_rotations(matches.homography[matches.planar], sizes[matches.pairs[matches.planar]])
+    if planar > count / 2 and rotations > planar / 2:
         return StageError(
             what,
-            f"the camera turned on the spot: {turns} of {count} matching pairs differ by a rotation alone",
-            "Move sideways between photos, by a tenth of the distance to the scene, instead of turning on the spot.",
+            f"pure rotation: {rotations} of {count} matching pairs differ by a rotation alone",
+            "Move sideways between photos, by a tenth of the distance to the scene, instead of only turning it.",
         )
-    if ahead > count / 2:
+    if forward > count / 2:
         return StageError(
             what,
-            f"the camera moved straight ahead: in {ahead} of {count} matching pairs it goes towards something in the "
-            "picture, which leaves too little parallax",
+            f"forward motion: in {forward} of {count} matching pairs the camera moves towards something in view, "
+            "which leaves too little parallax",
             "Step sideways between photos as well, by a tenth of the distance to the scene, or turn the camera aside.",
         )
-    if flat > count / 2:
+    if planar > count / 2:
         return StageError(
             what,
-            f"the photos show one flat surface: a plane alone explains {flat} of {count} matching pairs",
+            f"planar scene: one plane explains {planar} of {count} matching pairs",
             "Take in something that stands out from the surface, and photograph it from the side as well.",
         )
     return None

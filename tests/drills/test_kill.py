@@ -73,7 +73,7 @@ def test_a_killed_video_goes_on_with_the_size_that_was_chosen_for_it(chain: Chai
 
 
 # What is said when sfm reaches the instants to be killed at: finding features, matching, and matching once more.
-SFM_INSTANTS = ("features of", "match", "has no place yet: matching them again", "adjusting all cameras")
+SFM_INSTANTS = ("features of", "match", "is not registered yet: matching them again", "final bundle adjustment")
 
 
 @pytest.fixture

@@ -73,7 +73,7 @@ def errors(folder: Path, shots: Sequence[Shot]) -> dict[str, tuple[float, float]
 
 
 def missing(folder: Path) -> dict[str, str]:
-    """The reason why, by photo without a place."""
+    """The reason why, by unregistered photo."""
     images = read_json(folder / "registration.json")["images"]
     return {image["file"]: image["reason"] for image in images if not image["registered"]}
 
@@ -85,7 +85,7 @@ def missing(folder: Path) -> dict[str, str]:
         pytest.param(along(closer(walk(14, of=28), 0.5), FISHEYE), as_taken, (152.8,), id="fisheye of 150 degrees"),
         pytest.param(along(walk(12), OFF_CENTRE), as_taken, (330,), id="principal point off centre"),
         pytest.param(two_lenses(), as_taken, (TELE.params[0], WIDE.params[0]), id="two lenses"),
-        pytest.param(along(walk(12), scene=PLANE), as_taken, (334,), id="one flat surface"),
+        pytest.param(along(walk(12), scene=PLANE), as_taken, (334,), id="planar scene"),
         pytest.param(along(walk(3)), as_taken, (334,), id="three photos"),
         pytest.param(along(walk(12)), exposed, (334,), id="exposure from -2 to +2 EV"),
     ],
@@ -104,7 +104,7 @@ def test_every_camera_is_found(
 def test_a_photo_of_another_scene_is_left_out(tmp_path: Path) -> None:
     folder, notes = found(tmp_path, OUTLIER)
     assert missing(folder) == {"stranger.png": "it shares no view with any other photo"}
-    assert "1 of 12 photos found no place and are left out:" in notes
+    assert "1 of 12 photos could not be registered and are left out:" in notes
     assert 0 < max(max(pair) for pair in errors(folder, OUTLIER).values()) < 1
 
 
@@ -113,9 +113,9 @@ def test_of_two_groups_the_larger_is_taken_and_the_other_named(tmp_path: Path) -
     why = "it belongs to another group of 7 photos that does not connect to this one"
     assert missing(folder) == {shot.name: why for shot in TWO_GROUPS if shot.scene == PLANE}
     assert 0 < max(max(pair) for pair in errors(folder, TWO_GROUPS).values()) < 1
-    attempts = read_json(folder / "registration.json")["attempts"]
-    assert attempts[0]["registered"] == 9
-    assert any(note.startswith("7 of 16 photos have no place yet: ") for note in notes)
+    strategies = read_json(folder / "registration.json")["strategies"]
+    assert strategies[0]["registered"] == 9
+    assert any(note.startswith("7 of 16 photos are not registered yet: ") for note in notes)
 
 
 def test_blurred_photos_are_named_and_do_no_harm(tmp_path: Path) -> None:
@@ -129,22 +129,22 @@ def test_blurred_photos_are_named_and_do_no_harm(tmp_path: Path) -> None:
     assert all(max(pair) < 5 for pair in off.values())  # 15 px of blur are 5 % of the width
 
 
-def test_turning_on_the_spot_is_named(tmp_path: Path) -> None:
+def test_pure_rotation_is_named(tmp_path: Path) -> None:
     with pytest.raises(StageError) as caught:
         found(tmp_path, along(on_the_spot()))
-    assert caught.value.why == "the camera turned on the spot: 66 of 66 matching pairs differ by a rotation alone"
+    assert caught.value.why == "pure rotation: 66 of 66 matching pairs differ by a rotation alone"
     assert caught.value.hint.startswith("Move sideways between photos")
 
 
-def test_moving_straight_ahead_is_named_or_seen_through(tmp_path: Path) -> None:
-    """The first attempt alone: another one, which takes the lens as known, places them all. Whether the first one does
-    is on the edge: it differs between processors, by their rounding."""
+def test_forward_motion_is_named_or_solved(tmp_path: Path) -> None:
+    """The default strategy alone: another one, which takes the camera model as known, registers them all. Whether the
+    default does is on the edge: it differs between processors, by their rounding."""
     shots = along(straight_ahead())
     try:
-        folder, _ = found(tmp_path, shots, config=sfm.Config(attempts=1))
+        folder, _ = found(tmp_path, shots, config=sfm.Config(max_strategies=1))
     except StageError as error:
         assert error.why == (
-            "the camera moved straight ahead: in 66 of 66 matching pairs it goes towards something in the picture, "
+            "forward motion: in 66 of 66 matching pairs the camera moves towards something in view, "
             "which leaves too little parallax"
         )
         assert error.hint.startswith("Step sideways between photos")

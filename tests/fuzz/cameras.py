@@ -44,6 +44,8 @@ def _load_cameras(given: Path, folder: Path) -> None:
     from stages.ingest.sources import find_source
     from stages.io.photos import write_photos
 
+    for name in (frame["file_path"] for frame in transforms()["frames"]):
+        (folder.parent / name).touch()
     source = find_source(given)
     assert all(file.is_relative_to(source.root) for file in source.files)
     photos = photos_of(dict(source.frames))

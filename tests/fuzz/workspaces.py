@@ -45,7 +45,7 @@ def try_run(folder: Path) -> None:
 @cache
 def run_file() -> dict[str, Any]:
     """A valid run.json."""
-    from pipeline.cli.settings import Settings
+    from pipeline.engine.settings import Settings
 
     options = Settings().model_dump(mode="json")
     keys = dict.fromkeys(options, "0" * 64)

@@ -62,8 +62,8 @@ def read_pair_matches(
         if most and len(inliers) > most:
             inliers = inliers[random.choice(len(inliers), most, replace=False)]
         keypoints.append(inliers)
-    bearings = [_bearings(db, model, image_id) for image_id in ids]
-    begins = np.concatenate([[0], np.cumsum([len(some) for some in bearings])]).astype(int)
+    directions = [_directions(db, model, image_id) for image_id in ids]
+    begins = np.concatenate([[0], np.cumsum([len(some) for some in directions])]).astype(int)
     rows = [some + begins[list(pair)] for some, pair in zip(keypoints, pairs, strict=True)]
     return ids, PairMatches(
         pairs=np.array(pairs, int).reshape(-1, 2),
@@ -71,12 +71,12 @@ def read_pair_matches(
         pair=np.repeat(np.arange(len(pairs)), [len(some) for some in keypoints]),
         keypoint=np.concatenate([np.zeros((0, 2), int), *rows]),
         photo=np.repeat(np.arange(len(ids)), np.diff(begins)),
-        bearing=np.concatenate([np.zeros((0, 3)), *bearings]),
+        ray_direction=np.concatenate([np.zeros((0, 3)), *directions]),
         focal_px=np.array([model.camera(model.image(i).camera_id).mean_focal_length() for i in ids]),
     )
 
 
-def _bearings(db: "pycolmap.Database", model: "pycolmap.Reconstruction", image_id: int) -> np.ndarray:
+def _directions(db: "pycolmap.Database", model: "pycolmap.Reconstruction", image_id: int) -> np.ndarray:
     """Unit rays of a photo's keypoints in its camera's frame; along the axis where the lens has none."""
     xy = np.array(db.read_keypoints(image_id), float).reshape(-1, 6)[:, :2]
     rays = np.asarray(model.camera(model.image(image_id).camera_id).cam_ray_from_img(xy), float).reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""Why a photo has no place in a model. Call it in a child process."""
+"""Why an image is unregistered. Call it in a worker process."""
 
 from collections import Counter
 from collections.abc import Container, Sequence
@@ -9,53 +9,54 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from nerf.geometry.alignment import align
-from stages.sfm.degeneracy import elsewhere
-from stages.sfm.registration import FLAT_CONFIGS
-from stages.sfm.retry_strategies import FEWEST_MATCHES
+from stages.sfm.degeneracy import different_poses
+from stages.sfm.registration import PLANAR_CONFIGS
+from stages.sfm.retry_strategies import MIN_POSE_INLIERS
 
 if TYPE_CHECKING:
     import pycolmap
 
-MOSTLY = 0.9
-# A single photo may merely have a bad place in one of two models: it takes several to say that the models contradict.
-FEWEST_ELSEWHERE, SHARE_ELSEWHERE = 2, 0.2
+NEARLY_ALL = 0.9
+# A single image may merely have a bad pose in one of two models: it takes several to say that the models contradict.
+MIN_DIFFERENT, MIN_DIFFERENT_FRACTION = 2, 0.2
 
 
 class Links(NamedTuple):
-    """What the verified pairs of photos say: whether any of them ``join`` photos that have a place to photos that have
-    none, and whether next to all are explained by a plane or a turn of the camera alone (``flat``)."""
+    """What the verified pairs tell: whether any of them ``join`` registered to unregistered images, and whether nearly
+    all are planar or pure rotations (``planar``)."""
 
     join: bool
-    flat: bool
+    planar: bool
 
 
-def links(database: Path, placed: Container[str]) -> Links:
-    """Of all photos, those in ``placed`` having a place.
+def links(database: Path, registered: Container[str]) -> Links:
+    """Of all images, those whose names are in ``registered`` being registered.
 
-    They are joined where one photo has as many matches with all photos of the other side as mapping asks of a photo:
-    with fewer, none could be added to the others, whichever side mapping began on. While none has a place every pair
-    is one to begin with.
+    They are joined where one image has as many matches with all images of the other side as mapping asks of an image:
+    with fewer, none could be registered, whichever side mapping began on. While none is registered every pair may be
+    the initial one.
     """
     import pycolmap
 
     across: Counter[int] = Counter()
-    flat: list[bool] = []
+    planar: list[bool] = []
     with pycolmap.Database.open(database) as db:
-        has_place = {image.image_id: image.name in placed for image in db.read_all_images()}
+        is_registered = {image.image_id: image.name in registered for image in db.read_all_images()}
         for pair_id, geometry in zip(*db.read_two_view_geometries(), strict=True):
             if count := len(geometry.inlier_matches):
                 pair = pycolmap.pair_id_to_image_pair(pair_id)
-                if has_place[pair[0]] != has_place[pair[1]]:
+                if is_registered[pair[0]] != is_registered[pair[1]]:
                     across.update(dict.fromkeys(pair, count))
-                flat.append(int(geometry.config) in FLAT_CONFIGS)
-    join = max(across.values(), default=0) >= FEWEST_MATCHES if any(has_place.values()) else bool(flat)
-    return Links(join, sum(flat) > MOSTLY * len(flat))
+                planar.append(int(geometry.config) in PLANAR_CONFIGS)
+    any_registered = any(is_registered.values())
+    join = max(across.values(), default=0) >= MIN_POSE_INLIERS if any_registered else bool(planar)
+    return Links(join, sum(planar) > NEARLY_ALL * len(planar))
 
 
 def find_conflict(models: "Sequence[pycolmap.Reconstruction]") -> dict[str, Any] | None:
-    """The largest sub-model that shares photos with the best one (the first) and puts some of them elsewhere.
+    """The largest sub-model that shares images with the best one (the first) and gives some of them different poses.
 
-    ``group`` is its number, ``shared`` how many photos both have, ``elsewhere`` how many of them it puts elsewhere;
+    ``group`` is its number, ``shared`` how many images both have, ``different`` how many of them have different poses;
     these are the ``photos``, and ``others`` those that it alone has. Where there are none of the latter nothing is lost
     by it: the poses of the best model have passed the check, and the group has nothing to add.
     """
@@ -69,50 +70,52 @@ def find_conflict(models: "Sequence[pycolmap.Reconstruction]") -> dict[str, Any]
         if not (shared := sorted(best.keys() & poses.keys())):
             continue
         here, there = (np.array([of[name] for name in shared]) for of in (best, poses))
-        apart = elsewhere(here, there, extent)
-        if apart.sum() >= max(FEWEST_ELSEWHERE, SHARE_ELSEWHERE * len(shared)):
+        different = different_poses(here, there, extent)
+        if different.sum() >= max(MIN_DIFFERENT, MIN_DIFFERENT_FRACTION * len(shared)):
             others = sorted(poses.keys() - best.keys())
-            moved = [name for name, far in zip(shared, apart, strict=True) if far]
-            found = {"group": group, "shared": len(shared), "elsewhere": len(moved), "photos": moved, "others": others}
-            return found if others else None
+            moved = [name for name, is_different in zip(shared, different, strict=True) if is_different]
+            facts = {"group": group, "shared": len(shared), "different": len(moved), "photos": moved, "others": others}
+            return facts if others else None
     return None
 
 
 def compare_models(model: "pycolmap.Reconstruction", other: "pycolmap.Reconstruction") -> dict[str, Any]:
-    """How far two models of the same photos agree, after the similarity on which most of them do.
+    """How far two models of the same images agree, after the similarity on which most of them do.
 
-    ``photos`` is how many both have, ``agree`` how many of them stand the same in both, ``elsewhere`` the files of
-    those that do not; ``centre`` and ``degrees`` are mean differences of the former, centres as shares of the extent of
-    the first model's cameras.
+    ``photos`` is how many both have, ``agree`` how many of them have the same pose in both, ``different`` the files of
+    those that do not; ``centre`` and ``degrees`` are mean differences of the former, centres as fractions of the extent
+    of the first model's cameras.
     """
     first, second = _poses(model), _poses(other)
     shared = sorted(first.keys() & second.keys())
-    facts: dict[str, Any] = {"photos": len(shared), "agree": 0, "elsewhere": [], "centre": None, "degrees": None}
+    facts: dict[str, Any] = {"photos": len(shared), "agree": 0, "different": [], "centre": None, "degrees": None}
     if len(shared) < 3:
         return facts
     here, there = (np.array([of[name] for name in shared]) for of in (first, second))
     extent = float(np.linalg.norm(np.ptp(here[:, :, 3], axis=0)))
-    apart = elsewhere(here, there, extent)
-    facts |= {"agree": int((~apart).sum()), "elsewhere": [name for name, far in zip(shared, apart, strict=True) if far]}
+    different = different_poses(here, there, extent)
+    moved = [name for name, is_different in zip(shared, different, strict=True) if is_different]
+    here, there = here[~different], there[~different]
+    facts |= {"agree": len(here), "different": moved}
     with suppress(ValueError):  # all in one line: nothing to align by
-        first_from_second = align(there[~apart][:, :, 3], here[~apart][:, :, 3])
-        moved = np.array([first_from_second.pose(pose) for pose in there[~apart]])
-        off = np.linalg.norm(moved[:, :, 3] - here[~apart][:, :, 3], axis=1)
-        cosine = (np.einsum("nij,nij->n", moved[:, :, :3], here[~apart][:, :, :3]) - 1) / 2
+        first_from_second = align(there[:, :, 3], here[:, :, 3])
+        aligned = np.array([first_from_second.pose(pose) for pose in there])
+        off = np.linalg.norm(aligned[:, :, 3] - here[:, :, 3], axis=1)
+        cosine = (np.einsum("nij,nij->n", aligned[:, :, :3], here[:, :, :3]) - 1) / 2
         turned = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
         facts |= {"centre": float(off.mean() / extent), "degrees": float(turned.mean())}
     return facts
 
 
 def _poses(model: "pycolmap.Reconstruction") -> dict[str, np.ndarray]:
-    """By name, (3, 4) from the photo's camera to the model's frame."""
+    """By name, (3, 4) from the image's camera to the model's frame."""
     images = (model.image(number) for number in model.reg_image_ids())
     return {image.name: image.cam_from_world().inverse().matrix() for image in images}
 
 
 def supports(model: "pycolmap.Reconstruction", database: Path, seed: int) -> dict[str, tuple[int, int]]:
-    """For every photo that is in the database but not in the model: how many of its features are points of the model
-    by its verified matches, and how many of those agree on one position of the camera (P3P in RANSAC, 12 px)."""
+    """For every image that is in the database but not in the model: how many of its features are points of the model by
+    its verified matches, and how many of those agree on one pose (P3P in RANSAC, 12 px)."""
     import pycolmap
 
     registered = set(model.reg_image_ids())
@@ -125,7 +128,7 @@ def supports(model: "pycolmap.Reconstruction", database: Path, seed: int) -> dic
             keypoints = np.asarray(db.read_keypoints(image.image_id), float)[:, :2]
             known = model.exists_camera(image.camera_id)
             camera = model.camera(image.camera_id) if known else db.read_camera(image.camera_id)
-            found[image.name] = (len(points), _agreeing(points, keypoints, camera, model, seed))
+            found[image.name] = (len(points), _pose_inliers(points, keypoints, camera, model, seed))
     return found
 
 
@@ -141,14 +144,14 @@ def _points_seen(image_id: int, geometries: list, model: "pycolmap.Reconstructio
         other, mine = (second, 0) if image_id == first else (first, 1)
         if not (other in model.images and model.image(other).has_pose):
             continue
-        places = model.image(other).points2D
+        points2D = model.image(other).points2D
         for match in np.asarray(geometry.inlier_matches):
-            if (place := places[match[1 - mine]]).has_point3D():
-                seen.add((int(match[mine]), int(place.point3D_id)))
+            if (point2D := points2D[match[1 - mine]]).has_point3D():
+                seen.add((int(match[mine]), int(point2D.point3D_id)))
     return sorted(seen)
 
 
-def _agreeing(
+def _pose_inliers(
     points: list[tuple[int, int]],
     keypoints: np.ndarray,
     camera: "pycolmap.Camera",

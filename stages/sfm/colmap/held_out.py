@@ -1,8 +1,8 @@
 """Which camera model the photos call for, by the error of observations that were held out. Call it in a child process.
 
-Every candidate lens adjusts cameras, poses and points to most observations and then foretells the others. The
-simplest one wins that foretells them no worse than the best by more than the noise of the comparison. A lens that is
-too simple bends the poses; one that is too rich fits noise, and bends them too.
+Every candidate lens adjusts cameras, poses and points to most observations and then foretells the others. The simplest
+one wins that foretells them no worse than the best by more than the noise of the comparison. A lens that is too simple
+bends the poses; one that is too rich fits noise, and bends them too.
 """
 
 from collections import Counter

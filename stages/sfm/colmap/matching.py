@@ -18,7 +18,7 @@ from stages.hardware.device import processors
 from stages.hardware.memory import at_once
 from stages.sfm.pairs.feature_matching import IndexedFeatures, index_features, match_descriptors, match_indexed
 from stages.sfm.pairs.image_retrieval import WORDS, Words, photo_similarity, vocabulary
-from stages.sfm.pairs.pair_selection import Likeness, Pairs
+from stages.sfm.pairs.pair_selection import Pairs, SimilarityMatrix
 
 if TYPE_CHECKING:
     import pycolmap
@@ -29,7 +29,7 @@ FOCAL_GUESS = 1.2  # focal length over the longer side where EXIF is silent: 45 
 # Lowe's ratio: 0.8 is SIFT's own. 0.9 lets in many mismatches, most of which verification throws out again, and
 # finds views that lie farther apart; only photos that otherwise stay without a place are matched like that.
 STRICT_RATIO = 0.8
-LOOSE_RATIO = 0.9
+RELAXED_RATIO = 0.9
 BLOCK_SIZE = 32  # pairs of photos that are committed at once (progress, resuming)
 FISHEYE_MODEL = "SIMPLE_RADIAL_FISHEYE"
 FISHEYE_ANGLE_DEG = 150.0
@@ -246,7 +246,7 @@ def read_vocabulary(database: Path, count: int, seed: int, words: int) -> Words:
         return vocabulary(partial(read_descriptors, db), count, seed, words)
 
 
-def look_alike(database: Path, count: int, seed: int) -> Likeness:
+def look_alike(database: Path, count: int, seed: int) -> SimilarityMatrix:
     """How much any two photos look alike, by their features."""
     import pycolmap
 

@@ -5,11 +5,11 @@ without end, or abort the process. https://colmap.github.io/format.html. Only ca
 what rigs and frames say of poses is in images, too, and tracks are what images say of their points.
 """
 
+import math
 import struct
-from collections.abc import Iterator
-from itertools import zip_longest
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -81,16 +81,31 @@ def read_model_files(folder: Path) -> ModelFiles:
         if binary
         else {"cameras": _text_cameras, "images": _text_images, "points3D": _text_points}
     )
+    files = {part: folder / f"{part}{'.bin' if binary else '.txt'}" for part in readers}
+    if without_points := not files["points3D"].is_file():
+        readers["points3D"] = lambda _: iter(())
     parts = []
-    for part, reader in readers.items():
-        path = folder / f"{part}{'.bin' if binary else '.txt'}"
+    for part, path in files.items():
         try:
-            parts.append(_by_id(reader(path)))
+            parts.append(_by_id(readers[part](path)))
         except (struct.error, ValueError, OverflowError) as error:
             raise ValueError(f"{path.name} is damaged: {error}") from error
     model = ModelFiles(*parts)
+    if without_points:  # what images see are then points that nobody knows
+        images = {i: image._replace(points=np.full_like(image.points, NO_POINT)) for i, image in model.images.items()}
+        model = model._replace(images=images)
     _check(model)
     return model
+
+
+def image_names(folder: Path) -> list[str]:
+    """The names of the images of the model in ``folder``; none where its file of images is damaged."""
+    binary = (folder / "images.bin").is_file()
+    images = _binary_images(folder / "images.bin") if binary else _text_images(folder / "images.txt")
+    try:
+        return [image.name for _, image in images]
+    except (OSError, struct.error, ValueError, OverflowError):
+        return []
 
 
 def _by_id(entries: Iterator[tuple[int, Entry]]) -> dict[int, Entry]:
@@ -193,42 +208,89 @@ def _binary_points(path: Path) -> Iterator[tuple[int, FilePoint]]:
 # --- text: a line per entry, two per image
 
 
-def _lines(path: Path) -> list[str]:
-    return [line for line in path.read_text("utf-8-sig", "backslashreplace").split("\n") if not line.startswith("#")]
+class _Line(NamedTuple):
+    """A line of a file, counted from 1."""
+
+    number: int
+    text: str
+
+    def fields(self, least: int, what: str) -> list[str]:
+        """What stands in it, divided by spaces. Raises ValueError where ``what`` stands there is not whole."""
+        fields = self.text.split()
+        if len(fields) < least:
+            raise self.damaged(f"{what} has {len(fields)} fields where {least} belong")
+        return fields
+
+    def damaged(self, why: str) -> ValueError:
+        return ValueError(f"line {self.number}: {why}: {self.text.strip()[:60]!r}")
 
 
-def _fields(line: str, least: int) -> list[str]:
-    fields = line.split()
-    if len(fields) < least:
-        raise ValueError(f"a line has {len(fields)} fields where {least} belong: {line[:60]!r}")
-    return fields
+def _lines(path: Path) -> list[_Line]:
+    text = path.read_text("utf-8-sig", "backslashreplace")
+    return [_Line(i, line) for i, line in enumerate(text.split("\n"), 1) if not line.lstrip().startswith("#")]
+
+
+def _filled(path: Path) -> list[_Line]:
+    return [line for line in _lines(path) if line.text.strip()]
+
+
+def _numbers(line: _Line, fields: Sequence[str], kind: Callable[[str], Any]) -> list[Any]:
+    try:
+        return [kind(field) for field in fields]
+    except ValueError as error:
+        raise line.damaged(str(error)) from error
 
 
 def _text_cameras(path: Path) -> Iterator[tuple[int, Camera]]:
-    for line in filter(str.strip, _lines(path)):
-        number, model, width, height, *params = _fields(line, 4)
-        yield int(number), _camera(model, int(width), int(height), tuple(map(float, params)))
+    for line in _filled(path):
+        number, model, width, height, *params = line.fields(4, "a camera")
+        number, *size = _numbers(line, (number, width, height), int)
+        try:
+            yield number, _camera(model, size[0], size[1], tuple(map(float, params)))
+        except ValueError as error:
+            raise line.damaged(str(error)) from error
 
 
 def _text_images(path: Path) -> Iterator[tuple[int, FileImage]]:
-    lines = iter(_lines(path))
-    for line in lines:
-        if not line.strip():
+    """Images, each followed by a line with its keypoints, which may be empty, or left out where the next line can only
+    be an image: one of these ends in a name, and keypoints are triples of numbers."""
+    lines = _lines(path)
+    place = 0
+    while place < len(lines):
+        line = lines[place]
+        place += 1
+        if not line.text.strip():
             continue
-        number, *pose, camera, name = [*_fields(line, 10)[:9], line.split(maxsplit=9)[9].strip()]
-        seen = next(lines, "").split()
-        triples = list(zip_longest(*[iter(seen)] * 3))
-        if triples and None in triples[-1]:
-            raise ValueError(f"the keypoints of {name} are no triples")
-        xy = np.array([[float(x), float(y)] for x, y, _ in triples]).reshape(-1, 2)
-        points = np.array([int(point) for _, _, point in triples], np.int64)
-        yield int(number), FileImage(name, int(camera), np.array(pose, float), xy, points)
+        fields = line.fields(10, "an image (its line of keypoints, below it, may be empty)")
+        number, camera = _numbers(line, (fields[0], fields[8]), int)
+        pose = np.array(_numbers(line, fields[1:8], float))
+        follows = lines[place] if place < len(lines) else _Line(place, "")
+        is_left_out = _is_image(follows)
+        seen = [] if is_left_out else follows.text.split()
+        place += not is_left_out
+        if len(seen) % 3:
+            raise follows.damaged("keypoints are triples, x, y and the id of a point or -1")
+        xy = np.array(_numbers(follows, [v for i, v in enumerate(seen) if i % 3 < 2], float)).reshape(-1, 2)
+        points = np.array(_numbers(follows, seen[2::3], int), np.int64)
+        yield number, FileImage(line.text.split(maxsplit=9)[9].strip(), camera, pose, xy, points)
+
+
+def _is_image(line: _Line) -> bool:
+    fields = line.text.split()
+    return len(fields) >= 10 and _are_numbers(fields[:9]) and not _are_numbers(fields[9:])
+
+
+def _are_numbers(fields: Sequence[str]) -> bool:
+    try:
+        return all(math.isfinite(float(field)) for field in fields)
+    except ValueError:
+        return False
 
 
 def _text_points(path: Path) -> Iterator[tuple[int, FilePoint]]:
-    for line in filter(str.strip, _lines(path)):
-        number, *xyz_rgb, error = _fields(line, 8)[:8]
-        rgb = tuple(int(value) for value in xyz_rgb[3:])
+    for line in _filled(path):
+        number, *xyz_rgb, error = line.fields(8, "a point")[:8]
+        (number,), (x, y, z, *rgb, error_px) = _numbers(line, (number,), int), _numbers(line, (*xyz_rgb, error), float)
         if not all(0 <= value <= 255 for value in rgb):
-            raise ValueError(f"point {number} has the colour {rgb}")
-        yield int(number), FilePoint(tuple(map(float, xyz_rgb[:3])), rgb, float(error))
+            raise line.damaged("a colour is not between 0 and 255")
+        yield number, FilePoint((x, y, z), tuple(map(round, rgb)), error_px)

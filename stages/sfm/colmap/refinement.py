@@ -43,10 +43,10 @@ def finish(
 ) -> Finished:
     """Choose the camera model by held-out observations, unless it is given, and adjust everything with it.
 
-    Of a given model it is only chosen whether its principal point is refined; a known lens is kept as it is. Where
-    many more observations fit the chosen lens than mapping's, the choice is made again with them. No camera of the
-    model is absurd in the end, unless those of most photos are. Of a model of ``thinned`` matches (thinning.py) the
-    tracks that it has are adjusted first; then all matches come back.
+    Of a given model it is only chosen whether its principal point is refined; a known lens is kept as it is. Where many
+    more observations fit the chosen lens than mapping's, the choice is made again with them. No camera of the model is
+    absurd in the end, unless those of most photos are. Of a model of ``thinned`` matches (thinning.py) the tracks that
+    it has are adjusted first; then all matches come back.
     """
     import pycolmap
 

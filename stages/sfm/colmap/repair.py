@@ -1,6 +1,6 @@
-"""Photos whose poses the matches contradict: freed, registered again, left out if that does not help.
+"""Images whose poses contradict their matches: deregistered, registered again, left out if that does not help.
 
-Call it in a child process. What contradicts a pose is decided in stages/sfm/geometry_check.py.
+Call it in a worker process. stages/sfm/geometry_check.py decides what contradicts a pose.
 """
 
 import shutil
@@ -17,11 +17,11 @@ from stages.sfm.colmap.matching import copy_without_pairs, finish_copy, keep_inl
 from stages.sfm.geometry_check import (
     PairMatches,
     PoseCheck,
-    believed,
     check_poses,
-    cut_off,
-    is_torn,
-    row_breaks,
+    consistent_matches,
+    is_fragmented,
+    outside_main_segment,
+    sequence_breaks,
     weak_links,
 )
 from stages.sfm.pairs.match_graph import ORDER_OVERLAP
@@ -38,7 +38,7 @@ class Checked(NamedTuple):
     check: PoseCheck
 
     def failed(self) -> list[int]:
-        """The image ids of photos whose poses do not stand."""
+        """The image ids of photos whose poses fail the check."""
         return [image_id for image_id, passed in zip(self.ids, self.check.passed, strict=True) if not passed]
 
 
@@ -67,21 +67,21 @@ def reasons(model: "pycolmap.Reconstruction", checked: Checked) -> dict[str, str
         if misplaced:
             matches = f"{against:,.0f} of its {agree + against:,.0f} verified matches with other photos"
             together = f", as for {groups - 1} more" if groups > 1 else ""
-            found[model.image(image_id).name] = f"its place is contradicted by {matches}{together}"
+            found[model.image(image_id).name] = f"its pose is contradicted by {matches}{together}"
         elif unlinked:
-            found[model.image(image_id).name] = "no verified match supports its place among the other photos"
+            found[model.image(image_id).name] = "no verified match links its pose to the other photos"
     return found
 
 
-def tears(checked: Checked, row: Sequence[int]) -> bool:
-    """Whether the poses tear the ``row`` (image ids) apart: no photo by itself is at fault then."""
-    return is_torn(_places(checked, row), checked.matches, checked.check)
+def fragments_sequence(checked: Checked, sequence: Sequence[int]) -> bool:
+    """Whether the poses fragment the capture ``sequence`` (image ids): no single photo is at fault then."""
+    return is_fragmented(_numbers(checked, sequence), checked.matches, checked.check)
 
 
-def copy_believed(
+def copy_consistent_matches(
     model: "pycolmap.Reconstruction", database: Path, copy: Path, trusted: Container[tuple[int, int]]
 ) -> None:
-    """Copy the database with the verified matches alone that are believed beside a model which those of ``trusted``
+    """Copy the database with only the verified matches that are consistent with a model which those of ``trusted``
     pairs (image ids, the lower first) made."""
     import pycolmap
 
@@ -89,7 +89,7 @@ def copy_believed(
     with pycolmap.Database.open(unfinished) as db, pycolmap.DatabaseTransaction(db):
         ids, matches = read_pair_matches(db, model, 0, most=None)
         pairs = np.array(ids)[matches.pairs].tolist()  # the lower id first, as COLMAP numbers pairs
-        kept = believed(matches, camera_poses(model), np.array([(i, j) in trusted for i, j in pairs], bool))
+        kept = consistent_matches(matches, camera_poses(model), np.array([(i, j) in trusted for i, j in pairs], bool))
         bounds = np.searchsorted(matches.pair, np.arange(len(pairs) + 1))
         mine = {(i, j): kept[bounds[k] : bounds[k + 1]] for k, (i, j) in enumerate(pairs)}
         for pair_id, geometry in zip(*db.read_two_view_geometries(), strict=True):
@@ -100,41 +100,46 @@ def copy_believed(
     finish_copy(unfinished, copy)
 
 
-def drop_cut_off(model: "pycolmap.Reconstruction", checked: Checked, row: Sequence[int]) -> dict[str, str]:
-    """Take out photos that stand off the longest piece of a ``row`` (image ids, none where it is not known) that falls
-    apart: by name why."""
-    neighbours = "photos taken just before or after" if tears(checked, row) else "photos between it and the others"
-    lost = cut_off(_places(checked, row), checked.matches, checked.check, ORDER_OVERLAP)
-    ids = [image_id for image_id, cut in zip(checked.ids, lost, strict=True) if cut]
+def drop_outside_main_segment(
+    model: "pycolmap.Reconstruction", checked: Checked, sequence: Sequence[int]
+) -> dict[str, str]:
+    """Deregister images outside the longest segment of a broken capture ``sequence`` (image ids, none where it is not
+    known): by name why."""
+    fragmented = fragments_sequence(checked, sequence)
+    neighbours = "photos taken just before or after" if fragmented else "photos taken between it and the others"
+    outside = outside_main_segment(_numbers(checked, sequence), checked.matches, checked.check, ORDER_OVERLAP)
+    ids = [image_id for image_id, is_outside in zip(checked.ids, outside, strict=True) if is_outside]
     deregister(model, ids)
-    why = f"its place is contradicted by {neighbours}: parts of the scene look alike"
+    why = f"its pose is contradicted by {neighbours}: repeated structure"
     return {model.image(image_id).name: why for image_id in ids}
 
 
-def _places(checked: Checked, row: Sequence[int]) -> Int[np.ndarray, "photos"]:
-    """The row in numbers of the check."""
-    place = {image_id: number for number, image_id in enumerate(checked.ids)}
-    return np.array([place[image_id] for image_id in row if image_id in place], int)
+def _numbers(checked: Checked, sequence: Sequence[int]) -> Int[np.ndarray, "photos"]:
+    """The sequence in numbers of the check."""
+    number_of = {image_id: number for number, image_id in enumerate(checked.ids)}
+    return np.array([number_of[image_id] for image_id in sequence if image_id in number_of], int)
 
 
-def facts(model: "pycolmap.Reconstruction", checked: Checked, row: Sequence[int] = ()) -> dict[str, Any]:
-    """What registration.json says of a check, as plain JSON; of each photo under "images", by name.
+def facts(model: "pycolmap.Reconstruction", checked: Checked, sequence: Sequence[int] = ()) -> dict[str, Any]:
+    """What registration.json says of a check, as plain JSON; of each image under "images", by name.
 
-    ``row``: image ids in the order in which photos were taken, where that is known.
+    ``sequence``: image ids in the order in which photos were taken, where that is known.
     """
     names, check = [model.image(i).name for i in checked.ids], checked.check
     votes = check.votes_for + check.votes_against
     return {
         "pairs": int(check.agrees.sum() + check.contradicts.sum()),
         "agreeing": int(check.agrees.sum()),
-        "error_px": check.usual_px,
+        "error_px": check.median_px,
         "tolerance_px": check.tolerance_px,
         "doubtful": [name for name, misplaced in zip(names, check.misplaced, strict=True) if misplaced],
         "weak_links": [
             {"photos": [names[i] for i in link.photos], "pairs": link.pairs, "matches": link.matches}
             for link in weak_links(checked.matches, check)
         ],
-        "row_breaks": [[names[i] for i in step] for step in row_breaks(_places(checked, row), checked.matches, check)],
+        "sequence_breaks": [
+            [names[i] for i in step] for step in sequence_breaks(_numbers(checked, sequence), checked.matches, check)
+        ],
         "images": {
             name: {"agreement": agree / of if of else None, "transfer_px": float(px) if np.isfinite(px) else None}
             for name, agree, of, px in zip(names, check.votes_for, votes, check.photo_error_px, strict=True)
@@ -143,7 +148,7 @@ def facts(model: "pycolmap.Reconstruction", checked: Checked, row: Sequence[int]
 
 
 def deregister(model: "pycolmap.Reconstruction", image_ids: Sequence[int]) -> None:
-    """Free photos of their poses; what only they saw goes with them."""
+    """Deregister images; what only they saw goes with them."""
     for image_id in image_ids:
         model.deregister_frame(model.image(image_id).frame_id)
     model.update_point_3d_errors()
@@ -157,9 +162,9 @@ def register_again(
     scratch: Path,
     options: "pycolmap.IncrementalPipelineOptions",
 ) -> "pycolmap.Reconstruction":
-    """The model with the photos that failed freed and, where possible, registered anew.
+    """The model with the images that failed deregistered and, where possible, registered again.
 
-    Pairs of photos that stand and contradict their poses are mistakes of matching: mapping goes on without them.
+    Pairs of images that passed and contradict the poses are outliers of matching: mapping goes on without them.
     """
     from stages.sfm.colmap.models import load_native, write_native
 
@@ -167,13 +172,13 @@ def register_again(
     shutil.rmtree(scratch, ignore_errors=True)
     failed = checked.failed()
     write_native(begin, model)
-    freed = load_native(begin)
-    deregister(freed, failed)
-    write_native(begin, freed)
+    reduced = load_native(begin)
+    deregister(reduced, failed)
+    write_native(begin, reduced)
     clean, passed = scratch / "clean.db", checked.check.passed
     mistakes = checked.matches.pairs[checked.check.contradicts & passed[checked.matches.pairs].all(axis=1)]
     copy_without_pairs(database, clean, np.array(checked.ids)[mistakes].tolist())
     found = map_incrementally(clean, images, models, options, begin=begin)
-    best = max(found, key=lambda one: (one.num_reg_images(), one.num_points3D()), default=freed)
+    best = max(found, key=lambda one: (one.num_reg_images(), one.num_points3D()), default=reduced)
     shutil.rmtree(scratch, ignore_errors=True)
-    return best if best.num_reg_images() >= freed.num_reg_images() else freed
+    return best if best.num_reg_images() >= reduced.num_reg_images() else reduced

@@ -27,9 +27,9 @@ def pose_uncertainty_px(model: "pycolmap.Reconstruction", noise: float) -> dict[
     Bundle Adjustment, section 9.3). Cameras are held since refining poses could not mend them: a focal length a little
     long looks like places a little far away.
 
-    ``noise`` scales adjustments' soft-L1. Photos with very few observations have no entry. Raises LinAlgError where
-    the equations leave more than the frame open (points without depth), and MemoryError, with the sizes, where there
-    is no room for the covariance, which grows with the square of the number of photos.
+    ``noise`` scales adjustments' soft-L1. Photos with very few observations have no entry. Raises LinAlgError where the
+    equations leave more than the frame open (points without depth), and MemoryError, with the sizes, where there is no
+    room for the covariance, which grows with the square of the number of photos.
     """
     seen = observations(model)
     counts = dict(zip(*(a.tolist() for a in np.unique(seen.image, return_counts=True)), strict=True))
@@ -82,9 +82,9 @@ def _whitened_covariance(
 ) -> Float[np.ndarray, "k k"]:
     """The poses' covariance for unit noise, in coordinates in which a pose's own information is the identity.
 
-    There the information of poses alone is S = I − B Bᵀ, what is left once the points follow; directions Q of the
-    gauge are its null space, and the pseudo-inverse is (S + Q Qᵀ)⁻¹ − Q Qᵀ. Its trace over one photo is the sum of
-    squared pixels by which its points move.
+    There the information of poses alone is S = I − B Bᵀ, what is left once the points follow; directions Q of the gauge
+    are its null space, and the pseudo-inverse is (S + Q Qᵀ)⁻¹ − Q Qᵀ. Its trace over one photo is the sum of squared
+    pixels by which its points move.
     """
     from scipy.linalg import cho_factor, cho_solve
     from scipy.sparse import bsr_matrix

@@ -1,8 +1,8 @@
 """Cameras that are known already: transforms.json, Blender's transforms_train/test.json, or a COLMAP model.
 
-Poses in transforms files are world_from_camera with OpenGL axes (x right, y up, z backward); they are turned to
-OpenCV axes here and nowhere else. Photos are told apart by their own names, as ingest noted them. Cameras of photos as
-their files store them are turned upright as ingest turned the photos.
+Poses in transforms files are world_from_camera with OpenGL axes (x right, y up, z backward); they are turned to OpenCV
+axes here and nowhere else. Photos are told apart by their own names, as ingest noted them. Cameras of photos as their
+files store them are turned upright as ingest turned the photos.
 """
 
 import os
@@ -24,14 +24,17 @@ from stages.io.photos import Photo
 from stages.io.sparse_model import SparseModel
 from stages.io.transforms_export import OPENGL_FROM_OPENCV
 from stages.io.transforms_files import MOST_LETTERS, TRAIN, none_among_the_photos, pose_matrix, read_splits
-from stages.io.transforms_intrinsics import read_intrinsics
+from stages.io.transforms_intrinsics import contradictions, intrinsics_of, read_intrinsics
 from stages.sfm.colmap.model_files import FARTHEST
 from stages.sfm.colmap.models import read_model
 from stages.sfm.imported.orientation import fits_only_upright, pixel_map, stored_size
 from stages.sfm.imported.posed_photos import HINT, PosedPhoto, distinct, posed_photo, unusable, without_rays
 
-ORTHONORMAL_WITHIN = 1e-3  # largest entry of RᵀR − 1 that is rounding; beyond it a matrix means something else
-LARGEST_ENTRY = 1e6  # of a matrix that is looked at more closely: products of three of them are numbers
+# The root mean square stretch of a matrix beside its scale, as an angle, is about what its rotation is off by where the
+# numbers were rounded: 0.02° of three decimals, 0.2° of two. Beyond this a matrix is no rotation.
+MAX_STRETCH_DEG, NOTED_STRETCH_DEG = 0.05, 0.005
+SCALED_WITHIN = 1e-3  # of 1: what rounding makes of a rotation's scale
+MAX_ENTRY = 1e6  # of a matrix that is looked at more closely: products of three of them are numbers
 MOST_NAMES, FEW_NAMES = 5, 2
 APPROXIMATION = "approximation"  # how the note begins of a lens that is not the one it stands for
 
@@ -66,7 +69,7 @@ class KnownCameras:
 class _Framed(NamedTuple):
     photo: Photo
     frame: Mapping[str, Any]
-    values: Mapping[str, Any]  # of the frame, and of its file where the frame has none
+    values: Mapping[str, Any]  # of the frame, and of its file what the frame has none of
 
 
 def read_known_cameras(cameras: Path, photos: Sequence[Photo], frames: Mapping[str, str]) -> KnownCameras:
@@ -86,7 +89,7 @@ def read_known_cameras(cameras: Path, photos: Sequence[Photo], frames: Mapping[s
 def _from_transforms(cameras: Path, photos: Sequence[Photo], frames: Mapping[str, str]) -> KnownCameras:
     by_name = {photo.name: photo for photo in photos}
     framed: dict[str, _Framed] = {}
-    absent, test_files, approximate = [], [], 0
+    absent, repeated, test_files, approximate = [], [], [], 0
     unused: dict[str, Photo] = {}  # by file
     splits, notes = read_splits(cameras, lambda frame: frames.get(frame["file_path"]) in by_name)
     for where, content in splits:
@@ -101,21 +104,28 @@ def _from_transforms(cameras: Path, photos: Sequence[Photo], frames: Mapping[str
             if PurePosixPath(name) in in_no_split:
                 unused[file] = photo
                 continue
+            values = intrinsics_of(frame, content)
             if file in framed:
-                raise StageError(f"two frames for the photo {photo.name}", f"one is {name!r}", HINT)
-            values = {**content, **frame}
+                if {**values, "file_path": ""} != {**framed[file].values, "file_path": ""}:
+                    raise _two_frames(photo.name, framed[file].frame["file_path"], name)
+                repeated.append(name)
+                continue
             framed[file] = _Framed(photo, frame, values)
             approximate += str(values.get("note", "")).startswith(APPROXIMATION)
             if PurePosixPath(name) in held_out:
                 test_files.append(file)
         if held_out and not test_files:
             notes.append(none_among_the_photos(len(held_out), where))
+    if repeated:
+        notes.append(f"{len(repeated)} frames are listed twice, alike: {_few(repeated)}")
     if approximate:
         notes.append(f"the lenses of {approximate} frames are approximations, as their notes in the file say")
     if not framed:
         raise _nothing_matches(splits[0][0], absent, photos)
+    notes += _contradictions([content for _, content in splits], framed)
     upright = _are_of_upright_photos(framed.values())
-    posed = [_from_frame(framed[file], upright) for file in sorted(framed)]
+    posed, rotations = zip(*(_from_frame(framed[file], upright) for file in sorted(framed)), strict=True)
+    notes += _rounded_or_scaled({one.name: rotation for one, rotation in zip(posed, rotations, strict=True)})
     left_out = without_rays(posed)
     kept = [one for one in posed if one.file not in left_out]
     unposed = [photo.name for photo in photos if photo.image_name not in framed.keys() | unused.keys()]
@@ -131,6 +141,11 @@ def _from_transforms(cameras: Path, photos: Sequence[Photo], frames: Mapping[str
         test_files=kept_tests or None,
         notes=_notes(absent, unposed, posed, left_out) + notes,
     )
+
+
+def _two_frames(photo: str, first: str, second: str) -> StageError:
+    which = f"{first!r} is listed twice" if first == second else f"they are {first!r} and {second!r}"
+    return StageError(f"two frames for the photo {photo} differ", which, HINT)
 
 
 def _split(content: Mapping[str, Any], source: str, notes: list[str]) -> tuple[set[PurePosixPath], set[PurePosixPath]]:
@@ -163,6 +178,22 @@ def _listed(content: Mapping[str, Any], key: str, source: str, notes: list[str])
     return set(map(PurePosixPath, names))
 
 
+def _contradictions(files: Sequence[Mapping[str, Any]], framed: Mapping[str, _Framed]) -> list[str]:
+    """Notes on what files and frames say of a camera twice and not alike."""
+    size = next((one.photo.width, one.photo.height) for one in framed.values())
+    notes = [f"of all frames: {what}" for content in files for what in contradictions(content, *size)]
+    of_frames = {
+        one.frame["file_path"]: what
+        for one in framed.values()
+        if (what := contradictions(one.frame, *(one.values.get(s) or o for s, o in zip("wh", size, strict=True))))
+    }
+    if of_frames:
+        name, what = next(iter(of_frames.items()))
+        more = f" ({len(of_frames) - 1} more frames likewise)" if len(of_frames) > 1 else ""
+        notes.append(f"frame {name!r}: {'; '.join(what)}{more}")
+    return notes
+
+
 def _are_of_upright_photos(framed: Iterable[_Framed]) -> bool:
     """Whether the cameras are of photos that were turned upright first, as their shapes alone do not tell of half turns
     and squares: a frame names the photo beside the decoded, upright picture that its camera is of, as in our own
@@ -184,13 +215,21 @@ def _given_camera(framed: _Framed, upright: bool) -> Camera:
         raise unusable(f"the camera of frame {framed.frame['file_path']!r}", str(error)) from error
 
 
-def _from_frame(framed: _Framed, upright: bool) -> PosedPhoto:
+class _Rotation(NamedTuple):
+    """The rotation nearest to a matrix, by which it ``scales``, and the ``stretch_deg`` that is left."""
+
+    matrix: Float[np.ndarray, "3 3"]
+    scale: float
+    stretch_deg: float
+
+
+def _from_frame(framed: _Framed, upright: bool) -> tuple[PosedPhoto, _Rotation]:
     name = framed.frame["file_path"]
-    pose = _pose(framed.frame["transform_matrix"], name)
-    return posed_photo(framed.photo, name, _given_camera(framed, upright), pose, upright)
+    pose, rotation = _pose(framed.frame["transform_matrix"], name)
+    return posed_photo(framed.photo, name, _given_camera(framed, upright), pose, upright), rotation
 
 
-def _pose(matrix: Any, name: str) -> Float[np.ndarray, "3 4"]:
+def _pose(matrix: Any, name: str) -> tuple[Float[np.ndarray, "3 4"], _Rotation]:
     """world_from_camera with OpenCV axes, from a matrix as written in a transforms file."""
     try:
         pose = pose_matrix(matrix)
@@ -199,19 +238,37 @@ def _pose(matrix: Any, name: str) -> Float[np.ndarray, "3 4"]:
     if (place := np.abs(pose[:, 3]).max()) > FARTHEST:
         why = f"its place is {place:.3g} units from the origin, and the most is {FARTHEST:g}"
         raise unusable(f"the transform_matrix of frame {name!r}", why)
-    rotation = pose[:, :3]
-    if not np.abs(rotation).max() <= LARGEST_ENTRY:
-        raise unusable(
-            f"the transform_matrix of frame {name!r}", f"it is no rotation: {np.abs(rotation).max():.3g} is in it"
-        )
-    if (determinant := np.linalg.det(rotation)) < 0:
+    if not (largest := np.abs(pose[:, :3]).max()) <= MAX_ENTRY:
+        raise unusable(f"the transform_matrix of frame {name!r}", f"it is no rotation: {largest:.3g} is in it")
+    if np.linalg.det(pose[:, :3]) < 0:
         raise unusable(f"the transform_matrix of frame {name!r}", "it mirrors (its determinant is negative)")
-    off = np.abs(rotation.T @ rotation - np.eye(3)).max()
-    if not off <= ORTHONORMAL_WITHIN:
-        why = f"it is no rotation: RᵀR is off by {off:.2g}, and it scales by {np.cbrt(determinant):.4g}"
+    rotation = _nearest_rotation(pose[:, :3])
+    if not rotation.stretch_deg <= MAX_STRETCH_DEG:
+        why = (
+            f"it is no rotation: its axes are off by {rotation.stretch_deg:.2g}°, and it scales by {rotation.scale:.4g}"
+        )
         raise unusable(f"the transform_matrix of frame {name!r}", why)
-    u, _, vt = np.linalg.svd(rotation)
-    return np.concatenate([u @ vt @ OPENGL_FROM_OPENCV, pose[:, 3:]], axis=1)
+    return np.concatenate([rotation.matrix @ OPENGL_FROM_OPENCV, pose[:, 3:]], axis=1), rotation
+
+
+def _nearest_rotation(matrix: Float[np.ndarray, "3 3"]) -> _Rotation:
+    """By singular values (Schönemann 1966); infinitely stretched where one of them is 0."""
+    u, stretch, vt = np.linalg.svd(matrix)
+    scale = float(np.cbrt(stretch.prod()))
+    off = np.degrees(np.sqrt(np.mean((stretch / scale - 1) ** 2))) if scale > 0 else np.inf
+    return _Rotation(u @ vt, scale, float(off))
+
+
+def _rounded_or_scaled(rotations: Mapping[str, _Rotation]) -> list[str]:
+    """Notes on matrices, by their frames' names, that are not rotations as they stand."""
+    notes = []
+    if rounded := {name: r.stretch_deg for name, r in rotations.items() if r.stretch_deg > NOTED_STRETCH_DEG}:
+        off = f"off by up to {max(rounded.values()):.2g}°"
+        notes.append(f"the rotations of {len(rounded)} frames are rounded, {off}: {_few(list(rounded))}")
+    if scaled := {name: r.scale for name, r in rotations.items() if abs(r.scale - 1) > SCALED_WITHIN}:
+        by = " to ".join(f"{scale:.4g}" for scale in sorted({min(scaled.values()), max(scaled.values())}))
+        notes.append(f"the matrices of {len(scaled)} frames scale by {by}, which is left out: {_few(list(scaled))}")
+    return notes
 
 
 # --- COLMAP models
@@ -243,6 +300,8 @@ def _from_colmap(folder: Path, photos: Sequence[Photo]) -> KnownCameras:
     )
     if others := [pair for one in kept.values() if (pair := _other_ending(one.name, one.photo))]:
         notes.append(f"{len(others)} photos have the cameras of files with another ending: {_few(others)}")
+    if not len(given.xyz):
+        notes.append("the model has no points: near and far are taken from where its cameras stand and look")
     if behind:
         notes.append(f"{behind} observations of points behind their cameras are left out")
     return KnownCameras(model, left_out, None, notes)

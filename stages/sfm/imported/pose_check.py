@@ -19,12 +19,12 @@ import numpy as np
 from jaxtyping import Float
 
 from stages.sfm.pairs.pair_selection import Pairs, closeness, nearest
-from stages.sfm.process import environment
+from stages.sfm.worker_process import environment
 
 if TYPE_CHECKING:
     from stages.io.photos import Photo
 
-CHILD = ["-P", "-m", "stages.sfm.imported.pose_check"]
+COMMAND = ["-P", "-m", "stages.sfm.imported.pose_check"]
 MAX_IMAGE_SIZE, MAX_FEATURES = 1000, 2000  # enough to tell a step of a few pixels, in seconds for hundreds of photos
 PARTNERS = 6  # of each photo
 TURN_DEG = 30.0  # two photos whose axes differ by so much count as far apart as two whose centres are usual neighbours
@@ -40,7 +40,7 @@ def check_given_cameras(photos: "Sequence[Photo]", images: Path, folder: Path) -
     job = {"photos": [asdict(photo) for photo in photos], "images": str(images.absolute()), "folder": str(folder)}
     with (folder / "sfm.log").open("ab") as log:
         answer = subprocess.run(
-            [sys.executable, *CHILD],
+            [sys.executable, *COMMAND],
             input=json.dumps(job).encode() + b"\n",
             stdout=subprocess.PIPE,
             stderr=log,

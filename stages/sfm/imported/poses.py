@@ -29,11 +29,11 @@ def import_cameras(
     judged = check.pop("images", {}) if check else {}
     unknown = {"agreement": None, "transfer_px": None}
     return {
-        "attempts": [],
+        "strategies": [],
         "repeated_structure": None,
         "match_graph": None,
         "check": check,
-        "second_opinion": None,
+        "global_mapping": None,
         "images": [
             image | {"uncertainty_px": None} | judged.get(image["file"], unknown) for image in known.account(photos)
         ],

@@ -81,8 +81,8 @@ class IndexedFeatures:
     """The descriptors of a photo, sorted by the cell of a vocabulary that they fall into.
 
     Row k is feature ``feature[k]``; rows ``begins[c]`` to ``begins[c + 1]`` fall into cell c. Rows
-    ``probing[probe_begins[c]:probe_begins[c + 1]]`` have cell c among their PROBES nearest; it is their
-    ``probe``-th entry there.
+    ``probing[probe_begins[c]:probe_begins[c + 1]]`` have cell c among their PROBES nearest; it is their ``probe``-th
+    entry there.
     """
 
     feature: Int[np.ndarray, "features"]

@@ -1,8 +1,8 @@
 """The match graph: photos, and between them the pairs that were matched and verified. Which pairs to try next.
 
-Verification is the only judge of a pair. It starts with neighbours in order and photos that look alike, and goes on to
-where verified pairs point: to photos whose verified neighbours are the same, to photos with few verified pairs, and
-across the graph's weakest places, until every photo has been tried with enough others.
+Only verification decides about a pair. It starts with neighbours in order and similar photos, and goes on to where
+verified pairs point: to photos whose verified neighbours are the same, to photos with few verified pairs, and across
+the graph's weak cuts, until every photo has been tried with enough others.
 
 ``inliers`` is symmetric: the verified matches of each pair, 0 where a pair failed, UNTESTED where it was not tried.
 """
@@ -13,20 +13,20 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from stages.sfm.pairs.pair_selection import Likeness, Pairs, spanning_tree, union
+from stages.sfm.pairs.pair_selection import Pairs, SimilarityMatrix, spanning_tree, union
 
 if TYPE_CHECKING:
     from stages.io.photos import Photo
 
 UNTESTED = -1
 MIN_INLIERS = 30  # verified matches from which on a pair links two photos; mapping asks a photo for as many
-SATURATED = 400  # verified matches; a pair with more says no more about which photos look at the same things
+MAX_COUNTED_INLIERS = 400  # verified matches; a pair with more says no more about which photos look at the same things
 ORDER_OVERLAP = 5  # photos before and after each in the order of names or time that are tried with it
-PER_ROUND = 4  # untested partners of each photo that are tried in a round
+MAX_NEW_PARTNERS = 4  # untested partners of each photo that are tried in a round
 MIN_OVERLAP = 0.05  # cosine of two photos' verified neighbours, from which on it is worth trying the pair
 MIN_YIELD = 0.25  # share of a round's pairs that must turn out as links for another round
-ROUNDS = 8
-WEAK_CUT = 3  # links between two parts of the graph that are as good as none: tried pairs across are added
+MAX_GROWTH_ROUNDS = 8
+MAX_WEAK_CUT_EDGES = 3  # of links across a cut that is weak: untested pairs across it are added
 
 
 def inlier_matrix(count: int, pairs: Pairs, inliers: Int[np.ndarray, "pairs"]) -> Int[np.ndarray, "photos photos"]:
@@ -36,16 +36,16 @@ def inlier_matrix(count: int, pairs: Pairs, inliers: Int[np.ndarray, "pairs"]) -
     return matrix
 
 
-def in_order(order: Int[np.ndarray, "photos"], first: int, last: int) -> Pairs:
-    """Photos that are ``first`` to ``last`` steps apart in ``order``."""
+def pairs_apart(order: Int[np.ndarray, "photos"], first: int, last: int) -> Pairs:
+    """Photos that are ``first`` to ``last`` positions apart in ``order``."""
     steps = range(first, min(last, len(order) - 1) + 1)
     return union(*(np.stack([order[:-step], order[step:]], axis=1) for step in steps))
 
 
-def order_tells(order: Int[np.ndarray, "photos"], inliers: Int[np.ndarray, "photos photos"]) -> bool:
-    """Whether photos next to each other in ``order`` share as many verified matches as those that look most alike.
+def order_is_informative(order: Int[np.ndarray, "photos"], inliers: Int[np.ndarray, "photos photos"]) -> bool:
+    """Whether photos next to each other in ``order`` share as many verified matches as the most similar ones.
 
-    In a shuffled set they share what any two photos do, and there is no use in trying more of them.
+    In a shuffled set they share what any two photos do, and trying more of them is useless.
     """
     beside = inliers[order[:-1], order[1:]]
     tested = np.where(inliers < 0, 0, inliers)
@@ -53,28 +53,28 @@ def order_tells(order: Int[np.ndarray, "photos"], inliers: Int[np.ndarray, "phot
     return bool(np.median(beside) >= np.median(tested.max(axis=1)) / 2) if len(order) > 1 else False
 
 
-def next_pairs(inliers: Int[np.ndarray, "photos photos"], similarity: Likeness, neighbours: int) -> Pairs:
+def next_pairs(inliers: Int[np.ndarray, "photos photos"], similarity: SimilarityMatrix, neighbours: int) -> Pairs:
     """Untested pairs for the next round, none where the graph is saturated.
 
-    Two photos with the same verified neighbours see the same things. Photos with few links ask by similarity as well,
-    and so do the parts on either side of a weak place.
+    Two photos with the same verified neighbours see the same things. Photos with few links are tried with their most
+    similar ones as well, and so are both sides of a weak cut.
     """
     tested = (inliers >= 0).sum(axis=1)
-    room = np.clip(neighbours - tested, 0, PER_ROUND)
+    allowed = np.clip(neighbours - tested, 0, MAX_NEW_PARTNERS)
     overlap = np.where(inliers == UNTESTED, neighbour_overlap(inliers), -np.inf)
     np.fill_diagonal(overlap, -np.inf)
-    by_overlap = _best_partners(np.where(overlap >= MIN_OVERLAP, overlap, -np.inf), room)
+    by_overlap = _best_partners(np.where(overlap >= MIN_OVERLAP, overlap, -np.inf), allowed)
     links = (inliers >= MIN_INLIERS).sum(axis=1)
-    lonely = np.where(links < PER_ROUND, PER_ROUND, 0)
+    few_links = np.where(links < MAX_NEW_PARTNERS, MAX_NEW_PARTNERS, 0)
     untested = np.where(inliers == UNTESTED, similarity.astype(float), -np.inf)
     np.fill_diagonal(untested, -np.inf)
-    return union(by_overlap, _best_partners(untested, lonely), across_weak_cuts(inliers, untested))
+    return union(by_overlap, _best_partners(untested, few_links), across_weak_cuts(inliers, untested))
 
 
 def neighbour_overlap(inliers: Int[np.ndarray, "photos photos"]) -> Float[np.ndarray, "photos photos"]:
     """The cosine between any two photos' rows of verified matches, saturated, each photo its own best neighbour."""
-    weight = np.sqrt(np.clip(np.where(inliers >= MIN_INLIERS, inliers, 0), 0, SATURATED).astype(float))
-    np.fill_diagonal(weight, np.sqrt(SATURATED))
+    weight = np.sqrt(np.clip(np.where(inliers >= MIN_INLIERS, inliers, 0), 0, MAX_COUNTED_INLIERS).astype(float))
+    np.fill_diagonal(weight, np.sqrt(MAX_COUNTED_INLIERS))
     length = np.linalg.norm(weight, axis=1)
     return weight @ weight.T / (length[:, None] * length[None])
 
@@ -88,11 +88,11 @@ def _best_partners(score: Float[np.ndarray, "photos photos"], each: Int[np.ndarr
     return union(np.stack([first, order[first, place]], axis=1))
 
 
-# --- weak places
+# --- weak cuts
 
 
 class Cuts(NamedTuple):
-    """Parts of a graph and what holds each to the rest: how many edges, and their weight together."""
+    """Cuts of a graph: how many edges go across, and their total weight."""
 
     side: Bool[np.ndarray, "cuts photos"]  # the smaller one
     edges: Int[np.ndarray, "cuts"]
@@ -100,11 +100,10 @@ class Cuts(NamedTuple):
 
 
 def weak_cuts(weight: Float[np.ndarray, "photos photos"]) -> Cuts:
-    """For each edge of the maximum spanning forest: the part that would come off without it and others beside it.
+    """For each edge of the maximum spanning forest: the cut between the two trees that are left without it.
 
-    ``weight`` is symmetric, 0 where there is no edge. Groups that hardly connect to the rest are among these parts,
-    since within a group edges are heavier than across (single linkage). Parts that are not connected at all come as
-    cuts without edges.
+    ``weight`` is symmetric, 0 where there is no edge. Groups that hardly connect to the rest are on one side of such a
+    cut, since within a group edges are heavier than across (single linkage). Components come as cuts without edges.
     """
     from scipy.sparse import csr_matrix
     from scipy.sparse.csgraph import breadth_first_order
@@ -139,12 +138,12 @@ def connected(edges: Bool[np.ndarray, "photos photos"]) -> Int[np.ndarray, "phot
 
 
 def across_weak_cuts(inliers: Int[np.ndarray, "photos photos"], untested: Float[np.ndarray, "photos photos"]) -> Pairs:
-    """The most similar untested pairs across the graph's weak places, a few for each photo on the smaller side."""
+    """The most similar untested pairs across the graph's weak cuts, a few for each photo on the smaller side."""
     found = [np.zeros((0, 2), int)]
     cuts = weak_cuts(np.where(inliers >= MIN_INLIERS, inliers, 0).astype(float))
-    for side in cuts.side[cuts.edges <= WEAK_CUT]:
+    for side in cuts.side[cuts.edges <= MAX_WEAK_CUT_EDGES]:
         across = np.where(side[:, None] & ~side[None], untested, -np.inf)
-        each = np.where(side, PER_ROUND, 0)
+        each = np.where(side, MAX_NEW_PARTNERS, 0)
         found.append(_best_partners(across, each))
     return union(*found)
 
@@ -160,7 +159,7 @@ def natural_order(names: Sequence[str]) -> Int[np.ndarray, "photos"]:
     return np.array(sorted(range(len(names)), key=lambda i: (key(names[i]), names[i])), int)
 
 
-def possible_orders(photos: "Sequence[Photo]") -> list[np.ndarray]:
+def candidate_orders(photos: "Sequence[Photo]") -> list[np.ndarray]:
     """The orders in which the photos may have been taken: of their times, where all are known, and of their names,
     where that is another."""
     by_name = natural_order([photo.name for photo in photos])

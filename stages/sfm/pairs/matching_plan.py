@@ -19,7 +19,7 @@ from stages.contract import Progress, StageError
 from stages.hardware.device import processors
 from stages.io.amounts import rough_duration
 from stages.io.photos import evenly_spread
-from stages.sfm.process import environment
+from stages.sfm.worker_process import environment
 
 if TYPE_CHECKING:
     from stages.io.photos import Photo
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from stages.sfm.pairs.pair_selection import Places
 
 FEWEST_MEASURED = 4
-CHILD = ["-P", "-m", "stages.sfm.pairs.matching_plan"]
+COMMAND = ["-P", "-m", "stages.sfm.pairs.matching_plan"]
 WAYS = {
     "sequential": "neighbours in time, up to {} each",
     "spatial": "neighbours by GPS position and similarity, up to {} each",
@@ -154,7 +154,7 @@ def _measured(photos: "Sequence[Photo]", images: Path, tier: Tier, matcher: "Mat
     indexed = matcher != "exhaustive"
     job = json.dumps({"images": str(images.absolute()), "photos": some, "indexed": indexed, **tier._asdict()})
     answer = subprocess.run(
-        [sys.executable, *CHILD], input=job.encode(), capture_output=True, env=environment(), start_new_session=True
+        [sys.executable, *COMMAND], input=job.encode(), capture_output=True, env=environment(), start_new_session=True
     )
     if answer.returncode:
         lines = answer.stderr.decode("utf-8", "replace").strip().splitlines()

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from stages.sfm import Matcher
 
 Pairs = Int[np.ndarray, "pairs 2"]
-Likeness = Float[np.ndarray, "photos photos"]
+SimilarityMatrix = Float[np.ndarray, "photos photos"]
 
 # Matching every pair misses nothing, but most pairs of many photos show nothing in common. On sets of up to so many it
 # is done, exactly; on larger ones the match graph is grown (match_graph.py).
@@ -64,7 +64,7 @@ def sequential(order: Int[np.ndarray, "photos"], overlap: int) -> Pairs:
     return union(*(np.stack([order[:-step], order[step:]], axis=1) for step in steps))
 
 
-def nearest(similarity: Likeness, neighbours: int) -> Pairs:
+def nearest(similarity: SimilarityMatrix, neighbours: int) -> Pairs:
     """Each photo with its ``neighbours`` most similar; ties go to the lower number."""
     count = len(similarity)
     others = np.where(np.eye(count, dtype=bool), -np.inf, similarity)
@@ -72,7 +72,7 @@ def nearest(similarity: Likeness, neighbours: int) -> Pairs:
     return union(np.stack([np.repeat(np.arange(count), partners.shape[1]), partners.reshape(-1)], axis=1))
 
 
-def spanning_tree(similarity: Likeness) -> Pairs:
+def spanning_tree(similarity: SimilarityMatrix) -> Pairs:
     """The pairs of largest similarity that connect all photos (Prim 1957)."""
     count = len(similarity)
     best, parent = similarity[0].astype(float), np.zeros(count, int)
@@ -88,7 +88,7 @@ def spanning_tree(similarity: Likeness) -> Pairs:
     return union(np.array(pairs, int).reshape(-1, 2))
 
 
-def spatial(position_m: Float[np.ndarray, "photos 3"], similarity: Likeness, neighbours: int) -> Pairs:
+def spatial(position_m: Float[np.ndarray, "photos 3"], similarity: SimilarityMatrix, neighbours: int) -> Pairs:
     """Each photo with its ``neighbours``: half of them nearest by place, the others its most similar among the rest.
 
     Positions may be off by more than photos are apart, or the same for dozens of them: looks make up for that.
@@ -118,13 +118,13 @@ def cartesian(
     return np.stack([around * np.cos(lam), around * np.sin(lam), (flat * normal + height) * np.sin(phi)], axis=1)
 
 
-def closeness(position_m: Float[np.ndarray, "n 3"]) -> Likeness:
+def closeness(position_m: Float[np.ndarray, "n 3"]) -> SimilarityMatrix:
     """Minus the distance between any two positions, in metres."""
     return -np.sqrt(sum((axis[:, None] - axis[None]) ** 2 for axis in position_m.T))
 
 
 def start_pairs(
-    matcher: "Matcher", neighbours: int, count: int, places: Places, similarity: Callable[[], Likeness]
+    matcher: "Matcher", neighbours: int, count: int, places: Places, similarity: Callable[[], SimilarityMatrix]
 ) -> Pairs:
     """The pairs that matching begins with. ``similarity`` is asked for only where it is needed.
 
@@ -146,7 +146,9 @@ def start_pairs(
     return union(sequential(order, overlap), nearest(np.where(apart, similarity(), -np.inf), loops))
 
 
-def second_look(pairs: Pairs, missing: Sequence[int], neighbours: int, similarity: Callable[[], Likeness]) -> Pairs:
+def second_look(
+    pairs: Pairs, missing: Sequence[int], neighbours: int, similarity: Callable[[], SimilarityMatrix]
+) -> Pairs:
     """The pairs again, and more for photos that found no place: as many as were matched already, at most all.
 
     They go to each missing photo's most similar ones, and are at least twice as many as it had.

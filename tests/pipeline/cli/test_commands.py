@@ -13,8 +13,8 @@ import pytest
 from PIL import Image
 
 from pipeline.cli.commands import run_command
-from pipeline.cli.settings import Settings
 from pipeline.engine.runner import Runner
+from pipeline.engine.settings import Settings
 from pipeline.engine.workspace import default_workspace
 from stages.contract import StageError
 

@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 from pipeline.cli.commands import run_command
-from pipeline.cli.display import Display, PlainDisplay, choose_display, end_line
+from pipeline.cli.display import PlainDisplay, choose_display, end_line
+from pipeline.engine.display import Display
 from stages.contract import StageError
 
 

@@ -8,7 +8,8 @@ from PIL import Image
 
 from pipeline.cli.arguments import RunArguments, StageArguments, parse
 from pipeline.cli.commands import run_command
-from pipeline.cli.settings import Settings, UsageError, read_toml, with_effects
+from pipeline.cli.settings import UsageError, read_toml, with_effects
+from pipeline.engine.settings import Settings
 from stages.effects import Config
 from stages.render import Config as RenderConfig
 from stages.train import Config as TrainConfig

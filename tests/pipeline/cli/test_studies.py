@@ -7,8 +7,8 @@ import pytest
 from PIL import Image
 
 from pipeline.cli.commands import run_command
-from pipeline.cli.settings import Settings
 from pipeline.engine import stage_list as chain
+from pipeline.engine.settings import Settings
 
 
 def test_a_study_is_asked_for_by_its_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -11,8 +11,8 @@ from nerf.geometry.scene import Camera
 from nerf.synthetic.scenes import still_life
 from pipeline import demo
 from pipeline.cli.commands import command_demo, run_command
-from pipeline.cli.settings import Settings
 from pipeline.demo.truth import Truth
+from pipeline.engine.settings import Settings
 from stages.contract import StageError
 from stages.sfm.colmap.cameras import camera_rays
 from tests.synthetic_photos import SyntheticPhotos

@@ -6,9 +6,10 @@ import pytest
 
 from pipeline import doctor
 from pipeline.cli import commands as cli
-from pipeline.doctor import machine, selftest
+from pipeline.doctor import selftest
 from pipeline.doctor.numerics import matrix
 from pipeline.doctor.numerics.matrix import CASES
+from pipeline.engine import machine
 
 
 def test_every_formula_has_a_line_for_each_backend(capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,8 +8,8 @@ import pytest
 from PIL import Image
 
 from pipeline.cli.commands import run_command
-from pipeline.cli.display import SilentDisplay
-from pipeline.cli.failures import StageFailed
+from pipeline.engine.display import SilentDisplay
+from pipeline.engine.failures import StageFailed
 from pipeline.engine.runner import Runner
 from pipeline.engine.workspace import Workspace
 from stages.contract import StageError

@@ -8,9 +8,9 @@ import pytest
 from PIL import Image
 
 from pipeline.cli.commands import run_command
-from pipeline.cli.display import SilentDisplay
-from pipeline.cli.settings import Settings
+from pipeline.engine.display import SilentDisplay
 from pipeline.engine.runner import Runner
+from pipeline.engine.settings import Settings
 from pipeline.engine.workspace import COPIES, Workspace, is_result, lasting
 from stages.sfm import Config as SfmConfig
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from pipeline.cli.display import SilentDisplay
-from pipeline.cli.failures import StageFailed
 from pipeline.engine import status
+from pipeline.engine.display import SilentDisplay
+from pipeline.engine.failures import StageFailed
 from pipeline.engine.job import NotReady
 from pipeline.engine.runner import Runner
 from pipeline.engine.workspace import Workspace

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 from pydantic import BaseModel
 
-from pipeline.cli.display import SilentDisplay
+from pipeline.engine.display import SilentDisplay
 from pipeline.engine.runner import Runner
 from pipeline.engine.workspace import RUN_FILE, Workspace
 from pipeline.schedule.budget import SHARES, Budget, reading_seconds

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from PIL import Image
 
-from pipeline.cli.failures import StageFailed
+from pipeline.engine.failures import StageFailed
 from pipeline.schedule.budget import LEAST_SECONDS, Budget, allotted, least_total, reading_seconds, training_seconds
 from stages.hardware.device import processors
 from stages.io.files import read_json

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipeline.cli.settings import Settings
 from pipeline.engine import manifests
 from pipeline.engine.manifests import Manifest
+from pipeline.engine.settings import Settings
 from pipeline.engine.stage_list import usual
 from pipeline.schedule import forecast
 from pipeline.schedule.budget import BESIDE_PILOTS, Budget

@@ -50,8 +50,8 @@ def test_a_photo_is_found_in_another_spelling(tmp_path: Path, written: str, ther
     ],
 )
 def test_nothing_is_guessed(tmp_path: Path, written: str, there: list[str]) -> None:
-    source = find_source(transforms(touch(tmp_path, *there) / "transforms.json", written))
-    assert names(source) == [written]
+    touch(tmp_path, "another.jpg", *there)
+    assert written in names(find_source(transforms(tmp_path / "transforms.json", written, "another.jpg")))
 
 
 def test_a_file_of_the_very_name_goes_first(tmp_path: Path) -> None:
@@ -62,7 +62,7 @@ def test_a_file_of_the_very_name_goes_first(tmp_path: Path) -> None:
 def test_another_spelling_leads_out_of_the_folder_no_more_than_the_name(tmp_path: Path) -> None:
     touch(tmp_path, "secret.jpg", "set/b.jpg")
     (tmp_path / "set/a.JPG").symlink_to(tmp_path / "secret.jpg")
-    error = refusal(transforms(tmp_path / "set/transforms.json", "a.jpg"))
+    error = refusal(transforms(tmp_path / "set/transforms.json", "a.jpg", "b.jpg"))
     assert error.what == "refused the photo 'a.JPG'"
 
 
@@ -75,6 +75,47 @@ def test_a_linked_folder_of_photos_may_be_given_apart_from_its_cameras(tmp_path:
         assert names(find_source(tmp_path / photos, cameras)) == ["a.jpg"]
     (tmp_path / "disk/images/b.jpg").symlink_to(tmp_path / "secret.jpg")
     assert refusal(tmp_path / "set", transforms(cameras, "images/b.jpg")).what == "refused the photo 'images/b.jpg'"
+
+
+@pytest.mark.parametrize(
+    "prefix",
+    [
+        "/content/drive/MyDrive/set/images/",
+        "C:\\Users\\me\\set\\Images\\",
+        "\\\\server\\share\\",
+        "../../images/",
+        "old/",
+    ],
+)
+def test_paths_of_another_machine_are_matched_by_their_ends(tmp_path: Path, prefix: str) -> None:
+    touch(tmp_path, "photos/left/0.jpg", "photos/right/0.jpg", "photos/right/ONE.JPG")
+    written = [prefix + name for name in ("left/0.jpg", "right/0.jpg", "right/one")]
+    source = find_source(tmp_path / "photos", transforms(tmp_path / "cameras/transforms.json", *written))
+    assert list(source.frames.values()) == ["left/0.jpg", "right/0.jpg", "right/ONE.JPG"]
+
+
+def test_an_absolute_path_may_lie_in_the_folder(tmp_path: Path) -> None:
+    touch(tmp_path, "images/0.jpg", "other/0.jpg")
+    source = find_source(transforms(tmp_path / "transforms.json", str(tmp_path / "other/0.jpg"), "images/0.jpg"))
+    assert names(source) == ["images/0.jpg", "other/0.jpg"]
+
+
+def test_a_missing_photo_is_not_replaced_by_one_of_the_same_name(tmp_path: Path) -> None:
+    touch(tmp_path, "left/0.jpg", "left/1.jpg", "old/1.jpg")
+    assert "right/1.jpg" in names(find_source(transforms(tmp_path / "transforms.json", "left/0.jpg", "right/1.jpg")))
+
+
+def test_ends_that_two_photos_share_tell_nothing(tmp_path: Path) -> None:
+    touch(tmp_path, "a/0.jpg", "b/0.jpg")
+    error = refusal(transforms(tmp_path / "transforms.json", "elsewhere/0.jpg"))
+    assert "none of the 1 photos" in error.what and "elsewhere/0.jpg" in error.why and "a/0.jpg" in error.why
+
+
+def test_an_end_leads_to_nothing_outside(tmp_path: Path) -> None:
+    touch(tmp_path, "secret.jpg", "set/b.jpg")
+    (tmp_path / "set/c.jpg").symlink_to(tmp_path / "secret.jpg")
+    for name in ("/home/me/secret.jpg", "/home/me/c.jpg"):
+        assert refusal(transforms(tmp_path / "set/transforms.json", "b.jpg", name)).what.startswith("refused the photo")
 
 
 def test_masks_of_transforms_files_are_found_in_another_spelling(tmp_path: Path) -> None:

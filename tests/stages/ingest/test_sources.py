@@ -139,12 +139,20 @@ def test_the_account_of_a_model_of_ours_says_what_its_cameras_are(tmp_path: Path
     assert [file.name for file in camera_files(other)] == COLMAP
 
 
-def test_several_colmap_models_are_listed_never_guessed(tmp_path: Path) -> None:
-    touch(tmp_path, "photos/a.jpg", *(f"m/sparse/{index}/{name}" for index in (0, 1) for name in COLMAP))
+def test_of_several_colmap_models_the_largest_that_fits_is_recommended(tmp_path: Path) -> None:
+    touch(
+        tmp_path, "photos/a.jpg", "photos/b.jpg", *(f"m/sparse/{index}/{name}" for index in (0, 1) for name in COLMAP)
+    )
+    touch(tmp_path, *(f"m/sparse/2/{name}.txt" for name in ("cameras", "points3D")))
+    poses = [f"{i} 1 0 0 0 0 0 0 1 {name}\n" for i, name in enumerate(("b.jpg", "other.jpg", "another.jpg"), 1)]
+    (tmp_path / "m/sparse/2/images.txt").write_text("\n".join(poses))
+    (touch(tmp_path, "m/sparse/3/cameras.txt") / "m/sparse/3/images.txt").write_text(
+        "1 1 0 0 0 0 0 0 1 a.jpg\n\n2 1 0 0 0 0 0 0 1 b.jpg\n"
+    )
     error = refusal(tmp_path / "photos", tmp_path / "m")
-    assert error.what == f"2 COLMAP models in {tmp_path}/m"
-    assert error.why == "sparse/0, sparse/1: which one is meant is not clear"
-    assert error.hint == f"Give one of them: --cameras {tmp_path}/m/sparse/0"
+    assert error.what == f"4 COLMAP models in {tmp_path}/m"
+    assert "sparse/0 with 0, sparse/1 with 0, sparse/2 with 1, sparse/3 with 2" in error.why
+    assert error.hint == f"Give the one with most: --cameras {tmp_path}/m/sparse/3"
 
 
 def test_an_export_of_ours_finds_the_photos_by_their_own_names(tmp_path: Path) -> None:
@@ -327,7 +335,7 @@ def test_a_transforms_file_may_name_masks_which_go_before_others(tmp_path: Path,
 )
 def test_masks_may_not_leave_their_folder(mask: object, words: str, tmp_path: Path) -> None:
     frame = {"file_path": "a.jpg", "mask_path": mask, "transform_matrix": []}
-    (tmp_path / "transforms.json").write_text(json.dumps({"frames": [frame]}))
+    (touch(tmp_path, "a.jpg") / "transforms.json").write_text(json.dumps({"frames": [frame]}))
     assert words in str(refusal(tmp_path / "transforms.json"))
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from stages import report
 from stages.io.files import write_json
-from stages.report.cameras import MAX_SHOWN, camera_report, doubtful_files, order_tells
+from stages.report.cameras import MAX_SHOWN, camera_report, doubtful_files, order_is_informative
 from tests.stages.report.report_workspace import make_workspace, written
 
 PHOTOS = 60
@@ -20,12 +20,20 @@ def files(count: int) -> list[str]:
 
 
 def check(**changed: Any) -> dict[str, Any]:
-    agree = {"pairs": 800, "agreeing": 780, "error_px": 0.25, "tolerance_px": 0.75, "doubtful": [], "weak_links": []}
+    agree = {
+        "pairs": 800,
+        "agreeing": 780,
+        "error_px": 0.25,
+        "tolerance_px": 0.75,
+        "doubtful": [],
+        "weak_links": [],
+        "sequence_breaks": [],
+    }
     return agree | changed
 
 
 def opinion(**changed: Any) -> dict[str, Any]:
-    agree = {"photos": PHOTOS, "agree": PHOTOS, "elsewhere": [], "centre": 0.0006, "degrees": 0.02, "failed": None}
+    agree = {"photos": PHOTOS, "agree": PHOTOS, "different": [], "centre": 0.0006, "degrees": 0.02, "failed": None}
     return agree | changed
 
 
@@ -37,11 +45,11 @@ def weak(*counts: int) -> list[dict[str, Any]]:
 def registration(**changed: Any) -> dict[str, Any]:
     images = [{"file": file, "registered": True, "reason": None} for file in files(PHOTOS)]
     whole = {"source": "sfm", "photos": PHOTOS, "registered": PHOTOS, "images": images, "repeated_structure": None}
-    return whole | {"check": check(), "second_opinion": opinion()} | changed
+    return whole | {"check": check(), "global_mapping": opinion()} | changed
 
 
 def excluded(count: int) -> list[dict[str, Any]]:
-    reason = "its place is contradicted by 90 of its 99 verified matches with other photos"
+    reason = "its pose is contradicted by 90 of its 99 verified matches with other photos"
     return [{"file": file, "registered": False, "reason": reason} for file in files(count)]
 
 
@@ -58,12 +66,12 @@ def test_cameras_that_agree_are_said_to_with_figures() -> None:
         ({"images": excluded(4)}, 1),
         ({"check": check(agreeing=399)}, 0),
         ({"check": check(weak_links=weak(2))}, 1),
-        ({"check": check(row_breaks=[[file, file] for file in files(4)])}, 1),
+        ({"check": check(sequence_breaks=[[file, file] for file in files(4)])}, 1),
         ({"check": check(weak_links=[{"photos": [file], "pairs": 1, "matches": 9} for file in files(4)])}, 1),
-        ({"second_opinion": opinion(elsewhere=files(4))}, 1),
-        ({"check": None, "second_opinion": opinion(elsewhere=files(4))}, 1),
+        ({"global_mapping": opinion(different=files(4))}, 1),
+        ({"check": None, "global_mapping": opinion(different=files(4))}, 1),
         ({"repeated_structure": {"photos": files(2), "others": files(9)}}, 2),
-        ({"repeated_structure": {"group": 1, "shared": 9, "elsewhere": 5}, "check": None, "second_opinion": None}, 0),
+        ({"repeated_structure": {"photos": files(2), "others": files(9)}, "check": None, "global_mapping": None}, 2),
     ],
 )  # fmt: skip
 def test_each_kind_of_doubt_makes_the_cameras_doubtful(changed: dict[str, Any], groups: int) -> None:
@@ -77,9 +85,9 @@ def test_each_kind_of_doubt_makes_the_cameras_doubtful(changed: dict[str, Any], 
         ({"check": check(doubtful=files(3))}, 1),
         ({"check": check(agreeing=400)}, 0),
         ({"check": check(weak_links=weak(1))}, 1),
-        ({"check": check(row_breaks=[[file, file] for file in files(3)])}, 1),
-        ({"second_opinion": opinion(elsewhere=files(3))}, 0),
-        ({"second_opinion": {"failed": "global mapping found no model"}}, 0),
+        ({"check": check(sequence_breaks=[[file, file] for file in files(3)])}, 1),
+        ({"global_mapping": opinion(different=files(3))}, 0),
+        ({"global_mapping": {"failed": "global mapping found no model"}}, 0),
     ],
 )
 def test_single_photos_are_shown_and_cast_no_doubt(changed: dict[str, Any], groups: int) -> None:
@@ -98,17 +106,17 @@ def test_many_weak_links_are_shown_largest_first_and_the_rest_together() -> None
 
 
 @pytest.mark.parametrize("second", [None, {"failed": "global mapping found no model"}, opinion(centre=None)])
-def test_without_a_second_opinion_the_check_stands_alone(second: dict[str, Any] | None) -> None:
-    said = camera_report(registration(second_opinion=second), {})
+def test_without_global_mapping_the_check_stands_alone(second: dict[str, Any] | None) -> None:
+    said = camera_report(registration(global_mapping=second), {})
     assert said.figures and re.findall(r"[\d.]*\d", said.figures) == ["780", "800", "0.25"]
 
 
 @pytest.mark.parametrize("unchecked", [None, {}, {"check": None}, {"check": check(pairs=0, agreeing=0)}])
 def test_nothing_is_said_of_cameras_that_were_not_checked(unchecked: dict[str, Any] | None) -> None:
-    old = unchecked and registration(**unchecked, second_opinion=None)
+    old = unchecked and registration(**unchecked, global_mapping=None)
     said = camera_report(old, {})
     assert (said.verdict, said.doubt, said.groups) == (None, None, [])
-    without = {key: value for key, value in registration().items() if key not in ("check", "second_opinion")}
+    without = {key: value for key, value in registration().items() if key not in ("check", "global_mapping")}
     assert camera_report(without, {}).verdict is None and doubtful_files(without) == []
 
 
@@ -132,10 +140,10 @@ def test_given_cameras_do_not_rest_on_matches() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changed", "tells"), [({}, True), ({"match_graph": None}, True), ({"match_graph": {"order": False}}, False)]
+    ("changed", "informative"), [({}, True), ({"match_graph": None}, True), ({"match_graph": {"order": False}}, False)]
 )
-def test_names_tell_an_order_unless_matching_found_otherwise(changed: dict[str, Any], tells: bool) -> None:
-    assert order_tells(changed) is tells and order_tells(None)
+def test_names_tell_an_order_unless_matching_found_otherwise(changed: dict[str, Any], informative: bool) -> None:
+    assert order_is_informative(changed) is informative and order_is_informative(None)
 
 
 # --- on the page

@@ -175,15 +175,15 @@ def test_page_shows_the_evidence_for_the_camera_model(tmp_path: Path, progress: 
     assert "Camera model:" not in html and "pose is known" not in html
 
 
-ATTEMPTS = [
-    dict(zip(("attempt", "registered", "points", "reprojection_px", "kept", "passed"), row, strict=True))
+STRATEGIES = [
+    dict(zip(("strategy", "registered", "points", "reprojection_px", "kept", "skipped"), row, strict=True))
     for row in [
-        ("first", 20, 7000, 0.6, False, None),
+        ("default", 20, 7000, 0.6, False, None),
         ("fisheye", None, None, None, False, "4 of 24 photos missing is not worth starting over"),
-        ("looser matching", 23, 8123, 0.61, True, None),
-        ("weaker start", 0, 0, None, False, None),
+        ("relaxed ratio test", 23, 8123, 0.61, True, None),
+        ("weaker initial pair", 0, 0, None, False, None),
         ("other seed", 23, 8100, 0.6, False, None),
-        ("all at once", 23, 8123, 0.75, False, None),
+        ("global mapping", 23, 8123, 0.75, False, None),
     ]
 ]
 
@@ -192,22 +192,22 @@ def test_page_shows_what_was_tried_to_find_the_cameras(tmp_path: Path, progress:
     inputs = make_workspace(tmp_path)
     path = inputs["sfm"] / "registration.json"
     registration = json.loads(path.read_text("utf-8"))
-    write_json(path, registration | {"attempts": ATTEMPTS})
+    write_json(path, registration | {"strategies": STRATEGIES})
     html, _ = written(inputs, tmp_path / "out", progress)
-    assert "<summary>Ways tried to find the cameras: 5</summary>" in html
+    assert "<summary>Strategies tried to find the cameras: 5</summary>" in html
     row = re.compile(r"<tr><td>([^<]*)</td><td[^>]*>([^<]*)</td><td[^>]*>([^<]*)</td><td[^>]*>([^<]*)</td><td>([^<]*)<")
-    table = html[html.index("Ways tried") :].partition("</table>")[0]
+    table = html[html.index("Strategies tried") :].partition("</table>")[0]
     assert row.findall(table) == [
-        ("first", "20", "7,000", "0.60", "fewer photos"),
-        ("fisheye", "–", "–", "–", "not made: 4 of 24 photos missing is not worth starting over"),
-        ("looser matching", "23", "8,123", "0.61", "kept"),
-        ("weaker start", "0", "0", "–", "no model"),
+        ("default", "20", "7,000", "0.60", "fewer photos"),
+        ("fisheye", "–", "–", "–", "skipped: 4 of 24 photos missing is not worth starting over"),
+        ("relaxed ratio test", "23", "8,123", "0.61", "kept"),
+        ("weaker initial pair", "0", "0", "–", "no model"),
         ("other seed", "23", "8,100", "0.60", "fewer points"),
-        ("all at once", "23", "8,123", "0.75", "a larger error"),
+        ("global mapping", "23", "8,123", "0.75", "a larger error"),
     ]
-    write_json(path, registration | {"attempts": ATTEMPTS[2:3]})  # the first was enough
+    write_json(path, registration | {"strategies": STRATEGIES[2:3]})  # the default was enough
     html, _ = written(inputs, tmp_path / "one", progress)
-    assert "Ways tried" not in html
+    assert "Strategies tried" not in html
 
 
 def test_page_shows_the_study_and_leaves_its_time_out(tmp_path: Path, progress: Any):

@@ -3,12 +3,12 @@ import pytest
 
 from nerf.synthetic.scenes import ring_of_cameras
 from stages.sfm.degeneracy import (
-    LIKE_A_ROTATION,
-    count_turns,
+    MAX_ROTATION_DEPARTURE,
+    count_pure_rotations,
     departure_from_rotation,
-    elsewhere,
+    different_poses,
     epipoles_inside,
-    expands,
+    flow_is_radial,
 )
 
 SIZE = np.array([640, 480])
@@ -40,18 +40,20 @@ def sizes(count: int) -> np.ndarray:
 
 def test_a_turn_is_a_rotation_with_the_right_focal_length_only() -> None:
     assert departure_from_rotation(homographies(0), sizes(4), 0.8).max() < 1e-9
-    assert departure_from_rotation(homographies(0)[:2], sizes(2), 1.6).min() > LIKE_A_ROTATION
+    assert departure_from_rotation(homographies(0)[:2], sizes(2), 1.6).min() > MAX_ROTATION_DEPARTURE
 
 
 def test_turns_are_told_from_a_plane_without_the_focal_length() -> None:
-    assert count_turns(homographies(0), sizes(4)) == 4
-    assert count_turns(homographies(0.1), sizes(4)) <= 1  # with some focal length a single pair passes for a turn
-    assert count_turns(np.zeros((0, 3, 3)), sizes(0)) == 0
+    assert count_pure_rotations(homographies(0), sizes(4)) == 4
+    assert (
+        count_pure_rotations(homographies(0.1), sizes(4)) <= 1
+    )  # with some focal length a single pair passes for a turn
+    assert count_pure_rotations(np.zeros((0, 3, 3)), sizes(0)) == 0
 
 
 @pytest.mark.parametrize("broken", [np.zeros((3, 3)), np.full((3, 3), np.nan)])
 def test_a_homography_without_an_inverse_is_no_turn(broken: np.ndarray) -> None:
-    assert count_turns(np.concatenate([homographies(0)[:1], broken[None]]), sizes(2)) == 1
+    assert count_pure_rotations(np.concatenate([homographies(0)[:1], broken[None]]), sizes(2)) == 1
 
 
 def test_photos_of_two_sizes_have_a_calibration_each() -> None:
@@ -60,7 +62,7 @@ def test_photos_of_two_sizes_have_a_calibration_each() -> None:
     assert departure_from_rotation(mixed, np.tile([SIZE, SIZE // 2], (4, 1, 1)), 0.8).max() < 1e-9
 
 
-# --- moving straight ahead
+# --- forward motion
 
 AHEAD, ASIDE, BACK_AND_UP = np.array([0.05, -0.1, 1.0]), np.array([1.0, 0.1, 0.2]), np.array([0.0, -0.3, -1.0])
 
@@ -110,16 +112,16 @@ def seen(step: np.ndarray, rotation: np.ndarray, depths: tuple[float, float]) ->
 def test_what_moves_away_from_one_point_is_approached(
     step: np.ndarray, rotation: np.ndarray, moves: bool, depths: tuple[float, float]
 ) -> None:
-    assert expands(*seen(step, rotation, depths), SIZE) == moves
+    assert flow_is_radial(*seen(step, rotation, depths), SIZE) == moves
 
 
 def test_what_does_not_move_is_not_approached() -> None:
     first, _ = seen(AHEAD, np.eye(3), (3.0, 6.0))
-    assert not expands(first, first, SIZE)
-    assert not expands(first[:1], first[:1] + 1, SIZE)
+    assert not flow_is_radial(first, first, SIZE)
+    assert not flow_is_radial(first[:1], first[:1] + 1, SIZE)
 
 
-# --- parts that look alike
+# --- repeated structure
 
 
 def in_other_frame(poses: np.ndarray) -> np.ndarray:
@@ -142,23 +144,23 @@ def extent(poses: np.ndarray) -> float:
     return float(np.sqrt(poses[:, :, 3].var(axis=0).sum()))
 
 
-def test_the_same_poses_in_another_frame_stand_nowhere_else() -> None:
+def test_poses_are_equal_up_to_a_similarity() -> None:
     poses = ring_of_cameras(12)
-    assert not elsewhere(poses, in_other_frame(disturbed(poses)), extent(poses)).any()
-    assert not elsewhere(poses[:2], in_other_frame(poses)[[1, 0]], extent(poses)).any()  # too few to tell
-    assert not elsewhere(poses[[3, 3, 3]], poses[[3, 3, 3]], extent(poses)).any()
+    assert not different_poses(poses, in_other_frame(disturbed(poses)), extent(poses)).any()
+    assert not different_poses(poses[:2], in_other_frame(poses)[[1, 0]], extent(poses)).any()  # too few to tell
+    assert not different_poses(poses[[3, 3, 3]], poses[[3, 3, 3]], extent(poses)).any()
 
 
-def test_photos_of_another_side_that_looks_the_same_stand_elsewhere() -> None:
+def test_photos_taken_for_another_side_have_different_poses() -> None:
     """Of a square tower the second model takes the last four photos for photos of the next side."""
     poses = ring_of_cameras(12)
     folded = disturbed(poses)
     folded[8:] = np.concatenate([turn(90, 2) @ poses[8:, :, :3], (turn(90, 2) @ poses[8:, :, 3:])], axis=2)
-    assert elsewhere(poses, in_other_frame(folded), extent(poses)).tolist() == [False] * 8 + [True] * 4
+    assert different_poses(poses, in_other_frame(folded), extent(poses)).tolist() == [False] * 8 + [True] * 4
 
 
-def test_photos_of_the_next_window_stand_elsewhere_though_they_look_the_same_way() -> None:
+def test_photos_taken_for_the_next_window_have_different_poses() -> None:
     poses = ring_of_cameras(36)[:9]
     shifted = poses.copy()
     shifted[6:, :, 3] += [0.0, 0.5, 0.0]
-    assert elsewhere(poses, in_other_frame(shifted), extent(poses)).tolist() == [False] * 6 + [True] * 3
+    assert different_poses(poses, in_other_frame(shifted), extent(poses)).tolist() == [False] * 6 + [True] * 3

@@ -5,13 +5,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stages.sfm.geometry_check import (
-    MIN_WITNESS,
+    MIN_PAIR_MATCHES,
     PairMatches,
     _median_of_others,
     check_poses,
-    cut_off,
+    outside_main_segment,
     pair_medians,
-    row_breaks,
+    sequence_breaks,
     transfer_errors_px,
     weak_links,
 )
@@ -21,7 +21,7 @@ STEP = 0.2  # between photos, that are 2 from what they see: 80 px of parallax
 
 
 def walk(photos: int = 30, points: int = 1500, noise_px: float = 0.4, reach: int = 5) -> tuple[PairMatches, np.ndarray]:
-    """A straight row of photos along a wall of depth 2 to 3, each matched with the ``reach`` next ones."""
+    """A straight line of photos along a wall of depth 2 to 3, each matched with the ``reach`` next ones."""
     random = np.random.default_rng(0)
     length = STEP * photos
     world = random.uniform((-1, -1, 2), (length + 1, 1, 3), (points, 3))
@@ -41,7 +41,7 @@ def walk(photos: int = 30, points: int = 1500, noise_px: float = 0.4, reach: int
             if len(here):
                 pairs.append((first, second))
                 keypoints.append(np.stack([begins[first] + here, begins[second] + there], axis=1))
-    bearing = np.concatenate(rays)
+    ray_direction = np.concatenate(rays)
     counts = [len(some) for some in keypoints]
     return PairMatches(
         pairs=np.array(pairs),
@@ -49,7 +49,7 @@ def walk(photos: int = 30, points: int = 1500, noise_px: float = 0.4, reach: int
         pair=np.repeat(np.arange(len(pairs)), counts),
         keypoint=np.concatenate(keypoints),
         photo=np.repeat(np.arange(photos), np.diff(begins)),
-        bearing=bearing / np.linalg.norm(bearing, axis=1, keepdims=True),
+        ray_direction=ray_direction / np.linalg.norm(ray_direction, axis=1, keepdims=True),
         focal_px=np.full(photos, FOCAL_PX),
     ), poses
 
@@ -70,7 +70,7 @@ def test_right_poses_pass_and_errors_are_the_noise() -> None:
     matches, poses = walk()
     check = check_poses(matches, poses)
     assert check.passed.all() and check.agrees.all()
-    assert 0.3 < check.usual_px < 1.2
+    assert 0.3 < check.median_px < 1.2
     assert (check.votes_against == 0).all() and not weak_links(matches, check)
 
 
@@ -94,7 +94,7 @@ def test_poses_may_be_in_any_frame_and_scale() -> None:
     [
         (2.0, (0, 0, 0)),
         (30.0, (0, 0, 0)),
-        (0.0, (0.1, 0, 0)),  # along the row every epipolar line stays as it was
+        (0.0, (0.1, 0, 0)),  # along the line every epipolar line stays as it was
         (0.0, (0, 0.1, 0)),
         (0.0, (0, 0, -5)),
         (10.0, (3, 2, 1)),
@@ -108,8 +108,8 @@ def test_moved_photos_and_groups_are_found_and_no_others(
     assert np.flatnonzero(~check.passed).tolist() == photos
 
 
-def test_wrong_pairs_speak_against_nobody_who_has_better_ones() -> None:
-    """Photos of two parts that look alike: a tenth of all pairs are wrong."""
+def test_wrong_pairs_do_not_misplace_photos_with_better_ones() -> None:
+    """Repeated structure: a tenth of all pairs are wrong."""
     matches, poses = walk()
     random = np.random.default_rng(1)
     wrong = random.choice(len(matches.pairs), len(matches.pairs) // 10, replace=False)
@@ -144,50 +144,52 @@ def test_a_single_pair_across_is_a_weak_link() -> None:
     [
         (range(10, 16), True, range(10)),
         (range(10, 13), True, range(0)),  # matches reach over these
-        (range(10, 16), False, range(0)),  # a new row may begin there
+        (range(10, 16), False, range(0)),  # a new sequence may begin there
     ],
 )
-def test_a_row_falls_apart_where_photos_in_its_midst_stand_elsewhere(
-    middle: range, led_through: bool, lost: range
-) -> None:
+def test_photos_that_fail_in_the_middle_break_the_sequence(middle: range, led_through: bool, lost: range) -> None:
     matches, poses = walk()
     if not led_through:
         matches = restricted(matches, ~((matches.pairs[:, 0] <= 12) & (matches.pairs[:, 1] > 12)))
     check = check_poses(matches, moved(poses, list(middle), 0.0, (0, 0, -5)))
     linked = check._replace(misplaced=np.isin(np.arange(30), middle), unlinked=np.zeros(30, bool))  # as by a false loop
-    assert np.flatnonzero(cut_off(np.arange(30), matches, linked, 5)).tolist() == list(lost)
+    assert np.flatnonzero(outside_main_segment(np.arange(30), matches, linked, 5)).tolist() == list(lost)
 
 
-def test_a_step_of_the_row_that_its_own_matches_contradict_is_a_break() -> None:
+def test_a_contradicted_consecutive_pair_is_a_break() -> None:
     matches, poses = walk()
-    row = np.arange(30)
-    assert row_breaks(row, matches, check_poses(matches, poses)) == []
+    sequence = np.arange(30)
+    assert sequence_breaks(sequence, matches, check_poses(matches, poses)) == []
     elsewhere = moved(poses, list(range(12)), 0.0, (0, 0, -5))
     trusting = check_poses(matches, elsewhere)._replace(misplaced=np.zeros(30, bool), unlinked=np.zeros(30, bool))
-    assert row_breaks(row, matches, trusting) == [(11, 12)]
-    assert row_breaks(row[::2], matches, trusting) == [(10, 12)]
+    assert sequence_breaks(sequence, matches, trusting) == [(11, 12)]
+    assert sequence_breaks(sequence[::2], matches, trusting) == [(10, 12)]
 
 
 @pytest.mark.parametrize(
     ("breaks", "kept_of_breaks", "lost"),
     [
         ([[5, 6], [7, 8], [19, 20]], 1.0, [*range(8), *range(20, 30)]),
-        ([[5, 6], [7, 8], [19, 20]], 0.4, []),  # weaker than whole steps: the row may have gone on at another place
-        ([[7, 8], [19, 20]], 1.0, []),  # no more than two such places
+        (
+            [[5, 6], [7, 8], [19, 20]],
+            0.4,
+            [],
+        ),  # weaker than agreeing steps: the sequence may have gone on in another part
+        ([[7, 8], [19, 20]], 1.0, []),  # no more than two breaks
     ],
 )
-def test_of_a_torn_row_only_the_longest_piece_stands(
+def test_of_a_fragmented_sequence_only_the_longest_segment_stays(
     breaks: list[list[int]], kept_of_breaks: float, lost: list[int]
 ) -> None:
     matches, poses = walk()
-    row, ends = np.arange(30), [0, *(second for _, second in breaks), 30]
+    sequence, ends = np.arange(30), [0, *(second for _, second in breaks), 30]
     weight = np.where([pair in breaks for pair in matches.pairs.tolist()], kept_of_breaks, 1.0) * matches.weight
-    matches = matches._replace(weight=np.maximum(weight, MIN_WITNESS))
+    matches = matches._replace(weight=np.maximum(weight, MIN_PAIR_MATCHES))
     for number, (first, after) in enumerate(pairwise(ends)):
         poses = moved(poses, list(range(first, after)), 0.0, (0, 0, -5.0 * number))
     trusting = check_poses(matches, poses)._replace(misplaced=np.zeros(30, bool), unlinked=np.zeros(30, bool))
-    assert row_breaks(row, matches, trusting) == [tuple(step) for step in breaks]
-    assert np.flatnonzero(cut_off(row, matches, trusting, 5)).tolist() == lost
+    assert sequence_breaks(sequence, matches, trusting) == [tuple(step) for step in breaks]
+    assert np.flatnonzero(outside_main_segment(sequence, matches, trusting, 5)).tolist() == lost
 
 
 def restricted(matches: PairMatches, kept: np.ndarray) -> PairMatches:
@@ -202,7 +204,7 @@ def restricted(matches: PairMatches, kept: np.ndarray) -> PairMatches:
     )
 
 
-def test_photos_in_one_place_are_judged_by_their_turns() -> None:
+def test_photos_in_one_position_are_checked_by_rotation() -> None:
     matches, poses = walk(photos=6, noise_px=0.0)
     here = poses.copy()
     here[:, :, 3] = 0.0

@@ -8,12 +8,12 @@ import pytest
 from stages.io.photos import Photo
 from stages.sfm.registration import (
     Matches,
-    account,
     count_done,
+    image_rows,
     is_sound,
     repeated_structure,
     why_no_model,
-    with_left_out,
+    with_near_duplicates,
 )
 
 NAMES = ["a.jpg", "b.jpg", "c.jpg", "d.jpg", "e.jpg"]
@@ -23,31 +23,31 @@ PHOTOS = [Photo(name, f"images/{name}", 60, 40, 0, None, None, False, 1.0) for n
 def matches(
     *pairs: tuple[int, int],
     keypoints: int = 500,
-    flat: int = 0,
-    ahead: int = 0,
+    planar: int = 0,
+    forward: int = 0,
     shift_px: float = 9.0,
     turned: bool = True,
 ) -> Matches:
-    """The given pairs, the first so many of them ``flat`` or ``ahead``, all of them turns or none."""
+    """The given pairs, the first so many of them ``planar`` or ``forward``, all of them turns or none."""
     array = np.array(pairs, int).reshape(-1, 2)
     return Matches(
         keypoints=np.full(len(NAMES), keypoints),
         tried=len(NAMES) * (len(NAMES) - 1) // 2,
         pairs=array,
-        flat=np.arange(len(array)) < flat,
+        planar=np.arange(len(array)) < planar,
         homography=np.tile(np.eye(3) if turned else np.diag([2.0, 1.0, 1.0]), (len(array), 1, 1)),
-        ahead=np.arange(len(array)) < ahead,
+        forward=np.arange(len(array)) < forward,
         shift_px=np.full(len(array), shift_px),
     )
 
 
-def test_photos_left_out_of_matching_stand_in_the_account() -> None:
+def test_photos_left_out_of_matching_are_listed() -> None:
     photos = [
         replace(photo, near_duplicate_of="ä.jpg") if index in (0, 3) else photo for index, photo in enumerate(PHOTOS)
     ]
     names = ["b.jpg", "c.jpg", "e.jpg"]
-    matched = account(names, matches((0, 1), (1, 2)), [names], {}, {}, None, {})
-    entries = with_left_out(matched, photos)
+    matched = image_rows(names, matches((0, 1), (1, 2)), [names], {}, {}, None, {})
+    entries = with_near_duplicates(matched, photos)
     assert [entry["file"] for entry in entries] == NAMES
     assert [entry["reason"] for entry in entries if not entry["registered"]] == [
         "nearly the same picture as ä.jpg: it adds no baseline"
@@ -59,13 +59,13 @@ FOUR = (matches((0, 1), (1, 2), (2, 3), (1, 3)), [["a.jpg", "b.jpg", "c.jpg"]])
 
 
 def reasons(found: Matches, models: list[list[str]], **support: tuple[int, int]) -> dict[str, str | None]:
-    entries = account(NAMES, found, models, {}, {name: support.get(name[0], (0, 0)) for name in NAMES}, None, {})
+    entries = image_rows(NAMES, found, models, {}, {name: support.get(name[0], (0, 0)) for name in NAMES}, None, {})
     return {entry["file"][0]: entry["reason"] for entry in entries}
 
 
 def test_the_account_tells_who_is_registered() -> None:
     nothing = dict.fromkeys(NAMES, (0, 0))
-    entries = account(NAMES, *FOUR, {"a.jpg": 60, "b.jpg": 70, "c.jpg": 50}, nothing, None, {})
+    entries = image_rows(NAMES, *FOUR, {"a.jpg": 60, "b.jpg": 70, "c.jpg": 50}, nothing, None, {})
     assert [entry["registered"] for entry in entries] == [True, True, True, False, False]
     assert [entry["observations"] for entry in entries] == [60, 70, 50, 0, 0]
     assert [entry["reason"] is None for entry in entries] == [True, True, True, False, False]
@@ -73,7 +73,7 @@ def test_the_account_tells_who_is_registered() -> None:
 
 def test_a_photo_whose_camera_cannot_be_used_has_that_reason() -> None:
     why = "its camera came out absurd: its parameters are not finite"
-    entries = account(NAMES, *FOUR, {}, dict.fromkeys(NAMES, (60, 60)), None, {"d.jpg": why})
+    entries = image_rows(NAMES, *FOUR, {}, dict.fromkeys(NAMES, (60, 60)), None, {"d.jpg": why})
     assert [entry["reason"] for entry in entries][3] == why
 
 
@@ -81,8 +81,8 @@ def test_a_photo_whose_camera_cannot_be_used_has_that_reason() -> None:
     ("support", "why"),
     [
         ((7, 6), "too few of its features are points of the model: 7, 30 are needed"),
-        ((40, 9), "its matches contradict each other: 9 of 40 agree on one position, 30 are needed"),
-        ((40, 35), "its position is not sure: 35 of its 40 features that are points of the model agree on one"),
+        ((40, 9), "its matches contradict each other: 9 of 40 agree on one pose, 30 are needed"),
+        ((40, 35), "its pose is not sure: 35 of its 40 features that are points of the model agree on one"),
     ],
 )
 def test_a_photo_that_shares_views_with_the_model_has_too_little_to_stand_on(
@@ -91,47 +91,44 @@ def test_a_photo_that_shares_views_with_the_model_has_too_little_to_stand_on(
     assert reasons(*FOUR, d=support)["d"] == why
 
 
-def test_a_photo_may_only_be_turned_against_the_model() -> None:
-    found = matches((2, 3), (1, 3), (0, 1), flat=2)
-    why = "all 2 of its pairs with registered photos differ by a turn of the camera alone, or show one flat surface"
+def test_pure_rotation_is_a_reason() -> None:
+    found = matches((2, 3), (1, 3), (0, 1), planar=2)
+    why = "pure rotation or a planar scene in all 2 of its pairs with registered photos"
     assert reasons(found, FOUR[1], d=(3, 3))["d"] == why
 
 
-def test_a_photo_may_only_be_a_step_ahead_of_the_model() -> None:
+def test_forward_motion_is_a_reason() -> None:
     steps = (2, 3), (1, 3), (0, 1)
-    why = (
-        "in all 2 of its pairs with registered photos the camera moves straight towards something in the picture: "
-        "too little parallax"
-    )
-    assert reasons(matches(*steps, ahead=2), FOUR[1], d=(3, 3))["d"] == why
-    assert reasons(matches(*steps, ahead=2, flat=1), FOUR[1], d=(3, 3))["d"] == why
-    assert reasons(matches(*steps, ahead=1), FOUR[1], d=(3, 3))["d"] != why
-    assert reasons(matches(*steps, ahead=2), FOUR[1], d=(40, 35))["d"] != why  # it sees enough of the model
+    why = "forward motion in all 2 of its pairs with registered photos: too little parallax"
+    assert reasons(matches(*steps, forward=2), FOUR[1], d=(3, 3))["d"] == why
+    assert reasons(matches(*steps, forward=2, planar=1), FOUR[1], d=(3, 3))["d"] == why
+    assert reasons(matches(*steps, forward=1), FOUR[1], d=(3, 3))["d"] != why
+    assert reasons(matches(*steps, forward=2), FOUR[1], d=(40, 35))["d"] != why  # it sees enough of the model
 
 
 def test_groups_that_contradict_each_other_are_named() -> None:
     found, models = matches((0, 1), (3, 4)), [["a.jpg", "b.jpg", "c.jpg"], ["b.jpg", "c.jpg", "d.jpg", "e.jpg"]]
-    conflict = {"group": 1, "shared": 2, "elsewhere": 2}
-    entries = account(NAMES, found, models, {}, dict.fromkeys(NAMES, (0, 0)), conflict, {})
+    conflict = {"group": 1, "shared": 2, "different": 2}
+    entries = image_rows(NAMES, found, models, {}, dict.fromkeys(NAMES, (0, 0)), conflict, {})
     assert [entry["reason"] for entry in entries[:3]] == [None] * 3
     assert {entry["reason"] for entry in entries[3:]} == {
-        "it belongs to a group of 4 photos that shares 2 with this one and puts 2 of them elsewhere: "
-        "something looks alike there"
+        "it belongs to a group of 4 photos that shares 2 with this model and gives 2 of them different poses: "
+        "repeated structure"
     }
     moved = {"photos": ["b.jpg", "c.jpg"], "others": ["d.jpg", "e.jpg"]}
     own_names = {name: f"holiday/{name}" for name in NAMES}
     assert repeated_structure(conflict | moved, own_names).startswith(
-        "repeated structure: holiday/d.jpg, holiday/e.jpg fit only if holiday/b.jpg, holiday/c.jpg were taken elsewhere"
+        "repeated structure: holiday/d.jpg, holiday/e.jpg fit only if holiday/b.jpg, holiday/c.jpg have other poses"
     )
 
 
-def test_a_photo_may_share_no_view_or_belong_elsewhere() -> None:
+def test_a_photo_may_share_no_view_or_belong_to_another_group() -> None:
     told = reasons(matches((0, 1), (2, 3)), [["a.jpg", "b.jpg"], ["c.jpg"]])
     assert told == {
         "a": None,
         "b": None,
         "c": "it belongs to another group of 1 photos that does not connect to this one",
-        "d": "it shares views only with photos that are not registered either (1 of them)",
+        "d": "it shares views only with unregistered photos (1 of them)",
         "e": "it shares no view with any other photo",
     }
 
@@ -151,7 +148,7 @@ def test_few_features_are_named_where_they_match_something_too() -> None:
     few = " (only 20 features found in it)"
     told = reasons(matches((0, 1), (1, 2), (3, 4), keypoints=20), [["a.jpg", "b.jpg"]])
     assert told["c"] == f"too few of its features are points of the model: 0, 30 are needed{few}"
-    assert told["d"] == f"it shares views only with photos that are not registered either (1 of them){few}"
+    assert told["d"] == f"it shares views only with unregistered photos (1 of them){few}"
 
 
 @pytest.mark.parametrize(
@@ -165,25 +162,25 @@ def test_few_features_are_named_where_they_match_something_too() -> None:
             "the photos are all the same view (1 of 10 pairs differ by less than a pixel)",
         ),
         (
-            matches((0, 1), (1, 2), (2, 3), flat=2),
+            matches((0, 1), (1, 2), (2, 3), planar=2),
             3,
-            "the camera turned on the spot: 2 of 3 matching pairs differ by a rotation alone",
+            "pure rotation: 2 of 3 matching pairs differ by a rotation alone",
         ),
         (
-            matches((0, 1), (1, 2), (2, 3), flat=2, turned=False),
+            matches((0, 1), (1, 2), (2, 3), planar=2, turned=False),
             3,
-            "the photos show one flat surface: a plane alone explains 2 of 3 matching pairs",
+            "planar scene: one plane explains 2 of 3 matching pairs",
         ),
         (
-            matches((0, 1), (1, 2), (2, 3), ahead=2, flat=2, turned=False),
+            matches((0, 1), (1, 2), (2, 3), forward=2, planar=2, turned=False),
             3,
-            "the camera moved straight ahead: in 2 of 3 matching pairs it goes towards something in the picture, "
+            "forward motion: in 2 of 3 matching pairs the camera moves towards something in view, "
             "which leaves too little parallax",
         ),
         (
             matches((0, 1)),
             0,
-            "1 of 10 pairs of photos share a view, but no two of them tell the depth of the scene",
+            "1 of 10 pairs of photos share a view, but none of them shows the depth of the scene",
         ),
         (matches((0, 1)), 2, "only 2 photos and 7 points fit together; 1 of 10 pairs share a view"),
     ],

@@ -42,7 +42,7 @@ def test_photos_without_overlap_are_refused(tmp_path: Path, progress) -> None:
 def test_turning_on_the_spot_is_refused(tmp_path: Path, progress) -> None:
     panorama = blots(0)
     error = refusal({f"{i}.png": turned(0.12 * i - 0.3, panorama) for i in range(6)}, tmp_path, progress)
-    assert error.why == "the camera turned on the spot: 15 of 15 matching pairs differ by a rotation alone"
+    assert error.why == "pure rotation: 15 of 15 matching pairs differ by a rotation alone"
     assert "Move sideways" in error.hint
 
 

@@ -19,10 +19,10 @@ from stages import ingest, sfm
 from stages.contract import StageError
 from stages.io.files import read_json, write_png
 from stages.io.photos import read_photos, write_photos
-from stages.sfm import process as sfm_process
+from stages.sfm import worker_process
 from stages.sfm.colmap.models import read_model
 from stages.sfm.registration import count_done
-from stages.sfm.retry_strategies import ATTEMPTS, Journal, Tried
+from stages.sfm.retry_strategies import STRATEGIES, Outcome, StrategyLog
 from tests.blots import blots
 from tests.small_scenes import write_blender_scene
 from tests.stages.sfm.sfm_inputs import SMALL, ingested
@@ -114,7 +114,7 @@ def test_a_killed_run_takes_its_child_along_and_goes_on_to_the_same_bytes(
     parent.wait()
     wait_for(lambda: is_gone(child))
     sfm.run(SMALL, inputs, tmp_path, progress)
-    assert progress.notes[0].startswith("going on with the features of 12 photos and ")
+    assert progress.notes[0].startswith("resuming with the features of 12 photos and ")
     assert contents(tmp_path) == contents(reconstructed)
 
 
@@ -130,16 +130,16 @@ def test_a_damaged_database_is_made_anew(
 @pytest.mark.parametrize(
     ("child", "message"),
     [
-        ("import os; os.abort()", r"was ended by SIGABRT while finding features: COLMAP failed inside \(it left no"),
+        ("import os; os.abort()", r"was ended by SIGABRT while extracting features: COLMAP failed inside \(it left no"),
         ("import os; os.kill(os.getpid(), 9)", "was ended by SIGKILL .*: most often the machine ran out of memory"),
-        ("raise ValueError('no such thing')", "failed while finding features: ValueError: no such thing"),
-        ("import time; time.sleep(60)", "was given up while finding features: it took longer than 0.5 s"),
+        ("raise ValueError('no such thing')", "failed while extracting features: ValueError: no such thing"),
+        ("import time; time.sleep(60)", "was given up while extracting features: it took longer than 0.5 s"),
     ],
 )
 def test_however_the_child_ends_it_is_an_error_with_words(
     child: str, message: str, inputs: dict[str, Path], tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sfm_process, "CHILD", ["-c", child])
+    monkeypatch.setattr(worker_process, "COMMAND", ["-c", child])
     with pytest.raises(StageError, match=message):
         sfm.run(sfm.Config(max_seconds=0.5 if "sleep" in child else 60), inputs, tmp_path, progress)
     assert (tmp_path / "sfm.log").exists()
@@ -156,22 +156,22 @@ def test_strangers_are_left_out_and_named_and_alpha_and_mixed_sizes_work(
     notes = [re.sub(r"about .*", "…", note) for note in progress.notes if not note.startswith("camera model ")]
     assert notes == [
         "matching 36 pairs of photos: …",
-        "1 of 9 photos has no place yet: matching them again, less strictly",
+        "1 of 9 photos is not registered yet: matching them again with a relaxed ratio test",
         "matching 8 pairs of photos: …",
-        "passed over, for 1 of 9 photos missing is not worth starting over: verifying and mapping again, as if through "
-        "a fisheye lens; searching twice as many features at twice the size",
-        "passed over, for the missing photos share too little with the others: mapping again, asking less of the first "
-        "pair; mapping again, with another seed; mapping again, all photos at once",
-        "1 of 9 photos found no place and are left out:",
+        "skipped, because 1 of 9 photos missing is not worth starting over: verifying and mapping again with a fisheye "
+        "camera model; extracting twice as many features at twice the size",
+        "skipped, because the missing photos share too few matches with the others: mapping again from a weaker "
+        "initial pair; mapping again with another seed; mapping again with global mapping",
+        "1 of 9 photos could not be registered and are left out:",
         "  stranger.png: it shares no view with any other photo",
     ]
     account = read_json(tmp_path / "sfm/registration.json")
     assert [image["file"] for image in account["images"] if not image["registered"]] == ["stranger.png"]
-    tried = {row["attempt"]: row["passed"] for row in account["attempts"]}
-    assert list(tried) == [attempt.name for attempt in ATTEMPTS if attempt.matches != "row"]
-    assert [name for name, passed in tried.items() if passed is None] == ["first", "looser matching"]
+    tried = {row["strategy"]: row["skipped"] for row in account["strategies"]}
+    assert list(tried) == [strategy.name for strategy in STRATEGIES if strategy.matches != "consecutive"]
+    assert [name for name, skipped in tried.items() if skipped is None] == ["default", "relaxed ratio test"]
     assert tried["fisheye"] == "1 of 9 photos missing is not worth starting over"
-    assert [row["attempt"] for row in account["attempts"] if row["kept"]] == ["first"]
+    assert [row["strategy"] for row in account["strategies"] if row["kept"]] == ["default"]
     assert account["repeated_structure"] is None
 
 
@@ -259,7 +259,7 @@ def test_the_camera_of_one_photo_that_comes_out_absurd_does_not_end_the_run(
         f"lenses.flaw = lambda camera: 'it is absurd' if {absurd} else None\n"
         "c.main()"
     )
-    monkeypatch.setattr(sfm_process, "CHILD", ["-c", child])
+    monkeypatch.setattr(worker_process, "COMMAND", ["-c", child])
     sfm.run(SMALL, ingested(tmp_path / "ingest", images), tmp_path / "sfm", progress)
     assert "1 photo: the camera came out absurd (it is absurd): SIMPLE_PINHOLE instead" in progress.notes
     account, model = read_json(tmp_path / "sfm/registration.json"), read_model(tmp_path / "sfm/sparse")
@@ -273,7 +273,7 @@ def test_the_camera_of_one_photo_that_comes_out_absurd_does_not_end_the_run(
 
 
 def with_a_stranger(inputs: dict[str, Path], folder: Path) -> dict[str, Path]:
-    """Six photos and one of another scene: the first attempt leaves it without a place."""
+    """Six photos and one of another scene: the default strategy leaves it unregistered."""
     images = {path.name: np.asarray(Image.open(path)) for path in sorted((inputs["ingest"] / "images").iterdir())[:6]}
     return ingested(folder, images | {"stranger.png": blots(1, 300, 200)})
 
@@ -281,16 +281,16 @@ def with_a_stranger(inputs: dict[str, Path], folder: Path) -> dict[str, Path]:
 @pytest.mark.parametrize(
     ("end", "message", "became"),
     [
-        ("os.abort()", "was ended by SIGABRT .*goes on without the attempt 'looser matching'", "ended the program"),
+        ("os.abort()", "was ended by SIGABRT .*skips the strategy 'relaxed ratio test'", "ended the program"),
         (
             "os.kill(os.getpid(), 9)",
-            "was ended by SIGKILL .*ran out of memory. Run again: it goes on without",
+            "was ended by SIGKILL .*ran out of memory. Run again: it skips",
             "was killed, most often for want of memory",
         ),
-        ("int('x')", "failed while mapping: ValueError.*Run again: it goes on without", "ended the program"),
+        ("int('x')", "failed while mapping: ValueError.*Run again: it skips", "ended the program"),
     ],
 )
-def test_an_attempt_that_ended_the_program_is_left_out(
+def test_a_strategy_that_ended_the_worker_is_skipped(
     end: str,
     message: str,
     became: str,
@@ -302,56 +302,56 @@ def test_an_attempt_that_ended_the_program_is_left_out(
     folders = with_a_stranger(inputs, tmp_path / "ingest")
     crash = (
         "import sys, stages.sfm.worker as c, os\n"
-        "first = c.matched\n"
-        f"c.matched = lambda a, m, w: {end} if a.name == 'looser matching' else first(a, m, w)\n"
+        "first = c.match_photos\n"
+        f"c.match_photos = lambda a, m, w: {end} if a.name == 'relaxed ratio test' else first(a, m, w)\n"
         "c.main()"
     )
     with monkeypatch.context() as patched:
-        patched.setattr(sfm_process, "CHILD", ["-c", crash])
+        patched.setattr(worker_process, "COMMAND", ["-c", crash])
         with pytest.raises(StageError, match=message):
             sfm.run(SMALL, folders, tmp_path / "sfm", progress)
     progress.notes.clear()
     result = sfm.run(SMALL, folders, tmp_path / "sfm", progress)
     assert result.line.startswith("6/7 registered, ")
-    assert progress.notes[0].startswith("going on with the features of 7 photos and 21 matched pairs")
-    assert f"left out, for it {became} last time: matching them again, less strictly" in progress.notes
-    tried = {row["attempt"]: row["passed"] for row in read_json(tmp_path / "sfm/registration.json")["attempts"]}
-    assert tried["looser matching"] == f"it {became}"
-    assert not (tmp_path / "sfm/attempts").exists()
+    assert progress.notes[0].startswith("resuming with the features of 7 photos and 21 matched pairs")
+    assert f"skipped, because it {became} last time: matching them again with a relaxed ratio test" in progress.notes
+    tried = {row["strategy"]: row["skipped"] for row in read_json(tmp_path / "sfm/registration.json")["strategies"]}
+    assert tried["relaxed ratio test"] == f"it {became}"
+    assert not (tmp_path / "sfm/strategies").exists()
 
 
-def test_an_attempt_for_which_no_time_is_left_is_not_begun(
+def test_a_strategy_for_which_no_time_is_left_is_skipped(
     inputs: dict[str, Path], tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     slow = (
         "import stages.sfm.worker as c\n"
-        "end = c.Work.end\n"
-        "def slowly(work, phase):\n"
-        "    end(work, phase)\n"
-        "    work.seconds[phase] += 100\n"
-        "c.Work.end = slowly\n"
+        "end = c.JobState.end\n"
+        "def slowly(state, phase):\n"
+        "    end(state, phase)\n"
+        "    state.seconds[phase] += 100\n"
+        "c.JobState.end = slowly\n"
         "c.main()"
     )
-    monkeypatch.setattr(sfm_process, "CHILD", ["-c", slow])
+    monkeypatch.setattr(worker_process, "COMMAND", ["-c", slow])
     config = SMALL.model_copy(update={"max_seconds": 240.0})
     result = sfm.run(config, with_a_stranger(inputs, tmp_path / "ingest"), tmp_path / "sfm", progress)
     assert result.line.startswith("6/7 registered, ")
-    assert result.line.endswith(" · 1 way left out for time: sfm --force")
+    assert result.line.endswith(" · 1 retry strategy skipped for time: sfm --force")
     # All of the first time's 100 s of mapping, 1 - (6/7)² of those of matching; twice 100 s are for the adjustment.
     said = (
-        "left out, for it would take about 2 min and the last adjustment, of --sfm.max-seconds 4 min are left: "
-        "matching them again, less strictly"
+        "skipped, because it would take about 2 min and the final bundle adjustment, of --sfm.max-seconds 4 min are "
+        "left: matching them again with a relaxed ratio test"
     )
     assert said in progress.notes
-    tried = {row["attempt"]: row["passed"] for row in read_json(tmp_path / "sfm/registration.json")["attempts"]}
-    assert tried["looser matching"] == "too little was left of --sfm.max-seconds"
-    assert tried["weaker start"] == "the missing photos share too little with the others"
+    tried = {row["strategy"]: row["skipped"] for row in read_json(tmp_path / "sfm/registration.json")["strategies"]}
+    assert tried["relaxed ratio test"] == "too little was left of --sfm.max-seconds"
+    assert tried["weaker initial pair"] == "the missing photos share too few matches with the others"
 
 
-def test_attempts_whose_matches_are_gone_are_forgotten(
+def test_outcomes_whose_matches_are_gone_are_removed(
     inputs: dict[str, Path], reconstructed: Path, tmp_path: Path, progress
 ) -> None:
-    Journal(tmp_path / "attempts").add(Tried("first", "matches-0.db", [["photo_000.jpg"] * 12], 500, 0.1))
+    StrategyLog(tmp_path / "strategies").add(Outcome("default", "matches-0.db", [["photo_000.jpg"] * 12], 500, 0.1))
     sfm.run(SMALL, inputs, tmp_path, progress)
     assert contents(tmp_path) == contents(reconstructed)
 
@@ -372,7 +372,7 @@ def test_known_cameras_go_through_without_points(tmp_path: Path, progress) -> No
         sfm.Config(cameras=tmp_path / "blender"), {"ingest": tmp_path / "ingest"}, tmp_path / "sfm", progress
     )
     account = read_json(tmp_path / "sfm/registration.json")
-    assert result.line == "5/5 cameras known · PINHOLE"
+    assert result.line == "5/5 poses imported · PINHOLE"
     assert (account["source"], account["reprojection_px"], account["points"]) == ("import", None, 0)
     assert account["test_files"] == ["test/r_4.png"]
     assert account["camera_models"] == []
@@ -389,13 +389,13 @@ def test_photos_that_look_alike_are_enough(inputs: dict[str, Path], tmp_path: Pa
     assert graph["order"]
 
 
-def test_every_photo_is_checked_and_a_second_opinion_agrees(reconstructed: Path) -> None:
+def test_every_photo_is_checked_and_global_mapping_agrees(reconstructed: Path) -> None:
     account = read_json(reconstructed / "registration.json")
-    check, opinion = account["check"], account["second_opinion"]
+    check, other = account["check"], account["global_mapping"]
     assert check["doubtful"] == [] and check["weak_links"] == []
     assert 0.9 * check["pairs"] < check["agreeing"] <= check["pairs"] <= 12 * 11 / 2
     assert 0 < check["error_px"] < check["tolerance_px"] < 4
     assert min(image["agreement"] for image in account["images"]) > 0.9
     assert 0 < max(image["transfer_px"] for image in account["images"]) < check["tolerance_px"]
-    assert (opinion["photos"], opinion["agree"], opinion["elsewhere"], opinion["failed"]) == (12, 12, [], None)
-    assert 0 < opinion["centre"] < 0.02
+    assert (other["photos"], other["agree"], other["different"], other["failed"]) == (12, 12, [], None)
+    assert 0 < other["centre"] < 0.02

@@ -180,14 +180,14 @@ QUARTER_TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 @pytest.mark.parametrize(
     ("photos", "moved", "conflict"),
     [
-        (range(6, 16), range(10, 12), {"group": 1, "shared": 6, "elsewhere": 2}),
+        (range(6, 16), range(10, 12), {"group": 1, "shared": 6, "different": 2}),
         (range(6, 12), range(10, 12), None),  # it has no photo that the best model lacks
-        (range(6, 16), range(9, 10), None),  # one photo may merely have a bad place
+        (range(6, 16), range(9, 10), None),  # one photo may merely have a bad pose
         (range(6, 16), range(0), None),
         (range(12, 16), range(12, 16), None),  # nothing is shared
     ],
 )
-def test_a_model_that_puts_shared_photos_elsewhere_is_found(
+def test_a_model_with_different_poses_of_shared_photos_is_found(
     photos: range, moved: range, conflict: dict[str, Any] | None, tmp_path: Path
 ) -> None:
     poses = dict(enumerate(ring_of_cameras(16)))

@@ -134,7 +134,7 @@ def test_photos_without_a_place_are_joined_by_their_matches_with_those_that_have
     assert links(database, set(names[:-2])).join
     assert not links(database, set(names[:-1])).join
     assert not links(database, {names[-1]}).join, "five that share views with each other alone"
-    assert links(database, set()).join, "no place: any pair is one to begin with"
+    assert links(database, set()).join, "none is registered: any pair may be the initial one"
 
 
 def test_few_matches_with_each_of_several_photos_join_as_well(database: Path) -> None:

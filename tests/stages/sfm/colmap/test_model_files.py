@@ -49,6 +49,67 @@ def test_text_may_begin_with_the_byte_order_mark_of_windows(tmp_path: Path) -> N
     assert len(read_model(tmp_path).images) == 3
 
 
+def written(folder: Path, kind: str = "txt") -> Path:
+    for name, content in colmap_models()[kind].items():
+        (folder / name).write_bytes(content)
+    return folder
+
+
+@pytest.mark.parametrize("left_out", [[0, 1, 2], [1], [2]])
+@pytest.mark.parametrize("blank", [True, False])
+def test_lines_of_keypoints_may_be_empty_or_left_out(left_out: list[int], blank: bool, tmp_path: Path) -> None:
+    whole = read_model(written(tmp_path))
+    lines = [line for line in (tmp_path / "images.txt").read_text().splitlines() if not line.startswith("#")]
+    kept = []
+    for index in range(3):
+        keypoints = [lines[2 * index + 1]] if index not in left_out else [""] * blank
+        kept += [lines[2 * index], *keypoints]
+    (tmp_path / "images.txt").write_text("\n".join(kept) + "\n")
+    model = read_model(tmp_path)
+    assert [image.file for image in model.images] == [image.file for image in whole.images]
+    for one, other in zip(model.images, whole.images, strict=True):
+        np.testing.assert_array_equal(one.sfm_from_camera, other.sfm_from_camera)
+    seen = ~np.isin(whole.view, left_out)
+    np.testing.assert_array_equal(model.view, whole.view[seen])
+    np.testing.assert_array_equal(model.xy, whole.xy[seen])
+
+
+def test_a_model_may_be_without_points(model: Path) -> None:
+    (points,) = model.glob("points3D.*")
+    points.unlink()
+    read = read_model(model)
+    assert len(read.images) == 3 and len(read.xyz) == len(read.view) == 0
+
+
+def test_colours_may_be_written_as_decimals(tmp_path: Path) -> None:
+    whole = read_model(written(tmp_path))
+    lines = (tmp_path / "points3D.txt").read_text().splitlines()
+    decimals = [" ".join(f"{f}.0" if 4 <= i < 7 else f for i, f in enumerate(line.split())) for line in lines]
+    (tmp_path / "points3D.txt").write_text("\n".join(decimals))
+    np.testing.assert_array_equal(read_model(tmp_path).rgb, whole.rgb)
+
+
+@pytest.mark.parametrize(
+    ("name", "line", "why"),
+    [
+        ("images", "7 1 0 0 0 1 2", "line 1: an image (its line of keypoints, below it, may be empty) has 7 fields"),
+        ("images", "7 1 0 0 0 x 0 0 1 a.png\n", "line 1: could not convert string to float: 'x'"),
+        ("images", "7 1 0 0 0 0 0 0 1 a.png\n1 2 3 4", "line 2: keypoints are triples"),
+        ("images", "7 1 0 0 0 0 0 0 1 0007\n8 1 0 0 0 0 0 0 1 0008", "line 2: keypoints are triples"),
+        ("points3D", "7 0 0 0 1 2 300 0.5", "line 1: a colour is not between 0 and 255"),
+        ("points3D", "7 0 0 0 1 2 3", "line 1: a point has 7 fields where 8 belong"),
+        ("cameras", "7 PINHOLE 60", "line 1: a camera has 3 fields where 4 belong"),
+        ("cameras", "7 PINHOLE 60 40.5 1 1 1 1", "line 1: invalid literal"),
+    ],
+)
+def test_a_damaged_line_is_named(name: str, line: str, why: str, tmp_path: Path) -> None:
+    path = written(tmp_path) / f"{name}.txt"
+    path.write_text(line + "\n" + path.read_text())
+    with pytest.raises(StageError) as caught:
+        read_model(tmp_path)
+    assert f"{name}.txt is damaged: {why}" in caught.value.why
+
+
 @pytest.mark.parametrize("scale", [1e-300, 1e-9, 1.0, 1e9, 1e300])
 def test_quaternions_need_no_length(scale: float) -> None:
     pose = np.array([0.1, -0.5, 0.7, 0.2, 1.0, 2.0, 3.0])

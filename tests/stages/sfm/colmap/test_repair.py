@@ -1,4 +1,4 @@
-"""Matches and models that COLMAP makes up itself, with known poses: a check, repairs, thinned matches, two opinions."""
+"""COLMAP's synthetic matches and models, with known poses: check, repair, thinned matches, global mapping."""
 
 import sqlite3
 from contextlib import closing
@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from stages.io.photos import Photo
-from stages.sfm import global_mapping as sfm_global
+from stages.sfm import global_mapping
 from stages.sfm.colmap.diagnosis import compare_models
 from stages.sfm.colmap.mapping import incremental_options, map_incrementally
-from stages.sfm.colmap.repair import check_model, copy_believed, deregister, facts, reasons, register_again
+from stages.sfm.colmap.repair import check_model, copy_consistent_matches, deregister, facts, reasons, register_again
 from stages.sfm.colmap.thinning import thin_matches
-from stages.sfm.matching import steps_of_row
-from stages.sfm.retry_strategies import Effort
+from stages.sfm.matching import consecutive_pairs
+from stages.sfm.retry_strategies import MappingOptions
 
 PHOTOS = 16
 
@@ -71,7 +71,7 @@ def test_a_turned_photo_is_named_and_registered_again(made: Made, tmp_path: Path
     checked = check_model(wrong, made.database, 0)
     assert checked.failed() == [5]
     assert list(reasons(wrong, checked)) == [wrong.image(5).name]
-    options = incremental_options(0, Effort(), lens_is_known=False, thinned=False)
+    options = incremental_options(0, MappingOptions(), camera_is_known=False, thinned=False)
     again = register_again(wrong, checked, made.database, tmp_path, tmp_path / "again", options)
     assert again.num_reg_images() == PHOTOS
     assert check_model(again, made.database, 0).check.passed.all()
@@ -115,23 +115,23 @@ def test_mapping_of_thinned_matches_finds_the_same_cameras(tmp_path: Path) -> No
     assert 0 < after < 0.6 * before
     assert calibrated.has_prior_focal_length and not guess.has_prior_focal_length
     assert abs(calibrated.mean_focal_length() / 1280 - 1) < 0.1
-    options = incremental_options(0, Effort(), lens_is_known=False, thinned=True)
+    options = incremental_options(0, MappingOptions(), camera_is_known=False, thinned=True)
     (model,) = map_incrementally(thinned, tmp_path, tmp_path / "models", options)
     compared = compare_models(made.model, model)
     assert compared["agree"] == PHOTOS and 0 < compared["centre"] < 0.01
     assert check_model(model, made.database, 0).check.passed.all()
 
 
-def test_beside_trusted_pairs_those_are_believed_that_agree(made: Made, tmp_path: Path) -> None:
+def test_matches_consistent_with_trusted_pairs_are_kept(made: Made, tmp_path: Path) -> None:
     wrong = turned_alone(made, 5)
     photos = [Photo(f"{i:02}.jpg", f"images/{i:02}.jpg", 8, 8, 0, None, None, False, 1.0) for i in range(PHOTOS)]
-    work: Any = SimpleNamespace(database=made.database, photos=photos)
-    steps = steps_of_row(work)
+    state: Any = SimpleNamespace(database=made.database, photos=photos)
+    steps = consecutive_pairs(state)
     assert steps == {(i, i + 1) for i in range(1, PHOTOS)}
-    copy = tmp_path / "row.db"
-    copy_believed(wrong, made.database, copy, {step for step in steps if 5 not in step} | {(4, 6)})
+    copy = tmp_path / "consecutive.db"
+    copy_consistent_matches(wrong, made.database, copy, {step for step in steps if 5 not in step} | {(4, 6)})
     assert verified_pairs(copy) == {pair for pair in combinations(range(1, PHOTOS + 1), 2) if 5 not in pair}
-    copy_believed(wrong, made.database, copy, steps)  # trusted matches stay unless they are clearly off
+    copy_consistent_matches(wrong, made.database, copy, steps)  # trusted matches stay unless they are clearly off
     assert verified_pairs(copy) & {(4, 5), (5, 6)} == set()
 
 
@@ -170,22 +170,24 @@ def test_the_log_of_a_copy_whose_process_was_killed_is_not_taken_for_the_next_on
 def test_global_mapping_runs_beside_and_agrees(made: Made, tmp_path: Path) -> None:
     import pycolmap
 
-    started = sfm_global.start(
-        made.database, tmp_path / "thinned.db", tmp_path, tmp_path / "global", 0, lens_is_known=False
+    started = global_mapping.start(
+        made.database, tmp_path / "thinned.db", tmp_path, tmp_path / "global", 0, camera_is_known=False
     )
-    assert sfm_global.failure(started) is None
+    assert global_mapping.failure(started) is None
     compared = compare_models(made.model, pycolmap.Reconstruction(tmp_path / "global"))
-    assert compared["agree"] == PHOTOS and compared["centre"] < 0.02 and compared["elsewhere"] == []
+    assert compared["agree"] == PHOTOS and compared["centre"] < 0.02 and compared["different"] == []
 
 
 def test_what_global_mapping_dies_of_is_told(tmp_path: Path) -> None:
     damaged = tmp_path / "damaged.db"
     damaged.write_bytes(b"no database" * 100)
-    started = sfm_global.start(damaged, tmp_path / "thinned.db", tmp_path, tmp_path / "global", 0, lens_is_known=False)
-    assert "code" in (sfm_global.failure(started) or "")
+    started = global_mapping.start(
+        damaged, tmp_path / "thinned.db", tmp_path, tmp_path / "global", 0, camera_is_known=False
+    )
+    assert "code" in (global_mapping.failure(started) or "")
 
 
-def test_models_that_disagree_name_the_photos_that_stand_elsewhere(made: Made) -> None:
+def test_models_that_disagree_name_images_with_different_poses(made: Made) -> None:
     import pycolmap
 
     other = pycolmap.Reconstruction(made.model)
@@ -194,4 +196,4 @@ def test_models_that_disagree_name_the_photos_that_stand_elsewhere(made: Made) -
     names = [made.model.image(i).name for i in (3, 9)]
     compared = compare_models(made.model, other)
     assert (compared["photos"], compared["agree"]) == (PHOTOS, PHOTOS - 2)
-    assert sorted(compared["elsewhere"]) == sorted(names)
+    assert sorted(compared["different"]) == sorted(names)

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from nerf.geometry.scene import Camera
 from stages.contract import StageError
@@ -13,7 +14,7 @@ from stages.io.photos import Photo
 from stages.io.sparse_model import SparseImage, SparseModel
 from stages.io.transforms_export import intrinsics
 from stages.sfm.colmap.models import write_model
-from stages.sfm.imported.known_cameras import OPENGL_FROM_OPENCV, KnownCameras, _by_name, read_known_cameras
+from stages.sfm.imported.known_cameras import KnownCameras, _by_name, read_known_cameras
 
 W, H = 60, 40
 
@@ -123,6 +124,51 @@ def test_a_frames_own_intrinsics_win(read) -> None:
     assert [image.camera for image in model.images] == [0, 1, 0]
 
 
+ANGLE = 2 * math.atan(0.25)  # of a focal length of 120 across W pixels, of 80 across H
+
+
+@pytest.mark.parametrize(
+    ("own", "expected"),
+    [
+        ({"camera_angle_x": ANGLE}, ("OPENCV", (120, 120, 31, 19, 0.1, 0, 0, 0))),
+        ({"camera_angle_y": ANGLE}, ("OPENCV", (80, 80, 31, 19, 0.1, 0, 0, 0))),
+        ({"camera_angle_x": ANGLE, "camera_angle_y": ANGLE}, ("OPENCV", (120, 80, 31, 19, 0.1, 0, 0, 0))),
+        ({"x_fov": math.degrees(ANGLE)}, ("OPENCV", (120, 120, 31, 19, 0.1, 0, 0, 0))),
+        ({"fl_x": 70.0}, ("OPENCV", (70, 70, 31, 19, 0.1, 0, 0, 0))),
+        ({"fl_x": 70.0, "fl_y": None}, ("OPENCV", (70, 70, 31, 19, 0.1, 0, 0, 0))),
+        ({"fl_x": None}, ("OPENCV", (50, 52, 31, 19, 0.1, 0, 0, 0))),
+        ({"cx": 33.0}, ("OPENCV", (50, 52, 33, 20, 0.1, 0, 0, 0))),
+        ({"p1": 0.01}, ("OPENCV", (50, 52, 31, 19, 0, 0, 0.01, 0))),
+        ({"k1": 0.0}, ("PINHOLE", (50, 52, 31, 19))),
+        ({"distortion_params": [0, 0.2, 0, 0, 0, 0]}, ("OPENCV", (50, 52, 31, 19, 0, 0.2, 0, 0))),
+        ({"camera_model": "OPENCV_FISHEYE"}, ("OPENCV_FISHEYE", (50, 52, 31, 19, 0, 0, 0, 0))),
+        ({"camera_model": "OPENCV"}, ("OPENCV", (50, 52, 31, 19, 0.1, 0, 0, 0))),
+    ],
+)
+def test_a_frame_has_each_group_of_intrinsics_whole(read, own: dict[str, Any], expected: tuple[str, tuple]) -> None:
+    known = read([frame(0), frame(1, **own), frame(2)], k1=0.1, camera_model="OPENCV", **LENS)
+    camera = known.model.cameras[known.model.images[1].camera]
+    assert (camera.model, camera.width, camera.height) == (expected[0], W, H)
+    assert camera.params == pytest.approx(expected[1])
+    assert known.notes == []
+
+
+@pytest.mark.parametrize(
+    ("own", "shared", "named"),
+    [
+        ({"fl_x": 70.0, "camera_angle_x": ANGLE}, {}, ["./1", "fl_x", "70", "camera_angle_x", "120"]),
+        ({}, {"x_fov": math.degrees(ANGLE)}, ["all frames", "fl_x", "50", "x_fov", "120"]),
+        ({"k1": 0.2, "distortion_params": [0.1, 0, 0, 0, 0, 0]}, {}, ["./1", "k1", "distortion_params"]),
+        ({}, {"camera_model": "PINHOLE", "is_fisheye": True}, ["all frames", "PINHOLE", "is_fisheye"]),
+    ],
+)
+def test_contradictory_intrinsics_are_named(
+    read, own: dict[str, Any], shared: dict[str, Any], named: list[str]
+) -> None:
+    (note,) = read([frame(0), frame(1, **own), frame(2)], **LENS, **shared).notes
+    assert all(part in note for part in named)
+
+
 def _with(row: int, column: int, value: float) -> list[list[float]]:
     pose = matrix(1).tolist()
     pose[row][column] = value
@@ -138,14 +184,22 @@ def _with(row: int, column: int, value: float) -> list[list[float]]:
         ({"transform_matrix": [[1, 0], ["x"]]}, r"frame './1': its transform_matrix is not a matrix of numbers"),
         ({"transform_matrix": 7}, r"frame './1': its transform_matrix is not 4 × 4"),
         ({"transform_matrix": (matrix(1) @ np.diag([-1, 1, 1, 1])).tolist()}, r"frame './1': it mirrors"),
-        ({"transform_matrix": (matrix(1) @ np.diag([2, 2, 2, 1])).tolist()}, r"no rotation: .* it scales by 2\."),
-        ({"transform_matrix": np.zeros((4, 4)).tolist()}, r"no rotation: RᵀR is off by 1, and it scales by 0\."),
-        ({"fl_x": 0}, r"camera of frame './1': a focal length of 0 × 52 pixels is not one for a picture of 60×40"),
-        ({"fl_x": -50}, r"camera of frame './1': a focal length of -50 × 52 pixels is not one"),
-        ({"fl_x": 1e308}, r"camera of frame './1': a focal length of 1e\+308 × 52 pixels is not one"),
-        ({"fl_x": 1e-300}, r"camera of frame './1': a focal length of 1e-300 × 52 pixels is not one"),
+        (
+            {"transform_matrix": (matrix(1) @ np.diag([2, 2, 3, 1])).tolist()},
+            r"its axes are off by 12°, and it scales by",
+        ),
+        ({"transform_matrix": matrix(1).round(2).tolist()}, r"no rotation: its axes are off by 0\.\d+°"),
+        ({"transform_matrix": np.zeros((4, 4)).tolist()}, r"its axes are off by inf°, and it scales by 0\."),
+        (
+            {"transform_matrix": matrix(1).T.tolist()},
+            r"the last row .* is 1, 2, -1, 1 and not 0, 0, 0, 1: it may be trans",
+        ),
+        ({"fl_x": 0}, r"camera of frame './1': a focal length of 0 × 0 pixels is not one for a picture of 60×40"),
+        ({"fl_x": -50}, r"camera of frame './1': a focal length of -50 × -50 pixels is not one"),
+        ({"fl_x": 1e308}, r"camera of frame './1': a focal length of 1e\+308 × 1e\+308 pixels is not one"),
+        ({"fl_x": 1e-300}, r"camera of frame './1': a focal length of 1e-300 × 1e-300 pixels is not one"),
         ({"fl_x": 10**400}, r"camera of frame './1': its fl_x is 10{39}, not a finite number"),
-        ({"cx": -1e300}, r"camera of frame './1': its principal point \(-1e\+300, 19\) is far outside of its 60×40"),
+        ({"cx": -1e300}, r"camera of frame './1': its principal point \(-1e\+300, 20\) is far outside of its 60×40"),
         ({"w": 10**30, "h": 10**30}, r"camera of frame './1': its w and h are 1e\+30 and 1e\+30"),
         ({"transform_matrix": _with(0, 3, 1e300)}, r"frame './1': its place is 1e\+300 units from the origin"),
         ({"transform_matrix": _with(0, 0, 1e308)}, r"frame './1': it is no rotation: 1e\+308 is in it"),
@@ -180,13 +234,37 @@ def test_no_focal_length_at_all_is_refused(read) -> None:
         read([frame(0, camera_angle_x=40)])
 
 
-def test_a_rotation_with_rounding_is_made_orthonormal(read) -> None:
-    rounded = matrix(1)
-    rounded[:3, :3] = np.round(rounded[:3, :3], 4)
-    (image,) = read([frame(1, transform_matrix=rounded.tolist())], **LENS).model.images
-    turned = image.sfm_from_camera[:, :3]
-    np.testing.assert_allclose(turned.T @ turned, np.eye(3), atol=1e-12)
-    assert 0 < np.abs(turned @ OPENGL_FROM_OPENCV - matrix(1)[:3, :3]).max() < 1e-4
+def test_rounded_rotations_are_projected_and_named(read) -> None:
+    tilted = matrix(1)
+    tilted[:3, :3] = Rotation.from_euler("xyz", (0.4, -0.7, 1.1)).as_matrix()
+    exact = read([frame(0), frame(1, transform_matrix=tilted.tolist()), frame(2)], **LENS)
+    rounded = read([frame(0), frame(1, transform_matrix=tilted.round(3).tolist()), frame(2)], **LENS)
+    for a, b in zip(exact.model.images, rounded.model.images, strict=True):
+        rotation = b.sfm_from_camera[:, :3]
+        np.testing.assert_allclose(rotation.T @ rotation, np.eye(3), atol=1e-12)
+        np.testing.assert_allclose(rotation, a.sfm_from_camera[:, :3], atol=np.radians(0.05))
+    assert exact.notes == []
+    (note,) = rounded.notes
+    assert "1 frames" in note and "./1" in note
+
+
+@pytest.mark.parametrize("scale", [1.05, 0.1, 1000.0])
+@pytest.mark.parametrize("frames", [[1], [0, 1, 2]])
+def test_the_scale_of_a_matrix_is_left_out_and_named(read, scale: float, frames: list[int]) -> None:
+    by = np.diag([scale, scale, scale, 1])
+    given = [frame(i, transform_matrix=(matrix(i) @ (by if i in frames else np.eye(4))).tolist()) for i in range(3)]
+    known, plain = read(given, **LENS), read([frame(i) for i in range(3)], **LENS)
+    for scaled, image in zip(known.model.images, plain.model.images, strict=True):
+        np.testing.assert_allclose(scaled.sfm_from_camera, image.sfm_from_camera, atol=1e-12)
+    (note,) = known.notes
+    assert f"{len(frames)} frames" in note and f"{scale:g}" in note
+
+
+def test_a_matrix_may_be_a_flat_list_of_its_rows(read) -> None:
+    flat = read([frame(i, transform_matrix=matrix(i).ravel().tolist()) for i in range(3)], **LENS)
+    plain = read([frame(i) for i in range(3)], **LENS)
+    for one, other in zip(flat.model.images, plain.model.images, strict=True):
+        np.testing.assert_array_equal(one.sfm_from_camera, other.sfm_from_camera)
 
 
 def test_frames_without_photo_and_photos_without_frame_are_named(read) -> None:
@@ -202,8 +280,15 @@ def test_no_frame_with_a_photo_is_an_error(read) -> None:
 
 
 def test_a_photo_has_one_frame(read) -> None:
-    with pytest.raises(StageError, match=r"two frames for the photo ä1.png: one is './1'"):
-        read([frame(1), frame(1)], **LENS)
+    for second in (frame(1, fl_x=51.0), frame(1, transform_matrix=matrix(2).tolist())):
+        with pytest.raises(StageError, match=r"two frames for the photo ä1.png differ: './1' is listed twice"):
+            read([frame(1), second], **LENS)
+
+
+def test_frames_that_are_listed_twice_alike_count_once(read) -> None:
+    known = read([frame(0), frame(1), frame(1), frame(2)], **LENS)
+    assert [image.file for image in known.model.images] == ["a0.png", "a1.png", "a2.png"]
+    assert known.notes == ["1 frames are listed twice, alike: ./1"]
 
 
 @pytest.mark.parametrize("with_test", [True, False])

@@ -166,7 +166,7 @@ def test_one_camera_that_only_fits_upright_tells_it_of_all(kind: str, alone: boo
         write_model(tmp_path, SparseModel.without_points(cameras, images))
     known = read_known_cameras(given, photos, {name: name for name in names})
     turns = ["1 cameras are turned upright like their photos (EXIF orientation)"]
-    assert known.notes == (turns if alone else [])
+    assert [note for note in known.notes if "turned" in note] == (turns if alone else [])
 
 
 def turned_photo(orientation: int, name: str = "p.jpg") -> Photo:

@@ -7,14 +7,14 @@ from stages.io.photos import Photo
 from stages.sfm.pairs.match_graph import (
     MIN_INLIERS,
     UNTESTED,
+    candidate_orders,
     connected,
-    in_order,
     inlier_matrix,
     natural_order,
     neighbour_overlap,
     next_pairs,
-    order_tells,
-    possible_orders,
+    order_is_informative,
+    pairs_apart,
     weak_cuts,
 )
 from stages.sfm.pairs.pair_selection import Pairs, nearest, spanning_tree, union
@@ -53,7 +53,7 @@ def test_growing_finds_true_neighbours_that_retrieval_missed() -> None:
 
 def test_growing_stops_where_every_photo_was_tried_with_enough() -> None:
     truth = walk(60, reach=59)
-    tried = inlier_matrix(60, (pairs := in_order(np.arange(60), 1, 10)), truth[pairs[:, 0], pairs[:, 1]])
+    tried = inlier_matrix(60, (pairs := pairs_apart(np.arange(60), 1, 10)), truth[pairs[:, 0], pairs[:, 1]])
     assert len(next_pairs(tried, truth / 400.0, neighbours=9)) < 60
     assert len(next_pairs(np.where(tried == UNTESTED, 0, tried), truth / 400.0, neighbours=30)) == 0
 
@@ -76,12 +76,12 @@ def test_overlap_is_that_of_verified_neighbours() -> None:
     assert overlap[10, 11] > overlap[10, 13] > overlap[10, 15] > overlap[10, 20] == 0
 
 
-@pytest.mark.parametrize(("shuffled", "tells"), [(False, True), (True, False)])
-def test_order_tells_unless_names_are_shuffled(shuffled: bool, tells: bool) -> None:
+@pytest.mark.parametrize(("shuffled", "informative"), [(False, True), (True, False)])
+def test_order_is_informative_unless_names_are_shuffled(shuffled: bool, informative: bool) -> None:
     truth = walk(60, reach=40)
     order = np.random.default_rng(1).permutation(60) if shuffled else np.arange(60)
-    pairs = union(in_order(order, 1, 2), nearest(truth.astype(float), 8))
-    assert order_tells(order, inlier_matrix(60, pairs, truth[pairs[:, 0], pairs[:, 1]])) is tells
+    pairs = union(pairs_apart(order, 1, 2), nearest(truth.astype(float), 8))
+    assert order_is_informative(order, inlier_matrix(60, pairs, truth[pairs[:, 0], pairs[:, 1]])) is informative
 
 
 def test_numbers_in_names_count_as_numbers() -> None:
@@ -131,6 +131,6 @@ def test_photos_may_follow_each_other_by_clock_or_by_name(clocks: list[float | N
         Photo(f"{number}.jpg", f"images/{number}.jpg", 8, 8, 0, None, None, False, 1.0, clock_s=clock)
         for number, clock in enumerate(clocks)
     ]
-    assert [order.tolist() for order in possible_orders(photos)] == orders
+    assert [order.tolist() for order in candidate_orders(photos)] == orders
     frames = [replace(photo, time_s=float(number), clock_s=None) for number, photo in enumerate(photos)]
-    assert [order.tolist() for order in possible_orders(frames)] == [[0, 1, 2]]
+    assert [order.tolist() for order in candidate_orders(frames)] == [[0, 1, 2]]

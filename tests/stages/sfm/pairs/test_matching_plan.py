@@ -87,7 +87,7 @@ def test_what_is_given_stays_in_every_tier(progress, monkeypatch: pytest.MonkeyP
 
 
 def test_nothing_is_measured_without_a_time(progress, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(matching_plan, "CHILD", ["-c", "raise SystemExit('measured')"])
+    monkeypatch.setattr(matching_plan, "COMMAND", ["-c", "raise SystemExit('measured')"])
     assert chosen(ALL_OPEN, photos(50), Path(), 30, progress, None) == Chosen(1600, 4096, "exhaustive")
     with pytest.raises(StageError) as caught:
         chosen(ALL_OPEN, photos(400), Path(), 30, progress, 60.0)

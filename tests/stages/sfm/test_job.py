@@ -11,11 +11,9 @@ from PIL import Image
 
 from stages import sfm
 from stages.contract import StageError
-from stages.sfm import clock as sfm_clock
-from stages.sfm import process as sfm_process
-from stages.sfm.clock import Clock
-from stages.sfm.retry_strategies import GIVEN, GIVEN_UP, NO_TIME, OUT_OF_TIME, left_out_for_time
-from stages.sfm.work import Job, Work
+from stages.sfm import worker_process
+from stages.sfm.job import PHASE_SECONDS, Job, JobState, PhaseTimer
+from stages.sfm.retry_strategies import MAX_SECONDS_LIMIT, NO_TIME, OUT_OF_TIME, TIME_GIVEN, skipped_for_time
 from tests.stages.sfm.sfm_inputs import SMALL, ingested
 from tests.synthetic_photos import SyntheticPhotos
 
@@ -29,44 +27,44 @@ def wait(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
 
 
 def test_a_phase_goes_on_counting_unless_it_begins_anew(tmp_path: Path, wait: Callable[[float], None]) -> None:
-    clock = Clock(tmp_path / "clock.json")
+    clock = PhaseTimer(tmp_path / "clock.json")
     assert (clock.total, clock.earlier) == (0, 0)
     wait(1)
-    clock.begin("first: features", anew=False)
+    clock.begin("default: features", from_zero=False)
     wait(10)
     assert clock.end() == 10
-    clock.begin("first: matching", anew=False)
+    clock.begin("default: matching", from_zero=False)
     wait(100)
-    clock.keep()
+    clock.save()
     wait(5)  # of these nobody knows
-    again = Clock(tmp_path / "clock.json")
+    again = PhaseTimer(tmp_path / "clock.json")
     assert again.earlier == again.total == 111
-    again.begin("first: features", anew=False)
+    again.begin("default: features", from_zero=False)
     assert again.end() == 10
-    again.begin("first: matching", anew=False)
+    again.begin("default: matching", from_zero=False)
     wait(20)
     assert again.end() == 120
     for _ in range(2):
-        again.begin("first: mapping", anew=True)
+        again.begin("default: mapping", from_zero=True)
         wait(7)
         assert again.end() == 7
     assert (again.total, again.earlier) == (145, 111)
 
 
-def work(folder: Path, seconds: float | None, max_seconds: float) -> Work:
-    search = {"max_image_size": 800, "max_features": 500, "matcher": "exhaustive", "neighbours": 3, "attempts": 7}
+def work(folder: Path, seconds: float | None, max_seconds: float) -> JobState:
+    search = {"max_image_size": 800, "max_features": 500, "matcher": "exhaustive", "neighbours": 3, "max_strategies": 7}
     given = {"seed": 0, "camera_model": None, "camera_params": None, "seconds": seconds, "max_seconds": max_seconds}
     paths = {"folder": str(folder), "images": str(folder), "database": str(folder / "x.db")}
-    return Work(Job(**paths, photos=[], **search, **given), lambda **message: None)
+    return JobState(Job(**paths, photos=[], **search, **given), lambda **message: None)
 
 
 @pytest.mark.parametrize(
     ("seconds", "max_seconds", "left", "limit"),
     [
-        (500.0, 1000.0, 500 - 300 - 50, GIVEN),
-        (None, 1000.0, 1000 - 50, GIVEN_UP),
-        (5000.0, 1000.0, 1000 - 50, GIVEN_UP),
-        (1200.0, 1000.0, 1200 - 300 - 50, GIVEN),
+        (500.0, 1000.0, 500 - 300 - 50, TIME_GIVEN),
+        (None, 1000.0, 1000 - 50, MAX_SECONDS_LIMIT),
+        (5000.0, 1000.0, 1000 - 50, MAX_SECONDS_LIMIT),
+        (1200.0, 1000.0, 1200 - 300 - 50, TIME_GIVEN),
     ],
 )
 def test_the_time_given_is_for_all_runs_together(
@@ -74,15 +72,21 @@ def test_the_time_given_is_for_all_runs_together(
 ) -> None:
     first = work(tmp_path, seconds, max_seconds)
     wait(300)
-    first.clock.keep()
+    first.timer.save()
     second = work(tmp_path, seconds, max_seconds)
     wait(50)
     assert second.left() == (left, limit)
 
 
-def test_attempts_left_out_for_time_are_counted() -> None:
-    reasons = [None, f"{NO_TIME} {GIVEN}", f"{NO_TIME} {GIVEN_UP}", f"it {OUT_OF_TIME}", "it ended the program"]
-    assert left_out_for_time([{"passed": reason} for reason in reasons]) == 3
+def test_strategies_skipped_for_time_are_counted() -> None:
+    reasons = [
+        None,
+        f"{NO_TIME} {TIME_GIVEN}",
+        f"{NO_TIME} {MAX_SECONDS_LIMIT}",
+        f"it {OUT_OF_TIME}",
+        "it ended the program",
+    ]
+    assert skipped_for_time([{"skipped": reason} for reason in reasons]) == 3
 
 
 def test_a_run_that_goes_on_knows_what_the_one_before_it_took(
@@ -91,27 +95,27 @@ def test_a_run_that_goes_on_knows_what_the_one_before_it_took(
     pictures = sorted(synthetic_photos.folder.iterdir())[:6]
     folders = ingested(tmp_path / "ingest", {file.name: np.asarray(Image.open(file)) for file in pictures})
     killed = (
-        "import os, time, stages.sfm.worker as c, stages.sfm.clock as clock, stages.sfm.matching as matching\n"
-        "clock.BEAT = 0.1\n"
+        "import os, time, stages.sfm.worker as c, stages.sfm.job as job, stages.sfm.matching as matching\n"
+        "job.SAVE_INTERVAL_SECONDS = 0.1\n"
         "matching.match_pairs = lambda *_: (time.sleep(3), os.kill(os.getpid(), 9))\n"
         "c.main()"
     )
     told = (
         "import stages.sfm.worker as c, stages.sfm.retry_strategies as a\n"
-        "add = a.Journal.add\n"
-        "a.Journal.add = lambda journal, tried: (print(tried.seconds, file=c.sys.stderr), add(journal, tried))\n"
+        "add = a.StrategyLog.add\n"
+        "a.StrategyLog.add = lambda journal, tried: (print(tried.seconds, file=c.sys.stderr), add(journal, tried))\n"
         "c.main()"
     )
     with monkeypatch.context() as patched:
-        patched.setattr(sfm_process, "CHILD", ["-c", killed])
+        patched.setattr(worker_process, "COMMAND", ["-c", killed])
         with pytest.raises(StageError, match="was ended by SIGKILL while matching"):
             sfm.run(SMALL, folders, tmp_path / "sfm", progress)
-    total, phases = json.loads((tmp_path / "sfm/attempts" / sfm_clock.NAME).read_text())
-    assert phases["first: matching"] > 2 and total > phases["first: matching"] + phases["first: features"]
-    monkeypatch.setattr(sfm_process, "CHILD", ["-c", told])
+    total, phases = json.loads((tmp_path / "sfm/strategies" / PHASE_SECONDS).read_text())
+    assert phases["default: matching"] > 2 and total > phases["default: matching"] + phases["default: features"]
+    monkeypatch.setattr(worker_process, "COMMAND", ["-c", told])
     sfm.run(SMALL, folders, tmp_path / "sfm", progress)
     log = (tmp_path / "sfm/sfm.log").read_text()
     seconds = json.loads(next(line for line in log.splitlines() if line.startswith("{'features'")).replace("'", '"'))
-    assert seconds["features"] >= phases["first: features"]
-    assert seconds["matching"] >= phases["first: matching"]
-    assert not (tmp_path / "sfm/attempts").exists()
+    assert seconds["features"] >= phases["default: features"]
+    assert seconds["matching"] >= phases["default: matching"]
+    assert not (tmp_path / "sfm/strategies").exists()

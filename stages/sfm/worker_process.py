@@ -1,4 +1,4 @@
-"""The child process of stage sfm from outside: starting it, what is on the screen meanwhile, and every way it can end.
+"""The worker process of stage sfm from outside: starting it, the live line meanwhile, and every way it can end.
 
 What it does is in stages/sfm/worker.py.
 """
@@ -17,23 +17,23 @@ from typing import IO, TYPE_CHECKING, Any
 
 from stages.contract import Progress, StageError
 from stages.io.live_line import live_line
-from stages.sfm.retry_strategies import ATTEMPTS, OUT_OF_TIME, abandon
+from stages.sfm.retry_strategies import OUT_OF_TIME, STRATEGIES, abandon
 
 if TYPE_CHECKING:
     from stages.io.photos import Photo
     from stages.sfm import Config
 
-# The share of the first attempt where a phase begins, and how long it is (measured on 11 to 50 photos, two cores).
+# The fraction of the first strategy where a phase begins, and how long it is (measured on 11 to 50 photos, two cores).
 PHASES = {"features": (0.0, 0.35), "matching": (0.35, 0.5), "mapping": (0.85, 0.15)}
-FIRST_ATTEMPT, REFINING = 0.7, 0.95  # where they end and begin in the whole
-FULL_DISK = 1 << 22  # bytes: less than the smallest of COLMAP's files that may have found no room
-CHILD = ["-P", "-m", "stages.sfm.worker"]  # -P: nothing that lies in the current folder is taken for a module
+FIRST_STRATEGY, REFINING = 0.7, 0.95  # where they end and begin in the whole
+MIN_FREE_BYTES = 1 << 22  # less than the smallest of COLMAP's files that may have found no room
+COMMAND = ["-P", "-m", "stages.sfm.worker"]  # -P: nothing that lies in the current folder is taken for a module
 
 
-def run_child(
+def run_worker(
     config: "Config", photos: "Sequence[Photo]", images: Path, folder: Path, database: Path, progress: Progress
 ) -> dict[str, Any]:
-    """Do the work in stages/sfm/worker.py and hand back its result. Raises StageError if the child does not end
+    """Do the work in stages/sfm/worker.py and hand back its result. Raises StageError if the worker does not end
     well."""
     job = {
         "folder": str(folder.absolute()),
@@ -43,10 +43,10 @@ def run_child(
         **config.model_dump(exclude={"cameras"}),
     }
     latest: dict[str, Any] = {"phase": "features", "database": job["database"], "done": 0, "pairs": 0}
-    latest["attempt"] = ATTEMPTS[0].name
+    latest["strategy"] = STRATEGIES[0].name
     log = folder / "sfm.log"
     with log.open("ab") as stderr:
-        child = _start_child(stderr)
+        child = _start(stderr)
         overtime = threading.Timer(config.max_seconds, child.kill)
         overtime.start()
         assert child.stdin and child.stdout
@@ -65,24 +65,25 @@ def run_child(
             child.wait()
     if "result" not in latest:
         limit = config.max_seconds if late else None
-        last = latest.get("fault") or _last_words(log)
-        raise _child_failed(code, limit, latest["phase"], last, _without(latest["attempt"], code, late, log), log)
+        last = latest.get("fault") or _last_line(log)
+        raise _worker_failed(code, limit, latest["phase"], last, _without(latest["strategy"], code, late, log), log)
     return latest["result"]
 
 
-def _without(attempt: str, code: int, late: bool, log: Path) -> str | None:
-    """The hint to run again without the attempt that failed, which is noted; None for the first: it is always made."""
-    if attempt == ATTEMPTS[0].name or not (late or code):
+def _without(strategy: str, code: int, late: bool, log: Path) -> str | None:
+    """The hint to run again without the strategy that failed, which is noted; None for the first: it is always
+    tried."""
+    if strategy == STRATEGIES[0].name or not (late or code):
         return None
     # Also where it was killed: most often for want of memory, and then it would be every time.
     became = "was killed, most often for want of memory" if code == -signal.SIGKILL else "ended the program"
-    abandon(log.parent / "attempts", attempt, OUT_OF_TIME if late else became)
-    return f"Run again: it goes on without the attempt {attempt!r}. Log: {log}"
+    abandon(log.parent / "strategies", strategy, OUT_OF_TIME if late else became)
+    return f"Run again: it skips the strategy {strategy!r}. Log: {log}"
 
 
-def _start_child(stderr: IO[bytes]) -> "subprocess.Popen[bytes]":
+def _start(stderr: IO[bytes]) -> "subprocess.Popen[bytes]":
     return subprocess.Popen(
-        [sys.executable, *CHILD],
+        [sys.executable, *COMMAND],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=stderr,
@@ -114,34 +115,34 @@ def _describe(latest: Mapping[str, Any], photos: int) -> tuple[str, float | None
 
     phase = latest["phase"]
     if phase == "refining":
-        return "adjusting all cameras and points together", REFINING
-    features, pairs = count_done(Path(latest["database"]))  # the first of mapping's steps places two photos
+        return "final bundle adjustment", REFINING
+    features, pairs = count_done(Path(latest["database"]))  # the first of mapping's steps registers two photos
     done, total, words = {
         "features": (features, photos, "features of {} of {} photos"),
         "matching": (pairs, latest["pairs"], "matched {} of {} pairs of photos"),
-        "mapping": (latest["done"] and min(latest["done"] + 1, photos), photos, "placed {} of {} photos"),
+        "mapping": (latest["done"] and min(latest["done"] + 1, photos), photos, "registered {} of {} photos"),
     }[phase]
     begin, length = PHASES[phase]
     share = begin + length * done / max(1, total)
-    attempt = [one.name for one in ATTEMPTS].index(latest["attempt"])
-    if not attempt:
-        return words.format(done, total), FIRST_ATTEMPT * share
-    later = (attempt - 1 + share) / (len(ATTEMPTS) - 1)
-    return f"{words.format(done, total)} ({latest['attempt']})", FIRST_ATTEMPT + (REFINING - FIRST_ATTEMPT) * later
+    number = [one.name for one in STRATEGIES].index(latest["strategy"])
+    if not number:
+        return words.format(done, total), FIRST_STRATEGY * share
+    later = (number - 1 + share) / (len(STRATEGIES) - 1)
+    return f"{words.format(done, total)} ({latest['strategy']})", FIRST_STRATEGY + (REFINING - FIRST_STRATEGY) * later
 
 
-def _last_words(log: Path) -> str:
+def _last_line(log: Path) -> str:
     lines = log.read_text("utf-8", "replace").strip().splitlines()
     return lines[-1].strip() if lines else "it left no message"
 
 
-def _child_failed(code: int, limit: float | None, phase: str, last: str, without: str | None, log: Path) -> StageError:
-    """``last``: what the child said at last; ``without``: the hint where running again goes on without the attempt that
+def _worker_failed(code: int, limit: float | None, phase: str, last: str, without: str | None, log: Path) -> StageError:
+    """``last``: the last message of the worker; ``without``: the hint where running again skips the strategy that
     failed."""
     free = shutil.disk_usage(log.parent).free
-    if free < FULL_DISK:  # COLMAP and its database say it in words of their own, or do not notice
+    if free < MIN_FREE_BYTES:  # COLMAP and its database report it in other words, or do not notice
         last += f"; the disk has only {free / 2**20:.1f} MB free: No space left on device"
-    where = f"while {phase}" if phase != "features" else "while finding features"
+    where = f"while {phase}" if phase != "features" else "while extracting features"
     if limit is not None:
         return StageError(
             f"structure-from-motion was given up {where}",

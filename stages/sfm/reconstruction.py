@@ -1,0 +1,242 @@
+"""What stage sfm does in the user's own process: it checks the photos, runs the worker and reports what it found."""
+
+import shutil
+from collections.abc import Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nerf.geometry.scene import Camera
+from stages.contract import Progress, StageError, listed
+from stages.hardware.memory import check_memory
+from stages.io.photos import Photo, read_photos
+from stages.normalise.georeference import georeference
+from stages.sfm import Config
+from stages.sfm.colmap.cameras import is_valid
+from stages.sfm.colmap.matching import Search, feature_bytes
+from stages.sfm.colmap.models import read_model
+from stages.sfm.imported.poses import import_cameras
+from stages.sfm.pairs.matching_plan import Open, check_matcher, chosen
+from stages.sfm.pairs.pair_selection import places_of
+from stages.sfm.registration import (
+    MIN_MODEL_POINTS,
+    MIN_REGISTERED,
+    OVERLAP_HINT,
+    count_done,
+    image_rows,
+    is_sound,
+    read_matches,
+    repeated_structure,
+    why_no_model,
+    with_near_duplicates,
+)
+from stages.sfm.retry_strategies import LOG, read_kept, skipped_for_time
+from stages.sfm.worker_process import run_worker
+
+MAX_NAMES = 5
+# Of the worker's result, what registration.json takes as it is.
+FACTS = (
+    "strategies",
+    "reprojection_px",
+    "points",
+    "camera_model",
+    "camera_models",
+    "match_graph",
+    "check",
+    "global_mapping",
+)
+
+
+def choose_options(config: Config, ingest: Path, progress: Progress) -> Config:
+    """The config with features and pairs chosen, by what they take on this machine for some of the photos."""
+    left_open = Open(config.max_image_size, config.max_features, config.matcher)
+    _, photos = _photos(ingest)
+    answer = chosen(left_open, photos, ingest / "images", config.neighbours, progress, config.seconds)
+    return config.model_copy(update=answer._asdict())
+
+
+def find_cameras(config: Config, ingest: Path, folder: Path, progress: Progress) -> tuple[dict[str, Any], str]:
+    """Write ``sparse/``; what registration.json says of it, and what the stage's line adds.
+
+    Raises StageError where no usable model comes out.
+    """
+    photos, matched = _photos(ingest)
+    if config.cameras is not None:
+        return _registration("import", **import_cameras(config.cameras, photos, ingest, folder, progress)), ""
+    return _reconstruct(config, photos, matched, ingest, folder, progress)
+
+
+def _photos(ingest: Path) -> tuple[list[Photo], list[Photo]]:
+    """All photos by file, and those of them that are matched: near duplicates of others are not."""
+    everything = sorted(read_photos(ingest), key=lambda photo: photo.file)
+    return everything, [photo for photo in everything if not photo.near_duplicate_of]
+
+
+def _registration(source: str, images: list[dict[str, Any]], **facts: Any) -> dict[str, Any]:
+    """The content of registration.json."""
+    registered = sum(image["registered"] for image in images)
+    return {"source": source, "photos": len(images), "registered": registered, **facts, "images": images}
+
+
+def _reconstruct(
+    config: Config, everything: list[Photo], photos: list[Photo], ingest: Path, folder: Path, progress: Progress
+) -> tuple[dict[str, Any], str]:
+    _check_count(photos, len(everything))
+    _check_camera(config, photos)
+    check_matcher(config.matcher, places_of(photos))
+    _check_memory(config, photos)
+    names = [photo.image_name for photo in photos]
+    database = _database(folder, names, progress)
+    found = run_worker(config, photos, ingest / "images", folder, database, progress)
+    models, points = found["models"], found["points"]
+    if not models or len(models[0]) < MIN_REGISTERED or points < MIN_MODEL_POINTS:
+        shutil.rmtree(folder / "sparse", ignore_errors=True)
+        # By the matches of the first strategy: later ones let in many that are false.
+        raise why_no_model(photos, read_matches(database), len(models[0]) if models else 0, points)
+    matches, conflict = read_matches(Path(found["database"])), found["conflict"]
+    images = image_rows(names, matches, models, found["observations"], found["supports"], conflict, found["left_out"])
+    if conflict:
+        progress.note(repeated_structure(conflict, {photo.image_name: photo.name for photo in photos}))
+    _note_unregistered(photos, images, progress)
+    registration = _registration(
+        "sfm",
+        repeated_structure=conflict,
+        images=_with_figures(with_near_duplicates(images, everything), found),
+        georeference=_georeference(folder, photos, progress),
+        test_files=None,
+        **{name: found[name] for name in FACTS},
+    )
+    _remove_intermediate(folder)
+    complete = all(image["registered"] for image in images)
+    return registration, "" if complete else _skipped_for_time(found["strategies"])
+
+
+# --- checks beforehand
+
+
+def _check_count(photos: Sequence[Photo], ingested: int) -> None:
+    if len(photos) < MIN_REGISTERED:
+        why = f"it takes at least {MIN_REGISTERED} photos that overlap"
+        if same := ingested - len(photos):
+            why += f", and {same} are nearly the same picture as one of these"
+        raise StageError(f"cannot find cameras from {len(photos)} photo{'s' * (len(photos) != 1)}", why, OVERLAP_HINT)
+
+
+def _check_memory(config: Config, photos: Sequence[Photo]) -> None:
+    """Raises StageError where memory does not suffice for the features of even one photo at a time."""
+    assert config.max_image_size and config.max_features, "choose_options() sets them"
+    needed = feature_bytes(photos, Search(config.max_image_size, config.max_features))
+    why = f"feature extraction from one photo at {config.max_image_size} pixels takes"
+    check_memory(needed, "features of the photos", why, f"Try --sfm.max-image-size {config.max_image_size // 2}.")
+
+
+def _check_camera(config: Config, photos: Sequence[Photo]) -> None:
+    """Raises StageError where the given intrinsics cannot be those of the photos."""
+    if config.camera_params is None:
+        return
+    what = "cannot use --sfm.camera-params"
+    hint = "Give COLMAP's numbers for these photos: --sfm.camera-model SIMPLE_RADIAL --sfm.camera-params F CX CY K."
+    if config.camera_model is None:
+        raise StageError(what, "the model that they are the parameters of is not given", hint)
+    sizes = sorted({(photo.width, photo.height) for photo in photos})
+    if len(sizes) > 1:
+        listed = ", ".join(f"{width}×{height}" for width, height in sizes[:3])
+        raise StageError(what, f"the photos have {len(sizes)} sizes ({listed}) and so several cameras", hint)
+    try:
+        valid = is_valid(Camera(config.camera_model, *sizes[0], config.camera_params))
+    except ValueError as error:
+        raise StageError(what, str(error), hint) from error
+    if not valid:
+        raise StageError(what, "a focal length is not positive", hint)
+
+
+# --- what an interrupted run left
+
+
+def _database(folder: Path, names: Sequence[str], progress: Progress) -> Path:
+    """The database of features and matches: an interrupted run's if it can be trusted, else none yet.
+
+    Its settings are those of the folder's key; COLMAP's version is not part of the key, so it is in the name.
+    """
+    database = folder / f"matches-{version('pycolmap')}.db"
+    if not database.exists():
+        _remove_intermediate(folder)  # strategies without their matches, or those of another version of COLMAP
+        return database
+    if _are_sound(folder / "strategies") and all(is_sound(one, names) for one in folder.glob("matches-*.db")):
+        features, pairs = count_done(database)
+        progress.note(f"resuming with the features of {features} photos and {pairs} matched pairs")
+    else:
+        progress.note("the matches of the interrupted run are damaged: starting over")
+        _remove_intermediate(folder)
+    return database
+
+
+def _are_sound(strategies: Path) -> bool:
+    try:
+        for file in strategies.glob("*.json"):
+            read_kept(file)
+    except ValueError:
+        return False
+    return True
+
+
+def _remove_intermediate(folder: Path) -> None:
+    """Remove what only an interrupted run needs: the log first, for without the rest it would mislead."""
+    (folder / "strategies" / LOG).unlink(missing_ok=True)
+    shutil.rmtree(folder / "strategies", ignore_errors=True)
+    for database in folder.glob("matches-*"):
+        database.unlink()
+
+
+# --- the report of a reconstruction
+
+
+def _with_figures(images: list[dict[str, Any]], found: dict[str, Any]) -> list[dict[str, Any]]:
+    """The row of each image with how well its pose is known, and how its matches agree with it."""
+    uncertainty, checked = found["uncertainty_px"], found["check"].pop("images")
+    unknown = {"agreement": None, "transfer_px": None}
+    return [
+        image | {"uncertainty_px": uncertainty.get(image["file"])} | checked.get(image["file"], unknown)
+        for image in images
+    ]
+
+
+def _georeference(folder: Path, photos: Sequence[Photo], progress: Progress) -> dict[str, Any] | None:
+    """Metres and compass directions by the registered photos' GPS, noted; None where none or too few have it."""
+    position_of = {
+        photo.image_name: (photo.latitude, photo.longitude, photo.altitude_m)
+        for photo in photos
+        if photo.latitude is not None and photo.longitude is not None
+    }
+    images = read_model(folder / "sparse").images if position_of else []
+    located = [image for image in images if image.file in position_of]
+    if not located:
+        return None
+    centres = np.array([image.sfm_from_camera[:, 3] for image in located])
+    found = georeference(centres, [position_of[image.file] for image in located])
+    if isinstance(found, str):
+        progress.note(f"no metres from the photos' GPS: {found}")
+        return None
+    scale = f"one unit is {found.enu_from_sfm.scale:.3g} m"
+    progress.note(f"GPS of {found.used} photos: {scale}; positions are off by {found.error_m:.1f} m (median)")
+    return found.to_json()
+
+
+def _note_unregistered(photos: Sequence[Photo], images: list[dict[str, Any]], progress: Progress) -> None:
+    missing = [(photo.name, i["reason"]) for photo, i in zip(photos, images, strict=True) if not i["registered"]]
+    if not missing:
+        return
+    progress.note(f"{len(missing)} of {len(photos)} photos could not be registered and are left out:")
+    by_reason: dict[str, list[str]] = {}
+    for name, reason in missing:
+        by_reason.setdefault(reason, []).append(name)
+    for reason, who in by_reason.items():
+        progress.note(f"  {listed(who, MAX_NAMES)}: {reason}")
+
+
+def _skipped_for_time(strategies: Sequence[dict[str, Any]]) -> str:
+    """What the line says of strategies skipped for time: a run with more time takes this result as finished."""
+    count = skipped_for_time(strategies)
+    return f" · {count} retry strateg{'y' if count == 1 else 'ies'} skipped for time: sfm --force" if count else ""
