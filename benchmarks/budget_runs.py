@@ -27,7 +27,7 @@ from nerf.training.ray_dataset import RayDataset
 from nerf.training.schedule import plan_of
 from nerf.training.trainer import FieldTrainer
 from nerf.training.validation_probe import Probe, make_probe, measure
-from stages.effects.decisions import Decisions, photo_parts, read_decisions, told_by_neighbours
+from stages.effects.decisions import Decisions, image_effects, read_decisions, told_by_neighbours
 from stages.hardware.backend import chosen_backend, load_backend
 from stages.hardware.device import compute_device
 from stages.io.files import read_json, read_scene
@@ -113,8 +113,8 @@ class RunningMean:
 
 def train_run(bench: Bench, seed: int, steps: int, schedule: str) -> dict[str, Any]:
     """One run, measured at geometric steps."""
-    parts = photo_parts(bench.decisions, bench.scene.of_split("train"), bench.bank)
-    trainer = make_trainer(bench.config, bench.scene, bench.bank, seed, parts)
+    effects = image_effects(bench.decisions, bench.scene.of_split("train"), bench.bank)
+    trainer = make_trainer(bench.config, bench.scene, bench.bank, seed, effects)
     assert isinstance(trainer, HashGridTrainer)
     means = {name: RunningMean(trainer, exponent) for name, exponent in MEANS.items()}
     due = {round(steps / 2 ** (k / PER_DOUBLING)) for k in range(PER_DOUBLING * int(math.log2(steps / FIRST)) + 1)}
@@ -128,9 +128,9 @@ def train_run(bench: Bench, seed: int, steps: int, schedule: str) -> dict[str, A
             for mean in means.values():
                 mean.add(step + 1)
         if step + 1 in due:
-            unseen = trainer.photo_colours.of_unseen(bench.neighbours)
+            as_expected = trainer.effects.of_held_out(bench.neighbours)
             models = {"heldout_psnr": trainer.model} | {name: mean.model for name, mean in means.items()}
-            psnr = {name: measure(model, bench.probe, unseen).psnr for name, model in models.items()}
+            psnr = {name: measure(model, bench.probe, as_expected).psnr for name, model in models.items()}
             points.append({"step": step + 1, "train_psnr": pace, **psnr})
     return {"rays": rays, "pixels": bench.bank.drawable, "points": points}
 

@@ -3,8 +3,8 @@
     python -m benchmarks.effect_costs ../shared/data/fox --workspace /tmp/fox.nerf [--seconds 60] [--rounds 60]
 
 Trains the same field with every choice, a step of each in turn, and gives the median of each step's time over that of
-the step beside it in which no effect of photos is on (as many colours a step everywhere). "off": how much of that step
-passes in the parts that stand in place of effects which are off (nerf/effects), where one trainer that knows of no
+the step beside it in which no effect of images is on (as many colours a step everywhere). "off": how much of that step
+passes in the identity that stands in place of effects which are off (nerf/effects), where a trainer that knows of no
 effects would only take the difference of two colours; so it is a bound from above.
 """
 
@@ -18,12 +18,12 @@ from typing import Any
 from benchmarks.grid_parts import loaded
 from benchmarks.nerfacto import pipeline
 from benchmarks.record import Record, add_out
-from nerf.effects import AS_GIVEN, AS_RENDERED
+from nerf.effects import NO_EFFECTS
 from nerf.geometry.scene import Scene
 from nerf.runtime.matmul_precision import use_matmul_precision
 from nerf.training.ray_dataset import RayDataset
 from nerf.training.trainer import FieldTrainer
-from stages.effects.decisions import Decisions, photo_parts
+from stages.effects.decisions import Decisions, image_effects
 from stages.train import Config
 from stages.train.fields import make_trainer
 
@@ -32,14 +32,14 @@ SHARE = 0.1  # of the run: the learning rate is still whole
 
 
 class Timed:
-    """Stands in place of a part and keeps how many seconds pass in each thing it does, on whichever thread."""
+    """Stands in place of an object and keeps how many seconds pass in each thing it does, on whichever thread."""
 
-    def __init__(self, part: Any) -> None:
-        self.part = part
+    def __init__(self, timed: Any) -> None:
+        self.timed = timed
         self.seconds: list[float] = []
 
     def __getattr__(self, name: str) -> Any:
-        found = getattr(self.part, name)
+        found = getattr(self.timed, name)
         if not callable(found):
             return found
 
@@ -53,9 +53,9 @@ class Timed:
 
 
 def arms(
-    config: Config, scene: Scene, bank: RayDataset, decided: Decisions, neutral: tuple[Timed, Timed]
+    config: Config, scene: Scene, bank: RayDataset, decided: Decisions, identity: Timed
 ) -> dict[str, FieldTrainer]:
-    """A trainer for each choice; ``neutral`` stand in the first one."""
+    """A trainer for each choice; ``identity`` stands in the first one."""
     views = scene.of_split("train")
     none = replace(decided, view_dependence=True, pose_refinement=False, exposure=None)
     gains = decided.exposure or {view.name: [0.0, 0.0, 0.0] for view in views}
@@ -66,12 +66,12 @@ def arms(
         "no view dependence": replace(none, view_dependence=False),
     }
 
-    def trainer(decisions: Decisions, parts: Any) -> FieldTrainer:
+    def trainer(decisions: Decisions, effects: Any) -> FieldTrainer:
         of_choice = config.model_copy(update={"view_dependence": decisions.view_dependence})
-        return make_trainer(of_choice, scene, bank, config.seed, parts)
+        return make_trainer(of_choice, scene, bank, config.seed, effects)
 
-    return {"off": trainer(none, neutral)} | {
-        name: trainer(each, photo_parts(each, views, bank)) for name, each in choices.items()
+    return {"off": trainer(none, identity)} | {
+        name: trainer(each, image_effects(each, views, bank)) for name, each in choices.items()
     }
 
 
@@ -87,22 +87,21 @@ def main() -> None:
     workspace = given.workspace.absolute()
     pipeline("run", given.photos.absolute(), "-o", workspace, "--until", "effects")
     config, scene, bank, decided = loaded(workspace, Config(seconds=given.seconds))
-    neutral = Timed(AS_GIVEN), Timed(AS_RENDERED)
-    trainers = arms(config, scene, bank, decided, neutral)
+    identity = Timed(NO_EFFECTS)
+    trainers = arms(config, scene, bank, decided, identity)
     seconds: dict[str, list[float]] = {name: [] for name in trainers}
     with use_matmul_precision(config.matmul):
         for each in trainers.values():
             for step in range(WARM_STEPS):
                 each.step(step, SHARE, 1.0)
-        for part in neutral:
-            part.seconds.clear()
+        identity.seconds.clear()
         for step in range(WARM_STEPS, WARM_STEPS + given.rounds):
             for name, each in trainers.items():
                 began = time.perf_counter()
                 each.step(step, SHARE, 1.0)
                 seconds[name].append(time.perf_counter() - began)
     off = seconds.pop("off")
-    share = sum(sum(part.seconds) for part in neutral) / sum(off)
+    share = sum(identity.seconds) / sum(off)
     more = {name: median(a / b for a, b in zip(mine, off, strict=True)) - 1 for name, mine in seconds.items()}
     percent = {f"{name.replace(' ', '_')}_percent": round(100 * value, 1) for name, value in more.items()}
     Record(given.out).add(**percent, all_off_percent=round(100 * share, 2), step_ms=round(1e3 * median(off)))

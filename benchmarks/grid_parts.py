@@ -22,7 +22,7 @@ from nerf.runtime.machine_rates import measure_rates
 from nerf.runtime.matmul_precision import use_matmul_precision
 from nerf.training.ray_dataset import RayDataset
 from nerf.training.trainer import FieldTrainer
-from stages.effects.decisions import Decisions, photo_parts, read_decisions
+from stages.effects.decisions import Decisions, image_effects, read_decisions
 from stages.hardware.device import compute_device, cores
 from stages.io.files import read_scene
 from stages.train import Config, plan
@@ -75,7 +75,9 @@ def prepared(workspace: Path, asked: Config) -> tuple[Config, FieldTrainer]:
     """A fresh field with all that its first step needs, as stage train makes it, and the settings that the stage chose,
     which are printed."""
     config, scene, bank, decisions = loaded(workspace, asked)
-    return config, make_trainer(config, scene, bank, config.seed, photo_parts(decisions, scene.of_split("train"), bank))
+    return config, make_trainer(
+        config, scene, bank, config.seed, image_effects(decisions, scene.of_split("train"), bank)
+    )
 
 
 def loaded(workspace: Path, asked: Config) -> tuple[Config, Scene, RayDataset, Decisions]:

@@ -15,7 +15,7 @@ from pathlib import Path
 import torch
 
 from benchmarks.record import Record, add_out
-from nerf.effects.exposure import ExposedModel
+from nerf.effects.appearance import AppearanceModel
 from nerf.fields.hash_grid import HashGridField
 from nerf.fields.interface import RadianceModel
 from nerf.fields.vanilla import VanillaNerf
@@ -31,8 +31,8 @@ from stages.train.data import PhotoReader, view_rays
 
 def with_samples(model: RadianceModel, factor: float) -> RadianceModel:
     """The same field with so many times the samples along each ray."""
-    if isinstance(model, ExposedModel):
-        return ExposedModel(with_samples(model.model, factor), model.log_gain)
+    if isinstance(model, AppearanceModel):
+        return AppearanceModel(with_samples(model.model, factor), model.effects)
     if isinstance(model, HashGridField):
         given = model.settings
         finer = {"shortest_step": given.shortest_step / factor, "cone": given.cone / factor}
@@ -49,7 +49,7 @@ def with_samples(model: RadianceModel, factor: float) -> RadianceModel:
 
 def samples_of(model: RadianceModel) -> str:
     """How the samples of a field are laid, in its own terms."""
-    if isinstance(model, ExposedModel):
+    if isinstance(model, AppearanceModel):
         return samples_of(model.model)
     if isinstance(model, HashGridField):
         step, bounded = model.drawn_lattice.step, f"{model.settings.steps} along the box's diagonal"

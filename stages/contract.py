@@ -46,10 +46,13 @@ OptionalSourcePath = Annotated[Path | None, Suppress]
 class StageError(Exception):
     """A failure the user can act on: what happened, why, and what to try next (one sentence each).
 
-    Each part is cut where it is very long: it may quote a file, in which a name may have any length.
+    ``code`` is its name for programs, as in ``sfm.no-overlap``: it stays where the sentences are reworded. Each
+    sentence is cut where it is very long: it may quote a file, in which a name may have any length.
     """
 
-    def __init__(self, what: str, why: str, hint: str) -> None:
+    def __init__(self, code: str, what: str, why: str, hint: str) -> None:
+        self.code = code
+        self.add_note(f"code: {code}")  # for who reads the traceback of --debug
         self.what, self.why, self.hint = (bounded(part) for part in (what, why, hint))
         super().__init__(f"{self.what}: {self.why}. {self.hint}")
 

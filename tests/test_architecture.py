@@ -143,8 +143,11 @@ def swallowed_errors(module: Module) -> Iterator[str]:
             only_pass = len(node.body) == 1 and isinstance(node.body[0], ast.Pass)
             if only_pass and (node.type is None or ast.unparse(node.type) in ("Exception", "BaseException")):
                 yield f"line {node.lineno} swallows an error"
-        suppressed = node.args if isinstance(node, ast.Call) and ast.unparse(node.func).endswith("suppress") else []
-        if {ast.unparse(argument) for argument in suppressed} & {"Exception", "BaseException"}:
+        if (
+            isinstance(node, ast.Call)
+            and ast.unparse(node.func).endswith("suppress")
+            and {ast.unparse(argument) for argument in node.args} & {"Exception", "BaseException"}
+        ):
             yield f"line {node.lineno} swallows an error"
 
 

@@ -3,12 +3,16 @@
 import json
 import re
 from collections.abc import Iterator
+from dataclasses import fields
 from pathlib import Path
 
 from tyro.conf import Suppress
 
 from benchmarks import results
+from nerf.geometry.scene import Camera, Scene, Similarity, View
 from pipeline.engine.stage_list import STAGES
+from stages import evaluate
+from stages.io.photos import Photo
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -146,6 +150,17 @@ def test_the_table_of_modules_is_complete():
     modules = [name_of(path) for package in ("nerf", "stages", "pipeline") for path in (ROOT / package).rglob("*.py")]
     assert len(modules) > 60
     assert sorted(listed) == sorted(modules)
+
+
+def test_examples_of_files_name_every_key():
+    page = (ROOT / "docs" / "FILES.md").read_text("utf-8")
+    wanted = {
+        "photos.json": {field.name for field in fields(Photo)},
+        "scene.json": {field.name for kind in (Scene, View, Camera, Similarity) for field in fields(kind)},
+        "metrics.json": set(evaluate.FIGURES),
+    }
+    shown = {name: set(re.findall(r'"(\w+)"', page.split(f"## {name} ")[1].split("\n## ")[0])) for name in wanted}
+    assert {name: keys - shown[name] for name, keys in wanted.items() if keys - shown[name]} == {}
 
 
 def test_the_checks_can_fail(tmp_path: Path):

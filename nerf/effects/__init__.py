@@ -1,13 +1,12 @@
-"""What stands between a radiance field and a photo of it, each part switched on only where a scene calls for it.
+"""What stands between a radiance field and an image of it: optional effects, each on only where a scene calls for it.
 
-The trainers (nerf/training/hash_grid_trainer.py, nerf/training/trainer.py) know two places: where a photo's rays run
-(:class:`PhotoRays`) and what the photo makes of the colours they meet (:class:`PhotoColours`). In each stands one part;
-the neutral ones, :class:`AsGiven` and :class:`AsRendered`, have no parameters and compute nothing, so that an effect
-that is off costs nothing and changes no bit.
+An image has a tuple of ray effects (its camera model: where its rays run) and a tuple of colour effects (its appearance
+model: what it shows of the scene), applied in order. :class:`ImageEffects` holds both and composes them; without any it
+is the identity, which computes nothing and changes no bit.
 
-Parameters have a row per view of the ray bank and are updated in place by the trainer. ``forward`` is plain torch,
-which autograd may differentiate (the paper field's trainer does so); ``backward`` is its derivative by hand (the grid
-field's trainer has no autograd) and gives dense gradients of the part's parameters by name.
+Parameters have a row per image of the ray dataset and are updated in place by the trainer. ``forward`` is plain torch,
+which autograd may differentiate (the vanilla NeRF's trainer does so); the backward methods are its derivative by hand
+(the hash-grid trainer has no autograd) and give dense gradients of the parameters by name.
 """
 
 from collections.abc import Callable
@@ -17,25 +16,43 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from nerf import FULL
 from nerf.fields.interface import Rendering
 from nerf.geometry.rays import Rays
 
 
-class Seen(NamedTuple):
-    """What rays of the views ``view`` met, rendered over ``background``."""
+class RayGradients(NamedTuple):
+    """Gradients of a loss by rays' origins and directions."""
+
+    origins: Float[Tensor, "rays 3"]
+    directions: Float[Tensor, "rays 3"]
+
+
+class TrainingImages(NamedTuple):
+    """What effects may begin from: the calibrated cameras of the training images, and how far away (scene units) is
+    what each of them shows; None: nobody knows."""
+
+    scene_from_camera: Float[Tensor, "views 3 4"]
+    viewing_distance: Float[Tensor, "views"] | None = None
+
+
+class RenderedRays(NamedTuple):
+    """What a field shows along calibrated ``rays`` of the images ``view``, over ``background``."""
 
     rendering: Rendering
     background: Float[Tensor, "*#rays 3"]
+    rays: Rays
     view: Int[Tensor, "rays"]
 
 
-GradRays = Callable[[], tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays 3"]]]
-"""Computes the gradients of a loss by rays' origins and directions; costly, called only where they are wanted."""
-
-
 @runtime_checkable
-class PhotoRays(Protocol):
-    """Where the rays of each photo run."""
+class RayEffect(Protocol):
+    """Where the rays of each image run."""
+
+    @property
+    def name(self) -> str:
+        """What the effect is called everywhere (stages/effects/effect_list.py)."""
+        ...
 
     @property
     def parameters(self) -> dict[str, Float[Tensor, "views _"]]:
@@ -43,26 +60,40 @@ class PhotoRays(Protocol):
         ...
 
     @property
-    def rate(self) -> float:
+    def learning_rate(self) -> float:
         """Adam's learning rate for them before the field's warm-up and decay."""
         ...
 
-    def settle(self) -> None:
-        """After an update: take out what the field could take up itself (the gauge)."""
+    @property
+    def rows(self) -> Float[Tensor, "views _"]:
+        """What was learnt of each image, in the units of files."""
+        ...
+
+    def fix_gauge(self) -> None:
+        """After an update: take out what the field could take up itself."""
         ...
 
     def forward(self, rays: Rays, view: Int[Tensor, "rays"]) -> Rays:
-        """The rays along which to look, given those of the calibrated cameras."""
+        """The rays along which to render."""
         ...
 
-    def backward(self, rays: Rays, view: Int[Tensor, "rays"], grad: GradRays) -> dict[str, Tensor]:
-        """Gradients of the parameters; ``rays`` as forward was given them."""
+    def backward(self, rays: Rays, view: Int[Tensor, "rays"], grad: RayGradients) -> dict[str, Tensor]:
+        """Gradients of the parameters; ``rays`` as forward was given them, ``grad`` by those that it gave."""
+        ...
+
+    def backward_rays(self, rays: Rays, view: Int[Tensor, "rays"], grad: RayGradients) -> RayGradients:
+        """Gradients of the rays that forward was given; asked for only where another effect stands before."""
         ...
 
 
 @runtime_checkable
-class PhotoColours(Protocol):
-    """What each photo makes of the colours of its rays."""
+class ColourEffect(Protocol):
+    """What each image makes of the scene's radiance along its rays."""
+
+    @property
+    def name(self) -> str:
+        """What the effect is called everywhere (stages/effects/effect_list.py)."""
+        ...
 
     @property
     def parameters(self) -> dict[str, Float[Tensor, "views _"]]:
@@ -70,75 +101,147 @@ class PhotoColours(Protocol):
         ...
 
     @property
-    def rate(self) -> float:
+    def learning_rate(self) -> float:
         """Adam's learning rate for them before the field's warm-up and decay."""
         ...
 
-    def settle(self) -> None:
-        """After an update: take out what the field could take up itself (the gauge)."""
+    @property
+    def rows(self) -> Float[Tensor, "views _"]:
+        """What was learnt of each image, in the units of files: what the effect is made of again."""
         ...
-
-    def of_unseen(self, weights: Float[Tensor, "unseen views"]) -> "PhotoColours":
-        """What photos that took no part are expected to make of colours, from what ``weights`` says of their neighbours
-        among those that did (nerf/geometry/pose_distance.py)."""
-        ...
-
-    def residual(self, seen: Seen, target: Float[Tensor, "rays 3"]) -> Float[Tensor, "rays 3"]:
-        """By how much the photo would show more than its ``target`` colours; their squares are the loss."""
-        ...
-
-    def backward(self, seen: Seen, grad: Float[Tensor, "rays 3"]) -> tuple[Rendering, dict[str, Tensor]]:
-        """Gradients of the rendering and of the parameters, given that of the residual."""
-        ...
-
-
-class AsGiven:
-    """Rays as the calibrated cameras have them: a :class:`PhotoRays` without effect."""
-
-    rate = 0.0
 
     @property
-    def parameters(self) -> dict[str, Tensor]:
-        """None."""
-        return {}
+    def reference(self) -> Float[Tensor, "_"]:
+        """The row at which the field is shown where no image is meant."""
+        ...
 
-    def settle(self) -> None:
-        """Nothing to do."""
+    @property
+    def reference_sentence(self) -> str:
+        """What that is, in words."""
+        ...
 
-    def forward(self, rays: Rays, view: Int[Tensor, "rays"]) -> Rays:
-        """The same rays."""
+    def fix_gauge(self) -> None:
+        """After an update: take out what the field could take up itself."""
+        ...
+
+    def of_held_out(self, weights: Float[Tensor, "held_out views"]) -> "ColourEffect":
+        """Of images that took no part, from what ``weights`` says of their neighbours among those that did
+        (nerf/geometry/pose_distance.py)."""
+        ...
+
+    def forward(
+        self, colour: Float[Tensor, "rays 3"], rays: Rays, view: Int[Tensor, "rays"]
+    ) -> Float[Tensor, "rays 3"]:
+        """What the images show of ``colour`` (sRGB, may exceed 1), which the calibrated ``rays`` meet."""
+        ...
+
+    def backward(
+        self, colour: Float[Tensor, "rays 3"], rays: Rays, view: Int[Tensor, "rays"], grad: Float[Tensor, "rays 3"]
+    ) -> tuple[Float[Tensor, "rays 3"], dict[str, Tensor]]:
+        """Gradients of the colours and of the parameters, given that of what forward gave."""
+        ...
+
+
+Effect = RayEffect | ColourEffect
+
+
+class ImageEffects(NamedTuple):
+    """The effects that are on, in the order in which they are applied. Effects act on the scene's own radiance, not on
+    a background that images with alpha are laid over."""
+
+    rays: tuple[RayEffect, ...] = ()
+    colours: tuple[ColourEffect, ...] = ()
+
+    @property
+    def all(self) -> tuple[Effect, ...]:
+        """Those of rays, then those of colours."""
+        return (*self.rays, *self.colours)
+
+    @property
+    def parameters(self) -> dict[str, Float[Tensor, "views _"]]:
+        """By effect and name, like ``exposure.log_gain``."""
+        return {name: each for effect in self.all for name, each in parameters_of(effect).items()}
+
+    def forward_rays(self, rays: Rays, view: Int[Tensor, "rays"]) -> Rays:
+        """The rays along which to render, given those of the calibrated cameras."""
+        for effect in self.rays:
+            rays = effect.forward(rays, view)
         return rays
 
-    def backward(self, rays: Rays, view: Int[Tensor, "rays"], grad: GradRays) -> dict[str, Tensor]:
-        """Nothing to learn, and so nothing is computed."""
-        return {}
+    def backward_rays(
+        self, rays: Rays, view: Int[Tensor, "rays"], grad: Callable[[], RayGradients]
+    ) -> dict[str, Tensor]:
+        """Gradients of the ray effects' parameters. ``grad`` computes those of the rays that are rendered, which is
+        costly: called only where they are wanted."""
+        if not self.rays:
+            return {}
+        given = [rays]
+        for effect in self.rays[:-1]:
+            given.append(effect.forward(given[-1], view))
+        of_rays, gradients = grad(), dict[str, Tensor]()
+        for index in range(len(self.rays) - 1, -1, -1):
+            effect = self.rays[index]
+            gradients |= _named(effect, effect.backward(given[index], view, of_rays))
+            if index:
+                of_rays = effect.backward_rays(given[index], view, of_rays)
+        return gradients
+
+    def residual(self, seen: RenderedRays, target: Float[Tensor, "rays 3"]) -> Float[Tensor, "rays 3"]:
+        """By how much the images would show more than their ``target`` colours; their squares are the loss.
+
+        E(C - (1 - o) b) + (1 - o) b less the target, of opacity o, background b and all colour effects E; 0 where the
+        image is FULL and would be: an image ends at 1, and does not tell by how much it was exceeded."""
+        if not self.colours:
+            return seen.rendering.colour - target
+        behind = (1 - seen.rendering.opacity)[:, None] * seen.background
+        shown = self._stages(seen, self.colours)[-1] + behind
+        return torch.where((shown > 1) & (target >= FULL / 255), 0.0, shown - target)
+
+    def backward_residual(
+        self, seen: RenderedRays, grad: Float[Tensor, "rays 3"]
+    ) -> tuple[Rendering, dict[str, Tensor]]:
+        """Gradients of the rendering and of the colour effects' parameters, given that of the residual, which is 0
+        where that was cut to 0."""
+        none = torch.zeros(len(grad), dtype=grad.dtype, device=grad.device)
+        if not self.colours:
+            return Rendering(grad, none, none), {}
+        of_colour, gradients = grad, dict[str, Tensor]()
+        stages = self._stages(seen, self.colours[:-1])
+        for effect, colour in zip(reversed(self.colours), reversed(stages), strict=True):
+            of_colour, learnt = effect.backward(colour, seen.rays, seen.view, of_colour)
+            gradients |= _named(effect, learnt)
+        opacity = ((of_colour - grad) * seen.background).sum(-1)  # it moves both terms
+        return Rendering(of_colour, none, opacity), gradients
+
+    def of_held_out(self, weights: Float[Tensor, "held_out views"]) -> "ImageEffects":
+        """What images that took no part are expected to show, from what ``weights`` says of their neighbours; their
+        cameras count as calibrated."""
+        return ImageEffects(colours=tuple(effect.of_held_out(weights) for effect in self.colours))
+
+    @staticmethod
+    def _stages(seen: RenderedRays, effects: tuple[ColourEffect, ...]) -> list[Float[Tensor, "rays 3"]]:
+        """The scene's own radiance, and what each of ``effects`` in turn makes of it."""
+        rendering = seen.rendering
+        stages = [rendering.colour - (1 - rendering.opacity)[:, None] * seen.background]
+        for effect in effects:
+            stages.append(effect.forward(stages[-1], seen.rays, seen.view))
+        return stages
 
 
-class AsRendered:
-    """Photos that show what is rendered: a :class:`PhotoColours` without effect."""
-
-    rate = 0.0
-
-    @property
-    def parameters(self) -> dict[str, Tensor]:
-        """None."""
-        return {}
-
-    def settle(self) -> None:
-        """Nothing to do."""
-
-    def of_unseen(self, weights: Float[Tensor, "unseen views"]) -> "AsRendered":
-        """The same."""
-        return self
-
-    def residual(self, seen: Seen, target: Float[Tensor, "rays 3"]) -> Float[Tensor, "rays 3"]:
-        """Rendered less shown."""
-        return seen.rendering.colour - target
-
-    def backward(self, seen: Seen, grad: Float[Tensor, "rays 3"]) -> tuple[Rendering, dict[str, Tensor]]:
-        """The same gradient."""
-        none = torch.zeros(len(grad), device=grad.device)
-        return Rendering(grad, none, none), {}
+NO_EFFECTS = ImageEffects()
 
 
-AS_GIVEN, AS_RENDERED = AsGiven(), AsRendered()
+def parameters_of(effect: Effect) -> dict[str, Float[Tensor, "views _"]]:
+    """An effect's parameters by the names that they have among all."""
+    return _named(effect, effect.parameters)
+
+
+def _named(effect: Effect, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    return {f"{effect.name}.{name}": tensor for name, tensor in tensors.items()}
+
+
+def foreground_radiance(
+    colour: Float[Tensor, "*n 3"], opacity: Float[Tensor, "*n"], background: Float[Tensor, "3"]
+) -> Float[Tensor, "*n 3"]:
+    """The part of a rendering's colour that is the scene's own and not the background's: what colour effects act on."""
+    return (colour - (1 - opacity)[..., None] * background).clamp(min=0)

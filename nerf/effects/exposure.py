@@ -1,4 +1,4 @@
-"""Exposure: photos of one scene taken at different gains, one per channel (which is white balance, too).
+"""Effect ``exposure``: photos of one scene taken at different gains, one per channel (which is white balance, too).
 
 A gain acts on light, photos are sRGB: what a photo of log gain g shows of a colour c is s(exp(g) s⁻¹(c)), where s is
 the transfer curve of sRGB (nerf/rendering/srgb.py). Gains are natural logarithms, so they add up: expose(expose(c, a),
@@ -6,32 +6,97 @@ b) is expose(c, a + b), and g = log 2 is one stop (EV).
 
 From power to power no light has to be computed: s(exp(g) s⁻¹(c)) = k (c + 0.055) - 0.055 with k = exp(g / 2.4), which
 is c + (k - 1) (c + 0.055). That keeps colours as large as 1e30 finite, and c exactly what it is where g is 0.
+
+Gains begin as the tracks measured them (nerf/effects/statistics/exposure.py) and are learnt on with the field, which
+holds what the darkest photo shows: its colours end at 1, and only the photo with the least gain shows all that is
+bright. So gains are kept as they are above the least one of each channel, which stands for one.
 """
 
+import math
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from nerf.fields.interface import RadianceModel, Rendering
+from nerf.effects import TrainingImages
 from nerf.geometry.rays import Rays
 from nerf.rendering.srgb import KNEE, OFFSET, POWER, SLOPE, linear_to_srgb, srgb_to_linear
 
-LARGEST = 16.0  # of a log gain, either way: 23 stops, beyond what any camera spans
+LEARNING_RATE = 2e-3  # of the logarithm of a gain; gains begin within a percent or two of where they end
+MAX_LOG_GAIN = 16.0  # either way: 23 stops, beyond what any camera spans
 
-DARKEST, LIGHTEST = 2 / 255, 253 / 255  # within, 8 bits tell a photo's log gain
-MOST_PIXELS = 1 << 14  # that a fit looks at: noise of 0.05 then moves a gain by 0.002
+MIN_VALUE, MAX_VALUE = 2 / 255, 253 / 255  # within, 8 bits tell a photo's log gain
+MAX_PIXELS = 1 << 14  # that a fit looks at: noise of 0.05 then moves a gain by 0.002
 ITERATIONS = 8  # with each of the two weights
 HUBER, TUKEY = 1.345, 4.685  # standard deviations: 95 % of the efficiency of least squares on Gaussian noise
 OF_GAUSSIAN = 1.4826  # standard deviation of Gaussian noise by its median absolute value
-FINEST = 1 / 255  # no residual spreads less than a step of the photos
+MIN_SPREAD = 1 / 255  # no residual spreads less than a step of the photos
+
+
+class ExposureModel:
+    """A :class:`nerf.effects.ColourEffect`. ``log_gain``: natural logarithms of gains in linear light, a row per
+    view."""
+
+    name = "exposure"
+    learning_rate = LEARNING_RATE
+
+    def __init__(self, log_gain: Float[Tensor, "views 3"]) -> None:
+        self.log_gain = log_gain.clone()
+        self.mean = self.log_gain.mean(0)
+
+    @classmethod
+    def initial(cls, images: TrainingImages, measured: Float[Tensor, "views 3"]) -> "ExposureModel":
+        """From gains that are known up to a factor per channel."""
+        return cls(measured - measured.amin(0))
+
+    @property
+    def parameters(self) -> dict[str, Float[Tensor, "views 3"]]:
+        """The logarithms of the gains."""
+        return {"log_gain": self.log_gain}
+
+    @property
+    def rows(self) -> Float[Tensor, "views 3"]:
+        """The same."""
+        return self.log_gain
+
+    @property
+    def reference(self) -> Float[Tensor, "3"]:
+        """The reference exposure: the median over the photos, per channel."""
+        return self.log_gain.median(0).values
+
+    @property
+    def reference_sentence(self) -> str:
+        """In stops (EV) above the photo with the least exposure, the three channels on the mean."""
+        stops = float(self.reference.double().mean() - self.log_gain.double().mean(1).min()) / math.log(2)
+        return f"reference exposure, {round(stops, 2) + 0.0:+.2f} EV over the least exposed photo"  # no -0
+
+    def fix_gauge(self) -> None:
+        """Keep the mean: a field twice as bright under gains half as large shows the same."""
+        self.log_gain -= self.log_gain.mean(0) - self.mean
+
+    def of_held_out(self, weights: Float[Tensor, "held_out views"]) -> "ExposureModel":
+        """Gains like those of the photos taken nearest by: a camera that sets its exposure sees there what they saw."""
+        return ExposureModel(weights.to(self.log_gain) @ self.log_gain)
+
+    def forward(
+        self, colour: Float[Tensor, "rays 3"], rays: Rays, view: Int[Tensor, "rays"]
+    ) -> Float[Tensor, "rays 3"]:
+        """The colours at the gains of their photos."""
+        return expose(colour, self.log_gain.index_select(0, view))
+
+    def backward(
+        self, colour: Float[Tensor, "rays 3"], rays: Rays, view: Int[Tensor, "rays"], grad: Float[Tensor, "rays 3"]
+    ) -> tuple[Float[Tensor, "rays 3"], dict[str, Tensor]]:
+        """By the chain rule; a photo's gain moves all of its rays."""
+        of_colour, of_gain = expose_backward(colour, self.log_gain.index_select(0, view), grad)
+        return of_colour, {"log_gain": torch.zeros_like(self.log_gain).index_add_(0, view, of_gain)}
 
 
 def expose(colour: Float[Tensor, "*n 3"], log_gain: Float[Tensor, "*#n 3"]) -> Float[Tensor, "*n 3"]:
     """What a photo of gain exp(``log_gain``) shows of sRGB colours, s(exp(g) s⁻¹(c)); not clipped above 1.
 
-    expose(c, 0) is c, bit for bit. Colours below 0 count as 0, gains beyond LARGEST as that.
+    expose(c, 0) is c, bit for bit. Colours below 0 count as 0, gains beyond MAX_LOG_GAIN as that.
     """
     return _shown(_branches(colour, log_gain))
 
@@ -45,7 +110,7 @@ def expose_backward(
     from_power = by_gain * POWER / (done.colour + OFFSET)  # by_gain · d log s⁻¹(c) / dc
     from_line = torch.where(done.bright, by_gain / done.colour.clamp(min=KNEE / 1e9), done.gain)  # never divides by 0
     by_colour = torch.where(done.was_bright, from_power, from_line) * (colour >= 0)
-    by_gain = by_gain * (log_gain.abs() <= LARGEST)
+    by_gain = by_gain * (log_gain.abs() <= MAX_LOG_GAIN)
     return grad * by_colour, (grad * by_gain).sum_to_size(log_gain.shape)
 
 
@@ -62,7 +127,7 @@ class _Branches(NamedTuple):
 
 
 def _branches(colour: Tensor, log_gain: Tensor) -> _Branches:
-    colour, log_gain = torch.broadcast_tensors(colour.clamp(min=0), log_gain.clamp(-LARGEST, LARGEST))
+    colour, log_gain = torch.broadcast_tensors(colour.clamp(min=0), log_gain.clamp(-MAX_LOG_GAIN, MAX_LOG_GAIN))
     gain = log_gain.exp()
     powered = colour + torch.expm1(log_gain / POWER) * (colour + OFFSET)
     straight = colour * gain
@@ -84,13 +149,6 @@ def _slope(done: _Branches, shown: Tensor) -> Tensor:
     return torch.where(done.bright, (shown + OFFSET) / POWER, shown)
 
 
-def own_light(
-    colour: Float[Tensor, "*n 3"], opacity: Float[Tensor, "*n"], background: Float[Tensor, "3"]
-) -> Float[Tensor, "*n 3"]:
-    """The part of a rendering's colour that is the scene's own and not the background's: what a gain acts on."""
-    return (colour - (1 - opacity)[..., None] * background).clamp(min=0)
-
-
 def fit_log_gain(shown: Float[Tensor, "n 3"], truth: Float[Tensor, "n 3"]) -> Float[Tensor, "3"]:
     """The log gains that make ``shown`` (a rendering, sRGB) like ``truth`` (a photo of it, sRGB).
 
@@ -101,66 +159,42 @@ def fit_log_gain(shown: Float[Tensor, "n 3"], truth: Float[Tensor, "n 3"]) -> Fl
     tells a gain: without pixels, or where the rendering is black.
     """
     count = len(shown)
-    chosen = torch.linspace(0, count - 1, min(count, MOST_PIXELS), dtype=torch.float64).round().long()
+    chosen = torch.linspace(0, count - 1, min(count, MAX_PIXELS), dtype=torch.float64).round().long()
     pair = (picture[chosen.to(picture.device)].double() for picture in (shown, truth))
     channels = zip(*(picture.clamp(min=0).unbind(-1) for picture in pair), strict=True)
     return torch.stack([_fit_channel(*channel) for channel in channels]).to(shown.dtype)
 
 
 def _fit_channel(shown: Float[Tensor, "n"], truth: Float[Tensor, "n"]) -> Float[Tensor, ""]:
-    log_gain, spread = _first_guess(shown, truth), shown.new_tensor(FINEST)
+    log_gain, spread = _first_guess(shown, truth), shown.new_tensor(MIN_SPREAD)
     for iteration in range(2 * ITERATIONS):
         done = _branches(shown, log_gain)
         exposed = _shown(done)
-        telling = (exposed < 1) & (_slope(done, exposed) > FINEST)  # the others' error does not change with the gain
+        telling = (exposed < 1) & (
+            _slope(done, exposed) > MIN_SPREAD
+        )  # the others' error does not change with the gain
         if not telling.any():
             break
         slope, residual = _slope(done, exposed)[telling], (exposed - truth.clamp(max=1))[telling]
         if iteration < ITERATIONS:
-            spread = (OF_GAUSSIAN * residual.abs().median()).clamp(min=FINEST)
+            spread = (OF_GAUSSIAN * residual.abs().median()).clamp(min=MIN_SPREAD)
             weight = HUBER * spread / residual.abs().clamp(min=HUBER * spread)
         else:
             weight = (1 - (residual / (TUKEY * spread)) ** 2).clamp(min=0) ** 2
-        pull, curvature = (weight * slope * residual).sum(), (weight * slope**2).sum()
+        gradient, curvature = (weight * slope * residual).sum(), (weight * slope**2).sum()
         if curvature <= 0:
             break
-        log_gain = (log_gain - (pull / curvature).clamp(-1, 1)).clamp(-LARGEST, LARGEST)
+        log_gain = (log_gain - (gradient / curvature).clamp(-1, 1)).clamp(-MAX_LOG_GAIN, MAX_LOG_GAIN)
     return log_gain
 
 
 def _first_guess(shown: Float[Tensor, "n"], truth: Float[Tensor, "n"]) -> Float[Tensor, ""]:
     """The median logarithmic ratio of pixels that are neither black nor saturated; of those that are, if there are no
     others."""
-    seen = shown > DARKEST
-    within = seen & (truth > DARKEST) & (truth < LIGHTEST)
+    seen = shown > MIN_VALUE
+    within = seen & (truth > MIN_VALUE) & (truth < MAX_VALUE)
     told = within if within.any() else seen
     if not told.any():
         return shown.new_zeros(())
-    light = srgb_to_linear(truth[told].clamp(FINEST / 2, 1))
-    return (light.log() - srgb_to_linear(shown[told]).log()).median().clamp(-LARGEST, LARGEST)
-
-
-class ExposedModel:
-    """A RadianceModel that shows another one at a fixed gain. Its colours may exceed 1."""
-
-    def __init__(self, model: RadianceModel, log_gain: Float[Tensor, "3"]) -> None:
-        self.model, self.log_gain = model, log_gain
-        self.chunk_rays = model.chunk_rays
-
-    def density(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points"]:
-        """The other model's."""
-        return self.model.density(points)
-
-    def density_and_colour(
-        self, points: Float[Tensor, "*points 3"], directions: Float[Tensor, "*points 3"]
-    ) -> tuple[Float[Tensor, "*points"], Float[Tensor, "*points 3"]]:
-        """The other model's density, and its colour, exposed."""
-        density, colour = self.model.density_and_colour(points, directions)
-        return density, expose(colour, self.log_gain)
-
-    def render(self, rays: Rays, background: Float[Tensor, "3"]) -> Rendering:
-        """The other model's rendering, exposed; the background is shown as it is."""
-        seen = self.model.render(rays, background)
-        light = own_light(seen.colour, seen.opacity, background)
-        # Not expose(light) + the rest: a gain of 1 is to change no bit.
-        return seen._replace(colour=seen.colour + (expose(light, self.log_gain) - light))
+    light = srgb_to_linear(truth[told].clamp(MIN_SPREAD / 2, 1))
+    return (light.log() - srgb_to_linear(shown[told]).log()).median().clamp(-MAX_LOG_GAIN, MAX_LOG_GAIN)

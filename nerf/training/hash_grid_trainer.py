@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from nerf.effects import AS_GIVEN, AS_RENDERED, PhotoColours, PhotoRays, Seen
+from nerf.effects import NO_EFFECTS, Effect, ImageEffects, RayGradients, RenderedRays, parameters_of
 from nerf.fields import mlp as grid_mlp
 from nerf.fields.background import PRIOR as SKY_PRIOR
 from nerf.fields.background import RATE as SKY_RATE
@@ -89,13 +89,13 @@ class HashGridBatch(NamedTuple):
 
 class Loss(NamedTuple):
     """A chunk's share of the loss, of the mean squared error in it, and the gradients of rendering, weights and of
-    what the photos make of colours."""
+    the colour effects' parameters."""
 
     value: Tensor
     squared_error: Tensor
     grad: Rendering
     grad_weights: Float[Tensor, "samples"]
-    grad_photos: dict[str, Tensor]
+    grad_effects: dict[str, Tensor]
 
 
 class _Part(NamedTuple):
@@ -109,7 +109,7 @@ class _Part(NamedTuple):
     features: Float[Tensor, "samples width"]
     points: Float[Tensor, "samples 3"]
     sky: dict[str, Tensor]
-    photos: dict[str, Tensor]
+    effects: dict[str, Tensor]
     norm: Tensor
     thickness: Float[Tensor, "samples"]
     densities: int
@@ -133,27 +133,23 @@ def depth_factor(share: float) -> float:
 
 
 class HashGridTrainer:
-    """Trains a grid field on the robust error of colours by Adam, and keeps its density cache. ``photo_rays`` and
-    ``photo_colours`` stand between the field and each photo (nerf/effects)."""
+    """Trains a grid field on the robust error of colours by Adam, and keeps its density cache. ``effects`` stand
+    between the field and each image (nerf/effects)."""
 
     def __init__(
         self,
         model: HashGridField,
         bank: RayDataset,
         settings: HashGridTrainerSettings,
-        photo_rays: PhotoRays = AS_GIVEN,
-        photo_colours: PhotoColours = AS_RENDERED,
+        effects: ImageEffects = NO_EFFECTS,
     ) -> None:
-        self.model, self.settings = model, settings
+        self.model, self.settings, self.effects = model, settings, effects
         # Nothing beyond the box of a bounded scene is drawn: a point there would pull the light to its walls.
         self.bank = bank if model.settings.contracted else bank.known_within(BOX)
-        self.photo_rays, self.photo_colours = photo_rays, photo_colours
         self.cache = OccupancyGrid(model, self._usable())
-        self.photo_parts = [each for each in (photo_rays, photo_colours) if each.parameters]
-        self.photo_parameters = {**photo_rays.parameters, **photo_colours.parameters}
         of_networks = model.weights._asdict()
         self.sky = {"sky": model.sky} if model.settings.sky else {}
-        self.parameters = {"table": model.table, **of_networks, **self.sky, **self.photo_parameters}
+        self.parameters = {"table": model.table, **of_networks, **self.sky, **effects.parameters}
         self.mean = {name: torch.zeros_like(tensor) for name, tensor in self.parameters.items()}
         self.square = {name: torch.zeros_like(tensor) for name, tensor in self.parameters.items()}
         self.grad_table = torch.zeros_like(model.table)
@@ -187,12 +183,12 @@ class HashGridTrainer:
         return StepResult(loss, psnr(error), rays, samples, sum(each.densities for each in parts))
 
     def state(self) -> dict[str, Tensor]:
-        """Weights and cache bits as ``model.<name>``, what is learnt of photos as ``photo.<name>``, Adam's moments as
-        ``mean.<name>`` and ``square.<name>``, the cache's thickness, the mean number of samples per ray, how
+        """Weights and cache bits as ``model.<name>``, per-image parameters as ``image.<effect>.<name>``, Adam's moments
+        as ``mean.<name>`` and ``square.<name>``, the cache's thickness, the mean number of samples per ray, how
         many pixels were drawn, and the field's settings, to know it by."""
         return (
             {f"model.{name}": tensor for name, tensor in self.model.state_dict().items()}
-            | {f"photo.{name}": tensor for name, tensor in self.photo_parameters.items()}
+            | {f"image.{name}": tensor for name, tensor in self.effects.parameters.items()}
             | {f"mean.{name}": tensor for name, tensor in self.mean.items()}
             | {f"square.{name}": tensor for name, tensor in self.square.items()}
             | {"thickness": self.cache.thickness, "samples_per_ray": self.samples_per_ray, "drawn": self.drawn}
@@ -245,7 +241,7 @@ class HashGridTrainer:
         """What a chunk of so many rays adds to loss and gradients."""
         with part("batch"):
             batch = self._batch(step, share, chunk, rays)
-            seen_along = self.photo_rays.forward(batch.rays, batch.view)
+            seen_along = self.effects.forward_rays(batch.rays, batch.view)
             if not all_finite(seen_along):
                 raise NonFinite(RAYS, step, _whole([batch]))
         done = self.model.forward(seen_along, batch.jitter, batch.offset, batch.background)
@@ -253,25 +249,26 @@ class HashGridTrainer:
             loss = self._loss(rays * self.settings.chunks, share, done, batch)
         with part("backward", self._backward_work(done)):
             gradients = self.model.backward(done, loss.grad, loss.grad_weights)
-            grad_rays = partial(self.model.rays_backward, done, gradients)
-            photos = loss.grad_photos | self.photo_rays.backward(batch.rays, batch.view, grad_rays)
+            effects = loss.grad_effects | self.effects.backward_rays(
+                batch.rays, batch.view, lambda: RayGradients(*self.model.rays_backward(done, gradients))
+            )
             sky = {name: self.model.background_backward(done, gradients) for name in self.sky}
         weights, features, *_ = gradients
-        norm = torch.nn.utils.get_total_norm([*weights, features, *sky.values(), *photos.values()])
+        norm = torch.nn.utils.get_total_norm([*weights, features, *sky.values(), *effects.values()])
         of_loss = loss.value, loss.squared_error
-        return _Part(batch, *of_loss, weights, features, done.points, sky, photos, norm, done.thickness, done.marched)
+        return _Part(batch, *of_loss, weights, features, done.points, sky, effects, norm, done.thickness, done.marched)
 
     def _backward_work(self, done: HashGridPass) -> Work:
         weights = self.model.weights
         products = 2 * (grid_mlp.density_products(weights) + grid_mlp.colour_products(weights)) * len(done.points)
-        to_points = CORNERS * len(self.model.layout.resolutions) * len(done.points) if self.photo_rays.parameters else 0
+        to_points = CORNERS * len(self.model.layout.resolutions) * len(done.points) if self.effects.rays else 0
         return Work(products, to_points)
 
     def _loss(self, rays: int, share: float, done: HashGridPass, batch: HashGridBatch) -> Loss:
-        seen = Seen(done.rendering, batch.background, batch.view)
-        error = self.photo_colours.residual(seen, batch.target)
+        seen = RenderedRays(done.rendering, batch.background, batch.rays, batch.view)
+        error = self.effects.residual(seen, batch.target)
         robust, pull = huber_loss(error)
-        grad, photos = self.photo_colours.backward(seen, pull * (2 / (3 * rays)))
+        grad, effects = self.effects.backward_residual(seen, pull * (2 / (3 * rays)))
         value, grad_weights = robust.sum() / (3 * rays), torch.zeros_like(done.weights)
         backend, lattice = self.model.backend, self.model.lattice
         if self.settings.distortion:
@@ -285,7 +282,7 @@ class HashGridTrainer:
             value = value + (each * apart).sum()
             of_weights, of_opacity = backend.depth_loss_backward(done.samples, *places, each)
             grad_weights, grad = grad_weights + of_weights, grad._replace(opacity=grad.opacity + of_opacity)
-        return Loss(value, error.square().sum() / (3 * rays), grad, grad_weights, photos)
+        return Loss(value, error.square().sum() / (3 * rays), grad, grad_weights, effects)
 
     def _finite(self, step: int, parts: Sequence[_Part]) -> tuple[float, float]:
         """Loss and squared error as numbers, once they and all gradients are known to be finite.
@@ -301,7 +298,7 @@ class HashGridTrainer:
         return loss_now, error_now
 
     def _update(self, parts: Sequence[_Part], factor: float, count: int) -> None:
-        """Of the table's levels, which share no rows, of the networks, of what is learnt of photos and of the cache:
+        """Of the table's levels, which share no rows, of the networks, of per-image parameters and of the cache:
         each work for a core. ``factor``: of all learning rates."""
         finest_first = range(len(self.model.layout.resolutions) - 1, -1, -1)  # no core waits long for the last
         rate = self.settings.rate * factor
@@ -311,8 +308,8 @@ class HashGridTrainer:
         of_sky = [*(chunk.sky for chunk in parts), self._sky_prior(parts)]
         work.append(partial(self._update_small, self.sky, of_sky, SKY_RATE * rate, count))
         work.append(partial(self._raise_cache, parts))
-        for of_photos in self.photo_parts:
-            work.append(partial(self._update_photos, of_photos, parts, of_photos.rate * factor, count))
+        for effect in self.effects.all:
+            work.append(partial(self._update_effect, effect, parts, effect.learning_rate * factor, count))
         for _ in in_order(lambda update: update(), work, self.bank.device):
             pass
 
@@ -341,11 +338,9 @@ class HashGridTrainer:
                 parameter, mean, square = self.parameters[name], self.mean[name], self.square[name]
                 self.model.backend.adam(parameter, gradient, mean, square, rate, count)
 
-    def _update_photos(
-        self, of_photos: PhotoRays | PhotoColours, parts: Sequence[_Part], rate: float, count: int
-    ) -> None:
-        self._update_small(of_photos.parameters, [chunk.photos for chunk in parts], rate, count)
-        of_photos.settle()
+    def _update_effect(self, effect: Effect, parts: Sequence[_Part], rate: float, count: int) -> None:
+        self._update_small(parameters_of(effect), [chunk.effects for chunk in parts], rate, count)
+        effect.fix_gauge()
 
     def _raise_cache(self, parts: Sequence[_Part]) -> None:
         with part("cache"):

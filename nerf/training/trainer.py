@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerf.effects import AS_GIVEN, AS_RENDERED, PhotoColours, PhotoRays, Seen
+from nerf.effects import NO_EFFECTS, ImageEffects, RenderedRays
 from nerf.fields.interface import RadianceModel, Rendering
 from nerf.fields.vanilla import VanillaNerf
 from nerf.geometry.rays import Rays
@@ -54,13 +54,8 @@ class FieldTrainer(Protocol):
         ...
 
     @property
-    def photo_rays(self) -> PhotoRays:
-        """Where the photos' rays run."""
-        ...
-
-    @property
-    def photo_colours(self) -> PhotoColours:
-        """What the photos make of its colours."""
+    def effects(self) -> ImageEffects:
+        """What stands between it and the images."""
         ...
 
     def step(self, step: int, share: float, rate_scale: float) -> StepResult:
@@ -137,29 +132,26 @@ class _Part(NamedTuple):
 
 class VanillaTrainer:
     """Trains coarse and fine network together on |C_c - C|² + |C_f - C|² (Mildenhall et al. 2020, eq. 6) by Adam
-    with the published constants; the loss is the mean over rays and channels. ``photo_rays`` and ``photo_colours``
-    stand between the field and each photo (nerf/effects)."""
+    with the published constants; the loss is the mean over rays and channels. ``effects`` stand
+    between the field and each image (nerf/effects)."""
 
     def __init__(
         self,
         model: VanillaNerf,
         bank: RayDataset,
         settings: VanillaTrainerSettings,
-        photo_rays: PhotoRays = AS_GIVEN,
-        photo_colours: PhotoColours = AS_RENDERED,
+        effects: ImageEffects = NO_EFFECTS,
     ) -> None:
         self.model = model
         self.bank = bank
         self.settings = settings
         self.order = PixelSampler(bank.drawable, settings.seed, bank.device)
-        self.photo_rays, self.photo_colours = photo_rays, photo_colours
-        self.photo_parts = [each for each in (photo_rays, photo_colours) if each.parameters]
-        self.photo_parameters = {**photo_rays.parameters, **photo_colours.parameters}
+        self.effects = effects
         networks = [p for p in model.parameters() if p.requires_grad]
         groups = [{"params": networks, "of_start": 1.0}]
-        for of_photos in self.photo_parts:
-            learnt = [parameter.requires_grad_() for parameter in of_photos.parameters.values()]
-            groups.append({"params": learnt, "of_start": of_photos.rate / settings.rate_start})
+        for effect in effects.all:
+            learnt = [parameter.requires_grad_() for parameter in effect.parameters.values()]
+            groups.append({"params": learnt, "of_start": effect.learning_rate / settings.rate_start})
         self.parameters = [parameter for group in groups for parameter in group["params"]]
         self.optimiser = torch.optim.Adam(groups, betas=(0.9, 0.999), eps=PUBLISHED_EPSILON, fused=True)
 
@@ -185,8 +177,8 @@ class VanillaTrainer:
         with part("optimiser", Work(bytes=ADAM_BYTES * sum(each.numel() for each in self.parameters))):
             self.optimiser.step()
         with torch.no_grad():
-            for of_photos in self.photo_parts:
-                of_photos.settle()
+            for effect in self.effects.all:
+                effect.fix_gauge()
         rays, queries = self.settings.batch_rays, self.settings.batch_rays * self.model.settings.queries_per_ray
         return StepResult(loss, psnr(error), rays, samples=queries, densities=queries)
 
@@ -195,13 +187,13 @@ class VanillaTrainer:
         size = CHUNK_RAYS.get(self.bank.device.type, self.settings.batch_rays)
         rays, target, view, background = batch.part(slice(start, start + size))
         random = generator(self.bank.device, self.settings.seed, step, 1 + start)
-        seen_along = self.photo_rays.forward(rays, view)
+        seen_along = self.effects.forward_rays(rays, view)
         if not all_finite(seen_along):
             raise NonFinite(RAYS, step, _tensors_of(batch))
         coarse, fine = self.model.render_training(seen_along, background, random)
 
         def squared_error(rendering: Rendering) -> Float[Tensor, ""]:
-            residual = self.photo_colours.residual(Seen(rendering, background, view), target)
+            residual = self.effects.residual(RenderedRays(rendering, background, rays, view), target)
             return residual.square().sum() / batch.target.numel()
 
         with part("composite"):
@@ -212,11 +204,11 @@ class VanillaTrainer:
             return _Part(loss.detach(), fine_error.detach(), torch.autograd.grad(loss, self.parameters))
 
     def state(self) -> dict[str, Tensor]:
-        """Weights as ``model.<name>``, what is learnt of photos as ``photo.<name>``, Adam's moments and step counts as
-        ``adam.<parameter>.<name>``, and the field's settings, to know it by."""
+        """Weights as ``model.<name>``, per-image parameters as ``image.<effect>.<name>``, Adam's moments and step
+        counts as ``adam.<parameter>.<name>``, and the field's settings, to know it by."""
         tensors = {"settings": torch.frombuffer(bytearray(repr(self.model.settings).encode()), dtype=torch.uint8)}
         tensors |= {f"model.{name}": tensor for name, tensor in self.model.state_dict().items()}
-        tensors |= {f"photo.{name}": tensor.detach() for name, tensor in self.photo_parameters.items()}
+        tensors |= {f"image.{name}": tensor.detach() for name, tensor in self.effects.parameters.items()}
         for index, moments in self.optimiser.state_dict()["state"].items():
             tensors |= {f"adam.{index}.{name}": tensor for name, tensor in moments.items()}
         return tensors
@@ -232,8 +224,8 @@ class VanillaTrainer:
             kind, _, name = key.partition(".")
             if kind == "model":
                 weights[name] = tensor
-            elif kind == "photo":
-                self.photo_parameters[name].detach().copy_(tensor)
+            elif kind == "image":
+                self.effects.parameters[name].detach().copy_(tensor)
             elif kind == "adam":
                 index, name = name.split(".")
                 moments.setdefault(int(index), {})[name] = tensor.clone()

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from nerf.effects import AS_GIVEN, AS_RENDERED, PhotoColours, PhotoRays, Seen
+from nerf.effects import NO_EFFECTS, ImageEffects, RenderedRays
 from nerf.fields.interface import RadianceModel, Rendering
 from nerf.geometry.rays import Rays
 from nerf.rendering.images import render_image
@@ -76,36 +76,32 @@ def _probe_of(bank: RayDataset, pixels: Int[Tensor, "rays"], background: Float[T
 
 
 @torch.no_grad()
-def measure(
-    model: RadianceModel,
-    probe: Probe,
-    photo_colours: PhotoColours = AS_RENDERED,
-    photo_rays: PhotoRays = AS_GIVEN,
-) -> ProbeResult:
-    """Render the probe and compare it with the photos, as ``photo_rays`` and ``photo_colours`` have them.
+def measure(model: RadianceModel, probe: Probe, effects: ImageEffects = NO_EFFECTS) -> ProbeResult:
+    """Render the probe through ``effects`` and compare it with the photos.
 
     Raises ValueError where what it shows is no finite number.
     """
-    shown, opacity = _shown(model, probe, photo_colours, photo_rays)
+    shown, opacity = _shown(model, probe, effects)
     return ProbeResult(psnr(mean_squared_error(shown, probe.colours)), float(opacity.mean()))
 
 
 @torch.no_grad()
 def pictures(
-    model: RadianceModel, patches: Patches, photo_colours: PhotoColours = AS_RENDERED
+    model: RadianceModel, patches: Patches, effects: ImageEffects = NO_EFFECTS
 ) -> tuple[Float[Tensor, "patches side side 3"], Float[Tensor, "patches side side 3"]]:
     """What the field shows of the patches, in [0, 1], and what the photos show."""
-    shown, _ = _shown(model, patches.probe, photo_colours, AS_GIVEN)
+    shown, _ = _shown(model, patches.probe, effects)
     shape = (*patches.used.shape, 3)
     return shown.view(shape), patches.probe.colours.view(shape)
 
 
 def _shown(
-    model: RadianceModel, probe: Probe, photo_colours: PhotoColours, photo_rays: PhotoRays
+    model: RadianceModel, probe: Probe, effects: ImageEffects
 ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays"]]:
     """What the field shows in the photos' place, in [0, 1] as they are, and its opacity. What is no finite number stays
     that."""
-    one_row = photo_rays.forward(probe.rays, probe.view).each(lambda part: part[None])
+    one_row = effects.forward_rays(probe.rays, probe.view).each(lambda part: part[None])
     seen = Rendering(*(part[0] for part in render_image(model, one_row, probe.background)))
-    shown = probe.colours + photo_colours.residual(Seen(seen, probe.background, probe.view), probe.colours)
+    rendered = RenderedRays(seen, probe.background, probe.rays, probe.view)
+    shown = probe.colours + effects.residual(rendered, probe.colours)
     return torch.where(shown.isfinite(), shown.clamp(0, 1), shown), seen.opacity

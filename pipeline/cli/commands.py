@@ -79,7 +79,7 @@ def run_command(words: Sequence[str]) -> int:
     try:
         return _command(words[0])(words[1:])
     except UsageError as error:
-        _say(str(error), "", "", as_json)
+        _say("pipeline.usage", str(error), "", "", as_json)
         return EXIT_USAGE
     except StageFailed as failure:
         if debug:
@@ -88,13 +88,13 @@ def run_command(words: Sequence[str]) -> int:
     except StageError as error:
         if debug:
             traceback.print_exc()
-        _say(error.what, error.why, error.hint, as_json)
+        _say(error.code, error.what, error.why, error.hint, as_json)
         return EXIT_WORKSPACE
     except KeyboardInterrupt:
-        _say("stopped", "Ctrl-C", go_on(words), as_json)
+        _say("pipeline.interrupted", "stopped", "Ctrl-C", go_on(words), as_json)
         return EXIT_INTERRUPT
     except Terminated:
-        _say("stopped", "SIGTERM", go_on(words), as_json)
+        _say("pipeline.terminated", "stopped", "SIGTERM", go_on(words), as_json)
         return EXIT_TERMINATED
     except BrokenPipeError:
         raise
@@ -102,14 +102,14 @@ def run_command(words: Sequence[str]) -> int:
         if debug:
             traceback.print_exc()
         what = f"a defect of this program, not of your photos: {type(error).__name__}: {error}"
-        _say(what, "it should not happen", REPORT_IT, as_json)
+        _say("pipeline.defect", what, "it should not happen", REPORT_IT, as_json)
         return EXIT_DEFECT
 
 
-def _say(what: str, why: str, hint: str, as_json: bool) -> None:
+def _say(code: str, what: str, why: str, hint: str, as_json: bool) -> None:
     """What ended the program outside of any stage, in words, or as an event like that of a stage that failed."""
     if as_json:
-        event = {"event": "error", "stage": None, "what": what, "why": why, "hint": hint}
+        event = {"event": "error", "stage": None, "code": code, "what": what, "why": why, "hint": hint}
         print(json.dumps(event), flush=True)
         return
     reason = f"\n  why: {why}\n  try: {hint}" if why else ""
@@ -305,7 +305,9 @@ def _recorded_settings(workspace: Workspace) -> Settings:
     except UsageError as error:
         why = f"{error}; another version of this program wrote it"
         hint = f"Give the photos again: pipeline run PHOTOS -o {workspace.root}. What still fits is kept."
-        raise StageError(f"cannot use the options of {workspace.root}", why, hint) from error
+        raise StageError(
+            "pipeline.recorded-options", f"cannot use the options of {workspace.root}", why, hint
+        ) from error
 
 
 def command_resume(words: Sequence[str]) -> int:

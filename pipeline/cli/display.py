@@ -136,7 +136,7 @@ class JsonDisplay:
         self._event("end", stage=stage, line=line, seconds=round(seconds, 3), cached=cached)
 
     def failed(self, stage: str, error: StageError) -> None:
-        self._event("error", stage=stage, what=error.what, why=error.why, hint=error.hint)
+        self._event("error", stage=stage, code=error.code, what=error.what, why=error.why, hint=error.hint)
 
     def finished(self, message: str, outputs: dict[str, Path]) -> None:
         self._event("finished", message=message, outputs={k: str(v) for k, v in outputs.items()})

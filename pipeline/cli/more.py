@@ -32,7 +32,12 @@ def with_more(settings: Settings, workspace: Workspace, text: str) -> Settings:
     finished = None if key is None else _finished(workspace, key, command)
     after = training_name(finished.key, finished.outputs_digest) if finished else train.after
     if after is None:
-        raise StageError(f"{workspace.root} cannot go on", "no training is finished there", f"First: {command}")
+        raise StageError(
+            "pipeline.nothing-to-continue",
+            f"{workspace.root} cannot go on",
+            "no training is finished there",
+            f"First: {command}",
+        )
     return settings.model_copy(update={"train": train.model_copy(update={"after": after, **_budget(text)})})
 
 
@@ -49,4 +54,4 @@ def _finished(workspace: Workspace, key: str, command: str) -> Manifest | None:
         return workspace.finished("train", key)
     except BadManifest as problem:
         hint = f"It was set aside; {command} trains again."
-        raise StageError(f"{workspace.root} cannot go on", str(problem), hint) from problem
+        raise StageError("pipeline.training-damaged", f"{workspace.root} cannot go on", str(problem), hint) from problem

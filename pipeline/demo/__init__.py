@@ -129,4 +129,9 @@ def _refuse_strangers(folder: Path, truth: Truth) -> None:
 
 
 def _cannot_write(folder: Path, why: str, better: str) -> StageError:
-    return StageError(f"cannot write the demo's photos to {folder}", why, f"Give {better}: pipeline demo -o FOLDER")
+    return StageError(
+        "pipeline.demo-not-written",
+        f"cannot write the demo's photos to {folder}",
+        why,
+        f"Give {better}: pipeline demo -o FOLDER",
+    )

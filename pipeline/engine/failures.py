@@ -28,7 +28,7 @@ def worded(stage: str) -> Iterator[None]:
             raise
         hint = "Close other programs, or lower the resolution or batch settings of this stage."
         why = str(error).splitlines()[0] if str(error) else f"{stage} asked for more than there is"
-        raise StageFailed(stage, StageError("out of memory", why, hint)) from error
+        raise StageFailed(stage, StageError("pipeline.out-of-memory", "out of memory", why, hint)) from error
 
 
 def _is_out_of_memory(error: Exception) -> bool:
@@ -42,4 +42,4 @@ def _disk_error(error: OSError) -> StageError:
     """An OSError in words; finished stages are never touched by it."""
     what = f"cannot read or write {error.filename}" if error.filename else "a file could not be read or written"
     hint = "Free disk space or check permissions, then run again: finished stages are kept."
-    return StageError(what, error.strerror or str(error), hint)
+    return StageError("pipeline.disk", what, error.strerror or str(error), hint)

@@ -85,7 +85,9 @@ class ContentIndex:
         if path.is_file():
             return self.sha256(path)
         if not path.is_dir():
-            raise StageError(f"{path} does not exist", "a setting names it", "Check the path and run again.")
+            raise StageError(
+                "pipeline.no-such-file", f"{path} does not exist", "a setting names it", "Check the path and run again."
+            )
         try:
             return self.of_files(path, camera_files(path))
         except OSError as error:

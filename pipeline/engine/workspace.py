@@ -41,7 +41,12 @@ def default_workspace(photos: Path) -> Path:
     if base.is_file():
         base = base.with_suffix("")
     if base.name == "":
-        raise StageError("no workspace name", f"{photos} has no name to derive it from", "Give one with -o.")
+        raise StageError(
+            "pipeline.no-workspace-name",
+            "no workspace name",
+            f"{photos} has no name to derive it from",
+            "Give one with -o.",
+        )
     return Path.cwd() / f"{base.name}.nerf"
 
 
@@ -71,7 +76,7 @@ class Workspace:
             hint = "Start one with: pipeline run PHOTOS"
             if photo_set(root).name and root.exists() and ((named := default_workspace(root)) / RUN_FILE).is_file():
                 hint = f"The workspace that is called after it is {named.name}."
-            raise StageError(f"{root} is not a workspace", why, hint)
+            raise StageError("pipeline.no-workspace", f"{root} is not a workspace", why, hint)
         _refuse_links(root)
         return cls(root)
 
@@ -87,7 +92,7 @@ class Workspace:
         except Timeout:
             why = f"process {self._holder()} holds its lock"
             hint = "Wait for it to end; `run` and `demo` can be given another one with -o."
-            raise StageError(f"{self.root} is in use", why, hint) from None
+            raise StageError("pipeline.workspace-in-use", f"{self.root} is in use", why, hint) from None
         except OSError as error:
             self._lock.release()
             raise self._cannot_write(error) from error
@@ -99,7 +104,7 @@ class Workspace:
 
     def _cannot_write(self, error: OSError) -> StageError:
         hint = "Make room there, or give a folder you may write to with -o."
-        return StageError(f"cannot write to {self.root}", error.strerror or str(error), hint)
+        return StageError("pipeline.cannot-write", f"cannot write to {self.root}", error.strerror or str(error), hint)
 
     def _holder(self) -> str:
         try:
@@ -202,7 +207,7 @@ class Workspace:
         except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
             reason = f"it cannot be used ({error})"
         hint = f"Delete {self.root / RUN_FILE} and give the same `pipeline run` again: finished stages are kept."
-        raise StageError(f"cannot read {self.root / RUN_FILE}", reason, hint)
+        raise StageError("pipeline.run-file", f"cannot read {self.root / RUN_FILE}", reason, hint)
 
     def write_run(self, run: dict[str, Any]) -> None:
         """Write run.json durably. Raises StageError if it cannot be written."""
@@ -304,6 +309,7 @@ class Workspace:
         for shown in map(self._shown, names):
             if shown.exists() and not self._is_ours(shown):
                 raise StageError(
+                    "pipeline.not-a-result",
                     f"{shown} is none of this program's results",
                     "one of that name is to be shown there, and what is there would be lost",
                     "Move it elsewhere, or give another folder with -o.",
@@ -367,6 +373,7 @@ def _refuse_links(root: Path) -> None:
     for path in (path for folder in ours if folder.is_dir() for path in folder.iterdir()):
         if path.is_symlink():
             raise StageError(
+                "pipeline.link",
                 f"{path} is a link",
                 "results are written and removed there, and a link may lead anywhere",
                 "Put the folder itself in its place. The whole workspace may be a link.",

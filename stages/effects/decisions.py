@@ -12,7 +12,7 @@ from stages.io.files import read_dataclass, write_json
 if TYPE_CHECKING:
     import torch
 
-    from nerf.effects import PhotoColours, PhotoRays
+    from nerf.effects import ImageEffects
     from nerf.geometry.scene import Scene, View
     from nerf.training.ray_dataset import RayDataset
     from nerf.training.trainer import FieldTrainer
@@ -53,23 +53,24 @@ def read_decisions(folder: Path) -> Decisions:
     return read_dataclass(folder / "decisions.json", Decisions)
 
 
-def photo_parts(decisions: Decisions, views: "Sequence[View]", bank: "RayDataset") -> "tuple[PhotoRays, PhotoColours]":
+def image_effects(decisions: Decisions, views: "Sequence[View]", bank: "RayDataset") -> "ImageEffects":
     """What stands between the field and the photos ``views`` of ``bank``, in their order."""
     import numpy as np
     import torch
 
-    from nerf.effects import AS_GIVEN, AS_RENDERED
-    from nerf.effects.exposure_model import Exposures
-    from nerf.effects.pose_refinement import RefinedPoses
+    from nerf.effects import NO_EFFECTS, ImageEffects, TrainingImages
+    from nerf.effects.exposure import ExposureModel
+    from nerf.effects.pose_refinement import PoseRefinement
 
-    rays = AS_GIVEN
-    if decisions.pose_refinement:
-        centres = np.stack([view.scene_from_camera[:, 3] for view in views])
-        placed = torch.tensor(centres, dtype=torch.float32, device=bank.device)
-        rays = RefinedPoses(placed, bank.viewing_distance)
+    if not decisions.pose_refinement and decisions.exposure is None:
+        return NO_EFFECTS
+    poses = np.stack([view.scene_from_camera for view in views])
+    images = TrainingImages(torch.tensor(poses, dtype=torch.float32, device=bank.device), bank.viewing_distance)
     gains = None if decisions.exposure is None else decisions.log_gain(views).to(bank.device)
-    colours = AS_RENDERED if gains is None else Exposures.of_tracks(gains)
-    return rays, colours
+    return ImageEffects(
+        (PoseRefinement.initial(images),) if decisions.pose_refinement else (),
+        () if gains is None else (ExposureModel.initial(images, gains),),
+    )
 
 
 def told_by_neighbours(scene: "Scene", unseen: "Sequence[View]") -> "torch.Tensor":
@@ -105,7 +106,7 @@ def neutral_in_words(field: dict[str, Any]) -> str | None:
     neutral = fmean(field["exposure"]["neutral"])
     least = min((fmean(gains) for gains in field["exposure"]["photos"].values()), default=neutral)
     stops = round((neutral - least) / math.log(2), 2) + 0.0  # no -0
-    return f"neutral exposure, {stops:+.2f} EV over the least exposed photo"
+    return f"reference exposure, {stops:+.2f} EV over the least exposed photo"
 
 
 def learnt_of_photos(trainer: "FieldTrainer", views: "Sequence[View]") -> dict[str, Any]:
@@ -114,19 +115,12 @@ def learnt_of_photos(trainer: "FieldTrainer", views: "Sequence[View]") -> dict[s
     ``exposure``: ``neutral``, at which the field is shown, and the gain of each photo, as natural logarithms in linear
     light. ``poses``: each photo's rotation vector (radians) and shift (scene units), added to its calibrated pose.
     """
-    import torch
-
-    from nerf.effects.exposure_model import Exposures
-    from nerf.effects.pose_refinement import RefinedPoses
-
     learnt: dict[str, Any] = {}
     names = [view.name for view in views]
-    if isinstance(trainer.photo_colours, Exposures):
-        gains = trainer.photo_colours.log_gain.tolist()
-        learnt["exposure"] = {"neutral": trainer.photo_colours.neutral.tolist(), "photos": _by(names, gains)}
-    if isinstance(trainer.photo_rays, RefinedPoses):
-        corrections = torch.cat([trainer.photo_rays.turn, trainer.photo_rays.shift], dim=1)
-        learnt["poses"] = _by(names, corrections.tolist())
+    for effect in trainer.effects.colours:
+        learnt[effect.name] = {"neutral": effect.reference.tolist(), "photos": _by(names, effect.rows.tolist())}
+    for effect in trainer.effects.rays:
+        learnt["poses"] = _by(names, effect.rows.tolist())
     return learnt
 
 

@@ -10,7 +10,7 @@ from statistics import mean, median
 from typing import TYPE_CHECKING, NamedTuple
 
 from stages.contract import Inputs, Progress, StageError
-from stages.effects.decisions import Decisions, photo_parts
+from stages.effects.decisions import Decisions, image_effects
 from stages.evaluate.image_metrics import FEWEST_FOR_INTERVAL, mean_interval
 from stages.train.config import BLACK
 
@@ -74,7 +74,7 @@ def pilot_scene(inputs: Inputs, scene: "Scene", progress: Progress) -> PilotScen
     """Small photos to train on and to judge by, both from the training photos; or why there can be no pilot."""
     from stages.evaluate.half_images import enough
     from stages.hardware.device import compute_device
-    from stages.train.data import NOTHING_LEFT, PhotoReader, guided_bank, view_mask, view_rays
+    from stages.train.data import ALL_MASKED, PhotoReader, guided_bank, view_mask, view_rays
     from stages.train.validation_images import set_aside
 
     split = set_aside(scene, MOST_KEPT, FEWEST_FOR_INTERVAL)
@@ -86,7 +86,7 @@ def pilot_scene(inputs: Inputs, scene: "Scene", progress: Progress) -> PilotScen
     try:
         bank = guided_bank(inputs, split, downscale, progress).to(compute_device())
     except StageError as error:
-        if error.what != NOTHING_LEFT:
+        if error.code != ALL_MASKED:
             raise
         # Larger photos may show enough of a thin thing.
         return f"masks leave nothing of the training photos at {size}"
@@ -157,8 +157,8 @@ def _trained(trial: PilotScene, arm: Decisions, steps: int, seed: int) -> "HashG
     from nerf.fields.hash_grid import HashGridField
     from stages.train.fields import make_trainer
 
-    parts = photo_parts(arm, trial.scene.of_split("train"), trial.bank)
-    trainer = make_trainer(_config(arm, steps, trial.bank.device.type), trial.scene, trial.bank, seed, parts)
+    effects = image_effects(arm, trial.scene.of_split("train"), trial.bank)
+    trainer = make_trainer(_config(arm, steps, trial.bank.device.type), trial.scene, trial.bank, seed, effects)
     for step in range(steps):
         trainer.step(step, step / steps, 1.0)
     assert isinstance(trainer.model, HashGridField)

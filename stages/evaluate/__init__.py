@@ -233,13 +233,13 @@ class Examiner:
 
     def _from_fitted_pose(self, view: "View", truth: "Tensor", used: "Tensor | None") -> "Rendering":
         """The view from where its left half says that it was taken."""
-        from nerf.effects.exposure import ExposedModel
+        from nerf.effects.appearance import AppearanceModel
         from nerf.fields.hash_grid import HashGridField
         from stages.evaluate.half_images import from_fitted_pose
         from stages.train.data import view_rays
 
         model = self.painter.model
-        field = model.model if isinstance(model, ExposedModel) else model
+        field = model.model if isinstance(model, AppearanceModel) else model
         assert isinstance(field, HashGridField), "only with a grid field does evaluate fit poses"
         rays = view_rays(self.scene, view, self.downscale)
         as_it_is = replace(self.painter, model=field).draw(rays)
@@ -283,7 +283,9 @@ def fits_poses(config: Config, field: dict[str, Any]) -> bool:
     fittable = field["kind"] == "grid"
     if config.fit_poses == "on" and not fittable:
         why = f"this is a {field['kind']} field, and only a grid field tells the gradients of its rays"
-        raise StageError("cannot fit poses of test photos", why, "Give --evaluate.fit-poses auto.")
+        raise StageError(
+            "evaluate.no-pose-fit", "cannot fit poses of test photos", why, "Give --evaluate.fit-poses auto."
+        )
     return fittable and (config.fit_poses == "on" or (config.fit_poses == "auto" and "poses" in field))
 
 

@@ -52,13 +52,14 @@ def from_fitted_pose(
     ``rendering`` of ``field`` along them (at no other exposure than the field's own); everything on the CPU."""
     import torch
 
-    from nerf.effects.exposure_model import Exposures
-    from nerf.effects.pose_fit import fit_pose
+    from nerf.effects import ImageEffects
+    from nerf.effects.exposure import ExposureModel
+    from nerf.effects.pose_refinement import fit_pose
     from nerf.geometry.rays import Rays
 
     left, _ = halves(truth, used)
     _, log_gain = _exposed_as_left(rendering, background, truth, left)
-    exposure = Exposures(log_gain[None])
+    exposure = ImageEffects(colours=(ExposureModel(log_gain[None]),))
     distance = viewing_distance(rendering, left)
     pose = fit_pose(field, rays.each(lambda part: part[left]), truth[left], background, exposure, seed, distance)
     flat = rays.each(lambda part: part.flatten(0, 1))
@@ -77,9 +78,10 @@ def _exposed_as_left(
     rendering: "Rendering", background: "Tensor", truth: "Tensor", left: "Tensor"
 ) -> "tuple[Tensor, Tensor]":
     """The scene's own light (H, W, 3) in a rendering, and its log gain (3,) by the pixels ``left`` of the photo."""
-    from nerf.effects.exposure import fit_log_gain, own_light
+    from nerf.effects import foreground_radiance
+    from nerf.effects.exposure import fit_log_gain
 
-    light = own_light(rendering.colour, rendering.opacity, background)
+    light = foreground_radiance(rendering.colour, rendering.opacity, background)
     behind = rendering.colour - light
     return light, fit_log_gain(light[left], truth[left] - behind[left])
 

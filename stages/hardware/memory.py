@@ -42,7 +42,10 @@ def check_memory(needed: float, what: str, why: str, hint: str) -> None:
     free = available_bytes()
     if needed > free:
         raise StageError(
-            f"not enough memory for {what}", f"{why} {bytes_in_words(needed)} and {bytes_in_words(free)} are free", hint
+            "hardware.not-enough-memory",
+            f"not enough memory for {what}",
+            f"{why} {bytes_in_words(needed)} and {bytes_in_words(free)} are free",
+            hint,
         )
 
 

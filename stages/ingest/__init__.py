@@ -183,6 +183,7 @@ def _writing(folder: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise StageError(
+            "ingest.cannot-write",
             f"cannot write the photos to {folder}",
             error.strerror or str(error),
             "Make room there, or choose another workspace with -o.",

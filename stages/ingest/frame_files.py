@@ -146,7 +146,7 @@ def _inside(folder: Path, root: Path, file_path: str, what: str) -> Path:
     absolute, is_name = Path(file_path).is_absolute(), "\0" not in file_path
     if absolute or not is_name or not any(file.resolve().is_relative_to(place.resolve()) for place in (folder, root)):
         linked = is_name and what == "photo" and not absolute and ".." not in file.relative_to(folder).parts
-        raise StageError(
+        raise StageError("ingest.outside-folder", 
             f"refused the {what} {file_path[:MOST_LETTERS]!r}",
             "its path is absolute" if absolute else f"it leads out of the folder {folder}",
             "Give the photo folder apart, if it is a link: pipeline run PHOTOS --cameras FILE." if linked else

@@ -39,14 +39,19 @@ def list_photos(root: Path) -> tuple[Path, ...]:
     """
     found = files_below(root, _is_photo_folder)
     if not found:
-        raise StageError(f"{root} is empty", "there is no file in it", FOLDER_HINT)
+        raise StageError("ingest.empty-folder", f"{root} is empty", "there is no file in it", FOLDER_HINT)
     photos, videos = [file for file in found if _may_be_photo(file)], _videos(found)
     unknown = not any(file.suffix.lower() in IMAGES + RAW for file in photos)
     if len(videos) == 1 and unknown and len(photos) <= MOST_PASSED_OVER:
         photos = []  # a README, say; more of them may be photos of whatever ending
     lost = sum(not file.is_file() for file in found)
     if lost and not any(map(Path.is_file, photos + videos)):
-        raise StageError(f"no photos in {root}", f"{lost} of its files are links to what is not there", _LINKS_HINT)
+        raise StageError(
+            "ingest.broken-links",
+            f"no photos in {root}",
+            f"{lost} of its files are links to what is not there",
+            _LINKS_HINT,
+        )
     if not photos and len(videos) != 1:
         raise _no_photos(root, found, videos)
     return tuple(photos or videos)
@@ -107,9 +112,11 @@ def _videos(found: list[Path]) -> list[Path]:
 def _no_photos(root: Path, found: list[Path], videos: list[Path]) -> StageError:
     if videos:
         names = ", ".join(video.relative_to(root).as_posix() for video in videos[:5])
-        return StageError(
+        return StageError("ingest.several-videos", 
             f"{len(videos)} videos in {root}", f"{names}: which one is meant is not clear",
             f"Give one of them: pipeline run {videos[0]}",
         )  # fmt: skip
     suffixes = ", ".join(sorted({file.suffix.lower() or file.name for file in found})[:5])
-    return StageError(f"no photos in {root}", f"its {len(found)} files are no images ({suffixes})", FOLDER_HINT)
+    return StageError(
+        "ingest.no-photos", f"no photos in {root}", f"its {len(found)} files are no images ({suffixes})", FOLDER_HINT
+    )

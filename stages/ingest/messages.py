@@ -138,19 +138,39 @@ def too_few(source: Source, names: Sequence[str], refused: Sequence[Refusal]) ->
     """The error for one photo or none, ``names``, and what the refusals tell."""
     if not names:
         first = f"{shown(refused[0].name)}: {refused[0].reason}"
-        return StageError(f"none of the {len(refused)} files in {source.root} is a usable photo", first, HINT)
+        return StageError(
+            "ingest.no-usable-photo",
+            f"none of the {len(refused)} files in {source.root} is a usable photo",
+            first,
+            HINT,
+        )
     only = shown(names[0])
     if refused and all(refusal.reason.startswith("identical to ") for refusal in refused):
-        return StageError(f"all {len(refused) + 1} photos are identical", f"they have the pixels of {only}", HINT)
+        return StageError(
+            "ingest.identical-photos",
+            f"all {len(refused) + 1} photos are identical",
+            f"they have the pixels of {only}",
+            HINT,
+        )
     if refused:
-        return StageError(f"only one photo can be used, {only}", f"{len(refused)} other files were refused", HINT)
-    return StageError("there is only one photo", f"{only}; a scene needs at least two", HINT)
+        return StageError(
+            "ingest.one-usable-photo",
+            f"only one photo can be used, {only}",
+            f"{len(refused)} other files were refused",
+            HINT,
+        )
+    return StageError("ingest.one-photo", "there is only one photo", f"{only}; a scene needs at least two", HINT)
 
 
 def all_the_same(photos: int) -> StageError:
     """The error for photos that all show nearly the same picture."""
     why = "the camera stood still between them, so they tell nothing of depth"
-    return StageError(f"all {photos} photos are nearly the same picture", why, f"{HINT} {STILL_BACKGROUND_HINT}")
+    return StageError(
+        "ingest.same-picture",
+        f"all {photos} photos are nearly the same picture",
+        why,
+        f"{HINT} {STILL_BACKGROUND_HINT}",
+    )
 
 
 def all_plain(colours: Sequence[tuple[str, str]]) -> StageError:
@@ -158,7 +178,7 @@ def all_plain(colours: Sequence[tuple[str, str]]) -> StageError:
     name, colour = colours[0]
     why = f"{shown(name)} is {colour} everywhere, so there is nothing that could be found or learnt"
     hint = "Look at the photos: a cap on the lens, an exposure far off, or an export that failed."
-    return StageError(f"all {len(colours)} photos show one single colour", why, hint)
+    return StageError("ingest.plain-photos", f"all {len(colours)} photos show one single colour", why, hint)
 
 
 def summary(source: Source, photos: Sequence[Photo], refused: Sequence[Refusal]) -> str:

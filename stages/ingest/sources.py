@@ -73,7 +73,7 @@ def find_source(photos: Path, cameras: Path | None = None) -> Source:
 def cannot_read(path: Path | str, error: OSError) -> StageError:
     """The error for a file or folder of the user's that cannot be read, or has gone since it was listed."""
     hint = "Check that it is still there and may be read (chmod -R u+rX), then run again."
-    return StageError(f"cannot read {path}", (error.strerror or str(error)).lower(), hint)
+    return StageError("ingest.cannot-read", f"cannot read {path}", (error.strerror or str(error)).lower(), hint)
 
 
 def _source(photos: Path, cameras: Path | None) -> Source:
@@ -165,29 +165,48 @@ def _list_masks(root: Path, files: tuple[Path, ...]) -> tuple[tuple[str, Path], 
 
 def _check_given(photos: Path, cameras: Path | None) -> None:
     if not photos.exists():
-        raise StageError(f"{photos} does not exist", "no file or folder has this name", "Check the spelling.")
+        raise StageError(
+            "ingest.no-such-photos",
+            f"{photos} does not exist",
+            "no file or folder has this name",
+            "Check the spelling.",
+        )
     if cameras is not None and not cameras.exists():
-        raise StageError(f"{cameras} does not exist", "no file or folder has this name", "Check --cameras.")
+        raise StageError(
+            "ingest.no-such-cameras", f"{cameras} does not exist", "no file or folder has this name", "Check --cameras."
+        )
     if photos.is_dir():
         if (photos / "run.json").is_file():
             raise StageError(
-                f"{photos} is a workspace", "it holds results, not photos", f"Go on with it: pipeline resume {photos}"
+                "ingest.workspace-given",
+                f"{photos} is a workspace",
+                "it holds results, not photos",
+                f"Go on with it: pipeline resume {photos}",
             )
     elif (suffix := photos.suffix.lower()) in IMAGES:
         raise StageError(
-            f"{photos.name} is a single image", "a scene needs many photos from different places", FOLDER_HINT
+            "ingest.single-image",
+            f"{photos.name} is a single image",
+            "a scene needs many photos from different places",
+            FOLDER_HINT,
         )
     elif suffix != ".json" and not is_video(photos):
         raise StageError(
-            f"cannot use {photos.name}", "it is no folder of photos, video or transforms.json", FOLDER_HINT
+            "ingest.unknown-input",
+            f"cannot use {photos.name}",
+            "it is no folder of photos, video or transforms.json",
+            FOLDER_HINT,
         )
     elif cameras is not None and suffix == ".json":
         raise StageError(
-            "two sources of cameras", f"{photos.name} and --cameras {cameras}", "Give the photo folder with --cameras."
+            "ingest.transforms-and-cameras",
+            "two sources of cameras",
+            f"{photos.name} and --cameras {cameras}",
+            "Give the photo folder with --cameras.",
         )
     if cameras is not None and cameras.is_file() and (suffix := cameras.suffix.lower()) != ".json":
         of_colmap = suffix in (".bin", ".txt")
-        raise StageError(
+        raise StageError("ingest.unknown-cameras", 
             f"cannot use the cameras {cameras.name}",
             "it is no transforms file, whose name ends in .json",
             f"Give the folder of the COLMAP model: --cameras {cameras.parent}" if of_colmap else
@@ -224,6 +243,7 @@ def _none_of_its_photos(cameras: Path, root: Path, names: list[str]) -> StageErr
     here = sorted(file.relative_to(root).as_posix() for file in walk_photos(root) if file.suffix.lower() in IMAGES)
     there = f"{root} has {listed(here, FEW_NAMES)}" if here else f"there are no photos in {root}"
     return StageError(
+        "ingest.cameras-of-other-photos",
         f"none of the {len(names)} photos of {cameras.name} is there",
         f"it names {listed(names, FEW_NAMES)}, and {there}",
         f"Give the folder with its photos: pipeline run PHOTOS --cameras {cameras}",
@@ -250,6 +270,7 @@ def _sorted_inside(root: Path, files: set[Path]) -> tuple[Path, ...]:
     outside = [file for file in files if not file.is_relative_to(root)]
     if outside:
         raise StageError(
+            "ingest.photo-outside",
             f"{min(outside)} is not among the photos",
             f"the transforms file names it, but it lies outside {root}",
             "Give the folder that holds all photos of the transforms file.",
@@ -264,7 +285,7 @@ def _cameras_in(folder: Path, photos: Sequence[str]) -> Path:
     if not found or _colmap_models(folder):
         return _colmap_model(folder, photos)
     if len(found) > 1:
-        raise StageError(
+        raise StageError("ingest.several-cameras", 
             f"two sources of cameras in {folder}", " and ".join(file.name for file in found),
             f"Give one of them: --cameras {found[0]}",
         )  # fmt: skip
@@ -284,6 +305,7 @@ def _colmap_model(folder: Path, photos: Sequence[str]) -> Path:
     models = _colmap_models(folder)
     if not models:
         raise StageError(
+            "ingest.no-colmap-model",
             f"no COLMAP model in {folder}",
             "there is no cameras and images with .bin or .txt, nor a transforms.json",
             "Give the model's own folder, for example sparse/0, or a transforms file.",
@@ -293,6 +315,7 @@ def _colmap_model(folder: Path, photos: Sequence[str]) -> Path:
         each = ", ".join(f"{model.relative_to(folder)} with {counts[model]}" for model in models)
         best = max(models, key=lambda model: counts[model])
         raise StageError(
+            "ingest.several-colmap-models",
             f"{len(models)} COLMAP models in {folder}",
             f"cameras of the {len(photos)} photos are in {each}: which one is meant is not clear",
             f"Give the one with most: --cameras {best}",
@@ -318,6 +341,7 @@ def _model_files(folder: Path) -> tuple[Path, ...]:
 
 def _cameras_of_video(video: Path) -> StageError:
     return StageError(
+        "ingest.cameras-of-video",
         f"cannot use --cameras with {video.name}",
         "it is a video, and which of its frames become photos is decided here: no cameras can be known for them",
         "Leave --cameras out, or give the folder of the photos that the cameras belong to.",

@@ -143,7 +143,7 @@ def _measure(video: Path, progress: Progress) -> list[Frame]:
                 share = len(frames) / announced / 2 if announced >= len(frames) else None
                 progress.update(f"looked at {len(frames)} frames of {video.name}", share)
     if not frames:
-        raise _undecodable(video, "not one frame of it can be decoded")
+        raise _undecodable("ingest.no-frame-decodes", video, "not one frame of it can be decoded")
     if lacks_frames(len(frames), announced):
         progress.note(f"only {len(frames)} of {announced} frames of {video.name} can be decoded: is the file whole?")
     return frames
@@ -196,7 +196,7 @@ def _write(
         stretch = _stretch(capture)
         for number in range(max(chosen) + 1):
             if not capture.grab():
-                raise _undecodable(video, f"frame {number} could be decoded before and cannot now")
+                raise _undecodable("ingest.frame-lost", video, f"frame {number} could be decoded before and cannot now")
             if number not in wanted:
                 continue
             frame = _with_square_pixels(capture.retrieve()[1], stretch)
@@ -219,7 +219,7 @@ def _opened(video: Path) -> "Iterator[cv2.VideoCapture]":
     cv2.utils.logging.setLogLevel(before)
     try:
         if not capture.isOpened():
-            raise _undecodable(video, "it is damaged, or of a kind that is not known here")
+            raise _undecodable("ingest.unknown-video", video, "it is damaged, or of a kind that is not known here")
         capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
         yield capture
     finally:
@@ -247,25 +247,31 @@ def _with_square_pixels(frame: "np.ndarray", stretch: tuple[float, float]) -> "n
     return cv2.resize(frame, (round(width * stretch[0]), round(height * stretch[1])), interpolation=cv2.INTER_CUBIC)
 
 
-def _undecodable(video: Path, why: str) -> StageError:
+def _undecodable(code: str, video: Path, why: str) -> StageError:
     return StageError(
-        f"cannot decode the video {video.name}", why, f"Convert it first: ffmpeg -i {video.name} converted.mp4"
+        code, f"cannot decode the video {video.name}", why, f"Convert it first: ffmpeg -i {video.name} converted.mp4"
     )
 
 
 def _panoramas(video: Path) -> StageError:
     advice = cutting_advice(video.name, "0.mp4")
     what, why = f"cannot take photos from {video.name}", "its frames are panoramas"
-    return StageError(what, why, f"{advice[0].upper()}{advice[1:]}.")
+    return StageError("ingest.panorama-video", what, why, f"{advice[0].upper()}{advice[1:]}.")
 
 
 def _no_way(video: Path, frames: Sequence[Frame]) -> StageError:
     what = f"cannot take photos from {video.name}"
     if len(frames) < FEWEST_FRAMES:
         count = f"{len(frames)} frame{'s' * (len(frames) != 1)}"
-        return StageError(what, f"it has only {count}", "Film for ten seconds and more, walking around the scene.")
+        return StageError(
+            "ingest.short-video",
+            what,
+            f"it has only {count}",
+            "Film for ten seconds and more, walking around the scene.",
+        )
     way = frames[-1].path
     return StageError(
+        "ingest.still-video",
         what,
         f"the camera hardly moves: in {len(frames)} frames the picture shifts by {way:.1%} of its width",
         "Walk around the scene while filming, slowly, so that every part of it is seen from several sides.",

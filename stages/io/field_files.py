@@ -43,8 +43,8 @@ def load_field(
 ) -> "tuple[RadianceModel, dict[str, Any]]":
     """The field in ``folder``, ready to render, and the content of its field.json.
 
-    One that models exposure comes at its neutral one, wrapped in an ExposedModel. ``progress`` is told why a grid field
-    is computed by torch's kernels: they trained it, or Warp's do not run on ``device``.
+    One that models exposure comes at its reference exposure, in an AppearanceModel. ``progress`` is told why a grid
+    field is computed by torch's kernels: they trained it, or Warp's do not run on ``device``.
 
     Raises:
         StageError: if the files are missing or damaged, or another version of the program wrote them.
@@ -60,7 +60,9 @@ def load_field(
         model.load_state_dict(load(weights.read_bytes()))  # load_file takes paths in Unicode alone
         neutral = _neutral(info)
     except ValidationError as error:
-        raise StageError("cannot read the trained field", first_fault(error), "Run stage train again.") from error
+        raise StageError(
+            "io.field-settings", "cannot read the trained field", first_fault(error), "Run stage train again."
+        ) from error
     except (
         OSError,
         KeyError,
@@ -72,7 +74,7 @@ def load_field(
         SafetensorError,
     ) as error:
         why = " ".join(str(error).split())  # torch lists mismatches over several lines
-        raise StageError("cannot read the trained field", why, "Run stage train again.") from error
+        raise StageError("io.field-weights", "cannot read the trained field", why, "Run stage train again.") from error
     model = model.to(device).requires_grad_(False)
     return model if neutral is None else _exposed(model, neutral, device), info
 
@@ -90,9 +92,10 @@ def _neutral(info: dict[str, Any]) -> list[float] | None:
 def _exposed(model: "RadianceModel", log_gain: list[float], device: str) -> "RadianceModel":
     import torch
 
-    from nerf.effects.exposure import ExposedModel
+    from nerf.effects.appearance import AppearanceModel
+    from nerf.effects.exposure import ExposureModel
 
-    return ExposedModel(model, torch.tensor(log_gain, dtype=torch.float32, device=device))
+    return AppearanceModel(model, (ExposureModel(torch.tensor([log_gain], dtype=torch.float32, device=device)),))
 
 
 def _untrained(

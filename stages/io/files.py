@@ -35,12 +35,12 @@ def read_json(path: Path) -> Any:
     try:
         return json.loads(path.read_text("utf-8"))
     except (OSError, ValueError, RecursionError) as error:
-        raise damaged(path.name, str(error)) from error
+        raise damaged("io.damaged-json", path.name, str(error)) from error
 
 
-def damaged(name: str, why: str) -> StageError:
+def damaged(code: str, name: str, why: str) -> StageError:
     """The error for a file that one of our stages wrote and that is not any more as it was."""
-    return StageError(f"cannot read {name}", why, "Delete its folder and run again.")
+    return StageError(code, f"cannot read {name}", why, "Delete its folder and run again.")
 
 
 def read_dataclass(path: Path, kind: type[T]) -> T:
@@ -53,9 +53,9 @@ def read_dataclass(path: Path, kind: type[T]) -> T:
     try:
         return TypeAdapter(kind).validate_json(path.read_bytes(), strict=True)
     except OSError as error:
-        raise damaged(path.name, str(error)) from error
+        raise damaged("io.missing-file", path.name, str(error)) from error
     except ValidationError as error:
-        raise damaged(path.name, first_fault(error)) from error
+        raise damaged("io.damaged-fields", path.name, first_fault(error)) from error
 
 
 def first_fault(error: "ValidationError") -> str:
@@ -113,7 +113,7 @@ def read_tensors(path: Path) -> "dict[str, np.ndarray]":
     try:
         return load(path.read_bytes())  # load_file takes paths in Unicode alone
     except (OSError, KeyError, ValueError, SafetensorError) as error:
-        raise damaged(path.name, str(error)) from error
+        raise damaged("io.damaged-tensors", path.name, str(error)) from error
 
 
 def write_png(path: Path, pixels: "np.ndarray") -> None:
@@ -141,4 +141,4 @@ def read_scene(folder: Path) -> "Scene":
     try:
         return Scene.from_json(value)
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
-        raise damaged("scene.json", f"{type(error).__name__}: {error}") from error
+        raise damaged("io.damaged-scene", "scene.json", f"{type(error).__name__}: {error}") from error

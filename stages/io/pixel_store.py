@@ -236,5 +236,8 @@ def _check_room(store: PixelStore) -> None:
             f"they take {bytes_in_words(needed)} at this size, and {store.path.parent} has {bytes_in_words(free)} free"
         )
         raise StageError(
-            "no room for the pixels of the photos", why, "Free disk space, or give a larger --train.downscale."
+            "io.no-room-for-pixels",
+            "no room for the pixels of the photos",
+            why,
+            "Free disk space, or give a larger --train.downscale.",
         )

@@ -25,11 +25,13 @@ def read_transforms(transforms: Path, *, may_be_empty: bool = False) -> dict[str
     try:
         content = json.loads(transforms.read_text("utf-8-sig"))  # -sig: Windows writes a byte order mark
     except (ValueError, RecursionError) as error:
-        raise StageError(f"cannot read {transforms.name}", f"it is not JSON ({error})", _HINT) from error
+        raise StageError(
+            "io.transforms-not-json", f"cannot read {transforms.name}", f"it is not JSON ({error})", _HINT
+        ) from error
     if not isinstance(content, dict) or not isinstance(content.get("frames"), list):
-        raise StageError(what, "it has no list named 'frames'", _HINT)
+        raise StageError("io.transforms-without-frames", what, "it has no list named 'frames'", _HINT)
     if not (content["frames"] or may_be_empty):
-        raise StageError(what, "its list 'frames' is empty", _HINT)
+        raise StageError("io.transforms-empty", what, "its list 'frames' is empty", _HINT)
     _check_frames(content["frames"], what)
     return content
 
@@ -37,13 +39,17 @@ def read_transforms(transforms: Path, *, may_be_empty: bool = False) -> dict[str
 def _check_frames(frames: list[Any], what: str) -> None:
     for index, frame in enumerate(frames):
         if not (isinstance(frame, dict) and isinstance(frame.get("file_path"), str) and "transform_matrix" in frame):
-            raise StageError(what, f"frame {index} lacks file_path or transform_matrix", _HINT)
+            raise StageError(
+                "io.transforms-incomplete-frame", what, f"frame {index} lacks file_path or transform_matrix", _HINT
+            )
         mask = frame.get("mask_path") or ""
         if not isinstance(mask, str):
-            raise StageError(what, f"the mask_path of frame {index} is no name of a file", _HINT)
+            raise StageError(
+                "io.transforms-mask-path", what, f"the mask_path of frame {index} is no name of a file", _HINT
+            )
         if wrong := next((name for name in (*photo_names(frame), mask) if not _is_name(name)), None):
             why = f"no file can have the name of frame {index}, {ascii(wrong)[:MOST_LETTERS]}"
-            raise StageError(what, why, _HINT)
+            raise StageError("io.transforms-file-path", what, why, _HINT)
 
 
 def read_splits(
@@ -99,7 +105,7 @@ def _test_frames(file: str, content: dict[str, Any]) -> tuple[str, dict[str, Any
     """The frames that lie under ``test_frames``, as ScanNet++ has them, as a file of their own."""
     where, frames = f"test_frames of {file}", content["test_frames"]
     if not isinstance(frames, list):
-        raise StageError(f"cannot use {where}", "it is no list", _HINT)
+        raise StageError("io.transforms-split", f"cannot use {where}", "it is no list", _HINT)
     _check_frames(frames, f"cannot use {where}")
     return where, content | {"frames": frames}
 

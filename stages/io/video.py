@@ -54,7 +54,12 @@ def video_writer(path: Path, width: int, height: int, fps: int) -> "Iterator[Cal
         if failed:
             words.seek(0)
             why = words.read().decode("utf-8", "replace").strip().splitlines() or ["the encoder stopped"]
-            raise StageError(f"cannot write {path.name}", why[-1], "Check the free disk space and run again.")
+            raise StageError(
+                "io.cannot-write-video",
+                f"cannot write {path.name}",
+                why[-1],
+                "Check the free disk space and run again.",
+            )
 
 
 def _send(encoder: "subprocess.Popen[bytes]", frame: "np.ndarray") -> None:

@@ -51,7 +51,9 @@ def clean(
     inside = np.all(visibility.in_frustum[surface.faces] >= min_views, axis=1) | (keep != "visible")
     if not inside.any():
         why = f"none of its {len(surface.faces)} faces lies in {min_views} photos between near and far"
-        raise StageError("no part of the surface lies in the photos", why, "Try --mesh.keep all.")
+        raise StageError(
+            "mesh.nothing-covered", "no part of the surface lies in the photos", why, "Try --mesh.keep all."
+        )
     surface, old = keep_faces(surface, inside)
     hidden = 0
     if keep == "visible":
@@ -69,7 +71,7 @@ def clean(
     if not good.any():
         why = f"in none of its {count} components is a tenth of the area visible in {min_views} photos"
         hint = "Try --mesh.keep all or another --mesh.iso-level."
-        raise StageError("no part of the surface is visible in the photos", why, hint)
+        raise StageError("mesh.nothing-seen", "no part of the surface is visible in the photos", why, hint)
     surface, left = keep_faces(surface, good[label])
     return Cleaned(surface, old[left], int(good.sum()), int((~good).sum()), int((~inside).sum()), hidden)
 

@@ -50,6 +50,7 @@ def check_range(grid: Lattice, iso_level: float | None) -> None:
     broken = int((~torch.isfinite(grid.values)).sum())
     if broken:
         raise StageError(
+            "mesh.density-not-finite",
             "the density is not finite",
             f"{broken} of {grid.values.numel()} grid points are NaN or infinite",
             "Train again: the field is broken.",
@@ -58,14 +59,14 @@ def check_range(grid: Lattice, iso_level: float | None) -> None:
     opacity = 1 - float(torch.exp(-high * (grid.high - grid.low).norm()))
     if opacity < 0.01:
         why = f"its density is at most {high:.3g} per scene unit: a ray across the box has an opacity of {opacity:.1%}"
-        raise StageError("the field is empty", why, RETRAIN)
+        raise StageError("mesh.empty-field", "the field is empty", why, RETRAIN)
     if high - low < 1e-3 * high:
         why = f"its density is {low:.3g} to {high:.3g} per scene unit, the same everywhere"
-        raise StageError("the field has no surface", why, RETRAIN)
+        raise StageError("mesh.uniform-field", "the field has no surface", why, RETRAIN)
     if iso_level is not None and not low < iso_level < high:
         why = f"density runs from {low:.3g} to {high:.3g} per scene unit"
         hint = "Give --mesh.iso-level a value in between, or leave it out to have one chosen."
-        raise StageError(f"no surface at density {iso_level:g}", why, hint)
+        raise StageError("mesh.level-out-of-range", f"no surface at density {iso_level:g}", why, hint)
 
 
 def choose_iso_level(grid: Lattice, model: RadianceModel, rays: Rays) -> IsoLevel:

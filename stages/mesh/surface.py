@@ -41,6 +41,7 @@ def extract_surface(grid: Lattice, iso_level: float) -> Surface:
     values = smoothed_occupancy(grid, iso_level).values.cpu().numpy()
     if not values.min() < 0.5 < values.max():
         raise StageError(
+            "mesh.too-thin",
             f"no surface at density {iso_level:.3g}",
             f"the smoothed occupancy runs from {values.min():.0%} to {values.max():.0%} and does not pass 50%: the "
             "scene is too thin for the grid, or fills the box",

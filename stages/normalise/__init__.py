@@ -73,9 +73,10 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
         found = normalise(sfm, config.roi, _up_by_gps(registration["georeference"], sfm, photos))
     except ValueError as error:
         hint = "Take photos from different places, or give --normalise.roi."
-        raise StageError("the scene has no scale", str(error), hint) from error
+        raise StageError("normalise.no-scale", "the scene has no scale", str(error), hint) from error
     if split.count("train") < FEWEST_TRAINING_VIEWS:
         raise StageError(
+            "normalise.few-training-photos",
             f"only {split.count('train')} of {len(split)} photos are left to train on",
             "the others are held out as test photos",
             f"Add training photos, or {'change the given split' if official else 'raise --normalise.test-every'}.",
@@ -103,12 +104,14 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
 def _check(config: Config, views: int) -> None:
     if views < FEWEST_VIEWS:
         raise StageError(
+            "normalise.few-photos",
             f"only {views} photo{'s' * (views != 1)} with a known camera",
             f"a scene needs at least {FEWEST_VIEWS}: two to learn from and one to check against",
             "Add photos that overlap with these.",
         )
     if config.roi and config.roi[3] <= 0:
         raise StageError(
+            "normalise.roi-radius",
             f"--normalise.roi has radius {config.roi[3]:g}",
             "the fourth number is the region's half side and must be above 0",
             "Give x y z radius in the frame of output/transforms.json.",

@@ -154,6 +154,7 @@ def _why(
 def _check(config: Config) -> None:
     if config.cameras is not None and (config.path or config.frames):
         raise StageError(
+            "render.cameras-and-path",
             "--render.cameras excludes --render.path and --render.frames",
             "the file says where the cameras stand and how many there are",
             "Leave out one of them.",

@@ -111,7 +111,7 @@ def fitted_path(scene: "Scene", kind: PathKind, frames: int) -> CameraPath:
     poses = _poses(scene)
     if kind == "orbit" and np.ptp(poses[:, :, 3], axis=0).max() < ONE_PLACE:
         hint = "Give --render.path interpolated, or None to have one chosen."
-        raise StageError("there is no orbit to fly", "all photos were taken from one place", hint)
+        raise StageError("render.no-orbit", "there is no orbit to fly", "all photos were taken from one place", hint)
     path, camera, relative = path_of(poses, frames), median_camera(scene), _relative_focals(scene)
     if np.ptp(np.log(relative)) <= math.log(ONE_LENS):
         return CameraPath((camera,) * frames, path)
@@ -173,14 +173,22 @@ def path_from_file(scene: "Scene", file: Path) -> CameraPath:
             poses.append(_in_scene(frame["transform_matrix"], scene.scene_from_sfm))
         except (TypeError, ValueError, ArithmeticError) as error:
             hint = "Give numbers as output/transforms.json and output/path.json have them."
-            raise StageError(f"cannot use frame {index} of {file.name}", str(error), hint) from error
+            raise StageError(
+                "render.unusable-frame", f"cannot use frame {index} of {file.name}", str(error), hint
+            ) from error
     if (side := max(max(camera.width, camera.height) for camera in cameras)) > LARGEST_SIDE:
         raise StageError(
-            f"cannot render the frames of {file.name}", f"one is {side} pixels long", f"Give at most {LARGEST_SIDE}."
+            "render.large-frames",
+            f"cannot render the frames of {file.name}",
+            f"one is {side} pixels long",
+            f"Give at most {LARGEST_SIDE}.",
         )
     if len({(camera.width, camera.height) for camera in cameras}) > 1:
         raise StageError(
-            f"cannot make one video of {file.name}", "its frames differ in size", "Give all frames one w and h."
+            "render.frame-sizes",
+            f"cannot make one video of {file.name}",
+            "its frames differ in size",
+            "Give all frames one w and h.",
         )
     return CameraPath(tuple(cameras), np.stack(poses))
 

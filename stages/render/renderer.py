@@ -33,10 +33,12 @@ class Painter:
 
     def at_gain(self, log_gain: "Tensor") -> "Painter":
         """This field at another gain than the neutral one; only for a field that models exposure."""
-        from nerf.effects.exposure import ExposedModel
+        from nerf.effects.appearance import AppearanceModel
+        from nerf.effects.exposure import ExposureModel
 
-        assert isinstance(self.model, ExposedModel)
-        return replace(self, model=ExposedModel(self.model.model, log_gain.to(self.background.device)))
+        assert isinstance(self.model, AppearanceModel)
+        effects = (ExposureModel(log_gain[None].to(self.background.device)),)
+        return replace(self, model=AppearanceModel(self.model.model, effects))
 
     def draw(self, rays: "Rays", on_chunk: Callable[[float], None] | None = None) -> "Rendering":
         """The picture (height, width) that ``rays`` see, on the CPU. ``on_chunk`` is told the finished share."""

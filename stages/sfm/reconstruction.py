@@ -121,7 +121,12 @@ def _check_count(photos: Sequence[Photo], ingested: int) -> None:
         why = f"it takes at least {MIN_REGISTERED} photos that overlap"
         if same := ingested - len(photos):
             why += f", and {same} are nearly the same picture as one of these"
-        raise StageError(f"cannot find cameras from {len(photos)} photo{'s' * (len(photos) != 1)}", why, OVERLAP_HINT)
+        raise StageError(
+            "sfm.few-photos",
+            f"cannot find cameras from {len(photos)} photo{'s' * (len(photos) != 1)}",
+            why,
+            OVERLAP_HINT,
+        )
 
 
 def _check_memory(config: Config, photos: Sequence[Photo]) -> None:
@@ -139,17 +144,24 @@ def _check_camera(config: Config, photos: Sequence[Photo]) -> None:
     what = "cannot use --sfm.camera-params"
     hint = "Give COLMAP's numbers for these photos: --sfm.camera-model SIMPLE_RADIAL --sfm.camera-params F CX CY K."
     if config.camera_model is None:
-        raise StageError(what, "the model that they are the parameters of is not given", hint)
+        raise StageError(
+            "sfm.parameters-without-model", what, "the model that they are the parameters of is not given", hint
+        )
     sizes = sorted({(photo.width, photo.height) for photo in photos})
     if len(sizes) > 1:
         listed = ", ".join(f"{width}×{height}" for width, height in sizes[:3])
-        raise StageError(what, f"the photos have {len(sizes)} sizes ({listed}) and so several cameras", hint)
+        raise StageError(
+            "sfm.parameters-of-several-cameras",
+            what,
+            f"the photos have {len(sizes)} sizes ({listed}) and so several cameras",
+            hint,
+        )
     try:
         valid = is_valid(Camera(config.camera_model, *sizes[0], config.camera_params))
     except ValueError as error:
-        raise StageError(what, str(error), hint) from error
+        raise StageError("sfm.parameter-count", what, str(error), hint) from error
     if not valid:
-        raise StageError(what, "a focal length is not positive", hint)
+        raise StageError("sfm.focal-not-positive", what, "a focal length is not positive", hint)
 
 
 # --- what an interrupted run left

@@ -214,14 +214,16 @@ def why_no_model(photos: "Sequence[Photo]", matches: Matches, registered: int, p
     what = f"the cameras of {len(photos)} photos could not be found"
     if np.median(matches.keypoints) < MIN_FEATURES:
         return StageError(
+            "sfm.few-features",
             what,
             f"half of the photos show fewer than {MIN_FEATURES} features",
             "Take sharper, better lit photos, or put something with texture into the scene.",
         )
     if not verified:
-        return StageError(what, f"0 of {pairs} pairs of photos share a view", OVERLAP_HINT)
+        return StageError("sfm.no-overlap", what, f"0 of {pairs} pairs of photos share a view", OVERLAP_HINT)
     if np.median(matches.shift_px) < MAX_SAME_VIEW_PX:
         return StageError(
+            "sfm.same-view",
             what,
             f"the photos are all the same view ({verified} of {pairs} pairs differ by less than a pixel)",
             f"Move the camera between photos. {STILL_BACKGROUND_HINT}",
@@ -231,7 +233,7 @@ def why_no_model(photos: "Sequence[Photo]", matches: Matches, registered: int, p
     why = f"{verified} of {pairs} pairs of photos share a view, but none of them shows the depth of the scene"
     if registered:
         why = f"only {registered} photos and {points} points fit together; {verified} of {pairs} pairs share a view"
-    return StageError(what, why, OVERLAP_HINT)
+    return StageError("sfm.no-model", what, why, OVERLAP_HINT)
 
 
 def _no_depth(what: str, photos: "Sequence[Photo]", matches: Matches) -> StageError | None:
@@ -241,12 +243,14 @@ def _no_depth(what: str, photos: "Sequence[Photo]", matches: Matches) -> StageEr
     rotations = count_pure_rotations(matches.homography[matches.planar], sizes[matches.pairs[matches.planar]])
     if planar > count / 2 and rotations > planar / 2:
         return StageError(
+            "sfm.pure-rotation",
             what,
             f"pure rotation: {rotations} of {count} matching pairs differ by a rotation alone",
             "Move sideways between photos, by a tenth of the distance to the scene, instead of only turning it.",
         )
     if forward > count / 2:
         return StageError(
+            "sfm.forward-motion",
             what,
             f"forward motion: in {forward} of {count} matching pairs the camera moves towards something in view, "
             "which leaves too little parallax",
@@ -254,6 +258,7 @@ def _no_depth(what: str, photos: "Sequence[Photo]", matches: Matches) -> StageEr
         )
     if planar > count / 2:
         return StageError(
+            "sfm.planar-scene",
             what,
             f"planar scene: one plane explains {planar} of {count} matching pairs",
             "Take in something that stands out from the surface, and photograph it from the side as well.",

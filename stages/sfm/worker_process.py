@@ -145,6 +145,7 @@ def _worker_failed(code: int, limit: float | None, phase: str, last: str, withou
     where = f"while {phase}" if phase != "features" else "while extracting features"
     if limit is not None:
         return StageError(
+            "sfm.timeout",
             f"structure-from-motion was given up {where}",
             f"it took longer than {limit:g} s",
             without or "Give it longer with --sfm.max-seconds, or fewer photos; matches found so far are kept.",
@@ -153,8 +154,11 @@ def _worker_failed(code: int, limit: float | None, phase: str, last: str, withou
         name = signal.Signals(-code).name
         memory = code == -signal.SIGKILL
         return StageError(
+            "sfm.worker-killed",
             f"structure-from-motion was ended by {name} {where}",
             "most often the machine ran out of memory" if memory else f"COLMAP failed inside ({last})",
             without or f"Run again: what was matched is kept. With less memory: --sfm.max-features 2048. Log: {log}",
         )
-    return StageError(f"structure-from-motion failed {where}", last, without or f"The whole log is in {log}")
+    return StageError(
+        "sfm.worker-failed", f"structure-from-motion failed {where}", last, without or f"The whole log is in {log}"
+    )

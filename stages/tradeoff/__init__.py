@@ -104,7 +104,12 @@ def _scene_with_test_photos(inputs: Inputs) -> "Scene":
     scene = read_scene(inputs["normalise"])
     if not scene.of_split("test"):
         why = "no photo of this scene was kept for testing"
-        raise StageError("nothing to score a study by", why, "Lower --normalise.test-every, or add photos.")
+        raise StageError(
+            "tradeoff.no-test-photos",
+            "nothing to score a study by",
+            why,
+            "Lower --normalise.test-every, or add photos.",
+        )
     return scene
 
 
@@ -131,7 +136,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     if all(trial.figures["failed"] for trial in trials):
         why = "; ".join(dict.fromkeys(str(trial.figures["failed"]) for trial in trials))
         why = why or f"{duration(config.seconds)} are too short here even for {selection.left_out[0]}"
-        raise StageError("the study has no result", why, "Give it more time, as in --budget 30m.")
+        raise StageError("tradeoff.no-result", "the study has no result", why, "Give it more time, as in --budget 30m.")
     workspace = inputs["normalise"].resolve().parents[1].name
     failed = [f"{trial.arm.words} ({trial.figures['failed']})" for trial in trials if trial.figures["failed"]]
     return _written(config, trials, own, (*selection.left_out, *late, *failed), exam, folder, workspace)

@@ -17,7 +17,7 @@ from stages.contract import Inputs, Progress, StageError
 from stages.io.files import read_json, sync_file, write_json_durably
 from stages.io.periodically import periodically
 from stages.tradeoff.runs import SMALL_SIDE, THINNED, Arm
-from stages.train.data import NOTHING_LEFT
+from stages.train.data import ALL_MASKED
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -32,8 +32,8 @@ STEPS_OF_PLACES = (0.7548776662466927, 0.5698402909980532)
 ENOUGH = 0.25  # of a window's pixels that masks leave
 PLACES = 256  # in a photo that are looked at for a window with ENOUGH
 MEMORY_LOOK_SECONDS = 0.05
-OWN_FAULTS = ("training diverged", "the field does not learn", NOTHING_LEFT)
-"""What stage train says where the arm itself is at fault: it would say so again."""
+OWN_FAULTS = ("train.diverged", "train.collapsed", ALL_MASKED)
+"""The errors of stage train where the arm itself is at fault: it would say so again."""
 
 Colour = tuple[float, float, float]
 
@@ -115,7 +115,12 @@ def _check_used(windows: tuple[Window, ...]) -> None:
     thinned = slice(None, None, THINNED)
     if not any(window.used is None or window.used[thinned, thinned].any() for window in windows):
         why = "masks leave next to nothing of the held-out photos at this size"
-        raise StageError("nothing to score a study by", why, "Lower --normalise.test-every, or ignore less.")
+        raise StageError(
+            "tradeoff.no-pixels-to-score",
+            "nothing to score a study by",
+            why,
+            "Lower --normalise.test-every, or ignore less.",
+        )
 
 
 def run_arm(arm: Arm, exam: Exam, inputs: Inputs, folder: Path, progress: Progress) -> dict[str, Any]:
@@ -136,10 +141,10 @@ def run_arm(arm: Arm, exam: Exam, inputs: Inputs, folder: Path, progress: Progre
         try:
             result = train.run(train.Config(**arm.options), inputs, work, progress)
         except StageError as error:
-            if error.what not in OWN_FAULTS:
+            if error.code not in OWN_FAULTS:
                 what = f"the study stopped at {arm.words}: {error.what}"
                 hint = "Close other programs or free disk space; the same command then goes on with this training."
-                raise StageError(what, error.why, hint) from error
+                raise StageError("tradeoff.stopped", what, error.why, hint) from error
             figures["failed"] = f"{error.what}: {error.why}"
         else:
             figures |= {name: result.facts[name] for name in ("train_seconds", "restarts")}

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 # lens, 0.02 for an action camera's, 0.05 for a fisheye's, and a camera takes 1 MB; twice as many: a quarter, and 4 MB.
 MAX_PATCHES = 192
 MIN_LONG_SIDE = 150  # pixels of a photo: below this it shows too little to judge anything by
-NOTHING_LEFT = "nothing is left to train on"  # what happened, of the StageError where masks leave no pixel at a size
+ALL_MASKED = "train.all-masked"  # the error where masks leave no pixel at a size
 
 
 def scaled_size(camera: "Camera", downscale: float) -> tuple[int, int]:
@@ -58,7 +58,7 @@ def patch_bearings(camera: "Camera", downscale: float) -> "Tensor":
 
 def training_bank(ingest: Path, scene: "Scene", split: "Split", downscale: float, progress: Progress) -> RayDataset:
     """All pixels and rays of one split, on the CPU; the pixels are mapped from the pixel store, which is made if need
-    be. What masks ignore is never drawn. Raises StageError, NOTHING_LEFT, where they leave nothing."""
+    be. What masks ignore is never drawn. Raises StageError, ALL_MASKED, where they leave nothing."""
     views, store = scene.of_split(split), _store(ingest, scene, split, downscale)
     at_once = cache(lambda: loaders(ingest / view.file for view in views))  # opens every file
     fill(store, lambda index: _decoded_pixels(ingest, scene, views[index], downscale), at_once, progress)
@@ -118,7 +118,7 @@ def _masked(bank: RayDataset, ignored: "Iterable[Tensor | None]", split: "Split"
         bank = bank.without(ignored)
     except ValueError as error:
         why = f"{error} of the {split} photos at this size"
-        raise StageError(NOTHING_LEFT, why, "Give a smaller --train.downscale.") from error
+        raise StageError(ALL_MASKED, "nothing is left to train on", why, "Give a smaller --train.downscale.") from error
     progress.note(f"masks leave {bank.drawable / len(bank.pixels):.0%} of the pixels of the {split} photos")
     return bank
 

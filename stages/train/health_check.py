@@ -20,7 +20,7 @@ def symptom_of(trainer: FieldTrainer, probe: Probe) -> str | None:
     if name := not_finite(trainer):
         return f"its {name} is not finite"
     try:
-        seen = measure(trainer.model, probe, trainer.photo_colours, trainer.photo_rays)
+        seen = measure(trainer.model, probe, trainer.effects)
     except ValueError as error:  # of PSNR, which has no value there
         return f"it shows what is no number: {error}"
     if not seen.opacity >= EMPTY_OPACITY:  # nor is what is no number

@@ -113,13 +113,17 @@ class TrainingRun:
         """Start from the end of the finished run in ``folder``, at the rate that the longer run would have there."""
         checkpoint = latest_checkpoint(folder / "checkpoints", self.progress.note, remove=False)
         if checkpoint is None:
-            raise cannot_go_on(f"the last state of the training in {folder} cannot be read")
+            raise cannot_go_on("train.no-state", f"the last state of the training in {folder} cannot be read")
         try:
             self._load(checkpoint, folder / "plan.json")
         except (RuntimeError, TypeError) as error:
-            raise cannot_go_on(f"the training in {folder} is of another version of this program: {error}") from error
+            raise cannot_go_on(
+                "train.other-version", f"the training in {folder} is of another version of this program: {error}"
+            ) from error
         if self.state.step < self.plan.total_steps:
-            raise cannot_go_on(f"the last state of the training in {folder} cannot be read, only an earlier one")
+            raise cannot_go_on(
+                "train.earlier-state", f"the last state of the training in {folder} cannot be read, only an earlier one"
+            )
         self.state.steps_before, self.state.seconds_before = step, seconds = self.state.step, self.state.seconds
         self.state.validation_before = self.state.validation_psnr
         steps, self.clock_budget = self._limits()
@@ -320,7 +324,7 @@ class TrainingRun:
         rollbacks = self.state.rollbacks + 1
         if rollbacks > MOST_ROLLBACKS:
             why = f"{fault}, after {MOST_ROLLBACKS} roll-backs that each halved the learning rate"
-            raise StageError("training diverged", why, hint)
+            raise StageError("train.diverged", "training diverged", why, hint)
         checkpoint = latest_checkpoint(self.checkpoints, self.progress.note, self._load_sound)
         if checkpoint is None and self.budget.after is not None:
             self._go_on(self.budget.after)
@@ -352,7 +356,7 @@ class TrainingRun:
         return f"{advice}; the batch is kept in {self.folder / name}."
 
     def _on_training_photos(self) -> ProbeResult:
-        return measure(self.trainer.model, self.probes.train, self.trainer.photo_colours, self.trainer.photo_rays)
+        return measure(self.trainer.model, self.probes.train, self.trainer.effects)
 
     def _restart(self, symptom: str) -> None:
         """Begin anew with another seed; give up by name after the second."""
@@ -361,7 +365,7 @@ class TrainingRun:
         if restarts > MOST_RESTARTS:
             why = f"after {WARM_UP_STEPS} steps {symptom}, with {restarts} different seeds"
             hint = "Check the cameras: the photos may not fit their poses. Or try a tenth of --train.learning-rate."
-            raise StageError("the field does not learn", why, hint)
+            raise StageError("train.collapsed", "the field does not learn", why, hint)
         self.progress.note(f"after {WARM_UP_STEPS} steps the field is dead: {symptom}; starting with another seed")
         shutil.rmtree(self.checkpoints)
         self._begin(self.state.anew(restarts, rollbacks=0))

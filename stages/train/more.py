@@ -23,9 +23,9 @@ def training_name(key: str, outputs_digest: str) -> str:
     return f"{key[:KEY_LENGTH]}/{outputs_digest[:KEY_LENGTH]}"
 
 
-def cannot_go_on(why: str) -> StageError:
+def cannot_go_on(code: str, why: str) -> StageError:
     """The error for a finished training whose last state is of no use here."""
-    return StageError("training cannot go on", why, "Train anew, for longer, without --more.")
+    return StageError(code, "training cannot go on", why, "Train anew, for longer, without --more.")
 
 
 def earlier_training(name: str, inputs: Inputs) -> Path:
@@ -37,9 +37,14 @@ def earlier_training(name: str, inputs: Inputs) -> Path:
     folder = inputs["effects"].parents[1] / "train" / key
     what = "training cannot go on"
     if not (folder / "manifest.json").is_file():
-        raise StageError(what, f"the training that it goes on from, {folder}, is gone", ANEW)
+        raise StageError("train.training-gone", what, f"the training that it goes on from, {folder}, is gone", ANEW)
     if not read_json(folder / "manifest.json")["outputs_digest"].startswith(digest):
-        raise StageError(what, f"{folder} was trained again since and is another field now", "Give --more again.")
+        raise StageError(
+            "train.training-changed",
+            what,
+            f"{folder} was trained again since and is another field now",
+            "Give --more again.",
+        )
     return folder
 
 
@@ -57,7 +62,7 @@ def continued(config: Config, inputs: Inputs) -> Config:
     for name, value in given.items():
         if name not in free and value != settings.get(name):
             why = f"{name} is {value} now and was {settings.get(name)}"
-            raise StageError("training cannot go on with other settings", why, ANEW)
+            raise StageError("train.other-settings", "training cannot go on with other settings", why, ANEW)
     own = {name: getattr(config, name) for name in (*OWN, "checkpoint_seconds", "tensorboard")}
     target = {"target_psnr": config.target_psnr or settings["target_psnr"]}
     return Config.model_validate(settings | own | target)
@@ -67,7 +72,7 @@ def _same_inputs(digests: dict[str, str], inputs: Inputs) -> None:
     now = {stage: read_json(inputs[stage] / "manifest.json")["outputs_digest"] for stage in digests}
     if changed := [stage for stage in digests if digests[stage] != now[stage]]:
         why = f"what it was trained on has changed since: {', '.join(changed)}"
-        raise StageError("training cannot go on", why, ANEW)
+        raise StageError("train.other-photos", "training cannot go on", why, ANEW)
 
 
 def earlier_seconds(config: Config, inputs: Inputs) -> float:

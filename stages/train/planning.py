@@ -12,7 +12,7 @@ import torch
 from nerf.runtime.matmul_precision import use_matmul_precision
 from nerf.training.ray_dataset import RayDataset, build_ray_bank
 from stages.contract import Inputs, Progress
-from stages.effects.decisions import Decisions, photo_parts, read_decisions
+from stages.effects.decisions import Decisions, image_effects, read_decisions
 from stages.hardware.device import compute_device
 from stages.hardware.memory import available_on
 from stages.io.amounts import bytes_in_words, duration, short_count
@@ -96,8 +96,8 @@ def rays_per_second(config: Config, scene: "Scene", decisions: Decisions) -> flo
 def seconds_per_step(config: Config, scene: "Scene", decisions: Decisions, device: str) -> float:
     """Measured: steps of a fresh field of known sizes, with its effects, on a grey picture, for about a second."""
     bank = _grey_bank(scene).to(device)
-    parts = photo_parts(decisions, scene.of_split("train")[:1], bank)
-    trainer = make_trainer(config, scene, bank, seed=0, photo_parts=parts)
+    effects = image_effects(decisions, scene.of_split("train")[:1], bank)
+    trainer = make_trainer(config, scene, bank, seed=0, effects=effects)
     with use_matmul_precision(config.matmul):
         trainer.step(0, 0.0, 1.0)  # the first step pays for memory and kernels
         started, steps = time.perf_counter(), 0

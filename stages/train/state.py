@@ -129,5 +129,5 @@ def _board(folder: Path) -> Any:
     except ImportError as error:
         why = "the tensorboard package is not installed"
         hint = "Install it with `pip install tensorboard`, or leave out --train.tensorboard."
-        raise StageError("cannot write TensorBoard files", why, hint) from error
+        raise StageError("train.no-tensorboard", "cannot write TensorBoard files", why, hint) from error
     return SummaryWriter(str(folder))

@@ -10,7 +10,7 @@ from nerf.runtime.matmul_precision import use_matmul_precision
 from nerf.training.ray_dataset import RayDataset
 from nerf.training.validation_probe import make_probe
 from stages.contract import Inputs, Progress, StageResult
-from stages.effects.decisions import learnt_of_photos, photo_parts, read_decisions
+from stages.effects.decisions import image_effects, learnt_of_photos, read_decisions
 from stages.hardware.device import compute_device, cores
 from stages.hardware.memory import check_memory
 from stages.io.amounts import short_count
@@ -88,7 +88,7 @@ def prepare(config: Config, scene: Scene, inputs: Inputs, folder: Path, progress
     _say_sizes(config, budget, bank, progress)
     decisions, views = read_decisions(inputs["effects"]), scene.of_split("train")
     return TrainingRun(
-        lambda attempt: make_trainer(config, scene, bank, config.seed + attempt, photo_parts(decisions, views, bank)),
+        lambda attempt: make_trainer(config, scene, bank, config.seed + attempt, image_effects(decisions, views, bank)),
         probes,
         budget,
         folder,

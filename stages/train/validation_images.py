@@ -15,7 +15,7 @@ from stages.effects.decisions import told_by_neighbours
 from stages.evaluate.image_metrics import ssim
 from stages.io.photos import evenly_spread
 from stages.train.config import Config
-from stages.train.data import NOTHING_LEFT, field_background, training_bank
+from stages.train.data import ALL_MASKED, field_background, training_bank
 
 PROBE_RAYS = 2048
 PROBE_SEED = 0  # whatever the training's: curves of different seeds differ by what was trained, not by the pixels
@@ -60,7 +60,7 @@ def unseen_photos(
     try:
         bank = training_bank(ingest, scene, split, config.downscale, progress).to(device)
     except StageError as error:
-        if split != "test" or error.what != NOTHING_LEFT:
+        if split != "test" or error.code != ALL_MASKED:
             raise
         progress.note(f"held-out quality is not measured while training: {error.why}")
         return None
@@ -80,7 +80,7 @@ def load_metrics() -> None:
 
 def look(trainer: FieldTrainer, unseen: Unseen) -> Look:
     """How the field does on photos that it has never seen, exposed as their neighbours let expect."""
-    as_expected = trainer.photo_colours.of_unseen(unseen.neighbours)
+    as_expected = trainer.effects.of_held_out(unseen.neighbours)
     psnr = measure(trainer.model, unseen.probe, as_expected).psnr
     rows = zip(*pictures(trainer.model, unseen.patches, as_expected), unseen.patches.used, strict=True)
     known = [value for row in rows if (value := ssim(*(part.cpu() for part in row))) is not None]
@@ -96,7 +96,7 @@ def with_validation(scene: Scene) -> Scene:
     if split is None:
         count = len(scene.of_split("train"))
         why = f"photos to decide by have to be set aside, and of {count} training photos too few would be left"
-        raise StageError("no target can be trained to", why, "Leave out --target-psnr.")
+        raise StageError("train.few-photos-for-target", "no target can be trained to", why, "Leave out --target-psnr.")
     return split
 
 

@@ -12,8 +12,9 @@ import torch
 from PIL import Image
 from safetensors.torch import load_file
 
-from nerf.effects.exposure_model import Exposures
-from nerf.effects.pose_refinement import RefinedPoses
+from nerf.effects import ImageEffects
+from nerf.effects.exposure import ExposureModel
+from nerf.effects.pose_refinement import PoseRefinement
 from nerf.training.hash_grid_trainer import HashGridTrainer
 from nerf.training.ray_dataset import RayDataset
 from nerf.training.trainer import VanillaTrainer
@@ -163,14 +164,14 @@ def test_rays_that_are_no_numbers_end_training_by_name(
 
 @pytest.mark.parametrize("what", ["poses", "gains"])
 @pytest.mark.parametrize("kind", KINDS)
-def test_what_is_learnt_of_photos_is_gated_and_rolled_back(
+def test_per_image_parameters_are_gated_and_rolled_back(
     kind: str, what: str, inputs: dict[str, Path], tmp_path: Path, progress: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with_photo_parts(monkeypatch, what)
+    with_effects(monkeypatch, what)
     monkeypatch.setattr(training_loop, "WARM_UP_STEPS", 3 * WARM_UP)  # the rate is halved: at first it looks dead
 
     def poison(trainer: Any) -> None:
-        next(iter(trainer.photo_parameters.values())).detach().view(-1)[::2] = float("nan")
+        next(iter(trainer.effects.parameters.values())).detach().view(-1)[::2] = float("nan")
 
     spoil_once_at(20, poison, monkeypatch, kind)
     result = trained(kind, inputs, tmp_path / "train", progress, steps=3 * WARM_UP + 21)
@@ -300,16 +301,13 @@ def spoil_once_at(step: int, spoil: Callable[[Any], None], monkeypatch: pytest.M
     spoil_at(step, first_time, monkeypatch, kind)
 
 
-def with_photo_parts(monkeypatch: pytest.MonkeyPatch, what: str) -> None:
+def with_effects(monkeypatch: pytest.MonkeyPatch, what: str) -> None:
     """Train with poses or gains of photos, whatever the effects say."""
-    from nerf.effects import AS_GIVEN, AS_RENDERED
 
-    def parts(decisions: Any, views: Any, bank: Any):
+    def effects(decisions: Any, views: Any, bank: Any) -> ImageEffects:
         centres = torch.tensor(np.stack([view.scene_from_camera[:, 3] for view in views]), dtype=torch.float32)
-        return (
-            (RefinedPoses(centres), AS_RENDERED)
-            if what == "poses"
-            else (AS_GIVEN, Exposures(torch.zeros(len(views), 3)))
-        )
+        if what == "poses":
+            return ImageEffects((PoseRefinement(centres),))
+        return ImageEffects(colours=(ExposureModel(torch.zeros(len(views), 3)),))
 
-    monkeypatch.setattr("stages.effects.decisions.photo_parts", parts)
+    monkeypatch.setattr("stages.effects.decisions.image_effects", effects)

@@ -67,7 +67,7 @@ def _import_cameras(cameras: Path, photos: list, folder: Path) -> None:
     try:
         found = normalise(_reconstruction(model, list(range(len(model.images))), None), None)
     except ValueError as error:
-        raise StageError("the scene has no scale", str(error), "-") from error
+        raise StageError("normalise.no-scale", "the scene has no scale", str(error), "-") from error
     assert (found.near > 0).all() and (found.near < found.far).all() and np.isfinite(found.far).all()
     assert np.isfinite(found.scene_from_sfm.matrix()).all()
 

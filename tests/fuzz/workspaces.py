@@ -167,4 +167,4 @@ def try_checkpoint(folder: Path) -> None:
     from stages.train.checkpoints import latest_checkpoint
 
     if latest_checkpoint(folder, lambda _: None) is None:
-        raise StageError("no checkpoint", "the only one is damaged", "-")
+        raise StageError("train.no-state", "no checkpoint", "the only one is damaged", "-")

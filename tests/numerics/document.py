@@ -33,13 +33,13 @@ ELSEWHERE = {
     "tests/nerf/rendering/test_srgb.py",
     "nerf/effects/exposure.py": "powers taken between powers, without light in between; value, gradient, extremes: "
     "tests/nerf/effects/test_exposure.py",
-    "nerf/effects/exposure_model.py": "gains of a photo's rays, from nothing to 1e30: "
-    "tests/nerf/effects/test_exposure_model.py",
+    "nerf/effects/__init__.py": "effects in order, by the chain rule: tests/nerf/effects/test_composition.py; "
+    "gains of a photo's rays, from nothing to 1e30: tests/nerf/effects/test_exposure_model.py",
+    "nerf/effects/appearance.py": "changes no bit where effects change nothing: tests/nerf/effects/test_exposure.py",
     "nerf/geometry/rotations.py": "its series below 0.1 radians, against the matrix exponential from 0 to beyond π: "
     "tests/nerf/geometry/test_rotations.py",
     "nerf/effects/pose_refinement.py": "turns and shifts of rays, up to 3.1 radians: "
-    "tests/nerf/effects/test_pose_refinement.py",
-    "nerf/effects/pose_fit.py": "a search: tests/stages/effects/test_pilots.py, tests/nerf/effects/test_pose_fit.py",
+    "tests/nerf/effects/test_pose_refinement.py; the fit of one is a search: tests/nerf/effects/test_pose_fit.py",
     "nerf/geometry/pose_distance.py": "float64, ratios of distances: tests/nerf/geometry/test_pose_distance.py",
     "nerf/rendering/images.py": "cuts pictures into chunks: tests/nerf/rendering/test_images.py",
     "nerf/training/validation_probe.py": "mean colour, PSNR, patches of pixels: "

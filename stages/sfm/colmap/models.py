@@ -28,7 +28,10 @@ def read_model(sparse: Path) -> SparseModel:
         files = read_model_files(sparse)
     except (ValueError, OverflowError, OSError) as error:
         raise StageError(
-            f"cannot read the COLMAP model in {sparse.name}", str(error), "Check that it is a complete COLMAP model."
+            "sfm.damaged-model",
+            f"cannot read the COLMAP model in {sparse.name}",
+            str(error),
+            "Check that it is a complete COLMAP model.",
         ) from error
     camera_ids = sorted(files.cameras)
     images = sorted(files.images.values(), key=lambda image: image.name)

@@ -145,7 +145,7 @@ def _from_transforms(cameras: Path, photos: Sequence[Photo], frames: Mapping[str
 
 def _two_frames(photo: str, first: str, second: str) -> StageError:
     which = f"{first!r} is listed twice" if first == second else f"they are {first!r} and {second!r}"
-    return StageError(f"two frames for the photo {photo} differ", which, HINT)
+    return StageError("sfm.two-frames", f"two frames for the photo {photo} differ", which, HINT)
 
 
 def _split(content: Mapping[str, Any], source: str, notes: list[str]) -> tuple[set[PurePosixPath], set[PurePosixPath]]:
@@ -168,11 +168,15 @@ def _listed(content: Mapping[str, Any], key: str, source: str, notes: list[str])
     StageError where none has a frame."""
     names = content.get(key) or []
     if not (isinstance(names, list) and all(isinstance(name, str) for name in names)):
-        raise unusable(f"the {key} of {source}", "it is no list of names")
+        raise unusable("sfm.split-no-list", f"the {key} of {source}", "it is no list of names")
     of_frames = {PurePosixPath(frame["file_path"]) for frame in content["frames"]}
     strange = [name[:MOST_LETTERS] for name in names if PurePosixPath(name) not in of_frames]
     if strange and len(strange) == len(names):
-        raise unusable(f"the {key} of {source}", f"none of them is the file_path of a frame: {_few(strange)}")
+        raise unusable(
+            "sfm.split-of-no-frame",
+            f"the {key} of {source}",
+            f"none of them is the file_path of a frame: {_few(strange)}",
+        )
     if strange:
         notes.append(f"{len(strange)} photos in {key} of {source} have no frame: {_few(strange)}")
     return set(map(PurePosixPath, names))
@@ -212,7 +216,9 @@ def _given_camera(framed: _Framed, upright: bool) -> Camera:
     try:
         return read_intrinsics(framed.values, *size)
     except ValueError as error:
-        raise unusable(f"the camera of frame {framed.frame['file_path']!r}", str(error)) from error
+        raise unusable(
+            "sfm.frame-intrinsics", f"the camera of frame {framed.frame['file_path']!r}", str(error)
+        ) from error
 
 
 class _Rotation(NamedTuple):
@@ -234,20 +240,26 @@ def _pose(matrix: Any, name: str) -> tuple[Float[np.ndarray, "3 4"], _Rotation]:
     try:
         pose = pose_matrix(matrix)
     except ValueError as error:
-        raise unusable(f"frame {name!r}", str(error)) from error
+        raise unusable("sfm.frame-pose", f"frame {name!r}", str(error)) from error
     if (place := np.abs(pose[:, 3]).max()) > FARTHEST:
         why = f"its place is {place:.3g} units from the origin, and the most is {FARTHEST:g}"
-        raise unusable(f"the transform_matrix of frame {name!r}", why)
+        raise unusable("sfm.pose-far-away", f"the transform_matrix of frame {name!r}", why)
     if not (largest := np.abs(pose[:, :3]).max()) <= MAX_ENTRY:
-        raise unusable(f"the transform_matrix of frame {name!r}", f"it is no rotation: {largest:.3g} is in it")
+        raise unusable(
+            "sfm.pose-large-entry",
+            f"the transform_matrix of frame {name!r}",
+            f"it is no rotation: {largest:.3g} is in it",
+        )
     if np.linalg.det(pose[:, :3]) < 0:
-        raise unusable(f"the transform_matrix of frame {name!r}", "it mirrors (its determinant is negative)")
+        raise unusable(
+            "sfm.pose-mirrors", f"the transform_matrix of frame {name!r}", "it mirrors (its determinant is negative)"
+        )
     rotation = _nearest_rotation(pose[:, :3])
     if not rotation.stretch_deg <= MAX_STRETCH_DEG:
         why = (
             f"it is no rotation: its axes are off by {rotation.stretch_deg:.2g}°, and it scales by {rotation.scale:.4g}"
         )
-        raise unusable(f"the transform_matrix of frame {name!r}", why)
+        raise unusable("sfm.pose-no-rotation", f"the transform_matrix of frame {name!r}", why)
     return np.concatenate([rotation.matrix @ OPENGL_FROM_OPENCV, pose[:, 3:]], axis=1), rotation
 
 
@@ -420,6 +432,7 @@ def _without_ending(name: str) -> str:
 def _nothing_matches(source: str, names: Sequence[str], photos: Sequence[Photo]) -> StageError:
     here = _few([photo.name for photo in photos], FEW_NAMES)
     return StageError(
+        "sfm.no-camera-matches",
         f"no camera in {source} belongs to a photo",
         f"it is of {_few(names, FEW_NAMES)}, and the photos are {here}",
         "Give the folder of the very photos that the cameras were made for.",

@@ -47,11 +47,12 @@ def _turns(photo: Photo, camera: Camera, name: str, upright: bool) -> int:
     """How many quarter turns clockwise make a given camera one of the upright photo. Raises StageError for a lens that
     is none, and where the photo was mirrored, which no camera can be."""
     if flaw := flaw_of(camera):
-        raise unusable(f"the camera of {name!r}", flaw)
+        raise unusable("sfm.degenerate-camera", f"the camera of {name!r}", flaw)
     if not is_of_stored_pixels(camera, photo, upright):
         return 0
     if photo.orientation not in QUARTER_TURNS:
         raise StageError(
+            "sfm.mirrored-photo",
             f"cannot use the camera of {name!r}",
             f"the EXIF orientation {photo.orientation} of {photo.name} mirrors the photo, and no camera sees mirrored",
             "Leave the cameras out, or make them for photos that are saved upright, without an EXIF orientation.",
@@ -66,6 +67,7 @@ def _at_size_of(photo: Photo, camera: Camera, name: str) -> Camera:
         return camera
     if not same_shape(camera, size):
         raise unusable(
+            "sfm.photo-shape",
             f"the camera of {name!r}",
             f"it is for {camera.width}×{camera.height} pixels, the photo has {photo.width}×{photo.height}",
         )
@@ -92,6 +94,6 @@ def distinct(posed: Collection[PosedPhoto]) -> tuple[list[Camera], list[SparseIm
     return cameras, [SparseImage(p.file, cameras.index(p.camera), p.world_from_camera) for p in posed]
 
 
-def unusable(what: str, why: str) -> StageError:
+def unusable(code: str, what: str, why: str) -> StageError:
     """The error for what stands in a file of cameras."""
-    return StageError(f"cannot use {what}", why, HINT)
+    return StageError(code, f"cannot use {what}", why, HINT)

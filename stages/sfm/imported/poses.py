@@ -58,6 +58,7 @@ def write_known_model(
     errors = read_model(folder / "sparse").error_px  # computed anew: what the given model says of them may be anything
     if lost := int((~np.isfinite(errors)).sum()):
         raise StageError(
+            "sfm.points-do-not-fit",
             f"the cameras of {cameras.name} do not fit its points",
             f"{lost} of {len(errors)} points are seen where their cameras cannot see anything",
             "Check the distortion of the cameras, or leave them out to have them found from the photos.",

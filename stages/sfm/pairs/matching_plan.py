@@ -85,6 +85,7 @@ def check_matcher(matcher: "Matcher | None", places: "Places") -> None:
     """Raises StageError where a matcher was asked for that the photos do not allow."""
     if matcher == "spatial" and places.position_m is None:
         raise StageError(
+            "sfm.no-positions",
             "cannot choose pairs of photos by place",
             "not all photos tell by EXIF where they were taken",
             "Leave out --sfm.matcher, or try --sfm.matcher retrieval.",
@@ -161,7 +162,7 @@ def _measured(photos: "Sequence[Photo]", images: Path, tier: Tier, matcher: "Mat
         why = lines[-1] if lines else f"COLMAP ended with {answer.returncode}"
         every = f"--sfm.matcher exhaustive --sfm.max-image-size {tier.max_image_size}"
         hint = f"Say how, and nothing is measured: {every} --sfm.max-features {tier.max_features}."
-        raise StageError("could not measure what features and matches take", why, hint)
+        raise StageError("sfm.not-measured", "could not measure what features and matches take", why, hint)
     return Cost(**json.loads(answer.stdout))
 
 

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING, Protocol
 
-from nerf.effects import AS_GIVEN, AS_RENDERED, PhotoColours, PhotoRays
+from nerf.effects import NO_EFFECTS, ImageEffects
 from nerf.training.trainer import FieldTrainer
 from stages.contract import Progress
 from stages.train.config import Config
@@ -75,8 +75,7 @@ class Field(Protocol):
         scene: "Scene",
         bank: "RayDataset",
         seed: int,
-        photo_rays: PhotoRays,
-        photo_colours: PhotoColours,
+        effects: ImageEffects,
     ) -> FieldTrainer:
         """A fresh field with its trainer, where ``bank`` is."""
         ...
@@ -100,8 +99,8 @@ def make_trainer(
     scene: "Scene",
     bank: "RayDataset",
     seed: int,
-    photo_parts: tuple[PhotoRays, PhotoColours] = (AS_GIVEN, AS_RENDERED),
+    effects: ImageEffects = NO_EFFECTS,
 ) -> FieldTrainer:
-    """A fresh field of the kind that ``config`` asks for, with its trainer, where ``bank`` is. ``photo_parts`` stand
-    between it and the photos; by default nothing does."""
-    return field_of(config).make_trainer(config, scene, bank, seed, *photo_parts)
+    """A fresh field of the kind that ``config`` asks for, with its trainer, where ``bank`` is. ``effects`` stand
+    between it and the photos."""
+    return field_of(config).make_trainer(config, scene, bank, seed, effects)

@@ -3,7 +3,7 @@
 import math
 from typing import TYPE_CHECKING, Any
 
-from nerf.effects import PhotoColours, PhotoRays
+from nerf.effects import ImageEffects
 from nerf.fields.hash_grid import HashGridField, HashGridSettings
 from nerf.fields.mlp import HIDDEN
 from nerf.kernels import BOX, CONTRACTED_BOX
@@ -176,13 +176,13 @@ def step_in_words(config: Config) -> str:
 
 
 def make_trainer(
-    config: Config, scene: "Scene", bank: "RayDataset", seed: int, photo_rays: PhotoRays, photo_colours: PhotoColours
+    config: Config, scene: "Scene", bank: "RayDataset", seed: int, effects: ImageEffects
 ) -> HashGridTrainer:
     """A fresh field with its trainer, where ``bank`` is."""
     assert config.backend, "plan() chooses it"
     backend = load_backend(config.backend, bank.device.type)
     model = HashGridField(field_settings(config, has_background_model(config, scene)), seed, backend).to(bank.device)
-    return HashGridTrainer(model, bank, _trainer_settings(config, scene, seed), photo_rays, photo_colours)
+    return HashGridTrainer(model, bank, _trainer_settings(config, scene, seed), effects)
 
 
 def field_settings(config: Config, sky: bool) -> HashGridSettings:

@@ -3,7 +3,7 @@
 from dataclasses import fields
 from typing import TYPE_CHECKING
 
-from nerf.effects import PhotoColours, PhotoRays
+from nerf.effects import ImageEffects
 from nerf.fields.vanilla import VanillaNerf, VanillaSettings
 from nerf.training.trainer import CHUNK_RAYS, VanillaTrainer, VanillaTrainerSettings
 from stages.contract import Progress
@@ -121,14 +121,14 @@ def step_in_words(config: Config) -> str | None:
 
 
 def make_trainer(
-    config: Config, scene: "Scene", bank: "RayDataset", seed: int, photo_rays: PhotoRays, photo_colours: PhotoColours
+    config: Config, scene: "Scene", bank: "RayDataset", seed: int, effects: ImageEffects
 ) -> VanillaTrainer:
     """A fresh field with its trainer, where ``bank`` is."""
     assert config.batch_rays is not None and config.learning_rate is not None, "plan() chooses them"
     model = VanillaNerf(field_settings(config), seed).to(bank.device)
     rates = (config.learning_rate, config.learning_rate * FINAL_LEARNING_RATE)
     settings = VanillaTrainerSettings(config.batch_rays, seed, training_background(config, scene), *rates)
-    return VanillaTrainer(model, bank, settings, photo_rays, photo_colours)
+    return VanillaTrainer(model, bank, settings, effects)
 
 
 def field_settings(config: Config) -> VanillaSettings:

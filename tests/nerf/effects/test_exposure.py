@@ -8,14 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from nerf.effects import exposure
-from nerf.effects.exposure import (
-    ExposedModel,
-    expose,
-    expose_backward,
-    fit_log_gain,
-    own_light,
-)
+from nerf.effects import exposure, foreground_radiance
+from nerf.effects.appearance import AppearanceModel
+from nerf.effects.exposure import ExposureModel, expose, expose_backward, fit_log_gain
 from nerf.fields.interface import RadianceModel, Rendering
 from nerf.geometry.rays import Rays
 from nerf.rendering.srgb import KNEE, linear_to_srgb, srgb_to_linear
@@ -163,7 +158,7 @@ def test_flat_pictures_have_finite_gains_that_fit(shown: float, truth: float):
     flat = torch.full((100, 3), shown)
     found = fit_log_gain(flat, torch.full((100, 3), truth))
     assert torch.isfinite(found).all()
-    if shown <= exposure.DARKEST:
+    if shown <= exposure.MIN_VALUE:
         assert (found == 0).all()
     else:
         assert (expose(flat, found).clamp(max=1) - truth).abs().max() < 1 / 255
@@ -176,7 +171,7 @@ def test_no_pixels_ask_for_no_gain():
 def test_a_fit_looks_at_many_pixels_and_not_at_all(monkeypatch: pytest.MonkeyPatch):
     c = colours(4000, brightest=0.9)
     photo = photo_of(c, gain(0.5), 0.02)
-    monkeypatch.setattr(exposure, "MOST_PIXELS", 500)
+    monkeypatch.setattr(exposure, "MAX_PIXELS", 500)
     few = fit_log_gain(c, photo)
     assert not torch.equal(few, c.new_zeros(3)) and (few - gain(0.5)).abs().max() < 0.03
 
@@ -203,23 +198,24 @@ def fog_rays() -> Rays:
 
 
 def test_an_exposed_model_shows_the_scene_at_its_gain_and_the_background_as_it_is():
-    model = ExposedModel(Fog(), torch.tensor([0.5, 0.0, -0.5]))
+    log_gain = torch.tensor([0.5, 0.0, -0.5])
+    model = AppearanceModel(Fog(), (ExposureModel(log_gain[None]),))
     assert isinstance(model, RadianceModel) and model.chunk_rays == 77
     points = torch.rand(4, 3)
     assert torch.equal(model.density(points), points[..., 0])
     density, colour = model.density_and_colour(points, points)
     assert torch.equal(density, points[..., 0])
-    torch.testing.assert_close(colour, expose(torch.full((4, 3), 0.5), model.log_gain))
+    torch.testing.assert_close(colour, expose(torch.full((4, 3), 0.5), log_gain))
     background = torch.tensor([0.2, 1.0, 0.4])
     seen, plain = model.render(fog_rays(), background), Fog().render(fog_rays(), background)
     torch.testing.assert_close(seen.colour[0], background)
     torch.testing.assert_close(seen.colour[-1], colour[0])
-    light = own_light(plain.colour, plain.opacity, background)
-    torch.testing.assert_close(seen.colour, expose(light, model.log_gain) + plain.colour - light)
+    light = foreground_radiance(plain.colour, plain.opacity, background)
+    torch.testing.assert_close(seen.colour, expose(light, log_gain) + plain.colour - light)
     assert torch.equal(seen.depth, plain.depth) and torch.equal(seen.opacity, plain.opacity)
 
 
 def test_a_model_exposed_at_no_gain_is_the_model_bit_for_bit():
     background = torch.tensor([0.2, 0.9, 0.4])
-    seen = ExposedModel(Fog(), torch.zeros(3)).render(fog_rays(), background)
+    seen = AppearanceModel(Fog(), (ExposureModel(torch.zeros(1, 3)),)).render(fog_rays(), background)
     assert all(torch.equal(*pair) for pair in zip(seen, Fog().render(fog_rays(), background), strict=True))

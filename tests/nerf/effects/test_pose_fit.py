@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from nerf.effects.pose_fit import fit_pose
+from nerf.effects.pose_refinement import fit_pose
 from nerf.fields.hash_grid import HashGridField, HashGridGradients, HashGridPass, HashGridSettings
 from nerf.geometry.rays import Rays
 from nerf.kernels import torch as reference

@@ -1,10 +1,9 @@
-from functools import partial
-
 import pytest
 import torch
 from torch import Tensor
 
-from nerf.effects.pose_refinement import RATE, RefinedPoses
+from nerf.effects import RayGradients
+from nerf.effects.pose_refinement import LEARNING_RATE, PoseRefinement
 from nerf.geometry.rays import Rays
 from nerf.kernels import torch as reference
 
@@ -20,19 +19,19 @@ VIEW = torch.tensor([0, 2, 2, 1, 0, 2])
 
 def test_things_a_unit_away_or_farther_have_the_unit_one() -> None:
     """And then an offset is a shift, to the bit."""
-    poses, farther = RefinedPoses(ring()), RefinedPoses(ring(), torch.full((8,), 3.0))
+    poses, farther = PoseRefinement(ring()), PoseRefinement(ring(), torch.full((8,), 3.0))
     poses.offset += torch.randn(8, 3, generator=torch.Generator().manual_seed(4))
     assert torch.equal(poses.shift, poses.offset) and torch.equal(poses.unit, farther.unit)
     assert torch.equal(poses.gauge, farther.gauge)
 
 
 def test_a_correction_of_nothing_changes_no_bit() -> None:
-    same = RefinedPoses(torch.zeros(3, 3)).forward(rays(), VIEW)
+    same = PoseRefinement(torch.zeros(3, 3)).forward(rays(), VIEW)
     assert all(torch.equal(a, b) for a, b in zip(same, rays(), strict=True))
 
 
 def test_rays_turn_and_shift_with_their_own_camera() -> None:
-    poses = RefinedPoses(torch.zeros(3, 3))
+    poses = PoseRefinement(torch.zeros(3, 3))
     poses.turn[2], poses.offset[1] = torch.tensor([0, 0, torch.pi / 2]), torch.tensor([1.0, 2, 3])
     moved, before = poses.forward(rays(), VIEW), rays()
     quarter = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
@@ -43,12 +42,12 @@ def test_rays_turn_and_shift_with_their_own_camera() -> None:
 
 
 def test_backward_is_the_derivative_of_forward() -> None:
-    poses, given = RefinedPoses(torch.zeros(3, 3)), rays()
+    poses, given = PoseRefinement(torch.zeros(3, 3)), rays()
     random = torch.Generator().manual_seed(2)
     for part in poses.parameters.values():
         part += 0.3 * torch.randn(3, 3, generator=random)
     weights = [torch.randn(6, 3, generator=random) for _ in range(2)]
-    by_hand = poses.backward(given, VIEW, lambda: (weights[0], weights[1]))
+    by_hand = poses.backward(given, VIEW, RayGradients(weights[0], weights[1]))
     leaves = [part.requires_grad_() for part in poses.parameters.values()]
     moved = poses.forward(given, VIEW)
     expected = torch.autograd.grad((moved.origins * weights[0]).sum() + (moved.directions * weights[1]).sum(), leaves)
@@ -60,7 +59,7 @@ def test_backward_is_the_derivative_of_forward() -> None:
 def test_its_derivatives_are_those_of_differences_at_every_size(radians: float) -> None:
     random = torch.Generator().manual_seed(3)
     axes = torch.nn.functional.normalize(torch.randn(3, 3, generator=random, dtype=torch.float64), dim=-1)
-    poses, given = RefinedPoses(torch.zeros(3, 3).double()), rays().each(Tensor.double)
+    poses, given = PoseRefinement(torch.zeros(3, 3).double()), rays().each(Tensor.double)
 
     def moved(turn: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
         poses.turn, poses.offset = turn, shift
@@ -71,7 +70,7 @@ def test_its_derivatives_are_those_of_differences_at_every_size(radians: float) 
     assert torch.autograd.gradcheck(moved, parts)
     weights = torch.randn(2, 6, 3, generator=random, dtype=torch.float64)
     expected = torch.autograd.grad(moved(parts[0], parts[1]), parts, list(weights))
-    by_hand = poses.backward(given, VIEW, lambda: (weights[0], weights[1]))
+    by_hand = poses.backward(given, VIEW, RayGradients(weights[0], weights[1]))
     torch.testing.assert_close(list(by_hand.values()), list(expected), rtol=1e-12, atol=1e-12)
 
 
@@ -82,25 +81,25 @@ def ring(count: int = 8) -> torch.Tensor:
 
 @pytest.mark.parametrize("distance", [None, torch.tensor([0.1, 0.3, 5.0, 0.2, 0.7, 1.0, 0.4, 0.1])])
 def test_what_all_cameras_share_is_taken_out(distance: Tensor | None) -> None:
-    poses, centres = RefinedPoses(ring(), distance), ring()
+    poses, centres = PoseRefinement(ring(), distance), ring()
     turn, shift = torch.tensor([0.01, -0.02, 0.03]), torch.tensor([0.1, 0.2, -0.3])
     poses.turn += turn
     poses.offset += (shift + torch.linalg.cross(turn.expand_as(centres), centres) + 0.05 * centres) / poses.unit
-    poses.settle()
+    poses.fix_gauge()
     assert poses.turn.abs().max() < 1e-6 and poses.offset.abs().max() < 2e-6
 
 
 def test_what_is_a_cameras_own_stays() -> None:
-    poses = RefinedPoses(ring())
+    poses = PoseRefinement(ring())
     poses.turn[3] = torch.tensor([0.0, 0.02, 0])
-    poses.settle()
+    poses.fix_gauge()
     once = poses.turn.clone()
-    poses.settle()
+    poses.fix_gauge()
     torch.testing.assert_close(poses.turn, once)  # a projection
     assert poses.turn[3, 1] > 0.01 and poses.turn[[0, 1, 2, 4, 5, 6, 7]].abs().max() < 0.01
 
 
-def refined(scale: float) -> tuple[RefinedPoses, float]:
+def refined(scale: float) -> tuple[PoseRefinement, float]:
     """Poses that were jittered, after some steps towards noisy pictures of known points half a unit away, in a scene
     made so many times larger; and how far off (radians) points then appear at most in the mean of a view."""
     random = torch.Generator().manual_seed(5)
@@ -109,14 +108,14 @@ def refined(scale: float) -> tuple[RefinedPoses, float]:
     towards = points.repeat(8, 1) - ring()[view] / 5
     distance, directions = towards.norm(dim=-1), torch.nn.functional.normalize(towards, dim=-1)
     median = distance.view(8, 60).median(1).values
-    wrong = RefinedPoses(ring() / 5, median)
+    wrong = PoseRefinement(ring() / 5, median)
     wrong.turn += 0.02 * torch.randn(8, 3, generator=random)
     wrong.offset += 0.02 * torch.randn(8, 3, generator=random)
-    wrong.settle()
+    wrong.fix_gauge()
     origins = ring()[view] / 5
     given = wrong.forward(Rays(origins, directions, torch.ones(480), torch.ones(480)), view)
     given = given._replace(origins=scale * given.origins)
-    poses = RefinedPoses(scale * ring() / 5, scale * median)
+    poses = PoseRefinement(scale * ring() / 5, scale * median)
     moments = [{name: torch.zeros(8, 3) for name in poses.parameters} for _ in range(2)]
 
     def off(moved: Rays, noise: Tensor) -> Tensor:
@@ -127,11 +126,11 @@ def refined(scale: float) -> tuple[RefinedPoses, float]:
         noise = 5e-3 * torch.randn(480, 3, generator=random)
         moved = poses.forward(given, view).each(lambda part: part.detach().requires_grad_())
         of_origins, of_directions = torch.autograd.grad(off(moved, noise).square().mean(), moved[:2])
-        gradients = poses.backward(given, view, partial(lambda *both: both, of_origins, of_directions))
+        gradients = poses.backward(given, view, RayGradients(of_origins, of_directions))
         for name, gradient in gradients.items():
             mean, square = moments[0][name], moments[1][name]
-            reference.adam(poses.parameters[name], gradient, mean, square, RATE, step + 1)
-        poses.settle()
+            reference.adam(poses.parameters[name], gradient, mean, square, LEARNING_RATE, step + 1)
+        poses.fix_gauge()
     left = off(poses.forward(given, view), torch.zeros(480, 3)).view(8, 60, 3).mean(1).norm(dim=-1)
     return poses, float(left.max())
 
@@ -145,7 +144,7 @@ def test_in_a_small_scene_poses_are_refined_as_well_as_in_a_large_one() -> None:
 
 
 def test_cameras_in_one_place_have_a_gauge_too() -> None:
-    poses = RefinedPoses(torch.zeros(2, 3))
+    poses = PoseRefinement(torch.zeros(2, 3))
     poses.turn += torch.tensor([[1.0, 0, 0], [3, 0, 3]])
-    poses.settle()
+    poses.fix_gauge()
     torch.testing.assert_close(poses.turn, torch.tensor([[-1.0, 0, -1.5], [1, 0, 1.5]]))

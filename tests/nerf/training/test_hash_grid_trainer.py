@@ -5,10 +5,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerf.effects import AS_GIVEN, AS_RENDERED
-from nerf.effects.exposure import expose
-from nerf.effects.exposure_model import Exposures
-from nerf.effects.pose_refinement import RefinedPoses
+from nerf.effects import NO_EFFECTS, ImageEffects
+from nerf.effects.exposure import ExposureModel, expose
+from nerf.effects.pose_refinement import PoseRefinement
 from nerf.fields.background import background_colour
 from nerf.fields.hash_grid import HashGridField, HashGridSettings
 from nerf.geometry.rays import Rays
@@ -232,9 +231,9 @@ def unequal_bank() -> RayDataset:
 
 def test_exposures_are_learnt_where_they_are_modelled() -> None:
     settings, errors = replace(TRAINER, background=(0.0, 0.0, 0.0), seed=0), []  # of some seeds all becomes black
-    exposures = Exposures(torch.zeros(2, 3))
-    for colours in (AS_RENDERED, exposures):
-        run = HashGridTrainer(HashGridField(FIELD, 0, reference), unequal_bank(), settings, AS_GIVEN, colours)
+    exposures = ExposureModel(torch.zeros(2, 3))
+    for effects in (NO_EFFECTS, ImageEffects(colours=(exposures,))):
+        run = HashGridTrainer(HashGridField(FIELD, 0, reference), unequal_bank(), settings, effects)
         errors.append([run.step(step, step / 300).psnr for step in range(300)][-1])
     red = exposures.log_gain[:, 0]
     assert 0.15 < float(red[0] - red[1]) < 0.8 and exposures.log_gain.mean(0).abs().max() < 1e-6
@@ -244,15 +243,13 @@ def test_exposures_are_learnt_where_they_are_modelled() -> None:
 @pytest.mark.parametrize("seed", [1, 2])
 def test_the_gradient_of_poses_is_that_of_the_loss(seed: int) -> None:
     """As far as differences tell: of other fields, samples that come to lie in another cell weigh more in them."""
-    poses = RefinedPoses(torch.eye(3)[:2])
+    poses, settings = PoseRefinement(torch.eye(3)[:2]), replace(TRAINER, background=BACKGROUND)
     poses.turn += torch.tensor([[0.02, 0.01, -0.01], [0.0, -0.02, 0.03]])
-    run = HashGridTrainer(
-        HashGridField(FIELD, seed, reference), small_bank(), replace(TRAINER, background=BACKGROUND), poses
-    )
+    run = HashGridTrainer(HashGridField(FIELD, seed, reference), small_bank(), settings, ImageEffects((poses,)))
     for step in range(60):
         run.step(step, 0.84)  # at a third of the rate
-    by_hand = run._part(7, 0.5, 128, 0).photos
-    assert set(by_hand) == {"turn", "offset"}
+    by_hand = run._part(7, 0.5, 128, 0).effects
+    assert set(by_hand) == {"pose_refinement.turn", "pose_refinement.offset"}
 
     def difference(part: Tensor, view: int, axis: int) -> float:
         losses = []
@@ -265,13 +262,16 @@ def test_the_gradient_of_poses_is_that_of_the_loss(seed: int) -> None:
     for name, part in poses.parameters.items():
         # across the line of sight: what a shift along it or a turn about it does is too little to measure like this
         found = torch.tensor([[difference(part, view, axis) for axis in (0, 1)] for view in (0, 1)])
-        torch.testing.assert_close(by_hand[name][:, :2], found, rtol=0.2, atol=0.1 * float(found.abs().max()))
+        torch.testing.assert_close(
+            by_hand[f"pose_refinement.{name}"][:, :2], found, rtol=0.2, atol=0.1 * float(found.abs().max())
+        )
 
 
-def test_what_is_learnt_of_photos_is_part_of_the_state() -> None:
+def test_per_image_parameters_are_part_of_the_state() -> None:
     def fresh() -> HashGridTrainer:
-        parts = RefinedPoses(torch.eye(3)[:2]), Exposures(torch.tensor([[0.0, 0, 0], [0.5, 0.5, 0.5]]))
-        return HashGridTrainer(HashGridField(FIELD, 0, reference), small_bank(), TRAINER, *parts)
+        exposures = ExposureModel(torch.tensor([[0.0, 0, 0], [0.5, 0.5, 0.5]]))
+        effects = ImageEffects((PoseRefinement(torch.eye(3)[:2]),), (exposures,))
+        return HashGridTrainer(HashGridField(FIELD, 0, reference), small_bank(), TRAINER, effects)
 
     whole, first, second = fresh(), fresh(), fresh()
     for step in range(20):
@@ -282,8 +282,9 @@ def test_what_is_learnt_of_photos_is_part_of_the_state() -> None:
     for step in range(10, 20):
         second.step(step, step / 20)
     assert same(whole.state(), second.state())
-    assert {"photo.turn", "photo.offset", "photo.log_gain", "mean.turn"} <= whole.state().keys()
-    with pytest.raises(RuntimeError, match="photo"):
+    names = {"image.pose_refinement.turn", "image.pose_refinement.offset", "image.exposure.log_gain"}
+    assert names <= whole.state().keys()
+    with pytest.raises(RuntimeError, match="image"):
         trainer().load_state(whole.state())
 
 

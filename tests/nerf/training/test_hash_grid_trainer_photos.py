@@ -8,7 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerf.effects.pose_refinement import RefinedPoses
+from nerf.effects import ImageEffects
+from nerf.effects.pose_refinement import PoseRefinement
 from nerf.fields.hash_grid import HashGridField
 from nerf.fields.interface import Rendering
 from nerf.kernels import torch as reference
@@ -20,7 +21,7 @@ from tests.nerf.training.test_hash_grid_trainer import FIELD, TRAINER, copied, s
 
 
 def part_without_effects(run: HashGridTrainer, step: int, share: float, rays: int, chunk: int) -> _Part:
-    """What a chunk adds to loss and gradients, written as if no photo had rays or colours of its own."""
+    """What a chunk adds to loss and gradients, written as if there were no effects."""
     batch = run._batch(step, share, chunk, rays)
     done = run.model.forward(batch.rays, batch.jitter, batch.offset, batch.background)
     error = done.rendering.colour - batch.target
@@ -45,8 +46,8 @@ def test_effects_that_are_off_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> 
 
 @pytest.mark.parametrize("runaway", [1e30, float("nan")])
 def test_turns_that_run_away_are_refused_and_change_nothing(runaway: float) -> None:
-    poses = RefinedPoses(torch.eye(3)[:2])
-    run = HashGridTrainer(HashGridField(FIELD, 0, reference), small_bank(), TRAINER, poses)
+    poses = PoseRefinement(torch.eye(3)[:2])
+    run = HashGridTrainer(HashGridField(FIELD, 0, reference), small_bank(), TRAINER, ImageEffects((poses,)))
     run.step(0, 0.0)
     poses.turn[:, 1] = runaway
     before = copied(run.state())

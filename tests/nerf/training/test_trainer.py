@@ -5,8 +5,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerf.effects.exposure_model import Exposures
-from nerf.effects.pose_refinement import RefinedPoses
+from nerf.effects import ImageEffects
+from nerf.effects.exposure import ExposureModel
+from nerf.effects.pose_refinement import PoseRefinement
 from nerf.fields.vanilla import VanillaNerf, VanillaSettings
 from nerf.geometry.rays import Rays
 from nerf.training.ray_dataset import RayDataset, build_ray_bank
@@ -163,13 +164,14 @@ def test_a_state_of_another_architecture_is_refused() -> None:
         trainer().load_state(other.state())
 
 
-def test_what_is_learnt_of_photos_is_trained_and_resumed() -> None:
+def test_per_image_parameters_are_trained_and_resumed() -> None:
     def fresh() -> VanillaTrainer:
-        parts = RefinedPoses(torch.eye(3)[:2]), Exposures(torch.tensor([[0.0, 0, 0], [0.5, 0.5, 0.5]]))
-        return VanillaTrainer(VanillaNerf(FIELD, seed=0), small_bank(), TRAINER, *parts)
+        exposures = ExposureModel(torch.tensor([[0.0, 0, 0], [0.5, 0.5, 0.5]]))
+        effects = ImageEffects((PoseRefinement(torch.eye(3)[:2]),), (exposures,))
+        return VanillaTrainer(VanillaNerf(FIELD, seed=0), small_bank(), TRAINER, effects)
 
     whole, first, second = fresh(), fresh(), fresh()
-    begun = {name: part.detach().clone() for name, part in whole.photo_parameters.items()}
+    begun = {name: part.detach().clone() for name, part in whole.effects.parameters.items()}
     for step in range(12):
         whole.step(step, step / 12)
     for step in range(6):
@@ -178,5 +180,6 @@ def test_what_is_learnt_of_photos_is_trained_and_resumed() -> None:
     for step in range(6, 12):
         second.step(step, step / 12)
     assert same(whole.state(), second.state())
-    moved = {name: (part.detach() - begun[name]).abs().max() for name, part in whole.photo_parameters.items()}
-    assert set(moved) == {"turn", "offset", "log_gain"} and all(1e-4 < change < 0.2 for change in moved.values())
+    moved = {name: (part.detach() - begun[name]).abs().max() for name, part in whole.effects.parameters.items()}
+    assert set(moved) == {"pose_refinement.turn", "pose_refinement.offset", "exposure.log_gain"}
+    assert all(1e-4 < change < 0.2 for change in moved.values())

@@ -326,7 +326,7 @@ def test_a_photo_that_cannot_be_read_any_more_fails_the_stage_that_reads_it(
     assert run_on(tmp_path / "photos", capsys, "--until", "ingest")[0] == 0
 
     def unreadable(_: Runner) -> str:
-        raise StageError("cannot read 1.png", "Permission denied", "Check its permissions.")
+        raise StageError("ingest.cannot-read", "cannot read 1.png", "Permission denied", "Check its permissions.")
 
     monkeypatch.setattr(Runner, "_photos_digest", unreadable)
     assert run_command(["resume", str(tmp_path / "w.nerf")]) == 10

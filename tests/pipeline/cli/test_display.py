@@ -22,7 +22,7 @@ def say_everything(display: Display) -> None:
         display.update("step 1", 0.5)
         display.note("a note " * 2000)  # more than a buffer holds
         display.end(stage, "it is done", 1.0, cached=False)
-    display.failed("train", StageError("what", "why", "what to try"))
+    display.failed("train", StageError("train.code", "what", "why", "what to try"))
     display.finished("at last", {})
 
 

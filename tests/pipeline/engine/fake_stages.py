@@ -45,7 +45,7 @@ def _plan_sfm(config: SfmConfig, inputs: dict[str, Path], progress: Progress) ->
 def _run_sfm(config: SfmConfig, inputs: dict[str, Path], folder: Path, progress: Any) -> StageResult:
     calls.append("sfm")
     if config.fail:
-        raise StageError("it failed", "it was told to", "Do not tell it to.")
+        raise StageError("sfm.fake", "it failed", "it was told to", "Do not tell it to.")
     (folder / "deep").mkdir()
     write_json(folder / "deep" / "number.json", 2 * read_json(inputs["ingest"] / "number.json") + (config.offset or 0))
     (folder / "log.txt").write_text("a record")

@@ -38,7 +38,9 @@ def test_without_the_photos_and_their_digest_no_report_is_made_up(
 ) -> None:
     go = runs_on(tmp_path, monkeypatch)
     go(Machine(), 300.0)
-    monkeypatch.setattr(Runner, "_photos_digest", lambda _: (_ for _ in ()).throw(StageError("cannot read", "", "")))
+    monkeypatch.setattr(
+        Runner, "_photos_digest", lambda _: (_ for _ in ()).throw(StageError("ingest.cannot-read", "", "", ""))
+    )
     with pytest.raises(StageFailed, match="report: cannot read"):
         go(Machine(), 300.0, resume=True, alone=True, stages=("report",))
 

@@ -142,7 +142,7 @@ def chain(machine: Machine) -> dict[str, SimpleNamespace]:
             else:
                 machine.work(MUST[name])
             if name == machine.refuses:
-                raise StageError("it cannot be done", "nothing overlaps", "Add photos.")
+                raise StageError("sfm.fake", "it cannot be done", "nothing overlaps", "Add photos.")
             if name == "ingest":
                 photo = Photo(
                     "0.png", "images/0.png", round(1000 * machine.megapixels), 1000, 0, None, None, False, 1.0

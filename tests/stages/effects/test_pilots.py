@@ -8,8 +8,7 @@ import pytest
 import torch
 
 from nerf.effects.exposure import expose
-from nerf.effects.pose_fit import fit_pose
-from nerf.effects.pose_refinement import RefinedPoses
+from nerf.effects.pose_refinement import PoseRefinement, fit_pose
 from nerf.rendering.images import render_image
 from stages.effects import pilots
 from stages.effects.decisions import Decisions, expected_gains, told_by_neighbours
@@ -147,7 +146,7 @@ def test_a_photos_pose_is_found_against_a_finished_field(trial: PilotScene) -> N
     rays = type(photo.rays)(*(part.flatten(0, 1) for part in photo.rays))
     black, view = torch.zeros(3), torch.zeros(len(rays.near), dtype=torch.int64)
     target = render_image(field, photo.rays, black).colour.flatten(0, 1)
-    wrong = RefinedPoses(torch.zeros(1, 3))
+    wrong = PoseRefinement(torch.zeros(1, 3))
     wrong.turn += torch.tensor([[0.02, -0.015, 0.0]])
     found = fit_pose(field, wrong.forward(rays, view), target, black)
     left = (found.forward(wrong.forward(rays, view), view).directions - rays.directions).norm(dim=-1).mean()

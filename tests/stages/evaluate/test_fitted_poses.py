@@ -7,13 +7,14 @@ from typing import Any
 import pytest
 import torch
 
-from nerf.effects.exposure import ExposedModel
-from nerf.effects.pose_refinement import RefinedPoses
+from nerf.effects.appearance import AppearanceModel
+from nerf.effects.exposure import ExposureModel
+from nerf.effects.pose_refinement import PoseRefinement
 from nerf.fields.hash_grid import HashGridField, HashGridSettings
 from nerf.fields.interface import Rendering
 from nerf.geometry.rays import Rays
 from stages import evaluate
-from stages.effects.decisions import Decisions, learnt_of_photos, photo_parts
+from stages.effects.decisions import Decisions, image_effects, learnt_of_photos
 from stages.evaluate import Examiner
 from stages.evaluate.half_images import from_fitted_pose, right_half_psnr
 from stages.hardware.backend import chosen_backend, load_backend
@@ -39,7 +40,7 @@ def test_poses_are_fitted_to_the_field_as_it_is_and_scored_as_the_photo_was_expo
         return rays._replace(near=rays.near + 0.5)  # seen from elsewhere
 
     monkeypatch.setattr("stages.evaluate.half_images.from_fitted_pose", fit)
-    neutral = Painter(ExposedModel(field, torch.full((3,), 0.3)), torch.zeros(3))
+    neutral = Painter(AppearanceModel(field, (ExposureModel(torch.full((1, 3), 0.3)),)), torch.zeros(3))
     examiner = Examiner(scene, inputs["ingest"], tmp_path, neutral, {view.name: gain}, True, 1.0)
     (scored,) = examiner.score([view], Quiet())
     rays = view_rays(scene, view, 1.0)
@@ -57,9 +58,9 @@ def test_refined_poses_are_learnt_in_units_of_what_photos_see_and_written_in_sce
     views = scene.of_split("train")
     bank = training_bank(inputs["ingest"], scene, "train", 1.0, Quiet())
     near = bank._replace(known=bank.first_pixel[:-1] + 5, distance=torch.full((len(views),), 0.25))
-    rays, colours = photo_parts(Decisions(pose_refinement=True), views, near)
-    rays.parameters["offset"][1] = torch.tensor([1.0, 0.0, -2.0])
-    trainer: Any = SimpleNamespace(photo_rays=rays, photo_colours=colours)
+    effects = image_effects(Decisions(pose_refinement=True), views, near)
+    effects.rays[0].parameters["offset"][1] = torch.tensor([1.0, 0.0, -2.0])
+    trainer: Any = SimpleNamespace(effects=effects)
     learnt = learnt_of_photos(trainer, views)["poses"]
     assert learnt[views[1].name] == [0.0, 0.0, 0.0, 0.25, 0.0, -0.5] and learnt[views[0].name] == [0.0] * 6
 
@@ -67,11 +68,11 @@ def test_refined_poses_are_learnt_in_units_of_what_photos_see_and_written_in_sce
 def test_a_test_photos_pose_is_fitted_in_units_of_what_it_sees(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[float] = []
 
-    def fit(*given: Any) -> RefinedPoses:
+    def fit(*given: Any) -> PoseRefinement:
         asked.append(given[-1])
-        return RefinedPoses(torch.zeros(1, 3))
+        return PoseRefinement(torch.zeros(1, 3))
 
-    monkeypatch.setattr("nerf.effects.pose_fit.fit_pose", fit)
+    monkeypatch.setattr("nerf.effects.pose_refinement.fit_pose", fit)
     some, whole = torch.rand(8, 40, 3), torch.ones(8, 40)
     rays = Rays(some, some, whole, whole)
     field: Any = None

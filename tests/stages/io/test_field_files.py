@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 import torch
 
-from nerf.effects.exposure import ExposedModel
+from nerf.effects.appearance import AppearanceModel
+from nerf.effects.exposure import ExposureModel
 from nerf.fields.hash_grid import HashGridField, HashGridSettings
 from nerf.fields.vanilla import VanillaNerf, VanillaSettings
 from nerf.geometry.rays import Rays
@@ -98,8 +99,9 @@ def test_a_field_with_exposure_is_shown_at_the_neutral_one(kind: str, tmp_path: 
     plain = KINDS[kind]
     save_field(tmp_path, plain, INFO | {"exposure": EXPOSURE})
     loaded, info = load_field(tmp_path)
-    assert info["exposure"] == EXPOSURE and isinstance(loaded, ExposedModel)
-    wanted = ExposedModel(plain, torch.tensor(EXPOSURE["neutral"])).render(RAYS, torch.ones(3)).colour
+    assert info["exposure"] == EXPOSURE and isinstance(loaded, AppearanceModel)
+    exposure = ExposureModel(torch.tensor([EXPOSURE["neutral"]]))
+    wanted = AppearanceModel(plain, (exposure,)).render(RAYS, torch.ones(3)).colour
     assert torch.equal(loaded.render(RAYS, torch.ones(3)).colour, wanted)
     assert (wanted[:, 1] == plain.render(RAYS, torch.ones(3)).colour[:, 1]).all()
     assert (wanted[:, 0] > plain.render(RAYS, torch.ones(3)).colour[:, 0]).all()

@@ -182,8 +182,8 @@ def test_colours_at_a_neutral_exposure_say_at_which(run_mesh):
     stop = math.log(2)
     photos = {"a.jpg": [0.0, 0.1 * stop, 0.2 * stop], "b.jpg": [stop] * 3, "c.jpg": [2 * stop] * 3}
     result, _ = run_mesh(Solid(ball), "exposed", learnt={"exposure": {"neutral": [stop] * 3, "photos": photos}})
-    assert result.facts["exposure"] == "neutral exposure, +0.90 EV over the least exposed photo"
-    assert result.line.endswith("watertight · neutral exposure, +0.90 EV over the least exposed photo")
+    assert result.facts["exposure"] == "reference exposure, +0.90 EV over the least exposed photo"
+    assert result.line.endswith("watertight · reference exposure, +0.90 EV over the least exposed photo")
 
 
 def test_glb_stands_upright_and_the_scene_frame_can_be_had(run_mesh):

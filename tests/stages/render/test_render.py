@@ -10,7 +10,8 @@ import pytest
 import torch
 from PIL import Image
 
-from nerf.effects.exposure import ExposedModel
+from nerf.effects.appearance import AppearanceModel
+from nerf.effects.exposure import ExposureModel
 from nerf.fields.interface import Rendering
 from nerf.geometry.region_of_interest import Layout
 from nerf.geometry.scene import Camera, Scene, Similarity, View
@@ -328,7 +329,7 @@ def test_speed_is_a_record_and_path_an_output(inputs, progress) -> None:
     assert (content["w"], content["h"], content["fps"]) == (40, 30, 1)
 
 
-NEUTRAL = "neutral exposure, +1.00 EV over the least exposed photo"
+NEUTRAL = "reference exposure, +1.00 EV over the least exposed photo"
 
 
 def with_exposure(inputs, monkeypatch) -> None:
@@ -337,7 +338,7 @@ def with_exposure(inputs, monkeypatch) -> None:
     photos |= {f"{number}.jpg": [np.log(2)] * 3 for number in range(1, 12)}
     info = read_json(inputs["train"] / "field.json") | {"exposure": {"neutral": [0.0] * 3, "photos": photos}}
     write_json(inputs["train"] / "field.json", info)
-    shown = ExposedModel(GreyBall(), torch.zeros(3))
+    shown = AppearanceModel(GreyBall(), (ExposureModel(torch.zeros(1, 3)),))
     monkeypatch.setattr("stages.io.field_files.load_field", lambda *_: (shown, info))
 
 

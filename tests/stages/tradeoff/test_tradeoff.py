@@ -282,7 +282,7 @@ def test_an_arm_that_does_not_learn_is_said_and_the_study_goes_on(
 
     def diverges(config: train.Config, *rest: Any) -> Any:
         if not config.positional_encoding:
-            raise StageError("training diverged", "it was told to", "Do not tell it to.")
+            raise StageError("train.diverged", "training diverged", "it was told to", "Do not tell it to.")
         return whole(config, *rest)
 
     monkeypatch.setattr(train, "run", diverges)
@@ -305,7 +305,12 @@ def test_want_of_memory_ends_the_study_which_goes_on_with_that_training(
     def short_of_memory(config: train.Config, *rest: Any) -> Any:
         asked.append(config.steps or 0)
         if len(asked) == 2:
-            raise StageError("not enough memory for the field", "5 grids take 1 TB and 8 GB are free", "Smaller ones.")
+            raise StageError(
+                "hardware.not-enough-memory",
+                "not enough memory for the field",
+                "5 grids take 1 TB and 8 GB are free",
+                "Smaller ones.",
+            )
         return whole(config, *rest)
 
     monkeypatch.setattr(train, "run", short_of_memory)

@@ -21,7 +21,7 @@ NO_EXAM: Any = None
 @pytest.fixture
 def diverging(monkeypatch: pytest.MonkeyPatch) -> None:
     def diverges(*_: object) -> None:
-        raise StageError(OWN_FAULTS[0], "it was told to", "Do not tell it to.")
+        raise StageError(OWN_FAULTS[0], "training diverged", "it was told to", "Do not tell it to.")
 
     monkeypatch.setattr(train, "run", diverges)
 
@@ -33,7 +33,7 @@ def test_figures_that_cannot_be_read_are_found_anew(content: bytes, tmp_path: Pa
     file.write_bytes(content)
     assert kept(file) is None
     figures = run_arm(ARM, NO_EXAM, {}, tmp_path, progress)
-    assert figures["failed"] == f"{OWN_FAULTS[0]}: it was told to"
+    assert figures["failed"] == "training diverged: it was told to"
     assert kept(file) == read_json(file) == figures
 
 

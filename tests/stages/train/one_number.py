@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from nerf.effects import AS_GIVEN, AS_RENDERED
+from nerf.effects import NO_EFFECTS
 from nerf.fields.interface import Rendering
 from nerf.geometry.rays import Rays
 from nerf.training.trainer import StepResult
@@ -26,7 +26,7 @@ class OneNumber:
     """Trains one number; ``trouble(step, rate_scale)`` may raise. Its model paints ``shown``, 20 dB from the truth."""
 
     chunk_rays = 64
-    photo_rays, photo_colours = AS_GIVEN, AS_RENDERED
+    effects = NO_EFFECTS
 
     def __init__(self, seed: int, trouble: Callable[[int, float], None]) -> None:
         self.seed, self.trouble = seed, trouble

@@ -1,0 +1,27 @@
+"""Errors that a user can act on, told by their codes: how they are worded is no matter of the tests that raise them."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+
+from pipeline.engine.failures import StageFailed
+from stages.contract import StageError
+
+
+def error_of(caught: pytest.ExceptionInfo[Exception]) -> StageError:
+    """The StageError that was raised, by itself or as the end of a stage."""
+    error = caught.value.error if isinstance(caught.value, StageFailed) else caught.value
+    assert isinstance(error, StageError)
+    return error
+
+
+@contextmanager
+def refused(code: str, *values: object) -> Iterator[pytest.ExceptionInfo[Exception]]:
+    """The block ends with the StageError of this code, whose sentences name all the ``values``."""
+    with pytest.raises((StageError, StageFailed)) as caught:
+        yield caught
+    error = error_of(caught)
+    assert error.code == code, str(error)
+    said = f"{error.what}\n{error.why}\n{error.hint}"
+    assert [value for value in values if str(value) not in said] == [], said
