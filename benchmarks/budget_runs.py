@@ -105,7 +105,7 @@ class RunningMean:
     def add(self, step: int) -> None:
         new = 1 - max(0.0, 1 - MEAN_EVERY / step) ** (self.exponent + 1)
         for name, tensor in self.of.state_dict().items():
-            if name in ("bits", "clearance"):
+            if name in ("occupancy_bits", "empty_distance"):
                 self.model.state_dict()[name].copy_(tensor)
             else:
                 self.model.state_dict()[name].lerp_(tensor, new)

@@ -91,7 +91,7 @@ def main() -> None:
     record = Record(given.out)
     print(f"{torch.get_num_threads()} threads")
     take_over_cores()
-    settings = HashGridSettings(given.levels, 4, given.log2_rows, 16, given.finest, steps=given.steps)
+    settings = HashGridSettings(given.levels, 4, given.log2_rows, 16, given.finest, diagonal_steps=given.steps)
     train = read_bank(given.folder, "train", given.downscale, 1)
     test = read_bank(given.folder, "test", given.downscale, given.test_every)
     model = HashGridField(settings, given.seed, fast if given.backend == "warp" else reference)

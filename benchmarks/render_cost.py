@@ -22,10 +22,10 @@ from nerf.fields.vanilla import VanillaNerf
 from nerf.training.metrics import mean_squared_error, psnr
 from pipeline.engine.workspace import Workspace
 from stages.effects.decisions import expected_gains
+from stages.io.amounts import resolution_name
 from stages.io.files import read_json, read_scene
 from stages.io.photos import evenly_spread
 from stages.render.renderer import Painter, load_painter
-from stages.tradeoff.runs import resolution_words
 from stages.train.data import PhotoReader, view_rays
 
 
@@ -35,7 +35,7 @@ def with_samples(model: RadianceModel, factor: float) -> RadianceModel:
         return AppearanceModel(with_samples(model.model, factor), model.effects)
     if isinstance(model, HashGridField):
         given = model.settings
-        finer = {"shortest_step": given.shortest_step / factor, "cone": given.cone / factor}
+        finer = {"min_step_size": given.min_step_size / factor, "cone_angle": given.cone_angle / factor}
         settings = replace(given, steps=max(1, round(given.steps * factor)), **finer)
         changed: HashGridField | VanillaNerf = HashGridField(settings, 0, model.backend)
     else:
@@ -52,7 +52,7 @@ def samples_of(model: RadianceModel) -> str:
     if isinstance(model, AppearanceModel):
         return samples_of(model.model)
     if isinstance(model, HashGridField):
-        step, bounded = model.drawn_lattice.step, f"{model.settings.steps} along the box's diagonal"
+        step, bounded = model.render_stepping.step_size, f"{model.settings.diagonal_steps} along the box's diagonal"
         return f"steps from {step:.4f}" if model.settings.contracted else bounded
     assert isinstance(model, VanillaNerf)
     return f"{model.settings.samples_coarse} + {model.settings.samples_fine}"
@@ -97,7 +97,7 @@ def main() -> None:
             with torch.no_grad():
                 seconds, score = measured(other, folders, downscale, given.photos)
             words = f"× {factor:g} ({samples_of(other.model)})"
-            record.add(samples=words, resolution=resolution_words(downscale), frame_seconds=seconds, psnr=score)
+            record.add(samples=words, resolution=resolution_name(downscale), frame_seconds=seconds, psnr=score)
 
 
 if __name__ == "__main__":

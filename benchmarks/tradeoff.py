@@ -18,9 +18,9 @@ from pipeline.engine.runner import Runner
 from pipeline.engine.settings import Settings
 from pipeline.engine.stage_list import needed_for
 from pipeline.engine.workspace import Workspace
+from stages.io.amounts import resolution_name
 from stages.io.files import read_json
 from stages.tradeoff import Config
-from stages.tradeoff.runs import resolution_words
 
 IMAGES = Path(__file__).parents[1] / "docs" / "images"
 
@@ -46,14 +46,14 @@ def main() -> None:
     for point in read_json(folder / "tradeoff.json")["points"]:
         record.add(
             field=point["variant"],
-            photos=resolution_words(point["downscale"]),
+            photos=resolution_name(point["downscale"]),
             **{key: point[key] for key in ("steps", "train_seconds", "frame_seconds")},
             memory=point["peak_memory_mb"] and f"{point['peak_memory_mb']:,.0f} MB",
             model=f"{point['model_mb']:.1f} MB",
-            psnr=point["psnr"] if point["deviation"] is None else [point["psnr"], point["deviation"]],
-            ssim=point["ssim"] if point["ssim_deviation"] is None else [point["ssim"], point["ssim_deviation"]],
+            psnr=point["psnr"] if point["psnr_std"] is None else [point["psnr"], point["psnr_std"]],
+            ssim=point["ssim"] if point["ssim_std"] is None else [point["ssim"], point["ssim_std"]],
             seeds=point["seeds"],
-            front=point["front"],
+            front=point["pareto_front"],
         )
     if given.out:
         for plot in folder.glob("*.png"):

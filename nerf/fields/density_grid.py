@@ -1,4 +1,4 @@
-"""A field's density on a regular, vertex-centred lattice, and what rays meet there.
+"""A field's density on a regular, vertex-centred grid, and what rays meet there.
 
 Naming: ``values[i, j, k]`` lies at ``low + (i, j, k) * spacing``; the first and last vertices lie on the box.
 ``t`` are ``samples`` distances along each unit ray, evenly spaced over the part of [near, far] inside the box.
@@ -17,7 +17,7 @@ from nerf.geometry.rays import Rays, clip_to_box, points_on
 from nerf.runtime.parallel import in_order
 
 
-class Lattice(NamedTuple):
+class DensityGrid(NamedTuple):
     """Values at the vertices of a box; ``low`` and ``high`` are its corners in the scene frame."""
 
     values: Float[Tensor, "nx ny nz"]
@@ -36,7 +36,7 @@ def sample_density_grid(
     high: Float[Tensor, "3"],
     chunk: int = 1 << 16,
     on_chunk: Callable[[float], None] = lambda done: None,
-) -> Lattice:
+) -> DensityGrid:
     """Sample the density with ``resolution`` vertices along the longest edge and nearly cubic voxels.
 
     Points go to the model in chunks of fixed size, so the result does not depend on threads; ``on_chunk`` hears
@@ -44,7 +44,7 @@ def sample_density_grid(
     """
     edges = high - low
     if resolution < 2 or not bool((edges > 0).all()):
-        raise ValueError(f"a lattice needs a box and two vertices per edge, got {edges.tolist()} and {resolution}")
+        raise ValueError(f"a grid needs a box and two vertices per edge, got {edges.tolist()} and {resolution}")
     counts = [max(2, round(float(edge / edges.max()) * (resolution - 1)) + 1) for edge in edges]
     axes = [torch.linspace(float(a), float(b), n, device=low.device) for a, b, n in zip(low, high, counts, strict=True)]
     total = math.prod(counts)
@@ -59,28 +59,28 @@ def sample_density_grid(
     for number, part in enumerate(in_order(density, range(0, total, chunk), low.device)):
         values[number * chunk : (number + 1) * chunk] = part
         on_chunk(min((number + 1) * chunk, total) / total)
-    return Lattice(values.reshape(counts), low, high)
+    return DensityGrid(values.reshape(counts), low, high)
 
 
-def occupancy(lattice: Lattice, level: float) -> Lattice:
+def occupancy(grid: DensityGrid, level: float) -> DensityGrid:
     """Map density to 1 - 2^(-density / level), which is 1/2 at ``level`` and stays within [0, 1].
 
     Density spans many decades, so linear interpolation of it puts every level set of a sharp surface within a
     sliver of the empty vertex; interpolating this bounded value puts it between the two.
     """
-    return lattice._replace(values=-torch.expm1(lattice.values * (-math.log(2) / level)))
+    return grid._replace(values=-torch.expm1(grid.values * (-math.log(2) / level)))
 
 
-def smoothed(lattice: Lattice, passes: int) -> Lattice:
+def smoothed(grid: DensityGrid, passes: int) -> DensityGrid:
     """Average every value with its neighbours along each axis, by 1/4, 1/2, 1/4; beyond the box all is as at its side.
 
     ``passes`` of it are a Gaussian of sqrt(passes / 2) vertices' distance. Values stay within their range, and the
     middle of a step where it is.
     """
-    values = lattice.values
+    values = grid.values
     for axis in passes * [0, 1, 2]:
         values = _averaged(values.transpose(0, axis)).transpose(0, axis)
-    return lattice._replace(values=values)
+    return grid._replace(values=values)
 
 
 def _averaged(values: Float[Tensor, "n _ _"]) -> Float[Tensor, "n _ _"]:
@@ -90,12 +90,12 @@ def _averaged(values: Float[Tensor, "n _ _"]) -> Float[Tensor, "n _ _"]:
     return result
 
 
-def trilinear(lattice: Lattice, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points"]:
+def trilinear(grid: DensityGrid, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points"]:
     """Interpolate inside the box; the value is zero beyond it."""
-    scaled = 2 * (points - lattice.low) / (lattice.high - lattice.low) - 1
-    grid = scaled.flip(-1).reshape(1, 1, 1, -1, 3)  # grid_sample's x runs along the last axis
-    volume = lattice.values[None, None]
-    sampled = torch.nn.functional.grid_sample(volume, grid, padding_mode="zeros", align_corners=True)
+    scaled = 2 * (points - grid.low) / (grid.high - grid.low) - 1
+    locations = scaled.flip(-1).reshape(1, 1, 1, -1, 3)  # grid_sample's x runs along the last axis
+    volume = grid.values[None, None]
+    sampled = torch.nn.functional.grid_sample(volume, locations, padding_mode="zeros", align_corners=True)
     return sampled.reshape(points.shape[:-1])
 
 
@@ -105,9 +105,9 @@ def ray_distances(rays: Rays, samples: int) -> Float[Tensor, "*rays samples"]:
     return rays.near[..., None] + (rays.far - rays.near)[..., None] * fraction
 
 
-def along(lattice: Lattice, rays: Rays, t: Float[Tensor, "*rays samples"]) -> Float[Tensor, "*rays samples"]:
-    """The lattice's values at distances ``t`` along the rays."""
-    return trilinear(lattice, points_on(rays, t))
+def along(grid: DensityGrid, rays: Rays, t: Float[Tensor, "*rays samples"]) -> Float[Tensor, "*rays samples"]:
+    """The grid's values at distances ``t`` along the rays."""
+    return trilinear(grid, points_on(rays, t))
 
 
 def optical_depth(
@@ -131,8 +131,8 @@ def first_crossing(
     return torch.where(above.any(-1, keepdim=True), t0 + (t1 - t0) * share, torch.inf).squeeze(-1)
 
 
-def median_depth(lattice: Lattice, rays: Rays, samples: int) -> Float[Tensor, "*rays"]:
-    """Distance at which half of the light is lost to the density lattice: the median depth; infinite if never."""
-    rays = clip_to_box(rays, lattice.low, lattice.high)
+def median_depth(grid: DensityGrid, rays: Rays, samples: int) -> Float[Tensor, "*rays"]:
+    """Distance at which half of the light is lost to the density grid: the median depth; infinite if never."""
+    rays = clip_to_box(rays, grid.low, grid.high)
     t = ray_distances(rays, samples)
-    return first_crossing(optical_depth(along(lattice, rays, t), t), t, math.log(2))
+    return first_crossing(optical_depth(along(grid, rays, t), t), t, math.log(2))

@@ -30,7 +30,7 @@ TOGETHER = 16  # photos that look at once, on all cores, at what is undecided; f
 _answers: MutableMapping[Tensor, dict[tuple[int, int], Tensor]] = WeakTensorKeyDictionary()
 
 
-def compute_frustum_mask(bank: RayDataset, least: int, cells: int) -> Bool[Tensor, "cache"]:
+def compute_frustum_mask(bank: RayDataset, least: int, cells: int) -> Bool[Tensor, "cells"]:
     """Which of ``cells``³ cells of folded space, in the order of ``nerf.kernels.torch.occupancy``, may hold something:
     those whose middles ``least`` photos of ``bank`` look at, or one, from where its foreground begins; and a coarse
     cell around them. What hides them, and masks, count for nothing. Found once for a bank; not to be written to."""
@@ -40,7 +40,7 @@ def compute_frustum_mask(bank: RayDataset, least: int, cells: int) -> Bool[Tenso
     return answers[least, cells]
 
 
-def _compute_frustum_mask(bank: RayDataset, least: int, cells: int) -> Bool[Tensor, "cache"]:
+def _compute_frustum_mask(bank: RayDataset, least: int, cells: int) -> Bool[Tensor, "cells"]:
     side, views = min(SIDE, cells), range(len(bank.near))
     middles = _middles(side, bank.device)
     undecided = torch.arange(side**3, device=bank.device)

@@ -1,8 +1,7 @@
-"""A radiance field of feature grids and two tiny networks (Müller et al. 2022), with empty space left out.
+"""The hash-grid field: a multiresolution hash grid and two tiny MLPs (Müller et al. 2022), with empty space skipped.
 
-The density cache plays the coarse network's part in the hierarchical NeRF: it places the samples. Its bits mark the
-cells that may hold something, rays are sampled in these alone, and the density found there decides how far along a
-ray colour is asked for at all.
+The occupancy grid plays the coarse network's part in the hierarchical NeRF: it places the samples. Rays are sampled in
+its occupied cells alone, and the density found there decides how far along a ray colours are evaluated at all.
 """
 
 import math
@@ -14,29 +13,34 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
 
-from nerf.fields import mlp as grid_mlp
+from nerf.fields import mlp
 from nerf.fields.background import background_backward, background_colour, directions_backward, initial_background
 from nerf.fields.interface import Rendering
 from nerf.fields.mlp import ColourPass, DensityPass, Weights
 from nerf.geometry.rays import Rays
-from nerf.kernels import BOX, Backend, GridLayout, Lattice, Occupied, Samples, grid_layout
+from nerf.kernels import BOX, Backend, BinaryOccupancy, GridLayout, RayStepping, Samples, grid_layout
 from nerf.kernels.torch.marching import unit_coordinates
-from nerf.kernels.torch.occupancy import cell_numbers, is_occupied, occupied
-from nerf.rendering.early_termination import EARLY_STOP_TRANSMITTANCE, Wave, march_with_early_termination
+from nerf.kernels.torch.occupancy import binary_occupancy, cell_numbers, is_occupied
+from nerf.rendering.early_termination import EARLY_STOP_TRANSMITTANCE, MarchingRound, march_with_early_termination
 from nerf.runtime.profiler import Work, part
 from nerf.runtime.randomness import generator
 
 INITIAL_FEATURE = 1e-4
 # Far beyond any use: no loop over them is endless, and indices stay within 32 bits.
-LARGEST = {"levels": 64, "features": 256, "log2_rows": 30, "finest": 2**20, "occupancy_resolution": 1024} | {
-    "steps": 10**6,
-    "most_samples": 10**6,
+MAX_SIZES = {
+    "num_levels": 64,
+    "features_per_level": 256,
+    "log2_hashmap_size": 30,
+    "max_res": 2**20,
+    "occupancy_resolution": 1024,
+    "diagonal_steps": 10**6,
+    "max_samples_per_ray": 10**6,
 }
-DRAWN_CLOSER = 1.5  # samples of a drawn ray for one in training (docs/experiments/ray_samples.md)
-# Optical thickness below which a sample of training stands for others like it (docs/experiments/ray_samples.md).
-THIN = 1e-2
-# Share of a ray's light that a picture may show in a neighbouring sample's colour (docs/experiments/colour_samples.md).
-QUANTUM = 1 / 512
+RENDER_SAMPLE_RATIO = 1.5  # samples of a rendered ray for one in training (docs/experiments/ray_samples.md)
+# Optical thickness below which training keeps a sample with a probability only (docs/experiments/ray_samples.md).
+THINNING_THRESHOLD = 1e-2
+# Opacity that takes the colour of a neighbouring sample when an image is rendered (docs/experiments/colour_samples.md)
+OPACITY_STEP = 1 / 512
 CORNERS = 8  # of a cell: rows that a point reads of each grid
 
 
@@ -44,62 +48,78 @@ CORNERS = 8  # of a cell: rows that a point reads of each grid
 class HashGridSettings:
     """Sizes of a grid field. Raises ValueError on impossible ones.
 
-    ``steps``: lattice steps along the diagonal of a bounded scene's box. ``shortest_step`` (scene units) and ``cone``
-    (step per distance) replace it where space is ``contracted``. Without ``view_dependence`` a point has one colour.
-    ``sky``: a colour for each direction lies behind everything (nerf/fields/background.py), whatever else is given as a
-    background.
+    ``diagonal_steps``: steps along the diagonal of a bounded scene's box. ``min_step_size`` (scene units) and
+    ``cone_angle`` (step per distance) replace it where space is ``contracted``. Without ``view_dependence`` a point has
+    one colour. ``background_model``: a colour for each direction lies behind everything (nerf/fields/background.py),
+    whatever else is given as a background.
     """
 
-    levels: int = 5
-    features: int = 4
-    log2_rows: int = 18
-    coarsest: int = 16
-    finest: int = 384
+    num_levels: int = 5
+    features_per_level: int = 4
+    log2_hashmap_size: int = 18
+    base_res: int = 16
+    max_res: int = 384
     contracted: bool = False
-    steps: int = 384
-    shortest_step: float = 0.002
-    cone: float = 0.008
-    most_samples: int = 1024
+    diagonal_steps: int = 384
+    min_step_size: float = 0.002
+    cone_angle: float = 0.008
+    max_samples_per_ray: int = 1024
     occupancy_resolution: int = 128
     view_dependence: bool = True
-    sky: bool = False
+    background_model: bool = False
 
     def __post_init__(self) -> None:
-        at_least = {"levels": 1, "features": 1, "log2_rows": 1, "coarsest": 1, "steps": 1, "most_samples": 1}
-        for name, least in (at_least | {"finest": self.coarsest, "occupancy_resolution": 4}).items():
-            if getattr(self, name) < least:
-                raise ValueError(f"{name} is {getattr(self, name)}; it must be at least {least}")
-        for name, most in LARGEST.items():
-            if getattr(self, name) > most:
-                raise ValueError(f"{name} is {getattr(self, name)}; it must be at most {most}")
+        at_least = {
+            "num_levels": 1,
+            "features_per_level": 1,
+            "log2_hashmap_size": 1,
+            "base_res": 1,
+            "diagonal_steps": 1,
+            "max_samples_per_ray": 1,
+        }
+        for name, minimum in (at_least | {"max_res": self.base_res, "occupancy_resolution": 4}).items():
+            if getattr(self, name) < minimum:
+                raise ValueError(f"{name} is {getattr(self, name)}; it must be at least {minimum}")
+        for name, maximum in MAX_SIZES.items():
+            if getattr(self, name) > maximum:
+                raise ValueError(f"{name} is {getattr(self, name)}; it must be at most {maximum}")
         if self.occupancy_resolution % 4:
             raise ValueError(f"occupancy_resolution is {self.occupancy_resolution}; it must be a multiple of 4")
-        if not (0 < self.shortest_step < math.inf and 0 < self.cone < math.inf):
-            raise ValueError(f"shortest_step ({self.shortest_step}) and cone ({self.cone}) must be positive numbers")
+        if not (0 < self.min_step_size < math.inf and 0 < self.cone_angle < math.inf):
+            raise ValueError(
+                f"min_step_size ({self.min_step_size}) and cone_angle ({self.cone_angle}) must be positive numbers"
+            )
 
     @property
     def layout(self) -> GridLayout:
         """Of the feature table."""
-        return grid_layout(self.levels, self.coarsest, self.finest, self.log2_rows, self.features)
+        return grid_layout(
+            self.num_levels, self.base_res, self.max_res, self.log2_hashmap_size, self.features_per_level
+        )
 
     @property
-    def lattice(self) -> Lattice:
+    def stepping(self) -> RayStepping:
         """Of the samples."""
         if self.contracted:
-            return Lattice(self.shortest_step, self.cone, True, self.occupancy_resolution, self.most_samples)
-        step = 2 * BOX * math.sqrt(3) / self.steps
-        return Lattice(step, 0.0, False, self.occupancy_resolution, self.most_samples)
+            return RayStepping(
+                self.min_step_size, self.cone_angle, True, self.occupancy_resolution, self.max_samples_per_ray
+            )
+        step = 2 * BOX * math.sqrt(3) / self.diagonal_steps
+        return RayStepping(step, 0.0, False, self.occupancy_resolution, self.max_samples_per_ray)
 
     @property
-    def drawn_lattice(self) -> Lattice:
-        """Of the samples of rays that are only drawn: ``DRAWN_CLOSER`` in folded space.
+    def render_stepping(self) -> RayStepping:
+        """Of the samples of rays that are rendered without training: RENDER_SAMPLE_RATIO times as many if contracted.
 
         Training jitters samples that stand a few finest cells apart, so that over many steps it meets what lies between
-        them; a drawing stands at fixed places, once, and would show the gaps as shells. In a box they are closer.
+        them; a rendering samples fixed places, once, and would show the gaps as shells. In a box samples are closer.
         """
-        lattice, closer = self.lattice, DRAWN_CLOSER if self.contracted else 1
-        step, cone, most = lattice.step / closer, lattice.cone / closer, math.ceil(closer * lattice.most_samples)
-        return lattice._replace(step=step, cone=cone, most_samples=most)
+        stepping, closer = self.stepping, RENDER_SAMPLE_RATIO if self.contracted else 1
+        return stepping._replace(
+            step_size=stepping.step_size / closer,
+            cone_angle=stepping.cone_angle / closer,
+            max_samples=math.ceil(closer * stepping.max_samples),
+        )
 
 
 class HashGridPass(NamedTuple):
@@ -138,35 +158,35 @@ class HashGridField(nn.Module):
     chunk_rays = 16384
 
     table: Tensor
-    bits: Tensor
-    clearance: Tensor
+    occupancy_bits: Tensor
+    empty_distance: Tensor
     density_hidden: Tensor
     density_out: Tensor
     colour_hidden: Tensor
     colour_out: Tensor
-    sky: Tensor
+    background_table: Tensor
 
     def __init__(self, settings: HashGridSettings, seed: int, backend: Backend) -> None:
         super().__init__()
         self.settings, self.backend = settings, backend
-        self.layout, self.lattice, self.drawn_lattice = settings.layout, settings.lattice, settings.drawn_lattice
+        self.layout, self.stepping, self.render_stepping = settings.layout, settings.stepping, settings.render_stepping
         random = generator("cpu", seed, 0)
-        shape = (self.layout.rows, settings.features)
+        shape = (self.layout.rows, settings.features_per_level)
         self.register_buffer("table", (2 * torch.rand(shape, generator=random) - 1) * INITIAL_FEATURE)
         self.of_directions, self.of_directions_backward = (
             (backend.spherical_harmonics, backend.spherical_harmonics_backward)
             if settings.view_dependence
-            else (grid_mlp.no_directions, grid_mlp.no_directions_backward)
+            else (mlp.no_directions, mlp.no_directions_backward)
         )
-        direction = grid_mlp.DIRECTION if settings.view_dependence else 0
-        for name, weight in grid_mlp.initial_weights(self.layout.width, direction, random)._asdict().items():
+        direction = mlp.DIRECTION if settings.view_dependence else 0
+        for name, weight in mlp.initial_weights(self.layout.width, direction, random)._asdict().items():
             self.register_buffer(name, weight)
-        if settings.sky:
-            self.register_buffer("sky", initial_background())
+        if settings.background_model:
+            self.register_buffer("background_table", initial_background())
         self.register_buffer(
-            "bits", torch.full((settings.occupancy_resolution**3 // 64,), -1)
+            "occupancy_bits", torch.full((settings.occupancy_resolution**3 // 64,), -1)
         )  # every cell may hold something
-        self.register_buffer("clearance", torch.zeros(settings.occupancy_resolution**3 // 64, dtype=torch.uint8))
+        self.register_buffer("empty_distance", torch.zeros(settings.occupancy_resolution**3 // 64, dtype=torch.uint8))
 
     def on_cpu(self) -> "HashGridField":
         """This field, or on a GPU its like in the CPU's memory."""
@@ -181,10 +201,10 @@ class HashGridField(nn.Module):
         """The networks."""
         return Weights(self.density_hidden, self.density_out, self.colour_hidden, self.colour_out)
 
-    def occupy(self, bits: Int64[Tensor, "bricks"]) -> None:
-        """From now on sample these cells alone (``nerf.kernels.torch.occupancy``)."""
-        self.bits.copy_(bits)
-        self.clearance.copy_(occupied(bits).clearance)
+    def set_occupancy(self, bits: Int64[Tensor, "bricks"]) -> None:
+        """From now on sample these cells alone; a bit each (``nerf.kernels.torch.occupancy``)."""
+        self.occupancy_bits.copy_(bits)
+        self.empty_distance.copy_(binary_occupancy(bits).empty_distance)
 
     def density(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points"]:
         """Density per scene unit; zero in cells that are not sampled, and outside the box of a bounded scene."""
@@ -203,15 +223,15 @@ class HashGridField(nn.Module):
         """What :meth:`density` says, and the colour seen by viewing rays of unit ``directions``."""
         unit, sampled = self._located(points)
         density = self._density_pass(unit.clamp(0, 1))
-        of_rays = grid_mlp.ray_hidden(self.weights, self.of_directions(directions.reshape(-1, 3).contiguous()))
+        of_rays = mlp.ray_hidden(self.weights, self.of_directions(directions.reshape(-1, 3).contiguous()))
         each = torch.arange(len(unit), dtype=torch.int32, device=unit.device)  # a ray of its own for every point
-        colour = grid_mlp.colour_of(self.weights, each, density.geometry, of_rays)
+        colour = mlp.colour_of(self.weights, each, density.geometry, of_rays)
         return torch.where(sampled, density.sigma, 0).view(points.shape[:-1]), colour.view(points.shape)
 
     def _located(self, points: Float[Tensor, "*points 3"]) -> tuple[Float[Tensor, "n 3"], Bool[Tensor, "n"]]:
         """Unit coordinates of points, and which of them lie in cells that are sampled and in a bounded scene's box."""
         unit = unit_coordinates(points, self.settings.contracted).reshape(-1, 3)
-        sampled = is_occupied(self.bits, cell_numbers(self.settings.occupancy_resolution, unit))
+        sampled = is_occupied(self.occupancy_bits, cell_numbers(self.settings.occupancy_resolution, unit))
         if not self.settings.contracted:
             sampled &= (points.reshape(-1, 3).abs() <= BOX).all(-1)
         return unit, sampled
@@ -220,25 +240,25 @@ class HashGridField(nn.Module):
     def render(self, rays: Rays, background: Float[Tensor, "3"]) -> Rendering:
         """Render without randomness: samples stand in the middle of their intervals.
 
-        From front to back in waves of a few samples per ray, so that little is computed behind what stops a ray's
-        light, and of each wave only the colours that stand for all (``nerf.kernels.torch.colour_sampling``). What is
-        stopped behind the last of them on a ray, less than a quantum, has the colour of the rest.
+        Rays are marched in rounds of a few samples, so that little is computed behind opaque surfaces. Of each round
+        only selected samples have their colour evaluated (``nerf.kernels.torch.colour_sampling``); the opacity behind
+        the last of them on a ray, less than OPACITY_STEP, takes the colour of the rest.
         """
         rays, backend = rays.each(Tensor.contiguous), self.backend
-        seen, shown = rays.far.new_zeros(len(rays.far), 4), torch.zeros_like(rays.far)
+        rendered, accumulated = rays.far.new_zeros(len(rays.far), 4), torch.zeros_like(rays.far)
         depth = torch.zeros_like(rays.far, dtype=torch.float64)
-        of_rays = grid_mlp.ray_hidden(self.weights, self.of_directions(rays.directions))
-        for wave in self._waves(rays, torch.full_like(rays.near, 0.5), self.drawn_lattice):
+        of_rays = mlp.ray_hidden(self.weights, self.of_directions(rays.directions))
+        for samples, _, density in self._march(rays, torch.full_like(rays.near, 0.5), self.render_stepping):
             with part("composite"):
-                drawn = backend.select_colour_samples(wave.samples, wave.density.sigma, QUANTUM, depth, shown)
-                geometry = wave.density.geometry.index_select(0, drawn.rows)
-            colour = grid_mlp.colour_of(self.weights, drawn.samples.ray, geometry, of_rays)
+                selected = backend.select_colour_samples(samples, density.sigma, OPACITY_STEP, depth, accumulated)
+                geometry = density.geometry.index_select(0, selected.rows)
+            colour = mlp.colour_of(self.weights, selected.samples.ray, geometry, of_rays)
             with part("composite"):
-                backend.accumulate_colours(drawn, colour, seen)
-        light, opacity = (each.to(seen.dtype) for each in (torch.exp(-depth), -torch.expm1(-depth)))
-        seen *= torch.where(shown == 0, 1, opacity / shown)[:, None]
-        behind = self._behind(rays, background)
-        return Rendering(seen[:, :3] + light[:, None] * behind, seen[:, 3] + light * rays.far, opacity)
+                backend.accumulate_colours(selected, colour, rendered)
+        transmittance, opacity = (each.to(rendered.dtype) for each in (torch.exp(-depth), -torch.expm1(-depth)))
+        rendered *= torch.where(accumulated == 0, 1, opacity / accumulated)[:, None]
+        colour = rendered[:, :3] + transmittance[:, None] * self._behind(rays, background)
+        return Rendering(colour, rendered[:, 3] + transmittance * rays.far, opacity)
 
     def forward(
         self,
@@ -251,20 +271,22 @@ class HashGridField(nn.Module):
         like them (``Backend.visible_samples``, which ``offset`` is for)."""
         backend, rays = self.backend, rays.each(Tensor.contiguous)
         background = self._behind(rays, background)
-        waves = list(self._waves(rays, jitter, self.lattice))
+        rounds = list(self._march(rays, jitter, self.stepping))
         with part("march"):
-            marched, order = backend.pack_rounds([wave.samples for wave in waves])
-            sigma = torch.cat([wave.density.sigma for wave in waves]).index_select(0, order)
-            samples, seen = backend.visible_samples(marched, sigma, EARLY_STOP_TRANSMITTANCE, THIN, offset)
+            marched, order = backend.pack_rounds([each.samples for each in rounds])
+            sigma = torch.cat([each.density.sigma for each in rounds]).index_select(0, order)
+            samples, seen = backend.visible_samples(
+                marched, sigma, EARLY_STOP_TRANSMITTANCE, THINNING_THRESHOLD, offset
+            )
             rows = order.index_select(0, seen)
-            points = torch.cat([wave.points for wave in waves]).index_select(0, rows)
-            of_waves = zip(*(wave.density for wave in waves), strict=True)
-            density = DensityPass(*(torch.cat(parts).index_select(0, rows) for parts in of_waves))
+            points = torch.cat([each.points for each in rounds]).index_select(0, rows)
+            of_rounds = zip(*(each.density for each in rounds), strict=True)
+            density = DensityPass(*(torch.cat(parts).index_select(0, rows) for parts in of_rounds))
             thickness = density.sigma * marched.dt.index_select(0, seen)
         with part("encode"):
             harmonics = self.of_directions(rays.directions)
-            of_rays = grid_mlp.ray_hidden(self.weights, harmonics)
-        colour = grid_mlp.colour_forward(self.weights, backend, samples, density.geometry, of_rays)
+            of_rays = mlp.ray_hidden(self.weights, harmonics)
+        colour = mlp.colour_forward(self.weights, backend, samples, density.geometry, of_rays)
         with part("composite"):
             rendering, weights = backend.composite(samples, density.sigma, colour.colour, background, rays.far)
         of_samples = samples, points, thickness, density
@@ -278,8 +300,8 @@ class HashGridField(nn.Module):
         grad_sigma, grad_colour = backend.composite_backward(
             done.samples, density.sigma, colour.colour, done.background, done.rays.far, grad, grad_weights
         )
-        of_colour = grid_mlp.colour_backward(self.weights, backend, done.samples, colour, done.harmonics, grad_colour)
-        of_density = grid_mlp.density_backward(self.weights, backend, density, grad_sigma, of_colour.geometry)
+        of_colour = mlp.colour_backward(self.weights, backend, done.samples, colour, done.harmonics, grad_colour)
+        of_density = mlp.density_backward(self.weights, backend, density, grad_sigma, of_colour.geometry)
         weights = Weights(of_density.density_hidden, of_density.density_out, *of_colour[:2])
         of_background = (1 - done.rendering.opacity)[:, None] * grad.colour
         return HashGridGradients(weights, of_density.features, of_colour.harmonics, of_background)
@@ -294,25 +316,34 @@ class HashGridField(nn.Module):
             rays, samples, self.settings.contracted, grad_points
         )
         grad_directions = grad_directions + self.of_directions_backward(rays.directions, gradients.harmonics)
-        if self.settings.sky:
+        if self.settings.background_model:
             grad_directions += directions_backward(
-                backend, self.sky, rays.directions, done.background, gradients.background
+                backend, self.background_table, rays.directions, done.background, gradients.background
             )
         return grad_origins, grad_directions
 
     def background_backward(self, done: HashGridPass, gradients: HashGridGradients) -> Float[Tensor, "rows 4"]:
-        """Gradient of the sky, for a field that has one."""
+        """Gradient of the background table, for a field that has one."""
         return background_backward(self.backend, done.rays.directions, done.background, gradients.background)
 
     def _behind(self, rays: Rays, background: Float[Tensor, "*#rays 3"]) -> Float[Tensor, "*#rays 3"]:
-        return background_colour(self.backend, self.sky, rays.directions) if self.settings.sky else background
+        return (
+            background_colour(self.backend, self.background_table, rays.directions)
+            if self.settings.background_model
+            else background
+        )
 
-    def _waves(self, rays: Rays, jitter: Float[Tensor, "rays"], lattice: Lattice) -> Iterator[Wave]:
+    def _march(self, rays: Rays, jitter: Float[Tensor, "rays"], stepping: RayStepping) -> Iterator[MarchingRound]:
         return march_with_early_termination(
-            self.backend, Occupied(self.bits, self.clearance), lattice, self._density_pass, rays, jitter
+            self.backend,
+            BinaryOccupancy(self.occupancy_bits, self.empty_distance),
+            stepping,
+            self._density_pass,
+            rays,
+            jitter,
         )
 
     def _density_pass(self, unit: Float[Tensor, "points 3"]) -> DensityPass:
         with part("gather", Work(rows=CORNERS * len(self.layout.resolutions) * len(unit))):
             features = self.backend.encode(self.layout, self.table, unit)
-        return grid_mlp.density_forward(self.weights, features)
+        return mlp.density_forward(self.weights, features)

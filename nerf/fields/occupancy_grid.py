@@ -1,7 +1,7 @@
-"""Keeps the density cache of a grid field up to date: a slow memory of how much light a step in each cell stops.
+"""The occupancy grid of a hash-grid field (Müller et al. 2022, section 5.2): which cells may hold something.
 
-A cell holds the largest optical thickness of one lattice step seen lately: it is measured again now and then, what it
-held fading meanwhile, and raised at once where training finds more.
+A cell holds an exponential moving maximum of the optical thickness that one step of a ray has in it: measured again at
+regular intervals, decaying meanwhile, and raised at once where a training sample finds more.
 """
 
 import torch
@@ -14,70 +14,75 @@ from nerf.kernels import CONTRACTED_BOX
 from nerf.kernels.torch.occupancy import BRICK_CELLS
 from nerf.runtime.parallel import in_order
 
-EVERY, FADE = 16, 0.7  # steps between two measurements, and what of a cell's thickness outlives its own
-YOUNG_STEPS = 256  # a young field changes everywhere: all cells are measured each time,
-PARTS = 4  # later a part of them in turn
-THIN = 0.01  # a cell as thin as this, or as the mean cell, counts as empty
-CHUNK = 1 << 14  # points measured at once
+UPDATE_INTERVAL = 16  # steps between two updates
+EMA_DECAY = 0.7  # of a cell's optical thickness, at each measurement
+WARMUP_STEPS = 256  # an untrained field changes everywhere: all cells are measured at each update,
+UPDATE_FRACTIONS = 4  # later a quarter of them in turn
+OCCUPANCY_THRESHOLD = 0.01  # a cell of no more optical thickness than this, or than the mean cell, counts as empty
+CHUNK_POINTS = 1 << 14  # measured at once
 BLOCK_SIDE, BRICK_BLOCKS = 2, 8  # cells are measured in blocks of 2³: 8 of them in a brick
 
 
 class OccupancyGrid:
-    """The thickness of every cell, in the order of the field's ``bits``, which follow from it. Cells that are not
-    ``usable`` stay empty; None: all are."""
+    """The optical thickness of every cell, in the order of the field's ``occupancy_bits``, which follow from it. Cells
+    outside ``mask`` stay empty; None: there are none."""
 
-    def __init__(self, field: HashGridField, usable: Bool[Tensor, "cache"] | None = None) -> None:
-        self.field, self.unusable = field, None if usable is None else ~usable
-        self.thickness = torch.zeros(field.settings.occupancy_resolution**3, device=field.table.device)
+    def __init__(self, field: HashGridField, mask: Bool[Tensor, "cells"] | None = None) -> None:
+        self.field, self.masked_out = field, None if mask is None else ~mask
+        self.optical_thickness = torch.zeros(field.settings.occupancy_resolution**3, device=field.table.device)
         self.corners, self.block_of_cell = _blocks(field)
-        self.usable_count = len(self.thickness) if usable is None else max(1, int(usable.sum()))
-        if usable is not None:
-            field.occupy(field.backend.occupancy_bits(usable.float(), 0.5))
+        self.cell_count = len(self.optical_thickness) if mask is None else max(1, int(mask.sum()))
+        if mask is not None:
+            field.set_occupancy(field.backend.occupancy_bits(mask.float(), 0.5))
 
-    def raise_to(self, unit: Float[Tensor, "points 3"], thickness: Float[Tensor, "points"]) -> None:
-        """Take note of what training has found at some points, in unit coordinates."""
-        self.field.backend.scatter_max(self.field.lattice.cells, self.thickness, unit, thickness)
+    def raise_to(self, unit: Float[Tensor, "points 3"], optical_thickness: Float[Tensor, "points"]) -> None:
+        """Raise the cells of training samples, given in unit coordinates, to their optical thickness."""
+        self.field.backend.scatter_max(
+            self.field.stepping.occupancy_resolution, self.optical_thickness, unit, optical_thickness
+        )
 
-    def refresh(self, step: int, random: torch.Generator) -> None:
+    def update(self, step: int, random: torch.Generator) -> None:
         """Measure what is due at the end of step number ``step``; if something is, set the field's bits anew."""
-        turn, early = divmod(step + 1, EVERY)
+        turn, early = divmod(step + 1, UPDATE_INTERVAL)
         if early:
             return
-        parts = 1 if step < YOUNG_STEPS else PARTS
+        parts = 1 if step < WARMUP_STEPS else UPDATE_FRACTIONS
         self._measure_part(turn % parts, parts, random)
-        if self.unusable is not None:
-            self.thickness.masked_fill_(self.unusable, 0)
-        self.field.occupy(self.field.backend.occupancy_bits(self.thickness, min(THIN, self._mean())))
+        if self.masked_out is not None:
+            self.optical_thickness.masked_fill_(self.masked_out, 0)
+        self.field.set_occupancy(
+            self.field.backend.occupancy_bits(self.optical_thickness, min(OCCUPANCY_THRESHOLD, self._mean()))
+        )
 
     def _mean(self) -> float:
-        """Of the usable cells; summed in rows, so that no result depends on how many threads share the work."""
-        rows = self.thickness.view(-1, self.field.settings.occupancy_resolution)
-        return float(rows.sum(-1).double().sum()) / self.usable_count
+        """Of the cells in the mask; summed in rows, so that no result depends on how many threads share the work."""
+        rows = self.optical_thickness.view(-1, self.field.settings.occupancy_resolution)
+        return float(rows.sum(-1).double().sum()) / self.cell_count
 
     def _measure_part(self, part: int, parts: int, random: torch.Generator) -> None:
         """Measure every ``parts``-th brick, beginning with number ``part``: each block at a random point of it."""
         corners = self.corners[part::parts].flatten(0, 1)
         side = BLOCK_SIDE / self.field.settings.occupancy_resolution
         points = corners + side * torch.rand(corners.shape, generator=random, device=corners.device)
-        measured = torch.cat(list(in_order(self._measure, points.split(CHUNK), points.device)))
+        measured = torch.cat(list(in_order(self._measure, points.split(CHUNK_POINTS), points.device)))
         of_cells = measured.view(-1, BRICK_BLOCKS).index_select(1, self.block_of_cell)
-        thickness = self.thickness.view(-1, BRICK_CELLS)[part::parts]
-        torch.maximum(thickness.mul_(FADE), of_cells, out=thickness)
+        optical_thickness = self.optical_thickness.view(-1, BRICK_CELLS)[part::parts]
+        torch.maximum(optical_thickness.mul_(EMA_DECAY), of_cells, out=optical_thickness)
 
     def _measure(self, unit: Float[Tensor, "points 3"]) -> Float[Tensor, "points"]:
         return self.field.unit_density(unit) * self._step_length(unit)
 
     def _step_length(self, unit: Float[Tensor, "points 3"]) -> Float[Tensor, "points"] | float:
-        """The lattice's step at points, as seen from a camera near the origin.
+        """The step size at points, as seen from a camera near the origin.
 
         The outermost cells reach to infinity; their points count as half a cell within.
         """
-        lattice = self.field.lattice
-        if not lattice.cone:
-            return lattice.step
-        margin = 0.5 / lattice.cells
+        stepping = self.field.stepping
+        if not stepping.cone_angle:
+            return stepping.step_size
+        margin = 0.5 / stepping.occupancy_resolution
         within = 2 * CONTRACTED_BOX * (unit.clamp(margin, 1 - margin) - 0.5)
-        return (lattice.cone * uncontract(within).norm(dim=-1)).clamp(min=lattice.step)
+        return (stepping.cone_angle * uncontract(within).norm(dim=-1)).clamp(min=stepping.step_size)
 
 
 def _blocks(field: HashGridField) -> tuple[Float[Tensor, "bricks blocks 3"], Int[Tensor, "cells"]]:

@@ -1,18 +1,18 @@
-"""The hot loops of the grid field: arrays in, arrays out, written more than once and tested against each other.
+"""The hot loops of the hash-grid field: arrays in, arrays out, written more than once and tested against each other.
 
 A backend is a module with the functions of :class:`Backend`. ``nerf.kernels.torch`` is the specification: plain
 torch, any device, float32 or float64. The contract:
 
 * Tensors are contiguous, all on one device. Values are float32 (the reference takes float64 as well), optical depths
-  float64, indices int32, bits int64, clearances uint8. Backends read their arguments without copying and neither keep
-  nor change them, except those that a docstring says are changed *in place*. What a function returns belongs to the
-  caller.
+  float64, indices int32, bits int64, empty distances uint8. Backends read their arguments without copying and neither
+  keep nor change them, except those that a docstring says are changed *in place*. What a function returns belongs to
+  the caller.
 * Nothing is differentiated by autograd: what has a ``_backward`` takes the gradient of a scalar loss with respect to
   the results and returns, or adds to, the one with respect to the arguments. Sample distances carry no gradient.
 * Samples are *packed*: those of ray r are the entries starts[r] ... starts[r + 1] - 1, front to back. A ray may have
   none.
-* Points given to a grid or to the density cache are in *unit coordinates*: [0, 1]^3 is the cube [-0.9, 0.9]^3 of a
-  bounded scene, or all of space folded into [-2, 2]^3 (nerf/geometry/contraction.py).
+* Points given to the hash grid or the occupancy grid are in *unit coordinates*: [0, 1]^3 is the cube [-0.9, 0.9]^3 of a
+  bounded scene, or the contracted space [-2, 2]^3 (nerf/geometry/contraction.py).
 * No function draws random numbers; no function fails on zero rays or zero samples.
 """
 
@@ -29,7 +29,7 @@ from nerf.geometry.rays import Rays
 
 BOX = REGION_HALF  # half the side of the cube that a bounded scene fills
 ALIGNED_ROWS = 4  # of four features: a cache line, and a whole number of vectors for Adam
-CONTRACTED_BOX = 2.0  # half the side of the cube into which contraction folds space
+CONTRACTED_BOX = 2.0  # half the side of the contracted space
 
 
 class GridLayout(NamedTuple):
@@ -65,54 +65,54 @@ class GridLayout(NamedTuple):
         return self.level_rows(level) < (self.resolutions[level] + 1) ** 3
 
 
-def grid_layout(levels: int, coarsest: int, finest: int, log2_rows: int, features: int) -> GridLayout:
-    """Levels growing geometrically from ``coarsest`` to ``finest`` cells (Müller et al. 2022, eq. 2), one alone of
-    ``finest``, none with more than 2^log2_rows rows."""
-    first = coarsest if levels > 1 else finest
-    growth = (finest / first) ** (1 / max(1, levels - 1))
-    resolutions = tuple(round(first * growth**level) for level in range(levels))
+def grid_layout(
+    num_levels: int, base_res: int, max_res: int, log2_hashmap_size: int, features_per_level: int
+) -> GridLayout:
+    """Levels growing geometrically from ``base_res`` to ``max_res`` cells (Müller et al. 2022, eq. 2), a single one of
+    ``max_res``, none with more than 2^log2_hashmap_size rows."""
+    first = base_res if num_levels > 1 else max_res
+    growth = (max_res / first) ** (1 / max(1, num_levels - 1))
+    resolutions = tuple(round(first * growth**level) for level in range(num_levels))
     first_rows = [0]
     for resolution in resolutions:
         vertices = -(-((resolution + 1) ** 3) // ALIGNED_ROWS) * ALIGNED_ROWS
-        first_rows.append(first_rows[-1] + min(vertices, 1 << log2_rows))
-    return GridLayout(resolutions, tuple(first_rows), features)
+        first_rows.append(first_rows[-1] + min(vertices, 1 << log2_hashmap_size))
+    return GridLayout(resolutions, tuple(first_rows), features_per_level)
 
 
-class Lattice(NamedTuple):
-    """Where samples may stand on a ray: at distances t(s_near + k + jitter), k = 0, 1, ...
+class RayStepping(NamedTuple):
+    """Where samples stand on a ray: at distances t(s_near + k + jitter), k = 0, 1, ...
 
-    A step is ``step`` long up to t = step / cone, from there on it is the share ``cone`` of the distance (always
-    ``step`` long if ``cone`` is 0): with dt/ds = max(step, cone t),
+    With d the ``step_size`` and c the ``cone_angle``, a step is max(d, c t) long (Müller et al. 2022, appendix E.1):
 
-        t(s) = step s                         for cone s <= 1
-        t(s) = step / cone exp(cone s - 1)    beyond
+        t(s) = d s                      for c s <= 1
+        t(s) = d / c exp(c s - 1)       beyond
 
     and s_near = s(max(near, entry into the box)). Sample k stands for the interval from t(s_near + k) to
     t(s_near + k + 1), the last of which ends at far.
 
-    ``contracted``: space is folded; otherwise rays are cut to the box. ``cells``: of the density cache, per axis, a
-    multiple of 4. ``most_samples``: per ray; what lies behind them is not sampled.
+    ``contracted``: the scene is contracted; otherwise rays are cut to the box. ``occupancy_resolution``: cells of the
+    occupancy grid along an axis, a multiple of 4. ``max_samples``: per ray; what lies behind them is not sampled.
     """
 
-    step: float
-    cone: float
+    step_size: float
+    cone_angle: float
     contracted: bool
-    cells: int
-    most_samples: int
+    occupancy_resolution: int
+    max_samples: int
 
     @property
     def linear_until(self) -> float:
         """The distance from which steps grow."""
-        return self.step / self.cone if self.cone else math.inf
+        return self.step_size / self.cone_angle if self.cone_angle else math.inf
 
 
-class Occupied(NamedTuple):
-    """Where the density cache says that there may be something, and how far around each brick it says that there is
-    nothing (``nerf.kernels.torch.occupancy``): what is known to be empty may be skipped, and no more follows from
-    it."""
+class BinaryOccupancy(NamedTuple):
+    """Which cells of the occupancy grid are occupied, a bit each, and how far each brick is from the nearest occupied
+    one (``nerf.kernels.torch.occupancy``)."""
 
     bits: Int64[Tensor, "bricks"]
-    clearance: UInt8[Tensor, "bricks"]
+    empty_distance: UInt8[Tensor, "bricks"]
 
 
 class Samples(NamedTuple):
@@ -124,9 +124,9 @@ class Samples(NamedTuple):
     dt: Float[Tensor, "samples"]
 
 
-class Drawn(NamedTuple):
-    """Samples whose colours stand for all (``nerf.kernels.torch.colour_sampling``): packed, their rows among all, their
-    weights."""
+class ColourSamples(NamedTuple):
+    """The samples whose colours are evaluated (``nerf.kernels.torch.colour_sampling``), packed, with their rows among
+    all samples and the opacity that each stands for."""
 
     samples: Samples
     rows: Int32[Tensor, "kept"]
@@ -137,7 +137,9 @@ class Drawn(NamedTuple):
 class Backend(Protocol):
     """The functions of a backend module; their docstrings are in ``nerf.kernels.torch``."""
 
-    def march(self, occupied: Occupied, lattice: Lattice, rays: Rays, jitter: Float[Tensor, "rays"]) -> Samples: ...
+    def march(
+        self, occupied: BinaryOccupancy, stepping: RayStepping, rays: Rays, jitter: Float[Tensor, "rays"]
+    ) -> Samples: ...
 
     def sample_points(self, rays: Rays, samples: Samples, contracted: bool) -> Float[Tensor, "samples 3"]: ...
 
@@ -184,7 +186,7 @@ class Backend(Protocol):
 
     def finish_round(
         self,
-        lattice: Lattice,
+        stepping: RayStepping,
         samples: Samples,
         sigma: Float[Tensor, "samples"],
         threshold: float,
@@ -194,7 +196,7 @@ class Backend(Protocol):
         near: Float[Tensor, "rays"],
     ) -> None: ...
 
-    def pack_rounds(self, waves: Sequence[Samples]) -> tuple[Samples, Int32[Tensor, "samples"]]: ...
+    def pack_rounds(self, rounds: Sequence[Samples]) -> tuple[Samples, Int32[Tensor, "samples"]]: ...
 
     def visible_samples(
         self,
@@ -229,21 +231,21 @@ class Backend(Protocol):
         self,
         samples: Samples,
         sigma: Float[Tensor, "samples"],
-        quantum: float,
+        opacity_step: float,
         depth: Float64[Tensor, "rays"],
-        shown: Float[Tensor, "rays"],
-    ) -> Drawn: ...
+        accumulated: Float[Tensor, "rays"],
+    ) -> ColourSamples: ...
 
     def accumulate_colours(
-        self, drawn: Drawn, colour: Float[Tensor, "kept 3"], seen: Float[Tensor, "rays 4"]
+        self, selected: ColourSamples, colour: Float[Tensor, "kept 3"], rendered: Float[Tensor, "rays 4"]
     ) -> None: ...
 
     def distortion(
-        self, samples: Samples, weights: Float[Tensor, "samples"], lattice: Lattice
+        self, samples: Samples, weights: Float[Tensor, "samples"], stepping: RayStepping
     ) -> Float[Tensor, "rays"]: ...
 
     def distortion_backward(
-        self, samples: Samples, weights: Float[Tensor, "samples"], lattice: Lattice, grad: Float[Tensor, "rays"]
+        self, samples: Samples, weights: Float[Tensor, "samples"], stepping: RayStepping, grad: Float[Tensor, "rays"]
     ) -> Float[Tensor, "samples"]: ...
 
     def depth_loss(
@@ -253,7 +255,7 @@ class Backend(Protocol):
         opacity: Float[Tensor, "rays"],
         far: Float[Tensor, "rays"],
         distance: Float[Tensor, "rays"],
-        lattice: Lattice,
+        stepping: RayStepping,
     ) -> Float[Tensor, "rays"]: ...
 
     def depth_loss_backward(
@@ -261,7 +263,7 @@ class Backend(Protocol):
         samples: Samples,
         far: Float[Tensor, "rays"],
         distance: Float[Tensor, "rays"],
-        lattice: Lattice,
+        stepping: RayStepping,
         grad: Float[Tensor, "rays"],
     ) -> tuple[Float[Tensor, "samples"], Float[Tensor, "rays"]]: ...
 
@@ -269,20 +271,22 @@ class Backend(Protocol):
         self,
         parameter: Float[Tensor, "*shape"],
         gradient: Float[Tensor, "*shape"],
-        mean: Float[Tensor, "*shape"],
-        square: Float[Tensor, "*shape"],
-        rate: float,
-        count: int,
+        exp_avg: Float[Tensor, "*shape"],
+        exp_avg_sq: Float[Tensor, "*shape"],
+        learning_rate: float,
+        step: int,
     ) -> None: ...
 
     def scatter_max(
         self,
         cells: int,
-        thickness: Float[Tensor, "cache"],
+        optical_thickness: Float[Tensor, "cells"],
         points: Float[Tensor, "points 3"],
         values: Float[Tensor, "points"],
     ) -> None: ...
 
-    def occupancy_bits(self, thickness: Float[Tensor, "cache"], threshold: float) -> Int64[Tensor, "bricks"]: ...
+    def occupancy_bits(
+        self, optical_thickness: Float[Tensor, "cells"], threshold: float
+    ) -> Int64[Tensor, "bricks"]: ...
 
     def cell_corners(self, cells: int, numbers: Int[Tensor, "chosen"]) -> Float[Tensor, "chosen 3"]: ...

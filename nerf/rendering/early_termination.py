@@ -1,7 +1,7 @@
-"""The samples of rays, taken from front to back in waves of a few per ray.
+"""Ray marching with early termination: samples are taken from front to back in rounds of a few per ray.
 
-Behind what stops a ray's light nothing needs to be computed, but where that is only the densities can tell. So each
-wave asks for those of the next samples of all rays that still have light.
+Nothing behind an opaque surface needs to be computed, but only the densities tell where that is. So each round computes
+those of the next samples of all rays that are not yet opaque.
 """
 
 from collections.abc import Callable, Iterator
@@ -13,18 +13,18 @@ from torch import Tensor
 
 from nerf.fields.mlp import DensityPass
 from nerf.geometry.rays import Rays
-from nerf.kernels import Backend, Lattice, Occupied, Samples
+from nerf.kernels import Backend, BinaryOccupancy, RayStepping, Samples
 from nerf.runtime.profiler import part
 
-EARLY_STOP_TRANSMITTANCE = 1e-3  # transmittance below which the rest of a ray is left out
+EARLY_STOP_TRANSMITTANCE = 1e-3  # below it the rest of a ray is left out
 # Samples whose densities are computed at once, in all, and per ray (docs/experiments/early_termination.md). A GPU waits
-# for the host after each wave, and works on a million samples as long as on a few.
-WAVE = {"cpu": 1 << 14, "cuda": 1 << 20}
-SHORTEST_WAVE, LONGEST_WAVE = 6, 64
+# for the host after each round, and works on a million samples as long as on a few.
+ROUND_SAMPLES = {"cpu": 1 << 14, "cuda": 1 << 20}
+MIN_ROUND_SAMPLES_PER_RAY, MAX_ROUND_SAMPLES_PER_RAY = 6, 64
 
 
-class Wave(NamedTuple):
-    """Some samples of all rays; of those whose light is used up there are none."""
+class MarchingRound(NamedTuple):
+    """The next samples of all rays; a ray that has ended has none."""
 
     samples: Samples
     points: Float[Tensor, "samples 3"]
@@ -33,35 +33,35 @@ class Wave(NamedTuple):
 
 def march_with_early_termination(
     backend: Backend,
-    occupied: Occupied,
-    lattice: Lattice,
+    occupancy: BinaryOccupancy,
+    stepping: RayStepping,
     density_at: Callable[[Float[Tensor, "points 3"]], DensityPass],
     rays: Rays,
     jitter: Float[Tensor, "rays"],
-) -> Iterator[Wave]:
-    """The samples in occupied cells that rays with light left meet, ``lattice.most_samples`` per ray at most, in one
-    wave or more; there must be rays.
+) -> Iterator[MarchingRound]:
+    """The samples of rays in occupied cells up to where their transmittance falls below EARLY_STOP_TRANSMITTANCE,
+    ``stepping.max_samples`` per ray at most, in one round or more. There must be rays.
 
-    Their places are those of :meth:`Backend.march`: the next wave goes on along the lattice where the last has ended.
-    ``density_at`` answers for points in unit coordinates.
+    Samples stand where :meth:`Backend.march` puts them: each round goes on where the last has ended. ``density_at``
+    takes points in unit coordinates.
     """
-    going_on, near = len(jitter), rays.near.clone()
+    active_rays, near = len(jitter), rays.near.clone()
     depth, taken = torch.zeros_like(jitter, dtype=torch.float64), 0
-    while going_on and taken < lattice.most_samples:
-        length = _wave_length(going_on, jitter.device)
-        of_wave = lattice._replace(most_samples=min(length, lattice.most_samples - taken))
+    while active_rays and taken < stepping.max_samples:
+        length = _samples_per_ray(active_rays, jitter.device)
+        this_round = stepping._replace(max_samples=min(length, stepping.max_samples - taken))
         with part("march"):
-            samples = backend.march(occupied, of_wave, rays._replace(near=near), jitter)
-            points = backend.sample_points(rays, samples, lattice.contracted)
+            samples = backend.march(occupancy, this_round, rays._replace(near=near), jitter)
+            points = backend.sample_points(rays, samples, stepping.contracted)
         density = density_at(points)
-        yield Wave(samples, points, density)
+        yield MarchingRound(samples, points, density)
         with part("march"):
             backend.finish_round(
-                of_wave, samples, density.sigma, EARLY_STOP_TRANSMITTANCE, jitter, rays.far, depth, near
+                this_round, samples, density.sigma, EARLY_STOP_TRANSMITTANCE, jitter, rays.far, depth, near
             )
-            taken, going_on = taken + of_wave.most_samples, int((near < rays.far).sum())
+            taken, active_rays = taken + this_round.max_samples, int((near < rays.far).sum())
 
 
-def _wave_length(rays: int, device: torch.device) -> int:
-    """Samples per ray: few while there are many rays, so that little lies behind what stops their light."""
-    return min(max(WAVE[device.type] // rays, SHORTEST_WAVE), LONGEST_WAVE)
+def _samples_per_ray(rays: int, device: torch.device) -> int:
+    """Few while there are many rays, so that little is computed behind opaque surfaces."""
+    return min(max(ROUND_SAMPLES[device.type] // rays, MIN_ROUND_SAMPLES_PER_RAY), MAX_ROUND_SAMPLES_PER_RAY)

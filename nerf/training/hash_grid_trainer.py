@@ -11,9 +11,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from nerf.effects import NO_EFFECTS, Effect, ImageEffects, RayGradients, RenderedRays, parameters_of
-from nerf.fields import mlp as grid_mlp
-from nerf.fields.background import PRIOR as SKY_PRIOR
-from nerf.fields.background import RATE as SKY_RATE
+from nerf.fields import mlp
+from nerf.fields.background import BACKGROUND_LR_SCALE, BACKGROUND_PRIOR
 from nerf.fields.frustum_mask import compute_frustum_mask
 from nerf.fields.hash_grid import CORNERS, HashGridField, HashGridPass
 from nerf.fields.interface import Rendering
@@ -55,13 +54,16 @@ MEMORY = 0.9  # how much of the mean of samples per ray remains after each step
 
 @dataclass(frozen=True)
 class HashGridTrainerSettings:
-    """How to train. ``samples``: colours to compute in a step; its rays are as many as are expected to need them.
-    ``chunks``: equal parts of a step, each computed on a core; results depend on their number, not on that of the
-    cores. ``background`` is what lies behind a scene without a sky: a colour, or another random one for each ray (only
-    for photos with alpha, where it shows the field which space is empty). ``distortion``: full weight of the distortion
-    loss, for scenes without a known background. ``depth_loss``: its weight at first, at the pixels whose distance the
-    bank knows. ``least_photos``: that must look into a cell of folded space for something to stand before their
-    foregrounds (nerf/fields/frustum_mask.py), or all but one where they are few."""
+    """How to train.
+
+    ``samples``: colours to evaluate in a step; its rays are as many as are expected to need them. ``chunks``: equal
+    micro-batches of a step, each computed on a core; results depend on their number, not on that of the cores.
+    ``background`` is what lies behind a scene without a background model: a colour, or another random one for each ray
+    (only for photos with alpha, where it shows the field which space is empty). ``distortion``: full weight of the
+    distortion loss, for scenes without a known background. ``depth_loss``: initial weight of the sparse depth loss, at
+    the pixels whose distance the dataset knows. ``least_photos``: that must see a cell of contracted space for
+    something to stand before their foregrounds (nerf/fields/frustum_mask.py), or all but one where they are few.
+    """
 
     seed: int
     background: tuple[float, float, float] | Literal["random"]
@@ -99,8 +101,8 @@ class Loss(NamedTuple):
 
 
 class _Part(NamedTuple):
-    """What one chunk of a batch contributes to it: loss, gradients and their norm, the thickness of cells it met, and
-    how many densities it asked for."""
+    """What one micro-batch contributes: loss, gradients and their norm, the optical thickness of its samples, and how
+    many densities it evaluated."""
 
     batch: HashGridBatch
     loss: Tensor
@@ -108,7 +110,7 @@ class _Part(NamedTuple):
     weights: Weights
     features: Float[Tensor, "samples width"]
     points: Float[Tensor, "samples 3"]
-    sky: dict[str, Tensor]
+    background: dict[str, Tensor]
     effects: dict[str, Tensor]
     norm: Tensor
     thickness: Float[Tensor, "samples"]
@@ -133,7 +135,7 @@ def depth_factor(share: float) -> float:
 
 
 class HashGridTrainer:
-    """Trains a grid field on the robust error of colours by Adam, and keeps its density cache. ``effects`` stand
+    """Trains a grid field on the Huber loss of colours by Adam, and updates its occupancy grid. ``effects`` stand
     between the field and each image (nerf/effects)."""
 
     def __init__(
@@ -146,14 +148,14 @@ class HashGridTrainer:
         self.model, self.settings, self.effects = model, settings, effects
         # Nothing beyond the box of a bounded scene is drawn: a point there would pull the light to its walls.
         self.bank = bank if model.settings.contracted else bank.known_within(BOX)
-        self.cache = OccupancyGrid(model, self._usable())
+        self.occupancy_grid = OccupancyGrid(model, self._usable())
         of_networks = model.weights._asdict()
-        self.sky = {"sky": model.sky} if model.settings.sky else {}
-        self.parameters = {"table": model.table, **of_networks, **self.sky, **effects.parameters}
-        self.mean = {name: torch.zeros_like(tensor) for name, tensor in self.parameters.items()}
-        self.square = {name: torch.zeros_like(tensor) for name, tensor in self.parameters.items()}
+        self.background = {"background_table": model.background_table} if model.settings.background_model else {}
+        self.parameters = {"table": model.table, **of_networks, **self.background, **effects.parameters}
+        self.exp_avg = {name: torch.zeros_like(tensor) for name, tensor in self.parameters.items()}
+        self.exp_avg_sq = {name: torch.zeros_like(tensor) for name, tensor in self.parameters.items()}
         self.grad_table = torch.zeros_like(model.table)
-        tables = model.table, self.grad_table, self.mean["table"], self.square["table"]
+        tables = model.table, self.grad_table, self.exp_avg["table"], self.exp_avg_sq["table"]
         self.levels = [
             tuple(tensor[first:end] for tensor in tables) for first, end in pairwise(model.layout.first_rows)
         ]
@@ -161,12 +163,12 @@ class HashGridTrainer:
         self.order = PixelSampler(self.bank.drawable, settings.seed, bank.device)
         self.drawn = torch.tensor(0)  # pixels of that order so far; steps differ in how many they take
 
-    def _usable(self) -> Bool[Tensor, "cache"] | None:
+    def _usable(self) -> Bool[Tensor, "cells"] | None:
         """Known only where points tell where foregrounds begin, in folded space: a box is carved beforehand."""
-        least, lattice = min(self.settings.least_photos, len(self.bank.near) - 1), self.model.lattice
-        if least <= 1 or self.bank.known is None or not lattice.contracted:
+        least, stepping = min(self.settings.least_photos, len(self.bank.near) - 1), self.model.stepping
+        if least <= 1 or self.bank.known is None or not stepping.contracted:
             return None
-        return compute_frustum_mask(self.bank, least, lattice.cells)
+        return compute_frustum_mask(self.bank, least, stepping.occupancy_resolution)
 
     def step(self, step: int, share: float, rate_scale: float = 1.0) -> StepResult:
         """One batch, one update. Raises NonFinite before the update, leaving model and optimiser as they were."""
@@ -175,7 +177,7 @@ class HashGridTrainer:
         loss, error = self._finite(step, parts)
         self._update(parts, rate_scale * lr_multiplier(step, share), step + 1)
         with part("cache"):
-            self.cache.refresh(step, generator(device, self.settings.seed, step, self.settings.chunks))
+            self.occupancy_grid.update(step, generator(device, self.settings.seed, step, self.settings.chunks))
         samples = sum(len(each.points) for each in parts)
         rays *= self.settings.chunks
         self.drawn += self._of_photos(rays, share)
@@ -183,15 +185,16 @@ class HashGridTrainer:
         return StepResult(loss, psnr(error), rays, samples, sum(each.densities for each in parts))
 
     def state(self) -> dict[str, Tensor]:
-        """Weights and cache bits as ``model.<name>``, per-image parameters as ``image.<effect>.<name>``, Adam's moments
-        as ``mean.<name>`` and ``square.<name>``, the cache's thickness, the mean number of samples per ray, how
-        many pixels were drawn, and the field's settings, to know it by."""
+        """Weights and occupancy bits as ``model.<name>``, per-image parameters as ``image.<effect>.<name>``, Adam's
+        moments as ``exp_avg.<name>`` and ``exp_avg_sq.<name>``, the optical thickness of the occupancy grid's cells,
+        the mean number of samples per ray, how many pixels were sampled, and the field's settings, to know it by."""
         return (
             {f"model.{name}": tensor for name, tensor in self.model.state_dict().items()}
             | {f"image.{name}": tensor for name, tensor in self.effects.parameters.items()}
-            | {f"mean.{name}": tensor for name, tensor in self.mean.items()}
-            | {f"square.{name}": tensor for name, tensor in self.square.items()}
-            | {"thickness": self.cache.thickness, "samples_per_ray": self.samples_per_ray, "drawn": self.drawn}
+            | {f"exp_avg.{name}": tensor for name, tensor in self.exp_avg.items()}
+            | {f"exp_avg_sq.{name}": tensor for name, tensor in self.exp_avg_sq.items()}
+            | {"optical_thickness": self.occupancy_grid.optical_thickness}
+            | {"samples_per_ray": self.samples_per_ray, "drawn": self.drawn}
             | {"settings": torch.tensor(astuple(self.model.settings), dtype=torch.float64)}
         )
 
@@ -252,15 +255,17 @@ class HashGridTrainer:
             effects = loss.grad_effects | self.effects.backward_rays(
                 batch.rays, batch.view, lambda: RayGradients(*self.model.rays_backward(done, gradients))
             )
-            sky = {name: self.model.background_backward(done, gradients) for name in self.sky}
+            background = {name: self.model.background_backward(done, gradients) for name in self.background}
         weights, features, *_ = gradients
-        norm = torch.nn.utils.get_total_norm([*weights, features, *sky.values(), *effects.values()])
+        norm = torch.nn.utils.get_total_norm([*weights, features, *background.values(), *effects.values()])
         of_loss = loss.value, loss.squared_error
-        return _Part(batch, *of_loss, weights, features, done.points, sky, effects, norm, done.thickness, done.marched)
+        return _Part(
+            batch, *of_loss, weights, features, done.points, background, effects, norm, done.thickness, done.marched
+        )
 
     def _backward_work(self, done: HashGridPass) -> Work:
         weights = self.model.weights
-        products = 2 * (grid_mlp.density_products(weights) + grid_mlp.colour_products(weights)) * len(done.points)
+        products = 2 * (mlp.density_products(weights) + mlp.colour_products(weights)) * len(done.points)
         to_points = CORNERS * len(self.model.layout.resolutions) * len(done.points) if self.effects.rays else 0
         return Work(products, to_points)
 
@@ -270,14 +275,14 @@ class HashGridTrainer:
         robust, pull = huber_loss(error)
         grad, effects = self.effects.backward_residual(seen, pull * (2 / (3 * rays)))
         value, grad_weights = robust.sum() / (3 * rays), torch.zeros_like(done.weights)
-        backend, lattice = self.model.backend, self.model.lattice
+        backend, stepping = self.model.backend, self.model.stepping
         if self.settings.distortion:
             each = torch.full_like(batch.distance, self.settings.distortion * distortion_factor(share) / rays)
-            value = value + (each * backend.distortion(done.samples, done.weights, lattice)).sum()
-            grad_weights = backend.distortion_backward(done.samples, done.weights, lattice, each)
+            value = value + (each * backend.distortion(done.samples, done.weights, stepping)).sum()
+            grad_weights = backend.distortion_backward(done.samples, done.weights, stepping, each)
         if self._is_guided(share):
             each = torch.full_like(batch.distance, self.settings.depth_loss * depth_factor(share) / rays)
-            places = done.rays.far, batch.distance, lattice
+            places = done.rays.far, batch.distance, stepping
             apart = backend.depth_loss(done.samples, done.weights, done.rendering.opacity, *places)
             value = value + (each * apart).sum()
             of_weights, of_opacity = backend.depth_loss_backward(done.samples, *places, each)
@@ -297,55 +302,59 @@ class HashGridTrainer:
                 raise NonFinite(quantity, step, _whole([chunk.batch for chunk in parts]))
         return loss_now, error_now
 
-    def _update(self, parts: Sequence[_Part], factor: float, count: int) -> None:
-        """Of the table's levels, which share no rows, of the networks, of per-image parameters and of the cache:
-        each work for a core. ``factor``: of all learning rates."""
+    def _update(self, parts: Sequence[_Part], factor: float, adam_step: int) -> None:
+        """Update the table's levels, which share no rows, the networks, the per-image parameters and the occupancy
+        grid, each on a core. ``factor`` scales all learning rates."""
         finest_first = range(len(self.model.layout.resolutions) - 1, -1, -1)  # no core waits long for the last
-        rate = self.settings.rate * factor
-        work = [partial(self._update_level, level, parts, rate, count) for level in finest_first]
+        learning_rate = self.settings.rate * factor
+        work = [partial(self._update_level, level, parts, learning_rate, adam_step) for level in finest_first]
         of_networks = [chunk.weights._asdict() for chunk in parts]
-        work.append(partial(self._update_small, Weights._fields, of_networks, rate, count))
-        of_sky = [*(chunk.sky for chunk in parts), self._sky_prior(parts)]
-        work.append(partial(self._update_small, self.sky, of_sky, SKY_RATE * rate, count))
-        work.append(partial(self._raise_cache, parts))
+        work.append(partial(self._update_small, Weights._fields, of_networks, learning_rate, adam_step))
+        of_background = [*(chunk.background for chunk in parts), self._background_prior(parts)]
+        work.append(
+            partial(self._update_small, self.background, of_background, BACKGROUND_LR_SCALE * learning_rate, adam_step)
+        )
+        work.append(partial(self._raise_occupancy, parts))
         for effect in self.effects.all:
-            work.append(partial(self._update_effect, effect, parts, effect.learning_rate * factor, count))
+            work.append(partial(self._update_effect, effect, parts, effect.learning_rate * factor, adam_step))
         for _ in in_order(lambda update: update(), work, self.bank.device):
             pass
 
-    def _sky_prior(self, parts: Sequence[_Part]) -> dict[str, Tensor]:
-        """The prior's gradient of the sky, where rays of this batch ran to it: what none runs to stays as it is."""
+    def _background_prior(self, parts: Sequence[_Part]) -> dict[str, Tensor]:
+        """The prior's gradient of the background where rays of this batch reach it; elsewhere it stays as it is."""
         rays = sum(len(chunk.batch.jitter) for chunk in parts)
-        touched = {name: torch.stack([chunk.sky[name] for chunk in parts]).sum(0) != 0 for name in self.sky}
-        return {name: SKY_PRIOR / rays * sky * touched[name] for name, sky in self.sky.items()}
+        touched = {
+            name: torch.stack([chunk.background[name] for chunk in parts]).sum(0) != 0 for name in self.background
+        }
+        return {name: BACKGROUND_PRIOR / rays * table * touched[name] for name, table in self.background.items()}
 
-    def _update_level(self, level: int, parts: Sequence[_Part], rate: float, count: int) -> None:
+    def _update_level(self, level: int, parts: Sequence[_Part], learning_rate: float, adam_step: int) -> None:
         layout, backend = self.model.layout, self.model.backend
         with part("scatter", Work(rows=CORNERS * sum(len(each.points) for each in parts))):
             for each in parts:
                 backend.encode_backward_table(layout, level, each.points, each.features, self.grad_table)
-        table, grad, mean, square = self.levels[level]
+        table, grad, exp_avg, exp_avg_sq = self.levels[level]
         with part("optimiser", Work(bytes=ADAM_BYTES * table.numel())):
-            backend.adam(table, grad, mean, square, rate, count)
+            backend.adam(table, grad, exp_avg, exp_avg_sq, learning_rate, adam_step)
 
     def _update_small(
-        self, names: Iterable[str], of_parts: Sequence[dict[str, Tensor]], rate: float, count: int
+        self, names: Iterable[str], of_parts: Sequence[dict[str, Tensor]], learning_rate: float, adam_step: int
     ) -> None:
         """Of parameters that are small beside the table."""
         with part("optimiser"):
             for name in names:
                 gradient = torch.stack([each[name] for each in of_parts]).sum(0)
-                parameter, mean, square = self.parameters[name], self.mean[name], self.square[name]
-                self.model.backend.adam(parameter, gradient, mean, square, rate, count)
+                parameter, exp_avg, exp_avg_sq = self.parameters[name], self.exp_avg[name], self.exp_avg_sq[name]
+                self.model.backend.adam(parameter, gradient, exp_avg, exp_avg_sq, learning_rate, adam_step)
 
-    def _update_effect(self, effect: Effect, parts: Sequence[_Part], rate: float, count: int) -> None:
-        self._update_small(parameters_of(effect), [chunk.effects for chunk in parts], rate, count)
+    def _update_effect(self, effect: Effect, parts: Sequence[_Part], learning_rate: float, adam_step: int) -> None:
+        self._update_small(parameters_of(effect), [chunk.effects for chunk in parts], learning_rate, adam_step)
         effect.fix_gauge()
 
-    def _raise_cache(self, parts: Sequence[_Part]) -> None:
+    def _raise_occupancy(self, parts: Sequence[_Part]) -> None:
         with part("cache"):
             for each in parts:
-                self.cache.raise_to(each.points, each.thickness)
+                self.occupancy_grid.raise_to(each.points, each.thickness)
 
 
 def _whole(batches: Sequence[HashGridBatch]) -> dict[str, Tensor]:

@@ -67,7 +67,7 @@ def _meaning(products: dict[int, float], reads: float, copied: float, count: int
 def grid_work(contracted: bool, densities: float) -> "Work":
     """Of a ray in training, its share of the optimiser's included: a large field, in the steps that stage train takes
     on this machine."""
-    from nerf.fields import mlp as grid_mlp
+    from nerf.fields import mlp
     from nerf.fields.hash_grid import CORNERS, HashGridField
     from nerf.kernels import torch as reference
     from nerf.runtime.profiler import Work
@@ -79,9 +79,9 @@ def grid_work(contracted: bool, densities: float) -> "Work":
     asked = Config(field="grid", contracted=contracted, view_dependence=True)
     config = timed(with_defaults(asked), compute_device())
     model = HashGridField(field_settings(config, sky=False), 0, reference)
-    density, colour = grid_mlp.density_products(model.weights), grid_mlp.colour_products(model.weights)
+    density, colour = mlp.density_products(model.weights), mlp.colour_products(model.weights)
     colours = SAMPLES_PER_RAY[config.space]
-    rows = CORNERS * model.settings.levels * (densities + colours)
+    rows = CORNERS * model.settings.num_levels * (densities + colours)
     adam = ADAM_BYTES * model.table.numel() / rays_per_step(config)
     return Work(densities * density + colours * (colour + 2 * (density + colour)), rows, adam)
 

@@ -41,3 +41,10 @@ def duration_option(seconds: float) -> str:
 def bytes_in_words(count: float) -> str:
     """``1.5 GB``, ``40 MB``: an amount of memory or disk."""
     return f"{count / GB:.1f} GB" if count >= 0.1 * GB else f"{count / 2**20:.0f} MB"
+
+
+def resolution_name(downscale: float) -> str:
+    """``full resolution``, ``half resolution``, ``a quarter of the resolution``, ``1/2.7 of the resolution``."""
+    names = {1.0: "full resolution", 2.0: "half resolution", 3.0: "a third of the resolution"}
+    names[4.0] = "a quarter of the resolution"
+    return names.get(downscale, f"1/{downscale:g} of the resolution")

@@ -1,8 +1,9 @@
-"""Names that every program can open: ASCII files for photos of any name."""
+"""Names that every program can open: ASCII files for photos of any name, and names for a shell."""
 
 import hashlib
 import os
 import re
+import shlex
 import unicodedata
 from collections.abc import Sequence
 
@@ -42,3 +43,10 @@ def _safe_file(name: str, suffix: str) -> str:
 
 def _hash(name: str, salt: int) -> str:
     return hashlib.sha256(f"{salt}/{name}".encode()).hexdigest()[:8]
+
+
+def shell_quoted(name: str) -> str:
+    """As a shell takes it; the bytes of a name that is not Unicode, which no text holds, as in ``$'caf\\xe9'``."""
+    escaped = name.replace("\\", r"\\").replace("'", r"\'")
+    text = os.fsencode(escaped).decode("utf-8", "backslashreplace")
+    return shlex.quote(name) if text == escaped else f"$'{text}'"

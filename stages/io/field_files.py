@@ -115,7 +115,7 @@ def _untrained(
     if kind == "grid":
         grid = HashGridSettings(**settings)  # which refuses unknown names; their types are checked next
         TypeAdapter(HashGridSettings).validate_json(text, strict=True)
-        _check_size(grid.layout.rows * grid.features, stored)
+        _check_size(grid.layout.rows * grid.features_per_level, stored)
         return HashGridField(grid, 0, load_backend(backend_of_field(_trained_with(info), device, progress), device))
     paper = VanillaSettings(**settings)
     TypeAdapter(VanillaSettings).validate_json(text, strict=True)

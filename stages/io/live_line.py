@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from stages.contract import Progress
-from stages.io.periodically import periodically
+from stages.io.stopwatch import periodically
 
 PERIOD_SECONDS = 0.5
 

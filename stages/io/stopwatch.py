@@ -5,13 +5,13 @@ files are those of a clock that can be put forward or back, of a machine that sl
 """
 
 import json
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from stages.io.files import write_durably
-from stages.io.periodically import periodically
 
 BEAT = 5.0  # seconds between what is kept: whatever ends the program takes no more than these with it
 
@@ -47,3 +47,21 @@ def counted(file: Path) -> Iterator[Callable[[], float]]:
             yield spent
     finally:
         beat()
+
+
+@contextmanager
+def periodically(seconds: float, act: Callable[[], object]) -> Iterator[None]:
+    """Call ``act`` every ``seconds`` as long as the block runs, and not once after it; from another thread."""
+    over = threading.Event()
+
+    def repeat() -> None:
+        while not over.wait(seconds):
+            act()
+
+    thread = threading.Thread(target=repeat, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from scipy.spatial import KDTree
 
-from nerf.fields.density_grid import Lattice, sample_density_grid
+from nerf.fields.density_grid import DensityGrid, sample_density_grid
 from nerf.fields.interface import RadianceModel
 from nerf.geometry.scene import Scene
 from nerf.rendering.volume_rendering import composite
@@ -88,7 +88,7 @@ def extract_mesh(config: "Config", source: Source, progress: Progress) -> Extrac
     return Extracted(mesh, iso_level, cleaned, boundary(surface, box, voxel), voxel)
 
 
-def _density_grid(config: "Config", source: Source, box: np.ndarray, progress: Progress) -> Lattice:
+def _density_grid(config: "Config", source: Source, box: np.ndarray, progress: Progress) -> DensityGrid:
     assert config.resolution is not None
     bytes_per_point = BYTES_PER_POINT * point_cost(slab_factor(box))
     fits = int((available_bytes() / bytes_per_point) ** (1 / 3)) // 16 * 16
@@ -104,7 +104,7 @@ def _density_grid(config: "Config", source: Source, box: np.ndarray, progress: P
 
 
 def _iso_level(
-    config: "Config", grid: Lattice, model: RadianceModel, maps: list[ShadowMap], progress: Progress
+    config: "Config", grid: DensityGrid, model: RadianceModel, maps: list[ShadowMap], progress: Progress
 ) -> IsoLevel:
     """The one asked for, or the one chosen from some of the maps' rays."""
     check_range(grid, config.iso_level)

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from skimage.filters import threshold_otsu
 
-from nerf.fields.density_grid import Lattice, along, first_crossing, ray_distances
+from nerf.fields.density_grid import DensityGrid, along, first_crossing, ray_distances
 from nerf.fields.interface import RadianceModel
 from nerf.geometry.rays import Rays, clip_to_box, points_on
 from stages.contract import StageError
@@ -44,7 +44,7 @@ class IsoLevel(NamedTuple):
     well_defined: bool
 
 
-def check_range(grid: Lattice, iso_level: float | None) -> None:
+def check_range(grid: DensityGrid, iso_level: float | None) -> None:
     """Raise StageError for a grid in which no surface can be (non-finite, empty or constant), or a given iso-level out
     of its range."""
     broken = int((~torch.isfinite(grid.values)).sum())
@@ -69,7 +69,7 @@ def check_range(grid: Lattice, iso_level: float | None) -> None:
         raise StageError("mesh.level-out-of-range", f"no surface at density {iso_level:g}", why, hint)
 
 
-def choose_iso_level(grid: Lattice, model: RadianceModel, rays: Rays) -> IsoLevel:
+def choose_iso_level(grid: DensityGrid, model: RadianceModel, rays: Rays) -> IsoLevel:
     """The density whose surface in ``grid`` lies closest to where ``rays`` lose half of their transmittance in
     ``model``."""
     inside = clip_to_box(rays, grid.low, grid.high)
@@ -125,7 +125,7 @@ def _surface_error(surface: torch.Tensor, depth: torch.Tensor, voxel: float) -> 
     return float((distance / voxel).clamp(max=CLIP_VOXELS).mean())
 
 
-def _otsu_level(grid: Lattice, stopped: float) -> IsoLevel:
+def _otsu_level(grid: DensityGrid, stopped: float) -> IsoLevel:
     """Otsu's threshold (1979) on the logarithm of the density, for fields in which hardly any ray stops."""
     values = grid.values.cpu().numpy()
     level = float(np.exp(threshold_otsu(np.log(values[values > 1e-3 * values.max()]))))

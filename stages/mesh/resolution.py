@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from nerf import REGION_HALF
-from nerf.fields.density_grid import Lattice, sample_density_grid
+from nerf.fields.density_grid import DensityGrid, sample_density_grid
 from nerf.geometry.region_of_interest import Layout
 from stages.contract import Inputs, Progress
 from stages.hardware.device import compute_device
@@ -140,7 +140,7 @@ def reference_seconds() -> float:
     best of a few."""
     line = torch.linspace(-1, 1, REFERENCE_EDGE)
     radius = torch.stack(torch.meshgrid(line, line, line, indexing="ij")).norm(dim=0)
-    grid, times = Lattice((4 * (0.6 - radius)).exp(), -torch.ones(3), torch.ones(3)), []
+    grid, times = DensityGrid((4 * (0.6 - radius)).exp(), -torch.ones(3), torch.ones(3)), []
     for _ in range(REFERENCE_REPEATS):
         began = time.perf_counter()
         vertex_normals(extract_surface(grid, 1.0))

@@ -12,7 +12,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from skimage.measure import marching_cubes
 
-from nerf.fields.density_grid import Lattice, occupancy, smoothed
+from nerf.fields.density_grid import DensityGrid, occupancy, smoothed
 from stages.contract import StageError
 
 # Passes of nerf.fields.density_grid.smoothed: a Gaussian of one grid spacing. The field's finest cells are about as
@@ -27,12 +27,12 @@ class Surface(NamedTuple):
     faces: np.ndarray
 
 
-def smoothed_occupancy(grid: Lattice, iso_level: float) -> Lattice:
+def smoothed_occupancy(grid: DensityGrid, iso_level: float) -> DensityGrid:
     """The occupancy, 1/2 where the density is ``iso_level``, without what is finer than the grid."""
     return smoothed(occupancy(grid, iso_level), SMOOTHING_PASSES)
 
 
-def extract_surface(grid: Lattice, iso_level: float) -> Surface:
+def extract_surface(grid: DensityGrid, iso_level: float) -> Surface:
     """The surface at density ``iso_level`` (marching cubes, Lewiner et al. 2003); open where the box cuts it.
 
     Raises StageError where no point is that dense, or all are. Smoothing leaves nothing of sheets one grid point thick

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from scipy.ndimage import maximum_filter
 
-from nerf.fields.density_grid import Lattice, median_depth
+from nerf.fields.density_grid import DensityGrid, median_depth
 from nerf.geometry.rays import Rays, join_rays
 from nerf.geometry.scene import Camera, Scene, View
 from nerf.runtime.randomness import generator
@@ -54,7 +54,7 @@ class ShadowMap(NamedTuple):
 
 
 def shadow_maps(
-    grid: Lattice, scene: Scene, ingest: Path, views: Sequence[View], on_view: Callable[[float], None]
+    grid: DensityGrid, scene: Scene, ingest: Path, views: Sequence[View], on_view: Callable[[float], None]
 ) -> list[ShadowMap]:
     """One map per photo; together about ``NUM_RAYS`` rays, each with a sample per voxel of the longest edge. Masks lie
     in the folder of stage ``ingest``."""

@@ -154,9 +154,9 @@ def page(results: Results, summary: dict[str, Any], config: Config) -> str:
     """The whole HTML page."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
+    from stages.io.ascii_names import shell_quoted
     from stages.report.effects import effects_table
     from stages.report.profile import parts_bar
-    from stages.tradeoff.pareto_front import quoted
 
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent),
@@ -165,7 +165,13 @@ def page(results: Results, summary: dict[str, Any], config: Config) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    words = {"duration": duration, "short": short_count, "thousands": "{:,}".format, "value": _value, "quoted": quoted}
+    words = {
+        "duration": duration,
+        "short": short_count,
+        "thousands": "{:,}".format,
+        "value": _value,
+        "quoted": shell_quoted,
+    }
     environment.filters |= words
     names = {photo["file"]: photo["name"] for photo in results.photos["photos"]} if results.photos else {}
     return environment.get_template("report.html.j2").render(
@@ -309,19 +315,18 @@ def _study(results: Results) -> dict[str, Any] | None:
     """The study of cost and quality: recommendation, plot, table, and the ablation's pictures where there are any."""
     from markupsafe import Markup
 
-    from stages.tradeoff import COLUMNS, cells, drawing_words
-    from stages.tradeoff.plot import plot_svg
+    from stages.tradeoff.plots import COLUMNS, plot_svg, rendering_sentence, table_cells
 
     if results.study is None:
         return None
-    ablation, own = results.inputs["tradeoff"] / "ablation.png", results.study["own"]
+    ablation, field = results.inputs["tradeoff"] / "ablation.png", results.study["workspace_field"]
     train = results.inputs.get("train")
     return results.study | {
         "svg": Markup(plot_svg(results.study)),
         "columns": COLUMNS,
-        "drawing": drawing_words(results.study["points"]),
-        "rows": [{"cells": cells(row), "front": row["front"]} for row in results.study["points"]],
-        "own_is_older": own and train and own["train"] != train.resolve().name,
+        "rendering": rendering_sentence(results.study["points"]),
+        "rows": [{"cells": table_cells(row), "front": row["pareto_front"]} for row in results.study["points"]],
+        "field_is_older": field and train and field["train"] != train.resolve().name,
         "sheet": _data_uri(ablation.read_bytes(), "image/png") if ablation.exists() else None,
     }
 

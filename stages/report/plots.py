@@ -1,26 +1,25 @@
 """The report's plots as inline SVG: text and axes take the page's colour, and equal data is equal bytes."""
 
 import re
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import PurePosixPath
 from typing import TYPE_CHECKING, Any
 
 from nerf import REGION_HALF
 from stages.io.amounts import duration
+from stages.io.figures import INK, svg_element, svg_figure
 from stages.train.curve import heldout_curve
 
 if TYPE_CHECKING:
     import numpy as np
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
     from nerf.geometry.scene import Scene, View
     from nerf.training.learning_curve import Gain
 
 BLUE, ORANGE, GREY = "#3b82f6", "#f2711c", "#8a8f98"
 ORDER_COLOURS = (BLUE, "#9b5de5", "#e0457b", ORANGE, "#e0a800")  # from first to last, legible on light and dark pages
-INK = "#010203"  # drawn with this and then replaced by the page's own text colour
+
 MOST_POINTS = 20_000
 ROOM_BELOW = 0.08  # of the curve's height, so that the name of the lowest line stands clear of the times
 
@@ -35,7 +34,7 @@ def curve_svg(
     rows = [row for row in points if row["seconds"] > 0]
     if len(rows) < 2:
         return None
-    with drawing((8.2, 3.4), "curve") as figure:
+    with svg_figure((8.2, 3.4), "curve") as figure:
         axes = figure.add_subplot()
         for key, label, colour in (("train_psnr", "training rays", GREY), ("heldout_psnr", "held-out photos", BLUE)):
             seen = [(row["seconds"], row[key]) for row in rows if row[key] is not None]
@@ -114,7 +113,7 @@ def _layout_svg(
     middle, half = (low + high) / 2, (high - low) / 2 + 0.06 * (high - low).max()
     xyz, rgb = points
     shown = np.linspace(0, len(xyz) - 1, min(len(xyz), MOST_POINTS)).astype(int)
-    with drawing((5, min(8.0, max(1.6, 5 * half[1] / half[0]))), name) as figure:
+    with svg_figure((5, min(8.0, max(1.6, 5 * half[1] / half[0]))), name) as figure:
         axes = figure.add_subplot(aspect="equal")
         axes.scatter(*xyz[shown][:, plane].T, c=rgb[shown] / 255, s=2, lw=0, alpha=0.7, rasterized=True)
         axes.add_patch(
@@ -174,33 +173,3 @@ def _doubling_axis(axes: "Axes", first: float, last: float, end: float) -> None:
     axes.set_xticks([], minor=True)
     axes.axvspan(last / 2, last, color=BLUE, alpha=0.08, lw=0)
     axes.grid(color=INK, alpha=0.15, lw=0.8)
-
-
-@contextmanager
-def drawing(size: tuple[float, float], salt: str) -> "Iterator[Figure]":
-    """A figure to draw on, without pyplot's global state, whose identifiers depend on ``salt`` alone."""
-    from matplotlib import rc_context
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    style: dict[Any, Any] = {"svg.hashsalt": salt, "svg.fonttype": "none", "font.size": 10.5}
-    style |= {f"axes.spines.{side}": False for side in ("top", "right")}
-    style |= dict.fromkeys(("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color"), INK)
-    with rc_context(style):
-        figure = Figure(figsize=size, layout="constrained")
-        FigureCanvasAgg(figure)
-        yield figure
-
-
-def svg_element(figure: "Figure") -> str:
-    """The figure as an element to be put into a page, transparent, scaling with its column."""
-    import io
-
-    buffer = io.StringIO()
-    figure.savefig(buffer, format="svg", transparent=True, dpi=160, metadata={"Date": None, "Creator": None})
-    text = buffer.getvalue()
-    text = text[text.index("<svg") :].replace(INK, "currentColor")
-    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
-    # Matplotlib numbers its groups afresh in every figure; nothing refers to them and a page may hold each id once.
-    text = re.sub(r' id="[\w.]+_\d+"', "", text)
-    return re.sub(r'<svg ([^>]*?)width="[^"]*"', r"<svg \1", re.sub(r'(<svg [^>]*?)height="[^"]*"', r"\1", text))

@@ -6,7 +6,7 @@ from stages.contract import Inputs, Progress, StageResult
 from stages.train.config import Config
 
 INPUTS = ("ingest", "normalise", "effects")
-VERSION = 23
+VERSION = 24
 RESUMES = True
 PUBLISHED = ("curve.json",)
 NOT_HASHED = ("checkpoint_seconds", "tensorboard")

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from nerf.geometry.rays import Rays, rays_of_view
-from nerf.training.ray_dataset import Placement, RayDataset, ray_bank
+from nerf.training.ray_dataset import PosedViews, RayDataset, make_ray_dataset
 from nerf.training.trainer import over
 from stages.contract import Inputs, Progress, StageError
 from stages.effects.track_colours import training_tracks
@@ -50,13 +50,13 @@ def camera_directions(camera: "Camera", downscale: float) -> "Tensor":
 
 def patch_bearings(camera: "Camera", downscale: float) -> "Tensor":
     """Bearing vectors (rows, columns, 3) of a camera in the middles of the patches that stand for its pixels in a ray
-    bank, MAX_PATCHES along the longer side or one per pixel."""
+    dataset, MAX_PATCHES along the longer side or one per pixel."""
     width, height = scaled_size(camera, downscale)
     shrink = max(1.0, max(width, height) / MAX_PATCHES)
     return torch.from_numpy(camera_rays(camera, math.ceil(width / shrink), math.ceil(height / shrink)))
 
 
-def training_bank(ingest: Path, scene: "Scene", split: "Split", downscale: float, progress: Progress) -> RayDataset:
+def training_dataset(ingest: Path, scene: "Scene", split: "Split", downscale: float, progress: Progress) -> RayDataset:
     """All pixels and rays of one split, on the CPU; the pixels are mapped from the pixel store, which is made if need
     be. What masks ignore is never drawn. Raises StageError, ALL_MASKED, where they leave nothing."""
     views, store = scene.of_split(split), _store(ingest, scene, split, downscale)
@@ -68,28 +68,28 @@ def training_bank(ingest: Path, scene: "Scene", split: "Split", downscale: float
         progress.update(f"rays of camera {index + 1} of {len(used)}", index / len(used))
         return patch_bearings(scene.cameras[used[index]], downscale)
 
-    bank = ray_bank(
+    dataset = make_ray_dataset(
         pixels=store.table(progress),
         sizes=[(photo.height, photo.width) for photo in store.photos],
         camera_of=[used.index(view.camera) for view in views],
         camera_bearings=[bearings(index) for index in range(len(used))],
-        placement=Placement(
+        placement=PosedViews(
             poses=torch.tensor(np.stack([view.scene_from_camera for view in views]), dtype=torch.float32),
             near=torch.tensor([view.near for view in views]),
             far=torch.tensor([view.far for view in views]),
         ),
     )
     if not any(view.mask for view in views):
-        return bank
+        return dataset
     masks = _ignored(views, lambda view: view_mask(ingest, scene, view, downscale), at_once())
-    return _masked(bank, masks, split, progress)
+    return _masked(dataset, masks, split, progress)
 
 
-def guided_bank(inputs: Inputs, scene: "Scene", downscale: float, progress: Progress) -> RayDataset:
-    """:func:`training_bank` of the training photos, which knows how far away are the sparse points that they show.
+def guided_dataset(inputs: Inputs, scene: "Scene", downscale: float, progress: Progress) -> RayDataset:
+    """:func:`training_dataset` of the training photos, which knows how far away are the sparse points that they show.
 
     Of normalise's points only those that two training photos saw at least, where these saw them."""
-    bank = training_bank(inputs["ingest"], scene, "train", downscale, progress)
+    dataset = training_dataset(inputs["ingest"], scene, "train", downscale, progress)
     points = read_tensors(inputs["normalise"] / "points.safetensors")
     tracks, xy = training_tracks(scene, points, most=len(points["view"]))
     cameras = [scene.cameras[view.camera] for view in scene.of_split("train")]
@@ -97,8 +97,8 @@ def guided_bank(inputs: Inputs, scene: "Scene", downscale: float, progress: Prog
     size = np.array([scaled_size(camera, downscale) for camera in cameras]).reshape(-1, 2)[tracks.view]
     column, row = np.clip(np.floor(xy * size / full), 0, size - 1).astype(int).T
     within = torch.from_numpy(row * size[:, 0] + column)
-    return bank.with_distances(
-        bank.first_pixel[torch.from_numpy(tracks.view)] + within, torch.from_numpy(tracks.distance)
+    return dataset.with_distances(
+        dataset.first_pixel[torch.from_numpy(tracks.view)] + within, torch.from_numpy(tracks.distance)
     )
 
 
@@ -113,14 +113,14 @@ def _ignored(
                 yield None if used is None else used.logical_not_()
 
 
-def _masked(bank: RayDataset, ignored: "Iterable[Tensor | None]", split: "Split", progress: Progress) -> RayDataset:
+def _masked(dataset: RayDataset, ignored: "Iterable[Tensor | None]", split: "Split", progress: Progress) -> RayDataset:
     try:
-        bank = bank.without(ignored)
+        dataset = dataset.without(ignored)
     except ValueError as error:
         why = f"{error} of the {split} photos at this size"
         raise StageError(ALL_MASKED, "nothing is left to train on", why, "Give a smaller --train.downscale.") from error
-    progress.note(f"masks leave {bank.drawable / len(bank.pixels):.0%} of the pixels of the {split} photos")
-    return bank
+    progress.note(f"masks leave {dataset.drawable / len(dataset.pixels):.0%} of the pixels of the {split} photos")
+    return dataset
 
 
 def view_mask(ingest: Path, scene: "Scene", view: "View", downscale: float) -> "Tensor | None":

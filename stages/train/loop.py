@@ -22,7 +22,7 @@ from pathlib import Path
 
 from safetensors.torch import save
 
-from nerf.training.schedule import CLOSING_SHARE, Decision, StepPlan, next_in_series, plan_of, replanned
+from nerf.training.schedule import CLOSING_SHARE, ScheduleRevision, StepSchedule, next_in_series, replanned, schedule_of
 from nerf.training.trainer import RAYS, FieldTrainer, NonFinite
 from nerf.training.validation_probe import ProbeResult, measure
 from stages.contract import Progress, StageError
@@ -104,7 +104,7 @@ class TrainingRun:
         self.trainer: FieldTrainer = self.make_trainer(state.restarts)
         self.lost = lost_seconds(self.spent, state)
         steps, self.clock_budget = self._limits()
-        self.plan: StepPlan = plan_of(steps or PROVISIONAL_STEPS)
+        self.plan: StepSchedule = schedule_of(steps or PROVISIONAL_STEPS)
         self._plan_measurement()
         self._write_journal()
         self._save()
@@ -168,7 +168,7 @@ class TrainingRun:
         self.state = RunState(**checkpoint.facts)
         self.trainer = self.make_trainer(self.state.restarts)
         self.trainer.load_state(checkpoint.tensors)
-        self.plan = StepPlan(tuple(Decision(*decision) for decision in read_json(journal)))
+        self.plan = StepSchedule(tuple(ScheduleRevision(*decision) for decision in read_json(journal)))
         self.lost = lost_seconds(self.spent, self.state)
         self._plan_measurement()
 
@@ -406,7 +406,7 @@ def reached_before_words(target_psnr: float) -> str:
     return f"{target_psnr:g} dB are reached already: training goes on for all that was asked for"
 
 
-def steering_words(state: RunState, target_psnr: float, plan: StepPlan) -> str:
+def steering_words(state: RunState, target_psnr: float, plan: StepSchedule) -> str:
     """That the rate falls before the end, or goes back up, with a target in mind."""
     seen = f"{state.validation_psnr:.1f} of {target_psnr:g} dB on photos set aside after {state.step:,} steps"
     and_now = "annealing over" if plan.decisions[-1].reason == "target" else "going on for"

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from nerf.runtime.matmul_precision import use_matmul_precision
-from nerf.training.ray_dataset import RayDataset, build_ray_bank
+from nerf.training.ray_dataset import RayDataset, ray_dataset_from_images
 from stages.contract import Inputs, Progress
 from stages.effects.decisions import Decisions, image_effects, read_decisions
 from stages.hardware.device import compute_device
@@ -95,9 +95,9 @@ def rays_per_second(config: Config, scene: "Scene", decisions: Decisions) -> flo
 
 def seconds_per_step(config: Config, scene: "Scene", decisions: Decisions, device: str) -> float:
     """Measured: steps of a fresh field of known sizes, with its effects, on a grey picture, for about a second."""
-    bank = _grey_bank(scene).to(device)
-    effects = image_effects(decisions, scene.of_split("train")[:1], bank)
-    trainer = make_trainer(config, scene, bank, seed=0, effects=effects)
+    dataset = _grey_dataset(scene).to(device)
+    effects = image_effects(decisions, scene.of_split("train")[:1], dataset)
+    trainer = make_trainer(config, scene, dataset, seed=0, effects=effects)
     with use_matmul_precision(config.matmul):
         trainer.step(0, 0.0, 1.0)  # the first step pays for memory and kernels
         started, steps = time.perf_counter(), 0
@@ -107,14 +107,16 @@ def seconds_per_step(config: Config, scene: "Scene", decisions: Decisions, devic
         return (time.perf_counter() - started) / steps
 
 
-def _grey_bank(scene: "Scene") -> RayDataset:
+def _grey_dataset(scene: "Scene") -> RayDataset:
     """The rays of the first training view, of a picture that is grey all over."""
     view = scene.of_split("train")[0]
     camera = scene.cameras[view.camera]
     directions = camera_directions(camera, max(1.0, max(camera.width, camera.height) / MIN_LONG_SIDE))
     grey = torch.full((*directions.shape[:2], 3), 128, dtype=torch.uint8)
     pose = torch.tensor(view.scene_from_camera, dtype=torch.float32)
-    return build_ray_bank([grey], [0], [directions], pose[None], torch.tensor([view.near]), torch.tensor([view.far]))
+    return ray_dataset_from_images(
+        [grey], [0], [directions], pose[None], torch.tensor([view.near]), torch.tensor([view.far])
+    )
 
 
 def chosen_downscale(

@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from nerf.runtime.matmul_precision import Medium, Precision, medium_matmul
+from nerf.runtime.matmul_precision import Medium, Precision, measure_medium_matmul
 from stages.contract import Progress
 from stages.hardware.device import compute_device
 from stages.train.config import Config
@@ -47,4 +47,4 @@ def precision_facts(config: Config) -> dict[str, Any]:
 
 def _medium(config: Config) -> Medium:
     """Measured at the width of the field's networks."""
-    return medium_matmul(torch.device(compute_device()), field_of(config).matmul_width(config))
+    return measure_medium_matmul(torch.device(compute_device()), field_of(config).matmul_width(config))

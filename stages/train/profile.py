@@ -13,7 +13,7 @@ import torch
 
 from nerf.runtime.machine_rates import Rates, measure_rates
 from nerf.runtime.parallel import workers
-from nerf.runtime.profiler import Stopwatch, Work, running
+from nerf.runtime.profiler import Profiler, Work, running
 from nerf.training.trainer import StepResult
 from stages.io.files import write_json
 from stages.train.config import Config
@@ -29,7 +29,7 @@ def observed(take: Callable[[], StepResult], step: int, timings: dict[str, Any],
     """Take a step; if its turn has come, add what it did to ``timings``: JSON values, empty at first."""
     if step % TIMED_EVERY != FIRST_TIMED:
         return take()
-    stopwatch, started = Stopwatch(device), time.perf_counter()
+    stopwatch, started = Profiler(device), time.perf_counter()
     with running(stopwatch):
         result = take()
     seconds = time.perf_counter() - started

@@ -26,7 +26,7 @@ from stages.train.curve import (
     target_words,
     write_curve,
 )
-from stages.train.data import field_background, guided_bank
+from stages.train.data import field_background, guided_dataset
 from stages.train.fields import field_of, make_trainer
 from stages.train.loop import TrainingRun
 from stages.train.more import budget_of, earlier_seconds
@@ -73,11 +73,11 @@ def prepare(config: Config, scene: Scene, inputs: Inputs, folder: Path, progress
         field = field_of(config)
         check_memory(field.memory_bytes(config, cores()), "the field", *field.memory_advice(config))
     progress.update("reading the photos")
-    bank = guided_bank(inputs, scene, config.downscale, progress).to(device)
+    dataset = guided_dataset(inputs, scene, config.downscale, progress).to(device)
     shown_over = torch.tensor(field_background(config, scene), device=device)
 
     probes = Probes(
-        make_probe(bank, PROBE_RAYS, shown_over, PROBE_SEED),
+        make_probe(dataset, PROBE_RAYS, shown_over, PROBE_SEED),
         unseen_photos(config, inputs["ingest"], scene, "test", device, progress),
     )
     if config.target_psnr is not None:
@@ -85,10 +85,12 @@ def prepare(config: Config, scene: Scene, inputs: Inputs, folder: Path, progress
         assert aside is not None, "load() sets some aside"
         probes = probes._replace(target=Target(config.target_psnr, aside))
     budget = budget_of(config, inputs)
-    _say_sizes(config, budget, bank, progress)
+    _say_sizes(config, budget, dataset, progress)
     decisions, views = read_decisions(inputs["effects"]), scene.of_split("train")
     return TrainingRun(
-        lambda attempt: make_trainer(config, scene, bank, config.seed + attempt, image_effects(decisions, views, bank)),
+        lambda attempt: make_trainer(
+            config, scene, dataset, config.seed + attempt, image_effects(decisions, views, dataset)
+        ),
         probes,
         budget,
         folder,
@@ -98,13 +100,13 @@ def prepare(config: Config, scene: Scene, inputs: Inputs, folder: Path, progress
     )
 
 
-def _say_sizes(config: Config, budget: TrainingBudget, bank: RayDataset, progress: Progress) -> None:
+def _say_sizes(config: Config, budget: TrainingBudget, dataset: RayDataset, progress: Progress) -> None:
     much = f"{budget.seconds:g} s" if budget.steps is None else f"{budget.steps:,} steps"
     another = "" if budget.after is None else "another "
-    photos = f"{len(bank.near)} photos at 1/{config.downscale:g} of their size"
+    photos = f"{len(dataset.near)} photos at 1/{config.downscale:g} of their size"
     field = field_of(config)
     sizes = f"{config.field} field ({field.sizes_in_words(config)})"
-    progress.note(f"{sizes}, {another}{much} · {photos}, {short_count(len(bank.pixels))} pixels")
+    progress.note(f"{sizes}, {another}{much} · {photos}, {short_count(len(dataset.pixels))} pixels")
     if words := field.step_in_words(config):
         progress.note(words)
 

@@ -15,7 +15,7 @@ from stages.effects.decisions import told_by_neighbours
 from stages.evaluate.image_metrics import ssim
 from stages.io.photos import evenly_spread
 from stages.train.config import Config
-from stages.train.data import ALL_MASKED, field_background, training_bank
+from stages.train.data import ALL_MASKED, field_background, training_dataset
 
 PROBE_RAYS = 2048
 PROBE_SEED = 0  # whatever the training's: curves of different seeds differ by what was trained, not by the pixels
@@ -58,7 +58,7 @@ def unseen_photos(
         return None
     assert config.downscale is not None, "plan() chooses it"
     try:
-        bank = training_bank(ingest, scene, split, config.downscale, progress).to(device)
+        dataset = training_dataset(ingest, scene, split, config.downscale, progress).to(device)
     except StageError as error:
         if split != "test" or error.code != ALL_MASKED:
             raise
@@ -66,8 +66,8 @@ def unseen_photos(
         return None
     shown_over = torch.tensor(field_background(config, scene), device=device)
     return Unseen(
-        make_probe(bank, PROBE_RAYS, shown_over, PROBE_SEED),
-        make_patches(bank, PATCHES, PATCH_SIDE, shown_over, PROBE_SEED),
+        make_probe(dataset, PROBE_RAYS, shown_over, PROBE_SEED),
+        make_patches(dataset, PATCHES, PATCH_SIDE, shown_over, PROBE_SEED),
         told_by_neighbours(scene, scene.of_split(split)),
     )
 

@@ -51,7 +51,9 @@ def short_warm_up(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(training_loop, "WARM_UP_STEPS", WARM_UP)
     monkeypatch.setattr("stages.train.training.write_parts", lambda *_: [])
     monkeypatch.setattr("stages.train.validation_images.PROBE_RAYS", 256)
-    monkeypatch.setattr("nerf.fields.occupancy_grid.EVERY", 32)  # measuring it is most of what so small a field costs
+    monkeypatch.setattr(
+        "nerf.fields.occupancy_grid.UPDATE_INTERVAL", 32
+    )  # measuring it is most of what so small a field costs
 
 
 @pytest.fixture

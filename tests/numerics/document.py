@@ -15,7 +15,7 @@ ELSEWHERE = {
     "nerf/kernels/torch/occupancy.py": "comparisons and bits, exact: "
     "tests/nerf/kernels/torch/test_occupancy.py; a cell that is "
     "no number counts as occupied",
-    "nerf/kernels/torch/early_termination.py": "sums of optical depth in float64, the lattice's step as marching "
+    "nerf/kernels/torch/early_termination.py": "sums of optical depth in float64, the step size as marching "
     "takes it: tests/nerf/kernels/test_early_termination.py",
     "nerf/kernels/torch/colour_sampling.py": "1 − exp(−x) as in compositing, of optical depth summed in float64; "
     "differences of it are off by 1e-7, and what is no number is left out and reaches the light behind it: "
@@ -23,7 +23,7 @@ ELSEWHERE = {
     "nerf/rendering/early_termination.py": "cuts rays where the light is below 1e-3: "
     "tests/nerf/fields/test_hash_grid.py",
     "nerf/fields/hash_grid.py": "puts rows together: tests/nerf/fields/test_hash_grid.py",
-    "nerf/fields/occupancy_grid.py": "σ times the lattice's step; the outermost cells, which reach to infinity, count "
+    "nerf/fields/occupancy_grid.py": "σ times the step size; the outermost cells, which reach to infinity, count "
     "half a cell within: tests/nerf/training/test_hash_grid_trainer.py",
     "nerf/fields/frustum_mask.py": "angles and distances of the middles of cells; the cells around them count as "
     "well: tests/nerf/fields/test_frustum_mask.py",

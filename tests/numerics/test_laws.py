@@ -1,4 +1,4 @@
-"""What must hold for all input: partition of light, order, continuity, flat pictures, lattices without a surface."""
+"""What must hold for all input: partition of light, order, continuity, flat pictures, grids without a surface."""
 
 import math
 
@@ -9,13 +9,13 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from nerf.fields.density_grid import Lattice as DensityLattice
+from nerf.fields.density_grid import DensityGrid
 from nerf.fields.positional_encoding import positional_encoding
 from nerf.geometry.contraction import contract, uncontract
 from nerf.geometry.rays import Rays, clip_to_box
-from nerf.kernels import BOX, Backend, Lattice, Samples, grid_layout, warp
+from nerf.kernels import BOX, Backend, RayStepping, Samples, grid_layout, warp
 from nerf.kernels import torch as reference
-from nerf.kernels.torch.occupancy import cell_numbers, occupied
+from nerf.kernels.torch.occupancy import binary_occupancy, cell_numbers
 from nerf.rendering.sampling import invert_cdf
 from nerf.rendering.volume_rendering import composite, volume_weights
 from stages.contract import StageError
@@ -137,9 +137,9 @@ def test_axis_parallel_rays_meet_the_box_where_it_is(towards: list[float], at: f
     t = torch.linspace(0, 10, 5001)
     inside = ((rays.origins + t[:, None] * directions).abs() <= BOX).all(-1).double().mean() * 10
     assert float(cut.far - cut.near) == pytest.approx(float(inside), abs=5e-3)
-    where, lattice = occupied(torch.full((8,), -1)), Lattice(0.05, 0.0, False, 8, 1000)
+    where, stepping = binary_occupancy(torch.full((8,), -1)), RayStepping(0.05, 0.0, False, 8, 1000)
     for backend in (reference, warp):
-        samples = backend.march(where, lattice, rays, torch.full((1,), 0.5))
+        samples = backend.march(where, stepping, rays, torch.full((1,), 0.5))
         assert ((samples.t >= cut.near) & (samples.t <= cut.far)).all()
         assert float(samples.dt.sum()) == pytest.approx(float(cut.far - cut.near), abs=0.051)
 
@@ -187,11 +187,11 @@ def test_ssim_of_flat_pictures_is_that_of_their_means(a: list[float], b: list[fl
 
 
 @pytest.mark.parametrize("density", [0.0, 1e-30, 3.0, 1e30])
-def test_a_lattice_without_a_surface_is_refused(density: float) -> None:
+def test_a_grid_without_a_surface_is_refused(density: float) -> None:
     """Empty, full, constant: no level lies strictly inside."""
     corner = torch.ones(3)
     with pytest.raises(StageError, match="no surface at density 7"):
-        extract_surface(DensityLattice(torch.full((6, 6, 6), density), -corner, corner), 7.0)
+        extract_surface(DensityGrid(torch.full((6, 6, 6), density), -corner, corner), 7.0)
 
 
 @pytest.mark.parametrize("density", [1e4, 1e30])
@@ -200,10 +200,10 @@ def test_a_block_of_full_vertices_is_a_closed_surface_and_a_single_one_is_too_th
 ) -> None:
     values = torch.zeros(7, 7, 7)
     values[2:5, 2:5, 2:5] = density
-    surface = extract_surface(DensityLattice(values, -torch.ones(3), torch.ones(3)), 7.0)
+    surface = extract_surface(DensityGrid(values, -torch.ones(3), torch.ones(3)), 7.0)
     assert is_watertight(surface) and np.isfinite(surface.vertices).all()
     assert 1 / 3 < np.abs(surface.vertices).max() < 2 / 3
     alone = torch.zeros(7, 7, 7)
     alone[3, 3, 3] = density
     with pytest.raises(StageError, match="too thin for the grid"):
-        extract_surface(DensityLattice(alone, -torch.ones(3), torch.ones(3)), 7.0)
+        extract_surface(DensityGrid(alone, -torch.ones(3), torch.ones(3)), 7.0)

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from nerf.fields.interface import Rendering
-from nerf.kernels import Backend, Lattice, Samples, grid_layout, warp
+from nerf.kernels import Backend, RayStepping, Samples, grid_layout, warp
 from nerf.kernels import torch as reference
 
 BACKENDS = pytest.mark.parametrize("backend", [reference, warp], ids=["torch", "warp"])
@@ -84,12 +84,12 @@ def test_a_point_that_is_not_a_number_has_such_features(backend: Backend, resolu
 
 @BACKENDS
 def test_weights_and_gradients_that_are_not_numbers_stay(backend: Backend) -> None:
-    lattice, weights = Lattice(0.01, 0.02, True, 8, 9), with_nan(torch.full((5,), 0.1))
-    assert backend.distortion(SAMPLES, weights, lattice)[0].isnan()
-    assert backend.distortion_backward(SAMPLES, weights, lattice, torch.ones(2))[0].isnan()
+    stepping, weights = RayStepping(0.01, 0.02, True, 8, 9), with_nan(torch.full((5,), 0.1))
+    assert backend.distortion(SAMPLES, weights, stepping)[0].isnan()
+    assert backend.distortion_backward(SAMPLES, weights, stepping, torch.ones(2))[0].isnan()
     opacity, far, distance = torch.ones(2), torch.full((2,), 9.0), torch.ones(2)
-    assert backend.depth_loss(SAMPLES, weights, opacity, far, distance, lattice)[0].isnan()
-    of_weights, of_opacity = backend.depth_loss_backward(SAMPLES, far, distance, lattice, torch.full((2,), math.nan))
+    assert backend.depth_loss(SAMPLES, weights, opacity, far, distance, stepping)[0].isnan()
+    of_weights, of_opacity = backend.depth_loss_backward(SAMPLES, far, distance, stepping, torch.full((2,), math.nan))
     assert of_weights[0].isnan() and of_opacity[0].isnan()
 
 

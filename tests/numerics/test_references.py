@@ -9,8 +9,8 @@ from mpmath import mp, mpf
 from torch import Tensor
 
 from nerf.fields.vanilla import SOFTPLUS_SHIFT
-from nerf.kernels import Lattice
-from nerf.kernels.torch.adam import LEAST_ROOT
+from nerf.kernels import RayStepping
+from nerf.kernels.torch.adam import EPSILON
 from pipeline.doctor.numerics import Case, error
 from pipeline.doctor.numerics.losses import GROWING
 from pipeline.doctor.numerics.matrix import CASES
@@ -37,13 +37,13 @@ def expansion(y: Row) -> Row:
     return [each / (m * (2 - m)) for each in y]
 
 
-def distance(s: Row, lattice: Lattice = FOLDED) -> Row:
-    step, cone = mpf(lattice.step), mpf(lattice.cone)
+def distance(s: Row, stepping: RayStepping = FOLDED) -> Row:
+    step, cone = mpf(stepping.step_size), mpf(stepping.cone_angle)
     return [step / cone * mp.exp(cone * each - 1) if cone * each > 1 else step * each for each in s]
 
 
 def coordinate(t: Row) -> Row:
-    step, cone = mpf(FOLDED.step), mpf(FOLDED.cone)
+    step, cone = mpf(FOLDED.step_size), mpf(FOLDED.cone_angle)
     return [(1 + mp.log(each * cone / step)) / cone if each * cone > step else each / step for each in t]
 
 
@@ -77,7 +77,7 @@ def spread(weights: Row, grows: bool) -> Row:
     at, length = ends()[:-1], [b - a for a, b in zip(ends(), ends()[1:], strict=False)]
     far = mpf(768 if grows else 3)
     t, dt = [far * (1 + each / 64) for each in at], [far / 64 * each for each in length]
-    from_there = mpf(GROWING.step) / mpf(GROWING.cone)
+    from_there = mpf(GROWING.step_size) / mpf(GROWING.cone_angle)
     m = [1 + mp.log(each / from_there) for each in t] if grows else t
     lengths = [b / a for a, b in zip(t, dt, strict=True)] if grows else dt
     pairs = [w * v * abs(a - b) for w, a in zip(weights, m, strict=True) for v, b in zip(weights, m, strict=True)]
@@ -104,7 +104,7 @@ def softplus(x: Row) -> Row:
 def adam(gradient: Row, mean: Row, square: Row) -> Row:
     g, m = gradient[0], mpf(0.9) * mean[0] + (1 - mpf(0.9)) * gradient[0]
     v = mpf(0.99) * square[0] + (1 - mpf(0.99)) * g * g
-    root = max(mpf(LEAST_ROOT), mp.sqrt(v / (1 - mpf(0.99) ** COUNT)))
+    root = max(mpf(EPSILON), mp.sqrt(v / (1 - mpf(0.99) ** COUNT)))
     return [-m / (1 - mpf(0.9) ** COUNT) / root if g else mpf(0)]
 
 

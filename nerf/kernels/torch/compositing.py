@@ -17,7 +17,7 @@ from jaxtyping import Float, Int32
 from torch import Tensor
 
 from nerf.fields.interface import Rendering
-from nerf.kernels import Lattice, Samples
+from nerf.kernels import RayStepping, Samples
 from nerf.kernels.torch.marching import normalised_distance
 
 OPAQUE = 800.0
@@ -39,18 +39,18 @@ def visible_samples(
     a random number in [0, 1), and a sample is kept where the sum reaches a whole number (systematic sampling;
     Carpenter et al. 1999), so that thin fog is sampled evenly. ``thin`` 0 keeps all.
     """
-    chance = _chance(sigma * samples.dt, thin)
-    of_thin = torch.where(chance < 1, chance, 0).double()
+    probability = _keep_probability(sigma * samples.dt, thin)
+    of_thin = torch.where(probability < 1, probability, 0).double()
     before = sums_before(samples, of_thin) + offset.double().index_select(0, samples.ray)
-    kept = ~(chance < 1) | ((before + of_thin).floor() > before.floor())
+    kept = ~(probability < 1) | ((before + of_thin).floor() > before.floor())
     index = (kept & (_stopping(samples, sigma).before >= threshold)).nonzero()[:, 0]
     starts = torch.searchsorted(index, samples.starts.long(), out_int32=True)
     index = index.int()
-    ray, t, dt = (each.index_select(0, index) for each in (samples.ray, samples.t, samples.dt / chance))
+    ray, t, dt = (each.index_select(0, index) for each in (samples.ray, samples.t, samples.dt / probability))
     return Samples(starts, ray, t, dt), index
 
 
-def _chance(tau: Float[Tensor, "samples"], thin: float) -> Float[Tensor, "samples"]:
+def _keep_probability(tau: Float[Tensor, "samples"], thin: float) -> Float[Tensor, "samples"]:
     """Of a sample to be kept; 1 for what is no number, that it may be noticed."""
     return torch.where(tau < thin, (tau / thin).clamp(min=MIN_KEEP_PROBABILITY), 1)
 
@@ -100,26 +100,26 @@ def composite_backward(
     return grad_sigma, light.weights[:, None] * grad_seen
 
 
-def distortion(samples: Samples, weights: Float[Tensor, "samples"], lattice: Lattice) -> Float[Tensor, "rays"]:
+def distortion(samples: Samples, weights: Float[Tensor, "samples"], stepping: RayStepping) -> Float[Tensor, "rays"]:
     """How far the weights of a ray are spread: sum_ij w_i w_j |m_i - m_j| + 1/3 sum_i w_i² l_i (Barron et al. 2022,
     eq. 15), in one pass since the samples are in order: the first sum is 2 sum_i w_i sum_{j<i} w_j (m_i - m_j).
 
-    Positions m and lengths l are measured as the lattice does, dm = dt / max(t_1, t), where steps grow from t_1 on
+    Positions m and lengths l are measured as step sizes grow, dm = dt / max(t_1, t), where steps grow from t_1 on
     (beyond it m is log t + const), and as distances if they do not.
 
     All in float64: m sum w_j - sum w_j m_j cancels for weights that stand close together far out.
     """
-    m, lengths = _measure(samples, lattice)
+    m, lengths = _measure(samples, stepping)
     w = weights.double()
     before, moment_before = sums_before(samples, torch.stack([w, w * m]))
     return _ray_sums(samples, 2 * w * (m * before - moment_before) + w.square() * lengths / 3).to(weights.dtype)
 
 
 def distortion_backward(
-    samples: Samples, weights: Float[Tensor, "samples"], lattice: Lattice, grad: Float[Tensor, "rays"]
+    samples: Samples, weights: Float[Tensor, "samples"], stepping: RayStepping, grad: Float[Tensor, "rays"]
 ) -> Float[Tensor, "samples"]:
     """Gradient of the weights: 2 sum_j w_j |m_i - m_j| + 2/3 w_i l_i."""
-    m, lengths = _measure(samples, lattice)
+    m, lengths = _measure(samples, stepping)
     w = weights.double()
     both = torch.stack([w, w * m])
     before, moment_before = sums_before(samples, both)
@@ -192,8 +192,8 @@ def _sums_ray_by_ray(
     return sums.to(values.dtype)
 
 
-def _measure(samples: Samples, lattice: Lattice) -> tuple[Float[Tensor, "samples"], Float[Tensor, "samples"]]:
-    """Positions and lengths in the measure of the lattice, float64."""
+def _measure(samples: Samples, stepping: RayStepping) -> tuple[Float[Tensor, "samples"], Float[Tensor, "samples"]]:
+    """Positions and lengths in the measure of the stepping, float64."""
     t, dt = samples.t.double(), samples.dt.double()
-    lengths = dt / (lattice.linear_until * (t / lattice.linear_until).clamp(min=1)) if lattice.cone else dt
-    return normalised_distance(lattice, t), lengths
+    lengths = dt / (stepping.linear_until * (t / stepping.linear_until).clamp(min=1)) if stepping.cone_angle else dt
+    return normalised_distance(stepping, t), lengths

@@ -1,5 +1,4 @@
-"""What holds between two waves of samples (nerf/rendering/early_termination.py): which rays still have light, and where
-they go on."""
+"""Between two rounds of ray marching (nerf/rendering/early_termination.py): which rays go on, and from where."""
 
 from collections.abc import Sequence
 
@@ -7,13 +6,13 @@ import torch
 from jaxtyping import Float, Float64, Int32
 from torch import Tensor
 
-from nerf.kernels import Lattice, Samples
+from nerf.kernels import RayStepping, Samples
 from nerf.kernels.torch.compositing import OPAQUE
 from nerf.kernels.torch.marching import s_to_t, t_to_s
 
 
 def finish_round(
-    lattice: Lattice,
+    stepping: RayStepping,
     samples: Samples,
     sigma: Float[Tensor, "samples"],
     threshold: float,
@@ -22,31 +21,31 @@ def finish_round(
     depth: Float64[Tensor, "rays"],
     near: Float[Tensor, "rays"],
 ) -> None:
-    """In place, after a wave of up to ``lattice.most_samples`` samples of each ray: ``depth`` grows by their optical
+    """In place, after a round of up to ``stepping.max_samples`` samples of each ray: ``depth`` grows by their optical
     depth, sum sigma dt, and ``near`` becomes where the ray goes on.
 
     That is where the interval behind its last sample's begins; ``far``, so that nothing is left of it, for a ray that
     had fewer samples than it might have had, or whose transmittance exp(-depth) is below ``threshold`` or no number.
     """
     depth.index_add_(0, samples.ray, (sigma * samples.dt).clamp(max=OPAQUE).double())
-    goes_on = (samples.starts.diff() == lattice.most_samples) & (torch.exp(-depth.to(sigma.dtype)) >= threshold)
+    goes_on = (samples.starts.diff() == stepping.max_samples) & (torch.exp(-depth.to(sigma.dtype)) >= threshold)
     ray = goes_on.nonzero()[:, 0]
     last = samples.t.index_select(0, samples.starts.index_select(0, ray + 1) - 1)
-    onward = s_to_t(lattice, t_to_s(lattice, last) + (1 - jitter.index_select(0, ray)))
+    onward = s_to_t(stepping, t_to_s(stepping, last) + (1 - jitter.index_select(0, ray)))
     near.copy_(far)
     near[ray] = torch.minimum(onward, far[ray])
 
 
-def pack_rounds(waves: Sequence[Samples]) -> tuple[Samples, Int32[Tensor, "samples"]]:
-    """The samples of several waves of the same rays packed ray by ray, and where each is among the waves' samples one
+def pack_rounds(rounds: Sequence[Samples]) -> tuple[Samples, Int32[Tensor, "samples"]]:
+    """The samples of several rounds of the same rays packed ray by ray, and where each is among the rounds' samples one
     after the other."""
-    counts = torch.stack([wave.starts.diff() for wave in waves])
-    starts = torch.stack([wave.starts for wave in waves]).sum(0, dtype=torch.int32)
-    first = starts[:-1] + counts.cumsum(0, dtype=torch.int32) - counts  # where each wave's samples of a ray go
-    ray, t, dt = (torch.cat(parts) for parts in zip(*(wave[1:] for wave in waves), strict=True))
+    counts = torch.stack([each.starts.diff() for each in rounds])
+    starts = torch.stack([each.starts for each in rounds]).sum(0, dtype=torch.int32)
+    first = starts[:-1] + counts.cumsum(0, dtype=torch.int32) - counts  # where each round's samples of a ray go
+    ray, t, dt = (torch.cat(parts) for parts in zip(*(each[1:] for each in rounds), strict=True))
     places = [
-        (first[number] - wave.starts[:-1]).index_select(0, wave.ray) + torch.arange(len(wave.ray), device=ray.device)
-        for number, wave in enumerate(waves)
+        (first[number] - each.starts[:-1]).index_select(0, each.ray) + torch.arange(len(each.ray), device=ray.device)
+        for number, each in enumerate(rounds)
     ]
     order = torch.empty_like(ray)
     order[torch.cat(places)] = torch.arange(len(ray), dtype=torch.int32, device=ray.device)

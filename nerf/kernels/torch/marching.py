@@ -6,58 +6,61 @@ from torch import Tensor
 
 from nerf.geometry.contraction import contract
 from nerf.geometry.rays import Rays, clip_to_box
-from nerf.kernels import BOX, CONTRACTED_BOX, Lattice, Occupied, Samples
+from nerf.kernels import BOX, CONTRACTED_BOX, BinaryOccupancy, RayStepping, Samples
 from nerf.kernels.torch.occupancy import cell_numbers, is_occupied
 
 
-def march(occupied: Occupied, lattice: Lattice, rays: Rays, jitter: Float[Tensor, "rays"]) -> Samples:
-    """The samples of the lattice that lie in occupied cells.
+def march(occupied: BinaryOccupancy, stepping: RayStepping, rays: Rays, jitter: Float[Tensor, "rays"]) -> Samples:
+    """The samples that lie in occupied cells.
 
     ``jitter`` in [0, 1) says where in its interval each sample of a ray stands; a sample that would stand at or
-    beyond far is left out. Empty cells are skipped without leaving the lattice: a sample's place does not depend on
+    beyond far is left out. Empty cells are skipped without leaving the stepping: a sample's place does not depend on
     what lies before it.
     """
-    if not lattice.contracted:
+    if not stepping.contracted:
         rays = clip_to_box(rays, -BOX, BOX)
-    first = t_to_s(lattice, rays.near)
-    counts = torch.ceil(t_to_s(lattice, rays.far) - first)
+    first = t_to_s(stepping, rays.near)
+    counts = torch.ceil(t_to_s(stepping, rays.far) - first)
     k = torch.arange(int(counts.max()) if len(counts) else 0, dtype=first.dtype, device=first.device)
-    t = s_to_t(lattice, (first + jitter)[:, None] + k)
+    t = s_to_t(stepping, (first + jitter)[:, None] + k)
     wanted = (k < counts[:, None]) & (t < rays.far[:, None])
     # The same as points_on(rays, t), laid out axis by axis: torch is several times faster without a row of 3 innermost.
     points = (rays.origins.T[:, :, None] + t * rays.directions.T[:, :, None]).movedim(0, -1)
-    points = unit_coordinates(points, lattice.contracted)
-    wanted &= is_occupied(occupied.bits, cell_numbers(lattice.cells, points))
-    if len(k) > lattice.most_samples:
-        wanted &= wanted.cumsum(-1) <= lattice.most_samples
+    points = unit_coordinates(points, stepping.contracted)
+    wanted &= is_occupied(occupied.bits, cell_numbers(stepping.occupancy_resolution, points))
+    if len(k) > stepping.max_samples:
+        wanted &= wanted.cumsum(-1) <= stepping.max_samples
     ray, k_wanted = wanted.nonzero(as_tuple=True)
-    start, end = (s_to_t(lattice, first[ray] + k_wanted + edge) for edge in (0, 1))
+    start, end = (s_to_t(stepping, first[ray] + k_wanted + edge) for edge in (0, 1))
     dt = torch.minimum(end, rays.far[ray]) - start
     return Samples(_starts_of(wanted.sum(-1)), ray.int(), t[wanted], dt)
 
 
-def s_to_t(lattice: Lattice, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-    """t(s) of :class:`nerf.kernels.Lattice`."""
-    if not lattice.cone:
-        return lattice.step * s
-    beyond = (lattice.cone * s - 1).clamp(min=0)
-    return torch.minimum(lattice.step * s, s.new_tensor(lattice.linear_until)) * torch.exp(beyond)
+def s_to_t(stepping: RayStepping, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """t(s) of :class:`nerf.kernels.RayStepping`."""
+    if not stepping.cone_angle:
+        return stepping.step_size * s
+    beyond = (stepping.cone_angle * s - 1).clamp(min=0)
+    return torch.minimum(stepping.step_size * s, s.new_tensor(stepping.linear_until)) * torch.exp(beyond)
 
 
-def t_to_s(lattice: Lattice, t: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+def t_to_s(stepping: RayStepping, t: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     """s(t), the inverse of :func:`s_to_t`."""
-    if not lattice.cone:
-        return t / lattice.step
-    linear_until = lattice.linear_until
-    return t.clamp(max=linear_until) / lattice.step + torch.log(t.clamp(min=linear_until) / linear_until) / lattice.cone
+    if not stepping.cone_angle:
+        return t / stepping.step_size
+    linear_until = stepping.linear_until
+    return (
+        t.clamp(max=linear_until) / stepping.step_size
+        + torch.log(t.clamp(min=linear_until) / linear_until) / stepping.cone_angle
+    )
 
 
-def normalised_distance(lattice: Lattice, t: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+def normalised_distance(stepping: RayStepping, t: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     """The measure m in which losses tell distances: dm = dt / max(t_1, t) where steps grow from t_1 on (beyond it m is
     log t + const), distances themselves if they do not."""
-    if not lattice.cone:
+    if not stepping.cone_angle:
         return t
-    relative = t / lattice.linear_until
+    relative = t / stepping.linear_until
     return relative.clamp(max=1) + torch.log(relative.clamp(min=1))
 
 

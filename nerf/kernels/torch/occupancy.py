@@ -1,4 +1,4 @@
-"""The density cache: how much light each cell of the unit cube may stop, and one bit for whether to look there.
+"""The occupancy grid: each cell of the unit cube has an optical thickness and a bit for whether it is occupied.
 
 Cells are numbered brick by brick, so that 64 neighbours share a word: the brick of 4³ cells around cell (x, y, z) has
 index b = ((x/4) B + y/4) B + z/4 with B bricks along each axis, and the cell has number 64 b + 16 (x mod 4) +
@@ -9,42 +9,43 @@ import torch
 from jaxtyping import Bool, Float, Int, Int32, Int64
 from torch import Tensor
 
-from nerf.kernels import Occupied
+from nerf.kernels import BinaryOccupancy
 
 BRICK_CELLS = 64
-MOST_CLEAR = 8  # bricks: a quarter of a cube of 128 cells, so that a ray crosses an empty one in a few hops
+MAX_EMPTY_DISTANCE = 8  # bricks: a quarter of a cube of 128 cells, so that a ray crosses an empty one in a few hops
 
 
 def scatter_max(
     cells: int,
-    thickness: Float[Tensor, "cache"],
+    optical_thickness: Float[Tensor, "cells"],
     points: Float[Tensor, "points 3"],
     values: Float[Tensor, "points"],
 ) -> None:
     """In place: every cell with a point becomes the largest of itself and its points' values, however many.
 
-    It is NaN from then on if one of these is: what is broken stays in sight (:func:`occupancy_bits`).
+    It is NaN from then on if one of these is: a broken field stays visible (:func:`occupancy_bits`).
     """
-    thickness.scatter_reduce_(0, cell_numbers(cells, points).long(), values, "amax")
+    optical_thickness.scatter_reduce_(0, cell_numbers(cells, points).long(), values, "amax")
 
 
-def occupancy_bits(thickness: Float[Tensor, "cache"], threshold: float) -> Int64[Tensor, "bricks"]:
-    """A bit for each cell thicker than ``threshold``, and for each whose thickness is not a number: left out, a cell
-    where the field is broken would look empty."""
-    occupied = ~(thickness <= threshold).view(-1, BRICK_CELLS)
-    return (occupied.long() << torch.arange(BRICK_CELLS, device=thickness.device)).sum(-1)
+def occupancy_bits(optical_thickness: Float[Tensor, "cells"], threshold: float) -> Int64[Tensor, "bricks"]:
+    """A bit for each cell whose optical thickness exceeds ``threshold`` or is NaN: left out, a cell where the field is
+    broken would look empty."""
+    occupied = ~(optical_thickness <= threshold).view(-1, BRICK_CELLS)
+    return (occupied.long() << torch.arange(BRICK_CELLS, device=optical_thickness.device)).sum(-1)
 
 
-def occupied(bits: Int64[Tensor, "bricks"]) -> Occupied:
-    """With the clearance of each brick. A clearance of n means that the cube of 2 n - 1 bricks per side around it holds
-    no occupied cell; it is 0 where the brick itself holds one, and at most MOST_CLEAR."""
+def binary_occupancy(bits: Int64[Tensor, "bricks"]) -> BinaryOccupancy:
+    """With the empty-space distance of each brick. A distance of n means that the cube of 2 n - 1 bricks per side
+    around it holds no occupied cell; it is 0 where the brick itself holds one, and at most
+    MAX_EMPTY_DISTANCE."""
     side = round(len(bits) ** (1 / 3))
     reached = (bits != 0).view(side, side, side)
     clear = torch.zeros_like(reached, dtype=torch.uint8)
-    for _ in range(MOST_CLEAR):
+    for _ in range(MAX_EMPTY_DISTANCE):
         clear += ~reached
         reached = grown(reached)
-    return Occupied(bits, clear.flatten())
+    return BinaryOccupancy(bits, clear.flatten())
 
 
 def grown(reached: Bool[Tensor, "side side side"]) -> Bool[Tensor, "side side side"]:

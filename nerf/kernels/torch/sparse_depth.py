@@ -10,7 +10,7 @@ of it being stopped there: finite wherever the light is, and an outlier pulls no
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf.kernels import Lattice, Samples
+from nerf.kernels import RayStepping, Samples
 from nerf.kernels.torch.marching import normalised_distance
 
 
@@ -20,7 +20,7 @@ def depth_loss(
     opacity: Float[Tensor, "rays"],
     far: Float[Tensor, "rays"],
     distance: Float[Tensor, "rays"],
-    lattice: Lattice,
+    stepping: RayStepping,
 ) -> Float[Tensor, "rays"]:
     """sum_i w_i |m(t_i) - m(d)| + U |m(far) - m(d)| of each ray, where U = 1 - opacity is the light that nothing stops
     and d the ``distance`` of its point; 0 for rays whose d is 0, of which none is known.
@@ -29,7 +29,7 @@ def depth_loss(
     where steps grow a tenth too far costs the same at any distance. In float64: logarithms of nearly the same
     distance cancel.
     """
-    of_samples, of_rest = _apart(samples, far, distance, lattice)
+    of_samples, of_rest = _apart(samples, far, distance, stepping)
     rest = (1 - opacity) * of_rest
     return rest.index_add(0, samples.ray, weights * of_samples).to(weights.dtype)
 
@@ -38,20 +38,20 @@ def depth_loss_backward(
     samples: Samples,
     far: Float[Tensor, "rays"],
     distance: Float[Tensor, "rays"],
-    lattice: Lattice,
+    stepping: RayStepping,
     grad: Float[Tensor, "rays"],
 ) -> tuple[Float[Tensor, "samples"], Float[Tensor, "rays"]]:
     """Gradients of the weights and of the opacities."""
-    of_samples, of_rest = _apart(samples, far, distance, lattice)
+    of_samples, of_rest = _apart(samples, far, distance, stepping)
     of_weights = grad.index_select(0, samples.ray) * of_samples
     return of_weights.to(grad.dtype), (-grad * of_rest).to(grad.dtype)
 
 
 def _apart(
-    samples: Samples, far: Float[Tensor, "rays"], distance: Float[Tensor, "rays"], lattice: Lattice
+    samples: Samples, far: Float[Tensor, "rays"], distance: Float[Tensor, "rays"], stepping: RayStepping
 ) -> tuple[Float[Tensor, "samples"], Float[Tensor, "rays"]]:
     """How far samples and the ends of rays are from their point, float64; 0 on rays without one."""
-    known, point = distance > 0, normalised_distance(lattice, distance.double())
-    of_samples = (normalised_distance(lattice, samples.t.double()) - point.index_select(0, samples.ray)).abs()
-    of_rest = (normalised_distance(lattice, far.double()) - point).abs()
+    known, point = distance > 0, normalised_distance(stepping, distance.double())
+    of_samples = (normalised_distance(stepping, samples.t.double()) - point.index_select(0, samples.ray)).abs()
+    of_rest = (normalised_distance(stepping, far.double()) - point).abs()
     return of_samples * known.index_select(0, samples.ray), of_rest * known

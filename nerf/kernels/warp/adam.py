@@ -4,28 +4,31 @@ import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf.kernels.torch.adam import LEAST_ROOT, MEAN_DECAY, SQUARE_DECAY
+from nerf.kernels.torch.adam import BETA1, BETA2, EPSILON
 from nerf.kernels.warp.launch import launch, vec16
 
 wp.set_module_options({"enable_backward": False})
 
-_MEAN_SHARE = wp.constant(1 - MEAN_DECAY)
-_SQUARE_SHARE = wp.constant(1 - SQUARE_DECAY)
-_LEAST_SQUARE = wp.constant(LEAST_ROOT**2)
+_ONE_MINUS_BETA1 = wp.constant(1 - BETA1)
+_ONE_MINUS_BETA2 = wp.constant(1 - BETA2)
+_EPSILON_SQUARED = wp.constant(EPSILON**2)
 _LANES = 16
 
 
 def adam(
     parameter: Float[Tensor, "*shape"],
     gradient: Float[Tensor, "*shape"],
-    mean: Float[Tensor, "*shape"],
-    square: Float[Tensor, "*shape"],
-    rate: float,
-    count: int,
+    exp_avg: Float[Tensor, "*shape"],
+    exp_avg_sq: Float[Tensor, "*shape"],
+    learning_rate: float,
+    step: int,
 ) -> None:
     """As in nerf.kernels.torch.adam."""
-    mean_share, square_share = 1 - MEAN_DECAY**count, 1 - SQUARE_DECAY**count
-    scales, tensors = (rate / mean_share, 1 / square_share), (parameter, gradient, mean, square)
+    bias_correction1, bias_correction2 = 1 - BETA1**step, 1 - BETA2**step
+    scales, tensors = (
+        (learning_rate / bias_correction1, 1 / bias_correction2),
+        (parameter, gradient, exp_avg, exp_avg_sq),
+    )
     whole, rest = divmod(parameter.numel(), _LANES)
     if rest:
         flat = [tensor.view(-1) for tensor in tensors]
@@ -68,43 +71,43 @@ def _roots(x: vec16):
 
 @wp.kernel
 def _adam16(
-    rate: float,
+    learning_rate: float,
     correction: float,
     parameter: wp.array[vec16],
     gradient: wp.array[vec16],
-    mean: wp.array[vec16],
-    square: wp.array[vec16],
+    exp_avg: wp.array[vec16],
+    exp_avg_sq: wp.array[vec16],
 ):
     i = wp.tid()
     g = gradient[i]
     live = _live(g)
     if wp.max(live) == 0.0:  # of the gradients themselves it would pass over what is not a number
         return
-    m = mean[i] + _MEAN_SHARE * wp.cw_mul(live, g - mean[i])
-    v = square[i] + _SQUARE_SHARE * wp.cw_mul(live, wp.cw_mul(g, g) - square[i])
-    root = _roots(wp.max(correction * v, vec16(_LEAST_SQUARE)))
-    parameter[i] = parameter[i] - wp.cw_div(wp.cw_mul(live, rate * m), root)
-    mean[i] = m
-    square[i] = v
+    m = exp_avg[i] + _ONE_MINUS_BETA1 * wp.cw_mul(live, g - exp_avg[i])
+    v = exp_avg_sq[i] + _ONE_MINUS_BETA2 * wp.cw_mul(live, wp.cw_mul(g, g) - exp_avg_sq[i])
+    root = _roots(wp.max(correction * v, vec16(_EPSILON_SQUARED)))
+    parameter[i] = parameter[i] - wp.cw_div(wp.cw_mul(live, learning_rate * m), root)
+    exp_avg[i] = m
+    exp_avg_sq[i] = v
     gradient[i] = vec16(0.0)
 
 
 @wp.kernel
 def _adam(
-    rate: float,
+    learning_rate: float,
     correction: float,
     parameter: wp.array[float],
     gradient: wp.array[float],
-    mean: wp.array[float],
-    square: wp.array[float],
+    exp_avg: wp.array[float],
+    exp_avg_sq: wp.array[float],
 ):
     i = wp.tid()
     g = gradient[i]
     if g == 0.0:
         return
-    m = mean[i] + _MEAN_SHARE * (g - mean[i])
-    v = square[i] + _SQUARE_SHARE * (g * g - square[i])
-    parameter[i] = parameter[i] - rate * m / wp.sqrt(wp.max(correction * v, _LEAST_SQUARE))
-    mean[i] = m
-    square[i] = v
+    m = exp_avg[i] + _ONE_MINUS_BETA1 * (g - exp_avg[i])
+    v = exp_avg_sq[i] + _ONE_MINUS_BETA2 * (g * g - exp_avg_sq[i])
+    parameter[i] = parameter[i] - learning_rate * m / wp.sqrt(wp.max(correction * v, _EPSILON_SQUARED))
+    exp_avg[i] = m
+    exp_avg_sq[i] = v
     gradient[i] = 0.0

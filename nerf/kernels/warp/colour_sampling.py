@@ -1,12 +1,12 @@
-"""What rays see of samples that are only drawn (``nerf.kernels.torch.colour_sampling``): a ray is one thread's loop."""
+"""Opacity-quantised colour sampling (``nerf.kernels.torch.colour_sampling``): a ray is one thread's loop."""
 
 import torch
 import warp as wp
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from nerf.kernels import Drawn, Samples
-from nerf.kernels.warp.compositing import stopped, thickness
+from nerf.kernels import ColourSamples, Samples
+from nerf.kernels.warp.compositing import opacity_of, optical_thickness
 from nerf.kernels.warp.launch import launch
 
 wp.set_module_options({"enable_backward": False})
@@ -15,28 +15,30 @@ wp.set_module_options({"enable_backward": False})
 def select_colour_samples(
     samples: Samples,
     sigma: Float[Tensor, "samples"],
-    quantum: float,
+    opacity_step: float,
     depth: Float64[Tensor, "rays"],
-    shown: Float[Tensor, "rays"],
-) -> Drawn:
+    accumulated: Float[Tensor, "rays"],
+) -> ColourSamples:
     """As in nerf.kernels.torch.colour_sampling."""
     rays, device = len(depth), sigma.device
     counts = torch.empty(rays, dtype=torch.int32, device=device)
     found, found_weights = torch.empty_like(samples.ray), torch.empty_like(sigma)
     packed = samples.starts, samples.dt, sigma
-    launch(_find, rays, *packed, 1 / quantum, depth, shown, counts, found, found_weights)
+    launch(_find, rays, *packed, 1 / opacity_step, depth, accumulated, counts, found, found_weights)
     starts = torch.nn.functional.pad(counts.cumsum(0, dtype=torch.int32), (1, 0))
     total = int(starts[-1])
     index, ray = (torch.empty(total, dtype=torch.int32, device=device) for _ in range(2))
     t, dt, weights = (torch.empty(total, device=device) for _ in range(3))
     kept = samples.starts, starts, samples.t, samples.dt, found, found_weights
     launch(_keep, rays, *kept, index, ray, t, dt, weights)
-    return Drawn(Samples(starts, ray, t, dt), index, weights)
+    return ColourSamples(Samples(starts, ray, t, dt), index, weights)
 
 
-def accumulate_colours(drawn: Drawn, colour: Float[Tensor, "kept 3"], seen: Float[Tensor, "rays 4"]) -> None:
+def accumulate_colours(
+    selected: ColourSamples, colour: Float[Tensor, "kept 3"], rendered: Float[Tensor, "rays 4"]
+) -> None:
     """As in nerf.kernels.torch.colour_sampling."""
-    launch(_add, len(seen), drawn.samples.starts, drawn.samples.t, drawn.weights, colour, seen)
+    launch(_add, len(rendered), selected.samples.starts, selected.samples.t, selected.weights, colour, rendered)
 
 
 @wp.kernel
@@ -44,9 +46,9 @@ def _find(
     starts: wp.array[int],
     lengths: wp.array[float],
     sigma: wp.array[float],
-    per_quantum: float,
+    steps_per_opacity: float,
     depth: wp.array[wp.float64],
-    shown: wp.array[float],
+    accumulated: wp.array[float],
     counts: wp.array[int],
     found: wp.array[int],
     weights: wp.array[float],
@@ -58,22 +60,22 @@ def _find(
     if start == end:
         return
     tau = depth[ray]
-    already = shown[ray]
-    quanta = wp.floor(stopped(float(tau)) * per_quantum + 0.5)
+    previous = accumulated[ray]
+    steps = wp.floor(opacity_of(float(tau)) * steps_per_opacity + 0.5)
     place = int(start)
     for i in range(start, end):
-        tau += wp.float64(thickness(sigma[i], lengths[i]))
-        here = stopped(float(tau))
-        now = wp.floor(here * per_quantum + 0.5)
+        tau += wp.float64(optical_thickness(sigma[i], lengths[i]))
+        here = opacity_of(float(tau))
+        now = wp.floor(here * steps_per_opacity + 0.5)
         # Written in any case, as a branch that is taken half of the time costs more.
         found[place] = i
-        weights[place] = here - already
-        keep = now > quanta
-        already = wp.where(keep, here, already)
+        weights[place] = here - previous
+        keep = now > steps
+        previous = wp.where(keep, here, previous)
         place += int(keep)
-        quanta = now
+        steps = now
     depth[ray] = tau
-    shown[ray] = already
+    accumulated[ray] = previous
     counts[ray] = place - start
 
 
@@ -109,7 +111,7 @@ def _add(
     distances: wp.array[float],
     weights: wp.array[float],
     colour: wp.array[wp.vec3],
-    seen: wp.array[wp.vec4],
+    rendered: wp.array[wp.vec4],
 ):
     ray = wp.tid()
     sum_colour = wp.vec3d()
@@ -118,4 +120,4 @@ def _add(
         sum_colour += wp.vec3d(weights[i] * colour[i])
         sum_distance += wp.float64(weights[i] * distances[i])
     more = wp.vec3(sum_colour)
-    seen[ray] += wp.vec4(more[0], more[1], more[2], float(sum_distance))
+    rendered[ray] += wp.vec4(more[0], more[1], more[2], float(sum_distance))

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int32
 from torch import Tensor
 
 from nerf.fields.interface import Rendering
-from nerf.kernels import Lattice, Samples
+from nerf.kernels import RayStepping, Samples
 from nerf.kernels.torch.compositing import MIN_KEEP_PROBABILITY, OPAQUE
 from nerf.kernels.warp.launch import launch
 
@@ -69,37 +69,37 @@ def composite_backward(
     return grad_sigma, grad_colour
 
 
-def distortion(samples: Samples, weights: Float[Tensor, "samples"], lattice: Lattice) -> Float[Tensor, "rays"]:
+def distortion(samples: Samples, weights: Float[Tensor, "samples"], stepping: RayStepping) -> Float[Tensor, "rays"]:
     """As in nerf.kernels.torch.compositing."""
     spread = weights.new_empty(len(samples.starts) - 1)
-    launch(_distortion, len(spread), grows_from(lattice), samples.starts, samples.t, samples.dt, weights, spread)
+    launch(_distortion, len(spread), grows_from(stepping), samples.starts, samples.t, samples.dt, weights, spread)
     return spread
 
 
 def distortion_backward(
-    samples: Samples, weights: Float[Tensor, "samples"], lattice: Lattice, grad: Float[Tensor, "rays"]
+    samples: Samples, weights: Float[Tensor, "samples"], stepping: RayStepping, grad: Float[Tensor, "rays"]
 ) -> Float[Tensor, "samples"]:
     """As in nerf.kernels.torch.compositing."""
     grad_weights = torch.empty_like(weights)
     packed = samples.starts, samples.t, samples.dt, weights
-    launch(_distortion_backward, len(grad), grows_from(lattice), *packed, grad, grad_weights)
+    launch(_distortion_backward, len(grad), grows_from(stepping), *packed, grad, grad_weights)
     return grad_weights
 
 
-def grows_from(lattice: Lattice) -> float:
+def grows_from(stepping: RayStepping) -> float:
     """The distance from which steps grow; 0 where they never do."""
-    return lattice.linear_until if lattice.cone else 0.0
+    return stepping.linear_until if stepping.cone_angle else 0.0
 
 
 @wp.func
-def thickness(sigma: float, length: float):
+def optical_thickness(sigma: float, length: float):
     """At most OPAQUE. Not by wp.min, which takes NaN for missing: a density that is no number would look solid."""
     tau = sigma * length
     return wp.where(tau > _OPAQUE, _OPAQUE, tau)
 
 
 @wp.func
-def stopped(tau: float):
+def opacity_of(tau: float):
     """1 - exp(-tau); by its series where the difference would lose digits."""
     if tau < 0.1:
         return tau * (1.0 - tau / 2.0 * (1.0 - tau / 3.0 * (1.0 - tau / 4.0 * (1.0 - tau / 5.0))))
@@ -107,7 +107,7 @@ def stopped(tau: float):
 
 
 @wp.func
-def _chance(tau: float, thin: float):
+def _keep_probability(tau: float, thin: float):
     """Of a sample to be kept; 1 for what is no number."""
     if tau < thin:
         return wp.max(tau / thin, _MIN_KEEP_PROBABILITY)
@@ -126,18 +126,18 @@ def _count_visible(
 ):
     ray = wp.tid()
     tau = wp.float64(0.0)
-    chances = wp.float64(offsets[ray])
+    probabilities = wp.float64(offsets[ray])
     count = int(0)
     i = int(starts[ray])
     end = starts[ray + 1]
     while i < end and wp.exp(-float(tau)) >= threshold:
-        more = thickness(sigma[i], lengths[i])
+        more = optical_thickness(sigma[i], lengths[i])
         tau += wp.float64(more)
-        chance = _chance(more, thin)
-        if chance < 1.0:
-            before = wp.floor(chances)
-            chances += wp.float64(chance)
-            count += int(wp.floor(chances) - before)
+        probability = _keep_probability(more, thin)
+        if probability < 1.0:
+            before = wp.floor(probabilities)
+            probabilities += wp.float64(probability)
+            count += int(wp.floor(probabilities) - before)
         else:
             count += 1
         i += 1
@@ -159,22 +159,22 @@ def _keep_visible(
     kept_lengths: wp.array[float],
 ):
     ray = wp.tid()
-    chances = wp.float64(offsets[ray])
+    probabilities = wp.float64(offsets[ray])
     place = int(kept_starts[ray])
     end = kept_starts[ray + 1]
     i = int(starts[ray])
     while place < end:
-        chance = _chance(thickness(sigma[i], lengths[i]), thin)
+        probability = _keep_probability(optical_thickness(sigma[i], lengths[i]), thin)
         kept = bool(True)
-        if chance < 1.0:
-            before = wp.floor(chances)
-            chances += wp.float64(chance)
-            kept = wp.floor(chances) > before
+        if probability < 1.0:
+            before = wp.floor(probabilities)
+            probabilities += wp.float64(probability)
+            kept = wp.floor(probabilities) > before
         if kept:
             index[place] = i
             rays[place] = ray
             kept_distances[place] = distances[i]
-            kept_lengths[place] = lengths[i] / chance
+            kept_lengths[place] = lengths[i] / probability
             place += 1
         i += 1
 
@@ -198,8 +198,8 @@ def _composite(
     sum_colour = wp.vec3d()
     sum_depth = wp.float64(0.0)
     for i in range(starts[ray], starts[ray + 1]):
-        more = thickness(sigma[i], lengths[i])
-        weight = wp.exp(-float(tau)) * stopped(more)
+        more = optical_thickness(sigma[i], lengths[i])
+        weight = wp.exp(-float(tau)) * opacity_of(more)
         tau += wp.float64(more)
         weights[i] = weight
         sum_colour += wp.vec3d(weight * colour[i])
@@ -207,7 +207,7 @@ def _composite(
     unstopped = wp.exp(-float(tau))
     seen[ray] = wp.vec3(sum_colour) + unstopped * background[ray]
     depth[ray] = float(sum_depth) + unstopped * far[ray]
-    opacity[ray] = stopped(float(tau))
+    opacity[ray] = opacity_of(float(tau))
 
 
 @wp.kernel
@@ -232,16 +232,16 @@ def _composite_backward(
     tau = wp.float64(0.0)
     for i in range(start, end):
         grad_sigma[i] = float(tau)  # what lies before the sample, for the way back
-        tau += wp.float64(thickness(sigma[i], lengths[i]))
+        tau += wp.float64(optical_thickness(sigma[i], lengths[i]))
     on_seen = grad_seen[ray]
     on_depth = grad_depth[ray]
     on_unstopped = wp.dot(on_seen, background[ray]) + on_depth * far[ray] - grad_opacity[ray]
     behind = wp.float64(wp.exp(-float(tau)) * on_unstopped)
     for step in range(end - start):
         i = end - 1 - step
-        more = thickness(sigma[i], lengths[i])
+        more = optical_thickness(sigma[i], lengths[i])
         before = wp.exp(-grad_sigma[i])
-        weight = before * stopped(more)
+        weight = before * opacity_of(more)
         g = grad_weights[i] + wp.dot(on_seen, colour[i]) + on_depth * distances[i]
         grad_sigma[i] = lengths[i] * (before * wp.exp(-more) * g - float(behind))
         grad_colour[i] = weight * on_seen
@@ -250,7 +250,7 @@ def _composite_backward(
 
 @wp.func
 def apart(grows_from: float, start: float, end: float):
-    """m(end) - m(start), where m is the distance as the lattice measures it: its logarithm where steps grow.
+    """m(end) - m(start), where m is the distance as the losses measure it: its logarithm where steps grow.
 
     No difference of two logarithms: each is off by 5e-7 far out, where neighbours differ by 1e-2. Nor the logarithm of
     end / start, whose rounding is 6e-8 of 1. With z = (end - start) / (end + start), whose difference is exact for

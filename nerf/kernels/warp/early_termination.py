@@ -1,4 +1,4 @@
-"""Between two waves of samples (``nerf.kernels.torch.early_termination``): a ray is one thread's loop."""
+"""Between two rounds of ray marching (``nerf.kernels.torch.early_termination``): a ray is one thread's loop."""
 
 from collections.abc import Sequence
 
@@ -7,8 +7,8 @@ import warp as wp
 from jaxtyping import Float, Float64, Int32
 from torch import Tensor
 
-from nerf.kernels import Lattice, Samples
-from nerf.kernels.warp.compositing import thickness
+from nerf.kernels import RayStepping, Samples
+from nerf.kernels.warp.compositing import optical_thickness
 from nerf.kernels.warp.launch import launch
 from nerf.kernels.warp.marching import s_to_t, t_to_s
 
@@ -16,7 +16,7 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 
 def finish_round(
-    lattice: Lattice,
+    stepping: RayStepping,
     samples: Samples,
     sigma: Float[Tensor, "samples"],
     threshold: float,
@@ -26,20 +26,20 @@ def finish_round(
     near: Float[Tensor, "rays"],
 ) -> None:
     """As in nerf.kernels.torch.early_termination."""
-    sizes, packed = lattice[:2], (samples.starts, samples.t, samples.dt)
-    launch(_finish_round, len(far), *sizes, lattice.most_samples, *packed, sigma, threshold, jitter, far, depth, near)
+    sizes, packed = stepping[:2], (samples.starts, samples.t, samples.dt)
+    launch(_finish_round, len(far), *sizes, stepping.max_samples, *packed, sigma, threshold, jitter, far, depth, near)
 
 
-def pack_rounds(waves: Sequence[Samples]) -> tuple[Samples, Int32[Tensor, "samples"]]:
+def pack_rounds(rounds: Sequence[Samples]) -> tuple[Samples, Int32[Tensor, "samples"]]:
     """As in nerf.kernels.torch.early_termination."""
-    starts, rays = sum(wave.starts for wave in waves[1:]) + waves[0].starts, len(waves[0].starts) - 1
-    total, device, before = sum(len(wave.t) for wave in waves), starts.device, 0
+    starts, rays = sum(each.starts for each in rounds[1:]) + rounds[0].starts, len(rounds[0].starts) - 1
+    total, device, before = sum(len(each.t) for each in rounds), starts.device, 0
     order, ray = (torch.empty(total, dtype=torch.int32, device=device) for _ in range(2))
     t, dt = (torch.empty(total, device=device) for _ in range(2))
     placed = starts[:-1].clone()
-    for wave in waves:
-        launch(_place_round, rays, wave.starts, wave.t, wave.dt, before, placed, order, ray, t, dt)
-        before += len(wave.t)
+    for each in rounds:
+        launch(_place_round, rays, each.starts, each.t, each.dt, before, placed, order, ray, t, dt)
+        before += len(each.t)
     return Samples(starts, ray, t, dt), order
 
 
@@ -63,7 +63,7 @@ def _finish_round(
     end = starts[ray + 1]
     tau = depth[ray]
     for i in range(start, end):
-        tau += wp.float64(thickness(sigma[i], lengths[i]))
+        tau += wp.float64(optical_thickness(sigma[i], lengths[i]))
     depth[ray] = tau
     onward = far[ray]
     if end - start == most and wp.exp(-float(tau)) >= threshold:

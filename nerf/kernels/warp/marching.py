@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf.geometry.rays import Rays
-from nerf.kernels import BOX, CONTRACTED_BOX, Lattice, Occupied, Samples
+from nerf.kernels import BOX, CONTRACTED_BOX, BinaryOccupancy, RayStepping, Samples
 from nerf.kernels.warp.launch import launch
 from nerf.kernels.warp.occupancy import cell_number
 
@@ -20,20 +20,26 @@ _HALF = wp.constant(CONTRACTED_BOX)
 _LARGEST = wp.constant(1.0e30)
 
 
-def march(occupied: Occupied, lattice: Lattice, rays: Rays, jitter: Float[Tensor, "rays"]) -> Samples:
+def march(occupied: BinaryOccupancy, stepping: RayStepping, rays: Rays, jitter: Float[Tensor, "rays"]) -> Samples:
     """As in nerf.kernels.torch.marching."""
     count, device = len(jitter), jitter.device
-    found = _scratch(count * lattice.most_samples, device)
+    found = _scratch(count * stepping.max_samples, device)
     counts = torch.empty(count, dtype=torch.int32, device=device)
     first = torch.empty(count, device=device)
     far = torch.empty(count, device=device)
-    sizes = lattice.step, lattice.cone, int(lattice.contracted), lattice.cells, lattice.most_samples
+    sizes = (
+        stepping.step_size,
+        stepping.cone_angle,
+        int(stepping.contracted),
+        stepping.occupancy_resolution,
+        stepping.max_samples,
+    )
     launch(_march, count, *occupied, *sizes, *rays, jitter, found, counts, first, far)
     starts = torch.nn.functional.pad(counts.cumsum(0, dtype=torch.int32), (1, 0))
     total = int(starts[-1])
     ray = torch.empty(total, dtype=torch.int32, device=device)
     t, dt = torch.empty(total, device=device), torch.empty(total, device=device)
-    launch(_place, count, *sizes[:2], lattice.most_samples, found, starts, first, jitter, far, ray, t, dt)
+    launch(_place, count, *sizes[:2], stepping.max_samples, found, starts, first, jitter, far, ray, t, dt)
     return Samples(starts, ray, t, dt)
 
 
@@ -69,7 +75,7 @@ def _scratch(length: int, device: torch.device) -> Tensor:
 
 @wp.func
 def s_to_t(step: float, cone: float, s: float):
-    """t(s) of nerf.kernels.Lattice."""
+    """t(s) of nerf.kernels.RayStepping."""
     if cone == 0.0:
         return step * s
     beyond = wp.max(cone * s - 1.0, 0.0)
@@ -177,7 +183,7 @@ def _free_distance(
 @wp.kernel
 def _march(
     bits: wp.array[wp.int64],
-    clearance: wp.array[wp.uint8],
+    empty_distance: wp.array[wp.uint8],
     step: float,
     cone: float,
     contracted: int,
@@ -221,7 +227,7 @@ def _march(
         number = cell_number(cells, cell[0], cell[1], cell[2])
         word = bits[number >> 6]
         if word == wp.int64(0):
-            clear = wp.max(1, int(clearance[number >> 6]))
+            clear = wp.max(1, int(empty_distance[number >> 6]))
             free = _free_distance(contracted, cells, cell, clear, u, point, inverse)
             # Rounded down by a thousandth of a step: a step too few is looked at again, one too many is lost.
             steps = t_to_s(step, cone, t + free) - s - 0.001

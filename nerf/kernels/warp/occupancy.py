@@ -15,19 +15,19 @@ __all__ = ["cell_corners", "occupancy_bits", "scatter_max"]  # cell_corners runs
 
 def scatter_max(
     cells: int,
-    thickness: Float[Tensor, "cache"],
+    optical_thickness: Float[Tensor, "cells"],
     points: Float[Tensor, "points 3"],
     values: Float[Tensor, "points"],
 ) -> None:
     """As in nerf.kernels.torch.occupancy."""
-    launch(_raise, len(points), cells, thickness, points, values)
-    launch(_spoil, len(points), cells, thickness, points, values)
+    launch(_raise, len(points), cells, optical_thickness, points, values)
+    launch(_spoil, len(points), cells, optical_thickness, points, values)
 
 
-def occupancy_bits(thickness: Float[Tensor, "cache"], threshold: float) -> Int64[Tensor, "bricks"]:
+def occupancy_bits(optical_thickness: Float[Tensor, "cells"], threshold: float) -> Int64[Tensor, "bricks"]:
     """As in nerf.kernels.torch.occupancy."""
-    bits = thickness.new_empty(len(thickness) // BRICK_CELLS, dtype=torch.int64)
-    launch(_occupancy_bits, len(bits), thickness, threshold, bits)
+    bits = optical_thickness.new_empty(len(optical_thickness) // BRICK_CELLS, dtype=torch.int64)
+    launch(_occupancy_bits, len(bits), optical_thickness, threshold, bits)
     return bits
 
 
@@ -50,27 +50,27 @@ def cell_of(cells: int, point: wp.vec3):
 
 
 @wp.kernel
-def _raise(cells: int, thickness: wp.array[float], points: wp.array[wp.vec3], values: wp.array[float]):
+def _raise(cells: int, optical_thickness: wp.array[float], points: wp.array[wp.vec3], values: wp.array[float]):
     """To the largest number; a maximum of Warp's takes NaN for missing, so a cell that holds one is let be."""
     i = wp.tid()
     cell = cell_of(cells, points[i])
-    if thickness[cell] < values[i]:
-        wp.atomic_max(thickness, cell, values[i])
+    if optical_thickness[cell] < values[i]:
+        wp.atomic_max(optical_thickness, cell, values[i])
 
 
 @wp.kernel
-def _spoil(cells: int, thickness: wp.array[float], points: wp.array[wp.vec3], values: wp.array[float]):
+def _spoil(cells: int, optical_thickness: wp.array[float], points: wp.array[wp.vec3], values: wp.array[float]):
     """Where a value is no number, nor is the cell's. A launch by itself: on a GPU a maximum might undo it."""
     i = wp.tid()
     if wp.isnan(values[i]):
-        thickness[cell_of(cells, points[i])] = values[i]
+        optical_thickness[cell_of(cells, points[i])] = values[i]
 
 
 @wp.kernel
-def _occupancy_bits(thickness: wp.array[float], threshold: float, bits: wp.array[wp.int64]):
+def _occupancy_bits(optical_thickness: wp.array[float], threshold: float, bits: wp.array[wp.int64]):
     brick = wp.tid()
     word = wp.int64(0)
     for cell in range(64):
-        if not (thickness[64 * brick + cell] <= threshold):
+        if not (optical_thickness[64 * brick + cell] <= threshold):
             word = word | (wp.int64(1) << wp.int64(cell))
     bits[brick] = word

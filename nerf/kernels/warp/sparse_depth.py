@@ -5,7 +5,7 @@ import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf.kernels import Lattice, Samples
+from nerf.kernels import RayStepping, Samples
 from nerf.kernels.warp.compositing import apart, grows_from
 from nerf.kernels.warp.launch import launch
 
@@ -18,12 +18,12 @@ def depth_loss(
     opacity: Float[Tensor, "rays"],
     far: Float[Tensor, "rays"],
     distance: Float[Tensor, "rays"],
-    lattice: Lattice,
+    stepping: RayStepping,
 ) -> Float[Tensor, "rays"]:
     """As in nerf.kernels.torch.sparse_depth."""
     loss = torch.zeros_like(distance)
     packed = samples.starts, samples.t, weights
-    launch(_depth_loss, len(distance), grows_from(lattice), *packed, opacity, far, distance, loss)
+    launch(_depth_loss, len(distance), grows_from(stepping), *packed, opacity, far, distance, loss)
     return loss
 
 
@@ -31,13 +31,13 @@ def depth_loss_backward(
     samples: Samples,
     far: Float[Tensor, "rays"],
     distance: Float[Tensor, "rays"],
-    lattice: Lattice,
+    stepping: RayStepping,
     grad: Float[Tensor, "rays"],
 ) -> tuple[Float[Tensor, "samples"], Float[Tensor, "rays"]]:
     """As in nerf.kernels.torch.sparse_depth."""
     of_weights, of_opacity = torch.zeros_like(samples.t), torch.zeros_like(distance)
     places = samples.starts, samples.t, far, distance
-    launch(_depth_loss_backward, len(distance), grows_from(lattice), *places, grad, of_weights, of_opacity)
+    launch(_depth_loss_backward, len(distance), grows_from(stepping), *places, grad, of_weights, of_opacity)
     return of_weights, of_opacity
 
 

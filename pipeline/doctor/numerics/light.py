@@ -1,12 +1,11 @@
-"""Cases of what rays see: samples placed by a density, volume rendering, what a density lattice stops."""
+"""Cases of what rays see: samples placed by a density, volume rendering, what a density grid stops."""
 
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from nerf.fields.density_grid import Lattice as DensityLattice
-from nerf.fields.density_grid import first_crossing, occupancy, optical_depth
+from nerf.fields.density_grid import DensityGrid, first_crossing, occupancy, optical_depth
 from nerf.fields.interface import Rendering
 from nerf.kernels import Backend, Samples
 from nerf.rendering.sampling import Spacing, invert_cdf, midpoint_edges, stratified
@@ -128,7 +127,7 @@ def _occupancy(density: Tensor, level: float = 7.0) -> Tensor:
 
 def _occupied(_: Backend, density: Tensor) -> Tensor:
     corner = torch.ones(3, device=density.device)
-    return occupancy(DensityLattice(density[None], -corner, corner), 7.0).values[0]
+    return occupancy(DensityGrid(density[None], -corner, corner), 7.0).values[0]
 
 
 def _crossing(values: Tensor) -> Tensor:

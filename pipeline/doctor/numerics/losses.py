@@ -5,38 +5,38 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nerf.kernels import Backend, Lattice, Samples
+from nerf.kernels import Backend, RayStepping, Samples
 from nerf.training.losses import HUBER_DELTA, huber_loss
 from nerf.training.metrics import PSNR_LIMIT, psnr
 from pipeline.doctor.numerics import Bound, Case
 from pipeline.doctor.numerics.light import N, light, packed
 from pipeline.doctor.numerics.space import decades
 
-EVEN, GROWING = Lattice(0.05, 0.0, False, 8, 100), Lattice(0.05, 0.2, True, 8, 100)
+EVEN, GROWING = RayStepping(0.05, 0.0, False, 8, 100), RayStepping(0.05, 0.2, True, 8, 100)
 FAR = 1000.0
 
 
-def _far_out(like: Tensor, lattice: Lattice) -> Samples:
-    """Packed samples far from the camera, in steps of 0.2 to 2 % of their distance, as the lattice's are: around 3
+def _far_out(like: Tensor, stepping: RayStepping) -> Samples:
+    """Packed samples far from the camera, in steps of 0.2 to 2 % of their distance, as ray steps are: around 3
     where steps do not grow, around 768 where they do. float32 and float64 share their places."""
-    samples, distance = packed(like), 768.0 if lattice.cone else 3.0
+    samples, distance = packed(like), 768.0 if stepping.cone_angle else 3.0
     return samples._replace(t=distance * (1 + samples.t / 64), dt=distance / 64 * samples.dt)
 
 
-def _distortion(lattice: Lattice) -> dict[str, Any]:
+def _distortion(stepping: RayStepping) -> dict[str, Any]:
     def reference(weights: Tensor) -> Tensor:
-        t, lengths = (part[:N] for part in _far_out(weights, lattice)[2:])
-        m = 1 + torch.log(t / lattice.linear_until) if lattice.cone else t
-        lengths = lengths / t if lattice.cone else lengths
+        t, lengths = (part[:N] for part in _far_out(weights, stepping)[2:])
+        m = 1 + torch.log(t / stepping.linear_until) if stepping.cone_angle else t
+        lengths = lengths / t if stepping.cone_angle else lengths
         pairs = weights[:, :, None] * weights[:, None] * (m[:, None] - m).abs()
         return (pairs.sum((1, 2)) + (weights.square() * lengths).sum(1) / 3)[:, None]
 
     def function(backend: Backend, weights: Tensor) -> Tensor:
-        return backend.distortion(_far_out(weights, lattice), weights.reshape(-1), lattice)[:, None]
+        return backend.distortion(_far_out(weights, stepping), weights.reshape(-1), stepping)[:, None]
 
     def backward(backend: Backend, grad: Tensor, weights: Tensor) -> tuple[Tensor]:
         flat = weights.reshape(-1)
-        return (backend.distortion_backward(_far_out(weights, lattice), flat, lattice, grad[:, 0]).view(-1, N),)
+        return (backend.distortion_backward(_far_out(weights, stepping), flat, stepping, grad[:, 0]).view(-1, N),)
 
     return {"function": function, "reference": reference, "backward": backward, "differentiable": 1, "kernels": True}
 

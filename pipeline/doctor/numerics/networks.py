@@ -6,16 +6,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nerf.fields import background as sky
-from nerf.fields import mlp as grid_mlp
+from nerf.fields import background, mlp
 from nerf.fields.mlp import DIRECTION, GEOMETRY, LARGEST_LOG_DENSITY, DensityPass, Weights
 from nerf.fields.vanilla import SOFTPLUS_SHIFT, shifted_softplus
 from nerf.kernels import Backend, GridLayout, Samples, grid_layout
-from nerf.kernels.torch.adam import LEAST_ROOT, MEAN_DECAY, SQUARE_DECAY
+from nerf.kernels.torch.adam import BETA1, BETA2, EPSILON
 from pipeline.doctor.numerics import Bound, Case
 from pipeline.doctor.numerics.space import decades, directions, uniform
 
-LAYOUT = grid_layout(levels=4, coarsest=6, finest=384, log2_rows=12, features=4)
+LAYOUT = grid_layout(num_levels=4, base_res=6, max_res=384, log2_hashmap_size=12, features_per_level=4)
 FEATURES = 20
 RATE, COUNT = 0.01, 3
 
@@ -25,7 +24,7 @@ def _table(like: Tensor) -> Tensor:
 
 
 def _weights(like: Tensor) -> Weights:
-    drawn = grid_mlp.initial_weights(FEATURES, DIRECTION, torch.Generator().manual_seed(8))
+    drawn = mlp.initial_weights(FEATURES, DIRECTION, torch.Generator().manual_seed(8))
     return Weights(*(part.to(like) for part in drawn))
 
 
@@ -120,28 +119,28 @@ def _harmonics(d: Tensor) -> Tensor:
 
 
 def _sigma(_: Backend, logarithm: Tensor) -> Tensor:
-    return grid_mlp.sigma_of(logarithm)[:, None]
+    return mlp.sigma_of(logarithm)[:, None]
 
 
 def _sigma_backward(backend: Backend, grad: Tensor, logarithm: Tensor) -> tuple[Tensor]:
     """Alone: of a network whose hidden layer is silent, and whose colours ask for nothing."""
     geometry = torch.nn.functional.pad(logarithm, (0, GEOMETRY - 1))
-    features, sigma = torch.zeros(len(logarithm), FEATURES).to(logarithm), grid_mlp.sigma_of(geometry)
+    features, sigma = torch.zeros(len(logarithm), FEATURES).to(logarithm), mlp.sigma_of(geometry)
     done = DensityPass(features, geometry, sigma)
     of_geometry = torch.zeros_like(geometry)
-    grid_mlp.density_backward(_weights(logarithm), backend, done, grad[:, 0], of_geometry)
+    mlp.density_backward(_weights(logarithm), backend, done, grad[:, 0], of_geometry)
     return (of_geometry[:, :1],)
 
 
 def _density(_: Backend, features: Tensor) -> Tensor:
-    return grid_mlp.density_forward(_weights(features), features).geometry
+    return mlp.density_forward(_weights(features), features).geometry
 
 
 def _density_backward(backend: Backend, grad: Tensor, features: Tensor) -> tuple[Tensor]:
     weights = _weights(features)
-    done = grid_mlp.density_forward(weights, features)
+    done = mlp.density_forward(weights, features)
     none = torch.zeros_like(features[:, 0])
-    return (grid_mlp.density_backward(weights, backend, done, none, grad.clone()).features,)
+    return (mlp.density_backward(weights, backend, done, none, grad.clone()).features,)
 
 
 def _density_plainly(features: Tensor) -> Tensor:
@@ -157,14 +156,14 @@ def _each(like: Tensor) -> Samples:
 
 def _colour(backend: Backend, geometry: Tensor, harmonics: Tensor) -> Tensor:
     weights = _weights(geometry)
-    of_rays = grid_mlp.ray_hidden(weights, harmonics)
-    return grid_mlp.colour_forward(weights, backend, _each(geometry), geometry, of_rays).colour
+    of_rays = mlp.ray_hidden(weights, harmonics)
+    return mlp.colour_forward(weights, backend, _each(geometry), geometry, of_rays).colour
 
 
 def _colour_backward(backend: Backend, grad: Tensor, geometry: Tensor, harmonics: Tensor) -> tuple[Tensor, Tensor]:
     weights, samples = _weights(geometry), _each(geometry)
-    done = grid_mlp.colour_forward(weights, backend, samples, geometry, grid_mlp.ray_hidden(weights, harmonics))
-    gradients = grid_mlp.colour_backward(weights, backend, samples, done, harmonics, grad)
+    done = mlp.colour_forward(weights, backend, samples, geometry, mlp.ray_hidden(weights, harmonics))
+    gradients = mlp.colour_backward(weights, backend, samples, done, harmonics, grad)
     return gradients.geometry, gradients.harmonics
 
 
@@ -174,22 +173,28 @@ def _colour_plainly(geometry: Tensor, harmonics: Tensor) -> Tensor:
     return torch.sigmoid(hidden @ weights.colour_out.T)
 
 
-def _sky_directions(like: Tensor) -> Tensor:
+def _background_directions(like: Tensor) -> Tensor:
     return torch.nn.functional.normalize(_dyadic(directions(12, 512))).to(like)
 
 
 def _sky(backend: Backend, table: Tensor) -> Tensor:
-    return sky.background_colour(backend, table, _sky_directions(table))
+    return background.background_colour(backend, table, _background_directions(table))
 
 
 def _sky_backward(backend: Backend, grad: Tensor, table: Tensor) -> tuple[Tensor]:
-    directions = _sky_directions(table)
-    return (sky.background_backward(backend, directions, sky.background_colour(backend, table, directions), grad),)
+    directions = _background_directions(table)
+    return (
+        background.background_backward(
+            backend, directions, background.background_colour(backend, table, directions), grad
+        ),
+    )
 
 
 def _sky_plainly(table: Tensor) -> Tensor:
-    on_sphere = (_sky_directions(torch.zeros(1)).to(table) + 1) / 2
-    return torch.sigmoid(_trilinear(table, on_sphere, sky.LAYOUT).view(len(on_sphere), -1, 4).sum(1))[:, :3]
+    on_sphere = (_background_directions(torch.zeros(1)).to(table) + 1) / 2
+    return torch.sigmoid(_trilinear(table, on_sphere, background.BACKGROUND_LAYOUT).view(len(on_sphere), -1, 4).sum(1))[
+        :, :3
+    ]
 
 
 def _adam(backend: Backend, gradient: Tensor, mean: Tensor, square: Tensor) -> Tensor:
@@ -200,10 +205,10 @@ def _adam(backend: Backend, gradient: Tensor, mean: Tensor, square: Tensor) -> T
 
 
 def _adam_plainly(gradient: Tensor, mean: Tensor, square: Tensor) -> Tensor:
-    m = MEAN_DECAY * mean + (1 - MEAN_DECAY) * gradient
-    v = SQUARE_DECAY * square + (1 - SQUARE_DECAY) * gradient.square()
-    root = (v / (1 - SQUARE_DECAY**COUNT)).sqrt().clamp(min=LEAST_ROOT)
-    return torch.where(gradient != 0, -m / (1 - MEAN_DECAY**COUNT) / root, 0)
+    m = BETA1 * mean + (1 - BETA1) * gradient
+    v = BETA2 * square + (1 - BETA2) * gradient.square()
+    root = (v / (1 - BETA2**COUNT)).sqrt().clamp(min=EPSILON)
+    return torch.where(gradient != 0, -m / (1 - BETA1**COUNT) / root, 0)
 
 
 def _hard_gradients() -> tuple[Tensor, Tensor, Tensor]:
@@ -215,7 +220,9 @@ def _hard_gradients() -> tuple[Tensor, Tensor, Tensor]:
 
 
 LOGARITHMS = torch.tensor([[-1e30], [-200.0], [-88.0], [-1e-45], [0.0], [14.999], [15.0], [15.000001], [88.0], [1e30]])
-SKY_SIZES = torch.tensor([0, 1e-38, 1.0, 30.0, 1.0]).repeat(sky.LAYOUT.rows)[: sky.LAYOUT.rows, None]
+BACKGROUND_SIZES = torch.tensor([0, 1e-38, 1.0, 30.0, 1.0]).repeat(background.BACKGROUND_LAYOUT.rows)[
+    : background.BACKGROUND_LAYOUT.rows, None
+]
 
 CASES = [
     Case(
@@ -273,7 +280,7 @@ CASES = [
         hazard="levels cancel: a logit is off by half an ulp of the largest feature; 1 − c is 0 beyond 17",
         answer="accepted, as for the colour network: where features are that large, the colour is saturated",
         tried="features of size 1, 0, 1e-38 and 30 in 512 directions",
-        typical=lambda: (uniform(13, -1, 1, sky.LAYOUT.rows, 4) * SKY_SIZES,),
+        typical=lambda: (uniform(13, -1, 1, background.BACKGROUND_LAYOUT.rows, 4) * BACKGROUND_SIZES,),
         extreme=lambda: (torch.zeros(0, 4),),
         function=_sky,
         reference=_sky_plainly,

@@ -1,4 +1,4 @@
-"""Cases of where things are: encoding, contraction, points on rays, boxes, the lattice of samples."""
+"""Cases of where things are: encoding, contraction, points on rays, boxes, ray stepping."""
 
 import torch
 from torch import Tensor
@@ -6,12 +6,12 @@ from torch import Tensor
 from nerf.fields.positional_encoding import positional_encoding
 from nerf.geometry.contraction import contract, uncontract
 from nerf.geometry.rays import Rays, clip_to_box, points_on
-from nerf.kernels import BOX, CONTRACTED_BOX, Backend, Lattice, Samples
+from nerf.kernels import BOX, CONTRACTED_BOX, Backend, RayStepping, Samples
 from nerf.kernels.torch.marching import s_to_t, t_to_s
 from pipeline.doctor.numerics import Bound, Case
 
 OCTAVES = 16
-FOLDED = Lattice(step=0.002, cone=0.008, contracted=True, cells=128, most_samples=1024)
+FOLDED = RayStepping(step_size=0.002, cone_angle=0.008, contracted=True, occupancy_resolution=128, max_samples=1024)
 PER_RAY = 4
 
 
@@ -112,14 +112,14 @@ def _points_on(_: Backend, origins: Tensor, towards: Tensor, t: Tensor) -> Tenso
 
 
 def _distance(s: Tensor) -> Tensor:
-    beyond = FOLDED.cone * s > 1
-    grown = FOLDED.linear_until * torch.exp(torch.where(beyond, FOLDED.cone * s - 1, 0))
-    return torch.where(beyond, grown, FOLDED.step * s)
+    beyond = FOLDED.cone_angle * s > 1
+    grown = FOLDED.linear_until * torch.exp(torch.where(beyond, FOLDED.cone_angle * s - 1, 0))
+    return torch.where(beyond, grown, FOLDED.step_size * s)
 
 
 def _coordinate(t: Tensor) -> Tensor:
     relative = t / FOLDED.linear_until
-    return torch.where(relative > 1, 1 + torch.log(relative.clamp(min=1)), relative) / FOLDED.cone
+    return torch.where(relative > 1, 1 + torch.log(relative.clamp(min=1)), relative) / FOLDED.cone_angle
 
 
 def _interval(s: Tensor) -> Tensor:

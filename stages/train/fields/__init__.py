@@ -73,11 +73,11 @@ class Field(Protocol):
         self,
         config: Config,
         scene: "Scene",
-        bank: "RayDataset",
+        dataset: "RayDataset",
         seed: int,
         effects: ImageEffects,
     ) -> FieldTrainer:
-        """A fresh field with its trainer, where ``bank`` is."""
+        """A fresh field with its trainer, where ``dataset`` is."""
         ...
 
 
@@ -97,10 +97,10 @@ def with_defaults(config: Config) -> Config:
 def make_trainer(
     config: Config,
     scene: "Scene",
-    bank: "RayDataset",
+    dataset: "RayDataset",
     seed: int,
     effects: ImageEffects = NO_EFFECTS,
 ) -> FieldTrainer:
-    """A fresh field of the kind that ``config`` asks for, with its trainer, where ``bank`` is. ``effects`` stand
+    """A fresh field of the kind that ``config`` asks for, with its trainer, where ``dataset`` is. ``effects`` stand
     between it and the photos."""
-    return field_of(config).make_trainer(config, scene, bank, seed, effects)
+    return field_of(config).make_trainer(config, scene, dataset, seed, effects)

@@ -143,7 +143,7 @@ def memory_bytes(config: Config, workers: int) -> float:
     """Memory on the CPU that training takes beside the photos, so many chunks of work at a time."""
     settings = field_settings(config, sky=False)  # which is small beside the rest
     assert config.batch_samples, "plan() chooses it"
-    return TABLE_COPIES * 4 * settings.features * settings.layout.rows + SAMPLE_BYTES * config.batch_samples
+    return TABLE_COPIES * 4 * settings.features_per_level * settings.layout.rows + SAMPLE_BYTES * config.batch_samples
 
 
 def memory_advice(config: Config) -> tuple[str, str]:
@@ -168,21 +168,22 @@ def sizes_in_words(config: Config) -> str:
 
 def step_in_words(config: Config) -> str:
     """How a step is divided and what computes it, and where samples stand along a ray."""
-    lattice = field_settings(config, sky=False).lattice
-    growing = f", from {lattice.linear_until:g} on every {lattice.cone:.1%} of the distance" if lattice.cone else ""
+    stepping = field_settings(config, sky=False).stepping
+    cone = f", from {stepping.linear_until:g} on every {stepping.cone_angle:.1%} of the distance"
+    growing = cone if stepping.cone_angle else ""
     parts = f"{config.chunks} part{'' if config.chunks == 1 else 's'}"
     step = f"{config.batch_samples:,} colours a step in {parts}, by {config.backend}"
-    return f"{step} · samples every {lattice.step:.2g} scene units{growing}"
+    return f"{step} · samples every {stepping.step_size:.2g} scene units{growing}"
 
 
 def make_trainer(
-    config: Config, scene: "Scene", bank: "RayDataset", seed: int, effects: ImageEffects
+    config: Config, scene: "Scene", dataset: "RayDataset", seed: int, effects: ImageEffects
 ) -> HashGridTrainer:
-    """A fresh field with its trainer, where ``bank`` is."""
+    """A fresh field with its trainer, where ``dataset`` is."""
     assert config.backend, "plan() chooses it"
-    backend = load_backend(config.backend, bank.device.type)
-    model = HashGridField(field_settings(config, has_background_model(config, scene)), seed, backend).to(bank.device)
-    return HashGridTrainer(model, bank, _trainer_settings(config, scene, seed), effects)
+    backend = load_backend(config.backend, dataset.device.type)
+    model = HashGridField(field_settings(config, has_background_model(config, scene)), seed, backend).to(dataset.device)
+    return HashGridTrainer(model, dataset, _trainer_settings(config, scene, seed), effects)
 
 
 def field_settings(config: Config, sky: bool) -> HashGridSettings:
@@ -193,17 +194,17 @@ def field_settings(config: Config, sky: bool) -> HashGridSettings:
     assert config.contracted is not None and config.view_dependence is not None, "plan() takes them from stage effects"
     shortest = 2 * CONTRACTED_BOX / (_steps_across(config.finest) * config.ray_samples)
     return HashGridSettings(
-        levels=config.levels,
-        log2_rows=config.log2_rows,
-        coarsest=min(BASE_RES[config.space], config.finest),
-        finest=config.finest,
+        num_levels=config.levels,
+        log2_hashmap_size=config.log2_rows,
+        base_res=min(BASE_RES[config.space], config.finest),
+        max_res=config.finest,
         contracted=config.contracted,
-        steps=max(1, round(config.ray_samples * min(math.sqrt(3) * config.finest, MAX_STEPS))),
-        shortest_step=shortest,
-        cone=shortest / EVEN_UNTIL,
-        most_samples=math.ceil(MAX_SAMPLES * max(1.0, config.ray_samples)),
+        diagonal_steps=max(1, round(config.ray_samples * min(math.sqrt(3) * config.finest, MAX_STEPS))),
+        min_step_size=shortest,
+        cone_angle=shortest / EVEN_UNTIL,
+        max_samples_per_ray=math.ceil(MAX_SAMPLES * max(1.0, config.ray_samples)),
         view_dependence=config.view_dependence,
-        sky=sky,
+        background_model=sky,
     )
 
 

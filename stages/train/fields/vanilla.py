@@ -121,14 +121,14 @@ def step_in_words(config: Config) -> str | None:
 
 
 def make_trainer(
-    config: Config, scene: "Scene", bank: "RayDataset", seed: int, effects: ImageEffects
+    config: Config, scene: "Scene", dataset: "RayDataset", seed: int, effects: ImageEffects
 ) -> VanillaTrainer:
-    """A fresh field with its trainer, where ``bank`` is."""
+    """A fresh field with its trainer, where ``dataset`` is."""
     assert config.batch_rays is not None and config.learning_rate is not None, "plan() chooses them"
-    model = VanillaNerf(field_settings(config), seed).to(bank.device)
+    model = VanillaNerf(field_settings(config), seed).to(dataset.device)
     rates = (config.learning_rate, config.learning_rate * FINAL_LEARNING_RATE)
     settings = VanillaTrainerSettings(config.batch_rays, seed, training_background(config, scene), *rates)
-    return VanillaTrainer(model, bank, settings, effects)
+    return VanillaTrainer(model, dataset, settings, effects)
 
 
 def field_settings(config: Config) -> VanillaSettings:

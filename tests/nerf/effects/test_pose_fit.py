@@ -9,7 +9,9 @@ from nerf.geometry.rays import Rays
 from nerf.kernels import torch as reference
 
 SMALLER = 1 / 16  # a power of two: numbers that differ by it have the same digits
-FIELD = HashGridSettings(levels=2, log2_rows=10, coarsest=4, finest=16, steps=32, occupancy_resolution=16)
+FIELD = HashGridSettings(
+    num_levels=2, log2_hashmap_size=10, base_res=4, max_res=16, diagonal_steps=32, occupancy_resolution=16
+)
 
 
 class Small(HashGridField):

@@ -1,4 +1,4 @@
-"""The density lattice: exact where its interpolation is exact, and rays that lose light at the right place."""
+"""The density grid: exact where its interpolation is exact, and rays that lose light at the right place."""
 
 import math
 
@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from nerf.fields.density_grid import (
-    Lattice,
+    DensityGrid,
     along,
     first_crossing,
     median_depth,
@@ -51,18 +51,18 @@ def make_rays(origins, directions, near=0.0, far=10.0):
 
 
 def test_values_lie_at_the_vertices_and_the_corners_on_the_box():
-    lattice = sample_density_grid(Field(linear), 7, LOW, HIGH)
-    assert lattice.values.shape == (7, 7, 7)
+    grid = sample_density_grid(Field(linear), 7, LOW, HIGH)
+    assert grid.values.shape == (7, 7, 7)
     index = torch.tensor([[0, 0, 0], [6, 6, 6], [1, 4, 2]])
-    points = LOW + index * lattice.spacing()
-    torch.testing.assert_close(lattice.values[tuple(index.T)], linear(points))
+    points = LOW + index * grid.spacing()
+    torch.testing.assert_close(grid.values[tuple(index.T)], linear(points))
     torch.testing.assert_close(points[1], HIGH)
 
 
 def test_a_long_box_has_nearly_cubic_voxels():
-    lattice = sample_density_grid(Field(linear), 41, LOW, torch.tensor([0.9, 0.0, -0.75]))
-    assert lattice.values.shape == (41, 21, 4)
-    assert float(lattice.spacing().max() / lattice.spacing().min()) < 1.2
+    grid = sample_density_grid(Field(linear), 41, LOW, torch.tensor([0.9, 0.0, -0.75]))
+    assert grid.values.shape == (41, 21, 4)
+    assert float(grid.spacing().max() / grid.spacing().min()) < 1.2
 
 
 def test_the_chunk_size_changes_nothing_and_progress_is_told():
@@ -80,7 +80,7 @@ def test_no_gradient_is_recorded():
 
 @pytest.mark.parametrize(("resolution", "high"), [(1, HIGH), (8, LOW), (8, torch.tensor([0.9, -0.9, 0.9]))])
 def test_boxes_and_resolutions_without_a_voxel_are_refused(resolution, high):
-    with pytest.raises(ValueError, match="a lattice needs a box and two vertices per edge"):
+    with pytest.raises(ValueError, match="a grid needs a box and two vertices per edge"):
         sample_density_grid(Field(linear), resolution, LOW, high)
 
 
@@ -89,15 +89,15 @@ def test_interpolation_is_exact_for_trilinear_functions_and_zero_outside():
         return (1 + p[..., 0]) * (2 - p[..., 1]) * (3 + p[..., 2])
 
     box = torch.tensor([1.0, 1.0, 1.0])
-    lattice = sample_density_grid(Field(product), 5, -box, box)
+    grid = sample_density_grid(Field(product), 5, -box, box)
     points = torch.rand(500, 3, generator=torch.Generator().manual_seed(0)) * 2 - 1
-    torch.testing.assert_close(trilinear(lattice, points), product(points), atol=2e-5, rtol=1e-5)
-    assert (trilinear(lattice, points + torch.tensor([5.0, 0, 0])) == 0).all()
+    torch.testing.assert_close(trilinear(grid, points), product(points), atol=2e-5, rtol=1e-5)
+    assert (trilinear(grid, points + torch.tensor([5.0, 0, 0])) == 0).all()
 
 
 def test_occupancy_is_a_half_at_the_level_and_bounded_over_sixty_decades():
     density = torch.tensor([0.0, 1e-30, 1.0, 7.0, 1e4, 1e30])
-    values = occupancy(Lattice(density.reshape(1, 1, 6), LOW, HIGH), 7.0).values.flatten()
+    values = occupancy(DensityGrid(density.reshape(1, 1, 6), LOW, HIGH), 7.0).values.flatten()
     assert float(values[3]) == pytest.approx(0.5, abs=1e-7)
     assert values[0] == 0 and values[-1] == 1 and (values.diff() >= 0).all()
 
@@ -115,33 +115,33 @@ def test_first_crossing_is_the_first_exact_on_lines_and_infinite_without_one():
 
 @pytest.mark.parametrize(("density", "near"), [(2.0, 0.0), (50.0, 0.0), (2.0, 2.3), (0.3, 0.0)])
 def test_light_stops_half_a_transmittance_behind_the_wall(density, near):
-    lattice = Lattice(torch.full((20, 20, 20), density), LOW, HIGH)
+    grid = DensityGrid(torch.full((20, 20, 20), density), LOW, HIGH)
     rays = make_rays([[-3.0, 0.1, 0.2]], [[1.0, 0, 0]], near=near)
     expected = max(near, 2.1) + math.log(2) / density
     expected = expected if expected < 3.9 else math.inf
-    assert float(median_depth(lattice, rays, 200)) == pytest.approx(expected, rel=1e-4)
+    assert float(median_depth(grid, rays, 200)) == pytest.approx(expected, rel=1e-4)
 
 
 def test_what_rays_meet_is_what_lies_there():
-    lattice = sample_density_grid(Field(linear), 9, LOW, HIGH)
+    grid = sample_density_grid(Field(linear), 9, LOW, HIGH)
     rays = clip_to_box(make_rays([[-2.0, 0.3, 0.1]], [[1.0, -0.1, 0.2]]), LOW, HIGH)
     t = ray_distances(rays, 12)
     points = rays.origins[:, None] + t[..., None] * rays.directions[:, None]
-    torch.testing.assert_close(along(lattice, rays, t)[:, 1:-1], linear(points)[:, 1:-1], atol=1e-4, rtol=0)
+    torch.testing.assert_close(along(grid, rays, t)[:, 1:-1], linear(points)[:, 1:-1], atol=1e-4, rtol=0)
 
 
 def test_smoothing_averages_neighbours_and_takes_what_is_beyond_the_box_for_its_side():
     values = torch.zeros(5, 4, 3)
     values[2, 0, 1] = 1.0
-    once = smoothed(Lattice(values, LOW, HIGH), 1).values
+    once = smoothed(DensityGrid(values, LOW, HIGH), 1).values
     assert float(once[2, 0, 1]) == 0.5 * 0.75 * 0.5 and float(once[1, 1, 2]) == 0.25**3
-    assert float(smoothed(Lattice(torch.full((3, 4, 5), 0.3), LOW, HIGH), 3).values.std()) < 1e-7
-    assert torch.equal(smoothed(Lattice(values, LOW, HIGH), 0).values, values)
+    assert float(smoothed(DensityGrid(torch.full((3, 4, 5), 0.3), LOW, HIGH), 3).values.std()) < 1e-7
+    assert torch.equal(smoothed(DensityGrid(values, LOW, HIGH), 0).values, values)
 
 
 def test_smoothing_is_a_gaussian_of_the_passes_and_leaves_a_step_where_it_is():
     line = (torch.arange(40) >= 20).double().expand(3, 3, 40)
-    smooth = smoothed(Lattice(line, LOW, HIGH), 2).values[1, 1]
+    smooth = smoothed(DensityGrid(line, LOW, HIGH), 2).values[1, 1]
     slope = smooth.diff()
     places = torch.arange(39) + 0.5
     middle = float((slope * places).sum())

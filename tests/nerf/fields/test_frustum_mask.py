@@ -22,7 +22,13 @@ from nerf.training.ray_dataset import RayDataset, build_ray_bank
 SIZE, HALF = 12, 0.5  # pixels of a photo, and half its width at a distance of one
 NEAR, FAR = 1.0, 40.0
 FIELD = HashGridSettings(
-    levels=2, log2_rows=10, coarsest=4, finest=16, steps=32, occupancy_resolution=16, contracted=True
+    num_levels=2,
+    log2_hashmap_size=10,
+    base_res=4,
+    max_res=16,
+    diagonal_steps=32,
+    occupancy_resolution=16,
+    contracted=True,
 )
 TRAINER = HashGridTrainerSettings(seed=3, background=(0.0, 0.0, 0.0), samples=1024, least_photos=3)
 
@@ -109,7 +115,7 @@ def test_all_trainers_of_a_bank_ask_once(monkeypatch: pytest.MonkeyPatch) -> Non
     fields = [HashGridField(FIELD, seed, reference) for seed in (0, 1)]
     for field in fields:
         HashGridTrainer(field, views, TRAINER)
-    assert asked == [0, 1, 2, 3] and torch.equal(fields[0].bits, fields[1].bits)
+    assert asked == [0, 1, 2, 3] and torch.equal(fields[0].occupancy_bits, fields[1].occupancy_bits)
     compute_frustum_mask(bank(), 3, 16)
     compute_frustum_mask(views, 2, 16)
     assert len(asked) == 12, "another bank, and another question"
@@ -130,7 +136,7 @@ def test_nothing_is_ever_sampled_elsewhere_nor_found_there() -> None:
     assert 0.02 < usable.float().mean() < 0.98
     numbers = torch.arange(16**3, dtype=torch.int32)
     for step in range(40):
-        assert not (is_occupied(field.bits, numbers) & ~usable).any()
+        assert not (is_occupied(field.occupancy_bits, numbers) & ~usable).any()
         trainer.step(step, step / 40)
     elsewhere = cell_corners(16, numbers[~usable]) + 0.5 / 16
     assert not field.density(uncontract(2 * CONTRACTED_BOX * (elsewhere - 0.5))).any()
@@ -145,4 +151,4 @@ def test_nothing_is_ever_sampled_elsewhere_nor_found_there() -> None:
 def test_where_the_rule_says_nothing_all_of_space_is_used(views: RayDataset, contracted: bool, least: int) -> None:
     field = HashGridField(replace(FIELD, contracted=contracted), 0, reference)
     HashGridTrainer(field, views, replace(TRAINER, least_photos=least))
-    assert (field.bits == -1).all()
+    assert (field.occupancy_bits == -1).all()

@@ -5,19 +5,21 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerf.fields import background as sky
-from nerf.fields import mlp as grid_mlp
-from nerf.fields.hash_grid import THIN, HashGridField, HashGridSettings
+from nerf.fields import mlp
+from nerf.fields.background import BACKGROUND_LAYOUT, background_colour
+from nerf.fields.hash_grid import THINNING_THRESHOLD, HashGridField, HashGridSettings
 from nerf.fields.interface import RadianceModel, Rendering
 from nerf.geometry.rays import Rays
-from nerf.kernels import Backend, GridLayout, Lattice, Samples, warp
+from nerf.kernels import Backend, GridLayout, RayStepping, Samples, warp
 from nerf.kernels import torch as reference
-from nerf.kernels.torch.occupancy import occupied
+from nerf.kernels.torch.occupancy import binary_occupancy
 from nerf.rendering.early_termination import EARLY_STOP_TRANSMITTANCE
 
-SMALL = HashGridSettings(levels=2, log2_rows=9, coarsest=3, finest=9, steps=24, occupancy_resolution=8)
-FOLDED = replace(SMALL, contracted=True, shortest_step=0.1, cone=0.2)
-OUTDOORS = replace(FOLDED, sky=True)
+SMALL = HashGridSettings(
+    num_levels=2, log2_hashmap_size=9, base_res=3, max_res=9, diagonal_steps=24, occupancy_resolution=8
+)
+FOLDED = replace(SMALL, contracted=True, min_step_size=0.1, cone_angle=0.2)
+OUTDOORS = replace(FOLDED, background_model=True)
 DIFFUSE = replace(SMALL, view_dependence=False)
 BACKENDS = pytest.mark.parametrize("backend", [reference, warp], ids=["reference", "warp"])
 
@@ -26,8 +28,8 @@ def field(settings: HashGridSettings = SMALL, seed: int = 1) -> HashGridField:
     """A field in float64 whose features are large enough to matter."""
     model = HashGridField(settings, seed, reference).double()
     model.table.mul_(2e4)
-    if settings.sky:
-        model.sky.normal_(generator=torch.Generator().manual_seed(5))
+    if settings.background_model:
+        model.background_table.normal_(generator=torch.Generator().manual_seed(5))
     return model
 
 
@@ -44,11 +46,13 @@ def rays(count: int = 6) -> Rays:
 def seen_by_autograd(model: HashGridField, given: Rays, jitter: Tensor, background: Tensor) -> Tensor:
     """The loss sum(colour * k) + sum(depth) written with plain torch, differentiable in parameters and rays."""
     settings = model.settings
-    samples = reference.march(occupied(model.bits), model.lattice, given.each(lambda part: part.detach()), jitter)
+    samples = reference.march(
+        binary_occupancy(model.occupancy_bits), model.stepping, given.each(lambda part: part.detach()), jitter
+    )
     points = reference.sample_points(given, samples, settings.contracted)
     features = encoded_by_autograd(model.layout, model.table, points)
-    if settings.sky:
-        on_sphere = encoded_by_autograd(sky.LAYOUT, model.sky, (given.directions + 1) / 2)
+    if settings.background_model:
+        on_sphere = encoded_by_autograd(BACKGROUND_LAYOUT, model.background_table, (given.directions + 1) / 2)
         background = torch.sigmoid(on_sphere.view(len(on_sphere), -1, 4).sum(1))[:, :3]
     weights = model.weights
     geometry = torch.relu(features @ weights.density_hidden) @ weights.density_out.T
@@ -82,8 +86,8 @@ def encoded_by_autograd(layout: GridLayout, table: Tensor, points: Tensor) -> Te
 
 @pytest.mark.parametrize("settings", [SMALL, FOLDED, OUTDOORS, DIFFUSE])
 def test_all_gradients_are_those_of_autograd(settings: HashGridSettings, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nerf.fields.hash_grid.THIN", 0.0)
-    monkeypatch.setattr(grid_mlp, "BLOCK", {"cpu": 7})  # so that there are several, the last one short
+    monkeypatch.setattr("nerf.fields.hash_grid.THINNING_THRESHOLD", 0.0)
+    monkeypatch.setattr(mlp, "BLOCK", {"cpu": 7})  # so that there are several, the last one short
     model, given = field(settings), rays()
     jitter = torch.rand(6, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
     background = torch.rand(6, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
@@ -97,9 +101,9 @@ def test_all_gradients_are_those_of_autograd(settings: HashGridSettings, monkeyp
         reference.encode_backward_table(model.layout, level, done.points, gradients.features, grad_table)
     of_rays = model.rays_backward(done, gradients)
 
-    of_sky = [model.background_backward(done, gradients)] if settings.sky else []
+    of_sky = [model.background_backward(done, gradients)] if settings.background_model else []
 
-    skies = [model.sky] if settings.sky else []
+    skies = [model.background_table] if settings.background_model else []
     parameters = [model.table, *model.weights, *skies, given.origins, given.directions]
     for parameter in parameters:
         parameter.requires_grad_()
@@ -112,7 +116,7 @@ def test_density_is_bounded_in_value_and_gradient() -> None:
     logits = torch.tensor([-1e30, -100.0, 0.0, 15.0, 16.0, 1e30])
     geometry = torch.zeros(6, 16)
     geometry[:, 0] = logits
-    sigma = grid_mlp.sigma_of(geometry)
+    sigma = mlp.sigma_of(geometry)
     assert sigma.isfinite().all()
     assert sigma.max() == pytest.approx(math.exp(15))
     assert sigma[2] == 1
@@ -134,12 +138,12 @@ def test_it_is_a_radiance_model_of_the_scene_frame() -> None:
 
 
 def test_density_agrees_with_what_rays_see() -> None:
-    """The opacity along a ray is 1 - exp(-∫ sigma dt), here by the middle rule on the field's own lattice."""
+    """The opacity along a ray is 1 - exp(-∫ sigma dt), here by the middle rule on the field's own stepping."""
     model, given = field(), rays()
     rendering = model.render(given, torch.zeros(3, dtype=torch.float64))
-    step = model.lattice.step
+    step = model.stepping.step_size
     middle = torch.full((6,), 0.5, dtype=torch.float64)
-    samples = reference.march(occupied(model.bits), model.lattice, given, middle)
+    samples = reference.march(binary_occupancy(model.occupancy_bits), model.stepping, given, middle)
     points = given.origins[samples.ray] + samples.t[:, None] * given.directions[samples.ray]
     depth = torch.zeros(6, dtype=torch.float64).index_add(0, samples.ray.long(), model.density(points) * samples.dt)
     torch.testing.assert_close(rendering.opacity, -torch.expm1(-depth), rtol=0, atol=2e-3)
@@ -147,21 +151,23 @@ def test_density_agrees_with_what_rays_see() -> None:
 
 
 def test_folded_space_is_drawn_with_closer_samples_than_it_is_trained_with() -> None:
-    """The opacity of a drawn ray by the middle rule on a lattice of shorter steps; a box keeps its own."""
+    """The opacity of a drawn ray by the middle rule with shorter steps; a box keeps its own."""
     model, given = field(FOLDED), rays()
-    closer = model.lattice._replace(step=model.lattice.step / 1.5, cone=model.lattice.cone / 1.5, most_samples=1536)
+    closer = model.stepping._replace(
+        step_size=model.stepping.step_size / 1.5, cone_angle=model.stepping.cone_angle / 1.5, max_samples=1536
+    )
     middle = torch.full((6,), 0.5, dtype=torch.float64)
-    samples = reference.march(occupied(model.bits), closer, given, middle)
+    samples = reference.march(binary_occupancy(model.occupancy_bits), closer, given, middle)
     points = given.origins[samples.ray] + samples.t[:, None] * given.directions[samples.ray]
     depth = torch.zeros(6, dtype=torch.float64).index_add(0, samples.ray.long(), model.density(points) * samples.dt)
     drawn = model.render(given, torch.zeros(3, dtype=torch.float64))
     torch.testing.assert_close(drawn.opacity, -torch.expm1(-depth), rtol=0, atol=2e-3)
-    assert field().drawn_lattice == field().lattice
+    assert field().render_stepping == field().stepping
 
 
 def test_closed_cells_are_not_seen() -> None:
     model, given = field(), rays()
-    model.occupy(torch.zeros_like(model.bits))
+    model.set_occupancy(torch.zeros_like(model.occupancy_bits))
     rendering = model.render(given, torch.tensor([0.2, 0.4, 0.6], dtype=torch.float64))
     assert (rendering.opacity == 0).all()
     assert torch.equal(rendering.depth, given.far)
@@ -173,7 +179,7 @@ def test_the_density_beside_a_colour_is_the_density_zero_in_closed_cells_and_bey
     settings: HashGridSettings,
 ) -> None:
     model = field(settings)
-    model.bits[::2] = 0
+    model.occupancy_bits[::2] = 0
     points = 2.4 * torch.rand(500, 3, generator=torch.Generator().manual_seed(6), dtype=torch.float64) - 1.2
     density, colour = model.density_and_colour(points, torch.nn.functional.normalize(points, dim=-1))
     assert 0.1 < (density > 0).double().mean() < 0.9
@@ -183,32 +189,34 @@ def test_the_density_beside_a_colour_is_the_density_zero_in_closed_cells_and_bey
 
 def test_what_nothing_stops_ends_in_the_sky_whatever_the_background() -> None:
     model, given = field(OUTDOORS), rays()
-    model.occupy(torch.zeros_like(model.bits))
+    model.set_occupancy(torch.zeros_like(model.occupancy_bits))
     seen = [model.render(given, torch.full((3,), shade, dtype=torch.float64)).colour for shade in (0.0, 1.0)]
     assert torch.equal(*seen) and seen[0].std(0).min() > 0.01
-    torch.testing.assert_close(seen[0], sky.background_colour(reference, model.sky, given.directions))
+    torch.testing.assert_close(seen[0], background_colour(reference, model.background_table, given.directions))
     there_too = Rays(1000 + given.origins, *given[1:])
     assert torch.equal(model.render(there_too, torch.zeros(3, dtype=torch.float64)).colour, seen[0])
 
 
 def test_a_new_sky_is_grey_all_around() -> None:
     model = HashGridField(OUTDOORS, 1, reference)
-    assert (sky.background_colour(reference, model.sky, torch.nn.functional.normalize(torch.randn(99, 3))) == 0.5).all()
+    assert (
+        background_colour(reference, model.background_table, torch.nn.functional.normalize(torch.randn(99, 3))) == 0.5
+    ).all()
 
 
 @BACKENDS
 def test_a_new_sky_is_a_grey_background_bit_for_bit(backend: Backend) -> None:
     with_sky, without = HashGridField(OUTDOORS, 1, backend), HashGridField(FOLDED, 1, backend)
     assert_same_field(with_sky, without)
-    assert with_sky.state_dict().keys() - without.state_dict().keys() == {"sky"}
+    assert with_sky.state_dict().keys() - without.state_dict().keys() == {"background_table"}
 
 
 @BACKENDS
 def test_view_dependence_without_weight_is_a_diffuse_field_bit_for_bit(backend: Backend) -> None:
     dependent, diffuse = HashGridField(SMALL, 1, backend), HashGridField(DIFFUSE, 1, backend)
-    dependent.colour_hidden[grid_mlp.GEOMETRY :] = 0
+    dependent.colour_hidden[mlp.GEOMETRY :] = 0
     weights = dependent.state_dict()
-    diffuse.load_state_dict(weights | {"colour_hidden": weights["colour_hidden"][: grid_mlp.GEOMETRY]})
+    diffuse.load_state_dict(weights | {"colour_hidden": weights["colour_hidden"][: mlp.GEOMETRY]})
     assert_same_field(dependent, diffuse)
 
 
@@ -233,17 +241,25 @@ def test_parameters_depend_on_the_seed_alone() -> None:
     one, same, other = (HashGridField(SMALL, seed, reference).state_dict() for seed in (1, 1, 2))
     assert all(torch.equal(one[name], same[name]) for name in one)
     assert not torch.equal(one["table"], other["table"])
-    assert set(one) == {"table", "bits", "clearance", "density_hidden", "density_out", "colour_hidden", "colour_out"}
+    assert set(one) == {
+        "table",
+        "occupancy_bits",
+        "empty_distance",
+        "density_hidden",
+        "density_out",
+        "colour_hidden",
+        "colour_out",
+    }
     assert 0.9e-4 < one["table"].abs().max() <= 1e-4
 
 
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"levels": 0}, "levels is 0; it must be at least 1"),
-        ({"coarsest": 10}, "finest is 9; it must be at least 10"),
+        ({"num_levels": 0}, "levels is 0; it must be at least 1"),
+        ({"base_res": 10}, "max_res is 9; it must be at least 10"),
         ({"occupancy_resolution": 10}, "occupancy_resolution is 10; it must be a multiple of 4"),
-        ({"cone": 0.0}, r"shortest_step \(0.002\) and cone \(0.0\) must be positive"),
+        ({"cone_angle": 0.0}, r"min_step_size \(0.002\) and cone_angle \(0.0\) must be positive"),
     ],
 )
 def test_impossible_sizes_are_refused(wrong: dict, message: str) -> None:
@@ -251,7 +267,7 @@ def test_impossible_sizes_are_refused(wrong: dict, message: str) -> None:
         replace(SMALL, **wrong)
 
 
-def in_waves(model: HashGridField, given: Rays, background: Tensor) -> tuple[Rendering, int]:
+def in_rounds(model: HashGridField, given: Rays, background: Tensor) -> tuple[Rendering, int]:
     """The rendering, and of how many samples the density was asked for it."""
     asked, encode = [0], reference.encode
 
@@ -265,21 +281,25 @@ def in_waves(model: HashGridField, given: Rays, background: Tensor) -> tuple[Ren
 
 
 def in_one_pass(
-    model: HashGridField, lattice: Lattice, given: Rays, jitter: Tensor, background: Tensor, thin: float = 0.0
+    model: HashGridField, stepping: RayStepping, given: Rays, jitter: Tensor, background: Tensor, thin: float = 0.0
 ) -> tuple[int, Samples, Rendering]:
-    """How many samples of a lattice stand in occupied cells, those that can be seen, and what rays see; no waves."""
-    samples = reference.march(occupied(model.bits), lattice, given, jitter)
+    """How many samples stand in occupied cells, those that can be seen, and what rays see; no rounds."""
+    samples = reference.march(binary_occupancy(model.occupancy_bits), stepping, given, jitter)
     density = model._density_pass(reference.sample_points(given, samples, model.settings.contracted))
     front, seen = reference.visible_samples(samples, density.sigma, EARLY_STOP_TRANSMITTANCE, thin, jitter)
-    of_rays = grid_mlp.ray_hidden(model.weights, reference.spherical_harmonics(given.directions))
-    colour = grid_mlp.colour_forward(model.weights, reference, front, density.geometry[seen], of_rays).colour
+    of_rays = mlp.ray_hidden(model.weights, reference.spherical_harmonics(given.directions))
+    colour = mlp.colour_forward(model.weights, reference, front, density.geometry[seen], of_rays).colour
     behind = background.repeat(len(jitter), 1)
     rendering, _ = reference.composite(front, density.sigma[seen], colour, behind, given.far)
     return len(samples.t), front, rendering
 
 
-def in_short_waves(monkeypatch: pytest.MonkeyPatch, whole: int, shortest: int, longest: int) -> None:
-    for name, length in {"WAVE": {"cpu": whole}, "SHORTEST_WAVE": shortest, "LONGEST_WAVE": longest}.items():
+def in_short_rounds(monkeypatch: pytest.MonkeyPatch, whole: int, shortest: int, longest: int) -> None:
+    for name, length in {
+        "ROUND_SAMPLES": {"cpu": whole},
+        "MIN_ROUND_SAMPLES_PER_RAY": shortest,
+        "MAX_ROUND_SAMPLES_PER_RAY": longest,
+    }.items():
         monkeypatch.setattr(f"nerf.rendering.early_termination.{name}", length)
 
 
@@ -288,39 +308,48 @@ def in_short_waves(monkeypatch: pytest.MonkeyPatch, whole: int, shortest: int, l
 def test_waves_through_thin_fog_see_what_a_single_pass_sees(
     settings: HashGridSettings, lengths: tuple[int, int, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    in_short_waves(monkeypatch, *lengths)
+    in_short_rounds(monkeypatch, *lengths)
     model, given, background = field(settings), rays(40), torch.tensor([0.2, 0.4, 0.6], dtype=torch.float64)
-    model.occupy(model.bits.random_(generator=torch.Generator().manual_seed(5)))  # half of the cells are closed
-    marched, front, whole = in_one_pass(model, model.drawn_lattice, given, torch.full_like(given.near, 0.5), background)
-    waves, asked = in_waves(model, given, background)
+    model.set_occupancy(
+        model.occupancy_bits.random_(generator=torch.Generator().manual_seed(5))
+    )  # half of the cells are closed
+    marched, front, whole = in_one_pass(
+        model, model.render_stepping, given, torch.full_like(given.near, 0.5), background
+    )
+    rounds, asked = in_rounds(model, given, background)
     assert asked == marched == len(front.t) > 40
     assert whole.opacity.min() < 0.5 < whole.opacity.max()
-    torch.testing.assert_close(tuple(waves), tuple(whole), rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(tuple(rounds), tuple(whole), rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("settings", [SMALL, FOLDED])
 def test_waves_end_soon_behind_what_stops_the_light(
     settings: HashGridSettings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    in_short_waves(monkeypatch, 80, 2, 64)
+    in_short_rounds(monkeypatch, 80, 2, 64)
     model, given, background = dense_field(settings), rays(40), torch.tensor([0.2, 0.4, 0.6], dtype=torch.float64)
-    marched, front, whole = in_one_pass(model, model.drawn_lattice, given, torch.full_like(given.near, 0.5), background)
-    waves, asked = in_waves(model, given, background)
+    marched, front, whole = in_one_pass(
+        model, model.render_stepping, given, torch.full_like(given.near, 0.5), background
+    )
+    rounds, asked = in_rounds(model, given, background)
     assert len(front.t) < asked < 0.7 * marched
     assert whole.opacity.min() > 0.99
     left = EARLY_STOP_TRANSMITTANCE * torch.tensor([1.0, 5.0, 1.0])  # of a ray's colour, depth and opacity
-    for one, other, most in zip(waves, whole, left, strict=True):
+    for one, other, most in zip(rounds, whole, left, strict=True):
         assert 0 < (one - other).abs().max() < most
 
 
 def test_what_is_empty_follows_from_what_is_occupied() -> None:
     model = field(replace(SMALL, occupancy_resolution=32))
     for cell in (5, 17):
-        bits = torch.zeros_like(model.bits)
+        bits = torch.zeros_like(model.occupancy_bits)
         bits[cell] = 1
-        model.occupy(bits)
-        assert torch.equal(model.bits, bits)
-        assert torch.equal(model.clearance, occupied(bits).clearance) and model.clearance.unique().numel() > 3
+        model.set_occupancy(bits)
+        assert torch.equal(model.occupancy_bits, bits)
+        assert (
+            torch.equal(model.empty_distance, binary_occupancy(bits).empty_distance)
+            and model.empty_distance.unique().numel() > 3
+        )
 
 
 @pytest.mark.parametrize("settings", [SMALL, FOLDED])
@@ -332,11 +361,11 @@ def test_waves_of_compiled_kernels_see_what_a_single_pass_of_them_sees(
         rays(300).each(lambda part: part.float()),
     )
     model.table.mul_(3e4)
-    few = torch.randint(len(model.bits), (40,), generator=torch.Generator().manual_seed(5))
-    model.occupy(torch.zeros_like(model.bits).index_fill_(0, few, -1))
+    few = torch.randint(len(model.occupancy_bits), (40,), generator=torch.Generator().manual_seed(5))
+    model.set_occupancy(torch.zeros_like(model.occupancy_bits).index_fill_(0, few, -1))
     pictures = []
     for lengths in ((1 << 16, 64, 64), (1, 2, 2)):
-        in_short_waves(monkeypatch, *lengths)
+        in_short_rounds(monkeypatch, *lengths)
         pictures.append(model.render(given, torch.ones(3)))
     assert pictures[0].opacity.max() > 0.1
     for one, other in zip(*pictures, strict=True):
@@ -349,12 +378,12 @@ def test_waves_of_compiled_kernels_see_what_a_single_pass_of_them_sees(
 def test_training_keeps_the_samples_of_a_single_pass_whatever_the_waves(
     settings: HashGridSettings, lengths: tuple[int, int, int], dense: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    in_short_waves(monkeypatch, *lengths)
+    in_short_rounds(monkeypatch, *lengths)
     model, given = (dense_field if dense else field)(settings), rays(40)
-    model.occupy(model.bits.random_(generator=torch.Generator().manual_seed(5)))
+    model.set_occupancy(model.occupancy_bits.random_(generator=torch.Generator().manual_seed(5)))
     jitter = torch.rand(40, generator=torch.Generator().manual_seed(6), dtype=torch.float64)
     background = torch.tensor([0.2, 0.4, 0.6], dtype=torch.float64)
-    marched, front, whole = in_one_pass(model, model.lattice, given, jitter, background, THIN)
+    marched, front, whole = in_one_pass(model, model.stepping, given, jitter, background, THINNING_THRESHOLD)
     done = model.forward(given, jitter, jitter, background.repeat(40, 1))
     assert done.marched < marched if dense else done.marched == marched
     assert torch.equal(done.samples.starts, front.starts) and torch.equal(done.samples.ray, front.ray)
@@ -362,7 +391,9 @@ def test_training_keeps_the_samples_of_a_single_pass_whatever_the_waves(
     torch.testing.assert_close(tuple(done.rendering), tuple(whole), rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("settings", [replace(SMALL, steps=500), replace(FOLDED, shortest_step=0.005, cone=0.01)])
+@pytest.mark.parametrize(
+    "settings", [replace(SMALL, diagonal_steps=500), replace(FOLDED, min_step_size=0.005, cone_angle=0.01)]
+)
 def test_thin_samples_that_stand_for_others_keep_picture_and_gradients(
     settings: HashGridSettings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -375,12 +406,12 @@ def test_thin_samples_that_stand_for_others_keep_picture_and_gradients(
     def seen_and_gradients(offset: float) -> tuple[int, list[Tensor]]:
         done = model.forward(given, jitter, torch.full_like(jitter, offset), background)
         gradients = model.backward(done, grad, torch.zeros_like(done.weights))
-        chance = done.thickness / (done.density.sigma * done.samples.dt)
-        assert 1 / 17 < chance.min() <= chance.max() < 1.001
+        probability = done.thickness / (done.density.sigma * done.samples.dt)
+        assert 1 / 17 < probability.min() <= probability.max() < 1.001
         return len(done.points), [*done.rendering, *gradients.weights]
 
     with monkeypatch.context() as patch:
-        patch.setattr("nerf.fields.hash_grid.THIN", 0.0)
+        patch.setattr("nerf.fields.hash_grid.THINNING_THRESHOLD", 0.0)
         every, wanted = seen_and_gradients(0.0)
     counts, found = zip(*(seen_and_gradients((draw + 0.5) / draws) for draw in range(draws)), strict=True)
     assert max(counts) < 0.9 * every
@@ -390,8 +421,8 @@ def test_thin_samples_that_stand_for_others_keep_picture_and_gradients(
 
 
 def test_a_ray_ends_after_the_most_samples_it_may_have(monkeypatch: pytest.MonkeyPatch) -> None:
-    in_short_waves(monkeypatch, 1, 3, 3)
-    model, given = field(replace(SMALL, most_samples=7)), rays(40)
+    in_short_rounds(monkeypatch, 1, 3, 3)
+    model, given = field(replace(SMALL, max_samples_per_ray=7)), rays(40)
     middle = torch.full_like(given.near, 0.5)
     done = model.forward(given, middle, middle, torch.zeros(40, 3, dtype=torch.float64))
     assert done.marched == 7 * 40 and done.samples.starts.diff().max() <= 7

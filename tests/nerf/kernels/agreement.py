@@ -12,14 +12,14 @@ import torch
 from torch import Tensor
 
 from nerf.geometry.rays import Rays
-from nerf.kernels import BOX, Lattice, Occupied, Samples, warp
+from nerf.kernels import BOX, BinaryOccupancy, RayStepping, Samples, warp
 from nerf.kernels import torch as reference
-from nerf.kernels.torch.occupancy import occupied
+from nerf.kernels.torch.occupancy import binary_occupancy
 
 TOLERANCE = 1e-5
-BOUNDED = Lattice(2 * BOX * 3**0.5 / 256, 0.0, False, 32, 1024)
-FOLDED = Lattice(0.01, 0.02, True, 32, 1024)
-LATTICES = {"bounded": BOUNDED, "folded": FOLDED}
+BOUNDED = RayStepping(2 * BOX * 3**0.5 / 256, 0.0, False, 32, 1024)
+FOLDED = RayStepping(0.01, 0.02, True, 32, 1024)
+STEPPINGS = {"bounded": BOUNDED, "folded": FOLDED}
 
 
 def generator(device: str, seed: int) -> torch.Generator:
@@ -91,13 +91,13 @@ def random_rays(device: str, count: int, far: float = 30.0) -> Rays:
     return rays_of(origins, directions, 0.05, far)
 
 
-def occupied_of(device: str, kind: str, cells: int) -> Occupied:
+def occupied_of(device: str, kind: str, cells: int) -> BinaryOccupancy:
     if kind in ("empty", "full"):
-        return occupied(torch.full((cells**3 // 64,), -1 if kind == "full" else 0, device=device))
+        return binary_occupancy(torch.full((cells**3 // 64,), -1 if kind == "full" else 0, device=device))
     thickness = uniform(device, 7, cells**3)
     if kind == "bricks":  # three bricks of ten, all of their cells
-        return occupied(-(thickness.view(-1, 64)[:, 0] < 0.3).long())
-    return occupied(reference.occupancy_bits(thickness, {"random": 0.5, "sparse": 0.97}[kind]))
+        return binary_occupancy(-(thickness.view(-1, 64)[:, 0] < 0.3).long())
+    return binary_occupancy(reference.occupancy_bits(thickness, {"random": 0.5, "sparse": 0.97}[kind]))
 
 
 def packed(device: str, counts: list[int], lengths: Tensor | None = None) -> Samples:

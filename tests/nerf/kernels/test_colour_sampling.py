@@ -7,13 +7,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerf.kernels import Backend, Drawn, Samples, warp
+from nerf.kernels import Backend, ColourSamples, Samples, warp
 from nerf.kernels import torch as reference
 from tests.devices import DEVICES, skip_without
 from tests.nerf.kernels.agreement import COUNTS, normal, packed, uniform
 
 BACKENDS = pytest.mark.parametrize("backend", [reference, warp], ids=["reference", "warp"])
-QUANTUM = 1 / 64
+OPACITY_STEP = 1 / 64
 
 
 @pytest.fixture(params=DEVICES, autouse=True)
@@ -24,18 +24,18 @@ def device(request: pytest.FixtureRequest) -> Iterator[str]:
         yield request.param
 
 
-def drawn_of(
-    backend: Backend, samples: Samples, sigma: Tensor, depth: Tensor | None = None, shown: Tensor | None = None
-) -> tuple[Drawn, Tensor, Tensor]:
-    """A first wave's, and what is known of the rays behind it."""
+def selected_of(
+    backend: Backend, samples: Samples, sigma: Tensor, depth: Tensor | None = None, accumulated: Tensor | None = None
+) -> tuple[ColourSamples, Tensor, Tensor]:
+    """A first round's, and what is known of the rays behind it."""
     count = len(samples.starts) - 1
     depth = torch.zeros(count, dtype=torch.float64) if depth is None else depth.clone()
-    shown = torch.zeros(count) if shown is None else shown.clone()
-    return backend.select_colour_samples(samples, sigma, QUANTUM, depth, shown), depth, shown
+    accumulated = torch.zeros(count) if accumulated is None else accumulated.clone()
+    return backend.select_colour_samples(samples, sigma, OPACITY_STEP, depth, accumulated), depth, accumulated
 
 
 def cut(samples: Samples, sigma: Tensor, first: int) -> Iterator[tuple[Samples, Tensor]]:
-    """Two waves: the ``first`` samples of each ray, and its others."""
+    """Two rounds: the ``first`` samples of each ray, and its others."""
     place = torch.arange(len(samples.t)) - samples.starts.index_select(0, samples.ray)
     for part in (place < first, place >= first):
         counts = torch.bincount(samples.ray[part], minlength=len(samples.starts) - 1)
@@ -48,36 +48,40 @@ def cut(samples: Samples, sigma: Tensor, first: int) -> Iterator[tuple[Samples, 
 def test_samples_at_which_a_quantum_ends_stand_for_those_before(backend: Backend, device: str, scale: float) -> None:
     samples = packed(device, COUNTS)
     sigma = scale * uniform(device, 21, len(samples.t)).square()
-    drawn, depth, shown = drawn_of(backend, samples, sigma)
+    selected, depth, accumulated = selected_of(backend, samples, sigma)
     rows, weights = list[int](), list[float]()
     for ray in range(len(COUNTS)):
         tau = stood_for = 0.0
         for i in range(int(samples.starts[ray]), int(samples.starts[ray + 1])):
             before, tau = tau, tau + float(sigma[i]) * float(samples.dt[i])
-            quanta = [math.floor(-math.expm1(-x) / QUANTUM + 0.5) for x in (before, tau)]
+            quanta = [math.floor(-math.expm1(-x) / OPACITY_STEP + 0.5) for x in (before, tau)]
             if quanta[1] > quanta[0]:
                 rows.append(i)
                 weights.append(-math.expm1(-tau) - stood_for)
                 stood_for = -math.expm1(-tau)
         assert float(depth[ray]) == pytest.approx(tau, rel=1e-6)
-        assert float(shown[ray]) == pytest.approx(stood_for, abs=1e-6)
-    assert 5 < len(rows) < len(samples.t) and drawn.rows.tolist() == rows
-    assert drawn.weights.tolist() == pytest.approx(weights, abs=1e-6)
-    assert drawn.samples.starts[-1] == len(rows) and drawn.rows.dtype == drawn.samples.starts.dtype == torch.int32
-    for kept, of_all in zip(drawn.samples[1:], samples[1:], strict=True):
-        assert torch.equal(kept, of_all.index_select(0, drawn.rows))
-    assert torch.equal(drawn.samples.starts.diff(), torch.bincount(drawn.samples.ray, minlength=len(COUNTS)).int())
+        assert float(accumulated[ray]) == pytest.approx(stood_for, abs=1e-6)
+    assert 5 < len(rows) < len(samples.t) and selected.rows.tolist() == rows
+    assert selected.weights.tolist() == pytest.approx(weights, abs=1e-6)
+    assert (
+        selected.samples.starts[-1] == len(rows) and selected.rows.dtype == selected.samples.starts.dtype == torch.int32
+    )
+    for kept, of_all in zip(selected.samples[1:], samples[1:], strict=True):
+        assert torch.equal(kept, of_all.index_select(0, selected.rows))
+    assert torch.equal(
+        selected.samples.starts.diff(), torch.bincount(selected.samples.ray, minlength=len(COUNTS)).int()
+    )
 
 
 @BACKENDS
 def test_waves_go_on_where_the_last_ended(backend: Backend, device: str) -> None:
     samples = packed(device, COUNTS)
     sigma = uniform(device, 21, len(samples.t))
-    whole, depth, shown = drawn_of(backend, samples, sigma)
+    whole, depth, accumulated = selected_of(backend, samples, sigma)
     (one, its), (other, others) = cut(samples, sigma, 5)
-    first, half_depth, half_shown = drawn_of(backend, one, its)
-    second, *at_last = drawn_of(backend, other, others, half_depth, half_shown)
-    torch.testing.assert_close(at_last, [depth, shown])
+    first, half_depth, half_accumulated = selected_of(backend, one, its)
+    second, *at_last = selected_of(backend, other, others, half_depth, half_accumulated)
+    torch.testing.assert_close(at_last, [depth, accumulated])
     t, order = torch.cat([first.samples.t, second.samples.t]), torch.cat([first.samples.ray, second.samples.ray])
     order = order.argsort(stable=True)
     assert torch.equal(t[order], whole.samples.t) and len(first.weights) and len(second.weights)
@@ -93,15 +97,15 @@ def test_a_picture_is_off_by_a_quantum_at_most(backend: Backend, device: str) ->
     colour = (normal(device, 22, 2000, 3)).sigmoid()
     far = torch.full((50,), 9.0)
     wanted, weights = reference.composite(samples, sigma, colour, torch.zeros(50, 3), far)
-    drawn, depth, shown = drawn_of(backend, samples, sigma)
+    selected, depth, accumulated = selected_of(backend, samples, sigma)
     seen = torch.zeros(50, 4)
-    backend.accumulate_colours(drawn, colour.index_select(0, drawn.rows), seen)
-    assert len(drawn.rows) < 0.6 * float((weights > 0).sum())
-    assert float((seen[:, :3] - wanted.colour).abs().max()) < QUANTUM
-    assert float((seen[:, 3] - wanted.depth).abs().max()) < QUANTUM * float(samples.t.max())
-    assert ((-torch.expm1(-depth) - shown).abs() <= QUANTUM).all()
+    backend.accumulate_colours(selected, colour.index_select(0, selected.rows), seen)
+    assert len(selected.rows) < 0.6 * float((weights > 0).sum())
+    assert float((seen[:, :3] - wanted.colour).abs().max()) < OPACITY_STEP
+    assert float((seen[:, 3] - wanted.depth).abs().max()) < OPACITY_STEP * float(samples.t.max())
+    assert ((-torch.expm1(-depth) - accumulated).abs() <= OPACITY_STEP).all()
     again = seen.clone()
-    backend.accumulate_colours(drawn, colour.index_select(0, drawn.rows), again)
+    backend.accumulate_colours(selected, colour.index_select(0, selected.rows), again)
     torch.testing.assert_close(again, 2 * seen)
 
 
@@ -109,10 +113,12 @@ def test_a_picture_is_off_by_a_quantum_at_most(backend: Backend, device: str) ->
 @pytest.mark.parametrize("sigma", [0.0, 1e-45, 1e30, math.inf])
 def test_extreme_densities(backend: Backend, device: str, sigma: float) -> None:
     samples = packed(device, [4, 4])
-    drawn, depth, shown = drawn_of(backend, samples, torch.full((8,), sigma))
+    selected, depth, accumulated = selected_of(backend, samples, torch.full((8,), sigma))
     solid = sigma > 1
-    assert drawn.rows.tolist() == ([0, 4] if solid else []) and drawn.weights.tolist() == [1.0] * len(drawn.rows)
-    assert shown.tolist() == [float(solid)] * 2 and depth.isfinite().all()
+    assert selected.rows.tolist() == ([0, 4] if solid else []) and selected.weights.tolist() == [1.0] * len(
+        selected.rows
+    )
+    assert accumulated.tolist() == [float(solid)] * 2 and depth.isfinite().all()
 
 
 @BACKENDS
@@ -120,16 +126,18 @@ def test_a_density_that_is_no_number_reaches_its_rays_depth_alone(backend: Backe
     samples = packed(device, [4, 4])
     sigma = torch.full((8,), 0.5)
     sigma[2] = math.nan
-    drawn, depth, shown = drawn_of(backend, samples, sigma)
-    assert depth.isnan().tolist() == [True, False] and shown.isfinite().all() and drawn.weights.isfinite().all()
-    assert drawn.samples.starts[1] <= 2 and shown[1] > 0
+    selected, depth, accumulated = selected_of(backend, samples, sigma)
+    assert (
+        depth.isnan().tolist() == [True, False] and accumulated.isfinite().all() and selected.weights.isfinite().all()
+    )
+    assert selected.samples.starts[1] <= 2 and accumulated[1] > 0
 
 
 @BACKENDS
 @pytest.mark.parametrize("rays", [0, 3])
 def test_no_rays_and_no_samples(backend: Backend, device: str, rays: int) -> None:
-    drawn, depth, shown = drawn_of(backend, packed(device, [0] * rays), torch.zeros(0))
-    assert len(drawn.rows) == 0 and drawn.samples.starts.tolist() == [0] * (rays + 1)
+    selected, depth, accumulated = selected_of(backend, packed(device, [0] * rays), torch.zeros(0))
+    assert len(selected.rows) == 0 and selected.samples.starts.tolist() == [0] * (rays + 1)
     seen = torch.ones(rays, 4)
-    backend.accumulate_colours(drawn, torch.zeros(0, 3), seen)
-    assert not depth.any() and not shown.any() and (seen == 1).all()
+    backend.accumulate_colours(selected, torch.zeros(0, 3), seen)
+    assert not depth.any() and not accumulated.any() and (seen == 1).all()

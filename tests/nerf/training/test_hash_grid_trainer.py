@@ -23,7 +23,9 @@ from nerf.training.ray_dataset import RayDataset, build_ray_bank
 from nerf.training.trainer import FieldTrainer, NonFinite
 from nerf.training.validation_probe import make_probe, measure
 
-FIELD = HashGridSettings(levels=2, log2_rows=10, coarsest=4, finest=16, steps=32, occupancy_resolution=16)
+FIELD = HashGridSettings(
+    num_levels=2, log2_hashmap_size=10, base_res=4, max_res=16, diagonal_steps=32, occupancy_resolution=16
+)
 BACKGROUND = (0.2, 0.9, 0.5)
 TRAINER = HashGridTrainerSettings(seed=3, background="random", samples=1024)
 
@@ -82,7 +84,7 @@ def test_results_do_not_depend_on_the_number_of_threads() -> None:
     try:
         for count in (1, 2, 3):
             torch.set_num_threads(count)
-            run = trainer(settings, replace(FIELD, levels=3, finest=64, log2_rows=16))
+            run = trainer(settings, replace(FIELD, num_levels=3, max_res=64, log2_hashmap_size=16))
             for step in range(20):  # the density cache is refreshed once
                 run.step(step, step / 20)
             states.append(copied(run.state()))
@@ -115,17 +117,17 @@ def test_rays_adapt_to_the_samples_they_need() -> None:
     run = trainer()
     results = [run.step(step, 0.5) for step in range(100)]
     assert results[0].rays == 1024 // 128
-    assert results[0].rays < results[0].samples <= results[0].densities <= results[0].rays * FIELD.lattice.most_samples
+    assert results[0].rays < results[0].samples <= results[0].densities <= results[0].rays * FIELD.stepping.max_samples
     needed = results[-1].rays * float(run.samples_per_ray)
     assert 0.7 * 1024 < needed < 1.4 * 1024
     assert results[-1].rays > 5 * results[0].rays
 
 
 def test_empty_space_is_closed_and_the_object_stays_open() -> None:
-    run = trainer(field=replace(FIELD, steps=200))
+    run = trainer(field=replace(FIELD, diagonal_steps=200))
     for step in range(96):
         run.step(step, 0.5)
-    words = torch.stack([(run.model.bits >> bit) & 1 for bit in range(64)], -1)
+    words = torch.stack([(run.model.occupancy_bits >> bit) & 1 for bit in range(64)], -1)
     opened = words.sum() / FIELD.occupancy_resolution**3
     assert 0.02 < opened < 0.7
     rays, _, alpha, _ = run.bank.lookup(torch.arange(len(run.bank.pixels)))
@@ -145,7 +147,9 @@ def test_a_non_finite_step_changes_nothing_and_shows_its_batch(
     else:
         backward = run.model.backward
         monkeypatch.setattr(
-            run.model, "backward", lambda *a: backward(*a)._replace(features=torch.full((1, FIELD.levels * 4), broken))
+            run.model,
+            "backward",
+            lambda *a: backward(*a)._replace(features=torch.full((1, FIELD.num_levels * 4), broken)),
         )
     before = copied(run.state())
     with pytest.raises(NonFinite, match=f"the {quantity} of step 1 is not finite") as caught:
@@ -171,8 +175,8 @@ def test_the_distortion_loss_is_added_and_has_its_gradient() -> None:
     one, other = plain.step(0, 1.0), with_it.step(0, 1.0)
     assert one.psnr == other.psnr
     assert one.loss < other.loss < one.loss + 5
-    assert torch.equal(plain.mean["colour_out"], with_it.mean["colour_out"])
-    assert not torch.equal(plain.mean["density_out"], with_it.mean["density_out"])
+    assert torch.equal(plain.exp_avg["colour_out"], with_it.exp_avg["colour_out"])
+    assert not torch.equal(plain.exp_avg["density_out"], with_it.exp_avg["density_out"])
 
 
 def test_the_distortion_loss_begins_weak() -> None:
@@ -185,7 +189,7 @@ def test_the_distortion_loss_begins_weak() -> None:
 def test_unbounded_scenes_train_too() -> None:
     run = trainer(
         replace(TRAINER, background=(0.0, 0.0, 0.0), distortion=1e-3),
-        replace(FIELD, contracted=True, shortest_step=0.05, cone=0.1),
+        replace(FIELD, contracted=True, min_step_size=0.05, cone_angle=0.1),
     )
     results = [run.step(step, step / 60) for step in range(60)]
     first, last = (sum(r.psnr for r in part) / 10 for part in (results[:10], results[-10:]))
@@ -200,23 +204,23 @@ def test_the_rate_warms_up_stays_and_falls() -> None:
 
 
 def test_a_state_of_another_architecture_is_refused() -> None:
-    other = trainer(field=replace(FIELD, levels=1))
-    with pytest.raises(RuntimeError, match=r"another field: mean\.density_hidden, mean\.table"):
+    other = trainer(field=replace(FIELD, num_levels=1))
+    with pytest.raises(RuntimeError, match=r"another field: exp_avg\.density_hidden, exp_avg\.table"):
         trainer().load_state(other.state())
 
 
 def test_a_state_of_equal_shapes_but_other_settings_is_refused() -> None:
-    other = trainer(field=replace(FIELD, steps=33))
+    other = trainer(field=replace(FIELD, diagonal_steps=33))
     with pytest.raises(RuntimeError, match="another field: settings differ"):
         trainer().load_state(other.state())
 
 
 def test_a_density_cache_of_an_unbounded_scene_has_finite_steps_everywhere() -> None:
     model = HashGridField(replace(FIELD, contracted=True), 0, reference)
-    cache = HashGridTrainer(model, small_bank(), TRAINER).cache
-    cache.refresh(15, torch.Generator().manual_seed(1))
-    assert cache.thickness.isfinite().all()
-    assert cache.thickness.max() > 20 * cache.thickness.min() > 0
+    cache = HashGridTrainer(model, small_bank(), TRAINER).occupancy_grid
+    cache.update(15, torch.Generator().manual_seed(1))
+    assert cache.optical_thickness.isfinite().all()
+    assert cache.optical_thickness.max() > 20 * cache.optical_thickness.min() > 0
 
 
 def unequal_bank() -> RayDataset:
@@ -302,17 +306,17 @@ def test_the_sky_becomes_what_is_seen_in_its_direction() -> None:
     bank = small_bank()
     colours = torch.tensor([[30, 60, 230], [240, 200, 30]], dtype=torch.uint8)
     bank = bank._replace(pixels=colours.repeat_interleave(len(bank.pixels) // 2, 0))
-    outdoors = replace(FIELD, contracted=True, shortest_step=0.05, cone=0.1, sky=True)
+    outdoors = replace(FIELD, contracted=True, min_step_size=0.05, cone_angle=0.1, background_model=True)
     run = HashGridTrainer(
         HashGridField(outdoors, 0, reference), bank, replace(TRAINER, background=(0.0, 0.0, 0.0), rate=1e-2)
     )
     for step in range(20):
         run.step(step, step / 20)
     ahead = torch.tensor([[0.0, 0, 1], [0, 0, -1], [0, 0.1, 1]])
-    seen = background_colour(reference, run.model.sky, ahead / ahead.norm(dim=-1, keepdim=True))
+    seen = background_colour(reference, run.model.background_table, ahead / ahead.norm(dim=-1, keepdim=True))
     assert torch.equal(seen > 0.5, colours[[0, 1, 0]] > 127)
     assert (seen - 0.5).abs().min() > 0.05
-    assert {"model.sky", "mean.sky", "square.sky"} <= run.state().keys()
+    assert {"model.background_table", "exp_avg.background_table", "exp_avg_sq.background_table"} <= run.state().keys()
     assert not any("sky" in name for name in trainer().state())
 
 
@@ -368,7 +372,7 @@ def test_however_many_the_chunks_an_eighth_of_the_rays_run_to_points() -> None:
 
 def test_points_beyond_the_box_of_a_bounded_scene_are_no_guide() -> None:
     bank = small_bank().with_distances(torch.tensor([78, 78]), torch.tensor([3.0, 4.5]))
-    outdoors = replace(FIELD, contracted=True, shortest_step=0.05, cone=0.1)
+    outdoors = replace(FIELD, contracted=True, min_step_size=0.05, cone_angle=0.1)
     for field, distances in {FIELD: [3.0], outdoors: [3.0, 4.5]}.items():
         kept = HashGridTrainer(HashGridField(field, 0, reference), bank, TRAINER).bank.distance
         assert kept is not None and kept.tolist() == distances
@@ -383,20 +387,20 @@ def test_without_a_weight_known_distances_change_nothing() -> None:
 
 def test_the_sky_where_it_is_always_hidden_falls_back_to_grey(monkeypatch: pytest.MonkeyPatch) -> None:
     """Light of a millionth reaches it now and then; Adam alone would follow that anywhere."""
-    outdoors = replace(FIELD, contracted=True, shortest_step=0.05, cone=0.1, sky=True)
+    outdoors = replace(FIELD, contracted=True, min_step_size=0.05, cone_angle=0.1, background_model=True)
     run = HashGridTrainer(
         HashGridField(outdoors, 0, reference), small_bank(), replace(TRAINER, background=(0.0, 0.0, 0.0))
     )
-    run.model.sky.fill_(3.0)
+    run.model.background_table.fill_(3.0)
     noise = torch.Generator().manual_seed(0)
 
     def faint(*_: object) -> Tensor:
-        light = 1e-10 * torch.randn(run.model.sky.shape, generator=noise)
+        light = 1e-10 * torch.randn(run.model.background_table.shape, generator=noise)
         light[:100] = 0
         return light
 
     monkeypatch.setattr(run.model, "background_backward", faint)
     for step in range(120):
         run.step(step, 0.0)
-    assert run.model.sky[100:].abs().mean() < 0.5
-    assert torch.equal(run.model.sky[:100], torch.full((100, 4), 3.0)), "no ray of any batch ran there"
+    assert run.model.background_table[100:].abs().mean() < 0.5
+    assert torch.equal(run.model.background_table[:100], torch.full((100, 4), 3.0)), "no ray of any batch ran there"

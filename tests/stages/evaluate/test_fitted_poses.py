@@ -30,7 +30,7 @@ def test_poses_are_fitted_to_the_field_as_it_is_and_scored_as_the_photo_was_expo
     inputs, scene = photographed(tmp_path)
     kernels = load_backend(chosen_backend("cpu"), "cpu")
     field = HashGridField(
-        HashGridSettings(levels=2, log2_rows=8, coarsest=4, finest=16, occupancy_resolution=8), 5, kernels
+        HashGridSettings(num_levels=2, log2_hashmap_size=8, base_res=4, max_res=16, occupancy_resolution=8), 5, kernels
     )
     plain, gain = Painter(field, torch.zeros(3)), torch.full((3,), 0.7)
     view, given = scene.of_split("test")[0], []

@@ -16,10 +16,12 @@ from stages.io.field_files import load_field, save_field
 from stages.io.files import read_json, read_tensors, write_json, write_tensors
 
 SMALL = VanillaSettings(depth=2, width=8, samples_coarse=4, samples_fine=4, contracted=True, spacing="log")
-GRID = HashGridSettings(levels=2, log2_rows=8, coarsest=4, finest=16, contracted=True, occupancy_resolution=8)
+GRID = HashGridSettings(
+    num_levels=2, log2_hashmap_size=8, base_res=4, max_res=16, contracted=True, occupancy_resolution=8
+)
 KERNELS = load_backend(chosen_backend("cpu"), "cpu")
-OUTDOORS = HashGridField(replace(GRID, sky=True), 5, KERNELS)
-OUTDOORS.sky.normal_(generator=torch.Generator().manual_seed(6))
+OUTDOORS = HashGridField(replace(GRID, background_model=True), 5, KERNELS)
+OUTDOORS.background_table.normal_(generator=torch.Generator().manual_seed(6))
 KINDS = {"paper": VanillaNerf(SMALL, seed=5), "grid": HashGridField(GRID, 5, KERNELS), "sky": OUTDOORS}
 BY_TORCH = "the grid field is computed by torch alone, as it was trained"
 INFO = {"background": [1.0, 1.0, 1.0], "downscale": 2.5, "steps": 7, "rays": 700}

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from nerf.fields.density_grid import Lattice, sample_density_grid
+from nerf.fields.density_grid import DensityGrid, sample_density_grid
 from nerf.geometry.rays import Rays
 from stages.contract import StageError
 from stages.mesh.iso_level import check_range, choose_iso_level
@@ -48,18 +48,18 @@ def rays():
     return Rays(origins, directions, torch.full((NUM_RAYS,), 0.5), torch.full((NUM_RAYS,), 6.0))
 
 
-def lattice_of(model):
+def density_grid_of(model):
     return sample_density_grid(model, POINTS, -CORNER, CORNER)
 
 
 @pytest.mark.parametrize("inside", [60.0, 1e3, 1e5])
 def test_the_surface_lies_at_the_median_depth_whatever_the_density(rays, inside):
     model = Solid(ball, inside)
-    lattice = lattice_of(model)
-    chosen = choose_iso_level(lattice, model, rays)
+    grid = density_grid_of(model)
+    chosen = choose_iso_level(grid, model, rays)
     assert chosen.well_defined and chosen.surface_error_voxels is not None and 0 < chosen.surface_error_voxels < 0.35
     assert "e+" not in chosen.reason
-    radii = np.linalg.norm(extract_surface(lattice, chosen.density).vertices, axis=1)
+    radii = np.linalg.norm(extract_surface(grid, chosen.density).vertices, axis=1)
     assert abs(radii.mean() - 0.55) < VOXEL
     assert "rays of the photos lose half of their transmittance" in chosen.reason
 
@@ -68,17 +68,17 @@ def test_the_level_scales_with_density_and_inversely_with_length(rays):
     """Only density times length counts: a field twice the size with half the density has half the iso-level."""
     model = Solid(ball, 100.0, softness=0.02)
     large = Solid(lambda p: 2 * ball(p / 2), 50.0, softness=0.04)
-    lattice = lattice_of(model)
+    grid = density_grid_of(model)
     far_rays = Rays(rays.origins * 2, rays.directions, rays.near * 2, rays.far * 2)
-    level = choose_iso_level(lattice, model, rays).density
-    half = choose_iso_level(Lattice(lattice.values / 2, -2 * CORNER, 2 * CORNER), large, far_rays).density
+    level = choose_iso_level(grid, model, rays).density
+    half = choose_iso_level(DensityGrid(grid.values / 2, -2 * CORNER, 2 * CORNER), large, far_rays).density
     assert half == pytest.approx(level / 2, rel=1e-3)
 
 
 def test_haze_around_a_solid_is_not_its_surface(rays):
     model = Solid(ball, 500.0, outside=0.15)
-    lattice = lattice_of(model)
-    surface = extract_surface(lattice, choose_iso_level(lattice, model, rays).density)
+    grid = density_grid_of(model)
+    surface = extract_surface(grid, choose_iso_level(grid, model, rays).density)
     assert abs(np.linalg.norm(surface.vertices, axis=1).mean() - 0.55) < VOXEL
 
 
@@ -93,13 +93,16 @@ def test_density_before_near_has_no_say(rays):
     )
     rays = rays.each(lambda part: part[(rays.near > 0) & (rays.near < 4)])
     bare, hung = Solid(ball, 500.0), Solid(curtained, 500.0)
-    without, behind = choose_iso_level(lattice_of(bare), bare, rays), choose_iso_level(lattice_of(hung), hung, rays)
+    without, behind = (
+        choose_iso_level(density_grid_of(bare), bare, rays),
+        choose_iso_level(density_grid_of(hung), hung, rays),
+    )
     assert 1 / 2.4 < behind.density / without.density < 2.4  # two steps of the search at most
 
 
 def test_fog_is_split_into_thick_and_thin_and_called_fog(rays):
     model = Solid(ball, 0.02, softness=0.1, outside=0.002)
-    chosen = choose_iso_level(lattice_of(model), model, rays)
+    chosen = choose_iso_level(density_grid_of(model), model, rays)
     assert chosen.surface_error_voxels is None and not chosen.well_defined
     assert 0.002 < chosen.density < 0.022
     assert chosen.reason.startswith("only 0.0% of the photos' rays") and "still fog" in chosen.reason
@@ -108,7 +111,7 @@ def test_fog_is_split_into_thick_and_thin_and_called_fog(rays):
 def test_rays_that_all_miss_the_box_leave_fog(rays):
     model = Solid(ball, 500.0)
     away = rays._replace(directions=-rays.directions)
-    assert choose_iso_level(lattice_of(model), model, away).surface_error_voxels is None
+    assert choose_iso_level(density_grid_of(model), model, away).surface_error_voxels is None
 
 
 @pytest.mark.parametrize(
@@ -125,12 +128,12 @@ def test_rays_that_all_miss_the_box_leave_fog(rays):
         (torch.linspace(1, 9, 64).reshape(4, 4, 4), 0.5, "no surface at density 0.5: density runs from 1 to 9 per"),
     ],
 )
-def test_lattices_without_a_surface_are_refused_in_words(values, level, message):
+def test_grids_without_a_surface_are_refused_in_words(values, level, message):
     with pytest.raises(StageError) as error:
-        check_range(Lattice(values, -CORNER, CORNER), level)
+        check_range(DensityGrid(values, -CORNER, CORNER), level)
     assert str(error.value).startswith(message)
     assert error.value.hint.startswith("Give --mesh.iso-level" if level else "Train")
 
 
 def test_a_level_in_range_passes():
-    check_range(Lattice(torch.linspace(1, 9, 64).reshape(4, 4, 4), -CORNER, CORNER), 5.0)
+    check_range(DensityGrid(torch.linspace(1, 9, 64).reshape(4, 4, 4), -CORNER, CORNER), 5.0)

@@ -122,7 +122,7 @@ def test_a_ball_becomes_a_closed_ball_in_the_sfm_frame(run_mesh, progress):
         assert loaded.is_watertight and loaded.volume > 0
         assert 0 < abs(loaded.volume / (4 / 3 * np.pi * (radii.mean() / 0.25) ** 3) - 1) < 0.02
         expected = np.rint(255 * (0.5 + in_scene / 1.8))
-        assert np.abs(colours_of(loaded) - expected).max() <= 255 * VOXEL / 1.8, "those of a lattice cell away, at most"
+        assert np.abs(colours_of(loaded) - expected).max() <= 255 * VOXEL / 1.8, "those of a grid cell away, at most"
     assert any("surface at density" in note for note in progress.notes)
     assert any("density at 48³ points" in message for message, _ in progress.updates)
 
@@ -293,7 +293,7 @@ def test_fields_without_a_surface_write_nothing(run_mesh, tmp_path, model, setti
     assert list((tmp_path / "mesh").iterdir()) == []
 
 
-def test_a_lattice_beyond_memory_is_refused_with_one_that_fits(run_mesh, monkeypatch):
+def test_a_grid_beyond_memory_is_refused_with_one_that_fits(run_mesh, monkeypatch):
     import psutil
 
     memory = psutil.virtual_memory()._replace(available=16 * 40**3)

@@ -1,4 +1,4 @@
-"""How fine a lattice fits into the time there is."""
+"""How fine a grid fits into the time there is."""
 
 from types import SimpleNamespace
 
@@ -60,7 +60,7 @@ def test_the_yardstick_is_the_best_of_a_few(monkeypatch: pytest.MonkeyPatch):
 
 @pytest.mark.parametrize(("points", "flat"), [(GROUND, 2), (FACADE, 1)])
 @pytest.mark.parametrize("layout", ["forward", "inside"])
-def test_the_lattice_of_a_flat_scene_spans_the_slice_that_its_points_lie_in(points, flat, layout):
+def test_the_grid_of_a_flat_scene_spans_the_slice_that_its_points_lie_in(points, flat, layout):
     stray = np.array([[0.1, 0.1, 0.85], [0.5, 0.85, 0.1], [0.0, 0.0, 30.0]])
     box = grid_box(layout, np.concatenate([points, stray]))
     ends = np.quantile(points[:, flat], [0, 1]) + np.array([-1, 1]) * 2 * REGION_HALF * MARGIN

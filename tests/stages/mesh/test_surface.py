@@ -7,7 +7,7 @@ import pytest
 import torch
 from skimage.measure import marching_cubes
 
-from nerf.fields.density_grid import Lattice, occupancy
+from nerf.fields.density_grid import DensityGrid, occupancy
 from stages.mesh.surface import (
     Surface,
     border_vertices,
@@ -31,12 +31,12 @@ TETRAHEDRON = Surface(
 )
 
 
-def lattice_of(distance, points=64):
+def density_grid_of(distance, points=64):
     """Density LEVEL where the signed ``distance`` is zero, growing inwards: the occupancy is a logistic step."""
     axis = torch.linspace(-0.9, 0.9, points)
     grid = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1)
     corner = torch.full((3,), 0.9)
-    return Lattice(LEVEL / math.log(2) * torch.nn.functional.softplus(-distance(grid) / SHARPNESS), -corner, corner)
+    return DensityGrid(LEVEL / math.log(2) * torch.nn.functional.softplus(-distance(grid) / SHARPNESS), -corner, corner)
 
 
 def ball(points):
@@ -57,10 +57,10 @@ def euler(surface):
     return len(surface.vertices) - edges + len(surface.faces)
 
 
-def unsmoothed(lattice):
+def unsmoothed(grid):
     """Vertices of marching cubes on the bare occupancy."""
-    index, *_ = marching_cubes(occupancy(lattice, LEVEL).values.numpy(), 0.5, gradient_direction="ascent")
-    return lattice.low.double().numpy() + index * lattice.spacing().double().numpy()
+    index, *_ = marching_cubes(occupancy(grid, LEVEL).values.numpy(), 0.5, gradient_direction="ascent")
+    return grid.low.double().numpy() + index * grid.spacing().double().numpy()
 
 
 @pytest.mark.parametrize(
@@ -71,7 +71,7 @@ def unsmoothed(lattice):
     ],
 )
 def test_area_volume_and_topology_are_those_of_the_solid(distance, area, content, characteristic):
-    surface = extract_surface(lattice_of(distance), LEVEL)
+    surface = extract_surface(density_grid_of(distance), LEVEL)
     assert is_watertight(surface) and len(border_vertices(surface)) == 0
     assert euler(surface) == characteristic
     assert 0 < abs(float(face_areas(surface).sum()) / area - 1) < 0.015
@@ -81,8 +81,8 @@ def test_area_volume_and_topology_are_those_of_the_solid(distance, area, content
     assert 0 < float(off.mean()) < 0.12 * 1.8 / 63 and float(off.max()) < 0.2 * 1.8 / 63
 
 
-def test_noise_from_one_lattice_point_to_the_next_is_not_drawn():
-    clean, random = lattice_of(ball), torch.Generator().manual_seed(0)
+def test_noise_from_one_grid_point_to_the_next_is_not_drawn():
+    clean, random = density_grid_of(ball), torch.Generator().manual_seed(0)
     noisy = clean._replace(values=clean.values * torch.exp(torch.randn(clean.values.shape, generator=random)))
     off = ball(torch.from_numpy(extract_surface(noisy, LEVEL).vertices)) / (1.8 / 63)
     raw = ball(torch.from_numpy(unsmoothed(noisy))) / (1.8 / 63)
@@ -90,28 +90,28 @@ def test_noise_from_one_lattice_point_to_the_next_is_not_drawn():
 
 
 def test_normals_point_to_lower_density():
-    surface = extract_surface(lattice_of(ball), LEVEL)
+    surface = extract_surface(density_grid_of(ball), LEVEL)
     outward = surface.vertices / np.linalg.norm(surface.vertices, axis=1, keepdims=True)
     assert 0.99 < float((vertex_normals(surface) * outward).sum(axis=1).min()) <= 1
 
 
 def test_a_density_of_thirty_decades_makes_the_same_surface():
-    lattice = lattice_of(ball)
-    extreme = lattice._replace(values=torch.where(lattice.values > 10 * LEVEL, 1e30, lattice.values))
+    grid = density_grid_of(ball)
+    extreme = grid._replace(values=torch.where(grid.values > 10 * LEVEL, 1e30, grid.values))
     assert np.isfinite(extract_surface(extreme, LEVEL).vertices).all()
-    assert volume(extract_surface(extreme, LEVEL)) == pytest.approx(volume(extract_surface(lattice, LEVEL)), rel=0.01)
+    assert volume(extract_surface(extreme, LEVEL)) == pytest.approx(volume(extract_surface(grid, LEVEL)), rel=0.01)
 
 
 def test_a_step_is_put_halfway_between_full_and_empty():
     values = torch.zeros(12, 12, 12)
     values[:6] = 1e6
     corner = torch.full((3,), 1.1)
-    surface = extract_surface(Lattice(values, -corner, corner), LEVEL)
+    surface = extract_surface(DensityGrid(values, -corner, corner), LEVEL)
     np.testing.assert_allclose(surface.vertices[:, 0], 0, atol=1e-6)  # between vertices at -0.1 and 0.1
 
 
 def test_what_the_box_cuts_stays_open_there():
-    surface = extract_surface(lattice_of(lambda p: p[..., 2] + 0.31), LEVEL)
+    surface = extract_surface(density_grid_of(lambda p: p[..., 2] + 0.31), LEVEL)
     assert not is_watertight(surface)
     border = border_vertices(surface)
     assert len(border) == 2 * 4 * 63
@@ -158,7 +158,7 @@ def test_what_decimation_folds_onto_itself_goes_and_nothing_opens(monkeypatch):
 
 
 def test_decimation_keeps_the_shape_closed():
-    surface = extract_surface(lattice_of(torus), LEVEL)
+    surface = extract_surface(density_grid_of(torus), LEVEL)
     fewer = decimate(surface, len(surface.faces) // 4)
     assert 0.2 < len(fewer.faces) / len(surface.faces) <= 0.25
     assert is_watertight(fewer) and euler(fewer) == 0
@@ -167,7 +167,7 @@ def test_decimation_keeps_the_shape_closed():
 
 
 def test_decimation_leaves_borders_where_they_are():
-    surface = extract_surface(lattice_of(lambda p: p[..., 2] + 0.2 * p[..., 0].cos()), LEVEL)
+    surface = extract_surface(density_grid_of(lambda p: p[..., 2] + 0.2 * p[..., 0].cos()), LEVEL)
     fewer = decimate(surface, len(surface.faces) // 3)
     assert len(fewer.faces) < len(surface.faces) / 2
     before, after = (np.unique(border_vertices(s).round(9), axis=0) for s in (surface, fewer))

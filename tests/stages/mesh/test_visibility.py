@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from nerf.fields.density_grid import Lattice
+from nerf.fields.density_grid import DensityGrid
 from nerf.geometry.camera_paths import look_at
 from nerf.geometry.scene import Camera, Scene, Similarity, View
 from stages.io.files import write_png
@@ -31,7 +31,7 @@ def scene_of(*centres, camera=PINHOLE, near=0.5, far=6.0, target=(0, 0, 0)):
 def ball():
     axis = torch.linspace(-0.9, 0.9, 64)
     radius = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1).norm(dim=-1)
-    return Lattice(500 * torch.sigmoid((RADIUS - radius) / 0.01), -CORNER, CORNER)
+    return DensityGrid(500 * torch.sigmoid((RADIUS - radius) / 0.01), -CORNER, CORNER)
 
 
 @pytest.fixture(scope="module")
@@ -40,8 +40,8 @@ def normals():
     return random / np.linalg.norm(random, axis=1, keepdims=True)
 
 
-def looked(lattice, scene, vertices, normals):
-    maps = shadow_maps(lattice, scene, Path(), scene.views, lambda done: None)
+def looked(grid, scene, vertices, normals):
+    maps = shadow_maps(grid, scene, Path(), scene.views, lambda done: None)
     return vertex_visibility(vertices, normals, maps, VOXEL)
 
 
@@ -76,7 +76,9 @@ def test_an_occluder_hides_what_is_behind_it():
     values = torch.zeros(64, 64, 64)
     values[50:53, :32] = 500.0  # a wall at x = 0.55, y < 0
     points = np.array([[-0.5, 0.4, 0], [-0.5, -0.4, 0]])
-    visibility = looked(Lattice(values, -CORNER, CORNER), scene_of((2.5, 0, 0)), points, np.tile([1.0, 0, 0], (2, 1)))
+    visibility = looked(
+        DensityGrid(values, -CORNER, CORNER), scene_of((2.5, 0, 0)), points, np.tile([1.0, 0, 0], (2, 1))
+    )
     assert visibility.in_frustum.tolist() == [1, 1] and visibility.visible.tolist() == [1, 0]
 
 

@@ -18,17 +18,15 @@ from stages.contract import StageError
 from stages.effects.decisions import Decisions, write_decisions
 from stages.io import stopwatch
 from stages.io.files import read_json, read_scene, write_json
-from stages.tradeoff import Config
-from stages.tradeoff import own_field as tradeoff_own
-from stages.tradeoff import runs as tradeoff_arms
-from stages.tradeoff import trial as tradeoff_trial
-from stages.tradeoff.own_field import own_field
-from stages.tradeoff.runs import FEWER_RAYS, OWN, PUBLISHED, VARIANTS, Arm, Speed
+from stages.tradeoff import Config, schedule, study
+from stages.tradeoff import benchmark as benchmark_module
+from stages.tradeoff.benchmark import score_workspace_field
+from stages.tradeoff.schedule import FEWER_RAYS, PUBLISHED, VARIANTS, WORKSPACE_FIELD, Run, Speed
 from tests.stages.photo_scene import photographed
 
 TINY_GRID: dict[str, Any] = {"levels": 2, "log2_rows": 10, "finest": 32, "batch_samples": 1024}
 TINY_PAPER = {"depth": 2, "width": 16, "samples_coarse": 8, "samples_fine": 8, "batch_rays": 64}
-SPEEDS: dict[str, Any] = dict.fromkeys(tradeoff_arms.TIMED, (200.0, 1e7))
+SPEEDS: dict[str, Any] = dict.fromkeys(schedule.TIMED, (200.0, 1e7))
 SPEEDS |= dict.fromkeys((PUBLISHED, FEWER_RAYS), (0.1, 10.0))
 CONFIG: dict[str, Any] = {
     "seconds": 14.0,
@@ -36,7 +34,7 @@ CONFIG: dict[str, Any] = {
     "space": "bounded",
     "downscale": 1.0,
     "sizes": (1.0,),
-    "windows": 3,
+    "crops": 3,
 }
 
 
@@ -46,10 +44,10 @@ def tiny_fields(monkeypatch: pytest.MonkeyPatch) -> None:
     for name, variant in VARIANTS.items():
         sizes: Mapping[str, Any] = TINY_GRID if variant.family.startswith("grid") else TINY_PAPER
         kept = {key: value for key, value in variant.options.items() if key not in (*TINY_GRID, "preset")}
-        monkeypatch.setitem(VARIANTS, name, variant._replace(options=kept | sizes, grids=None))
-    monkeypatch.setattr(tradeoff_arms, "OVERHEAD", 1.0)
-    monkeypatch.setattr(tradeoff_arms, "SPENT_ELSEWHERE", 0.6)
-    monkeypatch.setattr(tradeoff, "LATE", 1e3)
+        monkeypatch.setitem(VARIANTS, name, variant._replace(options=kept | sizes, grid_size=None))
+    monkeypatch.setattr(schedule, "WALL_TIME_RATIO", 1.0)
+    monkeypatch.setattr(schedule, "OTHER_TIME", 0.6)
+    monkeypatch.setattr(study, "MAX_LATE", 1e3)
 
 
 @pytest.fixture(scope="module")
@@ -73,26 +71,26 @@ def test_a_study_from_arms_to_recommendation_and_the_same_after_a_kill(
     files = {*result.outputs, *result.records}
     assert {"quality.json", "ablation.png", "tradeoff.json", "tradeoff.md", "tradeoff.svg", "tradeoff.png"} == files
     assert all((tmp_path / "whole" / name).stat().st_size > 0 for name in files)
-    study = read_json(tmp_path / "whole" / "tradeoff.json")
-    assert {row["variant"] for row in study["points"]} >= {"grid", "paper, reduced", "no positional encoding"}
-    assert any(row["seeds"] == 2 and row["deviation"] > 0 for row in study["points"])
-    for row in study["points"]:
+    content = read_json(tmp_path / "whole" / "tradeoff.json")
+    assert {row["variant"] for row in content["points"]} >= {"grid", "paper, reduced", "no positional encoding"}
+    assert any(row["seeds"] == 2 and row["psnr_std"] > 0 for row in content["points"])
+    for row in content["points"]:
         assert 5 < row["psnr"] < 60 and row["train_seconds"] > 0 and row["frame_seconds"] > 0
         assert 0.001 < row["model_mb"] < 10 and 50 < row["peak_memory_mb"] < 100_000
-    assert "paper, published at full resolution: 1 steps (fewer than 300)" in study["left_out"]
-    assert study["points"][study["recommended"] - 1]["front"]
-    assert study["recommendation"] in (tmp_path / "whole" / "tradeoff.md").read_text()
-    assert result.line.endswith(f"{study['recommendation']} Train it: {study['command']}")
-    assert study["command"].startswith(f"pipeline train {photos['normalise'].parents[1].name} --train.seconds ")
-    assert sum(row["cheapest_drawn"] for row in study["points"] if row["front"]) == 1
-    assert study["ablation"].startswith("Against the complete reduced method, seed by seed, of 2 seeds")
+    assert "paper, published at full resolution: 1 steps (fewer than 300)" in content["left_out"]
+    assert content["points"][content["recommended"] - 1]["pareto_front"]
+    assert content["recommendation"] in (tmp_path / "whole" / "tradeoff.md").read_text()
+    assert result.line.endswith(f"{content['recommendation']} Train it: {content['command']}")
+    assert content["command"].startswith(f"pipeline train {photos['normalise'].parents[1].name} --train.seconds ")
+    assert sum(row["fastest_to_render"] for row in content["points"] if row["pareto_front"]) == 1
+    assert content["ablation"].startswith("Against the complete reduced method, seed by seed, of 2 seeds")
     text = (tmp_path / "whole" / "tradeoff.md").read_text()
-    assert study["ablation"] in text and "is drawn in the least time" in text
-    assert f"Train it: `{study['command']}`" in text and f"Fields: {study['fields']}." in text
-    assert "grid: 2 grids of features, the finest of 32³ cells; " in study["fields"]
+    assert content["ablation"] in text and "renders fastest" in text
+    assert f"Train it: `{content['command']}`" in text and f"Fields: {content['descriptions']}." in text
+    assert "grid: 2 grids of features, the finest of 32³ cells; " in content["descriptions"]
 
-    count, begun = len(study["arms"]), []
-    whole = tradeoff_trial.score
+    count, begun = len(content["runs"]), []
+    whole = benchmark_module.score
 
     def killed_at_the_fourth(field: Path, *rest: Any) -> dict[str, Any]:
         begun.append(field.name)
@@ -100,11 +98,11 @@ def test_a_study_from_arms_to_recommendation_and_the_same_after_a_kill(
             raise Killed
         return whole(field, *rest)
 
-    monkeypatch.setattr(tradeoff_trial, "score", killed_at_the_fourth)
+    monkeypatch.setattr(benchmark_module, "score", killed_at_the_fourth)
     with pytest.raises(Killed):
         studied(tmp_path / "killed", photos, progress)
     studied(tmp_path / "killed", photos, progress)
-    assert len(begun) == count + 1, "each arm once, and the killed one again"
+    assert len(begun) == count + 1, "each run once, and the killed one again"
     assert begun[3] == begun[4] and len(set(begun)) == count
     for name in ("quality.json", "ablation.png"):
         assert (tmp_path / "killed" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
@@ -112,7 +110,7 @@ def test_a_study_from_arms_to_recommendation_and_the_same_after_a_kill(
 
 def test_what_is_planned_is_what_is_run(tmp_path: Path, photos: dict[str, Path], progress: Any) -> None:
     planned = tradeoff.plan(Config(seconds=60.0), photos, progress)
-    assert planned.speeds and set(planned.speeds) == set(tradeoff_arms.TIMED)
+    assert planned.speeds and set(planned.speeds) == set(schedule.TIMED)
     assert all(steps > 0 and rays > steps for steps, rays in planned.speeds.values())
     assert planned.sizes == (1.0, 1.0) and planned.downscale == 1.0
 
@@ -127,15 +125,15 @@ def test_a_study_is_of_the_space_that_the_scene_lies_in(
     space: str,
 ) -> None:
     speeds = {name: Speed(*speed) for name, speed in SPEEDS.items()}
-    monkeypatch.setattr("stages.tradeoff.speeds.measured_speeds", lambda *_: speeds)
+    monkeypatch.setattr(study, "measure_speeds", lambda *_: speeds)
     write_decisions(tmp_path, Decisions(unbounded=unbounded))
     planned = tradeoff.plan(Config(seconds=60.0), photos | {"effects": tmp_path}, progress)
-    assert {planned.space} == {arm.space for arm in tradeoff.selection_of(planned).arms} == {space}
-    assert planned.windows and 6 <= planned.windows <= 32
+    assert {planned.space} == {run.space for run in study.schedule_of(planned).runs} == {space}
+    assert planned.crops and 6 <= planned.crops <= 32
     photos_take, windows_take = planned.reading
     assert 0 < photos_take < 5 and 0 < windows_take < 5
     assert Config.model_validate(planned.model_dump(mode="json")) == planned
-    words = tradeoff.plan_words(tradeoff.selection_of(planned), planned.seconds)
+    words = study.schedule_lines(study.schedule_of(planned), planned.seconds, tmp_path)
     shares = [int(line.rsplit(", ", 1)[1].split("%")[0]) for line in words if line.endswith("of the time")]
     assert 94 <= sum(shares) <= 106
 
@@ -145,8 +143,8 @@ def now(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """A clock that only trainings move, which take ``now[1]`` times as long as planned; the ``now[2]``-th is killed."""
     now = [100.0, 1.0, 0.0]
 
-    def trained(arm: Arm, _exam: Any, _inputs: Any, folder: Path, _progress: Any) -> dict[str, Any]:
-        found = tradeoff_trial.figures_file(arm, folder)
+    def trained(run: Run, _exam: Any, _inputs: Any, folder: Path, _progress: Any) -> dict[str, Any]:
+        found = benchmark_module.figures_file(run, folder)
         if found.exists():
             return read_json(found)
         folder.mkdir(exist_ok=True)
@@ -154,17 +152,17 @@ def now(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[float]:
         if now[2] == 0:
             now[0] += 0.5 * CONFIG["seconds"]
             raise Killed
-        now[0] += now[1] * arm.seconds
-        tradeoff_trial.write_strip(tradeoff_trial.strip_file(arm, folder), [torch.zeros(8, 8, 3)])
+        now[0] += now[1] * run.seconds
+        benchmark_module.write_strip(benchmark_module.strip_file(run, folder), [torch.zeros(8, 8, 3)])
         figures = {"failed": None, "restarts": 0, "psnr": 20.0, "ssim": 0.5, "train_seconds": 1.0}
         figures |= {"frame_seconds": 1.0, "peak_memory_mb": 100, "model_mb": 1.0}
-        write_json(found, figures | {"wall_seconds": now[1] * arm.seconds})
+        write_json(found, figures | {"wall_seconds": now[1] * run.seconds})
         return read_json(found)
 
-    monkeypatch.setattr(tradeoff_trial, "run_arm", trained)
+    monkeypatch.setattr(study, "train_and_score", trained)
     monkeypatch.setattr(stopwatch, "time", SimpleNamespace(monotonic=lambda: now[0]))
-    monkeypatch.setattr(tradeoff, "LATE", 0.1)
-    monkeypatch.setattr(tradeoff_arms, "SPENT_ELSEWHERE", 0.0)
+    monkeypatch.setattr(study, "MAX_LATE", 0.1)
+    monkeypatch.setattr(schedule, "OTHER_TIME", 0.0)
     return now
 
 
@@ -174,9 +172,9 @@ def test_a_slow_machine_leaves_arms_out_and_names_them(
     now[1] = 3.0
     studied(tmp_path, photos, progress)
     assert 0.5 * CONFIG["seconds"] < now[0] - 100 <= 1.1 * CONFIG["seconds"]
-    study = read_json(tmp_path / "tradeoff.json")
-    assert len(study["left_out"]) > len(
-        tradeoff.selection_of(Config.model_validate(CONFIG | {"speeds": SPEEDS})).left_out
+    content = read_json(tmp_path / "tradeoff.json")
+    assert len(content["left_out"]) > len(
+        study.schedule_of(Config.model_validate(CONFIG | {"speeds": SPEEDS})).left_out
     )
     assert any("slower than when it was measured" in note for note in progress.notes)
 
@@ -189,9 +187,9 @@ def test_what_a_killed_attempt_took_is_time_of_the_study(
         studied(tmp_path, photos, progress)
     studied(tmp_path, photos, progress)
     assert 0.9 * CONFIG["seconds"] < now[0] - 100 <= 1.1 * CONFIG["seconds"]
-    first, again = (note for note in progress.notes if "done at about" in note)
-    assert " trainings: done at about " in first and " trainings, 3 of them there: done at about " in again
-    assert any(note.startswith("no time left; not trained: ") for note in progress.notes)
+    first, again = (note for note in progress.notes if "runs" in note and "until" in note)
+    assert " runs: about " in first and " runs, 3 of them done: about " in again
+    assert any(note.startswith("no time is left; not trained: ") for note in progress.notes)
     assert not any("slower" in note for note in progress.notes), "the kill took the time"
 
 
@@ -203,7 +201,7 @@ def test_a_study_whose_killed_attempts_took_all_its_time_still_has_a_result(
         with pytest.raises(Killed):
             studied(tmp_path, photos, progress)
     studied(tmp_path, photos, progress)
-    assert len(read_json(tmp_path / "tradeoff.json")["arms"]) == 1
+    assert len(read_json(tmp_path / "tradeoff.json")["runs"]) == 1
 
 
 def test_the_field_of_the_workspace_is_a_point_and_no_output(
@@ -219,10 +217,10 @@ def test_the_field_of_the_workspace_is_a_point_and_no_output(
     for name in with_own.outputs:
         assert (tmp_path / "own" / name).read_bytes() == (tmp_path / "none" / name).read_bytes()
     points = {row["variant"]: row for row in read_json(tmp_path / "own" / "tradeoff.json")["points"]}
-    assert (points[OWN]["train_seconds"], points[OWN]["steps"]) == (facts["train_seconds"], 70)
-    assert 5 < points[OWN]["psnr"] < 60 and points[OWN]["peak_memory_mb"] is None
-    assert read_json(tmp_path / "own" / "tradeoff.json")["own"]["train"] == own.name
-    assert OWN not in {row["variant"] for row in read_json(tmp_path / "none" / "tradeoff.json")["points"]}
+    assert (points[WORKSPACE_FIELD]["train_seconds"], points[WORKSPACE_FIELD]["steps"]) == (facts["train_seconds"], 70)
+    assert 5 < points[WORKSPACE_FIELD]["psnr"] < 60 and points[WORKSPACE_FIELD]["peak_memory_mb"] is None
+    assert read_json(tmp_path / "own" / "tradeoff.json")["workspace_field"]["train"] == own.name
+    assert WORKSPACE_FIELD not in {row["variant"] for row in read_json(tmp_path / "none" / "tradeoff.json")["points"]}
     text = (tmp_path / "own" / "tradeoff.md").read_text()
     assert "This workspace's field (" in text and "this workspace's field ★ |" in text
 
@@ -234,19 +232,21 @@ def test_the_field_of_the_workspace_is_scored_on_some_pixels_where_it_is_drawn_s
     own.mkdir(parents=True)
     facts = train.run(train.Config(steps=70, downscale=1.0, **kind), photos, own, progress).facts
     write_json(own / "manifest.json", {"facts": facts})
-    exam = tradeoff_trial.make_exam(photos["ingest"], read_scene(photos["normalise"]), 1.0, 4, 1.0)
-    assert 0 < tradeoff_trial.drawing_seconds(own, exam) < 10
-    for seconds, every in ((1e3, 1), (1e-6, 4)):
-        folder = tmp_path / str(every)
+    benchmark = benchmark_module.make_benchmark(photos["ingest"], read_scene(photos["normalise"]), 1.0, 4, 1.0)
+    assert 0 < benchmark_module.rendering_seconds(own, benchmark) < 10
+    for seconds, stride in ((1e3, 1), (1e-6, 4)):
+        folder = tmp_path / str(stride)
         folder.mkdir()
-        found = own_field(exam, photos | {"train": own}, folder, seconds, progress)
-        assert found and (found.every, found.key) == (every, "0123456789abcdef")
-        assert (found.point.ssim is None) == (every > 1) and found.point.field == "paper"
-        assert own_field(exam, photos | {"train": own}, folder, 1e3, progress) == found, "as an earlier attempt found"
-    monkeypatch.setattr(tradeoff_own, "scored_every", lambda *_: 4)
+        found = score_workspace_field(benchmark, photos | {"train": own}, folder, seconds, progress)
+        assert found and (found.stride, found.key) == (stride, "0123456789abcdef")
+        assert (found.figures["ssim"] is None) == (stride > 1) and found.facts["field"] == "paper"
+        assert score_workspace_field(benchmark, photos | {"train": own}, folder, 1e3, progress) == found, (
+            "as an earlier attempt found"
+        )
+    monkeypatch.setattr(benchmark_module, "scoring_stride", lambda *_: 4)
     studied(tmp_path / "study", photos | {"train": own}, progress, seeds=1, seconds=8.0)
     scored = read_json(tmp_path / "study" / "tradeoff.json")["scored"]
-    assert "; this workspace's field: one in 4 of their rows and columns, for drawing all would take" in scored
+    assert "; this workspace's field: one in 4 of their rows and columns, to save time" in scored
 
 
 def test_a_field_that_is_drawn_slowly_is_scored_on_some_pixels_of_the_same_windows(
@@ -254,8 +254,8 @@ def test_a_field_that_is_drawn_slowly_is_scored_on_some_pixels_of_the_same_windo
 ) -> None:
     scene = read_scene(photos["normalise"])
     train.run(train.Config(steps=70, downscale=1.0, **TINY_GRID), photos, tmp_path, progress)
-    exam = tradeoff_trial.make_exam(photos["ingest"], scene, 1.0, 4, 1.0)
-    whole, thinned = (tradeoff_trial.score(tmp_path, exam, progress, every) for every in (1, 4))
+    benchmark = benchmark_module.make_benchmark(photos["ingest"], scene, 1.0, 4, 1.0)
+    whole, thinned = (benchmark_module.score(tmp_path, benchmark, progress, stride) for stride in (1, 4))
     assert whole["ssim"] is not None and thinned["ssim"] is None
     assert 0 < abs(whole["psnr"] - thinned["psnr"]) < 2
 
@@ -269,9 +269,9 @@ def test_a_field_trained_over_black_is_scored_over_what_the_photos_are_over(
     shutil.copytree(white, black)
     field = read_json(white / "field.json")
     write_json(black / "field.json", field | {"background": [0.0, 0.0, 0.0]})
-    exam = tradeoff_trial.make_exam(photos["ingest"], read_scene(photos["normalise"]), 1.0, 4, 1.0)
-    assert list(exam.background) == field["background"] == [1.0, 1.0, 1.0]
-    scores = [tradeoff_trial.score(folder, exam, progress)["psnr"] for folder in (white, black)]
+    benchmark = benchmark_module.make_benchmark(photos["ingest"], read_scene(photos["normalise"]), 1.0, 4, 1.0)
+    assert list(benchmark.background) == field["background"] == [1.0, 1.0, 1.0]
+    scores = [benchmark_module.score(folder, benchmark, progress)["psnr"] for folder in (white, black)]
     assert scores[0] == scores[1]
 
 
@@ -287,13 +287,13 @@ def test_an_arm_that_does_not_learn_is_said_and_the_study_goes_on(
 
     monkeypatch.setattr(train, "run", diverges)
     result = studied(tmp_path, photos, progress, seeds=1)
-    study = read_json(tmp_path / "tradeoff.json")
-    named = study["left_out"][-1]
+    content = read_json(tmp_path / "tradeoff.json")
+    named = content["left_out"][-1]
     assert named.startswith("no positional encoding, full resolution, ") and " steps, seed 0 (training" in named
     assert named in (tmp_path / "tradeoff.md").read_text()
-    assert f" 1 of {len(study['arms'])} trainings without a result · " in result.line
-    assert "no positional encoding" not in {row["variant"] for row in study["points"]}
-    assert [a["failed"] for a in study["arms"] if a["failed"]] == ["training diverged: it was told to"]
+    assert f" 1 of {len(content['runs'])} runs without a result · " in result.line
+    assert "no positional encoding" not in {row["variant"] for row in content["points"]}
+    assert [a["failed"] for a in content["runs"] if a["failed"]] == ["training diverged: it was told to"]
     assert any("no result (training diverged: it was told to)" in note for note in progress.notes)
 
 
@@ -319,12 +319,12 @@ def test_want_of_memory_ends_the_study_which_goes_on_with_that_training(
         studied(tmp_path, photos, progress, **small)
     studied(tmp_path, photos, progress, **small)
     assert asked[2] == asked[1], "the first one is not trained again, the second one is"
-    assert not any(arm["failed"] for arm in read_json(tmp_path / "tradeoff.json")["arms"])
+    assert not any(run["failed"] for run in read_json(tmp_path / "tradeoff.json")["runs"])
 
 
 def test_what_counts_as_an_arms_own_fault_is_what_training_says() -> None:
     said = "".join((Path(train.__file__).parent / f"{name}.py").read_text() for name in ("loop", "data"))
-    assert all(f'"{what}"' in said for what in tradeoff_trial.OWN_FAULTS)
+    assert all(f'"{what}"' in said for what in benchmark_module.RUN_FAILURES)
 
 
 def test_without_held_out_photos_there_is_no_study(tmp_path: Path, photos: dict[str, Path], progress: Any) -> None:
@@ -346,38 +346,38 @@ def test_windows_are_parts_of_the_photos(photos: dict[str, Path], monkeypatch: p
     from stages.train.config import WHITE
     from stages.train.data import PhotoReader, view_rays
 
-    monkeypatch.setattr(tradeoff_trial, "WINDOW", 8)
+    monkeypatch.setattr(benchmark_module, "CROP_SIZE", 8)
     scene = read_scene(photos["normalise"])
-    exam = tradeoff_trial.make_exam(photos["ingest"], scene, 1.0, 5, 2.0)
-    assert exam.frame == 24 * 16 and len(exam.windows) == 5
-    assert len({window.photo for window in exam.windows}) == 2
-    assert [photo.truth.shape for photo in exam.photos] == [(8, 12, 3)] * 2
-    for window in exam.windows:
-        view = next(v for v in scene.views if v.name == window.photo)
+    benchmark = benchmark_module.make_benchmark(photos["ingest"], scene, 1.0, 5, 2.0)
+    assert benchmark.frame == 24 * 16 and len(benchmark.crops) == 5
+    assert len({crop.photo for crop in benchmark.crops}) == 2
+    assert [photo.truth.shape for photo in benchmark.photos] == [(8, 12, 3)] * 2
+    for crop in benchmark.crops:
+        view = next(v for v in scene.views if v.name == crop.photo)
         truth, rays = PhotoReader(photos["ingest"], scene, 1.0).pixels(view, WHITE), view_rays(scene, view, 1.0)
         places = [
             (y, x)
             for y in range(9)
             for x in range(17)
-            if torch.equal(rays.directions[y : y + 8, x : x + 8], window.rays.directions)
+            if torch.equal(rays.directions[y : y + 8, x : x + 8], crop.rays.directions)
         ]
         assert len(places) == 1
         y, x = places[0]
-        assert torch.equal(truth[y : y + 8, x : x + 8], window.truth)
+        assert torch.equal(truth[y : y + 8, x : x + 8], crop.truth)
 
 
 def test_large_photos_among_small_ones_are_drawn_small_and_whole(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(tradeoff_trial, "SMALL_SIDE", 12)
+    monkeypatch.setattr(benchmark_module, "SMALL_SIDE", 12)
     inputs, scene = photographed(tmp_path)
     large = Camera("PINHOLE", 240, 120, (200.0, 200.0, 120.0, 60.0))
     Image.new("RGB", (240, 120), "red").save(inputs["ingest"] / scene.views[4].file)
     views = (*scene.views[:4], replace(scene.views[4], camera=1), *scene.views[5:])
     scene = replace(scene, cameras=(*scene.cameras, large), views=views)
-    exam = tradeoff_trial.make_exam(inputs["ingest"], scene, 1.0, 2, 2.0)
-    assert [photo.truth.shape for photo in exam.photos] == [(8, 12, 3), (6, 12, 3)]
-    tradeoff_trial.write_strip(tmp_path / "strip.png", [photo.truth for photo in exam.photos])
+    benchmark = benchmark_module.make_benchmark(inputs["ingest"], scene, 1.0, 2, 2.0)
+    assert [photo.truth.shape for photo in benchmark.photos] == [(8, 12, 3), (6, 12, 3)]
+    benchmark_module.write_strip(tmp_path / "strip.png", [photo.truth for photo in benchmark.photos])
     with Image.open(tmp_path / "strip.png") as strip:
         assert strip.size == (9 + 12, 6), "nothing is cut off"
         assert strip.getpixel((20, 5)) == (255, 0, 0) and strip.getpixel((0, 5)) == (255, 255, 255)
@@ -385,7 +385,7 @@ def test_large_photos_among_small_ones_are_drawn_small_and_whole(
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="where there is a GPU, its memory is told")
 def test_memory_is_looked_at_while_the_block_runs() -> None:
-    with tradeoff_trial.peak_memory() as peak:
+    with benchmark_module.peak_memory() as peak:
         before = psutil.Process().memory_info().rss  # here, for what other tests have left may go at any time
         with mmap.mmap(-1, 100_000_000) as block:  # new pages, whatever allocators have in reserve
             block.write(b"1" * len(block))

@@ -140,12 +140,12 @@ def test_grids_grow_with_rays_and_pixels(scene: Scene, rays: float, factor: floa
     assert all(more_rays[name] >= small[name] >= fewer_pixels[name] for name in small)
     field = field_settings(config.model_copy(update=small), sky=False)
     assert isinstance(field, HashGridSettings)
-    assert 128 <= field.finest <= 1024
+    assert 128 <= field.max_res <= 1024
     # Two neighbouring samples lie in the same or in neighbouring cells of the finest grid, near the cameras at least.
-    cells_per_step = field.lattice.step * field.finest / (4 if folded else 1.8)
-    in_folded_space = 1 / 3 if field.finest <= 512 else 2 / 3
+    cells_per_step = field.stepping.step_size * field.max_res / (4 if folded else 1.8)
+    in_folded_space = 1 / 3 if field.max_res <= 512 else 2 / 3
     assert cells_per_step == pytest.approx(
-        in_folded_space if folded else max(1, math.sqrt(3) * field.finest / 576), rel=0.01
+        in_folded_space if folded else max(1, math.sqrt(3) * field.max_res / 576), rel=0.01
     )
 
 
@@ -184,9 +184,9 @@ def test_samples_follow_cells_up_to_a_512th_and_from_a_1024th_to_a_2048th() -> N
     folded = Config(contracted=True, view_dependence=True, levels=1, log2_rows=8)
     sizes = {finest: folded.model_copy(update={"finest": finest}) for finest in (256, 512, 700, 1024, 2048, 4096)}
     fields = {finest: field_settings(config, sky=False) for finest, config in sizes.items()}
-    steps = [field.shortest_step for field in fields.values()]
+    steps = [field.min_step_size for field in fields.values()]
     assert steps == [4 / 768, 4 / 1536, 4 / 1536, 4 / 1536, 4 / 3072, 4 / 3072]
-    assert all(field.cone == field.shortest_step / 0.25 for field in fields.values())
+    assert all(field.cone_angle == field.min_step_size / 0.25 for field in fields.values())
 
 
 @pytest.mark.parametrize("contracted", [False, True])
@@ -195,10 +195,10 @@ def test_ray_samples_multiply_the_samples_along_a_ray(contracted: bool, factor: 
     sizes = {"levels": 4, "log2_rows": 16, "finest": 512, "contracted": contracted}
     usual = field_settings(GRID.model_copy(update=sizes), sky=False)
     asked = field_settings(GRID.model_copy(update=sizes | {"ray_samples": factor}), sky=False)
-    assert asked.steps == pytest.approx(factor * usual.steps, abs=0.5)
-    assert asked.cone == pytest.approx(usual.cone / factor)
-    assert asked.lattice.step == pytest.approx(usual.lattice.step / factor, rel=0.01)
-    reach = [each.most_samples * each.lattice.step for each in (usual, asked)]
+    assert asked.diagonal_steps == pytest.approx(factor * usual.diagonal_steps, abs=0.5)
+    assert asked.cone_angle == pytest.approx(usual.cone_angle / factor)
+    assert asked.stepping.step_size == pytest.approx(usual.stepping.step_size / factor, rel=0.01)
+    reach = [each.max_samples_per_ray * each.stepping.step_size for each in (usual, asked)]
     assert reach[1] > 0.99 * reach[0]
 
 

@@ -7,13 +7,13 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from nerf.fields.interface import Rendering
-from nerf.kernels import Lattice, Samples
+from nerf.kernels import RayStepping, Samples
 from nerf.kernels.torch import composite, composite_backward, distortion, distortion_backward, visible_samples
 from nerf.kernels.torch.compositing import MIN_KEEP_PROBABILITY
 from nerf.rendering import volume_rendering as compositing
 
 COUNTS = (3, 0, 7, 1, 0, 12)
-EVEN, GROWING = Lattice(0.05, 0.0, False, 8, 100), Lattice(0.05, 0.2, True, 8, 100)
+EVEN, GROWING = RayStepping(0.05, 0.0, False, 8, 100), RayStepping(0.05, 0.2, True, 8, 100)
 
 
 def packed(counts: tuple[int, ...] = COUNTS, dtype: torch.dtype = torch.float64) -> Samples:
@@ -157,14 +157,14 @@ def test_thin_samples_are_kept_where_their_chances_add_up_to_whole_numbers() -> 
     kept, index = visible_samples(samples, sigma, 0.1, thin, torch.tensor([0.3, 0.0, 0.9]))
     wanted, lengths = [], []
     for ray, offset in enumerate((0.3, 0.0, 0.9)):
-        light, chances = 1.0, offset
+        light, probabilities = 1.0, offset
         for i in range(int(samples.starts[ray]), int(samples.starts[ray + 1])):
             tau = sigma[i].item() * samples.dt[i].item()
-            chance = min(max(tau / thin, MIN_KEEP_PROBABILITY), 1.0)
-            before, chances = math.floor(chances), chances + (chance if chance < 1 else 0)
-            if light >= 0.1 and (chance == 1 or math.floor(chances) > before):
+            probability = min(max(tau / thin, MIN_KEEP_PROBABILITY), 1.0)
+            before, probabilities = math.floor(probabilities), probabilities + (probability if probability < 1 else 0)
+            if light >= 0.1 and (probability == 1 or math.floor(probabilities) > before):
                 wanted.append(i)
-                lengths.append(samples.dt[i].item() / chance)
+                lengths.append(samples.dt[i].item() / probability)
             light *= math.exp(-tau)
     assert index.tolist() == wanted and 5 < len(wanted) < 40
     torch.testing.assert_close(kept.dt.tolist(), lengths)
@@ -192,11 +192,11 @@ def test_over_all_offsets_each_length_is_what_it_was(thin: float) -> None:
     assert (total[:150][thick] / samples.dt[:150][thick] - 1).abs().max() < 1e-12
 
 
-@pytest.mark.parametrize("lattice", [EVEN, GROWING])
-def test_distortion_is_the_double_sum(lattice: Lattice) -> None:
+@pytest.mark.parametrize("stepping", [EVEN, GROWING])
+def test_distortion_is_the_double_sum(stepping: RayStepping) -> None:
     samples = packed()
     weights = composite(samples, *field(samples), *surroundings())[1]
-    if lattice.cone:
+    if stepping.cone_angle:
         m = torch.where(samples.t < 0.25, samples.t / 0.25, 1 + torch.log(samples.t / 0.25))
         lengths = samples.dt / samples.t.clamp(min=0.25)
     else:
@@ -207,20 +207,20 @@ def test_distortion_is_the_double_sum(lattice: Lattice) -> None:
         w, at = weights[own], m[own]
         pairs = w[:, None] * w * (at[:, None] - at).abs()
         wanted.append(float(pairs.sum() + (w**2 * lengths[own]).sum() / 3))
-    torch.testing.assert_close(distortion(samples, weights, lattice).tolist(), wanted, rtol=1e-12, atol=1e-13)
+    torch.testing.assert_close(distortion(samples, weights, stepping).tolist(), wanted, rtol=1e-12, atol=1e-13)
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e6])
-@pytest.mark.parametrize("lattice", [EVEN, GROWING])
-def test_the_gradient_of_the_distortion_is_autograds(lattice: Lattice, scale: float) -> None:
+@pytest.mark.parametrize("stepping", [EVEN, GROWING])
+def test_the_gradient_of_the_distortion_is_autograds(stepping: RayStepping, scale: float) -> None:
     """Also of weights so large that rays are summed apart."""
     samples = packed()
     weights = (scale * composite(samples, *field(samples), *surroundings())[1]).requires_grad_()
     grad = torch.arange(1.0, 7.0, dtype=torch.float64)
-    wanted = torch.autograd.grad(distortion(samples, weights, lattice), weights, grad)[0]
-    given = distortion_backward(samples, weights.detach(), lattice, grad)
+    wanted = torch.autograd.grad(distortion(samples, weights, stepping), weights, grad)[0]
+    given = distortion_backward(samples, weights.detach(), stepping, grad)
     torch.testing.assert_close(given, wanted, rtol=0, atol=scale * 1e-13)
-    small = distortion_backward(samples, weights.detach() / scale, lattice, grad)
+    small = distortion_backward(samples, weights.detach() / scale, stepping, grad)
     torch.testing.assert_close(given / scale, small, rtol=0, atol=1e-13)
 
 

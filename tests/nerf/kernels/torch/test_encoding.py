@@ -7,12 +7,16 @@ from torch import Tensor
 from nerf.kernels import GridLayout, grid_layout
 from nerf.kernels.torch import encode, encode_backward_points, encode_backward_table
 
-LAYOUT = grid_layout(levels=3, coarsest=3, finest=9, log2_rows=7, features=2)
+LAYOUT = grid_layout(num_levels=3, base_res=3, max_res=9, log2_hashmap_size=7, features_per_level=2)
 
 
 def test_levels_grow_from_the_coarsest_to_the_finest_and_one_alone_is_the_finest() -> None:
-    assert grid_layout(levels=4, coarsest=16, finest=128, log2_rows=9, features=2).resolutions == (16, 32, 64, 128)
-    assert grid_layout(levels=1, coarsest=16, finest=128, log2_rows=9, features=2).resolutions == (128,)
+    assert grid_layout(
+        num_levels=4, base_res=16, max_res=128, log2_hashmap_size=9, features_per_level=2
+    ).resolutions == (16, 32, 64, 128)
+    assert grid_layout(
+        num_levels=1, base_res=16, max_res=128, log2_hashmap_size=9, features_per_level=2
+    ).resolutions == (128,)
 
 
 def random_inputs(layout: GridLayout = LAYOUT, count: int = 40) -> tuple[Tensor, Tensor, Tensor]:

@@ -5,14 +5,14 @@ from torch import Tensor
 
 from nerf.geometry.contraction import contract
 from nerf.geometry.rays import Rays, clip_to_box
-from nerf.kernels import BOX, Lattice
+from nerf.kernels import BOX, RayStepping
 from nerf.kernels.torch import march, occupancy_bits, sample_points, sample_points_backward
 from nerf.kernels.torch.marching import s_to_t, t_to_s
-from nerf.kernels.torch.occupancy import occupied
+from nerf.kernels.torch.occupancy import binary_occupancy
 
-BOUNDED = Lattice(step=0.05, cone=0.0, contracted=False, cells=8, most_samples=1000)
-FOLDED = Lattice(step=0.05, cone=0.1, contracted=True, cells=8, most_samples=1000)
-FULL = occupied(torch.full((8,), -1))
+BOUNDED = RayStepping(step_size=0.05, cone_angle=0.0, contracted=False, occupancy_resolution=8, max_samples=1000)
+FOLDED = RayStepping(step_size=0.05, cone_angle=0.1, contracted=True, occupancy_resolution=8, max_samples=1000)
+FULL = binary_occupancy(torch.full((8,), -1))
 
 
 def random_rays(count: int = 50, near: float = 0.1, far: float = 9.0) -> Rays:
@@ -29,11 +29,11 @@ def jitter_of(rays: Rays) -> Tensor:
     return torch.rand(len(rays.near), generator=torch.Generator().manual_seed(4), dtype=torch.float64)
 
 
-def lattice_slowly(lattice: Lattice, near: float, far: float, jitter: float) -> list[tuple[float, float]]:
+def lattice_slowly(stepping: RayStepping, near: float, far: float, jitter: float) -> list[tuple[float, float]]:
     """(t, dt) of every sample of a ray, by summing ds = dt / max(step, cone t) in tiny pieces."""
     edges = np.linspace(0, 2 * far, 200_001)
     middles = (edges[1:] + edges[:-1]) / 2
-    s = np.concatenate([[0], np.cumsum(np.diff(edges) / np.maximum(lattice.step, lattice.cone * middles))])
+    s = np.concatenate([[0], np.cumsum(np.diff(edges) / np.maximum(stepping.step_size, stepping.cone_angle * middles))])
     first, k, found = np.interp(near, edges, s), 0, []
     while (start := np.interp(first + k, s, edges)) < far:
         t = np.interp(first + k + jitter, s, edges)
@@ -44,36 +44,36 @@ def lattice_slowly(lattice: Lattice, near: float, far: float, jitter: float) -> 
 
 
 def test_the_lattice_is_the_solution_of_its_equation() -> None:
-    lattice = Lattice(0.3, 0.2, True, 8, 1000)
+    stepping = RayStepping(0.3, 0.2, True, 8, 1000)
     rays = Rays(torch.zeros(1, 3), torch.tensor([[1.0, 0, 0]]), torch.tensor([0.7]), torch.tensor([4.0]))
-    samples = march(FULL, lattice, rays, torch.tensor([0.25]))
-    slow = torch.tensor(lattice_slowly(lattice, 0.7, 4.0, 0.25), dtype=torch.float32)
+    samples = march(FULL, stepping, rays, torch.tensor([0.25]))
+    slow = torch.tensor(lattice_slowly(stepping, 0.7, 4.0, 0.25), dtype=torch.float32)
     assert 5 < len(slow) < 20
     torch.testing.assert_close(samples.t, slow[:, 0], rtol=1e-5, atol=0)
     torch.testing.assert_close(samples.dt, slow[:, 1], rtol=1e-4, atol=0)
 
 
-@pytest.mark.parametrize("lattice", [BOUNDED, FOLDED])
-def test_distance_and_coordinate_undo_each_other(lattice: Lattice) -> None:
+@pytest.mark.parametrize("stepping", [BOUNDED, FOLDED])
+def test_distance_and_coordinate_undo_each_other(stepping: RayStepping) -> None:
     t = torch.logspace(-6, 3, 50, dtype=torch.float64)
-    torch.testing.assert_close(s_to_t(lattice, t_to_s(lattice, t)), t)
+    torch.testing.assert_close(s_to_t(stepping, t_to_s(stepping, t)), t)
 
 
-@pytest.mark.parametrize("lattice", [BOUNDED, FOLDED])
-def test_intervals_of_a_full_cache_tile_each_ray(lattice: Lattice) -> None:
+@pytest.mark.parametrize("stepping", [BOUNDED, FOLDED])
+def test_intervals_of_a_full_cache_tile_each_ray(stepping: RayStepping) -> None:
     rays = random_rays()
-    samples = march(FULL, lattice, rays, torch.zeros(50, dtype=torch.float64))
+    samples = march(FULL, stepping, rays, torch.zeros(50, dtype=torch.float64))
     lengths = torch.zeros(50, dtype=torch.float64).index_add(0, samples.ray.long(), samples.dt)
-    inside = rays if lattice.contracted else clip_to_box(rays, -BOX, BOX)
+    inside = rays if stepping.contracted else clip_to_box(rays, -BOX, BOX)
     torch.testing.assert_close(lengths, inside.far - inside.near)
-    assert 0 < (lengths == 0).sum() < 50 or lattice.contracted
+    assert 0 < (lengths == 0).sum() < 50 or stepping.contracted
 
 
 def test_samples_of_an_empty_cell_are_skipped_and_the_others_stay_where_they_are() -> None:
     rays = random_rays(400)
     jitter = jitter_of(rays)
     thickness = torch.rand(512, generator=torch.Generator().manual_seed(5))
-    some = march(occupied(occupancy_bits(thickness, 0.7)), BOUNDED, rays, jitter)
+    some = march(binary_occupancy(occupancy_bits(thickness, 0.7)), BOUNDED, rays, jitter)
     every = march(FULL, BOUNDED, rays, jitter)
     points = sample_points(rays, every, False)
     x, y, z = (8 * points).long().clamp(0, 7).unbind(-1)
@@ -106,7 +106,7 @@ def test_a_ray_that_starts_inside_is_sampled_from_near_and_one_that_misses_is_no
 def test_the_cap_keeps_the_first_samples() -> None:
     rays = random_rays()
     every = march(FULL, BOUNDED, rays, jitter_of(rays))
-    few = march(FULL, BOUNDED._replace(most_samples=7), rays, jitter_of(rays))
+    few = march(FULL, BOUNDED._replace(max_samples=7), rays, jitter_of(rays))
     position = torch.arange(len(every.t)) - every.starts[every.ray]
     assert torch.equal(few.t, every.t[position < 7])
     assert few.starts.diff().max() == 7
@@ -114,7 +114,7 @@ def test_the_cap_keeps_the_first_samples() -> None:
 
 def test_an_empty_cache_or_no_rays_give_no_samples() -> None:
     rays = random_rays(3)
-    nothing = march(occupied(torch.zeros(8, dtype=torch.int64)), BOUNDED, rays, jitter_of(rays))
+    nothing = march(binary_occupancy(torch.zeros(8, dtype=torch.int64)), BOUNDED, rays, jitter_of(rays))
     assert (nothing.starts.tolist(), len(nothing.t)) == ([0, 0, 0, 0], 0)
     none = rays.each(lambda part: part[:0])
     assert march(FULL, FOLDED, none, jitter_of(none)).starts.tolist() == [0]
@@ -122,24 +122,24 @@ def test_an_empty_cache_or_no_rays_give_no_samples() -> None:
 
 def test_unit_coordinates_are_the_box_or_all_of_space() -> None:
     rays = random_rays()
-    for lattice in (BOUNDED, FOLDED):
-        samples = march(FULL, lattice, rays, jitter_of(rays))
-        points = sample_points(rays, samples, lattice.contracted)
+    for stepping in (BOUNDED, FOLDED):
+        samples = march(FULL, stepping, rays, jitter_of(rays))
+        points = sample_points(rays, samples, stepping.contracted)
         assert 0 <= points.min() < 0.1 and 0.9 < points.max() <= 1
         scene = rays.origins[samples.ray] + samples.t[:, None] * rays.directions[samples.ray]
-        wanted = (contract(scene) + 2) / 4 if lattice.contracted else (scene + 0.9) / 1.8
+        wanted = (contract(scene) + 2) / 4 if stepping.contracted else (scene + 0.9) / 1.8
         torch.testing.assert_close(points, wanted)
 
 
-@pytest.mark.parametrize("lattice", [BOUNDED, FOLDED])
-def test_gradients_reach_origins_and_directions(lattice: Lattice) -> None:
+@pytest.mark.parametrize("stepping", [BOUNDED, FOLDED])
+def test_gradients_reach_origins_and_directions(stepping: RayStepping) -> None:
     rays = random_rays(8)
-    samples = march(FULL, lattice, rays, jitter_of(rays))
+    samples = march(FULL, stepping, rays, jitter_of(rays))
     grad = torch.randn(len(samples.t), 3, generator=torch.Generator().manual_seed(7), dtype=torch.float64)
     origins, directions = rays.origins.requires_grad_(), rays.directions.requires_grad_()
-    points = sample_points(rays, samples, lattice.contracted)
+    points = sample_points(rays, samples, stepping.contracted)
     wanted = torch.autograd.grad(points, (origins, directions), grad)
-    given = sample_points_backward(rays, samples, lattice.contracted, grad)
+    given = sample_points_backward(rays, samples, stepping.contracted, grad)
     torch.testing.assert_close(given, wanted)
 
 

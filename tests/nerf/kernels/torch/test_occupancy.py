@@ -1,7 +1,7 @@
 import torch
 
 from nerf.kernels.torch import cell_corners, occupancy_bits, scatter_max
-from nerf.kernels.torch.occupancy import MOST_CLEAR, cell_numbers, occupied
+from nerf.kernels.torch.occupancy import MAX_EMPTY_DISTANCE, binary_occupancy, cell_numbers
 
 
 def test_every_cell_has_one_number_and_bricks_are_words() -> None:
@@ -44,11 +44,11 @@ def test_clearance_is_the_distance_to_the_nearest_occupied_brick() -> None:
     bits[filled] = torch.tensor([1, -(1 << 63)])
     place = torch.cartesian_prod(*3 * [torch.arange(side)])
     distance = (place[:, None] - place[filled]).abs().amax(-1).amin(-1)
-    assert (distance > MOST_CLEAR).any() and (distance == 0).sum() == 2
-    assert torch.equal(occupied(bits).clearance.long(), distance.clamp(max=MOST_CLEAR))
+    assert (distance > MAX_EMPTY_DISTANCE).any() and (distance == 0).sum() == 2
+    assert torch.equal(binary_occupancy(bits).empty_distance.long(), distance.clamp(max=MAX_EMPTY_DISTANCE))
 
 
 def test_nothing_is_clear_in_a_full_cache_and_all_of_it_in_an_empty_one() -> None:
-    assert occupied(torch.full((8,), -1)).clearance.tolist() == [0] * 8
-    assert occupied(torch.zeros(8, dtype=torch.int64)).clearance.tolist() == [MOST_CLEAR] * 8
-    assert occupied(torch.zeros(1, dtype=torch.int64)).clearance.tolist() == [MOST_CLEAR]
+    assert binary_occupancy(torch.full((8,), -1)).empty_distance.tolist() == [0] * 8
+    assert binary_occupancy(torch.zeros(8, dtype=torch.int64)).empty_distance.tolist() == [MAX_EMPTY_DISTANCE] * 8
+    assert binary_occupancy(torch.zeros(1, dtype=torch.int64)).empty_distance.tolist() == [MAX_EMPTY_DISTANCE]

@@ -4,10 +4,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from nerf.kernels import Lattice, Samples
+from nerf.kernels import RayStepping, Samples
 from nerf.kernels.torch.sparse_depth import depth_loss, depth_loss_backward
 
-EVEN, GROWING = Lattice(0.25, 0.0, False, 8, 100), Lattice(0.25, 0.1, True, 8, 100)  # the second grows from 2.5 on
+EVEN, GROWING = (
+    RayStepping(0.25, 0.0, False, 8, 100),
+    RayStepping(0.25, 0.1, True, 8, 100),
+)  # the second grows from 2.5 on
 T = torch.tensor([1.0, 2.0, 4.0, 8.0], dtype=torch.float64)
 FAR = torch.full((3,), 16.0, dtype=torch.float64)
 
@@ -19,10 +22,10 @@ def samples(rays: int = 3) -> Samples:
     return Samples(starts, ray, T.repeat(rays), torch.ones(4 * rays, dtype=torch.float64))
 
 
-def loss_of(weights: Tensor, distance: list[float], lattice: Lattice = EVEN) -> Tensor:
+def loss_of(weights: Tensor, distance: list[float], stepping: RayStepping = EVEN) -> Tensor:
     opacity = weights.view(-1, 4).sum(-1)
     where = torch.tensor(distance, dtype=torch.float64)
-    return depth_loss(samples(len(distance)), weights.flatten(), opacity, FAR[: len(distance)], where, lattice)
+    return depth_loss(samples(len(distance)), weights.flatten(), opacity, FAR[: len(distance)], where, stepping)
 
 
 def test_light_that_is_stopped_at_the_point_costs_nothing() -> None:
@@ -42,14 +45,14 @@ def test_where_steps_grow_a_tenth_too_far_costs_the_same_at_any_distance() -> No
     torch.testing.assert_close(float(near), float(torch.tensor(1.1).log()), rtol=1e-6, atol=0)
 
 
-@pytest.mark.parametrize("lattice", [EVEN, GROWING])
-def test_the_gradient_by_hand_is_that_of_autograd(lattice: Lattice) -> None:
+@pytest.mark.parametrize("stepping", [EVEN, GROWING])
+def test_the_gradient_by_hand_is_that_of_autograd(stepping: RayStepping) -> None:
     random = torch.Generator().manual_seed(0)
     weights = torch.rand(12, generator=random, dtype=torch.float64, requires_grad=True)
     opacity = torch.rand(3, generator=random, dtype=torch.float64, requires_grad=True)
     distance, each = torch.tensor([3.0, 0.0, 20.0]).double(), torch.tensor([0.3, 1.0, 2.0]).double()
-    loss = (each * depth_loss(samples(), weights, opacity, FAR, distance, lattice)).sum()
-    by_hand = depth_loss_backward(samples(), FAR, distance, lattice, each)
+    loss = (each * depth_loss(samples(), weights, opacity, FAR, distance, stepping)).sum()
+    by_hand = depth_loss_backward(samples(), FAR, distance, stepping, each)
     torch.testing.assert_close(by_hand, torch.autograd.grad(loss, (weights, opacity)))
 
 

@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from nerf.fields.interface import Rendering
-from nerf.kernels import Backend, Lattice, Samples, warp
+from nerf.kernels import Backend, RayStepping, Samples, warp
 from nerf.kernels import torch as reference
 from tests.nerf.kernels.agreement import (
     COUNTS,
-    LATTICES,
+    STEPPINGS,
     TOLERANCE,
     agree,
     assert_each_close,
@@ -25,7 +25,7 @@ from tests.nerf.kernels.agreement import (
     uniform,
 )
 
-EVEN, GROWING = LATTICES.values()
+EVEN, GROWING = STEPPINGS.values()
 
 
 def seen(device: str, rays: int, samples: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -63,9 +63,9 @@ def test_rays_of_4096_samples(device: str, varied: bool, density: float) -> None
     inputs = samples, density * each, *seen(device, 3, len(each))
     _, weights = agree("composite", *inputs, tolerance=1e-6)
     agree("composite_backward", *inputs, *gradients(device, 3, len(each)), tolerance=1e-6)
-    for lattice in (EVEN, GROWING):
-        agree("distortion", samples, weights, lattice, tolerance=1e-6)
-        agree("distortion_backward", samples, weights, lattice, normal(device, 23, 3), tolerance=1e-6)
+    for stepping in (EVEN, GROWING):
+        agree("distortion", samples, weights, stepping, tolerance=1e-6)
+        agree("distortion_backward", samples, weights, stepping, normal(device, 23, 3), tolerance=1e-6)
 
 
 @pytest.mark.parametrize("varied", [False, True])
@@ -76,9 +76,9 @@ def test_other_sums_along_rays_of_4096_samples(device: str, varied: bool) -> Non
         grad = 0.1 * each[:, None].repeat(1, 3)
         agree("sample_points_backward", rays, samples, contracted, grad, tolerance=1e-6)
     weights, opacity, distance = each / 5000, uniform(device, 28, 3), torch.tensor([0.05, 2.0, 5.0], device=device)
-    for lattice in (EVEN, GROWING):
-        agree("depth_loss", samples, weights, opacity, rays.far, distance, lattice, tolerance=1e-6)
-        agree("depth_loss_backward", samples, rays.far, distance, lattice, normal(device, 23, 3), tolerance=1e-6)
+    for stepping in (EVEN, GROWING):
+        agree("depth_loss", samples, weights, opacity, rays.far, distance, stepping, tolerance=1e-6)
+        agree("depth_loss_backward", samples, rays.far, distance, stepping, normal(device, 23, 3), tolerance=1e-6)
     hidden = (0.1 * each[:, None] - 0.06).relu().repeat(1, 64)
     given = 0.1 * each[:, None].repeat(1, 64)
     wanted = given.double()
@@ -90,13 +90,13 @@ def test_other_sums_along_rays_of_4096_samples(device: str, varied: bool) -> Non
 def test_waves_of_4096_samples(device: str, varied: bool) -> None:
     (samples, each), jitter = three_long_rays(device, varied), uniform(device, 33, 3)
     far, light_left = torch.full((3,), 9.0, device=device), 0.2
-    for lattice in (EVEN._replace(most_samples=4096), GROWING._replace(most_samples=4096)):
+    for stepping in (EVEN._replace(max_samples=4096), GROWING._replace(max_samples=4096)):
         depths, nears = [], []
         for backend, kind in ((warp, torch.float32), (reference, torch.float64)):
             depth, near = torch.full((3,), 0.1, dtype=torch.float64, device=device), torch.zeros(3, dtype=kind)
             arguments = samples, 0.3 * each, light_left, jitter, far
             arguments = arguments if backend is warp else doubled(arguments)
-            backend.finish_round(lattice, *arguments, depth, near)
+            backend.finish_round(stepping, *arguments, depth, near)
             depths.append(depth)
             nears.append(near)
         assert (depths[0] > 1).all() and float((depths[0] / depths[1] - 1).abs().max()) < 1e-6
@@ -117,8 +117,8 @@ def test_what_is_done_to_each_of_4096_samples(device: str, varied: bool) -> None
     warp.add_ray_relu(samples, given, of_ray)
     reference.add_ray_relu(samples, wanted, of_ray)
     assert torch.equal(given, wanted)
-    waves, _ = agree("pack_rounds", [samples, packed(device, [4096, 0, 1])])
-    assert waves.starts.diff().tolist() == [8192, 4096, 4097]
+    rounds, _ = agree("pack_rounds", [samples, packed(device, [4096, 0, 1])])
+    assert rounds.starts.diff().tolist() == [8192, 4096, 4097]
 
 
 THICKNESS = st.one_of(st.floats(0, 1e30), st.floats(0, 30), st.sampled_from([0.0, 1e-30, 800.0, 1e30]))
@@ -215,12 +215,12 @@ def test_a_density_that_is_no_number_is_visible(device: str) -> None:
         assert backend.visible_samples(samples, sigma, 1e-3, 1e-2, uniform(device, 32, 1))[1].tolist() == [1]
 
 
-@pytest.mark.parametrize("lattice", LATTICES.values(), ids=LATTICES)
-def test_distortion_and_its_gradient(device: str, lattice: Lattice) -> None:
+@pytest.mark.parametrize("stepping", STEPPINGS.values(), ids=STEPPINGS)
+def test_distortion_and_its_gradient(device: str, stepping: RayStepping) -> None:
     samples = packed(device, COUNTS)
     weights = uniform(device, 25, sum(COUNTS))
-    agree("distortion", samples, weights, lattice)
-    agree("distortion_backward", samples, weights, lattice, normal(device, 26, len(COUNTS)))
+    agree("distortion", samples, weights, stepping)
+    agree("distortion_backward", samples, weights, stepping, normal(device, 26, len(COUNTS)))
 
 
 @pytest.mark.parametrize("step", [1e-5, 0.002, 0.02, 0.5, 4.0])
@@ -242,15 +242,15 @@ def test_losses_of_light_that_ends_close_together_far_out(device: str, step: flo
     assert float(nearest) == pytest.approx(math.log(float(behind[0]) / float(samples.t[0])), rel=1e-6)
 
 
-@pytest.mark.parametrize("lattice", LATTICES.values(), ids=LATTICES)
-def test_depth_loss_and_its_gradient(device: str, lattice: Lattice) -> None:
+@pytest.mark.parametrize("stepping", STEPPINGS.values(), ids=STEPPINGS)
+def test_depth_loss_and_its_gradient(device: str, stepping: RayStepping) -> None:
     samples, rays = packed(device, COUNTS), len(COUNTS)
     weights, opacity = uniform(device, 27, sum(COUNTS)), uniform(device, 28, rays)
     far, distance = 20 + uniform(device, 29, rays), 8 * uniform(device, 30, rays)
     distance[::3] = 0  # no point is known
-    loss = agree("depth_loss", samples, weights, opacity, far, distance, lattice)
+    loss = agree("depth_loss", samples, weights, opacity, far, distance, stepping)
     assert (loss[::3] == 0).all() and (loss[1::3] > 0).all()
-    arguments = samples, far, distance, lattice, normal(device, 31, rays)
+    arguments = samples, far, distance, stepping, normal(device, 31, rays)
     given, wanted = warp.depth_loss_backward(*arguments), reference.depth_loss_backward(*doubled(arguments))
     for one, right in zip(given, wanted, strict=True):
         assert_each_close(one, right, 0.0)

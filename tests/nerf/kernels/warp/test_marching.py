@@ -6,14 +6,14 @@ from torch import Tensor
 
 from nerf.geometry.contraction import uncontract
 from nerf.geometry.rays import Rays, clip_to_box
-from nerf.kernels import BOX, Lattice, Occupied, Samples, warp
+from nerf.kernels import BOX, BinaryOccupancy, RayStepping, Samples, warp
 from nerf.kernels import torch as reference
 from nerf.kernels.torch.marching import t_to_s, unit_coordinates
-from nerf.kernels.torch.occupancy import cell_corners, cell_numbers, occupied
+from nerf.kernels.torch.occupancy import binary_occupancy, cell_corners, cell_numbers
 from tests.nerf.kernels.agreement import (
     BOUNDED,
     FOLDED,
-    LATTICES,
+    STEPPINGS,
     TOLERANCE,
     agree,
     doubled,
@@ -26,37 +26,37 @@ from tests.nerf.kernels.agreement import (
 )
 
 
-def places(lattice: Lattice, rays: Rays, jitter: Tensor, samples: Samples) -> Tensor:
-    """Ray and number k on the lattice of each sample, as one integer."""
-    near = rays.near if lattice.contracted else clip_to_box(rays, -BOX, BOX).near
+def places(stepping: RayStepping, rays: Rays, jitter: Tensor, samples: Samples) -> Tensor:
+    """Ray and number k of each sample on its ray, as one integer."""
+    near = rays.near if stepping.contracted else clip_to_box(rays, -BOX, BOX).near
     ray = samples.ray.long()
-    k = t_to_s(lattice, samples.t) - (t_to_s(lattice, near) + jitter)[ray]
+    k = t_to_s(stepping, samples.t) - (t_to_s(stepping, near) + jitter)[ray]
     assert not len(k) or (k - k.round()).abs().max() < 0.3
     return (ray << 24) + k.round().long()
 
 
-def decided_by_rounding(lattice: Lattice, rays: Rays, samples: Samples) -> Tensor:
+def decided_by_rounding(stepping: RayStepping, rays: Rays, samples: Samples) -> Tensor:
     """Samples so near to a face of their cell, or to far, that the last digit of exp() decides."""
     origin, direction, _, far = (part[samples.ray.long()].double() for part in rays)
     t = samples.t.double()
-    scaled = lattice.cells * unit_coordinates(origin + t[:, None] * direction, lattice.contracted)
+    scaled = stepping.occupancy_resolution * unit_coordinates(origin + t[:, None] * direction, stepping.contracted)
     to_face = (scaled - scaled.round()).abs().amin(-1)
-    return (to_face < 1e-6 * lattice.cells) | ((t / far - 1).abs() < 1e-6)
+    return (to_face < 1e-6 * stepping.occupancy_resolution) | ((t / far - 1).abs() < 1e-6)
 
 
-def assert_same_march(where: Occupied, lattice: Lattice, rays: Rays, jitter: Tensor) -> Samples:
+def assert_same_march(where: BinaryOccupancy, stepping: RayStepping, rays: Rays, jitter: Tensor) -> Samples:
     """Bounded, where samples are a step apart, both give the same numbers on the CPU; folded, exp() and log() may
     differ by their last digit: t by 1e-6 of itself, dt, a difference of two distances, by 1e-6 of t. So may everything
     on a GPU, where torch divides by a number by multiplying with its inverse."""
-    given, wanted = (backend.march(where, lattice, rays, jitter) for backend in (warp, reference))
-    at, right = (places(lattice, rays, jitter, samples) for samples in (given, wanted))
+    given, wanted = (backend.march(where, stepping, rays, jitter) for backend in (warp, reference))
+    at, right = (places(stepping, rays, jitter, samples) for samples in (given, wanted))
     in_both, common = torch.isin(at, right), torch.isin(right, at)
-    assert decided_by_rounding(lattice, rays, given)[~in_both].all(), "a sample in an empty cell"
-    assert decided_by_rounding(lattice, rays, wanted)[~common].all(), "a sample was lost"
+    assert decided_by_rounding(stepping, rays, given)[~in_both].all(), "a sample in an empty cell"
+    assert decided_by_rounding(stepping, rays, wanted)[~common].all(), "a sample was lost"
     most = (1e-3 if right.is_cuda else 1e-5) * len(right)
     assert (~common).sum() <= most and (~in_both).sum() <= most
     a, b = given.t[in_both], wanted.t[common]
-    tolerance = 1e-6 * b if lattice.cone or b.is_cuda else 0 * b
+    tolerance = 1e-6 * b if stepping.cone_angle or b.is_cuda else 0 * b
     assert ((a - b).abs() <= tolerance).all()
     assert ((given.dt[in_both] - wanted.dt[common]).abs() <= tolerance).all()
     assert torch.equal(given.starts.diff().long(), torch.bincount(given.ray, minlength=len(jitter)))
@@ -64,32 +64,34 @@ def assert_same_march(where: Occupied, lattice: Lattice, rays: Rays, jitter: Ten
     return given
 
 
-@pytest.mark.parametrize("lattice", LATTICES.values(), ids=LATTICES)
+@pytest.mark.parametrize("stepping", STEPPINGS.values(), ids=STEPPINGS)
 @pytest.mark.parametrize("cells", [4, 12, 32, 128])
 @pytest.mark.parametrize("kind", ["random", "sparse", "bricks", "full", "empty"])
-def test_marching(device: str, kind: str, cells: int, lattice: Lattice) -> None:
+def test_marching(device: str, kind: str, cells: int, stepping: RayStepping) -> None:
     rays = random_rays(device, 320)
     samples = assert_same_march(
-        occupied_of(device, kind, cells), lattice._replace(cells=cells), rays, uniform(device, 8, 320)
+        occupied_of(device, kind, cells), stepping._replace(occupancy_resolution=cells), rays, uniform(device, 8, 320)
     )
     assert kind != "empty" or len(samples.t) == 0
     assert kind == "empty" or cells == 4 or len(samples.t) > 20
 
 
-@pytest.mark.parametrize("lattice", LATTICES.values(), ids=LATTICES)
+@pytest.mark.parametrize("stepping", STEPPINGS.values(), ids=STEPPINGS)
 @pytest.mark.parametrize("most", [1, 17])
-def test_marching_stops_at_the_cap(device: str, most: int, lattice: Lattice) -> None:
+def test_marching_stops_at_the_cap(device: str, most: int, stepping: RayStepping) -> None:
     rays = random_rays(device, 320)
     where = occupied_of(device, "random", 32)
-    samples = assert_same_march(where, lattice._replace(most_samples=most), rays, uniform(device, 8, 320))
+    samples = assert_same_march(where, stepping._replace(max_samples=most), rays, uniform(device, 8, 320))
     assert samples.starts.diff().max() == most
 
 
-@pytest.mark.parametrize("lattice", [BOUNDED._replace(step=2e-4), FOLDED._replace(step=5e-4, cone=1e-3)], ids=LATTICES)
+@pytest.mark.parametrize(
+    "stepping", [BOUNDED._replace(step_size=2e-4), FOLDED._replace(step_size=5e-4, cone_angle=1e-3)], ids=STEPPINGS
+)
 @pytest.mark.parametrize("kind", ["random", "full"])
-def test_marching_of_4096_samples(device: str, kind: str, lattice: Lattice) -> None:
-    lattice, where = lattice._replace(most_samples=4096), occupied_of(device, kind, 32)
-    samples = assert_same_march(where, lattice, random_rays(device, 32), uniform(device, 8, 32))
+def test_marching_of_4096_samples(device: str, kind: str, stepping: RayStepping) -> None:
+    stepping, where = stepping._replace(max_samples=4096), occupied_of(device, kind, 32)
+    samples = assert_same_march(where, stepping, random_rays(device, 32), uniform(device, 8, 32))
     assert kind == "random" or samples.starts.diff().max() == 4096
 
 
@@ -98,41 +100,41 @@ def test_marching_from_far_away_in_folded_space(device: str) -> None:
     origins = rays.origins * torch.logspace(0, 6, 320)[:, None]
     samples = assert_same_march(
         occupied_of(device, "full", 16),
-        FOLDED._replace(cells=16),
+        FOLDED._replace(occupancy_resolution=16),
         rays._replace(origins=origins),
         uniform(device, 8, 320),
     )
     assert samples.t.max() > 5e6
 
 
-def aimed_rays(device: str, lattice: Lattice, cell: int, count: int) -> Rays:
+def aimed_rays(device: str, stepping: RayStepping, cell: int, count: int) -> Rays:
     """Rays through one cell of the cache: through its inside, its edges and corners, and along its faces."""
-    corner = cell_corners(lattice.cells, torch.tensor([cell], device=device))
+    corner = cell_corners(stepping.occupancy_resolution, torch.tensor([cell], device=device))
     inside = uniform(device, 9, count, 3)
     inside[: count // 3] = inside[: count // 3].round()
-    unit = (corner + inside / lattice.cells).clamp(1e-6, 1 - 1e-6)
-    aim = uncontract(4 * unit - 2) if lattice.contracted else BOX * (2 * unit - 1)
+    unit = (corner + inside / stepping.occupancy_resolution).clamp(1e-6, 1 - 1e-6)
+    aim = uncontract(4 * unit - 2) if stepping.contracted else BOX * (2 * unit - 1)
     origins = 3 * normal(device, 10, count, 3)
     origins[: count // 2] /= 10
     share = count // 8
     origins[:share, 0] = aim[:share, 0]  # directions along a face
     origins[share // 2 : share, 1] = aim[share // 2 : share, 1]
-    return rays_of(origins, aim - origins, 0.01, 1e3 if lattice.contracted else 30.0)
+    return rays_of(origins, aim - origins, 0.01, 1e3 if stepping.contracted else 30.0)
 
 
-@pytest.mark.parametrize("lattice", LATTICES.values(), ids=LATTICES)
+@pytest.mark.parametrize("stepping", STEPPINGS.values(), ids=STEPPINGS)
 @pytest.mark.parametrize("cells", [4, 8, 20, 64])
-def test_skipping_bricks_loses_no_sample(device: str, cells: int, lattice: Lattice) -> None:
+def test_skipping_bricks_loses_no_sample(device: str, cells: int, stepping: RayStepping) -> None:
     """Bit for bit: the samples in the one occupied cell are those that a full cache has there."""
-    lattice = lattice._replace(cells=cells, most_samples=4096)
+    stepping = stepping._replace(occupancy_resolution=cells, max_samples=4096)
     full = occupied_of(device, "full", cells)
     for cell in (0, cells**3 // 2, 7 * cells**3 // 9, cells**3 - 1):
-        rays, jitter = aimed_rays(device, lattice, cell, 1000), uniform(device, 11, 1000)
-        every = warp.march(full, lattice, rays, jitter)
-        here = cell_numbers(cells, warp.sample_points(rays, every, lattice.contracted)) == cell
+        rays, jitter = aimed_rays(device, stepping, cell, 1000), uniform(device, 11, 1000)
+        every = warp.march(full, stepping, rays, jitter)
+        here = cell_numbers(cells, warp.sample_points(rays, every, stepping.contracted)) == cell
         bits = torch.zeros_like(full.bits)
         bits[cell >> 6] = 1 << (cell & 63) if cell & 63 != 63 else -(1 << 63)
-        found = warp.march(occupied(bits), lattice, rays, jitter)
+        found = warp.march(binary_occupancy(bits), stepping, rays, jitter)
         assert here.sum() > 100
         for part, whole in zip(found[1:], every[1:], strict=True):
             assert torch.equal(part, whole[here])
@@ -143,8 +145,8 @@ def test_sample_points(device: str, contracted: bool) -> None:
     rays = random_rays(device, 320)
     if contracted:
         rays = rays._replace(origins=rays.origins * torch.logspace(0, 6, 320)[:, None])
-    lattice = FOLDED if contracted else BOUNDED
-    samples = warp.march(occupied_of(device, "random", 32), lattice, rays, uniform(device, 8, 320))
+    stepping = FOLDED if contracted else BOUNDED
+    samples = warp.march(occupied_of(device, "random", 32), stepping, rays, uniform(device, 8, 320))
     points = agree("sample_points", rays, samples, contracted)
     assert points.min() > -1e-6 and points.max() < 1 + 1e-6
 
@@ -153,8 +155,8 @@ def test_sample_points(device: str, contracted: bool) -> None:
 def test_gradients_of_sample_points(device: str, contracted: bool) -> None:
     """Ray by ray, as they fall with the square of the distance."""
     rays = random_rays(device, 320, far=1e3)
-    lattice = FOLDED if contracted else BOUNDED
-    samples = warp.march(occupied_of(device, "random", 32), lattice, rays, uniform(device, 8, 320))
+    stepping = FOLDED if contracted else BOUNDED
+    samples = warp.march(occupied_of(device, "random", 32), stepping, rays, uniform(device, 8, 320))
     grad = normal(device, 12, len(samples.t), 3)
     given = warp.sample_points_backward(rays, samples, contracted, grad)
     wanted = reference.sample_points_backward(*doubled((rays, samples, contracted, grad)))

@@ -18,8 +18,8 @@ from torch import Tensor
 from nerf.fields.hash_grid import HashGridField, HashGridSettings
 from nerf.fields.interface import Rendering
 from nerf.geometry.rays import Rays
-from nerf.kernels import Lattice, grid_layout, warp
-from nerf.kernels.torch.occupancy import occupied
+from nerf.kernels import RayStepping, grid_layout, warp
+from nerf.kernels.torch.occupancy import binary_occupancy
 from nerf.runtime.parallel import take_over_cores
 from nerf.runtime.randomness import generator
 from nerf.training.hash_grid_trainer import HashGridTrainer, HashGridTrainerSettings
@@ -70,16 +70,18 @@ def noise_bank() -> RayDataset:
     return build_ray_bank([photo] * 2, [0, 0], [bearings], torch.stack([front, back]), near, far)
 
 
-BOUNDED = HashGridSettings(levels=3, log2_rows=8, coarsest=4, finest=16, steps=32, occupancy_resolution=8)
-OUTDOORS = replace(BOUNDED, contracted=True, shortest_step=0.1, cone=0.1, sky=True)
+BOUNDED = HashGridSettings(
+    num_levels=3, log2_hashmap_size=8, base_res=4, max_res=16, diagonal_steps=32, occupancy_resolution=8
+)
+OUTDOORS = replace(BOUNDED, contracted=True, min_step_size=0.1, cone_angle=0.1, background_model=True)
 
 
 def small_trainer(field: HashGridSettings) -> HashGridTrainer:
     """A step has sixteen rays, two of which run to points whose distance is known."""
-    background = (0.0, 0.0, 0.0) if field.sky else "random"
+    background = (0.0, 0.0, 0.0) if field.background_model else "random"
     settings = HashGridTrainerSettings(3, background, samples=512, chunks=4, distortion=1e-3, depth_loss=0.1)
     model = HashGridField(field, 0, warp)
-    model.occupy(warp.occupancy_bits(torch.rand(512, generator=torch.Generator().manual_seed(2)), 0.3))
+    model.set_occupancy(warp.occupancy_bits(torch.rand(512, generator=torch.Generator().manual_seed(2)), 0.3))
     opaque = (noise_bank().pixels[:, 3] == 255).nonzero()[:, 0]
     trainer = HashGridTrainer(
         model, noise_bank().with_distances(opaque, torch.full_like(opaque, 3.0, dtype=torch.float32)), settings
@@ -96,7 +98,7 @@ def run_briefly(trainer: HashGridTrainer, start: dict[str, Tensor]) -> dict[str,
     """A step and a refresh of the density cache, from the same beginning each time."""
     trainer.load_state(start)
     trainer.step(0, 0.0)
-    trainer.cache.refresh(15, generator("cpu", 3, 15, 1))
+    trainer.occupancy_grid.update(15, generator("cpu", 3, 15, 1))
     return trainer.state()
 
 
@@ -104,7 +106,7 @@ def run_briefly(trainer: HashGridTrainer, start: dict[str, Tensor]) -> dict[str,
 def test_a_training_run_has_the_same_bits_again_and_again_on_any_number_of_threads(
     field: HashGridSettings, use_cores: Callable[[int], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("nerf.fields.occupancy_grid.CHUNK", 128)  # so that even this small cache is measured in several
+    monkeypatch.setattr("nerf.fields.occupancy_grid.CHUNK_POINTS", 128)  # several chunks even here
     trainer, used = small_trainer(field), set[int]()
     guided = [int((trainer._batch(0, 0.0, chunk, trainer._rays_per_chunk()).distance > 0).sum()) for chunk in range(4)]
     assert sum(guided) == 2 and trainer._rays_per_chunk() == 4
@@ -114,8 +116,14 @@ def test_a_training_run_has_the_same_bits_again_and_again_on_any_number_of_threa
     use_cores(1)
     wanted = copied(run_briefly(trainer, start))
     changed = {name for name in wanted if not torch.equal(wanted[name], start[name])}
-    assert {"model.table", "model.bits", "thickness", "mean.table", "square.colour_out"} <= changed
-    assert ("model.sky" in changed) == field.sky
+    assert {
+        "model.table",
+        "model.occupancy_bits",
+        "optical_thickness",
+        "exp_avg.table",
+        "exp_avg_sq.colour_out",
+    } <= changed
+    assert ("model.background_table" in changed) == field.background_model
     for repeat in range(200):
         use_cores(count := (1, 2, 4)[repeat % 3])
         found = run_briefly(trainer, start)
@@ -127,36 +135,36 @@ def test_a_training_run_has_the_same_bits_again_and_again_on_any_number_of_threa
 def everything(seed: int) -> list[Tensor]:
     """What all kernels make of random numbers."""
     random = torch.Generator().manual_seed(seed)
-    lattice, layout = Lattice(0.02, 0.05, seed % 2 == 1, 8, 64), grid_layout(3, 4, 16, 8, 4)
+    stepping, layout = RayStepping(0.02, 0.05, seed % 2 == 1, 8, 64), grid_layout(3, 4, 16, 8, 4)
     count = 40 + 7 * seed
     directions = torch.nn.functional.normalize(torch.randn(count, 3, generator=random), dim=-1)
     rays = Rays(
         0.3 * torch.randn(count, 3, generator=random), directions, *torch.tensor([[0.05], [4.0]]).repeat(1, count)
     )
     bits = warp.occupancy_bits(torch.rand(512, generator=random), 0.4)
-    samples = warp.march(occupied(bits), lattice, rays, torch.rand(count, generator=random))
-    points = warp.sample_points(rays, samples, lattice.contracted)
+    samples = warp.march(binary_occupancy(bits), stepping, rays, torch.rand(count, generator=random))
+    points = warp.sample_points(rays, samples, stepping.contracted)
     table = torch.randn(layout.rows, 4, generator=random)
     features = warp.encode(layout, table, points)
     grad_table = torch.zeros_like(table)
     for level in range(3):
         warp.encode_backward_table(layout, level, points, features, grad_table)
     grad_points = warp.encode_backward_points(layout, table, points, features)
-    grad_rays = warp.sample_points_backward(rays, samples, lattice.contracted, grad_points)
+    grad_rays = warp.sample_points_backward(rays, samples, stepping.contracted, grad_points)
     sigma, colour = features[:, 0].exp(), features[:, 1:4].sigmoid()
     front, kept = warp.visible_samples(samples, sigma, 0.1, 0.5, torch.rand(count, generator=random))
     background = torch.rand(count, 3, generator=random)
     rendering, weights = warp.composite(samples, sigma, colour, background, rays.far)
     ones = Rendering(*(torch.ones_like(part) for part in rendering))
     grad_field = warp.composite_backward(samples, sigma, colour, background, rays.far, ones, weights)
-    spread = warp.distortion(samples, weights, lattice)
-    grad_weights = warp.distortion_backward(samples, weights, lattice, spread)
+    spread = warp.distortion(samples, weights, stepping)
+    grad_weights = warp.distortion_backward(samples, weights, stepping, spread)
     known = torch.rand(count, generator=random) + 1
-    apart = warp.depth_loss(samples, weights, rendering.opacity, rays.far, known, lattice)
-    grad_apart = warp.depth_loss_backward(samples, rays.far, known, lattice, apart)
+    apart = warp.depth_loss(samples, weights, rendering.opacity, rays.far, known, stepping)
+    grad_apart = warp.depth_loss_backward(samples, rays.far, known, stepping, apart)
     depth, near = torch.zeros(count, dtype=torch.float64), rays.near.clone()
-    warp.finish_round(lattice, samples, sigma, 0.1, known - 1, rays.far, depth, near)
-    waves, order = warp.pack_rounds([samples, front])
+    warp.finish_round(stepping, samples, sigma, 0.1, known - 1, rays.far, depth, near)
+    rounds, order = warp.pack_rounds([samples, front])
     drawn_depth, shown, seen = torch.zeros_like(depth), torch.zeros(count), torch.zeros(count, 4)
     drawn = warp.select_colour_samples(samples, sigma, 0.1, drawn_depth, shown)
     warp.accumulate_colours(drawn, colour.index_select(0, drawn.rows), seen)
@@ -173,7 +181,7 @@ def everything(seed: int) -> list[Tensor]:
     warp.scatter_max(8, thickness, points, sigma)
     return [
         *(bits, *samples, points, features, grad_table, grad_points, *grad_rays, *front, kept, *rendering, weights),
-        *(*grad_field, spread, grad_weights, apart, *grad_apart, depth, near, *waves, order),
+        *(*grad_field, spread, grad_weights, apart, *grad_apart, depth, near, *rounds, order),
         *(*drawn.samples, drawn.rows, drawn.weights, drawn_depth, shown, seen),
         *(harmonics, grad_directions, hidden, grad_hidden, grad_rectified, of_ray, *adam, thickness),
     ]

@@ -194,7 +194,7 @@ def test_adam(device: str, size: int, count: int) -> None:
 
 
 def test_the_smallest_gradients_move_what_has_no_past(device: str) -> None:
-    """A gradient of 1e-20 counts as much as one of 1: its square is below float32, LEAST_ROOT stands in for its root;
+    """A gradient of 1e-20 counts as much as one of 1: its square is below float32, EPSILON stands in for its root;
     of the smallest, 1e-45, the share in the mean already is below float32."""
     parameter, gradient, mean, square = (torch.zeros(16, device=device) for _ in range(4))
     gradient[:4] = torch.tensor([1e-20, 1e-10, 1.0, 1e-45])
@@ -267,13 +267,13 @@ def test_no_rays_and_no_samples_are_fine_even_at_first(device: str, rays: int) -
         samples, empty, none = packed(device, counts), torch.zeros(0, device=device), torch.zeros(0, 3, device=device)
         nowhere, some = occupied_of(device, "empty", 32), random_rays(device, 320)
         few = some.each(lambda part: part[:rays])
-        for lattice in (BOUNDED, FOLDED):
-            marched = warp.march(nowhere, lattice, few, few.near)
+        for stepping in (BOUNDED, FOLDED):
+            marched = warp.march(nowhere, stepping, few, few.near)
             assert marched.starts.tolist() == [0] * (rays + 1) and len(marched.t) == 0
-            agree("sample_points", few, samples, lattice.contracted)
-            agree("sample_points_backward", few, samples, lattice.contracted, none)
-            agree("distortion", samples, empty, lattice)
-            agree("distortion_backward", samples, empty, lattice, few.near)
+            agree("sample_points", few, samples, stepping.contracted)
+            agree("sample_points_backward", few, samples, stepping.contracted, none)
+            agree("distortion", samples, empty, stepping)
+            agree("distortion_backward", samples, empty, stepping, few.near)
         table = torch.ones(layout.rows, 4, device=device)
         features = agree("encode", layout, table, none)
         agree("encode_backward_points", layout, table, none, features)

@@ -3,35 +3,34 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stages.effects.decisions import Space
-from stages.tradeoff.runs import (
+from stages.io.amounts import resolution_name
+from stages.tradeoff.schedule import (
     ABLATIONS,
+    DESCRIPTIONS,
     FEWER_RAYS,
-    FEWEST_STEPS,
-    LONGEST,
-    MEANINGS,
-    MOST_SHARE,
-    OWN,
+    LEVEL_RATIO,
+    LONGEST_RUN,
+    MAX_RUN,
+    MIN_STEPS,
+    NUM_LEVELS,
     PUBLISHED,
     REDUCED,
-    RUNG,
-    RUNGS,
-    THINNED,
+    SCORING_STRIDE,
     TIMED,
     VARIANTS,
-    Reading,
-    Selection,
+    WORKSPACE_FIELD,
+    ReadingTime,
+    Schedule,
     Speed,
-    meanings,
-    options_of,
+    describe,
+    make_schedule,
     photo_sizes,
-    resolution_words,
     round_to_two_digits,
-    select,
-    wanted,
+    run_order,
+    train_options,
 )
 from stages.train import Config
-from stages.train.fields.hash_grid import SIZES as GRID_SIZES
-from stages.train.fields.vanilla import SIZES as PAPER_SIZES
+from stages.train.fields import hash_grid, vanilla
 
 FAST = {name: Speed(100.0, 1e6) for name in TIMED}
 SIZES = (1.0, 2.0, 4.0, 8.0)
@@ -44,18 +43,18 @@ CORES |= {REDUCED: Speed(27.0, 6.9e3), PUBLISHED: Speed(0.066, 68.0), FEWER_RAYS
 
 @SPACES
 def test_every_variant_is_one_that_stage_train_takes(space: Space) -> None:
-    for arm in select(1e4, 1, space, SIZES, FAST, 1000).arms:
-        assert Config(**arm.options).kind == ("grid" if "grid" in arm.variant else "paper")
+    for run in make_schedule(1e4, 1, space, SIZES, FAST, 1000).runs:
+        assert Config(**run.options).kind == ("grid" if "grid" in run.variant else "paper")
 
 
 @SPACES
 def test_a_study_has_the_sizes_of_grids_that_training_has_for_long_and_for_short_runs(space: Space) -> None:
     def sizes(variant: str) -> tuple[int, ...]:
-        return tuple(options_of(variant, space)[name] for name in ("levels", "log2_rows", "finest"))
+        return tuple(train_options(variant, space)[name] for name in ("levels", "log2_rows", "finest"))
 
-    usual = [arm for arm in select(1e4, 1, space, SIZES, FAST, 1000).arms if arm.variant == "grid"]
-    assert {arm.options["finest"] for arm in usual} == {512 if space == "bounded" else 1024}
-    chosen = [tuple(entry[1:]) for entry in GRID_SIZES[space]]
+    usual = [run for run in make_schedule(1e4, 1, space, SIZES, FAST, 1000).runs if run.variant == "grid"]
+    assert {run.options["finest"] for run in usual} == {512 if space == "bounded" else 1024}
+    chosen = [tuple(entry[1:]) for entry in hash_grid.SIZES[space]]
     assert [sizes("grid"), sizes("small grid")] == chosen
     assert sizes("grid, half the samples") == sizes("grid, twice the samples") == sizes("grid")
     assert all(larger > usual for larger, usual in zip(sizes("large grid"), sizes("grid"), strict=True))
@@ -63,47 +62,50 @@ def test_a_study_has_the_sizes_of_grids_that_training_has_for_long_and_for_short
 
 @SPACES
 def test_every_variant_is_explained_with_its_sizes(space: Space) -> None:
-    assert set(MEANINGS) == {*VARIANTS, OWN}
+    assert set(DESCRIPTIONS) == {*VARIANTS, WORKSPACE_FIELD}
     for name, variant in VARIANTS.items():
-        said = meanings([name], space)
+        said = describe([name], space)
         if variant.family.startswith("grid"):
-            assert f"{options_of(name, space)['levels']} grids" in said
+            assert f"{train_options(name, space)['levels']} grids" in said
         if variant.family == "grid":
-            assert f"{options_of(name, space)['finest']:,}³ cells" in said
-    assert meanings([OWN, "grid"], space) == f"{meanings(['grid'], space)}; {OWN}: {MEANINGS[OWN]}"
+            assert f"{train_options(name, space)['finest']:,}³ cells" in said
+    assert (
+        describe([WORKSPACE_FIELD, "grid"], space)
+        == f"{describe(['grid'], space)}; {WORKSPACE_FIELD}: {DESCRIPTIONS[WORKSPACE_FIELD]}"
+    )
     networks = {REDUCED: "small", PUBLISHED: "published", FEWER_RAYS: "published"}
     for name, preset in networks.items():
-        sizes = {**PAPER_SIZES[preset], **VARIANTS[name].options}
+        sizes = {**vanilla.SIZES[preset], **VARIANTS[name].options}
         words = "{depth} layers of {width}, {samples_coarse} + {samples_fine} samples".format(**sizes)
-        assert words in MEANINGS[name] and f"{sizes['batch_rays']:,} rays a step" in MEANINGS[name]
+        assert words in DESCRIPTIONS[name] and f"{sizes['batch_rays']:,} rays a step" in DESCRIPTIONS[name]
 
 
 def test_with_time_enough_nothing_is_left_out_and_each_arm_is_there_once() -> None:
     plenty = {name: Speed(1e4, 1e8) for name in TIMED}
-    arms, left_out = select(1e4, 1, "bounded", SIZES, plenty, 0)
+    runs, left_out = make_schedule(1e4, 1, "bounded", SIZES, plenty, 0)
     assert not left_out
-    assert {arm.variant for arm in arms} == set(VARIANTS) - {FEWER_RAYS}, "nobody needs fewer rays a step"
-    assert len({arm.name for arm in arms}) == len(arms) > 3 * RUNGS
-    keys = list(wanted(3))
-    assert len(set(keys)) == len(keys) == 3 * (len(arms) + 1)
+    assert {run.variant for run in runs} == set(VARIANTS) - {FEWER_RAYS}, "nobody needs fewer rays a step"
+    assert len({run.name for run in runs}) == len(runs) > 3 * NUM_LEVELS
+    keys = list(run_order(3))
+    assert len(set(keys)) == len(keys) == 3 * (len(runs) + 1)
 
 
 @given(st.floats(10, 1e5), st.integers(1, 4), st.floats(0.01, 1e3), st.floats(0, 1e5))
 def test_a_plan_keeps_to_its_time(seconds: float, seeds: int, steps: float, drawn: float) -> None:
     speeds = {name: Speed(steps, 100 * steps) for name in TIMED}
-    selection = select(seconds, seeds, "bounded", SIZES, speeds, drawn)
-    assert selection.seconds <= seconds
-    for arm in selection.arms:
-        assert arm.steps >= FEWEST_STEPS and arm.seconds <= MOST_SHARE * seconds
-    variants = {arm.variant for arm in selection.arms}
+    made = make_schedule(seconds, seeds, "bounded", SIZES, speeds, drawn)
+    assert made.seconds <= seconds
+    for run in made.runs:
+        assert run.steps >= MIN_STEPS and run.seconds <= MAX_RUN * seconds
+    variants = {run.variant for run in made.runs}
     for name in VARIANTS:
-        left_out = any(words.startswith(name) for words in selection.left_out)
+        left_out = any(words.startswith(name) for words in made.left_out)
         assert name in variants or left_out or (name == FEWER_RAYS and PUBLISHED in variants)
 
 
-def planned(seconds: float, sizes: tuple[float, ...], reading: float, drawn: float = 16 * 64**2 + 5e4) -> Selection:
+def planned(seconds: float, sizes: tuple[float, ...], reading: float, drawn: float = 16 * 64**2 + 5e4) -> Schedule:
     """A study on two cores."""
-    return select(seconds, 3, "bounded", sizes, CORES, drawn, Reading(reading, reading))
+    return make_schedule(seconds, 3, "bounded", sizes, CORES, drawn, ReadingTime(reading, reading))
 
 
 @pytest.mark.parametrize(
@@ -113,57 +115,57 @@ def planned(seconds: float, sizes: tuple[float, ...], reading: float, drawn: flo
 )
 @pytest.mark.parametrize("seconds", [600.0, 1320.0, 1800.0, 7200.0])
 def test_a_study_on_two_cores_has_what_it_is_made_for(seconds: float, sizes: tuple[float, ...], reading: float) -> None:
-    selection = planned(seconds, sizes, reading)
-    assert 0.8 * seconds < selection.seconds <= seconds
+    made = planned(seconds, sizes, reading)
+    assert 0.8 * seconds < made.seconds <= seconds
     seeds: dict[tuple[str, float, int], int] = {}
-    for arm in selection.arms:
-        setting = (arm.variant, arm.downscale, arm.steps)
+    for run in made.runs:
+        setting = (run.variant, run.downscale, run.steps)
         seeds[setting] = seeds.get(setting, 0) + 1
     assert len(seeds) >= 15
     for variant in (REDUCED, *ABLATIONS):
         assert max(seeds[s] for s in seeds if s[0] == variant) >= 2, "differences have a spread"
-    longest = round_to_two_digits(LONGEST * seconds * CORES["grid"].steps)
+    longest = round_to_two_digits(LONGEST_RUN * seconds * CORES["grid"].steps)
     ends = [count for (variant, _, steps), count in seeds.items() if variant == "grid" and steps == longest]
     assert len(ends) == len({*sizes[:2]}) and min(ends) >= 2, "so has the end of the front"
     for variant in ("grid, half the samples", "grid, twice the samples"):
-        assert sum(s[0] == variant for s in seeds) >= (2 if reading < 10 else 1), "sample counts on two rungs"
+        assert sum(s[0] == variant for s in seeds) >= (2 if reading < 10 else 1), "sample counts on two levels"
     if seconds > 1000 and reading < 10:
         assert any(s[0] == FEWER_RAYS for s in seeds)
 
 
 def test_the_methods_trainings_are_longer_than_most_and_none_is_hardly_begun() -> None:
-    arms = planned(1320.0, (1.0, 2.0, 4.0), 0.2).arms
-    steps = {arm.variant: arm.steps for arm in arms if arm.variant in (REDUCED, *ABLATIONS)}
-    assert set(steps.values()) == {round_to_two_digits(1320 * LONGEST / RUNG * CORES[REDUCED].steps)}
-    assert min(arm.steps / CORES["grid"].steps for arm in arms if arm.variant == "grid") > 4, "seconds"
+    runs = planned(1320.0, (1.0, 2.0, 4.0), 0.2).runs
+    steps = {run.variant: run.steps for run in runs if run.variant in (REDUCED, *ABLATIONS)}
+    assert set(steps.values()) == {round_to_two_digits(1320 * LONGEST_RUN / LEVEL_RATIO * CORES[REDUCED].steps)}
+    assert min(run.steps / CORES["grid"].steps for run in runs if run.variant == "grid") > 4, "seconds"
 
 
 def test_a_slowly_drawn_field_is_scored_on_fewer_pixels_and_still_takes_no_sixth_of_the_time() -> None:
-    (arm,) = [arm for arm in planned(1320.0, (1.0, 2.0, 4.0), 0.2).arms if arm.variant == FEWER_RAYS]
-    assert arm.every == THINNED and arm.steps >= FEWEST_STEPS and arm.seconds < 1320 / 6
-    assert {a.every for a in planned(1320.0, (1.0, 2.0, 4.0), 0.2).arms if a.variant != FEWER_RAYS} == {1}
+    (run,) = [run for run in planned(1320.0, (1.0, 2.0, 4.0), 0.2).runs if run.variant == FEWER_RAYS]
+    assert run.stride == SCORING_STRIDE and run.steps >= MIN_STEPS and run.seconds < 1320 / 6
+    assert {a.stride for a in planned(1320.0, (1.0, 2.0, 4.0), 0.2).runs if a.variant != FEWER_RAYS} == {1}
 
 
 def test_where_there_is_time_for_it_the_published_networks_have_their_rays() -> None:
     gpu = CORES | {PUBLISHED: Speed(20.0, 20e3), FEWER_RAYS: Speed(60.0, 4e3)}
-    variants = {arm.variant for arm in select(1320.0, 3, "bounded", SIZES, gpu, 1e5).arms}
+    variants = {run.variant for run in make_schedule(1320.0, 3, "bounded", SIZES, gpu, 1e5).runs}
     assert PUBLISHED in variants and FEWER_RAYS not in variants
 
 
 def test_the_first_training_at_a_size_reads_the_photos_and_the_study_those_of_its_windows() -> None:
-    arms = select(600, 1, "bounded", SIZES, FAST, 1000).arms
-    told = select(600, 1, "bounded", SIZES, FAST, 1000, Reading(photos=5.0, windows=7.0)).arms
-    more = {arm.name: arm.seconds for arm in told}
-    slower = [arm.downscale for arm in arms if arm.name in more and more[arm.name] == pytest.approx(arm.seconds + 5)]
+    runs = make_schedule(600, 1, "bounded", SIZES, FAST, 1000).runs
+    told = make_schedule(600, 1, "bounded", SIZES, FAST, 1000, ReadingTime(photos=5.0, crops=7.0)).runs
+    more = {run.name: run.seconds for run in told}
+    slower = [run.downscale for run in runs if run.name in more and more[run.name] == pytest.approx(run.seconds + 5)]
     assert sorted(slower) == list(SIZES)
-    free = select(600, 1, "bounded", SIZES, FAST, 1000).seconds
+    free = make_schedule(600, 1, "bounded", SIZES, FAST, 1000).seconds
     assert sum(more.values()) <= min(free + 20, 600 - 7)
-    assert not select(600, 1, "bounded", SIZES, FAST, 1000, Reading(photos=600.0)).arms
+    assert not make_schedule(600, 1, "bounded", SIZES, FAST, 1000, ReadingTime(photos=600.0)).runs
 
 
 def test_the_method_and_its_ablations_take_the_same_steps() -> None:
-    arms = select(1e4, 1, "bounded", SIZES, FAST, 1000).arms
-    of = {name: {(a.downscale, a.steps) for a in arms if a.variant == name} for name in VARIANTS}
+    runs = make_schedule(1e4, 1, "bounded", SIZES, FAST, 1000).runs
+    of = {name: {(a.downscale, a.steps) for a in runs if a.variant == name} for name in VARIANTS}
     for name in ABLATIONS:
         assert of[name] and of[name] <= of[REDUCED]
         assert {size for size, _ in of[name]} == {8.0}, "the small photos"
@@ -171,17 +173,17 @@ def test_the_method_and_its_ablations_take_the_same_steps() -> None:
 
 def test_what_is_too_slow_is_named() -> None:
     speeds = FAST | {PUBLISHED: Speed(0.01, 10.0)}
-    selection = select(1800, 1, "bounded", SIZES, speeds, 1000)
-    assert PUBLISHED not in {arm.variant for arm in selection.arms}
-    assert "paper, published at 1/8 of the resolution: 1 steps (fewer than 300)" in selection.left_out
+    made = make_schedule(1800, 1, "bounded", SIZES, speeds, 1000)
+    assert PUBLISHED not in {run.variant for run in made.runs}
+    assert "paper, published at 1/8 of the resolution: 1 steps (fewer than 300)" in made.left_out
 
 
 def test_seeds_come_first_where_the_spread_is_judged() -> None:
-    keys = list(wanted(2))
+    keys = list(run_order(2))
     last_of_front, ablation = keys.index(("grid", 0, 0, 1)), keys.index((REDUCED, -1, 1, 1))
     assert keys.index((REDUCED, -1, 1, 0)) < last_of_front < ablation
-    assert keys.index(("grid", 1, RUNGS - 1, 1)) < ablation, "short trainings are the least alike"
-    assert ablation < keys.index(("grid, half the samples", 1, 2, 0)) < keys.index(("grid", 1, RUNGS - 2, 1))
+    assert keys.index(("grid", 1, NUM_LEVELS - 1, 1)) < ablation, "short trainings are the least alike"
+    assert ablation < keys.index(("grid, half the samples", 1, 2, 0)) < keys.index(("grid", 1, NUM_LEVELS - 2, 1))
 
 
 @pytest.mark.parametrize(
@@ -200,8 +202,8 @@ def test_photo_sizes_are_distinct_and_not_tiny(
 
 
 def test_half_and_twice_the_samples_take_as_many_steps_and_their_part_of_the_time() -> None:
-    arms = {arm.variant: arm for arm in select(1e4, 1, "bounded", SIZES, FAST, 0).arms}
-    half, twice = arms["paper, half the samples"], arms["paper, twice the samples"]
+    runs = {run.variant: run for run in make_schedule(1e4, 1, "bounded", SIZES, FAST, 0).runs}
+    half, twice = runs["paper, half the samples"], runs["paper, twice the samples"]
     assert half.steps == twice.steps
     assert twice.seconds == pytest.approx(4 * half.seconds, rel=0.01)
 
@@ -211,7 +213,7 @@ def test_steps_are_round_numbers() -> None:
 
 
 def test_resolutions_in_words() -> None:
-    assert [resolution_words(size) for size in (1.0, 2.0, 2.6)] == [
+    assert [resolution_name(size) for size in (1.0, 2.0, 2.6)] == [
         "full resolution",
         "half resolution",
         "1/2.6 of the resolution",

@@ -5,25 +5,25 @@ from typing import Any
 import pytest
 from PIL import Image
 
-from stages.tradeoff.ablation import worth, worth_words
-from stages.tradeoff.plot import Row, write_sheet
-from stages.tradeoff.runs import REDUCED, Arm
+from stages.tradeoff.plots import Row, write_sheet
+from stages.tradeoff.schedule import REDUCED, Run
+from stages.tradeoff.study import ablation_differences, ablation_sentence
 
 LEFT_OUT = "no positional encoding"
 
 
-def trial(variant: str, seed: int, psnr: float | None, steps: int = 1000) -> tuple[Arm, Mapping[str, Any]]:
-    return Arm(variant, "bounded", 4.0, steps, seed, 0.0), {"psnr": psnr, "failed": None if psnr else "it diverged"}
+def result(variant: str, seed: int, psnr: float | None, steps: int = 1000) -> tuple[Run, Mapping[str, Any]]:
+    return Run(variant, "bounded", 4.0, steps, seed, 0.0), {"psnr": psnr, "failed": None if psnr else "it diverged"}
 
 
 def test_differences_are_taken_seed_by_seed() -> None:
-    trials = [trial(REDUCED, 0, 20.0), trial(REDUCED, 1, 21.0), trial(LEFT_OUT, 0, 17.0), trial(LEFT_OUT, 1, 18.2)]
-    trials += [trial(REDUCED, 0, 25.0, steps=2000), trial("no view dependence", 0, 19.9)]
-    view, encoding = sorted(worth(trials), key=lambda part: part.seeds)
-    assert (encoding.difference, encoding.deviation) == (pytest.approx(-2.9), pytest.approx(0.2 / 2**0.5))
+    results = [result(REDUCED, 0, 20.0), result(REDUCED, 1, 21.0), result(LEFT_OUT, 0, 17.0), result(LEFT_OUT, 1, 18.2)]
+    results += [result(REDUCED, 0, 25.0, steps=2000), result("no view dependence", 0, 19.9)]
+    view, encoding = sorted(ablation_differences(results), key=lambda part: part.seeds)
+    assert (encoding.difference, encoding.std) == (pytest.approx(-2.9), pytest.approx(0.2 / 2**0.5))
     assert encoding.words == "−2.90 ± 0.14 dB"
-    assert (view.variant, view.words, view.deviation) == ("no view dependence", "−0.10 dB", None)
-    assert worth_words(trials, 1.0) == (
+    assert (view.variant, view.words, view.std) == ("no view dependence", "−0.10 dB", None)
+    assert ablation_sentence(results, 1.0) == (
         "Against the complete reduced method, seed by seed, of 2 seeds (± their standard deviation): no positional "
         "encoding −2.90 ± 0.14 dB; no view dependence −0.10 dB; 1,000 steps each, trained on photos at a "
         "quarter of the resolution, scored at full resolution."
@@ -31,8 +31,8 @@ def test_differences_are_taken_seed_by_seed() -> None:
 
 
 def test_without_its_counterpart_a_training_tells_no_difference() -> None:
-    assert worth([trial(REDUCED, 0, None), trial(LEFT_OUT, 0, 17.0)]) == []
-    assert worth_words([trial(REDUCED, 0, 20.0), trial(LEFT_OUT, 1, 17.0)], 1.0) is None
+    assert ablation_differences([result(REDUCED, 0, None), result(LEFT_OUT, 0, 17.0)]) == []
+    assert ablation_sentence([result(REDUCED, 0, 20.0), result(LEFT_OUT, 1, 17.0)], 1.0) is None
 
 
 def test_the_line_stands_under_the_pictures(tmp_path: Path) -> None:
