@@ -24,7 +24,7 @@ from nerf.geometry.scene import Scene
 from nerf.training import hash_grid_trainer as grid_training
 from nerf.training.hash_grid_trainer import HashGridTrainer
 from nerf.training.ray_dataset import RayDataset
-from nerf.training.schedule import plan_of
+from nerf.training.schedule import schedule_of
 from nerf.training.trainer import FieldTrainer
 from nerf.training.validation_probe import Probe, make_probe, measure
 from stages.effects.decisions import Decisions, image_effects, read_decisions, told_by_neighbours
@@ -32,7 +32,7 @@ from stages.hardware.backend import chosen_backend, load_backend
 from stages.hardware.device import compute_device
 from stages.io.files import read_json, read_scene
 from stages.train import Config
-from stages.train.data import field_background, guided_bank, training_bank
+from stages.train.data import field_background, guided_dataset, training_dataset
 from stages.train.fields import field_of, make_trainer, with_defaults
 from stages.train.planning import chosen_downscale
 
@@ -63,7 +63,7 @@ class Bench(NamedTuple):
     config: Config
     scene: Scene
     decisions: Decisions
-    bank: RayDataset
+    dataset: RayDataset
     probe: Probe
     neighbours: torch.Tensor
 
@@ -86,8 +86,8 @@ def bench_of(workspace: Path) -> Bench:
     downscale = chosen_downscale(scene, rays)
     config = config.model_copy(update={"downscale": downscale})
     config = field_of(config).with_sizes(config, scene, rays)
-    train = guided_bank(inputs, scene, downscale, Quiet())
-    test = training_bank(inputs["ingest"], scene, "test", downscale, Quiet())
+    train = guided_dataset(inputs, scene, downscale, Quiet())
+    test = training_dataset(inputs["ingest"], scene, "test", downscale, Quiet())
     shown_over = torch.tensor(field_background(config, scene))
     probe = make_probe(test, PROBE_RAYS, shown_over, seed=0)
     return Bench(config, scene, decisions, train, probe, told_by_neighbours(scene, scene.of_split("test")))
@@ -113,12 +113,12 @@ class RunningMean:
 
 def train_run(bench: Bench, seed: int, steps: int, schedule: str) -> dict[str, Any]:
     """One run, measured at geometric steps."""
-    effects = image_effects(bench.decisions, bench.scene.of_split("train"), bench.bank)
-    trainer = make_trainer(bench.config, bench.scene, bench.bank, seed, effects)
+    effects = image_effects(bench.decisions, bench.scene.of_split("train"), bench.dataset)
+    trainer = make_trainer(bench.config, bench.scene, bench.dataset, seed, effects)
     assert isinstance(trainer, HashGridTrainer)
     means = {name: RunningMean(trainer, exponent) for name, exponent in MEANS.items()}
     due = {round(steps / 2 ** (k / PER_DOUBLING)) for k in range(PER_DOUBLING * int(math.log2(steps / FIRST)) + 1)}
-    plan = plan_of(steps) if schedule == "whole" else plan_of(steps // 2).extended(steps)
+    plan = schedule_of(steps) if schedule == "whole" else schedule_of(steps // 2).extended(steps)
     points, pace, rays = [], 0.0, 0
     for step in range(steps):
         result = trainer.step(step, plan.share(step))
@@ -132,7 +132,7 @@ def train_run(bench: Bench, seed: int, steps: int, schedule: str) -> dict[str, A
             models = {"heldout_psnr": trainer.model} | {name: mean.model for name, mean in means.items()}
             psnr = {name: measure(model, bench.probe, as_expected).psnr for name, model in models.items()}
             points.append({"step": step + 1, "train_psnr": pace, **psnr})
-    return {"rays": rays, "pixels": bench.bank.drawable, "points": points}
+    return {"rays": rays, "pixels": bench.dataset.unmasked_count, "points": points}
 
 
 def main() -> None:

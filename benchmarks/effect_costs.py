@@ -53,7 +53,7 @@ class Timed:
 
 
 def arms(
-    config: Config, scene: Scene, bank: RayDataset, decided: Decisions, identity: Timed
+    config: Config, scene: Scene, dataset: RayDataset, decided: Decisions, identity: Timed
 ) -> dict[str, FieldTrainer]:
     """A trainer for each choice; ``identity`` stands in the first one."""
     views = scene.of_split("train")
@@ -68,10 +68,10 @@ def arms(
 
     def trainer(decisions: Decisions, effects: Any) -> FieldTrainer:
         of_choice = config.model_copy(update={"view_dependence": decisions.view_dependence})
-        return make_trainer(of_choice, scene, bank, config.seed, effects)
+        return make_trainer(of_choice, scene, dataset, config.seed, effects)
 
     return {"off": trainer(none, identity)} | {
-        name: trainer(each, image_effects(each, views, bank)) for name, each in choices.items()
+        name: trainer(each, image_effects(each, views, dataset)) for name, each in choices.items()
     }
 
 
@@ -86,9 +86,9 @@ def main() -> None:
     given = parser.parse_args()
     workspace = given.workspace.absolute()
     pipeline("run", given.photos.absolute(), "-o", workspace, "--until", "effects")
-    config, scene, bank, decided = loaded(workspace, Config(seconds=given.seconds))
+    config, scene, dataset, decided = loaded(workspace, Config(seconds=given.seconds))
     identity = Timed(NO_EFFECTS)
-    trainers = arms(config, scene, bank, decided, identity)
+    trainers = arms(config, scene, dataset, decided, identity)
     seconds: dict[str, list[float]] = {name: [] for name in trainers}
     with use_matmul_precision(config.matmul):
         for each in trainers.values():

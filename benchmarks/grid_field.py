@@ -22,14 +22,14 @@ from nerf.rendering.images import render_image
 from nerf.runtime.parallel import take_over_cores, workers
 from nerf.training.hash_grid_trainer import HashGridTrainer, HashGridTrainerSettings
 from nerf.training.metrics import mean_squared_error, psnr
-from nerf.training.ray_dataset import RayDataset, build_ray_bank
+from nerf.training.ray_dataset import RayDataset, ray_dataset_from_images
 from nerf.training.trainer import over
 
 SCENE_PER_BLENDER = 0.75  # takes the objects of the NeRF-synthetic set into [-0.9, 0.9]^3
 WHITE = torch.ones(3)
 
 
-def read_bank(folder: Path, split: str, downscale: int, every: int) -> RayDataset:
+def read_dataset(folder: Path, split: str, downscale: int, every: int) -> RayDataset:
     """All photos of a split, RGBA, made smaller by averaging premultiplied pixels."""
     cameras = json.loads((folder / f"transforms_{split}.json").read_text())
     photos, poses = [], []
@@ -44,7 +44,7 @@ def read_bank(folder: Path, split: str, downscale: int, every: int) -> RayDatase
     bearings = torch.stack([(x - width / 2) / focal, (y - height / 2) / focal, torch.ones_like(x)], -1)
     near, far = torch.full((len(poses),), 0.1), torch.full((len(poses),), 10.0)
     bearings /= bearings.norm(dim=-1, keepdim=True)
-    return build_ray_bank(photos, [0] * len(poses), [bearings], torch.stack(poses), near, far)
+    return ray_dataset_from_images(photos, [0] * len(poses), [bearings], torch.stack(poses), near, far)
 
 
 def _smaller(pixels: np.ndarray, factor: int) -> np.ndarray:
@@ -56,13 +56,13 @@ def _smaller(pixels: np.ndarray, factor: int) -> np.ndarray:
     return np.round(255 * np.concatenate([colour, mean[..., 3:]], -1)).astype(np.uint8)
 
 
-def heldout(model: HashGridField, bank: RayDataset) -> tuple[float, list[torch.Tensor]]:
+def heldout(model: HashGridField, dataset: RayDataset) -> tuple[float, list[torch.Tensor]]:
     """Mean PSNR over the views, and [picture, truth] of the first."""
     values, first = [], []
-    for view in range(len(bank.near)):
-        pixels = torch.arange(int(bank.first_pixel[view]), int(bank.first_pixel[view + 1]))
+    for view in range(len(dataset.near)):
+        pixels = torch.arange(int(dataset.first_pixel[view]), int(dataset.first_pixel[view + 1]))
         side = math.isqrt(len(pixels))
-        rays, colour, alpha, _ = bank.lookup(pixels)
+        rays, colour, alpha, _ = dataset.lookup(pixels)
         square = Rays(*(part.reshape(side, side, *part.shape[1:]) for part in rays))
         truth = over(colour, alpha, WHITE).view(side, side, 3)
         picture = render_image(model, square, WHITE).colour
@@ -92,8 +92,8 @@ def main() -> None:
     print(f"{torch.get_num_threads()} threads")
     take_over_cores()
     settings = HashGridSettings(given.levels, 4, given.log2_rows, 16, given.finest, diagonal_steps=given.steps)
-    train = read_bank(given.folder, "train", given.downscale, 1)
-    test = read_bank(given.folder, "test", given.downscale, given.test_every)
+    train = read_dataset(given.folder, "train", given.downscale, 1)
+    test = read_dataset(given.folder, "test", given.downscale, given.test_every)
     model = HashGridField(settings, given.seed, fast if given.backend == "warp" else reference)
     trainer = HashGridTrainer(
         model, train, HashGridTrainerSettings(given.seed, "random", given.samples, chunks=workers())

@@ -26,7 +26,7 @@ from stages.effects.decisions import Decisions, image_effects, read_decisions
 from stages.hardware.device import compute_device, cores
 from stages.io.files import read_scene
 from stages.train import Config, plan
-from stages.train.data import guided_bank
+from stages.train.data import guided_dataset
 from stages.train.fields import field_of, make_trainer
 from stages.train.profile import FIRST_TIMED, RATES_SECONDS, observed, parts_table
 
@@ -74,9 +74,9 @@ def main() -> None:
 def prepared(workspace: Path, asked: Config) -> tuple[Config, FieldTrainer]:
     """A fresh field with all that its first step needs, as stage train makes it, and the settings that the stage chose,
     which are printed."""
-    config, scene, bank, decisions = loaded(workspace, asked)
+    config, scene, dataset, decisions = loaded(workspace, asked)
     return config, make_trainer(
-        config, scene, bank, config.seed, image_effects(decisions, scene.of_split("train"), bank)
+        config, scene, dataset, config.seed, image_effects(decisions, scene.of_split("train"), dataset)
     )
 
 
@@ -88,8 +88,8 @@ def loaded(workspace: Path, asked: Config) -> tuple[Config, Scene, RayDataset, D
     sizes = f"{config.levels} grids of 2^{config.log2_rows} rows to {config.finest}³, photos at 1/{config.downscale:g}"
     of_step = f"{config.batch_samples:,} colours in a step of {config.chunks} parts, {cores()} cores at work"
     print(f"{sizes}, {of_step}", flush=True)
-    bank = guided_bank(inputs, scene, config.downscale, Spoken()).to(compute_device())
-    return config, scene, bank, read_decisions(inputs["effects"])
+    dataset = guided_dataset(inputs, scene, config.downscale, Spoken()).to(compute_device())
+    return config, scene, dataset, read_decisions(inputs["effects"])
 
 
 def report(table: dict[str, Any]) -> None:

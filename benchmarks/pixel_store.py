@@ -37,7 +37,7 @@ from stages.hardware.device import compute_device
 from stages.hardware.memory import available_bytes
 from stages.io import pixel_store
 from stages.train import Config
-from stages.train.data import training_bank
+from stages.train.data import training_dataset
 from stages.train.fields import field_of, make_trainer, with_defaults
 
 WIDTH, HEIGHT = 4000, 3000
@@ -92,12 +92,12 @@ def milliseconds(work: Callable[[], object], repeats: int) -> dict[str, float]:
     return {"median_ms": round(statistics.median(taken), 2), "lowest_ms": round(min(taken), 2)}
 
 
-def draw(bank: RayDataset, where: str, record: Record, repeats: int = REPEATS) -> None:
+def draw(dataset: RayDataset, where: str, record: Record, repeats: int = REPEATS) -> None:
     """Time batches of rays."""
-    order = PixelSampler(bank.drawable, 0, bank.device)
+    order = PixelSampler(dataset.unmasked_count, 0, dataset.device)
     for count in BATCHES:
         places = itertools.count(step=count)
-        taken = milliseconds(lambda n=count, p=places: bank.lookup(bank.nth(order.take(next(p), n))), repeats)
+        taken = milliseconds(lambda n=count, p=places: dataset.lookup(dataset.nth(order.take(next(p), n))), repeats)
         record.add(what=f"{count} rays, {where}", **taken, **memory())
 
 
@@ -107,8 +107,8 @@ def train(ingest: Path, scene: Scene, downscale: float) -> dict[str, Any]:
     asked = Config(field="grid", contracted=True, view_dependence=True, downscale=downscale)
     config = with_defaults(asked.model_copy(update={"backend": chosen_backend(device, Spoken())}))
     config = field_of(config).with_sizes(config, scene, rays=math.inf)
-    bank = training_bank(ingest, scene, "train", downscale, Spoken()).to(device)
-    trainer, step = make_trainer(config, scene, bank, config.seed), itertools.count()
+    dataset = training_dataset(ingest, scene, "train", downscale, Spoken()).to(device)
+    trainer, step = make_trainer(config, scene, dataset, config.seed), itertools.count()
     taken = milliseconds(lambda: trainer.step(next(step), 0.0, 1.0), STEPS)
     sizes = f"{config.levels} grids of 2^{config.log2_rows} rows, {config.batch_samples:,} colours in a step"
     return {"what": f"a step of training: {sizes}", **taken, **memory()}
@@ -139,10 +139,10 @@ def measure(ingest: Path, photos: int, downscale: float, record: Record) -> None
 
     def opened(what: str) -> RayDataset:
         started = time.perf_counter()
-        bank = training_bank(ingest, scene, "train", downscale, Spoken())
+        dataset = training_dataset(ingest, scene, "train", downscale, Spoken())
         taken = round(1e3 * (time.perf_counter() - started))
         record.add(what=f"{what} of {photos} photos", median_ms=taken, lowest_ms=taken, **memory())
-        return bank
+        return dataset
 
     opened("making the store")
     (store,) = (path for path in ingest.with_name("ingest.pixels").iterdir() if not path.suffix)
@@ -155,15 +155,15 @@ def measure(ingest: Path, photos: int, downscale: float, record: Record) -> None
     draw(opened("opening the store from the disk"), "from the disk", record, 5)
 
 
-def warm(bank: RayDataset, record: Record) -> None:
+def warm(dataset: RayDataset, record: Record) -> None:
     """Batches from a store that memory holds, and from a copy in plain memory."""
-    draw(bank, "first ones", record, 5)
-    bank.pixels.view(-1)[:: mmap.PAGESIZE].sum()
-    draw(bank, "mapped", record)
-    if bank.pixels.numel() > pixel_store.FITS * available_bytes():
+    draw(dataset, "first ones", record, 5)
+    dataset.pixels.view(-1)[:: mmap.PAGESIZE].sum()
+    draw(dataset, "mapped", record)
+    if dataset.pixels.numel() > pixel_store.FITS * available_bytes():
         print("left out: the same from plain memory, which has no room for them")
     else:
-        draw(bank._replace(pixels=bank.pixels.clone()), "plain memory", record)
+        draw(dataset._replace(pixels=dataset.pixels.clone()), "plain memory", record)
 
 
 if __name__ == "__main__":

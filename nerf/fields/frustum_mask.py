@@ -26,36 +26,36 @@ EDGE_PIXELS = 16  # along each side of a photo, from which its field of view is 
 TOGETHER = 16  # photos that look at once, on all cores, at what is undecided; fixed, whatever the cores
 
 
-# Of banks that are in use, by their geometry: all trainers of a run ask for the same, and so do all of its pilots.
+# Of datasets that are in use, by their geometry: all trainers of a run ask for the same, and so do all of its pilots.
 _answers: MutableMapping[Tensor, dict[tuple[int, int], Tensor]] = WeakTensorKeyDictionary()
 
 
-def compute_frustum_mask(bank: RayDataset, least: int, cells: int) -> Bool[Tensor, "cells"]:
+def compute_frustum_mask(dataset: RayDataset, least: int, cells: int) -> Bool[Tensor, "cells"]:
     """Which of ``cells``³ cells of folded space, in the order of ``nerf.kernels.torch.occupancy``, may hold something:
-    those whose middles ``least`` photos of ``bank`` look at, or one, from where its foreground begins; and a coarse
-    cell around them. What hides them, and masks, count for nothing. Found once for a bank; not to be written to."""
-    answers = _answers.setdefault(bank.geometry, {})
+    those whose middles ``least`` photos of ``dataset`` look at, or one, from where its foreground begins; and a coarse
+    cell around them. What hides them, and masks, count for nothing. Found once for a dataset; not to be written to."""
+    answers = _answers.setdefault(dataset.geometry, {})
     if (least, cells) not in answers:
-        answers[least, cells] = _compute_frustum_mask(bank, least, cells)
+        answers[least, cells] = _compute_frustum_mask(dataset, least, cells)
     return answers[least, cells]
 
 
-def _compute_frustum_mask(bank: RayDataset, least: int, cells: int) -> Bool[Tensor, "cells"]:
-    side, views = min(SIDE, cells), range(len(bank.near))
-    middles = _middles(side, bank.device)
-    undecided = torch.arange(side**3, device=bank.device)
+def _compute_frustum_mask(dataset: RayDataset, least: int, cells: int) -> Bool[Tensor, "cells"]:
+    side, views = min(SIDE, cells), range(len(dataset.near))
+    middles = _middles(side, dataset.device)
+    undecided = torch.arange(side**3, device=dataset.device)
     photos = torch.zeros_like(undecided)
     for first in range(0, len(views), TOGETHER):
         decided = torch.zeros_like(undecided, dtype=torch.bool)
         together = views[first : first + TOGETHER]
-        for seen, in_foreground in in_order(partial(_looked_at, bank, middles), together, bank.device):
+        for seen, in_foreground in in_order(partial(_looked_at, dataset, middles), together, dataset.device):
             photos += seen
             decided |= in_foreground
         still = (~decided & (photos < least)).nonzero()[:, 0]
         undecided, photos, middles = undecided[still], photos[still], middles[:, still]
-    usable = torch.ones(side**3, dtype=torch.bool, device=bank.device)
+    usable = torch.ones(side**3, dtype=torch.bool, device=dataset.device)
     usable[undecided] = False
-    corners = cell_corners(cells, torch.arange(cells**3, device=bank.device))
+    corners = cell_corners(cells, torch.arange(cells**3, device=dataset.device))
     x, y, z = (side * corners).long().unbind(-1)
     return grown(usable.view(side, side, side))[x, y, z]
 
@@ -67,12 +67,12 @@ def _middles(side: int, device: torch.device) -> Float[Tensor, "3 cells"]:
 
 
 def _looked_at(
-    bank: RayDataset, points: Float[Tensor, "3 points"], view: int
+    dataset: RayDataset, points: Float[Tensor, "3 points"], view: int
 ) -> tuple[Bool[Tensor, "points"], Bool[Tensor, "points"]]:
     """Which points a photo may show between near and far, and which of these are no nearer than its foreground."""
-    geometry = bank.geometry[:, view]
+    geometry = dataset.geometry[:, view]
     from_scene, centre, near, far = geometry[:9].view(3, 3).T, geometry[9:12, None], geometry[12], geometry[13]
-    field = _angles(from_scene @ _spread_directions(bank, view).T)
+    field = _angles(from_scene @ _spread_directions(dataset, view).T)
     local = from_scene @ (points - centre)
     angles, distance = _angles(local), local.square().sum(0).sqrt()
     inside = (angles >= field.amin(1, keepdim=True)) & (angles <= field.amax(1, keepdim=True))
@@ -86,10 +86,10 @@ def _angles(vectors: Float[Tensor, "3 n"]) -> Float[Tensor, "2 n"]:
     return torch.atan2(vectors[:2], vectors[2:])
 
 
-def _spread_directions(bank: RayDataset, view: int) -> Float[Tensor, "rays 3"]:
+def _spread_directions(dataset: RayDataset, view: int) -> Float[Tensor, "rays 3"]:
     """Of EDGE_PIXELS² rays of a photo, those of its corners among them."""
-    first, end = bank.first_pixel[view : view + 2].tolist()
-    width = int(bank.layout[1, view])
-    share = torch.linspace(0, 1, EDGE_PIXELS, dtype=torch.float64, device=bank.device)
+    first, end = dataset.first_pixel[view : view + 2].tolist()
+    width = int(dataset.layout[1, view])
+    share = torch.linspace(0, 1, EDGE_PIXELS, dtype=torch.float64, device=dataset.device)
     row, column = (((n - 1) * share).round().long() for n in ((end - first) // width, width))
-    return bank.rays((first + width * row[:, None] + column).flatten())[0].directions
+    return dataset.rays((first + width * row[:, None] + column).flatten())[0].directions

@@ -18,7 +18,7 @@ from nerf.runtime.profiler import Work, part
 HIDDEN = 64
 GEOMETRY = 16  # numbers that the density network hands to the colour network; the first is the logarithm of density
 DIRECTION = 16  # spherical harmonics, where colour depends on the direction
-LARGEST_LOG_DENSITY = 15.0
+MAX_LOG_DENSITY = 15.0
 # Samples whose hidden layer of the density network exists at a time: as many as stay in a core's cache
 # (docs/experiments/step_time.md); on a GPU all.
 BLOCK = {"cpu": 1 << 12, "cuda": 1 << 22}
@@ -85,13 +85,13 @@ def no_directions_backward(
     return torch.zeros_like(directions)
 
 
-def density_products(weights: Weights) -> int:
+def density_flops(weights: Weights) -> int:
     """Multiplications and additions of a sample's density; the way back has twice as many, without those of the hidden
     layer, which is computed again."""
     return 2 * (weights.density_hidden.numel() + weights.density_out.numel())
 
 
-def colour_products(weights: Weights) -> int:
+def colour_flops(weights: Weights) -> int:
     """Multiplications and additions of a sample's colour, without what its ray shares; twice as many on the
     way back."""
     return 2 * (GEOMETRY * HIDDEN + weights.colour_out.numel())
@@ -99,7 +99,7 @@ def colour_products(weights: Weights) -> int:
 
 def density_forward(weights: Weights, features: Float[Tensor, "samples features"]) -> DensityPass:
     """Features to geometry and density."""
-    with part("mlp", Work(products=density_products(weights) * len(features))):
+    with part("mlp", Work(products=density_flops(weights) * len(features))):
         geometry = features.new_empty(len(features), GEOMETRY)
         for rows in _blocks(features):
             torch.mm(_density_hidden(weights, features[rows]), weights.density_out.T, out=geometry[rows])
@@ -119,7 +119,7 @@ def _blocks(samples: Float[Tensor, "samples _"]) -> Iterator[slice]:
 def sigma_of(geometry: Float[Tensor, "samples geometry"]) -> Float[Tensor, "samples"]:
     """exp(min(x, 15)) of the first output. At the limit an interval as short as 0.001 stops all light but e^-3000, so
     that what the limit takes from the gradient is zero already."""
-    return geometry[:, 0].clamp(max=LARGEST_LOG_DENSITY).exp()
+    return geometry[:, 0].clamp(max=MAX_LOG_DENSITY).exp()
 
 
 def ray_hidden(weights: Weights, harmonics: Float[Tensor, "rays direction"]) -> Float[Tensor, "rays hidden"]:
@@ -135,7 +135,7 @@ def colour_forward(
     of_rays: Float[Tensor, "rays hidden"],
 ) -> ColourPass:
     """Geometry and viewing direction (:func:`ray_hidden`) to colour, through a sigmoid."""
-    with part("mlp", Work(products=colour_products(weights) * len(geometry))):
+    with part("mlp", Work(products=colour_flops(weights) * len(geometry))):
         hidden = geometry @ weights.colour_hidden[:GEOMETRY]
         backend.add_ray_relu(samples, hidden, of_rays)
         return ColourPass(geometry, hidden, (hidden @ weights.colour_out.T).sigmoid_())
@@ -148,7 +148,7 @@ def colour_of(
     of_rays: Float[Tensor, "rays hidden"],
 ) -> Float[Tensor, "samples 3"]:
     """What :func:`colour_forward` says, for samples of rays ``ray``, where no way back is needed: nothing is kept."""
-    with part("mlp", Work(products=colour_products(weights) * len(geometry))):
+    with part("mlp", Work(products=colour_flops(weights) * len(geometry))):
         logits = geometry.new_empty(len(geometry), 3)
         for rows in _blocks(geometry):
             hidden = of_rays.index_select(0, ray[rows]).addmm_(geometry[rows], weights.colour_hidden[:GEOMETRY])
@@ -184,7 +184,7 @@ def density_backward(
 ) -> DensityGradients:
     """Gradients of the network's weights and of the features, given those of the density and of the geometry as the
     colour network saw it, to which the former's is added in place."""
-    within = done.geometry[:, 0] <= LARGEST_LOG_DENSITY
+    within = done.geometry[:, 0] <= MAX_LOG_DENSITY
     grad_geometry[:, 0] += torch.where(within, grad_sigma * done.sigma, 0)
     of_hidden, of_out = torch.zeros_like(weights.density_hidden), torch.zeros_like(weights.density_out)
     grad_features = torch.empty_like(done.features)

@@ -45,7 +45,7 @@ def shifted_softplus(raw: Float[Tensor, "*points"]) -> Float[Tensor, "*points"]:
     return functional.softplus(raw + SOFTPLUS_SHIFT, threshold=40)
 
 
-LARGEST = 10_000  # of any size of these networks: far beyond any use, and no loop over it is endless
+MAX_SIZE = 10_000  # of any size of these networks: far beyond any use, and no loop over it is endless
 
 
 @dataclass(frozen=True)
@@ -73,11 +73,11 @@ class VanillaSettings:
 
     def __post_init__(self) -> None:
         at_least = {"depth": 1, "width": 2, "skip": 0, "position_frequencies": 1, "direction_frequencies": 1}
-        for name, least in (at_least | {"samples_coarse": 2, "samples_fine": 1}).items():
-            if getattr(self, name) < least:
-                raise ValueError(f"{name} is {getattr(self, name)}; it must be at least {least}")
-            if getattr(self, name) > LARGEST:
-                raise ValueError(f"{name} is {getattr(self, name)}; it must be at most {LARGEST}")
+        for name, minimum in (at_least | {"samples_coarse": 2, "samples_fine": 1}).items():
+            if getattr(self, name) < minimum:
+                raise ValueError(f"{name} is {getattr(self, name)}; it must be at least {minimum}")
+            if getattr(self, name) > MAX_SIZE:
+                raise ValueError(f"{name} is {getattr(self, name)}; it must be at most {MAX_SIZE}")
         if self.spacing not in get_args(Spacing):
             raise ValueError(f"spacing is {self.spacing!r}; it must be 'linear' or 'log'")
         if self.density_activation not in ("softplus", "relu"):
@@ -111,7 +111,7 @@ class VanillaMlp(nn.Module):
         # Multiplications and additions per point, forward and back. On the way back each weight has its own gradient,
         # and passes on that of its input unless that is an encoding.
         self.products = 2 * (sum(each.numel() for each in self.parameters() if each.ndim == 2) - once_per_ray)
-        self.products_backward = 2 * self.products - 2 * of_encoding
+        self.matmul_flops_backward = 2 * self.products - 2 * of_encoding
 
     def forward(
         self, points: Float[Tensor, "*rays n 3"], directions: Float[Tensor, "*rays 3"]

@@ -18,8 +18,8 @@ CLEAR_SHARE = CLEAR_REACH = 0.9  # of a path, and of what its cameras have free 
 SPIRAL_SHARE = 0.7  # quantile of the cameras' offsets that the spiral reaches
 ROUNDING = 1e-9  # of tour lengths of about 10: reversing a stretch gains more, or the search would run in circles
 ALONG = 0.1  # sine of the angle, 6 degrees, within which a view is along a direction
-FRAMES_PER_KEY, LEAST_KEYS = 8, 4  # interpolated: frames for each camera it sets out for, so that it is not a blur
-MOST_CAMERAS = 1000  # that a tour knows of; of more, those farthest from each other
+FRAMES_PER_KEY, MIN_KEY_CAMERAS = 8, 4  # interpolated: frames for each camera it sets out for, so that it is not a blur
+MAX_TOUR_CAMERAS = 1000  # that a tour knows of; of more, those farthest from each other
 NEIGHBOURS = 3  # of each camera, to which a tour may go on from it
 FINE = 16  # points of a tour for each of its steps from camera to camera
 ROUNDED_STEPS = 2  # to either side over which a tour is averaged, or, where photos stand closer, as far as
@@ -141,8 +141,8 @@ def interpolated(cameras: Float[np.ndarray, "n 3 4"], frames: int) -> Poses:
     spread = np.median(np.linalg.norm(cameras[:, :, 3] - spatial_median(cameras[:, :, 3]), axis=1))
     unit = np.append(np.full(9, np.sqrt(2)), np.full(3, spread if spread > 0 else 1.0))
     features = np.concatenate([cameras[:, :, :3].reshape(-1, 9), cameras[:, :, 3]], axis=1) / unit
-    features = features[_farthest(features, MOST_CAMERAS)]
-    tour = features[_route(features, max(LEAST_KEYS, frames // FRAMES_PER_KEY))]
+    features = features[_farthest(features, MAX_TOUR_CAMERAS)]
+    tour = features[_route(features, max(MIN_KEY_CAMERAS, frames // FRAMES_PER_KEY))]
     fine = _evenly(tour, FINE * (len(tour) - 1) + 1)
     reach = max(ROUNDED_STEPS * FINE, ROUNDED_FRAMES * len(fine) // max(frames, SMOOTH_FRAMES))
     path = _rotating(_rounded(fine, reach))

@@ -6,12 +6,12 @@ from jaxtyping import Float
 from nerf import REGION_HALF
 from nerf.geometry.reconstruction import Reconstruction
 
-FEWEST_POINTS = 10  # fewer say nothing about a photo's depth range; all photos together then do
+MIN_POINTS_IN_VIEW = 10  # fewer say nothing about a photo's depth range; all photos together then do
 NEAR_MARGIN = 0.7  # bare surfaces carry no points: the nearest thing may be nearer than the nearest point
 SURE_VIEWS = 3  # photos that see a point which is no false match
-LEAST_NEAR = 0.05 * REGION_HALF  # for cameras in the region whose depths nobody knows
+MIN_NEAR = 0.05 * REGION_HALF  # for cameras in the region whose depths nobody knows
 BEYOND = 2.0  # a camera far from the region sees at least as far behind it as it is in front of it
-FARTHEST, LEAST_FAR = 1000.0, 20.0  # contraction maps these to 0.001 and 0.05 from the end of the world
+MAX_FAR, MIN_FAR = 1000.0, 20.0  # contraction maps these to 0.001 and 0.05 from the end of the world
 
 
 def near_and_far(scene: Reconstruction, bounded: bool) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
@@ -25,10 +25,10 @@ def near_and_far(scene: Reconstruction, bounded: bool) -> tuple[Float[np.ndarray
     entry, exit_ = _distances_to_region(scene.centres)
     near, far = _points_range(scene)
     # cameras that are inside the region and see no points still need a positive near
-    near = np.where(np.isfinite(near), near, np.maximum(entry, LEAST_NEAR))
+    near = np.where(np.isfinite(near), near, np.maximum(entry, MIN_NEAR))
     if bounded:
-        return np.where(entry > LEAST_NEAR, entry, np.minimum(near, 0.5 * exit_)), exit_
-    far = np.maximum(np.clip(4 * far, LEAST_FAR, FARTHEST), BEYOND * exit_)
+        return np.where(entry > MIN_NEAR, entry, np.minimum(near, 0.5 * exit_)), exit_
+    far = np.maximum(np.clip(4 * far, MIN_FAR, MAX_FAR), BEYOND * exit_)
     return np.minimum(near, 0.5 * far), far
 
 
@@ -53,7 +53,7 @@ def _points_range(scene: Reconstruction) -> tuple[Float[np.ndarray, "n"], Float[
     near, far = np.empty(count), np.empty(count)
     for view in range(count):
         seen = distances[scene.view == view]
-        seen = seen if len(seen) >= FEWEST_POINTS else distances
+        seen = seen if len(seen) >= MIN_POINTS_IN_VIEW else distances
         low, middle, high = np.quantile(seen, [0.002, 0.5, 0.999])
         low = max(low, 0.05 / NEAR_MARGIN * middle)
         low, high = _widened(scene, view, sure, low, high)
@@ -64,16 +64,16 @@ def _points_range(scene: Reconstruction) -> tuple[Float[np.ndarray, "n"], Float[
 def _widened(
     scene: Reconstruction, view: int, points: Float[np.ndarray, "n 3"], low: float, high: float
 ) -> tuple[float, float]:
-    """The range of distances, widened on either side as far as FEWEST_POINTS points in a photo's field of view go."""
+    """The range of distances, widened on either side as far as MIN_POINTS_IN_VIEW points in its field of view go."""
     distance = np.linalg.norm(points - scene.centres[view], axis=1)
     beyond = (distance < low) | (distance > high)
     _, shown = scene.project(view, points[beyond])
     distance = np.sort(distance[beyond][shown])
     nearer, farther = distance[distance < low], distance[distance > high]
-    if len(nearer) >= FEWEST_POINTS:  # below LEAST_NEAR in a large scene alone, by what the photo sees itself
-        low = min(low, max(float(nearer[FEWEST_POINTS - 1]), LEAST_NEAR))
-    if len(farther) >= FEWEST_POINTS:
-        high = float(farther[-FEWEST_POINTS])
+    if len(nearer) >= MIN_POINTS_IN_VIEW:  # below MIN_NEAR in a large scene alone, by what the photo sees itself
+        low = min(low, max(float(nearer[MIN_POINTS_IN_VIEW - 1]), MIN_NEAR))
+    if len(farther) >= MIN_POINTS_IN_VIEW:
+        high = float(farther[-MIN_POINTS_IN_VIEW])
     return low, high
 
 
@@ -89,14 +89,14 @@ def near_and_far_between_views(
 
     Without bounds, what a view has before it is nearer to a camera that stands further ahead, and its far is farther
     from one elsewhere. In a bounded scene near counts from where rays enter the region, and far is the region's
-    farthest corner. No near is below LEAST_NEAR, or below the nearest of its neighbours' where the scene is so large
+    farthest corner. No near is below MIN_NEAR, or below the nearest of its neighbours' where the scene is so large
     that theirs are.
     """
     centres = poses[:, :, 3]
     offset = centres[:, None] - view_centres
     distance = np.linalg.norm(offset, axis=2)
     nearest = np.argsort(distance, axis=1, kind="stable")[:, :3]
-    least = np.minimum(view_near[nearest].min(axis=1), LEAST_NEAR)
+    least = np.minimum(view_near[nearest].min(axis=1), MIN_NEAR)
     if not bounded:
         ahead = np.einsum("fva,fa->fv", offset, poses[:, :, 2]).clip(min=0)
         near, far = view_near - ahead, view_far + distance

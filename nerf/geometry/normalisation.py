@@ -21,10 +21,10 @@ from nerf.geometry.region_of_interest import (
 from nerf.geometry.scene import Similarity
 from nerf.geometry.up_vector import Up, Witness, find_up
 
-LEAST_HEADING = 0.3  # the level part of a unit vector, at least, that is one: it points no steeper than 73 deg
+MIN_HEADING = 0.3  # the level part of a unit vector, at least, that is one: it points no steeper than 73 deg
 # Of the distance from the origin: what places differ by that are written with twelve digits, or rounded a few times.
 ONE_PLACE = 1e-12
-LEAST_HALF = (
+MIN_HALF_SIZE = (
     1e-30  # of the region in input units: what single-precision numbers, in which meshes are written, still tell apart
 )
 
@@ -70,8 +70,8 @@ def normalise(
     if contradicted >= GOES_ON:
         upright = replace(upright, opaque=None)
     region = given or find_region(upright, layout)
-    if not region.half >= LEAST_HALF:
-        raise ValueError(f"it is {region.half:.2g} units large, and {LEAST_HALF:g} is the least")
+    if not region.half >= MIN_HALF_SIZE:
+        raise ValueError(f"it is {region.half:.2g} units large, and {MIN_HALF_SIZE:g} is the least")
     scale = REGION_HALF / region.half
     centre = middle + rotation.T @ region.centre
     scene = upright.in_frame(np.eye(3), region.centre, scale)
@@ -110,7 +110,7 @@ def _frame(up: Float[np.ndarray, "3"], sfm: Reconstruction) -> Float[np.ndarray,
     axes, ups = (vectors - np.outer(vectors @ up, up) for vectors in (sfm.axes, sfm.ups))
     candidates = np.stack([spatial_median(axes), axes[0], ups[0]])
     lengths = np.linalg.norm(candidates, axis=1)
-    chosen = int(np.argmax(lengths > LEAST_HEADING))
+    chosen = int(np.argmax(lengths > MIN_HEADING))
     y = candidates[chosen] / lengths[chosen]
     return np.stack([np.cross(y, up), y, up])
 

@@ -23,13 +23,13 @@ Layout = Literal["around", "inside", "forward"]
 
 FORWARD_DEG = 30.0  # four fifths of the optical axes within this of their median: all photos face one way
 CONVERGENT_DEG = 30.0  # four fifths of the axes within this of the direction to their common focus: they look at it
-LEAST_WIDTH = 0.5  # of what the photos see at the focus; textured spots may be small, the object around them is not
+MIN_WIDTH = 0.5  # of what the photos see at the focus; textured spots may be small, the object around them is not
 FORWARD_REACH = 3.0  # the farthest depth the cube takes in, in median depths; beyond, detail is below a pixel's
 INSIDE_REACH = 2.0  # likewise around a camera that looks outward
 FAR_CAMERA = 5.0  # a camera so many times as far from the cameras' middle as is usual does not count, nor what it sees
 CORE, WHOLE = 0.95, 0.999  # shares of the observations that the cube should hold, and that are the whole scene
 CARVED = 48  # points along an edge of the cube that is carved
-MOST_CARVING = 200  # photos that carve it; more tell no more
+MAX_CARVING_PHOTOS = 200  # photos that carve it; more tell no more
 MISTAKEN = 0.05  # of the photos in which a point is: so many may call it background by mistake
 GROWTH = 1.25  # a cube that becomes WHOLE by growing at most this much is grown
 # Share of the observations beyond the cube from which on a scene goes on there, whatever alpha says: ten times what
@@ -135,7 +135,7 @@ def _around(scene: Reconstruction) -> Region:
     if not len(scene.point):
         return Region(centre, width)
     half = float(np.quantile(_reach(scene, centre)[_near_by(scene)[scene.view]], CORE))
-    return Region(centre, min(max(half, LEAST_WIDTH * width), distance))
+    return Region(centre, min(max(half, MIN_WIDTH * width), distance))
 
 
 def _carved(scene: Reconstruction, opaque: Float[np.ndarray, "n 2 2"]) -> Region:
@@ -147,7 +147,7 @@ def _carved(scene: Reconstruction, opaque: Float[np.ndarray, "n 2 2"]) -> Region
     side = np.linspace(-half, half, CARVED)
     points = centre + np.stack(np.meshgrid(side, side, side, indexing="ij"), axis=-1).reshape(-1, 3)
     seen, clear = np.zeros(len(points), int), np.zeros(len(points), int)
-    for view in range(0, len(scene.centres), -(-len(scene.centres) // MOST_CARVING)):
+    for view in range(0, len(scene.centres), -(-len(scene.centres) // MAX_CARVING_PHOTOS)):
         at, shown = scene.project(view, points)
         seen += shown
         clear += shown & ~within(at, opaque[view])

@@ -16,16 +16,16 @@ from jaxtyping import Float
 
 from nerf.geometry.reconstruction import Reconstruction, angles_deg, spatial_median
 
-MOST_FLATNESS = 0.25  # tan 14 deg: a set of directions that leaves its plane further than this has no plane
-MOST_PITCH_DEG = 65.0  # between the plane's normal and the upper edges, which lean as far as the photos look down
-MOST_DISAGREEMENT_DEG = 35.0  # among the upper edges
+MAX_FLATNESS = 0.25  # tan 14 deg: a set of directions that leaves its plane further than this has no plane
+MAX_PITCH_DEG = 65.0  # between the plane's normal and the upper edges, which lean as far as the photos look down
+MAX_DISAGREEMENT_DEG = 35.0  # among the upper edges
 # Length of the mean of the upper edges, which are unit vectors. Level photos that look all around have a shorter one
-# only where they look 73 deg down, beyond MOST_PITCH_DEG; else it says that edges cancel, and what is left is noise.
-LEAST_EDGES = 0.3
-LEAST_LOOK = 0.15  # sin 9 deg: photos that look down or up by less, on average, do not tell which of the two
+# only where they look 73 deg down, beyond MAX_PITCH_DEG; else it says that edges cancel, and what is left is noise.
+MIN_EDGES = 0.3
+MIN_LOOK = 0.15  # sin 9 deg: photos that look down or up by less, on average, do not tell which of the two
 # tan 5 deg, less than the 14 deg of a plane: heights by GPS drift for minutes, and what drifts tilts the whole scene
 # without being off from it.
-MOST_TILT = 0.087
+MAX_TILT = 0.087
 
 
 class Up(NamedTuple):
@@ -50,12 +50,12 @@ class Witness(NamedTuple):
 def find_up(scene: Reconstruction, places: Witness | None = None) -> Up:
     """The up vector best supported by the poses, or by the cameras' ``places``, whichever is more certain."""
     edges = _unit(spatial_median(scene.ups)[None])[0]
-    witnesses = [*_planes(scene, edges), *([places] if places is not None and places.tilt <= MOST_TILT else [])]
+    witnesses = [*_planes(scene, edges), *([places] if places is not None and places.tilt <= MAX_TILT else [])]
     if witnesses:
         best = min(witnesses, key=lambda witness: round(witness.tilt, 6))
         return Up(best.direction, True, best.source)
     # three quarters must agree: a few photos turned by 90 degrees are common, half of them turned is no evidence
-    if np.quantile(angles_deg(scene.ups, edges), 0.75) < MOST_DISAGREEMENT_DEG:
+    if np.quantile(angles_deg(scene.ups, edges), 0.75) < MAX_DISAGREEMENT_DEG:
         return Up(edges, True, "upper edges")
     return Up(scene.ups[0], False, "first photo")
 
@@ -82,15 +82,15 @@ def _planes(scene: Reconstruction, edges: Float[np.ndarray, "3"]) -> Iterator[Wi
     # As of any fit, in which a plane's place and two angles are free: three standpoints always share one.
     of_fit = np.sqrt(max(count - 3, 0) / count)
     standpoints = (_unit(scene.centres - spatial_median(scene.centres)), "level standpoints", of_fit)
-    if np.linalg.norm(scene.ups.mean(axis=0)) >= LEAST_EDGES:
-        upwards, least = edges, np.cos(np.radians(MOST_PITCH_DEG))
+    if np.linalg.norm(scene.ups.mean(axis=0)) >= MIN_EDGES:
+        upwards, least = edges, np.cos(np.radians(MAX_PITCH_DEG))
         sets = ((scene.rights, "level horizons", 1.0), standpoints)
     else:
-        upwards, least, sets = -scene.axes.mean(axis=0), LEAST_LOOK, (standpoints,)
+        upwards, least, sets = -scene.axes.mean(axis=0), MIN_LOOK, (standpoints,)
     for vectors, source, certainty in sets:
         flatness, normal = _avoided_direction(vectors)
         agreement = float(normal @ upwards)
-        if flatness < certainty * MOST_FLATNESS and abs(agreement) > least:
+        if flatness < certainty * MAX_FLATNESS and abs(agreement) > least:
             yield Witness(flatness / certainty, np.sign(agreement) * normal, source)
 
 

@@ -13,7 +13,7 @@ from nerf.runtime.parallel import in_order
 
 GPU_CHUNKS = 16  # a GPU renders as much at once as so many cores, and waits for the host less often
 # A small picture is cut into so many chunks, of so many rays at least: with fewer, most cores would have nothing to do.
-CHUNKS, LEAST_CHUNK = 16, 1024
+CHUNKS, MIN_CHUNK_RAYS = 16, 1024
 
 
 def render_image(
@@ -30,7 +30,7 @@ def render_image(
     """
     height, width = rays.near.shape
     if chunk is None and rays.near.device.type == "cpu":
-        chunk = min(model.chunk_rays, max(LEAST_CHUNK, math.ceil(height * width / CHUNKS)))
+        chunk = min(model.chunk_rays, max(MIN_CHUNK_RAYS, math.ceil(height * width / CHUNKS)))
     chunk = chunk or GPU_CHUNKS * model.chunk_rays
     flat = rays.each(lambda part: part.reshape(height * width, *part.shape[2:]))
 

@@ -11,14 +11,14 @@ from typing import NamedTuple
 import torch
 
 from nerf.runtime.parallel import in_order, workers
-from nerf.runtime.profiler import Stopwatch, Work
+from nerf.runtime.profiler import Profiler, Work
 
-PRODUCT_ROWS = 1 << 13  # points that one product has, as in a chunk of a step
+MATMUL_ROWS = 1 << 13  # points that one product has, as in a chunk of a step
 GATHERED = 1 << 17  # rows read at once, of 4 float32, as a grid's table has them
 # float32 that all cores together copy at once: 128 MB read and as much written, more than their shared cache holds (60
-# to 105 MB on servers); each at least LEAST_STREAMED, which its own cache does not.
-STREAMED, LEAST_STREAMED = 1 << 25, 1 << 22
-FEWEST_RUNS = 3
+# to 105 MB on servers); each at least MIN_STREAMED, which its own cache does not.
+STREAMED, MIN_STREAMED = 1 << 25, 1 << 22
+MIN_RUNS = 3
 
 
 class Rates(NamedTuple):
@@ -38,21 +38,21 @@ def measure_rates(device: torch.device, width: int, rows: int, seconds: float) -
     """The rates of products (n, width) x (width, width) and of reading from a table of ``rows``, in about ``seconds``.
     Changes no random state."""
     return Rates(
-        measure_products(device, width, seconds / 3),
+        measure_matmul(device, width, seconds / 3),
         measure_gather(device, rows, seconds / 3),
         measure_copy(device, seconds / 3),
     )
 
 
-def measure_products(device: torch.device, width: int, seconds: float) -> float:
+def measure_matmul(device: torch.device, width: int, seconds: float) -> float:
     """Multiplications and additions a core does in a second, in float32 products (n, width) x (width, width)."""
 
     def make() -> Callable[[], object]:
-        a, b = torch.ones(PRODUCT_ROWS, width, device=device), torch.ones(width, width, device=device)
+        a, b = torch.ones(MATMUL_ROWS, width, device=device), torch.ones(width, width, device=device)
         out = torch.empty_like(a)
         return lambda: torch.mm(a, b, out=out)
 
-    return 2 * PRODUCT_ROWS * width * width / _best_on_every_core(make, device, seconds)
+    return 2 * MATMUL_ROWS * width * width / _best_on_every_core(make, device, seconds)
 
 
 def measure_gather(device: torch.device, rows: int, seconds: float) -> float:
@@ -83,7 +83,7 @@ def measure_copy(device: torch.device, seconds: float) -> float:
 
 def copied_bytes(device: torch.device) -> int:
     """How much each core copies at once in :func:`measure_copy`."""
-    return 4 * max(LEAST_STREAMED, STREAMED // _cores(device))
+    return 4 * max(MIN_STREAMED, STREAMED // _cores(device))
 
 
 def _cores(device: torch.device) -> int:
@@ -92,11 +92,11 @@ def _cores(device: torch.device) -> int:
 
 def _best_on_every_core(make: Callable[[], Callable[[], object]], device: torch.device, seconds: float) -> float:
     """Seconds of the fastest run, averaged over the cores, each repeating work of its own at the same time."""
-    clock = Stopwatch(device)
+    clock = Profiler(device)
 
     def best(_: int) -> float:
         work, until, found = make(), time.perf_counter() + seconds, list[float]()
-        while len(found) < FEWEST_RUNS or time.perf_counter() < until:
+        while len(found) < MIN_RUNS or time.perf_counter() < until:
             started, runs, spent = clock.now(), 0, 0.0
             while spent <= 0:  # clocks of a thread's time move in steps that may be longer than a run
                 work()

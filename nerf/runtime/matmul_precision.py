@@ -15,14 +15,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf.runtime.machine_rates import FEWEST_RUNS, PRODUCT_ROWS
+from nerf.runtime.machine_rates import MATMUL_ROWS, MIN_RUNS
 
 Precision = Literal["highest", "medium"]
 
 USUAL_WIDTH = 64  # of the networks; of wider ones fewer rows make as much work
-FEWEST_ROWS = 256
+MIN_ROWS = 256
 TRIED_SECONDS = 0.06  # for both precisions together
-LEAST_SPEEDUP, MOST_ERROR = 1.3, 1e-4
+MIN_SPEEDUP, MAX_MATMUL_ERROR = 1.3, 1e-4
 
 
 class Medium(NamedTuple):
@@ -34,12 +34,12 @@ class Medium(NamedTuple):
     @property
     def is_exact(self) -> bool:
         """Whether nobody would see the difference in training."""
-        return self.error <= MOST_ERROR
+        return self.error <= MAX_MATMUL_ERROR
 
     @property
     def pays(self) -> bool:
         """Whether training should use it: clearly faster, and about as exact."""
-        return self.is_exact and self.speedup >= LEAST_SPEEDUP
+        return self.is_exact and self.speedup >= MIN_SPEEDUP
 
 
 @contextmanager
@@ -54,11 +54,11 @@ def use_matmul_precision(precision: Precision | None) -> Iterator[None]:
 
 
 @functools.cache
-def medium_matmul(device: torch.device, width: int) -> Medium:
+def measure_medium_matmul(device: torch.device, width: int) -> Medium:
     """Of products (n, width) x (width, width), the fastest of several at each precision in turn; once in a process, in
     a tenth of a second. Changes no random state."""
     random = torch.Generator(device).manual_seed(0)
-    rows = max(FEWEST_ROWS, min(PRODUCT_ROWS, PRODUCT_ROWS * USUAL_WIDTH**2 // width**2))
+    rows = max(MIN_ROWS, min(MATMUL_ROWS, MATMUL_ROWS * USUAL_WIDTH**2 // width**2))
     a, b = (torch.randn(count, width, generator=random, device=device) for count in (rows, width))
     with use_matmul_precision("medium"):
         error = error_of(a @ b, a, b)
@@ -76,7 +76,7 @@ def _fastest(a: Tensor, b: Tensor) -> dict[Precision, float]:
     """Seconds of the fastest product at each precision."""
     seconds: dict[Precision, float] = {"highest": float("inf"), "medium": float("inf")}
     until, runs = time.perf_counter() + TRIED_SECONDS, 0
-    while runs < FEWEST_RUNS or time.perf_counter() < until:
+    while runs < MIN_RUNS or time.perf_counter() < until:
         runs += 1
         for precision, least in seconds.items():
             with use_matmul_precision(precision):

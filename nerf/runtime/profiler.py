@@ -38,7 +38,7 @@ class Spent(NamedTuple):
 NO_WORK, UNTIMED = Work(), nullcontext()
 
 
-class Stopwatch:
+class Profiler:
     """Sums up parts over all threads; a part within another counts for itself alone, so nothing counts twice.
 
     On the CPU these are seconds that a thread has computed: what it waited for others, or for other programs, is in no
@@ -73,11 +73,11 @@ class Stopwatch:
                 self.parts[name] = self.parts.get(name, Spent()).plus(whole - inner, work)
 
 
-_running: Stopwatch | None = None
+_running: Profiler | None = None
 
 
 @contextmanager
-def running(stopwatch: Stopwatch) -> Iterator[None]:
+def running(stopwatch: Profiler) -> Iterator[None]:
     """Every part met in the block counts, in all threads; what is in no part of its own is the rest. Raises
     RuntimeError where another stopwatch runs already."""
     global _running

@@ -29,7 +29,7 @@ from nerf.training.pixel_sampler import PixelSampler
 from nerf.training.ray_dataset import RayDataset
 from nerf.training.trainer import RAYS, NonFinite, StepResult, all_finite
 
-WARM_UP_STEPS = 20
+LR_WARMUP_STEPS = 20
 # Of the run, before the rate begins to fall. A fall over most of the run costs short runs up to 2 dB and gains long
 # ones nothing (docs/experiments/learning_rate.md); and what is measured before it does not depend on how long the run
 # will be.
@@ -38,18 +38,18 @@ LR_FINAL_FRACTION = 0.05  # of the rate at first
 # The distortion loss begins weak: it draws fog together wherever that stands, and far things that only smooth colours
 # tell apart (the sky) would be drawn close behind the scene before their place is known
 # (docs/experiments/learning_rate.md).
-FIRST_DISTORTION = 0.25  # of its weight
-FULL_DISTORTION_SHARE = 0.3  # of the run
+INITIAL_DISTORTION = 0.25  # of its weight
+FULL_DISTORTION_PROGRESS = 0.3  # of the run
 DEPTH_RAY_INTERVAL = 8  # one ray in so many runs to a sparse point, where some are known
-FIRST_SAMPLES_PER_RAY = 128.0
+INITIAL_SAMPLES_PER_RAY = 128.0
 # A ray is not free, though it may need no colour: no step has more rays than if each needed so many.
-LEAST_SAMPLES_PER_RAY = 2.0
+MIN_SAMPLES_PER_RAY = 2.0
 # Of the table's entries, how many have a gradient in a step: of 5 grids of 2^18 rows with 33 to 49 k colours 0.29 to
 # 0.36 (docs/experiments/step_time.md); larger steps reach more.
-TOUCHED = 0.33
+TOUCHED_FRACTION = 0.33
 # Of an entry: its gradient read; if there is one, that cleared, the entry itself and its moments read and written.
-ADAM_BYTES = 4 * (1 + 7 * TOUCHED)
-MEMORY = 0.9  # how much of the mean of samples per ray remains after each step
+ADAM_BYTES = 4 * (1 + 7 * TOUCHED_FRACTION)
+SAMPLES_PER_RAY_EMA_DECAY = 0.9  # how much of the mean of samples per ray remains after each step
 
 
 @dataclass(frozen=True)
@@ -120,15 +120,15 @@ class _Part(NamedTuple):
 def lr_multiplier(step: int, share: float) -> float:
     """The learning rate over its base: a linear warm-up, then constant, then falling exponentially."""
     fallen = max(0.0, share - LR_HOLD_FRACTION) / (1 - LR_HOLD_FRACTION)
-    return min(1.0, (step + 1) / WARM_UP_STEPS) * LR_FINAL_FRACTION**fallen
+    return min(1.0, (step + 1) / LR_WARMUP_STEPS) * LR_FINAL_FRACTION**fallen
 
 
-def distortion_factor(share: float) -> float:
+def distortion_multiplier(share: float) -> float:
     """The weight of the distortion loss over its full one: from a quarter it grows with the share of the run."""
-    return min(1.0, max(FIRST_DISTORTION, share / FULL_DISTORTION_SHARE))
+    return min(1.0, max(INITIAL_DISTORTION, share / FULL_DISTORTION_PROGRESS))
 
 
-def depth_factor(share: float) -> float:
+def depth_loss_multiplier(share: float) -> float:
     """The weight of the depth loss over its first one: it falls to nothing over the run. Shape is decided early, and
     once it is about right photos know it better than points do."""
     return 1 - share
@@ -141,13 +141,13 @@ class HashGridTrainer:
     def __init__(
         self,
         model: HashGridField,
-        bank: RayDataset,
+        dataset: RayDataset,
         settings: HashGridTrainerSettings,
         effects: ImageEffects = NO_EFFECTS,
     ) -> None:
         self.model, self.settings, self.effects = model, settings, effects
         # Nothing beyond the box of a bounded scene is drawn: a point there would pull the light to its walls.
-        self.bank = bank if model.settings.contracted else bank.known_within(BOX)
+        self.dataset = dataset if model.settings.contracted else dataset.with_sparse_depths_within(BOX)
         self.occupancy_grid = OccupancyGrid(model, self._usable())
         of_networks = model.weights._asdict()
         self.background = {"background_table": model.background_table} if model.settings.background_model else {}
@@ -159,20 +159,20 @@ class HashGridTrainer:
         self.levels = [
             tuple(tensor[first:end] for tensor in tables) for first, end in pairwise(model.layout.first_rows)
         ]
-        self.samples_per_ray = torch.tensor(FIRST_SAMPLES_PER_RAY, dtype=torch.float64)
-        self.order = PixelSampler(self.bank.drawable, settings.seed, bank.device)
+        self.samples_per_ray = torch.tensor(INITIAL_SAMPLES_PER_RAY, dtype=torch.float64)
+        self.order = PixelSampler(self.dataset.unmasked_count, settings.seed, dataset.device)
         self.drawn = torch.tensor(0)  # pixels of that order so far; steps differ in how many they take
 
     def _usable(self) -> Bool[Tensor, "cells"] | None:
         """Known only where points tell where foregrounds begin, in folded space: a box is carved beforehand."""
-        least, stepping = min(self.settings.least_photos, len(self.bank.near) - 1), self.model.stepping
-        if least <= 1 or self.bank.known is None or not stepping.contracted:
+        least, stepping = min(self.settings.least_photos, len(self.dataset.near) - 1), self.model.stepping
+        if least <= 1 or self.dataset.known is None or not stepping.contracted:
             return None
-        return compute_frustum_mask(self.bank, least, stepping.occupancy_resolution)
+        return compute_frustum_mask(self.dataset, least, stepping.occupancy_resolution)
 
     def step(self, step: int, share: float, rate_scale: float = 1.0) -> StepResult:
         """One batch, one update. Raises NonFinite before the update, leaving model and optimiser as they were."""
-        device, rays = self.bank.device, self._rays_per_chunk()
+        device, rays = self.dataset.device, self._rays_per_chunk()
         parts = list(in_order(partial(self._part, step, share, rays), range(self.settings.chunks), device))
         loss, error = self._finite(step, parts)
         self._update(parts, rate_scale * lr_multiplier(step, share), step + 1)
@@ -181,7 +181,7 @@ class HashGridTrainer:
         samples = sum(len(each.points) for each in parts)
         rays *= self.settings.chunks
         self.drawn += self._of_photos(rays, share)
-        self.samples_per_ray.mul_(MEMORY).add_((1 - MEMORY) * samples / rays)
+        self.samples_per_ray.mul_(SAMPLES_PER_RAY_EMA_DECAY).add_((1 - SAMPLES_PER_RAY_EMA_DECAY) * samples / rays)
         return StepResult(loss, psnr(error), rays, samples, sum(each.densities for each in parts))
 
     def state(self) -> dict[str, Tensor]:
@@ -211,20 +211,20 @@ class HashGridTrainer:
             tensor.copy_(state[name])
 
     def _rays_per_chunk(self) -> int:
-        wanted = int(self.settings.samples / max(LEAST_SAMPLES_PER_RAY, float(self.samples_per_ray)))
+        wanted = int(self.settings.samples / max(MIN_SAMPLES_PER_RAY, float(self.samples_per_ray)))
         return max(1, wanted // self.settings.chunks)
 
     def _batch(self, step: int, share: float, chunk: int, count: int) -> HashGridBatch:
-        device = self.bank.device
+        device = self.dataset.device
         random = generator(device, self.settings.seed, step, chunk)
         # Shared out over the chunks, which are small where cores are many and the field is young.
         first, end = self._of_photos(chunk * count, share), self._of_photos((chunk + 1) * count, share)
-        pixel = self.bank.nth(self.order.take(int(self.drawn) + first, end - first))
+        pixel = self.dataset.nth(self.order.take(int(self.drawn) + first, end - first))
         to_points, distance = count - len(pixel), torch.zeros(count, device=device)
         if to_points:
-            of_points, distance[-to_points:] = self.bank.draw_known(to_points, random)
+            of_points, distance[-to_points:] = self.dataset.sample_sparse_depths(to_points, random)
             pixel = torch.cat([pixel, of_points])
-        rays, colour, alpha, view = self.bank.lookup(pixel)
+        rays, colour, alpha, view = self.dataset.lookup(pixel)
         if self.settings.background == "random":
             background = torch.rand(count, 3, generator=random, device=device)
         else:
@@ -235,10 +235,10 @@ class HashGridTrainer:
 
     def _of_photos(self, rays: int, share: float) -> int:
         """How many of so many rays run through pixels of all the photos; the others run to sparse points."""
-        return rays - rays // DEPTH_RAY_INTERVAL if self._is_guided(share) else rays
+        return rays - rays // DEPTH_RAY_INTERVAL if self._has_depth_loss(share) else rays
 
-    def _is_guided(self, share: float) -> bool:
-        return self.bank.known is not None and self.settings.depth_loss * depth_factor(share) > 0
+    def _has_depth_loss(self, share: float) -> bool:
+        return self.dataset.known is not None and self.settings.depth_loss * depth_loss_multiplier(share) > 0
 
     def _part(self, step: int, share: float, rays: int, chunk: int) -> _Part:
         """What a chunk of so many rays adds to loss and gradients."""
@@ -265,7 +265,7 @@ class HashGridTrainer:
 
     def _backward_work(self, done: HashGridPass) -> Work:
         weights = self.model.weights
-        products = 2 * (mlp.density_products(weights) + mlp.colour_products(weights)) * len(done.points)
+        products = 2 * (mlp.density_flops(weights) + mlp.colour_flops(weights)) * len(done.points)
         to_points = CORNERS * len(self.model.layout.resolutions) * len(done.points) if self.effects.rays else 0
         return Work(products, to_points)
 
@@ -277,11 +277,11 @@ class HashGridTrainer:
         value, grad_weights = robust.sum() / (3 * rays), torch.zeros_like(done.weights)
         backend, stepping = self.model.backend, self.model.stepping
         if self.settings.distortion:
-            each = torch.full_like(batch.distance, self.settings.distortion * distortion_factor(share) / rays)
+            each = torch.full_like(batch.distance, self.settings.distortion * distortion_multiplier(share) / rays)
             value = value + (each * backend.distortion(done.samples, done.weights, stepping)).sum()
             grad_weights = backend.distortion_backward(done.samples, done.weights, stepping, each)
-        if self._is_guided(share):
-            each = torch.full_like(batch.distance, self.settings.depth_loss * depth_factor(share) / rays)
+        if self._has_depth_loss(share):
+            each = torch.full_like(batch.distance, self.settings.depth_loss * depth_loss_multiplier(share) / rays)
             places = done.rays.far, batch.distance, stepping
             apart = backend.depth_loss(done.samples, done.weights, done.rendering.opacity, *places)
             value = value + (each * apart).sum()
@@ -317,7 +317,7 @@ class HashGridTrainer:
         work.append(partial(self._raise_occupancy, parts))
         for effect in self.effects.all:
             work.append(partial(self._update_effect, effect, parts, effect.learning_rate * factor, adam_step))
-        for _ in in_order(lambda update: update(), work, self.bank.device):
+        for _ in in_order(lambda update: update(), work, self.dataset.device):
             pass
 
     def _background_prior(self, parts: Sequence[_Part]) -> dict[str, Tensor]:

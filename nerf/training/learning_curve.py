@@ -55,15 +55,15 @@ def knee(curve: Curve) -> float | None:
 # Least squares over 32 pairs of runs of T and 2 T steps of the grid field, eight sets
 # (docs/experiments/learning_curve.md): what a run gained from half of its time to its end, annealing included, against
 # what a run of twice the time ends higher.
-FEWEST_STEPS = 500  # a shorter run is still fog, and tells nothing of a longer one
+MIN_STEPS = 500  # a shorter run is still fog, and tells nothing of a longer one
 NEXT_OF_LAST = 0.71
 NEXT_HALF_WIDTH = 0.37  # dB: held four of five, each judged by the other sets
 
 
 def next_doubling(curve: Curve, steps: int) -> Gain | None:
     """What a run of twice the time is predicted to end higher than this one of ``steps``; None where these are fewer
-    than FEWEST_STEPS, and as :func:`last_doubling`."""
+    than MIN_STEPS, and as :func:`last_doubling`."""
     last = last_doubling(curve)
-    if last is None or steps < FEWEST_STEPS:
+    if last is None or steps < MIN_STEPS:
         return None
     return Gain(NEXT_OF_LAST * last, NEXT_HALF_WIDTH)

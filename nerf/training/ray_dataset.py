@@ -3,11 +3,11 @@
 Photos may differ in size and camera. They are laid end to end: a *pixel* index counts through all of them, row by
 row. The pixels stay uint8 and may be a file mapped into memory, so that there may be more of them than memory holds.
 
-A camera is a mosaic of *patches*, each small enough for its bearings to be linear in the pixel (the model of a pinhole
-camera: exact without distortion). One look-up then gives the ray of a pixel, and a camera takes the same small memory
-whatever the size of its photos: a set where every photo has a camera of its own stays small.
+A camera is a mosaic of *patches*, each small enough for its ray directions to be linear in the pixel (the model of a
+pinhole camera: exact without distortion). One look-up then gives the ray of a pixel, and a camera takes the same small
+memory whatever the size of its photos: a set where every photo has a camera of its own stays small.
 
-Where photos have masks, the pixels that may be drawn are kept as *runs* of neighbours, of which a photo has a few in a
+Where photos have masks, the unmasked pixels are kept as *runs* of neighbours, of which a photo has a few in a
 row; without masks there are none, and nothing to look up.
 """
 
@@ -20,12 +20,12 @@ from torch import Tensor
 
 from nerf.geometry.rays import Rays
 
-# Bearings are brought to the plane z = 1, where those of a camera without distortion are linear in the pixel. Beyond 60
-# degrees from the axis, where that plane is too far away, they keep a bounded length.
-LEAST_FORWARD = 0.5
+# Ray directions are scaled to the plane z = 1, where those of a camera without distortion are linear in the pixel.
+# Beyond 60 degrees from the axis, where that plane is too far away, they keep a bounded length.
+MIN_FORWARD = 0.5
 
 
-class Drawn(NamedTuple):
+class PixelBatch(NamedTuple):
     """Pixels with the rays through them: colour and alpha in [0, 1] (None without such a channel), and whose view."""
 
     rays: Rays
@@ -35,7 +35,7 @@ class Drawn(NamedTuple):
 
 
 class RayDataset(NamedTuple):
-    """Photos as one table of pixels; make it with :func:`ray_bank` or :func:`build_ray_bank`.
+    """Photos as one table of pixels; make it with :func:`make_ray_dataset` or :func:`ray_dataset_from_images`.
 
     View v owns the pixels [first_pixel[v], first_pixel[v + 1]); ``pixels`` have 3 channels, or 4 with a straight (not
     premultiplied) alpha. What a look-up needs of a view stands in two tables with a column per view:
@@ -43,10 +43,10 @@ class RayDataset(NamedTuple):
     * ``layout``: its first pixel, its width, its camera's first patch, patches in a row;
     * ``geometry``: the rotation scene_from_camera row by row, the centre, near, far, patches per pixel along x and y.
 
-    ``patches`` has a column per patch: the bearing in its middle, and how it changes along x and y over one patch.
+    ``patches`` has a column per patch: the direction in its middle, and how it changes along x and y over one patch.
 
-    ``runs`` has a column per run of pixels that may be drawn: how many of them lie before it, and its first pixel. A
-    last column has the number of all of them. None: every pixel may be drawn.
+    ``runs`` has a column per run of unmasked pixels: how many unmasked pixels lie before it, and its first pixel. A
+    last column has the number of all of them. None: no pixel is masked.
 
     ``known`` are pixels that show a sparse point, ``distance`` how far along their rays (scene units) it lies. None: of
     no pixel is that known.
@@ -83,17 +83,17 @@ class RayDataset(NamedTuple):
         return torch.stack([each.median() if len(each) else of_all for each in of_views])
 
     def to(self, device: torch.device | str) -> "RayDataset":
-        """This bank with its tables on ``device``."""
+        """This dataset with its tables on ``device``."""
         moved = {name: table.to(device) for name, table in self._asdict().items() if table is not None}
         return self._replace(**moved)
 
     @property
-    def drawable(self) -> int:
-        """How many pixels may be drawn."""
+    def unmasked_count(self) -> int:
+        """How many pixels no mask excludes."""
         return len(self.pixels) if self.runs is None else int(self.runs[0, -1])
 
     def without(self, ignored: Iterable[Bool[Tensor, "_ _"] | None]) -> "RayDataset":
-        """This bank with pixels that :meth:`draw` never gives: per view, (height, width) True where the photo is to
+        """This dataset with pixels that :meth:`draw` never gives: per view, (height, width) True where the photo is to
         be ignored, None where all of it is used. Taken one by one, for together they may not fit into memory. Raises
         ValueError if no pixel is left."""
         runs = _runs(ignored, self.first_pixel)
@@ -103,20 +103,20 @@ class RayDataset(NamedTuple):
             raise ValueError("the masks ignore every pixel")
         return self._replace(runs=runs.to(self.device))
 
-    def with_distances(self, pixel: Int[Tensor, "known"], distance: Float[Tensor, "known"]) -> "RayDataset":
-        """This bank, which knows how far away is what these pixels show (scene units, along the ray).
+    def with_sparse_depths(self, pixel: Int[Tensor, "known"], distance: Float[Tensor, "known"]) -> "RayDataset":
+        """This dataset with sparse depths: how far along their rays (scene units) these pixels show a sparse point.
 
         Left out are pixels that may not be drawn (so give the masks first), those that are not wholly opaque, whose
         light ends in part elsewhere, and distances that are not between near and far of their views: no sample stands
         there, and what does would be pulled to the end of the ray."""
         near, far = self.geometry[12:].index_select(1, torch.searchsorted(self.first_pixel, pixel, right=True) - 1)[:2]
-        kept = self.may_be_drawn(pixel) & (near < distance) & (distance < far)
+        kept = self.is_unmasked(pixel) & (near < distance) & (distance < far)
         if self.pixels.shape[1] == 4:
             kept &= self.pixels.index_select(0, pixel)[:, 3] == 255
         return self._knowing(pixel[kept], distance[kept].float())
 
-    def known_within(self, half: float) -> "RayDataset":
-        """This bank without the known distances that end outside of the cube from -``half`` to ``half``."""
+    def with_sparse_depths_within(self, half: float) -> "RayDataset":
+        """This dataset without the known distances that end outside of the cube from -``half`` to ``half``."""
         if self.known is None or self.distance is None:
             return self
         rays, _ = self.rays(self.known)
@@ -127,24 +127,24 @@ class RayDataset(NamedTuple):
         known = len(pixel) > 0
         return self._replace(known=pixel if known else None, distance=distance if known else None)
 
-    def lookup(self, pixel: Int[Tensor, "rays"]) -> Drawn:
+    def lookup(self, pixel: Int[Tensor, "rays"]) -> PixelBatch:
         """Given pixels, and the rays through them."""
         rays, view = self.rays(pixel)
         values = self.pixels.index_select(0, pixel).float().div_(255)
-        return Drawn(rays, values[:, :3], values[:, 3] if values.shape[1] == 4 else None, view)
+        return PixelBatch(rays, values[:, :3], values[:, 3] if values.shape[1] == 4 else None, view)
 
     def rays(self, pixel: Int[Tensor, "rays"]) -> tuple[Rays, Int[Tensor, "rays"]]:
         """The rays through pixels, and whose views they are; the photos, which may be on disk, are not read."""
         view = torch.searchsorted(self.first_pixel, pixel, right=True).sub_(1)
         geometry = self.geometry.index_select(1, view)
-        bearing = self._bearing(pixel, self.layout.index_select(1, view), geometry[14:])
-        directions = (geometry[:9].view(3, 3, -1) * bearing).sum(1)
+        direction = self._direction(pixel, self.layout.index_select(1, view), geometry[14:])
+        directions = (geometry[:9].view(3, 3, -1) * direction).sum(1)
         return Rays(geometry[9:12].T.contiguous(), directions.T.contiguous(), geometry[12], geometry[13]), view
 
-    def _bearing(
+    def _direction(
         self, pixel: Int[Tensor, "rays"], layout: Int[Tensor, "4 rays"], per_pixel: Float[Tensor, "2 rays"]
     ) -> Float[Tensor, "3 rays"]:
-        """Unit bearings in the camera frame: of the patch, b + u db/du + v db/dv, with (u, v) from its middle."""
+        """Unit directions in the camera frame: of the patch, b + u db/du + v db/dv, with (u, v) from its middle."""
         first_pixel, width, first_patch, across = layout
         within = pixel - first_pixel
         row = within // width
@@ -152,25 +152,27 @@ class RayDataset(NamedTuple):
         column, line = x.long(), y.long()
         u, v = x.sub_(column).sub_(0.5), y.sub_(line).sub_(0.5)
         patch = self.patches.index_select(1, first_patch + line * across + column)
-        bearing = torch.addcmul(torch.addcmul(patch[:3], patch[3:6], u), patch[6:], v)
-        return bearing / bearing.square().sum(0).sqrt_()
+        direction = torch.addcmul(torch.addcmul(patch[:3], patch[3:6], u), patch[6:], v)
+        return direction / direction.square().sum(0).sqrt_()
 
     def draw(self, count: int, generator: torch.Generator) -> Int[Tensor, "rays"]:
         """``count`` pixels drawn uniformly from those that may be, with replacement."""
-        return self.nth(torch.randint(self.drawable, (count,), generator=generator, device=self.device))
+        return self.nth(torch.randint(self.unmasked_count, (count,), generator=generator, device=self.device))
 
     def nth(self, number: Int[Tensor, "rays"]) -> Int[Tensor, "rays"]:
         """The pixels that have these numbers, from 0 on, among those that may be drawn."""
         return number if self.runs is None else _in_runs(self.runs, number)
 
-    def draw_known(self, count: int, generator: torch.Generator) -> tuple[Int[Tensor, "rays"], Float[Tensor, "rays"]]:
+    def sample_sparse_depths(
+        self, count: int, generator: torch.Generator
+    ) -> tuple[Int[Tensor, "rays"], Float[Tensor, "rays"]]:
         """``count`` of the pixels whose distance is known, drawn uniformly with replacement, and their distances."""
-        assert self.known is not None and self.distance is not None, "a bank that knows none is not asked"
+        assert self.known is not None and self.distance is not None, "the dataset has no sparse depths"
         drawn = torch.randint(len(self.known), (count,), generator=generator, device=self.device)
         return self.known.index_select(0, drawn), self.distance.index_select(0, drawn)
 
-    def may_be_drawn(self, pixel: Int[Tensor, "*rays"]) -> Bool[Tensor, "*rays"]:
-        """Whether :meth:`draw` may give these pixels."""
+    def is_unmasked(self, pixel: Int[Tensor, "*rays"]) -> Bool[Tensor, "*rays"]:
+        """Whether no mask excludes these pixels."""
         if self.runs is None:
             return torch.ones_like(pixel, dtype=torch.bool)
         run = torch.searchsorted(self.runs[1].contiguous(), pixel.flatten(), right=True).sub_(1).clamp_(min=0)
@@ -178,7 +180,7 @@ class RayDataset(NamedTuple):
         return ((into >= 0) & (into < self.runs[0].diff()[run])).view(pixel.shape)
 
 
-class Placement(NamedTuple):
+class PosedViews(NamedTuple):
     """How the views stand: scene_from_camera, and distances along the unit ray."""
 
     poses: Float[Tensor, "views 3 4"]
@@ -186,34 +188,34 @@ class Placement(NamedTuple):
     far: Float[Tensor, "views"]
 
 
-def ray_bank(
+def make_ray_dataset(
     pixels: UInt8[Tensor, "pixels channels"],
     sizes: Sequence[tuple[int, int]],
     camera_of: Sequence[int],
-    camera_bearings: Sequence[Float[Tensor, "_ _ 3"]],
-    placement: Placement,
+    camera_directions: Sequence[Float[Tensor, "_ _ 3"]],
+    placement: PosedViews,
 ) -> RayDataset:
-    """The bank of photos that are laid end to end already.
+    """The dataset of photos that are laid end to end already.
 
     Args:
         pixels: all photos, row by row, with 3 or with 4 channels; taken as it is, without a copy.
         sizes: per view, (height, width) of its photo in pixels.
-        camera_of: per view, the index of its camera in ``camera_bearings``.
-        camera_bearings: per camera, (rows, columns, 3) bearing vectors (camera frame) in the middles of the equal
+        camera_of: per view, the index of its camera in ``camera_directions``.
+        camera_directions: per camera, (rows, columns, 3) direction vectors (camera frame) in the middles of the equal
             patches into which they divide the picture. As many as pixels give each pixel its own; fewer are enough
             where distortion is smooth.
         placement: of every view.
 
     Raises:
-        ValueError: if there are no photos, one has fewer pixels along a side than its camera has bearings, or
+        ValueError: if there are no photos, one has fewer pixels along a side than its camera has directions, or
             ``pixels`` has another length than all photos together.
     """
     if not sizes:
-        raise ValueError("a ray bank needs at least one photo")
-    grids = [(bearings.shape[0], bearings.shape[1]) for bearings in camera_bearings]
+        raise ValueError("a ray dataset needs at least one photo")
+    grids = [(directions.shape[0], directions.shape[1]) for directions in camera_directions]
     for view, (size, camera) in enumerate(zip(sizes, camera_of, strict=True)):
         if size[0] < grids[camera][0] or size[1] < grids[camera][1]:
-            raise ValueError(f"photo {view} has size {size}, its camera {camera} {grids[camera]} bearings")
+            raise ValueError(f"photo {view} has size {size}, its camera {camera} {grids[camera]} directions")
     first_pixel = _starts([height * width for height, width in sizes])
     if len(pixels) != first_pixel[-1]:
         raise ValueError(f"there are {len(pixels)} pixels, the photos have {first_pixel[-1]}")
@@ -227,22 +229,22 @@ def ray_bank(
         first_pixel=first_pixel,
         layout=torch.stack([first_pixel[:-1], size[:, 1], first_patch[cameras], grid[:, 1]]),
         geometry=torch.cat([rotations, centres, near[:, None], far[:, None], (grid / size).flip(1)], 1).T.contiguous(),
-        patches=torch.cat([_patches(bearings) for bearings in camera_bearings], 1),
+        patches=torch.cat([_patches(directions) for directions in camera_directions], 1),
     )
 
 
-def build_ray_bank(
+def ray_dataset_from_images(
     photos: Sequence[UInt8[Tensor, "_ _ channels"]],
     camera_of: Sequence[int],
-    camera_bearings: Sequence[Float[Tensor, "_ _ 3"]],
+    camera_directions: Sequence[Float[Tensor, "_ _ 3"]],
     poses: Float[Tensor, "views 3 4"],
     near: Float[Tensor, "views"],
     far: Float[Tensor, "views"],
 ) -> RayDataset:
-    """:func:`ray_bank` of photos in memory, (height, width, channels) each, which it copies."""
+    """:func:`make_ray_dataset` of photos in memory, (height, width, channels) each, which it copies."""
     pixels = [photo.flatten(0, 1) for photo in photos] or [torch.zeros(0, 3, dtype=torch.uint8)]
     sizes = [(photo.shape[0], photo.shape[1]) for photo in photos]
-    return ray_bank(torch.cat(pixels), sizes, camera_of, camera_bearings, Placement(poses, near, far))
+    return make_ray_dataset(torch.cat(pixels), sizes, camera_of, camera_directions, PosedViews(poses, near, far))
 
 
 def _runs(
@@ -270,9 +272,9 @@ def _in_runs(runs: Int[Tensor, "2 runs_and_end"], drawn: Int[Tensor, "rays"]) ->
     return first + drawn - before
 
 
-def _patches(bearings: Float[Tensor, "rows columns 3"]) -> Float[Tensor, "9 patches"]:
-    """Bearings on the plane z = 1, with their slopes along x and y per patch (central differences)."""
-    flat = bearings / bearings[..., 2:].clamp(min=LEAST_FORWARD)
+def _patches(directions: Float[Tensor, "rows columns 3"]) -> Float[Tensor, "9 patches"]:
+    """Directions on the plane z = 1, with their slopes along x and y per patch (central differences)."""
+    flat = directions / directions[..., 2:].clamp(min=MIN_FORWARD)
     return torch.cat([flat, _slope(flat, 1), _slope(flat, 0)], -1).flatten(0, 1).T.contiguous()
 
 

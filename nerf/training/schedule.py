@@ -2,7 +2,7 @@
 
 ``share`` is how much of a run is done, from 0 to 1; everything that changes while training is a function of it.
 A run bounded by steps knows its share exactly. A run bounded by seconds estimates how many steps will fit, and
-revises the estimate when the clock disagrees; the decisions are data (:class:`StepPlan`), so a resumed run that
+revises the estimate when the clock disagrees; the decisions are data (:class:`StepSchedule`), so a resumed run that
 replays them gives every step the learning rate it had before, and goes on from there by steps or by the clock.
 """
 
@@ -16,7 +16,7 @@ Reason = Literal["begin", "clock", "target", "more"]
 CLOSING_SHARE = 0.75
 
 
-class Decision(NamedTuple):
+class ScheduleRevision(NamedTuple):
     """From step ``from_step`` on, before which ``share`` of the run is done, it is meant to have ``total_steps``, for a
     ``reason``: it begins, the clock says so, a target is near or reached, or it is to go on."""
 
@@ -26,10 +26,10 @@ class Decision(NamedTuple):
     reason: Reason = "begin"
 
 
-class StepPlan(NamedTuple):
+class StepSchedule(NamedTuple):
     """The decisions so far, in order; the last one holds."""
 
-    decisions: tuple[Decision, ...]
+    decisions: tuple[ScheduleRevision, ...]
 
     @property
     def total_steps(self) -> int:
@@ -49,35 +49,35 @@ class StepPlan(NamedTuple):
         start, total, share, _ = next(decision for decision in reversed(self.decisions) if decision.from_step <= step)
         return share if total == start else share + (1 - share) * min(1.0, (step - start) / (total - start))
 
-    def revised(self, step: int, total_steps: int, share: float) -> "StepPlan":
+    def revised(self, step: int, total_steps: int, share: float) -> "StepSchedule":
         """This plan with one more decision made before ``step``, when ``share`` of the run is done by the clock.
 
         Raises ValueError where that would leave no step to take, or rewrite a decision already made.
         """
         if not self.decisions[-1].from_step <= step < total_steps:
             raise ValueError(f"at step {step} the plan {self.decisions} cannot become {total_steps} steps")
-        return StepPlan((*self.decisions, Decision(step, total_steps, share, "clock")))
+        return StepSchedule((*self.decisions, ScheduleRevision(step, total_steps, share, "clock")))
 
-    def until(self, step: int) -> "StepPlan":
+    def until(self, step: int) -> "StepSchedule":
         """The decisions made up to ``step``: later ones are about steps that are to be taken once more."""
-        return StepPlan(tuple(decision for decision in self.decisions if decision.from_step <= step))
+        return StepSchedule(tuple(decision for decision in self.decisions if decision.from_step <= step))
 
-    def closing(self, step: int) -> "StepPlan":
+    def closing(self, step: int) -> "StepSchedule":
         """This plan with ``step`` as the first one of the last quarter of a run, or of what is left if that is less.
         Raises ValueError where that rewrites a decision or leaves no step."""
         if not self.decisions[-1].from_step <= step < self.total_steps:
             raise ValueError(f"the plan {self.decisions} cannot close at step {step}")
         total = min(self.total_steps, max(step + 1, round(step / CLOSING_SHARE)))
         share = max(CLOSING_SHARE, self.share(step))
-        return StepPlan((*self.decisions, Decision(step, total, share, "target")))
+        return StepSchedule((*self.decisions, ScheduleRevision(step, total, share, "target")))
 
-    def ended(self, step: int) -> "StepPlan":
+    def ended(self, step: int) -> "StepSchedule":
         """This plan without the steps from ``step`` on. Raises ValueError where that rewrites a decision."""
         if not self.decisions[-1].from_step < step <= self.total_steps:
             raise ValueError(f"the plan {self.decisions} cannot end at step {step}")
-        return StepPlan((*self.decisions, Decision(step, step, self.share(step), "target")))
+        return StepSchedule((*self.decisions, ScheduleRevision(step, step, self.share(step), "target")))
 
-    def extended(self, total_steps: int) -> "StepPlan":
+    def extended(self, total_steps: int) -> "StepSchedule":
         """This plan, once it is at its end, with more steps: its share falls to that of a run of ``total_steps``.
 
         Raises ValueError where that would add no step.
@@ -85,14 +85,14 @@ class StepPlan(NamedTuple):
         done = self.total_steps
         if total_steps <= done:
             raise ValueError(f"after {done} steps the run cannot go on to {total_steps}")
-        return StepPlan((*self.decisions, Decision(done, total_steps, done / total_steps, "more")))
+        return StepSchedule((*self.decisions, ScheduleRevision(done, total_steps, done / total_steps, "more")))
 
 
-def plan_of(total_steps: int) -> StepPlan:
+def schedule_of(total_steps: int) -> StepSchedule:
     """The plan of a run of ``total_steps`` steps. Raises ValueError below one step."""
     if total_steps < 1:
         raise ValueError(f"a run needs at least one step, not {total_steps}")
-    return StepPlan((Decision(0, total_steps, 0.0),))
+    return StepSchedule((ScheduleRevision(0, total_steps, 0.0),))
 
 
 def steps_that_fit(step: int, seconds_left: float, steps_per_second: float) -> int:
@@ -101,8 +101,8 @@ def steps_that_fit(step: int, seconds_left: float, steps_per_second: float) -> i
 
 
 def replanned(
-    plan: StepPlan, step: int, seconds: float, budget: float, steps_per_second: float, tolerance: float
-) -> StepPlan:
+    plan: StepSchedule, step: int, seconds: float, budget: float, steps_per_second: float, tolerance: float
+) -> StepSchedule:
     """The plan before ``step``, ``seconds`` of the ``budget`` being used; revised only if it would end more than
     ``tolerance`` seconds early or late. Its share is then that of the time, so that a plan which the clock proved wrong
     leaves no trace in the rates."""

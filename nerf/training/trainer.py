@@ -138,14 +138,14 @@ class VanillaTrainer:
     def __init__(
         self,
         model: VanillaNerf,
-        bank: RayDataset,
+        dataset: RayDataset,
         settings: VanillaTrainerSettings,
         effects: ImageEffects = NO_EFFECTS,
     ) -> None:
         self.model = model
-        self.bank = bank
+        self.dataset = dataset
         self.settings = settings
-        self.order = PixelSampler(bank.drawable, settings.seed, bank.device)
+        self.order = PixelSampler(dataset.unmasked_count, settings.seed, dataset.device)
         self.effects = effects
         networks = [p for p in model.parameters() if p.requires_grad]
         groups = [{"params": networks, "of_start": 1.0}]
@@ -159,7 +159,7 @@ class VanillaTrainer:
         """One batch, one update. Raises NonFinite before the update, leaving model and optimiser as they were."""
         with part("batch"):
             batch = self._batch(step)
-        device = self.bank.device
+        device = self.dataset.device
         starts = range(0, self.settings.batch_rays, CHUNK_RAYS.get(device.type, self.settings.batch_rays))
         parts = list(in_order(partial(self._part, batch, step), starts, device))
         gradients = [torch.stack(of).sum(0) for of in zip(*(each.gradients for each in parts), strict=True)]
@@ -184,9 +184,9 @@ class VanillaTrainer:
 
     def _part(self, batch: Batch, step: int, start: int) -> _Part:
         """What a slice of the batch adds to loss and gradient; it draws its samples from its own random numbers."""
-        size = CHUNK_RAYS.get(self.bank.device.type, self.settings.batch_rays)
+        size = CHUNK_RAYS.get(self.dataset.device.type, self.settings.batch_rays)
         rays, target, view, background = batch.part(slice(start, start + size))
-        random = generator(self.bank.device, self.settings.seed, step, 1 + start)
+        random = generator(self.dataset.device, self.settings.seed, step, 1 + start)
         seen_along = self.effects.forward_rays(rays, view)
         if not all_finite(seen_along):
             raise NonFinite(RAYS, step, _tensors_of(batch))
@@ -234,16 +234,16 @@ class VanillaTrainer:
         self.optimiser.load_state_dict({"state": moments, "param_groups": groups})
 
     def _backward_work(self, rays: int) -> Work:
-        return Work(products=self.model.fine.products_backward * self.model.settings.queries_per_ray * rays)
+        return Work(products=self.model.fine.matmul_flops_backward * self.model.settings.queries_per_ray * rays)
 
     def _batch(self, step: int) -> Batch:
-        random = generator(self.bank.device, self.settings.seed, step)
+        random = generator(self.dataset.device, self.settings.seed, step)
         count = self.settings.batch_rays
-        rays, colour, alpha, view = self.bank.lookup(self.bank.nth(self.order.take(step * count, count)))
+        rays, colour, alpha, view = self.dataset.lookup(self.dataset.nth(self.order.take(step * count, count)))
         if self.settings.background == "random":
-            background = torch.rand(3, generator=random, device=self.bank.device)
+            background = torch.rand(3, generator=random, device=self.dataset.device)
         else:
-            background = torch.tensor(self.settings.background, device=self.bank.device)
+            background = torch.tensor(self.settings.background, device=self.dataset.device)
         return Batch(rays, over(colour, alpha, background), view, background)
 
 

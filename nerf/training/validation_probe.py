@@ -26,7 +26,7 @@ class Probe(NamedTuple):
     view: Int[Tensor, "rays"]
 
     @property
-    def flat_psnr(self) -> float:
+    def mean_colour_psnr(self) -> float:
         """What the best single colour scores (dB): a field that is no better has learned nothing of the scene."""
         mean = self.colours.mean(0).expand_as(self.colours)
         return psnr(mean_squared_error(mean, self.colours))
@@ -47,31 +47,31 @@ class Patches(NamedTuple):
     used: Bool[Tensor, "patches side side"]
 
 
-def make_probe(bank: RayDataset, count: int, background: Float[Tensor, "3"], seed: int) -> Probe:
-    """Draw ``count`` pixels of ``bank``, always the same for the same seed."""
-    return _probe_of(bank, bank.draw(count, generator(bank.device, seed)), background)
+def make_probe(dataset: RayDataset, count: int, background: Float[Tensor, "3"], seed: int) -> Probe:
+    """Draw ``count`` pixels of ``dataset``, always the same for the same seed."""
+    return _probe_of(dataset, dataset.draw(count, generator(dataset.device, seed)), background)
 
 
-def make_patches(bank: RayDataset, count: int, side: int, background: Float[Tensor, "3"], seed: int) -> Patches:
-    """``count`` squares around drawn pixels of ``bank``, moved to lie inside their photos; always the same for the same
+def make_patches(dataset: RayDataset, count: int, side: int, background: Float[Tensor, "3"], seed: int) -> Patches:
+    """``count`` squares around random pixels of ``dataset``, moved to lie inside their photos; the same for the same
     seed. Their side is ``side`` pixels, less where a photo is smaller."""
-    first, width = bank.layout[:2]
-    height = bank.first_pixel.diff() // width
+    first, width = dataset.layout[:2]
+    height = dataset.first_pixel.diff() // width
     side = min(side, int(width.min()), int(height.min()))
-    pixel = bank.draw(count, generator(bank.device, seed, 1))
-    view = torch.searchsorted(bank.first_pixel, pixel, right=True) - 1
+    pixel = dataset.draw(count, generator(dataset.device, seed, 1))
+    view = torch.searchsorted(dataset.first_pixel, pixel, right=True) - 1
     first, width, height = (table.index_select(0, view) for table in (first, width, height))
     within = pixel - first
     top = (within // width - side // 2).clamp(min=0).minimum(height - side)
     left = (within % width - side // 2).clamp(min=0).minimum(width - side)
-    steps = torch.arange(side, device=bank.device)
+    steps = torch.arange(side, device=dataset.device)
     corner = first + top * width + left
     pixels = corner[:, None, None] + steps[:, None] * width[:, None, None] + steps
-    return Patches(_probe_of(bank, pixels.flatten(), background), bank.may_be_drawn(pixels))
+    return Patches(_probe_of(dataset, pixels.flatten(), background), dataset.is_unmasked(pixels))
 
 
-def _probe_of(bank: RayDataset, pixels: Int[Tensor, "rays"], background: Float[Tensor, "3"]) -> Probe:
-    rays, colour, alpha, view = bank.lookup(pixels)
+def _probe_of(dataset: RayDataset, pixels: Int[Tensor, "rays"], background: Float[Tensor, "3"]) -> Probe:
+    rays, colour, alpha, view = dataset.lookup(pixels)
     return Probe(rays, over(colour, alpha, background), background, view)
 
 

@@ -19,13 +19,13 @@ PAPER_RAYS = {"paper field as published": (8, 256, 64, 128), "paper field 4 × 6
 
 def bench_lines(device: "torch.device") -> list[str]:
     """Measure, and the table in lines."""
-    from nerf.runtime.machine_rates import copied_bytes, measure_copy, measure_gather, measure_products
+    from nerf.runtime.machine_rates import copied_bytes, measure_copy, measure_gather, measure_matmul
     from stages.hardware.device import compute_device, cores
     from stages.io.amounts import bytes_in_words
 
     compute_device()
     count = cores()
-    products = {width: measure_products(device, width, SECONDS) for width in (64, 256)}
+    products = {width: measure_matmul(device, width, SECONDS) for width in (64, 256)}
     reads = {name: measure_gather(device, rows, SECONDS) for name, rows in TABLES.items()}
     copied = measure_copy(device, SECONDS)
     words = f"{count} cores at once" if device.type == "cpu" else "the GPU"
@@ -79,7 +79,7 @@ def grid_work(contracted: bool, densities: float) -> "Work":
     asked = Config(field="grid", contracted=contracted, view_dependence=True)
     config = timed(with_defaults(asked), compute_device())
     model = HashGridField(field_settings(config, sky=False), 0, reference)
-    density, colour = mlp.density_products(model.weights), mlp.colour_products(model.weights)
+    density, colour = mlp.density_flops(model.weights), mlp.colour_flops(model.weights)
     colours = SAMPLES_PER_RAY[config.space]
     rows = CORNERS * model.settings.num_levels * (densities + colours)
     adam = ADAM_BYTES * model.table.numel() / rays_per_step(config)
@@ -91,4 +91,4 @@ def paper_products(depth: int, width: int, coarse: int, fine: int) -> int:
     from nerf.fields.vanilla import VanillaNerf, VanillaSettings
 
     model = VanillaNerf(VanillaSettings(depth=depth, width=width, samples_coarse=coarse, samples_fine=fine), 0)
-    return model.settings.queries_per_ray * (model.fine.products + model.fine.products_backward)
+    return model.settings.queries_per_ray * (model.fine.products + model.fine.matmul_flops_backward)

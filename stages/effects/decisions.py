@@ -53,8 +53,8 @@ def read_decisions(folder: Path) -> Decisions:
     return read_dataclass(folder / "decisions.json", Decisions)
 
 
-def image_effects(decisions: Decisions, views: "Sequence[View]", bank: "RayDataset") -> "ImageEffects":
-    """What stands between the field and the photos ``views`` of ``bank``, in their order."""
+def image_effects(decisions: Decisions, views: "Sequence[View]", dataset: "RayDataset") -> "ImageEffects":
+    """What stands between the field and the photos ``views`` of ``dataset``, in their order."""
     import numpy as np
     import torch
 
@@ -65,8 +65,8 @@ def image_effects(decisions: Decisions, views: "Sequence[View]", bank: "RayDatas
     if not decisions.pose_refinement and decisions.exposure is None:
         return NO_EFFECTS
     poses = np.stack([view.scene_from_camera for view in views])
-    images = TrainingImages(torch.tensor(poses, dtype=torch.float32, device=bank.device), bank.viewing_distance)
-    gains = None if decisions.exposure is None else decisions.log_gain(views).to(bank.device)
+    images = TrainingImages(torch.tensor(poses, dtype=torch.float32, device=dataset.device), dataset.viewing_distance)
+    gains = None if decisions.exposure is None else decisions.log_gain(views).to(dataset.device)
     return ImageEffects(
         (PoseRefinement.initial(images),) if decisions.pose_refinement else (),
         () if gains is None else (ExposureModel.initial(images, gains),),

@@ -66,7 +66,7 @@ class PilotScene(NamedTuple):
     """What every pilot of a scene shares; make it with :func:`pilot_scene`."""
 
     scene: "Scene"
-    bank: "RayDataset"
+    dataset: "RayDataset"
     kept: "tuple[_Photo, ...]"
 
 
@@ -74,7 +74,7 @@ def pilot_scene(inputs: Inputs, scene: "Scene", progress: Progress) -> PilotScen
     """Small photos to train on and to judge by, both from the training photos; or why there can be no pilot."""
     from stages.evaluate.half_images import enough
     from stages.hardware.device import compute_device
-    from stages.train.data import ALL_MASKED, PhotoReader, guided_bank, view_mask, view_rays
+    from stages.train.data import ALL_MASKED, PhotoReader, guided_dataset, view_mask, view_rays
     from stages.train.validation_images import set_aside
 
     split = set_aside(scene, MOST_KEPT, FEWEST_FOR_INTERVAL)
@@ -84,7 +84,7 @@ def pilot_scene(inputs: Inputs, scene: "Scene", progress: Progress) -> PilotScen
     downscale = max(1.0, median(max(camera.width, camera.height) for camera in cameras) / LONG_SIDE)
     size = f"1/{downscale:.3g} of their size"
     try:
-        bank = guided_bank(inputs, split, downscale, progress).to(compute_device())
+        dataset = guided_dataset(inputs, split, downscale, progress).to(compute_device())
     except StageError as error:
         if error.code != ALL_MASKED:
             raise
@@ -102,7 +102,7 @@ def pilot_scene(inputs: Inputs, scene: "Scene", progress: Progress) -> PilotScen
     kept = tuple(photo for photo in photos if enough(photo.colours, photo.used))
     if len(kept) < FEWEST_FOR_INTERVAL:
         return f"too few training photos show enough at {size}"
-    return PilotScene(split, bank, kept)
+    return PilotScene(split, dataset, kept)
 
 
 def fits_poses(off: Decisions, on: Decisions) -> bool:
@@ -157,8 +157,8 @@ def _trained(trial: PilotScene, arm: Decisions, steps: int, seed: int) -> "HashG
     from nerf.fields.hash_grid import HashGridField
     from stages.train.fields import make_trainer
 
-    effects = image_effects(arm, trial.scene.of_split("train"), trial.bank)
-    trainer = make_trainer(_config(arm, steps, trial.bank.device.type), trial.scene, trial.bank, seed, effects)
+    effects = image_effects(arm, trial.scene.of_split("train"), trial.dataset)
+    trainer = make_trainer(_config(arm, steps, trial.dataset.device.type), trial.scene, trial.dataset, seed, effects)
     for step in range(steps):
         trainer.step(step, step / steps, 1.0)
     assert isinstance(trainer.model, HashGridField)

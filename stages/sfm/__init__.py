@@ -18,6 +18,8 @@ PUBLISHED = ("sparse", "registration.json")
 NOT_HASHED = ("max_seconds", "seconds")
 
 CameraModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE"]
+Direction = Literal["world-from-camera", "camera-from-world"]
+CameraAxes = Literal["opencv", "opengl"]
 Matcher = Literal["exhaustive", "sequential", "spatial", "retrieval"]
 MAX_STRATEGIES = 8  # the default of ``max_strategies``, which is all of them
 
@@ -28,6 +30,16 @@ class Config(StageConfig):
     cameras: OptionalSourcePath = Field(
         default=None,
         description="Poses to import: a transforms.json, a folder with transforms_train.json, or a COLMAP model.",
+    )
+    pose_direction: Direction | None = Field(
+        default=None,
+        description="What the matrices of known cameras are (default: world-from-camera in transforms files, "
+        "camera-from-world in COLMAP models).",
+    )
+    camera_axes: CameraAxes | None = Field(
+        default=None,
+        description="Where the axes of known cameras point: opencv (x right, y down, z forward) or opengl (x right, "
+        "y up, z back) (default: opengl in transforms files, opencv in COLMAP models).",
     )
     seed: int = Field(
         default=0,

@@ -200,6 +200,14 @@ def check_poses(matches: PairMatches, world_from_camera: Float[np.ndarray, "phot
     )
 
 
+def agreement(matches: PairMatches, world_from_camera: Float[np.ndarray, "photos 3 4"]) -> tuple[int, int]:
+    """How many pairs agree with poses, and how many agree with or contradict them."""
+    error = pair_medians(matches, *transfer_errors_px(matches, world_from_camera))
+    _, tolerance = _tolerance_px(error, matches.weight)
+    agreeing = int((error <= tolerance).sum())
+    return agreeing, agreeing + int(_contradicts(matches, error, tolerance).sum())
+
+
 def _tolerance_px(error_px: Float[np.ndarray, "pairs"], weight: Float[np.ndarray, "pairs"]) -> tuple[float, float]:
     """The median error of matches, and up to which one a pair agrees."""
     known = np.isfinite(error_px)

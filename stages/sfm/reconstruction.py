@@ -17,6 +17,7 @@ from stages.sfm import Config
 from stages.sfm.colmap.cameras import is_valid
 from stages.sfm.colmap.matching import Search, feature_bytes
 from stages.sfm.colmap.models import read_model
+from stages.sfm.imported.conventions import PoseConvention
 from stages.sfm.imported.poses import import_cameras
 from stages.sfm.pairs.matching_plan import Open, check_matcher, chosen
 from stages.sfm.pairs.pair_selection import places_of
@@ -64,7 +65,9 @@ def find_cameras(config: Config, ingest: Path, folder: Path, progress: Progress)
     """
     photos, matched = _photos(ingest)
     if config.cameras is not None:
-        return _registration("import", **import_cameras(config.cameras, photos, ingest, folder, progress)), ""
+        convention = PoseConvention(config.pose_direction, config.camera_axes)
+        imported = import_cameras(config.cameras, convention, photos, ingest, folder, progress)
+        return _registration("import", **imported), ""
     return _reconstruct(config, photos, matched, ingest, folder, progress)
 
 

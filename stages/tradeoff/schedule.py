@@ -20,8 +20,9 @@ from stages.hardware.device import processors
 from stages.io.amounts import resolution_name
 from stages.io.ascii_names import shell_quoted
 from stages.io.photos import load_pixels
+from stages.train import fields
 from stages.train.data import scaled_size
-from stages.train.fields import field_of, hash_grid
+from stages.train.fields import hash_grid
 from stages.train.planning import chosen_downscale, rays_per_second
 
 LONGEST_RUN = 1 / 20
@@ -349,11 +350,11 @@ def measure_speeds(scene: Scene, inputs: Inputs, seconds: float, progress: Progr
         if VARIANTS[name].family == "published":
             reduced = _planned(REDUCED, decisions.space, inputs, progress)
             rays = speeds[REDUCED].rays * _multiplications(reduced) / _multiplications(config)
-            if LONGEST_RUN * seconds * rays < VARIANTS[name].min_steps * field_of(config).rays_per_step(config):
-                speeds[name] = Speed(rays / field_of(config).rays_per_step(config), rays)
+            if LONGEST_RUN * seconds * rays < VARIANTS[name].min_steps * fields.field_of(config).rays_per_step(config):
+                speeds[name] = Speed(rays / fields.field_of(config).rays_per_step(config), rays)
                 continue
         rays = rays_per_second(config, scene, decisions)
-        speeds[name] = Speed(rays / field_of(config).rays_per_step(config), rays)
+        speeds[name] = Speed(rays / fields.field_of(config).rays_per_step(config), rays)
     return speeds
 
 

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     from nerf.geometry.scene import Camera, Scene, Split, View
 
-# Along the longer side of a picture. At 1000 pixels the bearings are then off by at most 0.002 of them for a phone's
+# Along the longer side of a picture. At 1000 pixels the directions are then off by at most 0.002 of them for a phone's
 # lens, 0.02 for an action camera's, 0.05 for a fisheye's, and a camera takes 1 MB; twice as many: a quarter, and 4 MB.
 MAX_PATCHES = 192
 MIN_LONG_SIDE = 150  # pixels of a photo: below this it shows too little to judge anything by
@@ -41,7 +41,7 @@ def scaled_size(camera: "Camera", downscale: float) -> tuple[int, int]:
 
 @lru_cache(maxsize=1)
 def camera_directions(camera: "Camera", downscale: float) -> "Tensor":
-    """The unit bearing vectors (H, W, 3) of a camera's pixel centres at a reduced size; not to be written to.
+    """The unit direction vectors (H, W, 3) of a camera's pixel centres at a reduced size; not to be written to.
 
     The last answer is kept: photos of one camera mostly follow each other.
     """
@@ -64,7 +64,7 @@ def training_dataset(ingest: Path, scene: "Scene", split: "Split", downscale: fl
     fill(store, lambda index: _decoded_pixels(ingest, scene, views[index], downscale), at_once, progress)
     used = sorted({view.camera for view in views})
 
-    def bearings(index: int) -> "Tensor":
+    def directions(index: int) -> "Tensor":
         progress.update(f"rays of camera {index + 1} of {len(used)}", index / len(used))
         return patch_bearings(scene.cameras[used[index]], downscale)
 
@@ -72,7 +72,7 @@ def training_dataset(ingest: Path, scene: "Scene", split: "Split", downscale: fl
         pixels=store.table(progress),
         sizes=[(photo.height, photo.width) for photo in store.photos],
         camera_of=[used.index(view.camera) for view in views],
-        camera_bearings=[bearings(index) for index in range(len(used))],
+        camera_directions=[directions(index) for index in range(len(used))],
         placement=PosedViews(
             poses=torch.tensor(np.stack([view.scene_from_camera for view in views]), dtype=torch.float32),
             near=torch.tensor([view.near for view in views]),
@@ -97,7 +97,7 @@ def guided_dataset(inputs: Inputs, scene: "Scene", downscale: float, progress: P
     size = np.array([scaled_size(camera, downscale) for camera in cameras]).reshape(-1, 2)[tracks.view]
     column, row = np.clip(np.floor(xy * size / full), 0, size - 1).astype(int).T
     within = torch.from_numpy(row * size[:, 0] + column)
-    return dataset.with_distances(
+    return dataset.with_sparse_depths(
         dataset.first_pixel[torch.from_numpy(tracks.view)] + within, torch.from_numpy(tracks.distance)
     )
 
@@ -119,7 +119,7 @@ def _masked(dataset: RayDataset, ignored: "Iterable[Tensor | None]", split: "Spl
     except ValueError as error:
         why = f"{error} of the {split} photos at this size"
         raise StageError(ALL_MASKED, "nothing is left to train on", why, "Give a smaller --train.downscale.") from error
-    progress.note(f"masks leave {dataset.drawable / len(dataset.pixels):.0%} of the pixels of the {split} photos")
+    progress.note(f"masks leave {dataset.unmasked_count / len(dataset.pixels):.0%} of the pixels of the {split} photos")
     return dataset
 
 

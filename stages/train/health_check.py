@@ -25,14 +25,14 @@ def symptom_of(trainer: FieldTrainer, probe: Probe) -> str | None:
         return f"it shows what is no number: {error}"
     if not seen.opacity >= EMPTY_OPACITY:  # nor is what is no number
         return f"it is empty (mean opacity {seen.opacity:.0e})"
-    if not seen.psnr > probe.flat_psnr:
-        return f"it is no better than a flat colour ({seen.psnr:.1f} of {probe.flat_psnr:.1f} dB)"
+    if not seen.psnr > probe.mean_colour_psnr:
+        return f"it is no better than a flat colour ({seen.psnr:.1f} of {probe.mean_colour_psnr:.1f} dB)"
     return None
 
 
 def is_suspicious(batch_psnr: float, probe: Probe) -> bool:
     """Whether batches as bad as this ask for :func:`symptom_of`."""
-    return not batch_psnr > probe.flat_psnr + SUSPICIOUS_DB
+    return not batch_psnr > probe.mean_colour_psnr + SUSPICIOUS_DB
 
 
 def not_finite(trainer: FieldTrainer) -> str | None:

@@ -25,7 +25,7 @@ from stages.ingest.decoding import DecodeError, decode
 from stages.io.field_files import load_field
 from stages.io.files import read_scene
 from stages.train import loop as training_loop
-from stages.train.data import training_bank
+from stages.train.data import training_dataset
 from stages.train.health_check import symptom_of
 from tests.stages.photo_scene import photographed
 
@@ -70,9 +70,9 @@ def trained(kind: str, inputs: dict[str, Path], folder: Path, progress: Any, **s
 
 def seen(folder: Path, inputs: dict[str, Path], progress: Any) -> tuple[float, float]:
     """PSNR of the field in ``folder`` on training photos, and that of a flat colour."""
-    bank = training_bank(inputs["ingest"], read_scene(inputs["normalise"]), "train", 1.0, progress)
-    probe = make_probe(bank, 512, torch.ones(3), 0)
-    return measure(load_field(folder)[0], probe).psnr, probe.flat_psnr
+    dataset = training_dataset(inputs["ingest"], read_scene(inputs["normalise"]), "train", 1.0, progress)
+    probe = make_probe(dataset, 512, torch.ones(3), 0)
+    return measure(load_field(folder)[0], probe).psnr, probe.mean_colour_psnr
 
 
 @pytest.mark.parametrize("steps", [WARM_UP - 20, WARM_UP + 20])
@@ -133,7 +133,7 @@ def test_weights_that_the_last_update_broke_are_never_kept(
     assert weights_are_finite(tmp_path / "train")
 
 
-# Of the bank: near and far, the cameras' places, their rotations; and how bearings change from pixel to pixel.
+# Of the dataset: near and far, the cameras' places, their rotations; and how bearings change from pixel to pixel.
 ROWS = {"near": ("geometry", 12), "far": ("geometry", 13), "centres": ("geometry", 9), "rotations": ("geometry", 4)}
 ROWS["bearings"] = ("patches", 1)
 
@@ -150,11 +150,11 @@ def test_rays_that_are_no_numbers_end_training_by_name(
     progress: Any,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def poisoned(bank: RayDataset) -> None:
+    def poisoned(dataset: RayDataset) -> None:
         table, number = ROWS[row]
-        getattr(bank, table)[number, ::2] = poison
+        getattr(dataset, table)[number, ::2] = poison
 
-    spoil_at(5, lambda trainer: poisoned(trainer.bank), monkeypatch, kind)
+    spoil_at(5, lambda trainer: poisoned(trainer.dataset), monkeypatch, kind)
     with pytest.raises(StageError) as failure:
         trained(kind, inputs, tmp_path / "train", progress, steps=10)
     assert failure.value.what == "training diverged"
@@ -224,9 +224,9 @@ def _checkpoint_of_another(
 
 def test_no_number_is_a_symptom(inputs: dict[str, Path], progress: Any) -> None:
     """Comparisons with NaN are false: neither empty nor worse than a flat colour would be said of it."""
-    bank = training_bank(inputs["ingest"], read_scene(inputs["normalise"]), "train", 1.0, progress)
-    trainer = train_loop_trainer(inputs, bank)
-    probe = make_probe(bank, 64, torch.ones(3), 0)
+    dataset = training_dataset(inputs["ingest"], read_scene(inputs["normalise"]), "train", 1.0, progress)
+    trainer = train_loop_trainer(inputs, dataset)
+    probe = make_probe(dataset, 64, torch.ones(3), 0)
     trainer.model.colour_out[:] = float("nan")
     assert symptom_of(trainer, probe) == "its model.colour_out is not finite"
     trainer.model.colour_out[:] = 3e38
@@ -235,13 +235,13 @@ def test_no_number_is_a_symptom(inputs: dict[str, Path], progress: Any) -> None:
     assert symptom is None or "no number" in symptom or "flat colour" in symptom
 
 
-def train_loop_trainer(inputs: dict[str, Path], bank: RayDataset) -> HashGridTrainer:
+def train_loop_trainer(inputs: dict[str, Path], dataset: RayDataset) -> HashGridTrainer:
     from stages.train.fields import make_trainer, with_defaults
 
     settings: dict[str, Any] = {"downscale": 1.0, "steps": 1, "chunks": 1} | GRID | KINDS["torch"]
     asked = train.Config(**settings)
     config = with_defaults(asked.model_copy(update={"contracted": False, "view_dependence": True}))
-    trainer = make_trainer(config, read_scene(inputs["normalise"]), bank, 0)
+    trainer = make_trainer(config, read_scene(inputs["normalise"]), dataset, 0)
     assert isinstance(trainer, HashGridTrainer)
     return trainer
 
@@ -306,7 +306,7 @@ def spoil_once_at(step: int, spoil: Callable[[Any], None], monkeypatch: pytest.M
 def with_effects(monkeypatch: pytest.MonkeyPatch, what: str) -> None:
     """Train with poses or gains of photos, whatever the effects say."""
 
-    def effects(decisions: Any, views: Any, bank: Any) -> ImageEffects:
+    def effects(decisions: Any, views: Any, dataset: Any) -> ImageEffects:
         centres = torch.tensor(np.stack([view.scene_from_camera[:, 3] for view in views]), dtype=torch.float32)
         if what == "poses":
             return ImageEffects((PoseRefinement(centres),))

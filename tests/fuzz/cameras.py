@@ -60,9 +60,10 @@ def _import_cameras(cameras: Path, photos: list, folder: Path) -> None:
     from nerf.geometry.normalisation import normalise
     from stages.normalise import _reconstruction
     from stages.sfm.colmap.models import read_model
+    from stages.sfm.imported.conventions import AS_DECLARED
     from stages.sfm.imported.poses import write_known_model
 
-    write_known_model(cameras, photos, folder, folder / "sfm", Quiet())
+    write_known_model(cameras, AS_DECLARED, photos, folder, folder / "sfm", Quiet())
     model = read_model(folder / "sfm" / "sparse")
     try:
         found = normalise(_reconstruction(model, list(range(len(model.images))), None), None)

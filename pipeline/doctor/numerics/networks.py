@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from nerf.fields import background, mlp
-from nerf.fields.mlp import DIRECTION, GEOMETRY, LARGEST_LOG_DENSITY, DensityPass, Weights
+from nerf.fields.mlp import DIRECTION, GEOMETRY, MAX_LOG_DENSITY, DensityPass, Weights
 from nerf.fields.vanilla import SOFTPLUS_SHIFT, shifted_softplus
 from nerf.kernels import Backend, GridLayout, Samples, grid_layout
 from nerf.kernels.torch.adam import BETA1, BETA2, EPSILON
@@ -317,7 +317,7 @@ CASES = [
         typical=lambda: (uniform(1, -15, 15, 512, 1),),
         extreme=lambda: (LOGARITHMS,),
         function=_sigma,
-        reference=lambda x: torch.exp(torch.where(x <= LARGEST_LOG_DENSITY, x, LARGEST_LOG_DENSITY)),
+        reference=lambda x: torch.exp(torch.where(x <= MAX_LOG_DENSITY, x, MAX_LOG_DENSITY)),
         backward=_sigma_backward,
         value=Bound(3e-7, "itself"),
         gradient=Bound(5e-7, "itself"),

@@ -10,6 +10,10 @@ Image ids are 1 + the photo's place in order of ``file``; an image, its frame an
 import signal
 import threading
 
+# Before pycolmap, whose wheel brings a zlib of its own: loaded first, it makes Pillow's PNG encoder hang or abort
+# (pycolmap 4.2.1, Pillow 13).
+import PIL.Image  # noqa: F401
+
 
 def load() -> None:
     """Import pycolmap, and take back the handler that it installs: it would turn SIGTERM into a crash report."""

@@ -1,8 +1,9 @@
 """Cameras that are known already: transforms.json, Blender's transforms_train/test.json, or a COLMAP model.
 
-Poses in transforms files are world_from_camera with OpenGL axes (x right, y up, z backward); they are turned to OpenCV
-axes here and nowhere else. Photos are told apart by their own names, as ingest noted them. Cameras of photos as their
-files store them are turned upright as ingest turned the photos.
+Poses in transforms files are world_from_camera with OpenGL axes (x right, y up, z backward), in COLMAP models
+camera_from_world with OpenCV axes, unless the user says otherwise; here they become world_from_camera with OpenCV axes.
+Photos are told apart by their own names, as ingest noted them. Cameras of photos as their files store them are turned
+upright as ingest turned the photos.
 """
 
 import os
@@ -22,11 +23,18 @@ from stages.contract import StageError
 from stages.ingest.sources import account_of_ours
 from stages.io.photos import Photo
 from stages.io.sparse_model import SparseModel
-from stages.io.transforms_export import OPENGL_FROM_OPENCV
 from stages.io.transforms_files import MOST_LETTERS, TRAIN, none_among_the_photos, pose_matrix, read_splits
 from stages.io.transforms_intrinsics import contradictions, intrinsics_of, read_intrinsics
 from stages.sfm.colmap.model_files import FARTHEST
 from stages.sfm.colmap.models import read_model
+from stages.sfm.imported.conventions import (
+    AS_DECLARED,
+    OF_COLMAP,
+    OF_TRANSFORMS,
+    PoseConvention,
+    inverse,
+    world_from_camera,
+)
 from stages.sfm.imported.orientation import fits_only_upright, pixel_map, stored_size
 from stages.sfm.imported.posed_photos import HINT, PosedPhoto, distinct, posed_photo, unusable, without_rays
 
@@ -72,21 +80,30 @@ class _Framed(NamedTuple):
     values: Mapping[str, Any]  # of the frame, and of its file what the frame has none of
 
 
-def read_known_cameras(cameras: Path, photos: Sequence[Photo], frames: Mapping[str, str]) -> KnownCameras:
+def read_known_cameras(
+    cameras: Path, photos: Sequence[Photo], frames: Mapping[str, str], convention: PoseConvention = AS_DECLARED
+) -> KnownCameras:
     """Read ``cameras`` and match them to ``photos``. ``frames`` maps a transforms file's file_path to a photo's name.
 
     Raises StageError, naming the frame, for anything that is no camera: numbers that are not finite, a focal length
     that is not positive, a rotation that is scaled or mirrored; and where no frame has a photo.
     """
-    if cameras.is_file() or (cameras / TRAIN).is_file():
-        return _from_transforms(cameras, photos, frames)
-    return _from_colmap(cameras, photos)
+    if is_transforms(cameras):
+        return _from_transforms(cameras, photos, frames, convention.with_defaults(OF_TRANSFORMS))
+    return _from_colmap(cameras, photos, convention.with_defaults(OF_COLMAP))
+
+
+def is_transforms(cameras: Path) -> bool:
+    """Whether cameras stand in a transforms file, or a Blender-style folder of them, and not in a COLMAP model."""
+    return cameras.is_file() or (cameras / TRAIN).is_file()
 
 
 # --- transforms files
 
 
-def _from_transforms(cameras: Path, photos: Sequence[Photo], frames: Mapping[str, str]) -> KnownCameras:
+def _from_transforms(
+    cameras: Path, photos: Sequence[Photo], frames: Mapping[str, str], convention: PoseConvention
+) -> KnownCameras:
     by_name = {photo.name: photo for photo in photos}
     framed: dict[str, _Framed] = {}
     absent, repeated, test_files, approximate = [], [], [], 0
@@ -124,7 +141,7 @@ def _from_transforms(cameras: Path, photos: Sequence[Photo], frames: Mapping[str
         raise _nothing_matches(splits[0][0], absent, photos)
     notes += _contradictions([content for _, content in splits], framed)
     upright = _are_of_upright_photos(framed.values())
-    posed, rotations = zip(*(_from_frame(framed[file], upright) for file in sorted(framed)), strict=True)
+    posed, rotations = zip(*(_from_frame(framed[file], upright, convention) for file in sorted(framed)), strict=True)
     notes += _rounded_or_scaled({one.name: rotation for one, rotation in zip(posed, rotations, strict=True)})
     left_out = without_rays(posed)
     kept = [one for one in posed if one.file not in left_out]
@@ -229,14 +246,15 @@ class _Rotation(NamedTuple):
     stretch_deg: float
 
 
-def _from_frame(framed: _Framed, upright: bool) -> tuple[PosedPhoto, _Rotation]:
+def _from_frame(framed: _Framed, upright: bool, convention: PoseConvention) -> tuple[PosedPhoto, _Rotation]:
     name = framed.frame["file_path"]
-    pose, rotation = _pose(framed.frame["transform_matrix"], name)
+    matrix, rotation = _rigid(framed.frame["transform_matrix"], name)
+    pose = world_from_camera(matrix, convention)
     return posed_photo(framed.photo, name, _given_camera(framed, upright), pose, upright), rotation
 
 
-def _pose(matrix: Any, name: str) -> tuple[Float[np.ndarray, "3 4"], _Rotation]:
-    """world_from_camera with OpenCV axes, from a matrix as written in a transforms file."""
+def _rigid(matrix: Any, name: str) -> tuple[Float[np.ndarray, "3 4"], _Rotation]:
+    """A matrix as written in a transforms file with the rotation that is nearest to it."""
     try:
         pose = pose_matrix(matrix)
     except ValueError as error:
@@ -260,7 +278,7 @@ def _pose(matrix: Any, name: str) -> tuple[Float[np.ndarray, "3 4"], _Rotation]:
             f"it is no rotation: its axes are off by {rotation.stretch_deg:.2g}°, and it scales by {rotation.scale:.4g}"
         )
         raise unusable("sfm.pose-no-rotation", f"the transform_matrix of frame {name!r}", why)
-    return np.concatenate([rotation.matrix @ OPENGL_FROM_OPENCV, pose[:, 3:]], axis=1), rotation
+    return np.concatenate([rotation.matrix, pose[:, 3:]], axis=1), rotation
 
 
 def _nearest_rotation(matrix: Float[np.ndarray, "3 3"]) -> _Rotation:
@@ -286,7 +304,7 @@ def _rounded_or_scaled(rotations: Mapping[str, _Rotation]) -> list[str]:
 # --- COLMAP models
 
 
-def _from_colmap(folder: Path, photos: Sequence[Photo]) -> KnownCameras:
+def _from_colmap(folder: Path, photos: Sequence[Photo], convention: PoseConvention) -> KnownCameras:
     given = _with_slashes(read_model(folder), photos)
     photo_of = _by_name([image.file for image in given.images], photos)
     if not photo_of:
@@ -295,7 +313,10 @@ def _from_colmap(folder: Path, photos: Sequence[Photo]) -> KnownCameras:
     posed = {}
     for i in sorted(photo_of, key=lambda i: photo_of[i].image_name):
         image = given.images[i]
-        posed[i] = posed_photo(photo_of[i], image.file, given.cameras[image.camera], image.sfm_from_camera, upright)
+        pose = image.sfm_from_camera
+        if convention != OF_COLMAP:
+            pose = world_from_camera(inverse(pose), convention)
+        posed[i] = posed_photo(photo_of[i], image.file, given.cameras[image.camera], pose, upright)
     left_out = without_rays(posed.values())
     kept = {i: one for i, one in posed.items() if one.file not in left_out}
     pixel_maps = [

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
-from stages.sfm.pairs.pair_selection import Pairs, closeness, nearest
+from stages.sfm.pairs.pair_selection import Pairs, closeness, nearest, union
 from stages.sfm.worker_process import environment
 
 if TYPE_CHECKING:
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 COMMAND = ["-P", "-m", "stages.sfm.imported.pose_check"]
 MAX_IMAGE_SIZE, MAX_FEATURES = 1000, 2000  # enough to tell a step of a few pixels, in seconds for hundreds of photos
 PARTNERS = 6  # of each photo
+NEXT = 2  # places before and after it, in the order of names
 TURN_DEG = 30.0  # two photos whose axes differ by so much count as far apart as two whose centres are usual neighbours
 MIN_PAIRS = 3  # verified pairs, for there to be any evidence
 
@@ -34,7 +35,8 @@ MIN_PAIRS = 3  # verified pairs, for there to be any evidence
 def check_given_cameras(photos: "Sequence[Photo]", images: Path, folder: Path) -> dict[str, Any]:
     """Check the model in ``folder/sparse``, whose images are these photos in order of ``file``.
 
-    Returns what :func:`stages.sfm.colmap.repair.facts` says, or {"failed": why} where nothing could be compared. The
+    Returns what :func:`stages.sfm.colmap.repair.facts` says, with the ``fit`` of another convention where the poses
+    contradict their photos and it does not, or {"failed": why} where nothing could be compared. The
     model stays as it is.
     """
     job = {"photos": [asdict(photo) for photo in photos], "images": str(images.absolute()), "folder": str(folder)}
@@ -63,7 +65,7 @@ def main() -> None:
 
 
 def check(photos: list[dict[str, Any]], images: str, folder: str) -> dict[str, Any]:
-    """Match neighbours by pose and let their matches judge the poses."""
+    """Match neighbours by pose and by name, and let their matches judge the poses."""
     from stages.ingest.masks import write_feature_masks
     from stages.io.photos import Photo
     from stages.sfm.colmap.mapping import MAPPING_MODEL
@@ -77,7 +79,8 @@ def check(photos: list[dict[str, Any]], images: str, folder: str) -> dict[str, A
     )
     from stages.sfm.colmap.models import load_native
     from stages.sfm.colmap.repair import camera_poses, check_model, facts
-    from stages.sfm.pairs.match_graph import MIN_INLIERS
+    from stages.sfm.imported.conventions import best_fit
+    from stages.sfm.pairs.match_graph import MIN_INLIERS, natural_order, pairs_apart
 
     some, scratch = [Photo(**photo) for photo in photos], Path(folder, "check")
     scratch.mkdir(exist_ok=True)
@@ -88,14 +91,18 @@ def check(photos: list[dict[str, Any]], images: str, folder: str) -> dict[str, A
     if write_feature_masks(Path(images).parent, some, masks):
         search = search._replace(masks=masks)
     extract_features(database, Path(images), some, search)
-    pairs = neighbours_by_pose(camera_poses(model))
+    poses = camera_poses(model)
+    by_name = natural_order([photo.name for photo in some])  # where poses are wrong, so are their neighbours
+    pairs = union(neighbours_by_pose(poses), pairs_apart(by_name, 1, NEXT))
     match_pairs(database, pairs, 0, STRICT_RATIO)
     verified = int((verified_matches(database, pairs) >= MIN_INLIERS).sum())
     checked = check_model(model, database, 0) if verified >= MIN_PAIRS else None
     shutil.rmtree(scratch)
     if checked is None:
         return {"failed": f"only {verified} pairs of neighbouring photos share enough features"}
-    return facts(model, checked)
+    found = facts(model, checked)
+    fit = best_fit(checked.matches, poses) if 2 * found["agreeing"] < found["pairs"] else None
+    return found | {"fit": fit._asdict() if fit else None}
 
 
 def neighbours_by_pose(world_from_camera: Float[np.ndarray, "photos 3 4"]) -> Pairs:

@@ -11,21 +11,35 @@ from stages.contract import Progress, StageError, listed
 from stages.io.photos import Photo, read_frame_names
 from stages.io.sparse_model import SparseModel
 from stages.sfm.colmap.models import read_model, write_model
-from stages.sfm.imported.known_cameras import KnownCameras, read_known_cameras
+from stages.sfm.imported.conventions import (
+    OF_COLMAP,
+    OF_TRANSFORMS,
+    Fit,
+    PoseConvention,
+    axes_in_words,
+    found_convention,
+    named_axes,
+)
+from stages.sfm.imported.known_cameras import KnownCameras, is_transforms, read_known_cameras
 from stages.sfm.imported.pose_check import check_given_cameras
 
 MOST_NAMES = 5
 
 
 def import_cameras(
-    cameras: Path, photos: Sequence[Photo], ingest: Path, folder: Path, progress: Progress
+    cameras: Path, convention: PoseConvention, photos: Sequence[Photo], ingest: Path, folder: Path, progress: Progress
 ) -> dict[str, Any]:
     """Write ``sparse/`` from known cameras, and check them against the photos: what registration.json says of them.
 
-    Raises StageError where they cannot be used.
+    Raises StageError where they cannot be used, and where their photos show that they are of another convention.
     """
-    known, errors = write_known_model(cameras, photos, ingest, folder, progress)
+    known, errors = write_known_model(cameras, convention, photos, ingest, folder, progress)
     check = _check_given(known.model, photos, ingest, folder, progress)
+    if check and (fit := check.pop("fit")):
+        of_format = OF_TRANSFORMS if is_transforms(cameras) else OF_COLMAP
+        raise _another_convention(cameras.name, check, Fit(**fit), convention.with_defaults(of_format))
+    if check:
+        _note_doubts(check, known.model, photos, progress)
     judged = check.pop("images", {}) if check else {}
     unknown = {"agreement": None, "transfer_px": None}
     return {
@@ -47,11 +61,11 @@ def import_cameras(
 
 
 def write_known_model(
-    cameras: Path, photos: Sequence[Photo], ingest: Path, folder: Path, progress: Progress
+    cameras: Path, convention: PoseConvention, photos: Sequence[Photo], ingest: Path, folder: Path, progress: Progress
 ) -> tuple[KnownCameras, Float[np.ndarray, "points"]]:
     """Read the cameras and write ``sparse/``; also the reprojection errors of its points, in pixels."""
     progress.update(f"reading the cameras of {cameras.name}")
-    known = read_known_cameras(cameras, photos, read_frame_names(ingest))
+    known = read_known_cameras(cameras, photos, read_frame_names(ingest), convention)
     for note in known.notes:
         progress.note(note)
     write_model(folder / "sparse", known.model)
@@ -66,6 +80,22 @@ def write_known_model(
     return known, errors
 
 
+def _another_convention(name: str, check: dict[str, Any], fit: Fit, read_as: PoseConvention) -> StageError:
+    """The error for poses that agree with their photos under another convention than they were read with."""
+    direction, axes = found_convention(fit, read_as)
+    known = named_axes(axes)
+    how = f"as {direction.replace('-', ' ')}, its cameras with {axes_in_words(axes)}"
+    say_so = f"--sfm.pose-direction {direction} --sfm.camera-axes {known}"
+    return StageError(
+        "sfm.other-pose-convention",
+        f"the poses of {name} contradict their photos",
+        f"{check['agreeing']} of {check['pairs']} verified pairs of photos agree with them; read {how}, "
+        f"{fit.agreeing} of {fit.pairs} do",
+        f"If that is how they are meant, add {say_so}." if known else
+        "Turn the cameras' axes to x right, y down, z forward and add --sfm.camera-axes opencv, or leave out the file.",
+    )  # fmt: skip
+
+
 def _check_given(
     model: SparseModel, photos: Sequence[Photo], ingest: Path, folder: Path, progress: Progress
 ) -> dict[str, Any] | None:
@@ -76,15 +106,19 @@ def _check_given(
     if why := check.get("failed"):
         progress.note(f"the given cameras could not be checked: {why}")
         return None
+    return check
+
+
+def _note_doubts(check: dict[str, Any], model: SparseModel, photos: Sequence[Photo], progress: Progress) -> None:
+    """Say so where photos contradict their given cameras."""
     if 2 * check["agreeing"] < check["pairs"]:
         progress.note(
             f"the given cameras contradict their photos: {check['agreeing']} of {check['pairs']} verified pairs agree "
-            "with them. Check that poses are world from camera and which way their axes point, or leave out --cameras"
+            "with them, and more do under no other convention. Check what they are of, or leave out --cameras"
         )
     elif check["doubtful"]:
         names = {photo.image_name: photo.name for photo in photos}
         who = listed([names[file] for file in check["doubtful"]], MOST_NAMES)
         progress.note(
-            f"{len(check['doubtful'])} of {len(posed)} given cameras contradict what their photos show: {who}"
+            f"{len(check['doubtful'])} of {len(model.images)} given cameras contradict what their photos show: {who}"
         )
-    return check

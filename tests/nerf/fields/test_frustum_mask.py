@@ -17,7 +17,7 @@ from nerf.kernels import torch as reference
 from nerf.kernels.torch.marching import unit_coordinates
 from nerf.kernels.torch.occupancy import cell_corners, cell_numbers, grown, is_occupied
 from nerf.training.hash_grid_trainer import HashGridTrainer, HashGridTrainerSettings
-from nerf.training.ray_dataset import RayDataset, build_ray_bank
+from nerf.training.ray_dataset import RayDataset, ray_dataset_from_images
 
 SIZE, HALF = 12, 0.5  # pixels of a photo, and half its width at a distance of one
 NEAR, FAR = 1.0, 40.0
@@ -33,7 +33,7 @@ FIELD = HashGridSettings(
 TRAINER = HashGridTrainerSettings(seed=3, background=(0.0, 0.0, 0.0), samples=1024, least_photos=3)
 
 
-def bank(count: int = 4, half: float = HALF) -> RayDataset:
+def dataset(count: int = 4, half: float = HALF) -> RayDataset:
     """Photos from 2.5 units away, a fifth of the circle apart, that all look at the origin."""
     grid = 2 * half * ((torch.arange(SIZE) + 0.5) / SIZE - 0.5)
     y, x = torch.meshgrid(grid, grid, indexing="ij")
@@ -46,12 +46,12 @@ def bank(count: int = 4, half: float = HALF) -> RayDataset:
         poses.append(torch.cat([rotation, -2.5 * forward[:, None]], 1))
     photo = torch.randint(0, 256, (SIZE, SIZE, 3), generator=torch.Generator().manual_seed(0)).to(torch.uint8)
     near, far = torch.full((count,), NEAR), torch.full((count,), FAR)
-    return build_ray_bank([photo] * count, [0] * count, [bearings], torch.stack(poses), near, far)
+    return ray_dataset_from_images([photo] * count, [0] * count, [bearings], torch.stack(poses), near, far)
 
 
 def knowing(views: RayDataset) -> RayDataset:
     """With a sparse point: the rule holds where some are known."""
-    return views.with_distances(torch.tensor([5]), torch.tensor([2.5]))
+    return views.with_sparse_depths(torch.tensor([5]), torch.tensor([2.5]))
 
 
 def middles(cells: int) -> torch.Tensor:
@@ -74,7 +74,7 @@ def projected(views: RayDataset, points: torch.Tensor, near: float, half: float)
 @pytest.mark.parametrize("half", [0.15, 0.5, 1.3])
 @pytest.mark.parametrize("least", [1, 2, 3, 4])
 def test_a_cell_is_usable_where_enough_photos_look_or_one_from_its_foreground_on(half: float, least: int) -> None:
-    views = bank(half=half)
+    views = dataset(half=half)
     usable, points = compute_frustum_mask(views, least, 64), middles(64)
     photos = projected(views, points, NEAR, half)
     wanted = (photos >= least) | (projected(views, points, NEAR / NEAR_MARGIN, half) > 0)
@@ -95,7 +95,7 @@ def test_photos_that_look_together_find_what_each_finds_after_the_other(monkeypa
         for count, together in ((1, 1), (2, 2), (2, 16)):
             torch.set_num_threads(count)
             monkeypatch.setattr(visibility, "TOGETHER", together)
-            found.append(compute_frustum_mask(bank(5, 0.15), 3, 64))
+            found.append(compute_frustum_mask(dataset(5, 0.15), 3, 64))
     finally:
         torch.set_num_threads(threads)
     assert 0 < found[0].float().mean() < 1
@@ -111,26 +111,26 @@ def test_all_trainers_of_a_bank_ask_once(monkeypatch: pytest.MonkeyPatch) -> Non
 
     own = visibility._looked_at
     monkeypatch.setattr(visibility, "_looked_at", looked_at)
-    views = knowing(bank())
+    views = knowing(dataset())
     fields = [HashGridField(FIELD, seed, reference) for seed in (0, 1)]
     for field in fields:
         HashGridTrainer(field, views, TRAINER)
     assert asked == [0, 1, 2, 3] and torch.equal(fields[0].occupancy_bits, fields[1].occupancy_bits)
-    compute_frustum_mask(bank(), 3, 16)
+    compute_frustum_mask(dataset(), 3, 16)
     compute_frustum_mask(views, 2, 16)
-    assert len(asked) == 12, "another bank, and another question"
+    assert len(asked) == 12, "another dataset, and another question"
 
 
 def test_what_one_photo_sees_alone_before_its_foreground_is_left_empty() -> None:
     along = torch.tensor([[2.5 - t, 0.0, 0.0] for t in (-3.0, 0.4, 1.2, 1.7, 2.5, 20.0)])
-    usable = compute_frustum_mask(bank(2), 2, 64)
+    usable = compute_frustum_mask(dataset(2), 2, 64)
     numbers = cell_numbers(64, unit_coordinates(along, True)).long()
     assert usable[numbers].tolist() == [False, False, False, True, True, True]
 
 
 def test_nothing_is_ever_sampled_elsewhere_nor_found_there() -> None:
     field = HashGridField(FIELD, 0, reference)
-    views = knowing(bank(4, 0.15))
+    views = knowing(dataset(4, 0.15))
     trainer = HashGridTrainer(field, views, TRAINER)
     usable = compute_frustum_mask(views, 3, 16)
     assert 0.02 < usable.float().mean() < 0.98
@@ -145,7 +145,12 @@ def test_nothing_is_ever_sampled_elsewhere_nor_found_there() -> None:
 
 @pytest.mark.parametrize(
     ("views", "contracted", "least"),
-    [(knowing(bank(2)), True, 3), (bank(), True, 3), (knowing(bank()), False, 3), (knowing(bank()), True, 1)],
+    [
+        (knowing(dataset(2)), True, 3),
+        (dataset(), True, 3),
+        (knowing(dataset()), False, 3),
+        (knowing(dataset()), True, 1),
+    ],
     ids=["two photos", "no points", "a box", "one is enough"],
 )
 def test_where_the_rule_says_nothing_all_of_space_is_used(views: RayDataset, contracted: bool, least: int) -> None:

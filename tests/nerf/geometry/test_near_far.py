@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from nerf.geometry.near_far import LEAST_NEAR, near_and_far_between_views
+from nerf.geometry.near_far import MIN_NEAR, near_and_far_between_views
 
 PHOTOS = np.array([[0.0, 0, -2.5], [0.5, 0, -2.5], [-0.5, 0, -2.5], [0, 0, 9.0]])
 NEAR, FAR = np.array([1.0, 1.1, 1.2, 0.1]), np.array([20.0, 30.0, 25.0, 90.0])
@@ -27,7 +27,7 @@ def test_a_step_aside_or_back_brings_nothing_nearer() -> None:
 
 def test_what_photos_have_before_them_is_nearer_from_further_ahead() -> None:
     assert ranges((0.0, 0, -2.1))[0] == pytest.approx(0.6)
-    assert ranges((0.0, 0, -1.0))[0] == LEAST_NEAR
+    assert ranges((0.0, 0, -1.0))[0] == MIN_NEAR
 
 
 def test_where_photos_see_nearer_than_usual_so_do_cameras_between_them() -> None:

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nerf.geometry.camera_paths import nearest_rotations
-from nerf.geometry.near_far import LEAST_NEAR
+from nerf.geometry.near_far import MIN_NEAR
 from nerf.geometry.normalisation import Normalisation, normalise
 from nerf.geometry.reconstruction import Reconstruction, angles_deg, extent
 from nerf.geometry.region_of_interest import find_layout
@@ -188,7 +188,7 @@ def test_in_a_scene_that_is_large_beside_its_distances_near_lies_before_what_pho
     own = (with_mast.view == 0) & (with_mast.point >= len(scene.points))
     found = normalise(dataclasses.replace(with_mast, view=with_mast.view[~own], point=with_mast.point[~own]), None)
     distance = found.scene_from_sfm.scale * scene.distances()
-    assert distance.max() < LEAST_NEAR
+    assert distance.max() < MIN_NEAR
     assert (found.near[scene.view] < distance).mean() > 0.999
 
 

@@ -5,14 +5,14 @@ import torch
 
 from nerf.runtime import machine_rates
 from nerf.runtime.machine_rates import Rates, measure_rates
-from nerf.runtime.profiler import Stopwatch, Work
+from nerf.runtime.profiler import Profiler, Work
 
 CPU = torch.device("cpu")
 
 
 def test_rates_are_those_of_a_computer_and_no_random_state_changes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(machine_rates, "STREAMED", 1 << 18)
-    monkeypatch.setattr(machine_rates, "LEAST_STREAMED", 1 << 16)
+    monkeypatch.setattr(machine_rates, "MIN_STREAMED", 1 << 16)
     monkeypatch.setattr(machine_rates, "GATHERED", 1 << 12)
     before = torch.get_rng_state()
     rates = measure_rates(CPU, width=16, rows=1 << 10, seconds=0.05)
@@ -24,7 +24,7 @@ def test_rates_are_those_of_a_computer_and_no_random_state_changes(monkeypatch: 
 def test_a_clock_that_moves_in_long_steps_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(machine_rates, "GATHERED", 1 << 12)
     rate = machine_rates.measure_gather(CPU, 1 << 10, 0.2)
-    monkeypatch.setattr(Stopwatch, "now", lambda _: time.thread_time() // 0.016 * 0.016)  # as on Windows
+    monkeypatch.setattr(Profiler, "now", lambda _: time.thread_time() // 0.016 * 0.016)  # as on Windows
     assert 1 / 4 < machine_rates.measure_gather(CPU, 1 << 10, 0.2) / rate < 4
 
 

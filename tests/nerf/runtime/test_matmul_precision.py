@@ -6,14 +6,20 @@ import pytest
 import torch
 
 from nerf.runtime import matmul_precision as product_precision
-from nerf.runtime.matmul_precision import MOST_ERROR, Medium, error_of, medium_matmul, use_matmul_precision
+from nerf.runtime.matmul_precision import (
+    MAX_MATMUL_ERROR,
+    Medium,
+    error_of,
+    measure_medium_matmul,
+    use_matmul_precision,
+)
 
 CPU = torch.device("cpu")
 
 
 @pytest.fixture(autouse=True)
 def nothing_is_known() -> None:
-    medium_matmul.cache_clear()
+    measure_medium_matmul.cache_clear()
 
 
 def rounded(values: torch.Tensor, bits: int) -> torch.Tensor:
@@ -50,23 +56,23 @@ def test_the_fastest_of_several_counts(seconds: dict[str, float], speedup: float
 
     monkeypatch.setattr(product_precision, "TRIED_SECONDS", 0.0)
     monkeypatch.setattr(product_precision, "seconds_of_product", made_up)
-    found = medium_matmul(CPU, 64)
+    found = measure_medium_matmul(CPU, 64)
     assert found.speedup == speedup and 0 <= found.error < 0.1
     assert asked == [("highest", 8192, 64, 64, 64), ("medium", 8192, 64, 64, 64)] * 3
-    assert medium_matmul(CPU, 64) is found and len(asked) == 6, "once is enough"
+    assert measure_medium_matmul(CPU, 64) is found and len(asked) == 6, "once is enough"
 
 
 @pytest.mark.parametrize("width, rows", [(2, 8192), (64, 8192), (128, 2048), (256, 512), (1024, 256)])
 def test_networks_of_any_width_are_as_much_work(width: int, rows: int, monkeypatch) -> None:
     tried = []
     monkeypatch.setattr(product_precision, "_fastest", lambda a, b: tried.append(a) or {"highest": 1.0, "medium": 1.0})
-    medium_matmul(CPU, width)
+    measure_medium_matmul(CPU, width)
     assert tried[0].shape == (rows, width)
 
 
 def test_it_is_measured_here_without_touching_random_state() -> None:
     state = torch.get_rng_state()
-    found = medium_matmul(CPU, 64)
+    found = measure_medium_matmul(CPU, 64)
     assert 0.01 < found.speedup < 100 and 0 <= found.error < 0.1
     assert torch.equal(torch.get_rng_state(), state)
     assert torch.get_float32_matmul_precision() == "highest"
@@ -75,6 +81,6 @@ def test_it_is_measured_here_without_touching_random_state() -> None:
 def test_float32_is_exact_enough_and_fewer_bits_inside_are_not() -> None:
     random = torch.Generator().manual_seed(1)
     a, b = torch.randn(2048, 64, generator=random), torch.randn(64, 64, generator=random)
-    assert 0 < error_of(a @ b, a, b) < MOST_ERROR / 100
+    assert 0 < error_of(a @ b, a, b) < MAX_MATMUL_ERROR / 100
     tf32, bfloat16 = (error_of(rounded(a, bits) @ rounded(b, bits), a, b) for bits in (10, 7))
-    assert 2 * MOST_ERROR < tf32 < 1e-3 < bfloat16 < 1e-2
+    assert 2 * MAX_MATMUL_ERROR < tf32 < 1e-3 < bfloat16 < 1e-2

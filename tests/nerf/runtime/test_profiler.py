@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from nerf.runtime.parallel import in_order
-from nerf.runtime.profiler import REST, UNTIMED, Spent, Stopwatch, Work, part, running
+from nerf.runtime.profiler import REST, UNTIMED, Profiler, Spent, Work, part, running
 
 CPU = torch.device("cpu")
 
@@ -24,7 +24,7 @@ def test_without_a_stopwatch_a_part_is_nothing() -> None:
 
 
 def test_a_part_within_another_counts_for_itself_alone() -> None:
-    stopwatch = Stopwatch(CPU)
+    stopwatch = Profiler(CPU)
     with running(stopwatch), part("outer"):
         compute(0.02)
         with part("inner"):
@@ -44,7 +44,7 @@ def test_the_parts_are_all_that_the_threads_computed() -> None:
         compute(0.005)
         return time.thread_time() - started
 
-    stopwatch = Stopwatch(CPU)
+    stopwatch = Profiler(CPU)
     torch.set_num_threads(3)
     started = time.thread_time()
     try:
@@ -60,7 +60,7 @@ def test_the_parts_are_all_that_the_threads_computed() -> None:
 
 
 def test_waiting_is_in_no_part() -> None:
-    stopwatch = Stopwatch(CPU)
+    stopwatch = Profiler(CPU)
     with running(stopwatch), part("mlp"):
         time.sleep(0.05)
     assert sum(found.seconds for found in stopwatch.parts.values()) < 0.02
@@ -71,7 +71,7 @@ def test_work_adds_up_over_threads() -> None:
         with part("gather", Work(rows=count, bytes=2)):
             pass
 
-    stopwatch = Stopwatch(CPU)
+    stopwatch = Profiler(CPU)
     with running(stopwatch), ThreadPoolExecutor(4) as pool:
         list(pool.map(work, range(100)))
     assert stopwatch.parts["gather"].work == Work(0, 4950, 200)
@@ -79,7 +79,7 @@ def test_work_adds_up_over_threads() -> None:
 
 
 def test_a_fault_ends_the_stopwatch_and_its_parts() -> None:
-    stopwatch = Stopwatch(CPU)
+    stopwatch = Profiler(CPU)
     with pytest.raises(ZeroDivisionError), running(stopwatch), part("mlp"), part("encode"):
         raise ZeroDivisionError
     assert part("mlp") is UNTIMED
@@ -87,8 +87,8 @@ def test_a_fault_ends_the_stopwatch_and_its_parts() -> None:
 
 
 def test_two_at_once_are_refused() -> None:
-    with running(Stopwatch(CPU)):
-        second = running(Stopwatch(CPU))
+    with running(Profiler(CPU)):
+        second = running(Profiler(CPU))
         with pytest.raises(RuntimeError, match="a stopwatch runs already"):
             second.__enter__()
 

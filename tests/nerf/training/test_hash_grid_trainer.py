@@ -16,10 +16,10 @@ from nerf.training.hash_grid_trainer import (
     HashGridBatch,
     HashGridTrainer,
     HashGridTrainerSettings,
-    depth_factor,
+    depth_loss_multiplier,
     lr_multiplier,
 )
-from nerf.training.ray_dataset import RayDataset, build_ray_bank
+from nerf.training.ray_dataset import RayDataset, ray_dataset_from_images
 from nerf.training.trainer import FieldTrainer, NonFinite
 from nerf.training.validation_probe import make_probe, measure
 
@@ -30,7 +30,7 @@ BACKGROUND = (0.2, 0.9, 0.5)
 TRAINER = HashGridTrainerSettings(seed=3, background="random", samples=1024)
 
 
-def small_bank(size: int = 12) -> RayDataset:
+def small_dataset(size: int = 12) -> RayDataset:
     """Two opposite views of a red disc on nothing, from 3 units away."""
     grid = (torch.arange(size) + 0.5) / size - 0.5
     y, x = torch.meshgrid(grid, grid, indexing="ij")
@@ -41,11 +41,13 @@ def small_bank(size: int = 12) -> RayDataset:
     front = torch.tensor([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, -3]])
     back = torch.tensor([[-1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 3]])
     near, far = torch.full((2,), 1.0), torch.full((2,), 5.0)
-    return build_ray_bank([photo.to(torch.uint8)] * 2, [0, 0], [bearings], torch.stack([front, back]), near, far)
+    return ray_dataset_from_images(
+        [photo.to(torch.uint8)] * 2, [0, 0], [bearings], torch.stack([front, back]), near, far
+    )
 
 
 def trainer(settings: HashGridTrainerSettings = TRAINER, field: HashGridSettings = FIELD) -> HashGridTrainer:
-    return HashGridTrainer(HashGridField(field, 0, reference), small_bank(), settings)
+    return HashGridTrainer(HashGridField(field, 0, reference), small_dataset(), settings)
 
 
 def copied(state: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -58,12 +60,12 @@ def same(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:
 
 def test_it_trains_behind_the_common_interface() -> None:
     run: FieldTrainer = trainer()
-    probe = make_probe(small_bank(), 288, torch.ones(3), seed=5)
+    probe = make_probe(small_dataset(), 288, torch.ones(3), seed=5)
     before = measure(run.model, probe).psnr
     for step in range(80):
         run.step(step, step / 80, 1.0)
     after = measure(run.model, probe).psnr
-    assert before < probe.flat_psnr < probe.flat_psnr + 5 < after < 60
+    assert before < probe.mean_colour_psnr < probe.mean_colour_psnr + 5 < after < 60
 
 
 def test_a_resumed_run_is_the_uninterrupted_one_bit_for_bit() -> None:
@@ -95,7 +97,7 @@ def test_results_do_not_depend_on_the_number_of_threads() -> None:
 
 def test_the_gradient_of_a_batch_is_the_sum_over_its_chunks() -> None:
     run = trainer(replace(TRAINER, samples=1 << 14, distortion=0.1, depth_loss=0.2, chunks=4))
-    run.bank = run.bank.with_distances(torch.tensor([78, 222]), torch.tensor([3.0, 2.5]))
+    run.dataset = run.dataset.with_sparse_depths(torch.tensor([78, 222]), torch.tensor([3.0, 2.5]))
     rays = run._rays_per_chunk()
     parts = [run._part(0, 0.25, rays, chunk) for chunk in range(4)]
     assert sum(int((part.batch.distance > 0).sum()) for part in parts) == 4 * rays // 8
@@ -130,7 +132,7 @@ def test_empty_space_is_closed_and_the_object_stays_open() -> None:
     words = torch.stack([(run.model.occupancy_bits >> bit) & 1 for bit in range(64)], -1)
     opened = words.sum() / FIELD.occupancy_resolution**3
     assert 0.02 < opened < 0.7
-    rays, _, alpha, _ = run.bank.lookup(torch.arange(len(run.bank.pixels)))
+    rays, _, alpha, _ = run.dataset.lookup(torch.arange(len(run.dataset.pixels)))
     opacity = run.model.render(rays, torch.ones(3)).opacity
     assert opacity[alpha == 1].mean() > 0.7
     assert opacity[alpha == 0].mean() < 0.1
@@ -217,27 +219,27 @@ def test_a_state_of_equal_shapes_but_other_settings_is_refused() -> None:
 
 def test_a_density_cache_of_an_unbounded_scene_has_finite_steps_everywhere() -> None:
     model = HashGridField(replace(FIELD, contracted=True), 0, reference)
-    cache = HashGridTrainer(model, small_bank(), TRAINER).occupancy_grid
+    cache = HashGridTrainer(model, small_dataset(), TRAINER).occupancy_grid
     cache.update(15, torch.Generator().manual_seed(1))
     assert cache.optical_thickness.isfinite().all()
     assert cache.optical_thickness.max() > 20 * cache.optical_thickness.min() > 0
 
 
-def unequal_bank() -> RayDataset:
+def unequal_dataset() -> RayDataset:
     """The disc on black from one place twice, the second time at half the light."""
-    bank = small_bank(40)
-    half = len(bank.pixels) // 2
-    colour = bank.pixels[:half, :3].where(bank.pixels[:half, 3:] > 0, 0)
+    dataset = small_dataset(40)
+    half = len(dataset.pixels) // 2
+    colour = dataset.pixels[:half, :3].where(dataset.pixels[:half, 3:] > 0, 0)
     darker = (255 * expose(colour / 255, torch.full((3,), -math.log(2)))).round().byte()
-    geometry = bank.geometry[:, :1].repeat(1, 2)
-    return bank._replace(pixels=torch.cat([colour, darker]), geometry=geometry)
+    geometry = dataset.geometry[:, :1].repeat(1, 2)
+    return dataset._replace(pixels=torch.cat([colour, darker]), geometry=geometry)
 
 
 def test_exposures_are_learnt_where_they_are_modelled() -> None:
     settings, errors = replace(TRAINER, background=(0.0, 0.0, 0.0), seed=0), []  # of some seeds all becomes black
     exposures = ExposureModel(torch.zeros(2, 3))
     for effects in (NO_EFFECTS, ImageEffects(colours=(exposures,))):
-        run = HashGridTrainer(HashGridField(FIELD, 0, reference), unequal_bank(), settings, effects)
+        run = HashGridTrainer(HashGridField(FIELD, 0, reference), unequal_dataset(), settings, effects)
         errors.append([run.step(step, step / 300).psnr for step in range(300)][-1])
     red = exposures.log_gain[:, 0]
     assert 0.15 < float(red[0] - red[1]) < 0.8 and exposures.log_gain.mean(0).abs().max() < 1e-6
@@ -249,7 +251,7 @@ def test_the_gradient_of_poses_is_that_of_the_loss(seed: int) -> None:
     """As far as differences tell: of other fields, samples that come to lie in another cell weigh more in them."""
     poses, settings = PoseRefinement(torch.eye(3)[:2]), replace(TRAINER, background=BACKGROUND)
     poses.turn += torch.tensor([[0.02, 0.01, -0.01], [0.0, -0.02, 0.03]])
-    run = HashGridTrainer(HashGridField(FIELD, seed, reference), small_bank(), settings, ImageEffects((poses,)))
+    run = HashGridTrainer(HashGridField(FIELD, seed, reference), small_dataset(), settings, ImageEffects((poses,)))
     for step in range(60):
         run.step(step, 0.84)  # at a third of the rate
     by_hand = run._part(7, 0.5, 128, 0).effects
@@ -275,7 +277,7 @@ def test_per_image_parameters_are_part_of_the_state() -> None:
     def fresh() -> HashGridTrainer:
         exposures = ExposureModel(torch.tensor([[0.0, 0, 0], [0.5, 0.5, 0.5]]))
         effects = ImageEffects((PoseRefinement(torch.eye(3)[:2]),), (exposures,))
-        return HashGridTrainer(HashGridField(FIELD, 0, reference), small_bank(), TRAINER, effects)
+        return HashGridTrainer(HashGridField(FIELD, 0, reference), small_dataset(), TRAINER, effects)
 
     whole, first, second = fresh(), fresh(), fresh()
     for step in range(20):
@@ -293,7 +295,7 @@ def test_per_image_parameters_are_part_of_the_state() -> None:
 
 
 def test_without_view_dependence_a_point_has_one_colour() -> None:
-    run = HashGridTrainer(HashGridField(replace(FIELD, view_dependence=False), 0, reference), small_bank(), TRAINER)
+    run = HashGridTrainer(HashGridField(replace(FIELD, view_dependence=False), 0, reference), small_dataset(), TRAINER)
     psnr = [run.step(step, step / 60).psnr for step in range(60)]
     points, directions = torch.rand(50, 3) - 0.5, torch.nn.functional.normalize(torch.randn(2, 50, 3), dim=-1)
     one, other = (run.model.density_and_colour(points, towards)[1] for towards in directions)
@@ -303,12 +305,12 @@ def test_without_view_dependence_a_point_has_one_colour() -> None:
 
 def test_the_sky_becomes_what_is_seen_in_its_direction() -> None:
     """Two opposite views, one of blue and one of yellow: even through the first fog that shows at once."""
-    bank = small_bank()
+    dataset = small_dataset()
     colours = torch.tensor([[30, 60, 230], [240, 200, 30]], dtype=torch.uint8)
-    bank = bank._replace(pixels=colours.repeat_interleave(len(bank.pixels) // 2, 0))
+    dataset = dataset._replace(pixels=colours.repeat_interleave(len(dataset.pixels) // 2, 0))
     outdoors = replace(FIELD, contracted=True, min_step_size=0.05, cone_angle=0.1, background_model=True)
     run = HashGridTrainer(
-        HashGridField(outdoors, 0, reference), bank, replace(TRAINER, background=(0.0, 0.0, 0.0), rate=1e-2)
+        HashGridField(outdoors, 0, reference), dataset, replace(TRAINER, background=(0.0, 0.0, 0.0), rate=1e-2)
     )
     for step in range(20):
         run.step(step, step / 20)
@@ -322,9 +324,9 @@ def test_the_sky_becomes_what_is_seen_in_its_direction() -> None:
 
 def test_known_distances_decide_a_shape_that_colours_leave_open() -> None:
     """Photos of one colour fit any depth; the centre of one is known to be 3 units away."""
-    bank = small_bank()
-    grey = bank._replace(pixels=torch.full_like(bank.pixels[:, :3], 128))
-    guided = grey.with_distances(torch.tensor([78]), torch.tensor([3.0]))
+    dataset = small_dataset()
+    grey = dataset._replace(pixels=torch.full_like(dataset.pixels[:, :3], 128))
+    guided = grey.with_sparse_depths(torch.tensor([78]), torch.tensor([3.0]))
     settings = replace(TRAINER, background=(0.0, 0.0, 0.0), depth_loss=0.1)
     centre, depth = grey.lookup(torch.tensor([78])).rays, {}
     for name, photos in {"open": grey, "guided": guided}.items():
@@ -338,8 +340,8 @@ def test_known_distances_decide_a_shape_that_colours_leave_open() -> None:
 def test_points_guide_a_run_less_and_less() -> None:
     settings = replace(TRAINER, depth_loss=0.1)
     plain, guided = trainer(settings), trainer(settings)
-    guided.bank = guided.bank.with_distances(torch.tensor([78, 222]), torch.tensor([3.0, 2.5]))
-    assert depth_factor(0.0) == 1 and depth_factor(0.25) == 0.75 and depth_factor(1.0) == 0
+    guided.dataset = guided.dataset.with_sparse_depths(torch.tensor([78, 222]), torch.tensor([3.0, 2.5]))
+    assert depth_loss_multiplier(0.0) == 1 and depth_loss_multiplier(0.25) == 0.75 and depth_loss_multiplier(1.0) == 0
     assert plain.step(0, 1.0) == guided.step(0, 1.0)
     assert same(plain.state(), guided.state())
     plain.step(1, 0.9)
@@ -349,7 +351,7 @@ def test_points_guide_a_run_less_and_less() -> None:
 
 def test_the_depth_loss_fades_in_value_and_gradient() -> None:
     run = trainer(replace(TRAINER, depth_loss=0.1))
-    run.bank = run.bank.with_distances(torch.tensor([78]), torch.tensor([3.0]))
+    run.dataset = run.dataset.with_sparse_depths(torch.tensor([78]), torch.tensor([3.0]))
     batch = run._batch(0, 0.0, 0, 64)
     done = run.model.forward(batch.rays, batch.jitter, batch.offset, batch.background)
     early, late, over = (run._loss(64, share, done, batch) for share in (0.25, 0.75, 1.0))
@@ -364,23 +366,23 @@ def test_the_depth_loss_fades_in_value_and_gradient() -> None:
 
 def test_however_many_the_chunks_an_eighth_of_the_rays_run_to_points() -> None:
     run = trainer(replace(TRAINER, depth_loss=0.1))
-    run.bank = run.bank.with_distances(torch.tensor([78]), torch.tensor([3.0]))
+    run.dataset = run.dataset.with_sparse_depths(torch.tensor([78]), torch.tensor([3.0]))
     for count in (1, 3, 5, 8, 21):
         to_points = [int((run._batch(0, 0.1, chunk, count).distance > 0).sum()) for chunk in range(32)]
         assert sum(to_points) == 32 * count // 8 and max(to_points) - min(to_points) <= 1
 
 
 def test_points_beyond_the_box_of_a_bounded_scene_are_no_guide() -> None:
-    bank = small_bank().with_distances(torch.tensor([78, 78]), torch.tensor([3.0, 4.5]))
+    dataset = small_dataset().with_sparse_depths(torch.tensor([78, 78]), torch.tensor([3.0, 4.5]))
     outdoors = replace(FIELD, contracted=True, min_step_size=0.05, cone_angle=0.1)
     for field, distances in {FIELD: [3.0], outdoors: [3.0, 4.5]}.items():
-        kept = HashGridTrainer(HashGridField(field, 0, reference), bank, TRAINER).bank.distance
+        kept = HashGridTrainer(HashGridField(field, 0, reference), dataset, TRAINER).dataset.distance
         assert kept is not None and kept.tolist() == distances
 
 
 def test_without_a_weight_known_distances_change_nothing() -> None:
     plain, other = trainer(), trainer()
-    other.bank = other.bank.with_distances(torch.tensor([78, 222]), torch.tensor([3.0, 2.5]))
+    other.dataset = other.dataset.with_sparse_depths(torch.tensor([78, 222]), torch.tensor([3.0, 2.5]))
     assert [plain.step(step, 0.1) for step in range(3)] == [other.step(step, 0.1) for step in range(3)]
     assert same(plain.state(), other.state())
 
@@ -389,7 +391,7 @@ def test_the_sky_where_it_is_always_hidden_falls_back_to_grey(monkeypatch: pytes
     """Light of a millionth reaches it now and then; Adam alone would follow that anywhere."""
     outdoors = replace(FIELD, contracted=True, min_step_size=0.05, cone_angle=0.1, background_model=True)
     run = HashGridTrainer(
-        HashGridField(outdoors, 0, reference), small_bank(), replace(TRAINER, background=(0.0, 0.0, 0.0))
+        HashGridField(outdoors, 0, reference), small_dataset(), replace(TRAINER, background=(0.0, 0.0, 0.0))
     )
     run.model.background_table.fill_(3.0)
     noise = torch.Generator().manual_seed(0)

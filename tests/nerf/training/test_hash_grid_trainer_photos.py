@@ -17,7 +17,7 @@ from nerf.training.hash_grid_trainer import HashGridTrainer, _Part
 from nerf.training.losses import huber_loss
 from nerf.training.ray_dataset import RayDataset
 from nerf.training.trainer import RAYS, NonFinite
-from tests.nerf.training.test_hash_grid_trainer import FIELD, TRAINER, copied, same, small_bank, trainer
+from tests.nerf.training.test_hash_grid_trainer import FIELD, TRAINER, copied, same, small_dataset, trainer
 
 
 def part_without_effects(run: HashGridTrainer, step: int, share: float, rays: int, chunk: int) -> _Part:
@@ -47,7 +47,7 @@ def test_effects_that_are_off_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> 
 @pytest.mark.parametrize("runaway", [1e30, float("nan")])
 def test_turns_that_run_away_are_refused_and_change_nothing(runaway: float) -> None:
     poses = PoseRefinement(torch.eye(3)[:2])
-    run = HashGridTrainer(HashGridField(FIELD, 0, reference), small_bank(), TRAINER, ImageEffects((poses,)))
+    run = HashGridTrainer(HashGridField(FIELD, 0, reference), small_dataset(), TRAINER, ImageEffects((poses,)))
     run.step(0, 0.0)
     poses.turn[:, 1] = runaway
     before = copied(run.state())
@@ -59,11 +59,14 @@ def test_turns_that_run_away_are_refused_and_change_nothing(runaway: float) -> N
 
 def test_steps_draw_every_pixel_once_before_any_again(monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever the number of rays, of chunks, and of rays to sparse points, which end half-way."""
-    bank, drawn = small_bank(16).with_distances(torch.tensor([136, 392]), torch.tensor([3.0, 2.5])), list[Tensor]()
-    assert bank.known is not None and bank.drawable == 512
+    dataset, drawn = (
+        small_dataset(16).with_sparse_depths(torch.tensor([136, 392]), torch.tensor([3.0, 2.5])),
+        list[Tensor](),
+    )
+    assert dataset.known is not None and dataset.unmasked_count == 512
     monkeypatch.setattr(RayDataset, "nth", lambda _, numbers: drawn.append(numbers) or numbers)
     settings = replace(TRAINER, chunks=3, depth_loss=0.1)
-    run, rays = HashGridTrainer(HashGridField(FIELD, 0, reference), bank, settings), set[int]()
+    run, rays = HashGridTrainer(HashGridField(FIELD, 0, reference), dataset, settings), set[int]()
     for step in range(40):
         rays.add(run.step(step, min(1.0, step / 20)).rays)
     often = torch.cat(drawn).bincount(minlength=512)

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nerf.training.learning_curve import FEWEST_STEPS, KNEE_DB, knee, last_doubling, next_doubling, quality_at
+from nerf.training.learning_curve import KNEE_DB, MIN_STEPS, knee, last_doubling, next_doubling, quality_at
 
 LATEST = 8.0
 
@@ -64,7 +64,7 @@ def test_a_late_rise_undoes_a_knee():
 
 @given(st.floats(-1, 4))
 def test_the_next_doubling_buys_less_than_the_last(last: float):
-    coming = next_doubling(straight(last), FEWEST_STEPS)
+    coming = next_doubling(straight(last), MIN_STEPS)
     assert coming is not None
     assert coming.db == pytest.approx(0.71 * last) and 0 < coming.half_width < 0.5
-    assert next_doubling(straight(last), FEWEST_STEPS - 1) is None
+    assert next_doubling(straight(last), MIN_STEPS - 1) is None

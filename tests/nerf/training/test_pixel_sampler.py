@@ -40,7 +40,7 @@ def test_a_place_has_its_number_however_it_is_asked_for(data: st.DataObject, cou
 
 def test_a_round_takes_one_of_every_stratum_and_seeds_differ() -> None:
     first, other = (PixelSampler(1000 * BLOCK_SIZE, seed, "cpu").take(0, 1000) for seed in (0, 1))
-    apart = first.sort().values.diff()  # strata do not begin at 0
+    apart = first.sort().values.diff()  # blocks do not begin at 0
     assert apart.max() < 2 * BLOCK_SIZE and 254 < apart.float().mean() < 258
     assert not torch.equal(first, other)
-    assert (first % BLOCK_SIZE).bincount(minlength=BLOCK_SIZE).max() < 20, "each stands somewhere else in its stratum"
+    assert (first % BLOCK_SIZE).bincount(minlength=BLOCK_SIZE).max() < 20, "each stands somewhere else in its block"

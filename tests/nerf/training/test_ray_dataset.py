@@ -8,7 +8,7 @@ from torch import Tensor
 
 from nerf.geometry.rays import rays_of_view
 from nerf.runtime.randomness import generator
-from nerf.training.ray_dataset import Placement, RayDataset, _in_runs, build_ray_bank, ray_bank
+from nerf.training.ray_dataset import PosedViews, RayDataset, _in_runs, make_ray_dataset, ray_dataset_from_images
 
 SIZES = [(3, 5), (4, 2), (3, 5)]  # (height, width) of each view
 CAMERAS = [0, 1, 0]
@@ -17,17 +17,17 @@ CAMERAS = [0, 1, 0]
 def scattered(channels: int = 3) -> tuple[RayDataset, list[Tensor], list[Tensor], Tensor]:
     random = generator("cpu", 11)
     photos = [torch.randint(256, (h, w, channels), generator=random, dtype=torch.uint8) for h, w in SIZES]
-    bearings = [torch.randn(h, w, 3, generator=random) for h, w in SIZES[:2]]
-    bearings = [b / b.norm(dim=-1, keepdim=True) for b in bearings]
+    directions = [torch.randn(h, w, 3, generator=random) for h, w in SIZES[:2]]
+    directions = [b / b.norm(dim=-1, keepdim=True) for b in directions]
     poses = torch.cat([torch.linalg.qr(torch.randn(3, 3, 3, generator=random))[0], torch.randn(3, 3, 1)], -1)
     near = torch.tensor([1.0, 2.0, 3.0])
-    return build_ray_bank(photos, CAMERAS, bearings, poses, near, near + 5), photos, bearings, poses
+    return ray_dataset_from_images(photos, CAMERAS, directions, poses, near, near + 5), photos, directions, poses
 
 
 def test_every_pixel_gets_its_own_ray_and_colour() -> None:
-    bank, photos, bearings, poses = scattered()
-    rays, colours, alpha, _ = bank.lookup(torch.arange(3 * 5 + 4 * 2 + 3 * 5))
-    expected = [rays_of_view(bearings[c], poses[v], v + 1.0, v + 6.0) for v, c in enumerate(CAMERAS)]
+    dataset, photos, directions, poses = scattered()
+    rays, colours, alpha, _ = dataset.lookup(torch.arange(3 * 5 + 4 * 2 + 3 * 5))
+    expected = [rays_of_view(directions[c], poses[v], v + 1.0, v + 6.0) for v, c in enumerate(CAMERAS)]
     for name, width in {"origins": (3,), "directions": (3,), "near": (), "far": ()}.items():
         flat = torch.cat([getattr(part, name).reshape(-1, *width) for part in expected])
         torch.testing.assert_close(getattr(rays, name), flat)
@@ -36,74 +36,74 @@ def test_every_pixel_gets_its_own_ray_and_colour() -> None:
 
 
 def test_the_fourth_channel_is_alpha() -> None:
-    bank, photos, _, _ = scattered(channels=4)
-    _, colours, alpha, _ = bank.lookup(torch.tensor([0, 7]))
+    dataset, photos, _, _ = scattered(channels=4)
+    _, colours, alpha, _ = dataset.lookup(torch.tensor([0, 7]))
     assert alpha is not None
     assert torch.equal(alpha, photos[0].flatten(0, 1)[[0, 7], 3].float() / 255)
     assert torch.equal(colours, photos[0].flatten(0, 1)[[0, 7], :3].float() / 255)
 
 
 def test_samples_are_uniform_over_pixels_whatever_the_sizes_of_the_photos() -> None:
-    bank, *_ = scattered()
+    dataset, *_ = scattered()
     count = 38_000  # a thousand for each of the 38 pixels
-    near = bank.lookup(bank.draw(count, generator("cpu", 0))).rays.near
+    near = dataset.lookup(dataset.draw(count, generator("cpu", 0))).rays.near
     for view, (height, width) in enumerate(SIZES):
         expected = count * height * width / 38
         assert abs((near == view + 1).sum() - expected) < 4 * expected**0.5
 
 
 def test_samples_depend_on_the_generator_alone() -> None:
-    bank, *_ = scattered()
-    first, second, other = (bank.draw(20, generator("cpu", seed)) for seed in (1, 1, 2))
+    dataset, *_ = scattered()
+    first, second, other = (dataset.draw(20, generator("cpu", seed)) for seed in (1, 1, 2))
     assert torch.equal(first, second) and not torch.equal(first, other)
 
 
 def test_a_photo_with_fewer_pixels_than_its_camera_has_bearings_is_refused() -> None:
-    photo, bearings = torch.zeros(2, 3, 3, dtype=torch.uint8), torch.zeros(3, 2, 3)
-    with pytest.raises(ValueError, match=r"photo 0 has size \(2, 3\), its camera 0 \(3, 2\) bearings"):
-        build_ray_bank([photo], [0], [bearings], torch.zeros(1, 3, 4), torch.ones(1), torch.ones(1))
+    photo, directions = torch.zeros(2, 3, 3, dtype=torch.uint8), torch.zeros(3, 2, 3)
+    with pytest.raises(ValueError, match=r"photo 0 has size \(2, 3\), its camera 0 \(3, 2\) directions"):
+        ray_dataset_from_images([photo], [0], [directions], torch.zeros(1, 3, 4), torch.ones(1), torch.ones(1))
 
 
 def test_no_photos_are_refused() -> None:
     with pytest.raises(ValueError, match="at least one photo"):
-        build_ray_bank([], [], [], torch.zeros(0, 3, 4), torch.ones(0), torch.ones(0))
+        ray_dataset_from_images([], [], [], torch.zeros(0, 3, 4), torch.ones(0), torch.ones(0))
 
 
 def test_a_table_that_is_not_all_photos_is_refused() -> None:
-    placement = Placement(torch.zeros(1, 3, 4), torch.ones(1), torch.ones(1))
+    placement = PosedViews(torch.zeros(1, 3, 4), torch.ones(1), torch.ones(1))
     with pytest.raises(ValueError, match="there are 5 pixels, the photos have 6"):
-        ray_bank(torch.zeros(5, 3, dtype=torch.uint8), [(2, 3)], [0], [torch.ones(1, 1, 3)], placement)
+        make_ray_dataset(torch.zeros(5, 3, dtype=torch.uint8), [(2, 3)], [0], [torch.ones(1, 1, 3)], placement)
 
 
 def test_the_table_of_pixels_is_not_copied() -> None:
-    placement = Placement(torch.zeros(1, 3, 4), torch.ones(1), torch.ones(1))
+    placement = PosedViews(torch.zeros(1, 3, 4), torch.ones(1), torch.ones(1))
     pixels = torch.zeros(6, 3, dtype=torch.uint8)
-    assert ray_bank(pixels, [(2, 3)], [0], [torch.ones(1, 1, 3)], placement).pixels is pixels
+    assert make_ray_dataset(pixels, [(2, 3)], [0], [torch.ones(1, 1, 3)], placement).pixels is pixels
 
 
 @given(st.integers(1, 40), st.integers(1, 40), st.integers(2, 40), st.integers(2, 40))
 def test_without_distortion_few_patches_are_as_good_as_many(rows: int, columns: int, height: int, width: int) -> None:
     rows, columns = min(max(2, rows), height), min(max(2, columns), width)
 
-    def bearings(rows: int, columns: int) -> Tensor:
+    def directions(rows: int, columns: int) -> Tensor:
         y, x = torch.meshgrid((torch.arange(rows) + 0.5) / rows, (torch.arange(columns) + 0.5) / columns, indexing="ij")
-        bearing = torch.stack([1.2 * x - 0.5, 0.8 * y - 0.4, torch.ones_like(x)], -1)
-        return bearing / bearing.norm(dim=-1, keepdim=True)
+        direction = torch.stack([1.2 * x - 0.5, 0.8 * y - 0.4, torch.ones_like(x)], -1)
+        return direction / direction.norm(dim=-1, keepdim=True)
 
     photo = torch.zeros(height, width, 3, dtype=torch.uint8)
     views = (torch.eye(3, 4)[None], torch.ones(1), torch.ones(1))
-    bank = build_ray_bank([photo], [0], [bearings(rows, columns)], *views)
-    found = bank.lookup(torch.arange(height * width))[0].directions
-    assert bank.patches.shape[1] == rows * columns
-    torch.testing.assert_close(found, bearings(height, width).view(-1, 3), atol=2e-6, rtol=0)
+    dataset = ray_dataset_from_images([photo], [0], [directions(rows, columns)], *views)
+    found = dataset.lookup(torch.arange(height * width))[0].directions
+    assert dataset.patches.shape[1] == rows * columns
+    torch.testing.assert_close(found, directions(height, width).view(-1, 3), atol=2e-6, rtol=0)
 
 
 def test_rays_are_unit_vectors_behind_the_camera_too() -> None:
     turn = torch.linspace(0.1, 2.9, 33)  # to 166 degrees from the axis
-    bearings = torch.stack([turn.sin(), torch.zeros(33), turn.cos()], -1)[None]
+    directions = torch.stack([turn.sin(), torch.zeros(33), turn.cos()], -1)[None]
     photo = torch.zeros(1, 330, 3, dtype=torch.uint8)
-    bank = build_ray_bank([photo], [0], [bearings], torch.eye(3, 4)[None], torch.ones(1), torch.ones(1))
-    directions = bank.lookup(torch.arange(330))[0].directions
+    dataset = ray_dataset_from_images([photo], [0], [directions], torch.eye(3, 4)[None], torch.ones(1), torch.ones(1))
+    directions = dataset.lookup(torch.arange(330))[0].directions
     torch.testing.assert_close(directions.norm(dim=1), torch.ones(330))
     step = (2.9 - 0.1) / 32
     expected = 0.1 + step * ((torch.arange(330) + 0.5) / 10 - 0.5)
@@ -116,7 +116,7 @@ SHARES = st.sampled_from([None, 0.0, 0.3, 0.6, 0.9, 1.0])
 
 @given(st.tuples(SHARES, SHARES, SHARES), st.integers(0, 99))
 def test_runs_count_through_the_pixels_that_no_mask_ignores(shares: tuple[float | None, ...], seed: int) -> None:
-    bank, *_ = scattered()
+    dataset, *_ = scattered()
     random = generator("cpu", seed)
     noise = [torch.rand(size, generator=random) for size in SIZES]
     ignored = [None if share is None else part < share for share, part in zip(shares, noise, strict=True)]
@@ -124,22 +124,22 @@ def test_runs_count_through_the_pixels_that_no_mask_ignores(shares: tuple[float 
     used = (~torch.cat(flat)).nonzero()[:, 0]
     if not len(used):
         with pytest.raises(ValueError, match="the masks ignore every pixel"):
-            bank.without(ignored)
+            dataset.without(ignored)
         return
-    masked = bank.without(ignored)
-    assert masked.drawable == len(used)
+    masked = dataset.without(ignored)
+    assert masked.unmasked_count == len(used)
     if len(used) == 38:
-        assert masked is bank and bank.runs is None
+        assert masked is dataset and dataset.runs is None
     else:
         assert masked.runs is not None
         assert torch.equal(_in_runs(masked.runs, torch.arange(len(used))), used)
 
 
 def test_ignored_pixels_are_never_drawn_and_the_others_alike() -> None:
-    bank, photos, *_ = scattered()
+    dataset, photos, *_ = scattered()
     ignored = torch.zeros(SIZES[0], dtype=torch.bool)
     ignored[1:, 1:4] = True
-    masked = bank.without([ignored, torch.ones(SIZES[1], dtype=torch.bool), None])
+    masked = dataset.without([ignored, torch.ones(SIZES[1], dtype=torch.bool), None])
     used = torch.cat([photos[0][~ignored], photos[2].flatten(0, 1)]).float() / 255
     drawn = masked.lookup(masked.draw(24_000, generator("cpu", 0))).colour  # a thousand for each of the 24 pixels
     counts = (drawn[:, None] == used).all(-1).sum(0)
@@ -149,7 +149,7 @@ def test_ignored_pixels_are_never_drawn_and_the_others_alike() -> None:
 
 
 def test_masks_are_taken_one_by_one_and_dropped() -> None:
-    bank, *_ = scattered()
+    dataset, *_ = scattered()
     shown, alive = list[weakref.ref[Tensor]](), list[int]()
 
     def mask(size: tuple[int, int]) -> Tensor:
@@ -159,73 +159,73 @@ def test_masks_are_taken_one_by_one_and_dropped() -> None:
         shown.append(weakref.ref(ignored))
         return ignored
 
-    masked, expected = bank.without(map(mask, SIZES)), bank.without([mask(size) for size in SIZES])
+    masked, expected = dataset.without(map(mask, SIZES)), dataset.without([mask(size) for size in SIZES])
     assert alive[:3] == [0, 1, 1], "the one before is held until the next is there"
     assert masked.runs is not None and expected.runs is not None and torch.equal(masked.runs, expected.runs)
 
 
 def test_without_masks_the_same_pixels_are_drawn_as_ever() -> None:
-    bank, *_ = scattered()
+    dataset, *_ = scattered()
     pixel = torch.randint(38, (20,), generator=generator("cpu", 3))
-    assert torch.equal(bank.without([None] * 3).draw(20, generator("cpu", 3)), pixel)
-    assert torch.equal(bank.nth(pixel), pixel) and bank.to("cpu").runs is None
+    assert torch.equal(dataset.without([None] * 3).draw(20, generator("cpu", 3)), pixel)
+    assert torch.equal(dataset.nth(pixel), pixel) and dataset.to("cpu").runs is None
 
 
 def test_known_distances_are_drawn_with_their_pixels_as_often_as_each_other() -> None:
-    bank, *_ = scattered()
-    assert bank.known is None and bank.with_distances(torch.zeros(0).long(), torch.zeros(0)).known is None
-    known = bank.with_distances(torch.tensor([3, 30, 3]), torch.tensor([1.5, 4.5, 3.5]))
-    pixel, distance = known.draw_known(3000, generator("cpu", 0))
+    dataset, *_ = scattered()
+    assert dataset.known is None and dataset.with_sparse_depths(torch.zeros(0).long(), torch.zeros(0)).known is None
+    known = dataset.with_sparse_depths(torch.tensor([3, 30, 3]), torch.tensor([1.5, 4.5, 3.5]))
+    pixel, distance = known.sample_sparse_depths(3000, generator("cpu", 0))
     pairs, counts = torch.stack([pixel.float(), distance], 1).unique(dim=0, return_counts=True)
     assert pairs.tolist() == [[3, 1.5], [3, 3.5], [30, 4.5]]
     assert (counts - 1000).abs().max() < 100
-    again, *_ = known.draw_known(3000, generator("cpu", 0))
+    again, *_ = known.sample_sparse_depths(3000, generator("cpu", 0))
     assert torch.equal(pixel, again)
-    assert torch.equal(known.draw(50, generator("cpu", 1)), bank.draw(50, generator("cpu", 1)))
+    assert torch.equal(known.draw(50, generator("cpu", 1)), dataset.draw(50, generator("cpu", 1)))
 
 
 def test_how_far_away_views_look_is_the_median_of_what_they_are_known_to_show() -> None:
-    bank, *_ = scattered()
-    assert bank.viewing_distance is None
-    known = bank.with_distances(torch.tensor([30, 3, 37, 4, 23]), torch.tensor([4.5, 3.0, 5.0, 1.5, 3.25]))
+    dataset, *_ = scattered()
+    assert dataset.viewing_distance is None
+    known = dataset.with_sparse_depths(torch.tensor([30, 3, 37, 4, 23]), torch.tensor([4.5, 3.0, 5.0, 1.5, 3.25]))
     assert known.viewing_distance is not None
     assert known.viewing_distance.tolist() == [1.5, 3.25, 4.5], "the second view has none, and that of all"
 
 
 def test_distances_of_pixels_that_masks_ignore_are_forgotten() -> None:
-    bank, *_ = scattered()
+    dataset, *_ = scattered()
     ignored = torch.zeros(SIZES[0], dtype=torch.bool)
     ignored[0] = True
-    masked = bank.without([ignored, None, None])
-    known = masked.with_distances(torch.tensor([3, 30]), torch.tensor([1.5, 4.5])).known
+    masked = dataset.without([ignored, None, None])
+    known = masked.with_sparse_depths(torch.tensor([3, 30]), torch.tensor([1.5, 4.5])).known
     assert known is not None and known.tolist() == [30]
-    assert masked.with_distances(torch.tensor([3]), torch.tensor([1.5])).known is None
+    assert masked.with_sparse_depths(torch.tensor([3]), torch.tensor([1.5])).known is None
 
 
 def test_distances_beyond_near_and_far_are_forgotten() -> None:
-    bank, *_ = scattered()
-    rays, _ = bank.rays(torch.tensor([3]))
+    dataset, *_ = scattered()
+    rays, _ = dataset.rays(torch.tensor([3]))
     near, far = float(rays.near), float(rays.far)
     distance = torch.tensor([0.9 * near, near, 1.1 * near, 0.9 * far, far, 1.1 * far])
-    known = bank.with_distances(torch.full((6,), 3), distance).distance
+    known = dataset.with_sparse_depths(torch.full((6,), 3), distance).distance
     assert known is not None and known.tolist() == distance[2:4].tolist()
 
 
 def test_distances_of_pixels_that_are_not_opaque_are_forgotten() -> None:
-    bank, *_ = scattered(channels=4)
-    pixels = bank.pixels.clone()
+    dataset, *_ = scattered(channels=4)
+    pixels = dataset.pixels.clone()
     pixels[3, 3], pixels[4, 3] = 255, 254
-    known = bank._replace(pixels=pixels).with_distances(torch.tensor([3, 4]), torch.tensor([1.5, 2.5])).known
+    known = dataset._replace(pixels=pixels).with_sparse_depths(torch.tensor([3, 4]), torch.tensor([1.5, 2.5])).known
     assert known is not None and known.tolist() == [3]
 
 
 def test_distances_that_end_outside_of_a_cube_are_forgotten() -> None:
-    bank, *_ = scattered()
-    rays = bank.lookup(torch.tensor([3, 3])).rays
+    dataset, *_ = scattered()
+    rays = dataset.lookup(torch.tensor([3, 3])).rays
     distance = torch.tensor([1.5, 5.5])
     ends = (rays.origins + distance[:, None] * rays.directions).abs().amax(-1)
-    known = bank.with_distances(torch.tensor([3, 3]), distance)
-    kept = known.known_within(float(ends[0]) + 1e-3).distance
+    known = dataset.with_sparse_depths(torch.tensor([3, 3]), distance)
+    kept = known.with_sparse_depths_within(float(ends[0]) + 1e-3).distance
     assert kept is not None and kept.tolist() == [1.5]
-    assert known.known_within(float(ends[0]) - 1e-3).known is None
-    assert bank.known_within(1.0) is bank
+    assert known.with_sparse_depths_within(float(ends[0]) - 1e-3).known is None
+    assert dataset.with_sparse_depths_within(1.0) is dataset

@@ -4,12 +4,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nerf.training.schedule import CLOSING_SHARE, StepPlan, learning_rate, plan_of, replanned, steps_that_fit
+from nerf.training.schedule import CLOSING_SHARE, StepSchedule, learning_rate, replanned, schedule_of, steps_that_fit
 
 
 @st.composite
-def plans(draw: st.DrawFn) -> StepPlan:
-    plan = plan_of(draw(st.integers(1, 60)))
+def plans(draw: st.DrawFn) -> StepSchedule:
+    plan = schedule_of(draw(st.integers(1, 60)))
     for _ in range(draw(st.integers(0, 6))):
         earliest = plan.decisions[-1].from_step
         step = draw(st.integers(earliest, max(earliest, plan.total_steps - 1)))
@@ -18,7 +18,7 @@ def plans(draw: st.DrawFn) -> StepPlan:
 
 
 @given(plans())
-def test_share_goes_from_0_to_1_and_never_back(plan: StepPlan) -> None:
+def test_share_goes_from_0_to_1_and_never_back(plan: StepSchedule) -> None:
     shares = [plan.share(step) for step in range(plan.total_steps + 1)]
     assert shares[0] == 0
     assert shares[-1] == pytest.approx(1, abs=1e-12)
@@ -26,7 +26,7 @@ def test_share_goes_from_0_to_1_and_never_back(plan: StepPlan) -> None:
 
 
 @given(plans(), st.integers(1, 50), st.integers(0, 10**6))
-def test_a_decision_leaves_the_past_and_the_present_alone(plan: StepPlan, more: int, position: int) -> None:
+def test_a_decision_leaves_the_past_and_the_present_alone(plan: StepSchedule, more: int, position: int) -> None:
     earliest = plan.decisions[-1].from_step
     step = earliest + position % (plan.total_steps - earliest)
     revised = plan.revised(step, step + more, plan.share(step))
@@ -34,27 +34,27 @@ def test_a_decision_leaves_the_past_and_the_present_alone(plan: StepPlan, more: 
 
 
 @given(plans(), st.integers(0, 60))
-def test_a_plan_without_its_later_decisions_is_the_one_that_held(plan: StepPlan, step: int) -> None:
+def test_a_plan_without_its_later_decisions_is_the_one_that_held(plan: StepSchedule, step: int) -> None:
     earlier = plan.until(step)
     assert [earlier.share(s) for s in range(step + 1)] == [plan.share(s) for s in range(step + 1)]
     assert earlier.decisions[-1].from_step <= step and plan.decisions[: len(earlier.decisions)] == earlier.decisions
 
 
 def test_a_plan_without_revision_is_linear() -> None:
-    assert [plan_of(4).share(step) for step in range(5)] == [0, 0.25, 0.5, 0.75, 1]
+    assert [schedule_of(4).share(step) for step in range(5)] == [0, 0.25, 0.5, 0.75, 1]
 
 
 def test_half_way_through_twice_the_steps() -> None:
-    plan = plan_of(4).revised(2, 6, 0.5)
+    plan = schedule_of(4).revised(2, 6, 0.5)
     assert [plan.share(step) for step in range(7)] == [0, 0.25, 0.5, 0.625, 0.75, 0.875, 1]
 
 
 @given(plans(), st.integers(1, 60), st.integers(1, 60))
-def test_more_steps_take_the_share_back_to_that_of_the_longer_run(plan: StepPlan, more: int, yet_more: int) -> None:
+def test_more_steps_take_the_share_back_to_that_of_the_longer_run(plan: StepSchedule, more: int, yet_more: int) -> None:
     done = plan.total_steps
     longer = plan.extended(done + more)
     assert [longer.share(step) for step in range(done)] == [plan.share(step) for step in range(done)]
-    whole = plan_of(done + more)
+    whole = schedule_of(done + more)
     for step in range(done, done + more + 1):
         assert longer.share(step) == pytest.approx(whole.share(step), abs=1e-12)
     assert longer.extended(done + more + yet_more).share(done + more) == (done + more) / (done + more + yet_more)
@@ -63,19 +63,19 @@ def test_more_steps_take_the_share_back_to_that_of_the_longer_run(plan: StepPlan
 
 @given(st.integers(1, 500), st.data())
 def test_a_run_that_closes_early_ends_as_every_run_does(total: int, data: st.DataObject) -> None:
-    plan, step = plan_of(total), data.draw(st.integers(0, total - 1))
+    plan, step = schedule_of(total), data.draw(st.integers(0, total - 1))
     closed = plan.closing(step)
     assert step < closed.total_steps <= total
     assert closed.share(step) >= CLOSING_SHARE and closed.share(closed.total_steps) == 1
     assert [closed.share(s) for s in range(step)] == [plan.share(s) for s in range(step)]
     if closed.total_steps < total and step >= 10:
-        whole = plan_of(closed.total_steps)
+        whole = schedule_of(closed.total_steps)
         assert closed.share(step) == pytest.approx(whole.share(step), abs=0.05)
 
 
 def test_a_run_may_end_at_any_step_it_has_come_to() -> None:
-    ended = plan_of(10).closing(6).ended(7)
-    assert ended.total_steps == 7 and ended.share(7) == plan_of(10).closing(6).share(7)
+    ended = schedule_of(10).closing(6).ended(7)
+    assert ended.total_steps == 7 and ended.share(7) == schedule_of(10).closing(6).share(7)
     with pytest.raises(ValueError, match="cannot end"):
         ended.ended(7)
     with pytest.raises(ValueError, match="cannot close"):
@@ -85,23 +85,23 @@ def test_a_run_may_end_at_any_step_it_has_come_to() -> None:
 @pytest.mark.parametrize("total", [4, 3])
 def test_more_steps_are_more_than_there_were(total: int) -> None:
     with pytest.raises(ValueError, match="cannot go on"):
-        plan_of(4).extended(total)
+        schedule_of(4).extended(total)
 
 
 @pytest.mark.parametrize(("step", "total"), [(5, 5), (3, 9)])
 def test_no_decision_without_a_step_left_or_about_the_past(step: int, total: int) -> None:
     with pytest.raises(ValueError, match="cannot become"):
-        plan_of(10).revised(4, 8, 0.4).revised(step, total, 0.5)
+        schedule_of(10).revised(4, 8, 0.4).revised(step, total, 0.5)
 
 
 def test_a_run_has_steps() -> None:
     with pytest.raises(ValueError, match="at least one step"):
-        plan_of(0)
+        schedule_of(0)
 
 
 @given(st.floats(0.01, 1000), st.floats(0.01, 1000))
 def test_a_run_on_a_steady_clock_ends_on_time(budget: float, rate: float) -> None:
-    plan, step = plan_of(10**6), 0
+    plan, step = schedule_of(10**6), 0
     while step < plan.total_steps and step < 40:
         step += 1
         if step < plan.total_steps:
@@ -112,20 +112,20 @@ def test_a_run_on_a_steady_clock_ends_on_time(budget: float, rate: float) -> Non
 
 
 def test_a_run_that_turns_out_slow_is_cut_short_and_still_ends_at_1() -> None:
-    plan = replanned(plan_of(100), 50, 9.0, 10.0, 10.0, 0.1)
+    plan = replanned(schedule_of(100), 50, 9.0, 10.0, 10.0, 0.1)
     assert plan.total_steps == 60
     assert plan.share(49) == 0.49 and plan.share(50) == 0.9
     assert plan.share(60) == pytest.approx(1)
 
 
 def test_a_plan_made_too_short_leaves_no_trace_in_the_rates() -> None:
-    plan = replanned(plan_of(30), 29, 1.5, 30.0, 20.0, 0.3)
+    plan = replanned(schedule_of(30), 29, 1.5, 30.0, 20.0, 0.3)
     assert plan.total_steps == 29 + 570
     assert plan.share(29) == 0.05
 
 
 def test_a_plan_that_is_right_enough_stands() -> None:
-    plan = plan_of(100)
+    plan = schedule_of(100)
     assert replanned(plan, 50, 4.95, 10.0, 10.0, 0.1) is plan
 
 

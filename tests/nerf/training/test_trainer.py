@@ -10,7 +10,7 @@ from nerf.effects.exposure import ExposureModel
 from nerf.effects.pose_refinement import PoseRefinement
 from nerf.fields.vanilla import VanillaNerf, VanillaSettings
 from nerf.geometry.rays import Rays
-from nerf.training.ray_dataset import RayDataset, build_ray_bank
+from nerf.training.ray_dataset import RayDataset, ray_dataset_from_images
 from nerf.training.trainer import NonFinite, VanillaTrainer, VanillaTrainerSettings, over
 from nerf.training.validation_probe import make_probe, measure
 
@@ -20,7 +20,7 @@ FIELD = VanillaSettings(
 TRAINER = VanillaTrainerSettings(batch_rays=64, seed=3, background=(1.0, 1.0, 1.0), rate_start=5e-3, rate_end=5e-4)
 
 
-def small_bank(channels: int = 3, size: int = 12) -> RayDataset:
+def small_dataset(channels: int = 3, size: int = 12) -> RayDataset:
     """Two opposite views of a red disc on white (or on nothing, with alpha), from 3 units away."""
     grid = (torch.arange(size) + 0.5) / size - 0.5
     y, x = torch.meshgrid(grid, grid, indexing="ij")
@@ -33,11 +33,13 @@ def small_bank(channels: int = 3, size: int = 12) -> RayDataset:
     front = torch.tensor([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, -3]])
     back = torch.tensor([[-1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 3]])
     near, far = torch.full((2,), 2.0), torch.full((2,), 4.0)
-    return build_ray_bank([photo.to(torch.uint8)] * 2, [0, 0], [bearings], torch.stack([front, back]), near, far)
+    return ray_dataset_from_images(
+        [photo.to(torch.uint8)] * 2, [0, 0], [bearings], torch.stack([front, back]), near, far
+    )
 
 
-def trainer(settings: VanillaTrainerSettings = TRAINER, bank: RayDataset | None = None) -> VanillaTrainer:
-    return VanillaTrainer(VanillaNerf(FIELD, seed=0), bank or small_bank(), settings)
+def trainer(settings: VanillaTrainerSettings = TRAINER, dataset: RayDataset | None = None) -> VanillaTrainer:
+    return VanillaTrainer(VanillaNerf(FIELD, seed=0), dataset or small_dataset(), settings)
 
 
 def same(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:
@@ -76,19 +78,19 @@ def test_results_do_not_depend_on_the_number_of_threads() -> None:
 
 
 def test_training_beats_a_flat_colour() -> None:
-    bank = small_bank()
-    run = trainer(bank=bank)
-    probe = make_probe(bank, 288, torch.ones(3), seed=5)
-    assert measure(run.model, probe).psnr < probe.flat_psnr + 2
+    dataset = small_dataset()
+    run = trainer(dataset=dataset)
+    probe = make_probe(dataset, 288, torch.ones(3), seed=5)
+    assert measure(run.model, probe).psnr < probe.mean_colour_psnr + 2
     for step in range(150):
         run.step(step, step / 150)
-    assert probe.flat_psnr + 3 < measure(run.model, probe).psnr < 60
+    assert probe.mean_colour_psnr + 3 < measure(run.model, probe).psnr < 60
 
 
 def test_the_loss_is_the_sum_of_both_renderings_mean_squared_errors() -> None:
     run = trainer()
     nothing = replace(FIELD, hierarchical=False)
-    alone = VanillaTrainer(VanillaNerf(nothing, seed=0), small_bank(), TRAINER).step(0, 0.0)
+    alone = VanillaTrainer(VanillaNerf(nothing, seed=0), small_dataset(), TRAINER).step(0, 0.0)
     both = run.step(0, 0.0)
     assert alone.loss == pytest.approx(10 ** (-alone.psnr / 10), rel=1e-5)
     assert both.loss > 1.2 * 10 ** (-both.psnr / 10)
@@ -126,7 +128,7 @@ def test_the_rate_scale_scales_the_update() -> None:
 
 
 def test_a_random_background_is_new_in_every_step_and_shines_through_alpha() -> None:
-    run = trainer(replace(TRAINER, background="random"), small_bank(channels=4))
+    run = trainer(replace(TRAINER, background="random"), small_dataset(channels=4))
     seen = []
     forward = run.model.render_training
 
@@ -142,7 +144,7 @@ def test_a_random_background_is_new_in_every_step_and_shines_through_alpha() -> 
 
 
 def test_steps_draw_every_pixel_once_before_any_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    run, drawn = trainer(bank=small_bank(size=16)), list[Tensor]()
+    run, drawn = trainer(dataset=small_dataset(size=16)), list[Tensor]()
     monkeypatch.setattr(RayDataset, "nth", lambda _, numbers: drawn.append(numbers) or numbers)
     for step in range(12):
         run.step(step, 0.0)
@@ -159,7 +161,7 @@ def test_over_is_linear_between_background_and_colour() -> None:
 
 
 def test_a_state_of_another_architecture_is_refused() -> None:
-    other = VanillaTrainer(VanillaNerf(replace(FIELD, width=8), seed=0), small_bank(), TRAINER)
+    other = VanillaTrainer(VanillaNerf(replace(FIELD, width=8), seed=0), small_dataset(), TRAINER)
     with pytest.raises(RuntimeError, match="this state belongs to another field: settings differ"):
         trainer().load_state(other.state())
 
@@ -168,7 +170,7 @@ def test_per_image_parameters_are_trained_and_resumed() -> None:
     def fresh() -> VanillaTrainer:
         exposures = ExposureModel(torch.tensor([[0.0, 0, 0], [0.5, 0.5, 0.5]]))
         effects = ImageEffects((PoseRefinement(torch.eye(3)[:2]),), (exposures,))
-        return VanillaTrainer(VanillaNerf(FIELD, seed=0), small_bank(), TRAINER, effects)
+        return VanillaTrainer(VanillaNerf(FIELD, seed=0), small_dataset(), TRAINER, effects)
 
     whole, first, second = fresh(), fresh(), fresh()
     begun = {name: part.detach().clone() for name, part in whole.effects.parameters.items()}

@@ -6,7 +6,7 @@ import torch
 from nerf.fields.interface import Rendering
 from nerf.geometry.rays import Rays
 from nerf.training.metrics import PSNR_LIMIT
-from nerf.training.ray_dataset import RayDataset, build_ray_bank
+from nerf.training.ray_dataset import RayDataset, ray_dataset_from_images
 from nerf.training.validation_probe import make_patches, make_probe, measure, pictures
 
 
@@ -26,26 +26,28 @@ class Painted:
         return Rendering(grey, rays.far, torch.full_like(rays.far, 0.5))
 
 
-def painted_bank() -> RayDataset:
+def painted_dataset() -> RayDataset:
     values = torch.arange(256)
     directions = torch.stack([values / 255, values * 0.0, values * 0.0 + 1], -1)[None]
     photo = values.to(torch.uint8)[None, :, None].expand(1, 256, 3)
-    return build_ray_bank([photo], [0], [directions], torch.eye(3, 4)[None], torch.ones(1), torch.full((1,), 2.0))
+    return ray_dataset_from_images(
+        [photo], [0], [directions], torch.eye(3, 4)[None], torch.ones(1), torch.full((1,), 2.0)
+    )
 
 
 def test_a_perfect_model_scores_the_limit() -> None:
-    result = measure(Painted(), make_probe(painted_bank(), 3000, torch.zeros(3), seed=0))
+    result = measure(Painted(), make_probe(painted_dataset(), 3000, torch.zeros(3), seed=0))
     assert result.psnr == PSNR_LIMIT
     assert result.opacity == 0.5
 
 
 def test_flat_psnr_is_the_variance_of_the_colours() -> None:
-    probe = make_probe(painted_bank(), 20_000, torch.zeros(3), seed=0)
-    assert abs(probe.flat_psnr - -10 * math.log10(1 / 12)) < 0.2
+    probe = make_probe(painted_dataset(), 20_000, torch.zeros(3), seed=0)
+    assert abs(probe.mean_colour_psnr - -10 * math.log10(1 / 12)) < 0.2
 
 
 def test_a_probe_is_always_the_same() -> None:
-    first, again, other = (make_probe(painted_bank(), 50, torch.zeros(3), seed).colours for seed in (4, 4, 5))
+    first, again, other = (make_probe(painted_dataset(), 50, torch.zeros(3), seed).colours for seed in (4, 4, 5))
     assert torch.equal(first, again)
     assert not torch.equal(first, other)
 
@@ -58,7 +60,7 @@ def two_photos(grey: float = 0.0) -> RayDataset:
         photos.append(torch.stack([torch.full_like(x, 100 * view), y, x], -1).to(torch.uint8))
         directions.append(torch.tensor([grey, 0.0, 1.0]).expand(height, width, 3))
     poses = torch.eye(3, 4).expand(2, 3, 4)
-    return build_ray_bank(photos, [0, 1], directions, poses, torch.ones(2), torch.full((2,), 2.0))
+    return ray_dataset_from_images(photos, [0, 1], directions, poses, torch.ones(2), torch.full((2,), 2.0))
 
 
 def test_patches_are_squares_of_the_photos() -> None:
@@ -81,8 +83,8 @@ def test_patches_fit_into_the_smallest_photo() -> None:
 def test_patches_know_what_masks_ignore() -> None:
     ignored = torch.zeros(20, 30, dtype=torch.bool)
     ignored[:, :10] = True
-    bank = two_photos().without([ignored, torch.ones(13, 17, dtype=torch.bool)])
-    patches = make_patches(bank, 40, 9, torch.zeros(3), seed=1)
+    dataset = two_photos().without([ignored, torch.ones(13, 17, dtype=torch.bool)])
+    patches = make_patches(dataset, 40, 9, torch.zeros(3), seed=1)
     _, truth = pictures(Painted(), patches)
     values = (truth * 255).round().long()
     assert (values[..., 0] == 0).all(), "nothing of the second photo is used"

@@ -17,7 +17,7 @@ from stages.train.fields.hash_grid import PART_SAMPLES, SAMPLES_PER_RAY
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bench, "SECONDS", 0.01)
     monkeypatch.setattr(machine_rates, "STREAMED", 1 << 20)
-    monkeypatch.setattr(machine_rates, "LEAST_STREAMED", 1 << 18)
+    monkeypatch.setattr(machine_rates, "MIN_STREAMED", 1 << 18)
     monkeypatch.setattr(doctor, "self_test", lambda device: [])
 
 

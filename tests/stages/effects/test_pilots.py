@@ -38,7 +38,7 @@ def test_photos_are_kept_back_from_the_training_photos_alone(trial: PilotScene, 
     given = read_scene(inputs["normalise"])
     trained, kept = ({view.name for view in trial.scene.of_split(split)} for split in ("train", "validation"))
     assert kept and trained | kept == {view.name for view in given.of_split("train")} and not trained & kept
-    assert len(trial.kept) == len(kept) and len(trial.bank.near) == len(trained)
+    assert len(trial.kept) == len(kept) and len(trial.dataset.near) == len(trained)
 
 
 def test_equal_arms_gain_exactly_nothing(trial: PilotScene) -> None:

@@ -19,7 +19,7 @@ from stages.evaluate import Examiner
 from stages.evaluate.half_images import from_fitted_pose, right_half_psnr
 from stages.hardware.backend import chosen_backend, load_backend
 from stages.render.renderer import Painter
-from stages.train.data import PhotoReader, training_bank, view_rays
+from stages.train.data import PhotoReader, training_dataset, view_rays
 from tests.stages.photo_scene import photographed
 from tests.synthetic_photos import Quiet
 
@@ -56,8 +56,8 @@ def test_poses_are_fitted_to_the_field_as_it_is_and_scored_as_the_photo_was_expo
 def test_refined_poses_are_learnt_in_units_of_what_photos_see_and_written_in_scene_units(tmp_path: Path) -> None:
     inputs, scene = photographed(tmp_path)
     views = scene.of_split("train")
-    bank = training_bank(inputs["ingest"], scene, "train", 1.0, Quiet())
-    near = bank._replace(known=bank.first_pixel[:-1] + 5, distance=torch.full((len(views),), 0.25))
+    dataset = training_dataset(inputs["ingest"], scene, "train", 1.0, Quiet())
+    near = dataset._replace(known=dataset.first_pixel[:-1] + 5, distance=torch.full((len(views),), 0.25))
     effects = image_effects(Decisions(pose_refinement=True), views, near)
     effects.rays[0].parameters["offset"][1] = torch.tensor([1.0, 0.0, -2.0])
     trainer: Any = SimpleNamespace(effects=effects)

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from nerf.geometry.scene import Camera
-from nerf.training.ray_dataset import Placement, ray_bank
+from nerf.training.ray_dataset import PosedViews, make_ray_dataset
 from stages.contract import StageError
 from stages.ingest.masks import load_mask
 from stages.io.files import write_png, write_tensors
@@ -21,10 +21,10 @@ from stages.train.data import (
     MAX_PATCHES,
     PhotoReader,
     camera_directions,
-    guided_bank,
+    guided_dataset,
     patch_bearings,
     scaled_size,
-    training_bank,
+    training_dataset,
     view_mask,
     view_rays,
 )
@@ -64,10 +64,10 @@ def test_the_bank_and_the_views_are_the_same_pixels_and_rays(
     downscale: float, tmp_path: Path, progress: SilentProgress
 ) -> None:
     inputs, scene = photographed(tmp_path)
-    bank = training_bank(inputs["ingest"], scene, "train", downscale, progress)
-    rays, colours, alpha, _ = bank.lookup(torch.arange(len(bank.pixels)))
+    dataset = training_dataset(inputs["ingest"], scene, "train", downscale, progress)
+    rays, colours, alpha, _ = dataset.lookup(torch.arange(len(dataset.pixels)))
     views = scene.of_split("train")
-    assert alpha is None and len(bank.near) == len(views) == 6
+    assert alpha is None and len(dataset.near) == len(views) == 6
     reader = PhotoReader(inputs["ingest"], scene, downscale)
     pixels = [reader.pixels(view, WHITE).flatten(0, 1) for view in views]
     assert torch.equal(colours, torch.cat(pixels))
@@ -82,7 +82,7 @@ def test_transparent_pixels_are_shown_over_the_background(tmp_path: Path, progre
     torch.testing.assert_close(over_white, torch.from_numpy(ball_photo()).float() / 255)
     over_green = reader.pixels(scene.views[0], (0.0, 1.0, 0.0))
     assert over_green[0, 0].tolist() == [0, 1, 0]
-    assert training_bank(inputs["ingest"], scene, "train", 1.0, progress).pixels.shape[1] == 4
+    assert training_dataset(inputs["ingest"], scene, "train", 1.0, progress).pixels.shape[1] == 4
 
 
 @pytest.mark.parametrize("downscale", [1.0, 2.0])
@@ -93,32 +93,32 @@ def test_alpha_that_is_no_background_is_ignored_like_what_a_mask_ignores(
     write_png(inputs["ingest"] / "opaque/all.png", ball_photo(4)[..., 3].copy())
     views = tuple(replace(view, mask="opaque/all.png") for view in scene.views)
     opaque = replace(scene, has_alpha=False, views=views)
-    bank = training_bank(inputs["ingest"], opaque, "train", downscale, progress)
-    assert bank.pixels.shape[1] == 3
+    dataset = training_dataset(inputs["ingest"], opaque, "train", downscale, progress)
+    assert dataset.pixels.shape[1] == 3
     used = view_mask(inputs["ingest"], opaque, opaque.views[1], downscale)
     assert used is not None and 0 < used.float().mean() < 0.5
-    assert bank.drawable == 6 * used.sum()
-    drawn = bank.lookup(bank.nth(torch.arange(bank.drawable))).colour * 255
+    assert dataset.unmasked_count == 6 * used.sum()
+    drawn = dataset.lookup(dataset.nth(torch.arange(dataset.unmasked_count))).colour * 255
     assert torch.equal(drawn, torch.tensor([30.0, 60.0, 200.0]).expand_as(drawn)), "no white of what was cut out"
     assert view_mask(inputs["ingest"], scene, scene.views[1], downscale) is None
 
 
 def test_an_opaque_photo_in_a_scene_with_alpha_covers_every_pixel(tmp_path: Path, progress: SilentProgress) -> None:
     inputs, scene = photographed(tmp_path, channels=3)
-    bank = training_bank(inputs["ingest"], replace(scene, has_alpha=True), "train", 1.0, progress)
-    assert bank.pixels.shape[1] == 4
-    assert (bank.pixels[:, 3] == 255).all()
-    assert torch.equal(bank.pixels[: WIDTH * HEIGHT, :3], torch.from_numpy(ball_photo()).flatten(0, 1))
+    dataset = training_dataset(inputs["ingest"], replace(scene, has_alpha=True), "train", 1.0, progress)
+    assert dataset.pixels.shape[1] == 4
+    assert (dataset.pixels[:, 3] == 255).all()
+    assert torch.equal(dataset.pixels[: WIDTH * HEIGHT, :3], torch.from_numpy(ball_photo()).flatten(0, 1))
 
 
-def test_cameras_of_test_views_do_not_enter_the_training_bank(tmp_path: Path, progress: SilentProgress) -> None:
+def test_cameras_of_test_views_do_not_enter_the_training_dataset(tmp_path: Path, progress: SilentProgress) -> None:
     inputs, scene = photographed(tmp_path)
     other = replace(CAMERA, params=(FOCAL, FOCAL, 1.0, 1.0))
     views = tuple(replace(view, camera=int(view.split == "train")) for view in scene.views)
     mixed = replace(scene, cameras=(other, CAMERA), views=views)
-    bank = training_bank(inputs["ingest"], mixed, "train", 1.0, progress)
-    assert bank.patches.shape[1] == WIDTH * HEIGHT
-    assert torch.equal(bank.patches, training_bank(inputs["ingest"], scene, "train", 1.0, progress).patches)
+    dataset = training_dataset(inputs["ingest"], mixed, "train", 1.0, progress)
+    assert dataset.patches.shape[1] == WIDTH * HEIGHT
+    assert torch.equal(dataset.patches, training_dataset(inputs["ingest"], scene, "train", 1.0, progress).patches)
 
 
 def test_evaluation_reads_the_pixels_that_training_stored(
@@ -129,7 +129,7 @@ def test_evaluation_reads_the_pixels_that_training_stored(
     reader = PhotoReader(ingest, scene, 2.0)
     decoded = [reader.pixels(view, WHITE) for view in (trained, unseen)]
     for split in ("train", "test"):
-        training_bank(ingest, scene, split, 2.0, progress)
+        training_dataset(ingest, scene, split, 2.0, progress)
     monkeypatch.setattr("stages.io.photos.load_pixels", None)
     for view, pixels in zip((trained, unseen), decoded, strict=True):
         assert torch.equal(reader.pixels(view, WHITE), pixels)
@@ -165,7 +165,7 @@ def test_how_many_photos_are_decoded_at_a_time_follows_from_what_their_files_hol
     monkeypatch.setattr("stages.io.photos.processors", lambda: 16)
     monkeypatch.setattr("stages.io.photos.DECODING_BYTES", 2 * 80 * WIDTH * HEIGHT)
     monkeypatch.setattr("stages.io.pixel_store.ThreadPoolExecutor", pool)
-    training_bank(inputs["ingest"], replace(scene, has_alpha=has_alpha), "train", downscale, progress)
+    training_dataset(inputs["ingest"], replace(scene, has_alpha=has_alpha), "train", downscale, progress)
     assert asked == [2]
 
 
@@ -185,9 +185,11 @@ def test_patches_bend_no_ray(lens: str, limit_px: float) -> None:
     width, height = scaled_size(camera, downscale)
     bearings = patch_bearings(camera, downscale)
     assert max(bearings.shape[:2]) == MAX_PATCHES < width
-    placed = Placement(torch.eye(3, 4)[None], torch.ones(1), torch.ones(1))
-    bank = ray_bank(torch.zeros(width * height, 3, dtype=torch.uint8), [(height, width)], [0], [bearings], placed)
-    found = bank.lookup(torch.arange(width * height))[0].directions
+    placed = PosedViews(torch.eye(3, 4)[None], torch.ones(1), torch.ones(1))
+    dataset = make_ray_dataset(
+        torch.zeros(width * height, 3, dtype=torch.uint8), [(height, width)], [0], [bearings], placed
+    )
+    found = dataset.lookup(torch.arange(width * height))[0].directions
     exact = camera_directions(camera, downscale).view(-1, 3)
     off_px = (found.double() - exact.double()).norm(dim=1).max() * camera.params[0] / downscale
     assert 0 < off_px < limit_px
@@ -210,8 +212,8 @@ def test_a_reduced_pixel_is_used_where_all_it_covers_is(
     width, height = scaled_size(CAMERA, downscale)
     assert used.shape == (height, width)
     assert torch.equal(used, (torch.arange(width) < columns).expand(height, width))
-    bank = training_bank(inputs["ingest"], scene, "train", downscale, progress)
-    assert (bank.drawable, len(bank.pixels)) == (6 * height * columns, 6 * height * width)
+    dataset = training_dataset(inputs["ingest"], scene, "train", downscale, progress)
+    assert (dataset.unmasked_count, len(dataset.pixels)) == (6 * height * columns, 6 * height * width)
     assert progress.notes[-1] == f"masks leave {columns / width:.0%} of the pixels of the train photos"
 
 
@@ -229,25 +231,25 @@ def test_masks_are_loaded_a_few_at_a_time_and_dropped(
     inputs, scene = photographed(tmp_path, views=16, mask=half_mask())
     monkeypatch.setattr("stages.ingest.masks.load_mask", load)
     monkeypatch.setattr("stages.io.photos.loaders", lambda files: 2)
-    bank = training_bank(inputs["ingest"], scene, "train", 1.0, progress)
+    dataset = training_dataset(inputs["ingest"], scene, "train", 1.0, progress)
     assert len(loaded) == 12 and 1 <= max(alive) <= 4
-    drawable = bank.may_be_drawn(torch.arange(len(bank.pixels))).view(12, HEIGHT, WIDTH)
-    assert torch.equal(drawable, torch.from_numpy(half_mask() > 0).expand(12, -1, -1))
+    unmasked_count = dataset.is_unmasked(torch.arange(len(dataset.pixels))).view(12, HEIGHT, WIDTH)
+    assert torch.equal(unmasked_count, torch.from_numpy(half_mask() > 0).expand(12, -1, -1))
 
 
 def test_no_photo_is_opened_where_the_pixels_are_there(
     tmp_path: Path, progress: SilentProgress, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     inputs, scene = photographed(tmp_path)
-    pixels = training_bank(inputs["ingest"], scene, "train", 1.0, progress).pixels
+    pixels = training_dataset(inputs["ingest"], scene, "train", 1.0, progress).pixels
     monkeypatch.setattr("PIL.Image.open", None)
-    assert torch.equal(training_bank(inputs["ingest"], scene, "train", 1.0, progress).pixels, pixels)
+    assert torch.equal(training_dataset(inputs["ingest"], scene, "train", 1.0, progress).pixels, pixels)
 
 
 def test_without_masks_nothing_is_kept_of_them(tmp_path: Path, progress: SilentProgress) -> None:
     inputs, scene = photographed(tmp_path)
     assert view_mask(inputs["ingest"], scene, scene.views[0], 1.0) is None
-    assert training_bank(inputs["ingest"], scene, "train", 1.0, progress).runs is None
+    assert training_dataset(inputs["ingest"], scene, "train", 1.0, progress).runs is None
     assert progress.notes == []
 
 
@@ -255,9 +257,9 @@ def test_masks_that_leave_nothing_at_a_size_are_said(tmp_path: Path, progress: S
     mask = np.zeros((HEIGHT, WIDTH), np.uint8)
     mask[4, 4] = 255
     inputs, scene = photographed(tmp_path, mask=mask)
-    assert training_bank(inputs["ingest"], scene, "train", 1.0, progress).drawable == 6
+    assert training_dataset(inputs["ingest"], scene, "train", 1.0, progress).unmasked_count == 6
     with pytest.raises(StageError) as error:
-        training_bank(inputs["ingest"], scene, "train", 2.0, progress)
+        training_dataset(inputs["ingest"], scene, "train", 2.0, progress)
     assert str(error.value) == (
         "nothing is left to train on: the masks ignore every pixel of the train photos at this size. "
         "Give a smaller --train.downscale."
@@ -269,13 +271,13 @@ def test_the_bank_knows_where_training_photos_show_points(
     downscale: float, tmp_path: Path, progress: SilentProgress
 ) -> None:
     inputs, scene = photographed(tmp_path)
-    bank = guided_bank(inputs, scene, downscale, progress)
-    assert bank.known is not None and bank.distance is not None
+    dataset = guided_dataset(inputs, scene, downscale, progress)
+    assert dataset.known is not None and dataset.distance is not None
     seen = seen_points(scene)
     trained = np.array([view.split == "train" for view in scene.views])[seen["view"]]
-    assert len(bank.known) == trained.sum() > 30
-    rays = bank.lookup(bank.known).rays
-    hit = rays.origins + bank.distance[:, None] * rays.directions
+    assert len(dataset.known) == trained.sum() > 30
+    rays = dataset.lookup(dataset.known).rays
+    hit = rays.origins + dataset.distance[:, None] * rays.directions
     # Rays run through the middles of pixels, points lie anywhere inside of them.
     half_a_pixel = 0.5 * 2**0.5 * downscale * 3.0 / FOCAL
     closest = torch.cdist(hit, torch.from_numpy(seen["xyz"])).min(-1).values
@@ -293,21 +295,21 @@ def test_points_guide_once_two_training_photos_saw_them(tmp_path: Path, progress
     for count, known in {len(rows) - 1: 0, len(rows): 2}.items():
         some = {name: seen[name][rows[:count]] if name in ("view", "point", "xy") else seen[name] for name in seen}
         write_tensors(inputs["normalise"] / "points.safetensors", some)
-        bank = guided_bank(inputs, scene, 1.0, progress)
-        assert (0 if bank.known is None else len(bank.known)) == known
+        dataset = guided_dataset(inputs, scene, 1.0, progress)
+        assert (0 if dataset.known is None else len(dataset.known)) == known
 
 
 def test_points_on_the_rim_of_what_alpha_shows_are_no_guide(tmp_path: Path, progress: SilentProgress) -> None:
     inputs, scene = photographed(tmp_path, channels=4)
-    bank, opaque = (guided_bank(inputs, each, 1.0, progress) for each in (scene, replace(scene, has_alpha=False)))
-    assert bank.known is not None and opaque.known is not None
-    assert (bank.pixels[bank.known, 3] == 255).all()
-    assert 0 < len(bank.known) < len(opaque.known)
+    dataset, opaque = (guided_dataset(inputs, each, 1.0, progress) for each in (scene, replace(scene, has_alpha=False)))
+    assert dataset.known is not None and opaque.known is not None
+    assert (dataset.pixels[dataset.known, 3] == 255).all()
+    assert 0 < len(dataset.known) < len(opaque.known)
 
 
 def test_points_on_masked_pixels_are_no_guide(tmp_path: Path, progress: SilentProgress) -> None:
     mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
     mask[:, WIDTH // 2 :] = 0
     inputs, scene = photographed(tmp_path, mask=mask)
-    known = guided_bank(inputs, scene, 1.0, progress).known
+    known = guided_dataset(inputs, scene, 1.0, progress).known
     assert known is not None and (known % WIDTH < WIDTH // 2).all()

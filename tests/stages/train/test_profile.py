@@ -14,7 +14,7 @@ from nerf.kernels import torch as reference
 from nerf.runtime.machine_rates import Rates
 from nerf.synthetic.scenes import ring_of_cameras
 from nerf.training.hash_grid_trainer import HashGridTrainer, HashGridTrainerSettings
-from nerf.training.ray_dataset import RayDataset, build_ray_bank
+from nerf.training.ray_dataset import RayDataset, ray_dataset_from_images
 from nerf.training.trainer import StepResult, VanillaTrainer, VanillaTrainerSettings
 from stages.hardware.backend import load_backend
 from stages.io.files import read_json
@@ -33,21 +33,23 @@ PAPER: dict[str, Any] = {"depth": 3, "width": 16, "skip": 1, "samples_coarse": 8
 COUNTED: dict[str, Any] = {"steps": 1, "rays": 8, "samples": 80, "densities": 200, "seconds": 1.0, "core_seconds": 1.0}
 
 
-def bank() -> RayDataset:
+def dataset() -> RayDataset:
     random = torch.Generator().manual_seed(0)
     photos = [torch.randint(256, (12, 12, 4), generator=random, dtype=torch.uint8) for _ in range(3)]
     poses = torch.stack([torch.tensor(pose, dtype=torch.float32) for pose in ring_of_cameras(3)])
     near, far = torch.full((3,), 0.2), torch.full((3,), 4.0)
-    return build_ray_bank(photos, [0, 0, 0], [pinhole_directions(12, 12, 14.0)], poses, near, far)
+    return ray_dataset_from_images(photos, [0, 0, 0], [pinhole_directions(12, 12, 14.0)], poses, near, far)
 
 
 def trainer(kind: str) -> HashGridTrainer | VanillaTrainer:
     if kind == "paper":
-        return VanillaTrainer(VanillaNerf(VanillaSettings(**PAPER), 0), bank(), VanillaTrainerSettings(32, 0, "random"))
+        return VanillaTrainer(
+            VanillaNerf(VanillaSettings(**PAPER), 0), dataset(), VanillaTrainerSettings(32, 0, "random")
+        )
     backend = load_backend("warp" if kind == "warp" else "torch", "cpu")
     settings = HashGridTrainerSettings(0, "random", samples=512, chunks=2, distortion=1e-3)
     return HashGridTrainer(
-        HashGridField(HashGridSettings(2, 4, 10, 8, 16, occupancy_resolution=16), 0, backend), bank(), settings
+        HashGridField(HashGridSettings(2, 4, 10, 8, 16, occupancy_resolution=16), 0, backend), dataset(), settings
     )
 
 

@@ -23,7 +23,7 @@ from nerf.kernels.torch.occupancy import binary_occupancy
 from nerf.runtime.parallel import take_over_cores
 from nerf.runtime.randomness import generator
 from nerf.training.hash_grid_trainer import HashGridTrainer, HashGridTrainerSettings
-from nerf.training.ray_dataset import RayDataset, build_ray_bank
+from nerf.training.ray_dataset import RayDataset, ray_dataset_from_images
 
 ROOT = Path(__file__).parents[4]
 
@@ -57,7 +57,7 @@ def test_kernels_are_compiled_on_all_cores_when_torch_has_given_them_up(
     assert torch.get_num_threads() == 1 and asked == [3]
 
 
-def noise_bank() -> RayDataset:
+def noise_dataset() -> RayDataset:
     """Two opposite views of coloured noise, opaque and transparent, from 3 units away."""
     grid = (torch.arange(12) + 0.5) / 12 - 0.5
     y, x = torch.meshgrid(grid, grid, indexing="ij")
@@ -67,7 +67,7 @@ def noise_bank() -> RayDataset:
     front = torch.tensor([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, -3]])
     back = torch.tensor([[-1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 3]])
     near, far = torch.full((2,), 1.0), torch.full((2,), 5.0)
-    return build_ray_bank([photo] * 2, [0, 0], [bearings], torch.stack([front, back]), near, far)
+    return ray_dataset_from_images([photo] * 2, [0, 0], [bearings], torch.stack([front, back]), near, far)
 
 
 BOUNDED = HashGridSettings(
@@ -82,9 +82,9 @@ def small_trainer(field: HashGridSettings) -> HashGridTrainer:
     settings = HashGridTrainerSettings(3, background, samples=512, chunks=4, distortion=1e-3, depth_loss=0.1)
     model = HashGridField(field, 0, warp)
     model.set_occupancy(warp.occupancy_bits(torch.rand(512, generator=torch.Generator().manual_seed(2)), 0.3))
-    opaque = (noise_bank().pixels[:, 3] == 255).nonzero()[:, 0]
+    opaque = (noise_dataset().pixels[:, 3] == 255).nonzero()[:, 0]
     trainer = HashGridTrainer(
-        model, noise_bank().with_distances(opaque, torch.full_like(opaque, 3.0, dtype=torch.float32)), settings
+        model, noise_dataset().with_sparse_depths(opaque, torch.full_like(opaque, 3.0, dtype=torch.float32)), settings
     )
     trainer.samples_per_ray.fill_(32)
     return trainer

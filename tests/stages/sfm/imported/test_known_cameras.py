@@ -14,6 +14,7 @@ from stages.io.photos import Photo
 from stages.io.sparse_model import SparseImage, SparseModel
 from stages.io.transforms_export import intrinsics
 from stages.sfm.colmap.models import write_model
+from stages.sfm.imported.conventions import PoseConvention
 from stages.sfm.imported.known_cameras import KnownCameras, _by_name, read_known_cameras
 
 W, H = 60, 40
@@ -289,6 +290,21 @@ def test_frames_that_are_listed_twice_alike_count_once(read) -> None:
     known = read([frame(0), frame(1), frame(1), frame(2)], **LENS)
     assert [image.file for image in known.model.images] == ["a0.png", "a1.png", "a2.png"]
     assert known.notes == ["1 frames are listed twice, alike: ./1"]
+
+
+def test_the_convention_of_poses_may_be_given(tmp_path: Path) -> None:
+    poses = [matrix(i) @ np.diag([1, -1, -1, 1]) for i in range(3)]
+    frames = [frame(i, transform_matrix=np.linalg.inv(pose).tolist()) for i, pose in enumerate(poses)]
+    (tmp_path / "t.json").write_text(json.dumps({**LENS, "frames": frames}))
+    convention = PoseConvention("camera-from-world", "opencv")
+    known = read_known_cameras(tmp_path / "t.json", PHOTOS, NAMES, convention)
+    cameras = [Camera("PINHOLE", W, H, (50.0, 52.0, 31.0, 19.0))]
+    inverted = [SparseImage(f"ä{i}.png", 0, np.linalg.inv(pose)[:3]) for i, pose in enumerate(poses)]
+    write_model(tmp_path / "model", SparseModel.without_points(cameras, inverted))
+    of_colmap = read_known_cameras(tmp_path / "model", PHOTOS, {}, PoseConvention("world-from-camera", None))
+    for model in (known.model, of_colmap.model):
+        for image, pose in zip(model.images, poses, strict=True):
+            np.testing.assert_allclose(image.sfm_from_camera, pose[:3], atol=1e-12)
 
 
 @pytest.mark.parametrize("with_test", [True, False])
