@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import pytest
 
@@ -9,7 +10,7 @@ from pipeline.engine.failures import StageFailed
 from stages.contract import StageError
 
 
-def error_of(caught: pytest.ExceptionInfo[Exception]) -> StageError:
+def error_of(caught: pytest.ExceptionInfo[Any]) -> StageError:
     """The StageError that was raised, by itself or as the end of a stage."""
     error = caught.value.error if isinstance(caught.value, StageFailed) else caught.value
     assert isinstance(error, StageError)
@@ -17,7 +18,7 @@ def error_of(caught: pytest.ExceptionInfo[Exception]) -> StageError:
 
 
 @contextmanager
-def refused(code: str, *values: object) -> Iterator[pytest.ExceptionInfo[Exception]]:
+def refused(code: str, *values: object) -> Iterator[pytest.ExceptionInfo[Any]]:
     """The block ends with the StageError of this code, whose sentences name all the ``values``."""
     with pytest.raises((StageError, StageFailed)) as caught:
         yield caught

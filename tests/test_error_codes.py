@@ -1,6 +1,5 @@
 """Every error that a user can act on has a code of its own, which begins with its stage or package."""
 
-import ast
 import re
 from collections import Counter
 from collections.abc import Iterator
@@ -9,46 +8,18 @@ import pytest
 
 from stages.contract import StageError
 from tests.refusals import refused
-from tests.test_architecture import OURS, Module, functions, module, offenders
+from tests.test_architecture import OURS, ROOT, Module, module, offenders
+from tests.wording import SNAPSHOT, code_of, made, package_of, snapshots
 
 CODE = re.compile(r"[a-z]+(\.[a-z]+(-[a-z]+)*)")
 
 
-def makers(modules: list[Module]) -> set[str]:
-    """What makes an error: StageError and the functions that are given its code."""
-    defined = (function for module in modules for function in functions(module.tree))
-    return {"StageError"} | {f.name for f in defined if f.args.args and f.args.args[0].arg == "code"}
-
-
-MAKERS = makers(OURS)
-
-
-def codes(module: Module) -> Iterator[ast.expr]:
-    """The code of each error that is made in a module, as it is written, but where a function hands on its own."""
-    for call in (node for node in ast.walk(module.tree) if isinstance(node, ast.Call)):
-        if isinstance(call.func, ast.Name) and call.func.id in MAKERS:
-            code = call.args[0]
-            if not (isinstance(code, ast.Name) and code.id == "code") and ast.unparse(code) != "error.code":
-                yield code
-
-
-def constants(module: Module) -> dict[str, str]:
-    """Names of texts at the top of a module."""
-    named = (node for node in module.tree.body if isinstance(node, ast.Assign) and isinstance(node.value, ast.Constant))
-    return {ast.unparse(node.targets[0]): str(ast.literal_eval(node.value)) for node in named}
-
-
-def text_of(code: ast.expr, module: Module) -> str:
-    return str(code.value) if isinstance(code, ast.Constant) else constants(module).get(ast.unparse(code), "")
-
-
 def wrong_codes(module: Module) -> Iterator[str]:
-    folder, package, *_ = module.name.split("/")
-    package = package if folder == "stages" else folder
-    for code in codes(module):
-        text = text_of(code, module)
-        if not CODE.fullmatch(text) or text.split(".")[0] != package:
-            yield f"{ast.unparse(code)} is not {package}.some-words"
+    package = package_of(module).split("/")[-1]
+    for call in made(module.tree):
+        code = code_of(call, module)
+        if not CODE.fullmatch(code) or code.split(".")[0] != package:
+            yield f"{code} is not {package}.some-words"
 
 
 def test_codes_name_the_package_they_come_from() -> None:
@@ -56,9 +27,23 @@ def test_codes_name_the_package_they_come_from() -> None:
 
 
 def test_a_code_is_used_once() -> None:
-    used = Counter(text_of(code, module) for module in OURS for code in codes(module))
+    used = Counter(code_of(call, module) for module in OURS for call in made(module.tree))
     assert len(used) > 110
     assert [code for code, times in used.items() if times > 1] == []
+
+
+def test_messages_are_worded_as_in_the_snapshots() -> None:
+    """Reworded on purpose: ``python -m tests.wording``, and read what it changed."""
+    found = {path.relative_to(ROOT).as_posix(): path.read_text("utf-8") for path in (ROOT / "tests").rglob(SNAPSHOT)}
+    wanted = snapshots()
+    assert sorted(found) == sorted(wanted)
+    changed = [
+        f"{path}: {line}"
+        for path, text in wanted.items()
+        for line in sorted(set(text.splitlines()) ^ set(found[path].splitlines()))
+    ]
+    assert changed == []
+    assert found == wanted
 
 
 def test_wrong_codes_are_found() -> None:

@@ -11,8 +11,8 @@ from skimage.measure import marching_cubes
 from nerf.geometry.scene import Camera, Scene, Similarity, View
 from nerf.synthetic.scenes import ring_of_cameras, still_life
 from pipeline.demo.truth import Truth, compare_with_truth, seen
-from stages.contract import StageError
 from stages.io.transforms_export import transforms
+from tests.refusals import refused
 
 LENS = Camera("OPENCV", 480, 360, (500.0, 502.0, 240.0, 180.0, 0.0, 0.0, 0.0, 0.0))
 SFM_FROM_TRUTH = Similarity(3.7, Rotation.from_euler("xyz", [0.4, -1.1, 2.0]).as_matrix(), np.array([5.0, -2.0, 9.0]))
@@ -125,5 +125,5 @@ def test_truth_survives_writing_and_a_broken_file_is_named(tmp_path: Path):
     assert again.to_json() == truth.to_json()
     assert again.camera == LENS
     (tmp_path / "truth.json").write_text("{")
-    with pytest.raises(StageError, match=r"cannot read truth\.json"):
+    with refused("io.damaged-fields", "truth.json"):
         Truth.read(tmp_path / "truth.json")

@@ -18,6 +18,7 @@ from stages.contract import StageError
 from stages.ingest import sources
 from tests.pipeline.engine import fake_stages
 from tests.pipeline.engine.fake_stages import FakeSettings, calls
+from tests.refusals import refused
 
 ALL = ("ingest", "sfm", "train")
 Bring = Callable[..., bool]
@@ -327,10 +328,10 @@ def test_a_full_disk_under_the_books_is_the_workspaces_fault(tmp_path: Path, mon
 
     with Workspace(tmp_path / "w.nerf") as workspace:
         monkeypatch.setattr("pipeline.engine.workspace.write_durably", full)
-        with pytest.raises(StageError, match="No space left on device"):
+        with refused("pipeline.cannot-write", "No space left on device"):
             workspace.write_run(workspace.read_run())
     monkeypatch.setattr(Path, "write_text", full)
-    with pytest.raises(StageError, match="No space left on device"), Workspace(tmp_path / "other.nerf"):
+    with refused("pipeline.cannot-write", "No space left on device"), Workspace(tmp_path / "other.nerf"):
         pass
     monkeypatch.undo()
     with Workspace(tmp_path / "other.nerf"):
@@ -379,15 +380,15 @@ def test_status_of_a_chain_that_stopped_early(bring: Bring, tmp_path: Path):
 
 def test_two_runs_on_one_workspace(bring: Bring, tmp_path: Path):
     bring()
-    with Workspace(tmp_path / "w.nerf"), pytest.raises(StageError, match="is in use") as caught:
+    with Workspace(tmp_path / "w.nerf"), refused("pipeline.workspace-in-use") as caught:
         bring()
     assert str(os.getpid()) in caught.value.why
 
 
 def test_a_folder_that_is_no_workspace(tmp_path: Path):
-    with pytest.raises(StageError, match=r"there is no run\.json in it"):
+    with refused("pipeline.no-workspace", "run.json"):
         Workspace.existing(tmp_path)
-    with pytest.raises(StageError, match="there is no such folder"):
+    with refused("pipeline.no-workspace", "no such folder"):
         Workspace.existing(tmp_path / "nowhere")
 
 

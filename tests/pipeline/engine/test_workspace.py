@@ -16,8 +16,8 @@ from pipeline.cli.commands import run_command
 from pipeline.engine.manifests import Manifest, describe_outputs, outputs_digest
 from pipeline.engine.status import status_of
 from pipeline.engine.workspace import COPIES, Workspace
-from stages.contract import StageError
 from stages.io.files import make_durable
+from tests.refusals import refused
 
 KEY = "0123456789abcdef"
 
@@ -49,9 +49,9 @@ def test_what_others_put_into_output_stays(tmp_path: Path):
         (tmp_path / "output").mkdir()
         (tmp_path / "output/mesh.ply").write_text("of another program")
         workspace.unlink_outputs(names)
-        with pytest.raises(StageError, match="none of this program's results"):
+        with refused("pipeline.not-a-result"):
             workspace.link_outputs(folder, names)
-    with pytest.raises(StageError, match="none of this program's results"), Workspace(tmp_path):
+    with refused("pipeline.not-a-result"), Workspace(tmp_path):
         pass
     assert (tmp_path / "output/mesh.ply").read_text() == "of another program"
 
@@ -76,7 +76,7 @@ def test_copies_make_way_where_links_are_not_allowed(tmp_path: Path, monkeypatch
     assert not any(output.iterdir())
     (output / "mesh.ply").write_text("the user's own")
     workspace.unlink_outputs(names)
-    with pytest.raises(StageError, match="is none of this program's results"):
+    with refused("pipeline.not-a-result"):
         workspace.link_outputs(result(tmp_path, 4), names)
     assert (output / "mesh.ply").read_text() == "the user's own"
 

@@ -17,6 +17,7 @@ from stages.contract import StageConfig, StageError
 from stages.hardware.backend import chosen_backend, load_backend
 from stages.io.field_files import load_field
 from stages.train import Config
+from tests.refusals import refused
 from tests.stages.photo_scene import photographed
 
 ROOT = Path(__file__).parents[3]
@@ -67,7 +68,7 @@ def test_where_kernels_cannot_be_kept_the_way_out_is_named(tmp_path: Path, monke
         raise OSError(errno.ENOSPC, "No space left on device", "/home/.cache")
 
     monkeypatch.setattr(warp, "compile_kernels", full)
-    with pytest.raises(StageError, match=r"cannot be kept here .* WARP_CACHE_PATH .* --train.backend torch"):
+    with refused("hardware.kernel-cache", "WARP_CACHE_PATH", "--train.backend torch"):
         load_backend("warp", "cpu")
 
 
@@ -115,7 +116,7 @@ def test_planning_chooses_and_keeps_a_backend(tmp_path: Path, progress, monkeypa
     monkeypatch.setattr(warp, "why_not", lambda device: OLD_DRIVER)
     assert train.plan(sized, inputs, progress).backend == "torch"
     assert progress.notes == [NOTE + OLD_DRIVER]
-    with pytest.raises(StageError, match=r"cannot use the Warp kernels: .*--train.backend torch"):
+    with refused("hardware.no-warp", "--train.backend torch"):
         train.plan(Config(**TINY, steps=10, backend="warp"), inputs, progress)
 
 

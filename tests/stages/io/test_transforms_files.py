@@ -11,6 +11,7 @@ from stages.contract import StageError
 from stages.io.photos import Photo
 from stages.io.transforms_files import read_transforms
 from stages.sfm.imported.known_cameras import KnownCameras, read_known_cameras
+from tests.refusals import refused
 
 LENS = {"camera_angle_x": 0.7}
 
@@ -68,14 +69,14 @@ def test_the_test_photos_of_blender_folders(
 
 
 def test_one_photo_in_two_places_is_an_error_still(tmp_path: Path) -> None:
-    with pytest.raises(StageError, match=r"two frames for the photo train/0\.png"):
+    with refused("sfm.two-frames", "train/0.png"):
         known(tmp_path, train=TRAIN, test=[frame("train/0", 9)])
 
 
 def test_validation_photos_that_are_not_needed_are_not_read(tmp_path: Path) -> None:
     (tmp_path / "transforms_val.json").write_text("{")
     assert known(tmp_path, train=TRAIN, test=TEST).test_files == ["test/0.png"]
-    with pytest.raises(StageError, match=r"cannot read transforms_val\.json"):
+    with refused("io.transforms-not-json", "transforms_val.json"):
         known(tmp_path, train=TRAIN, test=[])
 
 
@@ -98,5 +99,5 @@ def test_the_test_frames_of_a_single_file_are_its_test_photos(tmp_path: Path) ->
 
 def test_a_file_without_frames_is_no_path_to_render(tmp_path: Path) -> None:
     (tmp_path / "path.json").write_text('{"frames": []}')
-    with pytest.raises(StageError, match="its list 'frames' is empty"):
+    with refused("io.transforms-empty"):
         read_transforms(tmp_path / "path.json")

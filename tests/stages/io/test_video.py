@@ -5,8 +5,8 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 
-from stages.contract import StageError
 from stages.io.video import video_writer
+from tests.refusals import refused
 from tests.video_files import read_video
 
 COLOURS = [(200, 30, 30), (30, 200, 30), (30, 30, 200), (128, 128, 128), (255, 255, 255), (0, 0, 0)]
@@ -57,7 +57,7 @@ def test_a_browser_can_play_it_while_it_loads(tmp_path: Path) -> None:
 
 
 def test_a_video_that_cannot_be_written_is_an_error_with_the_encoders_words(tmp_path: Path) -> None:
-    with pytest.raises(StageError, match=r"cannot write a.mp4: .*No such file or directory"):
+    with refused("io.cannot-write-video", "a.mp4", "No such file or directory"):
         write(tmp_path / "missing/a.mp4", plain_frames() * 200)
 
 

@@ -7,6 +7,7 @@ from stages.contract import StageError
 from stages.mesh.cleaning import DILATION_STEPS, MIN_POINTS, SUPPORT_RADIUS, boundary, clean
 from stages.mesh.surface import Surface
 from stages.mesh.visibility import Visibility
+from tests.refusals import refused
 
 CORNERS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
 FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32)
@@ -116,7 +117,7 @@ def test_nothing_counts_as_hidden_where_all_would():
     strip = Surface(*long_strip())
     in_frustum = strip.vertices[:, 0] > 50
     view = Visibility(np.where(in_frustum, 5, 1), np.where(in_frustum, 1, 0), np.zeros((202, 3)))
-    with pytest.raises(StageError, match="no part of the surface is visible in the photos"):
+    with refused("mesh.nothing-seen"):
         clean(strip, view, points_at(*strip.vertices[:3]), "visible", 2, 0.0)
 
 

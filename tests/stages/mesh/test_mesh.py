@@ -20,6 +20,7 @@ from stages.mesh import extraction, resolution
 from stages.mesh import preview as mesh_preview
 from stages.mesh import visibility as mesh_visibility
 from stages.mesh.extraction import vertex_colours
+from tests.refusals import refused
 
 RADIUS = 0.4
 TURN = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
@@ -298,7 +299,7 @@ def test_a_grid_beyond_memory_is_refused_with_one_that_fits(run_mesh, monkeypatc
 
     memory = psutil.virtual_memory()._replace(available=16 * 40**3)
     monkeypatch.setattr(psutil, "virtual_memory", lambda: memory)
-    with pytest.raises(StageError, match="not enough memory for the mesh") as error:
+    with refused("hardware.not-enough-memory", "the mesh") as error:
         run_mesh(Solid(ball), resolution=64)
     assert error.value.hint == "Try --mesh.resolution 32."
 

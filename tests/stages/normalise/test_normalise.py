@@ -13,6 +13,7 @@ from stages.contract import StageError
 from stages.io.files import read_json, read_scene, read_tensors
 from stages.io.photos import Box, Photo, read_photos, write_photos
 from tests.camera_layouts import ball, ring, seen_by
+from tests.refusals import refused
 
 CAMERA = Camera("PINHOLE", 400, 400, (400.0, 400.0, 200.0, 200.0))
 
@@ -225,7 +226,7 @@ def test_an_official_split_is_kept(inputs, progress) -> None:
 
 def test_an_official_split_leaves_photos_to_train_on(inputs, progress) -> None:
     folders = inputs(9, test_files=[f"{i:02d}.png" for i in range(9)])
-    with pytest.raises(StageError, match=r"only 0 of 9 photos are left to train on: .* or change the given split\."):
+    with refused("normalise.few-training-photos", "0 of 9", "given split"):
         run(folders, progress)
 
 
@@ -265,12 +266,12 @@ def test_two_photos_are_too_few(inputs, progress) -> None:
 
 
 def test_a_region_without_size_is_refused(inputs, progress) -> None:
-    with pytest.raises(StageError, match=r"--normalise.roi has radius 0: the fourth number is the region's half side"):
+    with refused("normalise.roi-radius", 0):
         run(inputs(), progress, roi=(0.0, 0.0, 0.0, 0.0))
 
 
 def test_photos_from_one_place_are_refused_with_a_hint(inputs, progress) -> None:
-    with pytest.raises(StageError, match="the scene has no scale: all cameras stand in one place"):
+    with refused("normalise.no-scale", "all cameras stand in one place"):
         run(inputs(one_place=True), progress)
 
 

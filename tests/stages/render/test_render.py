@@ -21,6 +21,7 @@ from stages.io.files import read_json, write_json
 from stages.io.transforms_export import transforms
 from stages.render.path import CameraPath, fitted_path, median_camera, path_from_file, path_rays, resized
 from tests.camera_layouts import ring, wall
+from tests.refusals import refused
 from tests.video_files import read_video
 
 CAMERA = Camera("OPENCV", 160, 120, (150.0, 151.0, 82.0, 60.0, 0.05, 0.0, 0.0, 0.001))
@@ -236,7 +237,7 @@ def test_bearings_are_made_frame_by_frame_and_kept_while_the_lens_is_the_same(mo
 
 
 def test_cameras_and_path_exclude_each_other(inputs, progress, tmp_path: Path) -> None:
-    with pytest.raises(StageError, match=r"--render.cameras excludes --render.path and --render.frames"):
+    with refused("render.cameras-and-path"):
         run(inputs, progress, cameras=tmp_path / "x.json", frames=5)
 
 
@@ -280,13 +281,13 @@ def test_unusable_frames_are_named(frame, words: str, tmp_path: Path) -> None:
 
 def test_frames_beyond_all_screens_are_refused(tmp_path: Path) -> None:
     frame = {"file_path": "a", "transform_matrix": np.eye(4).tolist(), "w": 10**6, "h": 10}
-    with pytest.raises(StageError, match=r"cannot render the frames of t.json: one is 1000000 pixels long"):
+    with refused("render.large-frames", "t.json", 1000000):
         given_path({"frames": [frame]}, scene_with(ring(5)), tmp_path)
 
 
 def test_frames_of_different_size_make_no_video(tmp_path: Path) -> None:
     frame = {"file_path": "a", "transform_matrix": np.eye(4).tolist()}
-    with pytest.raises(StageError, match=r"cannot make one video of t.json: its frames differ in size"):
+    with refused("render.frame-sizes", "t.json"):
         given_path({"frames": [frame, frame | {"w": 10, "h": 10}]}, scene_with(ring(5)), tmp_path)
 
 

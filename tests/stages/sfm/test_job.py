@@ -10,10 +10,10 @@ import pytest
 from PIL import Image
 
 from stages import sfm
-from stages.contract import StageError
 from stages.sfm import worker_process
 from stages.sfm.job import PHASE_SECONDS, Job, JobState, PhaseTimer
 from stages.sfm.retry_strategies import MAX_SECONDS_LIMIT, NO_TIME, OUT_OF_TIME, TIME_GIVEN, skipped_for_time
+from tests.refusals import refused
 from tests.stages.sfm.sfm_inputs import SMALL, ingested
 from tests.synthetic_photos import SyntheticPhotos
 
@@ -108,7 +108,7 @@ def test_a_run_that_goes_on_knows_what_the_one_before_it_took(
     )
     with monkeypatch.context() as patched:
         patched.setattr(worker_process, "COMMAND", ["-c", killed])
-        with pytest.raises(StageError, match="was ended by SIGKILL while matching"):
+        with refused("sfm.worker-killed", "SIGKILL", "matching"):
             sfm.run(SMALL, folders, tmp_path / "sfm", progress)
     total, phases = json.loads((tmp_path / "sfm/strategies" / PHASE_SECONDS).read_text())
     assert phases["default: matching"] > 2 and total > phases["default: matching"] + phases["default: features"]

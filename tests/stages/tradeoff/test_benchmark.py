@@ -20,6 +20,7 @@ from stages.tradeoff.benchmark import (
     train_and_score,
 )
 from stages.tradeoff.schedule import Run
+from tests.refusals import refused
 from tests.stages.photo_scene import HEIGHT, WIDTH, photographed
 
 RUN = Run("grid", "bounded", 1.0, 100, 0, 1.0)
@@ -84,6 +85,6 @@ def test_where_masks_leave_too_little_the_best_places_are_taken(
 
 
 def test_masks_that_leave_nothing_are_said(tmp_path: Path) -> None:
-    with pytest.raises(StageError, match="nothing to score a study by") as caught:
+    with refused("tradeoff.no-pixels-to-score") as caught:
         masked_benchmark(tmp_path, (slice(0, 0), slice(0, 0)))
     assert "masks leave next to nothing" in caught.value.why

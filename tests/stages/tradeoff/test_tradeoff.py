@@ -22,6 +22,7 @@ from stages.tradeoff import Config, schedule, study
 from stages.tradeoff import benchmark as benchmark_module
 from stages.tradeoff.benchmark import score_workspace_field
 from stages.tradeoff.schedule import FEWER_RAYS, PUBLISHED, VARIANTS, WORKSPACE_FIELD, Run, Speed
+from tests.refusals import refused
 from tests.stages.photo_scene import photographed
 
 TINY_GRID: dict[str, Any] = {"levels": 2, "log2_rows": 10, "finest": 32, "batch_samples": 1024}
@@ -315,7 +316,7 @@ def test_want_of_memory_ends_the_study_which_goes_on_with_that_training(
 
     monkeypatch.setattr(train, "run", short_of_memory)
     small = {"seconds": 8.0, "seeds": 1}
-    with pytest.raises(StageError, match=r"stopped at grid, full resolution, \d+ steps, seed 0: not enough memory"):
+    with refused("tradeoff.stopped", "grid, full resolution", "seed 0", "not enough memory"):
         studied(tmp_path, photos, progress, **small)
     studied(tmp_path, photos, progress, **small)
     assert asked[2] == asked[1], "the first one is not trained again, the second one is"
@@ -333,12 +334,12 @@ def test_without_held_out_photos_there_is_no_study(tmp_path: Path, photos: dict[
         shutil.copytree(folder, inputs[name])
     scene = (inputs["normalise"] / "scene.json").read_text()
     (inputs["normalise"] / "scene.json").write_text(scene.replace('"test"', '"train"'))
-    with pytest.raises(StageError, match="no photo of this scene was kept for testing"):
+    with refused("tradeoff.no-test-photos"):
         tradeoff.plan(Config(), inputs, progress)
 
 
 def test_too_little_time_is_said_with_numbers(tmp_path: Path, photos: dict[str, Path], progress: Any) -> None:
-    with pytest.raises(StageError, match=r"2 s are too short here even for grid at full resolution: 20, 12, 7, 4"):
+    with refused("tradeoff.no-result", "2 s", "grid at full resolution", "20, 12, 7, 4"):
         studied(tmp_path, photos, progress, seconds=2.0)
 
 

@@ -16,6 +16,7 @@ from stages.io.transforms_export import intrinsics
 from stages.sfm.colmap.models import write_model
 from stages.sfm.imported.conventions import PoseConvention
 from stages.sfm.imported.known_cameras import KnownCameras, _by_name, read_known_cameras
+from tests.refusals import refused
 
 W, H = 60, 40
 
@@ -231,7 +232,7 @@ def test_what_is_no_camera_is_refused_by_name(read, changes: dict[str, Any], mes
 
 
 def test_no_focal_length_at_all_is_refused(read) -> None:
-    with pytest.raises(StageError, match=r"camera of frame './0': no focal length in it: neither fl_x nor camera_ang"):
+    with refused("sfm.frame-intrinsics", "./0", "fl_x", "camera_ang"):
         read([frame(0, camera_angle_x=40)])
 
 
@@ -276,13 +277,13 @@ def test_frames_without_photo_and_photos_without_frame_are_named(read) -> None:
 
 
 def test_no_frame_with_a_photo_is_an_error(read) -> None:
-    with pytest.raises(StageError, match=r"no camera in transforms.json belongs to a photo: it is of \./8, \./9, and"):
+    with refused("sfm.no-camera-matches", "transforms.json", "./8, ./9"):
         read([frame(8), frame(9)], **LENS)
 
 
 def test_a_photo_has_one_frame(read) -> None:
     for second in (frame(1, fl_x=51.0), frame(1, transform_matrix=matrix(2).tolist())):
-        with pytest.raises(StageError, match=r"two frames for the photo ä1.png differ: './1' is listed twice"):
+        with refused("sfm.two-frames", "ä1.png", "./1"):
             read([frame(1), second], **LENS)
 
 
@@ -391,7 +392,7 @@ def test_a_colmap_model_of_larger_photos_is_scaled(tmp_path: Path) -> None:
 def test_a_colmap_model_of_panoramas_is_refused(tmp_path: Path) -> None:
     given = colmap_model(tmp_path, ["ä0.png", "ä1.png"])
     write_model(tmp_path, dataclasses.replace(given, cameras=[Camera("EQUIRECTANGULAR", W, H, (float(W), float(H)))]))
-    with pytest.raises(StageError, match=r"the camera of 'ä0\.png': panoramas are not supported"):
+    with refused("sfm.degenerate-camera", "ä0.png", "panoramas"):
         read_known_cameras(tmp_path, PHOTOS, {})
 
 

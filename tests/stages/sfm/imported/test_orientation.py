@@ -12,7 +12,6 @@ from PIL import Image
 
 from nerf.geometry.scene import Camera
 from stages import ingest, normalise, sfm
-from stages.contract import StageError
 from stages.ingest.decoding import upright
 from stages.io.photos import Photo, load_pixels, read_photos
 from stages.io.sparse_model import SparseImage, SparseModel
@@ -22,6 +21,7 @@ from stages.sfm.colmap.models import read_model, write_model
 from stages.sfm.imported.known_cameras import KnownCameras, read_known_cameras
 from stages.sfm.imported.orientation import QUARTER_TURNS, pixel_map, turned_camera, turned_pose
 from tests.camera_layouts import ring
+from tests.refusals import refused
 from tests.stages.ingest.photo_files import exif_with
 
 WIDTH, HEIGHT = 60, 40
@@ -183,7 +183,7 @@ def read_one(folder: Path, taken: Photo, **values: Any) -> KnownCameras:
 
 @pytest.mark.parametrize("orientation", [2, 4, 5, 7])
 def test_no_camera_is_mirrored(orientation: int, tmp_path: Path) -> None:
-    with pytest.raises(StageError, match=rf"EXIF orientation {orientation} of p\.jpg mirrors the photo"):
+    with refused("sfm.mirrored-photo", orientation, "p.jpg"):
         read_one(tmp_path, turned_photo(orientation), w=WIDTH, h=HEIGHT)
     photo = turned_photo(orientation)  # a camera of what ingest made of it needs no mirroring
     known = read_one(tmp_path, photo, w=photo.width, h=photo.height, photo="p.jpg")
@@ -200,7 +200,7 @@ def test_a_camera_that_only_fits_the_upright_photo_is_of_that(orientation: int, 
 
 
 def test_a_camera_that_fits_neither_is_refused_with_the_size_it_came_with(tmp_path: Path) -> None:
-    with pytest.raises(StageError, match=r"it is for 80×40 pixels, the photo has 40×60"):
+    with refused("sfm.photo-shape", "80×40", "40×60"):
         read_one(tmp_path, turned_photo(6), w=80, h=40)
 
 

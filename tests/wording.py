@@ -1,0 +1,119 @@
+"""How errors and notes are worded, in one snapshot a stage: ``python -m tests.wording`` writes them from the source.
+
+A snapshot is tests/stages/<stage>/messages.txt, or tests/pipeline/messages.txt: each code with what happened, why, and
+what to try; then the notes of each module. A value that the program fills in stands there in braces as the source names
+it; where one of several sentences is chosen, each has a line.
+"""
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+from tests.test_architecture import OURS, ROOT, Module
+
+SNAPSHOT = "messages.txt"
+
+
+def makers(modules: list[Module]) -> dict[str, ast.FunctionDef | None]:
+    """What makes an error, StageError and the functions that are given its code, with how they are defined."""
+    found: dict[str, ast.FunctionDef | None] = {"StageError": None}
+    for node in (node for module in modules for node in ast.walk(module.tree)):
+        if isinstance(node, ast.FunctionDef) and node.args.args and node.args.args[0].arg == "code":
+            found[node.name] = node
+    return found
+
+
+MAKERS = makers(OURS)
+
+
+def package_of(module: Module) -> str:
+    """``stages/sfm`` for all of that stage, ``pipeline`` for all of the pipeline."""
+    parts = module.name.split("/")
+    return "/".join(parts[:2]) if parts[0] == "stages" else parts[0]
+
+
+def made(tree: ast.AST) -> Iterator[ast.Call]:
+    """Calls that make an error with a code of its own."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in MAKERS and node.args:
+            code = ast.unparse(node.args[0])
+            if code not in ("code", "error.code"):
+                yield node
+
+
+def assigned(tree: ast.AST, own: bool = False) -> dict[str, list[ast.expr]]:
+    """What stands behind a name: every expression that it is given in ``tree``, or at its top alone (``own``)."""
+    found: dict[str, list[ast.expr]] = {}
+    for node in ast.iter_child_nodes(tree) if own else ast.walk(tree):
+        if isinstance(node, ast.Assign | ast.AnnAssign | ast.AugAssign) and node.value is not None:
+            for target in node.targets if isinstance(node, ast.Assign) else [node.target]:
+                names = target.elts if isinstance(target, ast.Tuple) else [target]
+                values = node.value.elts if isinstance(node.value, ast.Tuple) else [node.value] * len(names)
+                for name, value in zip(names, values, strict=False):
+                    found.setdefault(ast.unparse(name), []).append(value)
+    return found
+
+
+def sentences(expression: ast.expr, names: dict[str, list[ast.expr]], depth: int = 3) -> list[str]:
+    """The texts that an expression may have, values in braces."""
+    if isinstance(expression, ast.Constant):
+        return [str(expression.value)]
+    if isinstance(expression, ast.IfExp):
+        return [*sentences(expression.body, names, depth), *sentences(expression.orelse, names, depth)]
+    if isinstance(expression, ast.BoolOp):
+        return [text for value in expression.values for text in sentences(value, names, depth)]
+    if isinstance(expression, ast.Name) and depth and expression.id in names:
+        return [text for value in names[expression.id] for text in sentences(value, names, depth - 1)]
+    if isinstance(expression, ast.JoinedStr):
+        parts = [
+            part.value if isinstance(part, ast.Constant) else "{" + ast.unparse(part.value) + "}"
+            for part in expression.values
+            if isinstance(part, ast.Constant | ast.FormattedValue)
+        ]
+        return ["".join(map(str, parts))]
+    return ["{" + ast.unparse(expression) + "}"]
+
+
+def code_of(call: ast.Call, module: Module) -> str:
+    (code,) = sentences(call.args[0], assigned(module.tree, own=True))
+    return code
+
+
+def wording(module: Module) -> Iterator[tuple[str, list[str]]]:
+    """Each code of a module with how it is worded, and its path with its notes."""
+    constants = assigned(module.tree, own=True)
+    scopes = [node for node in ast.walk(module.tree) if isinstance(node, ast.FunctionDef)]
+
+    def texts(call: ast.Call, parts: list[ast.expr]) -> list[str]:
+        inside = [scope for scope in scopes if call in ast.walk(scope)]
+        names = constants | {name: values for scope in inside for name, values in assigned(scope).items()}
+        return list(dict.fromkeys(text for part in parts for text in sentences(part, names)))
+
+    for call in made(module.tree):
+        yield code_of(call, module), texts(call, call.args[1:])
+    notes = [node for node in ast.walk(module.tree) if isinstance(node, ast.Call) and _is_note(node)]
+    if said := [text for call in notes for text in texts(call, call.args)]:
+        yield module.name, said
+
+
+def _is_note(call: ast.Call) -> bool:
+    return isinstance(call.func, ast.Attribute) and call.func.attr == "note"
+
+
+def snapshots() -> dict[str, str]:
+    """Every snapshot: its path from the root and what it holds."""
+    messages: dict[str, dict[str, list[str]]] = {}
+    for module in OURS:
+        for code, lines in wording(module):
+            messages.setdefault(package_of(module), {})[code] = lines
+    return {
+        f"tests/{package}/{SNAPSHOT}": "".join(
+            f"{code}\n" + "".join(f"  {line}\n" for line in lines) for code, lines in sorted(found.items())
+        )
+        for package, found in messages.items()
+    }
+
+
+if __name__ == "__main__":
+    for path, text in snapshots().items():
+        Path(ROOT / path).write_text(text, "utf-8")
