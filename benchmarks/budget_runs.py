@@ -21,7 +21,7 @@ import torch
 
 from nerf.fields.hash_grid import HashGridField
 from nerf.geometry.scene import Scene
-from nerf.training import hash_grid_trainer as grid_training
+from nerf.training import hash_grid_trainer
 from nerf.training.hash_grid_trainer import HashGridTrainer
 from nerf.training.ray_dataset import RayDataset
 from nerf.training.schedule import schedule_of
@@ -121,7 +121,7 @@ def train_run(bench: Bench, seed: int, steps: int, schedule: str) -> dict[str, A
     plan = schedule_of(steps) if schedule == "whole" else schedule_of(steps // 2).extended(steps)
     points, pace, rays = [], 0.0, 0
     for step in range(steps):
-        result = trainer.step(step, plan.share(step))
+        result = trainer.step(step, plan.progress(step))
         pace += (result.psnr - pace) * max(1 / (step + 1), 0.02)
         rays += result.rays
         if (step + 1) % MEAN_EVERY == 0:
@@ -143,7 +143,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, nargs="+", default=BUDGETS)
     parser.add_argument("--schedule", choices=SCHEDULES, default="whole")
     parser.add_argument(
-        "--constant", type=float, default=grid_training.LR_HOLD_FRACTION, help="share before the rate falls"
+        "--constant", type=float, default=hash_grid_trainer.LR_HOLD_FRACTION, help="share before the rate falls"
     )
     given = parser.parse_args()
     runs = json.loads(given.runs.read_text()) if given.runs.exists() else []
@@ -151,7 +151,7 @@ def main() -> None:
         bench = None
         for seed, steps in product(given.seeds, given.steps):
             run = {"set": workspace.stem, "seed": seed, "steps": steps, "schedule": given.schedule}
-            run["constant"] = grid_training.LR_HOLD_FRACTION = given.constant
+            run["constant"] = hash_grid_trainer.LR_HOLD_FRACTION = given.constant
             if any(run.items() <= made.items() for made in runs):
                 continue
             bench = bench or bench_of(workspace)

@@ -1,4 +1,4 @@
-"""What the grid field reaches on real sets in so many seconds of training: held-out quality, speed, memory.
+"""What the hash-grid field reaches on real sets in so many seconds of training: held-out quality, speed, memory.
 
     python -m benchmarks.fast_field ../shared/data --workspaces /tmp/fast_field [--only lego_400 fox/2.4/60]
 

@@ -1,4 +1,4 @@
-"""Trains the grid field on a scene with Blender-style cameras and prints held-out PSNR against training seconds.
+"""Trains the hash-grid field on a scene with Blender-style cameras and prints held-out PSNR against training seconds.
 
 python -m benchmarks.grid_field ../shared/data/lego_400 --downscale 2 --seconds 60 --picture lego.png
 """
@@ -41,10 +41,10 @@ def read_dataset(folder: Path, split: str, downscale: int, every: int) -> RayDat
     height, width = photos[0].shape[:2]
     focal = width / 2 / math.tan(cameras["camera_angle_x"] / 2)
     y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
-    bearings = torch.stack([(x - width / 2) / focal, (y - height / 2) / focal, torch.ones_like(x)], -1)
+    ray_directions = torch.stack([(x - width / 2) / focal, (y - height / 2) / focal, torch.ones_like(x)], -1)
     near, far = torch.full((len(poses),), 0.1), torch.full((len(poses),), 10.0)
-    bearings /= bearings.norm(dim=-1, keepdim=True)
-    return ray_dataset_from_images(photos, [0] * len(poses), [bearings], torch.stack(poses), near, far)
+    ray_directions /= ray_directions.norm(dim=-1, keepdim=True)
+    return ray_dataset_from_images(photos, [0] * len(poses), [ray_directions], torch.stack(poses), near, far)
 
 
 def _smaller(pixels: np.ndarray, factor: int) -> np.ndarray:

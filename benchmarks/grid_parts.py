@@ -1,4 +1,4 @@
-"""Where a training step of the grid field spends its time, beside what this machine can do.
+"""Where a training step of the hash-grid field spends its time, beside what this machine can do.
 
     python -m benchmarks.grid_parts ../shared/data/lego_400 --workspace /tmp/lego.nerf [--seconds 300] [--downscale 1]
 

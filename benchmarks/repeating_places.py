@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf.geometry.camera_paths import look_at
-from nerf.synthetic import textures as solid_texture
+from nerf.synthetic import textures
 from nerf.synthetic.scenes import Solid, SyntheticScene
 from nerf.synthetic.shapes import Box, Frustum, Shape, Sphere, Torus
 from nerf.synthetic.textures import Colour, Noise, make_noise, mix, speckled
@@ -19,12 +19,12 @@ from nerf.synthetic.textures import Colour, Noise, make_noise, mix, speckled
 FOREVER = 1e6  # scene units: a period that no scene reaches the end of
 SOFT = 0.012  # scene units over which painted edges pass from one colour to the other
 UNIQUE = (
-    solid_texture.marble,
-    solid_texture.wrapping,
-    solid_texture.doughnut,
-    solid_texture.peel,
-    solid_texture.banded,
-    solid_texture.foliage,
+    textures.marble,
+    textures.wrapping,
+    textures.doughnut,
+    textures.peel,
+    textures.banded,
+    textures.foliage,
 )
 
 Poses = Float[np.ndarray, "photos 3 4"]
@@ -166,13 +166,13 @@ def table_room(count: int) -> SyntheticScene:
     solids = [
         placed(Box((1.1, 1.1, 0.05)), partial(tiles, noise, 0.2, 0.8), (0, 0, -0.05)),
         placed(Box((side, side, 0.05)), partial(tiles, noise, 0.6, FOREVER), (0, 0, floor - 0.05)),
-        placed(Box((0.22, 0.18, 0.15)), scaled(solid_texture.wrapping, 2, 1.0), (-0.45, 0.40, 0.146), 26),
-        placed(Sphere(0.22), scaled(solid_texture.marble, 3, 1.0), (0.45, 0.45, 0.215)),
-        placed(Frustum(0.15, 0.22, 0.2), scaled(solid_texture.banded, 4, 1.0), (-0.50, -0.45, 0.196), 17),
-        placed(Torus(0.19, 0.085), scaled(solid_texture.doughnut, 5, 1.0), (0.30, -0.50, 0.08), 40),
+        placed(Box((0.22, 0.18, 0.15)), scaled(textures.wrapping, 2, 1.0), (-0.45, 0.40, 0.146), 26),
+        placed(Sphere(0.22), scaled(textures.marble, 3, 1.0), (0.45, 0.45, 0.215)),
+        placed(Frustum(0.15, 0.22, 0.2), scaled(textures.banded, 4, 1.0), (-0.50, -0.45, 0.196), 17),
+        placed(Torus(0.19, 0.085), scaled(textures.doughnut, 5, 1.0), (0.30, -0.50, 0.08), 40),
         placed(Frustum(0.20, 0.26, 0.02), partial(plain, (0.80, 0.80, 0.78)), (0.02, 0.02, 0.018)),
     ]
-    cupboard = Box((0.5, 0.35, 0.7)), scaled(solid_texture.banded, 6, 0.6)
+    cupboard = Box((0.5, 0.35, 0.7)), scaled(textures.banded, 6, 0.6)
     solids += [placed(*cupboard, (2.9, 2.9, floor + 0.69), 45), placed(*cupboard, (-2.9, -2.9, floor + 0.69), 225)]
     for wall, texture in enumerate((paper, paint, paper, paint)):
         turn_deg = 90.0 * wall
@@ -251,15 +251,15 @@ def building(count: int) -> SyntheticScene:
     solids = [
         placed(*front, (0, -SHORT, 0)),
         placed(*front, (0, SHORT, 0), 180),
-        placed(ends, scaled(solid_texture.marble, 4, 0.45), (LONG - 0.06, 0, 0), 90),
-        placed(ends, scaled(solid_texture.wrapping, 5, 0.45), (0.06 - LONG, 0, 0), 270),
+        placed(ends, scaled(textures.marble, 4, 0.45), (LONG - 0.06, 0, 0), 90),
+        placed(ends, scaled(textures.wrapping, 5, 0.45), (0.06 - LONG, 0, 0), 270),
         placed(Box((LONG + 0.15, SHORT + 0.2, 0.06)), partial(plain, (0.32, 0.14, 0.10)), (0, 0, TALL + 0.05)),
         placed(Box((14, 14, 0.05)), partial(tiles, noise, 0.9, 5.4), (0, 0, -TALL - 0.05)),
     ]
     for turn_deg, y, signs, flowers in ((0.0, -SHORT, [-2.5, 0.5], -1.0), (180.0, SHORT, [-1.5, 2.5], 1.0)):
         solids += pictures(random, (0, math.copysign(0.05, y) + y), turn_deg, signs)
         sill = Box((0.3, 0.09, 0.07))
-        texture = scaled(solid_texture.foliage, int(random.integers(1 << 30)), 0.8)
+        texture = scaled(textures.foliage, int(random.integers(1 << 30)), 0.8)
         outside = math.copysign(0.1, y)
         solids.append(placed(sill, texture, (math.copysign(flowers, flowers * y), y + outside, -0.38), turn_deg))
     return SyntheticScene(tuple(solids), noise)

@@ -31,7 +31,7 @@ from benchmarks.sfm_speed import Timed
 from nerf.geometry.alignment import align
 from nerf.geometry.camera_paths import look_at
 from nerf.geometry.scene import Camera
-from nerf.synthetic import textures as solid_texture
+from nerf.synthetic import textures
 from nerf.synthetic.scenes import Solid, SyntheticScene, photograph
 from nerf.synthetic.shapes import Box
 from nerf.synthetic.textures import make_noise
@@ -43,7 +43,7 @@ LENS = Camera("SIMPLE_RADIAL", 320, 240, (300.0, 160.0, 120.0, -0.05))
 STEP = 0.25  # scene units between photos
 AWAY = 2.5  # from the houses
 VISIBLE = 4.0  # along the street
-TEXTURES = (solid_texture.marble, solid_texture.wrapping, solid_texture.doughnut, solid_texture.peel)
+TEXTURES = (textures.marble, textures.wrapping, textures.doughnut, textures.peel)
 
 
 def street(length: float, random: np.random.Generator) -> SyntheticScene:

@@ -13,13 +13,13 @@ FIELD_OF_VIEW_TAN = 0.5
 def seen_by(poses: np.ndarray, points: np.ndarray) -> Reconstruction:
     """A reconstruction in which every camera observes all points that fall into its square field of view."""
     grid = np.linspace(-FIELD_OF_VIEW_TAN, FIELD_OF_VIEW_TAN, 9)
-    bearings = np.stack([*np.meshgrid(grid, grid), np.ones((9, 9))], axis=-1).reshape(-1, 3)
-    bearings /= np.linalg.norm(bearings, axis=1, keepdims=True)
+    ray_directions = np.stack([*np.meshgrid(grid, grid), np.ones((9, 9))], axis=-1).reshape(-1, 3)
+    ray_directions /= np.linalg.norm(ray_directions, axis=1, keepdims=True)
     local = np.einsum("nji,nmj->nmi", poses[:, :, :3], points[None] - poses[:, None, :, 3])
     depth = np.where(local[..., 2] > 0, local[..., 2], np.inf)
     inside = (np.abs(local[..., :2]).max(axis=-1) <= FIELD_OF_VIEW_TAN * depth) & np.isfinite(depth)
     view, point = np.nonzero(inside)
-    return Reconstruction(poses, np.repeat(bearings[None], len(poses), axis=0), points, view, point)
+    return Reconstruction(poses, np.repeat(ray_directions[None], len(poses), axis=0), points, view, point)
 
 
 def opaque_everywhere(scene: Reconstruction) -> Reconstruction:

@@ -122,8 +122,8 @@ def _write_scene(
     has_alpha: bool,
 ) -> None:
     points, view, point, xy = tracks
-    bearings = pinhole_directions(32, 32, 32 * FOCAL / WIDTH).reshape(-1, 3).double().numpy()
-    sfm = Reconstruction(poses, np.repeat(bearings[None], len(poses), 0), points, view, point)
+    ray_directions = pinhole_directions(32, 32, 32 * FOCAL / WIDTH).reshape(-1, 3).double().numpy()
+    sfm = Reconstruction(poses, np.repeat(ray_directions[None], len(poses), 0), points, view, point)
     found = normalise(opaque_everywhere(sfm) if has_alpha else sfm, None)
     views = tuple(
         View(

@@ -15,7 +15,7 @@ OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0])
 
 
 def pinhole_directions(width: int, height: int, focal_px: float) -> torch.Tensor:
-    """Unit bearing vectors (height, width, 3) of the pixel centres of an ideal camera."""
+    """Unit ray directions (height, width, 3) of the pixel centres of an ideal camera."""
     x, y = np.meshgrid(np.arange(width) + 0.5 - width / 2, np.arange(height) + 0.5 - height / 2)
     rays = np.stack([x, y, np.full_like(x, focal_px)], -1)
     return torch.tensor(rays / np.linalg.norm(rays, axis=-1, keepdims=True), dtype=torch.float32)

@@ -13,7 +13,28 @@ KINDS = (".py", ".md", ".toml", ".j2")
 FOLDERS = ("nerf", "stages", "pipeline", "tests", "benchmarks", "docs")
 EXEMPT = "tests/test_vocabulary.py"
 
-SCENE_FIELDS_RENDERING: dict[str, str] = {}
+SCENE_FIELDS_RENDERING: dict[str, str] = {
+    r"Paper(Nerf|Mlp|Settings|Trainer)": "Vanilla*",
+    r"\bGrid(Field|Settings|Pass|Gradients|Trainer|TrainerSettings|Batch)\b": "HashGrid*",
+    r"(?i)density.?cache": "occupancy grid",
+    r"\b(raise_cache|occupied_bits|cache_cells)\b": "scatter_max, occupancy_bits, occupancy_resolution",
+    r"\bMOST_CLEAR\b|\bclearance\b": "empty-space distance",
+    r"\bLattice\b|\blattice_(distance|coordinate|measure)\b": "RayStepping, s_to_t, t_to_s, normalised_distance",
+    r"density.lattice": "density grid",
+    r"\b(end_wave|pack_waves|front_to_back)\b|\bwaves of samples\b": "marching rounds, march_with_early_termination",
+    r"HIDDEN_BEHIND": "EARLY_STOP_TRANSMITTANCE",
+    r"quantum of light|\bQUANTUM\b|\b(drawn_samples|add_drawn)\b": "opacity-quantised colour sampling",
+    r"LEAST_CHANCE": "MIN_KEEP_PROBABILITY",
+    r"\bsky_(colour|backward)\b|\binitial_sky\b": "background model",
+    r"usable_cells": "frustum mask",
+    r"robust_error|LARGEST_PULL": "Huber loss",
+    r"(?i)ray.?bank": "ray dataset",
+    r"PixelOrder|\bSTRATUM\b": "pixel sampler, block",
+    r"\bbearings?\b": "ray directions",
+    r"range_between_views": "near_and_far_between_views",
+    r"\b(StepPlan|Decision)\b": "StepSchedule, ScheduleRevision",
+    r"\bGUIDED_EVERY\b": "sparse depth supervision",
+}
 
 EFFECTS: dict[str, str] = {}
 

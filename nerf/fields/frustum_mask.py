@@ -1,4 +1,4 @@
-"""Where a field of folded space may put things, by how many photos look there.
+"""Where a field of contracted space may put things, by how many photos look there.
 
 What one photo alone sees can be explained by something at any distance, also right before its camera; and what two see
 often can, where it is dark or plain. A field puts it there, in the way of every other view. (Philip and Deschaintre
@@ -31,7 +31,7 @@ _answers: MutableMapping[Tensor, dict[tuple[int, int], Tensor]] = WeakTensorKeyD
 
 
 def compute_frustum_mask(dataset: RayDataset, least: int, cells: int) -> Bool[Tensor, "cells"]:
-    """Which of ``cells``³ cells of folded space, in the order of ``nerf.kernels.torch.occupancy``, may hold something:
+    """Which of ``cells``³ contracted cells, in the order of ``nerf.kernels.torch.occupancy``, may hold something:
     those whose middles ``least`` photos of ``dataset`` look at, or one, from where its foreground begins; and a coarse
     cell around them. What hides them, and masks, count for nothing. Found once for a dataset; not to be written to."""
     answers = _answers.setdefault(dataset.geometry, {})

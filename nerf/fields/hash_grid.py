@@ -22,7 +22,7 @@ from nerf.kernels import BOX, Backend, BinaryOccupancy, GridLayout, RayStepping,
 from nerf.kernels.torch.marching import unit_coordinates
 from nerf.kernels.torch.occupancy import binary_occupancy, cell_numbers, is_occupied
 from nerf.rendering.early_termination import EARLY_STOP_TRANSMITTANCE, MarchingRound, march_with_early_termination
-from nerf.runtime.profiler import Work, part
+from nerf.runtime.profiler import WorkCounts, span
 from nerf.runtime.randomness import generator
 
 INITIAL_FEATURE = 1e-4
@@ -46,7 +46,7 @@ CORNERS = 8  # of a cell: rows that a point reads of each grid
 
 @dataclass(frozen=True)
 class HashGridSettings:
-    """Sizes of a grid field. Raises ValueError on impossible ones.
+    """Sizes of a hash-grid field. Raises ValueError on impossible ones.
 
     ``diagonal_steps``: steps along the diagonal of a bounded scene's box. ``min_step_size`` (scene units) and
     ``cone_angle`` (step per distance) replace it where space is ``contracted``. Without ``view_dependence`` a point has
@@ -249,11 +249,11 @@ class HashGridField(nn.Module):
         depth = torch.zeros_like(rays.far, dtype=torch.float64)
         of_rays = mlp.ray_hidden(self.weights, self.of_directions(rays.directions))
         for samples, _, density in self._march(rays, torch.full_like(rays.near, 0.5), self.render_stepping):
-            with part("composite"):
+            with span("composite"):
                 selected = backend.select_colour_samples(samples, density.sigma, OPACITY_STEP, depth, accumulated)
                 geometry = density.geometry.index_select(0, selected.rows)
             colour = mlp.colour_of(self.weights, selected.samples.ray, geometry, of_rays)
-            with part("composite"):
+            with span("composite"):
                 backend.accumulate_colours(selected, colour, rendered)
         transmittance, opacity = (each.to(rendered.dtype) for each in (torch.exp(-depth), -torch.expm1(-depth)))
         rendered *= torch.where(accumulated == 0, 1, opacity / accumulated)[:, None]
@@ -272,7 +272,7 @@ class HashGridField(nn.Module):
         backend, rays = self.backend, rays.each(Tensor.contiguous)
         background = self._behind(rays, background)
         rounds = list(self._march(rays, jitter, self.stepping))
-        with part("march"):
+        with span("march"):
             marched, order = backend.pack_rounds([each.samples for each in rounds])
             sigma = torch.cat([each.density.sigma for each in rounds]).index_select(0, order)
             samples, seen = backend.visible_samples(
@@ -283,11 +283,11 @@ class HashGridField(nn.Module):
             of_rounds = zip(*(each.density for each in rounds), strict=True)
             density = DensityPass(*(torch.cat(parts).index_select(0, rows) for parts in of_rounds))
             thickness = density.sigma * marched.dt.index_select(0, seen)
-        with part("encode"):
+        with span("encode"):
             harmonics = self.of_directions(rays.directions)
             of_rays = mlp.ray_hidden(self.weights, harmonics)
         colour = mlp.colour_forward(self.weights, backend, samples, density.geometry, of_rays)
-        with part("composite"):
+        with span("composite"):
             rendering, weights = backend.composite(samples, density.sigma, colour.colour, background, rays.far)
         of_samples = samples, points, thickness, density
         return HashGridPass(rays, background, len(order), *of_samples, harmonics, colour, rendering, weights)
@@ -344,6 +344,6 @@ class HashGridField(nn.Module):
         )
 
     def _density_pass(self, unit: Float[Tensor, "points 3"]) -> DensityPass:
-        with part("gather", Work(rows=CORNERS * len(self.layout.resolutions) * len(unit))):
+        with span("gather", WorkCounts(gathered_rows=CORNERS * len(self.layout.resolutions) * len(unit))):
             features = self.backend.encode(self.layout, self.table, unit)
         return mlp.density_forward(self.weights, features)

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int32
 from torch import Tensor
 
 from nerf.kernels import Backend, Samples
-from nerf.runtime.profiler import Work, part
+from nerf.runtime.profiler import WorkCounts, span
 
 HIDDEN = 64
 GEOMETRY = 16  # numbers that the density network hands to the colour network; the first is the logarithm of density
@@ -99,7 +99,7 @@ def colour_flops(weights: Weights) -> int:
 
 def density_forward(weights: Weights, features: Float[Tensor, "samples features"]) -> DensityPass:
     """Features to geometry and density."""
-    with part("mlp", Work(products=density_flops(weights) * len(features))):
+    with span("mlp", WorkCounts(matmul_flops=density_flops(weights) * len(features))):
         geometry = features.new_empty(len(features), GEOMETRY)
         for rows in _blocks(features):
             torch.mm(_density_hidden(weights, features[rows]), weights.density_out.T, out=geometry[rows])
@@ -135,7 +135,7 @@ def colour_forward(
     of_rays: Float[Tensor, "rays hidden"],
 ) -> ColourPass:
     """Geometry and viewing direction (:func:`ray_hidden`) to colour, through a sigmoid."""
-    with part("mlp", Work(products=colour_flops(weights) * len(geometry))):
+    with span("mlp", WorkCounts(matmul_flops=colour_flops(weights) * len(geometry))):
         hidden = geometry @ weights.colour_hidden[:GEOMETRY]
         backend.add_ray_relu(samples, hidden, of_rays)
         return ColourPass(geometry, hidden, (hidden @ weights.colour_out.T).sigmoid_())
@@ -148,7 +148,7 @@ def colour_of(
     of_rays: Float[Tensor, "rays hidden"],
 ) -> Float[Tensor, "samples 3"]:
     """What :func:`colour_forward` says, for samples of rays ``ray``, where no way back is needed: nothing is kept."""
-    with part("mlp", Work(products=colour_flops(weights) * len(geometry))):
+    with span("mlp", WorkCounts(matmul_flops=colour_flops(weights) * len(geometry))):
         logits = geometry.new_empty(len(geometry), 3)
         for rows in _blocks(geometry):
             hidden = of_rays.index_select(0, ray[rows]).addmm_(geometry[rows], weights.colour_hidden[:GEOMETRY])

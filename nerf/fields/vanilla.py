@@ -26,8 +26,8 @@ from nerf.geometry.contraction import contract
 from nerf.geometry.rays import Rays, clip_to_box, points_on
 from nerf.rendering.sampling import Spacing, midpoint_edges, sample_pdf, stratified
 from nerf.rendering.volume_rendering import composite, volume_weights
-from nerf.runtime.profiler import Work, part
-from nerf.runtime.randomness import generator as seeded_generator
+from nerf.runtime.profiler import WorkCounts, span
+from nerf.runtime.randomness import generator
 
 BOX = 0.95  # between the region of interest, 0.9, and half the encoding's period, 1
 CONTRACTED_SCALE = 0.45  # takes the contracted cube of half size 2 to 0.9
@@ -110,14 +110,14 @@ class VanillaMlp(nn.Module):
         of_encoding = position * width * (2 if settings.skip + 1 < settings.depth else 1)
         # Multiplications and additions per point, forward and back. On the way back each weight has its own gradient,
         # and passes on that of its input unless that is an encoding.
-        self.products = 2 * (sum(each.numel() for each in self.parameters() if each.ndim == 2) - once_per_ray)
-        self.matmul_flops_backward = 2 * self.products - 2 * of_encoding
+        self.matmul_flops = 2 * (sum(each.numel() for each in self.parameters() if each.ndim == 2) - once_per_ray)
+        self.matmul_flops_backward = 2 * self.matmul_flops - 2 * of_encoding
 
     def forward(
         self, points: Float[Tensor, "*rays n 3"], directions: Float[Tensor, "*rays 3"]
     ) -> tuple[Float[Tensor, "*rays n"], Float[Tensor, "*rays n 3"]]:
         """Density and colour of n points on each ray; points lie in (-1, 1)^3."""
-        with part("mlp", Work(products=self.products * points[..., 0].numel())):
+        with span("mlp", WorkCounts(matmul_flops=self.matmul_flops * points[..., 0].numel())):
             hidden = self._hidden(points)
             feature = self.feature(hidden)
             if self.settings.view_dependence:
@@ -149,7 +149,7 @@ class VanillaMlp(nn.Module):
 
     def _encode(self, x: Float[Tensor, "*batch 3"], frequencies: int) -> Float[Tensor, "*batch encoded"]:
         dtype = self.density_head.weight.dtype
-        with part("encode"):
+        with span("encode"):
             return positional_encoding(x, frequencies, dtype) if self.settings.positional_encoding else x.to(dtype)
 
 
@@ -161,8 +161,8 @@ class VanillaNerf(nn.Module):
     def __init__(self, settings: VanillaSettings, seed: int) -> None:
         super().__init__()
         self.settings = settings
-        self.coarse = VanillaMlp(settings, seeded_generator("cpu", seed, 0)) if settings.hierarchical else None
-        self.fine = VanillaMlp(settings, seeded_generator("cpu", seed, 1))
+        self.coarse = VanillaMlp(settings, generator("cpu", seed, 0)) if settings.hierarchical else None
+        self.fine = VanillaMlp(settings, generator("cpu", seed, 1))
 
     def density(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points"]:
         """Density per scene unit; zero outside the cube to which an uncontracted field is cut."""
@@ -201,7 +201,7 @@ class VanillaNerf(nn.Module):
     def _in_field(self, rays: Rays) -> Rays:
         """In float64, as are the points and sums on the rays: 2⁹π, the highest frequency, takes the rounding of a
         float32 point to 1e-4. The networks compute in the type of their weights."""
-        with part("sampling"):
+        with span("sampling"):
             exact = rays.each(Tensor.double)
             return exact if self.settings.contracted else clip_to_box(exact, -BOX, BOX)
 
@@ -214,7 +214,7 @@ class VanillaNerf(nn.Module):
     def _first_samples(self, rays: Rays, generator: torch.Generator | None) -> Float[Tensor, "*rays ends"]:
         settings = self.settings
         count = settings.samples_coarse if settings.hierarchical else settings.queries_per_ray
-        with part("sampling"):
+        with span("sampling"):
             return stratified(rays.near, rays.far, count, generator, settings.spacing)
 
     def _refined(
@@ -225,17 +225,17 @@ class VanillaNerf(nn.Module):
         generator: torch.Generator | None,
     ) -> Float[Tensor, "*rays more"]:
         """The sorted union of the samples and those drawn from their weights (section 5.2); far stays last."""
-        with part("sampling"):
+        with span("sampling"):
             drawn = sample_pdf(midpoint_edges(t, rays.near), weights, self.settings.samples_fine, generator)
             return torch.sort(torch.cat([t, drawn], -1)).values
 
     def _seen(
         self, mlp: VanillaMlp, rays: Rays, t: Float[Tensor, "*rays ends"], background: Float[Tensor, "*#rays 3"]
     ) -> tuple[Rendering, Float[Tensor, "*rays ends-1"]]:
-        with part("sampling"):
+        with span("sampling"):
             points = self._coordinates(points_on(rays, t[..., :-1]))
         sigma, colour = mlp(points, rays.directions)
-        with part("composite"):
+        with span("composite"):
             rendering, weights = composite(sigma, colour, t, background)
             return Rendering(*(each.to(background.dtype) for each in rendering)), weights
 

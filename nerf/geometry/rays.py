@@ -32,7 +32,7 @@ def rays_of_view(
     near: float,
     far: float,
 ) -> Rays:
-    """Turn a camera's unit bearing vectors (one per pixel centre, camera frame) into rays of one view."""
+    """Turn a camera's unit ray directions (one per pixel centre, camera frame) into rays of one view."""
     directions = camera_directions @ scene_from_camera[:, :3].T
     origins = scene_from_camera[:, 3].expand_as(directions)
     return Rays(

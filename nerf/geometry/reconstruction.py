@@ -18,14 +18,14 @@ NEAREST = 1e-6  # of the usual distance: a line hit exactly would weigh infinite
 class Reconstruction:
     """Posed photos and sparse points in one common frame.
 
-    ``bearings`` are unit vectors in the camera frame, sampled over each photo's whole field of view (the frustum);
+    ``ray_directions`` are unit vectors in the camera frame, sampled over each photo's whole field of view (frustum);
     observation j says that photo ``view[j]`` sees point ``point[j]``. There may be no points at all. ``opaque`` is the
     :func:`extent` of the :func:`angles` of what may be opaque in each photo: beside it all is background. Without
     alpha, which alone tells, None.
     """
 
     from_camera: Float[np.ndarray, "n 3 4"]
-    bearings: Float[np.ndarray, "n k 3"]
+    ray_directions: Float[np.ndarray, "n k 3"]
     points: Float[np.ndarray, "m 3"]
     view: Int[np.ndarray, "observations"]
     point: Int[np.ndarray, "observations"]
@@ -53,19 +53,19 @@ class Reconstruction:
 
     @property
     def rays(self) -> Float[np.ndarray, "n k 3"]:
-        """The bearings in the common frame."""
-        return np.einsum("nij,nkj->nki", self.from_camera[:, :, :3], self.bearings)
+        """The ray directions in the common frame."""
+        return np.einsum("nij,nkj->nki", self.from_camera[:, :, :3], self.ray_directions)
 
     def field(self, view: int) -> Float[np.ndarray, "2 2"]:
         """The least and the greatest :func:`angles` in a photo."""
-        return extent(angles(self.bearings[view]))
+        return extent(angles(self.ray_directions[view]))
 
     def project(
         self, view: int, points: Float[np.ndarray, "m 3"]
     ) -> tuple[Float[np.ndarray, "m 2"], Bool[np.ndarray, "m"]]:
         """The :func:`angles` at which a photo has points, and which of them lie in its field of view, hidden or not."""
         local = (points - self.centres[view]) @ self.from_camera[view, :, :3]
-        at, widest = angles(local), self.bearings[view, :, 2].min()
+        at, widest = angles(local), self.ray_directions[view, :, 2].min()
         return at, within(at, self.field(view)) & (local[:, 2] >= widest * np.linalg.norm(local, axis=1))
 
     def distances(self) -> Float[np.ndarray, "observations"]:

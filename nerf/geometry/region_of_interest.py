@@ -64,8 +64,8 @@ def look_at_point(
     """Whether four fifths of the photos look within CONVERGENT_DEG of a point; one that stands on it does not."""
     towards = point - centres
     distance = np.linalg.norm(towards, axis=1, keepdims=True)
-    bearing = np.divide(towards, distance, out=-axes, where=distance > 0)
-    return bool(np.quantile(angles_deg(axes, bearing), 0.8) <= CONVERGENT_DEG)
+    ray_direction = np.divide(towards, distance, out=-axes, where=distance > 0)
+    return bool(np.quantile(angles_deg(axes, ray_direction), 0.8) <= CONVERGENT_DEG)
 
 
 def find_region(scene: Reconstruction, layout: Layout) -> Region:
@@ -160,7 +160,7 @@ def _carved(scene: Reconstruction, opaque: Float[np.ndarray, "n 2 2"]) -> Region
 
 def _half_widths(scene: Reconstruction) -> Float[np.ndarray, "n"]:
     """How far each photo sees to the side, at unit depth; at most 1 (45 degrees)."""
-    sideways = np.abs(scene.bearings[..., :2]).max(-1) / np.maximum(scene.bearings[..., 2], 1e-3)
+    sideways = np.abs(scene.ray_directions[..., :2]).max(-1) / np.maximum(scene.ray_directions[..., 2], 1e-3)
     return np.minimum(sideways.max(-1), 1.0)
 
 

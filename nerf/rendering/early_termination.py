@@ -14,7 +14,7 @@ from torch import Tensor
 from nerf.fields.mlp import DensityPass
 from nerf.geometry.rays import Rays
 from nerf.kernels import Backend, BinaryOccupancy, RayStepping, Samples
-from nerf.runtime.profiler import part
+from nerf.runtime.profiler import span
 
 EARLY_STOP_TRANSMITTANCE = 1e-3  # below it the rest of a ray is left out
 # Samples whose densities are computed at once, in all, and per ray (docs/experiments/early_termination.md). A GPU waits
@@ -50,12 +50,12 @@ def march_with_early_termination(
     while active_rays and taken < stepping.max_samples:
         length = _samples_per_ray(active_rays, jitter.device)
         this_round = stepping._replace(max_samples=min(length, stepping.max_samples - taken))
-        with part("march"):
+        with span("march"):
             samples = backend.march(occupancy, this_round, rays._replace(near=near), jitter)
             points = backend.sample_points(rays, samples, stepping.contracted)
         density = density_at(points)
         yield MarchingRound(samples, points, density)
-        with part("march"):
+        with span("march"):
             backend.finish_round(
                 this_round, samples, density.sigma, EARLY_STOP_TRANSMITTANCE, jitter, rays.far, depth, near
             )

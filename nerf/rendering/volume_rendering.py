@@ -33,12 +33,12 @@ def composite(
     t: Float[Tensor, "*rays n+1"],
     background: Float[Tensor, "*#rays 3"],
 ) -> tuple[Rendering, Float[Tensor, "*rays n"]]:
-    """What the rays see over ``background``, and the weights; light that no interval stops comes from far."""
+    """What the rays see over ``background``, and the weights; what they transmit comes from far."""
     weights, optical_depth = volume_weights(sigma, t)
-    unstopped = torch.exp(-optical_depth)
+    transmittance = torch.exp(-optical_depth)
     rendering = Rendering(
-        colour=(weights[..., None] * colour).sum(-2) + unstopped[..., None] * background,
-        depth=(weights * t[..., :-1]).sum(-1) + unstopped * t[..., -1],
+        colour=(weights[..., None] * colour).sum(-2) + transmittance[..., None] * background,
+        depth=(weights * t[..., :-1]).sum(-1) + transmittance * t[..., -1],
         opacity=-torch.expm1(-optical_depth),
     )
     return rendering, weights

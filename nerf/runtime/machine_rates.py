@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 
 from nerf.runtime.parallel import in_order, workers
-from nerf.runtime.profiler import Profiler, Work
+from nerf.runtime.profiler import Profiler, WorkCounts
 
 MATMUL_ROWS = 1 << 13  # points that one product has, as in a chunk of a step
 GATHERED = 1 << 17  # rows read at once, of 4 float32, as a grid's table has them
@@ -25,11 +25,11 @@ class Rates(NamedTuple):
     """Per core and second, all cores being busy: multiplications and additions of float32 matrix products, rows read
     at random places, bytes copied (read and written ones both count)."""
 
-    products: float
-    rows: float
-    bytes: float
+    matmul_flops: float
+    gathered_rows: float
+    streamed_bytes: float
 
-    def seconds(self, work: Work) -> float:
+    def seconds(self, work: WorkCounts) -> float:
         """Of a core, for so much work at these rates."""
         return sum(amount / rate for amount, rate in zip(work, self, strict=True))
 

@@ -13,7 +13,7 @@ from typing import TypeVar
 
 import torch
 
-from nerf.runtime.profiler import REST, part
+from nerf.runtime.profiler import OTHER, span
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -61,7 +61,7 @@ def in_order(function: Callable[[Item], Result], items: Iterable[Item], device: 
 
 
 def _worked(function: Callable[[Item], Result], item: Item) -> Result:
-    with part(REST):
+    with span(OTHER):
         return function(item)
 
 

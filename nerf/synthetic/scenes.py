@@ -18,7 +18,7 @@ from torch import Tensor
 from nerf.geometry.camera_paths import look_at
 from nerf.geometry.rays import Rays, rays_of_view
 from nerf.rendering.srgb import linear_to_srgb
-from nerf.synthetic import textures as solid_texture
+from nerf.synthetic import textures
 from nerf.synthetic.shapes import Box, Frustum, Points, Shape, Sphere, Torus, Values, dot
 from nerf.synthetic.textures import Noise, make_noise, mix
 
@@ -167,7 +167,7 @@ def photograph(
     world_from_camera: Float[Tensor, "3 4"],
     samples: int,
 ) -> Float[Tensor, "height width 3"]:
-    """What a camera sees; ``camera_directions`` hold samples x samples unit bearing vectors per pixel."""
+    """What a camera sees; ``camera_directions`` hold samples x samples unit ray directions per pixel."""
     rays = rays_of_view(camera_directions.reshape(-1, 3), world_from_camera, near=0.0, far=math.inf)
     chunks = zip(*(part.split(CHUNK) for part in rays), strict=True)
     colour = torch.cat([scene.trace(Rays(*chunk)).colour for chunk in chunks])
@@ -186,14 +186,14 @@ def still_life(seed: int = 0, highlight: float = 0.0) -> SyntheticScene:
 
     sink = 0.004  # what stands on the table reaches a little into it, so that no two surfaces coincide
     solids = (
-        solid(Frustum(TABLE_RADIUS, TABLE_RADIUS, 0.05), solid_texture.mosaic, 0.0, 0.0, -0.05),
-        solid(Box((0.24, 0.20, 0.15)), solid_texture.wrapping, -0.30, 0.28, 0.15 - sink, 0.45),
-        solid(Sphere(0.24), solid_texture.marble, 0.34, 0.36, 0.24 - sink),
-        solid(Frustum(0.17, 0.25, 0.21), solid_texture.banded, -0.50, -0.30, 0.21 - sink, 0.3),
-        solid(Frustum(0.23, 0.0, 0.30), solid_texture.foliage, -0.50, -0.30, 0.70, 1.0),
-        solid(Torus(0.19, 0.085), solid_texture.doughnut, 0.14, -0.42, 0.085 - sink, 0.7),
-        solid(Sphere(0.13), solid_texture.peel, 0.56, -0.12, 0.13 - sink),
-        solid(Sphere(0.115), solid_texture.peel, -0.30, 0.28, 0.3 - 2 * sink + 0.115, 2.0),
+        solid(Frustum(TABLE_RADIUS, TABLE_RADIUS, 0.05), textures.mosaic, 0.0, 0.0, -0.05),
+        solid(Box((0.24, 0.20, 0.15)), textures.wrapping, -0.30, 0.28, 0.15 - sink, 0.45),
+        solid(Sphere(0.24), textures.marble, 0.34, 0.36, 0.24 - sink),
+        solid(Frustum(0.17, 0.25, 0.21), textures.banded, -0.50, -0.30, 0.21 - sink, 0.3),
+        solid(Frustum(0.23, 0.0, 0.30), textures.foliage, -0.50, -0.30, 0.70, 1.0),
+        solid(Torus(0.19, 0.085), textures.doughnut, 0.14, -0.42, 0.085 - sink, 0.7),
+        solid(Sphere(0.13), textures.peel, 0.56, -0.12, 0.13 - sink),
+        solid(Sphere(0.115), textures.peel, -0.30, 0.28, 0.3 - 2 * sink + 0.115, 2.0),
     )
     return SyntheticScene(solids, noise, highlight)
 

@@ -1,4 +1,4 @@
-"""One optimisation step of a grid field, behind the same interface as the paper's (nerf/training/trainer.py)."""
+"""One optimisation step of a hash-grid field, behind the same interface as the paper's (nerf/training/trainer.py)."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import astuple, dataclass
@@ -21,7 +21,7 @@ from nerf.fields.occupancy_grid import OccupancyGrid
 from nerf.geometry.rays import Rays
 from nerf.kernels import BOX
 from nerf.runtime.parallel import in_order
-from nerf.runtime.profiler import Work, part
+from nerf.runtime.profiler import WorkCounts, span
 from nerf.runtime.randomness import generator
 from nerf.training.losses import huber_loss
 from nerf.training.metrics import psnr
@@ -117,25 +117,25 @@ class _Part(NamedTuple):
     densities: int
 
 
-def lr_multiplier(step: int, share: float) -> float:
+def lr_multiplier(step: int, progress: float) -> float:
     """The learning rate over its base: a linear warm-up, then constant, then falling exponentially."""
-    fallen = max(0.0, share - LR_HOLD_FRACTION) / (1 - LR_HOLD_FRACTION)
+    fallen = max(0.0, progress - LR_HOLD_FRACTION) / (1 - LR_HOLD_FRACTION)
     return min(1.0, (step + 1) / LR_WARMUP_STEPS) * LR_FINAL_FRACTION**fallen
 
 
-def distortion_multiplier(share: float) -> float:
-    """The weight of the distortion loss over its full one: from a quarter it grows with the share of the run."""
-    return min(1.0, max(INITIAL_DISTORTION, share / FULL_DISTORTION_PROGRESS))
+def distortion_multiplier(progress: float) -> float:
+    """The weight of the distortion loss over its full one: from a quarter it grows with the progress of the run."""
+    return min(1.0, max(INITIAL_DISTORTION, progress / FULL_DISTORTION_PROGRESS))
 
 
-def depth_loss_multiplier(share: float) -> float:
+def depth_loss_multiplier(progress: float) -> float:
     """The weight of the depth loss over its first one: it falls to nothing over the run. Shape is decided early, and
     once it is about right photos know it better than points do."""
-    return 1 - share
+    return 1 - progress
 
 
 class HashGridTrainer:
-    """Trains a grid field on the Huber loss of colours by Adam, and updates its occupancy grid. ``effects`` stand
+    """Trains a hash-grid field on the Huber loss of colours by Adam, and updates its occupancy grid. ``effects`` stand
     between the field and each image (nerf/effects)."""
 
     def __init__(
@@ -164,23 +164,23 @@ class HashGridTrainer:
         self.drawn = torch.tensor(0)  # pixels of that order so far; steps differ in how many they take
 
     def _usable(self) -> Bool[Tensor, "cells"] | None:
-        """Known only where points tell where foregrounds begin, in folded space: a box is carved beforehand."""
+        """Known only where points tell where foregrounds begin, in contracted space: a box is carved beforehand."""
         least, stepping = min(self.settings.least_photos, len(self.dataset.near) - 1), self.model.stepping
         if least <= 1 or self.dataset.known is None or not stepping.contracted:
             return None
         return compute_frustum_mask(self.dataset, least, stepping.occupancy_resolution)
 
-    def step(self, step: int, share: float, rate_scale: float = 1.0) -> StepResult:
+    def step(self, step: int, progress: float, lr_scale: float = 1.0) -> StepResult:
         """One batch, one update. Raises NonFinite before the update, leaving model and optimiser as they were."""
         device, rays = self.dataset.device, self._rays_per_chunk()
-        parts = list(in_order(partial(self._part, step, share, rays), range(self.settings.chunks), device))
+        parts = list(in_order(partial(self._part, step, progress, rays), range(self.settings.chunks), device))
         loss, error = self._finite(step, parts)
-        self._update(parts, rate_scale * lr_multiplier(step, share), step + 1)
-        with part("cache"):
+        self._update(parts, lr_scale * lr_multiplier(step, progress), step + 1)
+        with span("cache"):
             self.occupancy_grid.update(step, generator(device, self.settings.seed, step, self.settings.chunks))
         samples = sum(len(each.points) for each in parts)
         rays *= self.settings.chunks
-        self.drawn += self._of_photos(rays, share)
+        self.drawn += self._of_photos(rays, progress)
         self.samples_per_ray.mul_(SAMPLES_PER_RAY_EMA_DECAY).add_((1 - SAMPLES_PER_RAY_EMA_DECAY) * samples / rays)
         return StepResult(loss, psnr(error), rays, samples, sum(each.densities for each in parts))
 
@@ -214,11 +214,11 @@ class HashGridTrainer:
         wanted = int(self.settings.samples / max(MIN_SAMPLES_PER_RAY, float(self.samples_per_ray)))
         return max(1, wanted // self.settings.chunks)
 
-    def _batch(self, step: int, share: float, chunk: int, count: int) -> HashGridBatch:
+    def _batch(self, step: int, progress: float, chunk: int, count: int) -> HashGridBatch:
         device = self.dataset.device
         random = generator(device, self.settings.seed, step, chunk)
         # Shared out over the chunks, which are small where cores are many and the field is young.
-        first, end = self._of_photos(chunk * count, share), self._of_photos((chunk + 1) * count, share)
+        first, end = self._of_photos(chunk * count, progress), self._of_photos((chunk + 1) * count, progress)
         pixel = self.dataset.nth(self.order.take(int(self.drawn) + first, end - first))
         to_points, distance = count - len(pixel), torch.zeros(count, device=device)
         if to_points:
@@ -233,24 +233,24 @@ class HashGridTrainer:
         jitter, offset = torch.rand(2, count, generator=random, device=device)
         return HashGridBatch(rays, target, background, jitter, offset, view, distance)
 
-    def _of_photos(self, rays: int, share: float) -> int:
+    def _of_photos(self, rays: int, progress: float) -> int:
         """How many of so many rays run through pixels of all the photos; the others run to sparse points."""
-        return rays - rays // DEPTH_RAY_INTERVAL if self._has_depth_loss(share) else rays
+        return rays - rays // DEPTH_RAY_INTERVAL if self._has_depth_loss(progress) else rays
 
-    def _has_depth_loss(self, share: float) -> bool:
-        return self.dataset.known is not None and self.settings.depth_loss * depth_loss_multiplier(share) > 0
+    def _has_depth_loss(self, progress: float) -> bool:
+        return self.dataset.known is not None and self.settings.depth_loss * depth_loss_multiplier(progress) > 0
 
-    def _part(self, step: int, share: float, rays: int, chunk: int) -> _Part:
+    def _part(self, step: int, progress: float, rays: int, chunk: int) -> _Part:
         """What a chunk of so many rays adds to loss and gradients."""
-        with part("batch"):
-            batch = self._batch(step, share, chunk, rays)
+        with span("batch"):
+            batch = self._batch(step, progress, chunk, rays)
             seen_along = self.effects.forward_rays(batch.rays, batch.view)
             if not all_finite(seen_along):
                 raise NonFinite(RAYS, step, _whole([batch]))
         done = self.model.forward(seen_along, batch.jitter, batch.offset, batch.background)
-        with part("composite"):
-            loss = self._loss(rays * self.settings.chunks, share, done, batch)
-        with part("backward", self._backward_work(done)):
+        with span("composite"):
+            loss = self._loss(rays * self.settings.chunks, progress, done, batch)
+        with span("backward", self._backward_work(done)):
             gradients = self.model.backward(done, loss.grad, loss.grad_weights)
             effects = loss.grad_effects | self.effects.backward_rays(
                 batch.rays, batch.view, lambda: RayGradients(*self.model.rays_backward(done, gradients))
@@ -263,13 +263,13 @@ class HashGridTrainer:
             batch, *of_loss, weights, features, done.points, background, effects, norm, done.thickness, done.marched
         )
 
-    def _backward_work(self, done: HashGridPass) -> Work:
+    def _backward_work(self, done: HashGridPass) -> WorkCounts:
         weights = self.model.weights
         products = 2 * (mlp.density_flops(weights) + mlp.colour_flops(weights)) * len(done.points)
         to_points = CORNERS * len(self.model.layout.resolutions) * len(done.points) if self.effects.rays else 0
-        return Work(products, to_points)
+        return WorkCounts(products, to_points)
 
-    def _loss(self, rays: int, share: float, done: HashGridPass, batch: HashGridBatch) -> Loss:
+    def _loss(self, rays: int, progress: float, done: HashGridPass, batch: HashGridBatch) -> Loss:
         seen = RenderedRays(done.rendering, batch.background, batch.rays, batch.view)
         error = self.effects.residual(seen, batch.target)
         robust, pull = huber_loss(error)
@@ -277,11 +277,11 @@ class HashGridTrainer:
         value, grad_weights = robust.sum() / (3 * rays), torch.zeros_like(done.weights)
         backend, stepping = self.model.backend, self.model.stepping
         if self.settings.distortion:
-            each = torch.full_like(batch.distance, self.settings.distortion * distortion_multiplier(share) / rays)
+            each = torch.full_like(batch.distance, self.settings.distortion * distortion_multiplier(progress) / rays)
             value = value + (each * backend.distortion(done.samples, done.weights, stepping)).sum()
             grad_weights = backend.distortion_backward(done.samples, done.weights, stepping, each)
-        if self._has_depth_loss(share):
-            each = torch.full_like(batch.distance, self.settings.depth_loss * depth_loss_multiplier(share) / rays)
+        if self._has_depth_loss(progress):
+            each = torch.full_like(batch.distance, self.settings.depth_loss * depth_loss_multiplier(progress) / rays)
             places = done.rays.far, batch.distance, stepping
             apart = backend.depth_loss(done.samples, done.weights, done.rendering.opacity, *places)
             value = value + (each * apart).sum()
@@ -303,7 +303,7 @@ class HashGridTrainer:
         return loss_now, error_now
 
     def _update(self, parts: Sequence[_Part], factor: float, adam_step: int) -> None:
-        """Update the table's levels, which share no rows, the networks, the per-image parameters and the occupancy
+        """Update the table's levels, which progress no rows, the networks, the per-image parameters and the occupancy
         grid, each on a core. ``factor`` scales all learning rates."""
         finest_first = range(len(self.model.layout.resolutions) - 1, -1, -1)  # no core waits long for the last
         learning_rate = self.settings.rate * factor
@@ -330,18 +330,18 @@ class HashGridTrainer:
 
     def _update_level(self, level: int, parts: Sequence[_Part], learning_rate: float, adam_step: int) -> None:
         layout, backend = self.model.layout, self.model.backend
-        with part("scatter", Work(rows=CORNERS * sum(len(each.points) for each in parts))):
+        with span("scatter", WorkCounts(gathered_rows=CORNERS * sum(len(each.points) for each in parts))):
             for each in parts:
                 backend.encode_backward_table(layout, level, each.points, each.features, self.grad_table)
         table, grad, exp_avg, exp_avg_sq = self.levels[level]
-        with part("optimiser", Work(bytes=ADAM_BYTES * table.numel())):
+        with span("optimiser", WorkCounts(streamed_bytes=ADAM_BYTES * table.numel())):
             backend.adam(table, grad, exp_avg, exp_avg_sq, learning_rate, adam_step)
 
     def _update_small(
         self, names: Iterable[str], of_parts: Sequence[dict[str, Tensor]], learning_rate: float, adam_step: int
     ) -> None:
         """Of parameters that are small beside the table."""
-        with part("optimiser"):
+        with span("optimiser"):
             for name in names:
                 gradient = torch.stack([each[name] for each in of_parts]).sum(0)
                 parameter, exp_avg, exp_avg_sq = self.parameters[name], self.exp_avg[name], self.exp_avg_sq[name]
@@ -352,7 +352,7 @@ class HashGridTrainer:
         effect.fix_gauge()
 
     def _raise_occupancy(self, parts: Sequence[_Part]) -> None:
-        with part("cache"):
+        with span("cache"):
             for each in parts:
                 self.occupancy_grid.raise_to(each.points, each.thickness)
 

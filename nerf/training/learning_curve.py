@@ -52,7 +52,7 @@ def knee(curve: Curve) -> float | None:
     return found
 
 
-# Least squares over 32 pairs of runs of T and 2 T steps of the grid field, eight sets
+# Least squares over 32 pairs of runs of T and 2 T steps of the hash-grid field, eight sets
 # (docs/experiments/learning_curve.md): what a run gained from half of its time to its end, annealing included, against
 # what a run of twice the time ends higher.
 MIN_STEPS = 500  # a shorter run is still fog, and tells nothing of a longer one

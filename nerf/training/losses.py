@@ -1,4 +1,4 @@
-"""The colour loss of the grid field: squares of small errors, and no more than linear in those that stand out."""
+"""The colour loss of the hash-grid field: squares of small errors, and no more than linear in those that stand out."""
 
 from jaxtyping import Float
 from torch import Tensor

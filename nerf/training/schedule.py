@@ -1,7 +1,7 @@
 """When a run ends and which learning rate each step has, and when it is measured.
 
-``share`` is how much of a run is done, from 0 to 1; everything that changes while training is a function of it.
-A run bounded by steps knows its share exactly. A run bounded by seconds estimates how many steps will fit, and
+``progress`` is how much of a run is done, from 0 to 1; everything that changes while training is a function of it.
+A run bounded by steps knows its progress exactly. A run bounded by seconds estimates how many steps will fit, and
 revises the estimate when the clock disagrees; the decisions are data (:class:`StepSchedule`), so a resumed run that
 replays them gives every step the learning rate it had before, and goes on from there by steps or by the clock.
 """
@@ -17,12 +17,12 @@ CLOSING_SHARE = 0.75
 
 
 class ScheduleRevision(NamedTuple):
-    """From step ``from_step`` on, before which ``share`` of the run is done, it is meant to have ``total_steps``, for a
+    """From step ``from_step`` on, where the run has made this ``progress``, it is meant to have ``total_steps``, for a
     ``reason``: it begins, the clock says so, a target is near or reached, or it is to go on."""
 
     from_step: int
     total_steps: int
-    share: float
+    progress: float
     reason: Reason = "begin"
 
 
@@ -38,25 +38,27 @@ class StepSchedule(NamedTuple):
 
     @property
     def is_whole(self) -> bool:
-        """Whether the share never fell to go on from an end: that of another run, or one short of a target."""
+        """Whether the progress never fell to go on from an end: that of another run, or one short of a target."""
         return all(decision.reason != "more" for decision in self.decisions)
 
-    def share(self, step: int) -> float:
-        """The share of the run done before ``step``, 1 at the end.
+    def progress(self, step: int) -> float:
+        """The progress of the run before ``step``, 1 at the end.
 
-        Every decision spreads the share that was left when it was made evenly over the steps that were left.
+        Every decision spreads the progress that was left when it was made evenly over the steps that were left.
         """
-        start, total, share, _ = next(decision for decision in reversed(self.decisions) if decision.from_step <= step)
-        return share if total == start else share + (1 - share) * min(1.0, (step - start) / (total - start))
+        start, total, progress, _ = next(
+            decision for decision in reversed(self.decisions) if decision.from_step <= step
+        )
+        return progress if total == start else progress + (1 - progress) * min(1.0, (step - start) / (total - start))
 
-    def revised(self, step: int, total_steps: int, share: float) -> "StepSchedule":
-        """This plan with one more decision made before ``step``, when ``share`` of the run is done by the clock.
+    def revised(self, step: int, total_steps: int, progress: float) -> "StepSchedule":
+        """This plan with one more decision made before ``step``, when the clock says ``progress``.
 
         Raises ValueError where that would leave no step to take, or rewrite a decision already made.
         """
         if not self.decisions[-1].from_step <= step < total_steps:
             raise ValueError(f"at step {step} the plan {self.decisions} cannot become {total_steps} steps")
-        return StepSchedule((*self.decisions, ScheduleRevision(step, total_steps, share, "clock")))
+        return StepSchedule((*self.decisions, ScheduleRevision(step, total_steps, progress, "clock")))
 
     def until(self, step: int) -> "StepSchedule":
         """The decisions made up to ``step``: later ones are about steps that are to be taken once more."""
@@ -68,17 +70,17 @@ class StepSchedule(NamedTuple):
         if not self.decisions[-1].from_step <= step < self.total_steps:
             raise ValueError(f"the plan {self.decisions} cannot close at step {step}")
         total = min(self.total_steps, max(step + 1, round(step / CLOSING_SHARE)))
-        share = max(CLOSING_SHARE, self.share(step))
-        return StepSchedule((*self.decisions, ScheduleRevision(step, total, share, "target")))
+        progress = max(CLOSING_SHARE, self.progress(step))
+        return StepSchedule((*self.decisions, ScheduleRevision(step, total, progress, "target")))
 
     def ended(self, step: int) -> "StepSchedule":
         """This plan without the steps from ``step`` on. Raises ValueError where that rewrites a decision."""
         if not self.decisions[-1].from_step < step <= self.total_steps:
             raise ValueError(f"the plan {self.decisions} cannot end at step {step}")
-        return StepSchedule((*self.decisions, ScheduleRevision(step, step, self.share(step), "target")))
+        return StepSchedule((*self.decisions, ScheduleRevision(step, step, self.progress(step), "target")))
 
     def extended(self, total_steps: int) -> "StepSchedule":
-        """This plan, once it is at its end, with more steps: its share falls to that of a run of ``total_steps``.
+        """This plan, once it is at its end, with more steps: its progress falls to that of a run of ``total_steps``.
 
         Raises ValueError where that would add no step.
         """
@@ -104,8 +106,8 @@ def replanned(
     plan: StepSchedule, step: int, seconds: float, budget: float, steps_per_second: float, tolerance: float
 ) -> StepSchedule:
     """The plan before ``step``, ``seconds`` of the ``budget`` being used; revised only if it would end more than
-    ``tolerance`` seconds early or late. Its share is then that of the time, so that a plan which the clock proved wrong
-    leaves no trace in the rates."""
+    ``tolerance`` seconds early or late. Its progress is then that of the time, so that a schedule which the clock
+    proved wrong leaves no trace in the learning rates."""
     left = budget - seconds
     if abs((plan.total_steps - step) / steps_per_second - left) <= tolerance:
         return plan
@@ -113,9 +115,9 @@ def replanned(
     return plan if total == plan.total_steps else plan.revised(step, total, min(1.0, seconds / budget))
 
 
-def learning_rate(share: float, start: float, end: float) -> float:
-    """From ``start`` to ``end`` exponentially in the share of the run done (Mildenhall et al. 2020, section 5.3)."""
-    return start * (end / start) ** share
+def learning_rate(progress: float, start: float, end: float) -> float:
+    """From ``start`` to ``end`` exponentially in the progress of the run (Mildenhall et al. 2020, section 5.3)."""
+    return start * (end / start) ** progress
 
 
 def next_in_series(now: float, first: float, growth: float) -> float:

@@ -113,7 +113,7 @@ def with_source(settings: Settings, photos: Path, cameras: Path | None) -> Setti
 def check_fitted_poses(settings: Settings) -> None:
     """Raises UsageError where stage evaluate would refuse to fit poses: better now than after the training."""
     if settings.evaluate.fit_poses == "on" and settings.train.kind == "paper":
-        what = "--evaluate.fit-poses on is for the grid field, and the options of training ask for the paper field"
+        what = "--evaluate.fit-poses on is for the hash-grid field, and the options of training ask for the paper field"
         raise UsageError(f"{what}; give --evaluate.fit-poses auto")
 
 

@@ -79,7 +79,7 @@ def write_photos(folder: Path, truth: Truth, progress: Progress) -> None:
 
 
 def _scene_and_directions(truth: Truth) -> "tuple[SyntheticScene, torch.Tensor]":
-    """The scene, and the unit bearing vectors of a grid of points inside every pixel, lens distortion included."""
+    """The scene, and the unit ray directions of a grid of points inside every pixel, lens distortion included."""
     import torch
 
     from nerf.synthetic.scenes import still_life

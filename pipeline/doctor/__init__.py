@@ -19,7 +19,7 @@ LOW_DISK_GB = 2.0
 
 
 def examine(folder: Path, selftest: bool, bench: bool) -> int:
-    """Print versions, device, threads, free disk, the grid field's kernels and the self-test, the long one and the
+    """Print versions, device, threads, free disk, the hash-grid field's kernels and the self-test, the long one and the
     machine's rates if asked for. 0 if all is well, 1 otherwise."""
     import torch
 
@@ -44,6 +44,6 @@ def examine(folder: Path, selftest: bool, bench: bool) -> int:
 
 
 def _grid_field_line(device: str) -> str:
-    """Which kernels stage train would choose for the grid field, and why not Warp's."""
+    """Which kernels stage train would choose for the hash-grid field, and why not Warp's."""
     why = why_not_warp(device)
-    return f"grid field: torch, because {why}" if why else "grid field: warp"
+    return f"hash-grid field: torch, because {why}" if why else "hash-grid field: warp"

@@ -5,11 +5,11 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     import torch
 
-    from nerf.runtime.profiler import Work
+    from nerf.runtime.profiler import WorkCounts
 
 SECONDS = 0.3  # for each rate
 TABLES = {"2¹⁷": 1 << 17, "2²⁰": 1 << 20}  # rows: of one grid, of all of a large field
-# Of a ray while the grid field trains: densities asked for, beside the colours of stages/train/fields/hash_grid.py.
+# Of a ray while the hash-grid field trains: densities asked for, beside the colours of stages/train/fields/hash_grid.py.
 # Over a run lego_400, fox, banana and fountain_p11 ask for 2.3 to 2.9 for each colour
 # (docs/experiments/ray_samples.md).
 DENSITIES = {"bounded": 7, "contracted": 24}
@@ -48,7 +48,6 @@ def _line(name: str, rate: float, count: int, unit: str) -> str:
 def _meaning(products: dict[int, float], reads: float, copied: float, count: int) -> list[str]:
     """What training can reach here at most: the work of a ray that nothing can save, at these rates."""
     from nerf.runtime.machine_rates import Rates
-    from nerf.runtime.profiler import Work
     from stages.io.amounts import short_count
     from stages.train.fields.hash_grid import SAMPLES_PER_RAY
 
@@ -56,21 +55,20 @@ def _meaning(products: dict[int, float], reads: float, copied: float, count: int
     for space, densities in DENSITIES.items():
         work = grid_work(space == "contracted", densities)
         most = count / Rates(products[64], reads, copied).seconds(work)
-        text = f"grid field {WHERE[space]} ({SAMPLES_PER_RAY[space]} colours, {densities} densities a ray)"
+        text = f"hash-grid field {WHERE[space]} ({SAMPLES_PER_RAY[space]} colours, {densities} densities a ray)"
         lines.append(f"  {short_count(most):>8} rays/s  {text}")
     for name, sizes in PAPER_RAYS.items():
-        most = count / Rates(products[sizes[1]], reads, copied).seconds(Work(products=paper_products(*sizes)))
+        most = count / Rates(products[sizes[1]], reads, copied).seconds(WorkCounts(matmul_flops=paper_products(*sizes)))
         lines.append(f"  {short_count(most):>8} rays/s  {name}")
     return lines
 
 
-def grid_work(contracted: bool, densities: float) -> "Work":
+def grid_work(contracted: bool, densities: float) -> "WorkCounts":
     """Of a ray in training, its share of the optimiser's included: a large field, in the steps that stage train takes
     on this machine."""
     from nerf.fields import mlp
     from nerf.fields.hash_grid import CORNERS, HashGridField
     from nerf.kernels import torch as reference
-    from nerf.runtime.profiler import Work
     from nerf.training.hash_grid_trainer import ADAM_BYTES
     from stages.hardware.device import compute_device
     from stages.train.config import Config
@@ -83,7 +81,7 @@ def grid_work(contracted: bool, densities: float) -> "Work":
     colours = SAMPLES_PER_RAY[config.space]
     rows = CORNERS * model.settings.num_levels * (densities + colours)
     adam = ADAM_BYTES * model.table.numel() / rays_per_step(config)
-    return Work(densities * density + colours * (colour + 2 * (density + colour)), rows, adam)
+    return WorkCounts(densities * density + colours * (colour + 2 * (density + colour)), rows, adam)
 
 
 def paper_products(depth: int, width: int, coarse: int, fine: int) -> int:
@@ -91,4 +89,4 @@ def paper_products(depth: int, width: int, coarse: int, fine: int) -> int:
     from nerf.fields.vanilla import VanillaNerf, VanillaSettings
 
     model = VanillaNerf(VanillaSettings(depth=depth, width=width, samples_coarse=coarse, samples_fine=fine), 0)
-    return model.settings.queries_per_ray * (model.fine.products + model.fine.matmul_flops_backward)
+    return model.settings.queries_per_ray * (model.fine.matmul_flops + model.fine.matmul_flops_backward)

@@ -153,7 +153,7 @@ def _noise(gains: list[list[float]]) -> float:
 
 
 def _trained(trial: PilotScene, arm: Decisions, steps: int, seed: int) -> "HashGridField":
-    """A grid field after ``steps`` steps under the decisions of one arm."""
+    """A hash-grid field after ``steps`` steps under the decisions of one arm."""
     from nerf.fields.hash_grid import HashGridField
     from stages.train.fields import make_trainer
 
@@ -166,7 +166,7 @@ def _trained(trial: PilotScene, arm: Decisions, steps: int, seed: int) -> "HashG
 
 
 def _config(arm: Decisions, steps: int, device: str) -> "TrainConfig":
-    """A small grid field with what stage train would choose."""
+    """A small hash-grid field with what stage train would choose."""
     from stages.hardware.backend import chosen_backend
     from stages.train.config import Config
     from stages.train.fields import with_defaults

@@ -72,7 +72,7 @@ class Config(StageConfig):
     fit_poses: Literal["auto", "on", "off"] = Field(
         default="auto",
         description="Score right halves at poses fitted on the left halves, too. auto: where training refined poses. "
-        "A grid field's only.",
+        "A hash-grid field's only.",
     )
     seconds: float | None = Field(
         default=None,
@@ -240,7 +240,7 @@ class Examiner:
 
         model = self.painter.model
         field = model.model if isinstance(model, AppearanceModel) else model
-        assert isinstance(field, HashGridField), "only with a grid field does evaluate fit poses"
+        assert isinstance(field, HashGridField), "only with a hash-grid field does evaluate fit poses"
         rays = view_rays(self.scene, view, self.downscale)
         as_it_is = replace(self.painter, model=field).draw(rays)
         moved = from_fitted_pose(field.on_cpu(), rays, as_it_is, self.painter.background.cpu(), truth, used)
@@ -282,7 +282,7 @@ def fits_poses(config: Config, field: dict[str, Any]) -> bool:
     that."""
     fittable = field["kind"] == "grid"
     if config.fit_poses == "on" and not fittable:
-        why = f"this is a {field['kind']} field, and only a grid field tells the gradients of its rays"
+        why = f"this is a {field['kind']} field, and only a hash-grid field tells the gradients of its rays"
         raise StageError(
             "evaluate.no-pose-fit", "cannot fit poses of test photos", why, "Give --evaluate.fit-poses auto."
         )

@@ -1,4 +1,4 @@
-"""Which kernels compute the grid field: Warp's where they run, else torch's; these stay with what they trained."""
+"""Which kernels compute the hash-grid field: Warp's where they run, else torch's; these stay with what they trained."""
 
 import contextlib
 import os
@@ -18,7 +18,7 @@ def chosen_backend(device: str, progress: Progress | None = None) -> BackendName
     """ "warp" if its kernels run on ``device`` ("cpu" or "cuda"), else "torch"; then the reason is said."""
     why = why_not_warp(device)
     if why and progress:
-        progress.note(f"the grid field is computed by torch alone, several times slower: {why}")
+        progress.note(f"the hash-grid field is computed by torch alone, several times slower: {why}")
     return "torch" if why else "warp"
 
 
@@ -28,7 +28,9 @@ def backend_of_field(trained_with: BackendName, device: str, progress: Progress 
     if trained_with == "warp":
         return chosen_backend(device, progress)
     if progress:
-        progress.note("the grid field is computed by torch alone, as it was trained: several times slower than by Warp")
+        progress.note(
+            "the hash-grid field is computed by torch alone, as it was trained: several times slower than by Warp"
+        )
     return "torch"
 
 

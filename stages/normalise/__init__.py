@@ -31,7 +31,7 @@ PUBLISHED = ("transforms.json", "scene.json")
 
 FEWEST_TRAINING_VIEWS = 2
 FEWEST_VIEWS = 3  # one to hold out, two to train on
-FRUSTUM_SAMPLES = 32  # bearings along each side of a photo
+FRUSTUM_SAMPLES = 32  # ray directions along each side of a photo
 OPAQUE_SAMPLES = 128  # likewise, where the edges of what is opaque are told
 FULL_TURN_DEG = 320.0  # no gap wider than the step of nine photos around
 
@@ -158,7 +158,7 @@ def _reconstruction(model: "SparseModel", order: list[int], boxes: "Sequence[Box
         opaque = np.stack([extent(angles(part)) for part in parts])
     return Reconstruction(
         from_camera=np.stack([model.images[i].sfm_from_camera for i in order]),
-        bearings=np.stack([grid.reshape(-1, 3) for grid in rays(FRUSTUM_SAMPLES)]),
+        ray_directions=np.stack([grid.reshape(-1, 3) for grid in rays(FRUSTUM_SAMPLES)]),
         points=model.xyz,
         view=np.argsort(order)[model.view],
         point=model.point,
@@ -179,7 +179,7 @@ def _up_by_gps(georeference: dict[str, Any] | None, sfm: "Reconstruction", photo
 
 
 def _within(rays: "np.ndarray", box: "Box | None") -> "np.ndarray":
-    """Those of a photo's (side, side, 3) bearings that go through a box, and at least one along each side, (n, 3)."""
+    """Those of a photo's (side, side, 3) ray directions that go through a box, at least one along each side, (n, 3)."""
     if box is None:
         return rays.reshape(-1, 3)
     side, (left, top, right, bottom) = len(rays), box

@@ -56,12 +56,12 @@ def path_rays(path: CameraPath, scene: "Scene") -> "Iterator[Rays]":
         np.array([view.far for view in views]),
         scene.bounded,
     )
-    bearings = last = None
+    ray_directions = last = None
     for index, camera in enumerate(path.cameras):
-        if bearings is None or camera != last:  # one camera's at a time: 25 MB at 1920×1080
-            bearings, last = torch.from_numpy(camera_rays(camera, camera.width, camera.height)), camera
+        if ray_directions is None or camera != last:  # one camera's at a time: 25 MB at 1920×1080
+            ray_directions, last = torch.from_numpy(camera_rays(camera, camera.width, camera.height)), camera
         pose = torch.from_numpy(path.poses[index]).float()
-        yield rays_of_view(bearings, pose, float(near[index]), float(far[index]))
+        yield rays_of_view(ray_directions, pose, float(near[index]), float(far[index]))
 
 
 def usual_path(scene: "Scene") -> PathKind:

@@ -53,9 +53,7 @@ def camera_report(registration: Mapping[str, Any] | None, config: Mapping[str, A
 
 def doubtful_files(registration: Mapping[str, Any]) -> list[str]:
     """The photos whose matches contradict their poses: they lost them, unless these were given."""
-    found = [image["file"] for image in registration["images"] if "contradicted by" in (image["reason"] or "")]
-    check = registration.get("check") or {"doubtful": []}
-    return found + [file for file in check["doubtful"] if file not in found]
+    return list((registration.get("check") or {"doubtful": []})["doubtful"])
 
 
 def order_is_informative(registration: Mapping[str, Any] | None) -> bool:

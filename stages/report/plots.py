@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 BLUE, ORANGE, GREY = "#3b82f6", "#f2711c", "#8a8f98"
 ORDER_COLOURS = (BLUE, "#9b5de5", "#e0457b", ORANGE, "#e0a800")  # from first to last, legible on light and dark pages
 
-MOST_POINTS = 20_000
+MAX_POINTS = 20_000
 ROOM_BELOW = 0.08  # of the curve's height, so that the name of the lowest line stands clear of the times
 
 
@@ -112,7 +112,7 @@ def _layout_svg(
     low, high = np.minimum(centres.min(0), -REGION_HALF), np.maximum(centres.max(0), REGION_HALF)
     middle, half = (low + high) / 2, (high - low) / 2 + 0.06 * (high - low).max()
     xyz, rgb = points
-    shown = np.linspace(0, len(xyz) - 1, min(len(xyz), MOST_POINTS)).astype(int)
+    shown = np.linspace(0, len(xyz) - 1, min(len(xyz), MAX_POINTS)).astype(int)
     with svg_figure((5, min(8.0, max(1.6, 5 * half[1] / half[0]))), name) as figure:
         axes = figure.add_subplot(aspect="equal")
         axes.scatter(*xyz[shown][:, plane].T, c=rgb[shown] / 255, s=2, lw=0, alpha=0.7, rasterized=True)

@@ -48,7 +48,7 @@ def camera_directions(camera: "Camera", downscale: float) -> "Tensor":
     return torch.from_numpy(camera_rays(camera, *scaled_size(camera, downscale)))
 
 
-def patch_bearings(camera: "Camera", downscale: float) -> "Tensor":
+def patch_directions(camera: "Camera", downscale: float) -> "Tensor":
     """Bearing vectors (rows, columns, 3) of a camera in the middles of the patches that stand for its pixels in a ray
     dataset, MAX_PATCHES along the longer side or one per pixel."""
     width, height = scaled_size(camera, downscale)
@@ -66,7 +66,7 @@ def training_dataset(ingest: Path, scene: "Scene", split: "Split", downscale: fl
 
     def directions(index: int) -> "Tensor":
         progress.update(f"rays of camera {index + 1} of {len(used)}", index / len(used))
-        return patch_bearings(scene.cameras[used[index]], downscale)
+        return patch_directions(scene.cameras[used[index]], downscale)
 
     dataset = make_ray_dataset(
         pixels=store.table(progress),

@@ -192,7 +192,7 @@ class TrainingRun:
 
     def _take_step(self) -> None:
         started = time.perf_counter()
-        share, scale = self.plan.share(self.state.step), 0.5**self.state.rollbacks
+        share, scale = self.plan.progress(self.state.step), 0.5**self.state.rollbacks
         take = partial(self.trainer.step, self.state.step, share, scale)
         result = observed(take, self.state.step, self.state.timings, self.probes.train.colours.device)
         seconds = time.perf_counter() - started
@@ -268,7 +268,7 @@ class TrainingRun:
         elif step == plan.total_steps:
             if decided.reason == "target" and self._most_steps() > step:
                 plan = plan.extended(self._most_steps())
-        elif missing <= ANNEALING_DB / 2**failed and plan.share(step) < CLOSING_SHARE:
+        elif missing <= ANNEALING_DB / 2**failed and plan.progress(step) < CLOSING_SHARE:
             plan = plan.closing(step)
         if plan is not self.plan:
             self.plan = plan
@@ -377,7 +377,7 @@ class TrainingRun:
         left = (self.plan.total_steps - self.state.step) * self.pace.seconds_per_step
         if self.clock_budget is not None:
             left = max(0.0, self.clock_budget - self.state.seconds)
-        return live_words(self.state, self.pace, left), self.plan.share(self.state.step)
+        return live_words(self.state, self.pace, left), self.plan.progress(self.state.step)
 
 
 def live_words(state: RunState, pace: Pace, left: float) -> str:

@@ -13,7 +13,7 @@ import torch
 
 from nerf.runtime.machine_rates import Rates, measure_rates
 from nerf.runtime.parallel import workers
-from nerf.runtime.profiler import Profiler, Work, running
+from nerf.runtime.profiler import Profiler, WorkCounts, profiling
 from nerf.training.trainer import StepResult
 from stages.io.files import write_json
 from stages.train.config import Config
@@ -29,8 +29,8 @@ def observed(take: Callable[[], StepResult], step: int, timings: dict[str, Any],
     """Take a step; if its turn has come, add what it did to ``timings``: JSON values, empty at first."""
     if step % TIMED_EVERY != FIRST_TIMED:
         return take()
-    stopwatch, started = Profiler(device), time.perf_counter()
-    with running(stopwatch):
+    profiler, started = Profiler(device), time.perf_counter()
+    with profiling(profiler):
         result = take()
     seconds = time.perf_counter() - started
     cores = workers() if device.type == "cpu" else 1
@@ -38,7 +38,7 @@ def observed(take: Callable[[], StepResult], step: int, timings: dict[str, Any],
     for name, amount in (amounts | {"seconds": seconds, "core_seconds": cores * seconds}).items():
         timings[name] = timings.get(name, 0) + amount
     parts = timings.setdefault("parts", {})
-    for name, spent in stopwatch.parts.items():
+    for name, spent in profiler.spans.items():
         parts[name] = [a + b for a, b in zip(parts.get(name, [0.0] * 4), (spent.seconds, *spent.work), strict=True)]
     return result
 
@@ -51,7 +51,7 @@ def parts_table(timings: dict[str, Any], rates: Rates) -> dict[str, Any]:
     part's work takes at ``rates``; null for parts whose work is not of that kind. ``floor_share`` is of what was
     computed.
     """
-    spent = {name: (seconds, rates.seconds(Work(*work))) for name, (seconds, *work) in timings["parts"].items()}
+    spent = {name: (seconds, rates.seconds(WorkCounts(*work))) for name, (seconds, *work) in timings["parts"].items()}
     busy, floor = (sum(column) for column in zip(*spent.values(), strict=True))
     whole = max(timings["core_seconds"], busy)
     spent[WAITING] = (whole - busy, 0.0)

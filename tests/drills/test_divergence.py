@@ -17,8 +17,8 @@ from nerf.effects.exposure import ExposureModel
 from nerf.effects.pose_refinement import PoseRefinement
 from nerf.training.hash_grid_trainer import HashGridTrainer
 from nerf.training.ray_dataset import RayDataset
-from nerf.training.trainer import VanillaTrainer
 from nerf.training.validation_probe import make_probe, measure
+from nerf.training.vanilla_trainer import VanillaTrainer
 from stages import train
 from stages.contract import StageError, StageResult
 from stages.ingest.decoding import DecodeError, decode
@@ -134,9 +134,9 @@ def test_weights_that_the_last_update_broke_are_never_kept(
     assert weights_are_finite(tmp_path / "train")
 
 
-# Of the dataset: near and far, the cameras' places, their rotations; and how bearings change from pixel to pixel.
+# Of the dataset: near and far, the cameras' places, their rotations; and how ray directions change from pixel to pixel.
 ROWS = {"near": ("geometry", 12), "far": ("geometry", 13), "centres": ("geometry", 9), "rotations": ("geometry", 4)}
-ROWS["bearings"] = ("patches", 1)
+ROWS["ray_directions"] = ("patches", 1)
 
 
 @pytest.mark.parametrize("poison", [float("nan"), float("inf")])

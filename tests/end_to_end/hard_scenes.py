@@ -49,9 +49,9 @@ def moved(poses: Poses, scale: float = 1.0, offset: Sequence[float] = (0.0, 0.0,
 @cache
 def _picture(pose: bytes, zoom: float) -> Picture:
     with torch.inference_mode():
-        bearings = pinhole_directions(SIZE, SIZE, zoom * FOCAL_PX)
+        ray_directions = pinhole_directions(SIZE, SIZE, zoom * FOCAL_PX)
         world_from_camera = torch.tensor(np.frombuffer(pose).reshape(3, 4), dtype=torch.float32)
-        trace = still_life(0).trace(rays_of_view(bearings, world_from_camera, 0.0, 1e5))
+        trace = still_life(0).trace(rays_of_view(ray_directions, world_from_camera, 0.0, 1e5))
         return torch.cat([trace.colour, trace.hit[..., None].float()], -1).double().numpy()
 
 

@@ -27,8 +27,8 @@ ELSEWHERE = {
     "half a cell within: tests/nerf/training/test_hash_grid_trainer.py",
     "nerf/fields/frustum_mask.py": "angles and distances of the middles of cells; the cells around them count as "
     "well: tests/nerf/fields/test_frustum_mask.py",
-    "nerf/training/ray_dataset.py": "bearings linear within a patch, of length 1/2 or more before they are divided by "
-    "it: tests/nerf/training/test_ray_dataset.py",
+    "nerf/training/ray_dataset.py": "ray directions linear within a patch, of length 1/2 or more before they are "
+    "divided by it: tests/nerf/training/test_ray_dataset.py",
     "nerf/rendering/srgb.py": "the standard's own curve, its inverse, from nothing to 1e30: "
     "tests/nerf/rendering/test_srgb.py",
     "nerf/effects/exposure.py": "powers taken between powers, without light in between; value, gradient, extremes: "
@@ -44,8 +44,8 @@ ELSEWHERE = {
     "nerf/rendering/images.py": "cuts pictures into chunks: tests/nerf/rendering/test_images.py",
     "nerf/training/validation_probe.py": "mean colour, PSNR, patches of pixels: "
     "tests/nerf/training/test_validation_probe.py",
-    "nerf/training/trainer.py": "sums of chunks; refuses what is not finite before the update: "
-    "tests/nerf/training/test_trainer.py",
+    "nerf/training/vanilla_trainer.py": "sums of chunks; refuses what is not finite before the update: "
+    "tests/nerf/training/test_vanilla_trainer.py",
     "nerf/training/hash_grid_trainer.py": "likewise: tests/nerf/training/test_hash_grid_trainer.py",
     "nerf/runtime/matmul_precision.py": "lets products be off by 1e-4 beside float64, where that is faster: "
     "tests/nerf/runtime/test_matmul_precision.py",

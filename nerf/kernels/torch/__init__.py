@@ -1,4 +1,4 @@
-"""The specification of the grid field's hot loops: plain torch, readable, on any device, in float32 or float64.
+"""The specification of the hash-grid field's hot loops: plain torch, readable, on any device, in float32 or float64.
 
 Also a backend of its own (:class:`nerf.kernels.Backend`), for machines where no other runs.
 """

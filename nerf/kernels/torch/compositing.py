@@ -1,8 +1,8 @@
 """Volume rendering of packed samples (Mildenhall et al. 2020, eq. 3), and the distortion loss of its weights.
 
 With the optical depth tau_i = sigma_i dt_i of sample i, T_i = exp(-sum_{j<i} tau_j) is the transmittance before it,
-T_{i+1} the one behind it, and w_i = T_i (1 - exp(-tau_i)) its weight; U = exp(-sum tau_j) is the light that nothing
-stops.
+T_{i+1} the one behind it, and w_i = T_i (1 - exp(-tau_i)) its weight; U = exp(-sum tau_j) is the transmittance of
+the whole ray.
 
 Sums over a ray are differences of running sums over all packed samples, taken in float64, as long as these are numbers
 up to OPAQUE. Otherwise, which takes longer, rays are summed apart: what is no number on one of them, or huge, changes
@@ -43,7 +43,7 @@ def visible_samples(
     of_thin = torch.where(probability < 1, probability, 0).double()
     before = sums_before(samples, of_thin) + offset.double().index_select(0, samples.ray)
     kept = ~(probability < 1) | ((before + of_thin).floor() > before.floor())
-    index = (kept & (_stopping(samples, sigma).before >= threshold)).nonzero()[:, 0]
+    index = (kept & (_transmittances(samples, sigma).before >= threshold)).nonzero()[:, 0]
     starts = torch.searchsorted(index, samples.starts.long(), out_int32=True)
     index = index.int()
     ray, t, dt = (each.index_select(0, index) for each in (samples.ray, samples.t, samples.dt / probability))
@@ -66,14 +66,14 @@ def composite(
 
     colour = sum w_i c_i + U background, depth = sum w_i t_i + U far, opacity = 1 - U.
     """
-    light = _stopping(samples, sigma)
-    stopped = _ray_sums(samples, light.weights[:, None] * torch.cat([colour, samples.t[:, None]], -1))
+    along = _transmittances(samples, sigma)
+    stopped = _ray_sums(samples, along.weights[:, None] * torch.cat([colour, samples.t[:, None]], -1))
     rendering = Rendering(
-        colour=stopped[:, :3] + light.unstopped[:, None] * background,
-        depth=stopped[:, 3] + light.unstopped * far,
-        opacity=light.opacity,
+        colour=stopped[:, :3] + along.transmittance[:, None] * background,
+        depth=stopped[:, 3] + along.transmittance * far,
+        opacity=along.opacity,
     )
-    return rendering, light.weights
+    return rendering, along.weights
 
 
 def composite_backward(
@@ -90,14 +90,14 @@ def composite_backward(
     With g_i = dL/dw_i and G = dL/dU in total, dL/dcolour_i = w_i dL/dcolour and
     dL/dsigma_i = dt_i (T_{i+1} g_i - sum_{k>i} w_k g_k - U G).
     """
-    light = _stopping(samples, sigma)
+    along = _transmittances(samples, sigma)
     grad_seen, grad_depth = (part.index_select(0, samples.ray) for part in (grad.colour, grad.depth))
     g = grad_weights + (grad_seen * colour).sum(-1) + grad_depth * samples.t
-    grad_unstopped = (grad.colour * background).sum(-1) + grad.depth * far - grad.opacity
-    behind = _sums_behind(samples, light.weights * g)
-    unstopped = (light.unstopped * grad_unstopped).index_select(0, samples.ray)
-    grad_sigma = samples.dt * (light.behind * g - behind - unstopped)
-    return grad_sigma, light.weights[:, None] * grad_seen
+    grad_transmittance = (grad.colour * background).sum(-1) + grad.depth * far - grad.opacity
+    behind = _sums_behind(samples, along.weights * g)
+    transmittance = (along.transmittance * grad_transmittance).index_select(0, samples.ray)
+    grad_sigma = samples.dt * (along.behind * g - behind - transmittance)
+    return grad_sigma, along.weights[:, None] * grad_seen
 
 
 def distortion(samples: Samples, weights: Float[Tensor, "samples"], stepping: RayStepping) -> Float[Tensor, "rays"]:
@@ -128,21 +128,21 @@ def distortion_backward(
     return grad.index_select(0, samples.ray) * (2 * apart + 2 / 3 * w * lengths).to(weights.dtype)
 
 
-class _Stopping(NamedTuple):
-    """Where the light is stopped: T_i, T_{i+1} and w_i per sample, U and 1 - U per ray."""
+class _Transmittances(NamedTuple):
+    """Along a ray: T_i, T_{i+1} and w_i per sample, U and 1 - U per ray."""
 
     before: Float[Tensor, "samples"]
     behind: Float[Tensor, "samples"]
     weights: Float[Tensor, "samples"]
-    unstopped: Float[Tensor, "rays"]
+    transmittance: Float[Tensor, "rays"]
     opacity: Float[Tensor, "rays"]
 
 
-def _stopping(samples: Samples, sigma: Float[Tensor, "samples"]) -> _Stopping:
+def _transmittances(samples: Samples, sigma: Float[Tensor, "samples"]) -> _Transmittances:
     tau = (sigma * samples.dt).clamp(max=OPAQUE)
     depth_before, depth = sums_before(samples, tau), _ray_sums(samples, tau)
     before = torch.exp(-depth_before)
-    return _Stopping(
+    return _Transmittances(
         before, torch.exp(-depth_before - tau), before * -torch.expm1(-tau), torch.exp(-depth), -torch.expm1(-depth)
     )
 

@@ -1,4 +1,4 @@
-"""Samples along rays where the density cache says that there may be something, and the points at which they stand."""
+"""Samples along rays where the occupancy grid says that there may be something, and the points at which they stand."""
 
 import torch
 from jaxtyping import Float, Int32

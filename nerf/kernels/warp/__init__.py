@@ -1,4 +1,4 @@
-"""The grid field's hot loops as NVIDIA Warp kernels: one source for CPU and CUDA (:class:`nerf.kernels.Backend`).
+"""The hash-grid field's hot loops as NVIDIA Warp kernels: one source for CPU and CUDA (:class:`nerf.kernels.Backend`).
 
 Float32 and int32 tensors, but for the cache (int64, uint8) and optical depths (float64). On the CPU a call uses the
 thread it is made from; results do not depend on how many threads call. On a GPU, gradients of the table are added in

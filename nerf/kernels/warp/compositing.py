@@ -204,9 +204,9 @@ def _composite(
         weights[i] = weight
         sum_colour += wp.vec3d(weight * colour[i])
         sum_depth += wp.float64(weight * distances[i])
-    unstopped = wp.exp(-float(tau))
-    seen[ray] = wp.vec3(sum_colour) + unstopped * background[ray]
-    depth[ray] = float(sum_depth) + unstopped * far[ray]
+    transmittance = wp.exp(-float(tau))
+    seen[ray] = wp.vec3(sum_colour) + transmittance * background[ray]
+    depth[ray] = float(sum_depth) + transmittance * far[ray]
     opacity[ray] = opacity_of(float(tau))
 
 

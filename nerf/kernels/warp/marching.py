@@ -1,4 +1,4 @@
-"""Samples along rays (``nerf.kernels.torch.marching``): where the density cache is empty, whole
+"""Samples along rays (``nerf.kernels.torch.marching``): where the occupancy grid is empty, whole
 neighbourhoods of bricks are skipped."""
 
 import threading
@@ -158,10 +158,10 @@ def _free_distance(
     """How far along the ray it stays, but for rounding at a face, within the cube of ``2 clear - 1`` bricks per side
     around a cell, which holds its point (unit: u).
 
-    Where unit coordinates are linear, up to where it leaves these bricks or that region. Where space is folded, r being
-    the largest component of the point, coordinates in [-2, 2] move at most 4/3 times as fast as the point, and at most
-    4/(r - a) times within a distance a of it; so within a distance m of the nearest face (in the largest component) it
-    stays for max(3/4 m, m r / (4 + m)).
+    Where unit coordinates are linear, up to where it leaves these bricks or that region. Where space is contracted, r
+    being the largest component of the point, coordinates in [-2, 2] move at most 4/3 times as fast as the point, and
+    at most 4/(r - a) times within a distance a of it; so within a distance m of the nearest face (in the largest
+    component) it stays for max(3/4 m, m r / (4 + m)).
     """
     width = 1.0 / float(cells)
     around = 4.0 * float(clear - 1)

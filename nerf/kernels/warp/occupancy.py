@@ -1,4 +1,4 @@
-"""The density cache (``nerf.kernels.torch.occupancy``)."""
+"""The occupancy grid (``nerf.kernels.torch.occupancy``)."""
 
 import torch
 import warp as wp

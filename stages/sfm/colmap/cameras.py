@@ -11,12 +11,12 @@ from stages.contract import StageError
 if TYPE_CHECKING:
     import pycolmap
 
-ROUND_TRIP_PX = 0.01  # a bearing that does not project back to its pixel is a false root of the distortion
+ROUND_TRIP_PX = 0.01  # a ray direction that does not project back to its pixel is a false root of the distortion
 CHECKED_PIXELS = (33, 25)  # across and down, the very corners among them: there lenses bend most
 
 
 def camera_rays(camera: Camera, width: int, height: int) -> Float[np.ndarray, "height width 3"]:
-    """Unit bearing vectors (float32) of the pixel centres of ``camera``'s image resized to width × height.
+    """Unit ray directions (float32) of the pixel centres of ``camera``'s image resized to width × height.
 
     Raises StageError where the camera model has no inverse at some pixels.
     """
@@ -43,10 +43,10 @@ def share_without_ray(model: "pycolmap.Camera") -> float:
 
 
 def _bearings(model: "pycolmap.Camera", pixels: Float[np.ndarray, "n 2"]) -> tuple[Float[np.ndarray, "n 3"], int]:
-    """Unit bearing vectors of pixels, and how many of these they are not those of."""
-    bearings = np.asarray(model.cam_ray_from_img(pixels))
-    miss = np.abs(np.asarray(model.img_from_cam(bearings)) - pixels).max(axis=1)
-    return bearings, int(np.count_nonzero(~(miss < ROUND_TRIP_PX)))  # NaN counts as lost
+    """Unit ray directions of pixels, and how many of these they are not those of."""
+    ray_directions = np.asarray(model.cam_ray_from_img(pixels))
+    miss = np.abs(np.asarray(model.img_from_cam(ray_directions)) - pixels).max(axis=1)
+    return ray_directions, int(np.count_nonzero(~(miss < ROUND_TRIP_PX)))  # NaN counts as lost
 
 
 def no_ray(camera: Camera, share: float, of: str = "") -> StageError:
@@ -65,7 +65,7 @@ def no_ray(camera: Camera, share: float, of: str = "") -> StageError:
 
 def why_no_ray(model: str) -> str:
     """What may be the matter where a camera of this model has no ray: COLMAP's fisheyes end at 90° from the axis, and
-    the bearings that they give further out are of other pixels."""
+    the ray directions that they give further out are of other pixels."""
     return f"{'it looks beyond 90° from its axis or ' if is_fisheye(model) else ''}its distortion cannot be undone"
 
 

@@ -61,15 +61,15 @@ def _jacobians(
     for image_id, (mine, points) in points_in_camera(model, seen).items():
         camera, pose = model.camera(model.image(image_id).camera_id), model.image(image_id).cam_from_world().matrix()
         step = STEP * np.linalg.norm(points, axis=1)
-        bearing = np.empty((len(points), 2, 3))
+        ray_direction = np.empty((len(points), 2, 3))
         for axis, unit in enumerate(np.eye(3)):
             ahead, behind = (np.asarray(camera.img_from_cam(points + s * step[:, None] * unit)) for s in (1, -1))
-            bearing[:, :, axis] = (ahead - behind) / (2 * step[:, None])
+            ray_direction[:, :, axis] = (ahead - behind) / (2 * step[:, None])
         # J (φ × y) = Σ φ_a J (e_a × y) with y = R x
         turned = np.cross(np.eye(3)[None], (points - pose[:, 3])[:, None])
-        to_pose[mine, :, :3] = np.einsum("nij,naj->nia", bearing, turned)
-        to_pose[mine, :, 3:] = bearing
-        to_point[mine] = bearing @ pose[:, :3]
+        to_pose[mine, :, :3] = np.einsum("nij,naj->nia", ray_direction, turned)
+        to_pose[mine, :, 3:] = ray_direction
+        to_point[mine] = ray_direction @ pose[:, :3]
     return to_pose, to_point
 
 

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 from nerf.effects import ImageEffects
 from nerf.fields.vanilla import VanillaNerf, VanillaSettings
-from nerf.training.trainer import CHUNK_RAYS, VanillaTrainer, VanillaTrainerSettings
+from nerf.training.vanilla_trainer import CHUNK_RAYS, VanillaTrainer, VanillaTrainerSettings
 from stages.contract import Progress
 from stages.hardware.device import cores
 from stages.train.config import Config

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import torch
 
-from nerf.fields import frustum_mask as visibility
+from nerf.fields import frustum_mask
 from nerf.fields.frustum_mask import compute_frustum_mask
 from nerf.fields.hash_grid import HashGridField, HashGridSettings
 from nerf.geometry.contraction import uncontract
@@ -37,7 +37,7 @@ def dataset(count: int = 4, half: float = HALF) -> RayDataset:
     """Photos from 2.5 units away, a fifth of the circle apart, that all look at the origin."""
     grid = 2 * half * ((torch.arange(SIZE) + 0.5) / SIZE - 0.5)
     y, x = torch.meshgrid(grid, grid, indexing="ij")
-    bearings = torch.nn.functional.normalize(torch.stack([x, y, torch.ones_like(x)], -1), dim=-1)
+    ray_directions = torch.nn.functional.normalize(torch.stack([x, y, torch.ones_like(x)], -1), dim=-1)
     poses = []
     for angle in torch.arange(count) * (2 * math.pi / 5):
         forward = torch.stack([-angle.cos(), -angle.sin(), torch.zeros(())])
@@ -46,7 +46,7 @@ def dataset(count: int = 4, half: float = HALF) -> RayDataset:
         poses.append(torch.cat([rotation, -2.5 * forward[:, None]], 1))
     photo = torch.randint(0, 256, (SIZE, SIZE, 3), generator=torch.Generator().manual_seed(0)).to(torch.uint8)
     near, far = torch.full((count,), NEAR), torch.full((count,), FAR)
-    return ray_dataset_from_images([photo] * count, [0] * count, [bearings], torch.stack(poses), near, far)
+    return ray_dataset_from_images([photo] * count, [0] * count, [ray_directions], torch.stack(poses), near, far)
 
 
 def knowing(views: RayDataset) -> RayDataset:
@@ -94,7 +94,7 @@ def test_photos_that_look_together_find_what_each_finds_after_the_other(monkeypa
     try:
         for count, together in ((1, 1), (2, 2), (2, 16)):
             torch.set_num_threads(count)
-            monkeypatch.setattr(visibility, "TOGETHER", together)
+            monkeypatch.setattr(frustum_mask, "TOGETHER", together)
             found.append(compute_frustum_mask(dataset(5, 0.15), 3, 64))
     finally:
         torch.set_num_threads(threads)
@@ -109,8 +109,8 @@ def test_all_trainers_of_a_bank_ask_once(monkeypatch: pytest.MonkeyPatch) -> Non
         asked.append(given[-1])
         return own(*given)
 
-    own = visibility._looked_at
-    monkeypatch.setattr(visibility, "_looked_at", looked_at)
+    own = frustum_mask._looked_at
+    monkeypatch.setattr(frustum_mask, "_looked_at", looked_at)
     views = knowing(dataset())
     fields = [HashGridField(FIELD, seed, reference) for seed in (0, 1)]
     for field in fields:

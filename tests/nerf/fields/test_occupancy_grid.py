@@ -1,4 +1,4 @@
-"""The density cache measures blocks of 2³ cells, in turn, each at a point within."""
+"""The occupancy grid measures blocks of 2³ cells, in turn, each at a point within."""
 
 import pytest
 import torch

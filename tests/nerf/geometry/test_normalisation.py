@@ -283,9 +283,9 @@ def test_a_camera_anywhere_has_near_before_far_and_reaches_the_region(away: floa
 def test_a_telephoto_lens_far_away_sees_the_region() -> None:
     """The region is as wide as the picture: 40 of its half sides away."""
     scene = seen_by(ring(radius=4.0), np.zeros((0, 3)))
-    narrow = scene.bearings * [0.05, 0.05, 1.0]
+    narrow = scene.ray_directions * [0.05, 0.05, 1.0]
     narrow /= np.linalg.norm(narrow, axis=2, keepdims=True)
-    found = normalise(dataclasses.replace(scene, bearings=narrow), None)
+    found = normalise(dataclasses.replace(scene, ray_directions=narrow), None)
     distance = np.linalg.norm(found.scene_from_sfm.points(scene.centres), axis=1)
     assert (distance > 20).all()
     assert (found.near < distance - 0.9).all() and (found.far > distance + 0.9).all()
@@ -368,8 +368,10 @@ def test_lego_fills_the_region_and_stays_inside(shared_data) -> None:
     poses = np.stack([np.concatenate([f[:, :3] @ axes, f[:, 3:]], axis=1) for f in frames])
     scene = seen_by(poses, np.zeros((0, 3)))
     tangent = np.tan(content["camera_angle_x"] / 2)
-    bearings = scene.bearings * [tangent / 0.5, tangent / 0.5, 1]
-    scene = dataclasses.replace(scene, bearings=bearings / np.linalg.norm(bearings, axis=-1, keepdims=True))
+    ray_directions = scene.ray_directions * [tangent / 0.5, tangent / 0.5, 1]
+    scene = dataclasses.replace(
+        scene, ray_directions=ray_directions / np.linalg.norm(ray_directions, axis=-1, keepdims=True)
+    )
     found = normalise(opaque_everywhere(scene), None)
     assert found.layout == "around"
     assert found.bounded

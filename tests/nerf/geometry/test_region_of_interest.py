@@ -46,7 +46,7 @@ def rings(count: int) -> Reconstruction:
     rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
     return Reconstruction(
         from_camera=np.concatenate([turns, centres[:, :, None]], axis=2),
-        bearings=np.tile(rays / np.linalg.norm(rays, axis=1, keepdims=True), (count, 1, 1)),
+        ray_directions=np.tile(rays / np.linalg.norm(rays, axis=1, keepdims=True), (count, 1, 1)),
         points=random.normal(0, 0.4, (3000, 3)) * [1, 1, 0.3],
         view=np.repeat(np.arange(count), 60),
         point=random.integers(0, 3000, 60 * count),

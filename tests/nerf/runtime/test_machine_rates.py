@@ -5,7 +5,7 @@ import torch
 
 from nerf.runtime import machine_rates
 from nerf.runtime.machine_rates import Rates, measure_rates
-from nerf.runtime.profiler import Profiler, Work
+from nerf.runtime.profiler import Profiler, WorkCounts
 
 CPU = torch.device("cpu")
 
@@ -37,11 +37,11 @@ def test_what_is_copied_fits_into_no_cache(cores: int, monkeypatch: pytest.Monke
 
 
 def test_the_same_again_is_about_as_fast(monkeypatch: pytest.MonkeyPatch) -> None:
-    first, second = (measure_rates(CPU, width=64, rows=1 << 12, seconds=0.3).products for _ in range(2))
+    first, second = (measure_rates(CPU, width=64, rows=1 << 12, seconds=0.3).matmul_flops for _ in range(2))
     assert 1 / 3 < first / second < 3
 
 
 def test_seconds_of_work_are_a_sum_of_shares() -> None:
-    rates = Rates(products=10.0, rows=4.0, bytes=2.0)
-    assert rates.seconds(Work()) == 0
-    assert rates.seconds(Work(products=20, rows=4, bytes=1)) == 2 + 1 + 0.5
+    rates = Rates(matmul_flops=10.0, gathered_rows=4.0, streamed_bytes=2.0)
+    assert rates.seconds(WorkCounts()) == 0
+    assert rates.seconds(WorkCounts(matmul_flops=20, gathered_rows=4, streamed_bytes=1)) == 2 + 1 + 0.5

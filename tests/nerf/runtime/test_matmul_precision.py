@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from nerf.runtime import matmul_precision as product_precision
+from nerf.runtime import matmul_precision
 from nerf.runtime.matmul_precision import (
     MAX_MATMUL_ERROR,
     Medium,
@@ -54,8 +54,8 @@ def test_the_fastest_of_several_counts(seconds: dict[str, float], speedup: float
         asked.append((torch.get_float32_matmul_precision(), *a.shape, *b.shape))
         return seconds.get(asked[-1][0], 1.0) * (3.0 if len(asked) < 5 else 1.0)
 
-    monkeypatch.setattr(product_precision, "TRIED_SECONDS", 0.0)
-    monkeypatch.setattr(product_precision, "seconds_of_product", made_up)
+    monkeypatch.setattr(matmul_precision, "TRIED_SECONDS", 0.0)
+    monkeypatch.setattr(matmul_precision, "seconds_of_product", made_up)
     found = measure_medium_matmul(CPU, 64)
     assert found.speedup == speedup and 0 <= found.error < 0.1
     assert asked == [("highest", 8192, 64, 64, 64), ("medium", 8192, 64, 64, 64)] * 3
@@ -65,7 +65,7 @@ def test_the_fastest_of_several_counts(seconds: dict[str, float], speedup: float
 @pytest.mark.parametrize("width, rows", [(2, 8192), (64, 8192), (128, 2048), (256, 512), (1024, 256)])
 def test_networks_of_any_width_are_as_much_work(width: int, rows: int, monkeypatch) -> None:
     tried = []
-    monkeypatch.setattr(product_precision, "_fastest", lambda a, b: tried.append(a) or {"highest": 1.0, "medium": 1.0})
+    monkeypatch.setattr(matmul_precision, "_fastest", lambda a, b: tried.append(a) or {"highest": 1.0, "medium": 1.0})
     measure_medium_matmul(CPU, width)
     assert tried[0].shape == (rows, width)
 

@@ -13,8 +13,8 @@ def scene() -> SyntheticScene:
     return still_life()
 
 
-def bearings(height: int, width: int) -> torch.Tensor:
-    """Unit bearing vectors of a pinhole camera of 50 degrees."""
+def ray_directions(height: int, width: int) -> torch.Tensor:
+    """Unit ray directions of a pinhole camera of 50 degrees."""
     y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     pinhole = torch.stack([(x - width / 2) / width, (y - height / 2) / width, torch.ones_like(x)], dim=-1)
     return torch.nn.functional.normalize(pinhole, dim=-1)
@@ -22,7 +22,7 @@ def bearings(height: int, width: int) -> torch.Tensor:
 
 def view(number: int, height: int = 60, width: int = 80, dtype: torch.dtype = torch.float32) -> Rays:
     pose = torch.tensor(ring_of_cameras(40)[number], dtype=dtype)
-    return rays_of_view(bearings(height, width).to(dtype), pose, near=0.1, far=10.0)
+    return rays_of_view(ray_directions(height, width).to(dtype), pose, near=0.1, far=10.0)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -88,7 +88,7 @@ def test_rays_that_leave_the_surface_do_not_hit_where_they_start(scene: Syntheti
 
 def test_supersampling_converges(scene: SyntheticScene):
     pose = torch.tensor(ring_of_cameras(40)[3], dtype=torch.float32)
-    images = {n: photograph(scene, bearings(24 * n, 32 * n), pose, n) for n in (1, 2, 4, 8)}
+    images = {n: photograph(scene, ray_directions(24 * n, 32 * n), pose, n) for n in (1, 2, 4, 8)}
     assert images[1].shape == (24, 32, 3)
     error = [(images[n] - images[8]).square().mean().sqrt() for n in (1, 2, 4)]
     assert 0.1 > error[0] > 1.4 * error[1] > 1.4**2 * error[2] > 1e-4
@@ -96,7 +96,7 @@ def test_supersampling_converges(scene: SyntheticScene):
 
 def test_a_photo_is_the_mean_of_its_samples(scene: SyntheticScene):
     pose = torch.tensor(ring_of_cameras(40)[3], dtype=torch.float32)
-    fine = bearings(12, 16)
+    fine = ray_directions(12, 16)
     colour = scene.trace(rays_of_view(fine, pose, near=0.0, far=math.inf)).colour
     pixel = photograph(scene, fine, pose, 2)[1, 3]
     torch.testing.assert_close(pixel, colour[2:4, 6:8].mean((0, 1)))

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from nerf.synthetic import textures as solid_texture
+from nerf.synthetic import textures
 from nerf.synthetic.textures import LATTICE, make_noise
 
 TEXTURES = ("mosaic", "marble", "wrapping", "banded", "foliage", "doughnut", "peel")
@@ -39,7 +39,7 @@ def test_seeds_give_different_noise_and_one_seed_the_same():
 
 @pytest.mark.parametrize("name", TEXTURES)
 def test_textures_are_colourful_and_depend_on_the_point_alone(name: str):
-    texture, noise, where = getattr(solid_texture, name), make_noise(0), points(4000)
+    texture, noise, where = getattr(textures, name), make_noise(0), points(4000)
     colour = texture(noise, where)
     assert colour.isfinite().all()
     assert colour.min() >= 0
@@ -50,7 +50,7 @@ def test_textures_are_colourful_and_depend_on_the_point_alone(name: str):
 
 @pytest.mark.parametrize("name", TEXTURES)
 def test_no_texture_repeats_itself(name: str):
-    texture, noise, where = getattr(solid_texture, name), make_noise(0), points(2000) * 0.3
+    texture, noise, where = getattr(textures, name), make_noise(0), points(2000) * 0.3
     here = texture(noise, where).flatten()
     for shift in ([0.5, 0.0, 0.0], [0.0, 0.35, 0.0], [-0.2, 0.4, 0.0]):
         there = texture(noise, where + torch.tensor(shift)).flatten()

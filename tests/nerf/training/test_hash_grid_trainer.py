@@ -34,15 +34,15 @@ def small_dataset(size: int = 12) -> RayDataset:
     """Two opposite views of a red disc on nothing, from 3 units away."""
     grid = (torch.arange(size) + 0.5) / size - 0.5
     y, x = torch.meshgrid(grid, grid, indexing="ij")
-    bearings = torch.stack([x, y, torch.ones_like(x)], -1)
-    bearings = bearings / bearings.norm(dim=-1, keepdim=True)
+    ray_directions = torch.stack([x, y, torch.ones_like(x)], -1)
+    ray_directions = ray_directions / ray_directions.norm(dim=-1, keepdim=True)
     inside = (x**2 + y**2 < 0.04)[..., None]
     photo = torch.cat([torch.where(inside, torch.tensor([200, 20, 20]), 255), torch.where(inside, 255, 0)], -1)
     front = torch.tensor([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, -3]])
     back = torch.tensor([[-1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 3]])
     near, far = torch.full((2,), 1.0), torch.full((2,), 5.0)
     return ray_dataset_from_images(
-        [photo.to(torch.uint8)] * 2, [0, 0], [bearings], torch.stack([front, back]), near, far
+        [photo.to(torch.uint8)] * 2, [0, 0], [ray_directions], torch.stack([front, back]), near, far
     )
 
 
@@ -87,7 +87,7 @@ def test_results_do_not_depend_on_the_number_of_threads() -> None:
         for count in (1, 2, 3):
             torch.set_num_threads(count)
             run = trainer(settings, replace(FIELD, num_levels=3, max_res=64, log2_hashmap_size=16))
-            for step in range(20):  # the density cache is refreshed once
+            for step in range(20):  # the occupancy grid is refreshed once
                 run.step(step, step / 20)
             states.append(copied(run.state()))
     finally:
@@ -217,7 +217,7 @@ def test_a_state_of_equal_shapes_but_other_settings_is_refused() -> None:
         trainer().load_state(other.state())
 
 
-def test_a_density_cache_of_an_unbounded_scene_has_finite_steps_everywhere() -> None:
+def test_an_occupancy_grid_of_an_unbounded_scene_has_finite_steps_everywhere() -> None:
     model = HashGridField(replace(FIELD, contracted=True), 0, reference)
     cache = HashGridTrainer(model, small_dataset(), TRAINER).occupancy_grid
     cache.update(15, torch.Generator().manual_seed(1))

@@ -1,5 +1,5 @@
-"""What a step of a grid field takes of the photos: pixels, each once, and effects, which change no bit where they are
-off and are refused where they run away."""
+"""What a step of a hash-grid field takes of the photos: pixels, each once, and effects, which change no bit where
+they are off and are refused where they run away."""
 
 from dataclasses import replace
 from functools import partial
@@ -20,9 +20,9 @@ from nerf.training.trainer import RAYS, NonFinite
 from tests.nerf.training.test_hash_grid_trainer import FIELD, TRAINER, copied, same, small_dataset, trainer
 
 
-def part_without_effects(run: HashGridTrainer, step: int, share: float, rays: int, chunk: int) -> _Part:
+def part_without_effects(run: HashGridTrainer, step: int, progress: float, rays: int, chunk: int) -> _Part:
     """What a chunk adds to loss and gradients, written as if there were no effects."""
-    batch = run._batch(step, share, chunk, rays)
+    batch = run._batch(step, progress, chunk, rays)
     done = run.model.forward(batch.rays, batch.jitter, batch.offset, batch.background)
     error = done.rendering.colour - batch.target
     robust, pull = huber_loss(error)

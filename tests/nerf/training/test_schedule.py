@@ -13,13 +13,13 @@ def plans(draw: st.DrawFn) -> StepSchedule:
     for _ in range(draw(st.integers(0, 6))):
         earliest = plan.decisions[-1].from_step
         step = draw(st.integers(earliest, max(earliest, plan.total_steps - 1)))
-        plan = plan.revised(step, draw(st.integers(step + 1, step + 60)), plan.share(step))
+        plan = plan.revised(step, draw(st.integers(step + 1, step + 60)), plan.progress(step))
     return plan
 
 
 @given(plans())
 def test_share_goes_from_0_to_1_and_never_back(plan: StepSchedule) -> None:
-    shares = [plan.share(step) for step in range(plan.total_steps + 1)]
+    shares = [plan.progress(step) for step in range(plan.total_steps + 1)]
     assert shares[0] == 0
     assert shares[-1] == pytest.approx(1, abs=1e-12)
     assert all(a < b for a, b in pairwise(shares))
@@ -29,35 +29,35 @@ def test_share_goes_from_0_to_1_and_never_back(plan: StepSchedule) -> None:
 def test_a_decision_leaves_the_past_and_the_present_alone(plan: StepSchedule, more: int, position: int) -> None:
     earliest = plan.decisions[-1].from_step
     step = earliest + position % (plan.total_steps - earliest)
-    revised = plan.revised(step, step + more, plan.share(step))
-    assert [revised.share(s) for s in range(step + 1)] == [plan.share(s) for s in range(step + 1)]
+    revised = plan.revised(step, step + more, plan.progress(step))
+    assert [revised.progress(s) for s in range(step + 1)] == [plan.progress(s) for s in range(step + 1)]
 
 
 @given(plans(), st.integers(0, 60))
 def test_a_plan_without_its_later_decisions_is_the_one_that_held(plan: StepSchedule, step: int) -> None:
     earlier = plan.until(step)
-    assert [earlier.share(s) for s in range(step + 1)] == [plan.share(s) for s in range(step + 1)]
+    assert [earlier.progress(s) for s in range(step + 1)] == [plan.progress(s) for s in range(step + 1)]
     assert earlier.decisions[-1].from_step <= step and plan.decisions[: len(earlier.decisions)] == earlier.decisions
 
 
 def test_a_plan_without_revision_is_linear() -> None:
-    assert [schedule_of(4).share(step) for step in range(5)] == [0, 0.25, 0.5, 0.75, 1]
+    assert [schedule_of(4).progress(step) for step in range(5)] == [0, 0.25, 0.5, 0.75, 1]
 
 
 def test_half_way_through_twice_the_steps() -> None:
     plan = schedule_of(4).revised(2, 6, 0.5)
-    assert [plan.share(step) for step in range(7)] == [0, 0.25, 0.5, 0.625, 0.75, 0.875, 1]
+    assert [plan.progress(step) for step in range(7)] == [0, 0.25, 0.5, 0.625, 0.75, 0.875, 1]
 
 
 @given(plans(), st.integers(1, 60), st.integers(1, 60))
 def test_more_steps_take_the_share_back_to_that_of_the_longer_run(plan: StepSchedule, more: int, yet_more: int) -> None:
     done = plan.total_steps
     longer = plan.extended(done + more)
-    assert [longer.share(step) for step in range(done)] == [plan.share(step) for step in range(done)]
+    assert [longer.progress(step) for step in range(done)] == [plan.progress(step) for step in range(done)]
     whole = schedule_of(done + more)
     for step in range(done, done + more + 1):
-        assert longer.share(step) == pytest.approx(whole.share(step), abs=1e-12)
-    assert longer.extended(done + more + yet_more).share(done + more) == (done + more) / (done + more + yet_more)
+        assert longer.progress(step) == pytest.approx(whole.progress(step), abs=1e-12)
+    assert longer.extended(done + more + yet_more).progress(done + more) == (done + more) / (done + more + yet_more)
     assert plan.is_whole and not longer.is_whole
 
 
@@ -66,16 +66,16 @@ def test_a_run_that_closes_early_ends_as_every_run_does(total: int, data: st.Dat
     plan, step = schedule_of(total), data.draw(st.integers(0, total - 1))
     closed = plan.closing(step)
     assert step < closed.total_steps <= total
-    assert closed.share(step) >= CLOSING_SHARE and closed.share(closed.total_steps) == 1
-    assert [closed.share(s) for s in range(step)] == [plan.share(s) for s in range(step)]
+    assert closed.progress(step) >= CLOSING_SHARE and closed.progress(closed.total_steps) == 1
+    assert [closed.progress(s) for s in range(step)] == [plan.progress(s) for s in range(step)]
     if closed.total_steps < total and step >= 10:
         whole = schedule_of(closed.total_steps)
-        assert closed.share(step) == pytest.approx(whole.share(step), abs=0.05)
+        assert closed.progress(step) == pytest.approx(whole.progress(step), abs=0.05)
 
 
 def test_a_run_may_end_at_any_step_it_has_come_to() -> None:
     ended = schedule_of(10).closing(6).ended(7)
-    assert ended.total_steps == 7 and ended.share(7) == schedule_of(10).closing(6).share(7)
+    assert ended.total_steps == 7 and ended.progress(7) == schedule_of(10).closing(6).progress(7)
     with pytest.raises(ValueError, match="cannot end"):
         ended.ended(7)
     with pytest.raises(ValueError, match="cannot close"):
@@ -114,14 +114,14 @@ def test_a_run_on_a_steady_clock_ends_on_time(budget: float, rate: float) -> Non
 def test_a_run_that_turns_out_slow_is_cut_short_and_still_ends_at_1() -> None:
     plan = replanned(schedule_of(100), 50, 9.0, 10.0, 10.0, 0.1)
     assert plan.total_steps == 60
-    assert plan.share(49) == 0.49 and plan.share(50) == 0.9
-    assert plan.share(60) == pytest.approx(1)
+    assert plan.progress(49) == 0.49 and plan.progress(50) == 0.9
+    assert plan.progress(60) == pytest.approx(1)
 
 
 def test_a_plan_made_too_short_leaves_no_trace_in_the_rates() -> None:
     plan = replanned(schedule_of(30), 29, 1.5, 30.0, 20.0, 0.3)
     assert plan.total_steps == 29 + 570
-    assert plan.share(29) == 0.05
+    assert plan.progress(29) == 0.05
 
 
 def test_a_plan_that_is_right_enough_stands() -> None:
@@ -134,8 +134,8 @@ def test_past_the_deadline_one_step_is_left() -> None:
 
 
 @given(st.floats(0.0, 1.0), st.floats(0.0, 0.5))
-def test_equal_shares_lower_the_rate_by_equal_factors(share: float, more: float) -> None:
-    ratio = learning_rate(share + more, 5e-4, 5e-5) / learning_rate(share, 5e-4, 5e-5)
+def test_equal_shares_lower_the_rate_by_equal_factors(progress: float, more: float) -> None:
+    ratio = learning_rate(progress + more, 5e-4, 5e-5) / learning_rate(progress, 5e-4, 5e-5)
     assert ratio == pytest.approx(0.1**more, rel=1e-9)
 
 

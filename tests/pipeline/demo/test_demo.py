@@ -75,8 +75,8 @@ def test_a_photo_shows_what_the_true_camera_sees(synthetic_photos: SyntheticPhot
     with Image.open(folder / name) as image:
         photo = np.asarray(image) / 255
     assert photo.shape == (180, 240, 3)
-    bearings = torch.from_numpy(camera_rays(truth.camera, 240, 180))
-    rays = rays_of_view(bearings, torch.tensor(pose, dtype=torch.float32), near=0.0, far=9.0)
+    ray_directions = torch.from_numpy(camera_rays(truth.camera, 240, 180))
+    rays = rays_of_view(ray_directions, torch.tensor(pose, dtype=torch.float32), near=0.0, far=9.0)
     error = np.abs(still_life(truth.seed).trace(rays).colour.numpy() - photo)
     assert 0 < np.median(error) < 0.02
     shifted = np.abs(np.roll(photo, 2, axis=1) - still_life(truth.seed).trace(rays).colour.numpy())

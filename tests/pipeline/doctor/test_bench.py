@@ -52,7 +52,7 @@ def test_the_optimiser_is_shared_by_as_many_rays_as_a_step_has_on_this_machine(
         monkeypatch.setattr("stages.train.fields.hash_grid.cores", lambda count=count: count)
         works.append(bench.grid_work(space == "contracted", 20))
     one, four = works
-    assert one.bytes == pytest.approx(4 * four.bytes)
-    assert (one.products, one.rows) == (four.products, four.rows)
-    entries = one.bytes / ADAM_BYTES * PART_SAMPLES[space] / SAMPLES_PER_RAY[space]
+    assert one.streamed_bytes == pytest.approx(4 * four.streamed_bytes)
+    assert (one.matmul_flops, one.gathered_rows) == (four.matmul_flops, four.gathered_rows)
+    entries = one.streamed_bytes / ADAM_BYTES * PART_SAMPLES[space] / SAMPLES_PER_RAY[space]
     assert 3 * 2**18 < entries / 4 <= 5 * 2**18, "five grids of four features, the coarse ones small"

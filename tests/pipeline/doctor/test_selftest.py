@@ -52,7 +52,7 @@ def test_the_matrix_is_measured_only_if_asked_for(monkeypatch, capsys: pytest.Ca
 
 
 @pytest.mark.parametrize(
-    "why, line", [(None, "grid field: warp"), ("it is old", "grid field: torch, because it is old")]
+    "why, line", [(None, "hash-grid field: warp"), ("it is old", "hash-grid field: torch, because it is old")]
 )
 def test_the_kernels_of_the_grid_field_are_those_that_train_would_choose(why, line, monkeypatch, capsys) -> None:
     monkeypatch.setattr(doctor, "self_test", lambda device: [])

@@ -65,8 +65,10 @@ def _view(index: int, name: str, split: Any) -> View:
 def _photo(view: View, alpha: bool) -> Image.Image:
     """What a pinhole camera sees of the sky, computed from scratch."""
     x, y = np.meshgrid(np.arange(WIDTH) + 0.5 - WIDTH / 2, np.arange(HEIGHT) + 0.5 - HEIGHT / 2)
-    bearings = np.stack([x, y, np.full_like(x, FOCAL)], -1)
-    directions = bearings / np.linalg.norm(bearings, axis=-1, keepdims=True) @ view.scene_from_camera[:, :3].T
+    ray_directions = np.stack([x, y, np.full_like(x, FOCAL)], -1)
+    directions = (
+        ray_directions / np.linalg.norm(ray_directions, axis=-1, keepdims=True) @ view.scene_from_camera[:, :3].T
+    )
     pixels = np.rint(255 * sky(directions))
     if alpha:
         covered = directions[..., :1] >= 0

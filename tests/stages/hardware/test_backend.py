@@ -23,8 +23,8 @@ from tests.stages.photo_scene import photographed
 ROOT = Path(__file__).parents[3]
 TINY: dict[str, Any] = {"levels": 2, "log2_rows": 10, "finest": 32, "batch_samples": 1024, "downscale": 1.0}
 OLD_DRIVER = "Warp 1.19.0 finds no CUDA driver that is new enough for it"
-NOTE = "the grid field is computed by torch alone, several times slower: "
-AS_TRAINED = "the grid field is computed by torch alone, as it was trained: several times slower than by Warp"
+NOTE = "the hash-grid field is computed by torch alone, several times slower: "
+AS_TRAINED = "the hash-grid field is computed by torch alone, as it was trained: several times slower than by Warp"
 
 
 @pytest.fixture

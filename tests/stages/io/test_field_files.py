@@ -24,7 +24,7 @@ KERNELS = load_backend(chosen_backend("cpu"), "cpu")
 OUTDOORS = HashGridField(replace(GRID, background_model=True), 5, KERNELS)
 OUTDOORS.background_table.normal_(generator=torch.Generator().manual_seed(6))
 KINDS = {"paper": VanillaNerf(SMALL, seed=5), "grid": HashGridField(GRID, 5, KERNELS), "sky": OUTDOORS}
-BY_TORCH = "the grid field is computed by torch alone, as it was trained"
+BY_TORCH = "the hash-grid field is computed by torch alone, as it was trained"
 INFO = {"background": [1.0, 1.0, 1.0], "downscale": 2.5, "steps": 7, "rays": 700}
 
 
@@ -147,7 +147,7 @@ def test_a_field_of_warp_is_read_without_it_and_the_reason_said(tmp_path: Path, 
     loaded, _ = load_field(tmp_path, "cpu", progress)
     assert isinstance(loaded, HashGridField)
     assert backend_name(loaded.backend) == "torch"
-    assert progress.notes == ["the grid field is computed by torch alone, several times slower: it is not there"]
+    assert progress.notes == ["the hash-grid field is computed by torch alone, several times slower: it is not there"]
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ import pytest
 
 from stages import report
 from stages.io.files import write_json
+from stages.report import page
 from stages.report.cameras import MAX_SHOWN, camera_report, doubtful_files, order_is_informative
 from tests.stages.report.report_workspace import make_workspace, written
 
@@ -48,11 +49,6 @@ def registration(**changed: Any) -> dict[str, Any]:
     return whole | {"check": check(), "global_mapping": opinion()} | changed
 
 
-def excluded(count: int) -> list[dict[str, Any]]:
-    reason = "its pose is contradicted by 90 of its 99 verified matches with other photos"
-    return [{"file": file, "registered": False, "reason": reason} for file in files(count)]
-
-
 def test_cameras_that_agree_are_said_to_with_figures() -> None:
     said = camera_report(registration(), {})
     assert said.doubt is None and not said.groups and said.verdict == said.figures
@@ -63,7 +59,6 @@ def test_cameras_that_agree_are_said_to_with_figures() -> None:
     ("changed", "groups"),
     [
         ({"check": check(doubtful=files(4))}, 1),
-        ({"images": excluded(4)}, 1),
         ({"check": check(agreeing=399)}, 0),
         ({"check": check(weak_links=weak(2))}, 1),
         ({"check": check(sequence_breaks=[[file, file] for file in files(4)])}, 1),
@@ -184,7 +179,7 @@ def test_photos_whose_given_poses_are_contradicted_are_not_drawn(
     inputs: dict[str, Path], tmp_path: Path, progress: Any, monkeypatch: pytest.MonkeyPatch
 ):
     drawn: list[int] = []
-    monkeypatch.setattr("stages.report.plots.camera_svgs", lambda _, views, *__: str(drawn.append(len(views))) and {})
+    monkeypatch.setattr(page, "camera_svgs", lambda _, views, *__: str(drawn.append(len(views))) and {})
     change(inputs, source="import", check=check(doubtful=png(range(5))))
     assert "Left out of the plot: 5 photos" in written(inputs, tmp_path / "out", progress)[0]
     change(inputs, check=check(doubtful=png(range(24))))

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from stages import report
 from stages.io.files import read_json, write_json
+from stages.report import page
 from stages.tradeoff.pareto_front import recommend, table
 from tests.refusals import refused
 from tests.stages.report.report_workspace import LINES, PARTS, make_workspace, written
@@ -217,35 +217,39 @@ def test_page_shows_the_study_and_leaves_its_time_out(tmp_path: Path, progress: 
     inputs["tradeoff"].mkdir(parents=True)
     points = [
         point(10.0, 20.0),
-        point(20.0, 23.0, seeds=2, deviation=0.2),
+        point(20.0, 23.0, seeds=2, psnr_std=0.2),
         point(15.0, 18.0, variant="no view dependence"),
     ]
     points = sorted(points, key=lambda p: p.train_seconds)
     study = {"headline": "", "recommendation": recommend(points).words, "recommended": 3, "points": table(points)}
-    study |= {"fields": "grid: 5 grids of features"}
+    study |= {"descriptions": "grid: 5 grids of features"}
     study |= {"command": "pipeline train fox.nerf --train.seconds 20", "ablation": "Against the complete one: −2 dB."}
-    study |= {"own": None, "scored": "6 windows of 2 held-out photos", "left_out": ["paper, published: 5 steps"]}
+    study |= {
+        "workspace_field": None,
+        "scored": "6 crops of 2 held-out photos",
+        "left_out": ["paper, published: 5 steps"],
+    }
     write_json(inputs["tradeoff"] / "tradeoff.json", study)
     (inputs["tradeoff"] / "manifest.json").write_text('{"seconds": 1800}')
     assert "What quality costs here" not in before
     text, summary = written(inputs, tmp_path / "out", progress)
     assert "What quality costs here" in text and study["recommendation"] in text
-    for words in ("All 3 settings", "<b>23.00 ± 0.20</b>", ">18.00<", "6 windows of 2", "paper, published: 5 steps"):
+    for words in ("All 3 settings", "<b>23.00 ± 0.20</b>", ">18.00<", "6 crops of 2", "paper, published: 5 steps"):
         assert words in text, words
     assert "reduced, a part left out" in text, "the plot's legend"
     assert "Train it: <code>pipeline train fox.nerf --train.seconds 20</code>" in text
-    assert "number 1 is drawn in the least time, 1.00 s a frame" in text
+    assert "number 1 renders fastest, 1.00 s a frame" in text
     assert "Fields: grid: 5 grids of features." in text
     assert "What each part of the method is worth" not in text, "no picture, no title"
-    assert "the star" not in text and "before the present one" not in text
+    assert "the star" not in text and "trained again" not in text
     assert summary == summary_before, "the study's time is none of the run's"
     Image.new("RGB", (64, 48)).save(inputs["tradeoff"] / "ablation.png")
     for key, older in (("fedcba9876543210", True), (inputs["train"].resolve().name, False)):
-        study |= {"own": {"train": key, "every": 1}}
+        study |= {"workspace_field": {"train": key, "stride": 1}}
         write_json(inputs["tradeoff"] / "tradeoff.json", study)
         text = written(inputs, tmp_path / f"pictures_{older}", progress)[0]
-        assert "Every mark is a setting, the star the workspace's own field, scored on" in text
-        assert ("own field of this study was trained before the present one." in text) == older
+        assert "Every mark is a setting, the star this workspace's field, scored on" in text
+        assert ("has been trained again since this study." in text) == older
     assert "What each part of the method is worth" in text and "Against the complete one: −2 dB." in text
 
 
@@ -292,8 +296,8 @@ def test_few_test_photos_are_all_shown(tests: int, roles: list[str], tmp_path: P
 
 def test_transparent_photos_are_shown_as_they_were_scored():
     pixels = np.array([[[200, 100, 0, 0], [200, 100, 0, 255], [200, 100, 0, 51]]], np.uint8)
-    assert report._opaque(pixels, 255).tolist() == [[[255, 255, 255], [200, 100, 0], [244, 224, 204]]]
-    assert report._opaque(pixels[..., :3], 255).tolist() == [[[200, 100, 0]] * 3]
+    assert page._opaque(pixels, 255).tolist() == [[[255, 255, 255], [200, 100, 0], [244, 224, 204]]]
+    assert page._opaque(pixels[..., :3], 255).tolist() == [[[200, 100, 0]] * 3]
 
 
 def test_a_finished_stage_that_lost_a_file_is_an_error_with_its_name(tmp_path: Path, progress: Any):
@@ -310,7 +314,7 @@ def test_a_finished_stage_that_lost_a_file_is_an_error_with_its_name(tmp_path: P
      ("/home/someone/fox", "fox"), ("white", "white")],
 )  # fmt: skip
 def test_settings_in_words(value: Any, words: str):
-    assert report._value(value) == words
+    assert page._value(value) == words
 
 
 def test_training_shows_where_its_time_went(inputs: dict[str, Path], tmp_path: Path, progress: Any):

@@ -23,7 +23,7 @@ class Killed(BaseException):
 
 
 class OneNumber:
-    """Trains one number; ``trouble(step, rate_scale)`` may raise. Its model paints ``shown``, 20 dB from the truth."""
+    """Trains one number; ``trouble(step, lr_scale)`` may raise. Its model paints ``shown``, 20 dB from the truth."""
 
     chunk_rays = 64
     effects = NO_EFFECTS
@@ -38,10 +38,10 @@ class OneNumber:
     def model(self) -> "OneNumber":
         return self
 
-    def step(self, step: int, share: float, rate_scale: float) -> StepResult:
-        self.trouble(step, rate_scale)
-        self.history.append((step, share, rate_scale))
-        self.value = self.value * 0.9 + rate_scale * (1 - share) * torch.sin(torch.tensor(float(step)))
+    def step(self, step: int, share: float, lr_scale: float) -> StepResult:
+        self.trouble(step, lr_scale)
+        self.history.append((step, share, lr_scale))
+        self.value = self.value * 0.9 + lr_scale * (1 - share) * torch.sin(torch.tensor(float(step)))
         return StepResult(float(self.value), 20.0, rays=4, samples=12, densities=20)
 
     def state(self) -> dict[str, Tensor]:
@@ -60,11 +60,11 @@ class OneNumber:
         return Rendering(self.shown.expand(*rays.near.shape, 3), rays.far, torch.full_like(rays.far, self.opacity))
 
 
-def quiet(step: int, rate_scale: float) -> None:
+def quiet(step: int, lr_scale: float) -> None:
     """No trouble."""
 
 
-def slow(step: int, rate_scale: float) -> None:
+def slow(step: int, lr_scale: float) -> None:
     """Steps long enough for a clock."""
     time.sleep(0.003)
 
@@ -104,9 +104,9 @@ def events(folder: Path) -> list[dict]:
 
 
 def killed_at(step: int) -> Callable[[int], OneNumber]:
-    def trouble(now: int, rate_scale: float) -> None:
+    def trouble(now: int, lr_scale: float) -> None:
         if now == step:
             raise Killed
-        slow(now, rate_scale)
+        slow(now, lr_scale)
 
     return lambda attempt: OneNumber(attempt, trouble)

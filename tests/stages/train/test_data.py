@@ -22,7 +22,7 @@ from stages.train.data import (
     PhotoReader,
     camera_directions,
     guided_dataset,
-    patch_bearings,
+    patch_directions,
     scaled_size,
     training_dataset,
     view_mask,
@@ -183,11 +183,11 @@ LENSES = {
 def test_patches_bend_no_ray(lens: str, limit_px: float) -> None:
     camera, downscale = LENSES[lens], 4.0
     width, height = scaled_size(camera, downscale)
-    bearings = patch_bearings(camera, downscale)
-    assert max(bearings.shape[:2]) == MAX_PATCHES < width
+    directions = patch_directions(camera, downscale)
+    assert max(directions.shape[:2]) == MAX_PATCHES < width
     placed = PosedViews(torch.eye(3, 4)[None], torch.ones(1), torch.ones(1))
     dataset = make_ray_dataset(
-        torch.zeros(width * height, 3, dtype=torch.uint8), [(height, width)], [0], [bearings], placed
+        torch.zeros(width * height, 3, dtype=torch.uint8), [(height, width)], [0], [directions], placed
     )
     found = dataset.lookup(torch.arange(width * height))[0].directions
     exact = camera_directions(camera, downscale).view(-1, 3)

@@ -43,8 +43,8 @@ def test_finished_and_run_again_does_nothing(tmp_path: Path, progress) -> None:
 
 
 def non_finite(at: int, until_rate: float) -> Callable[[int], OneNumber]:
-    def trouble(step: int, rate_scale: float) -> None:
-        if step == at and rate_scale > until_rate:
+    def trouble(step: int, lr_scale: float) -> None:
+        if step == at and lr_scale > until_rate:
             raise NonFinite("loss", step, {"target": torch.full((2, 3), torch.nan)})
 
     return lambda attempt: OneNumber(attempt, trouble)
@@ -130,8 +130,8 @@ def test_what_was_measured_of_steps_taken_back_is_forgotten(
 ) -> None:
     monkeypatch.setitem(training_loop.FIRST_MEASUREMENT, "steps", 10.0)
 
-    def trouble(step: int, rate_scale: float) -> None:
-        if step == 22 and rate_scale == 1:
+    def trouble(step: int, lr_scale: float) -> None:
+        if step == 22 and lr_scale == 1:
             raise NonFinite("loss", step, {})
 
     run = run_in(tmp_path, progress, make=lambda attempt: OneNumber(attempt, trouble))
@@ -217,8 +217,8 @@ class Rising(OneNumber):
     def __init__(self) -> None:
         super().__init__(0, quiet)
 
-    def step(self, step: int, share: float, rate_scale: float) -> StepResult:
-        result = super().step(step, share, rate_scale)
+    def step(self, step: int, share: float, lr_scale: float) -> StepResult:
+        result = super().step(step, share, lr_scale)
         db = 20 + math.log2((step + 1) / 500) + self.annealing * share
         self.shown = probe().colours + 10 ** (-db / 20)
         return result
@@ -259,7 +259,7 @@ def test_annealing_that_does_not_suffice_is_undone(tmp_path: Path, progress) -> 
     assert reasons(run)[:3] == ["begin", "target", "more"]
     assert run.state.validation_psnr is not None and 20.0 <= run.state.validation_psnr < 20.3
     back = run.plan.decisions[2]
-    assert (back.total_steps, back.share) == (1000, back.from_step / 1000)
+    assert (back.total_steps, back.progress) == (1000, back.from_step / 1000)
 
 
 def more_towards(folder: Path, progress, target: float, first: Path, make=Rising) -> TrainingRun:
@@ -270,16 +270,16 @@ def more_towards(folder: Path, progress, target: float, first: Path, make=Rising
 
 def test_a_target_that_was_reached_does_not_end_more_steps(tmp_path: Path, progress) -> None:
     class Mortal(Rising):
-        def step(self, step: int, share: float, rate_scale: float) -> StepResult:
+        def step(self, step: int, share: float, lr_scale: float) -> StepResult:
             if step == 500:
                 raise Killed
-            return super().step(step, share, rate_scale)
+            return super().step(step, share, lr_scale)
 
     first = towards(tmp_path / "first", progress, 20.0)
     with pytest.raises(Killed):
         more_towards(tmp_path / "more", progress, 20.0, tmp_path / "first", Mortal)
     more = more_towards(tmp_path / "more", progress, 20.0, tmp_path / "first")
-    assert more.state.step == first.state.step + 600 and more.plan.share(more.state.step) == pytest.approx(1)
+    assert more.state.step == first.state.step + 600 and more.plan.progress(more.state.step) == pytest.approx(1)
     assert reasons(more) == [*reasons(first), "more"]
     assert progress.notes.count("20 dB are reached already: training goes on for all that was asked for") == 1
     assert more.state.open_target(20.0) is None and first.state.open_target(20.0) == 20.0
@@ -297,10 +297,10 @@ def test_more_steps_towards_a_higher_target_anneal_as_if_none_had_been(tmp_path:
 @pytest.mark.parametrize("at", [70, 225, 250])
 def test_a_run_to_a_target_in_two_pieces_is_the_same(at: int, tmp_path: Path, progress) -> None:
     class Mortal(Rising):
-        def step(self, step: int, share: float, rate_scale: float) -> StepResult:
+        def step(self, step: int, share: float, lr_scale: float) -> StepResult:
             if step == at:
                 raise Killed
-            return super().step(step, share, rate_scale)
+            return super().step(step, share, lr_scale)
 
     whole = towards(tmp_path / "whole", progress, 20.0)
     with pytest.raises(Killed):

@@ -19,7 +19,7 @@ def test_a_run_in_seconds_takes_about_that_long_and_its_share_ends_at_1(tmp_path
     run = run_in(tmp_path, progress, TrainingBudget(None, 0.3), make=lambda attempt: OneNumber(attempt, slow))
     run.train()
     assert 0.2 < run.state.seconds < 0.5
-    assert run.plan.share(run.state.step) == pytest.approx(1)
+    assert run.plan.progress(run.state.step) == pytest.approx(1)
     assert len(run.plan.decisions) >= 2
     shares = [share for _, share, _ in number_of(run).history]
     assert 0.8 < shares[-1] < 1
@@ -32,7 +32,7 @@ def test_a_resumed_run_in_seconds_keeps_its_plan_and_its_clock(tmp_path: Path, p
     resumed = run_in(tmp_path, progress, TrainingBudget(None, 0.3), make=lambda attempt: OneNumber(attempt, slow))
     resumed.train()
     assert [list(decision) for decision in resumed.plan.decisions][: len(journal)] == journal
-    assert number_of(resumed).history[0][:2] == (30, resumed.plan.share(30))
+    assert number_of(resumed).history[0][:2] == (30, resumed.plan.progress(30))
     assert 0.2 < resumed.state.seconds < 0.5
     assert any(note.startswith("going on from step 30, with 0 s of training left") for note in progress.notes)
 
@@ -44,7 +44,7 @@ def test_more_seconds_take_about_that_long(tmp_path: Path, progress) -> None:
     first = run_in(tmp_path / "first", progress, TrainingBudget(None, 0.2), make)
     first.train()
     more = run_in(tmp_path / "more", progress, TrainingBudget(None, 0.2, tmp_path / "first"), make)
-    assert more.plan.share(first.state.step) == pytest.approx(0.5, abs=0.05)
+    assert more.plan.progress(first.state.step) == pytest.approx(0.5, abs=0.05)
     more.train()
     assert 0.1 < more.state.seconds - first.state.seconds < 0.35
 
@@ -61,7 +61,7 @@ def run_on_a_made_up_clock(
     """``takes(step)`` seconds a step, and no time at all beside the steps."""
     now = 0.0
 
-    def step_by_step(step: int, rate_scale: float) -> None:
+    def step_by_step(step: int, lr_scale: float) -> None:
         nonlocal now
         if now >= killed_after:
             raise Killed

@@ -15,7 +15,8 @@ from nerf.runtime.machine_rates import Rates
 from nerf.synthetic.scenes import ring_of_cameras
 from nerf.training.hash_grid_trainer import HashGridTrainer, HashGridTrainerSettings
 from nerf.training.ray_dataset import RayDataset, ray_dataset_from_images
-from nerf.training.trainer import StepResult, VanillaTrainer, VanillaTrainerSettings
+from nerf.training.trainer import StepResult
+from nerf.training.vanilla_trainer import VanillaTrainer, VanillaTrainerSettings
 from stages.hardware.backend import load_backend
 from stages.io.files import read_json
 from stages.report.profile import PARTS, parts_bar
@@ -64,7 +65,7 @@ def test_a_run_has_the_same_bits_with_every_step_timed_and_with_none(
     monkeypatch.setattr("stages.train.profile.TIMED_EVERY", 1)
     monkeypatch.setattr("stages.train.profile.FIRST_TIMED", 0)
     timed, plain, timings = trainer(kind), trainer(kind), {}
-    for step in range(20):  # the density cache is measured in the sixteenth
+    for step in range(20):  # the occupancy grid is measured in the sixteenth
         assert timed_step(timed, step, timings) == plain.step(step, 0.1, 1.0)
     assert timings["steps"] == 20
     for name, tensor in plain.state().items():

@@ -9,7 +9,7 @@ import torch
 from pydantic import ValidationError
 
 from nerf.training.hash_grid_trainer import HashGridTrainer
-from nerf.training.trainer import VanillaTrainer
+from nerf.training.vanilla_trainer import VanillaTrainer
 from stages import train
 from stages.contract import Progress
 from stages.hardware.device import cores

@@ -10,7 +10,7 @@ from nerf.fields.interface import Rendering
 from nerf.kernels import RayStepping, Samples
 from nerf.kernels.torch import composite, composite_backward, distortion, distortion_backward, visible_samples
 from nerf.kernels.torch.compositing import MIN_KEEP_PROBABILITY
-from nerf.rendering import volume_rendering as compositing
+from nerf.rendering import volume_rendering
 
 COUNTS = (3, 0, 7, 1, 0, 12)
 EVEN, GROWING = RayStepping(0.05, 0.0, False, 8, 100), RayStepping(0.05, 0.2, True, 8, 100)
@@ -65,7 +65,7 @@ def test_equal_rays_are_rendered_as_the_unpacked_compositing_does() -> None:
     sigma, colour = field(samples)
     background, far = surroundings(4)
     ends = torch.cat([torch.zeros(4, 1, dtype=torch.float64), samples.dt.view(4, 9).cumsum(-1)], -1)
-    wanted, weights = compositing.composite(sigma.view(4, 9), colour.view(4, 9, 3), ends, background)
+    wanted, weights = volume_rendering.composite(sigma.view(4, 9), colour.view(4, 9, 3), ends, background)
     given, given_weights = composite(samples, sigma, colour, background, far)
     torch.testing.assert_close(given.colour, wanted.colour)
     torch.testing.assert_close(given_weights.view(4, 9), weights)

@@ -61,13 +61,13 @@ def noise_dataset() -> RayDataset:
     """Two opposite views of coloured noise, opaque and transparent, from 3 units away."""
     grid = (torch.arange(12) + 0.5) / 12 - 0.5
     y, x = torch.meshgrid(grid, grid, indexing="ij")
-    bearings = torch.nn.functional.normalize(torch.stack([x, y, torch.ones_like(x)], -1), dim=-1)
+    ray_directions = torch.nn.functional.normalize(torch.stack([x, y, torch.ones_like(x)], -1), dim=-1)
     photo = torch.randint(256, (12, 12, 4), generator=torch.Generator().manual_seed(1), dtype=torch.uint8)
     photo[:6, :, 3] = 255
     front = torch.tensor([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, -3]])
     back = torch.tensor([[-1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 3]])
     near, far = torch.full((2,), 1.0), torch.full((2,), 5.0)
-    return ray_dataset_from_images([photo] * 2, [0, 0], [bearings], torch.stack([front, back]), near, far)
+    return ray_dataset_from_images([photo] * 2, [0, 0], [ray_directions], torch.stack([front, back]), near, far)
 
 
 BOUNDED = HashGridSettings(
@@ -95,7 +95,7 @@ def copied(state: dict[str, Tensor]) -> dict[str, Tensor]:
 
 
 def run_briefly(trainer: HashGridTrainer, start: dict[str, Tensor]) -> dict[str, Tensor]:
-    """A step and a refresh of the density cache, from the same beginning each time."""
+    """A step and a refresh of the occupancy grid, from the same beginning each time."""
     trainer.load_state(start)
     trainer.step(0, 0.0)
     trainer.occupancy_grid.update(15, generator("cpu", 3, 15, 1))

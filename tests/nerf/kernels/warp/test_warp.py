@@ -15,7 +15,7 @@ from torch import Tensor
 
 from nerf.kernels import Backend, grid_layout, warp
 from nerf.kernels import torch as reference
-from nerf.kernels.warp import occupancy as cache
+from nerf.kernels.warp import occupancy
 from nerf.kernels.warp.launch import launch
 from tests.devices import skip_without
 from tests.nerf.kernels.agreement import (
@@ -216,7 +216,7 @@ def test_adam_on_slices_leaves_their_neighbours_alone(device: str) -> None:
         assert torch.equal(one[[0, *range(40, 43), 44]], old[[0, *range(40, 43), 44]])
 
 
-# The density cache
+# The occupancy grid
 
 
 @pytest.mark.parametrize("cells", [4, 32])
@@ -297,7 +297,7 @@ def test_no_rays_and_no_samples_are_fine_even_at_first(device: str, rays: int) -
     on_a_new_thread(everything)
 
 
-KERNEL: Any = cache._raise
+KERNEL: Any = occupancy._raise
 GOOD = torch.zeros(8, 3)
 
 

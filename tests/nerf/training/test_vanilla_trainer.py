@@ -11,8 +11,9 @@ from nerf.effects.pose_refinement import PoseRefinement
 from nerf.fields.vanilla import VanillaNerf, VanillaSettings
 from nerf.geometry.rays import Rays
 from nerf.training.ray_dataset import RayDataset, ray_dataset_from_images
-from nerf.training.trainer import NonFinite, VanillaTrainer, VanillaTrainerSettings, over
+from nerf.training.trainer import NonFinite, over
 from nerf.training.validation_probe import make_probe, measure
+from nerf.training.vanilla_trainer import VanillaTrainer, VanillaTrainerSettings
 
 FIELD = VanillaSettings(
     depth=2, width=16, skip=9, position_frequencies=3, direction_frequencies=1, samples_coarse=8, samples_fine=8
@@ -24,8 +25,8 @@ def small_dataset(channels: int = 3, size: int = 12) -> RayDataset:
     """Two opposite views of a red disc on white (or on nothing, with alpha), from 3 units away."""
     grid = (torch.arange(size) + 0.5) / size - 0.5
     y, x = torch.meshgrid(grid, grid, indexing="ij")
-    bearings = torch.stack([x, y, torch.ones_like(x)], -1)
-    bearings = bearings / bearings.norm(dim=-1, keepdim=True)
+    ray_directions = torch.stack([x, y, torch.ones_like(x)], -1)
+    ray_directions = ray_directions / ray_directions.norm(dim=-1, keepdim=True)
     inside = (x**2 + y**2 < 0.06)[..., None]
     photo = torch.where(inside, torch.tensor([200, 20, 20]), 255)
     if channels == 4:
@@ -34,7 +35,7 @@ def small_dataset(channels: int = 3, size: int = 12) -> RayDataset:
     back = torch.tensor([[-1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 3]])
     near, far = torch.full((2,), 2.0), torch.full((2,), 4.0)
     return ray_dataset_from_images(
-        [photo.to(torch.uint8)] * 2, [0, 0], [bearings], torch.stack([front, back]), near, far
+        [photo.to(torch.uint8)] * 2, [0, 0], [ray_directions], torch.stack([front, back]), near, far
     )
 
 

@@ -1,0 +1,360 @@
+"""The page of the report and summary.json: what the finished stages left, and one function per part of the page."""
+
+import base64
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup
+from PIL import Image
+from tyro.conf import Suppress
+
+from nerf.geometry.scene import Scene
+from stages.contract import Inputs
+from stages.ingest.decoding import pillow
+from stages.io.amounts import duration, short_count
+from stages.io.ascii_names import shell_quoted
+from stages.io.files import read_json, read_scene, read_tensors
+from stages.io.photos import load_pixels
+from stages.report.cameras import (
+    CameraReport,
+    camera_models,
+    camera_report,
+    doubtful_files,
+    missing,
+    order_is_informative,
+    strategies,
+    uncertainty,
+)
+from stages.report.effects import effects_table
+from stages.report.plots import ORDER_COLOURS, camera_svgs, curve_svg
+from stages.report.profile import parts_bar
+from stages.tradeoff.plots import COLUMNS, plot_svg, rendering_sentence, table_cells
+from stages.train.curve import coming_doubling, doubling_words, knee_words, more_option, ssim_words
+
+if TYPE_CHECKING:
+    from stages.report import Config
+
+WIDTH_LARGE, WIDTH_SMALL = 900, 420  # pixels of a picture in the page
+THUMBNAIL_PX = 160
+MAX_SMALL = 12  # further test photos shown, besides the best, the median and the worst
+
+
+@dataclass(frozen=True)
+class Results:
+    """What the finished stages left. The parts of stages that have not run are None.
+
+    The study has no part in ``manifests``: its time is none of the run's.
+    """
+
+    inputs: Inputs
+    manifests: Mapping[str, dict[str, Any]]
+    photos: dict[str, Any] | None
+    registration: dict[str, Any] | None
+    scene: Scene | None
+    effects: dict[str, Any] | None
+    field: dict[str, Any] | None
+    curve: dict[str, Any] | None
+    parts: dict[str, Any] | None
+    metrics: dict[str, Any] | None
+    study: dict[str, Any] | None
+
+
+def read_results(inputs: Inputs, stages: Sequence[str]) -> Results:
+    """Read what is there of the ``stages``, in their order. Raises StageError for a file that a finished stage must
+    have left and did not."""
+
+    def of(stage: str, name: str) -> Any:
+        return read_json(inputs[stage] / name) if stage in inputs else None
+
+    return Results(
+        inputs=inputs,
+        manifests={stage: of(stage, "manifest.json") for stage in stages if stage in inputs and stage != "tradeoff"},
+        photos=of("ingest", "photos.json"),
+        registration=of("sfm", "registration.json"),
+        scene=read_scene(inputs["normalise"]) if "normalise" in inputs else None,
+        effects=of("effects", "effects.json"),
+        field=of("train", "field.json"),
+        curve=of("train", "curve.json"),
+        parts=of("train", "parts.json") if "train" in inputs and (inputs["train"] / "parts.json").exists() else None,
+        metrics=of("evaluate", "metrics.json"),
+        study=of("tradeoff", "tradeoff.json"),
+    )
+
+
+def summarise(results: Results) -> dict[str, Any]:
+    """The content of summary.json; null for what no stage has told."""
+    manifests, registration, metrics = results.manifests, results.registration or {}, results.metrics or {}
+    train = manifests["train"]["facts"] if "train" in manifests else {}
+    mesh = manifests["mesh"]["facts"] if "mesh" in manifests else None
+    cameras = _camera_report(results)
+    return {
+        "photos": len(results.photos["photos"]) if results.photos else None,
+        **{key: registration.get(key) for key in ("registered", "camera_model", "reprojection_px")},
+        "cameras_verdict": cameras.verdict,
+        "cameras_doubtful": cameras.doubt is not None,
+        "field": results.field["kind"] if results.field else None,
+        "train_seconds": train.get("train_seconds"),
+        "total_seconds": round(train.get("earlier_seconds", 0.0) + sum(m["seconds"] for m in manifests.values()), 3),
+        "stage_seconds": {stage: manifest["seconds"] for stage, manifest in manifests.items()},
+        "expected_seconds": _expected(manifests),
+        "training_parts": results.parts,
+        **{key: metrics.get(key) for key in ("psnr", "ssim", "psnr_mean_image", "psnr_nearest_view")},
+        "mesh": mesh and {key: mesh[key] for key in ("vertices", "faces", "watertight")},
+        "verdict": metrics.get("verdict", "Not measured: stage evaluate has not run."),
+    }
+
+
+def _camera_report(results: Results) -> CameraReport:
+    return camera_report(results.registration, results.manifests["sfm"]["config"] if results.registration else {})
+
+
+def _expected(manifests: Mapping[str, dict[str, Any]]) -> dict[str, float]:
+    """The seconds that stages were expected to take before their run began, where anybody could tell."""
+    known = {stage: manifest.get("expected") for stage, manifest in manifests.items()}
+    return {stage: seconds for stage, seconds in known.items() if seconds is not None}
+
+
+def page(results: Results, summary: dict[str, Any], config: "Config") -> str:
+    """The whole HTML page."""
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {
+        "duration": duration,
+        "short": short_count,
+        "thousands": "{:,}".format,
+        "value": _value,
+        "quoted": shell_quoted,
+    }
+    names = {photo["file"]: photo["name"] for photo in results.photos["photos"]} if results.photos else {}
+    return environment.get_template("report.html.j2").render(
+        workspace=_workspace(results.inputs),
+        summary=summary,
+        refused=results.photos["refused"] if results.photos else [],
+        **_cameras_part(results, names),
+        effects=effects_table(results.effects),
+        curve=_curve(results),
+        parts=parts_bar(results.parts),
+        metrics=results.metrics,
+        compared=_compared(results),
+        video=_video(results.inputs, config.video_limit_mb),
+        **_mesh_part(results),
+        study=_study(results),
+        **_run_part(results, summary, config),
+    )
+
+
+def _cameras_part(results: Results, names: Mapping[str, str]) -> dict[str, Any]:
+    """Stage sfm: the verdict on the cameras, the photos that it speaks of, where the cameras stood, how they were
+    found."""
+    return {
+        "registration": results.registration,
+        "camera_report": _camera_report(results),
+        "camera_groups": _camera_groups(results, names),
+        "cameras": _cameras(results),
+        "lenses": camera_models(results.registration),
+        "strategies": strategies(results.registration),
+        "uncertainty": uncertainty(results.registration, names),
+        "missing": missing(results.registration, names),
+    }
+
+
+def _mesh_part(results: Results) -> dict[str, Any]:
+    """Stage mesh: its picture, and the names of its files."""
+    preview = results.inputs["mesh"] / "preview.png" if "mesh" in results.inputs else None
+    files = results.manifests.get("mesh", {}).get("outputs", ())
+    return {
+        "mesh_preview": _data_uri(preview.read_bytes(), "image/png") if preview and preview.exists() else None,
+        "mesh_files": [name for name in files if name != "preview.png"],
+    }
+
+
+def _run_part(results: Results, summary: dict[str, Any], config: "Config") -> dict[str, Any]:
+    """How it was made: time of every stage, settings, machine."""
+    manifests = results.manifests
+    return {
+        "manifests": manifests,
+        "budget": config.budget,
+        "expected": {} if config.budget else summary["expected_seconds"],
+        "longest": max((manifest["seconds"] for manifest in manifests.values()), default=0) or 1,
+        "settings": _settings(manifests),
+        "machine": manifests.get("train", next(iter(manifests.values()), {})).get("machine", {}),
+    }
+
+
+def _settings(manifests: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
+    """Every option that has a flag, by its flag, in the order of the stages."""
+    return {
+        f"--{stage}.{name.replace('_', '-')}": manifests[stage]["config"].get(name)
+        for stage in manifests
+        for name, field in sorted(import_module(f"stages.{stage}").Config.model_fields.items())
+        if Suppress not in field.metadata
+    }
+
+
+def _workspace(inputs: Inputs) -> str:
+    """The workspace folder's own name: stage folders are <workspace>/<stage>/<key>."""
+    return next((folder.resolve().parents[1].name for folder in inputs.values()), "")
+
+
+def _camera_groups(results: Results, names: Mapping[str, str]) -> list[dict[str, Any]]:
+    """The photos that the verdict on the cameras speaks of: a title, names and pictures, how many more there are."""
+    groups = _camera_report(results).groups if names else []
+    return [
+        {
+            "title": group.title,
+            "more": group.more,
+            "photos": [
+                {"name": names[f"images/{file}"], "picture": _thumbnail(results.inputs["ingest"] / "images" / file)}
+                for file in group.files
+            ],
+        }
+        for group in groups
+    ]
+
+
+def _thumbnail(path: Path) -> str | None:
+    """A small picture of a photo, None where it is not there."""
+    import numpy as np
+
+    if not path.exists():
+        return None
+    with pillow().open(path) as picture:
+        picture.thumbnail((THUMBNAIL_PX, THUMBNAIL_PX))
+        return _jpeg_uri(Image.fromarray(_opaque(np.asarray(picture), 255)))
+
+
+def _video(inputs: Inputs, limit_mb: float) -> str | None:
+    """The video as a data URI, or its name beside the page where it is larger than the limit."""
+    if "render" not in inputs:
+        return None
+    video = inputs["render"] / "video.mp4"
+    return _data_uri(video.read_bytes(), "video/mp4") if video.stat().st_size < limit_mb * 1e6 else "video.mp4"
+
+
+def _cameras(results: Results) -> dict[str, Any] | None:
+    """The layout of cameras that passed: ``svgs`` by the name of the view, and what a reader has to know of them."""
+    if results.scene is None:
+        return None
+    doubtful = {f"images/{file}" for file in doubtful_files(results.registration)} if results.registration else set()
+    drawn = [view for view in results.scene.views if view.file not in doubtful] or list(results.scene.views)
+    points = read_tensors(results.inputs["normalise"] / "points.safetensors")
+    joined = order_is_informative(results.registration)
+    svgs = camera_svgs(results.scene, drawn, points["xyz"], points["rgb"], joined)
+    return {
+        "svgs": {name: Markup(svg) for name, svg in svgs.items()},
+        "joined": joined,
+        "colours": ORDER_COLOURS,
+        "undrawn": len(results.scene.views) - len(drawn),
+    }
+
+
+def _curve(results: Results) -> dict[str, Any] | None:
+    """The training curve, and what it says of the time, in sentences."""
+    if results.curve is None:
+        return None
+    points, metrics = results.curve["points"], results.metrics or {}
+    baselines = {"nearest photo": "psnr_nearest_view", "mean image": "psnr_mean_image"}
+    coming = coming_doubling(results.curve["field"], results.curve["whole"], points)
+    svg = curve_svg(points, {name: metrics.get(key) for name, key in baselines.items()}, coming)
+    if svg is None:
+        return None
+    words = [doubling_words(points, coming), knee_words(points), ssim_words(points)]
+    threads = results.curve["threads"]
+    where = "a GPU" if results.curve["device"] == "cuda" else f"{threads} processor core{'' if threads == 1 else 's'}"
+    sentences = [f"{word[0].upper()}{word[1:]}." for word in words if word]
+    return {"svg": Markup(svg), "words": sentences, "where": where, "more": more_option(points)}
+
+
+def _study(results: Results) -> dict[str, Any] | None:
+    """The study of cost and quality: recommendation, plot, table, and the ablation's pictures where there are any."""
+    if results.study is None:
+        return None
+    ablation, field = results.inputs["tradeoff"] / "ablation.png", results.study["workspace_field"]
+    train = results.inputs.get("train")
+    return results.study | {
+        "svg": Markup(plot_svg(results.study)),
+        "columns": COLUMNS,
+        "rendering": rendering_sentence(results.study["points"]),
+        "rows": [{"cells": table_cells(row), "front": row["pareto_front"]} for row in results.study["points"]],
+        "field_is_older": field and train and field["train"] != train.resolve().name,
+        "sheet": _data_uri(ablation.read_bytes(), "image/png") if ablation.exists() else None,
+    }
+
+
+def _compared(results: Results) -> dict[str, Any] | None:
+    """Photo, render and error of the best, median and worst test photos, and of some of the others, small."""
+    if results.metrics is None or results.scene is None or not results.metrics["images"]:
+        return None
+    ranked = sorted(results.metrics["images"], key=lambda image: (-image["psnr"], image["name"]))
+    roles = {0: "best", len(ranked) // 2: "median", len(ranked) - 1: "worst"} if len(ranked) > 2 else {}
+    large = roles or dict.fromkeys(range(len(ranked)), "test photo")
+    others = [rank for rank in range(len(ranked)) if rank not in large]
+    small = others[:: max(1, -(-len(others) // MAX_SMALL))]
+    return {
+        "large": [_pictures(results, ranked[rank], WIDTH_LARGE) | {"role": role} for rank, role in large.items()],
+        "small": [_pictures(results, ranked[rank], WIDTH_SMALL) for rank in small],
+        "ranked": ranked,
+    }
+
+
+def _pictures(results: Results, image: dict[str, Any], width: int) -> dict[str, Any]:
+    """One test photo's figures with its photo, render and error map as data URIs, all of one size."""
+    assert results.scene is not None
+    view = next(view for view in results.scene.views if view.name == image["name"])
+    render = Image.open(results.inputs["evaluate"] / image["render"])
+    error = Image.open(results.inputs["evaluate"] / image["error"])
+    size = (min(width, render.width), max(1, round(render.height * min(1, width / render.width))))
+    assert results.metrics is not None
+    background = round(255 * results.metrics["background"][0])
+    photo = Image.fromarray(_opaque(load_pixels(results.inputs["ingest"] / view.file, *size), background))
+    pictures = {"photo": photo, "render": render.resize(size, Image.Resampling.BOX), "error": error.resize(size)}
+    aspect = round(size[0] / size[1], 4)
+    return image | {"aspect": aspect} | {name: _jpeg_uri(picture) for name, picture in pictures.items()}
+
+
+def _opaque(pixels: np.ndarray, background: int) -> np.ndarray:
+    """(H, W, 3) uint8 from (H, W, 3 or 4): transparent photos over a grey level, as they were scored."""
+    import numpy as np
+
+    if pixels.shape[2] == 3:
+        return pixels
+    alpha = pixels[..., 3:] / 255
+    return np.rint(pixels[..., :3] * alpha + background * (1 - alpha)).astype(np.uint8)
+
+
+def _jpeg_uri(picture: Image.Image) -> str:
+    buffer = io.BytesIO()
+    picture.save(buffer, "JPEG", quality=88)
+    return _data_uri(buffer.getvalue(), "image/jpeg")
+
+
+def _data_uri(content: bytes, media_type: str) -> str:
+    return f"data:{media_type};base64,{base64.b64encode(content).decode('ascii')}"
+
+
+def _value(value: Any) -> str:
+    """A setting or fact in words; of an absolute path only the name, so that the page can be given away."""
+    if value is None:
+        return "–"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, int):
+        return f"{value:,}"
+    if isinstance(value, float):
+        return f"{value:.4g}" if abs(value) < 1e4 else f"{value:,.0f}"
+    if isinstance(value, list):
+        return ", ".join(map(_value, value))
+    if isinstance(value, dict):
+        return ", ".join(f"{key} {_value(entry)}" for key, entry in value.items())
+    return Path(value).name if isinstance(value, str) and Path(value).is_absolute() else str(value)
