@@ -9,8 +9,8 @@ if TYPE_CHECKING:
 
 SECONDS = 0.3  # for each rate
 TABLES = {"2¹⁷": 1 << 17, "2²⁰": 1 << 20}  # rows: of one grid, of all of a large field
-# Of a ray while the hash-grid field trains: densities asked for, beside the colours of stages/train/fields/hash_grid.py.
-# Over a run lego_400, fox, banana and fountain_p11 ask for 2.3 to 2.9 for each colour
+# Of a ray while the hash-grid field trains: densities asked for, beside the colours of
+# stages/train/fields/hash_grid.py. Over a run lego_400, fox, banana and fountain_p11 ask for 2.3 to 2.9 for each colour
 # (docs/experiments/ray_samples.md).
 DENSITIES = {"bounded": 7, "contracted": 24}
 WHERE = {"bounded": "around an object", "contracted": "in unbounded space"}
