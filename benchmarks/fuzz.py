@@ -82,10 +82,9 @@ def attack(name: str, seconds: float, seed: int) -> dict[str, Any]:
     from hypothesis import HealthCheck, Phase, given, settings
     from hypothesis import seed as seeded
 
-    from stages.sfm.colmap import load
+    import stages.sfm.colmap  # noqa: F401
     from tests.fuzz.loaders import LOADERS, SECONDS, attempt
 
-    load()
     loader, counts, faults = LOADERS[name], {"tried": 0, "refused": 0}, []
     faulthandler.register(signal.SIGPROF, chain=True)  # says where it was and ends the process
     resource.setrlimit(resource.RLIMIT_DATA, (MEMORY, MEMORY))

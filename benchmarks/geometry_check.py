@@ -19,8 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.record import Record, add_out
 from stages.io.photos import read_photos
-from stages.sfm.colmap.mapping import MAPPING_MODEL
-from stages.sfm.colmap.matching import (
+from stages.sfm.colmap.database import (
     STRICT_RATIO,
     Features,
     Search,
@@ -30,6 +29,7 @@ from stages.sfm.colmap.matching import (
     match_pairs,
     read_vocabulary,
 )
+from stages.sfm.colmap.mapping import MAPPING_MODEL
 from stages.sfm.colmap.models import load_native
 from stages.sfm.colmap.repair import Checked, camera_poses, check_model
 from stages.sfm.geometry_check import CONTRADICTION_FACTOR, check_poses

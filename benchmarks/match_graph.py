@@ -18,8 +18,7 @@ import pycolmap
 
 from benchmarks.record import Record, add_out
 from stages.io.photos import read_photos
-from stages.sfm.colmap.mapping import MAPPING_MODEL
-from stages.sfm.colmap.matching import (
+from stages.sfm.colmap.database import (
     STRICT_RATIO,
     Features,
     Search,
@@ -31,6 +30,7 @@ from stages.sfm.colmap.matching import (
     read_vocabulary,
     verified_matches,
 )
+from stages.sfm.colmap.mapping import MAPPING_MODEL
 from stages.sfm.pairs.feature_matching import match_descriptors
 from stages.sfm.pairs.image_retrieval import CELLS
 from stages.sfm.pairs.match_graph import (

@@ -21,10 +21,10 @@ from nerf.fields.interface import RadianceModel
 from nerf.fields.vanilla import VanillaNerf
 from nerf.training.metrics import mean_squared_error, psnr
 from pipeline.engine.workspace import Workspace
+from stages.amounts import resolution_name
 from stages.effects.decisions import expected_gains
-from stages.io.amounts import resolution_name
 from stages.io.files import read_json, read_scene
-from stages.io.photos import evenly_spread
+from stages.io.photos import spread
 from stages.render.renderer import Painter, load_painter
 from stages.train.data import PhotoReader, view_rays
 
@@ -64,7 +64,7 @@ def measured(painter: Painter, folders: dict[str, Path], downscale: float, photo
     test = scene.of_split("test")
     gains = expected_gains(read_json(folders["train"] / "field.json"), scene, test)
     reader, seconds, scores = PhotoReader(folders["ingest"], scene, downscale), [], []
-    for index in evenly_spread(len(test), min(photos, len(test))):
+    for index in spread(len(test), min(photos, len(test))):
         view = test[index]
         shown = painter.at_gain(gains[view.name]) if gains else painter
         rays = view_rays(scene, view, downscale)

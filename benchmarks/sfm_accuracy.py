@@ -37,7 +37,7 @@ from stages import ingest, sfm
 from stages.io.photos import Photo, read_photos
 from stages.io.sparse_model import SparseModel
 from stages.sfm.colmap.models import read_model
-from stages.sfm.imported.known_cameras import read_known_cameras
+from stages.sfm.imported.pose_files import read_known_cameras
 
 
 class Quiet:

@@ -31,8 +31,7 @@ from benchmarks.sfm_accuracy import Quiet
 from stages import ingest
 from stages.hardware.device import processors
 from stages.io.photos import Photo, read_photos
-from stages.sfm.colmap.mapping import MAPPING_MODEL
-from stages.sfm.colmap.matching import (
+from stages.sfm.colmap.database import (
     STRICT_RATIO,
     Search,
     extract_features,
@@ -40,9 +39,10 @@ from stages.sfm.colmap.matching import (
     match_pairs,
     read_descriptors,
 )
+from stages.sfm.colmap.mapping import MAPPING_MODEL
 from stages.sfm.pairs.feature_matching import match_descriptors
-from stages.sfm.pairs.matching_plan import TIERS
 from stages.sfm.pairs.pair_selection import exhaustive
+from stages.sfm.pairs.quality_level import TIERS
 
 SCALES, SIGMA = 3, 1.6  # of an octave; of the first picture
 

@@ -39,8 +39,8 @@ from pipeline.engine.runner import Runner
 from pipeline.engine.settings import Settings
 from pipeline.engine.workspace import RUN_FILE, Workspace, default_workspace
 from pipeline.schedule import forecast
+from stages.amounts import duration
 from stages.contract import StageError
-from stages.io.amounts import duration
 
 EXIT_DEFECT, EXIT_USAGE, EXIT_WORKSPACE, EXIT_INTERRUPT, EXIT_TERMINATED = 1, 2, 3, 130, 143
 

@@ -20,8 +20,8 @@ PAPER_RAYS = {"paper field as published": (8, 256, 64, 128), "paper field 4 × 6
 def bench_lines(device: "torch.device") -> list[str]:
     """Measure, and the table in lines."""
     from nerf.runtime.machine_rates import copied_bytes, measure_copy, measure_gather, measure_matmul
+    from stages.amounts import bytes_in_words
     from stages.hardware.device import compute_device, cores
-    from stages.io.amounts import bytes_in_words
 
     compute_device()
     count = cores()
@@ -48,7 +48,7 @@ def _line(name: str, rate: float, count: int, unit: str) -> str:
 def _meaning(products: dict[int, float], reads: float, copied: float, count: int) -> list[str]:
     """What training can reach here at most: the work of a ray that nothing can save, at these rates."""
     from nerf.runtime.machine_rates import Rates
-    from stages.io.amounts import short_count
+    from stages.amounts import short_count
     from stages.train.fields.hash_grid import SAMPLES_PER_RAY
 
     lines = ["at these rates, with nothing else to do and no core waiting, training would reach"]

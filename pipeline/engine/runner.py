@@ -349,7 +349,7 @@ class Runner:
             return None
 
     def _execute(self, job: Job) -> Manifest:
-        from stages.sfm.colmap import load
+        import stages.sfm.colmap  # noqa: F401 -- pycolmap changes how signals are handled: before ours are set
 
         partial, folder = self.workspace.partial(job.stage, job.key), self.workspace.folder(job.stage, job.key)
         if job.stage not in self.force and (manifest := self.workspace.complete(partial, folder, job.key)):
@@ -361,7 +361,6 @@ class Runner:
         partial.mkdir(parents=True, exist_ok=True)
         keep(partial / ATTEMPTS, before)
         self.workspace.write_run(self.state)
-        load()  # which changes how signals are handled; once it is over, they are ours again
         started = datetime.now(UTC)
         self.at_work = job.stage
         with counted(self.workspace.root / ALIVE), counted(partial / ATTEMPTS) as spent:

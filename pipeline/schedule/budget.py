@@ -13,9 +13,9 @@ from typing import Any
 
 from pipeline.engine.settings import Settings
 from pipeline.engine.stage_list import ON_REQUEST
+from stages.amounts import duration
 from stages.contract import StageConfig
 from stages.hardware.device import processors
-from stages.io.amounts import duration
 from stages.io.photos import read_photos
 from stages.io.stopwatch import kept
 

@@ -19,9 +19,9 @@ from pipeline.schedule.budget import (
     reading_seconds,
     takes_what_it_is_given,
 )
+from stages.amounts import duration, rough_duration
 from stages.contract import StageError
 from stages.hardware.device import processors
-from stages.io.amounts import duration, rough_duration
 from stages.train.config import SECONDS
 from stages.train.config import Config as TrainConfig
 

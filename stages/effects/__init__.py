@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 from pydantic import Field
 from tyro.conf import Suppress
 
+from stages.amounts import duration
 from stages.contract import Inputs, Progress, StageConfig, StageResult
 from stages.effects.decisions import Decisions, write_decisions
-from stages.io.amounts import duration
 from stages.io.files import read_json, read_scene, read_tensors, write_json
 
 if TYPE_CHECKING:

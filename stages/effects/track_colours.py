@@ -212,8 +212,7 @@ def _look(ingest: Path, scene: "Scene", view: "View", places: _Places) -> "tuple
     mean of g g^T."""
     import numpy as np
 
-    from stages.ingest.masks import load_mask
-    from stages.io.photos import load_pixels
+    from stages.io.pixels import load_mask, load_pixels
 
     width, height = _size(scene, view)
     pixels = load_pixels(ingest / view.file, width, height)

@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field
 
+from stages.amounts import duration, short_count
 from stages.contract import Inputs, Progress, StageConfig, StageError, StageResult
 from stages.evaluate.image_metrics import ERROR_SCALE, FEWEST_FOR_INTERVAL, error_map, mean_interval, ssim
-from stages.io.amounts import duration, short_count
 from stages.io.files import read_json, read_scene, write_json, write_png
-from stages.io.photos import evenly_spread
+from stages.io.photos import spread
 from stages.train.config import BLACK, WHITE
 
 if TYPE_CHECKING:
@@ -133,7 +133,7 @@ def _tried_rays(scene: "Scene", side: int) -> "Rays":
     from stages.train.data import view_rays
 
     test = scene.of_split("test")
-    few = [test[i] for i in evenly_spread(len(test), min(TRIED_PHOTOS, len(test)))]
+    few = [test[i] for i in spread(len(test), min(TRIED_PHOTOS, len(test)))]
     cameras = [scene.cameras[view.camera] for view in few]
     photos = [view_rays(scene, v, max(c.width, c.height) / side) for v, c in zip(few, cameras, strict=True)]
     return join_rays((rays.each(lambda part: part.reshape(1, -1, *part.shape[2:])) for rays in photos), dim=1)
@@ -145,7 +145,7 @@ def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> Sta
     config = plan(config, inputs, progress)
     examiner = _examiner(config, scene, inputs, folder, progress)
     test = scene.of_split("test")
-    chosen = evenly_spread(len(test), min(config.photos or 0, len(test)))
+    chosen = spread(len(test), min(config.photos or 0, len(test)))
     few = f"{len(chosen)} of {len(test)} test photos are scored, evenly spread"
     notes = [few] if len(chosen) < len(test) else []
     views = [test[i] for i in chosen]
@@ -292,10 +292,10 @@ def fits_poses(config: Config, field: dict[str, Any]) -> bool:
 def affordable(pixels: Sequence[int], budget: float) -> list[int]:
     """Which photos to score: as many as ``budget`` pixels allow, at least one, spread evenly over the list."""
     for count in range(len(pixels), 1, -1):
-        chosen = evenly_spread(len(pixels), count)
+        chosen = spread(len(pixels), count)
         if sum(pixels[i] for i in chosen) <= budget:
             return chosen
-    return evenly_spread(len(pixels), min(1, len(pixels)))
+    return spread(len(pixels), min(1, len(pixels)))
 
 
 def verdict(metrics: dict[str, Any]) -> str:

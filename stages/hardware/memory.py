@@ -7,8 +7,8 @@ shell to that of ``ulimit``. Whoever goes beyond is killed without a word, after
 from collections.abc import Iterator
 from pathlib import Path
 
+from stages.amounts import bytes_in_words
 from stages.contract import StageError
-from stages.io.amounts import bytes_in_words
 
 GROUPS = Path("/sys/fs/cgroup")
 OF_PROCESS = Path("/proc/self/cgroup")

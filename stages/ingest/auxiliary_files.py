@@ -1,11 +1,12 @@
 """Files that are no photos but belong to one: masks, depth maps, normals, masked copies. Told by their names, and
 depth maps by their values, too."""
 
+import os
 import re
+import unicodedata
 from collections.abc import Iterator, Mapping, Sequence
-from pathlib import PurePosixPath
-
-from stages.ingest.decoding import Stored
+from pathlib import Path, PurePosixPath
+from typing import Literal
 
 # a_mask.png and a.depth_2.tif belong to a.jpg; mask/a.png and depth_maps/a.png to image/a.jpg, or to a.jpg beside them.
 _ENDING = re.compile(r"(.+)[ ._-](masks?|masked|depth|depthmap|normals?|alpha|matte)([ ._-]?\d+)?", re.IGNORECASE)
@@ -20,15 +21,17 @@ _COLOUR = re.compile(r"(.+)[ ._-](colou?r|rgb|image)", re.IGNORECASE)  # a.color
 _MASK = re.compile(r"(.+[ ._-])?masks?([ ._-]?\d+)?", re.IGNORECASE)
 
 # Of a depth map there is a photo, but for a few that were lost; of photos in grey there need not be any in colour.
-_COLOURED = 0.9
+_MIN_COLOURED = 0.9
 
-_Place = tuple[PurePosixPath, str]  # a folder, and what a photo in it is called
+Stored = Literal["colour", "grey", "deep grey"]  # the last of 16 bits or of floats
+"""How a file stores its values; the last of 16 bits or floats."""
+_Key = tuple[PurePosixPath, str]  # a folder, and what a photo in it is called
 
 
-def twins(names: Sequence[str]) -> dict[str, str]:
+def auxiliary_files(names: Sequence[str]) -> dict[str, str]:
     """{file: the photo that it belongs to}, all named relative to the photo folder."""
     files = [PurePosixPath(name) for name in names]
-    photos: dict[_Place, PurePosixPath] = {}
+    photos: dict[_Key, PurePosixPath] = {}
     for file in files:
         photos.setdefault((file.parent, _plain(file.stem)), file)
     beside: dict[PurePosixPath, list[PurePosixPath]] = {}
@@ -36,8 +39,8 @@ def twins(names: Sequence[str]) -> dict[str, str]:
         beside.setdefault(folder.parent, []).append(folder)
     found = {}
     for file in files:
-        places = _places(file, beside)
-        if photo := next((photos[place] for place in places if photos.get(place, file) != file), None):
+        keys = _keys(file, beside)
+        if photo := next((photos[key] for key in keys if photos.get(key, file) != file), None):
             found[str(file)] = str(photo)
     return found
 
@@ -47,7 +50,36 @@ def depth_maps(stored: Mapping[str, Stored]) -> set[str]:
     as many in colour. ``stored`` is how each file stores its values, by its name."""
     deep = {name for name, kind in stored.items() if kind == "deep grey"}
     colour = sum(kind == "colour" for kind in stored.values())
-    return deep if colour >= _COLOURED * len(deep) else set()
+    return deep if colour >= _MIN_COLOURED * len(deep) else set()
+
+
+def pair_masks(names: Sequence[str], masks: Sequence[tuple[str, Path]]) -> tuple[dict[str, Path], list[Path]]:
+    """The mask file of each photo that has one, by the photo's name, and the files that are no photo's mask, each
+    once though it may stand for several names.
+
+    A photo's mask is called after it, with its ending or without, and ends in .png. Its accents may be composed in
+    another way, where no other mask is called so.
+    """
+    by_name: dict[str, Path] = {}
+    composed: dict[str, set[Path]] = {}
+    for name, file in masks:
+        if name.lower().endswith(".png"):
+            of = name[: -len(".png")]
+            by_name.setdefault(of, file)
+            composed.setdefault(unicodedata.normalize("NFC", of), set()).add(file)
+
+    def mask_of(name: str) -> Path | None:
+        alike = composed.get(unicodedata.normalize("NFC", name), set())
+        return by_name.get(name, next(iter(alike)) if len(alike) == 1 else None)
+
+    found: dict[str, Path] = {}
+    for name in names:
+        inside = name.removeprefix("images/")  # beside an images/ folder that a transforms file names
+        wanted = (name, os.path.splitext(name)[0], inside, os.path.splitext(inside)[0])
+        if file := next(filter(None, map(mask_of, wanted)), None):
+            found[name] = file
+    used = set(found.values())
+    return found, list(dict.fromkeys(file for _, file in masks if file not in used))
 
 
 def is_mask(name: str) -> bool:
@@ -65,7 +97,7 @@ def _is_jpeg(file: PurePosixPath) -> bool:
     return file.suffix.lower() in (".jpg", ".jpeg", ".heic", ".heif")
 
 
-def _places(file: PurePosixPath, beside: Mapping[PurePosixPath, Sequence[PurePosixPath]]) -> Iterator[_Place]:
+def _keys(file: PurePosixPath, beside: Mapping[PurePosixPath, Sequence[PurePosixPath]]) -> Iterator[_Key]:
     """Where the photo may lie that a file belongs to. ``beside``: the folders of photos in each folder."""
     ending = _ENDING.fullmatch(file.stem)
     if ending and ending[2].lower() == "normal" and _is_jpeg(file):

@@ -4,38 +4,35 @@ Files come from anywhere: formats are a fixed list, sizes are checked before pix
 wrong becomes a :class:`DecodeError` with a reason a user understands.
 """
 
+import io
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
-from types import ModuleType
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
-from stages.ingest.colour_profiles import to_srgb
+import numpy as np
+from PIL import Image, ImageCms
+
+from stages.ingest.auxiliary_files import Stored
 from stages.ingest.exif import (
-    Place,
+    GpsPosition,
     clock_from_exif,
     exposure_from_exif,
     focal_from_exif,
-    place_from_exif,
+    gps_from_exif,
     positive,
     read_exif,
 )
+from stages.ingest.listing import RAW_EXTENSIONS
 from stages.ingest.panoramas import is_panorama
-
-if TYPE_CHECKING:
-    import numpy as np
-    from PIL import Image
+from stages.io.pixels import pillow
 
 MAX_PIXELS = 250_000_000
+_SRGB_TOLERANCE = 2  # of 255: profiles closer than this to sRGB are sRGB written by another hand
 MIN_SIDE_PX = 16
-# EPS and its like run interpreters; RAW files would be read as their thumbnails.
+# EPS and its like run interpreters; RAW_EXTENSIONS files would be read as their thumbnails.
 _FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP", "GIF", "PPM", "HEIF", "AVIF", "JPEG2000")
 _DEEP_GREY = ("I", "I;16", "I;16L", "I;16B", "F")
 _LOSSY = ("JPEG", "MPO", "HEIF", "AVIF")
-RAW = (".dng", ".cr2", ".cr3", ".nef", ".nrw", ".arw", ".srf", ".raf", ".orf", ".rw2", ".pef", ".raw", ".iiq")
-
-
-Stored = Literal["colour", "grey", "deep grey"]  # the last of 16 bits or of floats
 
 
 class DecodeError(Exception):
@@ -68,10 +65,10 @@ class Decoded:
     :func:`exposure_from_exif` tells, ``clock_s`` what :func:`clock_from_exif` does.
     """
 
-    pixels: "np.ndarray"  # (h, w, 3 or 4) uint8
+    pixels: np.ndarray  # (h, w, 3 or 4) uint8
     focal_source: str | None
     camera_key: CameraKey
-    place: Place
+    gps: GpsPosition
     exposure_ev: float | None
     clock_s: float | None
     suffix: str | None
@@ -91,27 +88,9 @@ def decode(path: Path) -> Decoded:
         return _convert(image, stored_plainly, lossy, turned)
 
 
-@cache
-def pillow() -> ModuleType:
-    """Pillow, able to read HEIC, with its own pixel limit replaced by ours."""
-    import logging
-    import warnings
-
-    import pillow_heif
-    from PIL import Image
-
-    pillow_heif.register_heif_opener()
-    Image.MAX_IMAGE_PIXELS = None
-    # What is wrong with a file we say ourselves.
-    warnings.filterwarnings("ignore", category=UserWarning, module=r"PIL\.")
-    logging.getLogger("PIL").setLevel(logging.CRITICAL)
-    Image.init()
-    return Image
-
-
-def _open(path: Path) -> "Image.Image":
+def _open(path: Path) -> Image.Image:
     """The image with its header read, of a size we accept."""
-    if path.suffix.lower() in RAW:
+    if path.suffix.lower() in RAW_EXTENSIONS:
         raise DecodeError("camera raw files are not read; export JPEG, PNG or TIFF")
     library = pillow()
     try:
@@ -135,7 +114,7 @@ def _open(path: Path) -> "Image.Image":
 
 
 def pixel_count(path: Path) -> int:
-    """How many pixels a file says that it has; 0 for one that is refused by its name or header."""
+    """How many pixels a file says that it has; 0 for one that is rejected by its name or header."""
     try:
         with _open(path) as image:
             return image.width * image.height
@@ -153,7 +132,7 @@ def upright_size(path: Path) -> tuple[tuple[int, int], int]:
         return ((image.height, image.width) if turned else image.size), orientation
 
 
-def _load(image: "Image.Image") -> None:
+def _load(image: Image.Image) -> None:
     """Decode the pixels."""
     try:
         image.load()
@@ -177,13 +156,11 @@ def _unrecognised(path: Path) -> str:
     return "not an image of a known format"
 
 
-def _convert(image: "Image.Image", stored_plainly: bool, lossy: bool, turned: int | None) -> Decoded:
+def _convert(image: Image.Image, stored_plainly: bool, lossy: bool, turned: int | None) -> Decoded:
     """The loaded image as upright sRGB; ``turned`` is the EXIF orientation where it has been undone already."""
-    import numpy as np
-
     notes: list[str] = []
     tags, orientation = read_exif(image, notes)
-    converted, is_srgb = to_srgb(_to_eight_bit(image), image.info.get("icc_profile"), notes)
+    converted, is_srgb = _to_srgb(_to_eight_bit(image), image.info.get("icc_profile"), notes)
     pixels = np.asarray(converted if turned else upright(converted, orientation))
     opaque = pixels.shape[2] == 4 and bool((pixels[..., 3] == 255).all())
     pixels = np.ascontiguousarray(pixels[..., :3] if opaque else pixels)
@@ -195,7 +172,7 @@ def _convert(image: "Image.Image", stored_plainly: bool, lossy: bool, turned: in
         pixels=pixels,
         focal_source=focal_source,
         camera_key=_camera_key(tags, pixels.shape[1], pixels.shape[0], turned or orientation, focal_px),
-        place=place_from_exif(tags),
+        gps=gps_from_exif(tags),
         exposure_ev=exposure_from_exif(tags),
         clock_s=clock_from_exif(tags),
         suffix=(".png" if image.format == "PNG" else ".jpg") if copy else None,
@@ -206,7 +183,7 @@ def _convert(image: "Image.Image", stored_plainly: bool, lossy: bool, turned: in
     )
 
 
-def _is_plain(image: "Image.Image") -> bool:
+def _is_plain(image: Image.Image) -> bool:
     """Whether the file stores 8-bit RGB (or PNG RGBA) and nothing else. To be asked before its pixels are loaded."""
     if image.format in ("JPEG", "MPO"):  # the further frames of phones' MPO files are previews and gain maps
         return image.mode == "RGB"
@@ -221,14 +198,14 @@ def _stored(mode: str) -> Stored:
     return "grey" if mode in ("1", "L", "LA") else "colour"
 
 
-def _is_lossy(image: "Image.Image", path: Path) -> bool:
+def _is_lossy(image: Image.Image, path: Path) -> bool:
     if image.format == "WEBP":
         with path.open("rb") as file:
             return file.read(16).endswith(b"VP8 ")
     return image.format in _LOSSY
 
 
-def _frame_count(image: "Image.Image") -> int:
+def _frame_count(image: Image.Image) -> int:
     """How many pictures the file shows. Asked last: counting the pages of a damaged TIFF spoils the image object."""
     if image.format in ("MPO", "HEIF"):  # previews, depth and gain maps
         return 1
@@ -240,8 +217,6 @@ def _frame_count(image: "Image.Image") -> int:
 
 def _what_is_missing(image: Any, error: OSError) -> str:
     """Words for an image whose pixels end early; rows that were not decoded have stayed zero."""
-    import numpy as np
-
     word = "truncated" if "truncated" in str(error) else "damaged"
     if image.format not in ("JPEG", "MPO", "PNG"):
         return f"{word}: {error}"
@@ -254,7 +229,7 @@ def _what_is_missing(image: Any, error: OSError) -> str:
     return f"{word}: {100 * missing:.0f} % of the picture is missing" if missing >= 0.005 else f"{word}: {error}"
 
 
-def _to_eight_bit(image: "Image.Image") -> "Image.Image":
+def _to_eight_bit(image: Image.Image) -> Image.Image:
     """``image`` in mode L, LA, RGB, RGBA or CMYK."""
     if image.mode in _DEEP_GREY:
         return _quantised(image)
@@ -268,10 +243,8 @@ def _to_eight_bit(image: "Image.Image") -> "Image.Image":
         raise DecodeError(f"its pixel format {image.mode} is not read; export JPEG, PNG or TIFF") from error
 
 
-def _quantised(image: "Image.Image") -> "Image.Image":
+def _quantised(image: Image.Image) -> Image.Image:
     """Grey of 16 bits, or of floats in [0, 1], as 8 bits."""
-    import numpy as np
-
     values = np.asarray(image)
     if wrong := int(values.size - np.isfinite(values).sum()):
         raise DecodeError(f"{wrong:,} of its {values.size:,} pixels are no numbers (NaN or infinite)")
@@ -281,7 +254,34 @@ def _quantised(image: "Image.Image") -> "Image.Image":
     return pillow().fromarray(np.rint(values * (255 / limit)).astype(np.uint8))
 
 
-def upright(image: "Image.Image", orientation: int) -> "Image.Image":
+def _to_srgb(image: Image.Image, profile: bytes | None, notes: list[str]) -> tuple[Image.Image, bool]:
+    """``image`` as RGB or RGBA in sRGB, and whether its values already were sRGB."""
+    mode = "RGBA" if image.mode in ("LA", "RGBA") else "RGB"
+    if not profile:
+        return image.convert(mode), True
+    source = image.convert("RGBA") if image.mode == "LA" else image
+    try:
+        transform = ImageCms.buildTransform(
+            ImageCms.ImageCmsProfile(io.BytesIO(profile)), ImageCms.createProfile("sRGB"), source.mode, mode
+        )
+        if source.mode == mode and _is_identity(transform, mode):
+            return source, True
+        converted = ImageCms.applyTransform(source, transform) or source  # None only for in-place work
+    except (ImageCms.PyCMSError, OSError, ValueError) as error:
+        notes.append(f"colour profile ignored ({error})")
+        return image.convert(mode), False
+    return converted, False
+
+
+def _is_identity(transform: Any, mode: str) -> bool:
+    levels = np.arange(0, 256, 15, dtype=np.uint8)
+    cube = np.stack(np.meshgrid(levels, levels, levels), axis=-1).reshape(len(levels), -1, 3)
+    before = Image.fromarray(cube).convert(mode)
+    after = ImageCms.applyTransform(before, transform)
+    return int(np.abs(np.asarray(before, int) - np.asarray(after, int)).max()) <= _SRGB_TOLERANCE
+
+
+def upright(image: Image.Image, orientation: int) -> Image.Image:
     """Undo an EXIF orientation (EXIF 2.32, tag 0x0112)."""
     turns = pillow().Transpose
     turn = {

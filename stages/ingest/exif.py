@@ -2,18 +2,17 @@
 
 import math
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
-if TYPE_CHECKING:
-    from PIL import Image
+from PIL import ExifTags, Image
 
-# Focal lengths over the longer side: 157 to 6 degrees through a pinhole, what COLMAP accepts. Others are not believed,
-# neither of EXIF nor of a lens that was fitted.
+# Focal lengths over the longer side: 157 to 6 degrees through a pinhole, what COLMAP accepts. Others are rejected,
+# from EXIF and from a fitted camera.
 FOCAL_RANGE = (0.1, 10.0)
-_ALTITUDES_M = (-500.0, 20_000.0)  # of shores and aircraft: beyond, a receiver has not found its place
+_ALTITUDES_M = (-500.0, 20_000.0)  # of shores and aircraft: beyond, a receiver has no fix
 
 
-class Place(NamedTuple):
+class GpsPosition(NamedTuple):
     """Where EXIF says that a photo was taken: degrees, north and east positive, and metres above the sea."""
 
     latitude: float | None = None
@@ -21,19 +20,17 @@ class Place(NamedTuple):
     altitude_m: float | None = None
 
 
-def read_exif(image: "Image.Image", notes: list[str]) -> tuple[dict[str, Any], int]:
+def read_exif(image: Image.Image, notes: list[str]) -> tuple[dict[str, Any], int]:
     """EXIF tags by name, and the orientation (1 where absent or invalid)."""
-    from PIL import ExifTags
-
     try:
         exif = image.getexif()
         tags = {**exif, **exif.get_ifd(ExifTags.IFD.Exif)}
-        place = exif.get_ifd(ExifTags.IFD.GPSInfo)
+        gps = exif.get_ifd(ExifTags.IFD.GPSInfo)
     except Exception:  # Pillow raises what it likes of damaged tags; the pixels are good
         notes.append("its EXIF cannot be read")
         return {}, 1
     named = {ExifTags.TAGS.get(tag, str(tag)): value for tag, value in tags.items()}
-    named |= {ExifTags.GPSTAGS.get(tag, str(tag)): value for tag, value in place.items()}
+    named |= {ExifTags.GPSTAGS.get(tag, str(tag)): value for tag, value in gps.items()}
     orientation = named.get("Orientation")
     return named, orientation if isinstance(orientation, int) and 1 <= orientation <= 8 else 1
 
@@ -85,21 +82,21 @@ def clock_from_exif(tags: dict[str, Any]) -> float | None:
     return second.replace(tzinfo=UTC).timestamp() + (float(f"0.{fraction}") if fraction.isdecimal() else 0.0)
 
 
-def place_from_exif(tags: dict[str, Any]) -> Place:
+def gps_from_exif(tags: dict[str, Any]) -> GpsPosition:
     """Latitude, longitude and altitude (EXIF 2.32, GPS tags 1 to 6); nothing where they are incomplete, out of range,
-    or both 0, which is what a receiver writes that has not found its place."""
+    or both 0, which is what a receiver writes without a fix."""
     latitude = _degrees(tags.get("GPSLatitude"), tags.get("GPSLatitudeRef"), "NS")
     longitude = _degrees(tags.get("GPSLongitude"), tags.get("GPSLongitudeRef"), "EW")
     if latitude is None or longitude is None or abs(latitude) > 90 or abs(longitude) > 180:
-        return Place()
+        return GpsPosition()
     if latitude == longitude == 0:
-        return Place()
+        return GpsPosition()
     altitude = _number(tags.get("GPSAltitude"))
     below_sea = tags.get("GPSAltitudeRef") in (1, b"\x01")
     if altitude is not None:
         altitude = -altitude if below_sea else altitude
         altitude = altitude if _ALTITUDES_M[0] <= altitude <= _ALTITUDES_M[1] else None
-    return Place(latitude, longitude, altitude)
+    return GpsPosition(latitude, longitude, altitude)
 
 
 def _degrees(value: Any, direction: Any, positive_negative: str) -> float | None:

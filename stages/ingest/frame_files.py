@@ -11,7 +11,7 @@ from typing import Any
 
 from stages.contract import StageError
 from stages.ingest.listing import IMAGES, walk_photos
-from stages.io.transforms_files import MOST_LETTERS, photo_names
+from stages.io.transforms_files import MAX_LETTERS, photo_names
 
 _EXTENSIONS_TRIED = ("", ".png", ".jpg", ".jpeg")
 
@@ -35,7 +35,7 @@ class FrameFiles:
         """The photo of a frame: in a file of ours by its own name first, then by ``file_path``.
 
         Where the first folder is a reduction of the one that it names, as ``images_4`` of ``images/0.png``, its smaller
-        copy. One that is nowhere is returned as if it were in the first folder, and refused when it is to be decoded.
+        copy. One that is nowhere is returned as if it were in the first folder, and rejected when it is to be decoded.
         """
         name, *copies = photo_names(frame)
         if (reduced := self._reduced(name)) is not None and reduced.is_file():
@@ -147,7 +147,7 @@ def _inside(folder: Path, root: Path, file_path: str, what: str) -> Path:
     if absolute or not is_name or not any(file.resolve().is_relative_to(place.resolve()) for place in (folder, root)):
         linked = is_name and what == "photo" and not absolute and ".." not in file.relative_to(folder).parts
         raise StageError("ingest.outside-folder", 
-            f"refused the {what} {file_path[:MOST_LETTERS]!r}",
+            f"rejected the {what} {file_path[:MAX_LETTERS]!r}",
             "its path is absolute" if absolute else f"it leads out of the folder {folder}",
             "Give the photo folder apart, if it is a link: pipeline run PHOTOS --cameras FILE." if linked else
             f"A transforms file may name {what}s inside its own folder only.",

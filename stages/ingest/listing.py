@@ -5,7 +5,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from stages.contract import StageError
-from stages.ingest.decoding import RAW
 
 # Everything else is tried: what counts as a photo is decided by decoding, not by the name.
 # fmt: off
@@ -23,15 +22,33 @@ IMAGES = (
     ".jpg", ".jpeg", ".jpe", ".jfif", ".mpo", ".insp", ".png", ".heic", ".heif", ".hif", ".tif", ".tiff", ".webp",
     ".bmp", ".avif", ".gif", ".jp2", ".j2k", ".ppm", ".pgm", ".pnm",
 )
+RAW_EXTENSIONS = (
+    ".dng", ".cr2", ".cr3", ".nef", ".nrw", ".arw", ".srf", ".raf", ".orf", ".rw2", ".pef", ".raw", ".iiq",
+)
 # fmt: on
-MOST_PASSED_OVER = 2  # files beside a video, too few to be a set of photos
+RAW_EXTENSIONS = (
+    ".dng",
+    ".cr2",
+    ".cr3",
+    ".nef",
+    ".nrw",
+    ".arw",
+    ".srf",
+    ".raf",
+    ".orf",
+    ".rw2",
+    ".pef",
+    ".raw",
+    ".iiq",
+)
+MAX_OTHER_FILES = 2  # files beside a video, too few to be a set of photos
 FOLDER_HINT = "Give the folder that holds the photos: pipeline run FOLDER"
 _LINKS_HINT = "Fetch them (git annex get, dvc pull), or connect the drive that they lie on."
 
 
 def list_photos(root: Path) -> tuple[Path, ...]:
     """All files below ``root`` that may be photos, sorted by relative name; the video where there is a single one and
-    beside it no more than MOST_PASSED_OVER of these, none an image by its ending.
+    beside it no more than MAX_OTHER_FILES of these, none an image by its ending.
 
     Skipped: hidden files, ``masks`` folders, workspaces of ours (folders with a run.json), and files whose
     extension says that they are no images. Folders that are symbolic links are not followed.
@@ -41,8 +58,8 @@ def list_photos(root: Path) -> tuple[Path, ...]:
     if not found:
         raise StageError("ingest.empty-folder", f"{root} is empty", "there is no file in it", FOLDER_HINT)
     photos, videos = [file for file in found if _may_be_photo(file)], _videos(found)
-    unknown = not any(file.suffix.lower() in IMAGES + RAW for file in photos)
-    if len(videos) == 1 and unknown and len(photos) <= MOST_PASSED_OVER:
+    unknown = not any(file.suffix.lower() in IMAGES + RAW_EXTENSIONS for file in photos)
+    if len(videos) == 1 and unknown and len(photos) <= MAX_OTHER_FILES:
         photos = []  # a README, say; more of them may be photos of whatever ending
     lost = sum(not file.is_file() for file in found)
     if lost and not any(map(Path.is_file, photos + videos)):
@@ -86,7 +103,7 @@ def _walk(root: Path, enters: Callable[[Path], bool]) -> Iterator[Path]:
 
 
 def _is_lost(file: Path) -> bool:
-    """A link to a photo or video that is not there is refused by name. Other links may have led to folders."""
+    """A link to a photo or video that is not there is rejected by name. Other links may have led to folders."""
     return file.suffix.lower() in IMAGES + _VIDEOS and file.is_symlink() and not file.exists()
 
 

@@ -1,19 +1,17 @@
 """Masks: which parts of a photo are to be ignored. Black ignores, in the user's files as in ours."""
 
-import os
-import unicodedata
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from stages.ingest.decoding import DecodeError, decode, pillow, upright, upright_size
+import cv2
+import numpy as np
+from PIL import Image
+
+from stages.ingest.decoding import DecodeError, decode, upright, upright_size
 from stages.io.files import write_png
-
-if TYPE_CHECKING:
-    import numpy as np
-
-    from stages.io.photos import Photo
+from stages.io.photos import Photo
+from stages.io.pixels import pillow
 
 USE_FROM = 128  # of 255: from here on a pixel counts as used
 STILL_BACKGROUND_HINT = (
@@ -29,39 +27,10 @@ class Mask:
     ``ambiguous``: its shape does not tell whether it is of the upright photo or of what its file stores.
     """
 
-    pixels: "np.ndarray"
+    pixels: np.ndarray
     turned: bool
     resized: bool
     ambiguous: bool
-
-
-def pair_masks(names: Sequence[str], masks: Sequence[tuple[str, Path]]) -> tuple[dict[str, Path], list[Path]]:
-    """The mask file of each photo that has one, by the photo's name, and the files that are no photo's mask, each
-    once though it may stand for several names.
-
-    A photo's mask is called after it, with its ending or without, and ends in .png. Its accents may be composed in
-    another way, where no other mask is called so.
-    """
-    by_name: dict[str, Path] = {}
-    composed: dict[str, set[Path]] = {}
-    for name, file in masks:
-        if name.lower().endswith(".png"):
-            of = name[: -len(".png")]
-            by_name.setdefault(of, file)
-            composed.setdefault(unicodedata.normalize("NFC", of), set()).add(file)
-
-    def mask_of(name: str) -> Path | None:
-        alike = composed.get(unicodedata.normalize("NFC", name), set())
-        return by_name.get(name, next(iter(alike)) if len(alike) == 1 else None)
-
-    found: dict[str, Path] = {}
-    for name in names:
-        inside = name.removeprefix("images/")  # beside an images/ folder that a transforms file names
-        wanted = (name, os.path.splitext(name)[0], inside, os.path.splitext(inside)[0])
-        if file := next(filter(None, map(mask_of, wanted)), None):
-            found[name] = file
-    used = set(found.values())
-    return found, list(dict.fromkeys(file for _, file in masks if file not in used))
 
 
 def are_of_stored_pixels(pairs: Iterable[tuple[Path, Path]]) -> bool | None:
@@ -87,9 +56,6 @@ def read_mask(file: Path, width: int, height: int, orientation: int, stored: boo
     same shape and another size is resized to the nearest pixels. Raises DecodeError, words to follow the name of the
     photo, where it cannot be used.
     """
-    import cv2
-    import numpy as np
-
     try:
         decoded = decode(file)
     except DecodeError as error:
@@ -126,33 +92,15 @@ def _same_shape(found: tuple[int, int], wanted: tuple[int, int]) -> bool:
     return abs(found[0] * wanted[1] - found[1] * wanted[0]) <= max(*found, *wanted)
 
 
-def _turned(pixels: "np.ndarray", orientation: int) -> "np.ndarray":
-    import numpy as np
-    from PIL import Image
-
+def _turned(pixels: np.ndarray, orientation: int) -> np.ndarray:
     return np.ascontiguousarray(upright(Image.fromarray(pixels), orientation))
 
 
-def load_mask(path: Path, width: int, height: int) -> "np.ndarray":
-    """A mask that ingest wrote as (height, width) bool at a photo's reduced size, True where every pixel that goes into
-    one is to be used."""
-    import cv2
-    import numpy as np
-
-    with pillow().open(path) as image:
-        ignored = (np.asarray(image) == 0).astype(np.float32)
-    if ignored.shape != (height, width):
-        ignored = cv2.resize(ignored, (width, height), interpolation=cv2.INTER_AREA)
-    return ignored == 0
-
-
-def write_feature_masks(ingest: Path, photos: "Sequence[Photo]", folder: Path) -> bool:
+def write_feature_masks(ingest: Path, photos: Sequence[Photo], folder: Path) -> bool:
     """Write for COLMAP, as ``folder/<image name>.png``, where features may lie: neither ignored nor transparent.
 
     Returns whether any photo has such a mask; without, nothing is written.
     """
-    import numpy as np
-
     masked = [photo for photo in photos if photo.mask or photo.has_alpha]
     for photo in masked:
         allowed = np.full((photo.height, photo.width), 255, np.uint8)

@@ -1,4 +1,4 @@
-"""What ingest says: files that are refused, what photos are like beside each other, the summary."""
+"""Messages of ingest: rejected files, findings among the photos, errors, the summary."""
 
 import os
 import shlex
@@ -10,7 +10,7 @@ from stages.ingest.auxiliary_files import is_mask
 from stages.ingest.masks import STILL_BACKGROUND_HINT
 from stages.ingest.sharpness import BLURRED
 from stages.ingest.sources import Source, photos_beside, unused_cameras, unused_masks
-from stages.io.photos import Photo, Refusal
+from stages.io.photos import Photo, Rejection
 
 MAX_NOTES = 10
 NEARLY_BLACK = 16  # of 255: the most that 12 bits make in a file of 16
@@ -22,36 +22,38 @@ def shown(name: str) -> str:
     return name if name.isprintable() else repr(name)
 
 
-def say(notes: Sequence[str], where: str, progress: Progress) -> None:
-    """The first few notes, how many more there are, and in which file all of them stand."""
+def note_first(notes: Sequence[str], where: str, progress: Progress) -> None:
+    """Note the first few, how many more there are, and the file that has all of them."""
     for note in notes[:MAX_NOTES]:
         progress.note(note)
     if len(notes) > MAX_NOTES:
         progress.note(f"… and {len(notes) - MAX_NOTES} more, all in {where}")
 
 
-def say_refused(refused: Sequence[Refusal], progress: Progress) -> None:
-    """Which files are no photos, and why."""
-    say([f"refused {shown(refusal.name)}: {refusal.reason}" for refusal in refused], "photos.json", progress)
+def note_rejected(rejected: Sequence[Rejection], progress: Progress) -> None:
+    """Note which files are no photos, and why."""
+    note_first(
+        [f"rejected {shown(rejection.name)}: {rejection.reason}" for rejection in rejected], "photos.json", progress
+    )
 
 
-def say_everything(refused: Sequence[Refusal], notes: Sequence[str], progress: Progress) -> None:
-    """Every refused file, by reason, and every note, where no file will be left to look them up in."""
+def note_everything(rejected: Sequence[Rejection], notes: Sequence[str], progress: Progress) -> None:
+    """Every rejected file, by reason, and every note, where no file will be left to look them up in."""
     by_reason: dict[str, list[str]] = {}
-    for refusal in refused:
-        by_reason.setdefault(refusal.reason, []).append(shown(refusal.name))
+    for rejection in rejected:
+        by_reason.setdefault(rejection.reason, []).append(shown(rejection.name))
     for reason, names in by_reason.items():
-        progress.note(f"refused {', '.join(names)}: {reason}")
+        progress.note(f"rejected {', '.join(names)}: {reason}")
     for note in notes:
         progress.note(note)
 
 
-def say_unused(source: Source, photos: Path, progress: Progress) -> None:
-    """What lies with the photos, which were found in ``photos``, and could be used, and how."""
+def note_unused(source: Source, photos: Path, progress: Progress) -> None:
+    """Note what lies beside the photos, which were found in ``photos``, and could be used, and how."""
     if beside := photos_beside(source, photos):
         folder = shown(str(photos))
         lie, them = ("1 photo lies", "is") if beside == 1 else (f"{beside} photos lie", "are")
-        how = f"to use all, move what lies beside into images/; to use only that, move images/ out of {folder}"
+        how = f"to use all, move them into images/; to use only them, move images/ out of {folder}"
         progress.note(f"{lie} in {folder} beside images/ and {them} not used: {how}")
     if (cameras := unused_cameras(source)) is not None:
         place, option = shown(str(cameras)), shown(f"--cameras {shlex.quote(str(cameras))}")
@@ -61,26 +63,26 @@ def say_unused(source: Source, photos: Path, progress: Progress) -> None:
         progress.note(f"masks lie in {lie} and are not used: in {wanted} they would be (black is ignored)")
 
 
-def set_aside(files: Mapping[str, str]) -> list[str]:
+def excluded(files: Mapping[str, str]) -> list[str]:
     """Notes on files that are not taken for photos, {file: the photo that it belongs to}."""
     if not files:
         return []
     named = [f"{shown(name)} (of {shown(photo)})" for name, photo in sorted(files.items())]
     count = "1 file is" if len(files) == 1 else f"{len(files)} files are"
-    notes = [f"{count} set aside, named as a mask, depth map or other copy of a photo: {listed(named, 3)}"]
+    notes = [f"{count} excluded, named as a mask, depth map or other copy of a photo: {listed(named, 3)}"]
     if mask := next((name for name in sorted(files) if is_mask(name)), None):
         place = f"masks/{os.path.splitext(files[mask])[0]}.png"
         notes.append(f"to be used as a mask, whose black is ignored, {shown(mask)} would have to be {shown(place)}")
     return notes
 
 
-def set_aside_by_values(files: Sequence[str]) -> list[str]:
+def excluded_by_values(files: Sequence[str]) -> list[str]:
     """A note on files among colour photos whose values are those of depth maps."""
     if not files:
         return []
     count = "1 file is" if len(files) == 1 else f"{len(files)} files are"
     named = listed([shown(name) for name in files], 3)
-    return [f"{count} set aside as depth maps, being grey of 16 bits or of floats among photos in colour: {named}"]
+    return [f"{count} excluded as depth maps, being grey of 16 bits or of floats among photos in colour: {named}"]
 
 
 def nearly_black(brightest: Sequence[int]) -> list[str]:
@@ -92,7 +94,7 @@ def nearly_black(brightest: Sequence[int]) -> list[str]:
     return [f"all photos are nearly black, at most {most} of 255: {how}"]
 
 
-def say_findings(photos: Sequence[Photo], progress: Progress) -> None:
+def note_findings(photos: Sequence[Photo], progress: Progress) -> None:
     """Which photos are nearly the same picture, and which are blurred."""
     same = [f"{shown(p.name)} (as {shown(p.near_duplicate_of)})" for p in photos if p.near_duplicate_of]
     if same:
@@ -108,7 +110,7 @@ def say_findings(photos: Sequence[Photo], progress: Progress) -> None:
         progress.note(f"{are} far less sharp than those before and after, and kept: {_few(blurred)}")
 
 
-def say_masks(ignored: Sequence[float], turned: int, resized: int, photos: int, progress: Progress) -> None:
+def note_masks(ignored: Sequence[float], turned: int, resized: int, photos: int, progress: Progress) -> None:
     """How many of the photos have masks, how much these ignore, and how many were made to fit."""
     if not ignored:
         return
@@ -134,29 +136,29 @@ def _few(names: Sequence[str]) -> str:
     return listed(names, MAX_NOTES) + (", all in photos.json" if len(names) > MAX_NOTES else "")
 
 
-def too_few(source: Source, names: Sequence[str], refused: Sequence[Refusal]) -> StageError:
-    """The error for one photo or none, ``names``, and what the refusals tell."""
+def too_few(source: Source, names: Sequence[str], rejected: Sequence[Rejection]) -> StageError:
+    """The error for one photo or none, ``names``, and what the rejections show."""
     if not names:
-        first = f"{shown(refused[0].name)}: {refused[0].reason}"
+        first = f"{shown(rejected[0].name)}: {rejected[0].reason}"
         return StageError(
             "ingest.no-usable-photo",
-            f"none of the {len(refused)} files in {source.root} is a usable photo",
+            f"none of the {len(rejected)} files in {source.root} is a usable photo",
             first,
             HINT,
         )
     only = shown(names[0])
-    if refused and all(refusal.reason.startswith("identical to ") for refusal in refused):
+    if rejected and all(rejection.reason.startswith("identical to ") for rejection in rejected):
         return StageError(
             "ingest.identical-photos",
-            f"all {len(refused) + 1} photos are identical",
+            f"all {len(rejected) + 1} photos are identical",
             f"they have the pixels of {only}",
             HINT,
         )
-    if refused:
+    if rejected:
         return StageError(
             "ingest.one-usable-photo",
             f"only one photo can be used, {only}",
-            f"{len(refused)} other files were refused",
+            f"{len(rejected)} other files were rejected",
             HINT,
         )
     return StageError("ingest.one-photo", "there is only one photo", f"{only}; a scene needs at least two", HINT)
@@ -164,7 +166,7 @@ def too_few(source: Source, names: Sequence[str], refused: Sequence[Refusal]) ->
 
 def all_the_same(photos: int) -> StageError:
     """The error for photos that all show nearly the same picture."""
-    why = "the camera stood still between them, so they tell nothing of depth"
+    why = "the camera did not move between them, so they show no depth"
     return StageError(
         "ingest.same-picture",
         f"all {photos} photos are nearly the same picture",
@@ -181,21 +183,21 @@ def all_plain(colours: Sequence[tuple[str, str]]) -> StageError:
     return StageError("ingest.plain-photos", f"all {len(colours)} photos show one single colour", why, hint)
 
 
-def summary(source: Source, photos: Sequence[Photo], refused: Sequence[Refusal]) -> str:
+def summary(source: Source, photos: Sequence[Photo], rejected: Sequence[Rejection]) -> str:
     """Ingest's line."""
     sizes = sorted({(photo.width, photo.height) for photo in photos})
     size = "{}×{}".format(*sizes[0]) if len(sizes) == 1 else f"in {len(sizes)} sizes"
     alpha = " with alpha" if any(photo.has_alpha for photo in photos) else ""
     what = "frames" if source.kind == "video" else "photos"
-    line = f"{len(photos)} {what} {size}{alpha}, {_camera_words(source, photos)}"
+    line = f"{len(photos)} {what} {size}{alpha}, {_cameras(source, photos)}"
     if photos[-1].time_s is not None:
         line += f", {photos[-1].time_s:.1f} s of video"
-    return f"{line}, {len(refused)} refused" if refused else line
+    return f"{line}, {len(rejected)} rejected" if rejected else line
 
 
-def _camera_words(source: Source, photos: Sequence[Photo]) -> str:
+def _cameras(source: Source, photos: Sequence[Photo]) -> str:
     if source.cameras is not None:
-        return "cameras given"
+        return "poses imported"
     groups = len({photo.camera_group for photo in photos})
     cameras = "one camera" if groups == 1 else f"{groups} cameras"
     known = [photo.focal_px for photo in photos if photo.focal_px is not None]
@@ -206,12 +208,12 @@ def _camera_words(source: Source, photos: Sequence[Photo]) -> str:
     return f"{cameras}, EXIF focal" + (f" {known[0]:.0f} px" if len(set(known)) == 1 else "")
 
 
-def facts(source: Source, photos: Sequence[Photo], refused: Sequence[Refusal]) -> dict[str, object]:
+def facts(source: Source, photos: Sequence[Photo], rejected: Sequence[Rejection]) -> dict[str, object]:
     """The summary as JSON values."""
     return {
         "source": source.kind,
         "photos": len(photos),
-        "refused": [{"name": refusal.name, "reason": refusal.reason} for refusal in refused],
+        "rejected": [{"name": rejection.name, "reason": rejection.reason} for rejection in rejected],
         "sizes": sorted([width, height] for width, height in {(photo.width, photo.height) for photo in photos}),
         "cameras": len({photo.camera_group for photo in photos}),
         "focal_known": sum(photo.focal_px is not None for photo in photos),

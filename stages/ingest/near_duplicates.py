@@ -7,42 +7,39 @@ in the same order, which their ranks do not notice.
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
+
+import cv2
+import numpy as np
 
 from stages.ingest.optical_flow import corners, follow, follow_both_ways
 
-if TYPE_CHECKING:
-    import numpy as np
-
-THUMBNAIL_PX = 320  # longer side: PARALLAX is then 0.8 of a pixel, which corners are followed to with ease
+THUMBNAIL_PX = 320  # longer side: MAX_PARALLAX is then 0.8 of a pixel, which corners are followed to with ease
 # Shares of the picture's longer side. Through a usual lens of 60 degrees the parallax of a point is then below 0.15
 # degrees, a tenth of the least angle under which COLMAP keeps a point (1.5 degrees). And were all of the shift a step
 # to the side in front of a flat wall, which shows no parallax, that angle would still be no more than 1.2 degrees.
-PARALLAX = 0.0025
-SHIFT = 0.02
+MAX_PARALLAX = 0.0025
+MAX_SHIFT = 0.02
 # Of the corners that are followed: the others may be people, leaves, or mistakes.
-AGREEING_SHARE = 0.95
+MIN_AGREEING_FRACTION = 0.95
 # Of all corners: with fewer of them found again, the pictures differ.
-FOLLOWED_SHARE = 0.8
-FEWEST_CORNERS, MOST_CORNERS = 30, 200
+MIN_TRACKED_FRACTION = 0.8
+MIN_CORNERS, MAX_CORNERS = 30, 200
 # What is compared pair by pair: nearly the same pictures are nearly the same in a few large pixels.
 CELLS = 16
-LEAST_CORRELATION = 0.8
-MOST_CANDIDATES = 4
+MIN_CORRELATION = 0.8
+MAX_CANDIDATES = 4
 
 
 class _Picture(NamedTuple):
-    grey: "np.ndarray"  # (h, w) uint8, equalised
-    corners: "np.ndarray"  # (n, 1, 2) float32, pixels
+    grey: np.ndarray  # (h, w) uint8, equalised
+    corners: np.ndarray  # (n, 1, 2) float32, pixels
 
 
-def thumbnail(pixels: "np.ndarray", used: "np.ndarray | None" = None) -> "np.ndarray":
+def thumbnail(pixels: np.ndarray, used: np.ndarray | None = None) -> np.ndarray:
     """A photo, (h, w, 3 or 4) uint8, as (h', w') uint8 with equalised grey values. What is transparent counts as
     black, and what its mask ignores, ``used`` being the mask made :func:`small`: before a background that never moves,
     an object that turns is another picture."""
-    import cv2
-    import numpy as np
-
     picture = small(pixels)
     grey = cv2.cvtColor(picture[..., :3], cv2.COLOR_RGB2GRAY)
     for cover in (picture[..., 3] if pixels.shape[2] == 4 else None, used):
@@ -51,10 +48,8 @@ def thumbnail(pixels: "np.ndarray", used: "np.ndarray | None" = None) -> "np.nda
     return cv2.equalizeHist(grey)
 
 
-def small(pixels: "np.ndarray") -> "np.ndarray":
+def small(pixels: np.ndarray) -> np.ndarray:
     """A picture of any channels, no larger than a thumbnail."""
-    import cv2
-
     height, width = pixels.shape[:2]
     scale = min(1.0, THUMBNAIL_PX / max(height, width))
     size = max(1, round(width * scale)), max(1, round(height * scale))
@@ -62,7 +57,7 @@ def small(pixels: "np.ndarray") -> "np.ndarray":
 
 
 def near_duplicates(
-    thumbnails: "Sequence[np.ndarray]", sharpness: Sequence[float], pixels: Sequence[int]
+    thumbnails: Sequence[np.ndarray], sharpness: Sequence[float], pixels: Sequence[int]
 ) -> dict[int, int]:
     """Which photos are nearly the same picture as another one, and as which: {left out: kept}. ``pixels`` is how many
     each has.
@@ -77,13 +72,13 @@ def near_duplicates(
 
     def picture(index: int) -> _Picture:
         if index not in pictures:
-            pictures[index] = _Picture(thumbnails[index], corners(thumbnails[index], MOST_CORNERS))
+            pictures[index] = _Picture(thumbnails[index], corners(thumbnails[index], MAX_CORNERS))
         return pictures[index]
 
     left_out: dict[int, int] = {}
     kept: set[int] = set()
     for index in sorted(range(len(thumbnails)), key=lambda i: (-round(2 * math.log2(pixels[i])), -sharpness[i], i)):
-        nearest = [other for other in candidates[index] if other in kept][:MOST_CANDIDATES]
+        nearest = [other for other in candidates[index] if other in kept][:MAX_CANDIDATES]
         same = next((other for other in nearest if _is_same_picture(picture(index), picture(other))), None)
         if same is None:
             kept.add(index)
@@ -92,12 +87,9 @@ def near_duplicates(
     return left_out
 
 
-def _candidates(thumbnails: "Sequence[np.ndarray]") -> list[list[int]]:
+def _candidates(thumbnails: Sequence[np.ndarray]) -> list[list[int]]:
     """For each photo the others of its shape, as a smaller or larger copy rounded to whole pixels has it, that may be
     nearly the same, those most like it first."""
-    import cv2
-    import numpy as np
-
     cells = [cv2.resize(one, (CELLS, CELLS), interpolation=cv2.INTER_AREA).ravel() for one in thumbnails]
     table = np.array(cells, np.float32).reshape(len(thumbnails), CELLS * CELLS)
     table -= table.mean(axis=1, keepdims=True)
@@ -106,7 +98,7 @@ def _candidates(thumbnails: "Sequence[np.ndarray]") -> list[list[int]]:
     found = []
     for index in range(len(thumbnails)):
         # cos >= c without a quotient, which a blank picture would not have
-        alike = table @ table[index] - LEAST_CORRELATION * norms * norms[index]
+        alike = table @ table[index] - MIN_CORRELATION * norms * norms[index]
         askew = np.abs(shapes[:, 0] * shapes[index, 1] - shapes[:, 1] * shapes[index, 0])
         possible = (alike > 0) & (askew <= np.maximum(shapes.max(axis=1), shapes[index].max()))
         possible[index] = False
@@ -117,25 +109,22 @@ def _candidates(thumbnails: "Sequence[np.ndarray]") -> list[list[int]]:
 
 def _is_same_picture(one: _Picture, other: _Picture) -> bool:
     """Whether one picture, shifted and turned a little, is the other made as large as it, without parallax."""
-    import cv2
-    import numpy as np
-
-    if len(one.corners) < FEWEST_CORNERS:
+    if len(one.corners) < MIN_CORNERS:
         return False
     longer = max(one.grey.shape)
     grey = other.grey
     if grey.shape != one.grey.shape:
         grey = cv2.resize(grey, one.grey.shape[::-1], interpolation=cv2.INTER_AREA)
     there, _ = follow(one.grey, grey, one.corners)
-    if np.median(np.linalg.norm(there - one.corners, axis=2)) > SHIFT * longer:  # most pairs end here
+    if np.median(np.linalg.norm(there - one.corners, axis=2)) > MAX_SHIFT * longer:  # most pairs end here
         return False
     there, followed = follow_both_ways(one.grey, grey, one.corners)
-    if followed.sum() < max(FEWEST_CORNERS, FOLLOWED_SHARE * len(followed)):
+    if followed.sum() < max(MIN_CORNERS, MIN_TRACKED_FRACTION * len(followed)):
         return False
     before, after = one.corners[followed], there[followed]
-    if np.quantile(np.linalg.norm(after - before, axis=2), AGREEING_SHARE) > SHIFT * longer:
+    if np.quantile(np.linalg.norm(after - before, axis=2), MIN_AGREEING_FRACTION) > MAX_SHIFT * longer:
         return False
     _, agreeing = cv2.estimateAffinePartial2D(
-        before, after, method=cv2.RANSAC, ransacReprojThreshold=PARALLAX * longer, confidence=0.999
+        before, after, method=cv2.RANSAC, ransacReprojThreshold=MAX_PARALLAX * longer, confidence=0.999
     )
-    return bool(agreeing.mean() >= AGREEING_SHARE)
+    return bool(agreeing.mean() >= MIN_AGREEING_FRACTION)

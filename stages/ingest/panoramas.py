@@ -1,24 +1,23 @@
 """Which pictures are panoramas: each column one direction of the compass, so that no lens model here fits them."""
 
 import re
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    import numpy as np
+import cv2
+import numpy as np
 
 # Photo Sphere XMP metadata, as an attribute or an element. Views that were cut out of a panorama may have kept it.
 _TAG = re.compile(rb"GPano:ProjectionType\s*(=\s*[\"']|>)\s*(equirectangular|cylindrical)", re.IGNORECASE)
-LEAST_ASPECT = 1.9  # of a panorama by its tag: a whole one has 2, a view cut out of one less
+MIN_ASPECT = 1.9  # of a panorama by its tag: a whole one has 2, a view cut out of one less
 # The ends of ordinary photos that were cut to 2 : 1 agree by at most 0.25, columns half a photo apart by at most 0.45,
 # and neighbouring columns mostly by 0.5 to 0.97 (fox, fern, sceaux_castle, banana, fountain_p11, herzjesu_p8, which are
 # some 1000 pixels wide: of larger pictures by more).
 AGREEMENT, AHEAD = 0.5, 0.2
 ROWS, SMOOTH_ROWS = 512, 10.0  # columns are compared in so many rows, without what changes more slowly than that
-LEAST_DETAIL = 2.0  # of 255: what is plain tells nothing
+MIN_DETAIL = 2.0  # of 255: what is plain tells nothing
 OTHERS = 31
 
 
-def is_panorama(pixels: "np.ndarray", xmp: str | bytes | None = None) -> bool:
+def is_panorama(pixels: np.ndarray, xmp: str | bytes | None = None) -> bool:
     """Whether a picture, (h, w, 3 or 4) uint8, is a panorama: by its XMP metadata, or by its ends.
 
     A whole turn of the compass is exactly twice as wide as high, and its last column is followed by its first: they
@@ -26,7 +25,7 @@ def is_panorama(pixels: "np.ndarray", xmp: str | bytes | None = None) -> bool:
     """
     height, width = pixels.shape[:2]
     content = xmp.encode("utf-8", "replace") if isinstance(xmp, str) else xmp or b""
-    if width >= LEAST_ASPECT * height and _TAG.search(content):
+    if width >= MIN_ASPECT * height and _TAG.search(content):
         return True
     return width == 2 * height and _goes_round(pixels)
 
@@ -37,25 +36,20 @@ def cutting_advice(source: str, view: str) -> str:
     return f"cut it into perspective views, for example with {ffmpeg}, and so for yaw 60, 120, 180, -60 and -120"
 
 
-def _goes_round(pixels: "np.ndarray") -> bool:
-    import numpy as np
-
+def _goes_round(pixels: np.ndarray) -> bool:
     width = pixels.shape[1]
     inside = np.arange(1, OTHERS + 1) * width // (OTHERS + 1)
     one = _detail(pixels[:, np.append(0, inside)])
     other = _detail(pixels[:, np.append(width - 1, (inside + width // 2) % width)])
     sizes = np.linalg.norm(one, axis=0), np.linalg.norm(other, axis=0)
-    if min(sizes[0][0], sizes[1][0]) < LEAST_DETAIL * ROWS**0.5:
+    if min(sizes[0][0], sizes[1][0]) < MIN_DETAIL * ROWS**0.5:
         return False
     agreement = (one * other).sum(axis=0) / np.maximum(sizes[0] * sizes[1], 1.0)
     return bool(agreement[0] > max(AGREEMENT, AHEAD + agreement[1:].max()))
 
 
-def _detail(columns: "np.ndarray") -> "np.ndarray":
+def _detail(columns: np.ndarray) -> np.ndarray:
     """(ROWS, n) float32: the fine changes along each of the columns (h, n, 3 or 4) uint8."""
-    import cv2
-    import numpy as np
-
     grey = columns[..., :3].mean(axis=2, dtype=np.float32)
     rows = cv2.resize(grey, (grey.shape[1], ROWS), interpolation=cv2.INTER_AREA)
     smooth = cv2.GaussianBlur(rows, (1, 0), sigmaX=1.0, sigmaY=SMOOTH_ROWS)

@@ -1,4 +1,4 @@
-"""What PHOTOS may be: a folder of photos, a video, or photos whose cameras are already known.
+"""What PHOTOS may be: a folder of photos, a video, or photos with poses to import.
 
 Cheap: lists folders and reads at most the JSON of a transforms file, never an image.
 """
@@ -12,10 +12,9 @@ from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
 from stages.contract import StageError, listed
-from stages.ingest.auxiliary_files import twins
+from stages.ingest.auxiliary_files import auxiliary_files, pair_masks
 from stages.ingest.frame_files import FrameFiles
 from stages.ingest.listing import FOLDER_HINT, IMAGES, files_below, is_video, list_photos, photo_root, walk_photos
-from stages.ingest.masks import pair_masks
 from stages.io.transforms_files import HELD_OUT, TRAIN, photo_names, read_splits
 
 SourceKind = Literal["photos", "video", "transforms", "blender", "colmap"]
@@ -34,7 +33,7 @@ class Source:
     out to be no images, and files named by a transforms file may be missing. ``frames`` maps each file_path of a
     transforms file, as it is written there, to the name of its photo. ``masks`` are the files that a transforms file
     names as masks, each after its photo's name and .png, and then all files in folders named masks, each after the
-    name, relative to ``root``, that it would have without such a folder in it. ``set_aside`` are files in a folder of
+    name, relative to ``root``, that it would have without such a folder in it. ``excluded`` are files in a folder of
     photos that belong to one of them by their names, as a depth map does, and that photo, by name.
     """
 
@@ -44,7 +43,7 @@ class Source:
     files: tuple[Path, ...]
     frames: Mapping[str, str] = field(default_factory=dict)
     masks: tuple[tuple[str, Path], ...] = ()
-    set_aside: Mapping[str, str] = field(default_factory=dict)
+    excluded: Mapping[str, str] = field(default_factory=dict)
 
     def name(self, file: Path) -> str:
         """The name of one of ``files``: relative to ``root``, with forward slashes, always encodable as UTF-8."""
@@ -92,11 +91,11 @@ def _source(photos: Path, cameras: Path | None) -> Source:
     names = [_name(root, file) for file in files]
     if cameras is not None and not _model_files(cameras := _cameras_in(cameras, names)):
         return _from_transforms("transforms" if cameras.is_file() else "blender", root, cameras)
-    set_aside = twins(names)
-    files = tuple(file for file in files if _name(root, file) not in set_aside)
+    excluded = auxiliary_files(names)
+    files = tuple(file for file in files if _name(root, file) not in excluded)
     if cameras is not None:
-        return Source("colmap", root, cameras, files, set_aside=set_aside)
-    return Source("photos", root, None, files, set_aside=set_aside)
+        return Source("colmap", root, cameras, files, excluded=excluded)
+    return Source("photos", root, None, files, excluded=excluded)
 
 
 def unused_cameras(source: Source) -> Path | None:
@@ -255,11 +254,11 @@ def camera_files(folder: Path) -> tuple[Path, ...]:
     those of a COLMAP model, binary ones before text, with the account of one of ours; none where it holds neither."""
     if (folder / TRAIN).is_file():
         return tuple(path for name in (TRAIN, *HELD_OUT) if (path := folder / name).is_file())
-    account = account_of_ours(folder)
+    account = own_registration(folder)
     return (*_model_files(folder), *(() if account is None else (account,)))
 
 
-def account_of_ours(model: Path) -> Path | None:
+def own_registration(model: Path) -> Path | None:
     """The registration.json beside a COLMAP model that stage sfm wrote, in its own folder or in ``output/``; None
     without."""
     account = model.parent / "registration.json"
@@ -325,7 +324,7 @@ def _colmap_model(folder: Path, photos: Sequence[str]) -> Path:
 
 def _cameras_of(model: Path, photos: Sequence[str]) -> int:
     """How many of the photos have a camera in a model, by the last parts of their names."""
-    from stages.sfm.colmap.model_files import image_names
+    from stages.io.colmap_files import image_names
 
     own = {PurePosixPath(name).stem for name in photos}
     return len(own & {PurePosixPath(name.replace("\\", "/")).stem for name in image_names(model)})
@@ -343,6 +342,6 @@ def _cameras_of_video(video: Path) -> StageError:
     return StageError(
         "ingest.cameras-of-video",
         f"cannot use --cameras with {video.name}",
-        "it is a video, and which of its frames become photos is decided here: no cameras can be known for them",
+        "it is a video, and which of its frames become photos is decided by ingest: no poses can be imported for them",
         "Leave --cameras out, or give the folder of the photos that the cameras belong to.",
     )

@@ -11,7 +11,9 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
 
 from stages.contract import Progress, StageError
 from stages.ingest.optical_flow import corners, follow_both_ways
@@ -19,12 +21,8 @@ from stages.ingest.panoramas import cutting_advice, is_panorama
 from stages.ingest.sharpness import WIDTH, at_most, sharpness
 from stages.io.files import write_jpeg
 
-if TYPE_CHECKING:
-    import cv2
-    import numpy as np
-
 FLOW_WIDTH = 500  # pixels of the frames on which motion is measured
-MOST_CORNERS, FEWEST_CORNERS = 150, 10
+MAX_CORNERS, MIN_CORNERS = 150, 10
 # All in widths of the picture. Photos should share 60 to 80 % with their neighbours: frames a LONG_STEP apart do so
 # with three on each side. A clip that gives few frames is taken in shorter steps, down to STEP, until they are PLENTY:
 # more would hardly tell more of the scene, and each takes as long as any photo.
@@ -34,13 +32,13 @@ WAY_PER_SECOND = 0.2  # of somebody who walks around a thing or through a room, 
 # Of the ways of the corners: walking around a thing, and towards it, hardly moves what is in the middle of the picture.
 MOVED_QUANTILE = 0.75
 # Less than this is not added up: the tremble of a hand, or noise, would become a way.
-LEAST_MOTION = 0.01
+MIN_MOTION = 0.01
 # Where less than a third of the corners are found again, a cut or a jerk, they are those that happened to move least:
 # nothing is known to be shared.
-FOLLOWED_SHARE, LOST = 1 / 3, 1.0
-FEWEST_FRAMES = 3  # as sfm needs
-COUNTED_TOO_MANY = 2  # frames that a whole video's container may count and not hold
-# Widths over heights of pixels: what is stored for tape has 8/11 to 2; others are not believed, 0 is not known.
+MIN_TRACKED_FRACTION, LOST = 1 / 3, 1.0
+MIN_FRAMES = 3  # as sfm needs
+MAX_OVERCOUNT = 2  # frames that a whole video's container may count and not hold
+# Widths over heights of pixels: what is stored for tape has 8/11 to 2; others are wrong, 0 is unknown.
 PIXEL_ASPECTS = (0.25, 4.0)
 JPEG_QUALITY = 95  # far closer to the frame than the video is to what the camera saw
 
@@ -74,7 +72,7 @@ def take_frames(video: Path, most: int, folder: Path, progress: Progress) -> lis
     """
     frames = _measure(video, progress)
     chosen = choose_frames(frames, most)
-    if len(chosen) < FEWEST_FRAMES:
+    if len(chosen) < MIN_FRAMES:
         raise _no_way(video, frames)
     way = frames[-1].path
     progress.note(
@@ -100,15 +98,13 @@ def choose_frames(frames: Sequence[Frame], most: int) -> list[int]:
 def expected_frames(video: Path, most: int) -> tuple[int, int, int]:
     """How many frames are likely to be taken, by how long the container says that the video is, and their width and
     height. Raises StageError where it cannot be opened."""
-    import cv2
-
     with _opened(video) as capture:
         width, height = (int(capture.get(side)) for side in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
         across, down = _stretch(capture)
         count, rate = capture.get(cv2.CAP_PROP_FRAME_COUNT), capture.get(cv2.CAP_PROP_FPS)
     way = WAY_PER_SECOND * count / rate if count > 0 and rate > 0 else PLENTY * STEP
     expected = max(min(way / STEP, PLENTY), way / LONG_STEP)
-    return min(most, max(FEWEST_FRAMES, round(expected))), round(width * across), round(height * down)
+    return min(most, max(MIN_FRAMES, round(expected))), round(width * across), round(height * down)
 
 
 def _chosen_by(paths: Sequence[float], frames: Sequence[Frame], step: float) -> list[int]:
@@ -125,8 +121,6 @@ def _chosen_by(paths: Sequence[float], frames: Sequence[Frame], step: float) -> 
 
 def _measure(video: Path, progress: Progress) -> list[Frame]:
     """Time, way and sharpness of every frame."""
-    import cv2
-
     frames: list[Frame] = []
     motion = _Motion()
     with _opened(video) as capture:
@@ -151,12 +145,12 @@ def _measure(video: Path, progress: Progress) -> list[Frame]:
 
 def lacks_frames(decoded: int, announced: int) -> bool:
     """Whether a video is not whole, of which so many frames could be decoded and its container announces so many."""
-    return announced - decoded > max(COUNTED_TOO_MANY, 0.02 * announced)
+    return announced - decoded > max(MAX_OVERCOUNT, 0.02 * announced)
 
 
 class _Motion:
     """How far the picture has moved: the upper quartile of the ways of its corners, which are followed from one frame
-    to the next ones until it is LEAST_MOTION, and from there on anew."""
+    to the next ones until it is MIN_MOTION, and from there on anew."""
 
     def __init__(self) -> None:
         self.path = 0.0
@@ -164,23 +158,21 @@ class _Motion:
         self.start: np.ndarray | None = None  # where corners are followed from
         self.corners: np.ndarray | None = None
 
-    def path_to(self, grey: "np.ndarray") -> float:
+    def path_to(self, grey: np.ndarray) -> float:
         """The way to the next frame, (h, w) uint8, in widths of the picture. It never goes back."""
         moved = self._moved(grey)
         self.path = max(self.path, self.path_of_start + moved)
-        if self.corners is None or moved >= LEAST_MOTION or len(self.corners) < FEWEST_CORNERS:
+        if self.corners is None or moved >= MIN_MOTION or len(self.corners) < MIN_CORNERS:
             self.path_of_start, self.start = self.path, grey
-            self.corners = corners(grey, MOST_CORNERS)
+            self.corners = corners(grey, MAX_CORNERS)
         return self.path
 
-    def _moved(self, grey: "np.ndarray") -> float:
+    def _moved(self, grey: np.ndarray) -> float:
         """Since the start; nothing where that has no corners, a black frame for instance."""
-        import numpy as np
-
-        if self.start is None or self.corners is None or len(self.corners) < FEWEST_CORNERS:
+        if self.start is None or self.corners is None or len(self.corners) < MIN_CORNERS:
             return 0.0
         there, followed = follow_both_ways(self.start, grey, self.corners)
-        if followed.sum() < max(FEWEST_CORNERS, FOLLOWED_SHARE * len(followed)):
+        if followed.sum() < max(MIN_CORNERS, MIN_TRACKED_FRACTION * len(followed)):
             return LOST
         ways = np.linalg.norm((there - self.corners)[followed, 0], axis=1)
         return float(np.quantile(ways, MOVED_QUANTILE)) / grey.shape[1]
@@ -189,8 +181,6 @@ class _Motion:
 def _write(
     video: Path, frames: Sequence[Frame], chosen: Sequence[int], folder: Path, progress: Progress
 ) -> Iterator[TakenFrame]:
-    import cv2
-
     wanted = set(chosen)
     with _opened(video) as capture:
         stretch = _stretch(capture)
@@ -210,9 +200,8 @@ def _write(
 
 
 @contextmanager
-def _opened(video: Path) -> "Iterator[cv2.VideoCapture]":
+def _opened(video: Path) -> Iterator[cv2.VideoCapture]:
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # quiet: what is wrong with a file we say ourselves
-    import cv2
 
     before = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     capture = cv2.VideoCapture(str(video), cv2.CAP_FFMPEG)
@@ -226,11 +215,9 @@ def _opened(video: Path) -> "Iterator[cv2.VideoCapture]":
         capture.release()
 
 
-def _stretch(capture: "cv2.VideoCapture") -> tuple[float, float]:
+def _stretch(capture: cv2.VideoCapture) -> tuple[float, float]:
     """By how much upright frames have to be stretched across and down for their pixels to be square: across, by the
     sample aspect ratio, as players do it, unless they were turned by a quarter."""
-    import cv2
-
     wide, high = capture.get(cv2.CAP_PROP_SAR_NUM), capture.get(cv2.CAP_PROP_SAR_DEN)
     if not PIXEL_ASPECTS[0] * high <= wide <= PIXEL_ASPECTS[1] * high or not high:
         return 1.0, 1.0
@@ -238,9 +225,7 @@ def _stretch(capture: "cv2.VideoCapture") -> tuple[float, float]:
     return (1.0, wide / high) if turned else (wide / high, 1.0)
 
 
-def _with_square_pixels(frame: "np.ndarray", stretch: tuple[float, float]) -> "np.ndarray":
-    import cv2
-
+def _with_square_pixels(frame: np.ndarray, stretch: tuple[float, float]) -> np.ndarray:
     if stretch == (1.0, 1.0):
         return frame
     height, width = frame.shape[:2]
@@ -261,7 +246,7 @@ def _panoramas(video: Path) -> StageError:
 
 def _no_way(video: Path, frames: Sequence[Frame]) -> StageError:
     what = f"cannot take photos from {video.name}"
-    if len(frames) < FEWEST_FRAMES:
+    if len(frames) < MIN_FRAMES:
         count = f"{len(frames)} frame{'s' * (len(frames) != 1)}"
         return StageError(
             "ingest.short-video",

@@ -4,30 +4,30 @@ import json
 import math
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import Any, get_args
 
+import torch
+from pydantic import TypeAdapter, ValidationError
+from safetensors import SafetensorError
+from safetensors.torch import load, save
+
+from nerf.effects.appearance import AppearanceModel
+from nerf.effects.exposure import ExposureModel
+from nerf.fields.hash_grid import HashGridField, HashGridSettings
+from nerf.fields.interface import RadianceModel
+from nerf.fields.vanilla import VanillaNerf, VanillaSettings
 from stages.contract import Progress, StageError
 from stages.hardware.backend import BackendName, backend_name, backend_of_field, load_backend
 from stages.io.files import first_fault, read_json, write_json
 
-if TYPE_CHECKING:
-    from nerf.fields.hash_grid import HashGridField
-    from nerf.fields.interface import RadianceModel
-    from nerf.fields.vanilla import VanillaNerf
 
-
-def save_field(folder: Path, model: "RadianceModel", info: dict[str, Any]) -> None:
+def save_field(folder: Path, model: RadianceModel, info: dict[str, Any]) -> None:
     """Write a field; ``info`` says what it was trained on: background, downscale, steps, rays. What computes a grid
     field is written, too.
 
     Raises:
         TypeError: for a kind of field that has no file format.
     """
-    from safetensors.torch import save
-
-    from nerf.fields.hash_grid import HashGridField
-    from nerf.fields.vanilla import VanillaNerf
-
     if not isinstance(model, VanillaNerf | HashGridField):
         raise TypeError(f"no file format for a {type(model).__name__}")
     kind = {"kind": "paper"}
@@ -40,7 +40,7 @@ def save_field(folder: Path, model: "RadianceModel", info: dict[str, Any]) -> No
 
 def load_field(
     folder: Path, device: str = "cpu", progress: Progress | None = None
-) -> "tuple[RadianceModel, dict[str, Any]]":
+) -> tuple[RadianceModel, dict[str, Any]]:
     """The field in ``folder``, ready to render, and the content of its field.json.
 
     One that models exposure comes at its reference exposure, in an AppearanceModel. ``progress`` is told why a grid
@@ -49,10 +49,6 @@ def load_field(
     Raises:
         StageError: if the files are missing or damaged, or another version of the program wrote them.
     """
-    from pydantic import ValidationError
-    from safetensors import SafetensorError
-    from safetensors.torch import load
-
     info = read_json(folder / "field.json")
     try:
         weights = folder / "field.safetensors"
@@ -89,25 +85,15 @@ def _neutral(info: dict[str, Any]) -> list[float] | None:
     return info["exposure"]["neutral"]
 
 
-def _exposed(model: "RadianceModel", log_gain: list[float], device: str) -> "RadianceModel":
-    import torch
-
-    from nerf.effects.appearance import AppearanceModel
-    from nerf.effects.exposure import ExposureModel
-
+def _exposed(model: RadianceModel, log_gain: list[float], device: str) -> RadianceModel:
     return AppearanceModel(model, (ExposureModel(torch.tensor([log_gain], dtype=torch.float32, device=device)),))
 
 
 def _untrained(
     info: dict[str, Any], stored: int, device: str, progress: Progress | None
-) -> "VanillaNerf | HashGridField":
+) -> VanillaNerf | HashGridField:
     """The field that ``info`` describes; ``stored`` is the size of its weights in bytes, which it must not exceed.
     Raises ValueError, before anything is allocated."""
-    from pydantic import TypeAdapter
-
-    from nerf.fields.hash_grid import HashGridField, HashGridSettings
-    from nerf.fields.vanilla import VanillaNerf, VanillaSettings
-
     kind, settings = info["kind"], info["settings"]
     if kind not in ("grid", "paper"):
         raise ValueError(f"a field of kind {kind!r} is unknown to this version")

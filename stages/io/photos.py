@@ -1,23 +1,14 @@
-"""The photos as ingest left them: what photos.json says of each, and their pixels at any size."""
+"""The photos as ingest left them: what photos.json says of each."""
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from stages.hardware.device import processors
 from stages.io.files import damaged, read_dataclass, write_json
-
-if TYPE_CHECKING:
-    import numpy as np
-
 
 Box = tuple[float, float, float, float]
 """Left, top, right and bottom of a rectangle, as shares of a photo's width and height."""
-OPAQUE_FROM = 128  # of 255: from here on a pixel is more opaque than transparent
-DECODING_BYTES = 1 << 30  # how much memory may go into photos that are being loaded at a time
-BYTES_PER_PIXEL = {3: 16, 4: 80}  # of the file, that loading and shrinking takes, by channels; 10 and 78 measured
 
 
 @dataclass(frozen=True)
@@ -70,16 +61,18 @@ class Photo:
 
 
 @dataclass(frozen=True)
-class Refusal:
+class Rejection:
     """A file that was not taken, and why."""
 
     name: str
     reason: str
 
 
-def write_photos(folder: Path, photos: Sequence[Photo], refused: Sequence[Refusal], frames: Mapping[str, str]) -> None:
+def write_photos(
+    folder: Path, photos: Sequence[Photo], rejected: Sequence[Rejection], frames: Mapping[str, str]
+) -> None:
     """Write photos.json. ``frames`` maps each file_path of the given cameras to the name of its photo."""
-    content = {"photos": [asdict(p) for p in photos], "refused": [asdict(r) for r in refused], "frames": dict(frames)}
+    content = {"photos": [asdict(p) for p in photos], "rejected": [asdict(r) for r in rejected], "frames": dict(frames)}
     write_json(folder / "photos.json", content)
 
 
@@ -102,7 +95,7 @@ class _PhotosFile:
     """photos.json."""
 
     photos: list[Photo]
-    refused: list[Refusal]
+    rejected: list[Rejection]
     frames: dict[str, str]
 
 
@@ -110,60 +103,6 @@ def _read(ingest_folder: Path) -> _PhotosFile:
     return read_dataclass(ingest_folder / "photos.json", _PhotosFile)
 
 
-def opaque_box(pixels: "np.ndarray") -> Box | None:
-    """What holds all that is more than half opaque of (h, w, 3 or 4) uint8; None where all or nothing of it is."""
-    import numpy as np
-
-    if pixels.shape[2] != 4:
-        return None
-    opaque = pixels[..., 3] >= OPAQUE_FROM
-    if not opaque.any() or opaque.all():
-        return None
-    height, width = opaque.shape
-    columns, rows = np.flatnonzero(opaque.any(axis=0)), np.flatnonzero(opaque.any(axis=1))
-    left, right = float(columns[0]) / width, float(columns[-1] + 1) / width
-    return left, float(rows[0]) / height, right, float(rows[-1] + 1) / height
-
-
-def load_pixels(path: Path, width: int, height: int) -> "np.ndarray":
-    """The image as (height, width, 3 or 4) uint8, each pixel the mean of the area it covers.
-
-    The means are taken of sRGB values weighted by alpha (premultiplied); a pixel that nothing covers is black.
-    At the image's own size the values are those stored. Enlarging interpolates linearly.
-    """
-    import cv2
-    import numpy as np
-
-    from stages.ingest.decoding import pillow
-
-    with pillow().open(path) as image:
-        pixels = np.asarray(image)
-    if (pixels.shape[1], pixels.shape[0]) == (width, height):
-        return pixels
-    if pixels.shape[2] == 3:
-        return cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA)
-    alpha = pixels[..., 3:].astype(np.float32)
-    premultiplied = np.concatenate([pixels[..., :3] * alpha, alpha], axis=2)
-    resized = cv2.resize(premultiplied, (width, height), interpolation=cv2.INTER_AREA)
-    covered = resized[..., 3:] > 0
-    colour = np.divide(resized[..., :3], resized[..., 3:], out=np.zeros_like(resized[..., :3]), where=covered)
-    return np.rint(np.concatenate([colour, resized[..., 3:]], axis=2)).astype(np.uint8)
-
-
-def loaders(files: Iterable[Path]) -> int:
-    """How many of these photos, or of their masks, to load at a time, each in a thread: one per core, fewer where they
-    are too large for that. What counts is the size in the file, however small they are made afterwards."""
-    return max(1, min(processors(), DECODING_BYTES // max(map(_loading_bytes, files))))
-
-
-def _loading_bytes(file: Path) -> int:
-    """Memory that :func:`load_pixels` takes, by the file's header."""
-    from stages.ingest.decoding import pillow
-
-    with pillow().open(file) as image:
-        return BYTES_PER_PIXEL[len(image.getbands())] * image.width * image.height
-
-
-def evenly_spread(length: int, count: int) -> list[int]:
-    """``count`` indices in the middle of equal parts of a list of ``length``."""
+def spread(length: int, count: int) -> list[int]:
+    """A few of many, evenly: ``count`` indices in the middle of equal parts of a list of ``length``."""
     return [(2 * i + 1) * length // (2 * count) for i in range(count)]

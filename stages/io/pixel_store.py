@@ -13,9 +13,11 @@ waits for the disk (``benchmarks/pixel_store.py``).
 
 import hashlib
 import json
+import mmap
 import os
 import shutil
 import threading
+import warnings
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -23,15 +25,18 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO, NamedTuple
+from typing import BinaryIO, NamedTuple
 
+import numpy as np
+import torch
+from filelock import FileLock, Timeout
+from torch import Tensor
+
+from nerf.runtime.parallel import in_order
+from stages.amounts import bytes_in_words
 from stages.contract import Progress, StageError
-from stages.io.amounts import bytes_in_words
+from stages.hardware.memory import available_bytes
 from stages.io.live_line import live_line
-
-if TYPE_CHECKING:
-    import numpy as np
-    from torch import Tensor
 
 VERSION = 3  # raised when the same photos would give other pixels
 CHECKSUM_BYTES = 4
@@ -82,17 +87,11 @@ class PixelStore:
 
     def damaged(self) -> list[str]:
         """The files of the photos whose pixels are no longer those that were written; reads all of a whole store."""
-        import torch
-
-        from nerf.runtime.parallel import in_order
-
         sound = in_order(lambda index: self.photo(index) is not None, range(len(self.photos)), torch.device("cpu"))
         return [photo.file for photo, is_sound in zip(self.photos, sound, strict=True) if not is_sound]
 
-    def photo(self, index: int) -> "np.ndarray | None":
+    def photo(self, index: int) -> np.ndarray | None:
         """The pixels of one photo, read into memory; None where they are no longer those that were written."""
-        import numpy as np
-
         starts = self.starts
         with self.path.open("rb") as stream:
             stream.seek(starts[index])
@@ -102,15 +101,8 @@ class PixelStore:
                 return None
         return np.frombuffer(pixels, np.uint8).reshape(self.shape(index))
 
-    def table(self, progress: Progress) -> "Tensor":
+    def table(self, progress: Progress) -> Tensor:
         """All pixels, (pixels, channels) uint8, mapped into memory; not to be written to."""
-        import mmap
-        import warnings
-
-        import torch
-
-        from stages.hardware.memory import available_bytes
-
         with self.path.open("rb") as stream:
             mapped = mmap.mmap(stream.fileno(), self.starts[-1], access=mmap.ACCESS_READ)
         free = available_bytes()
@@ -125,7 +117,7 @@ class PixelStore:
             return torch.frombuffer(mapped, dtype=torch.uint8).view(-1, self.channels)
 
 
-def checksum(pixels: "bytes | memoryview") -> bytes:
+def checksum(pixels: bytes | memoryview) -> bytes:
     """CRC-32 of a photo's pixels, as it stands in the file."""
     return zlib.crc32(pixels).to_bytes(CHECKSUM_BYTES, "little")
 
@@ -170,8 +162,6 @@ def _is_sound(store: PixelStore, progress: Progress) -> bool:
 @contextmanager
 def _only_one(store: PixelStore, progress: Progress) -> Iterator[None]:
     """One process at a time; the system lifts the lock of one that dies."""
-    from filelock import FileLock, Timeout
-
     lock = FileLock(store.path.with_name(f"{store.path.name}.lock"))
     while not lock.is_locked:
         try:

@@ -12,8 +12,8 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 TRAIN, HELD_OUT = "transforms_train.json", ("transforms_test.json", "transforms_val.json")  # of a Blender-style folder
-LONGEST_PATH, LONGEST_NAME = 2000, 250  # bytes, with room for an extension
-MOST_LETTERS = 60  # of a name, in an error
+MAX_PATH_BYTES, MAX_NAME_BYTES = 2000, 250  # bytes, with room for an extension
+MAX_LETTERS = 60  # of a name, in an error
 ROUNDED = 1e-3  # what rounding may make of a 0
 _HINT = "Give a transforms.json as nerfstudio, instant-ngp or the NeRF-synthetic scenes write it."
 
@@ -48,7 +48,7 @@ def _check_frames(frames: list[Any], what: str) -> None:
                 "io.transforms-mask-path", what, f"the mask_path of frame {index} is no name of a file", _HINT
             )
         if wrong := next((name for name in (*photo_names(frame), mask) if not _is_name(name)), None):
-            why = f"no file can have the name of frame {index}, {ascii(wrong)[:MOST_LETTERS]}"
+            why = f"no file can have the name of frame {index}, {ascii(wrong)[:MAX_LETTERS]}"
             raise StageError("io.transforms-file-path", what, why, _HINT)
 
 
@@ -87,7 +87,7 @@ def read_splits(
 
 
 def none_among_the_photos(count: int, where: str) -> str:
-    """The note on test photos that are not there, or that ingest refused."""
+    """The note on test photos that are not there, or that ingest rejected."""
     return f"none of the {count} test photos of {where} is among the photos"
 
 
@@ -141,4 +141,4 @@ def _is_name(file_path: str) -> bool:
         parts = file_path.encode().split(b"/")
     except UnicodeEncodeError:
         return False
-    return sum(map(len, parts)) <= LONGEST_PATH and max(map(len, parts)) <= LONGEST_NAME
+    return sum(map(len, parts)) <= MAX_PATH_BYTES and max(map(len, parts)) <= MAX_NAME_BYTES

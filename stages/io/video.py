@@ -5,12 +5,11 @@ import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+import imageio_ffmpeg
+import numpy as np
 
 from stages.contract import StageError
-
-if TYPE_CHECKING:
-    import numpy as np
 
 # RGB becomes BT.709, the matrix browsers assume for video, and is labelled so; on the frames, because the encoder takes
 # primaries and transfer from there, whatever -color_primaries and -color_trc say.
@@ -27,15 +26,13 @@ _OUTPUT = f"""
 
 
 @contextmanager
-def video_writer(path: Path, width: int, height: int, fps: int) -> "Iterator[Callable[[np.ndarray], None]]":
+def video_writer(path: Path, width: int, height: int, fps: int) -> Iterator[Callable[[np.ndarray], None]]:
     """A function that appends one frame, (height, width, 3) uint8 sRGB, to the video at ``path``.
 
     Width and height must be even (yuv420p halves the colour planes). The file is whole once the context ends;
     if the context ends by an exception the encoder is stopped and the file is worthless.
     Raises StageError with the encoder's last words if it fails, on a full disk for instance.
     """
-    import imageio_ffmpeg
-
     source = f"-f rawvideo -vcodec rawvideo -pix_fmt rgb24 -s {width}x{height} -r {fps} -i -".split()
     place = f"file:{path}"  # what stands before a colon would be a protocol
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-v", "error", *source, *_OUTPUT, place]
@@ -62,6 +59,6 @@ def video_writer(path: Path, width: int, height: int, fps: int) -> "Iterator[Cal
             )
 
 
-def _send(encoder: "subprocess.Popen[bytes]", frame: "np.ndarray") -> None:
+def _send(encoder: subprocess.Popen[bytes], frame: np.ndarray) -> None:
     assert encoder.stdin is not None
     encoder.stdin.write(frame.tobytes())

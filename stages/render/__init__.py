@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import Field, field_validator
 
+from stages.amounts import duration, short_count
 from stages.contract import Inputs, Progress, StageConfig, StageError, StageResult
-from stages.io.amounts import duration, short_count
 from stages.io.files import read_json, read_scene, write_json, write_png
-from stages.io.photos import evenly_spread
+from stages.io.photos import spread
 from stages.render.path import CameraPath, PathKind, fitted_path, path_from_file, path_rays, usual_path
 from stages.render.plan import LEAST_WIDTH, even_width
 
@@ -128,7 +128,7 @@ def _tried_rays(path: CameraPath, scene: "Scene", side: int) -> "Rays":
 
     camera = path.cameras[0]
     count = len(path.cameras)
-    few = path.some(sorted(set(evenly_spread(count, TRIED_VIEWS))))
+    few = path.some(sorted(set(spread(count, TRIED_VIEWS))))
     width = max(2, 2 * round(side * camera.width / max(camera.width, camera.height) / 2))
     return join_rays(path_rays(few.resized(width), scene))
 

@@ -161,7 +161,7 @@ def path_from_file(scene: "Scene", file: Path) -> CameraPath:
     import numpy as np
 
     from stages.io.transforms_files import read_transforms
-    from stages.io.transforms_intrinsics import intrinsics_of, read_intrinsics
+    from stages.sfm.imported.transforms_intrinsics import intrinsics_of, read_intrinsics
 
     content = read_transforms(file)
     usual = median_camera(scene)

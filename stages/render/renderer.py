@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from stages.amounts import duration
 from stages.contract import Progress
-from stages.io.amounts import duration
 from stages.io.files import read_json
 
 if TYPE_CHECKING:

@@ -15,9 +15,9 @@ from PIL import Image
 from tyro.conf import Suppress
 
 from nerf.geometry.scene import Scene
+from stages.amounts import duration, short_count
 from stages.contract import Inputs
 from stages.ingest.decoding import pillow
-from stages.io.amounts import duration, short_count
 from stages.io.ascii_names import shell_quoted
 from stages.io.files import read_json, read_scene, read_tensors
 from stages.io.photos import load_pixels
@@ -140,7 +140,7 @@ def page(results: Results, summary: dict[str, Any], config: "Config") -> str:
     return environment.get_template("report.html.j2").render(
         workspace=_workspace(results.inputs),
         summary=summary,
-        refused=results.photos["refused"] if results.photos else [],
+        rejected=results.photos["rejected"] if results.photos else [],
         **_cameras_part(results, names),
         effects=effects_table(results.effects),
         curve=_curve(results),

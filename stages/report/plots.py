@@ -6,7 +6,7 @@ from pathlib import PurePosixPath
 from typing import TYPE_CHECKING, Any
 
 from nerf import REGION_HALF
-from stages.io.amounts import duration
+from stages.amounts import duration
 from stages.io.figures import INK, svg_element, svg_figure
 from stages.train.curve import heldout_curve
 

@@ -7,6 +7,7 @@ from pydantic import Field
 
 from stages.contract import Inputs, OptionalSourcePath, Progress, StageConfig, StageResult
 from stages.io.files import write_json
+from stages.sfm.pairs import Matcher
 
 INPUTS = ("ingest",)
 VERSION = 15
@@ -20,7 +21,6 @@ NOT_HASHED = ("max_seconds", "seconds")
 CameraModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE"]
 Direction = Literal["world-from-camera", "camera-from-world"]
 CameraAxes = Literal["opencv", "opengl"]
-Matcher = Literal["exhaustive", "sequential", "spatial", "retrieval"]
 MAX_STRATEGIES = 8  # the default of ``max_strategies``, which is all of them
 
 

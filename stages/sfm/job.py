@@ -14,8 +14,8 @@ from typing import Any
 
 from stages.io.files import write_durably
 from stages.io.photos import Photo
-from stages.sfm import Matcher
-from stages.sfm.colmap.matching import Features, hold_open, look_alike, read_vocabulary
+from stages.sfm.colmap.database import Features, hold_open, look_alike, read_vocabulary
+from stages.sfm.pairs import Matcher
 from stages.sfm.pairs.image_retrieval import CELLS
 from stages.sfm.pairs.pair_selection import MAX_EXHAUSTIVE, SimilarityMatrix
 from stages.sfm.registration import MIN_MODEL_POINTS, MIN_REGISTERED

@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from stages.amounts import rough_duration
 from stages.ingest.masks import write_feature_masks
-from stages.io.amounts import rough_duration
-from stages.sfm.colmap.mapping import MAPPING_MODEL
-from stages.sfm.colmap.matching import (
+from stages.sfm.colmap.database import (
     RELAXED_RATIO,
     STRICT_RATIO,
     Search,
@@ -23,6 +22,7 @@ from stages.sfm.colmap.matching import (
     matched_pairs,
     verified_matches,
 )
+from stages.sfm.colmap.mapping import MAPPING_MODEL
 from stages.sfm.job import JobState
 from stages.sfm.pairs.match_graph import (
     MAX_GROWTH_ROUNDS,

@@ -4,23 +4,22 @@ import shutil
 from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from nerf.geometry.georeference import georeference
 from nerf.geometry.scene import Camera
 from stages.contract import Progress, StageError, listed
 from stages.hardware.memory import check_memory
 from stages.io.photos import Photo, read_photos
-from stages.normalise.georeference import georeference
-from stages.sfm import Config
 from stages.sfm.colmap.cameras import is_valid
-from stages.sfm.colmap.matching import Search, feature_bytes
+from stages.sfm.colmap.database import Search, feature_bytes
 from stages.sfm.colmap.models import read_model
 from stages.sfm.imported.conventions import PoseConvention
-from stages.sfm.imported.poses import import_cameras
-from stages.sfm.pairs.matching_plan import Open, check_matcher, chosen
+from stages.sfm.imported.import_poses import import_cameras
 from stages.sfm.pairs.pair_selection import places_of
+from stages.sfm.pairs.quality_level import Open, check_matcher, chosen
 from stages.sfm.registration import (
     MIN_MODEL_POINTS,
     MIN_REGISTERED,
@@ -49,8 +48,11 @@ FACTS = (
     "global_mapping",
 )
 
+if TYPE_CHECKING:
+    from stages.sfm import Config
 
-def choose_options(config: Config, ingest: Path, progress: Progress) -> Config:
+
+def choose_options(config: "Config", ingest: Path, progress: Progress) -> "Config":
     """The config with features and pairs chosen, by what they take on this machine for some of the photos."""
     left_open = Open(config.max_image_size, config.max_features, config.matcher)
     _, photos = _photos(ingest)
@@ -58,7 +60,7 @@ def choose_options(config: Config, ingest: Path, progress: Progress) -> Config:
     return config.model_copy(update=answer._asdict())
 
 
-def find_cameras(config: Config, ingest: Path, folder: Path, progress: Progress) -> tuple[dict[str, Any], str]:
+def find_cameras(config: "Config", ingest: Path, folder: Path, progress: Progress) -> tuple[dict[str, Any], str]:
     """Write ``sparse/``; what registration.json says of it, and what the stage's line adds.
 
     Raises StageError where no usable model comes out.
@@ -84,7 +86,7 @@ def _registration(source: str, images: list[dict[str, Any]], **facts: Any) -> di
 
 
 def _reconstruct(
-    config: Config, everything: list[Photo], photos: list[Photo], ingest: Path, folder: Path, progress: Progress
+    config: "Config", everything: list[Photo], photos: list[Photo], ingest: Path, folder: Path, progress: Progress
 ) -> tuple[dict[str, Any], str]:
     _check_count(photos, len(everything))
     _check_camera(config, photos)
@@ -132,7 +134,7 @@ def _check_count(photos: Sequence[Photo], ingested: int) -> None:
         )
 
 
-def _check_memory(config: Config, photos: Sequence[Photo]) -> None:
+def _check_memory(config: "Config", photos: Sequence[Photo]) -> None:
     """Raises StageError where memory does not suffice for the features of even one photo at a time."""
     assert config.max_image_size and config.max_features, "choose_options() sets them"
     needed = feature_bytes(photos, Search(config.max_image_size, config.max_features))
@@ -140,7 +142,7 @@ def _check_memory(config: Config, photos: Sequence[Photo]) -> None:
     check_memory(needed, "features of the photos", why, f"Try --sfm.max-image-size {config.max_image_size // 2}.")
 
 
-def _check_camera(config: Config, photos: Sequence[Photo]) -> None:
+def _check_camera(config: "Config", photos: Sequence[Photo]) -> None:
     """Raises StageError where the given intrinsics cannot be those of the photos."""
     if config.camera_params is None:
         return

@@ -9,18 +9,16 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from stages.contract import StageError, listed
 from stages.ingest.masks import STILL_BACKGROUND_HINT
+from stages.io.photos import Photo
 from stages.sfm.degeneracy import count_pure_rotations, epipoles_inside, flow_is_radial
 from stages.sfm.retry_strategies import MIN_POSE_INLIERS
-
-if TYPE_CHECKING:
-    from stages.io.photos import Photo
 
 MIN_REGISTERED = 3  # one to hold out, two to learn from; two views alone fit many wrong scenes
 MIN_MODEL_POINTS = 100
@@ -167,7 +165,7 @@ def repeated_structure(conflict: Mapping[str, Any], name_of: Mapping[str, str]) 
     )
 
 
-def with_near_duplicates(entries: Sequence[dict[str, Any]], photos: "Sequence[Photo]") -> list[dict[str, Any]]:
+def with_near_duplicates(entries: Sequence[dict[str, Any]], photos: Sequence[Photo]) -> list[dict[str, Any]]:
     """The rows of all ``photos`` in their order: those of matched photos, and of near duplicates, which ingest excludes
     from matching, as which photo."""
     known = {entry["file"]: entry for entry in entries}
@@ -208,7 +206,7 @@ def _reason(
     return f"too few of its features are points of the model: {seen}, {MIN_POSE_INLIERS} are needed{few}"
 
 
-def why_no_model(photos: "Sequence[Photo]", matches: Matches, registered: int, points: int) -> StageError:
+def why_no_model(photos: Sequence[Photo], matches: Matches, registered: int, points: int) -> StageError:
     """The error for photos that give no model, with the cause that their pairs show."""
     pairs, verified = matches.tried, len(matches.pairs)
     what = f"the cameras of {len(photos)} photos could not be found"
@@ -236,7 +234,7 @@ def why_no_model(photos: "Sequence[Photo]", matches: Matches, registered: int, p
     return StageError("sfm.no-model", what, why, OVERLAP_HINT)
 
 
-def _no_depth(what: str, photos: "Sequence[Photo]", matches: Matches) -> StageError | None:
+def _no_depth(what: str, photos: Sequence[Photo], matches: Matches) -> StageError | None:
     """The error where most pairs are degenerate, by kind."""
     sizes = np.array([(photo.width, photo.height) for photo in photos])
     count, planar, forward = len(matches.pairs), int(matches.planar.sum()), int(matches.forward.sum())

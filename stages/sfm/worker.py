@@ -13,11 +13,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from stages.io.amounts import rough_duration
+from stages.amounts import rough_duration
 from stages.io.files import make_durable
 from stages.sfm.colmap.diagnosis import find_conflict, links, supports
+from stages.sfm.colmap.final_bundle_adjustment import finish
 from stages.sfm.colmap.models import load_native, write_native
-from stages.sfm.colmap.refinement import finish
 from stages.sfm.colmap.repair import check_model, deregister, facts, reasons
 from stages.sfm.job import Job, JobState, Send, end_with_parent
 from stages.sfm.mapping import run_mapping

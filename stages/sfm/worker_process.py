@@ -17,10 +17,11 @@ from typing import IO, TYPE_CHECKING, Any
 
 from stages.contract import Progress, StageError
 from stages.io.live_line import live_line
+from stages.io.photos import Photo
+from stages.sfm.registration import count_done
 from stages.sfm.retry_strategies import OUT_OF_TIME, STRATEGIES, abandon
 
 if TYPE_CHECKING:
-    from stages.io.photos import Photo
     from stages.sfm import Config
 
 # The fraction of the first strategy where a phase begins, and how long it is (measured on 11 to 50 photos, two cores).
@@ -31,7 +32,7 @@ COMMAND = ["-P", "-m", "stages.sfm.worker"]  # -P: nothing that lies in the curr
 
 
 def run_worker(
-    config: "Config", photos: "Sequence[Photo]", images: Path, folder: Path, database: Path, progress: Progress
+    config: "Config", photos: Sequence[Photo], images: Path, folder: Path, database: Path, progress: Progress
 ) -> dict[str, Any]:
     """Do the work in stages/sfm/worker.py and hand back its result. Raises StageError if the worker does not end
     well."""
@@ -81,7 +82,7 @@ def _without(strategy: str, code: int, late: bool, log: Path) -> str | None:
     return f"Run again: it skips the strategy {strategy!r}. Log: {log}"
 
 
-def _start(stderr: IO[bytes]) -> "subprocess.Popen[bytes]":
+def _start(stderr: IO[bytes]) -> subprocess.Popen[bytes]:
     return subprocess.Popen(
         [sys.executable, *COMMAND],
         stdin=subprocess.PIPE,
@@ -111,8 +112,6 @@ def _hand_over(stdin: IO[bytes], job: dict[str, Any]) -> None:
 
 def _describe(latest: Mapping[str, Any], photos: int) -> tuple[str, float | None]:
     """The live line and the finished share of the whole."""
-    from stages.sfm.registration import count_done
-
     phase = latest["phase"]
     if phase == "refining":
         return "final bundle adjustment", REFINING

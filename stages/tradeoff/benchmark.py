@@ -28,7 +28,7 @@ from stages.contract import Inputs, Progress, StageError
 from stages.effects.decisions import expected_gains
 from stages.evaluate.image_metrics import ssim
 from stages.io.files import read_json, sync_file, write_json_durably, write_png
-from stages.io.photos import evenly_spread
+from stages.io.photos import spread
 from stages.io.stopwatch import periodically
 from stages.render.renderer import TIMED_SECONDS, load_painter
 from stages.tradeoff.schedule import SCORING_STRIDE, SMALL_SIDE, WORKSPACE_FIELD, Run, scoring_stride
@@ -82,7 +82,7 @@ def make_benchmark(ingest: Path, scene: Scene, downscale: float, count: int, sma
     whole = (_photo(ingest, scene, test[i % len(test)], downscale, background) for i in range(count))
     crops = tuple(photo.part(_crop_position(photo, i, count)) for i, photo in enumerate(whole))
     _check_masks(crops)
-    shown = [test[i] for i in evenly_spread(len(test), min(NUM_SHOWN, len(test)))]
+    shown = [test[i] for i in spread(len(test), min(NUM_SHOWN, len(test)))]
     sides = [max(camera.width, camera.height) for camera in (scene.cameras[view.camera] for view in shown)]
     sizes = [max(small, side / SMALL_SIDE) for side in sides]
     photos = tuple(_photo(ingest, scene, *each, background) for each in zip(shown, sizes, strict=True))

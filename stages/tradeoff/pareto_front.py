@@ -19,7 +19,7 @@ from dataclasses import asdict, dataclass, replace
 from statistics import mean, stdev
 from typing import Any, Literal
 
-from stages.io.amounts import duration, resolution_name
+from stages.amounts import duration, resolution_name
 from stages.tradeoff.schedule import WORKSPACE_FIELD, Run, family_of, field_of
 
 MIN_GAIN_DB = 0.5  # a doubling of the time that buys less is not worth it; 0.5 dB is what one sees side by side

@@ -7,9 +7,9 @@ from statistics import mean, stdev
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from nerf.geometry.scene import Scene
+from stages.amounts import duration, resolution_name
 from stages.contract import Inputs, Progress, StageError, StageResult
 from stages.effects.decisions import read_decisions
-from stages.io.amounts import duration, resolution_name
 from stages.io.files import read_scene, write_json
 from stages.io.stopwatch import counted
 from stages.tradeoff import plots

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from nerf.training.learning_curve import KNEE_DB, Gain, knee, last_doubling, next_doubling, quality_at
+from stages.amounts import duration, duration_option
 from stages.hardware.device import compute_device, cores
-from stages.io.amounts import duration, duration_option
 from stages.io.files import write_json
 
 BARS = "▁▂▃▄▅▆▇█"

@@ -15,10 +15,9 @@ from nerf.training.ray_dataset import PosedViews, RayDataset, make_ray_dataset
 from nerf.training.trainer import over
 from stages.contract import Inputs, Progress, StageError
 from stages.effects.track_colours import training_tracks
-from stages.ingest.masks import load_mask
 from stages.io.files import read_tensors
-from stages.io.photos import load_pixels, loaders
 from stages.io.pixel_store import PixelStore, StoredPhoto, fill, pixel_store
+from stages.io.pixels import load_mask, load_pixels, loaders
 from stages.sfm.colmap.cameras import camera_rays
 from stages.train.config import BLACK, WHITE, Config
 

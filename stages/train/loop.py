@@ -25,8 +25,8 @@ from safetensors.torch import save
 from nerf.training.schedule import CLOSING_SHARE, ScheduleRevision, StepSchedule, next_in_series, replanned, schedule_of
 from nerf.training.trainer import RAYS, FieldTrainer, NonFinite
 from nerf.training.validation_probe import ProbeResult, measure
+from stages.amounts import short_count
 from stages.contract import Progress, StageError
-from stages.io.amounts import short_count
 from stages.io.files import read_json, write_durably
 from stages.io.live_line import live_line
 from stages.train.checkpoints import Checkpoint, latest_checkpoint, save_checkpoint

@@ -13,7 +13,7 @@ from nerf.training.validation_probe import Patches, Probe, make_patches, make_pr
 from stages.contract import Progress, StageError
 from stages.effects.decisions import told_by_neighbours
 from stages.evaluate.image_metrics import ssim
-from stages.io.photos import evenly_spread
+from stages.io.photos import spread
 from stages.train.config import Config
 from stages.train.data import ALL_MASKED, field_background, training_dataset
 
@@ -108,6 +108,6 @@ def set_aside(scene: Scene, most: int, least: int = 1) -> Scene | None:
     count = max(least, min(most, len(train) // VALIDATION_EVERY))
     if len(train) - count < FEWEST_LEFT:
         return None
-    chosen = {train[i].name for i in evenly_spread(len(train), count)}
+    chosen = {train[i].name for i in spread(len(train), count)}
     views = (replace(view, split="validation") if view.name in chosen else view for view in scene.views)
     return replace(scene, views=tuple(views))

@@ -10,7 +10,6 @@ import trimesh  # noqa: F401
 import warp  # noqa: F401
 
 import pipeline.cli.commands  # noqa: F401
-from stages.sfm.colmap import load
+import stages.sfm.colmap  # noqa: F401
 
-load()
 torch.set_num_threads(torch.get_num_threads())

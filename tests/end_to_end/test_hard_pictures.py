@@ -163,4 +163,4 @@ def test_a_good_photo_among_bad_files_is_not_lost(tmp_path: Path) -> None:
     done = run(folder, tmp_path / "w.nerf", "--until", "ingest")
     assert done.code == 0
     assert len(done.read("photos.json")["photos"]) == 4
-    assert {refusal["name"] for refusal in done.read("photos.json")["refused"]} == set(HUGE)
+    assert {rejection["name"] for rejection in done.read("photos.json")["rejected"]} == set(HUGE)

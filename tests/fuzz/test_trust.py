@@ -105,7 +105,7 @@ def test_a_transforms_file_names_photos_of_its_own_folder_alone(name: str, tmp_p
         return
     with pytest.raises(StageError) as refused:
         find_source(folder / "transforms.json")
-    assert refused.value.what == f"refused the photo {name!r}"
+    assert refused.value.what == f"rejected the photo {name!r}"
 
 
 def test_a_transforms_files_own_word_for_a_photo_leads_nowhere_either(tmp_path: Path) -> None:
@@ -113,7 +113,7 @@ def test_a_transforms_files_own_word_for_a_photo_leads_nowhere_either(tmp_path: 
     folder = picture(tmp_path / "set" / "b.png").parent
     frame = {"file_path": "b.png", "photo": "../secret.png", "transform_matrix": np.eye(4).tolist()}
     (folder / "transforms.json").write_text(json.dumps({"frames": [frame]}))
-    with pytest.raises(StageError, match=r"refused the photo '\.\./secret\.png'"):
+    with pytest.raises(StageError, match=r"rejected the photo '\.\./secret\.png'"):
         find_source(folder / "transforms.json")
 
 

@@ -1,15 +1,11 @@
 """Camera models: pixels to rays and back, for every model that COLMAP knows."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+import pycolmap
 from jaxtyping import Float
 
 from nerf.geometry.scene import Camera
 from stages.contract import StageError
-
-if TYPE_CHECKING:
-    import pycolmap
 
 ROUND_TRIP_PX = 0.01  # a ray direction that does not project back to its pixel is a false root of the distortion
 CHECKED_PIXELS = (33, 25)  # across and down, the very corners among them: there lenses bend most
@@ -27,22 +23,22 @@ def camera_rays(camera: Camera, width: int, height: int) -> Float[np.ndarray, "h
     lost = 0
     for row in range(height):
         pixels = np.stack([x, np.full(width, (row + 0.5) * (camera.height / height))], axis=1)
-        rays[row], missing = _bearings(model, pixels)
+        rays[row], missing = _ray_directions(model, pixels)
         lost += missing
     if lost:
         raise no_ray(camera, lost / (width * height))
     return rays
 
 
-def share_without_ray(model: "pycolmap.Camera") -> float:
+def share_without_ray(model: pycolmap.Camera) -> float:
     """Of a camera's pixels, seen at CHECKED_PIXELS of them, the share for which the camera model has no inverse."""
     sides = zip((model.width, model.height), CHECKED_PIXELS, strict=True)
     x, y = (np.linspace(0.5, length - 0.5, count) for length, count in sides)
     pixels = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    return _bearings(model, pixels)[1] / len(pixels)
+    return _ray_directions(model, pixels)[1] / len(pixels)
 
 
-def _bearings(model: "pycolmap.Camera", pixels: Float[np.ndarray, "n 2"]) -> tuple[Float[np.ndarray, "n 3"], int]:
+def _ray_directions(model: pycolmap.Camera, pixels: Float[np.ndarray, "n 2"]) -> tuple[Float[np.ndarray, "n 3"], int]:
     """Unit ray directions of pixels, and how many of these they are not those of."""
     ray_directions = np.asarray(model.cam_ray_from_img(pixels))
     miss = np.abs(np.asarray(model.img_from_cam(ray_directions)) - pixels).max(axis=1)
@@ -99,10 +95,8 @@ def focal_lengths_and_centre(camera: Camera) -> tuple[list[float], list[float]]:
     return [camera.params[i] for i in focal], [camera.params[i] for i in centre]
 
 
-def native(camera: Camera, camera_id: int = 1) -> "pycolmap.Camera":
+def native(camera: Camera, camera_id: int = 1) -> pycolmap.Camera:
     """The same camera for COLMAP. Raises ValueError where the model takes another number of parameters."""
-    import pycolmap
-
     model = pycolmap.Camera(
         camera_id=camera_id,
         model=camera.model,
@@ -115,7 +109,7 @@ def native(camera: Camera, camera_id: int = 1) -> "pycolmap.Camera":
     return model
 
 
-def plain(camera: "pycolmap.Camera") -> Camera:
+def plain(camera: pycolmap.Camera) -> Camera:
     """The inverse of :func:`native`."""
     return Camera(camera.model_name, camera.width, camera.height, tuple(float(p) for p in camera.params))
 

@@ -1,14 +1,12 @@
 """The verified matches of a database as arrays. Call it in a child process."""
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+import pycolmap
 from jaxtyping import Int
 
 from stages.sfm.geometry_check import PairMatches
-
-if TYPE_CHECKING:
-    import pycolmap
 
 MAX_MATCHES_CHECKED = 200  # of a pair, drawn by the seed: their median is known to a tenth of their spread
 
@@ -22,10 +20,8 @@ class Correspondences(NamedTuple):
     begins: Int[np.ndarray, "photos+1"]  # where each photo's keypoints begin
 
 
-def read_correspondences(db: "pycolmap.Database", geometries: "dict[int, pycolmap.TwoViewGeometry]") -> Correspondences:
+def read_correspondences(db: pycolmap.Database, geometries: dict[int, pycolmap.TwoViewGeometry]) -> Correspondences:
     """All verified matches, in order of ``geometries`` (by pair id)."""
-    import pycolmap
-
     counts = [db.num_keypoints_for_image(i + 1) for i in range(db.num_images())]
     begins = np.concatenate([[0], np.cumsum(counts)]).astype(int)
     pairs = np.array([pycolmap.pair_id_to_image_pair(pair_id) for pair_id in geometries], int).reshape(-1, 2)
@@ -39,15 +35,13 @@ def read_correspondences(db: "pycolmap.Database", geometries: "dict[int, pycolma
 
 
 def read_pair_matches(
-    db: "pycolmap.Database",
-    model: "pycolmap.Reconstruction",
+    db: pycolmap.Database,
+    model: pycolmap.Reconstruction,
     seed: int,
     most: int | None = MAX_MATCHES_CHECKED,
 ) -> tuple[list[int], PairMatches]:
     """The image ids of the model's photos, and the verified matches between them for a check of their poses; ``most``
     of each pair, None: all, in their order."""
-    import pycolmap
-
     ids = sorted(model.reg_image_ids())
     number = {image_id: place for place, image_id in enumerate(ids)}
     random = np.random.default_rng(seed)
@@ -76,7 +70,7 @@ def read_pair_matches(
     )
 
 
-def _directions(db: "pycolmap.Database", model: "pycolmap.Reconstruction", image_id: int) -> np.ndarray:
+def _directions(db: pycolmap.Database, model: pycolmap.Reconstruction, image_id: int) -> np.ndarray:
     """Unit rays of a photo's keypoints in its camera's frame; along the axis where the lens has none."""
     xy = np.array(db.read_keypoints(image_id), float).reshape(-1, 6)[:, :2]
     rays = np.asarray(model.camera(model.image(image_id).camera_id).cam_ray_from_img(xy), float).reshape(-1, 3)

@@ -4,17 +4,15 @@ from collections import Counter
 from collections.abc import Container, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import pycolmap
 
 from nerf.geometry.alignment import align
 from stages.sfm.degeneracy import different_poses
 from stages.sfm.registration import PLANAR_CONFIGS
 from stages.sfm.retry_strategies import MIN_POSE_INLIERS
-
-if TYPE_CHECKING:
-    import pycolmap
 
 NEARLY_ALL = 0.9
 # A single image may merely have a bad pose in one of two models: it takes several to say that the models contradict.
@@ -36,8 +34,6 @@ def links(database: Path, registered: Container[str]) -> Links:
     with fewer, none could be registered, whichever side mapping began on. While none is registered every pair may be
     the initial one.
     """
-    import pycolmap
-
     across: Counter[int] = Counter()
     planar: list[bool] = []
     with pycolmap.Database.open(database) as db:
@@ -53,7 +49,7 @@ def links(database: Path, registered: Container[str]) -> Links:
     return Links(join, sum(planar) > NEARLY_ALL * len(planar))
 
 
-def find_conflict(models: "Sequence[pycolmap.Reconstruction]") -> dict[str, Any] | None:
+def find_conflict(models: Sequence[pycolmap.Reconstruction]) -> dict[str, Any] | None:
     """The largest sub-model that shares images with the best one (the first) and gives some of them different poses.
 
     ``group`` is its number, ``shared`` how many images both have, ``different`` how many of them have different poses;
@@ -79,7 +75,7 @@ def find_conflict(models: "Sequence[pycolmap.Reconstruction]") -> dict[str, Any]
     return None
 
 
-def compare_models(model: "pycolmap.Reconstruction", other: "pycolmap.Reconstruction") -> dict[str, Any]:
+def compare_models(model: pycolmap.Reconstruction, other: pycolmap.Reconstruction) -> dict[str, Any]:
     """How far two models of the same images agree, after the similarity on which most of them do.
 
     ``photos`` is how many both have, ``agree`` how many of them have the same pose in both, ``different`` the files of
@@ -107,17 +103,15 @@ def compare_models(model: "pycolmap.Reconstruction", other: "pycolmap.Reconstruc
     return facts
 
 
-def _poses(model: "pycolmap.Reconstruction") -> dict[str, np.ndarray]:
+def _poses(model: pycolmap.Reconstruction) -> dict[str, np.ndarray]:
     """By name, (3, 4) from the image's camera to the model's frame."""
     images = (model.image(number) for number in model.reg_image_ids())
     return {image.name: image.cam_from_world().inverse().matrix() for image in images}
 
 
-def supports(model: "pycolmap.Reconstruction", database: Path, seed: int) -> dict[str, tuple[int, int]]:
+def supports(model: pycolmap.Reconstruction, database: Path, seed: int) -> dict[str, tuple[int, int]]:
     """For every image that is in the database but not in the model: how many of its features are points of the model by
     its verified matches, and how many of those agree on one pose (P3P in RANSAC, 12 px)."""
-    import pycolmap
-
     registered = set(model.reg_image_ids())
     found = {}
     with pycolmap.Database.open(database) as db:
@@ -132,10 +126,8 @@ def supports(model: "pycolmap.Reconstruction", database: Path, seed: int) -> dic
     return found
 
 
-def _points_seen(image_id: int, geometries: list, model: "pycolmap.Reconstruction") -> list[tuple[int, int]]:
+def _points_seen(image_id: int, geometries: list, model: pycolmap.Reconstruction) -> list[tuple[int, int]]:
     """(keypoint, point) pairs of an image, by its matches with registered images; each pair once."""
-    import pycolmap
-
     seen = set()
     for pair_id, geometry in geometries:
         first, second = pycolmap.pair_id_to_image_pair(pair_id)
@@ -154,12 +146,10 @@ def _points_seen(image_id: int, geometries: list, model: "pycolmap.Reconstructio
 def _pose_inliers(
     points: list[tuple[int, int]],
     keypoints: np.ndarray,
-    camera: "pycolmap.Camera",
-    model: "pycolmap.Reconstruction",
+    camera: pycolmap.Camera,
+    model: pycolmap.Reconstruction,
     seed: int,
 ) -> int:
-    import pycolmap
-
     if len(points) < 4:
         return 0
     options = pycolmap.AbsolutePoseEstimationOptions()

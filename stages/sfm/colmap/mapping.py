@@ -2,12 +2,13 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+import numpy as np
+import pycolmap
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components
 
 from stages.sfm.retry_strategies import MIN_POSE_INLIERS, MappingOptions
-
-if TYPE_CHECKING:
-    import pycolmap
 
 MAPPING_MODEL = "SIMPLE_RADIAL"  # one focal length and one distortion term hold with few matches
 MIN_MODEL_IMAGES = 3
@@ -19,14 +20,12 @@ def map_incrementally(
     database: Path,
     images: Path,
     models: Path,
-    options: "pycolmap.IncrementalPipelineOptions",
+    options: pycolmap.IncrementalPipelineOptions,
     on_image: Callable[[], None] = lambda: None,
     begin: Path | None = None,
-) -> "list[pycolmap.Reconstruction]":
+) -> list[pycolmap.Reconstruction]:
     """All sub-models, best first: most registered images, then most points. ``on_image`` is called per image. It goes
     on from the model in the folder ``begin``, where one is given."""
-    import pycolmap
-
     models.mkdir(parents=True, exist_ok=True)
     found = pycolmap.incremental_mapping(
         database,
@@ -42,7 +41,7 @@ def map_incrementally(
 
 def incremental_options(
     seed: int, mapping: MappingOptions, camera_is_known: bool, thinned: bool
-) -> "pycolmap.IncrementalPipelineOptions":
+) -> pycolmap.IncrementalPipelineOptions:
     """What mapping asks of images; a known camera is kept as it is. With ``thinned`` matches, those of many images,
     global bundle adjustment runs less often: long tracks hold the images together in the meantime."""
     options = pipeline_options(seed + mapping.seed_offset)
@@ -63,13 +62,11 @@ def incremental_options(
 
 def map_globally(
     database: Path, images: Path, models: Path, seed: int, camera_is_known: bool
-) -> "list[pycolmap.Reconstruction]":
+) -> list[pycolmap.Reconstruction]:
     """All sub-models of global mapping (GLOMAP, Pan et al. 2024), best first. It cannot be interrupted.
 
     Images that share no points with the others may be among them, with arbitrary poses: only the largest group stays.
     """
-    import pycolmap
-
     models.mkdir(parents=True, exist_ok=True)
     options = pycolmap.GlobalPipelineOptions(num_threads=1, random_seed=seed, min_model_size=MIN_MODEL_IMAGES)
     mapper = options.mapper
@@ -87,11 +84,7 @@ def map_globally(
     return sorted(found.values(), key=_rank, reverse=True)
 
 
-def _keep_largest_group(model: "pycolmap.Reconstruction") -> None:
-    import numpy as np
-    from scipy.sparse import csr_matrix
-    from scipy.sparse.csgraph import connected_components
-
+def _keep_largest_group(model: pycolmap.Reconstruction) -> None:
     images = [model.image(image_id) for image_id in sorted(model.reg_image_ids())]
     if not model.num_points3D():
         return
@@ -106,14 +99,12 @@ def _keep_largest_group(model: "pycolmap.Reconstruction") -> None:
             model.deregister_frame(image.frame_id)
 
 
-def _rank(model: "pycolmap.Reconstruction") -> tuple[int, int]:
+def _rank(model: pycolmap.Reconstruction) -> tuple[int, int]:
     return model.num_reg_images(), model.num_points3D()
 
 
-def pipeline_options(seed: int) -> "pycolmap.IncrementalPipelineOptions":
+def pipeline_options(seed: int) -> pycolmap.IncrementalPipelineOptions:
     """Options under which mapping with the same matches and seed repeats."""
-    import pycolmap
-
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
     # With more threads RANSAC stops and Ceres sums as timing has it: rarely, but then every number is another.

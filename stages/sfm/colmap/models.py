@@ -4,19 +4,15 @@ import errno
 import os
 import shutil
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+import pycolmap
 from jaxtyping import Float
 
 from stages.contract import StageError
+from stages.io.colmap_files import NO_POINT, read_model_files
 from stages.io.sparse_model import SparseImage, SparseModel
 from stages.sfm.colmap.cameras import native
-from stages.sfm.colmap.model_files import NO_POINT, read_model_files
-
-if TYPE_CHECKING:
-    import pycolmap
-
 
 # At most, in COLMAP's binary files: a feature with its part of a track, a point, a photo with its name; and the rest.
 BYTES_PER_PLACE, BYTES_PER_POINT, BYTES_PER_IMAGE, FIXED_BYTES = 32, 51, 1024, 1 << 16
@@ -68,14 +64,12 @@ def world_from_camera(pose: Float[np.ndarray, "7"]) -> Float[np.ndarray, "3 4"]:
     return np.concatenate([rotation, -(rotation @ pose[4:])[:, None]], axis=1)
 
 
-def load_native(sparse: Path) -> "pycolmap.Reconstruction":
+def load_native(sparse: Path) -> pycolmap.Reconstruction:
     """A model that this program wrote, as COLMAP has it."""
-    import pycolmap
-
     return pycolmap.Reconstruction(sparse)
 
 
-def write_native(sparse: Path, model: "pycolmap.Reconstruction") -> None:
+def write_native(sparse: Path, model: pycolmap.Reconstruction) -> None:
     """Write ``model`` as COLMAP's binary files. Raises OSError where the disk has no room: COLMAP itself would leave
     files that end in the middle, and say nothing."""
     sparse.mkdir(parents=True, exist_ok=True)
@@ -88,8 +82,6 @@ def write_native(sparse: Path, model: "pycolmap.Reconstruction") -> None:
 
 def write_model(sparse: Path, model: SparseModel) -> None:
     """The inverse of :func:`read_model`: standard binary files. Points are numbered anew, errors computed anew."""
-    import pycolmap
-
     new = pycolmap.Reconstruction()
     for index, camera in enumerate(model.cameras):
         new.add_camera_with_trivial_rig(native(camera, index + 1))

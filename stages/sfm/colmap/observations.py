@@ -1,12 +1,10 @@
 """Observations of a reconstruction as arrays: where points were seen, how far from where they should be."""
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+import pycolmap
 from jaxtyping import Float, Int
-
-if TYPE_CHECKING:
-    import pycolmap
 
 MEDIAN_PER_SIGMA = 1.1774  # the median length of a 2-D Gaussian vector over the deviation of its coordinates: √(2 ln 2)
 LEAST_NOISE_PX = 0.01  # no detector places a feature better than this
@@ -25,7 +23,7 @@ class Observations(NamedTuple):
         return slice(int(begin), int(end))
 
 
-def observations(model: "pycolmap.Reconstruction") -> Observations:
+def observations(model: pycolmap.Reconstruction) -> Observations:
     """All observations of a model."""
     ids = sorted(model.reg_image_ids())
     seen = [model.image(i).get_observation_points2D() for i in ids]
@@ -37,8 +35,8 @@ def observations(model: "pycolmap.Reconstruction") -> Observations:
 
 
 def points_in_camera(
-    model: "pycolmap.Reconstruction", seen: Observations
-) -> "dict[int, tuple[slice, Float[np.ndarray, 'm 3']]]":
+    model: pycolmap.Reconstruction, seen: Observations
+) -> dict[int, tuple[slice, Float[np.ndarray, "m 3"]]]:
     """By image id: where its observations lie, and their points in the camera's frame."""
     ids, index = np.unique(seen.point, return_inverse=True)
     xyz = np.array([model.point3D(i).xyz for i in ids.tolist()]).reshape(-1, 3)[index]
@@ -49,7 +47,7 @@ def points_in_camera(
     return found
 
 
-def residuals(model: "pycolmap.Reconstruction", seen: Observations) -> Float[np.ndarray, "n 2"]:
+def residuals(model: pycolmap.Reconstruction, seen: Observations) -> Float[np.ndarray, "n 2"]:
     """Projection minus observation in pixels; NaN for points behind the camera."""
     out = np.empty_like(seen.xy)
     for image_id, (mine, points) in points_in_camera(model, seen).items():
@@ -58,7 +56,7 @@ def residuals(model: "pycolmap.Reconstruction", seen: Observations) -> Float[np.
     return out
 
 
-def noise_px(model: "pycolmap.Reconstruction", seen: Observations) -> float:
+def noise_px(model: pycolmap.Reconstruction, seen: Observations) -> float:
     """Standard deviation of a coordinate of an observation, robust to mismatches.
 
     It is the residuals' own, from their median length, times √(2n / (2n − unknowns)): points and poses follow the

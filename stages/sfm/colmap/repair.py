@@ -6,14 +6,16 @@ Call it in a worker process. stages/sfm/geometry_check.py decides what contradic
 import shutil
 from collections.abc import Container, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import pycolmap
 from jaxtyping import Float, Int
 
 from stages.sfm.colmap.correspondences import read_pair_matches
+from stages.sfm.colmap.database import copy_without_pairs, finish_copy, keep_inliers, unfinished_copy
 from stages.sfm.colmap.mapping import map_incrementally
-from stages.sfm.colmap.matching import copy_without_pairs, finish_copy, keep_inliers, unfinished_copy
+from stages.sfm.colmap.models import load_native, write_native
 from stages.sfm.geometry_check import (
     PairMatches,
     PoseCheck,
@@ -25,9 +27,6 @@ from stages.sfm.geometry_check import (
     weak_links,
 )
 from stages.sfm.pairs.match_graph import ORDER_OVERLAP
-
-if TYPE_CHECKING:
-    import pycolmap
 
 
 class Checked(NamedTuple):
@@ -42,22 +41,20 @@ class Checked(NamedTuple):
         return [image_id for image_id, passed in zip(self.ids, self.check.passed, strict=True) if not passed]
 
 
-def check_model(model: "pycolmap.Reconstruction", database: Path, seed: int) -> Checked:
+def check_model(model: pycolmap.Reconstruction, database: Path, seed: int) -> Checked:
     """Check every registered photo by all verified matches, those that mapping did not use or rejected as well."""
-    import pycolmap
-
     with pycolmap.Database.open(database) as db:
         ids, matches = read_pair_matches(db, model, seed)
     return Checked(ids, matches, check_poses(matches, camera_poses(model)))
 
 
-def camera_poses(model: "pycolmap.Reconstruction") -> Float[np.ndarray, "photos 3 4"]:
+def camera_poses(model: pycolmap.Reconstruction) -> Float[np.ndarray, "photos 3 4"]:
     """World from camera of every registered photo, in order of image id."""
     poses = [model.image(i).cam_from_world().inverse().matrix() for i in sorted(model.reg_image_ids())]
     return np.array(poses).reshape(-1, 3, 4)
 
 
-def reasons(model: "pycolmap.Reconstruction", checked: Checked) -> dict[str, str]:
+def reasons(model: pycolmap.Reconstruction, checked: Checked) -> dict[str, str]:
     """By name, why each photo that failed cannot stay."""
     check, found = checked.check, {}
     groups = int(check.misplaced.sum())
@@ -79,12 +76,10 @@ def fragments_sequence(checked: Checked, sequence: Sequence[int]) -> bool:
 
 
 def copy_consistent_matches(
-    model: "pycolmap.Reconstruction", database: Path, copy: Path, trusted: Container[tuple[int, int]]
+    model: pycolmap.Reconstruction, database: Path, copy: Path, trusted: Container[tuple[int, int]]
 ) -> None:
     """Copy the database with only the verified matches that are consistent with a model which those of ``trusted``
     pairs (image ids, the lower first) made."""
-    import pycolmap
-
     unfinished = unfinished_copy(database, copy)
     with pycolmap.Database.open(unfinished) as db, pycolmap.DatabaseTransaction(db):
         ids, matches = read_pair_matches(db, model, 0, most=None)
@@ -101,7 +96,7 @@ def copy_consistent_matches(
 
 
 def drop_outside_main_segment(
-    model: "pycolmap.Reconstruction", checked: Checked, sequence: Sequence[int]
+    model: pycolmap.Reconstruction, checked: Checked, sequence: Sequence[int]
 ) -> dict[str, str]:
     """Deregister images outside the longest segment of a broken capture ``sequence`` (image ids, none where it is not
     known): by name why."""
@@ -120,7 +115,7 @@ def _numbers(checked: Checked, sequence: Sequence[int]) -> Int[np.ndarray, "phot
     return np.array([number_of[image_id] for image_id in sequence if image_id in number_of], int)
 
 
-def facts(model: "pycolmap.Reconstruction", checked: Checked, sequence: Sequence[int] = ()) -> dict[str, Any]:
+def facts(model: pycolmap.Reconstruction, checked: Checked, sequence: Sequence[int] = ()) -> dict[str, Any]:
     """What registration.json says of a check, as plain JSON; of each image under "images", by name.
 
     ``sequence``: image ids in the order in which photos were taken, where that is known.
@@ -147,7 +142,7 @@ def facts(model: "pycolmap.Reconstruction", checked: Checked, sequence: Sequence
     }
 
 
-def deregister(model: "pycolmap.Reconstruction", image_ids: Sequence[int]) -> None:
+def deregister(model: pycolmap.Reconstruction, image_ids: Sequence[int]) -> None:
     """Deregister images; what only they saw goes with them."""
     for image_id in image_ids:
         model.deregister_frame(model.image(image_id).frame_id)
@@ -155,19 +150,17 @@ def deregister(model: "pycolmap.Reconstruction", image_ids: Sequence[int]) -> No
 
 
 def register_again(
-    model: "pycolmap.Reconstruction",
+    model: pycolmap.Reconstruction,
     checked: Checked,
     database: Path,
     images: Path,
     scratch: Path,
-    options: "pycolmap.IncrementalPipelineOptions",
-) -> "pycolmap.Reconstruction":
+    options: pycolmap.IncrementalPipelineOptions,
+) -> pycolmap.Reconstruction:
     """The model with the images that failed deregistered and, where possible, registered again.
 
     Pairs of images that passed and contradict the poses are outliers of matching: mapping goes on without them.
     """
-    from stages.sfm.colmap.models import load_native, write_native
-
     begin, models = scratch / "begin", scratch / "models"
     shutil.rmtree(scratch, ignore_errors=True)
     failed = checked.failed()

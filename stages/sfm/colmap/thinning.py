@@ -2,20 +2,19 @@
 
 Bundle adjustment takes time with the observations, and hundreds of photos have far more than their poses need. Long
 tracks tie many photos together; where structure repeats, chance matches make short ones. Mapping works on these, and
-the final adjustment brings back all matches (stages/sfm/colmap/refinement.py).
+the final adjustment brings back all matches (stages/sfm/colmap/final_bundle_adjustment.py).
 """
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+import pycolmap
 from jaxtyping import Bool, Float, Int
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from stages.sfm.colmap.correspondences import Correspondences, read_correspondences
-from stages.sfm.colmap.matching import finish_copy, keep_inliers, unfinished_copy
-
-if TYPE_CHECKING:
-    import pycolmap
+from stages.sfm.colmap.database import finish_copy, keep_inliers, unfinished_copy
 
 TRACKS_PER_PHOTO = 500  # of mapping: 1,000 take 1.7 times as long and move no camera by more (docs/stages/sfm.md)
 CELLS = 4  # of 4 × 4 parts of a photo each gives tracks in turn: those of one corner would leave the rest loose
@@ -27,8 +26,6 @@ def thin_matches(database: Path, copy: Path, tracks: int = TRACKS_PER_PHOTO) -> 
     Focal lengths that nothing tells are calibrated by all pairs together in the copy: mapping that begins with a guess
     that is a fifth off can take minutes to leave it, or end with a lens that draws everything wrong.
     """
-    import pycolmap
-
     unfinished = unfinished_copy(database, copy)
     with pycolmap.Database.open(unfinished) as db:
         geometries = dict(zip(*db.read_two_view_geometries(), strict=True))
@@ -44,7 +41,7 @@ def thin_matches(database: Path, copy: Path, tracks: int = TRACKS_PER_PHOTO) -> 
     finish_copy(unfinished, copy)
 
 
-def _cells(db: "pycolmap.Database", photos: int) -> Int[np.ndarray, "keypoints"]:
+def _cells(db: pycolmap.Database, photos: int) -> Int[np.ndarray, "keypoints"]:
     """In which part of its photo each keypoint lies."""
     found = [np.zeros(0, int)]
     for photo in range(photos):
@@ -58,9 +55,6 @@ def _cells(db: "pycolmap.Database", photos: int) -> Int[np.ndarray, "keypoints"]
 def best_tracks(matches: Correspondences, cells: Int[np.ndarray, "keypoints"], tracks: int) -> Bool[np.ndarray, "k"]:
     """Which keypoints belong to one of the ``tracks`` best tracks of any photo: the longest in each of its cells, then
     the second longest, and so on. A track that sees a photo twice has mistakes in it and comes after all others."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
     count, photos = int(matches.begins[-1]), len(matches.begins) - 1
     edges = (np.ones(len(matches.keypoint), bool), tuple(matches.keypoint.T))
     _, track = connected_components(coo_matrix(edges, shape=(count, count)), directed=False)
@@ -88,8 +82,6 @@ def _rank(group: Int[np.ndarray, "n"], *keys: Int[np.ndarray, "n"]) -> Int[np.nd
 def calibrate_focal_lengths(database: Path) -> None:
     """Where no focal length is known: those under which most fundamental matrices are essential ones (Sweeney et al.
     2015, "Optimizing the viewing graph for structure-from-motion"). Nothing changes where the pairs do not tell."""
-    import pycolmap
-
     with pycolmap.Database.open(database) as db:
         before = db.read_all_cameras()
     if any(camera.has_prior_focal_length for camera in before):

@@ -1,23 +1,21 @@
 """How well each photo's pose is known, in its own pixels. Call it in a child process."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+import pycolmap
 from jaxtyping import Float
+from scipy.linalg import cho_factor, cho_solve
+from scipy.sparse import bsr_matrix
 
+from stages.amounts import bytes_in_words
 from stages.hardware.memory import available_bytes
-from stages.io.amounts import bytes_in_words
 from stages.sfm.colmap.observations import Observations, observations, points_in_camera, residuals
-
-if TYPE_CHECKING:
-    import pycolmap
 
 FEWEST_OBSERVATIONS = 6  # of a photo: 12 equations for 6 unknowns; with fewer its pose is not known
 MATRICES = 6  # of 6 n × 6 n float64 for n photos, that are there at once at most
 STEP = 1e-5  # of finite differences, as a share of the distance: rounding and curvature are both far below a percent
 
 
-def pose_uncertainty_px(model: "pycolmap.Reconstruction", noise: float) -> dict[int, float]:
+def pose_uncertainty_px(model: pycolmap.Reconstruction, noise: float) -> dict[int, float]:
     """By image id: how far, root mean square over the points a photo sees, its pose may have moved them, in pixels.
 
     It is the covariance of the bundle adjustment at its minimum (points and poses unknown, cameras as they are),
@@ -51,7 +49,7 @@ def pose_uncertainty_px(model: "pycolmap.Reconstruction", noise: float) -> dict[
 
 
 def _jacobians(
-    model: "pycolmap.Reconstruction", seen: Observations
+    model: pycolmap.Reconstruction, seen: Observations
 ) -> tuple[Float[np.ndarray, "n 2 6"], Float[np.ndarray, "n 2 3"]]:
     """Of each observation's projection, by its photo's turn (radians) and shift in the camera's frame and by its point.
 
@@ -74,7 +72,7 @@ def _jacobians(
 
 
 def _whitened_covariance(
-    model: "pycolmap.Reconstruction",
+    model: pycolmap.Reconstruction,
     seen: Observations,
     ids: np.ndarray,
     to_pose: Float[np.ndarray, "n 2 6"],
@@ -86,9 +84,6 @@ def _whitened_covariance(
     are its null space, and the pseudo-inverse is (S + Q Qᵀ)⁻¹ − Q Qᵀ. Its trace over one photo is the sum of squared
     pixels by which its points move.
     """
-    from scipy.linalg import cho_factor, cho_solve
-    from scipy.sparse import bsr_matrix
-
     place, point = np.searchsorted(ids, seen.image), np.unique(seen.point, return_inverse=True)[1]
     pose_roots = np.linalg.cholesky(_sums(np.einsum("nki,nkj->nij", to_pose, to_pose), place))
     point_roots = np.linalg.cholesky(_sums(np.einsum("nki,nkj->nij", to_point, to_point), point))

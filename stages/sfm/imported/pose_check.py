@@ -13,16 +13,28 @@ import sys
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from stages.ingest.masks import write_feature_masks
+from stages.io.photos import Photo
+from stages.sfm.colmap.database import (
+    STRICT_RATIO,
+    Search,
+    extract_features,
+    fill_database,
+    match_pairs,
+    verified_matches,
+)
+from stages.sfm.colmap.mapping import MAPPING_MODEL
+from stages.sfm.colmap.models import load_native
+from stages.sfm.colmap.repair import camera_poses, check_model, facts
+from stages.sfm.imported.conventions import best_fit
+from stages.sfm.pairs.match_graph import MIN_INLIERS, natural_order, pairs_apart
 from stages.sfm.pairs.pair_selection import Pairs, closeness, nearest, union
 from stages.sfm.worker_process import environment
-
-if TYPE_CHECKING:
-    from stages.io.photos import Photo
 
 COMMAND = ["-P", "-m", "stages.sfm.imported.pose_check"]
 MAX_IMAGE_SIZE, MAX_FEATURES = 1000, 2000  # enough to tell a step of a few pixels, in seconds for hundreds of photos
@@ -32,7 +44,7 @@ TURN_DEG = 30.0  # two photos whose axes differ by so much count as far apart as
 MIN_PAIRS = 3  # verified pairs, for there to be any evidence
 
 
-def check_given_cameras(photos: "Sequence[Photo]", images: Path, folder: Path) -> dict[str, Any]:
+def check_given_cameras(photos: Sequence[Photo], images: Path, folder: Path) -> dict[str, Any]:
     """Check the model in ``folder/sparse``, whose images are these photos in order of ``file``.
 
     Returns what :func:`stages.sfm.colmap.repair.facts` says, with the ``fit`` of another convention where the poses
@@ -66,22 +78,6 @@ def main() -> None:
 
 def check(photos: list[dict[str, Any]], images: str, folder: str) -> dict[str, Any]:
     """Match neighbours by pose and by name, and let their matches judge the poses."""
-    from stages.ingest.masks import write_feature_masks
-    from stages.io.photos import Photo
-    from stages.sfm.colmap.mapping import MAPPING_MODEL
-    from stages.sfm.colmap.matching import (
-        STRICT_RATIO,
-        Search,
-        extract_features,
-        fill_database,
-        match_pairs,
-        verified_matches,
-    )
-    from stages.sfm.colmap.models import load_native
-    from stages.sfm.colmap.repair import camera_poses, check_model, facts
-    from stages.sfm.imported.conventions import best_fit
-    from stages.sfm.pairs.match_graph import MIN_INLIERS, natural_order, pairs_apart
-
     some, scratch = [Photo(**photo) for photo in photos], Path(folder, "check")
     scratch.mkdir(exist_ok=True)
     database, masks = scratch / "check.db", scratch / "masks"

@@ -10,9 +10,9 @@ from nerf.geometry.scene import Camera
 from stages.contract import StageError
 from stages.io.photos import Photo
 from stages.io.sparse_model import SparseImage
-from stages.io.transforms_intrinsics import flaw_of
 from stages.sfm.colmap.cameras import native, no_ray, rescaled, share_without_ray, why_no_ray
 from stages.sfm.imported.orientation import QUARTER_TURNS, is_of_stored_pixels, same_shape, turned_camera, turned_pose
+from stages.sfm.imported.transforms_intrinsics import flaw_of
 
 HINT = "Correct the file, or leave the cameras out to have them found from the photos."
 

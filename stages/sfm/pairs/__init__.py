@@ -1,1 +1,5 @@
-"""Which pairs of photos to match, and which of their features look alike."""
+"""Pair selection: which image pairs are matched, and how features are compared."""
+
+from typing import Literal
+
+Matcher = Literal["exhaustive", "sequential", "spatial", "retrieval"]

@@ -7,16 +7,17 @@ the graph's weak cuts, until every photo has been tried with enough others.
 ``inliers`` is symmetric: the verified matches of each pair, 0 where a pair failed, UNTESTED where it was not tried.
 """
 
+import re
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import breadth_first_order, connected_components
 
+from stages.io.photos import Photo
 from stages.sfm.pairs.pair_selection import Pairs, SimilarityMatrix, spanning_tree, union
-
-if TYPE_CHECKING:
-    from stages.io.photos import Photo
 
 UNTESTED = -1
 MIN_INLIERS = 30  # verified matches from which on a pair links two photos; mapping asks a photo for as many
@@ -105,9 +106,6 @@ def weak_cuts(weight: Float[np.ndarray, "photos photos"]) -> Cuts:
     ``weight`` is symmetric, 0 where there is no edge. Groups that hardly connect to the rest are on one side of such a
     cut, since within a group edges are heavier than across (single linkage). Components come as cuts without edges.
     """
-    from scipy.sparse import csr_matrix
-    from scipy.sparse.csgraph import breadth_first_order
-
     component = connected(weight > 0)
     parts = [component == number for number in range(1, int(component.max(initial=0)) + 1)]
     ends = spanning_tree(np.where(weight > 0, weight, -1.0))
@@ -129,9 +127,6 @@ def weak_cuts(weight: Float[np.ndarray, "photos photos"]) -> Cuts:
 
 def connected(edges: Bool[np.ndarray, "photos photos"]) -> Int[np.ndarray, "photos"]:
     """The number of each photo's connected component, the largest being 0."""
-    from scipy.sparse import csr_matrix
-    from scipy.sparse.csgraph import connected_components
-
     _, label = connected_components(csr_matrix(edges), directed=False)
     by_size = np.argsort(-np.bincount(label), kind="stable")
     return np.argsort(by_size, kind="stable")[label]
@@ -150,7 +145,6 @@ def across_weak_cuts(inliers: Int[np.ndarray, "photos photos"], untested: Float[
 
 def natural_order(names: Sequence[str]) -> Int[np.ndarray, "photos"]:
     """The order of names in which numbers count as numbers: a2 comes before a10."""
-    import re
 
     def key(name: str) -> list[tuple[int, int, str]]:
         parts = re.split(r"(\d+)", name.casefold())
@@ -159,7 +153,7 @@ def natural_order(names: Sequence[str]) -> Int[np.ndarray, "photos"]:
     return np.array(sorted(range(len(names)), key=lambda i: (key(names[i]), names[i])), int)
 
 
-def candidate_orders(photos: "Sequence[Photo]") -> list[np.ndarray]:
+def candidate_orders(photos: Sequence[Photo]) -> list[np.ndarray]:
     """The orders in which the photos may have been taken: of their times, where all are known, and of their names,
     where that is another."""
     by_name = natural_order([photo.name for photo in photos])

@@ -4,14 +4,14 @@ Photos are numbered from 0. Pairs are rows (first, second) with first < second, 
 """
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
-if TYPE_CHECKING:
-    from stages.io.photos import Photo
-    from stages.sfm import Matcher
+from nerf.geometry.georeference import GPS_ERROR_M, cartesian
+from stages.io.photos import Photo
+from stages.sfm.pairs import Matcher
 
 Pairs = Int[np.ndarray, "pairs 2"]
 SimilarityMatrix = Float[np.ndarray, "photos photos"]
@@ -21,8 +21,6 @@ SimilarityMatrix = Float[np.ndarray, "photos photos"]
 MAX_EXHAUSTIVE = 50
 MUTUAL = 0.9  # of a photo's partners, about so many count it among their own
 LOOPS = 5  # in a sequence one of so many partners is looked for at other times
-GPS_ERROR_M = 10.0  # twice the 4.9 m that phones reach under open sky (gps.gov, GPS accuracy)
-EARTH_AXES_M = (6_378_137.0, 6_356_752.314)  # WGS 84
 
 
 class Places(NamedTuple):
@@ -35,7 +33,7 @@ class Places(NamedTuple):
     position_m: Float[np.ndarray, "photos 3"] | None = None
 
 
-def places_of(photos: "Sequence[Photo]") -> Places:
+def places_of(photos: Sequence[Photo]) -> Places:
     """When and where the photos were taken, as far as all of them tell."""
     times = [photo.time_s for photo in photos]
     places = [(photo.latitude, photo.longitude) for photo in photos]
@@ -105,26 +103,13 @@ def union(*pairs: Int[np.ndarray, "n 2"]) -> Pairs:
     return np.unique(together[together[:, 0] != together[:, 1]], axis=0)
 
 
-def cartesian(
-    latitude: Float[np.ndarray, "n"], longitude: Float[np.ndarray, "n"], altitude: Float[np.ndarray, "n"] | None
-) -> Float[np.ndarray, "n 3"]:
-    """Metres from the centre of the Earth (WGS 84), from degrees and metres: no seam at the date line or a pole."""
-    phi, lam = np.radians(latitude), np.radians(longitude)
-    height = np.zeros_like(phi) if altitude is None else altitude
-    long_axis, short_axis = EARTH_AXES_M
-    flat = (short_axis / long_axis) ** 2
-    normal = long_axis / np.sqrt(np.cos(phi) ** 2 + flat * np.sin(phi) ** 2)
-    around = (normal + height) * np.cos(phi)
-    return np.stack([around * np.cos(lam), around * np.sin(lam), (flat * normal + height) * np.sin(phi)], axis=1)
-
-
 def closeness(position_m: Float[np.ndarray, "n 3"]) -> SimilarityMatrix:
     """Minus the distance between any two positions, in metres."""
     return -np.sqrt(sum((axis[:, None] - axis[None]) ** 2 for axis in position_m.T))
 
 
 def start_pairs(
-    matcher: "Matcher", neighbours: int, count: int, places: Places, similarity: Callable[[], SimilarityMatrix]
+    matcher: Matcher, neighbours: int, count: int, places: Places, similarity: Callable[[], SimilarityMatrix]
 ) -> Pairs:
     """The pairs that matching begins with. ``similarity`` is asked for only where it is needed.
 
@@ -163,13 +148,13 @@ def second_look(
 # --- the choice among them
 
 
-def expected_pairs(matcher: "Matcher", count: int, neighbours: int) -> int:
+def expected_pairs(matcher: Matcher, count: int, neighbours: int) -> int:
     """About how many pairs there will be."""
     everything = count * (count - 1) // 2
     return everything if matcher == "exhaustive" else min(everything, round(count * neighbours * (1 - MUTUAL / 2)))
 
 
-def choose(count: int, neighbours: int, places: Places) -> "Matcher":
+def choose(count: int, neighbours: int, places: Places) -> Matcher:
     """Every pair of a set of ordinary size; else by time, place or looks."""
     if count <= MAX_EXHAUSTIVE:
         return "exhaustive"

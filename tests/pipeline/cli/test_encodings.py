@@ -40,7 +40,7 @@ def test_letters_that_the_terminal_lacks_are_no_error(photos: Path, encoding: st
     assert (done.returncode, done.stderr) == (0, "")
     lines = done.stdout.splitlines()
     arrow, mountain = ("→ ", "山") if encoding == "utf-8" else ("\\u2192 ", "\\u5c71")
-    assert f"ingest     refused {mountain}.jpg: not an image: it is text" in lines
+    assert f"ingest     rejected {mountain}.jpg: not an image: it is text" in lines
     assert lines[-1].startswith(arrow) and lines[-1].endswith("/" + root.replace("\udce9", "\\udce9"))
     for words in (("status", root), ("explain", "ingest", root), ("clean", root)):
         done = pipeline(photos.parent, encoding, *words)
@@ -54,7 +54,7 @@ def test_events_are_json_in_any_encoding(photos: Path):
     done = pipeline(photos.parent, "ascii", *words)
     events = [json.loads(line) for line in done.stdout.splitlines()]
     assert {event["event"] for event in events} >= {"start", "note", "finished"}
-    assert "refused 山.jpg: not an image: it is text" in [event.get("message") for event in events]
+    assert "rejected 山.jpg: not an image: it is text" in [event.get("message") for event in events]
     assert photos.name in events[0]["text"]
 
 

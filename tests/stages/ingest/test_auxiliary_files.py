@@ -14,8 +14,7 @@ from PIL import Image
 
 from stages import ingest
 from stages.ingest import Config
-from stages.ingest.auxiliary_files import depth_maps, is_mask, twins
-from stages.ingest.decoding import Stored
+from stages.ingest.auxiliary_files import Stored, auxiliary_files, depth_maps, is_mask
 from stages.ingest.sources import find_source, unused_masks
 from stages.io.photos import read_photos
 from tests.stages.ingest.test_sources import touch
@@ -46,8 +45,8 @@ from tests.stages.ingest.test_sources import touch
 )
 def test_a_twin_has_the_name_of_its_photo(photo: str, twin: str) -> None:
     others = ["other.jpg", "rgb/8.jpg", "image/1.png"]
-    assert twins([photo, twin, *others]) == {twin: photo}
-    assert twins([twin, *others]) == {}
+    assert auxiliary_files([photo, twin, *others]) == {twin: photo}
+    assert auxiliary_files([twin, *others]) == {}
     assert is_mask(twin) == ("mask" in twin.lower() and "masked" not in twin)
 
 
@@ -67,7 +66,7 @@ def test_a_twin_has_the_name_of_its_photo(photo: str, twin: str) -> None:
     ],
 )
 def test_what_may_be_a_photo_of_its_own_stays(names: tuple[str, ...]) -> None:
-    assert twins(names) == {}
+    assert auxiliary_files(names) == {}
 
 
 colours, maps = ["a", "0", "00", "image", "a.color"], ["a_depth", "a_mask_depth", "a_normal", "b_mask"]
@@ -80,7 +79,7 @@ names_of_files = st.lists(
 
 @given(names_of_files)
 def test_every_twin_leads_to_a_photo_that_stays(names: list[str]) -> None:
-    found = twins(names)
+    found = auxiliary_files(names)
     assert set(found) <= set(names) >= set(found.values())
     for name in found:
         for _ in names:
@@ -90,16 +89,16 @@ def test_every_twin_leads_to_a_photo_that_stays(names: list[str]) -> None:
 
 def test_a_map_belongs_to_the_photo_and_not_to_another_map() -> None:
     maps = [f"{folder}/1.png" for folder in ("conf", "depth", "instance", "label", "normal", "semantics")]
-    assert twins([*maps, "rgb/1.jpg"]) == dict.fromkeys(maps, "rgb/1.jpg")
-    assert twins([*maps[:3], "label/1.jpg"]) == dict.fromkeys(maps[:3], "label/1.jpg")
-    assert twins(maps) == {}
+    assert auxiliary_files([*maps, "rgb/1.jpg"]) == dict.fromkeys(maps, "rgb/1.jpg")
+    assert auxiliary_files([*maps[:3], "label/1.jpg"]) == dict.fromkeys(maps[:3], "label/1.jpg")
+    assert auxiliary_files(maps) == {}
 
 
 def test_sources_list_photos_without_their_twins(tmp_path: Path) -> None:
     touch(tmp_path, "image/000000.png", "image/000001.png", "mask/000.png", "mask/001.png", "mask/002.png")
     source = find_source(tmp_path)
     assert [source.name(file) for file in source.files] == ["image/000000.png", "image/000001.png", "mask/002.png"]
-    assert source.set_aside == {"mask/000.png": "image/000000.png", "mask/001.png": "image/000001.png"}
+    assert source.excluded == {"mask/000.png": "image/000000.png", "mask/001.png": "image/000001.png"}
 
 
 def put(file: Path, seed: int) -> None:
@@ -117,7 +116,7 @@ def test_what_is_set_aside_is_said_and_a_mask_can_be_used_as_is_said(tmp_path: P
     ingest.run(Config(photos=tmp_path / "in"), {}, tmp_path / "out", progress)
     assert [photo.name for photo in read_photos(tmp_path / "out")] == [f"image/{index}.png" for index in range(5)]
     assert progress.notes == [
-        "5 files are set aside, named as a mask, depth map or other copy of a photo: mask/0.png (of image/0.png), "
+        "5 files are excluded, named as a mask, depth map or other copy of a photo: mask/0.png (of image/0.png), "
         "mask/1.png (of image/1.png), mask/2.png (of image/2.png) and 2 more",
         "to be used as a mask, whose black is ignored, mask/0.png would have to be masks/image/0.png",
     ]
@@ -151,7 +150,7 @@ def test_depth_maps_are_told_by_their_values(photo: str, depth: str, kind: type,
     assert [one.name for one in read_photos(tmp_path / "out")] == [photo.format(index) for index in range(4)]
     named = [depth.format(index) for index in range(4)]
     assert progress.notes == [
-        "4 files are set aside as depth maps, being grey of 16 bits or of floats among photos in colour: "
+        "4 files are excluded as depth maps, being grey of 16 bits or of floats among photos in colour: "
         f"{named[0]}, {named[1]}, {named[2]} and 1 more"
     ]
 

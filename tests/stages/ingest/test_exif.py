@@ -10,7 +10,7 @@ import pytest
 from PIL import ExifTags, Image
 
 from stages.ingest.decoding import decode, upright_size
-from stages.ingest.exif import Place, clock_from_exif, exposure_from_exif, focal_from_exif, place_from_exif
+from stages.ingest.exif import GpsPosition, clock_from_exif, exposure_from_exif, focal_from_exif, gps_from_exif
 from tests.stages.ingest.photo_files import HEIGHT, WIDTH, exif_with, saved, smooth
 
 
@@ -115,11 +115,11 @@ def test_where_a_photo_was_taken(tmp_path: Path, suffix: str) -> None:
     exif.get_ifd(ExifTags.IFD.GPSInfo).update(numbers)
     big = Image.fromarray(smooth(96, 64))
     decode(saved(tmp_path / "warm.png", big))  # registers HEIC
-    place = decode(saved(tmp_path / f"a.{suffix}", big, exif=exif)).place
+    place = decode(saved(tmp_path / f"a.{suffix}", big, exif=exif)).gps
     assert place.latitude == pytest.approx(-(33 + 51 / 60 + 24.5 / 3600), abs=1e-6)
     assert place.longitude == pytest.approx(151 + 12 / 60 + 54 / 3600, abs=1e-6)
     assert place.altitude_m == pytest.approx(-4.25)
-    assert decode(tmp_path / "warm.png").place == Place()
+    assert decode(tmp_path / "warm.png").gps == GpsPosition()
 
 
 @pytest.mark.parametrize(
@@ -137,15 +137,15 @@ def test_where_a_photo_was_taken(tmp_path: Path, suffix: str) -> None:
     ],
 )
 def test_a_place_that_cannot_be_is_none(wrong: dict[str, object]) -> None:
-    assert place_from_exif(GREENWICH | {"GPSAltitude": 46.0} | wrong) == Place()
+    assert gps_from_exif(GREENWICH | {"GPSAltitude": 46.0} | wrong) == GpsPosition()
 
 
 def test_altitudes_stand_for_themselves() -> None:
-    place = place_from_exif(GREENWICH)
+    place = gps_from_exif(GREENWICH)
     assert place[:2] == pytest.approx((51.477222, -0.0005), abs=1e-6) and place.altitude_m is None
     for value, level, expected in ((46.0, b"\0", 46.0), (12.5, 1, -12.5), (1e9, 0, None), (float("nan"), 0, None)):
         tags = GREENWICH | {"GPSAltitude": value, "GPSAltitudeRef": level}
-        assert place_from_exif(tags) == Place(place.latitude, place.longitude, expected)
+        assert gps_from_exif(tags) == GpsPosition(place.latitude, place.longitude, expected)
 
 
 @pytest.mark.parametrize("scene", ["banana", "sceaux_castle", "fern", "fox"])

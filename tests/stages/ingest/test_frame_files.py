@@ -63,7 +63,7 @@ def test_another_spelling_leads_out_of_the_folder_no_more_than_the_name(tmp_path
     touch(tmp_path, "secret.jpg", "set/b.jpg")
     (tmp_path / "set/a.JPG").symlink_to(tmp_path / "secret.jpg")
     error = refusal(transforms(tmp_path / "set/transforms.json", "a.jpg", "b.jpg"))
-    assert error.what == "refused the photo 'a.JPG'"
+    assert error.what == "rejected the photo 'a.JPG'"
 
 
 def test_a_linked_folder_of_photos_may_be_given_apart_from_its_cameras(tmp_path: Path) -> None:
@@ -74,7 +74,7 @@ def test_a_linked_folder_of_photos_may_be_given_apart_from_its_cameras(tmp_path:
     for photos in ("set/images", "set"):
         assert names(find_source(tmp_path / photos, cameras)) == ["a.jpg"]
     (tmp_path / "disk/images/b.jpg").symlink_to(tmp_path / "secret.jpg")
-    assert refusal(tmp_path / "set", transforms(cameras, "images/b.jpg")).what == "refused the photo 'images/b.jpg'"
+    assert refusal(tmp_path / "set", transforms(cameras, "images/b.jpg")).what == "rejected the photo 'images/b.jpg'"
 
 
 @pytest.mark.parametrize(
@@ -115,7 +115,9 @@ def test_an_end_leads_to_nothing_outside(tmp_path: Path) -> None:
     touch(tmp_path, "secret.jpg", "set/b.jpg")
     (tmp_path / "set/c.jpg").symlink_to(tmp_path / "secret.jpg")
     for name in ("/home/me/secret.jpg", "/home/me/c.jpg"):
-        assert refusal(transforms(tmp_path / "set/transforms.json", "b.jpg", name)).what.startswith("refused the photo")
+        assert refusal(transforms(tmp_path / "set/transforms.json", "b.jpg", name)).what.startswith(
+            "rejected the photo"
+        )
 
 
 def test_masks_of_transforms_files_are_found_in_another_spelling(tmp_path: Path) -> None:

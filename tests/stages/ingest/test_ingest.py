@@ -15,7 +15,8 @@ from stages.contract import StageError
 from stages.ingest import Config
 from stages.ingest.masks import STILL_BACKGROUND_HINT
 from stages.io.files import read_json
-from stages.io.photos import load_pixels, read_frame_names, read_photos
+from stages.io.photos import read_frame_names, read_photos
+from stages.io.pixels import load_pixels
 from tests.blots import blots, cut_out
 
 
@@ -87,14 +88,14 @@ def test_refused_files_are_named_and_do_not_stop_the_rest(tmp_path: Path, progre
     (folder / "notes.jpg").write_text("not a photo at all\n")
     (folder / "z copy of a.jpg").write_bytes((folder / "a.jpg").read_bytes())
     result = ingest.run(Config(photos=folder), {}, tmp_path / "out", progress)
-    assert result.line == "2 photos 32×24, one camera, no EXIF focal, 3 refused"
-    refused = read_json(tmp_path / "out/photos.json")["refused"]
-    assert [refusal["name"] for refusal in refused] == ["cut.jpg", "notes.jpg", "z copy of a.jpg"]
-    assert refused == result.facts["refused"]
-    assert progress.notes[0].startswith("refused cut.jpg: truncated: ")
+    assert result.line == "2 photos 32×24, one camera, no EXIF focal, 3 rejected"
+    refused = read_json(tmp_path / "out/photos.json")["rejected"]
+    assert [rejection["name"] for rejection in refused] == ["cut.jpg", "notes.jpg", "z copy of a.jpg"]
+    assert refused == result.facts["rejected"]
+    assert progress.notes[0].startswith("rejected cut.jpg: truncated: ")
     assert progress.notes[1:] == [
-        "refused notes.jpg: not an image: it is text",
-        "refused z copy of a.jpg: identical to a.jpg",
+        "rejected notes.jpg: not an image: it is text",
+        "rejected z copy of a.jpg: identical to a.jpg",
     ]
 
 
@@ -117,7 +118,7 @@ def test_too_few_photos_in_words_that_fit(tmp_path: Path, progress: Any) -> None
     put(tmp_path / "rest", "a.jpg")
     (tmp_path / "rest/b.jpg").write_text("text")
     error = failure(tmp_path / "rest", tmp_path / "out4", progress)
-    assert (error.what, error.why) == ("only one photo can be used, a.jpg", "1 other files were refused")
+    assert (error.what, error.why) == ("only one photo can be used, a.jpg", "1 other files were rejected")
 
 
 def test_cameras_are_told_apart(tmp_path: Path, progress: Any) -> None:
@@ -212,7 +213,7 @@ def test_photos_that_are_all_nearly_the_same_are_no_scene(tmp_path: Path, progre
     error = failure(shifted(tmp_path / "in", 0, 1, 2), tmp_path / "out", progress)
     assert (error.what, error.why) == (
         "all 3 photos are nearly the same picture",
-        "the camera stood still between them, so they tell nothing of depth",
+        "the camera did not move between them, so they show no depth",
     )
     assert error.hint.endswith(f"into one folder. {STILL_BACKGROUND_HINT}")
 
@@ -269,8 +270,8 @@ def test_a_photo_whose_mask_cannot_be_used_is_refused(tmp_path: Path, progress: 
     ingest.run(Config(photos=folder), {}, tmp_path / "out", progress)
     assert [photo.name for photo in read_photos(tmp_path / "out")] == ["c.png", "d.png"]
     assert progress.notes == [
-        "refused a.png: its mask a.png does not fit: it is 30×30 and the photo 32×24",
-        "refused b.png: its mask b.png ignores all of it (its brightest value is 0 of 255)",
+        "rejected a.png: its mask a.png does not fit: it is 30×30 and the photo 32×24",
+        "rejected b.png: its mask b.png ignores all of it (its brightest value is 0 of 255)",
     ]
 
 
@@ -314,14 +315,14 @@ def test_odd_names_stay_inside_and_become_ascii(tmp_path: Path, progress: Any) -
     for photo in photos:
         assert (tmp_path / "out" / photo.file).resolve().is_relative_to(tmp_path / "out/images")
         assert (tmp_path / "out" / photo.file).is_file()
-    assert progress.notes == ["refused \\xff.jpg: damaged: its header cannot be read (Truncated File Read)"]
+    assert progress.notes == ["rejected \\xff.jpg: damaged: its header cannot be read (Truncated File Read)"]
 
 
 def test_terminal_codes_in_names_are_not_printed(tmp_path: Path, progress: Any) -> None:
     put(tmp_path / "in", "a.jpg", "b.jpg")
     (tmp_path / "in/\x1b[2J.jpg").write_text("text")
     ingest.run(Config(photos=tmp_path / "in"), {}, tmp_path / "out", progress)
-    assert progress.notes == [r"refused '\x1b[2J.jpg': not an image: it is text"]
+    assert progress.notes == [r"rejected '\x1b[2J.jpg': not an image: it is text"]
 
 
 def test_only_photos_named_by_the_cameras_are_taken(tmp_path: Path, progress: Any) -> None:
@@ -339,8 +340,8 @@ def test_only_photos_named_by_the_cameras_are_taken(tmp_path: Path, progress: An
         "images/copy.png",
     ]
     assert read_frame_names(tmp_path / "out")["images/a"] == "images/a.png"
-    assert result.line == "3 photos 32×24, cameras given, 1 refused"
-    assert progress.notes == ["refused images/gone.png: there is no such file"]
+    assert result.line == "3 photos 32×24, poses imported, 1 rejected"
+    assert progress.notes == ["rejected images/gone.png: there is no such file"]
 
 
 def test_what_is_opaque_is_noted(tmp_path: Path, progress: Any) -> None:
@@ -382,7 +383,7 @@ def test_a_full_disk_is_said_in_words(tmp_path: Path, progress: Any, monkeypatch
     [
         ("sceaux_castle", "11 photos 1416×1064, one camera, EXIF focal 1433 px"),
         ("room_no_overlap", "8 photos in 2 sizes, 2 cameras, no EXIF focal"),
-        ("lego_400", "125 photos 400×400 with alpha, cameras given"),
+        ("lego_400", "125 photos 400×400 with alpha, poses imported"),
     ],
 )
 def test_real_sets(shared_data: Path, tmp_path: Path, progress: Any, scene: str, line: str) -> None:

@@ -11,10 +11,12 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from stages import ingest
+from stages.ingest.auxiliary_files import pair_masks
 from stages.ingest.decoding import DecodeError, upright
-from stages.ingest.masks import are_of_stored_pixels, load_mask, pair_masks, read_mask, write_feature_masks
+from stages.ingest.masks import are_of_stored_pixels, read_mask, write_feature_masks
 from stages.io.files import write_png
 from stages.io.photos import Photo, read_photos
+from stages.io.pixels import load_mask
 from tests.stages.ingest.photo_files import exif_with
 from tests.stages.ingest.test_ingest import mask_for, picture, put
 

@@ -65,7 +65,7 @@ def test_photos_beside_an_images_folder_are_said(tmp_path: Path, progress: Any) 
     put(tmp_path / "in/images", "a.jpg", "b.jpg")
     put(tmp_path / "in", "c.jpg", "d.jpg")
     ingest.run(Config(photos=tmp_path / "in"), {}, tmp_path / "out", progress)
-    how = f"to use all, move what lies beside into images/; to use only that, move images/ out of {tmp_path}/in"
+    how = f"to use all, move them into images/; to use only them, move images/ out of {tmp_path}/in"
     assert progress.notes == [f"2 photos lie in {tmp_path}/in beside images/ and are not used: {how}"]
 
 
@@ -79,8 +79,8 @@ def test_where_it_fails_all_refusals_are_said_by_reason(tmp_path: Path, progress
         ingest.run(Config(photos=folder), {}, tmp_path / "out", progress)
     names = ", ".join(f"x{index:02d}.jpg" for index in range(12))
     assert progress.notes == [
-        f"refused {names}: not an image: it is text",
-        "refused y.jpg: identical to a.jpg",
+        f"rejected {names}: not an image: it is text",
+        "rejected y.jpg: identical to a.jpg",
         "masks/stray.png is no photo's mask, which are called NAME.png",
     ]
 

@@ -69,7 +69,7 @@ def test_panoramas_are_refused_by_name(tmp_path: Path, progress: Any) -> None:
     assert [photo.name for photo in read_photos(tmp_path / "out")] == ["0.jpg", "1.jpg"]
     begin = "a panorama: cut it into perspective views, for example with ffmpeg -i PHOTO -vf v360=e:flat:"
     for name, note in zip(("round", "swept"), progress.notes, strict=True):
-        assert note.startswith(f"refused {name}.jpg: {begin}")
+        assert note.startswith(f"rejected {name}.jpg: {begin}")
 
 
 def test_a_video_of_panoramas_is_refused(tmp_path: Path, progress: Any) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from stages.contract import StageError
-from stages.ingest.masks import pair_masks
+from stages.ingest.auxiliary_files import pair_masks
 from stages.ingest.sources import Source, camera_files, find_source, is_gone, photos_beside
 
 
@@ -189,7 +189,7 @@ def test_a_transforms_file_that_was_written_on_windows(tmp_path: Path) -> None:
     photos = ["train/0001.png", "train/0002.png", "train\\0002.png", "gone\\0.png"]
     assert list(find_source(cameras).frames.values()) == photos
     error = refusal(transforms(tmp_path / "transforms.json", "..\\secret.jpg"))
-    assert (error.what, error.why) == ("refused the photo '../secret.jpg'", f"it leads out of the folder {tmp_path}")
+    assert (error.what, error.why) == ("rejected the photo '../secret.jpg'", f"it leads out of the folder {tmp_path}")
 
 
 @pytest.mark.parametrize("file_path", ["../secret.jpg", "/etc/passwd", "images/../../secret", "link/secret.jpg", "a\0"])
@@ -197,7 +197,7 @@ def test_frames_may_not_leave_their_folder(tmp_path: Path, file_path: str) -> No
     touch(tmp_path, "secret.jpg", "scene/images/a.jpg")
     (tmp_path / "scene/link").symlink_to(tmp_path)
     error = refusal(transforms(tmp_path / "scene/transforms.json", "images/a.jpg", file_path))
-    assert error.what == f"refused the photo {file_path!r}"
+    assert error.what == f"rejected the photo {file_path!r}"
     of_link = "Give the photo folder apart, if it is a link: pipeline run PHOTOS --cameras FILE."
     of_name = "A transforms file may name photos inside its own folder only."
     assert error.hint == (of_link if file_path.startswith("link") else of_name)
@@ -283,8 +283,8 @@ def test_a_video_or_a_folder_with_nothing_else(tmp_path: Path, given: str) -> No
     with pytest.raises(StageError) as error:
         find_source(tmp_path / given, transforms(tmp_path / "t.json", "a.jpg").parent)
     assert str(error.value) == (
-        "cannot use --cameras with clip.MP4: it is a video, and which of its frames become photos is decided here: "
-        "no cameras can be known for them. "
+        "cannot use --cameras with clip.MP4: it is a video, and which of its frames become photos is "
+        "decided by ingest: no poses can be imported for them. "
         "Leave --cameras out, or give the folder of the photos that the cameras belong to."
     )
 
@@ -327,8 +327,8 @@ def test_a_transforms_file_may_name_masks_which_go_before_others(tmp_path: Path,
 @pytest.mark.parametrize(
     ("mask", "words"),
     [
-        ("../m.png", "refused the mask '../m.png': it leads out of the folder"),
-        ("/m.png", "refused the mask '/m.png': its path is absolute"),
+        ("../m.png", "rejected the mask '../m.png': it leads out of the folder"),
+        ("/m.png", "rejected the mask '/m.png': its path is absolute"),
         (3, "the mask_path of frame 0 is no name of a file"),
         ("x" * 300, "no file can have the name of frame 0"),
     ],

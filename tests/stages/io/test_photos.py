@@ -8,19 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from stages.ingest.decoding import pillow
-from stages.ingest.masks import load_mask
-from stages.io import photos as module
-from stages.io.photos import (
-    Photo,
-    Refusal,
-    load_pixels,
-    loaders,
-    opaque_box,
-    read_frame_names,
-    read_photos,
-    write_photos,
-)
+from stages.io import pixels
+from stages.io.photos import Photo, Rejection, read_frame_names, read_photos, write_photos
+from stages.io.pixels import load_mask, load_pixels, loaders, opaque_box, pillow
 from tests.png_files import png
 from tests.refusals import refused
 
@@ -96,7 +86,7 @@ def test_the_colour_of_transparent_pixels_does_not_leak(tmp_path: Path) -> None:
 def test_large_photos_are_loaded_by_fewer_threads(
     tmp_path: Path, size: tuple[int, int], alpha: bool, cores: int, expected: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "processors", lambda: cores)
+    monkeypatch.setattr(pixels, "processors", lambda: cores)
     (tmp_path / "large.png").write_bytes(png(*size, b"", alpha=alpha))
     (tmp_path / "small.png").write_bytes(png(1, 1, b""))
     assert loaders([tmp_path / "large.png", tmp_path / "small.png"]) == expected
@@ -128,7 +118,7 @@ def test_a_photo_in_a_folder_keeps_it_in_its_name_for_colmap() -> None:
 
 def test_photos_json_round_trips(tmp_path: Path) -> None:
     photos = [photo(), photo(name="b", focal_px=None, focal_source=None)]
-    write_photos(tmp_path, photos, [Refusal("c.jpg", "truncated")], {"./b": "b"})
+    write_photos(tmp_path, photos, [Rejection("c.jpg", "truncated")], {"./b": "b"})
     assert read_photos(tmp_path) == photos
     assert read_frame_names(tmp_path) == {"./b": "b"}
 

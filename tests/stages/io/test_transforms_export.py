@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from nerf.geometry.scene import Camera, Scene, Similarity, View
+from stages.io.colmap_files import PARAMETERS
 from stages.io.transforms_export import intrinsics, transforms
-from stages.io.transforms_intrinsics import read_intrinsics
-from stages.sfm.colmap.model_files import PARAMETERS
+from stages.sfm.imported.transforms_intrinsics import read_intrinsics
 from tests.camera_layouts import ring
 
 TURN = np.array([[0.0, -1.0, 0.0], [0.6, 0.0, -0.8], [0.8, 0.0, 0.6]])

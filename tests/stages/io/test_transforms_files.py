@@ -10,7 +10,7 @@ import pytest
 from stages.contract import StageError
 from stages.io.photos import Photo
 from stages.io.transforms_files import read_transforms
-from stages.sfm.imported.known_cameras import KnownCameras, read_known_cameras
+from stages.sfm.imported.pose_files import KnownCameras, read_known_cameras
 from tests.refusals import refused
 
 LENS = {"camera_angle_x": 0.7}

@@ -89,7 +89,7 @@ def _write_photos(folder: Path, names: list[str], size: tuple[int, int]) -> None
     photos = [{"name": name, "file": f"images/{i:04d}.png"} for i, name in enumerate(names)]
     photos.append({"name": "blurred <b>.jpg", "file": "images/9999.png"})
     refused = [{"name": "notes & sums.jpg", "reason": "not an image: text"}]
-    write_json(folder / "photos.json", {"photos": photos, "refused": refused, "frames": {}})
+    write_json(folder / "photos.json", {"photos": photos, "rejected": refused, "frames": {}})
     for i, _ in enumerate(names):
         _picture(i, size).save(folder / f"images/{i:04d}.png")
 

@@ -255,7 +255,7 @@ def test_the_camera_of_one_photo_that_comes_out_absurd_does_not_end_the_run(
     images["photo_003.jpg"] = np.ascontiguousarray(images["photo_003.jpg"][:, 10:230])  # another size, another camera
     absurd = "camera.width == 220" if always else "camera.width == 220 and camera.model_name != 'SIMPLE_PINHOLE'"
     child = (
-        "import stages.sfm.colmap.lenses as lenses, stages.sfm.worker as c\n"
+        "import stages.sfm.colmap.camera_models as lenses, stages.sfm.worker as c\n"
         f"lenses.flaw = lambda camera: 'it is absurd' if {absurd} else None\n"
         "c.main()"
     )

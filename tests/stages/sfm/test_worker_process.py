@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 
 from stages.sfm import worker_process
-from stages.sfm.pairs import matching_plan
+from stages.sfm.pairs import quality_level
 
 
-@pytest.mark.parametrize("command_line", [worker_process.COMMAND, matching_plan.COMMAND])
+@pytest.mark.parametrize("command_line", [worker_process.COMMAND, quality_level.COMMAND])
 def test_a_worker_takes_no_module_from_the_current_folder(tmp_path: Path, command_line: list[str]) -> None:
     for name in ("nerf/__init__.py", "stages/__init__.py", "random.py"):
         (tmp_path / name).parent.mkdir(exist_ok=True)

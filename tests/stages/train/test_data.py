@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from nerf.geometry.scene import Camera
 from nerf.training.ray_dataset import PosedViews, make_ray_dataset
 from stages.contract import StageError
-from stages.ingest.masks import load_mask
 from stages.io.files import write_png, write_tensors
 from stages.io.pixel_store import PixelStore, pixel_store
+from stages.io.pixels import load_mask
 from stages.train.config import WHITE
 from stages.train.data import (
     MAX_PATCHES,

@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from nerf.geometry.scene import Camera
+from stages.sfm.colmap.camera_model_selection import adjustment_options
+from stages.sfm.colmap.camera_models import equip
 from stages.sfm.colmap.cameras import native
-from stages.sfm.colmap.held_out import adjustment_options
-from stages.sfm.colmap.lenses import equip
 from stages.sfm.colmap.observations import observations, points_in_camera, residuals
 
 if TYPE_CHECKING:

@@ -6,9 +6,9 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from stages.sfm.colmap import uncertainty
-from stages.sfm.colmap.held_out import Choice
+from stages.sfm.colmap.camera_model_selection import Choice
+from stages.sfm.colmap.final_bundle_adjustment import _finished
 from stages.sfm.colmap.observations import LEAST_NOISE_PX, noise_px, observations
-from stages.sfm.colmap.refinement import _finished
 from stages.sfm.colmap.uncertainty import _error_px, pose_uncertainty_px
 from tests.stages.sfm.colmap.lens_scene import adjust, lens, photographed
 

@@ -13,7 +13,7 @@ from stages.io.photos import Photo
 from stages.io.sparse_model import SparseImage, SparseModel
 from stages.sfm.colmap.cameras import camera_rays
 from stages.sfm.colmap.models import write_model
-from stages.sfm.imported.known_cameras import KnownCameras, read_known_cameras
+from stages.sfm.imported.pose_files import KnownCameras, read_known_cameras
 from tests.camera_layouts import ring
 
 W, H = 600, 400

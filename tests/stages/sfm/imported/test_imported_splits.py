@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from stages.contract import StageError
-from stages.sfm.imported.known_cameras import KnownCameras, read_known_cameras
-from tests.stages.sfm.imported.test_known_cameras import LENS, NAMES, PHOTOS, frame
+from stages.sfm.imported.pose_files import KnownCameras, read_known_cameras
+from tests.stages.sfm.imported.test_pose_files import LENS, NAMES, PHOTOS, frame
 
 
 @pytest.fixture

@@ -13,13 +13,14 @@ from PIL import Image
 from nerf.geometry.scene import Camera
 from stages import ingest, normalise, sfm
 from stages.ingest.decoding import upright
-from stages.io.photos import Photo, load_pixels, read_photos
+from stages.io.colmap_files import PARAMETERS
+from stages.io.photos import Photo, read_photos
+from stages.io.pixels import load_pixels
 from stages.io.sparse_model import SparseImage, SparseModel
 from stages.sfm.colmap.cameras import camera_rays, project
-from stages.sfm.colmap.model_files import PARAMETERS
 from stages.sfm.colmap.models import read_model, write_model
-from stages.sfm.imported.known_cameras import KnownCameras, read_known_cameras
 from stages.sfm.imported.orientation import QUARTER_TURNS, pixel_map, turned_camera, turned_pose
+from stages.sfm.imported.pose_files import KnownCameras, read_known_cameras
 from tests.camera_layouts import ring
 from tests.refusals import refused
 from tests.stages.ingest.photo_files import exif_with

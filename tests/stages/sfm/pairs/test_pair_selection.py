@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from nerf.geometry.georeference import cartesian
 from stages.sfm.pairs.pair_selection import (
     MAX_EXHAUSTIVE,
     Places,
-    cartesian,
     choose,
     closeness,
     exhaustive,

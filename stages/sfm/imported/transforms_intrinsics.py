@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 
 from nerf.geometry.scene import Camera
+from stages.io.colmap_files import MAX_SIDE
 from stages.sfm.colmap.cameras import focal_lengths_and_centre
-from stages.sfm.colmap.model_files import LARGEST_SIDE
 
 # Focal lengths in widths of the picture: from 179° across to 20 seconds of arc, a telescope's.
 FOCAL_RATIOS = (0.005, 10_000.0)
-FARTHEST_CENTRE = 100.0  # in widths: where the principal point of the last corner cut out of a large picture may lie
-MOST_LETTERS = 40  # of a value, in an error
+MAX_CENTRE_OFFSET = 100.0  # in widths: where the principal point of the last corner cut out of a large picture may lie
+MAX_LETTERS = 40  # of a value, in an error
 FISHEYE, PRISM, RATIONAL, PANORAMA = "OPENCV_FISHEYE", "THIN_PRISM_FISHEYE", "FULL_OPENCV", "EQUIRECTANGULAR"
 PERSPECTIVES = ("", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", RATIONAL)
 FISHEYES = ("SIMPLE_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", FISHEYE, PRISM)
@@ -82,7 +82,7 @@ def read_intrinsics(values: Mapping[str, Any], width: int, height: int, focal: f
         return _finite(values.get(key, default), key)
 
     w, h = number("w", width), number("h", height)
-    if not all(1 <= side <= LARGEST_SIDE and side.is_integer() for side in (w, h)):
+    if not all(1 <= side <= MAX_SIDE and side.is_integer() for side in (w, h)):
         raise ValueError(f"its w and h are {w:g} and {h:g}")
     along = _focal_length(values, "x", w), _focal_length(values, "y", h)
     given = [one for one in along if one is not None] or [focal * max(w, h)] * (focal > 0)
@@ -110,7 +110,7 @@ def flaw_of(camera: Camera) -> str | None:
     if not all(FOCAL_RATIOS[0] <= value / longer <= FOCAL_RATIOS[1] for value in focal):
         pixels = " × ".join(f"{value:.5g}" for value in focal)
         return f"a focal length of {pixels} pixels is not one for a picture of {camera.width}×{camera.height}"
-    if max(map(abs, centre), default=0.0) > FARTHEST_CENTRE * longer:
+    if max(map(abs, centre), default=0.0) > MAX_CENTRE_OFFSET * longer:
         place = ", ".join(f"{value:.5g}" for value in centre)
         return f"its principal point ({place}) is far outside of its {camera.width}×{camera.height} pixels"
     return None
@@ -135,7 +135,7 @@ def _declared(values: Mapping[str, Any]) -> str:
         raise ValueError(NO_PANORAMAS)
     if declared not in PERSPECTIVES + FISHEYES:
         known = ", ".join((*PERSPECTIVES[1:], *FISHEYES))
-        raise ValueError(f"its camera_model is {repr(declared)[:MOST_LETTERS]}, which is none of {known}")
+        raise ValueError(f"its camera_model is {repr(declared)[:MAX_LETTERS]}, which is none of {known}")
     if other := next((key for key in OTHER_LENSES if values.get(key, False) is not False), None):
         raise ValueError(f"it has {other}: lenses of that kind are not supported")
     return FISHEYE if values.get("is_fisheye") and declared not in FISHEYES else declared
@@ -179,5 +179,5 @@ def _focal_lengths(values: Mapping[str, Any], axis: str, size: float) -> dict[st
 def _finite(value: Any, name: str) -> float:
     number = value if isinstance(value, int | float) and not isinstance(value, bool) else math.nan
     if not abs(number) <= sys.float_info.max:
-        raise ValueError(f"its {name} is {repr(value)[:MOST_LETTERS]}, not a finite number")
+        raise ValueError(f"its {name} is {repr(value)[:MAX_LETTERS]}, not a finite number")
     return float(number)

@@ -20,10 +20,10 @@ from stages.sfm.imported.conventions import (
     found_convention,
     named_axes,
 )
-from stages.sfm.imported.known_cameras import KnownCameras, is_transforms, read_known_cameras
 from stages.sfm.imported.pose_check import check_given_cameras
+from stages.sfm.imported.pose_files import KnownCameras, is_transforms, read_known_cameras
 
-MOST_NAMES = 5
+MAX_NAMES = 5
 
 
 def import_cameras(
@@ -118,7 +118,7 @@ def _note_doubts(check: dict[str, Any], model: SparseModel, photos: Sequence[Pho
         )
     elif check["doubtful"]:
         names = {photo.image_name: photo.name for photo in photos}
-        who = listed([names[file] for file in check["doubtful"]], MOST_NAMES)
+        who = listed([names[file] for file in check["doubtful"]], MAX_NAMES)
         progress.note(
             f"{len(check['doubtful'])} of {len(model.images)} given cameras contradict what their photos show: {who}"
         )

@@ -20,12 +20,11 @@ from jaxtyping import Float
 
 from nerf.geometry.scene import Camera
 from stages.contract import StageError
-from stages.ingest.sources import account_of_ours
+from stages.ingest.sources import own_registration
+from stages.io.colmap_files import MAX_COORDINATE
 from stages.io.photos import Photo
 from stages.io.sparse_model import SparseModel
-from stages.io.transforms_files import MOST_LETTERS, TRAIN, none_among_the_photos, pose_matrix, read_splits
-from stages.io.transforms_intrinsics import contradictions, intrinsics_of, read_intrinsics
-from stages.sfm.colmap.model_files import FARTHEST
+from stages.io.transforms_files import MAX_LETTERS, TRAIN, none_among_the_photos, pose_matrix, read_splits
 from stages.sfm.colmap.models import read_model
 from stages.sfm.imported.conventions import (
     AS_DECLARED,
@@ -37,13 +36,14 @@ from stages.sfm.imported.conventions import (
 )
 from stages.sfm.imported.orientation import fits_only_upright, pixel_map, stored_size
 from stages.sfm.imported.posed_photos import HINT, PosedPhoto, distinct, posed_photo, unusable, without_rays
+from stages.sfm.imported.transforms_intrinsics import contradictions, intrinsics_of, read_intrinsics
 
 # The root mean square stretch of a matrix beside its scale, as an angle, is about what its rotation is off by where the
 # numbers were rounded: 0.02° of three decimals, 0.2° of two. Beyond this a matrix is no rotation.
 MAX_STRETCH_DEG, NOTED_STRETCH_DEG = 0.05, 0.005
 SCALED_WITHIN = 1e-3  # of 1: what rounding makes of a rotation's scale
 MAX_ENTRY = 1e6  # of a matrix that is looked at more closely: products of three of them are numbers
-MOST_NAMES, FEW_NAMES = 5, 2
+MAX_NAMES, MAX_NAMES_OF_ERROR = 5, 2
 APPROXIMATION = "approximation"  # how the note begins of a lens that is not the one it stands for
 
 
@@ -187,7 +187,7 @@ def _listed(content: Mapping[str, Any], key: str, source: str, notes: list[str])
     if not (isinstance(names, list) and all(isinstance(name, str) for name in names)):
         raise unusable("sfm.split-no-list", f"the {key} of {source}", "it is no list of names")
     of_frames = {PurePosixPath(frame["file_path"]) for frame in content["frames"]}
-    strange = [name[:MOST_LETTERS] for name in names if PurePosixPath(name) not in of_frames]
+    strange = [name[:MAX_LETTERS] for name in names if PurePosixPath(name) not in of_frames]
     if strange and len(strange) == len(names):
         raise unusable(
             "sfm.split-of-no-frame",
@@ -259,8 +259,8 @@ def _rigid(matrix: Any, name: str) -> tuple[Float[np.ndarray, "3 4"], _Rotation]
         pose = pose_matrix(matrix)
     except ValueError as error:
         raise unusable("sfm.frame-pose", f"frame {name!r}", str(error)) from error
-    if (place := np.abs(pose[:, 3]).max()) > FARTHEST:
-        why = f"its place is {place:.3g} units from the origin, and the most is {FARTHEST:g}"
+    if (place := np.abs(pose[:, 3]).max()) > MAX_COORDINATE:
+        why = f"its place is {place:.3g} units from the origin, and the most is {MAX_COORDINATE:g}"
         raise unusable("sfm.pose-far-away", f"the transform_matrix of frame {name!r}", why)
     if not (largest := np.abs(pose[:, :3]).max()) <= MAX_ENTRY:
         raise unusable(
@@ -354,7 +354,7 @@ def _is_of_upright_photos(folder: Path, given: SparseModel, photo_of: Mapping[in
     pairs = [(given.images[i], photo) for i, photo in photo_of.items()]
     has_names_of_ingest = all(image.file == photo.image_name for image, photo in pairs)
     return (
-        account_of_ours(folder) is not None
+        own_registration(folder) is not None
         or (has_names_of_ingest and any(photo.image_name != photo.name for _, photo in pairs))
         or any(fits_only_upright(given.cameras[image.camera], photo) for image, photo in pairs)
     )
@@ -451,11 +451,11 @@ def _without_ending(name: str) -> str:
 
 
 def _nothing_matches(source: str, names: Sequence[str], photos: Sequence[Photo]) -> StageError:
-    here = _few([photo.name for photo in photos], FEW_NAMES)
+    here = _few([photo.name for photo in photos], MAX_NAMES_OF_ERROR)
     return StageError(
         "sfm.no-camera-matches",
         f"no camera in {source} belongs to a photo",
-        f"it is of {_few(names, FEW_NAMES)}, and the photos are {here}",
+        f"it is of {_few(names, MAX_NAMES_OF_ERROR)}, and the photos are {here}",
         "Give the folder of the very photos that the cameras were made for.",
     )
 
@@ -477,5 +477,5 @@ def _notes(
     return notes
 
 
-def _few(names: Sequence[str], most: int = MOST_NAMES) -> str:
+def _few(names: Sequence[str], most: int = MAX_NAMES) -> str:
     return ", ".join(names[:most]) + (", …" if len(names) > most else "")

@@ -2,18 +2,16 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pycolmap
 
-from stages.sfm.colmap.held_out import Choice, adjustment_options, choose
-from stages.sfm.colmap.lenses import MODELS, equip, flaws
+from stages.sfm.colmap.camera_model_selection import Choice, adjustment_options, choose
+from stages.sfm.colmap.camera_models import MODELS, equip, flaws
 from stages.sfm.colmap.mapping import pipeline_options
 from stages.sfm.colmap.observations import noise_px, observations
 from stages.sfm.colmap.uncertainty import pose_uncertainty_px
-
-if TYPE_CHECKING:
-    import pycolmap
 
 # The first choice can only go by what mapping's lens let in. Where another one lets in a tenth more, mostly from the
 # borders of wide photos, that is where it shows what it is worth.
@@ -26,7 +24,7 @@ CLOSING_STEPS = (3, 3)  # of the adjustment of all observations, before and afte
 class Finished:
     """The model after the final adjustment and what there is to say about it."""
 
-    model: "pycolmap.Reconstruction"
+    model: pycolmap.Reconstruction
     camera_models: list[dict[str, Any]]  # the comparison, a row per candidate (registration.json)
     notes: list[str]
     uncertainty_px: dict[str, float]  # by the image's name
@@ -34,7 +32,7 @@ class Finished:
 
 
 def finish(
-    mapped: "pycolmap.Reconstruction",
+    mapped: pycolmap.Reconstruction,
     database: Path,
     seed: int,
     camera_model: str | None,
@@ -48,8 +46,6 @@ def finish(
     absurd in the end, unless those of most photos are. Of a model of ``thinned`` matches (thinning.py) the tracks that
     it has are adjusted first; then all matches come back.
     """
-    import pycolmap
-
     if lens_is_known:
         choice = Choice(noise_px(mapped, observations(mapped)), notes=["the camera is kept as given"])
         model = pycolmap.Reconstruction(mapped)
@@ -66,7 +62,7 @@ def finish(
     return _finished(model, choice, _leave_out(model, flaws(model)))
 
 
-def _simplify_absurd(model: "pycolmap.Reconstruction", database: Path, seed: int, choice: Choice) -> None:
+def _simplify_absurd(model: pycolmap.Reconstruction, database: Path, seed: int, choice: Choice) -> None:
     """Make pinholes of absurd cameras, fisheyes excepted, and adjust everything but the other cameras.
 
     They are mostly those of few photos, that show too little to be judged by, or were judged by what others show.
@@ -81,11 +77,11 @@ def _simplify_absurd(model: "pycolmap.Reconstruction", database: Path, seed: int
     choice.notes.append(f"{photos}: the camera came out absurd ({next(iter(absurd.values()))}): {SIMPLEST} instead")
 
 
-def _camera(model: "pycolmap.Reconstruction", image_id: int) -> "pycolmap.Camera":
+def _camera(model: pycolmap.Reconstruction, image_id: int) -> pycolmap.Camera:
     return model.camera(model.image(image_id).camera_id)
 
 
-def _leave_out(model: "pycolmap.Reconstruction", absurd: dict[int, str]) -> dict[str, str]:
+def _leave_out(model: pycolmap.Reconstruction, absurd: dict[int, str]) -> dict[str, str]:
     """Take these photos out of the model: by name why. None where they are most of all: what is left is no scene."""
     if not absurd or 2 * len(absurd) >= model.num_reg_images():
         return {}
@@ -97,7 +93,7 @@ def _leave_out(model: "pycolmap.Reconstruction", absurd: dict[int, str]) -> dict
     return reasons
 
 
-def _finished(model: "pycolmap.Reconstruction", choice: Choice, left_out: dict[str, str]) -> Finished:
+def _finished(model: pycolmap.Reconstruction, choice: Choice, left_out: dict[str, str]) -> Finished:
     notes, uncertainty = choice.notes, {}
     untold = "how well the poses are known cannot be told"
     try:
@@ -111,10 +107,8 @@ def _finished(model: "pycolmap.Reconstruction", choice: Choice, left_out: dict[s
 
 
 def _adjusted(
-    before: "pycolmap.Reconstruction", database: Path, seed: int, choice: Choice, thinned: bool
-) -> "pycolmap.Reconstruction":
-    import pycolmap
-
+    before: pycolmap.Reconstruction, database: Path, seed: int, choice: Choice, thinned: bool
+) -> pycolmap.Reconstruction:
     adjust = _adjust_thinned if thinned else _adjust
     model = pycolmap.Reconstruction(before)
     equip(model, {camera_id: lens.model for camera_id, lens in choice.lenses.items()})
@@ -128,11 +122,11 @@ def _adjusted(
 
 
 def _adjust_thinned(
-    model: "pycolmap.Reconstruction",
+    model: pycolmap.Reconstruction,
     database: Path,
     seed: int,
     constant_cameras: set[int],
-    adjustment: "pycolmap.BundleAdjustmentOptions",
+    adjustment: pycolmap.BundleAdjustmentOptions,
 ) -> None:
     """Adjust cameras, poses and the tracks there are until little changes; then bring back all matches, and adjust all
     of it in a few steps: the long tracks have put everything in its place by then."""
@@ -150,14 +144,12 @@ def _adjust_thinned(
 
 
 def adjust_tracks(
-    model: "pycolmap.Reconstruction",
+    model: pycolmap.Reconstruction,
     constant_cameras: set[int],
-    adjustment: "pycolmap.BundleAdjustmentOptions",
+    adjustment: pycolmap.BundleAdjustmentOptions,
     steps: int = 100,
 ) -> None:
     """Adjust cameras, poses and points to the observations that the model has."""
-    import pycolmap
-
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in sorted(model.reg_image_ids()):
         config.add_image(image_id)
@@ -169,11 +161,11 @@ def adjust_tracks(
 
 
 def _adjust(
-    model: "pycolmap.Reconstruction",
+    model: pycolmap.Reconstruction,
     database: Path,
     seed: int,
     constant_cameras: set[int],
-    adjustment: "pycolmap.BundleAdjustmentOptions",
+    adjustment: pycolmap.BundleAdjustmentOptions,
 ) -> None:
     """Complete, merge and filter tracks and adjust everything together, until little changes."""
     mapper, options = _mapper(model, database, seed, constant_cameras)
@@ -189,11 +181,9 @@ def _adjust(
 
 
 def _mapper(
-    model: "pycolmap.Reconstruction", database: Path, seed: int, constant_cameras: set[int]
-) -> "tuple[pycolmap.IncrementalMapper, pycolmap.IncrementalPipelineOptions]":
+    model: pycolmap.Reconstruction, database: Path, seed: int, constant_cameras: set[int]
+) -> tuple[pycolmap.IncrementalMapper, pycolmap.IncrementalPipelineOptions]:
     """A mapper that works on the model with all matches of the database, and its options."""
-    import pycolmap
-
     options = pipeline_options(seed)
     options.mapper.constant_cameras = constant_cameras
     with pycolmap.Database.open(database) as db:

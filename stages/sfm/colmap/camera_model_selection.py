@@ -8,16 +8,14 @@ bends the poses; one that is too rich fits noise, and bends them too.
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import pycolmap
 from jaxtyping import Float, Int
 
-from stages.sfm.colmap.lenses import MODELS, Lens, equip, flaws
+from stages.sfm.colmap.camera_models import MODELS, Lens, equip, flaws
 from stages.sfm.colmap.observations import Observations, noise_px, observations, residuals
-
-if TYPE_CHECKING:
-    import pycolmap
 
 # Points for the comparison are drawn until they have so many observations: 14 candidates then take seconds.
 MOST_OBSERVATIONS = 20_000
@@ -59,7 +57,7 @@ class Choice:
     notes: list[str] = field(default_factory=list)
 
 
-def choose(mapped: "pycolmap.Reconstruction", seed: int, models: Sequence[str] = MODELS) -> Choice:
+def choose(mapped: pycolmap.Reconstruction, seed: int, models: Sequence[str] = MODELS) -> Choice:
     """The lens of every camera, of these models.
 
     A camera is judged by its own photos alone where they share enough points, and the others all together, each
@@ -87,7 +85,7 @@ def choose(mapped: "pycolmap.Reconstruction", seed: int, models: Sequence[str] =
 
 
 def _verdict(
-    mapped: "pycolmap.Reconstruction", cameras: list[int], seed: int, models: Sequence[str], noise: float
+    mapped: pycolmap.Reconstruction, cameras: list[int], seed: int, models: Sequence[str], noise: float
 ) -> Verdict:
     """Let every candidate foretell what these cameras saw."""
     sample = _part(mapped, cameras)
@@ -105,7 +103,7 @@ def _verdict(
     return Verdict(cameras, photos, chosen, rows, _reason(chosen, trials, cells))
 
 
-def _groups(mapped: "pycolmap.Reconstruction", cameras: list[int]) -> list[list[int]]:
+def _groups(mapped: pycolmap.Reconstruction, cameras: list[int]) -> list[list[int]]:
     """Cameras that are judged together: each one whose photos share enough points alone, then all others."""
     if len(cameras) == 1:
         return [cameras]
@@ -119,10 +117,8 @@ def _groups(mapped: "pycolmap.Reconstruction", cameras: list[int]) -> list[list[
     return [[camera] for camera in alone] + ([others] if others else [])
 
 
-def _part(mapped: "pycolmap.Reconstruction", cameras: list[int]) -> "pycolmap.Reconstruction":
+def _part(mapped: pycolmap.Reconstruction, cameras: list[int]) -> pycolmap.Reconstruction:
     """The photos of these cameras and the points that two of them see."""
-    import pycolmap
-
     part = pycolmap.Reconstruction(mapped)
     for image_id in sorted(part.reg_image_ids()):
         if part.image(image_id).camera_id not in cameras:
@@ -130,7 +126,7 @@ def _part(mapped: "pycolmap.Reconstruction", cameras: list[int]) -> "pycolmap.Re
     return part
 
 
-def hold_out(model: "pycolmap.Reconstruction", seed: int, most: int) -> Observations:
+def hold_out(model: pycolmap.Reconstruction, seed: int, most: int) -> Observations:
     """Reduce a model to points drawn until they have so many observations; take one of each with three or more away.
 
     Which one is drawn too, so they come from all photos. Two are left, and so every point keeps its place.
@@ -158,7 +154,7 @@ def hold_out(model: "pycolmap.Reconstruction", seed: int, most: int) -> Observat
     )
 
 
-def _cells(seen: Observations, model: "pycolmap.Reconstruction") -> Int[np.ndarray, "n"]:
+def _cells(seen: Observations, model: pycolmap.Reconstruction) -> Int[np.ndarray, "n"]:
     """In which part of which photo an observation lies."""
     size = {i: (c.width, c.height) for i in model.reg_image_ids() for c in [model.camera(model.image(i).camera_id)]}
     part = seen.xy / np.array([size[i] for i in seen.image.tolist()], float).reshape(-1, 2)
@@ -167,11 +163,9 @@ def _cells(seen: Observations, model: "pycolmap.Reconstruction") -> Int[np.ndarr
 
 
 def _trials(
-    sample: "pycolmap.Reconstruction", held_out: Observations, models: Sequence[str], noise: float
+    sample: pycolmap.Reconstruction, held_out: Observations, models: Sequence[str], noise: float
 ) -> Iterator[Trial]:
     """Every candidate adjusted to the sample; with a refined principal point it goes on from where it was centred."""
-    import pycolmap
-
     trained = observations(sample)
     cameras = sorted({sample.image(i).camera_id for i in sample.reg_image_ids()})
     _adjust(sample, False, noise)  # most of the way is the same for all candidates
@@ -187,9 +181,7 @@ def _trials(
             yield Trial(Lens(name, principal_point), error, noise_px(model, trained), why)
 
 
-def _adjust(model: "pycolmap.Reconstruction", principal_point: bool, noise: float) -> None:
-    import pycolmap
-
+def _adjust(model: pycolmap.Reconstruction, principal_point: bool, noise: float) -> None:
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in sorted(model.reg_image_ids()):
         config.add_image(image_id)
@@ -199,15 +191,13 @@ def _adjust(model: "pycolmap.Reconstruction", principal_point: bool, noise: floa
     pycolmap.create_default_bundle_adjuster(options, config, model).solve()
 
 
-def adjustment_options(principal_point: bool, noise: float) -> "pycolmap.BundleAdjustmentOptions":
+def adjustment_options(principal_point: bool, noise: float) -> pycolmap.BundleAdjustmentOptions:
     """Of comparison and final adjustment alike.
 
     Residuals r count by soft-L1, 2s²(√(1 + (r/s)²) − 1), with s the ``noise`` of the observations: beyond it they pull
     with a force that grows no more, so that the mismatches that remain do not bend the cameras. Were the noise
     Gaussian, this would cost 7 % of its efficiency (Huber 1981, section 7.6: E[ψ']² / E[ψ²] in two dimensions).
     """
-    import pycolmap
-
     options = pycolmap.BundleAdjustmentOptions(refine_principal_point=principal_point, print_summary=False)
     options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
     options.ceres.loss_function_scale = noise

@@ -38,8 +38,8 @@ CAMERA_MODELS = {
     17: ("EQUIRECTANGULAR", 2),
 }
 PARAMETERS = dict(CAMERA_MODELS.values())
-LARGEST_SIDE = 2**31 - 1
-FARTHEST = 1e30  # of anything, in its units: squares and products of three such numbers are numbers, too
+MAX_SIDE = 2**31 - 1
+MAX_COORDINATE = 1e30  # of anything, in its units: squares and products of three such numbers are numbers, too
 NO_POINT = -1
 
 Entry = TypeVar("Entry")
@@ -119,21 +119,23 @@ def _by_id(entries: Iterator[tuple[int, Entry]]) -> dict[int, Entry]:
 
 def _check(model: ModelFiles) -> None:
     for number, camera in model.cameras.items():
-        if not (1 <= camera.width <= LARGEST_SIDE and 1 <= camera.height <= LARGEST_SIDE):
+        if not (1 <= camera.width <= MAX_SIDE and 1 <= camera.height <= MAX_SIDE):
             raise ValueError(f"camera {number} has {camera.width:.6g}×{camera.height:.6g} pixels")
     ids = np.array(sorted(model.points), np.int64)
     for image in model.images.values():
         if image.camera not in model.cameras:
             raise ValueError(f"image {image.name} is of camera {image.camera}, which is not there")
-        if not (np.isfinite(image.pose).all() and image.pose[:4].any() and np.abs(image.pose[4:]).max() <= FARTHEST):
+        if not (
+            np.isfinite(image.pose).all() and image.pose[:4].any() and np.abs(image.pose[4:]).max() <= MAX_COORDINATE
+        ):
             raise ValueError(f"image {image.name} has no pose: {', '.join(f'{v:.6g}' for v in image.pose)}")
         seen = image.points != NO_POINT
-        if not (np.abs(image.xy[seen]) <= FARTHEST).all():
+        if not (np.abs(image.xy[seen]) <= MAX_COORDINATE).all():
             raise ValueError(f"image {image.name} has keypoints that are nowhere")
         if (unknown := ~np.isin(image.points, ids) & seen).any():
             raise ValueError(f"image {image.name} sees point {image.points[unknown][0]}, which is not there")
     for number, point in model.points.items():
-        if not (np.abs(point.xyz) <= FARTHEST).all():
+        if not (np.abs(point.xyz) <= MAX_COORDINATE).all():
             raise ValueError(f"point {number} is nowhere: {', '.join(f'{v:.6g}' for v in point.xyz)}")
 
 

@@ -1,16 +1,15 @@
 """Camera models: the candidates, how a mapped camera becomes one of them, and when one is absurd."""
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+import pycolmap
 from jaxtyping import Float
+from scipy.optimize import least_squares
 
 from stages.ingest.exif import FOCAL_RANGE
 from stages.sfm.colmap.cameras import is_fisheye, share_without_ray, why_no_ray
 from stages.sfm.colmap.observations import observations, points_in_camera
-
-if TYPE_CHECKING:
-    import pycolmap
 
 MODELS = (
     "SIMPLE_PINHOLE",
@@ -34,8 +33,6 @@ class Lens(NamedTuple):
     @property
     def free_parameters(self) -> int:
         """How many numbers of the camera are refined."""
-        import pycolmap
-
         parameters = pycolmap.Camera.create_from_model_name(1, self.model, 1.0, 2, 2).params
         return len(parameters) - 2 * (not self.principal_point)
 
@@ -54,7 +51,7 @@ class Lens(NamedTuple):
         return "refined" if self.principal_point else "centred"
 
 
-def equip(model: "pycolmap.Reconstruction", lenses: dict[int, str]) -> None:
+def equip(model: pycolmap.Reconstruction, lenses: dict[int, str]) -> None:
     """Give cameras (by id) the models named and centred principal points, to draw their points where they were drawn.
 
     Cameras without points stay as they are.
@@ -73,11 +70,8 @@ def equip(model: "pycolmap.Reconstruction", lenses: dict[int, str]) -> None:
             camera.model, camera.params = new.model, list(new.params)
 
 
-def _fitted(camera: "pycolmap.Camera", name: str, points: Float[np.ndarray, "n 3"]) -> "pycolmap.Camera":
+def _fitted(camera: pycolmap.Camera, name: str, points: Float[np.ndarray, "n 3"]) -> pycolmap.Camera:
     """The centred camera of a model that projects points in the camera's frame most nearly as this one does."""
-    import pycolmap
-    from scipy.optimize import least_squares
-
     target = np.asarray(camera.img_from_cam(points))
     points, target = points[np.isfinite(target[:, 0])], target[np.isfinite(target[:, 0])]
     new = pycolmap.Camera.create_from_model_name(
@@ -97,7 +91,7 @@ def _fitted(camera: "pycolmap.Camera", name: str, points: Float[np.ndarray, "n 3
     return new
 
 
-def flaw(camera: "pycolmap.Camera") -> str | None:
+def flaw(camera: pycolmap.Camera) -> str | None:
     """What makes an adjusted camera absurd, or None."""
     size = np.array([camera.width, camera.height])
     params = np.array(camera.params)
@@ -113,7 +107,7 @@ def flaw(camera: "pycolmap.Camera") -> str | None:
     return f"{why_no_ray(camera.model_name)} at {lost:.1%} of the pixels" if lost else None
 
 
-def flaws(model: "pycolmap.Reconstruction") -> dict[int, str]:
+def flaws(model: pycolmap.Reconstruction) -> dict[int, str]:
     """The registered photos whose camera is absurd, by image id, and what makes it so."""
     camera_of = {i: model.image(i).camera_id for i in sorted(model.reg_image_ids())}
     found = {camera_id: flaw(model.camera(camera_id)) for camera_id in set(camera_of.values())}

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from nerf.geometry.scene import Camera
-from stages.sfm.colmap import lenses, refinement
+from stages.sfm.colmap import camera_models, final_bundle_adjustment
+from stages.sfm.colmap.camera_model_selection import Choice, choose, hold_out, paired
+from stages.sfm.colmap.camera_models import MODELS, Lens, equip, flaw
 from stages.sfm.colmap.cameras import native
-from stages.sfm.colmap.held_out import Choice, choose, hold_out, paired
-from stages.sfm.colmap.lenses import MODELS, Lens, equip, flaw
 from stages.sfm.colmap.observations import noise_px, observations, residuals
 from tests.stages.sfm.colmap.lens_scene import HEIGHT, WIDTH, adjust, lens, mapped, photographed
 
@@ -114,7 +114,7 @@ def test_cameras_with_few_photos_are_judged_together() -> None:
 
 
 def test_where_every_candidate_is_absurd_the_camera_stays(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(lenses, "flaw", lambda camera: "it is absurd")
+    monkeypatch.setattr(camera_models, "flaw", lambda camera: "it is absurd")
     choice = choose(mapped(photographed(PINHOLE, photos=6, points=80)), 0)
     assert choice.lenses == {1: Lens("SIMPLE_RADIAL", False)}
     assert {row["reason"] for row in choice.table} == {"it is absurd"}
@@ -122,10 +122,10 @@ def test_where_every_candidate_is_absurd_the_camera_stays(monkeypatch: pytest.Mo
 
 
 def test_a_few_photos_with_absurd_cameras_do_not_decide_for_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(lenses, "flaw", lambda camera: "it is absurd" if camera.camera_id == 5 else flaw(camera))
+    monkeypatch.setattr(camera_models, "flaw", lambda camera: "it is absurd" if camera.camera_id == 5 else flaw(camera))
     choice = choose(mapped(photographed(*5 * [PINHOLE], points=100)), 0)  # two photos each
     assert choice.lenses == dict.fromkeys(range(1, 6), Lens("SIMPLE_PINHOLE", False))
-    monkeypatch.setattr(lenses, "flaw", lambda camera: "it is absurd" if camera.camera_id > 3 else flaw(camera))
+    monkeypatch.setattr(camera_models, "flaw", lambda camera: "it is absurd" if camera.camera_id > 3 else flaw(camera))
     choice = choose(mapped(photographed(*5 * [PINHOLE], points=100)), 0)
     assert choice.lenses == dict.fromkeys(range(1, 6), Lens("SIMPLE_RADIAL", False)), "as mapping had them"
 
@@ -219,13 +219,13 @@ def test_where_the_chosen_lens_lets_many_more_observations_in_it_is_chosen_again
         asked.append(before)
         return many
 
-    monkeypatch.setattr(refinement, "_adjusted", adjusted)
-    finished = refinement.finish(few, Path("matches.db"), 0, None, False)
+    monkeypatch.setattr(final_bundle_adjustment, "_adjusted", adjusted)
+    finished = final_bundle_adjustment.finish(few, Path("matches.db"), 0, None, False)
     assert asked == [few, many]
     assert finished.model is many
     assert sorted(finished.uncertainty_px) == [f"{i:02d}.jpg" for i in range(1, 7)]
     asked.clear()
-    refinement.finish(many, Path("matches.db"), 0, None, False)
+    final_bundle_adjustment.finish(many, Path("matches.db"), 0, None, False)
     assert asked == [many]
 
 
@@ -234,15 +234,15 @@ def with_a_bad_lens(monkeypatch: pytest.MonkeyPatch, *cameras: Camera) -> "pycol
     model = photographed(*cameras, points=300)
     bad = model.camera(len(cameras))
     bad.model, bad.params = native(lens("SIMPLE_RADIAL", 800, *CENTRE, -0.5)).model, [800, *CENTRE, -0.5]
-    monkeypatch.setattr(refinement, "choose", lambda *_: Choice(0.5))
-    monkeypatch.setattr(refinement, "_adjusted", lambda *_: model)
-    monkeypatch.setattr(refinement, "_adjust", lambda model, *_: adjust(model))
+    monkeypatch.setattr(final_bundle_adjustment, "choose", lambda *_: Choice(0.5))
+    monkeypatch.setattr(final_bundle_adjustment, "_adjusted", lambda *_: model)
+    monkeypatch.setattr(final_bundle_adjustment, "_adjust", lambda model, *_: adjust(model))
     return model
 
 
 def test_a_camera_that_comes_out_absurd_becomes_a_pinhole(monkeypatch: pytest.MonkeyPatch) -> None:
     model = with_a_bad_lens(monkeypatch, *5 * [PINHOLE])
-    finished = refinement.finish(model, Path("matches.db"), 0, None, False)
+    finished = final_bundle_adjustment.finish(model, Path("matches.db"), 0, None, False)
     assert finished.model.camera(5).model_name == "SIMPLE_PINHOLE"
     assert finished.model.camera(5).mean_focal_length() == pytest.approx(900, rel=0.005)
     assert finished.left_out == {} and finished.model.num_reg_images() == 10
@@ -254,8 +254,8 @@ def test_a_camera_that_comes_out_absurd_becomes_a_pinhole(monkeypatch: pytest.Mo
 
 def test_photos_whose_camera_stays_absurd_lose_their_places(monkeypatch: pytest.MonkeyPatch) -> None:
     model = with_a_bad_lens(monkeypatch, *5 * [PINHOLE])
-    monkeypatch.setattr(lenses, "flaw", lambda camera: "it is absurd" if camera.camera_id == 5 else None)
-    finished = refinement.finish(model, Path("matches.db"), 0, None, False)
+    monkeypatch.setattr(camera_models, "flaw", lambda camera: "it is absurd" if camera.camera_id == 5 else None)
+    finished = final_bundle_adjustment.finish(model, Path("matches.db"), 0, None, False)
     assert finished.left_out == dict.fromkeys(("04.jpg", "09.jpg"), "its camera came out absurd: it is absurd")
     assert finished.model.num_reg_images() == len(finished.uncertainty_px) == 8
     assert sorted(finished.model.cameras) == [1, 2, 3, 4]
@@ -263,6 +263,6 @@ def test_photos_whose_camera_stays_absurd_lose_their_places(monkeypatch: pytest.
 
 def test_where_most_cameras_are_absurd_none_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     model = with_a_bad_lens(monkeypatch, PINHOLE)
-    monkeypatch.setattr(lenses, "flaw", lambda camera: "it is absurd")
-    finished = refinement.finish(model, Path("matches.db"), 0, None, False)
+    monkeypatch.setattr(camera_models, "flaw", lambda camera: "it is absurd")
+    finished = final_bundle_adjustment.finish(model, Path("matches.db"), 0, None, False)
     assert finished.left_out == {} and finished.model.num_reg_images() == 10

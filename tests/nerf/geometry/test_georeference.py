@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from nerf.geometry.camera_paths import nearest_rotations
+from nerf.geometry.georeference import ONE_LINE, Georeference, east_north_up, georeference
 from nerf.geometry.scene import Similarity
-from stages.normalise.georeference import ONE_LINE, Georeference, east_north_up, georeference
 
 HERE = (47.3769, 8.5417, 408.0)
 METRES_PER_DEGREE = 111_178.0  # northwards at 47 degrees
@@ -27,8 +27,8 @@ SFM_FROM_ENU = Similarity(0.13, nearest_rotations(np.random.default_rng(3).norma
 
 
 def test_east_north_and_up_are_what_they_say() -> None:
-    np.testing.assert_allclose(east_north_up(0, 0), [[0, 1, 0], [0, 0, 1], [1, 0, 0]], atol=1e-15)
-    np.testing.assert_allclose(east_north_up(90, 0)[2], [0, 0, 1], atol=1e-15)
+    np.testing.assert_allclose(east_north_up(0.0, 0.0), [[0, 1, 0], [0, 0, 1], [1, 0, 0]], atol=1e-15)
+    np.testing.assert_allclose(east_north_up(90.0, 0.0)[2], [0, 0, 1], atol=1e-15)
     turned = east_north_up(*HERE[:2])
     np.testing.assert_allclose(turned @ turned.T, np.eye(3), atol=1e-15)
 
@@ -59,8 +59,8 @@ def test_a_few_wrong_places_do_no_harm() -> None:
 @pytest.mark.parametrize(
     ("enu", "why"),
     [
-        (walked()[:3], "3 registered photos tell where they were taken, 4 are needed"),
-        (walked(radius_m=3) * [1, 1, 0], "their places lie within 3 m, and GPS errs by up to 10 m"),
+        (walked()[:3], "3 registered photos have a GPS position, 4 are needed"),
+        (walked(radius_m=3) * [1, 1, 0], "their positions lie within 3 m, and GPS errs by up to 10 m"),
         (
             np.linspace(0, 90, 7)[:, None] * [1.0, 0, 0],
             "they were taken along one line, which leaves open how the scene is turned about it",
@@ -91,4 +91,4 @@ def test_places_that_have_nothing_to_do_with_the_photos_are_refused() -> None:
     told = np.random.default_rng(1).normal(0, 60, (12, 3))
     why = georeference(SFM_FROM_ENU.points(walked()), places(told))
     assert isinstance(why, str)
-    assert re.fullmatch(r"their places, \d+ m apart, are \d+ m off where the photos put them", why)
+    assert re.fullmatch(r"their GPS positions, \d+ m apart, are \d+ m off the reconstruction", why)

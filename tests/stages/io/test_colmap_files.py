@@ -9,7 +9,7 @@ import pycolmap
 import pytest
 
 from stages.contract import StageError
-from stages.sfm.colmap.model_files import CAMERA_MODELS, read_model_files
+from stages.io.colmap_files import CAMERA_MODELS, read_model_files
 from stages.sfm.colmap.models import read_model, world_from_camera
 from tests.fuzz.cameras import colmap_models
 from tests.refusals import refused

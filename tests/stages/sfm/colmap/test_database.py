@@ -8,10 +8,10 @@ import numpy as np
 import pycolmap
 import pytest
 
+import stages.sfm.colmap.database as database_module
 from stages.io.photos import Photo
-from stages.sfm.colmap import matching
+from stages.sfm.colmap.database import fill_database, hold_open, look_alike, match_pairs
 from stages.sfm.colmap.diagnosis import links
-from stages.sfm.colmap.matching import fill_database, hold_open, look_alike, match_pairs
 from stages.sfm.pairs.pair_selection import exhaustive
 from tests.stages.sfm.pairs.test_feature_matching import random_descriptors
 
@@ -92,7 +92,7 @@ def test_verified_matches_are_those_of_colmaps_own_verification(database: Path) 
 def test_the_number_of_cores_changes_nothing(database: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     results = []
     for cores in (1, 4):
-        monkeypatch.setattr(matching, "processors", lambda cores=cores: cores)
+        monkeypatch.setattr(database_module, "processors", lambda cores=cores: cores)
         copy = copy_of(database, f"{cores}.db")
         match_pairs(copy, exhaustive(COUNT), 0, 0.8)
         results.append(found(copy))
@@ -103,8 +103,8 @@ def test_only_what_is_missing_is_matched(database: Path, monkeypatch: pytest.Mon
     whole = copy_of(database, "whole.db")
     match_pairs(whole, exhaustive(COUNT), 0, 0.8)
     match_pairs(database, exhaustive(COUNT)[::2], 0, 0.8)
-    told, tried, real = [], [], matching._match
-    monkeypatch.setattr(matching, "_match", lambda *args: tried.append(args) or real(*args))
+    told, tried, real = [], [], database_module._match
+    monkeypatch.setattr(database_module, "_match", lambda *args: tried.append(args) or real(*args))
     match_pairs(database, exhaustive(COUNT), 0, 0.8, lambda pairs, seconds: told.append((pairs, seconds)))
     assert len(tried) == 7  # 8 of 15 were there
     assert [pairs for pairs, _ in told] == [7] and told[0][1] > 0
@@ -115,11 +115,11 @@ def test_only_what_is_missing_is_matched(database: Path, monkeypatch: pytest.Mon
 
 def test_the_first_block_is_spread_over_all_pairs() -> None:
     pairs = [(i, j) for i in range(40) for j in range(i + 1, 40)]
-    order = matching._spread(pairs)
+    order = database_module._spread(pairs)
     assert sorted(order) == pairs
-    firsts = [i for i, _ in order[: matching.BLOCK_SIZE]]
+    firsts = [i for i, _ in order[: database_module.BLOCK_SIZE]]
     assert min(firsts) == 0 and max(firsts) > 30
-    assert matching._spread([]) == []
+    assert database_module._spread([]) == []
 
 
 def test_photos_of_the_same_points_look_alike(database: Path) -> None:

@@ -1,7 +1,7 @@
 """How far to search features and which pairs of photos to match, decided beforehand.
 
 The cost is measured on a few of the photos, in a child process (COLMAP may abort): ``python -P -m
-stages.sfm.pairs.matching_plan`` reads a job from stdin as one line of JSON and answers with a :class:`Cost`.
+stages.sfm.pairs.quality_level`` reads a job from stdin as one line of JSON and answers with a :class:`Cost`.
 """
 
 import json
@@ -13,21 +13,29 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
+from stages.amounts import rough_duration
 from stages.contract import Progress, StageError
 from stages.hardware.device import processors
-from stages.io.amounts import rough_duration
-from stages.io.photos import evenly_spread
+from stages.io.photos import Photo, spread
+from stages.sfm.colmap.database import (
+    STRICT_RATIO,
+    Features,
+    Search,
+    extract_features,
+    fill_database,
+    match_pairs,
+    read_vocabulary,
+)
+from stages.sfm.colmap.mapping import MAPPING_MODEL
+from stages.sfm.pairs import Matcher
+from stages.sfm.pairs.image_retrieval import CELLS
+from stages.sfm.pairs.pair_selection import Places, choose, exhaustive, expected_pairs, places_of
 from stages.sfm.worker_process import environment
 
-if TYPE_CHECKING:
-    from stages.io.photos import Photo
-    from stages.sfm import Matcher
-    from stages.sfm.pairs.pair_selection import Places
-
 FEWEST_MEASURED = 4
-COMMAND = ["-P", "-m", "stages.sfm.pairs.matching_plan"]
+COMMAND = ["-P", "-m", "stages.sfm.pairs.quality_level"]
 WAYS = {
     "sequential": "neighbours in time, up to {} each",
     "spatial": "neighbours by GPS position and similarity, up to {} each",
@@ -59,7 +67,7 @@ class Open(NamedTuple):
 
     max_image_size: int | None
     max_features: int | None
-    matcher: "Matcher | None"
+    matcher: Matcher | None
 
 
 class Chosen(NamedTuple):
@@ -67,7 +75,7 @@ class Chosen(NamedTuple):
 
     max_image_size: int
     max_features: int
-    matcher: "Matcher"
+    matcher: Matcher
 
 
 class Cost(NamedTuple):
@@ -81,7 +89,7 @@ class Cost(NamedTuple):
         return photos * self.per_photo + pairs * self.per_pair
 
 
-def check_matcher(matcher: "Matcher | None", places: "Places") -> None:
+def check_matcher(matcher: Matcher | None, places: Places) -> None:
     """Raises StageError where a matcher was asked for that the photos do not allow."""
     if matcher == "spatial" and places.position_m is None:
         raise StageError(
@@ -94,7 +102,7 @@ def check_matcher(matcher: "Matcher | None", places: "Places") -> None:
 
 def chosen(
     left_open: Open,
-    photos: "Sequence[Photo]",
+    photos: Sequence[Photo],
     images: Path,
     neighbours: int,
     progress: Progress,
@@ -103,8 +111,6 @@ def chosen(
     """What is left open: the pairs by how many photos there are, and features in full, unless ``seconds_given`` to all
     of structure from motion would not be enough for them. Then some photos are timed on this machine, which is said.
     """
-    from stages.sfm.pairs.pair_selection import choose, expected_pairs, places_of
-
     count, tiers = len(photos), tiers_of(left_open)
     matcher = left_open.matcher or choose(count, neighbours, places_of(photos))
     pairs = expected_pairs(matcher, count, neighbours)
@@ -149,7 +155,7 @@ def _in_words(tier: Tier) -> str:
     return f"{tier.max_image_size} pixels for {tier.max_features} features"
 
 
-def _measured(photos: "Sequence[Photo]", images: Path, tier: Tier, matcher: "Matcher") -> Cost:
+def _measured(photos: Sequence[Photo], images: Path, tier: Tier, matcher: Matcher) -> Cost:
     """Measured in a child process, all cores at work. Raises StageError where it does not end well."""
     some = [asdict(photo) for photo in _sample(photos, processors())]
     indexed = matcher != "exhaustive"
@@ -166,12 +172,12 @@ def _measured(photos: "Sequence[Photo]", images: Path, tier: Tier, matcher: "Mat
     return Cost(**json.loads(answer.stdout))
 
 
-def _sample(photos: "Sequence[Photo]", cores: int) -> "list[Photo]":
+def _sample(photos: Sequence[Photo], cores: int) -> list[Photo]:
     """Two neighbours each from all over the list, at least four photos and enough for all cores.
 
     Neighbours in the list see much the same, those of different parts often nothing: both kinds of pairs are timed.
     """
-    first = evenly_spread(len(photos), max(FEWEST_MEASURED, cores) // 2)
+    first = spread(len(photos), max(FEWEST_MEASURED, cores) // 2)
     return [
         photos[index] for index in sorted({one for index in first for one in (index, index + 1)}) if index < len(photos)
     ]
@@ -190,20 +196,6 @@ def main() -> None:
 
 def measure(images: str, photos: list[dict[str, Any]], max_image_size: int, max_features: int, indexed: bool) -> Cost:
     """What these photos take."""
-    from stages.io.photos import Photo
-    from stages.sfm.colmap.mapping import MAPPING_MODEL
-    from stages.sfm.colmap.matching import (
-        STRICT_RATIO,
-        Features,
-        Search,
-        extract_features,
-        fill_database,
-        match_pairs,
-        read_vocabulary,
-    )
-    from stages.sfm.pairs.image_retrieval import CELLS
-    from stages.sfm.pairs.pair_selection import exhaustive
-
     some = [Photo(**photo) for photo in photos]
     pairs = exhaustive(len(some))
     with tempfile.TemporaryDirectory() as scratch:

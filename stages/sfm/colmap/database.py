@@ -9,21 +9,18 @@ from contextlib import suppress
 from functools import partial
 from itertools import combinations, product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import pycolmap
 from jaxtyping import Bool
 
 from stages.hardware.device import processors
 from stages.hardware.memory import at_once
+from stages.io.photos import Photo
 from stages.sfm.pairs.feature_matching import IndexedFeatures, index_features, match_descriptors, match_indexed
 from stages.sfm.pairs.image_retrieval import WORDS, Words, photo_similarity, vocabulary
 from stages.sfm.pairs.pair_selection import Pairs, SimilarityMatrix
-
-if TYPE_CHECKING:
-    import pycolmap
-
-    from stages.io.photos import Photo
 
 FOCAL_GUESS = 1.2  # focal length over the longer side where EXIF is silent: 45 degrees, a phone's wide lens
 # Lowe's ratio: 0.8 is SIFT's own. 0.9 lets in many mismatches, most of which verification throws out again, and
@@ -38,15 +35,13 @@ OPENINGS, PAUSE_SECONDS = 50, 0.1  # a reader holds the lock for milliseconds
 CACHED_PHOTOS = 256  # whose features are held in memory, about half a megabyte each
 
 
-def hold_open(database: Path) -> "pycolmap.Database":
+def hold_open(database: Path) -> pycolmap.Database:
     """A connection to keep for as long as another process reads along.
 
     Whoever opens the database first or closes it last has to be alone in it, and COLMAP does not wait for that: it
     fails. With this connection there no other one is the first or the last. Raises RuntimeError where it cannot be
     opened for seconds.
     """
-    import pycolmap
-
     for _ in range(OPENINGS - 1):
         with suppress(RuntimeError):
             return pycolmap.Database.open(database)
@@ -55,14 +50,12 @@ def hold_open(database: Path) -> "pycolmap.Database":
 
 
 def fill_database(
-    database: Path, photos: "Sequence[Photo]", camera_model: str, camera_params: Sequence[float] | None = None
+    database: Path, photos: Sequence[Photo], camera_model: str, camera_params: Sequence[float] | None = None
 ) -> None:
     """Enter photos (in order of ``file``) and one camera per camera group, all or nothing.
 
     Known ``camera_params`` are those of one camera for all photos.
     """
-    import pycolmap
-
     with pycolmap.Database.open(database) as db, pycolmap.DatabaseTransaction(db):
         if db.num_images():
             return
@@ -80,10 +73,8 @@ def fill_database(
             db.write_frame(frame, use_frame_id=True)
 
 
-def _first_guess(photo: "Photo", model: str, params: Sequence[float] | None, camera_id: int) -> "pycolmap.Camera":
+def _first_guess(photo: Photo, model: str, params: Sequence[float] | None, camera_id: int) -> pycolmap.Camera:
     """The camera of a photo: as it is known, by EXIF's focal length, or by a guess."""
-    import pycolmap
-
     size = photo.width, photo.height
     if params is not None:
         camera = pycolmap.Camera(camera_id=camera_id, model=model, width=size[0], height=size[1], params=list(params))
@@ -102,9 +93,7 @@ def fisheye_focal_px(width: int, height: int) -> float:
     return math.hypot(width, height) / math.radians(FISHEYE_ANGLE_DEG)
 
 
-def _enter_camera(db: "pycolmap.Database", camera: "pycolmap.Camera") -> None:
-    import pycolmap
-
+def _enter_camera(db: pycolmap.Database, camera: pycolmap.Camera) -> None:
     db.write_camera(camera, use_camera_id=True)
     rig = pycolmap.Rig(rig_id=camera.camera_id)
     rig.add_ref_sensor(camera.sensor_id)
@@ -121,10 +110,10 @@ class Search(NamedTuple):
     doubled_up_to: int = 1024
 
 
-def feature_bytes(photos: "Sequence[Photo]", search: Search) -> float:
+def feature_bytes(photos: Sequence[Photo], search: Search) -> float:
     """Memory that searching the largest of the photos takes, by its pixels as they are searched."""
 
-    def searched(photo: "Photo") -> float:
+    def searched(photo: Photo) -> float:
         longer = max(photo.width, photo.height)
         scale = min(1.0, search.max_image_size / longer) * (2 if longer <= search.doubled_up_to else 1)
         return photo.width * photo.height * scale**2
@@ -132,15 +121,13 @@ def feature_bytes(photos: "Sequence[Photo]", search: Search) -> float:
     return BYTES_PER_SEARCHED_PIXEL * max(map(searched, photos))
 
 
-def extract_features(database: Path, images: Path, photos: "Sequence[Photo]", search: Search) -> None:
+def extract_features(database: Path, images: Path, photos: Sequence[Photo], search: Search) -> None:
     """SIFT keypoints and descriptors of every photo that has none yet, where ``masks/<image name>.png`` is not black,
     or anywhere where that is not there.
 
     Photos are searched from their own size down. Doubling them first, as is COLMAP's habit, costs 4.5 times as
     much and moves no camera of a well-sized photo (benchmarks/sfm_accuracy.py), so only small ones are doubled.
     """
-    import pycolmap
-
     options = pycolmap.FeatureExtractionOptions()
     options.max_image_size = search.max_image_size
     options.sift.max_num_features = search.max_features
@@ -177,8 +164,6 @@ def match_pairs(
     features are compared, exactly without it, and keeps those that were read for further calls. ``on_expected`` is
     told how many pairs there are to match and how long it will take, once a first block, spread over all, is done.
     """
-    import pycolmap
-
     options = _verification(seed)
     with pycolmap.Database.open(database) as db, ThreadPoolExecutor(processors()) as pool:
         todo = _spread([(i, j) for i, j in pairs.tolist() if not db.exists_two_view_geometry(i + 1, j + 1)])
@@ -210,7 +195,7 @@ def _spread(pairs: list[tuple[int, int]]) -> list[tuple[int, int]]:
 
 
 class _Photo(NamedTuple):
-    camera: "pycolmap.Camera"
+    camera: pycolmap.Camera
     places: np.ndarray  # (keypoints, 2), pixels
     features: Any  # descriptors, (keypoints, 128) bytes, or IndexedFeatures of them
 
@@ -223,7 +208,7 @@ class Features:
         self._words = words
         self._photos: dict[int, _Photo] = {}
 
-    def read(self, db: "pycolmap.Database", photo: int) -> _Photo:
+    def read(self, db: pycolmap.Database, photo: int) -> _Photo:
         """Those of the photo with this number."""
         if (found := self._photos.pop(photo, None)) is None:
             camera = db.read_camera(db.read_image(photo + 1).camera_id)
@@ -240,16 +225,12 @@ class Features:
 
 def read_vocabulary(database: Path, count: int, seed: int, words: int) -> Words:
     """So many visual words of these photos' features."""
-    import pycolmap
-
     with pycolmap.Database.open(database) as db:
         return vocabulary(partial(read_descriptors, db), count, seed, words)
 
 
 def look_alike(database: Path, count: int, seed: int) -> SimilarityMatrix:
     """How much any two photos look alike, by their features."""
-    import pycolmap
-
     words = read_vocabulary(database, count, seed, WORDS)
     with pycolmap.Database.open(database) as db:
         return photo_similarity(partial(read_descriptors, db), count, words)
@@ -257,8 +238,6 @@ def look_alike(database: Path, count: int, seed: int) -> SimilarityMatrix:
 
 def verified_matches(database: Path, pairs: Pairs) -> np.ndarray:
     """How many verified matches each of these pairs has; 0 where it was not matched or failed."""
-    import pycolmap
-
     with pycolmap.Database.open(database) as db:
         found = dict(zip(*db.read_two_view_geometry_num_inliers(), strict=True))
     return np.array([found.get(pycolmap.image_pair_to_pair_id(i + 1, j + 1), 0) for i, j in pairs.tolist()], int)
@@ -266,48 +245,40 @@ def verified_matches(database: Path, pairs: Pairs) -> np.ndarray:
 
 def matched_pairs(database: Path) -> Pairs:
     """All pairs of photos that were matched so far, verified or not."""
-    import pycolmap
-
     with pycolmap.Database.open(database) as db:
         ids, _ = db.read_all_matches()
     return np.array([pycolmap.pair_id_to_image_pair(pair) for pair in ids], int).reshape(-1, 2) - 1
 
 
-def read_descriptors(db: "pycolmap.Database", photo: int) -> np.ndarray:
+def read_descriptors(db: pycolmap.Database, photo: int) -> np.ndarray:
     """Of the photo with this number, (keypoints, 128) bytes."""
     return np.array(db.read_descriptors(photo + 1).data, np.uint8).reshape(-1, 128)
 
 
 def _match(
-    first: _Photo, second: _Photo, max_ratio: float, options: "pycolmap.TwoViewGeometryOptions"
-) -> "tuple[np.ndarray, pycolmap.TwoViewGeometry]":
+    first: _Photo, second: _Photo, max_ratio: float, options: pycolmap.TwoViewGeometryOptions
+) -> tuple[np.ndarray, pycolmap.TwoViewGeometry]:
     """Matches, and the geometry of two views with those that it explains: none where they are too few."""
     match: Any = match_indexed if isinstance(first.features, IndexedFeatures) else match_descriptors
     matches = match(first.features, second.features, max_ratio)
     return matches, _verified(first, second, matches, options)
 
 
-def _verification(seed: int) -> "pycolmap.TwoViewGeometryOptions":
-    import pycolmap
-
+def _verification(seed: int) -> pycolmap.TwoViewGeometryOptions:
     options = pycolmap.TwoViewGeometryOptions()
     options.ransac.random_seed = seed
     return options
 
 
 def _verified(
-    first: _Photo, second: _Photo, matches: np.ndarray, options: "pycolmap.TwoViewGeometryOptions"
-) -> "pycolmap.TwoViewGeometry":
-    import pycolmap
-
+    first: _Photo, second: _Photo, matches: np.ndarray, options: pycolmap.TwoViewGeometryOptions
+) -> pycolmap.TwoViewGeometry:
     views = first.camera, first.places, second.camera, second.places
     return pycolmap.estimate_two_view_geometry(*views, matches, options)
 
 
 def copy_without_matches_of(names: Container[str], database: Path, copy: Path) -> None:
     """Copy the database, less every pair with one of these photos; nothing where the copy is there already."""
-    import pycolmap
-
     if copy.exists():
         return
     unfinished = unfinished_copy(database, copy)
@@ -322,8 +293,6 @@ def copy_without_matches_of(names: Container[str], database: Path, copy: Path) -
 
 def copy_without_pairs(database: Path, copy: Path, pairs: Iterable[Sequence[int]]) -> None:
     """Copy the database less what was verified of these pairs of image ids."""
-    import pycolmap
-
     unfinished = unfinished_copy(database, copy)
     with pycolmap.Database.open(unfinished) as db, pycolmap.DatabaseTransaction(db):
         for first, second in pairs:
@@ -332,7 +301,7 @@ def copy_without_pairs(database: Path, copy: Path, pairs: Iterable[Sequence[int]
 
 
 def keep_inliers(
-    db: "pycolmap.Database", pair: tuple[int, int], geometry: "pycolmap.TwoViewGeometry", keep: Bool[np.ndarray, "n"]
+    db: pycolmap.Database, pair: tuple[int, int], geometry: pycolmap.TwoViewGeometry, keep: Bool[np.ndarray, "n"]
 ) -> None:
     """Leave only some of the verified matches of a pair of image ids, which it is deleted without."""
     db.delete_two_view_geometry(*pair)
@@ -346,8 +315,6 @@ def copy_as_fisheye(database: Path, copy: Path, seed: int) -> None:
 
     Without EXIF the focal length is :func:`fisheye_focal_px`, and counts as known.
     """
-    import pycolmap
-
     if copy.exists():
         return
     unfinished, options = unfinished_copy(database, copy), _verification(seed)

@@ -12,19 +12,20 @@ from jaxtyping import Bool, Float
 
 from nerf.geometry.alignment import align
 from nerf.geometry.scene import Similarity
-from stages.sfm.pairs.pair_selection import GPS_ERROR_M, cartesian
 
-FEWEST_PLACES = 4  # three fix a similarity, the fourth tells whether it is right
-FAR_OFF = 3.0  # times the median distance: a place so wrong is not averaged with the others
-ROUNDS = 10
-LARGEST_ERROR = 1 / 3  # of how far apart the places are: with more they have nothing to do with the photos
+GPS_ERROR_M = 10.0  # twice the 4.9 m that phones reach under open sky (gps.gov, GPS accuracy)
+EARTH_AXES_M = (6_378_137.0, 6_356_752.314)  # WGS 84
+MIN_POSITIONS = 4  # three fix a similarity, the fourth tells whether it is right
+OUTLIER_FACTOR = 3.0  # times the median distance: positions so wrong are not averaged with the others
+MAX_TRIMMING_ROUNDS = 10
+MAX_ERROR = 1 / 3  # of how far apart the positions are: with more they have nothing to do with the photos
 ONE_LINE = "they were taken along one line, which leaves open how the scene is turned about it"
 
 
 @dataclass(frozen=True)
 class Georeference:
     """``enu_from_sfm`` in metres, for the tangent plane at ``origin`` (degrees north and east, metres above the
-    ellipsoid); how many places were ``used`` and how far off they are, in metres (median)."""
+    ellipsoid); how many positions were ``used`` and how far off they are, in metres (median)."""
 
     enu_from_sfm: Similarity
     origin: tuple[float, float, float]
@@ -43,8 +44,21 @@ class Georeference:
         }
 
 
+def cartesian(
+    latitude: Float[np.ndarray, "n"], longitude: Float[np.ndarray, "n"], altitude: Float[np.ndarray, "n"] | None
+) -> Float[np.ndarray, "n 3"]:
+    """Metres from the centre of the Earth (WGS 84), from degrees and metres: no seam at the date line or a pole."""
+    phi, lam = np.radians(latitude), np.radians(longitude)
+    height = np.zeros_like(phi) if altitude is None else altitude
+    long_axis, short_axis = EARTH_AXES_M
+    flat = (short_axis / long_axis) ** 2
+    normal = long_axis / np.sqrt(np.cos(phi) ** 2 + flat * np.sin(phi) ** 2)
+    around = (normal + height) * np.cos(phi)
+    return np.stack([around * np.cos(lam), around * np.sin(lam), (flat * normal + height) * np.sin(phi)], axis=1)
+
+
 def east_north_up(latitude: float, longitude: float) -> Float[np.ndarray, "3 3"]:
-    """The rotation from Earth-centred axes to east, north and up at a place given in degrees."""
+    """The rotation from Earth-centred axes to east, north and up at a position given in degrees."""
     phi, lam = np.radians([latitude, longitude])
     east = [-np.sin(lam), np.cos(lam), 0]
     north = [-np.sin(phi) * np.cos(lam), -np.sin(phi) * np.sin(lam), np.cos(phi)]
@@ -53,24 +67,24 @@ def east_north_up(latitude: float, longitude: float) -> Float[np.ndarray, "3 3"]
 
 
 def georeference(
-    centres: Float[np.ndarray, "n 3"], places: Sequence[tuple[float, float, float | None]]
+    centres: Float[np.ndarray, "n 3"], positions: Sequence[tuple[float, float, float | None]]
 ) -> Georeference | str:
-    """From the photos' centres in the sfm frame and their places (degrees north and east, metres), or why not.
+    """From the photos' centres in the sfm frame and their GPS positions (degrees north and east, metres), or why not.
 
-    Places far off the rest are left out, round by round. Heights count where every photo has one.
+    Positions far off the rest are left out, round by round. Heights count where every photo has one.
     """
-    if len(places) < FEWEST_PLACES:
-        return f"{len(places)} registered photos tell where they were taken, {FEWEST_PLACES} are needed"
-    latitude, longitude = np.array([place[:2] for place in places], float).T
-    heights = [place[2] for place in places]
-    altitude = np.zeros(len(places)) if None in heights else np.array(heights, float)
+    if len(positions) < MIN_POSITIONS:
+        return f"{len(positions)} registered photos have a GPS position, {MIN_POSITIONS} are needed"
+    latitude, longitude = np.array([position[:2] for position in positions], float).T
+    heights = [position[2] for position in positions]
+    altitude = np.zeros(len(positions)) if None in heights else np.array(heights, float)
     earth = cartesian(latitude, longitude, altitude)
     middle = int(np.linalg.norm(earth - np.median(earth, axis=0), axis=1).argmin())
     origin = (float(latitude[middle]), float(longitude[middle]), float(altitude[middle]))
     enu = (earth - earth[middle]) @ east_north_up(*origin[:2]).T
     spread = float(np.linalg.norm(enu - np.median(enu, axis=0), axis=1).max())
     if spread < GPS_ERROR_M:
-        return f"their places lie within {spread:.0f} m, and GPS errs by up to {GPS_ERROR_M:.0f} m"
+        return f"their positions lie within {spread:.0f} m, and GPS errs by up to {GPS_ERROR_M:.0f} m"
     width = _across(centres)
     if _across(enu) < GPS_ERROR_M / 2 or not width * np.sqrt(len(centres)) > 1e-6 * np.abs(centres).max():
         return ONE_LINE
@@ -79,8 +93,8 @@ def georeference(
         return ONE_LINE
     off = np.linalg.norm(fitted.points(centres) - enu, axis=1)
     error = float(np.median(off[kept]))
-    if error > LARGEST_ERROR * spread:
-        return f"their places, {spread:.0f} m apart, are {error:.0f} m off where the photos put them"
+    if error > MAX_ERROR * spread:
+        return f"their GPS positions, {spread:.0f} m apart, are {error:.0f} m off the reconstruction"
     return Georeference(fitted, origin, int(kept.sum()), error)
 
 
@@ -93,10 +107,10 @@ def _robust(
     centres: Float[np.ndarray, "n 3"], enu: Float[np.ndarray, "n 3"]
 ) -> tuple[Similarity, Bool[np.ndarray, "n"]]:
     kept = np.ones(len(centres), bool)
-    for _ in range(ROUNDS):
+    for _ in range(MAX_TRIMMING_ROUNDS):
         fitted = align(centres[kept], enu[kept])
         off = np.linalg.norm(fitted.points(centres) - enu, axis=1)
-        now = off <= max(FAR_OFF * float(np.median(off)), 1e-9)
+        now = off <= max(OUTLIER_FACTOR * float(np.median(off)), 1e-9)
         if (now == kept).all():
             break
         kept = now

@@ -15,7 +15,7 @@ from stages.io.sparse_model import SparseImage, SparseModel
 from stages.io.transforms_export import intrinsics
 from stages.sfm.colmap.models import write_model
 from stages.sfm.imported.conventions import PoseConvention
-from stages.sfm.imported.known_cameras import KnownCameras, _by_name, read_known_cameras
+from stages.sfm.imported.pose_files import KnownCameras, _by_name, read_known_cameras
 from tests.refusals import refused
 
 W, H = 60, 40

@@ -6,9 +6,9 @@ import pytest
 from stages import sfm
 from stages.contract import StageError
 from stages.io.photos import Photo
-from stages.sfm.pairs import matching_plan
-from stages.sfm.pairs import pair_selection as pairing
-from stages.sfm.pairs.matching_plan import (
+from stages.sfm.pairs import quality_level
+from stages.sfm.pairs.pair_selection import Places
+from stages.sfm.pairs.quality_level import (
     TIERS,
     Chosen,
     Cost,
@@ -20,7 +20,6 @@ from stages.sfm.pairs.matching_plan import (
     measure,
     tiers_of,
 )
-from stages.sfm.pairs.pair_selection import Places
 from tests.synthetic_photos import SyntheticPhotos
 
 ALL_OPEN = Open(None, None, None)
@@ -38,7 +37,7 @@ def costing(monkeypatch: pytest.MonkeyPatch, *seconds: tuple[float, float]) -> l
         asked.append(tier)
         return Cost(*seconds[len(asked) - 1])
 
-    monkeypatch.setattr(matching_plan, "_measured", measured)
+    monkeypatch.setattr(quality_level, "_measured", measured)
     return asked
 
 
@@ -54,7 +53,7 @@ def test_pairs_of_many_photos_are_chosen_by_what_is_known(
     places: Places, matcher: str, progress, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked = costing(monkeypatch)
-    monkeypatch.setattr(pairing, "places_of", lambda _: places)
+    monkeypatch.setattr(quality_level, "places_of", lambda _: places)
     assert chosen(ALL_OPEN, photos(400), Path(), 30, progress, None) == (1600, 4096, matcher)
     assert not asked and len(progress.notes) == 1
 
@@ -87,7 +86,7 @@ def test_what_is_given_stays_in_every_tier(progress, monkeypatch: pytest.MonkeyP
 
 
 def test_nothing_is_measured_without_a_time(progress, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(matching_plan, "COMMAND", ["-c", "raise SystemExit('measured')"])
+    monkeypatch.setattr(quality_level, "COMMAND", ["-c", "raise SystemExit('measured')"])
     assert chosen(ALL_OPEN, photos(50), Path(), 30, progress, None) == Chosen(1600, 4096, "exhaustive")
     with pytest.raises(StageError) as caught:
         chosen(ALL_OPEN, photos(400), Path(), 30, progress, 60.0)

@@ -1,0 +1,87 @@
+"""The pixels of photos and masks, decoded by Pillow, at any size."""
+
+import logging
+import warnings
+from collections.abc import Iterable
+from functools import cache
+from pathlib import Path
+from types import ModuleType
+
+import cv2
+import numpy as np
+import pillow_heif
+from PIL import Image
+
+from stages.hardware.device import processors
+from stages.io.photos import Box
+
+OPAQUE_FROM = 128  # of 255: from here on a pixel is more opaque than transparent
+DECODING_BYTES = 1 << 30  # how much memory may go into photos that are being loaded at a time
+BYTES_PER_PIXEL = {3: 16, 4: 80}  # of the file, that loading and shrinking takes, by channels; 10 and 78 measured
+
+
+@cache
+def pillow() -> ModuleType:
+    """Pillow, able to read HEIC, with its own pixel limit replaced by ours."""
+    pillow_heif.register_heif_opener()
+    Image.MAX_IMAGE_PIXELS = None
+    # What is wrong with a file we say ourselves.
+    warnings.filterwarnings("ignore", category=UserWarning, module=r"PIL\.")
+    logging.getLogger("PIL").setLevel(logging.CRITICAL)
+    Image.init()
+    return Image
+
+
+def opaque_box(pixels: np.ndarray) -> Box | None:
+    """What holds all that is more than half opaque of (h, w, 3 or 4) uint8; None where all or nothing of it is."""
+    if pixels.shape[2] != 4:
+        return None
+    opaque = pixels[..., 3] >= OPAQUE_FROM
+    if not opaque.any() or opaque.all():
+        return None
+    height, width = opaque.shape
+    columns, rows = np.flatnonzero(opaque.any(axis=0)), np.flatnonzero(opaque.any(axis=1))
+    left, right = float(columns[0]) / width, float(columns[-1] + 1) / width
+    return left, float(rows[0]) / height, right, float(rows[-1] + 1) / height
+
+
+def load_pixels(path: Path, width: int, height: int) -> np.ndarray:
+    """The image as (height, width, 3 or 4) uint8, each pixel the mean of the area it covers.
+
+    The means are taken of sRGB values weighted by alpha (premultiplied); a pixel that nothing covers is black.
+    At the image's own size the values are those stored. Enlarging interpolates linearly.
+    """
+    with pillow().open(path) as image:
+        pixels = np.asarray(image)
+    if (pixels.shape[1], pixels.shape[0]) == (width, height):
+        return pixels
+    if pixels.shape[2] == 3:
+        return cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA)
+    alpha = pixels[..., 3:].astype(np.float32)
+    premultiplied = np.concatenate([pixels[..., :3] * alpha, alpha], axis=2)
+    resized = cv2.resize(premultiplied, (width, height), interpolation=cv2.INTER_AREA)
+    covered = resized[..., 3:] > 0
+    colour = np.divide(resized[..., :3], resized[..., 3:], out=np.zeros_like(resized[..., :3]), where=covered)
+    return np.rint(np.concatenate([colour, resized[..., 3:]], axis=2)).astype(np.uint8)
+
+
+def loaders(files: Iterable[Path]) -> int:
+    """How many of these photos, or of their masks, to load at a time, each in a thread: one per core, fewer where they
+    are too large for that. What counts is the size in the file, however small they are made afterwards."""
+    return max(1, min(processors(), DECODING_BYTES // max(map(_loading_bytes, files))))
+
+
+def _loading_bytes(file: Path) -> int:
+    """Memory that :func:`load_pixels` takes, by the file's header."""
+    with pillow().open(file) as image:
+        return BYTES_PER_PIXEL[len(image.getbands())] * image.width * image.height
+
+
+def load_mask(path: Path, width: int, height: int) -> np.ndarray:
+    """A mask that ingest wrote as (height, width) bool at a photo's reduced size, True where every pixel that goes into
+    one is to be used."""
+    with pillow().open(path) as image:
+        ignored = (np.asarray(image) == 0).astype(np.float32)
+    if ignored.shape != (height, width):
+        ignored = cv2.resize(ignored, (width, height), interpolation=cv2.INTER_AREA)
+    return ignored == 0
