@@ -137,7 +137,7 @@ def _write_scene(
         )
         for index, name in enumerate(photos)
     )
-    scene = Scene((CAMERA,), views, found.scene_from_sfm, found.bounded, has_alpha, found.layout, found.up.known)
+    scene = Scene((CAMERA,), views, found.scene_from_sfm, found.bounded, has_alpha, found.capture_type, found.up.known)
     write_json(inputs["normalise"] / "scene.json", scene.to_json())
     tensors = {
         "xyz": found.scene_from_sfm.points(points).astype(np.float32),

@@ -11,10 +11,10 @@ from nerf.geometry.near_far import near_and_far
 from nerf.geometry.reconstruction import Reconstruction, spatial_median
 from nerf.geometry.region_of_interest import (
     GOES_ON,
-    Layout,
+    CaptureType,
     Region,
     beyond_alpha,
-    find_layout,
+    find_capture_type,
     find_region,
     share_beyond,
 )
@@ -38,7 +38,7 @@ class Normalisation(NamedTuple):
     """
 
     scene_from_sfm: Similarity
-    layout: Layout
+    capture_type: CaptureType
     bounded: bool
     up: Up  # in the sfm frame
     near: Float[np.ndarray, "n"]
@@ -60,16 +60,16 @@ def normalise(
     Raises ValueError when the cameras stand in one place and there are no points, or where the scene is too small for
     numbers, be it at its distance from the origin or by itself.
     """
-    layout, up = find_layout(sfm), find_up(sfm, places)
+    capture_type, up = find_capture_type(sfm), find_up(sfm, places)
     rotation = _frame(up.direction, sfm)
     middle = spatial_median(sfm.centres)
     _check_extent(sfm, middle)
     upright = sfm.in_frame(rotation, middle)
     given = None if roi is None else Region(rotation @ (np.array(roi[:3]) - middle), roi[3])
-    contradicted = 0.0 if upright.opaque is None else beyond_alpha(upright, layout, given)
+    contradicted = 0.0 if upright.opaque is None else beyond_alpha(upright, capture_type, given)
     if contradicted >= GOES_ON:
         upright = replace(upright, opaque=None)
-    region = given or find_region(upright, layout)
+    region = given or find_region(upright, capture_type)
     if not region.half >= MIN_HALF_SIZE:
         raise ValueError(f"it is {region.half:.2g} units large, and {MIN_HALF_SIZE:g} is the least")
     scale = REGION_HALF / region.half
@@ -80,7 +80,7 @@ def normalise(
     near, far = near_and_far(scene, bounded)
     return Normalisation(
         scene_from_sfm=Similarity(scale, rotation, -scale * (rotation @ centre)),
-        layout=layout,
+        capture_type=capture_type,
         bounded=bounded,
         up=up,
         near=near,

@@ -19,7 +19,7 @@ from nerf.geometry.reconstruction import (
     within,
 )
 
-Layout = Literal["around", "inside", "forward"]
+CaptureType = Literal["around", "inside", "forward"]
 
 FORWARD_DEG = 30.0  # four fifths of the optical axes within this of their median: all photos face one way
 CONVERGENT_DEG = 30.0  # four fifths of the axes within this of the direction to their common focus: they look at it
@@ -49,7 +49,7 @@ def focus(scene: Reconstruction) -> Float[np.ndarray, "3"]:
     return closest_point_to_lines(scene.centres, scene.axes)
 
 
-def find_layout(scene: Reconstruction) -> Layout:
+def find_capture_type(scene: Reconstruction) -> CaptureType:
     """forward: the axes are nearly parallel; around: they meet in front of the cameras; inside: neither."""
     middle = spatial_median(scene.axes)
     length = np.linalg.norm(middle)
@@ -68,7 +68,7 @@ def look_at_point(
     return bool(np.quantile(angles_deg(axes, ray_direction), 0.8) <= CONVERGENT_DEG)
 
 
-def find_region(scene: Reconstruction, layout: Layout) -> Region:
+def find_region(scene: Reconstruction, capture_type: CaptureType) -> Region:
     """The cube, aligned with the axes of the frame ``scene`` is in.
 
     around: centred on the focus, holding 95 % of the observed points but not reaching beyond the cameras;
@@ -77,27 +77,27 @@ def find_region(scene: Reconstruction, layout: Layout) -> Region:
     held whole.
     Raises ValueError when the cameras stand in one place and there are no points to give a scale.
     """
-    cube = _ungrown(scene, layout)
+    cube = _ungrown(scene, capture_type)
     if not cube.half > 0:
         raise ValueError("all cameras stand in one place and no point is known")
     return _grown(cube, scene)
 
 
-def beyond_alpha(scene: Reconstruction, layout: Layout, given: Region | None = None) -> float:
+def beyond_alpha(scene: Reconstruction, capture_type: CaptureType, given: Region | None = None) -> float:
     """The share of observations that contradict photos with alpha, by which there is no more than the cube: their
     points lie beyond the one ``given``, or beyond the one found, even when it is grown. 0 without observations."""
     if not len(scene.point):
         return 0.0
     if given is not None:
         return share_beyond(scene, given.centre, given.half)
-    cube = _ungrown(scene, layout)
+    cube = _ungrown(scene, capture_type)
     return share_beyond(scene, cube.centre, GROWTH * cube.half)
 
 
-def _ungrown(scene: Reconstruction, layout: Layout) -> Region:
-    if layout == "around" and scene.opaque is not None:
+def _ungrown(scene: Reconstruction, capture_type: CaptureType) -> Region:
+    if capture_type == "around" and scene.opaque is not None:
         return _carved(scene, scene.opaque)
-    return {"around": _around, "forward": _forward, "inside": _inside}[layout](scene)
+    return {"around": _around, "forward": _forward, "inside": _inside}[capture_type](scene)
 
 
 def share_beyond(scene: Reconstruction, centre: Float[np.ndarray, "3"], half: float) -> float:

@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 Split = Literal["train", "validation", "test"]
 """Validation photos are set aside from the training photos while a run is made that asks for them; no file has any."""
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 
 
 @dataclass(frozen=True)
@@ -72,9 +72,9 @@ class View:
 class Scene:
     """Everything that training and rendering need to know of the geometry.
 
-    ``bounded``: all that the photos show lies inside the region of interest; otherwise space beyond it is
-    contracted (nerf/geometry/contraction.py). ``has_alpha``: the photos' alpha says what is background. ``layout`` is
-    how the cameras stand: around an object, looking outward or through a room, or all facing one way.
+    ``bounded``: all that the photos show lies inside the region of interest; otherwise space beyond it is contracted
+    (nerf/geometry/contraction.py). ``has_alpha``: the photos' alpha says what is background. ``capture_type``: the
+    cameras stand around an object, look outward or through a room, or all face forward.
     """
 
     cameras: tuple[Camera, ...]
@@ -82,7 +82,7 @@ class Scene:
     scene_from_sfm: Similarity
     bounded: bool
     has_alpha: bool
-    layout: Literal["around", "inside", "forward"]
+    capture_type: Literal["around", "inside", "forward"]
     up_known: bool
 
     def of_split(self, split: Split) -> tuple[View, ...]:
@@ -107,7 +107,7 @@ class Scene:
             },
             "bounded": self.bounded,
             "has_alpha": self.has_alpha,
-            "layout": self.layout,
+            "capture_type": self.capture_type,
             "up_known": self.up_known,
         }
 

@@ -65,7 +65,7 @@ def load(inputs: Inputs, progress: Progress) -> Source:
 
 def extract_mesh(config: "Config", source: Source, progress: Progress) -> Extracted:
     """The mesh of the field; ``config.resolution`` must be set. Raises StageError without a surface."""
-    box = grid_box(source.scene.layout, source.points)
+    box = grid_box(source.scene.capture_type, source.points)
     grid = _density_grid(config, source, box, progress)
     voxel = float(grid.spacing().max())
     views = source.scene.of_split("train")

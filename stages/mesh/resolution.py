@@ -13,7 +13,7 @@ import torch
 
 from nerf import REGION_HALF
 from nerf.fields.density_grid import DensityGrid, sample_density_grid
-from nerf.geometry.region_of_interest import Layout
+from nerf.geometry.region_of_interest import CaptureType
 from stages.contract import Inputs, Progress
 from stages.hardware.device import compute_device
 from stages.io.field_files import load_field
@@ -55,7 +55,7 @@ def choose_resolution(seconds: float | None, inputs: Inputs, progress: Progress)
     progress.update("timing the field's density queries")
     began = time.perf_counter()
     points = read_tensors(inputs["normalise"] / "points.safetensors")["xyz"].astype(float)
-    box = grid_box(read_scene(inputs["normalise"]).layout, points)
+    box = grid_box(read_scene(inputs["normalise"]).capture_type, points)
     query, reference = density_query_seconds(inputs["train"], box), reference_seconds()
     return resolution_within(seconds - (time.perf_counter() - began), query, reference, slab_factor(box))
 
@@ -66,7 +66,7 @@ def resolution_from_training(rays: int) -> int:
     return min(MAX_RESOLUTION, max(MIN_TRAINED_RESOLUTION, round(edge / 16) * 16))
 
 
-def grid_box(layout: Layout, points: np.ndarray) -> np.ndarray:
+def grid_box(capture_type: CaptureType, points: np.ndarray) -> np.ndarray:
     """The box of the density grid: the region of interest, or where the scene is flat (ground from the air, a façade,
     the floor of a house) the slab of it that sparse ``points`` (n, 3) lie in.
 
@@ -75,7 +75,7 @@ def grid_box(layout: Layout, points: np.ndarray) -> np.ndarray:
     """
     cube = np.array([[-REGION_HALF] * 3, [REGION_HALF] * 3])
     points = points[(np.abs(points) <= REGION_HALF).all(axis=1)]
-    if layout == "around" or len(points) < MIN_POINTS:
+    if capture_type == "around" or len(points) < MIN_POINTS:
         return cube
     low, high = np.quantile(points, [QUANTILE, 1 - QUANTILE], axis=0)
     flat, side = int((high - low).argmin()), 2 * REGION_HALF

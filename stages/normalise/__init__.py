@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from stages.io.sparse_model import SparseModel
 
 INPUTS = ("ingest", "sfm")
-VERSION = 14
+VERSION = 15
 RESUMES = False
 PUBLISHED = ("transforms.json", "scene.json")
 
@@ -244,7 +244,7 @@ def _scene(
         scene_from_sfm=found.scene_from_sfm,
         bounded=found.bounded,
         has_alpha=found.bounded,
-        layout=found.layout,
+        capture_type=found.capture_type,
         up_known=found.up.known,
     )
 
@@ -266,14 +266,14 @@ def _points(model: "SparseModel", sfm: "Reconstruction", found: "Normalisation")
 def _line(found: "Normalisation") -> str:
     """What was decided, for the user."""
     arc = 360 if found.arc_deg > FULL_TURN_DEG else round(found.arc_deg / 10) * 10
-    layout = {
+    capture_type = {
         "around": f"{arc}° around an object",
         "inside": "inside a space, looking around",
         "forward": "photos facing one way",
-    }[found.layout]
+    }[found.capture_type]
     background = "transparent" if found.bounded else "unbounded"
     up = f"up from {found.up.source}" if found.up.known else "no up: the cameras disagree"
-    return f"{layout}, background {background} · {up}"
+    return f"{capture_type}, background {background} · {up}"
 
 
 def _facts(scene: "Scene", found: "Normalisation", observations: int) -> dict[str, Any]:
@@ -281,7 +281,7 @@ def _facts(scene: "Scene", found: "Normalisation", observations: int) -> dict[st
     from nerf import REGION_HALF
 
     return {
-        "layout": scene.layout,
+        "capture_type": scene.capture_type,
         "bounded": scene.bounded,
         "has_alpha": scene.has_alpha,
         "up": found.up.source,

@@ -78,9 +78,9 @@ def usual_path(scene: "Scene") -> PathKind:
     def clear(path: "np.ndarray") -> bool:
         return camera_paths.keeps_clear(path, poses, near)
 
-    if scene.layout == "around" and scene.up_known and clear(camera_paths.orbit(poses, TRIED_FRAMES)):
+    if scene.capture_type == "around" and scene.up_known and clear(camera_paths.orbit(poses, TRIED_FRAMES)):
         return "orbit"
-    spiral = scene.layout == "forward" and camera_paths.suits_spiral(poses)
+    spiral = scene.capture_type == "forward" and camera_paths.suits_spiral(poses)
     if spiral and clear(camera_paths.spiral(poses, TRIED_FRAMES)):
         return "spiral"
     return "interpolated"
@@ -93,7 +93,7 @@ def _poses(scene: "Scene") -> "np.ndarray":
     from nerf.geometry.camera_paths import levelled
 
     poses = np.stack([view.scene_from_camera for view in scene.of_split("train")])
-    return levelled(poses) if scene.layout == "forward" else poses
+    return levelled(poses) if scene.capture_type == "forward" else poses
 
 
 def fitted_path(scene: "Scene", kind: PathKind, frames: int) -> CameraPath:

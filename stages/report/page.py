@@ -17,10 +17,9 @@ from tyro.conf import Suppress
 from nerf.geometry.scene import Scene
 from stages.amounts import duration, short_count
 from stages.contract import Inputs
-from stages.ingest.decoding import pillow
 from stages.io.ascii_names import shell_quoted
 from stages.io.files import read_json, read_scene, read_tensors
-from stages.io.photos import load_pixels
+from stages.io.pixels import load_pixels, pillow
 from stages.report.cameras import (
     CameraReport,
     camera_models,

@@ -9,7 +9,7 @@ from nerf.geometry.camera_paths import nearest_rotations
 from nerf.geometry.near_far import MIN_NEAR
 from nerf.geometry.normalisation import Normalisation, normalise
 from nerf.geometry.reconstruction import Reconstruction, angles_deg, extent
-from nerf.geometry.region_of_interest import find_layout
+from nerf.geometry.region_of_interest import find_capture_type
 from nerf.geometry.up_vector import Witness
 from tests.camera_layouts import (
     ball,
@@ -47,28 +47,28 @@ def region_half(found: Normalisation) -> float:
     return 0.9 / found.scene_from_sfm.scale
 
 
-@pytest.mark.parametrize("layout", SCENES)
-def test_layouts_are_told_apart(layout: str) -> None:
-    assert find_layout(SCENES[layout]()) == layout
+@pytest.mark.parametrize("capture_type", SCENES)
+def test_layouts_are_told_apart(capture_type: str) -> None:
+    assert find_capture_type(SCENES[capture_type]()) == capture_type
 
 
 def test_an_arc_that_converges_is_around_and_a_narrow_one_is_forward() -> None:
-    assert find_layout(seen_by(ring(arc_deg=110.0), ball())) == "around"
-    assert find_layout(seen_by(ring(arc_deg=30.0), ball())) == "forward"
+    assert find_capture_type(seen_by(ring(arc_deg=110.0), ball())) == "around"
+    assert find_capture_type(seen_by(ring(arc_deg=30.0), ball())) == "forward"
 
 
-@pytest.mark.parametrize("layout", SCENES)
-def test_the_region_holds_nearly_all_that_is_seen_and_is_filled_by_it(layout: str) -> None:
-    scene = SCENES[layout]()
+@pytest.mark.parametrize("capture_type", SCENES)
+def test_the_region_holds_nearly_all_that_is_seen_and_is_filled_by_it(capture_type: str) -> None:
+    scene = SCENES[capture_type]()
     found = normalise(scene, None)
     reach = np.abs(found.scene_from_sfm.points(scene.points))[np.unique(scene.point)].max(axis=1)
     assert (reach <= 0.9).mean() >= 0.94
     assert np.quantile(reach, 0.95) > 0.35
 
 
-@pytest.mark.parametrize("layout", SCENES)
-def test_up_becomes_z_and_the_frame_is_a_rotation(layout: str) -> None:
-    found = normalise(SCENES[layout](), None)
+@pytest.mark.parametrize("capture_type", SCENES)
+def test_up_becomes_z_and_the_frame_is_a_rotation(capture_type: str) -> None:
+    found = normalise(SCENES[capture_type](), None)
     rotation = found.scene_from_sfm.rotation
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(rotation) > 0
@@ -87,25 +87,25 @@ def test_the_ground_lies_flat_and_in_line_with_the_flight_over_it(shaken: float)
     poses = survey()
     poses[:, :, :3] = nearest_rotations(poses[:, :, :3] + np.random.default_rng(1).normal(0, shaken, (48, 3, 3)))
     found = normalise(seen_by(poses, ground()), None, Witness(0.01, np.array([0.0, 0, 1]), "GPS"))
-    assert (found.layout, found.up.known) == ("forward", True)
+    assert (found.capture_type, found.up.known) == ("forward", True)
     xyz = found.scene_from_sfm.points(ground(relief=0.0))
     assert np.ptp(xyz[:, 2]) < 0.06
     east = found.scene_from_sfm.rotation @ [1.0, 0, 0]
     assert np.abs(east).max() > 0.998
 
 
-@pytest.mark.parametrize("layout", SCENES)
-def test_far_outliers_hardly_change_the_scale(layout: str) -> None:
-    clean = SCENES[layout]()
+@pytest.mark.parametrize("capture_type", SCENES)
+def test_far_outliers_hardly_change_the_scale(capture_type: str) -> None:
+    clean = SCENES[capture_type]()
     random = np.random.default_rng(1)
     spoilt = with_points(clean, 1e4 * random.normal(size=(15, 3)), views=2)
     before, after = region_half(normalise(clean, None)), region_half(normalise(spoilt, None))
     assert 0.8 * before < after < 1.3 * before
 
 
-@pytest.mark.parametrize("layout", SCENES)
-def test_one_far_camera_hardly_changes_the_scale(layout: str) -> None:
-    clean = SCENES[layout]()
+@pytest.mark.parametrize("capture_type", SCENES)
+def test_one_far_camera_hardly_changes_the_scale(capture_type: str) -> None:
+    clean = SCENES[capture_type]()
     from_camera = clean.from_camera.copy()
     from_camera[3, :, 3] += 1e3 * np.array([0.3, -0.9, 0.3])
     keep = clean.view != 3
@@ -121,14 +121,14 @@ def test_one_far_camera_hardly_changes_the_scale(layout: str) -> None:
     st.floats(-6, 6).map(lambda exponent: 10.0**exponent),
     st.floats(0, 1e6),
 )
-def test_similar_reconstructions_give_the_same_scene(layout: str, seed: int, scale: float, offset: float) -> None:
-    scene = SCENES[layout]()
+def test_similar_reconstructions_give_the_same_scene(capture_type: str, seed: int, scale: float, offset: float) -> None:
+    scene = SCENES[capture_type]()
     turn = nearest_rotations(np.random.default_rng(seed).normal(size=(3, 3)))
     # the sfm frame is offset by up to a million of its own units, which float64 holds to 1e-10 of them
     shift = np.array([offset, -offset, offset / 2]) * min(1.0, scale)
     moved = scene.in_frame(turn, -turn.T @ shift / scale, scale)
     one, other = normalise(scene, None), normalise(moved, None)
-    assert (one.layout, one.bounded, one.up.source) == (other.layout, other.bounded, other.up.source)
+    assert (one.capture_type, one.bounded, one.up.source) == (other.capture_type, other.bounded, other.up.source)
     np.testing.assert_allclose(
         other.scene_from_sfm.points(moved.points), one.scene_from_sfm.points(scene.points), atol=1e-5
     )
@@ -136,10 +136,10 @@ def test_similar_reconstructions_give_the_same_scene(layout: str, seed: int, sca
     np.testing.assert_allclose(other.far, one.far, rtol=1e-4)
 
 
-@pytest.mark.parametrize("layout", SCENES)
+@pytest.mark.parametrize("capture_type", SCENES)
 @pytest.mark.parametrize("has_alpha", [False, True])
-def test_every_observed_point_but_outliers_lies_between_near_and_far(layout: str, has_alpha: bool) -> None:
-    scene = opaque_everywhere(SCENES[layout]()) if has_alpha else SCENES[layout]()
+def test_every_observed_point_but_outliers_lies_between_near_and_far(capture_type: str, has_alpha: bool) -> None:
+    scene = opaque_everywhere(SCENES[capture_type]()) if has_alpha else SCENES[capture_type]()
     found = normalise(scene, None)
     distance = scene.distances() * found.scene_from_sfm.scale
     assert (found.near > 0).all()
@@ -373,7 +373,7 @@ def test_lego_fills_the_region_and_stays_inside(shared_data) -> None:
         scene, ray_directions=ray_directions / np.linalg.norm(ray_directions, axis=-1, keepdims=True)
     )
     found = normalise(opaque_everywhere(scene), None)
-    assert found.layout == "around"
+    assert found.capture_type == "around"
     assert found.bounded
     assert angles_deg(found.up.direction, np.array([0.0, 0.0, 1.0])) < 1e-3
     corners = np.array([[-0.65, -1.15, -0.5], [0.65, 1.15, 1.05]])  # of the lego itself, in Blender's units

@@ -263,7 +263,7 @@ def test_a_plain_ends_at_the_box_or_where_the_photos_end(run_mesh):
 def test_flat_scenes_have_smaller_voxels(run_mesh):
     """The same plain, by points on it that photos have which do not stand around it."""
     points = np.random.default_rng(0).uniform([-0.9, -0.9, -0.25], [0.9, 0.9, -0.15], (1000, 3)).astype(np.float32)
-    scene = replace(scene_around(), layout="inside")
+    scene = replace(scene_around(), capture_type="inside")
     cube, _ = run_mesh(Solid(plain), scene=scene, frame="scene")
     result, folder = run_mesh(Solid(plain), folder="flat", scene=scene, points=points, frame="scene")
     assert cube.facts["voxel"] == pytest.approx(VOXEL) and 0.4 * VOXEL < result.facts["voxel"] < 0.6 * VOXEL
@@ -309,8 +309,8 @@ def test_the_resolution_that_fits_into_seconds_is_that_of_the_box(run_mesh, monk
     monkeypatch.setattr(resolution, "reference_seconds", lambda: 0.02)
     monkeypatch.setattr(resolution, "density_query_seconds", lambda train, box: asked.append(box) or 2e-7)
     points = np.random.default_rng(0).uniform([-0.9, -0.9, -0.25], [0.9, 0.9, -0.15], (1000, 3)).astype(np.float32)
-    for layout in ("around", "inside"):
-        scene = replace(scene_around(), layout=layout)
+    for capture_type in ("around", "inside"):
+        scene = replace(scene_around(), capture_type=capture_type)
         run_mesh(Solid(plain), scene=scene, points=points, resolution=None, seconds=1.0)
     cube, flat = asked
     assert np.ptp(cube, axis=0).tolist() == [1.8, 1.8, 1.8]

@@ -15,13 +15,13 @@ CUBE = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-
 UP = np.array([0, 0, 1.0])
 
 
-def scene_of(layout, centres, target=(0.0, 0, 0)):
+def scene_of(capture_type, centres, target=(0.0, 0, 0)):
     views = tuple(
         View(f"{i}", f"{i}", 0, look_at(np.array([c], float), np.array(target))[0], 0.1, 9.0, "train")
         for i, c in enumerate(centres)
     )
     camera = Camera("SIMPLE_PINHOLE", 40, 30, (40.0, 20.0, 15.0))
-    return Scene((camera,), views, Similarity(1.0, np.eye(3), np.zeros(3)), True, False, layout, True)
+    return Scene((camera,), views, Similarity(1.0, np.eye(3), np.zeros(3)), True, False, capture_type, True)
 
 
 def shows_all(camera):

@@ -59,10 +59,10 @@ def test_the_yardstick_is_the_best_of_a_few(monkeypatch: pytest.MonkeyPatch):
 
 
 @pytest.mark.parametrize(("points", "flat"), [(GROUND, 2), (FACADE, 1)])
-@pytest.mark.parametrize("layout", ["forward", "inside"])
-def test_the_grid_of_a_flat_scene_spans_the_slice_that_its_points_lie_in(points, flat, layout):
+@pytest.mark.parametrize("capture_type", ["forward", "inside"])
+def test_the_grid_of_a_flat_scene_spans_the_slice_that_its_points_lie_in(points, flat, capture_type):
     stray = np.array([[0.1, 0.1, 0.85], [0.5, 0.85, 0.1], [0.0, 0.0, 30.0]])
-    box = grid_box(layout, np.concatenate([points, stray]))
+    box = grid_box(capture_type, np.concatenate([points, stray]))
     ends = np.quantile(points[:, flat], [0, 1]) + np.array([-1, 1]) * 2 * REGION_HALF * MARGIN
     np.testing.assert_allclose(box[:, flat], ends, atol=0.02)
     rest = [axis for axis in range(3) if axis != flat]
@@ -70,7 +70,7 @@ def test_the_grid_of_a_flat_scene_spans_the_slice_that_its_points_lie_in(points,
 
 
 @pytest.mark.parametrize(
-    ("points", "layout"),
+    ("points", "capture_type"),
     [
         (GROUND, "around"),  # the vase on the table is bare
         (GROUND * [0.5, 0.5, 1], "forward"),  # a poster on a bare wall
@@ -80,8 +80,8 @@ def test_the_grid_of_a_flat_scene_spans_the_slice_that_its_points_lie_in(points,
         (GROUND + np.array([0, 0, 5]), "inside"),
     ],
 )
-def test_the_lattice_spans_the_region_where_points_do_not_tell_that_it_is_flat(points, layout):
-    np.testing.assert_array_equal(grid_box(layout, points), CUBE)
+def test_the_lattice_spans_the_region_where_points_do_not_tell_that_it_is_flat(points, capture_type):
+    np.testing.assert_array_equal(grid_box(capture_type, points), CUBE)
 
 
 @pytest.mark.parametrize("resolution", [16, 48, 77, 256])

@@ -13,7 +13,7 @@ from PIL import Image
 from nerf.effects.appearance import AppearanceModel
 from nerf.effects.exposure import ExposureModel
 from nerf.fields.interface import Rendering
-from nerf.geometry.region_of_interest import Layout
+from nerf.geometry.region_of_interest import CaptureType
 from nerf.geometry.scene import Camera, Scene, Similarity, View
 from stages import render
 from stages.contract import StageError
@@ -52,13 +52,13 @@ class Ball:
         return Rendering(torch.where(hit[:, None], colour, background), torch.where(hit, t, rays.far), hit.to(t.dtype))
 
 
-def scene_with(poses: np.ndarray, layout: Layout = "around", camera: Camera = CAMERA) -> Scene:
+def scene_with(poses: np.ndarray, capture_type: CaptureType = "around", camera: Camera = CAMERA) -> Scene:
     views = tuple(
         View(f"{i}.jpg", f"images/{i}.png", 0, pose, 1.0, 9.0, "train" if i else "test") for i, pose in enumerate(poses)
     )
     turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     similarity = Similarity(0.5, turn, np.array([0.1, 0.2, 0.3]))
-    return Scene((camera,), views, similarity, False, False, layout, True)
+    return Scene((camera,), views, similarity, False, False, capture_type, True)
 
 
 @pytest.fixture
@@ -184,7 +184,7 @@ def test_nothing_is_timed_where_nothing_is_open(inputs, progress) -> None:
 
 
 @pytest.mark.parametrize(
-    ("poses", "layout", "up_known", "path"),
+    ("poses", "capture_type", "up_known", "path"),
     [
         (ring(), "around", True, "orbit"),
         (ring(), "around", False, "interpolated"),  # about which axis?
@@ -193,8 +193,10 @@ def test_nothing_is_timed_where_nothing_is_open(inputs, progress) -> None:
         (wall(), "inside", True, "interpolated"),
     ],
 )
-def test_the_layout_chooses_the_path(inputs, progress, poses, layout: Layout, up_known: bool, path: str) -> None:
-    scene = replace(scene_with(poses, layout), up_known=up_known)
+def test_the_layout_chooses_the_path(
+    inputs, progress, poses, capture_type: CaptureType, up_known: bool, path: str
+) -> None:
+    scene = replace(scene_with(poses, capture_type), up_known=up_known)
     write_json(inputs["normalise"] / "scene.json", scene.to_json())
     assert render.plan(render.Config(), inputs, progress).path == path
 
