@@ -76,8 +76,8 @@ def bench_of(workspace: Path) -> Bench:
     config = with_defaults(
         Config(
             field="grid",
-            contracted=decisions.unbounded,
-            view_dependence=decisions.view_dependence,
+            contracted="background" in decisions.on,
+            view_dependence="view_dependence" in decisions.on,
             backend=chosen_backend(compute_device(), Quiet()),
             chunks=CHUNKS,
         )

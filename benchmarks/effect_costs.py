@@ -10,7 +10,6 @@ effects would only take the difference of two colours; so it is a bound from abo
 
 import argparse
 import time
-from dataclasses import replace
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -57,17 +56,17 @@ def arms(
 ) -> dict[str, FieldTrainer]:
     """A trainer for each choice; ``identity`` stands in the first one."""
     views = scene.of_split("train")
-    none = replace(decided, view_dependence=True, pose_refinement=False, exposure=None)
-    gains = decided.exposure or {view.name: [0.0, 0.0, 0.0] for view in views}
+    gains = decided.on.get("exposure", {view.name: [0.0, 0.0, 0.0] for view in views})
+    none = decided.having("view_dependence").without("pose_refinement").without("exposure")
     choices = {
-        "exposure": replace(none, exposure=gains),
-        "pose refinement": replace(none, pose_refinement=True),
-        "both": replace(none, exposure=gains, pose_refinement=True),
-        "no view dependence": replace(none, view_dependence=False),
+        "exposure": none.having("exposure", gains),
+        "pose refinement": none.having("pose_refinement"),
+        "both": none.having("exposure", gains).having("pose_refinement"),
+        "no view dependence": none.without("view_dependence"),
     }
 
     def trainer(decisions: Decisions, effects: Any) -> FieldTrainer:
-        of_choice = config.model_copy(update={"view_dependence": decisions.view_dependence})
+        of_choice = config.model_copy(update={"view_dependence": "view_dependence" in decisions.on})
         return make_trainer(of_choice, scene, dataset, config.seed, effects)
 
     return {"off": trainer(none, identity)} | {

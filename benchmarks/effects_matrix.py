@@ -12,7 +12,6 @@ else is at stake.
 import argparse
 import json
 import tempfile
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -88,17 +87,12 @@ def gains(found: Outcome, wanted: Cell, steps: int) -> str:
     trial = pilot_scene(found.inputs, read_scene(found.inputs["normalise"]), Quiet())
     assert not isinstance(trial, str), trial
     called_for = (wanted.on & found.on) | ({"view_dependence"} if wanted.made.highlight else set())
-    without = {
-        "exposure": {"exposure": None},
-        "pose_refinement": {"pose_refinement": False},
-        "view_dependence": {"view_dependence": False},
-    }
-    parts = []
+    tried, parts = ["exposure", "pose_refinement", "view_dependence"], []
     if found.made == Effects():
-        without["background"] = {"unbounded": False}
-    for name, off in without.items():
+        tried.append("background")
+    for name in tried:
         if name in called_for:
-            pilot = run_pilot(trial, replace(found.decisions, **off), found.decisions, steps, 0, Quiet())
+            pilot = run_pilot(trial, found.decisions.without(name), found.decisions, steps, 0, Quiet())
             parts.append(f"{name} {pilot.gain_db:+.2f} ± {pilot.noise_db:.2f}, {pilot.cost:+.0%} time")
     return "; ".join(parts)
 

@@ -46,7 +46,7 @@ def scored(
 ) -> tuple[dict[str, float | None], float]:
     """The figures of a training with these effects at photos / ``downscale``, None for the size that it trained, and
     which that was; its field is removed again."""
-    choices = [f"--effects.{name.replace('_', '-')}={'on' if on else 'off'}" for name, on in effects.items()]
+    choices = [f"--effect={name}={'on' if on else 'off'}" for name, on in effects.items()]
     pipeline("effects", workspace, *choices)
     pipeline("train", workspace, "--train.steps", str(steps), "--train.seed", str(seed))
     trained = read_json(stage_folder(workspace, "curve.json") / "field.json")["downscale"]

@@ -25,7 +25,7 @@ from stages.io.files import read_json
 
 VARIANTS: dict[str, dict[str, dict[str, Any]]] = {
     "complete": {},
-    "no view dependence": {"effects": {"view_dependence": "off"}},
+    "no view dependence": {"force": {"view_dependence": "off"}},
     "no positional encoding": {"train": {"positional_encoding": False}},
     "no hierarchical sampling": {"train": {"hierarchical": False}},
 }
@@ -37,7 +37,7 @@ def settings_of(photos: Path, variant: str, seed: int, steps: int, downscale: fl
     """The reduced vanilla NeRF (4 layers of 64, 32 + 32 samples) in one variant."""
     train = {"field": "paper", "steps": steps, "seed": seed, "downscale": downscale}
     chosen = VARIANTS[variant]
-    values = {"train": train | chosen.get("train", {}), "effects": AS_PUBLISHED | chosen.get("effects", {})}
+    values = {"train": train | chosen.get("train", {}), "effects": {"force": AS_PUBLISHED | chosen.get("force", {})}}
     return with_source(settings_from(values, "the benchmark"), photos, None)
 
 

@@ -6,10 +6,10 @@ import sys
 def main() -> None:
     """Entry point. Ctrl-C while Python reads the program, half a second or so, ends it as it does later on."""
     try:
-        from pipeline.cli import commands as cli
+        from pipeline.cli import commands
     except KeyboardInterrupt:
         sys.exit(130)
-    cli.main()
+    commands.main()
 
 
 if __name__ == "__main__":

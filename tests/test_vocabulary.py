@@ -42,7 +42,16 @@ SFM_AND_INGEST: dict[str, str] = {}
 
 TRAINING: dict[str, str] = {}
 
-MESH_AND_TRADEOFF: dict[str, str] = {}
+MESH_AND_TRADEOFF: dict[str, str] = {
+    r"--mesh\.level\b": "--mesh.iso-level",
+    r"\bmiss_voxels\b|\blevel_reason\b": "surface error in voxels, iso_level_reason",
+    r"\byardstick\b": "reference timing",
+    r"\bFEWEST_WINDOWS\b|\bmake_exam\b|\bExam\b": "benchmark, evaluation crops",
+    r"\brungs?\b|\bRUNGS?\b": "budget level",
+    r"\bown_field\b|workspace's own field": "this workspace's field",
+    r"\bpoints? that nothing beats\b": "Pareto front",
+    r"\btells? its density\b": "density query rate",
+}
 
 PIPELINE: dict[str, str] = {}
 

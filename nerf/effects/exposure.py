@@ -46,8 +46,10 @@ class ExposureModel:
         self.mean = self.log_gain.mean(0)
 
     @classmethod
-    def initial(cls, images: TrainingImages, measured: Float[Tensor, "views 3"]) -> "ExposureModel":
-        """From gains that are known up to a factor per channel."""
+    def initial(cls, images: TrainingImages, measured: Float[Tensor, "views 3"] | None) -> "ExposureModel":
+        """From gains that are known up to a factor per channel; None: all alike."""
+        if measured is None:
+            measured = torch.zeros_like(images.scene_from_camera[:, :, 3])
         return cls(measured - measured.amin(0))
 
     @property

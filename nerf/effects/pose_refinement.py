@@ -46,8 +46,8 @@ class PoseRefinement:
         self.gauge = _gauge(centres, self.unit)
 
     @classmethod
-    def initial(cls, images: TrainingImages, measured: None = None) -> "PoseRefinement":
-        """No correction."""
+    def initial(cls, images: TrainingImages, measured: Tensor | None = None) -> "PoseRefinement":
+        """No correction: nothing is measured."""
         return cls(images.scene_from_camera[:, :, 3].contiguous(), images.viewing_distance)
 
     @property

@@ -15,7 +15,7 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from pipeline.cli import arguments as words_of
+from pipeline.cli import arguments
 from pipeline.cli.display import Unread, choose_display, open_closed_streams
 from pipeline.cli.durations import seconds_from
 from pipeline.cli.more import with_more
@@ -31,8 +31,7 @@ from pipeline.cli.settings import (
     with_source,
 )
 from pipeline.cli.signals import Terminated, go_on, heed_signals
-from pipeline.engine import machine, status
-from pipeline.engine import stage_list as chain
+from pipeline.engine import machine, stage_list, status
 from pipeline.engine.display import Display, SilentDisplay
 from pipeline.engine.failures import StageFailed
 from pipeline.engine.runner import Runner
@@ -69,7 +68,7 @@ def main() -> None:
 def run_command(words: Sequence[str]) -> int:
     """Run one command line and return its exit code; errors are said on the way."""
     if not words or words[0] in ("-h", "--help"):
-        print(words_of.overview(list(chain.STAGES)))
+        print(arguments.overview(list(stage_list.STAGES)))
         return 0 if words else EXIT_USAGE
     if words[0] == "--version":
         print(machine.versions(("pipeline-nerf",))["pipeline-nerf"])
@@ -84,7 +83,7 @@ def run_command(words: Sequence[str]) -> int:
     except StageFailed as failure:
         if debug:
             traceback.print_exc()
-        return chain.EXIT_CODES[failure.stage]
+        return stage_list.EXIT_CODES[failure.stage]
     except StageError as error:
         if debug:
             traceback.print_exc()
@@ -130,37 +129,37 @@ def _command(name: str) -> Callable[[Sequence[str]], int]:
     }
     if name in commands:
         return commands[name]
-    if name in chain.STAGES:
+    if name in stage_list.STAGES:
         return lambda words: command_stage(name, words)
     raise UsageError(f"no command {name!r}; there are: {', '.join([*commands, *chain.STAGES])}")
 
 
 def command_run(words: Sequence[str]) -> int:
     """``pipeline run PHOTOS``: the whole chain, or a part of it."""
-    given = words_of.parse(words_of.RunArguments, "run", words)
+    given = arguments.parse(arguments.RunArguments, "run", words)
     if given.more is not None and given.config is not None:
         what = f"--more goes on with the recorded options, not with those of --config {given.config}"
         raise UsageError(f"{what}; leave --config out, and give what is to change as flags")
     file = {} if given.config is None else read_toml(given.config)
     if given.config is not None:  # the file's values become the defaults that flags override
         from_file = settings_from(file, f"--config {given.config}")
-        given = words_of.parse(words_of.RunArguments, "run", words, from_file)
+        given = arguments.parse(arguments.RunArguments, "run", words, from_file)
     root, cameras = given.output or default_workspace(given.photos), given.cameras
     check_workspace(root, given.photos)
     if given.output is None:
         check_same_photos(Workspace(root), given.photos)
     if given.more is not None:
         recorded = _recorded_settings(Workspace.existing(root))
-        given = words_of.parse(words_of.RunArguments, "run", words, recorded)
+        given = arguments.parse(arguments.RunArguments, "run", words, recorded)
         cameras = cameras or recorded.ingest.cameras
     asked = _matching_exposure(with_effects(_more(given, root), given.effect), given.match_exposure)
     asked = _keeping_studies(asked, root, words, file)
-    stages = chain.up_to(_known_stage(given.until or list(chain.STAGES)[-1], "--until"))
+    stages = stage_list.up_to(_known_stage(given.until or list(stage_list.STAGES)[-1], "--until"))
     force = frozenset[str]()
     if given.from_ is not None:
         force = frozenset(stages[stages.index(_known_stage(given.from_, "--from", stages)) :])
     budget = _budget(given.budget, asked)
-    if budget is not None and (studies := [stage for stage in stages if stage in chain.ON_REQUEST]):
+    if budget is not None and (studies := [stage for stage in stages if stage in stage_list.ON_REQUEST]):
         later = f"`pipeline {studies[0]} {root} --budget 30m`"
         raise UsageError(f"--budget and --until {studies[0]}: a study has a budget of its own; run first, then {later}")
     with choose_display(given.common.json) as display:
@@ -168,7 +167,7 @@ def command_run(words: Sequence[str]) -> int:
             settings = with_source(asked, given.photos, cameras)
         except StageError as error:
             display.failed("ingest", error)
-            return chain.EXIT_CODES["ingest"]
+            return stage_list.EXIT_CODES["ingest"]
         new_budget = None if given.more is not None else (budget, 0.0)
         return _run_stages(root, settings, stages, given.common, display, force, new_budget=new_budget)
 
@@ -176,11 +175,14 @@ def command_run(words: Sequence[str]) -> int:
 def _keeping_studies(settings: Settings, root: Path, words: Sequence[str], file: Collection[str] = ()) -> Settings:
     """The settings with the recorded options of the stages ON_REQUEST but those that the command's ``words`` or tables
     of the ``file`` of --config name: a run that does not ask for them leaves what they found where it is."""
-    named = {*file, *(stage for stage in chain.ON_REQUEST if any(word.startswith(f"--{stage}.") for word in words))}
+    named = {
+        *file,
+        *(stage for stage in stage_list.ON_REQUEST if any(word.startswith(f"--{stage}.") for word in words)),
+    }
     if not os.path.isfile(root / RUN_FILE):
         return settings
     options = Workspace(root).read_run()["options"]
-    recorded = {stage: options[stage] for stage in chain.ON_REQUEST if stage in options and stage not in named}
+    recorded = {stage: options[stage] for stage in stage_list.ON_REQUEST if stage in options and stage not in named}
     try:
         kept = settings_from(recorded, f"options recorded in {root}")
     except UsageError:  # of another version of this program, which finds nothing by them anyway
@@ -198,7 +200,7 @@ def _budget(text: str | None, settings: Settings) -> float | None:
     return None if text is None else seconds_from(text)
 
 
-def _more(given: words_of.RunArguments | words_of.StageArguments, root: Path) -> Settings:
+def _more(given: arguments.RunArguments | arguments.StageArguments, root: Path) -> Settings:
     """The settings given, with ``--more``."""
     return given.settings if given.more is None else with_more(given.settings, Workspace.existing(root), given.more)
 
@@ -210,7 +212,7 @@ def _matching_exposure(settings: Settings, photo: str | None) -> Settings:
     return settings.model_copy(update={"render": settings.render.model_copy(update={"match_exposure": photo})})
 
 
-def _known_stage(name: str, flag: str, among: Sequence[str] = tuple(chain.STAGES)) -> str:
+def _known_stage(name: str, flag: str, among: Sequence[str] = tuple(stage_list.STAGES)) -> str:
     if name not in among:
         raise UsageError(f"{flag} {name}: not one of {', '.join(among)}")
     return name
@@ -220,7 +222,7 @@ def _run_stages(
     root: Path,
     settings: Settings,
     stages: Sequence[str],
-    common: words_of.Common,
+    common: arguments.Common,
     display: Display,
     force: frozenset[str] = frozenset(),
     alone: str | None = None,
@@ -266,10 +268,10 @@ def _closing_words(workspace: Workspace, ran: bool) -> str:
 
 def command_stage(stage: str, words: Sequence[str]) -> int:
     """``pipeline STAGE WORKSPACE``: bring one stage, what it needs, and the report if there is one, up to date."""
-    given = words_of.parse(words_of.StageArguments, stage, words)
+    given = arguments.parse(arguments.StageArguments, stage, words)
     workspace = Workspace.existing(given.workspace)
     recorded = _recorded_settings(workspace)
-    given = words_of.parse(words_of.StageArguments, stage, words, recorded)
+    given = arguments.parse(arguments.StageArguments, stage, words, recorded)
     for flag in ("cameras", "match_exposure"):
         if getattr(given, flag) is not None and stage != "render":
             option = flag.replace("_", "-")
@@ -282,7 +284,7 @@ def command_stage(stage: str, words: Sequence[str]) -> int:
     if given.cameras is not None:
         update = {"cameras": given.cameras.absolute()}
         settings = settings.model_copy(update={"render": settings.render.model_copy(update=update)})
-    stages = chain.needed_for(stage)
+    stages = stage_list.needed_for(stage)
     if stage != "report" and "report" in workspace.read_run()["keys"]:
         stages = [*stages, "report"]
     with choose_display(given.common.json) as display:
@@ -312,9 +314,9 @@ def _recorded_settings(workspace: Workspace) -> Settings:
 
 def command_resume(words: Sequence[str]) -> int:
     """``pipeline resume WORKSPACE``: repeat the recorded run."""
-    given = words_of.parse(words_of.ResumeArguments, "resume", words)
+    given = arguments.parse(arguments.ResumeArguments, "resume", words)
     workspace = Workspace.existing(given.workspace)
-    stages = workspace.read_run().get("stages") or chain.usual()
+    stages = workspace.read_run().get("stages") or stage_list.usual()
     with choose_display(given.common.json) as display:
         return _run_stages(given.workspace, _recorded_settings(workspace), stages, given.common, display)
 
@@ -326,7 +328,7 @@ def _reader(root: Path) -> tuple[Workspace, Runner]:
 
 def command_status(words: Sequence[str]) -> int:
     """``pipeline status WORKSPACE``."""
-    given = words_of.parse(words_of.StatusArguments, "status", words)
+    given = arguments.parse(arguments.StatusArguments, "status", words)
     statuses = status.all_statuses(*_reader(given.workspace), given.verify)
     code = EXIT_DEFECT if given.verify and any(s.state == "damaged" for s in statuses) else 0
     if given.json:
@@ -339,7 +341,7 @@ def command_status(words: Sequence[str]) -> int:
 
 def command_explain(words: Sequence[str]) -> int:
     """``pipeline explain STAGE WORKSPACE``."""
-    given = words_of.parse(words_of.ExplainArguments, "explain", words)
+    given = arguments.parse(arguments.ExplainArguments, "explain", words)
     stage = _known_stage(given.stage, "explain")
     print("\n".join(status.explain(*_reader(given.workspace), stage)))
     return 0
@@ -347,9 +349,9 @@ def command_explain(words: Sequence[str]) -> int:
 
 def command_clean(words: Sequence[str]) -> int:
     """``pipeline clean WORKSPACE``: remove results that the recorded options do not use."""
-    given = words_of.parse(words_of.CleanArguments, "clean", words)
+    given = arguments.parse(arguments.CleanArguments, "clean", words)
     with Workspace.existing(given.workspace) as workspace:
-        stale = workspace.stale_folders(workspace.read_run()["keys"], list(chain.STAGES))
+        stale = workspace.stale_folders(workspace.read_run()["keys"], list(stage_list.STAGES))
         freed = sum(p.stat().st_size for folder in stale for p in folder.rglob("*") if p.is_file())
         for folder in stale:
             print(f"{'would remove' if given.dry_run else 'removed'} {folder}")
@@ -361,7 +363,7 @@ def command_clean(words: Sequence[str]) -> int:
 
 def command_doctor(words: Sequence[str]) -> int:
     """``pipeline doctor``: versions, device, threads, free disk, a numerical self-test."""
-    given = words_of.parse(words_of.DoctorArguments, "doctor", words)
+    given = arguments.parse(arguments.DoctorArguments, "doctor", words)
     from pipeline.doctor import examine
 
     return examine(Path(os.curdir), given.selftest, given.bench)
@@ -371,9 +373,9 @@ def command_demo(words: Sequence[str]) -> int:
     """``pipeline demo``: photograph a synthetic scene, run everything, compare with the truth."""
     from pipeline import demo
 
-    given = words_of.parse(words_of.DemoArguments, "demo", words)
+    given = arguments.parse(arguments.DemoArguments, "demo", words)
     if given.budget is None:
-        given = words_of.parse(words_of.DemoArguments, "demo", words, demo.default_settings())
+        given = arguments.parse(arguments.DemoArguments, "demo", words, demo.default_settings())
     budget = _budget(given.budget, given.settings)
     asked = with_effects(given.settings, given.effect)
     photos, root = given.output / "photos", given.output / "demo.nerf"
@@ -384,7 +386,7 @@ def command_demo(words: Sequence[str]) -> int:
         display.end("photos", line, seconds, cached=seconds == 0)
         settings = with_source(asked, photos, None)
         budgeted = (budget, seconds)
-        code = _run_stages(root, settings, chain.usual(), given.common, display, new_budget=budgeted)
+        code = _run_stages(root, settings, stage_list.usual(), given.common, display, new_budget=budgeted)
         started = time.monotonic()
         display.begin("truth")
         *notes, last = demo.truth_lines(root / "output", photos)

@@ -5,14 +5,14 @@ import os
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel, ValidationError
 
 from pipeline.engine.settings import Settings
 from pipeline.engine.workspace import RUN_FILE, Workspace, default_workspace, is_result, lasting, photo_set
 from stages.contract import bounded
-from stages.effects import Config as EffectsConfig
+from stages.effects.effect_list import EFFECTS
 
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
@@ -68,21 +68,21 @@ def _wrong_option(name: str, problem: "ErrorDetails") -> str:
 
 
 def with_effects(settings: Settings, choices: Sequence[str]) -> Settings:
-    """The settings of all stages with each ``NAME=on|off|auto`` as the option NAME of stage effects; the last one wins.
+    """The settings of all stages with each effect of ``NAME=on|off|auto`` forced, or not any more; the last one wins.
 
     Raises UsageError for another name or value, with those that there are.
     """
-    fields = EffectsConfig.model_fields.items()
-    names = [name for name, field in fields if {"on", "off", "auto"} <= set(get_args(field.annotation))]
-    chosen = {}
+    names = [effect.name for effect in EFFECTS]
+    force: dict[str, Any] = dict(settings.effects.force)
     for choice in choices:
         name, _, value = choice.partition("=")
         if name.replace("-", "_") not in names:
             raise UsageError(f"--effect {choice}: no effect {name!r}; there are: {', '.join(names)}")
         if value not in ("on", "off", "auto"):
             raise UsageError(f"--effect {choice}: {name} can be on, off or auto, as in --effect {name}=on")
-        chosen[name.replace("-", "_")] = value
-    return settings.model_copy(update={"effects": settings.effects.model_copy(update=chosen)})
+        force[name.replace("-", "_")] = value
+    force = {name: value for name, value in force.items() if value != "auto"}
+    return settings.model_copy(update={"effects": settings.effects.model_copy(update={"force": force})})
 
 
 def with_source(settings: Settings, photos: Path, cameras: Path | None) -> Settings:

@@ -94,10 +94,10 @@ def _draw(path: Path, scene: "SyntheticScene", directions: "torch.Tensor", pose:
     import torch
     from PIL import Image
 
-    from nerf.synthetic.scenes import photograph as draw
+    from nerf.synthetic import scenes
 
     with torch.inference_mode():
-        image = draw(scene, directions, torch.tensor(pose, dtype=torch.float32), SAMPLES_PER_SIDE)
+        image = scenes.photograph(scene, directions, torch.tensor(pose, dtype=torch.float32), SAMPLES_PER_SIDE)
     pixels = (255 * image).round().byte().numpy()
     Image.fromarray(pixels).save(path, quality=JPEG_QUALITY, subsampling=0)
 

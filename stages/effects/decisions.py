@@ -2,11 +2,12 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from statistics import fmean
 from typing import TYPE_CHECKING, Any, Literal
 
+from stages.effects.effect_list import EFFECTS
 from stages.io.files import read_dataclass, write_json
 
 if TYPE_CHECKING:
@@ -22,25 +23,23 @@ Space = Literal["bounded", "contracted"]
 
 @dataclass(frozen=True)
 class Decisions:
-    """Which effects are modelled. ``exposure``: natural logarithm of the gain per channel in linear light, by the name
-    of each training photo; None: all photos have one exposure."""
+    """``on``: by the name of each effect that is modelled what it begins with: numbers by the name of each training
+    photo (as exposure has natural logarithms of gains in linear light), or nothing."""
 
-    view_dependence: bool = True
-    unbounded: bool = False
-    pose_refinement: bool = False
-    exposure: dict[str, list[float]] | None = None
+    on: dict[str, dict[str, list[float]]] = field(default_factory=dict)
 
     @property
     def space(self) -> Space:
-        """What the field lies in: the box, or all of space, folded."""
-        return "contracted" if self.unbounded else "bounded"
+        """What the field lies in: the box, or all of space, contracted."""
+        return "contracted" if "background" in self.on else "bounded"
 
-    def log_gain(self, views: "Sequence[View]") -> "torch.Tensor":
-        """The gains of some training photos, (views, 3)."""
-        import torch
+    def having(self, name: str, measured: dict[str, list[float]] | None = None) -> "Decisions":
+        """These, with one effect more."""
+        return Decisions({**self.on, name: measured or {}})
 
-        assert self.exposure is not None
-        return torch.tensor([self.exposure[view.name] for view in views])
+    def without(self, name: str) -> "Decisions":
+        """These, with one effect less."""
+        return Decisions({other: measured for other, measured in self.on.items() if other != name})
 
 
 def write_decisions(folder: Path, decisions: Decisions) -> None:
@@ -59,18 +58,22 @@ def image_effects(decisions: Decisions, views: "Sequence[View]", dataset: "RayDa
     import torch
 
     from nerf.effects import NO_EFFECTS, ImageEffects, TrainingImages
-    from nerf.effects.exposure import ExposureModel
-    from nerf.effects.pose_refinement import PoseRefinement
 
-    if not decisions.pose_refinement and decisions.exposure is None:
+    rays, colours = [], []
+    modelled = [(effect.name, effect.load()) for effect in EFFECTS if effect.name in decisions.on]
+    if not any(parts.rays or parts.colours for _, parts in modelled):
         return NO_EFFECTS
     poses = np.stack([view.scene_from_camera for view in views])
     images = TrainingImages(torch.tensor(poses, dtype=torch.float32, device=dataset.device), dataset.viewing_distance)
-    gains = None if decisions.exposure is None else decisions.log_gain(views).to(dataset.device)
-    return ImageEffects(
-        (PoseRefinement.initial(images),) if decisions.pose_refinement else (),
-        () if gains is None else (ExposureModel.initial(images, gains),),
-    )
+    for name, parts in modelled:
+        measured = None
+        if rows := decisions.on[name]:
+            measured = torch.tensor([rows[view.name] for view in views], device=dataset.device)
+        if parts.rays:
+            rays.append(parts.rays(images, measured))
+        if parts.colours:
+            colours.append(parts.colours(images, measured))
+    return ImageEffects(tuple(rays), tuple(colours))
 
 
 def told_by_neighbours(scene: "Scene", unseen: "Sequence[View]") -> "torch.Tensor":

@@ -3,35 +3,71 @@
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
+
+from nerf.effects.statistics.background import background_evidence, untracked_share
+from nerf.effects.statistics.blur import blur_evidence
+from nerf.effects.statistics.exposure import ExposureFit, exposure_evidence, fit_exposure, tone_evidence
+from nerf.effects.statistics.media import media_evidence
+from nerf.effects.statistics.poses import common_residuals, pose_evidence
+from nerf.effects.statistics.rolling_shutter import across_rows, motion_to_next, rolling_shutter_evidence
+from nerf.effects.statistics.scale import scale_evidence
+from nerf.effects.statistics.statistic import Evidence, unknown
+from nerf.effects.statistics.tracks import TrackColours
+from nerf.effects.statistics.transients import Odd, odd_photos, transients_evidence
+from nerf.effects.statistics.vignetting import vignetting_evidence
 from stages.contract import Progress
+from stages.effects.effect_list import EFFECTS
+from stages.effects.track_colours import look_at_photos
+from stages.io.photos import read_photos
+from stages.sfm.colmap.cameras import project
 
 if TYPE_CHECKING:
-    import numpy as np
-
-    from nerf.effects.statistics.exposure import ExposureFit
-    from nerf.effects.statistics.statistic import Evidence
     from nerf.geometry.scene import Scene
 
-
-PHOTOMETRIC = (
-    *("exposure", "tone", "view_dependence", "vignetting"),
-    *("transients", "scale", "participating_media", "blur"),
-)
-GEOMETRIC = ("background", "pose_refinement", "rolling_shutter")
 PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")
 REFERENCE_PX = 1000  # the longer side, as nerf/effects/statistics/poses.py says in its unit
 GAIN_DIGITS = 4  # of logarithms: a hundredth of what they are known to
 
 
-class SceneEvidence(NamedTuple):
-    """The evidence by effect, the gains that effects may begin with, of the training photos in order of name, and the
-    ``seconds`` that the evidence took, by effect."""
+class Places(NamedTuple):
+    """Of each of k observations its photo, point, pixel and residual (px of a photo of REFERENCE_PX); of the photos
+    their size, how uncertain poses are said to be, and their number among the frames of a video."""
 
-    of: "dict[str, Evidence]"
-    exposure: "ExposureFit"
+    views: int
+    has_alpha: bool
+    xyz: np.ndarray  # (points, 3)
+    view: np.ndarray
+    point: np.ndarray
+    xy: np.ndarray
+    residual_px: np.ndarray
+    size: np.ndarray  # (views, 2) width and height
+    uncertainty_px: np.ndarray  # (views,) NaN where it is not known
+    frame: np.ndarray | None  # (views,)
+
+
+class Observations(NamedTuple):
+    """All that statistics look at: ``tracks`` read off the photos, the ``exposure`` fitted to them, ``outliers`` among
+    the photos, the ``exif_ev`` that the camera wrote, the photos' ``gradients``, and ``places``."""
+
+    tracks: TrackColours
+    exposure: ExposureFit
+    outliers: Odd
+    exif_ev: np.ndarray
+    gradients: np.ndarray
+    places: Places
+
+
+class SceneEvidence(NamedTuple):
+    """The evidence by effect and warning, what effects begin with (training photos in order, numbers), and the
+    ``seconds`` that the evidence took."""
+
+    of: dict[str, Evidence]
+    measured: dict[str, np.ndarray]
     seconds: dict[str, float]
 
 
@@ -50,7 +86,7 @@ class Clock:
         for name in names:
             self.seconds[name] = self.seconds.get(name, 0.0) + part
 
-    def timed(self, statistics: "Mapping[str, Callable[[], Evidence]]") -> "dict[str, Evidence]":
+    def timed(self, statistics: Mapping[str, Callable[[], Evidence]]) -> dict[str, Evidence]:
         """What each of them says; each counts for its own name."""
         said = {}
         for name, statistic in statistics.items():
@@ -62,50 +98,112 @@ class Clock:
 def scene_evidence(
     ingest: Path,
     scene: "Scene",
-    points: "Mapping[str, np.ndarray]",
+    points: Mapping[str, np.ndarray],
     uncertainty_px: Mapping[str, float | None],
     progress: Progress,
 ) -> SceneEvidence:
     """Everything that can be told without training. ``points`` is points.safetensors, ``uncertainty_px`` what
     registration.json says of each photo by its file (``images/…``)."""
-    import numpy as np
+    clock, parts = Clock(), {effect.name: effect.load() for effect in EFFECTS}
+    with clock.runs_for(*parts, *WARNINGS):
+        seen = observed(ingest, scene, points, uncertainty_px, progress)
+    statistics = {name: each.statistic for name, each in parts.items()} | WARNINGS
+    of = clock.timed({name: partial(statistic, seen) for name, statistic in statistics.items()})
+    measured = {name: each.measured(seen) for name, each in parts.items() if each.measured}
+    return SceneEvidence(of, measured, clock.seconds)
 
-    from nerf.effects.statistics.blur import blur_evidence
-    from nerf.effects.statistics.exposure import exposure_evidence, fit_exposure, tone_evidence
-    from nerf.effects.statistics.media import media_evidence
-    from nerf.effects.statistics.scale import scale_evidence
-    from nerf.effects.statistics.transients import odd_photos, transients_evidence
-    from nerf.effects.statistics.view_dependence import view_dependence_evidence
-    from nerf.effects.statistics.vignetting import vignetting_evidence
-    from stages.effects.track_colours import look_at_photos
 
-    clock = Clock()
-    with clock.runs_for(*PHOTOMETRIC):
-        looked = look_at_photos(ingest, scene, points, progress)
-        progress.update("fitting the photos' exposures")
-        fit, tracks = fit_exposure(looked.tracks), looked.tracks
-        odd = odd_photos(tracks, fit, looked.expected)
-    of = clock.timed(
-        {
-            "exposure": lambda: exposure_evidence(fit, told_exposures(ingest, scene), odd.much),
-            "tone": lambda: tone_evidence(fit),
-            "view_dependence": lambda: view_dependence_evidence(tracks, fit),
-            "vignetting": lambda: vignetting_evidence(tracks, fit),
-            "transients": lambda: transients_evidence(odd, fit),
-            "scale": lambda: scale_evidence(tracks),
-            "participating_media": lambda: media_evidence(tracks, fit),
-            "blur": lambda: blur_evidence(looked.gradients),
-        }
+def observed(
+    ingest: Path,
+    scene: "Scene",
+    points: Mapping[str, np.ndarray],
+    uncertainty_px: Mapping[str, float | None],
+    progress: Progress,
+) -> Observations:
+    """What photos and tracks show."""
+    looked = look_at_photos(ingest, scene, points, progress)
+    progress.update("fitting the photos' exposures")
+    exposure = fit_exposure(looked.tracks)
+    return Observations(
+        tracks=looked.tracks,
+        exposure=exposure,
+        outliers=odd_photos(looked.tracks, exposure, looked.expected),
+        exif_ev=told_exposures(ingest, scene),
+        gradients=looked.gradients,
+        places=observed_places(ingest, scene, points, uncertainty_px),
     )
-    of["exposure"] = unless_pixels_differ(of["exposure"], of["scale"])
-    of |= geometric_evidence(ingest, scene, points, uncertainty_px, clock)
-    # What is trained begins with the gains: logarithms that differ in their last digits from processor to processor
-    # must not make another field.
-    gains = np.round(fit.log_gain, GAIN_DIGITS) + 0.0  # no -0
-    return SceneEvidence(of, fit._replace(log_gain=gains), clock.seconds)
 
 
-def unless_pixels_differ(exposure: "Evidence", scale: "Evidence") -> "Evidence":
+def observed_places(
+    ingest: Path, scene: "Scene", points: Mapping[str, np.ndarray], uncertainty_px: Mapping[str, float | None]
+) -> Places:
+    """What is told by places alone. Errors are laid on photos of REFERENCE_PX, for which thresholds are derived."""
+    views = scene.of_split("train")
+    xy, view, point, residual = training_residuals(scene, points)
+    size = np.array([[scene.cameras[one.camera].width, scene.cameras[one.camera].height] for one in views], float)
+    stated = np.array([uncertainty_px.get(one.file) for one in views], float)  # None becomes NaN
+    usual = REFERENCE_PX / size.max(axis=1)
+    return Places(
+        views=len(views),
+        has_alpha=scene.has_alpha,
+        xyz=points["xyz"].astype(float),
+        view=view,
+        point=point,
+        xy=xy,
+        residual_px=residual * usual[view, None],
+        size=size,
+        uncertainty_px=stated * usual,
+        frame=np.array(scene.indices_of("train")) if _is_video(ingest, [one.file for one in views]) else None,
+    )
+
+
+def exposure_statistic(seen: Observations) -> Evidence:
+    """The deviation of gains over the photos, outliers aside."""
+    found = exposure_evidence(seen.exposure, seen.exif_ev, seen.outliers.much)
+    return unless_pixels_differ(found, scale_evidence(seen.tracks))
+
+
+def measured_gains(seen: Observations) -> np.ndarray:
+    """The gains (views, 3), rounded: logarithms that differ in their last digits from processor to processor must not
+    make another field."""
+    return np.round(seen.exposure.log_gain, GAIN_DIGITS) + 0.0  # no -0
+
+
+def background_statistic(places: Places) -> Evidence:
+    """What lies beyond the region, and where no tracks are."""
+    untracked = untracked_share(places.xy / places.size[places.view], places.view, places.views)
+    return background_evidence(places.xyz, places.point, places.has_alpha, untracked)
+
+
+def pose_statistic(places: Places) -> Evidence:
+    """How far photos are from where their pose puts them."""
+    common = common_residuals(places.residual_px, places.xy, places.view, places.views)
+    return pose_evidence(*common, places.uncertainty_px)
+
+
+def rolling_shutter_statistic(places: Places) -> Evidence:
+    """Of the frames of a video."""
+    motion = np.full((places.views, 2), np.nan)
+    if places.frame is not None:
+        usual = REFERENCE_PX / places.size.max(axis=1)
+        motion = motion_to_next(places.xy * usual[places.view, None], places.point, places.view, places.frame)
+    row = across_rows(places.xy, places.size[places.view])
+    return rolling_shutter_evidence(places.residual_px, row, motion, places.view)
+
+
+# What is seen and not modelled.
+WARNINGS: dict[str, Callable[[Observations], Evidence]] = {
+    "tone": lambda seen: tone_evidence(seen.exposure),
+    "vignetting": lambda seen: vignetting_evidence(seen.tracks, seen.exposure),
+    "transients": lambda seen: transients_evidence(seen.outliers, seen.exposure),
+    "scale": lambda seen: scale_evidence(seen.tracks),
+    "blur": lambda seen: blur_evidence(seen.gradients),
+    "rolling_shutter": lambda seen: rolling_shutter_statistic(seen.places),
+    "participating_media": lambda seen: media_evidence(seen.tracks, seen.exposure),
+}
+
+
+def unless_pixels_differ(exposure: Evidence, scale: Evidence) -> Evidence:
     """What is told of exposure, left to a pilot where ``scale`` is seen: coarse pixels average what fine ones tell
     apart, by which the gains of photos from very different distances differ, too (docs/experiments/effects.md)."""
     if not (exposure.called_for and scale.called_for):
@@ -114,20 +212,14 @@ def unless_pixels_differ(exposure: "Evidence", scale: "Evidence") -> "Evidence":
     return exposure._replace(called_for=None, words=words)
 
 
-def told_exposures(ingest: Path, scene: "Scene") -> "np.ndarray":
+def told_exposures(ingest: Path, scene: "Scene") -> np.ndarray:
     """(training photos,) exposure that EXIF tells of each, EV up to a constant; NaN where it tells none."""
-    import numpy as np
-
-    from stages.io.photos import read_photos
-
     told = {photo.file: photo.exposure_ev for photo in read_photos(ingest)}
     return np.array([told.get(view.file) for view in scene.of_split("train")], float)  # None becomes NaN
 
 
-def lens_evidence(registration: dict[str, Any]) -> "Evidence":
+def lens_evidence(registration: dict[str, Any]) -> Evidence:
     """The choice that stage sfm made by held-out reprojection error, shown beside the others."""
-    from nerf.effects.statistics.statistic import Evidence, unknown
-
     rows = registration.get("camera_models") or []
     chosen = [row for row in rows if row["chosen"]]
     if not chosen:
@@ -144,64 +236,17 @@ def lens_evidence(registration: dict[str, Any]) -> "Evidence":
     return Evidence(most, "px", noise, noise, any(row["model"] not in PINHOLES for row in chosen), words)
 
 
-def geometric_evidence(
-    ingest: Path,
-    scene: "Scene",
-    points: "Mapping[str, np.ndarray]",
-    uncertainty_px: Mapping[str, float | None],
-    clock: Clock,
-) -> "dict[str, Evidence]":
-    """What is told by places alone. Errors are laid on photos of REFERENCE_PX, for which thresholds are derived."""
-    import numpy as np
-
-    from nerf.effects.statistics.background import background_evidence, untracked_share
-    from nerf.effects.statistics.poses import common_residuals, pose_evidence
-    from nerf.effects.statistics.rolling_shutter import across_rows, motion_to_next, rolling_shutter_evidence
-
-    views = scene.of_split("train")
-    with clock.runs_for(*GEOMETRIC):
-        xy, view, point, residual = training_residuals(scene, points)
-        size = np.array([[scene.cameras[one.camera].width, scene.cameras[one.camera].height] for one in views], float)
-        stated = np.array([uncertainty_px.get(one.file) for one in views], float)  # None becomes NaN
-        usual = REFERENCE_PX / size.max(axis=1)
-        residual, stated = residual * usual[view, None], stated * usual
-
-    def background() -> "Evidence":
-        untracked = untracked_share(xy / size[view], view, len(views))
-        return background_evidence(points["xyz"].astype(float), point, scene.has_alpha, untracked)
-
-    def rolling_shutter() -> "Evidence":
-        motion = np.full((len(views), 2), np.nan)
-        if _is_video(ingest, [one.file for one in views]):
-            motion = motion_to_next(xy * usual[view, None], point, view, np.array(scene.indices_of("train")))
-        return rolling_shutter_evidence(residual, across_rows(xy, size[view]), motion, view)
-
-    return clock.timed(
-        {
-            "background": background,
-            "pose_refinement": lambda: pose_evidence(*common_residuals(residual, xy, view, len(views)), stated),
-            "rolling_shutter": rolling_shutter,
-        }
-    )
-
-
 def _is_video(ingest: Path, files: Sequence[str]) -> bool:
     """Whether all of the photos are frames of a video."""
-    from stages.io.photos import read_photos
-
     timed = {photo.file for photo in read_photos(ingest) if photo.time_s is not None}
     return set(files) <= timed
 
 
 def training_residuals(
-    scene: "Scene", points: "Mapping[str, np.ndarray]"
-) -> "tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]":
+    scene: "Scene", points: Mapping[str, np.ndarray]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Of each observation of a training photo its pixel (k, 2), its photo's number among the training photos, its
     point, and observed minus projected pixel (k, 2). Points that their photo cannot see at all are left out."""
-    import numpy as np
-
-    from stages.sfm.colmap.cameras import project
-
     parts = []
     trained = scene.indices_of("train")
     for number, index in enumerate(trained):

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from stages.contract import Inputs, Progress, StageError
 from stages.effects.decisions import Decisions, image_effects
+from stages.effects.effect_list import EFFECTS
 from stages.evaluate.image_metrics import FEWEST_FOR_INTERVAL, mean_interval
 from stages.train.config import BLACK
 
@@ -108,7 +109,8 @@ def pilot_scene(inputs: Inputs, scene: "Scene", progress: Progress) -> PilotScen
 def fits_poses(off: Decisions, on: Decisions) -> bool:
     """Whether a pilot of these two arms finds out where photos kept back were taken from: where neither refines poses,
     they are taken as right."""
-    return off.pose_refinement or on.pose_refinement
+    refined = {effect.name for effect in EFFECTS if effect.load().rays}
+    return not refined.isdisjoint({*off.on, *on.on})
 
 
 def expected_seconds(scene: "Scene", steps: int) -> tuple[float, float]:
@@ -117,7 +119,7 @@ def expected_seconds(scene: "Scene", steps: int) -> tuple[float, float]:
     from stages.hardware.device import compute_device, cores
     from stages.train.planning import seconds_per_step
 
-    arm, device = Decisions(unbounded=not scene.has_alpha), compute_device()
+    arm, device = Decisions({"view_dependence": {}} | ({} if scene.has_alpha else {"background": {}})), compute_device()
     per_step = seconds_per_step(_config(arm, steps, device), scene, arm, device)
     trainings = (1 + BESIDE_TRAINING) * 2 * SEEDS * steps * per_step
     on_cpu = per_step if device == "cpu" else seconds_per_step(_config(arm, steps, "cpu"), scene, arm, "cpu")
@@ -175,8 +177,8 @@ def _config(arm: Decisions, steps: int, device: str) -> "TrainConfig":
         Config(
             field="grid",
             steps=steps,
-            contracted=arm.unbounded,
-            view_dependence=arm.view_dependence,
+            contracted="background" in arm.on,
+            view_dependence="view_dependence" in arm.on,
             backend=chosen_backend(device),
             chunks=CHUNKS,
             levels=4,

@@ -263,7 +263,7 @@ def _curve(results: Results) -> dict[str, Any] | None:
     if results.curve is None:
         return None
     points, metrics = results.curve["points"], results.metrics or {}
-    baselines = {"nearest photo": "psnr_nearest_view", "mean image": "psnr_mean_image"}
+    baselines = {"nearest training view": "psnr_nearest_view", "mean image": "psnr_mean_image"}
     coming = coming_doubling(results.curve["field"], results.curve["whole"], points)
     svg = curve_svg(points, {name: metrics.get(key) for name, key in baselines.items()}, coming)
     if svg is None:

@@ -4,17 +4,17 @@ from typing import Any
 
 # By part: its colour in the bar, and what it does.
 PARTS = {
-    "batch": ("#64748b", "pixels and rays of the photos drawn"),
-    "march": ("#0ea5e9", "samples placed along rays, through cells that may hold something"),
-    "sampling": ("#0ea5e9", "samples placed along rays, by the coarse network's weights"),
-    "gather": ("#3b82f6", "features of samples read from the grids"),
-    "encode": ("#8b5cf6", "positions and directions lifted to waves"),
+    "batch": ("#64748b", "pixels and rays of the batch"),
+    "march": ("#0ea5e9", "samples along rays, through occupied cells"),
+    "sampling": ("#0ea5e9", "samples along rays, by the coarse network's weights"),
+    "gather": ("#3b82f6", "features read from the grids"),
+    "encode": ("#8b5cf6", "positional encoding"),
     "mlp": ("#f2711c", "networks, forward"),
-    "composite": ("#10b981", "samples added up to colours; the loss"),
-    "backward": ("#e11d48", "gradients, back through all of it"),
+    "composite": ("#10b981", "volume rendering and the loss"),
+    "backward": ("#e11d48", "backward pass"),
     "scatter": ("#eab308", "gradients added to the grids"),
     "optimiser": ("#a16207", "Adam"),
-    "cache": ("#14b8a6", "the memory of which cells are empty"),
+    "cache": ("#14b8a6", "update of the occupancy grid"),
     "rest": ("#94a3b8", "everything between these parts"),
     "waiting": ("transparent", "cores waiting for each other, or for other programs"),
 }

@@ -47,7 +47,8 @@ def planned(config: Config, inputs: Inputs, progress: Progress) -> Config:
     preset = config.preset or "standard"
     seconds = SECONDS[preset] if config.steps is None and config.seconds is None else config.seconds
     config = config.model_copy(update={"field": config.kind, "preset": preset, "seconds": seconds})
-    config = config.filled({"contracted": decisions.unbounded, "view_dependence": decisions.view_dependence})
+    decided = {"contracted": "background" in decisions.on, "view_dependence": "view_dependence" in decisions.on}
+    config = config.filled(decided)
     field = field_of(config)
     config = field.prepared(field.with_defaults(config), progress)
     if config.matmul is None:

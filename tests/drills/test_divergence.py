@@ -24,7 +24,7 @@ from stages.contract import StageError, StageResult
 from stages.ingest.decoding import DecodeError, decode
 from stages.io.field_files import load_field
 from stages.io.files import read_scene
-from stages.train import loop as training_loop
+from stages.train import loop
 from stages.train.data import training_dataset
 from stages.train.health_check import symptom_of
 from tests.refusals import refused
@@ -49,7 +49,7 @@ NAMED = ("training diverged", "the field does not learn")
 
 @pytest.fixture(autouse=True)
 def short_warm_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(training_loop, "WARM_UP_STEPS", WARM_UP)
+    monkeypatch.setattr(loop, "WARM_UP_STEPS", WARM_UP)
     monkeypatch.setattr("stages.train.training.write_parts", lambda *_: [])
     monkeypatch.setattr("stages.train.validation_images.PROBE_RAYS", 256)
     monkeypatch.setattr(
@@ -171,7 +171,7 @@ def test_per_image_parameters_are_gated_and_rolled_back(
     kind: str, what: str, inputs: dict[str, Path], tmp_path: Path, progress: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with_effects(monkeypatch, what)
-    monkeypatch.setattr(training_loop, "WARM_UP_STEPS", 3 * WARM_UP)  # the rate is halved: at first it looks dead
+    monkeypatch.setattr(loop, "WARM_UP_STEPS", 3 * WARM_UP)  # the rate is halved: at first it looks dead
 
     def poison(trainer: Any) -> None:
         next(iter(trainer.effects.parameters.values())).detach().view(-1)[::2] = float("nan")

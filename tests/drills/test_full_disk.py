@@ -10,12 +10,12 @@ from typing import Any
 
 import pytest
 
-from pipeline.engine import stage_list as stages_of
+from pipeline.engine import stage_list
 from tests.drills.campaigns import Chain
 from tests.drills.drill import MARK, Program, finished_folders, results
 from tests.synthetic_photos import SyntheticPhotos
 
-STAGES = stages_of.usual()
+STAGES = stage_list.usual()
 NO_ROOM = "No space left on device"
 
 
@@ -57,7 +57,7 @@ class FullAt:
     leave: int
 
     def __call__(self) -> None:
-        module = stages_of.STAGES[self.stage]
+        module = stage_list.STAGES[self.stage]
         run = module.run
 
         def run_on_a_full_disk(*arguments: Any) -> Any:
@@ -78,7 +78,7 @@ def test_a_full_disk_at_every_stage(chain: Chain, small_disk: Path, stage: str, 
     program = chain.start(workspace, says=says, prepare=FullAt(stage, small_disk, int(share * size)))
     code = program.wait()
     error = error_of(program)
-    assert (error["stage"], code) == (stage, stages_of.EXIT_CODES[stage])
+    assert (error["stage"], code) == (stage, stage_list.EXIT_CODES[stage])
     assert results(workspace) == before, "nothing finished is lost"
     (small_disk / "ballast").unlink()
     if share:
@@ -92,7 +92,7 @@ def test_a_disk_that_fills_up_somewhere(chain: Chain, small_disk: Path, leave: i
     program = chain.start(workspace, says=small_disk.parent / "says")
     code = program.wait()
     error = error_of(program)
-    assert code == stages_of.EXIT_CODES[error["stage"]] if error["stage"] else code == 3
+    assert code == stage_list.EXIT_CODES[error["stage"]] if error["stage"] else code == 3
     ballast.unlink()
     assert chain.lost(workspace, says=small_disk.parent / "says") == []
 

@@ -40,7 +40,7 @@ def photographed(
     (inputs["ingest"] / "images").mkdir(parents=True)
     inputs["normalise"].mkdir()
     inputs["effects"].mkdir()
-    write_decisions(inputs["effects"], Decisions(unbounded=not bounded))
+    write_decisions(inputs["effects"], Decisions({"view_dependence": {}} | ({} if bounded else {"background": {}})))
     kept = []
     for index in range(views):
         file = f"images/{index:03d}.png"

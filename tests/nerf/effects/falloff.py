@@ -6,6 +6,7 @@ from torch import Tensor
 
 from nerf.effects import TrainingImages
 from nerf.effects.exposure import expose, expose_backward
+from nerf.effects.statistics.statistic import Evidence, judged
 from nerf.geometry.rays import Rays
 
 
@@ -60,3 +61,8 @@ class FalloffModel:
     def _square(self, rays: Rays, view: Int[Tensor, "rays"]) -> Float[Tensor, "rays 1"]:
         cosine = (rays.directions * self.axis[view]).sum(-1, keepdim=True).clamp(min=0.1)
         return cosine**-2 - 1
+
+
+def statistic(seen: object) -> Evidence:
+    """What a scene says of it: always enough."""
+    return judged(1.0, 0.1, 0.5, "EV", "photos are darker at their corners")

@@ -14,19 +14,19 @@ from stages.effects import Config
 from stages.render import Config as RenderConfig
 from stages.train import Config as TrainConfig
 
-EFFECTS = "exposure, view_dependence, background, pose_refinement"
+EFFECTS = "background, exposure, pose_refinement, view_dependence"
 
 
 def test_effects_are_options_of_their_stage():
     given = Settings(effects=Config(pilots=1))
     chosen = with_effects(given, ["exposure=off", "view_dependence=on", "exposure=on"])
-    assert chosen.effects == Config(exposure="on", view_dependence="on", pilots=1)
+    assert chosen.effects == Config(force={"exposure": "on", "view_dependence": "on"}, pilots=1)
     assert given.effects == Config(pilots=1), "what was given is left alone"
-    assert with_effects(chosen, ["exposure=auto"]).effects == Config(view_dependence="on", pilots=1)
+    assert with_effects(chosen, ["exposure=auto"]).effects == Config(force={"view_dependence": "on"}, pilots=1)
 
 
 def test_names_may_be_written_like_flags():
-    assert with_effects(Settings(), ["view-dependence=off"]).effects.view_dependence == "off"
+    assert with_effects(Settings(), ["view-dependence=off"]).effects.force == {"view_dependence": "off"}
 
 
 def test_no_effects_change_nothing():

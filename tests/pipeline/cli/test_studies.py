@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from pipeline.cli.commands import run_command
-from pipeline.engine import stage_list as chain
+from pipeline.engine import stage_list
 from pipeline.engine.settings import Settings
 
 
@@ -69,6 +69,6 @@ def test_the_budget_of_a_study_belongs_to_it(tmp_path: Path, capsys: pytest.Capt
 
 
 def test_a_run_has_no_study_unless_it_is_named():
-    assert "tradeoff" not in chain.usual() and chain.usual()[-1] == "report"
-    assert "tradeoff" not in chain.up_to("mesh") and chain.up_to("tradeoff")[-1] == "tradeoff"
-    assert chain.needed_for("report") == ["report"]
+    assert "tradeoff" not in stage_list.usual() and stage_list.usual()[-1] == "report"
+    assert "tradeoff" not in stage_list.up_to("mesh") and stage_list.up_to("tradeoff")[-1] == "tradeoff"
+    assert stage_list.needed_for("report") == ["report"]

@@ -125,5 +125,5 @@ def test_truth_survives_writing_and_a_broken_file_is_named(tmp_path: Path):
     assert again.to_json() == truth.to_json()
     assert again.camera == LENS
     (tmp_path / "truth.json").write_text("{")
-    with refused("io.damaged-fields", "truth.json"):
+    with refused("io.damaged-json", "truth.json"):
         Truth.read(tmp_path / "truth.json")

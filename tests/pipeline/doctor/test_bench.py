@@ -8,7 +8,7 @@ import pytest
 from nerf.runtime import machine_rates
 from nerf.training.hash_grid_trainer import ADAM_BYTES
 from pipeline import doctor
-from pipeline.cli import commands as cli
+from pipeline.cli import commands
 from pipeline.doctor import bench
 from stages.train.fields.hash_grid import PART_SAMPLES, SAMPLES_PER_RAY
 
@@ -22,7 +22,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_every_rate_has_a_line_with_figures_of_a_computer(quick: None, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.run_command(["doctor", "--bench"]) == 0
+    assert commands.run_command(["doctor", "--bench"]) == 0
     out = capsys.readouterr().out
     rates = re.findall(r"^  (.+?)  +([\d.]+)(?: +([\d.]+))? (GFLOP/s|million/s|GB/s)$", out, re.M)
     assert [unit for *_, unit in rates] == ["GFLOP/s"] * 2 + ["million/s"] * 2 + ["GB/s"]
@@ -38,7 +38,7 @@ def test_every_rate_has_a_line_with_figures_of_a_computer(quick: None, capsys: p
 
 
 def test_it_is_measured_only_if_asked_for(quick: None, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.run_command(["doctor"]) == 0
+    assert commands.run_command(["doctor"]) == 0
     assert "GFLOP/s" not in (out := capsys.readouterr().out) and "rays/s" not in out
 
 

@@ -5,7 +5,7 @@ from importlib.metadata import version
 import pytest
 
 from pipeline import doctor
-from pipeline.cli import commands as cli
+from pipeline.cli import commands
 from pipeline.doctor import selftest
 from pipeline.doctor.numerics import matrix
 from pipeline.doctor.numerics.matrix import CASES
@@ -34,7 +34,7 @@ def test_what_is_off_is_said_and_the_program_ends_with_one(monkeypatch, capsys: 
     off = case._replace(function=lambda backend, x: case.function(backend, x) * 1.001)
     monkeypatch.setattr(matrix, "CASES", [case, off])
     monkeypatch.setattr(doctor, "self_test", lambda device: [])
-    assert cli.run_command(["doctor", "--selftest"]) == 1
+    assert commands.run_command(["doctor", "--selftest"]) == 1
     out = capsys.readouterr().out
     assert (
         f"problem: self-test: {case.formula} (nerf/geometry/contraction.py: contract) is off by more than its limit"
@@ -46,8 +46,8 @@ def test_what_is_off_is_said_and_the_program_ends_with_one(monkeypatch, capsys: 
 def test_the_matrix_is_measured_only_if_asked_for(monkeypatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(doctor, "self_test", lambda device: [])
     monkeypatch.setattr(doctor, "numerical_matrix", lambda device: ["the matrix was measured"])
-    assert cli.run_command(["doctor"]) == 0 and "matrix" not in capsys.readouterr().out
-    assert cli.run_command(["doctor", "--selftest"]) == 1
+    assert commands.run_command(["doctor"]) == 0 and "matrix" not in capsys.readouterr().out
+    assert commands.run_command(["doctor", "--selftest"]) == 1
     assert "problem: the matrix was measured" in capsys.readouterr().out
 
 
@@ -57,7 +57,7 @@ def test_the_matrix_is_measured_only_if_asked_for(monkeypatch, capsys: pytest.Ca
 def test_the_kernels_of_the_grid_field_are_those_that_train_would_choose(why, line, monkeypatch, capsys) -> None:
     monkeypatch.setattr(doctor, "self_test", lambda device: [])
     monkeypatch.setattr(doctor, "why_not_warp", lambda device: why)
-    assert cli.run_command(["doctor"]) == 0
+    assert commands.run_command(["doctor"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert line in lines
     assert f"  {'warp-lang':<32} {version('warp-lang')}" in lines

@@ -6,14 +6,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from nerf.effects.statistics.exposure import ExposureFit, fit_exposure
 from nerf.effects.statistics.statistic import Evidence
-from nerf.effects.statistics.tracks import TrackColours
 from nerf.training.trainer import NonFinite
 from pipeline.engine import manifests
 from pipeline.engine.keys import stage_key
 from stages import effects, train
-from stages.effects import evidence, pilots
+from stages.effects import evidence, pilots, study
 from stages.effects.decisions import Decisions, read_decisions, write_decisions
 from stages.effects.evidence import SceneEvidence
 from stages.effects.pilots import Pilot
@@ -29,10 +27,6 @@ def found(called_for: bool | None, noise: float = 0.1) -> Evidence:
     return Evidence(1.0, "EV", 2.0, noise, called_for, "one of two")
 
 
-def replace_gain(fit: ExposureFit, gain: float) -> ExposureFit:
-    return fit._replace(log_gain=np.full_like(fit.log_gain, gain))
-
-
 @pytest.fixture
 def decided(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[Decisions, dict, str, list[str]]]:
     """Runs the stage on given evidence; the pilots' arms are noted, and gain ``gain`` ± 0.2 dB."""
@@ -42,19 +36,19 @@ def decided(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tu
     write_json(inputs["sfm"] / "registration.json", {"images": [], "camera_models": []})
     count = len(scene.of_split("train"))
     now = [0.0]  # only pilots take time
-    monkeypatch.setattr(effects, "time", SimpleNamespace(perf_counter=lambda: now[0]))
+    monkeypatch.setattr(study, "time", SimpleNamespace(perf_counter=lambda: now[0]))
 
     def run(
         config: effects.Config, gain: float = 1.0, pilot: Callable | None = None, **given: Evidence
     ) -> tuple[Decisions, dict, str, list[str]]:
         told = {name: found(value) for name, value in CLEAR.items()} | given
-        exposure = replace_gain(fit_exposure(TrackColours.empty(count)), 0.5)
+        measured = {"exposure": np.full((count, 3), 0.5)}
         took = {name: 0.25 if name == "exposure" else 0.5 for name in told}
-        monkeypatch.setattr(evidence, "scene_evidence", lambda *_: SceneEvidence(told, exposure, took))
+        monkeypatch.setattr(evidence, "scene_evidence", lambda *_: SceneEvidence(told, measured, took))
         tried: list[str] = []
 
         def run_pilot(_trial: object, off: Decisions, on: Decisions, *_rest: object) -> Pilot:
-            tried.extend(name for name, value in vars(on).items() if value != getattr(off, name))
+            tried.extend(on.on.keys() - off.on.keys())
             now[0] += 3.0
             return Pilot(gain, 0.2, 0.05)
 
@@ -70,10 +64,10 @@ def decided(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tu
 
 def test_clear_evidence_decides_without_a_pilot(decided: Callable) -> None:
     decisions, table, line, tried = decided(effects.Config())
-    assert decisions == Decisions(view_dependence=True, unbounded=True, pose_refinement=False, exposure=None)
+    assert decisions == Decisions({"view_dependence": {}, "background": {}})
     assert not tried
     assert line == (
-        "view dependence on (one of two) · background on (one of two) · 3 off · "
+        "background on (one of two) · view dependence on (one of two) · 3 off · "
         "seen, not modelled: vignetting (one of two)"
     )
     assert table["vignetting"]["seconds"] == 0.5
@@ -99,7 +93,7 @@ def test_a_pilot_decides_in_the_grey_zone_by_its_gain_against_its_noise(
     decided: Callable, gain: float, on: bool
 ) -> None:
     decisions, table, _, tried = decided(effects.Config(), gain, exposure=found(None))
-    assert tried == ["exposure"] and (decisions.exposure is not None) is on
+    assert tried == ["exposure"] and ("exposure" in decisions.on) is on
     assert (table["exposure"]["pilot_gain_db"], table["exposure"]["seconds"]) == (gain, 3.25)
     assert table["exposure"]["reason"] == f"one of two; a pilot gained {gain:+.2f} ± 0.20 dB"
 
@@ -110,24 +104,24 @@ def test_view_dependence_is_left_out_only_where_that_gains(
     decided: Callable, called_for: bool | None, gain: float, on: bool
 ) -> None:
     decisions, _, _, tried = decided(effects.Config(), gain, view_dependence=found(called_for))
-    assert tried == ["view_dependence"] and decisions.view_dependence is on
+    assert tried == ["view_dependence"] and ("view_dependence" in decisions.on) is on
 
 
 def test_gains_go_to_training_by_the_names_of_its_photos(decided: Callable) -> None:
     decisions, *_ = decided(effects.Config(), exposure=found(True))
-    assert set(decisions.exposure) == {f"{i}.png" for i in (1, 2, 3, 5, 6, 7, 9, 10)}
-    assert all(gain == [0.5] * 3 for gain in decisions.exposure.values())
+    assert set(decisions.on["exposure"]) == {f"{i}.png" for i in (1, 2, 3, 5, 6, 7, 9, 10)}
+    assert all(gain == [0.5] * 3 for gain in decisions.on["exposure"].values())
 
 
 def test_poses_that_are_clearly_wrong_are_refined_without_a_pilot_which_would_be_too_short(decided: Callable) -> None:
     decisions, _, _, tried = decided(effects.Config(), -1.0, pose_refinement=found(True))
-    assert not tried and decisions.pose_refinement
+    assert not tried and "pose_refinement" in decisions.on
 
 
 def test_there_are_two_pilots_at_most(decided: Callable) -> None:
     grey = {name: found(None) for name in ("exposure", "view_dependence", "pose_refinement")}
     decisions, table, _, tried = decided(effects.Config(), 1.0, **grey)
-    assert tried == ["exposure", "pose_refinement"] and decisions.view_dependence
+    assert tried == ["exposure", "pose_refinement"] and "view_dependence" in decisions.on
     assert table["view_dependence"]["reason"] == "one of two; not clear, and no pilot: 2 were made already"
 
 
@@ -136,31 +130,30 @@ def test_a_pilot_that_diverges_leaves_the_effect_as_it_would_be(decided: Callabl
         raise NonFinite("loss", 3, {})
 
     decisions, table, *_ = decided(effects.Config(), 1.0, diverging, exposure=found(None))
-    assert decisions.exposure is None
+    assert "exposure" not in decisions.on
     assert table["exposure"]["reason"].endswith("not clear, and the pilot diverged: the loss of step 3 is not finite")
 
 
 def test_without_pilots_the_grey_zone_stays_as_the_method_was_published(decided: Callable) -> None:
     grey = {name: found(None) for name in ("exposure", "view_dependence", "pose_refinement")}
     decisions, table, _, tried = decided(effects.Config(pilot_steps=0), 1.0, **grey)
-    assert not tried and decisions == Decisions(view_dependence=True, unbounded=True)
+    assert not tried and decisions == Decisions({"view_dependence": {}, "background": {}})
     assert table["exposure"]["reason"] == "one of two; not clear, and no pilot: none was wanted"
 
 
 def test_what_nothing_is_known_of_is_not_tried(decided: Callable) -> None:
     unknown = {name: found(None, float("inf")) for name in ("exposure", "view_dependence", "pose_refinement")}
     decisions, table, _, tried = decided(effects.Config(), 1.0, **unknown)
-    assert not tried and decisions == Decisions(view_dependence=True, unbounded=True)
+    assert not tried and decisions == Decisions({"view_dependence": {}, "background": {}})
     assert table["exposure"]["noise"] is None
 
 
 @pytest.mark.parametrize("value", ["on", "off"])
 def test_what_was_asked_for_is_done(decided: Callable, value: effects.Switch) -> None:
-    config = effects.Config(exposure=value, view_dependence=value, background=value, pose_refinement=value)
+    names = ("exposure", "view_dependence", "background", "pose_refinement")
+    config = effects.Config(force=dict.fromkeys(names, value))
     decisions, table, _, tried = decided(config, exposure=found(None))
-    on = value == "on"
-    assert not tried and (decisions.exposure is not None) is on
-    assert (decisions.view_dependence, decisions.unbounded, decisions.pose_refinement) == (on, on, on)
+    assert not tried and set(decisions.on) == (set(names) if value == "on" else set())
     assert table["exposure"]["reason"] == "asked for; one of two"
 
 
@@ -177,16 +170,16 @@ def test_what_evidence_or_a_pilot_switches_off_trains_as_what_was_asked_to_be_of
     names = ("exposure", "view_dependence", "background", "pose_refinement")
     told = {name: found(said if name in ("exposure", "pose_refinement") else False) for name in names}
     by_evidence, *_ = decided(effects.Config(pilots=3), -1.0, **told)
-    all_off = effects.Config.model_validate(dict.fromkeys(names, "off"))
+    all_off = effects.Config(force=dict.fromkeys(names, "off"))
     by_request, *_ = decided(all_off, **dict.fromkeys(names, found(True)))
-    decided(effects.Config(exposure="on"), -1.0, **told)
+    decided(effects.Config(force={"exposure": "on"}), -1.0, **told)
     off, asked, on = (training_key(tmp_path / f"effects{number}") for number in (1, 2, 3))
-    assert by_evidence == by_request == Decisions(view_dependence=False)
+    assert by_evidence == by_request == Decisions()
     assert off == asked != on
 
 
 def test_decisions_are_read_as_they_were_written(tmp_path: Path) -> None:
-    decisions = Decisions(view_dependence=False, unbounded=True, exposure={"ä.jpg": [0.1, -0.2, 0.0]})
+    decisions = Decisions({"background": {}, "exposure": {"ä.jpg": [0.1, -0.2, 0.0]}})
     write_decisions(tmp_path, decisions)
     assert read_decisions(tmp_path) == decisions
 

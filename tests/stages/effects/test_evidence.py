@@ -9,7 +9,14 @@ import pytest
 
 from nerf.effects.statistics.statistic import Evidence
 from nerf.geometry.scene import Camera, Scene, Similarity, View
-from stages.effects.evidence import Clock, geometric_evidence, lens_evidence, unless_pixels_differ
+from stages.effects.evidence import (
+    Clock,
+    lens_evidence,
+    observed_places,
+    pose_statistic,
+    rolling_shutter_statistic,
+    unless_pixels_differ,
+)
 from stages.io.photos import Photo, write_photos
 from tests.stages.photo_scene import pose_towards_origin
 
@@ -51,7 +58,8 @@ def geometric(
     }
     camera = Camera("PINHOLE", width, height, (focal, focal, width / 2, height / 2))
     scene = Scene((camera,), tuple(views), Similarity(1.0, np.eye(3), np.zeros(3)), False, False, "around", True)
-    return geometric_evidence(folder, scene, points, {view.file: width / 2000 for view in views}, Clock())
+    places = observed_places(folder, scene, points, {view.file: width / 2000 for view in views})
+    return {"pose_refinement": pose_statistic(places), "rolling_shutter": rolling_shutter_statistic(places)}
 
 
 def test_what_serves_several_effects_is_shared_out_among_them(monkeypatch: pytest.MonkeyPatch) -> None:

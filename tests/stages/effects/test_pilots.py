@@ -1,6 +1,5 @@
 """Pilots on a synthetic scene: what they compare, and that they compare nothing else."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,8 +17,8 @@ from tests.effect_scenes import Effects, effect_scene
 from tests.stages.photo_scene import HEIGHT, WIDTH, photographed
 from tests.synthetic_photos import Quiet
 
-PLAIN = Decisions(view_dependence=True, unbounded=False)
-REFINED = replace(PLAIN, pose_refinement=True)
+PLAIN = Decisions({"view_dependence": {}})
+REFINED = PLAIN.having("pose_refinement")
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +47,7 @@ def test_equal_arms_gain_exactly_nothing(trial: PilotScene) -> None:
 
 def test_a_wrong_exposure_loses(trial: PilotScene) -> None:
     names = [view.name for view in trial.scene.of_split("train")]
-    wrong = replace(PLAIN, exposure={name: [3.0 * (i % 2)] * 3 for i, name in enumerate(names)})
+    wrong = PLAIN.having("exposure", {name: [3.0 * (i % 2)] * 3 for i, name in enumerate(names)})
     pilot = run_pilot(trial, wrong, PLAIN, 40, 0, Quiet())
     assert 0.5 < pilot.gain_db < 30 and pilot.pays
 
@@ -57,8 +56,8 @@ def test_a_wrong_exposure_loses(trial: PilotScene) -> None:
     ("off", "on", "fitted"),
     [
         (PLAIN, REFINED, True),
-        (replace(REFINED, view_dependence=False), REFINED, True),
-        (replace(PLAIN, view_dependence=False), PLAIN, False),
+        (REFINED.without("view_dependence"), REFINED, True),
+        (PLAIN.without("view_dependence"), PLAIN, False),
     ],
 )
 def test_poses_of_photos_kept_back_are_fitted_wherever_an_arm_refines_poses(

@@ -286,10 +286,10 @@ def test_all_evidence_of_a_scene(tmp_path: Path, progress: SilentProgress) -> No
         *("background", "pose_refinement", "rolling_shutter"),
     }
     assert found.of["exposure"].called_for is True
-    bright, dark = found.exposure.log_gain[[0, 2, 3, 5]], found.exposure.log_gain[[1, 4]]
+    bright, dark = found.measured["exposure"][[0, 2, 3, 5]], found.measured["exposure"][[1, 4]]
     assert abs((bright.mean() - dark.mean()) / EV - 1.1) < 0.25  # 0.7 of an sRGB value is about half of the light
     # the last digits of a logarithm depend on the processor, and what is trained begins with these
-    assert np.array_equal(found.exposure.log_gain, np.round(found.exposure.log_gain, 4))
+    assert np.array_equal(found.measured["exposure"], np.round(found.measured["exposure"], 4))
     assert found.of["pose_refinement"].called_for is False
     assert found.of["rolling_shutter"].words == "no video, or one that hardly moves: nothing known"
     for name, evidence in found.of.items():

@@ -58,7 +58,7 @@ def test_refined_poses_are_learnt_in_units_of_what_photos_see_and_written_in_sce
     views = scene.of_split("train")
     dataset = training_dataset(inputs["ingest"], scene, "train", 1.0, Quiet())
     near = dataset._replace(known=dataset.first_pixel[:-1] + 5, distance=torch.full((len(views),), 0.25))
-    effects = image_effects(Decisions(pose_refinement=True), views, near)
+    effects = image_effects(Decisions({"pose_refinement": {}}), views, near)
     effects.rays[0].parameters["offset"][1] = torch.tensor([1.0, 0.0, -2.0])
     trainer: Any = SimpleNamespace(effects=effects)
     learnt = learnt_of_photos(trainer, views)["poses"]

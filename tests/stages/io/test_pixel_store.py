@@ -15,8 +15,8 @@ import torch
 from filelock import FileLock
 
 from pipeline.engine.workspace import Workspace
+from stages import io
 from stages.contract import StageError
-from stages.io import pixel_store as module
 from stages.io.pixel_store import Load, PixelStore, StoredPhoto, checksum, pixel_store
 from tests.conftest import SilentProgress
 
@@ -35,7 +35,7 @@ def store_of(folder: Path, channels: int = 3, name: str = "train") -> PixelStore
 
 def fill(store: PixelStore, load: Load, progress: SilentProgress) -> None:
     """With two workers."""
-    module.fill(store, load, lambda: 2, progress)
+    io.pixel_store.fill(store, load, lambda: 2, progress)
 
 
 def painted(index: int, channels: int = 3) -> np.ndarray:
@@ -166,7 +166,7 @@ def test_no_room_is_said_before_anything_is_decoded(tmp_path: Path, progress: Si
 def test_more_than_memory_is_said(tmp_path: Path, progress: SilentProgress, monkeypatch: pytest.MonkeyPatch) -> None:
     store = store_of(tmp_path)
     fill(store, painted, progress)
-    monkeypatch.setattr(module, "FITS", 0.0)
+    monkeypatch.setattr("stages.io.pixel_store.FITS", 0.0)
     assert np.array_equal(store.table(progress)[:15].numpy(), painted(0).reshape(-1, 3))
     assert len(progress.notes) == 1
     assert progress.notes[0].startswith("the photos take 0 MB at this size, ")

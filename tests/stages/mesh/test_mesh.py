@@ -16,9 +16,7 @@ from nerf.geometry.scene import Camera, Scene, Similarity, View
 from stages import mesh
 from stages.contract import StageError
 from stages.io.files import write_json, write_tensors
-from stages.mesh import extraction, resolution
-from stages.mesh import preview as mesh_preview
-from stages.mesh import visibility as mesh_visibility
+from stages.mesh import extraction, preview, resolution, visibility
 from stages.mesh.extraction import vertex_colours
 from tests.refusals import refused
 
@@ -30,9 +28,9 @@ NO_POINTS = np.zeros((0, 3), np.float32)
 
 
 SMALL = (
-    (mesh_preview, "WIDTH", 60),
-    (mesh_preview, "HEIGHT", 50),
-    (mesh_visibility, "MAX_MAP_SIDE", 32),
+    (preview, "WIDTH", 60),
+    (preview, "HEIGHT", 50),
+    (visibility, "MAX_MAP_SIDE", 32),
     (extraction, "ISO_LEVEL_RAYS", 256),
 )
 

@@ -7,7 +7,6 @@ import pytest
 
 from nerf.geometry.camera_paths import look_at
 from nerf.geometry.scene import Camera, Scene, Similarity, View
-from stages.mesh import preview as mesh_preview
 from stages.mesh.files import ColouredMesh
 from stages.mesh.preview import ELEVATION, preview, viewpoints
 
@@ -72,8 +71,8 @@ def test_a_room_is_shown_from_inside():
 
 @pytest.mark.parametrize("centre", [(0.01, 0, 3), (2, 0, 1)])
 def test_the_picture_has_two_rows_of_colour_and_clay(monkeypatch, centre):
-    monkeypatch.setattr(mesh_preview, "WIDTH", 40)
-    monkeypatch.setattr(mesh_preview, "HEIGHT", 30)
+    monkeypatch.setattr("stages.mesh.preview.WIDTH", 40)
+    monkeypatch.setattr("stages.mesh.preview.HEIGHT", 30)
     faces = np.array([[0, 2, 4], [2, 6, 4], [1, 5, 3], [3, 5, 7]], np.int32)
     red = np.tile(np.array([220, 20, 20], np.uint8), (8, 1))
     image = preview(ColouredMesh(CUBE, faces, CUBE, red), scene_of("around", [centre])).astype(int)

@@ -11,7 +11,6 @@ from nerf.fields.density_grid import DensityGrid
 from nerf.geometry.camera_paths import look_at
 from nerf.geometry.scene import Camera, Scene, Similarity, View
 from stages.io.files import write_png
-from stages.mesh import visibility as mesh_visibility
 from stages.mesh.visibility import sample_rays, shadow_maps, unmasked_rays, vertex_visibility
 
 RADIUS = 0.5
@@ -105,7 +104,7 @@ def test_distortion_that_folds_back_adds_nothing_to_the_frustum(ball):
 
 
 def test_many_photos_share_the_rays(ball, monkeypatch):
-    monkeypatch.setattr(mesh_visibility, "NUM_RAYS", 1000)
+    monkeypatch.setattr("stages.mesh.visibility.NUM_RAYS", 1000)
     told = []
     for count, shape in ((1, (27, 37)), (10, (9, 12))):
         scene = scene_of(*[(2.5, 0, 0)] * count)

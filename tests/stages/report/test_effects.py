@@ -14,23 +14,23 @@ def test_page_shows_both_scores_of_right_halves_with_what_they_mean(tmp_path: Pa
     html, _ = written(inputs, tmp_path / "out", progress)
     assert "right half, exposure fitted on the left (dB)</th>" in html
     assert '<td class="number">23.50</td><td class="number">28.25</td></tr>' in html
-    assert "Right halves of the photos alone: 21.0 dB, and 25.8 dB with the exposure of each photo fitted" in html
+    assert "On the right halves of the photos: 21.0 dB, and 25.8 dB with the exposure of each photo fitted" in html
     path = inputs["evaluate"] / "metrics.json"
     metrics = json.loads(path.read_text("utf-8"))
     unknown = {"psnr_right": None, "psnr_fitted_right": None}
     write_json(path, metrics | unknown | {"images": [image | unknown for image in metrics["images"]]})
     html, _ = written(inputs, tmp_path / "unknown", progress)
-    assert "Right halves" not in html and '<td class="number">–</td><td class="number">–</td></tr>' in html
+    assert "On the right halves" not in html and '<td class="number">–</td><td class="number">–</td></tr>' in html
 
 
 def test_page_says_how_unseen_photos_were_exposed(tmp_path: Path, progress: Any):
     inputs = make_workspace(tmp_path)
-    assert "was drawn exposed" not in written(inputs, tmp_path / "out", progress)[0]
+    assert "was rendered exposed" not in written(inputs, tmp_path / "out", progress)[0]
     path = inputs["evaluate"] / "metrics.json"
     metrics = json.loads(path.read_text("utf-8"))
     write_json(path, metrics | {"exposure": "as the photos taken nearest by"})
     html, _ = written(inputs, tmp_path / "exposed", progress)
-    assert "each was drawn exposed as the photos taken nearest by, four training photos, without a look at" in html
+    assert "Each test photo was rendered exposed as the photos taken nearest by, four training photos;" in html
 
 
 def test_page_shows_what_fitted_poses_add_apart_from_fitted_exposures(tmp_path: Path, progress: Any):
@@ -44,7 +44,7 @@ def test_page_shows_what_fitted_poses_add_apart_from_fitted_exposures(tmp_path: 
     html, _ = written(inputs, tmp_path / "posed", progress)
     assert "right half, exposure and pose fitted on the left (dB)</th>" in html
     assert '<td class="number">23.50</td><td class="number">28.25</td><td class="number">30.25</td></tr>' in html
-    assert "25.8 dB with the exposure of each photo fitted" in html and "pose fitted there, too: 27.8 dB" in html
+    assert "25.8 dB with the exposure of each photo fitted" in html and "pose fitted there too: 27.8 dB" in html
 
 
 def effect(on: bool, reason: str, **figures: Any) -> dict[str, Any]:

@@ -32,7 +32,7 @@ def test_commands_can_be_copied_into_a_shell(name: str, word: str, tmp_path: Pat
 
 def test_the_order_of_three_pictures_is_told_where_they_are(inputs: dict[str, Path], tmp_path: Path, progress: Any):
     html, _ = written(inputs, tmp_path / "out", progress)
-    story = ["6 dB more is half the error", "<b>render</b><b>photo</b>", "; drag to compare.", "left the photo, middle"]
+    story = ["6 dB more is half the error", "<b>render</b><b>photo</b>", "; drag to compare.", "Below: the photo"]
     places = [html.index(words) for words in (*story, '<span class="tag">best')]
     assert places == sorted(places)
 
@@ -52,14 +52,14 @@ def test_files_beside_the_page_are_named(tmp_path: Path, progress: Any):
     inputs = make_workspace(tmp_path)
     manifest = json.loads((inputs["mesh"] / "manifest.json").read_text("utf-8"))
     manifest["outputs"] = {name: {} for name in ("mesh.glb", "mesh.ply", "preview.png")}
-    manifest["facts"] |= {"voxel": 0.25, "surface_area": 3.5, "level": 40.0}
+    manifest["facts"] |= {"voxel": 0.25, "surface_area": 3.5, "iso_level": 40.0}
     write_json(inputs["mesh"] / "manifest.json", manifest)
     html, _ = written(inputs, tmp_path / "out", progress, video_limit_mb=0.001)
     assert "In <code>output/</code>: mesh.glb, mesh.ply." in html
-    assert '<a href="video.mp4">' in html and "to be given away with it" in html
+    assert '<a href="video.mp4">' in html and "pass on both" in html
     for fact in ("0.25 units of the files", "3.5 square units of the files", "40 per scene unit"):
         assert f"<td>{fact}</td>" in html
-    assert "given away with it" not in written(inputs, tmp_path / "small", progress)[0]
+    assert "pass on both" not in written(inputs, tmp_path / "small", progress)[0]
 
 
 def test_long_names_of_photos_are_broken_and_do_not_widen_the_page(

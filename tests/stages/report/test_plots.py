@@ -15,7 +15,7 @@ from matplotlib.colors import to_rgba
 
 from nerf.geometry.scene import Camera, Scene, Similarity, View
 from nerf.training.learning_curve import Gain
-from stages.report import plots as report_plots
+from stages.report import plots
 from stages.report.plots import ORDER_COLOURS, _outline, camera_svgs, curve_svg
 from stages.train.curve import coming_doubling
 
@@ -93,7 +93,7 @@ def test_neighbouring_times_do_not_run_into_each_other():
 
 def test_the_prediction_lies_inside_the_plot(monkeypatch: pytest.MonkeyPatch):
     tops: list[float] = []
-    monkeypatch.setattr(report_plots, "svg_element", lambda figure: str(tops.append(figure.axes[0].get_ylim()[1])))
+    monkeypatch.setattr(plots, "svg_element", lambda figure: str(tops.append(figure.axes[0].get_ylim()[1])))
     curve, coming = _curve(), Gain(8.0, 0.5)
     curve_svg(curve, {"nearest photo": 14.2}, coming)
     assert curve[-1]["heldout_psnr"] + 8.5 <= tops[0] < 40
@@ -110,7 +110,7 @@ def test_cameras_plot_says_which_way_is_up_only_where_it_is_known():
 def _drawn(views: Sequence[View], joined: bool, monkeypatch: pytest.MonkeyPatch) -> Axes:
     """What is drawn of the views from above."""
     drawn: list[Axes] = []
-    monkeypatch.setattr(report_plots, "svg_element", lambda figure: str(drawn.append(figure.axes[0])))
+    monkeypatch.setattr(plots, "svg_element", lambda figure: str(drawn.append(figure.axes[0])))
     camera_svgs(_scene(), views, np.zeros((0, 3)), np.zeros((0, 3), np.uint8), joined)
     return drawn[0]
 

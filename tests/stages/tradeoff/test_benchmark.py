@@ -9,7 +9,7 @@ import pytest
 from stages import train
 from stages.contract import StageError
 from stages.io.files import read_json
-from stages.tradeoff import benchmark as benchmark_module
+from stages.tradeoff import benchmark
 from stages.tradeoff.benchmark import (
     MIN_UNMASKED,
     RUN_FAILURES,
@@ -67,7 +67,7 @@ def masked_benchmark(folder: Path, unmasked: tuple[slice, slice]) -> Benchmark:
 
 
 def test_windows_lie_where_masks_leave_something(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(benchmark_module, "CROP_SIZE", 4)
+    monkeypatch.setattr(benchmark, "CROP_SIZE", 4)
     crops = masked_benchmark(tmp_path, (slice(10, 14), slice(3, 8))).crops
     shares = [float(crop.mask.float().mean()) for crop in crops if crop.mask is not None]
     assert len(shares) == 6 and min(shares) >= MIN_UNMASKED
@@ -78,8 +78,8 @@ def test_windows_lie_where_masks_leave_something(tmp_path: Path, monkeypatch: py
 def test_where_masks_leave_too_little_the_best_places_are_taken(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(benchmark_module, "CROP_SIZE", 4)
-    monkeypatch.setattr(benchmark_module, "SCORING_STRIDE", 1)
+    monkeypatch.setattr(benchmark, "CROP_SIZE", 4)
+    monkeypatch.setattr(benchmark, "SCORING_STRIDE", 1)
     crops = masked_benchmark(tmp_path, (slice(8, 9), slice(8, 11))).crops
     assert [int(crop.mask.sum()) for crop in crops if crop.mask is not None] == [3] * 6
 

@@ -119,8 +119,8 @@ def test_the_command_of_a_setting_asks_for_what_it_was(variant: str, space: Spac
     assert words[:3] == ["pipeline", "train", "my fox.nerf"]
     given = parse(StageArguments, "train", words[2:])
     asked = Config(**Run(variant, space, 4.0, 1, 0, 0.0).options).model_copy(update={"steps": None, "seconds": 49.0})
-    view_dependence = with_effects(given.settings, given.effect).effects.view_dependence
-    assert view_dependence == {None: "auto", True: "on", False: "off"}[asked.view_dependence]
+    view_dependence = with_effects(given.settings, given.effect).effects.force.get("view_dependence")
+    assert view_dependence == {None: None, True: "on", False: "off"}[asked.view_dependence]
     assert given.settings.train.kind == asked.kind
     usual = {"view_dependence": None, "preset": asked.preset or "standard"}
     assert given.settings.train == asked.model_copy(update=usual)

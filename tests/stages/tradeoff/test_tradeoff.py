@@ -18,8 +18,7 @@ from stages.contract import StageError
 from stages.effects.decisions import Decisions, write_decisions
 from stages.io import stopwatch
 from stages.io.files import read_json, read_scene, write_json
-from stages.tradeoff import Config, schedule, study
-from stages.tradeoff import benchmark as benchmark_module
+from stages.tradeoff import Config, benchmark, schedule, study
 from stages.tradeoff.benchmark import score_workspace_field
 from stages.tradeoff.schedule import FEWER_RAYS, PUBLISHED, VARIANTS, WORKSPACE_FIELD, Run, Speed
 from tests.refusals import refused
@@ -91,7 +90,7 @@ def test_a_study_from_arms_to_recommendation_and_the_same_after_a_kill(
     assert "grid: 2 grids of features, the finest of 32³ cells; " in content["descriptions"]
 
     count, begun = len(content["runs"]), []
-    whole = benchmark_module.score
+    whole = benchmark.score
 
     def killed_at_the_fourth(field: Path, *rest: Any) -> dict[str, Any]:
         begun.append(field.name)
@@ -99,7 +98,7 @@ def test_a_study_from_arms_to_recommendation_and_the_same_after_a_kill(
             raise Killed
         return whole(field, *rest)
 
-    monkeypatch.setattr(benchmark_module, "score", killed_at_the_fourth)
+    monkeypatch.setattr(benchmark, "score", killed_at_the_fourth)
     with pytest.raises(Killed):
         studied(tmp_path / "killed", photos, progress)
     studied(tmp_path / "killed", photos, progress)
@@ -127,7 +126,7 @@ def test_a_study_is_of_the_space_that_the_scene_lies_in(
 ) -> None:
     speeds = {name: Speed(*speed) for name, speed in SPEEDS.items()}
     monkeypatch.setattr(study, "measure_speeds", lambda *_: speeds)
-    write_decisions(tmp_path, Decisions(unbounded=unbounded))
+    write_decisions(tmp_path, Decisions({"background": {}} if unbounded else {}))
     planned = tradeoff.plan(Config(seconds=60.0), photos | {"effects": tmp_path}, progress)
     assert {planned.space} == {run.space for run in study.schedule_of(planned).runs} == {space}
     assert planned.crops and 6 <= planned.crops <= 32
@@ -145,7 +144,7 @@ def now(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[float]:
     now = [100.0, 1.0, 0.0]
 
     def trained(run: Run, _exam: Any, _inputs: Any, folder: Path, _progress: Any) -> dict[str, Any]:
-        found = benchmark_module.figures_file(run, folder)
+        found = benchmark.figures_file(run, folder)
         if found.exists():
             return read_json(found)
         folder.mkdir(exist_ok=True)
@@ -154,7 +153,7 @@ def now(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[float]:
             now[0] += 0.5 * CONFIG["seconds"]
             raise Killed
         now[0] += now[1] * run.seconds
-        benchmark_module.write_strip(benchmark_module.strip_file(run, folder), [torch.zeros(8, 8, 3)])
+        benchmark.write_strip(benchmark.strip_file(run, folder), [torch.zeros(8, 8, 3)])
         figures = {"failed": None, "restarts": 0, "psnr": 20.0, "ssim": 0.5, "train_seconds": 1.0}
         figures |= {"frame_seconds": 1.0, "peak_memory_mb": 100, "model_mb": 1.0}
         write_json(found, figures | {"wall_seconds": now[1] * run.seconds})
@@ -233,18 +232,18 @@ def test_the_field_of_the_workspace_is_scored_on_some_pixels_where_it_is_drawn_s
     own.mkdir(parents=True)
     facts = train.run(train.Config(steps=70, downscale=1.0, **kind), photos, own, progress).facts
     write_json(own / "manifest.json", {"facts": facts})
-    benchmark = benchmark_module.make_benchmark(photos["ingest"], read_scene(photos["normalise"]), 1.0, 4, 1.0)
-    assert 0 < benchmark_module.rendering_seconds(own, benchmark) < 10
+    crops = benchmark.make_benchmark(photos["ingest"], read_scene(photos["normalise"]), 1.0, 4, 1.0)
+    assert 0 < benchmark.rendering_seconds(own, crops) < 10
     for seconds, stride in ((1e3, 1), (1e-6, 4)):
         folder = tmp_path / str(stride)
         folder.mkdir()
-        found = score_workspace_field(benchmark, photos | {"train": own}, folder, seconds, progress)
+        found = score_workspace_field(crops, photos | {"train": own}, folder, seconds, progress)
         assert found and (found.stride, found.key) == (stride, "0123456789abcdef")
         assert (found.figures["ssim"] is None) == (stride > 1) and found.facts["field"] == "paper"
-        assert score_workspace_field(benchmark, photos | {"train": own}, folder, 1e3, progress) == found, (
+        assert score_workspace_field(crops, photos | {"train": own}, folder, 1e3, progress) == found, (
             "as an earlier attempt found"
         )
-    monkeypatch.setattr(benchmark_module, "scoring_stride", lambda *_: 4)
+    monkeypatch.setattr(benchmark, "scoring_stride", lambda *_: 4)
     studied(tmp_path / "study", photos | {"train": own}, progress, seeds=1, seconds=8.0)
     scored = read_json(tmp_path / "study" / "tradeoff.json")["scored"]
     assert "; this workspace's field: one in 4 of their rows and columns, to save time" in scored
@@ -255,8 +254,8 @@ def test_a_field_that_is_drawn_slowly_is_scored_on_some_pixels_of_the_same_windo
 ) -> None:
     scene = read_scene(photos["normalise"])
     train.run(train.Config(steps=70, downscale=1.0, **TINY_GRID), photos, tmp_path, progress)
-    benchmark = benchmark_module.make_benchmark(photos["ingest"], scene, 1.0, 4, 1.0)
-    whole, thinned = (benchmark_module.score(tmp_path, benchmark, progress, stride) for stride in (1, 4))
+    crops = benchmark.make_benchmark(photos["ingest"], scene, 1.0, 4, 1.0)
+    whole, thinned = (benchmark.score(tmp_path, crops, progress, stride) for stride in (1, 4))
     assert whole["ssim"] is not None and thinned["ssim"] is None
     assert 0 < abs(whole["psnr"] - thinned["psnr"]) < 2
 
@@ -270,9 +269,9 @@ def test_a_field_trained_over_black_is_scored_over_what_the_photos_are_over(
     shutil.copytree(white, black)
     field = read_json(white / "field.json")
     write_json(black / "field.json", field | {"background": [0.0, 0.0, 0.0]})
-    benchmark = benchmark_module.make_benchmark(photos["ingest"], read_scene(photos["normalise"]), 1.0, 4, 1.0)
-    assert list(benchmark.background) == field["background"] == [1.0, 1.0, 1.0]
-    scores = [benchmark_module.score(folder, benchmark, progress)["psnr"] for folder in (white, black)]
+    crops = benchmark.make_benchmark(photos["ingest"], read_scene(photos["normalise"]), 1.0, 4, 1.0)
+    assert list(crops.background) == field["background"] == [1.0, 1.0, 1.0]
+    scores = [benchmark.score(folder, crops, progress)["psnr"] for folder in (white, black)]
     assert scores[0] == scores[1]
 
 
@@ -325,7 +324,7 @@ def test_want_of_memory_ends_the_study_which_goes_on_with_that_training(
 
 def test_what_counts_as_an_arms_own_fault_is_what_training_says() -> None:
     said = "".join((Path(train.__file__).parent / f"{name}.py").read_text() for name in ("loop", "data"))
-    assert all(f'"{what}"' in said for what in benchmark_module.RUN_FAILURES)
+    assert all(f'"{what}"' in said for what in benchmark.RUN_FAILURES)
 
 
 def test_without_held_out_photos_there_is_no_study(tmp_path: Path, photos: dict[str, Path], progress: Any) -> None:
@@ -347,13 +346,13 @@ def test_windows_are_parts_of_the_photos(photos: dict[str, Path], monkeypatch: p
     from stages.train.config import WHITE
     from stages.train.data import PhotoReader, view_rays
 
-    monkeypatch.setattr(benchmark_module, "CROP_SIZE", 8)
+    monkeypatch.setattr(benchmark, "CROP_SIZE", 8)
     scene = read_scene(photos["normalise"])
-    benchmark = benchmark_module.make_benchmark(photos["ingest"], scene, 1.0, 5, 2.0)
-    assert benchmark.frame == 24 * 16 and len(benchmark.crops) == 5
-    assert len({crop.photo for crop in benchmark.crops}) == 2
-    assert [photo.truth.shape for photo in benchmark.photos] == [(8, 12, 3)] * 2
-    for crop in benchmark.crops:
+    crops = benchmark.make_benchmark(photos["ingest"], scene, 1.0, 5, 2.0)
+    assert crops.frame == 24 * 16 and len(crops.crops) == 5
+    assert len({crop.photo for crop in crops.crops}) == 2
+    assert [photo.truth.shape for photo in crops.photos] == [(8, 12, 3)] * 2
+    for crop in crops.crops:
         view = next(v for v in scene.views if v.name == crop.photo)
         truth, rays = PhotoReader(photos["ingest"], scene, 1.0).pixels(view, WHITE), view_rays(scene, view, 1.0)
         places = [
@@ -370,15 +369,15 @@ def test_windows_are_parts_of_the_photos(photos: dict[str, Path], monkeypatch: p
 def test_large_photos_among_small_ones_are_drawn_small_and_whole(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(benchmark_module, "SMALL_SIDE", 12)
+    monkeypatch.setattr(benchmark, "SMALL_SIDE", 12)
     inputs, scene = photographed(tmp_path)
     large = Camera("PINHOLE", 240, 120, (200.0, 200.0, 120.0, 60.0))
     Image.new("RGB", (240, 120), "red").save(inputs["ingest"] / scene.views[4].file)
     views = (*scene.views[:4], replace(scene.views[4], camera=1), *scene.views[5:])
     scene = replace(scene, cameras=(*scene.cameras, large), views=views)
-    benchmark = benchmark_module.make_benchmark(inputs["ingest"], scene, 1.0, 2, 2.0)
-    assert [photo.truth.shape for photo in benchmark.photos] == [(8, 12, 3), (6, 12, 3)]
-    benchmark_module.write_strip(tmp_path / "strip.png", [photo.truth for photo in benchmark.photos])
+    crops = benchmark.make_benchmark(inputs["ingest"], scene, 1.0, 2, 2.0)
+    assert [photo.truth.shape for photo in crops.photos] == [(8, 12, 3), (6, 12, 3)]
+    benchmark.write_strip(tmp_path / "strip.png", [photo.truth for photo in crops.photos])
     with Image.open(tmp_path / "strip.png") as strip:
         assert strip.size == (9 + 12, 6), "nothing is cut off"
         assert strip.getpixel((20, 5)) == (255, 0, 0) and strip.getpixel((0, 5)) == (255, 255, 255)
@@ -386,7 +385,7 @@ def test_large_photos_among_small_ones_are_drawn_small_and_whole(
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="where there is a GPU, its memory is told")
 def test_memory_is_looked_at_while_the_block_runs() -> None:
-    with benchmark_module.peak_memory() as peak:
+    with benchmark.peak_memory() as peak:
         before = psutil.Process().memory_info().rss  # here, for what other tests have left may go at any time
         with mmap.mmap(-1, 100_000_000) as block:  # new pages, whatever allocators have in reserve
             block.write(b"1" * len(block))

@@ -10,7 +10,7 @@ import torch
 
 from nerf.training.trainer import NonFinite, StepResult
 from stages.contract import StageError
-from stages.train import loop as training_loop
+from stages.train import loop
 from stages.train.checkpoints import latest_checkpoint
 from stages.train.loop import TrainingRun
 from stages.train.state import TrainingBudget
@@ -95,7 +95,7 @@ def dying(seeds: int, opacity: float, grey: float) -> Callable[[int], OneNumber]
 def test_a_dead_field_is_restarted_with_another_seed(
     opacity: float, grey: float, symptom: str, tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(training_loop, "WARM_UP_STEPS", 10)
+    monkeypatch.setattr(loop, "WARM_UP_STEPS", 10)
     run = run_in(tmp_path, progress, make=dying(2, opacity, grey))
     run.train()
     assert (run.state.restarts, run.state.step, number_of(run).seed) == (2, 40, 2)
@@ -103,7 +103,7 @@ def test_a_dead_field_is_restarted_with_another_seed(
 
 
 def test_a_field_that_stays_dead_fails_by_name(tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(training_loop, "WARM_UP_STEPS", 10)
+    monkeypatch.setattr(loop, "WARM_UP_STEPS", 10)
     run = run_in(tmp_path, progress, make=dying(9, opacity=0.0, grey=0.5))
     with pytest.raises(StageError) as failure:
         run.train()
@@ -114,7 +114,7 @@ def test_a_field_that_stays_dead_fails_by_name(tmp_path: Path, progress, monkeyp
 def test_the_curve_ends_with_the_run_and_is_on_record(
     tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(training_loop.FIRST_MEASUREMENT, "steps", 10.0)
+    monkeypatch.setitem(loop.FIRST_MEASUREMENT, "steps", 10.0)
     run = run_in(tmp_path, progress)
     run.train()
     assert run.state.curve[-1]["step"] == 40
@@ -128,7 +128,7 @@ def test_the_curve_ends_with_the_run_and_is_on_record(
 def test_what_was_measured_of_steps_taken_back_is_forgotten(
     tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(training_loop.FIRST_MEASUREMENT, "steps", 10.0)
+    monkeypatch.setitem(loop.FIRST_MEASUREMENT, "steps", 10.0)
 
     def trouble(step: int, lr_scale: float) -> None:
         if step == 22 and lr_scale == 1:

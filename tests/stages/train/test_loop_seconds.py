@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from stages.train import loop as training_loop
+from stages.train import loop
 from stages.train.checkpoints import latest_checkpoint
 from stages.train.loop import TrainingRun
 from stages.train.state import Pace, TrainingBudget, checkpoint_interval
@@ -68,7 +68,7 @@ def run_on_a_made_up_clock(
         now += takes(step)
 
     clock = SimpleNamespace(perf_counter=lambda: now, monotonic=lambda: now)
-    monkeypatch.setattr(training_loop, "time", clock)
+    monkeypatch.setattr(loop, "time", clock)
     budget = TrainingBudget(None, seconds)
     run = run_in(folder, progress, budget, lambda _: OneNumber(0, step_by_step), checkpoint_seconds=checkpoint_seconds)
     run.train()

@@ -1,0 +1,74 @@
+"""The optional effects. Options, statistics, A/B runs, training, records and the report follow from this list.
+
+A new effect is its model in ``nerf/effects``, its statistic in ``nerf/effects/statistics`` and its entry here. The
+order is that in which effects are decided, and applied to rays and colours.
+"""
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    import numpy as np
+    from torch import Tensor
+
+    from nerf.effects import ColourEffect, RayEffect, TrainingImages
+    from nerf.effects.statistics.statistic import Evidence
+    from stages.effects.evidence import Observations
+
+
+class EffectParts(NamedTuple):
+    """What an effect is made of. ``statistic`` tells whether the scene calls for it; ``measured``, what it begins with,
+    (training images, numbers). ``rays`` or ``colours`` makes its model, given the latter; neither: the field's own
+    settings model it (stages/train)."""
+
+    statistic: "Callable[[Observations], Evidence]"
+    measured: "Callable[[Observations], np.ndarray] | None" = None
+    rays: "Callable[[TrainingImages, Tensor | None], RayEffect] | None" = None
+    colours: "Callable[[TrainingImages, Tensor | None], ColourEffect] | None" = None
+
+
+class Effect(NamedTuple):
+    """``load`` imports its parts, which need torch. ``part_of_the_method``: the published method has it, so it is left
+    out only where that gains; others are added only where that does."""
+
+    name: str
+    description: str
+    load: Callable[[], EffectParts]
+    part_of_the_method: bool = False
+
+
+def _background() -> EffectParts:
+    from stages.effects.evidence import background_statistic
+
+    return EffectParts(lambda seen: background_statistic(seen.places))
+
+
+def _exposure() -> EffectParts:
+    from nerf.effects.exposure import ExposureModel
+    from stages.effects.evidence import exposure_statistic, measured_gains
+
+    return EffectParts(exposure_statistic, measured_gains, colours=ExposureModel.initial)
+
+
+def _pose_refinement() -> EffectParts:
+    from nerf.effects.pose_refinement import PoseRefinement
+    from stages.effects.evidence import pose_statistic
+
+    return EffectParts(lambda seen: pose_statistic(seen.places), rays=PoseRefinement.initial)
+
+
+def _view_dependence() -> EffectParts:
+    from nerf.effects.statistics.view_dependence import view_dependence_evidence
+
+    return EffectParts(lambda seen: view_dependence_evidence(seen.tracks, seen.exposure))
+
+
+EFFECTS = [
+    Effect("background", "space beyond the region of interest, contracted", _background),
+    Effect("exposure", "a gain per photo and colour channel", _exposure),
+    # Poses before view dependence: there are two A/B runs, and wrong poses cost more.
+    Effect("pose_refinement", "a rigid correction of each photo's camera", _pose_refinement),
+    Effect(
+        "view_dependence", "colour that depends on the viewing direction", _view_dependence, part_of_the_method=True
+    ),
+]

@@ -1,0 +1,154 @@
+"""Decides effect after effect: by what was asked for, by its statistic, or by an A/B training run."""
+
+import math
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from nerf.effects.statistics.statistic import Evidence
+from nerf.geometry.scene import Scene
+from nerf.training.trainer import NonFinite
+from stages.contract import Inputs, Progress, StageResult
+from stages.effects import evidence, pilots
+from stages.effects.decisions import Decisions, write_decisions
+from stages.effects.effect_list import EFFECTS, Effect
+from stages.effects.pilots import Pilot, PilotScene, fits_poses
+from stages.io.files import read_tensors, write_json
+
+if TYPE_CHECKING:
+    from stages.effects import Config
+
+
+class Verdict(NamedTuple):
+    """Whether an effect is on, and why, and the ``seconds`` that it took to come to that, the statistic apart."""
+
+    on: bool
+    reason: str
+    pilot: Pilot | None = None
+    seconds: float = 0.0
+
+
+def study(
+    config: "Config", scene: Scene, registration: dict[str, Any], inputs: Inputs, folder: Path, progress: Progress
+) -> StageResult:
+    """The stage's work, once it knows how many A/B runs there may be."""
+    started = time.perf_counter()
+    uncertainty = {f"images/{image['file']}": image.get("uncertainty_px") for image in registration["images"]}
+    points = read_tensors(inputs["normalise"] / "points.safetensors")
+    found = evidence.scene_evidence(inputs["ingest"], scene, points, uncertainty, progress)
+    statistics_seconds = time.perf_counter() - started
+    decisions, verdicts = _Study(config, scene, inputs, found, progress).decide()
+    write_decisions(folder, decisions)
+    lens = evidence.lens_evidence(registration)
+    of, seconds = found.of | {"lens": lens}, found.seconds | {"lens": 0.0}  # which stage sfm chose
+    verdicts["lens"] = Verdict(bool(lens.called_for), lens.words)
+    order = [*verdicts, *(name for name in of if name not in verdicts)]
+    table = {name: _entry(verdicts.get(name), of[name], seconds[name]) for name in order}
+    write_json(folder / "effects.json", table)
+    facts = {"on": [name for name, entry in table.items() if entry["on"]], "statistics_seconds": statistics_seconds}
+    return StageResult(("decisions.json",), _line(table), ("effects.json",), facts)
+
+
+class _Study:
+    """Decides effect after effect; each pilot builds on what was decided before it."""
+
+    def __init__(
+        self,
+        config: "Config",
+        scene: Scene,
+        inputs: Inputs,
+        found: evidence.SceneEvidence,
+        progress: Progress,
+    ) -> None:
+        self.config, self.scene, self.inputs, self.found, self.progress = config, scene, inputs, found, progress
+        self.pilots = self.fitting_pilots = 0
+        self.trial: PilotScene | str | None = None
+
+    def decide(self) -> tuple[Decisions, dict[str, Verdict]]:
+        """What to model, and the reasons by effect. What the published method has is on until it is decided."""
+        decisions = Decisions({effect.name: {} for effect in EFFECTS if effect.part_of_the_method})
+        verdicts: dict[str, Verdict] = {}
+        for effect in EFFECTS:
+            off, on = decisions.without(effect.name), decisions.having(effect.name, self._measured(effect.name))
+            began = time.perf_counter()
+            verdict = self._verdict(effect, off, on)
+            verdicts[effect.name] = verdict._replace(seconds=time.perf_counter() - began)
+            decisions = on if verdict.on else off
+        return decisions, verdicts
+
+    def _measured(self, name: str) -> dict[str, list[float]]:
+        """What an effect begins with, by the names of the training photos."""
+        if name not in self.found.measured:
+            return {}
+        names = [view.name for view in self.scene.of_split("train")]
+        return dict(zip(names, self.found.measured[name].tolist(), strict=True))
+
+    def _verdict(self, effect: Effect, off: Decisions, on: Decisions) -> Verdict:
+        asked = self.config.force.get(effect.name)
+        evidence, default = self.found.of[effect.name], effect.part_of_the_method
+        if asked is not None:
+            return Verdict(asked == "on", f"asked for; {evidence.words}")
+        # Highlights have no tracks: what is seen of view dependence is a lower bound, and too little of it no proof.
+        unproven = default and evidence.called_for is False
+        if evidence.called_for is not None and not unproven:
+            return Verdict(evidence.called_for, evidence.words)
+        if math.isinf(evidence.noise):
+            return Verdict(default, evidence.words)
+        if why := self._why_no_pilot(off, on):
+            return Verdict(default, f"{evidence.words}; not clear, and no pilot: {why}")
+        return self._piloted(effect, off, on)
+
+    def _why_no_pilot(self, off: Decisions, on: Decisions) -> str | None:
+        if not self.config.pilot_steps:
+            return "none was wanted"
+        if self.pilots == self.config.pilots:
+            return f"{self.pilots} were made already" if self.pilots else "there is no time for one"
+        if fits_poses(off, on) and self.fitting_pilots == self.config.fitting_pilots:
+            return "there is no time for one that fits poses"
+        if self.trial is None:
+            self.trial = pilots.pilot_scene(self.inputs, self.scene, self.progress)
+        return self.trial if isinstance(self.trial, str) else None
+
+    def _piloted(self, effect: Effect, off: Decisions, on: Decisions) -> Verdict:
+        assert self.trial is not None and not isinstance(self.trial, str), "a reason against pilots is heard before"
+        self.pilots += 1
+        self.fitting_pilots += fits_poses(off, on)
+        words, default = self.found.of[effect.name].words, effect.part_of_the_method
+        try:
+            pilot = pilots.run_pilot(self.trial, off, on, self.config.pilot_steps, self.config.seed, self.progress)
+        except NonFinite as fault:
+            return Verdict(default, f"{words}; not clear, and the pilot diverged: {fault}")
+        gain = f"a pilot gained {pilot.gain_db:+.2f} ± {pilot.noise_db:.2f} dB"
+        stays = not pilot.hurts if default else pilot.pays
+        return Verdict(stays, f"{words}; {gain}", pilot)
+
+
+def _entry(verdict: Verdict | None, evidence: Evidence, seconds: float) -> dict[str, Any]:
+    """One effect in effects.json, whose statistic took ``seconds``; without a verdict it is only seen."""
+    pilot = verdict.pilot if verdict else None
+    return {
+        "on": verdict.on if verdict else bool(evidence.called_for),
+        "modelled": verdict is not None,
+        "statistic": _finite(evidence.statistic),
+        "unit": evidence.unit,
+        "threshold": _finite(evidence.threshold),
+        "noise": _finite(evidence.noise),
+        "pilot_gain_db": pilot.gain_db if pilot else None,
+        "pilot_noise_db": pilot.noise_db if pilot else None,
+        "cost": pilot.cost if pilot else None,
+        "seconds": round(seconds + (verdict.seconds if verdict else 0.0), 3),
+        "reason": verdict.reason if verdict else evidence.words,
+    }
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _line(table: dict[str, dict[str, Any]]) -> str:
+    """exposure on (…) · view dependence on (…) · 2 off · seen, not modelled: vignetting (…)."""
+    modelled = {name.replace("_", " "): entry for name, entry in table.items() if entry["modelled"]}
+    on = [f"{name} on ({entry['reason']})" for name, entry in modelled.items() if entry["on"]]
+    seen = [f"{n.replace('_', ' ')} ({e['reason']})" for n, e in table.items() if not e["modelled"] and e["on"]]
+    line = " · ".join([*on, f"{len(modelled) - len(on)} off"])
+    return line + (f" · seen, not modelled: {', '.join(seen)}" if seen else "")
