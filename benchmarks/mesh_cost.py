@@ -87,7 +87,7 @@ def main() -> None:
     add_out(parser)
     given = parser.parse_args()
     workspace = Workspace.existing(given.workspace)
-    keys = workspace.read_run()["keys"]
+    keys = workspace.read_run().keys
     folders = {stage: workspace.folder(stage, keys[stage]) for stage in ("ingest", "normalise", "train")}
     truth = Truth.read(given.truth) if given.truth else None
     record = Record(given.out)

@@ -19,7 +19,7 @@ import numpy as np
 
 from benchmarks.record import Record, add_out
 from nerf.training.hash_grid_trainer import LR_HOLD_FRACTION
-from nerf.training.learning_curve import FEWEST_STEPS, Curve, last_doubling
+from nerf.training.learning_curve import MIN_STEPS, Curve, last_doubling
 
 SHARE = 0.8  # of the truths that an interval is to hold
 LEAST = 0.1  # dB: by as much two seeds differ
@@ -70,7 +70,7 @@ def cases_of(runs: list[Run]) -> list[Case]:
     whole = sorted(filter(in_use, runs), key=lambda run: (run["set"], run["seed"], run["steps"]))
     cases = []
     for short, long in pairwise(whole):
-        if short["steps"] < FEWEST_STEPS:
+        if short["steps"] < MIN_STEPS:
             continue
         if (short["set"], short["seed"], 2 * short["steps"]) != (long["set"], long["seed"], long["steps"]):
             continue

@@ -36,7 +36,7 @@ def with_samples(model: RadianceModel, factor: float) -> RadianceModel:
     if isinstance(model, HashGridField):
         given = model.settings
         finer = {"min_step_size": given.min_step_size / factor, "cone_angle": given.cone_angle / factor}
-        settings = replace(given, steps=max(1, round(given.steps * factor)), **finer)
+        settings = replace(given, diagonal_steps=max(1, round(given.diagonal_steps * factor)), **finer)
         changed: HashGridField | VanillaNerf = HashGridField(settings, 0, model.backend)
     else:
         assert isinstance(model, VanillaNerf)
@@ -87,7 +87,7 @@ def main() -> None:
     given = parser.parse_args()
     record = Record(given.out)
     workspace = Workspace.existing(given.workspace)
-    keys = workspace.read_run()["keys"]
+    keys = workspace.read_run().keys
     folders = {stage: workspace.folder(stage, keys[stage]) for stage in ("ingest", "normalise", "train")}
     painter = load_painter(folders["train"])
     for downscale in given.downscales:

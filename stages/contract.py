@@ -1,34 +1,47 @@
-"""What a stage is: the few types that every stage shares with the runner and nothing else.
+"""What a stage is and what it declares: all that stages share with the runner.
 
-A stage is a module of this package with
+A stage is a package in this folder and one line in pipeline/engine/stage_list.py. Its ``__init__.py`` has
 
 * ``INPUTS: tuple[str, ...]``: the stages whose finished folders it reads;
-* optionally ``OPTIONAL_INPUTS: tuple[str, ...]``: stages whose finished folders it reads where they are there: they
-  are no part of its key and are not brought up to date for it, nor given to it where damaged, so no output may depend
-  on them;
 * ``VERSION: int``: raised whenever the same config and inputs would give other outputs than before;
+* ``EXIT_CODE: int``: of a command that this stage ends with an error;
 * ``RESUMES: bool``: whether it can go on from its own half-written folder (otherwise it starts clean);
 * ``PUBLISHED: tuple[str, ...]``: the outputs or records shown in ``<workspace>/output/``;
-* optionally ``NOT_HASHED: tuple[str, ...]``: options that cannot change the result and so do not enter the key;
 * ``Config``: its settings, a :class:`StageConfig`;
 * ``run(config, inputs, folder, progress) -> StageResult``: reads ``inputs[stage]`` (finished folders), writes
   into ``folder`` and nowhere else, raises :class:`StageError` for everything a user can act on;
-* optionally ``plan(config, inputs, progress) -> Config``: replaces every ``None`` ("choose for me") by a value,
-  where it must by timing a piece of the work. It is called once, before the stage's first run; the answer is kept
-  in run.json and enters the stage's key, so a run that was killed goes on with the same choice.
+
+and may have (:data:`DEFAULTS` hold otherwise)
+
+* ``OPTIONAL_INPUTS: tuple[str, ...]``: stages whose finished folders it reads where they are there: they are no part of
+  its key and are not brought up to date for it, nor given to it where damaged, so no output may depend on them;
+* ``NOT_HASHED: tuple[str, ...]``: options that cannot change the result and so do not enter the key;
+* ``plan(config, inputs, progress) -> Config``: replaces every ``None`` ("choose for me") by a value, where it must by
+  timing a piece of the work. It is called once, before the stage's first run; the answer is kept in run.json and
+  enters the stage's key, so a run that was killed goes on with the same choice;
+* ``ON_REQUEST: bool``: nothing needs it, so it runs only where it is named, and no budget pays for it;
+* ``SUMMARY: bool``: it shows the whole run: of its ``INPUTS`` it takes what is there, with records and timings, and the
+  account of a budget; it is brought up to date after whichever stage was run alone;
+* ``expected_seconds(config, workload) -> float | None``: what it takes without a budget; None where nobody can tell;
+* ``FLEXIBLE: Flexible``: it fills whatever seconds a budget gives it;
+* ``budget_seconds(left) -> float``: for a stage that is not flexible: its ``seconds`` in a run with a budget;
+* ``limiting_seconds(options) -> float | None``: for a stage whose ``seconds`` have a limit without a budget as well:
+  what that limit follows from, None for no limit.
 
 Importing a stage must be cheap: torch, pycolmap, kornia and their like are imported inside ``run``.
 """
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Protocol
+from types import ModuleType
+from typing import Annotated, Any, NamedTuple, Protocol
 
 from pydantic import BaseModel, ConfigDict
 from tyro.conf import Suppress
 
-MOST_LETTERS = 600  # of each part of an error
+MAX_LETTERS = 600  # of each part of an error
 KEY_LENGTH = 16  # hex digits of a key that name a stage's folder: 64 bits
 
 
@@ -36,6 +49,16 @@ class StageConfig(BaseModel):
     """Settings of one stage. Unknown keys, infinities and NaN are refused. A ``Path`` enters keys by content."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    @property
+    def time_is_open(self) -> bool:
+        """Whether the stage has an option ``seconds`` and nothing says how long it works."""
+        return getattr(self, "seconds", 0.0) is None
+
+    @property
+    def exempt_from_budget(self) -> bool:
+        """Whether these options give the stage a time of its own, which no budget pays for."""
+        return False
 
 
 # A path that the command line fills in from PHOTOS and --cameras; no dotted flag is offered for it.
@@ -57,7 +80,7 @@ class StageError(Exception):
         super().__init__(f"{self.what}: {self.why}. {self.hint}")
 
 
-def bounded(text: str, most: int = MOST_LETTERS) -> str:
+def bounded(text: str, most: int = MAX_LETTERS) -> str:
     """At most so many letters of it."""
     return text if len(text) <= most else f"{text[:most]}…"
 
@@ -97,3 +120,91 @@ class StageResult:
 
 
 Inputs = Mapping[str, Path]
+
+
+# --- what a stage declares about its time
+
+# Seconds that a core takes to decode a million pixels and to shrink or examine them. Decoding alone takes 0.01 to 0.02
+# for JPEG, 0.03 for PNG (fox, banana, fountain_p11), all of stage ingest 0.03; large photos take longer.
+READING_SECONDS = 0.04
+
+
+def reading_seconds(megapixels: float, cores: int) -> float:
+    """Seconds that it takes to decode photos of so many million pixels in all, which several stages do once each."""
+    return READING_SECONDS * megapixels / cores
+
+
+class Photos(NamedTuple):
+    """The photos before any is decoded: how many, and how large each is in millions of pixels."""
+
+    number: int
+    megapixels: float
+
+    def reading_seconds(self, cores: int) -> float:
+        """Seconds that it takes to decode all of them once."""
+        return reading_seconds(self.number * self.megapixels, cores)
+
+
+class Workload(NamedTuple):
+    """What is known before a run begins, for stages to estimate their time.
+
+    ``facts(stage, key)`` gives what a finished stage told of itself: under that key, or with None the one that the run
+    will find; None where there is none, or where the run makes another.
+    """
+
+    photos: Photos
+    cores: int
+    options: Mapping[str, Any]
+    facts: Callable[[str, str | None], Mapping[str, Any] | None]
+
+
+class BudgetLeft(NamedTuple):
+    """What is left of a budget of ``total`` seconds as a stage begins: ``free`` of them once all that the later stages
+    are expected to take is set apart, ``reserved`` of these for the least that flexible ones can do with; ``reading``
+    are the seconds to decode the photos."""
+
+    total: float
+    free: float
+    reserved: float
+    reading: float
+
+
+def _as_given(wall: float, reading: float) -> float:
+    return wall
+
+
+class Flexible(NamedTuple):
+    """How a stage that fills the time it is given takes part in a budget."""
+
+    share: float  # of the time that is free, beside the shares of the other flexible stages
+    min_seconds: float  # less is worth nothing
+    max_seconds: float = math.inf  # that stages before it leave for it
+    max_share: float = 0.35  # of the whole budget, where all before it is there already
+    reads_photos: bool = False  # whether decoding them comes on top of ``min_seconds``
+    work: Callable[[float, float], float] = _as_given  # its option ``seconds`` by wall time and time to decode photos
+
+
+def _unknown(config: StageConfig, workload: Workload) -> float | None:
+    return None
+
+
+def _unlimited(options: Mapping[str, Any]) -> float | None:
+    return None
+
+
+DEFAULTS: dict[str, Any] = {
+    "OPTIONAL_INPUTS": (),
+    "NOT_HASHED": (),
+    "plan": None,
+    "ON_REQUEST": False,
+    "SUMMARY": False,
+    "expected_seconds": _unknown,
+    "FLEXIBLE": None,
+    "budget_seconds": None,
+    "limiting_seconds": _unlimited,
+}
+
+
+def declared(stage: ModuleType, name: str) -> Any:
+    """What a stage declares under ``name``, or the default."""
+    return getattr(stage, name, DEFAULTS[name])

@@ -50,7 +50,7 @@ class Common:
     replan: bool = False
     """Choose again what was chosen automatically before: for every stage of a run, or the one that is named."""
     verify: bool = False
-    """Read every file of finished results and compare it with its sha256; what is damaged is made again."""
+    """Read every file of finished results and compare it with its sha256; what is damaged is rebuilt."""
 
 
 @dataclass

@@ -37,7 +37,6 @@ from pipeline.engine.failures import StageFailed
 from pipeline.engine.runner import Runner
 from pipeline.engine.settings import Settings
 from pipeline.engine.workspace import RUN_FILE, Workspace, default_workspace
-from pipeline.schedule import forecast
 from stages.amounts import duration
 from stages.contract import StageError
 
@@ -83,7 +82,7 @@ def run_command(words: Sequence[str]) -> int:
     except StageFailed as failure:
         if debug:
             traceback.print_exc()
-        return stage_list.EXIT_CODES[failure.stage]
+        return stage_list.STAGES[failure.stage].EXIT_CODE
     except StageError as error:
         if debug:
             traceback.print_exc()
@@ -131,7 +130,7 @@ def _command(name: str) -> Callable[[Sequence[str]], int]:
         return commands[name]
     if name in stage_list.STAGES:
         return lambda words: command_stage(name, words)
-    raise UsageError(f"no command {name!r}; there are: {', '.join([*commands, *chain.STAGES])}")
+    raise UsageError(f"no command {name!r}; there are: {', '.join([*commands, *stage_list.STAGES])}")
 
 
 def command_run(words: Sequence[str]) -> int:
@@ -159,15 +158,15 @@ def command_run(words: Sequence[str]) -> int:
     if given.from_ is not None:
         force = frozenset(stages[stages.index(_known_stage(given.from_, "--from", stages)) :])
     budget = _budget(given.budget, asked)
-    if budget is not None and (studies := [stage for stage in stages if stage in stage_list.ON_REQUEST]):
+    if budget is not None and (studies := [stage for stage in stages if stage_list.is_on_request(stage)]):
         later = f"`pipeline {studies[0]} {root} --budget 30m`"
         raise UsageError(f"--budget and --until {studies[0]}: a study has a budget of its own; run first, then {later}")
     with choose_display(given.common.json) as display:
         try:
             settings = with_source(asked, given.photos, cameras)
         except StageError as error:
-            display.failed("ingest", error)
-            return stage_list.EXIT_CODES["ingest"]
+            display.failed(stage_list.SOURCE, error)
+            return stage_list.STAGES[stage_list.SOURCE].EXIT_CODE
         new_budget = None if given.more is not None else (budget, 0.0)
         return _run_stages(root, settings, stages, given.common, display, force, new_budget=new_budget)
 
@@ -175,14 +174,12 @@ def command_run(words: Sequence[str]) -> int:
 def _keeping_studies(settings: Settings, root: Path, words: Sequence[str], file: Collection[str] = ()) -> Settings:
     """The settings with the recorded options of the stages ON_REQUEST but those that the command's ``words`` or tables
     of the ``file`` of --config name: a run that does not ask for them leaves what they found where it is."""
-    named = {
-        *file,
-        *(stage for stage in stage_list.ON_REQUEST if any(word.startswith(f"--{stage}.") for word in words)),
-    }
+    studies = [stage for stage in stage_list.STAGES if stage_list.is_on_request(stage)]
+    named = {*file, *(stage for stage in studies if any(word.startswith(f"--{stage}.") for word in words))}
     if not os.path.isfile(root / RUN_FILE):
         return settings
-    options = Workspace(root).read_run()["options"]
-    recorded = {stage: options[stage] for stage in stage_list.ON_REQUEST if stage in options and stage not in named}
+    options = Workspace(root).read_run().options
+    recorded = {stage: options[stage] for stage in studies if stage in options and stage not in named}
     try:
         kept = settings_from(recorded, f"options recorded in {root}")
     except UsageError:  # of another version of this program, which finds nothing by them anyway
@@ -238,18 +235,18 @@ def _run_stages(
         if new_budget is not None:
             runner.set_budget(*new_budget)
         replan = (stages if alone is None else (alone,)) if common.replan else ()
-        anew = force | (runner.state["plans"].keys() & replan)
-        foretold = forecast.foretell(runner, stages, anew, forecast.photos_of(settings))
-        display.headline(" · ".join([machine.headline(root), *foretold.words]))
+        again = force | (runner.run_file.plans.keys() & replan)
+        forecast = runner.forecast(stages, again)
+        display.headline(" · ".join([machine.headline(root), *forecast.messages]))
         try:
             given = {"force": force, "replan": replan, "remember": alone is None, "verify": common.verify}
-            ran = runner.run(stages, times=foretold.times, **given)
+            ran = runner.run(stages, times=forecast.times, **given)
         except StageFailed as failure:
             display.failed(failure.stage, failure.error)
             raise
         words = _closing_words(workspace, ran)
         if runner.charged and alone is None and runner.budget:
-            words = f"{duration(runner.budget.spent)} of {duration(runner.budget.total)} spent {words}"
+            words = f"{duration(runner.budget.seconds_spent)} of {duration(runner.budget.total)} spent {words}"
         display.finished(words, _outputs(workspace))
     return 0
 
@@ -285,8 +282,8 @@ def command_stage(stage: str, words: Sequence[str]) -> int:
         update = {"cameras": given.cameras.absolute()}
         settings = settings.model_copy(update={"render": settings.render.model_copy(update=update)})
     stages = stage_list.needed_for(stage)
-    if stage != "report" and "report" in workspace.read_run()["keys"]:
-        stages = [*stages, "report"]
+    shown = [name for name in workspace.read_run().keys if stage_list.is_summary(name) and name not in stages]
+    stages = [*stages, *shown]
     with choose_display(given.common.json) as display:
         force = frozenset({stage}) if given.force else frozenset[str]()
         return _run_stages(given.workspace, settings, stages, given.common, display, force, alone=stage)
@@ -303,7 +300,7 @@ def _study_for(settings: Settings, budget: str, stage: str) -> Settings:
 def _recorded_settings(workspace: Workspace) -> Settings:
     """The options in run.json. Raises StageError where this version of the program has others."""
     try:
-        return settings_from(workspace.read_run()["options"], "recorded there")
+        return settings_from(workspace.read_run().options, "recorded there")
     except UsageError as error:
         why = f"{error}; another version of this program wrote it"
         hint = f"Give the photos again: pipeline run PHOTOS -o {workspace.root}. What still fits is kept."
@@ -316,7 +313,7 @@ def command_resume(words: Sequence[str]) -> int:
     """``pipeline resume WORKSPACE``: repeat the recorded run."""
     given = arguments.parse(arguments.ResumeArguments, "resume", words)
     workspace = Workspace.existing(given.workspace)
-    stages = workspace.read_run().get("stages") or stage_list.usual()
+    stages = workspace.read_run().stages or stage_list.usual()
     with choose_display(given.common.json) as display:
         return _run_stages(given.workspace, _recorded_settings(workspace), stages, given.common, display)
 
@@ -351,7 +348,7 @@ def command_clean(words: Sequence[str]) -> int:
     """``pipeline clean WORKSPACE``: remove results that the recorded options do not use."""
     given = arguments.parse(arguments.CleanArguments, "clean", words)
     with Workspace.existing(given.workspace) as workspace:
-        stale = workspace.stale_folders(workspace.read_run()["keys"], list(stage_list.STAGES))
+        stale = workspace.stale_folders(workspace.read_run().keys, list(stage_list.STAGES))
         freed = sum(p.stat().st_size for folder in stale for p in folder.rglob("*") if p.is_file())
         for folder in stale:
             print(f"{'would remove' if given.dry_run else 'removed'} {folder}")

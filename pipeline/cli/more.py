@@ -25,10 +25,10 @@ def with_more(settings: Settings, workspace: Workspace, text: str) -> Settings:
     budgets = {"steps": train.steps, "seconds": train.seconds, "preset": train.preset}
     recorded = workspace.read_run()
     for name, value in budgets.items():
-        if value is not None and value != recorded["options"]["train"][name]:
+        if value is not None and value != recorded.options["train"][name]:
             raise UsageError(f"--more and --train.{name} are two budgets; give one")
-    key = recorded["keys"].get("train")
-    command = command_that_makes("train", recorded.get("stages"), workspace.root)
+    key = recorded.keys.get("train")
+    command = command_that_makes("train", recorded.stages, workspace.root)
     finished = None if key is None else _finished(workspace, key, command)
     after = training_name(finished.key, finished.outputs_digest) if finished else train.after
     if after is None:
@@ -53,5 +53,5 @@ def _finished(workspace: Workspace, key: str, command: str) -> Manifest | None:
     try:
         return workspace.finished("train", key)
     except BadManifest as problem:
-        hint = f"It was set aside; {command} trains again."
+        hint = f"It was quarantined; {command} trains again."
         raise StageError("pipeline.training-damaged", f"{workspace.root} cannot go on", str(problem), hint) from problem

@@ -17,7 +17,7 @@ from stages.effects.effect_list import EFFECTS
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
 
-MOST_WRONG, MOST_LETTERS = 10, 100  # options in one error, and letters of a name or value in it
+MAX_WRONG, MAX_LETTERS = 10, 100  # options in one error, and letters of a name or value in it
 WORDS_ALONE = {("ingest", "photos"): "PHOTOS", ("ingest", "cameras"): "--cameras", ("sfm", "cameras"): "--cameras"}
 
 
@@ -50,9 +50,9 @@ def settings_from(values: Mapping[str, Any], origin: str) -> Settings:
 
 def wrong_options(error: ValidationError, *parents: str) -> str:
     """Every wrong option below ``parents`` with what it must be: ``train.steps 0 must be at least 1; …``."""
-    wrong = [_wrong_option(bounded(".".join([*parents, *map(str, e["loc"])]), MOST_LETTERS), e) for e in error.errors()]
-    more = f"; and {len(wrong) - MOST_WRONG} more" if len(wrong) > MOST_WRONG else ""
-    return "; ".join(wrong[:MOST_WRONG]) + more
+    wrong = [_wrong_option(bounded(".".join([*parents, *map(str, e["loc"])]), MAX_LETTERS), e) for e in error.errors()]
+    more = f"; and {len(wrong) - MAX_WRONG} more" if len(wrong) > MAX_WRONG else ""
+    return "; ".join(wrong[:MAX_WRONG]) + more
 
 
 def _wrong_option(name: str, problem: "ErrorDetails") -> str:
@@ -64,7 +64,7 @@ def _wrong_option(name: str, problem: "ErrorDetails") -> str:
     must = problem["msg"].removeprefix("Input should ")
     for long, short in (("greater than or equal to", "at least"), ("less than or equal to", "at most")):
         must = must.replace(long, short)
-    return f"{name} {bounded(str(problem['input']), MOST_LETTERS)} must {must}"
+    return f"{name} {bounded(str(problem['input']), MAX_LETTERS)} must {must}"
 
 
 def with_effects(settings: Settings, choices: Sequence[str]) -> Settings:
@@ -147,7 +147,7 @@ def check_same_photos(workspace: Workspace, photos: Path) -> None:
     its results would make way for those of PHOTOS. Where the old one is gone, it was moved or renamed."""
     from stages.ingest.sources import is_gone
 
-    recorded = workspace.read_run()["options"].get("ingest", {}).get("photos")
+    recorded = workspace.read_run().options.get("ingest", {}).get("photos")
     if not isinstance(recorded, str) or is_gone(Path(recorded)) or is_gone(photos):
         return
     before, now = photo_set(Path(recorded)), photo_set(photos)

@@ -9,7 +9,7 @@ from stages.contract import StageConfig
 
 
 class DamagedInputs(Exception):
-    """A stage was about to read files that are not what was written; they have been set aside."""
+    """A stage was about to read files that are not what was written; they have been quarantined."""
 
 
 class NotReady(Exception):

@@ -8,19 +8,29 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from pipeline.engine import machine, manifests
+from pipeline.engine import machine, manifests, run_file
 from pipeline.engine.display import Display
 from pipeline.engine.failures import StageFailed, worded
 from pipeline.engine.job import DamagedInputs, Job, NotReady
 from pipeline.engine.keys import ContentIndex, config_for_key, digest, stage_key
 from pipeline.engine.manifests import BadManifest, Manifest
 from pipeline.engine.settings import Settings
-from pipeline.engine.stage_list import ON_REQUEST, STAGES, command_that_makes, needed_for
+from pipeline.engine.stage_list import SOURCE, STAGES, command_that_makes, is_summary, needed_for
 from pipeline.engine.workspace import Workspace
-from pipeline.schedule.budget import ALIVE, Budget, has_its_own_time, reading_of, takes_what_it_is_given
-from pipeline.schedule.forecast import pilots_seconds, reckoned_with
-from stages.contract import StageConfig, StageError
-from stages.io.stopwatch import counted, keep, kept
+from pipeline.schedule.budget import RUNNING, Account
+from pipeline.schedule.forecast import (
+    Forecast,
+    Left,
+    forecast_run,
+    is_exempt,
+    limited_seconds,
+    photos_of,
+    time_behind_plan,
+)
+from stages.contract import StageConfig, StageError, Workload, declared, reading_seconds
+from stages.hardware.device import processors
+from stages.io.photos import read_photos
+from stages.io.stopwatch import counting, elapsed, write_elapsed
 
 ATTEMPTS = "attempts.json"  # in a partial folder: seconds of all attempts at the stage, planning included
 
@@ -31,27 +41,31 @@ class Runner:
     def __init__(self, workspace: Workspace, settings: Settings, display: Display) -> None:
         self.workspace, self.settings, self.display = workspace, settings, display
         self.force: frozenset[str] = frozenset()
-        self.state = workspace.read_run()
-        self.state["options"] = settings.model_dump(mode="json")
+        self.run_file = workspace.read_run()
+        self.run_file.options = settings.model_dump(mode="json")
         self.index = ContentIndex(workspace.root / ".content.json")
         self.done: dict[str, Manifest] = {}
         self.stages: list[str] = []
         self.times: Mapping[str, float | None] = {}
         self.planning: dict[str, float] = {}  # seconds that it took, where it was done by this program
-        self.apart: dict[str, Any] | None = None  # the account of a stage alone, after a whole run that has its own
+        self.detached: Account | None = None  # of a stage alone, after a whole run that has its own
         self.works_on: str | None = None
         self.charged = False  # whether any work of this program has cost time of the budget
-        self.started: dict[str, float] = {}  # when each stage did, later by what an input cost that was made again
+        self.started: dict[str, float] = {}  # when each stage did, later by what an input cost that was rebuilt
         self.photos: str | None = None  # their digest: they are listed once
         self.checked: set[str] = set()  # stages whose files were written or read anew by this program
-        self.at_work = ""
+        self.running = ""
         self.verify = False
 
     @property
-    def budget(self) -> Budget | None:
+    def budget(self) -> Account | None:
         """The time that the run may take in all, where there is a limit."""
-        state = self.apart or self.state.get("budget")
-        return Budget(state) if state else None
+        return self.detached or self.run_file.budget
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """The options of each stage, as the user gave them."""
+        return {stage: getattr(self.settings, stage) for stage in STAGES}
 
     def set_budget(self, total: float | None, before: float) -> None:
         """Make ``total`` seconds the budget of this workspace, None for no limit. The same as before goes on.
@@ -59,29 +73,53 @@ class Runner:
         ``before``: seconds spent already on what the photos were made in.
         """
         if total is None:
-            self.state.pop("budget", None)
+            self.run_file.budget = None
         elif self.budget is None or self.budget.total != total:
-            self.state["budget"] = Budget.new(total, self._options_digest())
+            self.run_file.budget = Account(total=total, run=self._options_digest())
             if before:
-                Budget(self.state["budget"]).end("photos", before)
+                self.run_file.budget.end("photos", before)
 
-    def time_left(self, budget: Budget) -> float:
+    def forecast(self, stages: Sequence[str], again: Collection[str]) -> Forecast:
+        """How long a run of ``stages`` takes, ``again`` those of them that may run though they have a result. Nothing
+        where the photos or a file that a setting names cannot be read: the stage that reads it says so."""
+        photos = photos_of(self.options[SOURCE])
+        if photos is None:
+            return Forecast([], {})
+        try:
+            to_run = [name for name in stages if name in again or self.found(name) is None]
+
+            def facts(stage: str, key: str | None) -> Mapping[str, Any] | None:
+                if key is None:
+                    finished = None if stage in to_run else self.found(stage)
+                    return finished and finished.facts
+                try:
+                    return manifests.read(self.workspace.folder(stage, key)).facts
+                except (FileNotFoundError, BadManifest):
+                    return None
+
+            left = self.budget and Left(self.budget.total, self._time_left(self.budget))
+            return forecast_run(STAGES, to_run, Workload(photos, processors(), self.options, facts), left)
+        except StageError:
+            return Forecast([], {})
+
+    def _time_left(self, budget: Account) -> float:
         """Seconds of the budget that this run has: all, unless it goes on with an interrupted one."""
         budget.recover(self.workspace.root)
-        goes_on = budget.spent and budget.is_of(self._options_digest(), self._photos_digest())
+        goes_on = budget.seconds_spent and budget.is_of(self._options_digest(), self._photos_digest())
         return budget.left if goes_on else budget.total
 
     def found(self, stage: str) -> Manifest | None:
         """The finished result of ``stage`` for these options, as far as can be told beforehand; None without one."""
         try:
-            return self._upstream(stage, "report") if self.state["keys"] else None
+            return self._upstream(stage, needed=False) if self.run_file.keys else None
         finally:
             self.done.clear()  # what runs now may make it outdated
 
     def _options_digest(self) -> str:
         """Of what a budget is kept for: a study has its own time."""
-        recorded = self.workspace.portable(self.state["options"])
-        return digest({stage: options for stage, options in recorded.items() if stage not in ON_REQUEST})
+        recorded = run_file.portable(self.run_file.options, self.workspace.root)
+        of_run = [stage for stage in STAGES if not declared(STAGES[stage], "ON_REQUEST")]
+        return digest({stage: recorded[stage] for stage in of_run})
 
     def run(
         self,
@@ -97,19 +135,19 @@ class Runner:
 
         ``force`` names stages that run again even where a finished result exists; ``replan`` those of which is
         forgotten what was chosen for the user before; ``remember`` makes ``stages`` what `pipeline resume` repeats;
-        ``times`` are the seconds that stages are expected to take (pipeline/schedule/forecast.py), for a budget and the
+        ``times`` are the seconds that stages are expected to take (:meth:`forecast`), for a budget and the
         report; ``verify`` reads every file of a finished result before it counts as finished.
         """
         self.verify, self.force, self.stages, self.times = verify, force, list(stages), times or {}
         if self.budget:
             self.budget.recover(self.workspace.root)
             if self.budget.over and not remember:
-                self.apart = Budget.new(self.budget.total, self._options_digest())
+                self.detached = Account(total=self.budget.total, run=self._options_digest())
         for stage in replan:
-            self.state["plans"].pop(stage, None)
+            self.run_file.plans.pop(stage, None)
         if remember:
-            self.state["stages"] = list(stages)
-        self.workspace.write_run(self.state)
+            self.run_file.stages = list(stages)
+        self.workspace.write_run(self.run_file)
         try:
             ran = [self._bring_up_to_date(stage) for stage in stages]
         except Exception as problem:
@@ -118,7 +156,7 @@ class Runner:
                 self._close_account(remember)
             raise
         except BaseException:  # a signal: whoever sent it does not wait for photos to be read
-            self._unlink_after(self.at_work)
+            self._unlink_after(self.running)
             raise
         self._unlink_outdated()
         self._close_account(remember)
@@ -127,23 +165,23 @@ class Runner:
     def _close_account(self, whole_run: bool) -> None:
         """A run that ended by itself, well or not, is over; one stage of an interrupted run does not end it."""
         if self.budget and whole_run:
-            self.budget.close()
-            self.workspace.write_run(self.state)
+            self.budget.over = True
+            self.workspace.write_run(self.run_file)
 
     def _unlink_outdated(self) -> None:
         """Take out of ``output/`` what belongs to other settings than the current ones."""
         for stage, module in STAGES.items():
             try:
-                self._upstream(stage, "output")
+                self._upstream(stage)
             except NotReady:
                 self.workspace.unlink_outputs(module.PUBLISHED)
             except StageError:  # photos or a file that a setting names cannot be read: said where that stage runs
                 continue
 
     def _unlink_after(self, stage: str) -> None:
-        """Take out of ``output/`` what rests on ``stage``, which was at work; nothing where none was."""
+        """Take out of ``output/`` what rests on ``stage``, which was running; nothing where none was."""
         for later, module in STAGES.items():
-            if stage and (later == "report" or stage in needed_for(later, STAGES)):
+            if stage and (is_summary(later, STAGES) or stage in needed_for(later, STAGES)):
                 self.workspace.unlink_outputs(module.PUBLISHED)
 
     def _bring_up_to_date(self, stage: str) -> bool:
@@ -153,7 +191,7 @@ class Runner:
             with worded(stage):
                 job, manifest, ran = self._found_or_made(stage)
                 self.workspace.link_outputs(self.workspace.folder(stage, job.key), job.module.PUBLISHED)
-                self.workspace.write_run(self.state)
+                self.workspace.write_run(self.run_file)
                 self.index.save()
         finally:
             self._end_work(stage)
@@ -165,20 +203,20 @@ class Runner:
         """The stage's job and result, and whether it had to run for it."""
         try:
             job = self.resolve(stage)
-            self.state["keys"][stage] = job.key
+            self.run_file.keys[stage] = job.key
             manifest = None if stage in self.force else self.find_finished(job)
             if manifest is not None:
                 return job, manifest, False
             self._check_inputs(stage, job.folders)
         except DamagedInputs:
-            self._make_inputs_again(stage)
+            self._rebuild_inputs(stage)
             return self._found_or_made(stage)
         self.workspace.unlink_outputs(job.module.PUBLISHED)
         return job, self._execute(job), True
 
     def _check_inputs(self, stage: str, folders: dict[str, Path]) -> None:
-        """Compare all that ``stage`` is to read with its sha256. Raises DamagedInputs after setting the bad aside.
-        What it reads only where that is there stays in place and leaves ``folders``: nobody makes that again here.
+        """Compare all that ``stage`` is to read with its sha256. Raises DamagedInputs after quarantining
+        what is damaged. An optional input stays in place and leaves ``folders``: nobody rebuilds that here.
 
         Once per program and stage: what this program wrote itself was hashed when it was written.
         """
@@ -195,16 +233,16 @@ class Runner:
             except BadManifest as problem:
                 damaged = damaged or needed
                 if needed:
-                    self.display.note(f"set aside as .bad and made again: {problem}")
+                    self.display.note(f"quarantined as .bad and rebuilt: {problem}")
                 else:
                     del folders[name]
-                    command = command_that_makes(name, self.state.get("stages"), self.workspace.root)
-                    again = f"`{command} --verify` makes it again ({problem})"
-                    self.display.note(f"{name} is damaged: left out; {again}")
+                    command = command_that_makes(name, self.run_file.stages, self.workspace.root)
+                    rebuild = f"`{command} --verify` rebuilds it ({problem})"
+                    self.display.note(f"{name} is damaged: left out; {rebuild}")
         if damaged:
             raise DamagedInputs
 
-    def _make_inputs_again(self, stage: str) -> None:
+    def _rebuild_inputs(self, stage: str) -> None:
         """Bring everything below ``stage`` up to date once more; what lies above the damage may change with it."""
         needed = {name for above in STAGES[stage].INPUTS if above in self.done for name in needed_for(above, STAGES)}
         clock = time.monotonic()
@@ -221,12 +259,13 @@ class Runner:
 
         Raises NotReady where an upstream result is missing, or where settings are left open and may not be planned.
         """
-        module = STAGES[stage]
-        upstream = {name: m for name in module.INPUTS if (m := self._upstream(name, stage)) is not None}
-        beside = {name: m for name in getattr(module, "OPTIONAL_INPUTS", ()) if (m := self._upstream(name, "report"))}
-        folders = {name: self.workspace.folder(name, m.key) for name, m in (upstream | beside).items()}
-        # The report shows timings and logs too, so it depends on whole manifests and not only on outputs.
-        if stage == "report":
+        module, summary = STAGES[stage], is_summary(stage, STAGES)
+        upstream = {name: m for name in module.INPUTS if (m := self._upstream(name, needed=not summary)) is not None}
+        names = declared(module, "OPTIONAL_INPUTS")
+        optional = {name: m for name in names if (m := self._upstream(name, needed=False)) is not None}
+        folders = {name: self.workspace.folder(name, m.key) for name, m in (upstream | optional).items()}
+        # A summary shows timings and logs too, so it depends on whole manifests and not only on outputs.
+        if summary:
             inputs = {name: manifests.file_sha256(folders[name] / manifests.NAME) for name in upstream}
         else:
             inputs = {name: m.outputs_digest for name, m in upstream.items()}
@@ -235,90 +274,97 @@ class Runner:
         key = stage_key(stage, module.VERSION, key_config, inputs)
         return Job(stage, module, config, key_config, inputs, folders, key)
 
-    def _upstream(self, name: str, stage: str) -> Manifest | None:
-        """The current result of ``name``. Only "report" does without it, as with OPTIONAL_INPUTS."""
+    def _upstream(self, name: str, needed: bool = True) -> Manifest | None:
+        """The current result of ``name``; where it is not ``needed`` None without one, else NotReady is raised."""
         if name not in self.done:
             try:
                 key = self.resolve(name, may_plan=False).key
                 self.done[name] = manifests.read(self.workspace.folder(name, key))
             except (NotReady, FileNotFoundError, BadManifest):
-                if stage != "report":
+                if needed:
                     raise NotReady(name) from None
             except StageError:  # a file that a setting names is gone: the stage says so where it runs
-                rest_on_it = any(name in module.INPUTS for later, module in STAGES.items() if later != "report")
-                if stage != "report" or rest_on_it:
+                rests_on_it = (name in m.INPUTS for later, m in STAGES.items() if not is_summary(later, STAGES))
+                if needed or any(rests_on_it):
                     raise
         return self.done.get(name)
 
     def _planned(self, stage: str, inputs: dict[str, str], folders: dict[str, Path], may_plan: bool) -> StageConfig:
         """The stage's config with every "choose for me" answered: from run.json, or by the stage's plan()."""
         module, options = STAGES[stage], getattr(self.settings, stage)
-        if stage == "report" and (account := self.state.get("budget")):
-            return module.Config.model_validate(options.model_dump() | {"budget": Budget(account).account()})
-        if not hasattr(module, "plan"):
+        if is_summary(stage, STAGES) and (account := self.run_file.budget):
+            return module.Config.model_validate(options.model_dump() | {"budget": account.shown(STAGES)})
+        plan = declared(module, "plan")
+        if plan is None:
             return options
         options_for_key = self._config_for_key(stage, options)
-        time_given = reckoned_with(stage, self.settings, self.budget)
+        total = None if self.budget is None else self.budget.total
+        time_given = time_behind_plan(STAGES, stage, self.options, total)
         asked = digest({"version": module.VERSION, "options": options_for_key, "inputs": inputs} | time_given)
-        plans = self.state["plans"].setdefault(stage, {})
+        plans = self.run_file.plans.setdefault(stage, {})
         if asked in plans:
             # Taken as given now: paths, for the plan was made for equal content, wherever that lay then, and what is
             # part of no key. But seconds stay: where they are open, a budget gave the plan its own.
             now = {name for name, value in options if isinstance(value, Path)}
-            now |= {*getattr(module, "NOT_HASHED", ())} - {"seconds"}
+            now |= {*declared(module, "NOT_HASHED")} - {"seconds"}
             return module.Config.model_validate(plans[asked] | options.model_dump(include=now))
         if not may_plan:
             raise NotReady(stage)
         self._check_inputs(stage, folders)
         self._begin_work(stage)
         clock = time.monotonic()
-        with counted(self.workspace.root / ALIVE):
-            config = module.plan(self._with_time(stage, options), folders, self.display)
+        with counting(self.workspace.root / RUNNING):
+            config = plan(self._with_time(stage, options), folders, self.display)
         self.planning[stage] = time.monotonic() - clock
         plans[asked] = config.model_dump(mode="json")
-        self.workspace.write_run(self.state)
+        self.workspace.write_run(self.run_file)
         return config
 
     def _begin_work(self, stage: str) -> None:
         """From here on ``stage`` costs time of the budget, which nothing does that was found finished."""
-        if self.budget is None or self.works_on == stage or has_its_own_time(stage, self.settings):
+        if self.budget is None or self.works_on == stage or is_exempt(STAGES, stage, self.options[stage]):
             return
-        if stage == "report" and self.budget.over:  # it shows that account, and would be out of date with another
+        if is_summary(stage, STAGES) and self.budget.over:  # it shows that account
             return
         self.works_on, self.charged = stage, True
         self.budget.continue_as(self._options_digest(), self._photos_digest())
-        (self.workspace.root / ALIVE).unlink(missing_ok=True)
-        self.budget.begin(stage)
+        (self.workspace.root / RUNNING).unlink(missing_ok=True)
+        self.budget.running = stage
         if (seconds := self.times.get(stage)) is not None:
-            self.budget.promise(stage, seconds)
-        self.workspace.write_run(self.state)
+            self.budget.allocate(stage, seconds)
+        self.workspace.write_run(self.run_file)
 
     def _end_work(self, stage: str) -> None:
         """Note what ``stage`` cost, where it did."""
         if self.budget and self.works_on == stage:
             self.budget.end(stage, time.monotonic() - self.started[stage])
             self.works_on = None
-            self.workspace.write_run(self.state)
+            self.workspace.write_run(self.run_file)
 
     def _with_time(self, stage: str, options: StageConfig) -> StageConfig:
-        """``options`` with the seconds that the budget leaves for the stage, where these are open; without a budget
-        only pilots have a limit."""
-        if not takes_what_it_is_given(options) or (self.budget is None and stage != "effects"):
+        """``options`` with the seconds that the run leaves for the stage, where these are open."""
+        module = STAGES[stage]
+        has_share = declared(module, "FLEXIBLE") is not None or declared(module, "budget_seconds") is not None
+        if not options.time_is_open or not has_share:
             return options
-        reading = reading_of(self.workspace.folder("ingest", self.done["ingest"].key))
+        photos = read_photos(self.workspace.folder(SOURCE, self.done[SOURCE].key))
+        reading = reading_seconds(sum(photo.width * photo.height for photo in photos) / 1e6, processors())
         if self.budget is None:
-            return options.model_copy(update={"seconds": pilots_seconds(self.settings, self.times, reading)})
-        # An input that has to be made again is none of the stages that were asked for.
+            seconds = limited_seconds(STAGES, stage, self.options, self.times, reading)
+            return options.model_copy(update={"seconds": seconds})
+        # An input that has to be rebuilt is none of the stages that were asked for.
         order = list(STAGES)
-        after = (name for name in self.stages if order.index(name) > order.index(stage))
-        to_come = {name: self.times.get(name) for name in after if not has_its_own_time(name, self.settings)}
-        if stage == "train" and (why := self.budget.shortage(to_come, reading)):
+        after = [name for name in self.stages if order.index(name) > order.index(stage)]
+        to_come = {name: self.times.get(name) for name in after if not is_exempt(STAGES, name, self.options[name])}
+        what_is_left = {stage: None, **to_come}
+        main = (how := declared(module, "FLEXIBLE")) is not None and how.max_share >= 1
+        if main and (why := self.budget.shortage(STAGES, what_is_left, reading)):
             self.display.note(f"the budget cannot be kept: {why}")
-        return options.model_copy(update={"seconds": self.budget.give(stage, to_come, reading)})
+        return options.model_copy(update={"seconds": self.budget.give(STAGES, stage, to_come, reading)})
 
     def _config_for_key(self, stage: str, config: StageConfig) -> dict[str, Any]:
-        replaced = {"photos": self._photos_digest()} if stage == "ingest" else {}
-        return config_for_key(config, self.index, replaced, getattr(STAGES[stage], "NOT_HASHED", ()))
+        replaced = {"photos": self._photos_digest()} if stage == SOURCE else {}
+        return config_for_key(config, self.index, replaced, declared(STAGES[stage], "NOT_HASHED"))
 
     def _photos_digest(self) -> str:
         """Digest of the photos' names and bytes; the last known one where the photos are gone but were ingested."""
@@ -326,26 +372,26 @@ class Runner:
 
         if self.photos is not None:
             return self.photos
-        config = self.settings.ingest
-        if (known := self.state.get("photos_digest")) and is_gone(config.photos):
+        config: Any = self.options[SOURCE]
+        if (known := self.run_file.photos_digest) and is_gone(config.photos):
             return known
         source = find_source(config.photos, config.cameras)
         self.display.update("reading the video" if source.kind == "video" else f"reading {len(source.files)} photos")
         files = self.index.of_files(source.root, (*source.files, *(mask for _, mask in source.masks)))
         masks = [(name, os.path.relpath(mask, source.root)) for name, mask in source.masks]
         self.photos = digest({"kind": source.kind, "frames": source.frames, "masks": masks, "files": files})
-        self.state["photos_digest"] = self.photos
+        self.run_file.photos_digest = self.photos
         return self.photos
 
     def find_finished(self, job: Job) -> Manifest | None:
-        """The finished result for this job, if there is one; a damaged one is set aside and said aloud."""
+        """The finished result for this job, if there is one; a damaged one is quarantined and said aloud."""
         try:
             manifest = self.workspace.finished(job.stage, job.key, deep=self.verify)
             if manifest is not None and self.verify:
                 self.checked.add(job.stage)
             return manifest
         except BadManifest as problem:
-            self.display.note(f"set aside as .bad and made again: {problem}")
+            self.display.note(f"quarantined as .bad and rebuilt: {problem}")
             return None
 
     def _execute(self, job: Job) -> Manifest:
@@ -355,15 +401,15 @@ class Runner:
         if job.stage not in self.force and (manifest := self.workspace.complete(partial, folder, job.key)):
             return manifest
         self._begin_work(job.stage)
-        before = kept(partial / ATTEMPTS) + self.planning.pop(job.stage, 0.0)
+        before = elapsed(partial / ATTEMPTS) + self.planning.pop(job.stage, 0.0)
         if partial.exists() and not (job.module.RESUMES and job.stage not in self.force):
             shutil.rmtree(partial)
         partial.mkdir(parents=True, exist_ok=True)
-        keep(partial / ATTEMPTS, before)
-        self.workspace.write_run(self.state)
+        write_elapsed(partial / ATTEMPTS, before)
+        self.workspace.write_run(self.run_file)
         started = datetime.now(UTC)
-        self.at_work = job.stage
-        with counted(self.workspace.root / ALIVE), counted(partial / ATTEMPTS) as spent:
+        self.running = job.stage
+        with counting(self.workspace.root / RUNNING), counting(partial / ATTEMPTS) as spent:
             result = job.module.run(job.config, job.folders, partial, self.display)
         outputs = manifests.describe_outputs(partial, result.outputs)
         manifest = Manifest(
@@ -385,5 +431,5 @@ class Runner:
         self.workspace.finish(partial, folder, manifest)
         self.checked.add(job.stage)
         self.force -= {job.stage}
-        self.at_work = ""
+        self.running = ""
         return manifest

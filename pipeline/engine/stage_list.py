@@ -1,44 +1,34 @@
-"""The stages in the order they run, and how they depend on each other."""
+"""The stages in the order they run, and how they depend on each other. A new stage is its package and one line here."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
 
 from stages import effects, evaluate, ingest, mesh, normalise, render, report, sfm, tradeoff, train
+from stages.contract import declared
 
 STAGES: dict[str, ModuleType] = {
-    "ingest": ingest,
-    "sfm": sfm,
-    "normalise": normalise,
-    "effects": effects,
-    "train": train,
-    "evaluate": evaluate,
-    "render": render,
-    "mesh": mesh,
-    "tradeoff": tradeoff,
-    "report": report,
+    module.__name__.rpartition(".")[2]: module
+    for module in (ingest, sfm, normalise, effects, train, evaluate, render, mesh, tradeoff, report)
 }
 
-EXIT_CODES = {
-    "ingest": 10,
-    "sfm": 11,
-    "normalise": 12,
-    "effects": 13,
-    "train": 14,
-    "evaluate": 15,
-    "render": 16,
-    "mesh": 17,
-    "tradeoff": 19,
-    "report": 18,
-}
+SOURCE = next(iter(STAGES))
+"""The stage that reads PHOTOS, which its key holds by their content."""
 
-ON_REQUEST = ("tradeoff",)
-"""Stages that take long and that nothing needs: they run where they are named."""
+
+def is_summary(stage: str, stages: Mapping[str, ModuleType] = STAGES) -> bool:
+    """Whether ``stage`` shows the whole run, from whatever is there."""
+    return declared(stages[stage], "SUMMARY")
+
+
+def is_on_request(stage: str) -> bool:
+    """Whether ``stage`` runs only where it is named."""
+    return declared(STAGES[stage], "ON_REQUEST")
 
 
 def needed_for(stage: str, stages: Mapping[str, ModuleType] = STAGES) -> list[str]:
-    """``stage`` and everything it depends on, in order; the report is written from whatever is there."""
-    if stage == "report":
+    """``stage`` and everything it depends on, in order; a summary is written from whatever is there."""
+    if is_summary(stage, stages):
         return [stage]
     wanted = {stage}
     for name in reversed(list(stages)):
@@ -48,9 +38,9 @@ def needed_for(stage: str, stages: Mapping[str, ModuleType] = STAGES) -> list[st
 
 
 def up_to(stage: str) -> list[str]:
-    """All stages from the first to ``stage``, in order, of those ON_REQUEST only ``stage`` itself."""
+    """All stages from the first to ``stage``, in order, of those on request only ``stage`` itself."""
     names = list(STAGES)
-    return [name for name in names[: names.index(stage) + 1] if name == stage or name not in ON_REQUEST]
+    return [name for name in names[: names.index(stage) + 1] if name == stage or not is_on_request(name)]
 
 
 def usual() -> list[str]:

@@ -9,7 +9,7 @@ from pipeline.engine.manifests import BadManifest, Manifest
 from pipeline.engine.runner import Runner
 from pipeline.engine.stage_list import STAGES, command_that_makes
 from pipeline.engine.workspace import Workspace
-from stages.contract import KEY_LENGTH, StageError
+from stages.contract import KEY_LENGTH, StageError, declared
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class StageStatus:
 
 def last_result(workspace: Workspace, runner: Runner, stage: str) -> Manifest | None:
     """The result run.json points to, or else the newest finished one of any key."""
-    known = runner.state["keys"].get(stage)
+    known = runner.run_file.keys.get(stage)
     folders = [workspace.folder(stage, known)] if known else []
     if (workspace.root / stage).is_dir():
         others = (p for p in (workspace.root / stage).iterdir() if len(p.name) == KEY_LENGTH)
@@ -49,7 +49,7 @@ def status_of(workspace: Workspace, runner: Runner, stage: str, deep: bool = Fal
     except StageError as error:
         return StageStatus(stage, "stale" if last else "never", f"{error.what}: {error.why}")
     folder = workspace.folder(stage, job.key)
-    command = command_that_makes(stage, runner.state.get("stages"), workspace.root)
+    command = command_that_makes(stage, runner.run_file.stages, workspace.root)
     try:
         manifest = manifests.read(folder)
         manifests.check_outputs(folder, manifest, deep)
@@ -57,11 +57,11 @@ def status_of(workspace: Workspace, runner: Runner, stage: str, deep: bool = Fal
     except FileNotFoundError:
         pass
     except BadManifest as problem:
-        return StageStatus(stage, "damaged", f"{problem}; `{command} --verify` makes it again")
+        return StageStatus(stage, "damaged", f"{problem}; `{command} --verify` rebuilds it")
     if workspace.partial(stage, job.key).exists():
-        if process := workspace.at_work():
-            return StageStatus(stage, "partial", f"process {process} is at work in this workspace")
-        return StageStatus(stage, "partial", f"interrupted; `{command}` takes it up again")
+        if process := workspace.running():
+            return StageStatus(stage, "partial", f"process {process} is running in this workspace")
+        return StageStatus(stage, "partial", f"interrupted; `{command}` resumes it")
     if last is not None:
         return StageStatus(stage, "stale", "; ".join(differences(job, last)) or "run again")
     return StageStatus(stage, "never", "")
@@ -70,7 +70,7 @@ def status_of(workspace: Workspace, runner: Runner, stage: str, deep: bool = Fal
 def _why_unplanned(runner: Runner, stage: str, last: Manifest) -> str:
     """Why a stage whose inputs are there has not the result it needs, while its open options are not chosen yet."""
     inputs = {name: runner.done[name].outputs_digest for name in STAGES[stage].INPUTS}
-    return "; ".join(_other_inputs(inputs, last)) or "what its options leave open is chosen anew"
+    return "; ".join(_other_inputs(inputs, last)) or "what its options leave open is chosen again"
 
 
 def _other_inputs(now: dict[str, str], last: Manifest) -> list[str]:
@@ -84,7 +84,7 @@ def differences(job: Job, last: Manifest) -> list[str]:
     if last.version != job.module.VERSION:
         found.append(f"the stage itself changed (version {last.version} → {job.module.VERSION})")
     now: dict[str, Any] = job.config.model_dump(mode="json")
-    for name in sorted({*now, *last.config} - set(getattr(job.module, "NOT_HASHED", ()))):
+    for name in sorted({*now, *last.config} - set(declared(job.module, "NOT_HASHED"))):
         before, after = last.config.get(name), now.get(name)
         if before != after:
             found.append(f"{job.stage}.{name}: {before} → {after}")

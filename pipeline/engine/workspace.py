@@ -5,27 +5,23 @@ links the latest results; ``run.json`` holds the options, the planned settings a
 hold other things as well: what this program did not put there it neither replaces nor removes.
 """
 
-import json
 import os
 import re
 import shutil
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Annotated, Any
 
 from filelock import FileLock, Timeout
-from pydantic import BaseModel, Field, ValidationError
 
-from pipeline.engine import manifests
+from pipeline.engine import manifests, run_file
 from pipeline.engine.manifests import BadManifest, Manifest
+from pipeline.engine.run_file import RunFile
 from pipeline.engine.stage_list import STAGES
 from stages.contract import KEY_LENGTH, StageError
-from stages.io.files import first_fault, sync_file, sync_folder, write_durably
+from stages.io.files import sync_file, sync_folder, write_durably
 
-RUN_FILE = "run.json"
-RUN_VERSION = 1
+RUN_FILE = run_file.NAME
 COPIES = ".copies"  # what in output/ is no link but a copy, one a line: its name, a tab, what of the workspace it shows
-_PATHS = ("photos", "cameras")  # options of stages that are paths
 _KEY = re.compile(rf"[0-9a-f]{{{KEY_LENGTH}}}(\.|$)")
 
 
@@ -48,17 +44,6 @@ def default_workspace(photos: Path) -> Path:
             "Give one with -o.",
         )
     return Path.cwd() / f"{base.name}.nerf"
-
-
-class _RunFile(BaseModel):
-    """run.json: of each stage its options, what was chosen for it by what was asked, and its key."""
-
-    version: int
-    options: dict[str, dict[str, Any]]
-    plans: dict[str, dict[str, dict[str, Any]]]
-    keys: dict[str, Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]]
-    stages: list[str] | None = None
-    photos_digest: str | None = None
 
 
 class Workspace:
@@ -112,7 +97,7 @@ class Workspace:
         except OSError:
             return "unknown"
 
-    def at_work(self) -> str | None:
+    def running(self) -> str | None:
         """The process that works in it; None where none does, or who asks may not write there and cannot tell."""
         if not (self.root / ".lock.pid").exists():  # a killed process leaves it, so the lock decides
             return None
@@ -133,10 +118,10 @@ class Workspace:
         return self.root / stage / f"{key[:KEY_LENGTH]}.partial"
 
     def finished(self, stage: str, key: str, deep: bool = False) -> Manifest | None:
-        """The manifest of a finished and undamaged result, or None. A damaged one is set aside as ``.bad``.
+        """The manifest of a finished and undamaged result, or None. A damaged one is quarantined as ``.bad``.
 
         ``deep``: every file is read and compared with its sha256; else sizes are.
-        Raises BadManifest after setting it aside, so that the caller can say it aloud; asking again gives None.
+        Raises BadManifest after quarantining it, so that the caller can say it aloud; asking again gives None.
         """
         folder = self.folder(stage, key)
         try:
@@ -146,15 +131,15 @@ class Workspace:
             manifests.check_outputs(folder, manifest, deep)
         except FileNotFoundError:
             if folder.exists():
-                self._set_aside(folder)
+                self._quarantine(folder)
                 raise BadManifest(f"{folder} has no manifest") from None
             return None
         except BadManifest:
-            self._set_aside(folder)
+            self._quarantine(folder)
             raise
         return manifest
 
-    def _set_aside(self, folder: Path) -> None:
+    def _quarantine(self, folder: Path) -> None:
         bad = folder.with_name(folder.name + ".bad")
         if bad.exists():
             shutil.rmtree(bad)
@@ -170,7 +155,7 @@ class Workspace:
         manifests.write(partial, manifest)
         self._tidy(partial, {*manifest.outputs, *manifest.records, manifests.NAME})
         if folder.exists():  # a forced run of the same key: the old result makes way at the last moment
-            self._set_aside(folder)
+            self._quarantine(folder)
         partial.rename(folder)
         sync_folder(folder.parent)
 
@@ -191,42 +176,16 @@ class Workspace:
             elif path.relative_to(folder).as_posix() not in keep:
                 path.unlink()
 
-    def read_run(self) -> dict[str, Any]:
-        """run.json, or an empty run for a new workspace. Paths in its options are absolute."""
-        try:
-            value = json.loads((self.root / RUN_FILE).read_text("utf-8"))
-            value = manifests.unsealed(value) if manifests.SEAL in value else value
-            if value["version"] == RUN_VERSION:
-                _RunFile.model_validate(value, strict=True)
-                return value | {"options": _with_paths(value["options"], lambda path: str(self.root.absolute() / path))}
-            reason = f"it has version {value['version']}, this program reads {RUN_VERSION}"
-        except FileNotFoundError:
-            return {"version": RUN_VERSION, "options": {}, "plans": {}, "keys": {}}
-        except ValidationError as error:
-            reason = first_fault(error)
-        except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-            reason = f"it cannot be used ({error})"
-        hint = f"Delete {self.root / RUN_FILE} and give the same `pipeline run` again: finished stages are kept."
-        raise StageError("pipeline.run-file", f"cannot read {self.root / RUN_FILE}", reason, hint)
+    def read_run(self) -> RunFile:
+        """Its run.json; an empty run for a new workspace. Raises StageError where it cannot be used."""
+        return run_file.read(self.root)
 
-    def write_run(self, run: dict[str, Any]) -> None:
+    def write_run(self, run: RunFile) -> None:
         """Write run.json durably. Raises StageError if it cannot be written."""
-        run = run | {"options": self.portable(run["options"])}
-        text = json.dumps(manifests.sealed(run), indent=1, sort_keys=True, allow_nan=False)
         try:
-            write_durably(self.root / RUN_FILE, (text + "\n").encode())
+            run_file.write(self.root, run)
         except OSError as error:
             raise self._cannot_write(error) from error
-
-    def portable(self, options: Mapping[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
-        """Options by stage, with paths that lie in the workspace relative to it: they go with it where it is moved."""
-        return _with_paths(options, self._relative)
-
-    def _relative(self, path: str) -> str:
-        for real in (os.path.abspath, os.path.realpath):
-            if (place := Path(real(path))).is_relative_to(root := real(self.root)):
-                return place.relative_to(root).as_posix()
-        return path
 
     def link_outputs(self, folder: Path, names: tuple[str, ...]) -> None:
         """Point ``output/<name>`` at the files of a finished folder; copies, made once, where links are not allowed.
@@ -316,17 +275,15 @@ class Workspace:
                 )
 
     def stale_folders(self, keys: dict[str, str], stages: list[str]) -> list[Path]:
-        """Stage folders that run.json does not use: other keys, abandoned partials, damaged ones. It uses the training
+        """Stage folders that run.json does not use: other keys, abandoned partials, damaged ones. It uses the result
         that the recorded one goes on from, what the options name as cameras, and a partial of the key until that is
         finished."""
         current = {self.folder(stage, key) for stage, key in keys.items()}
         current |= {self.partial(stage, key) for stage, key in keys.items() if _whole(self.folder(stage, key)) is None}
-        options = self.read_run()["options"]
-        named = (stage.get("cameras") for stage in options.values())
+        options = self.read_run().options
+        named = (values.get("cameras") for values in options.values())
         cameras = [Path(os.path.realpath(path)) for path in named if isinstance(path, str)]
-        after = options.get("train", {}).get("after")
-        if isinstance(after, str):
-            current.add(self.folder("train", after))
+        current |= {self.folder(s, after) for s, o in options.items() if isinstance(after := o.get("after"), str)}
         found = (p for stage in stages if (self.root / stage).is_dir() for p in (self.root / stage).iterdir())
         ours = (p for p in found if p.is_dir() and _KEY.match(p.name) and p not in current)  # others are not ours
         return sorted(p for p in ours if not any(path.is_relative_to(os.path.realpath(p)) for path in cameras))
@@ -346,14 +303,6 @@ def is_result(path: Path, root: Path) -> bool:
     """Whether ``path`` lies in a result of the workspace at ``root``, shown in its ``output/`` or where it stays."""
     inside = Path(os.path.relpath(os.path.realpath(lasting(path, root)), os.path.realpath(root))).parts
     return len(inside) > 1 and inside[0] in STAGES and _KEY.match(inside[1]) is not None
-
-
-def _with_paths(options: Mapping[str, dict[str, Any]], change: Callable[[str], str]) -> dict[str, dict[str, Any]]:
-    """Options by stage, with their paths changed."""
-    return {
-        stage: values | {name: change(path) for name in _PATHS if isinstance(path := values.get(name), str)}
-        for stage, values in options.items()
-    }
 
 
 def _whole(folder: Path) -> Manifest | None:

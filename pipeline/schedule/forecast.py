@@ -1,57 +1,29 @@
-"""How long a run is expected to take, said before it begins: from the photos' number and size and measured rates."""
+"""How long a run is expected to take, said before it begins: each stage's own estimate, and what a budget leaves."""
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
-from pipeline.engine import manifests
-from pipeline.engine.manifests import BadManifest
-from pipeline.engine.settings import Settings
-from pipeline.engine.stage_list import ON_REQUEST
-from pipeline.schedule.budget import (
-    READING,
-    STARTING,
-    Budget,
-    for_pilots,
-    has_its_own_time,
-    least_total,
-    most_total,
-    reading_seconds,
-    takes_what_it_is_given,
-)
+from pipeline.schedule.budget import Stages, Times, max_total, min_total
 from stages.amounts import duration, rough_duration
-from stages.contract import StageError
-from stages.hardware.device import processors
-from stages.train.config import SECONDS
-from stages.train.config import Config as TrainConfig
+from stages.contract import BudgetLeft, Photos, StageConfig, StageError, Workload, declared
 
 if TYPE_CHECKING:
-    from pipeline.engine.runner import Runner
+    from stages.ingest import Config as IngestConfig
 
 UNREADABLE_PIXELS = 2_000_000  # that a photo is taken to have until ingest says what is wrong with it
 
 
-class Photos(NamedTuple):
-    """How many, and how large each is in millions of pixels."""
-
-    number: int
-    megapixels: float
-
-    def reading(self, cores: int) -> float:
-        """Seconds that it takes to decode all of them once."""
-        return reading_seconds(self.number * self.megapixels, cores)
-
-
-def photos_of(settings: Settings) -> Photos | None:
+def photos_of(config: "IngestConfig") -> Photos | None:
     """What is to be seen of the photos without decoding any; None where they are gone or cannot be used."""
     from stages.ingest.decoding import pixel_count
     from stages.ingest.sources import find_source
     from stages.ingest.video_frames import expected_frames
 
     try:
-        source = find_source(settings.ingest.photos, settings.ingest.cameras)
+        source = find_source(config.photos, config.cameras)
         if source.kind == "video":
-            number, width, height = expected_frames(source.files[0], settings.ingest.frames)
+            number, width, height = expected_frames(source.files[0], config.frames)
             return Photos(number, width * height / 1e6)
     except StageError:  # ingest says what is wrong with them, where it has to run at all
         return None
@@ -59,155 +31,114 @@ def photos_of(settings: Settings) -> Photos | None:
     return Photos(len(source.files), pixels / 1e6)
 
 
-def expected(settings: Settings, photos: Photos | None) -> dict[str, float | None]:
-    """Seconds by stage; None of those that take what a budget gives them, and of a training in steps, which nobody has
-    timed yet. Nothing where the photos are gone.
-
-    Rates were measured on two cores, on fox, fountain_p11, fern, banana, herzjesu_p8 and the demo (docs/results.md):
-    sfm took 0.6 to 1.8 times as long, and more where photos found no place at once.
-    """
-    if photos is None:
-        return {}
-    cores = processors()
-    seconds: dict[str, float | None] = {
-        "ingest": 0.5 + photos.reading(min(cores, 8)),
-        "sfm": 0.2 if settings.sfm.cameras is not None else sfm_seconds(photos, cores),
-        "normalise": 0.3,
-        "effects": 10.0 + photos.reading(cores),  # two or three, and half a minute where a pilot has to decide
-        "report": 2.0 + READING * photos.megapixels * min(15, photos.number / settings.normalise.test_every),
+def expected_times(stages: Stages, workload: Workload, budgeted: bool) -> dict[str, float | None]:
+    """Seconds by stage; None where nobody can tell and, in a run with a budget, of those that fill what they get."""
+    return {
+        name: None
+        if budgeted and fills_its_time(stages, name, workload.options[name])
+        else _own(stages, name, workload)
+        for name, stage in stages.items()
+        if not declared(stage, "ON_REQUEST")
     }
-    given = settings.train.seconds if settings.train.after is None else settings.train.more_seconds
-    seconds["train"] = given and given + STARTING + photos.reading(cores)
-    return seconds | {stage: getattr(settings, stage).seconds for stage in ("evaluate", "render", "mesh")}
 
 
-def counts_steps(train: TrainConfig) -> bool:
-    """Whether the training ends after so many steps, however long they take."""
-    return (train.steps if train.after is None else train.more_steps) is not None
+def _own(stages: Stages, name: str, workload: Workload) -> float | None:
+    return declared(stages[name], "expected_seconds")(workload.options[name], workload)
 
 
-def sfm_seconds(photos: Photos, cores: int) -> float:
-    """Reading, features of each photo, matches of each pair or of 30 partners each, and mapping, which has one core."""
-    pairs = photos.number * min(photos.number - 1, 60) / 2
-    features = 0.25 * photos.number * min(photos.megapixels, 1.7)
-    return 4.0 + photos.reading(cores) + (features + 0.02 * pairs) * 2 / cores + 0.4 * photos.number
+def fills_its_time(stages: Stages, name: str, options: StageConfig) -> bool:
+    """Whether the stage takes what a budget gives it."""
+    return declared(stages[name], "FLEXIBLE") is not None and options.time_is_open
 
 
-def trained_in_all(runner: "Runner", trains: bool) -> float | None:
-    """Seconds of training steps behind the field that the later stages will meet, by which they give themselves time:
-    to come where the run ``trains``, else those of the finished training. None where nobody can tell."""
-    train = runner.settings.train
-    if not trains:
-        finished = runner.found("train")
-        return finished and finished.facts["train_seconds"]
-    if counts_steps(train):
+def is_exempt(stages: Stages, name: str, options: StageConfig) -> bool:
+    """Whether the stage is charged to no run's budget."""
+    return declared(stages[name], "ON_REQUEST") or options.exempt_from_budget
+
+
+def limited_seconds(
+    stages: Stages, name: str, options: Mapping[str, StageConfig], times: Times, reading: float
+) -> float | None:
+    """The option ``seconds`` of a stage that has a limit in a run without a budget as well, by what the run takes; None
+    for no limit, also where nothing is known of the run."""
+    if not times or declared(stages[name], "limiting_seconds")(options) is None:
         return None
-    if train.after is None:
-        return trained_seconds(train)
-    try:
-        before = manifests.read(runner.workspace.folder("train", train.after))
-    except (FileNotFoundError, BadManifest):  # stage train says why it cannot go on
-        return None
-    assert train.more_seconds is not None, "one of the two is given"
-    return before.facts["train_seconds"] + train.more_seconds
+    total = sum(seconds or 0.0 for seconds in times.values())
+    return declared(stages[name], "budget_seconds")(BudgetLeft(total, total, 0.0, reading))
 
 
-def without_budget(
-    train: TrainConfig, times: Mapping[str, float | None], reading: float, trained: float | None
-) -> dict[str, float | None]:
-    """``times`` of a run without a budget, after ``trained`` seconds of training in all; None where nobody can tell."""
-    usual: dict[str, float] = {}
-    if not counts_steps(train):
-        usual["train"] = trained_seconds(train) + STARTING + reading
-    if trained is not None:
-        # What a training of three minutes is followed by (fox, fountain_p11, the demo; drawing scaled to its share).
-        usual |= {"evaluate": 0.05 * trained, "render": 0.27 * trained, "mesh": 5.0 + 0.15 * trained}
-    return {stage: usual.get(stage) if seconds is None else seconds for stage, seconds in times.items()}
-
-
-def trained_seconds(train: TrainConfig) -> float:
-    """Of a training from the beginning that counts no steps: those asked for, or the preset's."""
-    return train.seconds or SECONDS[train.preset or "standard"]
-
-
-def pilots_seconds(settings: Settings, times: Mapping[str, float | None], reading: float) -> float | None:
-    """Seconds that pilots may take in a run without a budget, whose stages take ``times``: their part of what it is
-    expected to take. None, for as long as they take, where that is not known: a run that counts steps is to end the
-    same on every machine."""
-    if not times or settings.train.steps is not None:
-        return None
-    whole = without_budget(settings.train, times, reading, trained_seconds(settings.train))
-    return for_pilots(sum(seconds or 0.0 for seconds in whole.values()), reading)
-
-
-def reckoned_with(stage: str, settings: Settings, budget: Budget | None) -> dict[str, float]:
-    """The time that a plan of ``stage`` rests on: the run's budget, the stage's own seconds or, for pilots, training's;
-    {} without. It is part of no key; with another one the stage plans anew."""
-    options = getattr(settings, stage)
-    if not takes_what_it_is_given(options):
-        seconds = getattr(options, "seconds", None)
+def time_behind_plan(
+    stages: Stages, name: str, options: Mapping[str, StageConfig], total: float | None
+) -> dict[str, float]:
+    """The time that a plan of a stage rests on: the budget of ``total`` seconds, the stage's own option, or what limits
+    it without a budget; {} without. It is part of no key; with another one the stage plans anew."""
+    if not options[name].time_is_open:
+        seconds = getattr(options[name], "seconds", None)
         return {} if seconds is None else {"seconds": seconds}
-    if budget is not None:
-        return {"budget": budget.total}
-    # What --more adds changes no pilot: the field that goes on stands on their decisions.
-    limited = stage == "effects" and settings.train.steps is None
-    return {"training": trained_seconds(settings.train)} if limited else {}
+    if total is not None:
+        return {"budget": total}
+    limit = declared(stages[name], "limiting_seconds")(options)
+    return {} if limit is None else {"limit": limit}
 
 
 class Forecast(NamedTuple):
-    """What is said at the start of a run, and the seconds that its stages are expected to take; None of those that a
-    budget gives their time, and where nobody can tell."""
+    """What is said at the start of a run, and the seconds that its stages are expected to take; None of those that fill
+    what a budget gives them, and where nobody can tell."""
 
-    words: list[str]
-    times: Mapping[str, float | None]
-
-
-def foretell(runner: "Runner", stages: Sequence[str], anew: frozenset[str], photos: Photos | None) -> Forecast:
-    """How long a run of ``stages`` takes, ``anew`` those of them that may run though they have a result: in words,
-    where anything may have to run and it can be told, and by stage. Nothing where the photos or a file that a setting
-    names cannot be read: the stage that reads it says so."""
-    try:
-        return _foretold(runner, stages, anew, photos) if photos else Forecast([], {})
-    except StageError:
-        return Forecast([], {})
+    messages: list[str]
+    times: Times
 
 
-def _foretold(runner: "Runner", stages: Sequence[str], anew: frozenset[str], photos: Photos) -> Forecast:
-    train, times, reading = runner.settings.train, expected(runner.settings, photos), photos.reading(processors())
-    left = [name for name in stages if name in anew or runner.found(name) is None]
-    trains = "train" in left
-    apart = [name for name in left if has_its_own_time(name, runner.settings)]
-    budget = None if apart and set(left) <= {*apart, "report"} else runner.budget
-    if budget is None:
-        unknown = None in (times[name] for name in stages if name in times)
-        times = without_budget(train, times, reading, trained_in_all(runner, trains) if unknown else None)
-    if set(left) <= {"report"} or (trains and counts_steps(train)):
+class Left(NamedTuple):
+    """A budget of ``total`` seconds, ``left`` of them not spent."""
+
+    total: float
+    left: float
+
+
+def forecast_run(stages: Stages, to_run: Collection[str], workload: Workload, budget: Left | None) -> Forecast:
+    """How long the stages ``to_run`` take: a message where that can be told, and seconds by stage."""
+    exempt = [name for name in to_run if is_exempt(stages, name, workload.options[name])]
+    summaries = {name for name in stages if declared(stages[name], "SUMMARY")}
+    if exempt and {*to_run} <= {*exempt, *summaries}:
+        budget = None
+    times = expected_times(stages, workload, budget is not None)
+    ahead = {name: times[name] if name in times else _own(stages, name, workload) for name in stages if name in to_run}
+    known = [seconds for seconds in ahead.values() if seconds is not None]
+    unknown = [name for name in ahead.keys() - exempt if ahead[name] is None]
+    if {*to_run} <= summaries:
         return Forecast([], times)
-    studies = {name: getattr(runner.settings, name).seconds for name in ON_REQUEST}  # words alone: no run pays for them
-    of_left = {name: seconds for name, seconds in {**times, **studies}.items() if name in left}
-    if budget is not None:
-        beside = sum(of_left.pop(name) or 0.0 for name in apart)
-        return Forecast([in_words(budget.total, runner.time_left(budget), of_left, reading, beside)], times)
-    known = [seconds for seconds in of_left.values() if seconds is not None]
-    words = f"done in about {rough_duration(sum(known))}, about {_clock(sum(known))}"
-    return Forecast([words] if len(known) == len(left) else [], times)
+    if budget is None:
+        total = sum(known)
+        message = f"done in about {rough_duration(total)}, about {_clock(total)}"
+        return Forecast([message] if len(known) == len(ahead) else [], times)
+    if not all(fills_its_time(stages, name, workload.options[name]) for name in unknown) or any(
+        ahead[name] is None for name in exempt
+    ):
+        return Forecast([], times)
+    extra = sum(ahead.pop(name) or 0.0 for name in exempt)
+    reading = workload.photos.reading_seconds(workload.cores)
+    return Forecast([budget_message(stages, budget, ahead, reading, extra)], times)
 
 
-def in_words(total: float, left: float, times: Mapping[str, float | None], reading: float, beside: float = 0.0) -> str:
-    """The promise of a budget of ``total`` seconds, ``left`` of them not spent; ``times`` of what has to run by it, and
-    ``beside`` it the seconds of what has a time of its own."""
-    least, most = least_total(times, reading), most_total(times, total)
-    given = f"budget {duration(total)}" + (f" and {rough_duration(beside)} beside it" if beside else "")
+def budget_message(stages: Stages, budget: Left, times: Times, reading: float, extra: float = 0.0) -> str:
+    """When a run with a budget is done; ``times`` of what has to run by it, and ``extra`` the seconds of what is exempt
+    from it."""
+    total, left = budget
+    least, most = min_total(stages, times, reading), max_total(stages, times, total)
+    given = f"budget {duration(total)}" + (f" and {rough_duration(extra)} on top" if extra else "")
     if least > left and left < total:
         needed = f"about {rough_duration(least)} is needed: give a larger --budget, or all is made as small as can be"
         return f"{given}, {duration(max(0.0, left))} of it left by what was spent before; {needed}"
     if least > left:
         soonest = f"about {rough_duration(least)} is the least that would do"
         return f"{given}, too short for these photos: {soonest}; all is made as small as can be"
-    finish = _clock(min(left, most) + beside)
-    # Only training takes all that there is; the rest may well be done sooner.
-    trains = times.get("train", 0.0) is None
-    return f"{given}, done at {f'about {finish}' if trains else f'{finish} at the latest'}"
+    finish = _clock(min(left, most) + extra)
+    # Others have no use for more than a share, and may well be done sooner.
+    uses_all = any(
+        s is None and (how := declared(stages[n], "FLEXIBLE")) and how.max_share >= 1 for n, s in times.items()
+    )
+    return f"{given}, done at {f'about {finish}' if uses_all else f'{finish} at the latest'}"
 
 
 def _clock(seconds: float) -> str:

@@ -1,21 +1,33 @@
 """Stage effects: which optional effects the scene calls for, with the evidence; the others are not simulated at all."""
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator
 from tyro.conf import Suppress
 
 from stages.amounts import duration
-from stages.contract import Inputs, Progress, StageConfig, StageResult
+from stages.contract import (
+    BudgetLeft,
+    Inputs,
+    Progress,
+    StageConfig,
+    StageResult,
+    Workload,
+)
 from stages.effects.effect_list import EFFECTS
 from stages.io.files import read_json, read_scene
 
 INPUTS = ("ingest", "sfm", "normalise")
 VERSION = 13
+EXIT_CODE = 13
 RESUMES = False
 PUBLISHED = ("effects.json",)
 NOT_HASHED = ("seconds",)  # it decides how many A/B runs, and that enters the key
+# Of the run: what the stage may take, and of what is free no more than FREE_SHARE. Of that, beside reading the photos,
+# statistics take one or two seconds, timing a pilot as much.
+BUDGET_SHARE, FREE_SHARE, STATISTICS_SECONDS = 0.15, 0.25, 4.0
 
 Switch = Literal["on", "off"]
 MAX_PILOTS = 2
@@ -55,6 +67,24 @@ class Config(StageConfig):
         if unknown := [name for name in force if name not in names]:
             raise ValueError(f"there is no effect {unknown[0]!r}; there are: {', '.join(names)}")
         return force
+
+
+def expected_seconds(config: Config, workload: Workload) -> float:
+    """Reading the photos, two or three seconds, and half a minute where a pilot has to decide."""
+    return 10.0 + workload.photos.reading_seconds(workload.cores)
+
+
+def budget_seconds(left: BudgetLeft) -> float:
+    """What pilots may take: BUDGET_SHARE of the run, less what the stage takes without any; and of what is free no more
+    than leaves a training that is worth it."""
+    share = min(BUDGET_SHARE * left.total, FREE_SHARE * left.free)
+    return max(0.0, share - STATISTICS_SECONDS - left.reading)
+
+
+def limiting_seconds(options: Mapping[str, Any]) -> float | None:
+    """Without a budget a training in seconds limits its pilots; a run that counts steps is to end the same on every
+    machine. What ``--more`` adds changes no pilot: the field that goes on stands on their decisions."""
+    return options["train"].planned_seconds
 
 
 def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:

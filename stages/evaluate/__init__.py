@@ -13,10 +13,19 @@ from typing import TYPE_CHECKING, Any, Literal
 from pydantic import Field
 
 from stages.amounts import duration, short_count
-from stages.contract import Inputs, Progress, StageConfig, StageError, StageResult
+from stages.contract import (
+    Flexible,
+    Inputs,
+    Progress,
+    StageConfig,
+    StageError,
+    StageResult,
+    Workload,
+)
 from stages.evaluate.image_metrics import ERROR_SCALE, FEWEST_FOR_INTERVAL, error_map, mean_interval, ssim
 from stages.io.files import read_json, read_scene, write_json, write_png
 from stages.io.photos import spread
+from stages.train import trained_seconds
 from stages.train.config import BLACK, WHITE
 
 if TYPE_CHECKING:
@@ -31,9 +40,11 @@ if TYPE_CHECKING:
 
 INPUTS = ("ingest", "normalise", "train")
 VERSION = 12
+EXIT_CODE = 15
 RESUMES = False
 PUBLISHED = ("metrics.json", "renders", "errors")
 NOT_HASHED = ("seconds",)  # it decides how many photos, and that enters the key
+FLEXIBLE = Flexible(share=0.05, min_seconds=2.0, max_seconds=60.0)
 
 BACKGROUNDS = {"white": WHITE, "black": BLACK}
 RIGHT_HALVES = ("psnr_right", "psnr_fitted_right", "psnr_posed_right")
@@ -79,6 +90,14 @@ class Config(StageConfig):
         gt=0,
         description="Seconds that the stage may take. None: drawing takes 30 % of the training's seconds.",
     )
+
+
+def expected_seconds(config: Config, workload: Workload) -> float | None:
+    """A twentieth of the training's seconds (fox, fountain_p11 and the demo, after three minutes)."""
+    if config.seconds is not None:
+        return config.seconds
+    trained = trained_seconds(workload)
+    return None if trained is None else 0.05 * trained
 
 
 def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:

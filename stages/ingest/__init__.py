@@ -4,13 +4,22 @@ from pathlib import Path
 
 from pydantic import Field
 
-from stages.contract import Inputs, OptionalSourcePath, Progress, SourcePath, StageConfig, StageResult
+from stages.contract import (
+    Inputs,
+    OptionalSourcePath,
+    Progress,
+    SourcePath,
+    StageConfig,
+    StageResult,
+    Workload,
+)
 from stages.ingest.sources import find_source
 from stages.io.files import write_json
 from stages.io.photos import write_photos
 
 INPUTS: tuple[str, ...] = ()
 VERSION = 12
+EXIT_CODE = 10
 RESUMES = False
 NOTES = "notes.json"
 PUBLISHED = ("photos.json", NOTES, "images", "masks", "opaque")
@@ -35,6 +44,11 @@ class Config(StageConfig):
         description="At most so many frames are taken from a video; where the camera moves far, they are further "
         "apart.",
     )
+
+
+def expected_seconds(config: Config, workload: Workload) -> float:
+    """Every photo is decoded once, by at most eight workers."""
+    return 0.5 + workload.photos.reading_seconds(min(workload.cores, 8))
 
 
 def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> StageResult:

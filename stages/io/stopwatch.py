@@ -13,34 +13,34 @@ from pathlib import Path
 
 from stages.io.files import write_durably
 
-BEAT = 5.0  # seconds between what is kept: whatever ends the program takes no more than these with it
+BEAT = 5.0  # seconds between what is written: whatever ends the program takes no more than these with it
 
 
-def kept(file: Path) -> float:
-    """Seconds of all attempts with ``file``, as far as these were kept; 0 where it holds no number."""
+def elapsed(file: Path) -> float:
+    """Seconds of all attempts with ``file``, as far as these were written; 0 where it holds no number."""
     try:
         return max(0.0, float(json.loads(file.read_bytes())))
     except (OSError, ValueError, TypeError):
         return 0.0
 
 
-def keep(file: Path, seconds: float) -> None:
+def write_elapsed(file: Path, seconds: float) -> None:
     """Have ``file`` hold so many seconds. Raises OSError where it cannot be written."""
     write_durably(file, json.dumps(round(seconds, 3)).encode())
 
 
 @contextmanager
-def counted(file: Path) -> Iterator[Callable[[], float]]:
+def counting(file: Path) -> Iterator[Callable[[], float]]:
     """Yields a function that tells the seconds within this block, those of earlier attempts with the same ``file``
     included."""
-    earlier, started = kept(file), time.monotonic()
+    earlier, started = elapsed(file), time.monotonic()
 
     def spent() -> float:
         return earlier + time.monotonic() - started
 
     def beat() -> None:
         with suppress(OSError):  # a full disk is said by those whose files matter
-            keep(file, spent())
+            write_elapsed(file, spent())
 
     try:
         with periodically(BEAT, beat):

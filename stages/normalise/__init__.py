@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import Field
 
-from stages.contract import Inputs, Progress, StageConfig, StageError, StageResult
+from stages.contract import Inputs, Progress, StageConfig, StageError, StageResult, Workload
 from stages.io.files import read_json, write_json, write_tensors
 
 if TYPE_CHECKING:
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 INPUTS = ("ingest", "sfm")
 VERSION = 15
+EXIT_CODE = 12
 RESUMES = False
 PUBLISHED = ("transforms.json", "scene.json")
 
@@ -46,6 +47,11 @@ class Config(StageConfig):
     test_every: int = Field(
         default=8, ge=2, description="hold out every n-th photo by name, from the first (imported splits are kept)"
     )
+
+
+def expected_seconds(config: Config, workload: Workload) -> float:
+    """However many photos there are."""
+    return 0.3
 
 
 def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> StageResult:

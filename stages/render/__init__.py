@@ -10,11 +10,20 @@ from typing import TYPE_CHECKING, Any
 from pydantic import Field, field_validator
 
 from stages.amounts import duration, short_count
-from stages.contract import Inputs, Progress, StageConfig, StageError, StageResult
+from stages.contract import (
+    Flexible,
+    Inputs,
+    Progress,
+    StageConfig,
+    StageError,
+    StageResult,
+    Workload,
+)
 from stages.io.files import read_json, read_scene, write_json, write_png
 from stages.io.photos import spread
 from stages.render.path import CameraPath, PathKind, fitted_path, path_from_file, path_rays, usual_path
 from stages.render.plan import LEAST_WIDTH, even_width
+from stages.train import trained_seconds
 
 if TYPE_CHECKING:
     import numpy as np
@@ -27,9 +36,11 @@ if TYPE_CHECKING:
 
 INPUTS = ("normalise", "train")
 VERSION = 13
+EXIT_CODE = 16
 RESUMES = False
 PUBLISHED = ("video.mp4", "depth.mp4", "path.json")
 NOT_HASHED = ("seconds",)  # it decides how many frames and how large, and these enter the key
+FLEXIBLE = Flexible(share=0.15, min_seconds=4.0, max_seconds=300.0)
 
 STARTING_SECONDS = 1.0  # to load the field once more and to write what is not video
 TRIED_VIEWS = 4  # of the path, to see how fast the field draws them
@@ -77,6 +88,14 @@ class Config(StageConfig):
     def _even(cls, width: int | None) -> int | None:
         """Videos have no odd sides."""
         return width and even_width(width)
+
+
+def expected_seconds(config: Config, workload: Workload) -> float | None:
+    """About a quarter of the training's seconds (fox, fountain_p11 and the demo, after three minutes)."""
+    if config.seconds is not None:
+        return config.seconds
+    trained = trained_seconds(workload)
+    return None if trained is None else 0.27 * trained
 
 
 def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:

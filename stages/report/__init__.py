@@ -10,20 +10,22 @@ from typing import Annotated
 from pydantic import Field
 from tyro.conf import Suppress
 
-from stages.contract import Inputs, Progress, StageConfig, StageResult
+from stages.contract import READING_SECONDS, Inputs, Progress, StageConfig, StageResult, Workload
 from stages.io.files import write_json
 
 INPUTS = ("ingest", "sfm", "normalise", "effects", "train", "evaluate", "render", "mesh", "tradeoff")
 VERSION = 9
+EXIT_CODE = 18
 RESUMES = False
+SUMMARY = True
 PUBLISHED = ("report.html", "summary.json")
 
 
 class Account(StageConfig):
-    """What a budget of wall time promised and what was spent, in seconds, by stage; none of what was there already."""
+    """What a budget of wall time allocated and what was spent, in seconds, by stage; none of what was there already."""
 
     seconds: float
-    promised: dict[str, float]
+    allocated: dict[str, float]
     spent: dict[str, float]
 
 
@@ -36,6 +38,12 @@ class Config(StageConfig):
     budget: Annotated[Account | None, Suppress] = Field(
         default=None, description="What the runner knows of the time given to the run; no flag is offered for it."
     )
+
+
+def expected_seconds(config: Config, workload: Workload) -> float:
+    """The page, and at most fifteen test photos beside their renders."""
+    test_photos = workload.photos.number / workload.options["normalise"].test_every
+    return 2.0 + READING_SECONDS * workload.photos.megapixels * min(15, test_photos)
 
 
 def run(config: Config, inputs: Inputs, folder: Path, progress: Progress) -> StageResult:

@@ -11,13 +11,15 @@ from typing import Annotated
 from pydantic import Field
 from tyro.conf import Suppress
 
-from stages.contract import Inputs, Progress, StageConfig, StageResult
+from stages.contract import Inputs, Progress, StageConfig, StageResult, Workload
 from stages.effects.decisions import Space
 
 INPUTS = ("ingest", "normalise", "effects")
 OPTIONAL_INPUTS = ("train",)
 VERSION = 13
+EXIT_CODE = 19
 RESUMES = True
+ON_REQUEST = True
 PUBLISHED = ("tradeoff.svg", "tradeoff.png", "tradeoff.md", "tradeoff.json", "ablation.png")
 
 
@@ -39,6 +41,11 @@ class Config(StageConfig):
     reading: Annotated[tuple[float, float], Suppress] = Field(
         default=(0.0, 0.0), description="seconds to read the photos at one size, and those of the crops"
     )
+
+
+def expected_seconds(config: Config, workload: Workload) -> float:
+    """Just what it is given."""
+    return config.seconds
 
 
 def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:

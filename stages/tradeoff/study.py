@@ -11,7 +11,7 @@ from stages.amounts import duration, resolution_name
 from stages.contract import Inputs, Progress, StageError, StageResult
 from stages.effects.decisions import read_decisions
 from stages.io.files import read_scene, write_json
-from stages.io.stopwatch import counted
+from stages.io.stopwatch import counting
 from stages.tradeoff import plots
 from stages.tradeoff.benchmark import (
     CROP_SIZE,
@@ -153,7 +153,7 @@ def run_study(config: "Config", inputs: Inputs, folder: Path, progress: Progress
     scene, schedule, runs = _scene_with_test_photos(inputs), schedule_of(config), folder / "runs"
     for line in schedule_lines(schedule, config.seconds, runs):
         progress.note(line)
-    with counted(folder / "clock.json") as spent:
+    with counting(folder / "clock.json") as spent:
         benchmark = make_benchmark(inputs["ingest"], scene, config.downscale, config.crops, config.sizes[-1])
         results, late = list[Result](), list[Run]()
         slowness = 1.0

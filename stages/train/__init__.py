@@ -2,14 +2,48 @@
 
 from pathlib import Path
 
-from stages.contract import Inputs, Progress, StageResult
+from stages.contract import Flexible, Inputs, Progress, StageResult, Workload
 from stages.train.config import Config
 
 INPUTS = ("ingest", "normalise", "effects")
 VERSION = 24
+EXIT_CODE = 14
 RESUMES = True
 PUBLISHED = ("curve.json",)
 NOT_HASHED = ("checkpoint_seconds", "tensorboard")
+
+# Its own seconds count steps alone. Beside reading the photos, timing the first steps takes about STARTING_SECONDS,
+# validation and checkpoints 1.5 to 2 % (fox, fountain_p11 and sceaux_castle, three minutes each).
+STARTING_SECONDS, OVERHEAD = 4.0, 0.02
+
+
+def step_seconds(wall: float, reading: float) -> float:
+    """Seconds of training steps in a stage that takes ``wall`` seconds in all, at least half of these, and ``reading``
+    of them to read the photos."""
+    return max(wall / 2, (wall - STARTING_SECONDS - reading) / (1 + OVERHEAD))
+
+
+# A user waits for the field, so it gets most of what is left; figures, a video and a mesh are there to see it by. A
+# training of less than half a minute is worth none.
+FLEXIBLE = Flexible(share=0.68, min_seconds=30.0, max_share=1.0, reads_photos=True, work=step_seconds)
+
+
+def expected_seconds(config: Config, workload: Workload) -> float | None:
+    """The seconds of steps and what comes beside them; None where it counts steps, which nobody has timed yet."""
+    seconds = config.planned_seconds if config.after is None else config.more_seconds
+    return None if seconds is None else seconds + STARTING_SECONDS + workload.photos.reading_seconds(workload.cores)
+
+
+def trained_seconds(workload: Workload) -> float | None:
+    """Seconds of training steps behind the field that the later stages will meet, by which they give themselves time:
+    those of the finished training, or those to come. None where nobody can tell."""
+    if finished := workload.facts("train", None):
+        return finished["train_seconds"]
+    config: Config = workload.options["train"]
+    if config.after is None:
+        return config.planned_seconds
+    before = workload.facts("train", config.after)  # without it the stage says why it cannot go on
+    return before["train_seconds"] + config.more_seconds if before and config.more_seconds else None
 
 
 def plan(config: Config, inputs: Inputs, progress: Progress) -> Config:

@@ -149,3 +149,18 @@ class Config(StageConfig):
     def filled(self, values: dict[str, Any]) -> "Config":
         """These options with ``values`` where they are None."""
         return self.model_copy(update={name: v for name, v in values.items() if getattr(self, name) is None})
+
+    @property
+    def time_is_open(self) -> bool:
+        """Whether neither seconds nor steps are given, nor those of ``--more``."""
+        return self.seconds is None and self.steps is None and self.after is None
+
+    @property
+    def exempt_from_budget(self) -> bool:
+        """A training that goes on (``--more``) has a time of its own."""
+        return self.after is not None
+
+    @property
+    def planned_seconds(self) -> float | None:
+        """Of a training from the beginning: those asked for, or the preset's; None where it counts steps."""
+        return None if self.steps is not None else self.seconds or SECONDS[self.preset or "standard"]

@@ -1,4 +1,4 @@
-"""Files of every stage that were cut, deleted or changed by a bit: found, named, set aside, made again, equal."""
+"""Files of every stage that were cut, deleted or changed by a bit: found, named, quarantined, rebuilt, equal."""
 
 import random
 import shutil
@@ -64,7 +64,7 @@ def test_every_stage_damaged_at_once(chain: Chain, tmp_path: Path):
     assert code == 1 and said.count(" damaged ") == len(STAGES), said
     program = chain.start(workspace, "--verify").finish()
     # The report is keyed by the times of the others, too: after them it has another key and needs no repair.
-    assert program.said.count("set aside as .bad and made again") == len(STAGES) - 1
+    assert program.said.count("quarantined as .bad and rebuilt") == len(STAGES) - 1
     assert results(workspace) == chain.expected
     assert len(list(workspace.glob("*/*.bad"))) == len(STAGES) - 1
     assert status(workspace, "--verify")[0] == 0
@@ -72,12 +72,12 @@ def test_every_stage_damaged_at_once(chain: Chain, tmp_path: Path):
 
 @pytest.mark.parametrize("upstream, stage", [("ingest", "train"), ("train", "render"), ("sfm", "normalise")])
 def test_a_flipped_bit_does_not_reach_the_next_stage(chain: Chain, tmp_path: Path, upstream: str, stage: str):
-    # Without being asked to verify: what is read is checked, and what was damaged is made again beforehand.
+    # Without being asked to verify: what is read is checked, and what was damaged is rebuilt beforehand.
     workspace = chain.before(stage, tmp_path / "w.nerf")
     folder = finished_folders(workspace)[upstream]
     flip(max(files_of(folder), key=lambda file: file.stat().st_size))
     program = chain.start(workspace, "--until", stage).finish()
-    assert f"set aside as .bad and made again: {folder}" in program.said
+    assert f"quarantined as .bad and rebuilt: {folder}" in program.said
     found = results(workspace)
     assert found == {name: digest for name, digest in chain.expected.items() if name in found} and stage in found
 

@@ -78,7 +78,7 @@ def test_a_full_disk_at_every_stage(chain: Chain, small_disk: Path, stage: str, 
     program = chain.start(workspace, says=says, prepare=FullAt(stage, small_disk, int(share * size)))
     code = program.wait()
     error = error_of(program)
-    assert (error["stage"], code) == (stage, stage_list.EXIT_CODES[stage])
+    assert (error["stage"], code) == (stage, stage_list.STAGES[stage].EXIT_CODE)
     assert results(workspace) == before, "nothing finished is lost"
     (small_disk / "ballast").unlink()
     if share:
@@ -92,7 +92,7 @@ def test_a_disk_that_fills_up_somewhere(chain: Chain, small_disk: Path, leave: i
     program = chain.start(workspace, says=small_disk.parent / "says")
     code = program.wait()
     error = error_of(program)
-    assert code == stage_list.EXIT_CODES[error["stage"]] if error["stage"] else code == 3
+    assert code == stage_list.STAGES[error["stage"]].EXIT_CODE if error["stage"] else code == 3
     ballast.unlink()
     assert chain.lost(workspace, says=small_disk.parent / "says") == []
 

@@ -114,7 +114,7 @@ def test_a_target_is_an_option_of_train_whichever_way_it_is_spelt(tmp_path: Path
     )
     (tmp_path / "photos").mkdir()
     (tmp_path / "w").mkdir()
-    (tmp_path / "w/run.json").write_text(json.dumps({"version": 1, "options": {}, "plans": {}, "keys": {}}))
+    (tmp_path / "w/run.json").write_text(json.dumps({"version": 2, "options": {}, "plans": {}, "keys": {}}))
     Image.new("RGB", (40, 30)).save(tmp_path / "photos/a.jpg")
     for words in (["--target-psnr", "28"], ["--train.target-psnr", "28"], ["--target-psnr=None"], []):
         run_command(["run", str(tmp_path / "photos"), *words])
@@ -144,7 +144,7 @@ def test_match_exposure_belongs_to_render(
         "pipeline.cli.commands._run_stages",
         lambda root, settings, *_, **__: seen.append(settings.render.match_exposure),
     )
-    (tmp_path / "run.json").write_text(json.dumps({"version": 1, "options": {}, "plans": {}, "keys": {}}))
+    (tmp_path / "run.json").write_text(json.dumps({"version": 2, "options": {}, "plans": {}, "keys": {}}))
     assert run_command(["mesh", str(tmp_path), "--match-exposure", "a.jpg"]) == 2
     assert "--match-exposure belongs to `pipeline render` and `pipeline run`, not to mesh" in capsys.readouterr().err
     run_command(["render", str(tmp_path), "--match-exposure", "a.jpg"])
@@ -269,7 +269,7 @@ def test_a_budget_is_said_to_be_spent_by_a_run_and_not_by_a_stage(tmp_path: Path
 
 @pytest.mark.parametrize("command", ["status", "resume", "mesh"])
 def test_options_of_another_version_are_said_to_be(tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str):
-    run = {"version": 1, "options": {"evaluate": {"seed": 1}}, "plans": {}, "keys": {}}
+    run = {"version": 2, "options": {"evaluate": {"seed": 1}}, "plans": {}, "keys": {}}
     (tmp_path / "run.json").write_text(json.dumps(run))
     assert run_command([command, str(tmp_path)]) == 3
     text = capsys.readouterr().err
@@ -283,7 +283,7 @@ def test_photos_given_again_replace_the_options_of_another_version(tmp_path: Pat
         (tmp_path / folder).mkdir()
     for k in range(3):
         Image.effect_noise((64, 48), 30 + k).convert("RGB").save(tmp_path / f"photos/{k}.png")
-    run = {"version": 1, "options": {"evaluate": {"seed": 1}}, "plans": {}, "keys": {}}
+    run = {"version": 2, "options": {"evaluate": {"seed": 1}}, "plans": {}, "keys": {}}
     (tmp_path / "w.nerf/run.json").write_text(json.dumps(run))
     assert run_on(tmp_path / "photos", capsys, "--until", "ingest")[0] == 0
     assert run_command(["status", str(tmp_path / "w.nerf")]) == 0
@@ -386,7 +386,7 @@ def test_a_budget_and_more_are_two_budgets(
 
     monkeypatch.setattr("pipeline.cli.commands.with_more", with_after)
     (tmp_path / "w").mkdir()
-    (tmp_path / "w/run.json").write_text('{"version": 1, "options": {}, "plans": {}, "keys": {}}')
+    (tmp_path / "w/run.json").write_text('{"version": 2, "options": {}, "plans": {}, "keys": {}}')
     words = ["run", str(tmp_path), "-o", str(tmp_path / "w"), "--more", "10m", "--budget", "5m"]
     assert run_command(words) == 2
     assert "--budget and --more are two budgets; give one" in capsys.readouterr().err

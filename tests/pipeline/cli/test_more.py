@@ -142,7 +142,7 @@ def test_the_budget_that_the_workspace_was_made_with_stays(tmp_path: Path, capsy
     assert run_command([*words, "--more", "4steps"]) == 0
     assert "spent" not in capsys.readouterr().out, "none of it was: that would be what the first run took"
     after = run_of(workspace)
-    assert after["budget"]["seconds"] == before["budget"]["seconds"] == 120
+    assert after["budget"]["total"] == before["budget"]["total"] == 120
     assert after["keys"]["train"] != before["keys"]["train"]
     for stage in ("sfm", "effects"):
         assert after["plans"][stage] == before["plans"][stage]

@@ -18,7 +18,7 @@ def test_a_study_is_asked_for_by_its_time(tmp_path: Path, monkeypatch: pytest.Mo
         seen.append((settings, stages))
 
     monkeypatch.setattr("pipeline.cli.commands._run_stages", remember)
-    (tmp_path / "run.json").write_text('{"version": 1, "options": {}, "plans": {}, "keys": {}}')
+    (tmp_path / "run.json").write_text('{"version": 2, "options": {}, "plans": {}, "keys": {}}')
     run_command(["tradeoff", str(tmp_path), "--budget", "30m"])
     run_command(["tradeoff", str(tmp_path), "--tradeoff.seconds", "60"])
     assert [settings.tradeoff.seconds for settings, _ in seen] == [1800, 60]
@@ -36,7 +36,7 @@ def test_a_run_leaves_a_study_as_it_was_asked_for(tmp_path: Path, monkeypatch: p
     Image.new("RGB", (40, 30)).save(photos / "a.jpg")
     file.write_text("[tradeoff]\nseeds = 2")
     for recorded in ({"seconds": 1200}, {"seconds": 1200, "of_another_version": 1}):
-        run = {"version": 1, "options": {"tradeoff": recorded, "mesh": {"gone": 1}}, "plans": {}, "keys": {}}
+        run = {"version": 2, "options": {"tradeoff": recorded, "mesh": {"gone": 1}}, "plans": {}, "keys": {}}
         (workspace / "run.json").write_text(json.dumps(run))
         for words in ([], ["--tradeoff.seconds=1800"], ["--config", str(file)], ["-o", str(tmp_path / "new")]):
             assert not run_command(["run", str(photos), "-o", str(workspace), *words])
@@ -50,7 +50,7 @@ def test_the_name_of_a_study_is_no_option_of_it(words: list[str], tmp_path: Path
         "pipeline.cli.commands._run_stages", lambda root, settings, *_, **__: seen.append(settings.tradeoff.seconds)
     )
     monkeypatch.chdir(tmp_path)
-    run = {"version": 1, "options": {"tradeoff": {"seconds": 1200}}, "plans": {}, "keys": {}}
+    run = {"version": 2, "options": {"tradeoff": {"seconds": 1200}}, "plans": {}, "keys": {}}
     Path("photos").mkdir()
     for workspace in ("photos.nerf", "tradeoff", "tradeoff.nerf"):
         Path(workspace).mkdir()
@@ -61,7 +61,7 @@ def test_the_name_of_a_study_is_no_option_of_it(words: list[str], tmp_path: Path
 
 
 def test_the_budget_of_a_study_belongs_to_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    (tmp_path / "run.json").write_text('{"version": 1, "options": {}, "plans": {}, "keys": {}}')
+    (tmp_path / "run.json").write_text('{"version": 2, "options": {}, "plans": {}, "keys": {}}')
     assert run_command(["mesh", str(tmp_path), "--budget", "30m"]) == 2
     assert "--budget belongs to `pipeline tradeoff`, not to mesh" in capsys.readouterr().err
     assert run_command(["tradeoff", str(tmp_path), "--budget", "soon"]) == 2

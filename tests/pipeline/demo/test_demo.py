@@ -96,7 +96,7 @@ def test_the_demo_leaves_a_study_as_it_was_asked_for(tmp_path: Path, monkeypatch
 
     workspace = tmp_path / "demo.nerf"
     workspace.mkdir()
-    run = {"version": 1, "options": {"tradeoff": {"seconds": 1200}}, "plans": {}, "keys": {}}
+    run = {"version": 2, "options": {"tradeoff": {"seconds": 1200}}, "plans": {}, "keys": {}}
     (workspace / "run.json").write_text(json.dumps(run))
     monkeypatch.setattr("pipeline.cli.commands._run_stages", run_stages)
     monkeypatch.setattr("pipeline.demo.photograph", lambda photos, display: ("made", 0.0))

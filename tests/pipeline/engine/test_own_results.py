@@ -9,6 +9,7 @@ from PIL import Image
 
 from pipeline.cli.commands import run_command
 from pipeline.engine.display import SilentDisplay
+from pipeline.engine.run_file import RunFile
 from pipeline.engine.runner import Runner
 from pipeline.engine.settings import Settings
 from pipeline.engine.workspace import COPIES, Workspace, is_result, lasting
@@ -107,7 +108,7 @@ def test_clean_keeps_what_the_options_name(workspace: Path):
     for stays in (True, False):
         with Workspace(workspace) as held:
             cameras = str(workspace / "output/../render" / KEY / "path.json") if stays else None
-            held.write_run(held.read_run() | {"options": {"render": {"cameras": cameras}}})
+            held.write_run(RunFile(options={"render": {"cameras": cameras}}))
         assert run_command(["clean", str(workspace)]) == 0
         assert (workspace / "render" / KEY / "path.json").exists() == stays
         assert not (workspace / "sfm" / KEY).exists()
@@ -118,11 +119,11 @@ def test_what_the_options_name_inside_goes_with_a_moved_workspace(workspace: Pat
     inside, outside = workspace / "sfm" / KEY / "sparse", str(tmp_path / "set/transforms.json")
     options = {"ingest": {"photos": str(workspace / "mine")}, "sfm": {"cameras": str(inside)}}
     with Workspace(workspace) as held:
-        held.write_run(held.read_run() | {"options": options | {"render": {"cameras": outside}}})
+        held.write_run(RunFile(options=options | {"render": {"cameras": outside}}))
     moved = workspace.rename(tmp_path / "moved.nerf")
     (tmp_path / "link").symlink_to(moved)
     for root in (moved, tmp_path / "link"):
-        options = Workspace(root).read_run()["options"]
+        options = Workspace(root).read_run().options
         assert options["ingest"]["photos"] == str(root / "mine"), "also where no result lies"
         assert options["sfm"]["cameras"] == str(root / "sfm" / KEY / "sparse")
         assert options["render"]["cameras"] == outside

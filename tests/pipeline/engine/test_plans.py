@@ -14,7 +14,7 @@ from pipeline.engine.failures import StageFailed
 from pipeline.engine.runner import Runner
 from pipeline.engine.status import status_of
 from pipeline.engine.workspace import Workspace
-from pipeline.schedule import forecast
+from pipeline.schedule.forecast import Forecast
 from stages.io.files import read_json
 from tests.pipeline.engine import fake_stages
 from tests.pipeline.engine.fake_stages import FakeSettings, calls
@@ -65,10 +65,11 @@ def test_only_the_plans_of_the_stages_named_are_made_anew(bring: Bring, tmp_path
     bring()
     with Workspace(tmp_path / "w.nerf") as workspace:
         run = workspace.read_run()
-        workspace.write_run(run | {"plans": run["plans"] | {"train": {"asked": {"steps": 3}}}})
+        run.plans["train"] = {"asked": {"steps": 3}}
+        workspace.write_run(run)
     bring(replan=("sfm",))
     assert calls == ["plan sfm"]
-    assert Workspace(tmp_path / "w.nerf").read_run()["plans"] == run["plans"] | {"train": {"asked": {"steps": 3}}}
+    assert Workspace(tmp_path / "w.nerf").read_run().plans == run.plans
 
 
 def test_status_says_why_a_stage_is_stale_whose_plan_is_still_to_be_made(
@@ -77,7 +78,7 @@ def test_status_says_why_a_stage_is_stale_whose_plan_is_still_to_be_made(
     monkeypatch.setattr("pipeline.engine.status.STAGES", fake_stages.STAGES)
     bring()
     for number, sfm, why in (
-        (1, {"fail": True}, "what its options leave open is chosen anew"),
+        (1, {"fail": True}, "what its options leave open is chosen again"),
         (50, {}, "ingest gives"),
     ):
         given = {"ingest": {"photos": tmp_path / "photos", "number": number}, "sfm": sfm}
@@ -89,27 +90,25 @@ def test_status_says_why_a_stage_is_stale_whose_plan_is_still_to_be_made(
         assert found.state == "stale" and found.text.startswith(why)
 
 
-def test_a_run_plans_its_stages_anew_and_one_stage_alone_itself(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_replans_its_stages_and_one_stage_alone_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[tuple[str, ...]] = []
     monkeypatch.setattr(
         "pipeline.engine.runner.Runner.run", lambda *_, replan, **__: seen.append(tuple(replan)) or False
     )
     monkeypatch.chdir(tmp_path)
-    run = {"version": 1, "options": {}, "plans": {}, "keys": {}, "stages": ["ingest", "sfm"]}
+    run = {"version": 2, "options": {}, "plans": {}, "keys": {}, "stages": ["ingest", "sfm"]}
     (tmp_path / "run.json").write_text(json.dumps(run))
     for command in ("resume", "render", "tradeoff"):
         assert run_command([command, ".", "--replan"]) == run_command([command, "."]) == 0
     assert seen == [("ingest", "sfm"), (), ("render",), (), ("tradeoff",), ()]
 
 
-def test_what_is_planned_anew_is_foretold(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_planned_again_is_expected_to_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     anew: list[frozenset[str]] = []
     monkeypatch.setattr("pipeline.engine.runner.Runner.run", lambda *_, **__: False)
-    monkeypatch.setattr(forecast, "foretell", lambda *given: anew.append(given[2]) or forecast.Forecast([], {}))
+    monkeypatch.setattr(Runner, "forecast", lambda *given: anew.append(given[2]) or Forecast([], {}))
     monkeypatch.chdir(tmp_path)
-    run = {"version": 1, "options": {}, "plans": {"train": {"asked": {}}}, "keys": {}, "stages": ["ingest", "train"]}
+    run = {"version": 2, "options": {}, "plans": {"train": {"asked": {}}}, "keys": {}, "stages": ["ingest", "train"]}
     (tmp_path / "run.json").write_text(json.dumps(run))
     for words in (["resume", "."], ["resume", ".", "--replan"], ["ingest", ".", "--replan", "--force"]):
         assert run_command(words) == 0

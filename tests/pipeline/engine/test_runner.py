@@ -57,7 +57,7 @@ def bring(tmp_path: Path, photos: Path) -> Bring:
 
 def reader(root: Path) -> tuple[Workspace, Runner]:
     workspace = Workspace.existing(root)
-    options = FakeSettings.model_validate(workspace.read_run()["options"])
+    options = FakeSettings.model_validate(workspace.read_run().options)
     return workspace, Runner(workspace, options, SilentDisplay())  # type: ignore[arg-type]
 
 
@@ -205,7 +205,7 @@ def test_a_damaged_input_that_is_only_read_where_it_is_there_is_left_out_and_lef
     assert seen == [{"ingest"}] and calls == ["train"]
     assert [p.name for p in folder.parent.iterdir()] == [folder.name], "nobody would make it again"
     (note,) = notes
-    assert note.startswith(f"sfm is damaged: left out; `pipeline sfm {tmp_path / 'w.nerf'} --verify` makes it again (")
+    assert note.startswith(f"sfm is damaged: left out; `pipeline sfm {tmp_path / 'w.nerf'} --verify` rebuilds it (")
     bring(stages=("ingest", "sfm", "train"), verify=True, force={"train"})
     assert "sfm" in calls and seen[1:] == [{"ingest", "sfm"}]
 
@@ -327,7 +327,7 @@ def test_a_full_disk_under_the_books_is_the_workspaces_fault(tmp_path: Path, mon
         raise OSError(28, "No space left on device")
 
     with Workspace(tmp_path / "w.nerf") as workspace:
-        monkeypatch.setattr("pipeline.engine.workspace.write_durably", full)
+        monkeypatch.setattr("pipeline.engine.run_file.write_durably", full)
         with refused("pipeline.cannot-write", "No space left on device"):
             workspace.write_run(workspace.read_run())
     monkeypatch.setattr(Path, "write_text", full)
@@ -359,7 +359,7 @@ def test_status_and_explain_say_what_changed(bring: Bring, tmp_path: Path):
     bring(train={"steps": 3})
     with Workspace(tmp_path / "w.nerf") as workspace:
         run = workspace.read_run()
-        run["options"]["train"]["steps"] = 8
+        run.options["train"]["steps"] = 8
         workspace.write_run(run)
     workspace, runner = reader(tmp_path / "w.nerf")
     states = status.all_statuses(workspace, runner, deep=False)
@@ -396,6 +396,6 @@ def test_clean_keeps_what_is_used(bring: Bring, tmp_path: Path):
     bring(train={"steps": 3})
     bring(train={"steps": 5})
     workspace = Workspace.existing(tmp_path / "w.nerf")
-    stale = workspace.stale_folders(workspace.read_run()["keys"], list(ALL))
+    stale = workspace.stale_folders(workspace.read_run().keys, list(ALL))
     assert [p.parent.name for p in stale] == ["train"]
     assert bring(train={"steps": 5}) is False

@@ -14,6 +14,7 @@ from PIL import Image
 
 from pipeline.cli.commands import run_command
 from pipeline.engine.manifests import Manifest, describe_outputs, outputs_digest
+from pipeline.engine.run_file import RunFile
 from pipeline.engine.status import status_of
 from pipeline.engine.workspace import COPIES, Workspace
 from stages.io.files import make_durable
@@ -125,7 +126,7 @@ def test_folders_of_others_are_not_looked_into(tmp_path: Path, monkeypatch: pyte
 def test_a_workspace_that_was_copied_without_its_links_is_one(tmp_path: Path):
     names, first, again = ("images", "mesh.ply"), tmp_path / "first", tmp_path / "again"
     with Workspace(first) as workspace:
-        workspace.write_run({"options": {}, "keys": {}, "plans": {}})
+        workspace.write_run(RunFile())
         workspace.link_outputs(result(first, 1), names)
     shutil.copytree(first, again)
     assert not (again / "output/images").is_symlink()
@@ -134,14 +135,14 @@ def test_a_workspace_that_was_copied_without_its_links_is_one(tmp_path: Path):
     assert (again / "output/images").is_symlink() and (again / "output/mesh.ply").read_text() == "mesh 2"
 
 
-def test_a_stage_at_work_is_not_called_interrupted(tmp_path: Path):
-    runner: Any = SimpleNamespace(state={"keys": {}}, resolve=lambda *_, **__: SimpleNamespace(key=KEY))
+def test_a_running_stage_is_not_called_interrupted(tmp_path: Path):
+    runner: Any = SimpleNamespace(run_file=RunFile(), resolve=lambda *_, **__: SimpleNamespace(key=KEY))
     asked = Workspace(tmp_path)
     asked.partial("mesh", KEY).mkdir(parents=True)
     with Workspace(tmp_path):
-        at_work = status_of(asked, runner, "mesh")
-    assert (at_work.state, at_work.text) == ("partial", f"process {os.getpid()} is at work in this workspace")
-    assert status_of(asked, runner, "mesh").text == f"interrupted; `pipeline resume {tmp_path}` takes it up again"
+        found = status_of(asked, runner, "mesh")
+    assert (found.state, found.text) == ("partial", f"process {os.getpid()} is running in this workspace")
+    assert status_of(asked, runner, "mesh").text == f"interrupted; `pipeline resume {tmp_path}` resumes it"
 
 
 @pytest.mark.parametrize(
@@ -157,25 +158,23 @@ def test_the_command_named_is_one_that_makes_the_stage(
     tmp_path: Path, stage: str, recorded: list[str] | None, command: str
 ):
     job = SimpleNamespace(key=KEY)
-    runner: Any = SimpleNamespace(state={"keys": {}, "stages": recorded}, resolve=lambda *_, **__: job)
+    runner: Any = SimpleNamespace(run_file=RunFile(stages=recorded), resolve=lambda *_, **__: job)
     workspace = Workspace(tmp_path)
     workspace.partial(stage, KEY).mkdir(parents=True)
-    assert status_of(workspace, runner, stage).text == f"interrupted; `pipeline {command} {tmp_path}` takes it up again"
+    assert status_of(workspace, runner, stage).text == f"interrupted; `pipeline {command} {tmp_path}` resumes it"
     workspace.folder(stage, KEY).mkdir(parents=True)
     (workspace.folder(stage, KEY) / "manifest.json").write_text("{")
     damaged = status_of(workspace, runner, stage)
-    assert damaged.state == "damaged" and damaged.text.endswith(
-        f"`pipeline {command} {tmp_path} --verify` makes it again"
-    )
+    assert damaged.state == "damaged" and damaged.text.endswith(f"`pipeline {command} {tmp_path} --verify` rebuilds it")
 
 
-def test_a_killed_process_is_not_at_work(tmp_path: Path):
+def test_a_killed_process_is_not_running(tmp_path: Path):
     asked = Workspace(tmp_path)
-    assert asked.at_work() is None
+    assert asked.running() is None
     with Workspace(tmp_path):
-        assert asked.at_work() == str(os.getpid())
+        assert asked.running() == str(os.getpid())
     (tmp_path / ".lock.pid").write_text("1\n")
-    assert asked.at_work() is None
+    assert asked.running() is None
     with Workspace(tmp_path):  # the question did not take the lock
         pass
 

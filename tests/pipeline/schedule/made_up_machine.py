@@ -12,9 +12,10 @@ from pydantic import BaseModel
 
 from pipeline.engine.display import SilentDisplay
 from pipeline.engine.runner import Runner
+from pipeline.engine.stage_list import STAGES
 from pipeline.engine.workspace import RUN_FILE, Workspace
-from pipeline.schedule.budget import SHARES, Budget, reading_seconds
-from stages.contract import StageConfig, StageError, StageResult
+from pipeline.schedule.budget import Account, allocated_seconds, min_total
+from stages.contract import StageConfig, StageError, StageResult, reading_seconds
 from stages.hardware.device import processors
 from stages.io.files import write_durably, write_json
 from stages.io.photos import Photo, write_photos
@@ -28,6 +29,20 @@ INPUTS: dict[str, tuple[str, ...]] = {
 }
 INPUTS |= {"evaluate": ("train",), "render": ("train",), "mesh": ("train",), "tradeoff": ("effects",)}
 INPUTS["report"] = ("train", "evaluate", "render", "mesh", "tradeoff")
+
+FLEXIBLE = {name: module.FLEXIBLE for name, module in STAGES.items() if hasattr(module, "FLEXIBLE")}
+MIN_SECONDS = {name: flexible.min_seconds for name, flexible in FLEXIBLE.items()}
+ABOUT_TIME = ("FLEXIBLE", "budget_seconds", "limiting_seconds", "ON_REQUEST", "SUMMARY")
+
+
+def allocated(stage: str, left: float, to_come: dict[str, float | None], total: float, reading: float = 0.0) -> float:
+    """What the real stage is given."""
+    return allocated_seconds(STAGES, stage, left, to_come, total, reading)
+
+
+def least(times: dict[str, float | None], reading: float = 0.0) -> float:
+    """The smallest budget of the real stages."""
+    return min_total(STAGES, times, reading)
 
 
 class Stage(StageConfig):
@@ -44,6 +59,18 @@ class Training(Stage):
     steps: int | None = None
     preset: str | None = None
     after: str | None = None
+
+    @property
+    def time_is_open(self) -> bool:
+        return self.seconds is None and self.steps is None and self.after is None
+
+    @property
+    def exempt_from_budget(self) -> bool:
+        return self.after is not None
+
+    @property
+    def planned_seconds(self) -> float | None:
+        return None if self.steps is not None else self.seconds or 180.0
 
 
 class Fixed(StageConfig):
@@ -100,7 +127,7 @@ class Killed(BaseException):
 UNITS = {"evaluate": (1, 8, 1.5), "render": (6, 4000, 0.1), "mesh": (4, 400, 0.15)}
 """Least and most, and seconds for each at full speed."""
 MUST = {"ingest": 1.5, "sfm": 40.0, "normalise": 0.3, "effects": 3.0, "report": 1.5}
-EXPECTED: dict[str, float | None] = dict.fromkeys(SHARES) | {
+EXPECTED: dict[str, float | None] = dict.fromkeys(FLEXIBLE) | {
     "ingest": 1.0, "sfm": 50.0, "normalise": 0.3, "effects": 10.0, "report": 2.0,
 }  # fmt: skip
 
@@ -156,7 +183,8 @@ def chain(machine: Machine) -> dict[str, SimpleNamespace]:
         return work
 
     def stage(name: str) -> SimpleNamespace:
-        common = {"INPUTS": INPUTS.get(name, ()), "VERSION": 1, "RESUMES": name == "train", "PUBLISHED": ()}
+        declared = {one: getattr(STAGES[name], one) for one in ABOUT_TIME if hasattr(STAGES[name], one)}
+        common = declared | {"INPUTS": INPUTS.get(name, ()), "VERSION": 1, "RESUMES": name == "train", "PUBLISHED": ()}
         if name in ("ingest", "normalise", "report"):
             return SimpleNamespace(Config=Fixed, run=run(name), **common)
         unkeyed = () if name == "train" else ("seconds",)
@@ -182,7 +210,7 @@ class Options(BaseModel):
 class Outcome(NamedTuple):
     """Of one command: its account, whether anything ran, and the seconds until it ended."""
 
-    budget: Budget | None
+    budget: Account | None
     ran: bool
     took: float
 
@@ -197,13 +225,12 @@ def runs_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Go:
     Image.new("RGB", (4, 4)).save(photos / "0.png")
 
     def run(
-        machine: Machine, total: float | None, resume=False, stages=CHAIN, replan=(), alone=False, **options
+        machine: Machine, total: float | None, resume=False, stages=CHAIN, replan=(), alone=False, times=None, **options
     ) -> Outcome:
         clock = SimpleNamespace(monotonic=lambda: machine.now)
         monkeypatch.setattr("pipeline.engine.runner.STAGES", chain(machine))
         monkeypatch.setattr("pipeline.engine.runner.time", clock)
         monkeypatch.setattr("stages.io.stopwatch.time", clock)
-        monkeypatch.setattr("stages.sfm.colmap.load", lambda: None)
         monkeypatch.setattr("stages.io.stopwatch.periodically", machine.periodically)
         monkeypatch.setattr("stages.io.stopwatch.write_durably", machine.write_durably)
         settings = Options.model_validate({"ingest": {"photos": photos}} | options)
@@ -214,7 +241,7 @@ def runs_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Go:
                 runner.set_budget(total, 0.0)
             began = machine.now
             try:
-                ran = runner.run(stages, times=EXPECTED, replan=replan, remember=not alone)
+                ran = runner.run(stages, times=times or EXPECTED, replan=replan, remember=not alone)
             except Killed as kill:  # what the runner notes as it is left, no killed program does
                 (machine.root / RUN_FILE).write_bytes(kill.args[0])
                 raise
@@ -225,4 +252,4 @@ def runs_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Go:
 
 def spent(runner: Outcome) -> dict[str, float]:
     assert runner.budget is not None
-    return runner.budget.state["spent"]
+    return runner.budget.spent

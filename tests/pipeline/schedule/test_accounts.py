@@ -8,10 +8,23 @@ import pytest
 from PIL import Image
 
 from pipeline.engine.failures import StageFailed
-from pipeline.schedule.budget import LEAST_SECONDS, Budget, allotted, least_total, reading_seconds, training_seconds
+from pipeline.engine.stage_list import STAGES
+from stages.contract import reading_seconds
 from stages.hardware.device import processors
 from stages.io.files import read_json
-from tests.pipeline.schedule.made_up_machine import EXPECTED, MUST, Go, Killed, Machine, runs_on, spent
+from stages.train import step_seconds
+from tests.pipeline.schedule.made_up_machine import (
+    EXPECTED,
+    MIN_SECONDS,
+    MUST,
+    Go,
+    Killed,
+    Machine,
+    allocated,
+    least,
+    runs_on,
+    spent,
+)
 
 
 @pytest.fixture
@@ -100,7 +113,7 @@ def test_one_stage_does_not_end_an_interrupted_run(go: Go) -> None:
     alone = go(machine, None, resume=True, alone=True, stages=("ingest", "sfm", "normalise", "effects", "train"))
     assert alone.budget is not None and not alone.budget.over
     resumed = go(machine, None, resume=True)
-    assert 100 + alone.took + resumed.took < 300 + sum(LEAST_SECONDS.values())
+    assert 100 + alone.took + resumed.took < 300 + sum(MIN_SECONDS.values())
 
 
 @pytest.mark.parametrize("alone", [True, False])
@@ -113,9 +126,9 @@ def test_more_is_charged_to_no_budget_also_after_a_kill(go: Go, alone: bool) -> 
         go(machine, None, resume=True, alone=alone, stages=stages, train=more)
     resumed = go(machine, None, resume=True, train=more)
     assert resumed.budget is not None
-    account = resumed.budget.account()
-    assert set(account["promised"]) == set(account["spent"]) == {"evaluate", "render", "mesh"}
-    assert all(seconds > 0.3 * 300 for seconds in account["promised"].values())
+    account: dict[str, Any] = resumed.budget.shown(STAGES)
+    assert set(account["allocated"]) == set(account["spent"]) == {"evaluate", "render", "mesh"}
+    assert all(seconds > 0.3 * 300 for seconds in account["allocated"].values())
 
 
 def test_what_planning_takes_is_part_of_the_time_of_a_stage(go: Go, tmp_path: Path) -> None:
@@ -155,22 +168,15 @@ def test_training_that_reads_many_photos_ends_in_time(go: Go) -> None:
     runner = go(machine, 300.0)
     assert runner.took == pytest.approx(300, rel=0.1)
     assert runner.budget is not None
-    assert spent(runner)["train"] == pytest.approx(runner.budget.account()["promised"]["train"], abs=5)
+    assert spent(runner)["train"] == pytest.approx(runner.budget.allocated["train"], abs=5)
 
 
 def test_reading_takes_its_time_of_every_budget() -> None:
     assert reading_seconds(50 * 0.75, 2) == pytest.approx(0.75)
-    assert training_seconds(300.0, 40.0) == pytest.approx(training_seconds(300.0) - 40, rel=0.01)
+    assert step_seconds(300.0, 40.0) == pytest.approx(step_seconds(300.0, 0.0) - 40, rel=0.01)
     later: dict[str, float | None] = {"evaluate": None, "render": None, "mesh": None}
-    assert allotted("train", 10.0, later, 60.0, 40.0) == LEAST_SECONDS["train"] + 40
-    before = allotted("sfm", 90.0, {"train": None, **later}, 600.0)
-    assert allotted("sfm", 90.0, {"train": None, **later}, 600.0, 40.0) == pytest.approx(before - 40)
-    assert least_total(EXPECTED, 40.0) == pytest.approx(least_total(EXPECTED) + 40)
-    assert least_total(later, 40.0) == least_total(later), "what is trained already is not read again"
-
-
-def test_an_account_of_an_older_version_goes_on() -> None:
-    state = {"seconds": 60.0, "of": "of", "promised": {}, "spent": {"sfm": 9.0}, "running": None, "over": False}
-    budget = Budget(state)
-    budget.continue_as("of", "photos")
-    assert budget.left == 51 and not budget.is_of("of", "other photos")
+    assert allocated("train", 10.0, later, 60.0, 40.0) == MIN_SECONDS["train"] + 40
+    before = allocated("sfm", 90.0, {"train": None, **later}, 600.0)
+    assert allocated("sfm", 90.0, {"train": None, **later}, 600.0, 40.0) == pytest.approx(before - 40)
+    assert least(EXPECTED, 40.0) == pytest.approx(least(EXPECTED) + 40)
+    assert least(later, 40.0) == least(later), "what is trained already is not read again"

@@ -4,29 +4,34 @@ it is killed."""
 import os
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.schedule.budget import (
-    BESIDE_PILOTS,
-    LEAST_SECONDS,
-    MOST_SECONDS,
-    SHARES,
-    Budget,
-    allotted,
-    for_pilots,
-    least_total,
-    training_seconds,
-)
-from pipeline.schedule.forecast import without_budget
+from pipeline.engine.stage_list import STAGES
+from pipeline.schedule.budget import Account
+from stages.contract import BudgetLeft
+from stages.effects import STATISTICS_SECONDS, budget_seconds
 from stages.io.files import read_json
 from stages.io.stopwatch import BEAT
-from stages.train import Config as TrainConfig
-from tests.pipeline.schedule.made_up_machine import CHAIN, EXPECTED, Go, Killed, Machine, runs_on, spent
+from stages.train import step_seconds
+from tests.pipeline.schedule.made_up_machine import (
+    CHAIN,
+    EXPECTED,
+    FLEXIBLE,
+    MIN_SECONDS,
+    Go,
+    Killed,
+    Machine,
+    allocated,
+    least,
+    runs_on,
+    spent,
+)
 
-OPEN = dict.fromkeys(SHARES)
+OPEN = dict.fromkeys(FLEXIBLE)
 
 
 @pytest.fixture
@@ -43,7 +48,7 @@ def test_shares_use_up_what_is_left_and_no_more(left: float) -> None:
     rest, taken = dict(OPEN), []
     for stage in list(OPEN):
         del rest[stage]
-        taken.append(allotted(stage, left - sum(taken), rest, left))
+        taken.append(allocated(stage, left - sum(taken), rest, left))
     assert 0.9 * left < sum(taken) <= left * (1 + 1e-9)
     assert taken[0] == max(taken)
 
@@ -51,48 +56,48 @@ def test_shares_use_up_what_is_left_and_no_more(left: float) -> None:
 @given(
     left=st.floats(-1e3, 1e5),
     total=st.floats(1, 1e5),
-    stage=st.sampled_from(list(SHARES)),
+    stage=st.sampled_from(list(FLEXIBLE)),
     report=st.floats(0, 100),
 )
 def test_never_less_than_the_least_nor_more_than_there_is(left: float, total: float, stage: str, report: float) -> None:
-    after = list(SHARES)[list(SHARES).index(stage) + 1 :]
-    seconds = allotted(stage, left, dict.fromkeys(after) | {"report": report}, total)
-    assert LEAST_SECONDS[stage] <= seconds <= max(LEAST_SECONDS[stage], left)
-    more = allotted(stage, left + 50, dict.fromkeys(after) | {"report": report}, total)
+    after = list(FLEXIBLE)[list(FLEXIBLE).index(stage) + 1 :]
+    seconds = allocated(stage, left, dict.fromkeys(after) | {"report": report}, total)
+    assert MIN_SECONDS[stage] <= seconds <= max(MIN_SECONDS[stage], left)
+    more = allocated(stage, left + 50, dict.fromkeys(after) | {"report": report}, total)
     assert more >= seconds - 1e-9
 
 
 def test_what_later_stages_have_no_use_for_goes_to_training() -> None:
-    hours = allotted("train", 36000.0, {name: None for name in SHARES if name != "train"}, 36000.0)
-    assert hours == pytest.approx(36000 - sum(MOST_SECONDS.values()))
+    hours = allocated("train", 36000.0, {name: None for name in FLEXIBLE if name != "train"}, 36000.0)
+    assert hours == pytest.approx(36000 - sum(FLEXIBLE[name].max_seconds for name in FLEXIBLE if name != "train"))
 
 
 def test_cached_stages_cost_nothing_but_a_video_does_not_grow_to_fill_an_hour() -> None:
-    assert allotted("render", 3600.0, {"mesh": None, "report": 2.0}, 3600.0) == pytest.approx(0.35 * 3600)
+    assert allocated("render", 3600.0, {"mesh": None, "report": 2.0}, 3600.0) == pytest.approx(0.35 * 3600)
 
 
 def test_structure_from_motion_leaves_the_rest_its_least() -> None:
-    assert allotted("sfm", 600.0, OPEN, 600.0) == 300.0
-    assert allotted("sfm", 55.0, OPEN, 60.0) == pytest.approx(55 - sum(LEAST_SECONDS.values()))
-    assert allotted("sfm", 10.0, OPEN, 60.0) == 1.0
+    assert allocated("sfm", 600.0, OPEN, 600.0) == 300.0
+    assert allocated("sfm", 55.0, OPEN, 60.0) == pytest.approx(55 - sum(MIN_SECONDS.values()))
+    assert allocated("sfm", 10.0, OPEN, 60.0) == 1.0
 
 
 def test_pilots_and_statistics_never_take_more_than_their_part() -> None:
-    assert allotted("effects", 500.0, OPEN, 600.0) == 90.0 - BESIDE_PILOTS
-    assert allotted("effects", 500.0, OPEN, 600.0, 30.0) == 60.0 - BESIDE_PILOTS
-    assert allotted("effects", 80.0, OPEN, 600.0) == 20.0 - BESIDE_PILOTS
-    assert allotted("effects", -5.0, OPEN, 600.0) == 0.0
-    assert allotted("effects", 500.0, OPEN, 600.0, 100.0) == 0.0
+    assert allocated("effects", 500.0, OPEN, 600.0) == 90.0 - STATISTICS_SECONDS
+    assert allocated("effects", 500.0, OPEN, 600.0, 30.0) == 60.0 - STATISTICS_SECONDS
+    assert allocated("effects", 80.0, OPEN, 600.0) == 20.0 - STATISTICS_SECONDS
+    assert allocated("effects", -5.0, OPEN, 600.0) == 0.0
+    assert allocated("effects", 500.0, OPEN, 600.0, 100.0) == 0.0
 
 
 @pytest.mark.parametrize("wall", [5.0, 20.0, 300.0])
 def test_steps_are_given_less_than_the_stage(wall: float) -> None:
-    assert wall / 2 <= training_seconds(wall) < wall
-    assert training_seconds(wall) + 10 > 0.9 * wall
+    assert wall / 2 <= step_seconds(wall, 0.0) < wall
+    assert step_seconds(wall, 0.0) + 10 > 0.9 * wall
 
 
 def test_the_least_budget_is_what_has_to_be() -> None:
-    assert least_total({"sfm": 50.0, "train": None, "report": 2.0}) == 52 + LEAST_SECONDS["train"]
+    assert least({"sfm": 50.0, "train": None, "report": 2.0}) == 52 + MIN_SECONDS["train"]
 
 
 # --- whole runs
@@ -108,8 +113,8 @@ def test_a_run_takes_its_budget_on_slow_and_fast_machines(go: Go, total: float, 
     assert sum(spent(runner).values()) == pytest.approx(runner.took, abs=1)
     assert spent(runner)["train"] > 0.3 * total or slowness == 1.5
     assert runner.budget is not None
-    account = runner.budget.account()
-    assert set(account["promised"]) == set(account["spent"]) == set(CHAIN) - {"report"}
+    account: dict[str, Any] = runner.budget.shown(STAGES)
+    assert set(account["allocated"]) == set(account["spent"]) == set(CHAIN) - {"report"}
 
 
 @pytest.mark.parametrize("when", [20.0, 90.0, 200.0, 260.0])
@@ -121,8 +126,8 @@ def test_a_machine_that_becomes_half_as_fast_midway_is_met(go: Go, when: float) 
 
 def test_a_budget_too_small_for_the_cameras_makes_the_least_of_the_rest(go: Go) -> None:
     runner = go(Machine(), 45.0)
-    assert runner.took < 45 + sum(LEAST_SECONDS.values()) + 5
-    assert spent(runner)["train"] < LEAST_SECONDS["train"] + 5
+    assert runner.took < 45 + sum(MIN_SECONDS.values()) + 5
+    assert spent(runner)["train"] < MIN_SECONDS["train"] + 5
 
 
 def test_the_same_again_is_nothing_to_do_and_another_budget_loses_nothing(go: Go, tmp_path: Path) -> None:
@@ -140,7 +145,7 @@ def test_the_same_again_is_nothing_to_do_and_another_budget_loses_nothing(go: Go
 
 
 def test_without_a_budget_again_its_choices_are_forgotten_but_not_lost(go: Go) -> None:
-    given = {name: {"seconds": 5.0} for name in SHARES}
+    given = {name: {"seconds": 5.0} for name in FLEXIBLE}
     machine = Machine()
     go(machine, 120.0)
     plain = go(machine, None, **given)
@@ -155,12 +160,12 @@ def given_to_pilots(workspace: Path) -> list[float | None]:
 
 def test_without_a_budget_pilots_have_their_part_of_the_usual_run(go: Go, tmp_path: Path) -> None:
     others = {name: {"seconds": 5.0} for name in ("evaluate", "render", "mesh")}
-    whole = without_budget(TrainConfig(seconds=200.0), EXPECTED, 0.0, 200.0)
-    total = sum(seconds or 0.0 for seconds in whole.values())
-    assert total > 200
-    go(Machine(), None, train={"seconds": 200.0}, **others)
-    assert given_to_pilots(tmp_path / "w.nerf") == [pytest.approx(for_pilots(total, 0.0))]
-    assert 0 < for_pilots(total, 0.0) < 0.15 * total
+    times = EXPECTED | dict.fromkeys(others, 5.0) | {"train": 204.0}
+    total = sum(seconds or 0.0 for seconds in times.values())
+    limit = budget_seconds(BudgetLeft(total, total, 0.0, 0.0))
+    go(Machine(), None, train={"seconds": 200.0}, times=times, **others)
+    assert given_to_pilots(tmp_path / "w.nerf") == [pytest.approx(limit)]
+    assert 0 < limit < 0.15 * total
     ran = go(Machine(), None, train={"seconds": 200.0}, **others).ran
     assert not ran, "the plan stands"
 
@@ -265,11 +270,12 @@ def test_replan_shares_out_anew(go: Go) -> None:
 
 
 def test_an_account_survives_its_journey_through_json() -> None:
-    budget = Budget(Budget.new(60.0, "of"))
-    budget.promise("sfm", 20.0)
-    budget.promise("sfm", 99.0)
-    budget.begin("sfm")
+    budget = Account(total=60.0, run="run")
+    budget.allocate("sfm", 20.0)
+    budget.allocate("sfm", 99.0)
+    budget.running = "sfm"
     budget.end("sfm", 12.34)
     budget.end("sfm", 1.0)
-    assert (budget.spent, budget.left) == (pytest.approx(13.3), pytest.approx(46.7))
-    assert budget.account() == {"seconds": 60.0, "promised": {"sfm": 20.0}, "spent": {"sfm": 13.3}}
+    budget = Account.model_validate_json(budget.model_dump_json(), strict=True)
+    assert (budget.seconds_spent, budget.left) == (pytest.approx(13.3), pytest.approx(46.7))
+    assert budget.shown(STAGES) == {"seconds": 60.0, "allocated": {"sfm": 20.0}, "spent": {"sfm": 13.3}}

@@ -1,34 +1,43 @@
-"""What is promised at the start of a run."""
+"""What is said at the start of a run of how long it takes."""
 
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from pipeline.engine import manifests
-from pipeline.engine.manifests import Manifest
 from pipeline.engine.settings import Settings
-from pipeline.engine.stage_list import usual
+from pipeline.engine.stage_list import STAGES, usual
 from pipeline.schedule import forecast
-from pipeline.schedule.budget import BESIDE_PILOTS, Budget
-from pipeline.schedule.forecast import (
-    Photos,
-    expected,
-    photos_of,
-    pilots_seconds,
-    reckoned_with,
-    sfm_seconds,
-    without_budget,
-)
+from pipeline.schedule.forecast import Left, expected_times, forecast_run, limited_seconds, time_behind_plan
+from stages import sfm
+from stages.contract import Photos, Workload
+from stages.effects import STATISTICS_SECONDS
 from stages.effects import Config as EffectsConfig
 from stages.io.video import video_writer
 from stages.train import Config as TrainConfig
 from tests.png_files import png
+
+
+def photos_of(given: Settings) -> Photos | None:
+    return forecast.photos_of(given.ingest)
+
+
+def workload(given: Settings, photos: Photos, cores: int = 2) -> Workload:
+    options = {name: getattr(given, name) for name in STAGES}
+    return Workload(photos, cores, options, lambda stage, key: None)
+
+
+def expected(given: Settings, photos: Photos, cores: int = 2) -> dict[str, float | None]:
+    """Under a budget."""
+    return expected_times(STAGES, workload(given, photos, cores), budgeted=True)
+
+
+def sfm_seconds(photos: Photos, cores: int) -> float:
+    return sfm.expected_seconds(sfm.Config(), workload(Settings(), photos, cores))
 
 
 @pytest.fixture
@@ -51,7 +60,6 @@ def test_photos_are_counted_and_measured_without_decoding(photos: Path) -> None:
     assert photos_of(settings(photos / "gone")) is None
     (photos / "empty").mkdir()
     assert photos_of(settings(photos / "empty")) is None
-    assert expected(settings(photos / "gone"), None) == {}
 
 
 def test_of_a_video_its_length_and_size_tell(tmp_path: Path) -> None:
@@ -67,7 +75,7 @@ def test_of_a_video_its_length_and_size_tell(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("set_of", "measured"), [(Photos(50, 2.1), 37.6), (Photos(11, 1.6), 17.1), (Photos(20, 0.76), 43)]
 )
-def test_structure_from_motion_is_foretold_within_a_factor_of_two_and_a_half(set_of: Photos, measured: float) -> None:
+def test_structure_from_motion_is_expected_within_a_factor_of_two_and_a_half(set_of: Photos, measured: float) -> None:
     """fox, fountain_p11 and fern on two idle cores."""
     assert measured / 2.5 < sfm_seconds(set_of, 2) < 2.5 * measured
     assert sfm_seconds(set_of, 16) < sfm_seconds(set_of, 2)
@@ -79,25 +87,15 @@ def test_known_cameras_take_no_time() -> None:
     assert [stage for stage, seconds in times.items() if seconds is None] == ["train", "evaluate", "render", "mesh"]
 
 
-Promise = Callable[..., list[str]]
+SaidOf = Callable[..., list[str]]
 BEFORE_TRAINING = ("ingest", "sfm", "normalise", "effects")
 NOW = 1e9
-TRAINED = 180.0  # seconds of the finished training that the workspace of ``promise`` has
-
-
-def finished(stage: str) -> Manifest:
-    none: dict[str, Any] = {}
-    facts = {"train_seconds": TRAINED} if stage == "train" else none
-    digest = manifests.outputs_digest(none)
-    return Manifest(stage, 1, "0" * 64, none, {}, none, digest, none, facts, "", 190.0, "2026-01-01T00:00:00+00:00")
+TRAINED = 180.0  # seconds of the finished training that the workspace of ``said_of`` has
 
 
 @pytest.fixture
-def promise(photos: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Promise:
+def said_of(photos: Path, monkeypatch: pytest.MonkeyPatch) -> SaidOf:
     monkeypatch.setattr(forecast.time, "time", lambda: NOW)
-    monkeypatch.setattr(forecast, "processors", lambda: 2)
-    folder = tmp_path_factory.mktemp("training")
-    manifests.write(folder, finished("train"))
 
     def words(
         budget: float | None = None,
@@ -106,67 +104,74 @@ def promise(photos: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch:
         names: Sequence[str] = tuple(usual()),
         **stages: dict[str, Any],
     ) -> list[str]:
-        runner: Any = SimpleNamespace(
-            settings=settings(photos, **stages),
-            budget=budget and Budget(Budget.new(budget, "of")),
-            found=lambda stage: finished(stage) if stage in done else None,
-            time_left=lambda budget: budget.left - before,
-            workspace=SimpleNamespace(folder=lambda stage, name: folder if name == "there" else folder / name),
-        )
-        foretold = forecast.foretell(runner, names, frozenset(), Photos(50, 2.0))
-        waits = {**foretold.times, "tradeoff": runner.settings.tradeoff.seconds}
+        given = settings(photos, **stages)
+        options = {name: getattr(given, name) for name in STAGES}
+
+        def facts(stage: str, key: str | None) -> dict[str, Any] | None:
+            known = key == "there" if key else stage in done
+            return {"train_seconds": TRAINED} if known else None
+
+        to_run = [name for name in names if name not in done]
+        left = None if budget is None else Left(budget, budget - before)
+        found = forecast_run(STAGES, to_run, Workload(Photos(50, 2.0), 2, options, facts), left)
+        waits = {**found.times, "tradeoff": given.tradeoff.seconds}
         known = [waits[name] for name in names if name not in done]
-        for said in foretold.words:
+        for said in found.messages:
             if said.startswith("done in"):  # and until when, which is the sum of the stages' times
                 finish = time.localtime(NOW + sum(seconds or 0.0 for seconds in known))
                 assert None not in known and said.endswith(f", about {time.strftime('%H:%M', finish)}")
-        return [said.split(", about ")[0] if said.startswith("done in") else said for said in foretold.words]
+        return [said.split(", about ")[0] if said.startswith("done in") else said for said in found.messages]
 
     return words
 
 
-def test_a_run_without_a_budget_is_foretold_in_minutes(promise: Promise) -> None:
-    assert promise() == ["done in about 6 min"]  # fox: 5 min 42 s
-    assert promise(train={"seconds": 900.0}) == ["done in about 24 min"]
-    assert promise(train={"preset": "draft"}) == ["done in about 2 min"]
-    assert promise(train={"steps": 500}) == []
+def test_a_run_without_a_budget_is_expected_in_minutes(said_of: SaidOf) -> None:
+    assert said_of() == ["done in about 6 min"]  # fox: 5 min 42 s
+    assert said_of(train={"seconds": 900.0}) == ["done in about 24 min"]
+    assert said_of(train={"preset": "draft"}) == ["done in about 2 min"]
+    assert said_of(train={"steps": 500}) == []
+
+
+def pilots_seconds(given: Settings, times: dict[str, float | None], reading: float) -> float | None:
+    return limited_seconds(STAGES, "effects", {name: getattr(given, name) for name in STAGES}, times, reading)
 
 
 def test_pilots_have_a_limit_where_the_time_of_the_run_is_known() -> None:
-    times, reading = expected(Settings(), Photos(50, 2.0)), 2.0
-    total = sum(seconds or 0.0 for seconds in without_budget(TrainConfig(), times, reading, 180.0).values())
+    times, reading = expected_times(STAGES, workload(Settings(), Photos(50, 2.0)), budgeted=False), 2.0
+    total = sum(seconds or 0.0 for seconds in times.values())
     seconds = pilots_seconds(Settings(), times, reading)
-    assert seconds is not None and seconds + reading + BESIDE_PILOTS == pytest.approx(0.15 * total)
+    assert seconds is not None and seconds + reading + STATISTICS_SECONDS == pytest.approx(0.15 * total)
     assert pilots_seconds(Settings(), {}, reading) is None, "nothing is known of the run"
     assert pilots_seconds(Settings(train=TrainConfig(steps=500)), times, reading) is None
     assert pilots_seconds(Settings(), times, 300.0) == 0.0, "reading alone takes longer"
 
 
-def test_pilots_are_planned_anew_with_another_training_and_nothing_else_is() -> None:
+def behind_plan(stage: str, given: Settings, total: float | None) -> dict[str, float]:
+    return time_behind_plan(STAGES, stage, {name: getattr(given, name) for name in STAGES}, total)
+
+
+def test_only_pilots_are_planned_again_with_another_training() -> None:
     draft, counted = Settings(train=TrainConfig(preset="draft")), Settings(train=TrainConfig(steps=500))
-    assert reckoned_with("effects", Settings(), None) == {"training": 180.0}
-    assert reckoned_with("effects", draft, None) == {"training": 30.0}
-    assert reckoned_with("effects", counted, None) == {}
-    assert reckoned_with("render", draft, None) == {}
-    budget = Budget(Budget.new(60.0, "of"))
-    assert reckoned_with("effects", draft, budget) == {"budget": 60.0} == reckoned_with("render", draft, budget)
+    assert behind_plan("effects", Settings(), None) == {"limit": 180.0}
+    assert behind_plan("effects", draft, None) == {"limit": 30.0}
+    assert behind_plan("effects", counted, None) == {}
+    assert behind_plan("render", draft, None) == {}
+    assert behind_plan("effects", draft, 60.0) == {"budget": 60.0} == behind_plan("render", draft, 60.0)
     given = Settings(effects=EffectsConfig(seconds=7.0))
-    assert reckoned_with("effects", given, None) == {"seconds": 7.0} == reckoned_with("effects", given, budget)
+    assert behind_plan("effects", given, None) == {"seconds": 7.0} == behind_plan("effects", given, 60.0)
 
 
-def test_what_is_there_already_is_not_waited_for(promise: Promise) -> None:
-    assert promise(done=(*BEFORE_TRAINING, "train")) == ["done in about 2 min"]
-    assert promise(done=tuple(usual())) == [] == promise(600.0, done=tuple(usual()))
+def test_what_is_there_already_is_not_waited_for(said_of: SaidOf) -> None:
+    assert said_of(done=(*BEFORE_TRAINING, "train")) == ["done in about 2 min"]
+    assert said_of(done=tuple(usual())) == [] == said_of(600.0, done=tuple(usual()))
 
 
-def test_what_follows_a_finished_training_goes_by_its_seconds(
-    promise: Promise, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_follows_a_finished_training_goes_by_its_seconds(said_of: SaidOf, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever the options would train for now, steps included."""
     monkeypatch.setattr(f"{__name__}.TRAINED", 1800.0)
     done = (*BEFORE_TRAINING, "train")
     for options in ({}, {"steps": 500}, {"after": "there", "more_steps": 500}):
-        assert promise(done=done, train=options) == ["done in about 14 min"]
+        assert said_of(done=done, train=options) == ["done in about 14 min"]
 
 
 # --- going on from a finished training
@@ -185,10 +190,10 @@ def test_what_follows_a_finished_training_goes_by_its_seconds(
         (usual(), {"more_seconds": 600.0, "after": "gone"}, []),
     ],
 )
-def test_more_is_foretold_by_what_comes_on_top(
-    promise: Promise, names: Sequence[str], train: dict[str, Any], words: list[str]
+def test_more_is_expected_by_what_comes_on_top(
+    said_of: SaidOf, names: Sequence[str], train: dict[str, Any], words: list[str]
 ) -> None:
-    assert promise(done=BEFORE_TRAINING, names=names, train={"after": "there"} | train) == words
+    assert said_of(done=BEFORE_TRAINING, names=names, train={"after": "there"} | train) == words
 
 
 @pytest.mark.parametrize(
@@ -199,89 +204,85 @@ def test_more_is_foretold_by_what_comes_on_top(
         ({"steps": 500}, []),
     ],
 )
-def test_a_training_that_ends_by_itself_is_not_promised_within_the_workspaces_budget(
-    promise: Promise, train: dict[str, Any], words: list[str]
+def test_a_training_that_ends_by_itself_is_not_said_ofd_within_the_workspaces_budget(
+    said_of: SaidOf, train: dict[str, Any], words: list[str]
 ) -> None:
     names = (*BEFORE_TRAINING, "train", "report")
-    assert promise(120.0, done=BEFORE_TRAINING, names=names, train=train) == words
+    assert said_of(120.0, done=BEFORE_TRAINING, names=names, train=train) == words
 
 
-def test_what_follows_more_is_promised_by_the_budget_and_more_beside_it(promise: Promise) -> None:
+def test_what_follows_more_is_given_by_the_budget_and_more_beside_it(said_of: SaidOf) -> None:
     given: dict[str, Any] = {"train": {"after": "there", "more_seconds": 600.0}, "done": BEFORE_TRAINING}
     end = time.strftime("%H:%M", time.localtime(NOW + 606 + 300))
-    assert promise(300.0, **given) == [f"budget 5 min and 10 min beside it, done at {end} at the latest"]
+    assert said_of(300.0, **given) == [f"budget 5 min and 10 min on top, done at {end} at the latest"]
 
 
-def test_a_study_is_foretold_with_what_it_needs(promise: Promise) -> None:
+def test_a_study_is_expected_with_what_it_needs(said_of: SaidOf) -> None:
     study: dict[str, Any] = {"names": (*BEFORE_TRAINING, "tradeoff", "report"), "tradeoff": {"seconds": 1800.0}}
-    assert promise(done=(*BEFORE_TRAINING, "report"), **study) == ["done in about 30 min"]
-    assert promise(300.0, done=(*BEFORE_TRAINING, "report"), **study) == ["done in about 30 min"]
-    assert promise(done=(*BEFORE_TRAINING, "tradeoff", "report"), **study) == []
-    assert promise(done=(), **study) == ["done in about 31 min"]
-    (words,) = promise(300.0, done=BEFORE_TRAINING[:3], **study)
-    assert words.startswith("budget 5 min and 30 min beside it, done at ")
+    assert said_of(done=(*BEFORE_TRAINING, "report"), **study) == ["done in about 30 min"]
+    assert said_of(300.0, done=(*BEFORE_TRAINING, "report"), **study) == ["done in about 30 min"]
+    assert said_of(done=(*BEFORE_TRAINING, "tradeoff", "report"), **study) == []
+    assert said_of(done=(), **study) == ["done in about 31 min"]
+    (words,) = said_of(300.0, done=BEFORE_TRAINING[:3], **study)
+    assert words.startswith("budget 5 min and 30 min on top, done at ")
 
 
-def test_more_takes_what_was_asked_for_and_what_comes_beside_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(forecast, "processors", lambda: 2)
-    given = {"train": {"after": "there", "more_seconds": 600.0, "seconds": 30.0}}
+def test_more_takes_what_was_asked_for_and_what_comes_with_it() -> None:
+    given: dict[str, Any] = {"train": {"after": "there", "more_seconds": 600.0, "seconds": 30.0}}
     assert expected(Settings.model_validate(given), Photos(50, 0.75))["train"] == pytest.approx(604.75)
     given["train"] |= {"more_seconds": None, "more_steps": 9}
     assert expected(Settings.model_validate(given), Photos(50, 0.75))["train"] is None
 
 
-def test_a_budget_is_promised_with_its_end_or_said_to_be_too_short(promise: Promise) -> None:
-    (words,) = promise(600.0)
+def test_a_budget_is_given_with_its_end_or_said_to_be_too_short(said_of: SaidOf) -> None:
+    (words,) = said_of(600.0)
     assert words.startswith("budget 10 min, done at about ") and words[-3] == ":"
-    (words,) = promise(30.0)
+    (words,) = said_of(30.0)
     assert words.startswith("budget 30 s, too short for these photos: about ")
     assert words.endswith(" is the least that would do; all is made as small as can be")
 
 
-def test_what_earlier_attempts_took_is_told_apart_from_a_budget_too_small_for_the_photos(promise: Promise) -> None:
-    (words,) = promise(300.0, before=240.0)
+def test_what_earlier_attempts_took_is_told_apart_from_a_budget_too_small_for_the_photos(said_of: SaidOf) -> None:
+    (words,) = said_of(300.0, before=240.0)
     assert words.startswith("budget 5 min, 1 min of it left by what was spent before; about ")
     assert words.endswith(" is needed: give a larger --budget, or all is made as small as can be")
-    assert " 0 s of it left" in promise(300.0, before=400.0)[0]
+    assert " 0 s of it left" in said_of(300.0, before=400.0)[0]
 
 
-def test_no_end_is_promised_that_only_a_training_would_need(promise: Promise) -> None:
+def test_no_end_is_given_that_only_a_training_would_need(said_of: SaidOf) -> None:
     done = ("ingest", "sfm", "normalise", "effects", "train", "evaluate", "render")
     most = time.strftime("%H:%M", time.localtime(NOW + 0.35 * 3600))
-    assert promise(3600.0, done=done) == [f"budget 1 h, done at {most} at the latest"]
+    assert said_of(3600.0, done=done) == [f"budget 1 h, done at {most} at the latest"]
     left = time.strftime("%H:%M", time.localtime(NOW + 600))
-    assert promise(3600.0, done=done, before=3000.0) == [f"budget 1 h, done at {left} at the latest"]
-    assert promise(3600.0)[0].startswith("budget 1 h, done at about ")
+    assert said_of(3600.0, done=done, before=3000.0) == [f"budget 1 h, done at {left} at the latest"]
+    assert said_of(3600.0)[0].startswith("budget 1 h, done at about ")
 
 
 # --- reading the photos
 
 
-def test_large_photos_are_read_by_every_stage_that_looks_at_all_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_large_photos_are_read_by_every_stage_that_looks_at_all_of_them() -> None:
     small, large, given = Photos(200, 1.7), Photos(200, 24.0), Settings.model_validate({"train": {"seconds": 60.0}})
-    monkeypatch.setattr(forecast, "processors", lambda: 2)
     before, after = expected(given, small), expected(given, large)
     more = {stage: (after[stage] or 0) - (before[stage] or 0) for stage in before}
-    once = large.reading(2) - small.reading(2)
+    once = large.reading_seconds(2) - small.reading_seconds(2)
     assert once == pytest.approx(89.2)
     assert more == pytest.approx(
         dict.fromkeys(more, 0.0) | dict.fromkeys(("ingest", "sfm", "effects", "train"), once) | {"report": 13.38}
     )
-    assert expected(given, large)["ingest"] == pytest.approx(0.5 + large.reading(2))
-    monkeypatch.setattr(forecast, "processors", lambda: 64)
-    assert expected(given, large)["ingest"] == pytest.approx(0.5 + large.reading(8))
+    assert expected(given, large)["ingest"] == pytest.approx(0.5 + large.reading_seconds(2))
+    assert expected(given, large, cores=64)["ingest"] == pytest.approx(0.5 + large.reading_seconds(8))
 
 
-def test_small_sets_are_foretold_as_before(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(forecast, "processors", lambda: 2)
-    assert Photos(50, 0.75).reading(2) == pytest.approx(0.75)
+def test_small_sets_are_expected_to_take_as_long_as_measured() -> None:
+    assert Photos(50, 0.75).reading_seconds(2) == pytest.approx(0.75)
     times = expected(Settings(), Photos(50, 0.75))
     known = {stage: seconds for stage, seconds in times.items() if seconds is not None}
     before = {"ingest": 1.1, "sfm": 57.9, "normalise": 0.3, "effects": 10.0, "report": 2.0}
     assert known == pytest.approx(before, abs=1.0)
 
 
-def test_a_budget_too_short_for_reading_is_said_to_be(promise: Promise) -> None:
-    times = {"train": None, "report": 2.0}
-    assert "done at about" in forecast.in_words(60.0, 60.0, times, 1.0)
-    assert "too short for these photos: about 1 min" in forecast.in_words(60.0, 60.0, times, 40.0)
+def test_a_budget_too_short_for_reading_is_said_to_be(said_of: SaidOf) -> None:
+    times: dict[str, float | None] = {"train": None, "report": 2.0}
+    assert "done at about" in forecast.budget_message(STAGES, Left(60.0, 60.0), times, 1.0)
+    assert "too short for these photos: about 1 min" in forecast.budget_message(STAGES, Left(60.0, 60.0), times, 40.0)

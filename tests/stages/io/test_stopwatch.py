@@ -6,15 +6,15 @@ import pytest
 
 from stages.io import stopwatch
 from stages.io.files import read_json
-from stages.io.stopwatch import keep, kept
+from stages.io.stopwatch import elapsed, write_elapsed
 
 
 def test_the_seconds_of_earlier_attempts_count(tmp_path: Path) -> None:
     file = tmp_path / "clock.json"
-    with pytest.raises(KeyboardInterrupt), stopwatch.counted(file):
+    with pytest.raises(KeyboardInterrupt), stopwatch.counting(file):
         time.sleep(0.1)
         raise KeyboardInterrupt
-    with stopwatch.counted(file) as spent:
+    with stopwatch.counting(file) as spent:
         assert 0.1 <= spent() < 5
         time.sleep(0.1)
     assert 0.2 <= read_json(file) < 5
@@ -23,7 +23,7 @@ def test_the_seconds_of_earlier_attempts_count(tmp_path: Path) -> None:
 def test_what_is_counted_is_kept_now_and_then(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stopwatch, "BEAT", 0.02)
     file = tmp_path / "clock.json"
-    with stopwatch.counted(file):
+    with stopwatch.counting(file):
         deadline = time.monotonic() + 10
         while not file.exists() and time.monotonic() < deadline:
             time.sleep(0.01)
@@ -35,23 +35,23 @@ def test_what_is_counted_is_kept_now_and_then(tmp_path: Path, monkeypatch: pytes
 
 def test_what_was_kept_counts_whatever_the_times_of_the_files_say(tmp_path: Path) -> None:
     file = tmp_path / "clock.json"
-    keep(file, 100.0)
+    write_elapsed(file, 100.0)
     for day in (0.0, time.time() + 86_400):
         os.utime(file, (day, day))
-        with stopwatch.counted(file) as spent:
+        with stopwatch.counting(file) as spent:
             assert 100 <= spent() < 105
-    assert 100 <= kept(file) < 105
+    assert 100 <= elapsed(file) < 105
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b'{"spent": 1.0}', b"null", b"-3"])
 def test_nothing_was_spent_where_nobody_began_or_no_number_is_kept(tmp_path: Path, content: bytes) -> None:
-    assert kept(tmp_path / "none.partial/attempts.json") == 0
+    assert elapsed(tmp_path / "none.partial/attempts.json") == 0
     (tmp_path / "attempts.json").write_bytes(content)
-    assert kept(tmp_path / "attempts.json") == 0
+    assert elapsed(tmp_path / "attempts.json") == 0
 
 
 def test_a_place_that_cannot_be_written_stops_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stopwatch, "BEAT", 0.01)
-    with stopwatch.counted(tmp_path / "gone/clock.json") as spent:
+    with stopwatch.counting(tmp_path / "gone/clock.json") as spent:
         time.sleep(0.05)
         assert spent() > 0.04

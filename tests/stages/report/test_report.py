@@ -75,7 +75,7 @@ def test_summary_has_exactly_the_promised_keys(inputs: dict[str, Path], tmp_path
 
 
 def test_a_budget_is_shown_promised_beside_spent_and_in_all(inputs: dict[str, Path], tmp_path: Path, progress: Any):
-    account = {"seconds": 300.0, "promised": {"sfm": 50.0, "train": 170.0}, "spent": {"train": 166.0, "mesh": 12.0}}
+    account = {"seconds": 300.0, "allocated": {"sfm": 50.0, "train": 170.0}, "spent": {"train": 166.0, "mesh": 12.0}}
     html, summary = written(inputs, tmp_path / "out", progress, budget=account)
     assert summary["budget"] == account
     text = " ".join(re.sub("<[^>]+>", " ", html).split())
@@ -98,7 +98,7 @@ def test_without_a_budget_what_was_expected_stands_beside_what_was_spent(tmp_pat
     rows = {row[0]: row[2:4] for row in ([re.sub("<[^>]+>", "", c) for c in re.findall("<td.*?</td>", line)]
             for line in re.findall("<tr>.*</tr>", made)) if len(row) == 5}  # fmt: skip
     assert rows["sfm"] == ["50 s", "58 s"] and rows["train"] == ["3 min 4 s", "3 min 2 s"] and rows["mesh"][0] == "–"
-    account = {"seconds": 300.0, "promised": {}, "spent": {}}
+    account = {"seconds": 300.0, "allocated": {}, "spent": {}}
     assert '<th class="number">expected</th>' not in written(inputs, tmp_path / "budget", progress, budget=account)[0]
 
 
