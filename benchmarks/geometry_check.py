@@ -21,11 +21,11 @@ from benchmarks.record import Record, add_out
 from stages.io.photos import read_photos
 from stages.sfm.colmap.database import (
     STRICT_RATIO,
+    ExtractionOptions,
     Features,
-    Search,
     extract_features,
     fill_database,
-    look_alike,
+    image_similarity,
     match_pairs,
     read_vocabulary,
 )
@@ -86,9 +86,9 @@ def right_model(ingest: Path, sparse: Path) -> tuple[Checked, np.ndarray, float,
     with tempfile.TemporaryDirectory() as scratch:
         database = Path(scratch, "matches.db")
         fill_database(database, photos, MAPPING_MODEL)
-        extract_features(database, ingest / "images", photos, Search(1600, 4096))
+        extract_features(database, ingest / "images", photos, ExtractionOptions(1600, 4096))
         order = natural_order([photo.name for photo in photos])
-        pairs = union(pairs_apart(order, 1, 5), nearest(look_alike(database, len(photos), 0), 10))
+        pairs = union(pairs_apart(order, 1, 5), nearest(image_similarity(database, len(photos), 0), 10))
         features = Features(read_vocabulary(database, len(photos), 0, CELLS))
         match_pairs(database, pairs, 0, STRICT_RATIO, features=features)
         checked = check_model(model, database, 0)

@@ -20,11 +20,11 @@ from benchmarks.record import Record, add_out
 from stages.io.photos import read_photos
 from stages.sfm.colmap.database import (
     STRICT_RATIO,
+    ExtractionOptions,
     Features,
-    Search,
     extract_features,
     fill_database,
-    look_alike,
+    image_similarity,
     match_pairs,
     read_descriptors,
     read_vocabulary,
@@ -63,11 +63,11 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as scratch:
         database = Path(scratch, "all.db")
         fill_database(database, photos, MAPPING_MODEL)
-        extract_features(database, ingest / "images", photos, Search(1600, 4096))
+        extract_features(database, ingest / "images", photos, ExtractionOptions(1600, 4096))
         every = exhaustive(count)
         match_pairs(database, every, 0, STRICT_RATIO, features=Features(read_vocabulary(database, count, 0, CELLS)))
         truth = inlier_matrix(count, every, verified_matches(database, every))
-        vlad = look_alike(database, count, 0)
+        vlad = image_similarity(database, count, 0)
         ways = {
             "VLAD": nearest(vlad, asked.neighbours),
             f"{LARGEST} largest features": nearest(largest_features(database, count), asked.neighbours),

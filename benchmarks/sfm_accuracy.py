@@ -37,7 +37,7 @@ from stages import ingest, sfm
 from stages.io.photos import Photo, read_photos
 from stages.io.sparse_model import SparseModel
 from stages.sfm.colmap.models import read_model
-from stages.sfm.imported.pose_files import read_known_cameras
+from stages.sfm.imported.pose_files import read_poses
 
 
 class Quiet:
@@ -74,7 +74,7 @@ def agreement(model: SparseModel, transforms: Path, photos: list[Photo]) -> tupl
     """Distances of the centres in percent of the largest between two given ones, and angles in degrees, per photo."""
     frames = json.loads(transforms.read_text())["frames"]
     names = {frame["file_path"]: Path(frame["file_path"]).name for frame in frames}
-    given = {image.file: image.sfm_from_camera for image in read_known_cameras(transforms, photos, names).model.images}
+    given = {image.file: image.sfm_from_camera for image in read_poses(transforms, photos, names).model.images}
     poses = np.stack([given[image.file] for image in model.images])
     size = max(float(np.linalg.norm(poses[:, :, 3] - pose[:, 3], axis=1).max()) for pose in poses)
     distances, degrees = apart(model, poses)

@@ -33,7 +33,7 @@ from stages.hardware.device import processors
 from stages.io.photos import Photo, read_photos
 from stages.sfm.colmap.database import (
     STRICT_RATIO,
-    Search,
+    ExtractionOptions,
     extract_features,
     fill_database,
     match_pairs,
@@ -42,7 +42,7 @@ from stages.sfm.colmap.database import (
 from stages.sfm.colmap.mapping import MAPPING_MODEL
 from stages.sfm.pairs.feature_matching import match_descriptors
 from stages.sfm.pairs.pair_selection import exhaustive
-from stages.sfm.pairs.quality_level import TIERS
+from stages.sfm.pairs.quality_level import QUALITY_LEVELS
 
 SCALES, SIGMA = 3, 1.6  # of an octave; of the first picture
 
@@ -75,7 +75,7 @@ def operations(first: np.ndarray, second: np.ndarray) -> float:
     return 2.0 * 129 * len(first) * (len(second) + len(np.unique(nearest[distinct])))
 
 
-def blurred(path: Path, photo: Photo, search: Search) -> None:
+def blurred(path: Path, photo: Photo, search: ExtractionOptions) -> None:
     """All pictures in which features would be looked for."""
     size = max(photo.width, photo.height)
     scale = 2.0 if size <= search.doubled_up_to else min(1.0, search.max_image_size / size)
@@ -90,7 +90,7 @@ def blurred(path: Path, photo: Photo, search: Search) -> None:
 
 def compare(photos: list[Photo], folder: Path, database: Path, record: Record) -> None:
     """Record the rows of the table."""
-    cores, search = processors(), Search(*TIERS[0])
+    cores, search = processors(), ExtractionOptions(*QUALITY_LEVELS[0])
     fill_database(database, photos, MAPPING_MODEL)
     finding = seconds(lambda: extract_features(database, folder / "images", photos, search), 1)
     with pycolmap.Database.open(database) as db:

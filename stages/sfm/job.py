@@ -14,7 +14,7 @@ from typing import Any
 
 from stages.io.files import write_durably
 from stages.io.photos import Photo
-from stages.sfm.colmap.database import Features, hold_open, look_alike, read_vocabulary
+from stages.sfm.colmap.database import Features, image_similarity, keep_open, read_vocabulary
 from stages.sfm.pairs import Matcher
 from stages.sfm.pairs.image_retrieval import CELLS
 from stages.sfm.pairs.pair_selection import MAX_EXHAUSTIVE, SimilarityMatrix
@@ -60,7 +60,7 @@ class JobState:
         self.files = [photo.image_name for photo in self.photos]
         self.database, self.images = Path(job.database), Path(job.images)
         self.log = StrategyLog(Path(job.folder, "strategies"))
-        self.held = hold_open(self.database)  # the parent reads in it how far we are
+        self.held = keep_open(self.database)  # the parent reads in it how far we are
         self.timer, self.started = PhaseTimer(self.log.folder / PHASE_SECONDS), time.monotonic()
         self.strategy = STRATEGIES[0].name
         self.seconds: dict[str, float] = {}  # of this strategy's phases
@@ -71,7 +71,7 @@ class JobState:
     def begin(self, phase: str, **more: Any) -> None:
         """Say that a phase begins. Of an interrupted run features and matches are kept, while mapping starts again."""
         if database := more.get("database"):
-            self.held = hold_open(Path(database))
+            self.held = keep_open(Path(database))
         self.timer.begin(f"{self.strategy}: {phase}", from_zero=phase == "mapping")
         self.send(phase=phase, **more)
 
@@ -99,7 +99,7 @@ class JobState:
     @cached_property
     def similarity(self) -> SimilarityMatrix:
         """How similar any two photos are."""
-        return look_alike(self.database, len(self.photos), self.job.seed)
+        return image_similarity(self.database, len(self.photos), self.job.seed)
 
     def missing(self) -> list[int]:
         """The photos that are not registered in the best model so far."""

@@ -12,7 +12,7 @@ from stages.ingest.masks import write_feature_masks
 from stages.sfm.colmap.database import (
     RELAXED_RATIO,
     STRICT_RATIO,
-    Search,
+    ExtractionOptions,
     copy_as_fisheye,
     copy_without_matches_of,
     copy_without_pairs,
@@ -37,9 +37,9 @@ from stages.sfm.pairs.match_graph import (
 )
 from stages.sfm.pairs.pair_selection import (
     Pairs,
+    capture_priors,
     exhaustive,
     expected_pairs,
-    places_of,
     second_look,
     start_pairs,
     union,
@@ -54,7 +54,7 @@ def match_photos(strategy: Strategy, missing: list[int], state: JobState) -> tup
         best = state.usable()
         return state.latest(), best.match_graph if best else None
     if strategy.matches == "strict":
-        _extract(database, Search(job.max_image_size, job.max_features), state)
+        _extract(database, ExtractionOptions(job.max_image_size, job.max_features), state)
         graph = _match_all(database, state)
     elif strategy.matches == "relaxed":
         database = state.sibling("relaxed")
@@ -70,13 +70,13 @@ def match_photos(strategy: Strategy, missing: list[int], state: JobState) -> tup
         copy_as_fisheye(latest, database, job.seed)
     else:
         database = state.sibling("more-features")
-        twice = Search(2 * job.max_image_size, 2 * job.max_features, doubled_up_to=job.max_image_size)
+        twice = ExtractionOptions(2 * job.max_image_size, 2 * job.max_features, doubled_up_to=job.max_image_size)
         _extract(database, twice, state)
         graph = _match_all(database, state)
     return database, graph
 
 
-def _extract(database: Path, search: Search, state: JobState) -> None:
+def _extract(database: Path, search: ExtractionOptions, state: JobState) -> None:
     state.begin("features", database=str(database))
     fill_database(database, state.photos, state.job.camera_model or MAPPING_MODEL, state.job.camera_params)
     masks = Path(state.job.folder, "masks")
@@ -92,7 +92,7 @@ def _match_all(database: Path, state: JobState) -> dict[str, Any] | None:
 
     Returns how many pairs were tried and verified, and whether the order of names or times helped to choose them.
     """
-    job, count, places = state.job, len(state.photos), places_of(state.photos)
+    job, count, places = state.job, len(state.photos), capture_priors(state.photos)
     if job.matcher == "exhaustive":
         _match(database, exhaustive(count), STRICT_RATIO, state)
         return None

@@ -14,11 +14,11 @@ from stages.contract import Progress, StageError, listed
 from stages.hardware.memory import check_memory
 from stages.io.photos import Photo, read_photos
 from stages.sfm.colmap.cameras import is_valid
-from stages.sfm.colmap.database import Search, feature_bytes
+from stages.sfm.colmap.database import ExtractionOptions, feature_bytes
 from stages.sfm.colmap.models import read_model
 from stages.sfm.imported.conventions import PoseConvention
-from stages.sfm.imported.import_poses import import_cameras
-from stages.sfm.pairs.pair_selection import places_of
+from stages.sfm.imported.import_poses import import_poses
+from stages.sfm.pairs.pair_selection import capture_priors
 from stages.sfm.pairs.quality_level import Open, check_matcher, chosen
 from stages.sfm.registration import (
     MIN_MODEL_POINTS,
@@ -68,7 +68,7 @@ def find_cameras(config: "Config", ingest: Path, folder: Path, progress: Progres
     photos, matched = _photos(ingest)
     if config.cameras is not None:
         convention = PoseConvention(config.pose_direction, config.camera_axes)
-        imported = import_cameras(config.cameras, convention, photos, ingest, folder, progress)
+        imported = import_poses(config.cameras, convention, photos, ingest, folder, progress)
         return _registration("import", **imported), ""
     return _reconstruct(config, photos, matched, ingest, folder, progress)
 
@@ -90,7 +90,7 @@ def _reconstruct(
 ) -> tuple[dict[str, Any], str]:
     _check_count(photos, len(everything))
     _check_camera(config, photos)
-    check_matcher(config.matcher, places_of(photos))
+    check_matcher(config.matcher, capture_priors(photos))
     _check_memory(config, photos)
     names = [photo.image_name for photo in photos]
     database = _database(folder, names, progress)
@@ -137,7 +137,7 @@ def _check_count(photos: Sequence[Photo], ingested: int) -> None:
 def _check_memory(config: "Config", photos: Sequence[Photo]) -> None:
     """Raises StageError where memory does not suffice for the features of even one photo at a time."""
     assert config.max_image_size and config.max_features, "choose_options() sets them"
-    needed = feature_bytes(photos, Search(config.max_image_size, config.max_features))
+    needed = feature_bytes(photos, ExtractionOptions(config.max_image_size, config.max_features))
     why = f"feature extraction from one photo at {config.max_image_size} pixels takes"
     check_memory(needed, "features of the photos", why, f"Try --sfm.max-image-size {config.max_image_size // 2}.")
 

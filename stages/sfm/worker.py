@@ -16,7 +16,7 @@ from typing import Any
 from stages.amounts import rough_duration
 from stages.io.files import make_durable
 from stages.sfm.colmap.diagnosis import find_conflict, links, supports
-from stages.sfm.colmap.final_bundle_adjustment import finish
+from stages.sfm.colmap.final_bundle_adjustment import final_bundle_adjustment
 from stages.sfm.colmap.models import load_native, write_native
 from stages.sfm.colmap.repair import check_model, deregister, facts, reasons
 from stages.sfm.job import Job, JobState, Send, end_with_parent
@@ -74,7 +74,7 @@ def reconstruct(job: Job, send: Send) -> dict[str, Any]:
     # From disk also where it is at hand: then a resumed run is no other.
     mapped = load_native(state.log.model(best.name))
     known = job.camera_params is not None
-    finished = finish(mapped, database, job.seed, job.camera_model, known, state.thinned)
+    finished = final_bundle_adjustment(mapped, database, job.seed, job.camera_model, known, state.thinned)
     for note in finished.notes:
         send(note=note)
     model = finished.model

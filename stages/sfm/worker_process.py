@@ -41,7 +41,7 @@ def run_worker(
         "images": str(images.absolute()),
         "database": str(database.absolute()),
         "photos": [asdict(photo) for photo in photos],
-        **config.model_dump(exclude={"cameras"}),
+        **config.model_dump(exclude={"cameras", "camera_axes", "pose_direction"}),  # of imported poses, read before
     }
     latest: dict[str, Any] = {"phase": "features", "database": job["database"], "done": 0, "pairs": 0}
     latest["strategy"] = STRATEGIES[0].name

@@ -61,9 +61,9 @@ def _import_cameras(cameras: Path, photos: list, folder: Path) -> None:
     from stages.normalise import _reconstruction
     from stages.sfm.colmap.models import read_model
     from stages.sfm.imported.conventions import AS_DECLARED
-    from stages.sfm.imported.import_poses import write_known_model
+    from stages.sfm.imported.import_poses import write_imported_model
 
-    write_known_model(cameras, AS_DECLARED, photos, folder, folder / "sfm", Quiet())
+    write_imported_model(cameras, AS_DECLARED, photos, folder, folder / "sfm", Quiet())
     model = read_model(folder / "sfm" / "sparse")
     try:
         found = normalise(_reconstruction(model, list(range(len(model.images))), None), None)

@@ -14,50 +14,52 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float, Int
 
-from stages.sfm.colmap.camera_models import MODELS, Lens, equip, flaws
+from stages.sfm.colmap.camera_models import MODELS, CameraModelCandidate, degenerate_cameras, set_camera_models
 from stages.sfm.colmap.observations import Observations, noise_px, observations, residuals
 
 # Points for the comparison are drawn until they have so many observations: 14 candidates then take seconds.
-MOST_OBSERVATIONS = 20_000
-MOST_PER_PHOTO = 100  # where there are hundreds of photos it takes more: a pose alone has 6 unknowns
-FEWEST_HELD_OUT = 50  # the spread of so many is known to a tenth, 1/√(2 · 50); fewer are no evidence
+MAX_OBSERVATIONS = 20_000
+MAX_OBSERVATIONS_PER_IMAGE = 100  # where there are hundreds of photos it takes more: a pose alone has 6 unknowns
+MIN_HELD_OUT = 50  # the spread of so many is known to a tenth, 1/√(2 · 50); fewer are no evidence
 CAP_PX = 4.0  # what is farther off is a mismatch, as for COLMAP's own filter, and counts as this
 CELLS = 4  # neighbours in a photo err alike, so the noise is that of the means of 4 × 4 parts of each photo
-MOST_ITERATIONS = 50
-FEW_ABSURD = 0.2  # of the photos may have absurd cameras: these are put right in the end, and decide for no others
+MAX_ITERATIONS = 50
+MAX_DEGENERATE_FRACTION = (
+    0.2  # of the photos may have degenerate cameras: these are put right in the end, and decide for no others
+)
 NOISE_MULTIPLES = 3.0  # with a dozen rivals two standard errors are often exceeded by chance, three hardly ever
 
 
-class Trial(NamedTuple):
+class CandidateResult(NamedTuple):
     """How a candidate did."""
 
-    lens: Lens
+    lens: CameraModelCandidate
     error_px: Float[np.ndarray, "n"]  # of each held-out observation
     noise_px: float  # of the observations it was adjusted to
-    flaw: str | None  # of one of its cameras, where more than a few photos have such
+    why_degenerate: str | None  # of one of its cameras, where more than a few photos have such
 
 
-class Verdict(NamedTuple):
+class Selection(NamedTuple):
     """What came of the comparison for some cameras: the trial whose lens they take, None if there is none."""
 
     cameras: list[int]
     photos: int
-    chosen: Trial | None
+    chosen: CandidateResult | None
     rows: list[dict[str, Any]]
     why: str
 
 
 @dataclass
-class Choice:
+class CameraModels:
     """The lens of every camera that has photos, by its id, and why: a table's rows and sentences."""
 
     noise_px: float
-    lenses: dict[int, Lens] = field(default_factory=dict)
+    lenses: dict[int, CameraModelCandidate] = field(default_factory=dict)
     table: list[dict[str, Any]] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
 
-def choose(mapped: pycolmap.Reconstruction, seed: int, models: Sequence[str] = MODELS) -> Choice:
+def choose(mapped: pycolmap.Reconstruction, seed: int, models: Sequence[str] = MODELS) -> CameraModels:
     """The lens of every camera, of these models.
 
     A camera is judged by its own photos alone where they share enough points, and the others all together, each
@@ -73,9 +75,9 @@ def choose(mapped: pycolmap.Reconstruction, seed: int, models: Sequence[str] = M
         rest = [verdict for verdict in verdicts if not verdict.chosen]
         verdicts = [_verdict(mapped, alike, seed, models, noise), *rest]
     largest = max((v for v in verdicts if v.chosen), key=lambda v: v.photos, default=None)
-    choice = Choice(largest.chosen.noise_px if largest and largest.chosen else noise)
+    choice = CameraModels(largest.chosen.noise_px if largest and largest.chosen else noise)
     for index, (group, photos, chosen, rows, why) in enumerate(verdicts):
-        lens = chosen.lens if chosen else Lens(mapped.camera(group[0]).model_name, False)
+        lens = chosen.lens if chosen else CameraModelCandidate(mapped.camera(group[0]).model_name, False)
         choice.lenses |= dict.fromkeys(group, lens)
         choice.table += [row | {"group": index, "photos": photos} for row in rows]
         whose = f"{photos} photo{'s' * (photos != 1)}: " if len(verdicts) > 1 else ""
@@ -86,21 +88,21 @@ def choose(mapped: pycolmap.Reconstruction, seed: int, models: Sequence[str] = M
 
 def _verdict(
     mapped: pycolmap.Reconstruction, cameras: list[int], seed: int, models: Sequence[str], noise: float
-) -> Verdict:
+) -> Selection:
     """Let every candidate foretell what these cameras saw."""
     sample = _part(mapped, cameras)
     photos = sample.num_reg_images()
-    most = max(MOST_OBSERVATIONS * photos // mapped.num_reg_images(), MOST_PER_PHOTO * photos)
+    most = max(MAX_OBSERVATIONS * photos // mapped.num_reg_images(), MAX_OBSERVATIONS_PER_IMAGE * photos)
     held_out = hold_out(sample, seed, most)
-    if len(held_out.xy) < FEWEST_HELD_OUT:
+    if len(held_out.xy) < MIN_HELD_OUT:
         why = f"only {len(held_out.xy)} points are seen in three photos, too few to compare camera models"
         if photos < 3:  # however many points there are
             why = "camera models are compared by points that three photos of a camera see"
-        return Verdict(cameras, photos, None, [], why)
+        return Selection(cameras, photos, None, [], why)
     trials = list(_trials(sample, held_out, models, noise))
     cells = _cells(held_out, mapped)
     chosen, rows = _judge(trials, cells)
-    return Verdict(cameras, photos, chosen, rows, _reason(chosen, trials, cells))
+    return Selection(cameras, photos, chosen, rows, _reason(chosen, trials, cells))
 
 
 def _groups(mapped: pycolmap.Reconstruction, cameras: list[int]) -> list[list[int]]:
@@ -112,7 +114,7 @@ def _groups(mapped: pycolmap.Reconstruction, cameras: list[int]) -> list[list[in
     for point_id in mapped.point3D_ids():
         views = Counter(camera_of[element.image_id] for element in mapped.point3D(point_id).track.elements)
         shared.update(camera for camera, count in views.items() if count >= 3)
-    alone = [camera for camera in cameras if shared[camera] >= FEWEST_HELD_OUT]
+    alone = [camera for camera in cameras if shared[camera] >= MIN_HELD_OUT]
     others = [camera for camera in cameras if camera not in alone]
     return [[camera] for camera in alone] + ([others] if others else [])
 
@@ -164,21 +166,21 @@ def _cells(seen: Observations, model: pycolmap.Reconstruction) -> Int[np.ndarray
 
 def _trials(
     sample: pycolmap.Reconstruction, held_out: Observations, models: Sequence[str], noise: float
-) -> Iterator[Trial]:
+) -> Iterator[CandidateResult]:
     """Every candidate adjusted to the sample; with a refined principal point it goes on from where it was centred."""
     trained = observations(sample)
     cameras = sorted({sample.image(i).camera_id for i in sample.reg_image_ids()})
     _adjust(sample, False, noise)  # most of the way is the same for all candidates
     for name in models:
         model = pycolmap.Reconstruction(sample)
-        equip(model, dict.fromkeys(cameras, name))
+        set_camera_models(model, dict.fromkeys(cameras, name))
         for principal_point in (False, True):
             _adjust(model, principal_point, noise)
             length = np.linalg.norm(residuals(model, held_out), axis=1)
             error = np.where(length < CAP_PX, length, CAP_PX)  # a point behind the camera (NaN) counts as far off
-            absurd = list(flaws(model).values())
-            why = absurd[0] if len(absurd) > FEW_ABSURD * model.num_reg_images() else None
-            yield Trial(Lens(name, principal_point), error, noise_px(model, trained), why)
+            degenerate = list(degenerate_cameras(model).values())
+            why = degenerate[0] if len(degenerate) > MAX_DEGENERATE_FRACTION * model.num_reg_images() else None
+            yield CandidateResult(CameraModelCandidate(name, principal_point), error, noise_px(model, trained), why)
 
 
 def _adjust(model: pycolmap.Reconstruction, principal_point: bool, noise: float) -> None:
@@ -187,7 +189,7 @@ def _adjust(model: pycolmap.Reconstruction, principal_point: bool, noise: float)
         config.add_image(image_id)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     options = adjustment_options(principal_point, noise)
-    options.ceres.solver_options.max_num_iterations = MOST_ITERATIONS
+    options.ceres.solver_options.max_num_iterations = MAX_ITERATIONS
     pycolmap.create_default_bundle_adjuster(options, config, model).solve()
 
 
@@ -206,10 +208,12 @@ def adjustment_options(principal_point: bool, noise: float) -> pycolmap.BundleAd
     return options
 
 
-def _judge(trials: list[Trial], cells: Int[np.ndarray, "n"]) -> tuple[Trial | None, list[dict[str, Any]]]:
-    """The trial whose lens to take, None if all are absurd, and the table."""
+def _judge(
+    trials: list[CandidateResult], cells: Int[np.ndarray, "n"]
+) -> tuple[CandidateResult | None, list[dict[str, Any]]]:
+    """The trial whose lens to take, None if all are degenerate, and the table."""
     chosen, excess = None, {}
-    if sound := [trial for trial in trials if not trial.flaw]:
+    if sound := [trial for trial in trials if not trial.why_degenerate]:
         best = min(sound, key=lambda trial: trial.error_px.mean())
         excess = {trial.lens: paired(trial.error_px - best.error_px, cells) for trial in sound}
         able = [trial for trial in sound if excess[trial.lens][0] <= NOISE_MULTIPLES * excess[trial.lens][1]]
@@ -222,11 +226,11 @@ def _judge(trials: list[Trial], cells: Int[np.ndarray, "n"]) -> tuple[Trial | No
                 "model": trial.lens.model,
                 "principal_point": trial.lens.place,
                 "free_parameters": trial.lens.free_parameters,
-                "held_out_px": None if trial.flaw else float(trial.error_px.mean()),
+                "held_out_px": None if trial.why_degenerate else float(trial.error_px.mean()),
                 "worse_px": worse,
                 "noise_px": noise,
                 "chosen": trial is chosen,
-                "reason": trial.flaw,
+                "reason": trial.why_degenerate,
             }
         )
     return chosen, rows
@@ -240,11 +244,11 @@ def paired(difference: Float[np.ndarray, "n"], cells: Int[np.ndarray, "n"]) -> t
     return mean, float(np.sqrt((sums**2).sum() * len(sums) / max(len(sums) - 1, 1)) / len(difference))
 
 
-def _reason(chosen: Trial | None, trials: list[Trial], cells: Int[np.ndarray, "n"]) -> str:
+def _reason(chosen: CandidateResult | None, trials: list[CandidateResult], cells: Int[np.ndarray, "n"]) -> str:
     if chosen is None:
-        return "every candidate comes out absurd, so it stays as mapping had it"
+        return "every candidate is degenerate, so it stays as mapping had it"
     error = f"held-out error {chosen.error_px.mean():.2f} px"
-    simpler = [trial for trial in trials if not trial.flaw and trial.lens.complexity < chosen.lens.complexity]
+    simpler = [trial for trial in trials if not trial.why_degenerate and trial.lens.complexity < chosen.lens.complexity]
     if not simpler:
         return f"{error}, and no richer one is better by more than the noise"
     rival = min(simpler, key=lambda trial: trial.error_px.mean())

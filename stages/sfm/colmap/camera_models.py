@@ -1,4 +1,4 @@
-"""Camera models: the candidates, how a mapped camera becomes one of them, and when one is absurd."""
+"""Camera models: the candidates, how a mapped camera becomes one of them, and when one is degenerate."""
 
 from typing import NamedTuple
 
@@ -21,10 +21,10 @@ MODELS = (
     "OPENCV_FISHEYE",
 )
 FIT_POINTS = 300
-FARTHEST_PRINCIPAL_POINT = 0.1  # of the image, from its centre: lenses are centred to a percent or two
+MAX_PRINCIPAL_POINT_OFFSET = 0.1  # of the image, from its centre: lenses are centred to a percent or two
 
 
-class Lens(NamedTuple):
+class CameraModelCandidate(NamedTuple):
     """A candidate: a camera model, and whether the principal point is refined or stays in the centre."""
 
     model: str
@@ -48,10 +48,10 @@ class Lens(NamedTuple):
     @property
     def place(self) -> str:
         """What becomes of the principal point, in a word."""
-        return "refined" if self.principal_point else "centred"
+        return "refined" if self.principal_point else "fixed"
 
 
-def equip(model: pycolmap.Reconstruction, lenses: dict[int, str]) -> None:
+def set_camera_models(model: pycolmap.Reconstruction, lenses: dict[int, str]) -> None:
     """Give cameras (by id) the models named and centred principal points, to draw their points where they were drawn.
 
     Cameras without points stay as they are.
@@ -91,8 +91,8 @@ def _fitted(camera: pycolmap.Camera, name: str, points: Float[np.ndarray, "n 3"]
     return new
 
 
-def flaw(camera: pycolmap.Camera) -> str | None:
-    """What makes an adjusted camera absurd, or None."""
+def why_degenerate(camera: pycolmap.Camera) -> str | None:
+    """What makes an adjusted camera degenerate, or None."""
     size = np.array([camera.width, camera.height])
     params = np.array(camera.params)
     if not np.isfinite(params).all():
@@ -101,14 +101,14 @@ def flaw(camera: pycolmap.Camera) -> str | None:
     if focal.min() < FOCAL_RANGE[0] or focal.max() > FOCAL_RANGE[1]:
         return f"its focal length is {focal.min():.2g} to {focal.max():.2g} times the longer side"
     off = float(np.abs(params[list(camera.principal_point_idxs())] / size - 0.5).max())
-    if off > FARTHEST_PRINCIPAL_POINT:
+    if off > MAX_PRINCIPAL_POINT_OFFSET:
         return f"its principal point is {off:.0%} of the image off the centre"
     lost = share_without_ray(camera)
     return f"{why_no_ray(camera.model_name)} at {lost:.1%} of the pixels" if lost else None
 
 
-def flaws(model: pycolmap.Reconstruction) -> dict[int, str]:
-    """The registered photos whose camera is absurd, by image id, and what makes it so."""
+def degenerate_cameras(model: pycolmap.Reconstruction) -> dict[int, str]:
+    """The registered photos whose camera is degenerate, by image id, and what makes it so."""
     camera_of = {i: model.image(i).camera_id for i in sorted(model.reg_image_ids())}
-    found = {camera_id: flaw(model.camera(camera_id)) for camera_id in set(camera_of.values())}
+    found = {camera_id: why_degenerate(model.camera(camera_id)) for camera_id in set(camera_of.values())}
     return {i: why for i, camera_id in camera_of.items() if (why := found[camera_id])}

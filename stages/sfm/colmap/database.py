@@ -35,7 +35,7 @@ OPENINGS, PAUSE_SECONDS = 50, 0.1  # a reader holds the lock for milliseconds
 CACHED_PHOTOS = 256  # whose features are held in memory, about half a megabyte each
 
 
-def hold_open(database: Path) -> pycolmap.Database:
+def keep_open(database: Path) -> pycolmap.Database:
     """A connection to keep for as long as another process reads along.
 
     Whoever opens the database first or closes it last has to be alone in it, and COLMAP does not wait for that: it
@@ -100,7 +100,7 @@ def _enter_camera(db: pycolmap.Database, camera: pycolmap.Camera) -> None:
     db.write_rig(rig, use_rig_id=True)
 
 
-class Search(NamedTuple):
+class ExtractionOptions(NamedTuple):
     """How far features are searched: the longer side in pixels that photos are reduced to, the most features of each,
     the folder of masks, and up to which longer side photos are doubled first: smaller ones yield too few features."""
 
@@ -110,7 +110,7 @@ class Search(NamedTuple):
     doubled_up_to: int = 1024
 
 
-def feature_bytes(photos: Sequence[Photo], search: Search) -> float:
+def feature_bytes(photos: Sequence[Photo], search: ExtractionOptions) -> float:
     """Memory that searching the largest of the photos takes, by its pixels as they are searched."""
 
     def searched(photo: Photo) -> float:
@@ -121,7 +121,7 @@ def feature_bytes(photos: Sequence[Photo], search: Search) -> float:
     return BYTES_PER_SEARCHED_PIXEL * max(map(searched, photos))
 
 
-def extract_features(database: Path, images: Path, photos: Sequence[Photo], search: Search) -> None:
+def extract_features(database: Path, images: Path, photos: Sequence[Photo], search: ExtractionOptions) -> None:
     """SIFT keypoints and descriptors of every photo that has none yet, where ``masks/<image name>.png`` is not black,
     or anywhere where that is not there.
 
@@ -229,7 +229,7 @@ def read_vocabulary(database: Path, count: int, seed: int, words: int) -> Words:
         return vocabulary(partial(read_descriptors, db), count, seed, words)
 
 
-def look_alike(database: Path, count: int, seed: int) -> SimilarityMatrix:
+def image_similarity(database: Path, count: int, seed: int) -> SimilarityMatrix:
     """How much any two photos look alike, by their features."""
     words = read_vocabulary(database, count, seed, WORDS)
     with pycolmap.Database.open(database) as db:

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from stages.sfm.colmap.camera_model_selection import Choice, adjustment_options, choose
-from stages.sfm.colmap.camera_models import MODELS, equip, flaws
+from stages.sfm.colmap.camera_model_selection import CameraModels, adjustment_options, choose
+from stages.sfm.colmap.camera_models import MODELS, degenerate_cameras, set_camera_models
 from stages.sfm.colmap.mapping import pipeline_options
 from stages.sfm.colmap.observations import noise_px, observations
 from stages.sfm.colmap.uncertainty import pose_uncertainty_px
@@ -21,7 +21,7 @@ CLOSING_STEPS = (3, 3)  # of the adjustment of all observations, before and afte
 
 
 @dataclass(frozen=True)
-class Finished:
+class AdjustedModel:
     """The model after the final adjustment and what there is to say about it."""
 
     model: pycolmap.Reconstruction
@@ -31,23 +31,23 @@ class Finished:
     left_out: dict[str, str]  # by the image's name, why its camera cannot be used: it has no place any more
 
 
-def finish(
+def final_bundle_adjustment(
     mapped: pycolmap.Reconstruction,
     database: Path,
     seed: int,
     camera_model: str | None,
-    lens_is_known: bool,
+    camera_is_known: bool,
     thinned: bool = False,
-) -> Finished:
+) -> AdjustedModel:
     """Choose the camera model by held-out observations, unless it is given, and adjust everything with it.
 
     Of a given model it is only chosen whether its principal point is refined; a known lens is kept as it is. Where many
     more observations fit the chosen lens than mapping's, the choice is made again with them. No camera of the model is
-    absurd in the end, unless those of most photos are. Of a model of ``thinned`` matches (thinning.py) the tracks that
-    it has are adjusted first; then all matches come back.
+    degenerate in the end, unless those of most photos are. Of a model of ``thinned`` matches (thinning.py) the tracks
+    that it has are adjusted first; then all matches come back.
     """
-    if lens_is_known:
-        choice = Choice(noise_px(mapped, observations(mapped)), notes=["the camera is kept as given"])
+    if camera_is_known:
+        choice = CameraModels(noise_px(mapped, observations(mapped)), notes=["the camera is kept as given"])
         model = pycolmap.Reconstruction(mapped)
         adjust = _adjust_thinned if thinned else _adjust
         adjust(model, database, seed, set(model.cameras), adjustment_options(False, choice.noise_px))
@@ -58,42 +58,44 @@ def finish(
     if not thinned and model.compute_num_observations() > MANY_MORE * mapped.compute_num_observations():
         choice = choose(model, seed, models)
         model = _adjusted(model, database, seed, choice, thinned)
-    _simplify_absurd(model, database, seed, choice)
-    return _finished(model, choice, _leave_out(model, flaws(model)))
+    _simplify_degenerate(model, database, seed, choice)
+    return _finished(model, choice, _deregister_degenerate(model, degenerate_cameras(model)))
 
 
-def _simplify_absurd(model: pycolmap.Reconstruction, database: Path, seed: int, choice: Choice) -> None:
-    """Make pinholes of absurd cameras, fisheyes excepted, and adjust everything but the other cameras.
+def _simplify_degenerate(model: pycolmap.Reconstruction, database: Path, seed: int, choice: CameraModels) -> None:
+    """Make pinholes of degenerate cameras, fisheyes excepted, and adjust everything but the other cameras.
 
     They are mostly those of few photos, that show too little to be judged by, or were judged by what others show.
     """
-    absurd = {i: why for i, why in flaws(model).items() if not _camera(model, i).model_name.endswith("FISHEYE")}
-    if not absurd:
+    degenerate = {
+        i: why for i, why in degenerate_cameras(model).items() if not _camera(model, i).model_name.endswith("FISHEYE")
+    }
+    if not degenerate:
         return
-    cameras = {_camera(model, image_id).camera_id for image_id in absurd}
-    equip(model, dict.fromkeys(cameras, SIMPLEST))
+    cameras = {_camera(model, image_id).camera_id for image_id in degenerate}
+    set_camera_models(model, dict.fromkeys(cameras, SIMPLEST))
     _adjust(model, database, seed, set(model.cameras) - cameras, adjustment_options(False, choice.noise_px))
-    photos = f"{len(absurd)} photo{'s' * (len(absurd) != 1)}"
-    choice.notes.append(f"{photos}: the camera came out absurd ({next(iter(absurd.values()))}): {SIMPLEST} instead")
+    photos = f"{len(degenerate)} photo{'s' * (len(degenerate) != 1)}"
+    choice.notes.append(f"{photos}: the camera is degenerate ({next(iter(degenerate.values()))}): {SIMPLEST} instead")
 
 
 def _camera(model: pycolmap.Reconstruction, image_id: int) -> pycolmap.Camera:
     return model.camera(model.image(image_id).camera_id)
 
 
-def _leave_out(model: pycolmap.Reconstruction, absurd: dict[int, str]) -> dict[str, str]:
+def _deregister_degenerate(model: pycolmap.Reconstruction, degenerate: dict[int, str]) -> dict[str, str]:
     """Take these photos out of the model: by name why. None where they are most of all: what is left is no scene."""
-    if not absurd or 2 * len(absurd) >= model.num_reg_images():
+    if not degenerate or 2 * len(degenerate) >= model.num_reg_images():
         return {}
-    reasons = {model.image(image_id).name: f"its camera came out absurd: {why}" for image_id, why in absurd.items()}
-    for image_id in absurd:
+    reasons = {model.image(image_id).name: f"its camera is degenerate: {why}" for image_id, why in degenerate.items()}
+    for image_id in degenerate:
         model.deregister_frame(model.image(image_id).frame_id)
     model.tear_down()  # their cameras go too
     model.update_point_3d_errors()
     return reasons
 
 
-def _finished(model: pycolmap.Reconstruction, choice: Choice, left_out: dict[str, str]) -> Finished:
+def _finished(model: pycolmap.Reconstruction, choice: CameraModels, left_out: dict[str, str]) -> AdjustedModel:
     notes, uncertainty = choice.notes, {}
     untold = "how well the poses are known cannot be told"
     try:
@@ -103,15 +105,15 @@ def _finished(model: pycolmap.Reconstruction, choice: Choice, left_out: dict[str
     except MemoryError as error:
         notes = [*notes, f"{untold}: {str(error) or 'memory ran out'}"]
     by_name = {model.image(i).name: px for i, px in uncertainty.items()}
-    return Finished(model, choice.table, notes, by_name, left_out)
+    return AdjustedModel(model, choice.table, notes, by_name, left_out)
 
 
 def _adjusted(
-    before: pycolmap.Reconstruction, database: Path, seed: int, choice: Choice, thinned: bool
+    before: pycolmap.Reconstruction, database: Path, seed: int, choice: CameraModels, thinned: bool
 ) -> pycolmap.Reconstruction:
     adjust = _adjust_thinned if thinned else _adjust
     model = pycolmap.Reconstruction(before)
-    equip(model, {camera_id: lens.model for camera_id, lens in choice.lenses.items()})
+    set_camera_models(model, {camera_id: lens.model for camera_id, lens in choice.lenses.items()})
     centred = {camera_id for camera_id, lens in choice.lenses.items() if not lens.principal_point}
     # Whether to refine principal points holds for all cameras at once: those that keep theirs are adjusted before.
     if centred:
@@ -130,20 +132,20 @@ def _adjust_thinned(
 ) -> None:
     """Adjust cameras, poses and the tracks there are until little changes; then bring back all matches, and adjust all
     of it in a few steps: the long tracks have put everything in its place by then."""
-    adjust_tracks(model, constant_cameras, adjustment)
+    bundle_adjust(model, constant_cameras, adjustment)
     mapper, options = _mapper(model, database, seed, constant_cameras)
     for image_id in sorted(model.reg_image_ids()):
         mapper.triangulate_image(options.triangulation, image_id)
     for steps in CLOSING_STEPS:
         mapper.complete_and_merge_tracks(options.triangulation)
         mapper.filter_points(options.mapper)
-        adjust_tracks(model, constant_cameras, adjustment, steps)
+        bundle_adjust(model, constant_cameras, adjustment, steps)
     mapper.filter_points(options.mapper)
     mapper.end_reconstruction(discard=False)
     model.update_point_3d_errors()
 
 
-def adjust_tracks(
+def bundle_adjust(
     model: pycolmap.Reconstruction,
     constant_cameras: set[int],
     adjustment: pycolmap.BundleAdjustmentOptions,

@@ -7,7 +7,7 @@ import pycolmap
 from jaxtyping import Float, Int
 
 MEDIAN_PER_SIGMA = 1.1774  # the median length of a 2-D Gaussian vector over the deviation of its coordinates: √(2 ln 2)
-LEAST_NOISE_PX = 0.01  # no detector places a feature better than this
+MIN_NOISE_PX = 0.01  # no detector places a feature better than this
 
 
 class Observations(NamedTuple):
@@ -66,6 +66,6 @@ def noise_px(model: pycolmap.Reconstruction, seen: Observations) -> float:
     length = np.linalg.norm(residuals(model, seen), axis=1)
     in_front = length[np.isfinite(length)]
     if not len(in_front):
-        return LEAST_NOISE_PX
+        return MIN_NOISE_PX
     sigma = float(np.median(in_front)) / MEDIAN_PER_SIGMA
-    return max(sigma * (count / max(count - unknowns, 1)) ** 0.5, LEAST_NOISE_PX)
+    return max(sigma * (count / max(count - unknowns, 1)) ** 0.5, MIN_NOISE_PX)

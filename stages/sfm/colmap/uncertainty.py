@@ -10,7 +10,7 @@ from stages.amounts import bytes_in_words
 from stages.hardware.memory import available_bytes
 from stages.sfm.colmap.observations import Observations, observations, points_in_camera, residuals
 
-FEWEST_OBSERVATIONS = 6  # of a photo: 12 equations for 6 unknowns; with fewer its pose is not known
+MIN_OBSERVATIONS = 6  # of a photo: 12 equations for 6 unknowns; with fewer its pose is not known
 MATRICES = 6  # of 6 n × 6 n float64 for n photos, that are there at once at most
 STEP = 1e-5  # of finite differences, as a share of the distance: rounding and curvature are both far below a percent
 
@@ -31,7 +31,7 @@ def pose_uncertainty_px(model: pycolmap.Reconstruction, noise: float) -> dict[in
     """
     seen = observations(model)
     counts = dict(zip(*(a.tolist() for a in np.unique(seen.image, return_counts=True)), strict=True))
-    keep = np.isin(seen.image, [i for i, count in counts.items() if count >= FEWEST_OBSERVATIONS])
+    keep = np.isin(seen.image, [i for i, count in counts.items() if count >= MIN_OBSERVATIONS])
     seen = Observations(*(part[keep] for part in seen))
     point, views = np.unique(seen.point, return_counts=True)
     seen = Observations(*(part[np.isin(seen.point, point[views >= 2])] for part in seen))  # one view gives no depth

@@ -20,20 +20,20 @@ from stages.sfm.imported.conventions import (
     found_convention,
     named_axes,
 )
-from stages.sfm.imported.pose_check import check_given_cameras
-from stages.sfm.imported.pose_files import KnownCameras, is_transforms, read_known_cameras
+from stages.sfm.imported.pose_check import check_imported_poses
+from stages.sfm.imported.pose_files import ImportedPoses, is_transforms, read_poses
 
 MAX_NAMES = 5
 
 
-def import_cameras(
+def import_poses(
     cameras: Path, convention: PoseConvention, photos: Sequence[Photo], ingest: Path, folder: Path, progress: Progress
 ) -> dict[str, Any]:
     """Write ``sparse/`` from known cameras, and check them against the photos: what registration.json says of them.
 
     Raises StageError where they cannot be used, and where their photos show that they are of another convention.
     """
-    known, errors = write_known_model(cameras, convention, photos, ingest, folder, progress)
+    known, errors = write_imported_model(cameras, convention, photos, ingest, folder, progress)
     check = _check_given(known.model, photos, ingest, folder, progress)
     if check and (fit := check.pop("fit")):
         of_format = OF_TRANSFORMS if is_transforms(cameras) else OF_COLMAP
@@ -60,12 +60,12 @@ def import_cameras(
     }
 
 
-def write_known_model(
+def write_imported_model(
     cameras: Path, convention: PoseConvention, photos: Sequence[Photo], ingest: Path, folder: Path, progress: Progress
-) -> tuple[KnownCameras, Float[np.ndarray, "points"]]:
+) -> tuple[ImportedPoses, Float[np.ndarray, "points"]]:
     """Read the cameras and write ``sparse/``; also the reprojection errors of its points, in pixels."""
     progress.update(f"reading the cameras of {cameras.name}")
-    known = read_known_cameras(cameras, photos, read_frame_names(ingest), convention)
+    known = read_poses(cameras, photos, read_frame_names(ingest), convention)
     for note in known.notes:
         progress.note(note)
     write_model(folder / "sparse", known.model)
@@ -102,7 +102,7 @@ def _check_given(
     """What verified matches of neighbouring photos say of given cameras; None, said, where they say nothing."""
     progress.update("comparing the cameras with what neighbouring photos show")
     posed = {image.file for image in model.images}
-    check = check_given_cameras([photo for photo in photos if photo.image_name in posed], ingest / "images", folder)
+    check = check_imported_poses([photo for photo in photos if photo.image_name in posed], ingest / "images", folder)
     if why := check.get("failed"):
         progress.note(f"the given cameras could not be checked: {why}")
         return None

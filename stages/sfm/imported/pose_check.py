@@ -22,7 +22,7 @@ from stages.ingest.masks import write_feature_masks
 from stages.io.photos import Photo
 from stages.sfm.colmap.database import (
     STRICT_RATIO,
-    Search,
+    ExtractionOptions,
     extract_features,
     fill_database,
     match_pairs,
@@ -44,7 +44,7 @@ TURN_DEG = 30.0  # two photos whose axes differ by so much count as far apart as
 MIN_PAIRS = 3  # verified pairs, for there to be any evidence
 
 
-def check_given_cameras(photos: Sequence[Photo], images: Path, folder: Path) -> dict[str, Any]:
+def check_imported_poses(photos: Sequence[Photo], images: Path, folder: Path) -> dict[str, Any]:
     """Check the model in ``folder/sparse``, whose images are these photos in order of ``file``.
 
     Returns what :func:`stages.sfm.colmap.repair.facts` says, with the ``fit`` of another convention where the poses
@@ -83,7 +83,7 @@ def check(photos: list[dict[str, Any]], images: str, folder: str) -> dict[str, A
     database, masks = scratch / "check.db", scratch / "masks"
     model = load_native(Path(folder, "sparse"))
     fill_database(database, some, MAPPING_MODEL)
-    search = Search(MAX_IMAGE_SIZE, MAX_FEATURES, doubled_up_to=MAX_IMAGE_SIZE // 2)
+    search = ExtractionOptions(MAX_IMAGE_SIZE, MAX_FEATURES, doubled_up_to=MAX_IMAGE_SIZE // 2)
     if write_feature_masks(Path(images).parent, some, masks):
         search = search._replace(masks=masks)
     extract_features(database, Path(images), some, search)

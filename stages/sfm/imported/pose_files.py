@@ -48,7 +48,7 @@ APPROXIMATION = "approximation"  # how the note begins of a lens that is not the
 
 
 @dataclass(frozen=True)
-class KnownCameras:
+class ImportedPoses:
     """``left_out``: why photos are that have a camera; ``test_files``: an official split; both by files relative to
     ingest's ``images/``. ``notes`` are for the user."""
 
@@ -80,9 +80,9 @@ class _Framed(NamedTuple):
     values: Mapping[str, Any]  # of the frame, and of its file what the frame has none of
 
 
-def read_known_cameras(
+def read_poses(
     cameras: Path, photos: Sequence[Photo], frames: Mapping[str, str], convention: PoseConvention = AS_DECLARED
-) -> KnownCameras:
+) -> ImportedPoses:
     """Read ``cameras`` and match them to ``photos``. ``frames`` maps a transforms file's file_path to a photo's name.
 
     Raises StageError, naming the frame, for anything that is no camera: numbers that are not finite, a focal length
@@ -103,7 +103,7 @@ def is_transforms(cameras: Path) -> bool:
 
 def _from_transforms(
     cameras: Path, photos: Sequence[Photo], frames: Mapping[str, str], convention: PoseConvention
-) -> KnownCameras:
+) -> ImportedPoses:
     by_name = {photo.name: photo for photo in photos}
     framed: dict[str, _Framed] = {}
     absent, repeated, test_files, approximate = [], [], [], 0
@@ -152,7 +152,7 @@ def _from_transforms(
     if unused:
         names = _few(sorted(photo.name for photo in unused.values()))
         notes.append(f"{len(unused)} photos are neither to train nor to test on and are left out: {names}")
-    return KnownCameras(
+    return ImportedPoses(
         model=SparseModel.without_points(*distinct(kept)),
         left_out=left_out | dict.fromkeys(unused, "the transforms file has it neither to train nor to test on"),
         test_files=kept_tests or None,
@@ -304,7 +304,7 @@ def _rounded_or_scaled(rotations: Mapping[str, _Rotation]) -> list[str]:
 # --- COLMAP models
 
 
-def _from_colmap(folder: Path, photos: Sequence[Photo], convention: PoseConvention) -> KnownCameras:
+def _from_colmap(folder: Path, photos: Sequence[Photo], convention: PoseConvention) -> ImportedPoses:
     given = _with_slashes(read_model(folder), photos)
     photo_of = _by_name([image.file for image in given.images], photos)
     if not photo_of:
@@ -337,7 +337,7 @@ def _from_colmap(folder: Path, photos: Sequence[Photo], convention: PoseConventi
         notes.append("the model has no points: near and far are taken from where its cameras stand and look")
     if behind:
         notes.append(f"{behind} observations of points behind their cameras are left out")
-    return KnownCameras(model, left_out, None, notes)
+    return ImportedPoses(model, left_out, None, notes)
 
 
 def _with_slashes(model: SparseModel, photos: Sequence[Photo]) -> SparseModel:

@@ -12,7 +12,7 @@ from stages.io.photos import Photo
 from stages.io.sparse_model import SparseImage
 from stages.sfm.colmap.cameras import native, no_ray, rescaled, share_without_ray, why_no_ray
 from stages.sfm.imported.orientation import QUARTER_TURNS, is_of_stored_pixels, same_shape, turned_camera, turned_pose
-from stages.sfm.imported.transforms_intrinsics import flaw_of
+from stages.sfm.imported.transforms_intrinsics import why_unusable
 
 HINT = "Correct the file, or leave the cameras out to have them found from the photos."
 
@@ -46,8 +46,8 @@ def posed_photo(
 def _turns(photo: Photo, camera: Camera, name: str, upright: bool) -> int:
     """How many quarter turns clockwise make a given camera one of the upright photo. Raises StageError for a lens that
     is none, and where the photo was mirrored, which no camera can be."""
-    if flaw := flaw_of(camera):
-        raise unusable("sfm.degenerate-camera", f"the camera of {name!r}", flaw)
+    if why_degenerate := why_unusable(camera):
+        raise unusable("sfm.degenerate-camera", f"the camera of {name!r}", why_degenerate)
     if not is_of_stored_pixels(camera, photo, upright):
         return 0
     if photo.orientation not in QUARTER_TURNS:

@@ -94,12 +94,12 @@ def read_intrinsics(values: Mapping[str, Any], width: int, height: int, focal: f
     p, s = [number("p1", 0.0), number("p2", 0.0)], [number("sx1", 0.0), number("sy1", 0.0)]
     model, distortion = _distortion(k, p, s, declared)
     camera = Camera(model, int(w), int(h), (*pinhole, *distortion))
-    if flaw := flaw_of(camera):
-        raise ValueError(flaw)
+    if why_degenerate := why_unusable(camera):
+        raise ValueError(why_degenerate)
     return camera
 
 
-def flaw_of(camera: Camera) -> str | None:
+def why_unusable(camera: Camera) -> str | None:
     """What is wrong with intrinsics that no lens and no crop could have."""
     if camera.model == PANORAMA:
         return NO_PANORAMAS

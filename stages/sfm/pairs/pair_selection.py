@@ -23,7 +23,7 @@ MUTUAL = 0.9  # of a photo's partners, about so many count it among their own
 LOOPS = 5  # in a sequence one of so many partners is looked for at other times
 
 
-class Places(NamedTuple):
+class CapturePriors(NamedTuple):
     """When and where the photos were taken, as far as it is known.
 
     ``time_s``: seconds in the one video that all photos come from. ``position_m``: Cartesian, metres.
@@ -33,7 +33,7 @@ class Places(NamedTuple):
     position_m: Float[np.ndarray, "photos 3"] | None = None
 
 
-def places_of(photos: Sequence[Photo]) -> Places:
+def capture_priors(photos: Sequence[Photo]) -> CapturePriors:
     """When and where the photos were taken, as far as all of them tell."""
     times = [photo.time_s for photo in photos]
     places = [(photo.latitude, photo.longitude) for photo in photos]
@@ -43,7 +43,7 @@ def places_of(photos: Sequence[Photo]) -> Places:
     if all(None not in place for place in places):
         latitude, longitude = np.array(places, float).T
         position_m = cartesian(latitude, longitude, None if None in altitudes else np.array(altitudes, float))
-    return Places(time_s, position_m)
+    return CapturePriors(time_s, position_m)
 
 
 # --- the ways of choosing
@@ -109,7 +109,7 @@ def closeness(position_m: Float[np.ndarray, "n 3"]) -> SimilarityMatrix:
 
 
 def start_pairs(
-    matcher: Matcher, neighbours: int, count: int, places: Places, similarity: Callable[[], SimilarityMatrix]
+    matcher: Matcher, neighbours: int, count: int, places: CapturePriors, similarity: Callable[[], SimilarityMatrix]
 ) -> Pairs:
     """The pairs that matching begins with. ``similarity`` is asked for only where it is needed.
 
@@ -154,7 +154,7 @@ def expected_pairs(matcher: Matcher, count: int, neighbours: int) -> int:
     return everything if matcher == "exhaustive" else min(everything, round(count * neighbours * (1 - MUTUAL / 2)))
 
 
-def choose(count: int, neighbours: int, places: Places) -> Matcher:
+def choose(count: int, neighbours: int, places: CapturePriors) -> Matcher:
     """Every pair of a set of ordinary size; else by time, place or looks."""
     if count <= MAX_EXHAUSTIVE:
         return "exhaustive"

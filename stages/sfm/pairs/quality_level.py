@@ -21,8 +21,8 @@ from stages.hardware.device import processors
 from stages.io.photos import Photo, spread
 from stages.sfm.colmap.database import (
     STRICT_RATIO,
+    ExtractionOptions,
     Features,
-    Search,
     extract_features,
     fill_database,
     match_pairs,
@@ -31,10 +31,10 @@ from stages.sfm.colmap.database import (
 from stages.sfm.colmap.mapping import MAPPING_MODEL
 from stages.sfm.pairs import Matcher
 from stages.sfm.pairs.image_retrieval import CELLS
-from stages.sfm.pairs.pair_selection import Places, choose, exhaustive, expected_pairs, places_of
+from stages.sfm.pairs.pair_selection import CapturePriors, capture_priors, choose, exhaustive, expected_pairs
 from stages.sfm.worker_process import environment
 
-FEWEST_MEASURED = 4
+MIN_MEASURED = 4
 COMMAND = ["-P", "-m", "stages.sfm.pairs.quality_level"]
 WAYS = {
     "sequential": "neighbours in time, up to {} each",
@@ -52,14 +52,14 @@ DENSEST = (0.5, 0.08)  # seconds of a photo and of a pair, two cores, of photos 
 WORTH_IT = 0.7  # of the time: small photos, or such with few features, gain nothing by a step down, and are spared it
 
 
-class Tier(NamedTuple):
+class QualityLevel(NamedTuple):
     """How far features are searched: the longer side of photos in pixels, and how many each has at most."""
 
     max_image_size: int
     max_features: int
 
 
-TIERS = (Tier(1600, 4096), Tier(1131, 2048), Tier(1131, 1024))
+QUALITY_LEVELS = (QualityLevel(1600, 4096), QualityLevel(1131, 2048), QualityLevel(1131, 1024))
 
 
 class Open(NamedTuple):
@@ -89,7 +89,7 @@ class Cost(NamedTuple):
         return photos * self.per_photo + pairs * self.per_pair
 
 
-def check_matcher(matcher: Matcher | None, places: Places) -> None:
+def check_matcher(matcher: Matcher | None, places: CapturePriors) -> None:
     """Raises StageError where a matcher was asked for that the photos do not allow."""
     if matcher == "spatial" and places.position_m is None:
         raise StageError(
@@ -111,8 +111,8 @@ def chosen(
     """What is left open: the pairs by how many photos there are, and features in full, unless ``seconds_given`` to all
     of structure from motion would not be enough for them. Then some photos are timed on this machine, which is said.
     """
-    count, tiers = len(photos), tiers_of(left_open)
-    matcher = left_open.matcher or choose(count, neighbours, places_of(photos))
+    count, tiers = len(photos), quality_levels(left_open)
+    matcher = left_open.matcher or choose(count, neighbours, capture_priors(photos))
     pairs = expected_pairs(matcher, count, neighbours)
     if matcher != "exhaustive":
         everything = expected_pairs("exhaustive", count, neighbours)
@@ -136,13 +136,17 @@ def _at_most(count: int, pairs: int) -> float:
     return Cost(*DENSEST).of(count, pairs) * max(1.0, 2 / processors())
 
 
-def tiers_of(left_open: Open) -> list[Tier]:
+def quality_levels(left_open: Open) -> list[QualityLevel]:
     """The tiers to choose from, what is given in all of them."""
     size, features = left_open.max_image_size, left_open.max_features
-    return list(dict.fromkeys(Tier(size or tier.max_image_size, features or tier.max_features) for tier in TIERS))
+    return list(
+        dict.fromkeys(
+            QualityLevel(size or tier.max_image_size, features or tier.max_features) for tier in QUALITY_LEVELS
+        )
+    )
 
 
-def _search_in_words(count: int, full: Tier, tier: Tier, seconds_full: float, seconds: float) -> str:
+def _search_in_words(count: int, full: QualityLevel, tier: QualityLevel, seconds_full: float, seconds: float) -> str:
     if tier == full:
         return f"{count} photos searched at {_in_words(tier)} and matched: about {rough_duration(seconds)}"
     instead = f"at {_in_words(tier)} instead, about {rough_duration(seconds)}"
@@ -151,11 +155,11 @@ def _search_in_words(count: int, full: Tier, tier: Tier, seconds_full: float, se
     )
 
 
-def _in_words(tier: Tier) -> str:
+def _in_words(tier: QualityLevel) -> str:
     return f"{tier.max_image_size} pixels for {tier.max_features} features"
 
 
-def _measured(photos: Sequence[Photo], images: Path, tier: Tier, matcher: Matcher) -> Cost:
+def _measured(photos: Sequence[Photo], images: Path, tier: QualityLevel, matcher: Matcher) -> Cost:
     """Measured in a child process, all cores at work. Raises StageError where it does not end well."""
     some = [asdict(photo) for photo in _sample(photos, processors())]
     indexed = matcher != "exhaustive"
@@ -177,7 +181,7 @@ def _sample(photos: Sequence[Photo], cores: int) -> list[Photo]:
 
     Neighbours in the list see much the same, those of different parts often nothing: both kinds of pairs are timed.
     """
-    first = spread(len(photos), max(FEWEST_MEASURED, cores) // 2)
+    first = spread(len(photos), max(MIN_MEASURED, cores) // 2)
     return [
         photos[index] for index in sorted({one for index in first for one in (index, index + 1)}) if index < len(photos)
     ]
@@ -202,7 +206,7 @@ def measure(images: str, photos: list[dict[str, Any]], max_image_size: int, max_
         database = Path(scratch, "some.db")
         fill_database(database, some, MAPPING_MODEL)
         started = time.monotonic()
-        extract_features(database, Path(images), some, Search(max_image_size, max_features))
+        extract_features(database, Path(images), some, ExtractionOptions(max_image_size, max_features))
         extracted = time.monotonic()
         words = read_vocabulary(database, len(some), 0, CELLS) if indexed else None
         match_pairs(database, pairs, 0, STRICT_RATIO, features=Features(words))

@@ -10,7 +10,7 @@ import pytest
 from stages.contract import StageError
 from stages.io.photos import Photo
 from stages.io.transforms_files import read_transforms
-from stages.sfm.imported.pose_files import KnownCameras, read_known_cameras
+from stages.sfm.imported.pose_files import ImportedPoses, read_poses
 from tests.refusals import refused
 
 LENS = {"camera_angle_x": 0.7}
@@ -28,12 +28,12 @@ COPY = [frame("./train/0", 0), frame("train/1", 1)]
 GONE = [frame("test/7", 7)]
 
 
-def known(folder: Path, **splits: list[dict[str, Any]]) -> KnownCameras:
+def known(folder: Path, **splits: list[dict[str, Any]]) -> ImportedPoses:
     """A Blender-style folder with these files, read."""
     folder.mkdir(exist_ok=True)
     for split, frames in splits.items():
         (folder / f"transforms_{split}.json").write_text(json.dumps({**LENS, "frames": frames}))
-    return read_known_cameras(folder, PHOTOS, NAMES)
+    return read_poses(folder, PHOTOS, NAMES)
 
 
 NAMES = {f["file_path"]: f"{f['file_path']}.png".removeprefix("./") for f in (*TRAIN, *TEST, *VAL, *COPY)}
@@ -83,17 +83,17 @@ def test_validation_photos_that_are_not_needed_are_not_read(tmp_path: Path) -> N
 def test_the_test_frames_of_a_single_file_are_its_test_photos(tmp_path: Path) -> None:
     file = tmp_path / "transforms.json"
     file.write_text(json.dumps({**LENS, "frames": TRAIN, "test_frames": TEST}))
-    found = read_known_cameras(file, PHOTOS, NAMES)
+    found = read_poses(file, PHOTOS, NAMES)
     assert (len(found.model.images), found.test_files) == (3, ["test/0.png"])
     file.write_text(json.dumps({**LENS, "frames": TRAIN, "test_frames": COPY}))
-    found = read_known_cameras(file, PHOTOS, NAMES)
+    found = read_poses(file, PHOTOS, NAMES)
     assert found.test_files is None
     repeats = "test_frames of transforms.json repeats 2 frames of transforms.json: they stay photos to train on"
     assert found.notes[-1] == repeats
     for wrong, why in (({}, "it is no list"), ([{}], "frame 0 lacks file_path or transform_matrix")):
         file.write_text(json.dumps({**LENS, "frames": TRAIN, "test_frames": wrong}))
         with pytest.raises(StageError) as raised:
-            read_known_cameras(file, PHOTOS, NAMES)
+            read_poses(file, PHOTOS, NAMES)
         assert (raised.value.what, raised.value.why) == ("cannot use test_frames of transforms.json", why)
 
 

@@ -71,7 +71,7 @@ def test_the_account_says_what_became_of_each_photo(reconstructed: Path) -> None
     # So few points say next to nothing about distortion: which of the two it is differs between processors.
     assert account["camera_model"] in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL")
     (chosen,) = (row for row in account["camera_models"] if row["chosen"])
-    assert (chosen["model"], chosen["principal_point"], chosen["photos"]) == (account["camera_model"], "centred", 12)
+    assert (chosen["model"], chosen["principal_point"], chosen["photos"]) == (account["camera_model"], "fixed", 12)
     assert 0 < chosen["held_out_px"] < 1
     assert all(0 < image["uncertainty_px"] < 1 for image in account["images"])
     assert account["points"] == len(model.xyz) > 100
@@ -248,23 +248,23 @@ def test_photos_with_gps_tell_metres_and_directions(
 
 
 @pytest.mark.parametrize("always", [False, True], ids=["mended", "left out"])
-def test_the_camera_of_one_photo_that_comes_out_absurd_does_not_end_the_run(
+def test_the_camera_of_one_photo_that_comes_out_degenerate_does_not_end_the_run(
     always: bool, inputs: dict[str, Path], tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     images = {path.name: np.asarray(Image.open(path)) for path in sorted((inputs["ingest"] / "images").iterdir())[:8]}
     images["photo_003.jpg"] = np.ascontiguousarray(images["photo_003.jpg"][:, 10:230])  # another size, another camera
-    absurd = "camera.width == 220" if always else "camera.width == 220 and camera.model_name != 'SIMPLE_PINHOLE'"
+    degenerate = "camera.width == 220" if always else "camera.width == 220 and camera.model_name != 'SIMPLE_PINHOLE'"
     child = (
         "import stages.sfm.colmap.camera_models as lenses, stages.sfm.worker as c\n"
-        f"lenses.flaw = lambda camera: 'it is absurd' if {absurd} else None\n"
+        f"lenses.why_degenerate = lambda camera: 'it is wrong' if {degenerate} else None\n"
         "c.main()"
     )
     monkeypatch.setattr(worker_process, "COMMAND", ["-c", child])
     sfm.run(SMALL, ingested(tmp_path / "ingest", images), tmp_path / "sfm", progress)
-    assert "1 photo: the camera came out absurd (it is absurd): SIMPLE_PINHOLE instead" in progress.notes
+    assert "1 photo: the camera is degenerate (it is wrong): SIMPLE_PINHOLE instead" in progress.notes
     account, model = read_json(tmp_path / "sfm/registration.json"), read_model(tmp_path / "sfm/sparse")
     reasons = {image["file"]: image["reason"] for image in account["images"] if not image["registered"]}
-    assert reasons == ({"photo_003.jpg": "its camera came out absurd: it is absurd"} if always else {})
+    assert reasons == ({"photo_003.jpg": "its camera is degenerate: it is wrong"} if always else {})
     assert [camera.model for camera in model.cameras if camera.width == 220] == ([] if always else ["SIMPLE_PINHOLE"])
     assert len(model.images) == account["registered"] == 8 - len(reasons)
     assert [image["observations"] for image in account["images"] if image["registered"]] == (

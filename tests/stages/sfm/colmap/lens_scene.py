@@ -6,7 +6,7 @@ import numpy as np
 
 from nerf.geometry.scene import Camera
 from stages.sfm.colmap.camera_model_selection import adjustment_options
-from stages.sfm.colmap.camera_models import equip
+from stages.sfm.colmap.camera_models import set_camera_models
 from stages.sfm.colmap.cameras import native
 from stages.sfm.colmap.observations import observations, points_in_camera, residuals
 
@@ -95,7 +95,7 @@ def mapped(truth: "pycolmap.Reconstruction", widest: float = 180.0) -> "pycolmap
     for image_id, (mine, points) in points_in_camera(model, seen := observations(model)).items():
         off = np.degrees(np.arctan2(np.linalg.norm(points[:, :2], axis=1), points[:, 2]))
         _drop(model, image_id, seen.point[mine][off > widest].tolist())
-    equip(model, dict.fromkeys(model.cameras, "SIMPLE_RADIAL"))
+    set_camera_models(model, dict.fromkeys(model.cameras, "SIMPLE_RADIAL"))
     for _ in range(2):
         adjust(model)
         seen = observations(model)

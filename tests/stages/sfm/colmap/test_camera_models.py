@@ -7,8 +7,8 @@ import pytest
 
 from nerf.geometry.scene import Camera
 from stages.sfm.colmap import camera_models, final_bundle_adjustment
-from stages.sfm.colmap.camera_model_selection import Choice, choose, hold_out, paired
-from stages.sfm.colmap.camera_models import MODELS, Lens, equip, flaw
+from stages.sfm.colmap.camera_model_selection import CameraModels, choose, hold_out, paired
+from stages.sfm.colmap.camera_models import MODELS, CameraModelCandidate, set_camera_models, why_degenerate
 from stages.sfm.colmap.cameras import native
 from stages.sfm.colmap.observations import noise_px, observations, residuals
 from tests.stages.sfm.colmap.lens_scene import HEIGHT, WIDTH, adjust, lens, mapped, photographed
@@ -24,21 +24,21 @@ BARREL = lens("SIMPLE_RADIAL", 800, *CENTRE, -0.2)
 @pytest.mark.parametrize(
     ("camera", "expected"),
     [
-        (PINHOLE, Lens("SIMPLE_PINHOLE", False)),
-        (BARREL, Lens("SIMPLE_RADIAL", False)),
-        (lens("RADIAL", 800, *CENTRE, -0.3, 0.3), Lens("RADIAL", False)),
-        (lens("OPENCV", 800, 820, *CENTRE, -0.2, 0.1, 0.004, -0.003), Lens("OPENCV", False)),
-        (lens("SIMPLE_PINHOLE", 900, 475, 285), Lens("SIMPLE_PINHOLE", True)),
+        (PINHOLE, CameraModelCandidate("SIMPLE_PINHOLE", False)),
+        (BARREL, CameraModelCandidate("SIMPLE_RADIAL", False)),
+        (lens("RADIAL", 800, *CENTRE, -0.3, 0.3), CameraModelCandidate("RADIAL", False)),
+        (lens("OPENCV", 800, 820, *CENTRE, -0.2, 0.1, 0.004, -0.003), CameraModelCandidate("OPENCV", False)),
+        (lens("SIMPLE_PINHOLE", 900, 475, 285), CameraModelCandidate("SIMPLE_PINHOLE", True)),
     ],
     ids=lambda case: case.model if isinstance(case, Camera) else None,
 )
-def test_the_lens_is_the_simplest_that_describes_the_truth(camera: Camera, expected: Lens) -> None:
+def test_the_lens_is_the_simplest_that_describes_the_truth(camera: Camera, expected: CameraModelCandidate) -> None:
     model = mapped(photographed(camera))
     choice = choose(model, seed=0)
     assert choice.lenses == {1: expected}
     assert [row["model"] for row in choice.table if row["chosen"]] == [expected.model]
     assert 0.4 < choice.noise_px < 0.6  # half a pixel
-    equip(model, {1: expected.model})
+    set_camera_models(model, {1: expected.model})
     adjust(model, expected.principal_point)
     assert model.camera(1).mean_focal_length() == pytest.approx(native(camera).mean_focal_length(), rel=0.005)
 
@@ -56,24 +56,24 @@ def test_the_choice_repeats_and_says_why() -> None:
     assert choose(model, seed=3) == choice
     assert choose(model, seed=4).table != choice.table
     assert [(row["model"], row["principal_point"]) for row in choice.table] == [
-        (name, place) for name in MODELS for place in ("centred", "refined")
+        (name, place) for name in MODELS for place in ("fixed", "refined")
     ]
     best = min(choice.table, key=lambda row: row["held_out_px"] or 9)
     assert (best["worse_px"], best["noise_px"]) == (0, 0)
-    assert choice.notes[0].startswith("camera model SIMPLE_RADIAL, principal point centred: held-out error 0.")
+    assert choice.notes[0].startswith("camera model SIMPLE_RADIAL, principal point fixed: held-out error 0.")
     assert choice.notes[0].endswith(" px worse")
 
 
 def test_without_evidence_it_stays_simple() -> None:
     faint = lens("SIMPLE_RADIAL", 900, *CENTRE, -0.002)
     choice = choose(mapped(photographed(faint, points=80)), seed=0)
-    assert choice.lenses == {1: Lens("SIMPLE_PINHOLE", False)}
+    assert choice.lenses == {1: CameraModelCandidate("SIMPLE_PINHOLE", False)}
     assert choice.notes[0].endswith("and no richer one is better by more than the noise")
 
 
 def test_with_too_few_points_nothing_is_compared() -> None:
     choice = choose(mapped(photographed(PINHOLE, photos=4, points=40)), seed=0)
-    assert choice.lenses == {1: Lens("SIMPLE_RADIAL", False)}
+    assert choice.lenses == {1: CameraModelCandidate("SIMPLE_RADIAL", False)}
     assert choice.table == []
     assert choice.notes[0].endswith("points are seen in three photos, too few to compare camera models")
 
@@ -83,51 +83,64 @@ def test_a_single_photo_of_another_camera_is_no_lack_of_points() -> None:
     for image_id in sorted(i for i in model.reg_image_ids() if model.image(i).camera_id == 2)[1:]:
         model.deregister_frame(model.image(image_id).frame_id)
     words = "camera models are compared by points that three photos of a camera see"
-    assert choose(model, 0).notes[1] == f"1 photo: camera model SIMPLE_RADIAL, principal point centred: {words}"
+    assert choose(model, 0).notes[1] == f"1 photo: camera model SIMPLE_RADIAL, principal point fixed: {words}"
 
 
 def test_of_a_given_model_only_the_principal_point_is_chosen() -> None:
     choice = choose(mapped(photographed(PINHOLE, points=150)), 0, ("OPENCV",))
     assert [(row["model"], row["free_parameters"]) for row in choice.table] == [("OPENCV", 6), ("OPENCV", 8)]
-    assert choice.notes[0].startswith("camera model OPENCV as given, principal point centred: held-out error ")
+    assert choice.notes[0].startswith("camera model OPENCV as given, principal point fixed: held-out error ")
 
 
 def test_every_camera_is_judged_by_its_own_photos() -> None:
     choice = choose(mapped(photographed(PINHOLE, BARREL, points=250)), 0)
-    assert choice.lenses == {1: Lens("SIMPLE_PINHOLE", False), 2: Lens("SIMPLE_RADIAL", False)}
+    assert choice.lenses == {
+        1: CameraModelCandidate("SIMPLE_PINHOLE", False),
+        2: CameraModelCandidate("SIMPLE_RADIAL", False),
+    }
     assert [(row["group"], row["photos"]) for row in choice.table if row["chosen"]] == [(0, 5), (1, 5)]
     assert choice.notes[1].startswith("5 photos: camera model SIMPLE_RADIAL, ")
 
 
 def test_cameras_that_come_out_alike_are_judged_once_more_together() -> None:
     choice = choose(mapped(photographed(BARREL, BARREL, points=150)), 0)
-    assert choice.lenses == dict.fromkeys((1, 2), Lens("SIMPLE_RADIAL", False))
+    assert choice.lenses == dict.fromkeys((1, 2), CameraModelCandidate("SIMPLE_RADIAL", False))
     assert {(row["group"], row["photos"]) for row in choice.table} == {(0, 10)}
     assert len(choice.notes) == 1
 
 
 def test_cameras_with_few_photos_are_judged_together() -> None:
     choice = choose(mapped(photographed(*5 * [BARREL], points=100)), 0)  # two photos each
-    assert choice.lenses == dict.fromkeys(range(1, 6), Lens("SIMPLE_RADIAL", False))
+    assert choice.lenses == dict.fromkeys(range(1, 6), CameraModelCandidate("SIMPLE_RADIAL", False))
     assert {(row["group"], row["photos"]) for row in choice.table} == {(0, 10)}
     assert len(choice.notes) == 1
 
 
-def test_where_every_candidate_is_absurd_the_camera_stays(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(camera_models, "flaw", lambda camera: "it is absurd")
+def test_where_every_candidate_is_degenerate_the_camera_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(camera_models, "why_degenerate", lambda camera: "it is wrong")
     choice = choose(mapped(photographed(PINHOLE, photos=6, points=80)), 0)
-    assert choice.lenses == {1: Lens("SIMPLE_RADIAL", False)}
-    assert {row["reason"] for row in choice.table} == {"it is absurd"}
-    assert choice.notes[0].endswith("every candidate comes out absurd, so it stays as mapping had it")
+    assert choice.lenses == {1: CameraModelCandidate("SIMPLE_RADIAL", False)}
+    assert {row["reason"] for row in choice.table} == {"it is wrong"}
+    assert choice.notes[0].endswith("every candidate is degenerate, so it stays as mapping had it")
 
 
-def test_a_few_photos_with_absurd_cameras_do_not_decide_for_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(camera_models, "flaw", lambda camera: "it is absurd" if camera.camera_id == 5 else flaw(camera))
+def test_a_few_photos_with_degenerate_cameras_do_not_decide_for_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        camera_models,
+        "why_degenerate",
+        lambda camera: "it is wrong" if camera.camera_id == 5 else why_degenerate(camera),
+    )
     choice = choose(mapped(photographed(*5 * [PINHOLE], points=100)), 0)  # two photos each
-    assert choice.lenses == dict.fromkeys(range(1, 6), Lens("SIMPLE_PINHOLE", False))
-    monkeypatch.setattr(camera_models, "flaw", lambda camera: "it is absurd" if camera.camera_id > 3 else flaw(camera))
+    assert choice.lenses == dict.fromkeys(range(1, 6), CameraModelCandidate("SIMPLE_PINHOLE", False))
+    monkeypatch.setattr(
+        camera_models,
+        "why_degenerate",
+        lambda camera: "it is wrong" if camera.camera_id > 3 else why_degenerate(camera),
+    )
     choice = choose(mapped(photographed(*5 * [PINHOLE], points=100)), 0)
-    assert choice.lenses == dict.fromkeys(range(1, 6), Lens("SIMPLE_RADIAL", False)), "as mapping had them"
+    assert choice.lenses == dict.fromkeys(range(1, 6), CameraModelCandidate("SIMPLE_RADIAL", False)), (
+        "as mapping had them"
+    )
 
 
 def test_one_observation_a_point_is_held_out_and_two_are_left() -> None:
@@ -165,7 +178,7 @@ def test_noise_of_differences_is_that_of_independent_cells() -> None:
 def test_a_camera_of_another_model_draws_the_same(name: str) -> None:
     model = photographed(lens("SIMPLE_RADIAL", 900, *CENTRE, -0.05), noise=0, points=200, photos=4)
     before = model.camera(1).mean_focal_length()
-    equip(model, {1: name})
+    set_camera_models(model, {1: name})
     camera = model.camera(1)
     assert camera.model_name == name
     assert (camera.principal_point_x, camera.principal_point_y) == CENTRE
@@ -187,15 +200,15 @@ def test_a_camera_of_another_model_draws_the_same(name: str) -> None:
         (lens("SIMPLE_RADIAL", 450, *CENTRE, -0.5), r"its distortion cannot be undone at \d+\.\d% of the pixels"),
     ],
 )
-def test_absurd_cameras_are_out(camera: Camera, why: str | None) -> None:
-    found = flaw(native(camera))
+def test_degenerate_cameras_are_out(camera: Camera, why: str | None) -> None:
+    found = why_degenerate(native(camera))
     assert found is None if why is None else found is not None
     if why is not None:
         assert re.fullmatch(why, str(found))
 
 
 def test_fisheye_counts_as_less_simple_than_any_other() -> None:
-    lenses = [Lens(name, refined) for name in MODELS for refined in (False, True)]
+    lenses = [CameraModelCandidate(name, refined) for name in MODELS for refined in (False, True)]
     ordered = sorted(lenses, key=lambda one: one.complexity)
     assert [one.free_parameters for one in ordered] == [1, 2, 3, 3, 4, 5, 6, 8, 2, 3, 4, 5, 6, 8]
     assert [one.model.endswith("FISHEYE") for one in ordered] == 8 * [False] + 6 * [True]
@@ -215,17 +228,17 @@ def test_where_the_chosen_lens_lets_many_more_observations_in_it_is_chosen_again
     few, many = photographed(PINHOLE, photos=6, points=60), photographed(PINHOLE, photos=6, points=70)
     asked = []
 
-    def adjusted(before: object, database: Path, seed: int, choice: Choice, thinned: bool) -> object:
+    def adjusted(before: object, database: Path, seed: int, choice: CameraModels, thinned: bool) -> object:
         asked.append(before)
         return many
 
     monkeypatch.setattr(final_bundle_adjustment, "_adjusted", adjusted)
-    finished = final_bundle_adjustment.finish(few, Path("matches.db"), 0, None, False)
+    finished = final_bundle_adjustment.final_bundle_adjustment(few, Path("matches.db"), 0, None, False)
     assert asked == [few, many]
     assert finished.model is many
     assert sorted(finished.uncertainty_px) == [f"{i:02d}.jpg" for i in range(1, 7)]
     asked.clear()
-    final_bundle_adjustment.finish(many, Path("matches.db"), 0, None, False)
+    final_bundle_adjustment.final_bundle_adjustment(many, Path("matches.db"), 0, None, False)
     assert asked == [many]
 
 
@@ -234,35 +247,37 @@ def with_a_bad_lens(monkeypatch: pytest.MonkeyPatch, *cameras: Camera) -> "pycol
     model = photographed(*cameras, points=300)
     bad = model.camera(len(cameras))
     bad.model, bad.params = native(lens("SIMPLE_RADIAL", 800, *CENTRE, -0.5)).model, [800, *CENTRE, -0.5]
-    monkeypatch.setattr(final_bundle_adjustment, "choose", lambda *_: Choice(0.5))
+    monkeypatch.setattr(final_bundle_adjustment, "choose", lambda *_: CameraModels(0.5))
     monkeypatch.setattr(final_bundle_adjustment, "_adjusted", lambda *_: model)
     monkeypatch.setattr(final_bundle_adjustment, "_adjust", lambda model, *_: adjust(model))
     return model
 
 
-def test_a_camera_that_comes_out_absurd_becomes_a_pinhole(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_camera_that_comes_out_degenerate_becomes_a_pinhole(monkeypatch: pytest.MonkeyPatch) -> None:
     model = with_a_bad_lens(monkeypatch, *5 * [PINHOLE])
-    finished = final_bundle_adjustment.finish(model, Path("matches.db"), 0, None, False)
+    finished = final_bundle_adjustment.final_bundle_adjustment(model, Path("matches.db"), 0, None, False)
     assert finished.model.camera(5).model_name == "SIMPLE_PINHOLE"
     assert finished.model.camera(5).mean_focal_length() == pytest.approx(900, rel=0.005)
     assert finished.left_out == {} and finished.model.num_reg_images() == 10
     assert re.fullmatch(
-        r"2 photos: the camera came out absurd \(its distortion .* of the pixels\): SIMPLE_PINHOLE instead",
+        r"2 photos: the camera is degenerate \(its distortion .* of the pixels\): SIMPLE_PINHOLE instead",
         finished.notes[-1],
     )
 
 
-def test_photos_whose_camera_stays_absurd_lose_their_places(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_photos_whose_camera_stays_degenerate_lose_their_places(monkeypatch: pytest.MonkeyPatch) -> None:
     model = with_a_bad_lens(monkeypatch, *5 * [PINHOLE])
-    monkeypatch.setattr(camera_models, "flaw", lambda camera: "it is absurd" if camera.camera_id == 5 else None)
-    finished = final_bundle_adjustment.finish(model, Path("matches.db"), 0, None, False)
-    assert finished.left_out == dict.fromkeys(("04.jpg", "09.jpg"), "its camera came out absurd: it is absurd")
+    monkeypatch.setattr(
+        camera_models, "why_degenerate", lambda camera: "it is wrong" if camera.camera_id == 5 else None
+    )
+    finished = final_bundle_adjustment.final_bundle_adjustment(model, Path("matches.db"), 0, None, False)
+    assert finished.left_out == dict.fromkeys(("04.jpg", "09.jpg"), "its camera is degenerate: it is wrong")
     assert finished.model.num_reg_images() == len(finished.uncertainty_px) == 8
     assert sorted(finished.model.cameras) == [1, 2, 3, 4]
 
 
-def test_where_most_cameras_are_absurd_none_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_most_cameras_are_degenerate_none_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     model = with_a_bad_lens(monkeypatch, PINHOLE)
-    monkeypatch.setattr(camera_models, "flaw", lambda camera: "it is absurd")
-    finished = final_bundle_adjustment.finish(model, Path("matches.db"), 0, None, False)
+    monkeypatch.setattr(camera_models, "why_degenerate", lambda camera: "it is wrong")
+    finished = final_bundle_adjustment.final_bundle_adjustment(model, Path("matches.db"), 0, None, False)
     assert finished.left_out == {} and finished.model.num_reg_images() == 10

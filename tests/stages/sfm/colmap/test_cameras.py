@@ -8,7 +8,7 @@ import pytest
 from nerf.geometry.scene import Camera
 from nerf.synthetic.scenes import ring_of_cameras
 from stages.io.sparse_model import SparseImage, SparseModel
-from stages.sfm.colmap.camera_models import flaw
+from stages.sfm.colmap.camera_models import why_degenerate
 from stages.sfm.colmap.cameras import camera_rays, is_valid, native, project, rescaled
 from stages.sfm.colmap.diagnosis import find_conflict
 from stages.sfm.colmap.models import load_native, read_model, write_model
@@ -68,9 +68,9 @@ def test_a_fisheye_of_180_degrees_is_to_be_cropped(model: str, focals: int, term
         camera_rays(cropped_to(100), 100, 100)
     assert raised.value.why.startswith("it looks beyond 90° from its axis or its distortion cannot be undone there (")
     assert raised.value.hint.endswith("or crop photos and cameras to the square inside the lens's circle.")
-    assert re.match(r"it looks beyond 90° .* at \d+\.\d% of the pixels", str(flaw(native(cropped_to(100)))))
+    assert re.match(r"it looks beyond 90° .* at \d+\.\d% of the pixels", str(why_degenerate(native(cropped_to(100)))))
     assert camera_rays(cropped_to(70), 70, 70)[..., 2].min() > 0
-    assert flaw(native(cropped_to(70))) is None
+    assert why_degenerate(native(cropped_to(70))) is None
 
 
 def test_points_behind_the_camera_project_nowhere() -> None:

@@ -10,7 +10,7 @@ import pytest
 
 import stages.sfm.colmap.database as database_module
 from stages.io.photos import Photo
-from stages.sfm.colmap.database import fill_database, hold_open, look_alike, match_pairs
+from stages.sfm.colmap.database import fill_database, image_similarity, keep_open, match_pairs
 from stages.sfm.colmap.diagnosis import links
 from stages.sfm.pairs.pair_selection import exhaustive
 from tests.stages.sfm.pairs.test_feature_matching import random_descriptors
@@ -123,7 +123,7 @@ def test_the_first_block_is_spread_over_all_pairs() -> None:
 
 
 def test_photos_of_the_same_points_look_alike(database: Path) -> None:
-    alike = look_alike(database, COUNT, seed=0)
+    alike = image_similarity(database, COUNT, seed=0)
     assert alike.shape == (COUNT, COUNT)
     assert alike[:-1, -1].max() < alike[:-1, :-1].min()
 
@@ -164,7 +164,7 @@ def test_a_database_that_is_held_open_can_be_opened_while_another_process_reads_
     )
     try:
         assert reader.stdout and reader.stdout.readline() == b"ready\n"
-        held = hold_open(database)
+        held = keep_open(database)
         for _ in range(500):  # without it one in ten or twenty fails
             with pycolmap.Database.open(database) as db:
                 assert db.num_images() == COUNT

@@ -6,9 +6,9 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from stages.sfm.colmap import uncertainty
-from stages.sfm.colmap.camera_model_selection import Choice
+from stages.sfm.colmap.camera_model_selection import CameraModels
 from stages.sfm.colmap.final_bundle_adjustment import _finished
-from stages.sfm.colmap.observations import LEAST_NOISE_PX, noise_px, observations
+from stages.sfm.colmap.observations import MIN_NOISE_PX, noise_px, observations
 from stages.sfm.colmap.uncertainty import _error_px, pose_uncertainty_px
 from tests.stages.sfm.colmap.lens_scene import adjust, lens, photographed
 
@@ -107,7 +107,7 @@ def test_where_there_is_no_room_for_it_that_is_said_and_the_model_stands(
     else:
         monkeypatch.setattr(uncertainty, "_whitened_covariance", Mock(side_effect=MemoryError()))
         words = "memory ran out"
-    finished = _finished(model, Choice(0.5, notes=["the camera is kept as given"]), {})
+    finished = _finished(model, CameraModels(0.5, notes=["the camera is kept as given"]), {})
     assert finished.model is model and finished.uncertainty_px == {}
     assert finished.notes[1:] == [f"how well the poses are known cannot be told: {words}"]
 
@@ -117,4 +117,4 @@ def test_where_nothing_was_seen_nothing_is_known() -> None:
     for point_id in list(model.point3D_ids()):
         model.delete_point3D(point_id)
     assert pose_uncertainty_px(model, 0.5) == {}
-    assert noise_px(model, observations(model)) == LEAST_NOISE_PX
+    assert noise_px(model, observations(model)) == MIN_NOISE_PX

@@ -13,7 +13,7 @@ from stages.io.photos import Photo
 from stages.io.sparse_model import SparseImage, SparseModel
 from stages.sfm.colmap.cameras import camera_rays
 from stages.sfm.colmap.models import write_model
-from stages.sfm.imported.pose_files import KnownCameras, read_known_cameras
+from stages.sfm.imported.pose_files import ImportedPoses, read_poses
 from tests.camera_layouts import ring
 
 W, H = 600, 400
@@ -26,17 +26,17 @@ def photos(count: int) -> list[Photo]:
     return [Photo(f"{i}.jpg", f"images/{i}.jpg", W, H, 0, None, None, False, 1.0) for i in range(count)]
 
 
-def from_transforms(folder: Path, bent: list[int], count: int) -> KnownCameras:
+def from_transforms(folder: Path, bent: list[int], count: int) -> ImportedPoses:
     frames: list[dict[str, Any]] = []
     for i, pose in enumerate(ring(count)):
         matrix = np.vstack([pose, [0, 0, 0, 1]]) @ np.diag([1.0, -1, -1, 1])
         frames.append({"file_path": f"{i}.jpg", "transform_matrix": matrix.tolist(), "k1": BENT * (i in bent)})
     content = {"fl_x": LENS[0], "test_filenames": ["0.jpg", "1.jpg"], "frames": frames}
     (folder / "given.json").write_text(json.dumps(content))
-    return read_known_cameras(folder / "given.json", photos(count), {f"{i}.jpg": f"{i}.jpg" for i in range(count)})
+    return read_poses(folder / "given.json", photos(count), {f"{i}.jpg": f"{i}.jpg" for i in range(count)})
 
 
-def from_colmap(folder: Path, bent: list[int], count: int) -> KnownCameras:
+def from_colmap(folder: Path, bent: list[int], count: int) -> ImportedPoses:
     """Every camera sees the one point, at (i, i)."""
     cameras = [Camera("PINHOLE", W, H, LENS), Camera("OPENCV", W, H, (*LENS, BENT, 0.0, 0.0, 0.0))]
     images = [SparseImage(f"{i}.jpg", int(i in bent), pose) for i, pose in enumerate(ring(count))]
@@ -44,7 +44,7 @@ def from_colmap(folder: Path, bent: list[int], count: int) -> KnownCameras:
     index = np.arange(count)
     seen = {"view": index, "point": 0 * index, "xy": np.stack([index, index], axis=1).astype(float)}
     write_model(folder, SparseModel(cameras=cameras, images=images, **point, **seen))
-    return read_known_cameras(folder, photos(count), {})
+    return read_poses(folder, photos(count), {})
 
 
 def test_a_fold_in_the_very_corner_is_missed_by_coarse_looks() -> None:

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from stages.contract import StageError
-from stages.sfm.imported.pose_files import KnownCameras, read_known_cameras
+from stages.sfm.imported.pose_files import ImportedPoses, read_poses
 from tests.stages.sfm.imported.test_pose_files import LENS, NAMES, PHOTOS, frame
 
 
@@ -16,10 +16,10 @@ from tests.stages.sfm.imported.test_pose_files import LENS, NAMES, PHOTOS, frame
 def read(tmp_path: Path):
     """Writes a transforms.json of these frames and values and reads it with PHOTOS."""
 
-    def write_and_read(frames: list[dict[str, Any]], **values: Any) -> KnownCameras:
+    def write_and_read(frames: list[dict[str, Any]], **values: Any) -> ImportedPoses:
         path = tmp_path / "transforms.json"
         path.write_text(json.dumps({**values, "frames": frames}))
-        return read_known_cameras(path, PHOTOS, NAMES)
+        return read_poses(path, PHOTOS, NAMES)
 
     return write_and_read
 

@@ -20,7 +20,7 @@ from stages.io.sparse_model import SparseImage, SparseModel
 from stages.sfm.colmap.cameras import camera_rays, project
 from stages.sfm.colmap.models import read_model, write_model
 from stages.sfm.imported.orientation import QUARTER_TURNS, pixel_map, turned_camera, turned_pose
-from stages.sfm.imported.pose_files import KnownCameras, read_known_cameras
+from stages.sfm.imported.pose_files import ImportedPoses, read_poses
 from tests.camera_layouts import ring
 from tests.refusals import refused
 from tests.stages.ingest.photo_files import exif_with
@@ -165,7 +165,7 @@ def test_one_camera_that_only_fits_upright_tells_it_of_all(kind: str, alone: boo
         cameras = [dataclasses.replace(OPENCV, width=photo.width, height=photo.height) for photo in photos]
         images = [SparseImage(name, i, pose) for i, (name, pose) in enumerate(zip(names, ring(5), strict=False))]
         write_model(tmp_path, SparseModel.without_points(cameras, images))
-    known = read_known_cameras(given, photos, {name: name for name in names})
+    known = read_poses(given, photos, {name: name for name in names})
     turns = ["1 cameras are turned upright like their photos (EXIF orientation)"]
     assert [note for note in known.notes if "turned" in note] == (turns if alone else [])
 
@@ -175,11 +175,11 @@ def turned_photo(orientation: int, name: str = "p.jpg") -> Photo:
     return Photo(name, "images/p.png", width, height, 0, None, None, False, 1.0, orientation=orientation)
 
 
-def read_one(folder: Path, taken: Photo, **values: Any) -> KnownCameras:
+def read_one(folder: Path, taken: Photo, **values: Any) -> ImportedPoses:
     file = folder / "given.json"
     frame = {"file_path": "p.jpg", "transform_matrix": np.eye(4).tolist()}
     file.write_text(json.dumps({**LENS, "frames": [frame | values]}))
-    return read_known_cameras(file, [taken], {"p.jpg": taken.name})
+    return read_poses(file, [taken], {"p.jpg": taken.name})
 
 
 @pytest.mark.parametrize("orientation", [2, 4, 5, 7])
@@ -216,7 +216,7 @@ def test_the_keypoints_of_a_colmap_model_turn_too(name: str, tmp_path: Path) -> 
     points = {"xyz": xyz, "rgb": np.zeros((count, 3), np.uint8), "error_px": np.zeros(count), "xy": xy}
     seen = {"view": np.zeros(count, int), "point": np.arange(count)}
     write_model(tmp_path, SparseModel(cameras=[camera], images=[SparseImage(name, 0, pose)], **points, **seen))
-    model = read_known_cameras(tmp_path, [turned_photo(3)], {}).model
+    model = read_poses(tmp_path, [turned_photo(3)], {}).model
     (image,) = model.images
     inside = (model.xyz[model.point] - image.sfm_from_camera[:, 3]) @ image.sfm_from_camera[:, :3]
     np.testing.assert_allclose(project(model.cameras[0], inside), model.xy, atol=1e-3)

@@ -15,7 +15,7 @@ from stages.io.sparse_model import SparseImage, SparseModel
 from stages.io.transforms_export import intrinsics
 from stages.sfm.colmap.models import write_model
 from stages.sfm.imported.conventions import PoseConvention
-from stages.sfm.imported.pose_files import KnownCameras, _by_name, read_known_cameras
+from stages.sfm.imported.pose_files import ImportedPoses, _by_name, read_poses
 from tests.refusals import refused
 
 W, H = 60, 40
@@ -50,10 +50,10 @@ LENS = {"fl_x": 50.0, "fl_y": 52.0, "cx": 31.0, "cy": 19.0}
 def read(tmp_path: Path):
     """Writes a transforms.json of these frames and values and reads it with PHOTOS."""
 
-    def write_and_read(frames: list[dict[str, Any]], photos: list[Photo] = PHOTOS, **values: Any) -> KnownCameras:
+    def write_and_read(frames: list[dict[str, Any]], photos: list[Photo] = PHOTOS, **values: Any) -> ImportedPoses:
         path = tmp_path / "transforms.json"
         path.write_text(json.dumps({**values, "frames": frames}))
-        return read_known_cameras(path, photos, NAMES)
+        return read_poses(path, photos, NAMES)
 
     return write_and_read
 
@@ -298,11 +298,11 @@ def test_the_convention_of_poses_may_be_given(tmp_path: Path) -> None:
     frames = [frame(i, transform_matrix=np.linalg.inv(pose).tolist()) for i, pose in enumerate(poses)]
     (tmp_path / "t.json").write_text(json.dumps({**LENS, "frames": frames}))
     convention = PoseConvention("camera-from-world", "opencv")
-    known = read_known_cameras(tmp_path / "t.json", PHOTOS, NAMES, convention)
+    known = read_poses(tmp_path / "t.json", PHOTOS, NAMES, convention)
     cameras = [Camera("PINHOLE", W, H, (50.0, 52.0, 31.0, 19.0))]
     inverted = [SparseImage(f"ä{i}.png", 0, np.linalg.inv(pose)[:3]) for i, pose in enumerate(poses)]
     write_model(tmp_path / "model", SparseModel.without_points(cameras, inverted))
-    of_colmap = read_known_cameras(tmp_path / "model", PHOTOS, {}, PoseConvention("world-from-camera", None))
+    of_colmap = read_poses(tmp_path / "model", PHOTOS, {}, PoseConvention("world-from-camera", None))
     for model in (known.model, of_colmap.model):
         for image, pose in zip(model.images, poses, strict=True):
             np.testing.assert_allclose(image.sfm_from_camera, pose[:3], atol=1e-12)
@@ -314,7 +314,7 @@ def test_blender_folders_keep_their_split(tmp_path: Path, with_test: bool) -> No
         if split == "train" or with_test:
             content = {"camera_angle_x": math.pi / 2, "frames": [frame(i) for i in indices]}
             (tmp_path / f"transforms_{split}.json").write_text(json.dumps(content))
-    known = read_known_cameras(tmp_path, PHOTOS, NAMES)
+    known = read_poses(tmp_path, PHOTOS, NAMES)
     assert len(known.model.images) == (3 if with_test else 2)
     assert known.test_files == (["a2.png"] if with_test else None)
     (camera,) = known.model.cameras
@@ -351,7 +351,7 @@ def test_points_behind_cameras_or_in_them_are_left_out(tmp_path: Path) -> None:
     behind = given.images[0].sfm_from_camera @ np.array([0.0, 0, -1, 1])
     harmed = dataclasses.replace(given, xyz=np.stack([behind, given.images[1].sfm_from_camera[:, 3]]))
     write_model(tmp_path, harmed)
-    known = read_known_cameras(tmp_path, PHOTOS, {})
+    known = read_poses(tmp_path, PHOTOS, {})
     assert "observations of points behind their cameras are left out" in known.notes[-1]
     seen = known.model
     depth = [
@@ -364,7 +364,7 @@ def test_points_behind_cameras_or_in_them_are_left_out(tmp_path: Path) -> None:
 
 def test_a_colmap_model_is_matched_by_name_and_keeps_its_points(tmp_path: Path) -> None:
     given = colmap_model(tmp_path, ["ä1.png", "elsewhere/ä0.png", "other.png"])
-    known = read_known_cameras(tmp_path, PHOTOS, {})
+    known = read_poses(tmp_path, PHOTOS, {})
     assert [image.file for image in known.model.images] == ["a0.png", "a1.png"]
     poses = {image.file: image.sfm_from_camera for image in given.images}
     np.testing.assert_allclose(known.model.images[0].sfm_from_camera, poses["elsewhere/ä0.png"], atol=1e-12)
@@ -377,14 +377,14 @@ def test_a_colmap_model_is_matched_by_name_and_keeps_its_points(tmp_path: Path) 
 def test_a_colmap_model_that_was_written_on_windows(tmp_path: Path) -> None:
     colmap_model(tmp_path, ["left\\ä0.png", "right\\ä0.png", "right\\ä1.png"])
     photos = [photo(0, folder="left/"), photo(0, folder="right/"), photo(1, folder="right\\")]
-    known = read_known_cameras(tmp_path, photos, {})
+    known = read_poses(tmp_path, photos, {})
     assert [image.file for image in known.model.images] == ["left/a0.png", "right/a0.png", "right\\a1.png"]
     assert known.notes == []
 
 
 def test_a_colmap_model_of_larger_photos_is_scaled(tmp_path: Path) -> None:
     colmap_model(tmp_path, ["ä0.png", "ä1.png"])
-    known = read_known_cameras(tmp_path, [photo(0, W // 2, H // 2), photo(1)], {})
+    known = read_poses(tmp_path, [photo(0, W // 2, H // 2), photo(1)], {})
     assert [camera.params for camera in known.model.cameras] == [(25, 15.5, 9.5, 0.1, 0), (50, 31, 19, 0.1, 0)]
     np.testing.assert_array_equal(known.model.xy, [[10, 5], [20, 15], [20, 10], [40, 30]])
 
@@ -393,13 +393,13 @@ def test_a_colmap_model_of_panoramas_is_refused(tmp_path: Path) -> None:
     given = colmap_model(tmp_path, ["ä0.png", "ä1.png"])
     write_model(tmp_path, dataclasses.replace(given, cameras=[Camera("EQUIRECTANGULAR", W, H, (float(W), float(H)))]))
     with refused("sfm.degenerate-camera", "ä0.png", "panoramas"):
-        read_known_cameras(tmp_path, PHOTOS, {})
+        read_poses(tmp_path, PHOTOS, {})
 
 
 def test_a_name_that_two_photos_share_matches_neither(tmp_path: Path) -> None:
     colmap_model(tmp_path, ["ä0.png", "ä1.png"])
     photos = [photo(0, folder="left/"), photo(0, folder="right/"), photo(1)]
-    known = read_known_cameras(tmp_path, photos, {})
+    known = read_poses(tmp_path, photos, {})
     assert [image.file for image in known.model.images] == ["a1.png"]
 
 
@@ -438,14 +438,14 @@ def test_images_have_the_photos_of_their_names(images: list[str], own: list[str]
 
 def test_cameras_of_photos_with_another_ending_are_taken_and_named(tmp_path: Path) -> None:
     colmap_model(tmp_path, ["ä0.jpg", "a1.png", "ä2.png"])
-    known = read_known_cameras(tmp_path, PHOTOS, {})
+    known = read_poses(tmp_path, PHOTOS, {})
     assert [image.file for image in known.model.images] == ["a0.png", "a1.png", "a2.png"]
     assert known.notes == ["1 photos have the cameras of files with another ending: ä0.png (ä0.jpg)"]
 
 
 def test_one_name_that_is_not_clear_leaves_the_other_cameras(tmp_path: Path) -> None:
     colmap_model(tmp_path, ["left/ä0.png", "right/ä0.png", "ä1.png"])
-    known = read_known_cameras(tmp_path, PHOTOS, {})
+    known = read_poses(tmp_path, PHOTOS, {})
     assert [image.file for image in known.model.images] == ["a1.png"]
     assert known.notes[0] == "2 cameras have no photo: left/ä0.png, right/ä0.png"
 
@@ -454,6 +454,6 @@ def test_the_fox_of_instant_ngp(shared_data: Path) -> None:
     content = json.loads((shared_data / "fox/transforms.json").read_text())
     names = {entry["file_path"]: Path(entry["file_path"]).name for entry in content["frames"]}
     photos = [Photo(name, f"images/{name}", 648, 1152, 0, None, None, False, 1.0) for name in names.values()]
-    known = read_known_cameras(shared_data / "fox/transforms.json", photos, names)
+    known = read_poses(shared_data / "fox/transforms.json", photos, names)
     assert len(known.model.images) == 50
     assert [(camera.model, camera.params[0]) for camera in known.model.cameras] == [("OPENCV", 825.312)]

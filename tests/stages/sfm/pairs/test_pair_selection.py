@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from nerf.geometry.georeference import cartesian
 from stages.sfm.pairs.pair_selection import (
     MAX_EXHAUSTIVE,
-    Places,
+    CapturePriors,
     choose,
     closeness,
     exhaustive,
@@ -60,13 +60,13 @@ def test_exhaustive_is_every_pair_once(count: int) -> None:
     pairs = exhaustive(count)
     assert is_proper(pairs)
     assert len(pairs) == count * (count - 1) // 2
-    np.testing.assert_array_equal(start_pairs("exhaustive", 3, count, Places(), unused), pairs)
+    np.testing.assert_array_equal(start_pairs("exhaustive", 3, count, CapturePriors(), unused), pairs)
 
 
 @given(st.integers(2, 40), st.integers(1, 50), st.integers(0, 5))
 def test_retrieval_begins_with_the_most_similar_and_all_hang_together(count: int, neighbours: int, seed: int) -> None:
     alike = similarity(count, seed)
-    pairs = start_pairs("retrieval", neighbours, count, Places(), lambda: alike)
+    pairs = start_pairs("retrieval", neighbours, count, CapturePriors(), lambda: alike)
     assert is_proper(pairs)
     assert groups(pairs, count) == 1
     for photo, found in enumerate(partners(pairs, count)):
@@ -79,7 +79,7 @@ def test_two_groups_that_look_like_themselves_only_are_joined_by_their_likest_pa
     alike[:3, :3] = alike[3:, 3:] = 0.9
     alike[1, 5] = alike[5, 1] = 0.1
     assert groups(nearest(alike, 2), 6) == 2
-    assert [1, 5] in start_pairs("retrieval", 2, 6, Places(), lambda: alike).tolist()
+    assert [1, 5] in start_pairs("retrieval", 2, 6, CapturePriors(), lambda: alike).tolist()
 
 
 @given(st.integers(1, 12), st.integers(0, 9))
@@ -114,7 +114,7 @@ def test_a_video_that_returns_is_closed_by_what_looks_alike() -> None:
     times[shuffled] = np.arange(60) / 30
     frame = np.argsort(shuffled)
     alike = around[np.ix_(frame, frame)]
-    pairs = start_pairs("sequential", 10, 60, Places(time_s=times), lambda: alike)
+    pairs = start_pairs("sequential", 10, 60, CapturePriors(time_s=times), lambda: alike)
     found = {frozenset(pair) for pair in pairs.tolist()}
     assert frozenset((int(shuffled[0]), int(shuffled[59]))) in found
     assert all(frozenset((int(a), int(b))) in found for a, b in pairwise(shuffled))
@@ -122,7 +122,7 @@ def test_a_video_that_returns_is_closed_by_what_looks_alike() -> None:
 
 
 def test_without_times_a_sequence_goes_by_name() -> None:
-    pairs = start_pairs("sequential", 5, 12, Places(), lambda: similarity(12)).tolist()
+    pairs = start_pairs("sequential", 5, 12, CapturePriors(), lambda: similarity(12)).tolist()
     assert all([i, i + 1] in pairs for i in range(11))
 
 
@@ -152,7 +152,7 @@ def test_nearest_places_are_those_next_door() -> None:
     walk = union(np.stack([steps[:-1], steps[1:]], axis=1), np.array([[0, 2], [17, 19]]))
     assert nearest(closeness(places), 2).tolist() == walk.tolist()
     alike = similarity(20)
-    pairs = start_pairs("spatial", 4, 20, Places(position_m=places), lambda: alike)
+    pairs = start_pairs("spatial", 4, 20, CapturePriors(position_m=places), lambda: alike)
     assert is_proper(pairs) and groups(pairs, 20) == 1
     assert {*map(tuple, walk.tolist())} < {*map(tuple, pairs.tolist())}
     assert min(map(len, partners(pairs, 20))) >= 4
@@ -164,7 +164,7 @@ def test_where_positions_tell_nothing_looks_choose_half_of_the_partners(error_m:
     angle = 2 * np.pi * np.arange(120) / 120
     alike = np.cos(angle[:, None] - angle[None])
     places = np.random.default_rng(0).normal(0, error_m, (120, 3))
-    found = partners(start_pairs("spatial", 30, 120, Places(position_m=places), lambda: alike), 120)
+    found = partners(start_pairs("spatial", 30, 120, CapturePriors(position_m=places), lambda: alike), 120)
     likest = partners(nearest(alike, 14), 120)
     assert all(mine <= theirs for mine, theirs in zip(likest, found, strict=True))
     assert sum(map(len, found)) <= 2 * 120 * 30
@@ -183,13 +183,15 @@ def test_a_second_look_takes_as_many_pairs_again_for_the_missing() -> None:
 
 
 def test_pairs_are_chosen_of_sets_above_ordinary_size() -> None:
-    assert choose(MAX_EXHAUSTIVE, 30, Places()) == "exhaustive"
-    assert choose(MAX_EXHAUSTIVE + 1, 30, Places()) == "retrieval"
+    assert choose(MAX_EXHAUSTIVE, 30, CapturePriors()) == "exhaustive"
+    assert choose(MAX_EXHAUSTIVE + 1, 30, CapturePriors()) == "retrieval"
 
 
 def test_time_and_place_are_used_where_they_are_known() -> None:
     along = np.arange(200.0)
     street = np.stack([5 * along, 0 * along, 0 * along], axis=1)
-    assert choose(200, 30, Places(time_s=along, position_m=street)) == "sequential"
-    assert choose(200, 30, Places(position_m=street)) == "spatial"
-    assert choose(200, 30, Places(position_m=street / 100)) == "retrieval", "GPS does not tell photos in a room apart"
+    assert choose(200, 30, CapturePriors(time_s=along, position_m=street)) == "sequential"
+    assert choose(200, 30, CapturePriors(position_m=street)) == "spatial"
+    assert choose(200, 30, CapturePriors(position_m=street / 100)) == "retrieval", (
+        "GPS does not tell photos in a room apart"
+    )

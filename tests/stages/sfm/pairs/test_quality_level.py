@@ -7,18 +7,18 @@ from stages import sfm
 from stages.contract import StageError
 from stages.io.photos import Photo
 from stages.sfm.pairs import quality_level
-from stages.sfm.pairs.pair_selection import Places
+from stages.sfm.pairs.pair_selection import CapturePriors
 from stages.sfm.pairs.quality_level import (
-    TIERS,
+    QUALITY_LEVELS,
     Chosen,
     Cost,
     Open,
-    Tier,
+    QualityLevel,
     _sample,
     check_matcher,
     chosen,
     measure,
-    tiers_of,
+    quality_levels,
 )
 from tests.synthetic_photos import SyntheticPhotos
 
@@ -29,11 +29,11 @@ def photos(count: int) -> list[Photo]:
     return [Photo(f"{i}.jpg", f"images/{i}.jpg", 240, 180, 0, None, None, False, 1.0) for i in range(count)]
 
 
-def costing(monkeypatch: pytest.MonkeyPatch, *seconds: tuple[float, float]) -> list[Tier]:
+def costing(monkeypatch: pytest.MonkeyPatch, *seconds: tuple[float, float]) -> list[QualityLevel]:
     """Let tiers cost so much, one after the other; the answer grows by what is measured."""
-    asked: list[Tier] = []
+    asked: list[QualityLevel] = []
 
-    def measured(_: list[Photo], __: Path, tier: Tier, ___: str) -> Cost:
+    def measured(_: list[Photo], __: Path, tier: QualityLevel, ___: str) -> Cost:
         asked.append(tier)
         return Cost(*seconds[len(asked) - 1])
 
@@ -44,16 +44,16 @@ def costing(monkeypatch: pytest.MonkeyPatch, *seconds: tuple[float, float]) -> l
 @pytest.mark.parametrize(
     ("places", "matcher"),
     [
-        (Places(), "retrieval"),
-        (Places(time_s=np.arange(400.0)), "sequential"),
-        (Places(position_m=9.0 * np.indices((400, 3))[0]), "spatial"),
+        (CapturePriors(), "retrieval"),
+        (CapturePriors(time_s=np.arange(400.0)), "sequential"),
+        (CapturePriors(position_m=9.0 * np.indices((400, 3))[0]), "spatial"),
     ],
 )
 def test_pairs_of_many_photos_are_chosen_by_what_is_known(
-    places: Places, matcher: str, progress, monkeypatch: pytest.MonkeyPatch
+    places: CapturePriors, matcher: str, progress, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked = costing(monkeypatch)
-    monkeypatch.setattr(quality_level, "places_of", lambda _: places)
+    monkeypatch.setattr(quality_level, "capture_priors", lambda _: places)
     assert chosen(ALL_OPEN, photos(400), Path(), 30, progress, None) == (1600, 4096, matcher)
     assert not asked and len(progress.notes) == 1
 
@@ -61,24 +61,28 @@ def test_pairs_of_many_photos_are_chosen_by_what_is_known(
 @pytest.mark.parametrize(
     ("costs", "tier"),
     [
-        ([(0.36, 0.034)], Tier(1600, 4096)),
-        ([(0.72, 0.068), (0.18, 0.009)], Tier(1131, 2048)),
-        ([(0.72, 0.068), (0.54, 0.05), (0.12, 0.002)], Tier(1131, 1024)),
-        ([(0.72, 0.068), (0.70, 0.067), (0.70, 0.066)], Tier(1600, 4096)),  # a step down saves too little
+        ([(0.36, 0.034)], QualityLevel(1600, 4096)),
+        ([(0.72, 0.068), (0.18, 0.009)], QualityLevel(1131, 2048)),
+        ([(0.72, 0.068), (0.54, 0.05), (0.12, 0.002)], QualityLevel(1131, 1024)),
+        ([(0.72, 0.068), (0.70, 0.067), (0.70, 0.066)], QualityLevel(1600, 4096)),  # a step down saves too little
     ],
 )
 def test_features_give_way_only_to_a_time_that_is_given(
-    costs: list[tuple[float, float]], tier: Tier, progress, monkeypatch: pytest.MonkeyPatch
+    costs: list[tuple[float, float]], tier: QualityLevel, progress, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked = costing(monkeypatch, *costs)
     assert chosen(ALL_OPEN, photos(400), Path(), 30, progress, 900.0) == Chosen(*tier, "retrieval")
-    assert asked == list(TIERS[: len(costs)])
+    assert asked == list(QUALITY_LEVELS[: len(costs)])
     assert chosen(ALL_OPEN, photos(400), Path(), 30, progress, None) == Chosen(1600, 4096, "retrieval")
 
 
 def test_what_is_given_stays_in_every_tier(progress, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert tiers_of(Open(None, 8192, None)) == [Tier(1600, 8192), Tier(1131, 8192)]
-    assert tiers_of(Open(2400, None, None)) == [Tier(2400, 4096), Tier(2400, 2048), Tier(2400, 1024)]
+    assert quality_levels(Open(None, 8192, None)) == [QualityLevel(1600, 8192), QualityLevel(1131, 8192)]
+    assert quality_levels(Open(2400, None, None)) == [
+        QualityLevel(2400, 4096),
+        QualityLevel(2400, 2048),
+        QualityLevel(2400, 1024),
+    ]
     asked = costing(monkeypatch, (0.36, 0.034), (0.18, 0.009))
     every_pair = chosen(Open(None, None, "exhaustive"), photos(200), Path(), 30, progress, 900.0)
     assert every_pair == Chosen(1131, 2048, "exhaustive") and len(asked) == 2
@@ -120,10 +124,10 @@ def test_features_and_pairs_take_time(synthetic_photos: SyntheticPhotos, indexed
 
 
 def test_places_are_needed_to_go_by_places() -> None:
-    check_matcher("spatial", Places(position_m=np.zeros((3, 3))))
-    check_matcher("retrieval", Places())
+    check_matcher("spatial", CapturePriors(position_m=np.zeros((3, 3))))
+    check_matcher("retrieval", CapturePriors())
     with pytest.raises(StageError) as caught:
-        check_matcher("spatial", Places())
+        check_matcher("spatial", CapturePriors())
     assert caught.value.what == "cannot choose pairs of photos by place"
     assert caught.value.why == "not all photos tell by EXIF where they were taken"
     assert "--sfm.matcher retrieval" in caught.value.hint
@@ -132,7 +136,7 @@ def test_places_are_needed_to_go_by_places() -> None:
 def test_where_time_is_given_sets_of_ordinary_size_give_way_too(progress, monkeypatch: pytest.MonkeyPatch) -> None:
     asked = costing(monkeypatch, (0.5, 0.05), (0.2, 0.01))
     assert chosen(ALL_OPEN, photos(50), Path(), 30, progress, 60.0) == Chosen(1131, 2048, "exhaustive")
-    assert asked == list(TIERS[:2]) and "50 photos searched at 1600 pixels" in progress.notes[0]
+    assert asked == list(QUALITY_LEVELS[:2]) and "50 photos searched at 1600 pixels" in progress.notes[0]
 
 
 def test_time_enough_is_found_by_measuring_or_beyond_doubt_without(progress, monkeypatch: pytest.MonkeyPatch) -> None:
