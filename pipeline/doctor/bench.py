@@ -48,6 +48,7 @@ def _line(name: str, rate: float, count: int, unit: str) -> str:
 def _meaning(products: dict[int, float], reads: float, copied: float, count: int) -> list[str]:
     """What training can reach here at most: the work of a ray that nothing can save, at these rates."""
     from nerf.runtime.machine_rates import Rates
+    from nerf.runtime.profiler import WorkCounts
     from stages.amounts import short_count
     from stages.train.fields.hash_grid import SAMPLES_PER_RAY
 
@@ -69,6 +70,7 @@ def grid_work(contracted: bool, densities: float) -> "WorkCounts":
     from nerf.fields import mlp
     from nerf.fields.hash_grid import CORNERS, HashGridField
     from nerf.kernels import torch as reference
+    from nerf.runtime.profiler import WorkCounts
     from nerf.training.hash_grid_trainer import ADAM_BYTES
     from stages.hardware.device import compute_device
     from stages.train.config import Config
