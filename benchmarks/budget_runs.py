@@ -31,10 +31,10 @@ from stages.effects.decisions import Decisions, image_effects, read_decisions, t
 from stages.hardware.backend import chosen_backend, load_backend
 from stages.hardware.device import compute_device
 from stages.io.files import read_json, read_scene
-from stages.train import Config, with_habits
-from stages.train.data import guided_dataset, training_dataset
-from stages.train.setup import field_background, make_trainer
-from stages.train.size import chosen_downscale, grid_size, rays_per_step
+from stages.train import Config
+from stages.train.data import field_background, guided_dataset, training_dataset
+from stages.train.fields import field_of, make_trainer, with_defaults
+from stages.train.planning import chosen_downscale
 
 BUDGETS = (125, 250, 500, 1000, 2000)
 ONCE = 1000  # steps that draw every pixel of the training photos once: it is their number that gives the photos' size
@@ -73,7 +73,7 @@ def bench_of(workspace: Path) -> Bench:
     keys = read_json(workspace / "run.json")["keys"]
     inputs = {stage: workspace / stage / keys[stage][:16] for stage in ("ingest", "normalise", "effects")}
     scene, decisions = read_scene(inputs["normalise"]), read_decisions(inputs["effects"])
-    config = with_habits(
+    config = with_defaults(
         Config(
             field="grid",
             contracted="background" in decisions.on,
@@ -82,10 +82,10 @@ def bench_of(workspace: Path) -> Bench:
             chunks=CHUNKS,
         )
     )
-    rays = ONCE * rays_per_step(config)
+    rays = ONCE * field_of(config).rays_per_step(config)
     downscale = chosen_downscale(scene, rays)
     config = config.model_copy(update={"downscale": downscale})
-    config = config.model_copy(update=grid_size(config, scene, rays))
+    config = field_of(config).with_sizes(config, scene, rays)
     train = guided_dataset(inputs, scene, downscale, Quiet())
     test = training_dataset(inputs["ingest"], scene, "test", downscale, Quiet())
     shown_over = torch.tensor(field_background(config, scene))

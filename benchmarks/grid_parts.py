@@ -18,6 +18,7 @@ from benchmarks.nerfacto import pipeline, stage_folder
 from benchmarks.pixel_store import Spoken
 from benchmarks.record import Record, add_out
 from nerf.geometry.scene import Scene
+from nerf.runtime.machine_rates import measure_rates
 from nerf.runtime.matmul_precision import use_matmul_precision
 from nerf.training.ray_dataset import RayDataset
 from nerf.training.trainer import FieldTrainer
@@ -26,8 +27,8 @@ from stages.hardware.device import compute_device, cores
 from stages.io.files import read_scene
 from stages.train import Config, plan
 from stages.train.data import guided_dataset
-from stages.train.profile import FIRST_TIMED, observed, parts_table, rates_for
-from stages.train.setup import make_trainer
+from stages.train.fields import field_of, make_trainer
+from stages.train.profile import FIRST_TIMED, RATES_SECONDS, observed, parts_table
 
 LINKED = {"ingest": "photos.json", "normalise": "scene.json", "effects": "effects.json"}
 WARM_STEPS, TIMED_STEPS = 300, 60
@@ -55,7 +56,9 @@ def main() -> None:
             trainer.step(step, SHARE, 1.0)
         for step in range(WARM_STEPS, WARM_STEPS + TIMED_STEPS):
             observed(partial(trainer.step, step, SHARE, 1.0), FIRST_TIMED, timings, device)
-        table = parts_table(timings, rates_for(trainer.model, device))
+        field = field_of(config)
+        rates = measure_rates(device, field.matmul_width(config), field.table_rows(config), RATES_SECONDS)
+        table = parts_table(timings, rates)
     report(table)
     Record(given.out).add(
         set=given.photos.name,

@@ -72,8 +72,8 @@ def score_ours(workspace: Path) -> float:
     from stages.effects.decisions import expected_gains
     from stages.io.files import read_json, read_scene
     from stages.render.renderer import load_painter
+    from stages.train.config import WHITE
     from stages.train.data import PhotoReader, view_rays
-    from stages.train.setup import WHITE
 
     scene, train = read_scene(stage_folder(workspace, "scene.json")), stage_folder(workspace, "curve.json")
     painter, info = load_painter(train), read_json(train / "field.json")
@@ -94,8 +94,8 @@ def export(workspace: Path, downscale: float, target: Path) -> tuple[int, int]:
     from PIL import Image
 
     from stages.io.files import read_json, read_scene, write_json
+    from stages.train.config import WHITE
     from stages.train.data import PhotoReader, scaled_size
-    from stages.train.setup import WHITE
 
     ingest, normalise = stage_folder(workspace, "photos.json"), stage_folder(workspace, "scene.json")
     scene = read_scene(normalise)

@@ -36,10 +36,9 @@ from stages.hardware.backend import chosen_backend
 from stages.hardware.device import compute_device
 from stages.hardware.memory import available_bytes
 from stages.io import pixel_store
-from stages.train import Config, with_habits
+from stages.train import Config
 from stages.train.data import training_dataset
-from stages.train.setup import make_trainer
-from stages.train.size import grid_size
+from stages.train.fields import field_of, make_trainer, with_defaults
 
 WIDTH, HEIGHT = 4000, 3000
 DIFFERENT = 4  # photos that are painted; the others are copies
@@ -106,8 +105,8 @@ def train(ingest: Path, scene: Scene, downscale: float) -> dict[str, Any]:
     """The time of a step of training on a store that has been made, and the memory of the process that took it."""
     device = compute_device()
     asked = Config(field="grid", contracted=True, view_dependence=True, downscale=downscale)
-    config = with_habits(asked.model_copy(update={"backend": chosen_backend(device, Spoken())}))
-    config = config.model_copy(update=grid_size(config, scene, rays=math.inf))
+    config = with_defaults(asked.model_copy(update={"backend": chosen_backend(device, Spoken())}))
+    config = field_of(config).with_sizes(config, scene, rays=math.inf)
     dataset = training_dataset(ingest, scene, "train", downscale, Spoken()).to(device)
     trainer, step = make_trainer(config, scene, dataset, config.seed), itertools.count()
     taken = milliseconds(lambda: trainer.step(next(step), 0.0, 1.0), STEPS)

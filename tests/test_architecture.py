@@ -1,6 +1,7 @@
 """The rules of the house, checked on the source as it stands: one test a rule, which lists who breaks it."""
 
 import ast
+import inspect
 import subprocess
 import sys
 from collections.abc import Callable, Iterable, Iterator
@@ -298,7 +299,7 @@ def test_options_are_documented():
     from pipeline.engine.stage_list import STAGES
 
     for name, module in STAGES.items():
-        source = Path(module.__file__ or "").read_text("utf-8")
+        source = Path(inspect.getsourcefile(module.Config) or "").read_text("utf-8")
         config = next(n for n in ast.parse(source).body if isinstance(n, ast.ClassDef) and n.name == "Config")
         for field, following in zip(config.body, [*config.body[1:], None], strict=True):
             if isinstance(field, ast.AnnAssign):

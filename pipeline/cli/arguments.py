@@ -15,8 +15,8 @@ from pydantic import ValidationError
 from pipeline.cli.settings import UsageError, wrong_options
 from pipeline.engine.settings import Settings
 from stages.render import Config as RenderConfig
-from stages.train import GRID_ONLY, PAPER_ONLY
-from stages.train import Config as TrainConfig
+from stages.train.config import GRID_ONLY, PAPER_ONLY
+from stages.train.config import Config as TrainConfig
 
 T = TypeVar("T")
 

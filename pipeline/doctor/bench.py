@@ -9,8 +9,9 @@ if TYPE_CHECKING:
 
 SECONDS = 0.3  # for each rate
 TABLES = {"2¹⁷": 1 << 17, "2²⁰": 1 << 20}  # rows: of one grid, of all of a large field
-# Of a ray while the hash-grid field trains: densities asked for, beside the colours of stages/train/size.py. Over a run
-# lego_400, fox, banana and fountain_p11 ask for 2.3 to 2.9 for each colour (docs/experiments/ray_samples.md).
+# Of a ray while the hash-grid field trains: densities asked for, beside the colours of
+# stages/train/fields/hash_grid.py. Over a run lego_400, fox, banana and fountain_p11 ask for 2.3 to 2.9 for each colour
+# (docs/experiments/ray_samples.md).
 DENSITIES = {"bounded": 7, "contracted": 24}
 WHERE = {"bounded": "around an object", "contracted": "in unbounded space"}
 PAPER_RAYS = {"paper field as published": (8, 256, 64, 128), "paper field 4 × 64": (4, 64, 32, 32)}
@@ -47,8 +48,9 @@ def _line(name: str, rate: float, count: int, unit: str) -> str:
 def _meaning(products: dict[int, float], reads: float, copied: float, count: int) -> list[str]:
     """What training can reach here at most: the work of a ray that nothing can save, at these rates."""
     from nerf.runtime.machine_rates import Rates
+    from nerf.runtime.profiler import WorkCounts
     from stages.amounts import short_count
-    from stages.train.size import SAMPLES_PER_RAY
+    from stages.train.fields.hash_grid import SAMPLES_PER_RAY
 
     lines = ["at these rates, with nothing else to do and no core waiting, training would reach"]
     for space, densities in DENSITIES.items():
@@ -68,15 +70,15 @@ def grid_work(contracted: bool, densities: float) -> "WorkCounts":
     from nerf.fields import mlp
     from nerf.fields.hash_grid import CORNERS, HashGridField
     from nerf.kernels import torch as reference
+    from nerf.runtime.profiler import WorkCounts
     from nerf.training.hash_grid_trainer import ADAM_BYTES
     from stages.hardware.device import compute_device
-    from stages.train import Config, with_habits
-    from stages.train.setup import grid_settings
-    from stages.train.size import SAMPLES_PER_RAY, rays_per_step, timed_settings
+    from stages.train.config import Config
+    from stages.train.fields.hash_grid import SAMPLES_PER_RAY, field_settings, rays_per_step, timed, with_defaults
 
     asked = Config(field="grid", contracted=contracted, view_dependence=True)
-    config = timed_settings(with_habits(asked), compute_device())
-    model = HashGridField(grid_settings(config, sky=False), 0, reference)
+    config = timed(with_defaults(asked), compute_device())
+    model = HashGridField(field_settings(config, sky=False), 0, reference)
     density, colour = mlp.density_flops(model.weights), mlp.colour_flops(model.weights)
     colours = SAMPLES_PER_RAY[config.space]
     rows = CORNERS * model.settings.num_levels * (densities + colours)

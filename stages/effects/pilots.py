@@ -13,7 +13,7 @@ from stages.contract import Inputs, Progress, StageError
 from stages.effects.decisions import Decisions, image_effects
 from stages.effects.effect_list import EFFECTS
 from stages.evaluate.image_metrics import FEWEST_FOR_INTERVAL, mean_interval
-from stages.train.setup import BLACK
+from stages.train.config import BLACK
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from nerf.geometry.rays import Rays
     from nerf.geometry.scene import Scene
     from nerf.training.ray_dataset import RayDataset
-    from stages.train import Config as TrainConfig
+    from stages.train.config import Config as TrainConfig
 
 LONG_SIDE = 200  # pixels of the photos in a pilot
 MOST_KEPT = 4  # of the training photos, to judge by; with fewer than FEWEST_FOR_INTERVAL their own noise is not known
@@ -117,7 +117,7 @@ def expected_seconds(scene: "Scene", steps: int) -> tuple[float, float]:
     """What a pilot takes here: its trainings, by a few steps of a fresh field, and what goes on beside them; and what a
     pilot takes that fits poses, too."""
     from stages.hardware.device import compute_device, cores
-    from stages.train.size import seconds_per_step
+    from stages.train.planning import seconds_per_step
 
     arm, device = Decisions({"view_dependence": {}} | ({} if scene.has_alpha else {"background": {}})), compute_device()
     per_step = seconds_per_step(_config(arm, steps, device), scene, arm, device)
@@ -157,7 +157,7 @@ def _noise(gains: list[list[float]]) -> float:
 def _trained(trial: PilotScene, arm: Decisions, steps: int, seed: int) -> "HashGridField":
     """A hash-grid field after ``steps`` steps under the decisions of one arm."""
     from nerf.fields.hash_grid import HashGridField
-    from stages.train.setup import make_trainer
+    from stages.train.fields import make_trainer
 
     effects = image_effects(arm, trial.scene.of_split("train"), trial.dataset)
     trainer = make_trainer(_config(arm, steps, trial.dataset.device.type), trial.scene, trial.dataset, seed, effects)
@@ -170,9 +170,10 @@ def _trained(trial: PilotScene, arm: Decisions, steps: int, seed: int) -> "HashG
 def _config(arm: Decisions, steps: int, device: str) -> "TrainConfig":
     """A small hash-grid field with what stage train would choose."""
     from stages.hardware.backend import chosen_backend
-    from stages.train import Config, with_habits
+    from stages.train.config import Config
+    from stages.train.fields import with_defaults
 
-    return with_habits(
+    return with_defaults(
         Config(
             field="grid",
             steps=steps,

@@ -26,7 +26,7 @@ from stages.evaluate.image_metrics import ERROR_SCALE, FEWEST_FOR_INTERVAL, erro
 from stages.io.files import read_json, read_scene, write_json, write_png
 from stages.io.photos import spread
 from stages.train import trained_seconds
-from stages.train.setup import BLACK, WHITE
+from stages.train.config import BLACK, WHITE
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -35,7 +35,6 @@ from stages.report.plots import ORDER_COLOURS, camera_svgs, curve_svg
 from stages.report.profile import parts_bar
 from stages.tradeoff.plots import COLUMNS, plot_svg, rendering_sentence, table_cells
 from stages.train.curve import coming_doubling, doubling_words, knee_words, more_option, ssim_words
-from stages.train.profile import PARTS_FILE
 
 if TYPE_CHECKING:
     from stages.report import Config
@@ -81,7 +80,7 @@ def read_results(inputs: Inputs, stages: Sequence[str]) -> Results:
         effects=of("effects", "effects.json"),
         field=of("train", "field.json"),
         curve=of("train", "curve.json"),
-        parts=of("train", PARTS_FILE) if "train" in inputs and (inputs["train"] / PARTS_FILE).exists() else None,
+        parts=of("train", "parts.json") if "train" in inputs and (inputs["train"] / "parts.json").exists() else None,
         metrics=of("evaluate", "metrics.json"),
         study=of("tradeoff", "tradeoff.json"),
     )

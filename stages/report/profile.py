@@ -2,8 +2,6 @@
 
 from typing import Any
 
-from stages.train.profile import WAITING
-
 # By part: its colour in the bar, and what it does.
 PARTS = {
     "batch": ("#64748b", "pixels and rays of the batch"),
@@ -18,7 +16,7 @@ PARTS = {
     "optimiser": ("#a16207", "Adam"),
     "cache": ("#14b8a6", "update of the occupancy grid"),
     "rest": ("#94a3b8", "everything between these parts"),
-    WAITING: ("transparent", "cores waiting for each other, or for other programs"),
+    "waiting": ("transparent", "cores waiting for each other, or for other programs"),
 }
 
 
@@ -27,7 +25,7 @@ def parts_bar(table: dict[str, Any] | None) -> dict[str, Any] | None:
     timed."""
     if table is None:
         return None
-    ordered = sorted(table["parts"], key=lambda row: row["part"] == WAITING)
+    ordered = sorted(table["parts"], key=lambda row: row["part"] == "waiting")
     rows = [row | dict(zip(("colour", "words"), PARTS[row["part"]], strict=True)) for row in ordered]
     for row in rows:
         row["percent"] = 100 * row["share"]

@@ -32,8 +32,8 @@ from stages.io.photos import spread
 from stages.io.stopwatch import periodically
 from stages.render.renderer import TIMED_SECONDS, load_painter
 from stages.tradeoff.schedule import SCORING_STRIDE, SMALL_SIDE, WORKSPACE_FIELD, Run, scoring_stride
+from stages.train.config import BLACK, WHITE
 from stages.train.data import ALL_MASKED, PhotoReader, scaled_size, view_mask, view_rays
-from stages.train.setup import BLACK, WHITE
 
 CROP_SIZE = 64  # pixels along an edge
 NUM_SHOWN = 3  # held-out photos kept as pictures

@@ -20,8 +20,10 @@ from stages.effects.decisions import Space, read_decisions
 from stages.hardware.device import processors
 from stages.io.ascii_names import shell_quoted
 from stages.io.pixels import load_pixels
+from stages.train import fields
 from stages.train.data import scaled_size
-from stages.train.size import GRID_SIZES, chosen_downscale, rays_per_second, rays_per_step
+from stages.train.fields import hash_grid
+from stages.train.planning import chosen_downscale, rays_per_second
 
 LONGEST_RUN = 1 / 20
 LEVEL_RATIO = 1.7
@@ -187,7 +189,7 @@ def family_of(variant: str) -> str:
 def grid_sizes(size: GridSize, space: Space) -> dict[str, int]:
     """Sizes of a grid field: those that stage train has on a CPU for long runs (``usual``) and for short ones, whatever
     the size of the photos, and larger still, by one grid, twice the rows and twice the cells along an axis."""
-    (_, levels, log2_rows, finest), (_, *small) = GRID_SIZES[space]
+    (_, levels, log2_rows, finest), (_, *small) = hash_grid.SIZES[space]
     of = {"small": small, "usual": (levels, log2_rows, finest), "large": (levels + 1, log2_rows + 1, 2 * finest)}
     return dict(zip(("levels", "log2_rows", "finest"), of[size], strict=True))
 
@@ -348,11 +350,11 @@ def measure_speeds(scene: Scene, inputs: Inputs, seconds: float, progress: Progr
         if VARIANTS[name].family == "published":
             reduced = _planned(REDUCED, decisions.space, inputs, progress)
             rays = speeds[REDUCED].rays * _multiplications(reduced) / _multiplications(config)
-            if LONGEST_RUN * seconds * rays < VARIANTS[name].min_steps * rays_per_step(config):
-                speeds[name] = Speed(rays / rays_per_step(config), rays)
+            if LONGEST_RUN * seconds * rays < VARIANTS[name].min_steps * fields.field_of(config).rays_per_step(config):
+                speeds[name] = Speed(rays / fields.field_of(config).rays_per_step(config), rays)
                 continue
         rays = rays_per_second(config, scene, decisions)
-        speeds[name] = Speed(rays / rays_per_step(config), rays)
+        speeds[name] = Speed(rays / fields.field_of(config).rays_per_step(config), rays)
     return speeds
 
 

@@ -9,13 +9,13 @@ import hashlib
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
+
+from safetensors.torch import load, save
+from torch import Tensor
 
 from stages.io.files import write_durably
 from stages.train.health_check import Lost
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 KEPT = 2
 
@@ -24,14 +24,12 @@ class Checkpoint(NamedTuple):
     """A training state: tensors, and whatever else the run must know to go on, as JSON values."""
 
     step: int
-    tensors: "dict[str, Tensor]"
+    tensors: dict[str, Tensor]
     facts: dict[str, Any]
 
 
 def save_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
     """Write ``checkpoint`` and forget all but the last KEPT."""
-    from safetensors.torch import save
-
     folder.mkdir(parents=True, exist_ok=True)
     tensors = save({name: tensor.contiguous() for name, tensor in checkpoint.tensors.items()})
     name = f"{checkpoint.step:09d}"
@@ -90,8 +88,6 @@ def _digest(name: str, facts: dict[str, Any], tensors: bytes) -> str:
 
 
 def _read(folder: Path, step: int) -> Checkpoint:
-    from safetensors.torch import load
-
     meta = json.loads((folder / f"{step:09d}.json").read_bytes())
     tensors = (folder / f"{step:09d}.safetensors").read_bytes()
     if _digest(f"{step:09d}", meta["facts"], tensors) != meta["sha256"]:

@@ -8,13 +8,12 @@ the rate fell once, at the end, and never rose again to go on.
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from nerf.training.learning_curve import KNEE_DB, Gain, knee, last_doubling, next_doubling, quality_at
 from stages.amounts import duration, duration_option
+from stages.hardware.device import compute_device, cores
 from stages.io.files import write_json
-
-if TYPE_CHECKING:
-    from nerf.training.learning_curve import Gain
 
 BARS = "▁▂▃▄▅▆▇█"
 SPARK_WIDTH = 10
@@ -22,8 +21,6 @@ SPARK_WIDTH = 10
 
 def write_curve(folder: Path, field: str, downscale: float, whole: bool, points: list[dict[str, Any]]) -> None:
     """Write curve.json of a run that ends on this machine."""
-    from stages.hardware.device import compute_device, cores
-
     about = {"field": field, "downscale": downscale, "device": compute_device(), "threads": cores(), "whole": whole}
     write_json(folder / "curve.json", about | {"points": points})
 
@@ -34,19 +31,15 @@ def heldout_curve(points: Sequence[dict[str, Any]]) -> list[tuple[float, float]]
     return [(seconds, psnr) for seconds, psnr in known if psnr is not None and seconds > 0]
 
 
-def coming_doubling(field: str, whole: bool, points: Sequence[dict[str, Any]]) -> "Gain | None":
+def coming_doubling(field: str, whole: bool, points: Sequence[dict[str, Any]]) -> Gain | None:
     """What the next doubling of the time is predicted to buy at the same sizes of photos and field, as ``--more`` keeps
     them; None where the curve is too short, and for what the prediction was not fitted to: the paper's field, whose
     rate falls all the way, and a run that is not ``whole``, where half of the time may have ended annealed, too."""
-    from nerf.training.learning_curve import next_doubling
-
     return next_doubling(heldout_curve(points), points[-1]["step"]) if points and field == "grid" and whole else None
 
 
-def doubling_words(points: Sequence[dict[str, Any]], coming: "Gain | None") -> str | None:
+def doubling_words(points: Sequence[dict[str, Any]], coming: Gain | None) -> str | None:
     """What the last doubling of the time bought and what is ``coming``; None where the curve is too short."""
-    from nerf.training.learning_curve import last_doubling
-
     curve = heldout_curve(points)
     last = last_doubling(curve)
     if last is None:
@@ -61,7 +54,7 @@ def doubling_words(points: Sequence[dict[str, Any]], coming: "Gain | None") -> s
     return f"{words}; {again} is predicted to buy {coming.db:+z.1f} dB (± {coming.half_width:.1f})"
 
 
-def next_words(points: Sequence[dict[str, Any]], coming: "Gain | None") -> str | None:
+def next_words(points: Sequence[dict[str, Any]], coming: Gain | None) -> str | None:
     """:func:`doubling_words` for a line that has no room."""
     gain = coming and f"{coming.db:+z.1f} ± {coming.half_width:.1f} dB"
     return gain and f"as long again ({more_option(points)}) is predicted to buy {gain}"
@@ -83,8 +76,6 @@ def target_words(target: float | None, reached: float | None, seconds: float) ->
 
 def knee_words(points: Sequence[dict[str, Any]]) -> str | None:
     """Where the knee is, or that there is none; None where the curve is too short to tell."""
-    from nerf.training.learning_curve import KNEE_DB, knee, last_doubling
-
     curve = heldout_curve(points)
     if last_doubling(curve) is None:
         return None
@@ -99,8 +90,6 @@ def ssim_words(points: Sequence[dict[str, Any]]) -> str | None:
     known = [(p["seconds"], p["heldout_ssim"]) for p in points if p["heldout_ssim"] is not None and p["seconds"] > 0]
     if len(known) < 2 or known[0][0] > known[-1][0] / 2:
         return None
-    from nerf.training.learning_curve import quality_at
-
     before, after = quality_at(known, known[-1][0] / 2), known[-1][1]
     if f"{before:.2f}" == f"{after:.2f}":
         return f"SSIM stayed at {after:.2f} in that doubling"
@@ -109,8 +98,6 @@ def ssim_words(points: Sequence[dict[str, Any]]) -> str | None:
 
 def sparkline(points: Sequence[dict[str, Any]]) -> str:
     """Held-out PSNR from the first measurement to the last, even in log time; "" for fewer than three."""
-    from nerf.training.learning_curve import quality_at
-
     curve = heldout_curve(points)
     if len(curve) < 3:
         return ""

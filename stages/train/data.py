@@ -5,23 +5,31 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache, lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
+import numpy as np
+import torch
+
+from nerf.geometry.rays import Rays, rays_of_view
+from nerf.training.ray_dataset import PosedViews, RayDataset, make_ray_dataset
+from nerf.training.trainer import over
 from stages.contract import Inputs, Progress, StageError
+from stages.effects.track_colours import training_tracks
 from stages.io.files import read_tensors
+from stages.io.pixel_store import PixelStore, StoredPhoto, fill, pixel_store
+from stages.io.pixels import load_mask, load_pixels, loaders
+from stages.sfm.colmap.cameras import camera_rays
+from stages.train.config import BLACK, WHITE, Config
 
 if TYPE_CHECKING:
-    import numpy as np
     from torch import Tensor
 
-    from nerf.geometry.rays import Rays
     from nerf.geometry.scene import Camera, Scene, Split, View
-    from nerf.training.ray_dataset import RayDataset
-    from stages.io.pixel_store import PixelStore
 
 # Along the longer side of a picture. At 1000 pixels the directions are then off by at most 0.002 of them for a phone's
 # lens, 0.02 for an action camera's, 0.05 for a fisheye's, and a camera takes 1 MB; twice as many: a quarter, and 4 MB.
-MOST_PATCHES = 192
+MAX_PATCHES = 192
+MIN_LONG_SIDE = 150  # pixels of a photo: below this it shows too little to judge anything by
 ALL_MASKED = "train.all-masked"  # the error where masks leave no pixel at a size
 
 
@@ -36,37 +44,20 @@ def camera_directions(camera: "Camera", downscale: float) -> "Tensor":
 
     The last answer is kept: photos of one camera mostly follow each other.
     """
-    import torch
-
-    from stages.sfm.colmap.cameras import camera_rays
-
     return torch.from_numpy(camera_rays(camera, *scaled_size(camera, downscale)))
 
 
 def patch_directions(camera: "Camera", downscale: float) -> "Tensor":
     """Bearing vectors (rows, columns, 3) of a camera in the middles of the patches that stand for its pixels in a ray
-    dataset, MOST_PATCHES along the longer side or one per pixel."""
-    import torch
-
-    from stages.sfm.colmap.cameras import camera_rays
-
+    dataset, MAX_PATCHES along the longer side or one per pixel."""
     width, height = scaled_size(camera, downscale)
-    shrink = max(1.0, max(width, height) / MOST_PATCHES)
+    shrink = max(1.0, max(width, height) / MAX_PATCHES)
     return torch.from_numpy(camera_rays(camera, math.ceil(width / shrink), math.ceil(height / shrink)))
 
 
-def training_dataset(
-    ingest: Path, scene: "Scene", split: "Split", downscale: float, progress: Progress
-) -> "RayDataset":
+def training_dataset(ingest: Path, scene: "Scene", split: "Split", downscale: float, progress: Progress) -> RayDataset:
     """All pixels and rays of one split, on the CPU; the pixels are mapped from the pixel store, which is made if need
     be. What masks ignore is never drawn. Raises StageError, ALL_MASKED, where they leave nothing."""
-    import numpy as np
-    import torch
-
-    from nerf.training.ray_dataset import PosedViews, make_ray_dataset
-    from stages.io.pixel_store import fill
-    from stages.io.pixels import loaders
-
     views, store = scene.of_split(split), _store(ingest, scene, split, downscale)
     at_once = cache(lambda: loaders(ingest / view.file for view in views))  # opens every file
     fill(store, lambda index: _decoded_pixels(ingest, scene, views[index], downscale), at_once, progress)
@@ -93,15 +84,10 @@ def training_dataset(
     return _masked(dataset, masks, split, progress)
 
 
-def guided_dataset(inputs: Inputs, scene: "Scene", downscale: float, progress: Progress) -> "RayDataset":
+def guided_dataset(inputs: Inputs, scene: "Scene", downscale: float, progress: Progress) -> RayDataset:
     """:func:`training_dataset` of the training photos, which knows how far away are the sparse points that they show.
 
     Of normalise's points only those that two training photos saw at least, where these saw them."""
-    import numpy as np
-    import torch
-
-    from stages.effects.track_colours import training_tracks
-
     dataset = training_dataset(inputs["ingest"], scene, "train", downscale, progress)
     points = read_tensors(inputs["normalise"] / "points.safetensors")
     tracks, xy = training_tracks(scene, points, most=len(points["view"]))
@@ -126,9 +112,7 @@ def _ignored(
                 yield None if used is None else used.logical_not_()
 
 
-def _masked(
-    dataset: "RayDataset", ignored: "Iterable[Tensor | None]", split: "Split", progress: Progress
-) -> "RayDataset":
+def _masked(dataset: RayDataset, ignored: "Iterable[Tensor | None]", split: "Split", progress: Progress) -> RayDataset:
     try:
         dataset = dataset.without(ignored)
     except ValueError as error:
@@ -140,21 +124,13 @@ def _masked(
 
 def view_mask(ingest: Path, scene: "Scene", view: "View", downscale: float) -> "Tensor | None":
     """Which pixels of a view are to be used, (H, W) bool; None: all of them."""
-    import torch
-
-    from stages.io.pixels import load_mask
-
     if view.mask is None:
         return None
     return torch.from_numpy(load_mask(ingest / view.mask, *scaled_size(scene.cameras[view.camera], downscale)))
 
 
-def view_rays(scene: "Scene", view: "View", downscale: float) -> "Rays":
+def view_rays(scene: "Scene", view: "View", downscale: float) -> Rays:
     """One ray per pixel of a view, (H, W), on the CPU."""
-    import torch
-
-    from nerf.geometry.rays import rays_of_view
-
     pose = torch.tensor(view.scene_from_camera, dtype=torch.float32)
     return rays_of_view(camera_directions(scene.cameras[view.camera], downscale), pose, view.near, view.far)
 
@@ -169,15 +145,11 @@ class PhotoReader:
 
     def pixels(self, view: "View", background: Sequence[float]) -> "Tensor":
         """The photo of a view as (H, W, 3) float32 in [0, 1], over ``background`` where it has alpha."""
-        import torch
-
-        from nerf.training.trainer import over
-
         pixels = torch.tensor(self._pixels(view)).float() / 255
         alpha = pixels[..., 3] if self.scene.has_alpha else None
         return over(pixels[..., :3], alpha, torch.tensor(background, dtype=torch.float32))
 
-    def _pixels(self, view: "View") -> "np.ndarray":
+    def _pixels(self, view: "View") -> np.ndarray:
         """The photo of a view as uint8, out of the pixel store where that is there."""
         if view.split not in self._stores:
             store = _store(self.ingest, self.scene, view.split, self.downscale)
@@ -187,22 +159,32 @@ class PhotoReader:
         return _decoded_pixels(self.ingest, self.scene, view, self.downscale) if stored is None else stored
 
 
-def _store(ingest: Path, scene: "Scene", split: "Split", downscale: float) -> "PixelStore":
+def _store(ingest: Path, scene: "Scene", split: "Split", downscale: float) -> PixelStore:
     """Where the pixels of one split at this size are kept, whether or not they are there yet."""
-    from stages.io.pixel_store import StoredPhoto, pixel_store
-
     views = scene.of_split(split)
     photos = [StoredPhoto(view.file, *scaled_size(scene.cameras[view.camera], downscale)) for view in views]
     return pixel_store(ingest, split, photos, 4 if scene.has_alpha else 3)
 
 
-def _decoded_pixels(ingest: Path, scene: "Scene", view: "View", downscale: float) -> "np.ndarray":
+def _decoded_pixels(ingest: Path, scene: "Scene", view: "View", downscale: float) -> np.ndarray:
     """The photo of a view as uint8: (H, W, 4) in a scene with alpha, else (H, W, 3) as it is below its alpha."""
-    import numpy as np
-
-    from stages.io.pixels import load_pixels
-
     pixels = load_pixels(ingest / view.file, *scaled_size(scene.cameras[view.camera], downscale))
     if scene.has_alpha and pixels.shape[2] == 3:  # a photo without transparent parts covers every pixel
         return np.concatenate([pixels, np.full_like(pixels[..., :1], 255)], axis=2)
     return pixels if scene.has_alpha else np.ascontiguousarray(pixels[..., :3])
+
+
+def training_background(config: Config, scene: "Scene") -> tuple[float, float, float] | Literal["random"]:
+    """What lies behind the scene while training; random only where alpha says how much of it is seen."""
+    return "random" if scene.has_alpha and config.background == "random" else field_background(config, scene)
+
+
+def field_background(config: Config, scene: "Scene") -> tuple[float, float, float]:
+    """What the finished field is shown over, unless it has a background model. Photos without alpha fill every ray;
+    what a field without one leaves open is black, as published."""
+    return WHITE if scene.has_alpha and config.background != "black" else BLACK
+
+
+def has_background_model(config: Config, scene: "Scene") -> bool:
+    """Whether something is seen at infinity: where space has no end, and no alpha tells what is seen of it."""
+    return bool(config.contracted) and not scene.has_alpha

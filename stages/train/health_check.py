@@ -4,11 +4,8 @@ A field is examined in full after the warm-up and at the end. In between the PSN
 tells when to look: whenever it has come near that of a flat colour, before a checkpoint replaces an older one.
 """
 
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from nerf.training.trainer import FieldTrainer
-    from nerf.training.validation_probe import Probe
+from nerf.training.trainer import FieldTrainer
+from nerf.training.validation_probe import Probe, measure
 
 EMPTY_OPACITY = 1e-3  # a field whose mean opacity is below this shows nothing but background or sky
 SUSPICIOUS_DB = 3.0  # above a flat colour: batches that are no better may come from a field that is lost
@@ -18,10 +15,8 @@ class Lost(Exception):
     """The field in training is useless: not finite, empty or flat, as the text says. Training goes back or restarts."""
 
 
-def symptom_of(trainer: "FieldTrainer", probe: "Probe") -> str | None:
+def symptom_of(trainer: FieldTrainer, probe: Probe) -> str | None:
     """What is wrong with the field as the training photos see it, or None."""
-    from nerf.training.validation_probe import measure
-
     if name := not_finite(trainer):
         return f"its {name} is not finite"
     try:
@@ -35,12 +30,12 @@ def symptom_of(trainer: "FieldTrainer", probe: "Probe") -> str | None:
     return None
 
 
-def is_suspicious(batch_psnr: float, probe: "Probe") -> bool:
+def is_suspicious(batch_psnr: float, probe: Probe) -> bool:
     """Whether batches as bad as this ask for :func:`symptom_of`."""
     return not batch_psnr > probe.mean_colour_psnr + SUSPICIOUS_DB
 
 
-def not_finite(trainer: "FieldTrainer") -> str | None:
+def not_finite(trainer: FieldTrainer) -> str | None:
     """A tensor of the state with a number that is not finite: the update after the last finite loss can do that."""
     state = trainer.state().items()
     return next((name for name, one in state if one.is_floating_point() and not bool(one.isfinite().all())), None)

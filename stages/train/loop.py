@@ -19,24 +19,22 @@ from collections.abc import Callable
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from safetensors.torch import save
+
+from nerf.training.schedule import CLOSING_SHARE, ScheduleRevision, StepSchedule, next_in_series, replanned, schedule_of
+from nerf.training.trainer import RAYS, FieldTrainer, NonFinite
+from nerf.training.validation_probe import ProbeResult, measure
+from stages.amounts import short_count
 from stages.contract import Progress, StageError
 from stages.io.files import read_json, write_durably
 from stages.io.live_line import live_line
 from stages.train.checkpoints import Checkpoint, latest_checkpoint, save_checkpoint
 from stages.train.health_check import Lost, is_suspicious, not_finite, symptom_of
-from stages.train.messages import going_on_words, live_words, lost_words, reached_before_words, steering_words
 from stages.train.more import cannot_go_on
 from stages.train.profile import observed
-from stages.train.state import Pace, Probes, RunState, TrainingBudget, checkpoint_interval, lost_seconds
-
-if TYPE_CHECKING:
-    from nerf.training.schedule import StepSchedule
-    from nerf.training.trainer import FieldTrainer, NonFinite
-    from nerf.training.validation_probe import ProbeResult
-    from stages.train.log import TrainingLog
-    from stages.train.validation_images import Target
+from stages.train.state import Pace, Probes, RunState, TrainingBudget, TrainingLog, checkpoint_interval, lost_seconds
+from stages.train.validation_images import Target, load_metrics, look
 
 MOST_ROLLBACKS = 3
 MOST_RESTARTS = 2
@@ -60,12 +58,12 @@ class TrainingRun:
 
     def __init__(
         self,
-        make_trainer: "Callable[[int], FieldTrainer]",
+        make_trainer: Callable[[int], FieldTrainer],
         probes: Probes,
         budget: TrainingBudget,
         folder: Path,
         checkpoint_seconds: float | None,
-        log: "TrainingLog",
+        log: TrainingLog,
         progress: Progress,
     ) -> None:
         self.make_trainer, self.probes, self.budget = make_trainer, probes, budget
@@ -84,8 +82,6 @@ class TrainingRun:
 
     def train(self) -> None:
         """Train to the end of the budget. Raises StageError where the field diverges or stays dead."""
-        from nerf.training.trainer import NonFinite
-
         with live_line(self.progress, self._describe):
             over = False
             while not over:
@@ -104,8 +100,6 @@ class TrainingRun:
 
     def _begin(self, state: RunState) -> None:
         """Start from fresh weights; ``state`` carries over what earlier attempts cost."""
-        from nerf.training.schedule import schedule_of
-
         self.state = state
         self.trainer: FieldTrainer = self.make_trainer(state.restarts)
         self.lost = lost_seconds(self.spent, state)
@@ -171,8 +165,6 @@ class TrainingRun:
         self.progress.note(going_on_words(self.state.step, self.plan.total_steps, left))
 
     def _load(self, checkpoint: Checkpoint, journal: Path) -> None:
-        from nerf.training.schedule import ScheduleRevision, StepSchedule
-
         self.state = RunState(**checkpoint.facts)
         self.trainer = self.make_trainer(self.state.restarts)
         self.trainer.load_state(checkpoint.tensors)
@@ -218,8 +210,6 @@ class TrainingRun:
 
     def _replan(self, budget: float) -> None:
         """Fit the number of steps to the time left. Never rewrites a decision (after a roll-back, that is)."""
-        from nerf.training.schedule import replanned
-
         step, tolerance = self.state.step, PLAN_SHARE * (budget - self.state.seconds_before)
         self.next_planning = self.state.seconds + tolerance
         self.spent.write_text(f"{self.state.seconds + self.lost:.3f}")
@@ -234,8 +224,6 @@ class TrainingRun:
 
     def _measure(self) -> None:
         """Add a point to the curve. Not training time, and without influence on what is trained."""
-        from stages.train.validation_images import load_metrics, look
-
         load_metrics()
         started = time.perf_counter()
         seen = look(self.trainer, self.probes.heldout) if self.probes.heldout else None
@@ -257,20 +245,15 @@ class TrainingRun:
 
     def _plan_measurement(self, cost: float = 0.0) -> None:
         """Decide when to measure next; the last time took ``cost`` seconds."""
-        from nerf.training.schedule import next_in_series
-
         growth = MEASUREMENT_GROWTH if self.probes.target is None else TARGET_GROWTH
         kind = "seconds" if self.budget.steps is None else "steps"
         self.next_measurement = next_in_series(self._elapsed, FIRST_MEASUREMENT[kind], growth)
         if kind == "seconds":
             self.next_measurement = max(self.next_measurement, self._elapsed + cost / MOST_MEASURING)
 
-    def _steer(self, target: "Target") -> None:
+    def _steer(self, target: Target) -> None:
         """Stop where the validation photos are as good as wanted; anneal where that may be all it takes; go on as
         before where it was not enough and there is time. Decisions already in the plan are not made again."""
-        from nerf.training.schedule import CLOSING_SHARE
-        from stages.train.validation_images import look
-
         step, decided = self.state.step, self.plan.decisions[-1]
         self.state.validation_psnr = round(look(self.trainer, target.photos).psnr, 3)
         self.log.event("validated", step, psnr=self.state.validation_psnr)
@@ -335,7 +318,7 @@ class TrainingRun:
         if symptom := symptom_of(self.trainer, self.probes.train):
             raise Lost(f"after {self.state.step:,} steps the field is lost: {symptom}")
 
-    def _roll_back(self, fault: "NonFinite | Lost") -> None:
+    def _roll_back(self, fault: NonFinite | Lost) -> None:
         """Keep the batch, return to the last good checkpoint and halve the rate; give up by name after the third."""
         hint = self._on_record(fault)
         rollbacks = self.state.rollbacks + 1
@@ -360,25 +343,19 @@ class TrainingRun:
         if checkpoint.step > WARM_UP_STEPS and (symptom := symptom_of(self.trainer, self.probes.train)):
             raise Lost(symptom)
 
-    def _on_record(self, fault: "NonFinite | Lost") -> str:
+    def _on_record(self, fault: NonFinite | Lost) -> str:
         """Log the fault, and keep the batch of one that has it; what the user may try."""
         slower = "Try a tenth of --train.learning-rate"
         if isinstance(fault, Lost):
             self.log.event("lost", self.state.step, symptom=str(fault))
             return f"{slower}."
-        from safetensors.torch import save
-
-        from nerf.training.trainer import RAYS
-
         name = f"nonfinite_{fault.step}.safetensors"
         (self.folder / name).write_bytes(save({key: tensor.contiguous() for key, tensor in fault.batch.items()}))
         self.log.event("nonfinite", fault.step, quantity=fault.quantity, batch=name)
         advice = "Check the cameras, which give the rays" if fault.quantity == RAYS else slower
         return f"{advice}; the batch is kept in {self.folder / name}."
 
-    def _on_training_photos(self) -> "ProbeResult":
-        from nerf.training.validation_probe import measure
-
+    def _on_training_photos(self) -> ProbeResult:
         return measure(self.trainer.model, self.probes.train, self.trainer.effects)
 
     def _restart(self, symptom: str) -> None:
@@ -401,3 +378,36 @@ class TrainingRun:
         if self.clock_budget is not None:
             left = max(0.0, self.clock_budget - self.state.seconds)
         return live_words(self.state, self.pace, left), self.plan.progress(self.state.step)
+
+
+def live_words(state: RunState, pace: Pace, left: float) -> str:
+    """Step, speed, quality and the seconds left; of a run that knows its pace."""
+    measured = [point["heldout_psnr"] for point in state.curve if point["heldout_psnr"] is not None]
+    heldout = f" · held out {measured[-1]:.1f} dB" if measured else ""
+    speed = f"{short_count(pace.rays_per_step / pace.seconds_per_step)} rays/s"
+    return f"step {state.step:,} · {speed} · train {pace.psnr:.1f} dB{heldout} · {left:.0f} s left"
+
+
+def going_on_words(step: int, total_steps: int, left: float | None) -> str:
+    """After a kill; ``left``: seconds, where it is these that count."""
+    much = f" of {total_steps:,}" if left is None else f", with {max(0.0, left):.0f} s of training left"
+    return f"going on from step {step:,}{much}"
+
+
+def lost_words(seconds: float) -> str | None:
+    """What a kill cost; None where it is next to nothing."""
+    return (
+        f"{seconds:.0f} s of training after the last checkpoint are lost, and count as spent" if seconds >= 1 else None
+    )
+
+
+def reached_before_words(target_psnr: float) -> str:
+    """That a target which a finished run has reached does not end the one that goes on from it."""
+    return f"{target_psnr:g} dB are reached already: training goes on for all that was asked for"
+
+
+def steering_words(state: RunState, target_psnr: float, plan: StepSchedule) -> str:
+    """That the rate falls before the end, or goes back up, with a target in mind."""
+    seen = f"{state.validation_psnr:.1f} of {target_psnr:g} dB on photos set aside after {state.step:,} steps"
+    and_now = "annealing over" if plan.decisions[-1].reason == "target" else "going on for"
+    return f"{seen}: {and_now} {plan.total_steps - state.step:,} more"

@@ -4,17 +4,18 @@ A run in seconds may choose by a measurement, as it does its sizes: the choice i
 in steps promises the same bytes every time, which no measurement does: it takes "highest" unless told otherwise.
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import torch
+
+from nerf.runtime.matmul_precision import Medium, Precision, measure_medium_matmul
 from stages.contract import Progress
 from stages.hardware.device import compute_device
-
-if TYPE_CHECKING:
-    from nerf.runtime.matmul_precision import Medium, Precision
-    from stages.train import Config
+from stages.train.config import Config
+from stages.train.fields import field_of
 
 
-def chosen_precision(config: "Config", progress: Progress) -> "Precision":
+def chosen_precision(config: Config, progress: Progress) -> Precision:
     """For the products of a training whose field and sizes of networks are known; "medium" is said."""
     if config.steps is not None:
         return "highest"
@@ -28,13 +29,13 @@ def chosen_precision(config: "Config", progress: Progress) -> "Precision":
     return "medium"
 
 
-def say_if_inexact(config: "Config", progress: Progress) -> None:
+def say_if_inexact(config: Config, progress: Progress) -> None:
     """Where a precision that was asked for, or chosen on another machine, means less here."""
     if config.matmul == "medium" and not (medium := _medium(config)).is_exact:
         progress.note(f"matrix products are off by {medium.error:.0e} here; --train.matmul highest computes exact ones")
 
 
-def precision_facts(config: "Config") -> dict[str, Any]:
+def precision_facts(config: Config) -> dict[str, Any]:
     """For the manifest: the precision, and what "medium" is on this machine."""
     medium = _medium(config)
     return {
@@ -44,13 +45,6 @@ def precision_facts(config: "Config") -> dict[str, Any]:
     }
 
 
-def _medium(config: "Config") -> "Medium":
+def _medium(config: Config) -> Medium:
     """Measured at the width of the field's networks."""
-    import torch
-
-    from nerf.fields.mlp import HIDDEN
-    from nerf.runtime.matmul_precision import measure_medium_matmul
-
-    width = HIDDEN if config.kind == "grid" else config.width
-    assert width, "plan() chooses it"
-    return measure_medium_matmul(torch.device(compute_device()), width)
+    return measure_medium_matmul(torch.device(compute_device()), field_of(config).matmul_width(config))

@@ -7,14 +7,17 @@ the result depends on it. At the end the machine's own rates are measured, and t
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    import torch
+import torch
 
-    from nerf.fields.interface import RadianceModel
-    from nerf.runtime.machine_rates import Rates
-    from nerf.training.trainer import StepResult
+from nerf.runtime.machine_rates import Rates, measure_rates
+from nerf.runtime.parallel import workers
+from nerf.runtime.profiler import Profiler, WorkCounts, profiling
+from nerf.training.trainer import StepResult
+from stages.io.files import write_json
+from stages.train.config import Config
+from stages.train.fields import field_of
 
 TIMED_EVERY, FIRST_TIMED = 32, 8  # steps: one of so many is timed; the very first ones are unlike the others
 RATES_SECONDS = 0.5  # to measure the machine's rates in, once training has ended
@@ -22,15 +25,10 @@ PARTS_FILE = "parts.json"
 WAITING = "waiting"
 
 
-def observed(
-    take: "Callable[[], StepResult]", step: int, timings: dict[str, Any], device: "torch.device"
-) -> "StepResult":
+def observed(take: Callable[[], StepResult], step: int, timings: dict[str, Any], device: torch.device) -> StepResult:
     """Take a step; if its turn has come, add what it did to ``timings``: JSON values, empty at first."""
     if step % TIMED_EVERY != FIRST_TIMED:
         return take()
-    from nerf.runtime.parallel import workers
-    from nerf.runtime.profiler import Profiler, profiling
-
     profiler, started = Profiler(device), time.perf_counter()
     with profiling(profiler):
         result = take()
@@ -45,19 +43,7 @@ def observed(
     return result
 
 
-def rates_for(model: "RadianceModel", device: "torch.device") -> "Rates":
-    """This machine's rates at the sizes of a field. A field without a table reads nothing at random."""
-    from nerf.fields.hash_grid import HashGridField
-    from nerf.fields.mlp import HIDDEN
-    from nerf.fields.vanilla import VanillaNerf
-    from nerf.runtime.machine_rates import measure_rates
-
-    rows = model.layout.rows if isinstance(model, HashGridField) else 1
-    width = model.settings.width if isinstance(model, VanillaNerf) else HIDDEN
-    return measure_rates(device, width, rows, RATES_SECONDS)
-
-
-def parts_table(timings: dict[str, Any], rates: "Rates") -> dict[str, Any]:
+def parts_table(timings: dict[str, Any], rates: Rates) -> dict[str, Any]:
     """The content of parts.json, from what :func:`observed` noted of at least one step.
 
     ``samples`` are points whose colour was computed, ``densities`` points whose density was asked for.
@@ -65,8 +51,6 @@ def parts_table(timings: dict[str, Any], rates: "Rates") -> dict[str, Any]:
     part's work takes at ``rates``; null for parts whose work is not of that kind. ``floor_share`` is of what was
     computed.
     """
-    from nerf.runtime.profiler import WorkCounts
-
     spent = {name: (seconds, rates.seconds(WorkCounts(*work))) for name, (seconds, *work) in timings["parts"].items()}
     busy, floor = (sum(column) for column in zip(*spent.values(), strict=True))
     whole = max(timings["core_seconds"], busy)
@@ -84,14 +68,13 @@ def parts_table(timings: dict[str, Any], rates: "Rates") -> dict[str, Any]:
     }
 
 
-def write_parts(folder: Path, timings: dict[str, Any], model: "RadianceModel", device: "torch.device") -> list[str]:
+def write_parts(folder: Path, timings: dict[str, Any], config: Config, device: torch.device) -> list[str]:
     """Measure the machine and write parts.json; the names of the files written: none where no step was timed."""
-    from stages.io.files import write_json
-
     if not timings:
         return []
-    table = parts_table(timings, rates_for(model, device))
-    write_json(folder / PARTS_FILE, table)
+    field = field_of(config)
+    rates = measure_rates(device, field.matmul_width(config), field.table_rows(config), RATES_SECONDS)
+    write_json(folder / PARTS_FILE, parts_table(timings, rates))
     return [PARTS_FILE]
 
 

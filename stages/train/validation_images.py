@@ -2,19 +2,20 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
+import torch
+from torch import Tensor
+
+from nerf.geometry.scene import Scene, Split
+from nerf.training.trainer import FieldTrainer
+from nerf.training.validation_probe import Patches, Probe, make_patches, make_probe, measure, pictures
 from stages.contract import Progress, StageError
+from stages.effects.decisions import told_by_neighbours
 from stages.evaluate.image_metrics import ssim
 from stages.io.photos import spread
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from nerf.geometry.scene import Scene, Split
-    from nerf.training.trainer import FieldTrainer
-    from nerf.training.validation_probe import Patches, Probe
-    from stages.train import Config
+from stages.train.config import Config
+from stages.train.data import ALL_MASKED, field_background, training_dataset
 
 PROBE_RAYS = 2048
 PROBE_SEED = 0  # whatever the training's: curves of different seeds differ by what was trained, not by the pixels
@@ -29,9 +30,9 @@ MOST_VALIDATION = 8  # where a target decides when to stop
 class Unseen(NamedTuple):
     """Pixels and patches of some photos, and how much each training photo tells of each of these."""
 
-    probe: "Probe"
-    patches: "Patches"
-    neighbours: "Tensor"
+    probe: Probe
+    patches: Patches
+    neighbours: Tensor
 
 
 class Target(NamedTuple):
@@ -49,17 +50,10 @@ class Look(NamedTuple):
 
 
 def unseen_photos(
-    config: "Config", ingest: Path, scene: "Scene", split: "Split", device: str, progress: Progress
+    config: Config, ingest: Path, scene: Scene, split: Split, device: str, progress: Progress
 ) -> Unseen | None:
     """Of the photos of a split; None where it has none, or where masks leave nothing of its test photos, which decide
     nothing: then ``progress`` is told. Always the same pixels."""
-    import torch
-
-    from nerf.training.validation_probe import make_patches, make_probe
-    from stages.effects.decisions import told_by_neighbours
-    from stages.train.data import ALL_MASKED, training_dataset
-    from stages.train.setup import field_background
-
     if not scene.of_split(split):
         return None
     assert config.downscale is not None, "plan() chooses it"
@@ -84,10 +78,8 @@ def load_metrics() -> None:
     import kornia.metrics  # noqa: F401
 
 
-def look(trainer: "FieldTrainer", unseen: Unseen) -> Look:
+def look(trainer: FieldTrainer, unseen: Unseen) -> Look:
     """How the field does on photos that it has never seen, exposed as their neighbours let expect."""
-    from nerf.training.validation_probe import measure, pictures
-
     as_expected = trainer.effects.of_held_out(unseen.neighbours)
     psnr = measure(trainer.model, unseen.probe, as_expected).psnr
     rows = zip(*pictures(trainer.model, unseen.patches, as_expected), unseen.patches.used, strict=True)
@@ -95,7 +87,7 @@ def look(trainer: "FieldTrainer", unseen: Unseen) -> Look:
     return Look(psnr, sum(known) / len(known) if known else None)
 
 
-def with_validation(scene: "Scene") -> "Scene":
+def with_validation(scene: Scene) -> Scene:
     """``scene`` with every eighth training photo, at most MOST_VALIDATION, evenly spread, in the split "validation".
 
     Raises StageError where too few would be left to train on.
@@ -108,7 +100,7 @@ def with_validation(scene: "Scene") -> "Scene":
     return split
 
 
-def set_aside(scene: "Scene", most: int, least: int = 1) -> "Scene | None":
+def set_aside(scene: Scene, most: int, least: int = 1) -> Scene | None:
     """``scene`` with every eighth training photo, ``least`` to ``most`` in all, evenly spread, in the split
     "validation"; None where too few would be left to train on. Views keep their places, by which sparse points know
     them."""

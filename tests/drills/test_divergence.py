@@ -50,7 +50,7 @@ NAMED = ("training diverged", "the field does not learn")
 @pytest.fixture(autouse=True)
 def short_warm_up(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(loop, "WARM_UP_STEPS", WARM_UP)
-    monkeypatch.setattr("stages.train.profile.write_parts", lambda *_: [])
+    monkeypatch.setattr("stages.train.training.write_parts", lambda *_: [])
     monkeypatch.setattr("stages.train.validation_images.PROBE_RAYS", 256)
     monkeypatch.setattr(
         "nerf.fields.occupancy_grid.UPDATE_INTERVAL", 32
@@ -237,11 +237,11 @@ def test_no_number_is_a_symptom(inputs: dict[str, Path], progress: Any) -> None:
 
 
 def train_loop_trainer(inputs: dict[str, Path], dataset: RayDataset) -> HashGridTrainer:
-    from stages.train.setup import make_trainer
+    from stages.train.fields import make_trainer, with_defaults
 
     settings: dict[str, Any] = {"downscale": 1.0, "steps": 1, "chunks": 1} | GRID | KINDS["torch"]
     asked = train.Config(**settings)
-    config = train.with_habits(asked.model_copy(update={"contracted": False, "view_dependence": True}))
+    config = with_defaults(asked.model_copy(update={"contracted": False, "view_dependence": True}))
     trainer = make_trainer(config, read_scene(inputs["normalise"]), dataset, 0)
     assert isinstance(trainer, HashGridTrainer)
     return trainer

@@ -10,8 +10,7 @@ from nerf.training.hash_grid_trainer import ADAM_BYTES
 from pipeline import doctor
 from pipeline.cli import commands
 from pipeline.doctor import bench
-from stages.train import PART_SAMPLES
-from stages.train.size import SAMPLES_PER_RAY
+from stages.train.fields.hash_grid import PART_SAMPLES, SAMPLES_PER_RAY
 
 
 @pytest.fixture
@@ -47,10 +46,10 @@ def test_it_is_measured_only_if_asked_for(quick: None, capsys: pytest.CaptureFix
 def test_the_optimiser_is_shared_by_as_many_rays_as_a_step_has_on_this_machine(
     space: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("stages.hardware.device.compute_device", lambda: "cpu")
+    monkeypatch.setattr("stages.train.fields.hash_grid.compute_device", lambda: "cpu")
     works = []
     for count in (1, 4):
-        monkeypatch.setattr("stages.hardware.device.cores", lambda count=count: count)
+        monkeypatch.setattr("stages.train.fields.hash_grid.cores", lambda count=count: count)
         works.append(bench.grid_work(space == "contracted", 20))
     one, four = works
     assert one.streamed_bytes == pytest.approx(4 * four.streamed_bytes)

@@ -83,7 +83,7 @@ def test_a_pilot_is_foretold_by_its_steps_and_the_poses_that_it_fits_on_the_cpu(
     monkeypatch.setattr("stages.hardware.device.compute_device", lambda: device)
     monkeypatch.setattr("stages.hardware.device.cores", lambda: 16)
     monkeypatch.setattr("stages.hardware.backend.chosen_backend", lambda _device: "torch")
-    monkeypatch.setattr("stages.train.size.seconds_per_step", lambda *given: on[given[-1]])
+    monkeypatch.setattr("stages.train.planning.seconds_per_step", lambda *given: on[given[-1]])
     scene = read_scene(inputs["normalise"])
     without, fitting = pilots.expected_seconds(scene, 100)
     assert without == pytest.approx(1.3 * 6 * 100 * 0.02)

@@ -29,8 +29,8 @@ from stages.tradeoff.schedule import (
     run_order,
     train_options,
 )
-from stages.train import PAPER_SIZES, Config
-from stages.train.size import GRID_SIZES
+from stages.train import Config
+from stages.train.fields import hash_grid, vanilla
 
 FAST = {name: Speed(100.0, 1e6) for name in TIMED}
 SIZES = (1.0, 2.0, 4.0, 8.0)
@@ -54,7 +54,7 @@ def test_a_study_has_the_sizes_of_grids_that_training_has_for_long_and_for_short
 
     usual = [run for run in make_schedule(1e4, 1, space, SIZES, FAST, 1000).runs if run.variant == "grid"]
     assert {run.options["finest"] for run in usual} == {512 if space == "bounded" else 1024}
-    chosen = [tuple(entry[1:]) for entry in GRID_SIZES[space]]
+    chosen = [tuple(entry[1:]) for entry in hash_grid.SIZES[space]]
     assert [sizes("grid"), sizes("small grid")] == chosen
     assert sizes("grid, half the samples") == sizes("grid, twice the samples") == sizes("grid")
     assert all(larger > usual for larger, usual in zip(sizes("large grid"), sizes("grid"), strict=True))
@@ -75,7 +75,7 @@ def test_every_variant_is_explained_with_its_sizes(space: Space) -> None:
     )
     networks = {REDUCED: "small", PUBLISHED: "published", FEWER_RAYS: "published"}
     for name, preset in networks.items():
-        sizes = {**PAPER_SIZES[preset], **VARIANTS[name].options}
+        sizes = {**vanilla.SIZES[preset], **VARIANTS[name].options}
         words = "{depth} layers of {width}, {samples_coarse} + {samples_fine} samples".format(**sizes)
         assert words in DESCRIPTIONS[name] and f"{sizes['batch_rays']:,} rays a step" in DESCRIPTIONS[name]
 

@@ -343,8 +343,8 @@ def test_too_little_time_is_said_with_numbers(tmp_path: Path, photos: dict[str, 
 
 
 def test_windows_are_parts_of_the_photos(photos: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    from stages.train.config import WHITE
     from stages.train.data import PhotoReader, view_rays
-    from stages.train.setup import WHITE
 
     monkeypatch.setattr(benchmark, "CROP_SIZE", 8)
     scene = read_scene(photos["normalise"])

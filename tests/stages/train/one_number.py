@@ -13,9 +13,8 @@ from nerf.fields.interface import Rendering
 from nerf.geometry.rays import Rays
 from nerf.training.trainer import StepResult
 from nerf.training.validation_probe import Patches, Probe
-from stages.train.log import TrainingLog
 from stages.train.loop import TrainingRun
-from stages.train.state import Probes, TrainingBudget
+from stages.train.state import Probes, TrainingBudget, TrainingLog
 from stages.train.validation_images import Target, Unseen
 
 

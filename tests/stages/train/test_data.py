@@ -16,8 +16,9 @@ from stages.contract import StageError
 from stages.io.files import write_png, write_tensors
 from stages.io.pixel_store import PixelStore, pixel_store
 from stages.io.pixels import load_mask
+from stages.train.config import WHITE
 from stages.train.data import (
-    MOST_PATCHES,
+    MAX_PATCHES,
     PhotoReader,
     camera_directions,
     guided_dataset,
@@ -27,7 +28,6 @@ from stages.train.data import (
     view_mask,
     view_rays,
 )
-from stages.train.setup import WHITE
 from tests.conftest import SilentProgress
 from tests.stages.photo_scene import CAMERA, FOCAL, HEIGHT, RADIUS, WIDTH, ball_photo, photographed, seen_points
 
@@ -184,7 +184,7 @@ def test_patches_bend_no_ray(lens: str, limit_px: float) -> None:
     camera, downscale = LENSES[lens], 4.0
     width, height = scaled_size(camera, downscale)
     directions = patch_directions(camera, downscale)
-    assert max(directions.shape[:2]) == MOST_PATCHES < width
+    assert max(directions.shape[:2]) == MAX_PATCHES < width
     placed = PosedViews(torch.eye(3, 4)[None], torch.ones(1), torch.ones(1))
     dataset = make_ray_dataset(
         torch.zeros(width * height, 3, dtype=torch.uint8), [(height, width)], [0], [directions], placed

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from stages.contract import StageError
-from stages.train.log import TrainingLog
+from stages.train.state import TrainingLog
 
 POINT = {"step": 3, "seconds": 0.5, "train_psnr": 20.0, "heldout_psnr": None}
 

@@ -11,8 +11,8 @@ from nerf.training.hash_grid_trainer import HashGridTrainer
 from stages import train
 from stages.effects.decisions import Decisions
 from stages.train import Config
+from stages.train.planning import rays_per_second
 from stages.train.precision import chosen_precision
-from stages.train.size import rays_per_second
 from tests.stages.photo_scene import photographed
 
 TINY: dict[str, Any] = {"levels": 2, "log2_rows": 10, "finest": 32, "batch_samples": 1024, "downscale": 1.0}
@@ -88,7 +88,7 @@ def test_it_is_set_while_training_alone_and_recorded(matmul, tmp_path: Path, her
 
 
 def test_speed_is_measured_as_it_will_be_trained(tmp_path: Path, trained_at, progress, monkeypatch) -> None:
-    monkeypatch.setattr("stages.train.size.TIMED_SECONDS", 0.0)
+    monkeypatch.setattr("stages.train.planning.TIMED_SECONDS", 0.0)
     inputs, scene = photographed(tmp_path)
     config = train.plan(Config(**TINY, steps=5, matmul="medium"), inputs, progress)
     assert rays_per_second(config, scene, Decisions()) > 0

@@ -20,7 +20,10 @@ from nerf.training.vanilla_trainer import VanillaTrainer, VanillaTrainerSettings
 from stages.hardware.backend import load_backend
 from stages.io.files import read_json
 from stages.report.profile import PARTS, parts_bar
-from stages.train.profile import FIRST_TIMED, TIMED_EVERY, observed, parts_table, rates_for, write_parts
+from stages.train import Config
+from stages.train.fields import field_of
+from stages.train.fields.hash_grid import field_settings
+from stages.train.profile import FIRST_TIMED, RATES_SECONDS, TIMED_EVERY, observed, parts_table, write_parts
 from tests.small_scenes import pinhole_directions
 
 CPU = torch.device("cpu")
@@ -169,19 +172,17 @@ def test_the_page_has_a_row_per_part_and_nothing_where_nothing_was_timed() -> No
 
 
 def test_the_file_is_written_where_a_step_was_timed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("stages.train.profile.rates_for", lambda *_: RATES)
-    of, timings = trainer("paper"), {}
-    assert write_parts(tmp_path, timings, of.model, CPU) == []
-    timed_step(of, FIRST_TIMED, timings)
-    assert write_parts(tmp_path, timings, of.model, CPU) == ["parts.json"]
-    assert read_json(tmp_path / "parts.json") == parts_table(timings, RATES)
-
-
-@pytest.mark.parametrize("kind", ["torch", "paper"])
-def test_rates_are_measured_at_the_sizes_of_the_field(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
-    monkeypatch.setattr("nerf.runtime.machine_rates.measure_rates", lambda *arguments: asked.append(arguments) or RATES)
-    model = trainer(kind).model
-    assert rates_for(model, CPU) == RATES
-    rows = model.layout.rows if isinstance(model, HashGridField) else 1
-    assert asked[0][1:3] == ((64, rows) if kind == "torch" else (16, 1))
+    monkeypatch.setattr("stages.train.profile.measure_rates", lambda *sizes: asked.append(sizes) or RATES)
+    of, timings, config = trainer("paper"), {}, Config(field="paper", width=16)
+    assert write_parts(tmp_path, timings, config, CPU) == []
+    timed_step(of, FIRST_TIMED, timings)
+    assert write_parts(tmp_path, timings, config, CPU) == ["parts.json"]
+    assert read_json(tmp_path / "parts.json") == parts_table(timings, RATES)
+    assert asked == [(CPU, 16, 1, RATES_SECONDS)]
+
+
+def test_rates_of_the_grid_field_are_at_the_size_of_its_table() -> None:
+    config = Config(levels=2, log2_rows=8, finest=64, contracted=False, view_dependence=True)
+    rows = field_of(config).table_rows(config)
+    assert (field_of(config).matmul_width(config), rows) == (64, field_settings(config, sky=False).layout.rows)

@@ -17,7 +17,9 @@ from stages.io.field_files import load_field
 from stages.io.files import read_json
 from stages.io.photos import Photo, write_photos
 from stages.train import Config
-from stages.train.setup import prepare
+from stages.train.config import GRID_ONLY, PAPER_ONLY
+from stages.train.fields.hash_grid import LEARNING_RATES
+from stages.train.training import prepare
 from stages.train.validation_images import unseen_photos, with_validation
 from tests.refusals import refused
 from tests.stages.photo_scene import HEIGHT, WIDTH, photographed
@@ -218,21 +220,21 @@ def test_every_option_is_shared_or_of_one_field() -> None:
     shared = {"field", "preset", "steps", "seconds", "learning_rate", "seed", "downscale", "background", "contracted"}
     shared |= {"view_dependence", "checkpoint_seconds", "tensorboard", "target_psnr", "matmul"}
     shared |= {"after", "more_steps", "more_seconds"}
-    assert sorted([*shared, *train.GRID_ONLY, *train.PAPER_ONLY]) == sorted(Config.model_fields)
+    assert sorted([*shared, *GRID_ONLY, *PAPER_ONLY]) == sorted(Config.model_fields)
 
 
 @pytest.mark.parametrize("bounded", [True, False])
 def test_plan_answers_everything_for_the_grid_field(
     bounded: bool, tmp_path: Path, progress, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("stages.train.size.TIMED_SECONDS", 0.01)
+    monkeypatch.setattr("stages.train.planning.TIMED_SECONDS", 0.01)
     inputs, _ = photographed(tmp_path, bounded=bounded)
     planned = train.plan(Config(), inputs, progress)
     assert (planned.field, planned.seconds, planned.contracted) == ("grid", 180, not bounded)
     assert any(note.startswith("180 s on this machine draw about ") for note in progress.notes)
     assert (planned.downscale, planned.background) == (1.0, "random")
     assert planned.levels and planned.log2_rows and planned.finest and planned.batch_samples
-    assert planned.learning_rate == train.GRID_RATES["bounded" if bounded else "contracted"]
+    assert planned.learning_rate == LEARNING_RATES["bounded" if bounded else "contracted"]
     assert train.plan(Config.model_validate(planned.model_dump()), inputs, progress) == planned
     assert train.plan(Config(levels=3, finest=64), inputs, progress).levels == 3
 
@@ -240,7 +242,7 @@ def test_plan_answers_everything_for_the_grid_field(
 def test_what_masks_ignore_does_not_count_for_the_size_of_the_photos(
     tmp_path: Path, progress: Progress, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("stages.train.size.LEAST_LONG_SIDE", 2)
+    monkeypatch.setattr("stages.train.planning.MIN_LONG_SIDE", 2)
     mask = np.zeros((HEIGHT, WIDTH), np.uint8)
     mask[: HEIGHT // 4] = 255
     sizes: dict[str, Any] = {"levels": 2, "log2_rows": 8, "finest": 16, "batch_samples": 256, "steps": 2}
@@ -260,7 +262,7 @@ def test_what_masks_ignore_does_not_count_for_the_size_of_the_photos(
 def test_plan_answers_everything_for_the_paper_field(
     tmp_path: Path, progress: Progress, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("stages.train.size.TIMED_SECONDS", 0.01)
+    monkeypatch.setattr("stages.train.planning.TIMED_SECONDS", 0.01)
     inputs, _ = photographed(tmp_path)
     planned = train.plan(Config(batch_rays=8), inputs, progress)
     assert (planned.field, planned.background, planned.levels) == ("paper", "white", None)

@@ -8,20 +8,20 @@ from hypothesis import strategies as st
 
 from nerf.fields.hash_grid import HashGridSettings
 from nerf.geometry.scene import Camera, Scene
+from stages.contract import Progress
 from stages.effects.decisions import Decisions
-from stages.train import LARGE_STEP_RATE, LARGEST_STEP, PART_SAMPLES, Config, with_habits
-from stages.train.data import scaled_size
-from stages.train.setup import field_bytes, grid_settings, has_sky
-from stages.train.size import (
-    LEAST_LONG_SIDE,
-    MOST_PHOTOS,
-    MOST_PIXELS,
-    chosen_downscale,
-    grid_size,
-    rays_in_budget,
-    rays_per_second,
-    reason_words,
+from stages.train import Config
+from stages.train.data import MIN_LONG_SIDE, has_background_model, scaled_size
+from stages.train.fields import with_defaults
+from stages.train.fields.hash_grid import (
+    LARGE_STEP_LEARNING_RATE,
+    MAX_STEP_SAMPLES,
+    PART_SAMPLES,
+    field_settings,
+    memory_bytes,
+    with_sizes,
 )
+from stages.train.planning import MAX_PHOTOS, MAX_PIXELS, chosen_downscale, rays_in_budget, rays_per_second, reason
 from tests.stages.photo_scene import photographed
 
 
@@ -48,7 +48,7 @@ def test_photos_are_never_enlarged_nor_made_tiny(scene: Scene, width: int, heigh
     downscale = chosen_downscale(sized, rays)
     assert downscale >= 1
     long_side = max(scaled_size(sized.cameras[0], downscale))
-    assert long_side >= min(LEAST_LONG_SIDE, max(width, height))
+    assert long_side >= min(MIN_LONG_SIDE, max(width, height))
 
 
 @given(st.floats(1.0, 1e9), st.floats(1.0, 100.0))
@@ -75,10 +75,10 @@ def test_many_photos_of_the_same_things_are_not_made_ever_smaller(scene: Scene) 
     train = scene.of_split("train")[0]
     few, many = (
         replace(of_size(scene, 2000, 1000), views=tuple(replace(train, name=str(i)) for i in range(count)))
-        for count in (MOST_PHOTOS, 10 * MOST_PHOTOS)
+        for count in (MAX_PHOTOS, 10 * MAX_PHOTOS)
     )
     assert chosen_downscale(few, 6e6) == chosen_downscale(many, 6e6) == 4.0
-    assert chosen_downscale(many, 90e6) == math.floor(10 * math.sqrt(480 * 2e6 / MOST_PIXELS)) / 10 > 1
+    assert chosen_downscale(many, 90e6) == math.floor(10 * math.sqrt(480 * 2e6 / MAX_PIXELS)) / 10 > 1
     assert chosen_downscale(many, 960e6) == 1.0
 
 
@@ -111,7 +111,7 @@ PAPER = Config(
 
 @pytest.mark.parametrize("config", [GRID, PAPER], ids=["grid", "paper"])
 def test_the_speed_is_measured_on_this_machine(config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("stages.train.size.TIMED_SECONDS", 0.05)
+    monkeypatch.setattr("stages.train.planning.TIMED_SECONDS", 0.05)
     _, scene = photographed(tmp_path, channels=4)
     assert 10 < rays_per_second(config, scene, Decisions()) < 1e7
 
@@ -123,16 +123,22 @@ def test_a_budget_of_steps_is_counted_not_timed(scene: Scene) -> None:
     assert 100 * 4096 / 100 < folded < in_box < 100 * 4096
 
 
+def sizes_of(config: Config, scene: Scene, rays: float, progress: Progress | None = None) -> dict[str, int]:
+    """What is chosen where ``config`` leaves sizes open."""
+    sized = with_sizes(config, scene, rays, progress).model_dump()
+    return {name: sized[name] for name in ("levels", "log2_rows", "finest")}
+
+
 @given(st.floats(1e3, 1e9), st.floats(1, 100), st.floats(1, 20), st.booleans())
 def test_grids_grow_with_rays_and_pixels(scene: Scene, rays: float, factor: float, down: float, folded: bool) -> None:
     sized, config = of_size(scene, 3000, 2000), GRID.model_copy(update={"contracted": folded})
 
     def chosen(rays: float, downscale: float) -> dict[str, int]:
-        return grid_size(config.model_copy(update={"downscale": downscale}), sized, rays)
+        return sizes_of(config.model_copy(update={"downscale": downscale}), sized, rays)
 
     small, more_rays, fewer_pixels = chosen(rays, down), chosen(rays * factor, down), chosen(rays, down * factor)
     assert all(more_rays[name] >= small[name] >= fewer_pixels[name] for name in small)
-    field = grid_settings(config.model_copy(update=small), sky=False)
+    field = field_settings(config.model_copy(update=small), sky=False)
     assert isinstance(field, HashGridSettings)
     assert 128 <= field.max_res <= 1024
     # Two neighbouring samples lie in the same or in neighbouring cells of the finest grid, near the cameras at least.
@@ -149,36 +155,35 @@ def test_a_gpu_has_larger_fields_and_takes_larger_steps(
 ) -> None:
     config = Config(field="grid", contracted=folded, view_dependence=True, downscale=1.0, chunks=2)
     large = of_size(scene, 4000, 3000)
-    on_cpu = grid_size(with_habits(config), large, 1e9), with_habits(config)
-    monkeypatch.setattr("stages.train.size.compute_device", lambda: "cuda")
-    monkeypatch.setattr("stages.hardware.device.compute_device", lambda: "cuda")
-    monkeypatch.setattr("stages.train.size.available_on", {"cuda": 80e9}.get)
-    on_gpu = grid_size(with_habits(config), large, 1e9), with_habits(config)
+    on_cpu = sizes_of(with_defaults(config), large, 1e9), with_defaults(config)
+    monkeypatch.setattr("stages.train.fields.hash_grid.compute_device", lambda: "cuda")
+    monkeypatch.setattr("stages.train.fields.hash_grid.available_on", {"cuda": 80e9}.get)
+    on_gpu = sizes_of(with_defaults(config), large, 1e9), with_defaults(config)
     assert on_gpu[0] == {"levels": 8, "log2_rows": 20, "finest": most}
     assert on_gpu[0]["finest"] > on_cpu[0]["finest"] and on_gpu[0]["log2_rows"] > on_cpu[0]["log2_rows"]
-    assert grid_size(with_habits(config), large, 1e6) == {
+    assert sizes_of(with_defaults(config), large, 1e6) == {
         "levels": 5 if folded else 4,
         "log2_rows": 17,
         "finest": 512 // (2 - folded),
     }
     assert (on_gpu[1].batch_samples, on_gpu[1].learning_rate) == (1 << 18, 2e-2)
     assert (on_cpu[1].batch_samples or 0) < 1 << 16
-    few = with_habits(config.model_copy(update={"batch_samples": 1 << 14}))
+    few = with_defaults(config.model_copy(update={"batch_samples": 1 << 14}))
     assert few.learning_rate == (1e-2 if folded else 2e-2)
 
 
 @pytest.mark.parametrize("folded", [True, False])
 def test_every_core_has_a_part_of_the_same_size_up_to_the_largest_step(folded: bool) -> None:
-    parts = [with_habits(Config(contracted=folded, chunks=chunks)) for chunks in (1, 2, 64)]
+    parts = [with_defaults(Config(contracted=folded, chunks=chunks)) for chunks in (1, 2, 64)]
     sizes = [part.batch_samples or 0 for part in parts]
-    assert sizes == [PART_SAMPLES[parts[0].space], 2 * sizes[0], LARGEST_STEP]
-    assert parts[2].learning_rate == LARGE_STEP_RATE >= (parts[1].learning_rate or 1)
+    assert sizes == [PART_SAMPLES[parts[0].space], 2 * sizes[0], MAX_STEP_SAMPLES]
+    assert parts[2].learning_rate == LARGE_STEP_LEARNING_RATE >= (parts[1].learning_rate or 1)
 
 
 def test_samples_follow_cells_up_to_a_512th_and_from_a_1024th_to_a_2048th() -> None:
     folded = Config(contracted=True, view_dependence=True, levels=1, log2_rows=8)
     sizes = {finest: folded.model_copy(update={"finest": finest}) for finest in (256, 512, 700, 1024, 2048, 4096)}
-    fields = {finest: grid_settings(config, sky=False) for finest, config in sizes.items()}
+    fields = {finest: field_settings(config, sky=False) for finest, config in sizes.items()}
     steps = [field.min_step_size for field in fields.values()]
     assert steps == [4 / 768, 4 / 1536, 4 / 1536, 4 / 1536, 4 / 3072, 4 / 3072]
     assert all(field.cone_angle == field.min_step_size / 0.25 for field in fields.values())
@@ -188,8 +193,8 @@ def test_samples_follow_cells_up_to_a_512th_and_from_a_1024th_to_a_2048th() -> N
 @given(factor=st.floats(0.25, 4.0))
 def test_ray_samples_multiply_the_samples_along_a_ray(contracted: bool, factor: float) -> None:
     sizes = {"levels": 4, "log2_rows": 16, "finest": 512, "contracted": contracted}
-    usual = grid_settings(GRID.model_copy(update=sizes), sky=False)
-    asked = grid_settings(GRID.model_copy(update=sizes | {"ray_samples": factor}), sky=False)
+    usual = field_settings(GRID.model_copy(update=sizes), sky=False)
+    asked = field_settings(GRID.model_copy(update=sizes | {"ray_samples": factor}), sky=False)
     assert asked.diagonal_steps == pytest.approx(factor * usual.diagonal_steps, abs=0.5)
     assert asked.cone_angle == pytest.approx(usual.cone_angle / factor)
     assert asked.stepping.step_size == pytest.approx(usual.stepping.step_size / factor, rel=0.01)
@@ -201,13 +206,13 @@ def test_ray_samples_multiply_the_samples_along_a_ray(contracted: bool, factor: 
 @pytest.mark.parametrize("contracted", [False, True])
 def test_a_sky_is_where_space_has_no_end_and_no_alpha_tells(scene: Scene, contracted: bool, has_alpha: bool) -> None:
     config = GRID.model_copy(update={"contracted": contracted})
-    assert has_sky(config, replace(scene, has_alpha=has_alpha)) is (contracted and not has_alpha)
+    assert has_background_model(config, replace(scene, has_alpha=has_alpha)) is (contracted and not has_alpha)
 
 
 def test_the_reason_for_sizes_is_the_budget() -> None:
-    reason = "100 steps draw about 1.0 M rays and compute 3.0 M colours: sizes left open are chosen for that"
-    assert reason_words(GRID, 1e6) == reason
-    assert reason_words(PAPER, 950) == "10 s on this machine draw about 950 rays: sizes left open are chosen for that"
+    said = "100 steps draw about 1.0 M rays and compute 3.0 M colours: sizes left open are chosen for that"
+    assert reason(GRID, 1e6) == said
+    assert reason(PAPER, 950) == "10 s on this machine draw about 950 rays: sizes left open are chosen for that"
 
 
 FOLDED = GRID.model_copy(update={"contracted": True, "downscale": 1.0})
@@ -215,7 +220,7 @@ LARGEST, SMALLEST = (
     {"levels": levels, "log2_rows": log2_rows, "finest": finest}
     for levels, log2_rows, finest in ((6, 18, 1024), (5, 17, 512))
 )
-NEEDED = field_bytes(FOLDED.model_copy(update=LARGEST), 1)
+NEEDED = memory_bytes(FOLDED.model_copy(update=LARGEST), 1)
 
 
 @pytest.mark.parametrize(
@@ -230,9 +235,9 @@ NEEDED = field_bytes(FOLDED.model_copy(update=LARGEST), 1)
 def test_grids_take_half_of_the_free_memory_at_most(
     scene: Scene, free: float, own: dict[str, int], chosen: dict[str, int], monkeypatch: pytest.MonkeyPatch, progress
 ) -> None:
-    monkeypatch.setattr("stages.train.size.available_on", {"cpu": free}.get)
+    monkeypatch.setattr("stages.train.fields.hash_grid.available_on", {"cpu": free}.get)
     config = FOLDED.model_copy(update=own)
-    assert grid_size(config, of_size(scene, 4000, 3000), 1e9, progress) == chosen
+    assert sizes_of(config, of_size(scene, 4000, 3000), 1e9, progress) == chosen | own
     said = "5 grids of up to 2^{log2_rows} rows: 6 grids of up to 2^18 rows, which the budget could fill, take "
     assert [note.startswith(said.format(**chosen)) for note in progress.notes] == [True] * (chosen is not LARGEST)
 
@@ -250,8 +255,8 @@ def test_grids_take_half_of_the_free_memory_at_most(
 def test_the_pixels_take_half_of_a_gpus_free_memory_at_most(
     scene: Scene, device: str, free: float, has_alpha: bool, downscale: float, monkeypatch: pytest.MonkeyPatch, progress
 ) -> None:
-    monkeypatch.setattr("stages.train.size.compute_device", lambda: device)
-    monkeypatch.setattr("stages.train.size.available_on", {"cuda": free}.get)
+    monkeypatch.setattr("stages.train.planning.compute_device", lambda: device)
+    monkeypatch.setattr("stages.train.planning.available_on", {"cuda": free}.get)
     large = replace(of_size(scene, 2000, 1000), has_alpha=has_alpha)  # six photos, 36 MB without alpha
     assert chosen_downscale(large, 12e6, progress=progress) == downscale
     said = f"photos at 1/{downscale:g} of their size: at 1/1, which the budget could make use of, their pixels take "

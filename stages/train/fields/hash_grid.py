@@ -1,0 +1,227 @@
+"""The hash-grid field as stage train has it: what it is trained with by default, how large it is, what a step costs."""
+
+import math
+from typing import TYPE_CHECKING, Any
+
+from nerf.effects import ImageEffects
+from nerf.fields.hash_grid import HashGridField, HashGridSettings
+from nerf.fields.mlp import HIDDEN
+from nerf.kernels import BOX, CONTRACTED_BOX
+from nerf.training.hash_grid_trainer import HashGridTrainer, HashGridTrainerSettings
+from stages.amounts import bytes_in_words, short_count
+from stages.contract import Progress
+from stages.hardware.backend import chosen_backend, load_backend
+from stages.hardware.device import compute_device, cores
+from stages.hardware.memory import available_on
+from stages.train.config import MAX_MICRO_BATCHES, Config
+from stages.train.data import has_background_model, training_background
+
+if TYPE_CHECKING:
+    from nerf.geometry.scene import Scene
+    from nerf.training.ray_dataset import RayDataset
+
+# At first; both fall while training. In contracted space a cell is met from farther away, and rays are longer.
+LEARNING_RATES = {"bounded": 2e-2, "contracted": 1e-2}
+# Colours that each part of a step computes, so each core: half of what a part takes does not depend on how many they
+# are, and fewer cost as long. In a box more of them go with its closer samples (docs/experiments/colour_samples.md).
+PART_SAMPLES = {"bounded": 3 << 13, "contracted": 1 << 14}
+# The largest step, which a GPU takes as fast as a small one. Its gradients are sure enough for the larger rate
+# (docs/experiments/colour_samples.md).
+MAX_STEP_SAMPLES, LARGE_STEP_LEARNING_RATE = 1 << 18, 2e-2
+# Weight of the distortion loss (Barron et al. 2022, who take 1e-2) in contracted space, against fog and matter close
+# before the cameras; fog also costs most of the time (docs/experiments/distortion_loss.md). A box around an object
+# needs none.
+DISTORTION = 2e-3
+# Weight at first of the loss at sparse points (docs/experiments/sparse_depth.md; Deng et al. 2022 take 0.1, too, of
+# another loss).
+DEPTH_LOSS = 0.1
+# Photos that must look into a cell for something to stand before their foregrounds (docs/experiments/few_photos.md).
+MIN_PHOTOS = 3
+# Cells along an axis of the coarsest grid: fewer where they have to fill all of contracted space
+# (docs/experiments/few_photos.md).
+BASE_RES = {"bounded": 16, "contracted": 8}
+# Samples along a ray (docs/experiments/ray_samples.md).
+MAX_STEPS = 576  # bounded scenes: steps along the diagonal of the box
+# Contracted space: steps in one of the finest cells, by how many of these along an axis it counts for at most. Finer
+# cells gain more by more rays than by closer samples (docs/experiments/cell_sizes.md).
+STEPS_PER_CELL = {512: 3, 2048: 1.5}
+EVEN_UNTIL = 0.25  # contracted space: scene units from the camera up to which steps are even; beyond, they grow
+# Contracted space: at the shortest steps so many samples reach to a distance of 23; --train.ray-samples may ask for
+# more.
+MAX_SAMPLES = 1024
+SAMPLES_PER_RAY = {"bounded": 3, "contracted": 10}
+"""Colours computed for a ray, over a run: measured on lego_400 and five photo sets (docs/results.md)."""
+SIZES = {
+    "bounded": ((50e6, 5, 18, 512), (0, 4, 17, 256)),
+    "contracted": ((30e6, 6, 18, 1024), (0, 5, 17, 512)),
+}
+"""(computed colours from which on it pays, levels, log2 of rows, most cells along an axis), the largest first."""
+# The same on a GPU, which reads a large table as fast as a small one.
+GPU_SIZES = {"bounded": (200e6, 8, 20, 1024), "contracted": (200e6, 8, 20, 2048)}
+MIN_MAX_RES = 128
+MAX_MEMORY_SHARE = 0.5  # of what is free: what training may take of it
+TABLE_COPIES = 6  # of the grids' features: themselves, their gradient, Adam's two moments, and twice in a checkpoint
+SAMPLE_BYTES = 4096  # that a sample of a step takes while it is computed
+
+
+def with_defaults(config: Config) -> Config:
+    """``config`` with what this field is usually trained with where it leaves that open."""
+    gpu, parts = compute_device() == "cuda", config.chunks or min(MAX_MICRO_BATCHES, cores())
+    most = MAX_STEP_SAMPLES if gpu else min(MAX_STEP_SAMPLES, parts * PART_SAMPLES[config.space])
+    samples = config.batch_samples or most
+    rate = LARGE_STEP_LEARNING_RATE if samples >= MAX_STEP_SAMPLES else LEARNING_RATES[config.space]
+    return config.filled({"background": "random", "learning_rate": rate, "batch_samples": samples, "chunks": parts})
+
+
+def prepared(config: Config, progress: Progress) -> Config:
+    """``config`` with kernels that run here, compiled."""
+    backend = config.backend or chosen_backend(compute_device(), progress)
+    load_backend(backend, compute_device(), progress)
+    return config.model_copy(update={"backend": backend})
+
+
+def is_sized(config: Config) -> bool:
+    """Whether ``config`` leaves no size of the field open."""
+    return None not in (config.levels, config.log2_rows, config.finest)
+
+
+def with_sizes(config: Config, scene: "Scene", rays: float, progress: Progress | None = None) -> Config:
+    """``config`` with the sizes, where open, of a field that sees ``rays`` at its ``downscale``: more and larger tables
+    where there are enough to fill them, and MAX_MEMORY_SHARE holds what their training takes; else the next smaller
+    ones, and ``progress`` is told. The finest cells are about as wide as a pixel where the region of interest fills the
+    photo."""
+    assert config.downscale is not None
+    samples, device = rays * SAMPLES_PER_RAY[config.space], compute_device()
+    sizes = SIZES[config.space]
+    if device == "cuda":
+        sizes = (GPU_SIZES[config.space], *sizes)
+    cameras = [scene.cameras[view.camera] for view in scene.of_split("train")]
+    pixels = max(max(camera.width, camera.height) for camera in cameras) / config.downscale
+    across = 2 ** math.ceil(math.log2(pixels * (CONTRACTED_BOX / BOX if config.contracted else 1)))
+    wanted, *smaller = (
+        {"levels": levels, "log2_rows": log2_rows, "finest": max(MIN_MAX_RES, min(most, across))}
+        for least, levels, log2_rows, most in sizes
+        if samples >= least
+    )
+    free = available_on(device)
+
+    def bytes_of(size: dict[str, Any]) -> float:
+        return memory_bytes(config.filled(size), cores())
+
+    fitting = (size for size in (wanted, *smaller) if bytes_of(size) <= MAX_MEMORY_SHARE * free)
+    chosen = next(fitting, [wanted, *smaller][-1])
+    if chosen is not wanted and progress:
+        progress.note(
+            f"{_grids(chosen)}: {_grids(wanted)}, which the budget could fill, take {bytes_in_words(bytes_of(wanted))} "
+            f"while they are trained, and {bytes_in_words(free)} of memory are free"
+        )
+    return config.filled(chosen)
+
+
+def _grids(size: dict[str, Any]) -> str:
+    return f"{size['levels']} grids of up to 2^{size['log2_rows']} rows"
+
+
+def timed(config: Config, device: str) -> Config:
+    """``config`` under which speed is measured before sizes are known: those which most budgets get."""
+    _, levels, log2_rows, finest = SIZES[config.space][0]
+    return config.filled({"levels": levels, "log2_rows": log2_rows, "finest": finest})
+
+
+def rays_per_step(config: Config) -> float:
+    """Rays of one step, expected from the colours that it computes."""
+    assert config.batch_samples is not None, "plan() chooses it"
+    return config.batch_samples / SAMPLES_PER_RAY[config.space]
+
+
+def work(config: Config, rays: float) -> str:
+    """What so many rays take, beside drawing them."""
+    return f" and compute {short_count(rays * SAMPLES_PER_RAY[config.space])} colours"
+
+
+def memory_bytes(config: Config, workers: int) -> float:
+    """Memory on the CPU that training takes beside the photos, so many chunks of work at a time."""
+    settings = field_settings(config, sky=False)  # which is small beside the rest
+    assert config.batch_samples, "plan() chooses it"
+    return TABLE_COPIES * 4 * settings.features_per_level * settings.layout.rows + SAMPLE_BYTES * config.batch_samples
+
+
+def memory_advice(config: Config) -> tuple[str, str]:
+    """What takes that memory, and how it would take less."""
+    return f"{config.levels} grids of up to 2^{config.log2_rows} rows take", "Give a smaller --train.log2-rows."
+
+
+def matmul_width(config: Config) -> int:
+    """Of the matrix multiplications."""
+    return HIDDEN
+
+
+def table_rows(config: Config) -> int:
+    """Rows of features that are read at random."""
+    return field_settings(config, sky=False).layout.rows
+
+
+def sizes_in_words(config: Config) -> str:
+    """``5 grids of up to 2^18 rows, to 512³``."""
+    return f"{config.levels} grids of up to 2^{config.log2_rows} rows, to {config.finest}³"
+
+
+def step_in_words(config: Config) -> str:
+    """How a step is divided and what computes it, and where samples stand along a ray."""
+    stepping = field_settings(config, sky=False).stepping
+    cone = f", from {stepping.linear_until:g} on every {stepping.cone_angle:.1%} of the distance"
+    growing = cone if stepping.cone_angle else ""
+    parts = f"{config.chunks} part{'' if config.chunks == 1 else 's'}"
+    step = f"{config.batch_samples:,} colours a step in {parts}, by {config.backend}"
+    return f"{step} · samples every {stepping.step_size:.2g} scene units{growing}"
+
+
+def make_trainer(
+    config: Config, scene: "Scene", dataset: "RayDataset", seed: int, effects: ImageEffects
+) -> HashGridTrainer:
+    """A fresh field with its trainer, where ``dataset`` is."""
+    assert config.backend, "plan() chooses it"
+    backend = load_backend(config.backend, dataset.device.type)
+    model = HashGridField(field_settings(config, has_background_model(config, scene)), seed, backend).to(dataset.device)
+    return HashGridTrainer(model, dataset, _trainer_settings(config, scene, seed), effects)
+
+
+def field_settings(config: Config, sky: bool) -> HashGridSettings:
+    """Sizes of the field. Samples stand as close as the finest cells can tell them apart: in contracted space a third
+    to two thirds of a cell near the camera, growing with the distance, as pixels do; in a box a cell, or MAX_STEPS in
+    all."""
+    assert config.levels and config.log2_rows and config.finest, "plan() chooses them"
+    assert config.contracted is not None and config.view_dependence is not None, "plan() takes them from stage effects"
+    shortest = 2 * CONTRACTED_BOX / (_steps_across(config.finest) * config.ray_samples)
+    return HashGridSettings(
+        num_levels=config.levels,
+        log2_hashmap_size=config.log2_rows,
+        base_res=min(BASE_RES[config.space], config.finest),
+        max_res=config.finest,
+        contracted=config.contracted,
+        diagonal_steps=max(1, round(config.ray_samples * min(math.sqrt(3) * config.finest, MAX_STEPS))),
+        min_step_size=shortest,
+        cone_angle=shortest / EVEN_UNTIL,
+        max_samples_per_ray=math.ceil(MAX_SAMPLES * max(1.0, config.ray_samples)),
+        view_dependence=config.view_dependence,
+        background_model=sky,
+    )
+
+
+def _steps_across(max_res: int) -> float:
+    """The shortest steps that fit along an axis of contracted space whose finest cells are so many."""
+    return max(per_cell * min(max_res, most) for most, per_cell in STEPS_PER_CELL.items())
+
+
+def _trainer_settings(config: Config, scene: "Scene", seed: int) -> HashGridTrainerSettings:
+    assert config.batch_samples and config.chunks and config.learning_rate, "plan() chooses them"
+    return HashGridTrainerSettings(
+        seed=seed,
+        background=training_background(config, scene),
+        samples=config.batch_samples,
+        chunks=config.chunks,
+        rate=config.learning_rate,
+        distortion=DISTORTION if config.contracted else 0.0,
+        depth_loss=DEPTH_LOSS,
+        least_photos=MIN_PHOTOS,
+    )

@@ -1,0 +1,136 @@
+"""The vanilla NeRF as stage train has it: what it is trained with by default, how large it is, what a step costs."""
+
+from dataclasses import fields
+from typing import TYPE_CHECKING
+
+from nerf.effects import ImageEffects
+from nerf.fields.vanilla import VanillaNerf, VanillaSettings
+from nerf.training.vanilla_trainer import CHUNK_RAYS, VanillaTrainer, VanillaTrainerSettings
+from stages.contract import Progress
+from stages.hardware.device import cores
+from stages.train.config import Config
+from stages.train.data import training_background
+
+if TYPE_CHECKING:
+    from nerf.geometry.scene import Scene
+    from nerf.training.ray_dataset import RayDataset
+
+# The small networks have few steps and take large ones: after 300 of 512 rays on lego_400 at a quarter of its size a
+# start at 5e-4 gave 14.7 dB held out, 2e-3 17.4, 5e-3 19.1. The published ones are those of the released lego config.
+SIZES = {
+    "small": {
+        "depth": 4,
+        "width": 64,
+        "skip": 4,
+        "samples_coarse": 32,
+        "samples_fine": 32,
+        "batch_rays": 512,
+        "learning_rate": 5e-3,
+    },
+    "published": {
+        "depth": 8,
+        "width": 256,
+        "skip": 4,
+        "samples_coarse": 64,
+        "samples_fine": 128,
+        "batch_rays": 1024,
+        "learning_rate": 5e-4,
+    },
+}
+FINAL_LEARNING_RATE = 0.1  # of that at the start
+MAX_TIMED_RAYS = {"cpu": 256, "cuda": 1 << 20}
+"""For each core: one chunk of a batch. More keep a CPU no busier and make the published model's steps long; a GPU needs
+many."""
+ACTIVATIONS_PER_LAYER = 2  # numbers kept of each unit for its gradient
+
+
+def with_defaults(config: Config) -> Config:
+    """``config`` with what this field is usually trained with where it leaves that open."""
+    sizes = SIZES["published" if config.preset == "paper" else "small"]
+    spacing = "log" if config.contracted else "linear"
+    return config.filled({"background": "white", "spacing": spacing, **sizes})
+
+
+def prepared(config: Config, progress: Progress) -> Config:
+    """``config``: torch runs anywhere."""
+    return config
+
+
+def is_sized(config: Config) -> bool:
+    """Whether ``config`` leaves no size of the field open: defaults tell them all."""
+    return True
+
+
+def with_sizes(config: Config, scene: "Scene", rays: float, progress: Progress | None = None) -> Config:
+    """``config``: no size depends on the budget."""
+    return config
+
+
+def timed(config: Config, device: str) -> Config:
+    """``config`` under which speed is measured: with no more rays in a step than it takes to be as fast."""
+    assert config.batch_rays is not None, "plan() chooses it"
+    return config.model_copy(update={"batch_rays": min(config.batch_rays, MAX_TIMED_RAYS[device] * cores())})
+
+
+def rays_per_step(config: Config) -> float:
+    """Rays of one step."""
+    assert config.batch_rays is not None, "plan() chooses it"
+    return config.batch_rays
+
+
+def work(config: Config, rays: float) -> str:
+    """What so many rays take, beside drawing them: each of them the same."""
+    return ""
+
+
+def memory_bytes(config: Config, workers: int) -> float:
+    """Memory on the CPU that training takes beside the photos, so many chunks of work at a time."""
+    sizes = field_settings(config)
+    assert config.batch_rays, "plan() chooses it"
+    rays = min(CHUNK_RAYS["cpu"], config.batch_rays)
+    samples = rays * (2 * sizes.samples_coarse + sizes.samples_fine)
+    return workers * ACTIVATIONS_PER_LAYER * 4 * samples * sizes.width * sizes.depth
+
+
+def memory_advice(config: Config) -> tuple[str, str]:
+    """What takes that memory, and how it would take less."""
+    why = f"{config.depth} × {config.width} networks on {cores()} cores at a time take"
+    hint = "Give a smaller --train.width, --train.batch-rays or --train.samples-fine, or fewer cores (taskset)."
+    return why, hint
+
+
+def matmul_width(config: Config) -> int:
+    """Of the matrix multiplications."""
+    assert config.width, "plan() chooses it"
+    return config.width
+
+
+def table_rows(config: Config) -> int:
+    """Rows of features that are read at random: there is no table."""
+    return 1
+
+
+def sizes_in_words(config: Config) -> str:
+    """``8 × 256``."""
+    return f"{config.depth} × {config.width}"
+
+
+def step_in_words(config: Config) -> str | None:
+    """Nothing: a step is as published."""
+    return None
+
+
+def make_trainer(
+    config: Config, scene: "Scene", dataset: "RayDataset", seed: int, effects: ImageEffects
+) -> VanillaTrainer:
+    """A fresh field with its trainer, where ``dataset`` is."""
+    assert config.batch_rays is not None and config.learning_rate is not None, "plan() chooses them"
+    model = VanillaNerf(field_settings(config), seed).to(dataset.device)
+    rates = (config.learning_rate, config.learning_rate * FINAL_LEARNING_RATE)
+    settings = VanillaTrainerSettings(config.batch_rays, seed, training_background(config, scene), *rates)
+    return VanillaTrainer(model, dataset, settings, effects)
+
+
+def field_settings(config: Config) -> VanillaSettings:
+    """Sizes and ablations of the field."""
+    return VanillaSettings(**{part.name: getattr(config, part.name) for part in fields(VanillaSettings)})
