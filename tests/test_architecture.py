@@ -87,8 +87,9 @@ def calls(tree: ast.AST) -> set[str]:
 def renamed_imports(module: Module) -> Iterator[str]:
     """Modules and functions of ours under another name than their own. Backends may stand beside torch and Warp."""
     for node in ast.walk(module.tree):
-        ours = isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in (*PACKAGES, "tests")
-        for alias in node.names if isinstance(node, ast.ImportFrom) and ours else ():
+        if not isinstance(node, ast.ImportFrom) or (node.module or "").split(".")[0] not in (*PACKAGES, "tests"):
+            continue
+        for alias in node.names:
             if alias.asname and alias.name.islower() and alias.name not in BACKENDS:
                 yield f"{node.module}.{alias.name} as {alias.asname}"
 

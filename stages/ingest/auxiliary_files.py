@@ -8,6 +8,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Literal
 
+from stages.ingest.listing import IMAGES
+
 # a_mask.png and a.depth_2.tif belong to a.jpg; mask/a.png and depth_maps/a.png to image/a.jpg, or to a.jpg beside them.
 _ENDING = re.compile(r"(.+)[ ._-](masks?|masked|depth|depthmap|normals?|alpha|matte)([ ._-]?\d+)?", re.IGNORECASE)
 _FOLDER = re.compile(r"(masks?|masked|depths?)(maps?)?($|[._-]|\d)|normals([._-]?maps?)?$", re.IGNORECASE)
@@ -18,6 +20,7 @@ _PERHAPS = re.compile(
     re.IGNORECASE,
 )
 _COLOUR = re.compile(r"(.+)[ ._-](colou?r|rgb|image)", re.IGNORECASE)  # a.color.jpg beside a.depth.png
+IGNORED = "dynamic_mask_"  # instant-ngp's masks, beside their photos, whose white is ignored
 _MASK = re.compile(r"(.+[ ._-])?masks?([ ._-]?\d+)?", re.IGNORECASE)
 
 # Of a depth map there is a photo, but for a few that were lost; of photos in grey there need not be any in colour.
@@ -42,6 +45,8 @@ def auxiliary_files(names: Sequence[str]) -> dict[str, str]:
         keys = _keys(file, beside)
         if photo := next((photos[key] for key in keys if photos.get(key, file) != file), None):
             found[str(file)] = str(photo)
+        elif marks_ignored(file.name):  # of a photo that is not there
+            found[str(file)] = file.stem.removeprefix(IGNORED)
     return found
 
 
@@ -53,18 +58,28 @@ def depth_maps(stored: Mapping[str, Stored]) -> set[str]:
     return deep if colour >= _MIN_COLOURED * len(deep) else set()
 
 
+def marks_ignored(name: str) -> bool:
+    """Whether such a file is a mask of instant-ngp's, in which white, not black, is ignored."""
+    return name.startswith(IGNORED)
+
+
+def instant_ngp_masks(excluded: Mapping[str, str]) -> dict[str, str]:
+    """Of files that belong to a photo those that are its mask of instant-ngp's, {photo: mask}."""
+    return {photo: name for name, photo in excluded.items() if marks_ignored(PurePosixPath(name).name)}
+
+
 def pair_masks(names: Sequence[str], masks: Sequence[tuple[str, Path]]) -> tuple[dict[str, Path], list[Path]]:
     """The mask file of each photo that has one, by the photo's name, and the files that are no photo's mask, each
     once though it may stand for several names.
 
-    A photo's mask is called after it, with its ending or without, and ends in .png. Its accents may be composed in
-    another way, where no other mask is called so.
+    A photo's mask is called after it, with its ending or without, and ends as images do, in .png rather than in another
+    way. Its accents may be composed in another way, where no other mask is called so.
     """
     by_name: dict[str, Path] = {}
     composed: dict[str, set[Path]] = {}
-    for name, file in masks:
-        if name.lower().endswith(".png"):
-            of = name[: -len(".png")]
+    for name, file in sorted(masks, key=lambda mask: not mask[0].lower().endswith(".png")):
+        of, ending = os.path.splitext(name)
+        if ending.lower() in IMAGES:
             by_name.setdefault(of, file)
             composed.setdefault(unicodedata.normalize("NFC", of), set()).add(file)
 
@@ -99,6 +114,8 @@ def _is_jpeg(file: PurePosixPath) -> bool:
 
 def _keys(file: PurePosixPath, beside: Mapping[PurePosixPath, Sequence[PurePosixPath]]) -> Iterator[_Key]:
     """Where the photo may lie that a file belongs to. ``beside``: the folders of photos in each folder."""
+    if marks_ignored(file.name):
+        yield file.parent, _plain(file.stem.removeprefix(IGNORED))
     ending = _ENDING.fullmatch(file.stem)
     if ending and ending[2].lower() == "normal" and _is_jpeg(file):
         ending = None

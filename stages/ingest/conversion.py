@@ -27,7 +27,7 @@ from stages.ingest.decoding import CameraKey, DecodeError, decode, pixel_count
 from stages.ingest.exif import GpsPosition
 from stages.ingest.masks import are_of_stored_pixels, read_mask
 from stages.ingest.messages import shown
-from stages.ingest.near_duplicates import near_duplicates, small, thumbnail
+from stages.ingest.near_duplicates import Exposure, exposure, near_duplicates, small, thumbnail, well_exposed
 from stages.ingest.panoramas import cutting_advice
 from stages.ingest.sharpness import one_colour, relative_sharpness, sharpness
 from stages.ingest.sources import Source
@@ -42,6 +42,7 @@ _BYTES_PER_PIXEL = 24  # of a photo while it is decoded, turned, packed and look
 # 46 to 51 dB from the pixels, in a third of a PNG's bytes (fox, fern, sceaux_castle, banana, fountain_p11): far closer
 # than the file, at 90 or so, is to what the camera saw.
 _JPEG_QUALITY = 97
+_UNMEASURED = Exposure(0.0, 1.0)
 _NO_POSITION = GpsPosition()
 # Of the pixels, that have to be more transparent than opaque in a photo with alpha. Fewer are scratches: where they are
 # wrong by half of all that a value can be, they cost what is 0.3 dB at 30 dB (nerf/effects/statistics/statistic.py).
@@ -75,6 +76,7 @@ class _Taken:
     opaque_share: float | None = None  # that a mask beside ``waiting`` leaves; None without alpha
     one_colour: str | None = None
     brightest: int = 255  # of all channels
+    exposure: Exposure = _UNMEASURED
     gps: GpsPosition = _NO_POSITION
     exposure_ev: float | None = None
     clock_s: float | None = None
@@ -237,6 +239,7 @@ def _take(file: Path, name: str, mask: Path | None, stored: bool, waiting: Path)
         opaque_share=_take_opaque(pixels, taken_mask, waiting),
         one_colour=one_colour(pixels),
         brightest=int(pixels[..., :3].max()),
+        exposure=exposure(pixels),
         gps=decoded.gps,
         exposure_ev=decoded.exposure_ev,
         clock_s=decoded.clock_s,
@@ -293,10 +296,10 @@ def _checked(
     if source.kind != "photos":
         return {}
     progress.update("looking for photos that are nearly the same")
-    return _near_duplicates(taken)
+    return _near_duplicates(taken, progress)
 
 
-def _near_duplicates(taken: Sequence[_Taken]) -> dict[str, str]:
+def _near_duplicates(taken: Sequence[_Taken], progress: Progress) -> dict[str, str]:
     """{photo that is left out of matching: the one it is nearly the same picture as}, by name. Raises StageError where
     one picture is all there is."""
     thumbnails = [photo.thumbnail for photo in taken if photo.thumbnail is not None]
@@ -304,6 +307,9 @@ def _near_duplicates(taken: Sequence[_Taken]) -> dict[str, str]:
     same = near_duplicates(thumbnails, [photo.sharpness for photo in taken], pixels)
     if len(same) == len(taken) - 1:
         raise messages.all_the_same(len(taken))
+    same, brackets = well_exposed(same, [photo.exposure for photo in taken], pixels)
+    if brackets:
+        progress.note(messages.bracketed(brackets))
     return {taken[index].name: taken[kept].name for index, kept in sorted(same.items())}
 
 

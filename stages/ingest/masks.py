@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from PIL import Image
 
+from stages.ingest.auxiliary_files import marks_ignored
 from stages.ingest.decoding import DecodeError, decode, upright, upright_size
 from stages.io.files import write_png
 from stages.io.photos import Photo
@@ -63,6 +64,10 @@ def read_mask(file: Path, width: int, height: int, orientation: int, stored: boo
     light = decoded.pixels[..., :3].max(axis=2)
     if decoded.pixels.shape[2] == 4:
         light = np.rint(light * (decoded.pixels[..., 3] / 255.0)).astype(np.uint8)
+    if light.max() == 1:  # a mask of 0 and 1
+        light = 255 * light
+    if marks_ignored(file.name):
+        light = 255 - light
     pixels = np.where(light >= USE_FROM, np.uint8(255), np.uint8(0))
     size, found = (width, height), (pixels.shape[1], pixels.shape[0])
     fits, fits_stored = _same_shape(found, size), _same_shape(found, _stored(size, orientation))

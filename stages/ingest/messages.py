@@ -6,8 +6,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from stages.contract import Progress, StageError, listed
-from stages.ingest.auxiliary_files import is_mask
+from stages.ingest.auxiliary_files import instant_ngp_masks, is_mask
 from stages.ingest.masks import STILL_BACKGROUND_HINT
+from stages.ingest.near_duplicates import Brackets
 from stages.ingest.sharpness import BLURRED
 from stages.ingest.sources import Source, photos_beside, unused_cameras, unused_masks
 from stages.io.photos import Photo, Rejection
@@ -65,11 +66,14 @@ def note_unused(source: Source, photos: Path, progress: Progress) -> None:
 
 def excluded(files: Mapping[str, str]) -> list[str]:
     """Notes on files that are not taken for photos, {file: the photo that it belongs to}."""
+    used = instant_ngp_masks(files).values()
+    notes = [f"{len(used)} masks of instant-ngp's ({shown(min(used))}, …) are used: white is ignored"] if used else []
+    files = {name: photo for name, photo in files.items() if name not in used}
     if not files:
-        return []
+        return notes
     named = [f"{shown(name)} (of {shown(photo)})" for name, photo in sorted(files.items())]
     count = "1 file is" if len(files) == 1 else f"{len(files)} files are"
-    notes = [f"{count} excluded, named as a mask, depth map or other copy of a photo: {listed(named, 3)}"]
+    notes += [f"{count} excluded, named as a mask, depth map or other copy of a photo: {listed(named, 3)}"]
     if mask := next((name for name in sorted(files) if is_mask(name)), None):
         place = f"masks/{os.path.splitext(files[mask])[0]}.png"
         notes.append(f"to be used as a mask, whose black is ignored, {shown(mask)} would have to be {shown(place)}")
@@ -83,6 +87,15 @@ def excluded_by_values(files: Sequence[str]) -> list[str]:
     count = "1 file is" if len(files) == 1 else f"{len(files)} files are"
     named = listed([shown(name) for name in files], 3)
     return [f"{count} excluded as depth maps, being grey of 16 bits or of floats among photos in colour: {named}"]
+
+
+def bracketed(brackets: Brackets) -> str:
+    """The note on places that were photographed with several exposures each."""
+    last = brackets.exposures - 1
+    names = {0: "darkest", last: "brightest", last / 2: "middle one"}
+    which = names.get(brackets.position, f"number {brackets.position + 1} from the darkest")
+    each = f"{brackets.places} places were photographed with {brackets.exposures} exposures each"
+    return f"{each}: the {which} of each is kept, where least is clipped or too dark"
 
 
 def nearly_black(brightest: Sequence[int]) -> list[str]:

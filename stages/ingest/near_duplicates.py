@@ -6,7 +6,8 @@ in the same order, which their ranks do not notice.
 """
 
 import math
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import cv2
@@ -29,6 +30,27 @@ MIN_CORNERS, MAX_CORNERS = 30, 200
 CELLS = 16
 MIN_CORRELATION = 0.8
 MAX_CANDIDATES = 4
+MIN_BRACKET_EV = 0.7  # between the darkest and the lightest of one place; brackets step by as much, or by more
+# Of 255. Of a pixel that is darker, rounding and noise leave ever less; nothing is left of a clipped one.
+DARK, CLIPPED = 48, 250
+GAMMA = 2.2  # about what takes sRGB to linear light
+
+
+class Exposure(NamedTuple):
+    """How a picture is exposed: ``level_ev`` is the base-2 logarithm of its median luminance in linear light,
+    ``usable`` the fraction of it that is neither clipped nor lost in the dark."""
+
+    level_ev: float
+    usable: float
+
+
+class Brackets(NamedTuple):
+    """Places that were photographed with the same number of exposures; of each the one at ``position`` is kept, counted
+    from the darkest."""
+
+    places: int
+    exposures: int
+    position: int
 
 
 class _Picture(NamedTuple):
@@ -56,6 +78,61 @@ def small(pixels: np.ndarray) -> np.ndarray:
     return cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
 
 
+def exposure(pixels: np.ndarray) -> Exposure:
+    """Of a photo, (h, w, 3 or 4) uint8; what is transparent does not count."""
+    picture = small(pixels)
+    opaque = picture[..., 3] > 0 if picture.shape[2] == 4 else np.ones(picture.shape[:2], bool)
+    if not opaque.any():
+        return Exposure(0.0, 0.0)
+    grey = cv2.cvtColor(picture[..., :3], cv2.COLOR_RGB2GRAY)[opaque]
+    left = np.minimum(grey / DARK, 1.0)
+    left[picture[..., :3].max(axis=2)[opaque] >= CLIPPED] = 0
+    return Exposure(float(GAMMA * np.log2(max(float(np.median(grey)), 1.0) / 255)), float(left.mean()))
+
+
+def well_exposed(
+    left_out: Mapping[int, int], exposures: Sequence[Exposure], pixels: Sequence[int]
+) -> tuple[dict[int, int], Brackets | None]:
+    """:func:`near_duplicates` with the best exposed picture kept of each place with several exposures: in all places of
+    a bracketed set the same one, so that the photos kept are exposed alike. Also the pattern of such a set."""
+    groups: dict[int, list[int]] = {}
+    for index, kept in left_out.items():
+        groups.setdefault(kept, [kept]).append(index)
+    brackets = []
+    for kept, members in groups.items():
+        largest = [i for i in members if _size_class(pixels[i]) >= _size_class(pixels[kept])]
+        largest.sort(key=lambda i: (exposures[i].level_ev, i))
+        if exposures[largest[-1]].level_ev - exposures[largest[0]].level_ev >= MIN_BRACKET_EV:
+            brackets.append((kept, largest))
+    chosen: dict[int, int] = {}
+    pattern = _pattern([members for _, members in brackets], exposures)
+    for kept, members in brackets:
+        if pattern and len(members) == pattern.exposures:
+            chosen[kept] = members[pattern.position]
+        else:
+            chosen[kept] = max(members, key=lambda i: exposures[i].usable)
+    found = {}
+    for kept, members in groups.items():
+        best = chosen.get(kept, kept)
+        found |= {index: best for index in members if index != best}
+    return found, pattern
+
+
+def _pattern(brackets: Sequence[Sequence[int]], exposures: Sequence[Exposure]) -> Brackets | None:
+    """How most of the places with several exposures, darkest first, were taken; None of a single place."""
+    counts = Counter(map(len, brackets))
+    if not counts or max(counts.values()) < 2:
+        return None
+    count, places = counts.most_common(1)[0]
+    usable = np.mean([[exposures[i].usable for i in members] for members in brackets if len(members) == count], axis=0)
+    return Brackets(places, count, int(usable.argmax()))
+
+
+def _size_class(pixels: int) -> int:
+    """By the nearest power of √2."""
+    return round(2 * math.log2(pixels))
+
+
 def near_duplicates(
     thumbnails: Sequence[np.ndarray], sharpness: Sequence[float], pixels: Sequence[int]
 ) -> dict[int, int]:
@@ -77,7 +154,7 @@ def near_duplicates(
 
     left_out: dict[int, int] = {}
     kept: set[int] = set()
-    for index in sorted(range(len(thumbnails)), key=lambda i: (-round(2 * math.log2(pixels[i])), -sharpness[i], i)):
+    for index in sorted(range(len(thumbnails)), key=lambda i: (-_size_class(pixels[i]), -sharpness[i], i)):
         nearest = [other for other in candidates[index] if other in kept][:MAX_CANDIDATES]
         same = next((other for other in nearest if _is_same_picture(picture(index), picture(other))), None)
         if same is None:

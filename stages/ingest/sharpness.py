@@ -14,12 +14,14 @@ BLURRED = 0.25
 
 
 def sharpness(pixels: np.ndarray) -> float:
-    """Variance of the Laplacian (Pech-Pacheco et al. 2000) of the grey image, at most WIDTH pixels wide, of (h, w) or
-    (h, w, 3 or 4) uint8."""
+    """Variance of the Laplacian (Pech-Pacheco et al. 2000) of the grey image, at most WIDTH pixels wide, over its
+    squared mean, of (h, w) or (h, w, 3 or 4) uint8: another exposure multiplies both by the same. 0 of a black one."""
     grey = pixels if pixels.ndim == 2 else cv2.cvtColor(pixels[..., :3], cv2.COLOR_RGB2GRAY)
     if pixels.shape[2:] == (4,):  # what is transparent has no sharpness
         grey = np.rint(grey * (pixels[..., 3] / 255.0)).astype(np.uint8)
-    return float(f"{cv2.Laplacian(at_most(grey, WIDTH), cv2.CV_64F).var():.4g}")
+    grey = at_most(grey, WIDTH)
+    mean = float(grey.mean())
+    return float(f"{cv2.Laplacian(grey, cv2.CV_64F).var() / mean**2:.4g}") if mean else 0.0
 
 
 def at_most(grey: np.ndarray, most: int) -> np.ndarray:

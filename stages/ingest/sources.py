@@ -12,14 +12,15 @@ from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
 from stages.contract import StageError, listed
-from stages.ingest.auxiliary_files import auxiliary_files, pair_masks
+from stages.ingest.auxiliary_files import IGNORED, auxiliary_files, instant_ngp_masks, pair_masks
 from stages.ingest.frame_files import FrameFiles
 from stages.ingest.listing import FOLDER_HINT, IMAGES, files_below, is_video, list_photos, photo_root, walk_photos
 from stages.io.transforms_files import HELD_OUT, TRAIN, photo_names, read_splits
 
-SourceKind = Literal["photos", "video", "transforms", "blender", "colmap"]
+SourceKind = Literal["photos", "video", "transforms", "blender", "colmap", "llff"]
 
 FEW_NAMES = 2
+LLFF = ".npy"  # the ending of LLFF's file of cameras
 _HAS_BESIDE = re.compile(r"images(_\d+)?|input|photos")  # folders of photos beside which their masks may lie
 
 
@@ -27,14 +28,15 @@ _HAS_BESIDE = re.compile(r"images(_\d+)?|input|photos")  # folders of photos bes
 class Source:
     """Where photos, and perhaps cameras, come from.
 
-    ``kind`` "photos" goes through structure-from-motion and has no ``cameras``, and so does "video", whose one file
-    is the video; otherwise ``cameras`` is the transforms file, the folder of transforms_train.json, or the folder of
-    one COLMAP model. ``files`` are the files to decode, in order of their names relative to ``root``; some may turn
-    out to be no images, and files named by a transforms file may be missing. ``frames`` maps each file_path of a
-    transforms file, as it is written there, to the name of its photo. ``masks`` are the files that a transforms file
-    names as masks, each after its photo's name and .png, and then all files in folders named masks, each after the
-    name, relative to ``root``, that it would have without such a folder in it. ``excluded`` are files in a folder of
-    photos that belong to one of them by their names, as a depth map does, and that photo, by name.
+    ``kind`` "photos" goes through structure-from-motion and has no ``cameras``, and so does "video", whose one file is
+    the video; otherwise ``cameras`` is the transforms file, the folder of transforms_train.json, the folder of one
+    COLMAP model or LLFF's file. ``files`` are the files to decode, in order of their names relative to ``root``; some
+    may turn out to be no images, and files named by a transforms file may be missing. ``frames`` maps each file_path of
+    a transforms file, as it is written there, or each row of LLFF's, from 0, to the name of its photo. ``masks`` are
+    the files that a transforms file names as masks, each after its photo's name and .png, and then all files in folders
+    named masks, each after the name, relative to ``root``, that it would have without such a folder in it. ``excluded``
+    are files in a folder of photos that belong to one of them by their names, as a depth map does, and that photo, by
+    name.
     """
 
     kind: SourceKind
@@ -61,7 +63,7 @@ def find_source(photos: Path, cameras: Path | None = None) -> Source:
         _check_given(photos, cameras)
         source = _source(photos, cameras)
         if source.kind != "video":
-            return replace(source, masks=source.masks + _list_masks(source.root, source.files))
+            return replace(source, masks=source.masks + _list_masks(source.root, source.files) + _beside(source))
         if cameras is not None:
             raise _cameras_of_video(source.files[0])
         return source
@@ -81,7 +83,7 @@ def _source(photos: Path, cameras: Path | None) -> Source:
     if photos.is_file():
         return _from_transforms("transforms", photos.parent, photos)
     root = photo_root(photos)
-    if cameras is not None and cameras.is_file():
+    if cameras is not None and cameras.is_file() and cameras.suffix.lower() != LLFF:
         return _from_transforms("transforms", root, cameras)
     if cameras is None and (photos / TRAIN).is_file():
         return _from_transforms("blender", photos, photos)
@@ -89,10 +91,14 @@ def _source(photos: Path, cameras: Path | None) -> Source:
     if is_video(files[0]):
         return Source("video", root, None, files)
     names = [_name(root, file) for file in files]
-    if cameras is not None and not _model_files(cameras := _cameras_in(cameras, names)):
+    of_llff = cameras is not None and cameras.is_file()
+    if cameras is not None and not of_llff and not _model_files(cameras := _cameras_in(cameras, names)):
         return _from_transforms("transforms" if cameras.is_file() else "blender", root, cameras)
     excluded = auxiliary_files(names)
     files = tuple(file for file in files if _name(root, file) not in excluded)
+    if cameras is not None and of_llff:
+        rows = {str(row): name for row, name in enumerate(sorted(_name(root, file) for file in files))}
+        return Source("llff", root, cameras, files, rows, excluded=excluded)
     if cameras is not None:
         return Source("colmap", root, cameras, files, excluded=excluded)
     return Source("photos", root, None, files, excluded=excluded)
@@ -100,7 +106,7 @@ def _source(photos: Path, cameras: Path | None) -> Source:
 
 def unused_cameras(source: Source) -> Path | None:
     """What lies with photos that were given without cameras and could be given as their cameras: the one COLMAP model
-    in a ``sparse`` folder, or a transforms.json that names some of them."""
+    in a ``sparse`` folder, a transforms.json that names some of them, or LLFF's file."""
     if source.kind != "photos":
         return None
     places = (source.root.parent, source.root) if source.root.name == "images" else (source.root,)
@@ -111,7 +117,7 @@ def unused_cameras(source: Source) -> Path | None:
         with suppress(StageError, OSError):
             if set(_from_transforms("transforms", source.root, file).files) & set(source.files):
                 return file
-    return None
+    return next((file for place in places if (file := place / f"poses_bounds{LLFF}").is_file()), None)
 
 
 def unused_masks(source: Source) -> Path | None:
@@ -162,6 +168,15 @@ def _list_masks(root: Path, files: tuple[Path, ...]) -> tuple[tuple[str, Path], 
     return tuple(found)
 
 
+def _beside(source: Source) -> tuple[tuple[str, Path], ...]:
+    """Masks of instant-ngp's that lie beside their photos, after the names that they would have in a masks folder."""
+    if source.kind in ("transforms", "blender"):
+        own = {source.name(file): file.with_name(f"{IGNORED}{file.stem}.png") for file in source.files}
+        return tuple((f"{photo}.png", mask) for photo, mask in own.items() if mask.is_file())
+    found = instant_ngp_masks(source.excluded)
+    return tuple((f"{photo}.png", source.root / mask) for photo, mask in found.items())
+
+
 def _check_given(photos: Path, cameras: Path | None) -> None:
     if not photos.exists():
         raise StageError(
@@ -203,11 +218,11 @@ def _check_given(photos: Path, cameras: Path | None) -> None:
             f"{photos.name} and --cameras {cameras}",
             "Give the photo folder with --cameras.",
         )
-    if cameras is not None and cameras.is_file() and (suffix := cameras.suffix.lower()) != ".json":
+    if cameras is not None and cameras.is_file() and (suffix := cameras.suffix.lower()) not in (".json", LLFF):
         of_colmap = suffix in (".bin", ".txt")
         raise StageError("ingest.unknown-cameras", 
             f"cannot use the cameras {cameras.name}",
-            "it is no transforms file, whose name ends in .json",
+            "it is no transforms file, whose name ends in .json, and no poses_bounds.npy",
             f"Give the folder of the COLMAP model: --cameras {cameras.parent}" if of_colmap else
             "Give a transforms file or the folder of a COLMAP model: cameras in other forms are not read.",
         )  # fmt: skip

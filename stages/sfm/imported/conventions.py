@@ -35,6 +35,7 @@ class PoseConvention(NamedTuple):
 AS_DECLARED = PoseConvention(None, None)
 OF_TRANSFORMS = PoseConvention("world-from-camera", "opengl")
 OF_COLMAP = PoseConvention("camera-from-world", "opencv")
+OF_LLFF = PoseConvention("world-from-camera", "opencv")  # as stages/sfm/imported/llff.py turns its axes
 
 
 def inverse(pose: Float[np.ndarray, "... 3 4"]) -> Float[np.ndarray, "... 3 4"]:

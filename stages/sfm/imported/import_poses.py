@@ -12,8 +12,6 @@ from stages.io.photos import Photo, read_frame_names
 from stages.io.sparse_model import SparseModel
 from stages.sfm.colmap.models import read_model, write_model
 from stages.sfm.imported.conventions import (
-    OF_COLMAP,
-    OF_TRANSFORMS,
     Fit,
     PoseConvention,
     axes_in_words,
@@ -21,7 +19,7 @@ from stages.sfm.imported.conventions import (
     named_axes,
 )
 from stages.sfm.imported.pose_check import check_imported_poses
-from stages.sfm.imported.pose_files import ImportedPoses, is_transforms, read_poses
+from stages.sfm.imported.pose_files import ImportedPoses, convention_of_format, read_poses
 
 MAX_NAMES = 5
 
@@ -36,8 +34,8 @@ def import_poses(
     known, errors = write_imported_model(cameras, convention, photos, ingest, folder, progress)
     check = _check_given(known.model, photos, ingest, folder, progress)
     if check and (fit := check.pop("fit")):
-        of_format = OF_TRANSFORMS if is_transforms(cameras) else OF_COLMAP
-        raise _another_convention(cameras.name, check, Fit(**fit), convention.with_defaults(of_format))
+        read_as = convention.with_defaults(convention_of_format(cameras))
+        raise _another_convention(cameras.name, check, Fit(**fit), read_as)
     if check:
         _note_doubts(check, known.model, photos, progress)
     judged = check.pop("images", {}) if check else {}

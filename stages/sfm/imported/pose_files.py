@@ -1,4 +1,4 @@
-"""Cameras that are known already: transforms.json, Blender's transforms_train/test.json, or a COLMAP model.
+"""Cameras that are known already: transforms.json, Blender's transforms_train/test.json, COLMAP models, LLFF's file.
 
 Poses in transforms files are world_from_camera with OpenGL axes (x right, y up, z backward), in COLMAP models
 camera_from_world with OpenCV axes, unless the user says otherwise; here they become world_from_camera with OpenCV axes.
@@ -20,7 +20,7 @@ from jaxtyping import Float
 
 from nerf.geometry.scene import Camera
 from stages.contract import StageError
-from stages.ingest.sources import own_registration
+from stages.ingest.sources import LLFF, own_registration
 from stages.io.colmap_files import MAX_COORDINATE
 from stages.io.photos import Photo
 from stages.io.sparse_model import SparseModel
@@ -29,11 +29,13 @@ from stages.sfm.colmap.models import read_model
 from stages.sfm.imported.conventions import (
     AS_DECLARED,
     OF_COLMAP,
+    OF_LLFF,
     OF_TRANSFORMS,
     PoseConvention,
     inverse,
     world_from_camera,
 )
+from stages.sfm.imported.llff import read_llff
 from stages.sfm.imported.orientation import fits_only_upright, pixel_map, stored_size
 from stages.sfm.imported.posed_photos import HINT, PosedPhoto, distinct, posed_photo, unusable, without_rays
 from stages.sfm.imported.transforms_intrinsics import contradictions, intrinsics_of, read_intrinsics
@@ -88,12 +90,22 @@ def read_poses(
     Raises StageError, naming the frame, for anything that is no camera: numbers that are not finite, a focal length
     that is not positive, a rotation that is scaled or mirrored; and where no frame has a photo.
     """
-    if is_transforms(cameras):
-        return _from_transforms(cameras, photos, frames, convention.with_defaults(OF_TRANSFORMS))
-    return _from_colmap(cameras, photos, convention.with_defaults(OF_COLMAP))
+    convention = convention.with_defaults(convention_of_format(cameras))
+    if cameras.suffix.lower() == LLFF:
+        return _from_llff(cameras, photos, frames, convention)
+    if _is_transforms(cameras):
+        return _from_transforms(cameras, photos, frames, convention)
+    return _from_colmap(cameras, photos, convention)
 
 
-def is_transforms(cameras: Path) -> bool:
+def convention_of_format(cameras: Path) -> PoseConvention:
+    """Of the poses in these files, unless the user says otherwise."""
+    if cameras.suffix.lower() == LLFF:
+        return OF_LLFF
+    return OF_TRANSFORMS if _is_transforms(cameras) else OF_COLMAP
+
+
+def _is_transforms(cameras: Path) -> bool:
     """Whether cameras stand in a transforms file, or a Blender-style folder of them, and not in a COLMAP model."""
     return cameras.is_file() or (cameras / TRAIN).is_file()
 
@@ -299,6 +311,33 @@ def _rounded_or_scaled(rotations: Mapping[str, _Rotation]) -> list[str]:
         by = " to ".join(f"{scale:.4g}" for scale in sorted({min(scaled.values()), max(scaled.values())}))
         notes.append(f"the matrices of {len(scaled)} frames scale by {by}, which is left out: {_few(list(scaled))}")
     return notes
+
+
+# --- LLFF's poses_bounds.npy
+
+
+def _from_llff(
+    file: Path, photos: Sequence[Photo], rows: Mapping[str, str], convention: PoseConvention
+) -> ImportedPoses:
+    """``rows`` maps the place of a row, from 0, to a photo's name."""
+    try:
+        given = read_llff(file)
+    except (OSError, ValueError) as error:
+        raise unusable("sfm.llff-unreadable", file.name, str(error)) from error
+    if len(given) != len(rows):
+        why = f"it has {len(given)} rows, one for each photo, and there are {len(rows)} photos"
+        raise unusable("sfm.llff-count", file.name, why)
+    by_name = {photo.name: photo for photo in photos}
+    of = [(by_name[name], given[int(row)]) for row, name in rows.items() if name in by_name]
+    upright = any(fits_only_upright(one.camera, photo) for photo, one in of)
+    posed = []
+    for photo, one in sorted(of, key=lambda pair: pair[0].image_name):
+        matrix, _ = _rigid(one.world_from_camera, photo.name)
+        pose = world_from_camera(matrix, convention)
+        posed.append(posed_photo(photo, photo.name, one.camera, pose, upright))
+    left_out = without_rays(posed)
+    model = SparseModel.without_points(*distinct([one for one in posed if one.file not in left_out]))
+    return ImportedPoses(model, left_out, None, _notes((), (), posed, left_out))
 
 
 # --- COLMAP models

@@ -1,5 +1,6 @@
 """Which file is whose mask, how it is made to fit, and what COLMAP and training get of it."""
 
+import json
 import unicodedata
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from stages import ingest
 from stages.ingest.auxiliary_files import pair_masks
 from stages.ingest.decoding import DecodeError, upright
 from stages.ingest.masks import are_of_stored_pixels, read_mask, write_feature_masks
+from stages.ingest.sources import find_source
 from stages.io.files import write_png
 from stages.io.photos import Photo, read_photos
 from stages.io.pixels import load_mask
@@ -43,10 +45,10 @@ def reason(file: Path) -> str:
 
 def test_masks_are_called_after_their_photos() -> None:
     names = ["a.jpg", "b.jpg", "left/a.jpg", "ö d.heic", "e.png", "images/f.jpg", "g.jpg"]
-    files = ["a.png", "b.jpg.PNG", "left/a.jpg.png", "ö d.png", "e.png", "f.png", "x.png", "g.jpg", "g.tif"]
+    files = ["a.png", "b.jpg.PNG", "left/a.jpg.png", "ö d.png", "e.png", "f.png", "x.png", "g.txt"]
     found, strays = pair_masks(names, [(file, Path("masks", file)) for file in files])
     assert found == {name: Path("masks", file) for name, file in zip(names, files[:6], strict=False)}
-    assert strays == [Path("masks/x.png"), Path("masks/g.jpg"), Path("masks/g.tif")]
+    assert strays == [Path("masks/x.png"), Path("masks/g.txt")]
 
 
 def test_accents_of_masks_may_be_composed_in_another_way() -> None:
@@ -75,6 +77,39 @@ def test_black_is_ignored_whatever_the_kind_of_picture(kind: str, tmp_path: Path
     found = read_mask(tmp_path / "m.png", WIDTH, HEIGHT, 1)
     assert np.array_equal(found.pixels, mask)
     assert (found.turned, found.resized) == (False, False)
+
+
+@pytest.mark.parametrize("used", [1, 255])
+def test_what_is_used_may_be_one_or_white(used: int, tmp_path: Path) -> None:
+    mask = np.where(ignoring(10, 20) > 0, np.uint8(used), np.uint8(0))
+    np.testing.assert_array_equal(read_mask(saved(tmp_path, mask), WIDTH, HEIGHT, 1).pixels, ignoring(10, 20))
+
+
+def test_masks_may_be_jpegs(tmp_path: Path) -> None:
+    paired, strays = pair_masks(["a.jpg", "b.jpg"], [("a.jpg", tmp_path / "a.jpg"), ("b.jpg.JPG", tmp_path / "b.JPG")])
+    assert paired == {"a.jpg": tmp_path / "a.jpg", "b.jpg": tmp_path / "b.JPG"} and strays == []
+    paired, strays = pair_masks(["a.jpg"], [("a.jpg", tmp_path / "a.jpg"), ("a.png", tmp_path / "a.png")])
+    assert paired == {"a.jpg": tmp_path / "a.png"} and strays == [tmp_path / "a.jpg"]
+
+
+def test_white_is_ignored_in_masks_of_instant_ngp(tmp_path: Path) -> None:
+    mask = 255 - ignoring(10, 20)
+    found = read_mask(saved(tmp_path, mask, "dynamic_mask_a.png"), WIDTH, HEIGHT, 1)
+    np.testing.assert_array_equal(found.pixels, ignoring(10, 20))
+
+
+@pytest.mark.parametrize("kind", ["photos", "transforms"])
+def test_masks_of_instant_ngp_lie_beside_their_photos(kind: str, tmp_path: Path) -> None:
+    for name in ("a.jpg", "b.jpg", "dynamic_mask_a.png", "dynamic_mask_gone.png"):
+        (tmp_path / name).write_bytes(b"x")
+    source = find_source(tmp_path)
+    if kind == "transforms":
+        frames = [{"file_path": name, "transform_matrix": []} for name in ("a.jpg", "b.jpg")]
+        (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
+        source = find_source(tmp_path / "transforms.json")
+    names = [source.name(file) for file in source.files]
+    assert names == ["a.jpg", "b.jpg"]
+    assert pair_masks(names, source.masks)[0] == {"a.jpg": tmp_path / "dynamic_mask_a.png"}
 
 
 def test_half_bright_is_used_and_transparent_ignored(tmp_path: Path) -> None:
@@ -165,8 +200,8 @@ def test_a_mask_that_cannot_be_used_is_a_reason_to_refuse_the_photo(tmp_path: Pa
         "its mask m.png does not fit: it is 40×40 and the photo 48×32"
     )
     assert reason(saved(tmp_path, ignoring(5, 5, HEIGHT, WIDTH))).startswith("its mask m.png does not fit")
-    labels = np.minimum(ignoring(5, 5), 1)
-    assert reason(saved(tmp_path, labels)) == "its mask m.png ignores all of it (its brightest value is 1 of 255)"
+    labels = np.minimum(ignoring(5, 5), 3)
+    assert reason(saved(tmp_path, labels)) == "its mask m.png ignores all of it (its brightest value is 3 of 255)"
     (tmp_path / "t.png").write_text("text")
     assert reason(tmp_path / "t.png") == "its mask t.png cannot be used: not an image: it is text"
 

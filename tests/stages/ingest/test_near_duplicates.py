@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stages.ingest.near_duplicates import near_duplicates, small, thumbnail
+from stages.ingest.near_duplicates import Brackets, Exposure, exposure, near_duplicates, small, thumbnail, well_exposed
 from stages.ingest.sharpness import sharpness
 from tests.blots import blots, cut_out
 
@@ -158,3 +158,43 @@ def test_the_answer_does_not_depend_on_threads() -> None:
     finally:
         cv2.setNumThreads(before)
     assert one == found(*pictures) != {}
+
+
+def exposed(picture: np.ndarray, ev: float) -> np.ndarray:
+    linear = (picture / 255) ** 2.2 * 2**ev
+    return np.rint(255 * linear.clip(0, 1) ** (1 / 2.2)).astype(np.uint8)
+
+
+def test_exposure_is_measured_in_stops_and_counts_what_is_lost() -> None:
+    plain = np.clip(0.6 * seen(0) + 30, 0, 255).astype(np.uint8)
+    dark, right, light = (exposure(exposed(plain, ev)) for ev in (-4, 0, 3))
+    assert right.level_ev - dark.level_ev == pytest.approx(4, abs=0.3)
+    assert right.usable > 0.95
+    assert dark.usable < 0.8 and light.usable < 0.8
+
+
+OF_A_PLACE = [Exposure(-3.0, 0.98), Exposure(-5.0, 0.8), Exposure(-1.0, 0.7)]  # 0, -2 and +2 EV
+
+
+def test_of_brackets_the_best_exposed_is_kept_the_same_everywhere() -> None:
+    exposures = OF_A_PLACE * 2 + [Exposure(-3.0, 0.9), Exposure(-5.0, 0.95), Exposure(-1.0, 0.7), Exposure(-3.0, 1.0)]
+    lightest = {0: 2, 1: 2, 3: 5, 4: 5, 6: 8, 7: 8}
+    found, pattern = well_exposed(lightest, exposures, [100] * 10)
+    assert found == {1: 0, 2: 0, 4: 3, 5: 3, 7: 6, 8: 6}
+    assert pattern == Brackets(3, 3, 1)
+
+
+def test_one_place_with_several_exposures_is_no_pattern() -> None:
+    assert well_exposed({0: 2, 1: 2}, OF_A_PLACE, [100] * 3) == ({1: 0, 2: 0}, None)
+
+
+def test_a_burst_keeps_its_sharpest() -> None:
+    assert well_exposed({0: 1, 2: 1}, [Exposure(-3.0, 0.9), Exposure(-3.1, 0.8), Exposure(-3.2, 0.95)], [9] * 3) == (
+        {0: 1, 2: 1},
+        None,
+    )
+
+
+def test_a_reduced_copy_is_not_kept_for_its_exposure() -> None:
+    found, _ = well_exposed({0: 1}, [Exposure(-3.0, 0.95), Exposure(-1.0, 0.5)], [100, 400])
+    assert found == {0: 1}

@@ -9,10 +9,10 @@ from tests.blots import blots
 
 
 def test_the_variance_of_the_laplacian_in_closed_form() -> None:
-    """A chessboard of single pixels of ±a has a Laplacian of ±8a, mirrored at the borders."""
+    """A chessboard of single pixels of m ± a has a Laplacian of ±8a, mirrored at the borders."""
     y, x = np.mgrid[:20, :30]
     board = np.where((x + y) % 2, 140, 100).astype(np.uint8)
-    assert sharpness(np.dstack([board] * 3)) == pytest.approx((8 * 20) ** 2, rel=1e-3)
+    assert sharpness(np.dstack([board] * 3)) == pytest.approx((8 * 20 / 120) ** 2, rel=1e-3)
     assert sharpness(board) == sharpness(np.dstack([board] * 3))
     assert sharpness(np.full((20, 30, 3), 77, np.uint8)) == 0
 
@@ -23,6 +23,17 @@ def test_blur_lowers_it_and_transparent_parts_have_none() -> None:
     assert sharpness(picture) > 2 * blurred[0] > 4 * blurred[1] > 8 * blurred[2] > 0
     hidden = np.dstack([picture, np.zeros(picture.shape[:2], np.uint8)])
     assert sharpness(hidden) == 0
+
+
+@pytest.mark.parametrize("stops", [-1.0, 1.0])
+def test_another_exposure_is_as_sharp(stops: float) -> None:
+    linear = (blots(0) * 0.5 / 255) ** 2.2
+    exposed = [np.rint(255 * (linear * 2**ev) ** (1 / 2.2)).astype(np.uint8) for ev in (0.0, stops)]
+    assert sharpness(exposed[1]) == pytest.approx(sharpness(exposed[0]), rel=0.1)
+
+
+def test_a_black_picture_is_not_sharp() -> None:
+    assert sharpness(np.zeros((20, 30, 3), np.uint8)) == 0
 
 
 def test_large_photos_are_looked_at_small() -> None:

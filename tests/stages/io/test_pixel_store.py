@@ -14,8 +14,8 @@ import pytest
 import torch
 from filelock import FileLock
 
+import stages.io.pixel_store
 from pipeline.engine.workspace import Workspace
-from stages import io
 from stages.contract import StageError
 from stages.io.pixel_store import Load, PixelStore, StoredPhoto, checksum, pixel_store
 from tests.conftest import SilentProgress
@@ -35,7 +35,7 @@ def store_of(folder: Path, channels: int = 3, name: str = "train") -> PixelStore
 
 def fill(store: PixelStore, load: Load, progress: SilentProgress) -> None:
     """With two workers."""
-    io.pixel_store.fill(store, load, lambda: 2, progress)
+    stages.io.pixel_store.fill(store, load, lambda: 2, progress)
 
 
 def painted(index: int, channels: int = 3) -> np.ndarray:

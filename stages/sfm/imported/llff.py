@@ -1,0 +1,49 @@
+"""LLFF's ``poses_bounds.npy``: cameras of the photos of a folder in order of their names (Mildenhall et al. 2019).
+
+A row per photo: a 3 × 5 matrix, row by row, and the nearest and farthest depth. The matrix has world_from_camera with
+axes (down, right, backward), the place, and height, width and focal length in pixels.
+https://github.com/Fyusion/LLFF#using-your-own-poses-without-running-colmap
+"""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from nerf.geometry.scene import Camera
+
+ROW = 17
+# From LLFF's camera axes, down, right and backward, to OpenCV's, right, down and forward.
+LLFF_FROM_OPENCV = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+
+
+class LlffCamera(NamedTuple):
+    """A pinhole camera with its principal point in the middle, and its pose with OpenCV axes, not yet checked to be a
+    rotation."""
+
+    camera: Camera
+    world_from_camera: Float[np.ndarray, "3 4"]
+
+
+def read_llff(file: Path) -> list[LlffCamera]:
+    """The cameras of all photos. Raises OSError, and ValueError with the reason."""
+    try:
+        rows = np.load(file, allow_pickle=False)
+    except (ValueError, EOFError) as error:
+        raise ValueError(f"it is no array that NumPy wrote ({error})") from error
+    if not (isinstance(rows, np.ndarray) and rows.ndim == 2 and rows.shape[1] == ROW and rows.dtype.kind in "fiu"):
+        shape = " × ".join(map(str, rows.shape)) if isinstance(rows, np.ndarray) else "an archive of arrays"
+        raise ValueError(f"it holds {shape}, not a row of {ROW} numbers for each photo")
+    return [_camera(row, number) for number, row in enumerate(rows.astype(np.float64), 1)]
+
+
+def _camera(row: Float[np.ndarray, "17"], number: int) -> LlffCamera:
+    matrix = row[:15].reshape(3, 5)
+    height, width, focal = matrix[:, 4].tolist()
+    if not np.isfinite(matrix).all():
+        raise ValueError(f"row {number} has numbers that are not finite")
+    if not all(1 <= side < 2**31 and side.is_integer() for side in (height, width)):
+        raise ValueError(f"row {number} gives a photo of {width:g} × {height:g} pixels")
+    camera = Camera("PINHOLE", int(width), int(height), (focal, focal, width / 2, height / 2))
+    return LlffCamera(camera, np.concatenate([matrix[:, :3] @ LLFF_FROM_OPENCV, matrix[:, 3:4]], axis=1))

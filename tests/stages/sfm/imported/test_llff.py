@@ -1,0 +1,72 @@
+"""LLFF's poses_bounds.npy as known cameras."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from nerf.synthetic.scenes import ring_of_cameras
+from stages.ingest.sources import find_source
+from stages.sfm.imported.llff import read_llff
+from stages.sfm.imported.pose_files import read_poses
+from tests.refusals import refused
+from tests.stages.sfm.imported.test_pose_files import H, W, photo
+
+POSES = np.stack(ring_of_cameras(3))[:, :3]
+PHOTOS = [photo(index) for index in range(3)]
+ROWS = {str(index): one.name for index, one in enumerate(PHOTOS)}
+
+
+def rows_of(poses: np.ndarray, scale: float = 1.0) -> np.ndarray:
+    """As LLFF writes OpenCV poses: axes down, right, backward, then the place, then height, width and focal length."""
+    right, down, forward, place = np.moveaxis(poses, 2, 0)
+    size = np.broadcast_to([scale * H, scale * W, scale * 50.0], place.shape)
+    matrices = np.stack([down, right, -forward, place, size], axis=2)
+    return np.concatenate([matrices.reshape(len(poses), 15), np.tile([1.0, 9.0], (len(poses), 1))], axis=1)
+
+
+@pytest.mark.parametrize("scale", [1.0, 4.0])
+def test_poses_and_focal_length_are_read(tmp_path: Path, scale: float) -> None:
+    np.save(tmp_path / "poses_bounds.npy", rows_of(POSES, scale))
+    known = read_poses(tmp_path / "poses_bounds.npy", PHOTOS, ROWS)
+    for image, pose in zip(known.model.images, POSES, strict=True):
+        np.testing.assert_allclose(image.sfm_from_camera, pose, atol=1e-9)
+    assert [camera.params for camera in known.model.cameras] == [(50, 50, W / 2, H / 2)]
+    assert known.notes == []
+
+
+def test_rows_belong_to_photos_in_order_of_their_names(tmp_path: Path) -> None:
+    np.save(tmp_path / "poses_bounds.npy", rows_of(POSES))
+    for name in ("b.jpg", "a10.jpg", "a2.jpg", "b_depth.png"):
+        (tmp_path / name).write_bytes(b"x")
+    source = find_source(tmp_path, tmp_path / "poses_bounds.npy")
+    assert (source.kind, source.frames) == ("llff", {"0": "a10.jpg", "1": "a2.jpg", "2": "b.jpg"})
+
+
+def test_a_row_too_few_is_refused(tmp_path: Path) -> None:
+    np.save(tmp_path / "poses_bounds.npy", rows_of(POSES[:2]))
+    with refused("sfm.llff-count"):
+        read_poses(tmp_path / "poses_bounds.npy", PHOTOS, ROWS)
+
+
+@pytest.mark.parametrize("content", ["text", "shape", "pickle", "nan", "size"])
+def test_what_is_no_such_file_is_refused(tmp_path: Path, content: str) -> None:
+    path, rows = tmp_path / "poses_bounds.npy", rows_of(POSES)
+    if content == "text":
+        path.write_text("no array")
+    elif content == "pickle":
+        np.save(path, np.array([{}], dtype=object))
+    else:
+        rows[1, {"nan": 3, "size": 4}.get(content, 0)] = {"nan": np.nan, "size": 40.5}.get(content, 1.0)
+        np.save(path, rows[:, :15] if content == "shape" else rows)
+    with refused("sfm.llff-unreadable"):
+        read_poses(path, PHOTOS, ROWS)
+
+
+def test_the_fern_of_llff(shared_data: Path) -> None:
+    given = read_llff(shared_data / "fern/poses_bounds.npy")
+    assert len(given) == 20
+    for one in given:
+        rotation = one.world_from_camera[:, :3]
+        np.testing.assert_allclose(rotation.T @ rotation, np.eye(3), atol=1e-6)
+        assert np.linalg.det(rotation) > 0 and (one.camera.width, one.camera.height) == (4032, 3024)
